@@ -1,0 +1,84 @@
+"""Closed loops against a second, plain implementation of the same protocol."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torch_qpmpc.envs.point_mass import PointMass
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.evaluation import closed_gap, closed_loop
+
+K = torch.tensor([[1.5, 0.0, 1.0, 0.0], [0.0, 1.5, 0.0, 1.0]], dtype=torch.float64)
+
+
+def in_numpy(kind: str, std: float, steps: int = 50) -> tuple[np.ndarray, np.ndarray]:
+    """States and costs of the policy -K s, written out without the package."""
+    rng = np.random.default_rng(123)
+    s = np.hstack([rng.uniform(-1.5, 1.5, (32, 2)), rng.uniform(-0.5, 0.5, (32, 2))])
+    A = np.eye(4) + 0.1 * np.eye(4, k=2) - 0.1 * np.diag([0, 0, 1, 1])
+    B, bound = 0.1 * np.eye(4, 2, k=-2), np.array([2, 2, 10, 10])
+    nu, states, costs = np.zeros((32, 4)), [s], []
+    for _ in range(steps):
+        a = np.clip(-s @ K.numpy().T, -1, 1)
+        costs.append((s**2) @ [3, 3, 0.25, 0.25])
+        step = std * rng.normal(size=(32, 4))
+        nu = nu + step if kind == "brownian" else step
+        s = np.clip(s @ A.T + a @ B.T + nu, -bound, bound)
+        states.append(s)
+    return np.array(states), np.array(costs)
+
+
+@pytest.mark.parametrize(("kind", "std"), [("gaussian", 0.01), ("brownian", 0.002)])
+def test_closed_loop_follows_the_protocol(kind, std):
+    run = closed_loop(lambda s: -s @ K.T, PointMass(kind))
+    states, costs = in_numpy(kind, std)
+    np.testing.assert_allclose(run.states.numpy(), states, atol=1e-12)
+    np.testing.assert_allclose(run.costs.numpy(), costs, atol=1e-12)
+    assert run.states.shape == (51, 32, 4)
+    assert run.actions.shape == (50, 32, 2)
+    assert run.actions.abs().max() == 1, "as applied: clipped"
+    assert pytest.approx(costs.sum(0).mean()) == run.J
+    discounted = (0.9 ** np.arange(50)[:, None] * costs).sum(0).mean()
+    assert pytest.approx(discounted) == run.J_discounted
+
+
+def test_arguments_change_the_experiment():
+    run = closed_loop(lambda s: -s @ K.T, PointMass(), steps=3, starts=2, seed=1, gamma=0.0)
+    assert run.states.shape == (4, 2, 4)
+    assert run.J_discounted == pytest.approx(run.costs[0].mean().item())
+    other = closed_loop(lambda s: -s @ K.T, PointMass(), steps=3, starts=2, seed=2)
+    assert not torch.equal(run.states[0], other.states[0])
+
+
+def test_policy_gets_float64_and_leaves_no_graph():
+    seen = []
+    net = torch.nn.Linear(4, 2)
+
+    def policy(s):
+        seen.append((s.dtype, s.shape, torch.is_grad_enabled()))
+        return net(s.float())
+
+    run = closed_loop(policy, PointMass(), steps=2, starts=3)
+    assert seen == [(torch.float64, (3, 4), False)] * 2
+    assert run.actions.dtype == torch.float64
+    assert not run.costs.requires_grad
+
+
+@pytest.mark.parametrize("shape", [(32,), (2,), (1, 2), (32, 1)])
+def test_policy_of_another_shape_is_an_error(shape):
+    match = rf"policy\(s\): got shape \({shape[0]},.*\), expected \(32, 2\)"
+    with pytest.raises(QPError, match=match):
+        closed_loop(lambda s: torch.zeros(shape), PointMass())
+
+
+def test_closed_gap():
+    assert closed_gap(100, 100, 50) == 0
+    assert closed_gap(100, 50, 50) == 1
+    assert closed_gap(100, 75, 50) == 0.5
+    assert closed_gap(100, 125, 50) == -0.5
+    assert all(map(math.isnan, (closed_gap(50, 40, 50), closed_gap(40, 40, 50))))
+    assert math.isnan(closed_gap(math.nan, 1, 0))

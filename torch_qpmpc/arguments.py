@@ -1,0 +1,86 @@
+"""What `QPMPC` accepts: its arguments and inputs, checked at the boundary."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.autograd import ON_FAILURE
+from torch_qpmpc.errors import QPError
+
+HESSIANS = ("diagonal", "block", "full")
+#: The parts of theta by family; the paper advises a learning rate for each of the two.
+COST = ("H", "H_f", "q", "c", "w")
+CONSTRAINTS = ("C", "b", "G", "lb", "ub")
+
+
+def check_structure(
+    n_x: int,
+    n_u: int,
+    horizon: int,
+    gamma: float,
+    hessian: str,
+    learn: Collection[str],
+    on_failure: str,
+) -> None:
+    for name, size in (("n_x", n_x), ("n_u", n_u), ("horizon", horizon)):
+        if not isinstance(size, int) or size < 1:
+            raise QPError.expected(name, repr(size), "a positive integer")
+    if not 0 < gamma <= 1:
+        raise QPError.expected("gamma", gamma, "a discount factor in (0, 1]")
+    if hessian not in HESSIANS:
+        raise QPError.expected("hessian", repr(hessian), f"one of {', '.join(HESSIANS)}")
+    parts = (*COST, *CONSTRAINTS)
+    if isinstance(learn, str) or not set(learn) <= set(parts):
+        raise QPError.expected(
+            "learn", repr(learn), f"a collection of names among {', '.join(parts)}"
+        )
+    if hessian == "full" and "H_f" in learn:
+        raise QPError.expected(
+            "learn",
+            "'H_f' with hessian='full'",
+            "'H' alone",
+            "A full H contains the terminal block.",
+        )
+    if on_failure not in ON_FAILURE:
+        raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
+
+
+def as_tensor(name: str, value: Any) -> Tensor:
+    try:
+        tensor = torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise QPError.expected(
+            name, repr(value), "a tensor, or what torch.as_tensor takes"
+        ) from error
+    if tensor.isnan().any() or (tensor.isinf().any() and not name.endswith("bounds")):
+        raise QPError.expected(name, "NaN or inf", "finite entries")
+    return tensor
+
+
+def bound(name: str, bounds: tuple[Any, Any] | None, side: int, size: int) -> Tensor:
+    if bounds is None:
+        return torch.full((size,), (2 * side - 1) * torch.inf)
+    if len(bounds) != 2:
+        raise QPError.expected(name, f"{len(bounds)} entries", "the pair (lower, upper)")
+    given = as_tensor(name, bounds[side])
+    if tuple(given.shape) != (size,):
+        raise QPError.expected(name, f"shape {tuple(given.shape)}", f"shape ({size},) on each side")
+    return given
+
+
+def check_input(name: str, x: Tensor, size: int) -> Tensor:
+    if not isinstance(x, Tensor) or not x.is_floating_point():
+        got = x.dtype if isinstance(x, Tensor) else type(x).__name__
+        raise QPError.expected(
+            name,
+            got,
+            "a floating-point torch.Tensor",
+            f"Convert it: torch.as_tensor({name}).float().",
+        )
+    if x.ndim == 0 or x.shape[-1] != size:
+        raise QPError.expected(name, f"shape {tuple(x.shape)}", f"shape (*batch, {size})")
+    return x

@@ -1,0 +1,336 @@
+"""The QP as a differentiable function: `solve_qp`, and the envelope gradient of its value.
+
+The optimal value's gradient is the Lagrangian's at the solution (eq:gradq): no linear system is
+solved for it. With z, sigma, chi, upsilon, eta, xi as in `torch_qpmpc.qp`,
+
+    dV/dH = 1/2 z z'   dV/dq = z    dV/dc = 1         dV/dC = chi z'   dV/db = -chi
+    dV/dG = (eta - upsilon) z'      dV/dlb = upsilon  dV/dub = -eta    dV/dw = sigma
+    dV/d(fixed) = -xi
+
+A custom operator keeps the solver opaque to `torch.compile`, fake tensors and `vmap`; the
+autograd Function round it makes it differentiable under `torch.func` as well, which a custom
+operator alone is not.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.condense import FlatPrograms
+from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.qp import QPSolution, QuadraticProgram, Status
+from torch_qpmpc.solvers import backend
+from torch_qpmpc.solvers.chain import RawSolution, solve_programs
+
+ON_FAILURE = ("raise", "warn", "mask")
+#: Event dimensions of the operator's tensors: H, q, C, b, G, lb, ub, w, fixed, and a warm start.
+EVENT_NDIMS = (2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 1)
+N_THETA = 9
+#: value, z, sigma, chi, lam, xi, status, residual, iterations
+Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+def solve_qp(
+    qp: QuadraticProgram,
+    fixed: Tensor | None = None,
+    *,
+    solver: str = "proxqp",
+    on_failure: str = "raise",
+    warm_start: QPSolution | None = None,
+    keep: int | None = None,
+) -> QPSolution:
+    """Solve a batch of QPs (eq:qp2, eq:qp3); every answer is certified.
+
+    Args:
+        qp: the problems.
+        fixed: values of the first n_f entries of z, ``(*batch, n_f)``: s for V, (s, a) for Q.
+        solver: ``"proxqp"``, ``"daqp"`` or ``"qpsolvers:NAME"``. What its answer's certificate
+            rejects is solved again by the others.
+        on_failure: what an unsolved element does. ``"raise"`` a `SolverError`; ``"warn"`` and
+            ``"mask"`` give it ``value = inf`` and no gradient, with and without a warning.
+        warm_start: a solution of nearly the same QPs with the same shapes; saves time only.
+        keep: leading entries of z that condensing leaves alone, at least n_f. A V and a Q that
+            keep the same entries share one elimination of C z = b.
+
+    Returns:
+        The solution. ``value`` is differentiable in every tensor of ``qp`` and in ``fixed``.
+        Differentiating ``z``, or ``value`` twice, raises NotImplementedError.
+
+    Raises:
+        QPError: ``fixed`` does not fit, or an argument is unknown.
+        SolverError: with ``on_failure="raise"``, an element is infeasible, unbounded or not solved.
+
+    References:
+        Büskens and Maurer (2001), as cited at eq:gradq.
+    """
+    if fixed is None:
+        fixed = qp.q.new_zeros(0)
+    theta = _operands(qp, fixed)
+    start = (
+        (None, None) if warm_start is None else (warm_start.z, warm_start.eta - warm_start.upsilon)
+    )
+    raw = QPValue.apply(*theta, *start, _checked_keep(qp, fixed, keep), solver, on_failure)
+    value, z, sigma, chi, lam, xi, status, residual, iterations = raw
+    upsilon, eta = (-lam).clamp(min=0), lam.clamp(min=0)
+    return QPSolution(
+        value=value + qp.c,
+        z=SolutionGradient.apply(z, *theta),
+        sigma=sigma,
+        chi=chi,
+        upsilon=upsilon,
+        eta=eta,
+        mu=qp.w.detach() - upsilon - eta,
+        xi=xi,
+        status=status,
+        residual=residual,
+        iterations=iterations,
+    )
+
+
+def optimal_value(
+    qp: QuadraticProgram, fixed: Tensor, *, solver: str, on_failure: str, keep: int | None = None
+) -> Tensor:
+    """The optimal cost alone, ``(*batch,)``: `solve_qp` without the rest of the solution."""
+    keep = _checked_keep(qp, fixed, keep)
+    return QPValue.apply(*_operands(qp, fixed), None, None, keep, solver, on_failure)[0] + qp.c
+
+
+def _operands(qp: QuadraticProgram, fixed: Tensor) -> tuple[Tensor, ...]:
+    if not isinstance(fixed, Tensor) or not fixed.is_floating_point():
+        got = fixed.dtype if isinstance(fixed, Tensor) else type(fixed).__name__
+        raise QPError.expected("fixed", got, "a floating-point torch.Tensor", "Convert it first.")
+    if fixed.ndim == 0 or fixed.shape[-1] > qp.n_z:
+        raise QPError.expected(
+            "fixed",
+            f"shape {tuple(fixed.shape)}",
+            f"shape (*batch, n_f) with n_f <= n_z = {qp.n_z}",
+        )
+    try:
+        torch.broadcast_shapes(qp.batch_shape, fixed.shape[:-1])
+    except RuntimeError as error:
+        raise QPError.expected(
+            "fixed",
+            f"shape {tuple(fixed.shape)}",
+            f"leading dimensions that broadcast with the QP's batch {tuple(qp.batch_shape)}",
+        ) from error
+    return (qp.H, qp.q, qp.C, qp.b, qp.G, qp.lb, qp.ub, qp.w, fixed)
+
+
+def _checked_keep(qp: QuadraticProgram, fixed: Tensor, keep: int | None) -> int:
+    n_f = fixed.shape[-1]
+    if keep is None:
+        return n_f
+    if not n_f <= keep <= qp.n_z:
+        raise QPError.expected("keep", keep, f"n_f = {n_f} <= keep <= n_z = {qp.n_z}")
+    return keep
+
+
+@torch.library.custom_op("torch_qpmpc::solve", mutates_args=())
+def solve_op(
+    H: Tensor,
+    q: Tensor,
+    C: Tensor,
+    b: Tensor,
+    G: Tensor,
+    lb: Tensor,
+    ub: Tensor,
+    w: Tensor,
+    fixed: Tensor,
+    start_z: Tensor | None,
+    start_lam: Tensor | None,
+    keep: int,
+    solver: str,
+    on_failure: str,
+) -> Outputs:
+    """Solve on the CPU in float64, whatever comes in; failures are dealt with here."""
+    backend(solver)
+    if on_failure not in ON_FAILURE:
+        raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
+    programs, batch = FlatPrograms.of(H, q, C, b, G, lb, ub, w, fixed)
+    start = None
+    if start_z is not None and start_lam is not None:
+        start = (_flatten(start_z, batch), _flatten(start_lam, batch))
+    raw = solve_programs(programs, keep, solver, start)
+    if on_failure != "mask":
+        _report(raw, batch, on_failure)
+
+    def out(tensor: Tensor) -> Tensor:
+        shaped = tensor.reshape((*batch, *tensor.shape[1:]))
+        return shaped.to(q.device, q.dtype if tensor.is_floating_point() else tensor.dtype)
+
+    return (
+        out(raw.value),
+        out(raw.z),
+        out(raw.sigma),
+        out(raw.chi),
+        out(raw.lam),
+        out(raw.xi),
+        out(raw.status),
+        out(raw.residual),
+        out(raw.iterations),
+    )
+
+
+def _flatten(tensor: Tensor, batch: torch.Size) -> Tensor:
+    n = tensor.shape[-1]
+    return tensor.detach().to("cpu", torch.float64).expand(*batch, n).reshape(-1, n)
+
+
+def _report(raw: RawSolution, batch: torch.Size, on_failure: str) -> None:
+    failed = (raw.status != Status.SOLVED).nonzero().squeeze(-1)
+    if not len(failed):
+        return
+    reasons = []
+    for status in Status:
+        where = (raw.status == status).nonzero().squeeze(-1)
+        if status != Status.SOLVED and len(where):
+            first = torch.unravel_index(where[0], batch) if batch else ()
+            at = f", first at batch index {tuple(int(i) for i in first)}" if batch else ""
+            reasons.append(f"{len(where)} {status.name}{at}: {status.explanation}")
+    message = f"{len(failed)} of {len(raw.status)} QPs have no certified solution. " + ". ".join(
+        reasons
+    )
+    if on_failure == "raise":
+        if (raw.status[failed] == Status.INVALID_DATA).all():
+            raise QPError(message)
+        raise SolverError(message)
+    warnings.warn(message, RuntimeWarning, stacklevel=2)
+
+
+@solve_op.register_fake
+def _(H, q, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure):
+    operands = (H, q, C, b, G, lb, ub, w, fixed)
+    batch = torch.broadcast_shapes(
+        *(t.shape[: t.ndim - n] for t, n in zip(operands, EVENT_NDIMS, strict=False))
+    )
+
+    def count() -> Tensor:
+        return q.new_empty(batch, dtype=torch.int64)
+
+    n_z, n_c, n_g, n_f = q.shape[-1], b.shape[-1], lb.shape[-1], fixed.shape[-1]
+    vectors = [q.new_empty((*batch, n)) for n in (n_z, n_g, n_c, n_g, n_f)]
+    return (q.new_empty(batch), *vectors, count(), q.new_empty(batch), count())
+
+
+def _batched(in_dims: tuple, args: tuple) -> list:
+    """Move the vmapped dimension of each tensor to the front, and align the batch ranks."""
+    ranks = []
+    for tensor, dim, n in zip(args, in_dims, EVENT_NDIMS, strict=False):
+        if tensor is not None:
+            ranks.append(tensor.ndim - n - (dim is not None))
+    out = list(args)
+    for i, (tensor, dim, n) in enumerate(zip(args, in_dims, EVENT_NDIMS, strict=False)):
+        if tensor is not None and dim is not None:
+            moved = tensor.movedim(dim, 0)
+            missing = max(ranks) - (moved.ndim - 1 - n)
+            out[i] = moved.reshape(moved.shape[0], *(1,) * missing, *moved.shape[1:])
+    return out
+
+
+@solve_op.register_vmap
+def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
+    return solve_op(*_batched(in_dims, args)), (0,) * 9
+
+
+def _setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
+    value, z, sigma, chi, lam, xi, status, residual, iterations = output
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(*inputs[:N_THETA], z, sigma, chi, lam, xi, status)
+
+
+def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
+    if grad_value is None:
+        return (None,) * (N_THETA + 5)
+    *theta, z, sigma, chi, lam, xi, status = ctx.saved_tensors
+    if torch.is_grad_enabled() and not torch.compiler.is_compiling():
+        # A second derivative needs the solution's own: let it say so instead of being zero.
+        z, sigma, chi, lam, xi = (
+            SolutionGradient.apply(t, *theta) for t in (z, sigma, chi, lam, xi)
+        )
+    # An unsolved element has zeros here, but zero times an infinite incoming gradient is NaN.
+    weight = torch.where(status.eq(int(Status.SOLVED)), grad_value, 0).unsqueeze(-1)
+    gradients = {
+        0: lambda like: _outer(0.5 * weight * z, z, like),
+        1: lambda like: _sum_to(weight * z, like),
+        2: lambda like: _outer(weight * chi, z, like),
+        3: lambda like: _sum_to(-weight * chi, like),
+        4: lambda like: _outer(weight * lam, z, like),
+        5: lambda like: _sum_to(weight * (-lam).clamp(min=0), like),
+        6: lambda like: _sum_to(-weight * lam.clamp(min=0), like),
+        7: lambda like: _sum_to(weight * sigma, like),
+        8: lambda like: _sum_to(-weight * xi, like),
+    }
+    needed = ctx.needs_input_grad
+    return (
+        *(gradients[i](theta[i]) if needed[i] else None for i in range(N_THETA)),
+        *(None,) * 5,
+    )
+
+
+def _sum_to(tensor: Tensor, like: Tensor) -> Tensor:
+    """Undo broadcasting: sum a batched gradient to the shape of the operand it belongs to."""
+    return tensor.sum_to_size(like.shape)
+
+
+def _outer(left: Tensor, right: Tensor, like: Tensor) -> Tensor:
+    """The outer products ``left right'`` summed over the batch dimensions that ``like`` lacks."""
+    if like.ndim == 2:
+        return left.reshape(-1, left.shape[-1]).mT @ right.reshape(-1, right.shape[-1])
+    return _sum_to(left.unsqueeze(-1) * right.unsqueeze(-2), like)
+
+
+solve_op.register_autograd(_backward, setup_context=_setup_context)
+
+
+class QPValue(torch.autograd.Function):
+    """`solve_op` with the envelope gradient of its first output, the optimal value (eq:gradq)."""
+
+    # Dynamo counts the parameters to tell this style of Function: no *args here.
+    @staticmethod
+    def forward(
+        H, q, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure
+    ) -> Outputs:
+        return solve_op(
+            H, q, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure
+        )
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
+        ctx.mark_non_differentiable(*output[1:])
+        _setup_context(ctx, inputs, output)
+
+    backward = staticmethod(_backward)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
+        return QPValue.apply(*_batched(in_dims, args)), (0,) * 9
+
+
+class SolutionGradient(torch.autograd.Function):
+    """Ties a part of the solution to the data it depends on.
+
+    The derivative by the KKT system belongs here. Until it is there, asking for it is an error
+    rather than a silent zero.
+    """
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(part, H, q, C, b, G, lb, ub, w, fixed) -> Tensor:
+        return part.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple:
+        raise NotImplementedError(
+            "the gradient of the solution z (and the second derivative of the value) is not "
+            "implemented; only the value can be differentiated, once. Detach z, or differentiate "
+            "the value instead."
+        )

@@ -1,0 +1,54 @@
+"""The banded constraint matrix of a linear MPC scheme (eq:cband), and where its band is.
+
+Rows are grouped in N blocks of n_x, columns in the order of z = [x_0, u_0, x_1, .., x_N]. In row
+block k the band is (x_k, u_k, x_{k+1}); what is right of it is above the band, what is left below.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.errors import QPError
+
+
+def banded_matrix(A: Tensor, B: Tensor, horizon: int) -> Tensor:
+    """C_0 of the model x+ = A x + B u, so that ``C_0 z = 0`` is the model over the horizon.
+
+    Args:
+        A: ``(n_x, n_x)``, or ``(N, n_x, n_x)`` for one per stage.
+        B: ``(n_x, n_u)``, or ``(N, n_x, n_u)``.
+        horizon: N.
+
+    Returns:
+        ``(N n_x, N (n_x + n_u) + n_x)``.
+
+    Raises:
+        QPError: A and B do not fit each other or the horizon.
+    """
+    n_x, n_u = A.shape[-1], B.shape[-1]
+    for name, matrix, shape in (("A", A, (n_x, n_x)), ("B", B, (n_x, n_u))):
+        if tuple(matrix.shape) not in (shape, (horizon, *shape)):
+            got = f"shape {tuple(matrix.shape)}"
+            raise QPError.expected(name, got, f"shape {shape} or {(horizon, *shape)}")
+    A, B = A.expand(horizon, n_x, n_x), B.expand(horizon, n_x, n_u)
+    C = A.new_zeros(horizon * n_x, horizon * (n_x + n_u) + n_x)
+    minus_identity = -torch.eye(n_x).to(C)
+    for k in range(horizon):
+        column = k * (n_x + n_u)
+        block = torch.cat((A[k], B[k], minus_identity), dim=1)
+        C[k * n_x : (k + 1) * n_x, column : column + block.shape[1]] = block
+    return C
+
+
+def band_distance(n_x: int, n_u: int, horizon: int) -> Tensor:
+    """Signed distance from the band in stages, ``(N n_x, n_z)``: 0 on it, positive above it."""
+    row = torch.arange(horizon).repeat_interleave(n_x).unsqueeze(1)
+    n_z = horizon * (n_x + n_u) + n_x
+    column = torch.arange(n_z)
+    stage = column // (n_x + n_u)
+    is_state = column % (n_x + n_u) < n_x
+    # x_{k+1} is on the band of row block k, u_{k+1} the first block above it.
+    above = (stage - row - is_state.long()).clamp(min=0)
+    below = (row - stage).clamp(min=0)
+    return above - below

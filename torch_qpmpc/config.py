@@ -1,0 +1,132 @@
+"""What a run's configuration may hold: each key, and a sentence for what it must be."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from torch_qpmpc.arguments import CONSTRAINTS, COST, HESSIANS
+from torch_qpmpc.envs.point_mass import NOISE_STD
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.solvers import backend
+
+Rule = tuple[Callable[[Any], bool], str]
+
+
+def _number(x: Any) -> bool:
+    return isinstance(x, int | float) and not isinstance(x, bool) and not math.isnan(x)
+
+
+def _whole(least: int) -> Rule:
+    return (
+        lambda x: isinstance(x, int) and not isinstance(x, bool) and x >= least,
+        f"a whole number >= {least}",
+    )
+
+
+def _one_of(*names: str) -> Rule:
+    return lambda x: x in names, f"one of {', '.join(names)}"
+
+
+def _subset(names: tuple[str, ...]) -> Rule:
+    return lambda x: isinstance(x, list) and set(x) <= set(names), f"a list of {', '.join(names)}"
+
+
+POSITIVE: Rule = lambda x: _number(x) and 0 < x < math.inf, "a finite number > 0"
+NON_NEGATIVE: Rule = lambda x: _number(x) and 0 <= x < math.inf, "a finite number >= 0"
+WEIGHT: Rule = lambda x: _number(x) and x >= 0, "a number >= 0, or .inf for hard rows"
+FRACTION: Rule = lambda x: _number(x) and 0 < x <= 1, "a number in (0, 1]"
+FLAG: Rule = lambda x: isinstance(x, bool), "true or false"
+NAME: Rule = lambda x: isinstance(x, str), "a name"
+
+RULES: dict[str, Rule] = {
+    "seed": _whole(0),
+    "solver": NAME,
+    "updates": _whole(1),
+    "batch_size": _whole(1),
+    "num_envs": _whole(1),
+    "steps_per_update": _whole(1),
+    "warmup_steps": _whole(1),
+    "replay_capacity": _whole(1),
+    "exploration_std": NON_NEGATIVE,
+    "td_error_clip": (lambda x: x is None or POSITIVE[0](x), "a finite number > 0, or null"),
+    "delay_value": FLAG,
+    "target_rate": FRACTION,
+    "penalty_step": _one_of("proximal", "subgradient"),
+    "eval_interval": _whole(1),
+    "log_interval": _whole(1),
+    "task.name": _one_of("point_mass"),
+    "task.horizon": _whole(1),
+    "task.gamma": FRACTION,
+    "task.episode_steps": _whole(1),
+    "task.hessian": _one_of(*HESSIANS),
+    "task.learn_cost": _subset(COST),
+    "task.state_slack": WEIGHT,
+    "task.action_slack": WEIGHT,
+    "task.discount_slack": FLAG,
+    "noise.name": _one_of(*NOISE_STD),
+    "noise.std": NON_NEGATIVE,
+    "constraint.name": NAME,
+    "constraint.learn": _subset(CONSTRAINTS),
+    "constraint.deviation.c_1": NON_NEGATIVE,
+    "constraint.deviation.c_2": NON_NEGATIVE,
+    "constraint.deviation.c_3": NON_NEGATIVE,
+    "constraint.deviation.growth": NON_NEGATIVE,
+    "constraint.si.beta": NON_NEGATIVE,
+    "constraint.si.windows": _whole(1),
+    "constraint.si.normalised": FLAG,
+    "optimizer.name": _one_of("adam", "sgd"),
+    "optimizer.lr_cost": NON_NEGATIVE,
+    "optimizer.lr_constraints": NON_NEGATIVE,
+    "optimizer.final_fraction": FRACTION,
+}
+#: A penalty that is null is off.
+OPTIONAL = ("constraint.deviation", "constraint.si")
+
+
+def check_config(cfg: DictConfig) -> None:
+    """Raise `QPError` on the first unknown or missing key or impossible value of ``cfg``."""
+    given = flatten(OmegaConf.to_container(cfg, resolve=True))
+    off = [name for name in OPTIONAL if name in given and given.pop(name) is None]
+    for key, value in given.items():
+        if key not in RULES:
+            close = difflib.get_close_matches(key, RULES, n=1)
+            hint = f"Did you mean {close[0]}?" if close else "See configs/config.yaml."
+            raise QPError.expected(key, "an unknown key", "a key of configs/", hint)
+        accepts, expected = RULES[key]
+        if not accepts(value):
+            raise QPError.expected(key, repr(value), expected)
+    for key in RULES:
+        if key not in given and not any(key.startswith(f"{name}.") for name in off):
+            raise QPError.expected(key, "nothing", RULES[key][1])
+    backend(cfg.solver)
+    if cfg.constraint.deviation is not None or cfg.constraint.si is not None:
+        if "C" not in cfg.constraint.learn:
+            raise QPError.expected(
+                "constraint.learn",
+                str(list(cfg.constraint.learn)),
+                "C among them, as a penalty on C is on",
+                "Set the penalty to null, or learn C.",
+            )
+    if cfg.constraint.si is not None and cfg.task.episode_steps < cfg.task.horizon:
+        raise QPError.expected(
+            "task.episode_steps",
+            cfg.task.episode_steps,
+            f"at least task.horizon = {cfg.task.horizon}",
+        )
+    if cfg.replay_capacity % cfg.num_envs:
+        raise QPError.expected(
+            "replay_capacity", cfg.replay_capacity, f"a multiple of num_envs = {cfg.num_envs}"
+        )
+
+
+def flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one, with dotted keys."""
+    if not isinstance(tree, Mapping):
+        return {prefix: tree}
+    pairs = (flatten(value, f"{prefix}.{key}".lstrip(".")) for key, value in tree.items())
+    return {key: value for pair in pairs for key, value in pair.items()}

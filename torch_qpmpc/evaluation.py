@@ -1,0 +1,98 @@
+"""Closed-loop evaluation: the same starts and the same noise for everyone, and the closed gap."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_qpmpc.envs.point_mass import PointMass
+from torch_qpmpc.errors import QPError
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """Trajectories of one policy, in float64, and its cumulative cost J.
+
+    Attributes:
+        states: ``(steps + 1, starts, n_x)``.
+        actions: ``(steps, starts, n_u)``, as applied: clipped to their bounds.
+        costs: ``(steps, starts)``, L(s_k, a_k).
+        gamma: the discount factor of ``J_discounted``.
+    """
+
+    states: Tensor
+    actions: Tensor
+    costs: Tensor
+    gamma: float
+
+    @property
+    def J(self) -> float:
+        """Mean over the starts of the sum of costs."""
+        return self.costs.sum(0).mean().item()
+
+    @property
+    def J_discounted(self) -> float:
+        """Mean over the starts of the sum of gamma^k L(s_k, a_k)."""
+        weights = self.gamma ** torch.arange(len(self.costs)).to(self.costs)
+        return (weights @ self.costs).mean().item()
+
+
+@torch.no_grad()
+def closed_loop(
+    policy: Callable[[Tensor], Tensor],
+    physics: PointMass,
+    *,
+    steps: int = 50,
+    starts: int = 32,
+    seed: int = 123,
+    gamma: float = 0.9,
+) -> ClosedLoop:
+    """Run ``policy`` from ``starts`` fixed starts side by side, without gradients.
+
+    One seed is one experiment: ``numpy.random.default_rng(seed)`` draws the positions, the
+    velocities, then a standard normal ``(starts, n_x)`` each step.
+
+    Args:
+        policy: from states ``(starts, n_x)`` in float64 to actions ``(starts, n_u)``.
+        physics: the true system, its noise and its start distribution.
+        steps, starts, seed: of the experiment.
+        gamma: the discount factor of ``J_discounted``.
+
+    Raises:
+        QPError: ``policy`` returns another shape.
+    """
+    rng = np.random.default_rng(seed)
+    s = physics.starts(rng, starts)
+    nu = torch.zeros_like(s)
+    expected = (starts, physics.B.shape[1])
+    states, actions, costs = [s], [], []
+    for _ in range(steps):
+        a = policy(s)
+        if a.shape != expected:
+            # A (starts,) or (n_u,) result would broadcast without a sound.
+            remedy = "Map a batch of states to a batch of actions."
+            raise QPError.expected("policy(s)", f"shape {tuple(a.shape)}", str(expected), remedy)
+        a = a.to(s).clamp(physics.lb_a, physics.ub_a)
+        costs.append(physics.cost(s, a))
+        nu = physics.noise(nu, torch.as_tensor(rng.normal(size=tuple(s.shape))))
+        s = physics.step(s, a, nu)
+        states.append(s)
+        actions.append(a)
+    return ClosedLoop(torch.stack(states), torch.stack(actions), torch.stack(costs), gamma)
+
+
+def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:
+    """The share of the way from the start to the true-model MPC that learning went.
+
+    (J_start - J_final) / (J_start - J_true_model): 0 is no gain, 1 is as good as knowing the model.
+
+    Returns:
+        nan where the start is no worse than the true model (or a J is nan): no gap to close.
+    """
+    gap = J_start - J_true_model
+    return (J_start - J_final) / gap if gap > 0 else math.nan

@@ -1,0 +1,222 @@
+"""Q-learning for a QP (eq:thup) as a TorchRL loss module."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import _GAMMA_LMBDA_DEPREC_ERROR, dispatch_value_estimator
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.operators import QPActorValueOperator
+
+
+def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Tensor:
+    """The loss of one TD error delta = target - prediction, elementwise, ``(*batch,)``.
+
+    ``1/2 delta^2``, whose gradient step with rate alpha is the paper's update alpha delta grad Q
+    (eq:thup). With ``clip`` the delta in the update is clipped to plus or minus that (Huber's loss).
+    """
+    if clip is None:
+        return 0.5 * (target - prediction).square()
+    return F.huber_loss(prediction, target, reduction="none", delta=clip)
+
+
+class QPQLearningLoss(LossModule):
+    """Semi-gradient Q-learning, delta = L + gamma (1 - terminated) V(s+) - Q(s, a) (eq:thup).
+
+    V and Q are the same QP with and without u_0 fixed, so V(s+) is exactly min over a of Q(s+, a).
+    In TorchRL's signs, reward = -L. Truncation bootstraps, termination does not. Samples whose QP
+    has no certified solution (``on_failure="mask"`` in the QPMPC) add nothing to loss or gradient
+    and are counted in ``unsolved``.
+
+    Args:
+        value_network: the critic, whose parameters are learned.
+        delay_value: evaluate V(s+) with a target network. Off, as in the paper: a transition is
+            evaluated at today's theta.
+        td_error_clip: bound of the TD error in the update; none by default.
+        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        use_prioritized_weights: weight the samples by ``priority_weight`` where a buffer gives it.
+
+    The discount factor is set as everywhere in TorchRL, by ``make_value_estimator(gamma=0.9)``.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> from tensordict import TensorDict
+        >>> loss = qm.QPQLearningLoss(qm.QPActorValueOperator(qm.QPMPC(2, 1, 5)))
+        >>> loss.make_value_estimator(gamma=0.9)
+        >>> step = dict(
+        ...     observation=torch.ones(3, 2),
+        ...     reward=-torch.ones(3, 1),
+        ...     done=torch.zeros(3, 1).bool(),
+        ...     terminated=torch.zeros(3, 1).bool(),
+        ... )
+        >>> batch = TensorDict(
+        ...     observation=torch.zeros(3, 2),
+        ...     action=torch.zeros(3, 1),
+        ...     next=TensorDict(step, 3),
+        ...     batch_size=3,
+        ... )
+        >>> loss(batch)["loss_value"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can rename; defaults as in TorchRL's other losses."""
+
+        advantage: NestedKey = "advantage"
+        value_target: NestedKey = "value_target"
+        value: NestedKey = "state_value"
+        state_action_value: NestedKey = "state_action_value"
+        action: NestedKey = "action"
+        priority: NestedKey = "td_error"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        priority_weight: NestedKey = "priority_weight"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    SUPPORTED_VALUE_ESTIMATORS = (
+        ValueEstimators.TD0,
+        ValueEstimators.TD1,
+        ValueEstimators.TDLambda,
+    )
+    out_keys = [  # noqa: RUF012 - TorchRL's convention
+        "loss_value",
+        "td_error",
+        "pred_value",
+        "target_value",
+        "pred_value_max",
+        "target_value_max",
+        "unsolved",
+    ]
+
+    value_network: QPActorValueOperator
+    value_network_params: TensorDictParams
+    target_value_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        value_network: QPActorValueOperator,
+        *,
+        delay_value: bool = False,
+        td_error_clip: float | None = None,
+        gamma: float | None = None,
+        reduction: str | None = None,
+        use_prioritized_weights: str | bool = "auto",
+    ) -> None:
+        self._in_keys = None
+        super().__init__()
+        if gamma is not None:
+            raise TypeError(_GAMMA_LMBDA_DEPREC_ERROR)
+        if not isinstance(value_network, QPActorValueOperator):
+            raise QPError.expected(
+                "value_network",
+                type(value_network).__name__,
+                "a QPActorValueOperator",
+                "Wrap the QPMPC: QPActorValueOperator(mpc).",
+            )
+        if td_error_clip is not None and not td_error_clip > 0:
+            raise QPError.expected("td_error_clip", td_error_clip, "a positive number or None")
+        if reduction not in (None, "mean", "sum", "none"):
+            raise QPError.expected("reduction", repr(reduction), "'mean', 'sum' or 'none'")
+        self.delay_value = delay_value
+        self.td_error_clip = td_error_clip
+        self.reduction = reduction or "mean"
+        self.use_prioritized_weights = use_prioritized_weights
+        self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
+        # Outside the module's registry, as its parameters are the value network's.
+        self.__dict__["state_value_network"] = self.value_network.get_value_operator()
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(**self._estimator_keys())
+        self._set_in_keys()
+
+    def _estimator_keys(self) -> dict[str, NestedKey]:
+        names = ("advantage", "value_target", "value", "reward", "done", "terminated")
+        return {name: getattr(self.tensor_keys, name) for name in names}
+
+    def _set_in_keys(self) -> None:
+        observation = self.state_value_network.in_keys
+        steps = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
+        keys = {
+            *self.value_network.in_keys,
+            *(unravel_key(("next", key)) for key in (*steps, *observation)),
+        }
+        if self.use_prioritized_weights is True:
+            keys.add(unravel_key(self.tensor_keys.priority_weight))
+        self._in_keys = sorted(keys, key=str)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        if self._in_keys is None:
+            self._set_in_keys()
+        return self._in_keys  # pyright: ignore[reportReturnType]
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | str | None = None, **hyperparams: Any
+    ) -> Any:
+        """Choose how V(s+) enters the target: TD0 (default), TD1 or TDLambda; ``gamma``, ``lmbda``."""
+        value_type, hp = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if value_type is None:
+            return self
+        dispatch_value_estimator(
+            self,
+            value_type,
+            supported=self.SUPPORTED_VALUE_ESTIMATORS,
+            tensor_keys=self._estimator_keys(),
+            value_network=self.state_value_network,
+            **hp,
+        )
+        return None
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The loss of a batch of transitions, and detached scalars that describe it."""
+        loss_value, metadata = self.loss_value(tensordict)
+        out = TensorDict({"loss_value": loss_value, **metadata}, batch_size=[])
+        self._clear_weakrefs(tensordict, out, "value_network_params", "target_value_network_params")
+        return out
+
+    def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """`forward` with the loss apart; writes the squared TD error under the priority key."""
+        weights = self._maybe_get_priority_weight(tensordict)
+        visited = tensordict.select(*self.value_network.in_keys, strict=False).detach()
+        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
+            self.value_network(visited)
+        prediction = visited.get(self.tensor_keys.state_action_value).squeeze(-1)
+        with torch.no_grad():
+            target = self.value_estimator.value_estimate(
+                tensordict.copy(), target_params=self.target_value_network_params
+            ).squeeze(-1)
+
+        # An unsolved QP's cost is infinite.
+        solved = prediction.isfinite() & target.isfinite()
+        prediction = torch.where(solved, prediction, 0)
+        target = torch.where(solved, target, 0)
+        delta = (target - prediction).detach()
+        tensordict.set(self.tensor_keys.priority, delta.square(), inplace=True)
+        metadata = {
+            "td_error": delta.abs().mean(),
+            "pred_value": prediction.detach().mean(),
+            "target_value": target.mean(),
+            "pred_value_max": prediction.detach().max(),
+            "target_value_max": target.max(),
+            "unsolved": (~solved).sum(),
+        }
+        loss = td_loss(prediction, target, self.td_error_clip)
+        return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata

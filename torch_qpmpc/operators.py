@@ -1,0 +1,92 @@
+"""TensorDict modules over a QPMPC: the QP as critic, value and actor of a TorchRL script.
+
+Here, and only here, costs become rewards: TorchRL maximises, so state_value = -V(s) and
+state_action_value = -Q(s, a), both with the trailing dimension of one that TorchRL wants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+
+from torch_qpmpc.mpc import QPMPC
+
+
+class _QPOperator(TensorDictModuleBase):
+    """A view of a QPMPC. Every view holds it as ``module``, so that the parameters of one, such as
+    a target network's, can drive any other."""
+
+    module: QPMPC
+
+    def __init__(self, mpc: QPMPC, in_keys: Sequence[NestedKey], out_key: NestedKey) -> None:
+        super().__init__()
+        self.module = mpc
+        self.in_keys = list(in_keys)
+        self.out_keys = [out_key]
+
+
+class QPPolicyOperator(_QPOperator):
+    """pi(s): observation ``(*batch, n_x)`` to action ``(*batch, n_u)``."""
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set(self.out_keys[0], self.module.policy(tensordict.get(self.in_keys[0])))
+
+
+class QPValueOperator(_QPOperator):
+    """-V(s): observation ``(*batch, n_x)`` to state_value ``(*batch, 1)``."""
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        value = self.module.value(tensordict.get(self.in_keys[0]))
+        return tensordict.set(self.out_keys[0], -value.unsqueeze(-1))
+
+
+class QPActorValueOperator(_QPOperator):
+    """-Q(s, a), and the views that share its parameters.
+
+    Args:
+        mpc: the QPMPC.
+        observation_key, action_key: what it reads.
+        state_value_key, state_action_value_key: what the value and the critic write.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> from tensordict import TensorDict
+        >>> operator = qm.QPActorValueOperator(qm.QPMPC(2, 1, 5))
+        >>> td = TensorDict(observation=torch.zeros(3, 2), action=torch.zeros(3, 1), batch_size=3)
+        >>> operator(td)["state_action_value"].shape
+        torch.Size([3, 1])
+    """
+
+    def __init__(
+        self,
+        mpc: QPMPC,
+        *,
+        observation_key: NestedKey = "observation",
+        action_key: NestedKey = "action",
+        state_value_key: NestedKey = "state_value",
+        state_action_value_key: NestedKey = "state_action_value",
+    ) -> None:
+        super().__init__(mpc, [observation_key, action_key], state_action_value_key)
+        self.state_value_key = state_value_key
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        s, a = (tensordict.get(key) for key in self.in_keys)
+        return tensordict.set(self.out_keys[0], -self.module.action_value(s, a).unsqueeze(-1))
+
+    def get_policy_operator(self) -> QPPolicyOperator:
+        """The actor: observation to action."""
+        return QPPolicyOperator(self.module, self.in_keys[:1], self.in_keys[1])
+
+    def get_value_operator(self) -> QPValueOperator:
+        """The state value: observation to state_value."""
+        return QPValueOperator(self.module, self.in_keys[:1], self.state_value_key)
+
+    def get_critic_operator(self) -> QPActorValueOperator:
+        """The critic: (observation, action) to state_action_value, this operator itself."""
+        return self

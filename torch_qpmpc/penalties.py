@@ -1,0 +1,146 @@
+"""The two penalties that pull C towards an MPC scheme's: deviation and system identification.
+
+Each is a pure function of C, and a thin module that holds its constants. Both are differentiable
+regularisers to add to the Q-learning loss; the deviation penalty also has its exact proximal step.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torch_qpmpc.banded import band_distance
+from torch_qpmpc.errors import QPError
+
+
+def deviation_penalty(C: Tensor, C_0: Tensor, C_mask: Tensor) -> Tensor:
+    """``sum |C_mask * (C - C_0)|`` (eq:sdp2): C, C_0, C_mask ``(n_c, n_z)`` to a scalar."""
+    return (C_mask * (C - C_0)).abs().sum()
+
+
+def system_identification_penalty(
+    C: Tensor, windows: Tensor, *, normalised: bool = False
+) -> Tensor:
+    """``sum_i ||C tau_i||^2`` (eq:sdp3).
+
+    C has a gauge: T C with any invertible T is the same QP, so the penalty can be made small by
+    shrinking C. With ``normalised`` the rows of C are scaled to unit norm first.
+
+    Args:
+        C: ``(n_c, n_z)``.
+        windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}], ``(M, n_z)``.
+        normalised: whether to scale the rows of C to unit norm.
+
+    Returns:
+        A scalar.
+    """
+    if windows.ndim != 2 or windows.shape[-1] != C.shape[-1]:
+        raise QPError.expected(
+            "windows",
+            f"shape {tuple(windows.shape)}",
+            f"shape (M, n_z) with n_z = {C.shape[-1]}",
+            "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}.",
+        )
+    if normalised:
+        C = C / torch.linalg.vector_norm(C, dim=-1, keepdim=True)
+    return (windows.to(C.dtype) @ C.mT).square().sum()
+
+
+class DeviationPenalty(nn.Module):
+    """The deviation penalty ``sum |C_mask * (C - C_0)|`` (eq:sdp2).
+
+    (1, 1, 1) holds C at C_0, (0, 0, 0) frees it. With c_3 = 0 everything below the band is free:
+    the prediction stays causal, but need not be Markovian.
+
+    Args:
+        C_0: the banded matrix, ``(N n_x, N (n_x + n_u) + n_x)``.
+        n_x: number of states.
+        n_u: number of actions.
+        c_1: weight above the band, where the future would act on the past.
+        c_2: weight on the band.
+        c_3: weight below the band.
+        growth: how much the weights off the band grow with each further stage of distance,
+            ``c (1 + growth (distance - 1))``.
+
+    Raises:
+        QPError: a negative weight, or a C_0 whose shape is no horizon's.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> mpc = qm.QPMPC.from_model(torch.eye(1), torch.eye(1), 3)
+        >>> penalty = qm.DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u)
+        >>> penalty(mpc.C).item()
+        0.0
+    """
+
+    C_0: Tensor
+    C_mask: Tensor
+
+    def __init__(
+        self,
+        C_0: Tensor,
+        n_x: int,
+        n_u: int,
+        *,
+        c_1: float = 1.0,
+        c_2: float = 1e-4,
+        c_3: float = 0.0,
+        growth: float = 0.0,
+    ) -> None:
+        super().__init__()
+        weights = {"c_1": c_1, "c_2": c_2, "c_3": c_3, "growth": growth}
+        for name, weight in weights.items():
+            if not 0 <= weight < torch.inf:
+                raise QPError.expected(name, weight, "a finite weight >= 0")
+        horizon = C_0.shape[0] // n_x
+        distance = band_distance(n_x, n_u, horizon)
+        if distance.shape != C_0.shape:
+            raise QPError.expected(
+                "C_0",
+                f"shape {tuple(C_0.shape)}",
+                f"shape {tuple(distance.shape)} for N = {horizon}",
+            )
+        mask = torch.where(distance > 0, c_1, torch.where(distance < 0, c_3, c_2))
+        mask = mask * (1 + growth * (distance.abs() - 1).clamp(min=0))
+        self.register_buffer("C_0", C_0.detach().clone())
+        self.register_buffer("C_mask", mask.to(C_0))
+
+    def forward(self, C: Tensor) -> Tensor:
+        """The penalty of C ``(N n_x, n_z)``, a scalar."""
+        return deviation_penalty(C, self.C_0, self.C_mask)
+
+    @torch.no_grad()
+    def proximal_step_(self, C: Tensor, scale: float = 1.0) -> None:
+        """Soft-threshold C towards C_0, in place: the minimiser of eq:sdp2 in Delta theta.
+
+        After a gradient step to C it solves ``min_X 1/2 |X - C|^2 + scale |C_mask * (X - C_0)|``.
+        Unlike the subgradient it reaches C_0 exactly.
+
+        Args:
+            C: the parameter.
+            scale: weight of the penalty against the step; 1 is the paper's program.
+        """
+        excess = C - self.C_0
+        C.copy_(self.C_0 + excess.sign() * (excess.abs() - scale * self.C_mask).clamp(min=0))
+
+
+class SystemIdentificationPenalty(nn.Module):
+    """The system-identification (SI) penalty ``beta sum_i ||C tau_i||^2`` (eq:sdp3).
+
+    Args:
+        beta: its weight.
+        normalised: scale the rows of C to unit norm, against the gauge freedom of C.
+
+    Raises:
+        QPError: a negative beta.
+    """
+
+    def __init__(self, beta: float = 1e-6, *, normalised: bool = False) -> None:
+        super().__init__()
+        if not 0 <= beta < torch.inf:
+            raise QPError.expected("beta", beta, "a finite weight >= 0")
+        self.beta, self.normalised = beta, normalised
+
+    def forward(self, C: Tensor, windows: Tensor) -> Tensor:
+        """The penalty of C ``(n_c, n_z)`` on windows ``(M, n_z)``, a scalar."""
+        return self.beta * system_identification_penalty(C, windows, normalised=self.normalised)

@@ -1,0 +1,110 @@
+"""Figures of a run: the constraint matrix, closed-loop and predicted trajectories, learning."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.colors import SymLogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+from torch import Tensor
+
+from torch_qpmpc.evaluation import ClosedLoop
+from torch_qpmpc.mpc import QPMPC
+
+COLOURS = {"start": "tab:red", "learned": "tab:blue", "true model": "tab:green"}
+
+
+def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
+    """A heatmap of a constraint matrix, symmetric and logarithmic beyond 0.01, with stage lines."""
+    image = axes.imshow(
+        C.detach().cpu().numpy(),
+        cmap="RdBu_r",
+        norm=SymLogNorm(linthresh=1e-2, vmin=-1, vmax=1),
+        interpolation="nearest",
+    )
+    n = mpc.n_x + mpc.n_u
+    for k in range(1, mpc.horizon):
+        axes.axhline(k * mpc.n_x - 0.5, color="0.85", linewidth=0.4)
+    for k in range(1, mpc.horizon + 1):
+        axes.axvline(k * n - 0.5, color="0.85", linewidth=0.4)
+    axes.set_title(title)
+    stages = range(0, mpc.horizon + 1, max(1, mpc.horizon // 5))
+    axes.set_xticks([k * n for k in stages], [f"$x_{{{k}}}$" for k in stages])
+    rows = [k for k in stages if k < mpc.horizon]
+    axes.set_yticks([k * mpc.n_x for k in rows], [f"$k={k}$" for k in rows])
+    axes.figure.colorbar(image, ax=axes, shrink=0.7, ticks=[-1, -0.1, -0.01, 0, 0.01, 0.1, 1])
+
+
+def constraint_figure(mpc: QPMPC) -> Figure:
+    """C beside C_0 and their difference, raw as in the paper's figures."""
+    figure = Figure(figsize=(15, 4), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    draw_matrix(left, mpc.C_0, mpc, "$C_0$, the start")
+    draw_matrix(middle, mpc.C, mpc, r"$C_\theta$, learned")
+    draw_matrix(right, mpc.C - mpc.C_0, mpc, r"$C_\theta - C_0$")
+    return figure
+
+
+def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, shown: int = 6) -> None:
+    """Closed-loop paths in the plane from a few starts, and the learned QP's first predictions."""
+    for name, loop in loops.items():
+        paths = loop.states[:, :shown]
+        colour = COLOURS.get(name)
+        axes.plot(paths[..., 0], paths[..., 1], color=colour, linewidth=1)
+        axes.plot([], [], color=colour, label=f"{name}, J = {loop.J:.0f}")
+    starts = next(iter(loops.values())).states[0, :shown]
+    with torch.no_grad():
+        predicted, _ = mpc.predicted(mpc.solve(starts).z)
+    axes.plot(predicted[..., 0].mT, predicted[..., 1].mT, "k:", linewidth=1)
+    axes.plot([], [], "k:", label="predicted at the start")
+    axes.plot(starts[:, 0], starts[:, 1], "ko", markersize=3)
+    axes.plot(0, 0, "k+", markersize=9)
+    axes.set(xlabel="x", ylabel="y", title="Closed loop")
+    axes.legend(fontsize="small", loc="upper right")
+
+
+def draw_states(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
+    """Mean stage cost over time."""
+    for name, loop in loops.items():
+        axes.plot(loop.costs.mean(1), color=COLOURS.get(name), label=name)
+    axes.set(xlabel="step", ylabel="L(s, a), mean over starts", title="Stage cost", yscale="log")
+    axes.legend(fontsize="small")
+
+
+def closed_loop_figure(loops: Mapping[str, ClosedLoop], mpc: QPMPC) -> Figure:
+    """Paths in the plane with predictions, and the stage cost over time."""
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    draw_positions(left, loops, mpc)
+    draw_states(right, loops)
+    return figure
+
+
+def draw_learning(axes: Axes, updates: Sequence[float], J: Sequence[float], ends: Mapping) -> None:
+    """J against updates, between its two ends."""
+    axes.plot(updates, J, color=COLOURS["learned"], marker="o", markersize=3, label="learned")
+    for name, value in ends.items():
+        axes.axhline(value, color=COLOURS.get(name), linestyle="--", label=name)
+    axes.set(xlabel="update", ylabel="J, mean over starts", title="Learning", yscale="log")
+    low, high = axes.get_ylim()
+    ticks = [t for t in (20, 30, 50, 70, 100, 150, 200, 300, 500, 700, 1000) if low <= t <= high]
+    axes.set_yticks(ticks, [str(t) for t in ticks])
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.legend(fontsize="small")
+
+
+def summary_figure(
+    mpc: QPMPC, loops: Mapping[str, ClosedLoop], updates: Sequence[float], J: Sequence[float]
+) -> Figure:
+    """One picture of a run: learning, the learned matrix, and what it does in closed loop."""
+    figure = Figure(figsize=(15, 4), layout="constrained")
+    left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1.5, 1))
+    ends = {name: loops[name].J for name in ("start", "true model")}
+    draw_learning(left, np.asarray(updates), np.asarray(J), ends)
+    draw_matrix(middle, mpc.C, mpc, r"Learned constraint matrix $C_\theta$")
+    draw_positions(right, loops, mpc)
+    return figure

@@ -1,0 +1,259 @@
+"""The quadratic program of the paper (eq:qp2, eq:qp3), its solution, and its symbols.
+
+    min over z, sigma:   1/2 z'Hz + q'z + c + w'sigma                                 (eq:qp2c0)
+    subject to           C z = b                              chi                     (eq:qp2c1)
+                         lb - sigma <= G z <= ub + sigma      upsilon, eta >= 0       (eq:qp2c2)
+                         sigma >= 0                           mu >= 0                 (eq:qp2c3)
+                         x_0 = s                              xi                      (eq:qp2c4)
+                         u_0 = a   (action value only)        zeta                    (eq:qp3c2)
+
+The inequality terms of the Lagrangian (eq:lag) are used with the sign that non-negative
+multipliers need, upsilon'(lb - sigma - Gz) + eta'(Gz - ub - sigma) - mu'sigma; the printed ones
+have it reversed. A row with w_i = inf is hard: its sigma_i is zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import InitVar, dataclass, fields
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.errors import QPError
+
+#: Trailing (event) dimensions of each tensor of a QP, in the order of the constructor.
+EVENT_SHAPES: dict[str, tuple[str, ...]] = {
+    "H": ("n_z", "n_z"),
+    "q": ("n_z",),
+    "c": (),
+    "C": ("n_c", "n_z"),
+    "b": ("n_c",),
+    "G": ("n_g", "n_z"),
+    "lb": ("n_g",),
+    "ub": ("n_g",),
+    "w": ("n_g",),
+}
+
+
+class Status(IntEnum):
+    """Outcome of one QP of a batch; everything but ``SOLVED`` carries no solution."""
+
+    SOLVED = 0
+    INFEASIBLE = 1
+    UNBOUNDED = 2
+    NOT_CONVERGED = 3
+    INVALID_DATA = 4
+
+    @property
+    def explanation(self) -> str:
+        return _EXPLANATIONS[self]
+
+
+_EXPLANATIONS = {
+    Status.SOLVED: "solved to the certificate's tolerance",
+    Status.INFEASIBLE: "no z satisfies C z = b and the hard rows (w = inf); soften rows with a "
+    "finite w, or check b, lb and ub",
+    Status.UNBOUNDED: "the cost decreases without bound; add curvature to H or bounds to G",
+    Status.NOT_CONVERGED: "no solver reached the certificate's tolerance; rescale the QP, or try "
+    "another solver",
+    Status.INVALID_DATA: "NaN or inf in the data, or lb > ub; look at the parameters and the state",
+}
+
+
+@dataclass(frozen=True)
+class QuadraticProgram:
+    """A validated batch of parametric QPs (eq:qp2).
+
+    Every tensor may have leading batch dimensions; they broadcast against each other. A tensor
+    without them is shared by the whole batch, and its gradient is the batch's sum.
+
+    Args:
+        H: cost matrix, ``(*batch, n_z, n_z)``, symmetric positive semidefinite.
+        q: linear cost, ``(*batch, n_z)``.
+        c: constant cost, ``(*batch,)``.
+        C: equality matrix, ``(*batch, n_c, n_z)``.
+        b: equality right-hand side, ``(*batch, n_c)``.
+        G: inequality matrix, ``(*batch, n_g, n_z)``.
+        lb: lower bounds, ``(*batch, n_g)``; ``-inf`` where there is none.
+        ub: upper bounds, ``(*batch, n_g)``; ``inf`` where there is none.
+        w: slack weights of the l1 relaxation, ``(*batch, n_g)``, non-negative; ``inf`` is a hard row.
+        check_values: also check the values (finite, H symmetric and positive semidefinite,
+            lb <= ub, w >= 0), not only the shapes. `QPMPC` passes ``False``: its parametrisation
+            guarantees them, and whatever training makes of theta is caught by the solve.
+
+    Raises:
+        QPError: a shape, a dtype or a value that is none; the message names the argument.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> one = torch.ones(1)
+        >>> qp = qm.QuadraticProgram(
+        ...     H=torch.eye(1),
+        ...     q=-2 * one,
+        ...     c=torch.zeros(()),
+        ...     C=torch.zeros(0, 1),
+        ...     b=torch.zeros(0),
+        ...     G=torch.eye(1),
+        ...     lb=-one,
+        ...     ub=one,
+        ...     w=torch.inf * one,
+        ... )
+        >>> qm.solve_qp(qp).z
+        tensor([1.])
+    """
+
+    H: Tensor
+    q: Tensor
+    c: Tensor
+    C: Tensor
+    b: Tensor
+    G: Tensor
+    lb: Tensor
+    ub: Tensor
+    w: Tensor
+    check_values: InitVar[bool] = True
+
+    def __post_init__(self, check_values: bool) -> None:
+        self._check_shapes()
+        if check_values:
+            self._check_values()
+
+    @property
+    def n_z(self) -> int:
+        return self.H.shape[-1]
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        return torch.broadcast_shapes(
+            *(
+                getattr(self, n).shape[: getattr(self, n).ndim - len(e)]
+                for n, e in EVENT_SHAPES.items()
+            )
+        )
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """H, q, c, C, b, G, lb, ub, w."""
+        return tuple(getattr(self, name) for name in EVENT_SHAPES)
+
+    def _check_shapes(self) -> None:
+        for field in fields(self):
+            tensor = getattr(self, field.name)
+            if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+                got = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
+                raise QPError.expected(
+                    field.name,
+                    got,
+                    "a floating-point torch.Tensor",
+                    "Convert it with torch.as_tensor(..., dtype=torch.float64).",
+                )
+            if tensor.dtype != self.H.dtype:
+                raise QPError.expected(
+                    field.name,
+                    tensor.dtype,
+                    f"H's dtype {self.H.dtype}",
+                    "Give all nine tensors one dtype.",
+                )
+        sizes: dict[str, tuple[str, int]] = {}
+        for name, event in EVENT_SHAPES.items():
+            tensor = getattr(self, name)
+            want = f"(*batch, {', '.join(event)})" if event else "(*batch,)"
+            if tensor.ndim < len(event):
+                raise QPError.expected(name, f"shape {tuple(tensor.shape)}", f"shape {want}")
+            for symbol, size in zip(event, tensor.shape[tensor.ndim - len(event) :], strict=True):
+                source, known = sizes.setdefault(symbol, (name, size))
+                if size != known:
+                    raise QPError.expected(
+                        name,
+                        f"shape {tuple(tensor.shape)}",
+                        f"shape {want} with {symbol} = {known} as in {source}",
+                    )
+        try:
+            _ = self.batch_shape
+        except RuntimeError as error:
+            shapes = {name: tuple(getattr(self, name).shape) for name in EVENT_SHAPES}
+            raise QPError.expected(
+                "batch", f"shapes {shapes}", "leading dimensions that broadcast"
+            ) from error
+
+    def _check_values(self) -> None:
+        for name in ("H", "q", "c", "C", "b", "G"):
+            if not getattr(self, name).isfinite().all():
+                raise QPError.expected(name, "NaN or inf", "finite entries")
+        for name, forbidden in (("lb", torch.inf), ("ub", -torch.inf), ("w", -torch.inf)):
+            tensor = getattr(self, name)
+            if (tensor.isnan() | (tensor == forbidden)).any():
+                raise QPError.expected(name, f"NaN or {forbidden}", "no NaN, and no such infinity")
+        if (self.lb > self.ub).any():
+            excess = (self.lb - self.ub).max().item()
+            raise QPError.expected("lb", f"lb > ub by up to {excess:.3g}", "lb <= ub in every row")
+        if (self.w < 0).any():
+            raise QPError.expected(
+                "w",
+                f"{self.w.min().item():.3g}",
+                "non-negative slack weights",
+                "Use inf for a hard row.",
+            )
+        asymmetry = (
+            (self.H - self.H.mT).abs().amax(dim=(-2, -1)) if self.n_z else self.H.new_zeros(1)
+        )
+        scale = self.H.abs().amax(dim=(-2, -1)) if self.n_z else asymmetry
+        tolerance = 1e-5 if self.H.dtype == torch.float32 else 1e-9
+        if (asymmetry > tolerance * scale).any():
+            raise QPError.expected(
+                "H",
+                f"asymmetry {asymmetry.max():.3g}",
+                "a symmetric matrix",
+                "Pass (H + H.mT) / 2.",
+            )
+        if (
+            self.n_z
+            and (torch.linalg.eigvalsh(self.H)[..., 0] < -tolerance * (scale + 1e-300)).any()
+        ):
+            lowest = torch.linalg.eigvalsh(self.H)[..., 0].min().item()
+            raise QPError.expected(
+                "H",
+                f"smallest eigenvalue {lowest:.3g}",
+                "a positive semidefinite matrix",
+                "Parameterise H by its Cholesky factor (torch_qpmpc.parametrizations).",
+            )
+
+
+@dataclass(frozen=True)
+class QPSolution:
+    """Primal-dual solution of a batch of QPs.
+
+    ``value`` and ``z`` take part in autograd. The multipliers and ``sigma`` are constants to it.
+    An element that is not solved (``status != 0``; only with ``on_failure`` "warn" or "mask") has
+    ``value = inf``, zeros elsewhere, and no gradient.
+
+    Attributes:
+        value: optimal cost, ``(*batch,)``.
+        z: minimiser, ``(*batch, n_z)``.
+        sigma: slacks, ``(*batch, n_g)``, zero on hard rows.
+        chi: multipliers of C z = b, ``(*batch, n_c)``.
+        upsilon: multipliers of the lower bounds, ``(*batch, n_g)``, non-negative.
+        eta: multipliers of the upper bounds, ``(*batch, n_g)``, non-negative.
+        mu: multipliers of sigma >= 0, ``w - upsilon - eta``, ``(*batch, n_g)``; inf on hard rows.
+        xi: multipliers of the fixed entries, ``(*batch, n_f)``: the paper's xi, then zeta.
+        status: `Status` as integers, ``(*batch,)``.
+        residual: relative KKT residual found by the certificate, ``(*batch,)``.
+        iterations: the solver's iterations, ``(*batch,)``.
+    """
+
+    value: Tensor
+    z: Tensor
+    sigma: Tensor
+    chi: Tensor
+    upsilon: Tensor
+    eta: Tensor
+    mu: Tensor
+    xi: Tensor
+    status: Tensor
+    residual: Tensor
+    iterations: Tensor
+
+    @property
+    def solved(self) -> Tensor:
+        """Which elements are certified solutions, ``(*batch,)``."""
+        return self.status == Status.SOLVED

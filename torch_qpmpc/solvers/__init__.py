@@ -1,0 +1,45 @@
+"""Backends, one a file, and the chain that turns their claims into certified solutions.
+
+A backend is a function ``solve(qps: SoftQPs, start: Answer | None) -> Answer``. To add one, write
+its file and name it in `BACKENDS`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from functools import partial
+
+from torch_qpmpc.condense import SoftQPs
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.solvers import daqp, proxqp, qpsolvers
+from torch_qpmpc.solvers.answer import Answer
+
+Backend = Callable[[SoftQPs, Answer | None], Answer]
+
+BACKENDS: dict[str, Backend] = {"proxqp": proxqp.solve, "daqp": daqp.solve}
+
+
+def backend(name: str) -> Backend:
+    """The backend called ``name``; `QPError` if there is none."""
+    if name in BACKENDS:
+        return BACKENDS[name]
+    if isinstance(name, str) and name.startswith("qpsolvers:"):
+        wrapped = name.removeprefix("qpsolvers:")
+        qpsolvers.check_available(wrapped)
+        return partial(qpsolvers.solve, name=wrapped)
+    close = difflib.get_close_matches(str(name), BACKENDS, n=1)
+    raise QPError.expected(
+        "solver",
+        repr(name),
+        f"one of {', '.join(BACKENDS)}, qpsolvers:NAME",
+        f"Did you mean {close[0]!r}?" if close else "",
+    )
+
+
+def fallbacks(name: str) -> list[Backend]:
+    """Who solves what the certificate rejects: every other backend, cold."""
+    return [other for known, other in BACKENDS.items() if known != name]
+
+
+__all__ = ["BACKENDS", "Answer", "Backend", "backend", "fallbacks"]

@@ -1,0 +1,158 @@
+"""Learn a quadratic program as value function by Q-learning, on the paper's point mass.
+
+    python train.py                                     the default: both penalties, seed 1
+    python train.py constraint=free noise=brownian      one of the paper's cases
+    python train.py -m constraint=fixed,free seed=1,2   a sweep
+    tensorboard --logdir runs                           watch it
+
+configs/ holds every key. The run's folder gets config.yaml, metrics.csv, TensorBoard events,
+checkpoint.pt, summary.png and summary.json.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from torchrl.objectives import SoftUpdate
+from tqdm import tqdm
+
+from torch_qpmpc import QPActorValueOperator, QPError, QPQLearningLoss, SolveLog
+from torch_qpmpc.checkpoint import save_checkpoint
+from torch_qpmpc.config import check_config
+from torch_qpmpc.experiment import (
+    evaluate,
+    gap_summary,
+    make_collector,
+    make_mpc,
+    make_optimizer,
+    make_penalties,
+    make_physics,
+    make_true_mpc,
+    table,
+)
+from torch_qpmpc.plots import closed_loop_figure, constraint_figure, summary_figure
+from torch_qpmpc.replay import make_replay
+from torch_qpmpc.structure import distance_by_band
+from torch_qpmpc.tracking import RunFolder
+
+
+def train(cfg: DictConfig, folder: str) -> dict[str, float | int | str]:
+    """One run; returns what summary.json holds."""
+    check_config(cfg)
+    torch.manual_seed(cfg.seed)
+
+    # The QP, between its two ends: the corrupted model it starts from, and the true one.
+    physics = make_physics(cfg)
+    mpc = make_mpc(cfg, physics)
+    loops = {
+        "start": evaluate(cfg, mpc, physics),
+        "true model": evaluate(cfg, make_true_mpc(cfg, physics), physics),
+    }
+
+    # Q-learning: V and Q from one QP, two learning rates, and the penalties on C.
+    operator = QPActorValueOperator(mpc)
+    loss_module = QPQLearningLoss(
+        operator, delay_value=cfg.delay_value, td_error_clip=cfg.td_error_clip
+    )
+    loss_module.make_value_estimator(gamma=cfg.task.gamma)
+    target = SoftUpdate(loss_module, tau=cfg.target_rate) if cfg.delay_value else None
+    deviation, si = make_penalties(cfg, mpc)
+    optimizer, schedule = make_optimizer(cfg, mpc)
+    initial_rate = optimizer.param_groups[0]["lr"]
+
+    # Data: vectorised episodes under today's policy, and one replay for transitions and windows.
+    collector = make_collector(cfg, physics, operator)
+    replay = make_replay(
+        cfg.replay_capacity,
+        cfg.num_envs,
+        cfg.batch_size,
+        cfg.task.horizon,
+        1 if si is None else cfg.constraint.si.windows,
+        seed=cfg.seed,
+    )
+    batches = iter(collector)
+    for batch in itertools.islice(batches, -(-cfg.warmup_steps // cfg.steps_per_update)):
+        replay.extend(batch)
+
+    J_start = loops["start"].J
+    unsolved, train_seconds = 0, 0.0
+    with RunFolder(folder, cfg) as run:
+        run.log({"eval/J": J_start, "eval/J_true_model": loops["true model"].J}, 0)
+        progress = tqdm(range(1, cfg.updates + 1), desc=f"{cfg.constraint.name}, {cfg.noise.name}")
+        for update in progress:
+            began = time.perf_counter()
+            with SolveLog() as qps:
+                batch = next(batches)
+                replay.extend(batch)
+                collected = time.perf_counter()
+
+                losses = loss_module(replay.sample())
+                terms = {"loss/value": losses["loss_value"]}
+                if si is not None:
+                    terms["loss/si"] = si(mpc.C, replay.sample_tau())
+                if deviation is not None and cfg.penalty_step == "subgradient":
+                    terms["loss/deviation"] = deviation(mpc.C)
+                optimizer.zero_grad()
+                sum(terms.values()).backward()
+                optimizer.step()
+                if deviation is not None and cfg.penalty_step == "proximal":
+                    # The penalty's weight falls with the rates, so that their ratio is kept.
+                    deviation.proximal_step_(mpc.C, schedule.get_last_lr()[0] / initial_rate)
+                schedule.step()
+                if target is not None:
+                    target.step()
+            ended = time.perf_counter()
+            train_seconds += ended - began
+            unsolved += qps.unsolved
+
+            if update % cfg.log_interval == 0:
+                metrics = {name: term.item() for name, term in terms.items()}
+                metrics |= {f"train/{name}": losses[name].item() for name in LOGGED}
+                metrics |= {"train/reward": batch["next", "reward"].mean().item(), **qps.metrics()}
+                metrics |= {"time/collect": collected - began, "time/update": ended - collected}
+                run.log(metrics, update)
+            if update % cfg.eval_interval == 0 or update == cfg.updates:
+                loops["learned"] = evaluate(cfg, mpc, physics)
+                summary = gap_summary(loops)
+                J, gap = summary["J_final"], summary["closed_gap"]
+                run.log({"eval/J": J, "eval/J_true_model": summary["J_true_model"]}, update)
+                run.log({"eval/J_discounted": summary["J_discounted_final"]}, update)
+                run.log({"eval/closed_gap": gap}, update)
+                distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
+                run.log({f"structure/{band}": d for band, d in distances.items()}, update)
+                run.figure("structure/C", constraint_figure(mpc), update)
+                run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
+                progress.set_postfix(J=f"{J:.1f}", closed_gap=f"{gap:.2f}")
+                state = {"mpc": mpc.state_dict(), "optimizer": optimizer.state_dict()}
+                save_checkpoint(run.path / "checkpoint.pt", {**state, "update": update})
+                run.flush()
+        summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
+        summary |= {"solver": cfg.solver, "unsolved": unsolved, "updates": cfg.updates}
+        summary["train_seconds"] = train_seconds
+        run.finish(summary)
+        summary_figure(mpc, loops, *run.column("eval/J")).savefig(run.path / "summary.png", dpi=110)
+    collector.shutdown()
+    print(f"\n{table(summary)}\n\n{run.path}")
+    return summary
+
+
+#: What the loss module tells of itself.
+LOGGED = ("td_error", "pred_value", "target_value", "unsolved")
+
+
+@hydra.main(version_base="1.3", config_path="configs", config_name="config")
+def main(cfg: DictConfig) -> float:
+    """Train; a sweep's optimiser maximises the closed gap that this returns."""
+    try:
+        return train(cfg, HydraConfig.get().runtime.output_dir)["closed_gap"]
+    except QPError as error:
+        raise SystemExit(f"{error}") from None
+
+
+if __name__ == "__main__":
+    main()
