@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import itertools
 import time
+from typing import Any
 
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
+from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
@@ -26,24 +28,24 @@ from torch_qpmpc.checkpoint import save_checkpoint
 from torch_qpmpc.config import check_config
 from torch_qpmpc.experiment import (
     evaluate,
-    gap_summary,
     make_collector,
     make_mpc,
     make_optimizer,
     make_penalties,
     make_physics,
     make_true_mpc,
+    report,
     table,
 )
-from torch_qpmpc.plots import closed_loop_figure, constraint_figure, summary_figure
+from torch_qpmpc.plots import summary_figure
 from torch_qpmpc.replay import make_replay
-from torch_qpmpc.structure import distance_by_band
 from torch_qpmpc.tracking import RunFolder
 
 
-def train(cfg: DictConfig, folder: str) -> dict[str, float | int | str]:
+def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     """One run; returns what summary.json holds."""
     check_config(cfg)
+    torchrl_logger.setLevel("WARNING")
     torch.manual_seed(cfg.seed)
 
     # The QP, between its two ends: the corrupted model it starts from, and the true one.
@@ -79,14 +81,13 @@ def train(cfg: DictConfig, folder: str) -> dict[str, float | int | str]:
     for batch in itertools.islice(batches, -(-cfg.warmup_steps // cfg.steps_per_update)):
         replay.extend(batch)
 
-    J_start = loops["start"].J
-    unsolved, train_seconds = 0, 0.0
+    qps, unsolved, train_seconds = SolveLog(), 0, 0.0
     with RunFolder(folder, cfg) as run:
-        run.log({"eval/J": J_start, "eval/J_true_model": loops["true model"].J}, 0)
+        run.log({"eval/J": loops["start"].J, "eval/J_true_model": loops["true model"].J}, 0)
         progress = tqdm(range(1, cfg.updates + 1), desc=f"{cfg.constraint.name}, {cfg.noise.name}")
         for update in progress:
             began = time.perf_counter()
-            with SolveLog() as qps:
+            with qps:
                 batch = next(batches)
                 replay.extend(batch)
                 collected = time.perf_counter()
@@ -98,7 +99,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, float | int | str]:
                 if deviation is not None and cfg.penalty_step == "subgradient":
                     terms["loss/deviation"] = deviation(mpc.C)
                 optimizer.zero_grad()
-                sum(terms.values()).backward()
+                torch.stack(list(terms.values())).sum().backward()
                 optimizer.step()
                 if deviation is not None and cfg.penalty_step == "proximal":
                     # The penalty's weight falls with the rates, so that their ratio is kept.
@@ -108,7 +109,6 @@ def train(cfg: DictConfig, folder: str) -> dict[str, float | int | str]:
                     target.step()
             ended = time.perf_counter()
             train_seconds += ended - began
-            unsolved += qps.unsolved
 
             if update % cfg.log_interval == 0:
                 metrics = {name: term.item() for name, term in terms.items()}
@@ -116,24 +116,17 @@ def train(cfg: DictConfig, folder: str) -> dict[str, float | int | str]:
                 metrics |= {"train/reward": batch["next", "reward"].mean().item(), **qps.metrics()}
                 metrics |= {"time/collect": collected - began, "time/update": ended - collected}
                 run.log(metrics, update)
+                unsolved, qps = unsolved + qps.unsolved, SolveLog()
             if update % cfg.eval_interval == 0 or update == cfg.updates:
                 loops["learned"] = evaluate(cfg, mpc, physics)
-                summary = gap_summary(loops)
-                J, gap = summary["J_final"], summary["closed_gap"]
-                run.log({"eval/J": J, "eval/J_true_model": summary["J_true_model"]}, update)
-                run.log({"eval/J_discounted": summary["J_discounted_final"]}, update)
-                run.log({"eval/closed_gap": gap}, update)
-                distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
-                run.log({f"structure/{band}": d for band, d in distances.items()}, update)
-                run.figure("structure/C", constraint_figure(mpc), update)
-                run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
-                progress.set_postfix(J=f"{J:.1f}", closed_gap=f"{gap:.2f}")
+                summary = report(run, mpc, loops, update)
+                progress.set_postfix(J=summary["J_final"], closed_gap=summary["closed_gap"])
                 state = {"mpc": mpc.state_dict(), "optimizer": optimizer.state_dict()}
                 save_checkpoint(run.path / "checkpoint.pt", {**state, "update": update})
                 run.flush()
         summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
-        summary |= {"solver": cfg.solver, "unsolved": unsolved, "updates": cfg.updates}
-        summary["train_seconds"] = train_seconds
+        summary |= {"solver": cfg.solver, "updates": cfg.updates, "train_seconds": train_seconds}
+        summary["unsolved"] = unsolved + qps.unsolved
         run.finish(summary)
         summary_figure(mpc, loops, *run.column("eval/J")).savefig(run.path / "summary.png", dpi=110)
     collector.shutdown()

@@ -64,12 +64,32 @@ def as_tensor(name: str, value: Any) -> Tensor:
 def bound(name: str, bounds: tuple[Any, Any] | None, side: int, size: int) -> Tensor:
     if bounds is None:
         return torch.full((size,), (2 * side - 1) * torch.inf)
-    if len(bounds) != 2:
-        raise QPError.expected(name, f"{len(bounds)} entries", "the pair (lower, upper)")
-    given = as_tensor(name, bounds[side])
+    try:
+        lower, upper = bounds
+    except (TypeError, ValueError) as error:
+        raise QPError.expected(name, repr(bounds), "the pair (lower, upper)") from error
+    given = as_tensor(name, (lower, upper)[side])
     if tuple(given.shape) != (size,):
         raise QPError.expected(name, f"shape {tuple(given.shape)}", f"shape ({size},) on each side")
+    if (given == (1 - 2 * side) * torch.inf).any():
+        raise QPError.expected(
+            name, f"{given.tolist()}", ("lower bounds below inf", "upper bounds above -inf")[side]
+        )
     return given
+
+
+def check_weight(name: str, weight: Tensor, diagonal: bool) -> None:
+    """Raise unless a cost weight, or the diagonal of one, is symmetric positive semidefinite."""
+    if not diagonal and not torch.allclose(weight, weight.mT):
+        asymmetry = (weight - weight.mT).abs().max()
+        raise QPError.expected(
+            name, f"asymmetry {asymmetry:.3g}", "a symmetric matrix", "Pass (W + W.mT) / 2."
+        )
+    eigenvalues = weight if diagonal else torch.linalg.eigvalsh(weight)
+    if (eigenvalues < (0.0 if diagonal else -1e-9 * eigenvalues.abs().max())).any():
+        raise QPError.expected(
+            name, f"smallest eigenvalue {eigenvalues.min():.3g}", "a positive semidefinite weight"
+        )
 
 
 def check_input(name: str, x: Tensor, size: int) -> Tensor:

@@ -27,9 +27,9 @@ from torch_qpmpc.solvers import backend
 from torch_qpmpc.solvers.chain import RawSolution, solve_programs
 
 ON_FAILURE = ("raise", "warn", "mask")
-#: Event dimensions of the operator's tensors: H, q, C, b, G, lb, ub, w, fixed, and a warm start.
-EVENT_NDIMS = (2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 1)
-N_THETA = 9
+#: Event dimensions of the operator's tensors: H, q, c, C, b, G, lb, ub, w, fixed, a warm start's.
+EVENT_NDIMS = (2, 1, 0, 2, 1, 2, 1, 1, 1, 1, 1, 1)
+N_THETA = 10
 #: value, z, sigma, chi, lam, xi, status, residual, iterations
 Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -61,7 +61,7 @@ def solve_qp(
         Differentiating ``z``, or ``value`` twice, raises NotImplementedError.
 
     Raises:
-        QPError: ``fixed`` does not fit, or an argument is unknown.
+        QPError: ``fixed`` or ``warm_start`` does not fit, or an argument is unknown.
         SolverError: with ``on_failure="raise"``, an element is infeasible, unbounded or not solved.
 
     References:
@@ -70,14 +70,12 @@ def solve_qp(
     if fixed is None:
         fixed = qp.q.new_zeros(0)
     theta = _operands(qp, fixed)
-    start = (
-        (None, None) if warm_start is None else (warm_start.z, warm_start.eta - warm_start.upsilon)
-    )
+    start = _checked_start(qp, fixed, warm_start)
     raw = QPValue.apply(*theta, *start, _checked_keep(qp, fixed, keep), solver, on_failure)
     value, z, sigma, chi, lam, xi, status, residual, iterations = raw
     upsilon, eta = (-lam).clamp(min=0), lam.clamp(min=0)
     return QPSolution(
-        value=value + qp.c,
+        value=value,
         z=SolutionGradient.apply(z, *theta),
         sigma=sigma,
         chi=chi,
@@ -96,7 +94,7 @@ def optimal_value(
 ) -> Tensor:
     """The optimal cost alone, ``(*batch,)``: `solve_qp` without the rest of the solution."""
     keep = _checked_keep(qp, fixed, keep)
-    return QPValue.apply(*_operands(qp, fixed), None, None, keep, solver, on_failure)[0] + qp.c
+    return QPValue.apply(*_operands(qp, fixed), None, None, keep, solver, on_failure)[0]
 
 
 def _operands(qp: QuadraticProgram, fixed: Tensor) -> tuple[Tensor, ...]:
@@ -117,7 +115,25 @@ def _operands(qp: QuadraticProgram, fixed: Tensor) -> tuple[Tensor, ...]:
             f"shape {tuple(fixed.shape)}",
             f"leading dimensions that broadcast with the QP's batch {tuple(qp.batch_shape)}",
         ) from error
-    return (qp.H, qp.q, qp.C, qp.b, qp.G, qp.lb, qp.ub, qp.w, fixed)
+    return (*qp.tensors(), fixed)
+
+
+def _checked_start(
+    qp: QuadraticProgram, fixed: Tensor, warm_start: QPSolution | None
+) -> tuple[Tensor | None, Tensor | None]:
+    if warm_start is None:
+        return None, None
+    batch = torch.broadcast_shapes(qp.batch_shape, fixed.shape[:-1])
+    got = tuple(warm_start.z.shape), tuple(warm_start.eta.shape)
+    want = (*batch, qp.n_z), (*batch, qp.lb.shape[-1])
+    if got != want:
+        raise QPError.expected(
+            "warm_start",
+            f"z and eta of shapes {got[0]} and {got[1]}",
+            f"{want[0]} and {want[1]}",
+            "Pass a solution of the same batch of QPs.",
+        )
+    return warm_start.z, warm_start.eta - warm_start.upsilon
 
 
 def _checked_keep(qp: QuadraticProgram, fixed: Tensor, keep: int | None) -> int:
@@ -133,6 +149,7 @@ def _checked_keep(qp: QuadraticProgram, fixed: Tensor, keep: int | None) -> int:
 def solve_op(
     H: Tensor,
     q: Tensor,
+    c: Tensor,
     C: Tensor,
     b: Tensor,
     G: Tensor,
@@ -150,7 +167,7 @@ def solve_op(
     backend(solver)
     if on_failure not in ON_FAILURE:
         raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
-    programs, batch = FlatPrograms.of(H, q, C, b, G, lb, ub, w, fixed)
+    programs, batch = FlatPrograms.of(H, q, c, C, b, G, lb, ub, w, fixed)
     start = None
     if start_z is not None and start_lam is not None:
         start = (_flatten(start_z, batch), _flatten(start_lam, batch))
@@ -202,8 +219,8 @@ def _report(raw: RawSolution, batch: torch.Size, on_failure: str) -> None:
 
 
 @solve_op.register_fake
-def _(H, q, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure):
-    operands = (H, q, C, b, G, lb, ub, w, fixed)
+def _(H, q, c, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure):
+    operands = (H, q, c, C, b, G, lb, ub, w, fixed)
     batch = torch.broadcast_shapes(
         *(t.shape[: t.ndim - n] for t, n in zip(operands, EVENT_NDIMS, strict=False))
     )
@@ -237,7 +254,7 @@ def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
 
 
 def _setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
-    value, z, sigma, chi, lam, xi, status, residual, iterations = output
+    _, z, sigma, chi, lam, xi, status, *_ = output
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(*inputs[:N_THETA], z, sigma, chi, lam, xi, status)
 
@@ -256,13 +273,14 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
     gradients = {
         0: lambda like: _outer(0.5 * weight * z, z, like),
         1: lambda like: _sum_to(weight * z, like),
-        2: lambda like: _outer(weight * chi, z, like),
-        3: lambda like: _sum_to(-weight * chi, like),
-        4: lambda like: _outer(weight * lam, z, like),
-        5: lambda like: _sum_to(weight * (-lam).clamp(min=0), like),
-        6: lambda like: _sum_to(-weight * lam.clamp(min=0), like),
-        7: lambda like: _sum_to(weight * sigma, like),
-        8: lambda like: _sum_to(-weight * xi, like),
+        2: lambda like: _sum_to(weight.squeeze(-1), like),
+        3: lambda like: _outer(weight * chi, z, like),
+        4: lambda like: _sum_to(-weight * chi, like),
+        5: lambda like: _outer(weight * lam, z, like),
+        6: lambda like: _sum_to(weight * (-lam).clamp(min=0), like),
+        7: lambda like: _sum_to(-weight * lam.clamp(min=0), like),
+        8: lambda like: _sum_to(weight * sigma, like),
+        9: lambda like: _sum_to(-weight * xi, like),
     }
     needed = ctx.needs_input_grad
     return (
@@ -292,10 +310,10 @@ class QPValue(torch.autograd.Function):
     # Dynamo counts the parameters to tell this style of Function: no *args here.
     @staticmethod
     def forward(
-        H, q, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure
+        H, q, c, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure
     ) -> Outputs:
         return solve_op(
-            H, q, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure
+            H, q, c, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure
         )
 
     @staticmethod
@@ -320,7 +338,7 @@ class SolutionGradient(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(part, H, q, C, b, G, lb, ub, w, fixed) -> Tensor:
+    def forward(part, H, q, c, C, b, G, lb, ub, w, fixed) -> Tensor:
         return part.clone()
 
     @staticmethod

@@ -1,7 +1,7 @@
 """The project's own judgement of a claimed solution: a relative, sign-aware KKT residual.
 
 No solver's word is taken. For multipliers ``lam = eta - upsilon`` of the softened rows, optimality
-of the cost ``h(y) = w dist(y, [lb, ub])`` in y = Gz is ``h(y) + h*(lam) = lam y`` with the conjugate
+of ``h(y) = w dist(y, [lb, ub])`` in y = Gz is ``h(y) + h*(lam) = lam y`` with the conjugate
 ``h*(lam) = ub max(lam, 0) - lb max(-lam, 0)`` on ``|lam| <= w`` (Fenchel and Young). Each row's gap
 is non-negative on its own, so errors of opposite sign cannot cancel as they do in a summed
 duality gap.
@@ -22,7 +22,7 @@ TOLERANCE = 1e-6
 
 @dataclass
 class Certificate:
-    """Value ``(B,)``, slacks ``(B, n_g)`` and relative KKT residual ``(B,)`` of a claimed solution."""
+    """Value ``(B,)``, slacks ``(B, n_g)`` and relative KKT residual ``(B,)`` of claims."""
 
     value: Tensor
     sigma: Tensor
@@ -39,7 +39,7 @@ def certify(programs: FlatPrograms, z: Tensor, lam: Tensor, chi: Tensor, xi: Ten
     p = programs
     Hz, y = p.multiply(p.H, z), p.multiply(p.G, z)
     terms = [Hz, p.q, p.multiply(p.G.mT, lam), p.multiply(p.C.mT, chi)]
-    stationarity = sum(terms)
+    stationarity = torch.stack(terms).sum(0)
     n_f = p.fixed.shape[-1]
     stationarity[:, :n_f] += xi
     scale = 1 + torch.stack([_largest(term) for term in terms]).amax(0)
@@ -62,17 +62,17 @@ def certify(programs: FlatPrograms, z: Tensor, lam: Tensor, chi: Tensor, xi: Ten
         - lam * y
     )
 
-    value = 0.5 * (z * Hz).sum(-1) + (p.q * z).sum(-1) + (weight * sigma).sum(-1)
+    cost = 0.5 * (z * Hz).sum(-1) + (p.q * z).sum(-1) + (weight * sigma).sum(-1)
     parts = [
         _largest(stationarity) / scale,
         _largest(p.multiply(p.C, z) - p.b) / (1 + _largest(p.b) + _largest(z)),
         _largest(z[:, :n_f] - p.fixed),
         _largest(violation),
         _largest(excess),
-        gap.abs().sum(-1) / (1 + value.abs()),
+        gap.abs().sum(-1) / (1 + cost.abs()),
     ]
     residual = torch.stack(parts).amax(0)
-    return Certificate(value, sigma, residual.nan_to_num(torch.inf, torch.inf))
+    return Certificate(cost + p.c, sigma, residual.nan_to_num(torch.inf, torch.inf))
 
 
 def _largest(x: Tensor) -> Tensor:

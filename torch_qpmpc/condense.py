@@ -16,6 +16,8 @@ from torch import Tensor
 
 #: Pivots below this fraction of the largest mean that the rows of C depend on each other.
 RANK_TOLERANCE = 1e-10
+#: A coefficient below this fraction of its row's absolute sum is rounding.
+ENTERS = 1e-12
 MEMO_SIZE = 4
 
 
@@ -24,7 +26,8 @@ class FlatPrograms:
     """A batch of B QPs over M distinct matrix triples, float64 on one device.
 
     H ``(M, n_z, n_z)``, C ``(M, n_c, n_z)``, G ``(M, n_g, n_z)``; ``group`` ``(B,)`` says which
-    triple a QP has; q ``(B, n_z)``, b ``(B, n_c)``, lb, ub, w ``(B, n_g)``, fixed ``(B, n_f)``.
+    triple a QP has; q ``(B, n_z)``, c ``(B,)``, b ``(B, n_c)``, lb, ub, w ``(B, n_g)``, fixed
+    ``(B, n_f)``. H is symmetric: its antisymmetric part, if any, is no part of the cost.
     """
 
     H: Tensor
@@ -32,6 +35,7 @@ class FlatPrograms:
     G: Tensor
     group: Tensor
     q: Tensor
+    c: Tensor
     b: Tensor
     lb: Tensor
     ub: Tensor
@@ -39,16 +43,16 @@ class FlatPrograms:
     fixed: Tensor
 
     @classmethod
-    def of(
-        cls, H: Tensor, q: Tensor, C: Tensor, *vectors: Tensor
-    ) -> tuple[FlatPrograms, torch.Size]:
-        """Broadcast the tensors H, q, C, b, G, lb, ub, w, fixed of any batch shapes, and flatten.
+    def of(cls, *operands: Tensor) -> tuple[FlatPrograms, torch.Size]:
+        """Broadcast H, q, c, C, b, G, lb, ub, w, fixed of any batch shapes, and flatten.
 
         Also returns the batch shape. Matrices are not repeated for the samples that share them.
         """
-        b, G, lb, ub, w, fixed = vectors
-        matrices = [m.detach().to("cpu", torch.float64) for m in (H, C, G)]
-        vectors = tuple(v.detach().to("cpu", torch.float64) for v in (q, b, lb, ub, w, fixed))
+        H, q, c, C, b, G, lb, ub, w, fixed = (
+            operand.detach().to("cpu", torch.float64) for operand in operands
+        )
+        matrices = ((H + H.mT) / 2, C, G)
+        vectors = (q, c.unsqueeze(-1), b, lb, ub, w, fixed)
         of_matrices = torch.broadcast_shapes(*(m.shape[:-2] for m in matrices))
         batch = torch.broadcast_shapes(of_matrices, *(v.shape[:-1] for v in vectors))
         count = of_matrices.numel()
@@ -56,20 +60,19 @@ class FlatPrograms:
             m.expand(*of_matrices, *m.shape[-2:]).reshape(count, *m.shape[-2:]) for m in matrices
         ]
         group = torch.arange(count).reshape(of_matrices).expand(batch).reshape(-1)
-        flat_vectors = [
+        q, c, b, lb, ub, w, fixed = (
             v.expand(*batch, v.shape[-1]).reshape(batch.numel(), v.shape[-1]) for v in vectors
-        ]
-        return cls(*flat_matrices, group, *flat_vectors), batch
+        )
+        H, C, G = flat_matrices
+        return cls(H, C, G, group, q, c.squeeze(-1), b, lb, ub, w, fixed), batch
 
     def __len__(self) -> int:
         return self.q.shape[0]
 
     def take(self, index: Tensor) -> FlatPrograms:
         """The QPs at ``index``, with the matrices as they are."""
-        vectors = (
-            v[index] for v in (self.group, self.q, self.b, self.lb, self.ub, self.w, self.fixed)
-        )
-        return FlatPrograms(self.H, self.C, self.G, *vectors)
+        vectors = (self.group, self.q, self.c, self.b, self.lb, self.ub, self.w, self.fixed)
+        return FlatPrograms(self.H, self.C, self.G, *(v[index] for v in vectors))
 
     def multiply(self, matrices: Tensor, vectors: Tensor) -> Tensor:
         """Row-wise matrix-vector products: ``(M, i, j)`` by ``(B, j)`` to ``(B, i)``."""
@@ -124,7 +127,10 @@ class Condensed:
         linear = programs.multiply(self.T[:, :, n_f:].mT, gradient)
         offset = programs.multiply(programs.G, z_0)
         bounded = ((programs.lb > -torch.inf) | (programs.ub < torch.inf)).any(dim=0)
-        entered = (self.G[:, :, n_f:] != 0).any(dim=2).any(dim=0)
+        # Rounding in the elimination leaves traces of variables that a row does not contain.
+        size = self.G.abs()
+        trace = ENTERS * size.sum(dim=2, keepdim=True)
+        entered = (size[:, :, n_f:] > trace).any(dim=2).any(dim=0)
         rows = (bounded & entered).nonzero().squeeze(-1)
         return SoftQPs(
             H=self.H[:, n_f:, n_f:].numpy(),
@@ -196,7 +202,8 @@ def _eliminate(C: Tensor, keep: int) -> tuple[Tensor, Tensor] | None:
     pivots = upper.diagonal(dim1=-2, dim2=-1).abs()
     if n_c and (pivots.amin(-1) <= RANK_TOLERANCE * pivots.amax(-1)).any():
         return None
-    order = permutation.argmax(dim=-2) + keep
+    # Which row of the permutation's column has the one; argmax refuses an empty dimension.
+    order = permutation.mT.nonzero()[:, -1].reshape(M, -1) + keep
     dependent, independent = order[:, :n_c], order[:, n_c:].sort(dim=-1).values
     kept = torch.arange(keep, device=C.device).expand(M, keep)
     columns = torch.cat((kept, independent), dim=-1)

@@ -33,12 +33,18 @@ def _one_of(*names: str) -> Rule:
 
 
 def _subset(names: tuple[str, ...]) -> Rule:
-    return lambda x: isinstance(x, list) and set(x) <= set(names), f"a list of {', '.join(names)}"
+    return (
+        lambda x: isinstance(x, list) and all(name in names for name in x),
+        f"a list of {', '.join(names)}",
+    )
 
 
 POSITIVE: Rule = lambda x: _number(x) and 0 < x < math.inf, "a finite number > 0"
 NON_NEGATIVE: Rule = lambda x: _number(x) and 0 <= x < math.inf, "a finite number >= 0"
-WEIGHT: Rule = lambda x: _number(x) and x >= 0, "a number >= 0, or .inf for hard rows"
+WEIGHT: Rule = (
+    lambda x: _number(x) and x >= 0,
+    "a number >= 0; for hard rows .inf in a file, inf on the command line",
+)
 FRACTION: Rule = lambda x: _number(x) and 0 < x <= 1, "a number in (0, 1]"
 FLAG: Rule = lambda x: isinstance(x, bool), "true or false"
 NAME: Rule = lambda x: isinstance(x, str), "a name"
@@ -82,6 +88,10 @@ RULES: dict[str, Rule] = {
     "optimizer.name": _one_of("adam", "sgd"),
     "optimizer.lr_cost": NON_NEGATIVE,
     "optimizer.lr_constraints": NON_NEGATIVE,
+    "optimizer.betas": (
+        lambda x: isinstance(x, list) and len(x) == 2 and all(_number(b) and 0 <= b < 1 for b in x),
+        "two numbers in [0, 1)",
+    ),
     "optimizer.final_fraction": FRACTION,
 }
 #: A penalty that is null is off.
@@ -100,24 +110,30 @@ def check_config(cfg: DictConfig) -> None:
         accepts, expected = RULES[key]
         if not accepts(value):
             raise QPError.expected(key, repr(value), expected)
-    for key in RULES:
+    required = [
+        key for key in RULES if key != "optimizer.betas" or given.get("optimizer.name") == "adam"
+    ]
+    for key in required:
         if key not in given and not any(key.startswith(f"{name}.") for name in off):
             raise QPError.expected(key, "nothing", RULES[key][1])
     backend(cfg.solver)
-    if cfg.constraint.deviation is not None or cfg.constraint.si is not None:
-        if "C" not in cfg.constraint.learn:
-            raise QPError.expected(
-                "constraint.learn",
-                str(list(cfg.constraint.learn)),
-                "C among them, as a penalty on C is on",
-                "Set the penalty to null, or learn C.",
-            )
-    if cfg.constraint.si is not None and cfg.task.episode_steps < cfg.task.horizon:
+    penalised = cfg.constraint.deviation is not None or cfg.constraint.si is not None
+    if penalised and "C" not in cfg.constraint.learn:
         raise QPError.expected(
-            "task.episode_steps",
-            cfg.task.episode_steps,
-            f"at least task.horizon = {cfg.task.horizon}",
+            "constraint.learn",
+            str(list(cfg.constraint.learn)),
+            "C among them, as a penalty on C is on",
+            "Set the penalty to null, or learn C.",
         )
+    if cfg.constraint.si is not None:
+        for key in ("task.episode_steps", "warmup_steps"):
+            if given[key] < cfg.task.horizon:
+                raise QPError.expected(
+                    key,
+                    given[key],
+                    f"at least task.horizon = {cfg.task.horizon}",
+                    "So long are the windows of constraint.si.",
+                )
     if cfg.replay_capacity % cfg.num_envs:
         raise QPError.expected(
             "replay_capacity", cfg.replay_capacity, f"a multiple of num_envs = {cfg.num_envs}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -16,6 +17,9 @@ from torch_qpmpc.evaluation import ClosedLoop, closed_gap, closed_loop
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.operators import QPActorValueOperator
 from torch_qpmpc.penalties import DeviationPenalty, SystemIdentificationPenalty
+from torch_qpmpc.plots import closed_loop_figure, constraint_figure
+from torch_qpmpc.structure import distance_by_band
+from torch_qpmpc.tracking import RunFolder
 
 
 def make_physics(cfg: DictConfig) -> PointMass:
@@ -64,7 +68,7 @@ def make_collector(
     )
     return Collector(
         env,
-        TensorDictSequential(operator.get_policy_operator(), exploration),
+        TensorDictSequential([operator.get_policy_operator(), exploration]),
         frames_per_batch=cfg.num_envs * cfg.steps_per_update,
         total_frames=-1,
         auto_register_policy_transforms=False,
@@ -86,14 +90,33 @@ def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> tuple[torch.optim.Optimizer, 
     """The optimiser, with one rate for the cost and one for the constraints, and their decay."""
     options = cfg.optimizer
     groups = mpc.parameter_groups({"cost": options.lr_cost, "constraints": options.lr_constraints})
-    kind = {"adam": torch.optim.Adam, "sgd": torch.optim.SGD}[options.name]
-    optimizer = kind(groups)
+    if options.name == "adam":
+        optimizer = torch.optim.Adam(groups, betas=tuple(options.betas))
+    else:
+        optimizer = torch.optim.SGD(groups)
     return optimizer, LinearLR(optimizer, 1.0, options.final_fraction, total_iters=cfg.updates)
 
 
 def evaluate(cfg: DictConfig, mpc: QPMPC, physics: PointMass) -> ClosedLoop:
     """The policy without exploration, from the fixed starts and with the fixed noise."""
     return closed_loop(mpc.policy, physics, steps=cfg.task.episode_steps, gamma=cfg.task.gamma)
+
+
+def report(run: RunFolder, mpc: QPMPC, loops: dict[str, ClosedLoop], update: int) -> dict[str, Any]:
+    """Log an evaluation: J between its two ends, the distance of C to C_0, and the figures.
+
+    Returns:
+        `gap_summary` of ``loops``.
+    """
+    summary = gap_summary(loops)
+    run.log({"eval/J": summary["J_final"], "eval/J_true_model": summary["J_true_model"]}, update)
+    run.log({"eval/J_discounted": summary["J_discounted_final"]}, update)
+    run.log({"eval/closed_gap": summary["closed_gap"]}, update)
+    distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
+    run.log({f"structure/{band}": distance for band, distance in distances.items()}, update)
+    run.figure("structure/C", constraint_figure(mpc), update)
+    run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
+    return summary
 
 
 def gap_summary(loops: dict[str, ClosedLoop]) -> dict[str, float]:

@@ -20,6 +20,7 @@ from torch_qpmpc.arguments import (
     bound,
     check_input,
     check_structure,
+    check_weight,
 )
 from torch_qpmpc.autograd import optimal_value, solve_qp
 from torch_qpmpc.banded import banded_matrix
@@ -73,10 +74,24 @@ class QPMPC(nn.Module):
         ...     stage_weight=[1.0, 0.1],
         ...     state_bounds=([-5.0], [5.0]),
         ... )
-        >>> mpc.policy(torch.tensor([[0.1], [4.0]]))
-        tensor([[-0.0954],
+        >>> mpc.policy(torch.tensor([[0.1], [4.0]])).detach()
+        tensor([[-0.0908],
                 [-1.0000]])
     """
+
+    H: Tensor
+    H_f: Tensor
+    q: Tensor
+    c: Tensor
+    C: Tensor
+    b: Tensor
+    G: Tensor
+    lb: Tensor
+    ub: Tensor
+    w: Tensor
+    C_0: Tensor
+    discount: Tensor
+    soft: Tensor
 
     def __init__(
         self,
@@ -257,7 +272,8 @@ class QPMPC(nn.Module):
     def __reduce_ex__(self, protocol: Any) -> tuple:
         # A parametrised module refuses to be pickled, which would bar it from spawned collectors.
         plain = parametrize.type_before_parametrizations(self)
-        return _rebuild, (plain, self._arguments, self.state_dict(), self.training)
+        frozen = [name for name, part in self.named_parameters() if not part.requires_grad]
+        return _rebuild, (plain, self._arguments, self.state_dict(), frozen, self.training)
 
     def _value(self, fixed: Tensor) -> Tensor:
         qp = self.quadratic_program()
@@ -293,7 +309,9 @@ class QPMPC(nn.Module):
         n, diagonal = self.n_x + self.n_u, self.hessian == "diagonal"
         event = (n,) if diagonal else (n, n)
         terminal_event = (self.n_x,) * len(event)
-        if not diagonal and tuple(stage.shape) in ((n,), (self.horizon, n)):
+        # A square matrix is one dense block, even where the horizon happens to be its size.
+        diagonals = ((n,), (self.horizon, n)) if self.horizon != n else ((n,),)
+        if not diagonal and tuple(stage.shape) in diagonals:
             stage = torch.diag_embed(stage)
         if not diagonal and tuple(terminal.shape) == (self.n_x,):
             terminal = torch.diag(terminal)
@@ -306,6 +324,8 @@ class QPMPC(nn.Module):
             raise QPError.expected(
                 "terminal_weight", f"shape {tuple(terminal.shape)}", f"shape {terminal_event}"
             )
+        check_weight("stage_weight", stage, diagonal)
+        check_weight("terminal_weight", terminal, diagonal)
         parts = {"H": stage, "H_f": terminal}
         if self.hessian == "full":
             blocks = stage.expand(self.horizon, n, n)
@@ -351,7 +371,12 @@ class QPMPC(nn.Module):
         return self.get_parameter(name)
 
 
-def _rebuild(cls: type[QPMPC], arguments: dict, state: dict, training: bool) -> QPMPC:
+def _rebuild(
+    cls: type[QPMPC], arguments: dict, state: dict, frozen: list[str], training: bool
+) -> QPMPC:
     mpc = cls(**arguments)
     mpc.load_state_dict(state, assign=True)
+    mpc.discount = mpc.discount.to(mpc.C_0)  # not part of the state
+    for name in frozen:
+        mpc.get_parameter(name).requires_grad_(False)
     return mpc.train(training)

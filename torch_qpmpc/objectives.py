@@ -15,14 +15,14 @@ from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import _GAMMA_LMBDA_DEPREC_ERROR, dispatch_value_estimator
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.operators import QPActorValueOperator
+from torch_qpmpc.operators import QPActorValueOperator, QPValueOperator
 
 
 def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Tensor:
     """The loss of one TD error delta = target - prediction, elementwise, ``(*batch,)``.
 
     ``1/2 delta^2``, whose gradient step with rate alpha is the paper's update alpha delta grad Q
-    (eq:thup). With ``clip`` the delta in the update is clipped to plus or minus that (Huber's loss).
+    (eq:thup). With ``clip`` the delta of the update is clipped to plus or minus it (Huber's loss).
     """
     if clip is None:
         return 0.5 * (target - prediction).square()
@@ -90,7 +90,7 @@ class QPQLearningLoss(LossModule):
         ValueEstimators.TD1,
         ValueEstimators.TDLambda,
     )
-    out_keys = [  # noqa: RUF012 - TorchRL's convention
+    out_keys = [  # noqa: RUF012  # pyright: ignore[reportAssignmentType] - TorchRL's convention
         "loss_value",
         "td_error",
         "pred_value",
@@ -101,6 +101,7 @@ class QPQLearningLoss(LossModule):
     ]
 
     value_network: QPActorValueOperator
+    state_value_network: QPValueOperator
     value_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
 
@@ -133,9 +134,14 @@ class QPQLearningLoss(LossModule):
         self.td_error_clip = td_error_clip
         self.reduction = reduction or "mean"
         self.use_prioritized_weights = use_prioritized_weights
-        self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
+        self.convert_to_functional(
+            value_network,  # pyright: ignore[reportArgumentType] - any TensorDict module will do
+            "value_network",
+            create_target_params=delay_value,
+        )
         # Outside the module's registry, as its parameters are the value network's.
-        self.__dict__["state_value_network"] = self.value_network.get_value_operator()
+        view = self.value_network.get_value_operator()
+        object.__setattr__(self, "state_value_network", view)
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         if self._value_estimator is not None:
@@ -170,9 +176,9 @@ class QPQLearningLoss(LossModule):
     def make_value_estimator(
         self, value_type: ValueEstimators | str | None = None, **hyperparams: Any
     ) -> Any:
-        """Choose how V(s+) enters the target: TD0 (default), TD1 or TDLambda; ``gamma``, ``lmbda``."""
-        value_type, hp = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
-        if value_type is None:
+        """Choose how V(s+) enters the target: TD0 (default), TD1 or TDLambda."""
+        value_type, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if options is None:
             return self
         dispatch_value_estimator(
             self,
@@ -180,11 +186,11 @@ class QPQLearningLoss(LossModule):
             supported=self.SUPPORTED_VALUE_ESTIMATORS,
             tensor_keys=self._estimator_keys(),
             value_network=self.state_value_network,
-            **hp,
+            **options,
         )
         return None
 
-    @dispatch
+    @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The loss of a batch of transitions, and detached scalars that describe it."""
         loss_value, metadata = self.loss_value(tensordict)
@@ -198,10 +204,10 @@ class QPQLearningLoss(LossModule):
         visited = tensordict.select(*self.value_network.in_keys, strict=False).detach()
         with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
             self.value_network(visited)
-        prediction = visited.get(self.tensor_keys.state_action_value).squeeze(-1)
+        prediction = visited[self.tensor_keys.state_action_value].squeeze(-1)
         with torch.no_grad():
             target = self.value_estimator.value_estimate(
-                tensordict.copy(), target_params=self.target_value_network_params
+                tensordict.copy(), next_value=self._next_value(tensordict)
             ).squeeze(-1)
 
         # An unsolved QP's cost is infinite.
@@ -210,13 +216,31 @@ class QPQLearningLoss(LossModule):
         target = torch.where(solved, target, 0)
         delta = (target - prediction).detach()
         tensordict.set(self.tensor_keys.priority, delta.square(), inplace=True)
+
+        def mean(x: Tensor) -> Tensor:
+            return x.sum() / solved.sum().clamp(min=1)
+
+        def largest(x: Tensor) -> Tensor:
+            return x.masked_fill(~solved, -torch.inf).max().nan_to_num(neginf=0.0)
+
         metadata = {
-            "td_error": delta.abs().mean(),
-            "pred_value": prediction.detach().mean(),
-            "target_value": target.mean(),
-            "pred_value_max": prediction.detach().max(),
-            "target_value_max": target.max(),
+            "td_error": mean(delta.abs()),
+            "pred_value": mean(prediction.detach()),
+            "target_value": mean(target),
+            "pred_value_max": largest(prediction.detach()),
+            "target_value_max": largest(target),
             "unsolved": (~solved).sum(),
         }
         loss = td_loss(prediction, target, self.td_error_clip)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
+
+    def _next_value(self, tensordict: TensorDictBase) -> Tensor:
+        """-V(s+), ``(*batch, 1)``; zero after a termination, where it is not used."""
+        following = tensordict.get("next").select(*self.state_value_network.in_keys)
+        with self.target_value_network_params.to_module(
+            self.state_value_network, preserve_module_state=False
+        ):
+            self.state_value_network(following)
+        done = tensordict.get(("next", self.tensor_keys.done))
+        terminated = tensordict.get(("next", self.tensor_keys.terminated), default=done)
+        return following[self.tensor_keys.value].masked_fill(terminated, 0.0)

@@ -24,14 +24,14 @@ class _QPOperator(TensorDictModuleBase):
     def __init__(self, mpc: QPMPC, in_keys: Sequence[NestedKey], out_key: NestedKey) -> None:
         super().__init__()
         self.module = mpc
-        self.in_keys = list(in_keys)
-        self.out_keys = [out_key]
+        self.in_keys = list(in_keys)  # pyright: ignore[reportAttributeAccessIssue]
+        self.out_keys = [out_key]  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class QPPolicyOperator(_QPOperator):
     """pi(s): observation ``(*batch, n_x)`` to action ``(*batch, n_u)``."""
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set(self.out_keys[0], self.module.policy(tensordict.get(self.in_keys[0])))
 
@@ -39,7 +39,7 @@ class QPPolicyOperator(_QPOperator):
 class QPValueOperator(_QPOperator):
     """-V(s): observation ``(*batch, n_x)`` to state_value ``(*batch, 1)``."""
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         value = self.module.value(tensordict.get(self.in_keys[0]))
         return tensordict.set(self.out_keys[0], -value.unsqueeze(-1))
@@ -74,7 +74,7 @@ class QPActorValueOperator(_QPOperator):
         super().__init__(mpc, [observation_key, action_key], state_action_value_key)
         self.state_value_key = state_value_key
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         s, a = (tensordict.get(key) for key in self.in_keys)
         return tensordict.set(self.out_keys[0], -self.module.action_value(s, a).unsqueeze(-1))

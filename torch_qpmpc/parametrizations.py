@@ -43,7 +43,8 @@ class Cholesky(nn.Module):
         a positive definite matrix. `QPError` if ``value`` is not positive semidefinite.
         """
         eigenvalues, vectors = torch.linalg.eigh((value + value.mT) / 2)
-        if (eigenvalues < -1e-9 * eigenvalues.abs().amax(-1, keepdim=True)).any():
+        tolerance = 1e-5 if value.dtype == torch.float32 else 1e-9
+        if (eigenvalues < -tolerance * eigenvalues.abs().amax(-1, keepdim=True)).any():
             raise QPError.expected(
                 "H",
                 f"smallest eigenvalue {eigenvalues.min():.3g}",

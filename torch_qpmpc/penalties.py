@@ -7,6 +7,7 @@ regularisers to add to the Q-learning loss; the deviation penalty also has its e
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from torch_qpmpc.banded import band_distance
@@ -42,7 +43,7 @@ def system_identification_penalty(
             "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}.",
         )
     if normalised:
-        C = C / torch.linalg.vector_norm(C, dim=-1, keepdim=True)
+        C = F.normalize(C, dim=-1)
     return (windows.to(C.dtype) @ C.mT).square().sum()
 
 
@@ -100,10 +101,12 @@ class DeviationPenalty(nn.Module):
                 f"shape {tuple(C_0.shape)}",
                 f"shape {tuple(distance.shape)} for N = {horizon}",
             )
-        mask = torch.where(distance > 0, c_1, torch.where(distance < 0, c_3, c_2))
-        mask = mask * (1 + growth * (distance.abs() - 1).clamp(min=0))
+        distance = distance.to(C_0)
+        mask = torch.full_like(distance, c_2)
+        mask[distance > 0], mask[distance < 0] = c_1, c_3
+        mask *= 1 + growth * (distance.abs() - 1).clamp(min=0)
         self.register_buffer("C_0", C_0.detach().clone())
-        self.register_buffer("C_mask", mask.to(C_0))
+        self.register_buffer("C_mask", mask)
 
     def forward(self, C: Tensor) -> Tensor:
         """The penalty of C ``(N n_x, n_z)``, a scalar."""

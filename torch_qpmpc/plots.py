@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
@@ -104,7 +103,7 @@ def summary_figure(
     figure = Figure(figsize=(15, 4), layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1.5, 1))
     ends = {name: loops[name].J for name in ("start", "true model")}
-    draw_learning(left, np.asarray(updates), np.asarray(J), ends)
+    draw_learning(left, updates, J, ends)
     draw_matrix(middle, mpc.C, mpc, r"Learned constraint matrix $C_\theta$")
     draw_positions(right, loops, mpc)
     return figure

@@ -77,7 +77,7 @@ class QuadraticProgram:
         G: inequality matrix, ``(*batch, n_g, n_z)``.
         lb: lower bounds, ``(*batch, n_g)``; ``-inf`` where there is none.
         ub: upper bounds, ``(*batch, n_g)``; ``inf`` where there is none.
-        w: slack weights of the l1 relaxation, ``(*batch, n_g)``, non-negative; ``inf`` is a hard row.
+        w: weights of the l1 relaxation, ``(*batch, n_g)``, non-negative; ``inf`` is a hard row.
         check_values: also check the values (finite, H symmetric and positive semidefinite,
             lb <= ub, w >= 0), not only the shapes. `QPMPC` passes ``False``: its parametrisation
             guarantees them, and whatever training makes of theta is caught by the solve.

@@ -14,10 +14,13 @@ from torch_qpmpc.certificate import TOLERANCE, certify
 from torch_qpmpc.condense import Condensed, FlatPrograms, SoftQPs, condense
 from torch_qpmpc.qp import Status
 from torch_qpmpc.solvers import Answer, Backend, backend, fallbacks
+from torch_qpmpc.solvers.crossover import refine
 from torch_qpmpc.solvers.diagnose import diagnose
 
 #: Multipliers of rows that no free variable enters count as active beyond this violation.
 ACTIVE_TOLERANCE = 1e-9
+#: A rejected claim with a relative residual up to this is worth sharpening.
+NEARLY = 1e-2
 
 
 @dataclass
@@ -33,6 +36,10 @@ class RawSolution:
     status: Tensor
     residual: Tensor
     iterations: Tensor
+
+    def at(self, index: Tensor) -> RawSolution:
+        """The solutions at ``index``."""
+        return RawSolution(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def put(self, index: Tensor, other: RawSolution) -> None:
         for field in fields(self):
@@ -144,15 +151,19 @@ def _attempt(
         answer = solve(qps, guess)
     claim = _recover(part, condensed, answer, rows)
     accepted = claim.residual <= TOLERANCE
+    nearly = ~accepted & (claim.residual <= NEARLY)
+    if nearly.any():
+        sharper = refine(qps, answer, nearly.nonzero().squeeze(-1).numpy())
+        second = _recover(part, condensed, sharper, rows)
+        improved = (second.residual < claim.residual).nonzero().squeeze(-1)
+        claim.put(improved, second.at(improved))
+        accepted = claim.residual <= TOLERANCE
     claim.status = torch.where(accepted, Status.SOLVED, Status.NOT_CONVERGED)
     if accepted.all():
         raw.put(todo, claim)
         return todo[:0]
     raw.residual[todo] = claim.residual
-    raw.put(
-        todo[accepted],
-        RawSolution(*(getattr(claim, field.name)[accepted] for field in fields(claim))),
-    )
+    raw.put(todo[accepted], claim.at(accepted))
     return todo[~accepted]
 
 
@@ -235,14 +246,14 @@ def _valid(p: FlatPrograms) -> Tensor:
     """Which QPs have finite data and lb <= ub, ``(B,)``."""
     matrices = torch.stack([m.isfinite().flatten(1).all(1) for m in (p.H, p.C, p.G)]).all(0)
     vectors = torch.stack([v.isfinite().all(-1) for v in (p.q, p.b, p.fixed)]).all(0)
+    vectors &= p.c.isfinite()
     # A comparison with NaN is false, and an empty interval is one whose bounds are crossed.
     bounds = ((p.lb <= p.ub) & (p.lb < torch.inf) & (p.ub > -torch.inf) & (p.w >= 0)).all(-1)
     return matrices[p.group] & vectors & bounds
 
 
 def _finite_matrices(p: FlatPrograms) -> tuple[Tensor, Tensor, Tensor]:
-    """H (symmetrised), C and G; a triple with NaN or inf, which nothing uses, becomes zero."""
-    H = (p.H + p.H.mT) / 2
-    if all(m.isfinite().all() for m in (H, p.C, p.G)):
-        return H, p.C, p.G
-    return H.nan_to_num(0, 0, 0), p.C.nan_to_num(0, 0, 0), p.G.nan_to_num(0, 0, 0)
+    """H, C and G; a triple with NaN or inf, which nothing uses, becomes zero."""
+    if all(m.isfinite().all() for m in (p.H, p.C, p.G)):
+        return p.H, p.C, p.G
+    return p.H.nan_to_num(0, 0, 0), p.C.nan_to_num(0, 0, 0), p.G.nan_to_num(0, 0, 0)

@@ -11,6 +11,8 @@ from torch_qpmpc.solvers.answer import Answer
 SOFT, ACTIVE_LOWER, ACTIVE = 8, 2, 1
 #: DAQP's reciprocal quadratic slack weight; 1e4 to 1e8 are right to 1e-7, outside it errs.
 RECIPROCAL_RHO = 1e6
+#: DAQP's infinity.
+NO_BOUND = 1e30
 SETTINGS = {"primal_tol": 1e-9, "dual_tol": 1e-12, "iter_limit": 2000, "time_limit": 0.2}
 
 
@@ -26,20 +28,23 @@ def solve(qps: SoftQPs, start: Answer | None = None) -> Answer:
         sense |= np.where(start.lam < 0, ACTIVE | ACTIVE_LOWER, 0).astype(np.int32)
     weight = np.where(hard, 0.0, qps.w)
     rho = np.full(n_rows, RECIPROCAL_RHO)
+    # A row that may be violated for nothing is no row; DAQP would hold it with its small rho.
+    upper = np.where(qps.w > 0, np.minimum(qps.u, NO_BOUND), NO_BOUND)
+    lower = np.where(qps.w > 0, np.maximum(qps.l, -NO_BOUND), -NO_BOUND)
     for m in np.unique(qps.group):
         H, G = np.array(qps.H[m], order="C"), np.array(qps.G[m], order="C")
         model, ready = daqp.Model(), False
         for i in np.flatnonzero(qps.group == m):
-            upper, lower = np.minimum(qps.u[i], 1e30), np.maximum(qps.l[i], -1e30)
             if ready:
-                model.update(f=qps.g[i], bupper=upper, blower=lower, sense=sense[i])
+                model.update(f=qps.g[i], bupper=upper[i], blower=lower[i], sense=sense[i])
             else:
-                flag, _ = model.setup(H, qps.g[i], G, upper, lower, sense[i].copy())
+                flag, _ = model.setup(H, qps.g[i], G, upper[i], lower[i], sense[i].copy())
                 if flag < 0:
                     continue
                 model.settings = SETTINGS
                 ready = True
-            model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[i], w_u=weight[i])
+            if n_rows:  # soft_weights refuses empty arrays
+                model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[i], w_u=weight[i])
             x, _, _, info = model.solve()
             v[i], lam[i], iterations[i] = x, info["lam"], info["iterations"]
     return Answer(v, lam, iterations)

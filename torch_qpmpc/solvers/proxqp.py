@@ -27,7 +27,7 @@ _forked = False
 
 
 def _mark_forked() -> None:
-    global _forked  # noqa: PLW0603
+    global _forked
     _forked = True
 
 
@@ -38,7 +38,7 @@ os.register_at_fork(after_in_child=_mark_forked)
 def solve(qps: SoftQPs, start: Answer | None = None) -> Answer:
     """Solve a batch; ``start`` is a primal-dual guess for the same QPs."""
     form = SplitSlack.of(qps)
-    n_x, n_in = form.H[0].shape[0], form.rows[0].shape[0]
+    n_x, n_in = form.n_x, form.n_in
     n_qps = len(qps.group)
     batch = proxqp.sparse.BatchQP(n_qps)
     handles = []

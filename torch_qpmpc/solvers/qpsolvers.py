@@ -33,7 +33,7 @@ def solve(qps: SoftQPs, start: Answer | None = None, *, name: str) -> Answer:
         rows = form.rows[m][: form.n_rows]
         has_upper = np.flatnonzero(np.isfinite(upper[: form.n_rows]))
         has_lower = np.flatnonzero(np.isfinite(lower[: form.n_rows]))
-        one_sided = sp.vstack([rows[has_upper], -rows[has_lower]], format="csc")
+        one_sided = sp.csc_matrix(sp.vstack([rows[has_upper], -rows[has_lower]]))
         box = np.full(form.n_v, np.inf)
         problem = qpsolvers.Problem(
             form.H[m] if sparse else form.H[m].toarray(),

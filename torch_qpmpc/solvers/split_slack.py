@@ -26,6 +26,8 @@ class SplitSlack:
     n_rows: int
     over: np.ndarray  # rows that have a t+
     under: np.ndarray  # rows that have a t-
+    n_x: int  # variables: v and the slacks
+    n_in: int  # rows: those of G and the slacks' signs
     H: list[sp.csc_matrix]
     rows: list[sp.csc_matrix]
 
@@ -36,7 +38,7 @@ class SplitSlack:
         over = np.flatnonzero(soft & np.isfinite(qps.u).any(axis=0))
         under = np.flatnonzero(soft & np.isfinite(qps.l).any(axis=0))
         n_t = len(over) + len(under)
-        unit = sp.identity(n_rows, format="csc")
+        unit = sp.csc_matrix(np.eye(n_rows))
         slack = sp.hstack([-unit[:, over], unit[:, under]])
         positive = sp.hstack([sp.csc_matrix((n_t, n_v)), sp.identity(n_t)])
         blank = sp.csc_matrix((n_t, n_t))
@@ -45,6 +47,8 @@ class SplitSlack:
             n_rows,
             over,
             under,
+            n_v + n_t,
+            n_rows + n_t,
             [sp.csc_matrix(sp.block_diag([H, blank])) for H in qps.H],
             [sp.csc_matrix(sp.vstack([sp.hstack([G, slack]), positive])) for G in qps.G],
         )

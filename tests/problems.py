@@ -1,0 +1,145 @@
+"""Random problems whose answer is known, because they are built from a KKT point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc import QPMPC, QuadraticProgram
+
+#: What a row does at the solution: strictly inside, at a bound, or beyond one (then it is soft).
+SOFT_ROWS = ("inside", "at_lower", "at_upper", "below", "above", "equality", "no_upper", "free")
+HARD_ROWS = ("inside", "at_lower", "at_upper", "equality", "no_upper")
+
+
+@dataclass(frozen=True)
+class KnownQP:
+    """A QP with its fixed entries and its solution; ``lam = eta - upsilon``."""
+
+    qp: QuadraticProgram
+    fixed: Tensor
+    value: Tensor
+    z: Tensor
+    sigma: Tensor
+    chi: Tensor
+    lam: Tensor
+    xi: Tensor
+
+    @property
+    def upsilon(self) -> Tensor:
+        return (-self.lam).clamp(min=0)
+
+    @property
+    def eta(self) -> Tensor:
+        return self.lam.clamp(min=0)
+
+
+def known_qp(
+    seed: int,
+    *,
+    batch: tuple[int, ...] = (),
+    matrices: tuple[int, ...] = (),
+    n_z: int = 12,
+    n_c: int = 3,
+    n_f: int = 2,
+    soft: tuple[str, ...] = SOFT_ROWS,
+    hard: tuple[str, ...] = HARD_ROWS,
+    weight: float = 5.0,
+    rank: int | None = None,
+    C: Tensor | None = None,
+    dtype: torch.dtype = torch.float64,
+) -> KnownQP:
+    """A QP whose rows are, in an order of each batch element's own, as ``soft`` and ``hard`` say.
+
+    H, C and G have the batch shape ``matrices``. H has the given rank, or is positive definite.
+    With H positive definite and C of full row rank, solution and multipliers are unique.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+
+    rows = [(kind, False) for kind in soft] + [(kind, True) for kind in hard]
+    n_g = len(rows)
+    order = uniform(0, 1, *batch, n_g).argsort(-1)
+
+    def which(*kinds: str) -> Tensor:
+        return torch.tensor([kind in kinds for kind, _ in rows], dtype=torch.bool)[order]
+
+    factor = normal(*matrices, n_z, n_z if rank is None else rank)
+    H = factor @ factor.mT / n_z
+    if rank is None:
+        H = H + torch.eye(n_z, dtype=torch.float64)
+    C = normal(*matrices, n_c, n_z) if C is None else C
+    G = normal(*matrices, n_g, n_z)
+
+    z, chi, xi = normal(*batch, n_z), normal(*batch, C.shape[-2]), normal(*batch, n_f)
+    y = (G @ z.unsqueeze(-1)).squeeze(-1)
+    is_hard = torch.tensor([hard for _, hard in rows], dtype=torch.bool)[order]
+    w = uniform(0.5, 1.5, *batch, n_g).mul(weight).masked_fill(is_hard, torch.inf)
+
+    sign = which("at_upper", "above").double() - which("at_lower", "below").double()
+    sign = torch.where(which("equality"), normal(*batch, n_g).sign(), sign)
+    share = torch.where(which("below", "above"), 1.0, uniform(0.2, 0.8, *batch, n_g))
+    lam = sign * share * torch.where(is_hard, weight, w)
+    gap, beyond = uniform(0.5, 2.0, *batch, n_g), uniform(0.1, 1.0, *batch, n_g)
+    lb, ub = y - gap, y + gap
+    lb = torch.where(which("at_lower", "equality"), y, lb)
+    ub = torch.where(which("at_upper", "equality"), y, ub)
+    lb = torch.where(which("below"), y + beyond, lb)
+    ub = torch.where(which("below"), lb + gap, ub)
+    ub = torch.where(which("above"), y - beyond, ub)
+    lb = torch.where(which("above"), ub - gap, lb)
+    lb = lb.masked_fill(which("free"), -torch.inf)
+    ub = ub.masked_fill(which("free", "no_upper"), torch.inf)
+    sigma = torch.where(which("below", "above"), beyond, 0.0)
+
+    def times(matrix: Tensor, vector: Tensor) -> Tensor:
+        return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+    gradient = times(H, z) + times(G.mT, lam) + times(C.mT, chi)
+    gradient[..., :n_f] += xi
+    q, c = -gradient, normal(*batch)
+    value = 0.5 * (z * times(H, z)).sum(-1) + (q * z).sum(-1) + c
+    value = value + (w.masked_fill(is_hard, 0.0) * sigma).sum(-1)
+    data = (H, q, c, C, times(C, z), G, lb, ub, w)
+    return KnownQP(
+        QuadraticProgram(*(tensor.to(dtype) for tensor in data)),
+        z[..., :n_f].to(dtype),
+        *(tensor.to(dtype) for tensor in (value, z, sigma, chi, lam, xi)),
+    )
+
+
+def solution_of(known: KnownQP) -> dict[str, Tensor]:
+    """The known solution under the names of `QPSolution`."""
+    names = ("value", "z", "sigma", "chi", "upsilon", "eta", "xi")
+    return {name: getattr(known, name) for name in names}
+
+
+def random_mpc(seed: int = 0, *, free: float = 0.1, horizon: int = 3, **options: Any) -> QPMPC:
+    """A QPMPC of two states and an action, bounded, each learned entry moved by ``free`` at most."""
+    settings: dict[str, Any] = {
+        "state_bounds": ([-1.0, -1.0], [1.0, 1.0]),
+        "action_bounds": ([-0.5], [0.5]),
+        "stage_weight": [1.0, 0.5, 0.1],
+        "solver": "daqp",
+    }
+    mpc = QPMPC(2, 1, horizon, seed=seed, **(settings | options))
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in mpc.parameters():
+            shift = 2 * torch.rand(parameter.shape, generator=generator, dtype=torch.float64) - 1
+            parameter += free * shift
+    return mpc
+
+
+def random_states(count: int, n: int = 2, *, size: float = 1.5, seed: int = 0) -> Tensor:
+    """States, or actions, uniform in plus or minus ``size``: some beyond `random_mpc`'s bounds."""
+    generator = torch.Generator().manual_seed(seed)
+    return size * (2 * torch.rand(count, n, generator=generator, dtype=torch.float64) - 1)

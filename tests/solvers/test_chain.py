@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.problems import KnownQP, known_qp
+from torch_qpmpc import QPSolution, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
+from torch_qpmpc.condense import SoftQPs
+from torch_qpmpc.solvers import BACKENDS, Answer, Backend, daqp
+
+BATCH = 6
+
+
+def doctored(change: Callable[[Answer], Answer]) -> Backend:
+    """A backend that solves, and then changes its answer."""
+
+    def solve(qps: SoftQPs, start: Answer | None = None) -> Answer:
+        return change(daqp.solve(qps, start))
+
+    return solve
+
+
+LIES = {
+    "zeros": lambda answer: replace(answer, v=0 * answer.v, lam=0 * answer.lam),
+    "NaN": lambda answer: replace(answer, v=np.nan * answer.v),
+    "v off": lambda answer: replace(answer, v=answer.v + 1.0),
+    "lam off": lambda answer: replace(answer, lam=answer.lam + 1.0),
+    "lam's sign": lambda answer: replace(answer, lam=-answer.lam),
+    "one's answer for all": lambda answer: replace(answer, v=answer.v[:1] + 0 * answer.v),
+}
+
+INACCURACIES = {
+    "v off": lambda answer: replace(answer, v=answer.v + 1e-4),
+    "lam off": lambda answer: replace(answer, lam=answer.lam + 1e-4),
+}
+
+
+@pytest.fixture
+def liar(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str:
+    """The name of a backend that tells the test's lie."""
+    monkeypatch.setitem(BACKENDS, "liar", doctored(LIES[request.param]))
+    return "liar"
+
+
+def solve(known: KnownQP, **options) -> QPSolution:
+    return solve_qp(known.qp, known.fixed, **options)
+
+
+def assert_right(solution: QPSolution, known: KnownQP) -> None:
+    assert (solution.status == Status.SOLVED).all()
+    assert_close(solution.value, known.value)
+    assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)
+
+
+# What the certificate rejects is solved by another
+
+
+@pytest.mark.parametrize("liar", LIES, indirect=True)
+def test_wrong_answers_are_caught_and_replaced(liar):
+    known = known_qp(0, batch=(BATCH,))
+    with SolveLog() as log:
+        solution = solve(known, solver=liar)
+    assert_right(solution, known)
+    assert (log.solves, log.unsolved) == (BATCH, 0)
+    assert log.fallback >= BATCH - 1  # where one's answer stands for all, that one is right
+
+
+@pytest.mark.parametrize("name", INACCURACIES)
+def test_inaccurate_answers_are_sharpened(monkeypatch, name):
+    monkeypatch.setitem(BACKENDS, "coarse", doctored(INACCURACIES[name]))
+    known = known_qp(0, batch=(BATCH,), matrices=(BATCH,))
+    with SolveLog() as log:
+        solution = solve(known, solver="coarse")
+    assert_right(solution, known)
+    assert log.fallback == 0
+    assert solution.residual.max() < 1e-9
+
+
+def test_only_what_is_rejected_is_solved_again(monkeypatch):
+    wrong = np.array([False, True, False, False, True, True])
+    asked = []
+
+    def recording(qps: SoftQPs, start: Answer | None = None) -> Answer:
+        asked.append(len(qps.g))
+        return daqp.solve(qps, start)
+
+    def lie(answer: Answer) -> Answer:
+        return replace(answer, v=answer.v + wrong[:, None])
+
+    monkeypatch.setitem(BACKENDS, "proxqp", recording)
+    monkeypatch.setitem(BACKENDS, "liar", doctored(lie))
+    known = known_qp(1, batch=(BATCH,), matrices=(BATCH,))
+    with SolveLog() as log:
+        solution = solve(known, solver="liar")
+    assert_right(solution, known)
+    assert asked == [3]
+    assert log.fallback == 3
+
+
+def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch):
+    started = []
+
+    def solve_and_lie_when_warm(qps: SoftQPs, start: Answer | None = None) -> Answer:
+        started.append(start is not None)
+        answer = daqp.solve(qps)
+        return answer if start is None else LIES["v off"](answer)
+
+    monkeypatch.setitem(BACKENDS, "liar", solve_and_lie_when_warm)
+    known = known_qp(2, batch=(BATCH,))
+    start = solve(known, solver="daqp")
+    with SolveLog() as log:
+        assert_right(solve(known, solver="liar", warm_start=start), known)
+    assert started == [True, False]
+    assert log.fallback == 0
+
+
+def test_a_warm_start_reaches_the_backend_in_its_own_variables(monkeypatch):
+    received = []
+
+    def recording(qps: SoftQPs, start: Answer | None = None) -> Answer:
+        received.append(start)
+        return daqp.solve(qps, start)
+
+    monkeypatch.setitem(BACKENDS, "recorder", recording)
+    known = known_qp(3, batch=(BATCH,))
+    cold = solve(known, solver="recorder")
+    solve(known, solver="recorder", warm_start=cold)
+    assert received[0] is None
+    # The free variables of a program with 12 entries, 2 fixed and 3 equalities, and its rows.
+    assert received[1].v.shape == (BATCH, 12 - 2 - 3)
+    expected = (cold.eta - cold.upsilon).numpy()
+    assert np.isin(np.abs(received[1].lam).max(), np.abs(expected))
+    assert_close(np.linalg.norm(received[1].lam), np.linalg.norm(expected))
+
+
+@pytest.fixture
+def nobody_solves(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in list(BACKENDS):
+        monkeypatch.setitem(BACKENDS, name, doctored(LIES["zeros"]))
+
+
+@pytest.mark.usefixtures("nobody_solves")
+def test_what_nobody_solves_is_not_converged():
+    known = known_qp(4, batch=(2, 3))
+    message = (
+        r"6 of 6 QPs have no certified solution. 6 NOT_CONVERGED, first at batch index \(0, 0\): "
+        r"no solver reached the certificate's tolerance; rescale"
+    )
+    with pytest.raises(SolverError, match=message):
+        solve(known)
+    with pytest.warns(RuntimeWarning, match=message):
+        solve(known, on_failure="warn")
+
+
+@pytest.mark.usefixtures("nobody_solves")
+def test_what_nobody_solves_is_masked_on_request(recwarn):
+    known = known_qp(4, batch=(2, 3))
+    with SolveLog() as log:
+        solution = solve(known, on_failure="mask")
+    assert not recwarn
+    assert (solution.status == Status.NOT_CONVERGED).all()
+    assert (solution.value == torch.inf).all()
+    assert (solution.residual > 1e-6).all()
+    assert not solution.solved.any()
+    assert (log.solves, log.unsolved) == (6, 6)
+
+
+# The log
+
+
+def spoil(known: KnownQP, index: int) -> KnownQP:
+    """The same batch with NaN in one element."""
+    tensors = list(known.qp.tensors())
+    tensors[1] = tensors[1].clone()
+    tensors[1][index] = torch.nan
+    qp = QuadraticProgram(*tensors, check_values=False)
+    return KnownQP(qp, *list(vars(known).values())[1:])
+
+
+def test_the_log_adds_up_all_solves_of_its_block():
+    known = known_qp(5, batch=(BATCH,))
+    with SolveLog() as log:
+        first = solve(known)
+        second = solve(spoil(known, 1), on_failure="mask")
+    solve(known)
+    assert log.solves == 2 * BATCH
+    assert log.unsolved == 1
+    assert log.fallback == 0
+    assert log.iterations == int(first.iterations.sum() + second.iterations.sum())
+    assert log.residual == max(first.residual.max(), second.residual[second.solved].max())
+    assert log.seconds > 0
+
+
+def test_the_log_reports_the_metrics_of_training():
+    log = SolveLog(solves=4, unsolved=1, fallback=2, iterations=10, residual=1e-8, seconds=0.5)
+    assert log.metrics() == {
+        "qp/solves": 4,
+        "qp/unsolved": 1,
+        "qp/fallback": 2,
+        "qp/iterations": 2.5,
+        "qp/residual": 1e-8,
+        "time/qp": 0.5,
+    }
+    assert SolveLog().metrics()["qp/iterations"] == 0
+
+
+def test_an_inner_log_takes_over_for_its_block():
+    known = known_qp(5, batch=(BATCH,))
+    with SolveLog() as outer:
+        solve(known)
+        with SolveLog() as inner:
+            solve(known)
+        solve(known)
+    assert (outer.solves, inner.solves) == (2 * BATCH, BATCH)
+
+
+def test_the_log_ends_with_its_block_even_by_an_error():
+    known = known_qp(5, batch=(BATCH,))
+    with pytest.raises(KeyError, match="stop"), SolveLog() as log:
+        raise KeyError("stop")
+    solve(known)
+    assert log.solves == 0
+
+
+def test_the_log_counts_its_own_thread_only():
+    known = known_qp(5, batch=(BATCH,))
+
+    def logged() -> int:
+        with SolveLog() as log:
+            solve(known)
+        return log.solves
+
+    with SolveLog() as log, ThreadPoolExecutor(2) as pool:
+        counts = list(pool.map(lambda _: logged(), range(4)))
+    assert counts == [BATCH] * 4
+    assert log.solves == 0
+
+
+# What never reaches a backend
+
+
+def test_rows_without_a_bound_or_a_free_variable_are_left_out(monkeypatch):
+    shapes = []
+
+    def recording(qps: SoftQPs, start: Answer | None = None) -> Answer:
+        shapes.append(qps.l.shape)
+        return daqp.solve(qps, start)
+
+    monkeypatch.setitem(BACKENDS, "recorder", recording)
+    known = known_qp(6, soft=("free", "inside", "above"), hard=("at_upper",))
+    assert_right(solve(known, solver="recorder"), known)
+    assert shapes == [(1, 3)]
+
+
+@pytest.mark.parametrize(("s", "kind"), [(0.5, "inside"), (1.5, "above"), (-3.0, "below")])
+def test_rows_of_fixed_entries_are_charged_in_closed_form(s, kind):
+    # min 1/2 (x^2 + u^2) + 7 dist(x, [-1, 1]) + u, with x fixed.
+    unit, none = torch.eye(2).double(), torch.zeros(0).double()
+    bound, w = torch.ones(2).double(), torch.tensor([7.0, torch.inf]).double()
+    q = torch.tensor([0.0, 1.0]).double()
+    C = none.reshape(0, 2)
+    qp = QuadraticProgram(unit, q, none.sum(), C, none, unit, -2 * bound, bound, w)
+    solution = solve_qp(qp, torch.tensor([s]).double(), solver="daqp")
+    sigma = {"inside": 0.0, "above": s - 1, "below": -2 - s}[kind]
+    lam = {"inside": 0.0, "above": 7.0, "below": -7.0}[kind]
+    assert_close(solution.value.item(), 0.5 * s**2 + 7 * sigma - 0.5)
+    assert_close(solution.sigma.tolist(), [sigma, 0.0])
+    assert_close((solution.eta - solution.upsilon).tolist(), [lam, 0.0])
+    assert_close(solution.xi.item(), -s - lam)
+
+
+def test_invalid_elements_reach_no_backend(monkeypatch):
+    seen: list[Tensor] = []
+
+    def recording(qps: SoftQPs, start: Answer | None = None) -> Answer:
+        seen.append(torch.from_numpy(qps.g))
+        return daqp.solve(qps, start)
+
+    monkeypatch.setitem(BACKENDS, "recorder", recording)
+    known = spoil(known_qp(7, batch=(BATCH,)), 2)
+    solution = solve(known, solver="recorder", on_failure="mask")
+    assert len(seen) == 1
+    assert seen[0].shape[0] == BATCH - 1
+    assert seen[0].isfinite().all()
+    assert solution.status.tolist() == [0, 0, Status.INVALID_DATA, 0, 0, 0]
+
+
+def test_a_batch_of_invalid_elements_reaches_no_backend(monkeypatch):
+    def refuse(qps: SoftQPs, start: Answer | None = None) -> Answer:
+        raise AssertionError("asked to solve nothing")
+
+    for name in list(BACKENDS):
+        monkeypatch.setitem(BACKENDS, name, refuse)
+    known = spoil(known_qp(8, batch=(1,)), 0)
+    assert solve(known, on_failure="mask").status.tolist() == [Status.INVALID_DATA]
+    assert solve(known_qp(8, batch=(0,))).status.shape == (0,)

@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, random_mpc
+from torch_qpmpc import QuadraticProgram, Status, solve_qp
+from torch_qpmpc.condense import FlatPrograms, SoftQPs, condense
+from torch_qpmpc.solvers.diagnose import diagnose
+
+pytestmark = pytest.mark.filterwarnings("ignore:Clarabel.rs terminated with status")
+
+INF = torch.inf
+
+
+def program(H, q, G=(), lb=(), ub=(), w=(), *, C=(), b=()) -> QuadraticProgram:
+    """A QP in two variables, from lists."""
+
+    def matrix(rows) -> Tensor:
+        return torch.tensor(rows, dtype=torch.float64).reshape(-1, 2)
+
+    def vector(entries) -> Tensor:
+        return torch.tensor(entries, dtype=torch.float64)
+
+    return QuadraticProgram(
+        matrix(H),
+        vector(q),
+        vector(0.0),
+        matrix(C),
+        vector(b),
+        matrix(G),
+        vector(lb),
+        vector(ub),
+        vector(w),
+        check_values=False,
+    )
+
+
+UNIT, FLAT, NONE = [[1, 0], [0, 1]], [[1, 0], [0, 0]], [[0, 0], [0, 0]]
+TWICE = [[1, 1], [1, 1]]
+INFEASIBLE = {
+    "two rows": program(UNIT, [1, 1], TWICE, [-INF, 2], [1, INF], [INF, INF]),
+    "by a little": program(UNIT, [1, 1], TWICE, [-INF, 1.001], [1, INF], [INF, INF]),
+    "far away": program(UNIT, [1, 1], TWICE, [-INF, 2e6], [1e6, INF], [INF, INF]),
+    "badly scaled": program(
+        UNIT, [1, 1], [[1e4, 1e4], [1e-4, 1e-4]], [-INF, 2e-4], [1e4, INF], [INF, INF]
+    ),
+    "beside a soft row": program(
+        UNIT, [1, 1], [*TWICE, [1, 0]], [-INF, 2, 5], [1, INF, 6], [INF, INF, 1e6]
+    ),
+    "no variable": program(UNIT, [1, 1], [[0, 0]], [1], [2], [INF]),
+    "unbounded too": program(NONE, [0, 1], [[1, 0], [1, 0]], [-INF, 2], [1, INF], [INF, INF]),
+    "equalities": program(UNIT, [1, 1], C=[[1, 1], [1, 1]], b=[1, 2]),
+    "equality and row": program(UNIT, [1, 1], [[1, 1]], [2], [3], [INF], C=[[1, 1]], b=[1]),
+}
+UNBOUNDED = {
+    "no rows": program(NONE, [1, 1]),
+    "flat direction": program(FLAT, [1, 1], [[1, 0]], [-1], [1], [INF]),
+    "one side open": program(FLAT, [1, 1], [[0, 1]], [-INF], [1], [INF]),
+    "weak slack": program(FLAT, [1, 10], [[0, 1]], [-1], [1], [2]),
+    "free slack": program(FLAT, [1, 10], [[0, 1]], [-1], [1], [0]),
+    "small slope": program(FLAT, [1, 1e-2], [[1, 0]], [-1], [1], [INF]),
+    "large cost": program([[1e6, 0], [0, 0]], [1e6, 1e6], [[1, 0]], [-1], [1], [INF]),
+}
+INVALID = {
+    "NaN in q": program(UNIT, [1, torch.nan]),
+    "NaN in H": program([[torch.nan, 0], [0, 1]], [1, 1]),
+    "NaN in ub": program(UNIT, [1, 1], [[1, 0]], [0], [torch.nan], [1]),
+    "infinite G": program(UNIT, [1, 1], [[INF, 0]], [0], [1], [1]),
+    "crossed bounds": program(UNIT, [1, 1], [[1, 0]], [1], [0], [1]),
+    "empty interval": program(UNIT, [1, 1], [[1, 0]], [INF], [INF], [1]),
+    "negative weight": program(UNIT, [1, 1], [[1, 0]], [0], [1], [-1]),
+}
+CASES = [
+    *((name, qp, Status.INFEASIBLE) for name, qp in INFEASIBLE.items()),
+    *((name, qp, Status.UNBOUNDED) for name, qp in UNBOUNDED.items()),
+    *((name, qp, Status.INVALID_DATA) for name, qp in INVALID.items()),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "qp", "status"), CASES, ids=[f"{s.name} {n}" for n, _, s in CASES]
+)
+def test_what_cannot_be_solved_is_named_and_soon(solver, name, qp, status):
+    began = time.perf_counter()
+    solution = solve_qp(qp, solver=solver, on_failure="mask")
+    assert time.perf_counter() - began < 2
+    assert Status(int(solution.status)) == status
+    assert solution.value == torch.inf
+
+
+def test_an_infeasible_mpc_batch_is_named_and_soon(solver):
+    mpc = random_mpc(
+        0, free=0.0, horizon=10, state_slack=torch.inf, solver=solver, on_failure="mask"
+    )
+    s = torch.full((2, 2), 5.0)
+    began = time.perf_counter()
+    solution = mpc.solve(s)
+    assert time.perf_counter() - began < 2
+    assert (solution.status == Status.INFEASIBLE).all()
+
+
+@pytest.mark.parametrize("fixed", [[2.0], [2.0, 1.0]])
+def test_fixed_entries_beyond_a_hard_row_are_infeasible(fixed):
+    qp = program(UNIT, [1, 1], UNIT, [-1, -1], [1, 1], [INF, 5])
+    solution = solve_qp(qp, torch.tensor(fixed).double(), solver="daqp", on_failure="mask")
+    assert solution.status == Status.INFEASIBLE
+
+
+def test_fixed_entries_that_break_an_equality_are_infeasible():
+    qp = program(UNIT, [1, 1], C=[[1, 0]], b=[1])
+    for s, status in ((1.0, Status.SOLVED), (2.0, Status.INFEASIBLE)):
+        solution = solve_qp(qp, torch.tensor([s]).double(), solver="daqp", on_failure="mask")
+        assert solution.status == status
+
+
+def soft_qps(**options) -> SoftQPs:
+    known = known_qp(1, batch=(4,), **options)
+    programs, _ = FlatPrograms.of(*known.qp.tensors(), known.fixed)
+    return condense(programs.H, programs.C, programs.G, 2).soft_qps(programs)[0]
+
+
+@pytest.mark.parametrize("rank", [None, 3, 0])
+@pytest.mark.parametrize("weight", [1e-2, 5.0, 1e4])
+def test_solvable_programs_are_neither_infeasible_nor_unbounded(rank, weight):
+    status = diagnose(soft_qps(rank=rank, weight=weight, soft=SOFT_ROWS, hard=HARD_ROWS))
+    assert (status == Status.NOT_CONVERGED).all()
+
+
+def test_each_element_of_a_batch_has_its_own_diagnosis():
+    qps = SoftQPs(
+        H=np.zeros((1, 2, 2)),
+        G=np.array([[[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]]),
+        group=np.zeros(3, dtype=np.int64),
+        g=np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 5.0]]),
+        l=np.array([[-1.0, -1.0, -1.0], [-1.0, 3.0, -1.0], [-1.0, -1.0, -1.0]]),
+        u=np.array([[1.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 1.0]]),
+        w=np.array([[np.inf, np.inf, 1.0]] * 3),
+    )
+    assert diagnose(qps).tolist() == [Status.NOT_CONVERGED, Status.INFEASIBLE, Status.UNBOUNDED]
+
+
+def test_matrices_of_its_own_for_each_element():
+    qps = SoftQPs(
+        H=np.stack([np.eye(2), np.zeros((2, 2))]),
+        G=np.array([[[1.0, 1.0], [1.0, 1.0]], [[1.0, 0.0], [2.0, 0.0]]]),
+        group=np.array([1, 0, 1]),
+        g=np.array([[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]]),
+        l=np.array([[-1.0, -1.0], [-1.0, 3.0], [-1.0, -1.0]]),
+        u=np.array([[1.0, 1.0], [1.0, 4.0], [1.0, 1.0]]),
+        w=np.full((3, 2), np.inf),
+    )
+    assert diagnose(qps).tolist() == [Status.UNBOUNDED, Status.INFEASIBLE, Status.NOT_CONVERGED]

@@ -1,0 +1,534 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
+
+import pytest
+import torch
+from torch import Tensor
+from torch.func import functional_call, grad, jacrev, vmap
+from torch.testing import assert_close
+
+from tests.problems import KnownQP, known_qp, random_mpc, random_states, solution_of
+from torch_qpmpc import QPError, QPSolution, QuadraticProgram, SolverError, Status, solve_qp
+from torch_qpmpc.autograd import solve_op
+from torch_qpmpc.qp import EVENT_SHAPES
+
+OPERANDS = (*EVENT_SHAPES, "fixed")
+#: Without equality rows, whose bounds cannot be moved one at a time.
+SOFT = ("inside", "at_lower", "at_upper", "below", "above", "no_upper", "free")
+HARD = ("inside", "at_lower", "at_upper", "no_upper")
+
+
+def value(*operands: Tensor, solver: str = "daqp", on_failure: str = "raise") -> Tensor:
+    """The optimal value as a function of the tensors named in `OPERANDS`."""
+    qp = QuadraticProgram(*operands[:-1], check_values=False)
+    return solve_qp(qp, operands[-1], solver=solver, on_failure=on_failure).value
+
+
+def operands_of(known: KnownQP, *, differentiable: bool = False) -> list[Tensor]:
+    tensors = (*known.qp.tensors(), known.fixed)
+    return [tensor.clone().requires_grad_(differentiable) for tensor in tensors]
+
+
+def infeasible(known: KnownQP, index: int) -> KnownQP:
+    """The same batch, but one element has hard rows that exclude each other."""
+    qp = known.qp
+    G, w = qp.G.clone(), qp.w.clone()
+    G[index, 1] = G[index, 0]
+    w[index, :2] = torch.inf
+    lb, ub = qp.lb.clone(), qp.ub.clone()
+    lb[index, 0], ub[index, 0] = 1.0, 2.0
+    lb[index, 1], ub[index, 1] = 3.0, 4.0
+    changed = QuadraticProgram(qp.H, qp.q, qp.c, qp.C, qp.b, G, lb, ub, w)
+    return KnownQP(changed, *list(vars(known).values())[1:])
+
+
+# What the gradient is
+
+
+def test_gradient_is_that_of_the_lagrangian_at_the_solution(solver):
+    known = known_qp(0, batch=(4,), matrices=(4,))
+    operands = operands_of(known, differentiable=True)
+    weight = torch.tensor([1.0, -2.0, 0.5, 3.0]).double()
+    value(*operands, solver=solver).backward(weight)
+    z, lam, chi = known.z, known.lam, known.chi
+
+    def outer(left: Tensor, right: Tensor) -> Tensor:
+        return left.unsqueeze(-1) * right.unsqueeze(-2)
+
+    expected = {
+        "H": 0.5 * outer(z, z),
+        "q": z,
+        "c": torch.ones(4).double(),
+        "C": outer(chi, z),
+        "b": -chi,
+        "G": outer(lam, z),
+        "lb": known.upsilon,
+        "ub": -known.eta,
+        "w": known.sigma,
+        "fixed": -known.xi,
+    }
+    for name, operand in zip(OPERANDS, operands, strict=True):
+        weighted = weight.reshape(-1, *(1,) * (operand.ndim - 1)) * expected[name]
+        assert_close(
+            operand.grad, weighted, rtol=1e-4, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}"
+        )
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("name", OPERANDS)
+def test_gradient_agrees_with_finite_differences(name, seed):
+    known = known_qp(seed, batch=(3,), soft=SOFT, hard=HARD)
+    operands = operands_of(known)
+    index = OPERANDS.index(name)
+    generator = torch.Generator().manual_seed(seed)
+    direction = torch.randn(operands[index].shape, generator=generator, dtype=torch.float64)
+    if name == "H":
+        direction = direction + direction.mT
+    weight = torch.tensor([1.0, -2.0, 0.5]).double()
+
+    def along(step: float) -> Tensor:
+        moved = list(operands)
+        moved[index] = operands[index] + step * direction
+        return value(*moved) @ weight
+
+    operands[index].requires_grad_()
+    (gradient,) = torch.autograd.grad(value(*operands) @ weight, operands[index])
+    operands[index].requires_grad_(False)
+    step = 1e-4
+    central = (along(step) - along(-step)) / (2 * step)
+    assert_close((gradient * direction).sum(), central, rtol=1e-5, atol=1e-5)
+    assert central.abs() > 1e-2
+
+
+def test_gradcheck_of_every_operand():
+    kinds = ("inside", "at_lower", "at_upper", "below", "above")
+    known = known_qp(1, n_z=6, n_c=1, n_f=2, soft=kinds, hard=())
+    operands = operands_of(known, differentiable=True)
+    assert torch.autograd.gradcheck(value, operands, eps=1e-5, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("of_action", [False, True])
+def test_gradient_in_state_and_action_agrees_with_finite_differences(of_action):
+    mpc, s, a = random_mpc(0), random_states(6), random_states(6, 1, size=0.4)
+    s.requires_grad_()
+    a.requires_grad_()
+    if of_action:
+        assert torch.autograd.gradcheck(mpc.action_value, (s, a), eps=1e-5, atol=1e-4)
+    else:
+        assert torch.autograd.gradcheck(mpc.value, (s,), eps=1e-5, atol=1e-4)
+
+
+def test_gradient_of_a_shared_tensor_is_the_sum_over_the_batch():
+    known = known_qp(2, batch=(5,))
+    shared = operands_of(known, differentiable=True)
+    separate = operands_of(known_qp(2, batch=(5,)), differentiable=False)
+    for i, name in enumerate(OPERANDS):
+        if name in ("H", "C", "G"):
+            separate[i] = separate[i].expand(5, -1, -1).clone()
+        separate[i].requires_grad_()
+    weight = torch.arange(1, 6).double()
+    value(*shared).backward(weight)
+    value(*separate).backward(weight)
+    for name, one, many in zip(OPERANDS, shared, separate, strict=True):
+        assert one.grad is not None
+        assert many.grad is not None
+        expected = many.grad.sum(0) if name in ("H", "C", "G") else many.grad
+        assert_close(one.grad, expected)
+
+
+def test_batch_dimensions_broadcast_in_value_and_gradient():
+    K, B = 3, 4
+    shapes = {"H": (K, 1), "q": (B,), "c": (K, 1), "C": (1, B), "b": (), "G": (), "w": (K, 1)}
+    known = known_qp(3, soft=("inside", "above", "at_upper"), hard=())
+    generator = torch.Generator().manual_seed(0)
+    operands = []
+    for name, operand in zip(OPERANDS, operands_of(known), strict=True):
+        scale = 0.02 * torch.rand(shapes.get(name, (B,)), generator=generator).double()
+        scale = scale.reshape(*scale.shape, *(1,) * operand.ndim)
+        operands.append(((1 + scale) * operand).requires_grad_())
+    values = value(*operands)
+    assert values.shape == (K, B)
+    values.square().sum().backward()
+
+    loop = [operand.detach().clone().requires_grad_() for operand in operands]
+    for k in range(K):
+        for j in range(B):
+            one = []
+            for name, operand in zip(OPERANDS, loop, strict=True):
+                n_event = len(EVENT_SHAPES.get(name, ("n_f",)))
+                expanded = operand.expand(K, B, *operand.shape[operand.ndim - n_event :])
+                one.append(expanded[k, j])
+            single = value(*one)
+            assert_close(values[k, j], single)
+            single.square().backward()
+    for name, together, alone in zip(OPERANDS, operands, loop, strict=True):
+        assert_close(together.grad, alone.grad, msg=lambda m, n=name: f"{n}: {m}")
+
+
+def test_gradient_is_the_same_whatever_is_kept():
+    known = known_qp(4, batch=(3,))
+    gradients = []
+    for keep in (None, 2, 5):
+        operands = operands_of(known, differentiable=True)
+        qp = QuadraticProgram(*operands[:-1])
+        solution = solve_qp(qp, operands[-1], solver="daqp", keep=keep)
+        solution.value.sum().backward()
+        gradients.append([operand.grad for operand in operands])
+    for other in gradients[1:]:
+        assert_close(other, gradients[0], rtol=1e-5, atol=1e-5)
+
+
+# Unsolved elements
+
+
+@pytest.mark.parametrize("incoming", [1.0, torch.inf, torch.nan])
+def test_an_unsolved_element_has_no_gradient_whatever_comes_in(incoming):
+    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
+    operands = operands_of(known, differentiable=True)
+    values = value(*operands, on_failure="mask")
+    assert values[1] == torch.inf
+    values.backward(torch.tensor([1.0, incoming, 1.0]).double())
+    for name, operand in zip(OPERANDS, operands, strict=True):
+        assert operand.grad is not None
+        assert operand.grad.isfinite().all(), name
+        assert (operand.grad[1] == 0).all(), name
+    assert (operands[0].grad[0] != 0).any()  # pyright: ignore[reportOptionalSubscript] - seen above
+
+
+def test_an_unsolved_element_adds_nothing_to_a_shared_tensors_gradient():
+    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
+    shared = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    operands = operands_of(known)
+    value(*(operand + shared for operand in operands), on_failure="mask").square().sum().backward()
+    assert shared.grad is not None
+    assert shared.grad.isfinite()
+
+
+def test_invalid_elements_have_no_gradient_and_spoil_no_other():
+    known = known_qp(6, batch=(3,), matrices=(3,))
+    operands = operands_of(known)
+    for i in range(len(operands)):
+        spoilt = [operand.clone() for operand in operands]
+        spoilt[i][1].fill_(torch.nan)
+        for operand in spoilt:
+            operand.requires_grad_()
+        values = value(*spoilt, on_failure="mask")
+        assert_close(values, torch.where(torch.arange(3) == 1, torch.inf, known.value))
+        values[values.isfinite()].sum().backward()
+        for operand in spoilt:
+            assert operand.grad is not None
+            assert operand.grad.isfinite().all(), OPERANDS[i]
+
+
+def test_an_unsolved_element_carries_infinite_cost_and_its_fixed_entries():
+    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
+    solution = solve_qp(known.qp, known.fixed, solver="daqp", on_failure="mask")
+    assert solution.solved.tolist() == [True, False, True]
+    assert solution.status[1] == Status.INFEASIBLE
+    assert solution.value[1] == torch.inf
+    assert_close(solution.z[1, :2], known.fixed[1])
+    for name in ("sigma", "chi", "upsilon", "eta", "xi"):
+        assert (getattr(solution, name)[1] == 0).all()
+    assert (solution.z[1, 2:] == 0).all()
+
+
+# What is not differentiable says so
+
+
+def test_differentiating_the_solution_is_refused():
+    known = known_qp(7)
+    operands = operands_of(known, differentiable=True)
+    z = solve_qp(QuadraticProgram(*operands[:-1]), operands[-1], solver="daqp").z
+    with pytest.raises(NotImplementedError, match="gradient of the solution z .* Detach z"):
+        z.sum().backward()
+
+
+@pytest.mark.parametrize("name", [name for name in OPERANDS if name != "c"])
+def test_differentiating_the_value_twice_is_refused(name):
+    operands = operands_of(known_qp(7))
+    operand = operands[OPERANDS.index(name)].requires_grad_()
+    (gradient,) = torch.autograd.grad(value(*operands), operand, create_graph=True)
+    with pytest.raises(NotImplementedError, match="second derivative of the value"):
+        gradient.sum().backward()
+
+
+def test_second_derivatives_by_torch_func_are_refused():
+    mpc, s = random_mpc(0), random_states(1)[0]
+    with pytest.raises(NotImplementedError, match="second derivative of the value"):
+        jacrev(jacrev(mpc.value))(s)
+    with pytest.raises(NotImplementedError, match="gradient of the solution z"):
+        jacrev(mpc.policy)(s)
+
+
+@pytest.mark.parametrize("name", ["sigma", "chi", "upsilon", "eta", "xi", "mu", "residual"])
+def test_the_rest_of_the_solution_is_constant(name):
+    operands = operands_of(known_qp(7), differentiable=True)
+    solution = solve_qp(QuadraticProgram(*operands[:-1]), operands[-1], solver="daqp")
+    assert not getattr(solution, name).requires_grad
+
+
+# torch.func and torch.compile
+
+
+def test_vmap_over_states_equals_the_batch():
+    mpc, s, a = random_mpc(1), random_states(5), random_states(5, 1, size=0.4)
+    assert_close(vmap(mpc.value)(s), mpc.value(s))
+    assert_close(vmap(mpc.action_value)(s, a), mpc.action_value(s, a))
+    assert_close(vmap(mpc.action_value, in_dims=(None, 0))(s[0], a), mpc.action_value(s[:1], a))
+    assert_close(vmap(mpc.value, in_dims=1)(s.mT), mpc.value(s))
+    assert_close(vmap(mpc.policy)(s), mpc.policy(s))
+
+
+def test_nested_vmap_makes_a_grid():
+    mpc, s, a = random_mpc(1), random_states(3), random_states(4, 1, size=0.4)
+    grid = vmap(lambda s: vmap(lambda a: mpc.action_value(s, a))(a))(s)
+    assert_close(grid, mpc.action_value(s.unsqueeze(1), a))
+
+
+@pytest.mark.parametrize("name", OPERANDS)
+def test_vmap_over_one_operand_equals_a_loop(name):
+    known = known_qp(8, batch=(2,), soft=("inside", "above", "at_lower"), hard=())
+    operands = operands_of(known)
+    index = OPERANDS.index(name)
+    scales = torch.tensor([0.95, 1.0, 1.05]).double()
+    stack = torch.stack([scale * operands[index] for scale in scales], dim=-1)
+
+    def of_one(operand: Tensor) -> Tensor:
+        return value(*operands[:index], operand, *operands[index + 1 :])
+
+    expected = torch.stack([of_one(scale * operands[index]) for scale in scales])
+    assert_close(vmap(of_one, in_dims=-1)(stack), expected)
+
+
+def test_per_sample_gradients_equal_a_loop():
+    mpc, s, a = random_mpc(2), random_states(4), random_states(4, 1, size=0.4)
+    parameters = {name: part.detach() for name, part in mpc.named_parameters()}
+
+    def of_one(parameters: dict[str, Tensor], s: Tensor, a: Tensor) -> Tensor:
+        return functional_call(mpc, parameters, (s, a))
+
+    together = vmap(grad(of_one), in_dims=(None, 0, 0))(parameters, s, a)
+    jacobian = jacrev(of_one)(parameters, s, a)
+    for i in range(len(s)):
+        mpc.zero_grad()
+        mpc.action_value(s[i], a[i]).backward()
+        alone = grad(of_one)(parameters, s[i], a[i])
+        for name, parameter in mpc.named_parameters():
+            assert parameter.grad is not None
+            for other in (together[name][i], jacobian[name][i], alone[name]):
+                assert_close(other, parameter.grad)
+
+
+def test_ensembles_of_parameters_are_vmapped():
+    modules, s = [random_mpc(seed) for seed in range(3)], random_states(4)
+    states = [dict(mpc.named_parameters()) for mpc in modules]
+    parameters = {name: torch.stack([state[name] for state in states]) for name in states[0]}
+
+    def of_one(parameters: dict[str, Tensor]) -> Tensor:
+        return functional_call(modules[0], parameters, (s,))
+
+    ensemble = vmap(of_one)(parameters)
+    assert_close(ensemble, torch.stack([mpc.value(s) for mpc in modules]))
+
+
+@pytest.mark.parametrize("of_action", [False, True])
+def test_compiled_without_graph_breaks_equals_eager(of_action):
+    mpc, s, a = random_mpc(3), random_states(4), random_states(4, 1, size=0.4)
+    inputs = (s, a) if of_action else (s,)
+    function: Callable[..., Tensor] = mpc.action_value if of_action else mpc.value
+    gradients, values = [], []
+    for one in (function, torch.compile(function, fullgraph=True, backend="aot_eager")):
+        mpc.zero_grad()
+        out = one(*inputs)
+        out.square().sum().backward()
+        values.append(out.detach())
+        gradients.append({name: part.grad for name, part in mpc.named_parameters()})
+    assert_close(values[1], values[0])
+    assert_close(gradients[1], gradients[0])
+    torch._dynamo.reset()
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_the_operator_keeps_torchs_contract(batch):
+    known = known_qp(9, batch=batch)
+    operands = operands_of(known, differentiable=True)
+    arguments = (*operands, known.z, known.lam, 2, "daqp", "mask")
+    torch.library.opcheck(solve_op, arguments)
+
+
+# What comes out
+
+
+@pytest.mark.parametrize("batch", [(), (0,), (1,), (5,), (2, 3)])
+@pytest.mark.parametrize("of_matrices", [False, True])
+def test_shapes_of_the_solution(batch, of_matrices):
+    known = known_qp(10, batch=batch, matrices=batch if of_matrices else ())
+    solution = solve_qp(known.qp, known.fixed, solver="daqp")
+    for name, part in solution_of(known).items():
+        assert getattr(solution, name).shape == part.shape, name
+    for name in ("status", "residual", "iterations"):
+        assert getattr(solution, name).shape == batch, name
+    assert solution.mu.shape == known.sigma.shape
+
+
+def test_a_constant_cost_of_its_own_makes_a_batch_too():
+    known = known_qp(10)
+    tensors = list(known.qp.tensors())
+    tensors[2] = known.qp.c + torch.arange(3).double()
+    solution = solve_qp(QuadraticProgram(*tensors), known.fixed, solver="daqp")
+    assert_close(solution.value, known.value + torch.arange(3).double())
+    assert solution.z.shape == (3, 12)
+    assert solution.status.shape == (3,)
+
+
+def test_multipliers_of_a_row_sum_to_its_weight():
+    known = known_qp(11, batch=(4,))
+    solution = solve_qp(known.qp, known.fixed, solver="daqp")
+    soft = known.qp.w.isfinite()
+    total = solution.upsilon + solution.eta + solution.mu
+    assert_close(total[soft], known.qp.w[soft])
+    assert (solution.mu[~soft] == torch.inf).all()
+    assert (torch.minimum(solution.upsilon, solution.eta) == 0).all()
+    assert (solution.mu >= -1e-9).all()
+    assert (solution.sigma[~soft] == 0).all()
+
+
+def test_single_precision_in_single_precision_out(solver):
+    known = known_qp(12, batch=(4,), dtype=torch.float32)
+    operands = operands_of(known, differentiable=True)
+    solution = solve_qp(QuadraticProgram(*operands[:-1]), operands[-1], solver=solver)
+    for name, part in solution_of(known).items():
+        assert getattr(solution, name).dtype == torch.float32
+        assert_close(getattr(solution, name), part, rtol=1e-3, atol=1e-3)
+    solution.value.sum().backward()
+    for operand in operands:
+        assert operand.grad is not None
+        assert operand.grad.dtype == torch.float32
+
+
+def test_an_asymmetry_within_the_tolerance_of_single_precision_does_no_harm():
+    H, unit = torch.eye(2), torch.ones(2)
+    H[0, 1] = 8e-6
+    none = torch.zeros(0)
+    qp = QuadraticProgram(
+        H, -100 * unit, torch.zeros(()), none.reshape(0, 2), none, H, -1e9 * unit, 1e9 * unit, unit
+    )
+    assert_close(solve_qp(qp, solver="daqp").z, 100 * unit, rtol=1e-5, atol=0)
+
+
+def test_everything_may_be_fixed():
+    known = known_qp(13, n_c=0, n_f=12, soft=("above", "below", "inside"), hard=("inside",))
+    solution = solve_qp(known.qp, known.fixed, solver="daqp")
+    assert_close(solution.value, known.value)
+    assert_close(solution.z, known.z)
+
+
+# What goes wrong
+
+
+GOOD = known_qp(14, batch=(3,))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"fixed": [1.0, 2.0]}, "fixed: got list, expected a floating-point torch.Tensor"),
+        ({"fixed": torch.ones(2, dtype=torch.int64)}, "fixed: got torch.int64, expected a float"),
+        ({"fixed": torch.tensor(1.0)}, r"fixed: got shape \(\), expected shape \(\*batch, n_f\)"),
+        ({"fixed": torch.ones(13)}, r"fixed: got shape \(13,\), .* with n_f <= n_z = 12"),
+        ({"fixed": torch.ones(4, 2)}, r"fixed: got shape \(4, 2\), .* the QP's batch \(3,\)"),
+        ({"keep": 1}, "keep: got 1, expected n_f = 2 <= keep <= n_z = 12"),
+        ({"keep": 13}, "keep: got 13, expected n_f = 2 <= keep <= n_z = 12"),
+        ({"solver": "prox"}, r"solver: got 'prox', expected one of .* Did you mean 'proxqp'\?"),
+        ({"on_failure": "ignore"}, "on_failure: got 'ignore', expected one of raise, warn, mask"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(QPError, match=message):
+        solve_qp(GOOD.qp, **({"fixed": GOOD.fixed} | arguments))
+
+
+@pytest.mark.parametrize("other", [known_qp(14), known_qp(14, batch=(3,), n_z=11)])
+def test_a_warm_start_of_other_shapes_is_named(other):
+    start = solve_qp(other.qp, other.fixed, solver="daqp")
+    with pytest.raises(QPError, match=r"warm_start: got z and eta of shapes .*same batch of QPs"):
+        solve_qp(GOOD.qp, GOOD.fixed, warm_start=start)
+
+
+@pytest.mark.parametrize("on_failure", ["raise", "warn"])
+def test_failures_are_counted_and_located(on_failure):
+    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
+    b = known.qp.b.clone()
+    b[2] = torch.nan
+    operands = operands_of(known)
+    operands[OPERANDS.index("b")] = b
+    message = (
+        r"2 of 3 QPs have no certified solution. 1 INFEASIBLE, first at batch index \(1,\): .*; "
+        r"soften rows with a finite w.* 1 INVALID_DATA, first at batch index \(2,\): NaN or inf"
+    )
+    if on_failure == "raise":
+        with pytest.raises(SolverError, match=message):
+            value(*operands, on_failure=on_failure)
+    else:
+        with pytest.warns(RuntimeWarning, match=message):
+            values = value(*operands, on_failure=on_failure)
+        assert values.isinf().tolist() == [False, True, True]
+
+
+def test_invalid_data_alone_is_bad_input():
+    operands = operands_of(known_qp(5))
+    operands[OPERANDS.index("lb")].fill_(torch.nan)
+    with pytest.raises(QPError, match="1 of 1 QPs .* 1 INVALID_DATA: NaN or inf in the data"):
+        value(*operands)
+
+
+def test_masked_failures_are_silent(recwarn):
+    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
+    assert value(*operands_of(known), on_failure="mask").isinf().tolist() == [False, True, False]
+    assert not recwarn
+
+
+# Threads and processes
+
+
+def test_threads_that_solve_at_once_get_their_own_answers(solver):
+    problems = [known_qp(seed, batch=(3,)) for seed in range(8)]
+
+    def solve(known: KnownQP) -> QPSolution:
+        return solve_qp(known.qp, known.fixed, solver=solver)
+
+    alone = [solve(known) for known in problems]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(solve, problems))
+    for one, other in zip(alone, together, strict=True):
+        for field in fields(QPSolution):
+            assert_close(getattr(other, field.name), getattr(one, field.name), rtol=1e-7, atol=1e-9)
+
+
+FORK = """
+import os, signal, torch
+from tests.problems import random_mpc, random_states
+
+torch.set_num_threads(2)
+mpc, s = random_mpc(0, solver="proxqp"), random_states(16)
+before = mpc.value(s).detach()
+child = os.fork()
+if child == 0:
+    signal.alarm(30)  # ends the child should it hang
+    same = torch.allclose(mpc.value(s).detach(), before)
+    os._exit(0 if same else 1)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+assert torch.allclose(mpc.value(s).detach(), before)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the platform has no fork")
+def test_a_child_forked_after_a_parallel_solve_solves_too():
+    root = os.path.dirname(os.path.dirname(__file__))
+    subprocess.run([sys.executable, "-c", FORK], check=True, timeout=90, cwd=root)

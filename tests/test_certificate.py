@@ -1,0 +1,201 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp
+from torch_qpmpc import QuadraticProgram
+from torch_qpmpc.certificate import TOLERANCE, Certificate, certify
+from torch_qpmpc.condense import FlatPrograms
+
+BATCH, SPOILT = 5, 2
+N_Z, N_C, N_F = 12, 3, 2
+
+
+def judge(known: KnownQP, **claim: Tensor) -> Certificate:
+    """The certificate of the exact solution, but for what ``claim`` says."""
+    programs, _ = FlatPrograms.of(*known.qp.tensors(), known.fixed)
+    parts = (claim.get(name, getattr(known, name)) for name in ("z", "lam", "chi", "xi"))
+    return certify(programs, *(part.reshape(len(programs), -1) for part in parts))
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_solutions_are_accepted(seed, matrices):
+    known = known_qp(seed, batch=(BATCH,), matrices=matrices)
+    certificate = judge(known)
+    assert certificate.residual.max() < 1e-12
+    assert_close(certificate.value, known.value)
+    assert_close(certificate.sigma, known.sigma)
+
+
+@pytest.mark.parametrize("rank", [0, 3])
+def test_exact_solutions_of_degenerate_costs_are_accepted(rank):
+    assert judge(known_qp(0, batch=(BATCH,), rank=rank)).residual.max() < 1e-12
+
+
+def first_row(known: KnownQP, condition: Tensor) -> int:
+    """The first row of the spoilt element where the condition holds."""
+    return int(condition[SPOILT].nonzero()[0, 0])
+
+
+def shifted(tensor: Tensor, entry: int, by: float) -> Tensor:
+    out = tensor.clone()
+    out[SPOILT, entry] += by
+    return out
+
+
+def without_sign(known: KnownQP) -> dict[str, Tensor]:
+    lam = known.lam.clone()
+    lam[SPOILT] *= -1
+    return {"lam": lam}
+
+
+SPOILERS: dict[str, Callable[[KnownQP], dict[str, Tensor]]] = {
+    "z moved off C z = b": lambda known: {"z": shifted(known.z, N_Z - 1, 1e-3)},
+    "fixed entry moved": lambda known: {"z": shifted(known.z, 0, 1e-3)},
+    "lam's sign flipped": without_sign,
+    "one multiplier changed": lambda known: {
+        "lam": shifted(known.lam, first_row(known, known.lam != 0), 1e-3)
+    },
+    "inside row with a multiplier": lambda known: {
+        "lam": shifted(known.lam, first_row(known, known.lam == 0), 1e-3)
+    },
+    "chi wrong": lambda known: {"chi": shifted(known.chi, 1, 1e-3)},
+    "xi wrong": lambda known: {"xi": shifted(known.xi, 1, 1e-3)},
+    "NaN in z": lambda known: {"z": shifted(known.z, 3, torch.nan)},
+    "infinite multiplier": lambda known: {"lam": shifted(known.lam, 3, torch.inf)},
+}
+
+
+@pytest.mark.parametrize("name", SPOILERS)
+def test_one_wrong_part_is_rejected_and_only_there(name):
+    known = known_qp(1, batch=(BATCH,))
+    residual = judge(known, **SPOILERS[name](known)).residual
+    assert residual[SPOILT] > 10 * TOLERANCE
+    assert not residual.isnan().any()
+    others = torch.arange(BATCH) != SPOILT
+    assert residual[others].max() < 1e-12
+
+
+def consistent(known: KnownQP, z: Tensor, lam: Tensor, **bounds: Tensor) -> Certificate:
+    """Judge z and lam with q and b adapted, so that only the rows can be wrong."""
+    H, _, c, C, _, G, lb, ub, w = known.qp.tensors()
+
+    def times(matrix: Tensor, vector: Tensor) -> Tensor:
+        return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+    q = -(times(H, z) + times(G.mT, lam) + times(C.mT, known.chi))
+    q[:, :N_F] -= known.xi
+    lb, ub = bounds.get("lb", lb), bounds.get("ub", ub)
+    qp = QuadraticProgram(H, q, c, C, times(C, z), G, lb, ub, w, check_values=False)
+    programs, _ = FlatPrograms.of(*qp.tensors(), z[:, :N_F])
+    return certify(programs, z, lam, known.chi, known.xi)
+
+
+def where(known: KnownQP, kinds: tuple[str, ...], *, hard: bool) -> Tensor:
+    """Which rows are of these kinds, by what the multipliers, slacks and bounds say."""
+    qp, y = known.qp, known.z @ known.qp.G.mT
+    is_kind = {
+        "inside": (known.lam == 0) & qp.lb.isfinite() & qp.ub.isfinite(),
+        "at_upper": (known.lam > 0) & (y - qp.ub).abs().lt(1e-9) & (qp.lb < qp.ub),
+        "at_lower": (known.lam < 0) & (y - qp.lb).abs().lt(1e-9) & (qp.lb < qp.ub),
+        "above": (known.sigma > 0) & (known.lam > 0),
+        "no_upper": (known.lam == 0) & qp.lb.isfinite() & qp.ub.isinf(),
+    }
+    return torch.stack([is_kind[kind] for kind in kinds]).any(0) & (qp.w.isinf() == hard)
+
+
+@pytest.mark.parametrize(
+    ("kind", "hard", "change"),
+    [
+        ("inside", True, 0.05),  # a multiplier where there is room
+        ("at_upper", True, -12.0),  # pulls away from its own bound
+        ("at_lower", False, 12.0),
+        ("above", False, 0.05),  # more than the slack's weight
+        ("above", False, -0.05),  # less than it, though violated
+        ("no_upper", True, 0.05),  # of a bound that does not exist
+        ("no_upper", False, 0.05),
+    ],
+)
+def test_multipliers_that_do_not_fit_their_rows_are_rejected(kind, hard, change):
+    known = known_qp(2, batch=(BATCH,))
+    row = first_row(known, where(known, (kind,), hard=hard))
+    residual = consistent(known, known.z, shifted(known.lam, row, change)).residual
+    assert residual[SPOILT] > 10 * TOLERANCE
+    assert residual[torch.arange(BATCH) != SPOILT].max() < 1e-12
+
+
+@pytest.mark.parametrize("hard", [False, True])
+def test_a_multiplier_without_its_bound_active_is_rejected(hard):
+    known = known_qp(3, batch=(BATCH,))
+    row = first_row(known, where(known, ("at_upper",), hard=hard))
+    ub = shifted(known.qp.ub, row, 1e-3)
+    residual = consistent(known, known.z, known.lam, ub=ub).residual
+    assert residual[SPOILT] > 10 * TOLERANCE
+    assert residual[torch.arange(BATCH) != SPOILT].max() < 1e-12
+
+
+def test_a_violated_hard_row_is_rejected_and_a_soft_one_is_not():
+    for hard in (True, False):
+        known = known_qp(4, batch=(BATCH,))
+        row = first_row(known, where(known, ("inside",), hard=hard))
+        y = known.z @ known.qp.G.mT
+        ub = known.qp.ub.clone()
+        ub[SPOILT, row] = y[SPOILT, row] - 1e-3
+        weight = 0.0 if hard else float(known.qp.w[SPOILT, row])
+        certificate = consistent(known, known.z, shifted(known.lam, row, weight), ub=ub)
+        assert (certificate.residual[SPOILT] > 10 * TOLERANCE) == hard
+        assert_close(certificate.sigma[SPOILT, row].item(), 0.0 if hard else 1e-3)
+
+
+def test_complementarity_gaps_of_opposite_sign_do_not_cancel():
+    # min 1/2 z'z + q'z with z <= 0: the first row is violated, by less than the tolerance, and
+    # the second has room; lam'(ub - z), the summed gap, is zero.
+    z = torch.tensor([[5e-7, -5e-7]]).double()
+    lam = torch.tensor([[1e3, 1e3]]).double()
+    unit, none = torch.eye(2).double(), torch.zeros(0).double()
+    programs, _ = FlatPrograms.of(
+        unit,
+        -(z[0] + lam[0]),
+        torch.zeros(()),
+        none.reshape(0, 2),
+        none,
+        unit,
+        -torch.ones(2),
+        torch.zeros(2),
+        torch.full((2,), torch.inf),
+        none,
+    )
+    assert abs((lam * (0 - z)).sum()) < 1e-12
+    empty = z[:, :0]
+    assert certify(programs, z, lam, empty, empty).residual > 10 * TOLERANCE
+    assert certify(programs, 0 * z, lam, empty, empty).residual < TOLERANCE
+
+
+def test_the_constant_is_part_of_the_value_but_loosens_nothing():
+    known = known_qp(5, batch=(BATCH,))
+    tensors = list(known.qp.tensors())
+    tensors[2] = known.qp.c + 1e9
+    lifted = KnownQP(QuadraticProgram(*tensors), *list(vars(known).values())[1:])
+    claim = {"lam": shifted(known.lam, first_row(known, known.lam == 0), 1e-3)}
+    assert_close(judge(lifted).value, known.value + 1e9)
+    assert_close(judge(lifted, **claim).residual, judge(known, **claim).residual)
+
+
+@pytest.mark.parametrize("missing", ["rows", "equalities", "fixed", "all"])
+def test_parts_of_a_program_may_be_missing(missing):
+    known = known_qp(
+        6,
+        batch=(BATCH,),
+        soft=() if missing in ("rows", "all") else SOFT_ROWS,
+        hard=() if missing in ("rows", "all") else HARD_ROWS,
+        n_c=0 if missing in ("equalities", "all") else N_C,
+        n_f=0 if missing in ("fixed", "all") else N_F,
+    )
+    assert judge(known).residual.max() < 1e-12
+    assert judge(known, z=shifted(known.z, 5, 1e-3)).residual[SPOILT] > 10 * TOLERANCE

@@ -1,0 +1,216 @@
+"""Every key has a rule, every rule a key, and every key a reader; each bad value has its sentence."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+import train
+from tests.runs import CONFIGS, SMALL, choices, make_config
+from torch_qpmpc import QPError
+from torch_qpmpc.config import OPTIONAL, RULES, check_config, flatten
+from torch_qpmpc.tracking import RunFolder
+
+GROUPS = sorted(path.name for path in CONFIGS.iterdir() if path.is_dir())
+
+
+def keys_of_the_files() -> set[str]:
+    """Dotted keys of every file in configs/, but for Hydra's own."""
+    keys = set()
+    for path in CONFIGS.rglob("*.yaml"):
+        tree = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+        assert isinstance(tree, dict)
+        group = "" if path.parent == CONFIGS else f"{path.parent.name}"
+        keys |= set(flatten({k: v for k, v in tree.items() if k not in ("defaults", "hydra")}, group))
+    return keys
+
+
+def test_each_key_has_a_rule_and_each_rule_a_key():
+    assert keys_of_the_files() - set(OPTIONAL) == set(RULES)
+
+
+class Recorder:
+    """A configuration that notes which of its leaves are read."""
+
+    def __init__(self, cfg: DictConfig, seen: set[str], prefix: str = "") -> None:
+        self.__dict__.update(_cfg=cfg, _seen=seen, _prefix=prefix)
+
+    def __getattr__(self, name: str) -> Any:
+        key, value = f"{self._prefix}{name}", self._cfg[name]
+        if isinstance(value, DictConfig):
+            return Recorder(value, self._seen, f"{key}.")
+        self._seen.add(key)
+        return value
+
+    __getitem__ = __getattr__
+
+    def keys(self) -> list[Any]:
+        return list(self._cfg)
+
+
+def test_each_key_is_read(tmp_path, monkeypatch):
+    """By a run, or by the names of the run's folder."""
+    cfg = make_config(*SMALL, "constraint=combined", "delay_value=true", "constraint.si.windows=4")
+    seen: set[str] = set()
+    # These two read everything at once, which proves nothing.
+    monkeypatch.setattr(train, "check_config", lambda _: None)
+    monkeypatch.setattr(train, "RunFolder", lambda folder, _: RunFolder(folder, cfg))
+    train.train(Recorder(cfg, seen), str(tmp_path))  # pyright: ignore[reportArgumentType]
+    text = (CONFIGS / "config.yaml").read_text(encoding="utf-8").partition("hydra:")[2]
+    seen |= set(re.findall(r"\$\{([\w.]+)\}", text))
+    assert seen == set(RULES)
+
+
+@pytest.mark.parametrize("names", list(itertools.product(*map(choices, GROUPS))))
+def test_each_choice_of_groups_is_accepted(names):
+    check_config(make_config(*(f"{g}={n}" for g, n in zip(GROUPS, names, strict=True))))
+
+
+WHOLE = [0, -1, 1.5, True, "three", None, math.nan]
+REAL = [-1.0, math.nan, math.inf, True, "much", None]
+FRACTION = [0, -0.5, 1.1, math.nan, False, "half", None]
+FLAG = [0, 1, "yes", None]
+NAME = [3, True, None]
+BAD: dict[str, list[Any]] = {
+    "seed": WHOLE[1:],
+    "solver": NAME,
+    "exploration_std": REAL,
+    "td_error_clip": [0, *REAL[:-1]],
+    "delay_value": FLAG,
+    "target_rate": FRACTION,
+    "penalty_step": ["newton", *NAME],
+    "task.name": ["pendulum", *NAME],
+    "task.gamma": FRACTION,
+    "task.hessian": ["dense", *NAME],
+    "task.learn_cost": ["H", ["H", "C"], ["h"], [["H"]], None, 3],
+    "task.state_slack": [*REAL[:2], *REAL[3:]],
+    "task.action_slack": [*REAL[:2], *REAL[3:]],
+    "task.discount_slack": FLAG,
+    "noise.name": ["pink", *NAME],
+    "noise.std": REAL,
+    "constraint.name": NAME,
+    "constraint.learn": ["C", ["C", "H"], ["c"], [{"C": 1}], None, 3],
+    "constraint.si.normalised": FLAG,
+    "optimizer.name": ["rmsprop", *NAME],
+    "optimizer.betas": [0.9, [0.9], [0.9, 1.0], [-0.1, 0.9], ["a", "b"], [0.9] * 3, None],
+    "optimizer.final_fraction": FRACTION,
+}
+for _name in ("updates", "batch_size", "num_envs", "steps_per_update", "warmup_steps"):
+    BAD[_name] = WHOLE
+for _name in ("replay_capacity", "eval_interval", "log_interval", "constraint.si.windows"):
+    BAD[_name] = WHOLE
+for _name in ("task.horizon", "task.episode_steps"):
+    BAD[_name] = WHOLE
+for _name in ("lr_cost", "lr_constraints"):
+    BAD[f"optimizer.{_name}"] = REAL
+for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.growth", "si.beta"):
+    BAD[f"constraint.{_name}"] = REAL
+
+
+@pytest.mark.parametrize("key", RULES)
+def test_impossible_values_are_rejected_by_name(key):
+    assert key in BAD, "a new rule: add what it rejects"
+    good = make_config("constraint=combined", "optimizer=adam")
+    for value in BAD[key]:
+        cfg = good.copy()
+        OmegaConf.update(cfg, key, value)
+        sentence = f"{key}: got {value!r}, expected {RULES[key][1]}."
+        with pytest.raises(QPError, match=f"^{re.escape(sentence)}"):
+            check_config(cfg)
+
+
+def test_rules_accept_the_edges():
+    cfg = make_config(
+        "constraint=combined",
+        "seed=0",
+        "updates=1",
+        "td_error_clip=null",
+        "exploration_std=0",
+        "target_rate=1",
+        "task.gamma=1",
+        "task.state_slack=inf",
+        "task.learn_cost=[]",
+        "noise.std=0",
+        "constraint.deviation.c_2=0",
+        "constraint.si.beta=0",
+        "optimizer.lr_cost=0",
+        "optimizer.betas=[0,0]",
+    )
+    check_config(cfg)
+
+
+@pytest.mark.parametrize(
+    ("key", "remedy"),
+    [
+        ("batchsize", "Did you mean batch_size?"),
+        ("task.horizn", "Did you mean task.horizon?"),
+        ("constraint.deviaton.c_1", "Did you mean constraint.deviation.c_1?"),
+        ("zzz", "See configs/config.yaml."),
+    ],
+)
+def test_unknown_keys(key, remedy):
+    cfg = make_config()
+    OmegaConf.update(cfg, key, 3, force_add=True)
+    sentence = f"{key}: got an unknown key, expected a key of configs/. {remedy}"
+    with pytest.raises(QPError, match=re.escape(sentence)):
+        check_config(cfg)
+
+
+@pytest.mark.parametrize("key", [*RULES, *OPTIONAL, "optimizer", "task", "noise", "constraint"])
+def test_missing_keys(key):
+    cfg = make_config("constraint=combined", "optimizer=adam")
+    owner, _, leaf = key.rpartition(".")
+    OmegaConf.set_struct(cfg, False)
+    del (OmegaConf.select(cfg, owner) if owner else cfg)[leaf]
+    with pytest.raises(QPError, match=rf"^{re.escape(key)}(\.\w+)*: got nothing, expected \w+"):
+        check_config(cfg)
+
+
+def test_betas_are_adams():
+    cfg = make_config("optimizer=sgd")
+    assert "betas" not in cfg.optimizer
+    check_config(cfg)
+
+
+def test_solver_must_be_known():
+    with pytest.raises(QPError, match="solver: got 'cplex'"):
+        check_config(make_config("solver=cplex"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["constraint.learn=[b]"], r"constraint.learn: got \['b'\], expected C among them"),
+        (
+            ["constraint=deviation", "constraint.learn=[]"],
+            r"constraint.learn: got \[\], expected C .* Set the penalty to null, or learn C",
+        ),
+        (
+            ["constraint=si", "task.episode_steps=5"],
+            r"task.episode_steps: got 5, expected at least task.horizon = 10",
+        ),
+        (
+            ["constraint=si", "warmup_steps=7"],
+            r"warmup_steps: got 7, expected at least task.horizon = 10",
+        ),
+        (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
+    ],
+)
+def test_values_that_do_not_fit_each_other(overrides, message):
+    with pytest.raises(QPError, match=message):
+        check_config(make_config(*overrides))
+
+
+def test_short_episodes_do_without_the_si_penalty():
+    check_config(make_config("constraint=free", "task.episode_steps=5", "warmup_steps=1"))
+
+
+def test_flatten():
+    tree = {"a": 1, "b": {"c": [1, 2], "d": {"e": None}}}
+    assert flatten(tree) == {"a": 1, "b.c": [1, 2], "b.d.e": None}
+    assert flatten({"e": None}, "b.d") == {"b.d.e": None}

@@ -1,0 +1,320 @@
+"""The QP in TorchRL's clothes: signs, shapes, shared parameters, and use in its losses."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import (
+    ActorCriticWrapper,
+    AdditiveGaussianModule,
+    ProbabilisticActor,
+    TanhNormal,
+)
+from torchrl.objectives import DDPGLoss, IQLLoss
+
+from torch_qpmpc import QPMPC, QPActorValueOperator
+from torch_qpmpc.envs import PointMass, PointMassEnv
+
+BATCHES = [(), (3,), (2, 3)]
+
+
+def make_mpc(**options: Any) -> QPMPC:
+    settings = {
+        "state_bounds": ([-1.0, -1.0], [1.0, 1.0]),
+        "action_bounds": ([-1.0], [1.0]),
+        "stage_weight": [1.0, 0.5, 0.1],
+        "solver": "daqp",
+    } | options
+    return QPMPC.from_model([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], 3, **settings)
+
+
+def make_inputs(*batch: int, dtype: torch.dtype = torch.float64) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+    s = 2 * torch.rand(*batch, 2, generator=generator) - 1
+    a = 2 * torch.rand(*batch, 1, generator=generator) - 1
+    return TensorDict(observation=s.to(dtype), action=a.to(dtype), batch_size=batch)
+
+
+def make_transitions(count: int) -> TensorDict:
+    td, following = make_inputs(count, dtype=torch.float32), make_inputs(count).flip(0)
+    td["next"] = TensorDict(
+        observation=following["observation"].float(),
+        reward=torch.linspace(-2, -1, count).unsqueeze(-1),
+        done=torch.zeros(count, 1, dtype=torch.bool),
+        terminated=torch.zeros(count, 1, dtype=torch.bool),
+        batch_size=[count],
+    )
+    return td
+
+
+@torch.no_grad()
+def change(mpc: QPMPC) -> None:
+    """Another QP, in place. (Scaling rows of C would not be one.)"""
+    mpc.C *= torch.linspace(0.5, 1.5, mpc.n_z)
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_values_are_minus_the_costs_to_go(batch, dtype):
+    mpc = make_mpc()
+    operator, td = QPActorValueOperator(mpc), make_inputs(*batch, dtype=dtype)
+    V, Q = mpc.value(td["observation"]), mpc.action_value(td["observation"], td["action"])
+    assert (V > 0).all(), "the sign is seen"
+    critic, value = operator.get_critic_operator(), operator.get_value_operator()
+    assert torch.equal(critic(td)["state_action_value"], -Q.unsqueeze(-1))
+    assert torch.equal(value(td)["state_value"], -V.unsqueeze(-1))
+    assert td["state_value"].shape == td["state_action_value"].shape == (*batch, 1)
+    assert td["state_value"].dtype == td["state_action_value"].dtype == dtype
+    assert (td["state_action_value"] < td["state_value"]).all(), "V is the best of Q"
+
+    state = td.select("observation")
+    best = operator.get_policy_operator()(state)["action"]
+    assert torch.equal(best, mpc.policy(td["observation"]))
+    assert best.shape == (*batch, 1)
+    assert best.dtype == dtype
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-9
+    torch.testing.assert_close(
+        critic(state)["state_action_value"], td["state_value"], rtol=tolerance, atol=tolerance
+    )
+
+
+def test_keys():
+    operator = QPActorValueOperator(make_mpc())
+    policy, value = operator.get_policy_operator(), operator.get_value_operator()
+    assert operator.get_critic_operator() is operator
+    assert (operator.in_keys, operator.out_keys) == (
+        ["observation", "action"],
+        ["state_action_value"],
+    )
+    assert (policy.in_keys, policy.out_keys) == (["observation"], ["action"])
+    assert (value.in_keys, value.out_keys) == (["observation"], ["state_value"])
+
+
+def test_nested_keys():
+    mpc, td = make_mpc(), make_inputs(3)
+    operator = QPActorValueOperator(
+        mpc,
+        observation_key=("agent", "s"),
+        action_key=("agent", "a"),
+        state_value_key=("critic", "v"),
+        state_action_value_key="q",
+    )
+    data = TensorDict({"agent": {"s": td["observation"]}}, batch_size=[3])
+    for view in (operator.get_policy_operator(), operator, operator.get_value_operator()):
+        view(data)
+    s = td["observation"]
+    assert torch.equal(data["agent", "a"], mpc.policy(s))
+    assert torch.equal(data["q"], -mpc.action_value(s, data["agent", "a"]).unsqueeze(-1))
+    assert torch.equal(data["critic", "v"], -mpc.value(s).unsqueeze(-1))
+
+
+def test_dispatch():
+    operator, td = QPActorValueOperator(make_mpc()), make_inputs(3)
+    s, a = td["observation"], td["action"]
+    expected = operator(td)["state_action_value"]
+    assert torch.equal(operator(s, a), expected)
+    assert torch.equal(operator(observation=s, action=a), expected)
+    policy, value = operator.get_policy_operator(), operator.get_value_operator()
+    assert torch.equal(policy(s), operator.module.policy(s))
+    assert torch.equal(value(observation=s), -operator.module.value(s).unsqueeze(-1))
+    assert torch.equal(value(s[0]), value(s)[0])
+
+
+def evaluate(operator: QPActorValueOperator, td: TensorDict) -> list[torch.Tensor]:
+    views = (operator, operator.get_value_operator(), operator.get_policy_operator())
+    # The policy last, as it writes the action.
+    data = td.clone()
+    return [view(data)[view.out_keys[0]].detach().clone() for view in views]
+
+
+def test_views_share_the_parameters():
+    mpc, td = make_mpc(), make_inputs(4)
+    operator = QPActorValueOperator(mpc)
+    views = [operator, operator.get_value_operator(), operator.get_policy_operator()]
+    for view in views:
+        assert view.module is mpc
+        assert [id(p) for p in view.parameters()] == [id(p) for p in mpc.parameters()]
+    before = evaluate(operator, td)
+    change(operator.get_policy_operator().module)
+    after = evaluate(operator, td)
+    assert all((x - y).abs().max() > 1e-3 for x, y in zip(before, after, strict=True))
+
+
+def test_one_set_of_parameters_drives_every_view():
+    """As a target network's do: through `to_module`, for Q, V and the policy alike."""
+    mpc, td = make_mpc(), make_inputs(4)
+    operator, other = QPActorValueOperator(mpc), QPActorValueOperator(copy.deepcopy(mpc))
+    change(other.module)
+    params = TensorDict.from_module(other, as_module=True)
+    expected, before = evaluate(other, td), evaluate(operator, td)
+    views = (operator, operator.get_value_operator(), operator.get_policy_operator())
+    for view, x, y in zip(views, expected, before, strict=True):
+        with params.to_module(view):
+            assert torch.equal(view(td.clone())[view.out_keys[0]], x)
+        assert torch.equal(view(td.clone())[view.out_keys[0]], y), "put back afterwards"
+        assert not torch.equal(x, y)
+
+
+@pytest.mark.parametrize("how", ["deepcopy", "pickle", "state_dict"])
+def test_copies(how):
+    operator, td = QPActorValueOperator(make_mpc()), make_inputs(4)
+    change(operator.module)
+    if how == "deepcopy":
+        twin = copy.deepcopy(operator)
+    elif how == "pickle":
+        twin = pickle.loads(pickle.dumps(operator))
+    else:
+        twin = QPActorValueOperator(make_mpc())
+        twin.load_state_dict(operator.state_dict())
+    expected = evaluate(operator, td)
+    change(operator.module)
+    assert all(torch.equal(x, y) for x, y in zip(evaluate(twin, td), expected, strict=True))
+
+
+def test_gradients_pass_through_the_critic():
+    td = make_inputs(4)
+    td["observation"].requires_grad_()
+    td["action"].requires_grad_()
+    mpc = make_mpc()
+    QPActorValueOperator(mpc)(td)["state_action_value"].sum().backward()
+    Q = mpc.action_value(td["observation"], td["action"]).sum()
+    ds, da = torch.autograd.grad(-Q, (td["observation"], td["action"]))
+    torch.testing.assert_close(td["observation"].grad, ds)
+    torch.testing.assert_close(td["action"].grad, da)
+    assert da.norm() > 0
+
+
+# --- In TorchRL's collectors and losses ----------------------------------------------------------
+
+
+def make_point_mass() -> tuple[QPMPC, PointMassEnv]:
+    physics = PointMass()
+    mpc = QPMPC.from_model(
+        physics.A,
+        physics.B,
+        3,
+        action_bounds=(physics.lb_a, physics.ub_a),
+        stage_weight=torch.tensor([6, 6, 0.5, 0.5, 0.1, 0.1]),
+        solver="daqp",
+    )
+    return mpc, PointMassEnv(4, physics, max_steps=10, seed=0)
+
+
+@pytest.mark.parametrize("explore", [False, True])
+def test_policy_in_a_collector(explore):
+    mpc, env = make_point_mass()
+    torch.manual_seed(0)
+    noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
+    policy = TensorDictSequential(QPActorValueOperator(mpc).get_policy_operator(), noise)
+    collector = Collector(
+        env,
+        policy,
+        frames_per_batch=12,
+        total_frames=24,
+        exploration_type=ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC,
+        auto_register_policy_transforms=False,
+    )
+    for batch in collector:
+        assert batch.shape == (4, 3)
+        assert batch["action"].dtype == torch.float32
+        assert not batch["action"].requires_grad
+        assert batch["action"].abs().max() <= 1
+        close = torch.isclose(batch["action"], mpc.policy(batch["observation"]), atol=1e-6)
+        assert not close.all() if explore else close.all()
+    collector.shutdown()
+
+
+def test_policy_in_a_rollout_follows_the_parameters():
+    mpc, env = make_point_mass()
+    policy = QPActorValueOperator(mpc).get_policy_operator()
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        before = env.rollout(3, policy)
+        change(mpc)
+        env.set_seed(0)
+        after = env.rollout(3, policy)
+    torch.testing.assert_close(after["action"], mpc.policy(after["observation"]))
+    assert not torch.allclose(before["action"][:, -1], after["action"][:, -1])
+
+
+def test_actor_critic_wrapper():
+    operator, td = QPActorValueOperator(make_mpc()), make_inputs(4)
+    both = ActorCriticWrapper(operator.get_policy_operator(), operator.get_critic_operator())
+    s = td["observation"]
+    out = both(TensorDict(observation=s, batch_size=[4]))
+    torch.testing.assert_close(
+        out["state_action_value"], operator.get_value_operator()(s), rtol=1e-9, atol=1e-9
+    )
+    assert len(list(both.parameters())) == len(list(operator.parameters()))
+
+
+def all_have_gradients(module: nn.Module) -> bool:
+    return all(p.grad is not None and p.grad.isfinite().all() for p in module.parameters())
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+def test_critic_in_ddpg_with_a_network_as_actor():
+    """The actor climbs -Q along dQ/da = -zeta."""
+    torch.manual_seed(0)
+    operator, td = QPActorValueOperator(make_mpc()), make_transitions(5)
+    net = nn.Sequential(nn.Linear(2, 1), nn.Tanh())
+    actor = TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
+    loss = DDPGLoss(actor, operator)
+    loss.make_value_estimator(gamma=0.9)
+    out = loss(td)
+    a = net(td["observation"])
+    Q = operator.module.action_value(td["observation"], a)
+    expected = torch.autograd.grad(Q.mean(), list(net.parameters()))
+    torch.testing.assert_close(out["loss_actor"], Q.mean())
+    (out["loss_actor"] + out["loss_value"]).backward()
+    assert all_have_gradients(operator)
+    for parameter, gradient in zip(net.parameters(), expected, strict=True):
+        assert gradient.norm() > 0
+        torch.testing.assert_close(parameter.grad, gradient)
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+def test_policy_as_the_actor_of_ddpg_says_what_is_missing():
+    operator, td = QPActorValueOperator(make_mpc()), make_transitions(5)
+    loss = DDPGLoss(operator.get_policy_operator(), copy.deepcopy(operator))
+    loss.make_value_estimator(gamma=0.9)
+    out = loss(td)
+    out["loss_value"].backward(retain_graph=True)
+    with pytest.raises(NotImplementedError, match="the gradient of the solution z"):
+        out["loss_actor"].backward()
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+def test_critics_and_value_in_iql():
+    """Two critics under vmap beside the value, all of them QPs, with a network as the policy."""
+    torch.manual_seed(0)
+    operator, td = QPActorValueOperator(make_mpc()), make_transitions(5)
+    critics = [copy.deepcopy(operator), copy.deepcopy(operator)]
+    change(critics[1].module)
+    net = nn.Sequential(nn.Linear(2, 2), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+    )
+    loss = IQLLoss(
+        actor,
+        qvalue_network=critics,  # pyright: ignore[reportArgumentType] - a list is accepted
+        value_network=operator.get_value_operator(),
+        num_qvalue_nets=2,
+    )
+    loss.make_value_estimator(gamma=0.9)
+    out = loss(td)
+    sum(value for key, value in out.items() if key.startswith("loss_")).backward()
+    assert all_have_gradients(loss)
+    stacked = loss.qvalue_network_params["module", "C"]
+    assert stacked.shape == (2, *operator.module.C.shape)
+    assert (stacked.grad.flatten(1).norm(dim=1) > 0).all()
