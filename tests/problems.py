@@ -9,10 +9,22 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc import QPMPC, QuadraticProgram
+from torch_qpmpc.condense import FlatPrograms
 
 #: What a row does at the solution: strictly inside, at a bound, or beyond one (then it is soft).
 SOFT_ROWS = ("inside", "at_lower", "at_upper", "below", "above", "equality", "no_upper", "free")
 HARD_ROWS = ("inside", "at_lower", "at_upper", "equality", "no_upper")
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    """Standard normal entries."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+
+def times(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Matrix-vector products over any batch dimensions."""
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
 @dataclass(frozen=True)
@@ -59,7 +71,7 @@ def known_qp(
     """
     generator = torch.Generator().manual_seed(seed)
 
-    def normal(*shape: int) -> Tensor:
+    def gauss(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator, dtype=torch.float64)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -72,20 +84,20 @@ def known_qp(
     def which(*kinds: str) -> Tensor:
         return torch.tensor([kind in kinds for kind, _ in rows], dtype=torch.bool)[order]
 
-    factor = normal(*matrices, n_z, n_z if rank is None else rank)
+    factor = gauss(*matrices, n_z, n_z if rank is None else rank)
     H = factor @ factor.mT / n_z
     if rank is None:
         H = H + torch.eye(n_z, dtype=torch.float64)
-    C = normal(*matrices, n_c, n_z) if C is None else C
-    G = normal(*matrices, n_g, n_z)
+    C = gauss(*matrices, n_c, n_z) if C is None else C
+    G = gauss(*matrices, n_g, n_z)
 
-    z, chi, xi = normal(*batch, n_z), normal(*batch, C.shape[-2]), normal(*batch, n_f)
-    y = (G @ z.unsqueeze(-1)).squeeze(-1)
+    z, chi, xi = gauss(*batch, n_z), gauss(*batch, C.shape[-2]), gauss(*batch, n_f)
+    y = times(G, z)
     is_hard = torch.tensor([hard for _, hard in rows], dtype=torch.bool)[order]
     w = uniform(0.5, 1.5, *batch, n_g).mul(weight).masked_fill(is_hard, torch.inf)
 
     sign = which("at_upper", "above").double() - which("at_lower", "below").double()
-    sign = torch.where(which("equality"), normal(*batch, n_g).sign(), sign)
+    sign = torch.where(which("equality"), gauss(*batch, n_g).sign(), sign)
     share = torch.where(which("below", "above"), 1.0, uniform(0.2, 0.8, *batch, n_g))
     lam = sign * share * torch.where(is_hard, weight, w)
     gap, beyond = uniform(0.5, 2.0, *batch, n_g), uniform(0.1, 1.0, *batch, n_g)
@@ -100,20 +112,22 @@ def known_qp(
     ub = ub.masked_fill(which("free", "no_upper"), torch.inf)
     sigma = torch.where(which("below", "above"), beyond, 0.0)
 
-    def times(matrix: Tensor, vector: Tensor) -> Tensor:
-        return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
-
     gradient = times(H, z) + times(G.mT, lam) + times(C.mT, chi)
     gradient[..., :n_f] += xi
-    q, c = -gradient, normal(*batch)
+    q, c = -gradient, gauss(*batch)
     value = 0.5 * (z * times(H, z)).sum(-1) + (q * z).sum(-1) + c
     value = value + (w.masked_fill(is_hard, 0.0) * sigma).sum(-1)
-    data = (H, q, c, C, times(C, z), G, lb, ub, w)
+    H, q, c, C, b, G, lb, ub, w = (x.to(dtype) for x in (H, q, c, C, times(C, z), G, lb, ub, w))
     return KnownQP(
-        QuadraticProgram(*(tensor.to(dtype) for tensor in data)),
+        QuadraticProgram(H, q, c, C, b, G, lb, ub, w),
         z[..., :n_f].to(dtype),
         *(tensor.to(dtype) for tensor in (value, z, sigma, chi, lam, xi)),
     )
+
+
+def programs_of(known: KnownQP) -> FlatPrograms:
+    """The known QP as the solvers get it."""
+    return FlatPrograms.of(*known.qp.tensors(), known.fixed)[0]
 
 
 def solution_of(known: KnownQP) -> dict[str, Tensor]:
@@ -123,7 +137,7 @@ def solution_of(known: KnownQP) -> dict[str, Tensor]:
 
 
 def random_mpc(seed: int = 0, *, free: float = 0.1, horizon: int = 3, **options: Any) -> QPMPC:
-    """A QPMPC of two states and an action, bounded, each learned entry moved by ``free`` at most."""
+    """A bounded QPMPC of two states and an action; learned entries are moved by up to ``free``."""
     settings: dict[str, Any] = {
         "state_bounds": ([-1.0, -1.0], [1.0, 1.0]),
         "action_bounds": ([-0.5], [0.5]),

@@ -38,7 +38,8 @@ def by_cvxpy(qp: QuadraticProgram, fixed: Tensor) -> tuple[float, Tensor]:
     problem.solve(
         solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10, tol_ktratio=1e-8
     )
-    return float(problem.value), torch.tensor(z.value)
+    assert isinstance(problem.value, float)
+    return problem.value, torch.tensor(z.value)
 
 
 def by_quadprog(qp: QuadraticProgram, fixed: Tensor) -> tuple[float, Tensor]:

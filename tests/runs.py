@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 from pathlib import Path
 
+import pytest
 from hydra import compose, initialize_config_dir
+from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -25,6 +29,11 @@ SMALL = (
 
 def make_config(*overrides: str) -> DictConfig:
     """configs/ with overrides as on the command line."""
+    return copy.deepcopy(_composed(*overrides))
+
+
+@functools.cache
+def _composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(version_base="1.3", config_dir=str(CONFIGS)):
         return compose("config", overrides=list(overrides))
 
@@ -32,3 +41,14 @@ def make_config(*overrides: str) -> DictConfig:
 def choices(group: str) -> list[str]:
     """The names that a group can be set to."""
     return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
+
+
+def skip_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave drawing, the larger part of a small run's time, to the tests that look at it."""
+
+    def blank(*_: object) -> Figure:
+        return Figure(figsize=(1, 1))
+
+    for owner in ("train", "torch_qpmpc.experiment"):
+        for name in ("closed_loop_figure", "constraint_figure", "summary_figure"):
+            monkeypatch.setattr(f"{owner}.{name}", blank, raising=False)

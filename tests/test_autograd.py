@@ -5,7 +5,8 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
+from dataclasses import fields, replace
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vmap
 from torch.testing import assert_close
 
-from tests.problems import KnownQP, known_qp, random_mpc, random_states, solution_of
+from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states, solution_of
 from torch_qpmpc import QPError, QPSolution, QuadraticProgram, SolverError, Status, solve_qp
 from torch_qpmpc.autograd import solve_op
 from torch_qpmpc.qp import EVENT_SHAPES
@@ -24,10 +25,15 @@ SOFT = ("inside", "at_lower", "at_upper", "below", "above", "no_upper", "free")
 HARD = ("inside", "at_lower", "at_upper", "no_upper")
 
 
-def value(*operands: Tensor, solver: str = "daqp", on_failure: str = "raise") -> Tensor:
-    """The optimal value as a function of the tensors named in `OPERANDS`."""
+def solution(*operands: Tensor, **options: Any) -> QPSolution:
+    """The solution as a function of the tensors named in `OPERANDS`."""
     qp = QuadraticProgram(*operands[:-1], check_values=False)
-    return solve_qp(qp, operands[-1], solver=solver, on_failure=on_failure).value
+    options.setdefault("solver", "daqp")
+    return solve_qp(qp, operands[-1], **options)
+
+
+def value(*operands: Tensor, **options: Any) -> Tensor:
+    return solution(*operands, **options).value
 
 
 def operands_of(known: KnownQP, *, differentiable: bool = False) -> list[Tensor]:
@@ -44,8 +50,7 @@ def infeasible(known: KnownQP, index: int) -> KnownQP:
     lb, ub = qp.lb.clone(), qp.ub.clone()
     lb[index, 0], ub[index, 0] = 1.0, 2.0
     lb[index, 1], ub[index, 1] = 3.0, 4.0
-    changed = QuadraticProgram(qp.H, qp.q, qp.c, qp.C, qp.b, G, lb, ub, w)
-    return KnownQP(changed, *list(vars(known).values())[1:])
+    return replace(known, qp=replace(qp, G=G, lb=lb, ub=ub, w=w))
 
 
 # What the gradient is
@@ -86,8 +91,7 @@ def test_gradient_agrees_with_finite_differences(name, seed):
     known = known_qp(seed, batch=(3,), soft=SOFT, hard=HARD)
     operands = operands_of(known)
     index = OPERANDS.index(name)
-    generator = torch.Generator().manual_seed(seed)
-    direction = torch.randn(operands[index].shape, generator=generator, dtype=torch.float64)
+    direction = normal(*operands[index].shape, seed=seed)
     if name == "H":
         direction = direction + direction.mT
     weight = torch.tensor([1.0, -2.0, 0.5]).double()
@@ -171,14 +175,34 @@ def test_batch_dimensions_broadcast_in_value_and_gradient():
         assert_close(together.grad, alone.grad, msg=lambda m, n=name: f"{n}: {m}")
 
 
+@pytest.mark.parametrize("name", OPERANDS)
+def test_one_batched_operand_makes_a_batch(name):
+    known = known_qp(3, soft=("inside", "above", "at_upper"), hard=("inside",))
+    operands, index = operands_of(known), OPERANDS.index(name)
+    scale = torch.tensor([0.99, 1.0, torch.nan, 1.01]).double()
+    batched = torch.stack([factor * operands[index] for factor in scale])
+
+    def of_one(operand: Tensor) -> QPSolution:
+        changed = [*operands[:index], operand, *operands[index + 1 :]]
+        return solution(*changed, on_failure="mask")
+
+    together = of_one(batched)
+    for i, operand in enumerate(batched):
+        alone = of_one(operand)
+        for field in fields(QPSolution):
+            if field.name != "iterations":
+                part = getattr(together, field.name)[i]
+                expected = getattr(alone, field.name)
+                assert_close(part, expected, rtol=1e-6, atol=1e-7, equal_nan=True)  # mu is w's NaN
+    assert together.solved.tolist() == [True, True, False, True]
+
+
 def test_gradient_is_the_same_whatever_is_kept():
     known = known_qp(4, batch=(3,))
     gradients = []
     for keep in (None, 2, 5):
         operands = operands_of(known, differentiable=True)
-        qp = QuadraticProgram(*operands[:-1])
-        solution = solve_qp(qp, operands[-1], solver="daqp", keep=keep)
-        solution.value.sum().backward()
+        value(*operands, keep=keep).sum().backward()
         gradients.append([operand.grad for operand in operands])
     for other in gradients[1:]:
         assert_close(other, gradients[0], rtol=1e-5, atol=1e-5)
@@ -228,49 +252,14 @@ def test_invalid_elements_have_no_gradient_and_spoil_no_other():
 
 def test_an_unsolved_element_carries_infinite_cost_and_its_fixed_entries():
     known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
-    solution = solve_qp(known.qp, known.fixed, solver="daqp", on_failure="mask")
-    assert solution.solved.tolist() == [True, False, True]
-    assert solution.status[1] == Status.INFEASIBLE
-    assert solution.value[1] == torch.inf
-    assert_close(solution.z[1, :2], known.fixed[1])
+    found = solve_qp(known.qp, known.fixed, solver="daqp", on_failure="mask")
+    assert found.solved.tolist() == [True, False, True]
+    assert found.status[1] == Status.INFEASIBLE
+    assert found.value[1] == torch.inf
+    assert_close(found.z[1, :2], known.fixed[1])
     for name in ("sigma", "chi", "upsilon", "eta", "xi"):
-        assert (getattr(solution, name)[1] == 0).all()
-    assert (solution.z[1, 2:] == 0).all()
-
-
-# What is not differentiable says so
-
-
-def test_differentiating_the_solution_is_refused():
-    known = known_qp(7)
-    operands = operands_of(known, differentiable=True)
-    z = solve_qp(QuadraticProgram(*operands[:-1]), operands[-1], solver="daqp").z
-    with pytest.raises(NotImplementedError, match="gradient of the solution z .* Detach z"):
-        z.sum().backward()
-
-
-@pytest.mark.parametrize("name", [name for name in OPERANDS if name != "c"])
-def test_differentiating_the_value_twice_is_refused(name):
-    operands = operands_of(known_qp(7))
-    operand = operands[OPERANDS.index(name)].requires_grad_()
-    (gradient,) = torch.autograd.grad(value(*operands), operand, create_graph=True)
-    with pytest.raises(NotImplementedError, match="second derivative of the value"):
-        gradient.sum().backward()
-
-
-def test_second_derivatives_by_torch_func_are_refused():
-    mpc, s = random_mpc(0), random_states(1)[0]
-    with pytest.raises(NotImplementedError, match="second derivative of the value"):
-        jacrev(jacrev(mpc.value))(s)
-    with pytest.raises(NotImplementedError, match="gradient of the solution z"):
-        jacrev(mpc.policy)(s)
-
-
-@pytest.mark.parametrize("name", ["sigma", "chi", "upsilon", "eta", "xi", "mu", "residual"])
-def test_the_rest_of_the_solution_is_constant(name):
-    operands = operands_of(known_qp(7), differentiable=True)
-    solution = solve_qp(QuadraticProgram(*operands[:-1]), operands[-1], solver="daqp")
-    assert not getattr(solution, name).requires_grad
+        assert (getattr(found, name)[1] == 0).all()
+    assert (found.z[1, 2:] == 0).all()
 
 
 # torch.func and torch.compile
@@ -354,6 +343,13 @@ def test_compiled_without_graph_breaks_equals_eager(of_action):
     torch._dynamo.reset()
 
 
+def test_the_compiled_policy_equals_the_eager_one():
+    mpc, s = random_mpc(3), random_states(4)
+    compiled = torch.compile(mpc.policy, fullgraph=True, backend="aot_eager")
+    assert_close(compiled(s), mpc.policy(s))
+    torch._dynamo.reset()
+
+
 @pytest.mark.parametrize("batch", [(), (3,)])
 def test_the_operator_keeps_torchs_contract(batch):
     known = known_qp(9, batch=batch)
@@ -369,44 +365,43 @@ def test_the_operator_keeps_torchs_contract(batch):
 @pytest.mark.parametrize("of_matrices", [False, True])
 def test_shapes_of_the_solution(batch, of_matrices):
     known = known_qp(10, batch=batch, matrices=batch if of_matrices else ())
-    solution = solve_qp(known.qp, known.fixed, solver="daqp")
+    found = solve_qp(known.qp, known.fixed, solver="daqp")
     for name, part in solution_of(known).items():
-        assert getattr(solution, name).shape == part.shape, name
+        assert getattr(found, name).shape == part.shape, name
     for name in ("status", "residual", "iterations"):
-        assert getattr(solution, name).shape == batch, name
-    assert solution.mu.shape == known.sigma.shape
+        assert getattr(found, name).shape == batch, name
+    assert found.mu.shape == known.sigma.shape
 
 
 def test_a_constant_cost_of_its_own_makes_a_batch_too():
     known = known_qp(10)
-    tensors = list(known.qp.tensors())
-    tensors[2] = known.qp.c + torch.arange(3).double()
-    solution = solve_qp(QuadraticProgram(*tensors), known.fixed, solver="daqp")
-    assert_close(solution.value, known.value + torch.arange(3).double())
-    assert solution.z.shape == (3, 12)
-    assert solution.status.shape == (3,)
+    lift = torch.arange(3).double()
+    found = solve_qp(replace(known.qp, c=known.qp.c + lift), known.fixed, solver="daqp")
+    assert_close(found.value, known.value + lift)
+    assert found.z.shape == (3, 12)
+    assert found.status.shape == (3,)
 
 
 def test_multipliers_of_a_row_sum_to_its_weight():
     known = known_qp(11, batch=(4,))
-    solution = solve_qp(known.qp, known.fixed, solver="daqp")
+    found = solve_qp(known.qp, known.fixed, solver="daqp")
     soft = known.qp.w.isfinite()
-    total = solution.upsilon + solution.eta + solution.mu
+    total = found.upsilon + found.eta + found.mu
     assert_close(total[soft], known.qp.w[soft])
-    assert (solution.mu[~soft] == torch.inf).all()
-    assert (torch.minimum(solution.upsilon, solution.eta) == 0).all()
-    assert (solution.mu >= -1e-9).all()
-    assert (solution.sigma[~soft] == 0).all()
+    assert (found.mu[~soft] == torch.inf).all()
+    assert (torch.minimum(found.upsilon, found.eta) == 0).all()
+    assert (found.mu >= -1e-9).all()
+    assert (found.sigma[~soft] == 0).all()
 
 
 def test_single_precision_in_single_precision_out(solver):
     known = known_qp(12, batch=(4,), dtype=torch.float32)
     operands = operands_of(known, differentiable=True)
-    solution = solve_qp(QuadraticProgram(*operands[:-1]), operands[-1], solver=solver)
+    found = solution(*operands, solver=solver)
     for name, part in solution_of(known).items():
-        assert getattr(solution, name).dtype == torch.float32
-        assert_close(getattr(solution, name), part, rtol=1e-3, atol=1e-3)
-    solution.value.sum().backward()
+        assert getattr(found, name).dtype == torch.float32
+        assert_close(getattr(found, name), part, rtol=1e-3, atol=1e-3)
+    found.value.sum().backward()
     for operand in operands:
         assert operand.grad is not None
         assert operand.grad.dtype == torch.float32
@@ -424,9 +419,9 @@ def test_an_asymmetry_within_the_tolerance_of_single_precision_does_no_harm():
 
 def test_everything_may_be_fixed():
     known = known_qp(13, n_c=0, n_f=12, soft=("above", "below", "inside"), hard=("inside",))
-    solution = solve_qp(known.qp, known.fixed, solver="daqp")
-    assert_close(solution.value, known.value)
-    assert_close(solution.z, known.z)
+    found = solve_qp(known.qp, known.fixed, solver="daqp")
+    assert_close(found.value, known.value)
+    assert_close(found.z, known.z)
 
 
 # What goes wrong
@@ -484,7 +479,7 @@ def test_failures_are_counted_and_located(on_failure):
 def test_invalid_data_alone_is_bad_input():
     operands = operands_of(known_qp(5))
     operands[OPERANDS.index("lb")].fill_(torch.nan)
-    with pytest.raises(QPError, match="1 of 1 QPs .* 1 INVALID_DATA: NaN or inf in the data"):
+    with pytest.raises(QPError, match=r"1 of 1 QPs .* 1 INVALID_DATA: NaN or inf in the data"):
         value(*operands)
 
 

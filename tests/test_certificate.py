@@ -1,14 +1,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp
-from torch_qpmpc import QuadraticProgram
+from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, programs_of, times
 from torch_qpmpc.certificate import TOLERANCE, Certificate, certify
 from torch_qpmpc.condense import FlatPrograms
 
@@ -18,9 +18,9 @@ N_Z, N_C, N_F = 12, 3, 2
 
 def judge(known: KnownQP, **claim: Tensor) -> Certificate:
     """The certificate of the exact solution, but for what ``claim`` says."""
-    programs, _ = FlatPrograms.of(*known.qp.tensors(), known.fixed)
-    parts = (claim.get(name, getattr(known, name)) for name in ("z", "lam", "chi", "xi"))
-    return certify(programs, *(part.reshape(len(programs), -1) for part in parts))
+    exact = {"z": known.z, "lam": known.lam, "chi": known.chi, "xi": known.xi}
+    parts = exact | claim
+    return certify(programs_of(known), parts["z"], parts["lam"], parts["chi"], parts["xi"])
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])
@@ -84,17 +84,14 @@ def test_one_wrong_part_is_rejected_and_only_there(name):
 
 def consistent(known: KnownQP, z: Tensor, lam: Tensor, **bounds: Tensor) -> Certificate:
     """Judge z and lam with q and b adapted, so that only the rows can be wrong."""
-    H, _, c, C, _, G, lb, ub, w = known.qp.tensors()
-
-    def times(matrix: Tensor, vector: Tensor) -> Tensor:
-        return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
-
+    H, _, _, C, _, G, lb, ub, _ = known.qp.tensors()
     q = -(times(H, z) + times(G.mT, lam) + times(C.mT, known.chi))
     q[:, :N_F] -= known.xi
     lb, ub = bounds.get("lb", lb), bounds.get("ub", ub)
-    qp = QuadraticProgram(H, q, c, C, times(C, z), G, lb, ub, w, check_values=False)
-    programs, _ = FlatPrograms.of(*qp.tensors(), z[:, :N_F])
-    return certify(programs, z, lam, known.chi, known.xi)
+    changed = replace(
+        known, qp=replace(known.qp, q=q, b=times(C, z), lb=lb, ub=ub), fixed=z[:, :N_F]
+    )
+    return certify(programs_of(changed), z, lam, known.chi, known.xi)
 
 
 def where(known: KnownQP, kinds: tuple[str, ...], *, hard: bool) -> Tensor:
@@ -116,6 +113,7 @@ def where(known: KnownQP, kinds: tuple[str, ...], *, hard: bool) -> Tensor:
         ("inside", True, 0.05),  # a multiplier where there is room
         ("at_upper", True, -12.0),  # pulls away from its own bound
         ("at_lower", False, 12.0),
+        ("at_upper", False, 12.0),  # at its bound, but more than the slack's weight
         ("above", False, 0.05),  # more than the slack's weight
         ("above", False, -0.05),  # less than it, though violated
         ("no_upper", True, 0.05),  # of a bound that does not exist
@@ -153,24 +151,28 @@ def test_a_violated_hard_row_is_rejected_and_a_soft_one_is_not():
         assert_close(certificate.sigma[SPOILT, row].item(), 0.0 if hard else 1e-3)
 
 
+def unit_programs(q: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> FlatPrograms:
+    """min 1/2 z'z + q'z over lb <= z <= ub."""
+    unit, none = torch.eye(len(q)), torch.zeros(0)
+    C = none.reshape(0, len(q))
+    return FlatPrograms.of(unit, q, none.sum(), C, none, unit, lb, ub, w, none)[0]
+
+
+@pytest.mark.parametrize("weight", [1.0, torch.inf])
+def test_a_multiplier_of_a_bound_that_does_not_exist_is_rejected_at_zero_too(weight):
+    z, lam = torch.zeros(1, 1).double(), torch.full((1, 1), 1e-3).double()
+    infinite = torch.full((1,), torch.inf)
+    programs = unit_programs(-lam[0], -torch.ones(1), infinite, torch.full((1,), weight))
+    assert certify(programs, z, lam, z[:, :0], z[:, :0]).residual > 10 * TOLERANCE
+
+
 def test_complementarity_gaps_of_opposite_sign_do_not_cancel():
     # min 1/2 z'z + q'z with z <= 0: the first row is violated, by less than the tolerance, and
     # the second has room; lam'(ub - z), the summed gap, is zero.
     z = torch.tensor([[5e-7, -5e-7]]).double()
     lam = torch.tensor([[1e3, 1e3]]).double()
-    unit, none = torch.eye(2).double(), torch.zeros(0).double()
-    programs, _ = FlatPrograms.of(
-        unit,
-        -(z[0] + lam[0]),
-        torch.zeros(()),
-        none.reshape(0, 2),
-        none,
-        unit,
-        -torch.ones(2),
-        torch.zeros(2),
-        torch.full((2,), torch.inf),
-        none,
-    )
+    hard = torch.full((2,), torch.inf)
+    programs = unit_programs(-(z + lam)[0], -torch.ones(2), torch.zeros(2), hard)
     assert abs((lam * (0 - z)).sum()) < 1e-12
     empty = z[:, :0]
     assert certify(programs, z, lam, empty, empty).residual > 10 * TOLERANCE
@@ -179,9 +181,7 @@ def test_complementarity_gaps_of_opposite_sign_do_not_cancel():
 
 def test_the_constant_is_part_of_the_value_but_loosens_nothing():
     known = known_qp(5, batch=(BATCH,))
-    tensors = list(known.qp.tensors())
-    tensors[2] = known.qp.c + 1e9
-    lifted = KnownQP(QuadraticProgram(*tensors), *list(vars(known).values())[1:])
+    lifted = replace(known, qp=replace(known.qp, c=known.qp.c + 1e9))
     claim = {"lam": shifted(known.lam, first_row(known, known.lam == 0), 1e-3)}
     assert_close(judge(lifted).value, known.value + 1e9)
     assert_close(judge(lifted, **claim).residual, judge(known, **claim).residual)

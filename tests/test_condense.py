@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,19 +10,10 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.testing import assert_close
 
-from tests.problems import KnownQP, known_qp, random_mpc, random_states
-from torch_qpmpc import QuadraticProgram, Status, solve_qp
+from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
+from torch_qpmpc import Status, solve_qp
 from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.condense import MEMO_SIZE, FlatPrograms, condense
-
-
-def normal(*shape: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-
-def flat(known: KnownQP) -> FlatPrograms:
-    return FlatPrograms.of(*known.qp.tensors(), known.fixed)[0]
 
 
 @pytest.fixture
@@ -76,7 +68,7 @@ def test_an_asymmetric_hessian_counts_by_its_symmetric_part():
 
 
 def test_taken_programs_keep_their_matrices():
-    programs = flat(known_qp(0, batch=(6,), matrices=(6,)))
+    programs = programs_of(known_qp(0, batch=(6,), matrices=(6,)))
     index = torch.tensor([4, 1])
     part = programs.take(index)
     assert len(part) == 2
@@ -87,7 +79,7 @@ def test_taken_programs_keep_their_matrices():
 
 @pytest.mark.parametrize("count", [1, 6])
 def test_products_are_those_of_each_program(count):
-    programs = flat(known_qp(0, batch=(6,), matrices=(count,)))
+    programs = programs_of(known_qp(0, batch=(6,), matrices=(count,)))
     product = programs.multiply(programs.G, programs.q)
     loop = [programs.G[m] @ q for m, q in zip(programs.group, programs.q, strict=True)]
     assert_close(product, torch.stack(loop))
@@ -143,7 +135,7 @@ def test_elimination_of_an_mpc_scheme_is_its_prediction_form():
 @pytest.mark.parametrize("name", [*REGULAR, *DEFICIENT])
 def test_free_part_inverts_expand(name):
     C = (REGULAR | DEFICIENT)[name]
-    programs = flat(known_qp(3, n_z=8, n_f=3, C=C, batch=(5,), hard=()))
+    programs = programs_of(known_qp(3, n_z=8, n_f=3, C=C, batch=(5,), hard=()))
     condensed = condense(programs.H, programs.C, programs.G, 3)
     v = normal(5, condensed.T.shape[-1] - 3)
     assert_close(condensed.free_part(programs, condensed.expand(programs, v)), v)
@@ -179,9 +171,8 @@ def test_a_rank_lost_to_the_kept_columns_is_regained_by_keeping_fewer():
 @pytest.mark.parametrize("name", ["dependent", "repeated", "many", "zero", "fixed only"])
 def test_inconsistent_equalities_are_infeasible(name):
     known = known_qp(6, n_z=8, n_f=3, C=DEFICIENT[name], batch=(2,), hard=())
-    tensors = list(known.qp.tensors())
-    tensors[4] = known.qp.b + torch.tensor([[0.0], [1.0]]).double() * normal(known.qp.b.shape[-1])
-    solution = solve_qp(QuadraticProgram(*tensors), known.fixed, solver="daqp", on_failure="mask")
+    b = known.qp.b + torch.tensor([[0.0], [1.0]]).double() * normal(known.qp.b.shape[-1])
+    solution = solve_qp(replace(known.qp, b=b), known.fixed, solver="daqp", on_failure="mask")
     assert solution.status.tolist() == [Status.SOLVED, Status.INFEASIBLE]
     assert_close(solution.value[0], known.value[0])
 
@@ -235,11 +226,13 @@ def test_threads_do_not_share_what_they_remember(eliminations):
 def test_value_action_value_and_policy_share_one_elimination(eliminations):
     mpc = random_mpc(40)
     s, a = random_states(6), random_states(6, 1, size=0.5)
-    mpc.value(s), mpc.action_value(s, a), mpc.policy(s)
+    for solve in (mpc.value, mpc.policy, lambda s: mpc.action_value(s, a)):
+        solve(s)
     assert len(eliminations) == 1
     with torch.no_grad():
         mpc.C += 0.01
-    mpc.action_value(s, a), mpc.value(s)
+    mpc.action_value(s, a)
+    mpc.value(s)
     assert len(eliminations) == 2
 
 
@@ -266,7 +259,7 @@ def test_the_answer_follows_the_module_that_is_asked():
 
 def test_the_answer_follows_the_parameters_of_a_functional_call():
     mpc, other, s = random_mpc(43), random_mpc(44), random_states(4)
-    parameters = dict(other.named_parameters())
+    parameters = {name: part.detach() for name, part in other.named_parameters()}
     own = mpc.value(s)
     called = functional_call(mpc, parameters, (s,))
     assert_close(called, other.value(s), rtol=0, atol=0)

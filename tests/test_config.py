@@ -1,4 +1,4 @@
-"""Every key has a rule, every rule a key, and every key a reader; each bad value has its sentence."""
+"""Every key has a rule and a reader, every rule a key, and each bad value its sentence."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 import train
-from tests.runs import CONFIGS, SMALL, choices, make_config
+from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
 from torch_qpmpc import QPError
 from torch_qpmpc.config import OPTIONAL, RULES, check_config, flatten
 from torch_qpmpc.tracking import RunFolder
@@ -26,7 +26,9 @@ def keys_of_the_files() -> set[str]:
         tree = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
         assert isinstance(tree, dict)
         group = "" if path.parent == CONFIGS else f"{path.parent.name}"
-        keys |= set(flatten({k: v for k, v in tree.items() if k not in ("defaults", "hydra")}, group))
+        keys |= set(
+            flatten({k: v for k, v in tree.items() if k not in ("defaults", "hydra")}, group)
+        )
     return keys
 
 
@@ -57,6 +59,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     """By a run, or by the names of the run's folder."""
     cfg = make_config(*SMALL, "constraint=combined", "delay_value=true", "constraint.si.windows=4")
     seen: set[str] = set()
+    skip_figures(monkeypatch)
     # These two read everything at once, which proves nothing.
     monkeypatch.setattr(train, "check_config", lambda _: None)
     monkeypatch.setattr(train, "RunFolder", lambda folder, _: RunFolder(folder, cfg))

@@ -148,8 +148,8 @@ def test_a_warm_start_leads_to_the_same_solution(solver):
     with torch.no_grad():
         mpc.C *= 1.001
         mpc.C[:, 5] += 0.01
-    for inputs in ((s,), (s, a)):
-        cold, warm = mpc.solve(*inputs), mpc.solve(*inputs, warm_start=start)
+    for action in (None, a):
+        cold, warm = mpc.solve(s, action), mpc.solve(s, action, warm_start=start)
         assert_close(warm.value, cold.value, rtol=1e-6, atol=1e-6)
 
 
@@ -509,5 +509,5 @@ def test_invalid_parameters_are_named(part):
     mpc = random_mpc(0)
     with torch.no_grad():
         mpc.get_parameter(part).view(-1)[0] = torch.nan
-    with pytest.raises(QPError, match="3 of 3 .* 3 INVALID_DATA, .*: NaN or inf in the data"):
+    with pytest.raises(QPError, match=r"3 of 3 .* 3 INVALID_DATA, .*: NaN or inf in the data"):
         mpc.value(torch.zeros(3, 2))

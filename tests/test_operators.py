@@ -44,10 +44,16 @@ def make_inputs(*batch: int, dtype: torch.dtype = torch.float64) -> TensorDict:
     return TensorDict(observation=s.to(dtype), action=a.to(dtype), batch_size=batch)
 
 
+def make_views(mpc: QPMPC) -> tuple[Any, Any, Any]:
+    """Critic, value and policy. (TorchRL annotates more narrowly than it accepts.)"""
+    operator = QPActorValueOperator(mpc)
+    return operator, operator.get_value_operator(), operator.get_policy_operator()
+
+
 def make_transitions(count: int) -> TensorDict:
-    td, following = make_inputs(count, dtype=torch.float32), make_inputs(count).flip(0)
+    td = make_inputs(count, dtype=torch.float32)
     td["next"] = TensorDict(
-        observation=following["observation"].float(),
+        observation=td["observation"].flip(0),
         reward=torch.linspace(-2, -1, count).unsqueeze(-1),
         done=torch.zeros(count, 1, dtype=torch.bool),
         terminated=torch.zeros(count, 1, dtype=torch.bool),
@@ -154,7 +160,7 @@ def test_one_set_of_parameters_drives_every_view():
     mpc, td = make_mpc(), make_inputs(4)
     operator, other = QPActorValueOperator(mpc), QPActorValueOperator(copy.deepcopy(mpc))
     change(other.module)
-    params = TensorDict.from_module(other, as_module=True)
+    params: Any = TensorDict.from_module(other, as_module=True)
     expected, before = evaluate(other, td), evaluate(operator, td)
     views = (operator, operator.get_value_operator(), operator.get_policy_operator())
     for view, x, y in zip(views, expected, before, strict=True):
@@ -209,18 +215,18 @@ def make_point_mass() -> tuple[QPMPC, PointMassEnv]:
     return mpc, PointMassEnv(4, physics, max_steps=10, seed=0)
 
 
-@pytest.mark.parametrize("explore", [False, True])
-def test_policy_in_a_collector(explore):
+@pytest.mark.parametrize("exploration", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
+def test_policy_in_a_collector(exploration):
     mpc, env = make_point_mass()
     torch.manual_seed(0)
-    noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
-    policy = TensorDictSequential(QPActorValueOperator(mpc).get_policy_operator(), noise)
+    noise: Any = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
+    policy: Any = make_views(mpc)[2]
     collector = Collector(
         env,
-        policy,
+        TensorDictSequential([policy, noise]),
         frames_per_batch=12,
         total_frames=24,
-        exploration_type=ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC,
+        exploration_type=exploration,
         auto_register_policy_transforms=False,
     )
     for batch in collector:
@@ -229,7 +235,7 @@ def test_policy_in_a_collector(explore):
         assert not batch["action"].requires_grad
         assert batch["action"].abs().max() <= 1
         close = torch.isclose(batch["action"], mpc.policy(batch["observation"]), atol=1e-6)
-        assert not close.all() if explore else close.all()
+        assert close.all() == (exploration == ExplorationType.DETERMINISTIC)
     collector.shutdown()
 
 
@@ -246,14 +252,11 @@ def test_policy_in_a_rollout_follows_the_parameters():
 
 
 def test_actor_critic_wrapper():
-    operator, td = QPActorValueOperator(make_mpc()), make_inputs(4)
-    both = ActorCriticWrapper(operator.get_policy_operator(), operator.get_critic_operator())
-    s = td["observation"]
+    (critic, value, policy), s = make_views(make_mpc()), make_inputs(4)["observation"]
+    both = ActorCriticWrapper(policy, critic)
     out = both(TensorDict(observation=s, batch_size=[4]))
-    torch.testing.assert_close(
-        out["state_action_value"], operator.get_value_operator()(s), rtol=1e-9, atol=1e-9
-    )
-    assert len(list(both.parameters())) == len(list(operator.parameters()))
+    torch.testing.assert_close(out["state_action_value"], value(s), rtol=1e-9, atol=1e-9)
+    assert len(list(both.parameters())) == len(list(critic.parameters()))
 
 
 def all_have_gradients(module: nn.Module) -> bool:
@@ -264,7 +267,7 @@ def all_have_gradients(module: nn.Module) -> bool:
 def test_critic_in_ddpg_with_a_network_as_actor():
     """The actor climbs -Q along dQ/da = -zeta."""
     torch.manual_seed(0)
-    operator, td = QPActorValueOperator(make_mpc()), make_transitions(5)
+    (operator, _, _), td = make_views(make_mpc()), make_transitions(5)
     net = nn.Sequential(nn.Linear(2, 1), nn.Tanh())
     actor = TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
     loss = DDPGLoss(actor, operator)
@@ -282,22 +285,30 @@ def test_critic_in_ddpg_with_a_network_as_actor():
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")
-def test_policy_as_the_actor_of_ddpg_says_what_is_missing():
-    operator, td = QPActorValueOperator(make_mpc()), make_transitions(5)
-    loss = DDPGLoss(operator.get_policy_operator(), copy.deepcopy(operator))
+def test_policy_as_the_actor_of_ddpg():
+    (operator, _, policy), td = make_views(make_mpc()), make_transitions(5)
+    loss = DDPGLoss(policy, copy.deepcopy(operator))
     loss.make_value_estimator(gamma=0.9)
-    out = loss(td)
-    out["loss_value"].backward(retain_graph=True)
-    with pytest.raises(NotImplementedError, match="the gradient of the solution z"):
-        out["loss_actor"].backward()
+    loss(td)["loss_actor"].backward()
+    mpc = operator.module
+    s = td["observation"]
+    leaves = dict(mpc.named_parameters())
+    # The critic is a detached copy: only what flows through the action counts.
+    critic = copy.deepcopy(mpc).requires_grad_(False)
+    expected = critic.action_value(s, mpc.policy(s)).mean()
+    for name, gradient in zip(
+        leaves, torch.autograd.grad(expected, list(leaves.values()), allow_unused=True), strict=True
+    ):
+        if gradient is not None:
+            torch.testing.assert_close(leaves[name].grad, gradient)
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")
 def test_critics_and_value_in_iql():
     """Two critics under vmap beside the value, all of them QPs, with a network as the policy."""
     torch.manual_seed(0)
-    operator, td = QPActorValueOperator(make_mpc()), make_transitions(5)
-    critics = [copy.deepcopy(operator), copy.deepcopy(operator)]
+    (operator, value, _), td = make_views(make_mpc()), make_transitions(5)
+    critics: Any = [copy.deepcopy(operator), copy.deepcopy(operator)]
     change(critics[1].module)
     net = nn.Sequential(nn.Linear(2, 2), NormalParamExtractor())
     actor = ProbabilisticActor(
@@ -307,13 +318,13 @@ def test_critics_and_value_in_iql():
     )
     loss = IQLLoss(
         actor,
-        qvalue_network=critics,  # pyright: ignore[reportArgumentType] - a list is accepted
-        value_network=operator.get_value_operator(),
+        qvalue_network=critics,
+        value_network=value,
         num_qvalue_nets=2,
     )
     loss.make_value_estimator(gamma=0.9)
     out = loss(td)
-    sum(value for key, value in out.items() if key.startswith("loss_")).backward()
+    (out["loss_actor"] + out["loss_qvalue"] + out["loss_value"]).backward()
     assert all_have_gradients(loss)
     stacked = loss.qvalue_network_params["module", "C"]
     assert stacked.shape == (2, *operator.module.C.shape)

@@ -6,14 +6,9 @@ from torch import nn
 from torch.nn.utils import parametrize
 from torch.testing import assert_close
 
+from tests.problems import normal
 from torch_qpmpc import QPError
 from torch_qpmpc.parametrizations import Cholesky, SquareRoot
-
-
-def normal(*shape: int, seed: int = 0) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(shape, generator=generator, dtype=torch.float64)
-
 
 FACTOR = normal(4, 4)
 DIRECTION = normal(4, 1)
@@ -88,12 +83,12 @@ def test_a_start_that_is_not_semidefinite_is_named(kind, value, message):
 
 @pytest.mark.parametrize("rate", [0.1, 10.0])
 def test_gradient_steps_leave_the_matrix_semidefinite(rate):
-    module = nn.Module()
-    module.register_parameter("H", nn.Parameter(MATRICES["rank one"].clone()))
-    parametrize.register_parametrization(module, "H", Cholesky())
+    module = nn.Linear(4, 4).double()
+    module.weight.data.copy_(MATRICES["rank one"])
+    parametrize.register_parametrization(module, "weight", Cholesky())
     optimizer = torch.optim.SGD(module.parameters(), lr=rate)
     for _ in range(3):
-        (module.H * normal(4, 4)).sum().backward()
+        (module.weight * normal(4, 4)).sum().backward()
         optimizer.step()
-        lowest = torch.linalg.eigvalsh(module.H)[0]
-        assert lowest > -1e-9 * module.H.abs().max()
+        H = module.weight.detach()
+        assert torch.linalg.eigvalsh(H)[0] > -1e-9 * H.abs().max()

@@ -35,7 +35,7 @@ def make_C_0(generator: torch.Generator) -> torch.Tensor:
 
 
 def test_mask_is_the_printed_one():
-    """eq:sdp2's C_mask for z = [x_0, u_0, x_1, u_1, x_2, u_2, x_3]; then with blocks for entries."""
+    """eq:sdp2's C_mask for z = [x_0, u_0, .., u_2, x_3]; then with blocks for entries."""
     a, o, b = 3.0, 5.0, 7.0  # c_1 above, c_2 on, c_3 below the band
     scalar = torch.tensor(
         [
@@ -219,8 +219,9 @@ def test_system_identification_penalty_has_the_right_gradient(generator, normali
 def test_normalised_penalty_does_not_reward_shrinking_C(generator):
     C, windows = normal(generator, N * N_X, N_Z), normal(generator, 7, N_Z)
     scaled = torch.linspace(0.1, 3, N * N_X, dtype=torch.float64).unsqueeze(1) * C
-    raw, normalised = SystemIdentificationPenalty(1.0), SystemIdentificationPenalty(
-        1.0, normalised=True
+    raw, normalised = (
+        SystemIdentificationPenalty(1.0),
+        SystemIdentificationPenalty(1.0, normalised=True),
     )
     torch.testing.assert_close(normalised(scaled, windows), normalised(C, windows))
     torch.testing.assert_close(raw(0.1 * C, windows), 0.01 * raw(C, windows))

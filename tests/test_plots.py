@@ -101,28 +101,27 @@ def test_constraint_figure_of_a_fixed_C():
 
 
 def test_closed_loop_figure_shows_paths_costs_and_J(mpc, loops):
-    left, right = closed_loop_figure(loops, mpc).axes
+    figure = closed_loop_figure(loops, mpc)
+    left, right = figure.axes
     assert legend_of(left) == [
         *(f"{name}, J = {loop.J:.0f}" for name, loop in loops.items()),
         "predicted at the start",
     ]
-    lines = [(line.get_xdata(), line.get_ydata()) for line in left.lines]
+    lines = [np.asarray(line.get_xydata()) for line in left.lines]
     for loop in loops.values():
-        x, y = (loop.states[:, 2, i].numpy() for i in (0, 1))
-        assert any(np.array_equal(a, x) and np.array_equal(b, y) for a, b in lines if len(a))
+        path = loop.states[:, 2, :2].numpy()
+        assert any(np.array_equal(line, path) for line in lines)
     start = loops["start"].states[0, 2]
     with torch.no_grad():
         predicted = mpc.predicted(mpc.solve(start).z)[0]
     # Not exactly, as one state is solved alone here and with others there.
-    assert any(
-        len(a) == 5 and np.allclose(np.stack([a, b], -1), predicted[:, :2], atol=1e-6)
-        for a, b in lines
-    )
+    expected = predicted[:, :2].numpy()
+    assert any(len(line) == 5 and np.allclose(line, expected, atol=1e-6) for line in lines)
     assert legend_of(right) == list(loops)
     for line, loop in zip(right.lines, loops.values(), strict=True):
         assert np.array_equal(line.get_ydata(), loop.costs.mean(1))
     assert right.get_yscale() == "log"
-    rendered(left.figure)
+    rendered(figure)
 
 
 def test_summary_figure(mpc, loops):
@@ -130,10 +129,10 @@ def test_summary_figure(mpc, loops):
     figure = summary_figure(mpc, loops, updates, J)
     learning, matrix, paths = (a for a in figure.axes if a.get_title())
     assert legend_of(learning) == ["learned", "start", "true model"]
-    assert list(learning.lines[0].get_xdata()) == updates
-    assert list(learning.lines[0].get_ydata()) == J
+    curve = np.asarray(learning.lines[0].get_xydata())
+    assert curve.tolist() == [list(point) for point in zip(updates, J, strict=True)]
     for line, name in zip(learning.lines[1:], ("start", "true model"), strict=True):
-        assert set(line.get_ydata()) == {loops[name].J}
+        assert np.all(np.asarray(line.get_ydata()) == loops[name].J)
     assert np.array_equal(image_of(matrix), mpc.C.detach())
     assert len(legend_of(paths)) == 4
     rendered(figure)

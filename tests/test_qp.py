@@ -3,6 +3,7 @@ from __future__ import annotations
 import doctest
 import importlib
 from dataclasses import FrozenInstanceError
+from typing import Any
 
 import pytest
 import torch
@@ -11,16 +12,16 @@ from tests.problems import known_qp
 from torch_qpmpc import QPError, QuadraticProgram, Status
 from torch_qpmpc.qp import EVENT_SHAPES
 
-GOOD = dict(zip(EVENT_SHAPES, known_qp(0).qp.tensors(), strict=True))
+GOOD: dict[str, Any] = dict(zip(EVENT_SHAPES, known_qp(0).qp.tensors(), strict=True))
 
 
-def with_entry(name: str, value: float) -> torch.Tensor:
+def with_entry(name: str, value: float) -> Any:
     tensor = GOOD[name].clone()
     tensor.view(-1)[0] = value
     return tensor
 
 
-def with_eigenvalue(lowest: float) -> torch.Tensor:
+def with_eigenvalue(lowest: float) -> Any:
     n_z = GOOD["q"].shape[0]
     eigenvalues = torch.ones(n_z, dtype=torch.float64)
     eigenvalues[0] = lowest
@@ -84,7 +85,7 @@ def test_values_are_not_checked_on_request(changes, message):
 
 
 def test_one_bad_element_of_a_batch_is_found():
-    lb = GOOD["lb"].clone().expand(4, -1).clone()
+    lb: Any = GOOD["lb"].clone().expand(4, -1).clone()
     lb[2] = GOOD["ub"].clamp(max=9.0) + 1
     with pytest.raises(QPError, match="lb: got lb > ub by up to"):
         QuadraticProgram(**(GOOD | {"lb": lb}))
@@ -116,7 +117,7 @@ def test_batch_shape_counts_every_tensor():
 
 def test_tensors_come_in_the_order_of_the_constructor():
     qp = QuadraticProgram(**GOOD)
-    again = QuadraticProgram(*qp.tensors())
+    again = QuadraticProgram(*qp.tensors(), check_values=False)
     assert all(getattr(again, name) is tensor for name, tensor in GOOD.items())
 
 

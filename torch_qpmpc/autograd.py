@@ -20,9 +20,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_qpmpc.batching import align, outer, sum_to
 from torch_qpmpc.condense import FlatPrograms
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.qp import QPSolution, QuadraticProgram, Status
+from torch_qpmpc.sensitivity import SolutionGradient
 from torch_qpmpc.solvers import backend
 from torch_qpmpc.solvers.chain import RawSolution, solve_programs
 
@@ -30,6 +32,8 @@ ON_FAILURE = ("raise", "warn", "mask")
 #: Event dimensions of the operator's tensors: H, q, c, C, b, G, lb, ub, w, fixed, a warm start's.
 EVENT_NDIMS = (2, 1, 0, 2, 1, 2, 1, 1, 1, 1, 1, 1)
 N_THETA = 10
+#: Position of ``keep`` among the operator's arguments.
+KEEP = 12
 #: value, z, sigma, chi, lam, xi, status, residual, iterations
 Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -57,8 +61,8 @@ def solve_qp(
             keep the same entries share one elimination of C z = b.
 
     Returns:
-        The solution. ``value`` is differentiable in every tensor of ``qp`` and in ``fixed``.
-        Differentiating ``z``, or ``value`` twice, raises NotImplementedError.
+        The solution, differentiable in every tensor of ``qp`` and in ``fixed``: ``value`` by the
+        envelope theorem, and twice; the rest by the KKT system (`torch_qpmpc.sensitivity`).
 
     Raises:
         QPError: ``fixed`` or ``warm_start`` does not fit, or an argument is unknown.
@@ -71,17 +75,20 @@ def solve_qp(
         fixed = qp.q.new_zeros(0)
     theta = _operands(qp, fixed)
     start = _checked_start(qp, fixed, warm_start)
-    raw = QPValue.apply(*theta, *start, _checked_keep(qp, fixed, keep), solver, on_failure)
-    value, z, sigma, chi, lam, xi, status, residual, iterations = raw
+    keep = _checked_keep(qp, fixed, keep)
+    raw = QPValue.apply(*theta, *start, keep, solver, on_failure)
+    value, z, _, chi, lam, xi, status, residual, iterations = raw
+    z, lam, chi, xi = SolutionGradient.apply(z, lam, chi, xi, status, *theta, keep)
     upsilon, eta = (-lam).clamp(min=0), lam.clamp(min=0)
+    solved = status.eq(int(Status.SOLVED)).unsqueeze(-1)
     return QPSolution(
         value=value,
-        z=SolutionGradient.apply(z, *theta),
-        sigma=sigma,
+        z=z,
+        sigma=torch.where(solved, slacks(z, qp.G, qp.lb, qp.ub, qp.w), 0),
         chi=chi,
         upsilon=upsilon,
         eta=eta,
-        mu=qp.w.detach() - upsilon - eta,
+        mu=qp.w - upsilon - eta,
         xi=xi,
         status=status,
         residual=residual,
@@ -95,6 +102,12 @@ def optimal_value(
     """The optimal cost alone, ``(*batch,)``: `solve_qp` without the rest of the solution."""
     keep = _checked_keep(qp, fixed, keep)
     return QPValue.apply(*_operands(qp, fixed), None, None, keep, solver, on_failure)[0]
+
+
+def slacks(z: Tensor, G: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
+    """sigma of z: how far soft rows are outside their bounds, ``(*batch, n_g)``."""
+    y = (z.unsqueeze(-2) @ G.mT).squeeze(-2)
+    return torch.where(w.isinf(), 0, torch.maximum(lb - y, y - ub).clamp(min=0))
 
 
 def _operands(qp: QuadraticProgram, fixed: Tensor) -> tuple[Tensor, ...]:
@@ -233,29 +246,15 @@ def _(H, q, c, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_f
     return (q.new_empty(batch), *vectors, count(), q.new_empty(batch), count())
 
 
-def _batched(in_dims: tuple, args: tuple) -> list:
-    """Move the vmapped dimension of each tensor to the front, and align the batch ranks."""
-    ranks = []
-    for tensor, dim, n in zip(args, in_dims, EVENT_NDIMS, strict=False):
-        if tensor is not None:
-            ranks.append(tensor.ndim - n - (dim is not None))
-    out = list(args)
-    for i, (tensor, dim, n) in enumerate(zip(args, in_dims, EVENT_NDIMS, strict=False)):
-        if tensor is not None and dim is not None:
-            moved = tensor.movedim(dim, 0)
-            missing = max(ranks) - (moved.ndim - 1 - n)
-            out[i] = moved.reshape(moved.shape[0], *(1,) * missing, *moved.shape[1:])
-    return out
-
-
 @solve_op.register_vmap
 def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
-    return solve_op(*_batched(in_dims, args)), (0,) * 9
+    return solve_op(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9
 
 
 def _setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
     _, z, sigma, chi, lam, xi, status, *_ = output
     ctx.set_materialize_grads(False)
+    ctx.keep = inputs[KEEP]
     ctx.save_for_backward(*inputs[:N_THETA], z, sigma, chi, lam, xi, status)
 
 
@@ -264,41 +263,28 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
         return (None,) * (N_THETA + 5)
     *theta, z, sigma, chi, lam, xi, status = ctx.saved_tensors
     if torch.is_grad_enabled() and not torch.compiler.is_compiling():
-        # A second derivative needs the solution's own: let it say so instead of being zero.
-        z, sigma, chi, lam, xi = (
-            SolutionGradient.apply(t, *theta) for t in (z, sigma, chi, lam, xi)
-        )
+        # For second derivatives the solution must depend on the data here.
+        z, lam, chi, xi = SolutionGradient.apply(z, lam, chi, xi, status, *theta, ctx.keep)
+        sigma = slacks(z, *theta[5:9])
     # An unsolved element has zeros here, but zero times an infinite incoming gradient is NaN.
     weight = torch.where(status.eq(int(Status.SOLVED)), grad_value, 0).unsqueeze(-1)
     gradients = {
-        0: lambda like: _outer(0.5 * weight * z, z, like),
-        1: lambda like: _sum_to(weight * z, like),
-        2: lambda like: _sum_to(weight.squeeze(-1), like),
-        3: lambda like: _outer(weight * chi, z, like),
-        4: lambda like: _sum_to(-weight * chi, like),
-        5: lambda like: _outer(weight * lam, z, like),
-        6: lambda like: _sum_to(weight * (-lam).clamp(min=0), like),
-        7: lambda like: _sum_to(-weight * lam.clamp(min=0), like),
-        8: lambda like: _sum_to(weight * sigma, like),
-        9: lambda like: _sum_to(-weight * xi, like),
+        0: lambda like: outer(0.5 * weight * z, z, like),
+        1: lambda like: sum_to(weight * z, like),
+        2: lambda like: sum_to(weight.squeeze(-1), like),
+        3: lambda like: outer(weight * chi, z, like),
+        4: lambda like: sum_to(-weight * chi, like),
+        5: lambda like: outer(weight * lam, z, like),
+        6: lambda like: sum_to(weight * (-lam).clamp(min=0), like),
+        7: lambda like: sum_to(-weight * lam.clamp(min=0), like),
+        8: lambda like: sum_to(weight * sigma, like),
+        9: lambda like: sum_to(-weight * xi, like),
     }
     needed = ctx.needs_input_grad
     return (
         *(gradients[i](theta[i]) if needed[i] else None for i in range(N_THETA)),
         *(None,) * 5,
     )
-
-
-def _sum_to(tensor: Tensor, like: Tensor) -> Tensor:
-    """Undo broadcasting: sum a batched gradient to the shape of the operand it belongs to."""
-    return tensor.sum_to_size(like.shape)
-
-
-def _outer(left: Tensor, right: Tensor, like: Tensor) -> Tensor:
-    """The outer products ``left right'`` summed over the batch dimensions that ``like`` lacks."""
-    if like.ndim == 2:
-        return left.reshape(-1, left.shape[-1]).mT @ right.reshape(-1, right.shape[-1])
-    return _sum_to(left.unsqueeze(-1) * right.unsqueeze(-2), like)
 
 
 solve_op.register_autograd(_backward, setup_context=_setup_context)
@@ -325,30 +311,4 @@ class QPValue(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
-        return QPValue.apply(*_batched(in_dims, args)), (0,) * 9
-
-
-class SolutionGradient(torch.autograd.Function):
-    """Ties a part of the solution to the data it depends on.
-
-    The derivative by the KKT system belongs here. Until it is there, asking for it is an error
-    rather than a silent zero.
-    """
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(part, H, q, c, C, b, G, lb, ub, w, fixed) -> Tensor:
-        return part.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple:
-        raise NotImplementedError(
-            "the gradient of the solution z (and the second derivative of the value) is not "
-            "implemented; only the value can be differentiated, once. Detach z, or differentiate "
-            "the value instead."
-        )
+        return QPValue.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9

@@ -29,45 +29,58 @@ class Certificate:
     residual: Tensor
 
 
-def certify(programs: FlatPrograms, z: Tensor, lam: Tensor, chi: Tensor, xi: Tensor) -> Certificate:
+@dataclass
+class Products:
+    """H z ``(B, n_z)``, G z ``(B, n_g)`` and G'lam ``(B, n_z)`` of a claimed solution."""
+
+    Hz: Tensor
+    Gz: Tensor
+    G_lam: Tensor
+
+    @classmethod
+    def of(cls, programs: FlatPrograms, z: Tensor, lam: Tensor) -> Products:
+        p = programs
+        return cls(p.multiply(p.H, z), p.multiply(p.G, z), p.multiply(p.G.mT, lam))
+
+
+def certify(
+    programs: FlatPrograms,
+    z: Tensor,
+    lam: Tensor,
+    chi: Tensor,
+    xi: Tensor,
+    products: Products | None = None,
+) -> Certificate:
     """Judge z ``(B, n_z)`` with multipliers lam ``(B, n_g)``, chi ``(B, n_c)``, xi ``(B, n_f)``.
 
     The residual is the largest of: stationarity, C z = b, the fixed entries, violation of hard
-    rows, multipliers outside [-w, w], and the rows' summed complementarity gaps; each relative to
-    the size of the terms that it compares.
+    rows, multipliers outside [-w, w] or of absent bounds, and the rows' summed complementarity
+    gaps; each relative to the size of the terms that it compares. ``products`` saves computing
+    them again.
     """
-    p = programs
-    Hz, y = p.multiply(p.H, z), p.multiply(p.G, z)
-    terms = [Hz, p.q, p.multiply(p.G.mT, lam), p.multiply(p.C.mT, chi)]
-    stationarity = torch.stack(terms).sum(0)
-    n_f = p.fixed.shape[-1]
+    p, n_f = programs, programs.fixed.shape[-1]
+    given = Products.of(p, z, lam) if products is None else products
+    Hz, y, pull, push = given.Hz, given.Gz, given.G_lam, p.multiply(p.C.mT, chi)
+    stationarity = Hz + p.q + pull + push
     stationarity[:, :n_f] += xi
-    scale = 1 + torch.stack([_largest(term) for term in terms]).amax(0)
+    scale = 1 + _largest(torch.cat((Hz, pull, push), dim=-1)).maximum(_largest(p.q))
 
-    hard = p.w.isinf()
-    outside = torch.maximum(p.lb - y, y - p.ub).clamp(min=0)
-    sigma = outside.masked_fill(hard, 0)
-    violation = torch.where(hard, outside / (1 + y.abs()), 0)
-
+    hard, size = p.w.isinf(), lam.abs()
     weight = p.w.masked_fill(hard, 0)
-    excess = torch.where(hard, 0, (lam.abs() - weight).clamp(min=0) / (1 + weight))
-    up, down = lam.clamp(min=0), (-lam).clamp(min=0)
-    no_upper, no_lower = p.ub.isinf(), p.lb.isinf()
-    # A multiplier of a bound that does not exist is a dual infeasibility of its own size.
-    excess = torch.maximum(excess, torch.where(no_upper, up, 0) + torch.where(no_lower, down, 0))
-    gap = (
-        weight * sigma
-        + p.ub.masked_fill(no_upper, 0) * up
-        - p.lb.masked_fill(no_lower, 0) * down
-        - lam * y
-    )
+    outside = (y - y.maximum(p.lb).minimum(p.ub)).abs()
+    sigma = outside.masked_fill(hard, 0)
+    # h*(lam): the bound that lam pushes from; one that is absent can have no multiplier.
+    bound = torch.where(lam > 0, p.ub, p.lb)
+    absent = bound.isinf()
+    excess = torch.where(absent, size, (size - p.w).clamp(min=0) / (1 + p.w))
+    gap = weight * sigma + lam * (bound.masked_fill(absent, 0) - y)
 
-    cost = 0.5 * (z * Hz).sum(-1) + (p.q * z).sum(-1) + (weight * sigma).sum(-1)
+    cost = (z * (0.5 * Hz + p.q)).sum(-1) + (weight * sigma).sum(-1)
     parts = [
         _largest(stationarity) / scale,
         _largest(p.multiply(p.C, z) - p.b) / (1 + _largest(p.b) + _largest(z)),
         _largest(z[:, :n_f] - p.fixed),
-        _largest(violation),
+        _largest((outside - sigma) / (1 + y.abs())),
         _largest(excess),
         gap.abs().sum(-1) / (1 + cost.abs()),
     ]

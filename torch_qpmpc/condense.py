@@ -8,7 +8,7 @@ Y, T'HT and GT; fixing the first n_f <= keep entries then only changes a linear 
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -27,7 +27,8 @@ class FlatPrograms:
 
     H ``(M, n_z, n_z)``, C ``(M, n_c, n_z)``, G ``(M, n_g, n_z)``; ``group`` ``(B,)`` says which
     triple a QP has; q ``(B, n_z)``, c ``(B,)``, b ``(B, n_c)``, lb, ub, w ``(B, n_g)``, fixed
-    ``(B, n_f)``. H is symmetric: its antisymmetric part, if any, is no part of the cost.
+    ``(B, n_f)``. A vector that the batch shares has one row (q, c, b, lb, ub, w, not fixed). H is
+    symmetric: its antisymmetric part, if any, is no part of the cost.
     """
 
     H: Tensor
@@ -60,24 +61,34 @@ class FlatPrograms:
             m.expand(*of_matrices, *m.shape[-2:]).reshape(count, *m.shape[-2:]) for m in matrices
         ]
         group = torch.arange(count).reshape(of_matrices).expand(batch).reshape(-1)
-        q, c, b, lb, ub, w, fixed = (
-            v.expand(*batch, v.shape[-1]).reshape(batch.numel(), v.shape[-1]) for v in vectors
-        )
+        q, c, b, lb, ub, w = (_flat(v, batch) for v in vectors[:-1])
+        fixed = vectors[-1].expand(*batch, -1).reshape(batch.numel(), vectors[-1].shape[-1])
         H, C, G = flat_matrices
         return cls(H, C, G, group, q, c.squeeze(-1), b, lb, ub, w, fixed), batch
 
     def __len__(self) -> int:
-        return self.q.shape[0]
+        return len(self.group)
 
     def take(self, index: Tensor) -> FlatPrograms:
         """The QPs at ``index``, with the matrices as they are."""
-        vectors = (self.group, self.q, self.c, self.b, self.lb, self.ub, self.w, self.fixed)
-        return FlatPrograms(self.H, self.C, self.G, *(v[index] for v in vectors))
+        shared = (self.q, self.c, self.b, self.lb, self.ub, self.w)
+        q, c, b, lb, ub, w = (v if len(v) == 1 else v[index] for v in shared)
+        group, fixed = self.group[index], self.fixed[index]
+        return FlatPrograms(self.H, self.C, self.G, group, q, c, b, lb, ub, w, fixed)
+
+    def without_nan(self) -> FlatPrograms:
+        """The same, with zeros for NaN and inf in matrices whose QPs are not going to be solved."""
+        finite = {name: getattr(self, name).nan_to_num(0, 0, 0) for name in ("H", "C", "G")}
+        return replace(self, **finite)
 
     def multiply(self, matrices: Tensor, vectors: Tensor) -> Tensor:
-        """Row-wise matrix-vector products: ``(M, i, j)`` by ``(B, j)`` to ``(B, i)``."""
+        """Row-wise matrix-vector products: ``(M, i, j)`` by ``(B, j)`` to ``(B, i)``.
+
+        A vector shared by the batch, ``(1, j)``, gives ``(1, i)`` if the matrices are shared too.
+        """
         if matrices.shape[0] == 1:
             return vectors @ matrices[0].mT
+        vectors = vectors.expand(len(self.group), -1)
         return torch.bmm(matrices[self.group], vectors.unsqueeze(-1)).squeeze(-1)
 
 
@@ -104,7 +115,8 @@ class SoftQPs:
 class Condensed:
     """The part of condensing that depends on (H, C, G) alone.
 
-    T ``(M, n_z, n_y)``, Y ``(M, n_z, n_c)``, H = T'HT ``(M, n_y, n_y)``, G = GT ``(M, n_g, n_y)``.
+    T ``(M, n_z, n_y)``, Y ``(M, n_z, n_c)``, H = T'HT ``(M, n_y, n_y)``, G = GT ``(M, n_g, n_y)``,
+    and what b contributes: H_b = T'HY ``(M, n_y, n_c)``, G_b = GY ``(M, n_g, n_c)``.
     Where the columns after ``keep`` do not have full row rank, ``deficient`` says so: then it is
     valid only for QPs that fix exactly ``keep`` entries.
     """
@@ -115,32 +127,39 @@ class Condensed:
     Y: Tensor
     H: Tensor
     G: Tensor
+    H_b: Tensor
+    G_b: Tensor
+    _entered: dict[int, Tensor] = field(default_factory=dict)
 
     def soft_qps(self, programs: FlatPrograms) -> tuple[SoftQPs, Tensor]:
         """The backend's problem, and the indices of the rows of G that it contains.
 
         Rows that no free variable enters, and rows without a finite bound, are left out.
         """
-        n_f = programs.fixed.shape[-1]
-        z_0 = self.particular(programs)
-        gradient = programs.q + programs.multiply(programs.H, z_0)
-        linear = programs.multiply(self.T[:, :, n_f:].mT, gradient)
-        offset = programs.multiply(programs.G, z_0)
-        bounded = ((programs.lb > -torch.inf) | (programs.ub < torch.inf)).any(dim=0)
-        # Rounding in the elimination leaves traces of variables that a row does not contain.
-        size = self.G.abs()
-        trace = ENTERS * size.sum(dim=2, keepdim=True)
-        entered = (size[:, :, n_f:] > trace).any(dim=2).any(dim=0)
-        rows = (bounded & entered).nonzero().squeeze(-1)
+        p, n_f = programs, programs.fixed.shape[-1]
+        linear = p.multiply(self.T[:, :, n_f:].mT, p.q) + p.multiply(self.H_b[:, n_f:], p.b)
+        linear = linear + p.multiply(self.H[:, n_f:, :n_f], p.fixed)
+        bounded = ((p.lb > -torch.inf) | (p.ub < torch.inf)).any(dim=0)
+        rows = (bounded & self._rows_entered(n_f)).nonzero().squeeze(-1)
+        offset = p.multiply(self.G[:, rows, :n_f], p.fixed) + p.multiply(self.G_b[:, rows], p.b)
         return SoftQPs(
             H=self.H[:, n_f:, n_f:].numpy(),
             G=self.G[:, rows, n_f:].numpy(),
-            group=programs.group.numpy(),
+            group=p.group.numpy(),
             g=linear.numpy(),
-            l=(programs.lb - offset)[:, rows].numpy(),
-            u=(programs.ub - offset)[:, rows].numpy(),
-            w=programs.w[:, rows].numpy(),
+            l=(p.lb[:, rows] - offset).numpy(),
+            u=(p.ub[:, rows] - offset).numpy(),
+            w=p.w[:, rows].expand(len(p), -1).numpy(),
         ), rows
+
+    def _rows_entered(self, n_f: int) -> Tensor:
+        """Which rows of G contain a variable that is free with n_f entries fixed, ``(n_g,)``."""
+        if n_f not in self._entered:
+            # Rounding in the elimination leaves traces of variables that a row does not contain.
+            size = self.G.abs()
+            trace = ENTERS * size.sum(dim=2, keepdim=True)
+            self._entered[n_f] = (size[:, :, n_f:] > trace).any(dim=2).any(dim=0)
+        return self._entered[n_f]
 
     def particular(self, programs: FlatPrograms) -> Tensor:
         """z at v = 0: ``Y b`` plus what the fixed entries contribute, ``(B, n_z)``."""
@@ -158,6 +177,14 @@ class Condensed:
         n_f = programs.fixed.shape[-1]
         inverse = torch.linalg.pinv(self.T[:, :, n_f:])
         return programs.multiply(inverse, z - self.particular(programs))
+
+
+def _flat(vectors: Tensor, batch: torch.Size) -> Tensor:
+    """``(*batch, n)`` as ``(B, n)``, or ``(1, n)`` where the whole batch shares one."""
+    n = vectors.shape[-1]
+    if vectors.numel() == n:
+        return vectors.reshape(1, n)
+    return vectors.expand(*batch, n).reshape(batch.numel(), n)
 
 
 def condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
@@ -179,10 +206,18 @@ def condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
     H_y = (H_y + H_y.mT) / 2
     if padding is not None:
         H_y = H_y + torch.diag_embed(padding)
-    condensed = Condensed(keep, eliminated is None, T, Y, H_y, G @ T)
+    condensed = Condensed(keep, eliminated is None, T, Y, H_y, G @ T, T.mT @ H @ Y, G @ Y)
     entries.insert(0, ((C.clone(), H.clone(), G.clone()), condensed))
     del entries[MEMO_SIZE:]
     return condensed
+
+
+def condensed_for(programs: FlatPrograms, keep: int) -> Condensed:
+    """Condensed with ``keep`` entries kept, or just the fixed ones where C does not allow more."""
+    H, C, G = programs.H, programs.C, programs.G
+    condensed = condense(H, C, G, keep)
+    n_f = programs.fixed.shape[-1]
+    return condense(H, C, G, n_f) if condensed.deficient and keep > n_f else condensed
 
 
 _memo = threading.local()
@@ -203,7 +238,7 @@ def _eliminate(C: Tensor, keep: int) -> tuple[Tensor, Tensor] | None:
     if n_c and (pivots.amin(-1) <= RANK_TOLERANCE * pivots.amax(-1)).any():
         return None
     # Which row of the permutation's column has the one; argmax refuses an empty dimension.
-    order = permutation.mT.nonzero()[:, -1].reshape(M, -1) + keep
+    order = permutation.mT.nonzero()[:, -1].reshape(M, n_z - keep) + keep
     dependent, independent = order[:, :n_c], order[:, n_c:].sort(dim=-1).values
     kept = torch.arange(keep, device=C.device).expand(M, keep)
     columns = torch.cat((kept, independent), dim=-1)

@@ -18,7 +18,7 @@ Rule = tuple[Callable[[Any], bool], str]
 
 
 def _number(x: Any) -> bool:
-    return isinstance(x, int | float) and not isinstance(x, bool) and not math.isnan(x)
+    return isinstance(x, int | float) and not isinstance(x, bool)
 
 
 def _whole(least: int) -> Rule:

@@ -39,12 +39,15 @@ def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
 
 
 def constraint_figure(mpc: QPMPC) -> Figure:
-    """C beside C_0 and their difference, raw as in the paper's figures."""
-    figure = Figure(figsize=(15, 4), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
-    draw_matrix(left, mpc.C_0, mpc, "$C_0$, the start")
+    """C with C_0 and their difference, raw as in the paper's figures.
+
+    One above the other: TensorBoard's cards are narrow.
+    """
+    figure = Figure(figsize=(6, 10.5), layout="constrained")
+    top, middle, bottom = figure.subplots(3, 1)
+    draw_matrix(top, mpc.C_0, mpc, "$C_0$, the start")
     draw_matrix(middle, mpc.C, mpc, r"$C_\theta$, learned")
-    draw_matrix(right, mpc.C - mpc.C_0, mpc, r"$C_\theta - C_0$")
+    draw_matrix(bottom, mpc.C - mpc.C_0, mpc, r"$C_\theta - C_0$")
     return figure
 
 
@@ -63,10 +66,10 @@ def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, show
     axes.plot(starts[:, 0], starts[:, 1], "ko", markersize=3)
     axes.plot(0, 0, "k+", markersize=9)
     axes.set(xlabel="x", ylabel="y", title="Closed loop")
-    axes.legend(fontsize="small", loc="upper right")
+    axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2)
 
 
-def draw_states(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
+def draw_stage_costs(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
     """Mean stage cost over time."""
     for name, loop in loops.items():
         axes.plot(loop.costs.mean(1), color=COLOURS.get(name), label=name)
@@ -76,10 +79,10 @@ def draw_states(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
 
 def closed_loop_figure(loops: Mapping[str, ClosedLoop], mpc: QPMPC) -> Figure:
     """Paths in the plane with predictions, and the stage cost over time."""
-    figure = Figure(figsize=(11, 4.5), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    draw_positions(left, loops, mpc)
-    draw_states(right, loops)
+    figure = Figure(figsize=(6, 9), layout="constrained")
+    top, bottom = figure.subplots(2, 1, height_ratios=(3, 2))
+    draw_positions(top, loops, mpc)
+    draw_stage_costs(bottom, loops)
     return figure
 
 

@@ -223,9 +223,9 @@ class QuadraticProgram:
 class QPSolution:
     """Primal-dual solution of a batch of QPs.
 
-    ``value`` and ``z`` take part in autograd. The multipliers and ``sigma`` are constants to it.
+    All of it is differentiable in the QP's tensors and in the fixed entries, but for the last three.
     An element that is not solved (``status != 0``; only with ``on_failure`` "warn" or "mask") has
-    ``value = inf``, zeros elsewhere, and no gradient.
+    ``value = inf``, the fixed entries in ``z``, zeros elsewhere, and no gradient.
 
     Attributes:
         value: optimal cost, ``(*batch,)``.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -65,8 +66,15 @@ class RunFolder:
         self.logger.experiment.flush()
 
     def finish(self, summary: Mapping[str, float | int | str]) -> None:
-        """Write summary.json, and the hyper-parameters with the outcome to TensorBoard."""
-        text = json.dumps(dict(summary), indent=2)
+        """Write summary.json, and the hyper-parameters with the outcome to TensorBoard.
+
+        JSON knows neither nan (no gap to close) nor inf: there they are null.
+        """
+        finite = {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in summary.items()
+        }
+        text = json.dumps(finite, indent=2, allow_nan=False)
         (self.path / "summary.json").write_text(text + "\n", encoding="utf-8")
         plain = (bool, int, float, str)
         hparams = {

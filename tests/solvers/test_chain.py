@@ -177,11 +177,9 @@ def test_what_nobody_solves_is_masked_on_request(recwarn):
 
 def spoil(known: KnownQP, index: int) -> KnownQP:
     """The same batch with NaN in one element."""
-    tensors = list(known.qp.tensors())
-    tensors[1] = tensors[1].clone()
-    tensors[1][index] = torch.nan
-    qp = QuadraticProgram(*tensors, check_values=False)
-    return KnownQP(qp, *list(vars(known).values())[1:])
+    q = known.qp.q.clone()
+    q[index] = torch.nan
+    return replace(known, qp=replace(known.qp, q=q, check_values=False))
 
 
 def test_the_log_adds_up_all_solves_of_its_block():

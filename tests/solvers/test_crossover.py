@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.problems import KnownQP, known_qp
-from torch_qpmpc.condense import FlatPrograms, SoftQPs, condense
+from tests.problems import KnownQP, known_qp, programs_of
+from torch_qpmpc.condense import SoftQPs, condense
 from torch_qpmpc.solvers import Answer
 from torch_qpmpc.solvers.crossover import MAX_STEPS, refine
 
@@ -16,7 +16,7 @@ BATCH = 5
 
 def condensed(known: KnownQP) -> tuple[SoftQPs, Answer]:
     """What a backend is asked, and the exact answer to it."""
-    programs, _ = FlatPrograms.of(*known.qp.tensors(), known.fixed)
+    programs = programs_of(known)
     form = condense(programs.H, programs.C, programs.G, known.fixed.shape[-1])
     qps, rows = form.soft_qps(programs)
     v = form.free_part(programs, known.z).numpy()

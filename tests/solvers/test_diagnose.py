@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, random_mpc
+from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, programs_of, random_mpc
 from torch_qpmpc import QuadraticProgram, Status, solve_qp
-from torch_qpmpc.condense import FlatPrograms, SoftQPs, condense
+from torch_qpmpc.condense import SoftQPs, condense
 from torch_qpmpc.solvers.diagnose import diagnose
 
 pytestmark = pytest.mark.filterwarnings("ignore:Clarabel.rs terminated with status")
@@ -94,12 +94,10 @@ def test_what_cannot_be_solved_is_named_and_soon(solver, name, qp, status):
 
 
 def test_an_infeasible_mpc_batch_is_named_and_soon(solver):
-    mpc = random_mpc(
-        0, free=0.0, horizon=10, state_slack=torch.inf, solver=solver, on_failure="mask"
-    )
-    s = torch.full((2, 2), 5.0)
+    options = {"horizon": 20, "state_slack": torch.inf, "action_slack": 1.0, "on_failure": "mask"}
+    mpc = random_mpc(0, free=0.0, solver=solver, **options)
     began = time.perf_counter()
-    solution = mpc.solve(s)
+    solution = mpc.solve(torch.tensor([[2.0, 2.0], [5.0, 5.0], [-5.0, 5.0]]))
     assert time.perf_counter() - began < 2
     assert (solution.status == Status.INFEASIBLE).all()
 
@@ -120,7 +118,7 @@ def test_fixed_entries_that_break_an_equality_are_infeasible():
 
 def soft_qps(**options) -> SoftQPs:
     known = known_qp(1, batch=(4,), **options)
-    programs, _ = FlatPrograms.of(*known.qp.tensors(), known.fixed)
+    programs = programs_of(known)
     return condense(programs.H, programs.C, programs.G, 2).soft_qps(programs)[0]
 
 

@@ -12,12 +12,16 @@ from functools import partial
 
 from torch_qpmpc.condense import SoftQPs
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.solvers import daqp, proxqp, qpsolvers
+from torch_qpmpc.solvers import daqp, interior_point, proxqp, qpsolvers
 from torch_qpmpc.solvers.answer import Answer
 
 Backend = Callable[[SoftQPs, Answer | None], Answer]
 
-BACKENDS: dict[str, Backend] = {"proxqp": proxqp.solve, "daqp": daqp.solve}
+BACKENDS: dict[str, Backend] = {
+    "proxqp": proxqp.solve,
+    "daqp": daqp.solve,
+    "torch": interior_point.solve,
+}
 
 
 def backend(name: str) -> Backend:

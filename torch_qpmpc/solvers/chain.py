@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.certificate import TOLERANCE, certify
-from torch_qpmpc.condense import Condensed, FlatPrograms, SoftQPs, condense
+from torch_qpmpc.certificate import TOLERANCE, Products, certify
+from torch_qpmpc.condense import Condensed, FlatPrograms, SoftQPs, condensed_for
 from torch_qpmpc.qp import Status
 from torch_qpmpc.solvers import Answer, Backend, backend, fallbacks
 from torch_qpmpc.solvers.crossover import refine
@@ -97,23 +97,7 @@ def solve_programs(
         start: warm start, z ``(B, n_z)`` and lam ``(B, n_g)`` of a solution of nearly these QPs.
     """
     began = time.perf_counter()
-    raw = _unsolved(programs)
-    todo = _valid(programs).nonzero().squeeze(-1)
-    raw.status[todo] = Status.NOT_CONVERGED
-    chain: list[Backend] = [backend(solver), *fallbacks(solver)]
-    rejected = 0
-    if len(todo):
-        n_f = programs.fixed.shape[-1]
-        condensed = condense(*_finite_matrices(programs), keep)
-        if condensed.deficient and keep > n_f:
-            condensed = condense(*_finite_matrices(programs), n_f)
-        if start is not None:
-            todo = _attempt(chain[0], programs, condensed, todo, raw, start)
-        for solve in chain:
-            todo = _attempt(solve, programs, condensed, todo, raw)
-            rejected += len(todo)
-        if len(todo):
-            _explain(programs.take(todo), condensed, todo, raw)
+    raw, rejected = _solve_programs(programs, keep, solver, start)
     if (log := _active_log.get()) is not None:
         log.solves += len(programs)
         log.unsolved += int((raw.status != Status.SOLVED).sum())
@@ -125,46 +109,68 @@ def solve_programs(
     return raw
 
 
+def _solve_programs(
+    programs: FlatPrograms, keep: int, solver: str, start: tuple[Tensor, Tensor] | None
+) -> tuple[RawSolution, int]:
+    """The solutions, and how often a claim was rejected and the next solver asked."""
+    attempts: list[tuple[Backend, bool]] = [(backend(solver), False)]
+    attempts += [(other, False) for other in fallbacks(solver)]
+    if start is not None:
+        attempts.insert(0, (backend(solver), True))
+    todo, valid = torch.arange(len(programs)), _valid(programs)
+    raw, rejected = None, 0
+    if not valid.all():
+        raw, todo = _unsolved(programs), valid.nonzero().squeeze(-1)
+        raw.status[todo] = Status.NOT_CONVERGED
+        if not len(todo):
+            return raw, 0
+        programs = programs.without_nan()
+    condensed = condensed_for(programs, keep)
+    for solve, warm in attempts:
+        whole = len(todo) == len(programs)
+        part = programs if whole else programs.take(todo)
+        guess = (start[0][todo], start[1][todo]) if warm and start is not None else None
+        claim = _attempt(solve, part, condensed, guess)
+        accepted = claim.status == Status.SOLVED
+        if whole and accepted.all():
+            return claim, rejected
+        raw = _unsolved(programs, Status.NOT_CONVERGED) if raw is None else raw
+        raw.put(todo[accepted], claim.at(accepted))
+        todo = todo[~accepted]
+        raw.residual[todo] = claim.residual[~accepted]
+        rejected += 0 if warm else len(todo)
+        if not len(todo):
+            return raw, rejected
+    assert raw is not None
+    raw.status[todo] = _reasons(programs.take(todo), condensed)
+    return raw, rejected
+
+
 def _attempt(
     solve: Backend,
     programs: FlatPrograms,
     condensed: Condensed,
-    todo: Tensor,
-    raw: RawSolution,
-    start: tuple[Tensor, Tensor] | None = None,
-) -> Tensor:
-    """Solve the QPs at ``todo``, keep what the certificate accepts, return the rest."""
-    if not len(todo):
-        return todo
-    whole = len(todo) == len(programs)
-    part = programs if whole else programs.take(todo)
-    qps, rows = condensed.soft_qps(part)
+    start: tuple[Tensor, Tensor] | None,
+) -> RawSolution:
+    """One backend's claims, sharpened where that helps; ``status`` is the certificate's verdict."""
+    qps, rows = condensed.soft_qps(programs)
     if qps.l.shape[1] == 0:
         answer = _unconstrained(qps)
+    elif start is None:
+        answer = solve(qps, None)
     else:
-        guess = None
-        if start is not None:
-            z, lam = (tensor[todo] for tensor in start)
-            guess = Answer(
-                condensed.free_part(part, z).numpy(), lam[:, rows].numpy(), part.group.numpy()
-            )
-        answer = solve(qps, guess)
-    claim = _recover(part, condensed, answer, rows)
-    accepted = claim.residual <= TOLERANCE
-    nearly = ~accepted & (claim.residual <= NEARLY)
+        z, lam = start
+        v = condensed.free_part(programs, z).numpy()
+        answer = solve(qps, Answer(v, lam[:, rows].numpy(), np.zeros(len(v), dtype=np.int64)))
+    claim = _recover(programs, condensed, answer, rows)
+    nearly = (claim.residual > TOLERANCE) & (claim.residual <= NEARLY)
     if nearly.any():
         sharper = refine(qps, answer, nearly.nonzero().squeeze(-1).numpy())
-        second = _recover(part, condensed, sharper, rows)
+        second = _recover(programs, condensed, sharper, rows)
         improved = (second.residual < claim.residual).nonzero().squeeze(-1)
         claim.put(improved, second.at(improved))
-        accepted = claim.residual <= TOLERANCE
-    claim.status = torch.where(accepted, Status.SOLVED, Status.NOT_CONVERGED)
-    if accepted.all():
-        raw.put(todo, claim)
-        return todo[:0]
-    raw.residual[todo] = claim.residual
-    raw.put(todo[accepted], claim.at(accepted))
-    return todo[~accepted]
+    claim.status[claim.residual > TOLERANCE] = Status.NOT_CONVERGED
+    return claim
 
 
 def _unconstrained(qps: SoftQPs) -> Answer:
@@ -182,19 +188,20 @@ def _recover(p: FlatPrograms, condensed: Condensed, answer: Answer, rows: Tensor
     """
     z = condensed.expand(p, torch.from_numpy(answer.v))
     y = p.multiply(p.G, z)
+    # A row that no free variable enters is active exactly where it is violated.
     lam = torch.zeros_like(y)
-    lam[y > p.ub + ACTIVE_TOLERANCE] = torch.inf
-    lam[y < p.lb - ACTIVE_TOLERANCE] = -torch.inf
+    lam.masked_fill_(y > p.ub + ACTIVE_TOLERANCE, torch.inf)
+    lam.masked_fill_(y < p.lb - ACTIVE_TOLERANCE, -torch.inf)
     lam[:, rows] = torch.from_numpy(answer.lam)
-    lam = torch.minimum(torch.maximum(lam, -p.w), p.w)
-    lam = lam.masked_fill(lam.isinf(), 0)  # a hard row out of reach: the certificate sees it
-    gradient = p.multiply(p.H, z) + p.q + p.multiply(p.G.mT, lam)
+    lam = lam.minimum(p.w).maximum(-p.w)
+    lam = lam.masked_fill_(lam.isinf(), 0)  # a hard row out of reach: the certificate sees it
+    products = Products(p.multiply(p.H, z), y, p.multiply(p.G.mT, lam))
+    gradient = products.Hz + p.q + products.G_lam
     chi = -p.multiply(condensed.Y.mT, gradient)
     n_f = p.fixed.shape[-1]
     xi = -(gradient + p.multiply(p.C.mT, chi))[:, :n_f]
-    certificate = certify(p, z, lam, chi, xi)
+    certificate = certify(p, z, lam, chi, xi, products)
     iterations = torch.from_numpy(answer.iterations).to(torch.int64)
-    status = torch.empty_like(iterations)
     return RawSolution(
         certificate.value,
         z,
@@ -202,14 +209,14 @@ def _recover(p: FlatPrograms, condensed: Condensed, answer: Answer, rows: Tensor
         chi,
         lam,
         xi,
-        status,
+        torch.full_like(iterations, int(Status.SOLVED)),
         certificate.residual,
         iterations,
     )
 
 
-def _explain(part: FlatPrograms, condensed: Condensed, todo: Tensor, raw: RawSolution) -> None:
-    """Replace NOT_CONVERGED by what is really the matter, where that can be told."""
+def _reasons(part: FlatPrograms, condensed: Condensed) -> Tensor:
+    """What is the matter with QPs that no solver solved: their status, ``(B,)``."""
     particular = condensed.particular(part)
     inconsistent = (part.multiply(part.C, particular) - part.b).abs() > TOLERANCE * (
         1 + part.b.abs() + particular.abs().amax(-1, keepdim=True)
@@ -219,41 +226,34 @@ def _explain(part: FlatPrograms, condensed: Condensed, todo: Tensor, raw: RawSol
     unreachable = (torch.maximum(part.lb - y, y - part.ub) > TOLERANCE) & part.w.isinf()
     unreachable[:, rows] = False
     impossible = inconsistent.any(-1) | unreachable.any(-1)
-    reasons = torch.from_numpy(diagnose(qps)) if qps.g.shape[1] else raw.status[todo]
-    raw.status[todo] = torch.where(impossible, int(Status.INFEASIBLE), reasons)
+    if not qps.g.shape[1]:
+        return torch.where(impossible, int(Status.INFEASIBLE), int(Status.NOT_CONVERGED))
+    return torch.where(impossible, int(Status.INFEASIBLE), torch.from_numpy(diagnose(qps)))
 
 
-def _unsolved(p: FlatPrograms) -> RawSolution:
+def _unsolved(p: FlatPrograms, status: Status = Status.INVALID_DATA) -> RawSolution:
     """What an element carries that has no solution: an infinite cost, and zeros."""
-    n, device = len(p), p.q.device
-    z = torch.zeros_like(p.q)
+    n, zeros = len(p), p.q.new_zeros
+    z = zeros(n, p.q.shape[-1])
     z[:, : p.fixed.shape[-1]] = p.fixed.nan_to_num(0, 0, 0)
-    rows, count = torch.zeros_like(p.lb), torch.zeros(n, dtype=torch.int64, device=device)
     return RawSolution(
-        value=torch.full((n,), torch.inf, dtype=p.q.dtype, device=device),
+        value=p.q.new_full((n,), torch.inf),
         z=z,
-        sigma=rows,
-        chi=torch.zeros_like(p.b),
-        lam=rows.clone(),
+        sigma=zeros(n, p.lb.shape[-1]),
+        chi=zeros(n, p.b.shape[-1]),
+        lam=zeros(n, p.lb.shape[-1]),
         xi=torch.zeros_like(p.fixed),
-        status=torch.full_like(count, int(Status.INVALID_DATA)),
-        residual=torch.full((n,), torch.inf, dtype=p.q.dtype, device=device),
-        iterations=count,
+        status=p.group.new_full((n,), int(status)),
+        residual=p.q.new_full((n,), torch.inf),
+        iterations=p.group.new_zeros(n),
     )
 
 
 def _valid(p: FlatPrograms) -> Tensor:
     """Which QPs have finite data and lb <= ub, ``(B,)``."""
-    matrices = torch.stack([m.isfinite().flatten(1).all(1) for m in (p.H, p.C, p.G)]).all(0)
-    vectors = torch.stack([v.isfinite().all(-1) for v in (p.q, p.b, p.fixed)]).all(0)
-    vectors &= p.c.isfinite()
+    # A sum is finite if its terms are (but for overflow, which no solver survives either).
+    matrices = (p.H.sum((1, 2)) + p.C.sum((1, 2)) + p.G.sum((1, 2))).isfinite()
+    vectors = (p.q.sum(-1) + p.b.sum(-1) + p.fixed.sum(-1) + p.c).isfinite()
     # A comparison with NaN is false, and an empty interval is one whose bounds are crossed.
     bounds = ((p.lb <= p.ub) & (p.lb < torch.inf) & (p.ub > -torch.inf) & (p.w >= 0)).all(-1)
     return matrices[p.group] & vectors & bounds
-
-
-def _finite_matrices(p: FlatPrograms) -> tuple[Tensor, Tensor, Tensor]:
-    """H, C and G; a triple with NaN or inf, which nothing uses, becomes zero."""
-    if all(m.isfinite().all() for m in (p.H, p.C, p.G)):
-        return p.H, p.C, p.G
-    return p.H.nan_to_num(0, 0, 0), p.C.nan_to_num(0, 0, 0), p.G.nan_to_num(0, 0, 0)

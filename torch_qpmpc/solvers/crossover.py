@@ -24,25 +24,34 @@ def refine(qps: SoftQPs, start: Answer, which: np.ndarray) -> Answer:
         previous = None
         for _ in range(MAX_STEPS):
             p = G @ v[i] + lam[i]
-            over, under = p - qps.u[i], qps.l[i] - p
-            active = ((over > 0) & (over <= qps.w[i])) | ((under > 0) & (under <= qps.w[i]))
-            held = np.where(over > qps.w[i], qps.w[i], np.where(under > qps.w[i], -qps.w[i], 0.0))
-            state = np.where(active, np.sign(over), held)
-            if previous is not None and np.array_equal(state, previous):
+            bound, active, held = row_states(p, qps.l[i], qps.u[i], qps.w[i])
+            states = np.where(active, bound, np.inf), np.where(active, 0, held)
+            if previous is not None and np.array_equal(states, previous):
                 break
-            previous = state
-            v[i], lam[i] = _solve_kkt(H, G, qps.g[i], held, active, qps.l[i], qps.u[i], over > 0)
+            previous = states
+            v[i], lam[i] = _solve_kkt(H, G, qps.g[i], bound, active, states[1])
             iterations[i] += 1
     return Answer(v, lam, iterations)
 
 
-def _solve_kkt(H, G, g, held, active, lower, upper, at_upper) -> tuple[np.ndarray, np.ndarray]:
-    """v and lam with ``G_i v`` at a bound where active, and lam as held elsewhere."""
+def row_states(p, lower, upper, w) -> tuple:
+    """Each row's nearest bound, whether it is active there, and lam if not; arrays or tensors.
+
+    The excess of ``p = y + lam`` over the bounds would be the multiplier; |lam| <= w caps it.
+    """
+    bound = p.clip(lower, upper)
+    excess = p - bound
+    held = excess.clip(-w, w)
+    active = (held == excess) & ((excess != 0) | (lower == upper))
+    return bound, active, held
+
+
+def _solve_kkt(H, G, g, bound, active, held) -> tuple[np.ndarray, np.ndarray]:
+    """v and lam with ``G_i v`` at its bound where active, and lam as held elsewhere."""
     d = len(g)
     G_a = G[active]
     kkt = np.block([[H, G_a.T], [G_a, np.zeros((len(G_a), len(G_a)))]])
-    bound = np.where(at_upper, upper, lower)[active]
-    right = np.concatenate([-g - G.T @ held, bound])
+    right = np.concatenate([-g - G.T @ held, bound[active]])
     solution = np.linalg.lstsq(kkt, right, rcond=1e-13)[0]
     lam = held.copy()
     lam[active] = solution[d:]

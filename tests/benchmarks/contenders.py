@@ -1,0 +1,128 @@
+"""Who takes part in the gradient benchmark: our solvers from their table, cold and warm, and peers.
+
+A contender's `Gradient` computes one Q-learning gradient (eq:thup): V on the next states, Q on the
+visited pairs, and the gradient of the squared TD error in all of theta.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tests.benchmarks.peers import PEERS, Values
+from tests.benchmarks.problems import GAMMA, PAPER, Transitions, make_mpc, move, transitions
+from torch_qpmpc import QPMPC
+from torch_qpmpc.qp import QPSolution
+from torch_qpmpc.solvers import BACKENDS
+
+BATCHES = (1, 32, 256, 1024)
+REFERENCE = next(iter(PEERS))
+#: How far theta has moved, relatively, since the solutions that a warm start uses.
+MOVED = 1e-3
+
+
+@dataclass
+class Gradient:
+    """One gradient at a time: `step` returns V(s+) and Q(s, a), and leaves theta's ``grad``."""
+
+    mpc: QPMPC
+    batch: Transitions
+    value: Callable[[Tensor], Tensor]
+    action_value: Callable[[Tensor, Tensor], Tensor]
+
+    def step(self) -> tuple[Tensor, Tensor]:
+        self.mpc.zero_grad()
+        with torch.no_grad():
+            V = self.value(self.batch.following)
+        Q = self.action_value(self.batch.s, self.batch.a)
+        (0.5 * (self.batch.cost + GAMMA * V - Q).square().mean()).backward()
+        return V, Q.detach()
+
+    def flat(self) -> Tensor:
+        """The gradient in all of theta, as one vector."""
+        gradients = (p.grad for p in self.mpc.parameters())
+        return torch.cat([g.flatten() for g in gradients if g is not None])
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A row of the table.
+
+    ``make`` builds its `Gradient` from the QP and the batch; ``largest`` is the largest batch that
+    it is worth waiting for; ``fast`` allows more rounds.
+    """
+
+    label: str
+    solver: str
+    make: Callable[[QPMPC, Transitions], Gradient]
+    threads: int = 1
+    largest: int = BATCHES[-1]
+    fast: bool = True
+    ours: bool = True
+
+    def gradient(self, dense: bool, batch: int) -> Gradient:
+        mpc = make_mpc(PAPER, dense=dense, solver=self.solver)
+        return self.make(mpc, transitions(PAPER.n_x, PAPER.n_u, BATCHES[-1]).first(batch))
+
+
+def cold(mpc: QPMPC, batch: Transitions) -> Gradient:
+    return Gradient(mpc, batch, mpc.value, mpc.action_value)
+
+
+def warm(mpc: QPMPC, batch: Transitions) -> Gradient:
+    """From the solutions of the same transitions at a theta that was 0.1 % different."""
+    with torch.no_grad():
+        theta = {name: p.clone() for name, p in mpc.named_parameters()}
+        move(mpc, MOVED)
+        of_V, of_Q = _constants(mpc.solve(batch.following)), _constants(mpc.solve(batch.s, batch.a))
+        for name, parameter in mpc.named_parameters():
+            parameter.copy_(theta[name])
+    return Gradient(
+        mpc,
+        batch,
+        lambda s: mpc.solve(s, warm_start=of_V).value,
+        lambda s, a: mpc.solve(s, a, warm_start=of_Q).value,
+    )
+
+
+def _constants(solution: QPSolution) -> QPSolution:
+    return replace(solution, value=solution.value.detach(), z=solution.z.detach())
+
+
+def peer(values: Callable[[], Values]) -> Callable[[QPMPC, Transitions], Gradient]:
+    def make(mpc: QPMPC, batch: Transitions) -> Gradient:
+        of = values()
+        return Gradient(
+            mpc,
+            batch,
+            lambda s: of(mpc.quadratic_program(), s),
+            lambda s, a: of(mpc.quadratic_program(), torch.cat((s, a), dim=-1)),
+        )
+
+    return make
+
+
+def _ours() -> list[Contender]:
+    contenders = []
+    for name in BACKENDS:
+        contenders.append(Contender(name, name, cold))
+        if name == "proxqp":
+            contenders.append(Contender(f"{name}, 2 threads", name, cold, threads=2))
+        contenders.append(Contender(f"{name}, warm", name, warm))
+    return contenders
+
+
+#: The largest batch of each peer.
+PATIENCE = {REFERENCE: 1024, "qpth": 256, "cvxpylayers": 32}
+
+CONTENDERS: list[Contender] = [
+    *(
+        Contender(name, "daqp", peer(make), largest=PATIENCE[name], fast=False, ours=False)
+        for name, make in PEERS.items()
+    ),
+    Contender("Clarabel (qpsolvers), condensed", "qpsolvers:clarabel", cold, fast=False),
+    *_ours(),
+]

@@ -1,0 +1,141 @@
+"""Other packages' differentiable QPs, each as a function from the QP and what is fixed to values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+from torch import Tensor
+
+from tests.benchmarks.full_space import INFINITE, FullSpace
+from torch_qpmpc import QuadraticProgram
+
+#: Optimal values ``(B,)``, differentiable in the QP's tensors, of a QP and fixed entries.
+Values = Callable[[QuadraticProgram, Tensor], Tensor]
+#: qpth refuses a singular Q, and sigma has no curvature.
+CURVATURE = 1e-8
+
+
+def needs(module: str) -> Any:
+    """The module, or the test is skipped."""
+    return pytest.importorskip(module, reason=f"{module} is not installed: pip install '.[peers]'")
+
+
+def proxsuite() -> Values:
+    """ProxSuite's own torch layer, with its default settings."""
+    layer = needs("proxsuite.torch.qplayer").QPFunction()
+
+    def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
+        full = FullSpace.of(qp, fixed)
+        return full.value(layer(full.Q, full.p, full.A, full.b, full.G, full.l, full.u)[0])
+
+    return values
+
+
+def qpth() -> Values:
+    layer = needs("qpth.qp").QPFunction(verbose=-1, check_Q_spd=False)
+
+    def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
+        full = FullSpace.of(qp, fixed)
+        upper, lower = full.u[0] < INFINITE, full.l[0] > -INFINITE
+        G = torch.cat((full.G[upper], -full.G[lower]))
+        h = torch.cat((full.u[:, upper], -full.l[:, lower]), dim=1)
+        Q = full.Q + CURVATURE * torch.eye(len(full.Q)).to(full.Q)
+        # It would give matrices that the batch shares the mean of the batch's gradients.
+        Q, G, A = (matrix.expand(len(fixed), -1, -1) for matrix in (Q, G, full.A))
+        return full.value(layer(Q, full.p, G, h, A, full.b))
+
+    return values
+
+
+def cvxpylayers() -> Values:
+    """The QP as eq:qp2 prints it, compiled once for V and once for Q; its solver is Clarabel."""
+    CvxpyLayer = needs("cvxpylayers.torch").CvxpyLayer
+    layers: dict[int, Any] = {}
+
+    def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
+        soft = qp.w.isfinite()
+        n_f = fixed.shape[-1]
+        if n_f not in layers:
+            layers[n_f] = _cvxpy_layer(CvxpyLayer, qp, n_f)
+        # H is diagonal; a root has no derivative at zero.
+        root = (qp.H.diagonal() + 1e-12).sqrt()
+        operands = root, qp.q, qp.C, qp.b, qp.G, qp.lb, qp.ub, qp.w[soft], fixed
+        z, sigma = layers[n_f](*operands)
+        return 0.5 * (z @ qp.H * z).sum(-1) + z @ qp.q + qp.c + sigma @ qp.w[soft]
+
+    return values
+
+
+def _cvxpy_layer(CvxpyLayer: Any, qp: QuadraticProgram, n_f: int) -> Any:
+    import cvxpy as cp
+
+    soft = qp.w.isfinite().numpy()
+    n_s = int(soft.sum())
+    z, sigma = cp.Variable(qp.n_z), cp.Variable(n_s)
+    shapes = (qp.n_z, qp.n_z, qp.C.shape, qp.b.shape, qp.G.shape, qp.lb.shape, qp.ub.shape)
+    root, q, C, b, G, lb, ub = (cp.Parameter(shape) for shape in shapes)
+    w, fixed = cp.Parameter(n_s, nonneg=True), cp.Parameter(n_f)
+    slack = np.eye(len(soft))[:, soft] @ sigma
+    cost = 0.5 * cp.sum_squares(cp.multiply(root, z)) + q @ z + w @ sigma
+    constraints = [C @ z == b, lb - slack <= G @ z, G @ z <= ub + slack, sigma >= 0]
+    # The hard rows of what is fixed hold by themselves; stated again, they leave no interior.
+    free = np.arange(len(soft)) >= n_f
+    keep = (soft | free).nonzero()[0]
+    constraints[1] = lb[keep] - slack[keep] <= (G @ z)[keep]
+    constraints[2] = (G @ z)[keep] <= ub[keep] + slack[keep]
+    problem = cp.Problem(cp.Minimize(cost), [*constraints, z[:n_f] == fixed])
+    parameters = [root, q, C, b, G, lb, ub, w, fixed]
+    return CvxpyLayer(problem, parameters, [z, sigma], solver_args={"solve_method": "CLARABEL"})
+
+
+PEERS: dict[str, Callable[[], Values]] = {
+    "ProxSuite's QPFunction": proxsuite,
+    "qpth": qpth,
+    "cvxpylayers": cvxpylayers,
+}
+
+
+def piqp_solver(full: FullSpace) -> Callable[[], Tensor]:
+    """PIQP's sparse solver on the full space: set up once, a solve a sample; its values ``(B,)``.
+
+    The rows of sigma >= 0, and those of hard rows, are bounds on x.
+    """
+    piqp = needs("piqp")
+    Q, A, G = (sp.csc_matrix(matrix.detach().numpy()) for matrix in (full.Q, full.A, full.G))
+    p, b, lower, upper = (v.detach().numpy() for v in (full.p, full.b, full.l, full.u))
+    lower, upper = (np.where(abs(v) < INFINITE, v, np.sign(v) * np.inf) for v in (lower, upper))
+    single = np.diff(G.tocsr().indptr) == 1
+    rows, columns = G[single].nonzero()
+    columns = columns[np.argsort(rows)]
+    if not (G[single].data == 1).all():
+        raise ValueError("G: single entries other than 1, expected the identity's")
+    x_l, x_u = np.full_like(p, -np.inf), np.full_like(p, np.inf)
+    x_l[:, columns], x_u[:, columns] = lower[:, single], upper[:, single]
+    G, lower, upper = sp.csc_matrix(G[~single]), lower[:, ~single], upper[:, ~single]
+    solver = piqp.SparseSolver()
+    solver.settings.eps_abs = solver.settings.eps_rel = 1e-9
+    solver.settings.check_duality_gap = True
+    solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = 1e-9
+
+    def arguments(i: int) -> dict[str, Any]:
+        vectors = {"c": p[i], "b": b[i], "h_l": lower[i], "h_u": upper[i]}
+        return vectors | {"x_l": x_l[i], "x_u": x_u[i]}
+
+    setup = partial(solver.setup, P=Q, A=A, G=G)
+    setup(**arguments(0))
+
+    def values() -> Tensor:
+        x = np.empty_like(p)
+        for i in range(len(p)):
+            solver.update(**arguments(i))
+            solver.solve()
+            x[i] = solver.result.x
+        return full.value(torch.from_numpy(x)).detach()
+
+    return values

@@ -1,0 +1,79 @@
+"""What is left of a gradient outside the solver's own calls, and how fast the policy decides."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from statistics import median
+from typing import Any
+
+import pytest
+import torch
+
+from tests.benchmarks.contenders import cold, warm
+from tests.benchmarks.problems import PAPER, make_mpc, nudge, transitions
+from torch_qpmpc.condense import SoftQPs
+from torch_qpmpc.solvers import BACKENDS, Answer
+
+pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
+
+STARTS = {"": cold, ", warm": warm}
+
+
+@pytest.mark.parametrize("batch", [32, 256])
+@pytest.mark.parametrize("start", STARTS, ids=["cold", "warm"])
+@pytest.mark.parametrize("solver", BACKENDS)
+def test_share_outside_the_solver(
+    benchmark: Any,
+    interleaved: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+    solver: str,
+    start: str,
+    batch: int,
+) -> None:
+    """The backend's call is what hands QPs to the solver's own code, its Python loop included."""
+    solve, inside, shares = BACKENDS[solver], [], []
+
+    def timed(qps: SoftQPs, guess: Answer | None) -> Answer:
+        began = time.perf_counter()
+        answer = solve(qps, guess)
+        inside.append(time.perf_counter() - began)
+        return answer
+
+    monkeypatch.setitem(BACKENDS, solver, timed)
+    gradient = STARTS[start](
+        make_mpc(PAPER, dense=True, solver=solver),
+        transitions(PAPER.n_x, PAPER.n_u, 256).first(batch),
+    )
+
+    def step() -> int:
+        inside.clear()
+        began = time.perf_counter()
+        gradient.step()
+        shares.append(1 - sum(inside) / (time.perf_counter() - began))
+        return len(inside)
+
+    calls = interleaved(step, rounds=10, warmup=2, before=lambda: nudge(gradient.mpc))
+    benchmark.extra_info |= {
+        "row": solver + start,
+        "batch": batch,
+        "outside": median(shares[2:]),
+    }
+    assert calls == 2  # one for V and one for Q: what is timed is all there is
+
+
+@pytest.mark.parametrize("solver", BACKENDS)
+def test_decisions(benchmark: Any, interleaved: Callable[..., Any], solver: str) -> None:
+    """The collection loop's policy: batches of 32 with theta at rest."""
+    mpc = make_mpc(PAPER, dense=True, solver=solver)
+    states = transitions(PAPER.n_x, PAPER.n_u, 32).s
+
+    @torch.no_grad()
+    def decide() -> torch.Tensor:
+        return mpc.policy(states)
+
+    actions = interleaved(decide, rounds=100, warmup=5)
+    benchmark.extra_info |= {"row": solver, "batch": 32}
+    for i in (0, 31):
+        alone = mpc.policy(states[i : i + 1])
+        assert torch.allclose(actions[i], alone[0], atol=1e-5)

@@ -1,0 +1,60 @@
+"""What the documentation shows runs: README.md's Python, and every docstring's example."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import pkgutil
+import re
+from pathlib import Path
+
+import pytest
+
+import torch_qpmpc
+
+README = Path(__file__).parents[1] / "README.md"
+MODULES = sorted(
+    module.name for module in pkgutil.walk_packages(torch_qpmpc.__path__, "torch_qpmpc.")
+)
+
+
+def python_blocks(text: str) -> list[tuple[int, str]]:
+    """Fenced Python blocks, each with the line that it starts on."""
+    fence = re.compile(r"^```python[^\n]*\n(.*?)^```", re.DOTALL | re.MULTILINE)
+    return [(text.count("\n", 0, m.start(1)), m.group(1)) for m in fence.finditer(text)]
+
+
+def test_blocks_are_found():
+    text = "a\n```bash\nls\n```\n```python\nx = 1\n```\nb\n```python title\ny = 2\n\nz = 3\n```\n"
+    assert python_blocks(text) == [(5, "x = 1\n"), (9, "y = 2\n\nz = 3\n")]
+
+
+@pytest.mark.skipif(not README.exists(), reason="README.md is not there, as in a wheel's tests")
+def test_readme_runs(tmp_path, monkeypatch):
+    """Block after block, as a reader would paste them into one session."""
+    monkeypatch.chdir(tmp_path)
+    blocks = python_blocks(README.read_text(encoding="utf-8"))
+    assert blocks, "README.md shows no Python"
+    namespace: dict[str, object] = {"__name__": "readme"}
+    for line, code in blocks:
+        # Blank lines first, so that a traceback names README.md's own line.
+        exec(compile("\n" * line + code, str(README), "exec"), namespace)
+
+
+@pytest.mark.parametrize("name", ["torch_qpmpc", *MODULES])
+def test_docstrings_run(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    results = doctest.testmod(
+        importlib.import_module(name),
+        optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS,
+    )
+    assert results.failed == 0, f"{results.failed} of {results.attempted} examples of {name}"
+
+
+PUBLIC = [torch_qpmpc.__dict__[name] for name in torch_qpmpc.__all__]
+
+
+@pytest.mark.parametrize("public", PUBLIC, ids=lambda x: x.__name__)
+def test_public_names_are_documented(public):
+    assert public.__module__.startswith("torch_qpmpc")
+    assert len((public.__doc__ or "").strip().splitlines()[0]) > 20

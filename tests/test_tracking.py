@@ -1,0 +1,134 @@
+"""What a run's folder holds is what was logged, also when the run is cut short."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from omegaconf import OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from tests.runs import make_config
+from torch_qpmpc.config import flatten
+from torch_qpmpc.tracking import RunFolder
+
+
+def events(folder: Path) -> EventAccumulator:
+    found = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0, "images": 0})
+    found.Reload()
+    return found
+
+
+def scalars(found: EventAccumulator, tag: str) -> dict[int, float]:
+    return {event.step: event.value for event in found.Scalars(tag)}
+
+
+def a_figure() -> Figure:
+    figure = Figure(figsize=(2, 1))
+    figure.subplots().plot([0, 1], [1, 0])
+    return figure
+
+
+def test_folder_has_everything_logged(tmp_path):
+    cfg = make_config("seed=7")
+    with RunFolder(tmp_path / "new" / "run", cfg) as run:
+        for update in range(1, 301):
+            run.log({"loss/value": 1 / update, "train/reward": -update}, update)
+            if update % 100 == 0:
+                run.log({"eval/J": 1000.0 - update}, update)
+        run.figure("structure/C", a_figure(), 300)
+        run.finish({"J_final": 700.0, "closed_gap": 0.5, "seed": 7, "constraint": "combined"})
+    folder = tmp_path / "new" / "run"
+    assert run.path == folder.resolve()
+    assert OmegaConf.load(folder / "config.yaml") == OmegaConf.create(
+        OmegaConf.to_container(cfg, resolve=True)
+    )
+
+    table: Any = pd.read_csv(folder / "metrics.csv").set_index("update")
+    assert list(table.index) == list(range(1, 301)), "one row for an update"
+    assert list(table.columns) == ["loss/value", "train/reward", "eval/J"]
+    assert table["loss/value"][7] == 1 / 7, "to the last digit"
+    assert table["eval/J"].dropna().to_dict() == {100: 900.0, 200: 800.0, 300: 700.0}
+
+    found = events(folder)
+    assert {"loss/value", "train/reward", "eval/J"} <= set(found.Tags()["scalars"])
+    assert len(found.Scalars("loss/value")) == 300, "TensorBoard lost none"
+    assert scalars(found, "eval/J") == {100: 900.0, 200: 800.0, 300: 700.0}
+    assert found.Tags()["images"] == ["structure/C"]
+    assert found.Images("structure/C")[0].step == 300
+
+    text = found.Tensors("config/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert "seed: 7" in text
+    assert "lr_constraints: 0.002" in text
+    assert scalars(found, "hparam/J_final") == {0: 700.0}
+    assert scalars(found, "hparam/closed_gap") == {0: 0.5}
+    plugin = found.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    for key in flatten(OmegaConf.to_container(cfg)):
+        assert key.encode() in plugin, key
+
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary == {"J_final": 700, "closed_gap": 0.5, "seed": 7, "constraint": "combined"}
+
+
+def test_summary_is_strict_json(tmp_path):
+    with RunFolder(tmp_path, make_config()) as run:
+        run.finish({"closed_gap": math.nan, "J_final": math.inf, "J_start": 1.5})
+
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    text = (tmp_path / "summary.json").read_text()
+    summary = json.loads(text, parse_constant=refuse)
+    assert summary == {"closed_gap": None, "J_final": None, "J_start": 1.5}
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_what_was_logged_survives_an_interruption(tmp_path, error):
+    def interrupted() -> None:
+        with RunFolder(tmp_path, make_config()) as run:
+            for update in range(1, 20):
+                run.log({"eval/J": float(update)}, update)
+            raise error
+
+    threads = threading.active_count()
+    with pytest.raises(error):
+        interrupted()
+    assert threading.active_count() == threads, "the writer's thread has ended"
+    assert pd.read_csv(tmp_path / "metrics.csv")["eval/J"].tolist() == list(range(1, 20))
+    assert len(events(tmp_path).Scalars("eval/J")) == 19
+    assert not (tmp_path / "summary.json").exists(), "there is none of half a run"
+
+
+def test_metrics_are_there_during_the_run(tmp_path):
+    with RunFolder(tmp_path, make_config()) as run:
+        run.log({"eval/J": 3.0}, 1)
+        run.flush()
+        assert pd.read_csv(tmp_path / "metrics.csv")["eval/J"].tolist() == [3.0]
+        assert scalars(events(tmp_path), "eval/J") == {1: 3.0}
+        assert not list(tmp_path.glob("*.partial"))
+
+
+def test_column(tmp_path):
+    with RunFolder(tmp_path, make_config()) as run:
+        for update in (0, 5, 10):
+            run.log({"loss/value": 0.0}, update)
+            if update != 5:
+                run.log({"eval/J": 2.0 * update}, update)
+        assert run.column("eval/J") == ([0, 10], [0.0, 20.0])
+        assert run.column("eval/none") == ([], [])
+
+
+def test_relative_folder_is_kept_when_the_working_directory_changes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with RunFolder("run", make_config()) as run:
+        (tmp_path / "elsewhere").mkdir()
+        monkeypatch.chdir(tmp_path / "elsewhere")
+        run.log({"eval/J": 1.0}, 1)
+    assert (tmp_path / "run" / "metrics.csv").exists()
+    assert scalars(events(tmp_path / "run"), "eval/J") == {1: 1.0}

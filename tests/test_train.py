@@ -1,0 +1,379 @@
+"""train.py from the configuration to the run's folder."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from matplotlib.image import imread
+from omegaconf import DictConfig, OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import train
+from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
+from torch_qpmpc import (
+    DeviationPenalty,
+    QPError,
+    QPQLearningLoss,
+    SystemIdentificationPenalty,
+)
+from torch_qpmpc.banded import band_distance
+from torch_qpmpc.checkpoint import load_checkpoint
+from torch_qpmpc.config import flatten
+from torch_qpmpc.experiment import evaluate, make_mpc, make_physics
+
+SUMMARY = {"seed", "constraint", "noise", "solver", "unsolved", "updates", "train_seconds"}
+for _tag in ("J", "J_discounted"):
+    SUMMARY |= {f"{_tag}_start", f"{_tag}_final", f"{_tag}_true_model"}
+SUMMARY |= {"closed_gap", "closed_gap_discounted"}
+
+
+def run_small(folder: Path, *overrides: str) -> dict[str, Any]:
+    return train.train(make_config(*SMALL, *overrides), str(folder))
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    skip_figures(monkeypatch)
+
+
+def metrics(folder: Path) -> Any:
+    """metrics.csv as a DataFrame by update."""
+    return pd.read_csv(folder / "metrics.csv").set_index("update")
+
+
+def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """C - C_0 at the end, and the signed distance of its entries from the band."""
+    state = load_checkpoint(folder / "checkpoint.pt")["mpc"]
+    horizon = state["C_0"].shape[0] // 4
+    return (state["C"] - state["C_0"]).numpy(), band_distance(4, 2, horizon).numpy()
+
+
+# --- One whole run -------------------------------------------------------------------------------
+
+WHOLE = ("solver=daqp", "seed=5", "constraint=combined", "updates=80", "eval_interval=40")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    return folder, train.train(make_config(*WHOLE), str(folder))
+
+
+def test_a_short_run_learns(whole):
+    folder, summary = whole
+    assert summary["J_final"] < 0.5 * summary["J_start"]
+    assert summary["closed_gap"] > 0.5
+    assert summary["J_discounted_final"] < summary["J_discounted_start"]
+    assert summary["unsolved"] == 0
+    deviation, distance = learned_C(folder)
+    assert np.abs(deviation[distance == 0]).max() > 0, "on the band it has learned"
+
+
+def test_summary_is_complete(whole):
+    folder, returned = whole
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary == returned
+    assert set(summary) >= SUMMARY
+    assert all(math.isfinite(v) for v in summary.values() if not isinstance(v, str))
+    names = {"seed": 5, "constraint": "combined", "noise": "gaussian", "solver": "daqp"}
+    assert {**summary, **names, "updates": 80} == summary
+    assert 0 < summary["train_seconds"] < 600
+    gap = (summary["J_start"] - summary["J_final"]) / (summary["J_start"] - summary["J_true_model"])
+    assert summary["closed_gap"] == pytest.approx(gap)
+
+
+def test_folder_is_complete(whole):
+    folder, summary = whole
+    files = {"config.yaml", "metrics.csv", "checkpoint.pt", "summary.png", "summary.json"}
+    assert files <= {path.name for path in folder.iterdir()}
+    assert not list(folder.rglob("*.partial"))
+    assert OmegaConf.load(folder / "config.yaml") == make_config(*WHOLE)
+    assert np.ptp(imread(folder / "summary.png")[..., :3]) > 0.5
+
+    table = metrics(folder)
+    assert sorted(table.index) == [0, 10, 20, 30, 40, 50, 60, 70, 80]
+    J = table["eval/J"].dropna()
+    assert list(J.index) == [0, 40, 80]
+    assert (J[0], J[80]) == (summary["J_start"], summary["J_final"])
+    assert (table["eval/J_true_model"].dropna() == summary["J_true_model"]).all()
+    logged = table.drop(index=0)
+    columns = ["loss/value", "loss/si", "train/td_error", "train/reward", "train/unsolved"]
+    columns += ["qp/solves", "qp/unsolved", "qp/residual", "time/collect", "time/update", "time/qp"]
+    for column in columns:
+        assert np.isfinite(logged[column]).all(), column
+    assert logged["qp/residual"].max() < 1e-6
+    assert (logged["train/reward"] < 0).all()
+
+
+def test_checkpoint_is_the_learned_qp(whole):
+    folder, summary = whole
+    cfg = OmegaConf.load(folder / "config.yaml")
+    assert isinstance(cfg, DictConfig)
+    physics = make_physics(cfg)
+    mpc = make_mpc(cfg, physics)
+    state = load_checkpoint(folder / "checkpoint.pt")
+    mpc.load_state_dict(state["mpc"])
+    assert state["update"] == 80
+    loop = evaluate(cfg, mpc, physics)
+    np.testing.assert_allclose(loop.J, summary["J_final"], rtol=1e-9)
+
+
+def test_events_are_complete(whole):
+    folder, summary = whole
+    sizes = {"scalars": 0, "images": 0}
+    events = EventAccumulator(str(folder / "tensorboard"), size_guidance=sizes)
+    events.Reload()
+    table = metrics(folder)
+    for column in table:
+        expected = table[column].dropna()
+        found = {event.step: event.value for event in events.Scalars(column)}
+        assert list(found) == list(expected.index), column
+        np.testing.assert_allclose(list(found.values()), expected, rtol=1e-6)
+    for image in ("structure/C", "eval/closed_loop"):
+        assert [event.step for event in events.Images(image)] == [40, 80]
+    text = events.Tensors("config/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert "constraint:" in text
+    plugin = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    for key in flatten(OmegaConf.to_container(make_config(*WHOLE))):
+        assert key.encode() in plugin
+    assert events.Scalars("hparam/J_final")[0].value == pytest.approx(summary["J_final"])
+
+
+def test_proximal_step_leaves_nothing_above_the_band(whole):
+    folder, _ = whole
+    deviation, distance = learned_C(folder)
+    assert np.abs(deviation[distance > 0]).max() == 0
+    assert np.abs(deviation[distance < 0]).max() > 0, "what is below is free"
+    last = metrics(folder).iloc[-1]
+    assert last["structure/above"] == 0
+    assert last["structure/below"] == pytest.approx(np.abs(deviation[distance < 0]).sum())
+
+
+# --- Small runs ----------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("noise", choices("noise"))
+@pytest.mark.parametrize("constraint", choices("constraint"))
+def test_each_case_runs(tmp_path, constraint, noise):
+    summary = run_small(tmp_path, f"constraint={constraint}", f"noise={noise}")
+    assert (summary["constraint"], summary["noise"]) == (constraint, noise)
+    table, losses = metrics(tmp_path), {"loss/value"}
+    if constraint in ("si", "combined"):
+        losses.add("loss/si")
+    assert {column for column in table if column.startswith("loss/")} == losses
+    assert np.isfinite(table.drop(index=0)[sorted(losses)]).all(axis=None)
+    deviation, distance = learned_C(tmp_path)
+    moved = {side: np.abs(deviation[np.sign(distance) == side]).max() > 0 for side in (-1, 0, 1)}
+    free = constraint in ("free", "si")
+    assert moved == {-1: constraint != "fixed", 0: constraint != "fixed", 1: free}
+
+
+def frame_without_times(folder: Path) -> Any:
+    table = metrics(folder)
+    return table.drop(columns=[column for column in table if column.startswith("time/")])
+
+
+@pytest.mark.usefixtures("small")
+def test_a_seed_determines_every_number(tmp_path):
+    for name, seed in (("first", 3), ("again", 3), ("other", 4)):
+        torch.manual_seed(len(name))  # what happened before plays no part
+        run_small(tmp_path / name, f"seed={seed}")
+    first, again, other = (frame_without_times(tmp_path / n) for n in ("first", "again", "other"))
+    pd.testing.assert_frame_equal(first, again, check_exact=True)
+    assert not np.allclose(first["loss/value"][1:], other["loss/value"][1:])
+    assert first["eval/J"][0] != other["eval/J"][0]
+
+
+@pytest.mark.usefixtures("small")
+def test_subgradient_step(tmp_path):
+    run_small(tmp_path, "constraint=deviation", "penalty_step=subgradient")
+    deviation, distance = learned_C(tmp_path)
+    assert np.abs(deviation[distance > 0]).max() > 0
+    assert metrics(tmp_path)["loss/deviation"][1] == 0, "it starts at C_0"
+    assert (metrics(tmp_path)["loss/deviation"][2:] > 0).all()
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
+def test_target_network(tmp_path):
+    """It changes the targets from the second update on, not the first."""
+    for name, rate in (("slow", 0.01), ("fast", 1.0), ("none", None)):
+        more = (
+            ["delay_value=false"] if rate is None else ["delay_value=true", f"target_rate={rate}"]
+        )
+        run_small(tmp_path / name, *more)
+    slow, fast, none = (metrics(tmp_path / n)["loss/value"] for n in ("slow", "fast", "none"))
+    assert slow[1] == fast[1] == none[1]
+    assert slow[2] != fast[2]
+    np.testing.assert_allclose(fast[2:], none[2:], rtol=1e-6)
+
+
+@pytest.mark.usefixtures("small")
+def test_plain_gradient_step(tmp_path):
+    run_small(tmp_path / "free", "optimizer=sgd", "constraint=free")
+    deviation, _ = learned_C(tmp_path / "free")
+    assert 0 < np.abs(deviation).max() < 0.1
+    quiet = ("optimizer.lr_cost=0", "optimizer.lr_constraints=0")
+    run_small(tmp_path / "still", "optimizer=sgd", "constraint=free", *quiet)
+    assert np.abs(learned_C(tmp_path / "still")[0]).max() == 0
+
+
+@pytest.mark.usefixtures("small")
+def test_uneven_intervals_and_steps(tmp_path):
+    """The end is always evaluated and saved, whatever the intervals."""
+    more = (
+        "updates=5",
+        "eval_interval=3",
+        "log_interval=2",
+        "steps_per_update=3",
+        "warmup_steps=5",
+    )
+    summary = run_small(tmp_path, *more)
+    assert list(metrics(tmp_path)["eval/J"].dropna().index) == [0, 3, 5]
+    assert list(metrics(tmp_path)["loss/value"].dropna().index) == [2, 4]
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["update"] == 5
+    assert summary["updates"] == 5
+
+
+@pytest.mark.usefixtures("small")
+def test_another_solver_reaches_the_same(tmp_path):
+    for solver in ("daqp", "proxqp"):
+        assert run_small(tmp_path / solver, f"solver={solver}", "updates=2")["solver"] == solver
+    first, other = (metrics(tmp_path / name)["loss/value"] for name in ("daqp", "proxqp"))
+    np.testing.assert_allclose(first, other, rtol=1e-4)
+
+
+@pytest.mark.usefixtures("small")
+def test_configuration_reaches_the_parts(tmp_path, monkeypatch):
+    losses, windows, scales = [], [], []
+    loss_value = QPQLearningLoss.loss_value
+    si, proximal = SystemIdentificationPenalty.forward, DeviationPenalty.proximal_step_
+
+    def spy_loss(self, tensordict):
+        gamma = self.value_estimator.gamma.item()
+        losses.append((gamma, self.td_error_clip, self.delay_value, tuple(tensordict.shape)))
+        return loss_value(self, tensordict)
+
+    def spy_si(self, C, tau):
+        windows.append(tuple(tau.shape))
+        return si(self, C, tau)
+
+    def spy_proximal(self, C, scale):
+        scales.append(scale)
+        return proximal(self, C, scale)
+
+    monkeypatch.setattr(QPQLearningLoss, "loss_value", spy_loss)
+    monkeypatch.setattr(SystemIdentificationPenalty, "forward", spy_si)
+    monkeypatch.setattr(DeviationPenalty, "proximal_step_", spy_proximal)
+    more = ("task.gamma=0.5", "td_error_clip=7.0", "constraint.si.windows=5", "batch_size=6")
+    run_small(tmp_path, *more, "optimizer.final_fraction=0.2", "optimizer.lr_cost=0.125")
+    assert losses == [(0.5, 7.0, False, (6,))] * 4
+    assert windows == [(5, 22)] * 4
+    assert scales == pytest.approx([1.0, 0.8, 0.6, 0.4]), "it falls with the rates"
+    groups = load_checkpoint(tmp_path / "checkpoint.pt")["optimizer"]["param_groups"]
+    assert groups[0]["lr"] == pytest.approx(0.125 * 0.2)
+
+
+@pytest.mark.usefixtures("small")
+def test_training_goes_on_past_unsolved_qps(tmp_path):
+    """Hard states, and velocities that the action cannot tame within a narrow box."""
+    more = ("task.state_slack=inf", "noise.std=0.5", "updates=6", "constraint=free")
+    summary = run_small(tmp_path, *more)
+    table = metrics(tmp_path).drop(index=0)
+    assert summary["unsolved"] == table["qp/unsolved"].sum() > 0
+    assert table["train/unsolved"].sum() > 0
+    assert np.isfinite(table["loss/value"]).all()
+    state = load_checkpoint(tmp_path / "checkpoint.pt")["mpc"]
+    assert all(value.isfinite().all() for value in state.values())
+
+
+@pytest.mark.usefixtures("small")
+def test_an_interruption_leaves_what_was_logged(tmp_path, monkeypatch):
+    calls, forward = [], QPQLearningLoss.loss_value
+
+    def interrupted(self, tensordict):
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return forward(self, tensordict)
+
+    monkeypatch.setattr(QPQLearningLoss, "loss_value", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_small(tmp_path)
+    table = metrics(tmp_path)
+    assert list(table.index) == [0, 1, 2, 3]
+    assert np.isfinite(table["loss/value"][1:]).all()
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("loss/value")] == [1, 2, 3]
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["update"] == 2
+    assert not (tmp_path / "summary.json").exists()
+
+
+def test_a_bad_configuration_writes_nothing(tmp_path):
+    with pytest.raises(QPError, match=r"task.horizon: got 0, expected a whole number >= 1"):
+        run_small(tmp_path / "run", "task.horizon=0")
+    assert not (tmp_path / "run").exists()
+
+
+# --- The command ---------------------------------------------------------------------------------
+
+
+QUIET = ("hydra/job_logging=disabled", "hydra/hydra_logging=disabled")
+
+
+def test_command(tmp_path, monkeypatch, capsys):
+    """`python train.py ..` makes the folder that it names at the end, below a table."""
+    skip_figures(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    # Hydra finds the folder by itself only for a script, not for an imported module.
+    arguments = ["--config-path", str(CONFIGS), *SMALL, "noise=brownian", *QUIET]
+    monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
+    train.main()
+    lines = capsys.readouterr().out.splitlines()
+    folder = Path(lines[-1])
+    assert folder.parent == tmp_path / "runs" / "point_mass" / "brownian-combined"
+    assert folder.name.startswith("seed1-")
+    assert json.loads((folder / "summary.json").read_text())["noise"] == "brownian"
+    assert any(line.startswith("J discounted") for line in lines)
+
+
+def test_impossible_value_on_the_command_line(tmp_path):
+    """One sentence, no traceback."""
+    process = subprocess.run(
+        [sys.executable, str(Path(train.__file__).resolve()), "task.gamma=1.5"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert process.returncode != 0
+    assert process.stderr.strip() == "task.gamma: got 1.5, expected a number in (0, 1]."
+
+
+@pytest.mark.parametrize(
+    ("mistake", "sentence"),
+    [
+        ("batchsize=3", "Could not override 'batchsize'"),
+        ("+batchsize=3", "Did you mean batch_size?"),
+        ("constraint=none", "Could not find 'constraint/none'"),
+    ],
+)
+def test_misspelt_key_on_the_command_line(tmp_path, monkeypatch, capsys, mistake, sentence):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", "--config-path", str(CONFIGS), mistake, *QUIET])
+    with pytest.raises(SystemExit) as error:
+        train.main()
+    assert error.value.code not in (0, None)
+    assert sentence in capsys.readouterr().err + str(error.value.code)

@@ -1,0 +1,183 @@
+"""The gradient of the solution itself: of z, and so of pi(s), and of the multipliers.
+
+Within one active set the solution is affine in the data. With A the rows held at a bound, the
+multipliers of saturated rows held at plus or minus w, and E z = (x_0, u_0), an incoming gradient is
+carried back by the KKT system
+
+    [H   C'  G_A' E'] [p]   [dl/dz    ]
+    [C   0   0    0 ] [r] = [dl/dchi  ]
+    [G_A 0   0    0 ] [t]   [dl/dlam_A]
+    [E   0   0    0 ] [u]   [dl/dxi   ]
+
+    dl/dH = -p z'               dl/dq = -p                dl/dC = -(chi p' + r z')    dl/db = r
+    dl/dG = -(lam p' + t z')    dl/d(lb, ub)_A = t        dl/d(fixed) = u
+    dl/dw_i = sign(lam_i) (dl/dlam_i - G_i p) where saturated
+
+solved in condensed form for the whole batch at once. Where a row is weakly active (at its bound
+with a zero multiplier) the solution has a kink, and this is one of its one-sided derivatives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.batching import align, outer, sum_to
+from torch_qpmpc.condense import FlatPrograms, condensed_for
+from torch_qpmpc.qp import Status
+
+#: A multiplier below this fraction of the largest is zero; one as near to w is saturated.
+ACTIVE_FRACTION = 1e-8
+#: Residual of the KKT system from which on it counts as singular.
+SINGULAR = 1e-8
+#: Event dimensions of the operator's tensors: four gradients; z, lam, status; the QP's data.
+_ADJOINT_NDIMS = (1, 1, 1, 1, 1, 1, 0, 2, 1, 0, 2, 1, 2, 1, 1, 1, 1)
+#: Those of `SolutionGradient`: z, lam, chi, xi, status; the QP's data.
+_SOLUTION_NDIMS = (1, 1, 1, 1, 0, 2, 1, 0, 2, 1, 2, 1, 1, 1, 1)
+
+
+def row_states(lam: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Which rows are held at a bound, and which are saturated at |lam| = w, ``(*batch, n_g)``."""
+    size = lam.abs()
+    saturated = w.isfinite() & (size >= (1 - ACTIVE_FRACTION) * w)
+    largest = size.amax(-1, keepdim=True) if size.shape[-1] else size
+    return (size > ACTIVE_FRACTION * (1 + largest)) & ~saturated, saturated
+
+
+@torch.library.custom_op("torch_qpmpc::kkt_adjoint", mutates_args=())
+def kkt_adjoint(
+    grad_z: Tensor,
+    grad_lam: Tensor,
+    grad_chi: Tensor,
+    grad_xi: Tensor,
+    z: Tensor,
+    lam: Tensor,
+    status: Tensor,
+    H: Tensor,
+    q: Tensor,
+    c: Tensor,
+    C: Tensor,
+    b: Tensor,
+    G: Tensor,
+    lb: Tensor,
+    ub: Tensor,
+    w: Tensor,
+    fixed: Tensor,
+    keep: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """p ``(*batch, n_z)``, r ``(*batch, n_c)``, t ``(*batch, n_g)``, u ``(*batch, n_f)``."""
+    # Under vmap the gradients may have batch dimensions that the QP does not.
+    vectors = (grad_z, grad_lam, grad_chi, grad_xi, z, lam, fixed)
+    batch = torch.broadcast_shapes(*(x.shape[:-1] for x in vectors), status.shape)
+    fixed = fixed.expand(*batch, fixed.shape[-1])
+    programs, batch = FlatPrograms.of(H, q, c, C, b, G, lb, ub, w, fixed)
+    solved = (status == Status.SOLVED).cpu().expand(batch).reshape(-1, 1)
+
+    def flat(tensor: Tensor) -> Tensor:
+        wide = tensor.detach().to("cpu", torch.float64).expand(*batch, tensor.shape[-1])
+        return torch.where(solved, wide.reshape(len(programs), -1), 0)
+
+    if not solved.all():
+        programs = programs.without_nan()
+    condensed = condensed_for(programs, keep)
+    pull_z, pull_lam = flat(grad_z), flat(grad_lam)
+    active, _ = row_states(flat(lam), programs.w)
+    # What C p = dl/dchi and E p = dl/dxi fix; then the condensed system for the rest.
+    adjoint = replace(programs, b=flat(grad_chi), fixed=flat(grad_xi))
+    particular = condensed.particular(adjoint)
+    n_f = fixed.shape[-1]
+    T = condensed.T[:, :, n_f:]
+    right_v = programs.multiply(T.mT, pull_z - programs.multiply(programs.H, particular))
+    right_t = (pull_lam - programs.multiply(programs.G, particular)) * active
+    v, t = _solve(
+        condensed.H[programs.group, n_f:, n_f:],
+        condensed.G[programs.group, :, n_f:] * active.unsqueeze(-1),
+        active,
+        right_v,
+        right_t,
+    )
+    p = particular + programs.multiply(T, v)
+    left = pull_z - programs.multiply(programs.H, p) - programs.multiply(programs.G.mT, t)
+    r = programs.multiply(condensed.Y.mT, left)
+    u = (left - programs.multiply(programs.C.mT, r))[:, :n_f]
+    return tuple(x.reshape(*batch, x.shape[-1]).to(z) for x in (p, r, t, u))  # pyright: ignore[reportReturnType] - four of them
+
+
+def _solve(
+    H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Solve ``H v + G't = right_v, G v = right_t``; G and right_t are zero in rows not active."""
+    d = H.shape[-1]
+    rows = active.any(dim=0).nonzero().squeeze(-1)
+    G, idle = G[:, rows], (~active[:, rows]).to(H.dtype)
+    top = torch.cat((H, G.mT), dim=-1)
+    kkt = torch.cat((top, torch.cat((G, torch.diag_embed(idle)), dim=-1)), dim=-2)
+    right = torch.cat((right_v, right_t[:, rows]), dim=-1).unsqueeze(-1)
+    solution = torch.linalg.solve_ex(kkt, right)[0]
+    error = (kkt @ solution - right).abs().amax(dim=(-2, -1)) if len(kkt) else right.new_zeros(0)
+    bound = SINGULAR * (1 + right.abs().amax(dim=(-2, -1))) if len(kkt) else error
+    singular = ~(error <= bound)
+    if singular.any():
+        # Dependent active rows, or directions without curvature: the solution of least norm.
+        inverse = torch.linalg.pinv(kkt[singular], hermitian=True)
+        solution[singular] = inverse @ right[singular]
+    t = torch.zeros_like(right_t)
+    t[:, rows] = solution[:, d:, 0]
+    return solution[:, :d, 0], t
+
+
+@kkt_adjoint.register_fake
+def _(grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta):
+    return tuple(torch.empty_like(x) for x in (grad_z, grad_chi, grad_lam, grad_xi))
+
+
+@kkt_adjoint.register_vmap
+def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
+    return kkt_adjoint(*align(in_dims, args, _ADJOINT_NDIMS)), (0,) * 4
+
+
+class SolutionGradient(torch.autograd.Function):
+    """z, lam, chi, xi as they are, tied to the data that they depend on."""
+
+    @staticmethod
+    def forward(z, lam, chi, xi, status, H, q, c, C, b, G, lb, ub, w, fixed, keep):
+        return z.clone(), lam.clone(), chi.clone(), xi.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
+        *tensors, ctx.keep = inputs
+        ctx.save_for_backward(*tensors)
+
+    @staticmethod
+    def backward(ctx: Any, grad_z: Tensor, grad_lam: Tensor, grad_chi: Tensor, grad_xi: Tensor):
+        z, lam, chi, _, status, *theta = ctx.saved_tensors
+        H, q, _, C, b, G, lb, ub, w, fixed = theta
+        p, r, t, u = kkt_adjoint(
+            grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, ctx.keep
+        )
+        _, saturated = row_states(lam, w)
+        slope = torch.where(
+            saturated, lam.sign() * (grad_lam - (p.unsqueeze(-2) @ G.mT).squeeze(-2)), 0
+        )
+        needed = ctx.needs_input_grad[5:15]
+        gradients = (
+            lambda: -0.5 * (outer(p, z, H) + outer(z, p, H)),
+            lambda: sum_to(-p, q),
+            lambda: None,
+            lambda: -(outer(chi, p, C) + outer(r, z, C)),
+            lambda: sum_to(r, b),
+            lambda: -(outer(lam, p, G) + outer(t, z, G)),
+            lambda: sum_to(torch.where(lam < 0, t, 0), lb),
+            lambda: sum_to(torch.where(lam > 0, t, 0), ub),
+            lambda: sum_to(slope, w),
+            lambda: sum_to(u, fixed),
+        )
+        of_theta = (f() if need else None for f, need in zip(gradients, needed, strict=True))
+        return None, None, None, None, None, *of_theta, None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
+        return SolutionGradient.apply(*align(in_dims, args, _SOLUTION_NDIMS)), (0,) * 4
