@@ -527,3 +527,9 @@ assert torch.allclose(mpc.value(s).detach(), before)
 def test_a_child_forked_after_a_parallel_solve_solves_too():
     root = os.path.dirname(os.path.dirname(__file__))
     subprocess.run([sys.executable, "-c", FORK], check=True, timeout=90, cwd=root)
+
+
+@pytest.mark.parametrize("name", ["solver", "on_failure"])
+def test_a_choice_that_is_no_name_is_refused(name):
+    with pytest.raises(QPError, match=f"{name}: got None, expected a name"):
+        solution(*operands_of(known_qp(0)), **{name: None})

@@ -265,3 +265,12 @@ def test_the_answer_follows_the_parameters_of_a_functional_call():
     assert_close(called, other.value(s), rtol=0, atol=0)
     assert (called - own).abs().min() > 1e-6
     assert_close(mpc.value(s), own, rtol=0, atol=0)
+
+
+def test_a_row_of_any_scale_counts():
+    """C z = b is the same whatever its rows are multiplied by."""
+    known = known_qp(4)
+    scale = torch.tensor([1.0, 1e-11, 1e9]).double()
+    C, b = scale[:, None] * known.qp.C, scale * known.qp.b
+    solution = solve_qp(replace(known.qp, C=C, b=b), known.fixed, solver="daqp")
+    assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)

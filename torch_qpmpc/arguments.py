@@ -78,6 +78,33 @@ def bound(name: str, bounds: tuple[Any, Any] | None, side: int, size: int) -> Te
     return given
 
 
+def cost_weights(
+    stage: Tensor, terminal: Tensor, hessian: str, n_x: int, n_u: int, horizon: int
+) -> dict[str, Tensor]:
+    """The starts of H and H_f in the shapes that the kind of ``hessian`` has; one H if full."""
+    n, diagonal = n_x + n_u, hessian == "diagonal"
+    event = (n,) if diagonal else (n, n)
+    terminal_event = (n_x,) * len(event)
+    # A square matrix is one dense block, even where the horizon happens to be its size.
+    diagonals = ((n,), (horizon, n)) if horizon != n else ((n,),)
+    if not diagonal and tuple(stage.shape) in diagonals:
+        stage = torch.diag_embed(stage)
+    if not diagonal and tuple(terminal.shape) == (n_x,):
+        terminal = torch.diag(terminal)
+    per_stage = (horizon, *event)
+    if tuple(stage.shape) not in (event, per_stage):
+        got = f"shape {tuple(stage.shape)}"
+        raise QPError.expected("stage_weight", got, f"shape {event} or {per_stage}")
+    if tuple(terminal.shape) != terminal_event:
+        got = f"shape {tuple(terminal.shape)}"
+        raise QPError.expected("terminal_weight", got, f"shape {terminal_event}")
+    check_weight("stage_weight", stage, diagonal)
+    check_weight("terminal_weight", terminal, diagonal)
+    if hessian == "full":
+        return {"H": torch.block_diag(*stage.expand(horizon, n, n), terminal)}
+    return {"H": stage, "H_f": terminal}
+
+
 def check_weight(name: str, weight: Tensor, diagonal: bool) -> None:
     """Raise unless a cost weight, or the diagonal of one, is symmetric positive semidefinite."""
     if not diagonal and not torch.allclose(weight, weight.mT):

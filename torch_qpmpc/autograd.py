@@ -71,6 +71,9 @@ def solve_qp(
     References:
         Büskens and Maurer (2001), as cited at eq:gradq.
     """
+    for name, choice in (("solver", solver), ("on_failure", on_failure)):
+        if not isinstance(choice, str):
+            raise QPError.expected(name, repr(choice), "a name")
     if fixed is None:
         fixed = qp.q.new_zeros(0)
     theta = _operands(qp, fixed)
@@ -88,7 +91,7 @@ def solve_qp(
         chi=chi,
         upsilon=upsilon,
         eta=eta,
-        mu=qp.w - upsilon - eta,
+        mu=torch.where(solved, qp.w - upsilon - eta, 0),
         xi=xi,
         status=status,
         residual=residual,

@@ -14,10 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-#: Pivots below this fraction of the largest mean that the rows of C depend on each other.
+#: A pivot below this fraction of its row's norm means that the rows of C depend on each other.
 RANK_TOLERANCE = 1e-10
 #: A coefficient below this fraction of its row's absolute sum is rounding.
 ENTERS = 1e-12
+#: H is indefinite if an eigenvalue is below minus this fraction of the largest.
+CONVEX = 1e-9
 MEMO_SIZE = 4
 
 
@@ -130,6 +132,7 @@ class Condensed:
     H_b: Tensor
     G_b: Tensor
     _entered: dict[int, Tensor] = field(default_factory=dict)
+    _convex: dict[int, Tensor] = field(default_factory=dict)
 
     def soft_qps(self, programs: FlatPrograms) -> tuple[SoftQPs, Tensor]:
         """The backend's problem, and the indices of the rows of G that it contains.
@@ -160,6 +163,15 @@ class Condensed:
             trace = ENTERS * size.sum(dim=2, keepdim=True)
             self._entered[n_f] = (size[:, :, n_f:] > trace).any(dim=2).any(dim=0)
         return self._entered[n_f]
+
+    def convex(self, n_f: int) -> Tensor:
+        """Where H is positive semidefinite in what is free with n_f entries fixed, ``(M,)``."""
+        if n_f not in self._convex:
+            H = self.H[:, n_f:, n_f:]
+            size = H.shape[-1]
+            eigenvalues = torch.linalg.eigvalsh(H) if size else H.new_zeros(len(H), 1)
+            self._convex[n_f] = eigenvalues[:, 0] >= -CONVEX * (1 + eigenvalues.abs().amax(-1))
+        return self._convex[n_f]
 
     def particular(self, programs: FlatPrograms) -> Tensor:
         """z at v = 0: ``Y b`` plus what the fixed entries contribute, ``(B, n_z)``."""
@@ -235,7 +247,7 @@ def _eliminate(C: Tensor, keep: int) -> tuple[Tensor, Tensor] | None:
         return None
     permutation, _, upper = torch.linalg.lu(rest.mT)
     pivots = upper.diagonal(dim1=-2, dim2=-1).abs()
-    if n_c and (pivots.amin(-1) <= RANK_TOLERANCE * pivots.amax(-1)).any():
+    if (pivots <= RANK_TOLERANCE * torch.linalg.vector_norm(rest, dim=-1)).any():
         return None
     # Which row of the permutation's column has the one; argmax refuses an empty dimension.
     order = permutation.mT.nonzero()[:, -1].reshape(M, n_z - keep) + keep

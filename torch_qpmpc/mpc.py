@@ -20,7 +20,7 @@ from torch_qpmpc.arguments import (
     bound,
     check_input,
     check_structure,
-    check_weight,
+    cost_weights,
 )
 from torch_qpmpc.autograd import optimal_value, solve_qp
 from torch_qpmpc.banded import banded_matrix
@@ -147,9 +147,13 @@ class QPMPC(nn.Module):
         discount = self._per_entry(powers.expand(-1, n_x), powers.expand(-1, n_u))
         self.register_buffer("discount", discount, persistent=False)
         self.register_buffer("C_0", C_0)
-        self._own_cost_matrices(
-            as_tensor("stage_weight", stage_weight), as_tensor("terminal_weight", terminal_weight)
-        )
+        stage = as_tensor("stage_weight", stage_weight)
+        terminal = as_tensor("terminal_weight", terminal_weight)
+        for name, start in cost_weights(stage, terminal, hessian, n_x, n_u, horizon).items():
+            self._own(name, start)
+            if name in self.learned:
+                kind = SquareRoot() if hessian == "diagonal" else Cholesky()
+                parametrize.register_parametrization(self, name, kind)
         self._own("q", torch.zeros(self.n_z))
         self._own("c", torch.zeros(()))
         self._own("C", C_0)
@@ -304,37 +308,6 @@ class QPMPC(nn.Module):
             self.register_parameter(name, nn.Parameter(value))
         else:
             self.register_buffer(name, value)
-
-    def _own_cost_matrices(self, stage: Tensor, terminal: Tensor) -> None:
-        n, diagonal = self.n_x + self.n_u, self.hessian == "diagonal"
-        event = (n,) if diagonal else (n, n)
-        terminal_event = (self.n_x,) * len(event)
-        # A square matrix is one dense block, even where the horizon happens to be its size.
-        diagonals = ((n,), (self.horizon, n)) if self.horizon != n else ((n,),)
-        if not diagonal and tuple(stage.shape) in diagonals:
-            stage = torch.diag_embed(stage)
-        if not diagonal and tuple(terminal.shape) == (self.n_x,):
-            terminal = torch.diag(terminal)
-        per_stage = (self.horizon, *event)
-        if tuple(stage.shape) not in (event, per_stage):
-            raise QPError.expected(
-                "stage_weight", f"shape {tuple(stage.shape)}", f"shape {event} or {per_stage}"
-            )
-        if tuple(terminal.shape) != terminal_event:
-            raise QPError.expected(
-                "terminal_weight", f"shape {tuple(terminal.shape)}", f"shape {terminal_event}"
-            )
-        check_weight("stage_weight", stage, diagonal)
-        check_weight("terminal_weight", terminal, diagonal)
-        parts = {"H": stage, "H_f": terminal}
-        if self.hessian == "full":
-            blocks = stage.expand(self.horizon, n, n)
-            parts = {"H": torch.block_diag(*blocks, terminal)}
-        for name, start in parts.items():
-            self._own(name, start)
-            if name in self.learned:
-                kind = SquareRoot() if diagonal else Cholesky()
-                parametrize.register_parametrization(self, name, kind)
 
     def _own_slack_weights(self, state: float, action: float, discounted: bool) -> None:
         for name, weight in (("state_slack", state), ("action_slack", action)):

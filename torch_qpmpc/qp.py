@@ -57,7 +57,8 @@ _EXPLANATIONS = {
     Status.UNBOUNDED: "the cost decreases without bound; add curvature to H or bounds to G",
     Status.NOT_CONVERGED: "no solver reached the certificate's tolerance; rescale the QP, or try "
     "another solver",
-    Status.INVALID_DATA: "NaN or inf in the data, or lb > ub; look at the parameters and the state",
+    Status.INVALID_DATA: "NaN or inf in the data, lb > ub, or an H that is not positive "
+    "semidefinite; look at the parameters and the state",
 }
 
 
@@ -223,7 +224,7 @@ class QuadraticProgram:
 class QPSolution:
     """Primal-dual solution of a batch of QPs.
 
-    All of it is differentiable in the QP's tensors and in the fixed entries, but for the last three.
+    All but the last three is differentiable in the tensors of the QP and in the fixed entries.
     An element that is not solved (``status != 0``; only with ``on_failure`` "warn" or "mask") has
     ``value = inf``, the fixed entries in ``z``, zeros elsewhere, and no gradient.
 

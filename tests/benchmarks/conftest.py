@@ -1,12 +1,20 @@
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from typing import Any
 
 import pytest
 import torch
 
 from tests.benchmarks.interleaved import Interleaved
+
+#: What is timed, and what the times depend on.
+PACKAGES = (
+    *("torch", "numpy", "proxsuite", "daqp"),
+    *("qpth", "cvxpylayers", "diffcp", "clarabel", "qpsolvers", "piqp"),
+)
 
 
 @pytest.fixture(autouse=True)
@@ -21,3 +29,11 @@ def thread_count() -> Iterator[None]:
 def interleaved(benchmark: Any) -> Callable[..., Any]:
     """`Interleaved.run` on pytest-benchmark's fixture."""
     return Interleaved(benchmark).run
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_benchmark_update_machine_info(config: pytest.Config, machine_info: dict) -> None:
+    """Put the packages' versions into the results."""
+    machine_info["versions"] = {
+        name: version(name) for name in PACKAGES if importlib.util.find_spec(name) is not None
+    }

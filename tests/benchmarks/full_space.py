@@ -1,4 +1,4 @@
-"""The QP as the user of a QP layer would state it: x_0 (and u_0) substituted, a sigma a soft row."""
+"""The QP as the user of a QP layer states it: x_0 (and u_0) substituted, one sigma a soft row."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class FullSpace:
         )
 
     def value(self, x: Tensor) -> Tensor:
-        """The optimal cost ``(B,)`` of a minimiser x ``(B, n)``, with what the fixed entries cost."""
+        """The cost ``(B,)`` of a minimiser x ``(B, n)``, with what the fixed entries cost."""
         qp, n = self.qp, self.fixed.shape[-1]
         n_y = qp.n_z - n
         z, sigma = torch.cat((self.fixed, x[:, :n_y]), dim=1), x[:, n_y:]

@@ -1,4 +1,4 @@
-"""Other packages' differentiable QPs, each as a function from the QP and what is fixed to values."""
+"""Other packages' differentiable QPs, each as a function from a QP and fixed entries to values."""
 
 from __future__ import annotations
 
@@ -119,9 +119,6 @@ def piqp_solver(full: FullSpace) -> Callable[[], Tensor]:
     x_l[:, columns], x_u[:, columns] = lower[:, single], upper[:, single]
     G, lower, upper = sp.csc_matrix(G[~single]), lower[:, ~single], upper[:, ~single]
     solver = piqp.SparseSolver()
-    solver.settings.eps_abs = solver.settings.eps_rel = 1e-9
-    solver.settings.check_duality_gap = True
-    solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = 1e-9
 
     def arguments(i: int) -> dict[str, Any]:
         vectors = {"c": p[i], "b": b[i], "h_l": lower[i], "h_u": upper[i]}

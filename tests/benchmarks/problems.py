@@ -1,4 +1,4 @@
-"""What the benchmarks solve: the paper's QP at any size, banded or dense, and random transitions."""
+"""What the benchmarks solve: the paper's QP at any size, and random transitions."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from torch_qpmpc.envs import PointMass
 
 LEARN = ("H", "H_f", "q", "c", "C", "b", "G", "lb", "ub", "w")
 GAMMA, SLACK = 0.9, 100.0
-#: A dense C is the banded one plus normal entries; the spectral norm of the sum is about twice this.
+#: A dense C is the banded one plus normal entries, whose spectral norm is about twice this.
 PERTURBATION = 0.3
-#: States are drawn within plus or minus this. The position bounds, 2, are soft and often violated.
-STATE_RANGE = 2.2
+#: States and actions are drawn within plus or minus these. The bounds of the positions, 2, are soft;
+#: those of the actions, 1, are hard, and stay out of reach when theta moves.
+STATE_RANGE, ACTION_RANGE = 2.2, 0.9
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def model(n_x: int, n_u: int) -> tuple[Tensor, Tensor]:
 
 
 def make_mpc(size: Size, *, dense: bool, solver: str = "daqp") -> QPMPC:
-    """The QP with all of theta learned: soft states (w = 100), hard actions, no weight on actions."""
+    """The QP with all of theta learned; soft states, hard actions, no weight on actions."""
     generator = torch.Generator().manual_seed(1)
     A, B = model(size.n_x, size.n_u)
     if (size.n_x, size.n_u) == (4, 2):
@@ -99,14 +100,14 @@ def transitions(n_x: int, n_u: int, count: int) -> Transitions:
         return size * (2 * torch.rand(count, n, generator=generator, dtype=torch.float64) - 1)
 
     A, B = model(n_x, n_u)
-    s, a = uniform(n_x, STATE_RANGE), uniform(n_u, 1.0)
+    s, a = uniform(n_x, STATE_RANGE), uniform(n_u, ACTION_RANGE)
     noise = 0.01 * torch.randn(count, n_x, generator=generator, dtype=torch.float64)
     return Transitions(s, a, s @ A.mT + a @ B.mT + noise, s.square().sum(-1))
 
 
 @torch.no_grad()
 def nudge(mpc: QPMPC) -> None:
-    """Move theta in its last digits: no answer changes, but nothing remembered of it may be used."""
+    """Move theta in its last digits: the answers stay, but nothing remembered of it may be used."""
     for parameter in mpc.parameters():
         parameter *= 1 + 1e-13
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import clarabel
 import numpy as np
 import scipy.sparse as sp
 import torch
 from torch import Tensor
 
 from tests.benchmarks.full_space import INFINITE, FullSpace
+from tests.benchmarks.peers import needs
 from torch_qpmpc import QuadraticProgram
 
 #: Relative value error above which an answer counts as wrong.
@@ -18,6 +18,7 @@ WRONG = 1e-6
 @torch.no_grad()
 def reference_values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
     """Optimal values ``(B,)`` by Clarabel in the full space, at tight tolerances."""
+    clarabel = needs("clarabel")
     full = FullSpace.of(qp, fixed)
     settings = clarabel.DefaultSettings()
     settings.verbose = False

@@ -11,8 +11,17 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp
-from torch_qpmpc import QPSolution, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
+from torch_qpmpc import (
+    QPMPC,
+    QPSolution,
+    QuadraticProgram,
+    SolveLog,
+    SolverError,
+    Status,
+    solve_qp,
+)
 from torch_qpmpc.condense import SoftQPs
+from torch_qpmpc.envs import PointMass
 from torch_qpmpc.solvers import BACKENDS, Answer, Backend, daqp
 
 BATCH = 6
@@ -299,3 +308,41 @@ def test_a_batch_of_invalid_elements_reaches_no_backend(monkeypatch):
     known = spoil(known_qp(8, batch=(1,)), 0)
     assert solve(known, on_failure="mask").status.tolist() == [Status.INVALID_DATA]
     assert solve(known_qp(8, batch=(0,))).status.shape == (0,)
+
+
+def test_an_indefinite_hessian_is_not_certified(solver):
+    """A stationary point of a concave cost satisfies every first-order condition."""
+    known = known_qp(0)
+    H = known.qp.H - 1e3 * torch.eye(known.qp.n_z).double()
+    indefinite = QuadraticProgram(H, *known.qp.tensors()[1:], check_values=False)
+    found = solve_qp(indefinite, known.fixed, solver=solver, on_failure="mask")
+    assert found.status == Status.INVALID_DATA
+    with pytest.raises(ValueError, match="not positive semidefinite"):
+        solve_qp(indefinite, known.fixed, solver=solver)
+
+
+@pytest.mark.parametrize("solver", ["proxqp", "daqp"])
+def test_a_row_that_the_fixed_entries_decide_but_for_rounding_is_no_row(solver):
+    """Q of a banded C: x_1 is decided by x_0 and u_0, and eliminating C leaves traces of rounding.
+
+    Its multiplier belongs to no free variable, so that no solver can be asked for it.
+    """
+    physics = PointMass()
+    A, B, theta = physics.corrupted(1)
+    mpc = QPMPC.from_model(
+        A,
+        B,
+        10,
+        stage_weight=torch.cat((theta, torch.zeros(2))),
+        state_bounds=(physics.lb_s, physics.ub_s),
+        action_bounds=(physics.lb_a, physics.ub_a),
+        solver=solver,
+    )
+    s = torch.tensor([[-2.0, 0.42, -0.7, 0.23], [2.0, 0.06, 0.63, -0.42]]).double()
+    a = torch.tensor([[-0.23, -1.0], [0.82, -0.36]]).double()
+    solution = mpc.solve(s, a)
+    x_1 = slice(mpc.n_x + mpc.n_u, mpc.n_x + mpc.n_u + 1)
+    assert (solution.sigma[:, x_1] > 0).all()
+    assert_close((solution.upsilon + solution.eta)[:, x_1], torch.full((2, 1), 100.0).double())
+    assert solution.residual.max() < 1e-8
+    assert solution.iterations.max() < 100

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, programs_of, random_mpc
 from torch_qpmpc import QuadraticProgram, Status, solve_qp
-from torch_qpmpc.condense import SoftQPs, condense
+from torch_qpmpc.condense import FlatPrograms, SoftQPs, condense
 from torch_qpmpc.solvers.diagnose import diagnose
 
 pytestmark = pytest.mark.filterwarnings("ignore:Clarabel.rs terminated with status")
@@ -153,3 +153,11 @@ def test_matrices_of_its_own_for_each_element():
         w=np.full((3, 2), np.inf),
     )
     assert diagnose(qps).tolist() == [Status.UNBOUNDED, Status.INFEASIBLE, Status.NOT_CONVERGED]
+
+
+def test_little_curvature_is_not_called_unbounded():
+    far = [1e9, 1e9]
+    qp = program([[1, 0], [0, 1e-4]], [0, 1], [[1, 0], [0, 1]], [-1e9, -1e9], far, [1, 1])
+    programs, _ = FlatPrograms.of(*qp.tensors(), torch.zeros(0).double())
+    qps, _ = condense(programs.H, programs.C, programs.G, 0).soft_qps(programs)
+    assert diagnose(qps).tolist() == [Status.NOT_CONVERGED]

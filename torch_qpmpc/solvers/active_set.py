@@ -2,7 +2,7 @@
 
 With the rows' states held (see `crossover`), the KKT conditions are linear. The method of
 multipliers solves them: a large curvature holds the active rows at their bounds, and its error
-falls by a factor of a million a pass, so one Cholesky factor of d x d and no pivoting suffices,
+falls by orders of magnitude a pass, so one Cholesky factor of d x d and no pivoting suffices,
 dependent active rows included.
 """
 
@@ -18,7 +18,7 @@ from torch_qpmpc.solvers.crossover import row_states
 
 #: Relative residual of an answer that needs no further step.
 SETTLED = 1e-9
-PASSES = 3
+PASSES = 2
 
 
 @dataclass

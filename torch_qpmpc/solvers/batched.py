@@ -12,9 +12,9 @@ from torch import Tensor
 
 #: Stands for infinity: its reciprocal's products vanish, and its square does not overflow.
 HUGE = 1e100
-#: Curvature added to H in factorisations, relative to its size: it damps a step, and moves no limit.
+#: Curvature added in factorisations, relative to a typical one: it damps steps, not their limit.
 REGULARISATION = 1e-10
-#: Curvature that holds a row at a bound, relative to the size of H.
+#: Curvature that holds a row at a bound, relative to a typical one.
 PENALTY = 1e8
 #: Multipliers are expected at this fraction of the forces that they balance.
 TYPICAL = 0.05
@@ -22,19 +22,16 @@ TYPICAL = 0.05
 
 @dataclass(frozen=True)
 class BatchedQPs:
-    """`SoftQPs` as tensors, `HUGE` for infinity, with what a solve computes from them once.
+    """`SoftQPs` as tensors, `HUGE` for infinity, and their scales.
 
-    H, G and the regularised H are ``(1, ..)`` where the batch shares them, and then ``products``
-    holds the outer products of G's rows, ``(r, d d)``; else they are ``(B, ..)``. ``width`` and
-    ``force``, ``(B, r)``, are the typical distance between a row's bounds and size of its
-    multiplier, ``cost`` ``(B,)`` their least product; ``penalty`` is the curvature along a row that
-    holds it at a bound.
+    H and G are ``(1, ..)`` where the batch shares them, and then ``products`` holds the outer
+    products of G's rows, ``(r, d d)``; else they are ``(B, ..)``. Typical sizes make every decision
+    independent of units: ``width`` between a row's bounds and ``force`` of its multiplier,
+    ``(B, r)``, ``cost``, their least product, and ``curvature``, ``(B,)``.
     """
 
     H: Tensor
     G: Tensor
-    regularised: Tensor
-    penalty: Tensor
     products: Tensor | None
     g: Tensor
     l: Tensor
@@ -42,48 +39,44 @@ class BatchedQPs:
     w: Tensor
     width: Tensor
     force: Tensor
+    penalty: Tensor
     cost: Tensor
+    curvature: Tensor
 
     @classmethod
     def of(
         cls, H: Tensor, G: Tensor, group: Tensor, g: Tensor, l: Tensor, u: Tensor, w: Tensor
     ) -> BatchedQPs:
         """From the tensors of `SoftQPs`."""
-        size = _largest(H.flatten(1)) + 1e-6 * _largest(G.flatten(1)).square()
-        eye = torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
-        regularised = H + REGULARISATION * size.unsqueeze(-1) * eye
-        penalty = PENALTY * size / G.square().sum(-1).clamp(min=1e-300)
         products = None
         if len(H) == 1:
             products = (G[0].unsqueeze(-1) * G[0].unsqueeze(-2)).flatten(1)
         else:
-            H, G, regularised, penalty = (m[group] for m in (H, G, regularised, penalty))
+            H, G = H[group], G[group]
         l, u, w = l.clamp(min=-HUGE), u.clamp(max=HUGE), w.clamp(max=HUGE)
         size = G.abs().amax(-1).clamp(min=1e-300)
         width = (u - l) / size
-        known = (width > 0) & (width < HUGE / 1e10)
+        known = (width > 0) & (width < 1e-10 * HUGE)
         mean = (width * known).sum(-1, keepdim=True) / known.sum(-1, keepdim=True)
         mean = mean.nan_to_num(1.0)
         width = torch.where(known, width, mean).maximum(1e-3 * mean)
-        forces = _largest(g) + _largest(H.flatten(1)) * width.amin(-1, keepdim=True)
-        forces = torch.where(forces > 0, forces, 1.0)
-        width, force = width * size, TYPICAL * forces / size
-        cost = (force * width).amin(-1)
-        return cls(H, G, regularised, penalty, products, g, l, u, w, width, force, cost)
+        length = width.amin(-1, keepdim=True)
+        pull = _largest(g) + _largest(H.flatten(1)) * length
+        pull = torch.where(pull > 0, pull, 1.0)
+        curvature = pull / length
+        width, force = width * size, TYPICAL * pull / size
+        penalty, cost = PENALTY * curvature / size.square(), (force * width).amin(-1)
+        curvature = curvature.squeeze(-1)
+        return cls(H, G, products, g, l, u, w, width, force, penalty, cost, curvature)
 
     def __len__(self) -> int:
         return len(self.g)
 
     def take(self, index: Tensor) -> BatchedQPs:
         """The QPs at ``index``."""
-        shared = ("H", "G", "regularised", "penalty") if self.products is not None else ()
+        same = ("H", "G", "products") if self.products is not None else ("products",)
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        return BatchedQPs(
-            **{
-                name: part if name in (*shared, "products") else part[index]
-                for name, part in parts.items()
-            }
-        )
+        return BatchedQPs(**{n: t if n in same else t[index] for n, t in parts.items()})
 
     def bend(self, v: Tensor) -> Tensor:
         """H v, ``(B, d)``."""
@@ -98,12 +91,14 @@ class BatchedQPs:
         return self._multiply(self.G.mT, lam)
 
     def factor(self, weight: Tensor) -> Tensor:
-        """Cholesky factors of ``H + G' diag(weight) G``, ``(B, d, d)``; NaN or worse where none."""
+        """Cholesky factors of ``H + G' diag(weight) G``, slightly regularised, ``(B, d, d)``."""
         if self.products is not None:
-            normal = torch.addmm(self.regularised.flatten(1), weight, self.products)
+            normal = torch.addmm(self.H.flatten(1), weight, self.products)
             normal = normal.unflatten(1, self.H.shape[1:])
         else:
-            normal = torch.baddbmm(self.regularised, (self.G * weight.unsqueeze(-1)).mT, self.G)
+            normal = torch.baddbmm(self.H, (self.G * weight.unsqueeze(-1)).mT, self.G)
+        extra = REGULARISATION * self.curvature.unsqueeze(-1)
+        normal.diagonal(dim1=-2, dim2=-1).add_(extra)
         return torch.linalg.cholesky_ex(normal)[0]
 
     def residual(self, v: Tensor, lam: Tensor) -> Tensor:

@@ -117,15 +117,18 @@ def _solve_programs(
     attempts += [(other, False) for other in fallbacks(solver)]
     if start is not None:
         attempts.insert(0, (backend(solver), True))
-    todo, valid = torch.arange(len(programs)), _valid(programs)
-    raw, rejected = None, 0
+    valid = _valid(programs)
+    usable = programs if valid.all() else programs.without_nan()
+    condensed = condensed_for(usable, keep)
+    # First-order conditions certify an optimum only where the QP is convex.
+    valid &= condensed.convex(programs.fixed.shape[-1])[programs.group]
+    todo, raw, rejected = torch.arange(len(programs)), None, 0
     if not valid.all():
         raw, todo = _unsolved(programs), valid.nonzero().squeeze(-1)
         raw.status[todo] = Status.NOT_CONVERGED
         if not len(todo):
             return raw, 0
-        programs = programs.without_nan()
-    condensed = condensed_for(programs, keep)
+    programs = usable
     for solve, warm in attempts:
         whole = len(todo) == len(programs)
         part = programs if whole else programs.take(todo)
@@ -138,7 +141,7 @@ def _solve_programs(
         raw.put(todo[accepted], claim.at(accepted))
         todo = todo[~accepted]
         raw.residual[todo] = claim.residual[~accepted]
-        rejected += 0 if warm else len(todo)
+        rejected = max(rejected, 0 if warm else len(todo))
         if not len(todo):
             return raw, rejected
     assert raw is not None

@@ -73,5 +73,7 @@ def _falls_without_bound(qps: SoftQPs) -> np.ndarray:
     charge = np.where(np.isfinite(qps.w), qps.w / scale[:, None], WEIGHT) * np.maximum(uphill, 0)
     bend = np.einsum("bij,bj->bi", (qps.H / curvature)[qps.group], direction)
     slope = (recession.g * direction).sum(-1) + charge.sum(-1)
+    # Only a direction without curvature reaches the box against so large a weight.
+    far = np.abs(direction).max(axis=-1, initial=0) > 0.5
     flat = np.abs(bend).max(axis=-1, initial=0) <= 10 / WEIGHT
-    return flat & (slope < -1e3 * SIGNIFICANT)
+    return far & flat & (slope < -1e3 * SIGNIFICANT)

@@ -34,7 +34,8 @@ STEP = 0.995
 #: Distances begin at no less than this fraction of a row's width, ..
 ROOM = 0.25
 #: .. unless a soft row is violated by more than this many widths: then at a strictly feasible point.
-MILD = 0.5
+MILD = 0.3
+GIVE = 1e-2
 #: Solved QPs leave the computation once this fraction or less is unsolved.
 SHRINK = 0.75
 
@@ -175,7 +176,7 @@ def _follow(qps: BatchedQPs, end: Point, target: float, limit: int) -> Tensor:
 
         inverse, y = dual.reciprocal(), qps.rows(v)
         ratio = primal * inverse
-        D = ratio.sum(1).reciprocal()
+        D = (ratio.sum(1) + GIVE / qps.penalty.unsqueeze(1)).reciprocal()
         factor = qps.factor(D.sum(1) + point.hold)
         held = point.hold * (point.level - y)
         right = qps.pull(held - point.lam) - qps.bend(v) - qps.g

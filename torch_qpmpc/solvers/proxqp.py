@@ -60,9 +60,8 @@ def solve(qps: SoftQPs, start: Answer | None = None) -> Answer:
         for qp in handles:
             qp.solve()
     else:
+        # ProxSuite sets the thread count of the OpenMP runtime that torch uses too: keep torch's.
         proxqp.sparse.solve_in_parallel(batch, threads)
-        # ProxSuite sets the thread count of the OpenMP runtime that torch uses too.
-        torch.set_num_threads(threads)
     return Answer(
         v=np.array([qp.results.x[: form.n_v] for qp in handles]),
         lam=np.array([qp.results.z[: form.n_rows] for qp in handles]),

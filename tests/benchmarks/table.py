@@ -1,0 +1,214 @@
+"""Run the benchmarks and write their tables to README.md: ``python -m tests.benchmarks.table``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+README = ROOT / "README.md"
+RESULTS = ROOT / "runs" / "benchmark.json"
+BEGIN, END = "<!-- benchmark -->", "<!-- /benchmark -->"
+REFERENCE = "ProxSuite's QPFunction"
+#: The horizons between which growth is fitted.
+FITTED = (10, 40)
+
+Row = dict[str, Any]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.benchmarks.table", description="Write the benchmark's tables."
+    )
+    parser.add_argument("--json", type=Path, help="format these results instead of running")
+    parser.add_argument("--readme", type=Path, default=README, help="where the tables go")
+    options = parser.parse_args(arguments)
+    replaced(options.readme.read_text(encoding="utf-8"), "")  # before waiting for minutes
+    results = json.loads((options.json or run()).read_text(encoding="utf-8"))
+    text = replaced(options.readme.read_text(encoding="utf-8"), tables(results))
+    options.readme.write_text(text, encoding="utf-8")
+
+
+def run() -> Path:
+    """Run the benchmarks in a process of their own; the file of their results."""
+    RESULTS.parent.mkdir(exist_ok=True)
+    command = [sys.executable, "-m", "pytest", "-q", str(Path(__file__).parent)]
+    options = [f"--benchmark-json={RESULTS}", "--benchmark-columns=median,rounds"]
+    # NumPy's own threads would come on top of those that a row is allowed.
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    ended = subprocess.run(command + options, cwd=ROOT, env=environment, check=False)
+    if ended.returncode:
+        sys.exit(f"the benchmarks failed; {README.name} is as it was")
+    print(f"results: {RESULTS}")
+    return RESULTS
+
+
+def replaced(readme: str, text: str) -> str:
+    """``readme`` with ``text`` between the two markers."""
+    if (
+        readme.count(BEGIN) != 1
+        or readme.count(END) != 1
+        or readme.index(BEGIN) > readme.index(END)
+    ):
+        sys.exit(f"README: expected one line {BEGIN} and below it one line {END}; add them")
+    before, after = readme.split(BEGIN)[0], readme.split(END)[1]
+    return f"{before}{BEGIN}\n{text}\n{END}{after}"
+
+
+def tables(results: dict[str, Any]) -> str:
+    """The Markdown of all results."""
+    rows = [
+        {**b["extra_info"], "test": b["name"].split("[")[0], "seconds": b["stats"]["median"]}
+        for b in results["benchmarks"]
+    ]
+
+    def of(test: str) -> list[Row]:
+        return [row for row in rows if row["test"] == test]
+
+    parts = [
+        conditions(results["machine_info"]),
+        *(gradients(of("test_gradient"), dense) for dense in (True, False)),
+        growth(of("test_value"), of("test_condensing")),
+        overhead(of("test_share_outside_the_solver"), of("test_decisions")),
+    ]
+    return "\n\n".join(part for part in parts if part)
+
+
+def conditions(machine: dict[str, Any]) -> str:
+    cpu = machine.get("cpu", {})
+    versions = ", ".join(f"{name} {number}" for name, number in machine["versions"].items())
+    return (
+        f"Measured in one run on {cpu.get('count', '?')} cores ({cpu.get('brand_raw', 'unknown')}, "
+        f"no GPU) with Python {machine['python_version']}, {versions}. One thread unless a row "
+        "says two; medians of wall-clock time after a warm-up."
+    )
+
+
+def gradients(rows: list[Row], dense: bool) -> str:
+    rows = [row for row in rows if row["dense"] == dense]
+    if not rows:
+        return ""
+    batches = _unique(row["batch"] for row in rows)
+    own = {row["batch"]: row["seconds"] for row in rows if row["row"] == REFERENCE}
+    lines = []
+    for name in _unique(row["row"] for row in rows):
+        mine = {row["batch"]: row for row in rows if row["row"] == name}
+        cells = []
+        for batch in batches:
+            row = mine.get(batch)
+            cells.append("" if row is None else _timing(row, own.get(batch)))
+        lines.append([name, *cells, _errors(mine[max(mine)]), _small(mine[max(mine)])])
+    kind = "dense" if dense else "banded"
+    head = [f"{kind} C, batch of", *(f"{batch:,}" for batch in batches), "value", "gradient"]
+    caption = (
+        f"**One Q-learning gradient, {kind} C**: V on the next states, Q on the visited pairs, and "
+        "the gradient in all of theta, in ms; in brackets how many times as fast as ProxSuite's "
+        "layer, whose rounds are between those of each row up to batch 256. The right columns are "
+        "the largest relative errors, of the values and of the gradient's vector, and how many "
+        "values are wrong by more than 1e-6."
+    )
+    return f"{caption}\n\n{_table(head, lines)}"
+
+
+def _timing(row: Row, own: float | None) -> str:
+    reference = row.get("reference_seconds", own)
+    ratio = "" if reference is None or row["row"] == REFERENCE else reference / row["seconds"]
+    return _digits(1e3 * row["seconds"]) + (f" ({_digits(ratio)}x)" if ratio else "")
+
+
+def _errors(row: Row) -> str:
+    wrong = f", {row['wrong']:,} of {row['solved']:,} wrong" if row["wrong"] else ""
+    return f"{row['value_error']:.0e}{wrong}"
+
+
+def _small(row: Row) -> str:
+    return f"{row['gradient_error']:.0e}"
+
+
+def growth(values: list[Row], condensing: list[Row]) -> str:
+    if not values:
+        return ""
+    rows = values + condensing
+    horizons = sorted(_unique(row["horizon"] for row in rows))
+    lines = []
+    for key in _unique((tuple(row["dimensions"]), row["dense"], row["row"]) for row in rows):
+        mine = {
+            row["horizon"]: 1e3 * row["seconds"] / row["batch"]
+            for row in rows
+            if (tuple(row["dimensions"]), row["dense"], row["row"]) == key
+        }
+        dimensions, dense, name = key
+        kind = "dense" if dense else "banded"
+        label = name if name == "condensing" else f"{name}, {kind} C"
+        cells = [_digits(mine[N]) if N in mine else "" for N in horizons]
+        lines.append([str(dimensions), label, *cells, _exponent(mine)])
+    wrong = sum(row["wrong"] for row in values)
+    verdict = "No value" if not wrong else f"{wrong} values"
+    head = ["n_x, n_u", "", *(f"N = {N}" for N in horizons), "exponent"]
+    caption = (
+        f"**Growth with the horizon**: ms a QP (V, theta at rest), or a theta for condensing; the "
+        f"exponent of N is fitted from {FITTED[0]} to {FITTED[1]}. {verdict} compared with the "
+        "reference was wrong by more than 1e-6."
+    )
+    return f"{caption}\n\n{_table(head, lines)}"
+
+
+def _exponent(milliseconds: dict[int, float]) -> str:
+    points = [(N, t) for N, t in milliseconds.items() if FITTED[0] <= N <= FITTED[1]]
+    if len(points) < 2:
+        return ""
+    N, t = np.log(points).T
+    return f"{np.polyfit(N, t, 1)[0]:.1f}"
+
+
+def overhead(shares: list[Row], decisions: list[Row]) -> str:
+    if not shares:
+        return ""
+    batches = _unique(row["batch"] for row in shares)
+    rates = {row["row"]: row["batch"] / row["seconds"] for row in decisions}
+    lines = []
+    for name in _unique(row["row"] for row in shares):
+        mine = {row["batch"]: row["outside"] for row in shares if row["row"] == name}
+        cells = [f"{mine[batch]:.0%}" if batch in mine else "" for batch in batches]
+        rate = f"{_round(rates[name]):,}" if name in rates else ""
+        lines.append([name, *cells, rate])
+    head = ["", *(f"outside, batch {batch}" for batch in batches), "decisions a second"]
+    caption = (
+        "**Overhead**: the share of a gradient's time outside the backend's calls, and the "
+        "policy's decisions a second, in batches of 32 with theta at rest."
+    )
+    return f"{caption}\n\n{_table(head, lines)}"
+
+
+def _table(head: list[str], lines: list[list[str]]) -> str:
+    rule = ["---"] + ["---:"] * (len(head) - 1)
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, rule, *lines))
+
+
+def _unique(items: Iterable[Any]) -> list[Any]:
+    return list(dict.fromkeys(items))
+
+
+def _digits(x: float) -> str:
+    """Three significant digits below a hundred, whole numbers above."""
+    if x >= 100:
+        return f"{_round(x):,}"
+    return f"{x:.{max(0, 2 - math.floor(math.log10(x)))}f}"
+
+
+def _round(x: float) -> int:
+    """To three significant digits."""
+    return int(float(f"{x:.3g}"))
+
+
+if __name__ == "__main__":
+    main()
