@@ -11,6 +11,7 @@ checkpoint.pt, summary.png and summary.json.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import time
 from typing import Any
@@ -27,6 +28,7 @@ from torch_qpmpc import QPActorValueOperator, QPError, QPQLearningLoss, SolveLog
 from torch_qpmpc.checkpoint import save_checkpoint
 from torch_qpmpc.config import check_config
 from torch_qpmpc.experiment import (
+    decay,
     evaluate,
     make_collector,
     make_mpc,
@@ -65,7 +67,6 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     target = SoftUpdate(loss_module, tau=cfg.target_rate) if cfg.delay_value else None
     deviation, si = make_penalties(cfg, mpc)
     optimizer, schedule = make_optimizer(cfg, mpc)
-    initial_rate = optimizer.param_groups[0]["lr"]
 
     # Data: vectorised episodes under today's policy, and one replay for transitions and windows.
     collector = make_collector(cfg, physics, operator)
@@ -82,7 +83,9 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
         replay.extend(batch)
 
     qps, unsolved, train_seconds = SolveLog(), 0, 0.0
-    with RunFolder(folder, cfg) as run:
+    with contextlib.ExitStack() as stack:
+        stack.callback(collector.shutdown)
+        run = stack.enter_context(RunFolder(folder, cfg))
         run.log({"eval/J": loops["start"].J, "eval/J_true_model": loops["true model"].J}, 0)
         progress = tqdm(range(1, cfg.updates + 1), desc=f"{cfg.constraint.name}, {cfg.noise.name}")
         for update in progress:
@@ -103,7 +106,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 optimizer.step()
                 if deviation is not None and cfg.penalty_step == "proximal":
                     # The penalty's weight falls with the rates, so that their ratio is kept.
-                    deviation.proximal_step_(mpc.C, schedule.get_last_lr()[0] / initial_rate)
+                    deviation.proximal_step_(mpc.C, decay(cfg, update - 1))
                 schedule.step()
                 if target is not None:
                     target.step()
@@ -114,6 +117,8 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 metrics = {name: term.item() for name, term in terms.items()}
                 metrics |= {f"train/{name}": losses[name].item() for name in LOGGED}
                 metrics |= {"train/reward": batch["next", "reward"].mean().item(), **qps.metrics()}
+                if deviation is not None:
+                    metrics.setdefault("loss/deviation", deviation(mpc.C).item())
                 metrics |= {"time/collect": collected - began, "time/update": ended - collected}
                 run.log(metrics, update)
                 unsolved, qps = unsolved + qps.unsolved, SolveLog()
@@ -129,7 +134,6 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
         summary["unsolved"] = unsolved + qps.unsolved
         run.finish(summary)
         summary_figure(mpc, loops, *run.column("eval/J")).savefig(run.path / "summary.png", dpi=110)
-    collector.shutdown()
     print(f"\n{table(summary)}\n\n{run.path}")
     return summary
 
@@ -142,9 +146,10 @@ LOGGED = ("td_error", "pred_value", "target_value", "unsolved")
 def main(cfg: DictConfig) -> float:
     """Train; a sweep's optimiser maximises the closed gap that this returns."""
     try:
-        return train(cfg, HydraConfig.get().runtime.output_dir)["closed_gap"]
+        check_config(cfg)
     except QPError as error:
-        raise SystemExit(f"{error}") from None
+        raise SystemExit(str(error)) from None
+    return train(cfg, HydraConfig.get().runtime.output_dir)["closed_gap"]
 
 
 if __name__ == "__main__":

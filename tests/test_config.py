@@ -80,7 +80,7 @@ FRACTION = [0, -0.5, 1.1, math.nan, False, "half", None]
 FLAG = [0, 1, "yes", None]
 NAME = [3, True, None]
 BAD: dict[str, list[Any]] = {
-    "seed": WHOLE[1:],
+    "seed": [*WHOLE[1:], 2**63],
     "solver": NAME,
     "exploration_std": REAL,
     "td_error_clip": [0, *REAL[:-1]],
@@ -200,6 +200,10 @@ def test_solver_must_be_known():
         (
             ["constraint=si", "warmup_steps=7"],
             r"warmup_steps: got 7, expected at least task.horizon = 10",
+        ),
+        (
+            ["constraint=fixed", "task.learn_cost=[]"],
+            r"task.learn_cost: got \[\], as is constraint.learn, expected something to learn",
         ),
         (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
     ],

@@ -79,9 +79,11 @@ def bound(name: str, bounds: tuple[Any, Any] | None, side: int, size: int) -> Te
 
 
 def cost_weights(
-    stage: Tensor, terminal: Tensor, hessian: str, n_x: int, n_u: int, horizon: int
+    stage_weight: Any, terminal_weight: Any, hessian: str, n_x: int, n_u: int, horizon: int
 ) -> dict[str, Tensor]:
     """The starts of H and H_f in the shapes that the kind of ``hessian`` has; one H if full."""
+    stage = as_tensor("stage_weight", stage_weight)
+    terminal = as_tensor("terminal_weight", terminal_weight)
     n, diagonal = n_x + n_u, hessian == "diagonal"
     event = (n,) if diagonal else (n, n)
     terminal_event = (n_x,) * len(event)
@@ -117,6 +119,11 @@ def check_weight(name: str, weight: Tensor, diagonal: bool) -> None:
         raise QPError.expected(
             name, f"smallest eigenvalue {eigenvalues.min():.3g}", "a positive semidefinite weight"
         )
+
+
+def check_slack(name: str, weight: float) -> None:
+    if not weight >= 0:
+        raise QPError.expected(name, weight, "a non-negative weight, or inf for hard rows")
 
 
 def check_input(name: str, x: Tensor, size: int) -> Tensor:

@@ -50,7 +50,7 @@ FLAG: Rule = lambda x: isinstance(x, bool), "true or false"
 NAME: Rule = lambda x: isinstance(x, str), "a name"
 
 RULES: dict[str, Rule] = {
-    "seed": _whole(0),
+    "seed": (lambda x: _whole(0)[0](x) and x < 2**63, "a whole number >= 0 and < 2^63"),
     "solver": NAME,
     "updates": _whole(1),
     "batch_size": _whole(1),
@@ -124,6 +124,10 @@ def check_config(cfg: DictConfig) -> None:
             str(list(cfg.constraint.learn)),
             "C among them, as a penalty on C is on",
             "Set the penalty to null, or learn C.",
+        )
+    if not cfg.constraint.learn and not cfg.task.learn_cost:
+        raise QPError.expected(
+            "task.learn_cost", "[], as is constraint.learn", "something to learn in one of them"
         )
     if cfg.constraint.si is not None:
         for key in ("task.episode_steps", "warmup_steps"):

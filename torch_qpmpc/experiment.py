@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictSequential
-from torch.optim.lr_scheduler import LinearLR
+from torch.optim.lr_scheduler import LambdaLR
 from torchrl.collectors import Collector
 from torchrl.modules import AdditiveGaussianModule
 
@@ -86,7 +87,7 @@ def make_penalties(
     )
 
 
-def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> tuple[torch.optim.Optimizer, LinearLR]:
+def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> tuple[torch.optim.Optimizer, LambdaLR]:
     """The optimiser, with one rate for the cost and one for the constraints, and their decay."""
     options = cfg.optimizer
     groups = mpc.parameter_groups({"cost": options.lr_cost, "constraints": options.lr_constraints})
@@ -94,7 +95,12 @@ def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> tuple[torch.optim.Optimizer, 
         optimizer = torch.optim.Adam(groups, betas=tuple(options.betas))
     else:
         optimizer = torch.optim.SGD(groups)
-    return optimizer, LinearLR(optimizer, 1.0, options.final_fraction, total_iters=cfg.updates)
+    return optimizer, LambdaLR(optimizer, partial(decay, cfg))
+
+
+def decay(cfg: DictConfig, update: int) -> float:
+    """What the learning rates are multiplied by after ``update`` updates: linear in them."""
+    return 1 - (1 - cfg.optimizer.final_fraction) * min(update / cfg.updates, 1)
 
 
 def evaluate(cfg: DictConfig, mpc: QPMPC, physics: PointMass) -> ClosedLoop:

@@ -19,6 +19,7 @@ from torch_qpmpc.arguments import (
     as_tensor,
     bound,
     check_input,
+    check_slack,
     check_structure,
     cost_weights,
 )
@@ -142,21 +143,19 @@ class QPMPC(nn.Module):
         if A.shape[-1:] != (n_x,) or B.shape[-1:] != (n_u,):
             got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
             raise QPError.expected("A, B", got, f"({n_x}, {n_x}) and ({n_x}, {n_u})")
-        C_0 = banded_matrix(A, B, horizon)
         powers = gamma ** torch.arange(horizon + 1, dtype=torch.float64).unsqueeze(-1)
         discount = self._per_entry(powers.expand(-1, n_x), powers.expand(-1, n_u))
         self.register_buffer("discount", discount, persistent=False)
-        self.register_buffer("C_0", C_0)
-        stage = as_tensor("stage_weight", stage_weight)
-        terminal = as_tensor("terminal_weight", terminal_weight)
-        for name, start in cost_weights(stage, terminal, hessian, n_x, n_u, horizon).items():
+        self.register_buffer("C_0", banded_matrix(A, B, horizon))
+        weights = cost_weights(stage_weight, terminal_weight, hessian, n_x, n_u, horizon)
+        for name, start in weights.items():
             self._own(name, start)
             if name in self.learned:
                 kind = SquareRoot() if hessian == "diagonal" else Cholesky()
                 parametrize.register_parametrization(self, name, kind)
         self._own("q", torch.zeros(self.n_z))
         self._own("c", torch.zeros(()))
-        self._own("C", C_0)
+        self._own("C", self.C_0)
         self._own("b", torch.zeros(horizon * n_x))
         self._own("G", torch.eye(self.n_z))
         for name, side in (("lb", 0), ("ub", 1)):
@@ -165,6 +164,8 @@ class QPMPC(nn.Module):
             self._own(name, self._per_entry(x, u))
         if not (self.lb <= self.ub).all():
             raise QPError.expected("state_bounds, action_bounds", "lower > upper", "lower <= upper")
+        check_slack("state_slack", state_slack)
+        check_slack("action_slack", action_slack)
         self._own_slack_weights(state_slack, action_slack, discount_slack)
 
     @classmethod
@@ -310,14 +311,8 @@ class QPMPC(nn.Module):
             self.register_buffer(name, value)
 
     def _own_slack_weights(self, state: float, action: float, discounted: bool) -> None:
-        for name, weight in (("state_slack", state), ("action_slack", action)):
-            if not weight >= 0:
-                raise QPError.expected(name, weight, "a non-negative weight, or inf for hard rows")
-        shape = (self.horizon + 1, 1)
-        w = self._per_entry(
-            torch.full(shape, float(state)).expand(-1, self.n_x),
-            torch.full(shape, float(action)).expand(-1, self.n_u),
-        )
+        x, u = torch.full((self.n_x,), float(state)), torch.full((self.n_u,), float(action))
+        w = self._per_entry(x.expand(self.horizon + 1, -1), u.expand(self.horizon + 1, -1))
         self.register_buffer("soft", w.isfinite())
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         w = w.masked_fill(~self.soft, 0.0).to(torch.float64)

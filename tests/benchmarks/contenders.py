@@ -115,14 +115,20 @@ def _ours() -> list[Contender]:
     return contenders
 
 
-#: The largest batch of each peer.
-PATIENCE = {REFERENCE: 1024, "qpth": 256, "cvxpylayers": 32}
+#: The largest batch of the peers for whom a larger one takes minutes.
+PATIENCE = {"qpth": 256, "cvxpylayers": 256}
 
 CONTENDERS: list[Contender] = [
     *(
-        Contender(name, "daqp", peer(make), largest=PATIENCE[name], fast=False, ours=False)
+        Contender(
+            name,
+            "daqp",
+            peer(make),
+            largest=PATIENCE.get(name, BATCHES[-1]),
+            fast=False,
+            ours=False,
+        )
         for name, make in PEERS.items()
     ),
-    Contender("Clarabel (qpsolvers), condensed", "qpsolvers:clarabel", cold, fast=False),
     *_ours(),
 ]

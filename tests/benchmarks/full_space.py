@@ -62,6 +62,12 @@ class FullSpace:
             u=torch.cat((upper[:, soft], absent, absent, upper[:, ~soft]), dim=1),
         )
 
+    def one_sided(self) -> tuple[Tensor, Tensor]:
+        """The inequalities as ``G x <= h``: G ``(m, n)`` and h ``(B, m)``."""
+        upper, lower = self.u[0] < INFINITE, self.l[0] > -INFINITE
+        G = torch.cat((self.G[upper], -self.G[lower]))
+        return G, torch.cat((self.u[:, upper], -self.l[:, lower]), dim=1)
+
     def value(self, x: Tensor) -> Tensor:
         """The cost ``(B,)`` of a minimiser x ``(B, n)``, with what the fixed entries cost."""
         qp, n = self.qp, self.fixed.shape[-1]

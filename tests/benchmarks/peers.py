@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import qpsolvers
 import scipy.sparse as sp
 import torch
 from torch import Tensor
@@ -42,9 +43,7 @@ def qpth() -> Values:
 
     def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
         full = FullSpace.of(qp, fixed)
-        upper, lower = full.u[0] < INFINITE, full.l[0] > -INFINITE
-        G = torch.cat((full.G[upper], -full.G[lower]))
-        h = torch.cat((full.u[:, upper], -full.l[:, lower]), dim=1)
+        G, h = full.one_sided()
         Q = full.Q + CURVATURE * torch.eye(len(full.Q)).to(full.Q)
         # It would give matrices that the batch shares the mean of the batch's gradients.
         Q, G, A = (matrix.expand(len(fixed), -1, -1) for matrix in (Q, G, full.A))
@@ -94,10 +93,34 @@ def _cvxpy_layer(CvxpyLayer: Any, qp: QuadraticProgram, n_f: int) -> Any:
     return CvxpyLayer(problem, parameters, [z, sigma], solver_args={"solve_method": "CLARABEL"})
 
 
+def clarabel() -> Values:
+    """Clarabel through qpsolvers, a QP at a time; differentiated as this package does it.
+
+    The Lagrangian with x and the multipliers held has the value's gradient.
+    """
+    needs("clarabel")
+
+    def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
+        full = FullSpace.of(qp, fixed)
+        G, h = full.one_sided()
+        P, A, rows = (sp.csc_matrix(m.detach().numpy()) for m in (full.Q, full.A, G))
+        p, b, right = (v.detach().numpy() for v in (full.p, full.b, h))
+        found = [
+            qpsolvers.solve_problem(qpsolvers.Problem(P, p[i], rows, right[i], A, b[i]), "clarabel")
+            for i in range(len(fixed))
+        ]
+        x, y, z = (torch.from_numpy(np.array([getattr(f, n) for f in found])) for n in "xyz")
+        cost = full.value(x) + (y * (x @ full.A.mT - full.b)).sum(-1)
+        return cost + (z * (x @ G.mT - h)).sum(-1)
+
+    return values
+
+
 PEERS: dict[str, Callable[[], Values]] = {
     "ProxSuite's QPFunction": proxsuite,
     "qpth": qpth,
     "cvxpylayers": cvxpylayers,
+    "Clarabel through qpsolvers": clarabel,
 }
 
 

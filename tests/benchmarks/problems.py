@@ -15,7 +15,7 @@ LEARN = ("H", "H_f", "q", "c", "C", "b", "G", "lb", "ub", "w")
 GAMMA, SLACK = 0.9, 100.0
 #: A dense C is the banded one plus normal entries, whose spectral norm is about twice this.
 PERTURBATION = 0.3
-#: States and actions are drawn within plus or minus these. The bounds of the positions, 2, are soft;
+#: States and actions are drawn within plus or minus these. The bounds of positions, 2, are soft;
 #: those of the actions, 1, are hard, and stay out of reach when theta moves.
 STATE_RANGE, ACTION_RANGE = 2.2, 0.9
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import scipy.sparse as sp
 import torch
 from torch import Tensor
 
-from tests.benchmarks.full_space import INFINITE, FullSpace
+from tests.benchmarks.full_space import FullSpace
 from tests.benchmarks.peers import needs
 from torch_qpmpc import QuadraticProgram
 
@@ -23,16 +22,13 @@ def reference_values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
-    has_upper, has_lower = (full.u[0] < INFINITE).numpy(), (full.l[0] > -INFINITE).numpy()
-    G = full.G.numpy()
-    rows = sp.csc_matrix(np.vstack([full.A.numpy(), G[has_upper], -G[has_lower]]))
-    Q = sp.csc_matrix(np.triu(full.Q.numpy()))
-    n_eq, n_in = len(full.A), int(has_upper.sum() + has_lower.sum())
-    cones = [clarabel.ZeroConeT(n_eq), clarabel.NonnegativeConeT(n_in)]
+    G, h = full.one_sided()
+    rows, right = sp.csc_matrix(torch.cat((full.A, G))), torch.cat((full.b, h), dim=1).numpy()
+    Q = sp.csc_matrix(full.Q.triu())
+    cones = [clarabel.ZeroConeT(len(full.A)), clarabel.NonnegativeConeT(len(G))]
     x = []
-    for p, b, lower, upper in zip(full.p, full.b, full.l, full.u, strict=True):
-        right = np.concatenate([b, upper[has_upper], -lower[has_lower]])
-        solution = clarabel.DefaultSolver(Q, p.numpy(), rows, right, cones, settings).solve()
+    for p, r in zip(full.p.numpy(), right, strict=True):
+        solution = clarabel.DefaultSolver(Q, p, rows, r, cones, settings).solve()
         if "Solved" not in str(solution.status):
             raise RuntimeError(f"no reference value: {solution.status}")
         x.append(solution.x)

@@ -18,17 +18,24 @@ from torch_qpmpc.solvers.crossover import row_states
 
 #: Relative residual of an answer that needs no further step.
 SETTLED = 1e-9
-PASSES = 2
+PASSES = 3
 
 
 @dataclass
 class Found:
-    """The best v ``(B, d)`` and lam ``(B, r)`` so far, their residuals, and the steps taken ``(B,)``."""
+    """The best v ``(B, d)`` and lam ``(B, r)`` so far, their residuals and steps, ``(B,)``."""
 
     v: Tensor
     lam: Tensor
     residual: Tensor
     steps: Tensor
+
+    @classmethod
+    def nothing(cls, qps: BatchedQPs) -> Found:
+        """Zeros, and what any answer betters."""
+        residual = torch.full_like(qps.cost, torch.inf)
+        steps = torch.zeros_like(qps.cost, dtype=torch.int64)
+        return cls(torch.zeros_like(qps.g), torch.zeros_like(qps.w), residual, steps)
 
     def offer(self, index: Tensor, v: Tensor, lam: Tensor, residual: Tensor) -> None:
         """Take the answers for ``index`` where they lower the residual."""
@@ -58,7 +65,7 @@ def settle(qps: BatchedQPs, v: Tensor, lam: Tensor, max_steps: int) -> Found:
 def _step(qps: BatchedQPs, v: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
     """v and lam with the active rows at their bounds, and lam as held elsewhere."""
     y, stiffness = qps.rows(v), qps.force / qps.width
-    nearest, active, held = row_states(y + lam / stiffness, qps.l, qps.u, qps.w / stiffness)
+    nearest, active, held = row_states(y + lam / stiffness, qps.lower, qps.upper, qps.w / stiffness)
     lam = torch.where(active, lam, held * stiffness)
     weight = active * qps.penalty
     factor = qps.factor(weight)

@@ -10,32 +10,36 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-#: Stands for infinity: its reciprocal's products vanish, and its square does not overflow.
+#: Stands for infinity: its reciprocal vanishes in sums, and its square does not overflow.
 HUGE = 1e100
-#: Curvature added in factorisations, relative to a typical one: it damps steps, not their limit.
-REGULARISATION = 1e-10
-#: Curvature that holds a row at a bound, relative to a typical one.
-PENALTY = 1e8
-#: Multipliers are expected at this fraction of the forces that they balance.
+#: Of the larger bound: the width of a row that is an equality rather than an interval.
+NARROW = 1e-6
+#: A multiplier's typical part of the largest force.
 TYPICAL = 0.05
+#: Typical curvature is H's, or where that is flat this part of the largest force over a length.
+FLAT = 1e-2
+#: Times the typical curvature: what holds a row at its bound, and what damps every step.
+PENALTY, DAMPING = 1e10, 1e-10
+#: Of the largest diagonal entry: makes a matrix positive definite that rounding has spoilt.
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
 class BatchedQPs:
-    """`SoftQPs` as tensors, `HUGE` for infinity, and their scales.
+    """`SoftQPs` as tensors, with `HUGE` for infinity, and what is typical of each.
 
     H and G are ``(1, ..)`` where the batch shares them, and then ``products`` holds the outer
-    products of G's rows, ``(r, d d)``; else they are ``(B, ..)``. Typical sizes make every decision
-    independent of units: ``width`` between a row's bounds and ``force`` of its multiplier,
-    ``(B, r)``, ``cost``, their least product, and ``curvature``, ``(B,)``.
+    products of G's rows, ``(r, d d)``; else they are ``(B, ..)``. Typical sizes make all decisions
+    independent of units: ``width`` between a row's bounds, ``force`` of its multiplier, ``penalty``
+    that holds it, ``(B, r)``; ``cost``, the least width times force, and ``curvature``, ``(B,)``.
     """
 
     H: Tensor
     G: Tensor
     products: Tensor | None
     g: Tensor
-    l: Tensor
-    u: Tensor
+    lower: Tensor
+    upper: Tensor
     w: Tensor
     width: Tensor
     force: Tensor
@@ -45,7 +49,14 @@ class BatchedQPs:
 
     @classmethod
     def of(
-        cls, H: Tensor, G: Tensor, group: Tensor, g: Tensor, l: Tensor, u: Tensor, w: Tensor
+        cls,
+        H: Tensor,
+        G: Tensor,
+        group: Tensor,
+        g: Tensor,
+        lower: Tensor,
+        upper: Tensor,
+        w: Tensor,
     ) -> BatchedQPs:
         """From the tensors of `SoftQPs`."""
         products = None
@@ -53,21 +64,23 @@ class BatchedQPs:
             products = (G[0].unsqueeze(-1) * G[0].unsqueeze(-2)).flatten(1)
         else:
             H, G = H[group], G[group]
-        l, u, w = l.clamp(min=-HUGE), u.clamp(max=HUGE), w.clamp(max=HUGE)
-        size = G.abs().amax(-1).clamp(min=1e-300)
-        width = (u - l) / size
-        known = (width > 0) & (width < 1e-10 * HUGE)
-        mean = (width * known).sum(-1, keepdim=True) / known.sum(-1, keepdim=True)
-        mean = mean.nan_to_num(1.0)
-        width = torch.where(known, width, mean).maximum(1e-3 * mean)
-        length = width.amin(-1, keepdim=True)
-        pull = _largest(g) + _largest(H.flatten(1)) * length
-        pull = torch.where(pull > 0, pull, 1.0)
-        curvature = pull / length
-        width, force = width * size, TYPICAL * pull / size
+        lower, upper, w = lower.clamp(min=-HUGE), upper.clamp(max=HUGE), w.clamp(max=HUGE)
+        size = _largest(G).squeeze(-1).clamp(min=1e-300)
+        width = (upper - lower) / size
+        narrow = upper - lower <= NARROW * lower.abs().maximum(upper.abs())
+        known = ~narrow & (width < 1e-10 * HUGE)
+        median = width.masked_fill(~known, torch.nan).nanmedian(-1, keepdim=True).values
+        median = median.nan_to_num(1.0)
+        width = torch.where(known, width, median).maximum(1e-3 * median)
+        length, stiffest = width.amin(-1, keepdim=True), _largest(H.flatten(1))
+        push = _largest(g) + stiffest * length
+        push = torch.where(push > 0, push, 1.0)
+        curvature = stiffest.maximum(FLAT * push / length)
+        width, force = width * size, TYPICAL * push / size
         penalty, cost = PENALTY * curvature / size.square(), (force * width).amin(-1)
         curvature = curvature.squeeze(-1)
-        return cls(H, G, products, g, l, u, w, width, force, penalty, cost, curvature)
+        typical = (width, force, penalty, cost, curvature)
+        return cls(H, G, products, g, lower, upper, w, *typical)
 
     def __len__(self) -> int:
         return len(self.g)
@@ -91,15 +104,19 @@ class BatchedQPs:
         return self._multiply(self.G.mT, lam)
 
     def factor(self, weight: Tensor) -> Tensor:
-        """Cholesky factors of ``H + G' diag(weight) G``, slightly regularised, ``(B, d, d)``."""
+        """Cholesky factors of ``H + G' diag(weight) G``, slightly damped, ``(B, d, d)``."""
         if self.products is not None:
             normal = torch.addmm(self.H.flatten(1), weight, self.products)
             normal = normal.unflatten(1, self.H.shape[1:])
         else:
             normal = torch.baddbmm(self.H, (self.G * weight.unsqueeze(-1)).mT, self.G)
-        extra = REGULARISATION * self.curvature.unsqueeze(-1)
-        normal.diagonal(dim1=-2, dim2=-1).add_(extra)
-        return torch.linalg.cholesky_ex(normal)[0]
+        diagonal = normal.diagonal(dim1=-2, dim2=-1)
+        diagonal += DAMPING * self.curvature.unsqueeze(-1)
+        factor, info = torch.linalg.cholesky_ex(normal)
+        if (failed := info > 0).any():
+            diagonal += ROUNDING * diagonal.amax(-1, keepdim=True)
+            factor[failed] = torch.linalg.cholesky_ex(normal[failed])[0]
+        return factor
 
     def residual(self, v: Tensor, lam: Tensor) -> Tensor:
         """The certificate's relative KKT residual, of the condensed problem, ``(B,)``."""
@@ -107,11 +124,11 @@ class BatchedQPs:
         stationarity = _largest(Hv + self.g + pull)
         stationarity /= 1 + _largest(torch.cat((Hv, self.g, pull), dim=-1))
         hard = self.w == HUGE
-        weight, outside = self.w.masked_fill(hard, 0), (y - y.clip(self.l, self.u)).abs()
+        weight, outside = self.w.masked_fill(hard, 0), (y - y.clip(self.lower, self.upper)).abs()
         violation = _largest(outside * hard / (1 + y.abs()))
         excess = _largest((lam.abs() - self.w).clamp(min=0) / (1 + weight))
         charge = weight * outside
-        gap = charge + lam.clamp(min=0) * (self.u - y) + lam.clamp(max=0) * (self.l - y)
+        gap = charge + lam.clamp(min=0) * (self.upper - y) + lam.clamp(max=0) * (self.lower - y)
         cost = (v * (Hv / 2 + self.g)).sum(-1, keepdim=True) + charge.sum(-1, keepdim=True)
         gap = gap.abs().sum(-1, keepdim=True) / (1 + cost.abs())
         parts = (stationarity, violation, excess, gap)
