@@ -9,7 +9,7 @@ from torch.testing import assert_close
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states
 from torch_qpmpc import QuadraticProgram, solve_qp
 from torch_qpmpc.qp import EVENT_SHAPES
-from torch_qpmpc.sensitivity import row_states
+from torch_qpmpc.sensitivity import active_rows
 
 OPERANDS = (*EVENT_SHAPES, "fixed")
 PARTS = ("value", "z", "sigma", "chi", "upsilon", "eta", "xi")
@@ -65,7 +65,7 @@ def test_saturated_rows_pass_on_their_weight():
     operands = operands_of(known)
     leaf = operands[OPERANDS.index("w")].requires_grad_()
     (gradient,) = torch.autograd.grad(part_of(operands, "z").sum(), leaf)
-    saturated = row_states(known.lam, known.qp.w)[1]
+    saturated = active_rows(known.lam, known.qp.w)[1]
     assert saturated.any()
     assert (gradient[saturated] != 0).all()
     assert (gradient[~saturated] == 0).all()

@@ -39,7 +39,7 @@ _ADJOINT_NDIMS = (1, 1, 1, 1, 1, 1, 0, 2, 1, 0, 2, 1, 2, 1, 1, 1, 1)
 _SOLUTION_NDIMS = (1, 1, 1, 1, 0, 2, 1, 0, 2, 1, 2, 1, 1, 1, 1)
 
 
-def row_states(lam: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+def active_rows(lam: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     """Which rows are held at a bound, and which are saturated at |lam| = w, ``(*batch, n_g)``."""
     size = lam.abs()
     saturated = w.isfinite() & (size >= (1 - ACTIVE_FRACTION) * w)
@@ -84,7 +84,7 @@ def kkt_adjoint(
         programs = programs.without_nan()
     condensed = condensed_for(programs, keep)
     pull_z, pull_lam = flat(grad_z), flat(grad_lam)
-    active, _ = row_states(flat(lam), programs.w)
+    active, _ = active_rows(flat(lam), programs.w)
     # What C p = dl/dchi and E p = dl/dxi fix; then the condensed system for the rest.
     adjoint = replace(programs, b=flat(grad_chi), fixed=flat(grad_xi))
     particular = condensed.particular(adjoint)
@@ -158,7 +158,7 @@ class SolutionGradient(torch.autograd.Function):
         p, r, t, u = kkt_adjoint(
             grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, ctx.keep
         )
-        _, saturated = row_states(lam, w)
+        _, saturated = active_rows(lam, w)
         slope = torch.where(
             saturated, lam.sign() * (grad_lam - (p.unsqueeze(-2) @ G.mT).squeeze(-2)), 0
         )

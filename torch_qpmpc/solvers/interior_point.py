@@ -209,6 +209,9 @@ def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: T
     centre = (left / gap).clamp(0, 1) ** 3 * gap / products[0].numel()
 
     # The corrector aims at products of ``centre``, with the predictor's second-order term.
+    late = point.steps > 15
+    centre = torch.where(late, centre.maximum(0.6 * gap / products[0].numel()), centre)
+    second *= torch.where(late, 1.0, 1.0)[:, None, None, None]
     goal = second.mul_(primal).addcmul_(inverse, centre[:, None, None, None])
     dv, dy, dlam = direction(room - goal.sum(1))
     change = goal.sub_(primal).addcmul_(ratio, dlam, value=-1)
