@@ -1,6 +1,6 @@
 """Learn a quadratic program as value function by Q-learning, on the paper's point mass.
 
-    python train.py                                     the default: both penalties, seed 1
+    python train.py                                     the default: deviation penalty, seed 1
     python train.py constraint=free noise=brownian      one of the paper's cases
     python train.py -m constraint=fixed,free seed=1,2   a sweep
     tensorboard --logdir runs                           watch it

@@ -65,7 +65,8 @@ class BatchedQPs:
         else:
             H, G = H[group], G[group]
         lower, upper, w = lower.clamp(min=-HUGE), upper.clamp(max=HUGE), w.clamp(max=HUGE)
-        size = _largest(G).squeeze(-1).clamp(min=1e-300)
+        size = _largest(G).squeeze(-1)
+        size = torch.where(size > 1 / HUGE, size, 1.0)
         width = (upper - lower) / size
         narrow = upper - lower <= NARROW * lower.abs().maximum(upper.abs())
         known = ~narrow & (width < 1e-10 * HUGE)

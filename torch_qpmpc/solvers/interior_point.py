@@ -34,6 +34,8 @@ STEP = 0.995
 ROOM = 0.25
 #: .. but with the true one if it is soft and the QP has a row violated by more than this part.
 MILD = 0.3
+#: After so many steps, which may then be circling, one aims at no less than this part of the gap.
+LATE, CAUTION = 20, 0.3
 #: Solved QPs leave the computation when no more than this part is unsolved.
 SHRINK = 0.75
 
@@ -206,12 +208,10 @@ def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: T
     reach = torch.maximum(1 + high, -low).clamp(min=1).reciprocal()
     second = relative.addcmul_(relative, relative)
     left = (1 - reach) * gap - reach.square() * products.mul_(second).sum((1, 2, 3))
-    centre = (left / gap).clamp(0, 1) ** 3 * gap / products[0].numel()
+    share = ((left / gap).clamp(0, 1) ** 3).maximum(CAUTION * (point.steps > LATE))
+    centre = share * gap / products[0].numel()
 
     # The corrector aims at products of ``centre``, with the predictor's second-order term.
-    late = point.steps > 15
-    centre = torch.where(late, centre.maximum(0.6 * gap / products[0].numel()), centre)
-    second *= torch.where(late, 1.0, 1.0)[:, None, None, None]
     goal = second.mul_(primal).addcmul_(inverse, centre[:, None, None, None])
     dv, dy, dlam = direction(room - goal.sum(1))
     change = goal.sub_(primal).addcmul_(ratio, dlam, value=-1)
