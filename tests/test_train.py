@@ -277,7 +277,13 @@ def test_configuration_reaches_the_parts(tmp_path, monkeypatch):
     monkeypatch.setattr(QPQLearningLoss, "loss_value", spy_loss)
     monkeypatch.setattr(SystemIdentificationPenalty, "forward", spy_si)
     monkeypatch.setattr(DeviationPenalty, "proximal_step_", spy_proximal)
-    more = ("task.gamma=0.5", "td_error_clip=7.0", "constraint.si.windows=5", "batch_size=6")
+    more = (
+        "constraint=combined",
+        "task.gamma=0.5",
+        "td_error_clip=7.0",
+        "constraint.si.windows=5",
+        "batch_size=6",
+    )
     run_small(tmp_path, *more, "optimizer.final_fraction=0.2", "optimizer.lr_cost=0.125")
     assert losses == [(0.5, 7.0, False, (6,))] * 4
     assert windows == [(5, 22)] * 4
@@ -339,7 +345,14 @@ def test_command(tmp_path, monkeypatch, capsys):
     skip_figures(monkeypatch)
     monkeypatch.chdir(tmp_path)
     # Hydra finds the folder by itself only for a script, not for an imported module.
-    arguments = ["--config-path", str(CONFIGS), *SMALL, "noise=brownian", *QUIET]
+    arguments = [
+        "--config-path",
+        str(CONFIGS),
+        *SMALL,
+        "constraint=combined",
+        "noise=brownian",
+        *QUIET,
+    ]
     monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
     train.main()
     lines = capsys.readouterr().out.splitlines()

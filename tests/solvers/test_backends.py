@@ -229,3 +229,16 @@ def test_every_other_backend_is_a_fallback():
         assert solve not in fallbacks(name)
         assert len(fallbacks(name)) == len(BACKENDS) - 1
     assert len(fallbacks("qpsolvers:clarabel")) == len(BACKENDS)
+
+
+def test_rows_that_are_hard_in_some_of_a_batch_only(solver):
+    """A model that is updated from one pattern of soft rows to another must not be relied on."""
+    known = known_qp(5, batch=(24,))
+    w = known.qp.w.expand(24, -1).clone()
+    inside = (known.sigma == 0) & w.isfinite()
+    harden = inside & (torch.arange(24) % 3 == 0).unsqueeze(-1)
+    mixed = replace(known.qp, w=torch.where(harden, torch.inf, w))
+    for _ in range(3):
+        solution = solve_qp(mixed, known.fixed, solver=solver)
+    assert harden.any()
+    assert_close(solution.value, known.value)

@@ -18,6 +18,7 @@ from torch_qpmpc.solvers.crossover import row_states
 
 #: Relative residual of an answer that needs no further step.
 SETTLED = 1e-9
+#: Of the method of multipliers, a Newton step.
 PASSES = 3
 
 
@@ -70,9 +71,9 @@ def _step(qps: BatchedQPs, v: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
     weight = active * qps.penalty
     factor = qps.factor(weight)
     for _ in range(PASSES):
-        short = weight * (nearest - y)
-        right = qps.pull(short - lam) - qps.bend(v) - qps.g
+        short = nearest - y
+        right = qps.pull(weight * short - lam) - qps.bend(v) - qps.g
         dv = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
         dy = qps.rows(dv)
-        v, y, lam = v + dv, y + dy, lam + weight * dy - short
+        v, y, lam = v + dv, y + dy, lam + weight * (dy - short)
     return v, lam

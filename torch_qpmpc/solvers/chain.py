@@ -141,11 +141,14 @@ def _solve_programs(
         raw.put(todo[accepted], claim.at(accepted))
         todo = todo[~accepted]
         raw.residual[todo] = claim.residual[~accepted]
-        rejected = max(rejected, 0 if warm else len(todo))
+        if len(todo) and not warm and not rejected:
+            rejected = len(todo)
+            # What is proved to be infeasible need not be tried by every other solver.
+            raw.status[todo] = _reasons(programs.take(todo), condensed)
+            todo = todo[raw.status[todo] != Status.INFEASIBLE]
         if not len(todo):
-            return raw, rejected
+            break
     assert raw is not None
-    raw.status[todo] = _reasons(programs.take(todo), condensed)
     return raw, rejected
 
 

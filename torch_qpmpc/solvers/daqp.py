@@ -33,16 +33,18 @@ def solve(qps: SoftQPs, start: Answer | None = None) -> Answer:
     lower = np.where(qps.w > 0, np.maximum(qps.l, -NO_BOUND), -NO_BOUND)
     for m in np.unique(qps.group):
         H, G = np.array(qps.H[m], order="C"), np.array(qps.G[m], order="C")
-        model, ready = daqp.Model(), False
+        model, pattern = daqp.Model(), None
         for i in np.flatnonzero(qps.group == m):
-            if ready:
+            # Updating a model to another pattern of soft rows corrupts memory: set up another one.
+            if pattern is not None and np.array_equal(pattern, hard[i]):
                 model.update(f=qps.g[i], bupper=upper[i], blower=lower[i], sense=sense[i])
             else:
+                model, pattern = daqp.Model(), None
                 flag, _ = model.setup(H, qps.g[i], G, upper[i], lower[i], sense[i].copy())
                 if flag < 0:
                     continue
                 model.settings = SETTINGS
-                ready = True
+                pattern = hard[i]
             if n_rows:  # soft_weights refuses empty arrays
                 model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[i], w_u=weight[i])
             x, _, _, info = model.solve()

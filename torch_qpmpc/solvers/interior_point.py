@@ -190,8 +190,8 @@ def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: T
     ratio = primal * inverse
     D = ratio.sum(1).reciprocal_().minimum(qps.penalty.unsqueeze(1))
     factor = qps.factor(D.sum(1) + hold)
-    held = hold * (point.level - y)
-    right = qps.pull(held - point.lam) - qps.bend(v) - qps.g
+    short = point.level - y
+    right = qps.pull(hold * short - point.lam) - qps.bend(v) - qps.g
     room = point.bound - y.unsqueeze(1)
 
     def direction(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -226,6 +226,6 @@ def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: T
     v.addcmul_(ahead[:, None], dv)
     primal.addcmul_(ahead[:, None, None, None], change)
     dual.addcmul_(ahead[:, None, None, None], dlam)
-    point.equality.addcmul_(ahead[:, None], hold * dy - held)
+    point.equality.addcmul_(ahead[:, None], hold * (dy - short))
     point.astray.mul_(1 - ahead)
     point.steps += going
