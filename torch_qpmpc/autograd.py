@@ -52,8 +52,8 @@ def solve_qp(
     Args:
         qp: the problems.
         fixed: values of the first n_f entries of z, ``(*batch, n_f)``: s for V, (s, a) for Q.
-        solver: ``"proxqp"``, ``"daqp"``, ``"torch"`` or ``"qpsolvers:NAME"``. What its answer's certificate
-            rejects is solved again by the others.
+        solver: ``"proxqp"``, ``"daqp"``, ``"torch"`` or ``"qpsolvers:NAME"``. What its answer's
+            certificate rejects is solved again by the others.
         on_failure: what an unsolved element does. ``"raise"`` a `SolverError`; ``"warn"`` and
             ``"mask"`` give it ``value = inf`` and no gradient, with and without a warning.
         warm_start: a solution of nearly the same QPs with the same shapes; saves time only.

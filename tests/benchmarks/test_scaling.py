@@ -73,7 +73,7 @@ def test_value(
         "wrong": int((error > WRONG).sum()),
         "solved": CHECKED,
     }
-    assert name not in BACKENDS or benchmark.extra_info["wrong"] == 0
+    assert name not in BACKENDS or error.max() < 1e-5
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
