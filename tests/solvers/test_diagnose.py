@@ -161,3 +161,12 @@ def test_little_curvature_is_not_called_unbounded():
     programs, _ = FlatPrograms.of(*qp.tensors(), torch.zeros(0).double())
     qps, _ = condense(programs.H, programs.C, programs.G, 0).soft_qps(programs)
     assert diagnose(qps).tolist() == [Status.NOT_CONVERGED]
+
+
+@pytest.mark.parametrize("far", [1.0, 1e2, 1e4])
+def test_hard_rows_that_hold_only_far_away_are_not_called_infeasible(far):
+    rows = [[1, 0], [0, 1]]
+    qp = program(rows, [0, 0], rows, [far, far], [2 * far, 2 * far], [INF, INF])
+    programs, _ = FlatPrograms.of(*qp.tensors(), torch.zeros(0).double())
+    qps, _ = condense(programs.H, programs.C, programs.G, 0).soft_qps(programs)
+    assert diagnose(qps).tolist() == [Status.NOT_CONVERGED]

@@ -222,7 +222,7 @@ def _recover(p: FlatPrograms, condensed: Condensed, answer: Answer, rows: Tensor
 
 
 def _reasons(part: FlatPrograms, condensed: Condensed) -> Tensor:
-    """What is the matter with QPs that no solver solved: their status, ``(B,)``."""
+    """What is the matter with QPs that a solver did not solve: their status, ``(B,)``."""
     particular = condensed.particular(part)
     inconsistent = (part.multiply(part.C, particular) - part.b).abs() > TOLERANCE * (
         1 + part.b.abs() + particular.abs().amax(-1, keepdim=True)
