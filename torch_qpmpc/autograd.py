@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_qpmpc.batching import align, outer, sum_to
+from torch_qpmpc.batching import align, flatten, outer, sum_to
 from torch_qpmpc.condense import FlatPrograms
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.qp import QPSolution, QuadraticProgram, Status
@@ -186,7 +186,7 @@ def solve_op(
     programs, batch = FlatPrograms.of(H, q, c, C, b, G, lb, ub, w, fixed)
     start = None
     if start_z is not None and start_lam is not None:
-        start = (_flatten(start_z, batch), _flatten(start_lam, batch))
+        start = (flatten(start_z, batch), flatten(start_lam, batch))
     raw = solve_programs(programs, keep, solver, start)
     if on_failure != "mask":
         _report(raw, batch, on_failure)
@@ -206,11 +206,6 @@ def solve_op(
         out(raw.residual),
         out(raw.iterations),
     )
-
-
-def _flatten(tensor: Tensor, batch: torch.Size) -> Tensor:
-    n = tensor.shape[-1]
-    return tensor.detach().to("cpu", torch.float64).expand(*batch, n).reshape(-1, n)
 
 
 def _report(raw: RawSolution, batch: torch.Size, on_failure: str) -> None:

@@ -1,11 +1,19 @@
-"""Batch dimensions: aligning them under vmap, and undoing their broadcasting in gradients."""
+"""Batch dimensions: flattened for the solvers, aligned under vmap, summed in gradients."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
+
+
+def flatten(vectors: Tensor, batch: torch.Size) -> Tensor:
+    """``(*batch, n)``, or what broadcasts to it, as ``(B, n)``: detached, on the CPU, float64."""
+    n = vectors.shape[-1]
+    wide = vectors.detach().to("cpu", torch.float64).expand(*batch, n)
+    return wide.reshape(batch.numel(), n)
 
 
 def align(in_dims: tuple, args: tuple, event_ndims: Sequence[int]) -> list[Any]:

@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_qpmpc.batching import flatten
+
 #: A pivot below this fraction of its row's norm means that the rows of C depend on each other.
 RANK_TOLERANCE = 1e-10
 #: A coefficient below this fraction of its row's absolute sum is rounding.
@@ -64,7 +66,7 @@ class FlatPrograms:
         ]
         group = torch.arange(count).reshape(of_matrices).expand(batch).reshape(-1)
         q, c, b, lb, ub, w = (_flat(v, batch) for v in vectors[:-1])
-        fixed = vectors[-1].expand(*batch, -1).reshape(batch.numel(), vectors[-1].shape[-1])
+        fixed = flatten(vectors[-1], batch)
         H, C, G = flat_matrices
         return cls(H, C, G, group, q, c.squeeze(-1), b, lb, ub, w, fixed), batch
 
@@ -196,7 +198,7 @@ def _flat(vectors: Tensor, batch: torch.Size) -> Tensor:
     n = vectors.shape[-1]
     if vectors.numel() == n:
         return vectors.reshape(1, n)
-    return vectors.expand(*batch, n).reshape(batch.numel(), n)
+    return flatten(vectors, batch)
 
 
 def condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:

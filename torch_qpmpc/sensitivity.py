@@ -25,7 +25,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_qpmpc.batching import align, outer, sum_to
+from torch_qpmpc.batching import align, flatten, outer, sum_to
 from torch_qpmpc.condense import FlatPrograms, condensed_for
 from torch_qpmpc.qp import Status
 
@@ -77,8 +77,7 @@ def kkt_adjoint(
     solved = (status == Status.SOLVED).cpu().expand(batch).reshape(-1, 1)
 
     def flat(tensor: Tensor) -> Tensor:
-        wide = tensor.detach().to("cpu", torch.float64).expand(*batch, tensor.shape[-1])
-        return torch.where(solved, wide.reshape(len(programs), -1), 0)
+        return torch.where(solved, flatten(tensor, batch), 0)
 
     if not solved.all():
         programs = programs.without_nan()
