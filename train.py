@@ -40,7 +40,7 @@ from torch_qpmpc.experiment import (
     table,
 )
 from torch_qpmpc.plots import summary_figure
-from torch_qpmpc.replay import make_replay
+from torch_qpmpc.replay import ACTIVE_SET, make_replay
 from torch_qpmpc.tracking import RunFolder
 
 
@@ -59,7 +59,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     }
 
     # Q-learning: V and Q from one QP, two learning rates, and the penalties on C.
-    operator = QPActorValueOperator(mpc)
+    operator = QPActorValueOperator(mpc, active_set_key=ACTIVE_SET if cfg.warm_start else None)
     loss_module = QPQLearningLoss(
         operator, delay_value=cfg.delay_value, td_error_clip=cfg.td_error_clip
     )
@@ -77,6 +77,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
         cfg.task.horizon,
         1 if si is None else cfg.constraint.si.windows,
         seed=cfg.seed,
+        active_rows=len(mpc.G) if cfg.warm_start else None,
     )
     batches = iter(collector)
     for batch in itertools.islice(batches, -(-cfg.warmup_steps // cfg.steps_per_update)):
@@ -95,7 +96,9 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 replay.extend(batch)
                 collected = time.perf_counter()
 
-                losses = loss_module(replay.sample())
+                sample = replay.sample()
+                losses = loss_module(sample)
+                replay.remember(sample)
                 terms = {"loss/value": losses["loss_value"]}
                 if si is not None:
                     terms["loss/si"] = si(mpc.C, replay.sample_tau())

@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc import QPMPC, QuadraticProgram
-from torch_qpmpc.condense import FlatPrograms
+from torch_qpmpc.condense import Reduced, condensed_for
+from torch_qpmpc.programs import FlatPrograms, SoftQPs
+from torch_qpmpc.solvers import Answer
 
 #: What a row does at the solution: strictly inside, at a bound, or beyond one (then it is soft).
 SOFT_ROWS = ("inside", "at_lower", "at_upper", "below", "above", "equality", "no_upper", "free")
@@ -128,6 +130,20 @@ def known_qp(
 def programs_of(known: KnownQP) -> FlatPrograms:
     """The known QP as the solvers get it."""
     return FlatPrograms.of(*known.qp.tensors(), known.fixed)[0]
+
+
+def soft_qps(known: KnownQP) -> tuple[SoftQPs, Answer]:
+    """What a backend is asked, and the exact answer to it."""
+    reduced, programs = reduced_of(known), programs_of(known)
+    v = times(torch.linalg.pinv(reduced.T_v), known.z - reduced.particular(programs))
+    lam = known.lam.reshape(len(programs), -1)[:, reduced.rows]
+    return reduced.soft_qps(programs), Answer(v, lam, torch.zeros_like(programs.group))
+
+
+def reduced_of(known: KnownQP) -> Reduced:
+    """The known QP condensed, with no more entries kept than are fixed."""
+    programs = programs_of(known)
+    return condensed_for(programs, known.fixed.shape[-1]).reduced(programs)
 
 
 def solution_of(known: KnownQP) -> dict[str, Tensor]:

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, programs_of, times
 from torch_qpmpc.certificate import TOLERANCE, Certificate, certify
-from torch_qpmpc.condense import FlatPrograms
+from torch_qpmpc.programs import FlatPrograms
 
 BATCH, SPOILT = 5, 2
 N_Z, N_C, N_F = 12, 3, 2

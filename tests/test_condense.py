@@ -10,23 +10,25 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.testing import assert_close
 
-from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
+from tests.problems import known_qp, normal, programs_of, random_mpc, random_states, reduced_of
 from torch_qpmpc import Status, solve_qp
+from torch_qpmpc import condense as condense_module
 from torch_qpmpc.banded import banded_matrix
-from torch_qpmpc.condense import MEMO_SIZE, FlatPrograms, condense
+from torch_qpmpc.condense import condense
+from torch_qpmpc.programs import ContentMemo, FlatPrograms
 
 
 @pytest.fixture
 def eliminations(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
     """The matrices that were factorised since the test began."""
     factorised = []
-    lu = torch.linalg.lu
+    eliminate = condense_module._eliminate
 
-    def counting(A: Tensor, *args, **kwargs):
-        factorised.append(A)
-        return lu(A, *args, **kwargs)
+    def counting(C: Tensor, keep: int):
+        factorised.append(C)
+        return eliminate(C, keep)
 
-    monkeypatch.setattr(torch.linalg, "lu", counting)
+    monkeypatch.setattr(condense_module, "_eliminate", counting)
     return factorised
 
 
@@ -99,7 +101,7 @@ def test_elimination_spans_the_solutions_of_the_equalities(name):
     assert_close(C @ condensed.T[:, :, keep:], torch.zeros(1, C.shape[1], n_free).double())
     # A right-hand side that the entries after `keep` can meet is met.
     b = C[:, :, keep:] @ normal(1, 5, 1, seed=4)
-    assert_close(C @ condensed.Y @ b, b)
+    assert_close(-C @ condensed.Y_neg @ b, b)
     assert_close(condensed.H, condensed.T.mT @ (H + H.mT) @ condensed.T)
     assert_close(condensed.G, G @ condensed.T)
 
@@ -133,12 +135,13 @@ def test_elimination_of_an_mpc_scheme_is_its_prediction_form():
 
 
 @pytest.mark.parametrize("name", [*REGULAR, *DEFICIENT])
-def test_free_part_inverts_expand(name):
+def test_expanded_variables_satisfy_the_equalities(name):
     C = (REGULAR | DEFICIENT)[name]
-    programs = programs_of(known_qp(3, n_z=8, n_f=3, C=C, batch=(5,), hard=()))
-    condensed = condense(programs.H, programs.C, programs.G, 3)
-    v = normal(5, condensed.T.shape[-1] - 3)
-    assert_close(condensed.free_part(programs, condensed.expand(programs, v)), v)
+    known = known_qp(3, n_z=8, n_f=3, C=C, batch=(5,), hard=())
+    programs, reduced = programs_of(known), reduced_of(known)
+    z = reduced.expand(programs, normal(5, reduced.T_v.shape[-1]))
+    assert_close(z @ C.mT, known.qp.b)
+    assert_close(z[:, :3], known.fixed)
 
 
 @pytest.mark.parametrize("name", [*REGULAR, *DEFICIENT])
@@ -204,14 +207,14 @@ def test_matrices_changed_in_place_are_eliminated_again(changed):
 
 def test_only_the_latest_eliminations_are_remembered(eliminations):
     H, G = torch.eye(8).double().unsqueeze(0), normal(1, 2, 8)
-    C = [normal(1, 3, 8, seed=20 + i) for i in range(MEMO_SIZE + 1)]
+    C = [normal(1, 3, 8, seed=20 + i) for i in range(ContentMemo.SIZE + 1)]
     for matrix in C:
         condense(H, matrix, G, 2)
-    assert len(eliminations) == MEMO_SIZE + 1
+    assert len(eliminations) == ContentMemo.SIZE + 1
     condense(H, C[-1], G, 2)
-    assert len(eliminations) == MEMO_SIZE + 1
+    assert len(eliminations) == ContentMemo.SIZE + 1
     condense(H, C[0], G, 2)
-    assert len(eliminations) == MEMO_SIZE + 2
+    assert len(eliminations) == ContentMemo.SIZE + 2
 
 
 def test_threads_do_not_share_what_they_remember(eliminations):

@@ -82,6 +82,7 @@ NAME = [3, True, None]
 BAD: dict[str, list[Any]] = {
     "seed": [*WHOLE[1:], 2**63],
     "solver": NAME,
+    "warm_start": FLAG,
     "exploration_std": REAL,
     "td_error_clip": [0, *REAL[:-1]],
     "delay_value": FLAG,

@@ -20,20 +20,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_qpmpc.batching import align, flatten, outer, sum_to
-from torch_qpmpc.condense import FlatPrograms
+from torch_qpmpc.batching import align, broadcast, outer, sum_to, weighted_sum
 from torch_qpmpc.errors import QPError, SolverError
-from torch_qpmpc.qp import QPSolution, QuadraticProgram, Status
+from torch_qpmpc.programs import FlatPrograms
+from torch_qpmpc.qp import QPSolution, QuadraticProgram, Status, slacks
 from torch_qpmpc.sensitivity import SolutionGradient
 from torch_qpmpc.solvers import backend
 from torch_qpmpc.solvers.chain import RawSolution, solve_programs
 
 ON_FAILURE = ("raise", "warn", "mask")
-#: Event dimensions of the operator's tensors: H, q, c, C, b, G, lb, ub, w, fixed, a warm start's.
-EVENT_NDIMS = (2, 1, 0, 2, 1, 2, 1, 1, 1, 1, 1, 1)
+#: Event dimensions of the operator's tensors: H, q, c, C, b, G, lb, ub, w, fixed, a warm start.
+EVENT_NDIMS = (2, 1, 0, 2, 1, 2, 1, 1, 1, 1, 1)
 N_THETA = 10
-#: Position of ``keep`` among the operator's arguments.
-KEEP = 12
+#: Position of ``keep`` among the operator's arguments, and how many follow theirs.
+KEEP = 11
+N_OTHERS = 4
 #: value, z, sigma, chi, lam, xi, status, residual, iterations
 Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -44,7 +45,7 @@ def solve_qp(
     *,
     solver: str = "proxqp",
     on_failure: str = "raise",
-    warm_start: QPSolution | None = None,
+    warm_start: QPSolution | Tensor | None = None,
     keep: int | None = None,
 ) -> QPSolution:
     """Solve a batch of QPs (eq:qp2, eq:qp3); every answer is certified.
@@ -56,7 +57,8 @@ def solve_qp(
             certificate rejects is solved again by the others.
         on_failure: what an unsolved element does. ``"raise"`` a `SolverError`; ``"warn"`` and
             ``"mask"`` give it ``value = inf`` and no gradient, with and without a warning.
-        warm_start: a solution of nearly the same QPs with the same shapes; saves time only.
+        warm_start: a solution of nearly the same QPs, or its ``active`` ``(*batch, n_g)``: tried
+            before the solver is, for the whole batch at once. Saves time only.
         keep: leading entries of z that condensing leaves alone, at least n_f. A V and a Q that
             keep the same entries share one elimination of C z = b.
 
@@ -79,24 +81,12 @@ def solve_qp(
     theta = _operands(qp, fixed)
     start = _checked_start(qp, fixed, warm_start)
     keep = _checked_keep(qp, fixed, keep)
-    raw = QPValue.apply(*theta, *start, keep, solver, on_failure)
-    value, z, _, chi, lam, xi, status, residual, iterations = raw
-    z, lam, chi, xi = SolutionGradient.apply(z, lam, chi, xi, status, *theta, keep)
-    upsilon, eta = (-lam).clamp(min=0), lam.clamp(min=0)
-    solved = status.eq(int(Status.SOLVED)).unsqueeze(-1)
-    return QPSolution(
-        value=value,
-        z=z,
-        sigma=torch.where(solved, slacks(z, qp.G, qp.lb, qp.ub, qp.w), 0),
-        chi=chi,
-        upsilon=upsilon,
-        eta=eta,
-        mu=torch.where(solved, qp.w - upsilon - eta, 0),
-        xi=xi,
-        status=status,
-        residual=residual,
-        iterations=iterations,
+    value, z, _, chi, lam, xi, status, residual, iterations = _solve(
+        *theta, start, keep, solver, on_failure
     )
+    if torch.is_grad_enabled():
+        z, lam, chi, xi = SolutionGradient.apply(z, lam, chi, xi, status, *theta, keep)
+    return QPSolution(qp, value, z, chi, lam, xi, status, residual, iterations)
 
 
 def optimal_value(
@@ -104,13 +94,12 @@ def optimal_value(
 ) -> Tensor:
     """The optimal cost alone, ``(*batch,)``: `solve_qp` without the rest of the solution."""
     keep = _checked_keep(qp, fixed, keep)
-    return QPValue.apply(*_operands(qp, fixed), None, None, keep, solver, on_failure)[0]
+    return _solve(*_operands(qp, fixed), None, keep, solver, on_failure)[0]
 
 
-def slacks(z: Tensor, G: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
-    """sigma of z: how far soft rows are outside their bounds, ``(*batch, n_g)``."""
-    y = (z.unsqueeze(-2) @ G.mT).squeeze(-2)
-    return torch.where(w.isinf(), 0, torch.maximum(lb - y, y - ub).clamp(min=0))
+def _solve(*arguments: Any) -> Outputs:
+    # The Function's bookkeeping takes as long as solving some ten QPs.
+    return QPValue.apply(*arguments) if torch.is_grad_enabled() else solve_op(*arguments)
 
 
 def _operands(qp: QuadraticProgram, fixed: Tensor) -> tuple[Tensor, ...]:
@@ -124,7 +113,7 @@ def _operands(qp: QuadraticProgram, fixed: Tensor) -> tuple[Tensor, ...]:
             f"shape (*batch, n_f) with n_f <= n_z = {qp.n_z}",
         )
     try:
-        torch.broadcast_shapes(qp.batch_shape, fixed.shape[:-1])
+        broadcast(qp.batch_shape, fixed.shape[:-1])
     except RuntimeError as error:
         raise QPError.expected(
             "fixed",
@@ -135,21 +124,21 @@ def _operands(qp: QuadraticProgram, fixed: Tensor) -> tuple[Tensor, ...]:
 
 
 def _checked_start(
-    qp: QuadraticProgram, fixed: Tensor, warm_start: QPSolution | None
-) -> tuple[Tensor | None, Tensor | None]:
+    qp: QuadraticProgram, fixed: Tensor, warm_start: QPSolution | Tensor | None
+) -> Tensor | None:
     if warm_start is None:
-        return None, None
-    batch = torch.broadcast_shapes(qp.batch_shape, fixed.shape[:-1])
-    got = tuple(warm_start.z.shape), tuple(warm_start.eta.shape)
-    want = (*batch, qp.n_z), (*batch, qp.lb.shape[-1])
-    if got != want:
+        return None
+    active = warm_start if isinstance(warm_start, Tensor) else warm_start.active
+    batch = broadcast(qp.batch_shape, fixed.shape[:-1])
+    want = (*batch, qp.lb.shape[-1])
+    if tuple(active.shape) != want or active.dtype != torch.int8:
         raise QPError.expected(
             "warm_start",
-            f"z and eta of shapes {got[0]} and {got[1]}",
-            f"{want[0]} and {want[1]}",
-            "Pass a solution of the same batch of QPs.",
+            f"shape {tuple(active.shape)} of {active.dtype}",
+            f"{want} of torch.int8",
+            "Pass the solution of the same batch of QPs, or its `active`.",
         )
-    return warm_start.z, warm_start.eta - warm_start.upsilon
+    return active
 
 
 def _checked_keep(qp: QuadraticProgram, fixed: Tensor, keep: int | None) -> int:
@@ -173,26 +162,28 @@ def solve_op(
     ub: Tensor,
     w: Tensor,
     fixed: Tensor,
-    start_z: Tensor | None,
-    start_lam: Tensor | None,
+    start: Tensor | None,
     keep: int,
     solver: str,
     on_failure: str,
 ) -> Outputs:
-    """Solve on the CPU in float64, whatever comes in; failures are dealt with here."""
+    """Solve in float64, whatever comes in, on the CPU, or for "torch" on CUDA where q is.
+
+    Failures are dealt with here.
+    """
     backend(solver)
     if on_failure not in ON_FAILURE:
         raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
-    programs, batch = FlatPrograms.of(H, q, c, C, b, G, lb, ub, w, fixed)
-    start = None
-    if start_z is not None and start_lam is not None:
-        start = (flatten(start_z, batch), flatten(start_lam, batch))
+    device = q.device if solver == "torch" and q.is_cuda else torch.device("cpu")
+    programs, batch = FlatPrograms.of(H, q, c, C, b, G, lb, ub, w, fixed, device=device)
+    if start is not None:
+        start = start.to(device).expand(*batch, -1).reshape(len(programs), -1)
     raw = solve_programs(programs, keep, solver, start)
     if on_failure != "mask":
         _report(raw, batch, on_failure)
 
     def out(tensor: Tensor) -> Tensor:
-        shaped = tensor.reshape((*batch, *tensor.shape[1:]))
+        shaped = tensor if len(batch) == 1 else tensor.reshape((*batch, *tensor.shape[1:]))
         return shaped.to(q.device, q.dtype if tensor.is_floating_point() else tensor.dtype)
 
     return (
@@ -230,11 +221,9 @@ def _report(raw: RawSolution, batch: torch.Size, on_failure: str) -> None:
 
 
 @solve_op.register_fake
-def _(H, q, c, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure):
+def _(H, q, c, C, b, G, lb, ub, w, fixed, start, keep, solver, on_failure):
     operands = (H, q, c, C, b, G, lb, ub, w, fixed)
-    batch = torch.broadcast_shapes(
-        *(t.shape[: t.ndim - n] for t, n in zip(operands, EVENT_NDIMS, strict=False))
-    )
+    batch = broadcast(*(t.shape[: t.ndim - n] for t, n in zip(operands, EVENT_NDIMS, strict=False)))
 
     def count() -> Tensor:
         return q.new_empty(batch, dtype=torch.int64)
@@ -258,30 +247,31 @@ def _setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
 
 def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
     if grad_value is None:
-        return (None,) * (N_THETA + 5)
+        return (None,) * (N_THETA + N_OTHERS)
     *theta, z, sigma, chi, lam, xi, status = ctx.saved_tensors
     if torch.is_grad_enabled() and not torch.compiler.is_compiling():
         # For second derivatives the solution must depend on the data here.
         z, lam, chi, xi = SolutionGradient.apply(z, lam, chi, xi, status, *theta, ctx.keep)
         sigma = slacks(z, *theta[5:9])
     # An unsolved element has zeros here, but zero times an infinite incoming gradient is NaN.
-    weight = torch.where(status.eq(int(Status.SOLVED)), grad_value, 0).unsqueeze(-1)
+    weight = torch.where(status.eq(int(Status.SOLVED)), grad_value, 0)
+    weighted_z = weight.unsqueeze(-1) * z
     gradients = {
-        0: lambda like: outer(0.5 * weight * z, z, like),
-        1: lambda like: sum_to(weight * z, like),
-        2: lambda like: sum_to(weight.squeeze(-1), like),
-        3: lambda like: outer(weight * chi, z, like),
-        4: lambda like: sum_to(-weight * chi, like),
-        5: lambda like: outer(weight * lam, z, like),
-        6: lambda like: sum_to(weight * (-lam).clamp(min=0), like),
-        7: lambda like: sum_to(-weight * lam.clamp(min=0), like),
-        8: lambda like: sum_to(weight * sigma, like),
-        9: lambda like: sum_to(-weight * xi, like),
+        0: lambda like: 0.5 * outer(weighted_z, z, like),
+        1: lambda like: weighted_sum(weight, z, like),
+        2: lambda like: sum_to(weight, like),
+        3: lambda like: outer(chi, weighted_z, like),
+        4: lambda like: weighted_sum(-weight, chi, like),
+        5: lambda like: outer(lam, weighted_z, like),
+        6: lambda like: weighted_sum(weight, (-lam).clamp(min=0), like),
+        7: lambda like: weighted_sum(-weight, lam.clamp(min=0), like),
+        8: lambda like: weighted_sum(weight, sigma, like),
+        9: lambda like: weighted_sum(-weight, xi, like),
     }
     needed = ctx.needs_input_grad
     return (
         *(gradients[i](theta[i]) if needed[i] else None for i in range(N_THETA)),
-        *(None,) * 5,
+        *(None,) * N_OTHERS,
     )
 
 
@@ -293,12 +283,8 @@ class QPValue(torch.autograd.Function):
 
     # Dynamo counts the parameters to tell this style of Function: no *args here.
     @staticmethod
-    def forward(
-        H, q, c, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure
-    ) -> Outputs:
-        return solve_op(
-            H, q, c, C, b, G, lb, ub, w, fixed, start_z, start_lam, keep, solver, on_failure
-        )
+    def forward(H, q, c, C, b, G, lb, ub, w, fixed, start, keep, solver, on_failure) -> Outputs:
+        return solve_op(H, q, c, C, b, G, lb, ub, w, fixed, start, keep, solver, on_failure)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:

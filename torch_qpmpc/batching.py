@@ -1,4 +1,4 @@
-"""Batch dimensions: flattened for the solvers, aligned under vmap, summed in gradients."""
+"""Batch dimensions: flattened, reduced, aligned under vmap, summed in gradients."""
 
 from __future__ import annotations
 
@@ -9,10 +9,20 @@ import torch
 from torch import Tensor
 
 
-def flatten(vectors: Tensor, batch: torch.Size) -> Tensor:
-    """``(*batch, n)``, or what broadcasts to it, as ``(B, n)``: detached, on the CPU, float64."""
+def broadcast(*shapes: Sequence[int]) -> torch.Size:
+    """`torch.broadcast_shapes`, at once where there is nothing to broadcast."""
+    common: Sequence[int] = ()
+    for shape in shapes:
+        if len(shape) and len(common) and tuple(shape) != tuple(common):
+            return torch.broadcast_shapes(*shapes)
+        common = shape if len(shape) else common
+    return torch.Size(common)
+
+
+def flatten(vectors: Tensor, batch: torch.Size, device: torch.device | str = "cpu") -> Tensor:
+    """``(*batch, n)``, or what broadcasts to it, as ``(B, n)``: detached, float64."""
     n = vectors.shape[-1]
-    wide = vectors.detach().to("cpu", torch.float64).expand(*batch, n)
+    wide = vectors.detach().to(device, torch.float64).expand(*batch, n)
     return wide.reshape(batch.numel(), n)
 
 
@@ -44,8 +54,20 @@ def sum_to(tensor: Tensor, like: Tensor) -> Tensor:
     return tensor.sum_to_size(like.shape)
 
 
+def weighted_sum(weight: Tensor, vectors: Tensor, like: Tensor) -> Tensor:
+    """``weight`` ``(*batch,)`` times ``(*batch, n)``, summed over the dimensions ``like`` lacks."""
+    if like.ndim == 1:
+        return weight.reshape(-1) @ vectors.reshape(-1, vectors.shape[-1])
+    return sum_to(weight.unsqueeze(-1) * vectors, like)
+
+
 def outer(left: Tensor, right: Tensor, like: Tensor) -> Tensor:
     """The outer products ``left right'`` summed over the batch dimensions that ``like`` lacks."""
     if like.ndim == 2:
         return left.reshape(-1, left.shape[-1]).mT @ right.reshape(-1, right.shape[-1])
     return sum_to(left.unsqueeze(-1) * right.unsqueeze(-2), like)
+
+
+def largest(x: Tensor) -> Tensor:
+    """Largest absolute entry along the last dimension; zero where that is empty."""
+    return x.abs().amax(-1) if x.shape[-1] else x.new_zeros(x.shape[:-1])

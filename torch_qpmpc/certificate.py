@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_qpmpc.condense import FlatPrograms
+from torch_qpmpc.batching import largest
+from torch_qpmpc.programs import FlatPrograms
 
 #: A claimed solution with a larger relative residual is not a solution.
 TOLERANCE = 1e-6
@@ -31,16 +32,60 @@ class Certificate:
 
 @dataclass
 class Products:
-    """H z ``(B, n_z)``, G z ``(B, n_g)`` and G'lam ``(B, n_z)`` of a claimed solution."""
+    """The terms of a claim's KKT conditions.
+
+    H z, G'lam, C'chi and ``slope``, their sum with q, ``(B, n_z)``; y = G z and ``beyond``, how far
+    it is above ub (or below lb, negative), ``(B, n_g)``.
+    """
 
     Hz: Tensor
-    Gz: Tensor
     G_lam: Tensor
+    C_chi: Tensor
+    slope: Tensor
+    y: Tensor
+    beyond: Tensor
 
     @classmethod
-    def of(cls, programs: FlatPrograms, z: Tensor, lam: Tensor) -> Products:
+    def of(cls, programs: FlatPrograms, z: Tensor, lam: Tensor, chi: Tensor) -> Products:
         p = programs
-        return cls(p.multiply(p.H, z), p.multiply(p.G, z), p.multiply(p.G.mT, lam))
+        Hz, G_lam, C_chi = p.times_H(z), p.times_G(lam, transposed=True), p.multiply(p.C.mT, chi)
+        y = p.times_G(z)
+        return cls(Hz, G_lam, C_chi, Hz + p.q + G_lam + C_chi, y, y - y.clamp(p.lb, p.ub))
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """What the certificate needs to know of the rows and of the sizes of q and b.
+
+    All but the sizes ``(B or 1, n_g)``: ``weight`` is w with zeros on hard rows, ``soft`` one on
+    soft rows, ``shrink`` 1 / (1 + w); lb and ub have zeros for absent bounds, which ``no_lb`` and
+    ``no_ub`` mark, or None if none is absent.
+    """
+
+    weight: Tensor
+    soft: Tensor
+    shrink: Tensor
+    lb: Tensor
+    ub: Tensor
+    no_lb: Tensor | None
+    no_ub: Tensor | None
+    q_size: Tensor
+    b_size: Tensor
+
+    @classmethod
+    def of(cls, p: FlatPrograms) -> _Rows:
+        hard, no_lb, no_ub = p.w.isinf(), p.lb.isinf(), p.ub.isinf()
+        return cls(
+            p.w.masked_fill(hard, 0),
+            (~hard).to(p.w),
+            1 / (1 + p.w),
+            p.lb.masked_fill(no_lb, 0),
+            p.ub.masked_fill(no_ub, 0),
+            no_lb if no_lb.any() else None,
+            no_ub if no_ub.any() else None,
+            1 + largest(p.q),
+            1 + largest(p.b),
+        )
 
 
 def certify(
@@ -59,35 +104,38 @@ def certify(
     them again.
     """
     p, n_f = programs, programs.fixed.shape[-1]
-    given = Products.of(p, z, lam) if products is None else products
-    Hz, y, pull, push = given.Hz, given.Gz, given.G_lam, p.multiply(p.C.mT, chi)
-    stationarity = Hz + p.q + pull + push
+    terms = Products.of(p, z, lam, chi) if products is None else products
+    rows: _Rows = p.known("rows", lambda: _Rows.of(p))
+    stationarity = terms.slope.clone()
     stationarity[:, :n_f] += xi
-    scale = 1 + _largest(torch.cat((Hz, pull, push), dim=-1)).maximum(_largest(p.q))
+    scale = largest(torch.cat((terms.Hz, terms.G_lam, terms.C_chi), dim=-1))
 
-    hard, size = p.w.isinf(), lam.abs()
-    weight = p.w.masked_fill(hard, 0)
-    outside = (y - y.maximum(p.lb).minimum(p.ub)).abs()
-    sigma = outside.masked_fill(hard, 0)
-    # h*(lam): the bound that lam pushes from; one that is absent can have no multiplier.
-    bound = torch.where(lam > 0, p.ub, p.lb)
-    absent = bound.isinf()
-    excess = torch.where(absent, size, (size - p.w).clamp(min=0) / (1 + p.w))
-    gap = weight * sigma + lam * (bound.masked_fill(absent, 0) - y)
-
-    cost = (z * (0.5 * Hz + p.q)).sum(-1) + (weight * sigma).sum(-1)
+    outside = terms.beyond.abs()
+    sigma, charge = outside * rows.soft, outside * rows.weight
+    up, down = lam.clamp(min=0), lam.clamp(max=0)
+    excess = (lam.abs() - p.w).clamp_(min=0).mul_(rows.shrink)
+    # Row by row h(y) + h*(lam) - lam y, where h* charges the bound that lam pushes from.
+    gap = (rows.ub - terms.y).mul_(up)
+    gap += (rows.lb - terms.y).mul_(down)
+    gap += charge
+    cost = torch.add(p.q, terms.Hz, alpha=0.5).mul_(z).sum(-1) + charge.sum(-1)
     parts = [
-        _largest(stationarity) / scale,
-        _largest(p.multiply(p.C, z) - p.b) / (1 + _largest(p.b) + _largest(z)),
-        _largest(z[:, :n_f] - p.fixed),
-        _largest((outside - sigma) / (1 + y.abs())),
-        _largest(excess),
-        gap.abs().sum(-1) / (1 + cost.abs()),
+        largest(stationarity) / rows.q_size.maximum(1 + scale),
+        largest(p.multiply(p.C, z) - p.b) / (rows.b_size + largest(z)),
+        largest(z[:, :n_f] - p.fixed),
+        _violation(outside - sigma, terms.y),
+        largest(excess),
+        gap.abs_().sum(-1) / (1 + cost.abs()),
     ]
+    for absent, push in ((rows.no_ub, up), (rows.no_lb, down)):
+        if absent is not None:
+            parts.append(largest(push * absent))
     residual = torch.stack(parts).amax(0)
     return Certificate(cost + p.c, sigma, residual.nan_to_num(torch.inf, torch.inf))
 
 
-def _largest(x: Tensor) -> Tensor:
-    """Largest absolute entry along the last dimension; zero where that is empty."""
-    return x.abs().amax(-1) if x.shape[-1] else x.new_zeros(x.shape[:-1])
+def _violation(outside: Tensor, y: Tensor) -> Tensor:
+    """The largest violation of a hard row, relative to its y, ``(B,)``."""
+    worst = largest(outside)
+    # Relative to one or more: what is small as it is need not be divided.
+    return worst if (worst <= TOLERANCE).all() else largest(outside / (1 + y.abs()))

@@ -25,6 +25,7 @@ from torch_qpmpc.arguments import (
 )
 from torch_qpmpc.autograd import optimal_value, solve_qp
 from torch_qpmpc.banded import banded_matrix
+from torch_qpmpc.batching import broadcast
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.parametrizations import Cholesky, SquareRoot
 from torch_qpmpc.qp import QPSolution, QuadraticProgram
@@ -200,7 +201,7 @@ class QPMPC(nn.Module):
         return self.value(s) if a is None else self.action_value(s, a)
 
     def solve(
-        self, s: Tensor, a: Tensor | None = None, warm_start: QPSolution | None = None
+        self, s: Tensor, a: Tensor | None = None, warm_start: QPSolution | Tensor | None = None
     ) -> QPSolution:
         """The whole solution of V's QP, or of Q's where an action is given, in theta's dtype."""
         fixed = check_input("s", s, self.n_x) if a is None else self._state_action(s, a)
@@ -291,7 +292,7 @@ class QPMPC(nn.Module):
     def _state_action(self, s: Tensor, a: Tensor) -> Tensor:
         s, a = check_input("s", s, self.n_x), check_input("a", a, self.n_u)
         try:
-            batch = torch.broadcast_shapes(s.shape[:-1], a.shape[:-1])
+            batch = broadcast(s.shape[:-1], a.shape[:-1])
         except RuntimeError as error:
             got = f"shape {tuple(a.shape)}"
             want = f"leading dimensions that broadcast with those of s, {tuple(s.shape[:-1])}"
@@ -328,7 +329,7 @@ class QPMPC(nn.Module):
             H = torch.block_diag(*self.H.expand(self.horizon, n, n), self.H_f)
         else:
             stages = self.H.expand(self.horizon, self.n_x + self.n_u).flatten()
-            H = torch.diag_embed(torch.cat((stages, self.H_f)))
+            return torch.diag_embed(self.discount * torch.cat((stages, self.H_f)))
         root = self.discount.sqrt()
         return root.unsqueeze(-1) * H * root
 

@@ -199,11 +199,18 @@ class QPQLearningLoss(LossModule):
         return out
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """`forward` with the loss apart; writes the squared TD error under the priority key."""
+        """`forward` with the loss apart; writes the squared TD error under the priority key.
+
+        If the value network has an ``active_set_key``, the active sets of Q(s, a) and, under
+        ``"next"``, of V(s+) are read from there where they are, and written.
+        """
         weights = self._maybe_get_priority_weight(tensordict)
-        visited = tensordict.select(*self.value_network.in_keys, strict=False).detach()
+        active_set = self.value_network.active_set_key
+        visited = tensordict.select(*_read_by(self.value_network), strict=False).detach()
         with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
             self.value_network(visited)
+        if active_set is not None:
+            tensordict.set(active_set, visited.get(active_set))
         prediction = visited[self.tensor_keys.state_action_value].squeeze(-1)
         with torch.no_grad():
             target = self.value_estimator.value_estimate(
@@ -236,11 +243,19 @@ class QPQLearningLoss(LossModule):
 
     def _next_value(self, tensordict: TensorDictBase) -> Tensor:
         """-V(s+), ``(*batch, 1)``; zero after a termination, where it is not used."""
-        following = tensordict.get("next").select(*self.state_value_network.in_keys)
+        active_set = self.state_value_network.active_set_key
+        following = tensordict.get("next").select(*_read_by(self.state_value_network), strict=False)
         with self.target_value_network_params.to_module(
             self.state_value_network, preserve_module_state=False
         ):
             self.state_value_network(following)
+        if active_set is not None:
+            tensordict.set(unravel_key(("next", active_set)), following.get(active_set))
         done = tensordict.get(("next", self.tensor_keys.done))
         terminated = tensordict.get(("next", self.tensor_keys.terminated), default=done)
         return following[self.tensor_keys.value].masked_fill(terminated, 0.0)
+
+
+def _read_by(network: QPActorValueOperator | QPValueOperator) -> list[NestedKey]:
+    start = [] if network.active_set_key is None else [network.active_set_key]
+    return [*network.in_keys, *start]

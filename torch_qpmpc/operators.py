@@ -21,11 +21,31 @@ class _QPOperator(TensorDictModuleBase):
 
     module: QPMPC
 
-    def __init__(self, mpc: QPMPC, in_keys: Sequence[NestedKey], out_key: NestedKey) -> None:
+    def __init__(
+        self,
+        mpc: QPMPC,
+        in_keys: Sequence[NestedKey],
+        out_key: NestedKey,
+        active_set_key: NestedKey | None = None,
+    ) -> None:
         super().__init__()
         self.module = mpc
+        self.active_set_key = active_set_key
+        out_keys = [out_key] if active_set_key is None else [out_key, active_set_key]
         self.in_keys = list(in_keys)  # pyright: ignore[reportAttributeAccessIssue]
-        self.out_keys = [out_key]  # pyright: ignore[reportAttributeAccessIssue]
+        self.out_keys = out_keys  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _set_value(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Minus V, or minus Q where there is an action to read, under the first out-key."""
+        inputs = [tensordict.get(key) for key in self.in_keys]
+        if self.active_set_key is None:
+            cost = self.module(*inputs)
+        else:
+            start = tensordict.get(self.active_set_key, None)
+            solution = self.module.solve(*inputs, warm_start=start)
+            tensordict.set(self.active_set_key, solution.active)
+            cost = solution.value.to(inputs[0].dtype)
+        return tensordict.set(self.out_keys[0], -cost.unsqueeze(-1))
 
 
 class QPPolicyOperator(_QPOperator):
@@ -41,8 +61,7 @@ class QPValueOperator(_QPOperator):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        value = self.module.value(tensordict.get(self.in_keys[0]))
-        return tensordict.set(self.out_keys[0], -value.unsqueeze(-1))
+        return self._set_value(tensordict)
 
 
 class QPActorValueOperator(_QPOperator):
@@ -52,6 +71,9 @@ class QPActorValueOperator(_QPOperator):
         mpc: the QPMPC.
         observation_key, action_key: what it reads.
         state_value_key, state_action_value_key: what the value and the critic write.
+        active_set_key: where the value and the critic write the QP's active set, int8
+            ``(*batch, n_g)``, and read one to start from if there is any, as from a replay buffer
+            that kept it. None, the default, starts cold.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -70,14 +92,15 @@ class QPActorValueOperator(_QPOperator):
         action_key: NestedKey = "action",
         state_value_key: NestedKey = "state_value",
         state_action_value_key: NestedKey = "state_action_value",
+        active_set_key: NestedKey | None = None,
     ) -> None:
-        super().__init__(mpc, [observation_key, action_key], state_action_value_key)
+        in_keys = [observation_key, action_key]
+        super().__init__(mpc, in_keys, state_action_value_key, active_set_key)
         self.state_value_key = state_value_key
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        s, a = (tensordict.get(key) for key in self.in_keys)
-        return tensordict.set(self.out_keys[0], -self.module.action_value(s, a).unsqueeze(-1))
+        return self._set_value(tensordict)
 
     def get_policy_operator(self) -> QPPolicyOperator:
         """The actor: observation to action."""
@@ -85,7 +108,8 @@ class QPActorValueOperator(_QPOperator):
 
     def get_value_operator(self) -> QPValueOperator:
         """The state value: observation to state_value."""
-        return QPValueOperator(self.module, self.in_keys[:1], self.state_value_key)
+        keys = self.state_value_key, self.active_set_key
+        return QPValueOperator(self.module, self.in_keys[:1], *keys)
 
     def get_critic_operator(self) -> QPActorValueOperator:
         """The critic: (observation, action) to state_action_value, this operator itself."""

@@ -14,12 +14,14 @@ have it reversed. A row with w_i = inf is hard: its sigma_i is zero.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import InitVar, dataclass, fields
 from enum import IntEnum
 
 import torch
 from torch import Tensor
 
+from torch_qpmpc.batching import broadcast
 from torch_qpmpc.errors import QPError
 
 #: Trailing (event) dimensions of each tensor of a QP, in the order of the constructor.
@@ -60,6 +62,10 @@ _EXPLANATIONS = {
     Status.INVALID_DATA: "NaN or inf in the data, lb > ub, or an H that is not positive "
     "semidefinite; look at the parameters and the state",
 }
+
+
+#: Shapes and dtypes that were found to fit lately: training asks for the same again and again.
+_accepted: deque[tuple] = deque(maxlen=16)
 
 
 @dataclass(frozen=True)
@@ -116,7 +122,11 @@ class QuadraticProgram:
     check_values: InitVar[bool] = True
 
     def __post_init__(self, check_values: bool) -> None:
-        self._check_shapes()
+        kind = tuple((getattr(x, "shape", None), getattr(x, "dtype", None)) for x in self.tensors())
+        if torch.compiler.is_compiling() or kind not in _accepted:
+            self._check_shapes()
+            if not torch.compiler.is_compiling():
+                _accepted.append(kind)
         if check_values:
             self._check_values()
 
@@ -126,7 +136,7 @@ class QuadraticProgram:
 
     @property
     def batch_shape(self) -> torch.Size:
-        return torch.broadcast_shapes(
+        return broadcast(
             *(
                 getattr(self, n).shape[: getattr(self, n).ndim - len(e)]
                 for n, e in EVENT_SHAPES.items()
@@ -220,35 +230,57 @@ class QuadraticProgram:
             )
 
 
+#: A multiplier below this fraction of the largest is zero; one as near to w is saturated.
+ACTIVE_FRACTION = 1e-8
+#: In the place of a row's state: nothing is known, as before an element is solved.
+UNKNOWN = 127
+
+
+def active_rows(lam: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Which rows are held at a bound, and which are saturated at |lam| = w, ``(*batch, n_g)``."""
+    size = lam.abs()
+    saturated = w.isfinite() & (size >= (1 - ACTIVE_FRACTION) * w)
+    largest = size.amax(-1, keepdim=True) if size.shape[-1] else size
+    return (size > ACTIVE_FRACTION * (1 + largest)) & ~saturated, saturated
+
+
+def row_states(p, lower, upper, w) -> tuple:
+    """Each row's nearest bound, whether it is active there, and lam if not; arrays or tensors.
+
+    The excess of ``p = y + lam`` over the bounds would be the multiplier; |lam| <= w caps it.
+    """
+    bound = p.clip(lower, upper)
+    excess = p - bound
+    held = excess.clip(-w, w)
+    active = (held == excess) & ((excess != 0) | (lower == upper))
+    return bound, active, held
+
+
 @dataclass(frozen=True)
 class QPSolution:
     """Primal-dual solution of a batch of QPs.
 
-    All but the last three is differentiable in the tensors of the QP and in the fixed entries.
-    An element that is not solved (``status != 0``; only with ``on_failure`` "warn" or "mask") has
-    ``value = inf``, the fixed entries in ``z``, zeros elsewhere, and no gradient.
+    All but ``active`` and the last three is differentiable in the tensors of the QP and in the
+    fixed entries. An element that is not solved (``status != 0``; only with ``on_failure`` "warn"
+    or "mask") has ``value = inf``, the fixed entries in ``z``, zeros elsewhere, and no gradient.
 
     Attributes:
+        qp: the problems that this solves.
         value: optimal cost, ``(*batch,)``.
         z: minimiser, ``(*batch, n_z)``.
-        sigma: slacks, ``(*batch, n_g)``, zero on hard rows.
         chi: multipliers of C z = b, ``(*batch, n_c)``.
-        upsilon: multipliers of the lower bounds, ``(*batch, n_g)``, non-negative.
-        eta: multipliers of the upper bounds, ``(*batch, n_g)``, non-negative.
-        mu: multipliers of sigma >= 0, ``w - upsilon - eta``, ``(*batch, n_g)``; inf on hard rows.
+        lam: signed multipliers eta - upsilon of the rows, ``(*batch, n_g)``.
         xi: multipliers of the fixed entries, ``(*batch, n_f)``: the paper's xi, then zeta.
         status: `Status` as integers, ``(*batch,)``.
         residual: relative KKT residual found by the certificate, ``(*batch,)``.
         iterations: the solver's iterations, ``(*batch,)``.
     """
 
+    qp: QuadraticProgram
     value: Tensor
     z: Tensor
-    sigma: Tensor
     chi: Tensor
-    upsilon: Tensor
-    eta: Tensor
-    mu: Tensor
+    lam: Tensor
     xi: Tensor
     status: Tensor
     residual: Tensor
@@ -258,3 +290,46 @@ class QPSolution:
     def solved(self) -> Tensor:
         """Which elements are certified solutions, ``(*batch,)``."""
         return self.status == Status.SOLVED
+
+    @property
+    def sigma(self) -> Tensor:
+        """Slacks, ``(*batch, n_g)``, zero on hard rows."""
+        qp = self.qp
+        return self._where_solved(slacks(self.z, qp.G, qp.lb, qp.ub, qp.w))
+
+    @property
+    def upsilon(self) -> Tensor:
+        """Multipliers of the lower bounds, ``(*batch, n_g)``, non-negative."""
+        return (-self.lam).clamp(min=0)
+
+    @property
+    def eta(self) -> Tensor:
+        """Multipliers of the upper bounds, ``(*batch, n_g)``, non-negative."""
+        return self.lam.clamp(min=0)
+
+    @property
+    def mu(self) -> Tensor:
+        """Multipliers of sigma >= 0, ``w - upsilon - eta``, ``(*batch, n_g)``; inf on hard rows."""
+        return self._where_solved(self.qp.w - self.upsilon - self.eta)
+
+    @property
+    def active(self) -> Tensor:
+        """The active set as int8 ``(*batch, n_g)``, which is a warm start for a nearly equal QP.
+
+        0 is a row without multiplier, 1 one that is held at ub and -1 one at lb; 2 and -2 are rows
+        saturated there, at eta = w or upsilon = w. All rows of an unsolved element are `UNKNOWN`.
+        """
+        z, lam, qp = self.z.detach(), self.lam.detach(), self.qp
+        y = (z.unsqueeze(-2) @ qp.G.mT).squeeze(-2)
+        _, held, fixed = row_states(y + lam, qp.lb, qp.ub, qp.w)
+        active = torch.where(held, lam.sign(), 2 * fixed.sign()).detach().to(torch.int8)
+        return active.masked_fill_(~self.solved.unsqueeze(-1), UNKNOWN)
+
+    def _where_solved(self, rows: Tensor) -> Tensor:
+        return torch.where(self.solved.unsqueeze(-1), rows, 0)
+
+
+def slacks(z: Tensor, G: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
+    """sigma of z: how far soft rows are outside their bounds, ``(*batch, n_g)``."""
+    y = (z.unsqueeze(-2) @ G.mT).squeeze(-2)
+    return torch.where(w.isinf(), 0, torch.maximum(lb - y, y - ub).clamp(min=0))

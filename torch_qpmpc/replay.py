@@ -23,6 +23,11 @@ from torchrl.data import (
 )
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.qp import UNKNOWN
+
+#: Where a transition's active sets are: that of Q(s, a), and that of V(s+).
+ACTIVE_SET = "active_set"
+ACTIVE_SETS = (ACTIVE_SET, ("next", ACTIVE_SET))
 
 
 def windows_to_tau(windows: TensorDictBase) -> Tensor:
@@ -49,12 +54,14 @@ class Replay:
             uniformly. It leaves the stored done flags as they are.
         generator: see :func:`make_replay`.
         window: N.
+        active_rows: n_g, if the active sets of a transition's QPs are kept with it, else None.
     """
 
     transitions: ReplayBuffer
     windows: ReplayBuffer
     generator: torch.Generator
     window: int
+    active_rows: int | None = None
 
     def __len__(self) -> int:
         return len(self.transitions)
@@ -68,11 +75,26 @@ class Replay:
         if batch.batch_dims != 2:
             got, remedy = f"shape {tuple(batch.shape)}", "Pass the collector's batch as it comes."
             raise QPError.expected("batch", got, "(num_envs, T)", remedy)
+        if self.active_rows is not None:
+            batch = batch.copy()
+            for key in ACTIVE_SETS:
+                unknown = torch.full((*batch.shape, self.active_rows), UNKNOWN, dtype=torch.int8)
+                batch.set(key, unknown)
         self.transitions.extend(batch)
 
     def sample(self) -> TensorDictBase:
-        """``(batch_size,)`` transitions."""
-        return self.transitions.sample()
+        """``(batch_size,)`` transitions, with their ``"index"`` ``(batch_size, 2)``."""
+        sample, info = self.transitions.sample(return_info=True)
+        return sample.set("index", torch.stack(info["index"], dim=-1))
+
+    def remember(self, sample: TensorDictBase) -> None:
+        """Keep the active sets that the loss found for a sample, for the next time it is drawn."""
+        if self.active_rows is None:
+            return
+        stored = self.transitions.storage.get(slice(None))
+        index = sample.get("index").unbind(-1)
+        for key in ACTIVE_SETS:
+            stored.get(key)[index] = sample.get(key)
 
     def has_windows(self) -> bool:
         """Whether any stored trajectory has the N steps of a window."""
@@ -126,6 +148,7 @@ def make_replay(
     *,
     seed: int = 0,
     device: torch.device | str = "cpu",
+    active_rows: int | None = None,
 ) -> Replay:
     """The replay of a training run; filled by :meth:`Replay.extend`.
 
@@ -137,6 +160,8 @@ def make_replay(
         num_windows: M, windows a sample.
         seed: of the replay's own generator. All sampling uses that one, never torch's global one.
         device: of the stored data and of the generator.
+        active_rows: n_g, to keep the active sets of Q(s, a) and V(s+) with each transition, n_g
+            bytes each, under `ACTIVE_SETS`; see :meth:`Replay.remember`.
 
     Raises:
         QPError: ``capacity`` is no multiple of ``num_envs``, or has fewer than ``window`` rows.
@@ -164,4 +189,4 @@ def make_replay(
         batch_size=num_windows * window,
         generator=generator,
     )
-    return Replay(transitions, windows, generator, window)
+    return Replay(transitions, windows, generator, window, active_rows)

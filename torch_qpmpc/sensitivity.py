@@ -19,32 +19,22 @@ with a zero multiplier) the solution has a kink, and this is one of its one-side
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torch_qpmpc.batching import align, flatten, outer, sum_to
-from torch_qpmpc.condense import FlatPrograms, condensed_for
-from torch_qpmpc.qp import Status
+from torch_qpmpc.batching import align, broadcast, flatten, outer, sum_to
+from torch_qpmpc.condense import condensed_for
+from torch_qpmpc.programs import FlatPrograms
+from torch_qpmpc.qp import Status, active_rows
 
-#: A multiplier below this fraction of the largest is zero; one as near to w is saturated.
-ACTIVE_FRACTION = 1e-8
 #: Residual of the KKT system from which on it counts as singular.
 SINGULAR = 1e-8
 #: Event dimensions of the operator's tensors: four gradients; z, lam, status; the QP's data.
 _ADJOINT_NDIMS = (1, 1, 1, 1, 1, 1, 0, 2, 1, 0, 2, 1, 2, 1, 1, 1, 1)
 #: Those of `SolutionGradient`: z, lam, chi, xi, status; the QP's data.
 _SOLUTION_NDIMS = (1, 1, 1, 1, 0, 2, 1, 0, 2, 1, 2, 1, 1, 1, 1)
-
-
-def active_rows(lam: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-    """Which rows are held at a bound, and which are saturated at |lam| = w, ``(*batch, n_g)``."""
-    size = lam.abs()
-    saturated = w.isfinite() & (size >= (1 - ACTIVE_FRACTION) * w)
-    largest = size.amax(-1, keepdim=True) if size.shape[-1] else size
-    return (size > ACTIVE_FRACTION * (1 + largest)) & ~saturated, saturated
 
 
 @torch.library.custom_op("torch_qpmpc::kkt_adjoint", mutates_args=())
@@ -71,7 +61,7 @@ def kkt_adjoint(
     """p ``(*batch, n_z)``, r ``(*batch, n_c)``, t ``(*batch, n_g)``, u ``(*batch, n_f)``."""
     # Under vmap the gradients may have batch dimensions that the QP does not.
     vectors = (grad_z, grad_lam, grad_chi, grad_xi, z, lam, fixed)
-    batch = torch.broadcast_shapes(*(x.shape[:-1] for x in vectors), status.shape)
+    batch = broadcast(*(x.shape[:-1] for x in vectors), status.shape)
     fixed = fixed.expand(*batch, fixed.shape[-1])
     programs, batch = FlatPrograms.of(H, q, c, C, b, G, lb, ub, w, fixed)
     solved = (status == Status.SOLVED).cpu().expand(batch).reshape(-1, 1)
@@ -84,11 +74,11 @@ def kkt_adjoint(
     condensed = condensed_for(programs, keep)
     pull_z, pull_lam = flat(grad_z), flat(grad_lam)
     active, _ = active_rows(flat(lam), programs.w)
-    # What C p = dl/dchi and E p = dl/dxi fix; then the condensed system for the rest.
-    adjoint = replace(programs, b=flat(grad_chi), fixed=flat(grad_xi))
-    particular = condensed.particular(adjoint)
     n_f = fixed.shape[-1]
-    T = condensed.T[:, :, n_f:]
+    T_f, T = condensed.T[:, :, :n_f], condensed.T[:, :, n_f:]
+    # What C p = dl/dchi and E p = dl/dxi fix; then the condensed system for the rest.
+    particular = -programs.multiply(condensed.Y_neg, flat(grad_chi))
+    particular = particular + programs.multiply(T_f, flat(grad_xi))
     right_v = programs.multiply(T.mT, pull_z - programs.multiply(programs.H, particular))
     right_t = (pull_lam - programs.multiply(programs.G, particular)) * active
     v, t = _solve(
@@ -100,7 +90,7 @@ def kkt_adjoint(
     )
     p = particular + programs.multiply(T, v)
     left = pull_z - programs.multiply(programs.H, p) - programs.multiply(programs.G.mT, t)
-    r = programs.multiply(condensed.Y.mT, left)
+    r = -programs.multiply(condensed.Y_neg.mT, left)
     u = (left - programs.multiply(programs.C.mT, r))[:, :n_f]
     return tuple(x.reshape(*batch, x.shape[-1]).to(z) for x in (p, r, t, u))  # pyright: ignore[reportReturnType] - four of them
 

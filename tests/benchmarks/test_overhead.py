@@ -12,7 +12,7 @@ import torch
 
 from tests.benchmarks.contenders import cold, warm
 from tests.benchmarks.problems import PAPER, make_mpc, nudge, transitions
-from torch_qpmpc.condense import SoftQPs
+from torch_qpmpc.programs import SoftQPs
 from torch_qpmpc.solvers import BACKENDS, Answer
 
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
@@ -34,9 +34,9 @@ def test_share_outside_the_solver(
     """The backend's call is what hands QPs to the solver's own code, its Python loop included."""
     solve, inside, shares = BACKENDS[solver], [], []
 
-    def timed(qps: SoftQPs, guess: Answer | None) -> Answer:
+    def timed(qps: SoftQPs) -> Answer:
         began = time.perf_counter()
-        answer = solve(qps, guess)
+        answer = solve(qps)
         inside.append(time.perf_counter() - began)
         return answer
 

@@ -10,14 +10,13 @@ from tests.problems import (
     KnownQP,
     known_qp,
     normal,
-    programs_of,
     random_mpc,
     random_states,
+    soft_qps,
     solution_of,
 )
 from tests.references import by_cvxpy, by_quadprog
 from torch_qpmpc import QPError, SolveLog, solve_qp
-from torch_qpmpc.condense import condense
 from torch_qpmpc.qp import EVENT_SHAPES
 from torch_qpmpc.solvers import BACKENDS, backend, fallbacks
 
@@ -189,9 +188,9 @@ def test_a_warm_start_from_an_unsolved_element_does_no_harm(solver):
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_a_warm_start_from_the_solution_saves_iterations(name):
-    known = known_qp(13, batch=(6,))
-    cold = solve_qp(known.qp, known.fixed, solver=name)
-    warm = solve_qp(known.qp, known.fixed, solver=name, warm_start=cold)
+    mpc, s = random_mpc(13, solver=name, horizon=8), random_states(12, size=0.7)
+    cold = mpc.solve(s)
+    warm = mpc.solve(s, warm_start=cold.active)
     assert warm.iterations.sum() < 0.7 * cold.iterations.sum()
 
 
@@ -200,13 +199,12 @@ def test_a_warm_start_from_the_solution_saves_iterations(name):
 
 def test_a_backend_answers_with_one_row_per_program(solver):
     known = known_qp(14, batch=(4,))
-    programs = programs_of(known)
-    qps, _ = condense(programs.H, programs.C, programs.G, 2).soft_qps(programs)
-    found = backend(solver)(qps, None)
+    qps, _ = soft_qps(known)
+    found = backend(solver)(qps)
     assert found.v.shape == qps.g.shape
     assert found.lam.shape == qps.l.shape
     assert found.iterations.shape == (4,)
-    assert found.v.dtype == found.lam.dtype == float
+    assert found.v.dtype == found.lam.dtype == torch.float64
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -20,9 +19,10 @@ from torch_qpmpc import (
     Status,
     solve_qp,
 )
-from torch_qpmpc.condense import SoftQPs
 from torch_qpmpc.envs import PointMass
-from torch_qpmpc.solvers import BACKENDS, Answer, Backend, daqp
+from torch_qpmpc.programs import SoftQPs
+from torch_qpmpc.qp import UNKNOWN
+from torch_qpmpc.solvers import BACKENDS, OWN_WARM_STARTS, Answer, Backend, daqp
 
 BATCH = 6
 
@@ -30,15 +30,15 @@ BATCH = 6
 def doctored(change: Callable[[Answer], Answer]) -> Backend:
     """A backend that solves, and then changes its answer."""
 
-    def solve(qps: SoftQPs, start: Answer | None = None) -> Answer:
-        return change(daqp.solve(qps, start))
+    def solve(qps: SoftQPs) -> Answer:
+        return change(daqp.solve(qps))
 
     return solve
 
 
 LIES = {
     "zeros": lambda answer: replace(answer, v=0 * answer.v, lam=0 * answer.lam),
-    "NaN": lambda answer: replace(answer, v=np.nan * answer.v),
+    "NaN": lambda answer: replace(answer, v=torch.nan * answer.v),
     "v off": lambda answer: replace(answer, v=answer.v + 1.0),
     "lam off": lambda answer: replace(answer, lam=answer.lam + 1.0),
     "lam's sign": lambda answer: replace(answer, lam=-answer.lam),
@@ -93,12 +93,12 @@ def test_inaccurate_answers_are_sharpened(monkeypatch, name):
 
 
 def test_only_what_is_rejected_is_solved_again(monkeypatch):
-    wrong = np.array([False, True, False, False, True, True])
+    wrong = torch.tensor([False, True, False, False, True, True])
     asked = []
 
-    def recording(qps: SoftQPs, start: Answer | None = None) -> Answer:
+    def recording(qps: SoftQPs) -> Answer:
         asked.append(len(qps.g))
-        return daqp.solve(qps, start)
+        return daqp.solve(qps)
 
     def lie(answer: Answer) -> Answer:
         return replace(answer, v=answer.v + wrong[:, None])
@@ -113,40 +113,57 @@ def test_only_what_is_rejected_is_solved_again(monkeypatch):
     assert log.fallback == 3
 
 
-def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch):
-    started = []
+@pytest.mark.parametrize("own", [False, True])
+def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, own):
+    asked = []
 
-    def solve_and_lie_when_warm(qps: SoftQPs, start: Answer | None = None) -> Answer:
-        started.append(start is not None)
-        answer = daqp.solve(qps)
-        return answer if start is None else LIES["v off"](answer)
+    def recording(qps: SoftQPs) -> Answer:
+        asked.append(len(qps.g))
+        return daqp.solve(qps)
 
-    monkeypatch.setitem(BACKENDS, "liar", solve_and_lie_when_warm)
-    known = known_qp(2, batch=(BATCH,))
-    start = solve(known, solver="daqp")
-    with SolveLog() as log:
-        assert_right(solve(known, solver="liar", warm_start=start), known)
-    assert started == [True, False]
-    assert log.fallback == 0
-
-
-def test_a_warm_start_reaches_the_backend_in_its_own_variables(monkeypatch):
-    received = []
-
-    def recording(qps: SoftQPs, start: Answer | None = None) -> Answer:
-        received.append(start)
-        return daqp.solve(qps, start)
+    def misled(qps: SoftQPs, active: Tensor) -> Answer:
+        return LIES["v off"](daqp.solve(qps))
 
     monkeypatch.setitem(BACKENDS, "recorder", recording)
+    if own:
+        monkeypatch.setitem(OWN_WARM_STARTS, "recorder", misled)
+    known = known_qp(2, batch=(BATCH,))
+    active = solve(known, solver="daqp").active
+    if not own:
+        active = -active
+    with SolveLog() as log:
+        assert_right(solve(known, solver="recorder", warm_start=active), known)
+    assert asked == [BATCH]
+    assert (log.fallback, log.recalled) == (0, 0)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_known_active_set_spares_the_backend(monkeypatch, own):
+    asked = []
+
+    def recording(qps: SoftQPs) -> Answer:
+        asked.append(len(qps.g))
+        return daqp.solve(qps)
+
+    monkeypatch.setitem(BACKENDS, "recorder", recording)
+    if own:
+        monkeypatch.setitem(OWN_WARM_STARTS, "recorder", daqp.solve)
     known = known_qp(3, batch=(BATCH,))
-    cold = solve(known, solver="recorder")
-    solve(known, solver="recorder", warm_start=cold)
-    assert received[0] is None
-    # The free variables of a program with 12 entries, 2 fixed and 3 equalities, and its rows.
-    assert received[1].v.shape == (BATCH, 12 - 2 - 3)
-    expected = (cold.eta - cold.upsilon).numpy()
-    assert np.isin(np.abs(received[1].lam).max(), np.abs(expected))
-    assert_close(np.linalg.norm(received[1].lam), np.linalg.norm(expected))
+    active = solve(known, solver="daqp").active
+    active[2:4] = UNKNOWN
+    with SolveLog() as log:
+        assert_right(solve(known, solver="recorder", warm_start=active), known)
+    # One that starts from active sets itself gets those that are not known, too.
+    assert asked == ([] if own else [2])
+    assert (log.fallback, log.recalled) == (0, BATCH - 2)
+
+
+def test_the_active_set_of_what_is_not_solved_is_unknown():
+    known = spoil(known_qp(3, batch=(BATCH,)), 4)
+    active = solve(known, solver="daqp", on_failure="mask").active
+    assert (active[4] == UNKNOWN).all()
+    assert (active[:4].abs() <= 2).all()
+    assert solve(known_qp(3, batch=(BATCH,)), warm_start=active).solved.all()
 
 
 @pytest.fixture
@@ -206,11 +223,20 @@ def test_the_log_adds_up_all_solves_of_its_block():
 
 
 def test_the_log_reports_the_metrics_of_training():
-    log = SolveLog(solves=4, unsolved=1, fallback=2, iterations=10, residual=1e-8, seconds=0.5)
+    log = SolveLog(
+        solves=4,
+        unsolved=1,
+        fallback=2,
+        recalled=3,
+        iterations=10,
+        residual=1e-8,
+        seconds=0.5,
+    )
     assert log.metrics() == {
         "qp/solves": 4,
         "qp/unsolved": 1,
         "qp/fallback": 2,
+        "qp/recalled": 3,
         "qp/iterations": 2.5,
         "qp/residual": 1e-8,
         "time/qp": 0.5,
@@ -256,9 +282,9 @@ def test_the_log_counts_its_own_thread_only():
 def test_rows_without_a_bound_or_a_free_variable_are_left_out(monkeypatch):
     shapes = []
 
-    def recording(qps: SoftQPs, start: Answer | None = None) -> Answer:
+    def recording(qps: SoftQPs) -> Answer:
         shapes.append(qps.l.shape)
-        return daqp.solve(qps, start)
+        return daqp.solve(qps)
 
     monkeypatch.setitem(BACKENDS, "recorder", recording)
     known = known_qp(6, soft=("free", "inside", "above"), hard=("at_upper",))
@@ -286,9 +312,9 @@ def test_rows_of_fixed_entries_are_charged_in_closed_form(s, kind):
 def test_invalid_elements_reach_no_backend(monkeypatch):
     seen: list[Tensor] = []
 
-    def recording(qps: SoftQPs, start: Answer | None = None) -> Answer:
-        seen.append(torch.from_numpy(qps.g))
-        return daqp.solve(qps, start)
+    def recording(qps: SoftQPs) -> Answer:
+        seen.append(qps.g)
+        return daqp.solve(qps)
 
     monkeypatch.setitem(BACKENDS, "recorder", recording)
     known = spoil(known_qp(7, batch=(BATCH,)), 2)
@@ -300,7 +326,7 @@ def test_invalid_elements_reach_no_backend(monkeypatch):
 
 
 def test_a_batch_of_invalid_elements_reaches_no_backend(monkeypatch):
-    def refuse(qps: SoftQPs, start: Answer | None = None) -> Answer:
+    def refuse(qps: SoftQPs) -> Answer:
         raise AssertionError("asked to solve nothing")
 
     for name in list(BACKENDS):

@@ -2,14 +2,14 @@ from __future__ import annotations
 
 import time
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, programs_of, random_mpc
+from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, random_mpc, soft_qps
 from torch_qpmpc import QuadraticProgram, Status, solve_qp
-from torch_qpmpc.condense import FlatPrograms, SoftQPs, condense
+from torch_qpmpc.condense import condensed_for
+from torch_qpmpc.programs import FlatPrograms, SoftQPs
 from torch_qpmpc.solvers.diagnose import diagnose
 
 pytestmark = pytest.mark.filterwarnings("ignore:Clarabel.rs terminated with status")
@@ -116,41 +116,46 @@ def test_fixed_entries_that_break_an_equality_are_infeasible():
         assert solution.status == status
 
 
-def soft_qps(**options) -> SoftQPs:
-    known = known_qp(1, batch=(4,), **options)
-    programs = programs_of(known)
-    return condense(programs.H, programs.C, programs.G, 2).soft_qps(programs)[0]
+def only(qp: QuadraticProgram) -> SoftQPs:
+    """One QP without fixed entries, condensed."""
+    programs, _ = FlatPrograms.of(*qp.tensors(), torch.zeros(0).double())
+    return condensed_for(programs, 0).reduced(programs).soft_qps(programs)
+
+
+def doubles(entries) -> Tensor:
+    return torch.tensor(entries, dtype=torch.float64)
 
 
 @pytest.mark.parametrize("rank", [None, 3, 0])
 @pytest.mark.parametrize("weight", [1e-2, 5.0, 1e4])
 def test_solvable_programs_are_neither_infeasible_nor_unbounded(rank, weight):
-    status = diagnose(soft_qps(rank=rank, weight=weight, soft=SOFT_ROWS, hard=HARD_ROWS))
+    options = {"rank": rank, "weight": weight, "soft": SOFT_ROWS, "hard": HARD_ROWS}
+    status = diagnose(soft_qps(known_qp(1, batch=(4,), **options))[0])
     assert (status == Status.NOT_CONVERGED).all()
 
 
 def test_each_element_of_a_batch_has_its_own_diagnosis():
     qps = SoftQPs(
-        H=np.zeros((1, 2, 2)),
-        G=np.array([[[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]]),
-        group=np.zeros(3, dtype=np.int64),
-        g=np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 5.0]]),
-        l=np.array([[-1.0, -1.0, -1.0], [-1.0, 3.0, -1.0], [-1.0, -1.0, -1.0]]),
-        u=np.array([[1.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 1.0]]),
-        w=np.array([[np.inf, np.inf, 1.0]] * 3),
+        H=torch.zeros(1, 2, 2).double(),
+        G=doubles([[[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]]),
+        group=torch.zeros(3, dtype=torch.int64),
+        g=doubles([[0.0, 0.0], [0.0, 0.0], [0.0, 5.0]]),
+        l=doubles([[-1.0, -1.0, -1.0], [-1.0, 3.0, -1.0], [-1.0, -1.0, -1.0]]),
+        u=doubles([[1.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 1.0]]),
+        w=doubles([[INF, INF, 1.0]] * 3),
     )
     assert diagnose(qps).tolist() == [Status.NOT_CONVERGED, Status.INFEASIBLE, Status.UNBOUNDED]
 
 
 def test_matrices_of_its_own_for_each_element():
     qps = SoftQPs(
-        H=np.stack([np.eye(2), np.zeros((2, 2))]),
-        G=np.array([[[1.0, 1.0], [1.0, 1.0]], [[1.0, 0.0], [2.0, 0.0]]]),
-        group=np.array([1, 0, 1]),
-        g=np.array([[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]]),
-        l=np.array([[-1.0, -1.0], [-1.0, 3.0], [-1.0, -1.0]]),
-        u=np.array([[1.0, 1.0], [1.0, 4.0], [1.0, 1.0]]),
-        w=np.full((3, 2), np.inf),
+        H=torch.stack([torch.eye(2), torch.zeros(2, 2)]).double(),
+        G=doubles([[[1.0, 1.0], [1.0, 1.0]], [[1.0, 0.0], [2.0, 0.0]]]),
+        group=torch.tensor([1, 0, 1]),
+        g=doubles([[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]]),
+        l=doubles([[-1.0, -1.0], [-1.0, 3.0], [-1.0, -1.0]]),
+        u=doubles([[1.0, 1.0], [1.0, 4.0], [1.0, 1.0]]),
+        w=torch.full((3, 2), INF).double(),
     )
     assert diagnose(qps).tolist() == [Status.UNBOUNDED, Status.INFEASIBLE, Status.NOT_CONVERGED]
 
@@ -158,15 +163,11 @@ def test_matrices_of_its_own_for_each_element():
 def test_little_curvature_is_not_called_unbounded():
     far = [1e9, 1e9]
     qp = program([[1, 0], [0, 1e-4]], [0, 1], [[1, 0], [0, 1]], [-1e9, -1e9], far, [1, 1])
-    programs, _ = FlatPrograms.of(*qp.tensors(), torch.zeros(0).double())
-    qps, _ = condense(programs.H, programs.C, programs.G, 0).soft_qps(programs)
-    assert diagnose(qps).tolist() == [Status.NOT_CONVERGED]
+    assert diagnose(only(qp)).tolist() == [Status.NOT_CONVERGED]
 
 
 @pytest.mark.parametrize("far", [1.0, 1e2, 1e4])
 def test_hard_rows_that_hold_only_far_away_are_not_called_infeasible(far):
     rows = [[1, 0], [0, 1]]
     qp = program(rows, [0, 0], rows, [far, far], [2 * far, 2 * far], [INF, INF])
-    programs, _ = FlatPrograms.of(*qp.tensors(), torch.zeros(0).double())
-    qps, _ = condense(programs.H, programs.C, programs.G, 0).soft_qps(programs)
-    assert diagnose(qps).tolist() == [Status.NOT_CONVERGED]
+    assert diagnose(only(qp)).tolist() == [Status.NOT_CONVERGED]

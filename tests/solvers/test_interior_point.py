@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose
+from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, programs_of
+from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, soft_qps
 from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
-from torch_qpmpc.condense import SoftQPs, condense
+from torch_qpmpc.programs import SoftQPs
+from torch_qpmpc.qp import row_states
 from torch_qpmpc.solvers import Answer, active_set, batched, interior_point
 from torch_qpmpc.solvers.active_set import SETTLED, settle
 from torch_qpmpc.solvers.batched import BatchedQPs
-from torch_qpmpc.solvers.crossover import row_states
 
 MAX_ITERATIONS = sum(limit + interior_point.LAST_STEPS for _, limit in interior_point.TARGETS)
 COUNT = 32
@@ -107,23 +108,12 @@ def test_multipliers_of_inactive_rows_are_zero():
 # Programs with a known answer
 
 
-def soft_qps(known: KnownQP) -> tuple[SoftQPs, Answer]:
-    """What a backend is asked, and the exact answer to it."""
-    programs = programs_of(known)
-    form = condense(programs.H, programs.C, programs.G, known.fixed.shape[-1])
-    qps, rows = form.soft_qps(programs)
-    v = form.free_part(programs, known.z).numpy()
-    return qps, Answer(v, known.lam[:, rows].numpy(), np.zeros(len(v), dtype=np.int64))
+def tensors(qps: SoftQPs, device: str = "cpu") -> tuple[Tensor, ...]:
+    return tuple(getattr(qps, field.name).to(device) for field in fields(qps))
 
 
-def tensors(qps: SoftQPs, device: str = "cpu") -> tuple[torch.Tensor, ...]:
-    arrays = (getattr(qps, field.name) for field in fields(qps))
-    return tuple(torch.as_tensor(np.array(array), device=device) for array in arrays)
-
-
-def residual(qps: SoftQPs, answer: Answer) -> np.ndarray:
-    v, lam = torch.from_numpy(answer.v), torch.from_numpy(answer.lam)
-    return BatchedQPs.of(*tensors(qps)).residual(v, lam).numpy()
+def residual(qps: SoftQPs, answer: Answer) -> Tensor:
+    return BatchedQPs.of(*tensors(qps)).residual(answer.v, answer.lam)
 
 
 SINGLE_KINDS = [((kind,), ()) for kind in SOFT_ROWS] + [((), (kind,)) for kind in HARD_ROWS]
@@ -151,6 +141,10 @@ def test_rows_of_one_kind(soft, hard):
         assert_allclose(answer.lam, exact.lam, atol=1e-9)
 
 
+def as_tensors(**arrays: np.ndarray) -> SoftQPs:
+    return SoftQPs(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+
+
 def random_qps(
     seed: int, *, count: int = 16, d: int = 6, rank: int | None = None, twice: bool = True
 ) -> SoftQPs:
@@ -165,7 +159,7 @@ def random_qps(
     w = 10.0 ** random.choice([-1, 0, 2], y.shape)
     w[random.random(y.shape) < 0.3] = np.inf
     room[:, :, -d:], w[:, -d:] = 3.0, np.inf
-    return SoftQPs(
+    return as_tensors(
         H=factor @ factor.transpose(0, 2, 1) / d,
         G=G,
         group=np.zeros(count, dtype=np.int64),
@@ -191,18 +185,18 @@ def test_matrices_of_each_group_are_used():
     order = np.array([2, 0, 1, 0, 2, 2, 1, 1, 0, 0, 1, 2])
     place = np.array([order[:i].tolist().count(m) for i, m in enumerate(order)])
     vectors = {
-        name: np.array([getattr(several[m], name)[i] for m, i in zip(order, place, strict=True)])
+        name: torch.stack([getattr(several[m], name)[i] for m, i in zip(order, place, strict=True)])
         for name in ("g", "l", "u", "w")
     }
     mixed = SoftQPs(
-        H=np.concatenate([qps.H for qps in several]),
-        G=np.concatenate([qps.G for qps in several]),
-        group=order,
+        H=torch.cat([qps.H for qps in several]),
+        G=torch.cat([qps.G for qps in several]),
+        group=torch.from_numpy(order),
         **vectors,
     )
     answer = interior_point.solve(mixed)
     for m, qps in enumerate(several):
-        assert_allclose(answer.v[order == m], interior_point.solve(qps).v, atol=1e-8)
+        assert_allclose(answer.v.numpy()[order == m], interior_point.solve(qps).v, atol=1e-8)
 
 
 def test_units_change_nothing():
@@ -228,7 +222,7 @@ def test_units_change_nothing():
 @pytest.mark.parametrize("matrices", [0, 1, 3])
 def test_an_empty_batch(matrices):
     none = np.zeros((0, 4))
-    qps = SoftQPs(
+    qps = as_tensors(
         H=np.zeros((matrices, 2, 2)),
         G=np.zeros((matrices, 4, 2)),
         group=np.zeros(0, dtype=np.int64),
@@ -246,16 +240,16 @@ def test_an_empty_batch(matrices):
 def one_row(count: int = 3, **changes: Any) -> SoftQPs:
     """min 1/2 |v|^2 + (9, 9)'v with v_1 in [-1, 1], a hard row, and a soft row of zeros."""
     ones = np.ones((count, 2))
-    qps = SoftQPs(
-        H=np.eye(2)[None],
-        G=np.array([[[1.0, 0.0], [0.0, 0.0]]]),
-        group=np.zeros(count, dtype=np.int64),
-        g=9 * ones,
-        l=-ones,
-        u=ones,
-        w=np.tile([np.inf, 5.0], (count, 1)),
-    )
-    return replace(qps, **changes)
+    arrays: dict[str, np.ndarray] = {
+        "H": np.eye(2)[None],
+        "G": np.array([[[1.0, 0.0], [0.0, 0.0]]]),
+        "group": np.zeros(count, dtype=np.int64),
+        "g": 9 * ones,
+        "l": -ones,
+        "u": ones,
+        "w": np.tile([np.inf, 5.0], (count, 1)),
+    }
+    return as_tensors(**(arrays | changes))
 
 
 @pytest.mark.parametrize(
@@ -316,8 +310,8 @@ HOPELESS = {
 def test_without_a_solution_the_answer_is_finite_and_soon(case):
     qps = HOPELESS[case]
     answer = interior_point.solve(qps)
-    assert np.isfinite(answer.v).all()
-    assert np.isfinite(answer.lam).all()
+    assert answer.v.isfinite().all()
+    assert answer.lam.isfinite().all()
     assert answer.iterations.max() <= MAX_ITERATIONS
     assert residual(qps, answer).min() > 1e-3
 
@@ -328,9 +322,7 @@ def test_without_a_solution_the_answer_is_finite_and_soon(case):
 )
 def test_the_chain_says_what_is_the_matter(case, status):
     qps = HOPELESS[case]
-    H, G, g, lower, upper, w = (
-        torch.from_numpy(array[0]) for array in (qps.H, qps.G, qps.g, qps.l, qps.u, qps.w)
-    )
+    H, G, g, lower, upper, w = (part[0] for part in (qps.H, qps.G, qps.g, qps.l, qps.u, qps.w))
     C, none = torch.zeros(0, 2).double(), torch.zeros(0).double()
     qp = QuadraticProgram(H, g, torch.zeros(()).double(), C, none, G, lower, upper, w)
     solution = solve_qp(qp, solver="torch", on_failure="mask")
@@ -339,20 +331,20 @@ def test_the_chain_says_what_is_the_matter(case, status):
 
 def test_nan_in_the_data_ends_in_a_finite_answer():
     answer = interior_point.solve(one_row(g=np.full((3, 2), np.nan)))
-    assert np.isfinite(answer.v).all()
-    assert np.isfinite(answer.lam).all()
+    assert answer.v.isfinite().all()
+    assert answer.lam.isfinite().all()
 
 
 def test_hopeless_neighbours_do_no_harm():
     good = random_qps(5)
-    lower, upper, w = good.l.copy(), good.u.copy(), good.w.copy()
-    w[:, [0, 6]] = np.inf  # the same row twice, ..
+    lower, upper, w = good.l.clone(), good.u.clone(), good.w.clone()
+    w[:, [0, 6]] = torch.inf  # the same row twice, ..
     lower[:, 6], upper[:, 6] = upper[:, 0] + 1, upper[:, 0] + 2  # .. with bounds far apart
     both = replace(
         good,
-        group=np.zeros(32, dtype=np.int64),
+        group=torch.zeros(32, dtype=torch.int64),
         **{
-            name: np.stack([getattr(good, name), bad], 1).reshape(32, -1)
+            name: torch.stack([getattr(good, name), bad], 1).reshape(32, -1)
             for name, bad in (("g", good.g), ("l", lower), ("u", upper), ("w", w))
         },
     )
@@ -362,44 +354,13 @@ def test_hopeless_neighbours_do_no_harm():
     assert residual(both, answer)[1::2].min() > 1e-3
 
 
-# Warm starts
-
-
-def test_the_exact_start_takes_one_step():
-    qps = random_qps(7)
-    cold = interior_point.solve(qps)
-    warm = interior_point.solve(qps, cold)
-    assert (warm.iterations == 1).all()
-    assert_allclose(warm.v, cold.v, atol=1e-8)
-
-
-@pytest.mark.parametrize("size", [1e-4, 1e-2, 0.3])
-def test_a_start_nearby_is_found_again_in_fewer_steps(size):
-    mpc, (s, a) = paper_mpc(), paper_inputs()
-    start = mpc.solve(s, a)
-    with torch.no_grad():
-        mpc.C += size * mpc.C * torch.from_numpy(np.random.default_rng(2).normal(size=mpc.C.shape))
-    cold, warm = mpc.solve(s, a), mpc.solve(s, a, warm_start=start)
-    assert warm.residual.max() <= 1e-9
-    assert_close(warm.value, cold.value, rtol=1e-9, atol=1e-9)
-    if size < 0.1:
-        assert warm.iterations.double().mean() < 2
-        assert warm.iterations.max() <= interior_point.WARM_STEPS
-
-
-def test_a_misleading_start_costs_only_time():
-    qps = random_qps(8)
-    cold = interior_point.solve(qps)
-    wrong = Answer(cold.v + 1e3, -10 * cold.lam - 1, cold.iterations)
-    warm = interior_point.solve(qps, wrong)
-    assert residual(qps, warm).max() <= SETTLED
-    assert_allclose(wrong.v, cold.v + 1e3)  # not in place
+# Its active-set steps
 
 
 def test_settling_keeps_what_is_better():
     qps = random_qps(9)
     form, cold = BatchedQPs.of(*tensors(qps)), interior_point.solve(qps)
-    v, lam = torch.from_numpy(cold.v), torch.from_numpy(cold.lam)
+    v, lam = cold.v, cold.lam
     for noise in (0.0, 1e-6, 1.0):
         near = v + noise * torch.randn(v.shape, generator=torch.Generator().manual_seed(0)).double()
         found = settle(form, near, lam, 2)
@@ -434,13 +395,11 @@ def test_the_core_stays_on_its_device_in_float64(device):
     qps = random_qps(10)
     expected = interior_point.solve(qps)
     operands = tensors(qps, device)
-    v, lam = (torch.as_tensor(part, device=device) for part in (expected.v, expected.lam))
-    for guess in (None, (v, lam)):
-        v, lam, iterations = interior_point.interior_point(*operands, start=guess)
-        assert v.dtype == lam.dtype == torch.float64
-        assert {v.device.type, lam.device.type, iterations.device.type} == {device}
-        assert_allclose(v.cpu().numpy(), expected.v, atol=1e-8)
-        assert_allclose(lam.cpu().numpy(), expected.lam, atol=1e-7)
+    v, lam, iterations = interior_point.interior_point(*operands)
+    assert v.dtype == lam.dtype == torch.float64
+    assert {v.device.type, lam.device.type, iterations.device.type} == {device}
+    assert_allclose(v.cpu(), expected.v, atol=1e-8)
+    assert_allclose(lam.cpu(), expected.lam, atol=1e-7)
 
 
 def test_the_core_never_leaves_the_device_nor_loops_over_the_batch():

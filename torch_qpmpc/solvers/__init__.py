@@ -1,7 +1,7 @@
 """Backends, one a file, and the chain that turns their claims into certified solutions.
 
-A backend is a function ``solve(qps: SoftQPs, start: Answer | None) -> Answer``. To add one, write
-its file and name it in `BACKENDS`.
+A backend is a function ``solve(qps: SoftQPs) -> Answer``. To add one, write its file and name it in
+`BACKENDS`.
 """
 
 from __future__ import annotations
@@ -10,18 +10,23 @@ import difflib
 from collections.abc import Callable
 from functools import partial
 
-from torch_qpmpc.condense import SoftQPs
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.programs import SoftQPs
 from torch_qpmpc.solvers import daqp, interior_point, proxqp, qpsolvers
 from torch_qpmpc.solvers.answer import Answer
+from torch_qpmpc.solvers.recall import recall
 
-Backend = Callable[[SoftQPs, Answer | None], Answer]
+Backend = Callable[[SoftQPs], Answer]
+WarmStart = Callable[..., Answer]
 
 BACKENDS: dict[str, Backend] = {
     "proxqp": proxqp.solve,
     "daqp": daqp.solve,
     "torch": interior_point.solve,
 }
+
+#: Of the backends that are better than `recall` at starting from active sets: solve(qps, active).
+OWN_WARM_STARTS: dict[str, WarmStart] = {"daqp": daqp.solve}
 
 
 def backend(name: str) -> Backend:
@@ -41,9 +46,14 @@ def backend(name: str) -> Backend:
     )
 
 
+def warm_start(name: str) -> WarmStart:
+    """What solves QPs from active sets ``(B, r)`` before the backend called ``name`` is asked."""
+    return OWN_WARM_STARTS.get(name, recall)
+
+
 def fallbacks(name: str) -> list[Backend]:
     """Who solves what the certificate rejects: every other backend, cold."""
     return [other for known, other in BACKENDS.items() if known != name]
 
 
-__all__ = ["BACKENDS", "Answer", "Backend", "backend", "fallbacks"]
+__all__ = ["BACKENDS", "Answer", "Backend", "backend", "fallbacks", "warm_start"]

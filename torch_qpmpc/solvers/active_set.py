@@ -1,4 +1,4 @@
-"""Active-set Newton steps for a whole batch: the end of the interior point, and its warm start.
+"""Active-set Newton steps for a whole batch: the end of the interior point.
 
 With the rows' states held (see `crossover`), the KKT conditions are linear. The method of
 multipliers solves them: a large curvature holds the active rows at their bounds, and its error
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_qpmpc.qp import row_states
 from torch_qpmpc.solvers.batched import BatchedQPs
-from torch_qpmpc.solvers.crossover import row_states
 
 #: Relative residual of an answer that needs no further step.
 SETTLED = 1e-9

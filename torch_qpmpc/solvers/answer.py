@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -14,6 +17,14 @@ class Answer:
     There is no status: the project's own certificate decides what is solved.
     """
 
-    v: np.ndarray
-    lam: np.ndarray
-    iterations: np.ndarray
+    v: Tensor
+    lam: Tensor
+    iterations: Tensor
+
+    @classmethod
+    def like(
+        cls, g: Tensor, v: np.ndarray, lam: np.ndarray, iterations: np.ndarray | Sequence[int]
+    ) -> Answer:
+        """From what a solver of arrays found, on the device of ``g``."""
+        found = torch.as_tensor(iterations, dtype=torch.int64, device=g.device)
+        return cls(torch.from_numpy(v).to(g), torch.from_numpy(lam).to(g), found)

@@ -5,27 +5,33 @@ from __future__ import annotations
 import contextvars
 import time
 from dataclasses import dataclass, fields
+from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torch_qpmpc.certificate import TOLERANCE, Products, certify
-from torch_qpmpc.condense import Condensed, FlatPrograms, SoftQPs, condensed_for
-from torch_qpmpc.qp import Status
-from torch_qpmpc.solvers import Answer, Backend, backend, fallbacks
+from torch_qpmpc.condense import Reduced, condensed_for
+from torch_qpmpc.programs import FlatPrograms, SoftQPs
+from torch_qpmpc.qp import UNKNOWN, Status
+from torch_qpmpc.solvers import (
+    OWN_WARM_STARTS,
+    Answer,
+    Backend,
+    backend,
+    fallbacks,
+    warm_start,
+)
 from torch_qpmpc.solvers.crossover import refine
 from torch_qpmpc.solvers.diagnose import diagnose
 
-#: Multipliers of rows that no free variable enters count as active beyond this violation.
-ACTIVE_TOLERANCE = 1e-9
 #: A rejected claim with a relative residual up to this is worth sharpening.
 NEARLY = 1e-2
 
 
 @dataclass
 class RawSolution:
-    """Certified primal-dual solutions of B QPs: float64, on the CPU; lam = eta - upsilon."""
+    """Certified primal-dual solutions of B QPs, float64; lam = eta - upsilon."""
 
     value: Tensor
     z: Tensor
@@ -59,6 +65,7 @@ class SolveLog:
     solves: int = 0
     unsolved: int = 0
     fallback: int = 0
+    recalled: int = 0
     iterations: int = 0
     residual: float = 0.0
     seconds: float = 0.0
@@ -76,6 +83,7 @@ class SolveLog:
             "qp/solves": self.solves,
             "qp/unsolved": self.unsolved,
             "qp/fallback": self.fallback,
+            "qp/recalled": self.recalled,
             "qp/iterations": self.iterations / max(self.solves, 1),
             "qp/residual": self.residual,
             "time/qp": self.seconds,
@@ -86,7 +94,7 @@ _active_log: contextvars.ContextVar[SolveLog | None] = contextvars.ContextVar("l
 
 
 def solve_programs(
-    programs: FlatPrograms, keep: int, solver: str, start: tuple[Tensor, Tensor] | None = None
+    programs: FlatPrograms, keep: int, solver: str, start: Tensor | None = None
 ) -> RawSolution:
     """Solve and certify B QPs; what cannot be certified has a status that says why.
 
@@ -94,14 +102,16 @@ def solve_programs(
         programs: the QPs.
         keep: leading entries of z that the elimination of C z = b leaves alone, at least n_f.
         solver: a backend's name, see `torch_qpmpc.solvers`.
-        start: warm start, z ``(B, n_z)`` and lam ``(B, n_g)`` of a solution of nearly these QPs.
+        start: active sets ``(B, n_g)`` of nearly these QPs, see `torch_qpmpc.solvers.recall`.
     """
     began = time.perf_counter()
-    raw, rejected = _solve_programs(programs, keep, solver, start)
+    chain = _Chain(programs, keep)
+    raw = chain.run(solver, start)
     if (log := _active_log.get()) is not None:
         log.solves += len(programs)
         log.unsolved += int((raw.status != Status.SOLVED).sum())
-        log.fallback += rejected
+        log.fallback += chain.rejected
+        log.recalled += chain.recalled
         log.iterations += int(raw.iterations.sum())
         solved = raw.residual[raw.status == Status.SOLVED]
         log.residual = max(log.residual, float(solved.max()) if len(solved) else 0.0)
@@ -109,105 +119,125 @@ def solve_programs(
     return raw
 
 
-def _solve_programs(
-    programs: FlatPrograms, keep: int, solver: str, start: tuple[Tensor, Tensor] | None
-) -> tuple[RawSolution, int]:
-    """The solutions, and how often a claim was rejected and the next solver asked."""
-    attempts: list[tuple[Backend, bool]] = [(backend(solver), False)]
-    attempts += [(other, False) for other in fallbacks(solver)]
-    if start is not None:
-        attempts.insert(0, (backend(solver), True))
-    valid = _valid(programs)
-    usable = programs if valid.all() else programs.without_nan()
-    condensed = condensed_for(usable, keep)
-    # First-order conditions certify an optimum only where the QP is convex.
-    valid &= condensed.convex(programs.fixed.shape[-1])[programs.group]
-    todo, raw, rejected = torch.arange(len(programs)), None, 0
-    if not valid.all():
-        raw, todo = _unsolved(programs), valid.nonzero().squeeze(-1)
-        raw.status[todo] = Status.NOT_CONVERGED
-        if not len(todo):
-            return raw, 0
-    programs = usable
-    for solve, warm in attempts:
-        whole = len(todo) == len(programs)
-        part = programs if whole else programs.take(todo)
-        guess = (start[0][todo], start[1][todo]) if warm and start is not None else None
-        claim = _attempt(solve, part, condensed, guess)
-        accepted = claim.status == Status.SOLVED
-        if whole and accepted.all():
-            return claim, rejected
-        raw = _unsolved(programs, Status.NOT_CONVERGED) if raw is None else raw
-        raw.put(todo[accepted], claim.at(accepted))
-        todo = todo[~accepted]
-        raw.residual[todo] = claim.residual[~accepted]
-        if len(todo) and not warm and not rejected:
-            rejected = len(todo)
+class _Chain:
+    """One batch on its way from attempt to attempt: what one leaves, the next one gets.
+
+    ``recalled`` counts what the active sets of ``start`` solved, ``rejected`` the claims of the
+    chosen solver that the certificate rejected.
+    """
+
+    def __init__(self, programs: FlatPrograms, keep: int) -> None:
+        self.programs = programs
+        valid = programs.valid()
+        if not valid.all():
+            self.programs = programs = programs.without_nan()
+        self.keep, self.recalled, self.rejected = keep, 0, 0
+        self.reduced = condensed_for(programs, keep).reduced(programs)
+        # First-order conditions certify an optimum only where the QP is convex.
+        if not self.reduced.convex.all():
+            valid = valid & self.reduced.convex[programs.group]
+        self.raw: RawSolution | None = None
+        self.todo = torch.arange(len(programs), device=valid.device)
+        if not valid.all():
+            self.raw = _unsolved(programs)
+            self.todo = valid.nonzero().squeeze(-1)
+            self.raw.status[self.todo] = Status.NOT_CONVERGED
+
+    def run(self, solver: str, start: Tensor | None) -> RawSolution:
+        if start is not None:
+            self.recall(solver, start)
+        self.attempt(backend(solver))
+        self.rejected = len(self.todo)
+        if self.rejected:
+            assert self.raw is not None
+            part = self.part()
             # What is proved to be infeasible need not be tried by every other solver.
-            raw.status[todo] = _reasons(programs.take(todo), condensed)
-            todo = todo[raw.status[todo] != Status.INFEASIBLE]
-        if not len(todo):
-            break
-    assert raw is not None
-    return raw, rejected
+            self.raw.status[self.todo] = _reasons(part, self.reduced_for(part))
+            self.todo = self.todo[self.raw.status[self.todo] != Status.INFEASIBLE]
+        for other in fallbacks(solver):
+            self.attempt(other)
+        assert self.raw is not None
+        return self.raw
+
+    def recall(self, solver: str, start: Tensor) -> None:
+        """Try the active sets ``start`` ``(B, n_g)`` that are known."""
+        known = (start != UNKNOWN).all(-1)
+        others, before = self.todo[:0], self.todo[known[self.todo]]
+        if not len(before):
+            return
+        if solver not in OWN_WARM_STARTS:
+            others, self.todo = self.todo[~known[self.todo]], before
+        active = start[self.todo][:, self.reduced.rows]
+        self.attempt(partial(warm_start(solver), active=active), sharpen=False)
+        self.recalled = len(before) - int(known[self.todo].sum())
+        self.todo = torch.cat((self.todo, others)).sort().values
+
+    def part(self) -> FlatPrograms:
+        """The programs that are still to be solved."""
+        whole = len(self.todo) == len(self.programs)
+        return self.programs if whole else self.programs.take(self.todo)
+
+    def reduced_for(self, part: FlatPrograms) -> Reduced:
+        return condensed_for(part, self.keep).reduced(part)
+
+    def attempt(self, solve: Backend, *, sharpen: bool = True) -> None:
+        """Ask for what is still to be solved, and keep what the certificate accepts."""
+        if not len(self.todo) and self.raw is not None:
+            return
+        part = self.part()
+        claim = _attempt(solve, part, self.reduced_for(part), sharpen)
+        accepted = claim.residual <= TOLERANCE
+        if accepted.all() and len(part) == len(self.programs):
+            self.raw, self.todo = claim, self.todo[:0]
+            return
+        if self.raw is None:
+            self.raw = _unsolved(self.programs, Status.NOT_CONVERGED)
+        self.raw.put(self.todo[accepted], claim.at(accepted))
+        self.todo = self.todo[~accepted]
+        self.raw.residual[self.todo] = claim.residual[~accepted]
 
 
 def _attempt(
-    solve: Backend,
-    programs: FlatPrograms,
-    condensed: Condensed,
-    start: tuple[Tensor, Tensor] | None,
+    solve: Backend, programs: FlatPrograms, reduced: Reduced, sharpen: bool
 ) -> RawSolution:
-    """One backend's claims, sharpened where that helps; ``status`` is the certificate's verdict."""
-    qps, rows = condensed.soft_qps(programs)
-    if qps.l.shape[1] == 0:
-        answer = _unconstrained(qps)
-    elif start is None:
-        answer = solve(qps, None)
-    else:
-        z, lam = start
-        v = condensed.free_part(programs, z).numpy()
-        answer = solve(qps, Answer(v, lam[:, rows].numpy(), np.zeros(len(v), dtype=np.int64)))
-    claim = _recover(programs, condensed, answer, rows)
+    """One backend's claims, sharpened where that helps; their ``status`` is SOLVED."""
+    qps = reduced.soft_qps(programs)
+    answer = solve(qps) if qps.l.shape[1] else _unconstrained(qps)
+    claim = _recover(programs, reduced, answer)
     nearly = (claim.residual > TOLERANCE) & (claim.residual <= NEARLY)
-    if nearly.any():
-        sharper = refine(qps, answer, nearly.nonzero().squeeze(-1).numpy())
-        second = _recover(programs, condensed, sharper, rows)
+    if sharpen and nearly.any():
+        sharper = refine(qps, answer, nearly.nonzero().squeeze(-1))
+        second = _recover(programs, reduced, sharper)
         improved = (second.residual < claim.residual).nonzero().squeeze(-1)
         claim.put(improved, second.at(improved))
-    claim.status[claim.residual > TOLERANCE] = Status.NOT_CONVERGED
     return claim
 
 
 def _unconstrained(qps: SoftQPs) -> Answer:
     """Without rows there is a closed form; where it is unbounded, the certificate sees that."""
-    inverse = np.linalg.pinv(qps.H, hermitian=True)
-    v = np.einsum("bij,bj->bi", inverse[qps.group], -qps.g)
-    return Answer(v, qps.l, np.zeros(len(v), dtype=np.int64))
+    inverse = torch.linalg.pinv(qps.H, hermitian=True)
+    v = torch.einsum("bij,bj->bi", inverse[qps.group], -qps.g)
+    return Answer(v, qps.l, torch.zeros_like(qps.group))
 
 
-def _recover(p: FlatPrograms, condensed: Condensed, answer: Answer, rows: Tensor) -> RawSolution:
+def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
     """The full primal-dual solution from a backend's answer, certified.
 
     The multipliers that condensing eliminated come from the stationarity of the Lagrangian: chi by
     the transpose of the same elimination, xi from what is left in the fixed entries.
     """
-    z = condensed.expand(p, torch.from_numpy(answer.v))
-    y = p.multiply(p.G, z)
-    # A row that no free variable enters is active exactly where it is violated.
-    lam = torch.zeros_like(y)
-    lam.masked_fill_(y > p.ub + ACTIVE_TOLERANCE, torch.inf)
-    lam.masked_fill_(y < p.lb - ACTIVE_TOLERANCE, -torch.inf)
-    lam[:, rows] = torch.from_numpy(answer.lam)
-    lam = lam.minimum(p.w).maximum(-p.w)
-    lam = lam.masked_fill_(lam.isinf(), 0)  # a hard row out of reach: the certificate sees it
-    products = Products(p.multiply(p.H, z), y, p.multiply(p.G.mT, lam))
-    gradient = products.Hz + p.q + products.G_lam
-    chi = -p.multiply(condensed.Y.mT, gradient)
-    n_f = p.fixed.shape[-1]
-    xi = -(gradient + p.multiply(p.C.mT, chi))[:, :n_f]
-    certificate = certify(p, z, lam, chi, xi, products)
-    iterations = torch.from_numpy(answer.iterations).to(torch.int64)
+    z = reduced.expand(p, answer.v)
+    Hz, y = p.times_H(z), p.times_G(z)
+    beyond = y - y.clamp(p.lb, p.ub)
+    lam = reduced.all_rows(answer.lam, beyond)
+    G_lam = p.times_G(lam, transposed=True)
+    slope = Hz + p.q + G_lam
+    chi = p.multiply(reduced.Y_neg.mT, slope)
+    C_chi = p.multiply(p.C.mT, chi)
+    slope += C_chi
+    xi = -slope[:, : p.fixed.shape[-1]]
+    certificate = certify(p, z, lam, chi, xi, Products(Hz, G_lam, C_chi, slope, y, beyond))
+    status = torch.full_like(answer.iterations, int(Status.SOLVED))
     return RawSolution(
         certificate.value,
         z,
@@ -215,26 +245,26 @@ def _recover(p: FlatPrograms, condensed: Condensed, answer: Answer, rows: Tensor
         chi,
         lam,
         xi,
-        torch.full_like(iterations, int(Status.SOLVED)),
+        status,
         certificate.residual,
-        iterations,
+        answer.iterations,
     )
 
 
-def _reasons(part: FlatPrograms, condensed: Condensed) -> Tensor:
+def _reasons(part: FlatPrograms, reduced: Reduced) -> Tensor:
     """What is the matter with QPs that a solver did not solve: their status, ``(B,)``."""
-    particular = condensed.particular(part)
+    particular = reduced.particular(part)
     inconsistent = (part.multiply(part.C, particular) - part.b).abs() > TOLERANCE * (
         1 + part.b.abs() + particular.abs().amax(-1, keepdim=True)
     )
     y = part.multiply(part.G, particular)
-    qps, rows = condensed.soft_qps(part)
+    qps = reduced.soft_qps(part)
     unreachable = (torch.maximum(part.lb - y, y - part.ub) > TOLERANCE) & part.w.isinf()
-    unreachable[:, rows] = False
+    unreachable[:, reduced.rows] = False
     impossible = inconsistent.any(-1) | unreachable.any(-1)
     if not qps.g.shape[1]:
         return torch.where(impossible, int(Status.INFEASIBLE), int(Status.NOT_CONVERGED))
-    return torch.where(impossible, int(Status.INFEASIBLE), torch.from_numpy(diagnose(qps)))
+    return torch.where(impossible, int(Status.INFEASIBLE), diagnose(qps))
 
 
 def _unsolved(p: FlatPrograms, status: Status = Status.INVALID_DATA) -> RawSolution:
@@ -253,13 +283,3 @@ def _unsolved(p: FlatPrograms, status: Status = Status.INVALID_DATA) -> RawSolut
         residual=p.q.new_full((n,), torch.inf),
         iterations=p.group.new_zeros(n),
     )
-
-
-def _valid(p: FlatPrograms) -> Tensor:
-    """Which QPs have finite data and lb <= ub, ``(B,)``."""
-    # A sum is finite if its terms are (but for overflow, which no solver survives either).
-    matrices = (p.H.sum((1, 2)) + p.C.sum((1, 2)) + p.G.sum((1, 2))).isfinite()
-    vectors = (p.q.sum(-1) + p.b.sum(-1) + p.fixed.sum(-1) + p.c).isfinite()
-    # A comparison with NaN is false, and an empty interval is one whose bounds are crossed.
-    bounds = ((p.lb <= p.ub) & (p.lb < torch.inf) & (p.ub > -torch.inf) & (p.w >= 0)).all(-1)
-    return matrices[p.group] & vectors & bounds

@@ -9,41 +9,34 @@ steps from a good start.
 from __future__ import annotations
 
 import numpy as np
+from torch import Tensor
 
-from torch_qpmpc.condense import SoftQPs
+from torch_qpmpc.programs import SoftQPs
+from torch_qpmpc.qp import row_states
 from torch_qpmpc.solvers.answer import Answer
 
 MAX_STEPS = 10
 
 
-def refine(qps: SoftQPs, start: Answer, which: np.ndarray) -> Answer:
+def refine(qps: SoftQPs, start: Answer, which: Tensor) -> Answer:
     """Sharpen the answers at the indices ``which``; where steps do not settle, the last stays."""
-    v, lam, iterations = start.v.copy(), start.lam.copy(), start.iterations.copy()
-    for i in which:
-        H, G = qps.H[qps.group[i]], qps.G[qps.group[i]]
+    arrays = qps.arrays()
+    v, lam, iterations = (
+        tensor.cpu().numpy().copy() for tensor in (start.v, start.lam, start.iterations)
+    )
+    for i in which.tolist():
+        H, G = arrays.H[arrays.group[i]], arrays.G[arrays.group[i]]
         previous = None
         for _ in range(MAX_STEPS):
             p = G @ v[i] + lam[i]
-            bound, active, held = row_states(p, qps.l[i], qps.u[i], qps.w[i])
+            bound, active, held = row_states(p, arrays.l[i], arrays.u[i], arrays.w[i])
             states = np.where(active, bound, np.inf), np.where(active, 0, held)
             if previous is not None and np.array_equal(states, previous):
                 break
             previous = states
-            v[i], lam[i] = _solve_kkt(H, G, qps.g[i], bound, active, states[1])
+            v[i], lam[i] = _solve_kkt(H, G, arrays.g[i], bound, active, states[1])
             iterations[i] += 1
-    return Answer(v, lam, iterations)
-
-
-def row_states(p, lower, upper, w) -> tuple:
-    """Each row's nearest bound, whether it is active there, and lam if not; arrays or tensors.
-
-    The excess of ``p = y + lam`` over the bounds would be the multiplier; |lam| <= w caps it.
-    """
-    bound = p.clip(lower, upper)
-    excess = p - bound
-    held = excess.clip(-w, w)
-    active = (held == excess) & ((excess != 0) | (lower == upper))
-    return bound, active, held
+    return Answer.like(qps.g, v, lam, iterations)
 
 
 def _solve_kkt(H, G, g, bound, active, held) -> tuple[np.ndarray, np.ndarray]:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import daqp
 import numpy as np
+from torch import Tensor
 
-from torch_qpmpc.condense import SoftQPs
+from torch_qpmpc.programs import SoftArrays, SoftQPs
+from torch_qpmpc.qp import UNKNOWN
 from torch_qpmpc.solvers.answer import Answer
 
 SOFT, ACTIVE_LOWER, ACTIVE = 8, 2, 1
+#: What to add to ``sense`` by a row's code: 0, 1, 2, -2, -1. Saturated rows it has to find again:
+#: started with them as active, DAQP returns wrong answers.
+STATES = np.array([0, ACTIVE, 0, 0, ACTIVE | ACTIVE_LOWER], dtype=np.int32)
+#: From how many QPs on it pays to put them in order.
+MANY = 64
 #: DAQP's reciprocal quadratic slack weight; 1e4 to 1e8 are right to 1e-7, outside it errs.
 RECIPROCAL_RHO = 1e6
 #: DAQP's infinity.
@@ -16,37 +25,91 @@ NO_BOUND = 1e30
 SETTINGS = {"primal_tol": 1e-9, "dual_tol": 1e-12, "iter_limit": 2000, "time_limit": 0.2}
 
 
-def solve(qps: SoftQPs, start: Answer | None = None) -> Answer:
-    """Solve a batch; the multipliers of ``start`` say which rows to begin with as active."""
-    n_qps, n_rows = qps.l.shape
-    v, lam = np.zeros_like(qps.g), np.zeros_like(qps.l)
-    iterations = np.zeros(n_qps, dtype=np.int64)
-    hard = np.isinf(qps.w)
-    sense = np.where(hard, 0, SOFT).astype(np.int32)
-    if start is not None:
-        sense |= np.where(start.lam > 0, ACTIVE, 0).astype(np.int32)
-        sense |= np.where(start.lam < 0, ACTIVE | ACTIVE_LOWER, 0).astype(np.int32)
-    weight = np.where(hard, 0.0, qps.w)
-    rho = np.full(n_rows, RECIPROCAL_RHO)
+def solve(qps: SoftQPs, active: Tensor | None = None) -> Answer:
+    """Solve a batch, each QP from its ``active`` set ``(B, r)``, or from that of one much like it.
+
+    The codes are those of `QPSolution.active`.
+    """
+    arrays = qps.arrays()
+    codes = None if active is None else active.cpu().numpy()
+    v, lam = np.zeros_like(arrays.g), np.zeros_like(arrays.l)
+    iterations = np.zeros(len(v), dtype=np.int64)
+    hard = np.isinf(arrays.w)
+    for members in _alike(arrays.group, hard):
+        start = None if codes is None else codes[members]
+        _solve_alike(arrays, members, hard[members[0]], start, (v, lam, iterations))
+    return Answer.like(qps.g, v, lam, iterations)
+
+
+def _alike(group: np.ndarray, hard: np.ndarray) -> list[np.ndarray]:
+    """The indices of QPs that share their matrices and their pattern of hard rows."""
+    if len(group) and (group == group[0]).all() and (hard == hard[0]).all():
+        return [np.arange(len(group))]
+    kinds: dict[tuple, list[int]] = {}
+    for i, (m, pattern) in enumerate(zip(group, hard, strict=True)):
+        kinds.setdefault((m, pattern.tobytes()), []).append(i)
+    return [np.array(members) for members in kinds.values()]
+
+
+def _solve_alike(
+    arrays: SoftArrays,
+    members: np.ndarray,
+    hard: np.ndarray,
+    start: np.ndarray | None,
+    found: tuple[np.ndarray, ...],
+) -> None:
+    """Solve with one model; updated to another pattern of soft rows, it would corrupt memory."""
+    v, lam, iterations = found
+    w, g = arrays.w[members], arrays.g[members]
     # A row that may be violated for nothing is no row; DAQP would hold it with its small rho.
-    upper = np.where(qps.w > 0, np.minimum(qps.u, NO_BOUND), NO_BOUND)
-    lower = np.where(qps.w > 0, np.maximum(qps.l, -NO_BOUND), -NO_BOUND)
-    for m in np.unique(qps.group):
-        H, G = np.array(qps.H[m], order="C"), np.array(qps.G[m], order="C")
-        model, pattern = daqp.Model(), None
-        for i in np.flatnonzero(qps.group == m):
-            # Updating a model to another pattern of soft rows corrupts memory: set up another one.
-            if pattern is not None and np.array_equal(pattern, hard[i]):
-                model.update(f=qps.g[i], bupper=upper[i], blower=lower[i], sense=sense[i])
-            else:
-                model, pattern = daqp.Model(), None
-                flag, _ = model.setup(H, qps.g[i], G, upper[i], lower[i], sense[i].copy())
-                if flag < 0:
-                    continue
-                model.settings = SETTINGS
-                pattern = hard[i]
-            if n_rows:  # soft_weights refuses empty arrays
-                model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[i], w_u=weight[i])
-            x, _, _, info = model.solve()
-            v[i], lam[i], iterations[i] = x, info["lam"], info["iterations"]
-    return Answer(v, lam, iterations)
+    upper = np.where(w > 0, arrays.u[members].clip(max=NO_BOUND), NO_BOUND)
+    lower = np.where(w > 0, arrays.l[members].clip(min=-NO_BOUND), -NO_BOUND)
+    weight = np.where(hard, 0.0, w)
+    same_weight = (weight == weight[0]).all()
+    empty = np.where(hard, 0, SOFT).astype(np.int32)
+    rho = np.full(len(hard), RECIPROCAL_RHO)
+    m, model = arrays.group[members[0]], daqp.Model()
+    flag, _ = model.setup(arrays.H[m], g[0], arrays.G[m], upper[0], lower[0], empty.copy())
+    if flag < 0:
+        return  # The zeros that stand for the answers do not pass the certificate.
+    model.settings = SETTINGS
+    if len(hard):  # soft_weights refuses empty arrays
+        model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[0], w_u=weight[0])
+    order: Sequence[int] = range(len(g))
+    # Without a ``sense``, the model begins with the active set that it ended with.
+    senses: list[np.ndarray | None] = [empty] * len(g)
+    if start is not None:
+        known = (start != UNKNOWN).all(axis=1)
+        senses = list(empty + STATES[np.where(known[:, None], start, 0)])
+    elif len(g) >= MANY:
+        order, senses = _path(g), [None] * len(g)
+    update, solve_one, failed = model.update, model.solve, False
+    for k in order:
+        sense = empty if failed and senses[k] is None else senses[k]
+        if not len(hard):
+            update(f=g[k])
+        else:
+            update(f=g[k], bupper=upper[k], blower=lower[k], sense=sense)
+        if not same_weight:
+            model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[k], w_u=weight[k])
+        i = members[k]
+        v[i], _, flag, info = solve_one()
+        lam[i], iterations[i] = info["lam"], info["iterations"]
+        failed = flag <= 0
+
+
+def _path(g: np.ndarray) -> list[int]:
+    """An order of the rows of g ``(B, d)`` in which neighbours resemble each other.
+
+    Strips along the second principal component, each walked along the first, to and fro. A
+    neighbour's active set saves DAQP a third of its iterations.
+    """
+    n_qps, d = g.shape
+    if d < 2:
+        return list(range(n_qps))
+    spread = g.std(axis=0)
+    scaled = (g - g.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    first, second = (scaled @ np.linalg.eigh(scaled.T @ scaled)[1][:, [-1, -2]]).T
+    count = max(1, round(n_qps**0.5))
+    strip = second.argsort().argsort() * count // n_qps
+    return np.lexsort((np.where(strip % 2, -first, first), strip)).tolist()

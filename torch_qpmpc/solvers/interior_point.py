@@ -10,7 +10,7 @@ side, they leave ``(H + G'DG) dv = right`` with the diagonal ``1 / D = s / lam +
 iteration costs one batched product and one Cholesky factor of d x d, used twice. An infinite weight
 or bound is a huge one, whose pair then is inert; a hard equality, which has no interior, is held by
 a penalty and a multiplier of its own. At the end the active set is read off and solved for (see
-`active_set`), which is also what a warm start begins with.
+`active_set`).
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from torch_qpmpc.condense import SoftQPs
+from torch_qpmpc.programs import SoftQPs
 from torch_qpmpc.solvers.active_set import SETTLED, Found, settle
 from torch_qpmpc.solvers.answer import Answer
 from torch_qpmpc.solvers.batched import HUGE, BatchedQPs
 
 #: Gaps, relative to a typical cost, at which the active set is tried; and iterations up to there.
 TARGETS = ((1e-4, 40), (1e-8, 15), (1e-12, 10))
-WARM_STEPS, LAST_STEPS = 5, 3
+LAST_STEPS = 3
 #: Part of the way to the boundary that a step may go.
 STEP = 0.995
 #: A side's distance begins with at least this part of the row's width, ..
@@ -40,13 +40,9 @@ LATE, CAUTION = 20, 0.3
 SHRINK = 0.75
 
 
-def solve(qps: SoftQPs, start: Answer | None = None) -> Answer:
-    """Solve a batch; the active set of ``start``, a primal-dual guess, is tried first."""
-    arrays = (qps.H, qps.G, qps.group, qps.g, qps.l, qps.u, qps.w)
-    tensors = (torch.from_numpy(array) for array in arrays)
-    guess = None if start is None else (torch.from_numpy(start.v), torch.from_numpy(start.lam))
-    v, lam, iterations = interior_point(*tensors, start=guess)
-    return Answer(v.numpy(), lam.numpy(), iterations.numpy())
+def solve(qps: SoftQPs) -> Answer:
+    """Solve a batch on its own device."""
+    return Answer(*interior_point(qps.H, qps.G, qps.group, qps.g, qps.l, qps.u, qps.w))
 
 
 @torch.no_grad()
@@ -58,8 +54,6 @@ def interior_point(
     lower: Tensor,
     upper: Tensor,
     w: Tensor,
-    *,
-    start: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """v ``(B, d)``, lam ``(B, r)`` and iterations ``(B,)`` for the tensors of `SoftQPs`.
 
@@ -72,10 +66,7 @@ def interior_point(
         v, lam, iterations = interior_point(H, row, group, g, none, none, none)
         return v, lam[:, 1:], iterations
     qps = BatchedQPs.of(H, G, group, g, lower, upper, w)
-    found = Found.nothing(qps) if start is None else settle(qps, *start, WARM_STEPS)
-    todo = (~(found.residual <= SETTLED)).nonzero().squeeze(-1)
-    if len(todo) < len(qps):
-        qps = qps.take(todo)
+    found, todo = Found.nothing(qps), torch.arange(len(qps), device=g.device)
     point = _begin(qps)
     for target, limit in TARGETS:
         if not len(todo):

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import copy
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+from torch.testing import assert_close
+
+from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
+from torch_qpmpc.programs import ContentMemo, FlatPrograms
+
+
+def test_a_memo_finds_equal_tensors_and_nothing_else():
+    memo, made = ContentMemo(), []
+
+    def get(x, options=None):
+        return memo.get((x,), options, lambda own: made.append(own) or len(made))
+
+    x = normal(3)
+    assert [get(x), get(x.clone()), get(x + 1), get(x, "other"), get(x.float())] == [1, 1, 2, 3, 4]
+    x[0] += 1
+    assert get(x) == 5
+
+
+def test_a_memo_keeps_copies():
+    memo, x = ContentMemo(), normal(3)
+    kept = memo.get((x,), None, lambda own: own)
+    before = x.clone()
+    x += 1
+    assert_close(kept, before)
+    assert memo.get((before,), None, lambda own: own) is kept
+
+
+def test_a_memo_forgets_the_oldest():
+    memo = ContentMemo()
+    keys = [normal(2, seed=i) for i in range(ContentMemo.SIZE + 1)]
+    for i, key in enumerate(keys):
+        memo.get((key,), None, lambda own, i=i: i)
+    assert len(memo.entries) == ContentMemo.SIZE
+    assert memo.get((keys[0],), None, lambda own: "made again") == "made again"
+    assert memo.get((keys[-1],), None, lambda own: "made again") == len(keys) - 1
+
+
+def test_a_theta_shared_by_the_batch_is_prepared_once():
+    known = known_qp(0)
+    fixed = normal(5, 2)
+    one, _ = FlatPrograms.of(*known.qp.tensors(), fixed)
+    two, _ = FlatPrograms.of(*known.qp.tensors(), fixed[:2])
+    assert one.known("x", lambda: 1) == two.known("x", lambda: 2) == 1
+    other, _ = FlatPrograms.of(*known_qp(1).qp.tensors(), fixed)
+    assert other.known("x", lambda: 3) == 3
+
+
+def test_programs_that_differ_in_vectors_share_nothing():
+    known = known_qp(0, batch=(4,))
+    one, two = programs_of(known), programs_of(known)
+    assert one.known("x", lambda: 1) == 1
+    assert two.known("x", lambda: 2) == 2
+    assert one.take(torch.tensor([0])).known("x", lambda: 3) == 3
+
+
+def test_an_update_in_place_and_back_is_followed():
+    mpc, s = random_mpc(1), random_states(4)
+    before, C = mpc.value(s), mpc.C.detach().clone()
+    twin = copy.deepcopy(mpc)
+    with torch.no_grad():
+        mpc.C += 0.1 * normal(*C.shape)
+    assert (mpc.value(s) - before).abs().min() > 1e-6
+    assert_close(twin.value(s), before, rtol=0, atol=0)
+    mpc.C.data.copy_(C)  # unseen by version counters
+    assert_close(mpc.value(s), before, rtol=0, atol=0)
+
+
+def test_threads_prepare_for_themselves():
+    known = known_qp(0)
+    here, _ = FlatPrograms.of(*known.qp.tensors(), known.fixed)
+    assert here.known("thread", lambda: "here") == "here"
+    with ThreadPoolExecutor(1) as pool:
+        there, _ = pool.submit(FlatPrograms.of, *known.qp.tensors(), known.fixed).result()
+    assert there.known("thread", lambda: "there") == "there"
+
+
+def test_diagonal_matrices_are_multiplied_as_such():
+    known = known_qp(0)
+    H = torch.diag(torch.arange(12.0).double())
+    programs, _ = FlatPrograms.of(H, *known.qp.tensors()[1:], known.fixed)
+    z, lam = normal(3, 12), normal(3, 13)
+    assert_close(programs.times_H(z), z @ H)
+    assert_close(programs.times_G(z), z @ known.qp.G.mT)
+    assert_close(programs.times_G(lam, transposed=True), lam @ known.qp.G)

@@ -1,0 +1,230 @@
+"""A batch of QPs as plain tensors: what the solvers' pipeline passes from step to step."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_qpmpc.batching import broadcast, flatten
+from torch_qpmpc.qp import EVENT_SHAPES
+
+T = TypeVar("T")
+
+
+class ContentMemo(threading.local):
+    """The latest results of a function of tensors, found again by the *content* of the tensors.
+
+    No in-place update, copied module or functional call can make such a result stale.
+    """
+
+    SIZE = 4
+
+    def __init__(self) -> None:
+        self.entries: list[tuple[tuple[Tensor, ...], Any, Any]] = []
+
+    def get(self, tensors: Sequence[Tensor], options: Any, make: Callable[..., T]) -> T:
+        """What ``make(*tensors)`` returned for equal tensors and ``options``, or returns now.
+
+        It gets copies, so that its result may contain them.
+        """
+        for position, (known, with_options, result) in enumerate(self.entries):
+            if with_options == options and all(map(_same, known, tensors)):
+                self.entries.insert(0, self.entries.pop(position))
+                return result
+        own = tuple(tensor.clone() for tensor in tensors)
+        result = make(*own)
+        self.entries.insert(0, (own, options, result))
+        del self.entries[self.SIZE :]
+        return result
+
+
+def _same(one: Tensor, other: Tensor) -> bool:
+    alike = one.dtype == other.dtype and one.device == other.device
+    return alike and torch.equal(one, other)
+
+
+_memo = ContentMemo()
+#: Trailing dimensions of H, q, c, C, b, G, lb, ub, w that are no batch.
+_NDIMS = tuple(len(event) for event in EVENT_SHAPES.values())
+
+
+@dataclass(frozen=True, eq=False)
+class FlatPrograms:
+    """A batch of B QPs over M distinct matrix triples, float64 on one device.
+
+    H ``(M, n_z, n_z)``, C ``(M, n_c, n_z)``, G ``(M, n_g, n_z)``; ``group`` ``(B,)`` says which
+    triple a QP has; q ``(B, n_z)``, c ``(B,)``, b ``(B, n_c)``, lb, ub, w ``(B, n_g)``, fixed
+    ``(B, n_f)``. A vector that the batch shares has one row (q, c, b, lb, ub, w, not fixed). H is
+    symmetric: its antisymmetric part, if any, is no part of the cost.
+    """
+
+    H: Tensor
+    C: Tensor
+    G: Tensor
+    group: Tensor
+    q: Tensor
+    c: Tensor
+    b: Tensor
+    lb: Tensor
+    ub: Tensor
+    w: Tensor
+    fixed: Tensor
+    # What follows from all but `fixed`; those that differ in nothing else share it.
+    _known: dict[Any, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, *operands: Tensor, device: torch.device | str = "cpu"
+    ) -> tuple[FlatPrograms, torch.Size]:
+        """Broadcast H, q, c, C, b, G, lb, ub, w, fixed of any batch shapes, and flatten.
+
+        Also returns the batch shape. Matrices are not repeated for the samples that share them.
+        What was worked out for the same theta is found again where the batch shares all of it.
+        """
+        *theta, fixed = (operand.detach() for operand in operands)
+        batches = [t.shape[: t.ndim - n] for t, n in zip(theta, _NDIMS, strict=True)]
+        batch = broadcast(*batches, fixed.shape[:-1])
+        fixed = flatten(fixed, batch, device)
+        if any(batches):
+            return cls._flat(theta, batch, fixed), batch
+        programs = _memo.get(
+            theta, str(device), lambda *own: cls._flat(own, torch.Size(), fixed[:1])
+        )
+        group = torch.zeros(len(fixed), dtype=torch.int64, device=fixed.device)
+        return replace(programs, fixed=fixed, group=group), batch
+
+    @classmethod
+    def _flat(cls, theta: Sequence[Tensor], batch: torch.Size, fixed: Tensor) -> FlatPrograms:
+        H, q, c, C, b, G, lb, ub, w = (tensor.to(fixed) for tensor in theta)
+        matrices = ((H + H.mT) / 2, C, G)
+        of_matrices = broadcast(*(m.shape[:-2] for m in matrices))
+        count = of_matrices.numel()
+        H, C, G = (
+            m.expand(*of_matrices, *m.shape[-2:]).reshape(count, *m.shape[-2:]) for m in matrices
+        )
+        group = torch.arange(count, device=H.device).reshape(of_matrices).expand(batch).reshape(-1)
+        q, c, b, lb, ub, w = (
+            v.reshape(1, -1) if v.numel() == v.shape[-1] else flatten(v, batch, v.device)
+            for v in (q, c.unsqueeze(-1), b, lb, ub, w)
+        )
+        return cls(H, C, G, group, q, c.squeeze(-1), b, lb, ub, w, fixed)
+
+    def __len__(self) -> int:
+        return len(self.group)
+
+    def known(self, name: Any, make: Callable[[], T]) -> T:
+        """What ``make()`` works out from all but ``fixed``, once; ``name`` names it."""
+        if name not in self._known:
+            self._known[name] = make()
+        return self._known[name]
+
+    def take(self, index: Tensor) -> FlatPrograms:
+        """The QPs at ``index``, with the matrices as they are."""
+        shared = (self.q, self.c, self.b, self.lb, self.ub, self.w)
+        q, c, b, lb, ub, w = (v if len(v) == 1 else v[index] for v in shared)
+        known = self._known if all(len(x) == 1 for x in (self.H, *shared)) else {}
+        group, fixed = self.group[index], self.fixed[index]
+        return FlatPrograms(self.H, self.C, self.G, group, q, c, b, lb, ub, w, fixed, known)
+
+    def without_nan(self) -> FlatPrograms:
+        """The same, with zeros for NaN and inf in matrices whose QPs are not going to be solved."""
+        finite = {name: getattr(self, name).nan_to_num(0, 0, 0) for name in ("H", "C", "G")}
+        return replace(self, **finite, _known={})
+
+    def valid(self) -> Tensor:
+        """Which QPs have finite data and lb <= ub, ``(B,)``."""
+        return self.known("valid", self._valid_theta) & self.fixed.sum(-1).isfinite()
+
+    def _valid_theta(self) -> Tensor:
+        # A sum is finite if its terms are (but for overflow, which no solver survives either).
+        matrices = (self.H.sum((1, 2)) + self.C.sum((1, 2)) + self.G.sum((1, 2))).isfinite()
+        vectors = (self.q.sum(-1) + self.b.sum(-1) + self.c).isfinite()
+        # A comparison with NaN is false, and an empty interval is one whose bounds are crossed.
+        ordered = (self.lb <= self.ub) & (self.w >= 0)
+        bounds = (ordered & (self.lb < torch.inf) & (self.ub > -torch.inf)).all(-1)
+        return (matrices if len(matrices) == 1 else matrices[self.group]) & vectors & bounds
+
+    def times_H(self, z: Tensor) -> Tensor:
+        """H z, ``(B, n_z)``."""
+        return self._times("H", z)
+
+    def times_G(self, z: Tensor, *, transposed: bool = False) -> Tensor:
+        """G z ``(B, n_g)``, or G'lam ``(B, n_z)``."""
+        return self._times("G", z, transposed)
+
+    def _times(self, name: str, vectors: Tensor, transposed: bool = False) -> Tensor:
+        matrices = getattr(self, name)
+        # H is often diagonal, and G the identity.
+        diagonal = self.known(("diagonal", name), lambda: _diagonal(matrices))
+        if diagonal is not None:
+            return vectors * diagonal
+        return self.multiply(matrices.mT if transposed else matrices, vectors)
+
+    def multiply(self, matrices: Tensor, vectors: Tensor) -> Tensor:
+        """Row-wise matrix-vector products: ``(M, i, j)`` by ``(B, j)`` to ``(B, i)``.
+
+        A vector shared by the batch, ``(1, j)``, gives ``(1, i)`` if the matrices are shared too.
+        """
+        return multiply(matrices, self.group, vectors)
+
+
+def _diagonal(matrices: Tensor) -> Tensor | None:
+    """The diagonal ``(n,)`` of one square matrix that has nothing else."""
+    if len(matrices) != 1 or matrices.shape[-1] != matrices.shape[-2]:
+        return None
+    diagonal = matrices[0].diagonal()
+    return diagonal.clone() if torch.equal(torch.diag(diagonal), matrices[0]) else None
+
+
+def multiply(matrices: Tensor, group: Tensor, vectors: Tensor) -> Tensor:
+    """`FlatPrograms.multiply` for the matrices ``group`` of any."""
+    if matrices.shape[0] == 1:
+        return vectors @ matrices[0].mT
+    vectors = vectors.expand(len(group), -1)
+    return torch.bmm(matrices[group], vectors.unsqueeze(-1)).squeeze(-1)
+
+
+@dataclass(frozen=True)
+class SoftQPs:
+    """What a backend solves: B problems of d variables and r rows, float64 on one device,
+
+        min over v:  1/2 v'Hv + g'v + sum_i w_i dist(G_i v, [l_i, u_i]),
+
+    with H ``(M, d, d)``, G ``(M, r, d)``, group ``(B,)``, g ``(B, d)``, l, u, w ``(B, r)``;
+    ``w_i = inf`` means a hard row.
+    """
+
+    H: Tensor
+    G: Tensor
+    group: Tensor
+    g: Tensor
+    l: Tensor  # noqa: E741 - the literature's name for the lower bound
+    u: Tensor
+    w: Tensor
+
+    def take(self, index: Tensor) -> SoftQPs:
+        """The problems at ``index``, with the matrices as they are."""
+        vectors = (v[index] for v in (self.group, self.g, self.l, self.u, self.w))
+        return SoftQPs(self.H, self.G, *vectors)
+
+    def arrays(self) -> SoftArrays:
+        """The same for solvers that know nothing of tensors."""
+        return SoftArrays(*(getattr(self, name).cpu().numpy() for name in SoftArrays._fields))
+
+
+class SoftArrays(NamedTuple):
+    """`SoftQPs` as NumPy arrays."""
+
+    H: np.ndarray
+    G: np.ndarray
+    group: np.ndarray
+    g: np.ndarray
+    l: np.ndarray  # noqa: E741
+    u: np.ndarray
+    w: np.ndarray
