@@ -231,7 +231,8 @@ def _eliminate(C: Tensor, keep: int) -> tuple[Tensor, Tensor] | None:
     M, n_c, n_z = C.shape
     T, Y = (np.array(part) for part in zip(*eliminated, strict=True)) if M else ((), ())
     shapes = (M, n_z, n_z - n_c), (M, n_z, n_c)
-    return tuple(torch.as_tensor(x).reshape(n).to(C) for x, n in zip((T, Y), shapes, strict=True))
+    T, Y = (torch.as_tensor(x).reshape(n).to(C) for x, n in zip((T, Y), shapes, strict=True))
+    return T, Y
 
 
 def _eliminate_one(C: np.ndarray, keep: int) -> tuple[np.ndarray, np.ndarray] | None:

@@ -91,7 +91,7 @@ class Replay:
         """Keep the active sets that the loss found for a sample, for the next time it is drawn."""
         if self.active_rows is None:
             return
-        stored = self.transitions.storage.get(slice(None))
+        stored: Any = self.transitions.storage[:]
         index = sample.get("index").unbind(-1)
         for key in ACTIVE_SETS:
             stored.get(key)[index] = sample.get(key)
