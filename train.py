@@ -36,6 +36,7 @@ from torch_qpmpc.experiment import (
     make_penalties,
     make_physics,
     make_true_mpc,
+    make_update,
     report,
     table,
 )
@@ -67,6 +68,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     target = SoftUpdate(loss_module, tau=cfg.target_rate) if cfg.delay_value else None
     deviation, si = make_penalties(cfg, mpc)
     optimizer, schedule = make_optimizer(cfg, mpc)
+    learn = make_update(cfg, mpc, loss_module, optimizer, deviation, si)
 
     # Data: vectorised episodes under today's policy, and one replay for transitions and windows.
     collector = make_collector(cfg, physics, operator)
@@ -97,16 +99,8 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 collected = time.perf_counter()
 
                 sample = replay.sample()
-                losses = loss_module(sample)
+                terms, losses = learn(sample, None if si is None else replay.sample_tau())
                 replay.remember(sample)
-                terms = {"loss/value": losses["loss_value"]}
-                if si is not None:
-                    terms["loss/si"] = si(mpc.C, replay.sample_tau())
-                if deviation is not None and cfg.penalty_step == "subgradient":
-                    terms["loss/deviation"] = deviation(mpc.C)
-                optimizer.zero_grad()
-                torch.stack(list(terms.values())).sum().backward()
-                optimizer.step()
                 if deviation is not None and cfg.penalty_step == "proximal":
                     # The penalty's weight falls with the rates, so that their ratio is kept.
                     deviation.proximal_step_(mpc.C, decay(cfg, update - 1))

@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: Everything shrinks but the point mass itself.
 SMALL = (
+    "optimizer=adam",
     "solver=daqp",
     "updates=4",
     "batch_size=8",
@@ -28,8 +29,9 @@ SMALL = (
 
 
 def make_config(*overrides: str) -> DictConfig:
-    """configs/ with overrides as on the command line."""
-    return copy.deepcopy(_composed(*overrides))
+    """configs/ with overrides as on the command line, of which the last for a key counts."""
+    latest = {override.partition("=")[0]: override for override in overrides}
+    return copy.deepcopy(_composed(*latest.values()))
 
 
 @functools.cache

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 import train
 from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
 from torch_qpmpc import QPError
-from torch_qpmpc.config import OPTIONAL, RULES, check_config, flatten
+from torch_qpmpc.config import OF_OPTIMIZER, OPTIONAL, RULES, check_config, flatten
 from torch_qpmpc.tracking import RunFolder
 
 GROUPS = sorted(path.name for path in CONFIGS.iterdir() if path.is_dir())
@@ -25,7 +25,8 @@ def keys_of_the_files() -> set[str]:
     for path in CONFIGS.rglob("*.yaml"):
         tree = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
         assert isinstance(tree, dict)
-        group = "" if path.parent == CONFIGS else f"{path.parent.name}"
+        whole = "# @package _global_" in path.read_text(encoding="utf-8")
+        group = "" if whole or path.parent == CONFIGS else path.parent.name
         keys |= set(
             flatten({k: v for k, v in tree.items() if k not in ("defaults", "hydra")}, group)
         )
@@ -56,14 +57,22 @@ class Recorder:
 
 
 def test_each_key_is_read(tmp_path, monkeypatch):
-    """By a run, or by the names of the run's folder."""
-    cfg = make_config(*SMALL, "constraint=combined", "delay_value=true", "constraint.si.windows=4")
+    """By a run of one order or the other, or by the names of the run's folder."""
     seen: set[str] = set()
     skip_figures(monkeypatch)
     # These two read everything at once, which proves nothing.
     monkeypatch.setattr(train, "check_config", lambda _: None)
-    monkeypatch.setattr(train, "RunFolder", lambda folder, _: RunFolder(folder, cfg))
-    train.train(Recorder(cfg, seen), str(tmp_path))  # pyright: ignore[reportArgumentType]
+    for optimizer in ("adam", "gauss_newton"):
+        cfg = make_config(
+            *SMALL,
+            f"optimizer={optimizer}",
+            "constraint=combined",
+            "delay_value=true",
+            "constraint.si.windows=4",
+        )
+        monkeypatch.setattr(train, "RunFolder", lambda folder, _, cfg=cfg: RunFolder(folder, cfg))
+        recorder: Any = Recorder(cfg, seen)
+        train.train(recorder, str(tmp_path / optimizer))
     text = (CONFIGS / "config.yaml").read_text(encoding="utf-8").partition("hydra:")[2]
     seen |= set(re.findall(r"\$\{([\w.]+)\}", text))
     assert seen == set(RULES)
@@ -72,6 +81,11 @@ def test_each_key_is_read(tmp_path, monkeypatch):
 @pytest.mark.parametrize("names", list(itertools.product(*map(choices, GROUPS))))
 def test_each_choice_of_groups_is_accepted(names):
     check_config(make_config(*(f"{g}={n}" for g, n in zip(GROUPS, names, strict=True))))
+
+
+def optimizer_with(key: str) -> str:
+    """The choice of an optimiser that has the key."""
+    return f"optimizer={'gauss_newton' if key in OF_OPTIMIZER['gauss_newton'] else 'adam'}"
 
 
 WHOLE = [0, -1, 1.5, True, "three", None, math.nan]
@@ -110,6 +124,9 @@ for _name in ("replay_capacity", "eval_interval", "log_interval", "constraint.si
     BAD[_name] = WHOLE
 for _name in ("task.horizon", "task.episode_steps"):
     BAD[_name] = WHOLE
+for _name in ("scale_cost", "scale_constraints", "damping"):
+    BAD[f"optimizer.{_name}"] = [0, *REAL]
+BAD["optimizer.trust_region"] = FLAG
 for _name in ("lr_cost", "lr_constraints"):
     BAD[f"optimizer.{_name}"] = REAL
 for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.growth", "si.beta"):
@@ -119,7 +136,7 @@ for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.grow
 @pytest.mark.parametrize("key", RULES)
 def test_impossible_values_are_rejected_by_name(key):
     assert key in BAD, "a new rule: add what it rejects"
-    good = make_config("constraint=combined", "optimizer=adam")
+    good = make_config("constraint=combined", optimizer_with(key))
     for value in BAD[key]:
         cfg = good.copy()
         OmegaConf.update(cfg, key, value)
@@ -131,6 +148,7 @@ def test_impossible_values_are_rejected_by_name(key):
 def test_rules_accept_the_edges():
     cfg = make_config(
         "constraint=combined",
+        "optimizer=adam",
         "seed=0",
         "updates=1",
         "td_error_clip=null",
@@ -167,7 +185,7 @@ def test_unknown_keys(key, remedy):
 
 @pytest.mark.parametrize("key", [*RULES, *OPTIONAL, "optimizer", "task", "noise", "constraint"])
 def test_missing_keys(key):
-    cfg = make_config("constraint=combined", "optimizer=adam")
+    cfg = make_config("constraint=combined", optimizer_with(key))
     owner, _, leaf = key.rpartition(".")
     OmegaConf.set_struct(cfg, False)
     del (OmegaConf.select(cfg, owner) if owner else cfg)[leaf]
@@ -205,6 +223,14 @@ def test_solver_must_be_known():
         (
             ["constraint=fixed", "task.learn_cost=[]"],
             r"task.learn_cost: got \[\], as is constraint.learn, expected something to learn",
+        ),
+        (
+            ["optimizer=gauss_newton", "penalty_step=subgradient"],
+            r"penalty_step: got subgradient, expected proximal. gauss_newton has no subgrad",
+        ),
+        (
+            ["optimizer=gauss_newton", "constraint=si", "constraint.si.normalised=true"],
+            r"constraint.si.normalised: got True, expected false. gauss_newton takes the pen",
         ),
         (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
     ],

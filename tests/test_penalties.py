@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from torch_qpmpc import QPMPC, DeviationPenalty, QPError, SystemIdentificationPenalty
 from torch_qpmpc.banded import banded_matrix
@@ -281,3 +282,13 @@ def test_windows_of_another_shape(generator, shape):
 def test_impossible_beta(beta):
     with pytest.raises(QPError, match=rf"beta: got {beta}, expected a finite weight >= 0"):
         SystemIdentificationPenalty(beta)
+
+
+def test_the_si_penalty_as_a_quadratic_in_C():
+    generator = torch.Generator().manual_seed(0)
+    C, windows = normal(generator, 3, 8), normal(generator, 5, 8)
+    penalty = SystemIdentificationPenalty(0.3)
+    S = penalty.curvature(windows)
+    assert_close(0.5 * ((C @ S) * C).sum(), penalty(C, windows))
+    with pytest.raises(QPError, match=r"normalised: got True, expected False\. Only then"):
+        SystemIdentificationPenalty(0.3, normalised=True).curvature(windows)

@@ -65,7 +65,7 @@ def test_folder_has_everything_logged(tmp_path):
 
     text = found.Tensors("config/text_summary")[0].tensor_proto.string_val[0].decode()
     assert "seed: 7" in text
-    assert "lr_constraints: 0.002" in text
+    assert "damping: 0.03" in text
     assert scalars(found, "hparam/J_final") == {0: 700.0}
     assert scalars(found, "hparam/closed_gap") == {0: 0.5}
     plugin = found.SummaryMetadata("_hparams_/session_start_info").plugin_data.content

@@ -59,7 +59,10 @@ def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 # --- One whole run -------------------------------------------------------------------------------
 
-WHOLE = ("solver=daqp", "seed=5", "constraint=combined", "updates=150", "eval_interval=75")
+WHOLE = (
+    *("optimizer=adam", "solver=daqp", "seed=5", "constraint=combined"),
+    *("updates=150", "eval_interval=75"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -306,6 +309,24 @@ def test_training_goes_on_past_unsolved_qps(tmp_path):
 
 
 @pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("constraint", ["free", "combined"])
+def test_the_second_order_learns_in_tens_of_updates(tmp_path, small, constraint):
+    overrides = ("solver=daqp", "seed=5", f"constraint={constraint}", "eval_interval=40")
+    summary = train.train(make_config(*overrides, "updates=40"), str(tmp_path))
+    assert summary["closed_gap"] > 0.85
+    assert summary["unsolved"] == 0
+    table = metrics(tmp_path)
+    assert (
+        table["train/td_error"].iloc[-10:].mean() < 0.2 * table["train/td_error"].iloc[1:6].mean()
+    )
+    assert (table["train/accepted"].dropna() == 1).mean() > 0.7
+    assert table["train/damping"].min() >= 0.03
+    if constraint == "combined":
+        deviation, distance = learned_C(tmp_path)
+        assert (deviation[distance > 0] == 0).all(), "the proximal step holds it exactly"
+        assert np.isfinite(table["loss/si"].dropna()).all()
+
+
 def test_an_interruption_leaves_what_was_logged(tmp_path, monkeypatch):
     calls, forward = [], QPQLearningLoss.loss_value
 

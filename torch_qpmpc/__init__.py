@@ -3,6 +3,7 @@
 from torch_qpmpc import envs as envs
 from torch_qpmpc.autograd import solve_qp
 from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.gauss_newton import GaussNewton
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.objectives import QPQLearningLoss
 from torch_qpmpc.operators import QPActorValueOperator
@@ -13,6 +14,7 @@ from torch_qpmpc.solvers.chain import SolveLog
 __all__ = [
     "QPMPC",
     "DeviationPenalty",
+    "GaussNewton",
     "QPActorValueOperator",
     "QPError",
     "QPQLearningLoss",

@@ -86,7 +86,7 @@ RULES: dict[str, Rule] = {
     "constraint.si.beta": NON_NEGATIVE,
     "constraint.si.windows": _whole(1),
     "constraint.si.normalised": FLAG,
-    "optimizer.name": _one_of("adam", "sgd"),
+    "optimizer.name": _one_of("adam", "sgd", "gauss_newton"),
     "optimizer.lr_cost": NON_NEGATIVE,
     "optimizer.lr_constraints": NON_NEGATIVE,
     "optimizer.betas": (
@@ -94,6 +94,18 @@ RULES: dict[str, Rule] = {
         "two numbers in [0, 1)",
     ),
     "optimizer.final_fraction": FRACTION,
+    "optimizer.scale_cost": POSITIVE,
+    "optimizer.scale_constraints": POSITIVE,
+    "optimizer.damping": POSITIVE,
+    "optimizer.trust_region": FLAG,
+}
+_RATES = {"optimizer.lr_cost", "optimizer.lr_constraints"}
+_METRIC = {"optimizer.scale_cost", "optimizer.scale_constraints"}
+#: The keys that each optimiser has beside its name and final_fraction.
+OF_OPTIMIZER = {
+    "adam": _RATES | {"optimizer.betas"},
+    "sgd": _RATES,
+    "gauss_newton": _METRIC | {"optimizer.damping", "optimizer.trust_region"},
 }
 #: A penalty that is null is off.
 OPTIONAL = ("constraint.deviation", "constraint.si")
@@ -111,10 +123,11 @@ def check_config(cfg: DictConfig) -> None:
         accepts, expected = RULES[key]
         if not accepts(value):
             raise QPError.expected(key, repr(value), expected)
-    required = [
-        key for key in RULES if key != "optimizer.betas" or given.get("optimizer.name") == "adam"
-    ]
-    for key in required:
+    special = set().union(*OF_OPTIMIZER.values())
+    own = OF_OPTIMIZER.get(given.get("optimizer.name", ""), set())
+    for key in RULES:
+        if key in special - own:
+            continue
         if key not in given and not any(key.startswith(f"{name}.") for name in off):
             raise QPError.expected(key, "nothing", RULES[key][1])
     backend(cfg.solver)
@@ -139,6 +152,18 @@ def check_config(cfg: DictConfig) -> None:
                     f"at least task.horizon = {cfg.task.horizon}",
                     "So long are the windows of constraint.si.",
                 )
+    if cfg.optimizer.name == "gauss_newton":
+        if cfg.constraint.deviation is not None and cfg.penalty_step != "proximal":
+            raise QPError.expected(
+                "penalty_step", cfg.penalty_step, "proximal", "gauss_newton has no subgradients."
+            )
+        if cfg.constraint.si is not None and cfg.constraint.si.normalised:
+            raise QPError.expected(
+                "constraint.si.normalised",
+                True,
+                "false",
+                "gauss_newton takes the penalty as a quadratic in C, which this is not.",
+            )
     if cfg.replay_capacity % cfg.num_envs:
         raise QPError.expected(
             "replay_capacity", cfg.replay_capacity, f"a multiple of num_envs = {cfg.num_envs}"

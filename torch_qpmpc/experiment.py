@@ -15,12 +15,15 @@ from torchrl.modules import AdditiveGaussianModule
 
 from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv
 from torch_qpmpc.evaluation import ClosedLoop, closed_gap, closed_loop
+from torch_qpmpc.gauss_newton import GaussNewton
 from torch_qpmpc.mpc import QPMPC
+from torch_qpmpc.objectives import QPQLearningLoss
 from torch_qpmpc.operators import QPActorValueOperator
 from torch_qpmpc.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.plots import closed_loop_figure, constraint_figure
 from torch_qpmpc.structure import distance_by_band
 from torch_qpmpc.tracking import RunFolder
+from torch_qpmpc.updates import Update, first_order, second_order
 
 
 def make_physics(cfg: DictConfig) -> PointMass:
@@ -90,12 +93,36 @@ def make_penalties(
 def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> tuple[torch.optim.Optimizer, LambdaLR]:
     """The optimiser, with one rate for the cost and one for the constraints, and their decay."""
     options = cfg.optimizer
+    if options.name == "gauss_newton":
+        optimizer = GaussNewton(
+            mpc,
+            scales={"cost": options.scale_cost, "constraints": options.scale_constraints},
+            damping=options.damping,
+            td_error_clip=cfg.td_error_clip,
+            trust_region=options.trust_region,
+        )
+        return optimizer, LambdaLR(optimizer, partial(decay, cfg))
     groups = mpc.parameter_groups({"cost": options.lr_cost, "constraints": options.lr_constraints})
     if options.name == "adam":
         optimizer = torch.optim.Adam(groups, betas=tuple(options.betas))
     else:
         optimizer = torch.optim.SGD(groups)
     return optimizer, LambdaLR(optimizer, partial(decay, cfg))
+
+
+def make_update(
+    cfg: DictConfig,
+    mpc: QPMPC,
+    loss_module: QPQLearningLoss,
+    optimizer: torch.optim.Optimizer,
+    deviation: DeviationPenalty | None,
+    si: SystemIdentificationPenalty | None,
+) -> Update:
+    """What a batch does to theta, by the optimiser's order."""
+    if isinstance(optimizer, GaussNewton):
+        return second_order(mpc, loss_module, optimizer, si)
+    by_gradient = deviation if cfg.penalty_step == "subgradient" else None
+    return first_order(mpc, loss_module, optimizer, by_gradient, si)
 
 
 def decay(cfg: DictConfig, update: int) -> float:

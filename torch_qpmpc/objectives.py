@@ -29,6 +29,30 @@ def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Te
     return F.huber_loss(prediction, target, reduction="none", delta=clip)
 
 
+def td_metadata(prediction: Tensor, target: Tensor) -> dict[str, Tensor]:
+    """Detached scalars that describe a batch of values and their targets, ``(*batch,)`` each.
+
+    What is not finite, that is not solved, is counted and left out.
+    """
+    solved = prediction.isfinite() & target.isfinite()
+    prediction, target = torch.where(solved, prediction, 0), torch.where(solved, target, 0)
+
+    def mean(x: Tensor) -> Tensor:
+        return x.sum() / solved.sum().clamp(min=1)
+
+    def largest(x: Tensor) -> Tensor:
+        return x.masked_fill(~solved, -torch.inf).max().nan_to_num(neginf=0.0)
+
+    return {
+        "td_error": mean((target - prediction).abs()),
+        "pred_value": mean(prediction),
+        "target_value": mean(target),
+        "pred_value_max": largest(prediction),
+        "target_value_max": largest(target),
+        "unsolved": (~solved).sum(),
+    }
+
+
 class QPQLearningLoss(LossModule):
     """Semi-gradient Q-learning, delta = L + gamma (1 - terminated) V(s+) - Q(s, a) (eq:thup).
 
@@ -212,34 +236,26 @@ class QPQLearningLoss(LossModule):
         if active_set is not None:
             tensordict.set(active_set, visited.get(active_set))
         prediction = visited[self.tensor_keys.state_action_value].squeeze(-1)
-        with torch.no_grad():
-            target = self.value_estimator.value_estimate(
-                tensordict.copy(), next_value=self._next_value(tensordict)
-            ).squeeze(-1)
-
+        target = self.target(tensordict)
+        metadata = td_metadata(prediction.detach(), target)
         # An unsolved QP's cost is infinite.
         solved = prediction.isfinite() & target.isfinite()
         prediction = torch.where(solved, prediction, 0)
         target = torch.where(solved, target, 0)
-        delta = (target - prediction).detach()
-        tensordict.set(self.tensor_keys.priority, delta.square(), inplace=True)
-
-        def mean(x: Tensor) -> Tensor:
-            return x.sum() / solved.sum().clamp(min=1)
-
-        def largest(x: Tensor) -> Tensor:
-            return x.masked_fill(~solved, -torch.inf).max().nan_to_num(neginf=0.0)
-
-        metadata = {
-            "td_error": mean(delta.abs()),
-            "pred_value": mean(prediction.detach()),
-            "target_value": mean(target),
-            "pred_value_max": largest(prediction.detach()),
-            "target_value_max": largest(target),
-            "unsolved": (~solved).sum(),
-        }
+        priority = (target - prediction).detach().square()
+        tensordict.set(self.tensor_keys.priority, priority, inplace=True)
         loss = td_loss(prediction, target, self.td_error_clip)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
+
+    @torch.no_grad()
+    def target(self, tensordict: TensorDictBase) -> Tensor:
+        """What the estimator makes of V(s+), ``(*batch,)``; -inf where V(s+) has no solution.
+
+        With TD(0), r + gamma (1 - terminated) V(s+) in TorchRL's signs.
+        """
+        next_value = self._next_value(tensordict)
+        value = self.value_estimator.value_estimate(tensordict.copy(), next_value=next_value)
+        return value.squeeze(-1)
 
     def _next_value(self, tensordict: TensorDictBase) -> Tensor:
         """-V(s+), ``(*batch, 1)``; zero after a termination, where it is not used."""

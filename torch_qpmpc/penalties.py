@@ -144,6 +144,17 @@ class SystemIdentificationPenalty(nn.Module):
             raise QPError.expected("beta", beta, "a finite weight >= 0")
         self.beta, self.normalised = beta, normalised
 
+    def curvature(self, windows: Tensor) -> Tensor:
+        """S ``(n_z, n_z)`` of the penalty as ``1/2 tr(C S C')``, which it is if not normalised.
+
+        Raises:
+            QPError: it is normalised.
+        """
+        if self.normalised:
+            raise QPError.expected("normalised", True, "False", "Only then it is a quadratic in C.")
+        windows = windows.to(torch.float64)
+        return 2 * self.beta * windows.mT @ windows
+
     def forward(self, C: Tensor, windows: Tensor) -> Tensor:
         """The penalty of C ``(n_c, n_z)`` on windows ``(M, n_z)``, a scalar."""
         return self.beta * system_identification_penalty(C, windows, normalised=self.normalised)

@@ -1,0 +1,290 @@
+"""Second-order Q-learning: a Levenberg-Marquardt step on a batch of TD errors, in kernel form.
+
+With g_i = dQ(s_i, a_i)/dtheta by the envelope theorem and a metric D on theta, the step solves
+
+    min over dtheta:  1/2 sum_i (delta_i - g_i'dtheta)^2 + 1/2 mu dtheta'D^-1 dtheta
+
+by its dual, ``dtheta = D sum_i alpha_i g_i``, ``(K + mu I) alpha = delta``, ``K_ij = g_i'D g_j``:
+a system as large as the batch. For a free C, whose gradients are the outer products chi_i z_i',
+``K = (chi chi') * (z P z')``, and none of them is formed. P is the metric of C's rows: a multiple
+of the identity, or with the SI penalty (eq:sdp3), a quadratic in each row, the inverse of the two
+curvatures' sum, so that the penalty is part of the same step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc import QPMPC
+from torch_qpmpc.qp import QPSolution
+
+#: Decrease over predicted decrease: below the first the damping rises, above the second it falls.
+POOR, GOOD = 0.25, 0.75
+RISE, FALL = 4.0, 0.5
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What a step did.
+
+    Attributes:
+        solution: of Q(s, a) before the step.
+        damping: mu as a fraction of the mean of K's diagonal, as it was used.
+        ratio: the decrease of the squared errors over the predicted one; nan without trust region.
+        accepted: whether theta has moved.
+    """
+
+    solution: QPSolution
+    damping: float
+    ratio: float
+    accepted: bool
+
+
+class GaussNewton(torch.optim.Optimizer):
+    """Levenberg-Marquardt steps for the learned parts of a `QPMPC`, whichever they are.
+
+    Its ``lr``, which torch's schedulers change, is the part of the step that is taken.
+
+    Args:
+        mpc: the QPMPC. With ``on_failure="mask"``, pairs without a solution are left out.
+        scales: the metric D, a factor for each learned part of theta or for the ``"cost"`` and the
+            ``"constraints"``, as in `QPMPC.parameter_groups`. Only their ratios matter.
+        lr: the part of the step at first, in (0, 1].
+        damping: mu, as a fraction of the mean of K's diagonal; the least that the trust region
+            comes back to. It also says how far the noise of one batch is to be believed.
+        td_error_clip: bound of the TD error; none by default.
+        trust_region: solve the batch again after a step; take back one that raised the squared
+            errors (the targets held), and adapt the damping to how well they were predicted.
+
+    Raises:
+        QPError: a number out of its range, or scales that do not fit the learned parts.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> mpc = qm.QPMPC(2, 1, 3, solver="daqp")
+        >>> optimizer = qm.GaussNewton(mpc)
+        >>> s, a = torch.ones(1, 2), torch.zeros(1, 1)
+        >>> target = mpc.action_value(s, a).detach() + 1.0  # L + gamma V(s+)
+        >>> optimizer.step(s, a, target).accepted
+        True
+        >>> bool((mpc.action_value(s, a) - target).abs() < 0.2)
+        True
+    """
+
+    def __init__(
+        self,
+        mpc: QPMPC,
+        *,
+        scales: Mapping[str, float] | None = None,
+        lr: float = 1.0,
+        damping: float = 0.03,
+        td_error_clip: float | None = None,
+        trust_region: bool = True,
+    ) -> None:
+        if not 0 < lr <= 1:
+            raise QPError.expected("lr", lr, "a number in (0, 1]")
+        for name, number in (("damping", damping), ("td_error_clip", td_error_clip)):
+            if number is not None and not 0 < number < torch.inf:
+                raise QPError.expected(name, number, "a finite number > 0")
+        groups = mpc.parameter_groups(scales or {"cost": 1.0, "constraints": 1e-2})
+        for group in groups:
+            group |= {"scale": group["lr"], "lr": lr, "damping": damping}
+        super().__init__(groups, {})
+        self._mpc, self._least_damping = mpc, damping
+        self._clip, self._trust_region = td_error_clip, trust_region
+
+    @torch.no_grad()
+    def step(  # pyright: ignore[reportIncompatibleMethodOverride] - not a closure
+        self,
+        s: Tensor,
+        a: Tensor,
+        target: Tensor,
+        *,
+        penalty: Tensor | None = None,
+        warm_start: Tensor | None = None,
+    ) -> StepReport:
+        """Move theta so that Q(s, a) approaches ``target``, as far as the damping lets it.
+
+        Args:
+            s, a: visited pairs, ``(B, n_x)`` and ``(B, n_u)``.
+            target: costs to go, L + gamma V(s+), ``(B,)``; where it is not finite, the pair is
+                left out.
+            penalty: S ``(n_z, n_z)`` of a penalty ``1/2 tr(C S C')`` against the batch's mean of
+                ``1/2 delta^2``, such as `SystemIdentificationPenalty.curvature`; for a free C.
+            warm_start: active sets of Q(s, a), ``(B, n_g)``.
+
+        Raises:
+            QPError: a penalty without a free C.
+        """
+        group = self.param_groups[0]
+        solution = self._mpc.solve(s, a, warm_start=warm_start)
+        use = solution.solved & target.isfinite()
+        delta = torch.where(use, target.to(solution.value) - solution.value, 0)
+        if self._clip is not None:
+            delta = delta.clamp(-self._clip, self._clip)
+        if penalty is not None:
+            penalty = max(int(use.sum()), 1) * penalty
+        lr, damping = group["lr"], group["damping"]
+        blocks = self._blocks(solution, use, penalty)
+        alpha, change = _solve(blocks, delta, damping)
+        old = [block.leaf.clone() for block in blocks]
+        steps = [block.step(alpha) for block in blocks]
+        if not self._trust_region:
+            _move(blocks, steps, lr)
+            return StepReport(solution, damping, math.nan, True)
+        before = _objective(delta, blocks)
+        _move(blocks, steps, lr)
+        predicted = before - _objective(delta - lr * change, blocks)
+        again = self._mpc.solve(s, a, warm_start=solution.active)
+        decrease = before - _objective(
+            delta - torch.where(use, again.value - solution.value, 0), blocks
+        )
+        # With nothing to gain there is nothing to judge.
+        ratio = float(decrease / predicted) if predicted > 0 else 1.0
+        accepted = ratio > 0  # false for the NaN of an infinite cost
+        if not accepted:
+            for block, value in zip(blocks, old, strict=True):
+                block.leaf.copy_(value)
+        self._adapt(ratio)
+        return StepReport(solution, damping, ratio, accepted)
+
+    def _adapt(self, ratio: float) -> None:
+        for group in self.param_groups:
+            if not ratio >= POOR:
+                group["damping"] *= RISE
+            elif ratio > GOOD:
+                group["damping"] = max(FALL * group["damping"], self._least_damping)
+
+    def _blocks(
+        self, solution: QPSolution, use: Tensor, penalty: Tensor | None
+    ) -> list[_Dense | _OuterProducts]:
+        """The gradients of Q in each learned part, zero where not in ``use``."""
+        mpc = self._mpc
+        weight = use.to(solution.z)
+        z, chi, lam = (x * weight.unsqueeze(-1) for x in (solution.z, solution.chi, solution.lam))
+        sigma = solution.sigma * weight.unsqueeze(-1)
+        # The envelope gradients in the tensors of the QP, see `torch_qpmpc.autograd`.
+        gradients: dict[str, Callable[[], Tensor]] = {
+            "H": lambda: 0.5 * z.unsqueeze(-1) * z.unsqueeze(-2),
+            "q": lambda: z,
+            "c": lambda: weight,
+            "C": lambda: chi.unsqueeze(-1) * z.unsqueeze(-2),
+            "b": lambda: -chi,
+            "G": lambda: lam.unsqueeze(-1) * z.unsqueeze(-2),
+            "lb": lambda: (-lam).clamp(min=0),
+            "ub": lambda: -lam.clamp(min=0),
+            "w": lambda: sigma,
+        }
+        factored = mpc._parameters.get("C")
+        if penalty is not None and factored is None:
+            raise QPError.expected("penalty", "a C that is not free", "C among the learned parts")
+        with torch.enable_grad():
+            qp = mpc.quadratic_program()
+        names = [name for name in gradients if getattr(qp, name).requires_grad]
+        names = [name for name in names if name != "C" or factored is None]
+        leaves = [group["params"][0] for group in self.param_groups]
+        dense = [leaf for leaf in leaves if leaf is not factored]
+        found = iter(())
+        if dense:
+            found = iter(
+                torch.autograd.grad(
+                    [getattr(qp, name) for name in names],
+                    dense,
+                    [gradients[name]() for name in names],
+                    is_grads_batched=True,
+                    materialize_grads=True,
+                )
+            )
+        return [
+            _OuterProducts(leaf, group["scale"], chi, z, penalty)
+            if leaf is factored
+            else _Dense(leaf, group["scale"], next(found).reshape(len(z), -1))
+            for group, leaf in zip(self.param_groups, leaves, strict=True)
+        ]
+
+
+class _Dense:
+    """The gradients in one parameter, as rows ``(B, n)``; its metric is ``scale``."""
+
+    def __init__(self, leaf: nn.Parameter, scale: float, rows: Tensor) -> None:
+        self.leaf, self.scale, self.rows = leaf, scale, rows
+
+    def diagonal(self) -> Tensor:
+        """Of the kernel, ``(B,)``."""
+        return self.scale * self.rows.square().sum(-1)
+
+    def damp(self, mu: Tensor) -> Tensor:
+        """What the parameter's own penalty makes of Q, ``(B,)``: it has none."""
+        return torch.zeros_like(self.rows[:, 0])
+
+    def kernel(self) -> Tensor:
+        return self.scale * self.rows @ self.rows.mT
+
+    def step(self, alpha: Tensor) -> Tensor:
+        return (self.scale * alpha @ self.rows).reshape(self.leaf.shape)
+
+    def penalty(self) -> Tensor | float:
+        return 0.0
+
+
+class _OuterProducts:
+    """The gradients ``chi_i z_i'`` in C, with the metric P ``(n_z, n_z)`` of its rows.
+
+    The penalty ``1/2 tr(C S C')`` draws C by ``drift`` before any TD error does.
+    """
+
+    def __init__(
+        self, leaf: nn.Parameter, scale: float, chi: Tensor, z: Tensor, S: Tensor | None
+    ) -> None:
+        self.leaf, self.scale, self.chi, self.z, self.S = leaf, scale, chi, z, S
+        self.z_P, self.drift = scale * z, torch.zeros_like(leaf)
+
+    def diagonal(self) -> Tensor:
+        return self.scale * self.chi.square().sum(-1) * self.z.square().sum(-1)
+
+    def damp(self, mu: Tensor) -> Tensor:
+        if self.S is None:
+            return torch.zeros_like(self.z[:, 0])
+        precision = mu / self.scale * torch.eye(len(self.S)).to(self.S) + self.S
+        inverse = torch.linalg.inv(precision)
+        self.z_P, self.drift = mu * self.z @ inverse, -(self.leaf @ self.S) @ inverse
+        return ((self.chi @ self.drift) * self.z).sum(-1)
+
+    def kernel(self) -> Tensor:
+        return (self.chi @ self.chi.mT) * (self.z_P @ self.z.mT)
+
+    def step(self, alpha: Tensor) -> Tensor:
+        return (alpha.unsqueeze(-1) * self.chi).mT @ self.z_P + self.drift
+
+    def penalty(self) -> Tensor | float:
+        return 0.0 if self.S is None else 0.5 * ((self.leaf @ self.S) * self.leaf).sum()
+
+
+def _solve(
+    blocks: list[_Dense | _OuterProducts], delta: Tensor, damping: float
+) -> tuple[Tensor, Tensor]:
+    """alpha ``(B,)``, and the change of Q that the whole step is expected to make, ``(B,)``."""
+    mu = damping * sum((block.diagonal() for block in blocks), torch.zeros_like(delta)).mean()
+    mu = mu.clamp(min=torch.finfo(mu.dtype).tiny)
+    drifted = sum((block.damp(mu) for block in blocks), torch.zeros_like(delta))
+    K = sum((block.kernel() for block in blocks), torch.zeros(1).to(delta))
+    damped = K + mu * torch.eye(len(delta)).to(delta)
+    factor = torch.linalg.cholesky(damped)
+    alpha = torch.cholesky_solve((delta - drifted).unsqueeze(-1), factor).squeeze(-1)
+    return alpha, K @ alpha + drifted
+
+
+def _move(blocks: list[_Dense | _OuterProducts], steps: list[Tensor], lr: float) -> None:
+    for block, step in zip(blocks, steps, strict=True):
+        block.leaf.add_(step, alpha=lr)
+
+
+def _objective(left: Tensor, blocks: list[_Dense | _OuterProducts]) -> Tensor:
+    """What a step is to decrease: half the squared errors, and the penalties."""
+    return 0.5 * left.square().sum() + sum(block.penalty() for block in blocks)

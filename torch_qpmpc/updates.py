@@ -1,0 +1,80 @@
+"""One update of theta from a batch of transitions: of the first order (eq:thup), or of the second.
+
+An update takes a batch and the windows for the SI penalty (None without it), moves theta, and
+returns what there is to log: the terms of the loss, and scalars that describe the batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torch_qpmpc.gauss_newton import GaussNewton
+from torch_qpmpc.mpc import QPMPC
+from torch_qpmpc.objectives import QPQLearningLoss, td_loss, td_metadata
+from torch_qpmpc.penalties import DeviationPenalty, SystemIdentificationPenalty
+
+Scalars = Mapping[str, Tensor]
+Update = Callable[[TensorDictBase, Tensor | None], tuple[dict[str, Tensor], Scalars]]
+
+
+def first_order(
+    mpc: QPMPC,
+    loss_module: QPQLearningLoss,
+    optimizer: torch.optim.Optimizer,
+    deviation: DeviationPenalty | None,
+    si: SystemIdentificationPenalty | None,
+) -> Update:
+    """The gradient of the loss and of the penalties, for any torch optimiser.
+
+    ``deviation`` is None where its proximal step is taken instead.
+    """
+
+    def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
+        losses = loss_module(batch)
+        terms = {"loss/value": losses["loss_value"]}
+        if si is not None and windows is not None:
+            terms["loss/si"] = si(mpc.C, windows)
+        if deviation is not None:
+            terms["loss/deviation"] = deviation(mpc.C)
+        optimizer.zero_grad()
+        torch.stack(list(terms.values())).sum().backward()
+        optimizer.step()
+        return terms, losses
+
+    return update
+
+
+def second_order(
+    mpc: QPMPC,
+    loss_module: QPQLearningLoss,
+    optimizer: GaussNewton,
+    si: SystemIdentificationPenalty | None,
+) -> Update:
+    """A Gauss-Newton step towards the loss module's targets, the SI penalty in the same step."""
+    network = loss_module.value_network
+    observation, action = network.in_keys
+
+    def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
+        target, terms, penalty = loss_module.target(batch), {}, None
+        if si is not None and windows is not None:
+            penalty = si.curvature(windows)
+            terms["loss/si"] = si(mpc.C, windows)
+        start = None if network.active_set_key is None else batch.get(network.active_set_key, None)
+        s, a = batch.get(observation), batch.get(action)
+        report = optimizer.step(s, a, -target, penalty=penalty, warm_start=start)
+        if network.active_set_key is not None:
+            batch.set(network.active_set_key, report.solution.active)
+        prediction = -report.solution.value.to(target)
+        losses = td_metadata(prediction, target)
+        solved = prediction.isfinite() & target.isfinite()
+        of_each = td_loss(prediction, target, loss_module.td_error_clip)
+        terms["loss/value"] = of_each[solved].sum() / solved.sum().clamp(min=1)
+        terms["train/damping"] = torch.tensor(report.damping)
+        terms["train/accepted"] = torch.tensor(float(report.accepted))
+        return terms, losses
+
+    return update
