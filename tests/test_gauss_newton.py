@@ -188,6 +188,15 @@ def test_schedulers_change_the_part_of_the_step_that_is_taken():
     assert_close(mpc.C.detach() - before, whole / 2)
 
 
+def test_frozen_parts_stay():
+    mpc = random_mpc(14)
+    mpc.C.requires_grad_(False)
+    before, target = copy.deepcopy(mpc.state_dict()), targets(mpc)
+    GaussNewton(mpc).step(*pairs(), target)
+    assert torch.equal(mpc.C, before["C"])
+    assert not torch.equal(mpc.c, before["c"])
+
+
 def test_its_state_can_be_saved():
     mpc = random_mpc(11)
     optimizer = GaussNewton(mpc)

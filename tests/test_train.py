@@ -316,9 +316,8 @@ def test_the_second_order_learns_in_tens_of_updates(tmp_path, small, constraint)
     assert summary["closed_gap"] > 0.85
     assert summary["unsolved"] == 0
     table = metrics(tmp_path)
-    assert (
-        table["train/td_error"].iloc[-10:].mean() < 0.2 * table["train/td_error"].iloc[1:6].mean()
-    )
+    errors = table["train/td_error"]
+    assert errors.iloc[-10:].mean() < 0.5 * errors.iloc[1:6].mean()
     assert (table["train/accepted"].dropna() == 1).mean() > 0.7
     assert table["train/damping"].min() >= 0.03
     if constraint == "combined":

@@ -26,7 +26,7 @@ from torch_qpmpc.qp import QPSolution
 
 #: Decrease over predicted decrease: below the first the damping rises, above the second it falls.
 POOR, GOOD = 0.25, 0.75
-RISE, FALL = 4.0, 0.5
+RISE, FALL, MOST_DAMPING = 4.0, 0.5, 1e6
 
 
 @dataclass(frozen=True)
@@ -157,14 +157,14 @@ class GaussNewton(torch.optim.Optimizer):
     def _adapt(self, ratio: float) -> None:
         for group in self.param_groups:
             if not ratio >= POOR:
-                group["damping"] *= RISE
+                group["damping"] = min(RISE * group["damping"], MOST_DAMPING)
             elif ratio > GOOD:
                 group["damping"] = max(FALL * group["damping"], self._least_damping)
 
     def _blocks(
         self, solution: QPSolution, use: Tensor, penalty: Tensor | None
     ) -> list[_Dense | _OuterProducts]:
-        """The gradients of Q in each learned part, zero where not in ``use``."""
+        """The gradients of Q in each learned part that is not frozen, zero where not in ``use``."""
         mpc = self._mpc
         weight = use.to(solution.z)
         z, chi, lam = (x * weight.unsqueeze(-1) for x in (solution.z, solution.chi, solution.lam))
@@ -181,14 +181,15 @@ class GaussNewton(torch.optim.Optimizer):
             "ub": lambda: -lam.clamp(min=0),
             "w": lambda: sigma,
         }
-        factored = mpc._parameters.get("C")
+        groups = [group for group in self.param_groups if group["params"][0].requires_grad]
+        leaves = [group["params"][0] for group in groups]
+        factored = next((leaf for leaf in leaves if leaf is mpc._parameters.get("C")), None)
         if penalty is not None and factored is None:
             raise QPError.expected("penalty", "a C that is not free", "C among the learned parts")
         with torch.enable_grad():
             qp = mpc.quadratic_program()
         names = [name for name in gradients if getattr(qp, name).requires_grad]
         names = [name for name in names if name != "C" or factored is None]
-        leaves = [group["params"][0] for group in self.param_groups]
         dense = [leaf for leaf in leaves if leaf is not factored]
         found = iter(())
         if dense:
@@ -205,7 +206,7 @@ class GaussNewton(torch.optim.Optimizer):
             _OuterProducts(leaf, group["scale"], chi, z, penalty)
             if leaf is factored
             else _Dense(leaf, group["scale"], next(found).reshape(len(z), -1))
-            for group, leaf in zip(self.param_groups, leaves, strict=True)
+            for group, leaf in zip(groups, leaves, strict=True)
         ]
 
 
