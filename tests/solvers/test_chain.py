@@ -158,6 +158,18 @@ def test_a_known_active_set_spares_the_backend(monkeypatch, own):
     assert (log.fallback, log.recalled) == (0, BATCH - 2)
 
 
+@pytest.mark.parametrize("one", range(BATCH))
+def test_a_part_of_a_batch_may_have_other_rows(one):
+    """Rows without a bound are left out, and which they are differs from element to element."""
+    known = known_qp(3, batch=(BATCH,))
+    active = solve(known, solver="torch").active
+    unknown = torch.full_like(active, UNKNOWN)
+    unknown[one] = active[one]
+    with SolveLog() as log:
+        assert_right(solve(known, solver="torch", warm_start=unknown), known)
+    assert log.recalled == 1
+
+
 def test_the_active_set_of_what_is_not_solved_is_unknown():
     known = spoil(known_qp(3, batch=(BATCH,)), 4)
     active = solve(known, solver="daqp", on_failure="mask").active

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextvars
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import partial
 
@@ -167,8 +168,7 @@ class _Chain:
             return
         if solver not in OWN_WARM_STARTS:
             others, self.todo = self.todo[~known[self.todo]], before
-        active = start[self.todo][:, self.reduced.rows]
-        self.attempt(partial(warm_start(solver), active=active), sharpen=False)
+        self.attempt(warm_start(solver), start)
         self.recalled = len(before) - int(known[self.todo].sum())
         self.todo = torch.cat((self.todo, others)).sort().values
 
@@ -180,12 +180,19 @@ class _Chain:
     def reduced_for(self, part: FlatPrograms) -> Reduced:
         return condensed_for(part, self.keep).reduced(part)
 
-    def attempt(self, solve: Backend, *, sharpen: bool = True) -> None:
-        """Ask for what is still to be solved, and keep what the certificate accepts."""
+    def attempt(self, solve: Callable[..., Answer], start: Tensor | None = None) -> None:
+        """Ask for what is still to be solved, and keep what the certificate accepts.
+
+        A warm start gets its part of the active sets ``start``; what it misses is not sharpened.
+        """
         if not len(self.todo) and self.raw is not None:
             return
         part = self.part()
-        claim = _attempt(solve, part, self.reduced_for(part), sharpen)
+        reduced = self.reduced_for(part)
+        if start is not None:
+            # A part of a batch may have fewer rows with a bound than the whole.
+            solve = partial(solve, active=start[self.todo][:, reduced.rows])
+        claim = _attempt(solve, part, reduced, sharpen=start is None)
         accepted = claim.residual <= TOLERANCE
         if accepted.all() and len(part) == len(self.programs):
             self.raw, self.todo = claim, self.todo[:0]
