@@ -50,6 +50,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     check_config(cfg)
     torchrl_logger.setLevel("WARNING")
     torch.manual_seed(cfg.seed)
+    torch.set_num_threads(cfg.threads)
 
     # The QP, between its two ends: the corrupted model it starts from, and the true one.
     physics = make_physics(cfg)

@@ -118,7 +118,7 @@ BAD: dict[str, list[Any]] = {
     "optimizer.betas": [0.9, [0.9], [0.9, 1.0], [-0.1, 0.9], ["a", "b"], [0.9] * 3, None],
     "optimizer.final_fraction": FRACTION,
 }
-for _name in ("updates", "batch_size", "num_envs", "steps_per_update", "warmup_steps"):
+for _name in ("threads", "updates", "batch_size", "num_envs", "steps_per_update", "warmup_steps"):
     BAD[_name] = WHOLE
 for _name in ("replay_capacity", "eval_interval", "log_interval", "constraint.si.windows"):
     BAD[_name] = WHOLE

@@ -53,6 +53,7 @@ RULES: dict[str, Rule] = {
     "seed": (lambda x: _whole(0)[0](x) and x < 2**63, "a whole number >= 0 and < 2^63"),
     "solver": NAME,
     "warm_start": FLAG,
+    "threads": _whole(1),
     "updates": _whole(1),
     "batch_size": _whole(1),
     "num_envs": _whole(1),
