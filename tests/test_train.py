@@ -310,7 +310,7 @@ def test_training_goes_on_past_unsolved_qps(tmp_path):
 
 @pytest.mark.usefixtures("small")
 @pytest.mark.parametrize("constraint", ["free", "combined"])
-def test_the_second_order_learns_in_tens_of_updates(tmp_path, small, constraint):
+def test_the_second_order_learns_in_tens_of_updates(tmp_path, constraint):
     overrides = ("solver=daqp", "seed=5", f"constraint={constraint}", "eval_interval=40")
     summary = train.train(make_config(*overrides, "updates=40"), str(tmp_path))
     assert summary["closed_gap"] > 0.85
@@ -326,6 +326,7 @@ def test_the_second_order_learns_in_tens_of_updates(tmp_path, small, constraint)
         assert np.isfinite(table["loss/si"].dropna()).all()
 
 
+@pytest.mark.usefixtures("small")
 def test_an_interruption_leaves_what_was_logged(tmp_path, monkeypatch):
     calls, forward = [], QPQLearningLoss.loss_value
 

@@ -73,7 +73,7 @@ def second_order(
         solved = prediction.isfinite() & target.isfinite()
         of_each = td_loss(prediction, target, loss_module.td_error_clip)
         terms["loss/value"] = of_each[solved].sum() / solved.sum().clamp(min=1)
-        terms["train/damping"] = torch.tensor(report.damping)
+        terms["train/damping"] = torch.tensor(report.damping, dtype=torch.float64)
         terms["train/accepted"] = torch.tensor(float(report.accepted))
         return terms, losses
 
