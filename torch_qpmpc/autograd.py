@@ -15,6 +15,7 @@ operator alone is not.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -255,24 +256,33 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
         sigma = slacks(z, *theta[5:9])
     # An unsolved element has zeros here, but zero times an infinite incoming gradient is NaN.
     weight = torch.where(status.eq(int(Status.SOLVED)), grad_value, 0)
+    gradients = envelope_gradients(weight, z, sigma, chi, lam, xi).values()
+    needed = ctx.needs_input_grad[:N_THETA]
+    found = (f(x) if need else None for f, x, need in zip(gradients, theta, needed, strict=True))
+    return (*found, *(None,) * N_OTHERS)
+
+
+def envelope_gradients(
+    weight: Tensor, z: Tensor, sigma: Tensor, chi: Tensor, lam: Tensor, xi: Tensor
+) -> dict[str, Callable[[Tensor], Tensor]]:
+    """The gradient of sum_i weight_i value_i in each tensor of the QP, and in the fixed entries.
+
+    Each is a function of the tensor: over the batch dimensions that it lacks, the gradient is
+    summed.
+    """
     weighted_z = weight.unsqueeze(-1) * z
-    gradients = {
-        0: lambda like: 0.5 * outer(weighted_z, z, like),
-        1: lambda like: weighted_sum(weight, z, like),
-        2: lambda like: sum_to(weight, like),
-        3: lambda like: outer(chi, weighted_z, like),
-        4: lambda like: weighted_sum(-weight, chi, like),
-        5: lambda like: outer(lam, weighted_z, like),
-        6: lambda like: weighted_sum(weight, (-lam).clamp(min=0), like),
-        7: lambda like: weighted_sum(-weight, lam.clamp(min=0), like),
-        8: lambda like: weighted_sum(weight, sigma, like),
-        9: lambda like: weighted_sum(-weight, xi, like),
+    return {
+        "H": lambda like: 0.5 * outer(weighted_z, z, like),
+        "q": lambda like: weighted_sum(weight, z, like),
+        "c": lambda like: sum_to(weight, like),
+        "C": lambda like: outer(chi, weighted_z, like),
+        "b": lambda like: weighted_sum(-weight, chi, like),
+        "G": lambda like: outer(lam, weighted_z, like),
+        "lb": lambda like: weighted_sum(weight, (-lam).clamp(min=0), like),
+        "ub": lambda like: weighted_sum(-weight, lam.clamp(min=0), like),
+        "w": lambda like: weighted_sum(weight, sigma, like),
+        "fixed": lambda like: weighted_sum(-weight, xi, like),
     }
-    needed = ctx.needs_input_grad
-    return (
-        *(gradients[i](theta[i]) if needed[i] else None for i in range(N_THETA)),
-        *(None,) * N_OTHERS,
-    )
 
 
 solve_op.register_autograd(_backward, setup_context=_setup_context)

@@ -32,11 +32,10 @@ class Condensed:
     """The part of condensing that depends on (H, C, G) alone.
 
     T ``(M, n_z, n_y)``, Y_neg = -Y ``(M, n_z, n_c)``, H = T'HT ``(M, n_y, n_y)``, G = GT
-    ``(M, n_g, n_y)``,
-    and what b contributes: H_b = T'HY ``(M, n_y, n_c)``, G_b = GY ``(M, n_g, n_c)``.
-    ``surely_convex`` says that all of H is, so that no part of it need be looked at.
-    Where the columns after ``keep`` do not have full row rank, ``deficient`` says so: then it is
-    valid only for QPs that fix exactly ``keep`` entries.
+    ``(M, n_g, n_y)``, and what b contributes: H_b = T'HY ``(M, n_y, n_c)``, G_b = GY
+    ``(M, n_g, n_c)``. ``surely_convex`` says that all of H is, so that no part of it need be looked
+    at. Where the columns after ``keep`` do not have full row rank, ``deficient`` says so: then it
+    is valid only for QPs that fix exactly ``keep`` entries.
     """
 
     keep: int

@@ -14,15 +14,16 @@ curvatures' sum, so that the penalty is part of the same step.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from torch_qpmpc.autograd import envelope_gradients
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import QPMPC
-from torch_qpmpc.qp import QPSolution
+from torch_qpmpc.qp import EVENT_SHAPES, QPSolution
 
 #: Decrease over predicted decrease: below the first the damping rises, above the second it falls.
 POOR, GOOD = 0.25, 0.75
@@ -167,20 +168,8 @@ class GaussNewton(torch.optim.Optimizer):
         """The gradients of Q in each learned part that is not frozen, zero where not in ``use``."""
         mpc = self._mpc
         weight = use.to(solution.z)
-        z, chi, lam = (x * weight.unsqueeze(-1) for x in (solution.z, solution.chi, solution.lam))
-        sigma = solution.sigma * weight.unsqueeze(-1)
-        # The envelope gradients in the tensors of the QP, see `torch_qpmpc.autograd`.
-        gradients: dict[str, Callable[[], Tensor]] = {
-            "H": lambda: 0.5 * z.unsqueeze(-1) * z.unsqueeze(-2),
-            "q": lambda: z,
-            "c": lambda: weight,
-            "C": lambda: chi.unsqueeze(-1) * z.unsqueeze(-2),
-            "b": lambda: -chi,
-            "G": lambda: lam.unsqueeze(-1) * z.unsqueeze(-2),
-            "lb": lambda: (-lam).clamp(min=0),
-            "ub": lambda: -lam.clamp(min=0),
-            "w": lambda: sigma,
-        }
+        z, sigma, chi, lam = solution.z, solution.sigma, solution.chi, solution.lam
+        gradients = envelope_gradients(weight, z, sigma, chi, lam, solution.xi)
         groups = [group for group in self.param_groups if group["params"][0].requires_grad]
         leaves = [group["params"][0] for group in groups]
         factored = next((leaf for leaf in leaves if leaf is mpc._parameters.get("C")), None)
@@ -188,22 +177,24 @@ class GaussNewton(torch.optim.Optimizer):
             raise QPError.expected("penalty", "a C that is not free", "C among the learned parts")
         with torch.enable_grad():
             qp = mpc.quadratic_program()
-        names = [name for name in gradients if getattr(qp, name).requires_grad]
-        names = [name for name in names if name != "C" or factored is None]
+        parts = {name: getattr(qp, name) for name in EVENT_SHAPES}
+        parts = {n: x for n, x in parts.items() if x.requires_grad and x is not factored}
+        # Of a tensor for each pair, the gradient is that of each pair.
+        of_each = [gradients[n](x.expand(len(z), *x.shape)) for n, x in parts.items()]
         dense = [leaf for leaf in leaves if leaf is not factored]
         found = iter(())
         if dense:
             found = iter(
                 torch.autograd.grad(
-                    [getattr(qp, name) for name in names],
+                    list(parts.values()),
                     dense,
-                    [gradients[name]() for name in names],
+                    of_each,
                     is_grads_batched=True,
                     materialize_grads=True,
                 )
             )
         return [
-            _OuterProducts(leaf, group["scale"], chi, z, penalty)
+            _OuterProducts(leaf, group["scale"], weight.unsqueeze(-1) * chi, z, penalty)
             if leaf is factored
             else _Dense(leaf, group["scale"], next(found).reshape(len(z), -1))
             for group, leaf in zip(groups, leaves, strict=True)

@@ -58,6 +58,19 @@ def liar(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str
     return "liar"
 
 
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many QPs the backend "recorder", which is DAQP, is asked for at a time."""
+    counts = []
+
+    def recording(qps: SoftQPs) -> Answer:
+        counts.append(len(qps.g))
+        return daqp.solve(qps)
+
+    monkeypatch.setitem(BACKENDS, "recorder", recording)
+    return counts
+
+
 def solve(known: KnownQP, **options) -> QPSolution:
     return solve_qp(known.qp, known.fixed, **options)
 
@@ -92,18 +105,13 @@ def test_inaccurate_answers_are_sharpened(monkeypatch, name):
     assert solution.residual.max() < 1e-9
 
 
-def test_only_what_is_rejected_is_solved_again(monkeypatch):
+def test_only_what_is_rejected_is_solved_again(monkeypatch, asked):
     wrong = torch.tensor([False, True, False, False, True, True])
-    asked = []
-
-    def recording(qps: SoftQPs) -> Answer:
-        asked.append(len(qps.g))
-        return daqp.solve(qps)
 
     def lie(answer: Answer) -> Answer:
         return replace(answer, v=answer.v + wrong[:, None])
 
-    monkeypatch.setitem(BACKENDS, "proxqp", recording)
+    monkeypatch.setitem(BACKENDS, "proxqp", BACKENDS["recorder"])
     monkeypatch.setitem(BACKENDS, "liar", doctored(lie))
     known = known_qp(1, batch=(BATCH,), matrices=(BATCH,))
     with SolveLog() as log:
@@ -114,17 +122,10 @@ def test_only_what_is_rejected_is_solved_again(monkeypatch):
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, own):
-    asked = []
-
-    def recording(qps: SoftQPs) -> Answer:
-        asked.append(len(qps.g))
-        return daqp.solve(qps)
-
+def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, asked, own):
     def misled(qps: SoftQPs, active: Tensor) -> Answer:
         return LIES["v off"](daqp.solve(qps))
 
-    monkeypatch.setitem(BACKENDS, "recorder", recording)
     if own:
         monkeypatch.setitem(OWN_WARM_STARTS, "recorder", misled)
     known = known_qp(2, batch=(BATCH,))
@@ -138,14 +139,7 @@ def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, own):
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test_a_known_active_set_spares_the_backend(monkeypatch, own):
-    asked = []
-
-    def recording(qps: SoftQPs) -> Answer:
-        asked.append(len(qps.g))
-        return daqp.solve(qps)
-
-    monkeypatch.setitem(BACKENDS, "recorder", recording)
+def test_a_known_active_set_spares_the_backend(monkeypatch, asked, own):
     if own:
         monkeypatch.setitem(OWN_WARM_STARTS, "recorder", daqp.solve)
     known = known_qp(3, batch=(BATCH,))

@@ -108,12 +108,12 @@ def test_multipliers_of_inactive_rows_are_zero():
 # Programs with a known answer
 
 
-def tensors(qps: SoftQPs, device: str = "cpu") -> tuple[Tensor, ...]:
-    return tuple(getattr(qps, field.name).to(device) for field in fields(qps))
+def moved(qps: SoftQPs, device: str) -> SoftQPs:
+    return SoftQPs(**{f.name: getattr(qps, f.name).to(device) for f in fields(qps)})
 
 
 def residual(qps: SoftQPs, answer: Answer) -> Tensor:
-    return BatchedQPs.of(*tensors(qps)).residual(answer.v, answer.lam)
+    return BatchedQPs.of(qps).residual(answer.v, answer.lam)
 
 
 SINGLE_KINDS = [((kind,), ()) for kind in SOFT_ROWS] + [((), (kind,)) for kind in HARD_ROWS]
@@ -359,7 +359,7 @@ def test_hopeless_neighbours_do_no_harm():
 
 def test_settling_keeps_what_is_better():
     qps = random_qps(9)
-    form, cold = BatchedQPs.of(*tensors(qps)), interior_point.solve(qps)
+    form, cold = BatchedQPs.of(qps), interior_point.solve(qps)
     v, lam = cold.v, cold.lam
     for noise in (0.0, 1e-6, 1.0):
         near = v + noise * torch.randn(v.shape, generator=torch.Generator().manual_seed(0)).double()
@@ -394,8 +394,8 @@ def test_the_core_stays_on_its_device_in_float64(device):
         pytest.skip("no CUDA device")
     qps = random_qps(10)
     expected = interior_point.solve(qps)
-    operands = tensors(qps, device)
-    v, lam, iterations = interior_point.interior_point(*operands)
+    answer = interior_point.solve(moved(qps, device))
+    v, lam, iterations = answer.v, answer.lam, answer.iterations
     assert v.dtype == lam.dtype == torch.float64
     assert {v.device.type, lam.device.type, iterations.device.type} == {device}
     assert_allclose(v.cpu(), expected.v, atol=1e-8)
@@ -404,7 +404,7 @@ def test_the_core_stays_on_its_device_in_float64(device):
 
 def test_the_core_never_leaves_the_device_nor_loops_over_the_batch():
     functions = [
-        interior_point.interior_point,
+        interior_point.solve,
         interior_point._begin,
         interior_point._follow,
         interior_point._step,
@@ -416,10 +416,10 @@ def test_the_core_never_leaves_the_device_nor_loops_over_the_batch():
 
 
 def test_gradients_are_not_recorded():
-    operands = [
-        operand.requires_grad_() if operand.is_floating_point() else operand
-        for operand in tensors(random_qps(11, count=2))
-    ]
-    v, lam, _ = interior_point.interior_point(*operands)
-    assert not v.requires_grad
-    assert not lam.requires_grad
+    qps = random_qps(11, count=2)
+    for field in fields(qps):
+        if field.name != "group":
+            getattr(qps, field.name).requires_grad_()
+    answer = interior_point.solve(qps)
+    assert not answer.v.requires_grad
+    assert not answer.lam.requires_grad

@@ -1,4 +1,4 @@
-"""The soft QPs as tensors of any device, and what the batched algorithms ask of them.
+"""The soft QPs as the batched algorithms ask for them, on any device.
 
 Neither this module nor `active_set` and `interior_point`, which build on it, loop over the batch.
 """
@@ -9,6 +9,9 @@ from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
+
+from torch_qpmpc.batching import largest
+from torch_qpmpc.programs import SoftQPs
 
 #: Stands for infinity: its reciprocal vanishes in sums, and its square does not overflow.
 HUGE = 1e100
@@ -26,7 +29,7 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class BatchedQPs:
-    """`SoftQPs` as tensors, with `HUGE` for infinity, and what is typical of each.
+    """`SoftQPs` with `HUGE` for infinity, and what is typical of each.
 
     H and G are ``(1, ..)`` where the batch shares them, and then ``products`` holds the outer
     products of G's rows, ``(r, d d)``; else they are ``(B, ..)``. Typical sizes make all decisions
@@ -48,23 +51,13 @@ class BatchedQPs:
     curvature: Tensor
 
     @classmethod
-    def of(
-        cls,
-        H: Tensor,
-        G: Tensor,
-        group: Tensor,
-        g: Tensor,
-        lower: Tensor,
-        upper: Tensor,
-        w: Tensor,
-    ) -> BatchedQPs:
-        """From the tensors of `SoftQPs`."""
-        products = None
+    def of(cls, qps: SoftQPs) -> BatchedQPs:
+        H, G, g, products = qps.H, qps.G, qps.g, None
         if len(H) == 1:
             products = (G[0].unsqueeze(-1) * G[0].unsqueeze(-2)).flatten(1)
         else:
-            H, G = H[group], G[group]
-        lower, upper, w = lower.clamp(min=-HUGE), upper.clamp(max=HUGE), w.clamp(max=HUGE)
+            H, G = H[qps.group], G[qps.group]
+        lower, upper, w = qps.l.clamp(min=-HUGE), qps.u.clamp(max=HUGE), qps.w.clamp(max=HUGE)
         size = _largest(G).squeeze(-1)
         size = torch.where(size > 1 / HUGE, size, 1.0)
         width = (upper - lower) / size
@@ -143,4 +136,4 @@ class BatchedQPs:
 
 def _largest(x: Tensor) -> Tensor:
     """Largest absolute entry along the last dimension, which stays; zero where it is empty."""
-    return x.abs().amax(-1, keepdim=True) if x.shape[-1] else x.new_zeros(*x.shape[:-1], 1)
+    return largest(x).unsqueeze(-1)

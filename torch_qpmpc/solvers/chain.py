@@ -14,7 +14,7 @@ from torch import Tensor
 from torch_qpmpc.certificate import TOLERANCE, Products, certify
 from torch_qpmpc.condense import Reduced, condensed_for
 from torch_qpmpc.programs import FlatPrograms, SoftQPs
-from torch_qpmpc.qp import UNKNOWN, Status
+from torch_qpmpc.qp import Status
 from torch_qpmpc.solvers import (
     OWN_WARM_STARTS,
     Answer,
@@ -161,14 +161,14 @@ class _Chain:
         return self.raw
 
     def recall(self, solver: str, start: Tensor) -> None:
-        """Try the active sets ``start`` ``(B, n_g)`` that are known."""
-        known = (start != UNKNOWN).all(-1)
+        """Try the active sets ``start`` ``(B, n_g)`` that are known: whose codes are codes."""
+        known = ((start >= -2) & (start <= 2)).all(-1)
         others, before = self.todo[:0], self.todo[known[self.todo]]
         if not len(before):
             return
         if solver not in OWN_WARM_STARTS:
             others, self.todo = self.todo[~known[self.todo]], before
-        self.attempt(warm_start(solver), start)
+        self.attempt(warm_start(solver), torch.where(known.unsqueeze(-1), start, 0))
         self.recalled = len(before) - int(known[self.todo].sum())
         self.todo = torch.cat((self.todo, others)).sort().values
 

@@ -9,7 +9,6 @@ import numpy as np
 from torch import Tensor
 
 from torch_qpmpc.programs import SoftArrays, SoftQPs
-from torch_qpmpc.qp import UNKNOWN
 from torch_qpmpc.solvers.answer import Answer
 
 SOFT, ACTIVE_LOWER, ACTIVE = 8, 2, 1
@@ -79,8 +78,7 @@ def _solve_alike(
     # Without a ``sense``, the model begins with the active set that it ended with.
     senses: list[np.ndarray | None] = [empty] * len(g)
     if start is not None:
-        known = (start != UNKNOWN).all(axis=1)
-        senses = list(empty + STATES[np.where(known[:, None], start, 0)])
+        senses = list(empty + STATES[start])
     elif len(g) >= MANY:
         order, senses = _path(g), [None] * len(g)
     update, solve_one, failed = model.update, model.solve, False

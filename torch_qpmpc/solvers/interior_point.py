@@ -15,7 +15,7 @@ a penalty and a multiplier of its own. At the end the active set is read off and
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -40,45 +40,31 @@ LATE, CAUTION = 20, 0.3
 SHRINK = 0.75
 
 
-def solve(qps: SoftQPs) -> Answer:
-    """Solve a batch on its own device."""
-    return Answer(*interior_point(qps.H, qps.G, qps.group, qps.g, qps.l, qps.u, qps.w))
-
-
 @torch.no_grad()
-def interior_point(
-    H: Tensor,
-    G: Tensor,
-    group: Tensor,
-    g: Tensor,
-    lower: Tensor,
-    upper: Tensor,
-    w: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """v ``(B, d)``, lam ``(B, r)`` and iterations ``(B,)`` for the tensors of `SoftQPs`.
+def solve(qps: SoftQPs) -> Answer:
+    """Solve a batch on its own device.
 
-    Everything is float64 on one device. The answers are finite, but those of infeasible and
-    unbounded QPs are not solutions: that is for the certificate to say.
+    The answers are finite, but those of infeasible and unbounded QPs are not solutions: that is for
+    the certificate to say.
     """
-    if not w.shape[-1]:  # a row without weight, since reductions over no rows have no value
-        none = g.new_zeros(len(g), 1)
-        row = G.new_zeros(len(G), 1, g.shape[-1])
-        v, lam, iterations = interior_point(H, row, group, g, none, none, none)
-        return v, lam[:, 1:], iterations
-    qps = BatchedQPs.of(H, G, group, g, lower, upper, w)
-    found, todo = Found.nothing(qps), torch.arange(len(qps), device=g.device)
-    point = _begin(qps)
+    if not qps.w.shape[-1]:  # a row without weight, since reductions over no rows have no value
+        none, row = qps.g.new_zeros(len(qps.g), 1), torch.zeros_like(qps.H[:, :1])
+        answer = solve(replace(qps, G=row, l=none, u=none, w=none))
+        return replace(answer, lam=answer.lam[:, 1:])
+    form = BatchedQPs.of(qps)
+    found, todo = Found.nothing(form), torch.arange(len(form), device=qps.g.device)
+    point = _begin(form)
     for target, limit in TARGETS:
         if not len(todo):
             break
         before = point.steps.clone()
-        _follow(qps, point, target, limit)
-        last = settle(qps, point.v, point.lam, LAST_STEPS)
+        _follow(form, point, target, limit)
+        last = settle(form, point.v, point.lam, LAST_STEPS)
         found.offer(todo, last.v, last.lam, last.residual)
         found.steps[todo] += last.steps + point.steps - before
         going = ~(last.residual <= SETTLED)
-        qps, point, todo = qps.take(going), point.take(going), todo[going]
-    return found.v, found.lam, found.steps
+        form, point, todo = form.take(going), point.take(going), todo[going]
+    return Answer(found.v, found.lam, found.steps)
 
 
 @dataclass
