@@ -17,6 +17,12 @@ from torch_qpmpc.solvers import Answer
 SOFT_ROWS = ("inside", "at_lower", "at_upper", "below", "above", "equality", "no_upper", "free")
 HARD_ROWS = ("inside", "at_lower", "at_upper", "equality", "no_upper")
 
+#: Soft rows on (x_k, u_k) and on x_N.
+MIXED: dict[str, Any] = {
+    "constraints": ([[1.0, 0.5, 1.0], [0.0, 1.0, -1.0]], [-0.8, -torch.inf], [0.8, 0.6]),
+    "terminal_constraints": ([[1.0, 1.0]], [-0.4], [0.3]),
+}
+
 
 def normal(*shape: int, seed: int = 0) -> Tensor:
     """Standard normal entries."""
@@ -173,3 +179,11 @@ def random_states(count: int, n: int = 2, *, size: float = 1.5, seed: int = 0) -
     """States, or actions, uniform in plus or minus ``size``: some beyond `random_mpc`'s bounds."""
     generator = torch.Generator().manual_seed(seed)
     return size * (2 * torch.rand(count, n, generator=generator, dtype=torch.float64) - 1)
+
+
+def step(mpc: QPMPC, rate: float = 1e-3) -> None:
+    """One training step on the sum of some values."""
+    optimizer = torch.optim.Adam(mpc.parameters(), lr=rate)
+    mpc(random_states(4)).sum().backward()
+    optimizer.step()
+    optimizer.zero_grad()

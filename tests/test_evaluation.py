@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_qpmpc.envs.point_mass import PointMass
+from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.evaluation import closed_gap, closed_loop
 
@@ -44,6 +44,20 @@ def test_closed_loop_follows_the_protocol(kind, std):
     assert pytest.approx(costs.sum(0).mean()) == run.J
     discounted = (0.9 ** np.arange(50)[:, None] * costs).sum(0).mean()
     assert pytest.approx(discounted) == run.J_discounted
+
+
+def test_closed_loop_takes_any_linear_system():
+    run = closed_loop(lambda s: -4 * s[:, 1:], GrosZanonLTI(), steps=20, starts=3, seed=1)
+    rng, s = np.random.default_rng(1), np.tile([0, 0.15], (3, 1))
+    for k in range(20):
+        np.testing.assert_allclose(run.states[k], s, atol=1e-12)
+        a = np.clip(-4 * s[:, 1:], -1, 1)
+        violation = np.maximum([0, -1] - s, 0).sum(1) + np.maximum(s - 1, 0).sum(1)
+        cost = ((s**2).sum(1) + 0.5 * a[:, 0] ** 2 + 100 * violation) / 2
+        np.testing.assert_allclose(run.costs[k], cost, atol=1e-12)
+        s = s @ np.array([[0.9, 0], [0.35, 1.1]]) + a @ [[0.0813, 0.2]]
+        s[:, 0] += rng.uniform(-0.1, 0.0, size=3)
+    assert run.actions.shape == (20, 3, 1)
 
 
 def test_arguments_change_the_experiment():

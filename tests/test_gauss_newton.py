@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torch.testing import assert_close
 
-from tests.problems import normal, random_mpc, random_states
+from tests.problems import MIXED, normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SystemIdentificationPenalty
 from torch_qpmpc.gauss_newton import FALL, RISE
 
@@ -22,6 +22,8 @@ PARTS = {
     "everything": {"learn": ALL, "free": 0.01},
     "block": {"hessian": "block", "stage_weight": torch.eye(3), "learn": ("H", "H_f", "C")},
     "full": {"hessian": "full", "stage_weight": torch.eye(3), "learn": ("H", "C")},
+    "tied": {"structure": "tied", "learn": ("c", "q", "C", "b", "lb", "ub", "w"), "free": 0.01},
+    "varying": {"structure": "varying", "learn": ("C", "G"), **MIXED},
 }
 
 
@@ -32,6 +34,10 @@ def pairs(count: int = COUNT) -> tuple[Tensor, Tensor]:
 def targets(mpc: QPMPC, size: float = 0.1) -> Tensor:
     s, a = pairs()
     return mpc.action_value(s, a).detach() + size * normal(COUNT, seed=2)
+
+
+def leaves_of(optimizer: GaussNewton) -> list[Tensor]:
+    return [leaf for group in optimizer.param_groups for leaf in group["params"]]
 
 
 def dense_gradients(mpc: QPMPC, leaves: list[Tensor]) -> list[Tensor]:
@@ -47,8 +53,8 @@ def dense_gradients(mpc: QPMPC, leaves: list[Tensor]) -> list[Tensor]:
 
 def expected_steps(mpc: QPMPC, optimizer: GaussNewton, S: Tensor | None) -> list[Tensor]:
     """The damped least-squares step in theta itself, as large as theta is."""
-    leaves = [group["params"][0] for group in optimizer.param_groups]
-    scales = [group["scale"] for group in optimizer.param_groups]
+    leaves = leaves_of(optimizer)
+    scales = [group["scale"] for group in optimizer.param_groups for _ in group["params"]]
     gradients = dense_gradients(mpc, leaves)
     sizes = [scale * g.square().sum(-1) for scale, g in zip(scales, gradients, strict=True)]
     mu = DAMPING * torch.stack(sizes).sum(0).mean()
@@ -75,7 +81,7 @@ def expected_steps(mpc: QPMPC, optimizer: GaussNewton, S: Tensor | None) -> list
 def test_the_step_is_the_damped_least_squares_step(name):
     mpc = random_mpc(2, **PARTS[name])
     optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
-    leaves = [group["params"][0] for group in optimizer.param_groups]
+    leaves = leaves_of(optimizer)
     before = [leaf.detach().clone() for leaf in leaves]
     expected = expected_steps(mpc, optimizer, None)
     report = optimizer.step(*pairs(), targets(mpc))
@@ -90,7 +96,7 @@ def test_the_si_penalty_is_part_of_the_step():
     mpc = random_mpc(3)
     optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
     S = SystemIdentificationPenalty(1e-2).curvature(normal(5, mpc.n_z))
-    leaves = [group["params"][0] for group in optimizer.param_groups]
+    leaves = leaves_of(optimizer)
     before = [leaf.detach().clone() for leaf in leaves]
     expected = expected_steps(mpc, optimizer, S)
     optimizer.step(*pairs(), targets(mpc), penalty=S)

@@ -10,14 +10,13 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import random_mpc, random_states
+from tests.problems import MIXED, random_mpc, random_states, step
 from torch_qpmpc import QPMPC, QPError, SolverError, Status
 from torch_qpmpc.arguments import CONSTRAINTS, COST
 
 A = torch.tensor([[1.0, 0.2], [0.0, 0.9]]).double()
 B = torch.tensor([[0.0], [0.3]]).double()
 EVERYTHING = (*COST, *CONSTRAINTS)
-
 SETTINGS: dict[str, dict[str, Any]] = {
     "diagonal": {"hessian": "diagonal"},
     "block": {"hessian": "block"},
@@ -29,16 +28,12 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "no bounds": {"state_bounds": None, "action_bounds": None},
     "everything learned": {"learn": EVERYTHING, "hessian": "block", "action_slack": 50.0},
     "of one stage": {"horizon": 1},
+    "tied": {"structure": "tied", "learn": {*EVERYTHING} - {"G"}, "action_slack": 50.0},
+    "varying, mixed": {"structure": "varying", "learn": ("C", "G", "w"), **MIXED},
+    "tied, mixed": {"structure": "tied", "learn": ("C", "G", "b"), "horizon": 4, **MIXED},
+    "free, mixed": {"learn": ("C", "G", "w"), "action_slack": 50.0, **MIXED},
     "undiscounted": {"gamma": 1.0},
 }
-
-
-def step(mpc: QPMPC, rate: float = 1e-3) -> None:
-    """One training step on the sum of some values."""
-    optimizer = torch.optim.Adam(mpc.parameters(), lr=rate)
-    mpc(random_states(4)).sum().backward()
-    optimizer.step()
-    optimizer.zero_grad()
 
 
 def round_trip(mpc: QPMPC) -> QPMPC:
@@ -399,7 +394,10 @@ def test_a_checkpoint_restores_a_module_from_another_seed(name):
 
 def test_it_shows_what_it_is():
     text = repr(random_mpc(15))
-    assert "n_x=2, n_u=1, horizon=3, hessian='diagonal', learned=('H', 'c', 'C')" in text
+    assert (
+        "n_x=2, n_u=1, horizon=3, hessian='diagonal', structure='free', learned=('H', 'c', 'C')"
+        in text
+    )
 
 
 # Bad input
@@ -421,6 +419,33 @@ def test_it_shows_what_it_is():
             {"learn": ["H", "H_f"], "hessian": "full"},
             "learn: got 'H_f' with hessian='full', expected 'H' alone. A full H contains",
         ),
+        ({"structure": "banded"}, "structure: got 'banded', expected one of free, varying, tied"),
+        (
+            {"structure": "tied", "learn": ["G"]},
+            "learn: got 'G', expected parts that there are. Give constraints, or structure='free'",
+        ),
+        (
+            {"structure": "tied", "A": torch.eye(2) * torch.ones(3, 1, 1).cumsum(0)},
+            "C: got entries that a linear MPC scheme does not have, expected what its stages tie",
+        ),
+        ({"constraints": 1.0}, r"constraints: got 1.0, expected the triple \(D, lower, upper\)"),
+        (
+            {"constraints": (torch.ones(2, 2), [0.0], [1.0])},
+            r"constraints: got D of shape \(2, 2\), expected shape \(n_d, 3\)",
+        ),
+        (
+            {"terminal_constraints": (torch.ones(1, 3), [0.0], [1.0])},
+            r"terminal_constraints: got D of shape \(1, 3\), expected shape \(n_d, 2\)",
+        ),
+        (
+            {"constraints": (torch.ones(1, 3), [0.0, 0.0], [1.0, 1.0])},
+            r"constraints, bounds: got shape \(2,\), expected shape \(1,\) on each side",
+        ),
+        (
+            {"constraints": (torch.ones(1, 3), [1.0], [0.0])},
+            "state_bounds, action_bounds, constraints: got lower > upper",
+        ),
+        ({"constraint_slack": -1.0}, "constraint_slack: got -1.0, expected a non-negative weight"),
         ({"on_failure": "skip"}, "on_failure: got 'skip', expected one of raise, warn, mask"),
         ({"solver": "proxq"}, r"solver: got 'proxq', expected one of .* Did you mean 'proxqp'\?"),
         ({"solver": None}, "solver: got None, expected one of proxqp, daqp"),

@@ -9,9 +9,12 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.autograd import ON_FAILURE
+from torch_qpmpc.batching import broadcast
 from torch_qpmpc.errors import QPError
 
 HESSIANS = ("diagonal", "block", "full")
+#: From the least tied to the most.
+STRUCTURES = ("free", "varying", "tied")
 #: The parts of theta by family; the paper advises a learning rate for each of the two.
 COST = ("H", "H_f", "q", "c", "w")
 CONSTRAINTS = ("C", "b", "G", "lb", "ub")
@@ -23,6 +26,7 @@ def check_structure(
     horizon: int,
     gamma: float,
     hessian: str,
+    structure: str,
     learn: Collection[str],
     on_failure: str,
 ) -> None:
@@ -31,8 +35,13 @@ def check_structure(
             raise QPError.expected(name, repr(size), "a positive integer")
     if not 0 < gamma <= 1:
         raise QPError.expected("gamma", gamma, "a discount factor in (0, 1]")
-    if hessian not in HESSIANS:
-        raise QPError.expected("hessian", repr(hessian), f"one of {', '.join(HESSIANS)}")
+    for name, choice, choices in (
+        ("hessian", hessian, HESSIANS),
+        ("structure", structure, STRUCTURES),
+        ("on_failure", on_failure, ON_FAILURE),
+    ):
+        if choice not in choices:
+            raise QPError.expected(name, repr(choice), f"one of {', '.join(choices)}")
     parts = (*COST, *CONSTRAINTS)
     if isinstance(learn, str) or not set(learn) <= set(parts):
         raise QPError.expected(
@@ -45,8 +54,6 @@ def check_structure(
             "'H' alone",
             "A full H contains the terminal block.",
         )
-    if on_failure not in ON_FAILURE:
-        raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
@@ -138,3 +145,15 @@ def check_input(name: str, x: Tensor, size: int) -> Tensor:
     if x.ndim == 0 or x.shape[-1] != size:
         raise QPError.expected(name, f"shape {tuple(x.shape)}", f"shape (*batch, {size})")
     return x
+
+
+def check_pair(s: Tensor, a: Tensor, n_x: int, n_u: int) -> Tensor:
+    """s and a side by side, ``(*batch, n_x + n_u)``, in the dtype of s."""
+    s, a = check_input("s", s, n_x), check_input("a", a, n_u)
+    try:
+        batch = broadcast(s.shape[:-1], a.shape[:-1])
+    except RuntimeError as error:
+        got = f"shape {tuple(a.shape)}"
+        want = f"leading dimensions that broadcast with those of s, {tuple(s.shape[:-1])}"
+        raise QPError.expected("a", got, want) from error
+    return torch.cat((s.expand(*batch, -1), a.expand(*batch, -1).to(s.dtype)), dim=-1)

@@ -7,6 +7,7 @@ block k the band is (x_k, u_k, x_{k+1}); what is right of it is above the band, 
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
@@ -31,14 +32,10 @@ def banded_matrix(A: Tensor, B: Tensor, horizon: int) -> Tensor:
         if tuple(matrix.shape) not in (shape, (horizon, *shape)):
             got = f"shape {tuple(matrix.shape)}"
             raise QPError.expected(name, got, f"shape {shape} or {(horizon, *shape)}")
-    A, B = A.expand(horizon, n_x, n_x), B.expand(horizon, n_x, n_u)
-    C = A.new_zeros(horizon * n_x, horizon * (n_x + n_u) + n_x)
-    minus_identity = -torch.eye(n_x).to(C)
-    for k in range(horizon):
-        column = k * (n_x + n_u)
-        block = torch.cat((A[k], B[k], minus_identity), dim=1)
-        C[k * n_x : (k + 1) * n_x, column : column + block.shape[1]] = block
-    return C
+    blocks = torch.cat((A.expand(horizon, n_x, n_x), B.expand(horizon, n_x, n_u)), dim=-1)
+    following = torch.eye(horizon * n_x).to(A).unflatten(-1, (horizon, n_x))
+    following = F.pad(F.pad(following, (0, n_u)).flatten(1), (n_x + n_u, -n_u))
+    return F.pad(torch.block_diag(*blocks), (0, n_x)) - following
 
 
 def band_distance(n_x: int, n_u: int, horizon: int) -> Tensor:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.envs.point_mass import PointMass
+from torch_qpmpc.envs.linear_system import LinearSystem
 from torch_qpmpc.errors import QPError
 
 
@@ -45,7 +45,7 @@ class ClosedLoop:
 @torch.no_grad()
 def closed_loop(
     policy: Callable[[Tensor], Tensor],
-    physics: PointMass,
+    physics: LinearSystem,
     *,
     steps: int = 50,
     starts: int = 32,
@@ -54,8 +54,8 @@ def closed_loop(
 ) -> ClosedLoop:
     """Run ``policy`` from ``starts`` fixed starts side by side, without gradients.
 
-    One seed is one experiment: ``numpy.random.default_rng(seed)`` draws the positions, the
-    velocities, then a standard normal ``(starts, n_x)`` each step.
+    One seed is one experiment: ``numpy.random.default_rng(seed)`` draws the starts, then the
+    noise's random numbers ``(starts, n_noise)`` each step.
 
     Args:
         policy: from states ``(starts, n_x)`` in float64 to actions ``(starts, n_u)``.
@@ -77,9 +77,9 @@ def closed_loop(
             # A (starts,) or (n_u,) result would broadcast without a sound.
             remedy = "Map a batch of states to a batch of actions."
             raise QPError.expected("policy(s)", f"shape {tuple(a.shape)}", str(expected), remedy)
-        a = a.to(s).clamp(physics.lb_a, physics.ub_a)
+        a = physics.applied(a)
         costs.append(physics.cost(s, a))
-        nu = physics.noise(nu, torch.as_tensor(rng.normal(size=tuple(s.shape))))
+        nu = physics.noise(nu, physics.draw(rng, starts))
         s = physics.step(s, a, nu)
         states.append(s)
         actions.append(a)

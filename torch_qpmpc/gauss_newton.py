@@ -170,9 +170,9 @@ class GaussNewton(torch.optim.Optimizer):
         weight = use.to(solution.z)
         z, sigma, chi, lam = solution.z, solution.sigma, solution.chi, solution.lam
         gradients = envelope_gradients(weight, z, sigma, chi, lam, solution.xi)
-        groups = [group for group in self.param_groups if group["params"][0].requires_grad]
-        leaves = [group["params"][0] for group in groups]
-        factored = next((leaf for leaf in leaves if leaf is mpc._parameters.get("C")), None)
+        pairs = [(leaf, group["scale"]) for group in self.param_groups for leaf in group["params"]]
+        pairs = [(leaf, scale) for leaf, scale in pairs if leaf.requires_grad]
+        factored = next((leaf for leaf, _ in pairs if leaf is mpc._parameters.get("C")), None)
         if penalty is not None and factored is None:
             raise QPError.expected("penalty", "a C that is not free", "C among the learned parts")
         with torch.enable_grad():
@@ -181,7 +181,7 @@ class GaussNewton(torch.optim.Optimizer):
         parts = {n: x for n, x in parts.items() if x.requires_grad and x is not factored}
         # Of a tensor for each pair, the gradient is that of each pair.
         of_each = [gradients[n](x.expand(len(z), *x.shape)) for n, x in parts.items()]
-        dense = [leaf for leaf in leaves if leaf is not factored]
+        dense = [leaf for leaf, _ in pairs if leaf is not factored]
         found = iter(())
         if dense:
             found = iter(
@@ -194,10 +194,10 @@ class GaussNewton(torch.optim.Optimizer):
                 )
             )
         return [
-            _OuterProducts(leaf, group["scale"], weight.unsqueeze(-1) * chi, z, penalty)
+            _OuterProducts(leaf, scale, weight.unsqueeze(-1) * chi, z, penalty)
             if leaf is factored
-            else _Dense(leaf, group["scale"], next(found).reshape(len(z), -1))
-            for group, leaf in zip(groups, leaves, strict=True)
+            else _Dense(leaf, scale, next(found).reshape(len(z), -1))
+            for leaf, scale in pairs
         ]
 
 
@@ -213,7 +213,7 @@ class _Dense:
 
     def damp(self, mu: Tensor) -> Tensor:
         """What the parameter's own penalty makes of Q, ``(B,)``: it has none."""
-        return torch.zeros_like(self.rows[:, 0])
+        return self.rows.new_zeros(len(self.rows))
 
     def kernel(self) -> Tensor:
         return self.scale * self.rows @ self.rows.mT
@@ -242,7 +242,7 @@ class _OuterProducts:
 
     def damp(self, mu: Tensor) -> Tensor:
         if self.S is None:
-            return torch.zeros_like(self.z[:, 0])
+            return self.z.new_zeros(len(self.z))
         precision = mu / self.scale * torch.eye(len(self.S)).to(self.S) + self.S
         inverse = torch.linalg.inv(precision)
         self.z_P, self.drift = mu * self.z @ inverse, -(self.leaf @ self.S) @ inverse

@@ -1,7 +1,8 @@
 """QPMPC: the module that owns theta and turns it into V, Q and the policy (eq:qp4, eq:qp5).
 
 A generic QP whose constraint matrix C starts as that of a linear MPC scheme (eq:cband) and may
-leave it. Everything here is a cost to go, as in the paper; rewards begin in `operators`.
+leave it, or stays one (eq:v1, eq:q1). Everything here is a cost to go, as in the paper; rewards
+begin in `operators`.
 """
 
 from __future__ import annotations
@@ -13,21 +14,19 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
+from torch_qpmpc import starts
 from torch_qpmpc.arguments import (
     CONSTRAINTS,
     COST,
+    STRUCTURES,
     as_tensor,
-    bound,
     check_input,
-    check_slack,
+    check_pair,
     check_structure,
-    cost_weights,
 )
 from torch_qpmpc.autograd import optimal_value, solve_qp
-from torch_qpmpc.banded import banded_matrix
-from torch_qpmpc.batching import broadcast
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.parametrizations import Cholesky, SquareRoot
+from torch_qpmpc.parametrizations import Banded, Cholesky, LinearRows, SquareRoot, Tied
 from torch_qpmpc.qp import QPSolution, QuadraticProgram
 from torch_qpmpc.solvers import backend
 
@@ -48,13 +47,22 @@ class QPMPC(nn.Module):
             ``(N, n_x, n_x)`` and ``(N, n_x, n_u)``. By default random: A the identity plus, and B,
             normal entries with standard deviation 0.1.
         state_bounds, action_bounds: pairs of ``(n_x,)`` and ``(n_u,)``; unbounded by default.
+        constraints: mixed constraints of each stage, ``lower <= D [x_k; u_k] <= upper`` (eq:v1c4),
+            as the triple of D ``(n_d, n_x + n_u)`` and its bounds ``(n_d,)``.
+        terminal_constraints: likewise of x_N, with D^f ``(n_d_f, n_x)``.
+        structure: what the learned parts of theta tie. ``"free"``: nothing, C is a matrix (eq:qp5).
+            ``"tied"``: they are those of a linear MPC scheme (eq:q1), with one A, B, D and one
+            entry of b, q, lb, ub and w for all stages; ``"varying"``: with one for each stage.
         hessian: ``"diagonal"``, ``"block"`` (one dense block a stage) or ``"full"`` (dense in z).
         stage_weight: start of H_k, ``(n_x + n_u,)`` if diagonal, else ``(n_x + n_u, n_x + n_u)``,
             with an optional leading N for a weight of each stage's own; by default diagonal
             random entries uniform in (0.5, 5) on the states and zero on the actions.
         terminal_weight: start of H_f, ``(n_x,)`` or ``(n_x, n_x)``; the identity by default.
-        state_slack, action_slack: the slack weights w of the rows of states and of actions;
-            ``inf`` makes them hard. Soft states and hard actions by default.
+            ``"riccati"``: the cost to go of the linear quadratic regulator of A, B and the stage
+            weight; not for a diagonal hessian.
+        state_slack, action_slack, constraint_slack: the slack weights w of the rows of states, of
+            actions, and of mixed and terminal constraints; ``inf`` makes them hard. Hard actions
+            by default, and the others soft.
         discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
         learn: which of H, H_f, q, c, C, b, G, lb, ub, w are parameters; the others are buffers.
         solver, on_failure: as in `solve_qp`.
@@ -93,6 +101,7 @@ class QPMPC(nn.Module):
     w: Tensor
     C_0: Tensor
     discount: Tensor
+    slack_discount: Tensor
     soft: Tensor
 
     def __init__(
@@ -106,11 +115,15 @@ class QPMPC(nn.Module):
         B: Any = None,
         state_bounds: tuple[Any, Any] | None = None,
         action_bounds: tuple[Any, Any] | None = None,
+        constraints: tuple[Any, Any, Any] | None = None,
+        terminal_constraints: tuple[Any, Any, Any] | None = None,
+        structure: str = "free",
         hessian: str = "diagonal",
         stage_weight: Any = None,
         terminal_weight: Any = None,
         state_slack: float = 100.0,
         action_slack: float = torch.inf,
+        constraint_slack: float = 100.0,
         discount_slack: bool = False,
         learn: Collection[str] = ("H", "c", "C"),
         solver: str = "proxqp",
@@ -122,52 +135,27 @@ class QPMPC(nn.Module):
         }
         super().__init__()
         self._arguments = arguments
-        check_structure(n_x, n_u, horizon, gamma, hessian, learn, on_failure)
+        check_structure(n_x, n_u, horizon, gamma, hessian, structure, learn, on_failure)
         backend(solver)
-        self.n_x, self.n_u, self.horizon, self.gamma = n_x, n_u, horizon, gamma
-        self.n_z = horizon * (n_x + n_u) + n_x
-        self.hessian, self.solver, self.on_failure = hessian, solver, on_failure
+        self._layout, theta = starts.theta(**arguments)
+        self.n_x, self.n_u, self.horizon, self.n_z = n_x, n_u, horizon, self._layout.n_z
+        self.gamma, self.hessian, self.structure = gamma, hessian, structure
+        self.solver, self.on_failure = solver, on_failure
         self.learned = tuple(name for name in (*COST, *CONSTRAINTS) if name in learn)
-
-        random = torch.Generator().manual_seed(seed)
-        if A is None:
-            A = torch.eye(n_x) + 0.1 * torch.randn(n_x, n_x, generator=random)
-        if B is None:
-            B = 0.1 * torch.randn(n_x, n_u, generator=random)
-        if stage_weight is None:
-            weights = 0.5 + 4.5 * torch.rand(n_x, generator=random)
-            stage_weight = torch.cat((weights, torch.zeros(n_u)))
-        if terminal_weight is None:
-            terminal_weight = torch.ones(n_x)
-
-        A, B = as_tensor("A", A), as_tensor("B", B)
-        if A.shape[-1:] != (n_x,) or B.shape[-1:] != (n_u,):
-            got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
-            raise QPError.expected("A, B", got, f"({n_x}, {n_x}) and ({n_x}, {n_u})")
-        powers = gamma ** torch.arange(horizon + 1, dtype=torch.float64).unsqueeze(-1)
-        discount = self._per_entry(powers.expand(-1, n_x), powers.expand(-1, n_u))
+        if "G" in learn and structure != "free" and not self._layout.n_linear:
+            raise QPError.expected(
+                "learn", "'G'", "parts that there are", "Give constraints, or structure='free'."
+            )
+        self.register_buffer("C_0", theta["C"])
+        discount, of_rows = self._layout.discounts(gamma)
         self.register_buffer("discount", discount, persistent=False)
-        self.register_buffer("C_0", banded_matrix(A, B, horizon))
-        weights = cost_weights(stage_weight, terminal_weight, hessian, n_x, n_u, horizon)
-        for name, start in weights.items():
+        slack_discount = of_rows if discount_slack else torch.ones_like(of_rows)
+        self.register_buffer("slack_discount", slack_discount, persistent=False)
+        self.register_buffer("soft", theta["w"].isfinite())
+        # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
+        theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
+        for name, start in theta.items():
             self._own(name, start)
-            if name in self.learned:
-                kind = SquareRoot() if hessian == "diagonal" else Cholesky()
-                parametrize.register_parametrization(self, name, kind)
-        self._own("q", torch.zeros(self.n_z))
-        self._own("c", torch.zeros(()))
-        self._own("C", self.C_0)
-        self._own("b", torch.zeros(horizon * n_x))
-        self._own("G", torch.eye(self.n_z))
-        for name, side in (("lb", 0), ("ub", 1)):
-            x = bound("state_bounds", state_bounds, side, n_x).expand(horizon + 1, -1)
-            u = bound("action_bounds", action_bounds, side, n_u).expand(horizon + 1, -1)
-            self._own(name, self._per_entry(x, u))
-        if not (self.lb <= self.ub).all():
-            raise QPError.expected("state_bounds, action_bounds", "lower > upper", "lower <= upper")
-        check_slack("state_slack", state_slack)
-        check_slack("action_slack", action_slack)
-        self._own_slack_weights(state_slack, action_slack, discount_slack)
 
     @classmethod
     def from_model(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
@@ -184,13 +172,33 @@ class QPMPC(nn.Module):
             raise QPError.expected("A, B", got, "matrices (n_x, n_x) and (n_x, n_u)")
         return cls(A.shape[-1], B.shape[-1], horizon, A=A, B=B, **options)
 
+    @classmethod
+    def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
+        """The MPC end of the bridge: a linear MPC scheme, all of which is learned (eq:v1, eq:q1).
+
+        `from_model` with other defaults: ``structure="tied"``, dense weights that start as the
+        identity and, for x_N, from the Riccati equation, discounted slack weights, and all parts
+        of theta among those to ``learn``. `release` leaves it.
+
+        Args:
+            A, B, horizon, options: as for `from_model`.
+
+        Example:
+            >>> import torch, torch_qpmpc as qm
+            >>> A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]), torch.tensor([[0.0], [0.1]])
+            >>> mpc = qm.QPMPC.linear_mpc(A, B, 10, action_bounds=([-1.0], [1.0]))
+            >>> [tuple(part.shape) for part in mpc.model()]
+            [(2, 2), (2, 1)]
+        """
+        return cls.from_model(A, B, horizon, **(starts.linear_mpc(A, B, **options) | options))
+
     def value(self, s: Tensor) -> Tensor:
         """V(s) (eq:qp4), a cost to go: s ``(*batch, n_x)`` to ``(*batch,)``."""
         return self._value(check_input("s", s, self.n_x))
 
     def action_value(self, s: Tensor, a: Tensor) -> Tensor:
         """Q(s, a) (eq:qp5), a cost to go: ``(*batch, n_x)``, ``(*batch, n_u)`` to ``(*batch,)``."""
-        return self._value(self._state_action(s, a))
+        return self._value(check_pair(s, a, self.n_x, self.n_u))
 
     def policy(self, s: Tensor) -> Tensor:
         """pi(s), the u_0 of V's solution: s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
@@ -204,7 +212,7 @@ class QPMPC(nn.Module):
         self, s: Tensor, a: Tensor | None = None, warm_start: QPSolution | Tensor | None = None
     ) -> QPSolution:
         """The whole solution of V's QP, or of Q's where an action is given, in theta's dtype."""
-        fixed = check_input("s", s, self.n_x) if a is None else self._state_action(s, a)
+        fixed = check_input("s", s, self.n_x) if a is None else check_pair(s, a, self.n_x, self.n_u)
         qp = self.quadratic_program()
         return solve_qp(
             qp,
@@ -222,6 +230,44 @@ class QPMPC(nn.Module):
         terminal = z[..., None, self.horizon * n :]
         return torch.cat((stages[..., : self.n_x], terminal), -2), stages[..., self.n_x :]
 
+    def model(self) -> tuple[Tensor, Tensor]:
+        """A and B, ``(n_x, n_x)`` and ``(n_x, n_u)``, or with a leading N where they vary.
+
+        Raises:
+            QPError: C is free to be more than a model.
+        """
+        if self.structure == "free":
+            raise QPError.expected("structure", "'free'", "'tied' or 'varying', which have a model")
+        return Banded(self._layout, self.structure == "tied").right_inverse(self.C)
+
+    def release(self, structure: str = "free") -> None:
+        """Free what a linear MPC scheme ties, in place; the values stay as they are.
+
+        The learned parts get other parameters: make the loss module and the optimiser anew.
+
+        Args:
+            structure: ``"free"`` or ``"varying"``, and freer than today's.
+
+        Raises:
+            QPError: it is not.
+        """
+        if structure not in STRUCTURES[: STRUCTURES.index(self.structure)]:
+            freer = STRUCTURES[: STRUCTURES.index(self.structure)]
+            expected = f"one that is freer than {self.structure!r}"
+            raise QPError.expected("structure", repr(structure), expected, f"{', '.join(freer)}.")
+        self.structure = structure
+        self._arguments = {**self._arguments, "structure": structure}
+        for part in self.learned:
+            if not parametrize.is_parametrized(self, part) or part in ("H", "H_f"):
+                continue
+            value = getattr(self, part).detach()
+            frozen = not any(leaf.requires_grad for leaf in self._leaves(part))
+            parametrize.remove_parametrizations(self, part)
+            delattr(self, part)
+            self._own(part, value)
+            for leaf in self._leaves(part):
+                leaf.requires_grad_(not frozen)
+
     def quadratic_program(self) -> QuadraticProgram:
         """Today's theta as a QuadraticProgram, discounts included (eq:qpH)."""
         return QuadraticProgram(
@@ -233,7 +279,7 @@ class QPMPC(nn.Module):
             G=self.G,
             lb=self.lb,
             ub=self.ub,
-            w=torch.where(self.soft, self.w, torch.inf),
+            w=torch.where(self.soft, self.slack_discount * self.w, torch.inf),
             check_values=False,
         )
 
@@ -258,7 +304,7 @@ class QPMPC(nn.Module):
                 raise QPError.expected(
                     "rates", f"nothing for {part}", "a rate for every learned part, or its family"
                 )
-            groups.append({"params": [self._leaf(part)], "lr": rate, "name": part})
+            groups.append({"params": self._leaves(part), "lr": rate, "name": part})
         return groups
 
     def reset_parameters(self) -> None:
@@ -272,7 +318,7 @@ class QPMPC(nn.Module):
     def extra_repr(self) -> str:
         return (
             f"n_x={self.n_x}, n_u={self.n_u}, horizon={self.horizon}, hessian={self.hessian!r}, "
-            f"learned={self.learned}, solver={self.solver!r}"
+            f"structure={self.structure!r}, learned={self.learned}, solver={self.solver!r}"
         )
 
     def __reduce_ex__(self, protocol: Any) -> tuple:
@@ -289,37 +335,29 @@ class QPMPC(nn.Module):
         )
         return value.to(fixed.dtype)
 
-    def _state_action(self, s: Tensor, a: Tensor) -> Tensor:
-        s, a = check_input("s", s, self.n_x), check_input("a", a, self.n_u)
-        try:
-            batch = broadcast(s.shape[:-1], a.shape[:-1])
-        except RuntimeError as error:
-            got = f"shape {tuple(a.shape)}"
-            want = f"leading dimensions that broadcast with those of s, {tuple(s.shape[:-1])}"
-            raise QPError.expected("a", got, want) from error
-        return torch.cat((s.expand(*batch, -1), a.expand(*batch, -1).to(s.dtype)), dim=-1)
-
-    def _per_entry(self, x: Tensor, u: Tensor) -> Tensor:
-        """Lay out values ``(N + 1, n_x)`` and ``(N + 1, n_u)`` in the order of z (no u_N)."""
-        return torch.cat((x, u), dim=-1).flatten()[: self.n_z]
-
     def _own(self, name: str, value: Tensor) -> None:
         """Register a part of theta, as a parameter if it is learned."""
         value = value.to(torch.float64).clone()
-        if name in self.learned:
-            self.register_parameter(name, nn.Parameter(value))
-        else:
+        if name not in self.learned:
             self.register_buffer(name, value)
+            return
+        self.register_parameter(name, nn.Parameter(value))
+        kept = self._kept(name)
+        for parametrization in kept:
+            parametrize.register_parametrization(self, name, parametrization)
+        if len(kept) > 1:  # each but the first has changed the value
+            setattr(self, name, value)
 
-    def _own_slack_weights(self, state: float, action: float, discounted: bool) -> None:
-        x, u = torch.full((self.n_x,), float(state)), torch.full((self.n_u,), float(action))
-        w = self._per_entry(x.expand(self.horizon + 1, -1), u.expand(self.horizon + 1, -1))
-        self.register_buffer("soft", w.isfinite())
-        # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
-        w = w.masked_fill(~self.soft, 0.0).to(torch.float64)
-        self._own("w", w * self.discount if discounted else w)
-        if "w" in self.learned:
-            parametrize.register_parametrization(self, "w", SquareRoot())
+    def _kept(self, name: str) -> list[nn.Module]:
+        """What a learned part keeps: its structure, and its sign."""
+        kept, tied = [], self.structure == "tied"
+        if self.structure != "free" and name in ("C", "G"):
+            kept.append((Banded if name == "C" else LinearRows)(self._layout, tied))
+        if tied and name in ("q", "b", "lb", "ub", "w"):
+            kept.append(Tied(name, self._layout.ties(name)))
+        if name in ("H", "H_f", "w"):
+            kept.append(Cholesky() if self.hessian != "diagonal" and name != "w" else SquareRoot())
+        return kept
 
     def _hessian(self) -> Tensor:
         if self.hessian == "full":
@@ -333,11 +371,12 @@ class QPMPC(nn.Module):
         root = self.discount.sqrt()
         return root.unsqueeze(-1) * H * root
 
-    def _leaf(self, name: str) -> nn.Parameter:
-        """The parameter that the optimiser moves for a learned part: behind H its factor."""
-        if parametrize.is_parametrized(self, name):
-            return self.get_parameter(f"parametrizations.{name}.original")
-        return self.get_parameter(name)
+    def _leaves(self, name: str) -> list[nn.Parameter]:
+        """The parameters that the optimiser moves for a learned part: behind H its factor."""
+        if not parametrize.is_parametrized(self, name):
+            return [self.get_parameter(name)]
+        kept = self.get_submodule(f"parametrizations.{name}")
+        return list(kept.parameters(recurse=False))
 
 
 def _rebuild(
@@ -345,7 +384,9 @@ def _rebuild(
 ) -> QPMPC:
     mpc = cls(**arguments)
     mpc.load_state_dict(state, assign=True)
-    mpc.discount = mpc.discount.to(mpc.C_0)  # not part of the state
+    mpc.discount, mpc.slack_discount = (  # not part of the state
+        x.to(mpc.C_0) for x in (mpc.discount, mpc.slack_discount)
+    )
     for name in frozen:
         mpc.get_parameter(name).requires_grad_(False)
     return mpc.train(training)

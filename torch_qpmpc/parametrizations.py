@@ -1,15 +1,19 @@
-"""Keep H positive semidefinite while it is learned, in the idiom of `torch.nn.utils.parametrize`.
+"""What theta keeps while it is learned, in the idiom of `torch.nn.utils.parametrize`.
 
 With H = L L' any gradient step on L leaves H positive semidefinite, so that the update of eq:thup
-needs no semidefinite program (eq:sdp1).
+needs no semidefinite program (eq:sdp1). And a linear MPC scheme (eq:v1) ties: its C has nothing but
+a model in its band, and its stages share their values.
 """
 
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
+from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.layout import Layout
 
 
 class SquareRoot(nn.Module):
@@ -54,3 +58,85 @@ class Cholesky(nn.Module):
         upper = torch.linalg.qr(root.mT).R
         sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0)
         return upper.mT * sign.unsqueeze(-2)
+
+
+class Banded(nn.Module):
+    """C of a model (eq:cband): A and B, of all stages, or with a leading N where they vary."""
+
+    def __init__(self, layout: Layout, tied: bool) -> None:
+        super().__init__()
+        self.layout, self.tied = layout, tied
+
+    def forward(self, A: Tensor, B: Tensor) -> Tensor:
+        return banded_matrix(A, B, self.layout.horizon)
+
+    def right_inverse(self, C: Tensor) -> tuple[Tensor, Tensor]:
+        """The model in the band of C; `QPError` if there is more in C than that."""
+        n_x, n, horizon = self.layout.n_x, self.layout.n, self.layout.horizon
+        stages = C[:, : horizon * n].unflatten(0, (horizon, n_x)).unflatten(-1, (horizon, n))
+        blocks = stages.diagonal(dim1=0, dim2=2).movedim(-1, 0)
+        if self.tied:
+            blocks = blocks[0]
+        A, B = blocks[..., :n_x].contiguous(), blocks[..., n_x:].contiguous()
+        _check_tied("C", C, self(A, B))
+        return A, B
+
+
+class Tied(nn.Module):
+    """A vector whose entry i is the value ``index[i]`` of a shorter one."""
+
+    index: Tensor
+    first: Tensor
+
+    def __init__(self, name: str, index: Tensor) -> None:
+        super().__init__()
+        self.name = name
+        first = [int((index == i).nonzero()[0]) for i in range(int(index.max()) + 1)]
+        self.register_buffer("index", index, persistent=False)
+        self.register_buffer("first", torch.tensor(first), persistent=False)
+
+    def forward(self, values: Tensor) -> Tensor:
+        return values[..., self.index]
+
+    def right_inverse(self, entries: Tensor) -> Tensor:
+        """The first entry of each value; `QPError` if the others differ."""
+        values = entries[self.first]
+        _check_tied(self.name, entries, self(values))
+        return values
+
+
+class LinearRows(nn.Module):
+    """G of mixed constraints (eq:v1c4): the identity, D for each stage, and D^f for x_N.
+
+    D is ``(n_d, n_x + n_u)``, or ``(N, n_d, n_x + n_u)`` where the stages' own vary.
+    """
+
+    def __init__(self, layout: Layout, tied: bool) -> None:
+        super().__init__()
+        self.layout, self.tied = layout, tied
+
+    def forward(self, D: Tensor, D_f: Tensor) -> Tensor:
+        n_x, n, horizon, n_z = (getattr(self.layout, s) for s in ("n_x", "n", "horizon", "n_z"))
+        stages = torch.block_diag(*D.expand(horizon, -1, n))
+        unit = torch.eye(n_z).to(D)
+        return torch.cat((unit, F.pad(stages, (0, n_x)), F.pad(D_f, (n_z - n_x, 0))))
+
+    def right_inverse(self, G: Tensor) -> tuple[Tensor, Tensor]:
+        """D and D^f; `QPError` if there is more in G than they make."""
+        n_x, n, horizon, n_z = (getattr(self.layout, s) for s in ("n_x", "n", "horizon", "n_z"))
+        last = n_z + horizon * self.layout.n_d
+        stages = G[n_z:last, : horizon * n].unflatten(0, (horizon, self.layout.n_d))
+        D = stages.unflatten(-1, (horizon, n)).diagonal(dim1=0, dim2=2).movedim(-1, 0)
+        D, D_f = (D[0] if self.tied else D).contiguous(), G[last:, n_z - n_x :].contiguous()
+        _check_tied("G", G, self(D, D_f))
+        return D, D_f
+
+
+def _check_tied(name: str, given: Tensor, tied: Tensor) -> None:
+    if not torch.equal(given, tied):
+        raise QPError.expected(
+            name,
+            "entries that a linear MPC scheme does not have",
+            "what its stages tie",
+            "Call release() first to free them.",
+        )

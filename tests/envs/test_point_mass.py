@@ -1,60 +1,44 @@
-"""The physics, and that both environments are nothing but the physics."""
+"""The point mass's own: dynamics, cost, noise, starts, and random streams that stay as they are."""
 
 from __future__ import annotations
 
-import copy
-import importlib
-import warnings
 from dataclasses import replace
-from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
-from tensordict.nn import TensorDictModule
-from torchrl.collectors import Collector
-from torchrl.envs import SerialEnv, check_env_specs
 
-import torch_qpmpc.envs
 from torch_qpmpc.envs import PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.evaluation import closed_loop
 
-KINDS = ["gaussian", "brownian"]
-
-
-class StaggeredEnv(PointMassEnv):
-    """The episodes' clocks start apart, so that every later reset is a partial one."""
-
-    def _reset(self, tensordict=None, **kwargs):
-        out = super()._reset(tensordict, **kwargs)
-        if tensordict is None or "_reset" not in tensordict:
-            out["step_count"] = torch.arange(self.batch_size[0]).unsqueeze(-1) % self.max_steps
-        return out
-
-
-def linear_policy() -> TensorDictModule:
-    torch.manual_seed(0)
-    net = torch.nn.Sequential(torch.nn.Linear(4, 2), torch.nn.Tanh())
-    return TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
-
-
-def collect(env: PointMassEnv, batches: int, steps: int) -> Any:
-    """TensorDict of ``(num_envs, batches * steps)`` transitions."""
-    collector = Collector(
-        env,
-        linear_policy(),
-        frames_per_batch=steps * env.batch_size[0],
-        total_frames=batches * steps * env.batch_size[0],
-        auto_register_policy_transforms=False,
-    )
-    data: list[Any] = [batch.clone() for batch in collector]
-    collector.shutdown()
-    return torch.cat(data, dim=1)
-
-
-# --- PointMass ---------------------------------------------------------------------------------
+# The state after three steps without an action, from seed 0, by TorchRL's environment, Gymnasium's,
+# and the evaluation: computed once, since another stream would make old runs incomparable.
+STREAMS = {
+    "gaussian": (
+        [
+            [1.386189124241971, 0.7486546355191386, -0.05537488976231461, 0.28670656064945294],
+            [0.3418075824365586, 0.8524880912771976, -0.2293280592587446, -0.11370024203937927],
+        ],
+        [0.2526988685131073, -0.8310462832450867, -0.3421364724636078, -0.35173073410987854],
+        [
+            [0.491563465475065, -0.5925391578324675, 0.21959516356427516, 0.30139892283057174],
+            [-1.3803264710642795, -1.3755846539907206, 0.05156266796475741, 0.16244346226635692],
+        ],
+    ),
+    "brownian": (
+        [
+            [1.3924302589174424, 0.7388859620466084, -0.038814050528084176, 0.3003948846637864],
+            [0.34384107478641024, 0.844312654601799, -0.23549338263857872, -0.1075581195169474],
+        ],
+        [0.2764415442943573, -0.8244329690933228, -0.3324228823184967, -0.34862565994262695],
+        [
+            [0.4909096167236723, -0.5872203303804477, 0.2250730543295603, 0.30324090269488657],
+            [-1.364416575193558, -1.383984444293915, 0.06643766707383592, 0.1642514910114522],
+        ],
+    ),
+}
 
 
 def test_step_and_cost_are_the_papers():
@@ -106,7 +90,6 @@ def test_corrupted_draws_A_then_B_then_theta():
 def test_the_kind_alone_changes_the_default_noise():
     assert replace(PointMass(), noise_kind="brownian").std == 0.002
     assert PointMass("brownian", noise_std=0.5).std == 0.5
-    assert PointMass().to("cpu").A.dtype == torch.float64
 
 
 def test_bad_noise_is_an_error():
@@ -118,42 +101,12 @@ def test_bad_noise_is_an_error():
             PointMass(noise_std=std)
 
 
-# --- Gymnasium ---------------------------------------------------------------------------------
-
-
-def test_gymnasium_finds_nothing_to_complain_about():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(gymnasium.make("torch_qpmpc/PointMass-v0").unwrapped)
-
-
-def test_importing_again_does_not_register_again():
-    spec = gymnasium.registry["torch_qpmpc/PointMass-v0"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        importlib.reload(torch_qpmpc.envs)
-    assert gymnasium.registry["torch_qpmpc/PointMass-v0"] is spec
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_gymnasium_environment_follows_the_physics(kind):
-    p = PointMass(kind)
-    env = gymnasium.make("torch_qpmpc/PointMass-v0", physics=p)
-    rng, actions = np.random.default_rng(7), np.random.default_rng(8)
-    observation, _ = env.reset(seed=7)
-    s, nu, ends = p.starts(rng, 1)[0], torch.zeros(4), []
-    np.testing.assert_array_equal(observation, s.float().numpy())
-    for _ in range(50):
-        action = actions.uniform(-1, 1, 2).astype(np.float32)
-        a = torch.as_tensor(action)
-        observation, reward, terminated, truncated, _ = env.step(action)
-        assert reward == -p.cost(s, a).item()
-        nu = p.noise(nu, torch.as_tensor(rng.standard_normal(4)))
-        s = p.step(s, a, nu)
-        np.testing.assert_array_equal(observation, s.float().numpy())
-        assert not terminated
-        ends.append(truncated)
-    assert ends == [False] * 49 + [True]
+def test_starts_fill_their_range():
+    s = PointMassEnv(4000, seed=0).reset()["observation"]
+    limits = torch.tensor([1.5, 1.5, 0.5, 0.5])
+    assert (s.abs() <= limits).all()
+    torch.testing.assert_close(s.std(0), limits / 3**0.5, atol=0, rtol=0.05)
+    assert (PointMass().starts(np.random.default_rng(0), 4000).abs().amax(0) > 0.99 * limits).all()
 
 
 def test_gymnasium_random_walk_restarts_with_the_episode():
@@ -165,113 +118,46 @@ def test_gymnasium_random_walk_restarts_with_the_episode():
     np.testing.assert_array_equal(env.step(np.zeros(2, dtype=np.float32))[0], one)
 
 
-# --- TorchRL -----------------------------------------------------------------------------------
+@pytest.mark.parametrize("kind", STREAMS)
+def test_random_streams_stay_as_they_were(kind):
+    p, nothing = PointMass(kind), torch.zeros(2, 2, dtype=torch.float64)
+    torchrl, gym, evaluation = STREAMS[kind]
+
+    env = PointMassEnv(2, p, dtype=torch.float64, seed=0)
+    data = env.rollout(3, policy=lambda td: td.set("action", nothing))
+    np.testing.assert_allclose(data["next", "observation"][:, -1], torchrl, atol=1e-12)
+
+    one, observation = PointMassGymEnv(p), np.empty(4)
+    one.reset(seed=0)
+    for _ in range(3):
+        observation, *_ = one.step(np.zeros(2, dtype=np.float32))
+    np.testing.assert_allclose(observation, gym, atol=1e-6)
+
+    run = closed_loop(lambda s: nothing, p, steps=3, starts=2, seed=0)
+    np.testing.assert_allclose(run.states[-1], evaluation, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_torchrl_accepts_the_specs(kind, dtype):
-    check_env_specs(PointMassEnv(3, PointMass(kind), dtype=dtype, seed=0), seed=0)
-    check_env_specs(SerialEnv(2, lambda: PointMassEnv(3, PointMass(kind), dtype=dtype)), seed=0)
+def test_corrupted_stays_as_it_was():
+    A_hat, B_hat, theta = PointMass().corrupted(0)
+    row = [1.0136961687321455, -0.02302132862361297, 0.05409735239361947, -0.04834723644714709]
+    np.testing.assert_allclose(A_hat[0], row, atol=1e-15)
+    np.testing.assert_allclose(B_hat[0], [0.03631789223498866, 0.004146122024909174], atol=1e-15)
+    expected = [3.2692330016656426, 2.2265489941784757, 4.98744471105145, 4.913759024493036]
+    np.testing.assert_allclose(theta, expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_torchrl_environment_follows_the_physics(kind):
-    p = PointMass(kind)
-    env = PointMassEnv(5, p, dtype=torch.float64, seed=11)
-    data = env.rollout(50, policy=linear_policy().double())
-    rng = torch.Generator().manual_seed(11)
-    s = p.start_range * (2 * torch.rand(5, 4, generator=rng, dtype=torch.float64) - 1)
-    nu = torch.zeros(5, 4)
-    for k in range(50):
-        now = data[:, k]
-        torch.testing.assert_close(now["observation"], s, atol=0, rtol=0)
-        assert torch.equal(now["next", "reward"], -p.cost(s, now["action"]).unsqueeze(-1))
-        nu = p.noise(nu, torch.randn(5, 4, generator=rng, dtype=torch.float64))
-        s = p.step(s, now["action"], nu)
-        torch.testing.assert_close(now["next", "observation"], s, atol=0, rtol=0)
-    assert data.shape == (5, 50)
-    assert not data["next", "terminated"].any()
-    assert data["next", "truncated"].squeeze(-1).nonzero()[:, 1].tolist() == [49] * 5
-    assert torch.equal(data["next", "truncated"], data["next", "done"])
-
-
-def test_starts_fill_their_range():
-    s = PointMassEnv(4000, seed=0).reset()["observation"]
-    limits = torch.tensor([1.5, 1.5, 0.5, 0.5])
-    assert (s.abs() <= limits).all()
-    torch.testing.assert_close(s.std(0), limits / 3**0.5, atol=0, rtol=0.05)
-    assert (PointMass().starts(np.random.default_rng(0), 4000).abs().amax(0) > 0.99 * limits).all()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_partial_resets_in_a_collector_restart_exactly_the_finished_episodes(kind):
-    env = StaggeredEnv(8, PointMass(kind, noise_std=0.1), max_steps=5, seed=2)
-    data = collect(env, batches=20, steps=2)
-    done = data["next", "done"].squeeze(-1)
-    assert done.any(0).all(), "every step ends some episode"
-    assert not done.all(0).any(), "no step ends all"
-
-    now, then = data[:, 1:], data[:, :-1]
-    ended = done[:, :-1]
-    for key in ("noise", "step_count"):
-        assert (now[key][ended] == 0).all()
-        assert torch.equal(now[key][~ended], then["next", key][~ended])
-    assert torch.equal(now["observation"][~ended], then["next", "observation"][~ended])
-    assert (
-        not torch.isclose(now["observation"][ended], then["next", "observation"][ended])
-        .all(-1)
-        .any()
-    )
-    assert ((now["collector", "traj_ids"] != then["collector", "traj_ids"]) == ended).all()
-
-    # What was stored as nu is what entered the dynamics.
-    p = env.physics
-    following = p.step(data["observation"], data["action"], data["next", "noise"])
-    torch.testing.assert_close(data["next", "observation"], following.float())
-    if kind == "brownian":
-        increments = data["next", "noise"] - data["noise"]
-        assert increments.std().item() == pytest.approx(0.1, rel=0.05)
-        assert data["next", "noise"].std().item() > 0.13
-
-
-def test_same_seed_same_rollouts_whatever_the_global_generator_does():
-    def rollout(seed):
-        env = PointMassEnv(4, seed=seed)
-        torch.manual_seed(seed + torch.seed() % 1000)
-        return env.rollout(20, policy=linear_policy())["next", "observation"]
-
-    assert torch.equal(rollout(5), rollout(5))
-    assert not torch.equal(rollout(5), rollout(6))
-
-
-def test_without_a_seed_the_global_generator_decides():
-    def start():
-        torch.manual_seed(9)
-        return PointMassEnv(4).reset()["observation"]
-
-    assert torch.equal(start(), start())
-
-
-def test_saved_generator_continues_the_stream():
-    env = PointMassEnv(4, PointMass("brownian"), max_steps=7, seed=1)
-    td, state = env.reset(), env.get_rng_state()
-
-    def rollout(env):
-        return env.rollout(
-            30, linear_policy(), auto_reset=False, tensordict=td, break_when_any_done=False
-        )["observation"]
-
-    expected, other = rollout(env), PointMassEnv(4, PointMass("brownian"), max_steps=7, seed=2)
-    assert not torch.equal(rollout(other), expected)
-    other.set_rng_state(state)
-    assert torch.equal(rollout(other), expected)
-    env.set_rng_state(state)
-    assert torch.equal(rollout(copy.deepcopy(env)), expected)
-
-
-def test_bad_sizes_are_an_error():
-    with pytest.raises(QPError, match="num_envs: got 0, expected an integer >= 1"):
-        PointMassEnv(0)
-    with pytest.raises(QPError, match="max_steps: got -1, expected an integer >= 1"):
-        PointMassEnv(1, max_steps=-1)
+def test_environments_are_of_fifty_steps_with_the_papers_bounds():
+    one = gymnasium.make("torch_qpmpc/PointMass-v0")
+    assert one.spec is not None
+    assert one.spec.max_episode_steps == 50
+    bound = np.array([2, 2, 10, 10], dtype=np.float32)
+    assert one.observation_space == gymnasium.spaces.Box(-bound, bound)
+    env = PointMassEnv()
+    assert (env.batch_size, env.max_steps) == ((8,), 50)
+    far = env.reset()
+    far["observation"] += 2 * torch.as_tensor(bound)
+    assert not env.observation_spec.is_in(far.select("observation", "noise", "step_count"))
+    for environment in (env, one.unwrapped):
+        assert isinstance(environment, PointMassEnv | PointMassGymEnv)
+        assert isinstance(environment.physics, PointMass)
+        assert environment.physics.std == 0.01

@@ -1,17 +1,33 @@
-"""The experiment's environments; importing this registers ``torch_qpmpc/PointMass-v0``."""
+"""The experiments' environments; importing this registers them, as ``torch_qpmpc/PointMass-v0``."""
 
 from __future__ import annotations
 
 import gymnasium
 
+from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIEnv, GrosZanonLTIGymEnv
+from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
 from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
 
-__all__ = ["PointMass", "PointMassEnv", "PointMassGymEnv"]
+__all__ = [
+    "GrosZanonLTI",
+    "GrosZanonLTIEnv",
+    "GrosZanonLTIGymEnv",
+    "LinearSystem",
+    "LinearSystemEnv",
+    "LinearSystemGymEnv",
+    "PointMass",
+    "PointMassEnv",
+    "PointMassGymEnv",
+]
 
-# Registering an id twice warns, and a reload or a spawned worker imports this again.
-if "torch_qpmpc/PointMass-v0" not in gymnasium.registry:
-    gymnasium.register(
-        id="torch_qpmpc/PointMass-v0",
-        entry_point="torch_qpmpc.envs.point_mass:PointMassGymEnv",
-        max_episode_steps=50,
-    )
+for _name, _module, _steps in (
+    ("PointMass", "point_mass", 50),
+    ("GrosZanonLTI", "gros_zanon", 5000),
+):
+    # Registering an id twice warns, and a reload or a spawned worker imports this again.
+    if f"torch_qpmpc/{_name}-v0" not in gymnasium.registry:
+        gymnasium.register(
+            id=f"torch_qpmpc/{_name}-v0",
+            entry_point=f"torch_qpmpc.envs.{_module}:{_name}GymEnv",
+            max_episode_steps=_steps,
+        )

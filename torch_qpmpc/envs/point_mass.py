@@ -1,37 +1,34 @@
 """The paper's point mass (section "Point-Mass"), once, and its Gymnasium and TorchRL environments.
 
-    s+ = A s + B a + nu,    s = [x, y, vx, vy],    a = [F_x, F_y],    L(s, a) = s'Ws
-
-Both environments return the reward -L(s, a): the paper minimises a cost, they maximise.
+s+ = A s + B a + nu,    s = [x, y, vx, vy],    a = [F_x, F_y],    L(s, a) = s'Ws
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from dataclasses import KW_ONLY, dataclass, field
 
-import gymnasium
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
+from torch_qpmpc.envs.linear_system import (
+    LinearSystem,
+    LinearSystemEnv,
+    LinearSystemGymEnv,
+    Rng,
+    float64,
+    normal,
+    uniform,
+)
 from torch_qpmpc.errors import QPError
 
 #: Standard deviation of the noise by kind; the paper leaves it open.
 NOISE_STD = {"gaussian": 0.01, "brownian": 0.002}
 
 
-def _float64(*values: Any) -> Callable[[], Tensor]:
-    return lambda: torch.tensor(values, dtype=torch.float64)
-
-
 @dataclass(frozen=True, eq=False)
-class PointMass:
+class PointMass(LinearSystem):
     """The physics, in float64; every tensor that a method gets is converted to that.
 
     Args:
@@ -41,7 +38,8 @@ class PointMass:
             increments; ``None`` for :data:`NOISE_STD`.
         start_position, start_velocity: an episode starts uniformly within plus or minus these.
         A, B, W: dynamics ``(4, 4)``, ``(4, 2)`` and weight of the cost ``(4, 4)``.
-        lb_s, ub_s, lb_a, ub_a: bounds of the state ``(4,)`` and of the action ``(2,)``.
+        lb_s, ub_s, lb_a, ub_a: bounds of the state ``(4,)`` and of the action ``(2,)``; both are
+            clipped to them.
 
     Raises:
         QPError: unknown ``noise_kind``, or negative or not finite ``noise_std``.
@@ -51,17 +49,18 @@ class PointMass:
     noise_std: float | None = None
     start_position: float = 1.5
     start_velocity: float = 0.5
+    _: KW_ONLY
     A: Tensor = field(
-        default_factory=_float64([1, 0, 0.1, 0], [0, 1, 0, 0.1], [0, 0, 0.9, 0], [0, 0, 0, 0.9])
+        default_factory=float64([1, 0, 0.1, 0], [0, 1, 0, 0.1], [0, 0, 0.9, 0], [0, 0, 0, 0.9])
     )
-    B: Tensor = field(default_factory=_float64([0, 0], [0, 0], [0.1, 0], [0, 0.1]))
+    B: Tensor = field(default_factory=float64([0, 0], [0, 0], [0.1, 0], [0, 0.1]))
     W: Tensor = field(
-        default_factory=_float64([3, 0, 0, 0], [0, 3, 0, 0], [0, 0, 0.25, 0], [0, 0, 0, 0.25])
+        default_factory=float64([3, 0, 0, 0], [0, 3, 0, 0], [0, 0, 0.25, 0], [0, 0, 0, 0.25])
     )
-    lb_s: Tensor = field(default_factory=_float64(-2, -2, -10, -10))
-    ub_s: Tensor = field(default_factory=_float64(2, 2, 10, 10))
-    lb_a: Tensor = field(default_factory=_float64(-1, -1))
-    ub_a: Tensor = field(default_factory=_float64(1, 1))
+    lb_s: Tensor = field(default_factory=float64(-2, -2, -10, -10))
+    ub_s: Tensor = field(default_factory=float64(2, 2, 10, 10))
+    lb_a: Tensor = field(default_factory=float64(-1, -1))
+    ub_a: Tensor = field(default_factory=float64(1, 1))
 
     def __post_init__(self) -> None:
         if self.noise_kind not in NOISE_STD:
@@ -82,33 +81,30 @@ class PointMass:
         p, v = self.start_position, self.start_velocity
         return self.A.new_tensor([p, p, v, v])
 
-    def to(self, device: torch.device | str | None) -> PointMass:
-        """The same physics with its tensors on ``device``."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        tensors = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
-        return replace(self, **tensors)
-
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """L(s, a) = s'Ws ``(*batch,)`` of the current s ``(*batch, 4)``; a does not enter."""
         s = s.to(self.W)
         return ((s @ self.W) * s).sum(-1)
 
-    def noise(self, nu: Tensor, normal: Tensor) -> Tensor:
-        """The next nu ``(*batch, 4)`` from the last one and a standard normal draw."""
-        step = self.std * normal.to(self.A)
-        return nu.to(self.A) + step if self.noise_kind == "brownian" else step
+    def starts(self, rng: Rng, count: int) -> Tensor:
+        """Start states ``(count, 4)``.
 
-    def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
-        """s+ = A s + B a + nu ``(*batch, 4)``; a, then s+, are clipped to their bounds."""
-        a = a.to(self.A).clamp(self.lb_a, self.ub_a)
-        following = s.to(self.A) @ self.A.mT + a @ self.B.mT + nu.to(self.A)
-        return following.clamp(self.lb_s, self.ub_s)
-
-    def starts(self, rng: np.random.Generator, count: int) -> Tensor:
-        """Start states ``(count, 4)``: draws the positions, then the velocities."""
+        numpy's generator draws the positions, then the velocities; torch's each state at once.
+        """
+        if isinstance(rng, torch.Generator):
+            return self.start_range * (2 * uniform(rng, count, 4) - 1)
         ranges = (self.start_position, self.start_velocity)
         draws = [rng.uniform(-r, r, size=(count, 2)) for r in ranges]
         return torch.as_tensor(np.hstack(draws)).to(self.A)
+
+    def draw(self, rng: Rng, count: int) -> Tensor:
+        """Standard normal numbers ``(count, 4)``."""
+        return normal(rng, count, 4)
+
+    def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
+        """The next nu ``(*batch, 4)`` from the last one and a standard normal draw."""
+        step = self.std * draw.to(self.A)
+        return nu.to(self.A) + step if self.noise_kind == "brownian" else step
 
     def corrupted(self, seed: int) -> tuple[Tensor, Tensor, Tensor]:
         """The wrong model that learning starts from, and the first cost parameters.
@@ -124,53 +120,19 @@ class PointMass:
         return self.A + as_A(dA), self.B + as_A(dB), as_A(theta)
 
 
-class PointMassGymEnv(gymnasium.Env):
+class PointMassGymEnv(LinearSystemGymEnv):
     """``torch_qpmpc/PointMass-v0``: never terminates, its registration truncates it at 50 steps."""
 
-    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own convention)
-
     def __init__(self, physics: PointMass | None = None) -> None:
-        self.physics = p = PointMass() if physics is None else physics
-        lb_s, ub_s, lb_a, ub_a = (b.float().numpy() for b in (p.lb_s, p.ub_s, p.lb_a, p.ub_a))
-        self.observation_space = gymnasium.spaces.Box(lb_s, ub_s)
-        self.action_space = gymnasium.spaces.Box(lb_a, ub_a)
-        self._s = self._nu = torch.zeros_like(p.lb_s)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        super().reset(seed=seed)
-        self._s = self.physics.starts(self.np_random, 1)[0]
-        self._nu = torch.zeros_like(self._s)
-        return self._s.numpy().astype(np.float32), {}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        a = torch.as_tensor(action)
-        reward = -self.physics.cost(self._s, a).item()
-        normal = torch.as_tensor(self.np_random.standard_normal(self._s.shape))
-        self._nu = self.physics.noise(self._nu, normal)
-        self._s = self.physics.step(self._s, a, self._nu)
-        return self._s.numpy().astype(np.float32), reward, False, False, {}
+        super().__init__(PointMass() if physics is None else physics)
 
 
-class PointMassEnv(EnvBase):
-    """``num_envs`` point masses in one vectorised TorchRL environment, without a Python loop.
-
-    The environment holds no state but its generator. What a step needs beside the observation
-    travels in the TensorDict: ``noise``, the last nu ``(num_envs, 4)``, and ``step_count``
-    ``(num_envs, 1)``. So TorchRL's own merging by mask at a partial reset restarts exactly those
-    episodes' random walks and clocks. A policy must not read ``noise``.
-
-    It truncates itself at ``max_steps`` (no ``StepCounter`` needed), so that the collector sees the
-    end of an episode, resets it and changes its trajectory id; it never terminates.
+class PointMassEnv(LinearSystemEnv):
+    """``num_envs`` point masses in one :class:`LinearSystemEnv`.
 
     Args:
-        num_envs: number of episodes run side by side, the batch size.
         physics: ``None`` for ``PointMass()``.
-        max_steps: steps of an episode.
-        dtype: of observation, action and reward; the physics stays in float64.
-        device: of the TensorDicts and of the generator; ``None`` for the CPU.
-        seed: of the generator; ``None`` draws one from torch's global generator.
+        num_envs, max_steps, dtype, device, seed: as of :class:`LinearSystemEnv`.
 
     Raises:
         QPError: ``num_envs`` or ``max_steps`` below 1.
@@ -185,74 +147,5 @@ class PointMassEnv(EnvBase):
         device: torch.device | str | None = None,
         seed: int | None = None,
     ) -> None:
-        for name, value in (("num_envs", num_envs), ("max_steps", max_steps)):
-            if value < 1:
-                raise QPError.expected(name, value, "an integer >= 1", "Ask for at least one.")
-        super().__init__(device=device, batch_size=torch.Size([num_envs]))
-        self.physics = p = (PointMass() if physics is None else physics).to(self.device)
-        self.max_steps = max_steps
-        self.rng = torch.Generator(device=p.A.device)
-        one, kind = torch.Size([num_envs, 1]), {"dtype": dtype, "device": self.device}
-
-        def box(low: Tensor, high: Tensor) -> Bounded:
-            low, high = (b.to(dtype).expand(num_envs, -1).clone() for b in (low, high))
-            return Bounded(low, high, dtype=dtype, device=self.device)
-
-        def composite(**specs: Any) -> Composite:
-            return Composite(specs, shape=self.batch_size, device=self.device)
-
-        s = box(p.lb_s, p.ub_s)
-        nu = Unbounded(s.shape, **kind)
-        count = Unbounded(one, dtype=torch.int64, device=self.device)
-        flag = Categorical(2, shape=one, dtype=torch.bool, device=self.device)
-        # The hidden entries are inputs of a step (state) and outputs of it (observation).
-        self.state_spec = composite(noise=nu, step_count=count)
-        self.observation_spec = composite(observation=s, noise=nu.clone(), step_count=count.clone())
-        self.action_spec = box(p.lb_a, p.ub_a)
-        self.reward_spec = Unbounded(one, **kind)
-        self.done_spec = composite(done=flag, terminated=flag.clone(), truncated=flag.clone())
-        self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
-
-    def get_rng_state(self) -> Tensor:
-        """State of the generator, a uint8 tensor for a checkpoint."""
-        return self.rng.get_state()
-
-    def set_rng_state(self, state: Tensor) -> None:
-        """Continue the random stream from what :meth:`get_rng_state` returned."""
-        self.rng.set_state(state.cpu())
-
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            self.rng.manual_seed(seed)
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        # Fresh values for every environment: where only some are reset, TorchRL keeps the others'.
-        shape = (*self.batch_size, self.physics.A.shape[0])
-        uniform = torch.rand(shape, generator=self.rng, dtype=torch.float64, device=self.rng.device)
-        s = self.physics.start_range * (2 * uniform - 1)
-        count = torch.zeros((*self.batch_size, 1), dtype=torch.int64, device=s.device)
-        return self._pack(s, torch.zeros_like(s), count)
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        s, a = tensordict["observation"], tensordict["action"]
-        kind: dict[str, Any] = {"dtype": torch.float64, "device": self.rng.device}
-        normal = torch.randn(s.shape, generator=self.rng, **kind)
-        nu = self.physics.noise(tensordict["noise"], normal)
-        out = self._pack(self.physics.step(s, a, nu), nu, tensordict["step_count"] + 1)
-        return out.set("reward", -self.physics.cost(s, a).unsqueeze(-1).to(out["observation"]))
-
-    def _pack(self, s: Tensor, nu: Tensor, step_count: Tensor) -> TensorDict:
-        dtype = self.observation_spec["observation"].dtype
-        truncated = step_count >= self.max_steps
-        return TensorDict(
-            {
-                "observation": s.to(dtype),
-                "noise": nu.to(dtype),
-                "step_count": step_count,
-                "done": truncated,
-                "terminated": torch.zeros_like(truncated),
-                "truncated": truncated.clone(),
-            },
-            batch_size=self.batch_size,
-            device=self.device,
-        )
+        physics = PointMass() if physics is None else physics
+        super().__init__(physics, num_envs, max_steps, dtype, device, seed)

@@ -1,0 +1,111 @@
+"""Gros and Zanon's own: dynamics, cost, violations, noise and starts, by hand."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from torch_qpmpc.envs import GrosZanonLTI, GrosZanonLTIEnv, GrosZanonLTIGymEnv
+from torch_qpmpc.errors import QPError
+
+
+def test_step_cost_and_violation_are_those_of_the_paper():
+    p = GrosZanonLTI()
+    s = torch.tensor([[0.5, 0.2], [-0.1, 1.5], [1.2, -1.3]], dtype=torch.float64)
+    a = torch.tensor([[1.0], [-0.5], [0.0]], dtype=torch.float64)
+    nu = torch.tensor([[-0.05, 0], [0, 0], [-0.1, 0]], dtype=torch.float64)
+    expected = torch.tensor([[0.5513, 0.42], [0.39435, 1.55], [0.525, -1.43]]).double()
+    torch.testing.assert_close(p.step(s, a, nu), expected, atol=1e-7, rtol=0)
+    # Outside by nothing, by 0.1 below and 0.5 above, by 0.2 above and 0.3 below.
+    violations = torch.tensor([0, 0.6, 0.5], dtype=torch.float64)
+    torch.testing.assert_close(p.violation(s), violations)
+    costs = torch.tensor([0.395, 31.1925, 26.565], dtype=torch.float64)
+    torch.testing.assert_close(p.cost(s, a), costs)
+    torch.testing.assert_close(GrosZanonLTI(w=0).cost(s, a), costs - 50 * violations)
+
+
+def test_actions_are_clipped_and_states_are_not():
+    p, s, zero = GrosZanonLTI(), torch.tensor([3.0, 2.0]), torch.zeros(2)
+    at_the_bound, beyond = torch.ones(1), torch.tensor([50.0])
+    assert torch.equal(p.step(s, beyond, zero), p.step(s, at_the_bound, zero))
+    assert torch.equal(p.cost(s, beyond), p.cost(s, at_the_bound))
+    following = p.step(s, -beyond, zero)
+    torch.testing.assert_close(following, torch.tensor([3.3187, 2.0]).double(), rtol=0, atol=1e-6)
+
+
+def test_noise_is_one_uniform_number_for_the_first_state():
+    p, rng = GrosZanonLTI(), np.random.default_rng(0)
+    expected = rng.uniform(-0.1, 0.0, size=20_000)
+    draw = p.draw(np.random.default_rng(0), 20_000)
+    assert draw.shape == (20_000, 1)
+    nu = p.noise(torch.ones(20_000, 2), draw)
+    np.testing.assert_allclose(nu[:, 0], expected, atol=1e-16, rtol=0)
+    assert (nu[:, 1] == 0).all()
+
+    by_torch = p.noise(nu, p.draw(torch.Generator().manual_seed(0), 20_000))[:, 0]
+    for e in (nu[:, 0], by_torch):
+        assert (e >= -0.1).all()
+        assert (e <= 0).all()
+        assert e.mean().item() == pytest.approx(-0.05, abs=4 * 0.1 / (12 * 20_000) ** 0.5)
+        assert e.std().item() == pytest.approx(0.1 / 12**0.5, rel=0.02)
+
+
+def test_episodes_start_at_one_state_that_nothing_is_drawn_for():
+    for rng, untouched in (
+        (np.random.default_rng(3), np.random.default_rng(3)),
+        (torch.Generator().manual_seed(3), torch.Generator().manual_seed(3)),
+    ):
+        s = GrosZanonLTI().starts(rng, 4)
+        assert s.tolist() == [[0, 0.15]] * 4
+        assert torch.equal(GrosZanonLTI().draw(rng, 1), GrosZanonLTI().draw(untouched, 1))
+        s[0] = 1
+        assert s[1].tolist() == [0, 0.15], "memory of its own"
+
+
+def test_wrong_model():
+    A, B = GrosZanonLTI().wrong_model()
+    assert A.tolist() == [[1, 0.25], [0, 1]]
+    assert B.tolist() == [[0.0312], [0.25]]
+    assert A.dtype == B.dtype == torch.float64
+
+
+def test_gymnasium_environment_draws_one_number_a_step_and_none_at_a_reset():
+    env, rng = GrosZanonLTIGymEnv(), np.random.default_rng(5)
+    A, B = np.array([[0.9, 0.35], [0, 1.1]]), np.array([0.0813, 0.2])
+    actions = np.random.default_rng(6).uniform(-1, 1, 10).astype(np.float32)
+    for seed in (5, None):
+        observation, _ = env.reset(seed=seed)
+        s = np.array([0, 0.15])
+        np.testing.assert_array_equal(observation, s.astype(np.float32))
+        for action in actions:
+            observation, reward, *_ = env.step(action[None])
+            outside = np.maximum([0, -1] - s, 0) + np.maximum(s - 1, 0)
+            cost = (s @ s + 0.5 * np.float64(action) ** 2 + 100 * outside.sum()) / 2
+            assert reward == pytest.approx(-cost, abs=1e-12)
+            s = A @ s + B * action + [rng.uniform(-0.1, 0.0), 0]
+            np.testing.assert_allclose(observation, s, atol=1e-6)
+
+
+def test_environments_are_of_5000_steps_with_unbounded_observations():
+    one = gymnasium.make("torch_qpmpc/GrosZanonLTI-v0")
+    assert one.spec is not None
+    assert one.spec.max_episode_steps == 5000
+    assert one.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (2,))
+    assert one.action_space == gymnasium.spaces.Box(-1, 1, (1,))
+    env = GrosZanonLTIEnv()
+    assert (env.batch_size, env.max_steps) == ((8,), 5000)
+    far = env.reset()
+    far["observation"] += 1e6
+    assert env.observation_spec.is_in(far.select("observation", "noise", "step_count"))
+    for environment in (env, one.unwrapped):
+        assert isinstance(environment, GrosZanonLTIEnv | GrosZanonLTIGymEnv)
+        assert isinstance(environment.physics, GrosZanonLTI)
+        assert environment.physics.w == 100
+
+
+def test_bad_weight_is_an_error():
+    for w in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(QPError, match=rf"w: got {w}, expected a finite number >= 0"):
+            GrosZanonLTI(w)

@@ -1,0 +1,119 @@
+"""Gros and Zanon's linear system, and its Gymnasium and TorchRL environments.
+
+    s+ = A s + B a + [e, 0],    e uniform in (-0.1, 0),    s_0 = [0, 0.15]
+
+From "Data-driven economic NMPC using reinforcement learning" (IEEE TAC 2020, arXiv 1904.04152); the
+example of on-policy Q-learning of the package mpcrl learns on it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import KW_ONLY, dataclass, field
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.envs.linear_system import (
+    LinearSystem,
+    LinearSystemEnv,
+    LinearSystemGymEnv,
+    Rng,
+    float64,
+    uniform,
+)
+from torch_qpmpc.errors import QPError
+
+
+@dataclass(frozen=True, eq=False)
+class GrosZanonLTI(LinearSystem):
+    """The physics, in float64; every tensor that a method gets is converted to that.
+
+    It pays to be near the origin, a corner of the bounds of the state, and the noise pushes across
+    the edge.
+
+    Args:
+        w: weight of the violation in the cost.
+        A, B: dynamics ``(2, 2)`` and ``(2, 1)``.
+        lb_s, ub_s: soft bounds of the state ``(2,)``; it is not clipped to them.
+        lb_a, ub_a: bounds of the action ``(1,)``, which is clipped to them.
+
+    Raises:
+        QPError: negative or not finite ``w``.
+    """
+
+    clips_states: ClassVar[bool] = False
+
+    w: float = 100.0
+    _: KW_ONLY
+    A: Tensor = field(default_factory=float64([0.9, 0.35], [0, 1.1]))
+    B: Tensor = field(default_factory=float64([0.0813], [0.2]))
+    lb_s: Tensor = field(default_factory=float64(0, -1))
+    ub_s: Tensor = field(default_factory=float64(1, 1))
+    lb_a: Tensor = field(default_factory=float64(-1))
+    ub_a: Tensor = field(default_factory=float64(1))
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.w < math.inf:
+            remedy = "Pass 0 for a cost without the violation."
+            raise QPError.expected("w", self.w, "a finite number >= 0", remedy)
+
+    def violation(self, s: Tensor) -> Tensor:
+        """How far s ``(*batch, 2)`` is outside its bounds, summed over the states ``(*batch,)``."""
+        s = s.to(self.A)
+        return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
+
+    def cost(self, s: Tensor, a: Tensor) -> Tensor:
+        """L(s, a) = 1/2 (|s|^2 + 1/2 a^2 + w violation(s)) ``(*batch,)``, of a as applied."""
+        squares = s.to(self.A).square().sum(-1) + self.applied(a).square().sum(-1) / 2
+        return (squares + self.w * self.violation(s)) / 2
+
+    def starts(self, rng: Rng, count: int) -> Tensor:
+        """``count`` times s_0 ``(count, 2)``; draws nothing."""
+        return self.A.new_tensor([[0, 0.15]]).repeat(count, 1)
+
+    def draw(self, rng: Rng, count: int) -> Tensor:
+        """Numbers uniform in [0, 1) ``(count, 1)``, one an episode."""
+        return uniform(rng, count, 1)
+
+    def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
+        """[e, 0] ``(*batch, 2)``, as numpy's ``uniform(-0.1, 0.0)`` makes e of the draw."""
+        e = -0.1 + 0.1 * draw.to(self.A)
+        return torch.cat((e, torch.zeros_like(e)), -1)
+
+    def wrong_model(self) -> tuple[Tensor, Tensor]:
+        """The model that learning starts from: A_0 ``(2, 2)`` and B_0 ``(2, 1)``."""
+        as_A = self.A.new_tensor
+        return as_A([[1, 0.25], [0, 1]]), as_A([[0.0312], [0.25]])
+
+
+class GrosZanonLTIGymEnv(LinearSystemGymEnv):
+    """``torch_qpmpc/GrosZanonLTI-v0``: never terminates, truncated at 5000 steps."""
+
+    def __init__(self, physics: GrosZanonLTI | None = None) -> None:
+        super().__init__(GrosZanonLTI() if physics is None else physics)
+
+
+class GrosZanonLTIEnv(LinearSystemEnv):
+    """``num_envs`` such systems in one :class:`LinearSystemEnv`.
+
+    Args:
+        physics: ``None`` for ``GrosZanonLTI()``.
+        num_envs, max_steps, dtype, device, seed: as of :class:`LinearSystemEnv`.
+
+    Raises:
+        QPError: ``num_envs`` or ``max_steps`` below 1.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 8,
+        physics: GrosZanonLTI | None = None,
+        max_steps: int = 5000,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+        seed: int | None = None,
+    ) -> None:
+        physics = GrosZanonLTI() if physics is None else physics
+        super().__init__(physics, num_envs, max_steps, dtype, device, seed)

@@ -1,0 +1,229 @@
+"""Linear systems with additive noise, and their Gymnasium and TorchRL environments.
+
+    s+ = A s + B a + nu
+
+A concrete plant says what it costs, what its noise is and where it starts. Both environments return
+the reward -L(s, a): the paper minimises a cost, they maximise.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Self
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torch_qpmpc.errors import QPError
+
+#: What random numbers come from: the TorchRL environments hold a generator of torch's, the
+#: Gymnasium environments and the evaluation one of numpy's.
+Rng = np.random.Generator | torch.Generator
+
+
+def float64(*values: Any) -> Callable[[], Tensor]:
+    """What makes the tensor of ``values``: the default factory of a plant's field."""
+    return lambda: torch.tensor(values, dtype=torch.float64)
+
+
+def normal(rng: Rng, *shape: int) -> Tensor:
+    """Standard normal numbers in float64."""
+    if isinstance(rng, torch.Generator):
+        return torch.randn(shape, generator=rng, dtype=torch.float64, device=rng.device)
+    return torch.as_tensor(rng.standard_normal(shape))
+
+
+def uniform(rng: Rng, *shape: int) -> Tensor:
+    """Numbers uniform in [0, 1), in float64."""
+    if isinstance(rng, torch.Generator):
+        return torch.rand(shape, generator=rng, dtype=torch.float64, device=rng.device)
+    return torch.as_tensor(rng.random(shape))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LinearSystem(ABC):
+    """The physics, in float64; every tensor that a method gets is converted to that.
+
+    Args:
+        A, B: dynamics ``(n_x, n_x)`` and ``(n_x, n_u)``.
+        lb_s, ub_s, lb_a, ub_a: bounds of the state ``(n_x,)`` and of the action ``(n_u,)``.
+    """
+
+    #: Whether a step clips s+ to its bounds. Where not, they are soft: observations have none.
+    clips_states: ClassVar[bool] = True
+
+    A: Tensor
+    B: Tensor
+    lb_s: Tensor
+    ub_s: Tensor
+    lb_a: Tensor
+    ub_a: Tensor
+
+    def to(self, device: torch.device | str | None) -> Self:
+        """The same physics with its tensors on ``device``."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        tensors = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
+        return replace(self, **tensors)
+
+    @abstractmethod
+    def cost(self, s: Tensor, a: Tensor) -> Tensor:
+        """L(s, a) ``(*batch,)`` of the current s ``(*batch, n_x)`` and of a ``(*batch, n_u)``."""
+
+    @abstractmethod
+    def starts(self, rng: Rng, count: int) -> Tensor:
+        """Start states ``(count, n_x)``."""
+
+    @abstractmethod
+    def draw(self, rng: Rng, count: int) -> Tensor:
+        """The random numbers ``(count, n_noise)`` that one step of ``count`` episodes needs."""
+
+    @abstractmethod
+    def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
+        """The next nu ``(*batch, n_x)`` from the last one and a :meth:`draw`."""
+
+    def applied(self, a: Tensor) -> Tensor:
+        """The action that the system gets ``(*batch, n_u)``: a clipped to its bounds."""
+        return a.to(self.A).clamp(self.lb_a, self.ub_a)
+
+    def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
+        """s+ = A s + B a + nu ``(*batch, n_x)``; a is clipped, s+ where the system clips states."""
+        following = s.to(self.A) @ self.A.mT + self.applied(a) @ self.B.mT + nu.to(self.A)
+        return following.clamp(self.lb_s, self.ub_s) if self.clips_states else following
+
+
+class LinearSystemGymEnv(gymnasium.Env):
+    """One episode of ``physics``: never terminates, its registration truncates it."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own convention)
+
+    def __init__(self, physics: LinearSystem) -> None:
+        self.physics = p = physics
+        lb_s, ub_s, lb_a, ub_a = (b.float().numpy() for b in (p.lb_s, p.ub_s, p.lb_a, p.ub_a))
+        low, high = (lb_s, ub_s) if p.clips_states else (-np.inf, np.inf)
+        self.observation_space = gymnasium.spaces.Box(low, high, lb_s.shape)
+        self.action_space = gymnasium.spaces.Box(lb_a, ub_a)
+        self._s = self._nu = torch.zeros_like(p.lb_s)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._s = self.physics.starts(self.np_random, 1)[0]
+        self._nu = torch.zeros_like(self._s)
+        return self._s.numpy().astype(np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        a = torch.as_tensor(action)
+        reward = -self.physics.cost(self._s, a).item()
+        self._nu = self.physics.noise(self._nu, self.physics.draw(self.np_random, 1)[0])
+        self._s = self.physics.step(self._s, a, self._nu)
+        return self._s.numpy().astype(np.float32), reward, False, False, {}
+
+
+class LinearSystemEnv(EnvBase):
+    """``num_envs`` episodes in one vectorised TorchRL environment, without a Python loop.
+
+    The environment holds no state but its generator. What a step needs beside the observation
+    travels in the TensorDict: ``noise``, the last nu ``(num_envs, n_x)``, and ``step_count``
+    ``(num_envs, 1)``. So TorchRL's own merging by mask at a partial reset restarts exactly those
+    episodes' noise and clocks. A policy must not read ``noise``.
+
+    It truncates itself at ``max_steps`` (no ``StepCounter`` needed), so that the collector sees the
+    end of an episode, resets it and changes its trajectory id; it never terminates.
+
+    Args:
+        physics: the system.
+        num_envs: number of episodes run side by side, the batch size.
+        max_steps: steps of an episode.
+        dtype: of observation, action and reward; the physics stays in float64.
+        device: of the TensorDicts and of the generator; ``None`` for the CPU.
+        seed: of the generator; ``None`` draws one from torch's global generator.
+
+    Raises:
+        QPError: ``num_envs`` or ``max_steps`` below 1.
+    """
+
+    def __init__(
+        self,
+        physics: LinearSystem,
+        num_envs: int,
+        max_steps: int,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+        seed: int | None = None,
+    ) -> None:
+        for name, value in (("num_envs", num_envs), ("max_steps", max_steps)):
+            if value < 1:
+                raise QPError.expected(name, value, "an integer >= 1", "Ask for at least one.")
+        super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        self.physics = p = physics.to(self.device)
+        self.max_steps = max_steps
+        self.rng = torch.Generator(device=p.A.device)
+        one, kind = torch.Size([num_envs, 1]), {"dtype": dtype, "device": self.device}
+
+        def box(low: Tensor, high: Tensor) -> Bounded:
+            low, high = (b.to(dtype).expand(num_envs, -1).clone() for b in (low, high))
+            return Bounded(low, high, dtype=dtype, device=self.device)
+
+        def composite(**specs: Any) -> Composite:
+            return Composite(specs, shape=self.batch_size, device=self.device)
+
+        nu = Unbounded(torch.Size([num_envs, p.A.shape[0]]), **kind)
+        s = box(p.lb_s, p.ub_s) if p.clips_states else nu.clone()
+        count = Unbounded(one, dtype=torch.int64, device=self.device)
+        flag = Categorical(2, shape=one, dtype=torch.bool, device=self.device)
+        # The hidden entries are inputs of a step (state) and outputs of it (observation).
+        self.state_spec = composite(noise=nu, step_count=count)
+        self.observation_spec = composite(observation=s, noise=nu.clone(), step_count=count.clone())
+        self.action_spec = box(p.lb_a, p.ub_a)
+        self.reward_spec = Unbounded(one, **kind)
+        self.done_spec = composite(done=flag, terminated=flag.clone(), truncated=flag.clone())
+        self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
+
+    def get_rng_state(self) -> Tensor:
+        """State of the generator, a uint8 tensor for a checkpoint."""
+        return self.rng.get_state()
+
+    def set_rng_state(self, state: Tensor) -> None:
+        """Continue the random stream from what :meth:`get_rng_state` returned."""
+        self.rng.set_state(state.cpu())
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.rng.manual_seed(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        # Fresh values for every environment: where only some are reset, TorchRL keeps the others'.
+        s = self.physics.starts(self.rng, self.batch_size[0])
+        count = torch.zeros((*self.batch_size, 1), dtype=torch.int64, device=s.device)
+        return self._pack(s, torch.zeros_like(s), count)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        s, a = tensordict["observation"], tensordict["action"]
+        draw = self.physics.draw(self.rng, self.batch_size[0])
+        nu = self.physics.noise(tensordict["noise"], draw)
+        out = self._pack(self.physics.step(s, a, nu), nu, tensordict["step_count"] + 1)
+        return out.set("reward", -self.physics.cost(s, a).unsqueeze(-1).to(out["observation"]))
+
+    def _pack(self, s: Tensor, nu: Tensor, step_count: Tensor) -> TensorDict:
+        dtype = self.observation_spec["observation"].dtype
+        truncated = step_count >= self.max_steps
+        return TensorDict(
+            {
+                "observation": s.to(dtype),
+                "noise": nu.to(dtype),
+                "step_count": step_count,
+                "done": truncated,
+                "terminated": torch.zeros_like(truncated),
+                "truncated": truncated.clone(),
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )

@@ -1,0 +1,69 @@
+"""Where a stage's entries are, in z and among the rows of G, and what a linear MPC scheme ties.
+
+The rows of G are one for each entry of z, then those of D on (x_k, u_k) for each stage, then those
+of D^f on x_N (eq:v1c4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Layout:
+    """N, n_x and n_u, and how many rows D and D^f have."""
+
+    n_x: int
+    n_u: int
+    horizon: int
+    n_d: int = 0
+    n_d_f: int = 0
+
+    @property
+    def n(self) -> int:
+        """Entries of a stage, n_x + n_u."""
+        return self.n_x + self.n_u
+
+    @property
+    def n_z(self) -> int:
+        return self.horizon * self.n + self.n_x
+
+    @property
+    def n_linear(self) -> int:
+        """Rows of G that are no bounds."""
+        return self.horizon * self.n_d + self.n_d_f
+
+    def entries(self, x: Tensor, u: Tensor) -> Tensor:
+        """``(n_z,)`` from values of x ``(N + 1, n_x)`` and u ``(N + 1, n_u)``; there is no u_N."""
+        x, u = (part.expand(self.horizon + 1, -1) for part in (x, u))
+        return torch.cat((x, u), dim=-1).flatten()[: self.n_z]
+
+    def rows(self, x: Tensor, u: Tensor, d: Tensor, d_f: Tensor) -> Tensor:
+        """``(n_g,)`` from those values, and from those of D ``(N, n_d)`` and D^f ``(n_d_f,)``."""
+        return torch.cat((self.entries(x, u), d.expand(self.horizon, -1).flatten(), d_f))
+
+    def discounts(self, gamma: float) -> tuple[Tensor, Tensor]:
+        """gamma^k of the entries of z ``(n_z,)`` and of the rows of G ``(n_g,)``."""
+        powers = gamma ** torch.arange(self.horizon + 1, dtype=torch.float64).unsqueeze(-1)
+        x, u = powers.expand(-1, self.n_x), powers.expand(-1, self.n_u)
+        d, d_f = powers[:-1].expand(-1, self.n_d), powers[-1].expand(self.n_d_f)
+        return self.entries(x, u), self.rows(x, u, d, d_f)
+
+    def ties(self, part: str) -> Tensor:
+        """Which of its values each entry of a tied q, b, lb, ub or w has.
+
+        x_N has values of its own in q and w, as w^f in eq:v1c0, but not in lb and ub.
+        """
+        n_x, n = self.n_x, self.n
+        x, u = torch.arange(n_x), torch.arange(n_x, n)
+        if part == "b":
+            return x.repeat(self.horizon)
+        if part in ("q", "w"):
+            x, n = torch.stack((*[x] * self.horizon, n + x)), n + n_x
+        if part == "q":
+            return self.entries(x, u)
+        d, d_f = torch.arange(self.n_d), torch.arange(self.n_d_f)
+        return self.rows(x, u, n + d, n + self.n_d + d_f)

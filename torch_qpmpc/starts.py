@@ -1,0 +1,187 @@
+"""Where theta starts: the constructor's arguments as the tensors of a QP, before discounts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import scipy.linalg
+import torch
+from torch import Tensor
+
+from torch_qpmpc.arguments import as_tensor, bound, check_slack, cost_weights
+from torch_qpmpc.banded import banded_matrix
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.layout import Layout
+from torch_qpmpc.parametrizations import LinearRows
+
+RICCATI = "riccati"
+
+
+def theta(
+    n_x: int,
+    n_u: int,
+    horizon: int,
+    *,
+    gamma: float,
+    A: Any,
+    B: Any,
+    state_bounds: tuple[Any, Any] | None,
+    action_bounds: tuple[Any, Any] | None,
+    constraints: tuple[Any, Any, Any] | None,
+    terminal_constraints: tuple[Any, Any, Any] | None,
+    hessian: str,
+    stage_weight: Any,
+    terminal_weight: Any,
+    state_slack: float,
+    action_slack: float,
+    constraint_slack: float,
+    seed: int,
+    **_: Any,
+) -> tuple[Layout, dict[str, Tensor]]:
+    """All parts of theta by name, for the arguments of `QPMPC`; w is inf on hard rows."""
+    D = _linear_rows("constraints", constraints, n_x + n_u)
+    D_f = _linear_rows("terminal_constraints", terminal_constraints, n_x)
+    layout = Layout(n_x, n_u, horizon, len(D[0]), len(D_f[0]))
+    random = torch.Generator().manual_seed(seed)
+    A, B = _model(A, B, n_x, n_u, random)
+    C = banded_matrix(A, B, horizon)
+    if stage_weight is None:
+        states = 0.5 + 4.5 * torch.rand(n_x, generator=random)
+        stage_weight = torch.cat((states, torch.zeros(n_u)))
+    if terminal_weight is None:
+        terminal_weight = torch.ones(n_x)
+    elif isinstance(terminal_weight, str):
+        if terminal_weight != RICCATI or hessian == "diagonal":
+            got = f"{terminal_weight!r} with hessian={hessian!r}"
+            want = f"a tensor, or {RICCATI!r} with hessian='block' or 'full'"
+            raise QPError.expected("terminal_weight", got, want)
+        terminal_weight = _riccati_weight(A, B, stage_weight, gamma, layout)
+    return layout, {
+        **cost_weights(stage_weight, terminal_weight, hessian, n_x, n_u, horizon),
+        "q": torch.zeros(layout.n_z),
+        "c": torch.zeros(()),
+        "C": C,
+        "b": torch.zeros(horizon * n_x),
+        "G": LinearRows(layout, tied=True)(D[0], D_f[0]),
+        **_bounds(layout, state_bounds, action_bounds, D, D_f),
+        "w": _slack_weights(layout, state_slack, action_slack, constraint_slack),
+    }
+
+
+def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dict[str, Any]:
+    """What `QPMPC.linear_mpc` chooses where ``options`` do not."""
+    n_x, n_u = as_tensor("A", A).shape[-1], as_tensor("B", B).shape[-1]
+    learn = ["H", "H_f", "q", "c", "C", "b", "lb", "ub", "w"]
+    if hessian == "full":
+        learn.remove("H_f")
+    if {"constraints", "terminal_constraints"} & options.keys():
+        learn.append("G")
+    return {
+        "structure": "tied",
+        "hessian": hessian,
+        "stage_weight": torch.ones(n_x + n_u),
+        "terminal_weight": torch.ones(n_x) if hessian == "diagonal" else RICCATI,
+        "discount_slack": True,
+        "learn": learn,
+    }
+
+
+def _model(A: Any, B: Any, n_x: int, n_u: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
+    """A and B as given, or random."""
+    if A is None:
+        A = torch.eye(n_x) + 0.1 * torch.randn(n_x, n_x, generator=random)
+    if B is None:
+        B = 0.1 * torch.randn(n_x, n_u, generator=random)
+    A, B = as_tensor("A", A), as_tensor("B", B)
+    if A.shape[-1:] != (n_x,) or B.shape[-1:] != (n_u,):
+        got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
+        raise QPError.expected("A, B", got, f"({n_x}, {n_x}) and ({n_x}, {n_u})")
+    return A, B
+
+
+def _riccati_weight(
+    A: Tensor, B: Tensor, stage_weight: Any, gamma: float, layout: Layout
+) -> Tensor:
+    W = as_tensor("stage_weight", stage_weight)
+    W = torch.diag(W) if W.shape == (layout.n,) else W
+    sizes = {"A": (A, layout.n_x, layout.n_x), "B": (B, layout.n_x, layout.n_u)}
+    for name, (matrix, *shape) in (sizes | {"stage_weight": (W, layout.n, layout.n)}).items():
+        if list(matrix.shape) != shape:
+            got, remedy = f"shape {tuple(matrix.shape)}", "The Riccati equation has one stage."
+            raise QPError.expected(name, got, f"shape {tuple(shape)}", remedy)
+    return riccati_weight(A, B, W, gamma)
+
+
+def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
+    """P ``(n_x, n_x)`` of the discounted linear quadratic regulator, whose cost to go is 1/2 x'Px.
+
+    Without active bounds, an MPC scheme that has it as H_f is that regulator, at any horizon.
+
+    Args:
+        A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
+        W: of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
+        gamma: discount of the stage costs.
+
+    Raises:
+        QPError: the discrete Riccati equation has no stabilising solution.
+    """
+    n_x, root = A.shape[-1], gamma**0.5
+    Q, S, R = W[:n_x, :n_x], W[:n_x, n_x:], W[n_x:, n_x:]
+    try:
+        P = scipy.linalg.solve_discrete_are(
+            *(x.detach().numpy() for x in (root * A, root * B, Q, R)), s=S.detach().numpy()
+        )
+    except (ValueError, scipy.linalg.LinAlgError) as error:
+        raise QPError.expected(
+            "terminal_weight",
+            f"a Riccati equation without a solution ({error})",
+            "a stabilisable model and a positive definite weight of the actions",
+            "Give the actions some weight, or pass a matrix.",
+        ) from error
+    return torch.as_tensor((P + P.T) / 2).to(A)
+
+
+def _linear_rows(name: str, rows: tuple[Any, Any, Any] | None, width: int) -> tuple[Tensor, ...]:
+    if rows is None:
+        return torch.zeros(0, width), torch.zeros(0), torch.zeros(0)
+    try:
+        matrix, lower, upper = rows
+    except (TypeError, ValueError) as error:
+        raise QPError.expected(name, repr(rows), "the triple (D, lower, upper)") from error
+    matrix = as_tensor(name, matrix)
+    if matrix.ndim != 2 or matrix.shape[1] != width:
+        raise QPError.expected(name, f"D of shape {tuple(matrix.shape)}", f"shape (n_d, {width})")
+    pair = (lower, upper)
+    return matrix, *(bound(f"{name}, bounds", pair, side, len(matrix)) for side in (0, 1))
+
+
+def _bounds(
+    layout: Layout,
+    state_bounds: tuple[Any, Any] | None,
+    action_bounds: tuple[Any, Any] | None,
+    D: tuple[Tensor, ...],
+    D_f: tuple[Tensor, ...],
+) -> dict[str, Tensor]:
+    """lb and ub ``(n_g,)``."""
+    both = []
+    for side in (0, 1):
+        x = bound("state_bounds", state_bounds, side, layout.n_x)
+        u = bound("action_bounds", action_bounds, side, layout.n_u)
+        both.append(layout.rows(x, u, D[1 + side], D_f[1 + side]))
+    lower, upper = both
+    if not (lower <= upper).all():
+        names = "state_bounds, action_bounds"
+        names += ", constraints" * bool(layout.n_d or layout.n_d_f)
+        raise QPError.expected(names, "lower > upper", "lower <= upper")
+    return {"lb": lower, "ub": upper}
+
+
+def _slack_weights(layout: Layout, state: float, action: float, constraint: float) -> Tensor:
+    """w ``(n_g,)``, inf on hard rows."""
+    given = {"state_slack": state, "action_slack": action, "constraint_slack": constraint}
+    for name, weight in given.items():
+        check_slack(name, weight)
+    sizes = (layout.n_x, layout.n_u, layout.n_d, layout.n_d_f)
+    of_each = (state, action, constraint, constraint)
+    parts = (torch.full((n,), float(w)) for n, w in zip(sizes, of_each, strict=True))
+    return layout.rows(*parts)
