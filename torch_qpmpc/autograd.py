@@ -201,9 +201,9 @@ def solve_op(
 
 
 def _report(raw: RawSolution, batch: torch.Size, on_failure: str) -> None:
-    failed = (raw.status != Status.SOLVED).nonzero().squeeze(-1)
-    if not len(failed):
+    if not raw.status.any():  # SOLVED is zero
         return
+    failed = raw.status.nonzero().squeeze(-1)
     reasons = []
     for status in Status:
         where = (raw.status == status).nonzero().squeeze(-1)

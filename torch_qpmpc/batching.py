@@ -68,6 +68,9 @@ def outer(left: Tensor, right: Tensor, like: Tensor) -> Tensor:
     return sum_to(left.unsqueeze(-1) * right.unsqueeze(-2), like)
 
 
-def largest(x: Tensor) -> Tensor:
+def largest(x: Tensor, *, keepdim: bool = False) -> Tensor:
     """Largest absolute entry along the last dimension; zero where that is empty."""
-    return x.abs().amax(-1) if x.shape[-1] else x.new_zeros(x.shape[:-1])
+    if x.shape[-1]:
+        # vector_norm is one operation, but takes several times as long for a large batch.
+        return x.abs().amax(-1, keepdim=keepdim)
+    return x.new_zeros((*x.shape[:-1], 1) if keepdim else x.shape[:-1])

@@ -34,57 +34,73 @@ class Certificate:
 class Products:
     """The terms of a claim's KKT conditions.
 
-    H z, G'lam, C'chi and ``slope``, their sum with q, ``(B, n_z)``; y = G z and ``beyond``, how far
-    it is above ub (or below lb, negative), ``(B, n_g)``.
+    H z, G'lam, C'chi and ``left``, their sum with q and xi, ``(B, n_z)``; y = G z and ``beyond``,
+    how far it is above ub (or below lb, negative), ``(B, n_g)``.
     """
 
     Hz: Tensor
     G_lam: Tensor
     C_chi: Tensor
-    slope: Tensor
+    left: Tensor
     y: Tensor
     beyond: Tensor
 
     @classmethod
-    def of(cls, programs: FlatPrograms, z: Tensor, lam: Tensor, chi: Tensor) -> Products:
+    def of(
+        cls, programs: FlatPrograms, z: Tensor, lam: Tensor, chi: Tensor, xi: Tensor
+    ) -> Products:
         p = programs
-        Hz, G_lam, C_chi = p.times_H(z), p.times_G(lam, transposed=True), p.multiply(p.C.mT, chi)
+        Hz, G_lam, C_chi = (
+            p.times_H(z),
+            p.times_G(lam, transposed=True),
+            p.multiply(p.C, chi, transposed=True),
+        )
+        left = Hz + p.q + G_lam + C_chi
+        left[:, : xi.shape[-1]] += xi
         y = p.times_G(z)
-        return cls(Hz, G_lam, C_chi, Hz + p.q + G_lam + C_chi, y, y - y.clamp(p.lb, p.ub))
+        return cls(Hz, G_lam, C_chi, left, y, y - y.clamp(p.lb, p.ub))
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
-    """What the certificate needs to know of the rows and of the sizes of q and b.
+class _Scales:
+    """What the certificate needs to know of theta alone.
 
-    All but the sizes ``(B or 1, n_g)``: ``weight`` is w with zeros on hard rows, ``soft`` one on
-    soft rows, ``shrink`` 1 / (1 + w); lb and ub have zeros for absent bounds, which ``no_lb`` and
-    ``no_ub`` mark, or None if none is absent.
+    Of the rows, ``(B or 1, n_g)``: ``weight`` is w with zeros on hard rows, ``soft`` and ``hard``
+    are one on such rows, ``shrink`` is 1 / (1 + w) and ``minus_limit`` -w / (1 + w), zero on hard
+    rows; lb and ub have zeros for absent bounds, which ``no_lb`` and ``no_ub`` mark. None stands
+    for marks of which there are none. Then -b, and the sizes of q and b, ``(B or 1, 1)``.
     """
 
     weight: Tensor
     soft: Tensor
+    hard: Tensor | None
     shrink: Tensor
+    minus_limit: Tensor
     lb: Tensor
     ub: Tensor
     no_lb: Tensor | None
     no_ub: Tensor | None
+    minus_b: Tensor
     q_size: Tensor
     b_size: Tensor
 
     @classmethod
-    def of(cls, p: FlatPrograms) -> _Rows:
+    def of(cls, p: FlatPrograms) -> _Scales:
         hard, no_lb, no_ub = p.w.isinf(), p.lb.isinf(), p.ub.isinf()
+        weight, shrink = p.soft_w, 1.0 / (1.0 + p.w)
         return cls(
-            p.w.masked_fill(hard, 0),
-            (~hard).to(p.w),
-            1 / (1 + p.w),
-            p.lb.masked_fill(no_lb, 0),
-            p.ub.masked_fill(no_ub, 0),
-            no_lb if no_lb.any() else None,
-            no_ub if no_ub.any() else None,
-            1 + largest(p.q),
-            1 + largest(p.b),
+            weight,
+            soft=(~hard).to(p.w),
+            hard=hard.to(p.w) if hard.any() else None,
+            shrink=shrink,
+            minus_limit=-weight * shrink,
+            lb=p.lb.masked_fill(no_lb, 0),
+            ub=p.ub.masked_fill(no_ub, 0),
+            no_lb=no_lb if no_lb.any() else None,
+            no_ub=no_ub if no_ub.any() else None,
+            minus_b=-p.b,
+            q_size=_size(p.q),
+            b_size=largest(p.b, keepdim=True),
         )
 
 
@@ -103,39 +119,33 @@ def certify(
     gaps; each relative to the size of the terms that it compares. ``products`` saves computing
     them again.
     """
-    p, n_f = programs, programs.fixed.shape[-1]
-    terms = Products.of(p, z, lam, chi) if products is None else products
-    rows: _Rows = p.known("rows", lambda: _Rows.of(p))
-    stationarity = terms.slope.clone()
-    stationarity[:, :n_f] += xi
-    scale = largest(torch.cat((terms.Hz, terms.G_lam, terms.C_chi), dim=-1))
-
-    outside = terms.beyond.abs()
-    sigma, charge = outside * rows.soft, outside * rows.weight
-    up, down = lam.clamp(min=0), lam.clamp(max=0)
-    excess = (lam.abs() - p.w).clamp_(min=0).mul_(rows.shrink)
+    p = programs
+    terms = Products.of(p, z, lam, chi, xi) if products is None else products
+    scales: _Scales = p.known("scales", lambda: _Scales.of(p))
+    outside, up, down = terms.beyond.abs(), lam.clamp(min=0.0), lam.clamp(max=0.0)
+    sigma, charge = outside * scales.soft, outside * scales.weight
+    # A soft row's multiplier beyond w, and a hard row's violation.
+    defect = torch.addcmul(scales.minus_limit, lam.abs(), scales.shrink).clamp_(min=0.0)
+    if scales.hard is not None:
+        defect.addcdiv_(outside * scales.hard, terms.y.abs().add_(1.0))
     # Row by row h(y) + h*(lam) - lam y, where h* charges the bound that lam pushes from.
-    gap = (rows.ub - terms.y).mul_(up)
-    gap += (rows.lb - terms.y).mul_(down)
-    gap += charge
-    cost = torch.add(p.q, terms.Hz, alpha=0.5).mul_(z).sum(-1) + charge.sum(-1)
-    parts = [
-        largest(stationarity) / rows.q_size.maximum(1 + scale),
-        largest(p.multiply(p.C, z) - p.b) / (rows.b_size + largest(z)),
-        largest(z[:, :n_f] - p.fixed),
-        _violation(outside - sigma, terms.y),
-        largest(excess),
-        gap.abs_().sum(-1) / (1 + cost.abs()),
+    gap = torch.addcmul(charge, scales.ub - terms.y, up).addcmul_(scales.lb - terms.y, down)
+    cost = torch.linalg.vecdot(torch.add(p.q, terms.Hz, alpha=0.5), z) + charge.sum(-1)
+    forces = torch.cat((terms.Hz, terms.G_lam, terms.C_chi), dim=-1)
+    errors = [
+        terms.left / scales.q_size.maximum(_size(forces)),
+        p.affine(p.C, z, scales.minus_b) / (scales.b_size + _size(z)),
+        z[:, : p.fixed.shape[-1]] - p.fixed,
+        defect,
+        (gap.abs_().sum(-1) / cost.abs().add_(1.0)).unsqueeze(-1),
     ]
-    for absent, push in ((rows.no_ub, up), (rows.no_lb, down)):
+    for absent, push in ((scales.no_ub, up), (scales.no_lb, down)):
         if absent is not None:
-            parts.append(largest(push * absent))
-    residual = torch.stack(parts).amax(0)
-    return Certificate(cost + p.c, sigma, residual.nan_to_num(torch.inf, torch.inf))
+            errors.append(push * absent)
+    residual = largest(torch.cat(errors, dim=-1))
+    return Certificate(cost + p.c, sigma, residual.nan_to_num_(torch.inf, torch.inf))
 
 
-def _violation(outside: Tensor, y: Tensor) -> Tensor:
-    """The largest violation of a hard row, relative to its y, ``(B,)``."""
-    worst = largest(outside)
-    # Relative to one or more: what is small as it is need not be divided.
-    return worst if (worst <= TOLERANCE).all() else largest(outside / (1 + y.abs()))
+def _size(x: Tensor) -> Tensor:
+    """What absolute errors in x are compared with, ``(B, 1)``."""
+    return largest(x, keepdim=True).add_(1.0)

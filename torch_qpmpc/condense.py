@@ -8,11 +8,11 @@ Y, T'HT and GT; fixing the first n_f <= keep entries then only changes a linear 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import scipy.linalg
 import torch
+import torch.nn.functional as F
+from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
 from torch_qpmpc.programs import ContentMemo, FlatPrograms, SoftQPs
@@ -25,6 +25,8 @@ ENTERS = 1e-12
 VIOLATED = 1e-9
 #: H is indefinite if an eigenvalue is below minus this fraction of the largest.
 CONVEX = 1e-9
+
+_getrf, _getrs = get_lapack_funcs(("getrf", "getrs"), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,105 +50,132 @@ class Condensed:
     G_b: Tensor
     surely_convex: bool
 
-    def convex(self, n_f: int) -> Tensor:
-        """Where H is positive semidefinite in what is free with n_f entries fixed, ``(M,)``."""
-        if self.surely_convex:
-            return torch.ones(len(self.H), dtype=torch.bool, device=self.H.device)
-        return _convex(self.H[:, n_f:, n_f:])
-
     def reduced(self, programs: FlatPrograms) -> Reduced:
         """The problem in what is free of ``programs``."""
-        key = ("reduced", self.keep, programs.fixed.shape[-1])
-        return programs.known(key, lambda: Reduced.of(self, programs))
+        n_f = programs.fixed.shape[-1]
+        key = ("reduced", self.keep, n_f)
+        return programs.known(key, lambda: Reduced.of(self, self._affine(programs), programs, n_f))
+
+    def _affine(self, programs: FlatPrograms) -> _Affine:
+        return programs.known(("affine", self.keep), lambda: _Affine.of(self, programs))
+
+
+@dataclass(frozen=True, eq=False)
+class _Affine:
+    """What a sample moves of the condensed problem, if y = (fixed, v) is: all of it is affine in y.
+
+    Its gradient in y, the bounds of all rows and z: ``(g, l, u, z) = constant + matrix y``, with
+    ``(B or 1, n)`` and ``(M, n, n_y)``. ``last`` says how many variables there are up to the last
+    that enters a row, zero for a row without a finite bound.
+    """
+
+    matrix: Tensor
+    constant: Tensor
+    last: list[int]
+
+    @classmethod
+    def of(cls, condensed: Condensed, p: FlatPrograms) -> _Affine:
+        T, H, G = condensed.T, condensed.H, condensed.G
+        # Rounding in the elimination leaves traces of variables that a row does not contain.
+        size = G.abs()
+        entered = (size > ENTERS * size.sum(dim=2, keepdim=True)).any(dim=0)
+        bounded = ((p.lb > -torch.inf) | (p.ub < torch.inf)).any(dim=0)
+        position = torch.arange(G.shape[2] + 1, device=G.device)
+        shift = p.multiply(condensed.G_b, p.b)
+        constant = (
+            p.multiply(T, p.q, transposed=True) + p.multiply(condensed.H_b, p.b),
+            p.lb - shift,
+            p.ub - shift,
+            -p.multiply(condensed.Y_neg, p.b),
+        )
+        count = next((len(part) for part in constant if len(part) != 1), 1)
+        return cls(
+            torch.cat((H, -G, -G, T), dim=1),
+            torch.cat([part.expand(count, -1) for part in constant], dim=1),
+            (F.pad(entered & bounded.unsqueeze(-1), (1, 0)) * position).amax(dim=1).tolist(),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """The condensed problem with the first n_f entries fixed: its data are affine in those.
+    """The condensed problem with the first n_f entries fixed, in v, the rest of y.
 
     Of the rows of G, ``rows`` are its own, and ``others`` those that no free variable enters or
-    that have no finite bound. A leading B is 1 where the batch shares it. The sums that make a
-    sample's problem, with ``fixed`` ``(B, n_f)`` and its variables v ``(B, d)``:
-
-        g = linear + H_f fixed,  (l, u) = bounds - G_f fixed,  z = origin + T_f fixed + T_v v
+    that have no finite bound. A leading B is 1 where the batch shares it.
 
     Attributes:
         H, G: ``(M, d, d)`` and ``(M, r, d)``.
-        H_f, G_f: ``(M, d, n_f)`` and ``(M, r, n_f)``.
-        T_f, T_v, Y_neg: ``(M, n_z, n_f)``, ``(M, n_z, d)`` and ``(M, n_z, n_c)``.
-        linear, origin: ``(B, d)`` and ``(B, n_z)``.
-        lower, upper, w, minus_w: ``(B, r)``.
+        T_v, Y_neg: ``(M, n_z, d)`` and ``(M, n_z, n_c)``.
+        matrix, constant: ``(M, d + 2 r + n_z, n_f)`` and ``(B, d + 2 r + n_z)``. What a sample's
+            fixed entries make of g, l, u, and of z at v = 0, is ``constant + matrix fixed``.
+        w, minus_w: ``(B, r)``.
         w_others: ``(B, n_g - r)``, zero where inf: violated, a hard one stays so.
         place: where ``(others, rows)`` belong, ``(n_g,)``, or None if they are in order.
-        convex: where H is positive semidefinite, ``(M,)``.
+        convex: where H is positive semidefinite, ``(M,)``, or None if it is everywhere.
     """
 
     rows: Tensor
     others: Tensor
     H: Tensor
     G: Tensor
-    H_f: Tensor
-    G_f: Tensor
-    T_f: Tensor
     T_v: Tensor
     Y_neg: Tensor
-    linear: Tensor
-    origin: Tensor
-    lower: Tensor
-    upper: Tensor
+    matrix: Tensor
+    constant: Tensor
     w: Tensor
     minus_w: Tensor
     w_others: Tensor
     place: Tensor | None
-    convex: Tensor
+    convex: Tensor | None
 
     @classmethod
-    def of(cls, condensed: Condensed, p: FlatPrograms) -> Reduced:
-        n_f = p.fixed.shape[-1]
-        # Rounding in the elimination leaves traces of variables that a row does not contain.
-        size = condensed.G.abs()
-        entered = size[:, :, n_f:] > ENTERS * size.sum(dim=2, keepdim=True)
-        bounded = (p.lb > -torch.inf) | (p.ub < torch.inf)
-        own = bounded.any(dim=0) & entered.any(dim=2).any(dim=0)
-        rows, others = own.nonzero().squeeze(-1), (~own).nonzero().squeeze(-1)
-        in_order = not len(others) or not len(rows) or bool(others[-1] < rows[0])
-        G, w, w_others = condensed.G[:, rows], p.w[:, rows], p.w[:, others]
-        H, T_v = condensed.H[:, n_f:], condensed.T[:, :, n_f:]
-        shift = p.multiply(condensed.G_b[:, rows], p.b)
+    def of(cls, condensed: Condensed, affine: _Affine, p: FlatPrograms, n_f: int) -> Reduced:
+        n_g, n_y = condensed.G.shape[1:]
+        own = [i for i, last in enumerate(affine.last) if last > n_f]
+        alien = [i for i, last in enumerate(affine.last) if last <= n_f]
+        in_order = not own or not alien or alien[-1] < own[0]
+        lower, upper = (range(n_y + k * n_g, n_y + (k + 1) * n_g) for k in (0, 1))
+        moved = [*range(n_f, n_y), *(lower[i] for i in own), *(upper[i] for i in own)]
+        moved += range(n_y + 2 * n_g, affine.matrix.shape[1])
+        rows, others, index = (
+            torch.tensor(i, dtype=torch.int64, device=p.q.device) for i in (own, alien, moved)
+        )
+        H, w = condensed.H[:, n_f:, n_f:].contiguous(), p.w[:, rows]
         return cls(
             rows,
             others,
-            H=H[:, :, n_f:].contiguous(),
-            G=G[:, :, n_f:].contiguous(),
-            H_f=H[:, :, :n_f],
-            G_f=G[:, :, :n_f],
-            T_f=condensed.T[:, :, :n_f],
-            T_v=T_v,
+            H=H,
+            G=condensed.G[:, rows, n_f:],
+            T_v=condensed.T[:, :, n_f:],
             Y_neg=condensed.Y_neg,
-            linear=p.multiply(T_v.mT, p.q) + p.multiply(condensed.H_b[:, n_f:], p.b),
-            origin=-p.multiply(condensed.Y_neg, p.b),
-            lower=p.lb[:, rows] - shift,
-            upper=p.ub[:, rows] - shift,
+            matrix=affine.matrix[:, index, :n_f],
+            constant=affine.constant[:, index],
             w=w,
             minus_w=-w,
-            w_others=w_others.masked_fill(w_others.isinf(), 0),
+            w_others=p.soft_w[:, others],
             place=None if in_order else torch.cat((others, rows)).argsort(),
-            convex=condensed.convex(n_f),
+            convex=None if condensed.surely_convex else _convex(H),
         )
 
+    def at(self, programs: FlatPrograms) -> tuple[SoftQPs, Tensor]:
+        """What a backend solves, with the rows ``rows``, and z at v = 0, ``(B, n_z)``."""
+        d, r, n_z = self.H.shape[-1], self.rows.shape[0], self.T_v.shape[1]
+        moved = programs.affine(self.matrix, programs.fixed, self.constant)
+        g, lower, upper, particular = moved.split((d, r, r, n_z), dim=-1)
+        w = self.w.expand(len(programs), -1)
+        return SoftQPs(self.H, self.G, programs.group, g, lower, upper, w), particular
+
     def soft_qps(self, programs: FlatPrograms) -> SoftQPs:
-        """What a backend solves; its rows are ``rows``."""
-        p = programs
-        offset = p.multiply(self.G_f, p.fixed)
-        return SoftQPs(
-            H=self.H,
-            G=self.G,
-            group=p.group,
-            g=p.multiply(self.H_f, p.fixed) + self.linear,
-            l=self.lower - offset,
-            u=self.upper - offset,
-            w=self.w.expand(len(p), -1),
-        )
+        """The first of `at`."""
+        return self.at(programs)[0]
+
+    def particular(self, programs: FlatPrograms) -> Tensor:
+        """The second of `at`."""
+        return self.at(programs)[1]
+
+    def expand(self, programs: FlatPrograms, particular: Tensor, v: Tensor) -> Tensor:
+        """The full z ``(B, n_z)`` from the free variables v ``(B, d)``."""
+        return programs.affine(self.T_v, v, particular)
 
     def all_rows(self, lam: Tensor, beyond: Tensor) -> Tensor:
         """Multipliers ``(B, n_g)`` from those of ``rows``, ``(B, r)``.
@@ -155,20 +184,13 @@ class Reduced:
         how far it is above (or below, negative) its bounds.
         """
         lam = lam.clamp(self.minus_w, self.w)
-        if not len(self.others):
+        count = self.others.shape[0]
+        if not count:
             return lam
-        y = beyond[:, : len(self.others)] if self.place is None else beyond[:, self.others]
-        forced = (y.abs() > VIOLATED) * y.sign() * self.w_others
+        y = beyond[:, :count] if self.place is None else beyond[:, self.others]
+        forced = F.hardshrink(y, VIOLATED).sign_() * self.w_others
         lam = torch.cat((forced, lam), dim=-1)
         return lam if self.place is None else lam[:, self.place]
-
-    def particular(self, programs: FlatPrograms) -> Tensor:
-        """z at v = 0: what b and the fixed entries contribute, ``(B, n_z)``."""
-        return self.origin + programs.multiply(self.T_f, programs.fixed)
-
-    def expand(self, programs: FlatPrograms, v: Tensor) -> Tensor:
-        """The full z ``(B, n_z)`` from the free variables v ``(B, d)``."""
-        return self.particular(programs) + programs.multiply(self.T_v, v)
 
 
 def _convex(H: Tensor) -> Tensor:
@@ -182,7 +204,7 @@ def _surely_convex(H: Tensor) -> bool:
     if not H.shape[-1]:
         return True
     diagonal = H.diagonal(dim1=-2, dim2=-1)
-    shift = CONVEX * (1 + diagonal.amax(-1, keepdim=True))
+    shift = CONVEX * (1.0 + diagonal.amax(-1, keepdim=True))
     return not torch.linalg.cholesky_ex(H + torch.diag_embed(shift.expand_as(diagonal)))[1].any()
 
 
@@ -200,26 +222,20 @@ _memo = ContentMemo()
 def _condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
     eliminated = _eliminate(C, keep)
     T, Y, padding = _null_space(C, keep) if eliminated is None else (*eliminated, None)
-    H_T = H @ T
-    H_y = T.mT @ H_T
-    H_y = (H_y + H_y.mT) / 2
+    H_T = H.bmm(T)
+    H_y = T.mT.bmm(H_T)
+    H_y = (H_y + H_y.mT) / 2.0
     if padding is not None:
         H_y = H_y + torch.diag_embed(padding)
     deficient, convex = eliminated is None, _surely_convex(H_y)
-    return Condensed(keep, deficient, T, -Y, H_y, G @ T, H_T.mT @ Y, G @ Y, convex)
+    return Condensed(keep, deficient, T, -Y, H_y, G.bmm(T), H_T.mT.bmm(Y), G.bmm(Y), convex)
 
 
 def condensed_for(programs: FlatPrograms, keep: int) -> Condensed:
     """Condensed with ``keep`` entries kept, or just the fixed ones where C does not allow more."""
-    n_f = programs.fixed.shape[-1]
-    return programs.known(("condensed", keep, n_f), lambda: _condensed_for(programs, keep))
-
-
-def _condensed_for(programs: FlatPrograms, keep: int) -> Condensed:
-    H, C, G = programs.H, programs.C, programs.G
-    condensed = condense(H, C, G, keep)
-    n_f = programs.fixed.shape[-1]
-    return condense(H, C, G, n_f) if condensed.deficient and keep > n_f else condensed
+    p, n_f = programs, programs.fixed.shape[-1]
+    condensed: Condensed = p.known(("condensed", keep), lambda: condense(p.H, p.C, p.G, keep))
+    return condensed_for(p, n_f) if condensed.deficient and keep > n_f else condensed
 
 
 def _eliminate(C: Tensor, keep: int) -> tuple[Tensor, Tensor] | None:
@@ -243,21 +259,21 @@ def _eliminate_one(C: np.ndarray, keep: int) -> tuple[np.ndarray, np.ndarray] | 
     rest = C[:, keep:]
     if n_c > rest.shape[1]:
         return None
-    order = np.arange(n_z - keep)
+    order = list(range(keep, n_z))
     if n_c:
-        factors: Any = scipy.linalg.lu(rest.T, p_indices=True, check_finite=False)
-        position, _, upper = factors
+        factors, pivots, _ = _getrf(rest.T)
         norms = np.sqrt((rest * rest).sum(axis=1))
-        if (np.abs(upper.diagonal()) <= RANK_TOLERANCE * norms).any():
+        if (np.abs(factors.diagonal()) <= RANK_TOLERANCE * norms).any():
             return None
-        order[position] = order.copy()
-    order += keep
-    dependent = order[:n_c]
-    columns = np.concatenate((np.arange(keep), np.sort(order[n_c:])))
-    right = np.concatenate((np.eye(n_c), -C[:, columns]), axis=1)
-    solved = np.linalg.solve(C[:, dependent], right)
+        for i, pivot in enumerate(pivots.tolist()):
+            order[i], order[pivot] = order[pivot], order[i]
+    dependent, columns = order[:n_c], [*range(keep), *sorted(order[n_c:])]
     Y, T = np.zeros((n_z, n_c)), np.zeros((n_z, n_z - n_c))
-    Y[dependent], T[dependent] = solved[:, :n_c], solved[:, n_c:]
+    if n_c:
+        right = np.concatenate((np.eye(n_c), -C[:, columns]), axis=1)
+        # The dependent columns are the transpose of the first n_c rows of L times U.
+        solved, _ = _getrs(factors[:n_c], np.arange(n_c), right, trans=1)
+        Y[dependent], T[dependent] = solved[:, :n_c], solved[:, n_c:]
     T[columns, np.arange(n_z - n_c)] = 1
     return T, Y
 

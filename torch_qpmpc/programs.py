@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.batching import broadcast, flatten
@@ -37,7 +38,7 @@ class ContentMemo(threading.local):
             if with_options == options and all(map(_same, known, tensors)):
                 self.entries.insert(0, self.entries.pop(position))
                 return result
-        own = tuple(tensor.clone() for tensor in tensors)
+        own = tuple(tensor.detach().clone() for tensor in tensors)
         result = make(*own)
         self.entries.insert(0, (own, options, result))
         del self.entries[self.SIZE :]
@@ -87,22 +88,22 @@ class FlatPrograms:
         Also returns the batch shape. Matrices are not repeated for the samples that share them.
         What was worked out for the same theta is found again where the batch shares all of it.
         """
-        *theta, fixed = (operand.detach() for operand in operands)
+        *theta, fixed = operands
         batches = [t.shape[: t.ndim - n] for t, n in zip(theta, _NDIMS, strict=True)]
         batch = broadcast(*batches, fixed.shape[:-1])
         fixed = flatten(fixed, batch, device)
         if any(batches):
-            return cls._flat(theta, batch, fixed), batch
+            return cls._flat([tensor.detach() for tensor in theta], batch, fixed), batch
         programs = _memo.get(
             theta, str(device), lambda *own: cls._flat(own, torch.Size(), fixed[:1])
         )
-        group = torch.zeros(len(fixed), dtype=torch.int64, device=fixed.device)
-        return replace(programs, fixed=fixed, group=group), batch
+        group = torch.zeros(fixed.shape[0], dtype=torch.int64, device=fixed.device)
+        return programs._with(group, fixed), batch
 
     @classmethod
     def _flat(cls, theta: Sequence[Tensor], batch: torch.Size, fixed: Tensor) -> FlatPrograms:
         H, q, c, C, b, G, lb, ub, w = (tensor.to(fixed) for tensor in theta)
-        matrices = ((H + H.mT) / 2, C, G)
+        matrices = ((H + H.mT) / 2.0, C, G)
         of_matrices = broadcast(*(m.shape[:-2] for m in matrices))
         count = of_matrices.numel()
         H, C, G = (
@@ -116,7 +117,7 @@ class FlatPrograms:
         return cls(H, C, G, group, q, c.squeeze(-1), b, lb, ub, w, fixed)
 
     def __len__(self) -> int:
-        return len(self.group)
+        return self.group.shape[0]
 
     def known(self, name: Any, make: Callable[[], T]) -> T:
         """What ``make()`` works out from all but ``fixed``, once; ``name`` names it."""
@@ -124,13 +125,26 @@ class FlatPrograms:
             self._known[name] = make()
         return self._known[name]
 
+    @property
+    def soft_w(self) -> Tensor:
+        """w with zeros on hard rows."""
+        return self.known("soft w", lambda: self.w.masked_fill(self.w.isinf(), 0.0))
+
     def take(self, index: Tensor) -> FlatPrograms:
         """The QPs at ``index``, with the matrices as they are."""
-        shared = (self.q, self.c, self.b, self.lb, self.ub, self.w)
-        q, c, b, lb, ub, w = (v if len(v) == 1 else v[index] for v in shared)
-        known = self._known if all(len(x) == 1 for x in (self.H, *shared)) else {}
         group, fixed = self.group[index], self.fixed[index]
-        return FlatPrograms(self.H, self.C, self.G, group, q, c, b, lb, ub, w, fixed, known)
+        vectors = (self.q, self.c, self.b, self.lb, self.ub, self.w)
+        if all(len(x) == 1 for x in (self.H, *vectors)):
+            return self._with(group, fixed)
+        q, c, b, lb, ub, w = (v if len(v) == 1 else v[index] for v in vectors)
+        return FlatPrograms(self.H, self.C, self.G, group, q, c, b, lb, ub, w, fixed)
+
+    def _with(self, group: Tensor, fixed: Tensor) -> FlatPrograms:
+        """QPs of the same theta, which share what is known of it."""
+        p = self
+        return FlatPrograms(
+            p.H, p.C, p.G, group, p.q, p.c, p.b, p.lb, p.ub, p.w, fixed, self._known
+        )
 
     def without_nan(self) -> FlatPrograms:
         """The same, with zeros for NaN and inf in matrices whose QPs are not going to be solved."""
@@ -143,12 +157,11 @@ class FlatPrograms:
 
     def _valid_theta(self) -> Tensor:
         # A sum is finite if its terms are (but for overflow, which no solver survives either).
-        matrices = (self.H.sum((1, 2)) + self.C.sum((1, 2)) + self.G.sum((1, 2))).isfinite()
-        vectors = (self.q.sum(-1) + self.b.sum(-1) + self.c).isfinite()
-        # A comparison with NaN is false, and an empty interval is one whose bounds are crossed.
-        ordered = (self.lb <= self.ub) & (self.w >= 0)
-        bounds = (ordered & (self.lb < torch.inf) & (self.ub > -torch.inf)).all(-1)
-        return (matrices if len(matrices) == 1 else matrices[self.group]) & vectors & bounds
+        matrices = self.H.sum((1, 2)) + self.C.sum((1, 2)) + self.G.sum((1, 2))
+        vectors = self.q.sum(-1) + self.b.sum(-1) + self.c
+        sums = vectors + (matrices if len(matrices) == 1 else matrices[self.group])
+        # A comparison with NaN is false, as with inf - inf where both bounds are the same infinity.
+        return sums.isfinite() & ((self.ub - self.lb).minimum(self.w) >= 0.0).all(-1)
 
     def times_H(self, z: Tensor) -> Tensor:
         """H z, ``(B, n_z)``."""
@@ -164,19 +177,28 @@ class FlatPrograms:
         diagonal = self.known(("diagonal", name), lambda: _diagonal(matrices))
         if diagonal is not None:
             return vectors * diagonal
-        return self.multiply(matrices.mT if transposed else matrices, vectors)
+        return self.multiply(matrices, vectors, transposed=transposed)
 
-    def multiply(self, matrices: Tensor, vectors: Tensor) -> Tensor:
+    def multiply(self, matrices: Tensor, vectors: Tensor, *, transposed: bool = False) -> Tensor:
         """Row-wise matrix-vector products: ``(M, i, j)`` by ``(B, j)`` to ``(B, i)``.
 
-        A vector shared by the batch, ``(1, j)``, gives ``(1, i)`` if the matrices are shared too.
+        Or, by the transposed matrices, ``(B, i)`` to ``(B, j)``. A vector shared by the batch,
+        ``(1, j)``, gives ``(1, i)`` if the matrices are shared too.
         """
-        return multiply(matrices, self.group, vectors)
+        if transposed and matrices.shape[0] == 1:
+            return vectors @ matrices[0]
+        return multiply(matrices.mT if transposed else matrices, self.group, vectors)
+
+    def affine(self, matrices: Tensor, vectors: Tensor, constant: Tensor) -> Tensor:
+        """`multiply`, plus ``constant`` ``(B or 1, i)``."""
+        if matrices.shape[0] == 1:
+            return torch.addmm(constant, vectors, matrices[0].mT)
+        return self.multiply(matrices, vectors) + constant
 
 
 def _diagonal(matrices: Tensor) -> Tensor | None:
     """The diagonal ``(n,)`` of one square matrix that has nothing else."""
-    if len(matrices) != 1 or matrices.shape[-1] != matrices.shape[-2]:
+    if matrices.shape[0] != 1 or matrices.shape[-1] != matrices.shape[-2]:
         return None
     diagonal = matrices[0].diagonal()
     return diagonal.clone() if torch.equal(torch.diag(diagonal), matrices[0]) else None
@@ -185,7 +207,7 @@ def _diagonal(matrices: Tensor) -> Tensor | None:
 def multiply(matrices: Tensor, group: Tensor, vectors: Tensor) -> Tensor:
     """`FlatPrograms.multiply` for the matrices ``group`` of any."""
     if matrices.shape[0] == 1:
-        return vectors @ matrices[0].mT
+        return F.linear(vectors, matrices[0])
     vectors = vectors.expand(len(group), -1)
     return torch.bmm(matrices[group], vectors.unsqueeze(-1)).squeeze(-1)
 

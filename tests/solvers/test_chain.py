@@ -315,6 +315,20 @@ def test_rows_of_fixed_entries_are_charged_in_closed_form(s, kind):
     assert_close(solution.xi.item(), -s - lam)
 
 
+@pytest.mark.parametrize("w", [torch.inf, 10.0], ids=["hard", "soft"])
+@pytest.mark.parametrize("side", [-1.0, 1.0], ids=["lower", "upper"])
+def test_a_bound_on_one_side_is_a_bound(side, w):
+    # min 1/2 (z - 3 side)^2 with z <= 1, or z >= -1.
+    unit, none = torch.ones(1, 1).double(), torch.zeros(0).double()
+    lb, ub = torch.tensor([[-torch.inf], [1.0]] if side > 0 else [[-1.0], [torch.inf]]).double()
+    weight = torch.tensor([w]).double()
+    q, C = -3 * side * unit[0], none.reshape(0, 1)
+    qp = QuadraticProgram(unit, q, none.sum(), C, none, unit, lb, ub, weight)
+    solution = solve_qp(qp, none, solver="daqp")
+    assert_close(solution.z.item(), side)
+    assert_close((solution.eta - solution.upsilon).item(), 2 * side)
+
+
 def test_invalid_elements_reach_no_backend(monkeypatch):
     seen: list[Tensor] = []
 

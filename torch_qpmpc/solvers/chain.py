@@ -18,7 +18,6 @@ from torch_qpmpc.qp import Status
 from torch_qpmpc.solvers import (
     OWN_WARM_STARTS,
     Answer,
-    Backend,
     backend,
     fallbacks,
     warm_start,
@@ -133,10 +132,10 @@ class _Chain:
         if not valid.all():
             self.programs = programs = programs.without_nan()
         self.keep, self.recalled, self.rejected = keep, 0, 0
-        self.reduced = condensed_for(programs, keep).reduced(programs)
         # First-order conditions certify an optimum only where the QP is convex.
-        if not self.reduced.convex.all():
-            valid = valid & self.reduced.convex[programs.group]
+        convex = self.reduced_for(programs).convex
+        if convex is not None:
+            valid = valid & convex[programs.group]
         self.raw: RawSolution | None = None
         self.todo = torch.arange(len(programs), device=valid.device)
         if not valid.all():
@@ -148,7 +147,7 @@ class _Chain:
         if start is not None:
             self.recall(solver, start)
         self.attempt(backend(solver))
-        self.rejected = len(self.todo)
+        self.rejected = self.todo.shape[0]
         if self.rejected:
             assert self.raw is not None
             part = self.part()
@@ -174,7 +173,7 @@ class _Chain:
 
     def part(self) -> FlatPrograms:
         """The programs that are still to be solved."""
-        whole = len(self.todo) == len(self.programs)
+        whole = self.todo.shape[0] == len(self.programs)
         return self.programs if whole else self.programs.take(self.todo)
 
     def reduced_for(self, part: FlatPrograms) -> Reduced:
@@ -185,18 +184,25 @@ class _Chain:
 
         A warm start gets its part of the active sets ``start``; what it misses is not sharpened.
         """
-        if not len(self.todo) and self.raw is not None:
+        if not self.todo.shape[0] and self.raw is not None:
             return
         part = self.part()
         reduced = self.reduced_for(part)
+        qps, particular = reduced.at(part)
+        recover = partial(_recover, part, reduced, particular)
         if start is not None:
             # A part of a batch may have fewer rows with a bound than the whole.
             solve = partial(solve, active=start[self.todo][:, reduced.rows])
-        claim = _attempt(solve, part, reduced, sharpen=start is None)
+        answer = solve(qps) if qps.l.shape[1] else _unconstrained(qps)
+        claim = recover(answer)
         accepted = claim.residual <= TOLERANCE
-        if accepted.all() and len(part) == len(self.programs):
-            self.raw, self.todo = claim, self.todo[:0]
-            return
+        if accepted.all():
+            if part is self.programs:
+                self.raw, self.todo = claim, self.todo[:0]
+                return
+        elif start is None:
+            _sharpen(claim, qps, answer, recover)
+            accepted = claim.residual <= TOLERANCE
         if self.raw is None:
             self.raw = _unsolved(self.programs, Status.NOT_CONVERGED)
         self.raw.put(self.todo[accepted], claim.at(accepted))
@@ -204,20 +210,16 @@ class _Chain:
         self.raw.residual[self.todo] = claim.residual[~accepted]
 
 
-def _attempt(
-    solve: Backend, programs: FlatPrograms, reduced: Reduced, sharpen: bool
-) -> RawSolution:
-    """One backend's claims, sharpened where that helps; their ``status`` is SOLVED."""
-    qps = reduced.soft_qps(programs)
-    answer = solve(qps) if qps.l.shape[1] else _unconstrained(qps)
-    claim = _recover(programs, reduced, answer)
+def _sharpen(
+    claim: RawSolution, qps: SoftQPs, answer: Answer, recover: Callable[[Answer], RawSolution]
+) -> None:
+    """Improve in place, where that is likely, what the certificate rejects by little."""
     nearly = (claim.residual > TOLERANCE) & (claim.residual <= NEARLY)
-    if sharpen and nearly.any():
-        sharper = refine(qps, answer, nearly.nonzero().squeeze(-1))
-        second = _recover(programs, reduced, sharper)
-        improved = (second.residual < claim.residual).nonzero().squeeze(-1)
-        claim.put(improved, second.at(improved))
-    return claim
+    if not nearly.any():
+        return
+    second = recover(refine(qps, answer, nearly.nonzero().squeeze(-1)))
+    improved = (second.residual < claim.residual).nonzero().squeeze(-1)
+    claim.put(improved, second.at(improved))
 
 
 def _unconstrained(qps: SoftQPs) -> Answer:
@@ -227,22 +229,24 @@ def _unconstrained(qps: SoftQPs) -> Answer:
     return Answer(v, qps.l, torch.zeros_like(qps.group))
 
 
-def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
+def _recover(p: FlatPrograms, reduced: Reduced, particular: Tensor, answer: Answer) -> RawSolution:
     """The full primal-dual solution from a backend's answer, certified.
 
     The multipliers that condensing eliminated come from the stationarity of the Lagrangian: chi by
     the transpose of the same elimination, xi from what is left in the fixed entries.
     """
-    z = reduced.expand(p, answer.v)
+    z = reduced.expand(p, particular, answer.v)
     Hz, y = p.times_H(z), p.times_G(z)
     beyond = y - y.clamp(p.lb, p.ub)
     lam = reduced.all_rows(answer.lam, beyond)
     G_lam = p.times_G(lam, transposed=True)
     slope = Hz + p.q + G_lam
-    chi = p.multiply(reduced.Y_neg.mT, slope)
-    C_chi = p.multiply(p.C.mT, chi)
+    chi = p.multiply(reduced.Y_neg, slope, transposed=True)
+    C_chi = p.multiply(p.C, chi, transposed=True)
     slope += C_chi
-    xi = -slope[:, : p.fixed.shape[-1]]
+    of_fixed = slope[:, : p.fixed.shape[-1]]
+    xi = -of_fixed
+    of_fixed += xi
     certificate = certify(p, z, lam, chi, xi, Products(Hz, G_lam, C_chi, slope, y, beyond))
     status = torch.full_like(answer.iterations, int(Status.SOLVED))
     return RawSolution(
@@ -260,12 +264,11 @@ def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
 
 def _reasons(part: FlatPrograms, reduced: Reduced) -> Tensor:
     """What is the matter with QPs that a solver did not solve: their status, ``(B,)``."""
-    particular = reduced.particular(part)
+    qps, particular = reduced.at(part)
     inconsistent = (part.multiply(part.C, particular) - part.b).abs() > TOLERANCE * (
         1 + part.b.abs() + particular.abs().amax(-1, keepdim=True)
     )
     y = part.multiply(part.G, particular)
-    qps = reduced.soft_qps(part)
     unreachable = (torch.maximum(part.lb - y, y - part.ub) > TOLERANCE) & part.w.isinf()
     unreachable[:, reduced.rows] = False
     impossible = inconsistent.any(-1) | unreachable.any(-1)

@@ -31,12 +31,16 @@ def solve(qps: SoftQPs, active: Tensor | None = None) -> Answer:
     """
     arrays = qps.arrays()
     codes = None if active is None else active.cpu().numpy()
+    hard = np.isinf(arrays.w)
+    kinds = _alike(arrays.group, hard)
+    if len(kinds) == 1:
+        return Answer.like(qps.g, *_solve_alike(arrays, hard[0], codes))
     v, lam = np.zeros_like(arrays.g), np.zeros_like(arrays.l)
     iterations = np.zeros(len(v), dtype=np.int64)
-    hard = np.isinf(arrays.w)
-    for members in _alike(arrays.group, hard):
-        start = None if codes is None else codes[members]
-        _solve_alike(arrays, members, hard[members[0]], start, (v, lam, iterations))
+    for i in kinds:
+        part = SoftArrays(arrays.H, arrays.G, *(vectors[i] for vectors in arrays[2:]))
+        start = None if codes is None else codes[i]
+        v[i], lam[i], iterations[i] = _solve_alike(part, hard[i[0]], start)
     return Answer.like(qps.g, v, lam, iterations)
 
 
@@ -51,26 +55,24 @@ def _alike(group: np.ndarray, hard: np.ndarray) -> list[np.ndarray]:
 
 
 def _solve_alike(
-    arrays: SoftArrays,
-    members: np.ndarray,
-    hard: np.ndarray,
-    start: np.ndarray | None,
-    found: tuple[np.ndarray, ...],
-) -> None:
-    """Solve with one model; updated to another pattern of soft rows, it would corrupt memory."""
-    v, lam, iterations = found
-    w, g = arrays.w[members], arrays.g[members]
+    arrays: SoftArrays, hard: np.ndarray, start: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """v, lam and iterations by one model; with another pattern of soft rows, it corrupts memory."""
+    _, _, (m, *_), g, lower, upper, w = arrays
+    v, lam = np.zeros(g.shape), np.zeros(lower.shape)
+    iterations = np.zeros(len(g), dtype=np.int64)
+    upper, lower = np.minimum(upper, NO_BOUND), np.maximum(lower, -NO_BOUND)
     # A row that may be violated for nothing is no row; DAQP would hold it with its small rho.
-    upper = np.where(w > 0, arrays.u[members].clip(max=NO_BOUND), NO_BOUND)
-    lower = np.where(w > 0, arrays.l[members].clip(min=-NO_BOUND), -NO_BOUND)
+    if not w.all():
+        upper[w == 0], lower[w == 0] = NO_BOUND, -NO_BOUND
     weight = np.where(hard, 0.0, w)
     same_weight = (weight == weight[0]).all()
     empty = np.where(hard, 0, SOFT).astype(np.int32)
     rho = np.full(len(hard), RECIPROCAL_RHO)
-    m, model = arrays.group[members[0]], daqp.Model()
+    model = daqp.Model()
     flag, _ = model.setup(arrays.H[m], g[0], arrays.G[m], upper[0], lower[0], empty.copy())
     if flag < 0:
-        return  # The zeros that stand for the answers do not pass the certificate.
+        return v, lam, iterations  # zeros, which do not pass the certificate
     model.settings = SETTINGS
     if len(hard):  # soft_weights refuses empty arrays
         model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[0], w_u=weight[0])
@@ -90,10 +92,10 @@ def _solve_alike(
             update(f=g[k], bupper=upper[k], blower=lower[k], sense=sense)
         if not same_weight:
             model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[k], w_u=weight[k])
-        i = members[k]
-        v[i], _, flag, info = solve_one()
-        lam[i], iterations[i] = info["lam"], info["iterations"]
+        v[k], _, flag, info = solve_one()
+        lam[k], iterations[k] = info["lam"], info["iterations"]
         failed = flag <= 0
+    return v, lam, iterations
 
 
 def _path(g: np.ndarray) -> list[int]:
