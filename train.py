@@ -21,27 +21,24 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from torchrl import torchrl_logger
-from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from torch_qpmpc import QPActorValueOperator, QPError, QPQLearningLoss, SolveLog
+from torch_qpmpc import QPActorValueOperator, QPError, SolveLog
 from torch_qpmpc.checkpoint import save_checkpoint
 from torch_qpmpc.config import check_config
 from torch_qpmpc.experiment import (
     decay,
     evaluate,
     make_collector,
-    make_mpc,
-    make_optimizer,
-    make_penalties,
-    make_physics,
-    make_true_mpc,
-    make_update,
+    make_learner,
     report,
+    stream_summary,
     table,
+    theta_metrics,
 )
 from torch_qpmpc.plots import summary_figure
 from torch_qpmpc.replay import ACTIVE_SET, make_replay
+from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc
 from torch_qpmpc.tracking import RunFolder
 
 
@@ -52,7 +49,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
 
-    # The QP, between its two ends: the corrupted model it starts from, and the true one.
+    # The QP, between its two ends: the wrong model it starts from, and the true one.
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
     loops = {
@@ -60,16 +57,9 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
         "true model": evaluate(cfg, make_true_mpc(cfg, physics), physics),
     }
 
-    # Q-learning: V and Q from one QP, two learning rates, and the penalties on C.
+    # Q-learning, by gradients or of the second order.
     operator = QPActorValueOperator(mpc, active_set_key=ACTIVE_SET if cfg.warm_start else None)
-    loss_module = QPQLearningLoss(
-        operator, delay_value=cfg.delay_value, td_error_clip=cfg.td_error_clip
-    )
-    loss_module.make_value_estimator(gamma=cfg.task.gamma)
-    target = SoftUpdate(loss_module, tau=cfg.target_rate) if cfg.delay_value else None
-    deviation, si = make_penalties(cfg, mpc)
-    optimizer, schedule = make_optimizer(cfg, mpc)
-    learn = make_update(cfg, mpc, loss_module, optimizer, deviation, si)
+    learner = make_learner(cfg, operator)
 
     # Data: vectorised episodes under today's policy, and one replay for transitions and windows.
     collector = make_collector(cfg, physics, operator)
@@ -78,7 +68,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
         cfg.num_envs,
         cfg.batch_size,
         cfg.task.horizon,
-        1 if si is None else cfg.constraint.si.windows,
+        1 if learner.si is None else cfg.constraint.si.windows,
         seed=cfg.seed,
         active_rows=len(mpc.G) if cfg.warm_start else None,
     )
@@ -86,7 +76,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     for batch in itertools.islice(batches, -(-cfg.warmup_steps // cfg.steps_per_update)):
         replay.extend(batch)
 
-    qps, unsolved, train_seconds = SolveLog(), 0, 0.0
+    qps, unsolved, train_seconds, costs, violation = SolveLog(), 0, 0.0, [], 0.0
     with contextlib.ExitStack() as stack:
         stack.callback(collector.shutdown)
         run = stack.enter_context(RunFolder(folder, cfg))
@@ -99,24 +89,30 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 replay.extend(batch)
                 collected = time.perf_counter()
 
-                sample = replay.sample()
-                terms, losses = learn(sample, None if si is None else replay.sample_tau())
-                replay.remember(sample)
-                if deviation is not None and cfg.penalty_step == "proximal":
+                sample = replay.sample() if cfg.replay else batch.reshape(-1)
+                windows = None if learner.si is None else replay.sample_tau()
+                terms, losses = learner.learn(sample, windows)
+                if cfg.replay:
+                    replay.remember(sample)
+                if learner.deviation is not None and cfg.penalty_step == "proximal":
                     # The penalty's weight falls with the rates, so that their ratio is kept.
-                    deviation.proximal_step_(mpc.C, decay(cfg, update - 1))
-                schedule.step()
-                if target is not None:
-                    target.step()
+                    share = decay(update - 1, cfg.updates, cfg.optimizer.final_fraction)
+                    learner.deviation.proximal_step_(mpc.C, share)
+                learner.schedule.step()
+                if learner.target is not None:
+                    learner.target.step()
             ended = time.perf_counter()
             train_seconds += ended - began
+            costs.append(-batch["next", "reward"].mean().item())
+            violation += physics.violation(batch["observation"]).sum().item()
 
             if update % cfg.log_interval == 0:
                 metrics = {name: term.item() for name, term in terms.items()}
                 metrics |= {f"train/{name}": losses[name].item() for name in LOGGED}
-                metrics |= {"train/reward": batch["next", "reward"].mean().item(), **qps.metrics()}
-                if deviation is not None:
-                    metrics.setdefault("loss/deviation", deviation(mpc.C).item())
+                metrics |= {"train/reward": -costs[-1], "train/violation": violation}
+                metrics |= qps.metrics() | theta_metrics(mpc)
+                if learner.deviation is not None:
+                    metrics.setdefault("loss/deviation", learner.deviation(mpc.C).item())
                 metrics |= {"time/collect": collected - began, "time/update": ended - collected}
                 run.log(metrics, update)
                 unsolved, qps = unsolved + qps.unsolved, SolveLog()
@@ -124,11 +120,16 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 loops["learned"] = evaluate(cfg, mpc, physics)
                 summary = report(run, mpc, loops, update)
                 progress.set_postfix(J=summary["J_final"], closed_gap=summary["closed_gap"])
-                state = {"mpc": mpc.state_dict(), "optimizer": optimizer.state_dict()}
-                save_checkpoint(run.path / "checkpoint.pt", {**state, "update": update})
+                state = {"mpc": mpc.state_dict(), "optimizer": learner.optimizer.state_dict()}
+                state |= {"structure": mpc.structure, "update": update}
+                save_checkpoint(run.path / "checkpoint.pt", state)
                 run.flush()
+            if update == cfg.release:
+                mpc.release()
+                learner = make_learner(cfg, operator, done=update)
         summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
         summary |= {"solver": cfg.solver, "updates": cfg.updates, "train_seconds": train_seconds}
+        summary |= stream_summary(costs, violation)
         summary["unsolved"] = unsolved + qps.unsolved
         run.finish(summary)
         summary_figure(mpc, loops, *run.column("eval/J")).savefig(run.path / "summary.png", dpi=110)

@@ -66,6 +66,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         cfg = make_config(
             *SMALL,
             f"optimizer={optimizer}",
+            "batch_size=8",
             "constraint=combined",
             "delay_value=true",
             "constraint.si.windows=4",
@@ -80,7 +81,18 @@ def test_each_key_is_read(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("names", list(itertools.product(*map(choices, GROUPS))))
 def test_each_choice_of_groups_is_accepted(names):
-    check_config(make_config(*(f"{g}={n}" for g, n in zip(GROUPS, names, strict=True))))
+    """But for a noise of the other task, and windows for the SI penalty without a replay."""
+    choice = dict(zip(GROUPS, names, strict=True))
+    cfg = make_config(*(f"{group}={name}" for group, name in choice.items()), "warmup_steps=10")
+    if (choice["noise"] == "uniform") != (choice["task"] == "gros_zanon"):
+        key = "noise.name"
+    elif choice["optimizer"] == "recursive" and choice["constraint"] in ("si", "combined"):
+        key = "replay"
+    else:
+        check_config(cfg)
+        return
+    with pytest.raises(QPError, match=f"^({key}|replay): got"):
+        check_config(cfg)
 
 
 def optimizer_with(key: str) -> str:
@@ -97,6 +109,8 @@ BAD: dict[str, list[Any]] = {
     "seed": [*WHOLE[1:], 2**63],
     "solver": NAME,
     "warm_start": FLAG,
+    "replay": FLAG,
+    "release": [*WHOLE[:-2], math.nan],
     "exploration_std": REAL,
     "td_error_clip": [0, *REAL[:-1]],
     "delay_value": FLAG,
@@ -105,12 +119,16 @@ BAD: dict[str, list[Any]] = {
     "task.name": ["pendulum", *NAME],
     "task.gamma": FRACTION,
     "task.hessian": ["dense", *NAME],
+    "task.terminal_weight": ["lqr", *NAME],
+    "constraint.structure": ["banded", *NAME],
+    "optimizer.lr": FRACTION,
+    "optimizer.memory": WHOLE[1:],
     "task.learn_cost": ["H", ["H", "C"], ["h"], [["H"]], None, 3],
     "task.state_slack": [*REAL[:2], *REAL[3:]],
     "task.action_slack": [*REAL[:2], *REAL[3:]],
     "task.discount_slack": FLAG,
     "noise.name": ["pink", *NAME],
-    "noise.std": REAL,
+    "noise.std": REAL[:-1],
     "constraint.name": NAME,
     "constraint.learn": ["C", ["C", "H"], ["c"], [{"C": 1}], None, 3],
     "constraint.si.normalised": FLAG,
@@ -118,11 +136,12 @@ BAD: dict[str, list[Any]] = {
     "optimizer.betas": [0.9, [0.9], [0.9, 1.0], [-0.1, 0.9], ["a", "b"], [0.9] * 3, None],
     "optimizer.final_fraction": FRACTION,
 }
-for _name in ("threads", "updates", "batch_size", "num_envs", "steps_per_update", "warmup_steps"):
+for _name in ("threads", "updates", "batch_size", "num_envs", "steps_per_update"):
     BAD[_name] = WHOLE
+BAD["warmup_steps"] = WHOLE[1:]
 for _name in ("replay_capacity", "eval_interval", "log_interval", "constraint.si.windows"):
     BAD[_name] = WHOLE
-for _name in ("task.horizon", "task.episode_steps"):
+for _name in ("task.horizon", "task.episode_steps", "task.eval_steps"):
     BAD[_name] = WHOLE
 for _name in ("scale_cost", "scale_constraints", "damping"):
     BAD[f"optimizer.{_name}"] = [0, *REAL]
@@ -222,15 +241,42 @@ def test_solver_must_be_known():
         ),
         (
             ["constraint=fixed", "task.learn_cost=[]"],
-            r"task.learn_cost: got \[\], as is constraint.learn, expected something to learn",
+            r"task.learn_cost: got \[\], expected something to learn, here or in constraint.learn",
         ),
         (
             ["optimizer=gauss_newton", "penalty_step=subgradient"],
-            r"penalty_step: got subgradient, expected proximal. gauss_newton has no subgrad",
+            r"penalty_step: got 'subgradient', expected proximal. gauss_newton has no subgrad",
         ),
         (
             ["optimizer=gauss_newton", "constraint=si", "constraint.si.normalised=true"],
-            r"constraint.si.normalised: got True, expected false. gauss_newton takes the pen",
+            r"constraint.si.normalised: got True, expected False. gauss_newton takes the pen",
+        ),
+        (["constraint=si", "replay=false"], "replay: got False, expected true. The windows of"),
+        (
+            ["constraint=deviation", "constraint.structure=tied"],
+            "constraint.structure: got 'tied', expected free. A tied C has nothing off its band",
+        ),
+        (
+            ["constraint=si", "constraint.structure=varying"],
+            "constraint.structure: got 'varying', expected free. .* SI penalty no free C",
+        ),
+        (
+            ["constraint=mpc", "constraint.learn=[C,G]"],
+            r"constraint.learn: got \['C', 'G'\], expected no G. No task has mixed",
+        ),
+        (["release=10"], "release: got 10, expected null. Nothing is tied: choose constraint=mpc"),
+        (
+            ["task.terminal_weight=riccati"],
+            "task.terminal_weight: got 'riccati', expected identity. With task.hessian=block it",
+        ),
+        (["noise=uniform"], "noise.name: got 'uniform', expected the noise of point_mass. unifo"),
+        (
+            ["task=gros_zanon", "noise=gaussian"],
+            "noise.name: got 'gaussian', expected the noise of gros_zanon. uniform is that of",
+        ),
+        (
+            ["task=gros_zanon", "noise.std=0.1"],
+            "noise.std: got 0.1, expected null. The noise of gros_zanon cannot be changed",
         ),
         (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
     ],

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -13,93 +11,21 @@ from omegaconf import DictConfig
 
 from tests.runs import SMALL, choices, make_config
 from torch_qpmpc import QPActorValueOperator
-from torch_qpmpc.banded import banded_matrix
-from torch_qpmpc.envs import PointMass
 from torch_qpmpc.evaluation import ClosedLoop
 from torch_qpmpc.experiment import (
     evaluate,
     gap_summary,
     make_collector,
-    make_mpc,
+    make_learner,
     make_optimizer,
     make_penalties,
-    make_physics,
-    make_true_mpc,
     report,
+    stream_summary,
     table,
+    theta_metrics,
 )
+from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc
 from torch_qpmpc.tracking import RunFolder
-
-
-@pytest.mark.parametrize(("noise", "std"), [("gaussian", 0.01), ("brownian", 0.002)])
-def test_physics_has_the_noise(noise, std):
-    physics = make_physics(make_config(f"noise={noise}"))
-    assert (physics.noise_kind, physics.std) == (noise, std)
-    assert make_physics(make_config(f"noise={noise}", "noise.std=0")).std == 0
-
-
-#: Undiscounted J before learning, by the seed of the corruption, and with the true model.
-J_START = {1: 285, 2: 172, 3: 547, 4: 58, 5: 507}
-J_TRUE_MODEL = 47
-
-
-@pytest.mark.parametrize("seed", [1, 4])
-def test_ends_of_the_experiment_are_the_known_ones(seed):
-    """The numbers that everyone who draws, starts and rolls out alike gets."""
-    cfg = make_config(f"seed={seed}", "solver=daqp")
-    physics = make_physics(cfg)
-    assert round(evaluate(cfg, make_mpc(cfg, physics), physics).J) == J_START[seed]
-    assert round(evaluate(cfg, make_true_mpc(cfg, physics), physics).J) == J_TRUE_MODEL
-
-
-def test_start_is_the_corrupted_model_and_a_random_cost():
-    cfg, true = make_config("seed=3", "constraint=free"), PointMass()
-    mpc = make_mpc(cfg, make_physics(cfg))
-    rng = np.random.default_rng(3)
-    A = true.A + torch.as_tensor(rng.uniform(-0.05, 0.05, (4, 4)))
-    B = true.B + torch.as_tensor(rng.uniform(-0.05, 0.05, (4, 2)))
-    theta = rng.uniform(0.5, 5, 4)
-    assert torch.equal(mpc.C_0, banded_matrix(A, B, 10))
-    assert torch.equal(mpc.C, mpc.C_0)
-    torch.testing.assert_close(mpc.H, torch.as_tensor([*theta, 0, 0]))
-    qp = mpc.quadratic_program()
-    expected = torch.cat([0.9**k * mpc.H for k in range(10)] + [0.9**10 * torch.ones(4)])
-    torch.testing.assert_close(qp.H.diagonal(), expected)
-    assert torch.equal(qp.G, torch.eye(64, dtype=torch.float64))
-    stage = torch.tensor([2, 2, 10, 10, 1, 1], dtype=torch.float64)
-    assert torch.equal(qp.ub[:12], stage.repeat(2))
-    assert torch.equal(qp.lb[:12], -stage.repeat(2))
-    assert qp.w[:6].tolist() == [100.0] * 4 + [math.inf] * 2
-    assert mpc.on_failure == "mask", "training goes on where a QP is not solved"
-
-
-def test_true_model_has_the_true_cost_and_learns_nothing():
-    cfg = make_config()
-    physics = make_physics(cfg)
-    mpc = make_true_mpc(cfg, physics)
-    assert mpc.H.tolist() == [6, 6, 0.5, 0.5, 0, 0]
-    assert torch.equal(mpc.C, banded_matrix(physics.A, physics.B, 10))
-    assert list(mpc.parameters()) == []
-
-
-def test_configuration_reaches_the_qp():
-    cfg = make_config(
-        "solver=daqp",
-        "task.horizon=4",
-        "task.gamma=0.5",
-        "task.hessian=block",
-        "task.learn_cost=[H,H_f,q]",
-        "task.state_slack=7",
-        "task.action_slack=3",
-        "task.discount_slack=true",
-        "constraint=free",
-        "constraint.learn=[C,ub]",
-    )
-    mpc = make_mpc(cfg, make_physics(cfg))
-    assert (mpc.horizon, mpc.gamma, mpc.hessian, mpc.solver) == (4, 0.5, "block", "daqp")
-    assert set(mpc.learned) == {"H", "H_f", "q", "C", "ub"}
-    w = mpc.quadratic_program().w
-    assert w[:12].tolist() == [7.0] * 4 + [3.0] * 2 + [3.5] * 4 + [1.5] * 2
 
 
 @pytest.mark.parametrize("constraint", choices("constraint"))
@@ -170,7 +96,8 @@ def test_optimizer_has_two_rates_that_fall_linearly(name):
         "constraint.learn=[C,ub]",
     )
     mpc = make_mpc(cfg, make_physics(cfg))
-    optimizer, schedule = make_optimizer(cfg, mpc)
+    learner = make_learner(cfg, QPActorValueOperator(mpc))
+    optimizer, schedule = learner.optimizer, learner.schedule
     assert type(optimizer).__name__.lower() == name
     rates = {"H": 0.1, "c": 0.1, "C": 0.01, "ub": 0.01}
     assert {g["name"]: g["lr"] for g in optimizer.param_groups} == rates
@@ -186,12 +113,12 @@ def test_optimizer_has_two_rates_that_fall_linearly(name):
 
 def test_optimizer_options():
     cfg = make_config(*SMALL, "optimizer=adam", "optimizer.betas=[0.5,0.75]")
-    optimizer, _ = make_optimizer(cfg, make_mpc(cfg, make_physics(cfg)))
+    optimizer = make_optimizer(cfg, make_mpc(cfg, make_physics(cfg)))
     assert optimizer.param_groups[0]["betas"] == (0.5, 0.75)
 
 
 def test_evaluation_is_without_exploration_and_repeatable():
-    cfg = make_config(*SMALL, "task.gamma=0.5")
+    cfg = make_config(*SMALL, "task.gamma=0.5", "task.eval_steps=12")
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
     first, second = evaluate(cfg, mpc, physics), evaluate(cfg, mpc, physics)
@@ -225,6 +152,26 @@ def test_table():
     assert lines[1].split() == ["J", "100.0", "60.0", "50.0", "0.800"]
     assert lines[2].split() == ["J", "discounted", "95.0", "57.0", "47.5", "0.800"]
     assert "no gap" in table(gap_summary(loops_with(50, 60, 50)))
+
+
+def test_the_numbers_of_theta_are_logged_where_they_are_few():
+    cfg = make_config("task=gros_zanon", "solver=daqp")
+    metrics = theta_metrics(make_mpc(cfg, make_physics(cfg)))
+    expected = {"theta/c": 0.0, "theta/A_1": 0.25, "theta/B_0": 0.0312, "theta/ub_0": 2.0}
+    assert {name: metrics[name] for name in expected} == pytest.approx(expected)
+    parts = {"A": 4, "B": 2, "b": 2, "q": 5, "lb": 3, "ub": 3}
+    names = {f"theta/{part}_{i}" for part, count in parts.items() for i in range(count)}
+    assert set(metrics) == names | {"theta/c"}
+    free = make_config("constraint=free")
+    names = {f"theta/H_{i}" for i in range(6)} | {"theta/c"}
+    assert set(theta_metrics(make_mpc(free, make_physics(free)))) == names
+
+
+def test_stream_summary():
+    summary = stream_summary([2.0] * 18 + [1.0, 0.5], 0.25)
+    expected = {"train_cost": 1.875, "train_cost_last_tenth": 0.75, "train_violation": 0.25}
+    assert summary == pytest.approx(expected)
+    assert stream_summary([3.0], 0.0)["train_cost_last_tenth"] == 3.0
 
 
 def test_report_logs_the_evaluation(tmp_path):

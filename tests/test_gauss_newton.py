@@ -104,6 +104,43 @@ def test_the_si_penalty_is_part_of_the_step():
         assert_close(leaf.detach() - old, step, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", PARTS)
+def test_a_memory_keeps_what_past_pairs_know(name):
+    """A stream of single pairs: as if the past were in the batch, without errors and unchanged."""
+    mpc = random_mpc(2, **PARTS[name])
+    optimizer = GaussNewton(mpc, damping=DAMPING, memory=3, trust_region=False)
+    leaves, (s, a), target = leaves_of(optimizer), pairs(), targets(mpc)
+    scales = [group["scale"] for group in optimizer.param_groups for _ in group["params"]]
+    scale = torch.cat([torch.full((x.numel(),), d) for x, d in zip(leaves, scales, strict=True)])
+    rows = torch.zeros(0, len(scale)).double()
+    for i in range(COUNT):
+        value = mpc.action_value(s[i], a[i])
+        found = torch.autograd.grad(value, leaves, allow_unused=True, materialize_grads=True)
+        rows = torch.cat((torch.cat([part.flatten() for part in found]).unsqueeze(0), rows))[:4]
+        mu = DAMPING * (scale * rows.square()).sum(-1).mean()
+        matrix = rows.mT @ rows + torch.diag(mu / scale)
+        expected = torch.linalg.solve(matrix, rows[0] * (target[i] - value).detach())
+        before = torch.cat([leaf.detach().flatten() for leaf in leaves])
+        optimizer.step(s[i : i + 1], a[i : i + 1], target[i : i + 1])
+        after = torch.cat([leaf.detach().flatten() for leaf in leaves])
+        assert_close(after - before, expected, rtol=1e-4, atol=1e-8)
+        rows = rows[:3]
+
+
+def test_a_memory_is_part_of_the_state():
+    mpc = random_mpc(2)
+    optimizer = GaussNewton(mpc, memory=4)
+    optimizer.step(*pairs(), targets(mpc))
+    twin = copy.deepcopy(mpc)
+    other = GaussNewton(twin, memory=4)
+    other.load_state_dict(optimizer.state_dict())
+    for m, o in ((mpc, optimizer), (twin, other)):
+        o.step(*pairs(), targets(m, size=-0.2))
+    assert_close(twin.state_dict(), mpc.state_dict(), rtol=0, atol=0)
+    forgetful = GaussNewton(copy.deepcopy(twin), memory=4)
+    assert not forgetful.state
+
+
 def test_errors_fall_step_by_step():
     mpc, other = random_mpc(4), random_mpc(4, free=0.2)
     target = other.action_value(*pairs()).detach()
@@ -232,6 +269,7 @@ def test_without_any_error_theta_stays():
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
+        ("memory", -1, "a whole number >= 0"),
         ("lr", 0.0, r"a number in \(0, 1\]"),
         ("lr", 1.1, r"a number in \(0, 1\]"),
         ("damping", -1.0, "a finite number > 0"),

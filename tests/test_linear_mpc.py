@@ -116,6 +116,11 @@ def test_gradients_in_every_part_agree_with_differences(name, of_pairs):
     step_size = 1e-5
     for i, (part, leaf) in enumerate(mpc.named_parameters()):
         direction = normal(*leaf.shape, seed=i)
+        if part.removeprefix("parametrizations.")[:2] in ("lb", "ub"):
+            learned = mpc.soft
+            if mpc.structure == "tied":
+                learned = learned[mpc.get_buffer(f"{part.removesuffix('original')}0.first")]
+            direction = direction * learned
         values = []
         with torch.no_grad():
             for sign in (1, -2):
@@ -149,6 +154,21 @@ def test_it_stays_a_linear_mpc_scheme_while_it_is_learned(name, second_order):
         row = torch.cat((A_k, B_k, -torch.eye(2).double()), 1)
         assert_close(mpc.C[2 * k : 2 * k + 2, columns], row)
         assert mpc.C[2 * k : 2 * k + 2].count_nonzero() == row.count_nonzero()
+
+
+@pytest.mark.parametrize("structure", ["tied", "varying"])
+def test_the_bounds_of_hard_rows_are_not_learned(structure):
+    mpc = scheme(free=0.0, structure=structure)
+    far = torch.tensor([[3.0, 3.0]]).double()
+    mpc.value(far).sum().backward()
+    hard = torch.arange(mpc.n_z) % 3 == 2
+    for name in ("lb", "ub"):
+        kept = mpc.get_submodule(f"parametrizations.{name}") if structure == "tied" else None
+        leaf = mpc.get_parameter(name) if kept is None else next(kept.parameters())
+        assert leaf.grad is not None
+        assert (leaf.grad[hard[: len(leaf)]] == 0).all()
+    step(mpc, rate=0.1)
+    assert_close(mpc.lb[hard].detach(), torch.full((4,), -0.5).double())
 
 
 # Release
@@ -204,8 +224,9 @@ def test_a_released_module_can_be_copied_saved_and_reset():
 
 def test_what_is_frozen_stays_frozen():
     mpc = scheme(7)
-    for parameter in (*mpc.parametrizations.C.parameters(), *mpc.parametrizations.q.parameters()):
-        parameter.requires_grad_(False)
+    for name, parameter in mpc.named_parameters():
+        if name.split(".")[1:2] in (["C"], ["q"]):
+            parameter.requires_grad_(False)
     mpc.release()
     frozen = {name for name, p in mpc.named_parameters() if not p.requires_grad}
     assert frozen == {"C", "q"}

@@ -224,6 +224,13 @@ def test_stages_may_have_weights_and_models_of_their_own():
     assert_close(mpc.C, mpc.C_0)
 
 
+def test_the_model_may_have_an_offset():
+    mpc = QPMPC.from_model(A, B, 2, offset=[0.1, -0.2], solver="daqp")
+    s, a = random_states(3), random_states(3, 1)
+    states, _ = mpc.predicted(mpc.solve(s, a).z)
+    assert_close(states[:, 1], s @ A.mT + a @ B.mT + torch.tensor([0.1, -0.2]).double())
+
+
 @pytest.mark.parametrize("hessian", ["block", "full"])
 @pytest.mark.parametrize("horizon", [2, 3])
 def test_a_dense_stage_weight_is_one_block_whatever_the_horizon(hessian, horizon):
@@ -454,6 +461,7 @@ def test_it_shows_what_it_is():
         ({"A": torch.eye(3)}, r"A, B: got shapes \(3, 3\) and \(2, 1\), expected \(2, 2\) and"),
         ({"A": torch.ones(2)}, r"A: got shape \(2,\), expected shape \(2, 2\) or \(3, 2, 2\)"),
         ({"B": torch.ones(2, 2, 1)}, r"B: got shape \(2, 2, 1\), expected .* or \(3, 2, 1\)"),
+        ({"offset": [1.0]}, r"offset: got shape \(1,\), expected shape \(2,\)"),
         ({"stage_weight": [1.0, 1.0]}, r"stage_weight: got shape \(2,\), expected shape \(3,\)"),
         (
             {"stage_weight": torch.eye(3), "horizon": 4},

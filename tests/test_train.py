@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train
-from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
+from tests.runs import CONFIGS, SMALL, make_config, skip_figures
 from torch_qpmpc import (
+    QPMPC,
     DeviationPenalty,
     QPError,
     QPQLearningLoss,
@@ -28,12 +30,15 @@ from torch_qpmpc import (
 from torch_qpmpc.banded import band_distance
 from torch_qpmpc.checkpoint import load_checkpoint
 from torch_qpmpc.config import flatten
-from torch_qpmpc.experiment import evaluate, make_mpc, make_physics
+from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.experiment import evaluate
+from torch_qpmpc.tasks import make_mpc, make_physics
 
 SUMMARY = {"seed", "constraint", "noise", "solver", "unsolved", "updates", "train_seconds"}
 for _tag in ("J", "J_discounted"):
     SUMMARY |= {f"{_tag}_start", f"{_tag}_final", f"{_tag}_true_model"}
 SUMMARY |= {"closed_gap", "closed_gap_discounted"}
+SUMMARY |= {"train_cost", "train_cost_last_tenth", "train_violation"}
 
 
 def run_small(folder: Path, *overrides: str) -> dict[str, Any]:
@@ -165,8 +170,8 @@ def test_proximal_step_leaves_nothing_above_the_band(whole):
 
 
 @pytest.mark.usefixtures("small")
-@pytest.mark.parametrize("noise", choices("noise"))
-@pytest.mark.parametrize("constraint", choices("constraint"))
+@pytest.mark.parametrize("noise", ["gaussian", "brownian"])
+@pytest.mark.parametrize("constraint", ["fixed", "free", "deviation", "si", "combined"])
 def test_each_case_runs(tmp_path, constraint, noise):
     summary = run_small(tmp_path, f"constraint={constraint}", f"noise={noise}")
     assert (summary["constraint"], summary["noise"]) == (constraint, noise)
@@ -181,6 +186,66 @@ def test_each_case_runs(tmp_path, constraint, noise):
     moved = {side: np.abs(deviation[np.sign(distance) == side]).max() > 0 for side in (-1, 0, 1)}
     free = constraint in ("free", "si")
     assert moved == {-1: constraint != "fixed", 0: constraint != "fixed", 1: free}
+
+
+STREAM = ("task=gros_zanon", "solver=daqp", "task.horizon=4", "task.eval_steps=20")
+
+
+@pytest.mark.usefixtures("small")
+def test_a_stream_of_single_transitions_learns(tmp_path):
+    cfg = make_config(*STREAM, "updates=250", "eval_interval=125", "seed=69")
+    summary = train.train(cfg, str(tmp_path))
+    names = {"constraint": "mpc", "noise": "uniform", "updates": 250}
+    assert {**summary, **names} == summary
+    assert summary["unsolved"] == 0
+    assert summary["J_final"] < 0.5 * summary["J_start"]
+    assert summary["train_cost_last_tenth"] < summary["train_cost"] < 0.6
+    assert 0 < summary["train_violation"] < 3
+    table = metrics(tmp_path)
+    assert sorted(table.index) == sorted({*range(0, 251, 10), 125})
+    theta = table[[f"theta/{name}" for name in ("c", "A_0", "B_1", "b_0", "lb_0", "q_4")]]
+    assert (theta.dropna().std() > 0).all()
+    hard = table[["theta/lb_2", "theta/ub_2"]].dropna()
+    assert (hard == [-1.0, 1.0]).all(axis=None)
+    violation = table["train/violation"].dropna()
+    assert (violation.diff().dropna() >= 0).all()
+    assert violation[250] == pytest.approx(summary["train_violation"])
+
+
+@pytest.mark.usefixtures("small")
+def test_the_stream_can_be_replayed(tmp_path):
+    replayed = ("replay=true", "optimizer.memory=0")
+    cfg = make_config(*STREAM, *replayed, "updates=30", "eval_interval=15")
+    assert train.train(cfg, str(tmp_path))["unsolved"] == 0
+    assert metrics(tmp_path)["qp/recalled"].iloc[-1] > 0
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("optimizer", ["adam", "gauss_newton"])
+@pytest.mark.parametrize("structure", ["tied", "varying"])
+def test_a_scheme_is_released_in_mid_training(tmp_path, monkeypatch, optimizer, structure):
+    seen = []
+
+    def release(mpc: QPMPC) -> None:
+        s = torch.linspace(-1, 1, 20).double().reshape(5, 4)
+        before = mpc.value(s), mpc.policy(s)
+        QPMPC.release(mpc)
+        seen.append((before, (mpc.value(s), mpc.policy(s))))
+
+    def make(cfg: DictConfig, physics: LinearSystem) -> QPMPC:
+        mpc = make_mpc(cfg, physics)
+        monkeypatch.setattr(mpc, "release", partial(release, mpc))
+        return mpc
+
+    monkeypatch.setattr(train, "make_mpc", make)
+    options = ("constraint=mpc", f"constraint.structure={structure}", "release=2")
+    run_small(tmp_path, *options, f"optimizer={optimizer}", "updates=4", "batch_size=8")
+    ((before, after),) = seen
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-9)
+    state = load_checkpoint(tmp_path / "checkpoint.pt")
+    assert state["structure"] == "free"
+    deviation, distance = learned_C(tmp_path)
+    assert np.abs(deviation[distance > 0]).max() > 0, "it has learned what an MPC scheme cannot"
 
 
 def frame_without_times(folder: Path) -> Any:

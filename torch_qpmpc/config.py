@@ -9,10 +9,13 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from torch_qpmpc.arguments import CONSTRAINTS, COST, HESSIANS
+from torch_qpmpc.arguments import CONSTRAINTS, COST, HESSIANS, STRUCTURES
 from torch_qpmpc.envs.point_mass import NOISE_STD
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.solvers import backend
+
+#: The noise of Gros and Zanon's system, which has no other.
+UNIFORM = "uniform"
 
 Rule = tuple[Callable[[Any], bool], str]
 
@@ -58,27 +61,35 @@ RULES: dict[str, Rule] = {
     "batch_size": _whole(1),
     "num_envs": _whole(1),
     "steps_per_update": _whole(1),
-    "warmup_steps": _whole(1),
+    "warmup_steps": _whole(0),
+    "replay": FLAG,
     "replay_capacity": _whole(1),
     "exploration_std": NON_NEGATIVE,
     "td_error_clip": (lambda x: x is None or POSITIVE[0](x), "a finite number > 0, or null"),
     "delay_value": FLAG,
     "target_rate": FRACTION,
     "penalty_step": _one_of("proximal", "subgradient"),
+    "release": (lambda x: x is None or _whole(1)[0](x), "a whole number >= 1, or null"),
     "eval_interval": _whole(1),
     "log_interval": _whole(1),
-    "task.name": _one_of("point_mass"),
+    "task.name": _one_of("point_mass", "gros_zanon"),
     "task.horizon": _whole(1),
     "task.gamma": FRACTION,
     "task.episode_steps": _whole(1),
+    "task.eval_steps": _whole(1),
     "task.hessian": _one_of(*HESSIANS),
+    "task.terminal_weight": _one_of("identity", "riccati"),
     "task.learn_cost": _subset(COST),
     "task.state_slack": WEIGHT,
     "task.action_slack": WEIGHT,
     "task.discount_slack": FLAG,
-    "noise.name": _one_of(*NOISE_STD),
-    "noise.std": NON_NEGATIVE,
+    "noise.name": _one_of(*NOISE_STD, UNIFORM),
+    "noise.std": (
+        lambda x: x is None or NON_NEGATIVE[0](x),
+        "a finite number >= 0, or null for the task's own",
+    ),
     "constraint.name": NAME,
+    "constraint.structure": _one_of(*STRUCTURES),
     "constraint.learn": _subset(CONSTRAINTS),
     "constraint.deviation.c_1": NON_NEGATIVE,
     "constraint.deviation.c_2": NON_NEGATIVE,
@@ -95,6 +106,8 @@ RULES: dict[str, Rule] = {
         "two numbers in [0, 1)",
     ),
     "optimizer.final_fraction": FRACTION,
+    "optimizer.lr": FRACTION,
+    "optimizer.memory": _whole(0),
     "optimizer.scale_cost": POSITIVE,
     "optimizer.scale_constraints": POSITIVE,
     "optimizer.damping": POSITIVE,
@@ -106,10 +119,119 @@ _METRIC = {"optimizer.scale_cost", "optimizer.scale_constraints"}
 OF_OPTIMIZER = {
     "adam": _RATES | {"optimizer.betas"},
     "sgd": _RATES,
-    "gauss_newton": _METRIC | {"optimizer.damping", "optimizer.trust_region"},
+    "gauss_newton": _METRIC
+    | {f"optimizer.{name}" for name in ("lr", "damping", "memory", "trust_region")},
 }
 #: A penalty that is null is off.
 OPTIONAL = ("constraint.deviation", "constraint.si")
+
+
+def _second_order(cfg: DictConfig) -> bool:
+    return cfg.optimizer.name == "gauss_newton"
+
+
+#: What a key must be in view of others: the key, when it is not that, what it must be, and why or
+#: what to do.
+CONFLICTS: tuple[tuple[str, Callable[[DictConfig], bool], str, str], ...] = (
+    (
+        "constraint.learn",
+        lambda cfg: (
+            (cfg.constraint.deviation is not None or cfg.constraint.si is not None)
+            and "C" not in cfg.constraint.learn
+        ),
+        "C among them, as a penalty on C is on",
+        "Set the penalty to null, or learn C.",
+    ),
+    (
+        "task.learn_cost",
+        lambda cfg: not cfg.constraint.learn and not cfg.task.learn_cost,
+        "something to learn, here or in constraint.learn",
+        "",
+    ),
+    (
+        "constraint.learn",
+        lambda cfg: cfg.constraint.structure != "free" and "G" in cfg.constraint.learn,
+        "no G",
+        "No task has mixed constraints to learn.",
+    ),
+    *(
+        (
+            key,
+            lambda cfg, key=key: (
+                cfg.constraint.si is not None and OmegaConf.select(cfg, key) < cfg.task.horizon
+            ),
+            "at least task.horizon = {cfg.task.horizon}",
+            "So long are the windows of constraint.si.",
+        )
+        for key in ("task.episode_steps", "warmup_steps")
+    ),
+    (
+        "replay",
+        lambda cfg: cfg.constraint.si is not None and not cfg.replay,
+        "true",
+        "The windows of constraint.si come from there.",
+    ),
+    (
+        "penalty_step",
+        lambda cfg: (
+            _second_order(cfg)
+            and cfg.constraint.deviation is not None
+            and cfg.penalty_step != "proximal"
+        ),
+        "proximal",
+        "gauss_newton has no subgradients.",
+    ),
+    (
+        "constraint.si.normalised",
+        lambda cfg: (
+            _second_order(cfg) and cfg.constraint.si is not None and cfg.constraint.si.normalised
+        ),
+        "False",
+        "gauss_newton takes the penalty as a quadratic in C, which this is not.",
+    ),
+    (
+        "constraint.structure",
+        lambda cfg: (
+            cfg.constraint.structure != "free"
+            and (
+                cfg.constraint.deviation is not None
+                or (cfg.constraint.si is not None and _second_order(cfg))
+            )
+        ),
+        "free",
+        "A tied C has nothing off its band to penalise, and gauss_newton's SI penalty no free C.",
+    ),
+    (
+        "release",
+        lambda cfg: cfg.release is not None and cfg.constraint.structure == "free",
+        "null",
+        "Nothing is tied: choose constraint=mpc.",
+    ),
+    (
+        "task.terminal_weight",
+        lambda cfg: cfg.task.terminal_weight == "riccati" and cfg.task.hessian == "diagonal",
+        "identity",
+        "With task.hessian=block it can be.",
+    ),
+    (
+        "noise.name",
+        lambda cfg: (cfg.noise.name == UNIFORM) != (cfg.task.name == "gros_zanon"),
+        "the noise of {cfg.task.name}",
+        f"{UNIFORM} is that of gros_zanon, the others are the point mass's.",
+    ),
+    (
+        "noise.std",
+        lambda cfg: cfg.noise.name == UNIFORM and cfg.noise.std is not None,
+        "null",
+        "The noise of gros_zanon cannot be changed.",
+    ),
+    (
+        "replay_capacity",
+        lambda cfg: bool(cfg.replay_capacity % cfg.num_envs),
+        "a multiple of num_envs = {cfg.num_envs}",
+        "",
+    ),
+)
 
 
 def check_config(cfg: DictConfig) -> None:
@@ -132,43 +254,10 @@ def check_config(cfg: DictConfig) -> None:
         if key not in given and not any(key.startswith(f"{name}.") for name in off):
             raise QPError.expected(key, "nothing", RULES[key][1])
     backend(cfg.solver)
-    penalised = cfg.constraint.deviation is not None or cfg.constraint.si is not None
-    if penalised and "C" not in cfg.constraint.learn:
-        raise QPError.expected(
-            "constraint.learn",
-            str(list(cfg.constraint.learn)),
-            "C among them, as a penalty on C is on",
-            "Set the penalty to null, or learn C.",
-        )
-    if not cfg.constraint.learn and not cfg.task.learn_cost:
-        raise QPError.expected(
-            "task.learn_cost", "[], as is constraint.learn", "something to learn in one of them"
-        )
-    if cfg.constraint.si is not None:
-        for key in ("task.episode_steps", "warmup_steps"):
-            if given[key] < cfg.task.horizon:
-                raise QPError.expected(
-                    key,
-                    given[key],
-                    f"at least task.horizon = {cfg.task.horizon}",
-                    "So long are the windows of constraint.si.",
-                )
-    if cfg.optimizer.name == "gauss_newton":
-        if cfg.constraint.deviation is not None and cfg.penalty_step != "proximal":
-            raise QPError.expected(
-                "penalty_step", cfg.penalty_step, "proximal", "gauss_newton has no subgradients."
-            )
-        if cfg.constraint.si is not None and cfg.constraint.si.normalised:
-            raise QPError.expected(
-                "constraint.si.normalised",
-                True,
-                "false",
-                "gauss_newton takes the penalty as a quadratic in C, which this is not.",
-            )
-    if cfg.replay_capacity % cfg.num_envs:
-        raise QPError.expected(
-            "replay_capacity", cfg.replay_capacity, f"a multiple of num_envs = {cfg.num_envs}"
-        )
+    for key, wrong, expected, remedy in CONFLICTS:
+        if wrong(cfg):
+            expected = expected.format(cfg=cfg)
+            raise QPError.expected(key, repr(given.get(key)), expected, remedy)
 
 
 def flatten(tree: Any, prefix: str = "") -> dict[str, Any]:

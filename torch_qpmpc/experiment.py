@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,8 +12,9 @@ from tensordict.nn import TensorDictSequential
 from torch.optim.lr_scheduler import LambdaLR
 from torchrl.collectors import Collector
 from torchrl.modules import AdditiveGaussianModule
+from torchrl.objectives import SoftUpdate
 
-from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv
+from torch_qpmpc.envs import LinearSystem, LinearSystemEnv
 from torch_qpmpc.evaluation import ClosedLoop, closed_gap, closed_loop
 from torch_qpmpc.gauss_newton import GaussNewton
 from torch_qpmpc.mpc import QPMPC
@@ -25,48 +26,55 @@ from torch_qpmpc.structure import distance_by_band
 from torch_qpmpc.tracking import RunFolder
 from torch_qpmpc.updates import Update, first_order, second_order
 
-
-def make_physics(cfg: DictConfig) -> PointMass:
-    """The true system with the run's noise."""
-    return PointMass(noise_kind=cfg.noise.name, noise_std=cfg.noise.std)
+#: How many numbers a part of theta may have to be shown one by one.
+FEW = 16
 
 
-def make_mpc(cfg: DictConfig, physics: PointMass) -> QPMPC:
-    """The QP that learns: it starts from the seed's corrupted model and random cost."""
-    A, B, theta = physics.corrupted(cfg.seed)
-    learn = (*cfg.task.learn_cost, *cfg.constraint.learn)
-    return _mpc(cfg, physics, A, B, theta, learn)
+@dataclass(frozen=True)
+class Learner:
+    """What moves theta, for as long as its parameters are the same.
+
+    Attributes:
+        learn: what a batch does to theta.
+        deviation, si: the penalties that are on.
+        target: the soft update of the target network, if there is one.
+    """
+
+    learn: Update
+    optimizer: torch.optim.Optimizer
+    schedule: LambdaLR
+    deviation: DeviationPenalty | None
+    si: SystemIdentificationPenalty | None
+    target: SoftUpdate | None
 
 
-def make_true_mpc(cfg: DictConfig, physics: PointMass) -> QPMPC:
-    """The other end: the same QP with the true model and the true cost, 1/2 H_k = W."""
-    return _mpc(cfg, physics, physics.A, physics.B, 2 * physics.W.diagonal(), ())
+def make_learner(cfg: DictConfig, operator: QPActorValueOperator, done: int = 0) -> Learner:
+    """Q-learning: V and Q from one QP, two learning rates, and the penalties on C.
 
-
-def _mpc(cfg: DictConfig, physics: PointMass, A, B, theta, learn) -> QPMPC:
-    return QPMPC.from_model(
-        A,
-        B,
-        cfg.task.horizon,
-        gamma=cfg.task.gamma,
-        state_bounds=(physics.lb_s, physics.ub_s),
-        action_bounds=(physics.lb_a, physics.ub_a),
-        hessian=cfg.task.hessian,
-        stage_weight=torch.cat((theta, torch.zeros(physics.B.shape[1]))),
-        state_slack=cfg.task.state_slack,
-        action_slack=cfg.task.action_slack,
-        discount_slack=cfg.task.discount_slack,
-        learn=learn,
-        solver=cfg.solver,
-        on_failure="mask",
+    ``done`` updates have been made before, for the schedule of the rates.
+    """
+    mpc = operator.module
+    loss_module = QPQLearningLoss(
+        operator, delay_value=cfg.delay_value, td_error_clip=cfg.td_error_clip
+    )
+    loss_module.make_value_estimator(gamma=cfg.task.gamma)
+    deviation, si = make_penalties(cfg, mpc)
+    optimizer = make_optimizer(cfg, mpc)
+    return Learner(
+        make_update(cfg, mpc, loss_module, optimizer, deviation, si),
+        optimizer,
+        make_schedule(cfg, optimizer, done),
+        deviation,
+        si,
+        SoftUpdate(loss_module, tau=cfg.target_rate) if cfg.delay_value else None,
     )
 
 
 def make_collector(
-    cfg: DictConfig, physics: PointMass, operator: QPActorValueOperator
+    cfg: DictConfig, physics: LinearSystem, operator: QPActorValueOperator
 ) -> Collector:
     """Vectorised episodes under today's policy with Gaussian exploration."""
-    env = PointMassEnv(cfg.num_envs, physics, max_steps=cfg.task.episode_steps, seed=cfg.seed)
+    env = LinearSystemEnv(physics, cfg.num_envs, cfg.task.episode_steps, seed=cfg.seed)
     exploration = AdditiveGaussianModule(
         env.action_spec, sigma_init=cfg.exploration_std, sigma_end=cfg.exploration_std
     )
@@ -90,24 +98,23 @@ def make_penalties(
     )
 
 
-def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> tuple[torch.optim.Optimizer, LambdaLR]:
-    """The optimiser, with one rate for the cost and one for the constraints, and their decay."""
+def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> torch.optim.Optimizer:
+    """The optimiser, with one rate for the cost and one for the constraints."""
     options = cfg.optimizer
     if options.name == "gauss_newton":
-        optimizer = GaussNewton(
+        return GaussNewton(
             mpc,
             scales={"cost": options.scale_cost, "constraints": options.scale_constraints},
+            lr=options.lr,
             damping=options.damping,
+            memory=options.memory,
             td_error_clip=cfg.td_error_clip,
             trust_region=options.trust_region,
         )
-        return optimizer, LambdaLR(optimizer, partial(decay, cfg))
     groups = mpc.parameter_groups({"cost": options.lr_cost, "constraints": options.lr_constraints})
     if options.name == "adam":
-        optimizer = torch.optim.Adam(groups, betas=tuple(options.betas))
-    else:
-        optimizer = torch.optim.SGD(groups)
-    return optimizer, LambdaLR(optimizer, partial(decay, cfg))
+        return torch.optim.Adam(groups, betas=tuple(options.betas))
+    return torch.optim.SGD(groups)
 
 
 def make_update(
@@ -125,14 +132,21 @@ def make_update(
     return first_order(mpc, loss_module, optimizer, by_gradient, si)
 
 
-def decay(cfg: DictConfig, update: int) -> float:
-    """What the learning rates are multiplied by after ``update`` updates: linear in them."""
-    return 1 - (1 - cfg.optimizer.final_fraction) * min(update / cfg.updates, 1)
+def make_schedule(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int = 0) -> LambdaLR:
+    """The rates fall with the updates, of which ``done`` have been made before."""
+    # A configuration's values take longer to look up than such a function to evaluate.
+    last, updates = cfg.optimizer.final_fraction, cfg.updates
+    return LambdaLR(optimizer, lambda update: decay(done + update, updates, last))
 
 
-def evaluate(cfg: DictConfig, mpc: QPMPC, physics: PointMass) -> ClosedLoop:
+def decay(update: int, updates: int, last: float) -> float:
+    """What a rate is multiplied by after ``update`` of ``updates``: from 1 linearly to ``last``."""
+    return 1 - (1 - last) * min(update / updates, 1)
+
+
+def evaluate(cfg: DictConfig, mpc: QPMPC, physics: LinearSystem) -> ClosedLoop:
     """The policy without exploration, from the fixed starts and with the fixed noise."""
-    return closed_loop(mpc.policy, physics, steps=cfg.task.episode_steps, gamma=cfg.task.gamma)
+    return closed_loop(mpc.policy, physics, steps=cfg.task.eval_steps, gamma=cfg.task.gamma)
 
 
 def report(run: RunFolder, mpc: QPMPC, loops: dict[str, ClosedLoop], update: int) -> dict[str, Any]:
@@ -150,6 +164,27 @@ def report(run: RunFolder, mpc: QPMPC, loops: dict[str, ClosedLoop], update: int
     run.figure("structure/C", constraint_figure(mpc), update)
     run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
     return summary
+
+
+def theta_metrics(mpc: QPMPC) -> dict[str, float]:
+    """The learned numbers of the parts that have few, by name."""
+    few = {name: part for name, part in mpc.readable().items() if part.numel() <= FEW}
+    return {
+        f"theta/{name}_{i}" if part.ndim else f"theta/{name}": value
+        for name, part in few.items()
+        for i, value in enumerate(part.flatten().tolist())
+    }
+
+
+def stream_summary(costs: list[float], violation: float) -> dict[str, float]:
+    """What learning itself cost: the mean cost of a step, over all updates and over the last tenth,
+    and the violation of the states' bounds, summed over all steps."""
+    last = costs[-max(1, len(costs) // 10) :]
+    return {
+        "train_cost": sum(costs) / len(costs),
+        "train_cost_last_tenth": sum(last) / len(last),
+        "train_violation": violation,
+    }
 
 
 def gap_summary(loops: dict[str, ClosedLoop]) -> dict[str, float]:

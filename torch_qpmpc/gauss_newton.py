@@ -60,6 +60,9 @@ class GaussNewton(torch.optim.Optimizer):
         damping: mu, as a fraction of the mean of K's diagonal; the least that the trust region
             comes back to. It also says how far the noise of one batch is to be believed.
         td_error_clip: bound of the TD error; none by default.
+        memory: how many gradients of past pairs a step respects: it changes their Q as little as
+            their part of the sum says, though nothing of them is solved again. For small batches,
+            down to a stream of single transitions; the recursive form of least squares.
         trust_region: solve the batch again after a step; take back one that raised the squared
             errors (the targets held), and adapt the damping to how well they were predicted.
 
@@ -86,8 +89,11 @@ class GaussNewton(torch.optim.Optimizer):
         lr: float = 1.0,
         damping: float = 0.03,
         td_error_clip: float | None = None,
+        memory: int = 0,
         trust_region: bool = True,
     ) -> None:
+        if memory < 0:
+            raise QPError.expected("memory", memory, "a whole number >= 0")
         if not 0 < lr <= 1:
             raise QPError.expected("lr", lr, "a number in (0, 1]")
         for name, number in (("damping", damping), ("td_error_clip", td_error_clip)):
@@ -98,7 +104,7 @@ class GaussNewton(torch.optim.Optimizer):
             group |= {"scale": group["lr"], "lr": lr, "damping": damping}
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
-        self._clip, self._trust_region = td_error_clip, trust_region
+        self._clip, self._memory, self._trust_region = td_error_clip, memory, trust_region
 
     @torch.no_grad()
     def step(  # pyright: ignore[reportIncompatibleMethodOverride] - not a closure
@@ -124,7 +130,9 @@ class GaussNewton(torch.optim.Optimizer):
             QPError: a penalty without a free C.
         """
         group = self.param_groups[0]
-        solution = self._mpc.solve(s, a, warm_start=warm_start)
+        with torch.enable_grad():
+            qp = self._mpc.quadratic_program()
+        solution = self._mpc.solve(s, a, warm_start, qp)
         use = solution.solved & target.isfinite()
         delta = torch.where(use, target.to(solution.value) - solution.value, 0)
         if self._clip is not None:
@@ -133,7 +141,12 @@ class GaussNewton(torch.optim.Optimizer):
             penalty = max(int(use.sum()), 1) * penalty
         lr, damping = group["lr"], group["damping"]
         blocks = self._blocks(solution, use, penalty)
-        alpha, change = _solve(blocks, delta, damping)
+        for block in blocks:
+            block.remember(self.state[block.leaf], self._memory)
+        # The past has no errors: only its curvature is known.
+        past = delta.new_zeros(len(blocks[0]) - len(delta) if blocks else 0)
+        alpha, change = _solve(blocks, torch.cat((delta, past)), damping)
+        change = change[: len(delta)]
         old = [block.leaf.clone() for block in blocks]
         steps = [block.step(alpha) for block in blocks]
         if not self._trust_region:
@@ -175,9 +188,7 @@ class GaussNewton(torch.optim.Optimizer):
         factored = next((leaf for leaf, _ in pairs if leaf is mpc._parameters.get("C")), None)
         if penalty is not None and factored is None:
             raise QPError.expected("penalty", "a C that is not free", "C among the learned parts")
-        with torch.enable_grad():
-            qp = mpc.quadratic_program()
-        parts = {name: getattr(qp, name) for name in EVENT_SHAPES}
+        parts = {name: getattr(solution.qp, name) for name in EVENT_SHAPES}
         parts = {n: x for n, x in parts.items() if x.requires_grad and x is not factored}
         # Of a tensor for each pair, the gradient is that of each pair.
         of_each = [gradients[n](x.expand(len(z), *x.shape)) for n, x in parts.items()]
@@ -207,6 +218,15 @@ class _Dense:
     def __init__(self, leaf: nn.Parameter, scale: float, rows: Tensor) -> None:
         self.leaf, self.scale, self.rows = leaf, scale, rows
 
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def remember(self, state: dict[str, Tensor], count: int) -> None:
+        """Append up to ``count`` gradients of the past, and keep the newest for the next step."""
+        if count:
+            self.rows = torch.cat((self.rows, state.get("rows", self.rows[:0])))
+            state["rows"] = self.rows[:count]
+
     def diagonal(self) -> Tensor:
         """Of the kernel, ``(B,)``."""
         return self.scale * self.rows.square().sum(-1)
@@ -235,12 +255,22 @@ class _OuterProducts:
         self, leaf: nn.Parameter, scale: float, chi: Tensor, z: Tensor, S: Tensor | None
     ) -> None:
         self.leaf, self.scale, self.chi, self.z, self.S = leaf, scale, chi, z, S
-        self.z_P, self.drift = scale * z, torch.zeros_like(leaf)
+        self.drift = torch.zeros_like(leaf)
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def remember(self, state: dict[str, Tensor], count: int) -> None:
+        if count:
+            self.chi = torch.cat((self.chi, state.get("chi", self.chi[:0])))
+            self.z = torch.cat((self.z, state.get("z", self.z[:0])))
+            state["chi"], state["z"] = self.chi[:count], self.z[:count]
 
     def diagonal(self) -> Tensor:
         return self.scale * self.chi.square().sum(-1) * self.z.square().sum(-1)
 
     def damp(self, mu: Tensor) -> Tensor:
+        self.z_P = self.scale * self.z
         if self.S is None:
             return self.z.new_zeros(len(self.z))
         precision = mu / self.scale * torch.eye(len(self.S)).to(self.S) + self.S

@@ -46,6 +46,7 @@ class QPMPC(nn.Module):
         A, B: the model that C starts from, ``(n_x, n_x)`` and ``(n_x, n_u)``, or one per stage,
             ``(N, n_x, n_x)`` and ``(N, n_x, n_u)``. By default random: A the identity plus, and B,
             normal entries with standard deviation 0.1.
+        offset: of the model, x+ = A x + B u + offset, ``(n_x,)``, where b starts; zero by default.
         state_bounds, action_bounds: pairs of ``(n_x,)`` and ``(n_u,)``; unbounded by default.
         constraints: mixed constraints of each stage, ``lower <= D [x_k; u_k] <= upper`` (eq:v1c4),
             as the triple of D ``(n_d, n_x + n_u)`` and its bounds ``(n_d,)``.
@@ -53,6 +54,7 @@ class QPMPC(nn.Module):
         structure: what the learned parts of theta tie. ``"free"``: nothing, C is a matrix (eq:qp5).
             ``"tied"``: they are those of a linear MPC scheme (eq:q1), with one A, B, D and one
             entry of b, q, lb, ub and w for all stages; ``"varying"``: with one for each stage.
+            In both, the bounds of hard rows are not learned, as they are known limits (eq:v1c3).
         hessian: ``"diagonal"``, ``"block"`` (one dense block a stage) or ``"full"`` (dense in z).
         stage_weight: start of H_k, ``(n_x + n_u,)`` if diagonal, else ``(n_x + n_u, n_x + n_u)``,
             with an optional leading N for a weight of each stage's own; by default diagonal
@@ -113,6 +115,7 @@ class QPMPC(nn.Module):
         gamma: float = 0.9,
         A: Any = None,
         B: Any = None,
+        offset: Any = None,
         state_bounds: tuple[Any, Any] | None = None,
         action_bounds: tuple[Any, Any] | None = None,
         constraints: tuple[Any, Any, Any] | None = None,
@@ -209,11 +212,18 @@ class QPMPC(nn.Module):
         return self.value(s) if a is None else self.action_value(s, a)
 
     def solve(
-        self, s: Tensor, a: Tensor | None = None, warm_start: QPSolution | Tensor | None = None
+        self,
+        s: Tensor,
+        a: Tensor | None = None,
+        warm_start: QPSolution | Tensor | None = None,
+        qp: QuadraticProgram | None = None,
     ) -> QPSolution:
-        """The whole solution of V's QP, or of Q's where an action is given, in theta's dtype."""
+        """The whole solution of V's QP, or of Q's where an action is given, in theta's dtype.
+
+        ``qp`` is `quadratic_program`, where that has been made for today's theta already.
+        """
         fixed = check_input("s", s, self.n_x) if a is None else check_pair(s, a, self.n_x, self.n_u)
-        qp = self.quadratic_program()
+        qp = self.quadratic_program() if qp is None else qp
         return solve_qp(
             qp,
             fixed.to(qp.C.dtype),
@@ -239,6 +249,19 @@ class QPMPC(nn.Module):
         if self.structure == "free":
             raise QPError.expected("structure", "'free'", "'tied' or 'varying', which have a model")
         return Banded(self._layout, self.structure == "tied").right_inverse(self.C)
+
+    def readable(self) -> dict[str, Tensor]:
+        """The learned parts of theta, detached: what stages share, once; A, B and D for C and G."""
+        parts = {}
+        for part in self.learned:
+            value, kept = getattr(self, part).detach(), self._kept(part)
+            if kept and isinstance(kept[0], Banded | LinearRows):
+                names = ("A", "B") if part == "C" else ("D", "D_f")
+                parts |= zip(names, kept[0].right_inverse(value), strict=True)
+            else:
+                tied = bool(kept) and isinstance(kept[0], Tied)
+                parts[part] = value[kept[0].first] if tied else value
+        return parts
 
     def release(self, structure: str = "free") -> None:
         """Free what a linear MPC scheme ties, in place; the values stay as they are.
@@ -277,8 +300,8 @@ class QPMPC(nn.Module):
             C=self.C,
             b=self.b,
             G=self.G,
-            lb=self.lb,
-            ub=self.ub,
+            lb=self._limits(self.lb),
+            ub=self._limits(self.ub),
             w=torch.where(self.soft, self.slack_discount * self.w, torch.inf),
             check_values=False,
         )
@@ -334,6 +357,12 @@ class QPMPC(nn.Module):
             qp, fixed.to(qp.C.dtype), solver=self.solver, on_failure=self.on_failure, keep=keep
         )
         return value.to(fixed.dtype)
+
+    def _limits(self, bounds: Tensor) -> Tensor:
+        """lb or ub, which an MPC scheme does not learn on hard rows: those are known (eq:v1c3)."""
+        if self.structure == "free":
+            return bounds
+        return torch.where(self.soft, bounds, bounds.detach())
 
     def _own(self, name: str, value: Tensor) -> None:
         """Register a part of theta, as a parameter if it is learned."""

@@ -25,6 +25,7 @@ def theta(
     gamma: float,
     A: Any,
     B: Any,
+    offset: Any,
     state_bounds: tuple[Any, Any] | None,
     action_bounds: tuple[Any, Any] | None,
     constraints: tuple[Any, Any, Any] | None,
@@ -45,6 +46,9 @@ def theta(
     random = torch.Generator().manual_seed(seed)
     A, B = _model(A, B, n_x, n_u, random)
     C = banded_matrix(A, B, horizon)
+    offset = torch.zeros(n_x) if offset is None else as_tensor("offset", offset)
+    if tuple(offset.shape) != (n_x,):
+        raise QPError.expected("offset", f"shape {tuple(offset.shape)}", f"shape ({n_x},)")
     if stage_weight is None:
         states = 0.5 + 4.5 * torch.rand(n_x, generator=random)
         stage_weight = torch.cat((states, torch.zeros(n_u)))
@@ -61,7 +65,7 @@ def theta(
         "q": torch.zeros(layout.n_z),
         "c": torch.zeros(()),
         "C": C,
-        "b": torch.zeros(horizon * n_x),
+        "b": -offset.repeat(horizon),
         "G": LinearRows(layout, tied=True)(D[0], D_f[0]),
         **_bounds(layout, state_bounds, action_bounds, D, D_f),
         "w": _slack_weights(layout, state_slack, action_slack, constraint_slack),

@@ -17,7 +17,6 @@ import numpy as np
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 RESULTS = ROOT / "runs" / "benchmark.json"
-BEGIN, END = "<!-- benchmark -->", "<!-- /benchmark -->"
 REFERENCE = "ProxSuite's QPFunction"
 #: The horizons between which growth is fitted.
 FITTED = (10, 40)
@@ -52,16 +51,17 @@ def run() -> Path:
     return RESULTS
 
 
-def replaced(readme: str, text: str) -> str:
-    """``readme`` with ``text`` between the two markers."""
+def replaced(readme: str, text: str, marker: str = "benchmark") -> str:
+    """``readme`` with ``text`` between the two lines of the marker."""
+    begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
     if (
-        readme.count(BEGIN) != 1
-        or readme.count(END) != 1
-        or readme.index(BEGIN) > readme.index(END)
+        readme.count(begin) != 1
+        or readme.count(end) != 1
+        or readme.index(begin) > readme.index(end)
     ):
-        sys.exit(f"README: expected one line {BEGIN} and below it one line {END}; add them")
-    before, after = readme.split(BEGIN)[0], readme.split(END)[1]
-    return f"{before}{BEGIN}\n{text}\n{END}{after}"
+        sys.exit(f"README: expected one line {begin} and below it one line {end}; add them")
+    before, after = readme.split(begin)[0], readme.split(end)[1]
+    return f"{before}{begin}\n{text}\n{end}{after}"
 
 
 def tables(results: dict[str, Any]) -> str:
@@ -119,7 +119,7 @@ def _gradients(rows: list[Row]) -> str:
         gradient = max(row["gradient_error"] for row in mine.values())
         lines.append([name, *cells, _errors(worst), f"{gradient:.0e}"])
     head = [f"{_kind(rows[0])} C, batch of", *(f"{batch:,}" for batch in batches)]
-    return _table([*head, "value", "gradient"], lines)
+    return table([*head, "value", "gradient"], lines)
 
 
 def _timing(row: Row, own: float | None) -> str:
@@ -160,7 +160,7 @@ def growth(values: list[Row], condensing: list[Row]) -> str:
         f"exponent of N is fitted from {FITTED[0]} to {FITTED[1]}. {verdict} compared with the "
         "reference was wrong by more than 1e-6."
     )
-    return f"{caption}\n\n{_table(head, lines)}"
+    return f"{caption}\n\n{table(head, lines)}"
 
 
 def _growth_label(row: Row) -> tuple[str, str]:
@@ -193,7 +193,7 @@ def overhead(shares: list[Row], decisions: list[Row]) -> str:
         "**Overhead**: the share of a gradient's time outside the backend's calls, and the "
         "policy's decisions a second, in batches of 32 with theta at rest."
     )
-    return f"{caption}\n\n{_table(head, lines)}"
+    return f"{caption}\n\n{table(head, lines)}"
 
 
 def gpu(rows: list[Row]) -> str:
@@ -210,10 +210,11 @@ def gpu(rows: list[Row]) -> str:
     ]
     head = ["", "torch on the GPU", "daqp on a core", "value"]
     caption = "**On a GPU**: QPs a second (V, theta moved before each round)."
-    return f"{caption}\n\n{_table(head, lines)}"
+    return f"{caption}\n\n{table(head, lines)}"
 
 
-def _table(head: list[str], lines: list[list[str]]) -> str:
+def table(head: list[str], lines: list[list[str]]) -> str:
+    """Markdown, the first column to the left and the others to the right."""
     rule = ["---"] + ["---:"] * (len(head) - 1)
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, rule, *lines))
 

@@ -59,11 +59,6 @@ class GrosZanonLTI(LinearSystem):
             remedy = "Pass 0 for a cost without the violation."
             raise QPError.expected("w", self.w, "a finite number >= 0", remedy)
 
-    def violation(self, s: Tensor) -> Tensor:
-        """How far s ``(*batch, 2)`` is outside its bounds, summed over the states ``(*batch,)``."""
-        s = s.to(self.A)
-        return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
-
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """L(s, a) = 1/2 (|s|^2 + 1/2 a^2 + w violation(s)) ``(*batch,)``, of a as applied."""
         squares = s.to(self.A).square().sum(-1) + self.applied(a).square().sum(-1) / 2

@@ -92,6 +92,11 @@ class LinearSystem(ABC):
         """The action that the system gets ``(*batch, n_u)``: a clipped to its bounds."""
         return a.to(self.A).clamp(self.lb_a, self.ub_a)
 
+    def violation(self, s: Tensor) -> Tensor:
+        """How far s ``(*batch, n_x)`` is outside its bounds, summed over the states."""
+        s = s.to(self.A)
+        return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
+
     def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
         """s+ = A s + B a + nu ``(*batch, n_x)``; a is clipped, s+ where the system clips states."""
         following = s.to(self.A) @ self.A.mT + self.applied(a) @ self.B.mT + nu.to(self.A)
