@@ -193,7 +193,7 @@ STREAM = ("task=gros_zanon", "solver=daqp", "task.horizon=4", "task.eval_steps=2
 
 @pytest.mark.usefixtures("small")
 def test_a_stream_of_single_transitions_learns(tmp_path):
-    cfg = make_config(*STREAM, "updates=250", "eval_interval=125", "seed=69")
+    cfg = make_config(*STREAM, "optimizer.lr=0.3", "updates=250", "eval_interval=125", "seed=69")
     summary = train.train(cfg, str(tmp_path))
     names = {"constraint": "mpc", "noise": "uniform", "updates": 250}
     assert {**summary, **names} == summary
@@ -214,7 +214,7 @@ def test_a_stream_of_single_transitions_learns(tmp_path):
 
 @pytest.mark.usefixtures("small")
 def test_the_stream_can_be_replayed(tmp_path):
-    replayed = ("replay=true", "optimizer.memory=0")
+    replayed = ("optimizer=sliding", "exploration_std=0.05")
     cfg = make_config(*STREAM, *replayed, "updates=30", "eval_interval=15")
     assert train.train(cfg, str(tmp_path))["unsolved"] == 0
     assert metrics(tmp_path)["qp/recalled"].iloc[-1] > 0

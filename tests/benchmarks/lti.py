@@ -1,0 +1,122 @@
+"""Gros and Zanon's linear system, beside mpcrl: ``python -m tests.benchmarks.lti``.
+
+Both learn all numbers of the same linear MPC scheme from one endless episode, on the same noise, as
+`task=gros_zanon` does: from each transition once, or here also from a replay. The table goes into
+README.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import torch
+
+from tests.benchmarks import mpcrl_lti
+from tests.benchmarks.mpcrl_lti import Stream
+from tests.benchmarks.table import README, replaced, table
+from tests.runs import make_config
+from torch_qpmpc import GaussNewton
+from torch_qpmpc.envs import GrosZanonLTI
+from torch_qpmpc.experiment import make_optimizer, make_schedule
+from torch_qpmpc.tasks import make_mpc
+
+SEEDS, STEPS, LAST = (69, 1, 2, 3), 5000, 500
+#: Where the replay's settings differ from those of the stream.
+REPLAYED = ("optimizer=sliding", "exploration_std=0.05")
+
+
+def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = True) -> Stream:
+    """One episode under the learning QP, or under the one that learning starts from.
+
+    As mpcrl does it, a step solves Q at the visited pair and V at the next state, whose solution is
+    also the next action.
+    """
+    options = ("task=gros_zanon", "solver=daqp", f"updates={steps}", *REPLAYED * replay)
+    cfg, physics = make_config(*options), GrosZanonLTI()
+    mpc = make_mpc(cfg, physics)
+    optimizer = make_optimizer(cfg, mpc)
+    assert isinstance(optimizer, GaussNewton)
+    schedule, gamma = make_schedule(cfg, optimizer), cfg.task.gamma
+    # That of gymnasium's reset(seed=seed), and so mpcrl's noise.
+    rng, draws = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    s, still = physics.starts(rng, 1), torch.zeros(1, 2)
+    states, actions, costs = s.new_zeros(steps + 1, 2), s.new_zeros(steps, 1), s.new_zeros(steps)
+    states[0], newest = s, torch.zeros(1, dtype=torch.int64)
+    began = time.perf_counter()
+    with torch.no_grad():
+        a = mpc.policy(s)
+        for k in range(steps):
+            following = physics.step(s, a, physics.noise(still, physics.draw(rng, 1)))
+            states[k + 1], actions[k], costs[k] = following, a, physics.cost(s, a)
+            batch = newest + k
+            if replay:
+                stored = min(k, cfg.replay_capacity)
+                drawn = k - 1 - torch.randperm(stored, generator=draws)[: cfg.batch_size - 1]
+                batch = torch.cat((batch, drawn))
+            solution = mpc.solve(states[batch + 1])
+            noise = cfg.exploration_std * torch.randn(1, 1, generator=draws)
+            s, a = following, physics.applied(solution.z[:1, 2:3] + noise)
+            if learn:
+                target = costs[batch] + gamma * solution.value
+                optimizer.step(states[batch], actions[batch], target)
+                schedule.step()
+    seconds = time.perf_counter() - began
+    return Stream(costs.numpy(), physics.violation(states[:-1]).numpy(), seconds)
+
+
+CONTENDERS: dict[str, Callable[[int, int], Stream]] = {
+    "mpcrl": mpcrl_lti.run,
+    "ours, each transition once": run,
+    "ours, the latest replayed": lambda seed, steps: run(seed, steps, replay=True),
+    "ours, without learning": lambda seed, steps: run(seed, steps, learn=False),
+}
+
+
+def tables(streams: dict[str, list[Stream]], seeds: list[int]) -> str:
+    """For each contender the streams of the seeds, in the order of the latter, as Markdown."""
+    blocks = []
+    for caption, of, digits in (
+        ("total cost", lambda stream: stream.costs.sum(), 0),
+        (f"cost a step, last {LAST}", lambda stream: stream.costs[-LAST:].mean(), 4),
+        ("total violation", lambda stream: stream.violations.sum(), 2),
+        ("ms a step", lambda stream: 1000 * stream.seconds / len(stream.costs), 2),
+    ):
+        lines = []
+        for label, each in streams.items():
+            numbers = [float(of(stream)) for stream in each]
+            lines.append([label, *(f"{x:,.{digits}f}" for x in (*numbers, median(numbers)))])
+        blocks.append(table([caption, *(f"seed {seed}" for seed in seeds), "median"], lines))
+    return "\n\n".join(blocks)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.benchmarks.lti", description="Write the comparison with mpcrl."
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
+    parser.add_argument("--steps", type=int, default=STEPS)
+    parser.add_argument("--readme", type=Path, default=README, help="where the tables go")
+    options = parser.parse_args(arguments)
+    readme = options.readme.read_text(encoding="utf-8")
+    replaced(readme, "", "mpcrl")  # before waiting for minutes
+    torch.set_num_threads(1)
+    streams: dict[str, list[Stream]] = {label: [] for label in CONTENDERS}
+    for seed in options.seeds:
+        for label, contender in CONTENDERS.items():
+            stream = contender(seed, options.steps)
+            streams[label].append(stream)
+            print(f"seed {seed}, {label}: {stream.costs.sum():.0f}, {stream.seconds:.0f} s")
+    versions = ", ".join(f"{name} {version(name)}" for name in ("mpcrl", "casadi", "daqp", "torch"))
+    caption = f"{options.steps:,} steps, one thread, in one run with {versions}."
+    text = replaced(readme, f"{caption}\n\n{tables(streams, options.seeds)}", "mpcrl")
+    options.readme.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,140 @@
+"""mpcrl's on-policy LSTD Q-learning of the linear system of Gros and Zanon, on its public API."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from tests.benchmarks.peers import needs
+
+#: The plant: s+ = A s + B a + (e, 0), of which the MPC starts from a wrong model.
+A, B = np.array([[0.9, 0.35], [0.0, 1.1]]), np.array([[0.0813], [0.2]])
+A_0, B_0 = np.array([[1.0, 0.25], [0.0, 1.0]]), np.array([[0.0312], [0.25]])
+NOISE = -0.1, 0.0
+START = 0.0, 0.15
+LOWER, UPPER = np.array([0.0, -1.0]), np.array([1.0, 1.0])
+PENALTY = 100.0
+HORIZON, DISCOUNT, LEARNING_RATE = 10, 0.9, 0.05
+QUIET = {
+    "print_time": False,
+    "bound_consistency": True,
+    "calc_lam_p": False,
+    "ipopt": {"sb": "yes", "print_level": 0},
+}
+
+
+@dataclass(frozen=True)
+class Stream:
+    """What one agent met on one noise sequence."""
+
+    #: ``(steps,)``
+    costs: np.ndarray
+    #: ``(steps,)``: by how much the state that a cost is charged at is outside the box, in total.
+    violations: np.ndarray
+    #: The learning loop's wall time, without building the problem.
+    seconds: float
+
+
+def run(seed: int, steps: int = 5000, learn: bool = True) -> Stream:
+    """One episode under the learning agent, or under the MPC at the first parameters.
+
+    The closed loop is chaotic: rounding alone moves a total by hundreds, so that other versions,
+    solvers or processors agree with it on average, not digit by digit.
+    """
+    mpcrl, optim = needs("mpcrl"), needs("mpcrl.optim")
+    mpc, first = _mpc(), _first()
+    if learn:
+        shaped = (mpcrl.LearnableParameter(name, v.shape, v) for name, v in first.items())
+        agent = mpcrl.LstdQLearningAgent(
+            mpc,
+            update_strategy=1,
+            discount_factor=DISCOUNT,
+            optimizer=optim.NewtonMethod(learning_rate=LEARNING_RATE),
+            learnable_parameters=mpcrl.LearnableParametersDict(shaped),
+            hessian_type="approx",
+            # As published: Q of an action on its bound would have no interior.
+            remove_bounds_on_initial_action=True,
+        )
+        follow = agent.train
+    else:
+        follow = mpcrl.Agent(mpc, fixed_parameters=first).evaluate
+    plant = _Plant(steps)
+    began = time.perf_counter()
+    follow(plant, episodes=1, seed=seed)
+    seconds = time.perf_counter() - began
+    return Stream(np.array(plant.costs), np.array(plant.violations), seconds)
+
+
+class _Plant(gymnasium.Env):
+    """The linear system, which keeps the costs and the violations that it charged."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64)
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def __init__(self, steps: int) -> None:
+        self.costs: list[float] = []
+        self.violations: list[float] = []
+        self._steps = steps
+        self._s = np.array(START)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed, options=options)
+        self._s = np.array(START)
+        self.costs.clear()
+        self.violations.clear()
+        return self._s, {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        # mpcrl's actions are CasADi matrices.
+        s, a = self._s, np.asarray(action, dtype=float).reshape(1)
+        outside = np.maximum(LOWER - s, 0.0).sum() + np.maximum(s - UPPER, 0.0).sum()
+        cost = float(0.5 * (s @ s + 0.5 * a @ a + PENALTY * outside))
+        self.costs.append(cost)
+        self.violations.append(float(outside))
+        self._s = A @ s + B @ a + np.array([self.np_random.uniform(*NOISE), 0.0])
+        return self._s, cost, False, len(self.costs) >= self._steps, {}
+
+
+def _first() -> dict[str, np.ndarray]:
+    """The parameters that learning starts from: 16 scalars."""
+    return {
+        "V0": np.zeros(1),
+        "x_lb": np.zeros(2),
+        "x_ub": np.array([1.0, 0.0]),
+        "b": np.zeros(2),
+        "f": np.zeros(3),
+        "A": A_0,
+        "B": B_0,
+    }
+
+
+def _mpc() -> Any:
+    """The soft-constrained MPC, as mpcrl's wrapper of an NLP."""
+    cs, csnlp, wrappers = needs("casadi"), needs("csnlp"), needs("csnlp.wrappers")
+    mpc = wrappers.Mpc(csnlp.Nlp("SX"), HORIZON)
+    theta = {}
+    for name, value in _first().items():
+        rows, columns = value.shape if value.ndim == 2 else (value.size, 1)
+        theta[name] = mpc.parameter(name, (rows, columns))
+    x, _ = mpc.state("x", 2)
+    u, _ = mpc.action("u", 1, lb=-1.0, ub=1.0)
+    slack, _, _ = mpc.variable("slack", (2, HORIZON), lb=0.0)
+    mpc.set_affine_dynamics(theta["A"], theta["B"], c=theta["b"])
+    # One slack for both sides of an entry.
+    mpc.constraint("x_lower", x[:, 1:], ">=", LOWER + theta["x_lb"] - slack)
+    mpc.constraint("x_upper", x[:, 1:], "<=", UPPER + theta["x_ub"] + slack)
+
+    stage = cs.sum1(x[:, :-1] ** 2) + 0.5 * u**2 + PENALTY * cs.sum1(slack)
+    discounts = cs.DM(DISCOUNT ** np.arange(HORIZON))
+    linear = cs.sum2(theta["f"].T @ cs.vertcat(x[:, :-1], u))
+    terminal = cs.bilin(solve_discrete_are(A_0, B_0, 0.5 * np.eye(2), 0.25), x[:, -1])
+    mpc.minimize(theta["V0"] + terminal + linear + 0.5 * stage @ discounts)
+    mpc.init_solver(QUIET, solver="ipopt")
+    return mpc

@@ -1,0 +1,29 @@
+"""Our side of the comparison with mpcrl, in short, and its table on results made up."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.benchmarks.lti import Stream, run, tables
+
+
+def test_streams_are_those_of_the_noise_and_of_what_learns() -> None:
+    fixed, again, learned = run(1, 40, learn=False), run(1, 40), run(1, 40)
+    np.testing.assert_array_equal(again.costs, learned.costs)
+    assert fixed.costs[0] == learned.costs[0]
+    assert fixed.costs.sum() > learned.costs.sum() > 0
+    assert fixed.violations.sum() > learned.violations.sum() >= 0
+    assert run(1, 40, replay=True).costs.sum() < fixed.costs.sum()
+    assert run(2, 40).costs.sum() != learned.costs.sum()
+
+
+def test_the_table_has_each_seed_and_the_median() -> None:
+    def stream(cost: float) -> Stream:
+        return Stream(np.full(1000, cost), np.full(1000, 0.001), 2.0)
+
+    text = tables({"mpcrl": [stream(1.0), stream(3.0)], "ours": [stream(0.5)] * 2}, [69, 1])
+    assert "| total cost | seed 69 | seed 1 | median |" in text
+    assert "| mpcrl | 1,000 | 3,000 | 2,000 |" in text
+    assert "| ours | 0.5000 | 0.5000 | 0.5000 |" in text
+    assert "| mpcrl | 1.00 | 1.00 | 1.00 |" in text
+    assert "| ours | 2.00 | 2.00 | 2.00 |" in text
