@@ -1,7 +1,9 @@
-"""Learn a quadratic program as value function by Q-learning, on the paper's point mass.
+"""Learn a quadratic program as value function by Q-learning.
 
-    python train.py                                     the default: deviation penalty, seed 1
+    python train.py                                     the paper's point mass: deviation, seed 1
     python train.py constraint=free noise=brownian      one of the paper's cases
+    python train.py constraint=mpc                      its linear MPC scheme, tied
+    python train.py task=gros_zanon solver=daqp         another plant, from one long episode
     python train.py -m constraint=fixed,free seed=1,2   a sweep
     tensorboard --logdir runs                           watch it
 

@@ -165,14 +165,6 @@ class Reduced:
         w = self.w.expand(len(programs), -1)
         return SoftQPs(self.H, self.G, programs.group, g, lower, upper, w), particular
 
-    def soft_qps(self, programs: FlatPrograms) -> SoftQPs:
-        """The first of `at`."""
-        return self.at(programs)[0]
-
-    def particular(self, programs: FlatPrograms) -> Tensor:
-        """The second of `at`."""
-        return self.at(programs)[1]
-
     def expand(self, programs: FlatPrograms, particular: Tensor, v: Tensor) -> Tensor:
         """The full z ``(B, n_z)`` from the free variables v ``(B, d)``."""
         return programs.affine(self.T_v, v, particular)

@@ -274,10 +274,11 @@ class QPMPC(nn.Module):
         Raises:
             QPError: it is not.
         """
-        if structure not in STRUCTURES[: STRUCTURES.index(self.structure)]:
-            freer = STRUCTURES[: STRUCTURES.index(self.structure)]
+        freer = STRUCTURES[: STRUCTURES.index(self.structure)]
+        if structure not in freer:
             expected = f"one that is freer than {self.structure!r}"
-            raise QPError.expected("structure", repr(structure), expected, f"{', '.join(freer)}.")
+            remedy = f"Those are: {', '.join(freer) or 'none'}."
+            raise QPError.expected("structure", repr(structure), expected, remedy)
         self.structure = structure
         self._arguments = {**self._arguments, "structure": structure}
         for part in self.learned:

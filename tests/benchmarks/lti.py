@@ -1,8 +1,9 @@
 """Gros and Zanon's linear system, beside mpcrl: ``python -m tests.benchmarks.lti``.
 
-Both learn all numbers of the same linear MPC scheme from one endless episode, on the same noise, as
-`task=gros_zanon` does: from each transition once, or here also from a replay. The table goes into
-README.md.
+Both learn all numbers of a linear MPC scheme from one endless episode, on the same noise. The
+schemes are the same but for the terminal cost, an undiscounted regulator's there and the discounted
+one's here. Ours learns as `task=gros_zanon` does: from each transition once, or from the latest.
+The table goes into README.md.
 """
 
 from __future__ import annotations
@@ -43,8 +44,9 @@ def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = Tr
     optimizer = make_optimizer(cfg, mpc)
     assert isinstance(optimizer, GaussNewton)
     schedule, gamma = make_schedule(cfg, optimizer), cfg.task.gamma
-    # That of gymnasium's reset(seed=seed), and so mpcrl's noise.
-    rng, draws = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    # mpcrl's agents draw the seed of each episode.
+    rng = np.random.default_rng(int(np.random.default_rng(seed).integers(2**32)))
+    draws = torch.Generator().manual_seed(seed)
     s, still = physics.starts(rng, 1), torch.zeros(1, 2)
     states, actions, costs = s.new_zeros(steps + 1, 2), s.new_zeros(steps, 1), s.new_zeros(steps)
     states[0], newest = s, torch.zeros(1, dtype=torch.int64)
@@ -111,7 +113,8 @@ def main(arguments: list[str] | None = None) -> None:
         for label, contender in CONTENDERS.items():
             stream = contender(seed, options.steps)
             streams[label].append(stream)
-            print(f"seed {seed}, {label}: {stream.costs.sum():.0f}, {stream.seconds:.0f} s")
+            line = f"seed {seed}, {label}: {stream.costs.sum():.0f}, {stream.seconds:.0f} s"
+            print(line, flush=True)
     versions = ", ".join(f"{name} {version(name)}" for name in ("mpcrl", "casadi", "daqp", "torch"))
     caption = f"{options.steps:,} steps, one thread, in one run with {versions}."
     text = replaced(readme, f"{caption}\n\n{tables(streams, options.seeds)}", "mpcrl")

@@ -43,8 +43,9 @@ class Stream:
 def run(seed: int, steps: int = 5000, learn: bool = True) -> Stream:
     """One episode under the learning agent, or under the MPC at the first parameters.
 
-    The closed loop is chaotic: rounding alone moves a total by hundreds, so that other versions,
-    solvers or processors agree with it on average, not digit by digit.
+    mpcrl seeds the plant with ``default_rng(seed).integers(2**32)``. The closed loop is chaotic:
+    rounding alone moves a total by hundreds, so that other versions, solvers or processors agree
+    with it on average, not digit by digit.
     """
     mpcrl, optim = needs("mpcrl"), needs("mpcrl.optim")
     mpc, first = _mpc(), _first()
