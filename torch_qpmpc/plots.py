@@ -65,7 +65,7 @@ def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, show
     axes.plot([], [], "k:", label="predicted at the start")
     axes.plot(starts[:, 0], starts[:, 1], "ko", markersize=3)
     axes.plot(0, 0, "k+", markersize=9)
-    axes.set(xlabel="x", ylabel="y", title="Closed loop")
+    axes.set(xlabel="$s_1$", ylabel="$s_2$", title="Closed loop")
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2)
 
 
@@ -93,8 +93,9 @@ def draw_learning(axes: Axes, updates: Sequence[float], J: Sequence[float], ends
         axes.axhline(value, color=COLOURS.get(name), linestyle="--", label=name)
     axes.set(xlabel="update", ylabel="J, mean over starts", title="Learning", yscale="log")
     low, high = axes.get_ylim()
-    ticks = [t for t in (20, 30, 50, 70, 100, 150, 200, 300, 500, 700, 1000) if low <= t <= high]
-    axes.set_yticks(ticks, [str(t) for t in ticks])
+    steps = (1, 1.5, 2, 3, 5, 7)
+    ticks = [s * 10**k for k in range(-2, 5) for s in steps if low <= s * 10**k <= high]
+    axes.set_yticks(ticks, [f"{t:g}" for t in ticks])
     axes.yaxis.set_minor_locator(NullLocator())
     axes.legend(fontsize="small")
 
