@@ -11,10 +11,14 @@ def test_streams_are_those_of_the_noise_and_of_what_learns() -> None:
     fixed, again, learned = run(1, 40, learn=False), run(1, 40), run(1, 40)
     np.testing.assert_array_equal(again.costs, learned.costs)
     assert fixed.costs[0] == learned.costs[0]
-    assert fixed.costs.sum() > learned.costs.sum() > 0
-    assert fixed.violations.sum() > learned.violations.sum() >= 0
-    assert run(1, 40, replay=True).costs.sum() < fixed.costs.sum()
-    assert run(2, 40).costs.sum() != learned.costs.sum()
+    assert (fixed.costs[-30:] != learned.costs[-30:]).all()
+    assert run(2, 40).costs[1] != learned.costs[1]
+
+
+def test_replay_learns_within_some_hundred_steps() -> None:
+    fixed, replayed = run(2, 500, learn=False), run(2, 500, replay=True)
+    assert fixed.costs[-100:].sum() > 2 * replayed.costs[-100:].sum() > 0
+    assert fixed.violations.sum() > 2 * replayed.violations.sum() >= 0
 
 
 def test_the_table_has_each_seed_and_the_median() -> None:
