@@ -76,7 +76,8 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     )
     batches = iter(collector)
     for batch in itertools.islice(batches, -(-cfg.warmup_steps // cfg.steps_per_update)):
-        replay.extend(batch)
+        if cfg.replay:
+            replay.extend(batch)
 
     qps, unsolved, train_seconds, costs, violation = SolveLog(), 0, 0.0, [], 0.0
     with contextlib.ExitStack() as stack:
@@ -88,7 +89,8 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
             began = time.perf_counter()
             with qps:
                 batch = next(batches)
-                replay.extend(batch)
+                if cfg.replay:
+                    replay.extend(batch)
                 collected = time.perf_counter()
 
                 sample = replay.sample() if cfg.replay else batch.reshape(-1)

@@ -147,11 +147,11 @@ class GaussNewton(torch.optim.Optimizer):
         past = delta.new_zeros(len(blocks[0]) - len(delta) if blocks else 0)
         alpha, change = _solve(blocks, torch.cat((delta, past)), damping)
         change = change[: len(delta)]
-        old = [block.leaf.clone() for block in blocks]
         steps = [block.step(alpha) for block in blocks]
         if not self._trust_region:
             _move(blocks, steps, lr)
             return StepReport(solution, damping, math.nan, True)
+        old = [block.leaf.clone() for block in blocks]
         before = _objective(delta, blocks)
         _move(blocks, steps, lr)
         predicted = before - _objective(delta - lr * change, blocks)

@@ -361,7 +361,7 @@ class QPMPC(nn.Module):
 
     def _limits(self, bounds: Tensor) -> Tensor:
         """lb or ub, which an MPC scheme does not learn on hard rows: those are known (eq:v1c3)."""
-        if self.structure == "free":
+        if self.structure == "free" or not bounds.requires_grad:
             return bounds
         return torch.where(self.soft, bounds, bounds.detach())
 

@@ -72,11 +72,7 @@ class Banded(nn.Module):
 
     def right_inverse(self, C: Tensor) -> tuple[Tensor, Tensor]:
         """The model in the band of C; `QPError` if there is more in C than that."""
-        n_x, n, horizon = self.layout.n_x, self.layout.n, self.layout.horizon
-        stages = C[:, : horizon * n].unflatten(0, (horizon, n_x)).unflatten(-1, (horizon, n))
-        blocks = stages.diagonal(dim1=0, dim2=2).movedim(-1, 0)
-        if self.tied:
-            blocks = blocks[0]
+        n_x, blocks = self.layout.n_x, _stage_blocks(C, self.layout, self.tied)
         A, B = blocks[..., :n_x].contiguous(), blocks[..., n_x:].contiguous()
         _check_tied("C", C, self(A, B))
         return A, B
@@ -116,20 +112,30 @@ class LinearRows(nn.Module):
         self.layout, self.tied = layout, tied
 
     def forward(self, D: Tensor, D_f: Tensor) -> Tensor:
-        n_x, n, horizon, n_z = (getattr(self.layout, s) for s in ("n_x", "n", "horizon", "n_z"))
-        stages = torch.block_diag(*D.expand(horizon, -1, n))
+        n_x, n_z = self.layout.n_x, self.layout.n_z
+        stages = torch.block_diag(*D.expand(self.layout.horizon, -1, self.layout.n))
         unit = torch.eye(n_z).to(D)
         return torch.cat((unit, F.pad(stages, (0, n_x)), F.pad(D_f, (n_z - n_x, 0))))
 
     def right_inverse(self, G: Tensor) -> tuple[Tensor, Tensor]:
         """D and D^f; `QPError` if there is more in G than they make."""
-        n_x, n, horizon, n_z = (getattr(self.layout, s) for s in ("n_x", "n", "horizon", "n_z"))
-        last = n_z + horizon * self.layout.n_d
-        stages = G[n_z:last, : horizon * n].unflatten(0, (horizon, self.layout.n_d))
-        D = stages.unflatten(-1, (horizon, n)).diagonal(dim1=0, dim2=2).movedim(-1, 0)
-        D, D_f = (D[0] if self.tied else D).contiguous(), G[last:, n_z - n_x :].contiguous()
+        n_x, n_z = self.layout.n_x, self.layout.n_z
+        last = n_z + self.layout.horizon * self.layout.n_d
+        D = _stage_blocks(G[n_z:last], self.layout, self.tied).contiguous()
+        D_f = G[last:, n_z - n_x :].contiguous()
         _check_tied("G", G, self(D, D_f))
         return D, D_f
+
+
+def _stage_blocks(rows: Tensor, layout: Layout, tied: bool) -> Tensor:
+    """What equally many rows for each stage have in its (x_k, u_k), ``(N, n, n_x + n_u)``.
+
+    Of the first stage alone if they are tied.
+    """
+    horizon, n = layout.horizon, layout.n
+    stages = rows[:, : horizon * n].unflatten(0, (horizon, len(rows) // horizon))
+    blocks = stages.unflatten(-1, (horizon, n)).diagonal(dim1=0, dim2=2).movedim(-1, 0)
+    return blocks[0] if tied else blocks
 
 
 def _check_tied(name: str, given: Tensor, tied: Tensor) -> None:

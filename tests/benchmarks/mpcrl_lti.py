@@ -11,14 +11,15 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from tests.benchmarks.peers import needs
+from torch_qpmpc.envs import GrosZanonLTI
 
 #: The plant: s+ = A s + B a + (e, 0), of which the MPC starts from a wrong model.
-A, B = np.array([[0.9, 0.35], [0.0, 1.1]]), np.array([[0.0813], [0.2]])
-A_0, B_0 = np.array([[1.0, 0.25], [0.0, 1.0]]), np.array([[0.0312], [0.25]])
+PHYSICS = GrosZanonLTI()
+A, B = PHYSICS.A.numpy(), PHYSICS.B.numpy()
+A_0, B_0 = (matrix.numpy() for matrix in PHYSICS.wrong_model())
 NOISE = -0.1, 0.0
-START = 0.0, 0.15
-LOWER, UPPER = np.array([0.0, -1.0]), np.array([1.0, 1.0])
-PENALTY = 100.0
+START = PHYSICS.starts(np.random.default_rng(), 1)[0].numpy()
+LOWER, UPPER, PENALTY = PHYSICS.lb_s.numpy(), PHYSICS.ub_s.numpy(), PHYSICS.w
 HORIZON, DISCOUNT, LEARNING_RATE = 10, 0.9, 0.05
 QUIET = {
     "print_time": False,
