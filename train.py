@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import time
+from functools import partial
 from typing import Any
 
 import hydra
@@ -27,11 +28,12 @@ from tqdm import tqdm
 
 from torch_qpmpc import QPActorValueOperator, QPError, SolveLog
 from torch_qpmpc.checkpoint import save_checkpoint
+from torch_qpmpc.collection import batches, make_collector, num_columns
 from torch_qpmpc.config import check_config
 from torch_qpmpc.experiment import (
+    act,
     decay,
     evaluate,
-    make_collector,
     make_learner,
     report,
     stream_summary,
@@ -54,28 +56,28 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     # The QP, between its two ends: the wrong model it starts from, and the true one.
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
-    loops = {
-        "start": evaluate(cfg, mpc, physics),
-        "true model": evaluate(cfg, make_true_mpc(cfg, physics), physics),
-    }
+    loops = {"start": evaluate(cfg, mpc.policy, physics)}
+    if (true_mpc := make_true_mpc(cfg, physics)) is not None:
+        loops["true model"] = evaluate(cfg, true_mpc.policy, physics)
 
-    # Q-learning, by gradients or of the second order.
+    # Q-learning, by gradients or of the second order, or a policy gradient.
     operator = QPActorValueOperator(mpc, active_set_key=ACTIVE_SET if cfg.warm_start else None)
-    learner = make_learner(cfg, operator)
+    learner = make_learner(cfg, operator, physics)
+    learned_mpc = None if cfg.algo.name != "qlearning" and cfg.algo.actor != "qp" else mpc
 
     # Data: vectorised episodes under today's policy, and one replay for transitions and windows.
-    collector = make_collector(cfg, physics, operator)
+    collector = make_collector(cfg, physics, learner.actor)
     replay = make_replay(
         cfg.replay_capacity,
-        cfg.num_envs,
+        num_columns(cfg),
         cfg.batch_size,
         cfg.task.horizon,
         1 if learner.si is None else cfg.constraint.si.windows,
         seed=cfg.seed,
         active_rows=len(mpc.G) if cfg.warm_start else None,
     )
-    batches = iter(collector)
-    for batch in itertools.islice(batches, -(-cfg.warmup_steps // cfg.steps_per_update)):
+    stream = batches(collector)
+    for batch in itertools.islice(stream, -(-cfg.warmup_steps // cfg.steps_per_update)):
         if cfg.replay:
             replay.extend(batch)
 
@@ -83,12 +85,14 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     with contextlib.ExitStack() as stack:
         stack.callback(collector.shutdown)
         run = stack.enter_context(RunFolder(folder, cfg))
-        run.log({"eval/J": loops["start"].J, "eval/J_true_model": loops["true model"].J}, 0)
+        run.log(
+            {f"eval/J{suffix}": loops[end].J for end, suffix in ENDS.items() if end in loops}, 0
+        )
         progress = tqdm(range(1, cfg.updates + 1), desc=f"{cfg.constraint.name}, {cfg.noise.name}")
         for update in progress:
             began = time.perf_counter()
             with qps:
-                batch = next(batches)
+                batch = next(stream)
                 if cfg.replay:
                     replay.extend(batch)
                 collected = time.perf_counter()
@@ -112,7 +116,8 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
 
             if update % cfg.log_interval == 0:
                 metrics = {name: term.item() for name, term in terms.items()}
-                metrics |= {f"train/{name}": losses[name].item() for name in LOGGED}
+                told = {name: x for name, x in losses.items() if name in LOGGED}
+                metrics |= {f"train/{name}": x.double().mean().item() for name, x in told.items()}
                 metrics |= {"train/reward": -costs[-1], "train/violation": violation}
                 metrics |= qps.metrics() | theta_metrics(mpc)
                 if learner.deviation is not None:
@@ -121,8 +126,8 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 run.log(metrics, update)
                 unsolved, qps = unsolved + qps.unsolved, SolveLog()
             if update % cfg.eval_interval == 0 or update == cfg.updates:
-                loops["learned"] = evaluate(cfg, mpc, physics)
-                summary = report(run, mpc, loops, update)
+                loops["learned"] = evaluate(cfg, partial(act, learner.actor), physics)
+                summary = report(run, learned_mpc, loops, update)
                 progress.set_postfix(J=summary["J_final"], closed_gap=summary["closed_gap"])
                 state = {"mpc": mpc.state_dict(), "optimizer": learner.optimizer.state_dict()}
                 state |= {"structure": mpc.structure, "update": update}
@@ -130,17 +135,22 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 run.flush()
             if update == cfg.release:
                 mpc.release()
-                learner = make_learner(cfg, operator, done=update)
+                learner = make_learner(cfg, operator, physics, done=update)
         summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
-        summary |= {"solver": cfg.solver, "updates": cfg.updates, "train_seconds": train_seconds}
+        summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
+        summary |= {"updates": cfg.updates, "train_seconds": train_seconds}
         summary |= stream_summary(costs, violation)
         summary["unsolved"] = unsolved + qps.unsolved
         run.finish(summary)
-        summary_figure(mpc, loops, *run.column("eval/J")).savefig(run.path / "summary.png", dpi=110)
+        if learned_mpc is not None:
+            figure = summary_figure(mpc, loops, *run.column("eval/J"))
+            figure.savefig(run.path / "summary.png", dpi=110)
     print(f"\n{table(summary)}\n\n{run.path}")
     return summary
 
 
+#: Where J at the two ends goes.
+ENDS = {"start": "", "true model": "_true_model"}
 #: What the loss module tells of itself.
 LOGGED = ("td_error", "pred_value", "target_value", "unsolved")
 

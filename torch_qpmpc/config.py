@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -14,8 +15,12 @@ from torch_qpmpc.envs.point_mass import NOISE_STD
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.solvers import backend
 
-#: The noise of Gros and Zanon's system, which has no other.
-UNIFORM = "uniform"
+#: The noises that each task has.
+NOISES = {
+    "point_mass": tuple(NOISE_STD),
+    "gros_zanon": ("uniform",),
+    "gymnasium": ("none",),
+}
 
 Rule = tuple[Callable[[Any], bool], str]
 
@@ -51,6 +56,14 @@ WEIGHT: Rule = (
 FRACTION: Rule = lambda x: _number(x) and 0 < x <= 1, "a number in (0, 1]"
 FLAG: Rule = lambda x: isinstance(x, bool), "true or false"
 NAME: Rule = lambda x: isinstance(x, str), "a name"
+MATRIX: Rule = (
+    lambda x: (
+        isinstance(x, list)
+        and all(isinstance(row, list) and len(row) == len(x[0]) for row in x)
+        and all(_number(entry) and math.isfinite(entry) for row in x for entry in row)
+    ),
+    "a list of equally long rows of finite numbers",
+)
 
 RULES: dict[str, Rule] = {
     "seed": (lambda x: _whole(0)[0](x) and x < 2**63, "a whole number >= 0 and < 2^63"),
@@ -72,7 +85,24 @@ RULES: dict[str, Rule] = {
     "release": (lambda x: x is None or _whole(1)[0](x), "a whole number >= 1, or null"),
     "eval_interval": _whole(1),
     "log_interval": _whole(1),
-    "task.name": _one_of("point_mass", "gros_zanon"),
+    "algo.name": _one_of("qlearning", "ddpg", "td3"),
+    "algo.actor": _one_of("qp", "mlp"),
+    "algo.critic": _one_of("qp", "mlp"),
+    "algo.actor_rate": POSITIVE,
+    "algo.lr_network": POSITIVE,
+    "algo.width": _whole(1),
+    "algo.policy_delay": _whole(1),
+    "algo.policy_noise": NON_NEGATIVE,
+    "algo.noise_clip": NON_NEGATIVE,
+    "collector.name": _one_of("single", "multi", "ray"),
+    "collector.workers": _whole(1),
+    "collector.sync": FLAG,
+    "collector.num_cpus": POSITIVE,
+    "task.name": _one_of("point_mass", "gros_zanon", "gymnasium"),
+    "task.id": NAME,
+    "task.A": MATRIX,
+    "task.B": MATRIX,
+    "task.stage_weight": MATRIX,
     "task.horizon": _whole(1),
     "task.gamma": FRACTION,
     "task.episode_steps": _whole(1),
@@ -83,7 +113,7 @@ RULES: dict[str, Rule] = {
     "task.state_slack": WEIGHT,
     "task.action_slack": WEIGHT,
     "task.discount_slack": FLAG,
-    "noise.name": _one_of(*NOISE_STD, UNIFORM),
+    "noise.name": _one_of(*itertools.chain(*NOISES.values())),
     "noise.std": (
         lambda x: x is None or NON_NEGATIVE[0](x),
         "a finite number >= 0, or null for the task's own",
@@ -115,12 +145,23 @@ RULES: dict[str, Rule] = {
 }
 _RATES = {"optimizer.lr_cost", "optimizer.lr_constraints"}
 _METRIC = {"optimizer.scale_cost", "optimizer.scale_constraints"}
-#: The keys that each optimiser has beside its name and final_fraction.
-OF_OPTIMIZER = {
-    "adam": _RATES | {"optimizer.betas"},
-    "sgd": _RATES,
-    "gauss_newton": _METRIC
-    | {f"optimizer.{name}" for name in ("lr", "damping", "memory", "trust_region")},
+_NETWORKS = {f"algo.{name}" for name in ("actor", "critic", "actor_rate", "lr_network", "width")}
+_WORKERS = {"collector.workers", "collector.sync"}
+#: The keys that each choice has beside those of all choices.
+OF_CHOICE: dict[str, dict[str, set[str]]] = {
+    "optimizer": {
+        "adam": _RATES | {"optimizer.betas"},
+        "sgd": _RATES,
+        "gauss_newton": _METRIC
+        | {f"optimizer.{name}" for name in ("lr", "damping", "memory", "trust_region")},
+    },
+    "algo": {
+        "ddpg": _NETWORKS,
+        "td3": _NETWORKS
+        | {f"algo.{name}" for name in ("policy_delay", "policy_noise", "noise_clip")},
+    },
+    "collector": {"multi": _WORKERS, "ray": _WORKERS | {"collector.num_cpus"}},
+    "task": {"gymnasium": {f"task.{name}" for name in ("id", "A", "B", "stage_weight")}},
 }
 #: A penalty that is null is off.
 OPTIONAL = ("constraint.deviation", "constraint.si")
@@ -215,15 +256,62 @@ CONFLICTS: tuple[tuple[str, Callable[[DictConfig], bool], str, str], ...] = (
     ),
     (
         "noise.name",
-        lambda cfg: (cfg.noise.name == UNIFORM) != (cfg.task.name == "gros_zanon"),
-        "the noise of {cfg.task.name}",
-        f"{UNIFORM} is that of gros_zanon, the others are the point mass's.",
+        lambda cfg: cfg.noise.name not in NOISES[cfg.task.name],
+        "a noise that {cfg.task.name} has",
+        "The point mass has gaussian and brownian, gros_zanon uniform, the others none.",
     ),
     (
         "noise.std",
-        lambda cfg: cfg.noise.name == UNIFORM and cfg.noise.std is not None,
+        lambda cfg: cfg.task.name != "point_mass" and cfg.noise.std is not None,
         "null",
-        "The noise of gros_zanon cannot be changed.",
+        "The noise of {cfg.task.name} cannot be changed.",
+    ),
+    (
+        "optimizer.name",
+        lambda cfg: cfg.algo.name != "qlearning" and _second_order(cfg),
+        "adam or sgd",
+        "{cfg.algo.name} has no second order: say optimizer=adam.",
+    ),
+    (
+        "warm_start",
+        lambda cfg: cfg.algo.name != "qlearning" and cfg.warm_start,
+        "false",
+        "{cfg.algo.name} solves at other actions than it replays.",
+    ),
+    (
+        "replay",
+        lambda cfg: cfg.algo.name != "qlearning" and not cfg.replay,
+        "true",
+        "{cfg.algo.name} learns from a replay.",
+    ),
+    (
+        "release",
+        lambda cfg: cfg.release is not None and cfg.algo.name != "qlearning",
+        "null",
+        "{cfg.algo.name} has more parameters than the QP's.",
+    ),
+    (
+        "release",
+        lambda cfg: cfg.release is not None and cfg.collector.name != "single",
+        "null",
+        "The workers of collector={cfg.collector.name} would keep the old parameters.",
+    ),
+    (
+        "num_envs",
+        lambda cfg: cfg.collector.name != "single" and bool(cfg.num_envs % cfg.collector.workers),
+        "a multiple of collector.workers = {cfg.collector.workers}",
+        "",
+    ),
+    (
+        "steps_per_update",
+        lambda cfg: (
+            cfg.collector.name != "single"
+            and not cfg.collector.sync
+            and cfg.constraint.si is not None
+            and cfg.steps_per_update < cfg.task.horizon
+        ),
+        "at least task.horizon = {cfg.task.horizon}",
+        "The windows of constraint.si lie within one batch of a worker.",
     ),
     (
         "replay_capacity",
@@ -246,8 +334,10 @@ def check_config(cfg: DictConfig) -> None:
         accepts, expected = RULES[key]
         if not accepts(value):
             raise QPError.expected(key, repr(value), expected)
-    special = set().union(*OF_OPTIMIZER.values())
-    own = OF_OPTIMIZER.get(given.get("optimizer.name", ""), set())
+    special, own = set(), set()
+    for group, choices in OF_CHOICE.items():
+        special |= set().union(*choices.values())
+        own |= choices.get(given.get(f"{group}.name", ""), set())
     for key in RULES:
         if key in special - own:
             continue
@@ -256,7 +346,7 @@ def check_config(cfg: DictConfig) -> None:
     backend(cfg.solver)
     for key, wrong, expected, remedy in CONFLICTS:
         if wrong(cfg):
-            expected = expected.format(cfg=cfg)
+            expected, remedy = expected.format(cfg=cfg), remedy.format(cfg=cfg)
             raise QPError.expected(key, repr(given.get(key)), expected, remedy)
 
 

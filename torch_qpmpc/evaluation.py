@@ -6,10 +6,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import gymnasium
 import numpy as np
 import torch
 from torch import Tensor
 
+from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.linear_system import LinearSystem
 from torch_qpmpc.errors import QPError
 
@@ -84,6 +86,40 @@ def closed_loop(
         states.append(s)
         actions.append(a)
     return ClosedLoop(torch.stack(states), torch.stack(actions), torch.stack(costs), gamma)
+
+
+@torch.no_grad()
+def gymnasium_loop(
+    policy: Callable[[Tensor], Tensor],
+    plant: GymnasiumPlant,
+    *,
+    steps: int = 200,
+    starts: int = 32,
+    seed: int = 123,
+    gamma: float = 0.99,
+) -> ClosedLoop:
+    """`closed_loop` in a Gymnasium environment: start i is that of the seed ``seed + i``.
+
+    After an episode's end its state stays, at no cost.
+    """
+    envs = [gymnasium.make(plant.id, max_episode_steps=steps) for _ in range(starts)]
+    s = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(envs)])
+    states, actions, costs = [s], [], []
+    over = np.zeros(starts, dtype=bool)
+    low, high = plant.lb_a.numpy(), plant.ub_a.numpy()
+    for _ in range(steps):
+        a = policy(torch.as_tensor(s, dtype=torch.float64)).numpy().clip(low, high)
+        s, cost = s.copy(), np.zeros(starts)
+        for i in np.flatnonzero(~over):
+            s[i], reward, terminated, truncated, _ = envs[i].step(a[i].astype(low.dtype))
+            cost[i], over[i] = -float(reward), terminated or truncated
+        states.append(s)
+        actions.append(a)
+        costs.append(cost)
+    for env in envs:
+        env.close()
+    tensors = (torch.as_tensor(np.stack(x), dtype=torch.float64) for x in (states, actions, costs))
+    return ClosedLoop(*tensors, gamma)
 
 
 def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:

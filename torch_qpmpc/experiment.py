@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
-from torchrl.collectors import Collector
-from torchrl.modules import AdditiveGaussianModule
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import LossModule, SoftUpdate
 
-from torch_qpmpc.envs import LinearSystem, LinearSystemEnv
-from torch_qpmpc.evaluation import ClosedLoop, closed_gap, closed_loop
+from torch_qpmpc.actor_critic import actor_groups, critic_groups, make_actor_critic_loss
+from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
+from torch_qpmpc.evaluation import ClosedLoop, closed_gap, closed_loop, gymnasium_loop
 from torch_qpmpc.gauss_newton import GaussNewton
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.objectives import QPQLearningLoss
@@ -36,11 +38,13 @@ class Learner:
 
     Attributes:
         learn: what a batch does to theta.
+        actor: observation to action, without exploration.
         deviation, si: the penalties that are on.
         target: the soft update of the target network, if there is one.
     """
 
     learn: Update
+    actor: TensorDictModuleBase
     optimizer: torch.optim.Optimizer
     schedule: LambdaLR
     deviation: DeviationPenalty | None
@@ -48,42 +52,37 @@ class Learner:
     target: SoftUpdate | None
 
 
-def make_learner(cfg: DictConfig, operator: QPActorValueOperator, done: int = 0) -> Learner:
-    """Q-learning: V and Q from one QP, two learning rates, and the penalties on C.
+def make_learner(
+    cfg: DictConfig,
+    operator: QPActorValueOperator,
+    physics: LinearSystem | GymnasiumPlant,
+    done: int = 0,
+) -> Learner:
+    """What ``cfg.algo`` says, two learning rates, and the penalties on C.
 
     ``done`` updates have been made before, for the schedule of the rates.
     """
     mpc = operator.module
-    loss_module = QPQLearningLoss(
-        operator, delay_value=cfg.delay_value, td_error_clip=cfg.td_error_clip
-    )
+    if cfg.algo.name == "qlearning":
+        loss_module = QPQLearningLoss(
+            operator, delay_value=cfg.delay_value, td_error_clip=cfg.td_error_clip
+        )
+        actor = operator.get_policy_operator()
+    else:
+        loss_module = make_actor_critic_loss(cfg, mpc, physics.lb_a, physics.ub_a)
+        actor = loss_module.actor_network
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
     deviation, si = make_penalties(cfg, mpc)
-    optimizer = make_optimizer(cfg, mpc)
+    optimizer = make_optimizer(cfg, mpc, loss_module)
+    delayed = cfg.algo.name != "qlearning" or cfg.delay_value
     return Learner(
-        make_update(cfg, mpc, loss_module, optimizer, deviation, si),
+        make_update(cfg, mpc, loss_module, optimizer, deviation, si, done),
+        actor,
         optimizer,
         make_schedule(cfg, optimizer, done),
         deviation,
         si,
-        SoftUpdate(loss_module, tau=cfg.target_rate) if cfg.delay_value else None,
-    )
-
-
-def make_collector(
-    cfg: DictConfig, physics: LinearSystem, operator: QPActorValueOperator
-) -> Collector:
-    """Vectorised episodes under today's policy with Gaussian exploration."""
-    env = LinearSystemEnv(physics, cfg.num_envs, cfg.task.episode_steps, seed=cfg.seed)
-    exploration = AdditiveGaussianModule(
-        env.action_spec, sigma_init=cfg.exploration_std, sigma_end=cfg.exploration_std
-    )
-    return Collector(
-        env,
-        TensorDictSequential([operator.get_policy_operator(), exploration]),
-        frames_per_batch=cfg.num_envs * cfg.steps_per_update,
-        total_frames=-1,
-        auto_register_policy_transforms=False,
+        SoftUpdate(loss_module, tau=cfg.target_rate) if delayed else None,
     )
 
 
@@ -98,8 +97,8 @@ def make_penalties(
     )
 
 
-def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> torch.optim.Optimizer:
-    """The optimiser, with one rate for the cost and one for the constraints."""
+def make_optimizer(cfg: DictConfig, mpc: QPMPC, loss_module: LossModule) -> torch.optim.Optimizer:
+    """The optimiser, with one rate for the cost and one for the constraints; critics included."""
     options = cfg.optimizer
     if options.name == "gauss_newton":
         return GaussNewton(
@@ -111,7 +110,11 @@ def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> torch.optim.Optimizer:
             td_error_clip=cfg.td_error_clip,
             trust_region=options.trust_region,
         )
-    groups = mpc.parameter_groups({"cost": options.lr_cost, "constraints": options.lr_constraints})
+    rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}
+    if cfg.algo.name == "qlearning":
+        groups = mpc.parameter_groups(rates)
+    else:
+        groups = [*actor_groups(cfg, mpc, loss_module), *critic_groups(cfg, loss_module)]
     if options.name == "adam":
         return torch.optim.Adam(groups, betas=tuple(options.betas))
     return torch.optim.SGD(groups)
@@ -120,16 +123,20 @@ def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> torch.optim.Optimizer:
 def make_update(
     cfg: DictConfig,
     mpc: QPMPC,
-    loss_module: QPQLearningLoss,
+    loss_module: LossModule,
     optimizer: torch.optim.Optimizer,
     deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
+    done: int,
 ) -> Update:
     """What a batch does to theta, by the optimiser's order."""
     if isinstance(optimizer, GaussNewton):
+        assert isinstance(loss_module, QPQLearningLoss)
         return second_order(mpc, loss_module, optimizer, si)
     by_gradient = deviation if cfg.penalty_step == "subgradient" else None
-    return first_order(mpc, loss_module, optimizer, by_gradient, si)
+    every = cfg.algo.policy_delay if cfg.algo.name == "td3" else 1
+    turns = (update % every == 0 for update in itertools.count(done + 1))
+    return first_order(mpc, loss_module, optimizer, by_gradient, si, turns)
 
 
 def make_schedule(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int = 0) -> LambdaLR:
@@ -144,21 +151,36 @@ def decay(update: int, updates: int, last: float) -> float:
     return 1 - (1 - last) * min(update / updates, 1)
 
 
-def evaluate(cfg: DictConfig, mpc: QPMPC, physics: LinearSystem) -> ClosedLoop:
-    """The policy without exploration, from the fixed starts and with the fixed noise."""
-    return closed_loop(mpc.policy, physics, steps=cfg.task.eval_steps, gamma=cfg.task.gamma)
+def act(actor: TensorDictModuleBase, s: Tensor) -> Tensor:
+    """The policy of ``actor``, as a function: s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
+    return actor(observation=s)
 
 
-def report(run: RunFolder, mpc: QPMPC, loops: dict[str, ClosedLoop], update: int) -> dict[str, Any]:
+def evaluate(
+    cfg: DictConfig, policy: Callable[[Tensor], Tensor], physics: LinearSystem | GymnasiumPlant
+) -> ClosedLoop:
+    """``policy`` from the fixed starts and with the fixed noise."""
+    run = closed_loop if isinstance(physics, LinearSystem) else gymnasium_loop
+    return run(policy, physics, steps=cfg.task.eval_steps, gamma=cfg.task.gamma)
+
+
+def report(
+    run: RunFolder, mpc: QPMPC | None, loops: dict[str, ClosedLoop], update: int
+) -> dict[str, Any]:
     """Log an evaluation: J between its two ends, the distance of C to C_0, and the figures.
+
+    Args:
+        mpc: None where the learned policy is no QP's.
 
     Returns:
         `gap_summary` of ``loops``.
     """
     summary = gap_summary(loops)
-    run.log({"eval/J": summary["J_final"], "eval/J_true_model": summary["J_true_model"]}, update)
-    run.log({"eval/J_discounted": summary["J_discounted_final"]}, update)
-    run.log({"eval/closed_gap": summary["closed_gap"]}, update)
+    logged = {"J": "J_final", "J_true_model": "J_true_model", "J_discounted": "J_discounted_final"}
+    logged |= {"closed_gap": "closed_gap"}
+    run.log({f"eval/{name}": summary[key] for name, key in logged.items()}, update)
+    if mpc is None:
+        return summary
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
     run.log({f"structure/{band}": distance for band, distance in distances.items()}, update)
     run.figure("structure/C", constraint_figure(mpc), update)
@@ -188,11 +210,14 @@ def stream_summary(costs: list[float], violation: float) -> dict[str, float]:
 
 
 def gap_summary(loops: dict[str, ClosedLoop]) -> dict[str, float]:
-    """J at the start, at the end and with the true model, and the closed gap; both discountings."""
+    """J at the start, at the end and with the true model, and the closed gap; both discountings.
+
+    nan for what there is not, as a plant without a true model.
+    """
     summary = {}
     for tag, suffix in (("J", ""), ("J_discounted", "_discounted")):
         start, final, true = (
-            getattr(loops[name], tag) for name in ("start", "learned", "true model")
+            getattr(loops.get(name), tag, math.nan) for name in ("start", "learned", "true model")
         )
         summary |= {f"{tag}_start": start, f"{tag}_final": final, f"{tag}_true_model": true}
         summary[f"closed_gap{suffix}"] = closed_gap(start, final, true)

@@ -106,7 +106,7 @@ def summary_figure(
     """One picture of a run: learning, the learned matrix, and what it does in closed loop."""
     figure = Figure(figsize=(15, 4), layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1.5, 1))
-    ends = {name: loops[name].J for name in ("start", "true model")}
+    ends = {name: loops[name].J for name in ("start", "true model") if name in loops}
     draw_learning(left, updates, J, ends)
     draw_matrix(middle, mpc.C, mpc, r"Learned constraint matrix $C_\theta$")
     draw_positions(right, loops, mpc)

@@ -9,7 +9,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torch_qpmpc.envs import GrosZanonLTI, LinearSystem, PointMass
+from torch_qpmpc.envs import GrosZanonLTI, GymnasiumPlant, LinearSystem, PointMass
 from torch_qpmpc.mpc import QPMPC
 
 
@@ -25,22 +25,37 @@ class Scheme:
     ub_s: Tensor
 
 
-def make_physics(cfg: DictConfig) -> LinearSystem:
+def make_physics(cfg: DictConfig) -> LinearSystem | GymnasiumPlant:
     """The true system, with the run's noise where that can be chosen."""
+    if cfg.task.name == "gymnasium":
+        return GymnasiumPlant(cfg.task.id)
     if cfg.task.name == "gros_zanon":
         return GrosZanonLTI()
     return PointMass(noise_kind=cfg.noise.name, noise_std=cfg.noise.std)
 
 
-def make_mpc(cfg: DictConfig, physics: LinearSystem) -> QPMPC:
-    """The QP that learns: it starts from a wrong model."""
+def make_mpc(cfg: DictConfig, physics: LinearSystem | GymnasiumPlant) -> QPMPC:
+    """The QP that learns: it starts from a wrong model, or from the one that the task gives."""
     learn = (*cfg.task.learn_cost, *cfg.constraint.learn)
-    return _make(cfg, physics, _wrong_scheme(physics, cfg.seed), learn)
+    if isinstance(physics, LinearSystem):
+        return _make(cfg, physics, _wrong_scheme(physics, cfg.seed), learn)
+    return _make(cfg, physics, _given_scheme(cfg, physics), learn)
 
 
-def make_true_mpc(cfg: DictConfig, physics: LinearSystem) -> QPMPC:
-    """The other end: the same QP with the true model, cost and bounds."""
+def make_true_mpc(cfg: DictConfig, physics: LinearSystem | GymnasiumPlant) -> QPMPC | None:
+    """The other end: the same QP with the true model, cost and bounds; None where there is none."""
+    if not isinstance(physics, LinearSystem):
+        return None
     return _make(cfg, physics, _true_scheme(physics), ())
+
+
+def _given_scheme(cfg: DictConfig, physics: GymnasiumPlant) -> Scheme:
+    """The model and the weight in the task's configuration; the states are not bounded."""
+    A, B, weight = (
+        torch.tensor(cfg.task[name], dtype=torch.float64) for name in ("A", "B", "stage_weight")
+    )
+    free = torch.full_like(physics.lb_s, torch.inf)
+    return Scheme(A, B, torch.zeros_like(free), weight, -free, free)
 
 
 def _wrong_scheme(physics: LinearSystem, seed: int) -> Scheme:
@@ -68,7 +83,12 @@ def _true_scheme(physics: LinearSystem) -> Scheme:
     return Scheme(A, B, middle, A.new_tensor([1.0, 1.0, 0.5]), lb_s, ub_s)
 
 
-def _make(cfg: DictConfig, physics: LinearSystem, scheme: Scheme, learn: Collection[str]) -> QPMPC:
+def _make(
+    cfg: DictConfig,
+    physics: LinearSystem | GymnasiumPlant,
+    scheme: Scheme,
+    learn: Collection[str],
+) -> QPMPC:
     task = cfg.task
     return QPMPC.from_model(
         scheme.A,

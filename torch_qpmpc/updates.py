@@ -6,11 +6,12 @@ returns what there is to log: the terms of the loss, and scalars that describe t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.objectives import LossModule
 
 from torch_qpmpc.gauss_newton import GaussNewton
 from torch_qpmpc.mpc import QPMPC
@@ -23,26 +24,37 @@ Update = Callable[[TensorDictBase, Tensor | None], tuple[dict[str, Tensor], Scal
 
 def first_order(
     mpc: QPMPC,
-    loss_module: QPQLearningLoss,
+    loss_module: LossModule,
     optimizer: torch.optim.Optimizer,
     deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
+    actor_turns: Iterator[bool] | None = None,
 ) -> Update:
     """The gradient of the loss and of the penalties, for any torch optimiser.
 
-    ``deviation`` is None where its proximal step is taken instead.
+    A batch whose loss is not finite moves nothing and is counted as unsolved.
+
+    Args:
+        loss_module: any of TorchRL's, whose ``loss_*`` are summed.
+        deviation: None where its proximal step is taken instead.
+        actor_turns: for each update, whether the actor is updated, too, as TD3 delays it.
     """
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
         losses = loss_module(batch)
-        terms = {"loss/value": losses["loss_value"]}
+        terms = {name.replace("_", "/", 1): x for name, x in losses.items() if "loss_" in name}
         if si is not None and windows is not None:
             terms["loss/si"] = si(mpc.C, windows)
         if deviation is not None:
             terms["loss/deviation"] = deviation(mpc.C)
+        due = actor_turns is None or next(actor_turns)
+        total = torch.stack([x for name, x in terms.items() if due or "value" in name]).sum()
         optimizer.zero_grad()
-        torch.stack(list(terms.values())).sum().backward()
-        optimizer.step()
+        if total.isfinite():
+            total.backward()
+            optimizer.step()
+        elif losses.get("unsolved", None) is None:
+            losses["unsolved"] = (~losses["pred_value"].isfinite()).sum()
         return terms, losses
 
     return update

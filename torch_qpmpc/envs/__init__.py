@@ -5,6 +5,7 @@ from __future__ import annotations
 import gymnasium
 
 from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIEnv, GrosZanonLTIGymEnv
+from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
 from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
 
@@ -12,6 +13,7 @@ __all__ = [
     "GrosZanonLTI",
     "GrosZanonLTIEnv",
     "GrosZanonLTIGymEnv",
+    "GymnasiumPlant",
     "LinearSystem",
     "LinearSystemEnv",
     "LinearSystemGymEnv",

@@ -102,6 +102,10 @@ class LinearSystem(ABC):
         following = s.to(self.A) @ self.A.mT + self.applied(a) @ self.B.mT + nu.to(self.A)
         return following.clamp(self.lb_s, self.ub_s) if self.clips_states else following
 
+    def vectorised(self, num_envs: int, max_steps: int, seed: int) -> LinearSystemEnv:
+        """``num_envs`` episodes of ``max_steps`` in one TorchRL environment."""
+        return LinearSystemEnv(self, num_envs, max_steps, seed=seed)
+
 
 class LinearSystemGymEnv(gymnasium.Env):
     """One episode of ``physics``: never terminates, its registration truncates it."""

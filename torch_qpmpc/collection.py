@@ -1,0 +1,83 @@
+"""Where transitions come from: TorchRL's collectors, in this process, in others, or through Ray."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.modules import AdditiveGaussianModule
+
+from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
+from torch_qpmpc.errors import QPError
+
+#: TorchRL's collectors through Ray need a number; -1 would be none.
+ENDLESS = 2**62
+
+
+def num_columns(cfg: DictConfig) -> int:
+    """How many environments a batch has: all, or one worker's where they do not wait for others."""
+    asynchronous = cfg.collector.name != "single" and not cfg.collector.sync
+    return cfg.num_envs // cfg.collector.workers if asynchronous else cfg.num_envs
+
+
+def make_collector(
+    cfg: DictConfig, physics: LinearSystem | GymnasiumPlant, actor: TensorDictModuleBase
+) -> BaseCollector:
+    """Vectorised episodes under ``actor`` with Gaussian exploration, by ``cfg.collector``.
+
+    The environments are shared out among the workers, each of which has a copy of the actor; those
+    of worker i have the seed ``cfg.seed + i``.
+
+    Raises:
+        QPError: ``collector=ray`` without Ray.
+    """
+    name, steps = cfg.collector.name, cfg.steps_per_update
+    workers = 1 if name == "single" else cfg.collector.workers
+    make_env = partial(physics.vectorised, cfg.num_envs // workers, cfg.task.episode_steps)
+    makers = [partial(make_env, seed=cfg.seed + worker) for worker in range(workers)]
+    env = makers[0]()
+    exploration = AdditiveGaussianModule(
+        env.action_spec, sigma_init=cfg.exploration_std, sigma_end=cfg.exploration_std
+    )
+    policy = TensorDictSequential(actor, exploration)
+    options: dict[str, Any] = {"auto_register_policy_transforms": False}
+    if name == "single":
+        return Collector(
+            env, policy, frames_per_batch=cfg.num_envs * steps, total_frames=-1, **options
+        )
+    env.close()
+    frames = num_columns(cfg) * steps
+    if name == "multi":
+        kind = MultiSyncCollector if cfg.collector.sync else MultiAsyncCollector
+        return kind(makers, policy, frames_per_batch=frames, total_frames=-1, **options)
+    if importlib.util.find_spec("ray") is None:
+        remedy = "Install it: pip install -e '.[ray]'."
+        raise QPError.expected("collector", "ray, which is not installed", "Ray", remedy)
+    from torchrl.collectors.distributed import RayCollector
+
+    return RayCollector(
+        makers,
+        policy,
+        frames_per_batch=frames,
+        total_frames=ENDLESS,
+        sync=cfg.collector.sync,
+        remote_configs={"num_cpus": cfg.collector.num_cpus},
+        collector_kwargs=options,
+    )
+
+
+def batches(collector: BaseCollector) -> Iterator[TensorDictBase]:
+    """``(num_columns, steps_per_update)`` transitions for ever, under the newest theta."""
+    alone = isinstance(collector, Collector)
+    if not alone:
+        collector.update_policy_weights_()
+    for batch in collector:
+        yield batch if alone else batch.reshape(-1, batch.shape[-1])
+        if not alone:
+            collector.update_policy_weights_()

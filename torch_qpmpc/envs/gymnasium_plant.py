@@ -1,0 +1,72 @@
+"""Any Gymnasium environment with continuous observations and actions as the plant of a task.
+
+Unlike a `LinearSystem` it cannot be looked into: it can be reset and stepped, and that is all.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
+from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
+
+from torch_qpmpc.errors import QPError
+
+
+class GymnasiumPlant:
+    """The environment ``id``: its observation is the state s, its reward -L.
+
+    Args:
+        id: of a registered environment whose spaces are boxes of one dimension.
+
+    Attributes:
+        lb_s, ub_s, lb_a, ub_a: the bounds of its spaces, ``(n_x,)`` and ``(n_u,)``.
+
+    Raises:
+        QPError: it cannot be made, or has other spaces.
+
+    Example:
+        >>> GymnasiumPlant("Pendulum-v1").ub_a
+        tensor([2.], dtype=torch.float64)
+    """
+
+    def __init__(self, id: str) -> None:
+        self.id = id
+        try:
+            env = gymnasium.make(id)
+        except gymnasium.error.Error as error:
+            expected = "an environment that Gymnasium can make"
+            raise QPError.expected("task.id", repr(id), expected, str(error)) from error
+        self.lb_s, self.ub_s = self._bounds("observation", env.observation_space)
+        self.lb_a, self.ub_a = self._bounds("action", env.action_space)
+        env.close()
+
+    def _bounds(self, name: str, space: Any) -> tuple[Tensor, Tensor]:
+        if not isinstance(space, Box) or len(space.shape) != 1:
+            got = f"{self.id!r}, whose {name} space is {space}"
+            raise QPError.expected("task.id", got, "spaces that are boxes of one dimension")
+        low, high = (torch.as_tensor(x, dtype=torch.float64) for x in (space.low, space.high))
+        return low, high
+
+    def vectorised(self, num_envs: int, max_steps: int, seed: int) -> EnvBase:
+        """``num_envs`` episodes of at most ``max_steps`` in one TorchRL environment."""
+        envs = gymnasium.make_vec(
+            self.id,
+            num_envs,
+            vectorization_mode="sync",
+            # TorchRL resets by itself; else an episode's last observation would be lost.
+            vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED},
+            max_episode_steps=max_steps,
+        )
+        env = TransformedEnv(GymWrapper(envs), DoubleToFloat())
+        env.set_seed(seed)
+        return env
+
+    def violation(self, s: Tensor) -> Tensor:
+        """How far s ``(*batch, n_x)`` is outside the bounds of its space, summed: 0."""
+        s = s.to(self.lb_s)
+        return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
