@@ -29,7 +29,6 @@ from torch_qpmpc import QPActorValueOperator, QPError, SolveLog
 from torch_qpmpc.checkpoint import save_checkpoint
 from torch_qpmpc.config import check_config
 from torch_qpmpc.experiment import (
-    decay,
     evaluate,
     make_collector,
     make_learner,
@@ -98,10 +97,6 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 terms, losses = learner.learn(sample, windows)
                 if cfg.replay:
                     replay.remember(sample)
-                if learner.deviation is not None and cfg.penalty_step == "proximal":
-                    # The penalty's weight falls with the rates, so that their ratio is kept.
-                    share = decay(update - 1, cfg.updates, cfg.optimizer.final_fraction)
-                    learner.deviation.proximal_step_(mpc.C, share)
                 learner.schedule.step()
                 if learner.target is not None:
                     learner.target.step()
@@ -132,6 +127,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 mpc.release()
                 learner = make_learner(cfg, operator, done=update)
         summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
+        summary |= {"ablation": cfg.ablation, "step": cfg.step, "penalty_step": cfg.penalty_step}
         summary |= {"solver": cfg.solver, "updates": cfg.updates, "train_seconds": train_seconds}
         summary |= stream_summary(costs, violation)
         summary["unsolved"] = unsolved + qps.unsolved

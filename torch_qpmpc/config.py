@@ -13,6 +13,7 @@ from torch_qpmpc.arguments import CONSTRAINTS, COST, HESSIANS, STRUCTURES
 from torch_qpmpc.envs.point_mass import NOISE_STD
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.solvers import backend
+from torch_qpmpc.steps import STEPS, check_step
 
 #: The noise of Gros and Zanon's system, which has no other.
 UNIFORM = "uniform"
@@ -68,8 +69,10 @@ RULES: dict[str, Rule] = {
     "td_error_clip": (lambda x: x is None or POSITIVE[0](x), "a finite number > 0, or null"),
     "delay_value": FLAG,
     "target_rate": FRACTION,
+    "step": _one_of(*STEPS),
     "penalty_step": _one_of("proximal", "subgradient"),
     "release": (lambda x: x is None or _whole(1)[0](x), "a whole number >= 1, or null"),
+    "ablation": (lambda x: x is None or NAME[0](x), "a name, or null"),
     "eval_interval": _whole(1),
     "log_interval": _whole(1),
     "task.name": _one_of("point_mass", "gros_zanon"),
@@ -254,6 +257,7 @@ def check_config(cfg: DictConfig) -> None:
         if key not in given and not any(key.startswith(f"{name}.") for name in off):
             raise QPError.expected(key, "nothing", RULES[key][1])
     backend(cfg.solver)
+    check_step(cfg.step)
     for key, wrong, expected, remedy in CONFLICTS:
         if wrong(cfg):
             expected = expected.format(cfg=cfg)

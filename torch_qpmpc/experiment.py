@@ -127,9 +127,8 @@ def make_update(
 ) -> Update:
     """What a batch does to theta, by the optimiser's order."""
     if isinstance(optimizer, GaussNewton):
-        return second_order(mpc, loss_module, optimizer, si)
-    by_gradient = deviation if cfg.penalty_step == "subgradient" else None
-    return first_order(mpc, loss_module, optimizer, by_gradient, si)
+        return second_order(mpc, loss_module, optimizer, deviation, si)
+    return first_order(mpc, loss_module, optimizer, deviation, si, cfg.penalty_step)
 
 
 def make_schedule(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int = 0) -> LambdaLR:

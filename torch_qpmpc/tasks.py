@@ -86,6 +86,7 @@ def _make(cfg: DictConfig, physics: LinearSystem, scheme: Scheme, learn: Collect
         action_slack=task.action_slack,
         discount_slack=task.discount_slack,
         learn=learn,
+        step=cfg.step,
         solver=cfg.solver,
         on_failure="mask",
     )

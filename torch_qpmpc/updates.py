@@ -1,7 +1,9 @@
 """One update of theta from a batch of transitions: of the first order (eq:thup), or of the second.
 
 An update takes a batch and the windows for the SI penalty (None without it), moves theta, and
-returns what there is to log: the terms of the loss, and scalars that describe the batch.
+returns what there is to log: the terms of the loss, and scalars that describe the batch. Each step
+is an optimiser's proposal, then what the step rules make of it: `QPMPC.project_` (eq:sdp1), and the
+deviation penalty's proximal step (eq:sdp2).
 """
 
 from __future__ import annotations
@@ -27,22 +29,29 @@ def first_order(
     optimizer: torch.optim.Optimizer,
     deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
+    penalty_step: str = "proximal",
 ) -> Update:
     """The gradient of the loss and of the penalties, for any torch optimiser.
 
-    ``deviation`` is None where its proximal step is taken instead.
+    With ``penalty_step="subgradient"`` the deviation penalty is one of them.
     """
+    by_gradient, proximal = None, deviation
+    if penalty_step == "subgradient":
+        by_gradient, proximal = deviation, None
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
         losses = loss_module(batch)
         terms = {"loss/value": losses["loss_value"]}
         if si is not None and windows is not None:
             terms["loss/si"] = si(mpc.C, windows)
-        if deviation is not None:
-            terms["loss/deviation"] = deviation(mpc.C)
+        if by_gradient is not None:
+            terms["loss/deviation"] = by_gradient(mpc.C)
         optimizer.zero_grad()
         torch.stack(list(terms.values())).sum().backward()
         optimizer.step()
+        mpc.project_()
+        if proximal is not None:
+            proximal.proximal_step_(mpc.C, share_of_rate(optimizer))
         return terms, losses
 
     return update
@@ -52,9 +61,13 @@ def second_order(
     mpc: QPMPC,
     loss_module: QPQLearningLoss,
     optimizer: GaussNewton,
+    deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
 ) -> Update:
-    """A Gauss-Newton step towards the loss module's targets, the SI penalty in the same step."""
+    """A Gauss-Newton step towards the loss module's targets, the SI penalty in the same step.
+
+    The projection is part of it, too; the deviation penalty's proximal step follows.
+    """
     network = loss_module.value_network
     observation, action = network.in_keys
 
@@ -66,6 +79,8 @@ def second_order(
         start = None if network.active_set_key is None else batch.get(network.active_set_key, None)
         s, a = batch.get(observation), batch.get(action)
         report = optimizer.step(s, a, -target, penalty=penalty, warm_start=start)
+        if deviation is not None:
+            deviation.proximal_step_(mpc.C, share_of_rate(optimizer))
         if network.active_set_key is not None:
             batch.set(network.active_set_key, report.solution.active)
         prediction = -report.solution.value.to(target)
@@ -78,3 +93,10 @@ def second_order(
         return terms, losses
 
     return update
+
+
+def share_of_rate(optimizer: torch.optim.Optimizer) -> float:
+    """What a schedule has left of C's rate, which the penalty's weight follows: 1 without one."""
+    group = next(group for group in optimizer.param_groups if group["name"] == "C")
+    initial = group.get("initial_lr", 0.0)
+    return group["lr"] / initial if initial else 1.0
