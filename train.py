@@ -32,7 +32,6 @@ from torch_qpmpc.collection import batches, make_collector, num_columns
 from torch_qpmpc.config import check_config
 from torch_qpmpc.experiment import (
     act,
-    decay,
     evaluate,
     make_learner,
     report,
@@ -102,10 +101,6 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 terms, losses = learner.learn(sample, windows)
                 if cfg.replay:
                     replay.remember(sample)
-                if learner.deviation is not None and cfg.penalty_step == "proximal":
-                    # The penalty's weight falls with the rates, so that their ratio is kept.
-                    share = decay(update - 1, cfg.updates, cfg.optimizer.final_fraction)
-                    learner.deviation.proximal_step_(mpc.C, share)
                 learner.schedule.step()
                 if learner.target is not None:
                     learner.target.step()
@@ -138,6 +133,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 learner = make_learner(cfg, operator, physics, done=update)
         summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
         summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
+        summary |= {"ablation": cfg.ablation, "step": cfg.step, "penalty_step": cfg.penalty_step}
         summary |= {"updates": cfg.updates, "train_seconds": train_seconds}
         summary |= stream_summary(costs, violation)
         summary["unsolved"] = unsolved + qps.unsolved

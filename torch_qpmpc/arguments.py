@@ -11,6 +11,7 @@ from torch import Tensor
 from torch_qpmpc.autograd import ON_FAILURE
 from torch_qpmpc.batching import broadcast
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.steps import check_step
 
 HESSIANS = ("diagonal", "block", "full")
 #: From the least tied to the most.
@@ -28,6 +29,7 @@ def check_structure(
     hessian: str,
     structure: str,
     learn: Collection[str],
+    step: str,
     on_failure: str,
 ) -> None:
     for name, size in (("n_x", n_x), ("n_u", n_u), ("horizon", horizon)):
@@ -42,6 +44,7 @@ def check_structure(
     ):
         if choice not in choices:
             raise QPError.expected(name, repr(choice), f"one of {', '.join(choices)}")
+    check_step(step)
     parts = (*COST, *CONSTRAINTS)
     if isinstance(learn, str) or not set(learn) <= set(parts):
         raise QPError.expected(

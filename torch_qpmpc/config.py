@@ -14,6 +14,7 @@ from torch_qpmpc.arguments import CONSTRAINTS, COST, HESSIANS, STRUCTURES
 from torch_qpmpc.envs.point_mass import NOISE_STD
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.solvers import backend
+from torch_qpmpc.steps import STEPS, check_step
 
 #: The noises that each task has.
 NOISES = {
@@ -81,8 +82,10 @@ RULES: dict[str, Rule] = {
     "td_error_clip": (lambda x: x is None or POSITIVE[0](x), "a finite number > 0, or null"),
     "delay_value": FLAG,
     "target_rate": FRACTION,
+    "step": _one_of(*STEPS),
     "penalty_step": _one_of("proximal", "subgradient"),
     "release": (lambda x: x is None or _whole(1)[0](x), "a whole number >= 1, or null"),
+    "ablation": (lambda x: x is None or NAME[0](x), "a name, or null"),
     "eval_interval": _whole(1),
     "log_interval": _whole(1),
     "algo.name": _one_of("qlearning", "ddpg", "td3"),
@@ -285,6 +288,12 @@ CONFLICTS: tuple[tuple[str, Callable[[DictConfig], bool], str, str], ...] = (
         "{cfg.algo.name} learns from a replay.",
     ),
     (
+        "step",
+        lambda cfg: cfg.algo.name != "qlearning" and cfg.step != "cholesky",
+        "cholesky",
+        "The critics of {cfg.algo.name} know no other.",
+    ),
+    (
         "release",
         lambda cfg: cfg.release is not None and cfg.algo.name != "qlearning",
         "null",
@@ -344,6 +353,7 @@ def check_config(cfg: DictConfig) -> None:
         if key not in given and not any(key.startswith(f"{name}.") for name in off):
             raise QPError.expected(key, "nothing", RULES[key][1])
     backend(cfg.solver)
+    check_step(cfg.step)
     for key, wrong, expected, remedy in CONFLICTS:
         if wrong(cfg):
             expected, remedy = expected.format(cfg=cfg), remedy.format(cfg=cfg)

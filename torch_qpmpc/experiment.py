@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -74,12 +73,13 @@ def make_learner(
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
     deviation, si = make_penalties(cfg, mpc)
     optimizer = make_optimizer(cfg, mpc, loss_module)
+    schedule = make_schedule(cfg, optimizer, done)
     delayed = cfg.algo.name != "qlearning" or cfg.delay_value
     return Learner(
-        make_update(cfg, mpc, loss_module, optimizer, deviation, si, done),
+        make_update(cfg, mpc, loss_module, optimizer, schedule, deviation, si, done),
         actor,
         optimizer,
-        make_schedule(cfg, optimizer, done),
+        schedule,
         deviation,
         si,
         SoftUpdate(loss_module, tau=cfg.target_rate) if delayed else None,
@@ -125,6 +125,7 @@ def make_update(
     mpc: QPMPC,
     loss_module: LossModule,
     optimizer: torch.optim.Optimizer,
+    schedule: LambdaLR,
     deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
     done: int,
@@ -132,11 +133,17 @@ def make_update(
     """What a batch does to theta, by the optimiser's order."""
     if isinstance(optimizer, GaussNewton):
         assert isinstance(loss_module, QPQLearningLoss)
-        return second_order(mpc, loss_module, optimizer, si)
-    by_gradient = deviation if cfg.penalty_step == "subgradient" else None
+        return second_order(mpc, loss_module, optimizer, deviation, si)
     every = cfg.algo.policy_delay if cfg.algo.name == "td3" else 1
-    turns = (update % every == 0 for update in itertools.count(done + 1))
-    return first_order(mpc, loss_module, optimizer, by_gradient, si, turns)
+    return first_order(
+        mpc,
+        loss_module,
+        optimizer,
+        deviation,
+        si,
+        cfg.penalty_step,
+        lambda: (done + schedule.last_epoch + 1) % every == 0,
+    )
 
 
 def make_schedule(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int = 0) -> LambdaLR:

@@ -63,8 +63,9 @@ class GaussNewton(torch.optim.Optimizer):
         memory: how many gradients of past pairs a step respects: it changes their Q as little as
             their part of the sum says, though nothing of them is solved again. For small batches,
             down to a stream of single transitions; the recursive form of least squares.
-        trust_region: solve the batch again after a step; take back one that raised the squared
-            errors (the targets held), and adapt the damping to how well they were predicted.
+        trust_region: solve the batch again after a step and its projection (`QPMPC.project_`); take
+            back one that raised the squared errors (the targets held), and adapt the damping to how
+            well they were predicted.
 
     Raises:
         QPError: a number out of its range, or scales that do not fit the learned parts.
@@ -150,11 +151,13 @@ class GaussNewton(torch.optim.Optimizer):
         steps = [block.step(alpha) for block in blocks]
         if not self._trust_region:
             _move(blocks, steps, lr)
+            self._mpc.project_()
             return StepReport(solution, damping, math.nan, True)
         old = [block.leaf.clone() for block in blocks]
         before = _objective(delta, blocks)
         _move(blocks, steps, lr)
-        predicted = before - _objective(delta - lr * change, blocks)
+        change = self._project(blocks, lr * change)
+        predicted = before - _objective(delta - change, blocks)
         again = self._mpc.solve(s, a, warm_start=solution.active)
         decrease = before - _objective(
             delta - torch.where(use, again.value - solution.value, 0), blocks
@@ -167,6 +170,16 @@ class GaussNewton(torch.optim.Optimizer):
                 block.leaf.copy_(value)
         self._adapt(ratio)
         return StepReport(solution, damping, ratio, accepted)
+
+    def _project(self, blocks: list[_Dense | _OuterProducts], change: Tensor) -> Tensor:
+        """Project theta; ``change`` of Q with what that adds to it at first order, ``(B,)``."""
+        leaves = {id(leaf) for leaf in self._mpc._projected().values()}
+        dense = [x for x in blocks if isinstance(x, _Dense) and id(x.leaf) in leaves]
+        proposed = [block.leaf.clone() for block in dense]
+        self._mpc.project_()
+        for block, leaf in zip(dense, proposed, strict=True):
+            change = change + block.rows[: len(change)] @ (block.leaf - leaf).flatten()
+        return change
 
     def _adapt(self, ratio: float) -> None:
         for group in self.param_groups:
@@ -181,7 +194,9 @@ class GaussNewton(torch.optim.Optimizer):
         """The gradients of Q in each learned part that is not frozen, zero where not in ``use``."""
         mpc = self._mpc
         weight = use.to(solution.z)
-        z, sigma, chi, lam = solution.z, solution.sigma, solution.chi, solution.lam
+        z, chi, lam = solution.z, solution.chi, solution.lam
+        # The slacks are only asked for by a w that is learned.
+        sigma = solution.sigma if solution.qp.w.requires_grad else torch.zeros_like(lam)
         gradients = envelope_gradients(weight, z, sigma, chi, lam, solution.xi)
         pairs = [(leaf, group["scale"]) for group in self.param_groups for leaf in group["params"]]
         pairs = [(leaf, scale) for leaf, scale in pairs if leaf.requires_grad]

@@ -26,9 +26,21 @@ from torch_qpmpc.arguments import (
 )
 from torch_qpmpc.autograd import optimal_value, solve_qp
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.parametrizations import Banded, Cholesky, LinearRows, SquareRoot, Tied
+from torch_qpmpc.parametrizations import (
+    Banded,
+    Cholesky,
+    LinearRows,
+    SquareRoot,
+    Support,
+    Symmetric,
+    Tied,
+)
 from torch_qpmpc.qp import QPSolution, QuadraticProgram
 from torch_qpmpc.solvers import backend
+from torch_qpmpc.steps import CHOLESKY, NEAREST
+
+#: The parts of theta that a convex QP does not leave free.
+SIGNED = ("H", "H_f", "w")
 
 
 class QPMPC(nn.Module):
@@ -67,6 +79,10 @@ class QPMPC(nn.Module):
             by default, and the others soft.
         discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
         learn: which of H, H_f, q, c, C, b, G, lb, ub, w are parameters; the others are buffers.
+        step: how H and H_f stay positive semidefinite and w non-negative while they are learned
+            (eq:sdp1). ``"cholesky"``: theta is a factor of them. ``"projection"`` and ``"sdp"``:
+            theta is H itself, and `project_` after each step puts it back, by eigenvalues or by a
+            semidefinite program; see `torch_qpmpc.steps`.
         solver, on_failure: as in `solve_qp`.
         seed: of the random starts.
 
@@ -129,6 +145,7 @@ class QPMPC(nn.Module):
         constraint_slack: float = 100.0,
         discount_slack: bool = False,
         learn: Collection[str] = ("H", "c", "C"),
+        step: str = CHOLESKY,
         solver: str = "proxqp",
         on_failure: str = "raise",
         seed: int = 0,
@@ -138,12 +155,12 @@ class QPMPC(nn.Module):
         }
         super().__init__()
         self._arguments = arguments
-        check_structure(n_x, n_u, horizon, gamma, hessian, structure, learn, on_failure)
+        check_structure(n_x, n_u, horizon, gamma, hessian, structure, learn, step, on_failure)
         backend(solver)
         self._layout, theta = starts.theta(**arguments)
         self.n_x, self.n_u, self.horizon, self.n_z = n_x, n_u, horizon, self._layout.n_z
         self.gamma, self.hessian, self.structure = gamma, hessian, structure
-        self.solver, self.on_failure = solver, on_failure
+        self.step, self.solver, self.on_failure = step, solver, on_failure
         self.learned = tuple(name for name in (*COST, *CONSTRAINTS) if name in learn)
         if "G" in learn and structure != "free" and not self._layout.n_linear:
             raise QPError.expected(
@@ -254,7 +271,8 @@ class QPMPC(nn.Module):
         """The learned parts of theta, detached: what stages share, once; A, B and D for C and G."""
         parts = {}
         for part in self.learned:
-            value, kept = getattr(self, part).detach(), self._kept(part)
+            value = getattr(self, part).detach()
+            kept = self._kept(part, value)
             if kept and isinstance(kept[0], Banded | LinearRows):
                 names = ("A", "B") if part == "C" else ("D", "D_f")
                 parts |= zip(names, kept[0].right_inverse(value), strict=True)
@@ -291,6 +309,28 @@ class QPMPC(nn.Module):
             self._own(part, value)
             for leaf in self._leaves(part):
                 leaf.requires_grad_(not frozen)
+
+    @torch.no_grad()
+    def project_(self) -> None:
+        """Put H, H_f and w back to where they are >= 0, in place: what ends a step (eq:sdp1).
+
+        To be called after each step of an optimiser; `GaussNewton` does so itself. With
+        ``step="cholesky"`` nothing can be outside, and nothing is done.
+
+        Example:
+            >>> import torch, torch_qpmpc as qm
+            >>> mpc = qm.QPMPC(2, 1, 3, step="projection", stage_weight=[1.0, 2.0, 0.1])
+            >>> optimizer = torch.optim.SGD(mpc.parameters(), lr=1.0)
+            >>> mpc.H.sum().mul(1.5).backward()
+            >>> optimizer.step()
+            >>> mpc.project_()
+            >>> mpc.H.detach()
+            tensor([0.0000, 0.5000, 0.0000], dtype=torch.float64)
+        """
+        for name, leaf in self._projected().items():
+            dense = self.hessian != "diagonal" and name != "w"
+            matrices = leaf if dense else leaf[..., None, None]
+            leaf.copy_(NEAREST[self.step](matrices).view_as(leaf))
 
     def quadratic_program(self) -> QuadraticProgram:
         """Today's theta as a QuadraticProgram, discounts included (eq:qpH)."""
@@ -372,21 +412,24 @@ class QPMPC(nn.Module):
             self.register_buffer(name, value)
             return
         self.register_parameter(name, nn.Parameter(value))
-        kept = self._kept(name)
+        kept = self._kept(name, value)
         for parametrization in kept:
             parametrize.register_parametrization(self, name, parametrization)
         if len(kept) > 1:  # each but the first has changed the value
             setattr(self, name, value)
 
-    def _kept(self, name: str) -> list[nn.Module]:
-        """What a learned part keeps: its structure, and its sign."""
+    def _kept(self, name: str, value: Tensor) -> list[nn.Module]:
+        """What a learned part keeps: its structure, and its sign or what `project_` needs."""
         kept, tied = [], self.structure == "tied"
         if self.structure != "free" and name in ("C", "G"):
             kept.append((Banded if name == "C" else LinearRows)(self._layout, tied))
         if tied and name in ("q", "b", "lb", "ub", "w"):
             kept.append(Tied(name, self._layout.ties(name)))
-        if name in ("H", "H_f", "w"):
-            kept.append(Cholesky() if self.hessian != "diagonal" and name != "w" else SquareRoot())
+        dense = self.hessian != "diagonal" and name != "w"
+        if name in SIGNED and self.step == CHOLESKY:
+            kept.append(Cholesky() if dense else SquareRoot())
+        elif name in ("H", "H_f"):
+            kept.append(Symmetric() if dense else Support(value))
         return kept
 
     def _hessian(self) -> Tensor:
@@ -400,6 +443,11 @@ class QPMPC(nn.Module):
             return torch.diag_embed(self.discount * torch.cat((stages, self.H_f)))
         root = self.discount.sqrt()
         return root.unsqueeze(-1) * H * root
+
+    def _projected(self) -> dict[str, nn.Parameter]:
+        """The parameters that `project_` acts on, by part."""
+        names = () if self.step == CHOLESKY else SIGNED
+        return {name: self._leaves(name)[0] for name in names if name in self.learned}
 
     def _leaves(self, name: str) -> list[nn.Parameter]:
         """The parameters that the optimiser moves for a learned part: behind H its factor."""

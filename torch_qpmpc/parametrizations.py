@@ -1,8 +1,9 @@
 """What theta keeps while it is learned, in the idiom of `torch.nn.utils.parametrize`.
 
 With H = L L' any gradient step on L leaves H positive semidefinite, so that the update of eq:thup
-needs no semidefinite program (eq:sdp1). And a linear MPC scheme (eq:v1) ties: its C has nothing but
-a model in its band, and its stages share their values.
+needs no semidefinite program (eq:sdp1); where `torch_qpmpc.steps` projects H instead, it is kept
+symmetric. And a linear MPC scheme (eq:v1) ties: its C has nothing but a model in its band, and its
+stages share their values.
 """
 
 from __future__ import annotations
@@ -28,9 +29,41 @@ class SquareRoot(nn.Module):
 
     def right_inverse(self, value: Tensor) -> Tensor:
         """A factor of ``value``; `QPError` if an entry is negative."""
-        if (value < 0).any():
-            raise QPError.expected("diagonal", f"{value.min():.3g}", "non-negative entries")
+        _check_diagonal(value)
         return value.sqrt()
+
+
+class Support(nn.Module):
+    """A diagonal, any shape, whose zero entries are no part of theta, as with `SquareRoot`.
+
+    An entry that a step has brought to zero can leave it again.
+    """
+
+    support: Tensor
+
+    def __init__(self, start: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("support", start != 0)
+
+    def forward(self, entries: Tensor) -> Tensor:
+        return self.support * entries
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        """``value``; `QPError` if an entry is negative."""
+        _check_diagonal(value)
+        return value
+
+
+class Symmetric(nn.Module):
+    """The symmetric part of matrices ``(*batch, n, n)``; so is the gradient that they get."""
+
+    def forward(self, matrix: Tensor) -> Tensor:
+        return (matrix + matrix.mT) / 2
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        """``value``; `QPError` if it is not positive semidefinite."""
+        _spectrum(value)
+        return value
 
 
 class Cholesky(nn.Module):
@@ -46,14 +79,7 @@ class Cholesky(nn.Module):
         By a QR factorisation of the symmetric square root, as the usual Cholesky algorithm needs
         a positive definite matrix. `QPError` if ``value`` is not positive semidefinite.
         """
-        eigenvalues, vectors = torch.linalg.eigh((value + value.mT) / 2)
-        tolerance = 1e-5 if value.dtype == torch.float32 else 1e-9
-        if (eigenvalues < -tolerance * eigenvalues.abs().amax(-1, keepdim=True)).any():
-            raise QPError.expected(
-                "H",
-                f"smallest eigenvalue {eigenvalues.min():.3g}",
-                "a positive semidefinite matrix",
-            )
+        eigenvalues, vectors = _spectrum(value)
         root = vectors * eigenvalues.clamp(min=0).sqrt().unsqueeze(-2)
         upper = torch.linalg.qr(root.mT).R
         sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0)
@@ -136,6 +162,21 @@ def _stage_blocks(rows: Tensor, layout: Layout, tied: bool) -> Tensor:
     stages = rows[:, : horizon * n].unflatten(0, (horizon, len(rows) // horizon))
     blocks = stages.unflatten(-1, (horizon, n)).diagonal(dim1=0, dim2=2).movedim(-1, 0)
     return blocks[0] if tied else blocks
+
+
+def _check_diagonal(value: Tensor) -> None:
+    if (value < 0).any():
+        raise QPError.expected("diagonal", f"{value.min():.3g}", "non-negative entries")
+
+
+def _spectrum(H: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues and -vectors; `QPError` if H is not positive semidefinite."""
+    eigenvalues, vectors = torch.linalg.eigh((H + H.mT) / 2)
+    tolerance = 1e-5 if H.dtype == torch.float32 else 1e-9
+    if (eigenvalues < -tolerance * eigenvalues.abs().amax(-1, keepdim=True)).any():
+        got = f"smallest eigenvalue {eigenvalues.min():.3g}"
+        raise QPError.expected("H", got, "a positive semidefinite matrix")
+    return eigenvalues, vectors
 
 
 def _check_tied(name: str, given: Tensor, tied: Tensor) -> None:

@@ -116,8 +116,10 @@ class DeviationPenalty(nn.Module):
     def proximal_step_(self, C: Tensor, scale: float = 1.0) -> None:
         """Soft-threshold C towards C_0, in place: the minimiser of eq:sdp2 in Delta theta.
 
-        After a gradient step to C it solves ``min_X 1/2 |X - C|^2 + scale |C_mask * (X - C_0)|``.
-        Unlike the subgradient it reaches C_0 exactly.
+        After any optimiser's step to C it solves
+        ``min_X 1/2 |X - C|^2 + scale |C_mask * (X - C_0)|``. Unlike the subgradient it reaches C_0
+        exactly. After SGD's step it is the paper's program. Adam's and Gauss-Newton's metrics are
+        not in it: in Adam's, an entry with a smaller step would have a smaller threshold.
 
         Args:
             C: the parameter.

@@ -106,6 +106,7 @@ def _make(
         action_slack=task.action_slack,
         discount_slack=task.discount_slack,
         learn=learn,
+        step=cfg.step,
         solver=cfg.solver,
         on_failure="mask",
     )

@@ -1,12 +1,14 @@
 """One update of theta from a batch of transitions: of the first order (eq:thup), or of the second.
 
 An update takes a batch and the windows for the SI penalty (None without it), moves theta, and
-returns what there is to log: the terms of the loss, and scalars that describe the batch.
+returns what there is to log: the terms of the loss, and scalars that describe the batch. Each step
+is an optimiser's proposal, then what the step rules make of it: `QPMPC.project_` (eq:sdp1), and the
+deviation penalty's proximal step (eq:sdp2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from tensordict import TensorDictBase
@@ -28,33 +30,42 @@ def first_order(
     optimizer: torch.optim.Optimizer,
     deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
-    actor_turns: Iterator[bool] | None = None,
+    penalty_step: str = "proximal",
+    actor_due: Callable[[], bool] = lambda: True,
 ) -> Update:
     """The gradient of the loss and of the penalties, for any torch optimiser.
 
-    A batch whose loss is not finite moves nothing and is counted as unsolved.
+    A batch whose loss is not finite moves nothing, and is counted as unsolved.
 
     Args:
-        loss_module: any of TorchRL's, whose ``loss_*`` are summed.
-        deviation: None where its proximal step is taken instead.
-        actor_turns: for each update, whether the actor is updated, too, as TD3 delays it.
+        loss_module: any of TorchRL's; its ``loss_*`` are summed.
+        penalty_step: with ``"subgradient"`` the deviation penalty is one of the loss's terms.
+        actor_due: whether this update is the actor's, too, which TD3 delays; else the critics'.
     """
+    by_gradient, proximal = None, deviation
+    if penalty_step == "subgradient":
+        by_gradient, proximal = deviation, None
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
         losses = loss_module(batch)
         terms = {name.replace("_", "/", 1): x for name, x in losses.items() if "loss_" in name}
         if si is not None and windows is not None:
             terms["loss/si"] = si(mpc.C, windows)
-        if deviation is not None:
-            terms["loss/deviation"] = deviation(mpc.C)
-        due = actor_turns is None or next(actor_turns)
+        if by_gradient is not None:
+            terms["loss/deviation"] = by_gradient(mpc.C)
+        due = actor_due()
         total = torch.stack([x for name, x in terms.items() if due or "value" in name]).sum()
         optimizer.zero_grad()
-        if total.isfinite():
-            total.backward()
-            optimizer.step()
-        elif losses.get("unsolved", None) is None:
-            losses["unsolved"] = (~losses["pred_value"].isfinite()).sum()
+        if not total.isfinite():
+            if losses.get("unsolved", None) is None:
+                losses["unsolved"] = (~losses["pred_value"].isfinite()).sum()
+            return terms, losses
+        total.backward()
+        optimizer.step()
+        if due:
+            mpc.project_()
+            if proximal is not None:
+                proximal.proximal_step_(mpc.C, share_of_rate(optimizer))
         return terms, losses
 
     return update
@@ -64,9 +75,13 @@ def second_order(
     mpc: QPMPC,
     loss_module: QPQLearningLoss,
     optimizer: GaussNewton,
+    deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
 ) -> Update:
-    """A Gauss-Newton step towards the loss module's targets, the SI penalty in the same step."""
+    """A Gauss-Newton step towards the loss module's targets, the SI penalty in the same step.
+
+    The projection is part of it, too; the deviation penalty's proximal step follows.
+    """
     network = loss_module.value_network
     observation, action = network.in_keys
 
@@ -78,6 +93,8 @@ def second_order(
         start = None if network.active_set_key is None else batch.get(network.active_set_key, None)
         s, a = batch.get(observation), batch.get(action)
         report = optimizer.step(s, a, -target, penalty=penalty, warm_start=start)
+        if deviation is not None:
+            deviation.proximal_step_(mpc.C, share_of_rate(optimizer))
         if network.active_set_key is not None:
             batch.set(network.active_set_key, report.solution.active)
         prediction = -report.solution.value.to(target)
@@ -90,3 +107,10 @@ def second_order(
         return terms, losses
 
     return update
+
+
+def share_of_rate(optimizer: torch.optim.Optimizer) -> float:
+    """What a schedule has left of C's rate, which the penalty's weight follows: 1 without one."""
+    group = next(group for group in optimizer.param_groups if group["name"] == "C")
+    initial = group.get("initial_lr", 0.0)
+    return group["lr"] / initial if initial else 1.0

@@ -1,0 +1,135 @@
+"""The paper's step with H >= 0 (eq:sdp1), and the step rules that keep H positive semidefinite.
+
+The program, with 1/2 |dtheta|^2 for the printed dtheta^2 (whose minimum is half a step),
+
+    min over dtheta:  1/2 |dtheta|^2 - alpha g'dtheta   subject to   H(theta + dtheta) >= 0
+
+asks for the point next to theta + alpha g, which is the optimiser's proposal, where H >= 0. All
+parts of theta but H take the plain step. Where theta lists every entry of H, |dtheta| is the
+Frobenius norm, and the next point is known: the proposal without its negative eigenvalues. With a
+block-diagonal H it is that of each block, and with a diagonal one the entries cut off at zero; that
+the stages share a block, or discount it, changes nothing. So ``"projection"`` and ``"sdp"`` make
+the same step, and ``"cholesky"`` makes another, in the factor of H, which needs neither.
+
+Projection and program differ where |dtheta| is another norm:
+
+* Where theta lists the upper triangle once, an entry off the diagonal counts once, not twice.
+* In the metric of Adam, whose step sizes differ by entry, the next point of a block is another.
+  That of a diagonal is the same, as it is in every diagonal metric.
+* In the metric of Gauss-Newton, which couples all of theta, it is another even for a diagonal.
+
+Both rules take the next point in the Frobenius norm, whatever optimiser has made the proposal;
+`GaussNewton` judges its step by where they leave it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import ModuleType
+
+import numpy as np
+import scipy.sparse
+import torch
+from torch import Tensor
+
+from torch_qpmpc.errors import QPError, SolverError
+
+CHOLESKY = "cholesky"
+#: Clarabel's, of a program whose entries are at most one.
+TOLERANCE = 1e-10
+
+
+def nearest_psd(H: Tensor) -> Tensor:
+    """The positive semidefinite matrices next to H ``(*batch, n, n)`` in the Frobenius norm.
+
+    To the symmetric part of H, if it has another. A matrix that is semidefinite stays as it is, to
+    the last bit; one that is not finite stays for the QP's solver to find.
+
+    Example:
+        >>> import torch
+        >>> nearest_psd(torch.tensor([[0.0, 1.0], [1.0, 0.0]]))
+        tensor([[0.5000, 0.5000],
+                [0.5000, 0.5000]])
+    """
+    return _replaced(H, _without_negative_eigenvalues)
+
+
+def nearest_psd_by_sdp(H: Tensor) -> Tensor:
+    """`nearest_psd` as the semidefinite program that it is, solved by Clarabel (eq:sdp1).
+
+    Its cost grows with the sixth power of n: a block of six takes milliseconds, a full H of 64
+    (ten stages of six) half a minute.
+
+    Raises:
+        QPError: Clarabel is not installed.
+        SolverError: Clarabel has not solved the program.
+    """
+    return _replaced(H, _solve_sdp)
+
+
+def _without_negative_eigenvalues(H: Tensor) -> Tensor:
+    eigenvalues, vectors = torch.linalg.eigh(H)
+    return (vectors * eigenvalues.clamp(min=0).unsqueeze(-2)) @ vectors.mT
+
+
+def _solve_sdp(H: Tensor) -> Tensor:
+    """min 1/2 |X - H|^2 subject to X >= 0, for all blocks ``(K, n, n)`` in one program."""
+    clarabel = _clarabel()
+    scale = H.abs().amax((-2, -1), keepdim=True)
+    count, n = len(H), H.shape[-1]
+    # Clarabel's cone has the columns of the upper triangle, with sqrt(2) off the diagonal.
+    rows, columns = np.tril_indices(n)
+    weight = torch.from_numpy(np.where(rows == columns, 1.0, 2**0.5))
+    proposal = (weight * (H / scale)[:, rows, columns].double().cpu()).flatten().numpy()
+    unit, zero = scipy.sparse.identity(len(proposal), format="csc"), np.zeros(len(proposal))
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
+    cones = [clarabel.PSDTriangleConeT(n)] * count
+    found = clarabel.DefaultSolver(unit, -proposal, -unit, zero, cones, settings).solve()
+    if str(found.status) != "Solved":
+        raise SolverError(f"Clarabel has not solved the program of eq:sdp1: {found.status}.")
+    # Its slack, unlike its x, is inside the cone whatever the tolerance.
+    entries = (torch.tensor(found.s, dtype=torch.float64).reshape(count, -1) / weight).to(H)
+    nearest = torch.empty_like(H)
+    nearest[:, rows, columns] = nearest[:, columns, rows] = entries
+    return scale * nearest
+
+
+#: How the rules that project find the next point; ``"cholesky"`` has none to find.
+NEAREST: dict[str, Callable[[Tensor], Tensor]] = {
+    "projection": nearest_psd,
+    "sdp": nearest_psd_by_sdp,
+}
+STEPS = (CHOLESKY, *NEAREST)
+
+
+def check_step(step: str) -> None:
+    """Raise `QPError` unless ``step`` is a rule, and what it needs is installed."""
+    if step not in STEPS:
+        raise QPError.expected("step", repr(step), f"one of {', '.join(STEPS)}")
+    if step == "sdp":
+        _clarabel()
+
+
+def _clarabel() -> ModuleType:
+    try:
+        import clarabel
+    except ImportError as error:
+        remedy = "Run pip install 'torch-qpmpc[sdp]'; 'projection' makes the same step without."
+        raise QPError.expected("step", "'sdp' without Clarabel", "Clarabel", remedy) from error
+    return clarabel
+
+
+def _replaced(H: Tensor, nearest: Callable[[Tensor], Tensor]) -> Tensor:
+    """The symmetric part of H, with ``nearest`` of those that have a negative eigenvalue."""
+    H = (H + H.mT) / 2
+    blocks = H.reshape(-1, *H.shape[-2:])
+    finite = blocks.isfinite().all(-1).all(-1)
+    eigenvalues = torch.linalg.eigvalsh(torch.where(finite[:, None, None], blocks, 0))
+    rounding = H.shape[-1] * torch.finfo(H.dtype).eps * eigenvalues.abs().amax(-1)
+    outside = eigenvalues[:, 0] < -rounding
+    if not outside.any():
+        return H
+    found = nearest(blocks[outside])
+    return blocks.index_put((outside,), (found + found.mT) / 2).view_as(H)
