@@ -5,6 +5,7 @@
     python train.py constraint=mpc                      its linear MPC scheme, tied
     python train.py task=gros_zanon solver=daqp         another plant, from one long episode
     python train.py -m constraint=fixed,free seed=1,2   a sweep
+    python train.py resume=runs/point_mass/..           go on with a run that was stopped
     tensorboard --logdir runs                           watch it
 
 configs/ holds every key. The run's folder gets config.yaml, metrics.csv, TensorBoard events,
@@ -22,31 +23,37 @@ from typing import Any
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 from tqdm import tqdm
 
 from torch_qpmpc import QPActorValueOperator, QPError, SolveLog
-from torch_qpmpc.checkpoint import save_checkpoint
+from torch_qpmpc.checkpoint import CHECKPOINT, save_checkpoint
 from torch_qpmpc.collection import batches, make_collector, num_columns
 from torch_qpmpc.config import check_config
 from torch_qpmpc.experiment import (
     act,
     evaluate,
+    gap_summary,
     make_learner,
     report,
-    stream_summary,
     table,
     theta_metrics,
 )
+from torch_qpmpc.interrupt import Interrupt
 from torch_qpmpc.plots import summary_figure
 from torch_qpmpc.replay import ACTIVE_SET, make_replay
+from torch_qpmpc.snapshot import Tally, folder_of, restore, resumed, snapshot
 from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc
 from torch_qpmpc.tracking import RunFolder
 
 
-def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
-    """One run; returns what summary.json holds."""
+def train(cfg: DictConfig, folder: str, state: dict[str, Any] | None = None) -> dict[str, Any]:
+    """One run, from its beginning or from a checkpoint's ``state``.
+
+    Returns:
+        What summary.json holds.
+    """
     check_config(cfg)
     torchrl_logger.setLevel("WARNING")
     torch.manual_seed(cfg.seed)
@@ -55,14 +62,18 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     # The QP, between its two ends: the wrong model it starts from, and the true one.
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
-    loops = {"start": evaluate(cfg, mpc.policy, physics)}
+    start = evaluate(cfg, mpc.policy, physics)
+    loops = {"start": start, "learned": start}
     if (true_mpc := make_true_mpc(cfg, physics)) is not None:
         loops["true model"] = evaluate(cfg, true_mpc.policy, physics)
 
     # Q-learning, by gradients or of the second order, or a policy gradient.
     operator = QPActorValueOperator(mpc, active_set_key=ACTIVE_SET if cfg.warm_start else None)
-    learner = make_learner(cfg, operator, physics)
-    learned_mpc = None if cfg.algo.name != "qlearning" and cfg.algo.actor != "qp" else mpc
+    released = state is not None and state["structure"] != mpc.structure
+    if released:
+        mpc.release()
+    learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
+    learned_mpc = mpc if cfg.algo.name == "qlearning" or cfg.algo.actor == "qp" else None
 
     # Data: vectorised episodes under today's policy, and one replay for transitions and windows.
     collector = make_collector(cfg, physics, learner.actor)
@@ -76,21 +87,32 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
         active_rows=len(mpc.G) if cfg.warm_start else None,
     )
     stream = batches(collector)
-    for batch in itertools.islice(stream, -(-cfg.warmup_steps // cfg.steps_per_update)):
-        if cfg.replay:
-            replay.extend(batch)
 
-    qps, unsolved, train_seconds, costs, violation = SolveLog(), 0, 0.0, [], 0.0
     with contextlib.ExitStack() as stack:
         stack.callback(collector.shutdown)
-        run = stack.enter_context(RunFolder(folder, cfg))
-        run.log(
-            {f"eval/J{suffix}": loops[end].J for end, suffix in ENDS.items() if end in loops}, 0
+        interrupt = stack.enter_context(Interrupt())
+        run = stack.enter_context(
+            RunFolder(folder, cfg, None if state is None else state["update"])
         )
-        progress = tqdm(range(1, cfg.updates + 1), desc=f"{cfg.constraint.name}, {cfg.noise.name}")
+        if state is not None:
+            tally = restore(state, mpc, learner, collector, replay)
+            loops["learned"] = evaluate(cfg, partial(act, learner.actor), physics)
+        else:
+            tally = Tally()
+            report(run, learned_mpc, loops, 0)
+            for batch in itertools.islice(stream, -(-cfg.warmup_steps // cfg.steps_per_update)):
+                if cfg.replay:
+                    replay.extend(batch)
+
+        progress = tqdm(
+            range(tally.update + 1, cfg.updates + 1),
+            desc=f"{cfg.constraint.name}, {cfg.noise.name}",
+            initial=tally.update,
+            total=cfg.updates,
+        )
         for update in progress:
             began = time.perf_counter()
-            with qps:
+            with tally.qps:
                 batch = next(stream)
                 if cfg.replay:
                     replay.extend(batch)
@@ -105,38 +127,43 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
                 if learner.target is not None:
                     learner.target.step()
             ended = time.perf_counter()
-            train_seconds += ended - began
-            costs.append(-batch["next", "reward"].mean().item())
-            violation += physics.violation(batch["observation"]).sum().item()
+            tally.update = update
+            tally.seconds += ended - began
+            tally.costs.append(-batch["next", "reward"].mean().item())
+            tally.violation += physics.violation(batch["observation"]).sum().item()
 
             if update % cfg.log_interval == 0:
                 metrics = {name: term.item() for name, term in terms.items()}
                 told = {name: x for name, x in losses.items() if name in LOGGED}
                 metrics |= {f"train/{name}": x.double().mean().item() for name, x in told.items()}
-                metrics |= {"train/reward": -costs[-1], "train/violation": violation}
-                metrics |= qps.metrics() | theta_metrics(mpc)
+                metrics |= {"train/reward": -tally.costs[-1], "train/violation": tally.violation}
+                metrics |= tally.qps.metrics() | theta_metrics(mpc)
                 if learner.deviation is not None:
                     metrics.setdefault("loss/deviation", learner.deviation(mpc.C).item())
                 metrics |= {"time/collect": collected - began, "time/update": ended - collected}
                 run.log(metrics, update)
-                unsolved, qps = unsolved + qps.unsolved, SolveLog()
-            if update % cfg.eval_interval == 0 or update == cfg.updates:
-                loops["learned"] = evaluate(cfg, partial(act, learner.actor), physics)
-                summary = report(run, learned_mpc, loops, update)
-                progress.set_postfix(J=summary["J_final"], closed_gap=summary["closed_gap"])
-                state = {"mpc": mpc.state_dict(), "optimizer": learner.optimizer.state_dict()}
-                state |= {"structure": mpc.structure, "update": update}
-                save_checkpoint(run.path / "checkpoint.pt", state)
-                run.flush()
+                tally.unsolved, tally.qps = tally.unsolved + tally.qps.unsolved, SolveLog()
             if update == cfg.release:
                 mpc.release()
                 learner = make_learner(cfg, operator, physics, done=update)
+            last = update == cfg.updates
+            if update % cfg.eval_interval == 0 or last:
+                loops["learned"] = evaluate(cfg, partial(act, learner.actor), physics)
+                summary = report(run, learned_mpc, loops, update)
+                progress.set_postfix(J=summary["J_final"], closed_gap=summary["closed_gap"])
+            if update % cfg.eval_interval == 0 or last or interrupt.signum is not None:
+                run.flush()
+                state = snapshot(mpc, learner, collector, replay, tally)
+                save_checkpoint(run.path / CHECKPOINT, state)
+            if interrupt.signum is not None and not last:
+                print(f"\nStopped after update {update}: python train.py resume={run.path}")
+                raise SystemExit(128 + interrupt.signum)
+
+        summary = gap_summary(loops)
         summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
         summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
         summary |= {"ablation": cfg.ablation, "step": cfg.step, "penalty_step": cfg.penalty_step}
-        summary |= {"updates": cfg.updates, "train_seconds": train_seconds}
-        summary |= stream_summary(costs, violation)
-        summary["unsolved"] = unsolved + qps.unsolved
+        summary |= {"updates": cfg.updates, **tally.summary()}
         run.finish(summary)
         if learned_mpc is not None:
             figure = summary_figure(mpc, loops, *run.column("eval/J"))
@@ -145,8 +172,8 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
     return summary
 
 
-#: Where J at the two ends goes.
-ENDS = {"start": "", "true model": "_true_model"}
+# A run that goes on stays in its folder.
+OmegaConf.register_new_resolver("folder_of", folder_of, replace=True)
 #: What the loss module tells of itself.
 LOGGED = ("td_error", "pred_value", "target_value", "unsolved")
 
@@ -155,10 +182,14 @@ LOGGED = ("td_error", "pred_value", "target_value", "unsolved")
 def main(cfg: DictConfig) -> float:
     """Train; a sweep's optimiser maximises the closed gap that this returns."""
     try:
+        hydra_cfg = HydraConfig.get()
+        state = None
+        if cfg.resume is not None:
+            cfg, state = resumed(cfg.resume, list(hydra_cfg.overrides.task))
         check_config(cfg)
     except QPError as error:
         raise SystemExit(str(error)) from None
-    return train(cfg, HydraConfig.get().runtime.output_dir)["closed_gap"]
+    return train(cfg, hydra_cfg.runtime.output_dir, state)["closed_gap"]
 
 
 if __name__ == "__main__":

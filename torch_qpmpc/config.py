@@ -85,6 +85,7 @@ RULES: dict[str, Rule] = {
     "step": _one_of(*STEPS),
     "penalty_step": _one_of("proximal", "subgradient"),
     "release": (lambda x: x is None or _whole(1)[0](x), "a whole number >= 1, or null"),
+    "resume": (lambda x: x is None or NAME[0](x), "a path, or null"),
     "ablation": (lambda x: x is None or NAME[0](x), "a name, or null"),
     "eval_interval": _whole(1),
     "log_interval": _whole(1),

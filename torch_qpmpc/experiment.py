@@ -37,12 +37,14 @@ class Learner:
 
     Attributes:
         learn: what a batch does to theta.
+        loss_module: with the target networks and the critics that there are.
         actor: observation to action, without exploration.
         deviation, si: the penalties that are on.
         target: the soft update of the target network, if there is one.
     """
 
     learn: Update
+    loss_module: LossModule
     actor: TensorDictModuleBase
     optimizer: torch.optim.Optimizer
     schedule: LambdaLR
@@ -77,6 +79,7 @@ def make_learner(
     delayed = cfg.algo.name != "qlearning" or cfg.delay_value
     return Learner(
         make_update(cfg, mpc, loss_module, optimizer, schedule, deviation, si, done),
+        loss_module,
         actor,
         optimizer,
         schedule,
@@ -176,6 +179,8 @@ def report(
 ) -> dict[str, Any]:
     """Log an evaluation: J between its two ends, the distance of C to C_0, and the figures.
 
+    Before the first update, J alone.
+
     Args:
         mpc: None where the learned policy is no QP's.
 
@@ -183,16 +188,23 @@ def report(
         `gap_summary` of ``loops``.
     """
     summary = gap_summary(loops)
-    logged = {"J": "J_final", "J_true_model": "J_true_model", "J_discounted": "J_discounted_final"}
-    logged |= {"closed_gap": "closed_gap"}
-    run.log({f"eval/{name}": summary[key] for name, key in logged.items()}, update)
-    if mpc is None:
+    run.log({f"eval/{name}": summary[key] for name, key in LOGGED_OF_LOOPS.items()}, update)
+    if mpc is None or update == 0:
         return summary
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
     run.log({f"structure/{band}": distance for band, distance in distances.items()}, update)
     run.figure("structure/C", constraint_figure(mpc), update)
     run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
     return summary
+
+
+#: The names of an evaluation's scalars, and which of `gap_summary` they are.
+LOGGED_OF_LOOPS = {
+    "J": "J_final",
+    "J_true_model": "J_true_model",
+    "J_discounted": "J_discounted_final",
+    "closed_gap": "closed_gap",
+}
 
 
 def theta_metrics(mpc: QPMPC) -> dict[str, float]:
@@ -202,17 +214,6 @@ def theta_metrics(mpc: QPMPC) -> dict[str, float]:
         f"theta/{name}_{i}" if part.ndim else f"theta/{name}": value
         for name, part in few.items()
         for i, value in enumerate(part.flatten().tolist())
-    }
-
-
-def stream_summary(costs: list[float], violation: float) -> dict[str, float]:
-    """What learning itself cost: the mean cost of a step, over all updates and over the last tenth,
-    and the violation of the states' bounds, summed over all steps."""
-    last = costs[-max(1, len(costs) // 10) :]
-    return {
-        "train_cost": sum(costs) / len(costs),
-        "train_cost_last_tenth": sum(last) / len(last),
-        "train_violation": violation,
     }
 
 

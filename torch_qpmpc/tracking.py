@@ -10,6 +10,7 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from torch_qpmpc.config import flatten
@@ -21,9 +22,11 @@ class RunFolder:
     Args:
         folder: created if it does not exist.
         cfg: the run's configuration.
+        after: go on after this update: what the folder has of it and before is kept, what is later
+            is written anew. None starts from nothing.
     """
 
-    def __init__(self, folder: str | Path, cfg: DictConfig) -> None:
+    def __init__(self, folder: str | Path, cfg: DictConfig, after: int | None = None) -> None:
         # Absolute, as the event writer's thread outlives changes of the working directory.
         self.path = Path(folder).resolve()
         self.path.mkdir(parents=True, exist_ok=True)
@@ -33,6 +36,13 @@ class RunFolder:
         text = OmegaConf.to_yaml(cfg, resolve=True)
         self.logger.experiment.add_text("config", f"```yaml\n{text}```")
         self.rows: list[dict[str, float]] = []
+        if after is not None:
+            table = pd.read_csv(self.path / "metrics.csv", float_precision="round_trip")
+            found = [row.dropna().to_dict() for _, row in table.iterrows()]
+            self.rows = [row for row in found if row["update"] <= after]
+            # TensorBoard drops what earlier event files have from here on.
+            start = Event(step=after + 1, session_log=SessionLog(status=SessionLog.START))
+            self.logger.experiment.file_writer.event_writer.add_event(start)
 
     def __enter__(self) -> RunFolder:
         return self

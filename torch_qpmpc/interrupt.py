@@ -1,0 +1,39 @@
+"""Ctrl-C and SIGTERM as a wish to stop, which a loop grants between two updates."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType
+
+
+class Interrupt:
+    """Notes the first SIGINT or SIGTERM inside a ``with`` block; a second one acts as usual.
+
+    Only in the main thread, where Python delivers signals; elsewhere it notes nothing.
+
+    Example:
+        >>> with Interrupt() as interrupt:
+        ...     signal.raise_signal(signal.SIGTERM)
+        >>> interrupt.signum == signal.SIGTERM
+        True
+    """
+
+    def __init__(self) -> None:
+        self.signum: int | None = None
+        self._usual = {}
+
+    def __enter__(self) -> Interrupt:
+        if threading.current_thread() is threading.main_thread():
+            for signum in (signal.SIGINT, signal.SIGTERM):
+                self._usual[signum] = signal.signal(signum, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for signum, handler in self._usual.items():
+            signal.signal(signum, handler)
+        self._usual = {}
+
+    def _note(self, signum: int, frame: FrameType | None) -> None:
+        self.signum = signum
+        self.__exit__()
