@@ -172,6 +172,7 @@ def random_mpc(seed: int = 0, *, free: float = 0.1, horizon: int = 3, **options:
         for parameter in mpc.parameters():
             shift = 2 * torch.rand(parameter.shape, generator=generator, dtype=torch.float64) - 1
             parameter += free * shift
+    mpc.project_()
     return mpc
 
 
@@ -186,4 +187,5 @@ def step(mpc: QPMPC, rate: float = 1e-3) -> None:
     optimizer = torch.optim.Adam(mpc.parameters(), lr=rate)
     mpc(random_states(4)).sum().backward()
     optimizer.step()
+    mpc.project_()
     optimizer.zero_grad()

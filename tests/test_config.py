@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import sys
 from typing import Any
 
 import pytest
@@ -16,7 +17,8 @@ from torch_qpmpc import QPError
 from torch_qpmpc.config import OF_OPTIMIZER, OPTIONAL, RULES, check_config, flatten
 from torch_qpmpc.tracking import RunFolder
 
-GROUPS = sorted(path.name for path in CONFIGS.iterdir() if path.is_dir())
+#: An ablation is added to what the others choose.
+GROUPS = sorted({path.name for path in CONFIGS.iterdir() if path.is_dir()} - {"ablation"})
 
 
 def keys_of_the_files() -> set[str]:
@@ -115,7 +117,9 @@ BAD: dict[str, list[Any]] = {
     "td_error_clip": [0, *REAL[:-1]],
     "delay_value": FLAG,
     "target_rate": FRACTION,
+    "step": ["newton", *NAME],
     "penalty_step": ["newton", *NAME],
+    "ablation": [3, True],
     "task.name": ["pendulum", *NAME],
     "task.gamma": FRACTION,
     "task.hessian": ["dense", *NAME],
@@ -294,3 +298,43 @@ def test_flatten():
     tree = {"a": 1, "b": {"c": [1, 2], "d": {"e": None}}}
     assert flatten(tree) == {"a": 1, "b.c": [1, 2], "b.d.e": None}
     assert flatten({"e": None}, "b.d") == {"b.d.e": None}
+
+
+def test_the_step_rule_needs_its_solver(monkeypatch):
+    monkeypatch.setitem(sys.modules, "clarabel", None)
+    with pytest.raises(QPError, match=r"step: got 'sdp' without Clarabel, .* pip install"):
+        check_config(make_config("step=sdp"))
+
+
+#: What each differs in, beside its name: from the defaults, or from those of its optimiser.
+ABLATIONS: dict[str, tuple[list[str], dict[str, Any]]] = {
+    "adam_proximal": (["optimizer=adam"], {}),
+    "adam_subgradient": (["optimizer=adam"], {"penalty_step": "subgradient"}),
+    "sgd": (["optimizer=sgd"], {"step": "projection"}),
+    "target_network": (["optimizer=adam"], {"delay_value": True}),
+    "markov": ([], {"constraint.deviation.c_3": 1.0}),
+    "si_raw": (["optimizer=adam", "constraint=si"], {}),
+    "si_normalised": (["optimizer=adam", "constraint=si"], {"constraint.si.normalised": True}),
+    "soft_actions": ([], {"task.action_slack": 100.0}),
+    "horizon_5": ([], {"task.horizon": 5}),
+    "horizon_20": ([], {"task.horizon": 20, "warmup_steps": 20}),
+    "projection": ([], {"step": "projection"}),
+    "sdp": ([], {"step": "sdp"}),
+}
+
+
+@pytest.mark.parametrize("name", choices("ablation"))
+def test_an_ablation_differs_in_what_it_says(name):
+    base, expected = ABLATIONS[name]
+    found = make_config(f"+ablation={name}")
+    check_config(found)
+    found, usual = (flatten(OmegaConf.to_container(x)) for x in (found, make_config(*base)))
+    differing = {key: value for key, value in found.items() if value != usual[key]}
+    assert differing == {"ablation": name, **expected}
+
+
+@pytest.mark.parametrize("name", choices("ablation"))
+def test_an_ablation_goes_with_both_penalties_and_a_step_rule(name):
+    check_config(make_config(f"+ablation={name}", "constraint=combined", "optimizer=adam"))
+    cfg = make_config(f"+ablation={name}", "step=projection")
+    assert (cfg.step, cfg.ablation) == ("projection", name)

@@ -22,6 +22,7 @@ PARTS = {
     "everything": {"learn": ALL, "free": 0.01},
     "block": {"hessian": "block", "stage_weight": torch.eye(3), "learn": ("H", "H_f", "C")},
     "full": {"hessian": "full", "stage_weight": torch.eye(3), "learn": ("H", "C")},
+    "projected": {"step": "projection", "hessian": "full", "learn": ("H", "w"), "free": 0.01},
     "tied": {"structure": "tied", "learn": ("c", "q", "C", "b", "lb", "ub", "w"), "free": 0.01},
     "varying": {"structure": "varying", "learn": ("C", "G"), **MIXED},
 }

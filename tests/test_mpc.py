@@ -33,6 +33,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "tied, mixed": {"structure": "tied", "learn": ("C", "G", "b"), "horizon": 4, **MIXED},
     "free, mixed": {"learn": ("C", "G", "w"), "action_slack": 50.0, **MIXED},
     "undiscounted": {"gamma": 1.0},
+    "projected": {"step": "projection", "learn": EVERYTHING, "action_slack": 50.0},
+    "projected block": {"step": "projection", "hessian": "block", "learn": ("H", "H_f", "C", "w")},
 }
 
 

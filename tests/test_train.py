@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train
-from tests.runs import CONFIGS, SMALL, make_config, skip_figures
+from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
 from torch_qpmpc import (
     QPMPC,
     DeviationPenalty,
@@ -35,6 +35,7 @@ from torch_qpmpc.experiment import evaluate
 from torch_qpmpc.tasks import make_mpc, make_physics
 
 SUMMARY = {"seed", "constraint", "noise", "solver", "unsolved", "updates", "train_seconds"}
+SUMMARY |= {"ablation", "step", "penalty_step"}
 for _tag in ("J", "J_discounted"):
     SUMMARY |= {f"{_tag}_start", f"{_tag}_final", f"{_tag}_true_model"}
 SUMMARY |= {"closed_gap", "closed_gap_discounted"}
@@ -91,8 +92,10 @@ def test_summary_is_complete(whole):
     summary = json.loads((folder / "summary.json").read_text())
     assert summary == returned
     assert set(summary) >= SUMMARY
-    assert all(math.isfinite(v) for v in summary.values() if not isinstance(v, str))
-    names = {"seed": 5, "constraint": "combined", "noise": "gaussian", "solver": "daqp"}
+    assert summary["ablation"] is None
+    assert all(math.isfinite(v) for v in summary.values() if not isinstance(v, str | None))
+    names = {"step": "cholesky", "penalty_step": "proximal"}
+    names |= {"seed": 5, "constraint": "combined", "noise": "gaussian", "solver": "daqp"}
     assert {**summary, **names, "updates": 150} == summary
     assert 0 < summary["train_seconds"] < 600
     gap = (summary["J_start"] - summary["J_final"]) / (summary["J_start"] - summary["J_true_model"])
@@ -271,6 +274,34 @@ def test_subgradient_step(tmp_path):
     assert np.abs(deviation[distance > 0]).max() > 0
     assert metrics(tmp_path)["loss/deviation"][1] == 0, "it starts at C_0"
     assert (metrics(tmp_path)["loss/deviation"][2:] > 0).all()
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
+@pytest.mark.parametrize("name", choices("ablation"))
+def test_each_ablation_runs(tmp_path, name):
+    small = [override for override in SMALL if not override.startswith(("optimizer", "task.hor"))]
+    more = ("updates=2", "warmup_steps=20", "task.episode_steps=20", "task.eval_steps=5")
+    cfg = make_config(*small, f"+ablation={name}", *more)
+    summary = train.train(cfg, str(tmp_path))
+    assert (summary["ablation"], summary["step"]) == (name, cfg.step)
+    assert summary["unsolved"] == 0
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("optimizer", ["adam", "recursive"])
+@pytest.mark.parametrize("rule", ["projection", "sdp"])
+def test_a_scheme_with_dense_weights_learns_them_by_each_rule(tmp_path, rule, optimizer):
+    """And is released in the middle of it."""
+    dense = ("task.learn_cost=[H,H_f,q,c,w]", "updates=12", "eval_interval=12", "release=6")
+    cfg = make_config(*STREAM, *dense, f"optimizer={optimizer}", f"step={rule}", "batch_size=4")
+    assert train.train(cfg, str(tmp_path))["unsolved"] == 0
+    state = load_checkpoint(tmp_path / "checkpoint.pt")["mpc"]
+    for part in ("H", "H_f"):
+        H = state[f"parametrizations.{part}.original"]
+        assert torch.equal(H, H.mT)
+        assert torch.linalg.eigvalsh(H)[0] > -1e-12
+    assert (state["w"] >= 0).all()
 
 
 @pytest.mark.usefixtures("small")

@@ -156,14 +156,16 @@ class GaussNewton(torch.optim.Optimizer):
         old = [block.leaf.clone() for block in blocks]
         before = _objective(delta, blocks)
         _move(blocks, steps, lr)
-        change = self._project(blocks, lr * change)
+        proposed = lr * change
+        change = self._project(blocks, proposed)
         predicted = before - _objective(delta - change, blocks)
         again = self._mpc.solve(s, a, warm_start=solution.active)
         decrease = before - _objective(
             delta - torch.where(use, again.value - solution.value, 0), blocks
         )
-        # With nothing to gain there is nothing to judge.
-        ratio = float(decrease / predicted) if predicted > 0 else 1.0
+        # With nothing to gain there is nothing to judge, but a projection can make it a loss.
+        lost = not torch.equal(change, proposed) and not decrease >= 0
+        ratio = float(decrease / predicted) if predicted > 0 else float(not lost)
         accepted = ratio > 0  # false for the NaN of an infinite cost
         if not accepted:
             for block, value in zip(blocks, old, strict=True):
