@@ -35,12 +35,13 @@ from torch_qpmpc.experiment import (
     make_learner,
     report,
     stream_summary,
+    structure_summary,
     table,
     theta_metrics,
 )
 from torch_qpmpc.plots import summary_figure
 from torch_qpmpc.replay import ACTIVE_SET, make_replay
-from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc
+from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc, true_model
 from torch_qpmpc.tracking import RunFolder
 
 
@@ -134,6 +135,7 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
         summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
         summary |= {"solver": cfg.solver, "updates": cfg.updates, "train_seconds": train_seconds}
         summary |= stream_summary(costs, violation)
+        summary |= structure_summary(mpc, true_model(physics))
         summary["unsolved"] = unsolved + qps.unsolved
         run.finish(summary)
         summary_figure(mpc, loops, *run.column("eval/J")).savefig(run.path / "summary.png", dpi=110)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictSequential
+from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torchrl.collectors import Collector
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import SoftUpdate
 
+from torch_qpmpc.canonical import prediction_form
 from torch_qpmpc.envs import LinearSystem, LinearSystemEnv
 from torch_qpmpc.evaluation import ClosedLoop, closed_gap, closed_loop
 from torch_qpmpc.gauss_newton import GaussNewton
@@ -22,7 +25,9 @@ from torch_qpmpc.objectives import QPQLearningLoss
 from torch_qpmpc.operators import QPActorValueOperator
 from torch_qpmpc.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.plots import closed_loop_figure, constraint_figure
-from torch_qpmpc.structure import distance_by_band
+from torch_qpmpc.prediction_error import one_step_error
+from torch_qpmpc.reading import structure_metrics
+from torch_qpmpc.structure import distance_by_band, nearest_model
 from torch_qpmpc.tracking import RunFolder
 from torch_qpmpc.updates import Update, first_order, second_order
 
@@ -150,7 +155,7 @@ def evaluate(cfg: DictConfig, mpc: QPMPC, physics: LinearSystem) -> ClosedLoop:
 
 
 def report(run: RunFolder, mpc: QPMPC, loops: dict[str, ClosedLoop], update: int) -> dict[str, Any]:
-    """Log an evaluation: J between its two ends, the distance of C to C_0, and the figures.
+    """Log an evaluation: J between its two ends, what C says, raw and canonical, and the figures.
 
     Returns:
         `gap_summary` of ``loops``.
@@ -160,10 +165,27 @@ def report(run: RunFolder, mpc: QPMPC, loops: dict[str, ClosedLoop], update: int
     run.log({"eval/J_discounted": summary["J_discounted_final"]}, update)
     run.log({"eval/closed_gap": summary["closed_gap"]}, update)
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
-    run.log({f"structure/{band}": distance for band, distance in distances.items()}, update)
+    distances |= structure_metrics(mpc)
+    run.log({f"structure/{name}": distance for name, distance in distances.items()}, update)
     run.figure("structure/C", constraint_figure(mpc), update)
     run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
     return summary
+
+
+def structure_summary(mpc: QPMPC, true_model: Sequence[Tensor]) -> dict[str, float]:
+    """How far the learned constraints are from an MPC scheme's, and from the true model.
+
+    Returns:
+        ``canonical_distance``, to the nearest scheme, and ``model_error``, of that scheme's model
+        in one step (see `one_step_error`), with ``model_error_start``, that of C_0.
+    """
+    metrics = structure_metrics(mpc, true_model)
+    start = nearest_model(prediction_form(mpc.C_0, mpc.n_x, mpc.n_u))
+    return {
+        "canonical_distance": metrics["distance_to_mpc"],
+        "model_error": metrics["model_error"],
+        "model_error_start": one_step_error(start, *true_model).item(),
+    }
 
 
 def theta_metrics(mpc: QPMPC) -> dict[str, float]:

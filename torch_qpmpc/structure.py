@@ -180,7 +180,8 @@ def memory_energies(form: PredictionForm, rtol: float = 1e-9) -> Tensor:
 def markov_order(energies: Tensor, tolerance: float = 1e-6) -> float:
     """Of how many pairs (x_k, u_k), .. the next state is a function, by `memory_energies`.
 
-    1 is a Markovian scheme, as MPC is; inf is one that looks at later actions.
+    1 is a Markovian scheme, as MPC is; inf is one that looks at later actions. An order above 1 is
+    not always how far back the rows of C reach: some pairs may tell all that was before them.
 
     Args:
         energies: ``(N + 1,)``.

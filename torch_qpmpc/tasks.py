@@ -43,6 +43,12 @@ def make_true_mpc(cfg: DictConfig, physics: LinearSystem) -> QPMPC:
     return _make(cfg, physics, _true_scheme(physics), ())
 
 
+def true_model(physics: LinearSystem) -> tuple[Tensor, Tensor, Tensor]:
+    """A, B and the offset of the plant: the mean of its noise."""
+    scheme = _true_scheme(physics)
+    return scheme.A, scheme.B, scheme.offset
+
+
 def _wrong_scheme(physics: LinearSystem, seed: int) -> Scheme:
     """The point mass's corruption and random cost are the seed's; the other has no random ones."""
     none = torch.zeros_like(physics.lb_s)
