@@ -37,6 +37,7 @@ from torch_qpmpc.experiment import (
     gap_summary,
     make_learner,
     report,
+    structure_summary,
     table,
     theta_metrics,
 )
@@ -44,7 +45,7 @@ from torch_qpmpc.interrupt import Interrupt
 from torch_qpmpc.plots import summary_figure
 from torch_qpmpc.replay import ACTIVE_SET, make_replay
 from torch_qpmpc.snapshot import Tally, folder_of, restore, resumed, snapshot
-from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc
+from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc, true_model
 from torch_qpmpc.tracking import RunFolder
 
 
@@ -164,6 +165,8 @@ def train(cfg: DictConfig, folder: str, state: dict[str, Any] | None = None) -> 
         summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
         summary |= {"ablation": cfg.ablation, "step": cfg.step, "penalty_step": cfg.penalty_step}
         summary |= {"updates": cfg.updates, **tally.summary()}
+        if learned_mpc is not None:
+            summary |= structure_summary(mpc, true_model(physics))
         run.finish(summary)
         if learned_mpc is not None:
             figure = summary_figure(mpc, loops, *run.column("eval/J"))

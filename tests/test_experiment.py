@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pandas as pd
@@ -11,6 +12,7 @@ from omegaconf import DictConfig
 
 from tests.runs import SMALL, choices, make_config
 from torch_qpmpc import QPActorValueOperator
+from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.evaluation import ClosedLoop
 from torch_qpmpc.experiment import (
     evaluate,
@@ -21,10 +23,12 @@ from torch_qpmpc.experiment import (
     make_penalties,
     report,
     stream_summary,
+    structure_summary,
     table,
     theta_metrics,
 )
-from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc
+from torch_qpmpc.reading import structure_metrics
+from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc, true_model
 from torch_qpmpc.tracking import RunFolder
 
 
@@ -174,6 +178,32 @@ def test_stream_summary():
     assert stream_summary([3.0], 0.0)["train_cost_last_tenth"] == 3.0
 
 
+def test_structure_summary_tells_the_models_error_before_and_after():
+    cfg = make_config(*SMALL, "constraint=free")
+    physics = make_physics(cfg)
+    mpc = make_mpc(cfg, physics)
+    A, B, offset = true_model(physics)
+    before = (mpc.C_0[:4, :6] - torch.cat((A, B), dim=1)).norm().item()
+    expected = {"canonical_distance": 0, "model_error": before, "model_error_start": before}
+    assert structure_summary(mpc, (A, B, offset)) == pytest.approx(expected, abs=1e-9)
+    with torch.no_grad():
+        mpc.C.copy_(2 * banded_matrix(A, B, cfg.task.horizon))
+    after = expected | {"model_error": 0}
+    assert structure_summary(mpc, (A, B, offset)) == pytest.approx(after, abs=1e-9)
+
+
+def test_a_run_whose_C_cannot_be_read_goes_on():
+    cfg = make_config(*SMALL, "constraint=free")
+    physics = make_physics(cfg)
+    mpc = make_mpc(cfg, physics)
+    with torch.no_grad():
+        mpc.C.zero_()
+    summary = structure_summary(mpc, true_model(physics))
+    assert math.isnan(summary["canonical_distance"])
+    assert math.isnan(summary["model_error"])
+    assert summary["model_error_start"] > 0
+
+
 def test_report_logs_the_evaluation(tmp_path):
     cfg = make_config(*SMALL, "constraint=free")
     physics = make_physics(cfg)
@@ -190,4 +220,6 @@ def test_report_logs_the_evaluation(tmp_path):
     expected = {"update": 20, "eval/J": loop.J, "eval/J_true_model": truth.J}
     expected |= {"eval/J_discounted": loop.J_discounted, "eval/closed_gap": summary["closed_gap"]}
     expected |= {"structure/on": 0, "structure/above": 0.5, "structure/below": 0}
+    expected |= {f"structure/{name}": value for name, value in structure_metrics(mpc).items()}
+    assert row["structure/causality_defect"] > 0.01
     assert row == pytest.approx(expected, nan_ok=True)

@@ -13,9 +13,11 @@ import torch
 from matplotlib.figure import Figure
 
 from torch_qpmpc import QPMPC
+from torch_qpmpc.canonical import canonical_matrix, prediction_form
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.evaluation import ClosedLoop, closed_loop
 from torch_qpmpc.plots import closed_loop_figure, constraint_figure, summary_figure
+from torch_qpmpc.structure import stage_models
 
 
 def make_mpc(horizon: int = 4) -> QPMPC:
@@ -74,16 +76,18 @@ def legend_of(axes: Any) -> list[str]:
     return [text.get_text() for text in axes.get_legend().get_texts()]
 
 
-def test_constraint_figure_shows_C_beside_C_0(mpc):
+def test_constraint_figure_shows_C_raw_and_canonical_beside_C_0(mpc):
     figure = constraint_figure(mpc)
     axes = [a for a in figure.axes if a.images]
     C = mpc.C.detach()
-    for ax, matrix in zip(axes, (mpc.C_0, C, C - mpc.C_0), strict=True):
+    form = prediction_form(C, mpc.n_x, mpc.n_u)
+    canonical, _ = canonical_matrix(form, stage_models(form).A)
+    for ax, matrix in zip(axes, (mpc.C_0, C, canonical), strict=True):
         assert np.array_equal(image_of(ax), matrix.numpy())
     assert [a.get_title() for a in axes] == [
         "$C_0$, the start",
         r"$C_\theta$, learned",
-        r"$C_\theta - C_0$",
+        r"$C_\theta$ in canonical form",
     ]
     ticks = {t.get_text(): t.get_position()[0] for t in axes[0].get_xticklabels()}
     assert {f"$x_{{{k}}}$": 6.0 * k for k in range(5)} == ticks, "each x_k at its first column"
@@ -94,6 +98,16 @@ def test_constraint_figure_shows_C_beside_C_0(mpc):
 @pytest.mark.parametrize("horizon", [1, 2, 12])
 def test_constraint_figure_of_any_horizon(horizon):
     rendered(constraint_figure(make_mpc(horizon)))
+
+
+def test_constraint_figure_says_why_there_is_no_canonical_form():
+    mpc = make_mpc()
+    with torch.no_grad():
+        mpc.C[:, -1] = 0
+    figure = constraint_figure(mpc)
+    (text,) = figure.axes[2].texts
+    assert "state columns of rank 15 of 16" in text.get_text()
+    rendered(figure)
 
 
 def test_constraint_figure_of_a_fixed_C():

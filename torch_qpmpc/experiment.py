@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from torchrl.objectives import LossModule, SoftUpdate
 
 from torch_qpmpc.actor_critic import actor_groups, critic_groups, make_actor_critic_loss
+from torch_qpmpc.canonical import prediction_form
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.evaluation import ClosedLoop, closed_gap, closed_loop, gymnasium_loop
 from torch_qpmpc.gauss_newton import GaussNewton
@@ -23,7 +24,9 @@ from torch_qpmpc.objectives import QPQLearningLoss
 from torch_qpmpc.operators import QPActorValueOperator
 from torch_qpmpc.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.plots import closed_loop_figure, constraint_figure
-from torch_qpmpc.structure import distance_by_band
+from torch_qpmpc.prediction_error import one_step_error
+from torch_qpmpc.reading import structure_metrics
+from torch_qpmpc.structure import distance_by_band, nearest_model
 from torch_qpmpc.tracking import RunFolder
 from torch_qpmpc.updates import Update, first_order, second_order
 
@@ -177,7 +180,7 @@ def evaluate(
 def report(
     run: RunFolder, mpc: QPMPC | None, loops: dict[str, ClosedLoop], update: int
 ) -> dict[str, Any]:
-    """Log an evaluation: J between its two ends, the distance of C to C_0, and the figures.
+    """Log an evaluation: J between its two ends, what C says, raw and canonical, and the figures.
 
     Before the first update, J alone.
 
@@ -192,7 +195,8 @@ def report(
     if mpc is None or update == 0:
         return summary
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
-    run.log({f"structure/{band}": distance for band, distance in distances.items()}, update)
+    distances |= structure_metrics(mpc)
+    run.log({f"structure/{name}": distance for name, distance in distances.items()}, update)
     run.figure("structure/C", constraint_figure(mpc), update)
     run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
     return summary
@@ -205,6 +209,24 @@ LOGGED_OF_LOOPS = {
     "J_discounted": "J_discounted_final",
     "closed_gap": "closed_gap",
 }
+
+
+def structure_summary(mpc: QPMPC, true_model: Sequence[Tensor] | None) -> dict[str, float]:
+    """How far the learned constraints are from an MPC scheme's, and from the true model if any.
+
+    Returns:
+        ``canonical_distance``, to the nearest scheme, and ``model_error``, of that scheme's model
+        in one step (see `one_step_error`), with ``model_error_start``, that of C_0.
+    """
+    if true_model is None:
+        return {"canonical_distance": structure_metrics(mpc)["distance_to_mpc"]}
+    metrics = structure_metrics(mpc, true_model)
+    start = nearest_model(prediction_form(mpc.C_0, mpc.n_x, mpc.n_u))
+    return {
+        "canonical_distance": metrics["distance_to_mpc"],
+        "model_error": metrics["model_error"],
+        "model_error_start": one_step_error(start, *true_model).item(),
+    }
 
 
 def theta_metrics(mpc: QPMPC) -> dict[str, float]:

@@ -11,8 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from torch import Tensor
 
+from torch_qpmpc.canonical import canonical_matrix, prediction_form
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.evaluation import ClosedLoop
 from torch_qpmpc.mpc import QPMPC
+from torch_qpmpc.structure import stage_models
 
 COLOURS = {"start": "tab:red", "learned": "tab:blue", "true model": "tab:green"}
 
@@ -39,7 +42,7 @@ def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
 
 
 def constraint_figure(mpc: QPMPC) -> Figure:
-    """C with C_0 and their difference, raw as in the paper's figures.
+    """C_0, C raw as in the paper's figures, and C's canonical form, which has no gauge.
 
     One above the other: TensorBoard's cards are narrow.
     """
@@ -47,7 +50,14 @@ def constraint_figure(mpc: QPMPC) -> Figure:
     top, middle, bottom = figure.subplots(3, 1)
     draw_matrix(top, mpc.C_0, mpc, "$C_0$, the start")
     draw_matrix(middle, mpc.C, mpc, r"$C_\theta$, learned")
-    draw_matrix(bottom, mpc.C - mpc.C_0, mpc, r"$C_\theta - C_0$")
+    try:
+        form = prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
+    except QPError as error:
+        bottom.text(0.5, 0.5, f"No canonical form:\n{error}", ha="center", va="center", wrap=True)
+        bottom.set_axis_off()
+        return figure
+    canonical, _ = canonical_matrix(form, stage_models(form).A)
+    draw_matrix(bottom, canonical, mpc, r"$C_\theta$ in canonical form")
     return figure
 
 

@@ -58,6 +58,16 @@ def _given_scheme(cfg: DictConfig, physics: GymnasiumPlant) -> Scheme:
     return Scheme(A, B, torch.zeros_like(free), weight, -free, free)
 
 
+def true_model(
+    physics: LinearSystem | GymnasiumPlant,
+) -> tuple[Tensor, Tensor, Tensor] | None:
+    """A, B and the offset of the plant, the mean of its noise; None where it has no such model."""
+    if not isinstance(physics, LinearSystem):
+        return None
+    scheme = _true_scheme(physics)
+    return scheme.A, scheme.B, scheme.offset
+
+
 def _wrong_scheme(physics: LinearSystem, seed: int) -> Scheme:
     """The point mass's corruption and random cost are the seed's; the other has no random ones."""
     none = torch.zeros_like(physics.lb_s)
