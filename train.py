@@ -5,6 +5,7 @@
     python train.py constraint=mpc                      its linear MPC scheme, tied
     python train.py task=gros_zanon solver=daqp         another plant, from one long episode
     python train.py -m constraint=fixed,free seed=1,2   a sweep
+    python train.py -m +study=paper                     the paper's study; goes on where it stopped
     tensorboard --logdir runs                           watch it
 
 configs/ holds every key. The run's folder gets config.yaml, metrics.csv, TensorBoard events,
@@ -21,6 +22,7 @@ from typing import Any
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 from torchrl import torchrl_logger
 from tqdm import tqdm
@@ -40,12 +42,13 @@ from torch_qpmpc.experiment import (
 )
 from torch_qpmpc.plots import summary_figure
 from torch_qpmpc.replay import ACTIVE_SET, make_replay
+from torch_qpmpc.sweeps import finished_run
 from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc
 from torch_qpmpc.tracking import RunFolder
 
 
-def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
-    """One run; returns what summary.json holds."""
+def train(cfg: DictConfig, folder: str, quiet: bool = False) -> dict[str, Any]:
+    """One run; returns what summary.json holds. ``quiet``: prints nothing."""
     check_config(cfg)
     torchrl_logger.setLevel("WARNING")
     torch.manual_seed(cfg.seed)
@@ -84,7 +87,8 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
         stack.callback(collector.shutdown)
         run = stack.enter_context(RunFolder(folder, cfg))
         run.log({"eval/J": loops["start"].J, "eval/J_true_model": loops["true model"].J}, 0)
-        progress = tqdm(range(1, cfg.updates + 1), desc=f"{cfg.constraint.name}, {cfg.noise.name}")
+        label = f"{cfg.constraint.name}, {cfg.noise.name}"
+        progress = tqdm(range(1, cfg.updates + 1), desc=label, disable=quiet)
         for update in progress:
             began = time.perf_counter()
             with qps:
@@ -136,8 +140,11 @@ def train(cfg: DictConfig, folder: str) -> dict[str, Any]:
         summary |= stream_summary(costs, violation)
         summary["unsolved"] = unsolved + qps.unsolved
         run.finish(summary)
-        summary_figure(mpc, loops, *run.column("eval/J")).savefig(run.path / "summary.png", dpi=110)
-    print(f"\n{table(summary)}\n\n{run.path}")
+        if cfg.figures:
+            figure = summary_figure(mpc, loops, *run.column("eval/J"))
+            figure.savefig(run.path / "summary.png", dpi=110)
+    if not quiet:
+        print(f"\n{table(summary)}\n\n{run.path}")
     return summary
 
 
@@ -148,12 +155,19 @@ LOGGED = ("td_error", "pred_value", "target_value", "unsolved")
 @hydra.main(version_base="1.3", config_path="configs", config_name="config")
 def main(cfg: DictConfig) -> float:
     """Train; a sweep's optimiser maximises the closed gap that this returns."""
+    folder, sweep = HydraConfig.get().runtime.output_dir, HydraConfig.get().mode is RunMode.MULTIRUN
     try:
         check_config(cfg)
+        done = finished_run(folder, cfg) if sweep else None
     except QPError as error:
+        if sweep:
+            raise  # an exit would end the other runs, too
         raise SystemExit(str(error)) from None
-    return train(cfg, HydraConfig.get().runtime.output_dir)["closed_gap"]
+    return (done or train(cfg, folder, quiet=sweep))["closed_gap"]
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        raise SystemExit("\nstopped") from None

@@ -70,6 +70,7 @@ RULES: dict[str, Rule] = {
     "target_rate": FRACTION,
     "penalty_step": _one_of("proximal", "subgradient"),
     "release": (lambda x: x is None or _whole(1)[0](x), "a whole number >= 1, or null"),
+    "figures": FLAG,
     "eval_interval": _whole(1),
     "log_interval": _whole(1),
     "task.name": _one_of("point_mass", "gros_zanon"),

@@ -150,7 +150,7 @@ def evaluate(cfg: DictConfig, mpc: QPMPC, physics: LinearSystem) -> ClosedLoop:
 
 
 def report(run: RunFolder, mpc: QPMPC, loops: dict[str, ClosedLoop], update: int) -> dict[str, Any]:
-    """Log an evaluation: J between its two ends, the distance of C to C_0, and the figures.
+    """Log an evaluation: J between its two ends, the distance of C to C_0, and figures if wanted.
 
     Returns:
         `gap_summary` of ``loops``.
@@ -161,8 +161,9 @@ def report(run: RunFolder, mpc: QPMPC, loops: dict[str, ClosedLoop], update: int
     run.log({"eval/closed_gap": summary["closed_gap"]}, update)
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
     run.log({f"structure/{band}": distance for band, distance in distances.items()}, update)
-    run.figure("structure/C", constraint_figure(mpc), update)
-    run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
+    if run.cfg.figures:
+        run.figure("structure/C", constraint_figure(mpc), update)
+        run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
     return summary
 
 
