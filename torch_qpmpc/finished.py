@@ -105,6 +105,11 @@ class FinishedRun:
         }
 
 
+def has_real(frame: pd.DataFrame) -> bool:
+    """Whether any of `collect`'s runs had a gap worth closing."""
+    return any(frame["real"])
+
+
 def predictions(mpc: QPMPC) -> PredictionForm:
     """X = Phi x_0 + Gamma U + phi of its constraints."""
     return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
@@ -163,15 +168,16 @@ def collect(folder: str | Path) -> pd.DataFrame:
     return frame.assign(rank=rank).sort_values(keys, ignore_index=True).drop(columns="rank")
 
 
-def _labels(sweep: pd.DataFrame) -> pd.Series:
-    settings = pd.DataFrame([_settings(run.cfg) for run in sweep["run"]], index=sweep.index).astype(
-        str
-    )
-    labels = sweep["constraint"].copy()
-    for _, case in settings.groupby(sweep["constraint"]):
-        for key in case.columns[case.nunique() > 1]:
-            short = key.removeprefix("constraint.deviation.").removeprefix("constraint.")
-            labels[case.index] += ", " + short + "=" + case[key]
+def _labels(sweep: pd.DataFrame) -> list[str]:
+    settings = [_settings(run.cfg) for run in sweep["run"]]
+    values: dict[tuple[str, str], set[str]] = {}
+    for case, of_run in zip(sweep["constraint"], settings, strict=True):
+        for key, value in of_run.items():
+            values.setdefault((case, key), set()).add(str(value))
+    labels = []
+    for case, of_run in zip(sweep["constraint"], settings, strict=True):
+        varied = [key for key in of_run if len(values[case, key]) > 1]
+        labels.append(", ".join([case, *(f"{key.split('.')[-1]}={of_run[key]}" for key in varied)]))
     return labels
 
 

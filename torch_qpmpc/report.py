@@ -16,7 +16,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.finished import CASES, REAL_GAP, collect
+from torch_qpmpc.finished import CASES, REAL_GAP, collect, has_real
 from torch_qpmpc.markdown import replaced, table
 from torch_qpmpc.statistics import bootstrap_interval, interquartile_mean
 from torch_qpmpc.study_plots import (
@@ -43,7 +43,9 @@ def runs_table(frame: pd.DataFrame) -> str:
     """Every run with its two ends, as Markdown."""
     head = ["sweep", "noise", "case", "seed", "J_start", "J_final", "J_true_model", "closed_gap"]
     head += ["distance", "model_error", "model_error_start", "unsolved", "train_seconds"]
-    digits = dict.fromkeys(("J_start", "J_final", "J_true_model", "train_seconds"), ".1f")
+    digits: dict[str, str] = dict.fromkeys(
+        ("J_start", "J_final", "J_true_model", "train_seconds"), ".1f"
+    )
     digits |= dict.fromkeys(("closed_gap", "distance"), ".3f")
     digits |= dict.fromkeys(("model_error", "model_error_start"), ".4f")
     rows = frame.assign(case=frame["label"])[head].itertuples(index=False)
@@ -57,8 +59,9 @@ def runs_table(frame: pd.DataFrame) -> str:
 def cases_table(sweep: pd.DataFrame) -> str:
     """A sweep by noise and case, as Markdown."""
     lines = []
-    for (noise, label), runs in sweep.groupby(["noise", "label"], sort=False):
-        real = runs["closed_gap"][runs["real"]].to_numpy()
+    for noise, label in dict.fromkeys(zip(sweep["noise"], sweep["label"], strict=True)):
+        runs = sweep.query(f"noise == {noise!r} and label == {label!r}")
+        real = runs.query("real")["closed_gap"].to_numpy()
         median = runs.median(numeric_only=True)
         nearer = (runs["model_error"] < runs["model_error_start"]).sum()
         gap = "-"
@@ -67,8 +70,8 @@ def cases_table(sweep: pd.DataFrame) -> str:
             gap = f"{pd.Series(real).median():.3f} [{low:.3f}, {high:.3f}]"
         lines.append(
             [
-                str(noise),
-                str(label),
+                noise,
+                label,
                 f"{gap} ({len(real)} of {len(runs)})",
                 *_between_ends(median, "J"),
                 *_between_ends(median, "J_discounted"),
@@ -88,8 +91,8 @@ def _between_ends(median: pd.Series, name: str) -> list[str]:
 def overall(sweep: pd.DataFrame) -> str:
     """The closed gap of the paper's learned cases together, each a stratum of the bootstrap."""
     lines = []
-    for noise, runs in sweep[sweep["real"]].groupby("noise"):
-        cases = [runs["closed_gap"][runs["label"] == case].to_numpy() for case in CASES[1:]]
+    for noise, runs in sweep.query("real").groupby("noise"):
+        cases = [runs.query(f"label == {case!r}")["closed_gap"].to_numpy() for case in CASES[1:]]
         if not all(map(len, cases)):
             continue
         low, high = bootstrap_interval(cases, interquartile_mean)
@@ -102,15 +105,15 @@ def overall(sweep: pd.DataFrame) -> str:
 
 def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
     """The figures of a sweep, each with its name."""
-    if sweep["label"].nunique() <= SIDE_BY_SIDE:
+    if len({*sweep["label"]}) <= SIDE_BY_SIDE:
         for noise, runs in sweep.groupby("noise"):
             yield f"learning-{noise}", learning_figure(runs)
-            yield f"constraints-{noise}", constraints_figure(runs[runs["constraint"] != "fixed"])
+            yield f"constraints-{noise}", constraints_figure(runs.query("constraint != 'fixed'"))
             yield f"trajectories-{noise}", trajectories_figure(runs)
         yield "meaning", meaning_figure(sweep)
-    elif sweep["real"].any():
+    elif has_real(sweep):
         yield "frontier", frontier_figure(sweep)
-    if "ablation" in sweep and sweep["ablation"].nunique() > 1 and sweep["real"].any():
+    if "ablation" in sweep and len({*sweep["ablation"]}) > 1 and has_real(sweep):
         yield "ablation", ablation_figure(sweep)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pandas as pd
 from matplotlib import colormaps
@@ -11,13 +9,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torch_qpmpc.experiment import evaluate
-from torch_qpmpc.finished import CASES, FinishedRun, canonical
+from torch_qpmpc.finished import CASES, FinishedRun, canonical, has_real
 from torch_qpmpc.plots import draw_matrix, draw_positions
 from torch_qpmpc.statistics import bootstrap_interval, interquartile_mean
 
 
-def colours(labels: Sequence[str]) -> dict[str, tuple]:
+def colours(frame: pd.DataFrame) -> dict[str, tuple]:
     """One for each label; the paper's cases always have the same."""
+    labels = frame["label"].unique().tolist()
     palette = colormaps["tab10"].colors  # pyright: ignore[reportAttributeAccessIssue] -- no stubs
     order = [*CASES, *(label for label in labels if label not in CASES)]
     return {label: palette[i % len(palette)] for i, label in enumerate(order)}
@@ -41,7 +40,7 @@ def draw_J(axes: Axes, frame: pd.DataFrame) -> None:
     """The paper's J against updates, between the means of its two ends."""
     for label, runs in frame.groupby("label", sort=False):
         x, J = curves(runs, "eval/J")
-        draw_band(axes, x, J, str(label), colours(frame["label"].unique())[str(label)])
+        draw_band(axes, x, J, str(label), colours(frame)[str(label)])
     for name, style in (("J_start", "k:"), ("J_true_model", "k--")):
         end = interquartile_mean(frame.drop_duplicates("seed")[name].to_numpy())
         axes.plot([], [], style, label={"J_start": "start"}.get(name, "true model"))
@@ -52,12 +51,12 @@ def draw_J(axes: Axes, frame: pd.DataFrame) -> None:
 
 def draw_gap(axes: Axes, frame: pd.DataFrame) -> None:
     """What is left of the gap against updates, for the seeds with a real one."""
-    real = frame[frame["real"]]
+    real = frame.query("real")
     for label, runs in real.groupby("label", sort=False):
         start, true = (runs[name].to_numpy()[:, None] for name in ("J_start", "J_true_model"))
         x, J = curves(runs, "eval/J")
         left = (J - true) / (start - true)
-        draw_band(axes, x, left, str(label), colours(frame["label"].unique())[str(label)])
+        draw_band(axes, x, left, str(label), colours(frame)[str(label)])
     axes.set(xlabel="update", ylabel="gap left, (J - J true) / (J start - J true)")
     axes.set_yscale("symlog", linthresh=0.1)
     axes.set_yticks([0, 0.02, 0.05, 0.1, 0.2, 0.5, 1], ["0", ".02", ".05", ".1", ".2", ".5", "1"])
@@ -70,7 +69,7 @@ def learning_figure(frame: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     draw_J(left, frame)
-    if frame["real"].any():
+    if has_real(frame):
         draw_gap(right, frame)
     seeds = sorted(frame["seed"].unique())
     figure.suptitle(f"{frame['noise'].iloc[0]} noise: interquartile mean over seeds {seeds}, 95%")
@@ -79,12 +78,13 @@ def learning_figure(frame: pd.DataFrame) -> Figure:
 
 def shown_seed(frame: pd.DataFrame) -> int:
     """The first seed that had a real gap; the first, if none had."""
-    return int(min(frame["seed"][frame["real"]], default=frame["seed"].min()))
+    seeds: list[int] = (frame.query("real") if has_real(frame) else frame)["seed"].tolist()
+    return min(seeds)
 
 
 def constraints_figure(frame: pd.DataFrame) -> Figure:
     """The paper's figures 2 and 4: C_theta of each case beside C_0, raw and, below, canonical."""
-    runs = frame[frame["seed"] == shown_seed(frame)]
+    runs = frame.query(f"seed == {shown_seed(frame)}")
     figure = Figure(figsize=(4 * (len(runs) + 1), 6), layout="constrained")
     panels = figure.subplots(2, len(runs) + 1, squeeze=False)
     start: FinishedRun = runs["run"].iloc[0]
@@ -100,7 +100,7 @@ def constraints_figure(frame: pd.DataFrame) -> Figure:
 
 def trajectories_figure(frame: pd.DataFrame) -> Figure:
     """Closed-loop paths of each case between its two ends, and the QP's first predictions."""
-    runs = frame[frame["seed"] == shown_seed(frame)]
+    runs = frame.query(f"seed == {shown_seed(frame)}")
     figure = Figure(figsize=(4 * len(runs), 4.5), layout="constrained")
     for axes, label, run in zip(
         figure.subplots(1, len(runs), squeeze=False)[0], runs["label"], runs["run"], strict=True
@@ -116,7 +116,7 @@ def trajectories_figure(frame: pd.DataFrame) -> Figure:
 def draw_meaning(axes: Axes, frame: pd.DataFrame) -> None:
     """The error of the model read from C against that of the start's."""
     for label, runs in frame.groupby("label", sort=False):
-        colour = [colours(frame["label"].unique())[str(label)]]
+        colour = [colours(frame)[str(label)]]
         axes.scatter(runs["model_error_start"], runs["model_error"], c=colour, s=14, label=label)
     ends = [frame["model_error_start"].min() * 0.9, frame["model_error_start"].max() * 1.1]
     axes.plot(ends, ends, "k--", linewidth=1)
@@ -126,10 +126,10 @@ def draw_meaning(axes: Axes, frame: pd.DataFrame) -> None:
 
 def draw_use(axes: Axes, frame: pd.DataFrame) -> None:
     """What is left of the gap against how much nearer the truth the model came."""
-    real = frame[frame["real"]]
+    real = frame.query("real")
     for label, runs in real.groupby("label", sort=False):
         ratio = runs["model_error"] / runs["model_error_start"]
-        colour = [colours(frame["label"].unique())[str(label)]]
+        colour = [colours(frame)[str(label)]]
         axes.scatter(ratio, 1 - runs["closed_gap"], c=colour, s=14, label=label)
     axes.axvline(1, color="k", linestyle="--", linewidth=1)
     axes.set(xlabel="model error, learned / corrupted", ylabel="gap left", xscale="log")
@@ -151,7 +151,7 @@ def frontier_figure(frame: pd.DataFrame) -> Figure:
 
     Right and low is structure; up is return; bright is a model that predicts.
     """
-    real = frame[frame["real"]].assign(ratio=lambda f: f["model_error"] / f["model_error_start"])
+    real = frame.query("real").assign(ratio=lambda f: f["model_error"] / f["model_error_start"])
     names = ["distance", "closed_gap", "ratio"]
     medians = real.groupby("label", sort=False)[names].median()
     figure = Figure(figsize=(9, 6), layout="constrained")
@@ -170,14 +170,14 @@ def frontier_figure(frame: pd.DataFrame) -> Figure:
 
 def ablation_figure(frame: pd.DataFrame) -> Figure:
     """The closed gap of each ablation: every run, the median and its interval, for each noise."""
-    real = frame[frame["real"]]
+    real = frame.query("real")
     noises = sorted(real["noise"].unique())
-    figure = Figure(figsize=(5 * len(noises), 0.4 * real["ablation"].nunique() + 1.5))
+    figure = Figure(figsize=(5 * len(noises), 0.4 * len({*real["ablation"]}) + 1.5))
     figure.set_layout_engine("constrained")
     for axes, noise in zip(
         figure.subplots(1, len(noises), squeeze=False, sharey=True)[0], noises, strict=True
     ):
-        groups = real[real["noise"] == noise].groupby("ablation")["closed_gap"]
+        groups = real.query(f"noise == {noise!r}").groupby("ablation")["closed_gap"]
         for height, (_, gaps) in enumerate(groups):
             low, high = bootstrap_interval([gaps.to_numpy()])
             axes.plot(gaps, [height] * len(gaps), ".", color="0.7")
@@ -195,7 +195,7 @@ def readme_figure(frame: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(4 * (len(noises) + 1), 3.6), layout="constrained")
     panels = figure.subplots(1, len(noises) + 1)
     for axes, noise in zip(panels, noises, strict=False):
-        draw_gap(axes, frame[frame["noise"] == noise])
+        draw_gap(axes, frame.query(f"noise == {noise!r}"))
         axes.set_title(f"{noise} noise")
     draw_meaning(panels[-1], frame)
     panels[-1].legend(fontsize="small")
