@@ -6,6 +6,7 @@
     python train.py task=gros_zanon solver=daqp         another plant, from one long episode
     python train.py -m constraint=fixed,free seed=1,2   a sweep
     python train.py resume=runs/point_mass/..           go on with a run that was stopped
+    python train.py -m +study=paper                     the paper's study; goes on where it stopped
     tensorboard --logdir runs                           watch it
 
 configs/ holds every key. The run's folder gets config.yaml, metrics.csv, TensorBoard events,
@@ -23,6 +24,7 @@ from typing import Any
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 from tqdm import tqdm
@@ -45,12 +47,17 @@ from torch_qpmpc.interrupt import Interrupt
 from torch_qpmpc.plots import summary_figure
 from torch_qpmpc.replay import ACTIVE_SET, make_replay
 from torch_qpmpc.snapshot import Tally, folder_of, restore, resumed, snapshot
+from torch_qpmpc.sweeps import finished_run
 from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc, true_model
 from torch_qpmpc.tracking import RunFolder
 
 
-def train(cfg: DictConfig, folder: str, state: dict[str, Any] | None = None) -> dict[str, Any]:
+def train(
+    cfg: DictConfig, folder: str, state: dict[str, Any] | None = None, quiet: bool = False
+) -> dict[str, Any]:
     """One run, from its beginning or from a checkpoint's ``state``.
+
+    ``quiet``, as one run of a sweep is, it prints nothing, and leaves signals to the launcher.
 
     Returns:
         What summary.json holds.
@@ -91,7 +98,9 @@ def train(cfg: DictConfig, folder: str, state: dict[str, Any] | None = None) -> 
 
     with contextlib.ExitStack() as stack:
         stack.callback(collector.shutdown)
-        interrupt = stack.enter_context(Interrupt())
+        interrupt = Interrupt()
+        if not quiet:
+            stack.enter_context(interrupt)
         run = stack.enter_context(
             RunFolder(folder, cfg, None if state is None else state["update"])
         )
@@ -110,6 +119,7 @@ def train(cfg: DictConfig, folder: str, state: dict[str, Any] | None = None) -> 
             desc=f"{cfg.constraint.name}, {cfg.noise.name}",
             initial=tally.update,
             total=cfg.updates,
+            disable=quiet,
         )
         for update in progress:
             began = time.perf_counter()
@@ -168,10 +178,11 @@ def train(cfg: DictConfig, folder: str, state: dict[str, Any] | None = None) -> 
         if learned_mpc is not None:
             summary |= structure_summary(mpc, true_model(physics))
         run.finish(summary)
-        if learned_mpc is not None:
+        if cfg.figures and learned_mpc is not None:
             figure = summary_figure(mpc, loops, *run.column("eval/J"))
             figure.savefig(run.path / "summary.png", dpi=110)
-    print(f"\n{table(summary)}\n\n{run.path}")
+    if not quiet:
+        print(f"\n{table(summary)}\n\n{run.path}")
     return summary
 
 
@@ -184,16 +195,22 @@ LOGGED = ("td_error", "pred_value", "target_value", "unsolved")
 @hydra.main(version_base="1.3", config_path="configs", config_name="config")
 def main(cfg: DictConfig) -> float:
     """Train; a sweep's optimiser maximises the closed gap that this returns."""
+    ours = HydraConfig.get()
+    folder, sweep, state = ours.runtime.output_dir, ours.mode is RunMode.MULTIRUN, None
     try:
-        hydra_cfg = HydraConfig.get()
-        state = None
         if cfg.resume is not None:
-            cfg, state = resumed(cfg.resume, list(hydra_cfg.overrides.task))
+            cfg, state = resumed(cfg.resume, list(ours.overrides.task))
         check_config(cfg)
+        done = finished_run(folder, cfg) if sweep else None
     except QPError as error:
+        if sweep:
+            raise  # an exit would end the other runs, too
         raise SystemExit(str(error)) from None
-    return train(cfg, hydra_cfg.runtime.output_dir, state)["closed_gap"]
+    return (done or train(cfg, folder, state, quiet=sweep))["closed_gap"]
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        raise SystemExit("\nstopped") from None

@@ -87,6 +87,7 @@ RULES: dict[str, Rule] = {
     "release": (lambda x: x is None or _whole(1)[0](x), "a whole number >= 1, or null"),
     "resume": (lambda x: x is None or NAME[0](x), "a path, or null"),
     "ablation": (lambda x: x is None or NAME[0](x), "a name, or null"),
+    "figures": FLAG,
     "eval_interval": _whole(1),
     "log_interval": _whole(1),
     "algo.name": _one_of("qlearning", "ddpg", "td3"),

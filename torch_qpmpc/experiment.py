@@ -180,7 +180,7 @@ def evaluate(
 def report(
     run: RunFolder, mpc: QPMPC | None, loops: dict[str, ClosedLoop], update: int
 ) -> dict[str, Any]:
-    """Log an evaluation: J between its two ends, what C says, raw and canonical, and the figures.
+    """Log an evaluation: J between its two ends, what C says, raw and canonical, and figures if wanted.
 
     Before the first update, J alone.
 
@@ -197,8 +197,9 @@ def report(
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
     distances |= structure_metrics(mpc)
     run.log({f"structure/{name}": distance for name, distance in distances.items()}, update)
-    run.figure("structure/C", constraint_figure(mpc), update)
-    run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
+    if run.cfg.figures:
+        run.figure("structure/C", constraint_figure(mpc), update)
+        run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
     return summary
 
 

@@ -1,70 +1,173 @@
-"""Tables of finished runs: ``python -m torch_qpmpc.report RUNS_FOLDER``."""
+"""Tables and figures of finished runs: ``python -m torch_qpmpc.report RUNS_FOLDER``.
+
+They go to RUNS_FOLDER/report, a folder for each sweep: the paper's four figures, with intervals
+over seeds (learning-NOISE.png are its figures 1 and 3, constraints-NOISE.png its 2 and 4),
+closed-loop paths, what the learned C means, and, where settings were swept, the frontier and the
+ablations.
+"""
 
 from __future__ import annotations
 
 import argparse
-import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
+from matplotlib.figure import Figure
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.finished import CASES, REAL_GAP, collect, has_real
+from torch_qpmpc.markdown import replaced, table
+from torch_qpmpc.statistics import bootstrap_interval, interquartile_mean
+from torch_qpmpc.study_plots import (
+    ablation_figure,
+    constraints_figure,
+    frontier_figure,
+    learning_figure,
+    meaning_figure,
+    readme_figure,
+    trajectories_figure,
+)
 
-CASES = ("fixed", "free", "deviation", "si", "combined")
-COLUMNS = ("J_start", "J_final", "J_true_model", "closed_gap", "unsolved", "train_seconds")
-
-
-def collect(folder: str | Path) -> pd.DataFrame:
-    """The summary.json of every run below ``folder``, one row a run.
-
-    Raises:
-        QPError: there is none.
-    """
-    files = sorted(Path(folder).rglob("summary.json"))
-    if not files:
-        raise QPError.expected(
-            "RUNS_FOLDER", f"{folder}, without a finished run", "a folder that train.py wrote to"
-        )
-    frame = pd.DataFrame([json.loads(file.read_text(encoding="utf-8")) for file in files])
-    known = pd.Categorical(
-        frame["constraint"], [*CASES, *sorted({*frame["constraint"]} - {*CASES})]
-    )
-    return frame.assign(constraint=known).sort_values(["noise", "constraint", "seed"])
+#: So many settings fit side by side in a figure.
+SIDE_BY_SIDE = 8
+CAPTION = f"""\
+Closed gap: median and 95% interval (bootstrapped over seeds) of the runs with a real gap, J_start -
+J_true_model >= {REAL_GAP:.0f}; how many of all these are. The others are medians over all runs.
+Distance: of C's predictions to those of the nearest time-invariant MPC scheme, as a share. Model
+error: root mean square of one step predicted by that scheme's (A, B), and of the corrupted (A, B)
+at the start; how often it is the smaller."""
 
 
 def runs_table(frame: pd.DataFrame) -> str:
     """Every run with its two ends, as Markdown."""
-    rows = pd.DataFrame({name: frame[name] for name in ("noise", "constraint", "seed", *COLUMNS)})
-    for name, digits in (("closed_gap", 3), ("train_seconds", 1)):
-        rows[name] = rows[name].round(digits)
-    for name in ("J_start", "J_final", "J_true_model"):
-        rows[name] = rows[name].round(1)
-    return _markdown(rows)
+    head = ["sweep", "noise", "case", "seed", "J_start", "J_final", "J_true_model", "closed_gap"]
+    head += ["distance", "model_error", "model_error_start", "unsolved", "train_seconds"]
+    digits: dict[str, str] = dict.fromkeys(
+        ("J_start", "J_final", "J_true_model", "train_seconds"), ".1f"
+    )
+    digits |= dict.fromkeys(("closed_gap", "distance"), ".3f")
+    digits |= dict.fromkeys(("model_error", "model_error_start"), ".4f")
+    rows = frame.assign(case=frame["label"])[head].itertuples(index=False)
+    lines = [
+        [f"{value:{digits.get(name, '')}}" for name, value in zip(head, row, strict=True)]
+        for row in rows
+    ]
+    return table(head, lines)
 
 
-def cases_table(frame: pd.DataFrame) -> str:
-    """Median, and range over the seeds, of the closed gap by case and noise, as Markdown."""
-    groups = frame.groupby(["constraint", "noise"], observed=True)["closed_gap"]
-    cells = groups.agg(lambda gap: f"{gap.median():.2f} ({gap.min():.2f} to {gap.max():.2f})")
-    return _markdown(cells.unstack(fill_value="-").reset_index())
+def cases_table(sweep: pd.DataFrame) -> str:
+    """A sweep by noise and case, as Markdown."""
+    lines = []
+    for noise, label in dict.fromkeys(zip(sweep["noise"], sweep["label"], strict=True)):
+        runs = sweep.query(f"noise == {noise!r} and label == {label!r}")
+        real = runs.query("real")["closed_gap"].to_numpy()
+        median = runs.median(numeric_only=True)
+        nearer = (runs["model_error"] < runs["model_error_start"]).sum()
+        gap = "-"
+        if len(real):
+            low, high = bootstrap_interval([real])
+            gap = f"{pd.Series(real).median():.3f} [{low:.3f}, {high:.3f}]"
+        lines.append(
+            [
+                noise,
+                label,
+                f"{gap} ({len(real)} of {len(runs)})",
+                *_between_ends(median, "J"),
+                *_between_ends(median, "J_discounted"),
+                f"{median['distance']:.3f}",
+                f"{median['model_error_start']:.3f}",
+                f"{median['model_error']:.3f} ({nearer} of {len(runs)})",
+            ]
+        )
+    head = ["noise", "case", "closed gap", "J start", "J", "J true", "disc. start", "disc.", "true"]
+    return table([*head, "distance", "error at the start", "model error"], lines)
 
 
-def _markdown(frame: pd.DataFrame) -> str:
-    lines = [[str(name) for name in frame.columns], ["---"] * frame.shape[1]]
-    lines += [[str(value) for value in row] for row in frame.itertuples(index=False)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+def _between_ends(median: pd.Series, name: str) -> list[str]:
+    return [f"{median[f'{name}_{end}']:.1f}" for end in ("start", "final", "true_model")]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", metavar="RUNS_FOLDER", help="searched with all its subfolders")
+def overall(sweep: pd.DataFrame) -> str:
+    """The closed gap of the paper's learned cases together, each a stratum of the bootstrap."""
+    lines = []
+    for noise, runs in sweep.query("real").groupby("noise"):
+        cases = [runs.query(f"label == {case!r}")["closed_gap"].to_numpy() for case in CASES[1:]]
+        if not all(map(len, cases)):
+            continue
+        low, high = bootstrap_interval(cases, interquartile_mean)
+        mean = interquartile_mean(pd.Series([gap for case in cases for gap in case]).to_numpy())
+        lines.append(f"{noise} noise {mean:.3f} [{low:.3f}, {high:.3f}]")
+    if not lines:
+        return ""
+    return f"Interquartile mean over the four cases that learn C: {'; '.join(lines)}."
+
+
+def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
+    """The figures of a sweep, each with its name."""
+    if len({*sweep["label"]}) <= SIDE_BY_SIDE:
+        for noise, runs in sweep.groupby("noise"):
+            yield f"learning-{noise}", learning_figure(runs)
+            yield f"constraints-{noise}", constraints_figure(runs.query("constraint != 'fixed'"))
+            yield f"trajectories-{noise}", trajectories_figure(runs)
+        yield "meaning", meaning_figure(sweep)
+    elif has_real(sweep):
+        yield "frontier", frontier_figure(sweep)
+    if "ablation" in sweep and len({*sweep["ablation"]}) > 1 and has_real(sweep):
+        yield "ablation", ablation_figure(sweep)
+
+
+def write(frame: pd.DataFrame, folder: Path) -> str:
+    """Everything into ``folder``; returns the tables by case."""
+    parts = []
+    for name, sweep in frame.groupby("sweep"):
+        place = folder / str(name)
+        place.mkdir(parents=True, exist_ok=True)
+        links = []
+        for title, figure in figures(sweep):
+            figure.savefig(place / f"{title}.png", dpi=100)
+            links.append(f"![{title}]({(Path(str(name)) / title).as_posix()}.png)")
+        parts.append(((f"## {name}", section(sweep)), links))
+    tables = "\n\n".join("\n\n".join(text) for text, _ in parts)
+    whole = "\n\n".join("\n\n".join([*text, *links]) for text, links in parts)
+    (folder / "report.md").write_text(f"{CAPTION}\n\n{whole}\n", encoding="utf-8")
+    (folder / "runs.md").write_text(runs_table(frame) + "\n", encoding="utf-8")
+    return f"{CAPTION}\n\n{tables}"
+
+
+def section(sweep: pd.DataFrame) -> str:
+    """A sweep's table, and what its learned cases come to."""
+    return "\n\n".join(text for text in (cases_table(sweep), overall(sweep)) if text)
+
+
+def write_readme(frame: pd.DataFrame, readme: Path) -> None:
+    """The tables between the markers of a README, and notebooks/study.png beside it."""
+    text = readme.read_text(encoding="utf-8")
+    tables = [f"**{name}**\n\n{section(sweep)}" for name, sweep in frame.groupby("sweep")]
+    readme.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), "study"), encoding="utf-8")
+    first = max(frame.groupby("sweep"), key=lambda pair: pair[1]["closed_gap"].median())[1]
+    readme_figure(first).savefig(readme.parent / "notebooks" / "study.png", dpi=90)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m torch_qpmpc.report", description="Tables and figures of finished runs."
+    )
+    parser.add_argument(
+        "folder", type=Path, metavar="RUNS_FOLDER", help="searched with all its subfolders"
+    )
+    parser.add_argument(
+        "--readme", type=Path, help="write the tables between its lines <!-- study -->, too"
+    )
+    options = parser.parse_args(arguments)
     try:
-        frame = collect(parser.parse_args().folder)
+        frame = collect(options.folder)
+        print(write(frame, options.folder / "report"))
+        if options.readme:
+            write_readme(frame, options.readme)
     except QPError as error:
         raise SystemExit(str(error)) from None
-    seeds = sorted({*frame["seed"]})
-    print(f"{runs_table(frame)}\n\nClosed gap, median and range over seeds {seeds}:\n")
-    print(cases_table(frame))
+    print(f"\n{options.folder / 'report'}")
 
 
 if __name__ == "__main__":

@@ -85,7 +85,10 @@ class RunFolder:
             for key, value in summary.items()
         }
         text = json.dumps(finite, indent=2, allow_nan=False)
-        (self.path / "summary.json").write_text(text + "\n", encoding="utf-8")
+        # All at once: it is what tells a sweep that the run need not be done again.
+        partial = self.path / "summary.json.partial"
+        partial.write_text(text + "\n", encoding="utf-8")
+        partial.replace(self.path / "summary.json")
         plain = (bool, int, float, str)
         hparams = {
             key: value if isinstance(value, plain) else str(value)

@@ -20,11 +20,12 @@ import torch
 
 from tests.benchmarks import mpcrl_lti
 from tests.benchmarks.mpcrl_lti import Stream
-from tests.benchmarks.table import README, replaced, table
+from tests.benchmarks.table import README
 from tests.runs import make_config
 from torch_qpmpc import GaussNewton
 from torch_qpmpc.envs import GrosZanonLTI
 from torch_qpmpc.experiment import make_optimizer, make_schedule
+from torch_qpmpc.markdown import replaced, table
 from torch_qpmpc.tasks import make_mpc
 
 SEEDS, STEPS, LAST = (69, 1, 2, 3), 5000, 500

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from torch_qpmpc.markdown import replaced, table
+
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 RESULTS = ROOT / "runs" / "benchmark.json"
@@ -31,9 +33,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, help="format these results instead of running")
     parser.add_argument("--readme", type=Path, default=README, help="where the tables go")
     options = parser.parse_args(arguments)
-    replaced(options.readme.read_text(encoding="utf-8"), "")  # before waiting for minutes
+    replaced(
+        options.readme.read_text(encoding="utf-8"), "", "benchmark"
+    )  # before waiting for minutes
     results = json.loads((options.json or run()).read_text(encoding="utf-8"))
-    text = replaced(options.readme.read_text(encoding="utf-8"), tables(results))
+    text = replaced(options.readme.read_text(encoding="utf-8"), tables(results), "benchmark")
     options.readme.write_text(text, encoding="utf-8")
 
 
@@ -49,19 +53,6 @@ def run() -> Path:
         sys.exit(f"the benchmarks failed; {README.name} is as it was")
     print(f"results: {RESULTS}")
     return RESULTS
-
-
-def replaced(readme: str, text: str, marker: str = "benchmark") -> str:
-    """``readme`` with ``text`` between the two lines of the marker."""
-    begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
-    if (
-        readme.count(begin) != 1
-        or readme.count(end) != 1
-        or readme.index(begin) > readme.index(end)
-    ):
-        sys.exit(f"README: expected one line {begin} and below it one line {end}; add them")
-    before, after = readme.split(begin)[0], readme.split(end)[1]
-    return f"{before}{begin}\n{text}\n{end}{after}"
 
 
 def tables(results: dict[str, Any]) -> str:
@@ -211,12 +202,6 @@ def gpu(rows: list[Row]) -> str:
     head = ["", "torch on the GPU", "daqp on a core", "value"]
     caption = "**On a GPU**: QPs a second (V, theta moved before each round)."
     return f"{caption}\n\n{table(head, lines)}"
-
-
-def table(head: list[str], lines: list[list[str]]) -> str:
-    """Markdown, the first column to the left and the others to the right."""
-    rule = ["---"] + ["---:"] * (len(head) - 1)
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, rule, *lines))
 
 
 def _unique(items: Iterable[Any]) -> list[Any]:

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from tests.benchmarks.table import REFERENCE, main
+from torch_qpmpc import QPError
 
 BEGIN, END = "<!-- benchmark -->", "<!-- /benchmark -->"
 
@@ -66,5 +67,5 @@ def test_the_tables_replace_what_is_between_the_markers(results: Path, tmp_path:
 def test_a_readme_without_markers_is_refused(results: Path, tmp_path: Path) -> None:
     readme = tmp_path / "README.md"
     readme.write_text("nothing\n")
-    with pytest.raises(SystemExit, match=f"expected one line {BEGIN} and below it one line {END}"):
+    with pytest.raises(QPError, match=f"expected one line {BEGIN} and below it one line {END}"):
         main(["--json", str(results), "--readme", str(readme)])

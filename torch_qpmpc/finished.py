@@ -1,0 +1,190 @@
+"""Finished runs: what they wrote, as one table, and the QP that each has learned.
+
+What is read from a learned C here does not depend on its gauge.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from torch_qpmpc.canonical import PredictionForm, canonical_matrix, prediction_form
+from torch_qpmpc.checkpoint import load_checkpoint
+from torch_qpmpc.config import flatten
+from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc import QPMPC
+from torch_qpmpc.structure import Model, nearest_model, stage_models
+from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc
+
+#: The paper's, in its order.
+CASES = ("fixed", "free", "deviation", "si", "combined")
+#: The least J_start - J_true_model of a run whose closed gap says something.
+REAL_GAP = 50.0
+#: What differs between runs of one kind, or does not bear on what is learned.
+_NO_SETTING = ("seed", "figures", "threads", "log_interval", "eval_interval")
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedRun:
+    """A run's folder, read again.
+
+    Attributes:
+        folder: with config.yaml and checkpoint.pt.
+    """
+
+    folder: Path
+
+    @cached_property
+    def cfg(self) -> DictConfig:
+        cfg = OmegaConf.load(self.folder / "config.yaml")
+        assert isinstance(cfg, DictConfig)
+        return cfg
+
+    @cached_property
+    def physics(self) -> LinearSystem:
+        return make_physics(self.cfg)
+
+    @cached_property
+    def start(self) -> QPMPC:
+        """The QP that learning started from."""
+        return make_mpc(self.cfg, self.physics)
+
+    @cached_property
+    def true(self) -> QPMPC:
+        """The QP with the true model."""
+        return make_true_mpc(self.cfg, self.physics)
+
+    @cached_property
+    def learned(self) -> QPMPC:
+        """The QP that was learned."""
+        state = load_checkpoint(self.folder / "checkpoint.pt")
+        mpc = make_mpc(self.cfg, self.physics)
+        if state["structure"] != mpc.structure:
+            mpc.release(state["structure"])
+        mpc.load_state_dict(state["mpc"])
+        return mpc
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """metrics.csv by update."""
+        return pd.read_csv(self.folder / "metrics.csv").set_index("update")
+
+    def readings(self) -> dict[str, float]:
+        """What the learned constraints say.
+
+        The model read from them is the time-invariant one whose predictions are nearest. Its error
+        is the root mean square of ``A x + B u`` minus the true one's, over start states x and
+        actions u drawn uniformly from their bounds.
+
+        Returns:
+            ``distance`` of the predictions to that model's, as a share; ``model_error`` and, of
+            the model at the start, ``model_error_start``. The first two are nan where the
+            constraints do not determine the states.
+        """
+        true = nearest_model(predictions(self.true))
+        start = model_error(nearest_model(predictions(self.start)), true, self.physics)
+        try:
+            model = nearest_model(predictions(self.learned))
+        except QPError:
+            return {"distance": math.nan, "model_error": math.nan, "model_error_start": start}
+        return {
+            "distance": float(model.residual),
+            "model_error": model_error(model, true, self.physics),
+            "model_error_start": start,
+        }
+
+
+def has_real(frame: pd.DataFrame) -> bool:
+    """Whether any of `collect`'s runs had a gap worth closing."""
+    return any(frame["real"])
+
+
+def predictions(mpc: QPMPC) -> PredictionForm:
+    """X = Phi x_0 + Gamma U + phi of its constraints."""
+    return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
+
+
+def canonical(mpc: QPMPC) -> Tensor:
+    """Its C in the gauge in which that of an MPC scheme is banded."""
+    form = predictions(mpc)
+    return canonical_matrix(form, stage_models(form).A)[0]
+
+
+def model_error(model: Model, true: Model, physics: LinearSystem) -> float:
+    """Root mean square of one step's error, in units of the state."""
+    rng = np.random.default_rng(123)
+    x = physics.starts(rng, 1024)
+    share = torch.as_tensor(rng.random((1024, physics.B.shape[1])))
+    u = physics.lb_a + (physics.ub_a - physics.lb_a) * share
+    error = x @ (model.A - true.A).mT + u @ (model.B - true.B).mT + model.offset - true.offset
+    return error.square().sum(-1).mean().sqrt().item()
+
+
+def collect(folder: str | Path) -> pd.DataFrame:
+    """Every finished run below ``folder``: summary.json, what is read from the learned QP, and
+
+    ``run``, a `FinishedRun`; ``sweep``, the folder that it is in; ``label``, its case, and in what
+    settings it differs from others of the same case in that sweep; ``real``, whether there was a
+    gap worth closing.
+
+    Raises:
+        QPError: there is none.
+    """
+    folder = Path(folder)
+    files = sorted(folder.rglob("summary.json"))
+    if not files:
+        raise QPError.expected(
+            "RUNS_FOLDER", f"{folder}, without a finished run", "a folder that train.py wrote to"
+        )
+    rows = []
+    for file in files:
+        run = FinishedRun(file.parent)
+        summary = json.loads(file.read_text(encoding="utf-8"))
+        where = "." if file.parent == folder else str(file.parent.parent.relative_to(folder))
+        sweep = folder.resolve().name if where == "." else where
+        rows.append({**summary, "run": run, "sweep": sweep, **run.readings()})
+    frame = pd.DataFrame(rows)
+    # JSON's null.
+    frame["closed_gap"] = frame["closed_gap"].astype(float)
+    frame["closed_gap_discounted"] = frame["closed_gap_discounted"].astype(float)
+    frame["real"] = frame["J_start"] - frame["J_true_model"] >= REAL_GAP
+    frame["label"] = ""
+    for _, sweep in frame.groupby("sweep"):
+        frame.loc[sweep.index, "label"] = _labels(sweep)
+    order = [*CASES, *sorted({*frame["constraint"]} - {*CASES})]
+    rank = frame["constraint"].map(order.index)
+    keys = ["sweep", "noise", "rank", "label", "seed"]
+    return frame.assign(rank=rank).sort_values(keys, ignore_index=True).drop(columns="rank")
+
+
+def _labels(sweep: pd.DataFrame) -> list[str]:
+    settings = [_settings(run.cfg) for run in sweep["run"]]
+    values: dict[tuple[str, str], set[str]] = {}
+    for case, of_run in zip(sweep["constraint"], settings, strict=True):
+        for key, value in of_run.items():
+            values.setdefault((case, key), set()).add(str(value))
+    labels = []
+    for case, of_run in zip(sweep["constraint"], settings, strict=True):
+        varied = [key for key in of_run if len(values[case, key]) > 1]
+        labels.append(", ".join([case, *(f"{key.split('.')[-1]}={of_run[key]}" for key in varied)]))
+    return labels
+
+
+def _settings(cfg: DictConfig) -> dict[str, Any]:
+    everything = flatten(OmegaConf.to_container(cfg, resolve=True))
+    return {
+        key: value
+        for key, value in everything.items()
+        if key not in _NO_SETTING and not key.startswith("noise.")
+    }
