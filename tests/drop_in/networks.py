@@ -1,0 +1,69 @@
+"""The QPs that stand in for the networks of TorchRL's own tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict.nn import AddStateIndependentNormalScale
+from torch import nn
+
+from torch_qpmpc import QPMPC, QPActorValueOperator
+from torch_qpmpc.arguments import CONSTRAINTS, COST
+
+
+class Theta(QPMPC):
+    """A QPMPC whose constants are not buffers.
+
+    TorchRL's tests ask of every leaf of a network, buffers too, that it has a gradient and that it
+    moves. A QPMPC's buffers are constants (C_0, the discounts, which rows are soft) or parts of
+    theta that are not learned. Here the constants are plain attributes, and all parts are learned.
+    """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        for name, constant in list(self.named_buffers(recurse=False)):
+            delattr(self, name)
+            setattr(self, name, constant)
+
+
+def make_theta(n_x: int, n_u: int, unused: str | None = None) -> Theta:
+    """A small QP that learns all that enters, and of which all has a gradient in any batch.
+
+    Its linear cost pushes some actions to a bound and some beyond it. All entries of a part lie
+    between its smallest and its largest, in any order, without harm: where TorchRL is given one
+    module for an ensemble it fills the copies with such numbers. (In a script, give it a list.)
+    """
+    # Each call draws another start from the generator that the tests seed.
+    theta = Theta(
+        n_x,
+        n_u,
+        2,
+        state_bounds=([-0.5] * n_x, [0.5] * n_x),
+        action_bounds=([-0.5] * n_u, [0.5] * n_u),
+        stage_weight=0.5 + torch.rand(n_x + n_u),
+        state_slack=2.0,
+        action_slack=2.0,
+        learn=[part for part in (*COST, *CONSTRAINTS) if part != unused],
+        solver="daqp",
+        seed=int(torch.randint(2**31, ())),
+    )
+    stage = torch.cat((torch.linspace(-1, 1, n_x), torch.linspace(-4, 4, n_u)))
+    theta.q.data += torch.cat((stage, stage, torch.linspace(-1, 1, n_x)))
+    return theta
+
+
+def make_policy(n_x: int, n_u: int, observation: Any = "observation") -> Any:
+    """A deterministic actor. It learns nothing of c, as no action depends on it."""
+    mpc = make_theta(n_x, n_u, unused="c")
+    return QPActorValueOperator(mpc, observation_key=observation).get_policy_operator()
+
+
+def make_gaussian(n_x: int, n_u: int) -> nn.Module:
+    """The QP's action as the location of a distribution, and a learned scale."""
+    return nn.Sequential(make_policy(n_x, n_u), AddStateIndependentNormalScale(n_u))
+
+
+def make_critic(n_x: int, n_u: int, **keys: Any) -> Any:
+    """-Q, under the keys that a test may rename."""
+    return QPActorValueOperator(make_theta(n_x, n_u), **keys)

@@ -1,0 +1,201 @@
+"""TorchRL's losses, small, with the QP in one or more of their roles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import (
+    AddStateIndependentNormalScale,
+    NormalParamExtractor,
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torch import Tensor, nn
+from torchrl.data import Bounded
+from torchrl.modules import (
+    ProbabilisticActor,
+    QValueActor,
+    TanhNormal,
+    ValueOperator,
+)
+from torchrl.objectives import (
+    A2CLoss,
+    ClipPPOLoss,
+    CQLLoss,
+    DDPGLoss,
+    DQNLoss,
+    IQLLoss,
+    LossModule,
+    REDQLoss,
+    ReinforceLoss,
+    SACLoss,
+    TD3BCLoss,
+    TD3Loss,
+)
+
+from tests.problems import random_mpc, random_states
+from torch_qpmpc import QPMPC, QPActorValueOperator, QPQLearningLoss
+
+GAMMA = 0.9
+#: The action's bounds, and a grid over them for DQN.
+BOUND = 1.0
+GRID = torch.linspace(-BOUND, BOUND, 5).unsqueeze(-1)
+
+
+def make_mpc(seed: int) -> QPMPC:
+    """A QP with a start of its own; its bounds are buffers."""
+    learn = ("H", "q", "c", "C", "b")
+    bounds = ([-BOUND], [BOUND])
+    return random_mpc(seed, learn=learn, state_slack=5.0, action_bounds=bounds)
+
+
+def critic(seed: int = 1, **keys: Any) -> Any:
+    return QPActorValueOperator(make_mpc(seed), **keys)
+
+
+def critics(count: int = 2) -> Any:
+    """An ensemble: a list, as TorchRL would fill copies of one module with random numbers."""
+    return [critic(seed) for seed in range(1, count + 1)]
+
+
+def value(seed: int = 9, **keys: Any) -> Any:
+    return critic(seed, **keys).get_value_operator()
+
+
+def policy(seed: int = 0, **keys: Any) -> Any:
+    return critic(seed, **keys).get_policy_operator()
+
+
+def network_policy() -> Any:
+    net = nn.Sequential(nn.Linear(2, 1), nn.Tanh())
+    return TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
+
+
+def network_critic() -> Any:
+    class Net(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layers = nn.Sequential(nn.Linear(3, 8), nn.Tanh(), nn.Linear(8, 1))
+
+        def forward(self, s: Tensor, a: Tensor) -> Tensor:
+            return self.layers(torch.cat((s, a), -1))
+
+    return ValueOperator(Net(), in_keys=["observation", "action"])
+
+
+def stochastic(location: Any) -> Any:
+    """A policy that explores by itself, around what ``location`` writes."""
+    return ProbabilisticActor(
+        location,
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": -BOUND, "high": BOUND},
+        spec=Bounded(-BOUND, BOUND, (1,)),
+        return_log_prob=True,
+    )
+
+
+def network_gaussian() -> Any:
+    net = nn.Sequential(nn.Linear(2, 2), NormalParamExtractor())
+    return stochastic(TensorDictModule(net, ["observation"], ["loc", "scale"]))
+
+
+def qp_gaussian() -> Any:
+    """The QP as the mean of a stochastic policy, with a learned scale."""
+    scale = TensorDictModule(AddStateIndependentNormalScale(1), ["loc"], ["loc", "scale"])
+    return stochastic(TensorDictSequential(policy(action_key="loc"), scale))
+
+
+def grid_critic() -> Any:
+    """-Q of each action of a grid, for DQN."""
+
+    class Net(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.mpc = make_mpc(1)
+
+        def forward(self, s: Tensor) -> Tensor:
+            batch = (*s.shape[:-1], len(GRID), -1)
+            return -self.mpc.action_value(s.unsqueeze(-2).expand(batch), GRID.expand(batch))
+
+    return QValueActor(Net(), in_keys=["observation"], action_space="one_hot")
+
+
+#: By what is a QP and where.
+LOSSES: dict[str, Callable[[], LossModule]] = {
+    "critic of DDPG": lambda: DDPGLoss(network_policy(), critic(), delay_actor=True),
+    "critics of TD3": lambda: TD3Loss(network_policy(), critics(), bounds=(-BOUND, BOUND)),
+    "critics of TD3+BC": lambda: TD3BCLoss(network_policy(), critics(), bounds=(-BOUND, BOUND)),
+    "critics of SAC": lambda: SACLoss(network_gaussian(), critics()),
+    "critics of REDQ": lambda: REDQLoss(
+        network_gaussian(), critics(3), num_qvalue_nets=3, target_entropy=-1.0
+    ),
+    "critics of CQL": lambda: CQLLoss(network_gaussian(), critics()),
+    "critics and value of IQL": lambda: IQLLoss(network_gaussian(), critics(), value()),
+    "critic of DQN": lambda: DQNLoss(grid_critic(), action_space="one_hot"),
+    "V and Q of Q-learning": lambda: QPQLearningLoss(critic(), delay_value=True),
+    "actor of DDPG": lambda: DDPGLoss(policy(), network_critic(), delay_actor=True),
+    "actor of TD3": lambda: TD3Loss(policy(), network_critic(), bounds=(-BOUND, BOUND)),
+    "actor of TD3+BC": lambda: TD3BCLoss(policy(), network_critic(), bounds=(-BOUND, BOUND)),
+    "actor and critic of DDPG": lambda: DDPGLoss(policy(), critic(), delay_actor=True),
+    "actor and critics of TD3": lambda: TD3Loss(policy(), critics(), bounds=(-BOUND, BOUND)),
+    "mean and critics of SAC": lambda: SACLoss(qp_gaussian(), critics()),
+    "value and critics of SAC v1": lambda: SACLoss(network_gaussian(), critics(), value()),
+    "value of A2C": lambda: A2CLoss(network_gaussian(), value()),
+    "value of PPO": lambda: ClipPPOLoss(network_gaussian(), value()),
+    "value of REINFORCE": lambda: ReinforceLoss(network_gaussian(), value()),
+    "mean and value of PPO": lambda: ClipPPOLoss(qp_gaussian(), value()),
+}
+#: Those whose estimator is GAE by default, as they learn from whole trajectories of the policy.
+ON_POLICY = [name for name in LOSSES if any(x in name for x in ("A2C", "PPO", "REINFORCE"))]
+#: Those that call an ensemble under vmap.
+ENSEMBLES = [name for name in LOSSES if "critics" in name or "TD3" in name]
+
+
+def make_loss(name: str, estimator: str | None = None, seed: int = 0) -> LossModule:
+    """One of `LOSSES`, with its networks drawn and its estimator made."""
+    torch.manual_seed(seed)
+    loss = LOSSES[name]()
+    loss.make_value_estimator(estimator, gamma=GAMMA)
+    return loss
+
+
+def make_batch(loss: LossModule | None = None, *shape: int) -> TensorDict:
+    """Transitions along the last dimension, some of which end; with log-probabilities if asked."""
+    *batch, steps = shape or (4, 5)
+    s = random_states(20 * (steps + 1), seed=3)[: torch.Size((*batch, steps + 1)).numel()]
+    s = s.float().view(*batch, steps + 1, 2)
+    ended = random_states(1000, 1, size=1.0, seed=4)[: torch.Size((*batch, steps)).numel()]
+    ended = ended.view(*batch, steps, 1)
+    action = random_states(1000, 1, size=BOUND, seed=5)[: ended.numel()]
+    after = TensorDict(
+        observation=s[..., 1:, :].clone(),
+        reward=-s[..., 1:, :].square().sum(-1, keepdim=True),
+        done=ended > 0.5,
+        terminated=ended > 0.8,
+        batch_size=(*batch, steps),
+    )
+    td = TensorDict(
+        observation=s[..., :-1, :].clone(),
+        action=action.float().view(*batch, steps, 1),
+        next=after,
+        batch_size=(*batch, steps),
+        names=[None] * len(batch) + ["time"],
+    )
+    if isinstance(loss, DQNLoss):
+        nearest = (td["action"] - GRID.flatten()).abs().argmin(-1)
+        td["action"] = nn.functional.one_hot(nearest, len(GRID))
+    if isinstance(loss, A2CLoss | ClipPPOLoss | ReinforceLoss):
+        with torch.no_grad(), loss.actor_network_params.to_module(loss.actor_network):
+            loss.actor_network(td)
+    return td
+
+
+def total(loss: LossModule, batch: TensorDict, seed: int = 0) -> Tensor:
+    """The sum of a loss module's losses, whose noise is seeded."""
+    torch.manual_seed(seed)
+    out = loss(batch.copy())
+    return torch.stack([out[key] for key in out.keys() if key.startswith("loss")]).sum()
