@@ -9,33 +9,17 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import MultiStep
-from torchrl.envs import InitTracker, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import OrnsteinUhlenbeckProcessModule
-from torchrl.objectives import CQLLoss, DDPGLoss, HardUpdate, SACLoss, SoftUpdate, TD3Loss
-from torchrl.objectives.value import GAE
+from torchrl.objectives import HardUpdate, SoftUpdate
 
 from tests.losses import (
-    BOUND,
     ENSEMBLES,
-    GAMMA,
     LOSSES,
     ON_POLICY,
-    critic,
-    critics,
     make_batch,
     make_loss,
-    network_gaussian,
-    network_policy,
-    policy,
     total,
-    value,
 )
-from torch_qpmpc import SolverError
-from torch_qpmpc.envs import PointMassEnv
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 OFF_POLICY = [name for name in LOSSES if name not in ON_POLICY]

@@ -14,6 +14,7 @@ operator alone is not.
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -25,9 +26,10 @@ from torch_qpmpc.batching import align, broadcast, outer, sum_to, weighted_sum
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.qp import QPSolution, QuadraticProgram, Status, slacks
-from torch_qpmpc.sensitivity import SolutionGradient
+from torch_qpmpc.sensitivity import differentiable, is_differentiating, traceable
 from torch_qpmpc.solvers import backend
 from torch_qpmpc.solvers.chain import RawSolution, solve_programs
+from torch_qpmpc.tangents import value_tangent
 
 ON_FAILURE = ("raise", "warn", "mask")
 #: Event dimensions of the operator's tensors: H, q, c, C, b, G, lb, ub, w, fixed, a warm start.
@@ -85,8 +87,8 @@ def solve_qp(
     value, z, _, chi, lam, xi, status, residual, iterations = _solve(
         *theta, start, keep, solver, on_failure
     )
-    if torch.is_grad_enabled():
-        z, lam, chi, xi = SolutionGradient.apply(z, lam, chi, xi, status, *theta, keep)
+    if is_differentiating():
+        z, lam, chi, xi = differentiable(z, lam, chi, xi, status, *theta, keep)
     return QPSolution(qp, value, z, chi, lam, xi, status, residual, iterations)
 
 
@@ -100,7 +102,9 @@ def optimal_value(
 
 def _solve(*arguments: Any) -> Outputs:
     # The Function's bookkeeping takes as long as solving some ten QPs.
-    return QPValue.apply(*arguments) if torch.is_grad_enabled() else solve_op(*arguments)
+    if not is_differentiating():
+        return solve_op(*arguments)
+    return traceable(QPTangent, QPValue, solve_op)(*arguments)
 
 
 def _operands(qp: QuadraticProgram, fixed: Tensor) -> tuple[Tensor, ...]:
@@ -149,6 +153,10 @@ def _checked_keep(qp: QuadraticProgram, fixed: Tensor, keep: int | None) -> int:
     if not n_f <= keep <= qp.n_z:
         raise QPError.expected("keep", keep, f"n_f = {n_f} <= keep <= n_z = {qp.n_z}")
     return keep
+
+
+# OpenMP's threads do not survive a fork: in the child torch, too, would wait for them for ever.
+os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 @torch.library.custom_op("torch_qpmpc::solve", mutates_args=())
@@ -250,16 +258,22 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
     if grad_value is None:
         return (None,) * (N_THETA + N_OTHERS)
     *theta, z, sigma, chi, lam, xi, status = ctx.saved_tensors
-    if torch.is_grad_enabled() and not torch.compiler.is_compiling():
-        # For second derivatives the solution must depend on the data here.
-        z, lam, chi, xi = SolutionGradient.apply(z, lam, chi, xi, status, *theta, ctx.keep)
-        sigma = slacks(z, *theta[5:9])
+    if is_differentiating() and not torch.compiler.is_compiling():
+        z, sigma, chi, lam, xi = _tied(ctx.keep, theta, z, chi, lam, xi, status)
     # An unsolved element has zeros here, but zero times an infinite incoming gradient is NaN.
     weight = torch.where(status.eq(int(Status.SOLVED)), grad_value, 0)
     gradients = envelope_gradients(weight, z, sigma, chi, lam, xi).values()
     needed = ctx.needs_input_grad[:N_THETA]
     found = (f(x) if need else None for f, x, need in zip(gradients, theta, needed, strict=True))
     return (*found, *(None,) * N_OTHERS)
+
+
+def _tied(
+    keep: int, theta: list[Tensor], z: Tensor, chi: Tensor, lam: Tensor, xi: Tensor, status: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """z, sigma, chi, lam, xi as second derivatives need them: dependent on the data."""
+    z, lam, chi, xi = differentiable(z, lam, chi, xi, status, *theta, keep)
+    return z, slacks(z, *theta[5:9]), chi, lam, xi
 
 
 def envelope_gradients(
@@ -306,3 +320,23 @@ class QPValue(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
         return QPValue.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9
+
+
+class QPTangent(QPValue):
+    """And in forward mode, which Dynamo does not trace."""
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
+        QPValue.setup_context(ctx, inputs, output)
+        ctx.save_for_forward(*ctx.to_save)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple:
+        *theta, z, _, chi, lam, xi, status = ctx.saved_tensors
+        z, sigma, chi, lam, xi = _tied(ctx.keep, theta, z, chi, lam, xi, status)
+        tangent = value_tangent(tangents[:N_THETA], z, sigma, chi, lam, xi)
+        return torch.where(status.eq(int(Status.SOLVED)), tangent, 0), *(None,) * 8
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
+        return QPTangent.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9

@@ -180,7 +180,7 @@ def evaluate(
 def report(
     run: RunFolder, mpc: QPMPC | None, loops: dict[str, ClosedLoop], update: int
 ) -> dict[str, Any]:
-    """Log an evaluation: J between its two ends, what C says, raw and canonical, and figures if wanted.
+    """Log an evaluation: J between its two ends, what C says, and figures if wanted.
 
     Before the first update, J alone.
 

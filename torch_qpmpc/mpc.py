@@ -35,6 +35,7 @@ from torch_qpmpc.parametrizations import (
     Symmetric,
     Tied,
 )
+from torch_qpmpc.precision import full_precision
 from torch_qpmpc.qp import QPSolution, QuadraticProgram
 from torch_qpmpc.solvers import backend
 from torch_qpmpc.steps import CHOLESKY, NEAREST
@@ -157,20 +158,25 @@ class QPMPC(nn.Module):
         self._arguments = arguments
         check_structure(n_x, n_u, horizon, gamma, hessian, structure, learn, step, on_failure)
         backend(solver)
-        self._layout, theta = starts.theta(**arguments)
-        self.n_x, self.n_u, self.horizon, self.n_z = n_x, n_u, horizon, self._layout.n_z
-        self.gamma, self.hessian, self.structure = gamma, hessian, structure
-        self.step, self.solver, self.on_failure = step, solver, on_failure
+        with torch.device("cpu"):
+            self._start(learn)
+        if (device := torch.get_default_device()).type != "cpu":
+            self.to(device)
+
+    def _start(self, learn: Collection[str]) -> None:
+        given = self._arguments
+        self._layout, theta = starts.theta(**given)
+        self.n_x, self.n_u, self.horizon = (given[name] for name in ("n_x", "n_u", "horizon"))
+        self.n_z, self.gamma, self.hessian = self._layout.n_z, given["gamma"], given["hessian"]
+        self.structure, self.step = given["structure"], given["step"]
+        self.solver, self.on_failure = given["solver"], given["on_failure"]
         self.learned = tuple(name for name in (*COST, *CONSTRAINTS) if name in learn)
-        if "G" in learn and structure != "free" and not self._layout.n_linear:
+        if "G" in learn and self.structure != "free" and not self._layout.n_linear:
             raise QPError.expected(
                 "learn", "'G'", "parts that there are", "Give constraints, or structure='free'."
             )
-        self.register_buffer("C_0", theta["C"])
-        discount, of_rows = self._layout.discounts(gamma)
-        self.register_buffer("discount", discount, persistent=False)
-        slack_discount = of_rows if discount_slack else torch.ones_like(of_rows)
-        self.register_buffer("slack_discount", slack_discount, persistent=False)
+        self.register_buffer("C_0", theta["C"].to(torch.float64))
+        self._derive()
         self.register_buffer("soft", theta["w"].isfinite())
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
@@ -303,6 +309,8 @@ class QPMPC(nn.Module):
             if not parametrize.is_parametrized(self, part) or part in ("H", "H_f"):
                 continue
             value = getattr(self, part).detach()
+            # A deep copy has the same class, which the next line but one would change.
+            self.__class__ = type(type(self).__name__, type(self).__bases__, {**vars(type(self))})
             frozen = not any(leaf.requires_grad for leaf in self._leaves(part))
             parametrize.remove_parametrizations(self, part)
             delattr(self, part)
@@ -334,18 +342,19 @@ class QPMPC(nn.Module):
 
     def quadratic_program(self) -> QuadraticProgram:
         """Today's theta as a QuadraticProgram, discounts included (eq:qpH)."""
-        return QuadraticProgram(
-            H=self._hessian(),
-            q=self.discount * self.q,
-            c=self.c,
-            C=self.C,
-            b=self.b,
-            G=self.G,
-            lb=self._limits(self.lb),
-            ub=self._limits(self.ub),
-            w=torch.where(self.soft, self.slack_discount * self.w, torch.inf),
-            check_values=False,
-        )
+        with full_precision(self.C_0):
+            return QuadraticProgram(
+                H=self._hessian(),
+                q=self.discount * self.q,
+                c=self.c,
+                C=self.C,
+                b=self.b,
+                G=self.G,
+                lb=self._limits(self.lb),
+                ub=self._limits(self.ub),
+                w=torch.where(self.soft, self.slack_discount * self.w, torch.inf),
+                check_values=False,
+            )
 
     def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
         """Parameter groups for an optimiser, one for each learned part of theta.
@@ -374,10 +383,10 @@ class QPMPC(nn.Module):
     def reset_parameters(self) -> None:
         """Return theta to where the constructor put it."""
         fresh = parametrize.type_before_parametrizations(self)(**self._arguments)
-        for name, start in fresh.state_dict().items():
+        for name, start in (*fresh.named_parameters(), *fresh.named_buffers()):
             owner, _, leaf = name.rpartition(".")
             # By attribute: a functional call puts plain tensors in the place of parameters.
-            getattr(self.get_submodule(owner), leaf).data.copy_(start)
+            getattr(self.get_submodule(owner), leaf).data.copy_(start.detach())
 
     def extra_repr(self) -> str:
         return (
@@ -387,9 +396,34 @@ class QPMPC(nn.Module):
 
     def __reduce_ex__(self, protocol: Any) -> tuple:
         # A parametrised module refuses to be pickled, which would bar it from spawned collectors.
+        for name in getattr(self, "parametrizations", ()):
+            kept = self.get_submodule(f"parametrizations.{name}").children()
+            if [type(part) for part in kept] != [type(part) for part in self._kept(name)]:
+                got = f"a parametrization of {name} that is not QPMPC's own"
+                remedy = "Save the state_dict, or remove_parametrizations first."
+                raise QPError.expected("pickle", got, "QPMPC's own", remedy)
         plain = parametrize.type_before_parametrizations(self)
         frozen = [name for name, part in self.named_parameters() if not part.requires_grad]
         return _rebuild, (plain, self._arguments, self.state_dict(), frozen, self.training)
+
+    def __copy__(self) -> QPMPC:
+        twin = type(self).__new__(type(self))
+        twin.__dict__.update(self.__dict__)  # as every module's: the parameters are shared
+        return twin
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._derive()
+
+    def _derive(self) -> None:
+        """What follows from the arguments and is no part of the state, like C_0."""
+        discount, of_rows = self._layout.discounts(self.gamma)
+        weights = of_rows if self._arguments["discount_slack"] else torch.ones_like(of_rows)
+        for name, derived in (("discount", discount), ("slack_discount", weights)):
+            self.register_buffer(name, derived.to(self.C_0), persistent=False)
+        for part in self.modules():
+            if isinstance(part, Tied):
+                part.place(self.C_0.device)
 
     def _value(self, fixed: Tensor) -> Tensor:
         qp = self.quadratic_program()
@@ -462,9 +496,6 @@ def _rebuild(
 ) -> QPMPC:
     mpc = cls(**arguments)
     mpc.load_state_dict(state, assign=True)
-    mpc.discount, mpc.slack_discount = (  # not part of the state
-        x.to(mpc.C_0) for x in (mpc.discount, mpc.slack_discount)
-    )
     for name in frozen:
         mpc.get_parameter(name).requires_grad_(False)
     return mpc.train(training)

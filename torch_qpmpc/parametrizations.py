@@ -112,10 +112,14 @@ class Tied(nn.Module):
 
     def __init__(self, name: str, index: Tensor) -> None:
         super().__init__()
-        self.name = name
-        first = [int((index == i).nonzero()[0]) for i in range(int(index.max()) + 1)]
-        self.register_buffer("index", index, persistent=False)
-        self.register_buffer("first", torch.tensor(first), persistent=False)
+        self.name, self.ties = name, index.tolist()
+        self.place(index.device)
+
+    def place(self, device: torch.device) -> None:
+        """Put the index on a device; a module that was on "meta" has lost it."""
+        first = [self.ties.index(i) for i in range(max(self.ties) + 1)]
+        for name, index in (("index", self.ties), ("first", first)):
+            self.register_buffer(name, torch.tensor(index, device=device), persistent=False)
 
     def forward(self, values: Tensor) -> Tensor:
         return values[..., self.index]

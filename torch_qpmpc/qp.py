@@ -23,6 +23,7 @@ from torch import Tensor
 
 from torch_qpmpc.batching import broadcast
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.precision import full_precision
 
 #: Trailing (event) dimensions of each tensor of a QP, in the order of the constructor.
 EVENT_SHAPES: dict[str, tuple[str, ...]] = {
@@ -320,7 +321,7 @@ class QPSolution:
         saturated there, at eta = w or upsilon = w. All rows of an unsolved element are `UNKNOWN`.
         """
         z, lam, qp = self.z.detach(), self.lam.detach(), self.qp
-        y = (z.unsqueeze(-2) @ qp.G.mT).squeeze(-2)
+        y = _rows(z, qp.G)
         _, held, fixed = row_states(y + lam, qp.lb, qp.ub, qp.w)
         active = torch.where(held, lam.sign(), 2 * fixed.sign()).detach().to(torch.int8)
         return active.masked_fill_(~self.solved.unsqueeze(-1), UNKNOWN)
@@ -331,5 +332,10 @@ class QPSolution:
 
 def slacks(z: Tensor, G: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
     """sigma of z: how far soft rows are outside their bounds, ``(*batch, n_g)``."""
-    y = (z.unsqueeze(-2) @ G.mT).squeeze(-2)
+    y = _rows(z, G)
     return torch.where(w.isinf(), 0, torch.maximum(lb - y, y - ub).clamp(min=0))
+
+
+def _rows(z: Tensor, G: Tensor) -> Tensor:
+    with full_precision(z):
+        return (z.unsqueeze(-2) @ G.mT).squeeze(-2)

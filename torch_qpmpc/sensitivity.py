@@ -23,11 +23,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torch_qpmpc.batching import align, broadcast, flatten, outer, sum_to
 from torch_qpmpc.condense import condensed_for
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.qp import Status, active_rows
+from torch_qpmpc.tangents import right_side, times
 
 #: Residual of the KKT system from which on it counts as singular.
 SINGULAR = 1e-8
@@ -128,45 +131,181 @@ def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
     return kkt_adjoint(*align(in_dims, args, _ADJOINT_NDIMS)), (0,) * 4
 
 
-class SolutionGradient(torch.autograd.Function):
+class KKTAdjoint(torch.autograd.Function):
+    """`kkt_adjoint`, which a further derivative of the solution would have to pass."""
+
+    @staticmethod
+    def forward(*args):
+        return kkt_adjoint(*args)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> tuple:
+        raise QPError.expected(
+            "derivative",
+            "a second one of the solution, or a third one of the value",
+            "one of the solution, or two of the value",
+            "Detach what need not be differentiated.",
+        )
+
+    @staticmethod
+    def jvp(ctx: Any, *_: Tensor) -> tuple:
+        return KKTAdjoint.backward(ctx)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
+        return KKTAdjoint.apply(*align(in_dims, args, _ADJOINT_NDIMS)), (0,) * 4
+
+
+def _adjoint(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    # Dynamo traces no Function that has a jvp.
+    compiling = torch.compiler.is_compiling()
+    return (kkt_adjoint if compiling else KKTAdjoint.apply)(*arguments)
+
+
+@torch.library.custom_op("torch_qpmpc::solution", mutates_args=())
+def solution_op(
+    z: Tensor,
+    lam: Tensor,
+    chi: Tensor,
+    xi: Tensor,
+    status: Tensor,
+    H: Tensor,
+    q: Tensor,
+    c: Tensor,
+    C: Tensor,
+    b: Tensor,
+    G: Tensor,
+    lb: Tensor,
+    ub: Tensor,
+    w: Tensor,
+    fixed: Tensor,
+    keep: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """z, lam, chi, xi as they are, tied to the data that they depend on."""
+    return z.clone(), lam.clone(), chi.clone(), xi.clone()
+
+
+@solution_op.register_fake
+def _(z, lam, chi, xi, status, *theta):
+    return tuple(torch.empty_like(part) for part in (z, lam, chi, xi))
+
+
+@solution_op.register_vmap
+def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
+    return solution_op(*align(in_dims, args, _SOLUTION_NDIMS)), (0,) * 4
+
+
+def _setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
+    *tensors, ctx.keep = inputs
+    ctx.save_for_backward(*tensors)
+
+
+def _backward(ctx: Any, *gradients: Tensor) -> tuple:
+    grad_z, grad_lam, grad_chi, grad_xi = gradients
+    z, lam, chi, _, status, *theta = ctx.saved_tensors
+    H, q, _, C, b, G, lb, ub, w, fixed = theta
+    p, r, t, u = _adjoint(grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, ctx.keep)
+    _, saturated = active_rows(lam, w)
+    slope = torch.where(saturated, lam.sign() * (grad_lam - times(G, p)), 0)
+    needed = ctx.needs_input_grad[5:15]
+    of_theta = (
+        lambda: -0.5 * (outer(p, z, H) + outer(z, p, H)),
+        lambda: sum_to(-p, q),
+        lambda: None,
+        lambda: -(outer(chi, p, C) + outer(r, z, C)),
+        lambda: sum_to(r, b),
+        lambda: -(outer(lam, p, G) + outer(t, z, G)),
+        lambda: sum_to(torch.where(lam < 0, t, 0), lb),
+        lambda: sum_to(torch.where(lam > 0, t, 0), ub),
+        lambda: sum_to(slope, w),
+        lambda: sum_to(u, fixed),
+    )
+    found = (f() if need else None for f, need in zip(of_theta, needed, strict=True))
+    return None, None, None, None, None, *found, None
+
+
+solution_op.register_autograd(_backward, setup_context=_setup_context)
+
+
+class SolutionGradient(torch.autograd.Function):
+    """`solution_op`, differentiable under `torch.func` too."""
 
     @staticmethod
     def forward(z, lam, chi, xi, status, H, q, c, C, b, G, lb, ub, w, fixed, keep):
         return z.clone(), lam.clone(), chi.clone(), xi.clone()
 
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
-        *tensors, ctx.keep = inputs
-        ctx.save_for_backward(*tensors)
-
-    @staticmethod
-    def backward(ctx: Any, grad_z: Tensor, grad_lam: Tensor, grad_chi: Tensor, grad_xi: Tensor):
-        z, lam, chi, _, status, *theta = ctx.saved_tensors
-        H, q, _, C, b, G, lb, ub, w, fixed = theta
-        p, r, t, u = kkt_adjoint(
-            grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, ctx.keep
-        )
-        _, saturated = active_rows(lam, w)
-        slope = torch.where(
-            saturated, lam.sign() * (grad_lam - (p.unsqueeze(-2) @ G.mT).squeeze(-2)), 0
-        )
-        needed = ctx.needs_input_grad[5:15]
-        gradients = (
-            lambda: -0.5 * (outer(p, z, H) + outer(z, p, H)),
-            lambda: sum_to(-p, q),
-            lambda: None,
-            lambda: -(outer(chi, p, C) + outer(r, z, C)),
-            lambda: sum_to(r, b),
-            lambda: -(outer(lam, p, G) + outer(t, z, G)),
-            lambda: sum_to(torch.where(lam < 0, t, 0), lb),
-            lambda: sum_to(torch.where(lam > 0, t, 0), ub),
-            lambda: sum_to(slope, w),
-            lambda: sum_to(u, fixed),
-        )
-        of_theta = (f() if need else None for f, need in zip(gradients, needed, strict=True))
-        return None, None, None, None, None, *of_theta, None
+    setup_context = staticmethod(_setup_context)
+    backward = staticmethod(_backward)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
         return SolutionGradient.apply(*align(in_dims, args, _SOLUTION_NDIMS)), (0,) * 4
+
+
+class SolutionTangent(SolutionGradient):
+    """And in forward mode, which Dynamo does not trace."""
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
+        _setup_context(ctx, inputs, output)
+        ctx.save_for_forward(*inputs[:-1])
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        z, lam, chi, xi, status, *theta = ctx.saved_tensors
+        G, w = theta[5], theta[8]
+        *right, saturated = right_side(tangents[5:15], z, lam, chi, xi, G, w)
+        dz, dchi, dlam, dxi = _adjoint(*right, z, lam, status, *theta, ctx.keep)
+        return dz, dlam + saturated, dchi, dxi
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
+        return SolutionTangent.apply(*align(in_dims, args, _SOLUTION_NDIMS)), (0,) * 4
+
+
+def differentiable(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """z, lam, chi, xi, tied to the data that they depend on: the arguments of `solution_op`."""
+    return traceable(SolutionTangent, SolutionGradient, solution_op)(*arguments)
+
+
+def is_differentiating() -> bool:
+    """Whether a derivative of what is computed now may be asked for, in either mode."""
+    # `torch.no_grad` is silent on the forward mode.
+    return torch.is_grad_enabled() or forward_ad._current_level >= 0
+
+
+def traceable(eager: Any, compiled: Any, operator: Any) -> Any:
+    """Of three forms of a differentiable function, the one that PyTorch can trace now.
+
+    Dynamo traces no Function that has a jvp, none at all under `vmap`, and no custom operator under
+    `grad`. Of nested transforms it would drop the outer derivative without a word.
+    """
+    transforms = _transforms()
+    if not torch.compiler.is_compiling():
+        if transforms.count("Jvp") > 1:
+            raise QPError.expected(
+                "derivative", "jvp in jvp", "one forward mode", "Use hessian, or jacrev inside."
+            )
+        return eager.apply
+    if set(transforms) <= {"Vmap"}:
+        return operator if transforms else compiled.apply
+    if transforms != ("Grad",):
+        raise QPError.expected(
+            "torch.compile",
+            f"{' in '.join(reversed(transforms))}, transforms inside of what is compiled",
+            "vmap, or one grad, jacrev or vjp of a scalar",
+            "Leave this function out: torch.compiler.disable.",
+        )
+    return compiled.apply
+
+
+@torch.compiler.assume_constant_result
+def _transforms() -> tuple[str, ...]:
+    """The `torch.func` transforms that we are in, from the outermost."""
+    functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue] - has no stub
+    stack = functorch.get_interpreter_stack() or ()
+    return tuple(interpreter.key().name for interpreter in stack)

@@ -50,7 +50,7 @@ def theta(
     if tuple(offset.shape) != (n_x,):
         raise QPError.expected("offset", f"shape {tuple(offset.shape)}", f"shape ({n_x},)")
     if stage_weight is None:
-        states = 0.5 + 4.5 * torch.rand(n_x, generator=random)
+        states = 0.5 + 4.5 * torch.rand(n_x, generator=random, dtype=torch.float32)
         stage_weight = torch.cat((states, torch.zeros(n_u)))
     if terminal_weight is None:
         terminal_weight = torch.ones(n_x)
@@ -93,9 +93,11 @@ def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dic
 def _model(A: Any, B: Any, n_x: int, n_u: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
     """A and B as given, or random."""
     if A is None:
-        A = torch.eye(n_x) + 0.1 * torch.randn(n_x, n_x, generator=random)
+        A = torch.eye(n_x, dtype=torch.float32) + 0.1 * torch.randn(
+            n_x, n_x, generator=random, dtype=torch.float32
+        )
     if B is None:
-        B = 0.1 * torch.randn(n_x, n_u, generator=random)
+        B = 0.1 * torch.randn(n_x, n_u, generator=random, dtype=torch.float32)
     A, B = as_tensor("A", A), as_tensor("B", B)
     if A.shape[-1:] != (n_x,) or B.shape[-1:] != (n_u,):
         got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
@@ -187,5 +189,7 @@ def _slack_weights(layout: Layout, state: float, action: float, constraint: floa
         check_slack(name, weight)
     sizes = (layout.n_x, layout.n_u, layout.n_d, layout.n_d_f)
     of_each = (state, action, constraint, constraint)
-    parts = (torch.full((n,), float(w)) for n, w in zip(sizes, of_each, strict=True))
+    parts = (
+        torch.full((n,), float(w), dtype=torch.float64) for n, w in zip(sizes, of_each, strict=True)
+    )
     return layout.rows(*parts)

@@ -1,0 +1,117 @@
+"""`torch.compile(fullgraph=True)`: the same numbers, and an error where there would be others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from torch import Tensor
+from torch._dynamo.testing import CompileCounter
+from torch.func import grad, jvp, vmap
+from torch.testing import assert_close
+
+from tests.problems import random_mpc, random_states
+from torch_qpmpc import QPMPC
+
+Function = Callable[[Tensor, Tensor], Tensor]
+
+
+@pytest.fixture(autouse=True)
+def fresh_dynamo() -> Iterator[None]:
+    torch._dynamo.reset()
+    yield
+    torch._dynamo.reset()
+
+
+def functions(mpc: QPMPC) -> dict[str, Function]:
+    return {
+        "value": lambda s, a: mpc.value(s),
+        "action value": mpc.action_value,
+        "policy": lambda s, a: mpc.policy(s),
+        "vmap of value": lambda s, a: vmap(mpc.value)(s),
+        "vmap of action value": lambda s, a: vmap(mpc.action_value)(s, a),
+        "vmap of policy": lambda s, a: vmap(mpc.policy)(s),
+        "dV/ds": lambda s, a: grad(lambda s: mpc.value(s).sum())(s),
+    }
+
+
+NAMES = list(functions(random_mpc(0)))
+
+
+def outcome(mpc: QPMPC, function: Function, s: Tensor, a: Tensor) -> tuple[Tensor, list]:
+    """What a function returns, and the gradient of its square in theta."""
+    mpc.zero_grad()
+    out = function(s, a)
+    out.square().sum().backward()
+    return out.detach(), [part.grad for part in mpc.parameters()]
+
+
+@pytest.mark.parametrize("name", NAMES[:-1])
+def test_compiled_in_one_graph_equals_eager(name):
+    mpc, s, a = random_mpc(3), random_states(4), random_states(4, 1, size=0.4)
+    function = functions(mpc)[name]
+    compiled = torch.compile(function, fullgraph=True, backend="aot_eager")
+    assert_close(outcome(mpc, compiled, s, a), outcome(mpc, function, s, a))
+
+
+def test_a_gradient_inside_of_what_is_compiled():
+    mpc, s = random_mpc(3), random_states(4)
+    function = functions(mpc)["dV/ds"]
+    compiled = torch.compile(function, fullgraph=True, backend="aot_eager")
+    assert_close(compiled(s, s), function(s, s))
+
+
+def test_compiled_by_inductor_equals_eager():
+    mpc, s = random_mpc(3), random_states(4)
+    value = lambda s, a: mpc.value(s)  # noqa: E731 - has the form of the others
+    compiled = torch.compile(value, fullgraph=True)
+    assert_close(outcome(mpc, compiled, s, s), outcome(mpc, value, s, s))
+
+
+@pytest.mark.parametrize("name", ["value", "policy"])
+def test_batch_sizes_and_updates_of_theta_do_not_compile_again(name):
+    mpc, counter = random_mpc(3), CompileCounter()
+    function = functions(mpc)[name]
+    compiled = torch.compile(function, fullgraph=True, backend=counter)
+    for batch in range(2, 9):
+        s = random_states(batch)
+        assert_close(compiled(s, s), function(s, s))
+        with torch.no_grad():
+            mpc.C.mul_(1.001)
+    assert counter.frame_count == 2  # of one size, and of any
+
+
+@pytest.mark.parametrize(
+    "transformed",
+    [
+        lambda f: vmap(grad(f)),
+        lambda f: grad(lambda s: grad(lambda s: f(s).sum())(s).sum()),
+        lambda f: lambda s: jvp(f, (s,), (torch.ones_like(s),))[1],
+    ],
+    ids=["vmap of grad", "grad of grad", "jvp"],
+)
+def test_transforms_that_cannot_be_compiled_are_refused_or_left_eager(transformed):
+    mpc, s = random_mpc(3), random_states(4)
+    function = transformed(mpc.value)
+    with pytest.raises(Exception, match="QPError"):
+        torch.compile(function, fullgraph=True, backend="aot_eager")(s)
+    torch._dynamo.reset()
+    apart = torch.compile(torch.compiler.disable(function), backend="aot_eager")
+    assert_close(apart(s), function(s))
+
+
+def test_a_second_derivative_through_a_compiled_function_is_refused():
+    mpc, s = random_mpc(3), random_states(4).requires_grad_()
+    compiled = torch.compile(mpc.value, fullgraph=True, backend="aot_eager")
+    (slope,) = torch.autograd.grad(compiled(s).sum(), s, create_graph=True)
+    with pytest.raises(RuntimeError, match="does not currently support double backward"):
+        slope.square().sum().backward()
+
+
+def test_an_exported_program_has_the_same_values_for_any_batch():
+    mpc, s = random_mpc(3), random_states(4)
+    shapes = {"s": {0: torch.export.Dim("batch")}}
+    program = torch.export.export(mpc, (s,), dynamic_shapes=shapes)
+    more = random_states(7, seed=1)
+    assert_close(program.module()(more), mpc.value(more))

@@ -1,0 +1,101 @@
+"""Threads and processes: every solver, whatever was solved before, in the parent or at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from torch.func import grad, jacrev, vmap
+from torch.testing import assert_close
+
+from tests.problems import random_mpc, random_states
+from torch_qpmpc import QPMPC
+from torch_qpmpc.solvers import BACKENDS
+
+ROOT = Path(__file__).parents[2]
+#: A child that hangs is ended after this many seconds.
+WATCHDOG = 120
+
+
+def loss(mpc: QPMPC, s: Tensor, a: Tensor) -> Tensor:
+    target = 1.0 + 0.9 * mpc.value(-s).detach()
+    return (mpc.action_value(s, a) - target).square().mean()
+
+
+FEATURES: dict[str, Callable[[QPMPC, Tensor, Tensor], Tensor]] = {
+    "value": lambda mpc, s, a: mpc.value(s),
+    "action value": lambda mpc, s, a: mpc.action_value(s, a),
+    "policy": lambda mpc, s, a: mpc.policy(s),
+    "loss": loss,
+    "loss in theta": lambda mpc, s, a: torch.autograd.grad(loss(mpc, s, a), mpc.C)[0],
+    "dV/ds": lambda mpc, s, a: vmap(grad(mpc.value))(s),
+    "Hessian in s": lambda mpc, s, a: vmap(jacrev(jacrev(mpc.value)))(s),
+}
+
+
+def answers(mpc: QPMPC) -> dict[str, Tensor]:
+    s, a = random_states(48), random_states(48, 1, size=0.4)
+    return {name: feature(mpc, s, a).detach() for name, feature in FEATURES.items()}
+
+
+def compare(expected: dict[str, Tensor], found: dict[str, Tensor]) -> None:
+    for name in FEATURES:
+        assert_close(found[name], expected[name], rtol=1e-9, atol=1e-9, msg=name)
+
+
+def check(mpcs: list[QPMPC], expected: list[dict[str, Tensor]]) -> None:
+    for mpc, known in zip(mpcs, expected, strict=True):
+        compare(known, answers(mpc))
+
+
+def scenario(method: str) -> None:
+    """Solve with two threads, in a child made by ``method``, and again; modules are shared."""
+    torch.set_num_threads(2)
+    mpcs = [random_mpc(0, solver=name).share_memory() for name in BACKENDS]
+    expected = [answers(mpc) for mpc in mpcs]
+    context = torch.multiprocessing.get_context(method)
+    child = context.Process(target=check, args=(mpcs, expected), daemon=True)
+    child.start()
+    child.join(WATCHDOG)
+    assert child.exitcode == 0, "it hung" if child.exitcode is None else "it failed"
+    check(mpcs, expected)
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+def test_a_child_has_the_answers_of_its_parent(method):
+    if method not in torch.multiprocessing.get_all_start_methods():
+        pytest.skip(f"the platform has no {method}")
+    code = f"from tests.pytorch.test_processes import scenario; scenario({method!r})"
+    # A session of its own, so that a child that hangs can be ended too.
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, start_new_session=True)
+    try:
+        assert process.wait(2 * WATCHDOG) == 0
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+def test_threads_that_solve_at_once_get_the_same_answers(solver):
+    mpcs = [random_mpc(seed, solver=solver) for seed in range(4)]
+    expected = [answers(mpc) for mpc in mpcs]
+    with ThreadPoolExecutor(4) as pool:
+        for known, found in zip(expected, pool.map(answers, mpcs), strict=True):
+            compare(known, found)
+
+
+def test_shared_memory_shows_an_update_of_theta():
+    mpc, s = random_mpc(0).share_memory(), random_states(4)
+    assert all(part.is_shared() for part in mpc.state_dict().values())
+    before = mpc.value(s).detach()
+    with torch.no_grad():
+        mpc.C.mul_(1.1)
+    assert (mpc.value(s) - before).abs().max() > 1e-6

@@ -1,0 +1,16 @@
+"""Autocast is kept out: a matrix product in half precision is too coarse for a QP's data."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+from torch import Tensor
+
+
+def full_precision(like: Tensor) -> AbstractContextManager[object]:
+    """A block without autocast on the device of ``like``."""
+    device = like.device.type
+    if device == "meta" or not torch.is_autocast_enabled(device):
+        return nullcontext()
+    return torch.autocast(device, enabled=False)
