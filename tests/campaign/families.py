@@ -328,6 +328,14 @@ def scaled_everything(draw: Draw, count: int) -> Case:
     return scaled(draw, count, "cost", "variables", "rows", "equalities", most=4.0)
 
 
+def scaled_mixed(draw: Draw, count: int) -> Case:
+    """`mixed`, with cost, variables and constraints of any size."""
+    case = mixed(draw, count)
+    units = {name: draw.powers(-4, 4, count) for name in ("cost", "variables", "rows")}
+    known = in_units(case.known, **units, equalities=draw.powers(-8, 8, count))
+    return replace(case, known=known)
+
+
 def layouts(draw: Draw, count: int) -> Case:
     """Non-contiguous and expanded tensors."""
     known = draw.known(count, matrices=())
@@ -376,6 +384,7 @@ FAMILIES: dict[str, Callable[[Draw, int], Case]] = {
         scaled_variables,
         scaled_constraints,
         scaled_everything,
+        scaled_mixed,
         layouts,
         float32,
         empty_or_single,

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from tests.campaign.families import Case
 from tests.problems import times
-from torch_qpmpc import QPSolution, Status
+from torch_qpmpc import QPSolution, QuadraticProgram, Status, solve_qp
+from torch_qpmpc.autograd import EVENT_NDIMS
 from torch_qpmpc.qp import slacks
 
 
@@ -85,6 +86,21 @@ def _largest(x: Tensor) -> Tensor:
     return x.amax(-1) if x.shape[-1] else x.new_zeros(x.shape[:-1])
 
 
-def finite_gradients(case: Case, solver: str) -> bool:
-    """Whether no gradient of a masked batch, of the value and of z, has a NaN or an infinity."""
-    raise NotImplementedError
+def finite_gradients(case: Case, solver: str) -> Tensor:
+    """Where all gradients of a masked batch's values and z are finite, ``(B,)``.
+
+    A gradient of what the batch shares is finite for all or for none.
+    """
+    qp, fixed = case.known.qp, case.known.fixed
+    leaves = [x.detach().clone().requires_grad_() for x in (*qp.tensors(), fixed)]
+    moved = QuadraticProgram(*leaves[:-1], check_values=False)
+    solution = solve_qp(moved, leaves[-1], solver=solver, on_failure="mask")
+    finite = torch.ones(solution.status.shape, dtype=torch.bool)
+    for part in (solution.value, solution.z):
+        ones = torch.ones_like(part)
+        gradients = torch.autograd.grad(part, leaves, ones, retain_graph=True, allow_unused=True)
+        for gradient, ndim in zip(gradients, EVENT_NDIMS, strict=False):
+            if gradient is not None:
+                event = tuple(range(gradient.ndim - ndim, gradient.ndim))
+                finite &= gradient.isfinite().all(dim=event) if event else gradient.isfinite()
+    return finite
