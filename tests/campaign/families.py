@@ -52,7 +52,7 @@ class Draw(random.Random):
         n_c = self.randint(0, (n_z - n_f) // 2)
         settings: dict[str, Any] = {
             "batch": (count,),
-            "matrices": self.choice([(), (count,)]),
+            "matrices": self.choice([(), (), (), (count,)]),
             "n_z": n_z,
             "n_f": n_f,
             "n_c": n_c,
@@ -158,12 +158,11 @@ def absent_and_equal_bounds(draw: Draw, count: int) -> Case:
 
 
 def crossing_bounds(draw: Draw, count: int) -> Case:
-    """Equal bounds that rounding has made cross: solved, or refused as crossing."""
-    known = draw.known(count, soft=("equality", "above"), hard=("equality", "inside"))
+    """Equal bounds that rounding has made cross."""
+    known = draw.known(count, soft=("equality", "above"), hard=("equality",))
     lb, ub = known.qp.lb, known.qp.ub
     up = torch.nextafter(lb, torch.full_like(lb, torch.inf))
-    known = changed(known, lb=torch.where(lb == ub, up, lb))
-    return Case(known, torch.full(known.value.shape, int(Status.INVALID_DATA)))
+    return solvable(changed(known, lb=torch.where(lb == ub, up, lb)))
 
 
 def infeasible(draw: Draw, count: int) -> Case:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from tests.campaign.families import Case
 from tests.problems import times
-from torch_qpmpc import QPSolution, QuadraticProgram, Status, solve_qp
+from torch_qpmpc import QPSolution, Status
 from torch_qpmpc.autograd import EVENT_NDIMS
 from torch_qpmpc.qp import slacks
 
@@ -86,19 +86,15 @@ def _largest(x: Tensor) -> Tensor:
     return x.amax(-1) if x.shape[-1] else x.new_zeros(x.shape[:-1])
 
 
-def finite_gradients(case: Case, solver: str) -> Tensor:
+def finite_gradients(solution: QPSolution, operands: tuple[Tensor, ...]) -> Tensor:
     """Where all gradients of a masked batch's values and z are finite, ``(B,)``.
 
     A gradient of what the batch shares is finite for all or for none.
     """
-    qp, fixed = case.known.qp, case.known.fixed
-    leaves = [x.detach().clone().requires_grad_() for x in (*qp.tensors(), fixed)]
-    moved = QuadraticProgram(*leaves[:-1], check_values=False)
-    solution = solve_qp(moved, leaves[-1], solver=solver, on_failure="mask")
     finite = torch.ones(solution.status.shape, dtype=torch.bool)
     for part in (solution.value, solution.z):
         ones = torch.ones_like(part)
-        gradients = torch.autograd.grad(part, leaves, ones, retain_graph=True, allow_unused=True)
+        gradients = torch.autograd.grad(part, operands, ones, retain_graph=True, allow_unused=True)
         for gradient, ndim in zip(gradients, EVENT_NDIMS, strict=False):
             if gradient is not None:
                 event = tuple(range(gradient.ndim - ndim, gradient.ndim))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass, field, fields
 
+from torch import Tensor
+
 from tests.campaign.families import Case
 from tests.campaign.outcomes import finite_gradients, judge
 from torch_qpmpc import QuadraticProgram, Status, solve_qp
@@ -37,10 +39,13 @@ class Tally:
 
     def add(self, case: Case, solver: str) -> list[str]:
         """Solve and count a case; a line on each failure."""
+        tensors = (*case.known.qp.tensors(), case.known.fixed)
+        *theta, fixed = operands = tuple(x.detach().requires_grad_() for x in tensors)
+        qp = QuadraticProgram(*theta, check_values=False)
         began = time.process_time()
-        solution = solve_qp(case.known.qp, case.known.fixed, solver=solver, on_failure="mask")
+        solution = solve_qp(qp, fixed, solver=solver, on_failure="mask")
         taken = time.process_time() - began
-        outcome, finite = judge(case, solution), finite_gradients(case, solver)
+        outcome, finite = judge(case, solution), finite_gradients(solution, operands)
         # An empty batch counts as one: it was handed back as it came.
         self.count += max(1, len(case.expected))
         self.certified += int(outcome.certified.sum()) + (not len(case.expected))
@@ -89,7 +94,7 @@ class Tally:
         return f"{self.certified:,} / {self.named:,} / {self.missed:,}"
 
 
-def alone(case: Case, i: int):
+def alone(case: Case, i: int) -> tuple[QuadraticProgram, Tensor]:
     """The QP at ``i`` and its fixed entries."""
     qp = case.known.qp
     parts = {
