@@ -17,6 +17,11 @@ from torch_qpmpc.solvers import Answer
 SOFT_ROWS = ("inside", "at_lower", "at_upper", "below", "above", "equality", "no_upper", "free")
 HARD_ROWS = ("inside", "at_lower", "at_upper", "equality", "no_upper")
 
+#: Rows at a bound with no multiplier, and soft ones with all of w but no slack: where the exact
+#: penalty begins to pay.
+WEAK = ("weak_lower", "weak_upper")
+BRINK = ("brink_lower", "brink_upper")
+
 #: Soft rows on (x_k, u_k) and on x_N.
 MIXED: dict[str, Any] = {
     "constraints": ([[1.0, 0.5, 1.0], [0.0, 1.0, -1.0]], [-0.8, -torch.inf], [0.8, 0.6]),
@@ -69,13 +74,16 @@ def known_qp(
     hard: tuple[str, ...] = HARD_ROWS,
     weight: float = 5.0,
     rank: int | None = None,
+    H: Tensor | None = None,
     C: Tensor | None = None,
+    G: Tensor | None = None,
     dtype: torch.dtype = torch.float64,
 ) -> KnownQP:
     """A QP whose rows are, in an order of each batch element's own, as ``soft`` and ``hard`` say.
 
-    H, C and G have the batch shape ``matrices``. H has the given rank, or is positive definite.
-    With H positive definite and C of full row rank, solution and multipliers are unique.
+    H, C and G have the batch shape ``matrices``, where they are not given. H has the given rank, or
+    is positive definite. With H positive definite and C of full row rank, the solution is unique,
+    and with rows that are neither `WEAK` nor too many, so are the multipliers.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -92,26 +100,29 @@ def known_qp(
     def which(*kinds: str) -> Tensor:
         return torch.tensor([kind in kinds for kind, _ in rows], dtype=torch.bool)[order]
 
-    factor = gauss(*matrices, n_z, n_z if rank is None else rank)
-    H = factor @ factor.mT / n_z
-    if rank is None:
-        H = H + torch.eye(n_z, dtype=torch.float64)
+    if H is None:
+        factor = gauss(*matrices, n_z, n_z if rank is None else rank)
+        H = factor @ factor.mT / n_z
+        if rank is None:
+            H = H + torch.eye(n_z, dtype=torch.float64)
     C = gauss(*matrices, n_c, n_z) if C is None else C
-    G = gauss(*matrices, n_g, n_z)
+    G = gauss(*matrices, n_g, n_z) if G is None else G
 
     z, chi, xi = gauss(*batch, n_z), gauss(*batch, C.shape[-2]), gauss(*batch, n_f)
     y = times(G, z)
     is_hard = torch.tensor([hard for _, hard in rows], dtype=torch.bool)[order]
     w = uniform(0.5, 1.5, *batch, n_g).mul(weight).masked_fill(is_hard, torch.inf)
 
-    sign = which("at_upper", "above").double() - which("at_lower", "below").double()
+    pulled = which("at_upper", "above", "brink_upper").double()
+    sign = pulled - which("at_lower", "below", "brink_lower").double()
     sign = torch.where(which("equality"), gauss(*batch, n_g).sign(), sign)
-    share = torch.where(which("below", "above"), 1.0, uniform(0.2, 0.8, *batch, n_g))
+    saturated = which("below", "above", *BRINK)
+    share = torch.where(saturated, 1.0, uniform(0.2, 0.8, *batch, n_g))
     lam = sign * share * torch.where(is_hard, weight, w)
     gap, beyond = uniform(0.5, 2.0, *batch, n_g), uniform(0.1, 1.0, *batch, n_g)
     lb, ub = y - gap, y + gap
-    lb = torch.where(which("at_lower", "equality"), y, lb)
-    ub = torch.where(which("at_upper", "equality"), y, ub)
+    lb = torch.where(which("at_lower", "weak_lower", "brink_lower", "equality"), y, lb)
+    ub = torch.where(which("at_upper", "weak_upper", "brink_upper", "equality"), y, ub)
     lb = torch.where(which("below"), y + beyond, lb)
     ub = torch.where(which("below"), lb + gap, ub)
     ub = torch.where(which("above"), y - beyond, ub)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -57,15 +58,20 @@ def sum_to(tensor: Tensor, like: Tensor) -> Tensor:
 def weighted_sum(weight: Tensor, vectors: Tensor, like: Tensor) -> Tensor:
     """``weight`` ``(*batch,)`` times ``(*batch, n)``, summed over the dimensions ``like`` lacks."""
     if like.ndim == 1:
-        return weight.reshape(-1) @ vectors.reshape(-1, vectors.shape[-1])
+        return weight.reshape(-1) @ _listed(vectors)
     return sum_to(weight.unsqueeze(-1) * vectors, like)
 
 
 def outer(left: Tensor, right: Tensor, like: Tensor) -> Tensor:
     """The outer products ``left right'`` summed over the batch dimensions that ``like`` lacks."""
     if like.ndim == 2:
-        return left.reshape(-1, left.shape[-1]).mT @ right.reshape(-1, right.shape[-1])
+        return _listed(left).mT @ _listed(right)
     return sum_to(left.unsqueeze(-1) * right.unsqueeze(-2), like)
+
+
+def _listed(vectors: Tensor) -> Tensor:
+    """``(*batch, n)`` as ``(B, n)``; with n = 0 too, where -1 could be any size."""
+    return vectors.reshape(math.prod(vectors.shape[:-1]), vectors.shape[-1])
 
 
 def largest(x: Tensor, *, keepdim: bool = False) -> Tensor:

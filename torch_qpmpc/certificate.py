@@ -115,8 +115,9 @@ def certify(
     """Judge z ``(B, n_z)`` with multipliers lam ``(B, n_g)``, chi ``(B, n_c)``, xi ``(B, n_f)``.
 
     The residual is the largest of: stationarity, C z = b, the fixed entries, violation of hard
-    rows, multipliers outside [-w, w] or of absent bounds, and the rows' summed complementarity
-    gaps; each relative to the size of the terms that it compares. ``products`` saves computing
+    rows, multipliers outside [-w, w] or of absent bounds, each relative to the size of the terms
+    that it compares; and what all of them, with the rows' complementarity gaps, may be worth, by the
+    claim's own z and multipliers, relative to the cost. ``products`` saves computing
     them again.
     """
     p = programs
@@ -131,13 +132,18 @@ def certify(
     # Row by row h(y) + h*(lam) - lam y, where h* charges the bound that lam pushes from.
     gap = torch.addcmul(charge, scales.ub - terms.y, up).addcmul_(scales.lb - terms.y, down)
     cost = torch.linalg.vecdot(torch.add(p.q, terms.Hz, alpha=0.5), z) + charge.sum(-1)
+    short = p.affine(p.C, z, scales.minus_b)
+    # An absurd z or chi makes relative errors small that are large in the cost.
+    slip = torch.linalg.vecdot(terms.left.abs(), z.abs())
+    slip += torch.linalg.vecdot(short.abs(), chi.abs())
+    slip += gap.abs_().sum(-1)
     forces = torch.cat((terms.Hz, terms.G_lam, terms.C_chi), dim=-1)
     errors = [
         terms.left / scales.q_size.maximum(_size(forces)),
-        p.affine(p.C, z, scales.minus_b) / (scales.b_size + _size(z)),
+        short / (scales.b_size + _size(z)),
         z[:, : p.fixed.shape[-1]] - p.fixed,
         defect,
-        (gap.abs_().sum(-1) / cost.abs().add_(1.0)).unsqueeze(-1),
+        (slip / cost.abs().add_(1.0)).unsqueeze(-1),
     ]
     for absent, push in ((scales.no_ub, up), (scales.no_lb, down)):
         if absent is not None:

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.batching import broadcast, flatten
-from torch_qpmpc.qp import EVENT_SHAPES
+from torch_qpmpc.qp import EVENT_SHAPES, crossed
 
 T = TypeVar("T")
 
@@ -102,7 +102,11 @@ class FlatPrograms:
 
     @classmethod
     def _flat(cls, theta: Sequence[Tensor], batch: torch.Size, fixed: Tensor) -> FlatPrograms:
+        *_, lb, ub, _ = theta
+        rounded = (lb > ub) & ~crossed(lb, ub)
         H, q, c, C, b, G, lb, ub, w = (tensor.to(fixed) for tensor in theta)
+        if rounded.any():
+            lb = torch.where(rounded, ub, lb)
         matrices = ((H + H.mT) / 2.0, C, G)
         of_matrices = broadcast(*(m.shape[:-2] for m in matrices))
         count = of_matrices.numel()

@@ -196,7 +196,7 @@ class QuadraticProgram:
             tensor = getattr(self, name)
             if (tensor.isnan() | (tensor == forbidden)).any():
                 raise QPError.expected(name, f"NaN or {forbidden}", "no NaN, and no such infinity")
-        if (self.lb > self.ub).any():
+        if crossed(self.lb, self.ub).any():
             excess = (self.lb - self.ub).max().item()
             raise QPError.expected("lb", f"lb > ub by up to {excess:.3g}", "lb <= ub in every row")
         if (self.w < 0).any():
@@ -229,6 +229,16 @@ class QuadraticProgram:
                 "a positive semidefinite matrix",
                 "Parameterise H by its Cholesky factor (torch_qpmpc.parametrizations).",
             )
+
+
+#: Units of rounding by which bounds that should be equal may cross.
+CROSSING = 4.0
+
+
+def crossed(lb: Tensor, ub: Tensor) -> Tensor:
+    """Where lb > ub, and not by rounding alone."""
+    size = lb.abs().maximum(ub.abs())
+    return lb - ub > CROSSING * torch.finfo(lb.dtype).eps * size
 
 
 #: A multiplier below this fraction of the largest is zero; one as near to w is saturated.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextvars
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -24,32 +24,11 @@ from torch_qpmpc.solvers import (
 )
 from torch_qpmpc.solvers.crossover import refine
 from torch_qpmpc.solvers.diagnose import diagnose
+from torch_qpmpc.solvers.raw import RawSolution, unsolved
+from torch_qpmpc.solvers.units import Units
 
 #: A rejected claim with a relative residual up to this is worth sharpening.
 NEARLY = 1e-2
-
-
-@dataclass
-class RawSolution:
-    """Certified primal-dual solutions of B QPs, float64; lam = eta - upsilon."""
-
-    value: Tensor
-    z: Tensor
-    sigma: Tensor
-    chi: Tensor
-    lam: Tensor
-    xi: Tensor
-    status: Tensor
-    residual: Tensor
-    iterations: Tensor
-
-    def at(self, index: Tensor) -> RawSolution:
-        """The solutions at ``index``."""
-        return RawSolution(*(getattr(self, field.name)[index] for field in fields(self)))
-
-    def put(self, index: Tensor, other: RawSolution) -> None:
-        for field in fields(self):
-            getattr(self, field.name)[index] = getattr(other, field.name)
 
 
 @dataclass
@@ -105,8 +84,11 @@ def solve_programs(
         start: active sets ``(B, n_g)`` of nearly these QPs, see `torch_qpmpc.solvers.recall`.
     """
     began = time.perf_counter()
-    chain = _Chain(programs, keep)
+    units: Units | None = programs.known("units", lambda: Units.of(programs))
+    chain = _Chain(programs if units is None else units.scaled(programs), keep)
     raw = chain.run(solver, start)
+    if units is not None:
+        raw = units.restored(programs, raw)
     if (log := _active_log.get()) is not None:
         log.solves += len(programs)
         log.unsolved += int((raw.status != Status.SOLVED).sum())
@@ -139,7 +121,7 @@ class _Chain:
         self.raw: RawSolution | None = None
         self.todo = torch.arange(len(programs), device=valid.device)
         if not valid.all():
-            self.raw = _unsolved(programs)
+            self.raw = unsolved(programs)
             self.todo = valid.nonzero().squeeze(-1)
             self.raw.status[self.todo] = Status.NOT_CONVERGED
 
@@ -204,7 +186,7 @@ class _Chain:
             _sharpen(claim, qps, answer, recover)
             accepted = claim.residual <= TOLERANCE
         if self.raw is None:
-            self.raw = _unsolved(self.programs, Status.NOT_CONVERGED)
+            self.raw = unsolved(self.programs, Status.NOT_CONVERGED)
         self.raw.put(self.todo[accepted], claim.at(accepted))
         self.todo = self.todo[~accepted]
         self.raw.residual[self.todo] = claim.residual[~accepted]
@@ -275,21 +257,3 @@ def _reasons(part: FlatPrograms, reduced: Reduced) -> Tensor:
     if not qps.g.shape[1]:
         return torch.where(impossible, int(Status.INFEASIBLE), int(Status.NOT_CONVERGED))
     return torch.where(impossible, int(Status.INFEASIBLE), diagnose(qps))
-
-
-def _unsolved(p: FlatPrograms, status: Status = Status.INVALID_DATA) -> RawSolution:
-    """What an element carries that has no solution: an infinite cost, and zeros."""
-    n, zeros = len(p), p.q.new_zeros
-    z = zeros(n, p.q.shape[-1])
-    z[:, : p.fixed.shape[-1]] = p.fixed.nan_to_num(0, 0, 0)
-    return RawSolution(
-        value=p.q.new_full((n,), torch.inf),
-        z=z,
-        sigma=zeros(n, p.lb.shape[-1]),
-        chi=zeros(n, p.b.shape[-1]),
-        lam=zeros(n, p.lb.shape[-1]),
-        xi=torch.zeros_like(p.fixed),
-        status=p.group.new_full((n,), int(status)),
-        residual=p.q.new_full((n,), torch.inf),
-        iterations=p.group.new_zeros(n),
-    )

@@ -1,0 +1,107 @@
+"""Solve QPs of which the outcome is known: ``python -m tests.campaign --count 100000 --solver daqp``.
+
+It ends with a table in Markdown, which ``--readme`` writes to README.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from tests.benchmarks.table import README, replaced, table
+from tests.campaign.families import FAMILIES, Draw
+from tests.campaign.tally import SLOW, Tally
+from torch_qpmpc.solvers import BACKENDS
+
+#: QPs a batch; few of those families whose QPs take every solver's time, so that a batch does not
+#: take as long as no QP may.
+BATCH, FEW = 128, 16
+LONG = ("unbounded", "mixed", "scaled mixed")
+RESULTS = README.parent / "runs" / "campaign"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=__doc__)
+    parser.add_argument("--count", type=int, default=100_000, help="QPs for each solver")
+    parser.add_argument("--solver", nargs="*", default=list(BACKENDS), help="names of solvers")
+    parser.add_argument("--family", nargs="*", default=list(FAMILIES), help="names of families")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--results", type=Path, default=RESULTS, help="a folder for the counts")
+    parser.add_argument("--readme", action="store_true", help="write the table to README.md")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    for solver in options.solver:
+        campaign(solver, options.family, options.count, options.seed, options.results)
+    tallies = load(options.results)
+    text = summary(tallies)
+    print(text)
+    if options.readme:
+        README.write_text(replaced(README.read_text(encoding="utf-8"), text, "campaign"), "utf-8")
+    return int(any(tally.failures for of_one in tallies.values() for tally in of_one.values()))
+
+
+def campaign(solver: str, families: list[str], count: int, seed: int, folder: Path) -> None:
+    """Solve ``count`` QPs, as many of each family, and keep what became of them in a file."""
+    share = -(-count // len(families))
+    with tqdm(total=share * len(families), desc=solver, mininterval=5) as progress:
+        tallies = {}
+        for family in families:
+            tally = tallies[family] = Tally()
+            began, position = time.process_time(), 0
+            while tally.count < share:
+                size = min(FEW if family in LONG else BATCH, share - tally.count)
+                before = tally.count
+                case = FAMILIES[family](Draw(seed + position), size)
+                for line in tally.add(case, solver):
+                    tqdm.write(f"{solver}, {family}, seed {seed + position}: {line}", sys.stderr)
+                progress.update(tally.count - before)
+                position += 1
+            tally.settle(solver)
+            tally.seconds = time.process_time() - began
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{solver.replace(':', '-')}.json"
+    record = {"solver": solver, "families": {k: t.record() for k, t in tallies.items()}}
+    path.write_text(json.dumps(record, indent=1), encoding="utf-8")
+
+
+def load(folder: Path) -> dict[str, dict[str, Tally]]:
+    """The latest counts of each solver, in the order of `BACKENDS`."""
+    records = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")]
+    names = [*BACKENDS, *sorted(r["solver"] for r in records if r["solver"] not in BACKENDS)]
+    records.sort(key=lambda record: names.index(record["solver"]))
+    return {
+        record["solver"]: {name: Tally(**counts) for name, counts in record["families"].items()}
+        for record in records
+    }
+
+
+def summary(tallies: dict[str, dict[str, Tally]]) -> str:
+    """Families by solvers: certified / named / not converged / wrong, and the slowest."""
+    families = [name for name in FAMILIES if any(name in of_one for of_one in tallies.values())]
+    lines = []
+    for family in families:
+        of_all = [of_one.get(family) for of_one in tallies.values()]
+        lines.append([family, *(tally.cell() if tally else "" for tally in of_all)])
+    totals = []
+    for of_one in tallies.values():
+        total = Tally()
+        for tally in of_one.values():
+            total = total.plus(tally)
+        totals.append(total)
+    lines.append(["all", *(total.cell() for total in totals)])
+    lines.append(["wrong", *(f"{total.wrong:,}" for total in totals)])
+    lines.append(["NaN or inf in a gradient", *(f"{total.not_finite:,}" for total in totals)])
+    lines.append(["largest error", *(f"{total.error:.0e}" for total in totals)])
+    lines.append([f"slower than {SLOW} s", *(f"{total.slow:,}" for total in totals)])
+    lines.append(["slowest, s", *(f"{total.slowest:.2f}" for total in totals)])
+    return table(["certified / named / not converged", *tallies], lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

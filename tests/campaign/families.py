@@ -1,0 +1,392 @@
+"""Families of QPs whose outcome is known: a solution built from a KKT point, or why there is none.
+
+A family is a function of a `Draw` and a count. It returns a `Case`, a batch of so many QPs.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tests.campaign.trained import trained
+from tests.problems import BRINK, HARD_ROWS, SOFT_ROWS, WEAK, KnownQP, known_qp, times
+from torch_qpmpc import QuadraticProgram, Status
+
+#: Of a value, relative to the terms of the Lagrangian (see `tests.campaign.outcomes`).
+ACCURACY, FLOAT32 = 1e-5, 1e-3
+
+
+@dataclass(frozen=True)
+class Case:
+    """QPs, and the status that is true of each, ``(B,)``; ``known`` is their solution if SOLVED."""
+
+    known: KnownQP
+    expected: Tensor
+    accuracy: float = ACCURACY
+
+
+class Draw(random.Random):
+    """The numbers that a family draws, all from one seed."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(shape, generator=self.generator, dtype=torch.float64)
+
+    def powers(self, low: float, high: float, *shape: int) -> Tensor:
+        """Ten to the power of what is uniform between ``low`` and ``high``."""
+        exponent = torch.rand(shape, generator=self.generator, dtype=torch.float64)
+        return 10 ** (low + (high - low) * exponent)
+
+    def known(self, count: int, **options: Any) -> KnownQP:
+        """A batch of any size of QP, with matrices of their own or shared; few hard rows."""
+        n_z = self.randint(3, 14)
+        n_f = self.randint(0, min(4, n_z - 2))
+        n_c = self.randint(0, (n_z - n_f) // 2)
+        settings: dict[str, Any] = {
+            "batch": (count,),
+            "matrices": self.choice([(), (), (), (count,)]),
+            "n_z": n_z,
+            "n_f": n_f,
+            "n_c": n_c,
+            "soft": self.rows(SOFT_ROWS, 0, 8),
+            "hard": self.rows(HARD_ROWS, 0, (n_z - n_f - n_c) // 2),
+            "weight": 10 ** self.uniform(-1, 2),
+        }
+        return known_qp(self.getrandbits(32), **(settings | options))
+
+    def rows(self, kinds: tuple[str, ...], least: int, most: int) -> tuple[str, ...]:
+        return tuple(self.choices(kinds, k=self.randint(least, most)))
+
+    def combinations(self, rows: Tensor, count: int) -> Tensor:
+        """``count`` rows, each one of ``rows`` times a factor, or a sum of them."""
+        mix = self.normal(count, len(rows))
+        single = torch.rand(count, generator=self.generator) < 0.5
+        one = torch.eye(len(rows)).double()[torch.arange(count) % len(rows)]
+        factor = torch.tensor([self.choice([1.0, -1.0, 0.5, 3.0]) for _ in range(count)]).double()
+        return torch.where(single[:, None], factor[:, None] * one, mix) @ rows
+
+
+def solvable(known: KnownQP, accuracy: float = ACCURACY) -> Case:
+    return Case(known, torch.full(known.value.shape, int(Status.SOLVED)), accuracy)
+
+
+def changed(known: KnownQP, **tensors: Tensor) -> KnownQP:
+    """The same with other data, unchecked."""
+    parts = dict(vars(known.qp)) | tensors
+    return replace(known, qp=QuadraticProgram(**parts, check_values=False))
+
+
+def well_posed(draw: Draw, count: int) -> Case:
+    return solvable(draw.known(count))
+
+
+def degenerate(draw: Draw, count: int) -> Case:
+    """More active rows than variables."""
+    kinds = ("at_lower", "at_upper", "equality")
+    hard, soft = draw.rows(kinds, 10, 20), draw.rows((*kinds, "above", "below"), 0, 8)
+    return solvable(draw.known(count, hard=hard, soft=soft))
+
+
+def weakly_active(draw: Draw, count: int) -> Case:
+    """Rows at a bound that they do not need."""
+    soft, hard = draw.rows((*WEAK, *SOFT_ROWS), 1, 8), draw.rows((*WEAK, "at_upper"), 1, 6)
+    return solvable(draw.known(count, soft=(*soft, WEAK[0]), hard=hard))
+
+
+def exact_penalty_threshold(draw: Draw, count: int) -> Case:
+    """Multipliers that are all of w, without a slack."""
+    soft = draw.rows((*BRINK, "above", "inside"), 1, 8)
+    return solvable(draw.known(count, soft=(*soft, BRINK[0])))
+
+
+def dependent_rows(draw: Draw, count: int) -> Case:
+    """Rows of G that repeat each other and the rows of C."""
+    n_z, n_c, n_f = 10, 3, draw.randint(0, 2)
+    C, few = draw.normal(n_c, n_z), draw.normal(3, n_z)
+    soft, hard = draw.rows(SOFT_ROWS, 2, 8), draw.rows(HARD_ROWS, 2, 8)
+    G = draw.combinations(torch.cat((few, C)), len(soft) + len(hard))
+    return solvable(draw.known(count, n_z=n_z, n_f=n_f, C=C, G=G, soft=soft, hard=hard))
+
+
+def rank_deficient_C(draw: Draw, count: int) -> Case:
+    n_z = 10
+    C = draw.combinations(draw.normal(draw.randint(1, 3), n_z), draw.randint(4, 6))
+    return solvable(draw.known(count, n_z=n_z, n_f=draw.randint(0, 2), C=C, matrices=()))
+
+
+def inconsistent_C(draw: Draw, count: int) -> Case:
+    """Equalities that contradict each other."""
+    case = rank_deficient_C(draw, count)
+    left = torch.linalg.svd(case.known.qp.C)[0][:, -1]
+    off = left * draw.powers(-3, 2, count, 1) * (1 + case.known.qp.b.abs().amax(-1, keepdim=True))
+    known = changed(case.known, b=case.known.qp.b + off)
+    return Case(known, torch.full_like(case.expected, int(Status.INFEASIBLE)))
+
+
+def singular_H(draw: Draw, count: int) -> Case:
+    return solvable(draw.known(count, rank=draw.randint(1, 3)))
+
+
+def zero_H(draw: Draw, count: int) -> Case:
+    return solvable(draw.known(count, rank=0))
+
+
+def ill_conditioned_H(draw: Draw, count: int) -> Case:
+    n_z = draw.randint(3, 14)
+    basis = torch.linalg.qr(draw.normal(n_z, n_z))[0]
+    spectrum = torch.logspace(-12, 0, n_z, dtype=torch.float64)
+    H = basis @ torch.diag(spectrum * draw.powers(0, 3)) @ basis.mT
+    return solvable(draw.known(count, n_z=n_z, n_f=0, n_c=0, H=(H + H.mT) / 2))
+
+
+def slack_weights(draw: Draw, count: int) -> Case:
+    soft = draw.rows(SOFT_ROWS, 2, 8)
+    return solvable(draw.known(count, soft=soft, weight=10 ** draw.uniform(-3, 6)))
+
+
+def absent_and_equal_bounds(draw: Draw, count: int) -> Case:
+    kinds = ("free", "no_upper", "equality")
+    return solvable(draw.known(count, soft=draw.rows(kinds, 1, 8), hard=draw.rows(kinds, 0, 3)))
+
+
+def crossing_bounds(draw: Draw, count: int) -> Case:
+    """Equal bounds that rounding has made cross."""
+    known = draw.known(count, soft=("equality", "above"), hard=("equality",))
+    lb, ub = known.qp.lb, known.qp.ub
+    up = torch.nextafter(lb, torch.full_like(lb, torch.inf))
+    return solvable(changed(known, lb=torch.where(lb == ub, up, lb)))
+
+
+def infeasible(draw: Draw, count: int) -> Case:
+    known = draw.known(count, matrices=(count,), soft=draw.rows(SOFT_ROWS, 0, 8), hard=("inside",))
+    return contradicted(draw, widened(known), torch.ones(count, dtype=torch.bool))
+
+
+def unbounded(draw: Draw, count: int) -> Case:
+    return falling(draw, widened(draw.known(count, matrices=(count,), n_z=8, n_c=2, n_f=2)), all)
+
+
+def mixed(draw: Draw, count: int) -> Case:
+    """Good QPs beside infeasible, unbounded and invalid ones."""
+    known = widened(draw.known(count, matrices=(count,), n_z=8, n_c=2, n_f=2))
+    lot = torch.tensor([draw.randrange(5) for _ in range(count)], dtype=torch.int64)
+    case = contradicted(draw, known, lot == 2)
+    case = falling(draw, case.known, lambda _: lot == 3, case.expected)
+    spoilt = dict(vars(case.known.qp))
+    name = draw.choice(["H", "q", "C", "b", "G", "w"])
+    tensor = spoilt[name].clone()
+    tensor[lot == 4] = torch.nan
+    expected = case.expected.masked_fill(lot == 4, int(Status.INVALID_DATA))
+    return Case(changed(case.known, **{name: tensor}), expected)
+
+
+def widened(known: KnownQP) -> KnownQP:
+    """With four more rows, without bounds, for what makes a QP hopeless."""
+    qp, more = known.qp, 4
+    batch = known.value.shape
+    G = torch.cat((qp.G.new_ones(*qp.G.shape[:-2], more, qp.n_z), qp.G), dim=-2)
+    none, w = qp.lb.new_full((*batch, more), torch.inf), qp.w.new_ones(*batch, more)
+    padded = {
+        "lam": torch.cat((0 * w, known.lam), -1),
+        "sigma": torch.cat((0 * w, known.sigma), -1),
+    }
+    wide = changed(
+        known,
+        G=G,
+        lb=torch.cat((-none, qp.lb), -1),
+        ub=torch.cat((none, qp.ub), -1),
+        w=torch.cat((w, qp.w), -1),
+    )
+    return replace(wide, **padded)
+
+
+def contradicted(draw: Draw, known: KnownQP, at: Tensor) -> Case:
+    """Farkas' lemma: hard rows whose positive combination, with C's, asks for 0 < 0, where ``at``.
+
+    lam > 0 and chi with ``G'lam + C'chi = 0`` off the fixed entries, and ``lam'ub + chi'b`` below
+    what those give.
+    """
+    qp, n_f, k = known.qp, known.fixed.shape[-1], draw.randint(2, 4)
+    n, count = qp.n_z, len(at)
+    rows, lam = draw.normal(count, k, n), draw.powers(-1, 1, count, k)
+    chi = draw.normal(count, qp.C.shape[-2]) * draw.choice([0.0, 1.0])
+    pull = times(rows[:, :-1].mT, lam[:, :-1]) + times(qp.C.mT, chi)
+    rows[:, -1] = -pull / lam[:, -1:]
+    rows[:, -1, :n_f] = draw.normal(n_f)
+    y = times(rows, known.z)
+    upper = y + draw.normal(count, k)
+    given = ((pull + lam[:, -1:] * rows[:, -1])[:, :n_f] * known.fixed).sum(-1)
+    demand = given - (chi * qp.b).sum(-1) - (lam[:, :-1] * upper[:, :-1]).sum(-1)
+    margin = draw.powers(-3, 1, count) * (1 + upper.abs().amax(-1))
+    upper[:, -1] = demand / lam[:, -1] - margin
+    G, ub, w = qp.G.clone(), qp.ub.clone(), qp.w.clone()
+    G[at, :k], ub[at, :k], w[at, :k] = rows[at], upper[at], torch.inf
+    status = torch.where(at, int(Status.INFEASIBLE), int(Status.SOLVED))
+    return Case(changed(known, G=G, ub=ub, w=w), status)
+
+
+def falling(
+    draw: Draw, known: KnownQP, choose: Callable[..., Any], expected: Tensor | None = None
+) -> Case:
+    """Along a direction without curvature, that C and the hard rows allow, the cost falls."""
+    qp, n_f = known.qp, known.fixed.shape[-1]
+    at = torch.ones(known.value.shape, dtype=torch.bool) if choose is all else choose(known)
+    null = torch.linalg.svd(qp.C[..., n_f:], full_matrices=True)[2][..., -1, :]
+    d = torch.cat((null.new_zeros(*null.shape[:-1], n_f), null), -1)
+    P = torch.eye(qp.n_z).double() - d.unsqueeze(-1) * d.unsqueeze(-2)
+    hard = qp.w.isinf()
+    G = torch.where(hard.unsqueeze(-1), qp.G @ P, qp.G)
+    if draw.random() < 0.5:  # rows with a bound on the other side only hinder nothing
+        open_row = qp.G[:, 0].clone() - 0.1 * d
+        G[:, 0] = open_row
+    shift = times(G - qp.G, known.z)
+    charge = torch.where(hard, 0, qp.w * times(G, d).abs()).nan_to_num(0, 0, 0).sum(-1)
+    force = charge + draw.powers(-2, 1, *at.shape) * (1 + qp.q.abs().amax(-1))
+    q = qp.q - ((qp.q * d).sum(-1) + force).unsqueeze(-1) * d
+    moved = {
+        "H": (P @ qp.H @ P + (P @ qp.H @ P).mT) / 2,
+        "q": q,
+        "G": G,
+        "lb": qp.lb + shift,
+        "ub": qp.ub + shift,
+    }
+    where = {
+        name: torch.where(at.reshape(-1, *(1,) * (new.ndim - 1)), new, getattr(qp, name))
+        for name, new in moved.items()
+    }
+    if expected is None:
+        expected = torch.full(at.shape, int(Status.SOLVED))
+    return Case(changed(known, **where), expected.masked_fill(at, int(Status.UNBOUNDED)))
+
+
+def in_units(
+    known: KnownQP, cost: Tensor, variables: Tensor, rows: Tensor, equalities: Tensor
+) -> KnownQP:
+    """The same QP in other units, given per matrix triple: ``()`` or ``(B,)``."""
+    qp = known.qp
+
+    def of(factor: Tensor, tensor: Tensor, ndim: int) -> Tensor:
+        return factor.reshape(*factor.shape, *(1,) * ndim) * tensor
+
+    scaled = changed(
+        known,
+        H=of(cost / variables**2, qp.H, 2),
+        q=of(cost / variables, qp.q, 1),
+        c=cost * qp.c,
+        C=of(equalities / variables, qp.C, 2),
+        b=of(equalities, qp.b, 1),
+        G=of(rows / variables, qp.G, 2),
+        lb=of(rows, qp.lb, 1),
+        ub=of(rows, qp.ub, 1),
+        w=of(cost / rows, qp.w, 1),
+    )
+    return replace(
+        scaled,
+        fixed=of(variables, known.fixed, 1),
+        value=cost * known.value,
+        z=of(variables, known.z, 1),
+        sigma=of(rows, known.sigma, 1),
+        chi=of(cost / equalities, known.chi, 1),
+        lam=of(cost / rows, known.lam, 1),
+        xi=of(cost / variables, known.xi, 1),
+    )
+
+
+def scaled(draw: Draw, count: int, *which: str, most: float = 8.0) -> Case:
+    known = draw.known(count)
+    shape = known.qp.H.shape[:-2]
+    names = ("cost", "variables", "rows", "equalities")
+    units = {
+        name: draw.powers(-most, most, *shape) if name in which else torch.ones(shape).double()
+        for name in names
+    }
+    return solvable(in_units(known, **units))
+
+
+def scaled_cost(draw: Draw, count: int) -> Case:
+    return scaled(draw, count, "cost")
+
+
+def scaled_variables(draw: Draw, count: int) -> Case:
+    return scaled(draw, count, "variables")
+
+
+def scaled_constraints(draw: Draw, count: int) -> Case:
+    return scaled(draw, count, "rows", "equalities")
+
+
+def scaled_everything(draw: Draw, count: int) -> Case:
+    return scaled(draw, count, "cost", "variables", "rows", "equalities", most=4.0)
+
+
+def scaled_mixed(draw: Draw, count: int) -> Case:
+    """`mixed`, with cost, variables and constraints of any size."""
+    case = mixed(draw, count)
+    units = {name: draw.powers(-4, 4, count) for name in ("cost", "variables", "rows")}
+    known = in_units(case.known, **units, equalities=draw.powers(-8, 8, count))
+    return replace(case, known=known)
+
+
+def layouts(draw: Draw, count: int) -> Case:
+    """Non-contiguous and expanded tensors."""
+    known = draw.known(count, matrices=())
+    parts = {name: torch.stack((x, x), -1)[..., 0] for name, x in vars(known.qp).items()}
+    for name in ("H", "C", "G"):
+        parts[name] = parts[name].expand(count, -1, -1)
+    known = changed(known, **parts)
+    return solvable(replace(known, fixed=known.fixed.mT.contiguous().mT))
+
+
+def float32(draw: Draw, count: int) -> Case:
+    return solvable(draw.known(count, dtype=torch.float32), FLOAT32)
+
+
+def empty_or_single(draw: Draw, count: int) -> Case:
+    return solvable(draw.known(draw.randint(0, 1)))
+
+
+def after_training(draw: Draw, count: int) -> Case:
+    """The matrices that training with an absurd learning rate leaves behind."""
+    H, C, G, n_f = draw.choice(trained())
+    soft = draw.rows(SOFT_ROWS, len(G), len(G))
+    return solvable(draw.known(count, n_z=len(H), n_f=n_f, H=H, C=C, G=G, soft=soft, hard=()))
+
+
+FAMILIES: dict[str, Callable[[Draw, int], Case]] = {
+    family.__name__.replace("_", " "): family
+    for family in (
+        well_posed,
+        degenerate,
+        weakly_active,
+        exact_penalty_threshold,
+        dependent_rows,
+        rank_deficient_C,
+        inconsistent_C,
+        singular_H,
+        zero_H,
+        ill_conditioned_H,
+        slack_weights,
+        absent_and_equal_bounds,
+        crossing_bounds,
+        infeasible,
+        unbounded,
+        mixed,
+        scaled_cost,
+        scaled_variables,
+        scaled_constraints,
+        scaled_everything,
+        scaled_mixed,
+        layouts,
+        float32,
+        empty_or_single,
+        after_training,
+    )
+}

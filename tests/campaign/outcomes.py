@@ -1,0 +1,102 @@
+"""What became of each QP of a case, judged by what is known of it and not by the package.
+
+A solution is right if it satisfies C z = b, the fixed entries and the hard rows, if its value and
+the cost of its z are the known value, and if z is near the known one in the norm of H, which says as
+much of z as the value does: 1/2 (z - z*)'H(z - z*) is at most what z costs too much. All of it
+relative to the sum of the absolute terms of the Lagrangian at the known solution, which has the
+QP's own units.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tests.campaign.families import Case
+from tests.problems import times
+from torch_qpmpc import QPSolution, Status
+from torch_qpmpc.autograd import EVENT_NDIMS
+from torch_qpmpc.qp import slacks
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Masks ``(B,)``, of which each QP is in one; and the relative error of the value, if SOLVED."""
+
+    certified: Tensor
+    named: Tensor
+    missed: Tensor
+    wrong: Tensor
+    error: Tensor
+
+
+def judge(case: Case, solution: QPSolution) -> Outcome:
+    status, expected = solution.status, case.expected
+    error = relative_errors(case, solution)
+    hopeless = (expected == Status.INFEASIBLE) | (expected == Status.UNBOUNDED)
+    certified = (status == Status.SOLVED) & ~hopeless & (error <= case.accuracy)
+    named = (status == expected) & (status != Status.SOLVED)
+    missed = status == Status.NOT_CONVERGED
+    error = torch.where(status == Status.SOLVED, error, 0)
+    return Outcome(certified, named, missed, ~(certified | named | missed), error)
+
+
+def relative_errors(case: Case, solution: QPSolution) -> Tensor:
+    """The largest relative error of each solution, ``(B,)``; infinite if it is not finite."""
+    known = case.known
+    H, q, c, C, b, G, lb, ub, w = (x.double() for x in known.qp.tensors())
+    star, z, fixed = known.z.double(), solution.z.detach().double(), known.fixed.double()
+    n_f = fixed.shape[-1]
+
+    def terms(*pairs: tuple[Tensor, Tensor]) -> Tensor:
+        return torch.stack([(a * b).abs().sum(-1).expand(star.shape[:-1]) for a, b in pairs]).sum(0)
+
+    weight = w.masked_fill(w.isinf(), 0)
+    size = terms(
+        (times(H.abs(), star.abs()), star),
+        (q, star),
+        (weight, known.sigma.double()),
+        (times(C.abs(), star.abs()), known.chi.double()),
+        (times(G.abs(), star.abs()), known.lam.double()),
+        (fixed, known.xi.double()),
+    )
+    cost = (z * (times(H, z) / 2 + q)).sum(-1) + c + (weight * slacks(z, G, lb, ub, w)).sum(-1)
+    value = solution.value.detach().double()
+    off = z - star
+    errors = [
+        (cost - known.value).abs() / size,
+        (value - known.value).abs() / size,
+        (off * times(H, off)).sum(-1) / 2 / size,
+    ]
+    length = times(C.abs(), star.abs()) + b.abs()
+    errors.append(_largest((times(C, z) - b).abs() / length))
+    length = times(G.abs(), star.abs())
+    bound = torch.where(lb.isfinite(), lb.abs(), 0).maximum(torch.where(ub.isfinite(), ub.abs(), 0))
+    y = times(G, z)
+    beyond = torch.maximum(lb - y, y - ub).clamp(min=0) / (length + bound)
+    errors.append(_largest(torch.where(w.isinf(), beyond, 0)))
+    errors.append(_largest((z[..., :n_f] - fixed).abs() / fixed.abs()))
+    worst = torch.stack([e.expand(value.shape) for e in errors]).amax(0)
+    return worst.nan_to_num(torch.inf, torch.inf)
+
+
+def _largest(x: Tensor) -> Tensor:
+    return x.amax(-1) if x.shape[-1] else x.new_zeros(x.shape[:-1])
+
+
+def finite_gradients(solution: QPSolution, operands: tuple[Tensor, ...]) -> Tensor:
+    """Where all gradients of a masked batch's values and z are finite, ``(B,)``.
+
+    A gradient of what the batch shares is finite for all or for none.
+    """
+    finite = torch.ones(solution.status.shape, dtype=torch.bool)
+    for part in (solution.value, solution.z):
+        ones = torch.ones_like(part)
+        gradients = torch.autograd.grad(part, operands, ones, retain_graph=True, allow_unused=True)
+        for gradient, ndim in zip(gradients, EVENT_NDIMS, strict=False):
+            if gradient is not None:
+                event = tuple(range(gradient.ndim - ndim, gradient.ndim))
+                finite &= gradient.isfinite().all(dim=event) if event else gradient.isfinite()
+    return finite

@@ -1,0 +1,52 @@
+"""Certified solutions of a flat batch, and what stands for those that are missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.programs import FlatPrograms
+from torch_qpmpc.qp import Status
+
+
+@dataclass
+class RawSolution:
+    """Certified primal-dual solutions of B QPs, float64; lam = eta - upsilon."""
+
+    value: Tensor
+    z: Tensor
+    sigma: Tensor
+    chi: Tensor
+    lam: Tensor
+    xi: Tensor
+    status: Tensor
+    residual: Tensor
+    iterations: Tensor
+
+    def at(self, index: Tensor) -> RawSolution:
+        """The solutions at ``index``."""
+        return RawSolution(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def put(self, index: Tensor, other: RawSolution) -> None:
+        for field in fields(self):
+            getattr(self, field.name)[index] = getattr(other, field.name)
+
+
+def unsolved(p: FlatPrograms, status: Status = Status.INVALID_DATA) -> RawSolution:
+    """What an element carries that has no solution: an infinite cost, and zeros."""
+    n, zeros = len(p), p.q.new_zeros
+    z = zeros(n, p.q.shape[-1])
+    z[:, : p.fixed.shape[-1]] = p.fixed.nan_to_num(0, 0, 0)
+    return RawSolution(
+        value=p.q.new_full((n,), torch.inf),
+        z=z,
+        sigma=zeros(n, p.lb.shape[-1]),
+        chi=zeros(n, p.b.shape[-1]),
+        lam=zeros(n, p.lb.shape[-1]),
+        xi=torch.zeros_like(p.fixed),
+        status=p.group.new_full((n,), int(status)),
+        residual=p.q.new_full((n,), torch.inf),
+        iterations=p.group.new_zeros(n),
+    )
