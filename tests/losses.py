@@ -198,4 +198,4 @@ def total(loss: LossModule, batch: TensorDict, seed: int = 0) -> Tensor:
     """The sum of a loss module's losses, whose noise is seeded."""
     torch.manual_seed(seed)
     out = loss(batch.copy())
-    return torch.stack([out[key] for key in out.keys() if key.startswith("loss")]).sum()
+    return torch.stack([x for key, x in out.items() if key.startswith("loss")]).sum()

@@ -11,6 +11,10 @@ from hydra import compose, initialize_config_dir
 from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
+from torch_qpmpc import QPMPC
+from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.tasks import make_true_mpc
+
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: Everything shrinks but the point mass itself.
 SMALL = (
@@ -43,6 +47,13 @@ def _composed(*overrides: str) -> DictConfig:
 def choices(group: str) -> list[str]:
     """The names that a group can be set to."""
     return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
+
+
+def true_mpc(cfg: DictConfig, physics: LinearSystem) -> QPMPC:
+    """The MPC that knows the plant."""
+    mpc = make_true_mpc(cfg, physics)
+    assert mpc is not None
+    return mpc
 
 
 def skip_figures(monkeypatch: pytest.MonkeyPatch) -> None:

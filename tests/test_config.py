@@ -10,21 +10,23 @@ from typing import Any
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
+from torchrl.collectors import distributed
 
 import train
 from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
-from torch_qpmpc import QPError
-from torch_qpmpc.config import OF_OPTIMIZER, OPTIONAL, RULES, check_config, flatten
+from torch_qpmpc import QPActorValueOperator, QPError
+from torch_qpmpc.collection import make_collector, num_columns
+from torch_qpmpc.config import NOISES, OF_CHOICE, OPTIONAL, RULES, check_config, flatten
+from torch_qpmpc.tasks import make_mpc, make_physics
 from torch_qpmpc.tracking import RunFolder
 
-#: An ablation is added to what the others choose.
-GROUPS = sorted({path.name for path in CONFIGS.iterdir() if path.is_dir()} - {"ablation"})
+GROUPS = ("constraint", "noise", "optimizer", "task")
 
 
 def keys_of_the_files() -> set[str]:
     """Dotted keys of every file in configs/, but for Hydra's own."""
     keys = set()
-    for path in CONFIGS.rglob("*.yaml"):
+    for path in set(CONFIGS.rglob("*.yaml")) - set((CONFIGS / "hydra").rglob("*.yaml")):
         tree = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
         assert isinstance(tree, dict)
         whole = "# @package _global_" in path.read_text(encoding="utf-8")
@@ -64,18 +66,24 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     skip_figures(monkeypatch)
     # These two read everything at once, which proves nothing.
     monkeypatch.setattr(train, "check_config", lambda _: None)
-    for optimizer in ("adam", "gauss_newton"):
-        cfg = make_config(
-            *SMALL,
-            f"optimizer={optimizer}",
-            "batch_size=8",
-            "constraint=combined",
-            "delay_value=true",
-            "constraint.si.windows=4",
+    for name, overrides in {
+        "first": ("optimizer=adam", "constraint=combined", "constraint.si.windows=4"),
+        "second": ("optimizer=gauss_newton", "constraint=combined", "batch_size=8"),
+        "actor": ("algo=td3", "task=pendulum", "constraint=free", "batch_size=8"),
+        "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
+    }.items():
+        cfg = make_config(*SMALL, "delay_value=true", *overrides)
+        monkeypatch.setattr(
+            train, "RunFolder", lambda folder, _, after, cfg=cfg: RunFolder(folder, cfg, after)
         )
-        monkeypatch.setattr(train, "RunFolder", lambda folder, _, cfg=cfg: RunFolder(folder, cfg))
         recorder: Any = Recorder(cfg, seen)
-        train.train(recorder, str(tmp_path / optimizer))
+        train.train(recorder, str(tmp_path / name))
+    monkeypatch.setattr(distributed, "RayCollector", lambda *_, **__: None)
+    elsewhere: Any = Recorder(make_config("collector=ray"), seen)
+    physics = make_physics(elsewhere)
+    operator = QPActorValueOperator(make_mpc(elsewhere, physics))
+    make_collector(elsewhere, physics, operator.get_policy_operator())
+    assert num_columns(elsewhere) == 16
     text = (CONFIGS / "config.yaml").read_text(encoding="utf-8").partition("hydra:")[2]
     seen |= set(re.findall(r"\$\{([\w.]+)\}", text))
     assert seen == set(RULES)
@@ -83,10 +91,10 @@ def test_each_key_is_read(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("names", list(itertools.product(*map(choices, GROUPS))))
 def test_each_choice_of_groups_is_accepted(names):
-    """But for a noise of the other task, and windows for the SI penalty without a replay."""
+    """But for a noise of another task, and windows for the SI penalty without a replay."""
     choice = dict(zip(GROUPS, names, strict=True))
     cfg = make_config(*(f"{group}={name}" for group, name in choice.items()), "warmup_steps=10")
-    if (choice["noise"] == "uniform") != (choice["task"] == "gros_zanon"):
+    if choice["noise"] not in NOISES[cfg.task.name]:
         key = "noise.name"
     elif choice["optimizer"] == "recursive" and choice["constraint"] in ("si", "combined"):
         key = "replay"
@@ -97,9 +105,29 @@ def test_each_choice_of_groups_is_accepted(names):
         check_config(cfg)
 
 
-def optimizer_with(key: str) -> str:
-    """The choice of an optimiser that has the key."""
-    return f"optimizer={'gauss_newton' if key in OF_OPTIMIZER['gauss_newton'] else 'adam'}"
+@pytest.mark.parametrize("task", ["point_mass", "pendulum"])
+@pytest.mark.parametrize("collector", choices("collector"))
+@pytest.mark.parametrize("algo", choices("algo"))
+def test_each_algorithm_goes_with_each_collector(algo, collector, task):
+    check_config(make_config(f"algo={algo}", f"collector={collector}", f"task={task}"))
+
+
+def test_an_actor_has_the_first_order_by_itself():
+    assert make_config("algo=ddpg").optimizer.name == "adam"
+    assert make_config("algo=td3", "optimizer=sgd").optimizer.name == "sgd"
+
+
+def choices_with(key: str) -> list[str]:
+    """The choices of groups with which a configuration has the key."""
+    group = key.partition(".")[0]
+    if group == "optimizer":
+        second = key in OF_CHOICE["optimizer"]["gauss_newton"]
+        return [f"optimizer={'gauss_newton' if second else 'adam'}"]
+    having = {"algo": ["algo=td3"], "collector": ["collector=ray"], "task": ["task=pendulum"]}
+    known = (
+        {name for names in OF_CHOICE[group].values() for name in names} if group in having else {}
+    )
+    return having[group] if key in known else ["optimizer=adam"]
 
 
 WHOLE = [0, -1, 1.5, True, "three", None, math.nan]
@@ -107,6 +135,7 @@ REAL = [-1.0, math.nan, math.inf, True, "much", None]
 FRACTION = [0, -0.5, 1.1, math.nan, False, "half", None]
 FLAG = [0, 1, "yes", None]
 NAME = [3, True, None]
+MATRIX = [1.0, [1.0], [[1.0], [1.0, 2.0]], [["a"]], [[math.nan]], [[True]], None]
 BAD: dict[str, list[Any]] = {
     "seed": [*WHOLE[1:], 2**63],
     "solver": NAME,
@@ -120,7 +149,26 @@ BAD: dict[str, list[Any]] = {
     "step": ["newton", *NAME],
     "penalty_step": ["newton", *NAME],
     "ablation": [3, True],
+    "figures": FLAG,
+    "resume": [3, True],
+    "algo.name": ["sac", *NAME],
+    "algo.actor": ["net", *NAME],
+    "algo.critic": ["net", *NAME],
+    "algo.actor_rate": [0, *REAL],
+    "algo.lr_network": [0, *REAL],
+    "algo.width": WHOLE,
+    "algo.policy_delay": WHOLE,
+    "algo.policy_noise": REAL,
+    "algo.noise_clip": REAL,
+    "collector.name": ["many", *NAME],
+    "collector.workers": WHOLE,
+    "collector.sync": FLAG,
+    "collector.num_cpus": [0, *REAL],
     "task.name": ["pendulum", *NAME],
+    "task.id": NAME,
+    "task.A": MATRIX,
+    "task.B": MATRIX,
+    "task.stage_weight": MATRIX,
     "task.gamma": FRACTION,
     "task.hessian": ["dense", *NAME],
     "task.terminal_weight": ["lqr", *NAME],
@@ -159,7 +207,7 @@ for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.grow
 @pytest.mark.parametrize("key", RULES)
 def test_impossible_values_are_rejected_by_name(key):
     assert key in BAD, "a new rule: add what it rejects"
-    good = make_config("constraint=combined", optimizer_with(key))
+    good = make_config("constraint=combined", *choices_with(key))
     for value in BAD[key]:
         cfg = good.copy()
         OmegaConf.update(cfg, key, value)
@@ -206,9 +254,9 @@ def test_unknown_keys(key, remedy):
         check_config(cfg)
 
 
-@pytest.mark.parametrize("key", [*RULES, *OPTIONAL, "optimizer", "task", "noise", "constraint"])
+@pytest.mark.parametrize("key", [*RULES, *OPTIONAL, *GROUPS, "algo", "collector"])
 def test_missing_keys(key):
-    cfg = make_config("constraint=combined", optimizer_with(key))
+    cfg = make_config("constraint=combined", *choices_with(key))
     owner, _, leaf = key.rpartition(".")
     OmegaConf.set_struct(cfg, False)
     del (OmegaConf.select(cfg, owner) if owner else cfg)[leaf]
@@ -273,10 +321,37 @@ def test_solver_must_be_known():
             ["task.terminal_weight=riccati"],
             "task.terminal_weight: got 'riccati', expected identity. With task.hessian=block it",
         ),
-        (["noise=uniform"], "noise.name: got 'uniform', expected the noise of point_mass. unifo"),
+        (["noise=uniform"], "noise.name: got 'uniform', expected a noise that point_mass has. The"),
         (
             ["task=gros_zanon", "noise=gaussian"],
-            "noise.name: got 'gaussian', expected the noise of gros_zanon. uniform is that of",
+            "noise.name: got 'gaussian', expected a noise that gros_zanon has. .* uniform",
+        ),
+        (
+            ["algo=td3", "optimizer=gauss_newton"],
+            "optimizer.name: got 'gauss_newton', expected adam or sgd. td3 has no second order",
+        ),
+        (["algo=ddpg", "warm_start=true"], "warm_start: got True, expected false. ddpg solves at"),
+        (["algo=ddpg", "replay=false"], "replay: got False, expected true. ddpg learns from a"),
+        (
+            ["algo=ddpg", "algo.actor=mlp"],
+            "algo.actor: got 'mlp', expected qp. The penalties are on",
+        ),
+        (["algo=ddpg", "step=projection"], "step: got 'projection', expected cholesky. The crit"),
+        (
+            ["algo=ddpg", "constraint=mpc", "release=5"],
+            "release: got 5, expected null. ddpg has more parameters than the QP's",
+        ),
+        (
+            ["collector=multi", "constraint=mpc", "release=5"],
+            "release: got 5, expected null. The workers of collector=multi would keep",
+        ),
+        (
+            ["collector=ray", "collector.workers=3"],
+            "num_envs: got 16, expected a multiple of collector.workers = 3",
+        ),
+        (
+            ["collector=multi", "collector.sync=false", "constraint=si"],
+            "steps_per_update: got 1, expected at least task.horizon = 10. The windows of",
         ),
         (
             ["task=gros_zanon", "noise.std=0.1"],

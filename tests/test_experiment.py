@@ -3,32 +3,28 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pandas as pd
 import pytest
 import torch
-from omegaconf import DictConfig
 
-from tests.runs import SMALL, choices, make_config
+from tests.runs import SMALL, choices, make_config, true_mpc
 from torch_qpmpc import QPActorValueOperator
 from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.evaluation import ClosedLoop
 from torch_qpmpc.experiment import (
     evaluate,
     gap_summary,
-    make_collector,
     make_learner,
     make_optimizer,
     make_penalties,
     report,
-    stream_summary,
     structure_summary,
     table,
     theta_metrics,
 )
 from torch_qpmpc.reading import structure_metrics
-from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc, true_model
+from torch_qpmpc.tasks import make_mpc, make_physics, true_model
 from torch_qpmpc.tracking import RunFolder
 
 
@@ -60,33 +56,6 @@ def test_penalties_have_the_configured_weights():
     assert (si.beta, si.normalised) == (0.125, True)
 
 
-def test_collector_follows_the_policy_with_exploration():
-    cfg = make_config(*SMALL, "num_envs=50", "steps_per_update=3", "seed=2")
-    physics = make_physics(cfg)
-    mpc = make_mpc(cfg, physics)
-
-    def collect(cfg: DictConfig) -> Any:
-        collector = make_collector(cfg, physics, QPActorValueOperator(mpc))
-        torch.manual_seed(0)
-        batches: list[Any] = [b.clone() for _, b in zip(range(6), collector, strict=False)]
-        collector.shutdown()
-        return torch.cat(batches, dim=1)
-
-    data = collect(cfg)
-    assert data.shape == (50, 18)
-    assert data["step_count"].max() == 11, "episodes of 12 steps"
-    best = mpc.policy(data["observation"]).detach()
-    noise = (data["action"] - best)[best.abs() < 0.1]
-    assert 0.25 < noise.std() < 0.35
-    assert torch.equal(data["observation"], collect(cfg)["observation"])
-    cfg.exploration_std = 0.0
-    quiet = collect(cfg)
-    assert torch.allclose(quiet["action"], mpc.policy(quiet["observation"]), atol=1e-6)
-    cfg.seed = 3
-    other = collect(cfg)
-    assert not torch.equal(other["observation"][:, 0], quiet["observation"][:, 0])
-
-
 @pytest.mark.parametrize("name", ["adam", "sgd"])
 def test_optimizer_has_two_rates_that_fall_linearly(name):
     cfg = make_config(
@@ -100,7 +69,7 @@ def test_optimizer_has_two_rates_that_fall_linearly(name):
         "constraint.learn=[C,ub]",
     )
     mpc = make_mpc(cfg, make_physics(cfg))
-    learner = make_learner(cfg, QPActorValueOperator(mpc))
+    learner = make_learner(cfg, QPActorValueOperator(mpc), make_physics(cfg))
     optimizer, schedule = learner.optimizer, learner.schedule
     assert type(optimizer).__name__.lower() == name
     rates = {"H": 0.1, "c": 0.1, "C": 0.01, "ub": 0.01}
@@ -125,7 +94,7 @@ def test_evaluation_is_without_exploration_and_repeatable():
     cfg = make_config(*SMALL, "task.gamma=0.5", "task.eval_steps=12")
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
-    first, second = evaluate(cfg, mpc, physics), evaluate(cfg, mpc, physics)
+    first, second = evaluate(cfg, mpc.policy, physics), evaluate(cfg, mpc.policy, physics)
     assert first.states.shape == (13, 32, 4)
     assert torch.equal(first.states, second.states)
     torch.testing.assert_close(first.actions[0], mpc.policy(first.states[0]).detach())
@@ -171,13 +140,6 @@ def test_the_numbers_of_theta_are_logged_where_they_are_few():
     assert set(theta_metrics(make_mpc(free, make_physics(free)))) == names
 
 
-def test_stream_summary():
-    summary = stream_summary([2.0] * 18 + [1.0, 0.5], 0.25)
-    expected = {"train_cost": 1.875, "train_cost_last_tenth": 0.75, "train_violation": 0.25}
-    assert summary == pytest.approx(expected)
-    assert stream_summary([3.0], 0.0)["train_cost_last_tenth"] == 3.0
-
-
 def test_structure_summary_tells_the_models_error_before_and_after():
     cfg = make_config(*SMALL, "constraint=free")
     physics = make_physics(cfg)
@@ -210,8 +172,8 @@ def test_report_logs_the_evaluation(tmp_path):
     mpc = make_mpc(cfg, physics)
     with torch.no_grad():
         mpc.C[0, -1] += 0.5
-    loop = evaluate(cfg, mpc, physics)
-    truth = evaluate(cfg, make_true_mpc(cfg, physics), physics)
+    loop = evaluate(cfg, mpc.policy, physics)
+    truth = evaluate(cfg, true_mpc(cfg, physics).policy, physics)
     loops = {"start": loop, "true model": truth, "learned": loop}
     with RunFolder(tmp_path, cfg) as run:
         summary = report(run, mpc, loops, 20)

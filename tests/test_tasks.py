@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.runs import make_config
+from tests.runs import make_config, true_mpc
 from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.experiment import evaluate
-from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc
+from torch_qpmpc.tasks import make_mpc, make_physics
 
 
 @pytest.mark.parametrize(("noise", "std"), [("gaussian", 0.01), ("brownian", 0.002)])
@@ -35,8 +35,8 @@ def test_ends_of_the_experiment_are_the_known_ones(seed):
     """The numbers that everyone who draws, starts and rolls out alike gets."""
     cfg = make_config(f"seed={seed}", "solver=daqp")
     physics = make_physics(cfg)
-    assert round(evaluate(cfg, make_mpc(cfg, physics), physics).J) == J_START[seed]
-    assert round(evaluate(cfg, make_true_mpc(cfg, physics), physics).J) == J_TRUE_MODEL
+    assert round(evaluate(cfg, make_mpc(cfg, physics).policy, physics).J) == J_START[seed]
+    assert round(evaluate(cfg, true_mpc(cfg, physics).policy, physics).J) == J_TRUE_MODEL
 
 
 def test_start_is_the_corrupted_model_and_a_random_cost():
@@ -63,7 +63,7 @@ def test_start_is_the_corrupted_model_and_a_random_cost():
 def test_true_model_has_the_true_cost_and_learns_nothing():
     cfg = make_config()
     physics = make_physics(cfg)
-    mpc = make_true_mpc(cfg, physics)
+    mpc = true_mpc(cfg, physics)
     assert mpc.H.tolist() == [6, 6, 0.5, 0.5, 0, 0]
     assert torch.equal(mpc.C, banded_matrix(physics.A, physics.B, 10))
     assert list(mpc.parameters()) == []
@@ -114,7 +114,7 @@ def test_the_other_task_starts_from_the_original_wrong_model():
 def test_its_other_end_knows_the_mean_of_the_noise():
     cfg = make_config("task=gros_zanon")
     physics = make_physics(cfg)
-    mpc = make_true_mpc(cfg, physics)
+    mpc = true_mpc(cfg, physics)
     s, a = torch.tensor([[0.3, 0.2]]).double(), torch.tensor([[-0.4]]).double()
     states, _ = mpc.predicted(mpc.solve(s, a).z)
     mean = torch.tensor([[-0.05, 0.0]]).double()
@@ -127,7 +127,7 @@ def test_the_value_of_a_state_has_its_violation():
     cfg = make_config("task=gros_zanon", "solver=daqp")
     physics = make_physics(cfg)
     assert isinstance(physics, GrosZanonLTI)
-    mpc = make_true_mpc(cfg, physics)
+    mpc = true_mpc(cfg, physics)
     sigma = mpc.solve(torch.tensor([[-0.2, 1.3]]).double()).sigma
     violation = physics.violation(torch.tensor([[-0.2, 1.3]]))
     torch.testing.assert_close(sigma[:, :2].sum(-1), violation)

@@ -134,7 +134,7 @@ def test_checkpoint_is_the_learned_qp(whole):
     state = load_checkpoint(folder / "checkpoint.pt")
     mpc.load_state_dict(state["mpc"])
     assert state["update"] == 150
-    loop = evaluate(cfg, mpc, physics)
+    loop = evaluate(cfg, mpc.policy, physics)
     np.testing.assert_allclose(loop.J, summary["J_final"], rtol=1e-9)
 
 

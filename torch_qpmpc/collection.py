@@ -45,7 +45,7 @@ def make_collector(
     exploration = AdditiveGaussianModule(
         env.action_spec, sigma_init=cfg.exploration_std, sigma_end=cfg.exploration_std
     )
-    policy = TensorDictSequential(actor, exploration)
+    policy = TensorDictSequential([actor, exploration])
     options: dict[str, Any] = {"auto_register_policy_transforms": False}
     if name == "single":
         return Collector(
@@ -76,8 +76,8 @@ def batches(collector: BaseCollector) -> Iterator[TensorDictBase]:
     """``(num_columns, steps_per_update)`` transitions for ever, under the newest theta."""
     alone = isinstance(collector, Collector)
     if not alone:
-        collector.update_policy_weights_()
+        collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]
     for batch in collector:
         yield batch if alone else batch.reshape(-1, batch.shape[-1])
         if not alone:
-            collector.update_policy_weights_()
+            collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]

@@ -290,6 +290,15 @@ CONFLICTS: tuple[tuple[str, Callable[[DictConfig], bool], str, str], ...] = (
         "{cfg.algo.name} learns from a replay.",
     ),
     (
+        "algo.actor",
+        lambda cfg: (
+            cfg.algo.get("actor") == "mlp"
+            and (cfg.constraint.deviation is not None or cfg.constraint.si is not None)
+        ),
+        "qp",
+        "The penalties are on a QP's C: choose constraint=free.",
+    ),
+    (
         "step",
         lambda cfg: cfg.algo.name != "qlearning" and cfg.step != "cholesky",
         "cholesky",

@@ -118,8 +118,8 @@ def gymnasium_loop(
         costs.append(cost)
     for env in envs:
         env.close()
-    tensors = (torch.as_tensor(np.stack(x), dtype=torch.float64) for x in (states, actions, costs))
-    return ClosedLoop(*tensors, gamma)
+    s, a, L = (torch.as_tensor(np.stack(x), dtype=torch.float64) for x in (states, actions, costs))
+    return ClosedLoop(s, a, L, gamma)
 
 
 def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:

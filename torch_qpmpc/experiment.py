@@ -103,8 +103,13 @@ def make_penalties(
     )
 
 
-def make_optimizer(cfg: DictConfig, mpc: QPMPC, loss_module: LossModule) -> torch.optim.Optimizer:
-    """The optimiser, with one rate for the cost and one for the constraints; critics included."""
+def make_optimizer(
+    cfg: DictConfig, mpc: QPMPC, loss_module: LossModule | None = None
+) -> torch.optim.Optimizer:
+    """The optimiser, with one rate for the cost and one for the constraints.
+
+    ``loss_module`` is that of an actor, whose critics learn, too.
+    """
     options = cfg.optimizer
     if options.name == "gauss_newton":
         return GaussNewton(
@@ -117,7 +122,7 @@ def make_optimizer(cfg: DictConfig, mpc: QPMPC, loss_module: LossModule) -> torc
             trust_region=options.trust_region,
         )
     rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}
-    if cfg.algo.name == "qlearning":
+    if loss_module is None or cfg.algo.name == "qlearning":
         groups = mpc.parameter_groups(rates)
     else:
         groups = [*actor_groups(cfg, mpc, loss_module), *critic_groups(cfg, loss_module)]
@@ -173,8 +178,10 @@ def evaluate(
     cfg: DictConfig, policy: Callable[[Tensor], Tensor], physics: LinearSystem | GymnasiumPlant
 ) -> ClosedLoop:
     """``policy`` from the fixed starts and with the fixed noise."""
-    run = closed_loop if isinstance(physics, LinearSystem) else gymnasium_loop
-    return run(policy, physics, steps=cfg.task.eval_steps, gamma=cfg.task.gamma)
+    steps, gamma = cfg.task.eval_steps, cfg.task.gamma
+    if isinstance(physics, LinearSystem):
+        return closed_loop(policy, physics, steps=steps, gamma=gamma)
+    return gymnasium_loop(policy, physics, steps=steps, gamma=gamma)
 
 
 def report(
