@@ -235,7 +235,7 @@ def test_every_rule_learns(rule, optimizer):
 
 @pytest.mark.parametrize("name", ["diagonal", "block", "full"])
 def test_gauss_newton_judges_the_projected_step(name):
-    mpc = random_mpc(4, step="projection", **(HESSIANS[name] | {"learn": ("H", "q")}))
+    mpc = random_mpc(4, step="projection", hessian=name, learn=("H", "q"))
     s, a = random_states(5, size=0.9), random_states(5, 1, size=0.4)
     old, leaves = mpc.action_value(s, a), list(mpc.parameters())
     of_each = [torch.autograd.grad(value, leaves, retain_graph=True) for value in old]
