@@ -42,6 +42,7 @@ from torch_qpmpc import QPMPC, QPActorValueOperator, QPQLearningLoss
 GAMMA = 0.9
 #: The action's bounds, and a grid over them for DQN.
 BOUND = 1.0
+BOUNDS: Any = (-BOUND, BOUND)
 GRID = torch.linspace(-BOUND, BOUND, 5).unsqueeze(-1)
 
 
@@ -74,16 +75,31 @@ def network_policy() -> Any:
     return TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
 
 
+class NetworkCritic(nn.Module):
+    """An ordinary Q(s, a)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(3, 8), nn.Tanh(), nn.Linear(8, 1))
+
+    def forward(self, s: Tensor, a: Tensor) -> Tensor:
+        return self.layers(torch.cat((s, a), -1))
+
+
+class GridCritic(nn.Module):
+    """-Q of each action of a grid, for DQN."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mpc = make_mpc(1)
+
+    def forward(self, s: Tensor) -> Tensor:
+        batch = (*s.shape[:-1], len(GRID), -1)
+        return -self.mpc.action_value(s.unsqueeze(-2).expand(batch), GRID.expand(batch))
+
+
 def network_critic() -> Any:
-    class Net(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.layers = nn.Sequential(nn.Linear(3, 8), nn.Tanh(), nn.Linear(8, 1))
-
-        def forward(self, s: Tensor, a: Tensor) -> Tensor:
-            return self.layers(torch.cat((s, a), -1))
-
-    return ValueOperator(Net(), in_keys=["observation", "action"])
+    return ValueOperator(NetworkCritic(), in_keys=["observation", "action"])
 
 
 def stochastic(location: Any) -> Any:
@@ -93,7 +109,7 @@ def stochastic(location: Any) -> Any:
         in_keys=["loc", "scale"],
         distribution_class=TanhNormal,
         distribution_kwargs={"low": -BOUND, "high": BOUND},
-        spec=Bounded(-BOUND, BOUND, (1,)),
+        spec=Bounded(-BOUND, BOUND, torch.Size([1])),
         return_log_prob=True,
     )
 
@@ -105,43 +121,30 @@ def network_gaussian() -> Any:
 
 def qp_gaussian() -> Any:
     """The QP as the mean of a stochastic policy, with a learned scale."""
-    scale = TensorDictModule(AddStateIndependentNormalScale(1), ["loc"], ["loc", "scale"])
+    scale: Any = TensorDictModule(AddStateIndependentNormalScale(1), ["loc"], ["loc", "scale"])
     return stochastic(TensorDictSequential(policy(action_key="loc"), scale))
 
 
 def grid_critic() -> Any:
-    """-Q of each action of a grid, for DQN."""
-
-    class Net(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.mpc = make_mpc(1)
-
-        def forward(self, s: Tensor) -> Tensor:
-            batch = (*s.shape[:-1], len(GRID), -1)
-            return -self.mpc.action_value(s.unsqueeze(-2).expand(batch), GRID.expand(batch))
-
-    return QValueActor(Net(), in_keys=["observation"], action_space="one_hot")
+    return QValueActor(GridCritic(), in_keys=["observation"], action_space="one_hot")
 
 
 #: By what is a QP and where.
 LOSSES: dict[str, Callable[[], LossModule]] = {
     "critic of DDPG": lambda: DDPGLoss(network_policy(), critic(), delay_actor=True),
-    "critics of TD3": lambda: TD3Loss(network_policy(), critics(), bounds=(-BOUND, BOUND)),
-    "critics of TD3+BC": lambda: TD3BCLoss(network_policy(), critics(), bounds=(-BOUND, BOUND)),
+    "critics of TD3": lambda: TD3Loss(network_policy(), critics(), bounds=BOUNDS),
+    "critics of TD3+BC": lambda: TD3BCLoss(network_policy(), critics(), bounds=BOUNDS),
     "critics of SAC": lambda: SACLoss(network_gaussian(), critics()),
-    "critics of REDQ": lambda: REDQLoss(
-        network_gaussian(), critics(3), num_qvalue_nets=3, target_entropy=-1.0
-    ),
+    "critics of REDQ": lambda: REDQLoss(network_gaussian(), critics(3), num_qvalue_nets=3),
     "critics of CQL": lambda: CQLLoss(network_gaussian(), critics()),
     "critics and value of IQL": lambda: IQLLoss(network_gaussian(), critics(), value()),
     "critic of DQN": lambda: DQNLoss(grid_critic(), action_space="one_hot"),
     "V and Q of Q-learning": lambda: QPQLearningLoss(critic(), delay_value=True),
     "actor of DDPG": lambda: DDPGLoss(policy(), network_critic(), delay_actor=True),
-    "actor of TD3": lambda: TD3Loss(policy(), network_critic(), bounds=(-BOUND, BOUND)),
-    "actor of TD3+BC": lambda: TD3BCLoss(policy(), network_critic(), bounds=(-BOUND, BOUND)),
+    "actor of TD3": lambda: TD3Loss(policy(), network_critic(), bounds=BOUNDS),
+    "actor of TD3+BC": lambda: TD3BCLoss(policy(), network_critic(), bounds=BOUNDS),
     "actor and critic of DDPG": lambda: DDPGLoss(policy(), critic(), delay_actor=True),
-    "actor and critics of TD3": lambda: TD3Loss(policy(), critics(), bounds=(-BOUND, BOUND)),
+    "actor and critics of TD3": lambda: TD3Loss(policy(), critics(), bounds=BOUNDS),
     "mean and critics of SAC": lambda: SACLoss(qp_gaussian(), critics()),
     "value and critics of SAC v1": lambda: SACLoss(network_gaussian(), critics(), value()),
     "value of A2C": lambda: A2CLoss(network_gaussian(), value()),
@@ -159,13 +162,13 @@ def make_loss(name: str, estimator: str | None = None, seed: int = 0) -> LossMod
     """One of `LOSSES`, with its networks drawn and its estimator made."""
     torch.manual_seed(seed)
     loss = LOSSES[name]()
-    loss.make_value_estimator(estimator, gamma=GAMMA)
+    loss.make_value_estimator(estimator, gamma=GAMMA)  # pyright: ignore[reportArgumentType] - names are accepted
     return loss
 
 
 def make_batch(loss: LossModule | None = None, *shape: int) -> TensorDict:
     """Transitions along the last dimension, some of which end; with log-probabilities if asked."""
-    *batch, steps = shape or (4, 5)
+    *batch, steps = shape or (2, 4)
     s = random_states(20 * (steps + 1), seed=3)[: torch.Size((*batch, steps + 1)).numel()]
     s = s.float().view(*batch, steps + 1, 2)
     ended = random_states(1000, 1, size=1.0, seed=4)[: torch.Size((*batch, steps)).numel()]
@@ -183,13 +186,14 @@ def make_batch(loss: LossModule | None = None, *shape: int) -> TensorDict:
         action=action.float().view(*batch, steps, 1),
         next=after,
         batch_size=(*batch, steps),
-        names=[None] * len(batch) + ["time"],
     )
+    td.names = [None] * len(batch) + ["time"]  # pyright: ignore[reportAttributeAccessIssue]
     if isinstance(loss, DQNLoss):
         nearest = (td["action"] - GRID.flatten()).abs().argmin(-1)
         td["action"] = nn.functional.one_hot(nearest, len(GRID))
     if isinstance(loss, A2CLoss | ClipPPOLoss | ReinforceLoss):
-        with torch.no_grad(), loss.actor_network_params.to_module(loss.actor_network):
+        params: Any = loss.actor_network_params
+        with torch.no_grad(), params.to_module(loss.actor_network):
             loss.actor_network(td)
     return td
 

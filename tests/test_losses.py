@@ -9,17 +9,34 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torch import Tensor
-from torchrl.objectives import HardUpdate, SoftUpdate
+from torchrl.data import MultiStep
+from torchrl.envs import InitTracker, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import AdditiveGaussianModule, OrnsteinUhlenbeckProcessModule
+from torchrl.objectives import CQLLoss, DDPGLoss, HardUpdate, SoftUpdate, TD3Loss
+from torchrl.objectives.value import GAE
 
 from tests.losses import (
+    BOUNDS,
     ENSEMBLES,
+    GAMMA,
     LOSSES,
     ON_POLICY,
+    critic,
+    critics,
     make_batch,
     make_loss,
+    network_gaussian,
+    network_policy,
+    policy,
     total,
+    value,
 )
+from torch_qpmpc import QPMPC, QPActorValueOperator, SolverError
+from torch_qpmpc.envs import PointMassEnv
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 OFF_POLICY = [name for name in LOSSES if name not in ON_POLICY]
@@ -39,10 +56,14 @@ def learned(loss: Any) -> dict[str, Tensor]:
 
 
 def targets(loss: Any) -> dict[str, Tensor]:
-    return {name: x.clone() for name, x in loss.named_buffers() if name.startswith("target_")}
+    return {
+        name: x.clone()
+        for name, x in loss.named_buffers()
+        if name.startswith("target_") and "_network_params" in name
+    }
 
 
-def train(name: str, steps: int = 3) -> Any:
+def train(name: str, steps: int = 2) -> Any:
     loss = make_loss(name)
     batch = make_batch(loss)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
@@ -66,19 +87,19 @@ def test_gradients_reach_all_that_is_learned(name):
 
 @pytest.mark.parametrize("name", LOSSES)
 def test_training_moves_theta_and_can_be_repeated(name):
-    start, once, again = make_loss(name), train(name), train(name)
+    once = train(name)
     assert total(once, make_batch(once)).isfinite()
+    start, again = learned(make_loss(name)), learned(train(name))
     for key, parameter in learned(once).items():
         assert parameter.isfinite().all(), key
-        assert not torch.equal(parameter, start.get_parameter(key)), key
-        assert torch.equal(parameter, again.get_parameter(key)), key
+        assert not torch.equal(parameter, start[key]), key
+        assert torch.equal(parameter, again[key]), key
 
 
 @pytest.mark.parametrize("updater", UPDATERS)
 @pytest.mark.parametrize("name", OFF_POLICY)
 def test_targets_are_frozen_until_they_are_updated(name, updater):
     loss = make_loss(name)
-    # A DQN has its target, and an SAC v1 that of its value, only if asked: all here have one.
     start = targets(loss)
     assert start
     update = UPDATERS[updater](loss)
@@ -148,3 +169,121 @@ def test_pickle(name):
             pickle.dumps(loss)
     else:
         assert not differ(loss, pickle.loads(pickle.dumps(loss)))
+
+
+# --- What single losses and the modules around them do with a QP ---------------------------------
+
+
+def test_an_ensemble_of_modules_keeps_their_starts_and_shares_no_bounds():
+    modules = critics(3)
+    loss = TD3Loss(network_policy(), modules, bounds=BOUNDS, num_qvalue_nets=3)
+    params = loss.qvalue_network_params
+    for i, module in enumerate(modules):
+        assert torch.equal(params["module", "C"][i], module.module.C)
+        assert torch.equal(params["module", "ub"][i], module.module.ub)
+    assert not params["module", "ub"].requires_grad
+
+
+def test_copies_of_one_module_are_filled_with_random_numbers_by_torchrl():
+    """Why an ensemble should be a list: nothing is left of the model in C."""
+    loss = TD3Loss(network_policy(), critic(), bounds=BOUNDS, num_qvalue_nets=2)
+    stacked, mpc = loss.qvalue_network_params["module", "C"], critic().module
+    assert ((mpc.C_0 == 0) & (stacked == 0)).sum() == 0
+    assert (mpc.C_0 == 0).any()
+
+
+def test_actions_beyond_a_critics_hard_bounds_are_refused_by_name():
+    """CQL draws actions from plus or minus one whatever the action's bounds are."""
+    narrow = [critic(seed) for seed in (1, 2)]
+    for operator in narrow:
+        for bound in (operator.module.lb, operator.module.ub):
+            bound[2] /= 4  # of u_0
+    loss = CQLLoss(network_gaussian(), narrow)
+    with pytest.raises(SolverError, match=r"INFEASIBLE.* soften rows with a finite w"):
+        total(loss, make_batch())
+
+
+def renamed(td: TensorDict) -> TensorDict:
+    """A batch with its observation, action, reward and ends under other, nested keys."""
+    new = td.select("observation", "action", ("next", "observation")).clone()
+    new.rename_key_("observation", ("agent", "s"))
+    new.rename_key_("action", ("agent", "a"))
+    new.rename_key_(("next", "observation"), ("next", "agent", "s"))
+    new["next", "agent", "r"] = td["next", "reward"]
+    for end in ("done", "terminated"):
+        new["next", "ends", end] = td["next", end]
+    return new
+
+
+def test_renamed_and_nested_keys():
+    plain = DDPGLoss(policy(), critic())
+    names: dict[str, Any] = {"observation_key": ("agent", "s"), "action_key": ("agent", "a")}
+    actor = policy(**names)
+    q = critic(**names, state_action_value_key=("critic", "q"))
+    loss = DDPGLoss(actor, q)
+    loss.set_keys(
+        state_action_value=("critic", "q"),
+        reward=("agent", "r"),
+        done=("ends", "done"),
+        terminated=("ends", "terminated"),
+        priority=("replay", "p"),
+    )
+    for module in (plain, loss):
+        module.make_value_estimator(gamma=GAMMA)
+    td = make_batch()
+    new = renamed(td)
+    expected, out = plain(td), loss(new)
+    for key in ("loss_actor", "loss_value"):
+        assert torch.equal(out[key], expected[key]), key
+    assert torch.equal(new["replay", "p"], td["td_error"])
+
+
+def test_multi_step_returns():
+    """The sum of three discounted rewards, and V beyond them."""
+    actor, q = policy(), critic()
+    loss = DDPGLoss(actor, q, delay_value=False, reduction="none")
+    loss.make_value_estimator(gamma=GAMMA)
+    td = make_batch()
+    td["next", "done"].zero_()
+    td["next", "terminated"].zero_()
+    steps = MultiStep(gamma=GAMMA, n_steps=3)(td.clone())
+    out = loss(steps)
+    reward, following = td["next", "reward"].squeeze(-1), td["next", "observation"]
+    mpc, best = q.module, actor.module
+    Q = mpc.action_value(following[:, 2], best.policy(following[:, 2]))
+    target = sum(GAMMA**k * reward[:, k] for k in range(3)) - GAMMA**3 * Q
+    prediction = -mpc.action_value(td["observation"][:, 0], td["action"][:, 0])
+    torch.testing.assert_close(out["target_value"][:, 0], target, rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(out["pred_value"][:, 0], prediction, rtol=1e-4, atol=1e-3)
+
+
+def test_generalised_advantages():
+    lmbda, network, td = 0.8, value(), make_batch()
+    with torch.no_grad():
+        GAE(gamma=GAMMA, lmbda=lmbda, value_network=network)(td)
+        V = -network.module.value(td["observation"])
+        V_next = -network.module.value(td["next", "observation"])
+    reward, done, ended = (td["next", k].squeeze(-1) for k in ("reward", "done", "terminated"))
+    delta = reward + GAMMA * V_next * ~ended - V
+    advantage = torch.zeros_like(delta)
+    for t in reversed(range(delta.shape[-1])):
+        later = advantage[:, t + 1] * ~done[:, t] if t + 1 < delta.shape[-1] else 0.0
+        advantage[:, t] = delta[:, t] + GAMMA * lmbda * later
+    torch.testing.assert_close(td["advantage"].squeeze(-1), advantage, rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(td["value_target"].squeeze(-1), advantage + V, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", [AdditiveGaussianModule, OrnsteinUhlenbeckProcessModule])
+def test_exploration_around_the_policy_in_a_rollout(kind):
+    env = TransformedEnv(PointMassEnv(4, max_steps=10, seed=0), InitTracker())
+    bounds = ([-1.0] * 2, [1.0] * 2)
+    mpc = QPMPC(4, 2, 3, action_bounds=bounds, stage_weight=torch.ones(6), solver="daqp")
+    actor: Any = QPActorValueOperator(mpc).get_policy_operator()
+    torch.manual_seed(0)
+    explorer = TensorDictSequential(actor, kind(env.action_spec))
+    for exploration in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
+        with set_exploration_type(exploration), torch.no_grad():
+            rollout = env.rollout(6, explorer)
+        assert rollout["action"].abs().max() <= 1
+        close = torch.isclose(rollout["action"], mpc.policy(rollout["observation"]), atol=1e-6)
+        assert close.all() == (exploration == ExplorationType.DETERMINISTIC)

@@ -24,7 +24,7 @@ from tensordict.nn import (
 from torch import nn
 from torchrl.data import Bounded
 
-from tests.drop_in.networks import make_critic, make_gaussian, make_policy
+from tests.drop_in.networks import make_critic, make_gaussian, make_policy, make_value
 
 CHECKOUT = os.environ.get("TORCHRL_CHECKOUT")
 if not CHECKOUT:
@@ -33,21 +33,22 @@ OBJECTIVES = Path(CHECKOUT) / "test" / "objectives"
 if not OBJECTIVES.is_dir():
     raise FileNotFoundError(f"TORCHRL_CHECKOUT: {OBJECTIVES} is not there")
 sys.path.insert(0, str(OBJECTIVES))
+#: Of the mixins, which stand before a test class of TorchRL's and are not checked against it.
+Base: Any = object
 ddpg, sac, iql = (importlib.import_module(f"test_{name}") for name in ("ddpg", "sac", "iql"))
 
 
-class Deterministic:
+class Deterministic(Base):
     """For DDPG and TD3: the QP as actor and as critic, each with a theta of its own."""
 
     def _create_mock_actor(
         self, obs_dim: int = 3, action_dim: int = 4, device="cpu", in_keys=None, **other: Any
     ) -> Any:
         key = (in_keys or ["observation"])[0]
-        dropout = nn.Dropout(other.get("dropout", 0.0))
-        policy = make_policy(obs_dim, action_dim, "kept")
-        actor = TensorDictSequential(TensorDictModule(dropout, [key], ["kept"]), policy)
+        dropout: Any = TensorDictModule(nn.Dropout(other.get("dropout", 0.0)), [key], ["kept"])
+        actor: Any = TensorDictSequential(dropout, make_policy(obs_dim, action_dim, "kept"))
         bound = torch.ones(action_dim)
-        actor.spec = Bounded(-bound, bound, (action_dim,))
+        actor.spec = Bounded(-bound, bound)
         return actor.to(device)
 
     def _create_mock_value(
@@ -80,7 +81,7 @@ class Deterministic:
 class TestDDPG(Deterministic, ddpg.TestDDPG):
     def _create_mock_value(self, obs_dim: int = 3, state_dim: int = 8, **other: Any) -> Any:
         """The critic of these tests sees a state beside the observation."""
-        both = TensorDictModule(
+        both: Any = TensorDictModule(
             lambda *parts: torch.cat(parts, -1), ["observation", "state"], ["both"]
         )
         critic = super()._create_mock_value(obs_dim + state_dim, observation_key="both", **other)
@@ -91,7 +92,7 @@ class TestTD3(Deterministic, ddpg.TestTD3):
     pass
 
 
-class Stochastic:
+class Stochastic(Base):
     """For SAC and IQL: the QP as critic and as state value, and as the mean of the policy."""
 
     composite = False
@@ -128,13 +129,12 @@ class Stochastic:
         out_keys=None,
         observation_key="observation",
     ) -> Any:
-        critic = make_critic(
+        return make_value(
             obs_dim,
             action_dim,
             observation_key=observation_key,
             state_value_key=(out_keys or ["state_value"])[0],
-        )
-        return critic.get_value_operator().to(device)
+        ).to(device)
 
     def _create_mock_common_layer_setup(self, n_act: int = 4, n_hidden: int = 2, **other: Any):
         self.composite = other.get("composite_action_dist", False)
@@ -142,12 +142,13 @@ class Stochastic:
             n_act=n_act, n_hidden=n_hidden, **other
         )
         *_, parameters, distribution = actor
-        head = make_gaussian(n_hidden, n_act)
-        head = TensorDictModule(head, ["hidden"], parameters.out_keys)
+        net = make_gaussian(n_hidden, n_act)
+        head: Any = TensorDictModule(net, ["hidden"], parameters.out_keys)
         actor = ProbabilisticTensorDictSequential(common, head, distribution)
         action_key = ("action", "action1") if self.composite else "action"
         critic = make_critic(n_hidden, n_act, observation_key="hidden", action_key=action_key)
-        heads = [critic.get_value_operator(), critic] if len(values) == 2 else [critic]
+        value = make_value(n_hidden, n_act, observation_key="hidden")
+        heads = [value, critic] if len(values) == 2 else [critic]
         return actor, *(TensorDictSequential(common, head) for head in heads), common, td
 
 
