@@ -398,7 +398,9 @@ class QPMPC(nn.Module):
         # A parametrised module refuses to be pickled, which would bar it from spawned collectors.
         for name in getattr(self, "parametrizations", ()):
             kept = self.get_submodule(f"parametrizations.{name}").children()
-            if [type(part) for part in kept] != [type(part) for part in self._kept(name)]:
+            if [type(part) for part in kept] != [
+                type(part) for part in self._kept(name, getattr(self, name))
+            ]:
                 got = f"a parametrization of {name} that is not QPMPC's own"
                 remedy = "Save the state_dict, or remove_parametrizations first."
                 raise QPError.expected("pickle", got, "QPMPC's own", remedy)
