@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -61,7 +62,7 @@ def scenario(method: str) -> None:
     torch.set_num_threads(2)
     mpcs = [random_mpc(0, solver=name).share_memory() for name in BACKENDS]
     expected = [answers(mpc) for mpc in mpcs]
-    context = torch.multiprocessing.get_context(method)
+    context: Any = torch.multiprocessing.get_context(method)
     child = context.Process(target=check, args=(mpcs, expected), daemon=True)
     child.start()
     child.join(WATCHDOG)
