@@ -1,9 +1,5 @@
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -18,6 +14,7 @@ from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states,
 from torch_qpmpc import QPError, QPSolution, QuadraticProgram, SolverError, Status, solve_qp
 from torch_qpmpc.autograd import solve_op
 from torch_qpmpc.qp import EVENT_SHAPES
+from torch_qpmpc.sensitivity import solution_op
 
 SOLUTION = (
     *("value", "z", "sigma", "chi", "upsilon", "eta", "mu", "xi"),
@@ -328,30 +325,6 @@ def test_ensembles_of_parameters_are_vmapped():
     assert_close(ensemble, torch.stack([mpc.value(s) for mpc in modules]))
 
 
-@pytest.mark.parametrize("of_action", [False, True])
-def test_compiled_without_graph_breaks_equals_eager(of_action):
-    mpc, s, a = random_mpc(3), random_states(4), random_states(4, 1, size=0.4)
-    inputs = (s, a) if of_action else (s,)
-    function: Callable[..., Tensor] = mpc.action_value if of_action else mpc.value
-    gradients, values = [], []
-    for one in (function, torch.compile(function, fullgraph=True, backend="aot_eager")):
-        mpc.zero_grad()
-        out = one(*inputs)
-        out.square().sum().backward()
-        values.append(out.detach())
-        gradients.append({name: part.grad for name, part in mpc.named_parameters()})
-    assert_close(values[1], values[0])
-    assert_close(gradients[1], gradients[0])
-    torch._dynamo.reset()
-
-
-def test_the_compiled_policy_equals_the_eager_one():
-    mpc, s = random_mpc(3), random_states(4)
-    compiled = torch.compile(mpc.policy, fullgraph=True, backend="aot_eager")
-    assert_close(compiled(s), mpc.policy(s))
-    torch._dynamo.reset()
-
-
 @pytest.mark.parametrize("batch", [(), (3,)])
 def test_the_operator_keeps_torchs_contract(batch):
     known = known_qp(9, batch=batch)
@@ -359,6 +332,9 @@ def test_the_operator_keeps_torchs_contract(batch):
     active = torch.zeros(known.lam.shape, dtype=torch.int8)
     arguments = (*operands, active, 2, "daqp", "mask")
     torch.library.opcheck(solve_op, arguments)
+    solution = [part.detach() for part in (known.z, known.lam, known.chi)]
+    found = [*solution, torch.zeros_like(known.fixed), torch.zeros(batch, dtype=torch.int64)]
+    torch.library.opcheck(solution_op, (*found, *operands, 2))
 
 
 # What comes out
@@ -514,29 +490,6 @@ def test_threads_that_solve_at_once_get_their_own_answers(solver):
     for one, other in zip(alone, together, strict=True):
         for name in SOLUTION:
             assert_close(getattr(other, name), getattr(one, name), rtol=1e-7, atol=1e-9)
-
-
-FORK = """
-import os, signal, torch
-from tests.problems import random_mpc, random_states
-
-torch.set_num_threads(2)
-mpc, s = random_mpc(0, solver="proxqp"), random_states(16)
-before = mpc.value(s).detach()
-child = os.fork()
-if child == 0:
-    signal.alarm(30)  # ends the child should it hang
-    same = torch.allclose(mpc.value(s).detach(), before)
-    os._exit(0 if same else 1)
-assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-assert torch.allclose(mpc.value(s).detach(), before)
-"""
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="the platform has no fork")
-def test_a_child_forked_after_a_parallel_solve_solves_too():
-    root = os.path.dirname(os.path.dirname(__file__))
-    subprocess.run([sys.executable, "-c", FORK], check=True, timeout=90, cwd=root)
 
 
 @pytest.mark.parametrize("name", ["solver", "on_failure"])

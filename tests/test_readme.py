@@ -41,6 +41,17 @@ def test_readme_runs(tmp_path, monkeypatch):
         exec(compile("\n" * line + code, str(README), "exec"), namespace)
 
 
+@pytest.mark.skipif(not README.exists(), reason="README.md is not there, as in a wheel's tests")
+def test_every_test_that_the_readme_names_exists():
+    text = README.read_text(encoding="utf-8")
+    table = text.split("<!-- pytorch -->")[1].split("<!-- /pytorch -->")[0]
+    named = re.findall(r"\[(test_\w+)\]\((tests/[\w/]+\.py)\)", table)
+    assert len(named) == table.count("](") > 20
+    for test, path in named:
+        source = (README.parent / path).read_text(encoding="utf-8")
+        assert f"\ndef {test}(" in source, f"{path}::{test}"
+
+
 @pytest.mark.parametrize("name", ["torch_qpmpc", *MODULES])
 def test_docstrings_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -309,8 +309,9 @@ class QPMPC(nn.Module):
             if not parametrize.is_parametrized(self, part) or part in ("H", "H_f"):
                 continue
             value = getattr(self, part).detach()
-            # A deep copy has the same class, which the next line but one would change.
-            self.__class__ = type(type(self).__name__, type(self).__bases__, {**vars(type(self))})
+            # A deep copy has the same class, which remove_parametrizations would change.
+            own = type(type(self).__name__, type(self).__bases__, {**vars(type(self))})
+            self.__class__ = own  # pyright: ignore[reportAttributeAccessIssue] - the same but by id
             frozen = not any(leaf.requires_grad for leaf in self._leaves(part))
             parametrize.remove_parametrizations(self, part)
             delattr(self, part)
