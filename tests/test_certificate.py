@@ -179,6 +179,20 @@ def test_complementarity_gaps_of_opposite_sign_do_not_cancel():
     assert certify(programs, 0 * z, lam, empty, empty).residual < TOLERANCE
 
 
+def test_absurd_multipliers_excuse_nothing():
+    # min 1/2 z'z - 2 z_2 with z_1 = 0, once in C and once in G: z_2 is 2, not 1.9.
+    C, none = torch.tensor([[1.0, 0.0]]), torch.zeros(1)
+    q, hard = torch.tensor([0.0, -2.0]), torch.full((1,), torch.inf)
+    programs, _ = FlatPrograms.of(
+        torch.eye(2), q, none.sum(), C, none, C, none, none, hard, none[:0]
+    )
+    huge = torch.full((1, 1), 1e12).double()
+    for z_2, accepted in ((2.0, True), (1.9, False)):
+        z = torch.tensor([[0.0, z_2]]).double()
+        residual = certify(programs, z, huge, -huge, z[:, :0]).residual
+        assert bool(residual <= TOLERANCE) == accepted
+
+
 def test_the_constant_is_part_of_the_value_but_loosens_nothing():
     known = known_qp(5, batch=(BATCH,))
     lifted = replace(known, qp=replace(known.qp, c=known.qp.c + 1e9))

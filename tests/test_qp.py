@@ -2,15 +2,16 @@ from __future__ import annotations
 
 import doctest
 import importlib
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
 from typing import Any
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from tests.problems import known_qp
-from torch_qpmpc import QPError, QuadraticProgram, Status
-from torch_qpmpc.qp import EVENT_SHAPES
+from torch_qpmpc import QPError, QuadraticProgram, Status, solve_qp
+from torch_qpmpc.qp import EVENT_SHAPES, crossed
 
 GOOD: dict[str, Any] = dict(zip(EVENT_SHAPES, known_qp(0).qp.tensors(), strict=True))
 
@@ -94,6 +95,17 @@ def test_one_bad_element_of_a_batch_is_found():
 @pytest.mark.parametrize("lowest", [0.0, -1e-12])
 def test_a_singular_hessian_is_accepted_up_to_rounding(lowest):
     QuadraticProgram(**(GOOD | {"H": with_eigenvalue(lowest)}))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bounds_that_cross_by_rounding_are_accepted_as_equal(dtype):
+    known = known_qp(0, batch=(3,), soft=("equality",), hard=("equality",), dtype=dtype)
+    up = torch.nextafter(known.qp.lb, torch.full_like(known.qp.lb, torch.inf))
+    solution = solve_qp(replace(known.qp, lb=up), known.fixed, solver="daqp")
+    rounding = 1e-4 if dtype == torch.float32 else 1e-9
+    assert_close(solution.value, known.value, rtol=rounding, atol=rounding)
+    assert not crossed(up, known.qp.ub).any()
+    assert crossed(up + 1e-3, known.qp.ub).all()
 
 
 def test_infinite_bounds_and_weights_are_accepted():

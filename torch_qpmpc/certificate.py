@@ -116,9 +116,8 @@ def certify(
 
     The residual is the largest of: stationarity, C z = b, the fixed entries, violation of hard
     rows, multipliers outside [-w, w] or of absent bounds, each relative to the size of the terms
-    that it compares; and what all of them, with the rows' complementarity gaps, may be worth, by the
-    claim's own z and multipliers, relative to the cost. ``products`` saves computing
-    them again.
+    that it compares; and what all of them, with the rows' complementarity gaps, are worth at the
+    claim's own z and multipliers, relative to the cost. ``products`` saves computing them again.
     """
     p = programs
     terms = Products.of(p, z, lam, chi, xi) if products is None else products

@@ -1,4 +1,4 @@
-"""Solve QPs of which the outcome is known: ``python -m tests.campaign --count 100000 --solver daqp``.
+"""Solve QPs whose outcome is known: ``python -m tests.campaign --count 100000 --solver daqp``.
 
 It ends with a table in Markdown, which ``--readme`` writes to README.md.
 """

@@ -1,8 +1,8 @@
 """What became of each QP of a case, judged by what is known of it and not by the package.
 
 A solution is right if it satisfies C z = b, the fixed entries and the hard rows, if its value and
-the cost of its z are the known value, and if z is near the known one in the norm of H, which says as
-much of z as the value does: 1/2 (z - z*)'H(z - z*) is at most what z costs too much. All of it
+the cost of its z are the known value, and if z is near the known one in the norm of H, which says
+as much of z as the value does: 1/2 (z - z*)'H(z - z*) is at most what z costs too much. All of it
 relative to the sum of the absolute terms of the Lagrangian at the known solution, which has the
 QP's own units.
 """
@@ -23,7 +23,7 @@ from torch_qpmpc.qp import slacks
 
 @dataclass(frozen=True)
 class Outcome:
-    """Masks ``(B,)``, of which each QP is in one; and the relative error of the value, if SOLVED."""
+    """Masks ``(B,)``, each QP in one of them; and the relative error of what is called solved."""
 
     certified: Tensor
     named: Tensor

@@ -18,7 +18,7 @@ SLOW = 0.5
 
 @dataclass
 class Tally:
-    """Counts; ``error`` is the largest of a certified QP, ``slowest`` in seconds, measured alone."""
+    """Counts; ``error`` is a certified QP's largest, ``slowest`` in seconds, measured alone."""
 
     count: int = 0
     certified: int = 0

@@ -86,9 +86,10 @@ CASES = [
     ("name", "qp", "status"), CASES, ids=[f"{s.name} {n}" for n, _, s in CASES]
 )
 def test_what_cannot_be_solved_is_named_and_soon(solver, name, qp, status):
-    began = time.perf_counter()
+    # Of this process's own time: a busy machine is not slow.
+    began = time.process_time()
     solution = solve_qp(qp, solver=solver, on_failure="mask")
-    assert time.perf_counter() - began < 2
+    assert time.process_time() - began < 2
     assert Status(int(solution.status)) == status
     assert solution.value == torch.inf
 
@@ -96,9 +97,9 @@ def test_what_cannot_be_solved_is_named_and_soon(solver, name, qp, status):
 def test_an_infeasible_mpc_batch_is_named_and_soon(solver):
     options = {"horizon": 20, "state_slack": torch.inf, "action_slack": 1.0, "on_failure": "mask"}
     mpc = random_mpc(0, free=0.0, solver=solver, **options)
-    began = time.perf_counter()
+    began = time.process_time()
     solution = mpc.solve(torch.tensor([[2.0, 2.0], [5.0, 5.0], [-5.0, 5.0]]))
-    assert time.perf_counter() - began < 2
+    assert time.process_time() - began < 2
     assert (solution.status == Status.INFEASIBLE).all()
 
 

@@ -1,8 +1,8 @@
 """A QP's own units: far from ordinary sizes it is solved, and certified, in these.
 
 Tolerances are relative, but to no less than one: to the solvers and the certificate a QP whose
-cost, variables or rows are of size 1e-8 is a QP of zeros. With units of cost kappa, of length l, and
-of the rows rho (of G) and gamma (of C),
+cost, variables or rows are of size 1e-8 is a QP of zeros. With units of cost kappa, of length l,
+and of the rows rho (of G) and gamma (of C),
 
     z = l z',  H' = H l^2 / kappa,  q' = q l / kappa,  C' = C l / gamma,  b' = b / gamma,
     G' = G l / rho,  (lb, ub)' = (lb, ub) / rho,  w' = w rho / kappa,
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -39,20 +40,21 @@ class Units:
         """The units of ``p``, or None where all of them are one."""
         if not len(p) or not p.q.shape[-1]:
             return None
-        # What is infinite or NaN says nothing of sizes.
-        q, b, w = (_per_triple(p, x.abs().nan_to_num(0, 0, 0)) for x in (p.q, p.b, p.w))
-        lower, upper = (x.abs().nan_to_num(0, 0, 0) for x in (p.lb, p.ub))
-        bound = _per_triple(p, lower.maximum(upper))
-        G, C = p.G.abs().sum(-1), p.C.abs().sum(-1)
-        reach = torch.cat((bound / G, b / C, torch.zeros_like(q[:, :1])), dim=-1)
-        known = (reach > 0) & reach.isfinite()
-        length = _unit(reach.masked_fill(~known, torch.nan).nanmedian(-1, keepdim=True).values)
-        force = q.amax(-1, keepdim=True) * length
-        cost = force.maximum(p.H.abs().amax((1, 2)).unsqueeze(-1) * length.square())
-        if w.shape[-1]:  # of a QP without any other cost
-            cost = torch.where(cost > 0, cost, (w * G).amax(-1, keepdim=True) * length)
-        units = cls(_unit(cost), length, _unit(G * length), _unit(C * length))
-        return None if all((unit == 1).all() for unit in vars(units).values()) else units
+        # Some thirty operations on small arrays, for which torch takes several times as long.
+        parts = (p.H, p.C, p.G, p.q, p.b, p.lb, p.ub, p.w)
+        H, C, G, *vectors = (np.abs(part.cpu().numpy()) for part in parts)
+        group = p.group.cpu().numpy() if len(H) > 1 else None
+        q, b, lb, ub, w = (_per_triple(_finite(vector), len(H), group) for vector in vectors)
+        C, G = C.sum(-1), G.sum(-1)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            length = _unit(_median(np.concatenate((np.maximum(lb, ub) / G, b / C), axis=-1)))
+            cost = np.maximum(q.max(-1, keepdims=True) * length, H.max((1, 2))[:, None] * length**2)
+            if w.shape[-1]:  # of a QP without any other cost
+                cost = np.where(cost > 0, cost, (w * G).max(-1, keepdims=True) * length)
+            units = (_unit(cost), length, _unit(G * length), _unit(C * length))
+        if all((unit == 1.0).all() for unit in units):
+            return None
+        return cls(*(torch.from_numpy(unit).to(p.q) for unit in units))
 
     def scaled(self, p: FlatPrograms) -> FlatPrograms:
         """The same QPs in these units."""
@@ -97,16 +99,34 @@ class Units:
         return unit if len(unit) == 1 else unit[p.group]
 
 
-def _per_triple(p: FlatPrograms, sizes: Tensor) -> Tensor:
+def _finite(sizes: np.ndarray) -> np.ndarray:
+    """Zeros for what is infinite or NaN and says nothing of sizes; in place."""
+    sizes[~np.isfinite(sizes)] = 0.0
+    return sizes
+
+
+def _per_triple(sizes: np.ndarray, count: int, group: np.ndarray | None) -> np.ndarray:
     """The largest ``(B or 1, n)`` of the QPs that share their matrices, ``(M, n)``."""
-    if len(p.H) == 1:
-        return sizes.amax(0, keepdim=True)
-    index = p.group.unsqueeze(-1).expand(-1, sizes.shape[-1])
-    largest = sizes.new_zeros(len(p.H), sizes.shape[-1])
-    return largest.scatter_reduce_(0, index, sizes.expand(len(p), -1), "amax")
+    if group is None:
+        return sizes.max(0, keepdims=True)
+    largest = np.zeros((count, sizes.shape[-1]))
+    np.maximum.at(largest, group, np.broadcast_to(sizes, (len(group), sizes.shape[-1])))
+    return largest
 
 
-def _unit(sizes: Tensor) -> Tensor:
+def _median(sizes: np.ndarray) -> np.ndarray:
+    """The (lower) median of the positive finite sizes of each row, ``(M, 1)``; inf if none is."""
+    known = (sizes > 0) & (sizes < np.inf)
+    ordered = np.sort(np.where(known, sizes, np.inf), axis=-1)
+    if not ordered.shape[-1]:
+        return np.full((len(sizes), 1), np.inf)
+    middle = np.maximum(known.sum(-1, keepdims=True) - 1, 0) // 2
+    return np.take_along_axis(ordered, middle, axis=-1)
+
+
+def _unit(sizes: np.ndarray) -> np.ndarray:
     """The power of two next above each size, or one if that is ordinary, zero or not finite."""
-    extreme = ((sizes > 0) & (sizes < SMALL)) | ((sizes > LARGE) & sizes.isfinite())
-    return torch.where(extreme, sizes / torch.frexp(sizes).mantissa, 1.0)
+    extreme = ((sizes > 0) & (sizes < SMALL)) | ((sizes > LARGE) & (sizes < np.inf))
+    if not extreme.any():
+        return np.ones_like(sizes)
+    return np.where(extreme, np.ldexp(1.0, np.frexp(sizes)[1]), 1.0)

@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.campaign import families
+from tests.campaign.__main__ import load, main
+from tests.campaign.families import FAMILIES, Draw, solvable, well_posed
+from tests.campaign.outcomes import judge
+from tests.campaign.tally import Tally
+from tests.campaign.trained import trained
+from torch_qpmpc import QPSolution, Status, solve_qp
+
+pytestmark = pytest.mark.filterwarnings("ignore:Clarabel.rs terminated with status")
+
+
+@pytest.fixture(autouse=True)
+def _little_training(monkeypatch):
+    monkeypatch.setattr(families, "trained", lambda: trained(16))
+
+
+@settings(
+    derandomize=True,
+    deadline=None,
+    database=None,
+    max_examples=60,
+    # What the fixtures are does not depend on the example.
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(data=st.data())
+def test_no_qp_is_called_what_it_is_not(solver, data):
+    family = data.draw(st.sampled_from(sorted(FAMILIES)))
+    seed, count = data.draw(st.integers(0, 2**32)), data.draw(st.integers(1, 6))
+    tally = Tally()
+    assert tally.add(FAMILIES[family](Draw(seed), count), solver) == []
+    assert tally.certified + tally.named + tally.missed == tally.count
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_a_family_is_the_same_for_the_same_seed(name):
+    one, other = (FAMILIES[name](Draw(7), 3) for _ in range(2))
+    assert torch.equal(one.expected, other.expected)
+    for a, b in zip(one.known.qp.tensors(), other.known.qp.tensors(), strict=True):
+        assert torch.equal(a.nan_to_num(), b.nan_to_num())
+
+
+def solved(seed: int = 0) -> tuple[families.Case, QPSolution]:
+    case = well_posed(Draw(seed), 4)
+    return case, solve_qp(case.known.qp, case.known.fixed, solver="daqp")
+
+
+SPOILERS = {
+    "value": lambda s: {"value": s.value + 1e-3 * (1 + s.value.abs())},
+    "z": lambda s: {"z": s.z + 0.1},
+    "status": lambda s: {"status": torch.full_like(s.status, int(Status.INFEASIBLE))},
+    "NaN": lambda s: {"value": s.value * torch.nan},
+}
+
+
+@pytest.mark.parametrize("name", SPOILERS)
+def test_the_judge_notices_what_is_wrong(name):
+    case, solution = solved()
+    assert judge(case, solution).certified.all()
+    changed = QPSolution(**(vars(solution) | SPOILERS[name](solution)))
+    assert judge(case, changed).wrong.all()
+
+
+def test_a_solution_of_what_has_none_is_wrong_and_giving_up_is_not():
+    case, solution = solved()
+    hopeless = families.Case(case.known, torch.full_like(case.expected, int(Status.INFEASIBLE)))
+    assert judge(hopeless, solution).wrong.all()
+    gave_up = torch.full_like(solution.status, int(Status.NOT_CONVERGED))
+    tired = QPSolution(**(vars(solution) | {"status": gave_up}))
+    assert judge(hopeless, tired).missed.all()
+    assert judge(solvable(case.known), tired).missed.all()
+
+
+def test_the_command_counts_and_writes_its_table(tmp_path, capsys):
+    options = ["--count", "12", "--family", "well posed", "unbounded", "--results", str(tmp_path)]
+    assert main([*options, "--solver", "daqp", "torch"]) == 0
+    tallies = load(tmp_path)
+    assert list(tallies) == ["daqp", "torch"]
+    for of_one in tallies.values():
+        assert (of_one["well posed"].certified, of_one["unbounded"].named) == (6, 6)
+    printed = capsys.readouterr().out
+    assert "| well posed | 6 / 0 / 0 | 6 / 0 / 0 |" in printed
+    assert "| wrong | 0 | 0 |" in printed
