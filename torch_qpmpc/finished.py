@@ -94,8 +94,9 @@ class FinishedRun:
         """
         true = nearest_model(predictions(self.true))
         start = model_error(nearest_model(predictions(self.start)), true, self.physics)
+        mpc = self.learned
         try:
-            model = nearest_model(predictions(self.learned))
+            model = nearest_model(predictions(mpc))
         except QPError:
             return {"distance": math.nan, "model_error": math.nan, "model_error_start": start}
         return {
