@@ -93,7 +93,9 @@ class FinishedRun:
             determine the states, the errors also where the plant has no such model.
         """
         mpc = self.learned
-        readings = dict.fromkeys(("distance", "model_error", "model_error_start"), math.nan)
+        readings: dict[str, float] = dict.fromkeys(
+            ("distance", "model_error", "model_error_start"), math.nan
+        )
         try:
             model = nearest_model(predictions(mpc))
         except QPError:
