@@ -1,10 +1,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
 
+import train
+from tests.runs import SMALL, make_config
 from torch_qpmpc.solvers import BACKENDS
 
 # Test workers side by side are the parallelism; threads of each would only wait for one another.
@@ -24,3 +27,18 @@ def two_threads() -> Iterator[None]:
     torch.set_num_threads(2)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sweeps of small finished runs; seed 4 starts without a gap worth closing."""
+    folder = tmp_path_factory.mktemp("runs")
+    runs = [("small", "gaussian", case, seed) for case in ("fixed", "free") for seed in (1, 4)]
+    for sweep, noise, case, seed in [*runs, ("small", "brownian", "free", 1)]:
+        settings = (f"constraint={case}", f"noise={noise}", f"seed={seed}", "figures=false")
+        place = folder / sweep / f"{noise}-{case}-seed{seed}"
+        train.train(make_config(*SMALL, *settings), str(place), quiet=True)
+    for c_2 in (0.0, 0.5):
+        settings = (f"constraint.deviation.c_2={c_2}", "figures=false")
+        train.train(make_config(*SMALL, *settings), str(folder / "weights" / f"{c_2}"), quiet=True)
+    return folder

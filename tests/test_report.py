@@ -1,61 +1,93 @@
 from __future__ import annotations
 
-import json
-import sys
+from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
-from torch_qpmpc import QPError, report
+from torch_qpmpc import report
+from torch_qpmpc.finished import collect
 
 
-def write_runs(folder, gaps):
-    for (noise, constraint, seed), gap in gaps.items():
-        run = folder / f"{noise}-{constraint}" / str(seed)
-        run.mkdir(parents=True)
-        summary = {"noise": noise, "constraint": constraint, "seed": seed, "closed_gap": gap}
-        summary |= {"J_start": 285.04, "J_final": 50.0, "J_true_model": 46.97, "unsolved": 0}
-        (run / "summary.json").write_text(json.dumps(summary | {"train_seconds": 3.21}))
+def made_up(gaps: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
+    """Runs by noise and case, of which the last of each had no real gap."""
+    rows = []
+    for (noise, case), values in gaps.items():
+        for seed, gap in enumerate(values, 1):
+            row = {"sweep": "a", "noise": noise, "constraint": case, "label": case, "seed": seed}
+            row |= {"closed_gap": gap, "real": seed < len(values), "distance": 0.1 * seed}
+            row |= {"model_error": 0.02 * seed, "model_error_start": 0.05}
+            for name in ("J", "J_discounted"):
+                row |= {f"{name}_start": 285.04, f"{name}_final": 50.0, f"{name}_true_model": 46.97}
+            rows.append(row | {"unsolved": 0, "train_seconds": 3.21})
+    return pd.DataFrame(rows)
 
 
-@pytest.fixture
-def runs(tmp_path):
-    gaps = {("gaussian", "free", seed): 0.9 + seed / 100 for seed in (1, 2, 5)}
-    gaps |= {("gaussian", "fixed", 1): -0.2, ("brownian", "free", 1): 0.8}
-    write_runs(tmp_path, gaps)
-    return tmp_path
+def test_a_case_is_a_row_with_median_interval_and_both_ends():
+    frame = made_up({("gaussian", "free"): [0.9, 0.9, 0.9, 0.1], ("brownian", "si"): [0.5]})
+    *_, free, si = report.cases_table(frame).splitlines()
+    ends = "285.0 | 50.0 | 47.0 | 285.0 | 50.0 | 47.0"
+    errors = "0.250 | 0.050 | 0.050 (2 of 4)"
+    assert free == f"| gaussian | free | 0.900 [0.900, 0.900] (3 of 4) | {ends} | {errors} |"
+    assert si == f"| brownian | si | - (0 of 1) | {ends} | 0.100 | 0.050 | 0.020 (1 of 1) |"
 
 
-def test_every_run_is_a_row_in_the_papers_order(runs):
-    frame = report.collect(runs)
-    assert list(zip(frame["noise"], frame["constraint"], frame["seed"], strict=True)) == [
-        ("brownian", "free", 1),
-        ("gaussian", "fixed", 1),
-        ("gaussian", "free", 1),
-        ("gaussian", "free", 2),
-        ("gaussian", "free", 5),
-    ]
-    assert "| gaussian | fixed | 1 | 285.0 | 50.0 | 47.0 | -0.2 | 0 | 3.2 |" in report.runs_table(
-        frame
+def test_every_run_is_in_the_long_table():
+    frame = made_up({("gaussian", "free"): [0.91, 0.92]})
+    assert report.runs_table(frame).splitlines()[-1] == (
+        "| a | gaussian | free | 2 | 285.0 | 50.0 | 47.0 | 0.920 | 0.200 | 0.0400 | 0.0500 | 0 "
+        "| 3.2 |"
     )
 
 
-def test_cases_show_median_and_range(runs):
-    table = report.cases_table(report.collect(runs))
-    assert "| free | 0.80 (0.80 to 0.80) | 0.92 (0.91 to 0.95) |" in table
-    assert "| fixed | - | -0.20 (-0.20 to -0.20) |" in table
+def test_the_learned_cases_come_to_one_number_in_which_each_weighs_alike():
+    gaps = {"free": 0.9, "deviation": 0.8, "si": 1.0, "combined": 0.9, "fixed": -3.0}
+    frame = made_up({("gaussian", case): [gap] * 5 for case, gap in gaps.items()})
+    text = report.overall(frame)
+    # Each case is a stratum without spread, so that there is no doubt about the mean.
+    assert text.endswith("four cases that learn C: gaussian noise 0.900 [0.900, 0.900].")
+    assert report.overall(frame[frame["label"] != "si"]) == ""
 
 
-def test_the_command_prints_both_tables(runs, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["report", str(runs)])
-    report.main()
+def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
+    readme = tmp_path / "README.md"
+    readme.write_text("# A\n<!-- study -->\nold\n<!-- /study -->\nend\n")
+    (tmp_path / "notebooks").mkdir()
+    report.main([str(study), "--readme", str(readme)])
+
     printed = capsys.readouterr().out
-    assert "J_true_model" in printed
-    assert "over seeds [1, 2, 5]" in printed
+    frame = collect(study)
+    for name, sweep in frame.groupby("sweep"):
+        table = report.cases_table(sweep)
+        for text in (printed, (study / "report" / "report.md").read_text(), readme.read_text()):
+            assert table in text
+        kinds = ("learning", "constraints", "trajectories")
+        figures = {f"{kind}-{noise}.png" for kind in kinds for noise in {*sweep["noise"]}}
+        figures |= {"meaning.png"}
+        drawn = {path.name for path in (study / "report" / str(name)).iterdir()}
+        assert drawn == figures
+        for figure in drawn:
+            assert f"]({name}/{figure})" in (study / "report" / "report.md").read_text()
+    assert len((study / "report" / "runs.md").read_text().splitlines()) == 2 + len(frame)
+    assert "old" not in readme.read_text()
+    assert readme.read_text().endswith("<!-- /study -->\nend\n")
+    assert 5_000 < (tmp_path / "notebooks" / "study.png").stat().st_size < 200_000
+    # Its own folder is no run.
+    assert len(collect(study)) == len(frame)
 
 
-def test_a_folder_without_runs_is_named(tmp_path, monkeypatch):
-    with pytest.raises(QPError, match=r"RUNS_FOLDER: got .* without a finished run"):
-        report.collect(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["report", str(tmp_path)])
+def test_many_settings_are_a_frontier_and_ablations_have_their_figure():
+    gaps = {("gaussian", f"combined, c_2={i}"): [0.9, 0.8] for i in range(9)}
+    frame = made_up(gaps)
+    assert [name for name, _ in report.figures(frame)] == ["frontier"]
+    ablations = frame.assign(ablation=np.where(frame["label"] < "combined, c_2=4", "a", "b"))
+    assert [name for name, _ in report.figures(ablations)] == ["frontier", "ablation"]
+
+
+def test_what_is_wrong_is_said_in_one_line(study, tmp_path):
     with pytest.raises(SystemExit, match="without a finished run"):
-        report.main()
+        report.main([str(tmp_path)])
+    (tmp_path / "README.md").touch()
+    with pytest.raises(SystemExit, match="expected one line <!-- study -->"):
+        report.main([str(study / "weights"), "--readme", str(Path(tmp_path) / "README.md")])

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch_qpmpc.canonical import PredictionForm, canonical_matrix, prediction_form
 from torch_qpmpc.checkpoint import load_checkpoint
 from torch_qpmpc.config import flatten
-from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.structure import Model, nearest_model, stage_models
@@ -52,7 +52,7 @@ class FinishedRun:
         return cfg
 
     @cached_property
-    def physics(self) -> LinearSystem:
+    def physics(self) -> LinearSystem | GymnasiumPlant:
         return make_physics(self.cfg)
 
     @cached_property
@@ -61,8 +61,8 @@ class FinishedRun:
         return make_mpc(self.cfg, self.physics)
 
     @cached_property
-    def true(self) -> QPMPC:
-        """The QP with the true model."""
+    def true(self) -> QPMPC | None:
+        """The QP with the true model, if there is one."""
         return make_true_mpc(self.cfg, self.physics)
 
     @cached_property
@@ -89,20 +89,24 @@ class FinishedRun:
 
         Returns:
             ``distance`` of the predictions to that model's, as a share; ``model_error`` and, of
-            the model at the start, ``model_error_start``. The first two are nan where the
-            constraints do not determine the states.
+            the model at the start, ``model_error_start``. All are nan where the constraints do not
+            determine the states, the errors also where the plant has no such model.
         """
-        true = nearest_model(predictions(self.true))
-        start = model_error(nearest_model(predictions(self.start)), true, self.physics)
+        mpc = self.learned
+        readings: dict[str, float] = dict.fromkeys(
+            ("distance", "model_error", "model_error_start"), math.nan
+        )
         try:
-            model = nearest_model(predictions(self.learned))
+            model = nearest_model(predictions(mpc))
         except QPError:
-            return {"distance": math.nan, "model_error": math.nan, "model_error_start": start}
-        return {
-            "distance": float(model.residual),
-            "model_error": model_error(model, true, self.physics),
-            "model_error_start": start,
-        }
+            return readings
+        readings["distance"] = float(model.residual)
+        if self.true is not None and isinstance(self.physics, LinearSystem):
+            true = nearest_model(predictions(self.true))
+            start = nearest_model(predictions(self.start))
+            readings["model_error"] = model_error(model, true, self.physics)
+            readings["model_error_start"] = model_error(start, true, self.physics)
+        return readings
 
 
 def has_real(frame: pd.DataFrame) -> bool:
@@ -155,9 +159,9 @@ def collect(folder: str | Path) -> pd.DataFrame:
         sweep = folder.resolve().name if where == "." else where
         rows.append({**summary, "run": run, "sweep": sweep, **run.readings()})
     frame = pd.DataFrame(rows)
-    # JSON's null.
-    frame["closed_gap"] = frame["closed_gap"].astype(float)
-    frame["closed_gap_discounted"] = frame["closed_gap_discounted"].astype(float)
+    for name in ("closed_gap", "J_true_model", "J_discounted_true_model"):
+        # JSON's null where there is no gap or no true model.
+        frame[name] = frame[name].astype(float) if name in frame else math.nan
     frame["real"] = frame["J_start"] - frame["J_true_model"] >= REAL_GAP
     frame["label"] = ""
     for _, sweep in frame.groupby("sweep"):

@@ -89,7 +89,10 @@ def constraints_figure(frame: pd.DataFrame) -> Figure:
     panels = figure.subplots(2, len(runs) + 1, squeeze=False)
     start: FinishedRun = runs["run"].iloc[0]
     draw_matrix(panels[0, 0], start.start.C_0, start.start, "$C_0$, the start")
-    draw_matrix(panels[1, 0], start.true.C_0, start.true, "$C_0$ of the true model")
+    if start.true is None:
+        panels[1, 0].set_axis_off()
+    else:
+        draw_matrix(panels[1, 0], start.true.C_0, start.true, "$C_0$ of the true model")
     for column, label, run in zip(panels.T[1:], runs["label"], runs["run"], strict=True):
         mpc = run.learned
         draw_matrix(column[0], mpc.C, mpc, rf"$C_\theta$, {label}")
@@ -106,7 +109,11 @@ def trajectories_figure(frame: pd.DataFrame) -> Figure:
         figure.subplots(1, len(runs), squeeze=False)[0], runs["label"], runs["run"], strict=True
     ):
         ends = {"start": run.start, "learned": run.learned, "true model": run.true}
-        loops = {name: evaluate(run.cfg, mpc, run.physics) for name, mpc in ends.items()}
+        loops = {
+            name: evaluate(run.cfg, mpc.policy, run.physics)
+            for name, mpc in ends.items()
+            if mpc is not None
+        }
         draw_positions(axes, loops, run.learned)
         axes.set_title(label)
     figure.suptitle(f"{runs['noise'].iloc[0]} noise, seed {runs['seed'].iloc[0]}")
