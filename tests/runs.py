@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from torch_qpmpc import QPMPC
 from torch_qpmpc.envs import LinearSystem
-from torch_qpmpc.tasks import make_true_mpc
+from torch_qpmpc.tasks import make_physics, make_true_mpc
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: Everything shrinks but the point mass itself.
@@ -47,6 +47,13 @@ def _composed(*overrides: str) -> DictConfig:
 def choices(group: str) -> list[str]:
     """The names that a group can be set to."""
     return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
+
+
+def linear_system(cfg: DictConfig) -> LinearSystem:
+    """A plant that has a true model."""
+    physics = make_physics(cfg)
+    assert isinstance(physics, LinearSystem)
+    return physics
 
 
 def true_mpc(cfg: DictConfig, physics: LinearSystem) -> QPMPC:

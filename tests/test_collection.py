@@ -22,7 +22,7 @@ def collect(cfg: DictConfig, count: int) -> tuple[Any, Any]:
     collector = make_collector(cfg, physics, QPActorValueOperator(mpc).get_policy_operator())
     torch.manual_seed(0)
     try:
-        found = [batch.clone() for batch in itertools.islice(batches(collector), count)]
+        found: list[Any] = [b.clone() for b in itertools.islice(batches(collector), count)]
     finally:
         collector.shutdown()
     return torch.cat(found, dim=1), mpc

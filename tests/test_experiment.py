@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import torch
 
-from tests.runs import SMALL, choices, make_config, true_mpc
+from tests.runs import SMALL, choices, linear_system, make_config, true_mpc
 from torch_qpmpc import QPActorValueOperator
 from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.evaluation import ClosedLoop
@@ -92,7 +92,7 @@ def test_optimizer_options():
 
 def test_evaluation_is_without_exploration_and_repeatable():
     cfg = make_config(*SMALL, "task.gamma=0.5", "task.eval_steps=12")
-    physics = make_physics(cfg)
+    physics = linear_system(cfg)
     mpc = make_mpc(cfg, physics)
     first, second = evaluate(cfg, mpc.policy, physics), evaluate(cfg, mpc.policy, physics)
     assert first.states.shape == (13, 32, 4)
@@ -142,9 +142,11 @@ def test_the_numbers_of_theta_are_logged_where_they_are_few():
 
 def test_structure_summary_tells_the_models_error_before_and_after():
     cfg = make_config(*SMALL, "constraint=free")
-    physics = make_physics(cfg)
+    physics = linear_system(cfg)
     mpc = make_mpc(cfg, physics)
-    A, B, offset = true_model(physics)
+    truth = true_model(physics)
+    assert truth is not None
+    A, B, offset = truth
     before = (mpc.C_0[:4, :6] - torch.cat((A, B), dim=1)).norm().item()
     expected = {"canonical_distance": 0, "model_error": before, "model_error_start": before}
     assert structure_summary(mpc, (A, B, offset)) == pytest.approx(expected, abs=1e-9)
@@ -156,7 +158,7 @@ def test_structure_summary_tells_the_models_error_before_and_after():
 
 def test_a_run_whose_C_cannot_be_read_goes_on():
     cfg = make_config(*SMALL, "constraint=free")
-    physics = make_physics(cfg)
+    physics = linear_system(cfg)
     mpc = make_mpc(cfg, physics)
     with torch.no_grad():
         mpc.C.zero_()
@@ -168,7 +170,7 @@ def test_a_run_whose_C_cannot_be_read_goes_on():
 
 def test_report_logs_the_evaluation(tmp_path):
     cfg = make_config(*SMALL, "constraint=free")
-    physics = make_physics(cfg)
+    physics = linear_system(cfg)
     mpc = make_mpc(cfg, physics)
     with torch.no_grad():
         mpc.C[0, -1] += 0.5

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.runs import make_config, true_mpc
+from tests.runs import linear_system, make_config, true_mpc
 from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.experiment import evaluate
@@ -34,7 +34,7 @@ J_TRUE_MODEL = 47
 def test_ends_of_the_experiment_are_the_known_ones(seed):
     """The numbers that everyone who draws, starts and rolls out alike gets."""
     cfg = make_config(f"seed={seed}", "solver=daqp")
-    physics = make_physics(cfg)
+    physics = linear_system(cfg)
     assert round(evaluate(cfg, make_mpc(cfg, physics).policy, physics).J) == J_START[seed]
     assert round(evaluate(cfg, true_mpc(cfg, physics).policy, physics).J) == J_TRUE_MODEL
 
@@ -62,7 +62,7 @@ def test_start_is_the_corrupted_model_and_a_random_cost():
 
 def test_true_model_has_the_true_cost_and_learns_nothing():
     cfg = make_config()
-    physics = make_physics(cfg)
+    physics = linear_system(cfg)
     mpc = true_mpc(cfg, physics)
     assert mpc.H.tolist() == [6, 6, 0.5, 0.5, 0, 0]
     assert torch.equal(mpc.C, banded_matrix(physics.A, physics.B, 10))
@@ -94,7 +94,7 @@ def test_configuration_reaches_the_qp():
 
 def test_the_other_task_starts_from_the_original_wrong_model():
     cfg = make_config("task=gros_zanon")
-    physics = make_physics(cfg)
+    physics = linear_system(cfg)
     assert isinstance(physics, GrosZanonLTI)
     mpc = make_mpc(cfg, physics)
     A, B = physics.wrong_model()
@@ -113,7 +113,7 @@ def test_the_other_task_starts_from_the_original_wrong_model():
 
 def test_its_other_end_knows_the_mean_of_the_noise():
     cfg = make_config("task=gros_zanon")
-    physics = make_physics(cfg)
+    physics = linear_system(cfg)
     mpc = true_mpc(cfg, physics)
     s, a = torch.tensor([[0.3, 0.2]]).double(), torch.tensor([[-0.4]]).double()
     states, _ = mpc.predicted(mpc.solve(s, a).z)
@@ -125,7 +125,7 @@ def test_its_other_end_knows_the_mean_of_the_noise():
 def test_the_value_of_a_state_has_its_violation():
     """The slacks of x_0 are the plant's own price of leaving the bounds."""
     cfg = make_config("task=gros_zanon", "solver=daqp")
-    physics = make_physics(cfg)
+    physics = linear_system(cfg)
     assert isinstance(physics, GrosZanonLTI)
     mpc = true_mpc(cfg, physics)
     sigma = mpc.solve(torch.tensor([[-0.2, 1.3]]).double()).sigma

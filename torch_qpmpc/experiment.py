@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -262,7 +262,7 @@ def gap_summary(loops: dict[str, ClosedLoop]) -> dict[str, float]:
     return summary
 
 
-def table(summary: dict[str, float]) -> str:
+def table(summary: Mapping[str, Any]) -> str:
     """The outcome for the terminal."""
     lines = [f"{'':14}{'start':>10}{'learned':>10}{'true model':>12}{'closed gap':>12}"]
     for name, tag, gap in (

@@ -90,8 +90,9 @@ def restore(
         replay.load_state_dict(state["replay"])
     _restore_collector(collector, state["collector"])
     torch.set_rng_state(state["rng"])
-    tally = dict(state["tally"])
-    return Tally(**(tally | {"qps": SolveLog(**tally["qps"])}))
+    tally: dict[str, Any] = dict(state["tally"])
+    tally["qps"] = SolveLog(**tally["qps"])
+    return Tally(**tally)
 
 
 def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, dict | None]:

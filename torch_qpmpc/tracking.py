@@ -6,11 +6,12 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
-from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from tensorboard.compat.proto import event_pb2
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from torch_qpmpc.config import flatten
@@ -41,8 +42,10 @@ class RunFolder:
             found = [row.dropna().to_dict() for _, row in table.iterrows()]
             self.rows = [row for row in found if row["update"] <= after]
             # TensorBoard drops what earlier event files have from here on.
-            start = Event(step=after + 1, session_log=SessionLog(status=SessionLog.START))
-            self.logger.experiment.file_writer.event_writer.add_event(start)
+            event: Any = event_pb2  # its classes are made at run time
+            start = event.SessionLog(status=event.SessionLog.START)
+            writer = self.logger.experiment.file_writer.event_writer
+            writer.add_event(event.Event(step=after + 1, session_log=start))
 
     def __enter__(self) -> RunFolder:
         return self
