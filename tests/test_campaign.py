@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -63,7 +65,7 @@ SPOILERS = {
 def test_the_judge_notices_what_is_wrong(name):
     case, solution = solved()
     assert judge(case, solution).certified.all()
-    changed = QPSolution(**(vars(solution) | SPOILERS[name](solution)))
+    changed = replace(solution, **SPOILERS[name](solution))
     assert judge(case, changed).wrong.all()
 
 
@@ -72,7 +74,7 @@ def test_a_solution_of_what_has_none_is_wrong_and_giving_up_is_not():
     hopeless = families.Case(case.known, torch.full_like(case.expected, int(Status.INFEASIBLE)))
     assert judge(hopeless, solution).wrong.all()
     gave_up = torch.full_like(solution.status, int(Status.NOT_CONVERGED))
-    tired = QPSolution(**(vars(solution) | {"status": gave_up}))
+    tired = replace(solution, status=gave_up)
     assert judge(hopeless, tired).missed.all()
     assert judge(solvable(case.known), tired).missed.all()
 
