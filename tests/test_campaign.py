@@ -48,6 +48,13 @@ def test_a_family_is_the_same_for_the_same_seed(name):
         assert torch.equal(a.nan_to_num(), b.nan_to_num())
 
 
+def test_hard_rows_that_C_implies_are_not_called_infeasible():
+    # Rounding left of such rows in the condensed problem once passed for a contradiction.
+    case = FAMILIES["dependent rows"](Draw(2000003), 128)
+    solution = solve_qp(case.known.qp, case.known.fixed, solver="torch", on_failure="mask")
+    assert judge(case, solution).certified.all()
+
+
 def solved(seed: int = 0) -> tuple[families.Case, QPSolution]:
     case = well_posed(Draw(seed), 4)
     return case, solve_qp(case.known.qp, case.known.fixed, solver="daqp")
