@@ -78,7 +78,9 @@ class _Affine:
         T, H, G = condensed.T, condensed.H, condensed.G
         # Rounding in the elimination leaves traces of variables that a row does not contain.
         size = G.abs()
-        entered = (size > ENTERS * size.sum(dim=2, keepdim=True)).any(dim=0)
+        # A row that C implies has nothing else, so the sizes are those before it was eliminated.
+        whole = p.G.abs().bmm(T.abs()).sum(dim=2, keepdim=True)
+        entered = (size > ENTERS * whole).any(dim=0)
         bounded = ((p.lb > -torch.inf) | (p.ub < torch.inf)).any(dim=0)
         position = torch.arange(G.shape[2] + 1, device=G.device)
         shift = p.multiply(condensed.G_b, p.b)

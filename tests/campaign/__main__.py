@@ -1,11 +1,14 @@
 """Solve QPs whose outcome is known: ``python -m tests.campaign --count 100000 --solver daqp``.
 
-It ends with a table in Markdown, which ``--readme`` writes to README.md.
+It ends with two tables in Markdown of the latest counts of each solver: the families, which
+``--write`` writes to CONTRIBUTING.md, and their sums, to README.md. ``--solver`` without a name
+solves nothing.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import sys
 import time
@@ -23,6 +26,7 @@ from torch_qpmpc.solvers import BACKENDS
 #: take as long as no QP may.
 BATCH, FEW = 128, 16
 LONG = ("unbounded", "mixed", "scaled mixed")
+CONTRIBUTING = README.with_name("CONTRIBUTING.md")
 RESULTS = README.parent / "runs" / "campaign"
 
 
@@ -33,16 +37,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--family", nargs="*", default=list(FAMILIES), help="names of families")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--results", type=Path, default=RESULTS, help="a folder for the counts")
-    parser.add_argument("--readme", action="store_true", help="write the table to README.md")
+    parser.add_argument("--write", action="store_true", help="write the tables to the docs")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     for solver in options.solver:
         campaign(solver, options.family, options.count, options.seed, options.results)
     tallies = load(options.results)
-    text = summary(tallies)
-    print(text)
-    if options.readme:
-        README.write_text(replaced(README.read_text(encoding="utf-8"), text, "campaign"), "utf-8")
+    for page, text in ((CONTRIBUTING, by_family(tallies)), (README, totals(tallies))):
+        print(text, end="\n\n")
+        if options.write:
+            new = replaced(page.read_text(encoding="utf-8"), text, "campaign")
+            page.write_text(new, encoding="utf-8")
     return int(any(tally.failures for of_one in tallies.values() for tally in of_one.values()))
 
 
@@ -81,26 +86,31 @@ def load(folder: Path) -> dict[str, dict[str, Tally]]:
     }
 
 
-def summary(tallies: dict[str, dict[str, Tally]]) -> str:
-    """Families by solvers: certified / named / not converged / wrong, and the slowest."""
+def by_family(tallies: dict[str, dict[str, Tally]]) -> str:
+    """The table of families by solvers."""
     families = [name for name in FAMILIES if any(name in of_one for of_one in tallies.values())]
     lines = []
     for family in families:
         of_all = [of_one.get(family) for of_one in tallies.values()]
         lines.append([family, *(tally.cell() if tally else "" for tally in of_all)])
-    totals = []
-    for of_one in tallies.values():
-        total = Tally()
-        for tally in of_one.values():
-            total = total.plus(tally)
-        totals.append(total)
-    lines.append(["all", *(total.cell() for total in totals)])
-    lines.append(["wrong", *(f"{total.wrong:,}" for total in totals)])
-    lines.append(["NaN or inf in a gradient", *(f"{total.not_finite:,}" for total in totals)])
-    lines.append(["largest error", *(f"{total.error:.0e}" for total in totals)])
-    lines.append([f"slower than {SLOW} s", *(f"{total.slow:,}" for total in totals)])
-    lines.append(["slowest, s", *(f"{total.slowest:.2f}" for total in totals)])
-    return table(["certified / named / not converged", *tallies], lines)
+    return table(["certified / named / not converged / wrong", *tallies], lines)
+
+
+def totals(tallies: dict[str, dict[str, Tally]]) -> str:
+    """The table of all families together, by solvers."""
+    sums = [functools.reduce(Tally.plus, of_one.values()) for of_one in tallies.values()]
+    lines = [
+        ["QPs", *(f"{total.count:,}" for total in sums)],
+        ["certified, and right", *(f"{total.certified:,}" for total in sums)],
+        ["failed, and named for what they are", *(f"{total.named:,}" for total in sums)],
+        ["not solved to tolerance", *(f"{total.missed:,}" for total in sums)],
+        ["wrong", *(f"{total.wrong:,}" for total in sums)],
+        ["with NaN or inf in a gradient", *(f"{total.not_finite:,}" for total in sums)],
+        [f"slower than {SLOW} s", *(f"{total.slow:,}" for total in sums)],
+        ["slowest, in seconds of one core", *(f"{total.slowest:.2f}" for total in sums)],
+        ["largest error of what is certified", *(f"{total.error:.0e}" for total in sums)],
+    ]
+    return table(["", *tallies], lines)
 
 
 if __name__ == "__main__":

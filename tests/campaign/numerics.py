@@ -39,14 +39,14 @@ NAMES = (
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.campaign.numerics", description=__doc__)
     parser.add_argument("--solver", nargs="*", default=list(BACKENDS))
-    parser.add_argument("--readme", action="store_true", help="write the table to README.md")
+    parser.add_argument("--write", action="store_true", help="write the table to README.md")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     rows = [measure(solver) for solver in options.solver]
     lines = [[name, *(row[i] for row in rows)] for i, name in enumerate(NAMES)]
     text = table(["largest relative error", *options.solver], lines)
     print(text)
-    if options.readme:
+    if options.write:
         README.write_text(replaced(README.read_text(encoding="utf-8"), text, "numerics"), "utf-8")
 
 

@@ -91,7 +91,7 @@ class Tally:
         return {name: value for name, value in asdict(self).items() if name != "suspect"}
 
     def cell(self) -> str:
-        return f"{self.certified:,} / {self.named:,} / {self.missed:,}"
+        return f"{self.certified:,} / {self.named:,} / {self.missed:,} / {self.wrong:,}"
 
 
 def alone(case: Case, i: int) -> tuple[QuadraticProgram, Tensor]:
