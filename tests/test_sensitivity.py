@@ -190,3 +190,32 @@ def test_compiled_policy_and_its_gradient():
         leaf = s.clone().requires_grad_()
         gradients.append(torch.autograd.grad(policy(leaf).square().sum(), leaf)[0])
     assert_close(*gradients)
+
+
+@pytest.mark.parametrize("length", [1e-8, 1.0, 1e8])
+@pytest.mark.parametrize("cost", [1e-12, 1e-8, 1.0, 1e8])
+def test_the_gradient_of_z_does_not_depend_on_the_units(cost, length):
+    """A multiplier of a cost of 1e-8 is small, but no rounding: its row is active."""
+    M = normal(6, 6)
+    H, q = M @ M.mT + torch.eye(6, dtype=torch.float64), 5 * normal(6)
+    w = torch.tensor([torch.inf] * 3 + [4.0] * 3, dtype=torch.float64)
+    C, box = normal(1, 6), torch.full((6,), 0.5, dtype=torch.float64)
+
+    def in_units(q: Tensor, cost: float, length: float) -> Tensor:
+        qp = QuadraticProgram(
+            H=H * cost / length**2,
+            q=q * cost / length,
+            c=torch.zeros((), dtype=torch.float64),
+            C=C / length,
+            b=torch.zeros(1, dtype=torch.float64),
+            G=torch.eye(6, dtype=torch.float64),
+            lb=-box * length,
+            ub=box * length,
+            w=w * cost / length,
+        )
+        return solve_qp(qp, solver="daqp").z / length
+
+    ordinary = jacrev(lambda q: in_units(q, 1.0, 1.0))(q)
+    assert ordinary.abs().max() > 0.1
+    found = jacrev(lambda q: in_units(q, cost, length))(q)
+    assert_close(found, ordinary, rtol=1e-8, atol=1e-8)

@@ -30,6 +30,7 @@ from torch_qpmpc.condense import condensed_for
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.qp import Status, active_rows
+from torch_qpmpc.solvers.units import units_of
 from torch_qpmpc.tangents import right_side, times
 
 #: Residual of the KKT system from which on it counts as singular.
@@ -76,7 +77,10 @@ def kkt_adjoint(
         programs = programs.without_nan()
     condensed = condensed_for(programs, keep)
     pull_z, pull_lam = flat(grad_z), flat(grad_lam)
-    active, _ = active_rows(flat(lam), programs.w)
+    units, multipliers, weight = units_of(programs), flat(lam), programs.w
+    if units is not None:  # of what size a multiplier is not zero
+        multipliers, weight = (units.multipliers(programs, x) for x in (multipliers, weight))
+    active, _ = active_rows(multipliers, weight)
     n_f = fixed.shape[-1]
     T_f, T = condensed.T[:, :, :n_f], condensed.T[:, :, n_f:]
     # What C p = dl/dchi and E p = dl/dxi fix; then the condensed system for the rest.

@@ -25,7 +25,7 @@ from torch_qpmpc.solvers import (
 from torch_qpmpc.solvers.crossover import refine
 from torch_qpmpc.solvers.diagnose import diagnose
 from torch_qpmpc.solvers.raw import RawSolution, unsolved
-from torch_qpmpc.solvers.units import Units
+from torch_qpmpc.solvers.units import units_of
 
 #: A rejected claim with a relative residual up to this is worth sharpening.
 NEARLY = 1e-2
@@ -84,7 +84,7 @@ def solve_programs(
         start: active sets ``(B, n_g)`` of nearly these QPs, see `torch_qpmpc.solvers.recall`.
     """
     began = time.perf_counter()
-    units: Units | None = programs.known("units", lambda: Units.of(programs))
+    units = units_of(programs)
     chain = _Chain(programs if units is None else units.scaled(programs), keep)
     raw = chain.run(solver, start)
     if units is not None:

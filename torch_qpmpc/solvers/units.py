@@ -94,9 +94,18 @@ class Units:
             xi=raw.xi * cost / length,
         )
 
+    def multipliers(self, p: FlatPrograms, lam: Tensor) -> Tensor:
+        """Multipliers ``(B, n_g)`` of the rows in these units."""
+        return lam * self._of(p, self.rows) / self._of(p, self.cost)
+
     def _of(self, p: FlatPrograms, unit: Tensor) -> Tensor:
         """A unit of each QP, ``(B or 1, n)``."""
         return unit if len(unit) == 1 else unit[p.group]
+
+
+def units_of(p: FlatPrograms) -> Units | None:
+    """`Units.of` once for a theta."""
+    return p.known("units", lambda: Units.of(p))
 
 
 def _finite(sizes: np.ndarray) -> np.ndarray:
