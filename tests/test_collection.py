@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 from typing import Any
 
@@ -9,8 +10,9 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
-from tests.runs import SMALL, make_config
-from torch_qpmpc import QPActorValueOperator
+import train
+from tests.runs import SMALL, make_config, skip_figures
+from torch_qpmpc import QPActorValueOperator, QPError
 from torch_qpmpc.collection import batches, make_collector, num_columns
 from torch_qpmpc.tasks import make_mpc, make_physics
 
@@ -71,3 +73,31 @@ def test_workers_share_the_environments_and_follow_theta(name):
     # Each environment goes on where it was, and no two are alike.
     torch.testing.assert_close(first["next", "observation"][:, -1], second["observation"][:, 0])
     assert len(first["observation"][:, 0].unique(dim=0)) == 4
+
+
+@pytest.mark.parametrize("name", ["multi", "ray"])
+def test_workers_that_do_not_wait_bring_their_own_environments(tmp_path, monkeypatch, name):
+    """A run learns from each batch as it comes: half of the environments at a time."""
+    if name == "ray":
+        pytest.importorskip("ray", reason="the extra ray is not installed")
+    skip_figures(monkeypatch)
+    overrides = (*SMALL, f"collector={name}", "collector.sync=false", "num_envs=4", "constraint=si")
+    cfg = make_config(*overrides, "steps_per_update=5", "warmup_steps=10", "updates=6")
+    assert num_columns(cfg) == 2
+    seen = []
+    monkeypatch.setattr(
+        train, "batches", lambda collector: (seen.append(b.shape) or b for b in batches(collector))
+    )
+    summary = train.train(cfg, str(tmp_path))
+    assert seen == [(2, 5)] * 8
+    assert summary["updates"] == 6
+    assert summary["J_final"] != summary["J_start"]
+
+
+def test_ray_must_be_there(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    cfg = make_config(*SMALL, "collector=ray")
+    with pytest.raises(
+        QPError, match=r"collector: got ray, which is not installed, .* '\.\[ray\]'"
+    ):
+        collect(cfg, 1)
