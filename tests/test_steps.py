@@ -15,6 +15,7 @@ from torch.testing import assert_close
 
 from tests.problems import normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SolverError, steps
+from torch_qpmpc.parts import leaves
 from torch_qpmpc.steps import NEAREST, STEPS, nearest_psd, nearest_psd_by_sdp
 
 #: Both kinds of dense block, and the paper's diagonal; ``w`` learns with them.
@@ -57,7 +58,7 @@ def hessian_of(mpc: QPMPC, H: Any, H_f: Any) -> Any:
 def papers_step(mpc: QPMPC, rate: float) -> dict[str, Tensor]:
     """Where eq:sdp1 puts the parameters, which have their gradients, entry by entry of theta."""
     root = mpc.discount.sqrt()
-    parameters = {name: mpc._leaves(name)[0] for name in mpc.learned}
+    parameters = {name: leaves(mpc, name)[0] for name in mpc.learned}
     step = {
         name: cp.Variable(p.shape, symmetric=p.ndim == 2 and name != "C")
         for name, p in parameters.items()
@@ -158,7 +159,7 @@ def test_what_is_not_finite_is_left_to_the_solver(nearest):
 def test_the_gradient_of_a_matrix_is_symmetric():
     """Also where a loss is not: it asks for one entry of H, or differentiates the solution."""
     mpc = random_mpc(2, step="projection", **HESSIANS["block"])
-    (leaf,) = mpc._leaves("H")
+    (leaf,) = leaves(mpc, "H")
     (mpc.H[0, 1] + mpc.policy(random_states(3)).sum()).backward()
     assert leaf.grad is not None
     assert torch.equal(leaf.grad, leaf.grad.mT)
@@ -301,7 +302,7 @@ def test_a_released_scheme_keeps_the_rule(rule):
     before = mpc.value(s)
     mpc.release()
     assert_close(mpc.value(s), before)
-    (leaf,) = mpc._leaves("w")
+    (leaf,) = leaves(mpc, "w")
     assert leaf.shape == mpc.soft.shape, "each row has a weight of its own"
     learn(mpc, make_optimizer("gauss_newton", mpc), torch.zeros(4))
     assert (mpc.w >= 0).all()

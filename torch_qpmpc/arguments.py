@@ -59,6 +59,15 @@ def check_structure(
         )
 
 
+def check_model(A: Any, B: Any) -> tuple[Tensor, Tensor]:
+    """A and B as matrices, from which n_x and n_u can be read."""
+    A, B = as_tensor("A", A), as_tensor("B", B)
+    if A.ndim < 2 or B.ndim < 2:
+        got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
+        raise QPError.expected("A, B", got, "matrices (n_x, n_x) and (n_x, n_u)")
+    return A, B
+
+
 def as_tensor(name: str, value: Any) -> Tensor:
     try:
         tensor = torch.as_tensor(value, dtype=torch.float64)

@@ -67,3 +67,20 @@ class Layout:
             return self.entries(x, u)
         d, d_f = torch.arange(self.n_d), torch.arange(self.n_d_f)
         return self.rows(x, u, n + d, n + self.n_d + d_f)
+
+    def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """The states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
+        stages = z[..., : self.horizon * self.n].unflatten(-1, (self.horizon, self.n))
+        terminal = z[..., None, self.horizon * self.n :]
+        return torch.cat((stages[..., : self.n_x], terminal), -2), stages[..., self.n_x :]
+
+    def hessian(self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor) -> Tensor:
+        """H ``(n_z, n_z)`` (eq:qpH) from those of the stages and of x_N, or from itself if full."""
+        H = blocks[0]
+        if kind == "diagonal":
+            stages = H.expand(self.horizon, self.n).flatten()
+            return torch.diag_embed(discount * torch.cat((stages, blocks[1])))
+        if kind == "block":
+            H = torch.block_diag(*H.expand(self.horizon, self.n, self.n), blocks[1])
+        root = discount.sqrt()
+        return root.unsqueeze(-1) * H * root

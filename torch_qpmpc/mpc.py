@@ -14,34 +14,23 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torch_qpmpc import starts
+from torch_qpmpc import parts, pickling, starts
 from torch_qpmpc.arguments import (
     CONSTRAINTS,
     COST,
     STRUCTURES,
-    as_tensor,
     check_input,
+    check_model,
     check_pair,
     check_structure,
 )
 from torch_qpmpc.autograd import optimal_value, solve_qp
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.parametrizations import (
-    Banded,
-    Cholesky,
-    LinearRows,
-    SquareRoot,
-    Support,
-    Symmetric,
-    Tied,
-)
+from torch_qpmpc.parametrizations import SIGNED, Banded, Tied, kept
 from torch_qpmpc.precision import full_precision
 from torch_qpmpc.qp import QPSolution, QuadraticProgram
 from torch_qpmpc.solvers import backend
 from torch_qpmpc.steps import CHOLESKY, NEAREST
-
-#: The parts of theta that a convex QP does not leave free.
-SIGNED = ("H", "H_f", "w")
 
 
 class QPMPC(nn.Module):
@@ -171,17 +160,15 @@ class QPMPC(nn.Module):
         self.structure, self.step = given["structure"], given["step"]
         self.solver, self.on_failure = given["solver"], given["on_failure"]
         self.learned = tuple(name for name in (*COST, *CONSTRAINTS) if name in learn)
-        if "G" in learn and self.structure != "free" and not self._layout.n_linear:
-            raise QPError.expected(
-                "learn", "'G'", "parts that there are", "Give constraints, or structure='free'."
-            )
         self.register_buffer("C_0", theta["C"].to(torch.float64))
         self._derive()
         self.register_buffer("soft", theta["w"].isfinite())
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
         for name, start in theta.items():
-            self._own(name, start)
+            parts.register(self, name, start.to(torch.float64).clone(), name in self.learned)
+            if name in self.learned:
+                parts.keep(self, name, self._kept(name))
 
     @classmethod
     def from_model(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
@@ -192,10 +179,7 @@ class QPMPC(nn.Module):
             horizon: N.
             options: the keyword arguments of `QPMPC`.
         """
-        A, B = as_tensor("A", A), as_tensor("B", B)
-        if A.ndim < 2 or B.ndim < 2:
-            got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
-            raise QPError.expected("A, B", got, "matrices (n_x, n_x) and (n_x, n_u)")
+        A, B = check_model(A, B)
         return cls(A.shape[-1], B.shape[-1], horizon, A=A, B=B, **options)
 
     @classmethod
@@ -258,10 +242,7 @@ class QPMPC(nn.Module):
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """The states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
-        n = self.n_x + self.n_u
-        stages = z[..., : self.horizon * n].unflatten(-1, (self.horizon, n))
-        terminal = z[..., None, self.horizon * n :]
-        return torch.cat((stages[..., : self.n_x], terminal), -2), stages[..., self.n_x :]
+        return self._layout.predicted(z)
 
     def model(self) -> tuple[Tensor, Tensor]:
         """A and B, ``(n_x, n_x)`` and ``(n_x, n_u)``, or with a leading N where they vary.
@@ -275,17 +256,7 @@ class QPMPC(nn.Module):
 
     def readable(self) -> dict[str, Tensor]:
         """The learned parts of theta, detached: what stages share, once; A, B and D for C and G."""
-        parts = {}
-        for part in self.learned:
-            value = getattr(self, part).detach()
-            kept = self._kept(part, value)
-            if kept and isinstance(kept[0], Banded | LinearRows):
-                names = ("A", "B") if part == "C" else ("D", "D_f")
-                parts |= zip(names, kept[0].right_inverse(value), strict=True)
-            else:
-                tied = bool(kept) and isinstance(kept[0], Tied)
-                parts[part] = value[kept[0].first] if tied else value
-        return parts
+        return parts.readable(self, self.learned)
 
     def release(self, structure: str = "free") -> None:
         """Free what a linear MPC scheme ties, in place; the values stay as they are.
@@ -306,18 +277,8 @@ class QPMPC(nn.Module):
         self.structure = structure
         self._arguments = {**self._arguments, "structure": structure}
         for part in self.learned:
-            if not parametrize.is_parametrized(self, part) or part in ("H", "H_f"):
-                continue
-            value = getattr(self, part).detach()
-            # A deep copy has the same class, which remove_parametrizations would change.
-            own = type(type(self).__name__, type(self).__bases__, {**vars(type(self))})
-            self.__class__ = own  # pyright: ignore[reportAttributeAccessIssue] - the same but by id
-            frozen = not any(leaf.requires_grad for leaf in self._leaves(part))
-            parametrize.remove_parametrizations(self, part)
-            delattr(self, part)
-            self._own(part, value)
-            for leaf in self._leaves(part):
-                leaf.requires_grad_(not frozen)
+            if parametrize.is_parametrized(self, part) and part not in ("H", "H_f"):
+                parts.replace(self, part, self._kept(part))
 
     @torch.no_grad()
     def project_(self) -> None:
@@ -344,8 +305,9 @@ class QPMPC(nn.Module):
     def quadratic_program(self) -> QuadraticProgram:
         """Today's theta as a QuadraticProgram, discounts included (eq:qpH)."""
         with full_precision(self.C_0):
+            blocks = (self.H,) if self.hessian == "full" else (self.H, self.H_f)
             return QuadraticProgram(
-                H=self._hessian(),
+                H=self._layout.hessian(self.hessian, blocks, self.discount),
                 q=self.discount * self.q,
                 c=self.c,
                 C=self.C,
@@ -368,18 +330,7 @@ class QPMPC(nn.Module):
         Raises:
             QPError: a learned part without a rate, or a name that is neither.
         """
-        known = {*COST, *CONSTRAINTS, "cost", "constraints"}
-        if unknown := set(rates) - known:
-            raise QPError.expected("rates", sorted(unknown), f"names among {sorted(known)}")
-        groups = []
-        for part in self.learned:
-            rate = rates.get(part, rates.get("cost" if part in COST else "constraints"))
-            if rate is None:
-                raise QPError.expected(
-                    "rates", f"nothing for {part}", "a rate for every learned part, or its family"
-                )
-            groups.append({"params": self._leaves(part), "lr": rate, "name": part})
-        return groups
+        return parts.groups(self, self.learned, rates)
 
     def reset_parameters(self) -> None:
         """Return theta to where the constructor put it."""
@@ -396,18 +347,7 @@ class QPMPC(nn.Module):
         )
 
     def __reduce_ex__(self, protocol: Any) -> tuple:
-        # A parametrised module refuses to be pickled, which would bar it from spawned collectors.
-        for name in getattr(self, "parametrizations", ()):
-            kept = self.get_submodule(f"parametrizations.{name}").children()
-            if [type(part) for part in kept] != [
-                type(part) for part in self._kept(name, getattr(self, name))
-            ]:
-                got = f"a parametrization of {name} that is not QPMPC's own"
-                remedy = "Save the state_dict, or remove_parametrizations first."
-                raise QPError.expected("pickle", got, "QPMPC's own", remedy)
-        plain = parametrize.type_before_parametrizations(self)
-        frozen = [name for name, part in self.named_parameters() if not part.requires_grad]
-        return _rebuild, (plain, self._arguments, self.state_dict(), frozen, self.training)
+        return pickling.reduce(self, self._arguments, self._kept)
 
     def __copy__(self) -> QPMPC:
         twin = type(self).__new__(type(self))
@@ -442,63 +382,11 @@ class QPMPC(nn.Module):
             return bounds
         return torch.where(self.soft, bounds, bounds.detach())
 
-    def _own(self, name: str, value: Tensor) -> None:
-        """Register a part of theta, as a parameter if it is learned."""
-        value = value.to(torch.float64).clone()
-        if name not in self.learned:
-            self.register_buffer(name, value)
-            return
-        self.register_parameter(name, nn.Parameter(value))
-        kept = self._kept(name, value)
-        for parametrization in kept:
-            parametrize.register_parametrization(self, name, parametrization)
-        if len(kept) > 1:  # each but the first has changed the value
-            setattr(self, name, value)
-
-    def _kept(self, name: str, value: Tensor) -> list[nn.Module]:
-        """What a learned part keeps: its structure, and its sign or what `project_` needs."""
-        kept, tied = [], self.structure == "tied"
-        if self.structure != "free" and name in ("C", "G"):
-            kept.append((Banded if name == "C" else LinearRows)(self._layout, tied))
-        if tied and name in ("q", "b", "lb", "ub", "w"):
-            kept.append(Tied(name, self._layout.ties(name)))
-        dense = self.hessian != "diagonal" and name != "w"
-        if name in SIGNED and self.step == CHOLESKY:
-            kept.append(Cholesky() if dense else SquareRoot())
-        elif name in ("H", "H_f"):
-            kept.append(Symmetric() if dense else Support(value))
-        return kept
-
-    def _hessian(self) -> Tensor:
-        if self.hessian == "full":
-            H = self.H
-        elif self.hessian == "block":
-            n = self.n_x + self.n_u
-            H = torch.block_diag(*self.H.expand(self.horizon, n, n), self.H_f)
-        else:
-            stages = self.H.expand(self.horizon, self.n_x + self.n_u).flatten()
-            return torch.diag_embed(self.discount * torch.cat((stages, self.H_f)))
-        root = self.discount.sqrt()
-        return root.unsqueeze(-1) * H * root
+    def _kept(self, name: str) -> list[nn.Module]:
+        value = getattr(self, name).detach()
+        return kept(name, value, self._layout, self.structure, self.hessian, self.step)
 
     def _projected(self) -> dict[str, nn.Parameter]:
         """The parameters that `project_` acts on, by part."""
         names = () if self.step == CHOLESKY else SIGNED
-        return {name: self._leaves(name)[0] for name in names if name in self.learned}
-
-    def _leaves(self, name: str) -> list[nn.Parameter]:
-        """The parameters that the optimiser moves for a learned part: behind H its factor."""
-        if not parametrize.is_parametrized(self, name):
-            return [self.get_parameter(name)]
-        kept = self.get_submodule(f"parametrizations.{name}")
-        return list(kept.parameters(recurse=False))
-
-
-def _rebuild(
-    cls: type[QPMPC], arguments: dict, state: dict, frozen: list[str], training: bool
-) -> QPMPC:
-    mpc = cls(**arguments)
-    mpc.load_state_dict(state, assign=True)
-    for name in frozen:
-        mpc.get_parameter(name).requires_grad_(False)
-    return mpc.train(training)
+        return {name: parts.leaves(self, name)[0] for name in names if name in self.learned}

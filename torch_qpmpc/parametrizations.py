@@ -15,6 +15,27 @@ from torch import Tensor, nn
 from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.layout import Layout
+from torch_qpmpc.steps import CHOLESKY
+
+#: The parts of theta that a convex QP does not leave free.
+SIGNED = ("H", "H_f", "w")
+
+
+def kept(
+    name: str, value: Tensor, layout: Layout, structure: str, hessian: str, step: str
+) -> list[nn.Module]:
+    """What a learned part of `QPMPC` keeps: its structure, its sign or what projecting it needs."""
+    found, tied = [], structure == "tied"
+    if structure != "free" and name in ("C", "G"):
+        found.append((Banded if name == "C" else LinearRows)(layout, tied))
+    if tied and name in ("q", "b", "lb", "ub", "w"):
+        found.append(Tied(name, layout.ties(name)))
+    dense = hessian != "diagonal" and name != "w"
+    if name in SIGNED and step == CHOLESKY:
+        found.append(Cholesky() if dense else SquareRoot())
+    elif name in ("H", "H_f"):
+        found.append(Symmetric() if dense else Support(value))
+    return found
 
 
 class SquareRoot(nn.Module):

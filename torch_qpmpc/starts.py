@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import scipy.linalg
@@ -30,7 +31,9 @@ def theta(
     action_bounds: tuple[Any, Any] | None,
     constraints: tuple[Any, Any, Any] | None,
     terminal_constraints: tuple[Any, Any, Any] | None,
+    structure: str,
     hessian: str,
+    learn: Collection[str],
     stage_weight: Any,
     terminal_weight: Any,
     state_slack: float,
@@ -43,6 +46,9 @@ def theta(
     D = _linear_rows("constraints", constraints, n_x + n_u)
     D_f = _linear_rows("terminal_constraints", terminal_constraints, n_x)
     layout = Layout(n_x, n_u, horizon, len(D[0]), len(D_f[0]))
+    if "G" in learn and structure != "free" and not layout.n_linear:
+        remedy = "Give constraints, or structure='free'."
+        raise QPError.expected("learn", "'G'", "parts that there are", remedy)
     random = torch.Generator().manual_seed(seed)
     A, B = _model(A, B, n_x, n_u, random)
     C = banded_matrix(A, B, horizon)

@@ -1,0 +1,183 @@
+"""TorchRL's contract of a loss module: estimators, target networks, copies, and resets."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import pytest
+import torch
+from torchrl.data import MultiStep
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+from torchrl.objectives import HardUpdate, SoftUpdate, ValueEstimators
+from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
+
+from tests.transitions import (
+    GAMMA,
+    LMBDA,
+    hand_prediction,
+    learned_leaves,
+    make_batch,
+    make_loss,
+    make_operator,
+    perturb,
+)
+from torch_qpmpc import QPActorValueOperator, QPQLearningLoss
+
+
+@pytest.mark.parametrize("estimator", [ValueEstimators.GAE, ValueEstimators.VTrace, "gae"])
+def test_other_estimators_are_not_implemented(estimator):
+    with pytest.raises(NotImplementedError, match="not implemented for loss QPQLearningLoss"):
+        make_loss().make_value_estimator(estimator)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "estimator"),
+    [
+        ("td0", ValueEstimators.TD0, TD0Estimator),
+        ("td1", ValueEstimators.TD1, TD1Estimator),
+        ("tdlambda", ValueEstimators.TDLambda, TDLambdaEstimator),
+    ],
+)
+def test_estimator_by_string_enum_class_and_instance(name, kind, estimator):
+    td, losses = make_batch(2, 4), []
+    options: dict[str, Any] = {"gamma": GAMMA} | ({"lmbda": LMBDA} if name == "tdlambda" else {})
+    operator = make_operator()
+    for how in ("string", "enum", "class", "instance"):
+        loss = QPQLearningLoss(operator)
+        value_network = loss.state_value_network
+        if how == "string":
+            assert loss.make_value_estimator(name, **options) is None
+        elif how == "enum":
+            loss.make_value_estimator(kind, **options)
+        elif how == "class":
+            loss.make_value_estimator(estimator, value_network=value_network, **options)
+        else:
+            loss.make_value_estimator(estimator(value_network=value_network, **options))
+        assert isinstance(loss.value_estimator, estimator)
+        losses.append(loss(td)["loss_value"])
+    assert len({value.item() for value in losses}) == 1
+
+
+def test_default_estimator_is_td0():
+    loss = QPQLearningLoss(make_operator())
+    assert isinstance(loss.value_estimator, TD0Estimator)
+    assert loss.value_estimator.gamma.item() == pytest.approx(0.99)
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+@pytest.mark.parametrize("delay_value", [False, True])
+def test_state_dict_round_trip(delay_value):
+    first = make_loss(delay_value=delay_value)
+    second = make_loss(delay_value=delay_value)
+    perturb(first)
+    state = first.state_dict()
+    second.load_state_dict(state)
+    assert state.keys() == second.state_dict().keys()
+    assert all(torch.equal(value, second.state_dict()[key]) for key, value in state.items())
+    td = make_batch(6)
+    assert torch.equal(first(td.clone())["loss_value"], second(td.clone())["loss_value"])
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_multi_step_returns(n):
+    """r_t + gamma r_{t+1} + .., and gamma^k V(s_{t+k}) k steps on, cut at an episode's end.
+
+    Truncations only, as `MultiStep` leaves the flags of the first step where they are.
+    """
+    td = make_batch(3, 6)
+    td["next", "terminated"] = torch.zeros(3, 6, 1, dtype=torch.bool)
+    td["collector", "mask"] = torch.ones(3, 6, dtype=torch.bool)
+    operator = make_operator()
+    V = operator.module.value(td["next", "observation"]).detach()
+    flags: Any = td["next"]
+    expected = torch.zeros(3, 6, dtype=torch.float64)
+    for i in range(3):
+        for t in range(6):
+            for k in range(n):
+                j = t + k
+                expected[i, t] += GAMMA**k * flags["reward"][i, j, 0]
+                if flags["done"][i, j] or j == 5 or k == n - 1:
+                    expected[i, t] -= GAMMA ** (k + 1) * V[i, j]
+                    break
+    batch = MultiStep(gamma=GAMMA, n_steps=n)(td.clone())
+    out = make_loss(operator=operator, reduction="none")(batch)
+    delta = expected - hand_prediction(operator.module, td)
+    torch.testing.assert_close(out["loss_value"], 0.5 * delta**2, atol=1e-6, rtol=0)
+
+
+def test_target_network_updaters():
+    loss = make_loss(delay_value=True)
+    with pytest.warns(UserWarning, match="No target network updater"):
+        loss(make_batch(2))
+    soft = SoftUpdate(loss, tau=0.25)
+    start = copy.deepcopy(loss.value_network)
+    perturb(loss)
+    soft.step()
+    target, online = loss.target_value_network_params, loss.value_network_params
+    for key, leaf in learned_leaves(loss).items():
+        old = dict(start.named_parameters())[".".join(key)].detach()
+        torch.testing.assert_close(target[key], old + 0.25 * (leaf.detach() - old))
+
+    hard = HardUpdate(loss, value_network_update_interval=1)
+    perturb(loss)
+    C = ("module", "C")
+    assert not torch.equal(target[C], online[C])
+    hard.step()
+    hard.step()
+    assert torch.equal(target[C], online[C])
+
+
+@pytest.mark.parametrize(
+    "updater",
+    [lambda loss: SoftUpdate(loss, tau=0.1), lambda loss: HardUpdate(loss)],
+    ids=["soft", "hard"],
+)
+def test_updaters_need_delayed_parameters(updater):
+    with pytest.raises(RuntimeError, match="Did not find any target parameters"):
+        updater(make_loss(delay_value=False))
+
+
+@pytest.mark.parametrize("how", ["deepcopy", "pickle"])
+def test_copies_are_independent_and_whole(how):
+    loss, td = make_loss("tdlambda"), make_batch(3, 4)
+    expected = loss(td.clone())["loss_value"]
+    twin = copy.deepcopy(loss) if how == "deepcopy" else pickle.loads(pickle.dumps(loss))
+    perturb(loss)
+    out = twin(td.clone())["loss_value"]
+    assert torch.equal(out, expected)
+    perturb(twin)  # Q, and V inside the estimator, both follow the copy's parameters
+    assert torch.equal(twin(td.clone())["loss_value"], loss(td.clone())["loss_value"])
+
+
+class Spy(QPActorValueOperator):
+    seen: ExplorationType | None = None
+
+    def forward(self, tensordict: Any) -> Any:
+        Spy.seen = exploration_type()
+        return super().forward(tensordict)
+
+
+def test_exploration_is_off_inside():
+    loss = make_loss(operator=Spy(make_operator().module))
+    with set_exploration_type(ExplorationType.RANDOM):
+        loss(make_batch(2))
+        assert Spy.seen == ExplorationType.DETERMINISTIC
+        assert exploration_type() == ExplorationType.RANDOM
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+@pytest.mark.parametrize("delay_value", [False, True])
+def test_reset_parameters_recursive(delay_value):
+    loss = make_loss(delay_value=delay_value)
+    start = loss.value_network_params.clone()
+    perturb(loss)
+    with torch.no_grad():
+        loss.target_value_network_params.apply_(lambda x: x.add_(1) if x.is_floating_point() else x)
+    loss.reset_parameters_recursive()
+    for key, leaf in learned_leaves(loss).items():
+        torch.testing.assert_close(leaf, start[key], atol=1e-12, rtol=0)
+        torch.testing.assert_close(
+            loss.target_value_network_params[key], start[key].data, atol=1e-12, rtol=0
+        )
