@@ -17,6 +17,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import signal
+import sys
 import time
 from functools import partial
 from typing import Any
@@ -30,7 +32,7 @@ from torchrl import torchrl_logger
 from tqdm import tqdm
 
 from torch_qpmpc import QPActorValueOperator, QPError, SolveLog
-from torch_qpmpc.checkpoint import CHECKPOINT, save_checkpoint
+from torch_qpmpc.checkpoint import CHECKPOINT, drop_previous, save_checkpoint
 from torch_qpmpc.collection import batches, make_collector, num_columns
 from torch_qpmpc.config import check_config
 from torch_qpmpc.experiment import (
@@ -47,9 +49,9 @@ from torch_qpmpc.interrupt import Interrupt
 from torch_qpmpc.plots import summary_figure
 from torch_qpmpc.replay import ACTIVE_SET, make_replay
 from torch_qpmpc.snapshot import Tally, folder_of, restore, resumed, snapshot
-from torch_qpmpc.sweeps import finished_run
+from torch_qpmpc.sweeps import finished_run, stopped_run
 from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc, true_model
-from torch_qpmpc.tracking import RunFolder
+from torch_qpmpc.tracking import RunFolder, unwritable
 
 
 def train(
@@ -63,6 +65,14 @@ def train(
         What summary.json holds.
     """
     check_config(cfg)
+    interrupt = Interrupt()
+    with contextlib.nullcontext() if quiet else interrupt:
+        return _train(cfg, folder, state, quiet, interrupt)
+
+
+def _train(
+    cfg: DictConfig, folder: str, state: dict[str, Any] | None, quiet: bool, interrupt: Interrupt
+) -> dict[str, Any]:
     torchrl_logger.setLevel("WARNING")
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
@@ -98,14 +108,14 @@ def train(
 
     with contextlib.ExitStack() as stack:
         stack.callback(collector.shutdown)
-        interrupt = Interrupt()
-        if not quiet:
-            stack.enter_context(interrupt)
         run = stack.enter_context(
             RunFolder(folder, cfg, None if state is None else state["update"])
         )
+        go_on = f"python train.py resume={run.path}"
         if state is not None:
             tally = restore(state, mpc, learner, collector, replay)
+            if state["collector"] is None and tally.update < cfg.updates and not quiet:
+                print("New episodes: the environments' own state cannot be saved.")
             loops["learned"] = evaluate(cfg, partial(act, learner.actor), physics)
         else:
             tally = Tally()
@@ -113,6 +123,8 @@ def train(
             for batch in itertools.islice(stream, -(-cfg.warmup_steps // cfg.steps_per_update)):
                 if cfg.replay:
                     replay.extend(batch)
+                interrupt.grant(f"Stopped before the first update: {go_on}")
+        interrupt.grant(f"Stopped after update {tally.update}: {go_on}")
 
         progress = tqdm(
             range(tally.update + 1, cfg.updates + 1),
@@ -164,11 +176,10 @@ def train(
                 progress.set_postfix(J=summary["J_final"], closed_gap=summary["closed_gap"])
             if update % cfg.eval_interval == 0 or last or interrupt.signum is not None:
                 run.flush()
-                state = snapshot(mpc, learner, collector, replay, tally)
+                state = snapshot(cfg, mpc, learner, collector, replay, tally)
                 save_checkpoint(run.path / CHECKPOINT, state)
-            if interrupt.signum is not None and not last:
-                print(f"\nStopped after update {update}: python train.py resume={run.path}")
-                raise SystemExit(128 + interrupt.signum)
+            if not last:
+                interrupt.grant(f"Stopped after update {update}: {go_on}")
 
         summary = gap_summary(loops)
         summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
@@ -177,10 +188,11 @@ def train(
         summary |= {"updates": cfg.updates, **tally.summary()}
         if learned_mpc is not None:
             summary |= structure_summary(mpc, true_model(physics))
-        run.finish(summary)
         if cfg.figures and learned_mpc is not None:
             figure = summary_figure(mpc, loops, *run.column("eval/J"))
             figure.savefig(run.path / "summary.png", dpi=110)
+        run.finish(summary)
+        drop_previous(run.path / CHECKPOINT)
     if not quiet:
         print(f"\n{table(summary)}\n\n{run.path}")
     return summary
@@ -201,16 +213,24 @@ def main(cfg: DictConfig) -> float:
         if cfg.resume is not None:
             cfg, state = resumed(cfg.resume, list(ours.overrides.task))
         check_config(cfg)
-        done = finished_run(folder, cfg) if sweep else None
+        if sweep:
+            if (done := finished_run(folder, cfg)) is not None:
+                return done["closed_gap"]
+            state = stopped_run(folder, cfg)
+        return train(cfg, folder, state, quiet=sweep)["closed_gap"]
     except QPError as error:
         if sweep:
             raise  # an exit would end the other runs, too
         raise SystemExit(str(error)) from None
-    return (done or train(cfg, folder, state, quiet=sweep))["closed_gap"]
+    except OSError as error:
+        if sweep or isinstance(error, ConnectionError):
+            raise  # what a process of another one's lost is no file
+        raise SystemExit(str(unwritable(folder, error))) from None
 
 
 if __name__ == "__main__":
     try:
         main()
     except KeyboardInterrupt:
-        raise SystemExit("\nstopped") from None
+        print("\nstopped", file=sys.stderr)
+        raise SystemExit(128 + signal.SIGINT) from None

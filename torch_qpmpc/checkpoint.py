@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
-import pickle
 import shutil
 import zipfile
 from pathlib import Path
@@ -15,6 +16,26 @@ from torch_qpmpc.errors import QPError
 
 #: The newest checkpoint of a run's folder, and the one before.
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint-previous.pt"
+#: What the newest one is also called while it becomes the one before.
+SECOND = "checkpoint.second"
+
+
+def write_whole(path: Path, data: bytes | memoryview) -> None:
+    """Write ``data`` to ``path`` so that at all times the file is the old one or the new one.
+
+    Raises:
+        OSError: it cannot be written, as on a full disk; the file is as it was.
+    """
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError:
+        _remove(partial)
+        raise
 
 
 def save_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
@@ -24,21 +45,38 @@ def save_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
         OSError: it cannot be written, as on a full disk; both files are as they were.
     """
     path = Path(path)
-    partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    if path.exists():
-        # A second name for the old file, so that at no time there is none under the first.
-        second = path.with_suffix(".second")
-        second.unlink(missing_ok=True)
-        try:
-            os.link(path, second)
-        except OSError:  # a file system without links
-            shutil.copyfile(path, second)
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    second = path.with_name(SECOND)
+    second.unlink(missing_ok=True)
+    try:
+        if path.exists():
+            _duplicate(path, second)
+        write_whole(path, buffer.getbuffer())
+    except OSError:
+        _remove(second)
+        raise
+    # Only now: until there is a newer one, the one before may be the only one that can be read.
+    if second.exists():
         second.replace(path.with_name(PREVIOUS))
-    partial.replace(path)
+
+
+def drop_previous(path: str | Path) -> None:
+    """Leave of the checkpoints beside ``path`` only that one, as nobody goes back from the end."""
+    for name in (PREVIOUS, SECOND):
+        _remove(Path(path).with_name(name))
+
+
+def _duplicate(path: Path, second: Path) -> None:
+    try:
+        os.link(path, second)
+    except OSError:  # a file system without links
+        shutil.copyfile(path, second)
+
+
+def _remove(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        path.unlink()
 
 
 def load_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -55,8 +93,8 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
         return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise QPError.expected("checkpoint", f"{path}, which is not there", "a file") from error
-    except (*_UNREADABLE, RuntimeError) as error:
-        remedy = "It may be truncated, or hold something other than tensors"
+    except Exception as error:  # a damaged file can make its readers raise anything
+        remedy = "It may be damaged, or hold something other than tensors and numbers"
         previous = path.with_name(PREVIOUS)
         found = path.name != PREVIOUS and previous.exists()
         raise QPError.expected(
@@ -65,6 +103,3 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
             "a checkpoint that train.py wrote",
             f"{remedy}; use {f'the one before, {previous}' if found else 'another one'}.",
         ) from error
-
-
-_UNREADABLE = (EOFError, OSError, pickle.UnpicklingError, zipfile.BadZipFile, KeyError, ValueError)

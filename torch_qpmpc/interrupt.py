@@ -34,6 +34,12 @@ class Interrupt:
             signal.signal(signum, handler)
         self._usual = {}
 
+    def grant(self, sentence: str) -> None:
+        """Where there is a wish to stop, leave with ``sentence`` and the signal's exit code."""
+        if self.signum is not None:
+            print(f"\n{sentence}", flush=True)
+            raise SystemExit(128 + self.signum)
+
     def _note(self, signum: int, frame: FrameType | None) -> None:
         self.signum = signum
         self.__exit__()

@@ -6,7 +6,8 @@ number, continue. Other environments cannot be saved, and start new episodes.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import contextlib
+from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,17 @@ from tensordict import TensorDict
 from torchrl.collectors import BaseCollector, Collector
 
 from torch_qpmpc.checkpoint import CHECKPOINT, load_checkpoint
+from torch_qpmpc.config import flatten
 from torch_qpmpc.envs import LinearSystemEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment import Learner
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.replay import Replay
 from torch_qpmpc.solvers.chain import SolveLog
+
+#: The parts of a snapshot.
+STATE = ("config", "update", "structure", "mpc", "loss_module", "optimizer", "schedule")
+STATE += ("replay", "collector", "tally", "rng")
 
 
 @dataclass
@@ -57,18 +63,29 @@ class Tally:
 
 
 def snapshot(
-    mpc: QPMPC, learner: Learner, collector: BaseCollector, replay: Replay, tally: Tally
+    cfg: DictConfig,
+    mpc: QPMPC,
+    learner: Learner,
+    collector: BaseCollector,
+    replay: Replay,
+    tally: Tally,
 ) -> dict[str, Any]:
-    """The state of a run between two updates, for `checkpoint.save_checkpoint`."""
+    """The state of a run between two updates, for `checkpoint.save_checkpoint`.
+
+    After the last update without the data, which is most of it: nothing will be collected or
+    sampled any more.
+    """
+    over = tally.update == cfg.updates
     return {
+        "config": _settings(cfg),
         "update": tally.update,
         "structure": mpc.structure,
         "mpc": mpc.state_dict(),
         "loss_module": learner.loss_module.state_dict(),
         "optimizer": learner.optimizer.state_dict(),
         "schedule": {"last_epoch": learner.schedule.last_epoch},
-        "replay": replay.state_dict() if len(replay) else None,
-        "collector": _collector_state(collector),
+        "replay": replay.state_dict() if len(replay) and not over else None,
+        "collector": None if over else _collector_state(collector),
         "tally": asdict(tally),
         "rng": torch.get_rng_state(),
     }
@@ -81,18 +98,49 @@ def restore(
     collector: BaseCollector,
     replay: Replay,
 ) -> Tally:
-    """Bring the parts of a new run, made from the same configuration, to a `snapshot`."""
-    learner.loss_module.load_state_dict(state["loss_module"])
-    mpc.load_state_dict(state["mpc"])
-    learner.optimizer.load_state_dict(state["optimizer"])
-    learner.schedule.last_epoch = state["schedule"]["last_epoch"]
-    if state["replay"] is not None:
-        replay.load_state_dict(state["replay"])
-    _restore_collector(collector, state["collector"])
-    torch.set_rng_state(state["rng"])
-    tally: dict[str, Any] = dict(state["tally"])
-    tally["qps"] = SolveLog(**tally["qps"])
-    return Tally(**tally)
+    """Bring the parts of a new run, made from the same configuration, to a `snapshot`.
+
+    Raises:
+        QPError: a part does not fit the snapshot's.
+    """
+    with _part("loss_module"):
+        learner.loss_module.load_state_dict(state["loss_module"])
+    with _part("mpc"):
+        mpc.load_state_dict(state["mpc"])
+    with _part("optimizer"):
+        learner.optimizer.load_state_dict(state["optimizer"])
+    with _part("schedule"):
+        learner.schedule.last_epoch = int(state["schedule"]["last_epoch"])
+    with _part("replay"):
+        if state["replay"] is not None:
+            replay.load_state_dict(state["replay"])
+    with _part("collector"):
+        _restore_collector(collector, state["collector"])
+    with _part("rng"):
+        torch.set_rng_state(state["rng"])
+    with _part("tally"):
+        tally = Tally(**state["tally"])
+        tally.qps = SolveLog(**state["tally"]["qps"])
+    return tally
+
+
+def check_state(state: Any, cfg: DictConfig) -> None:
+    """Raise `QPError` unless ``state`` is a `snapshot` of a run with the configuration ``cfg``."""
+    remedy = "Another version of train.py has written it: go on with that one, or start anew."
+    if not isinstance(state, dict):
+        raise QPError.expected("checkpoint", f"a {type(state).__name__}", "a run's state", remedy)
+    if missing := [key for key in STATE if key not in state]:
+        raise QPError.expected(
+            "checkpoint", f"one without {', '.join(missing)}", "a run's state", remedy
+        )
+    then, now = state["config"], _settings(cfg)
+    if changed := [key for key in {**then, **now} if then.get(key) != now.get(key)]:
+        raise QPError.expected(
+            "checkpoint",
+            "one of a run with " + ", ".join(f"{key}={then.get(key)}" for key in changed),
+            "config.yaml's " + ", ".join(f"{key}={now.get(key)}" for key in changed),
+            "A run goes on with its own configuration, and from its own checkpoints.",
+        )
 
 
 def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, dict | None]:
@@ -103,7 +151,8 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
         overrides: what train.py was called with.
 
     Raises:
-        QPError: there is no run to go on with, or something else was asked for, too.
+        QPError: there is no run to go on with, it cannot be read or is another's, or something
+            else was asked for, too.
     """
     if others := [override for override in overrides if not override.startswith("resume=")]:
         remedy = "A run goes on with its own configuration."
@@ -117,8 +166,11 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
         raise QPError.expected("resume", f"{path}, which is finished", "a run that was stopped")
     cfg = OmegaConf.load(config)
     assert isinstance(cfg, DictConfig)
-    early = path.is_dir() and not checkpoint.exists()
-    return cfg, None if early else load_checkpoint(checkpoint)
+    if path.is_dir() and not checkpoint.exists():
+        return cfg, None
+    state = load_checkpoint(checkpoint)
+    check_state(state, cfg)
+    return cfg, state
 
 
 def folder_of(resume: str | None, fresh: str) -> str:
@@ -126,6 +178,21 @@ def folder_of(resume: str | None, fresh: str) -> str:
     if resume is None:
         return fresh
     return str(Path(resume) if Path(resume).is_dir() else Path(resume).parent)
+
+
+def _settings(cfg: DictConfig) -> dict[str, Any]:
+    return flatten(OmegaConf.to_container(cfg, resolve=True))
+
+
+@contextlib.contextmanager
+def _part(name: str) -> Iterator[None]:
+    try:
+        yield
+    except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
+        said = str(error).strip().partition("\n")[0]
+        got = f"{name!r} that does not fit ({type(error).__name__}: {said})"
+        remedy = "The checkpoint before may: resume=FOLDER/checkpoint-previous.pt."
+        raise QPError.expected("checkpoint", got, "the state of this run", remedy) from error
 
 
 def _collector_state(collector: BaseCollector) -> dict[str, Any] | None:
@@ -145,6 +212,8 @@ def _restore_collector(collector: BaseCollector, state: dict[str, Any] | None) -
     assert isinstance(collector, Collector)
     assert isinstance(collector.env, LinearSystemEnv)
     episodes = TensorDict(state["episodes"], batch_size=collector._carrier.batch_size)
+    if missing := set(collector._carrier.keys(True, True)) - set(episodes.keys(True, True)):
+        raise KeyError(f"no {missing}")
     collector._carrier.update(episodes)
     collector._traj_pool.load_state_dict(state["trajectories"])
     collector.env.set_rng_state(state["rng"])

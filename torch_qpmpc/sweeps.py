@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -18,8 +19,10 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from torch_qpmpc.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
 from torch_qpmpc.config import flatten
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.snapshot import check_state
 
 #: Seconds between two looks at what has ended.
 PERIOD = 0.5
@@ -27,8 +30,6 @@ PERIOD = 0.5
 
 def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
     """The summary of the run in ``folder``, or None where none has finished.
-
-    What a run that was stopped left for TensorBoard is removed, as it would show twice.
 
     Args:
         folder: of one run.
@@ -39,7 +40,6 @@ def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
     """
     folder = Path(folder)
     if not (folder / "summary.json").exists():
-        shutil.rmtree(folder / "tensorboard", ignore_errors=True)
         return None
     then, now = (
         flatten(OmegaConf.to_container(settings, resolve=True))
@@ -54,6 +54,22 @@ def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
             "Remove it, or choose another folder by hydra.sweep.dir=FOLDER.",
         )
     return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+
+
+def stopped_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
+    """The state from which the run in ``folder`` can go on, or None where it has to begin anew.
+
+    That is where there is none, or one that cannot be read or had other settings. What such a run
+    left for TensorBoard is removed.
+    """
+    folder = Path(folder)
+    for checkpoint in (folder / CHECKPOINT, folder / PREVIOUS):
+        with contextlib.suppress(QPError):
+            state = load_checkpoint(checkpoint)
+            check_state(state, cfg)
+            return state
+    shutil.rmtree(folder / "tensorboard", ignore_errors=True)
+    return None
 
 
 def number_of_runs(config: DictConfig) -> int | None:

@@ -14,7 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 from tensorboard.compat.proto import event_pb2
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
+from torch_qpmpc.checkpoint import CHECKPOINT, write_whole
 from torch_qpmpc.config import flatten
+from torch_qpmpc.errors import QPError
 
 
 class RunFolder:
@@ -25,6 +27,9 @@ class RunFolder:
         cfg: the run's configuration.
         after: go on after this update: what the folder has of it and before is kept, what is later
             is written anew. None starts from nothing.
+
+    Raises:
+        OSError: here and in what follows, something cannot be written; all other files are whole.
     """
 
     def __init__(self, folder: str | Path, cfg: DictConfig, after: int | None = None) -> None:
@@ -32,27 +37,33 @@ class RunFolder:
         self.path = Path(folder).resolve()
         self.path.mkdir(parents=True, exist_ok=True)
         self.cfg = cfg
-        OmegaConf.save(cfg, self.path / "config.yaml", resolve=True)
-        self.logger = TensorboardLogger(exp_name="tensorboard", log_dir=str(self.path))
-        text = OmegaConf.to_yaml(cfg, resolve=True)
-        self.logger.experiment.add_text("config", f"```yaml\n{text}```")
         self.rows: list[dict[str, float]] = []
-        if after is not None:
-            table = pd.read_csv(self.path / "metrics.csv", float_precision="round_trip")
-            found = [row.dropna().to_dict() for _, row in table.iterrows()]
-            self.rows = [row for row in found if row["update"] <= after]
-            # TensorBoard drops what earlier event files have from here on.
-            event: Any = event_pb2  # its classes are made at run time
-            start = event.SessionLog(status=event.SessionLog.START)
-            writer = self.logger.experiment.file_writer.event_writer
-            writer.add_event(event.Event(step=after + 1, session_log=start))
+        self.logger = TensorboardLogger(exp_name="tensorboard", log_dir=str(self.path))
+        # TensorBoard drops what earlier event files have from here on.
+        event: Any = event_pb2  # its classes are made at run time
+        start = event.SessionLog(status=event.SessionLog.START)
+        writer = self.logger.experiment.file_writer.event_writer
+        writer.add_event(event.Event(step=0 if after is None else after + 1, session_log=start))
+        if after is None:
+            text = OmegaConf.to_yaml(cfg, resolve=True)
+            write_whole(self.path / "config.yaml", text.encode())
+            self.logger.experiment.add_text("config", f"```yaml\n{text}```")
+        else:
+            # As text: not every reading of a float is exact.
+            table = pd.read_csv(self.path / "metrics.csv", dtype=str)
+            for _, row in table.iterrows():
+                numbers = {str(name): float(text) for name, text in row.dropna().items()}
+                if (update := int(numbers["update"])) <= after:
+                    self.rows.append(numbers | {"update": update})
 
     def __enter__(self) -> RunFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.flush()
-        self.logger.experiment.close()
+        try:
+            self.flush()
+        finally:
+            self.logger.experiment.close()
 
     def log(self, metrics: Mapping[str, float], update: int) -> None:
         """Scalars at an update: a row of metrics.csv, and TensorBoard."""
@@ -73,25 +84,15 @@ class RunFolder:
 
     def flush(self) -> None:
         """Write metrics.csv, and what TensorBoard still holds."""
-        partial = self.path / "metrics.csv.partial"
-        pd.DataFrame(self.rows).to_csv(partial, index=False)
-        partial.replace(self.path / "metrics.csv")
+        table = pd.DataFrame(self.rows).to_csv(index=False)
+        write_whole(self.path / "metrics.csv", table.encode())
         self.logger.experiment.flush()
 
     def finish(self, summary: Mapping[str, float | int | str]) -> None:
-        """Write summary.json, and the hyper-parameters with the outcome to TensorBoard.
+        """Write the hyper-parameters with the outcome to TensorBoard, and summary.json.
 
         JSON knows neither nan (no gap to close) nor inf: there they are null.
         """
-        finite = {
-            key: None if isinstance(value, float) and not math.isfinite(value) else value
-            for key, value in summary.items()
-        }
-        text = json.dumps(finite, indent=2, allow_nan=False)
-        # All at once: it is what tells a sweep that the run need not be done again.
-        partial = self.path / "summary.json.partial"
-        partial.write_text(text + "\n", encoding="utf-8")
-        partial.replace(self.path / "summary.json")
         plain = (bool, int, float, str)
         hparams = {
             key: value if isinstance(value, plain) else str(value)
@@ -101,3 +102,21 @@ class RunFolder:
             f"hparam/{key}": value for key, value in summary.items() if isinstance(value, float)
         }
         self.logger.experiment.add_hparams(hparams, outcome, run_name=".")
+        self.logger.experiment.flush()
+        finite = {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in summary.items()
+        }
+        text = json.dumps(finite, indent=2, allow_nan=False)
+        # At last and all at once: it is what tells that the run need not be done again.
+        write_whole(self.path / "summary.json", f"{text}\n".encode())
+
+
+def unwritable(folder: str | Path, error: OSError) -> QPError:
+    """What to tell whose run in ``folder`` ended with ``error``."""
+    checkpoint = Path(folder) / CHECKPOINT
+    remedy = "Choose another folder by hydra.run.dir=FOLDER."
+    if checkpoint.exists():
+        remedy = f"{checkpoint} is whole: make room, then python train.py resume={folder}."
+    got = f"{folder}, where writing failed ({error})"
+    return QPError.expected("folder", got, "one that can be written to", remedy)

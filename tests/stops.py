@@ -1,0 +1,82 @@
+"""Runs that are stopped and go on, and the comparison with the one that was not."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from omegaconf import DictConfig
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import train
+from torch_qpmpc.snapshot import resumed
+from torch_qpmpc.solvers.chain import SolveLog
+
+
+def stop(
+    monkeypatch: pytest.MonkeyPatch,
+    cfg: DictConfig,
+    folder: Path,
+    update: int,
+    signum: int = signal.SIGTERM,
+) -> int:
+    """The exit code of a run, a new one or one that goes on, that gets a signal in ``update``."""
+    state = None
+    if (folder / "config.yaml").exists():
+        cfg, state = resumed(folder, [])
+    left = update - (state["update"] if state else 0)
+    entered = []
+
+    def count(log: SolveLog) -> SolveLog:
+        entered.append(log)
+        if len(entered) == left:
+            signal.raise_signal(signum)
+        return enter(log)
+
+    enter = SolveLog.__enter__
+    with monkeypatch.context() as patch:
+        patch.setattr(SolveLog, "__enter__", count)
+        with pytest.raises(SystemExit) as ended:
+            train.train(cfg, str(folder), state)
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+def go_on(folder: Path) -> None:
+    """Finish the run that was stopped."""
+    cfg, state = resumed(folder, [])
+    train.train(cfg, str(folder), state)
+
+
+def assert_same_numbers(folder: Path, whole: Path) -> None:
+    """What the runs in both folders wrote is equal to the last digit, but for the times."""
+    found, expected = (
+        pd.read_csv(path / "metrics.csv", dtype=str).filter(regex="^(?!time/)").sort_index(axis=1)
+        for path in (folder, whole)
+    )
+    pd.testing.assert_frame_equal(found, expected)
+    summaries = [json.loads((path / "summary.json").read_text()) for path in (folder, whole)]
+    for summary in summaries:
+        assert summary.pop("train_seconds") > 0
+    assert summaries[0] == summaries[1]
+
+
+def assert_events_are_whole(folder: Path) -> None:
+    """TensorBoard shows each number of metrics.csv, and each once."""
+    found = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0, "images": 0})
+    found.Reload()
+    table: Any = pd.read_csv(folder / "metrics.csv").set_index("update")
+    for column in table:
+        logged = table[column].dropna()
+        shown = [event for event in found.Scalars(column) if not math.isnan(event.value)]
+        assert [event.step for event in shown] == list(logged.index), column
+        assert [event.value for event in shown] == pytest.approx(list(logged), rel=1e-6), column
+    for image in found.Tags()["images"]:
+        steps = [event.step for event in found.Images(image)]
+        assert steps == [step for step in table["eval/J"].dropna().index if step], image
+    assert len(found.Tensors("config/text_summary")) == 1
