@@ -86,7 +86,7 @@ def as_tensor(name: str, value: Any) -> Tensor:
         tensor = given.to(torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise QPError.expected(
-            name, _brief(value), "a tensor of real numbers, or what torch.as_tensor makes one of"
+            name, _brief(value), "a tensor, or what torch.as_tensor takes, of real numbers"
         ) from error
     if tensor.isnan().any() or (tensor.isinf().any() and not name.endswith("bounds")):
         raise QPError.expected(name, "NaN or inf", "finite entries")

@@ -153,4 +153,4 @@ def _check(policy: object, steps: int, starts: int, seed: int, gamma: float) -> 
     check_whole("steps", steps, 1)
     check_whole("starts", starts, 1)
     check_whole("seed", seed, 0)
-    check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
+    check_number("gamma", gamma, lambda x: 0 <= x <= 1, "a discount factor in [0, 1]")

@@ -137,7 +137,7 @@ def policy_map(
         (torch.Size([9, 5, 1]), torch.Size([9, 5, 1, 2]), True)
     """
     check_kind("mpc", mpc, QPMPC)
-    if not isinstance(axes, tuple) or len(axes) != 2:
+    if not isinstance(axes, tuple | list) or len(axes) != 2:
         raise QPError.expected("axes", repr(axes), "a pair of indices, such as (0, 1)")
     for axis in axes:
         check_whole("axes", axis, 0)

@@ -203,7 +203,7 @@ def markov_order(energies: Tensor, tolerance: float = 1e-6) -> float:
         tolerance: of the norm, as a share, that the pairs need not explain.
     """
     check_tensor("energies", energies, "N + 1", batched=False, remedy="Pass memory_energies(form).")
-    check_number("tolerance", tolerance, lambda x: 0 <= x < 1, "a number in [0, 1)")
+    check_number("tolerance", tolerance, lambda x: 0 <= x <= 1, "a number in [0, 1]")
     # Not as 1 minus what is explained, which has only half the digits.
     left = energies.flip(0).cumsum(0).flip(0)[1:].sqrt()
     enough = (left <= tolerance).nonzero()

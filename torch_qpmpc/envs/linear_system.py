@@ -170,13 +170,14 @@ class LinearSystemGymEnv(gymnasium.Env):
             raise QPError.expected(
                 "step", "no episode", "one that has begun", "Call reset() first."
             )
-        space = self.action_space
-        a = torch.as_tensor(np.asarray(action, dtype=np.float64))
-        if a.shape != space.shape or not a.isfinite().all():
-            got, expected = f"{action!r}", f"finite numbers of shape {space.shape}"
-            raise QPError.expected(
-                "action", got, expected, "A policy's batch has one row here: [0]."
-            )
+        try:
+            a = torch.as_tensor(np.asarray(action, dtype=np.float64))
+        except (TypeError, ValueError):
+            a = torch.tensor(torch.nan)
+        if a.shape != self.action_space.shape or not a.isfinite().all():
+            expected = f"finite numbers of shape {self.action_space.shape}"
+            remedy = "Of a batch of actions, pass one."
+            raise QPError.expected("action", repr(action), expected, remedy)
         reward = -self.physics.cost(self._s, a).item()
         self._nu = self.physics.noise(self._nu, self.physics.draw(self.np_random, 1)[0])
         self._s = self.physics.step(self._s, a, self._nu)
