@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -43,3 +46,21 @@ MISSPELT: Any = {"misspelt": 1}
 def test_a_misspelt_keyword_is_named(call):
     with pytest.raises(TypeError, match="unexpected keyword argument 'misspelt'"):
         call()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("optimizer=adm", "Could not find 'optimizer/adm'"),
+        ("constraint.deviation.c1=3", "Could not override 'constraint.deviation.c1'."),
+        ("+foo=1", "foo: got an unknown key, expected a key of configs/."),
+    ],
+)
+def test_a_mistake_on_the_command_line_is_a_sentence(override, message, tmp_path):
+    train = Path(__file__).parents[1] / "train.py"
+    command = [sys.executable, train, override, f"hydra.run.dir={tmp_path}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    said = done.stdout + done.stderr
+    assert done.returncode != 0
+    assert message in said
+    assert "Traceback" not in said

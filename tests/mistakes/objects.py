@@ -30,7 +30,8 @@ pm = PointMass()
 
 
 def Q(**changes: Any) -> Callable[[], Any]:
-    return lambda: qm.QuadraticProgram(**(GOOD | changes))
+    data: dict[str, Any] = GOOD | changes
+    return lambda: qm.QuadraticProgram(**data)
 
 
 def M(**changes: Any) -> Callable[[], Any]:
@@ -39,7 +40,8 @@ def M(**changes: Any) -> Callable[[], Any]:
 
 
 def G(**changes: Any) -> Callable[[], Any]:
-    return lambda: qm.GaussNewton(**({"mpc": random_mpc(0)} | changes))
+    options: dict[str, Any] = {"mpc": random_mpc(0)} | changes
+    return lambda: qm.GaussNewton(**options)
 
 
 def batch_without(*keys: Any) -> TensorDict:
