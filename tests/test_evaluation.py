@@ -84,7 +84,7 @@ def test_policy_gets_float64_and_leaves_no_graph():
 
 @pytest.mark.parametrize("shape", [(32,), (2,), (1, 2), (32, 1)])
 def test_policy_of_another_shape_is_an_error(shape):
-    match = rf"policy\(s\): got shape \({shape[0]},.*\), expected \(32, 2\)"
+    match = rf"policy\(s\): got shape \({shape[0]},.*\), expected shape \(32, 2\)"
     with pytest.raises(QPError, match=match):
         closed_loop(lambda s: torch.zeros(shape), PointMass())
 

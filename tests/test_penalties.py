@@ -273,7 +273,7 @@ def test_float32_windows_of_the_replay(generator):
 
 @pytest.mark.parametrize("shape", [(N_Z,), (3, N_Z - 1), (2, 3, N_Z)])
 def test_windows_of_another_shape(generator, shape):
-    match = rf"windows: got shape \({shape[0]},.*, expected shape \(M, n_z\) with n_z = {N_Z}"
+    match = rf"windows: got shape \({shape[0]},.*, expected shape \(M, {N_Z}\)"
     with pytest.raises(QPError, match=match):
         system_identification_penalty(normal(generator, N * N_X, N_Z), normal(generator, *shape))
 

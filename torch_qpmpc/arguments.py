@@ -10,6 +10,13 @@ from torch import Tensor
 
 from torch_qpmpc.autograd import ON_FAILURE
 from torch_qpmpc.batching import broadcast
+from torch_qpmpc.checks import (
+    check_choice,
+    check_flag,
+    check_number,
+    check_tensor,
+    check_whole,
+)
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.steps import check_step
 
@@ -31,22 +38,25 @@ def check_structure(
     learn: Collection[str],
     step: str,
     on_failure: str,
+    discount_slack: bool,
+    seed: int,
 ) -> None:
     for name, size in (("n_x", n_x), ("n_u", n_u), ("horizon", horizon)):
-        if not isinstance(size, int) or size < 1:
+        if not isinstance(size, int) or isinstance(size, bool) or size < 1:
             raise QPError.expected(name, repr(size), "a positive integer")
-    if not 0 < gamma <= 1:
-        raise QPError.expected("gamma", gamma, "a discount factor in (0, 1]")
-    for name, choice, choices in (
-        ("hessian", hessian, HESSIANS),
-        ("structure", structure, STRUCTURES),
-        ("on_failure", on_failure, ON_FAILURE),
-    ):
-        if choice not in choices:
-            raise QPError.expected(name, repr(choice), f"one of {', '.join(choices)}")
+    check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
+    check_choice("hessian", hessian, HESSIANS)
+    check_choice("structure", structure, STRUCTURES)
+    check_choice("on_failure", on_failure, ON_FAILURE)
     check_step(step)
+    check_flag("discount_slack", discount_slack)
+    check_whole("seed", seed, 0)
     parts = (*COST, *CONSTRAINTS)
-    if isinstance(learn, str) or not set(learn) <= set(parts):
+    if (
+        not isinstance(learn, Collection)
+        or isinstance(learn, str)
+        or not all(isinstance(part, str) and part in parts for part in learn)
+    ):
         raise QPError.expected(
             "learn", repr(learn), f"a collection of names among {', '.join(parts)}"
         )
@@ -70,14 +80,23 @@ def check_model(A: Any, B: Any) -> tuple[Tensor, Tensor]:
 
 def as_tensor(name: str, value: Any) -> Tensor:
     try:
-        tensor = torch.as_tensor(value, dtype=torch.float64)
+        given = torch.as_tensor(value)
+        if given.is_complex() or given.is_meta:
+            raise TypeError
+        tensor = given.to(torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise QPError.expected(
-            name, repr(value), "a tensor, or what torch.as_tensor takes"
+            name, _brief(value), "a tensor, or what torch.as_tensor takes, of real numbers"
         ) from error
     if tensor.isnan().any() or (tensor.isinf().any() and not name.endswith("bounds")):
         raise QPError.expected(name, "NaN or inf", "finite entries")
     return tensor
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"a tensor of {value.dtype} on {value.device}"
+    return repr(value)
 
 
 def bound(name: str, bounds: tuple[Any, Any] | None, side: int, size: int) -> Tensor:
@@ -141,27 +160,13 @@ def check_weight(name: str, weight: Tensor, diagonal: bool) -> None:
 
 
 def check_slack(name: str, weight: float) -> None:
-    if not weight >= 0:
-        raise QPError.expected(name, weight, "a non-negative weight, or inf for hard rows")
+    check_number(name, weight, lambda x: x >= 0, "a non-negative weight, or inf for hard rows")
 
 
-def check_input(name: str, x: Tensor, size: int) -> Tensor:
-    if not isinstance(x, Tensor) or not x.is_floating_point():
-        got = x.dtype if isinstance(x, Tensor) else type(x).__name__
-        raise QPError.expected(
-            name,
-            got,
-            "a floating-point torch.Tensor",
-            f"Convert it: torch.as_tensor({name}).float().",
-        )
-    if x.ndim == 0 or x.shape[-1] != size:
-        raise QPError.expected(name, f"shape {tuple(x.shape)}", f"shape (*batch, {size})")
-    return x
-
-
-def check_pair(s: Tensor, a: Tensor, n_x: int, n_u: int) -> Tensor:
+def check_pair(s: Tensor, a: Tensor, n_x: int, n_u: int, device: torch.device) -> Tensor:
     """s and a side by side, ``(*batch, n_x + n_u)``, in the dtype of s."""
-    s, a = check_input("s", s, n_x), check_input("a", a, n_u)
+    check_tensor("s", s, n_x, device=device)
+    check_tensor("a", a, n_u, device=device)
     try:
         batch = broadcast(s.shape[:-1], a.shape[:-1])
     except RuntimeError as error:

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.batching import align, broadcast, outer, sum_to, weighted_sum
+from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.qp import QPSolution, QuadraticProgram, Status, slacks
@@ -76,6 +77,7 @@ def solve_qp(
     References:
         Büskens and Maurer (2001), as cited at eq:gradq.
     """
+    check_kind("qp", qp, QuadraticProgram, "Of a QPMPC: mpc.quadratic_program(), or mpc.solve(s).")
     for name, choice in (("solver", solver), ("on_failure", on_failure)):
         if not isinstance(choice, str):
             raise QPError.expected(name, repr(choice), "a name")
@@ -111,6 +113,9 @@ def _operands(qp: QuadraticProgram, fixed: Tensor) -> tuple[Tensor, ...]:
     if not isinstance(fixed, Tensor) or not fixed.is_floating_point():
         got = fixed.dtype if isinstance(fixed, Tensor) else type(fixed).__name__
         raise QPError.expected("fixed", got, "a floating-point torch.Tensor", "Convert it first.")
+    if fixed.device != qp.q.device:
+        got, remedy = f"a tensor on {fixed.device}", f"Move it: fixed.to({str(qp.q.device)!r})."
+        raise QPError.expected("fixed", got, f"one on the QP's {qp.q.device}", remedy)
     if fixed.ndim == 0 or fixed.shape[-1] > qp.n_z:
         raise QPError.expected(
             "fixed",
@@ -133,6 +138,9 @@ def _checked_start(
 ) -> Tensor | None:
     if warm_start is None:
         return None
+    if not isinstance(warm_start, QPSolution | Tensor):
+        got = type(warm_start).__name__
+        raise QPError.expected("warm_start", got, "a QPSolution, or its `active`")
     active = warm_start if isinstance(warm_start, Tensor) else warm_start.active
     batch = broadcast(qp.batch_shape, fixed.shape[:-1])
     want = (*batch, qp.lb.shape[-1])
@@ -150,8 +158,8 @@ def _checked_keep(qp: QuadraticProgram, fixed: Tensor, keep: int | None) -> int:
     n_f = fixed.shape[-1]
     if keep is None:
         return n_f
-    if not n_f <= keep <= qp.n_z:
-        raise QPError.expected("keep", keep, f"n_f = {n_f} <= keep <= n_z = {qp.n_z}")
+    if not isinstance(keep, int) or not n_f <= keep <= qp.n_z:
+        raise QPError.expected("keep", repr(keep), f"n_f = {n_f} <= keep <= n_z = {qp.n_z}")
     return keep
 
 

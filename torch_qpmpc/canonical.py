@@ -17,8 +17,12 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.banded import banded_matrix
+from torch_qpmpc.batching import broadcast
+from torch_qpmpc.checks import check_kind, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 
+#: The remedy for what is no prediction form.
+FORM = "Pass prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)."
 #: The largest condition number of C's state columns (after scaling its rows) that can be read: the
 #: relative error of what is read is about 1e-16 times it.
 LARGEST_CONDITION = 1e12
@@ -73,8 +77,22 @@ class PredictionForm:
 
     def predict(self, x_0: Tensor, U: Tensor) -> Tensor:
         """x_1, .., x_N ``(*batch, N, n_x)`` from x_0 ``(*batch, n_x)``, U ``(*batch, N, n_u)``."""
+        check_tensor("x_0", x_0, self.n_x)
+        check_tensor("U", U, self.horizon, self.n_u)
+        x_0, U = x_0.to(self.Phi), U.to(self.Phi)
+        try:
+            broadcast(self.Phi.shape[:-2], x_0.shape[:-1], U.shape[:-2])
+        except RuntimeError as error:
+            got, want = f"shape {tuple(U.shape)}", "leading dimensions that broadcast with x_0's"
+            raise QPError.expected("U", got, f"{want}, {tuple(x_0.shape[:-1])}") from error
         X = self.Phi @ x_0.unsqueeze(-1) + self.Gamma @ U.flatten(-2).unsqueeze(-1)
         return (X.squeeze(-1) + self.phi).unflatten(-1, (self.horizon, self.n_x))
+
+
+def check_form(form: PredictionForm) -> None:
+    """Raise `QPError` unless ``form`` is one of a single C, without batch dimensions."""
+    check_kind("form", form, PredictionForm, FORM)
+    check_tensor("form.Phi", form.Phi, "N n_x", "n_x", batched=False, remedy="Take one at a time.")
 
 
 def prediction_form(C: Tensor, n_x: int, n_u: int, b: Tensor | None = None) -> PredictionForm:
@@ -102,15 +120,21 @@ def prediction_form(C: Tensor, n_x: int, n_u: int, b: Tensor | None = None) -> P
                 [0.5000, 1.0000, 0.0000],
                 [0.2500, 0.5000, 1.0000]], dtype=torch.float64)
     """
+    check_whole("n_x", n_x, 1)
+    check_whole("n_u", n_u, 1)
+    check_tensor("C", C, "N n_x", "N (n_x + n_u) + n_x", remedy="Pass mpc.C.")
     n_c, n_z = C.shape[-2:]
     N = n_c // n_x
     if N < 1 or n_c != N * n_x or n_z != N * (n_x + n_u) + n_x:
         want = f"(*batch, N n_x, N (n_x + n_u) + n_x) with n_x = {n_x}, n_u = {n_u}"
         raise QPError.expected("C", f"shape {tuple(C.shape)}", want)
-    C = C.detach().to("cpu", torch.float64)
-    b = C.new_zeros(n_c) if b is None else b.detach().to(C)
-    if b.shape[-1:] != (n_c,):
-        raise QPError.expected("b", f"shape {tuple(b.shape)}", f"shape (*batch, {n_c})")
+    b = C.new_zeros(n_c) if b is None else check_tensor("b", b, n_c)
+    try:
+        broadcast(C.shape[:-2], b.shape[:-1])
+    except RuntimeError as error:
+        got, want = f"shape {tuple(b.shape)}", "leading dimensions that broadcast with those of C"
+        raise QPError.expected("b", got, f"{want}, {tuple(C.shape[:-2])}") from error
+    C, b = (x.detach().to("cpu", torch.float64) for x in (C, b))
     if not (C.isfinite().all() and b.isfinite().all()):
         raise QPError.expected("C, b", "NaN or inf", "finite entries")
     # Rows of unit norm, so that a mere scale does not count as bad condition.
@@ -130,9 +154,18 @@ def model_form(A: Tensor, B: Tensor, horizon: int, offset: Tensor | None = None)
         A, B: ``(n_x, n_x)`` and ``(n_x, n_u)``, or with a leading N for one per stage.
         horizon: N.
         offset: ``(n_x,)``, or ``(N, n_x)``; zero by default.
+
+    Raises:
+        QPError: shapes that do not fit each other or the horizon.
     """
+    check_whole("horizon", horizon, 1)
+    check_tensor("A", A, "n_x", "n_x")
+    check_tensor("B", B, "n_x", "n_u")
     n_x, n_u = B.shape[-2:]
-    offset = A.new_zeros(n_x) if offset is None else offset
+    offset = A.new_zeros(n_x) if offset is None else check_tensor("offset", offset, n_x)
+    if offset.shape[:-1] not in ((), (horizon,)):
+        got = f"shape {tuple(offset.shape)}"
+        raise QPError.expected("offset", got, f"shape ({n_x},) or ({horizon}, {n_x})")
     C_0 = banded_matrix(A, B, horizon)
     return prediction_form(C_0, n_x, n_u, -offset.expand(horizon, n_x).flatten())
 
@@ -152,7 +185,10 @@ def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         C ``(N n_x, N (n_x + n_u) + n_x)`` and b ``(N n_x,)``.
     """
+    check_form(form)
     n_x, n_u, N = form.n_x, form.n_u, form.horizon
+    check_tensor("A", A, N, n_x, n_x, batched=False, remedy="Pass stage_models(form).A.")
+    A = A.to(form.Phi)
     F = form.Phi.new_zeros(N * n_x, N * (n_x + n_u) + n_x)
     following, x_0, u = _columns(n_x, n_u, N)
     F[:, x_0], F[:, u] = form.Phi, form.Gamma

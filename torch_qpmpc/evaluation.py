@@ -11,9 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.linear_system import LinearSystem
 from torch_qpmpc.errors import QPError
+
+POLICY = "Map a batch of states to a batch of actions."
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,19 +69,18 @@ def closed_loop(
         gamma: the discount factor of ``J_discounted``.
 
     Raises:
-        QPError: ``policy`` returns another shape.
+        QPError: ``policy`` returns another shape, or an argument is of another kind.
     """
+    _check(policy, steps, starts, seed, gamma)
+    check_kind("physics", physics, LinearSystem, "Of a GymnasiumPlant: gymnasium_loop.")
     rng = np.random.default_rng(seed)
     s = physics.starts(rng, starts)
     nu = torch.zeros_like(s)
-    expected = (starts, physics.B.shape[1])
+    expected = starts, physics.B.shape[1]
     states, actions, costs = [s], [], []
     for _ in range(steps):
-        a = policy(s)
-        if a.shape != expected:
-            # A (starts,) or (n_u,) result would broadcast without a sound.
-            remedy = "Map a batch of states to a batch of actions."
-            raise QPError.expected("policy(s)", f"shape {tuple(a.shape)}", str(expected), remedy)
+        # A (starts,) or (n_u,) result would broadcast without a sound.
+        a = check_tensor("policy(s)", policy(s), *expected, batched=False, remedy=POLICY)
         a = physics.applied(a)
         costs.append(physics.cost(s, a))
         nu = physics.noise(nu, physics.draw(rng, starts))
@@ -101,14 +103,22 @@ def gymnasium_loop(
     """`closed_loop` in a Gymnasium environment: start i is that of the seed ``seed + i``.
 
     After an episode's end its state stays, at no cost.
+
+    Raises:
+        QPError: as of `closed_loop`.
     """
+    _check(policy, steps, starts, seed, gamma)
+    check_kind("plant", plant, GymnasiumPlant, "Of a LinearSystem: closed_loop.")
+    expected = starts, len(plant.lb_a)
     envs = [gymnasium.make(plant.id, max_episode_steps=steps) for _ in range(starts)]
     s = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(envs)])
     states, actions, costs = [s], [], []
     over = np.zeros(starts, dtype=bool)
     low, high = plant.lb_a.numpy(), plant.ub_a.numpy()
     for _ in range(steps):
-        a = policy(torch.as_tensor(s, dtype=torch.float64)).numpy().clip(low, high)
+        a = policy(torch.as_tensor(s, dtype=torch.float64))
+        check_tensor("policy(s)", a, *expected, batched=False, remedy=POLICY)
+        a = a.numpy().clip(low, high)
         s, cost = s.copy(), np.zeros(starts)
         for i in np.flatnonzero(~over):
             s[i], reward, terminated, truncated, _ = envs[i].step(a[i].astype(low.dtype))
@@ -130,5 +140,17 @@ def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:
     Returns:
         nan where the start is no worse than the true model (or a J is nan): no gap to close.
     """
+    for name, J in (("J_start", J_start), ("J_final", J_final), ("J_true_model", J_true_model)):
+        check_number(name, J, lambda _: True, "a number, or nan")
     gap = J_start - J_true_model
     return (J_start - J_final) / gap if gap > 0 else math.nan
+
+
+def _check(policy: object, steps: int, starts: int, seed: int, gamma: float) -> None:
+    if not callable(policy):
+        remedy = "Pass a function of states, such as mpc.policy."
+        raise QPError.expected("policy", type(policy).__name__, "a function", remedy)
+    check_whole("steps", steps, 1)
+    check_whole("starts", starts, 1)
+    check_whole("seed", seed, 0)
+    check_number("gamma", gamma, lambda x: 0 <= x <= 1, "a discount factor in [0, 1]")

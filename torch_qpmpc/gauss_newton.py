@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_qpmpc.autograd import envelope_gradients
+from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.qp import EVENT_SHAPES, QPSolution
@@ -28,6 +29,10 @@ from torch_qpmpc.qp import EVENT_SHAPES, QPSolution
 #: Decrease over predicted decrease: below the first the damping rises, above the second it falls.
 POOR, GOOD = 0.25, 0.75
 RISE, FALL, MOST_DAMPING = 4.0, 0.5, 1e6
+
+
+def _positive(x: float) -> bool:
+    return 0 < x < math.inf
 
 
 @dataclass(frozen=True)
@@ -93,15 +98,17 @@ class GaussNewton(torch.optim.Optimizer):
         memory: int = 0,
         trust_region: bool = True,
     ) -> None:
-        if memory < 0:
-            raise QPError.expected("memory", memory, "a whole number >= 0")
-        if not 0 < lr <= 1:
-            raise QPError.expected("lr", lr, "a number in (0, 1]")
-        for name, number in (("damping", damping), ("td_error_clip", td_error_clip)):
-            if number is not None and not 0 < number < torch.inf:
-                raise QPError.expected(name, number, "a finite number > 0")
+        remedy = "Pass the QPMPC itself: its learned parts are the parameters."
+        check_kind("mpc", mpc, QPMPC, remedy)
+        check_whole("memory", memory, 0)
+        check_number("lr", lr, lambda x: 0 < x <= 1, "a number in (0, 1]")
+        check_number("damping", damping, _positive, "a finite number > 0")
+        if td_error_clip is not None:
+            check_number("td_error_clip", td_error_clip, _positive, "a finite number > 0")
+        check_flag("trust_region", trust_region)
         groups = mpc.parameter_groups(scales or {"cost": 1.0, "constraints": 1e-2})
         for group in groups:
+            check_number(f"scales[{group['name']}]", group["lr"], _positive, "a finite number > 0")
             group |= {"scale": group["lr"], "lr": lr, "damping": damping}
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
@@ -122,14 +129,24 @@ class GaussNewton(torch.optim.Optimizer):
         Args:
             s, a: visited pairs, ``(B, n_x)`` and ``(B, n_u)``.
             target: costs to go, L + gamma V(s+), ``(B,)``; where it is not finite, the pair is
-                left out.
+                left out. That a target has the wrong sign, as a reward or TorchRL's values have,
+                cannot be told from its numbers.
             penalty: S ``(n_z, n_z)`` of a penalty ``1/2 tr(C S C')`` against the batch's mean of
                 ``1/2 delta^2``, such as `SystemIdentificationPenalty.curvature`; for a free C.
             warm_start: active sets of Q(s, a), ``(B, n_g)``.
 
         Raises:
-            QPError: a penalty without a free C.
+            QPError: a shape that does not fit, or a penalty without a free C.
         """
+        mpc = self._mpc
+        check_tensor("s", s, "B", mpc.n_x, batched=False)
+        check_tensor("a", a, len(s), mpc.n_u, batched=False)
+        check_tensor("target", target, len(s), batched=False, remedy="Squeeze its last dimension.")
+        if not len(s):
+            raise QPError.expected("s", "an empty batch", "at least one pair")
+        if penalty is not None:
+            remedy = "Pass SystemIdentificationPenalty.curvature(windows)."
+            check_tensor("penalty", penalty, mpc.n_z, mpc.n_z, batched=False, remedy=remedy)
         group = self.param_groups[0]
         with torch.enable_grad():
             qp = self._mpc.quadratic_program()

@@ -12,11 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_qpmpc.arguments import as_tensor, check_input
+from torch_qpmpc.arguments import as_tensor, check_weight
+from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.qp import QPSolution
 from torch_qpmpc.starts import riccati_weight
+
+GRID = "Pass torch.linspace(lower, upper, n)."
 
 
 def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
@@ -29,7 +32,8 @@ def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
     Returns:
         ``(*batch, n_u, n_x)``; zero where the QP is not solved.
     """
-    return _solve_with_gain(mpc, check_input("s", s, mpc.n_x))[1]
+    check_kind("mpc", mpc, QPMPC)
+    return _solve_with_gain(mpc, check_tensor("s", s, mpc.n_x))[1]
 
 
 def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
@@ -41,22 +45,40 @@ def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
         gamma: discount of the stage costs.
 
     Raises:
-        QPError: the Riccati equation has no stabilising solution.
+        QPError: shapes that do not fit, a W that is no cost (not positive semidefinite), or a
+            Riccati equation without a stabilising solution.
     """
-    n_x, P = A.shape[-1], riccati_weight(A, B, W, gamma)
+    check_tensor("A", A, "n_x", "n_x", batched=False)
+    n_x = len(A)
+    check_tensor("A", A, n_x, n_x, batched=False)
+    check_tensor("B", B, n_x, "n_u", batched=False)
+    n = n_x + B.shape[-1]
+    check_tensor("W", W, n, n, batched=False, remedy="Of [x; u], as stage_weight(mpc) gives it.")
+    check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
+    B, W = B.to(A), W.to(A)
+    check_weight("W", W, diagonal=False)
+    P = riccati_weight(A, B, W, gamma)
     left = W[n_x:, n_x:] + gamma * B.mT @ P @ B
     return torch.linalg.solve(left, gamma * B.mT @ P @ A + W[n_x:, :n_x])
 
 
 def stage_weight(mpc: QPMPC) -> Tensor:
     """The weight of (x_0, u_0), ``(n_x + n_u, n_x + n_u)``: the first block of H (eq:qpH)."""
+    check_kind("mpc", mpc, QPMPC)
     n = mpc.n_x + mpc.n_u
     return mpc.quadratic_program().H.detach()[:n, :n]
 
 
 def spectral_radius(A: Tensor, B: Tensor, K: Tensor) -> Tensor:
     """Largest modulus of the eigenvalues of A - B K, ``(*batch,)``: below 1 it is stable."""
-    return torch.linalg.eigvals(A - B @ K).abs().amax(-1)
+    check_tensor("A", A, "n_x", "n_x")
+    n_x = A.shape[-1]
+    check_tensor("B", B, n_x, "n_u")
+    check_tensor("K", K, B.shape[-1], n_x)
+    closed = A - B.to(A) @ K.to(A)
+    if not closed.isfinite().all():
+        raise QPError.expected("A, B, K", "NaN or inf", "finite entries")
+    return torch.linalg.eigvals(closed).abs().amax(-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,13 +136,18 @@ def policy_map(
         >>> found.actions.shape, found.gains.shape, bool((found.regions >= 0).all())
         (torch.Size([9, 5, 1]), torch.Size([9, 5, 1, 2]), True)
     """
+    check_kind("mpc", mpc, QPMPC)
+    if not isinstance(axes, tuple | list) or len(axes) != 2:
+        raise QPError.expected("axes", repr(axes), "a pair of indices, such as (0, 1)")
+    for axis in axes:
+        check_whole("axes", axis, 0)
     first, second = axes
     if first == second or not all(0 <= axis < mpc.n_x for axis in axes):
         raise QPError.expected("axes", axes, f"two different states among 0 to {mpc.n_x - 1}")
     x, y = as_tensor("x", x), as_tensor("y", y)
-    if x.ndim != 1 or y.ndim != 1:
+    if x.ndim != 1 or y.ndim != 1 or not len(x) or not len(y):
         got = f"shapes {tuple(x.shape)} and {tuple(y.shape)}"
-        raise QPError.expected("x, y", got, "vectors", "Pass torch.linspace(lower, upper, n).")
+        raise QPError.expected("x, y", got, "vectors that are not empty", GRID)
     states = torch.zeros(mpc.n_x) if at is None else as_tensor("at", at)
     if tuple(states.shape) != (mpc.n_x,):
         raise QPError.expected("at", f"shape {tuple(states.shape)}", f"shape ({mpc.n_x},)")

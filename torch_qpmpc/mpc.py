@@ -19,12 +19,12 @@ from torch_qpmpc.arguments import (
     CONSTRAINTS,
     COST,
     STRUCTURES,
-    check_input,
     check_model,
     check_pair,
     check_structure,
 )
 from torch_qpmpc.autograd import optimal_value, solve_qp
+from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.parametrizations import SIGNED, Banded, Tied, kept
 from torch_qpmpc.precision import full_precision
@@ -145,7 +145,19 @@ class QPMPC(nn.Module):
         }
         super().__init__()
         self._arguments = arguments
-        check_structure(n_x, n_u, horizon, gamma, hessian, structure, learn, step, on_failure)
+        check_structure(
+            n_x,
+            n_u,
+            horizon,
+            gamma,
+            hessian,
+            structure,
+            learn,
+            step,
+            on_failure,
+            discount_slack,
+            seed,
+        )
         backend(solver)
         with torch.device("cpu"):
             self._start(learn)
@@ -204,11 +216,11 @@ class QPMPC(nn.Module):
 
     def value(self, s: Tensor) -> Tensor:
         """V(s) (eq:qp4), a cost to go: s ``(*batch, n_x)`` to ``(*batch,)``."""
-        return self._value(check_input("s", s, self.n_x))
+        return self._value(self._checked(s))
 
     def action_value(self, s: Tensor, a: Tensor) -> Tensor:
         """Q(s, a) (eq:qp5), a cost to go: ``(*batch, n_x)``, ``(*batch, n_u)`` to ``(*batch,)``."""
-        return self._value(check_pair(s, a, self.n_x, self.n_u))
+        return self._value(self._checked(s, a))
 
     def policy(self, s: Tensor) -> Tensor:
         """pi(s), the u_0 of V's solution: s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
@@ -229,8 +241,11 @@ class QPMPC(nn.Module):
 
         ``qp`` is `quadratic_program`, where that has been made for today's theta already.
         """
-        fixed = check_input("s", s, self.n_x) if a is None else check_pair(s, a, self.n_x, self.n_u)
-        qp = self.quadratic_program() if qp is None else qp
+        fixed = self._checked(s, a)
+        if qp is None:
+            qp = self.quadratic_program()
+        else:
+            check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or nothing.")
         return solve_qp(
             qp,
             fixed.to(qp.C.dtype),
@@ -242,7 +257,7 @@ class QPMPC(nn.Module):
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """The states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
-        return self._layout.predicted(z)
+        return self._layout.predicted(check_tensor("z", z, self.n_z))
 
     def model(self) -> tuple[Tensor, Tensor]:
         """A and B, ``(n_x, n_x)`` and ``(n_x, n_u)``, or with a leading N where they vary.
@@ -367,6 +382,13 @@ class QPMPC(nn.Module):
         for part in self.modules():
             if isinstance(part, Tied):
                 part.place(self.C_0.device)
+
+    def _checked(self, s: Tensor, a: Tensor | None = None) -> Tensor:
+        """What is fixed of z: s, or s and a side by side."""
+        device = self.C_0.device
+        if a is None:
+            return check_tensor("s", s, self.n_x, device=device)
+        return check_pair(s, a, self.n_x, self.n_u, device)
 
     def _value(self, fixed: Tensor) -> Tensor:
         qp = self.quadratic_program()

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import _GAMMA_LMBDA_DEPREC_ERROR, dispatch_value_estimator
 
+from torch_qpmpc.checks import check_flag, check_number
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.operators import QPActorValueOperator, QPValueOperator
 
@@ -69,7 +70,9 @@ class QPQLearningLoss(LossModule):
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
         use_prioritized_weights: weight the samples by ``priority_weight`` where a buffer gives it.
 
-    The discount factor is set as everywhere in TorchRL, by ``make_value_estimator(gamma=0.9)``.
+    The discount factor is set as everywhere in TorchRL, by ``make_value_estimator(gamma=0.9)``;
+    without it TorchRL's own 0.99 holds, whatever the QP's gamma is. Rewards are ``-L``: that they
+    have the wrong sign, costs in their place, cannot be told from their numbers.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -150,10 +153,15 @@ class QPQLearningLoss(LossModule):
                 "a QPActorValueOperator",
                 "Wrap the QPMPC: QPActorValueOperator(mpc).",
             )
-        if td_error_clip is not None and not td_error_clip > 0:
-            raise QPError.expected("td_error_clip", td_error_clip, "a positive number or None")
+        if td_error_clip is not None:
+            expected = "a positive number or None"
+            check_number("td_error_clip", td_error_clip, lambda x: x > 0, expected)
         if reduction not in (None, "mean", "sum", "none"):
             raise QPError.expected("reduction", repr(reduction), "'mean', 'sum' or 'none'")
+        check_flag("delay_value", delay_value)
+        if use_prioritized_weights not in ("auto", True, False):
+            got = repr(use_prioritized_weights)
+            raise QPError.expected("use_prioritized_weights", got, "'auto', True or False")
         self.delay_value = delay_value
         self.td_error_clip = td_error_clip
         self.reduction = reduction or "mean"
@@ -201,6 +209,8 @@ class QPQLearningLoss(LossModule):
         self, value_type: ValueEstimators | str | None = None, **hyperparams: Any
     ) -> Any:
         """Choose how V(s+) enters the target: TD0 (default), TD1 or TDLambda."""
+        for name in {"gamma", "lmbda"} & hyperparams.keys():
+            _check_factor(name, hyperparams[name])
         value_type, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if options is None:
             return self
@@ -228,6 +238,7 @@ class QPQLearningLoss(LossModule):
         If the value network has an ``active_set_key``, the active sets of Q(s, a) and, under
         ``"next"``, of V(s+) are read from there where they are, and written.
         """
+        self._check_batch(tensordict)
         weights = self._maybe_get_priority_weight(tensordict)
         active_set = self.value_network.active_set_key
         visited = tensordict.select(*_read_by(self.value_network), strict=False).detach()
@@ -246,6 +257,27 @@ class QPQLearningLoss(LossModule):
         tensordict.set(self.tensor_keys.priority, priority, inplace=True)
         loss = td_loss(prediction, target, self.td_error_clip)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
+
+    def _check_batch(self, tensordict: TensorDictBase) -> None:
+        """Raise `QPError` where an entry is missing, or would broadcast against the values."""
+        keys, shape = self.tensor_keys, (*tensordict.batch_size, 1)
+        for key in (keys.reward, keys.done, keys.terminated):
+            path = unravel_key(("next", key))
+            value = tensordict.get(path, None)
+            if value is None:
+                if key == keys.terminated and tensordict.get(("next", keys.done), None) is not None:
+                    continue  # then done says it
+                remedy = "Name another by set_keys, or collect transitions."
+                raise QPError.expected(str(path), "no such entry", f"one of shape {shape}", remedy)
+            if value.shape != shape:
+                remedy = "Unsqueeze its last dimension: TorchRL's rewards and flags have it."
+                raise QPError.expected(
+                    str(path), f"shape {tuple(value.shape)}", f"shape {shape}", remedy
+                )
+            if key != keys.reward and value.dtype != torch.bool:
+                raise QPError.expected(str(path), value.dtype, "torch.bool", "Convert: .bool().")
+        if 0 in tensordict.batch_size:
+            raise QPError.expected("tensordict", "an empty batch", "at least one transition")
 
     @torch.no_grad()
     def target(self, tensordict: TensorDictBase) -> Tensor:
@@ -270,6 +302,12 @@ class QPQLearningLoss(LossModule):
         done = tensordict.get(("next", self.tensor_keys.done))
         terminated = tensordict.get(("next", self.tensor_keys.terminated), default=done)
         return following[self.tensor_keys.value].masked_fill(terminated, 0.0)
+
+
+def _check_factor(name: str, value: Any) -> None:
+    if isinstance(value, Tensor):
+        value = value.item() if value.numel() == 1 else value.tolist()
+    check_number(name, value, lambda x: 0 <= x <= 1, "a number in [0, 1]")
 
 
 def _read_by(network: QPActorValueOperator | QPValueOperator) -> list[NestedKey]:

@@ -11,7 +11,10 @@ from collections.abc import Sequence
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
+from torch import Tensor
 
+from torch_qpmpc.checks import check_kind
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import QPMPC
 
 
@@ -29,6 +32,7 @@ class _QPOperator(TensorDictModuleBase):
         active_set_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
+        check_kind("mpc", mpc, QPMPC)
         self.module = mpc
         self.active_set_key = active_set_key
         out_keys = [out_key] if active_set_key is None else [out_key, active_set_key]
@@ -37,7 +41,7 @@ class _QPOperator(TensorDictModuleBase):
 
     def _set_value(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Minus V, or minus Q where there is an action to read, under the first out-key."""
-        inputs = [tensordict.get(key) for key in self.in_keys]
+        inputs = [_read(tensordict, key) for key in self.in_keys]
         if self.active_set_key is None:
             cost = self.module(*inputs)
         else:
@@ -48,12 +52,24 @@ class _QPOperator(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], -cost.unsqueeze(-1))
 
 
+def _read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """An entry; without this check, the Q of a missing action would be V."""
+    value = tensordict.get(key, None)
+    if value is None:
+        found = ", ".join(map(str, tensordict.keys(True, True))) or "nothing"
+        remedy = "Rename the operator's keys, such as action_key, or the TensorDict's."
+        raise QPError.expected(str(key), "no such entry", f"one beside {found}", remedy)
+    return value
+
+
 class QPPolicyOperator(_QPOperator):
     """pi(s): observation ``(*batch, n_x)`` to action ``(*batch, n_u)``."""
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set(self.out_keys[0], self.module.policy(tensordict.get(self.in_keys[0])))
+        return tensordict.set(
+            self.out_keys[0], self.module.policy(_read(tensordict, self.in_keys[0]))
+        )
 
 
 class QPValueOperator(_QPOperator):

@@ -6,6 +6,7 @@ that is tied from A and B. The others are buffers.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from torch_qpmpc.arguments import CONSTRAINTS, COST
+from torch_qpmpc.checks import check_number
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.parametrizations import Banded, LinearRows, Tied
 
@@ -76,9 +78,15 @@ def groups(
     module: nn.Module, learned: Collection[str], rates: Mapping[str, float]
 ) -> list[dict[str, Any]]:
     """Parameter groups for an optimiser, one for each learned part."""
+    if not isinstance(rates, Mapping):
+        got = type(rates).__name__
+        raise QPError.expected("rates", got, "a mapping such as {'cost': .., 'constraints': ..}")
     known = {*COST, *CONSTRAINTS, "cost", "constraints"}
     if unknown := set(rates) - known:
         raise QPError.expected("rates", sorted(unknown), f"names among {sorted(known)}")
+    if unused := set(rates) - {*learned, "cost", "constraints"}:
+        expected = f"parts that are learned: {', '.join(learned) or 'none'}"
+        raise QPError.expected("rates", sorted(unused), expected, "Name them in learn, too.")
     found = []
     for part in learned:
         rate = rates.get(part, rates.get("cost" if part in COST else "constraints"))
@@ -86,5 +94,6 @@ def groups(
             raise QPError.expected(
                 "rates", f"nothing for {part}", "a rate for every learned part, or its family"
             )
+        check_number(f"rates[{part}]", rate, lambda x: 0 <= x < math.inf, "a finite number >= 0")
         found.append({"params": leaves(module, part), "lr": rate, "name": part})
     return found

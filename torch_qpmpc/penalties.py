@@ -11,7 +11,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from torch_qpmpc.banded import band_distance
+from torch_qpmpc.checks import check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
+
+WINDOWS = "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}."
+
+
+def _finite(x: float) -> bool:
+    return 0 <= x < torch.inf
 
 
 def deviation_penalty(C: Tensor, C_0: Tensor, C_mask: Tensor) -> Tensor:
@@ -35,13 +42,8 @@ def system_identification_penalty(
     Returns:
         A scalar.
     """
-    if windows.ndim != 2 or windows.shape[-1] != C.shape[-1]:
-        raise QPError.expected(
-            "windows",
-            f"shape {tuple(windows.shape)}",
-            f"shape (M, n_z) with n_z = {C.shape[-1]}",
-            "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}.",
-        )
+    check_tensor("C", C, "n_c", "n_z", batched=False, remedy="Pass mpc.C.")
+    check_tensor("windows", windows, "M", C.shape[-1], batched=False, remedy=WINDOWS)
     if normalised:
         C = F.normalize(C, dim=-1)
     return (windows.to(C.dtype) @ C.mT).square().sum()
@@ -91,8 +93,13 @@ class DeviationPenalty(nn.Module):
         super().__init__()
         weights = {"c_1": c_1, "c_2": c_2, "c_3": c_3, "growth": growth}
         for name, weight in weights.items():
-            if not 0 <= weight < torch.inf:
-                raise QPError.expected(name, weight, "a finite weight >= 0")
+            check_number(name, weight, _finite, "a finite weight >= 0")
+        check_whole("n_x", n_x, 1)
+        check_whole("n_u", n_u, 1)
+        remedy = "Pass the C_0 of a QPMPC."
+        check_tensor("C_0", C_0, "N n_x", "n_z", batched=False, remedy=remedy)
+        if not C_0.isfinite().all():
+            raise QPError.expected("C_0", "NaN or inf", "finite entries", remedy)
         horizon = C_0.shape[0] // n_x
         distance = band_distance(n_x, n_u, horizon)
         if distance.shape != C_0.shape:
@@ -110,6 +117,7 @@ class DeviationPenalty(nn.Module):
 
     def forward(self, C: Tensor) -> Tensor:
         """The penalty of C ``(N n_x, n_z)``, a scalar."""
+        check_tensor("C", C, *self.C_0.shape, batched=False, remedy="Pass mpc.C.")
         return deviation_penalty(C, self.C_0, self.C_mask)
 
     @torch.no_grad()
@@ -125,6 +133,11 @@ class DeviationPenalty(nn.Module):
             C: the parameter.
             scale: weight of the penalty against the step; 1 is the paper's program.
         """
+        check_tensor("C", C, *self.C_0.shape, batched=False, remedy="Pass mpc.C.")
+        if C.grad_fn is not None:
+            remedy = "A tied C is computed from A and B: release() it first."
+            raise QPError.expected("C", "a computed tensor", "a parameter", remedy)
+        check_number("scale", scale, _finite, "a finite number >= 0")
         excess = C - self.C_0
         C.copy_(self.C_0 + excess.sign() * (excess.abs() - scale * self.C_mask).clamp(min=0))
 
@@ -142,8 +155,7 @@ class SystemIdentificationPenalty(nn.Module):
 
     def __init__(self, beta: float = 1e-6, *, normalised: bool = False) -> None:
         super().__init__()
-        if not 0 <= beta < torch.inf:
-            raise QPError.expected("beta", beta, "a finite weight >= 0")
+        check_number("beta", beta, _finite, "a finite weight >= 0")
         self.beta, self.normalised = beta, normalised
 
     def curvature(self, windows: Tensor) -> Tensor:
@@ -154,6 +166,7 @@ class SystemIdentificationPenalty(nn.Module):
         """
         if self.normalised:
             raise QPError.expected("normalised", True, "False", "Only then it is a quadratic in C.")
+        check_tensor("windows", windows, "M", "n_z", batched=False, remedy=WINDOWS)
         windows = windows.to(torch.float64)
         return 2 * self.beta * windows.mT @ windows
 

@@ -123,7 +123,8 @@ class QuadraticProgram:
     check_values: InitVar[bool] = True
 
     def __post_init__(self, check_values: bool) -> None:
-        kind = tuple((getattr(x, "shape", None), getattr(x, "dtype", None)) for x in self.tensors())
+        names = ("shape", "dtype", "device")
+        kind = tuple(tuple(getattr(x, name, None) for name in names) for x in self.tensors())
         if torch.compiler.is_compiling() or kind not in _accepted:
             self._check_shapes()
             if not torch.compiler.is_compiling():
@@ -159,6 +160,13 @@ class QuadraticProgram:
                     "a floating-point torch.Tensor",
                     "Convert it with torch.as_tensor(..., dtype=torch.float64).",
                 )
+            if tensor.dtype not in (torch.float32, torch.float64):
+                remedy = "Half precision has no factorisations: use torch.float64."
+                got = tensor.dtype
+                raise QPError.expected(field.name, got, "torch.float32 or torch.float64", remedy)
+            if tensor.device != self.H.device:
+                got, remedy = f"a tensor on {tensor.device}", "Move all nine to one device."
+                raise QPError.expected(field.name, got, f"one on H's {self.H.device}", remedy)
             if tensor.dtype != self.H.dtype:
                 raise QPError.expected(
                     field.name,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, fields
 from torch import Tensor
 
 from torch_qpmpc.canonical import PredictionForm, prediction_form
+from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.local_gain import local_gain, lqr_gain, spectral_radius, stage_weight
 from torch_qpmpc.mpc import QPMPC
@@ -107,6 +108,11 @@ def read(
         >>> found.order, found.distance_to_mpc < 1e-9, round(found.radius_predicted, 2)
         (1.0, True, 0.97)
     """
+    check_kind("mpc", mpc, QPMPC)
+    if true_model is not None:
+        true_model = _checked_model(mpc, true_model)
+    if at is not None:
+        check_tensor("at", at, mpc.n_x, batched=False)
     form = prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
     nearest, stages, memory = nearest_model(form), stage_models(form), memory_energies(form)
     K = local_gain(mpc, form.Phi.new_zeros(mpc.n_x) if at is None else at.to(form.Phi))
@@ -150,6 +156,9 @@ def structure_metrics(mpc: QPMPC, true_model: Sequence[Tensor] | None = None) ->
         ``causality_defect``, ``toeplitz_defect``, ``distance_to_mpc`` and, with a true model,
         ``model_error``; all nan where C has no prediction form, so that training goes on.
     """
+    check_kind("mpc", mpc, QPMPC)
+    if true_model is not None:
+        true_model = _checked_model(mpc, true_model)
     names = ("causality_defect", "toeplitz_defect", "distance_to_mpc")
     names += () if true_model is None else ("model_error",)
     try:
@@ -161,3 +170,14 @@ def structure_metrics(mpc: QPMPC, true_model: Sequence[Tensor] | None = None) ->
     if true_model is not None:
         values.append(one_step_error(nearest, *(part.to(form.Phi) for part in true_model)))
     return dict(zip(names, map(float, values), strict=True))
+
+
+def _checked_model(mpc: QPMPC, true_model: Sequence[Tensor]) -> Sequence[Tensor]:
+    if not isinstance(true_model, tuple | list) or len(true_model) not in (2, 3):
+        got = type(true_model).__name__
+        got += f" of {len(true_model)}" if isinstance(true_model, tuple | list) else ""
+        raise QPError.expected("true_model", got, "the pair (A, B), or (A, B, offset)")
+    shapes = ((mpc.n_x, mpc.n_x), (mpc.n_x, mpc.n_u), (mpc.n_x,))
+    for name, part, shape in zip(("A", "B", "offset"), true_model, shapes, strict=False):
+        check_tensor(f"true_model's {name}", part, *shape, batched=False)
+    return true_model

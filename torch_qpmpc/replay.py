@@ -22,6 +22,7 @@ from torchrl.data import (
     SliceSampler,
 )
 
+from torch_qpmpc.checks import check_kind, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp import UNKNOWN
 
@@ -40,6 +41,14 @@ def windows_to_tau(windows: TensorDictBase) -> Tensor:
     Returns:
         ``(M, N (n_x + n_u) + n_x)``.
     """
+    check_kind("windows", windows, TensorDictBase)
+    for key in ("observation", "action", ("next", "observation")):
+        if windows.get(key, None) is None or windows.batch_dims < 1:
+            got = (
+                f"shape {tuple(windows.shape)} with {', '.join(map(str, windows.keys(True, True)))}"
+            )
+            want = "consecutive transitions (M, N) with observation, action, (next, observation)"
+            raise QPError.expected("windows", got, want)
     pairs = torch.cat([windows["observation"], windows["action"]], dim=-1)
     return torch.cat([pairs.flatten(-2), windows["next", "observation"][..., -1, :]], dim=-1)
 
@@ -54,6 +63,7 @@ class Replay:
             uniformly. It leaves the stored done flags as they are.
         generator: see :func:`make_replay`.
         window: N.
+        num_envs: columns of the storage.
         active_rows: n_g, if the active sets of a transition's QPs are kept with it, else None.
     """
 
@@ -61,6 +71,7 @@ class Replay:
     windows: ReplayBuffer
     generator: torch.Generator
     window: int
+    num_envs: int
     active_rows: int | None = None
 
     def __len__(self) -> int:
@@ -70,11 +81,18 @@ class Replay:
         """Store a collector's batch ``(num_envs, T)``; the oldest rows make room.
 
         Raises:
-            QPError: ``batch`` has another number of dimensions.
+            QPError: ``batch`` is no TensorDict, or has another shape.
         """
+        check_kind("batch", batch, TensorDictBase, "Pass the collector's batch as it comes.")
         if batch.batch_dims != 2:
             got, remedy = f"shape {tuple(batch.shape)}", "Pass the collector's batch as it comes."
             raise QPError.expected("batch", got, "(num_envs, T)", remedy)
+        if batch.shape[0] != self.num_envs:
+            got, want = (
+                f"shape {tuple(batch.shape)}",
+                f"(num_envs, T) with num_envs = {self.num_envs}",
+            )
+            raise QPError.expected("batch", got, want, "Is it (T, num_envs)? Transpose it.")
         if self.active_rows is not None:
             batch = batch.copy()
             for key in ACTIVE_SETS:
@@ -84,6 +102,8 @@ class Replay:
 
     def sample(self) -> TensorDictBase:
         """``(batch_size,)`` transitions, with their ``"index"`` ``(batch_size, 2)``."""
+        if not len(self):
+            raise QPError.expected("replay", "nothing stored", "transitions", "extend() it first.")
         sample, info = self.transitions.sample(return_info=True)
         return sample.set("index", torch.stack(info["index"], dim=-1))
 
@@ -91,6 +111,10 @@ class Replay:
         """Keep the active sets that the loss found for a sample, for the next time it is drawn."""
         if self.active_rows is None:
             return
+        for key in ("index", *ACTIVE_SETS):
+            if sample.get(key, None) is None:
+                remedy = "Pass what sample() returned, after the loss."
+                raise QPError.expected("sample", f"no entry {key}", "one", remedy)
         stored: Any = self.transitions.storage[:]
         index = sample.get("index").unbind(-1)
         for key in ACTIVE_SETS:
@@ -128,6 +152,10 @@ class Replay:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`, into a replay made with the same arguments."""
+        missing = {"storage", "writer", "generator"} - set(state)
+        if missing:
+            got = f"no {', '.join(sorted(missing))}"
+            raise QPError.expected("state", got, "what state_dict() returned")
         storage, writer = self.transitions.storage, self.transitions.writer
         storage.load_state_dict(state["storage"])
         writer.load_state_dict(state["writer"])
@@ -166,6 +194,13 @@ def make_replay(
     Raises:
         QPError: ``capacity`` is no multiple of ``num_envs``, or has fewer than ``window`` rows.
     """
+    sizes = {"num_envs": num_envs, "batch_size": batch_size, "window": window}
+    for name, size in (sizes | {"num_windows": num_windows}).items():
+        check_whole(name, size, 1)
+    check_whole("capacity", capacity, 0)
+    check_whole("seed", seed, 0)
+    if active_rows is not None:
+        check_whole("active_rows", active_rows, 0)
     if capacity % num_envs or capacity // num_envs < window:
         expected = f"a multiple of num_envs = {num_envs}, at least window * num_envs"
         remedy = f"{window * num_envs} is the least."
@@ -189,4 +224,4 @@ def make_replay(
         batch_size=num_windows * window,
         generator=generator,
     )
-    return Replay(transitions, windows, generator, window, active_rows)
+    return Replay(transitions, windows, generator, window, num_envs, active_rows)

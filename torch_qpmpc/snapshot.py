@@ -157,6 +157,8 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
     if others := [override for override in overrides if not override.startswith("resume=")]:
         remedy = "A run goes on with its own configuration."
         raise QPError.expected("resume", f"{', '.join(others)}, too", "nothing else", remedy)
+    if not isinstance(path, str | Path):
+        raise QPError.expected("resume", repr(path), "a path")
     path = Path(path)
     checkpoint = path / CHECKPOINT if path.is_dir() else path
     config = checkpoint.with_name("config.yaml")

@@ -9,7 +9,7 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from torch_qpmpc.arguments import as_tensor, bound, check_slack, cost_weights
+from torch_qpmpc.arguments import as_tensor, bound, check_model, check_slack, cost_weights
 from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.layout import Layout
@@ -80,7 +80,8 @@ def theta(
 
 def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dict[str, Any]:
     """What `QPMPC.linear_mpc` chooses where ``options`` do not."""
-    n_x, n_u = as_tensor("A", A).shape[-1], as_tensor("B", B).shape[-1]
+    A, B = check_model(A, B)
+    n_x, n_u = A.shape[-1], B.shape[-1]
     learn = ["H", "H_f", "q", "c", "C", "b", "lb", "ub", "w"]
     if hessian == "full":
         learn.remove("H_f")

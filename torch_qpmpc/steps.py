@@ -32,6 +32,7 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
+from torch_qpmpc.checks import check_choice, check_tensor
 from torch_qpmpc.errors import QPError, SolverError
 
 CHOLESKY = "cholesky"
@@ -108,8 +109,7 @@ STEPS = (CHOLESKY, *NEAREST)
 
 def check_step(step: str) -> None:
     """Raise `QPError` unless ``step`` is a rule, and what it needs is installed."""
-    if step not in STEPS:
-        raise QPError.expected("step", repr(step), f"one of {', '.join(STEPS)}")
+    check_choice("step", step, STEPS)
     if step == "sdp":
         _clarabel()
 
@@ -125,6 +125,8 @@ def _clarabel() -> ModuleType:
 
 def _replaced(H: Tensor, nearest: Callable[[Tensor], Tensor]) -> Tensor:
     """The symmetric part of H, with ``nearest`` of those that have a negative eigenvalue."""
+    check_tensor("H", H, "n", "n")
+    check_tensor("H", H, "n", H.shape[-2])
     H = (H + H.mT) / 2
     blocks = H.reshape(-1, *H.shape[-2:])
     finite = blocks.isfinite().all(-1).all(-1)

@@ -16,7 +16,9 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from torch_qpmpc.banded import band_distance
-from torch_qpmpc.canonical import PredictionForm
+from torch_qpmpc.canonical import FORM, PredictionForm, check_form
+from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
+from torch_qpmpc.errors import QPError
 
 
 def distance_by_band(C: Tensor, C_0: Tensor, n_x: int, n_u: int) -> dict[str, float]:
@@ -24,7 +26,14 @@ def distance_by_band(C: Tensor, C_0: Tensor, n_x: int, n_u: int) -> dict[str, fl
 
     A raw distance, as in the paper: it depends on the gauge of C, unless C is a canonical matrix.
     """
+    check_whole("n_x", n_x, 1)
+    check_whole("n_u", n_u, 1)
+    check_tensor("C_0", C_0, "N n_x", "n_z", batched=False, remedy="Pass mpc.C_0.")
+    check_tensor("C", C, *C_0.shape, batched=False, remedy="Pass mpc.C.")
     distance = band_distance(n_x, n_u, C_0.shape[0] // n_x).to(C.device)
+    if distance.shape != C_0.shape:
+        got, want = f"shape {tuple(C_0.shape)}", f"shape {tuple(distance.shape)}"
+        raise QPError.expected("C_0", got, f"{want} for n_x = {n_x}, n_u = {n_u}")
     deviation = (C.detach() - C_0).abs()
     return {
         "on": deviation[distance == 0].sum().item(),
@@ -47,6 +56,7 @@ def gamma_energies(form: PredictionForm) -> Tensor:
 
     From lag -(N - 1), which is u_{N-1} in x_1, to N - 1, u_0 in x_N. Negative lags are not causal.
     """
+    check_kind("form", form, PredictionForm, FORM)
     N = form.horizon
     squares = form.blocks.square().sum((-1, -2))
     diagonals = [squares.diagonal(offset=-lag, dim1=-2, dim2=-1).sum(-1) for lag in range(1 - N, N)]
@@ -58,6 +68,7 @@ def toeplitz_defect(form: PredictionForm) -> Tensor:
 
     Zero if what an action does depends on how long ago it was only, as in a time-invariant scheme.
     """
+    check_kind("form", form, PredictionForm, FORM)
     N, blocks = form.horizon, form.blocks
     means = torch.zeros_like(blocks)
     for lag in range(1 - N, N):
@@ -92,6 +103,7 @@ def stage_models(form: PredictionForm) -> Model:
     earlier pairs or later actions: zero in all stages means Markovian. Directions of the state that
     no prediction for stage k reaches are unknown, and zero in A_k (the smallest solution).
     """
+    check_form(form)
     maps, regressors = form.maps, _regressors(form)
     fit = _fit(regressors, maps[1:])
     left = maps[1:] - fit @ regressors
@@ -108,6 +120,7 @@ def nearest_model(form: PredictionForm) -> Model:
     a scheme with tied stages the start is exact, and the residual is zero up to rounding. Otherwise
     it is a local minimum, and an upper bound on the distance to the MPC schemes.
     """
+    check_form(form)
     maps, N = form.maps, form.horizon
     n_x, n_v = maps.shape[-2:]
     inputs = _regressors(form)[:, n_x:]
@@ -160,6 +173,8 @@ def memory_energies(form: PredictionForm, rtol: float = 1e-9) -> Tensor:
         form: of the constraints.
         rtol: directions of the regressors below this share of the largest are not told from zero.
     """
+    check_form(form)
+    check_number("rtol", rtol, lambda x: 0 <= x < 1, "a number in [0, 1)")
     maps, pairs, N = form.maps, _regressors(form), form.horizon
     energies = maps.new_zeros(N + 1)
     for k in range(N):
@@ -187,6 +202,8 @@ def markov_order(energies: Tensor, tolerance: float = 1e-6) -> float:
         energies: ``(N + 1,)``.
         tolerance: of the norm, as a share, that the pairs need not explain.
     """
+    check_tensor("energies", energies, "N + 1", batched=False, remedy="Pass memory_energies(form).")
+    check_number("tolerance", tolerance, lambda x: 0 <= x <= 1, "a number in [0, 1]")
     # Not as 1 minus what is explained, which has only half the digits.
     left = energies.flip(0).cumsum(0).flip(0)[1:].sqrt()
     enough = (left <= tolerance).nonzero()

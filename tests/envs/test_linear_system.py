@@ -253,7 +253,7 @@ def test_saved_generator_continues_the_stream(plant):
 
 
 def test_bad_sizes_are_an_error(plant):
-    with pytest.raises(QPError, match="num_envs: got 0, expected an integer >= 1"):
+    with pytest.raises(QPError, match="num_envs: got 0, expected a whole number >= 1"):
         LinearSystemEnv(plant, 0, 50)
-    with pytest.raises(QPError, match="max_steps: got -1, expected an integer >= 1"):
+    with pytest.raises(QPError, match="max_steps: got -1, expected a whole number >= 1"):
         LinearSystemEnv(plant, 1, max_steps=-1)

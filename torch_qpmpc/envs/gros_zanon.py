@@ -15,6 +15,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torch_qpmpc.checks import check_number, check_tensor
 from torch_qpmpc.envs.linear_system import (
     LinearSystem,
     LinearSystemEnv,
@@ -23,7 +24,6 @@ from torch_qpmpc.envs.linear_system import (
     float64,
     uniform,
 )
-from torch_qpmpc.errors import QPError
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +55,16 @@ class GrosZanonLTI(LinearSystem):
     ub_a: Tensor = field(default_factory=float64(1))
 
     def __post_init__(self) -> None:
-        if not 0 <= self.w < math.inf:
-            remedy = "Pass 0 for a cost without the violation."
-            raise QPError.expected("w", self.w, "a finite number >= 0", remedy)
+        super().__post_init__()
+        remedy = "Pass 0 for a cost without the violation."
+        check_number("w", self.w, lambda x: 0 <= x < math.inf, "a finite number >= 0", remedy)
 
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """L(s, a) = 1/2 (|s|^2 + 1/2 a^2 + w violation(s)) ``(*batch,)``, of a as applied."""
-        squares = s.to(self.A).square().sum(-1) + self.applied(a).square().sum(-1) / 2
+        squares = (
+            check_tensor("s", s, len(self.A)).to(self.A).square().sum(-1)
+            + self.applied(a).square().sum(-1) / 2
+        )
         return (squares + self.w * self.violation(s)) / 2
 
     def starts(self, rng: Rng, count: int) -> Tensor:

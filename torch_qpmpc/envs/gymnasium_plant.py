@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
 
+from torch_qpmpc.checks import check_kind, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 
 
@@ -35,10 +36,11 @@ class GymnasiumPlant:
     """
 
     def __init__(self, id: str) -> None:
+        check_kind("task.id", id, str)
         self.id = id
         try:
             env = gymnasium.make(id)
-        except gymnasium.error.Error as error:
+        except (gymnasium.error.Error, ModuleNotFoundError) as error:
             expected = "an environment that Gymnasium can make"
             raise QPError.expected("task.id", repr(id), expected, str(error)) from error
         self.lb_s, self.ub_s = self._bounds("observation", env.observation_space)
@@ -54,6 +56,8 @@ class GymnasiumPlant:
 
     def vectorised(self, num_envs: int, max_steps: int, seed: int) -> EnvBase:
         """``num_envs`` episodes of at most ``max_steps`` in one TorchRL environment."""
+        check_whole("num_envs", num_envs, 1)
+        check_whole("max_steps", max_steps, 1)
         envs = gymnasium.make_vec(
             self.id,
             num_envs,
@@ -68,5 +72,5 @@ class GymnasiumPlant:
 
     def violation(self, s: Tensor) -> Tensor:
         """How far s ``(*batch, n_x)`` is outside the bounds of its space, summed: 0."""
-        s = s.to(self.lb_s)
+        s = check_tensor("s", s, len(self.lb_s)).to(self.lb_s)
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)

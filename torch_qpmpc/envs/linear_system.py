@@ -21,6 +21,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torch_qpmpc.checks import check_kind, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 
 #: What random numbers come from: the TorchRL environments hold a generator of torch's, the
@@ -35,6 +36,7 @@ def float64(*values: Any) -> Callable[[], Tensor]:
 
 def normal(rng: Rng, *shape: int) -> Tensor:
     """Standard normal numbers in float64."""
+    check_rng(rng)
     if isinstance(rng, torch.Generator):
         return torch.randn(shape, generator=rng, dtype=torch.float64, device=rng.device)
     return torch.as_tensor(rng.standard_normal(shape))
@@ -42,9 +44,17 @@ def normal(rng: Rng, *shape: int) -> Tensor:
 
 def uniform(rng: Rng, *shape: int) -> Tensor:
     """Numbers uniform in [0, 1), in float64."""
+    check_rng(rng)
     if isinstance(rng, torch.Generator):
         return torch.rand(shape, generator=rng, dtype=torch.float64, device=rng.device)
     return torch.as_tensor(rng.random(shape))
+
+
+def check_rng(rng: Rng) -> None:
+    """Raise `QPError` unless ``rng`` is a generator."""
+    if not isinstance(rng, Rng):
+        got, remedy = repr(rng), "Of a seed: numpy.random.default_rng(seed)."
+        raise QPError.expected("rng", got, "a generator of numpy's or torch's", remedy)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -65,6 +75,28 @@ class LinearSystem(ABC):
     ub_s: Tensor
     lb_a: Tensor
     ub_a: Tensor
+
+    def __post_init__(self) -> None:
+        remedy = "Use torch.tensor(.., dtype=torch.float64)."
+        check_tensor("A", self.A, "n_x", "n_x", batched=False, remedy=remedy)
+        n_x = len(self.A)
+        check_tensor("A", self.A, n_x, n_x, batched=False, remedy=remedy)
+        check_tensor("B", self.B, n_x, "n_u", batched=False, remedy=remedy)
+        n_u = self.B.shape[1]
+        for name, size in (("lb_s", n_x), ("ub_s", n_x), ("lb_a", n_u), ("ub_a", n_u)):
+            check_tensor(name, getattr(self, name), size, batched=False, remedy=remedy)
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor) and value.dtype != torch.float64:
+                raise QPError.expected(field.name, value.dtype, "torch.float64", remedy)
+        if self.A.is_meta:
+            return
+        for name in ("A", "B"):
+            if not getattr(self, name).isfinite().all():
+                raise QPError.expected(name, "NaN or inf", "finite entries")
+        for of in ("s", "a"):
+            if not (getattr(self, f"lb_{of}") <= getattr(self, f"ub_{of}")).all():
+                raise QPError.expected(f"lb_{of}", f"lb_{of} > ub_{of}", "lower bounds <= upper")
 
     def to(self, device: torch.device | str | None) -> Self:
         """The same physics with its tensors on ``device``."""
@@ -90,15 +122,18 @@ class LinearSystem(ABC):
 
     def applied(self, a: Tensor) -> Tensor:
         """The action that the system gets ``(*batch, n_u)``: a clipped to its bounds."""
+        check_tensor("a", a, len(self.lb_a))
         return a.to(self.A).clamp(self.lb_a, self.ub_a)
 
     def violation(self, s: Tensor) -> Tensor:
         """How far s ``(*batch, n_x)`` is outside its bounds, summed over the states."""
-        s = s.to(self.A)
+        s = check_tensor("s", s, len(self.A)).to(self.A)
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
 
     def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
         """s+ = A s + B a + nu ``(*batch, n_x)``; a is clipped, s+ where the system clips states."""
+        check_tensor("s", s, len(self.A))
+        check_tensor("nu", nu, len(self.A))
         following = s.to(self.A) @ self.A.mT + self.applied(a) @ self.B.mT + nu.to(self.A)
         return following.clamp(self.lb_s, self.ub_s) if self.clips_states else following
 
@@ -113,12 +148,14 @@ class LinearSystemGymEnv(gymnasium.Env):
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own convention)
 
     def __init__(self, physics: LinearSystem) -> None:
+        check_kind("physics", physics, LinearSystem)
         self.physics = p = physics
         lb_s, ub_s, lb_a, ub_a = (b.float().numpy() for b in (p.lb_s, p.ub_s, p.lb_a, p.ub_a))
         low, high = (lb_s, ub_s) if p.clips_states else (-np.inf, np.inf)
         self.observation_space = gymnasium.spaces.Box(low, high, lb_s.shape)
         self.action_space = gymnasium.spaces.Box(lb_a, ub_a)
-        self._s = self._nu = torch.zeros_like(p.lb_s)
+        self._s: Tensor | None = None
+        self._nu = torch.zeros_like(p.lb_s)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -129,7 +166,18 @@ class LinearSystemGymEnv(gymnasium.Env):
         return self._s.numpy().astype(np.float32), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        a = torch.as_tensor(action)
+        if self._s is None:
+            raise QPError.expected(
+                "step", "no episode", "one that has begun", "Call reset() first."
+            )
+        try:
+            a = torch.as_tensor(np.asarray(action, dtype=np.float64))
+        except (TypeError, ValueError):
+            a = torch.tensor(torch.nan)
+        if a.shape != self.action_space.shape or not a.isfinite().all():
+            expected = f"finite numbers of shape {self.action_space.shape}"
+            remedy = "Of a batch of actions, pass one."
+            raise QPError.expected("action", repr(action), expected, remedy)
         reward = -self.physics.cost(self._s, a).item()
         self._nu = self.physics.noise(self._nu, self.physics.draw(self.np_random, 1)[0])
         self._s = self.physics.step(self._s, a, self._nu)
@@ -168,9 +216,13 @@ class LinearSystemEnv(EnvBase):
         device: torch.device | str | None = None,
         seed: int | None = None,
     ) -> None:
-        for name, value in (("num_envs", num_envs), ("max_steps", max_steps)):
-            if value < 1:
-                raise QPError.expected(name, value, "an integer >= 1", "Ask for at least one.")
+        check_kind("physics", physics, LinearSystem)
+        check_whole("num_envs", num_envs, 1, "Ask for at least one.")
+        check_whole("max_steps", max_steps, 1, "Ask for at least one.")
+        if seed is not None:
+            check_whole("seed", seed, 0)
+        if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
+            raise QPError.expected("dtype", dtype, "a floating-point torch.dtype")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.physics = p = physics.to(self.device)
         self.max_steps = max_steps

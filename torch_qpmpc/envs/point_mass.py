@@ -12,11 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_qpmpc.checks import check_number, check_tensor, check_whole
 from torch_qpmpc.envs.linear_system import (
     LinearSystem,
     LinearSystemEnv,
     LinearSystemGymEnv,
     Rng,
+    check_rng,
     float64,
     normal,
     uniform,
@@ -25,6 +27,10 @@ from torch_qpmpc.errors import QPError
 
 #: Standard deviation of the noise by kind; the paper leaves it open.
 NOISE_STD = {"gaussian": 0.01, "brownian": 0.002}
+
+
+def _finite(x: float) -> bool:
+    return 0 <= x < math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +69,15 @@ class PointMass(LinearSystem):
     ub_a: Tensor = field(default_factory=float64(1, 1))
 
     def __post_init__(self) -> None:
-        if self.noise_kind not in NOISE_STD:
+        super().__post_init__()
+        check_tensor("W", self.W, *self.A.shape, batched=False)
+        for name in ("start_position", "start_velocity"):
+            check_number(name, getattr(self, name), _finite, "a finite number >= 0")
+        if not isinstance(self.noise_kind, str) or self.noise_kind not in NOISE_STD:
             kinds = " or ".join(map(repr, NOISE_STD))
             raise QPError.expected("noise_kind", repr(self.noise_kind), kinds, "Choose one.")
-        if not 0 <= self.std < math.inf:
-            remedy = "Pass 0 for no noise, None for the default."
-            raise QPError.expected("noise_std", self.noise_std, "a finite number >= 0", remedy)
+        remedy = "Pass 0 for no noise, None for the default."
+        check_number("noise_std", self.std, _finite, "a finite number >= 0", remedy)
 
     @property
     def std(self) -> float:
@@ -83,7 +92,7 @@ class PointMass(LinearSystem):
 
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """L(s, a) = s'Ws ``(*batch,)`` of the current s ``(*batch, 4)``; a does not enter."""
-        s = s.to(self.W)
+        s = check_tensor("s", s, len(self.W)).to(self.W)
         return ((s @ self.W) * s).sum(-1)
 
     def starts(self, rng: Rng, count: int) -> Tensor:
@@ -93,6 +102,7 @@ class PointMass(LinearSystem):
         """
         if isinstance(rng, torch.Generator):
             return self.start_range * (2 * uniform(rng, count, 4) - 1)
+        check_rng(rng)
         ranges = (self.start_position, self.start_velocity)
         draws = [rng.uniform(-r, r, size=(count, 2)) for r in ranges]
         return torch.as_tensor(np.hstack(draws)).to(self.A)
@@ -113,6 +123,7 @@ class PointMass(LinearSystem):
             A_hat ``(4, 4)`` and B_hat ``(4, 2)``, the true ones plus entries uniform in
             [-0.05, 0.05], and theta_1..theta_4 ``(4,)`` uniform in [0.5, 5]; drawn in this order.
         """
+        check_whole("seed", seed, 0)
         rng = np.random.default_rng(seed)
         dA, dB = (rng.uniform(-0.05, 0.05, size=tuple(M.shape)) for M in (self.A, self.B))
         theta = rng.uniform(0.5, 5, size=4)

@@ -1,0 +1,403 @@
+"""Mistakes with plants, their evaluation, statistics, and resuming."""
+
+# The mistakes are what is tested, so their types are wrong.
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnhashable=false
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from tests.mistakes.objects import mpc, op, pm
+from torch_qpmpc.envs import (
+    GrosZanonLTI,
+    GrosZanonLTIEnv,
+    GymnasiumPlant,
+    LinearSystemEnv,
+    PointMass,
+    PointMassEnv,
+    PointMassGymEnv,
+)
+from torch_qpmpc.evaluation import closed_gap, closed_loop, gymnasium_loop
+from torch_qpmpc.snapshot import resumed
+from torch_qpmpc.statistics import bootstrap_interval, interquartile_mean
+
+MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
+    "closed_loop: plant": (
+        lambda: closed_loop(mpc.policy, mpc),
+        "physics: got ParametrizedQPMPC, expected a LinearSystem. Of a GymnasiumPlan",
+    ),
+    "closed_loop: policy mpc": (
+        lambda: closed_loop(mpc, pm),
+        "s: got shape (32, 4), expected shape (*batch, 2).",
+    ),
+    "closed_loop: policy op": (
+        lambda: closed_loop(op.get_policy_operator(), pm),
+        "s: got shape (32, 4), expected shape (*batch, 2).",
+    ),
+    "closed_loop: policy none": (
+        lambda: closed_loop(None, pm),
+        "policy: got NoneType, expected a function. Pass a function of states, such ",
+    ),
+    "closed_loop: steps 0": (
+        lambda: closed_loop(lambda s: s[:, :2], pm, steps=0),
+        "steps: got 0, expected a whole number >= 1.",
+    ),
+    "closed_loop: steps f": (
+        lambda: closed_loop(lambda s: s[:, :2], pm, steps=1.5),
+        "steps: got 1.5, expected a whole number >= 1.",
+    ),
+    "closed_loop: starts 0": (
+        lambda: closed_loop(lambda s: s[:, :2], pm, starts=0).J,
+        "starts: got 0, expected a whole number >= 1.",
+    ),
+    "closed_loop: seed": (
+        lambda: closed_loop(lambda s: s[:, :2], pm, seed=-1),
+        "seed: got -1, expected a whole number >= 0.",
+    ),
+    "closed_loop: gamma": (
+        lambda: closed_loop(lambda s: s[:, :2], pm, gamma=2.0).J_discounted,
+        "gamma: got 2.0, expected a discount factor in [0, 1].",
+    ),
+    "closed_loop: swapped": (
+        lambda: closed_loop(pm, mpc.policy),
+        "policy: got PointMass, expected a function. Pass a function of states, such",
+    ),
+    "closed_loop: numpy": (
+        lambda: closed_loop(lambda s: s[:, :2].numpy(), pm),
+        "policy(s): got ndarray, expected a floating-point torch.Tensor. Convert it:",
+    ),
+    "closed_loop: tuple": (
+        lambda: closed_loop(lambda s: (s[:, :2],), pm),
+        "policy(s): got tuple, expected a floating-point torch.Tensor. Convert it: t",
+    ),
+    "closed_loop: gymplant": (
+        lambda: closed_loop(lambda s: s, GymnasiumPlant("Pendulum-v1")),
+        "physics: got GymnasiumPlant, expected a LinearSystem. Of a GymnasiumPlant: ",
+    ),
+    "gymnasium_loop: linear": (
+        lambda: gymnasium_loop(lambda s: s[:, :1], pm),
+        "plant: got PointMass, expected a GymnasiumPlant. Of a LinearSystem: closed_",
+    ),
+    "gymnasium_loop: shape": (
+        lambda: gymnasium_loop(lambda s: s[:, 0], GymnasiumPlant("Pendulum-v1"), steps=2, starts=2),
+        "policy(s): got shape (2,), expected shape (2, 1). Map a batch of states to ",
+    ),
+    "gymnasium_loop: id": (
+        lambda: gymnasium_loop(lambda s: s[:, :1], "Pendulum-v1"),
+        "plant: got str, expected a GymnasiumPlant. Of a LinearSystem: closed_loop.",
+    ),
+    "gymnasium_loop: steps": (
+        lambda: gymnasium_loop(lambda s: s[:, :1], GymnasiumPlant("Pendulum-v1"), steps=0),
+        "steps: got 0, expected a whole number >= 1.",
+    ),
+    "gymnasium_loop: shape2": (
+        lambda: gymnasium_loop(lambda s: s, GymnasiumPlant("Pendulum-v1"), steps=2, starts=2),
+        "policy(s): got shape (2, 3), expected shape (2, 1). Map a batch of states t",
+    ),
+    "gymnasium_loop: grad": (
+        lambda: (
+            gymnasium_loop(lambda s: s[0, :1], GymnasiumPlant("Pendulum-v1"), steps=2, starts=2).J
+        ),
+        "policy(s): got shape (1,), expected shape (2, 1). Map a batch of states to ",
+    ),
+    "gymnasium_loop: starts": (
+        lambda: gymnasium_loop(
+            lambda s: s[:, :1], GymnasiumPlant("Pendulum-v1"), starts=0, steps=1
+        ),
+        "starts: got 0, expected a whole number >= 1.",
+    ),
+    "closed_gap: str": (
+        lambda: closed_gap("1", 1, 1),
+        "J_start: got '1', expected a number, or nan.",
+    ),
+    "closed_gap: none": (
+        lambda: closed_gap(None, 1, 1),
+        "J_start: got None, expected a number, or nan.",
+    ),
+    "interquartile_mean: empty": (
+        lambda: interquartile_mean(np.array([])),
+        "x: got no values, expected at least one along axis 0.",
+    ),
+    "interquartile_mean: axis": (
+        lambda: interquartile_mean(np.ones(3), axis=2),
+        "x: got source: axis 2 is out of bounds for array of dimension 1, expected n",
+    ),
+    "interquartile_mean: str": (
+        lambda: interquartile_mean(["a"]),
+        "x: got could not convert string to float: 'a', expected numbers along axis ",
+    ),
+    "interquartile_mean: scalar": (
+        lambda: interquartile_mean(1.0),
+        "x: got source: axis 0 is out of bounds for array of dimension 0, expected n",
+    ),
+    "bootstrap_interval: array": (
+        lambda: bootstrap_interval(np.ones(3)),
+        "strata: got ndarray, expected a list of arrays. Pass [x] for a single strat",
+    ),
+    "bootstrap_interval: float": (
+        lambda: bootstrap_interval(1.0),
+        "strata: got float, expected a list of arrays. Pass [x] for a single stratum",
+    ),
+    "bootstrap_interval: level": (
+        lambda: bootstrap_interval([np.ones(3)], level=95),
+        "level: got 95, expected a level in (0, 1). 95% is 0.95.",
+    ),
+    "bootstrap_interval: resamples": (
+        lambda: bootstrap_interval([np.ones(3)], resamples=0),
+        "resamples: got 0, expected a whole number >= 1.",
+    ),
+    "bootstrap_interval: stat": (
+        lambda: bootstrap_interval([np.ones(3)], "median"),
+        "statistic: got 'median', expected a function. Such as numpy.median.",
+    ),
+    "bootstrap_interval: 2d array": (
+        lambda: bootstrap_interval(np.ones((2, 3))),
+        "strata: got ndarray, expected a list of arrays. Pass [x] for a single strat",
+    ),
+    "bootstrap_interval: shapes": (
+        lambda: bootstrap_interval([np.ones((3, 2)), np.ones((3, 3))]),
+        "strata: got shapes [(3, 2), (3, 3)], expected (n_i, ...) with ... the same ",
+    ),
+    "bootstrap_interval: resamples f": (
+        lambda: bootstrap_interval([np.ones(3)], resamples=1.5),
+        "resamples: got 1.5, expected a whole number >= 1.",
+    ),
+    "bootstrap_interval: seed": (
+        lambda: bootstrap_interval([np.ones(3)], seed=-1),
+        "seed: got -1, expected a whole number >= 0.",
+    ),
+    "bootstrap_interval: scalar strata": (
+        lambda: bootstrap_interval([1.0, 2.0]),
+        "strata: got shapes [(), ()], expected (n_i, ...) with ... the same for all.",
+    ),
+    "PointMassEnv: num f": (
+        lambda: PointMassEnv(1.5),
+        "num_envs: got 1.5, expected a whole number >= 1. Ask for at least one.",
+    ),
+    "PointMassEnv: num str": (
+        lambda: PointMassEnv("2"),
+        "num_envs: got '2', expected a whole number >= 1. Ask for at least one.",
+    ),
+    "PointMassEnv: num bool": (
+        lambda: PointMassEnv(True),
+        "num_envs: got True, expected a whole number >= 1. Ask for at least one.",
+    ),
+    "PointMassEnv: max f": (
+        lambda: PointMassEnv(2, max_steps=1.5),
+        "max_steps: got 1.5, expected a whole number >= 1. Ask for at least one.",
+    ),
+    "PointMassEnv: physics first": (
+        lambda: PointMassEnv(pm),
+        "num_envs: got PointMass(A=tensor([[1.0000, 0.0000, 0.1000, 0.0000],",
+    ),
+    "PointMassEnv: dtype": (
+        lambda: PointMassEnv(2, dtype=torch.int64),
+        "dtype: got torch.int64, expected a floating-point torch.dtype.",
+    ),
+    "PointMassEnv: seed": (
+        lambda: PointMassEnv(2, seed="a"),
+        "seed: got 'a', expected a whole number >= 0.",
+    ),
+    "PointMassEnv: physics str": (
+        lambda: PointMassEnv(2, physics="gaussian"),
+        "physics: got str, expected a LinearSystem.",
+    ),
+    "PointMassEnv: seed neg": (
+        lambda: PointMassEnv(2, seed=-1),
+        "seed: got -1, expected a whole number >= 0.",
+    ),
+    "PointMassEnv: physics other": (
+        lambda: LinearSystemEnv(mpc, 2, 5),
+        "physics: got ParametrizedQPMPC, expected a LinearSystem.",
+    ),
+    "PointMass: noise list": (
+        lambda: PointMass(["gaussian"]),
+        "noise_kind: got ['gaussian'], expected 'gaussian' or 'brownian'. Choose one",
+    ),
+    "PointMass: std str": (
+        lambda: PointMass(noise_std="1"),
+        "noise_std: got '1', expected a finite number >= 0. Pass 0 for no noise, Non",
+    ),
+    "PointMass: start neg": (
+        lambda: PointMass(start_position=-1.0),
+        "start_position: got -1.0, expected a finite number >= 0.",
+    ),
+    "PointMass: start nan": (
+        lambda: PointMass(start_velocity=math.nan),
+        "start_velocity: got nan, expected a finite number >= 0.",
+    ),
+    "PointMass: A": (
+        lambda: PointMass(A=torch.eye(3)),
+        "B: got shape (4, 2), expected shape (3, n_u). Use torch.tensor(.., dtype=to",
+    ),
+    "PointMass: A list": (
+        lambda: PointMass(A=[[1.0]]),
+        "A: got list, expected a floating-point torch.Tensor. Convert it: torch.as_t",
+    ),
+    "PointMass: bounds": (
+        lambda: PointMass(lb_a=torch.ones(2) * 2),
+        "lb_a: got torch.float32, expected torch.float64. Use torch.tensor(.., dtype",
+    ),
+    "PointMass: W": (
+        lambda: PointMass(W=torch.eye(3)),
+        "W: got torch.float32, expected torch.float64. Use torch.tensor(.., dtype=to",
+    ),
+    "PointMass: A float32": (
+        lambda: PointMass(A=torch.eye(4)),
+        "A: got torch.float32, expected torch.float64. Use torch.tensor(.., dtype=to",
+    ),
+    "PointMass: A nan": (
+        lambda: PointMass(A=torch.eye(4).double() * math.nan),
+        "A: got NaN or inf, expected finite entries.",
+    ),
+    "PointMass: start str": (
+        lambda: PointMass(start_position="a"),
+        "start_position: got 'a', expected a finite number >= 0.",
+    ),
+    "PointMass: lb shape": (
+        lambda: PointMass(lb_s=torch.tensor(-2.0).double()),
+        "lb_s: got shape (), expected shape (4,). Use torch.tensor(.., dtype=torch.f",
+    ),
+    "PointMass: step shape": (
+        lambda: pm.step(torch.zeros(3), torch.zeros(2), torch.zeros(4)),
+        "s: got shape (3,), expected shape (*batch, 4).",
+    ),
+    "PointMass: step swapped": (
+        lambda: pm.step(torch.zeros(2), torch.zeros(4), torch.zeros(4)),
+        "s: got shape (2,), expected shape (*batch, 4).",
+    ),
+    "PointMass: cost shape": (
+        lambda: pm.cost(torch.zeros(5, 3), torch.zeros(5, 2)),
+        "s: got shape (5, 3), expected shape (*batch, 4).",
+    ),
+    "PointMass: cost list": (
+        lambda: pm.cost([0.0], [0.0]),
+        "s: got list, expected a floating-point torch.Tensor. Convert it: torch.as_t",
+    ),
+    "PointMass: applied": (
+        lambda: pm.applied(torch.zeros(5, 1)).shape,
+        "a: got shape (5, 1), expected shape (*batch, 2).",
+    ),
+    "PointMass: applied scalar": (
+        lambda: pm.applied(torch.tensor(0.0)).shape,
+        "a: got shape (), expected shape (*batch, 2).",
+    ),
+    "PointMass: starts seed": (
+        lambda: pm.starts(1, 3),
+        "rng: got 1, expected a generator of numpy's or torch's. Of a seed: numpy.ra",
+    ),
+    "PointMass: draw seed": (
+        lambda: pm.draw(1, 3),
+        "rng: got 1, expected a generator of numpy's or torch's. Of a seed: numpy.ra",
+    ),
+    "PointMass: viol": (
+        lambda: pm.violation(torch.zeros(5, 1)).shape,
+        "s: got shape (5, 1), expected shape (*batch, 4).",
+    ),
+    "PointMass: corrupted": (
+        lambda: pm.corrupted(-1),
+        "seed: got -1, expected a whole number >= 0.",
+    ),
+    "PointMass: corrupted str": (
+        lambda: pm.corrupted("a"),
+        "seed: got 'a', expected a whole number >= 0.",
+    ),
+    "PointMass: corrupted None": (
+        lambda: pm.corrupted(None),
+        "seed: got None, expected a whole number >= 0.",
+    ),
+    "PointMass: nu 1d": (
+        lambda: pm.step(torch.zeros(5, 4), torch.zeros(5, 2), torch.zeros(5, 1)).shape,
+        "nu: got shape (5, 1), expected shape (*batch, 4).",
+    ),
+    "PointMass: a transposed": (
+        lambda: pm.step(torch.zeros(5, 4), torch.zeros(2, 5), torch.zeros(5, 4)),
+        "a: got shape (2, 5), expected shape (*batch, 2).",
+    ),
+    "PointMass: a scalar col": (
+        lambda: pm.step(torch.zeros(5, 4), torch.zeros(5, 1), torch.zeros(5, 4)).shape,
+        "a: got shape (5, 1), expected shape (*batch, 2).",
+    ),
+    "PointMassGymEnv: action shape": (
+        lambda: (lambda e: (e.reset(seed=0), e.step(np.zeros(3))))(PointMassGymEnv()),
+        "action: got array([0., 0., 0.]), expected finite numbers of shape (2,). Of ",
+    ),
+    "PointMassGymEnv: action scalar": (
+        lambda: (lambda e: (e.reset(seed=0), e.step(0.0)))(PointMassGymEnv()),
+        "action: got 0.0, expected finite numbers of shape (2,). Of a batch of actio",
+    ),
+    "PointMassGymEnv: before reset": (
+        lambda: PointMassGymEnv().step(np.zeros(2)),
+        "step: got no episode, expected one that has begun. Call reset() first.",
+    ),
+    "PointMassGymEnv: action str": (
+        lambda: (lambda e: (e.reset(seed=0), e.step("a")))(PointMassGymEnv()),
+        "action: got 'a', expected finite numbers of shape (2,). Of a batch of actio",
+    ),
+    "PointMassGymEnv: action nan": (
+        lambda: (lambda e: (e.reset(seed=0), e.step(np.full(2, np.nan))))(PointMassGymEnv()),
+        "action: got array([nan, nan]), expected finite numbers of shape (2,). Of a ",
+    ),
+    "PointMassGymEnv: physics": (
+        lambda: PointMassGymEnv("brownian"),
+        "physics: got str, expected a LinearSystem.",
+    ),
+    "PointMassGymEnv: (1,2)": (
+        lambda: (lambda e: (e.reset(seed=0), e.step(np.zeros((1, 2)))))(PointMassGymEnv()),
+        "action: got array([[0., 0.]]), expected finite numbers of shape (2,). Of a ",
+    ),
+    "GrosZanonLTI: w str": (
+        lambda: GrosZanonLTI("1"),
+        "w: got '1', expected a finite number >= 0. Pass 0 for a cost without the vi",
+    ),
+    "GrosZanonLTI: num": (
+        lambda: GrosZanonLTIEnv(0),
+        "num_envs: got 0, expected a whole number >= 1. Ask for at least one.",
+    ),
+    "GrosZanonLTI: A": (
+        lambda: GrosZanonLTI(A=torch.eye(3)),
+        "B: got shape (2, 1), expected shape (3, n_u). Use torch.tensor(.., dtype=to",
+    ),
+    "GymnasiumPlant: none": (
+        lambda: GymnasiumPlant(None),
+        "task.id: got NoneType, expected a str.",
+    ),
+    "GymnasiumPlant: discrete": (
+        lambda: GymnasiumPlant("CartPole-v1"),
+        "task.id: got 'CartPole-v1', whose action space is Discrete(2), expected spa",
+    ),
+    "GymnasiumPlant: vec 0": (
+        lambda: GymnasiumPlant("Pendulum-v1").vectorised(0, 5, 1),
+        "num_envs: got 0, expected a whole number >= 1.",
+    ),
+    "GymnasiumPlant: vec steps": (
+        lambda: GymnasiumPlant("Pendulum-v1").vectorised(1, 0, 1),
+        "max_steps: got 0, expected a whole number >= 1.",
+    ),
+    "GymnasiumPlant: viol": (
+        lambda: GymnasiumPlant("Pendulum-v1").violation(torch.zeros(2)),
+        "s: got shape (2,), expected shape (*batch, 3).",
+    ),
+    "GymnasiumPlant: module": (
+        lambda: GymnasiumPlant("nomod:Env-v0"),
+        "task.id: got 'nomod:Env-v0', expected an environment that Gymnasium can mak",
+    ),
+    "resumed: none": (
+        lambda: resumed("/nonexistent", []),
+        "resume: got /nonexistent, without config.yaml, expected a folder of train.p",
+    ),
+    "resumed: others": (
+        lambda: resumed("/x", ["seed=2"]),
+        "resume: got seed=2, too, expected nothing else. A run goes on with its own ",
+    ),
+    "resumed: type": (
+        lambda: resumed(None, []),
+        "resume: got None, expected a path.",
+    ),
+}

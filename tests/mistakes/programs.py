@@ -1,0 +1,401 @@
+"""Mistakes with the QP itself: its data, solving it, and the module that owns theta."""
+
+# The mistakes are what is tested, so their types are wrong.
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnhashable=false
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+import torch_qpmpc as qm
+from tests.mistakes.objects import A2, B1, GOOD, Aa, M, Q, S, fixed, mpc, qp
+
+MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
+    "QuadraticProgram: int": (
+        Q(q=GOOD["q"].long()),
+        "q: got torch.int64, expected a floating-point torch.Tensor. Convert it with",
+    ),
+    "QuadraticProgram: complex": (
+        Q(H=GOOD["H"].to(torch.complex128)),
+        "H: got torch.complex128, expected a floating-point torch.Tensor. Convert it",
+    ),
+    "QuadraticProgram: numpy": (
+        Q(H=GOOD["H"].numpy()),
+        "H: got ndarray, expected a floating-point torch.Tensor. Convert it with tor",
+    ),
+    "QuadraticProgram: list": (
+        Q(lb=[0.0]),
+        "lb: got list, expected a floating-point torch.Tensor. Convert it with torch",
+    ),
+    "QuadraticProgram: bool": (
+        Q(w=GOOD["w"] > 0),
+        "w: got torch.bool, expected a floating-point torch.Tensor. Convert it with ",
+    ),
+    "QuadraticProgram: dtype mix": (
+        Q(q=GOOD["q"].float()),
+        "q: got torch.float32, expected H's dtype torch.float64. Give all nine tenso",
+    ),
+    "QuadraticProgram: device": (
+        Q(q=GOOD["q"].to("meta")),
+        "q: got a tensor on meta, expected one on H's cpu. Move all nine to one devi",
+    ),
+    "QuadraticProgram: H negative": (
+        Q(H=-GOOD["H"]),
+        "H: got smallest eigenvalue -3.73, expected a positive semidefinite matrix. ",
+    ),
+    "QuadraticProgram: neg w": (
+        Q(w=-GOOD["w"].clamp(max=9)),
+        "w: got -9, expected non-negative slack weights. Use inf for a hard row.",
+    ),
+    "QuadraticProgram: nan": (
+        Q(b=GOOD["b"] * torch.nan),
+        "b: got NaN or inf, expected finite entries.",
+    ),
+    "QuadraticProgram: half": (
+        lambda: qm.QuadraticProgram(**{k: v.half() for k, v in GOOD.items()}),
+        "H: got torch.float16, expected torch.float32 or torch.float64. Half precisi",
+    ),
+    "QuadraticProgram: H vector": (
+        Q(H=torch.ones(12).double()),
+        "H: got shape (12,), expected shape (*batch, n_z, n_z).",
+    ),
+    "QuadraticProgram: transposed C": (
+        Q(C=GOOD["C"].mT),
+        "C: got shape (12, 3), expected shape (*batch, n_c, n_z) with n_z = 12 as in",
+    ),
+    "solve_qp: mpc": (
+        lambda: qm.solve_qp(mpc),
+        "qp: got ParametrizedQPMPC, expected a QuadraticProgram. Of a QPMPC: mpc.qua",
+    ),
+    "solve_qp: dict": (
+        lambda: qm.solve_qp(GOOD),
+        "qp: got dict, expected a QuadraticProgram. Of a QPMPC: mpc.quadratic_progra",
+    ),
+    "solve_qp: fixed numpy": (
+        lambda: qm.solve_qp(qp, fixed.numpy()),
+        "fixed: got ndarray, expected a floating-point torch.Tensor. Convert it firs",
+    ),
+    "solve_qp: fixed transposed": (
+        lambda: qm.solve_qp(qp, fixed.mT),
+        "fixed: got shape (2, 3), expected leading dimensions that broadcast with th",
+    ),
+    "solve_qp: fixed meta": (
+        lambda: qm.solve_qp(qp, fixed.to("meta")),
+        "fixed: got a tensor on meta, expected one on the QP's cpu. Move it: fixed.t",
+    ),
+    "solve_qp: keep float": (
+        lambda: qm.solve_qp(qp, fixed, keep=2.5),
+        "keep: got 2.5, expected n_f = 2 ",
+    ),
+    "solve_qp: keep bool": (
+        lambda: qm.solve_qp(qp, fixed, keep="3"),
+        "keep: got '3', expected n_f = 2 ",
+    ),
+    "solve_qp: warm list": (
+        lambda: qm.solve_qp(qp, fixed, warm_start=[0]),
+        "warm_start: got list, expected a QPSolution, or its `active`.",
+    ),
+    "solve_qp: warm dict": (
+        lambda: qm.solve_qp(qp, fixed, warm_start=fixed),
+        "warm_start: got shape (3, 2) of torch.float64, expected (3, 13) of torch.in",
+    ),
+    "solve_qp: nan fixed": (
+        lambda: qm.solve_qp(qp, fixed * torch.nan),
+        "3 of 3 QPs have no certified solution. 3 INVALID_DATA, first at batch index",
+    ),
+    "solve_qp: complex": (
+        lambda: qm.solve_qp(qp, fixed.to(torch.complex64)),
+        "fixed: got torch.complex64, expected a floating-point torch.Tensor. Convert",
+    ),
+    "solve_qp: solver class": (
+        lambda: qm.solve_qp(qp, fixed, solver=qm.QPMPC),
+        "solver: got <class 'torch_qpmpc.mpc.QPMPC'>, expected a name.",
+    ),
+    "QPMPC: n_x bool": (
+        M(n_x=True),
+        "n_x: got True, expected a positive integer.",
+    ),
+    "QPMPC: n_x float": (
+        M(n_x=2.0),
+        "n_x: got 2.0, expected a positive integer.",
+    ),
+    "QPMPC: n_x numpy": (
+        M(n_x=np.int64(2)),
+        "n_x: got np.int64(2), expected a positive integer.",
+    ),
+    "QPMPC: horizon str": (
+        M(horizon="3"),
+        "horizon: got '3', expected a positive integer.",
+    ),
+    "QPMPC: gamma str": (
+        M(gamma="0.9"),
+        "gamma: got '0.9', expected a discount factor in (0, 1].",
+    ),
+    "QPMPC: gamma nan": (
+        M(gamma=math.nan),
+        "gamma: got nan, expected a discount factor in (0, 1].",
+    ),
+    "QPMPC: gamma None": (
+        M(gamma=None),
+        "gamma: got None, expected a discount factor in (0, 1].",
+    ),
+    "QPMPC: gamma tensor": (
+        M(gamma=torch.tensor([0.9, 0.9])),
+        "gamma: got tensor([0.9000, 0.9000]), expected a discount factor in (0, 1].",
+    ),
+    "QPMPC: A 1d": (
+        M(A=torch.ones(2)),
+        "A: got shape (2,), expected shape (2, 2) or (3, 2, 2).",
+    ),
+    "QPMPC: A complex": (
+        M(A=torch.eye(2).to(torch.complex64)),
+        "A: got a tensor of torch.complex64 on cpu, expected a tensor, or what torch",
+    ),
+    "QPMPC: A transposed B": (
+        M(B=torch.ones(1, 2)),
+        "A, B: got shapes (2, 2) and (1, 2), expected (2, 2) and (2, 1).",
+    ),
+    "QPMPC: A meta": (
+        M(A=torch.eye(2, device="meta")),
+        "A: got a tensor of torch.float32 on meta, expected a tensor, or what torch.",
+    ),
+    "QPMPC: A str": (
+        M(A="eye"),
+        "A: got 'eye', expected a tensor, or what torch.as_tensor takes, of real num",
+    ),
+    "QPMPC: A ragged": (
+        M(A=[[1.0, 0.0], [1.0]]),
+        "A: got [[1.0, 0.0], [1.0]], expected a tensor, or what torch.as_tensor take",
+    ),
+    "QPMPC: A 3x2": (
+        M(A=torch.ones(3, 2)),
+        "A: got shape (3, 2), expected shape (2, 2) or (3, 2, 2).",
+    ),
+    "QPMPC: seed float": (
+        M(seed=1.5),
+        "seed: got 1.5, expected a whole number >= 0.",
+    ),
+    "QPMPC: seed str": (
+        M(seed="a"),
+        "seed: got 'a', expected a whole number >= 0.",
+    ),
+    "QPMPC: seed neg": (
+        M(seed=-1),
+        "seed: got -1, expected a whole number >= 0.",
+    ),
+    "QPMPC: seed None": (
+        M(seed=None),
+        "seed: got None, expected a whole number >= 0.",
+    ),
+    "QPMPC: slack str": (
+        M(state_slack="inf"),
+        "state_slack: got 'inf', expected a non-negative weight, or inf for hard row",
+    ),
+    "QPMPC: slack vec": (
+        M(state_slack=[1.0, 1.0]),
+        "state_slack: got [1.0, 1.0], expected a non-negative weight, or inf for har",
+    ),
+    "QPMPC: slack None": (
+        M(state_slack=None),
+        "state_slack: got None, expected a non-negative weight, or inf for hard rows",
+    ),
+    "QPMPC: discount_slack": (
+        M(discount_slack="no"),
+        "discount_slack: got 'no', expected True or False.",
+    ),
+    "QPMPC: learn None": (
+        M(learn=None),
+        "learn: got None, expected a collection of names among H, H_f, q, c, w, C, b",
+    ),
+    "QPMPC: learn typo": (
+        M(learn=("K",)),
+        "learn: got ('K',), expected a collection of names among H, H_f, q, c, w, C,",
+    ),
+    "QPMPC: learn nonhash": (
+        M(learn=[["C"]]),
+        "learn: got [['C']], expected a collection of names among H, H_f, q, c, w, C",
+    ),
+    "QPMPC: hessian": (
+        M(hessian="diag"),
+        "hessian: got 'diag', expected one of diagonal, block, full.",
+    ),
+    "QPMPC: hessian list": (
+        M(hessian=["block"]),
+        "hessian: got ['block'], expected one of diagonal, block, full.",
+    ),
+    "QPMPC: structure": (
+        M(structure="banded"),
+        "structure: got 'banded', expected one of free, varying, tied.",
+    ),
+    "QPMPC: step": (
+        M(step="proj"),
+        "step: got 'proj', expected one of cholesky, projection, sdp.",
+    ),
+    "QPMPC: step list": (
+        M(step=["sdp"]),
+        "step: got ['sdp'], expected one of cholesky, projection, sdp.",
+    ),
+    "QPMPC: solver None": (
+        M(solver=None),
+        "solver: got None, expected one of proxqp, daqp, torch, qpsolvers:NAME.",
+    ),
+    "QPMPC: terminal_w str": (
+        M(terminal_weight="ricatti"),
+        "terminal_weight: got 'ricatti' with hessian='diagonal', expected a tensor, ",
+    ),
+    "QPMPC: offset": (
+        M(offset=[1.0]),
+        "offset: got shape (1,), expected shape (2,).",
+    ),
+    "QPMPC: constraints pair": (
+        M(constraints=([[1.0, 0, 0]], [1.0])),
+        "constraints: got ([[1.0, 0, 0]], [1.0]), expected the triple (D, lower, upp",
+    ),
+    "QPMPC: constraints bounds": (
+        M(constraints=([[1.0, 0, 0]], [0.0, 0.0], [1.0, 1.0])),
+        "constraints, bounds: got shape (2,), expected shape (1,) on each side.",
+    ),
+    "QPMPC: on_failure": (
+        M(on_failure="ignore"),
+        "on_failure: got 'ignore', expected one of raise, warn, mask.",
+    ),
+    "QPMPC: on_failure list": (
+        M(on_failure=["mask"]),
+        "on_failure: got ['mask'], expected one of raise, warn, mask.",
+    ),
+    "QPMPC.from_model: swapped": (
+        lambda: qm.QPMPC.from_model(torch.ones(2, 1), torch.eye(2), 3),
+        "A: got shape (2, 1), expected shape (1, 1) or (3, 1, 1).",
+    ),
+    "QPMPC.from_model: none": (
+        lambda: qm.QPMPC.from_model(None, None, 3),
+        "A: got None, expected a tensor, or what torch.as_tensor takes, of real numb",
+    ),
+    "QPMPC.from_model: B 1d": (
+        lambda: qm.QPMPC.from_model(torch.eye(2), torch.ones(2), 3),
+        "A, B: got shapes (2, 2) and (2,), expected matrices (n_x, n_x) and (n_x, n_",
+    ),
+    "QPMPC.linear_mpc: 1d": (
+        lambda: qm.QPMPC.linear_mpc([1.0], [1.0], 3),
+        "A, B: got shapes (1,) and (1,), expected matrices (n_x, n_x) and (n_x, n_u)",
+    ),
+    "QPMPC.linear_mpc: scalar": (
+        lambda: qm.QPMPC.linear_mpc(1.0, 1.0, 3),
+        "A, B: got shapes () and (), expected matrices (n_x, n_x) and (n_x, n_u).",
+    ),
+    "QPMPC.linear_mpc: swapped": (
+        lambda: qm.QPMPC.linear_mpc(torch.ones(2, 1), torch.eye(2), 3),
+        "A: got shape (2, 1), expected shape (1, 1) or (3, 1, 1).",
+    ),
+    "QPMPC.value: numpy": (
+        lambda: mpc.value(np.zeros((4, 2))),
+        "s: got ndarray, expected a floating-point torch.Tensor. Convert it: torch.a",
+    ),
+    "QPMPC.value: complex": (
+        lambda: mpc.value(S.to(torch.complex64)),
+        "s: got torch.complex64, expected a floating-point torch.Tensor. Convert it:",
+    ),
+    "QPMPC.value: meta": (
+        lambda: mpc.value(S.to("meta")),
+        "s: got a tensor on meta, expected one on cpu. Move it, or the module: .to('",
+    ),
+    "QPMPC.value: td": (
+        lambda: mpc.value(TensorDict(observation=S)),
+        "s: got TensorDict, expected a floating-point torch.Tensor. Convert it: torc",
+    ),
+    "QPMPC.value: transposed": (
+        lambda: mpc.value(torch.zeros(2, 4)),
+        "s: got shape (2, 4), expected shape (*batch, 2).",
+    ),
+    "QPMPC.value: bool": (
+        lambda: mpc.value(S > 0),
+        "s: got torch.bool, expected a floating-point torch.Tensor. Convert it: torc",
+    ),
+    "QPMPC.value: none": (
+        lambda: mpc.value(None),
+        "s: got NoneType, expected a floating-point torch.Tensor. Convert it: torch.",
+    ),
+    "QPMPC.action_value: int action": (
+        lambda: mpc.action_value(S, Aa.long()),
+        "a: got torch.int64, expected a floating-point torch.Tensor. Convert it: tor",
+    ),
+    "QPMPC.action_value: 1d action": (
+        lambda: mpc.action_value(S, torch.zeros(4)),
+        "a: got shape (4,), expected shape (*batch, 1).",
+    ),
+    "QPMPC.action_value: swapped": (
+        lambda: mpc.action_value(Aa, S),
+        "s: got shape (4, 1), expected shape (*batch, 2).",
+    ),
+    "QPMPC.action_value: batch": (
+        lambda: mpc.action_value(torch.zeros(4, 2), torch.zeros(3, 1)),
+        "a: got shape (3, 1), expected leading dimensions that broadcast with those ",
+    ),
+    "QPMPC.action_value: meta a": (
+        lambda: mpc.action_value(S, Aa.to("meta")),
+        "a: got a tensor on meta, expected one on cpu. Move it, or the module: .to('",
+    ),
+    "solve_qp: qp wrong": (
+        lambda: mpc.solve(S, qp=GOOD),
+        "qp: got dict, expected a QuadraticProgram. Pass mpc.quadratic_program(), or",
+    ),
+    "solve_qp: qp other": (
+        lambda: mpc.solve(S, qp=qp),
+        "fixed: got shape (4, 2), expected leading dimensions that broadcast with th",
+    ),
+    "solve_qp: warm wrong": (
+        lambda: mpc.solve(S, warm_start=3),
+        "warm_start: got int, expected a QPSolution, or its `active`.",
+    ),
+    "QPMPC.predicted: shape": (
+        lambda: mpc.predicted(torch.zeros(3, 5)),
+        "z: got shape (3, 5), expected shape (*batch, 11).",
+    ),
+    "QPMPC.predicted: type": (
+        lambda: mpc.predicted([0.0]),
+        "z: got list, expected a floating-point torch.Tensor. Convert it: torch.as_t",
+    ),
+    "QPMPC.release: twice": (
+        lambda: (lambda m: (m.release(), m.release()))(qm.QPMPC.linear_mpc(A2, B1, 3)),
+        "structure: got 'free', expected one that is freer than 'free'. Those are: n",
+    ),
+    "QPMPC.release: typo": (
+        lambda: qm.QPMPC.linear_mpc(A2, B1, 3).release("fre"),
+        "structure: got 'fre', expected one that is freer than 'tied'. Those are: fr",
+    ),
+    "QPMPC.release: list": (
+        lambda: qm.QPMPC.linear_mpc(A2, B1, 3).release(["free"]),
+        "structure: got ['free'], expected one that is freer than 'tied'. Those are:",
+    ),
+    "QPMPC.parameter_groups: list": (
+        lambda: mpc.parameter_groups([1.0]),
+        "rates: got list, expected a mapping such as {'cost': .., 'constraints': ..}",
+    ),
+    "QPMPC.parameter_groups: float": (
+        lambda: mpc.parameter_groups(1e-3),
+        "rates: got float, expected a mapping such as {'cost': .., 'constraints': ..",
+    ),
+    "QPMPC.parameter_groups: negative": (
+        lambda: mpc.parameter_groups({"cost": -1.0, "constraints": 1.0}),
+        "rates[H]: got -1.0, expected a finite number >= 0.",
+    ),
+    "QPMPC.parameter_groups: nan": (
+        lambda: mpc.parameter_groups({"cost": math.nan, "constraints": 1.0}),
+        "rates[H]: got nan, expected a finite number >= 0.",
+    ),
+    "QPMPC.parameter_groups: str": (
+        lambda: mpc.parameter_groups({"cost": "1e-3", "constraints": 1.0}),
+        "rates[H]: got '1e-3', expected a finite number >= 0.",
+    ),
+    "QPMPC.parameter_groups: unlearned": (
+        lambda: mpc.parameter_groups({"cost": 1.0, "constraints": 1.0, "G": 1.0}),
+        "rates: got ['G'], expected parts that are learned: H, c, C. Name them in le",
+    ),
+}

@@ -1,0 +1,66 @@
+"""The user's mistakes: each is named, with what came, what was expected, and the remedy."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import torch_qpmpc as qm
+from tests.mistakes import learning, plants, programs, reading
+from tests.mistakes.objects import A2, B1, M, mpc, op
+from torch_qpmpc.envs import PointMass, PointMassEnv
+from torch_qpmpc.replay import make_replay
+
+TABLE = programs.MISTAKES | learning.MISTAKES | reading.MISTAKES | plants.MISTAKES
+
+
+@pytest.mark.parametrize(("mistake", "beginning"), TABLE.values(), ids=TABLE)
+def test_a_mistake_is_named(mistake, beginning):
+    with pytest.raises(qm.QPError, match="^" + re.escape(beginning)):
+        mistake()
+
+
+MISSPELT: Any = {"misspelt": 1}
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        M(**MISSPELT),
+        lambda: qm.QPMPC.linear_mpc(A2, B1, 3, **MISSPELT),
+        lambda: qm.QPActorValueOperator(mpc, **MISSPELT),
+        lambda: qm.QPQLearningLoss(op, **MISSPELT),
+        lambda: qm.GaussNewton(mpc, **MISSPELT),
+        lambda: qm.DeviationPenalty(mpc.C_0, 2, 1, **MISSPELT),
+        lambda: qm.SystemIdentificationPenalty(**MISSPELT),
+        lambda: PointMass(**MISSPELT),
+        lambda: PointMassEnv(**MISSPELT),
+        lambda: make_replay(64, 2, 4, 3, 2, **MISSPELT),
+    ],
+)
+def test_a_misspelt_keyword_is_named(call):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'misspelt'"):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("optimizer=adm", "Could not find 'optimizer/adm'"),
+        ("constraint.deviation.c1=3", "Could not override 'constraint.deviation.c1'."),
+        ("+foo=1", "foo: got an unknown key, expected a key of configs/."),
+    ],
+)
+def test_a_mistake_on_the_command_line_is_a_sentence(override, message, tmp_path):
+    train = Path(__file__).parents[1] / "train.py"
+    command = [sys.executable, train, override, f"hydra.run.dir={tmp_path}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    said = done.stdout + done.stderr
+    assert done.returncode != 0
+    assert message in said
+    assert "Traceback" not in said

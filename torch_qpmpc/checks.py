@@ -1,0 +1,90 @@
+"""Checks of what a caller passes, at the public boundary; each names the argument and the remedy.
+
+Only types, shapes and plain numbers: to look at a tensor's values would cost time in every call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from numbers import Real
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.errors import QPError
+
+
+def check_kind(name: str, value: Any, kind: type, remedy: str = "") -> None:
+    """Raise `QPError` unless ``value`` is a ``kind``."""
+    if not isinstance(value, kind):
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        got = type(value).__name__
+        raise QPError.expected(name, got, f"{article} {kind.__name__}", remedy)
+
+
+def check_whole(name: str, value: Any, least: int, remedy: str = "") -> None:
+    """Raise `QPError` unless ``value`` is an integer that is at least ``least``."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise QPError.expected(name, repr(value), f"a whole number >= {least}", remedy)
+
+
+def check_number(
+    name: str, value: Any, accepts: Callable[[Any], bool], expected: str, remedy: str = ""
+) -> None:
+    """Raise `QPError` unless ``value`` is a number that ``accepts`` does; nan is to be refused."""
+    if not isinstance(value, Real) or isinstance(value, bool) or not accepts(value):
+        raise QPError.expected(name, repr(value), expected, remedy)
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Raise `QPError` unless ``value`` is a bool."""
+    if not isinstance(value, bool):
+        raise QPError.expected(name, repr(value), "True or False")
+
+
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Raise `QPError` unless ``value`` is one of some names."""
+    if not isinstance(value, str) or value not in choices:
+        raise QPError.expected(name, repr(value), f"one of {', '.join(choices)}")
+
+
+def check_tensor(
+    name: str,
+    value: Any,
+    *event: int | str,
+    batched: bool = True,
+    device: torch.device | None = None,
+    remedy: str = "",
+) -> Tensor:
+    """``value``; `QPError` unless it is a floating-point tensor that fits.
+
+    Args:
+        name: of the argument.
+        value: what came.
+        event: the trailing dimensions; a name stands for any size.
+        batched: whether there may be others before them.
+        device: where it is to be; anywhere by default.
+        remedy: for another shape.
+    """
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        got = value.dtype if isinstance(value, Tensor) else type(value).__name__
+        how = f"Convert it: torch.as_tensor({name}).float()."
+        raise QPError.expected(name, got, "a floating-point torch.Tensor", how)
+    lead = value.ndim - len(event)
+    sizes = value.shape[max(lead, 0) :]
+    pairs = zip(event, sizes, strict=False)
+    fits = lead == 0 or (batched and lead > 0)
+    if not fits or any(n != size for n, size in pairs if isinstance(n, int)):
+        raise QPError.expected(
+            name, f"shape {tuple(value.shape)}", f"shape {_shape(event, batched)}", remedy
+        )
+    if device is not None and value.device != device:
+        remedy = f"Move it, or the module: .to({str(value.device)!r})."
+        raise QPError.expected(name, f"a tensor on {value.device}", f"one on {device}", remedy)
+    return value
+
+
+def _shape(event: tuple[int | str, ...], batched: bool) -> str:
+    parts = [*(["*batch"] if batched else []), *map(str, event)]
+    return f"({', '.join(parts)}{',' if len(parts) == 1 else ''})"
