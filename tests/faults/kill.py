@@ -35,7 +35,7 @@ STARTS, TRAINS = (0.0, 3.0), (0.0, 3.0)  # seconds from which the moments are dr
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.faults.kill", description=__doc__)
     parser.add_argument("--count", type=int, default=20, help="of kills")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         campaign(Path(folder), options.count, random.Random(options.seed))
@@ -44,19 +44,18 @@ def main(arguments: list[str] | None = None) -> None:
 def campaign(folder: Path, count: int, rng: random.Random, settings: tuple[str, ...] = RUN) -> None:
     """Runs in ``folder``, each killed until it finishes, until there have been ``count`` kills."""
     finish(start(folder / "whole", settings))
-    kills, halves, runs = Counter(), 0, 0
+    kills, runs = Counter(), 0
     while kills.total() < count:
         place, runs = folder / f"killed-{runs}", runs + 1
         process = start(place, settings)
         while kills.total() < count and (moment := kill(process, place, rng)):
             kills[moment] += 1
-            halves += (place / "checkpoint.pt.partial").exists()
             print(f"{kills.total()}: killed while {moment}, {reached(place)}", flush=True)
             process = start(place, settings)
         finish(process)
         assert_same_numbers(place, folder / "whole")
         assert_events_are_whole(place)
-    print(f"{count} kills in {runs} runs {dict(kills)}, {halves} of them in half a checkpoint:")
+    print(f"{count} kills in {runs} runs {dict(kills)}:")
     print("every number is that of the run that was left alone, and TensorBoard's events are whole")
 
 
