@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import pickle
@@ -117,7 +118,7 @@ def test_a_flipped_bit_is_found_or_changes_nothing(tmp_path, bit):
     state, path = make_state(), tmp_path / "checkpoint.pt"
     save_checkpoint(tmp_path / PREVIOUS, state)
     save_checkpoint(path, state)
-    whole, refused = path.read_bytes(), 0
+    whole, refused = path.read_bytes(), []
     # The directory at the end, whose every byte means something, and a share of the rest.
     positions = sorted({*range(0, len(whole), 61), *range(len(whole) - 300, len(whole))})
     for position in positions:
@@ -127,11 +128,11 @@ def test_a_flipped_bit_is_found_or_changes_nothing(tmp_path, bit):
         try:
             found = load_checkpoint(path)
         except QPError as error:
-            assert "use the one before" in str(error)
-            refused += 1
+            refused.append(str(error))
         else:
             assert same(found, state), position
-    assert refused > len(positions) / 4
+    assert len(refused) > len(positions) / 4
+    assert all("use the one before" in sentence for sentence in refused)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.9, 0.999])
@@ -190,8 +191,6 @@ def test_no_member_of_the_file_is_run(tmp_path):
         with zipfile.ZipFile(path, "w") as file:
             for name, data in members.items():
                 file.writestr(name, pickle.dumps(Touch(victim)) if name == evil else data)
-        try:
+        with contextlib.suppress(QPError):
             load_checkpoint(path)
-        except QPError as error:
-            assert "cannot be read" in str(error)
         assert not victim.exists(), evil
