@@ -181,8 +181,8 @@ def test_a_full_disk_is_said_in_a_sentence_and_keeps_the_last_checkpoint(tmp_pat
 def test_what_could_not_be_written_is_said(tmp_path):
     error = unwritable(tmp_path, OSError(errno.EROFS, "Read-only file system", "x.csv"))
     assert str(error) == (
-        f"folder: got {tmp_path}, where writing failed ([Errno 30] Read-only file system: 'x.csv'), "
-        "expected one that can be written to. Choose another folder by hydra.run.dir=FOLDER."
+        f"folder: got {tmp_path}, where writing failed ([Errno 30] Read-only file system: 'x.csv')"
+        ", expected one that can be written to. Choose another folder by hydra.run.dir=FOLDER."
     )
 
 
