@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import pickle
+import zipfile
 from pathlib import Path
 
 import pytest
 import torch
 
 from torch_qpmpc import QPMPC, QPError
-from torch_qpmpc.checkpoint import load_checkpoint, save_checkpoint
+from torch_qpmpc.checkpoint import PREVIOUS, drop_previous, load_checkpoint, save_checkpoint
 
 
 def same(first: object, second: object) -> bool:
@@ -80,6 +83,58 @@ def test_a_crash_keeps_the_previous_one(tmp_path, monkeypatch, when):
     assert load_checkpoint(path)["update"] == 3
 
 
+def test_the_checkpoint_before_is_kept_and_dropped_at_the_end(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    for update in (1, 2, 3):
+        save_checkpoint(path, make_state(update))
+    assert load_checkpoint(tmp_path / PREVIOUS)["update"] == 2
+    assert {found.name for found in tmp_path.iterdir()} == {"checkpoint.pt", PREVIOUS}
+    drop_previous(path)
+    assert [found.name for found in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+
+def test_a_damaged_checkpoint_does_not_replace_the_one_before_until_there_is_a_newer(
+    tmp_path, monkeypatch
+):
+    """One goes on from the one before, and the disk is full."""
+    path = tmp_path / "checkpoint.pt"
+    for update in (1, 2):
+        save_checkpoint(path, make_state(update))
+    path.write_bytes(b"damaged")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space left"):
+            save_checkpoint(path, make_state(3))
+    assert load_checkpoint(tmp_path / PREVIOUS)["update"] == 1
+    assert {found.name for found in tmp_path.iterdir()} == {"checkpoint.pt", PREVIOUS}
+
+
+@pytest.mark.parametrize("bit", [0, 7])
+def test_a_flipped_bit_is_found_or_changes_nothing(tmp_path, bit):
+    state, path = make_state(), tmp_path / "checkpoint.pt"
+    save_checkpoint(tmp_path / PREVIOUS, state)
+    save_checkpoint(path, state)
+    whole, refused = path.read_bytes(), []
+    # The directory at the end, whose every byte means something, and a share of the rest.
+    positions = sorted({*range(0, len(whole), 61), *range(len(whole) - 300, len(whole))})
+    for position in positions:
+        data = bytearray(whole)
+        data[position] ^= 1 << bit
+        path.write_bytes(data)
+        try:
+            found = load_checkpoint(path)
+        except QPError as error:
+            refused.append(str(error))
+        else:
+            assert same(found, state), position
+    assert len(refused) > len(positions) / 4
+    assert all("use the one before" in sentence for sentence in refused)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.9, 0.999])
 def test_a_truncated_checkpoint_is_an_error(tmp_path, share):
     path = tmp_path / "checkpoint.pt"
@@ -124,3 +179,18 @@ def test_loading_runs_no_code(tmp_path):
     assert not victim.exists()
     pickle.loads(pickle.dumps(Touch(victim)))
     assert victim.exists(), "it would have"
+
+
+def test_no_member_of_the_file_is_run(tmp_path):
+    """Each member in turn is replaced by such a pickle."""
+    victim, path = tmp_path / "victim", tmp_path / "checkpoint.pt"
+    save_checkpoint(path, make_state())
+    with zipfile.ZipFile(path) as file:
+        members = {name: file.read(name) for name in file.namelist()}
+    for evil in members:
+        with zipfile.ZipFile(path, "w") as file:
+            for name, data in members.items():
+                file.writestr(name, pickle.dumps(Touch(victim)) if name == evil else data)
+        with contextlib.suppress(QPError):
+            load_checkpoint(path)
+        assert not victim.exists(), evil

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
-from torch_qpmpc.sweeps import SweepProgress, finished_run, number_of_runs
+from torch_qpmpc.sweeps import SweepProgress, finished_run, number_of_runs, stopped_run
 
 ROOT = Path(__file__).parents[1]
 #: What each launcher needs beside a name, and the plugin that an extra brings.
@@ -112,6 +112,7 @@ def test_a_run_that_was_stopped_has_not_finished(finished):
     (finished / "summary.json").unlink()
     (finished / "tensorboard").mkdir()
     assert finished_run(finished, make_config(*SMALL)) is None
+    assert stopped_run(finished, make_config(*SMALL)) is None
     assert not (finished / "tensorboard").exists()
     assert (finished / "config.yaml").exists()
 

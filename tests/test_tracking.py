@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
+import re
+import subprocess
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -14,9 +19,10 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from tests.runs import make_config
+from tests.runs import CONFIGS, SMALL, make_config
+from torch_qpmpc.checkpoint import load_checkpoint
 from torch_qpmpc.config import flatten
-from torch_qpmpc.tracking import RunFolder
+from torch_qpmpc.tracking import RunFolder, unwritable
 
 
 def events(folder: Path) -> EventAccumulator:
@@ -132,3 +138,66 @@ def test_relative_folder_is_kept_when_the_working_directory_changes(tmp_path, mo
         run.log({"eval/J": 1.0}, 1)
     assert (tmp_path / "run" / "metrics.csv").exists()
     assert scalars(events(tmp_path / "run"), "eval/J") == {1: 1.0}
+
+
+# --- Faults --------------------------------------------------------------------------------------
+
+
+def command(folder: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    """train.py in ``folder``, with files of at most 1000 bytes after the first checkpoint."""
+    limited = (
+        "import resource, sys, train\n"
+        "save = train.save_checkpoint\n"
+        "def limit(*given):\n"
+        "    save(*given)\n"
+        "    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
+        "train.save_checkpoint = limit\n"
+        "train.main()\n"
+    )
+    arguments = ["--config-path", str(CONFIGS), *SMALL, "figures=false", "task.eval_steps=5"]
+    return subprocess.run(
+        [sys.executable, "-c", limited, *arguments, f"hydra.run.dir={folder}", *more],
+        cwd=CONFIGS.parent,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+
+
+def test_a_full_disk_is_said_in_a_sentence_and_keeps_the_last_checkpoint(tmp_path):
+    ended = command(tmp_path / "run")
+    assert ended.returncode == 1
+    sentence = ended.stderr.splitlines()[-1]
+    assert re.match(
+        r"folder: got .*/run, where writing failed \(.*File too large.*\), exp", sentence
+    )
+    assert sentence.endswith(f"make room, then python train.py resume={tmp_path / 'run'}.")
+    assert "Traceback" not in ended.stderr
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["update"] == 2
+    assert not list((tmp_path / "run").glob("*.partial"))
+
+
+def test_what_could_not_be_written_is_said(tmp_path):
+    error = unwritable(tmp_path, OSError(errno.EROFS, "Read-only file system", "x.csv"))
+    assert str(error) == (
+        f"folder: got {tmp_path}, where writing failed ([Errno 30] Read-only file system: 'x.csv')"
+        ", expected one that can be written to. Choose another folder by hydra.run.dir=FOLDER."
+    )
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "metrics.csv", "summary.json"])
+def test_a_file_is_as_it_was_when_writing_fails(tmp_path, monkeypatch, name):
+    with RunFolder(tmp_path, make_config()) as run:
+        run.log({"eval/J": 1.0}, 1)
+        run.finish({"J_final": 1.0})
+    before = (tmp_path / name).read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"), RunFolder(tmp_path, make_config()) as run:
+        run.finish({"J_final": 2.0})
+    assert (tmp_path / name).read_bytes() == before
+    assert not list(tmp_path.glob("*.partial"))

@@ -166,6 +166,11 @@ class GaussNewton(torch.optim.Optimizer):
         alpha, change = _solve(blocks, torch.cat((delta, past)), damping)
         change = change[: len(delta)]
         steps = [block.step(alpha) for block in blocks]
+        if not all(step.isfinite().all() for step in steps):
+            # Numbers too large to be squared: more damping, and nothing of them in the memory.
+            self._adapt(math.nan)
+            self.state.clear()
+            return StepReport(solution, damping, math.nan, False)
         if not self._trust_region:
             _move(blocks, steps, lr)
             self._mpc.project_()
@@ -308,7 +313,7 @@ class _OuterProducts:
         if self.S is None:
             return self.z.new_zeros(len(self.z))
         precision = mu / self.scale * torch.eye(len(self.S)).to(self.S) + self.S
-        inverse = torch.linalg.inv(precision)
+        inverse = torch.linalg.inv_ex(precision).inverse
         self.z_P, self.drift = mu * self.z @ inverse, -(self.leaf @ self.S) @ inverse
         return ((self.chi @ self.drift) * self.z).sum(-1)
 
@@ -331,8 +336,9 @@ def _solve(
     drifted = sum((block.damp(mu) for block in blocks), torch.zeros_like(delta))
     K = sum((block.kernel() for block in blocks), torch.zeros(1).to(delta))
     damped = K + mu * torch.eye(len(delta)).to(delta)
-    factor = torch.linalg.cholesky(damped)
+    factor, failed = torch.linalg.cholesky_ex(damped)
     alpha = torch.cholesky_solve((delta - drifted).unsqueeze(-1), factor).squeeze(-1)
+    alpha = torch.where(failed == 0, alpha, math.nan)
     return alpha, K @ alpha + drifted
 
 

@@ -35,7 +35,8 @@ def first_order(
 ) -> Update:
     """The gradient of the loss and of the penalties, for any torch optimiser.
 
-    A batch whose loss is not finite moves nothing, and is counted as unsolved.
+    A batch whose loss or gradient is not finite moves nothing; of such a loss, what is not finite
+    is counted as unsolved.
 
     Args:
         loss_module: any of TorchRL's; its ``loss_*`` are summed.
@@ -61,6 +62,9 @@ def first_order(
                 losses["unsolved"] = (~losses["pred_value"].isfinite()).sum()
             return terms, losses
         total.backward()
+        of_each = [x.grad for group in optimizer.param_groups for x in group["params"]]
+        if not all(gradient is None or gradient.isfinite().all() for gradient in of_each):
+            return terms, losses
         optimizer.step()
         if due:
             mpc.project_()
