@@ -10,6 +10,7 @@ import train
 from tests.problems import normal
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
+from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment import evaluate
 from torch_qpmpc.finished import FinishedRun, canonical, collect, model_error
 from torch_qpmpc.structure import Model
@@ -39,20 +40,20 @@ def test_one_run_will_do(study):
 
 
 def test_the_learned_qp_is_the_one_that_was_evaluated(study):
-    for row in collect(study / "small").itertuples():
-        run = row.run
-        for mpc, then in ((run.start, row.J_start), (run.learned, row.J_final)):
+    for row in collect(study / "small").to_dict("records"):
+        run = row["run"]
+        for mpc, then in ((run.start, row["J_start"]), (run.learned, row["J_final"])):
             now = evaluate(run.cfg, mpc.policy, run.physics).J
             assert now == pytest.approx(then, rel=1e-6)
 
 
 def test_where_C_is_fixed_its_model_is_the_corrupted_one(study):
     frame = collect(study / "small")
-    fixed, free = (frame[frame["constraint"] == case] for case in ("fixed", "free"))
-    assert fixed["distance"].to_numpy() == pytest.approx(0, abs=1e-9)
-    assert fixed["model_error"].to_numpy() == pytest.approx(fixed["model_error_start"].to_numpy())
-    assert (free["distance"] > 1e-4).all()
-    assert (free["model_error"] != free["model_error_start"]).all()
+    fixed, free = (frame.query(f"constraint == {case!r}") for case in ("fixed", "free"))
+    assert fixed["distance"].tolist() == pytest.approx([0, 0], abs=1e-9)
+    assert fixed["model_error"].tolist() == pytest.approx(fixed["model_error_start"].tolist())
+    assert min(free["distance"]) > 1e-4
+    assert all(free["model_error"] != free["model_error_start"])
 
 
 def test_readings_do_not_depend_on_the_gauge(study):
@@ -77,13 +78,28 @@ def test_constraints_that_determine_no_states_have_no_readings(study):
 def test_the_models_error_is_that_of_one_step(study):
     """An offset of 0.3 in one state is an error of 0.3, a gain of 1 on it its spread."""
     physics = FinishedRun(study / "small" / "gaussian-free-seed1").physics
+    assert isinstance(physics, LinearSystem)
     none = torch.zeros(4, dtype=torch.float64)
-    true = Model(physics.A, physics.B, none, none[0])
-    assert model_error(true, true, physics) == 0
+    A, B = physics.A, physics.B
+    assert model_error(Model(A, B, none, none[0]), physics) == 0
     offset = none.index_fill(0, torch.tensor([2]), 0.3)
-    assert model_error(Model(true.A, true.B, offset, none[0]), true, physics) == pytest.approx(0.3)
-    spread = model_error(Model(true.A - torch.eye(4), true.B, none, none[0]), true, physics)
+    assert model_error(Model(A, B, offset, none[0]), physics) == pytest.approx(0.3)
+    spread = model_error(Model(A - torch.eye(4), B, none, none[0]), physics)
     assert spread == pytest.approx(math.sqrt(2 * (1.5**2 + 0.5**2) / 3), rel=0.05)
+
+
+def test_exact_zeros_above_the_band_are_counted(study):
+    frame = collect(study / "small")
+    assert set(frame.query("constraint == 'fixed'")["zeros_above"]) == {1.0}
+    assert max(frame.query("constraint == 'free'")["zeros_above"]) < 0.1
+
+
+def test_an_ablation_gives_its_name(study, tmp_path):
+    for name in ("one", "two"):
+        shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / name)
+        config = tmp_path / name / "config.yaml"
+        config.write_text(config.read_text().replace("ablation: null", f"ablation: {name}"))
+    assert collect(tmp_path)["label"].tolist() == ["free, one", "free, two"]
 
 
 def test_a_scheme_released_in_training_is_read(tmp_path):
@@ -104,4 +120,12 @@ def test_a_checkpoint_that_is_lost_is_named(study, tmp_path):
     shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
     (tmp_path / "run" / "checkpoint.pt").unlink()
     with pytest.raises(QPError, match=r"checkpoint: got .*checkpoint.pt, which is not there"):
+        collect(tmp_path)
+
+
+def test_a_run_with_other_keys_than_todays_is_named(study, tmp_path):
+    shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
+    config = tmp_path / "run" / "config.yaml"
+    config.write_text(config.read_text().replace("step: cholesky\n", "", 1))
+    with pytest.raises(QPError, match=r"run: got .*step: got nothing.* expected one of this"):
         collect(tmp_path)

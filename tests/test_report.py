@@ -17,6 +17,7 @@ def made_up(gaps: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
         for seed, gap in enumerate(values, 1):
             row = {"sweep": "a", "noise": noise, "constraint": case, "label": case, "seed": seed}
             row |= {"closed_gap": gap, "real": seed < len(values), "distance": 0.1 * seed}
+            row |= {"zeros_above": 1.0}
             row |= {"model_error": 0.02 * seed, "model_error_start": 0.05}
             for name in ("J", "J_discounted"):
                 row |= {f"{name}_start": 285.04, f"{name}_final": 50.0, f"{name}_true_model": 46.97}
@@ -27,10 +28,10 @@ def made_up(gaps: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
 def test_a_case_is_a_row_with_median_interval_and_both_ends():
     frame = made_up({("gaussian", "free"): [0.9, 0.9, 0.9, 0.1], ("brownian", "si"): [0.5]})
     *_, free, si = report.cases_table(frame).splitlines()
-    ends = "285.0 | 50.0 | 47.0 | 285.0 | 50.0 | 47.0"
-    errors = "0.250 | 0.050 | 0.050 (2 of 4)"
+    ends = "285.0 to 50.0 (47.0) | 285.0 to 50.0 (47.0)"
+    errors = "0.250 | 1.00 | 0.050 to 0.050 (2 of 4)"
     assert free == f"| gaussian | free | 0.900 [0.900, 0.900] (3 of 4) | {ends} | {errors} |"
-    assert si == f"| brownian | si | - (0 of 1) | {ends} | 0.100 | 0.050 | 0.020 (1 of 1) |"
+    assert si == f"| brownian | si | - (0 of 1) | {ends} | 0.100 | 1.00 | 0.050 to 0.020 (1 of 1) |"
 
 
 def test_every_run_is_in_the_long_table():
@@ -47,7 +48,7 @@ def test_the_learned_cases_come_to_one_number_in_which_each_weighs_alike():
     text = report.overall(frame)
     # Each case is a stratum without spread, so that there is no doubt about the mean.
     assert text.endswith("four cases that learn C: gaussian noise 0.900 [0.900, 0.900].")
-    assert report.overall(frame[frame["label"] != "si"]) == ""
+    assert report.overall(frame.query("label != 'si'")) == ""
 
 
 def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):

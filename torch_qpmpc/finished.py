@@ -18,14 +18,16 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+from torch_qpmpc.banded import band_distance
 from torch_qpmpc.canonical import PredictionForm, canonical_matrix, prediction_form
 from torch_qpmpc.checkpoint import load_checkpoint
-from torch_qpmpc.config import flatten
+from torch_qpmpc.config import check_config, flatten
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import QPMPC
+from torch_qpmpc.prediction_error import one_step_error, second_moment
 from torch_qpmpc.structure import Model, nearest_model, stage_models
-from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc
+from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc, true_model
 
 #: The paper's, in its order.
 CASES = ("fixed", "free", "deviation", "si", "combined")
@@ -47,8 +49,22 @@ class FinishedRun:
 
     @cached_property
     def cfg(self) -> DictConfig:
+        """Its settings.
+
+        Raises:
+            QPError: they are not those of today's configs/.
+        """
         cfg = OmegaConf.load(self.folder / "config.yaml")
         assert isinstance(cfg, DictConfig)
+        try:
+            check_config(cfg)
+        except QPError as error:
+            raise QPError.expected(
+                str(self.folder),
+                f"a run with other keys ({error})",
+                "one of this version",
+                "Repeat it, or move it away.",
+            ) from None
         return cfg
 
     @cached_property
@@ -88,24 +104,26 @@ class FinishedRun:
         actions u drawn uniformly from their bounds.
 
         Returns:
+            ``zeros_above``, the share of C's entries above the band that are exactly zero;
             ``distance`` of the predictions to that model's, as a share; ``model_error`` and, of
-            the model at the start, ``model_error_start``. All are nan where the constraints do not
-            determine the states, the errors also where the plant has no such model.
+            the model at the start, ``model_error_start``. The latter are nan where the constraints
+            do not determine the states, the errors also where the plant has no such model.
         """
         mpc = self.learned
         readings: dict[str, float] = dict.fromkeys(
             ("distance", "model_error", "model_error_start"), math.nan
         )
+        above = band_distance(mpc.n_x, mpc.n_u, mpc.horizon) > 0
+        readings["zeros_above"] = (mpc.C[above] == 0).double().mean().item()
         try:
             model = nearest_model(predictions(mpc))
         except QPError:
             return readings
         readings["distance"] = float(model.residual)
-        if self.true is not None and isinstance(self.physics, LinearSystem):
-            true = nearest_model(predictions(self.true))
+        if isinstance(self.physics, LinearSystem):
             start = nearest_model(predictions(self.start))
-            readings["model_error"] = model_error(model, true, self.physics)
-            readings["model_error_start"] = model_error(start, true, self.physics)
+            readings["model_error"] = model_error(model, self.physics)
+            readings["model_error_start"] = model_error(start, self.physics)
         return readings
 
 
@@ -125,22 +143,23 @@ def canonical(mpc: QPMPC) -> Tensor:
     return canonical_matrix(form, stage_models(form).A)[0]
 
 
-def model_error(model: Model, true: Model, physics: LinearSystem) -> float:
-    """Root mean square of one step's error, in units of the state."""
+def model_error(model: Model, physics: LinearSystem) -> float:
+    """`one_step_error` over start states and uniform actions, in units of the state."""
     rng = np.random.default_rng(123)
-    x = physics.starts(rng, 1024)
+    s = physics.starts(rng, 1024)
     share = torch.as_tensor(rng.random((1024, physics.B.shape[1])))
-    u = physics.lb_a + (physics.ub_a - physics.lb_a) * share
-    error = x @ (model.A - true.A).mT + u @ (model.B - true.B).mT + model.offset - true.offset
-    return error.square().sum(-1).mean().sqrt().item()
+    a = physics.lb_a + (physics.ub_a - physics.lb_a) * share
+    truth = true_model(physics)
+    assert truth is not None
+    return one_step_error(model, *truth, moment=second_moment(s, a)).item()
 
 
 def collect(folder: str | Path) -> pd.DataFrame:
     """Every finished run below ``folder``: summary.json, what is read from the learned QP, and
 
-    ``run``, a `FinishedRun`; ``sweep``, the folder that it is in; ``label``, its case, and in what
-    settings it differs from others of the same case in that sweep; ``real``, whether there was a
-    gap worth closing.
+    ``run``, a `FinishedRun`; ``sweep``, the folder that it is in; ``label``, its case, and its
+    ablation or in what settings it differs from others of the same case in that sweep; ``real``,
+    whether there was a gap worth closing.
 
     Raises:
         QPError: there is none.
@@ -181,7 +200,10 @@ def _labels(sweep: pd.DataFrame) -> list[str]:
     labels = []
     for case, of_run in zip(sweep["constraint"], settings, strict=True):
         varied = [key for key in of_run if len(values[case, key]) > 1]
-        labels.append(", ".join([case, *(f"{key.split('.')[-1]}={of_run[key]}" for key in varied)]))
+        told = [f"{key.split('.')[-1]}={of_run[key]}" for key in varied]
+        if of_run["ablation"] is not None:
+            told = [of_run["ablation"]]
+        labels.append(", ".join([case, *told]))
     return labels
 
 

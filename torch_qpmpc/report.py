@@ -34,9 +34,10 @@ SIDE_BY_SIDE = 8
 CAPTION = f"""\
 Closed gap: median and 95% interval (bootstrapped over seeds) of the runs with a real gap, J_start -
 J_true_model >= {REAL_GAP:.0f}; how many of all these are. The others are medians over all runs.
-Distance: of C's predictions to those of the nearest time-invariant MPC scheme, as a share. Model
-error: root mean square of one step predicted by that scheme's (A, B), and of the corrupted (A, B)
-at the start; how often it is the smaller."""
+J: from the start to what was learned, and in brackets that of the true model. Distance: of C's
+predictions to those of the nearest time-invariant MPC scheme, as a share. Zeros: the share of C's
+entries above the band that are exactly zero. Model error: root mean square of one step predicted by
+the corrupted (A, B), and by that scheme's; how often the latter is the smaller."""
 
 
 def runs_table(frame: pd.DataFrame) -> str:
@@ -68,24 +69,26 @@ def cases_table(sweep: pd.DataFrame) -> str:
         if len(real):
             low, high = bootstrap_interval([real])
             gap = f"{pd.Series(real).median():.3f} [{low:.3f}, {high:.3f}]"
+        errors = f"{median['model_error_start']:.3f} to {median['model_error']:.3f}"
         lines.append(
             [
                 noise,
                 label,
                 f"{gap} ({len(real)} of {len(runs)})",
-                *_between_ends(median, "J"),
-                *_between_ends(median, "J_discounted"),
+                _ends(median, "J"),
+                _ends(median, "J_discounted"),
                 f"{median['distance']:.3f}",
-                f"{median['model_error_start']:.3f}",
-                f"{median['model_error']:.3f} ({nearer} of {len(runs)})",
+                f"{median['zeros_above']:.2f}",
+                f"{errors} ({nearer} of {len(runs)})",
             ]
         )
-    head = ["noise", "case", "closed gap", "J start", "J", "J true", "disc. start", "disc.", "true"]
-    return table([*head, "distance", "error at the start", "model error"], lines)
+    head = ["noise", "case", "closed gap", "J", "J discounted", "distance", "zeros", "model error"]
+    return table(head, lines)
 
 
-def _between_ends(median: pd.Series, name: str) -> list[str]:
-    return [f"{median[f'{name}_{end}']:.1f}" for end in ("start", "final", "true_model")]
+def _ends(median: pd.Series, name: str) -> str:
+    start, final, true = (median[f"{name}_{end}"] for end in ("start", "final", "true_model"))
+    return f"{start:.1f} to {final:.1f} ({true:.1f})"
 
 
 def overall(sweep: pd.DataFrame) -> str:
@@ -162,9 +165,9 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     try:
         frame = collect(options.folder)
-        print(write(frame, options.folder / "report"))
         if options.readme:
             write_readme(frame, options.readme)
+        print(write(frame, options.folder / "report"))
     except QPError as error:
         raise SystemExit(str(error)) from None
     print(f"\n{options.folder / 'report'}")
