@@ -74,12 +74,7 @@ def closed_loop(
     expected = (starts, physics.B.shape[1])
     states, actions, costs = [s], [], []
     for _ in range(steps):
-        a = policy(s)
-        if a.shape != expected:
-            # A (starts,) or (n_u,) result would broadcast without a sound.
-            remedy = "Map a batch of states to a batch of actions."
-            raise QPError.expected("policy(s)", f"shape {tuple(a.shape)}", str(expected), remedy)
-        a = physics.applied(a)
+        a = physics.applied(_checked(policy(s), expected))
         costs.append(physics.cost(s, a))
         nu = physics.noise(nu, physics.draw(rng, starts))
         s = physics.step(s, a, nu)
@@ -101,6 +96,9 @@ def gymnasium_loop(
     """`closed_loop` in a Gymnasium environment: start i is that of the seed ``seed + i``.
 
     After an episode's end its state stays, at no cost.
+
+    Raises:
+        QPError: ``policy`` returns another shape.
     """
     envs = [gymnasium.make(plant.id, max_episode_steps=steps) for _ in range(starts)]
     s = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(envs)])
@@ -108,7 +106,8 @@ def gymnasium_loop(
     over = np.zeros(starts, dtype=bool)
     low, high = plant.lb_a.numpy(), plant.ub_a.numpy()
     for _ in range(steps):
-        a = policy(torch.as_tensor(s, dtype=torch.float64)).numpy().clip(low, high)
+        a = _checked(policy(torch.as_tensor(s, dtype=torch.float64)), (starts, len(low)))
+        a = a.numpy().clip(low, high)
         s, cost = s.copy(), np.zeros(starts)
         for i in np.flatnonzero(~over):
             s[i], reward, terminated, truncated, _ = envs[i].step(a[i].astype(low.dtype))
@@ -120,6 +119,14 @@ def gymnasium_loop(
         env.close()
     s, a, L = (torch.as_tensor(np.stack(x), dtype=torch.float64) for x in (states, actions, costs))
     return ClosedLoop(s, a, L, gamma)
+
+
+def _checked(a: Tensor, expected: tuple[int, int]) -> Tensor:
+    """A (starts,) or (n_u,) result would broadcast without a sound."""
+    if a.shape != expected:
+        remedy = "Map a batch of states to a batch of actions."
+        raise QPError.expected("policy(s)", f"shape {tuple(a.shape)}", str(expected), remedy)
+    return a
 
 
 def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:
