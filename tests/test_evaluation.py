@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 
-from torch_qpmpc.envs import GrosZanonLTI, PointMass
+from torch_qpmpc.envs import GrosZanonLTI, GymnasiumPlant, PointMass
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.evaluation import closed_gap, closed_loop
+from torch_qpmpc.evaluation import closed_gap, closed_loop, gymnasium_loop
 
 K = torch.tensor([[1.5, 0.0, 1.0, 0.0], [0.0, 1.5, 0.0, 1.0]], dtype=torch.float64)
 
@@ -87,6 +88,72 @@ def test_policy_of_another_shape_is_an_error(shape):
     match = rf"policy\(s\): got shape \({shape[0]},.*\), expected shape \(32, 2\)"
     with pytest.raises(QPError, match=match):
         closed_loop(lambda s: torch.zeros(shape), PointMass())
+
+
+PENDULUM = GymnasiumPlant("Pendulum-v1")
+
+
+def swing(s):
+    return 4 * s[:, 2:]
+
+
+def test_gymnasium_loop_is_one_episode_of_each_start():
+    run = gymnasium_loop(swing, PENDULUM, steps=30, starts=3, seed=7, gamma=0.9)
+    assert run.states.shape == (31, 3, 3)
+    assert run.actions.shape == (30, 3, 1)
+    for i in range(3):
+        env = gymnasium.make("Pendulum-v1")
+        s, _ = env.reset(seed=7 + i)
+        for k in range(30):
+            np.testing.assert_allclose(run.states[k, i], s, rtol=1e-6)
+            a = np.clip(4 * s[2:], -2, 2)
+            np.testing.assert_allclose(run.actions[k, i], a, rtol=1e-6)
+            s, reward, *_ = env.step(a)
+            assert run.costs[k, i] == pytest.approx(-reward, rel=1e-6)
+        env.close()
+    assert run.actions.abs().max() == 2, "as applied: clipped"
+    assert (0.9 ** np.arange(30) @ run.costs.numpy()).mean() == pytest.approx(run.J_discounted)
+
+
+def test_the_same_seed_is_the_same_gymnasium_loop():
+    def costs(seed):
+        return gymnasium_loop(swing, PENDULUM, steps=5, starts=3, seed=seed).costs
+
+    assert torch.equal(costs(1), costs(1))
+    assert torch.equal(costs(1)[:, 1:], costs(2)[:, :2]), "start i is of the seed seed + i"
+    assert not torch.equal(costs(1), costs(4))
+
+
+class Ends(gymnasium.Env):
+    """Each step costs 1, and the episode ends when the observation, 0, 1, .., reaches 3."""
+
+    observation_space = gymnasium.spaces.Box(0.0, 10.0, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        self.k = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.k += 1
+        return np.full(1, self.k, np.float32), -1.0, self.k == 3, False, {}
+
+
+@pytest.mark.parametrize(("steps", "reached"), [(6, [0, 1, 2, 3, 3, 3, 3]), (2, [0, 1, 2])])
+def test_after_a_termination_nothing_costs_and_nothing_moves(monkeypatch, steps, reached):
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
+    gymnasium.register("Ends-v0", Ends)
+    run = gymnasium_loop(torch.zeros_like, GymnasiumPlant("Ends-v0"), steps=steps, starts=2)
+    assert run.states[..., 0].T.tolist() == [reached] * 2
+    assert min(steps, 3) == run.J
+    assert run.costs[3:].abs().sum() == 0
+
+
+@pytest.mark.parametrize("shape", [(32,), (1,), (1, 1), (32, 3)])
+def test_a_policy_of_another_shape_is_an_error_in_gymnasium_too(shape):
+    match = rf"policy\(s\): got shape \({shape[0]},.*\), expected \(32, 1\)"
+    with pytest.raises(QPError, match=match):
+        gymnasium_loop(lambda s: torch.zeros(shape), PENDULUM)
 
 
 def test_closed_gap():

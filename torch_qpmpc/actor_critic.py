@@ -7,7 +7,7 @@ QP of its own, or a network, as is usual; the actor may be a network, too, to co
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig
@@ -42,22 +42,59 @@ class BoundedPolicy(nn.Module):
         return (self.low + share * (self.high - self.low)).to(s.dtype)
 
 
-class ActionValue(nn.Module):
-    """A network for -Q(s, a)."""
+class Clip(torch.autograd.Function):
+    """a between its bounds; a gradient that would drive it further out is dropped, others pass.
 
-    def __init__(self, n_x: int, n_u: int, width: int) -> None:
+    A clamp's own gradient is zero outside, from where nothing would come back.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        ctx.save_for_backward(a < low, a > high)
+        return a.clamp(low, high)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        (below, above), (grad,) = ctx.saved_tensors, grads
+        # A descent moves a against its gradient.
+        further_out = (below & (grad > 0)) | (above & (grad < 0))
+        return grad.masked_fill(further_out, 0.0), None, None
+
+
+class ClippedPolicy(nn.Module):
+    """pi(s) of a QP, clipped as plants do it: with soft action rows it may exceed the bounds."""
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, mpc: QPMPC, low: Tensor, high: Tensor) -> None:
         super().__init__()
+        self.module = mpc
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
+        return cast("Tensor", Clip.apply(self.module.policy(s), self.low.to(s), self.high.to(s)))
+
+
+class ActionValue(nn.Module):
+    """A network for -Q(s, a), in units of ``scale``."""
+
+    def __init__(self, n_x: int, n_u: int, width: int, scale: float) -> None:
+        super().__init__()
+        self.scale = scale
         self.net = MLP(n_x + n_u, 1, num_cells=[width, width], activation_class=nn.ReLU)
 
     def forward(self, s: Tensor, a: Tensor) -> Tensor:
         """``(*batch, n_x)`` and ``(*batch, n_u)`` to ``(*batch, 1)``."""
-        return self.net(torch.cat((s, a), -1))
+        return self.scale * self.net(torch.cat((s, a), -1))
 
 
 def make_actor(cfg: DictConfig, mpc: QPMPC, low: Tensor, high: Tensor) -> TensorDictModule:
     """Observation to action, for actions between ``low`` and ``high`` ``(n_u,)``."""
     if cfg.algo.actor == "qp":
-        return QPActorValueOperator(mpc).get_policy_operator()
+        return TensorDictModule(ClippedPolicy(mpc, low, high), ["observation"], ["action"])
     network = BoundedPolicy(mpc.n_x, low, high, cfg.algo.width)
     return TensorDictModule(network, ["observation"], ["action"])
 
@@ -70,7 +107,9 @@ def make_critic(cfg: DictConfig, mpc: QPMPC) -> TensorDictModule:
             for parameter in critic.parameters():
                 parameter.mul_(1 + SPREAD * torch.randn_like(parameter))
         return QPActorValueOperator(critic)
-    network = ActionValue(mpc.n_x, mpc.n_u, cfg.algo.width)
+    # What rewards of one sum up to: outputs of another order of magnitude would be learned slowly.
+    scale = sum(cfg.task.gamma**k for k in range(cfg.task.episode_steps))
+    network = ActionValue(mpc.n_x, mpc.n_u, cfg.algo.width, scale)
     return TensorDictModule(network, ["observation", "action"], ["state_action_value"])
 
 

@@ -50,12 +50,11 @@ def make_true_mpc(cfg: DictConfig, physics: LinearSystem | GymnasiumPlant) -> QP
 
 
 def _given_scheme(cfg: DictConfig, physics: GymnasiumPlant) -> Scheme:
-    """The model and the weight in the task's configuration; the states are not bounded."""
+    """The model and the weight in the task's configuration, the bounds of the plant's spaces."""
     A, B, weight = (
         torch.tensor(cfg.task[name], dtype=torch.float64) for name in ("A", "B", "stage_weight")
     )
-    free = torch.full_like(physics.lb_s, torch.inf)
-    return Scheme(A, B, torch.zeros_like(free), weight, -free, free)
+    return Scheme(A, B, torch.zeros_like(physics.lb_s), weight, physics.lb_s, physics.ub_s)
 
 
 def true_model(

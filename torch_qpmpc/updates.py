@@ -59,7 +59,9 @@ def first_order(
         optimizer.zero_grad()
         if not total.isfinite():
             if losses.get("unsolved", None) is None:
-                losses["unsolved"] = (~losses["pred_value"].isfinite()).sum()
+                error = losses["pred_value"] - losses["target_value"]
+                # An ensemble has an error of each critic for a transition.
+                losses["unsolved"] = (~error.isfinite()).reshape(-1, len(batch)).any(0).sum()
             return terms, losses
         total.backward()
         of_each = [x.grad for group in optimizer.param_groups for x in group["params"]]

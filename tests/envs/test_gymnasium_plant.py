@@ -1,0 +1,126 @@
+"""Any Gymnasium environment as a plant: what it must be, and what its episodes are."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Discrete
+
+from torch_qpmpc.envs import GymnasiumPlant
+from torch_qpmpc.errors import QPError
+
+
+class Counter(gymnasium.Env):
+    """Its state counts the steps; it terminates at ``last``."""
+
+    def __init__(self, observations=None, actions=None, last: int = 1000) -> None:
+        self.observation_space = observations or Box(0.0, 1000.0, (1,), np.float32)
+        self.action_space = actions or Box(-1.0, 2.0, (1,), np.float32)
+        self.last, self.k = last, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.k = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.k += 1
+        return np.full(1, self.k, np.float32), -float(self.k), self.k >= self.last, False, {}
+
+
+@pytest.fixture
+def register(monkeypatch):
+    """Register a `Counter` with other spaces or another end, for one test."""
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
+
+    def add(**options):
+        gymnasium.register("Counter-v0", lambda **_: Counter(**options))
+        return "Counter-v0"
+
+    return add
+
+
+def test_the_bounds_are_those_of_its_spaces():
+    plant = GymnasiumPlant("Pendulum-v1")
+    assert plant.ub_s.tolist() == [1, 1, 8]
+    assert plant.lb_s.tolist() == [-1, -1, -8]
+    assert (plant.lb_a.tolist(), plant.ub_a.tolist()) == ([-2], [2])
+    assert plant.lb_s.dtype == plant.lb_a.dtype == torch.float64
+
+
+@pytest.mark.parametrize("id", ["Pendulum-v9", "NoSuchThing-v0", "no such thing"])
+def test_an_unknown_environment_is_an_error(id):
+    match = f"task.id: got '{id}', expected an environment that Gymnasium can make"
+    with pytest.raises(QPError, match=match):
+        GymnasiumPlant(id)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"actions": Discrete(2)}, r"whose action space is Discrete\(2\), expected spaces that"),
+        ({"observations": Discrete(5)}, r"whose observation space is Discrete\(5\), expected"),
+        (
+            {"observations": Box(0, 255, (8, 8, 3), np.uint8)},
+            r"whose observation space is Box\(0, 255, \(8, 8, 3\), uint8\), expected spaces that",
+        ),
+        ({"actions": Box(-1, 1, (2, 2))}, "whose action space is .* boxes of one dimension"),
+    ],
+)
+def test_other_spaces_are_an_error(register, options, match):
+    with pytest.raises(QPError, match=match):
+        GymnasiumPlant(register(**options))
+
+
+def test_a_truncated_episode_keeps_its_last_observation_and_is_not_terminated(register):
+    env = GymnasiumPlant(register()).vectorised(2, 3, seed=0)
+    batch = env.rollout(7, break_when_any_done=False)
+    env.close()
+    assert batch.shape == (2, 7)
+    before, after = batch["observation"][..., 0], batch["next", "observation"][..., 0]
+    assert before.tolist() == [[0, 1, 2, 0, 1, 2, 0]] * 2
+    assert after.tolist() == [[1, 2, 3, 1, 2, 3, 1]] * 2
+    ends = [[False, False, True, False, False, True, False]] * 2
+    assert batch["next", "truncated"].squeeze(-1).tolist() == ends
+    assert batch["next", "done"].squeeze(-1).tolist() == ends
+    assert not batch["next", "terminated"].any()
+    assert batch["next", "reward"].squeeze(-1)[0].tolist() == [-1, -2, -3, -1, -2, -3, -1]
+
+
+def test_a_terminated_episode_is_terminated(register):
+    env = GymnasiumPlant(register(last=2)).vectorised(1, 3, seed=0)
+    batch = env.rollout(4, break_when_any_done=False)
+    env.close()
+    assert batch["next", "terminated"].flatten().tolist() == [False, True, False, True]
+    assert batch["next", "observation"].flatten().tolist() == [1, 2, 1, 2]
+    assert not batch["next", "truncated"].any()
+
+
+def test_one_seed_is_one_set_of_different_episodes():
+    plant = GymnasiumPlant("Pendulum-v1")
+
+    def starts(seed: int) -> torch.Tensor:
+        env = plant.vectorised(3, 5, seed=seed)
+        s = env.reset()["observation"]
+        env.close()
+        return s
+
+    assert torch.equal(starts(1), starts(1))
+    assert not torch.equal(starts(1), starts(2))
+    assert len(starts(1).unique(dim=0)) == 3
+
+
+def test_violation_is_the_distance_to_the_box():
+    plant = GymnasiumPlant("Pendulum-v1")
+    s = torch.tensor([[1.0, 0.0, -8.0], [1.5, -1.25, 9.0]])
+    assert plant.violation(s).tolist() == [0, 1.75]
+
+
+def test_a_space_without_bounds_has_none(register):
+    plant = GymnasiumPlant(register(observations=Box(-math.inf, math.inf, (1,), np.float32)))
+    assert plant.ub_s.isinf().all()
+    assert plant.violation(torch.tensor([[1e9]])) == 0
