@@ -132,14 +132,6 @@ def gymnasium_loop(
     return ClosedLoop(s, a, L, gamma)
 
 
-def _checked(a: Tensor, expected: tuple[int, int]) -> Tensor:
-    """A (starts,) or (n_u,) result would broadcast without a sound."""
-    if a.shape != expected:
-        remedy = "Map a batch of states to a batch of actions."
-        raise QPError.expected("policy(s)", f"shape {tuple(a.shape)}", str(expected), remedy)
-    return a
-
-
 def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:
     """The share of the way from the start to the true-model MPC that learning went.
 
