@@ -19,6 +19,7 @@ import contextlib
 import itertools
 import signal
 import sys
+import threading
 import time
 from functools import partial
 from typing import Any
@@ -198,6 +199,12 @@ def _train(
     return summary
 
 
+def without_writers(given: threading.ExceptHookArgs) -> None:
+    """An error in a thread; that of TensorBoard's files is raised in the run, too."""
+    if not isinstance(given.exc_value, OSError):
+        threading.__excepthook__(given)
+
+
 # A run that goes on stays in its folder.
 OmegaConf.register_new_resolver("folder_of", folder_of, replace=True)
 #: What the loss module tells of itself.
@@ -207,6 +214,7 @@ LOGGED = ("td_error", "pred_value", "target_value", "unsolved")
 @hydra.main(version_base="1.3", config_path="configs", config_name="config")
 def main(cfg: DictConfig) -> float:
     """Train; a sweep's optimiser maximises the closed gap that this returns."""
+    threading.excepthook = without_writers
     ours = HydraConfig.get()
     folder, sweep, state = ours.runtime.output_dir, ours.mode is RunMode.MULTIRUN, None
     try:
