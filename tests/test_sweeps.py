@@ -35,12 +35,13 @@ LAUNCHERS = {
 
 
 def sweep(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
-    """``train.py -m +study=paper`` with small runs, in a process that cannot hang for long."""
+    """``train.py -m +study=paper`` with small runs, in a process that cannot hang for ever."""
     command = [sys.executable, "train.py", "-m", "+study=paper", *SMALL, *overrides]
     command += [f"hydra.sweep.dir={folder}", "constraint=free", "noise=gaussian"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    # Workers of Ray are nice by default, and would wait for all other tests.
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
     return subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=150, check=False
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False
     )
 
 

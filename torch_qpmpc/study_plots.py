@@ -71,7 +71,7 @@ def learning_figure(frame: pd.DataFrame) -> Figure:
     draw_J(left, frame)
     if has_real(frame):
         draw_gap(right, frame)
-    seeds = sorted(frame["seed"].unique())
+    seeds = sorted(frame["seed"].unique().tolist())
     figure.suptitle(f"{frame['noise'].iloc[0]} noise: interquartile mean over seeds {seeds}, 95%")
     return figure
 
