@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.registration import EnvSpec
 
 from torch_qpmpc.envs import GrosZanonLTI, GymnasiumPlant, PointMass
 from torch_qpmpc.errors import QPError
@@ -109,7 +110,7 @@ def test_gymnasium_loop_is_one_episode_of_each_start():
             a = np.clip(4 * s[2:], -2, 2)
             np.testing.assert_allclose(run.actions[k, i], a, rtol=1e-6)
             s, reward, *_ = env.step(a)
-            assert run.costs[k, i] == pytest.approx(-reward, rel=1e-6)
+            assert run.costs[k, i] == pytest.approx(-float(reward), rel=1e-6)
         env.close()
     assert run.actions.abs().max() == 2, "as applied: clipped"
     assert (0.9 ** np.arange(30) @ run.costs.numpy()).mean() == pytest.approx(run.J_discounted)
@@ -141,8 +142,7 @@ class Ends(gymnasium.Env):
 
 @pytest.mark.parametrize(("steps", "reached"), [(6, [0, 1, 2, 3, 3, 3, 3]), (2, [0, 1, 2])])
 def test_after_a_termination_nothing_costs_and_nothing_moves(monkeypatch, steps, reached):
-    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
-    gymnasium.register("Ends-v0", Ends)
+    monkeypatch.setitem(gymnasium.registry, "Ends-v0", EnvSpec("Ends-v0", lambda **_: Ends()))
     run = gymnasium_loop(torch.zeros_like, GymnasiumPlant("Ends-v0"), steps=steps, starts=2)
     assert run.states[..., 0].T.tolist() == [reached] * 2
     assert min(steps, 3) == run.J

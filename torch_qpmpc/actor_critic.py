@@ -99,8 +99,8 @@ def make_actor(cfg: DictConfig, mpc: QPMPC, low: Tensor, high: Tensor) -> Tensor
     return TensorDictModule(network, ["observation"], ["action"])
 
 
-def make_critic(cfg: DictConfig, mpc: QPMPC) -> TensorDictModule:
-    """(observation, action) to state_action_value."""
+def make_critic(cfg: DictConfig, mpc: QPMPC) -> Any:
+    """(observation, action) to state_action_value, a module that TorchRL's losses take."""
     if cfg.algo.critic == "qp":
         critic = copy.deepcopy(mpc)
         with torch.no_grad():
@@ -120,10 +120,11 @@ def make_actor_critic_loss(
     actor = make_actor(cfg, mpc, low, high)
     if cfg.algo.name == "ddpg":
         return DDPGLoss(actor, make_critic(cfg, mpc), delay_actor=True, delay_value=True)
+    bounds: Any = (low.float(), high.float())  # its annotation is tuple[float]
     return TD3Loss(
         actor,
         [make_critic(cfg, mpc) for _ in range(2)],
-        bounds=(low.float(), high.float()),
+        bounds=bounds,
         policy_noise=cfg.algo.policy_noise,
         noise_clip=cfg.algo.noise_clip,
         loss_function="l2",
@@ -137,7 +138,8 @@ def actor_groups(cfg: DictConfig, mpc: QPMPC, loss_module: LossModule) -> list[d
         return mpc.parameter_groups(
             {"cost": share * rates.lr_cost, "constraints": share * rates.lr_constraints}
         )
-    leaves = [leaf for leaf in loss_module.actor_network_params.parameters() if leaf.requires_grad]
+    params: Any = loss_module.actor_network_params
+    leaves = [leaf for leaf in params.parameters() if leaf.requires_grad]
     return [{"params": leaves, "lr": share * cfg.algo.lr_network, "name": "actor"}]
 
 

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Discrete
 
 from torch_qpmpc.envs import GymnasiumPlant
@@ -35,10 +36,10 @@ class Counter(gymnasium.Env):
 @pytest.fixture
 def register(monkeypatch):
     """Register a `Counter` with other spaces or another end, for one test."""
-    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
 
     def add(**options):
-        gymnasium.register("Counter-v0", lambda **_: Counter(**options))
+        spec = EnvSpec("Counter-v0", lambda **_: Counter(**options))
+        monkeypatch.setitem(gymnasium.registry, "Counter-v0", spec)
         return "Counter-v0"
 
     return add
