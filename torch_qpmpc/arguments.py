@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -80,10 +81,10 @@ def check_model(A: Any, B: Any) -> tuple[Tensor, Tensor]:
 
 def as_tensor(name: str, value: Any) -> Tensor:
     try:
-        given = torch.as_tensor(value)
-        if given.is_complex() or given.is_meta:
+        of_tensor = isinstance(value, Tensor) and (value.is_complex() or value.is_meta)
+        if of_tensor or (isinstance(value, np.ndarray) and np.iscomplexobj(value)):
             raise TypeError
-        tensor = given.to(torch.float64)
+        tensor = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise QPError.expected(
             name, _brief(value), "a tensor, or what torch.as_tensor takes, of real numbers"
