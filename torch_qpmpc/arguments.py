@@ -41,6 +41,7 @@ def check_structure(
     on_failure: str,
     discount_slack: bool,
     seed: int,
+    **_: Any,
 ) -> None:
     for name, size in (("n_x", n_x), ("n_u", n_u), ("horizon", horizon)):
         if not isinstance(size, int) or isinstance(size, bool) or size < 1:
