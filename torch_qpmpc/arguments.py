@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -40,6 +41,7 @@ def check_structure(
     on_failure: str,
     discount_slack: bool,
     seed: int,
+    **_: Any,
 ) -> None:
     for name, size in (("n_x", n_x), ("n_u", n_u), ("horizon", horizon)):
         if not isinstance(size, int) or isinstance(size, bool) or size < 1:
@@ -80,10 +82,10 @@ def check_model(A: Any, B: Any) -> tuple[Tensor, Tensor]:
 
 def as_tensor(name: str, value: Any) -> Tensor:
     try:
-        given = torch.as_tensor(value)
-        if given.is_complex() or given.is_meta:
+        of_tensor = isinstance(value, Tensor) and (value.is_complex() or value.is_meta)
+        if of_tensor or (isinstance(value, np.ndarray) and np.iscomplexobj(value)):
             raise TypeError
-        tensor = given.to(torch.float64)
+        tensor = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise QPError.expected(
             name, _brief(value), "a tensor, or what torch.as_tensor takes, of real numbers"

@@ -145,19 +145,7 @@ class QPMPC(nn.Module):
         }
         super().__init__()
         self._arguments = arguments
-        check_structure(
-            n_x,
-            n_u,
-            horizon,
-            gamma,
-            hessian,
-            structure,
-            learn,
-            step,
-            on_failure,
-            discount_slack,
-            seed,
-        )
+        check_structure(**arguments)
         backend(solver)
         with torch.device("cpu"):
             self._start(learn)
@@ -242,10 +230,8 @@ class QPMPC(nn.Module):
         ``qp`` is `quadratic_program`, where that has been made for today's theta already.
         """
         fixed = self._checked(s, a)
-        if qp is None:
-            qp = self.quadratic_program()
-        else:
-            check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or nothing.")
+        qp = self.quadratic_program() if qp is None else qp
+        check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or nothing.")
         return solve_qp(
             qp,
             fixed.to(qp.C.dtype),
@@ -385,10 +371,9 @@ class QPMPC(nn.Module):
 
     def _checked(self, s: Tensor, a: Tensor | None = None) -> Tensor:
         """What is fixed of z: s, or s and a side by side."""
-        device = self.C_0.device
         if a is None:
-            return check_tensor("s", s, self.n_x, device=device)
-        return check_pair(s, a, self.n_x, self.n_u, device)
+            return check_tensor("s", s, self.n_x, device=self.C_0.device)
+        return check_pair(s, a, self.n_x, self.n_u, self.C_0.device)
 
     def _value(self, fixed: Tensor) -> Tensor:
         qp = self.quadratic_program()
