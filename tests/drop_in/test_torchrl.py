@@ -148,7 +148,7 @@ class Stochastic(Base):
         action_key = ("action", "action1") if self.composite else "action"
         critic = make_critic(n_hidden, n_act, observation_key="hidden", action_key=action_key)
         # Of a batch of two, the clipped TD errors of a smooth L1 loss can cancel in c's gradient.
-        critic.module.c.data -= 50
+        critic.module.c.data -= 5000  # its target has 0.99 of that
         value = make_value(n_hidden, n_act, observation_key="hidden")
         heads = [value, critic] if len(values) == 2 else [critic]
         return actor, *(TensorDictSequential(common, head) for head in heads), common, td
