@@ -383,6 +383,7 @@ def test_the_step_rule_needs_its_solver(monkeypatch):
 
 #: What each differs in, beside its name: from the defaults, or from those of its optimiser.
 ABLATIONS: dict[str, tuple[list[str], dict[str, Any]]] = {
+    "reference": ([], {}),
     "adam_proximal": (["optimizer=adam"], {}),
     "adam_subgradient": (["optimizer=adam"], {"penalty_step": "subgradient"}),
     "sgd": (["optimizer=sgd"], {"step": "projection"}),

@@ -151,7 +151,7 @@ def test_after_a_termination_nothing_costs_and_nothing_moves(monkeypatch, steps,
 
 @pytest.mark.parametrize("shape", [(32,), (1,), (1, 1), (32, 3)])
 def test_a_policy_of_another_shape_is_an_error_in_gymnasium_too(shape):
-    match = rf"policy\(s\): got shape \({shape[0]},.*\), expected \(32, 1\)"
+    match = rf"policy\(s\): got shape \({shape[0]},.*\), expected shape \(32, 1\)"
     with pytest.raises(QPError, match=match):
         gymnasium_loop(lambda s: torch.zeros(shape), PENDULUM)
 

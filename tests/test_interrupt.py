@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,14 @@ from torch_qpmpc.solvers.chain import SolveLog
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 RUN = (*SMALL, "figures=false", "updates=5", "eval_interval=3", "task.eval_steps=5")
+
+
+@pytest.fixture(autouse=True)
+def listening() -> Iterator[None]:
+    """As in a terminal: a shell's background jobs begin with Ctrl-C ignored, and so do theirs."""
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, usual)
 
 
 @pytest.mark.parametrize("signum", SIGNALS)
