@@ -17,6 +17,7 @@ from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
 from torch_qpmpc import QPActorValueOperator, QPError
 from torch_qpmpc.collection import make_collector, num_columns
 from torch_qpmpc.config import NOISES, OF_CHOICE, OPTIONAL, RULES, check_config, flatten
+from torch_qpmpc.snapshot import snapshot
 from torch_qpmpc.tasks import make_mpc, make_physics
 from torch_qpmpc.tracking import RunFolder
 
@@ -76,6 +77,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         monkeypatch.setattr(
             train, "RunFolder", lambda folder, _, after, cfg=cfg: RunFolder(folder, cfg, after)
         )
+        monkeypatch.setattr(train, "snapshot", lambda _, *parts, cfg=cfg: snapshot(cfg, *parts))
         recorder: Any = Recorder(cfg, seen)
         train.train(recorder, str(tmp_path / name))
     monkeypatch.setattr(distributed, "RayCollector", lambda *_, **__: None)
