@@ -94,6 +94,9 @@ def _solve_sdp(H: Tensor) -> Tensor:
         raise SolverError(f"Clarabel has not solved the program of eq:sdp1: {found.status}.")
     # Its slack, unlike its x, is inside the cone whatever the tolerance.
     entries = (torch.tensor(found.s, dtype=torch.float64).reshape(count, -1) / weight).to(H)
+    if n == 1:
+        # Not a curvature of 1e-11, which no QP could be solved with.
+        entries = torch.where(entries > LOOSE, entries, 0)
     nearest = torch.empty_like(H)
     nearest[:, rows, columns] = nearest[:, columns, rows] = entries
     return scale * nearest
