@@ -45,7 +45,13 @@ def sweep(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("launcher", LAUNCHERS)
+@pytest.mark.parametrize(
+    "launcher",
+    [
+        pytest.param(name, marks=() if name == "cores" else pytest.mark.cluster)
+        for name in LAUNCHERS
+    ],
+)
 def test_every_launcher_runs_the_study_and_shows_one_line(launcher, tmp_path):
     package, settings = LAUNCHERS[launcher]
     if not importlib.util.find_spec(f"hydra_plugins.hydra_{package}_launcher"):
