@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ def stop(
         return enter(log)
 
     enter = SolveLog.__enter__
+    _next_second()
     with monkeypatch.context() as patch:
         patch.setattr(SolveLog, "__enter__", count)
         with pytest.raises(SystemExit) as ended:
@@ -50,7 +52,13 @@ def stop(
 def go_on(folder: Path) -> None:
     """Finish the run that was stopped."""
     cfg, state = resumed(folder, [])
+    _next_second()
     train.train(cfg, str(folder), state)
+
+
+def _next_second() -> None:
+    """TensorBoard knows the order of event files by the second in which each was begun."""
+    time.sleep(1.01 - time.time() % 1)
 
 
 def assert_same_numbers(folder: Path, whole: Path) -> None:
