@@ -12,7 +12,8 @@ from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment import evaluate
-from torch_qpmpc.finished import FinishedRun, canonical, collect, model_error
+from torch_qpmpc.finished import FinishedRun, collect, prediction_error
+from torch_qpmpc.reading import canonical
 from torch_qpmpc.structure import Model
 
 
@@ -50,10 +51,12 @@ def test_the_learned_qp_is_the_one_that_was_evaluated(study):
 def test_where_C_is_fixed_its_model_is_the_corrupted_one(study):
     frame = collect(study / "small")
     fixed, free = (frame.query(f"constraint == {case!r}") for case in ("fixed", "free"))
-    assert fixed["distance"].tolist() == pytest.approx([0, 0], abs=1e-9)
-    assert fixed["model_error"].tolist() == pytest.approx(fixed["model_error_start"].tolist())
-    assert min(free["distance"]) > 1e-4
-    assert all(free["model_error"] != free["model_error_start"])
+    assert fixed["canonical_distance"].tolist() == pytest.approx([0, 0], abs=1e-9)
+    assert fixed["prediction_error"].tolist() == pytest.approx(
+        fixed["prediction_error_start"].tolist()
+    )
+    assert min(free["canonical_distance"]) > 1e-4
+    assert all(free["prediction_error"] != free["prediction_error_start"])
 
 
 def test_readings_do_not_depend_on_the_gauge(study):
@@ -71,8 +74,7 @@ def test_constraints_that_determine_no_states_have_no_readings(study):
     with torch.no_grad():
         run.learned.C.zero_()
     readings = run.readings()
-    assert math.isnan(readings["distance"])
-    assert math.isnan(readings["model_error"])
+    assert math.isnan(readings["prediction_error"])
 
 
 def test_the_models_error_is_that_of_one_step(study):
@@ -81,10 +83,10 @@ def test_the_models_error_is_that_of_one_step(study):
     assert isinstance(physics, LinearSystem)
     none = torch.zeros(4, dtype=torch.float64)
     A, B = physics.A, physics.B
-    assert model_error(Model(A, B, none, none[0]), physics) == 0
+    assert prediction_error(Model(A, B, none, none[0]), physics) == 0
     offset = none.index_fill(0, torch.tensor([2]), 0.3)
-    assert model_error(Model(A, B, offset, none[0]), physics) == pytest.approx(0.3)
-    spread = model_error(Model(A - torch.eye(4), B, none, none[0]), physics)
+    assert prediction_error(Model(A, B, offset, none[0]), physics) == pytest.approx(0.3)
+    spread = prediction_error(Model(A - torch.eye(4), B, none, none[0]), physics)
     assert spread == pytest.approx(math.sqrt(2 * (1.5**2 + 0.5**2) / 3), rel=0.05)
 
 

@@ -94,7 +94,7 @@ def test_paths_are_shown_for_each_case_with_both_ends(gaussian):
 def test_meaning_shows_each_run_and_use_those_with_a_real_gap(gaussian, axes):
     draw_meaning(axes, gaussian)
     points = np.concatenate([dots.get_offsets() for dots in axes.collections])
-    np.testing.assert_allclose(points, gaussian[["model_error_start", "model_error"]])
+    np.testing.assert_allclose(points, gaussian[["prediction_error_start", "prediction_error"]])
     other = Figure().subplots()
     draw_use(other, gaussian)
     real = gaussian[gaussian["real"]]

@@ -186,6 +186,23 @@ def test_what_could_not_be_written_is_said(tmp_path):
     )
 
 
+@pytest.mark.parametrize("mode", [("run",), ("sweep", "-m")], ids=lambda mode: mode[0])
+def test_a_folder_that_cannot_be_made_is_said_in_one_sentence(tmp_path, mode):
+    key, *multirun = mode
+    (tmp_path / "file").touch()
+    command = [sys.executable, "train.py", *multirun, f"hydra.{key}.dir={tmp_path}/file/run"]
+    ended = subprocess.run(
+        command, cwd=CONFIGS.parent, capture_output=True, text=True, timeout=240, check=False
+    )
+    assert ended.returncode == 1
+    assert re.fullmatch(
+        r"folder: got .*/file/run, where writing failed \(.*Not a directory.*\), "
+        r"expected one that can be written to\. "
+        rf"Choose another folder by hydra\.{key}\.dir=FOLDER\.",
+        ended.stderr.strip(),
+    )
+
+
 @pytest.mark.parametrize("name", ["config.yaml", "metrics.csv", "summary.json"])
 def test_a_file_is_as_it_was_when_writing_fails(tmp_path, monkeypatch, name):
     with RunFolder(tmp_path, make_config()) as run:

@@ -344,7 +344,7 @@ CONFLICTS: tuple[tuple[str, Callable[[DictConfig], bool], str, str], ...] = (
 
 def check_config(cfg: DictConfig) -> None:
     """Raise `QPError` on the first unknown or missing key or impossible value of ``cfg``."""
-    given = flatten(OmegaConf.to_container(cfg, resolve=True))
+    given = settings(cfg)
     off = [name for name in OPTIONAL if name in given and given.pop(name) is None]
     for key, value in given.items():
         if key not in RULES:
@@ -369,6 +369,20 @@ def check_config(cfg: DictConfig) -> None:
         if wrong(cfg):
             expected, remedy = expected.format(cfg=cfg), remedy.format(cfg=cfg)
             raise QPError.expected(key, repr(given.get(key)), expected, remedy)
+
+
+def settings(cfg: DictConfig) -> dict[str, Any]:
+    """Every setting by its dotted key, as on the command line."""
+    return flatten(OmegaConf.to_container(cfg, resolve=True))
+
+
+def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[str, str] | None:
+    """The `settings` in which two differ, as ``key=value`` of either, for a message."""
+    changed = [key for key in {**then, **now} if then.get(key) != now.get(key)]
+    if not changed:
+        return None
+    before, after = (", ".join(f"{key}={of.get(key)}" for key in changed) for of in (then, now))
+    return before, after
 
 
 def flatten(tree: Any, prefix: str = "") -> dict[str, Any]:

@@ -5,6 +5,7 @@ What is read from a learned C here does not depend on its gauge.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from dataclasses import dataclass
@@ -16,17 +17,16 @@ import numpy as np
 import pandas as pd
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
 
 from torch_qpmpc.banded import band_distance
-from torch_qpmpc.canonical import PredictionForm, canonical_matrix, prediction_form
-from torch_qpmpc.checkpoint import load_checkpoint
-from torch_qpmpc.config import check_config, flatten
+from torch_qpmpc.checkpoint import CHECKPOINT, load_checkpoint
+from torch_qpmpc.config import check_config, settings
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.prediction_error import one_step_error, second_moment
-from torch_qpmpc.structure import Model, nearest_model, stage_models
+from torch_qpmpc.reading import predictions
+from torch_qpmpc.structure import Model, nearest_model
 from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc, true_model
 
 #: The paper's, in its order.
@@ -84,7 +84,7 @@ class FinishedRun:
     @cached_property
     def learned(self) -> QPMPC:
         """The QP that was learned."""
-        state = load_checkpoint(self.folder / "checkpoint.pt")
+        state = load_checkpoint(self.folder / CHECKPOINT)
         mpc = make_mpc(self.cfg, self.physics)
         if state["structure"] != mpc.structure:
             mpc.release(state["structure"])
@@ -105,25 +105,18 @@ class FinishedRun:
 
         Returns:
             ``zeros_above``, the share of C's entries above the band that are exactly zero;
-            ``distance`` of the predictions to that model's, as a share; ``model_error`` and, of
-            the model at the start, ``model_error_start``. The latter are nan where the constraints
-            do not determine the states, the errors also where the plant has no such model.
+            ``prediction_error`` and, of the model at the start, ``prediction_error_start``: nan
+            where the constraints do not determine the states, or the plant has no such model.
         """
         mpc = self.learned
-        readings: dict[str, float] = dict.fromkeys(
-            ("distance", "model_error", "model_error_start"), math.nan
-        )
         above = band_distance(mpc.n_x, mpc.n_u, mpc.horizon) > 0
+        readings = dict.fromkeys(("prediction_error", "prediction_error_start"), math.nan)
         readings["zeros_above"] = (mpc.C[above] == 0).double().mean().item()
-        try:
-            model = nearest_model(predictions(mpc))
-        except QPError:
-            return readings
-        readings["distance"] = float(model.residual)
         if isinstance(self.physics, LinearSystem):
-            start = nearest_model(predictions(self.start))
-            readings["model_error"] = model_error(model, self.physics)
-            readings["model_error_start"] = model_error(start, self.physics)
+            with contextlib.suppress(QPError):
+                learned, start = (nearest_model(predictions(m)) for m in (mpc, self.start))
+                readings["prediction_error"] = prediction_error(learned, self.physics)
+                readings["prediction_error_start"] = prediction_error(start, self.physics)
         return readings
 
 
@@ -132,18 +125,7 @@ def has_real(frame: pd.DataFrame) -> bool:
     return any(frame["real"])
 
 
-def predictions(mpc: QPMPC) -> PredictionForm:
-    """X = Phi x_0 + Gamma U + phi of its constraints."""
-    return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
-
-
-def canonical(mpc: QPMPC) -> Tensor:
-    """Its C in the gauge in which that of an MPC scheme is banded."""
-    form = predictions(mpc)
-    return canonical_matrix(form, stage_models(form).A)[0]
-
-
-def model_error(model: Model, physics: LinearSystem) -> float:
+def prediction_error(model: Model, physics: LinearSystem) -> float:
     """`one_step_error` over start states and uniform actions, in units of the state."""
     rng = np.random.default_rng(123)
     s = physics.starts(rng, 1024)
@@ -178,8 +160,8 @@ def collect(folder: str | Path) -> pd.DataFrame:
         sweep = folder.resolve().name if where == "." else where
         rows.append({**summary, "run": run, "sweep": sweep, **run.readings()})
     frame = pd.DataFrame(rows)
-    for name in ("closed_gap", "J_true_model", "J_discounted_true_model"):
-        # JSON's null where there is no gap or no true model.
+    for name in ("closed_gap", "J_true_model", "J_discounted_true_model", "canonical_distance"):
+        # JSON's null where there is no gap, no true model or no QP.
         frame[name] = frame[name].astype(float) if name in frame else math.nan
     frame["real"] = frame["J_start"] - frame["J_true_model"] >= REAL_GAP
     frame["label"] = ""
@@ -192,13 +174,13 @@ def collect(folder: str | Path) -> pd.DataFrame:
 
 
 def _labels(sweep: pd.DataFrame) -> list[str]:
-    settings = [_settings(run.cfg) for run in sweep["run"]]
+    kinds = [_kind(run.cfg) for run in sweep["run"]]
     values: dict[tuple[str, str], set[str]] = {}
-    for case, of_run in zip(sweep["constraint"], settings, strict=True):
+    for case, of_run in zip(sweep["constraint"], kinds, strict=True):
         for key, value in of_run.items():
             values.setdefault((case, key), set()).add(str(value))
     labels = []
-    for case, of_run in zip(sweep["constraint"], settings, strict=True):
+    for case, of_run in zip(sweep["constraint"], kinds, strict=True):
         varied = [key for key in of_run if len(values[case, key]) > 1]
         told = [f"{key.split('.')[-1]}={of_run[key]}" for key in varied]
         if of_run["ablation"] is not None:
@@ -207,10 +189,9 @@ def _labels(sweep: pd.DataFrame) -> list[str]:
     return labels
 
 
-def _settings(cfg: DictConfig) -> dict[str, Any]:
-    everything = flatten(OmegaConf.to_container(cfg, resolve=True))
+def _kind(cfg: DictConfig) -> dict[str, Any]:
     return {
         key: value
-        for key, value in everything.items()
+        for key, value in settings(cfg).items()
         if key not in _NO_SETTING and not key.startswith("noise.")
     }

@@ -11,11 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from torch import Tensor
 
-from torch_qpmpc.canonical import canonical_matrix, prediction_form
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.evaluation import ClosedLoop
 from torch_qpmpc.mpc import QPMPC
-from torch_qpmpc.structure import stage_models
+from torch_qpmpc.reading import canonical
 
 COLOURS = {"start": "tab:red", "learned": "tab:blue", "true model": "tab:green"}
 
@@ -51,13 +50,12 @@ def constraint_figure(mpc: QPMPC) -> Figure:
     draw_matrix(top, mpc.C_0, mpc, "$C_0$, the start")
     draw_matrix(middle, mpc.C, mpc, r"$C_\theta$, learned")
     try:
-        form = prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
+        C = canonical(mpc)
     except QPError as error:
         bottom.text(0.5, 0.5, f"No canonical form:\n{error}", ha="center", va="center", wrap=True)
         bottom.set_axis_off()
         return figure
-    canonical, _ = canonical_matrix(form, stage_models(form).A)
-    draw_matrix(bottom, canonical, mpc, r"$C_\theta$ in canonical form")
+    draw_matrix(bottom, C, mpc, r"$C_\theta$ in canonical form")
     return figure
 
 

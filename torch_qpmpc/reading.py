@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 
 from torch import Tensor
 
-from torch_qpmpc.canonical import PredictionForm, prediction_form
+from torch_qpmpc.canonical import PredictionForm, canonical_matrix, prediction_form
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.local_gain import local_gain, lqr_gain, spectral_radius, stage_weight
@@ -86,6 +86,25 @@ class StructureReport:
         return "\n".join(lines)
 
 
+def predictions(mpc: QPMPC) -> PredictionForm:
+    """What the constraints say of the states: X = Phi x_0 + Gamma U + phi.
+
+    Raises:
+        QPError: C cannot be put into prediction form.
+    """
+    return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
+
+
+def canonical(mpc: QPMPC) -> Tensor:
+    """C in the gauge in which that of an MPC scheme is banded, ``(m_c, n)``.
+
+    Raises:
+        QPError: C cannot be put into prediction form.
+    """
+    form = predictions(mpc)
+    return canonical_matrix(form, stage_models(form).A)[0]
+
+
 def read(
     mpc: QPMPC, true_model: Sequence[Tensor] | None = None, at: Tensor | None = None
 ) -> StructureReport:
@@ -113,7 +132,7 @@ def read(
         true_model = _checked_model(mpc, true_model)
     if at is not None:
         check_tensor("at", at, mpc.n_x, batched=False)
-    form = prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
+    form = predictions(mpc)
     nearest, stages, memory = nearest_model(form), stage_models(form), memory_energies(form)
     K = local_gain(mpc, form.Phi.new_zeros(mpc.n_x) if at is None else at.to(form.Phi))
     try:
@@ -162,7 +181,7 @@ def structure_metrics(mpc: QPMPC, true_model: Sequence[Tensor] | None = None) ->
     names = ("causality_defect", "toeplitz_defect", "distance_to_mpc")
     names += () if true_model is None else ("model_error",)
     try:
-        form = prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
+        form = predictions(mpc)
     except QPError:
         return dict.fromkeys(names, math.nan)
     nearest = nearest_model(form)

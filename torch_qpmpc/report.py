@@ -36,19 +36,25 @@ Closed gap: median and 95% interval (bootstrapped over seeds) of the runs with a
 J_true_model >= {REAL_GAP:.0f}; how many of all these are. The others are medians over all runs.
 J: from the start to what was learned, and in brackets that of the true model. Distance: of C's
 predictions to those of the nearest time-invariant MPC scheme, as a share. Zeros: the share of C's
-entries above the band that are exactly zero. Model error: root mean square of one step predicted by
-the corrupted (A, B), and by that scheme's; how often the latter is the smaller."""
+entries above the band that are exactly zero. Prediction error: of one step, root mean square, with
+the corrupted (A, B), and with that scheme's; how often the latter is the smaller."""
 
 
 def runs_table(frame: pd.DataFrame) -> str:
     """Every run with its two ends, as Markdown."""
     head = ["sweep", "noise", "case", "seed", "J_start", "J_final", "J_true_model", "closed_gap"]
-    head += ["distance", "model_error", "model_error_start", "unsolved", "train_seconds"]
+    head += [
+        "canonical_distance",
+        "prediction_error",
+        "prediction_error_start",
+        "unsolved",
+        "train_seconds",
+    ]
     digits: dict[str, str] = dict.fromkeys(
         ("J_start", "J_final", "J_true_model", "train_seconds"), ".1f"
     )
-    digits |= dict.fromkeys(("closed_gap", "distance"), ".3f")
-    digits |= dict.fromkeys(("model_error", "model_error_start"), ".4f")
+    digits |= dict.fromkeys(("closed_gap", "canonical_distance"), ".3f")
+    digits |= dict.fromkeys(("prediction_error", "prediction_error_start"), ".4f")
     rows = frame.assign(case=frame["label"])[head].itertuples(index=False)
     lines = [
         [f"{value:{digits.get(name, '')}}" for name, value in zip(head, row, strict=True)]
@@ -64,12 +70,12 @@ def cases_table(sweep: pd.DataFrame) -> str:
         runs = sweep.query(f"noise == {noise!r} and label == {label!r}")
         real = runs.query("real")["closed_gap"].to_numpy()
         median = runs.median(numeric_only=True)
-        nearer = (runs["model_error"] < runs["model_error_start"]).sum()
+        nearer = (runs["prediction_error"] < runs["prediction_error_start"]).sum()
         gap = "-"
         if len(real):
             low, high = bootstrap_interval([real])
             gap = f"{pd.Series(real).median():.3f} [{low:.3f}, {high:.3f}]"
-        errors = f"{median['model_error_start']:.3f} to {median['model_error']:.3f}"
+        errors = f"{median['prediction_error_start']:.3f} to {median['prediction_error']:.3f}"
         lines.append(
             [
                 noise,
@@ -77,12 +83,13 @@ def cases_table(sweep: pd.DataFrame) -> str:
                 f"{gap} ({len(real)} of {len(runs)})",
                 _ends(median, "J"),
                 _ends(median, "J_discounted"),
-                f"{median['distance']:.3f}",
+                f"{median['canonical_distance']:.3f}",
                 f"{median['zeros_above']:.2f}",
                 f"{errors} ({nearer} of {len(runs)})",
             ]
         )
-    head = ["noise", "case", "closed gap", "J", "J discounted", "distance", "zeros", "model error"]
+    head = ["noise", "case", "closed gap", "J", "J discounted", "distance", "zeros"]
+    head += ["prediction error"]
     return table(head, lines)
 
 

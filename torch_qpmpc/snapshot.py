@@ -18,7 +18,7 @@ from tensordict import TensorDict
 from torchrl.collectors import BaseCollector, Collector
 
 from torch_qpmpc.checkpoint import CHECKPOINT, load_checkpoint
-from torch_qpmpc.config import flatten
+from torch_qpmpc.config import differences, settings
 from torch_qpmpc.envs import LinearSystemEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment import Learner
@@ -77,7 +77,7 @@ def snapshot(
     """
     over = tally.update == cfg.updates
     return {
-        "config": _settings(cfg),
+        "config": settings(cfg),
         "update": tally.update,
         "structure": mpc.structure,
         "mpc": mpc.state_dict(),
@@ -133,13 +133,11 @@ def check_state(state: Any, cfg: DictConfig) -> None:
         raise QPError.expected(
             "checkpoint", f"one without {', '.join(missing)}", "a run's state", remedy
         )
-    then, now = state["config"], _settings(cfg)
-    if changed := [key for key in {**then, **now} if then.get(key) != now.get(key)]:
+    if changed := differences(state["config"], settings(cfg)):
+        then, now = changed
+        remedy = "A run goes on with its own configuration, and from its own checkpoints."
         raise QPError.expected(
-            "checkpoint",
-            "one of a run with " + ", ".join(f"{key}={then.get(key)}" for key in changed),
-            "config.yaml's " + ", ".join(f"{key}={now.get(key)}" for key in changed),
-            "A run goes on with its own configuration, and from its own checkpoints.",
+            "checkpoint", f"one of a run with {then}", f"config.yaml's {now}", remedy
         )
 
 
@@ -180,10 +178,6 @@ def folder_of(resume: str | None, fresh: str) -> str:
     if resume is None:
         return fresh
     return str(Path(resume) if Path(resume).is_dir() else Path(resume).parent)
-
-
-def _settings(cfg: DictConfig) -> dict[str, Any]:
-    return flatten(OmegaConf.to_container(cfg, resolve=True))
 
 
 @contextlib.contextmanager

@@ -18,6 +18,7 @@ from torch_qpmpc.evaluation import ClosedLoop
 from torch_qpmpc.local_gain import PolicyMap
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.plots import COLOURS, draw_matrix
+from torch_qpmpc.reading import predictions
 from torch_qpmpc.structure import (
     causality_defect,
     gamma_energies,
@@ -33,10 +34,9 @@ def forms(mpc: QPMPC) -> dict[str, PredictionForm]:
     Raises:
         QPError: C cannot be put into prediction form.
     """
-    n_x, n_u = mpc.n_x, mpc.n_u
     return {
-        "start": prediction_form(mpc.C_0, n_x, n_u),
-        "learned": prediction_form(mpc.C, n_x, n_u, mpc.b),
+        "start": prediction_form(mpc.C_0, mpc.n_x, mpc.n_u),
+        "learned": predictions(mpc),
     }
 
 

@@ -9,8 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torch_qpmpc.experiment import evaluate
-from torch_qpmpc.finished import CASES, FinishedRun, canonical, has_real
+from torch_qpmpc.finished import CASES, FinishedRun, has_real
 from torch_qpmpc.plots import draw_matrix, draw_positions
+from torch_qpmpc.reading import canonical
 from torch_qpmpc.statistics import bootstrap_interval, interquartile_mean
 
 
@@ -124,8 +125,13 @@ def draw_meaning(axes: Axes, frame: pd.DataFrame) -> None:
     """The error of the model read from C against that of the start's."""
     for label, runs in frame.groupby("label", sort=False):
         colour = [colours(frame)[str(label)]]
-        axes.scatter(runs["model_error_start"], runs["model_error"], c=colour, s=14, label=label)
-    ends = [frame["model_error_start"].min() * 0.9, frame["model_error_start"].max() * 1.1]
+        axes.scatter(
+            runs["prediction_error_start"], runs["prediction_error"], c=colour, s=14, label=label
+        )
+    ends = [
+        frame["prediction_error_start"].min() * 0.9,
+        frame["prediction_error_start"].max() * 1.1,
+    ]
     axes.plot(ends, ends, "k--", linewidth=1)
     axes.set(xlabel="one-step error of the corrupted model", ylabel="... of the model read from C")
     axes.set(yscale="log")
@@ -135,7 +141,7 @@ def draw_use(axes: Axes, frame: pd.DataFrame) -> None:
     """What is left of the gap against how much nearer the truth the model came."""
     real = frame.query("real")
     for label, runs in real.groupby("label", sort=False):
-        ratio = runs["model_error"] / runs["model_error_start"]
+        ratio = runs["prediction_error"] / runs["prediction_error_start"]
         colour = [colours(frame)[str(label)]]
         axes.scatter(ratio, 1 - runs["closed_gap"], c=colour, s=14, label=label)
     axes.axvline(1, color="k", linestyle="--", linewidth=1)
@@ -158,18 +164,23 @@ def frontier_figure(frame: pd.DataFrame) -> Figure:
 
     Right and low is structure; up is return; bright is a model that predicts.
     """
-    real = frame.query("real").assign(ratio=lambda f: f["model_error"] / f["model_error_start"])
-    names = ["distance", "closed_gap", "ratio"]
+    real = frame.query("real").assign(
+        ratio=lambda f: f["prediction_error"] / f["prediction_error_start"]
+    )
+    names = ["canonical_distance", "closed_gap", "ratio"]
     medians = real.groupby("label", sort=False)[names].median()
     figure = Figure(figsize=(9, 6), layout="constrained")
     axes = figure.subplots()
     points = axes.scatter(
-        medians["distance"], medians["closed_gap"], c=np.log10(medians["ratio"]), cmap="viridis_r"
+        medians["canonical_distance"],
+        medians["closed_gap"],
+        c=np.log10(medians["ratio"]),
+        cmap="viridis_r",
     )
     figure.colorbar(points, label="log10(model error, learned / corrupted)")
     for label, row in medians.iterrows():
         short = str(label).partition(", ")[2] or str(label)
-        axes.annotate(short, (row["distance"], row["closed_gap"]), fontsize=6)
+        axes.annotate(short, (row["canonical_distance"], row["closed_gap"]), fontsize=6)
     axes.set(xlabel="distance of the predictions to an MPC scheme's", ylabel="closed gap, median")
     axes.set_xscale("symlog", linthresh=1e-3)
     return figure

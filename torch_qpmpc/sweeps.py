@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torch_qpmpc.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
-from torch_qpmpc.config import flatten
+from torch_qpmpc.config import differences, settings
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.snapshot import check_state
 
@@ -41,18 +41,12 @@ def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
     folder = Path(folder)
     if not (folder / "summary.json").exists():
         return None
-    then, now = (
-        flatten(OmegaConf.to_container(settings, resolve=True))
-        for settings in (OmegaConf.load(folder / "config.yaml"), cfg)
-    )
-    changed = [key for key in {**then, **now} if then.get(key) != now.get(key)]
-    if changed:
-        raise QPError.expected(
-            f"{folder}",
-            "a finished run with " + ", ".join(f"{key}={then.get(key)}" for key in changed),
-            ", ".join(f"{key}={now.get(key)}" for key in changed),
-            "Remove it, or choose another folder by hydra.sweep.dir=FOLDER.",
-        )
+    saved = OmegaConf.load(folder / "config.yaml")
+    assert isinstance(saved, DictConfig)
+    if changed := differences(settings(saved), settings(cfg)):
+        then, now = changed
+        remedy = "Remove it, or choose another folder by hydra.sweep.dir=FOLDER."
+        raise QPError.expected(f"{folder}", f"a finished run with {then}", now, remedy)
     return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
 
 

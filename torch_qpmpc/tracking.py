@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from hydra.experimental.callback import Callback
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 from tensorboard.compat.proto import event_pb2
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from torch_qpmpc.checkpoint import CHECKPOINT, write_whole
-from torch_qpmpc.config import flatten
+from torch_qpmpc.config import settings
 from torch_qpmpc.errors import QPError
 
 
@@ -96,7 +97,7 @@ class RunFolder:
         plain = (bool, int, float, str)
         hparams = {
             key: value if isinstance(value, plain) else str(value)
-            for key, value in flatten(OmegaConf.to_container(self.cfg, resolve=True)).items()
+            for key, value in settings(self.cfg).items()
         }
         outcome = {
             f"hparam/{key}": value for key, value in summary.items() if isinstance(value, float)
@@ -112,10 +113,29 @@ class RunFolder:
         write_whole(self.path / "summary.json", f"{text}\n".encode())
 
 
-def unwritable(folder: str | Path, error: OSError) -> QPError:
-    """What to tell whose run in ``folder`` ended with ``error``."""
+class WritableFolder(Callback):
+    """Makes the folder of a run or of a sweep, or says why not before Hydra's own traceback."""
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        self._make("hydra.run.dir", config)
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        self._make("hydra.sweep.dir", config)
+
+    @staticmethod
+    def _make(key: str, config: DictConfig) -> None:
+        folder = OmegaConf.select(config, key)
+        try:
+            Path(folder).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            # Of a callback's errors, Hydra makes warnings; not of its exit.
+            raise SystemExit(str(unwritable(folder, error, key))) from None
+
+
+def unwritable(folder: str | Path, error: OSError, key: str = "hydra.run.dir") -> QPError:
+    """What to tell whose run in ``folder``, chosen by ``key``, ended with ``error``."""
     checkpoint = Path(folder) / CHECKPOINT
-    remedy = "Choose another folder by hydra.run.dir=FOLDER."
+    remedy = f"Choose another folder by {key}=FOLDER."
     if checkpoint.exists():
         remedy = f"{checkpoint} is whole: make room, then python train.py resume={folder}."
     got = f"{folder}, where writing failed ({error})"
