@@ -53,7 +53,7 @@ def test_the_learned_cases_come_to_one_number_in_which_each_weighs_alike():
 
 def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
     readme = tmp_path / "README.md"
-    readme.write_text("# A\n<!-- study -->\nold\n<!-- /study -->\nend\n")
+    readme.write_text(f"# A\n<!-- {study.name} -->\nold\n<!-- /{study.name} -->\nend\n")
     (tmp_path / "notebooks").mkdir()
     report.main([str(study), "--readme", str(readme)])
 
@@ -72,8 +72,8 @@ def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
             assert f"]({name}/{figure})" in (study / "report" / "report.md").read_text()
     assert len((study / "report" / "runs.md").read_text().splitlines()) == 2 + len(frame)
     assert "old" not in readme.read_text()
-    assert readme.read_text().endswith("<!-- /study -->\nend\n")
-    assert 5_000 < (tmp_path / "notebooks" / "study.png").stat().st_size < 200_000
+    assert readme.read_text().endswith(f"<!-- /{study.name} -->\nend\n")
+    assert 5_000 < (tmp_path / "notebooks" / f"{study.name}.png").stat().st_size < 200_000
     # Its own folder is no run.
     assert len(collect(study)) == len(frame)
 
@@ -84,11 +84,13 @@ def test_many_settings_are_a_frontier_and_ablations_have_their_figure():
     assert [name for name, _ in report.figures(frame)] == ["frontier"]
     ablations = frame.assign(ablation=np.where(frame["label"] < "combined, c_2=4", "a", "b"))
     assert [name for name, _ in report.figures(ablations)] == ["frontier", "ablation"]
+    labels = [report.headline(sweep).axes[0].get_xlabel() for sweep in (frame, ablations)]
+    assert labels == ["distance of the predictions to an MPC scheme's", "closed gap"]
 
 
 def test_what_is_wrong_is_said_in_one_line(study, tmp_path):
     with pytest.raises(SystemExit, match="without a finished run"):
         report.main([str(tmp_path)])
     (tmp_path / "README.md").touch()
-    with pytest.raises(SystemExit, match="expected one line <!-- study -->"):
+    with pytest.raises(SystemExit, match="expected one line <!-- weights -->"):
         report.main([str(study / "weights"), "--readme", str(Path(tmp_path) / "README.md")])

@@ -113,6 +113,11 @@ def overall(sweep: pd.DataFrame) -> str:
     return f"Interquartile mean over the four cases that learn C: {'; '.join(lines)}."
 
 
+def has_ablations(sweep: pd.DataFrame) -> bool:
+    """Whether it compares ablations, of runs that had a gap to close."""
+    return "ablation" in sweep and len({*sweep["ablation"]}) > 1 and has_real(sweep)
+
+
 def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
     """The figures of a sweep, each with its name."""
     if len({*sweep["label"]}) <= SIDE_BY_SIDE:
@@ -123,7 +128,7 @@ def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
         yield "meaning", meaning_figure(sweep)
     elif has_real(sweep):
         yield "frontier", frontier_figure(sweep)
-    if "ablation" in sweep and len({*sweep["ablation"]}) > 1 and has_real(sweep):
+    if has_ablations(sweep):
         yield "ablation", ablation_figure(sweep)
 
 
@@ -150,13 +155,22 @@ def section(sweep: pd.DataFrame) -> str:
     return "\n\n".join(text for text in (cases_table(sweep), overall(sweep)) if text)
 
 
-def write_readme(frame: pd.DataFrame, readme: Path) -> None:
-    """The tables between the markers of a README, and notebooks/study.png beside it."""
+def write_readme(frame: pd.DataFrame, readme: Path, name: str) -> None:
+    """The tables between the markers ``name`` of a README, and notebooks/NAME.png beside it."""
     text = readme.read_text(encoding="utf-8")
-    tables = [f"**{name}**\n\n{section(sweep)}" for name, sweep in frame.groupby("sweep")]
-    readme.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), "study"), encoding="utf-8")
+    tables = [f"**{title}**\n\n{section(sweep)}" for title, sweep in frame.groupby("sweep")]
+    readme.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), name), encoding="utf-8")
     first = max(frame.groupby("sweep"), key=lambda pair: pair[1]["closed_gap"].median())[1]
-    readme_figure(first).savefig(readme.parent / "notebooks" / "study.png", dpi=90)
+    headline(first).savefig(readme.parent / "notebooks" / f"{name}.png", dpi=90)
+
+
+def headline(sweep: pd.DataFrame) -> Figure:
+    """A sweep in one figure."""
+    if has_ablations(sweep):
+        return ablation_figure(sweep)
+    if len({*sweep["label"]}) > SIDE_BY_SIDE:
+        return frontier_figure(sweep)
+    return readme_figure(sweep)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -167,13 +181,13 @@ def main(arguments: list[str] | None = None) -> None:
         "folder", type=Path, metavar="RUNS_FOLDER", help="searched with all its subfolders"
     )
     parser.add_argument(
-        "--readme", type=Path, help="write the tables between its lines <!-- study -->, too"
+        "--readme", type=Path, help="write the tables between its lines <!-- RUNS_FOLDER -->, too"
     )
     options = parser.parse_args(arguments)
     try:
         frame = collect(options.folder)
         if options.readme:
-            write_readme(frame, options.readme)
+            write_readme(frame, options.readme, options.folder.resolve().name)
         print(write(frame, options.folder / "report"))
     except QPError as error:
         raise SystemExit(str(error)) from None

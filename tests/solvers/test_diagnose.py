@@ -6,6 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.campaign.families import FAMILIES, Draw
+from tests.campaign.tally import alone
 from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, random_mpc, soft_qps
 from torch_qpmpc import QuadraticProgram, Status, solve_qp
 from torch_qpmpc.condense import condensed_for
@@ -161,13 +163,32 @@ def test_matrices_of_its_own_for_each_element():
     assert diagnose(qps).tolist() == [Status.UNBOUNDED, Status.INFEASIBLE, Status.NOT_CONVERGED]
 
 
-def test_little_curvature_is_not_called_unbounded():
+@pytest.mark.parametrize("curvature", [1e-4, 1e-8])
+def test_little_curvature_is_not_called_unbounded(curvature):
     far = [1e9, 1e9]
-    qp = program([[1, 0], [0, 1e-4]], [0, 1], [[1, 0], [0, 1]], [-1e9, -1e9], far, [1, 1])
+    qp = program([[1, 0], [0, curvature]], [0, 1], [[1, 0], [0, 1]], [-1e9, -1e9], far, [1, 1])
     assert diagnose(only(qp)).tolist() == [Status.NOT_CONVERGED]
 
 
-@pytest.mark.parametrize("far", [1.0, 1e2, 1e4])
+@pytest.mark.parametrize(
+    ("family", "count", "seed", "index"),
+    [
+        ("infeasible", 128, 6, 70),  # rows that contradict each other by 1e-4
+        ("infeasible", 16, 4, 2),
+        ("infeasible", 16, 153, 0),  # ... and lead far away to another
+        ("unbounded", 16, 42, 5),  # a slope of 1 on curvatures of 1 and 0
+        ("unbounded", 16, 74, 6),
+        ("scaled mixed", 16, 108, 4),
+    ],
+)
+def test_what_was_once_called_not_converged_has_its_proof(family, count, seed, index):
+    case = FAMILIES[family](Draw(seed), count)
+    qp, fixed = alone(case, index)
+    solution = solve_qp(qp, fixed, solver="daqp", on_failure="mask")
+    assert solution.status == case.expected[index]
+
+
+@pytest.mark.parametrize("far", [1.0, 1e2, 1e4, 1e6])
 def test_hard_rows_that_hold_only_far_away_are_not_called_infeasible(far):
     rows = [[1, 0], [0, 1]]
     qp = program(rows, [0, 0], rows, [far, far], [2 * far, 2 * far], [INF, INF])

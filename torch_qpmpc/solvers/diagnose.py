@@ -14,9 +14,11 @@ from torch_qpmpc.programs import SoftQPs, multiply
 from torch_qpmpc.qp import Status
 from torch_qpmpc.solvers.daqp import solve
 
-#: Weight of the auxiliary objective against the unit curvature that makes it strictly convex.
-WEIGHT = 1e6
+#: Weight of the auxiliary objectives against the unit curvature that makes them strictly convex.
+WEIGHT = 1e8
 SIGNIFICANT = 1e-6
+#: A direction of so little curvature, against H's largest, has none.
+FLAT = 1e-9
 
 
 def diagnose(qps: SoftQPs) -> Tensor:
@@ -64,28 +66,28 @@ def _falls_without_bound(qps: SoftQPs) -> Tensor:
     """Whether a direction free of curvature and of hard bounds lowers the cost."""
     d = qps.g.shape[1]
     scale = largest(qps.g).clamp(min=1e-300).unsqueeze(-1)
-    curvature = largest(qps.H.flatten(1)).clamp(min=1e-300)[:, None, None]
-    unit = torch.eye(d).to(qps.H)
+    curvatures, basis = torch.linalg.eigh(qps.H)
+    flat = curvatures.abs() <= FLAT * largest(curvatures).unsqueeze(-1)
+    # A direction is N p: without its curved columns, N does not know what p is there.
+    N = basis * flat.unsqueeze(-2)
+    G = qps.G @ N
+    unit = torch.eye(d).to(qps.H).expand(len(qps.H), d, d)
     box = torch.ones_like(qps.g)
     recession = SoftQPs(
-        H=WEIGHT * qps.H / curvature + unit / WEIGHT,
-        G=torch.cat((unit.expand(len(qps.G), d, d), qps.G), dim=1),
+        H=unit / WEIGHT,
+        G=torch.cat((unit, G), dim=1),
         group=qps.group,
-        g=qps.g / scale,
+        g=multiply(N.mT, qps.group, qps.g) / scale,
         l=torch.cat((-box, torch.where(qps.l.isfinite(), 0.0, -torch.inf)), dim=1),
         u=torch.cat((box, torch.where(qps.u.isfinite(), 0.0, torch.inf)), dim=1),
         w=torch.cat((torch.inf * box, qps.w / scale), dim=1),
     )
-    direction = solve(recession).v
+    p = solve(recession).v
     # The slope far out: the linear cost, what soft rows charge, and no room for hard ones.
-    y = multiply(qps.G, qps.group, direction)
+    y = multiply(G, qps.group, p)
     uphill = torch.maximum(
         torch.where(qps.u.isfinite(), y, 0), torch.where(qps.l.isfinite(), -y, 0)
     )
     charge = torch.where(qps.w.isfinite(), qps.w / scale, WEIGHT) * uphill.clamp(min=0)
-    bend = multiply(qps.H / curvature, qps.group, direction)
-    slope = (recession.g * direction).sum(-1) + charge.sum(-1)
-    # Only a direction without curvature reaches the box against so large a weight.
-    far = largest(direction) > 0.5
-    flat = largest(bend) <= 10 / WEIGHT
-    return far & flat & (slope < -1e3 * SIGNIFICANT)
+    slope = (recession.g * p).sum(-1) + charge.sum(-1)
+    return slope < -1e3 * SIGNIFICANT
