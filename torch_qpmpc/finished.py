@@ -110,8 +110,11 @@ class FinishedRun:
         """
         mpc = self.learned
         above = band_distance(mpc.n_x, mpc.n_u, mpc.horizon) > 0
-        readings = dict.fromkeys(("prediction_error", "prediction_error_start"), math.nan)
-        readings["zeros_above"] = (mpc.C[above] == 0).double().mean().item()
+        readings = {
+            "zeros_above": (mpc.C[above] == 0).double().mean().item(),
+            "prediction_error": math.nan,
+            "prediction_error_start": math.nan,
+        }
         if isinstance(self.physics, LinearSystem):
             with contextlib.suppress(QPError):
                 learned, start = (nearest_model(predictions(m)) for m in (mpc, self.start))

@@ -145,7 +145,7 @@ def draw_use(axes: Axes, frame: pd.DataFrame) -> None:
         colour = [colours(frame)[str(label)]]
         axes.scatter(ratio, 1 - runs["closed_gap"], c=colour, s=14, label=label)
     axes.axvline(1, color="k", linestyle="--", linewidth=1)
-    axes.set(xlabel="model error, learned / corrupted", ylabel="gap left", xscale="log")
+    axes.set(xlabel="prediction error, learned / corrupted", ylabel="gap left", xscale="log")
     axes.set_yscale("symlog", linthresh=0.01)
     axes.legend(fontsize="small")
 
@@ -177,7 +177,7 @@ def frontier_figure(frame: pd.DataFrame) -> Figure:
         c=np.log10(medians["ratio"]),
         cmap="viridis_r",
     )
-    figure.colorbar(points, label="log10(model error, learned / corrupted)")
+    figure.colorbar(points, label="log10(prediction error, learned / corrupted)")
     for label, row in medians.iterrows():
         short = str(label).partition(", ")[2] or str(label)
         axes.annotate(short, (row["canonical_distance"], row["closed_gap"]), fontsize=6)
