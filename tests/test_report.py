@@ -63,7 +63,7 @@ def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
         table = report.cases_table(sweep)
         for text in (printed, (study / "report" / "report.md").read_text(), readme.read_text()):
             assert table in text
-        kinds = ("learning", "constraints", "trajectories")
+        kinds = ("learning", "constraints", "trajectories", "policies")
         figures = {f"{kind}-{noise}.png" for kind in kinds for noise in {*sweep["noise"]}}
         figures |= {"meaning.png"}
         drawn = {path.name for path in (study / "report" / str(name)).iterdir()}

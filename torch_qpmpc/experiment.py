@@ -27,6 +27,7 @@ from torch_qpmpc.plots import closed_loop_figure, constraint_figure
 from torch_qpmpc.prediction_error import one_step_error
 from torch_qpmpc.reading import structure_metrics
 from torch_qpmpc.structure import distance_by_band, nearest_model
+from torch_qpmpc.structure_plots import policy_figure, predictions_figure, slice_between
 from torch_qpmpc.tracking import RunFolder
 from torch_qpmpc.updates import Update, first_order, second_order
 
@@ -189,7 +190,7 @@ def report(
 ) -> dict[str, Any]:
     """Log an evaluation: J between its two ends, what C says, and figures if wanted.
 
-    Before the first update, J alone.
+    Before the first update, J alone; after the last, the predictions and the policy, too.
 
     Args:
         mpc: None where the learned policy is no QP's.
@@ -207,6 +208,12 @@ def report(
     if run.cfg.figures:
         run.figure("structure/C", constraint_figure(mpc), update)
         run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
+    if run.cfg.figures and update == run.cfg.updates:
+        states = loops["learned"].states
+        if states.isfinite().all():
+            run.figure("eval/predictions", predictions_figure(mpc, loops["learned"]), update)
+        if mpc.n_x > 1:
+            run.figure("eval/policy", policy_figure(slice_between(mpc, states[0])), update)
     return summary
 
 

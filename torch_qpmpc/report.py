@@ -2,8 +2,8 @@
 
 They go to RUNS_FOLDER/report, a folder for each sweep: the paper's four figures, with intervals
 over seeds (learning-NOISE.png are its figures 1 and 3, constraints-NOISE.png its 2 and 4),
-closed-loop paths, what the learned C means, and, where settings were swept, the frontier and the
-ablations.
+closed-loop paths, slices of value and policy, what the learned C means, and, where settings were
+swept, the frontier and the ablations.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from torch_qpmpc.study_plots import (
     frontier_figure,
     learning_figure,
     meaning_figure,
+    policies_figure,
     readme_figure,
     trajectories_figure,
 )
@@ -125,6 +126,8 @@ def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
             yield f"learning-{noise}", learning_figure(runs)
             yield f"constraints-{noise}", constraints_figure(runs.query("constraint != 'fixed'"))
             yield f"trajectories-{noise}", trajectories_figure(runs)
+            if runs["run"].iloc[0].start.n_x > 1:
+                yield f"policies-{noise}", policies_figure(runs)
         yield "meaning", meaning_figure(sweep)
     elif has_real(sweep):
         yield "frontier", frontier_figure(sweep)

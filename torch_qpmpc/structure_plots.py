@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_qpmpc.canonical import PredictionForm, canonical_matrix, prediction_form
 from torch_qpmpc.evaluation import ClosedLoop
-from torch_qpmpc.local_gain import PolicyMap
+from torch_qpmpc.local_gain import PolicyMap, policy_map
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.plots import COLOURS, draw_matrix
 from torch_qpmpc.reading import predictions
@@ -152,6 +152,20 @@ def predictions_figure(mpc: QPMPC, loop: ClosedLoop, every: int = 8, start: int 
     rows[0].set_title("Realised trajectory, and the predictions made on the way")
     rows[-1].set_xlabel("step")
     return figure
+
+
+def slice_between(mpc: QPMPC, starts: Tensor, points: int = 21) -> PolicyMap:
+    """The policy on a grid as wide as ``starts`` ``(n, n_x)``, of two states; the others are zero.
+
+    These are the first state and the one half-way: a position and its speed, where all positions
+    come first. A state that all starts share is taken from one below to one above.
+    """
+    axes = (0, mpc.n_x // 2)
+    low, high = (ends.double() for ends in starts.aminmax(dim=0))
+    wide = (high == low).double()
+    low, high = low - wide, high + wide
+    x, y = (torch.linspace(low[i].item(), high[i].item(), points) for i in axes)
+    return policy_map(mpc, x, y, axes=axes)
 
 
 def draw_slice(axes: Axes, found: PolicyMap, field: Tensor, title: str, **style: Any) -> QuadMesh:

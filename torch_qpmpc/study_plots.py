@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
+import torch
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -13,6 +14,7 @@ from torch_qpmpc.finished import CASES, FinishedRun, has_real
 from torch_qpmpc.plots import draw_matrix, draw_positions
 from torch_qpmpc.reading import canonical
 from torch_qpmpc.statistics import bootstrap_interval, interquartile_mean
+from torch_qpmpc.structure_plots import draw_slice, slice_between
 
 
 def colours(frame: pd.DataFrame) -> dict[str, tuple]:
@@ -117,6 +119,31 @@ def trajectories_figure(frame: pd.DataFrame) -> Figure:
         }
         draw_positions(axes, loops, run.learned)
         axes.set_title(label)
+    figure.suptitle(f"{runs['noise'].iloc[0]} noise, seed {runs['seed'].iloc[0]}")
+    return figure
+
+
+def policies_figure(frame: pd.DataFrame) -> Figure:
+    """A slice of the value and of the first action: each case between its two ends."""
+    runs = frame.query(f"seed == {shown_seed(frame)}")
+    first: FinishedRun = runs["run"].iloc[0]
+    shown = {"start": first.start}
+    shown |= {label: run.learned for label, run in zip(runs["label"], runs["run"], strict=True)}
+    if first.true is not None:
+        shown["true model"] = first.true
+    starts = evaluate(first.cfg, first.start.policy, first.physics).states[0]
+    slices = {label: slice_between(mpc, starts) for label, mpc in shown.items()}
+    figure = Figure(figsize=(3.2 * len(slices), 6), layout="constrained")
+    values, actions = figure.subplots(2, len(slices), squeeze=False)
+    for name, row, fields, cmap in (
+        ("V", values, [found.values for found in slices.values()], "viridis"),
+        (r"\pi_1", actions, [found.actions[..., 0] for found in slices.values()], "RdBu_r"),
+    ):
+        every = torch.stack(fields).numpy()
+        style = {"cmap": cmap, "vmin": np.nanmin(every), "vmax": np.nanmax(every)}
+        for axes, (label, found), field in zip(row, slices.items(), fields, strict=True):
+            image = draw_slice(axes, found, field, f"${name}$, {label}", **style)
+        figure.colorbar(image, ax=row.tolist())
     figure.suptitle(f"{runs['noise'].iloc[0]} noise, seed {runs['seed'].iloc[0]}")
     return figure
 
