@@ -17,6 +17,7 @@ from torch_qpmpc.structure_plots import (
     forms,
     policy_figure,
     predictions_figure,
+    slice_between,
 )
 
 
@@ -120,3 +121,12 @@ def test_states_without_a_solution_are_left_blank():
         shown = np.ma.masked_invalid(np.asarray(mesh.get_array()))
         assert 0 < shown.count() < shown.size
     rendered(figure)
+
+
+def test_a_slice_is_as_wide_as_the_starts(mpc):
+    starts = torch.zeros(3, mpc.n_x)
+    starts[:, 0] = torch.tensor([-2.0, 0.5, 1.0])
+    found = slice_between(mpc, starts, points=5)
+    assert found.axes == (0, mpc.n_x // 2)
+    torch.testing.assert_close(found.x, torch.linspace(-2, 1, 5).double())
+    torch.testing.assert_close(found.y, torch.linspace(-1, 1, 5).double())  # that all share
