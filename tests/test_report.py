@@ -8,6 +8,7 @@ import pytest
 
 from torch_qpmpc import report
 from torch_qpmpc.finished import collect
+from torch_qpmpc.study_plots import GAP_LEFT
 
 
 def made_up(gaps: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
@@ -85,7 +86,7 @@ def test_many_settings_are_a_frontier_and_ablations_have_their_figure():
     ablations = frame.assign(ablation=np.where(frame["label"] < "combined, c_2=4", "a", "b"))
     assert [name for name, _ in report.figures(ablations)] == ["frontier", "ablation"]
     labels = [report.headline(sweep).axes[0].get_xlabel() for sweep in (frame, ablations)]
-    assert labels == ["distance of the predictions to an MPC scheme's", "closed gap"]
+    assert labels == ["distance of the predictions to an MPC scheme's", GAP_LEFT]
 
 
 def test_what_is_wrong_is_said_in_one_line(study, tmp_path):

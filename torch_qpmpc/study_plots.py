@@ -16,6 +16,9 @@ from torch_qpmpc.reading import canonical
 from torch_qpmpc.statistics import bootstrap_interval, interquartile_mean
 from torch_qpmpc.structure_plots import draw_slice, slice_between
 
+GAP_LEFT = "gap left, (J - J true) / (J start - J true)"
+TICKS = [0, 0.02, 0.05, 0.1, 0.2, 0.5, 1], ["0", ".02", ".05", ".1", ".2", ".5", "1"]
+
 
 def colours(frame: pd.DataFrame) -> dict[str, tuple]:
     """One for each label; the paper's cases always have the same."""
@@ -60,9 +63,9 @@ def draw_gap(axes: Axes, frame: pd.DataFrame) -> None:
         x, J = curves(runs, "eval/J")
         left = (J - true) / (start - true)
         draw_band(axes, x, left, str(label), colours(frame)[str(label)])
-    axes.set(xlabel="update", ylabel="gap left, (J - J true) / (J start - J true)")
+    axes.set(xlabel="update", ylabel=GAP_LEFT)
     axes.set_yscale("symlog", linthresh=0.1)
-    axes.set_yticks([0, 0.02, 0.05, 0.1, 0.2, 0.5, 1], ["0", ".02", ".05", ".1", ".2", ".5", "1"])
+    axes.set_yticks(*TICKS)
     axes.axhline(0, color="k", linestyle="--", linewidth=1)
     axes.grid(alpha=0.3)
 
@@ -214,7 +217,7 @@ def frontier_figure(frame: pd.DataFrame) -> Figure:
 
 
 def ablation_figure(frame: pd.DataFrame) -> Figure:
-    """The closed gap of each ablation: every run, the median and its interval, for each noise."""
+    """What each ablation leaves of the gap: every run, the median and its interval, by noise."""
     real = frame.query("real")
     noises = sorted(real["noise"].unique())
     figure = Figure(figsize=(5 * len(noises), 0.4 * len({*real["ablation"]}) + 1.5))
@@ -224,12 +227,15 @@ def ablation_figure(frame: pd.DataFrame) -> Figure:
     ):
         groups = real.query(f"noise == {noise!r}").groupby("ablation")["closed_gap"]
         for height, (_, gaps) in enumerate(groups):
-            low, high = bootstrap_interval([gaps.to_numpy()])
-            axes.plot(gaps, [height] * len(gaps), ".", color="0.7")
+            left = 1 - gaps
+            low, high = bootstrap_interval([left.to_numpy()])
+            axes.plot(left, [height] * len(left), ".", color="0.7")
             axes.plot([low, high], [height, height], color="tab:blue")
-            axes.plot(gaps.median(), height, "o", color="tab:blue")
+            axes.plot(left.median(), height, "o", color="tab:blue")
         axes.set_yticks(range(len(groups)), [str(name) for name in groups.groups])
-        axes.set(xlabel="closed gap", title=f"{noise} noise")
+        axes.set_xscale("symlog", linthresh=0.1)
+        axes.set_xticks(*TICKS)
+        axes.set(xlabel=GAP_LEFT, title=f"{noise} noise")
         axes.grid(alpha=0.3)
     return figure
 
