@@ -104,10 +104,11 @@ def test_meaning_shows_each_run_and_use_those_with_a_real_gap(gaussian, axes):
 
 def test_a_setting_is_a_point_of_the_frontier():
     frame = made_up({("gaussian", f"combined, c_2={i}"): [0.1 * i, 0.1 * i, 9.0] for i in (1, 2)})
-    (axes, _) = frontier_figure(frame).axes
+    (axes, key, _) = frontier_figure(frame).axes
     points = np.asarray(axes.collections[0].get_offsets())
-    np.testing.assert_allclose(points, [[0.15, 0.1], [0.15, 0.2]])
-    assert [text.get_text() for text in axes.texts] == ["c_2=1", "c_2=2"]
+    np.testing.assert_allclose(points, [[0.15, 0.9], [0.15, 0.8]])
+    assert [text.get_text() for text in axes.texts] == ["1", "2"]
+    assert key.texts[0].get_text() == " 1  c_2=1\n 2  c_2=2"
 
 
 def test_an_ablation_has_its_runs_median_and_interval():

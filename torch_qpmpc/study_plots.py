@@ -192,27 +192,38 @@ def meaning_figure(frame: pd.DataFrame) -> Figure:
 def frontier_figure(frame: pd.DataFrame) -> Figure:
     """Return, structure and prediction: each setting's medians over its runs with a real gap.
 
-    Right and low is structure; up is return; bright is a model that predicts.
+    To the left is structure, below is return, and bright is a model that predicts. The settings are
+    numbered in the order of the table.
     """
     real = frame.query("real").assign(
-        ratio=lambda f: f["prediction_error"] / f["prediction_error_start"]
+        left=lambda f: 1 - f["closed_gap"],
+        ratio=lambda f: f["prediction_error"] / f["prediction_error_start"],
     )
-    names = ["canonical_distance", "closed_gap", "ratio"]
+    names = ["canonical_distance", "left", "ratio"]
     medians = real.groupby("label", sort=False)[names].median()
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    axes = figure.subplots()
+    figure = Figure(figsize=(11, 6), layout="constrained")
+    axes, key = figure.subplots(1, 2, width_ratios=[3, 1])
     points = axes.scatter(
         medians["canonical_distance"],
-        medians["closed_gap"],
-        c=np.log10(medians["ratio"]),
+        medians["left"],
+        c=medians["ratio"],
         cmap="viridis_r",
+        s=60,
     )
-    figure.colorbar(points, label="log10(prediction error, learned / corrupted)")
-    for label, row in medians.iterrows():
-        short = str(label).partition(", ")[2] or str(label)
-        axes.annotate(short, (row["canonical_distance"], row["closed_gap"]), fontsize=6)
-    axes.set(xlabel="distance of the predictions to an MPC scheme's", ylabel="closed gap, median")
-    axes.set_xscale("symlog", linthresh=1e-3)
+    figure.colorbar(points, ax=axes, label="prediction error, learned / corrupted")
+    settings = [str(label).partition(", ")[2] or str(label) for label in medians.index]
+    for number, (_, row) in enumerate(medians.iterrows(), 1):
+        axes.annotate(
+            str(number), (row["canonical_distance"], row["left"]), (4, 3),
+            textcoords="offset points", fontsize=7,
+        )  # fmt: skip
+    listed = [f"{number:2}  {setting}" for number, setting in enumerate(settings, 1)]
+    key.text(0, 1, "\n".join(listed), fontsize=7, va="top", family="monospace")
+    key.set_axis_off()
+    axes.set(xlabel="distance of the predictions to an MPC scheme's", ylabel=GAP_LEFT)
+    axes.set_yscale("symlog", linthresh=0.1)
+    axes.set_yticks(*TICKS)
+    axes.grid(alpha=0.3)
     return figure
 
 
