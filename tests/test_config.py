@@ -98,7 +98,7 @@ def test_each_choice_of_groups_is_accepted(names):
     cfg = make_config(*(f"{group}={name}" for group, name in choice.items()), "warmup_steps=10")
     if choice["noise"] not in NOISES[cfg.task.name]:
         key = "noise.name"
-    elif choice["optimizer"] == "recursive" and choice["constraint"] in ("si", "combined"):
+    elif choice["optimizer"] == "recursive" and cfg.constraint.si is not None:
         key = "replay"
     else:
         check_config(cfg)
