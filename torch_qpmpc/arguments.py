@@ -156,9 +156,9 @@ def check_weight(name: str, weight: Tensor, diagonal: bool) -> None:
         )
     eigenvalues = weight if diagonal else torch.linalg.eigvalsh(weight)
     if (eigenvalues < (0.0 if diagonal else -1e-9 * eigenvalues.abs().max())).any():
-        raise QPError.expected(
-            name, f"smallest eigenvalue {eigenvalues.min():.3g}", "a positive semidefinite weight"
-        )
+        got = f"smallest eigenvalue {eigenvalues.min():.3g}"
+        remedy = "It weighs a cost: turn the sign of a reward's."
+        raise QPError.expected(name, got, "a positive semidefinite weight", remedy)
 
 
 def check_slack(name: str, weight: float) -> None:

@@ -270,6 +270,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         M(on_failure=["mask"]),
         "on_failure: got ['mask'], expected one of raise, warn, mask.",
     ),
+    "QPMPC.from_model: a reward's weight": (
+        lambda: qm.QPMPC.from_model(A2, B1, 3, stage_weight=[-1.0, -1.0, -0.1]),
+        "stage_weight: got smallest eigenvalue -1, expected a positive semidefinite weight. It "
+        "weighs a cost: turn the sign of a reward's.",
+    ),
     "QPMPC.from_model: swapped": (
         lambda: qm.QPMPC.from_model(torch.ones(2, 1), torch.eye(2), 3),
         "A: got shape (2, 1), expected shape (1, 1) or (3, 1, 1).",
