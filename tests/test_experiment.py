@@ -33,15 +33,15 @@ def test_penalties_by_case(constraint):
     cfg = make_config(f"constraint={constraint}", *SMALL)
     mpc = make_mpc(cfg, make_physics(cfg))
     deviation, si = make_penalties(cfg, mpc)
-    assert (deviation is not None) == (constraint in ("deviation", "combined"))
-    assert (si is not None) == (constraint in ("si", "combined"))
+    assert (deviation is not None) == (constraint in ("deviation", "combined", "identified"))
+    assert (si is not None) == (constraint in ("si", "combined", "identified"))
     assert ("C" in mpc.learned) == (constraint != "fixed")
     assert {"H", "c"} <= set(mpc.learned)
     if deviation is not None:
         assert deviation.C_mask.unique().tolist() == [0, 1e-4, 1]
         assert torch.equal(deviation.C_0, mpc.C_0)
     if si is not None:
-        assert (si.beta, si.normalised) == (1e-6, False)
+        assert (si.beta, si.normalised) == (1.0 if constraint == "identified" else 1e-6, False)
 
 
 def test_penalties_have_the_configured_weights():
