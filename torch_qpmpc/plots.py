@@ -74,7 +74,7 @@ def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, show
     axes.plot(starts[:, 0], starts[:, 1], "ko", markersize=3)
     axes.plot(0, 0, "k+", markersize=9)
     axes.set(xlabel="$s_1$", ylabel="$s_2$", title="Closed loop")
-    axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2)
+    axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
 
 
 def draw_stage_costs(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
