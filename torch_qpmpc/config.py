@@ -6,6 +6,7 @@ import difflib
 import itertools
 import math
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -369,6 +370,13 @@ def check_config(cfg: DictConfig) -> None:
         if wrong(cfg):
             expected, remedy = expected.format(cfg=cfg), remedy.format(cfg=cfg)
             raise QPError.expected(key, repr(given.get(key)), expected, remedy)
+
+
+def load_config(file: Path) -> DictConfig:
+    """The configuration that a run has saved."""
+    cfg = OmegaConf.load(file)
+    assert isinstance(cfg, DictConfig)
+    return cfg
 
 
 def settings(cfg: DictConfig) -> dict[str, Any]:

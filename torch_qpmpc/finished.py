@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from torch_qpmpc.banded import band_distance
 from torch_qpmpc.checkpoint import CHECKPOINT, load_checkpoint
-from torch_qpmpc.config import check_config, settings
+from torch_qpmpc.config import check_config, load_config, settings
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import QPMPC
@@ -54,8 +54,7 @@ class FinishedRun:
         Raises:
             QPError: they are not those of today's configs/.
         """
-        cfg = OmegaConf.load(self.folder / "config.yaml")
-        assert isinstance(cfg, DictConfig)
+        cfg = load_config(self.folder / "config.yaml")
         try:
             check_config(cfg)
         except QPError as error:

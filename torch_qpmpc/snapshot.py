@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl.collectors import BaseCollector, Collector
 
 from torch_qpmpc.checkpoint import CHECKPOINT, load_checkpoint
-from torch_qpmpc.config import differences, settings
+from torch_qpmpc.config import differences, load_config, settings
 from torch_qpmpc.envs import LinearSystemEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment import Learner
@@ -164,8 +164,7 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
         raise QPError.expected("resume", f"{path}, without config.yaml", "a folder of train.py's")
     if checkpoint.with_name("summary.json").exists():
         raise QPError.expected("resume", f"{path}, which is finished", "a run that was stopped")
-    cfg = OmegaConf.load(config)
-    assert isinstance(cfg, DictConfig)
+    cfg = load_config(config)
     if path.is_dir() and not checkpoint.exists():
         return cfg, None
     state = load_checkpoint(checkpoint)

@@ -16,11 +16,11 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tqdm import tqdm
 
 from torch_qpmpc.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
-from torch_qpmpc.config import differences, settings
+from torch_qpmpc.config import differences, load_config, settings
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.snapshot import check_state
 
@@ -41,9 +41,8 @@ def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
     folder = Path(folder)
     if not (folder / "summary.json").exists():
         return None
-    saved = OmegaConf.load(folder / "config.yaml")
-    assert isinstance(saved, DictConfig)
-    if changed := differences(settings(saved), settings(cfg)):
+    saved = settings(load_config(folder / "config.yaml"))
+    if changed := differences(saved, settings(cfg)):
         then, now = changed
         remedy = "Remove it, or choose another folder by hydra.sweep.dir=FOLDER."
         raise QPError.expected(f"{folder}", f"a finished run with {then}", now, remedy)
