@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_qpmpc import kernels
 from torch_qpmpc.batching import largest
 from torch_qpmpc.programs import FlatPrograms
 
@@ -34,8 +35,7 @@ class Certificate:
 class Products:
     """The terms of a claim's KKT conditions.
 
-    H z, G'lam, C'chi and ``left``, their sum with q and xi, ``(B, n_z)``; y = G z and ``beyond``,
-    how far it is above ub (or below lb, negative), ``(B, n_g)``.
+    H z, G'lam, C'chi and ``left``, their sum with q and xi, ``(B, n_z)``; y = G z, ``(B, n_g)``.
     """
 
     Hz: Tensor
@@ -43,7 +43,6 @@ class Products:
     C_chi: Tensor
     left: Tensor
     y: Tensor
-    beyond: Tensor
 
     @classmethod
     def of(
@@ -57,8 +56,7 @@ class Products:
         )
         left = Hz + p.q + G_lam + C_chi
         left[:, : xi.shape[-1]] += xi
-        y = p.times_G(z)
-        return cls(Hz, G_lam, C_chi, left, y, y - y.clamp(p.lb, p.ub))
+        return cls(Hz, G_lam, C_chi, left, p.times_G(z))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +119,20 @@ def certify(
     """
     p = programs
     terms = Products.of(p, z, lam, chi, xi) if products is None else products
+    if not z.is_cpu:
+        return _certify(p, z, lam, chi, terms)
+    t = terms
+    of_claim = (z, t.Hz, t.G_lam, t.C_chi, t.left, t.y, lam, chi, p.multiply(p.C, z))
+    given = (p.fixed, p.q, p.c, p.b, p.lb, p.ub, p.w)
+    judged = kernels.judge(*kernels.arrays(*of_claim, *given))
+    return Certificate(*map(torch.from_numpy, judged))
+
+
+def _certify(p: FlatPrograms, z: Tensor, lam: Tensor, chi: Tensor, terms: Products) -> Certificate:
+    """`certify` in torch, for any device."""
     scales: _Scales = p.known("scales", lambda: _Scales.of(p))
-    outside, up, down = terms.beyond.abs(), lam.clamp(min=0.0), lam.clamp(max=0.0)
+    beyond = terms.y - terms.y.clamp(p.lb, p.ub)
+    outside, up, down = beyond.abs(), lam.clamp(min=0.0), lam.clamp(max=0.0)
     sigma, charge = outside * scales.soft, outside * scales.weight
     # A soft row's multiplier beyond w, and a hard row's violation.
     defect = torch.addcmul(scales.minus_limit, lam.abs(), scales.shrink).clamp_(min=0.0)

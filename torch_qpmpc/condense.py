@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
+from torch_qpmpc import kernels
 from torch_qpmpc.programs import ContentMemo, FlatPrograms, SoftQPs
 
 #: A pivot below this fraction of its row's norm means that the rows of C depend on each other.
@@ -171,12 +172,18 @@ class Reduced:
         """The full z ``(B, n_z)`` from the free variables v ``(B, d)``."""
         return programs.affine(self.T_v, v, particular)
 
-    def all_rows(self, lam: Tensor, beyond: Tensor) -> Tensor:
-        """Multipliers ``(B, n_g)`` from those of ``rows``, ``(B, r)``.
+    def all_rows(self, p: FlatPrograms, lam: Tensor, y: Tensor) -> Tensor:
+        """Multipliers ``(B, n_g)`` from those of ``rows``, ``(B, r)``, and y = G z ``(B, n_g)``.
 
-        A row that no free variable enters has w where it is violated: ``beyond`` ``(B, n_g)`` is
-        how far it is above (or below, negative) its bounds.
+        A row that no free variable enters has w where it is violated.
         """
+        if y.is_cpu:
+            given = kernels.arrays(lam, y, p.lb, p.ub, p.w, self.rows, self.others)
+            return torch.from_numpy(kernels.all_rows(*given, VIOLATED))
+        return self._all_rows(lam, y - y.clamp(p.lb, p.ub))
+
+    def _all_rows(self, lam: Tensor, beyond: Tensor) -> Tensor:
+        """`all_rows` in torch, for any device, from how far y is above (or below) its bounds."""
         lam = lam.clamp(self.minus_w, self.w)
         count = self.others.shape[0]
         if not count:

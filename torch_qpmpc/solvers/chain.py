@@ -16,14 +16,13 @@ from torch_qpmpc.condense import Reduced, condensed_for
 from torch_qpmpc.programs import FlatPrograms, SoftQPs
 from torch_qpmpc.qp import Status
 from torch_qpmpc.solvers import (
-    OWN_WARM_STARTS,
     Answer,
     backend,
     fallbacks,
-    warm_start,
 )
 from torch_qpmpc.solvers.crossover import refine
 from torch_qpmpc.solvers.diagnose import diagnose
+from torch_qpmpc.solvers.recall import recall
 from torch_qpmpc.solvers.raw import RawSolution, unsolved
 from torch_qpmpc.solvers.units import units_of
 
@@ -127,7 +126,7 @@ class _Chain:
 
     def run(self, solver: str, start: Tensor | None) -> RawSolution:
         if start is not None:
-            self.recall(solver, start)
+            self.recall(start)
         self.attempt(backend(solver))
         self.rejected = self.todo.shape[0]
         if self.rejected:
@@ -141,17 +140,19 @@ class _Chain:
         assert self.raw is not None
         return self.raw
 
-    def recall(self, solver: str, start: Tensor) -> None:
+    def recall(self, start: Tensor) -> None:
         """Try the active sets ``start`` ``(B, n_g)`` that are known: whose codes are codes."""
         known = ((start >= -2) & (start <= 2)).all(-1)
-        others, before = self.todo[:0], self.todo[known[self.todo]]
-        if not len(before):
+        everything, before = self.todo, int(known[self.todo].sum())
+        if not before:
             return
-        if solver not in OWN_WARM_STARTS:
-            others, self.todo = self.todo[~known[self.todo]], before
-        self.attempt(warm_start(solver), torch.where(known.unsqueeze(-1), start, 0))
-        self.recalled = len(before) - int(known[self.todo].sum())
-        self.todo = torch.cat((self.todo, others)).sort().values
+        whole = before == len(everything)
+        if not whole:
+            self.todo = everything[known[everything]]
+        self.attempt(recall, start)
+        self.recalled = before - len(self.todo)
+        if not whole:
+            self.todo = torch.cat((self.todo, everything[~known[everything]])).sort().values
 
     def part(self) -> FlatPrograms:
         """The programs that are still to be solved."""
@@ -219,8 +220,7 @@ def _recover(p: FlatPrograms, reduced: Reduced, particular: Tensor, answer: Answ
     """
     z = reduced.expand(p, particular, answer.v)
     Hz, y = p.times_H(z), p.times_G(z)
-    beyond = y - y.clamp(p.lb, p.ub)
-    lam = reduced.all_rows(answer.lam, beyond)
+    lam = reduced.all_rows(p, answer.lam, y)
     G_lam = p.times_G(lam, transposed=True)
     slope = Hz + p.q + G_lam
     chi = p.multiply(reduced.Y_neg, slope, transposed=True)
@@ -229,7 +229,7 @@ def _recover(p: FlatPrograms, reduced: Reduced, particular: Tensor, answer: Answ
     of_fixed = slope[:, : p.fixed.shape[-1]]
     xi = -of_fixed
     of_fixed += xi
-    certificate = certify(p, z, lam, chi, xi, Products(Hz, G_lam, C_chi, slope, y, beyond))
+    certificate = certify(p, z, lam, chi, xi, Products(Hz, G_lam, C_chi, slope, y))
     status = torch.full_like(answer.iterations, int(Status.SOLVED))
     return RawSolution(
         certificate.value,

@@ -12,6 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_qpmpc import kernels
 from torch_qpmpc.programs import SoftQPs, multiply
 from torch_qpmpc.solvers.answer import Answer
 
@@ -29,7 +30,13 @@ def recall(qps: SoftQPs, active: Tensor) -> Answer:
     Their codes are those of `QPSolution.active`.
     """
     forces = _Forces(qps)
-    active = active.clone()
+    if qps.g.is_cpu:
+        return forces.recall(qps, active)
+    return _recall(forces, qps, active.clone())
+
+
+def _recall(forces: _Forces, qps: SoftQPs, active: Tensor) -> Answer:
+    """`recall` in torch, for any device; changes ``active``."""
     v, lam, y = forces.solve(qps, active)
     steps = torch.ones_like(qps.group)
     todo = _contradicted(qps, active, lam, y).nonzero().squeeze(-1)
@@ -84,6 +91,12 @@ class _Forces:
         self.rise = torch.cat((inverse, G @ inverse), dim=-2)
         self.push = self.rise @ G.mT
         self.K = torch.nn.functional.pad(self.push[:, d:], (0, 1, 0, 1))
+
+    def recall(self, qps: SoftQPs, active: Tensor) -> Answer:
+        free = -multiply(self.rise, qps.group, qps.g)
+        given = (free, self.push.mT, qps.group, active, qps.l, qps.u, qps.w)
+        limits = (SLIP, MAX_STEPS, MAX_PASSES)
+        return Answer(*map(torch.from_numpy, kernels.recall(*kernels.arrays(*given), *limits)))
 
     def solve(self, qps: SoftQPs, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """v, lam and y with held rows at their bounds, and saturated ones at lam = +w or -w."""

@@ -1,0 +1,202 @@
+"""Loops over QPs, compiled by Numba for the CPU: what takes torch dozens of small operations.
+
+A torch operation costs some microseconds whatever its size, as much as a whole QP here. On other
+devices the torch forms beside the callers do the same; tests hold the two against each other.
+Arrays are float64 and contiguous. Of a vector ``(B or 1, n)``, all QPs share a single row.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+from torch import Tensor
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``function`` in machine code: kept on disk, or where no folder is writable, for the process."""
+    try:
+        return numba.njit(cache=True, error_model="numpy")(function)
+    except RuntimeError:
+        return numba.njit(error_model="numpy")(function)
+
+
+def arrays(*tensors: Tensor) -> list[np.ndarray]:
+    """The tensors as a kernel takes them."""
+    return [tensor.contiguous().numpy() for tensor in tensors]
+
+
+@compiled
+def _larger(x, y):
+    """The larger one, or NaN where either is."""
+    return x if x >= y or x != x else y
+
+
+@compiled
+def judge(z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w):
+    """Value ``(B,)``, sigma ``(B, n_g)`` and residual ``(B,)`` of `certificate.certify`."""
+    n_qps, n_z = z.shape
+    value, residual = np.empty(n_qps), np.empty(n_qps)
+    sigma = np.zeros(y.shape)
+    for i in range(n_qps):
+        q_i, b_i, lb_i, ub_i = q[i % len(q)], b[i % len(b)], lb[i % len(lb)], ub[i % len(ub)]
+        w_i = w[i % len(w)]
+        cost = slip = slope = force = length = error = 0.0
+        for j in range(n_z):
+            at, unmet = abs(z[i, j]), abs(left[i, j])
+            force = _larger(force, _larger(abs(q_i[j]), abs(Hz[i, j])))
+            force = _larger(force, _larger(abs(G_lam[i, j]), abs(C_chi[i, j])))
+            slope, length = _larger(slope, unmet), _larger(length, at)
+            cost += (q_i[j] + 0.5 * Hz[i, j]) * z[i, j]
+            slip += unmet * at
+        for j in range(fixed.shape[1]):
+            error = _larger(error, abs(z[i, j] - fixed[i, j]))
+        short = size = 0.0
+        for j in range(chi.shape[1]):
+            unmet = abs(Cz[i, j] - b_i[j])
+            short, size = _larger(short, unmet), _larger(size, abs(b_i[j]))
+            slip += unmet * abs(chi[i, j])
+        for j in range(y.shape[1]):
+            at, push, weight, above, below = y[i, j], lam[i, j], w_i[j], ub_i[j], lb_i[j]
+            outside = at - above if at > above else below - at if at < below else 0.0
+            # NaN is neither, and stays.
+            up, down = 0.0 if push < 0 else push, 0.0 if push > 0 else push
+            if above == np.inf:
+                above, error = 0.0, _larger(error, up)
+            if below == -np.inf:
+                below, error = 0.0, _larger(error, -down)
+            charge = 0.0
+            if weight == np.inf:
+                error = _larger(error, outside / (1.0 + abs(at)))
+            else:
+                sigma[i, j], charge = outside, outside * weight
+                error = _larger(error, (abs(push) - weight) / (1.0 + weight))
+            cost += charge
+            slip += abs(charge + (above - at) * up + (below - at) * down)
+        error = _larger(error, slope / (1.0 + force))
+        error = _larger(error, short / (1.0 + size + length))
+        error = _larger(error, slip / (1.0 + abs(cost)))
+        residual[i] = np.inf if error != error else error
+        value[i] = cost + c[i % len(c)]
+    return value, sigma, residual
+
+
+@compiled
+def all_rows(lam, y, lb, ub, w, rows, others, violated):
+    """`condense.Reduced.all_rows`."""
+    full = np.zeros(y.shape)
+    for i in range(len(y)):
+        lb_i, ub_i, w_i = lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)]
+        for k in range(len(rows)):
+            push, most = lam[i, k], w_i[rows[k]]
+            full[i, rows[k]] = most if push > most else -most if push < -most else push
+        for j in others:
+            if w_i[j] < np.inf:
+                if y[i, j] - ub_i[j] > violated:
+                    full[i, j] = w_i[j]
+                elif lb_i[j] - y[i, j] > violated:
+                    full[i, j] = -w_i[j]
+    return full
+
+
+@compiled
+def recall(free, push, group, codes, lower, upper, w, slip, max_steps, max_passes):
+    """v ``(B, d)``, lam ``(B, r)`` and steps ``(B,)`` of `solvers.recall.recall`.
+
+    ``free`` ``(B, d + r)`` is (v, y) without multipliers, and ``push`` ``(M, r, d + r)`` what a
+    multiplier takes from it.
+    """
+    n_qps, r = lower.shape
+    d = free.shape[1] - r
+    lam, vy, steps = np.zeros((n_qps, r)), free.copy(), np.zeros(n_qps, np.int64)
+    code, held, pull = np.empty(r, np.int8), np.empty(r, np.int64), np.empty(r)
+    factor = np.empty((r, r))
+    for i in range(n_qps):
+        code[:] = codes[i]
+        by = push[group[i]]
+        changed = True
+        while changed and steps[i] < max_steps:
+            steps[i] += 1
+            vy[i], lam[i] = free[i], 0.0
+            k = 0
+            for j in range(r):
+                if abs(code[j]) == 2:
+                    lam[i, j] = math.copysign(w[i, j], code[j])
+                    vy[i] -= lam[i, j] * by[j]
+                elif code[j] != 0:
+                    held[k] = j
+                    k += 1
+            if not _factorise(by, held, k, d, factor):
+                break
+            for _ in range(max_passes):
+                unmet = False
+                for a in range(k):
+                    j = held[a]
+                    level = upper[i, j] if code[j] > 0 else lower[i, j]
+                    pull[a] = vy[i, d + j] - level
+                    unmet = unmet or not abs(pull[a]) <= slip * (1.0 + abs(level))
+                if not unmet:
+                    break
+                _solve_factorised(factor, pull, k)
+                for a in range(k):
+                    lam[i, held[a]] += pull[a]
+                    vy[i] -= pull[a] * by[held[a]]
+            changed = _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i], slip)
+    return vy[:, :d].copy(), lam, steps
+
+
+@compiled
+def _factorise(by, held, k, d, factor):
+    """Cholesky's L of the held rows and columns of K; whether there is one."""
+    for a in range(k):
+        for b in range(a + 1):
+            entry = by[held[a], d + held[b]]
+            for e in range(b):
+                entry -= factor[a, e] * factor[b, e]
+            if a > b:
+                factor[a, b] = entry / factor[b, b]
+            elif entry > 0:
+                factor[a, a] = math.sqrt(entry)
+            else:
+                return False
+    return True
+
+
+@compiled
+def _solve_factorised(factor, x, k):
+    for a in range(k):
+        for e in range(a):
+            x[a] -= factor[a, e] * x[e]
+        x[a] /= factor[a, a]
+    for a in range(k - 1, -1, -1):
+        for e in range(a + 1, k):
+            x[a] -= factor[e, a] * x[e]
+        x[a] /= factor[a, a]
+
+
+@compiled
+def _correct(code, lam, y, lower, upper, w, slip):
+    """Put in place the codes that lam and y ask for; whether they contradict the old ones."""
+    contradicted = False
+    for j in range(len(code)):
+        small = slip * (1.0 + abs(y[j]))
+        above, below = y[j] > upper[j] + small, y[j] < lower[j] - small
+        over = abs(lam[j]) > (1.0 + slip) * w[j]
+        inwards = lam[j] * code[j] < -slip * (1.0 + abs(lam[j]))
+        if over or inwards or ((above or below) and abs(code[j]) < 2):
+            contradicted = True
+        if code[j] == 0:
+            code[j] = 1 if above else -1 if below else 0
+        elif abs(code[j]) == 2:
+            # A saturated row that is back within its bounds is held.
+            if y[j] < upper[j] - small if code[j] > 0 else y[j] > lower[j] + small:
+                code[j] //= 2
+        elif over:
+            code[j] = 2 if lam[j] > 0 else -2
+        elif inwards and lower[j] < upper[j]:
+            # One whose multiplier pulls inwards is let go, unless both its bounds are one.
+            code[j] = 0
+    return contradicted
