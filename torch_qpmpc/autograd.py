@@ -27,7 +27,7 @@ from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.qp import QPSolution, QuadraticProgram, Status, slacks
-from torch_qpmpc.sensitivity import differentiable, is_differentiating, traceable
+from torch_qpmpc.sensitivity import differentiable, is_differentiating, is_traced, traceable
 from torch_qpmpc.solvers import backend
 from torch_qpmpc.solvers.chain import RawSolution, solve_programs
 from torch_qpmpc.tangents import value_tangent
@@ -105,7 +105,7 @@ def optimal_value(
 def _solve(*arguments: Any) -> Outputs:
     # The Function's bookkeeping takes as long as solving some ten QPs.
     if not is_differentiating():
-        return solve_op(*arguments)
+        return _solve_opaque(*arguments)
     return traceable(QPTangent, QPValue, solve_op)(*arguments)
 
 
@@ -167,8 +167,7 @@ def _checked_keep(qp: QuadraticProgram, fixed: Tensor, keep: int | None) -> int:
 os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
-@torch.library.custom_op("torch_qpmpc::solve", mutates_args=())
-def solve_op(
+def _solve_now(
     H: Tensor,
     q: Tensor,
     c: Tensor,
@@ -214,6 +213,14 @@ def solve_op(
         out(raw.residual),
         out(raw.iterations),
     )
+
+
+solve_op = torch.library.custom_op("torch_qpmpc::solve", _solve_now, mutates_args=())
+
+
+def _solve_opaque(*arguments: Any) -> Outputs:
+    """`solve_op`, or where nothing looks on that needs an operator, what it does: sooner."""
+    return (solve_op if is_traced(arguments[:N_THETA]) else _solve_now)(*arguments)
 
 
 def _report(raw: RawSolution, batch: torch.Size, on_failure: str) -> None:
@@ -316,7 +323,7 @@ class QPValue(torch.autograd.Function):
     # Dynamo counts the parameters to tell this style of Function: no *args here.
     @staticmethod
     def forward(H, q, c, C, b, G, lb, ub, w, fixed, start, keep, solver, on_failure) -> Outputs:
-        return solve_op(H, q, c, C, b, G, lb, ub, w, fixed, start, keep, solver, on_failure)
+        return _solve_opaque(H, q, c, C, b, G, lb, ub, w, fixed, start, keep, solver, on_failure)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:

@@ -85,7 +85,7 @@ class _Scales:
     @classmethod
     def of(cls, p: FlatPrograms) -> _Scales:
         hard, no_lb, no_ub = p.w.isinf(), p.lb.isinf(), p.ub.isinf()
-        weight, shrink = p.soft_w, 1.0 / (1.0 + p.w)
+        weight, shrink = p.w.masked_fill(hard, 0.0), 1.0 / (1.0 + p.w)
         return cls(
             weight,
             soft=(~hard).to(p.w),

@@ -8,6 +8,7 @@ Y, T'HT and GT; fixing the first n_f <= keep entries then only changes a linear 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -72,18 +73,11 @@ class _Affine:
 
     matrix: Tensor
     constant: Tensor
-    last: list[int]
+    last: tuple[int, ...]
 
     @classmethod
     def of(cls, condensed: Condensed, p: FlatPrograms) -> _Affine:
         T, H, G = condensed.T, condensed.H, condensed.G
-        # Rounding in the elimination leaves traces of variables that a row does not contain.
-        size = G.abs()
-        # A row that C implies has nothing else, so the sizes are those before it was eliminated.
-        whole = p.G.abs().bmm(T.abs()).sum(dim=2, keepdim=True)
-        entered = (size > ENTERS * whole).any(dim=0)
-        bounded = ((p.lb > -torch.inf) | (p.ub < torch.inf)).any(dim=0)
-        position = torch.arange(G.shape[2] + 1, device=G.device)
         shift = p.multiply(condensed.G_b, p.b)
         constant = (
             p.multiply(T, p.q, transposed=True) + p.multiply(condensed.H_b, p.b),
@@ -95,8 +89,16 @@ class _Affine:
         return cls(
             torch.cat((H, -G, -G, T), dim=1),
             torch.cat([part.expand(count, -1) for part in constant], dim=1),
-            (F.pad(entered & bounded.unsqueeze(-1), (1, 0)) * position).amax(dim=1).tolist(),
+            _last_entered(condensed, p),
         )
+
+
+def _last_entered(condensed: Condensed, p: FlatPrograms) -> tuple[int, ...]:
+    """`_Affine.last`."""
+    # Rounding in the elimination leaves traces of variables that a row does not contain. A row that
+    # C implies has nothing else, so their sizes are those before it was eliminated.
+    given = kernels.arrays(*(x.cpu() for x in (condensed.G, p.G, condensed.T, p.lb, p.ub)))
+    return tuple(kernels.last_entered(*given, ENTERS).tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +113,7 @@ class Reduced:
         T_v, Y_neg: ``(M, n_z, d)`` and ``(M, n_z, n_c)``.
         matrix, constant: ``(M, d + 2 r + n_z, n_f)`` and ``(B, d + 2 r + n_z)``. What a sample's
             fixed entries make of g, l, u, and of z at v = 0, is ``constant + matrix fixed``.
-        w, minus_w: ``(B, r)``.
-        w_others: ``(B, n_g - r)``, zero where inf: violated, a hard one stays so.
-        place: where ``(others, rows)`` belong, ``(n_g,)``, or None if they are in order.
+        w: ``(B, r)``.
         convex: where H is positive semidefinite, ``(M,)``, or None if it is everywhere.
     """
 
@@ -126,24 +126,12 @@ class Reduced:
     matrix: Tensor
     constant: Tensor
     w: Tensor
-    minus_w: Tensor
-    w_others: Tensor
-    place: Tensor | None
     convex: Tensor | None
 
     @classmethod
     def of(cls, condensed: Condensed, affine: _Affine, p: FlatPrograms, n_f: int) -> Reduced:
-        n_g, n_y = condensed.G.shape[1:]
-        own = [i for i, last in enumerate(affine.last) if last > n_f]
-        alien = [i for i, last in enumerate(affine.last) if last <= n_f]
-        in_order = not own or not alien or alien[-1] < own[0]
-        lower, upper = (range(n_y + k * n_g, n_y + (k + 1) * n_g) for k in (0, 1))
-        moved = [*range(n_f, n_y), *(lower[i] for i in own), *(upper[i] for i in own)]
-        moved += range(n_y + 2 * n_g, affine.matrix.shape[1])
-        rows, others, index = (
-            torch.tensor(i, dtype=torch.int64, device=p.q.device) for i in (own, alien, moved)
-        )
-        H, w = condensed.H[:, n_f:, n_f:].contiguous(), p.w[:, rows]
+        rows, others, moved = _split(affine.last, n_f, condensed.T.shape[1:], p.q.device)
+        H = condensed.H[:, n_f:, n_f:].contiguous()
         return cls(
             rows,
             others,
@@ -151,12 +139,9 @@ class Reduced:
             G=condensed.G[:, rows, n_f:],
             T_v=condensed.T[:, :, n_f:],
             Y_neg=condensed.Y_neg,
-            matrix=affine.matrix[:, index, :n_f],
-            constant=affine.constant[:, index],
-            w=w,
-            minus_w=-w,
-            w_others=p.soft_w[:, others],
-            place=None if in_order else torch.cat((others, rows)).argsort(),
+            matrix=affine.matrix[:, moved, :n_f],
+            constant=affine.constant[:, moved],
+            w=p.w[:, rows],
             convex=None if condensed.surely_convex else _convex(H),
         )
 
@@ -180,18 +165,32 @@ class Reduced:
         if y.is_cpu:
             given = kernels.arrays(lam, y, p.lb, p.ub, p.w, self.rows, self.others)
             return torch.from_numpy(kernels.all_rows(*given, VIOLATED))
-        return self._all_rows(lam, y - y.clamp(p.lb, p.ub))
+        return self._all_rows(p, lam, y)
 
-    def _all_rows(self, lam: Tensor, beyond: Tensor) -> Tensor:
-        """`all_rows` in torch, for any device, from how far y is above (or below) its bounds."""
-        lam = lam.clamp(self.minus_w, self.w)
-        count = self.others.shape[0]
-        if not count:
-            return lam
-        y = beyond[:, :count] if self.place is None else beyond[:, self.others]
-        forced = F.hardshrink(y, VIOLATED).sign_() * self.w_others
-        lam = torch.cat((forced, lam), dim=-1)
-        return lam if self.place is None else lam[:, self.place]
+    def _all_rows(self, p: FlatPrograms, lam: Tensor, y: Tensor) -> Tensor:
+        """`all_rows` in torch, for any device."""
+        beyond = F.hardshrink(y - y.clamp(p.lb, p.ub), VIOLATED)
+        # Violated, a hard row stays so.
+        full = beyond.sign() * p.w.masked_fill(p.w.isinf(), 0.0)
+        full[:, self.rows] = lam.clamp(-self.w, self.w)
+        return full
+
+
+@lru_cache(maxsize=16)
+def _split(
+    last: tuple[int, ...], n_f: int, of_T: tuple[int, int], device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Of `Reduced`: rows, others, and what a sample moves among the rows of `_Affine`."""
+    (n_z, n_y), n_g = of_T, len(last)
+    own = [i for i in range(n_g) if last[i] > n_f]
+    others = [i for i in range(n_g) if last[i] <= n_f]
+    lower, upper = ([n_y + k * n_g + i for i in own] for k in (0, 1))
+    z = n_y + 2 * n_g
+    moved = [*range(n_f, n_y), *lower, *upper, *range(z, z + n_z)]
+    rows, others, moved = (
+        torch.tensor(i, dtype=torch.int64, device=device) for i in (own, others, moved)
+    )
+    return rows, others, moved
 
 
 def _convex(H: Tensor) -> Tensor:
@@ -204,9 +203,10 @@ def _surely_convex(H: Tensor) -> bool:
     """Whether Cholesky factors prove it of all, in a fraction of the time."""
     if not H.shape[-1]:
         return True
-    diagonal = H.diagonal(dim1=-2, dim2=-1)
-    shift = CONVEX * (1.0 + diagonal.amax(-1, keepdim=True))
-    return not torch.linalg.cholesky_ex(H + torch.diag_embed(shift.expand_as(diagonal)))[1].any()
+    shifted = H.clone()
+    diagonal = shifted.diagonal(dim1=-2, dim2=-1)
+    diagonal += CONVEX * (1.0 + diagonal.amax(-1, keepdim=True))
+    return not torch.linalg.cholesky_ex(shifted)[1].any()
 
 
 def condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``function`` in machine code: kept on disk, or where no folder is writable, for the process."""
+    """``function`` in machine code, kept on disk where a folder for that can be written."""
     try:
         return numba.njit(cache=True, error_model="numpy")(function)
     except RuntimeError:
@@ -103,6 +103,81 @@ def all_rows(lam, y, lb, ub, w, rows, others, violated):
 
 
 @compiled
+def units(H, C, G, group, q, b, lb, ub, w, small, large):
+    """cost, length, rows and equalities of `solvers.units.Units`, and whether any is not one."""
+    M, n_g, n_c = len(H), G.shape[1], C.shape[1]
+    of_G, of_C = np.abs(G).sum(axis=2), np.abs(C).sum(axis=2)
+    of_q, of_b = _sizes(q, group, M), _sizes(b, group, M)
+    of_rows, of_w = np.maximum(_sizes(lb, group, M), _sizes(ub, group, M)), _sizes(w, group, M)
+    cost, length = np.empty((M, 1)), np.empty((M, 1))
+    rows, equalities = np.empty((M, n_g)), np.empty((M, n_c))
+    extreme = False
+    for m in range(M):
+        reach = np.concatenate((of_rows[m] / of_G[m], of_b[m] / of_C[m]))
+        reach = np.sort(reach[(reach > 0) & (reach < np.inf)])
+        long = _power_above(reach[(len(reach) - 1) // 2], small, large) if len(reach) else 1.0
+        size = 0.0
+        for j in range(H.shape[1]):
+            size = _larger(size, of_q[m, j] * long)
+            for k in range(H.shape[2]):
+                size = _larger(size, abs(H[m, j, k]) * long**2)
+        if not size > 0:  # a QP without any other cost
+            for j in range(n_g):
+                size = _larger(size, of_w[m, j] * of_G[m, j] * long)
+        cost[m], length[m] = _power_above(size, small, large), long
+        for j in range(n_g):
+            rows[m, j] = _power_above(of_G[m, j] * long, small, large)
+        for j in range(n_c):
+            equalities[m, j] = _power_above(of_C[m, j] * long, small, large)
+        extreme = extreme or cost[m, 0] != 1 or long != 1
+        extreme = extreme or (rows[m] != 1).any() or (equalities[m] != 1).any()
+    return cost, length, rows, equalities, extreme
+
+
+@compiled
+def _sizes(vectors, group, M):
+    """The largest finite sizes ``(M, n)`` of the QPs that share their matrices."""
+    largest = np.zeros((M, vectors.shape[1]))
+    for i in range(max(len(vectors), M)):
+        m = i if len(vectors) == 1 else group[i]
+        for j in range(vectors.shape[1]):
+            size = abs(vectors[i % len(vectors), j])
+            if size < np.inf:  # neither is NaN
+                largest[m, j] = max(largest[m, j], size)
+    return largest
+
+
+@compiled
+def _power_above(size, small, large):
+    """The power of two next above a size, or one if that is ordinary, zero or not finite."""
+    if 0 < size < small or large < size < np.inf:
+        return math.ldexp(1.0, math.frexp(size)[1])
+    return 1.0
+
+
+@compiled
+def last_entered(G, G_z, T, lb, ub, enters):
+    """`condense._Affine.last` of the condensed G ``(M, n_g, n_y)``, and G_z and T that it is of."""
+    last = np.zeros(G.shape[1], np.int64)
+    for j in range(len(last)):
+        bounded = False
+        for i in range(max(len(lb), len(ub))):
+            bounded = bounded or lb[i % len(lb), j] > -np.inf or ub[i % len(ub), j] < np.inf
+        if not bounded:
+            continue
+        for m in range(len(G)):
+            whole = 0.0
+            for k in range(G_z.shape[2]):
+                if G_z[m, j, k] != 0:
+                    whole += abs(G_z[m, j, k]) * np.abs(T[m, k]).sum()
+            for k in range(G.shape[2] - 1, last[j] - 1, -1):
+                if abs(G[m, j, k]) > enters * whole:
+                    last[j] = k + 1
+                    break
+    return last
+
+
+@compiled
 def recall(free, push, group, codes, lower, upper, w, slip, max_steps, max_passes):
     """v ``(B, d)``, lam ``(B, r)`` and steps ``(B,)`` of `solvers.recall.recall`.
 
@@ -120,12 +195,13 @@ def recall(free, push, group, codes, lower, upper, w, slip, max_steps, max_passe
         changed = True
         while changed and steps[i] < max_steps:
             steps[i] += 1
-            vy[i], lam[i] = free[i], 0.0
+            vy[i] = free[i]
             k = 0
             for j in range(r):
+                lam[i, j] = 0.0
                 if abs(code[j]) == 2:
                     lam[i, j] = math.copysign(w[i, j], code[j])
-                    vy[i] -= lam[i, j] * by[j]
+                    _subtract(vy[i], lam[i, j], by[j])
                 elif code[j] != 0:
                     held[k] = j
                     k += 1
@@ -143,37 +219,42 @@ def recall(free, push, group, codes, lower, upper, w, slip, max_steps, max_passe
                 _solve_factorised(factor, pull, k)
                 for a in range(k):
                     lam[i, held[a]] += pull[a]
-                    vy[i] -= pull[a] * by[held[a]]
+                    _subtract(vy[i], pull[a], by[held[a]])
             changed = _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i], slip)
     return vy[:, :d].copy(), lam, steps
 
 
 @compiled
+def _subtract(x, factor, y):
+    for j in range(len(x)):
+        x[j] -= factor * y[j]
+
+
+@compiled
 def _factorise(by, held, k, d, factor):
-    """Cholesky's L of the held rows and columns of K; whether there is one."""
+    """Cholesky's upper factor of the held rows and columns of K; whether there is one."""
     for a in range(k):
-        for b in range(a + 1):
-            entry = by[held[a], d + held[b]]
-            for e in range(b):
-                entry -= factor[a, e] * factor[b, e]
-            if a > b:
-                factor[a, b] = entry / factor[b, b]
-            elif entry > 0:
-                factor[a, a] = math.sqrt(entry)
-            else:
-                return False
+        for b in range(a, k):
+            factor[a, b] = by[held[a], d + held[b]]
+    for a in range(k):
+        if not factor[a, a] > 0:
+            return False
+        root = math.sqrt(factor[a, a])
+        for b in range(a, k):
+            factor[a, b] /= root
+        for b in range(a + 1, k):
+            _subtract(factor[b, b:k], factor[a, b], factor[a, b:k])
     return True
 
 
 @compiled
 def _solve_factorised(factor, x, k):
     for a in range(k):
-        for e in range(a):
-            x[a] -= factor[a, e] * x[e]
         x[a] /= factor[a, a]
+        _subtract(x[a + 1 : k], x[a], factor[a, a + 1 : k])
     for a in range(k - 1, -1, -1):
-        for e in range(a + 1, k):
-            x[a] -= factor[e, a] * x[e]
+        for b in range(a + 1, k):
+            x[a] -= factor[a, b] * x[b]
         x[a] /= factor[a, a]
 
 

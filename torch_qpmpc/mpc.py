@@ -111,6 +111,7 @@ class QPMPC(nn.Module):
     discount: Tensor
     slack_discount: Tensor
     soft: Tensor
+    hardness: Tensor
 
     def __init__(
         self,
@@ -161,8 +162,8 @@ class QPMPC(nn.Module):
         self.solver, self.on_failure = given["solver"], given["on_failure"]
         self.learned = tuple(name for name in (*COST, *CONSTRAINTS) if name in learn)
         self.register_buffer("C_0", theta["C"].to(torch.float64))
-        self._derive()
         self.register_buffer("soft", theta["w"].isfinite())
+        self._derive()
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
         for name, start in theta.items():
@@ -316,7 +317,7 @@ class QPMPC(nn.Module):
                 G=self.G,
                 lb=self._limits(self.lb),
                 ub=self._limits(self.ub),
-                w=torch.where(self.soft, self.slack_discount * self.w, torch.inf),
+                w=torch.addcmul(self.hardness, self.slack_discount, self.w),
                 check_values=False,
             )
 
@@ -363,8 +364,10 @@ class QPMPC(nn.Module):
         """What follows from the arguments and is no part of the state, like C_0."""
         discount, of_rows = self._layout.discounts(self.gamma)
         weights = of_rows if self._arguments["discount_slack"] else torch.ones_like(of_rows)
-        for name, derived in (("discount", discount), ("slack_discount", weights)):
-            self.register_buffer(name, derived.to(self.C_0), persistent=False)
+        hardness = torch.where(self.soft, 0.0, torch.inf)
+        derived = {"discount": discount, "slack_discount": weights, "hardness": hardness}
+        for name, buffer in derived.items():
+            self.register_buffer(name, buffer.to(self.C_0), persistent=False)
         for part in self.modules():
             if isinstance(part, Tied):
                 part.place(self.C_0.device)

@@ -102,11 +102,11 @@ class FlatPrograms:
 
     @classmethod
     def _flat(cls, theta: Sequence[Tensor], batch: torch.Size, fixed: Tensor) -> FlatPrograms:
-        *_, lb, ub, _ = theta
-        rounded = (lb > ub) & ~crossed(lb, ub)
+        lb, ub = theta[6:8]
+        swapped = lb > ub
         H, q, c, C, b, G, lb, ub, w = (tensor.to(fixed) for tensor in theta)
-        if rounded.any():
-            lb = torch.where(rounded, ub, lb)
+        if swapped.any():
+            lb = torch.where(swapped & ~crossed(*theta[6:8]), ub, lb)
         matrices = ((H + H.mT) / 2.0, C, G)
         of_matrices = broadcast(*(m.shape[:-2] for m in matrices))
         count = of_matrices.numel()
@@ -128,11 +128,6 @@ class FlatPrograms:
         if name not in self._known:
             self._known[name] = make()
         return self._known[name]
-
-    @property
-    def soft_w(self) -> Tensor:
-        """w with zeros on hard rows."""
-        return self.known("soft w", lambda: self.w.masked_fill(self.w.isinf(), 0.0))
 
     def take(self, index: Tensor) -> FlatPrograms:
         """The QPs at ``index``, with the matrices as they are."""

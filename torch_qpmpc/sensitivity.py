@@ -19,10 +19,11 @@ with a zero multiplier) the solution has a kink, and this is one of its one-side
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd import forward_ad
 
 from torch_qpmpc.batching import align, broadcast, flatten, outer, sum_to
@@ -305,6 +306,22 @@ def traceable(eager: Any, compiled: Any, operator: Any) -> Any:
             "Leave this function out: torch.compiler.disable.",
         )
     return compiled.apply
+
+
+def is_traced(tensors: Iterable[Tensor]) -> bool:
+    """Whether anything but plain tensors may be at work, from which the solvers must be hidden."""
+    core = torch._C
+    return (
+        torch.compiler.is_compiling()
+        or core._len_torch_dispatch_stack() > 0  # fake tensors, traces
+        or core._len_torch_function_stack() > 0  # a default device
+        or core._get_tracing_state() is not None
+        or bool(_transforms())
+        or any(type(x) not in _PLAIN or x.is_meta for x in tensors)
+    )
+
+
+_PLAIN = (Tensor, nn.Parameter)
 
 
 @torch.compiler.assume_constant_result

@@ -22,7 +22,7 @@ from torch_qpmpc import (
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.programs import SoftQPs
 from torch_qpmpc.qp import UNKNOWN
-from torch_qpmpc.solvers import BACKENDS, OWN_WARM_STARTS, Answer, Backend, daqp
+from torch_qpmpc.solvers import BACKENDS, OWN_WARM_STARTS, Answer, Backend, chain, daqp
 
 BATCH = 6
 
@@ -129,27 +129,32 @@ def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, asked,
     if own:
         monkeypatch.setitem(OWN_WARM_STARTS, "recorder", misled)
     known = known_qp(2, batch=(BATCH,))
-    active = solve(known, solver="daqp").active
-    if not own:
-        active = -active
+    active = -solve(known, solver="daqp").active
     with SolveLog() as log:
         assert_right(solve(known, solver="recorder", warm_start=active), known)
     assert asked == [BATCH]
     assert (log.fallback, log.recalled) == (0, 0)
 
 
-@pytest.mark.parametrize("own", [False, True])
-def test_a_known_active_set_spares_the_backend(monkeypatch, asked, own):
-    if own:
-        monkeypatch.setitem(OWN_WARM_STARTS, "recorder", daqp.solve)
+def test_a_known_active_set_spares_the_backend(asked):
     known = known_qp(3, batch=(BATCH,))
     active = solve(known, solver="daqp").active
     active[2:4] = UNKNOWN
     with SolveLog() as log:
         assert_right(solve(known, solver="recorder", warm_start=active), known)
-    # One that starts from active sets itself gets those that are not known, too.
-    assert asked == ([] if own else [2])
+    assert asked == [2]
     assert (log.fallback, log.recalled) == (0, BATCH - 2)
+
+
+def test_a_backend_that_starts_from_active_sets_gets_those_that_recall_leaves(monkeypatch, asked):
+    monkeypatch.setitem(OWN_WARM_STARTS, "recorder", daqp.solve)
+    monkeypatch.setattr(chain, "recall", lambda qps, active: LIES["v off"](daqp.solve(qps)))
+    known = known_qp(3, batch=(BATCH,))
+    active = solve(known, solver="daqp").active
+    with SolveLog() as log:
+        assert_right(solve(known, solver="recorder", warm_start=active), known)
+    assert asked == []
+    assert (log.fallback, log.recalled) == (0, BATCH)
 
 
 @pytest.mark.parametrize("one", range(BATCH))

@@ -14,7 +14,6 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.programs import SoftQPs
 from torch_qpmpc.solvers import daqp, interior_point, proxqp, qpsolvers
 from torch_qpmpc.solvers.answer import Answer
-from torch_qpmpc.solvers.recall import recall
 
 Backend = Callable[[SoftQPs], Answer]
 WarmStart = Callable[..., Answer]
@@ -25,7 +24,7 @@ BACKENDS: dict[str, Backend] = {
     "torch": interior_point.solve,
 }
 
-#: Of the backends that are better than `recall` at starting from active sets: solve(qps, active).
+#: What solves from active sets ``(B, r)`` that `recall` could not mend: solve(qps, active).
 OWN_WARM_STARTS: dict[str, WarmStart] = {"daqp": daqp.solve}
 
 
@@ -46,14 +45,9 @@ def backend(name: str) -> Backend:
     )
 
 
-def warm_start(name: str) -> WarmStart:
-    """What solves QPs from active sets ``(B, r)`` before the backend called ``name`` is asked."""
-    return OWN_WARM_STARTS.get(name, recall)
-
-
 def fallbacks(name: str) -> list[Backend]:
     """Who solves what the certificate rejects: every other backend, cold."""
     return [other for known, other in BACKENDS.items() if known != name]
 
 
-__all__ = ["BACKENDS", "Answer", "Backend", "backend", "fallbacks", "warm_start"]
+__all__ = ["BACKENDS", "OWN_WARM_STARTS", "Answer", "Backend", "backend", "fallbacks"]

@@ -16,14 +16,15 @@ from torch_qpmpc.condense import Reduced, condensed_for
 from torch_qpmpc.programs import FlatPrograms, SoftQPs
 from torch_qpmpc.qp import Status
 from torch_qpmpc.solvers import (
+    OWN_WARM_STARTS,
     Answer,
     backend,
     fallbacks,
 )
 from torch_qpmpc.solvers.crossover import refine
 from torch_qpmpc.solvers.diagnose import diagnose
-from torch_qpmpc.solvers.recall import recall
 from torch_qpmpc.solvers.raw import RawSolution, unsolved
+from torch_qpmpc.solvers.recall import recall
 from torch_qpmpc.solvers.units import units_of
 
 #: A rejected claim with a relative residual up to this is worth sharpening.
@@ -126,8 +127,9 @@ class _Chain:
 
     def run(self, solver: str, start: Tensor | None) -> RawSolution:
         if start is not None:
-            self.recall(start)
-        self.attempt(backend(solver))
+            self.recall(solver, start)
+        if len(self.todo) or self.raw is None:
+            self.attempt(backend(solver))
         self.rejected = self.todo.shape[0]
         if self.rejected:
             assert self.raw is not None
@@ -136,11 +138,12 @@ class _Chain:
             self.raw.status[self.todo] = _reasons(part, self.reduced_for(part))
             self.todo = self.todo[self.raw.status[self.todo] != Status.INFEASIBLE]
         for other in fallbacks(solver):
-            self.attempt(other)
+            if len(self.todo):
+                self.attempt(other)
         assert self.raw is not None
         return self.raw
 
-    def recall(self, start: Tensor) -> None:
+    def recall(self, solver: str, start: Tensor) -> None:
         """Try the active sets ``start`` ``(B, n_g)`` that are known: whose codes are codes."""
         known = ((start >= -2) & (start <= 2)).all(-1)
         everything, before = self.todo, int(known[self.todo].sum())
@@ -150,6 +153,8 @@ class _Chain:
         if not whole:
             self.todo = everything[known[everything]]
         self.attempt(recall, start)
+        if solver in OWN_WARM_STARTS and len(self.todo):
+            self.attempt(OWN_WARM_STARTS[solver], start)
         self.recalled = before - len(self.todo)
         if not whole:
             self.todo = torch.cat((self.todo, everything[~known[everything]])).sort().values
@@ -167,8 +172,6 @@ class _Chain:
 
         A warm start gets its part of the active sets ``start``; what it misses is not sharpened.
         """
-        if not self.todo.shape[0] and self.raw is not None:
-            return
         part = self.part()
         reduced = self.reduced_for(part)
         qps, particular = reduced.at(part)

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from torch_qpmpc import kernels
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.solvers.raw import RawSolution
 
@@ -40,21 +40,10 @@ class Units:
         """The units of ``p``, or None where all of them are one."""
         if not len(p) or not p.q.shape[-1]:
             return None
-        # Some thirty operations on small arrays, for which torch takes several times as long.
-        parts = (p.H, p.C, p.G, p.q, p.b, p.lb, p.ub, p.w)
-        H, C, G, *vectors = (np.abs(part.cpu().numpy()) for part in parts)
-        group = p.group.cpu().numpy() if len(H) > 1 else None
-        q, b, lb, ub, w = (_per_triple(_finite(vector), len(H), group) for vector in vectors)
-        C, G = C.sum(-1), G.sum(-1)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            length = _unit(_median(np.concatenate((np.maximum(lb, ub) / G, b / C), axis=-1)))
-            cost = np.maximum(q.max(-1, keepdims=True) * length, H.max((1, 2))[:, None] * length**2)
-            if w.shape[-1]:  # of a QP without any other cost
-                cost = np.where(cost > 0, cost, (w * G).max(-1, keepdims=True) * length)
-            units = (_unit(cost), length, _unit(G * length), _unit(C * length))
-        if all((unit == 1.0).all() for unit in units):
-            return None
-        return cls(*(torch.from_numpy(unit).to(p.q) for unit in units))
+        parts = (p.H, p.C, p.G, p.group, p.q, p.b, p.lb, p.ub, p.w)
+        given = kernels.arrays(*(part.cpu() for part in parts))
+        *units, extreme = kernels.units(*given, SMALL, LARGE)
+        return cls(*(torch.from_numpy(unit).to(p.q) for unit in units)) if extreme else None
 
     def scaled(self, p: FlatPrograms) -> FlatPrograms:
         """The same QPs in these units."""
@@ -106,36 +95,3 @@ class Units:
 def units_of(p: FlatPrograms) -> Units | None:
     """`Units.of` once for a theta."""
     return p.known("units", lambda: Units.of(p))
-
-
-def _finite(sizes: np.ndarray) -> np.ndarray:
-    """Zeros for what is infinite or NaN and says nothing of sizes; in place."""
-    sizes[~np.isfinite(sizes)] = 0.0
-    return sizes
-
-
-def _per_triple(sizes: np.ndarray, count: int, group: np.ndarray | None) -> np.ndarray:
-    """The largest ``(B or 1, n)`` of the QPs that share their matrices, ``(M, n)``."""
-    if group is None:
-        return sizes.max(0, keepdims=True)
-    largest = np.zeros((count, sizes.shape[-1]))
-    np.maximum.at(largest, group, np.broadcast_to(sizes, (len(group), sizes.shape[-1])))
-    return largest
-
-
-def _median(sizes: np.ndarray) -> np.ndarray:
-    """The (lower) median of the positive finite sizes of each row, ``(M, 1)``; inf if none is."""
-    known = (sizes > 0) & (sizes < np.inf)
-    ordered = np.sort(np.where(known, sizes, np.inf), axis=-1)
-    if not ordered.shape[-1]:
-        return np.full((len(sizes), 1), np.inf)
-    middle = np.maximum(known.sum(-1, keepdims=True) - 1, 0) // 2
-    return np.take_along_axis(ordered, middle, axis=-1)
-
-
-def _unit(sizes: np.ndarray) -> np.ndarray:
-    """The power of two next above each size, or one if that is ordinary, zero or not finite."""
-    extreme = ((sizes > 0) & (sizes < SMALL)) | ((sizes > LARGE) & (sizes < np.inf))
-    if not extreme.any():
-        return np.ones_like(sizes)
-    return np.where(extreme, np.ldexp(1.0, np.frexp(sizes)[1]), 1.0)
