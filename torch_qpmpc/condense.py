@@ -245,10 +245,10 @@ def _eliminate(C: Tensor, keep: int) -> tuple[Tensor, Tensor] | None:
     if not all(eliminated):
         return None
     M, n_c, n_z = C.shape
-    T, Y = (np.array(part) for part in zip(*eliminated, strict=True)) if M else ((), ())
-    shapes = (M, n_z, n_z - n_c), (M, n_z, n_c)
-    T, Y = (torch.as_tensor(x).reshape(n).to(C) for x, n in zip((T, Y), shapes, strict=True))
-    return T, Y
+    if not M:
+        return C.new_zeros(M, n_z, n_z - n_c), C.new_zeros(M, n_z, n_c)
+    T, Y = (np.stack(part) for part in zip(*eliminated, strict=True))
+    return torch.from_numpy(T).to(C), torch.from_numpy(Y).to(C)
 
 
 def _eliminate_one(C: np.ndarray, keep: int) -> tuple[np.ndarray, np.ndarray] | None:

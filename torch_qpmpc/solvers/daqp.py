@@ -31,31 +31,37 @@ def solve(qps: SoftQPs, active: Tensor | None = None) -> Answer:
     """
     arrays = qps.arrays()
     codes = None if active is None else active.cpu().numpy()
-    hard = np.isinf(arrays.w)
-    kinds = _alike(arrays.group, hard)
+    kinds = _alike(arrays)
     if len(kinds) == 1:
-        return Answer.like(qps.g, *_solve_alike(arrays, hard[0], codes))
+        return Answer.like(qps.g, *_solve_alike(arrays, codes))
     v, lam = np.zeros_like(arrays.g), np.zeros_like(arrays.l)
     iterations = np.zeros(len(v), dtype=np.int64)
     for i in kinds:
         part = SoftArrays(arrays.H, arrays.G, *(vectors[i] for vectors in arrays[2:]))
         start = None if codes is None else codes[i]
-        v[i], lam[i], iterations[i] = _solve_alike(part, hard[i[0]], start)
+        v[i], lam[i], iterations[i] = _solve_alike(part, start)
     return Answer.like(qps.g, v, lam, iterations)
 
 
-def _alike(group: np.ndarray, hard: np.ndarray) -> list[np.ndarray]:
+def _alike(arrays: SoftArrays) -> list[np.ndarray]:
     """The indices of QPs that share their matrices and their pattern of hard rows."""
-    if len(group) and (group == group[0]).all() and (hard == hard[0]).all():
+    group, hard = arrays.group, np.isinf(_distinct(arrays.w))
+    if len(arrays.H) == 1 and len(group) and (hard == hard[0]).all():
         return [np.arange(len(group))]
+    hard = np.broadcast_to(hard, arrays.w.shape)
     kinds: dict[tuple, list[int]] = {}
     for i, (m, pattern) in enumerate(zip(group, hard, strict=True)):
         kinds.setdefault((m, pattern.tobytes()), []).append(i)
     return [np.array(members) for members in kinds.values()]
 
 
+def _distinct(vectors: np.ndarray) -> np.ndarray:
+    """One row where it is repeated for the batch, without a copy."""
+    return vectors[:1] if vectors.strides[0] == 0 else vectors
+
+
 def _solve_alike(
-    arrays: SoftArrays, hard: np.ndarray, start: np.ndarray | None
+    arrays: SoftArrays, start: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """v, lam and iterations by one model; with another pattern of soft rows, it corrupts memory."""
     _, _, (m, *_), g, lower, upper, w = arrays
@@ -63,8 +69,11 @@ def _solve_alike(
     iterations = np.zeros(len(g), dtype=np.int64)
     upper, lower = np.minimum(upper, NO_BOUND), np.maximum(lower, -NO_BOUND)
     # A row that may be violated for nothing is no row; DAQP would hold it with its small rho.
+    w = _distinct(w)
+    hard = np.isinf(w[0])
     if not w.all():
-        upper[w == 0], lower[w == 0] = NO_BOUND, -NO_BOUND
+        free = np.broadcast_to(w == 0, upper.shape)
+        upper[free], lower[free] = NO_BOUND, -NO_BOUND
     weight = np.where(hard, 0.0, w)
     same_weight = (weight == weight[0]).all()
     empty = np.where(hard, 0, SOFT).astype(np.int32)
