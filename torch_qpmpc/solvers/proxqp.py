@@ -22,6 +22,8 @@ EPS_ABS = 1e-9
 EPS_INFEASIBLE = 1e-12
 #: Its defaults, 10,000 x 1,500, can keep one infeasible QP busy for half a minute.
 MAX_ITER, MAX_ITER_IN = 300, 100
+#: Of 10 by default, which take a tenth of the time and save no iteration.
+REFINEMENTS = 2
 
 _forked = False
 
@@ -75,4 +77,6 @@ def _configure(settings: proxqp.Settings) -> None:
     settings.eps_duality_gap_abs = EPS_ABS
     settings.eps_duality_gap_rel = EPS_ABS
     settings.max_iter, settings.max_iter_in = MAX_ITER, MAX_ITER_IN
-    settings.initial_guess = proxqp.InitialGuess.NO_INITIAL_GUESS
+    settings.nb_iterative_refinement = REFINEMENTS
+    # Spares an iteration in ten against none. Without equalities, it is the unconstrained optimum.
+    settings.initial_guess = proxqp.InitialGuess.EQUALITY_CONSTRAINED_INITIAL_GUESS

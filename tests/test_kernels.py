@@ -1,0 +1,127 @@
+"""The compiled loops against the torch forms of the same, which serve other devices."""
+
+from __future__ import annotations
+
+import numba
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.problems import known_qp, programs_of, random_mpc, random_states, reduced_of, soft_qps
+from torch_qpmpc import certificate, kernels, solve_qp
+from torch_qpmpc.certificate import Products, certify
+from torch_qpmpc.condense import condensed_for
+from torch_qpmpc.programs import FlatPrograms, SoftQPs
+from torch_qpmpc.solvers.recall import MAX_STEPS, _Forces, _recall, recall
+
+BATCH = 6
+SPOILERS = {
+    "nothing": lambda parts: None,
+    "z": lambda parts: parts["z"].mul_(1.1),
+    "lam": lambda parts: parts["lam"].mul_(-3.0),
+    "chi": lambda parts: parts["chi"].add_(0.1),
+    "xi": lambda parts: parts["xi"].sub_(0.1),
+    "large": lambda parts: parts["lam"].mul_(1e9),
+    "NaN in z": lambda parts: parts["z"][1:3].fill_(torch.nan),
+    "NaN in lam": lambda parts: parts["lam"][2, 3:].fill_(torch.nan),
+    "NaN in chi": lambda parts: parts["chi"][0].fill_(torch.nan),
+    "inf in lam": lambda parts: parts["lam"][4, 1].fill_(torch.inf),
+    "inf in z": lambda parts: parts["z"][4, 5].fill_(-torch.inf),
+    "overflow": lambda parts: parts["z"].mul_(1e200),
+}
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+@pytest.mark.parametrize("name", SPOILERS)
+def test_the_certificate_is_that_of_torch(name, matrices):
+    for seed in range(3):
+        known = known_qp(seed, batch=(BATCH,), matrices=matrices)
+        claim = {n: getattr(known, n).clone() for n in ("z", "lam", "chi", "xi")}
+        SPOILERS[name](claim)
+        programs = programs_of(known)
+        products = Products.of(programs, **claim)
+        ours = certify(programs, **claim, products=products)
+        of_torch = certificate._certify(programs, claim["z"], claim["lam"], claim["chi"], products)
+        assert_close(ours.residual, of_torch.residual, rtol=1e-9, atol=1e-13)
+        fine = of_torch.residual.isfinite()
+        assert_close(ours.value[fine], of_torch.value[fine])
+        assert_close(ours.sigma[fine], of_torch.sigma[fine])
+
+
+@pytest.mark.parametrize("hard", [False, True])
+def test_absent_bounds_and_hard_rows_are_judged_as_by_torch(hard):
+    known = known_qp(1, batch=(BATCH,))
+    qp = known.qp
+    lb, ub, w = qp.lb.clone(), qp.ub.clone(), qp.w.clone()
+    lb[..., ::3], ub[..., 1::3] = -torch.inf, torch.inf
+    if hard:
+        w[...] = torch.inf
+    tensors = (qp.H, qp.q, qp.c, qp.C, qp.b, qp.G, lb, ub, w)
+    programs, _ = FlatPrograms.of(*tensors, known.fixed)
+    claim = (known.z, known.lam, known.chi, known.xi)
+    products = Products.of(programs, *claim)
+    ours = certify(programs, *claim, products=products)
+    of_torch = certificate._certify(programs, *claim[:3], products)
+    assert ours.residual.max() > 1e-3
+    for name in ("residual", "value", "sigma"):
+        assert_close(getattr(ours, name), getattr(of_torch, name))
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+def test_all_rows_are_those_of_torch(matrices):
+    for seed in range(4):
+        known = known_qp(seed, batch=(BATCH,), matrices=matrices)
+        programs, reduced = programs_of(known), reduced_of(known)
+        y = programs.times_G(known.z) * 1.5
+        lam = 3 * known.lam[:, reduced.rows]
+        assert_close(reduced.all_rows(programs, lam, y), reduced._all_rows(programs, lam, y))
+
+
+def assert_same_recall(qps: SoftQPs, active: Tensor) -> int:
+    """How many could be compared: those that are not solved at the last step need not be exact."""
+    ours, of_torch = recall(qps, active), _recall(_Forces(qps), qps, active.clone())
+    # Sets of rows that depend on each other have no solution at all.
+    done = (of_torch.iterations < MAX_STEPS) & of_torch.v.isfinite().all(-1)
+    assert torch.equal(ours.iterations[done], of_torch.iterations[done])
+    assert_close(ours.v[done], of_torch.v[done])
+    assert_close(ours.lam[done], of_torch.lam[done])
+    return int(done.sum())
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+def test_recall_is_that_of_torch(matrices):
+    for seed in range(4):
+        known = known_qp(seed, batch=(BATCH,), matrices=matrices)
+        active = solve_qp(known.qp, known.fixed, solver="torch").active[:, reduced_of(known).rows]
+        assert assert_same_recall(soft_qps(known)[0], active) == BATCH
+
+
+@pytest.mark.parametrize("changes", [1, 2, 3])
+def test_recall_corrects_active_sets_as_torch_does(changes):
+    mpc, s = random_mpc(4, horizon=6), random_states(48, size=0.7).double()
+    programs, _ = FlatPrograms.of(*mpc.quadratic_program().tensors(), s)
+    reduced = condensed_for(programs, s.shape[-1]).reduced(programs)
+    active = mpc.solve(s).active[:, reduced.rows]
+    generator = torch.Generator().manual_seed(changes)
+    for codes in active:
+        held = codes.nonzero().squeeze(-1)
+        codes[held[torch.randperm(len(held), generator=generator)[:changes]]] = 0
+    assert assert_same_recall(reduced.at(programs)[0], active) >= 12
+
+
+def test_where_nothing_can_be_written_kernels_are_compiled_each_time(monkeypatch):
+    njit = numba.njit
+
+    def refuses(*arguments, cache=False, **options):
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return njit(*arguments, **options)
+
+    monkeypatch.setattr(numba, "njit", refuses)
+
+    @kernels.compiled
+    def twice(x):
+        return 2 * x
+
+    assert twice(3.0) == 6.0
