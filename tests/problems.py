@@ -152,9 +152,11 @@ def programs_of(known: KnownQP) -> FlatPrograms:
 def soft_qps(known: KnownQP) -> tuple[SoftQPs, Answer]:
     """What a backend is asked, and the exact answer to it."""
     reduced, programs = reduced_of(known), programs_of(known)
-    v = times(torch.linalg.pinv(reduced.T_v), known.z - reduced.at(programs)[1])
+    d = reduced.H.shape[-1]
+    v = known.z - reduced.expand(programs, known.z.new_zeros(len(programs), d))
+    v = times(torch.linalg.pinv(reduced.T[:, :, -d:]), v)
     lam = known.lam.reshape(len(programs), -1)[:, reduced.rows]
-    return reduced.at(programs)[0], Answer(v, lam, torch.zeros_like(programs.group))
+    return reduced.at(programs), Answer(v, lam, torch.zeros_like(programs.group))
 
 
 def reduced_of(known: KnownQP) -> Reduced:

@@ -139,8 +139,8 @@ def test_expanded_variables_satisfy_the_equalities(name):
     C = (REGULAR | DEFICIENT)[name]
     known = known_qp(3, n_z=8, n_f=3, C=C, batch=(5,), hard=())
     programs, reduced = programs_of(known), reduced_of(known)
-    v = normal(5, reduced.T_v.shape[-1])
-    z = reduced.expand(programs, reduced.at(programs)[1], v)
+    v = normal(5, reduced.H.shape[-1])
+    z = reduced.expand(programs, v)
     assert_close(z @ C.mT, known.qp.b)
     assert_close(z[:, :3], known.fixed)
 

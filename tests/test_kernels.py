@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
+
 import numba
 import pytest
 import torch
@@ -13,6 +15,7 @@ from torch_qpmpc import certificate, kernels, solve_qp
 from torch_qpmpc.certificate import Products, certify
 from torch_qpmpc.condense import condensed_for
 from torch_qpmpc.programs import FlatPrograms, SoftQPs
+from torch_qpmpc.solvers import Answer, chain, daqp
 from torch_qpmpc.solvers.recall import MAX_STEPS, _Forces, _recall, recall
 
 BATCH = 6
@@ -68,14 +71,34 @@ def test_absent_bounds_and_hard_rows_are_judged_as_by_torch(hard):
         assert_close(getattr(ours, name), getattr(of_torch, name))
 
 
+def assert_same_solution(monkeypatch, programs: FlatPrograms, answer: Answer, n_f: int) -> None:
+    reduced = condensed_for(programs, n_f).reduced(programs)
+    ours = chain._recover(programs, reduced, answer)
+    with monkeypatch.context() as patch:
+        patch.setattr(chain, "CACHED", -1)
+        of_torch = chain._recover(programs, reduced, answer)
+    for field in fields(ours):
+        one, other = getattr(ours, field.name), getattr(of_torch, field.name)
+        assert_close(one, other, rtol=1e-9, atol=1e-9, equal_nan=True)
+
+
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])
-def test_all_rows_are_those_of_torch(matrices):
+@pytest.mark.parametrize("wrong", [0.0, 0.1, torch.nan])
+def test_the_full_solution_is_that_of_torch(monkeypatch, wrong, matrices):
     for seed in range(4):
         known = known_qp(seed, batch=(BATCH,), matrices=matrices)
-        programs, reduced = programs_of(known), reduced_of(known)
-        y = programs.times_G(known.z) * 1.5
-        lam = 3 * known.lam[:, reduced.rows]
-        assert_close(reduced.all_rows(programs, lam, y), reduced._all_rows(programs, lam, y))
+        _, answer = soft_qps(known)
+        answer = replace(answer, v=answer.v + wrong, lam=3 * answer.lam)
+        assert_same_solution(monkeypatch, programs_of(known), answer, known.fixed.shape[-1])
+
+
+def test_the_full_solution_of_diagonal_matrices_is_that_of_torch(monkeypatch):
+    mpc, s = random_mpc(4, horizon=6), random_states(48, size=0.7).double()
+    programs, _ = FlatPrograms.of(*mpc.quadratic_program().tensors(), s)
+    assert programs.is_diagonal("H")
+    assert programs.is_diagonal("G")
+    answer = daqp.solve(condensed_for(programs, 2).reduced(programs).at(programs))
+    assert_same_solution(monkeypatch, programs, answer, 2)
 
 
 def assert_same_recall(qps: SoftQPs, active: Tensor) -> int:
@@ -107,7 +130,7 @@ def test_recall_corrects_active_sets_as_torch_does(changes):
     for codes in active:
         held = codes.nonzero().squeeze(-1)
         codes[held[torch.randperm(len(held), generator=generator)[:changes]]] = 0
-    assert assert_same_recall(reduced.at(programs)[0], active) >= 12
+    assert assert_same_recall(reduced.at(programs), active) >= 12
 
 
 def test_where_nothing_can_be_written_kernels_are_compiled_each_time(monkeypatch):

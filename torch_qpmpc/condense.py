@@ -66,13 +66,14 @@ class Condensed:
 class _Affine:
     """What a sample moves of the condensed problem, if y = (fixed, v) is: all of it is affine in y.
 
-    Its gradient in y, the bounds of all rows and z: ``(g, l, u, z) = constant + matrix y``, with
-    ``(B or 1, n)`` and ``(M, n, n_y)``. ``last`` says how many variables there are up to the last
-    that enters a row, zero for a row without a finite bound.
+    Its gradient in y and the bounds of all rows: ``(g, l, u) = constant + matrix y``, with
+    ``(B or 1, n)`` and ``(M, n, n_y)``; z_0 ``(B or 1, n_z)`` is z at y = 0. ``last`` says how many
+    variables there are up to the last that enters a row, zero for a row without a finite bound.
     """
 
     matrix: Tensor
     constant: Tensor
+    z_0: Tensor
     last: tuple[int, ...]
 
     @classmethod
@@ -83,12 +84,12 @@ class _Affine:
             p.multiply(T, p.q, transposed=True) + p.multiply(condensed.H_b, p.b),
             p.lb - shift,
             p.ub - shift,
-            -p.multiply(condensed.Y_neg, p.b),
         )
         count = next((len(part) for part in constant if len(part) != 1), 1)
         return cls(
-            torch.cat((H, -G, -G, T), dim=1),
+            torch.cat((H, -G, -G), dim=1),
             torch.cat([part.expand(count, -1) for part in constant], dim=1),
+            -p.multiply(condensed.Y_neg, p.b),
             _last_entered(condensed, p),
         )
 
@@ -110,9 +111,10 @@ class Reduced:
 
     Attributes:
         H, G: ``(M, d, d)`` and ``(M, r, d)``.
-        T_v, Y_neg: ``(M, n_z, d)`` and ``(M, n_z, n_c)``.
-        matrix, constant: ``(M, d + 2 r + n_z, n_f)`` and ``(B, d + 2 r + n_z)``. What a sample's
-            fixed entries make of g, l, u, and of z at v = 0, is ``constant + matrix fixed``.
+        T, Y_neg: ``(M, n_z, n_y)`` and ``(M, n_z, n_c)``.
+        matrix, constant: ``(M, d + 2 r, n_f)`` and ``(B, d + 2 r)``. What a sample's fixed entries
+            make of g, l and u is ``constant + matrix fixed``.
+        z_0: ``(B, n_z)``, z where the fixed entries and v are zero.
         w: ``(B, r)``.
         convex: where H is positive semidefinite, ``(M,)``, or None if it is everywhere.
     """
@@ -121,54 +123,49 @@ class Reduced:
     others: Tensor
     H: Tensor
     G: Tensor
-    T_v: Tensor
+    T: Tensor
     Y_neg: Tensor
     matrix: Tensor
     constant: Tensor
+    z_0: Tensor
     w: Tensor
     convex: Tensor | None
 
     @classmethod
     def of(cls, condensed: Condensed, affine: _Affine, p: FlatPrograms, n_f: int) -> Reduced:
-        rows, others, moved = _split(affine.last, n_f, condensed.T.shape[1:], p.q.device)
+        rows, others, moved = _split(affine.last, n_f, condensed.T.shape[2], p.q.device)
         H = condensed.H[:, n_f:, n_f:].contiguous()
         return cls(
             rows,
             others,
             H=H,
             G=condensed.G[:, rows, n_f:],
-            T_v=condensed.T[:, :, n_f:],
+            T=condensed.T,
             Y_neg=condensed.Y_neg,
             matrix=affine.matrix[:, moved, :n_f],
             constant=affine.constant[:, moved],
+            z_0=affine.z_0,
             w=p.w[:, rows],
             convex=None if condensed.surely_convex else _convex(H),
         )
 
-    def at(self, programs: FlatPrograms) -> tuple[SoftQPs, Tensor]:
-        """What a backend solves, with the rows ``rows``, and z at v = 0, ``(B, n_z)``."""
-        d, r, n_z = self.H.shape[-1], self.rows.shape[0], self.T_v.shape[1]
+    def at(self, programs: FlatPrograms) -> SoftQPs:
+        """What a backend solves, with the rows ``rows``."""
+        d, r = self.H.shape[-1], self.rows.shape[0]
         moved = programs.affine(self.matrix, programs.fixed, self.constant)
-        g, lower, upper, particular = moved.split((d, r, r, n_z), dim=-1)
+        g, lower, upper = moved.split((d, r, r), dim=-1)
         w = self.w.expand(len(programs), -1)
-        return SoftQPs(self.H, self.G, programs.group, g, lower, upper, w), particular
+        return SoftQPs(self.H, self.G, programs.group, g, lower, upper, w)
 
-    def expand(self, programs: FlatPrograms, particular: Tensor, v: Tensor) -> Tensor:
+    def expand(self, p: FlatPrograms, v: Tensor) -> Tensor:
         """The full z ``(B, n_z)`` from the free variables v ``(B, d)``."""
-        return programs.affine(self.T_v, v, particular)
+        return p.affine(self.T, torch.cat((p.fixed, v), dim=-1), self.z_0)
 
     def all_rows(self, p: FlatPrograms, lam: Tensor, y: Tensor) -> Tensor:
         """Multipliers ``(B, n_g)`` from those of ``rows``, ``(B, r)``, and y = G z ``(B, n_g)``.
 
         A row that no free variable enters has w where it is violated.
         """
-        if y.is_cpu:
-            given = kernels.arrays(lam, y, p.lb, p.ub, p.w, self.rows, self.others)
-            return torch.from_numpy(kernels.all_rows(*given, VIOLATED))
-        return self._all_rows(p, lam, y)
-
-    def _all_rows(self, p: FlatPrograms, lam: Tensor, y: Tensor) -> Tensor:
-        """`all_rows` in torch, for any device."""
         beyond = F.hardshrink(y - y.clamp(p.lb, p.ub), VIOLATED)
         # Violated, a hard row stays so.
         full = beyond.sign() * p.w.masked_fill(p.w.isinf(), 0.0)
@@ -178,15 +175,14 @@ class Reduced:
 
 @lru_cache(maxsize=16)
 def _split(
-    last: tuple[int, ...], n_f: int, of_T: tuple[int, int], device: torch.device
+    last: tuple[int, ...], n_f: int, n_y: int, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Of `Reduced`: rows, others, and what a sample moves among the rows of `_Affine`."""
-    (n_z, n_y), n_g = of_T, len(last)
+    n_g = len(last)
     own = [i for i in range(n_g) if last[i] > n_f]
     others = [i for i in range(n_g) if last[i] <= n_f]
     lower, upper = ([n_y + k * n_g + i for i in own] for k in (0, 1))
-    z = n_y + 2 * n_g
-    moved = [*range(n_f, n_y), *lower, *upper, *range(z, z + n_z)]
+    moved = [*range(n_f, n_y), *lower, *upper]
     rows, others, moved = (
         torch.tensor(i, dtype=torch.int64, device=device) for i in (own, others, moved)
     )

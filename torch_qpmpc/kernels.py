@@ -36,70 +36,141 @@ def _larger(x, y):
 
 
 @compiled
+def recover(
+    v, lam_v, group, fixed, at_zero, T_T, Y_neg, C, C_T, H, G, G_T, diagonal, rows, others,
+    q, c, b, lb, ub, w, violated,
+):  # fmt: skip
+    """Value, z, sigma, chi, lam, xi and residual of `solvers.chain.recover`.
+
+    ``at_zero`` ``(B or 1, n_z)`` is z where the fixed entries and v are zero, ``T_T``, ``C_T`` and
+    ``G_T`` are transposes, and ``diagonal`` says of H and G whether they have nothing else.
+    """
+    n_qps, n_z, n_f = len(v), H.shape[2], fixed.shape[1]
+    value, residual = np.empty(n_qps), np.empty(n_qps)
+    z, xi = np.empty((n_qps, n_z)), np.empty((n_qps, n_f))
+    chi, lam = np.zeros((n_qps, C.shape[1])), np.zeros((n_qps, G.shape[1]))
+    sigma = np.zeros(lam.shape)
+    Hz, G_lam, C_chi, left = np.empty(n_z), np.empty(n_z), np.empty(n_z), np.empty(n_z)
+    y, Cz, y_i = np.empty(G.shape[1]), np.empty(C.shape[1]), np.empty(T_T.shape[1])
+    for i in range(n_qps):
+        m = group[i]
+        lb_i, ub_i, w_i = lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)]
+        z[i] = at_zero[i % len(at_zero)]
+        y_i[:n_f], y_i[n_f:] = fixed[i], v[i]
+        _add_product(z[i], y_i, T_T[m])
+        _product(Hz, z[i], H[m], diagonal[0])
+        _product(y, z[i], G_T[m], diagonal[1])
+        for k in range(len(rows)):
+            push, most = lam_v[i, k], w_i[rows[k]]
+            lam[i, rows[k]] = most if push > most else -most if push < -most else push
+        for j in others:
+            if w_i[j] < np.inf:  # violated, a hard row stays so
+                if y[j] - ub_i[j] > violated:
+                    lam[i, j] = w_i[j]
+                elif lb_i[j] - y[j] > violated:
+                    lam[i, j] = -w_i[j]
+        _product(G_lam, lam[i], G[m], diagonal[1])
+        for j in range(n_z):
+            left[j] = Hz[j] + q[i % len(q), j] + G_lam[j]
+        _product(chi[i], left, Y_neg[m], False)
+        _product(C_chi, chi[i], C[m], False)
+        _add(left, 1.0, C_chi)
+        for j in range(n_f):
+            xi[i, j], left[j] = -left[j], 0.0 * left[j]
+        _product(Cz, z[i], C_T[m], False)
+        value[i], residual[i] = _judge(
+            z[i], Hz, G_lam, C_chi, left, y, lam[i], chi[i], Cz, fixed[i],
+            q[i % len(q)], c[i % len(c)], b[i % len(b)], lb_i, ub_i, w_i, sigma[i],
+        )  # fmt: skip
+    return value, z, sigma, chi, lam, xi, residual
+
+
+@compiled
 def judge(z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w):
     """Value ``(B,)``, sigma ``(B, n_g)`` and residual ``(B,)`` of `certificate.certify`."""
-    n_qps, n_z = z.shape
-    value, residual = np.empty(n_qps), np.empty(n_qps)
-    sigma = np.zeros(y.shape)
+    n_qps = len(z)
+    value, residual, sigma = np.empty(n_qps), np.empty(n_qps), np.zeros(y.shape)
     for i in range(n_qps):
-        q_i, b_i, lb_i, ub_i = q[i % len(q)], b[i % len(b)], lb[i % len(lb)], ub[i % len(ub)]
-        w_i = w[i % len(w)]
-        cost = slip = slope = force = length = error = 0.0
-        for j in range(n_z):
-            at, unmet = abs(z[i, j]), abs(left[i, j])
-            force = _larger(force, _larger(abs(q_i[j]), abs(Hz[i, j])))
-            force = _larger(force, _larger(abs(G_lam[i, j]), abs(C_chi[i, j])))
-            slope, length = _larger(slope, unmet), _larger(length, at)
-            cost += (q_i[j] + 0.5 * Hz[i, j]) * z[i, j]
-            slip += unmet * at
-        for j in range(fixed.shape[1]):
-            error = _larger(error, abs(z[i, j] - fixed[i, j]))
-        short = size = 0.0
-        for j in range(chi.shape[1]):
-            unmet = abs(Cz[i, j] - b_i[j])
-            short, size = _larger(short, unmet), _larger(size, abs(b_i[j]))
-            slip += unmet * abs(chi[i, j])
-        for j in range(y.shape[1]):
-            at, push, weight, above, below = y[i, j], lam[i, j], w_i[j], ub_i[j], lb_i[j]
-            outside = at - above if at > above else below - at if at < below else 0.0
-            # NaN is neither, and stays.
-            up, down = 0.0 if push < 0 else push, 0.0 if push > 0 else push
-            if above == np.inf:
-                above, error = 0.0, _larger(error, up)
-            if below == -np.inf:
-                below, error = 0.0, _larger(error, -down)
-            charge = 0.0
-            if weight == np.inf:
-                error = _larger(error, outside / (1.0 + abs(at)))
-            else:
-                sigma[i, j], charge = outside, outside * weight
-                error = _larger(error, (abs(push) - weight) / (1.0 + weight))
-            cost += charge
-            slip += abs(charge + (above - at) * up + (below - at) * down)
-        error = _larger(error, slope / (1.0 + force))
-        error = _larger(error, short / (1.0 + size + length))
-        error = _larger(error, slip / (1.0 + abs(cost)))
-        residual[i] = np.inf if error != error else error
-        value[i] = cost + c[i % len(c)]
+        value[i], residual[i] = _judge(
+            z[i], Hz[i], G_lam[i], C_chi[i], left[i], y[i], lam[i], chi[i], Cz[i], fixed[i],
+            q[i % len(q)], c[i % len(c)], b[i % len(b)],
+            lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)], sigma[i],
+        )  # fmt: skip
     return value, sigma, residual
 
 
 @compiled
-def all_rows(lam, y, lb, ub, w, rows, others, violated):
-    """`condense.Reduced.all_rows`."""
-    full = np.zeros(y.shape)
-    for i in range(len(y)):
-        lb_i, ub_i, w_i = lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)]
-        for k in range(len(rows)):
-            push, most = lam[i, k], w_i[rows[k]]
-            full[i, rows[k]] = most if push > most else -most if push < -most else push
-        for j in others:
-            if w_i[j] < np.inf:
-                if y[i, j] - ub_i[j] > violated:
-                    full[i, j] = w_i[j]
-                elif lb_i[j] - y[i, j] > violated:
-                    full[i, j] = -w_i[j]
-    return full
+def _judge(z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w, sigma):
+    """Value and residual of one claim; fills in its sigma."""
+    cost = slip = slope = force = length = error = 0.0
+    for j in range(len(z)):
+        at, unmet = abs(z[j]), abs(left[j])
+        force = _larger(force, _larger(abs(q[j]), abs(Hz[j])))
+        force = _larger(force, _larger(abs(G_lam[j]), abs(C_chi[j])))
+        slope, length = _larger(slope, unmet), _larger(length, at)
+        cost += (q[j] + 0.5 * Hz[j]) * z[j]
+        slip += unmet * at
+    for j in range(len(fixed)):
+        error = _larger(error, abs(z[j] - fixed[j]))
+    short = size = 0.0
+    for j in range(len(chi)):
+        unmet = abs(Cz[j] - b[j])
+        short, size = _larger(short, unmet), _larger(size, abs(b[j]))
+        slip += unmet * abs(chi[j])
+    for j in range(len(y)):
+        at, push, weight, above, below = y[j], lam[j], w[j], ub[j], lb[j]
+        outside = at - above if at > above else below - at if at < below else 0.0
+        # NaN is neither, and stays.
+        up, down = 0.0 if push < 0 else push, 0.0 if push > 0 else push
+        if above == np.inf:
+            above, error = 0.0, _larger(error, up)
+        if below == -np.inf:
+            below, error = 0.0, _larger(error, -down)
+        charge = 0.0
+        if weight == np.inf:
+            error = _larger(error, outside / (1.0 + abs(at)))
+        else:
+            sigma[j], charge = outside, outside * weight
+            error = _larger(error, (abs(push) - weight) / (1.0 + weight))
+        cost += charge
+        slip += abs(charge + (above - at) * up + (below - at) * down)
+    error = _larger(error, slope / (1.0 + force))
+    error = _larger(error, short / (1.0 + size + length))
+    error = _larger(error, slip / (1.0 + abs(cost)))
+    return cost + c, np.inf if error != error else error
+
+
+@compiled
+def _add(x, factor, y):
+    """x += factor y."""
+    for j in range(len(x)):
+        x[j] += factor * y[j]
+
+
+@compiled
+def _product(x, factors, matrix, diagonal):
+    """x = matrix' factors."""
+    if diagonal:
+        for j in range(len(x)):
+            x[j] = factors[j] * matrix[j, j]
+    else:
+        x[:] = 0.0
+        _add_product(x, factors, matrix)
+
+
+@compiled
+def _add_product(x, factors, matrix):
+    """x += matrix' factors, four rows at a time: x is read and written as much less often."""
+    whole = len(factors) - len(factors) % 4
+    for j in range(0, whole, 4):
+        f, g, h, p = factors[j], factors[j + 1], factors[j + 2], factors[j + 3]
+        for k in range(len(x)):
+            x[k] += (f * matrix[j, k] + g * matrix[j + 1, k]) + (
+                h * matrix[j + 2, k] + p * matrix[j + 3, k]
+            )
+    for j in range(whole, len(factors)):
+        for k in range(len(x)):
+            x[k] += factors[j] * matrix[j, k]
 
 
 @compiled
@@ -201,7 +272,7 @@ def recall(free, push, group, codes, lower, upper, w, slip, max_steps, max_passe
                 lam[i, j] = 0.0
                 if abs(code[j]) == 2:
                     lam[i, j] = math.copysign(w[i, j], code[j])
-                    _subtract(vy[i], lam[i, j], by[j])
+                    _add(vy[i], -lam[i, j], by[j])
                 elif code[j] != 0:
                     held[k] = j
                     k += 1
@@ -219,15 +290,9 @@ def recall(free, push, group, codes, lower, upper, w, slip, max_steps, max_passe
                 _solve_factorised(factor, pull, k)
                 for a in range(k):
                     lam[i, held[a]] += pull[a]
-                    _subtract(vy[i], pull[a], by[held[a]])
+                    _add(vy[i], -pull[a], by[held[a]])
             changed = _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i], slip)
     return vy[:, :d].copy(), lam, steps
-
-
-@compiled
-def _subtract(x, factor, y):
-    for j in range(len(x)):
-        x[j] -= factor * y[j]
 
 
 @compiled
@@ -242,8 +307,10 @@ def _factorise(by, held, k, d, factor):
         root = math.sqrt(factor[a, a])
         for b in range(a, k):
             factor[a, b] /= root
+        # Slices of rows, to pass on, would take as long as such loops.
         for b in range(a + 1, k):
-            _subtract(factor[b, b:k], factor[a, b], factor[a, b:k])
+            for e in range(b, k):
+                factor[b, e] -= factor[a, b] * factor[a, e]
     return True
 
 
@@ -251,7 +318,8 @@ def _factorise(by, held, k, d, factor):
 def _solve_factorised(factor, x, k):
     for a in range(k):
         x[a] /= factor[a, a]
-        _subtract(x[a + 1 : k], x[a], factor[a, a + 1 : k])
+        for b in range(a + 1, k):
+            x[b] -= x[a] * factor[a, b]
     for a in range(k - 1, -1, -1):
         for b in range(a + 1, k):
             x[a] -= factor[a, b] * x[b]

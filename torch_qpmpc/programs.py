@@ -171,12 +171,18 @@ class FlatPrograms:
         return self._times("G", z, transposed)
 
     def _times(self, name: str, vectors: Tensor, transposed: bool = False) -> Tensor:
-        matrices = getattr(self, name)
-        # H is often diagonal, and G the identity.
-        diagonal = self.known(("diagonal", name), lambda: _diagonal(matrices))
+        matrices, diagonal = getattr(self, name), self._diagonal(name)
         if diagonal is not None:
             return vectors * diagonal
         return self.multiply(matrices, vectors, transposed=transposed)
+
+    def _diagonal(self, name: str) -> Tensor | None:
+        # H is often diagonal, and G the identity.
+        return self.known(("diagonal", name), lambda: _diagonal(getattr(self, name)))
+
+    def is_diagonal(self, name: str) -> bool:
+        """Whether all of H, or of G, is one diagonal matrix."""
+        return self._diagonal(name) is not None
 
     def multiply(self, matrices: Tensor, vectors: Tensor, *, transposed: bool = False) -> Tensor:
         """Row-wise matrix-vector products: ``(M, i, j)`` by ``(B, j)`` to ``(B, i)``.

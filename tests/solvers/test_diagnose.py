@@ -122,7 +122,7 @@ def test_fixed_entries_that_break_an_equality_are_infeasible():
 def only(qp: QuadraticProgram) -> SoftQPs:
     """One QP without fixed entries, condensed."""
     programs, _ = FlatPrograms.of(*qp.tensors(), torch.zeros(0).double())
-    return condensed_for(programs, 0).reduced(programs).at(programs)[0]
+    return condensed_for(programs, 0).reduced(programs).at(programs)
 
 
 def doubles(entries) -> Tensor:

@@ -8,11 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from torch_qpmpc import kernels
 from torch_qpmpc.certificate import TOLERANCE, Products, certify
-from torch_qpmpc.condense import Reduced, condensed_for
+from torch_qpmpc.condense import VIOLATED, Reduced, condensed_for
 from torch_qpmpc.programs import FlatPrograms, SoftQPs
 from torch_qpmpc.qp import Status
 from torch_qpmpc.solvers import (
@@ -29,6 +31,8 @@ from torch_qpmpc.solvers.units import units_of
 
 #: A rejected claim with a relative residual up to this is worth sharpening.
 NEARLY = 1e-2
+#: Entries of a C that fits into a core's cache, with what else a QP has: larger ones are for BLAS.
+CACHED = 2**15
 
 
 @dataclass
@@ -174,8 +178,7 @@ class _Chain:
         """
         part = self.part()
         reduced = self.reduced_for(part)
-        qps, particular = reduced.at(part)
-        recover = partial(_recover, part, reduced, particular)
+        qps, recover = reduced.at(part), partial(_recover, part, reduced)
         if start is not None:
             # A part of a batch may have fewer rows with a bound than the whole.
             solve = partial(solve, active=start[self.todo][:, reduced.rows])
@@ -215,13 +218,15 @@ def _unconstrained(qps: SoftQPs) -> Answer:
     return Answer(v, qps.l, torch.zeros_like(qps.group))
 
 
-def _recover(p: FlatPrograms, reduced: Reduced, particular: Tensor, answer: Answer) -> RawSolution:
+def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
     """The full primal-dual solution from a backend's answer, certified.
 
     The multipliers that condensing eliminated come from the stationarity of the Lagrangian: chi by
     the transpose of the same elimination, xi from what is left in the fixed entries.
     """
-    z = reduced.expand(p, particular, answer.v)
+    if p.q.is_cpu and p.C.shape[1:].numel() <= CACHED:
+        return _recover_compiled(p, reduced, answer)
+    z = reduced.expand(p, answer.v)
     Hz, y = p.times_H(z), p.times_G(z)
     lam = reduced.all_rows(p, answer.lam, y)
     G_lam = p.times_G(lam, transposed=True)
@@ -233,7 +238,7 @@ def _recover(p: FlatPrograms, reduced: Reduced, particular: Tensor, answer: Answ
     xi = -of_fixed
     of_fixed += xi
     certificate = certify(p, z, lam, chi, xi, Products(Hz, G_lam, C_chi, slope, y))
-    status = torch.full_like(answer.iterations, int(Status.SOLVED))
+    status = torch.zeros_like(p.group)
     return RawSolution(
         certificate.value,
         z,
@@ -247,9 +252,27 @@ def _recover(p: FlatPrograms, reduced: Reduced, particular: Tensor, answer: Answ
     )
 
 
+def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
+    """`_recover` QP by QP, which keeps all of one in the cache."""
+
+    def of_theta() -> list[np.ndarray]:
+        diagonal = torch.tensor([p.is_diagonal(name) for name in ("H", "G")])
+        G_T = p.G if diagonal[1] else p.G.mT
+        matrices = (reduced.T.mT, reduced.Y_neg, p.C, p.C.mT, p.H, p.G, G_T, diagonal)
+        vectors = (p.q, p.c, p.b, p.lb, p.ub, p.w)
+        return kernels.arrays(reduced.z_0, *matrices, reduced.rows, reduced.others, *vectors)
+
+    given = kernels.arrays(answer.v, answer.lam, p.group, p.fixed)
+    found = kernels.recover(*given, *p.known(("kernel", reduced), of_theta), VIOLATED)
+    value, z, sigma, chi, lam, xi, residual = map(torch.from_numpy, found)
+    status = torch.zeros_like(p.group)
+    return RawSolution(value, z, sigma, chi, lam, xi, status, residual, answer.iterations)
+
+
 def _reasons(part: FlatPrograms, reduced: Reduced) -> Tensor:
     """What is the matter with QPs that a solver did not solve: their status, ``(B,)``."""
-    qps, particular = reduced.at(part)
+    qps = reduced.at(part)
+    particular = reduced.expand(part, qps.g.new_zeros(qps.g.shape))
     inconsistent = (part.multiply(part.C, particular) - part.b).abs() > TOLERANCE * (
         1 + part.b.abs() + particular.abs().amax(-1, keepdim=True)
     )

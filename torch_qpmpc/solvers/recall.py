@@ -78,19 +78,14 @@ def _corrected(qps: SoftQPs, active: Tensor, lam: Tensor, y: Tensor) -> Tensor:
 
 
 class _Forces:
-    """What g and multipliers do to (v, y): ``rise`` g and ``push`` lam, by H^-1 and G H^-1.
-
-    ``K`` is G H^-1 G' with a zero row and column.
-    """
+    """What g and multipliers do to (v, y): ``rise`` g and ``push`` lam, by H^-1 and G H^-1."""
 
     def __init__(self, qps: SoftQPs) -> None:
-        d, G = qps.g.shape[1], qps.G
-        unit = torch.eye(d).to(qps.H).expand(len(qps.H), d, d)
+        self.d, G = qps.g.shape[1], qps.G
+        unit = torch.eye(self.d, dtype=G.dtype, device=G.device)
         inverse = torch.cholesky_solve(unit, torch.linalg.cholesky_ex(qps.H).L)
-        self.d = d
         self.rise = torch.cat((inverse, G @ inverse), dim=-2)
         self.push = self.rise @ G.mT
-        self.K = torch.nn.functional.pad(self.push[:, d:], (0, 1, 0, 1))
 
     def recall(self, qps: SoftQPs, active: Tensor) -> Answer:
         free = -multiply(self.rise, qps.group, qps.g)
@@ -123,11 +118,12 @@ class _Forces:
 
     def _factor_among(self, qps: SoftQPs, order: Tensor, real: Tensor) -> Tensor:
         """The factor of K's rows and columns ``order`` ``(B, k)``, of the unit where not real."""
-        n = self.K.shape[-1]
+        K = torch.nn.functional.pad(self.push[:, self.d :], (0, 1, 0, 1))  # for what is not real
+        n = K.shape[-1]
         index = order.unsqueeze(-1) * n + order.unsqueeze(-2)
-        if len(self.K) > 1:
+        if len(K) > 1:
             index += (qps.group * n * n)[:, None, None]
-        K = torch.take(self.K, index)
+        K = torch.take(K, index)
         K.diagonal(dim1=-2, dim2=-1).add_(~real)
         return torch.linalg.cholesky_ex(K).L
 
