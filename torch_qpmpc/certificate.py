@@ -59,49 +59,6 @@ class Products:
         return cls(Hz, G_lam, C_chi, left, p.times_G(z))
 
 
-@dataclass(frozen=True, eq=False)
-class _Scales:
-    """What the certificate needs to know of theta alone.
-
-    Of the rows, ``(B or 1, n_g)``: ``weight`` is w with zeros on hard rows, ``soft`` and ``hard``
-    are one on such rows, ``shrink`` is 1 / (1 + w) and ``minus_limit`` -w / (1 + w), zero on hard
-    rows; lb and ub have zeros for absent bounds, which ``no_lb`` and ``no_ub`` mark. None stands
-    for marks of which there are none. Then -b, and the sizes of q and b, ``(B or 1, 1)``.
-    """
-
-    weight: Tensor
-    soft: Tensor
-    hard: Tensor | None
-    shrink: Tensor
-    minus_limit: Tensor
-    lb: Tensor
-    ub: Tensor
-    no_lb: Tensor | None
-    no_ub: Tensor | None
-    minus_b: Tensor
-    q_size: Tensor
-    b_size: Tensor
-
-    @classmethod
-    def of(cls, p: FlatPrograms) -> _Scales:
-        hard, no_lb, no_ub = p.w.isinf(), p.lb.isinf(), p.ub.isinf()
-        weight, shrink = p.w.masked_fill(hard, 0.0), 1.0 / (1.0 + p.w)
-        return cls(
-            weight,
-            soft=(~hard).to(p.w),
-            hard=hard.to(p.w) if hard.any() else None,
-            shrink=shrink,
-            minus_limit=-weight * shrink,
-            lb=p.lb.masked_fill(no_lb, 0),
-            ub=p.ub.masked_fill(no_ub, 0),
-            no_lb=no_lb if no_lb.any() else None,
-            no_ub=no_ub if no_ub.any() else None,
-            minus_b=-p.b,
-            q_size=_size(p.q),
-            b_size=largest(p.b, keepdim=True),
-        )
-
-
 def certify(
     programs: FlatPrograms,
     z: Tensor,
@@ -130,37 +87,28 @@ def certify(
 
 def _certify(p: FlatPrograms, z: Tensor, lam: Tensor, chi: Tensor, terms: Products) -> Certificate:
     """`certify` in torch, for any device."""
-    scales: _Scales = p.known("scales", lambda: _Scales.of(p))
-    beyond = terms.y - terms.y.clamp(p.lb, p.ub)
-    outside, up, down = beyond.abs(), lam.clamp(min=0.0), lam.clamp(max=0.0)
-    sigma, charge = outside * scales.soft, outside * scales.weight
-    # A soft row's multiplier beyond w, and a hard row's violation.
-    defect = torch.addcmul(scales.minus_limit, lam.abs(), scales.shrink).clamp_(min=0.0)
-    if scales.hard is not None:
-        defect.addcdiv_(outside * scales.hard, terms.y.abs().add_(1.0))
+    hard, no_lb, no_ub = p.w.isinf(), p.lb.isinf(), p.ub.isinf()
+    y, up, down = terms.y, lam.clamp(min=0.0), lam.clamp(max=0.0)
+    outside = (y - y.clamp(p.lb, p.ub)).abs()
+    charge = outside * p.w.masked_fill(hard, 0.0)
     # Row by row h(y) + h*(lam) - lam y, where h* charges the bound that lam pushes from.
-    gap = torch.addcmul(charge, scales.ub - terms.y, up).addcmul_(scales.lb - terms.y, down)
-    cost = torch.linalg.vecdot(torch.add(p.q, terms.Hz, alpha=0.5), z) + charge.sum(-1)
-    short = p.affine(p.C, z, scales.minus_b)
+    lb, ub = p.lb.masked_fill(no_lb, 0.0), p.ub.masked_fill(no_ub, 0.0)
+    gap = charge + (ub - y) * up + (lb - y) * down
+    cost = torch.linalg.vecdot(p.q + 0.5 * terms.Hz, z) + charge.sum(-1)
+    short = p.multiply(p.C, z) - p.b
     # An absurd z or chi makes relative errors small that are large in the cost.
     slip = torch.linalg.vecdot(terms.left.abs(), z.abs())
-    slip += torch.linalg.vecdot(short.abs(), chi.abs())
-    slip += gap.abs_().sum(-1)
-    forces = torch.cat((terms.Hz, terms.G_lam, terms.C_chi), dim=-1)
-    errors = [
-        terms.left / scales.q_size.maximum(_size(forces)),
-        short / (scales.b_size + _size(z)),
+    slip = slip + torch.linalg.vecdot(short.abs(), chi.abs()) + gap.abs().sum(-1)
+    forces = torch.cat((terms.Hz, terms.G_lam, terms.C_chi, p.q.expand_as(z)), dim=-1)
+    errors = (
+        terms.left / (1.0 + largest(forces, keepdim=True)),
+        short / (1.0 + largest(p.b, keepdim=True) + largest(z, keepdim=True)),
         z[:, : p.fixed.shape[-1]] - p.fixed,
-        defect,
-        (slip / cost.abs().add_(1.0)).unsqueeze(-1),
-    ]
-    for absent, push in ((scales.no_ub, up), (scales.no_lb, down)):
-        if absent is not None:
-            errors.append(push * absent)
-    residual = largest(torch.cat(errors, dim=-1))
-    return Certificate(cost + p.c, sigma, residual.nan_to_num_(torch.inf, torch.inf))
-
-
-def _size(x: Tensor) -> Tensor:
-    """What absolute errors in x are compared with, ``(B, 1)``."""
-    return largest(x, keepdim=True).add_(1.0)
+        # A hard row's violation, and a soft row's multiplier beyond w.
+        torch.where(hard, outside / (1.0 + y.abs()), (lam.abs() - p.w) / (1.0 + p.w)).clamp(min=0),
+        up * no_ub,
+        down * no_lb,
+        (slip / (1.0 + cost.abs())).unsqueeze(-1),
+    )
+    residual = largest(torch.cat(errors, dim=-1)).nan_to_num_(torch.inf, torch.inf)
+    return Certificate(cost + p.c, outside.masked_fill(hard, 0.0), residual)

@@ -21,7 +21,7 @@ from tests.benchmarks.reference import WRONG, reference_values, relative_error
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
 
 #: Rounds of a fast contender by batch, and how many of them go between two of the reference.
-ROUNDS = {1: (20, 5), 32: (15, 5), 256: (10, 5), 1024: (3, 3)}
+ROUNDS = {1: (60, 15), 32: (60, 15), 256: (60, 15), 1024: (9, 3)}
 SLOW_ROUNDS = {1: 5, 32: 3, 256: 1, 1024: 1}
 #: At the largest batch, the reference's own row has to do.
 INTERLEAVED = (1, 32, 256)
