@@ -40,7 +40,7 @@ def recover(
     v, lam_v, group, fixed, at_zero, T_T, Y_neg, C, C_T, H, G, G_T, diagonal, rows, others,
     q, c, b, lb, ub, w, violated,
 ):  # fmt: skip
-    """Value, z, sigma, chi, lam, xi and residual of `solvers.chain.recover`.
+    """Value, z, sigma, chi, lam, xi and residual of `solvers.chain._recover`.
 
     ``at_zero`` ``(B or 1, n_z)`` is z where the fixed entries and v are zero, ``T_T``, ``C_T`` and
     ``G_T`` are transposes, and ``diagonal`` says of H and G whether they have nothing else.
@@ -51,13 +51,13 @@ def recover(
     chi, lam = np.zeros((n_qps, C.shape[1])), np.zeros((n_qps, G.shape[1]))
     sigma = np.zeros(lam.shape)
     Hz, G_lam, C_chi, left = np.empty(n_z), np.empty(n_z), np.empty(n_z), np.empty(n_z)
-    y, Cz, y_i = np.empty(G.shape[1]), np.empty(C.shape[1]), np.empty(T_T.shape[1])
+    y, Cz, kept = np.empty(G.shape[1]), np.empty(C.shape[1]), np.empty(T_T.shape[1])
     for i in range(n_qps):
         m = group[i]
         lb_i, ub_i, w_i = lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)]
         z[i] = at_zero[i % len(at_zero)]
-        y_i[:n_f], y_i[n_f:] = fixed[i], v[i]
-        _add_product(z[i], y_i, T_T[m])
+        kept[:n_f], kept[n_f:] = fixed[i], v[i]
+        _add_product(z[i], kept, T_T[m])
         _product(Hz, z[i], H[m], diagonal[0])
         _product(y, z[i], G_T[m], diagonal[1])
         for k in range(len(rows)):
