@@ -34,6 +34,8 @@ from torch_qpmpc.qp import Status, active_rows
 from torch_qpmpc.solvers.units import units_of
 from torch_qpmpc.tangents import right_side, times
 
+#: The tensors that nothing but autograd looks at.
+PLAIN = (Tensor, nn.Parameter)
 #: Residual of the KKT system from which on it counts as singular.
 SINGULAR = 1e-8
 #: Event dimensions of the operator's tensors: four gradients; z, lam, status; the QP's data.
@@ -317,11 +319,8 @@ def is_traced(tensors: Iterable[Tensor]) -> bool:
         or core._len_torch_function_stack() > 0  # a default device
         or core._get_tracing_state() is not None
         or bool(_transforms())
-        or any(type(x) not in _PLAIN or x.is_meta for x in tensors)
+        or any(type(x) not in PLAIN or x.is_meta for x in tensors)
     )
-
-
-_PLAIN = (Tensor, nn.Parameter)
 
 
 @torch.compiler.assume_constant_result
