@@ -265,8 +265,7 @@ def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
 def _setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
     _, z, sigma, chi, lam, xi, status, *_ = output
     ctx.set_materialize_grads(False)
-    ctx.keep, *_, on_failure = inputs[KEEP:]
-    ctx.masked = on_failure != "raise"
+    ctx.keep = inputs[KEEP]
     ctx.save_for_backward(*inputs[:N_THETA], z, sigma, chi, lam, xi, status)
 
 
@@ -277,9 +276,7 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
     if is_differentiating() and not torch.compiler.is_compiling():
         z, sigma, chi, lam, xi = _tied(ctx.keep, theta, z, chi, lam, xi, status)
     # An unsolved element has zeros here, but zero times an infinite incoming gradient is NaN.
-    weight = grad_value
-    if ctx.masked:
-        weight = torch.where(status.eq(int(Status.SOLVED)), weight, 0)
+    weight = torch.where(status.eq(int(Status.SOLVED)), grad_value, 0)
     gradients = envelope_gradients(weight, z, sigma, chi, lam, xi).values()
     needed = ctx.needs_input_grad[:N_THETA]
     found = (f(x) if need else None for f, x, need in zip(gradients, theta, needed, strict=True))

@@ -171,18 +171,15 @@ class FlatPrograms:
         return self._times("G", z, transposed)
 
     def _times(self, name: str, vectors: Tensor, transposed: bool = False) -> Tensor:
-        matrices, diagonal = getattr(self, name), self._diagonal(name)
+        matrices, diagonal = getattr(self, name), self.diagonal(name)
         if diagonal is not None:
             return vectors * diagonal
         return self.multiply(matrices, vectors, transposed=transposed)
 
-    def _diagonal(self, name: str) -> Tensor | None:
+    def diagonal(self, name: str) -> Tensor | None:
+        """The diagonal ``(n,)`` of H or of G where all QPs share one that has nothing else."""
         # H is often diagonal, and G the identity.
         return self.known(("diagonal", name), lambda: _diagonal(getattr(self, name)))
-
-    def is_diagonal(self, name: str) -> bool:
-        """Whether all of H, or of G, is one diagonal matrix."""
-        return self._diagonal(name) is not None
 
     def multiply(self, matrices: Tensor, vectors: Tensor, *, transposed: bool = False) -> Tensor:
         """Row-wise matrix-vector products: ``(M, i, j)`` by ``(B, j)`` to ``(B, i)``.

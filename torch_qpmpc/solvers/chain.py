@@ -150,18 +150,13 @@ class _Chain:
     def recall(self, solver: str, start: Tensor) -> None:
         """Try the active sets ``start`` ``(B, n_g)`` that are known: whose codes are codes."""
         known = ((start >= -2) & (start <= 2)).all(-1)
-        everything, before = self.todo, int(known[self.todo].sum())
-        if not before:
-            return
-        whole = before == len(everything)
-        if not whole:
-            self.todo = everything[known[everything]]
-        self.attempt(recall, start)
-        if solver in OWN_WARM_STARTS and len(self.todo):
-            self.attempt(OWN_WARM_STARTS[solver], start)
+        others, self.todo = self.todo[~known[self.todo]], self.todo[known[self.todo]]
+        before = len(self.todo)
+        for solve in (recall, OWN_WARM_STARTS.get(solver)):
+            if solve is not None and len(self.todo):
+                self.attempt(solve, start)
         self.recalled = before - len(self.todo)
-        if not whole:
-            self.todo = torch.cat((self.todo, everything[~known[everything]])).sort().values
+        self.todo = torch.cat((self.todo, others)).sort().values
 
     def part(self) -> FlatPrograms:
         """The programs that are still to be solved."""
@@ -256,7 +251,7 @@ def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawS
     """`_recover` QP by QP, which keeps all of one in the cache."""
 
     def of_theta() -> list[np.ndarray]:
-        diagonal = torch.tensor([p.is_diagonal(name) for name in ("H", "G")])
+        diagonal = torch.tensor([p.diagonal(name) is not None for name in ("H", "G")])
         G_T = p.G if diagonal[1] else p.G.mT
         matrices = (reduced.T.mT, reduced.Y_neg, p.C, p.C.mT, p.H, p.G, G_T, diagonal)
         vectors = (p.q, p.c, p.b, p.lb, p.ub, p.w)
