@@ -1,7 +1,10 @@
 """Loops over QPs, compiled by Numba for the CPU: what takes torch dozens of small operations.
 
-A torch operation costs some microseconds whatever its size, as much as a whole QP here. On other
-devices the torch forms beside the callers do the same; tests hold the two against each other.
+For the QP of eq:qp2 and eq:qp3: the full solution from that of its condensed form, the certificate,
+active sets tried again, and what theta is inspected for. A torch operation costs some microseconds
+whatever its size, as much as a whole QP here. On other devices the torch forms beside the callers
+do the same; tests hold the two against each other.
+
 Arrays are float64 and contiguous. Of a vector ``(B or 1, n)``, all QPs share a single row.
 """
 
