@@ -14,6 +14,7 @@ operator alone is not.
 
 from __future__ import annotations
 
+import inspect
 import os
 import warnings
 from collections.abc import Callable
@@ -335,6 +336,10 @@ class QPValue(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
         return QPValue.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9
+
+
+# Function.apply asks for it at each call; to work it out takes as long as solving some ten QPs.
+QPValue.forward.__signature__ = inspect.signature(QPValue.forward)  # pyright: ignore[reportFunctionMemberAccess]
 
 
 class QPTangent(QPValue):

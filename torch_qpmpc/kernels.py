@@ -40,7 +40,7 @@ def _larger(x, y):
 
 @compiled
 def recover(
-    v, lam_v, group, fixed, at_zero, T_T, Y_neg, C, C_T, H, G, G_T, diagonal, rows, others,
+    v, lam_v, group, fixed, rows, others, T_T, Y_neg, C, C_T, H, G, G_T, diagonal, at_zero,
     q, c, b, lb, ub, w, violated,
 ):  # fmt: skip
     """Value, z, sigma, chi, lam, xi and residual of `solvers.chain._recover`.
@@ -253,7 +253,7 @@ def last_entered(G, G_z, T, lb, ub, enters):
 
 @compiled
 def recall(free, push, group, codes, lower, upper, w, slip, max_steps, max_passes):
-    """v ``(B, d)``, lam ``(B, r)`` and steps ``(B,)`` of `solvers.recall.recall`.
+    """v ``(B, d)``, lam ``(B, r)``, steps and which are done ``(B,)`` of `solvers.recall.recall`.
 
     ``free`` ``(B, d + r)`` is (v, y) without multipliers, and ``push`` ``(M, r, d + r)`` what a
     multiplier takes from it.
@@ -261,13 +261,16 @@ def recall(free, push, group, codes, lower, upper, w, slip, max_steps, max_passe
     n_qps, r = lower.shape
     d = free.shape[1] - r
     lam, vy, steps = np.zeros((n_qps, r)), free.copy(), np.zeros(n_qps, np.int64)
+    done = np.zeros(n_qps, np.bool_)
     code, held, pull = np.empty(r, np.int8), np.empty(r, np.int64), np.empty(r)
     factor = np.empty((r, r))
     for i in range(n_qps):
         code[:] = codes[i]
         by = push[group[i]]
-        changed = True
-        while changed and steps[i] < max_steps:
+        known = True
+        for j in range(r):
+            known = known and -2 <= code[j] <= 2
+        while known and not done[i] and steps[i] < max_steps:
             steps[i] += 1
             vy[i] = free[i]
             k = 0
@@ -294,8 +297,8 @@ def recall(free, push, group, codes, lower, upper, w, slip, max_steps, max_passe
                 for a in range(k):
                     lam[i, held[a]] += pull[a]
                     _add(vy[i], -pull[a], by[held[a]])
-            changed = _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i], slip)
-    return vy[:, :d].copy(), lam, steps
+            done[i] = not _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i], slip)
+    return vy[:, :d].copy(), lam, steps, done
 
 
 @compiled

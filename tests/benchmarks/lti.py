@@ -34,13 +34,10 @@ REPLAYED = ("optimizer=sliding", "exploration_std=0.05")
 
 
 def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = True) -> Stream:
-    """One episode under the learning QP, or under the one that learning starts from.
-
-    As mpcrl does it, a step solves Q at the visited pair and V at the next state, whose solution is
-    also the next action.
-    """
-    options = ("task=gros_zanon", "solver=daqp", f"updates={steps}", *REPLAYED * replay)
-    cfg, physics = make_config(*options), GrosZanonLTI()
+    """One episode under the learning QP, or under the one that learning starts from."""
+    cfg, physics = make_config("task=gros_zanon", "solver=daqp", *REPLAYED * replay), GrosZanonLTI()
+    every = cfg.steps_per_update
+    cfg.updates = steps // every
     mpc = make_mpc(cfg, physics)
     optimizer = make_optimizer(cfg, mpc)
     assert isinstance(optimizer, GaussNewton)
@@ -50,25 +47,26 @@ def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = Tr
     draws = torch.Generator().manual_seed(seed)
     s, still = physics.starts(rng, 1), torch.zeros(1, 2)
     states, actions, costs = s.new_zeros(steps + 1, 2), s.new_zeros(steps, 1), s.new_zeros(steps)
-    states[0], newest = s, torch.zeros(1, dtype=torch.int64)
+    states[0] = s
     began = time.perf_counter()
     with torch.no_grad():
-        a = mpc.policy(s)
+        qp = mpc.quadratic_program()
         for k in range(steps):
-            following = physics.step(s, a, physics.noise(still, physics.draw(rng, 1)))
-            states[k + 1], actions[k], costs[k] = following, a, physics.cost(s, a)
-            batch = newest + k
-            if replay:
-                stored = min(k, cfg.replay_capacity)
-                drawn = k - 1 - torch.randperm(stored, generator=draws)[: cfg.batch_size - 1]
-                batch = torch.cat((batch, drawn))
-            solution = mpc.solve(states[batch + 1])
             noise = cfg.exploration_std * torch.randn(1, 1, generator=draws)
-            s, a = following, physics.applied(solution.z[:1, 2:3] + noise)
-            if learn:
-                target = costs[batch] + gamma * solution.value
-                optimizer.step(states[batch], actions[batch], target)
-                schedule.step()
+            a = physics.applied(mpc.solve(s, qp=qp).z[:, 2:3] + noise)
+            actions[k], costs[k] = a, physics.cost(s, a)
+            s = physics.step(s, a, physics.noise(still, physics.draw(rng, 1)))
+            states[k + 1] = s
+            if not learn or (k + 1) % every:
+                continue
+            batch = torch.arange(k + 1 - every, k + 1)
+            if replay:
+                stored = min(k + 1, cfg.replay_capacity)
+                batch = k - torch.randperm(stored, generator=draws)[: cfg.batch_size]
+            target = costs[batch] + gamma * mpc.solve(states[batch + 1], qp=qp).value
+            optimizer.step(states[batch], actions[batch], target)
+            schedule.step()
+            qp = mpc.quadratic_program()
     seconds = time.perf_counter() - began
     return Stream(costs.numpy(), physics.violation(states[:-1]).numpy(), seconds)
 

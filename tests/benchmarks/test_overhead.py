@@ -12,8 +12,7 @@ import torch
 
 from tests.benchmarks.contenders import cold, warm
 from tests.benchmarks.problems import PAPER, make_mpc, nudge, transitions
-from torch_qpmpc.programs import SoftQPs
-from torch_qpmpc.solvers import BACKENDS, OWN_WARM_STARTS, Answer, chain
+from torch_qpmpc.solvers import BACKENDS, chain
 
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
 
@@ -34,18 +33,16 @@ def test_share_outside_the_solver(
     """The backend's call is what hands QPs to the solver's own code, its Python loop included."""
     inside, shares = [], []
 
-    def timed(solve: Callable[..., Answer]) -> Callable[..., Answer]:
-        def timed_solve(qps: SoftQPs, **options: Any) -> Answer:
+    def timed(solve: Callable[..., Any]) -> Callable[..., Any]:
+        def timed_solve(*arguments: Any) -> Any:
             began = time.perf_counter()
-            answer = solve(qps, **options)
+            answer = solve(*arguments)
             inside.append(time.perf_counter() - began)
             return answer
 
         return timed_solve
 
     monkeypatch.setattr(chain, "recall", timed(chain.recall))
-    for name, own in OWN_WARM_STARTS.items():
-        monkeypatch.setitem(OWN_WARM_STARTS, name, timed(own))
     monkeypatch.setitem(BACKENDS, solver, timed(BACKENDS[solver]))
     gradient = STARTS[start](
         make_mpc(PAPER, dense=True, solver=solver),

@@ -22,7 +22,7 @@ from torch_qpmpc import (
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.programs import SoftQPs
 from torch_qpmpc.qp import UNKNOWN
-from torch_qpmpc.solvers import BACKENDS, OWN_WARM_STARTS, Answer, Backend, chain, daqp
+from torch_qpmpc.solvers import BACKENDS, Answer, Backend, chain, daqp
 
 BATCH = 6
 
@@ -121,15 +121,13 @@ def test_only_what_is_rejected_is_solved_again(monkeypatch, asked):
     assert log.fallback == 3
 
 
-@pytest.mark.parametrize("own", [False, True])
-def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, asked, own):
-    def misled(qps: SoftQPs, active: Tensor) -> Answer:
-        return LIES["v off"](daqp.solve(qps))
+def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, asked):
+    def misled(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
+        return LIES["v off"](daqp.solve(qps)), torch.ones(len(active), dtype=torch.bool)
 
-    if own:
-        monkeypatch.setitem(OWN_WARM_STARTS, "recorder", misled)
+    monkeypatch.setattr(chain, "recall", misled)
     known = known_qp(2, batch=(BATCH,))
-    active = -solve(known, solver="daqp").active
+    active = solve(known, solver="daqp").active
     with SolveLog() as log:
         assert_right(solve(known, solver="recorder", warm_start=active), known)
     assert asked == [BATCH]
@@ -146,15 +144,19 @@ def test_a_known_active_set_spares_the_backend(asked):
     assert (log.fallback, log.recalled) == (0, BATCH - 2)
 
 
-def test_a_backend_that_starts_from_active_sets_gets_those_that_recall_leaves(monkeypatch, asked):
-    monkeypatch.setitem(OWN_WARM_STARTS, "recorder", daqp.solve)
-    monkeypatch.setattr(chain, "recall", lambda qps, active: LIES["v off"](daqp.solve(qps)))
+def test_what_recall_does_not_finish_is_for_the_backend(monkeypatch, asked):
+    def half(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
+        finished = torch.arange(len(active)) % 2 == 0
+        answer = daqp.solve(qps)
+        return replace(answer, v=answer.v.where(finished[:, None], torch.nan)), finished
+
+    monkeypatch.setattr(chain, "recall", half)
     known = known_qp(3, batch=(BATCH,))
     active = solve(known, solver="daqp").active
     with SolveLog() as log:
         assert_right(solve(known, solver="recorder", warm_start=active), known)
-    assert asked == []
-    assert (log.fallback, log.recalled) == (0, BATCH)
+    assert asked == [BATCH // 2]
+    assert (log.fallback, log.recalled) == (0, BATCH // 2)
 
 
 @pytest.mark.parametrize("one", range(BATCH))

@@ -24,7 +24,8 @@ def true_set(seed: int, matrices: tuple[int, ...] = ()):
 @pytest.mark.parametrize("seed", range(3))
 def test_the_right_active_set_is_exact_at_once(seed, matrices):
     qps, exact, active = true_set(seed, matrices)
-    answer = recall(qps, active)
+    answer, finished = recall(qps, active)
+    assert finished.all()
     assert_close(answer.v, exact.v, rtol=0, atol=1e-10)
     assert_close(answer.lam, exact.lam, rtol=0, atol=1e-10)
     assert (answer.iterations == 1).all()
@@ -64,6 +65,15 @@ def test_the_active_sets_given_are_not_changed():
     before = wrong.clone()
     recall(qps, wrong)
     assert torch.equal(wrong, before)
+
+
+def test_where_nothing_is_known_nothing_is_finished():
+    qps, _, active = true_set(5)
+    active[1:3, 4] = UNKNOWN
+    active[4, 0] = -128
+    answer, finished = recall(qps, active)
+    assert finished.tolist() == [True, False, False, True, False, True]
+    assert answer.iterations[1:3].tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("rank", [0, 1])

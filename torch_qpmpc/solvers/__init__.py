@@ -16,16 +16,12 @@ from torch_qpmpc.solvers import daqp, interior_point, proxqp, qpsolvers
 from torch_qpmpc.solvers.answer import Answer
 
 Backend = Callable[[SoftQPs], Answer]
-WarmStart = Callable[..., Answer]
 
 BACKENDS: dict[str, Backend] = {
     "proxqp": proxqp.solve,
     "daqp": daqp.solve,
     "torch": interior_point.solve,
 }
-
-#: What solves from active sets ``(B, r)`` that `recall` could not mend: solve(qps, active).
-OWN_WARM_STARTS: dict[str, WarmStart] = {"daqp": daqp.solve}
 
 
 def backend(name: str) -> Backend:
@@ -50,4 +46,4 @@ def fallbacks(name: str) -> list[Backend]:
     return [other for known, other in BACKENDS.items() if known != name]
 
 
-__all__ = ["BACKENDS", "OWN_WARM_STARTS", "Answer", "Backend", "backend", "fallbacks"]
+__all__ = ["BACKENDS", "Answer", "Backend", "backend", "fallbacks"]

@@ -21,6 +21,11 @@ class Answer:
     lam: Tensor
     iterations: Tensor
 
+    def put(self, index: Tensor, other: Answer) -> None:
+        """Replace what there is at ``index``."""
+        self.v[index], self.lam[index] = other.v, other.lam
+        self.iterations[index] = other.iterations
+
     @classmethod
     def like(
         cls, g: Tensor, v: np.ndarray, lam: np.ndarray, iterations: np.ndarray | Sequence[int]

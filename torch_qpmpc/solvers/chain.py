@@ -17,12 +17,7 @@ from torch_qpmpc.certificate import TOLERANCE, Products, certify
 from torch_qpmpc.condense import VIOLATED, Reduced, condensed_for
 from torch_qpmpc.programs import FlatPrograms, SoftQPs
 from torch_qpmpc.qp import Status
-from torch_qpmpc.solvers import (
-    OWN_WARM_STARTS,
-    Answer,
-    backend,
-    fallbacks,
-)
+from torch_qpmpc.solvers import Answer, Backend, backend, fallbacks
 from torch_qpmpc.solvers.crossover import refine
 from torch_qpmpc.solvers.diagnose import diagnose
 from torch_qpmpc.solvers.raw import RawSolution, unsolved
@@ -131,7 +126,7 @@ class _Chain:
 
     def run(self, solver: str, start: Tensor | None) -> RawSolution:
         if start is not None:
-            self.recall(solver, start)
+            self.attempt(backend(solver), start)
         if len(self.todo) or self.raw is None:
             self.attempt(backend(solver))
         self.rejected = self.todo.shape[0]
@@ -147,17 +142,6 @@ class _Chain:
         assert self.raw is not None
         return self.raw
 
-    def recall(self, solver: str, start: Tensor) -> None:
-        """Try the active sets ``start`` ``(B, n_g)`` that are known: whose codes are codes."""
-        known = ((start >= -2) & (start <= 2)).all(-1)
-        others, self.todo = self.todo[~known[self.todo]], self.todo[known[self.todo]]
-        before = len(self.todo)
-        for solve in (recall, OWN_WARM_STARTS.get(solver)):
-            if solve is not None and len(self.todo):
-                self.attempt(solve, start)
-        self.recalled = before - len(self.todo)
-        self.todo = torch.cat((self.todo, others)).sort().values
-
     def part(self) -> FlatPrograms:
         """The programs that are still to be solved."""
         whole = self.todo.shape[0] == len(self.programs)
@@ -166,20 +150,30 @@ class _Chain:
     def reduced_for(self, part: FlatPrograms) -> Reduced:
         return condensed_for(part, self.keep).reduced(part)
 
-    def attempt(self, solve: Callable[..., Answer], start: Tensor | None = None) -> None:
+    def attempt(self, solve: Backend, start: Tensor | None = None) -> None:
         """Ask for what is still to be solved, and keep what the certificate accepts.
 
-        A warm start gets its part of the active sets ``start``; what it misses is not sharpened.
+        With active sets ``start``, ``solve`` is asked for what `recall` leaves of them; what both
+        miss is not sharpened.
         """
         part = self.part()
         reduced = self.reduced_for(part)
         qps, recover = reduced.at(part), partial(_recover, part, reduced)
-        if start is not None:
+        recalled = None
+        if not qps.l.shape[1]:
+            answer = _unconstrained(qps)
+        elif start is None:
+            answer = solve(qps)
+        else:
             # A part of a batch may have fewer rows with a bound than the whole.
-            solve = partial(solve, active=start[self.todo][:, reduced.rows])
-        answer = solve(qps) if qps.l.shape[1] else _unconstrained(qps)
+            answer, recalled = recall(qps, start[self.todo][:, reduced.rows])
+            if not recalled.all():
+                others = (~recalled).nonzero().squeeze(-1)
+                answer.put(others, solve(qps.take(others)))
         claim = recover(answer)
         accepted = claim.residual <= TOLERANCE
+        if recalled is not None:
+            self.recalled = int((recalled & accepted).sum())
         if accepted.all():
             if part is self.programs:
                 self.raw, self.todo = claim, self.todo[:0]
@@ -254,11 +248,12 @@ def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawS
         diagonal = torch.tensor([p.diagonal(name) is not None for name in ("H", "G")])
         G_T = p.G if diagonal[1] else p.G.mT
         matrices = (reduced.T.mT, reduced.Y_neg, p.C, p.C.mT, p.H, p.G, G_T, diagonal)
-        vectors = (p.q, p.c, p.b, p.lb, p.ub, p.w)
-        return kernels.arrays(reduced.z_0, *matrices, reduced.rows, reduced.others, *vectors)
+        return kernels.arrays(*matrices, reduced.z_0, p.q, p.c, p.b, p.lb, p.ub, p.w)
 
-    given = kernels.arrays(answer.v, answer.lam, p.group, p.fixed)
-    found = kernels.recover(*given, *p.known(("kernel", reduced), of_theta), VIOLATED)
+    given = (answer.v, answer.lam, p.group, p.fixed, reduced.rows, reduced.others)
+    # V and Q of a theta share its T, unless C has dependent rows.
+    theta = p.known(("kernel", reduced.T), of_theta)
+    found = kernels.recover(*kernels.arrays(*given), *theta, VIOLATED)
     value, z, sigma, chi, lam, xi, residual = map(torch.from_numpy, found)
     status = torch.zeros_like(p.group)
     return RawSolution(value, z, sigma, chi, lam, xi, status, residual, answer.iterations)

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import daqp
 import numpy as np
-from torch import Tensor
 
 from torch_qpmpc.programs import SoftArrays, SoftQPs
 from torch_qpmpc.solvers.answer import Answer
 
-SOFT, ACTIVE_LOWER, ACTIVE = 8, 2, 1
-#: What to add to ``sense`` by a row's code: 0, 1, 2, -2, -1. Saturated rows it has to find again:
-#: started with them as active, DAQP returns wrong answers.
-STATES = np.array([0, ACTIVE, 0, 0, ACTIVE | ACTIVE_LOWER], dtype=np.int32)
+#: Of a row's ``sense``.
+SOFT = 8
 #: From how many QPs on it pays to put them in order.
 MANY = 64
 #: DAQP's reciprocal quadratic slack weight; 1e4 to 1e8 are right to 1e-7, outside it errs.
@@ -24,22 +19,17 @@ NO_BOUND = 1e30
 SETTINGS = {"primal_tol": 1e-9, "dual_tol": 1e-12, "iter_limit": 2000, "time_limit": 0.2}
 
 
-def solve(qps: SoftQPs, active: Tensor | None = None) -> Answer:
-    """Solve a batch, each QP from its ``active`` set ``(B, r)``, or from that of one much like it.
-
-    The codes are those of `QPSolution.active`.
-    """
+def solve(qps: SoftQPs) -> Answer:
+    """Solve a batch, each QP from the active set of one much like it."""
     arrays = qps.arrays()
-    codes = None if active is None else active.cpu().numpy()
     kinds = _alike(arrays)
     if len(kinds) == 1:
-        return Answer.like(qps.g, *_solve_alike(arrays, codes))
+        return Answer.like(qps.g, *_solve_alike(arrays))
     v, lam = np.zeros_like(arrays.g), np.zeros_like(arrays.l)
     iterations = np.zeros(len(v), dtype=np.int64)
     for i in kinds:
         part = SoftArrays(arrays.H, arrays.G, *(vectors[i] for vectors in arrays[2:]))
-        start = None if codes is None else codes[i]
-        v[i], lam[i], iterations[i] = _solve_alike(part, start)
+        v[i], lam[i], iterations[i] = _solve_alike(part)
     return Answer.like(qps.g, v, lam, iterations)
 
 
@@ -60,9 +50,7 @@ def _distinct(vectors: np.ndarray) -> np.ndarray:
     return vectors[:1] if vectors.strides[0] == 0 else vectors
 
 
-def _solve_alike(
-    arrays: SoftArrays, start: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _solve_alike(arrays: SoftArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """v, lam and iterations by one model; with another pattern of soft rows, it corrupts memory."""
     _, _, (m, *_), g, lower, upper, w = arrays
     v, lam = np.zeros(g.shape), np.zeros(lower.shape)
@@ -85,16 +73,11 @@ def _solve_alike(
     model.settings = SETTINGS
     if len(hard):  # soft_weights refuses empty arrays
         model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[0], w_u=weight[0])
-    order: Sequence[int] = range(len(g))
-    # Without a ``sense``, the model begins with the active set that it ended with.
-    senses: list[np.ndarray | None] = [empty] * len(g)
-    if start is not None:
-        senses = list(empty + STATES[start])
-    elif len(g) >= MANY:
-        order, senses = _path(g), [None] * len(g)
+    many = len(g) >= MANY
     update, solve_one, failed = model.update, model.solve, False
-    for k in order:
-        sense = empty if failed and senses[k] is None else senses[k]
+    for k in _path(g) if many else range(len(g)):
+        # Without a ``sense``, the model begins with the active set that it ended with.
+        sense = None if many and not failed else empty
         if not len(hard):
             update(f=g[k])
         else:

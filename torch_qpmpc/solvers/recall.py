@@ -3,8 +3,8 @@
 Between two visits to a transition theta has moved a little, and most active sets have not changed.
 With the set held, the KKT conditions are linear in its multipliers: with K = G H^-1 G', one
 Cholesky factor of K's active part a QP, and no loop over the batch. Where the signs of the solution
-contradict the set, the rows concerned change their state, and it is tried again. Whether the end
-is a solution is for the certificate to say.
+contradict the set, the rows concerned change their state, and it is tried again. What comes to no
+end in this way is for a solver; whether an end is a solution is for the certificate to say.
 """
 
 from __future__ import annotations
@@ -17,29 +17,31 @@ from torch_qpmpc.programs import SoftQPs, multiply
 from torch_qpmpc.solvers.answer import Answer
 
 #: How often an active set is tried, corrected in between, before a solver is asked instead.
-MAX_STEPS = 4
+MAX_STEPS = 10
 #: Solves of the equations of one set: the first, and against what rounding left of it.
 MAX_PASSES = 3
 #: Relative errors up to which bounds are kept, and up to which signs are right.
 SLIP = 1e-9
 
 
-def recall(qps: SoftQPs, active: Tensor) -> Answer:
-    """v and lam of the active sets ``(B, r)``, or of sets near to them.
+def recall(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
+    """v and lam of the active sets ``(B, r)``, or of sets near to them, and where there are some.
 
-    Their codes are those of `QPSolution.active`.
+    The codes are those of `QPSolution.active`; of a set with any other code nothing is known.
     """
     forces = _Forces(qps)
     if qps.g.is_cpu:
         return forces.recall(qps, active)
-    return _recall(forces, qps, active.clone())
+    return _recall(forces, qps, active)
 
 
-def _recall(forces: _Forces, qps: SoftQPs, active: Tensor) -> Answer:
-    """`recall` in torch, for any device; changes ``active``."""
+def _recall(forces: _Forces, qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
+    """`recall` in torch, for any device."""
+    known = ((active >= -2) & (active <= 2)).all(-1)
+    active = torch.where(known.unsqueeze(-1), active, 0)
     v, lam, y = forces.solve(qps, active)
     steps = torch.ones_like(qps.group)
-    todo = _contradicted(qps, active, lam, y).nonzero().squeeze(-1)
+    todo = (known & _contradicted(qps, active, lam, y)).nonzero().squeeze(-1)
     for _ in range(MAX_STEPS - 1):
         if not len(todo):
             break
@@ -48,7 +50,8 @@ def _recall(forces: _Forces, qps: SoftQPs, active: Tensor) -> Answer:
         v[todo], lam[todo], y[todo] = found = forces.solve(part, active[todo])
         steps[todo] += 1
         todo = todo[_contradicted(part, active[todo], *found[1:])]
-    return Answer(v, lam, steps)
+    known[todo] = False
+    return Answer(v, lam, steps), known
 
 
 def _contradicted(qps: SoftQPs, active: Tensor, lam: Tensor, y: Tensor) -> Tensor:
@@ -87,11 +90,13 @@ class _Forces:
         self.rise = torch.cat((inverse, G @ inverse), dim=-2)
         self.push = self.rise @ G.mT
 
-    def recall(self, qps: SoftQPs, active: Tensor) -> Answer:
+    def recall(self, qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
         free = -multiply(self.rise, qps.group, qps.g)
         given = (free, self.push.mT, qps.group, active, qps.l, qps.u, qps.w)
         limits = (SLIP, MAX_STEPS, MAX_PASSES)
-        return Answer(*map(torch.from_numpy, kernels.recall(*kernels.arrays(*given), *limits)))
+        found = kernels.recall(*kernels.arrays(*given), *limits)
+        v, lam, steps, done = map(torch.from_numpy, found)
+        return Answer(v, lam, steps), done
 
     def solve(self, qps: SoftQPs, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """v, lam and y with held rows at their bounds, and saturated ones at lam = +w or -w."""
