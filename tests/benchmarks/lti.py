@@ -36,7 +36,7 @@ REPLAYED = ("optimizer=sliding", "exploration_std=0.05")
 def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = True) -> Stream:
     """One episode under the learning QP, or under the one that learning starts from."""
     cfg, physics = make_config("task=gros_zanon", "solver=daqp", *REPLAYED * replay), GrosZanonLTI()
-    every = cfg.steps_per_update
+    every, exploration = cfg.steps_per_update, cfg.exploration_std
     cfg.updates = steps // every
     mpc = make_mpc(cfg, physics)
     optimizer = make_optimizer(cfg, mpc)
@@ -52,14 +52,14 @@ def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = Tr
     with torch.no_grad():
         qp = mpc.quadratic_program()
         for k in range(steps):
-            noise = cfg.exploration_std * torch.randn(1, 1, generator=draws)
+            noise = exploration * torch.randn(1, 1, generator=draws)
             a = physics.applied(mpc.solve(s, qp=qp).z[:, 2:3] + noise)
-            actions[k], costs[k] = a, physics.cost(s, a)
             s = physics.step(s, a, physics.noise(still, physics.draw(rng, 1)))
-            states[k + 1] = s
+            actions[k], states[k + 1] = a, s
             if not learn or (k + 1) % every:
                 continue
             batch = torch.arange(k + 1 - every, k + 1)
+            costs[batch] = physics.cost(states[batch], actions[batch])
             if replay:
                 stored = min(k + 1, cfg.replay_capacity)
                 batch = k - torch.randperm(stored, generator=draws)[: cfg.batch_size]
@@ -68,6 +68,7 @@ def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = Tr
             schedule.step()
             qp = mpc.quadratic_program()
     seconds = time.perf_counter() - began
+    costs = physics.cost(states[:-1], actions)
     return Stream(costs.numpy(), physics.violation(states[:-1]).numpy(), seconds)
 
 

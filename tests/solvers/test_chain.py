@@ -159,6 +159,22 @@ def test_what_recall_does_not_finish_is_for_the_backend(monkeypatch, asked):
     assert (log.fallback, log.recalled) == (0, BATCH // 2)
 
 
+def test_a_solver_is_not_asked_twice_for_what_it_got_wrong(monkeypatch):
+    asked = []
+
+    def liar(qps: SoftQPs) -> Answer:
+        asked.append(len(qps.g))
+        return LIES["v off"](daqp.solve(qps))
+
+    monkeypatch.setitem(BACKENDS, "liar", liar)
+    known = known_qp(3, batch=(BATCH,))
+    nothing = torch.full(known.lam.shape, UNKNOWN, dtype=torch.int8)
+    with SolveLog() as log:
+        assert_right(solve(known, solver="liar", warm_start=nothing), known)
+    assert asked == [BATCH]
+    assert (log.fallback, log.recalled) == (BATCH, 0)
+
+
 @pytest.mark.parametrize("one", range(BATCH))
 def test_a_part_of_a_batch_may_have_other_rows(one):
     """Rows without a bound are left out, and which they are differs from element to element."""

@@ -125,10 +125,8 @@ class _Chain:
             self.raw.status[self.todo] = Status.NOT_CONVERGED
 
     def run(self, solver: str, start: Tensor | None) -> RawSolution:
-        if start is not None:
-            self.attempt(backend(solver), start)
         if len(self.todo) or self.raw is None:
-            self.attempt(backend(solver))
+            self.attempt(backend(solver), start)
         self.rejected = self.todo.shape[0]
         if self.rejected:
             assert self.raw is not None
@@ -153,8 +151,7 @@ class _Chain:
     def attempt(self, solve: Backend, start: Tensor | None = None) -> None:
         """Ask for what is still to be solved, and keep what the certificate accepts.
 
-        With active sets ``start``, ``solve`` is asked for what `recall` leaves of them; what both
-        miss is not sharpened.
+        With active sets ``start``, ``solve`` is only asked for what `recall` makes nothing of.
         """
         part = self.part()
         reduced = self.reduced_for(part)
@@ -167,18 +164,19 @@ class _Chain:
         else:
             # A part of a batch may have fewer rows with a bound than the whole.
             answer, recalled = recall(qps, start[self.todo][:, reduced.rows])
-            if not recalled.all():
-                others = (~recalled).nonzero().squeeze(-1)
-                answer.put(others, solve(qps.take(others)))
+            _replace(answer, ~recalled, qps, solve)
         claim = recover(answer)
         accepted = claim.residual <= TOLERANCE
         if recalled is not None:
             self.recalled = int((recalled & accepted).sum())
+            if _replace(answer, recalled & ~accepted, qps, solve):
+                claim = recover(answer)
+                accepted = claim.residual <= TOLERANCE
         if accepted.all():
             if part is self.programs:
                 self.raw, self.todo = claim, self.todo[:0]
                 return
-        elif start is None:
+        else:
             _sharpen(claim, qps, answer, recover)
             accepted = claim.residual <= TOLERANCE
         if self.raw is None:
@@ -186,6 +184,14 @@ class _Chain:
         self.raw.put(self.todo[accepted], claim.at(accepted))
         self.todo = self.todo[~accepted]
         self.raw.residual[self.todo] = claim.residual[~accepted]
+
+
+def _replace(answer: Answer, where: Tensor, qps: SoftQPs, solve: Backend) -> bool:
+    """Put the answers of ``solve`` where ``where`` ``(B,)`` says so; whether that is anywhere."""
+    index = where.nonzero().squeeze(-1)
+    if len(index):
+        answer.put(index, solve(qps.take(index)))
+    return len(index) > 0
 
 
 def _sharpen(
