@@ -46,7 +46,7 @@ def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = Tr
     rng = np.random.default_rng(int(np.random.default_rng(seed).integers(2**32)))
     draws = torch.Generator().manual_seed(seed)
     s, still = physics.starts(rng, 1), torch.zeros(1, 2)
-    states, actions, costs = s.new_zeros(steps + 1, 2), s.new_zeros(steps, 1), s.new_zeros(steps)
+    states, actions = s.new_zeros(steps + 1, 2), s.new_zeros(steps, 1)
     states[0] = s
     began = time.perf_counter()
     with torch.no_grad():
@@ -59,12 +59,12 @@ def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = Tr
             if not learn or (k + 1) % every:
                 continue
             batch = torch.arange(k + 1 - every, k + 1)
-            costs[batch] = physics.cost(states[batch], actions[batch])
             if replay:
                 stored = min(k + 1, cfg.replay_capacity)
                 batch = k - torch.randperm(stored, generator=draws)[: cfg.batch_size]
-            target = costs[batch] + gamma * mpc.solve(states[batch + 1], qp=qp).value
-            optimizer.step(states[batch], actions[batch], target)
+            visited = states[batch], actions[batch]
+            following = mpc.solve(states[batch + 1], qp=qp)
+            optimizer.step(*visited, physics.cost(*visited) + gamma * following.value)
             schedule.step()
             qp = mpc.quadratic_program()
     seconds = time.perf_counter() - began
