@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import numba
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -149,3 +150,26 @@ def test_where_nothing_can_be_written_kernels_are_compiled_each_time(monkeypatch
         return 2 * x
 
     assert twice(3.0) == 6.0
+
+
+@pytest.mark.parametrize("near", [40, 8])
+def test_a_tour_goes_from_neighbour_to_neighbour(near):
+    vectors = random_states(40, 3, seed=1).numpy()
+    order = kernels.tour(vectors, near)
+    scaled = (vectors - vectors.mean(0)) / vectors.std(0)
+
+    def length(order):
+        return np.linalg.norm(np.diff(scaled[order], axis=0), axis=1).sum()
+
+    assert sorted(order) == list(range(40))
+    assert length(order) < 0.7 * length(np.arange(40))
+    if near == 40:
+        left, at = set(range(1, 40)), 0
+        for k in order[1:]:
+            assert k == min(left, key=lambda j: np.linalg.norm(scaled[j] - scaled[at]))
+            left, at = left - {k}, k
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (1, 3), (4, 0)])
+def test_a_tour_of_nothing_is_one(shape):
+    assert kernels.tour(np.zeros(shape), 2).tolist() == list(range(shape[0]))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numba
@@ -19,12 +20,16 @@ import numpy as np
 from torch import Tensor
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """``function`` in machine code, kept on disk where a folder for that can be written."""
     try:
-        return numba.njit(cache=True, error_model="numpy")(function)
+        return numba.njit(cache=True, error_model="numpy", **options)(function)
     except RuntimeError:
-        return numba.njit(error_model="numpy")(function)
+        return numba.njit(error_model="numpy", **options)(function)
+
+
+#: For loops that sum or compare several entries at a time, in any order, and take no notice of NaN.
+comparing = partial(compiled, fastmath={"reassoc", "nsz", "nnan", "contract"})
 
 
 def arrays(*tensors: Tensor) -> list[np.ndarray]:
@@ -249,6 +254,37 @@ def last_entered(G, G_z, T, lb, ub, enters):
                     last[j] = k + 1
                     break
     return last
+
+
+@comparing
+def tour(vectors, near):
+    """An order of vectors ``(B, n)``: from each to the nearest of the next ``near`` that are left.
+
+    A nearest-neighbour tour in units of the entries' standard deviations; of more than ``near``
+    vectors, the next ones are those in the order of their first entry.
+    """
+    n_qps, n = vectors.shape
+    points = np.empty((n, n_qps), np.float32)
+    for k in range(n):
+        mean = vectors[:, k].sum() / n_qps
+        spread = math.sqrt(((vectors[:, k] - mean) ** 2).sum() / n_qps)
+        points[k] = (vectors[:, k] - mean) / (spread if spread > 0 else 1.0)
+    order = np.arange(n_qps)
+    if n_qps > near and n:
+        order = np.argsort(points[0])
+        points = points[:, order].copy()
+    distance = np.empty(near, np.float32)
+    for at in range(n_qps - 1):
+        left = min(near, n_qps - 1 - at)
+        distance[:left] = 0.0
+        for k in range(n):
+            for j in range(left):
+                distance[j] += (points[k, at + 1 + j] - points[k, at]) ** 2
+        nearest = at + 1 + np.argmin(distance[:left])
+        order[at + 1], order[nearest] = order[nearest], order[at + 1]
+        for k in range(n):
+            points[k, at + 1], points[k, nearest] = points[k, nearest], points[k, at + 1]
+    return order
 
 
 @compiled
