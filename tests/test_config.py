@@ -353,7 +353,7 @@ def test_solver_must_be_known():
         ),
         (
             ["collector=multi", "collector.sync=false", "constraint=si"],
-            "steps_per_update: got 1, expected at least task.horizon = 10. The windows of",
+            "steps_per_update: got 4, expected at least task.horizon = 10. The windows of",
         ),
         (
             ["task=gros_zanon", "noise.std=0.1"],
