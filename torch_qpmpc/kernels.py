@@ -1,9 +1,9 @@
 """Loops over QPs, compiled by Numba for the CPU: what takes torch dozens of small operations.
 
 For the QP of eq:qp2 and eq:qp3: the full solution from that of its condensed form, the certificate,
-active sets tried again, and what theta is inspected for. A torch operation costs some microseconds
-whatever its size, as much as a whole QP here. On other devices the torch forms beside the callers
-do the same; tests hold the two against each other.
+active sets tried again, which QP to solve after which, and what theta is inspected for. A torch
+operation costs some microseconds whatever its size, as much as a whole QP here. On other devices
+the torch forms beside the callers do the same; tests hold the two against each other.
 
 Arrays are float64 and contiguous. Of a vector ``(B or 1, n)``, all QPs share a single row.
 """
@@ -26,10 +26,6 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
         return numba.njit(cache=True, error_model="numpy", **options)(function)
     except RuntimeError:
         return numba.njit(error_model="numpy", **options)(function)
-
-
-#: For loops that sum or compare several entries at a time, in any order, and take no notice of NaN.
-comparing = partial(compiled, fastmath={"reassoc", "nsz", "nnan", "contract"})
 
 
 def arrays(*tensors: Tensor) -> list[np.ndarray]:
@@ -256,7 +252,8 @@ def last_entered(G, G_z, T, lb, ub, enters):
     return last
 
 
-@comparing
+# Several entries at a time, in any order; a tour of NaN is as good as any.
+@partial(compiled, fastmath={"reassoc", "nsz", "nnan", "contract"})
 def tour(vectors, near):
     """An order of vectors ``(B, n)``: from each to the nearest of the next ``near`` that are left.
 

@@ -91,4 +91,3 @@ def _solve_alike(arrays: SoftArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray
         lam[k], iterations[k] = info["lam"], info["iterations"]
         failed = flag <= 0
     return v, lam, iterations
-
