@@ -3,11 +3,13 @@ from __future__ import annotations
 import copy
 from concurrent.futures import ThreadPoolExecutor
 
+import pytest
 import torch
 from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
 from torch_qpmpc.programs import ContentMemo, FlatPrograms
+from torch_qpmpc.qp import EVENT_SHAPES
 
 
 def test_a_memo_finds_equal_tensors_and_nothing_else():
@@ -88,3 +90,43 @@ def test_diagonal_matrices_are_multiplied_as_such():
     assert_close(programs.times_H(z), z @ H)
     assert_close(programs.times_G(z), z @ known.qp.G.mT)
     assert_close(programs.times_G(lam, transposed=True), lam @ known.qp.G)
+
+
+@pytest.mark.parametrize("matrices", [(), (4,)])
+@pytest.mark.parametrize("batch", [(), (4,)])
+def test_what_is_no_data_is_found_in_every_tensor(batch, matrices):
+    known = known_qp(2, batch=batch, matrices=matrices)
+    parts = dict(zip(EVENT_SHAPES, known.qp.tensors(), strict=True))
+    fixed = known.fixed.expand(4, -1)
+    assert FlatPrograms.of(*parts.values(), fixed)[0].valid() is None
+    spoilt = dict.fromkeys(("H", "q", "c", "C", "b", "G"), (torch.nan, torch.inf))
+    spoilt |= {"lb": (torch.nan, torch.inf), "ub": (torch.nan, -torch.inf), "w": (torch.nan, -1.0)}
+    for name, values in spoilt.items():
+        for value in values:
+            bad = parts[name].clone()
+            of_one = bad[2] if bad.ndim > len(EVENT_SHAPES[name]) else bad
+            of_one.view(-1)[-1] = value
+            valid = FlatPrograms.of(*(parts | {name: bad}).values(), fixed)[0].valid()
+            assert valid is not None
+            alone = bad.ndim > len(EVENT_SHAPES[name])
+            assert valid.expand(4).tolist() == [alone, alone, False, alone], (name, value)
+    bad = fixed.clone()
+    bad[1, 0] = torch.nan
+    valid = FlatPrograms.of(*parts.values(), bad)[0].valid()
+    assert valid is not None
+    assert valid.tolist() == [True, False, True, True]
+
+
+def test_a_diagonal_is_one_of_a_single_square_matrix():
+    known = known_qp(0)
+    H = torch.diag(torch.arange(12.0).double())
+    theta = known.qp.tensors()[1:]
+    one, _ = FlatPrograms.of(H, *theta, known.fixed)
+    assert one.is_diagonal("H")
+    assert not one.is_diagonal("G")  # of 13 rows
+    assert one.diagonal("G") is None
+    assert_close(one.diagonal("H"), H.diagonal())
+    H[3, 5] = H[5, 3] = 1e-300
+    assert not FlatPrograms.of(H, *theta, known.fixed)[0].is_diagonal("H")
+    many, _ = FlatPrograms.of(torch.eye(12).double().expand(3, 12, 12), *theta, known.fixed)
+    assert not many.is_diagonal("H")

@@ -28,7 +28,7 @@ VIOLATED = 1e-9
 #: H is indefinite if an eigenvalue is below minus this fraction of the largest.
 CONVEX = 1e-9
 
-_getrf, _getrs = get_lapack_funcs(("getrf", "getrs"), dtype=np.float64)
+_getrf, _getrs, _potrf = get_lapack_funcs(("getrf", "getrs", "potrf"), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,12 +197,13 @@ def _convex(H: Tensor) -> Tensor:
 
 def _surely_convex(H: Tensor) -> bool:
     """Whether Cholesky factors prove it of all, in a fraction of the time."""
-    if not H.shape[-1]:
-        return True
-    shifted = H.clone()
-    diagonal = shifted.diagonal(dim1=-2, dim2=-1)
-    diagonal += CONVEX * (1.0 + diagonal.amax(-1, keepdim=True))
-    return not torch.linalg.cholesky_ex(shifted)[1].any()
+    return not H.shape[-1] or all(map(_has_factor, H.cpu().numpy()))
+
+
+def _has_factor(H: np.ndarray) -> bool:
+    shifted = H.copy()
+    shifted.ravel()[:: len(H) + 1] += CONVEX * (1.0 + H.diagonal().max())
+    return _potrf(shifted)[1] == 0
 
 
 def condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:

@@ -178,6 +178,34 @@ def _add_product(x, factors, matrix):
 
 
 @compiled
+def inspect(H, C, G, group, q, c, b, lb, ub, w):
+    """Which QPs have finite data and lb <= ub, ``(B or 1,)``, and whether H and G are diagonal."""
+    M = len(H)
+    finite = np.empty(M, np.bool_)
+    for m in range(M):
+        finite[m] = np.isfinite(H[m].sum() + C[m].sum() + G[m].sum())
+    shared = max(max(len(q), len(c), len(b)), max(len(lb), len(ub), len(w)))
+    valid = np.empty(shared if M == 1 else len(group), np.bool_)
+    for i in range(len(valid)):
+        vectors = q[i % len(q)].sum() + b[i % len(b)].sum() + c[i % len(c)]
+        good = np.isfinite(vectors) and finite[0 if M == 1 else group[i]]
+        for j in range(lb.shape[1]):
+            # False for NaN, as of inf - inf where both bounds are the same infinity.
+            good = good and ub[i % len(ub), j] - lb[i % len(lb), j] >= 0 and w[i % len(w), j] >= 0
+        valid[i] = good
+    return valid, M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
+
+
+@compiled
+def _is_diagonal(matrix):
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            if i != j and matrix[i, j] != 0:
+                return False
+    return matrix.shape[0] == matrix.shape[1]
+
+
+@compiled
 def units(H, C, G, group, q, b, lb, ub, w, small, large):
     """cost, length, rows and equalities of `solvers.units.Units`, and whether any is not one."""
     M, n_g, n_c = len(H), G.shape[1], C.shape[1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torch_qpmpc import kernels
 from torch_qpmpc.batching import broadcast, flatten
 from torch_qpmpc.qp import EVENT_SHAPES, crossed
 
@@ -150,17 +152,18 @@ class FlatPrograms:
         finite = {name: getattr(self, name).nan_to_num(0, 0, 0) for name in ("H", "C", "G")}
         return replace(self, **finite, _known={})
 
-    def valid(self) -> Tensor:
-        """Which QPs have finite data and lb <= ub, ``(B,)``."""
-        return self.known("valid", self._valid_theta) & self.fixed.sum(-1).isfinite()
-
-    def _valid_theta(self) -> Tensor:
+    def valid(self) -> Tensor | None:
+        """Which QPs have finite data and lb <= ub, ``(B,)``, or None if all do."""
+        valid = self._inspected.valid
         # A sum is finite if its terms are (but for overflow, which no solver survives either).
-        matrices = self.H.sum((1, 2)) + self.C.sum((1, 2)) + self.G.sum((1, 2))
-        vectors = self.q.sum(-1) + self.b.sum(-1) + self.c
-        sums = vectors + (matrices if len(matrices) == 1 else matrices[self.group])
-        # A comparison with NaN is false, as with inf - inf where both bounds are the same infinity.
-        return sums.isfinite() & ((self.ub - self.lb).minimum(self.w) >= 0.0).all(-1)
+        if valid is None and math.isfinite(self.fixed.sum()):
+            return None
+        finite = self.fixed.sum(-1).isfinite()
+        return finite if valid is None else valid & finite
+
+    @property
+    def _inspected(self) -> _Inspected:
+        return self.known("inspected", lambda: _Inspected.of(self))
 
     def times_H(self, z: Tensor) -> Tensor:
         """H z, ``(B, n_z)``."""
@@ -179,7 +182,13 @@ class FlatPrograms:
     def diagonal(self, name: str) -> Tensor | None:
         """The diagonal ``(n,)`` of H or of G where all QPs share one that has nothing else."""
         # H is often diagonal, and G the identity.
-        return self.known(("diagonal", name), lambda: _diagonal(getattr(self, name)))
+        if not self.is_diagonal(name):
+            return None
+        return self.known(("diagonal", name), lambda: getattr(self, name)[0].diagonal().clone())
+
+    def is_diagonal(self, name: str) -> bool:
+        """Whether there is such a diagonal."""
+        return self._inspected.diagonal[name]
 
     def multiply(self, matrices: Tensor, vectors: Tensor, *, transposed: bool = False) -> Tensor:
         """Row-wise matrix-vector products: ``(M, i, j)`` by ``(B, j)`` to ``(B, i)``.
@@ -198,12 +207,19 @@ class FlatPrograms:
         return self.multiply(matrices, vectors) + constant
 
 
-def _diagonal(matrices: Tensor) -> Tensor | None:
-    """The diagonal ``(n,)`` of one square matrix that has nothing else."""
-    if matrices.shape[0] != 1 or matrices.shape[-1] != matrices.shape[-2]:
-        return None
-    diagonal = matrices[0].diagonal()
-    return diagonal.clone() if torch.equal(torch.diag(diagonal), matrices[0]) else None
+class _Inspected(NamedTuple):
+    """`FlatPrograms.valid` of all but the fixed entries, and `FlatPrograms.is_diagonal`."""
+
+    valid: Tensor | None
+    diagonal: dict[str, bool]
+
+    @classmethod
+    def of(cls, p: FlatPrograms) -> _Inspected:
+        parts = (p.H, p.C, p.G, p.group, p.q, p.c, p.b, p.lb, p.ub, p.w)
+        given = kernels.arrays(*(part.cpu() for part in parts))
+        valid, H, G = kernels.inspect(*given)
+        some = None if valid.all() else torch.from_numpy(valid).to(p.q.device)
+        return cls(some, {"H": H, "G": G})
 
 
 def multiply(matrices: Tensor, group: Tensor, vectors: Tensor) -> Tensor:

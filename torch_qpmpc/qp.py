@@ -245,8 +245,8 @@ CROSSING = 4.0
 
 def crossed(lb: Tensor, ub: Tensor) -> Tensor:
     """Where lb > ub, and not by rounding alone."""
-    size = lb.abs().maximum(ub.abs())
-    return lb - ub > CROSSING * torch.finfo(lb.dtype).eps * size
+    size, gap = lb.abs().maximum(ub.abs()), lb - ub
+    return (gap > CROSSING * torch.finfo(lb.dtype).eps * size) | (gap == torch.inf)
 
 
 #: A multiplier below this fraction of the largest is zero; one as near to w is saturated.

@@ -29,6 +29,8 @@ from torch_qpmpc.markdown import replaced, table
 from torch_qpmpc.tasks import make_mpc
 
 SEEDS, STEPS, LAST = (69, 1, 2, 3), 5000, 500
+#: Untimed steps of each contender before: what is compiled at its first use is no step's time.
+WARMUP = 50
 #: Where the replay's settings differ from those of the stream.
 REPLAYED = ("optimizer=sliding", "exploration_std=0.05")
 
@@ -108,6 +110,8 @@ def main(arguments: list[str] | None = None) -> None:
     readme = options.readme.read_text(encoding="utf-8")
     replaced(readme, "", "mpcrl")  # before waiting for minutes
     torch.set_num_threads(1)
+    for contender in CONTENDERS.values():
+        contender(options.seeds[0], WARMUP)
     streams: dict[str, list[Stream]] = {label: [] for label in CONTENDERS}
     for seed in options.seeds:
         for label, contender in CONTENDERS.items():

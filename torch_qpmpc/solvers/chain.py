@@ -110,16 +110,17 @@ class _Chain:
     def __init__(self, programs: FlatPrograms, keep: int) -> None:
         self.programs = programs
         valid = programs.valid()
-        if not valid.all():
+        if valid is not None:
             self.programs = programs = programs.without_nan()
         self.keep, self.recalled, self.rejected = keep, 0, 0
         # First-order conditions certify an optimum only where the QP is convex.
         convex = self.reduced_for(programs).convex
         if convex is not None:
-            valid = valid & convex[programs.group]
+            of_qps = convex[programs.group]
+            valid = of_qps if valid is None else valid & of_qps
         self.raw: RawSolution | None = None
-        self.todo = torch.arange(len(programs), device=valid.device)
-        if not valid.all():
+        self.todo = torch.arange(len(programs), device=programs.q.device)
+        if valid is not None and not valid.all():
             self.raw = unsolved(programs)
             self.todo = valid.nonzero().squeeze(-1)
             self.raw.status[self.todo] = Status.NOT_CONVERGED
@@ -167,12 +168,14 @@ class _Chain:
             _replace(answer, ~recalled, qps, solve)
         claim = recover(answer)
         accepted = claim.residual <= TOLERANCE
+        all_accepted = bool(accepted.all())
         if recalled is not None:
             self.recalled = int((recalled & accepted).sum())
-            if _replace(answer, recalled & ~accepted, qps, solve):
+            if not all_accepted and _replace(answer, recalled & ~accepted, qps, solve):
                 claim = recover(answer)
                 accepted = claim.residual <= TOLERANCE
-        if accepted.all():
+                all_accepted = bool(accepted.all())
+        if all_accepted:
             if part is self.programs:
                 self.raw, self.todo = claim, self.todo[:0]
                 return
@@ -251,8 +254,8 @@ def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawS
     """`_recover` QP by QP, which keeps all of one in the cache."""
 
     def of_theta() -> list[np.ndarray]:
-        diagonal = torch.tensor([p.diagonal(name) is not None for name in ("H", "G")])
-        G_T = p.G if diagonal[1] else p.G.mT
+        diagonal = torch.tensor([p.is_diagonal(name) for name in ("H", "G")])
+        G_T = p.G if p.is_diagonal("G") else p.G.mT
         matrices = (reduced.T.mT, reduced.Y_neg, p.C, p.C.mT, p.H, p.G, G_T, diagonal)
         return kernels.arrays(*matrices, reduced.z_0, p.q, p.c, p.b, p.lb, p.ub, p.w)
 
