@@ -98,7 +98,7 @@ def _last_entered(condensed: Condensed, p: FlatPrograms) -> tuple[int, ...]:
     """`_Affine.last`."""
     # Rounding in the elimination leaves traces of variables that a row does not contain. A row that
     # C implies has nothing else, so their sizes are those before it was eliminated.
-    given = kernels.arrays(*(x.cpu() for x in (condensed.G, p.G, condensed.T, p.lb, p.ub)))
+    given = kernels.arrays(condensed.G, p.G, condensed.T, p.lb, p.ub)
     return tuple(kernels.last_entered(*given, ENTERS).tolist())
 
 

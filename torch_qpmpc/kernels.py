@@ -29,8 +29,8 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
 
 
 def arrays(*tensors: Tensor) -> list[np.ndarray]:
-    """The tensors as a kernel takes them."""
-    return [tensor.contiguous().numpy() for tensor in tensors]
+    """The tensors of any device as a kernel takes them."""
+    return [tensor.cpu().contiguous().numpy() for tensor in tensors]
 
 
 @compiled

@@ -215,8 +215,7 @@ class _Inspected(NamedTuple):
 
     @classmethod
     def of(cls, p: FlatPrograms) -> _Inspected:
-        parts = (p.H, p.C, p.G, p.group, p.q, p.c, p.b, p.lb, p.ub, p.w)
-        given = kernels.arrays(*(part.cpu() for part in parts))
+        given = kernels.arrays(p.H, p.C, p.G, p.group, p.q, p.c, p.b, p.lb, p.ub, p.w)
         valid, H, G = kernels.inspect(*given)
         some = None if valid.all() else torch.from_numpy(valid).to(p.q.device)
         return cls(some, {"H": H, "G": G})

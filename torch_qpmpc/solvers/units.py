@@ -40,8 +40,7 @@ class Units:
         """The units of ``p``, or None where all of them are one."""
         if not len(p) or not p.q.shape[-1]:
             return None
-        parts = (p.H, p.C, p.G, p.group, p.q, p.b, p.lb, p.ub, p.w)
-        given = kernels.arrays(*(part.cpu() for part in parts))
+        given = kernels.arrays(p.H, p.C, p.G, p.group, p.q, p.b, p.lb, p.ub, p.w)
         *units, extreme = kernels.units(*given, SMALL, LARGE)
         return cls(*(torch.from_numpy(unit).to(p.q) for unit in units)) if extreme else None
 
