@@ -19,6 +19,10 @@ import numba
 import numpy as np
 from torch import Tensor
 
+#: Of a product by BLAS, entries of the matrix times vectors; from four times as many on, OpenBLAS
+#: starts threads.
+SMALL = 2**16
+
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """``function`` in machine code, kept on disk where a folder for that can be written."""
@@ -49,99 +53,162 @@ def recover(
     ``at_zero`` ``(B or 1, n_z)`` is z where the fixed entries and v are zero, ``T_T``, ``C_T`` and
     ``G_T`` are transposes, and ``diagonal`` says of H and G whether they have nothing else.
     """
-    n_qps, n_z, n_f = len(v), H.shape[2], fixed.shape[1]
-    value, residual = np.empty(n_qps), np.empty(n_qps)
-    z, xi = np.empty((n_qps, n_z)), np.empty((n_qps, n_f))
-    chi, lam = np.zeros((n_qps, C.shape[1])), np.zeros((n_qps, G.shape[1]))
-    sigma = np.zeros(lam.shape)
-    Hz, G_lam, C_chi, left = np.empty(n_z), np.empty(n_z), np.empty(n_z), np.empty(n_z)
-    y, Cz, kept = np.empty(G.shape[1]), np.empty(C.shape[1]), np.empty(T_T.shape[1])
+    n_qps, n_f = fixed.shape
+    kept = np.empty((n_qps, T_T.shape[1]))
+    kept[:, :n_f], kept[:, n_f:] = fixed, v
+    z = _products(kept, T_T, group, False)
     for i in range(n_qps):
-        m = group[i]
-        lb_i, ub_i, w_i = lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)]
-        z[i] = at_zero[i % len(at_zero)]
-        kept[:n_f], kept[n_f:] = fixed[i], v[i]
-        _add_product(z[i], kept, T_T[m])
-        _product(Hz, z[i], H[m], diagonal[0])
-        _product(y, z[i], G_T[m], diagonal[1])
+        for j in range(z.shape[1]):
+            z[i, j] += at_zero[i % len(at_zero), j]
+    Hz, y = _products(z, H, group, diagonal[0]), _products(z, G_T, group, diagonal[1])
+    lam = np.zeros(y.shape)
+    for i in range(n_qps):
+        of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
         for k in range(len(rows)):
-            push, most = lam_v[i, k], w_i[rows[k]]
+            push, most = lam_v[i, k], w[of_w, rows[k]]
             lam[i, rows[k]] = most if push > most else -most if push < -most else push
         for j in others:
-            if w_i[j] < np.inf:  # violated, a hard row stays so
-                if y[j] - ub_i[j] > violated:
-                    lam[i, j] = w_i[j]
-                elif lb_i[j] - y[j] > violated:
-                    lam[i, j] = -w_i[j]
-        _product(G_lam, lam[i], G[m], diagonal[1])
-        for j in range(n_z):
-            left[j] = Hz[j] + q[i % len(q), j] + G_lam[j]
-        _product(chi[i], left, Y_neg[m], False)
-        _product(C_chi, chi[i], C[m], False)
-        _add(left, 1.0, C_chi)
-        for j in range(n_f):
-            xi[i, j], left[j] = -left[j], 0.0 * left[j]
-        _product(Cz, z[i], C_T[m], False)
-        value[i], residual[i] = _judge(
-            z[i], Hz, G_lam, C_chi, left, y, lam[i], chi[i], Cz, fixed[i],
-            q[i % len(q)], c[i % len(c)], b[i % len(b)], lb_i, ub_i, w_i, sigma[i],
-        )  # fmt: skip
+            if w[of_w, j] < np.inf:  # violated, a hard row stays so
+                if y[i, j] - ub[of_ub, j] > violated:
+                    lam[i, j] = w[of_w, j]
+                elif lb[of_lb, j] - y[i, j] > violated:
+                    lam[i, j] = -w[of_w, j]
+    G_lam = _products(lam, G, group, diagonal[1])
+    left = np.empty(z.shape)
+    for i in range(n_qps):
+        for j in range(z.shape[1]):
+            left[i, j] = Hz[i, j] + q[i % len(q), j] + G_lam[i, j]
+    chi = _products(left, Y_neg, group, False)
+    C_chi = _products(chi, C, group, False)
+    left += C_chi
+    xi = -left[:, :n_f]
+    left[:, :n_f] *= 0.0
+    Cz = _products(z, C_T, group, False)
+    value, sigma, residual = judge(
+        z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w
+    )
     return value, z, sigma, chi, lam, xi, residual
+
+
+@compiled
+def _products(vectors, matrices, group, diagonal):
+    """Each QP's transposed matrix times its vector, ``(M, i, j)`` and ``(B, i)`` to ``(B, j)``."""
+    products = np.zeros((len(vectors), matrices.shape[2]))
+    if diagonal:
+        for i in range(len(vectors)):
+            for j in range(vectors.shape[1]):
+                products[i, j] = vectors[i, j] * matrices[0, j, j]
+    elif len(matrices) == 1:
+        # So few at a time that BLAS does not start threads for them; that is fast enough.
+        many = min(16, max(1, SMALL // max(1, matrices.size)))
+        for i in range(0, len(vectors) if matrices.size else 0, many):
+            np.dot(vectors[i : i + many], matrices[0], products[i : i + many])
+    else:
+        for i in range(len(vectors)):
+            _add_product(products[i], vectors[i], matrices[group[i]])
+    return products
 
 
 @compiled
 def judge(z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w):
     """Value ``(B,)``, sigma ``(B, n_g)`` and residual ``(B,)`` of `certificate.certify`."""
     n_qps = len(z)
-    value, residual, sigma = np.empty(n_qps), np.empty(n_qps), np.zeros(y.shape)
+    value, residual, sigma = np.empty(n_qps), np.empty(n_qps), np.empty(y.shape)
     for i in range(n_qps):
-        value[i], residual[i] = _judge(
-            z[i], Hz[i], G_lam[i], C_chi[i], left[i], y[i], lam[i], chi[i], Cz[i], fixed[i],
-            q[i % len(q)], c[i % len(c)], b[i % len(b)],
-            lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)], sigma[i],
-        )  # fmt: skip
+        of_q, of_b = i % len(q), i % len(b)
+        of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
+        cost, slip = _cost(z, Hz, left, q, i, of_q)
+        charge, gap = _charge(y, lam, lb, ub, w, sigma, i, of_lb, of_ub, of_w)
+        cost, slip = cost + charge, slip + gap + _shortage(Cz, b, chi, i, of_b)
+        force, slope, length = _forces(z, Hz, G_lam, C_chi, left, q, i, of_q)
+        short, size = _distance(Cz, b, i, of_b)
+        error = max(slope / (1.0 + force), short / (1.0 + size + length))
+        error = max(error, _distance(z, fixed, i, i)[0])
+        error = max(error, _excess(y, lam, lb, ub, w, i, of_lb, of_ub, of_w))
+        slip /= 1.0 + abs(cost)
+        worst = max(error, slip)
+        value[i] = cost + c[i % len(c)]
+        # A NaN of any entry is in the sums; the largest sizes know nothing of it.
+        residual[i] = worst if slip < np.inf and worst < np.inf else np.inf
     return value, sigma, residual
 
 
-@compiled
-def _judge(z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w, sigma):
-    """Value and residual of one claim; fills in its sigma."""
-    cost = slip = slope = force = length = error = 0.0
-    for j in range(len(z)):
-        at, unmet = abs(z[j]), abs(left[j])
-        force = _larger(force, _larger(abs(q[j]), abs(Hz[j])))
-        force = _larger(force, _larger(abs(G_lam[j]), abs(C_chi[j])))
-        slope, length = _larger(slope, unmet), _larger(length, at)
-        cost += (q[j] + 0.5 * Hz[j]) * z[j]
-        slip += unmet * at
-    for j in range(len(fixed)):
-        error = _larger(error, abs(z[j] - fixed[j]))
-    short = size = 0.0
-    for j in range(len(chi)):
-        unmet = abs(Cz[j] - b[j])
-        short, size = _larger(short, unmet), _larger(size, abs(b[j]))
-        slip += unmet * abs(chi[j])
-    for j in range(len(y)):
-        at, push, weight, above, below = y[j], lam[j], w[j], ub[j], lb[j]
+# Four entries at a time: sums in any order, and largest sizes as if nothing were NaN.
+_summing = partial(compiled, fastmath={"reassoc", "contract"})
+_comparing = partial(compiled, fastmath={"nnan", "nsz"})
+
+
+@_summing
+def _cost(z, Hz, left, q, i, k):
+    """(q + Hz / 2) z, and what stationarity left is worth."""
+    cost = slip = 0.0
+    for j in range(z.shape[1]):
+        cost += (q[k, j] + 0.5 * Hz[i, j]) * z[i, j]
+        slip += abs(left[i, j] * z[i, j])
+    return cost, slip
+
+
+@_summing
+def _charge(y, lam, lb, ub, w, sigma, i, of_lb, of_ub, of_w):
+    """w sigma and the rows' complementarity gaps; fills in sigma."""
+    total = slip = 0.0
+    for j in range(y.shape[1]):
+        at, push, weight = y[i, j], lam[i, j], w[of_w, j]
+        above, below = ub[of_ub, j], lb[of_lb, j]
         outside = at - above if at > above else below - at if at < below else 0.0
+        outside = 0.0 if weight == np.inf else outside
+        charge = outside * (0.0 if weight == np.inf else weight)
         # NaN is neither, and stays.
         up, down = 0.0 if push < 0 else push, 0.0 if push > 0 else push
-        if above == np.inf:
-            above, error = 0.0, _larger(error, up)
-        if below == -np.inf:
-            below, error = 0.0, _larger(error, -down)
-        charge = 0.0
-        if weight == np.inf:
-            error = _larger(error, outside / (1.0 + abs(at)))
-        else:
-            sigma[j], charge = outside, outside * weight
-            error = _larger(error, (abs(push) - weight) / (1.0 + weight))
-        cost += charge
+        above, below = 0.0 if above == np.inf else above, 0.0 if below == -np.inf else below
+        sigma[i, j] = outside
+        total += charge
         slip += abs(charge + (above - at) * up + (below - at) * down)
-    error = _larger(error, slope / (1.0 + force))
-    error = _larger(error, short / (1.0 + size + length))
-    error = _larger(error, slip / (1.0 + abs(cost)))
-    return cost + c, np.inf if error != error else error
+    return total, slip
+
+
+@_summing
+def _shortage(Cz, b, chi, i, k):
+    """What C z = b lacks is worth."""
+    slip = 0.0
+    for j in range(b.shape[1]):
+        slip += abs((Cz[i, j] - b[k, j]) * chi[i, j])
+    return slip
+
+
+@_comparing
+def _forces(z, Hz, G_lam, C_chi, left, q, i, k):
+    """The largest sizes of the terms of stationarity, of what they leave, and of z."""
+    force = slope = length = 0.0
+    for j in range(z.shape[1]):
+        costs, rows = max(abs(q[k, j]), abs(Hz[i, j])), max(abs(G_lam[i, j]), abs(C_chi[i, j]))
+        force = max(force, max(costs, rows))
+        slope, length = max(slope, abs(left[i, j])), max(length, abs(z[i, j]))
+    return force, slope, length
+
+
+@_comparing
+def _distance(x, y, i, k):
+    """The largest difference of x from y, and size of y."""
+    difference = size = 0.0
+    for j in range(y.shape[1]):
+        difference, size = max(difference, abs(x[i, j] - y[k, j])), max(size, abs(y[k, j]))
+    return difference, size
+
+
+@_comparing
+def _excess(y, lam, lb, ub, w, i, of_lb, of_ub, of_w):
+    """The largest violation of a hard row, multiplier beyond w, or multiplier of no bound."""
+    error = 0.0
+    for j in range(y.shape[1]):
+        at, push, weight = y[i, j], lam[i, j], w[of_w, j]
+        above, below = ub[of_ub, j], lb[of_lb, j]
+        hard = weight == np.inf
+        excess = max(at - above, below - at) if hard else abs(push) - weight
+        error = max(error, excess / (1.0 + (abs(at) if hard else weight)))
+        error = max(error, push if above == np.inf else 0.0)
+        error = max(error, -push if below == -np.inf else 0.0)
+    return error
 
 
 @compiled
@@ -149,17 +216,6 @@ def _add(x, factor, y):
     """x += factor y."""
     for j in range(len(x)):
         x[j] += factor * y[j]
-
-
-@compiled
-def _product(x, factors, matrix, diagonal):
-    """x = matrix' factors."""
-    if diagonal:
-        for j in range(len(x)):
-            x[j] = factors[j] * matrix[j, j]
-    else:
-        x[:] = 0.0
-        _add_product(x, factors, matrix)
 
 
 @compiled
