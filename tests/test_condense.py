@@ -22,13 +22,13 @@ from torch_qpmpc.programs import ContentMemo, FlatPrograms
 def eliminations(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
     """The matrices that were factorised since the test began."""
     factorised = []
-    eliminate = condense_module._eliminate
+    condense_anew = condense_module._condense
 
-    def counting(C: Tensor, keep: int):
+    def counting(H: Tensor, C: Tensor, G: Tensor, keep: int):
         factorised.append(C)
-        return eliminate(C, keep)
+        return condense_anew(H, C, G, keep)
 
-    monkeypatch.setattr(condense_module, "_eliminate", counting)
+    monkeypatch.setattr(condense_module, "_condense", counting)
     return factorised
 
 

@@ -27,6 +27,8 @@ ENTERS = 1e-12
 VIOLATED = 1e-9
 #: H is indefinite if an eigenvalue is below minus this fraction of the largest.
 CONVEX = 1e-9
+#: Entries of a matrix up to which one kernel does it all; for larger ones BLAS would start threads.
+SMALL = 2**12
 
 _getrf, _getrs, _potrf = get_lapack_funcs(("getrf", "getrs", "potrf"), dtype=np.float64)
 
@@ -218,6 +220,11 @@ _memo = ContentMemo()
 
 
 def _condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
+    if max(x.shape[1:].numel() for x in (H, C, G)) <= SMALL:
+        given = kernels.arrays(H, C, G)
+        *found, regular, convex = kernels.condense(*given, keep, RANK_TOLERANCE, CONVEX)
+        if regular:
+            return Condensed(keep, False, *(torch.from_numpy(x).to(C) for x in found), convex)
     eliminated = _eliminate(C, keep)
     T, Y, padding = _null_space(C, keep) if eliminated is None else (*eliminated, None)
     H_T = H.bmm(T)

@@ -19,9 +19,8 @@ import numba
 import numpy as np
 from torch import Tensor
 
-#: Of a product by BLAS, entries of the matrix times vectors; from four times as many on, OpenBLAS
-#: starts threads.
-SMALL = 2**16
+#: Of a product by BLAS, entries of the matrix times vectors: beyond, OpenBLAS starts threads.
+SMALL = 2**18
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
@@ -99,10 +98,9 @@ def _products(vectors, matrices, group, diagonal):
             for j in range(vectors.shape[1]):
                 products[i, j] = vectors[i, j] * matrices[0, j, j]
     elif len(matrices) == 1:
-        # So few at a time that BLAS does not start threads for them; that is fast enough.
-        many = min(16, max(1, SMALL // max(1, matrices.size)))
-        for i in range(0, len(vectors) if matrices.size else 0, many):
-            np.dot(vectors[i : i + many], matrices[0], products[i : i + many])
+        some = max(1, SMALL // max(1, matrices.size))
+        for i in range(0, len(vectors) if matrices.size else 0, some):
+            np.dot(vectors[i : i + some], matrices[0], products[i : i + some])
     else:
         for i in range(len(vectors)):
             _add_product(products[i], vectors[i], matrices[group[i]])
@@ -231,6 +229,107 @@ def _add_product(x, factors, matrix):
     for j in range(whole, len(factors)):
         for k in range(len(x)):
             x[k] += factors[j] * matrix[j, k]
+
+
+@compiled
+def condense(H, C, G, keep, independent, convex):
+    """T, Y_neg, H, G, H_b and G_b of `condense.Condensed`, and what it says of them.
+
+    That is whether all rows of C are independent of each other in the columns after ``keep``, as
+    is needed for the rest, and whether all of H surely are convex.
+    """
+    M, n_c, n_z = C.shape
+    n_y, n_g = max(0, n_z - n_c), G.shape[1]
+    T, Y, regular = np.zeros((M, n_z, n_y)), np.zeros((M, n_z, n_c)), n_c <= n_z - keep
+    H_y, G_y = np.empty((M, n_y, n_y)), np.empty((M, n_g, n_y))
+    H_b, G_b = np.empty((M, n_y, n_c)), np.empty((M, n_g, n_c))
+    surely_convex = True
+    for m in range(M):
+        regular = regular and _eliminate(C[m], keep, independent, T[m], Y[m])
+        if regular:
+            H_is_diagonal, G_is_diagonal = _is_diagonal(H[m]), _is_diagonal(G[m])
+            H_T = _matrix_product(H[m], T[m], H_is_diagonal)
+            T_HT = _matrix_product(T[m].T.copy(), H_T, False)
+            H_y[m] = (T_HT + T_HT.T) / 2.0
+            H_b[m] = _matrix_product(H_T.T.copy(), Y[m], False)
+            G_y[m] = _matrix_product(G[m], T[m], G_is_diagonal)
+            G_b[m] = _matrix_product(G[m], Y[m], G_is_diagonal)
+            surely_convex = surely_convex and _has_factor(H_y[m], convex)
+    return T, -Y, H_y, G_y, H_b, G_b, regular, surely_convex
+
+
+@compiled
+def _eliminate(C, keep, independent, T, Y):
+    """T and Y of one C, by LU as `condense._eliminate_one`; whether there are such."""
+    n_c, n_z = C.shape
+    n_y, n_rest = n_z - n_c, n_z - keep
+    factors, order = C[:, keep:].T.copy(), np.arange(n_z)
+    for k in range(n_c):
+        pivot, size = k, 0.0
+        for j in range(n_rest):
+            size += C[k, keep + j] ** 2
+        for j in range(k + 1, n_rest):
+            if abs(factors[j, k]) > abs(factors[pivot, k]):
+                pivot = j
+        if not abs(factors[pivot, k]) > independent * math.sqrt(size):
+            return False
+        if pivot != k:
+            for i in range(n_c):
+                factors[k, i], factors[pivot, i] = factors[pivot, i], factors[k, i]
+            order[keep + k], order[keep + pivot] = order[keep + pivot], order[keep + k]
+        for j in range(k + 1, n_rest):
+            factors[j, k] /= factors[k, k]
+            for i in range(k + 1, n_c):
+                factors[j, i] -= factors[j, k] * factors[k, i]
+    dependent = order[keep : keep + n_c]
+    columns = np.concatenate((order[:keep], np.sort(order[keep + n_c :])))
+    # The dependent columns are the transpose of the first n_c rows of L times U.
+    right = np.zeros((n_c, n_z))
+    for i in range(n_c):
+        for j in range(n_y):
+            right[i, j] = -C[i, columns[j]]
+        right[i, n_y + i] = 1.0
+    for i in range(n_c):
+        for j in range(i):
+            _add(right[i], -factors[j, i], right[j])
+        right[i] /= factors[i, i]
+    for i in range(n_c - 2, -1, -1):
+        for j in range(i + 1, n_c):
+            _add(right[i], -factors[j, i], right[j])
+    for i in range(n_c):
+        T[dependent[i]], Y[dependent[i]] = right[i, :n_y], right[i, n_y:]
+    for j in range(n_y):
+        T[columns[j], j] = 1.0
+    return True
+
+
+@compiled
+def _matrix_product(left, right, diagonal):
+    if not diagonal:
+        return np.dot(left, right)
+    product = np.empty(right.shape)
+    for i in range(len(left)):
+        for j in range(right.shape[1]):
+            product[i, j] = left[i, i] * right[i, j]
+    return product
+
+
+@compiled
+def _has_factor(H, convex):
+    """`condense._has_factor`."""
+    shift = 0.0
+    for j in range(len(H)):
+        shift = max(shift, H[j, j])
+    L = H.copy()
+    for j in range(len(H)):
+        L[j, j] += convex * (1.0 + shift)
+        for k in range(j):
+            for i in range(j, len(H)):
+                L[i, j] -= L[j, k] * L[i, k]
+        if not L[j, j] > 0:
+            return False
+        L[j:, j] /= math.sqrt(L[j, j])
+    return True
 
 
 @compiled
