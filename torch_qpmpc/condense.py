@@ -8,7 +8,6 @@ Y, T'HT and GT; fixing the first n_f <= keep entries then only changes a linear 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ import torch.nn.functional as F
 from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
-from torch_qpmpc import kernels
+from torch_qpmpc import kernels, theta_kernels
 from torch_qpmpc.programs import ContentMemo, FlatPrograms, SoftQPs
 
 #: A pivot below this fraction of its row's norm means that the rows of C depend on each other.
@@ -57,51 +56,7 @@ class Condensed:
     def reduced(self, programs: FlatPrograms) -> Reduced:
         """The problem in what is free of ``programs``."""
         n_f = programs.fixed.shape[-1]
-        key = ("reduced", self.keep, n_f)
-        return programs.known(key, lambda: Reduced.of(self, self._affine(programs), programs, n_f))
-
-    def _affine(self, programs: FlatPrograms) -> _Affine:
-        return programs.known(("affine", self.keep), lambda: _Affine.of(self, programs))
-
-
-@dataclass(frozen=True, eq=False)
-class _Affine:
-    """What a sample moves of the condensed problem, if y = (fixed, v) is: all of it is affine in y.
-
-    Its gradient in y and the bounds of all rows: ``(g, l, u) = constant + matrix y``, with
-    ``(B or 1, n)`` and ``(M, n, n_y)``; z_0 ``(B or 1, n_z)`` is z at y = 0. ``last`` says how many
-    variables there are up to the last that enters a row, zero for a row without a finite bound.
-    """
-
-    matrix: Tensor
-    constant: Tensor
-    z_0: Tensor
-    last: tuple[int, ...]
-
-    @classmethod
-    def of(cls, condensed: Condensed, p: FlatPrograms) -> _Affine:
-        T, H, G = condensed.T, condensed.H, condensed.G
-        shift = p.multiply(condensed.G_b, p.b)
-        constant = (
-            p.multiply(T, p.q, transposed=True) + p.multiply(condensed.H_b, p.b),
-            p.lb - shift,
-            p.ub - shift,
-        )
-        count = next((len(part) for part in constant if len(part) != 1), 1)
-        return cls(
-            torch.cat((H, -G, -G), dim=1),
-            torch.cat([part.expand(count, -1) for part in constant], dim=1),
-            -p.multiply(condensed.Y_neg, p.b),
-            _last_entered(condensed, p),
-        )
-
-
-def _last_entered(condensed: Condensed, p: FlatPrograms) -> tuple[int, ...]:
-    """`_Affine.last`."""
-    # Rounding in the elimination leaves traces of variables that a row does not contain. A row that
-    # C implies has nothing else, so their sizes are those before it was eliminated.
-    given = kernels.arrays(condensed.G, p.G, condensed.T, p.lb, p.ub)
-    return tuple(kernels.last_entered(*given, ENTERS).tolist())
+        return programs.known(("reduced", self.keep, n_f), lambda: Reduced.of(self, programs, n_f))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,11 +68,11 @@ class Reduced:
 
     Attributes:
         H, G: ``(M, d, d)`` and ``(M, r, d)``.
-        T, Y_neg: ``(M, n_z, n_y)`` and ``(M, n_z, n_c)``.
         matrix, constant: ``(M, d + 2 r, n_f)`` and ``(B, d + 2 r)``. What a sample's fixed entries
             make of g, l and u is ``constant + matrix fixed``.
         z_0: ``(B, n_z)``, z where the fixed entries and v are zero.
         w: ``(B, r)``.
+        T, Y_neg: those of `Condensed`.
         convex: where H is positive semidefinite, ``(M,)``, or None if it is everywhere.
     """
 
@@ -125,31 +80,24 @@ class Reduced:
     others: Tensor
     H: Tensor
     G: Tensor
-    T: Tensor
-    Y_neg: Tensor
     matrix: Tensor
     constant: Tensor
     z_0: Tensor
     w: Tensor
+    T: Tensor
+    Y_neg: Tensor
     convex: Tensor | None
 
     @classmethod
-    def of(cls, condensed: Condensed, affine: _Affine, p: FlatPrograms, n_f: int) -> Reduced:
-        rows, others, moved = _split(affine.last, n_f, condensed.T.shape[2], p.q.device)
-        H = condensed.H[:, n_f:, n_f:].contiguous()
-        return cls(
-            rows,
-            others,
-            H=H,
-            G=condensed.G[:, rows, n_f:],
-            T=condensed.T,
-            Y_neg=condensed.Y_neg,
-            matrix=affine.matrix[:, moved, :n_f],
-            constant=affine.constant[:, moved],
-            z_0=affine.z_0,
-            w=p.w[:, rows],
-            convex=None if condensed.surely_convex else _convex(H),
-        )
+    def of(cls, condensed: Condensed, p: FlatPrograms, n_f: int) -> Reduced:
+        names = ("T", "Y_neg", "H", "G", "H_b", "G_b")
+        of_matrices = kernels.arrays(*(getattr(condensed, name) for name in names))
+        given = kernels.arrays(p.G, p.group, p.q, p.b, p.lb, p.ub, p.w)
+        found = theta_kernels.reduce(*of_matrices, *given, n_f, ENTERS)
+        device = p.q.device
+        rows, others, H, *rest = (torch.from_numpy(array).to(device) for array in found)
+        convex = None if condensed.surely_convex else _convex(H)
+        return cls(rows, others, H, *rest, convex=convex, T=condensed.T, Y_neg=condensed.Y_neg)
 
     def at(self, programs: FlatPrograms) -> SoftQPs:
         """What a backend solves, with the rows ``rows``."""
@@ -173,22 +121,6 @@ class Reduced:
         full = beyond.sign() * p.w.masked_fill(p.w.isinf(), 0.0)
         full[:, self.rows] = lam.clamp(-self.w, self.w)
         return full
-
-
-@lru_cache(maxsize=16)
-def _split(
-    last: tuple[int, ...], n_f: int, n_y: int, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Of `Reduced`: rows, others, and what a sample moves among the rows of `_Affine`."""
-    n_g = len(last)
-    own = [i for i in range(n_g) if last[i] > n_f]
-    others = [i for i in range(n_g) if last[i] <= n_f]
-    lower, upper = ([n_y + k * n_g + i for i in own] for k in (0, 1))
-    moved = [*range(n_f, n_y), *lower, *upper]
-    rows, others, moved = (
-        torch.tensor(i, dtype=torch.int64, device=device) for i in (own, others, moved)
-    )
-    return rows, others, moved
 
 
 def _convex(H: Tensor) -> Tensor:
@@ -222,7 +154,7 @@ _memo = ContentMemo()
 def _condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
     if max(x.shape[1:].numel() for x in (H, C, G)) <= SMALL:
         given = kernels.arrays(H, C, G)
-        *found, regular, convex = kernels.condense(*given, keep, RANK_TOLERANCE, CONVEX)
+        *found, regular, convex = theta_kernels.condense(*given, keep, RANK_TOLERANCE, CONVEX)
         if regular:
             return Condensed(keep, False, *(torch.from_numpy(x).to(C) for x in found), convex)
     eliminated = _eliminate(C, keep)

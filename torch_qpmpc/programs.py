@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torch_qpmpc import kernels
+from torch_qpmpc import kernels, theta_kernels
 from torch_qpmpc.batching import broadcast, flatten
 from torch_qpmpc.qp import EVENT_SHAPES, crossed
 
@@ -216,7 +216,7 @@ class _Inspected(NamedTuple):
     @classmethod
     def of(cls, p: FlatPrograms) -> _Inspected:
         given = kernels.arrays(p.H, p.C, p.G, p.group, p.q, p.c, p.b, p.lb, p.ub, p.w)
-        valid, H, G = kernels.inspect(*given)
+        valid, H, G = theta_kernels.inspect(*given)
         some = None if valid.all() else torch.from_numpy(valid).to(p.q.device)
         return cls(some, {"H": H, "G": G})
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torch_qpmpc import kernels
+from torch_qpmpc import kernels, theta_kernels
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.solvers.raw import RawSolution
 
@@ -41,7 +41,7 @@ class Units:
         if not len(p) or not p.q.shape[-1]:
             return None
         given = kernels.arrays(p.H, p.C, p.G, p.group, p.q, p.b, p.lb, p.ub, p.w)
-        *units, extreme = kernels.units(*given, SMALL, LARGE)
+        *units, extreme = theta_kernels.units(*given, SMALL, LARGE)
         return cls(*(torch.from_numpy(unit).to(p.q) for unit in units)) if extreme else None
 
     def scaled(self, p: FlatPrograms) -> FlatPrograms:

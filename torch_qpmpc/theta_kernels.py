@@ -1,0 +1,272 @@
+"""Loops of what is worked out once for a theta, compiled by Numba as those of `kernels` are.
+
+What theta is inspected for, its units, and the condensed problem, for which torch takes a hundred
+small operations. Arrays and vectors that all QPs share are as in `kernels`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from torch_qpmpc.kernels import add, compiled
+
+
+@compiled
+def inspect(H, C, G, group, q, c, b, lb, ub, w):
+    """Which QPs have finite data and lb <= ub, ``(B or 1,)``, and whether H and G are diagonal."""
+    M = len(H)
+    finite = np.empty(M, np.bool_)
+    for m in range(M):
+        finite[m] = np.isfinite(H[m].sum() + C[m].sum() + G[m].sum())
+    shared = max(max(len(q), len(c), len(b)), max(len(lb), len(ub), len(w)))
+    valid = np.empty(shared if M == 1 else len(group), np.bool_)
+    for i in range(len(valid)):
+        vectors = q[i % len(q)].sum() + b[i % len(b)].sum() + c[i % len(c)]
+        good = np.isfinite(vectors) and finite[0 if M == 1 else group[i]]
+        for j in range(lb.shape[1]):
+            # False for NaN, as of inf - inf where both bounds are the same infinity.
+            good = good and ub[i % len(ub), j] - lb[i % len(lb), j] >= 0 and w[i % len(w), j] >= 0
+        valid[i] = good
+    return valid, M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
+
+
+@compiled
+def _is_diagonal(matrix):
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            if i != j and matrix[i, j] != 0:
+                return False
+    return matrix.shape[0] == matrix.shape[1]
+
+
+@compiled
+def units(H, C, G, group, q, b, lb, ub, w, small, large):
+    """cost, length, rows and equalities of `solvers.units.Units`, and whether any is not one."""
+    M, n_g, n_c = len(H), G.shape[1], C.shape[1]
+    of_G, of_C = np.abs(G).sum(axis=2), np.abs(C).sum(axis=2)
+    of_q, of_b = _sizes(q, group, M), _sizes(b, group, M)
+    of_rows, of_w = np.maximum(_sizes(lb, group, M), _sizes(ub, group, M)), _sizes(w, group, M)
+    cost, length = np.empty((M, 1)), np.empty((M, 1))
+    rows, equalities = np.empty((M, n_g)), np.empty((M, n_c))
+    extreme = False
+    for m in range(M):
+        reach = np.concatenate((of_rows[m] / of_G[m], of_b[m] / of_C[m]))
+        reach = np.sort(reach[(reach > 0) & (reach < np.inf)])
+        long = _power_above(reach[(len(reach) - 1) // 2], small, large) if len(reach) else 1.0
+        size = 0.0
+        for j in range(H.shape[1]):
+            size = _larger(size, of_q[m, j] * long)
+            for k in range(H.shape[2]):
+                size = _larger(size, abs(H[m, j, k]) * long**2)
+        if not size > 0:  # a QP without any other cost
+            for j in range(n_g):
+                size = _larger(size, of_w[m, j] * of_G[m, j] * long)
+        cost[m], length[m] = _power_above(size, small, large), long
+        for j in range(n_g):
+            rows[m, j] = _power_above(of_G[m, j] * long, small, large)
+        for j in range(n_c):
+            equalities[m, j] = _power_above(of_C[m, j] * long, small, large)
+        extreme = extreme or cost[m, 0] != 1 or long != 1
+        extreme = extreme or (rows[m] != 1).any() or (equalities[m] != 1).any()
+    return cost, length, rows, equalities, extreme
+
+
+@compiled
+def _larger(x, y):
+    """The larger one, or NaN where either is."""
+    return x if x >= y or x != x else y
+
+
+@compiled
+def _sizes(vectors, group, M):
+    """The largest finite sizes ``(M, n)`` of the QPs that share their matrices."""
+    largest = np.zeros((M, vectors.shape[1]))
+    for i in range(max(len(vectors), M)):
+        m = i if len(vectors) == 1 else group[i]
+        for j in range(vectors.shape[1]):
+            size = abs(vectors[i % len(vectors), j])
+            if size < np.inf:  # neither is NaN
+                largest[m, j] = max(largest[m, j], size)
+    return largest
+
+
+@compiled
+def _power_above(size, small, large):
+    """The power of two next above a size, or one if that is ordinary, zero or not finite."""
+    if 0 < size < small or large < size < np.inf:
+        return math.ldexp(1.0, math.frexp(size)[1])
+    return 1.0
+
+
+@compiled
+def condense(H, C, G, keep, independent, convex):
+    """T, Y_neg, H, G, H_b and G_b of `condense.Condensed`, and what it says of them.
+
+    That is whether all rows of C are independent of each other in the columns after ``keep``, as
+    is needed for the rest, and whether all of H surely are convex.
+    """
+    M, n_c, n_z = C.shape
+    n_y, n_g = max(0, n_z - n_c), G.shape[1]
+    T, Y, regular = np.zeros((M, n_z, n_y)), np.zeros((M, n_z, n_c)), n_c <= n_z - keep
+    H_y, G_y = np.empty((M, n_y, n_y)), np.empty((M, n_g, n_y))
+    H_b, G_b = np.empty((M, n_y, n_c)), np.empty((M, n_g, n_c))
+    surely_convex = True
+    for m in range(M):
+        regular = regular and _eliminate(C[m], keep, independent, T[m], Y[m])
+        if regular:
+            H_is_diagonal, G_is_diagonal = _is_diagonal(H[m]), _is_diagonal(G[m])
+            H_T = _matrix_product(H[m], T[m], H_is_diagonal)
+            T_HT = _matrix_product(T[m].T.copy(), H_T, False)
+            H_y[m] = (T_HT + T_HT.T) / 2.0
+            H_b[m] = _matrix_product(H_T.T.copy(), Y[m], False)
+            G_y[m] = _matrix_product(G[m], T[m], G_is_diagonal)
+            G_b[m] = _matrix_product(G[m], Y[m], G_is_diagonal)
+            surely_convex = surely_convex and _has_factor(H_y[m], convex)
+    return T, -Y, H_y, G_y, H_b, G_b, regular, surely_convex
+
+
+@compiled
+def _eliminate(C, keep, independent, T, Y):
+    """T and Y of one C, by LU as `condense._eliminate_one`; whether there are such."""
+    n_c, n_z = C.shape
+    n_y, n_rest = n_z - n_c, n_z - keep
+    factors, order = C[:, keep:].T.copy(), np.arange(n_z)
+    for k in range(n_c):
+        pivot, size = k, 0.0
+        for j in range(n_rest):
+            size += C[k, keep + j] ** 2
+        for j in range(k + 1, n_rest):
+            if abs(factors[j, k]) > abs(factors[pivot, k]):
+                pivot = j
+        if not abs(factors[pivot, k]) > independent * math.sqrt(size):
+            return False
+        if pivot != k:
+            for i in range(n_c):
+                factors[k, i], factors[pivot, i] = factors[pivot, i], factors[k, i]
+            order[keep + k], order[keep + pivot] = order[keep + pivot], order[keep + k]
+        for j in range(k + 1, n_rest):
+            factors[j, k] /= factors[k, k]
+            for i in range(k + 1, n_c):
+                factors[j, i] -= factors[j, k] * factors[k, i]
+    dependent = order[keep : keep + n_c]
+    columns = np.concatenate((order[:keep], np.sort(order[keep + n_c :])))
+    # The dependent columns are the transpose of the first n_c rows of L times U.
+    right = np.zeros((n_c, n_z))
+    for i in range(n_c):
+        for j in range(n_y):
+            right[i, j] = -C[i, columns[j]]
+        right[i, n_y + i] = 1.0
+    for i in range(n_c):
+        for j in range(i):
+            add(right[i], -factors[j, i], right[j])
+        right[i] /= factors[i, i]
+    for i in range(n_c - 2, -1, -1):
+        for j in range(i + 1, n_c):
+            add(right[i], -factors[j, i], right[j])
+    for i in range(n_c):
+        T[dependent[i]], Y[dependent[i]] = right[i, :n_y], right[i, n_y:]
+    for j in range(n_y):
+        T[columns[j], j] = 1.0
+    return True
+
+
+@compiled
+def _matrix_product(left, right, diagonal):
+    if not diagonal:
+        return np.dot(left, right)
+    product = np.empty(right.shape)
+    for i in range(len(left)):
+        for j in range(right.shape[1]):
+            product[i, j] = left[i, i] * right[i, j]
+    return product
+
+
+@compiled
+def _has_factor(H, convex):
+    """`condense._has_factor`."""
+    shift = 0.0
+    for j in range(len(H)):
+        shift = max(shift, H[j, j])
+    L = H.copy()
+    for j in range(len(H)):
+        L[j, j] += convex * (1.0 + shift)
+        for k in range(j):
+            for i in range(j, len(H)):
+                L[i, j] -= L[j, k] * L[i, k]
+        if not L[j, j] > 0:
+            return False
+        L[j:, j] /= math.sqrt(L[j, j])
+    return True
+
+
+@compiled
+def reduce(T, Y_neg, H, G, H_b, G_b, G_z, group, q, b, lb, ub, w, n_f, enters):
+    """rows, others, H, G, matrix, constant, z_0 and w of `condense.Reduced`.
+
+    The arguments are those of `condense.Condensed` and of the QPs, whose G is ``G_z``.
+    """
+    M, n_y = len(H), H.shape[2]
+    last = _last_entered(G, G_z, T, lb, ub, enters)
+    rows, others = np.nonzero(last > n_f)[0], np.nonzero(last <= n_f)[0]
+    d, r = n_y - n_f, len(rows)
+    G_v, matrix = np.empty((M, r, d)), np.empty((M, d + 2 * r, n_f))
+    for m in range(M):
+        matrix[m, :d] = H[m, n_f:, :n_f]
+        for k in range(r):
+            G_v[m, k] = G[m, rows[k], n_f:]
+            matrix[m, d + k] = matrix[m, d + r + k] = -G[m, rows[k], :n_f]
+    alike = M == 1
+    count = max(max(len(q), len(b)), max(len(lb), len(ub))) if alike else len(group)
+    constant, z_0 = np.zeros((count, d + 2 * r)), np.zeros((len(b) if alike else count, T.shape[1]))
+    for i in range(count):
+        m = 0 if alike else group[i]
+        of_q, of_b = i % len(q), i % len(b)
+        for j in range(q.shape[1]):
+            add(constant[i, :d], q[of_q, j], T[m, j, n_f:])
+        for k in range(d):
+            constant[i, k] += _dot(H_b[m, n_f + k], b[of_b])
+        for k in range(r):
+            shift = _dot(G_b[m, rows[k]], b[of_b])
+            constant[i, d + k] = lb[i % len(lb), rows[k]] - shift
+            constant[i, d + r + k] = ub[i % len(ub), rows[k]] - shift
+        if i < len(z_0):
+            for j in range(T.shape[1]):
+                z_0[i, j] = -_dot(Y_neg[m, j], b[of_b])
+    return rows, others, H[:, n_f:, n_f:].copy(), G_v, matrix, constant, z_0, w[:, rows]
+
+
+@compiled
+def _dot(x, y):
+    total = 0.0
+    for j in range(len(x)):
+        total += x[j] * y[j]
+    return total
+
+
+@compiled
+def _last_entered(G, G_z, T, lb, ub, enters):
+    """How many variables there are up to the last that enters a row of G ``(M, n_g, n_y)``.
+
+    Zero for a row without a finite bound. Rounding in the elimination leaves traces of variables
+    that a row does not contain. A row that C implies has nothing else, so their sizes are compared
+    with those before it was eliminated, of G_z and T.
+    """
+    last = np.zeros(G.shape[1], np.int64)
+    for j in range(len(last)):
+        bounded = False
+        for i in range(max(len(lb), len(ub))):
+            bounded = bounded or lb[i % len(lb), j] > -np.inf or ub[i % len(ub), j] < np.inf
+        if not bounded:
+            continue
+        for m in range(len(G)):
+            whole = 0.0
+            for k in range(G_z.shape[2]):
+                if G_z[m, j, k] != 0:
+                    whole += abs(G_z[m, j, k]) * np.abs(T[m, k]).sum()
+            for k in range(G.shape[2] - 1, last[j] - 1, -1):
+                if abs(G[m, j, k]) > enters * whole:
+                    last[j] = k + 1
+                    break
+    return last
