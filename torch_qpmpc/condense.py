@@ -90,10 +90,9 @@ class Reduced:
 
     @classmethod
     def of(cls, condensed: Condensed, p: FlatPrograms, n_f: int) -> Reduced:
-        names = ("T", "Y_neg", "H", "G", "H_b", "G_b")
-        of_matrices = kernels.arrays(*(getattr(condensed, name) for name in names))
-        given = kernels.arrays(p.G, p.group, p.q, p.b, p.lb, p.ub, p.w)
-        found = theta_kernels.reduce(*of_matrices, *given, n_f, ENTERS)
+        x, a = condensed, p.arrays()
+        given = kernels.arrays(x.T, x.Y_neg, x.H, x.G, x.H_b, x.G_b, p.group)
+        found = theta_kernels.reduce(*given, a.G, a.q, a.b, a.lb, a.ub, a.w, n_f, ENTERS)
         device = p.q.device
         rows, others, H, *rest = (torch.from_numpy(array).to(device) for array in found)
         convex = None if condensed.surely_convex else _convex(H)
@@ -103,7 +102,7 @@ class Reduced:
         """What a backend solves, with the rows ``rows``."""
         d, r = self.H.shape[-1], self.rows.shape[0]
         moved = programs.affine(self.matrix, programs.fixed, self.constant)
-        g, lower, upper = moved.split((d, r, r), dim=-1)
+        g, lower, upper = moved.split_with_sizes((d, r, r), dim=-1)
         w = self.w.expand(len(programs), -1)
         return SoftQPs(self.H, self.G, programs.group, g, lower, upper, w)
 
@@ -156,7 +155,8 @@ def _condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
         given = kernels.arrays(H, C, G)
         *found, regular, convex = theta_kernels.condense(*given, keep, RANK_TOLERANCE, CONVEX)
         if regular:
-            return Condensed(keep, False, *(torch.from_numpy(x).to(C) for x in found), convex)
+            tensors = [torch.from_numpy(array).to(C) for array in found]
+            return Condensed(keep, False, *tensors, surely_convex=convex)
     eliminated = _eliminate(C, keep)
     T, Y, padding = _null_space(C, keep) if eliminated is None else (*eliminated, None)
     H_T = H.bmm(T)

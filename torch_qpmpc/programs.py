@@ -152,6 +152,10 @@ class FlatPrograms:
         finite = {name: getattr(self, name).nan_to_num(0, 0, 0) for name in ("H", "C", "G")}
         return replace(self, **finite, _known={})
 
+    def arrays(self) -> ProgramArrays:
+        """The same for the kernels."""
+        return self.known("arrays", lambda: ProgramArrays.of(self))
+
     def valid(self) -> Tensor | None:
         """Which QPs have finite data and lb <= ub, ``(B,)``, or None if all do."""
         valid = self._inspected.valid
@@ -207,6 +211,24 @@ class FlatPrograms:
         return self.multiply(matrices, vectors) + constant
 
 
+class ProgramArrays(NamedTuple):
+    """`FlatPrograms` but for group and fixed, as NumPy arrays."""
+
+    H: np.ndarray
+    C: np.ndarray
+    G: np.ndarray
+    q: np.ndarray
+    c: np.ndarray
+    b: np.ndarray
+    lb: np.ndarray
+    ub: np.ndarray
+    w: np.ndarray
+
+    @classmethod
+    def of(cls, p: FlatPrograms) -> ProgramArrays:
+        return cls(*kernels.arrays(*(getattr(p, name) for name in cls._fields)))
+
+
 class _Inspected(NamedTuple):
     """`FlatPrograms.valid` of all but the fixed entries, and `FlatPrograms.is_diagonal`."""
 
@@ -215,8 +237,8 @@ class _Inspected(NamedTuple):
 
     @classmethod
     def of(cls, p: FlatPrograms) -> _Inspected:
-        given = kernels.arrays(p.H, p.C, p.G, p.group, p.q, p.c, p.b, p.lb, p.ub, p.w)
-        valid, H, G = theta_kernels.inspect(*given)
+        a, group = p.arrays(), *kernels.arrays(p.group)
+        valid, H, G = theta_kernels.inspect(a.H, a.C, a.G, group, a.q, a.c, a.b, a.lb, a.ub, a.w)
         some = None if valid.all() else torch.from_numpy(valid).to(p.q.device)
         return cls(some, {"H": H, "G": G})
 

@@ -202,7 +202,7 @@ def _has_factor(H, convex):
 
 
 @compiled
-def reduce(T, Y_neg, H, G, H_b, G_b, G_z, group, q, b, lb, ub, w, n_f, enters):
+def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
     """rows, others, H, G, matrix, constant, z_0 and w of `condense.Reduced`.
 
     The arguments are those of `condense.Condensed` and of the QPs, whose G is ``G_z``.

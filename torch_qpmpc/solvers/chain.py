@@ -254,10 +254,11 @@ def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawS
     """`_recover` QP by QP, which keeps all of one in the cache."""
 
     def of_theta() -> list[np.ndarray]:
-        diagonal = torch.tensor([p.is_diagonal(name) for name in ("H", "G")])
-        G_T = p.G if p.is_diagonal("G") else p.G.mT
-        matrices = (reduced.T.mT, reduced.Y_neg, p.C, p.C.mT, p.H, p.G, G_T, diagonal)
-        return kernels.arrays(*matrices, reduced.z_0, p.q, p.c, p.b, p.lb, p.ub, p.w)
+        a, diagonal = p.arrays(), np.array([p.is_diagonal(name) for name in ("H", "G")])
+        T_T, C_T, Y_neg, z_0 = kernels.arrays(reduced.T.mT, p.C.mT, reduced.Y_neg, reduced.z_0)
+        G_T = a.G if diagonal[1] else np.ascontiguousarray(a.G.swapaxes(1, 2))
+        matrices = [T_T, Y_neg, a.C, C_T, a.H, a.G, G_T, diagonal]
+        return [*matrices, z_0, a.q, a.c, a.b, a.lb, a.ub, a.w]
 
     given = (answer.v, answer.lam, p.group, p.fixed, reduced.rows, reduced.others)
     # V and Q of a theta share its T, unless C has dependent rows.

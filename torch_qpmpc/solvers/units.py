@@ -40,7 +40,8 @@ class Units:
         """The units of ``p``, or None where all of them are one."""
         if not len(p) or not p.q.shape[-1]:
             return None
-        given = kernels.arrays(p.H, p.C, p.G, p.group, p.q, p.b, p.lb, p.ub, p.w)
+        a, group = p.arrays(), *kernels.arrays(p.group)
+        given = (a.H, a.C, a.G, group, a.q, a.b, a.lb, a.ub, a.w)
         *units, extreme = theta_kernels.units(*given, SMALL, LARGE)
         return cls(*(torch.from_numpy(unit).to(p.q) for unit in units)) if extreme else None
 
