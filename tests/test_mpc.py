@@ -216,6 +216,16 @@ def test_the_program_is_discounted_by_stage(discounted):
     assert_close(qp.b, torch.zeros(4).double())
 
 
+def test_value_and_action_value_may_share_a_quadratic_program():
+    mpc, s, a = random_mpc(8), random_states(5).double(), random_states(5, 1, size=0.5).double()
+    alone = mpc.value(s).sum() + mpc.action_value(s, a).sum()
+    qp = mpc.quadratic_program()
+    shared = mpc.value(s, qp).sum() + mpc.action_value(s, a, qp).sum()
+    assert shared == alone
+    gradients = [torch.autograd.grad(total, [*mpc.parameters()]) for total in (alone, shared)]
+    assert_close(*gradients)
+
+
 def test_stages_may_have_weights_and_models_of_their_own():
     weights = torch.arange(1.0, 7.0).reshape(2, 3)
     mpc = QPMPC.from_model(

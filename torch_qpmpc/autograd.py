@@ -199,21 +199,25 @@ def _solve_now(
     if on_failure != "mask":
         _report(raw, batch, on_failure)
 
-    def out(tensor: Tensor) -> Tensor:
-        shaped = tensor if len(batch) == 1 else tensor.reshape((*batch, *tensor.shape[1:]))
-        return shaped.to(q.device, q.dtype if tensor.is_floating_point() else tensor.dtype)
-
-    return (
-        out(raw.value),
-        out(raw.z),
-        out(raw.sigma),
-        out(raw.chi),
-        out(raw.lam),
-        out(raw.xi),
-        out(raw.status),
-        out(raw.residual),
-        out(raw.iterations),
+    outputs = (
+        raw.value,
+        raw.z,
+        raw.sigma,
+        raw.chi,
+        raw.lam,
+        raw.xi,
+        raw.status,
+        raw.residual,
+        raw.iterations,
     )
+    if len(batch) == 1 and q.dtype == raw.value.dtype and q.device == raw.value.device:
+        return outputs
+
+    def out(tensor: Tensor) -> Tensor:
+        dtype = q.dtype if tensor.is_floating_point() else tensor.dtype
+        return tensor.reshape((*batch, *tensor.shape[1:])).to(q.device, dtype)
+
+    return tuple(map(out, outputs))  # pyright: ignore[reportReturnType] - nine of them
 
 
 solve_op = torch.library.custom_op("torch_qpmpc::solve", _solve_now, mutates_args=())
@@ -300,18 +304,18 @@ def envelope_gradients(
     Each is a function of the tensor: over the batch dimensions that it lacks, the gradient is
     summed.
     """
-    weighted_z = weight.unsqueeze(-1) * z
+    weighted_z, negative = weight.unsqueeze(-1) * z, -weight
     return {
         "H": lambda like: 0.5 * outer(weighted_z, z, like),
         "q": lambda like: weighted_sum(weight, z, like),
         "c": lambda like: sum_to(weight, like),
         "C": lambda like: outer(chi, weighted_z, like),
-        "b": lambda like: weighted_sum(-weight, chi, like),
+        "b": lambda like: weighted_sum(negative, chi, like),
         "G": lambda like: outer(lam, weighted_z, like),
-        "lb": lambda like: weighted_sum(weight, (-lam).clamp(min=0), like),
-        "ub": lambda like: weighted_sum(-weight, lam.clamp(min=0), like),
+        "lb": lambda like: weighted_sum(negative, lam.clamp(max=0), like),
+        "ub": lambda like: weighted_sum(negative, lam.clamp(min=0), like),
         "w": lambda like: weighted_sum(weight, sigma, like),
-        "fixed": lambda like: weighted_sum(-weight, xi, like),
+        "fixed": lambda like: weighted_sum(negative, xi, like),
     }
 
 

@@ -203,13 +203,19 @@ class QPMPC(nn.Module):
         """
         return cls.from_model(A, B, horizon, **(starts.linear_mpc(A, B, **options) | options))
 
-    def value(self, s: Tensor) -> Tensor:
-        """V(s) (eq:qp4), a cost to go: s ``(*batch, n_x)`` to ``(*batch,)``."""
-        return self._value(self._checked(s))
+    def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
+        """V(s) (eq:qp4), a cost to go: s ``(*batch, n_x)`` to ``(*batch,)``.
 
-    def action_value(self, s: Tensor, a: Tensor) -> Tensor:
-        """Q(s, a) (eq:qp5), a cost to go: ``(*batch, n_x)``, ``(*batch, n_u)`` to ``(*batch,)``."""
-        return self._value(self._checked(s, a))
+        ``qp`` is `quadratic_program`, where that has been made for today's theta already.
+        """
+        return self._value(self._checked(s), qp)
+
+    def action_value(self, s: Tensor, a: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
+        """Q(s, a) (eq:qp5), a cost to go: ``(*batch, n_x)``, ``(*batch, n_u)`` to ``(*batch,)``.
+
+        ``qp`` is as for `value`.
+        """
+        return self._value(self._checked(s, a), qp)
 
     def policy(self, s: Tensor) -> Tensor:
         """pi(s), the u_0 of V's solution: s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
@@ -228,11 +234,10 @@ class QPMPC(nn.Module):
     ) -> QPSolution:
         """The whole solution of V's QP, or of Q's where an action is given, in theta's dtype.
 
-        ``qp`` is `quadratic_program`, where that has been made for today's theta already.
+        ``qp`` is as for `value`.
         """
         fixed = self._checked(s, a)
-        qp = self.quadratic_program() if qp is None else qp
-        check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or nothing.")
+        qp = self._today(qp)
         return solve_qp(
             qp,
             fixed.to(qp.C.dtype),
@@ -378,8 +383,14 @@ class QPMPC(nn.Module):
             return check_tensor("s", s, self.n_x, device=self.C_0.device)
         return check_pair(s, a, self.n_x, self.n_u, self.C_0.device)
 
-    def _value(self, fixed: Tensor) -> Tensor:
-        qp = self.quadratic_program()
+    def _today(self, qp: QuadraticProgram | None) -> QuadraticProgram:
+        if qp is None:
+            return self.quadratic_program()
+        check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or nothing.")
+        return qp
+
+    def _value(self, fixed: Tensor, qp: QuadraticProgram | None) -> Tensor:
+        qp = self._today(qp)
         keep = self.n_x + self.n_u
         value = optimal_value(
             qp, fixed.to(qp.C.dtype), solver=self.solver, on_failure=self.on_failure, keep=keep

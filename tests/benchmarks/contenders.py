@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tests.benchmarks.peers import PEERS, Values
 from tests.benchmarks.problems import GAMMA, PAPER, Transitions, make_mpc, move, transitions
-from torch_qpmpc import QPMPC
+from torch_qpmpc import QPMPC, QuadraticProgram
 from torch_qpmpc.solvers import BACKENDS
 
 BATCHES = (1, 32, 256, 1024)
@@ -29,14 +29,18 @@ class Gradient:
 
     mpc: QPMPC
     batch: Transitions
-    value: Callable[[Tensor], Tensor]
-    action_value: Callable[[Tensor, Tensor], Tensor]
+    value: Callable[[Tensor, QuadraticProgram], Tensor]
+    action_value: Callable[[Tensor, Tensor, QuadraticProgram], Tensor]
+
+    def __post_init__(self) -> None:
+        self.optimizer = torch.optim.SGD(self.mpc.parameters())
 
     def step(self) -> tuple[Tensor, Tensor]:
-        self.mpc.zero_grad()
+        self.optimizer.zero_grad()
+        qp = self.mpc.quadratic_program()
         with torch.no_grad():
-            V = self.value(self.batch.following)
-        Q = self.action_value(self.batch.s, self.batch.a)
+            V = self.value(self.batch.following, qp)
+        Q = self.action_value(self.batch.s, self.batch.a, qp)
         (0.5 * (self.batch.cost + GAMMA * V - Q).square().mean()).backward()
         return V, Q.detach()
 
@@ -82,8 +86,8 @@ def warm(mpc: QPMPC, batch: Transitions) -> Gradient:
     return Gradient(
         mpc,
         batch,
-        lambda s: mpc.solve(s, warm_start=of_V).value,
-        lambda s, a: mpc.solve(s, a, warm_start=of_Q).value,
+        lambda s, qp: mpc.solve(s, warm_start=of_V, qp=qp).value,
+        lambda s, a, qp: mpc.solve(s, a, warm_start=of_Q, qp=qp).value,
     )
 
 
@@ -93,8 +97,8 @@ def peer(values: Callable[[], Values]) -> Callable[[QPMPC, Transitions], Gradien
         return Gradient(
             mpc,
             batch,
-            lambda s: of(mpc.quadratic_program(), s),
-            lambda s, a: of(mpc.quadratic_program(), torch.cat((s, a), dim=-1)),
+            lambda s, qp: of(qp, s),
+            lambda s, a, qp: of(qp, torch.cat((s, a), dim=-1)),
         )
 
     return make

@@ -128,7 +128,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPMPC: n_x numpy": (
         M(n_x=np.int64(2)),
-        "n_x: got np.int64(2), expected a positive integer.",
+        f"n_x: got {np.int64(2)!r}, expected a positive integer.",  # by NumPy 1 as 2
     ),
     "QPMPC: horizon str": (
         M(horizon="3"),
@@ -346,6 +346,10 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "QPMPC.action_value: meta a": (
         lambda: mpc.action_value(S, Aa.to("meta")),
         "a: got a tensor on meta, expected one on cpu. Move it, or the module: .to('",
+    ),
+    "QPMPC.value: qp": (
+        lambda: mpc.value(S, GOOD),
+        "qp: got dict, expected a QuadraticProgram. Pass mpc.quadratic_program(), or",
     ),
     "solve_qp: qp wrong": (
         lambda: mpc.solve(S, qp=GOOD),
