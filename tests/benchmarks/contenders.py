@@ -33,10 +33,11 @@ class Gradient:
     action_value: Callable[[Tensor, Tensor, QuadraticProgram], Tensor]
 
     def __post_init__(self) -> None:
-        self.optimizer = torch.optim.SGD(self.mpc.parameters())
+        self.parameters = [*self.mpc.parameters()]
 
     def step(self) -> tuple[Tensor, Tensor]:
-        self.optimizer.zero_grad()
+        for parameter in self.parameters:
+            parameter.grad = None
         qp = self.mpc.quadratic_program()
         with torch.no_grad():
             V = self.value(self.batch.following, qp)
@@ -46,7 +47,7 @@ class Gradient:
 
     def flat(self) -> Tensor:
         """The gradient in all of theta, as one vector."""
-        gradients = (p.grad for p in self.mpc.parameters())
+        gradients = (p.grad for p in self.parameters)
         return torch.cat([g.flatten() for g in gradients if g is not None])
 
 
