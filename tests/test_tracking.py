@@ -56,7 +56,9 @@ def test_folder_has_everything_logged(tmp_path):
         OmegaConf.to_container(cfg, resolve=True)
     )
 
-    table: Any = pd.read_csv(folder / "metrics.csv").set_index("update")
+    table: Any = pd.read_csv(folder / "metrics.csv", float_precision="round_trip").set_index(
+        "update"
+    )
     assert list(table.index) == list(range(1, 301)), "one row for an update"
     assert list(table.columns) == ["loss/value", "train/reward", "eval/J"]
     assert table["loss/value"][7] == 1 / 7, "to the last digit"

@@ -53,7 +53,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def metrics(folder: Path) -> Any:
     """metrics.csv as a DataFrame by update."""
-    return pd.read_csv(folder / "metrics.csv").set_index("update")
+    return pd.read_csv(folder / "metrics.csv", float_precision="round_trip").set_index("update")
 
 
 def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:

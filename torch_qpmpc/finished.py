@@ -93,7 +93,9 @@ class FinishedRun:
     @property
     def metrics(self) -> pd.DataFrame:
         """metrics.csv by update."""
-        return pd.read_csv(self.folder / "metrics.csv").set_index("update")
+        return pd.read_csv(self.folder / "metrics.csv", float_precision="round_trip").set_index(
+            "update"
+        )
 
     def readings(self) -> dict[str, float]:
         """What the learned constraints say.
