@@ -49,11 +49,11 @@ def recover(
     n_qps, n_f = fixed.shape
     kept = np.empty((n_qps, T_T.shape[1]))
     kept[:, :n_f], kept[:, n_f:] = fixed, v
-    z = _products(kept, T_T, group, False)
+    z = products(kept, T_T, group, False)
     for i in range(n_qps):
         for j in range(z.shape[1]):
             z[i, j] += at_zero[i % len(at_zero), j]
-    Hz, y = _products(z, H, group, diagonal[0]), _products(z, G_T, group, diagonal[1])
+    Hz, y = products(z, H, group, diagonal[0]), products(z, G_T, group, diagonal[1])
     lam = np.zeros(y.shape)
     for i in range(n_qps):
         of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
@@ -66,17 +66,17 @@ def recover(
                     lam[i, j] = w[of_w, j]
                 elif lb[of_lb, j] - y[i, j] > violated:
                     lam[i, j] = -w[of_w, j]
-    G_lam = _products(lam, G, group, diagonal[1])
+    G_lam = products(lam, G, group, diagonal[1])
     left = np.empty(z.shape)
     for i in range(n_qps):
         for j in range(z.shape[1]):
             left[i, j] = Hz[i, j] + q[i % len(q), j] + G_lam[i, j]
-    chi = _products(left, Y_neg, group, False)
-    C_chi = _products(chi, C, group, False)
+    chi = products(left, Y_neg, group, False)
+    C_chi = products(chi, C, group, False)
     left += C_chi
     xi = -left[:, :n_f]
     left[:, :n_f] *= 0.0
-    Cz = _products(z, C_T, group, False)
+    Cz = products(z, C_T, group, False)
     value, sigma, residual = judge(
         z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w
     )
@@ -84,21 +84,21 @@ def recover(
 
 
 @compiled
-def _products(vectors, matrices, group, diagonal):
+def products(vectors, matrices, group, diagonal):
     """Each QP's transposed matrix times its vector, ``(M, i, j)`` and ``(B, i)`` to ``(B, j)``."""
-    products = np.zeros((len(vectors), matrices.shape[2]))
+    found = np.zeros((len(vectors), matrices.shape[2]))
     if diagonal:
         for i in range(len(vectors)):
             for j in range(vectors.shape[1]):
-                products[i, j] = vectors[i, j] * matrices[0, j, j]
+                found[i, j] = vectors[i, j] * matrices[0, j, j]
     elif len(matrices) == 1:
         some = max(1, SMALL // max(1, matrices.size))
         for i in range(0, len(vectors) if matrices.size else 0, some):
-            np.dot(vectors[i : i + some], matrices[0], products[i : i + some])
+            np.dot(vectors[i : i + some], matrices[0], found[i : i + some])
     else:
         for i in range(len(vectors)):
-            _add_product(products[i], vectors[i], matrices[group[i]])
-    return products
+            _add_product(found[i], vectors[i], matrices[group[i]])
+    return found
 
 
 @compiled

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from torch_qpmpc.kernels import add, compiled
+from torch_qpmpc.kernels import add, compiled, products
 
 
 @compiled
@@ -207,42 +207,43 @@ def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
 
     The arguments are those of `condense.Condensed` and of the QPs, whose G is ``G_z``.
     """
-    M, n_y = len(H), H.shape[2]
+    M, n_z, n_y = T.shape
     last = _last_entered(G, G_z, T, lb, ub, enters)
     rows, others = np.nonzero(last > n_f)[0], np.nonzero(last <= n_f)[0]
     d, r = n_y - n_f, len(rows)
     G_v, matrix = np.empty((M, r, d)), np.empty((M, d + 2 * r, n_f))
+    # What b makes of g, of y and of z.
+    by_b = np.empty((M, b.shape[1], d + r + n_z))
     for m in range(M):
         matrix[m, :d] = H[m, n_f:, :n_f]
+        by_b[m, :, :d], by_b[m, :, d + r :] = H_b[m, n_f:].T, -Y_neg[m].T
         for k in range(r):
             G_v[m, k] = G[m, rows[k], n_f:]
             matrix[m, d + k] = matrix[m, d + r + k] = -G[m, rows[k], :n_f]
-    alike = M == 1
-    count = max(max(len(q), len(b)), max(len(lb), len(ub))) if alike else len(group)
-    constant, z_0 = np.zeros((count, d + 2 * r)), np.zeros((len(b) if alike else count, T.shape[1]))
-    for i in range(count):
-        m = 0 if alike else group[i]
-        of_q, of_b = i % len(q), i % len(b)
-        for j in range(q.shape[1]):
-            add(constant[i, :d], q[of_q, j], T[m, j, n_f:])
-        for k in range(d):
-            constant[i, k] += _dot(H_b[m, n_f + k], b[of_b])
+            by_b[m, :, d + k] = G_b[m, rows[k]]
+    count = max(max(len(q), len(b)), max(len(lb), len(ub)))
+    if M != 1:
+        count = len(group)
+        q, b = _repeated(q, count), _repeated(b, count)
+    of_q, of_b = products(q, T[:, :, n_f:].copy(), group, False), products(b, by_b, group, False)
+    constant = np.empty((count, d + 2 * r))
+    for i in range(len(constant)):
+        from_b = of_b[i % len(b)]
+        constant[i, :d] = of_q[i % len(q)] + from_b[:d]
         for k in range(r):
-            shift = _dot(G_b[m, rows[k]], b[of_b])
-            constant[i, d + k] = lb[i % len(lb), rows[k]] - shift
-            constant[i, d + r + k] = ub[i % len(ub), rows[k]] - shift
-        if i < len(z_0):
-            for j in range(T.shape[1]):
-                z_0[i, j] = -_dot(Y_neg[m, j], b[of_b])
-    return rows, others, H[:, n_f:, n_f:].copy(), G_v, matrix, constant, z_0, w[:, rows]
+            constant[i, d + k] = lb[i % len(lb), rows[k]] - from_b[d + k]
+            constant[i, d + r + k] = ub[i % len(ub), rows[k]] - from_b[d + k]
+    z_0, H_v = of_b[:, d + r :].copy(), H[:, n_f:, n_f:].copy()
+    return rows, others, H_v, G_v, matrix, constant, z_0, w[:, rows]
 
 
 @compiled
-def _dot(x, y):
-    total = 0.0
-    for j in range(len(x)):
-        total += x[j] * y[j]
-    return total
+def _repeated(vectors, count):
+    """A row for each QP."""
+    repeated = np.empty((count, vectors.shape[1]))
+    for i in range(count):
+        repeated[i] = vectors[i % len(vectors)]
+    return repeated
 
 
 @compiled
