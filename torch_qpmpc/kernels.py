@@ -48,7 +48,11 @@ def recover(
     """
     n_qps, n_f = fixed.shape
     kept = np.empty((n_qps, T_T.shape[1]))
-    kept[:, :n_f], kept[:, n_f:] = fixed, v
+    for i in range(n_qps):
+        for j in range(n_f):
+            kept[i, j] = fixed[i, j]
+        for j in range(v.shape[1]):
+            kept[i, n_f + j] = v[i, j]
     z = products(kept, T_T, group, False)
     for i in range(n_qps):
         for j in range(z.shape[1]):
@@ -73,9 +77,12 @@ def recover(
             left[i, j] = Hz[i, j] + q[i % len(q), j] + G_lam[i, j]
     chi = products(left, Y_neg, group, False)
     C_chi = products(chi, C, group, False)
-    left += C_chi
-    xi = -left[:, :n_f]
-    left[:, :n_f] *= 0.0
+    xi = np.empty(fixed.shape)
+    for i in range(n_qps):
+        for j in range(z.shape[1]):
+            left[i, j] += C_chi[i, j]
+        for j in range(n_f):
+            xi[i, j], left[i, j] = -left[i, j], 0.0 * left[i, j]
     Cz = products(z, C_T, group, False)
     value, sigma, residual = judge(
         z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w
@@ -225,36 +232,47 @@ def _add_product(x, factors, matrix):
             x[k] += factors[j] * matrix[j, k]
 
 
-# Several entries at a time, in any order; a tour of NaN is as good as any.
-@partial(compiled, fastmath={"reassoc", "nsz", "nnan", "contract"})
-def tour(vectors, near):
+def tour(vectors: np.ndarray, near: int) -> np.ndarray:
     """An order of vectors ``(B, n)``: from each to the nearest of the next ``near`` that are left.
 
     A nearest-neighbour tour in units of the entries' standard deviations; of more than ``near``
     vectors, the next ones are those in the order of their first entry.
     """
+    few = len(vectors) <= near or not vectors.shape[1]
+    order = np.arange(len(vectors)) if few else vectors[:, 0].argsort()
+    _walk(vectors, order, near)
+    return order
+
+
+# Several entries at a time, in any order; a tour of NaN is as good as any.
+@partial(compiled, fastmath={"reassoc", "nsz", "nnan", "contract"})
+def _walk(vectors, order, near):
+    """Put ``order`` in the order of `tour`."""
     n_qps, n = vectors.shape
-    points = np.empty((n, n_qps), np.float32)
+    points, distance = np.empty((n, n_qps), np.float32), np.empty(near, np.float32)
     for k in range(n):
-        mean = vectors[:, k].sum() / n_qps
-        spread = math.sqrt(((vectors[:, k] - mean) ** 2).sum() / n_qps)
-        points[k] = (vectors[:, k] - mean) / (spread if spread > 0 else 1.0)
-    order = np.arange(n_qps)
-    if n_qps > near and n:
-        order = np.argsort(points[0])
-        points = points[:, order].copy()
-    distance = np.empty(near, np.float32)
+        mean = square = 0.0
+        for i in range(n_qps):
+            mean += vectors[i, k] / n_qps
+        for i in range(n_qps):
+            square += (vectors[i, k] - mean) ** 2 / n_qps
+        for i in range(n_qps):
+            points[k, i] = (vectors[order[i], k] - mean) / (
+                math.sqrt(square) if square > 0 else 1.0
+            )
     for at in range(n_qps - 1):
-        left = min(near, n_qps - 1 - at)
-        distance[:left] = 0.0
+        left, nearest = min(near, n_qps - 1 - at), 0
+        for j in range(left):
+            distance[j] = 0.0
         for k in range(n):
             for j in range(left):
                 distance[j] += (points[k, at + 1 + j] - points[k, at]) ** 2
-        nearest = at + 1 + np.argmin(distance[:left])
+        for j in range(left):
+            nearest = j if distance[j] < distance[nearest] else nearest
+        nearest += at + 1
         order[at + 1], order[nearest] = order[nearest], order[at + 1]
         for k in range(n):
             points[k, at + 1], points[k, nearest] = points[k, nearest], points[k, at + 1]
-    return order
 
 
 @compiled

@@ -45,16 +45,18 @@ def _is_diagonal(matrix):
 def units(H, C, G, group, q, b, lb, ub, w, small, large):
     """cost, length, rows and equalities of `solvers.units.Units`, and whether any is not one."""
     M, n_g, n_c = len(H), G.shape[1], C.shape[1]
-    of_G, of_C = np.abs(G).sum(axis=2), np.abs(C).sum(axis=2)
+    of_G, of_C = _sums(G), _sums(C)
     of_q, of_b = _sizes(q, group, M), _sizes(b, group, M)
-    of_rows, of_w = np.maximum(_sizes(lb, group, M), _sizes(ub, group, M)), _sizes(w, group, M)
+    of_lb, of_ub, of_w = _sizes(lb, group, M), _sizes(ub, group, M), _sizes(w, group, M)
     cost, length = np.empty((M, 1)), np.empty((M, 1))
-    rows, equalities = np.empty((M, n_g)), np.empty((M, n_c))
+    rows, equalities, reach = np.empty((M, n_g)), np.empty((M, n_c)), np.empty(n_g + n_c)
     extreme = False
     for m in range(M):
-        reach = np.concatenate((of_rows[m] / of_G[m], of_b[m] / of_C[m]))
-        reach = np.sort(reach[(reach > 0) & (reach < np.inf)])
-        long = _power_above(reach[(len(reach) - 1) // 2], small, large) if len(reach) else 1.0
+        for j in range(n_g):
+            reach[j] = max(of_lb[m, j], of_ub[m, j]) / of_G[m, j]
+        for j in range(n_c):
+            reach[n_g + j] = of_b[m, j] / of_C[m, j]
+        long = _typical(reach, small, large)
         size = 0.0
         for j in range(H.shape[1]):
             size = _larger(size, of_q[m, j] * long)
@@ -63,13 +65,14 @@ def units(H, C, G, group, q, b, lb, ub, w, small, large):
         if not size > 0:  # a QP without any other cost
             for j in range(n_g):
                 size = _larger(size, of_w[m, j] * of_G[m, j] * long)
-        cost[m], length[m] = _power_above(size, small, large), long
+        cost[m, 0], length[m, 0] = _power_above(size, small, large), long
+        extreme = extreme or cost[m, 0] != 1 or long != 1
         for j in range(n_g):
             rows[m, j] = _power_above(of_G[m, j] * long, small, large)
+            extreme = extreme or rows[m, j] != 1
         for j in range(n_c):
             equalities[m, j] = _power_above(of_C[m, j] * long, small, large)
-        extreme = extreme or cost[m, 0] != 1 or long != 1
-        extreme = extreme or (rows[m] != 1).any() or (equalities[m] != 1).any()
+            extreme = extreme or equalities[m, j] != 1
     return cost, length, rows, equalities, extreme
 
 
@@ -93,6 +96,33 @@ def _sizes(vectors, group, M):
 
 
 @compiled
+def _sums(matrices):
+    """The absolute sums of rows, ``(M, i, j)`` to ``(M, i)``."""
+    sums = np.zeros(matrices.shape[:2])
+    for m in range(matrices.shape[0]):
+        for i in range(matrices.shape[1]):
+            for j in range(matrices.shape[2]):
+                sums[m, i] += abs(matrices[m, i, j])
+    return sums
+
+
+@compiled
+def _typical(sizes, small, large):
+    """`_power_above` of the lower median of the sizes that are positive and finite."""
+    counts, known = np.zeros(2200, np.int64), 0
+    for size in sizes:
+        if 0 < size < np.inf:
+            # Their powers have the same order, and are sorted by being counted.
+            counts[1100 + math.frexp(_power_above(size, small, large))[1]] += 1
+            known += 1
+    at, passed = 0, counts[0]
+    while known and passed <= (known - 1) // 2:
+        at += 1
+        passed += counts[at]
+    return math.ldexp(1.0, at - 1101) if known else 1.0
+
+
+@compiled
 def _power_above(size, small, large):
     """The power of two next above a size, or one if that is ordinary, zero or not finite."""
     if 0 < size < small or large < size < np.inf:
@@ -109,30 +139,41 @@ def condense(H, C, G, keep, independent, convex):
     """
     M, n_c, n_z = C.shape
     n_y, n_g = max(0, n_z - n_c), G.shape[1]
-    T, Y, regular = np.zeros((M, n_z, n_y)), np.zeros((M, n_z, n_c)), n_c <= n_z - keep
+    T, Y_neg, regular = np.zeros((M, n_z, n_y)), np.zeros((M, n_z, n_c)), n_c <= n_z - keep
     H_y, G_y = np.empty((M, n_y, n_y)), np.empty((M, n_g, n_y))
     H_b, G_b = np.empty((M, n_y, n_c)), np.empty((M, n_g, n_c))
     surely_convex = True
     for m in range(M):
-        regular = regular and _eliminate(C[m], keep, independent, T[m], Y[m])
+        regular = regular and _eliminate(C[m], keep, independent, T[m], Y_neg[m])
         if regular:
             H_is_diagonal, G_is_diagonal = _is_diagonal(H[m]), _is_diagonal(G[m])
-            H_T = _matrix_product(H[m], T[m], H_is_diagonal)
-            T_HT = _matrix_product(T[m].T.copy(), H_T, False)
-            H_y[m] = (T_HT + T_HT.T) / 2.0
-            H_b[m] = _matrix_product(H_T.T.copy(), Y[m], False)
-            G_y[m] = _matrix_product(G[m], T[m], G_is_diagonal)
-            G_b[m] = _matrix_product(G[m], Y[m], G_is_diagonal)
+            H_T = _times(H[m], T[m], H_is_diagonal)
+            T_HT = _times(_transposed(T[m]), H_T, False)
+            HT_Y, G_T = _times(_transposed(H_T), Y_neg[m], False), _times(G[m], T[m], G_is_diagonal)
+            GY = _times(G[m], Y_neg[m], G_is_diagonal)
+            for i in range(n_y):
+                for j in range(n_y):
+                    H_y[m, i, j] = (T_HT[i, j] + T_HT[j, i]) / 2.0
+                for j in range(n_c):
+                    H_b[m, i, j] = -HT_Y[i, j]
+            for i in range(n_g):
+                for j in range(n_y):
+                    G_y[m, i, j] = G_T[i, j]
+                for j in range(n_c):
+                    G_b[m, i, j] = -GY[i, j]
             surely_convex = surely_convex and _has_factor(H_y[m], convex)
-    return T, -Y, H_y, G_y, H_b, G_b, regular, surely_convex
+    return T, Y_neg, H_y, G_y, H_b, G_b, regular, surely_convex
 
 
 @compiled
-def _eliminate(C, keep, independent, T, Y):
-    """T and Y of one C, by LU as `condense._eliminate_one`; whether there are such."""
+def _eliminate(C, keep, independent, T, Y_neg):
+    """T and -Y of one C, by LU as `condense._eliminate_one`; whether there are such."""
     n_c, n_z = C.shape
     n_y, n_rest = n_z - n_c, n_z - keep
-    factors, order = C[:, keep:].T.copy(), np.arange(n_z)
+    factors, order, stays = np.empty((n_rest, n_c)), np.arange(n_z), np.ones(n_z, np.bool_)
+    for i in range(n_c):
+        for j in range(n_rest):
+            factors[j, i] = C[i, keep + j]
     for k in range(n_c):
         pivot, size = k, 0.0
         for j in range(n_rest):
@@ -146,41 +187,55 @@ def _eliminate(C, keep, independent, T, Y):
             for i in range(n_c):
                 factors[k, i], factors[pivot, i] = factors[pivot, i], factors[k, i]
             order[keep + k], order[keep + pivot] = order[keep + pivot], order[keep + k]
+        stays[order[keep + k]] = False
         for j in range(k + 1, n_rest):
             factors[j, k] /= factors[k, k]
             for i in range(k + 1, n_c):
                 factors[j, i] -= factors[j, k] * factors[k, i]
-    dependent = order[keep : keep + n_c]
-    columns = np.concatenate((order[:keep], np.sort(order[keep + n_c :])))
-    # The dependent columns are the transpose of the first n_c rows of L times U.
-    right = np.zeros((n_c, n_z))
+    # -C of the columns that stay, and the unit: solved for by the dependent columns, which are the
+    # transpose of the first n_c rows of L times U.
+    right, k = np.zeros((n_c, n_z)), 0
+    for j in range(n_z):
+        if stays[j]:
+            T[j, k] = 1.0
+            for i in range(n_c):
+                right[i, k] = -C[i, j]
+            k += 1
     for i in range(n_c):
-        for j in range(n_y):
-            right[i, j] = -C[i, columns[j]]
         right[i, n_y + i] = 1.0
-    for i in range(n_c):
         for j in range(i):
             add(right[i], -factors[j, i], right[j])
-        right[i] /= factors[i, i]
-    for i in range(n_c - 2, -1, -1):
+        for j in range(n_z):
+            right[i, j] /= factors[i, i]
+    for i in range(n_c - 1, -1, -1):
         for j in range(i + 1, n_c):
             add(right[i], -factors[j, i], right[j])
-    for i in range(n_c):
-        T[dependent[i]], Y[dependent[i]] = right[i, :n_y], right[i, n_y:]
-    for j in range(n_y):
-        T[columns[j], j] = 1.0
+        dependent = order[keep + i]
+        for j in range(n_y):
+            T[dependent, j] = right[i, j]
+        for j in range(n_c):
+            Y_neg[dependent, j] = -right[i, n_y + j]
     return True
 
 
 @compiled
-def _matrix_product(left, right, diagonal):
+def _times(left, right, diagonal):
     if not diagonal:
         return np.dot(left, right)
     product = np.empty(right.shape)
-    for i in range(len(left)):
-        for j in range(right.shape[1]):
+    for i in range(product.shape[0]):
+        for j in range(product.shape[1]):
             product[i, j] = left[i, i] * right[i, j]
     return product
+
+
+@compiled
+def _transposed(matrix):
+    transpose = np.empty((matrix.shape[1], matrix.shape[0]))
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            transpose[j, i] = matrix[i, j]
+    return transpose
 
 
 @compiled
@@ -197,7 +252,9 @@ def _has_factor(H, convex):
                 L[i, j] -= L[j, k] * L[i, k]
         if not L[j, j] > 0:
             return False
-        L[j:, j] /= math.sqrt(L[j, j])
+        root = math.sqrt(L[j, j])
+        for i in range(j, len(H)):
+            L[i, j] /= root
     return True
 
 
@@ -208,33 +265,62 @@ def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
     The arguments are those of `condense.Condensed` and of the QPs, whose G is ``G_z``.
     """
     M, n_z, n_y = T.shape
-    last = _last_entered(G, G_z, T, lb, ub, enters)
-    rows, others = np.nonzero(last > n_f)[0], np.nonzero(last <= n_f)[0]
-    d, r = n_y - n_f, len(rows)
-    G_v, matrix = np.empty((M, r, d)), np.empty((M, d + 2 * r, n_f))
-    # What b makes of g, of y and of z.
-    by_b = np.empty((M, b.shape[1], d + r + n_z))
+    n_g, n_c, d = G.shape[1], b.shape[1], n_y - n_f
+    last, r, s = _last_entered(G, G_z, T, lb, ub, enters), 0, 0
+    for i in range(n_g):
+        r += last[i] > n_f
+    rows, others, w_v = np.empty(r, np.int64), np.empty(n_g - r, np.int64), np.empty((len(w), r))
+    for i in range(n_g):
+        if last[i] > n_f:
+            rows[i - s] = i
+            for k in range(len(w)):
+                w_v[k, i - s] = w[k, i]
+        else:
+            others[s] = i
+            s += 1
+    H_v, G_v, matrix = np.empty((M, d, d)), np.empty((M, r, d)), np.empty((M, d + 2 * r, n_f))
+    # What q makes of g, and what b makes of g, of y and of z.
+    by_q, by_b = np.empty((M, n_z, d)), np.empty((M, n_c, d + r + n_z))
     for m in range(M):
-        matrix[m, :d] = H[m, n_f:, :n_f]
-        by_b[m, :, :d], by_b[m, :, d + r :] = H_b[m, n_f:].T, -Y_neg[m].T
-        for k in range(r):
-            G_v[m, k] = G[m, rows[k], n_f:]
-            matrix[m, d + k] = matrix[m, d + r + k] = -G[m, rows[k], :n_f]
-            by_b[m, :, d + k] = G_b[m, rows[k]]
+        for i in range(d):
+            for j in range(d):
+                H_v[m, i, j] = H[m, n_f + i, n_f + j]
+            for j in range(n_f):
+                matrix[m, i, j] = H[m, n_f + i, j]
+            for j in range(n_c):
+                by_b[m, j, i] = H_b[m, n_f + i, j]
+        for i in range(r):
+            for j in range(d):
+                G_v[m, i, j] = G[m, rows[i], n_f + j]
+            for j in range(n_f):
+                matrix[m, d + i, j] = matrix[m, d + r + i, j] = -G[m, rows[i], j]
+            for j in range(n_c):
+                by_b[m, j, d + i] = G_b[m, rows[i], j]
+        for i in range(n_z):
+            for j in range(d):
+                by_q[m, i, j] = T[m, i, n_f + j]
+            for j in range(n_c):
+                by_b[m, j, d + r + i] = -Y_neg[m, i, j]
     count = max(max(len(q), len(b)), max(len(lb), len(ub)))
     if M != 1:
         count = len(group)
         q, b = _repeated(q, count), _repeated(b, count)
-    of_q, of_b = products(q, T[:, :, n_f:].copy(), group, False), products(b, by_b, group, False)
-    constant = np.empty((count, d + 2 * r))
-    for i in range(len(constant)):
-        from_b = of_b[i % len(b)]
-        constant[i, :d] = of_q[i % len(q)] + from_b[:d]
-        for k in range(r):
-            constant[i, d + k] = lb[i % len(lb), rows[k]] - from_b[d + k]
-            constant[i, d + r + k] = ub[i % len(ub), rows[k]] - from_b[d + k]
-    z_0, H_v = of_b[:, d + r :].copy(), H[:, n_f:, n_f:].copy()
-    return rows, others, H_v, G_v, matrix, constant, z_0, w[:, rows]
+    of_q, of_b = products(q, by_q, group, False), products(b, by_b, group, False)
+    constant, z_0 = np.empty((count, d + 2 * r)), np.empty((len(b), n_z))
+    for k in range(count):
+        of_lb, of_ub = k % len(lb), k % len(ub)
+        for i in range(d):
+            constant[k, i] = of_q[k % len(q), i] + of_b[k % len(b), i]
+        for i in range(r):
+            y = of_b[k % len(b), d + i]
+            constant[k, d + i], constant[k, d + r + i] = (
+                lb[of_lb, rows[i]] - y,
+                ub[of_ub, rows[i]] - y,
+            )
+    for k in range(len(b)):
+        for i in range(n_z):
+            z_0[k, i] = of_b[k, d + r + i]
+    return rows, others, H_v, G_v, matrix, constant, z_0, w_v
 
 
 @compiled
@@ -242,7 +328,8 @@ def _repeated(vectors, count):
     """A row for each QP."""
     repeated = np.empty((count, vectors.shape[1]))
     for i in range(count):
-        repeated[i] = vectors[i % len(vectors)]
+        for j in range(vectors.shape[1]):
+            repeated[i, j] = vectors[i % len(vectors), j]
     return repeated
 
 
