@@ -16,14 +16,11 @@ from torch_qpmpc.condense import Condensed, _condense
 BATCH = 6
 
 
-def by_lapack(monkeypatch: pytest.MonkeyPatch, *matrices: Tensor, keep: int) -> Condensed:
+def assert_condensed_alike(monkeypatch, H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
+    ours = _condense(H, C, G, keep)
     with monkeypatch.context() as patch:
         patch.setattr(condense_module, "SMALL", -1)
-        return _condense(*matrices, keep)
-
-
-def assert_condensed_alike(monkeypatch, H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
-    ours, of_lapack = _condense(H, C, G, keep), by_lapack(monkeypatch, H, C, G, keep=keep)
+        of_lapack = _condense(H, C, G, keep)
     for field in fields(Condensed):
         one, other = getattr(ours, field.name), getattr(of_lapack, field.name)
         if isinstance(one, Tensor):
