@@ -223,8 +223,8 @@ def _times(left, right, diagonal):
     if not diagonal:
         return np.dot(left, right)
     product = np.empty(right.shape)
-    for i in range(product.shape[0]):
-        for j in range(product.shape[1]):
+    for i in range(right.shape[0]):
+        for j in range(right.shape[1]):
             product[i, j] = left[i, i] * right[i, j]
     return product
 
