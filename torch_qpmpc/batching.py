@@ -23,8 +23,10 @@ def broadcast(*shapes: Sequence[int]) -> torch.Size:
 def flatten(vectors: Tensor, batch: torch.Size, device: torch.device | str = "cpu") -> Tensor:
     """``(*batch, n)``, or what broadcasts to it, as ``(B, n)``: detached, float64."""
     n = vectors.shape[-1]
-    wide = vectors.detach().to(device, torch.float64).expand(*batch, n)
-    return wide.reshape(batch.numel(), n)
+    flat = vectors.detach().to(device, torch.float64)
+    if flat.ndim == 2 and flat.shape[:1] == batch:
+        return flat
+    return flat.expand(*batch, n).reshape(batch.numel(), n)
 
 
 def align(in_dims: tuple, args: tuple, event_ndims: Sequence[int]) -> list[Any]:

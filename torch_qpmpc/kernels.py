@@ -291,10 +291,10 @@ def recall(free, push, group, codes, lower, upper, w, slip, max_steps, max_passe
     for i in range(n_qps):
         code[:] = codes[i]
         by = push[group[i]]
-        known = True
         for j in range(r):
-            known = known and -2 <= code[j] <= 2
-        while known and not done[i] and steps[i] < max_steps:
+            if not -2 <= code[j] <= 2:
+                code[:] = 0
+        while not done[i] and steps[i] < max_steps:
             steps[i] += 1
             vy[i] = free[i]
             k = 0

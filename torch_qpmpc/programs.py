@@ -36,20 +36,16 @@ class ContentMemo(threading.local):
 
         It gets copies, so that its result may contain them.
         """
-        for position, (known, with_options, result) in enumerate(self.entries):
-            if with_options == options and all(map(_same, known, tensors)):
+        kind = (options, *((tensor.dtype, tensor.device) for tensor in tensors))
+        for position, (known, of_kind, result) in enumerate(self.entries):
+            if of_kind == kind and all(map(torch.equal, known, tensors)):
                 self.entries.insert(0, self.entries.pop(position))
                 return result
         own = tuple(tensor.detach().clone() for tensor in tensors)
         result = make(*own)
-        self.entries.insert(0, (own, options, result))
+        self.entries.insert(0, (own, kind, result))
         del self.entries[self.SIZE :]
         return result
-
-
-def _same(one: Tensor, other: Tensor) -> bool:
-    alike = one.dtype == other.dtype and one.device == other.device
-    return alike and torch.equal(one, other)
 
 
 _memo = ContentMemo()
@@ -91,24 +87,26 @@ class FlatPrograms:
         What was worked out for the same theta is found again where the batch shares all of it.
         """
         *theta, fixed = operands
-        batches = [t.shape[: t.ndim - n] for t, n in zip(theta, _NDIMS, strict=True)]
-        batch = broadcast(*batches, fixed.shape[:-1])
-        fixed = flatten(fixed, batch, device)
-        if any(batches):
+        if any(t.ndim > n for t, n in zip(theta, _NDIMS, strict=True)):
+            batches = (t.shape[: t.ndim - n] for t, n in zip(theta, _NDIMS, strict=True))
+            batch = broadcast(*batches, fixed.shape[:-1])
+            fixed = flatten(fixed, batch, device)
             return cls._flat([tensor.detach() for tensor in theta], batch, fixed), batch
-        programs = _memo.get(
-            theta, str(device), lambda *own: cls._flat(own, torch.Size(), fixed[:1])
-        )
+        batch = fixed.shape[:-1]
+        fixed = flatten(fixed, batch, device)
+        programs = _memo.get(theta, str(device), lambda *own: cls._shared(own, fixed[:1]))
         group = torch.zeros(fixed.shape[0], dtype=torch.int64, device=fixed.device)
         return programs._with(group, fixed), batch
 
     @classmethod
+    def _shared(cls, theta: Sequence[Tensor], fixed: Tensor) -> FlatPrograms:
+        H, q, c, C, b, G, lb, ub, w = (x.to(fixed).unsqueeze(0) for x in _uncrossed(theta))
+        group = torch.zeros(1, dtype=torch.int64, device=fixed.device)
+        return cls((H + H.mT) / 2.0, C, G, group, q, c, b, lb, ub, w, fixed)
+
+    @classmethod
     def _flat(cls, theta: Sequence[Tensor], batch: torch.Size, fixed: Tensor) -> FlatPrograms:
-        lb, ub = theta[6:8]
-        swapped = lb > ub
-        H, q, c, C, b, G, lb, ub, w = (tensor.to(fixed) for tensor in theta)
-        if swapped.any():
-            lb = torch.where(swapped & ~crossed(*theta[6:8]), ub, lb)
+        H, q, c, C, b, G, lb, ub, w = (tensor.to(fixed) for tensor in _uncrossed(theta))
         matrices = ((H + H.mT) / 2.0, C, G)
         of_matrices = broadcast(*(m.shape[:-2] for m in matrices))
         count = of_matrices.numel()
@@ -209,6 +207,16 @@ class FlatPrograms:
         if matrices.shape[0] == 1:
             return torch.addmm(constant, vectors, matrices[0].mT)
         return self.multiply(matrices, vectors) + constant
+
+
+def _uncrossed(theta: Sequence[Tensor]) -> Sequence[Tensor]:
+    """H, .., w with lb = ub where rounding alone has them cross."""
+    lb, ub = theta[6:8]
+    swapped = lb > ub
+    if not swapped.any():
+        return theta
+    lb = torch.where(swapped & ~crossed(lb, ub), ub, lb)
+    return (*theta[:6], lb, *theta[7:])
 
 
 class ProgramArrays(NamedTuple):

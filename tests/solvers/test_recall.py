@@ -67,13 +67,17 @@ def test_the_active_sets_given_are_not_changed():
     assert torch.equal(wrong, before)
 
 
-def test_where_nothing_is_known_nothing_is_finished():
+def test_of_an_unknown_set_the_empty_one_is_tried():
     qps, _, active = true_set(5)
+    empty = active.clone()
+    empty[[1, 2, 4]] = 0
     active[1:3, 4] = UNKNOWN
     active[4, 0] = -128
-    answer, finished = recall(qps, active)
-    assert finished.tolist() == [True, False, False, True, False, True]
-    assert answer.iterations[1:3].tolist() == [0, 0]
+    (answer, finished), (of_empty, expected) = recall(qps, active), recall(qps, empty)
+    assert torch.equal(finished, expected)
+    assert torch.equal(answer.iterations, of_empty.iterations)
+    assert torch.equal(answer.v[finished], of_empty.v[finished])
+    assert answer.iterations[[1, 2, 4]].min() > 1
 
 
 @pytest.mark.parametrize("rank", [0, 1])
@@ -111,9 +115,11 @@ def test_active_sets_of_another_theta_lead_to_the_same_values(solver, size):
         assert log.recalled > 0.9 * log.solves
 
 
-def test_without_a_known_set_nothing_is_recalled():
-    mpc, s = random_mpc(10), random_states(4)
-    start = torch.full((4, mpc.n_z), UNKNOWN, dtype=torch.int8)
+def test_without_a_known_set_the_values_are_the_same(solver):
+    mpc, s = random_mpc(10, solver=solver), random_states(64)
+    start = torch.full((64, mpc.n_z), UNKNOWN, dtype=torch.int8)
     with SolveLog() as log:
-        mpc.solve(s, warm_start=start)
-    assert (log.recalled, log.solves) == (0, 4)
+        warm = mpc.solve(s, warm_start=start)
+    assert_close(warm.value, mpc.value(s), rtol=1e-6, atol=1e-6)
+    assert log.fallback == 0
+    assert 32 < log.recalled < 64

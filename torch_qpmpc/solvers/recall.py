@@ -4,7 +4,8 @@ Between two visits to a transition theta has moved a little, and most active set
 With the set held, the KKT conditions are linear in its multipliers: with K = G H^-1 G', one
 Cholesky factor of K's active part a QP, and no loop over the batch. Where the signs of the solution
 contradict the set, the rows concerned change their state, and it is tried again. What comes to no
-end in this way is for a solver; whether an end is a solution is for the certificate to say.
+end in this way is for a solver; whether an end is a solution is for the certificate to say. A QP of
+which no set is known starts from the empty one, and mostly comes to its end from there.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ SLIP = 1e-9
 def recall(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
     """v and lam of the active sets ``(B, r)``, or of sets near to them, and where there are some.
 
-    The codes are those of `QPSolution.active`; of a set with any other code nothing is known.
+    The codes are those of `QPSolution.active`; a set with any other code begins as the empty one.
     """
     forces = _Forces(qps)
     if qps.g.is_cpu:
@@ -40,8 +41,8 @@ def _recall(forces: _Forces, qps: SoftQPs, active: Tensor) -> tuple[Answer, Tens
     known = ((active >= -2) & (active <= 2)).all(-1)
     active = torch.where(known.unsqueeze(-1), active, 0)
     v, lam, y = forces.solve(qps, active)
-    steps = torch.ones_like(qps.group)
-    todo = (known & _contradicted(qps, active, lam, y)).nonzero().squeeze(-1)
+    steps, done = torch.ones_like(qps.group), torch.ones_like(known)
+    todo = _contradicted(qps, active, lam, y).nonzero().squeeze(-1)
     for _ in range(MAX_STEPS - 1):
         if not len(todo):
             break
@@ -50,8 +51,8 @@ def _recall(forces: _Forces, qps: SoftQPs, active: Tensor) -> tuple[Answer, Tens
         v[todo], lam[todo], y[todo] = found = forces.solve(part, active[todo])
         steps[todo] += 1
         todo = todo[_contradicted(part, active[todo], *found[1:])]
-    known[todo] = False
-    return Answer(v, lam, steps), known
+    done[todo] = False
+    return Answer(v, lam, steps), done
 
 
 def _contradicted(qps: SoftQPs, active: Tensor, lam: Tensor, y: Tensor) -> Tensor:
