@@ -22,7 +22,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tests.runs import CONFIGS, SMALL, make_config
 from torch_qpmpc.checkpoint import load_checkpoint
 from torch_qpmpc.config import flatten
-from torch_qpmpc.tracking import RunFolder, unwritable
+from torch_qpmpc.tracking import RunFolder, read_metrics, unwritable
 
 
 def events(folder: Path) -> EventAccumulator:
@@ -56,9 +56,7 @@ def test_folder_has_everything_logged(tmp_path):
         OmegaConf.to_container(cfg, resolve=True)
     )
 
-    table: Any = pd.read_csv(folder / "metrics.csv", float_precision="round_trip").set_index(
-        "update"
-    )
+    table: Any = read_metrics(folder)
     assert list(table.index) == list(range(1, 301)), "one row for an update"
     assert list(table.columns) == ["loss/value", "train/reward", "eval/J"]
     assert table["loss/value"][7] == 1 / 7, "to the last digit"

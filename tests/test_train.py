@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from torch_qpmpc.config import flatten
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment import evaluate
 from torch_qpmpc.tasks import make_mpc, make_physics
+from torch_qpmpc.tracking import read_metrics
 
 SUMMARY = {"seed", "constraint", "noise", "solver", "unsolved", "updates", "train_seconds"}
 SUMMARY |= {"ablation", "step", "penalty_step"}
@@ -51,9 +53,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     skip_figures(monkeypatch)
 
 
-def metrics(folder: Path) -> Any:
-    """metrics.csv as a DataFrame by update."""
-    return pd.read_csv(folder / "metrics.csv", float_precision="round_trip").set_index("update")
+#: A run's numbers; pandas' types know too many kinds of columns.
+metrics: Callable[[Path], Any] = read_metrics
 
 
 def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -28,6 +28,7 @@ from torch_qpmpc.prediction_error import one_step_error, second_moment
 from torch_qpmpc.reading import predictions
 from torch_qpmpc.structure import Model, nearest_model
 from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc, true_model
+from torch_qpmpc.tracking import read_metrics
 
 #: The paper's, in its order.
 CASES = ("fixed", "free", "deviation", "si", "combined")
@@ -93,9 +94,7 @@ class FinishedRun:
     @property
     def metrics(self) -> pd.DataFrame:
         """metrics.csv by update."""
-        return pd.read_csv(self.folder / "metrics.csv", float_precision="round_trip").set_index(
-            "update"
-        )
+        return read_metrics(self.folder)
 
     def readings(self) -> dict[str, float]:
         """What the learned constraints say.

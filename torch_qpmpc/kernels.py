@@ -19,8 +19,8 @@ import numba
 import numpy as np
 from torch import Tensor
 
-#: Of a product by BLAS, entries of the matrix times vectors: beyond, OpenBLAS starts threads.
-SMALL = 2**18
+#: Entries of the matrix times vectors up to which a product by BLAS stays in one thread.
+ONE_THREAD = 2**18
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
@@ -99,7 +99,7 @@ def products(vectors, matrices, group, diagonal):
             for j in range(vectors.shape[1]):
                 found[i, j] = vectors[i, j] * matrices[0, j, j]
     elif len(matrices) == 1:
-        some = max(1, SMALL // max(1, matrices.size))
+        some = max(1, ONE_THREAD // max(1, matrices.size))
         for i in range(0, len(vectors) if matrices.size else 0, some):
             np.dot(vectors[i : i + some], matrices[0], found[i : i + some])
     else:

@@ -1,7 +1,8 @@
 """Loops of what is worked out once for a theta, compiled by Numba as those of `kernels` are.
 
-What theta is inspected for, its units, and the condensed problem, for which torch takes a hundred
-small operations. Arrays and vectors that all QPs share are as in `kernels`.
+What theta is inspected for, its units, and the problem (eq:qp2, eq:qp3) that is left without
+C z = b (eq:qp2c1) and the fixed entries; torch takes a hundred small operations for it. Arrays, and
+vectors that all QPs share, are as in `kernels`.
 """
 
 from __future__ import annotations
@@ -147,20 +148,19 @@ def condense(H, C, G, keep, independent, convex):
         regular = regular and _eliminate(C[m], keep, independent, T[m], Y_neg[m])
         if regular:
             H_is_diagonal, G_is_diagonal = _is_diagonal(H[m]), _is_diagonal(G[m])
-            H_T = _times(H[m], T[m], H_is_diagonal)
-            T_HT = _times(_transposed(T[m]), H_T, False)
-            HT_Y, G_T = _times(_transposed(H_T), Y_neg[m], False), _times(G[m], T[m], G_is_diagonal)
-            GY = _times(G[m], Y_neg[m], G_is_diagonal)
+            H_T, G_T = _times(H[m], T[m], H_is_diagonal), _times(G[m], T[m], G_is_diagonal)
+            T_HT, TH_Y = np.dot(T[m].T, H_T), np.dot(H_T.T, Y_neg[m])
+            G_Y = _times(G[m], Y_neg[m], G_is_diagonal)
             for i in range(n_y):
                 for j in range(n_y):
                     H_y[m, i, j] = (T_HT[i, j] + T_HT[j, i]) / 2.0
                 for j in range(n_c):
-                    H_b[m, i, j] = -HT_Y[i, j]
+                    H_b[m, i, j] = -TH_Y[i, j]
             for i in range(n_g):
                 for j in range(n_y):
                     G_y[m, i, j] = G_T[i, j]
                 for j in range(n_c):
-                    G_b[m, i, j] = -GY[i, j]
+                    G_b[m, i, j] = -G_Y[i, j]
             surely_convex = surely_convex and _has_factor(H_y[m], convex)
     return T, Y_neg, H_y, G_y, H_b, G_b, regular, surely_convex
 
@@ -227,15 +227,6 @@ def _times(left, right, diagonal):
         for j in range(right.shape[1]):
             product[i, j] = left[i, i] * right[i, j]
     return product
-
-
-@compiled
-def _transposed(matrix):
-    transpose = np.empty((matrix.shape[1], matrix.shape[0]))
-    for i in range(matrix.shape[0]):
-        for j in range(matrix.shape[1]):
-            transpose[j, i] = matrix[i, j]
-    return transpose
 
 
 @compiled
@@ -313,10 +304,8 @@ def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
             constant[k, i] = of_q[k % len(q), i] + of_b[k % len(b), i]
         for i in range(r):
             y = of_b[k % len(b), d + i]
-            constant[k, d + i], constant[k, d + r + i] = (
-                lb[of_lb, rows[i]] - y,
-                ub[of_ub, rows[i]] - y,
-            )
+            constant[k, d + i] = lb[of_lb, rows[i]] - y
+            constant[k, d + r + i] = ub[of_ub, rows[i]] - y
     for k in range(len(b)):
         for i in range(n_z):
             z_0[k, i] = of_b[k, d + r + i]

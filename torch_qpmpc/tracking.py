@@ -50,12 +50,9 @@ class RunFolder:
             write_whole(self.path / "config.yaml", text.encode())
             self.logger.experiment.add_text("config", f"```yaml\n{text}```")
         else:
-            # As text: not every reading of a float is exact.
-            table = pd.read_csv(self.path / "metrics.csv", dtype=str)
-            for _, row in table.iterrows():
-                numbers = {str(name): float(text) for name, text in row.dropna().items()}
-                if (update := int(numbers["update"])) <= after:
-                    self.rows.append(numbers | {"update": update})
+            earlier: Any = read_metrics(self.path).loc[:after]
+            for update, row in earlier.iterrows():
+                self.rows.append({"update": update, **row.dropna()})
 
     def __enter__(self) -> RunFolder:
         return self
@@ -111,6 +108,12 @@ class RunFolder:
         text = json.dumps(finite, indent=2, allow_nan=False)
         # At last and all at once: it is what tells that the run need not be done again.
         write_whole(self.path / "summary.json", f"{text}\n".encode())
+
+
+def read_metrics(folder: str | Path) -> pd.DataFrame:
+    """A run's metrics.csv by update, to the last digit."""
+    table = pd.read_csv(Path(folder) / "metrics.csv", float_precision="round_trip")
+    return table.set_index("update")
 
 
 class WritableFolder(Callback):

@@ -1,4 +1,4 @@
-"""From a batch of QPs to certified solutions: condense, solve, certify, fall back, diagnose."""
+"""QPs (eq:qp2, eq:qp3) and their certified solutions: condense, solve, certify, fall back."""
 
 from __future__ import annotations
 
