@@ -35,7 +35,7 @@ def _little_training(monkeypatch):
 def test_no_qp_is_called_what_it_is_not(solver, data):
     family = data.draw(st.sampled_from(sorted(FAMILIES)))
     seed, count = data.draw(st.integers(0, 2**32)), data.draw(st.integers(1, 6))
-    tally = Tally()
+    solver, tally = solver + data.draw(st.sampled_from(("", ", warm"))), Tally()
     assert tally.add(FAMILIES[family](Draw(seed), count), solver) == []
     assert tally.certified + tally.named + tally.missed == tally.count
 
@@ -88,9 +88,9 @@ def test_a_solution_of_what_has_none_is_wrong_and_giving_up_is_not():
 
 def test_the_command_counts_and_writes_its_table(tmp_path, capsys):
     options = ["--count", "12", "--family", "well posed", "unbounded", "--results", str(tmp_path)]
-    assert main([*options, "--solver", "daqp", "torch"]) == 0
+    assert main([*options, "--solver", "daqp, warm", "daqp"]) == 0
     tallies = load(tmp_path)
-    assert list(tallies) == ["daqp", "torch"]
+    assert list(tallies) == ["daqp", "daqp, warm"]
     for of_one in tallies.values():
         assert (of_one["well posed"].certified, of_one["unbounded"].named) == (6, 6)
     printed = capsys.readouterr().out

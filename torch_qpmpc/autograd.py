@@ -194,7 +194,8 @@ def _solve_now(
     device = q.device if solver == "torch" and q.is_cuda else torch.device("cpu")
     programs, batch = FlatPrograms.of(H, q, c, C, b, G, lb, ub, w, fixed, device=device)
     if start is not None:
-        start = start.to(device).expand(*batch, -1).reshape(len(programs), -1)
+        n_g = start.shape[-1]
+        start = start.to(device).expand(*batch, n_g).reshape(len(programs), n_g)
     raw = solve_programs(programs, keep, solver, start)
     if on_failure != "mask":
         _report(raw, batch, on_failure)

@@ -33,7 +33,9 @@ RESULTS = README.parent / "runs" / "campaign"
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=__doc__)
     parser.add_argument("--count", type=int, default=100_000, help="QPs for each solver")
-    parser.add_argument("--solver", nargs="*", default=list(BACKENDS), help="names of solvers")
+    parser.add_argument(
+        "--solver", nargs="*", default=list(BACKENDS), help="names, or 'NAME, warm'"
+    )
     parser.add_argument("--family", nargs="*", default=list(FAMILIES), help="names of families")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--results", type=Path, default=RESULTS, help="a folder for the counts")
@@ -70,7 +72,7 @@ def campaign(solver: str, families: list[str], count: int, seed: int, folder: Pa
             tally.settle(solver)
             tally.seconds = time.process_time() - began
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{solver.replace(':', '-')}.json"
+    path = folder / f"{solver.replace(':', '-').replace(', ', '-')}.json"
     record = {"solver": solver, "families": {k: t.record() for k, t in tallies.items()}}
     path.write_text(json.dumps(record, indent=1), encoding="utf-8")
 

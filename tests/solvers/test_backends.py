@@ -59,6 +59,8 @@ def test_an_empty_batch_is_solved(solver, batch):
     known = known_qp(0, batch=batch)
     solution = solve_qp(known.qp, known.fixed, solver=solver)
     assert solution.value.shape == batch
+    again = solve_qp(known.qp, known.fixed, solver=solver, warm_start=solution)
+    assert again.value.shape == batch
 
 
 @pytest.mark.parametrize(
