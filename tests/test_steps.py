@@ -64,8 +64,9 @@ def papers_step(mpc: QPMPC, rate: float) -> dict[str, Tensor]:
         for name, p in parameters.items()
     }
     theta = {name: p.detach().numpy() + step[name] for name, p in parameters.items()}
+    # The paper's cost but for a constant: with its linear term apart, cvxpy 1.7 finds no minimum.
     cost = sum(
-        0.5 * cp.sum_squares(step[name]) + rate * cp.sum(cp.multiply(p.grad.numpy(), step[name]))
+        0.5 * cp.sum_squares(step[name] + rate * p.grad.numpy())
         for name, p in parameters.items()
         if p.grad is not None
     )
