@@ -14,7 +14,6 @@ operator alone is not.
 
 from __future__ import annotations
 
-import inspect
 import os
 import warnings
 from collections.abc import Callable
@@ -28,7 +27,13 @@ from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.qp import QPSolution, QuadraticProgram, Status, slacks
-from torch_qpmpc.sensitivity import differentiable, is_differentiating, is_traced, traceable
+from torch_qpmpc.sensitivity import (
+    differentiable,
+    is_differentiating,
+    is_traced,
+    signed,
+    traceable,
+)
 from torch_qpmpc.solvers import backend
 from torch_qpmpc.solvers.chain import RawSolution, solve_programs
 from torch_qpmpc.tangents import value_tangent
@@ -328,6 +333,7 @@ class QPValue(torch.autograd.Function):
 
     # Dynamo counts the parameters to tell this style of Function: no *args here.
     @staticmethod
+    @signed
     def forward(H, q, c, C, b, G, lb, ub, w, fixed, start, keep, solver, on_failure) -> Outputs:
         return _solve_opaque(H, q, c, C, b, G, lb, ub, w, fixed, start, keep, solver, on_failure)
 
@@ -341,10 +347,6 @@ class QPValue(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
         return QPValue.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9
-
-
-# Function.apply asks for it at each call; to work it out takes as long as solving some ten QPs.
-QPValue.forward.__signature__ = inspect.signature(QPValue.forward)  # pyright: ignore[reportFunctionMemberAccess]
 
 
 class QPTangent(QPValue):

@@ -356,4 +356,4 @@ def slacks(z: Tensor, G: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
 
 def _rows(z: Tensor, G: Tensor) -> Tensor:
     with full_precision(z):
-        return (z.unsqueeze(-2) @ G.mT).squeeze(-2)
+        return z @ G.mT if G.ndim == 2 else (z.unsqueeze(-2) @ G.mT).squeeze(-2)

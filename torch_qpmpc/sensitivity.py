@@ -19,7 +19,8 @@ with a zero multiplier) the solution has a kink, and this is one of its one-side
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import inspect
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -238,10 +239,20 @@ def _backward(ctx: Any, *gradients: Tensor) -> tuple:
 solution_op.register_autograd(_backward, setup_context=_setup_context)
 
 
+def signed(forward: Callable[..., Any]) -> Any:
+    """A Function's ``forward`` that knows its own signature.
+
+    ``apply`` asks for it at each call; to work it out takes as long as solving some ten QPs.
+    """
+    forward.__signature__ = inspect.signature(forward)  # pyright: ignore[reportFunctionMemberAccess]
+    return forward
+
+
 class SolutionGradient(torch.autograd.Function):
     """`solution_op`, differentiable under `torch.func` too."""
 
     @staticmethod
+    @signed
     def forward(z, lam, chi, xi, status, H, q, c, C, b, G, lb, ub, w, fixed, keep):
         return z.clone(), lam.clone(), chi.clone(), xi.clone()
 
