@@ -112,8 +112,9 @@ class RunFolder:
 
 def read_metrics(folder: str | Path) -> pd.DataFrame:
     """A run's metrics.csv by update, to the last digit."""
-    table = pd.read_csv(Path(folder) / "metrics.csv", float_precision="round_trip")
-    return table.set_index("update")
+    # First as text: before 3.1, pandas rounds what it reads as numbers.
+    table = pd.read_csv(Path(folder) / "metrics.csv", dtype=str).astype(float)
+    return table.astype({"update": int}).set_index("update")
 
 
 class WritableFolder(Callback):
