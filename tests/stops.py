@@ -17,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import train
 from torch_qpmpc.snapshot import resumed
 from torch_qpmpc.solvers.chain import SolveLog
+from torch_qpmpc.tracking import read_metrics
 
 
 def stop(
@@ -78,7 +79,7 @@ def assert_events_are_whole(folder: Path) -> None:
     """TensorBoard shows each number of metrics.csv, and each once."""
     found = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0, "images": 0})
     found.Reload()
-    table: Any = pd.read_csv(folder / "metrics.csv").set_index("update")
+    table: Any = read_metrics(folder)
     for column in table:
         logged = table[column].dropna()
         shown = [event for event in found.Scalars(column) if not math.isnan(event.value)]

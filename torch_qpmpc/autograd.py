@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_qpmpc.batching import align, broadcast, outer, sum_to, weighted_sum
+from torch_qpmpc.batching import align, broadcast, listed, outer, sum_to, weighted_sum
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.programs import FlatPrograms
@@ -199,8 +199,7 @@ def _solve_now(
     device = q.device if solver == "torch" and q.is_cuda else torch.device("cpu")
     programs, batch = FlatPrograms.of(H, q, c, C, b, G, lb, ub, w, fixed, device=device)
     if start is not None:
-        n_g = start.shape[-1]
-        start = start.to(device).expand(*batch, n_g).reshape(len(programs), n_g)
+        start = listed(start.to(device).expand(*batch, -1))
     raw = solve_programs(programs, keep, solver, start)
     if on_failure != "mask":
         _report(raw, batch, on_failure)

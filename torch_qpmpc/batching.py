@@ -26,7 +26,7 @@ def flatten(vectors: Tensor, batch: torch.Size, device: torch.device | str = "cp
     flat = vectors.detach().to(device, torch.float64)
     if flat.ndim == 2 and flat.shape[:1] == batch:
         return flat
-    return flat.expand(*batch, n).reshape(batch.numel(), n)
+    return listed(flat.expand(*batch, n))
 
 
 def align(in_dims: tuple, args: tuple, event_ndims: Sequence[int]) -> list[Any]:
@@ -60,18 +60,18 @@ def sum_to(tensor: Tensor, like: Tensor) -> Tensor:
 def weighted_sum(weight: Tensor, vectors: Tensor, like: Tensor) -> Tensor:
     """``weight`` ``(*batch,)`` times ``(*batch, n)``, summed over the dimensions ``like`` lacks."""
     if like.ndim == 1:
-        return weight.reshape(-1) @ _listed(vectors)
+        return weight.reshape(-1) @ listed(vectors)
     return sum_to(weight.unsqueeze(-1) * vectors, like)
 
 
 def outer(left: Tensor, right: Tensor, like: Tensor) -> Tensor:
     """The outer products ``left right'`` summed over the batch dimensions that ``like`` lacks."""
     if like.ndim == 2:
-        return _listed(left).mT @ _listed(right)
+        return listed(left).mT @ listed(right)
     return sum_to(left.unsqueeze(-1) * right.unsqueeze(-2), like)
 
 
-def _listed(vectors: Tensor) -> Tensor:
+def listed(vectors: Tensor) -> Tensor:
     """``(*batch, n)`` as ``(B, n)``; with n = 0 too, where -1 could be any size."""
     return vectors.reshape(math.prod(vectors.shape[:-1]), vectors.shape[-1])
 

@@ -87,27 +87,26 @@ class FlatPrograms:
         What was worked out for the same theta is found again where the batch shares all of it.
         """
         *theta, fixed = operands
-        if any(t.ndim > n for t, n in zip(theta, _NDIMS, strict=True)):
-            batches = (t.shape[: t.ndim - n] for t, n in zip(theta, _NDIMS, strict=True))
-            batch = broadcast(*batches, fixed.shape[:-1])
-            fixed = flatten(fixed, batch, device)
-            return cls._flat([tensor.detach() for tensor in theta], batch, fixed), batch
-        batch = fixed.shape[:-1]
+        batches = [t.shape[: t.ndim - n] for t, n in zip(theta, _NDIMS, strict=True)]
+        batch = broadcast(*batches, fixed.shape[:-1])
         fixed = flatten(fixed, batch, device)
+        if any(batches):
+            return cls._flat([tensor.detach() for tensor in theta], batch, fixed), batch
         programs = _memo.get(theta, str(device), lambda *own: cls._shared(own, fixed[:1]))
         group = torch.zeros(fixed.shape[0], dtype=torch.int64, device=fixed.device)
         return programs._with(group, fixed), batch
 
     @classmethod
     def _shared(cls, theta: Sequence[Tensor], fixed: Tensor) -> FlatPrograms:
-        H, q, c, C, b, G, lb, ub, w = (x.to(fixed).unsqueeze(0) for x in _uncrossed(theta))
+        """A single QP, as the form of all that have this theta."""
+        H, q, c, C, b, G, lb, ub, w = (x.unsqueeze(0) for x in _prepared(theta, fixed))
         group = torch.zeros(1, dtype=torch.int64, device=fixed.device)
-        return cls((H + H.mT) / 2.0, C, G, group, q, c, b, lb, ub, w, fixed)
+        return cls(H, C, G, group, q, c, b, lb, ub, w, fixed)
 
     @classmethod
     def _flat(cls, theta: Sequence[Tensor], batch: torch.Size, fixed: Tensor) -> FlatPrograms:
-        H, q, c, C, b, G, lb, ub, w = (tensor.to(fixed) for tensor in _uncrossed(theta))
-        matrices = ((H + H.mT) / 2.0, C, G)
+        H, q, c, C, b, G, lb, ub, w = _prepared(theta, fixed)
+        matrices = (H, C, G)
         of_matrices = broadcast(*(m.shape[:-2] for m in matrices))
         count = of_matrices.numel()
         H, C, G = (
@@ -209,14 +208,16 @@ class FlatPrograms:
         return self.multiply(matrices, vectors) + constant
 
 
-def _uncrossed(theta: Sequence[Tensor]) -> Sequence[Tensor]:
-    """H, .., w with lb = ub where rounding alone has them cross."""
-    lb, ub = theta[6:8]
-    swapped = lb > ub
-    if not swapped.any():
-        return theta
-    lb = torch.where(swapped & ~crossed(lb, ub), ub, lb)
-    return (*theta[:6], lb, *theta[7:])
+def _prepared(theta: Sequence[Tensor], like: Tensor) -> tuple[Tensor, ...]:
+    """H, .., w in the dtype and on the device of ``like``.
+
+    H is symmetric, and lb = ub where rounding alone, in the dtype that came, has them cross.
+    """
+    H, q, c, C, b, G, lb, ub, w = (tensor.to(like) for tensor in theta)
+    swapped = theta[6] > theta[7]
+    if swapped.any():
+        lb = torch.where(swapped & ~crossed(*theta[6:8]), ub, lb)
+    return (H + H.mT) / 2.0, q, c, C, b, G, lb, ub, w
 
 
 class ProgramArrays(NamedTuple):
