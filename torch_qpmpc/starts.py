@@ -1,4 +1,4 @@
-"""Where theta starts: the constructor's arguments as the tensors of a QP, before discounts."""
+"""Where theta starts: the arguments as the tensors of a QP (eq:qp5), before discounts (eq:qpH)."""
 
 from __future__ import annotations
 
