@@ -11,11 +11,20 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import known_qp, programs_of, random_mpc, random_states, reduced_of, soft_qps
+from tests.problems import (
+    known_qp,
+    normal,
+    programs_of,
+    random_mpc,
+    random_states,
+    reduced_of,
+    soft_qps,
+)
 from torch_qpmpc import certificate, kernels, solve_qp
+from torch_qpmpc.autograd import envelope_gradients
 from torch_qpmpc.certificate import Products, certify
 from torch_qpmpc.condense import condensed_for
-from torch_qpmpc.programs import FlatPrograms, SoftQPs
+from torch_qpmpc.programs import FlatPrograms, SoftArrays, SoftQPs
 from torch_qpmpc.qp import UNKNOWN
 from torch_qpmpc.solvers import Answer, chain, daqp
 from torch_qpmpc.solvers.recall import _Forces, _recall, recall
@@ -176,3 +185,36 @@ def test_a_tour_goes_from_neighbour_to_neighbour(near):
 def test_a_tour_visits_each_of_any_vectors_once(vectors):
     for near in (2, 40):
         assert sorted(kernels.tour(vectors, near)) == list(range(len(vectors)))
+
+
+@pytest.mark.parametrize("n_qps", [0, 1, 5, 3000])
+@pytest.mark.parametrize("unneeded", [(), (0, 3, 5)])
+def test_the_gradient_of_shared_data_is_that_of_torch(n_qps, unneeded):
+    n_z, n_c, n_g, n_f = 12, 4, 9, 3
+    z, sigma, chi, lam, xi = (normal(n_qps, n, seed=n) for n in (n_z, n_g, n_c, n_g, n_f))
+    status, incoming = torch.zeros(n_qps, dtype=torch.int64), normal(n_qps)
+    status[3:4] = 2
+    weight = torch.where(status == 0, incoming, 0)
+    incoming[3:4] = torch.inf
+    shapes = ((n_z, n_z), (n_z,), (), (n_c, n_z), (n_c,), (n_g, n_z), *((n_g,),) * 3, z.shape)
+    in_torch = envelope_gradients(weight, z, sigma, chi, lam, xi).values()
+    given = kernels.arrays(incoming, status, z, sigma, chi, lam, xi)
+    ours = kernels.envelope(*given, tuple(i not in unneeded for i in range(10)))
+    for i, (gradient, of_torch, shape) in enumerate(zip(ours, in_torch, shapes, strict=True)):
+        if i in unneeded:
+            assert not gradient.size
+        else:
+            like = z.new_empty(shape) if i < 9 else xi
+            assert_close(torch.from_numpy(gradient), of_torch(like))
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+def test_what_fixed_entries_make_of_the_condensed_problem_is_that_of_torch(matrices):
+    known = known_qp(0, batch=(BATCH,), matrices=matrices)
+    programs, reduced = programs_of(known), reduced_of(known)
+    qps = reduced.at(programs)
+    moved = programs.multiply(reduced.matrix, programs.fixed, transposed=True) + reduced.constant
+    assert_close(torch.cat((qps.g, qps.l, qps.u), dim=-1), moved)
+    again = replace(qps)
+    for name in SoftArrays._fields:
+        assert np.array_equal(getattr(qps.arrays, name), getattr(again.arrays, name))

@@ -22,6 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_qpmpc import kernels
 from torch_qpmpc.batching import align, broadcast, listed, outer, sum_to, weighted_sum
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError, SolverError
@@ -234,7 +235,7 @@ def _solve_opaque(*arguments: Any) -> Outputs:
 
 
 def _report(raw: RawSolution, batch: torch.Size, on_failure: str) -> None:
-    if not raw.status.any():  # SOLVED is zero
+    if raw.all_accepted or not raw.status.any():  # SOLVED is zero
         return
     failed = raw.status.nonzero().squeeze(-1)
     reasons = []
@@ -285,12 +286,24 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
     *theta, z, sigma, chi, lam, xi, status = ctx.saved_tensors
     if is_differentiating() and not torch.compiler.is_compiling():
         z, sigma, chi, lam, xi = _tied(ctx.keep, theta, z, chi, lam, xi, status)
+    needed = ctx.needs_input_grad[:N_THETA]
+    if _is_summed(theta, z) and not is_traced((grad_value, z)):
+        given = kernels.arrays(grad_value, status, z, sigma, chi, lam, xi)
+        found = kernels.tensors(kernels.envelope(*given, needed), z.device)
+        found = (x if need else None for x, need in zip(found, needed, strict=True))
+        return (*found, *(None,) * N_OTHERS)
     # An unsolved element has zeros here, but zero times an infinite incoming gradient is NaN.
     weight = torch.where(status.eq(int(Status.SOLVED)), grad_value, 0)
     gradients = envelope_gradients(weight, z, sigma, chi, lam, xi).values()
-    needed = ctx.needs_input_grad[:N_THETA]
     found = (f(x) if need else None for f, x, need in zip(gradients, theta, needed, strict=True))
     return (*found, *(None,) * N_OTHERS)
+
+
+def _is_summed(theta: list[Tensor], z: Tensor) -> bool:
+    """Whether one theta is shared by a batch on the CPU, and no further derivative is asked for."""
+    if not z.is_cpu or z.dtype != torch.float64 or is_differentiating():
+        return False
+    return all(x.ndim == n for x, n in zip(theta[:-1], EVENT_NDIMS, strict=False)) and z.ndim == 2
 
 
 def _tied(

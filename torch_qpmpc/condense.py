@@ -8,6 +8,8 @@ Y, T'HT and GT; fixing the first n_f <= keep entries then only changes a linear 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +18,7 @@ from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
 from torch_qpmpc import kernels, theta_kernels
-from torch_qpmpc.programs import ContentMemo, FlatPrograms, SoftQPs
+from torch_qpmpc.programs import ContentMemo, FlatPrograms, SoftArrays, SoftQPs
 
 #: A pivot below this fraction of its row's norm means that the rows of C depend on each other.
 RANK_TOLERANCE = 1e-10
@@ -53,10 +55,28 @@ class Condensed:
     G_b: Tensor
     surely_convex: bool
 
+    @cached_property
+    def arrays(self) -> list[np.ndarray]:
+        """T, Y_neg, H, G, H_b and G_b for the kernels."""
+        return kernels.arrays(self.T, self.Y_neg, self.H, self.G, self.H_b, self.G_b)
+
     def reduced(self, programs: FlatPrograms) -> Reduced:
         """The problem in what is free of ``programs``."""
         n_f = programs.fixed.shape[-1]
         return programs.known(("reduced", self.keep, n_f), lambda: Reduced.of(self, programs, n_f))
+
+
+class ReducedArrays(NamedTuple):
+    """Those of `Reduced` for the kernels."""
+
+    rows: np.ndarray
+    others: np.ndarray
+    H: np.ndarray
+    G: np.ndarray
+    matrix: np.ndarray
+    constant: np.ndarray
+    z_0: np.ndarray
+    w: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +88,13 @@ class Reduced:
 
     Attributes:
         H, G: ``(M, d, d)`` and ``(M, r, d)``.
-        matrix, constant: ``(M, d + 2 r, n_f)`` and ``(B, d + 2 r)``. What a sample's fixed entries
-            make of g, l and u is ``constant + matrix fixed``.
+        matrix, constant: ``(M, n_f, d + 2 r)`` and ``(B, d + 2 r)``. What a sample's fixed entries
+            make of g, l and u is ``constant + matrix' fixed``.
         z_0: ``(B, n_z)``, z where the fixed entries and v are zero.
         w: ``(B, r)``.
         T, Y_neg: those of `Condensed`.
         convex: where H is positive semidefinite, ``(M,)``, or None if it is everywhere.
+        arrays: the tensors of its own once more, on the CPU.
     """
 
     rows: Tensor
@@ -87,24 +108,33 @@ class Reduced:
     T: Tensor
     Y_neg: Tensor
     convex: Tensor | None
+    arrays: ReducedArrays
 
     @classmethod
     def of(cls, condensed: Condensed, p: FlatPrograms, n_f: int) -> Reduced:
-        x, a = condensed, p.arrays()
-        given = kernels.arrays(x.T, x.Y_neg, x.H, x.G, x.H_b, x.G_b, p.group)
-        found = theta_kernels.reduce(*given, a.G, a.q, a.b, a.lb, a.ub, a.w, n_f, ENTERS)
-        device = p.q.device
-        rows, others, H, *rest = (torch.from_numpy(array).to(device) for array in found)
-        convex = None if condensed.surely_convex else _convex(H)
-        return cls(rows, others, H, *rest, convex=convex, T=condensed.T, Y_neg=condensed.Y_neg)
+        x, a, (group, _) = condensed, p.arrays(), p.sample_arrays
+        given = (*x.arrays, group, a.G, a.q, a.b, a.lb, a.ub, a.w, n_f, ENTERS)
+        arrays = ReducedArrays(*theta_kernels.reduce(*given))
+        own = kernels.tensors(arrays, p.q.device)
+        convex = None if x.surely_convex else _convex(own[2])
+        return cls(*own, convex=convex, T=x.T, Y_neg=x.Y_neg, arrays=arrays)
 
     def at(self, programs: FlatPrograms) -> SoftQPs:
         """What a backend solves, with the rows ``rows``."""
-        d, r = self.H.shape[-1], self.rows.shape[0]
-        moved = programs.affine(self.matrix, programs.fixed, self.constant)
+        p, a, (group, fixed) = programs, self.arrays, programs.sample_arrays
+        d, r, w = self.H.shape[-1], self.rows.shape[0], self.w.expand(len(p), -1)
+        if p.q.is_cpu:
+            x = kernels.affine(fixed, a.matrix, group, a.constant)
+            moved = torch.from_numpy(x)
+        else:
+            moved = p.multiply(self.matrix, p.fixed, transposed=True) + self.constant
         g, lower, upper = moved.split_with_sizes((d, r, r), dim=-1)
-        w = self.w.expand(len(programs), -1)
-        return SoftQPs(self.H, self.G, programs.group, g, lower, upper, w)
+        qps = SoftQPs(self.H, self.G, p.group, g, lower, upper, w)
+        if p.q.is_cpu:
+            # What is known need not be worked out.
+            vectors = (x[:, :d], x[:, d : d + r], x[:, d + r :], w.numpy())
+            vars(qps)["arrays"] = SoftArrays(a.H, a.G, group, *vectors)
+        return qps
 
     def expand(self, p: FlatPrograms, v: Tensor) -> Tensor:
         """The full z ``(B, n_z)`` from the free variables v ``(B, d)``."""

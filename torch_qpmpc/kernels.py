@@ -11,12 +11,13 @@ Arrays are float64 and contiguous. Of a vector ``(B or 1, n)``, all QPs share a 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
 import numba
 import numpy as np
+import torch
 from torch import Tensor
 
 #: Entries of the matrix times vectors up to which a product by BLAS stays in one thread.
@@ -33,7 +34,16 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
 
 def arrays(*tensors: Tensor) -> list[np.ndarray]:
     """The tensors of any device as a kernel takes them."""
-    return [tensor.cpu().contiguous().numpy() for tensor in tensors]
+    # Each step of the way costs as much as a kernel spends on a QP: none without need.
+    return [
+        (x if x.is_cpu and x.is_contiguous() else x.cpu().contiguous()).numpy() for x in tensors
+    ]
+
+
+def tensors(found: Iterable[np.ndarray], device: torch.device) -> list[Tensor]:
+    """What kernels found, on a device."""
+    on_cpu = [torch.from_numpy(x) for x in found]
+    return on_cpu if device.type == "cpu" else [x.to(device) for x in on_cpu]
 
 
 @compiled
@@ -41,7 +51,7 @@ def recover(
     v, lam_v, group, fixed, rows, others, T_T, Y_neg, C, C_T, H, G, G_T, diagonal, at_zero,
     q, c, b, lb, ub, w, violated,
 ):  # fmt: skip
-    """Value, z, sigma, chi, lam, xi and residual of `solvers.chain._recover`.
+    """Value, z, sigma, chi, lam, xi, status, residual and worst of `solvers.chain._recover`.
 
     ``at_zero`` ``(B or 1, n_z)`` is z where the fixed entries and v are zero, ``T_T``, ``C_T`` and
     ``G_T`` are transposes, and ``diagonal`` says of H and G whether they have nothing else.
@@ -87,7 +97,26 @@ def recover(
     value, sigma, residual = judge(
         z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w
     )
-    return value, z, sigma, chi, lam, xi, residual
+    worst = 0.0
+    for i in range(n_qps):
+        worst = max(worst, residual[i])
+    return value, z, sigma, chi, lam, xi, np.zeros(n_qps, np.int64), residual, worst
+
+
+@compiled
+def is_finite(vectors):
+    """Whether all entries are: their sum is, but for overflow, which no solver survives either."""
+    return np.isfinite(vectors.sum())
+
+
+@compiled
+def affine(vectors, matrices, group, constant):
+    """`products` plus ``constant`` ``(B or 1, j)``."""
+    found = products(vectors, matrices, group, False)
+    for i in range(found.shape[0]):
+        for j in range(found.shape[1]):
+            found[i, j] += constant[i % len(constant), j]
+    return found
 
 
 @compiled
@@ -95,9 +124,10 @@ def products(vectors, matrices, group, diagonal):
     """Each QP's transposed matrix times its vector, ``(M, i, j)`` and ``(B, i)`` to ``(B, j)``."""
     found = np.zeros((len(vectors), matrices.shape[2]))
     if diagonal:
+        factors = np.diag(matrices[0]).copy()
         for i in range(len(vectors)):
             for j in range(vectors.shape[1]):
-                found[i, j] = vectors[i, j] * matrices[0, j, j]
+                found[i, j] = vectors[i, j] * factors[j]
     elif len(matrices) == 1:
         some = max(1, ONE_THREAD // max(1, matrices.size))
         for i in range(0, len(vectors) if matrices.size else 0, some):
@@ -204,9 +234,9 @@ def _excess(y, lam, lb, ub, w, i, of_lb, of_ub, of_w):
         above, below = ub[of_ub, j], lb[of_lb, j]
         hard = weight == np.inf
         excess = max(at - above, below - at) if hard else abs(push) - weight
-        error = max(error, excess / (1.0 + (abs(at) if hard else weight)))
-        error = max(error, push if above == np.inf else 0.0)
-        error = max(error, -push if below == -np.inf else 0.0)
+        excess /= 1.0 + (abs(at) if hard else weight)
+        astray = max(push if above == np.inf else 0.0, -push if below == -np.inf else 0.0)
+        error = max(error, max(excess, astray))
     return error
 
 
@@ -230,6 +260,55 @@ def _add_product(x, factors, matrix):
     for j in range(whole, len(factors)):
         for k in range(len(x)):
             x[k] += factors[j] * matrix[j, k]
+
+
+@compiled
+def envelope(incoming, status, z, sigma, chi, lam, xi, needed):
+    """`autograd.envelope_gradients` of a theta that the batch shares.
+
+    ``incoming`` and ``status`` are ``(B,)``; of the ten, the matrices that are not ``needed`` are
+    empty.
+    """
+    n_qps, n_z = z.shape
+    weight, weighted_z = np.empty(n_qps), np.empty(z.shape)
+    for i in range(n_qps):
+        # Zero times an infinite gradient would be NaN.
+        weight[i] = incoming[i] if status[i] == 0 else 0.0
+        for j in range(n_z):
+            weighted_z[i, j] = weight[i] * z[i, j]
+    H = _summed_outer(weighted_z, z, needed[0])
+    for i in range(H.shape[0]):
+        for j in range(n_z):
+            H[i, j] *= 0.5
+    c, q, b, of_w = np.zeros(()), np.zeros(n_z), np.zeros(chi.shape[1]), np.zeros(lam.shape[1])
+    of_lb, of_ub, fixed = np.zeros(lam.shape[1]), np.zeros(lam.shape[1]), np.empty(xi.shape)
+    for i in range(n_qps):
+        c[()] += weight[i]
+        for j in range(n_z):
+            q[j] += weighted_z[i, j]
+        for j in range(chi.shape[1]):
+            b[j] -= weight[i] * chi[i, j]
+        for j in range(lam.shape[1]):
+            of_lb[j] -= weight[i] * min(lam[i, j], 0.0)
+            of_ub[j] -= weight[i] * max(lam[i, j], 0.0)
+            of_w[j] += weight[i] * sigma[i, j]
+        for j in range(xi.shape[1]):
+            fixed[i, j] = -weight[i] * xi[i, j]
+    C = _summed_outer(chi, weighted_z, needed[3])
+    G = _summed_outer(lam, weighted_z, needed[5])
+    return H, q, c, C, b, G, of_lb, of_ub, of_w, fixed
+
+
+@compiled
+def _summed_outer(left, right, needed):
+    """The sum of ``left_i right_i'``, ``(B, m)`` and ``(B, n)`` to ``(m, n)``; or nothing."""
+    if not needed:
+        return np.empty((0, right.shape[1]))
+    found = np.zeros((left.shape[1], right.shape[1]))
+    some = max(1, ONE_THREAD // max(1, found.size))
+    for i in range(0, len(left) if found.size else 0, some):
+        found += np.dot(left[i : i + some].T, right[i : i + some])
+    return found
 
 
 def tour(vectors: np.ndarray, near: int) -> np.ndarray:

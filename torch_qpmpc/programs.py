@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -23,7 +23,8 @@ T = TypeVar("T")
 class ContentMemo(threading.local):
     """The latest results of a function of tensors, found again by the *content* of the tensors.
 
-    No in-place update, copied module or functional call can make such a result stale.
+    No in-place update, copied module or functional call can make such a result stale. The tensors
+    of a call are of one dtype, on one device.
     """
 
     SIZE = 4
@@ -36,7 +37,7 @@ class ContentMemo(threading.local):
 
         It gets copies, so that its result may contain them.
         """
-        kind = (options, *((tensor.dtype, tensor.device) for tensor in tensors))
+        kind = (options, tensors[0].dtype, tensors[0].device)
         for position, (known, of_kind, result) in enumerate(self.entries):
             if of_kind == kind and all(map(torch.equal, known, tensors)):
                 self.entries.insert(0, self.entries.pop(position))
@@ -153,11 +154,16 @@ class FlatPrograms:
         """The same for the kernels."""
         return self.known("arrays", lambda: ProgramArrays.of(self))
 
+    @cached_property
+    def sample_arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """group and fixed for the kernels."""
+        group, fixed = kernels.arrays(self.group, self.fixed)
+        return group, fixed
+
     def valid(self) -> Tensor | None:
         """Which QPs have finite data and lb <= ub, ``(B,)``, or None if all do."""
         valid = self._inspected.valid
-        # A sum is finite if its terms are (but for overflow, which no solver survives either).
-        if valid is None and math.isfinite(self.fixed.sum()):
+        if valid is None and kernels.is_finite(self.sample_arrays[1]):
             return None
         finite = self.fixed.sum(-1).isfinite()
         return finite if valid is None else valid & finite
@@ -246,7 +252,7 @@ class _Inspected(NamedTuple):
 
     @classmethod
     def of(cls, p: FlatPrograms) -> _Inspected:
-        a, group = p.arrays(), *kernels.arrays(p.group)
+        a, (group, _) = p.arrays(), p.sample_arrays
         valid, H, G = theta_kernels.inspect(a.H, a.C, a.G, group, a.q, a.c, a.b, a.lb, a.ub, a.w)
         some = None if valid.all() else torch.from_numpy(valid).to(p.q.device)
         return cls(some, {"H": H, "G": G})
@@ -283,6 +289,7 @@ class SoftQPs:
         vectors = (v[index] for v in (self.group, self.g, self.l, self.u, self.w))
         return SoftQPs(self.H, self.G, *vectors)
 
+    @cached_property
     def arrays(self) -> SoftArrays:
         """The same for solvers that know nothing of tensors."""
         return SoftArrays(*(getattr(self, name).cpu().numpy() for name in SoftArrays._fields))

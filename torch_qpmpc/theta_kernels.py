@@ -269,7 +269,7 @@ def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
         else:
             others[s] = i
             s += 1
-    H_v, G_v, matrix = np.empty((M, d, d)), np.empty((M, r, d)), np.empty((M, d + 2 * r, n_f))
+    H_v, G_v, matrix = np.empty((M, d, d)), np.empty((M, r, d)), np.empty((M, n_f, d + 2 * r))
     # What q makes of g, and what b makes of g, of y and of z.
     by_q, by_b = np.empty((M, n_z, d)), np.empty((M, n_c, d + r + n_z))
     for m in range(M):
@@ -277,14 +277,14 @@ def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
             for j in range(d):
                 H_v[m, i, j] = H[m, n_f + i, n_f + j]
             for j in range(n_f):
-                matrix[m, i, j] = H[m, n_f + i, j]
+                matrix[m, j, i] = H[m, n_f + i, j]
             for j in range(n_c):
                 by_b[m, j, i] = H_b[m, n_f + i, j]
         for i in range(r):
             for j in range(d):
                 G_v[m, i, j] = G[m, rows[i], n_f + j]
             for j in range(n_f):
-                matrix[m, d + i, j] = matrix[m, d + r + i, j] = -G[m, rows[i], j]
+                matrix[m, j, d + i] = matrix[m, j, d + r + i] = -G[m, rows[i], j]
             for j in range(n_c):
                 by_b[m, j, d + i] = G_b[m, rows[i], j]
         for i in range(n_z):

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 
 from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, soft_qps
 from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
-from torch_qpmpc.programs import SoftQPs
+from torch_qpmpc.programs import SoftArrays, SoftQPs
 from torch_qpmpc.qp import row_states
 from torch_qpmpc.solvers import Answer, active_set, batched, interior_point
 from torch_qpmpc.solvers.active_set import SETTLED, settle
@@ -109,7 +109,7 @@ def test_multipliers_of_inactive_rows_are_zero():
 
 
 def moved(qps: SoftQPs, device: str) -> SoftQPs:
-    return SoftQPs(**{f.name: getattr(qps, f.name).to(device) for f in fields(qps)})
+    return SoftQPs(*(getattr(qps, name).to(device) for name in SoftArrays._fields))
 
 
 def residual(qps: SoftQPs, answer: Answer) -> Tensor:

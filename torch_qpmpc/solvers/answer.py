@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
+
+from torch_qpmpc import kernels
 
 
 @dataclass(frozen=True)
@@ -31,5 +32,4 @@ class Answer:
         cls, g: Tensor, v: np.ndarray, lam: np.ndarray, iterations: np.ndarray | Sequence[int]
     ) -> Answer:
         """From what a solver of arrays found, on the device of ``g``."""
-        found = torch.as_tensor(iterations, dtype=torch.int64, device=g.device)
-        return cls(torch.from_numpy(v).to(g), torch.from_numpy(lam).to(g), found)
+        return cls(*kernels.tensors((v, lam, np.asarray(iterations, np.int64)), g.device))

@@ -89,13 +89,16 @@ def solve_programs(
     if units is not None:
         raw = units.restored(programs, raw)
     if (log := _active_log.get()) is not None:
+        residual, worst = raw.residual, raw.worst
+        if not raw.all_accepted:
+            residual = residual[raw.accepted()]
+            worst = float(residual.max()) if len(residual) else 0.0
         log.solves += len(programs)
-        log.unsolved += int((raw.status != Status.SOLVED).sum())
+        log.unsolved += len(programs) - len(residual)
         log.fallback += chain.rejected
         log.recalled += chain.recalled
         log.iterations += int(raw.iterations.sum())
-        solved = raw.residual[raw.status == Status.SOLVED]
-        log.residual = max(log.residual, float(solved.max()) if len(solved) else 0.0)
+        log.residual = max(log.residual, worst)
         log.seconds += time.perf_counter() - began
     return raw
 
@@ -103,57 +106,58 @@ def solve_programs(
 class _Chain:
     """One batch on its way from attempt to attempt: what one leaves, the next one gets.
 
+    ``todo`` are the indices of the QPs that are still to be solved, or None for the whole batch.
     ``recalled`` counts what the active sets of ``start`` solved, ``rejected`` the claims of the
     chosen solver that the certificate rejected.
     """
 
     def __init__(self, programs: FlatPrograms, keep: int) -> None:
-        self.programs = programs
         valid = programs.valid()
         if valid is not None:
-            self.programs = programs = programs.without_nan()
-        self.keep, self.recalled, self.rejected = keep, 0, 0
+            programs = programs.without_nan()
+        self.programs, self.keep = programs, keep
+        self.recalled = self.rejected = 0
         # First-order conditions certify an optimum only where the QP is convex.
         convex = self.reduced_for(programs).convex
         if convex is not None:
             of_qps = convex[programs.group]
             valid = of_qps if valid is None else valid & of_qps
         self.raw: RawSolution | None = None
-        self.todo = torch.arange(len(programs), device=programs.q.device)
+        self.todo: Tensor | None = None
         if valid is not None and not valid.all():
             self.raw = unsolved(programs)
             self.todo = valid.nonzero().squeeze(-1)
             self.raw.status[self.todo] = Status.NOT_CONVERGED
 
     def run(self, solver: str, start: Tensor | None) -> RawSolution:
-        if len(self.todo) or self.raw is None:
-            self.attempt(backend(solver), start)
-        self.rejected = self.todo.shape[0]
-        if self.rejected:
-            assert self.raw is not None
+        raw, todo = self.attempt(backend(solver), start)
+        self.rejected = 0 if todo is None else len(todo)
+        if todo is not None and self.rejected:
             part = self.part()
             # What is proved to be infeasible need not be tried by every other solver.
-            self.raw.status[self.todo] = _reasons(part, self.reduced_for(part))
-            self.todo = self.todo[self.raw.status[self.todo] != Status.INFEASIBLE]
-        for other in fallbacks(solver):
-            if len(self.todo):
+            raw.status[todo] = _reasons(part, self.reduced_for(part))
+            self.todo = todo[raw.status[todo] != Status.INFEASIBLE]
+            for other in fallbacks(solver):
                 self.attempt(other)
-        assert self.raw is not None
-        return self.raw
+        return raw
 
     def part(self) -> FlatPrograms:
         """The programs that are still to be solved."""
-        whole = self.todo.shape[0] == len(self.programs)
-        return self.programs if whole else self.programs.take(self.todo)
+        return self.programs if self.todo is None else self.programs.take(self.todo)
 
     def reduced_for(self, part: FlatPrograms) -> Reduced:
         return condensed_for(part, self.keep).reduced(part)
 
-    def attempt(self, solve: Backend, start: Tensor | None = None) -> None:
+    def attempt(
+        self, solve: Backend, start: Tensor | None = None
+    ) -> tuple[RawSolution, Tensor | None]:
         """Ask for what is still to be solved, and keep what the certificate accepts.
 
         With active sets ``start``, ``solve`` is only asked for what `recall` makes nothing of.
+        Returns the solutions so far, and ``todo``, None if there is nothing left at once.
         """
+        if self.raw is not None and self.todo is not None and not len(self.todo):
+            return self.raw, self.todo
         part = self.part()
         reduced = self.reduced_for(part)
         qps, recover = reduced.at(part), partial(_recover, part, reduced)
@@ -163,30 +167,31 @@ class _Chain:
         elif start is None:
             answer = solve(qps)
         else:
+            start = start if self.todo is None else start[self.todo]
             # A part of a batch may have fewer rows with a bound than the whole.
-            answer, recalled = recall(qps, start[self.todo][:, reduced.rows])
+            answer, recalled = recall(qps, start[:, reduced.rows])
             _replace(answer, ~recalled, qps, solve)
         claim = recover(answer)
-        accepted = claim.residual <= TOLERANCE
-        all_accepted = bool(accepted.all())
+        all_accepted = claim.all_accepted
         if recalled is not None:
-            self.recalled = int((recalled & accepted).sum())
-            if not all_accepted and _replace(answer, recalled & ~accepted, qps, solve):
+            kept = recalled if all_accepted else recalled & claim.accepted()
+            self.recalled = int(kept.sum())
+            if not all_accepted and _replace(answer, recalled & ~kept, qps, solve):
                 claim = recover(answer)
-                accepted = claim.residual <= TOLERANCE
-                all_accepted = bool(accepted.all())
-        if all_accepted:
-            if part is self.programs:
-                self.raw, self.todo = claim, self.todo[:0]
-                return
-        else:
+                all_accepted = claim.all_accepted
+        if all_accepted and self.todo is None:
+            self.raw = claim
+            return self.raw, None
+        if not all_accepted:
             _sharpen(claim, qps, answer, recover)
-            accepted = claim.residual <= TOLERANCE
-        if self.raw is None:
+        if self.raw is None or self.todo is None:
             self.raw = unsolved(self.programs, Status.NOT_CONVERGED)
+            self.todo = torch.arange(len(part), device=part.q.device)
+        accepted = claim.accepted()
         self.raw.put(self.todo[accepted], claim.at(accepted))
         self.todo = self.todo[~accepted]
         self.raw.residual[self.todo] = claim.residual[~accepted]
+        return self.raw, self.todo
 
 
 def _replace(answer: Answer, where: Tensor, qps: SoftQPs, solve: Backend) -> bool:
@@ -201,7 +206,7 @@ def _sharpen(
     claim: RawSolution, qps: SoftQPs, answer: Answer, recover: Callable[[Answer], RawSolution]
 ) -> None:
     """Improve in place, where that is likely, what the certificate rejects by little."""
-    nearly = (claim.residual > TOLERANCE) & (claim.residual <= NEARLY)
+    nearly = ~claim.accepted() & (claim.residual <= NEARLY)
     if not nearly.any():
         return
     second = recover(refine(qps, answer, nearly.nonzero().squeeze(-1)))
@@ -236,18 +241,10 @@ def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
     xi = -of_fixed
     of_fixed += xi
     certificate = certify(p, z, lam, chi, xi, Products(Hz, G_lam, C_chi, slope, y))
+    value, sigma, residual = certificate.value, certificate.sigma, certificate.residual
+    worst = float(residual.max()) if len(residual) else 0.0
     status = torch.zeros_like(p.group)
-    return RawSolution(
-        certificate.value,
-        z,
-        certificate.sigma,
-        chi,
-        lam,
-        xi,
-        status,
-        certificate.residual,
-        answer.iterations,
-    )
+    return RawSolution(value, z, sigma, chi, lam, xi, status, residual, answer.iterations, worst)
 
 
 def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
@@ -255,18 +252,17 @@ def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawS
 
     def of_theta() -> list[np.ndarray]:
         a, diagonal = p.arrays(), np.array([p.is_diagonal(name) for name in ("H", "G")])
-        T_T, C_T, Y_neg, z_0 = kernels.arrays(reduced.T.mT, p.C.mT, reduced.Y_neg, reduced.z_0)
+        T_T, C_T, Y_neg = kernels.arrays(reduced.T.mT, p.C.mT, reduced.Y_neg)
         G_T = a.G if diagonal[1] else np.ascontiguousarray(a.G.swapaxes(1, 2))
         matrices = [T_T, Y_neg, a.C, C_T, a.H, a.G, G_T, diagonal]
-        return [*matrices, z_0, a.q, a.c, a.b, a.lb, a.ub, a.w]
+        return [*matrices, reduced.arrays.z_0, a.q, a.c, a.b, a.lb, a.ub, a.w]
 
-    given = (answer.v, answer.lam, p.group, p.fixed, reduced.rows, reduced.others)
+    claim, x = kernels.arrays(answer.v, answer.lam), reduced.arrays
     # V and Q of a theta share its T, unless C has dependent rows.
     theta = p.known(("kernel", reduced.T), of_theta)
-    found = kernels.recover(*kernels.arrays(*given), *theta, VIOLATED)
-    value, z, sigma, chi, lam, xi, residual = map(torch.from_numpy, found)
-    status = torch.zeros_like(p.group)
-    return RawSolution(value, z, sigma, chi, lam, xi, status, residual, answer.iterations)
+    given = (*claim, *p.sample_arrays, x.rows, x.others, *theta, VIOLATED)
+    *found, worst = kernels.recover(*given)
+    return RawSolution(*kernels.tensors(found, p.q.device), answer.iterations, worst)
 
 
 def _reasons(part: FlatPrograms, reduced: Reduced) -> Tensor:

@@ -20,7 +20,7 @@ MAX_STEPS = 10
 
 def refine(qps: SoftQPs, start: Answer, which: Tensor) -> Answer:
     """Sharpen the answers at the indices ``which``; where steps do not settle, the last stays."""
-    arrays = qps.arrays()
+    arrays = qps.arrays
     v, lam, iterations = (
         tensor.cpu().numpy().copy() for tensor in (start.v, start.lam, start.iterations)
     )

@@ -24,7 +24,7 @@ SETTINGS = {"primal_tol": 1e-9, "dual_tol": 1e-12, "iter_limit": 2000, "time_lim
 
 def solve(qps: SoftQPs) -> Answer:
     """Solve a batch; of a large one, each QP from the active set of one much like it."""
-    arrays = qps.arrays()
+    arrays = qps.arrays
     kinds = _alike(arrays)
     if len(kinds) == 1:
         return Answer.like(qps.g, *_solve_alike(arrays))

@@ -39,7 +39,7 @@ os.register_at_fork(after_in_child=_mark_forked)
 
 def solve(qps: SoftQPs) -> Answer:
     """Solve a batch, by as many threads as torch may use."""
-    arrays = qps.arrays()
+    arrays = qps.arrays
     form = SplitSlack.of(arrays)
     n_x, n_in = form.n_x, form.n_in
     n_qps = len(arrays.group)

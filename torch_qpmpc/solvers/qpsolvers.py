@@ -25,7 +25,7 @@ def check_available(name: str) -> None:
 
 def solve(qps: SoftQPs, *, name: str) -> Answer:
     """Solve a batch one by one."""
-    arrays = qps.arrays()
+    arrays = qps.arrays
     form = SplitSlack.of(arrays)
     v, lam = np.zeros_like(arrays.g), np.zeros_like(arrays.l)
     sparse = name in qpsolvers.sparse_solvers

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
+from torch_qpmpc.certificate import TOLERANCE
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.qp import Status
 
 
 @dataclass
 class RawSolution:
-    """Certified primal-dual solutions of B QPs, float64; lam = eta - upsilon."""
+    """Certified primal-dual solutions of B QPs, float64; lam = eta - upsilon.
+
+    No residual is larger than ``worst``; up to the tolerance, that says that all are solved.
+    """
 
     value: Tensor
     z: Tensor
@@ -24,14 +29,27 @@ class RawSolution:
     status: Tensor
     residual: Tensor
     iterations: Tensor
+    worst: float = math.inf
+
+    def accepted(self) -> Tensor:
+        """Which of them the certificate accepts, ``(B,)``."""
+        return self.residual <= TOLERANCE
+
+    @property
+    def all_accepted(self) -> bool:
+        return self.worst <= TOLERANCE
 
     def at(self, index: Tensor) -> RawSolution:
         """The solutions at ``index``."""
-        return RawSolution(*(getattr(self, field.name)[index] for field in fields(self)))
+        return RawSolution(*(x[index] for x in self._tensors()))
 
     def put(self, index: Tensor, other: RawSolution) -> None:
-        for field in fields(self):
-            getattr(self, field.name)[index] = getattr(other, field.name)
+        for own, others in zip(self._tensors(), other._tensors(), strict=True):
+            own[index] = others
+        self.worst = math.inf
+
+    def _tensors(self) -> list[Tensor]:
+        return [getattr(self, field.name) for field in fields(self) if field.name != "worst"]
 
 
 def unsolved(p: FlatPrograms, status: Status = Status.INVALID_DATA) -> RawSolution:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torch_qpmpc import kernels, theta_kernels
+from torch_qpmpc import theta_kernels
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.solvers.raw import RawSolution
 
@@ -40,7 +40,7 @@ class Units:
         """The units of ``p``, or None where all of them are one."""
         if not len(p) or not p.q.shape[-1]:
             return None
-        a, group = p.arrays(), *kernels.arrays(p.group)
+        a, (group, _) = p.arrays(), p.sample_arrays
         given = (a.H, a.C, a.G, group, a.q, a.b, a.lb, a.ub, a.w)
         *units, extreme = theta_kernels.units(*given, SMALL, LARGE)
         return cls(*(torch.from_numpy(unit).to(p.q) for unit in units)) if extreme else None
