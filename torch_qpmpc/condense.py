@@ -201,7 +201,9 @@ def _condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
 def condensed_for(programs: FlatPrograms, keep: int) -> Condensed:
     """Condensed with ``keep`` entries kept, or just the fixed ones where C does not allow more."""
     p, n_f = programs, programs.fixed.shape[-1]
-    condensed: Condensed = p.known(("condensed", keep), lambda: condense(p.H, p.C, p.G, keep))
+    # QPs of one theta are found again by it, with all that is known of them.
+    make = _condense if p.share_theta else condense
+    condensed: Condensed = p.known(("condensed", keep), lambda: make(p.H, p.C, p.G, keep))
     return condensed_for(p, n_f) if condensed.deficient and keep > n_f else condensed
 
 

@@ -100,7 +100,11 @@ class FlatPrograms:
     @classmethod
     def _shared(cls, theta: Sequence[Tensor], fixed: Tensor) -> FlatPrograms:
         """A single QP, as the form of all that have this theta."""
-        H, q, c, C, b, G, lb, ub, w = (x.unsqueeze(0) for x in _prepared(theta, fixed))
+        H, lb, ub = theta[0], *theta[6:8]
+        same_kind = H.dtype == fixed.dtype and H.is_cpu and fixed.is_cpu
+        if not same_kind or not theta_kernels.is_regular(*kernels.arrays(H, lb, ub)):
+            theta = _prepared(theta, fixed)
+        H, q, c, C, b, G, lb, ub, w = (x.unsqueeze(0) for x in theta)
         group = torch.zeros(1, dtype=torch.int64, device=fixed.device)
         return cls(H, C, G, group, q, c, b, lb, ub, w, fixed)
 
@@ -132,11 +136,17 @@ class FlatPrograms:
     def take(self, index: Tensor) -> FlatPrograms:
         """The QPs at ``index``, with the matrices as they are."""
         group, fixed = self.group[index], self.fixed[index]
-        vectors = (self.q, self.c, self.b, self.lb, self.ub, self.w)
-        if all(len(x) == 1 for x in (self.H, *vectors)):
+        if self.share_theta:
             return self._with(group, fixed)
+        vectors = (self.q, self.c, self.b, self.lb, self.ub, self.w)
         q, c, b, lb, ub, w = (v if len(v) == 1 else v[index] for v in vectors)
         return FlatPrograms(self.H, self.C, self.G, group, q, c, b, lb, ub, w, fixed)
+
+    @property
+    def share_theta(self) -> bool:
+        """Whether they differ in nothing but their fixed entries."""
+        theta = (self.H, self.q, self.c, self.b, self.lb, self.ub, self.w)
+        return all(x.shape[0] == 1 for x in theta)
 
     def _with(self, group: Tensor, fixed: Tensor) -> FlatPrograms:
         """QPs of the same theta, which share what is known of it."""
@@ -254,7 +264,7 @@ class _Inspected(NamedTuple):
     def of(cls, p: FlatPrograms) -> _Inspected:
         a, (group, _) = p.arrays(), p.sample_arrays
         valid, H, G = theta_kernels.inspect(a.H, a.C, a.G, group, a.q, a.c, a.b, a.lb, a.ub, a.w)
-        some = None if valid.all() else torch.from_numpy(valid).to(p.q.device)
+        some = None if valid is None else kernels.tensors([valid], p.q.device)[0]
         return cls(some, {"H": H, "G": G})
 
 

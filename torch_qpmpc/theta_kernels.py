@@ -15,8 +15,24 @@ from torch_qpmpc.kernels import add, compiled, products
 
 
 @compiled
+def is_regular(H, lb, ub):
+    """Whether one H is symmetric, and lb <= ub."""
+    for i in range(H.shape[0]):
+        for j in range(i):
+            if not H[i, j] == H[j, i]:
+                return False
+    for i in range(len(lb)):
+        if not lb[i] <= ub[i]:
+            return False
+    return True
+
+
+@compiled
 def inspect(H, C, G, group, q, c, b, lb, ub, w):
-    """Which QPs have finite data and lb <= ub, ``(B or 1,)``, and whether H and G are diagonal."""
+    """Which QPs have finite data and lb <= ub, ``(B or 1,)``, and whether H and G are diagonal.
+
+    Instead of the former None, if all have.
+    """
     M = len(H)
     finite = np.empty(M, np.bool_)
     for m in range(M):
@@ -30,7 +46,8 @@ def inspect(H, C, G, group, q, c, b, lb, ub, w):
             # False for NaN, as of inf - inf where both bounds are the same infinity.
             good = good and ub[i % len(ub), j] - lb[i % len(lb), j] >= 0 and w[i % len(w), j] >= 0
         valid[i] = good
-    return valid, M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
+    some = None if valid.all() else valid
+    return some, M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
 
 
 @compiled
@@ -44,7 +61,7 @@ def _is_diagonal(matrix):
 
 @compiled
 def units(H, C, G, group, q, b, lb, ub, w, small, large):
-    """cost, length, rows and equalities of `solvers.units.Units`, and whether any is not one."""
+    """cost, length, rows and equalities of `solvers.units.Units`, or None if all are one."""
     M, n_g, n_c = len(H), G.shape[1], C.shape[1]
     of_G, of_C = _sums(G), _sums(C)
     of_q, of_b = _sizes(q, group, M), _sizes(b, group, M)
@@ -74,7 +91,7 @@ def units(H, C, G, group, q, b, lb, ub, w, small, large):
         for j in range(n_c):
             equalities[m, j] = _power_above(of_C[m, j] * long, small, large)
             extreme = extreme or equalities[m, j] != 1
-    return cost, length, rows, equalities, extreme
+    return (cost, length, rows, equalities) if extreme else None
 
 
 @compiled

@@ -14,10 +14,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
-from torch_qpmpc import theta_kernels
+from torch_qpmpc import kernels, theta_kernels
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.solvers.raw import RawSolution
 
@@ -42,8 +41,8 @@ class Units:
             return None
         a, (group, _) = p.arrays(), p.sample_arrays
         given = (a.H, a.C, a.G, group, a.q, a.b, a.lb, a.ub, a.w)
-        *units, extreme = theta_kernels.units(*given, SMALL, LARGE)
-        return cls(*(torch.from_numpy(unit).to(p.q) for unit in units)) if extreme else None
+        units = theta_kernels.units(*given, SMALL, LARGE)
+        return None if units is None else cls(*kernels.tensors(units, p.q.device))
 
     def scaled(self, p: FlatPrograms) -> FlatPrograms:
         """The same QPs in these units."""
