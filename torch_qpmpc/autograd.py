@@ -289,8 +289,8 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
     needed = ctx.needs_input_grad[:N_THETA]
     if _is_summed(theta, z) and not is_traced((grad_value, z)):
         given = kernels.arrays(grad_value, status, z, sigma, chi, lam, xi)
-        found = kernels.tensors(kernels.envelope(*given, needed), z.device)
-        found = (x if need else None for x, need in zip(found, needed, strict=True))
+        pairs = zip(kernels.envelope(*given, needed), needed, strict=True)
+        found = (torch.from_numpy(gradient) if need else None for gradient, need in pairs)
         return (*found, *(None,) * N_OTHERS)
     # An unsolved element has zeros here, but zero times an infinite incoming gradient is NaN.
     weight = torch.where(status.eq(int(Status.SOLVED)), grad_value, 0)

@@ -77,6 +77,8 @@ class ReducedArrays(NamedTuple):
     constant: np.ndarray
     z_0: np.ndarray
     w: np.ndarray
+    T: np.ndarray
+    Y_neg: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +96,7 @@ class Reduced:
         w: ``(B, r)``.
         T, Y_neg: those of `Condensed`.
         convex: where H is positive semidefinite, ``(M,)``, or None if it is everywhere.
-        arrays: the tensors of its own once more, on the CPU.
+        arrays: the tensors once more, on the CPU.
     """
 
     rows: Tensor
@@ -114,26 +116,25 @@ class Reduced:
     def of(cls, condensed: Condensed, p: FlatPrograms, n_f: int) -> Reduced:
         x, a, (group, _) = condensed, p.arrays(), p.sample_arrays
         given = (*x.arrays, group, a.G, a.q, a.b, a.lb, a.ub, a.w, n_f, ENTERS)
-        arrays = ReducedArrays(*theta_kernels.reduce(*given))
-        own = kernels.tensors(arrays, p.q.device)
+        found = theta_kernels.reduce(*given)
+        own = kernels.tensors(found, p.q.device)
         convex = None if x.surely_convex else _convex(own[2])
-        return cls(*own, convex=convex, T=x.T, Y_neg=x.Y_neg, arrays=arrays)
+        return cls(*own, x.T, x.Y_neg, convex, ReducedArrays(*found, *x.arrays[:2]))
 
     def at(self, programs: FlatPrograms) -> SoftQPs:
         """What a backend solves, with the rows ``rows``."""
-        p, a, (group, fixed) = programs, self.arrays, programs.sample_arrays
-        d, r, w = self.H.shape[-1], self.rows.shape[0], self.w.expand(len(p), -1)
-        if p.q.is_cpu:
-            x = kernels.affine(fixed, a.matrix, group, a.constant)
-            moved = torch.from_numpy(x)
-        else:
+        p, d, r = programs, self.H.shape[-1], self.rows.shape[0]
+        if not p.q.is_cpu:
             moved = p.multiply(self.matrix, p.fixed, transposed=True) + self.constant
-        g, lower, upper = moved.split_with_sizes((d, r, r), dim=-1)
-        qps = SoftQPs(self.H, self.G, p.group, g, lower, upper, w)
-        if p.q.is_cpu:
-            # What is known need not be worked out.
-            vectors = (x[:, :d], x[:, d : d + r], x[:, d + r :], w.numpy())
-            vars(qps)["arrays"] = SoftArrays(a.H, a.G, group, *vectors)
+            vectors = (*moved.split_with_sizes((d, r, r), dim=-1), self.w.expand(len(p), -1))
+            return SoftQPs(self.H, self.G, p.group, *vectors)
+        a, (group, fixed) = self.arrays, p.sample_arrays
+        moved, w = kernels.affine(fixed, a.matrix, group, a.constant), a.w
+        if len(w) != len(p):  # for each QP the same row
+            w = np.ndarray((len(p), r), buffer=w, strides=(0, w.itemsize))
+        of_samples = (moved[:, :d], moved[:, d : d + r], moved[:, d + r :], w)
+        qps = SoftQPs(self.H, self.G, p.group, *kernels.tensors(of_samples, p.q.device))
+        vars(qps)["arrays"] = SoftArrays(a.H, a.G, group, *of_samples)  # need not be worked out
         return qps
 
     def expand(self, p: FlatPrograms, v: Tensor) -> Tensor:
@@ -185,8 +186,9 @@ def _condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
         given = kernels.arrays(H, C, G)
         *found, regular, convex = theta_kernels.condense(*given, keep, RANK_TOLERANCE, CONVEX)
         if regular:
-            tensors = [torch.from_numpy(array).to(C) for array in found]
-            return Condensed(keep, False, *tensors, surely_convex=convex)
+            condensed = Condensed(keep, False, *kernels.tensors(found, C.device), convex)
+            vars(condensed)["arrays"] = found  # need not be worked out
+            return condensed
     eliminated = _eliminate(C, keep)
     T, Y, padding = _null_space(C, keep) if eliminated is None else (*eliminated, None)
     H_T = H.bmm(T)

@@ -122,18 +122,19 @@ def affine(vectors, matrices, group, constant):
 @compiled
 def products(vectors, matrices, group, diagonal):
     """Each QP's transposed matrix times its vector, ``(M, i, j)`` and ``(B, i)`` to ``(B, j)``."""
-    found = np.zeros((len(vectors), matrices.shape[2]))
+    found = np.empty((len(vectors), matrices.shape[2]))
     if diagonal:
         factors = np.diag(matrices[0]).copy()
         for i in range(len(vectors)):
             for j in range(vectors.shape[1]):
                 found[i, j] = vectors[i, j] * factors[j]
-    elif len(matrices) == 1:
-        some = max(1, ONE_THREAD // max(1, matrices.size))
-        for i in range(0, len(vectors) if matrices.size else 0, some):
+    elif len(matrices) == 1 and matrices.size:
+        some = max(1, ONE_THREAD // matrices.size)
+        for i in range(0, len(vectors), some):
             np.dot(vectors[i : i + some], matrices[0], found[i : i + some])
     else:
-        for i in range(len(vectors)):
+        found[:] = 0.0
+        for i in range(len(vectors) if matrices.size else 0):
             _add_product(found[i], vectors[i], matrices[group[i]])
     return found
 

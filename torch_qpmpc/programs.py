@@ -94,8 +94,10 @@ class FlatPrograms:
         if any(batches):
             return cls._flat([tensor.detach() for tensor in theta], batch, fixed), batch
         programs = _memo.get(theta, str(device), lambda *own: cls._shared(own, fixed[:1]))
-        group = torch.zeros(fixed.shape[0], dtype=torch.int64, device=fixed.device)
-        return programs._with(group, fixed), batch
+        known, n_qps = programs._known, fixed.shape[0]
+        if "group" not in known or len(known["group"]) != n_qps:
+            known["group"] = torch.zeros(n_qps, dtype=torch.int64, device=fixed.device)
+        return programs._with(known["group"], fixed), batch
 
     @classmethod
     def _shared(cls, theta: Sequence[Tensor], fixed: Tensor) -> FlatPrograms:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -250,19 +251,19 @@ def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
 def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
     """`_recover` QP by QP, which keeps all of one in the cache."""
 
-    def of_theta() -> list[np.ndarray]:
-        a, diagonal = p.arrays(), np.array([p.is_diagonal(name) for name in ("H", "G")])
-        T_T, C_T, Y_neg = kernels.arrays(reduced.T.mT, p.C.mT, reduced.Y_neg)
-        G_T = a.G if diagonal[1] else np.ascontiguousarray(a.G.swapaxes(1, 2))
-        matrices = [T_T, Y_neg, a.C, C_T, a.H, a.G, G_T, diagonal]
-        return [*matrices, reduced.arrays.z_0, a.q, a.c, a.b, a.lb, a.ub, a.w]
+    def of_theta() -> list[Any]:
+        a, diagonal = p.arrays(), (p.is_diagonal("H"), p.is_diagonal("G"))
+        T_T, C_T, G_T = (np.ascontiguousarray(M.swapaxes(1, 2)) for M in (x.T, a.C, a.G))
+        matrices = [T_T, x.Y_neg, a.C, C_T, a.H, a.G, G_T, diagonal]
+        return [*matrices, x.z_0, a.q, a.c, a.b, a.lb, a.ub, a.w]
 
     claim, x = kernels.arrays(answer.v, answer.lam), reduced.arrays
     # V and Q of a theta share its T, unless C has dependent rows.
     theta = p.known(("kernel", reduced.T), of_theta)
     given = (*claim, *p.sample_arrays, x.rows, x.others, *theta, VIOLATED)
     *found, worst = kernels.recover(*given)
-    return RawSolution(*kernels.tensors(found, p.q.device), answer.iterations, worst)
+    value, z, sigma, chi, lam, xi, status, residual = kernels.tensors(found, p.q.device)
+    return RawSolution(value, z, sigma, chi, lam, xi, status, residual, answer.iterations, worst)
 
 
 def _reasons(part: FlatPrograms, reduced: Reduced) -> Tensor:

@@ -41,7 +41,7 @@ class RawSolution:
 
     def at(self, index: Tensor) -> RawSolution:
         """The solutions at ``index``."""
-        return RawSolution(*(x[index] for x in self._tensors()))
+        return RawSolution(*(x[index] for x in self._tensors()))  # pyright: ignore[reportArgumentType]
 
     def put(self, index: Tensor, other: RawSolution) -> None:
         for own, others in zip(self._tensors(), other._tensors(), strict=True):
