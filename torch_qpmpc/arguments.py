@@ -175,4 +175,6 @@ def check_pair(s: Tensor, a: Tensor, n_x: int, n_u: int, device: torch.device) -
         got = f"shape {tuple(a.shape)}"
         want = f"leading dimensions that broadcast with those of s, {tuple(s.shape[:-1])}"
         raise QPError.expected("a", got, want) from error
-    return torch.cat((s.expand(*batch, -1), a.expand(*batch, -1).to(s.dtype)), dim=-1)
+    if not s.shape[:-1] == a.shape[:-1] == batch:
+        s, a = s.expand(*batch, -1), a.expand(*batch, -1)
+    return torch.cat((s, a.to(s.dtype)), dim=-1)

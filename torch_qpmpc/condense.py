@@ -81,6 +81,11 @@ class ReducedArrays(NamedTuple):
     Y_neg: np.ndarray
 
 
+def _tensor(name: str) -> cached_property[Tensor]:
+    """An array of `Reduced` as a tensor, made when it is asked for."""
+    return cached_property(lambda x: kernels.tensors([getattr(x.arrays, name)], x.device)[0])
+
+
 @dataclass(frozen=True, eq=False)
 class Reduced:
     """The condensed problem with the first n_f entries fixed, in v, the rest of y.
@@ -96,39 +101,45 @@ class Reduced:
         w: ``(B, r)``.
         T, Y_neg: those of `Condensed`.
         convex: where H is positive semidefinite, ``(M,)``, or None if it is everywhere.
-        arrays: the tensors once more, on the CPU.
     """
 
-    rows: Tensor
-    others: Tensor
-    H: Tensor
-    G: Tensor
-    matrix: Tensor
-    constant: Tensor
-    z_0: Tensor
-    w: Tensor
     T: Tensor
     Y_neg: Tensor
-    convex: Tensor | None
     arrays: ReducedArrays
+    convex: Tensor | None
+
+    rows = _tensor("rows")
+    others = _tensor("others")
+    H = _tensor("H")
+    G = _tensor("G")
+    matrix = _tensor("matrix")
+    constant = _tensor("constant")
+    z_0 = _tensor("z_0")
+    w = _tensor("w")
 
     @classmethod
     def of(cls, condensed: Condensed, p: FlatPrograms, n_f: int) -> Reduced:
         x, a, (group, _) = condensed, p.arrays(), p.sample_arrays
         given = (*x.arrays, group, a.G, a.q, a.b, a.lb, a.ub, a.w, n_f, ENTERS)
-        found = theta_kernels.reduce(*given)
-        own = kernels.tensors(found, p.q.device)
-        convex = None if x.surely_convex else _convex(own[2])
-        return cls(*own, x.T, x.Y_neg, convex, ReducedArrays(*found, *x.arrays[:2]))
+        arrays = ReducedArrays(*theta_kernels.reduce(*given), *x.arrays[:2])
+        convex = None
+        if not x.surely_convex:
+            convex = _convex(*kernels.tensors([arrays.H], p.q.device))
+        return cls(x.T, x.Y_neg, arrays, convex)
+
+    @property
+    def device(self) -> torch.device:
+        return self.T.device
 
     def at(self, programs: FlatPrograms) -> SoftQPs:
         """What a backend solves, with the rows ``rows``."""
-        p, d, r = programs, self.H.shape[-1], self.rows.shape[0]
+        p, a = programs, self.arrays
+        d, r = a.H.shape[-1], len(a.rows)
         if not p.q.is_cpu:
             moved = p.multiply(self.matrix, p.fixed, transposed=True) + self.constant
             vectors = (*moved.split_with_sizes((d, r, r), dim=-1), self.w.expand(len(p), -1))
             return SoftQPs(self.H, self.G, p.group, *vectors)
-        a, (group, fixed) = self.arrays, p.sample_arrays
+        group, fixed = p.sample_arrays
         moved, w = kernels.affine(fixed, a.matrix, group, a.constant), a.w
         if len(w) != len(p):  # for each QP the same row
             w = np.ndarray((len(p), r), buffer=w, strides=(0, w.itemsize))

@@ -135,7 +135,7 @@ def products(vectors, matrices, group, diagonal):
     else:
         found[:] = 0.0
         for i in range(len(vectors) if matrices.size else 0):
-            _add_product(found[i], vectors[i], matrices[group[i]])
+            add_product(found[i], vectors[i], matrices[group[i]])
     return found
 
 
@@ -164,11 +164,11 @@ def judge(z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w)
 
 
 # Four entries at a time: sums in any order, and largest sizes as if nothing were NaN.
-_summing = partial(compiled, fastmath={"reassoc", "contract"})
+summing = partial(compiled, fastmath={"reassoc", "contract"})
 _comparing = partial(compiled, fastmath={"nnan", "nsz"})
 
 
-@_summing
+@summing
 def _cost(z, Hz, left, q, i, k):
     """(q + Hz / 2) z, and what stationarity left is worth."""
     cost = slip = 0.0
@@ -178,7 +178,7 @@ def _cost(z, Hz, left, q, i, k):
     return cost, slip
 
 
-@_summing
+@summing
 def _charge(y, lam, lb, ub, w, sigma, i, of_lb, of_ub, of_w):
     """w sigma and the rows' complementarity gaps; fills in sigma."""
     total = slip = 0.0
@@ -197,7 +197,7 @@ def _charge(y, lam, lb, ub, w, sigma, i, of_lb, of_ub, of_w):
     return total, slip
 
 
-@_summing
+@summing
 def _shortage(Cz, b, chi, i, k):
     """What C z = b lacks is worth."""
     slip = 0.0
@@ -249,7 +249,7 @@ def add(x, factor, y):
 
 
 @compiled
-def _add_product(x, factors, matrix):
+def add_product(x, factors, matrix):
     """x += matrix' factors, four rows at a time: x is read and written as much less often."""
     whole = len(factors) - len(factors) % 4
     for j in range(0, whole, 4):

@@ -88,11 +88,13 @@ class FlatPrograms:
         What was worked out for the same theta is found again where the batch shares all of it.
         """
         *theta, fixed = operands
-        batches = [t.shape[: t.ndim - n] for t, n in zip(theta, _NDIMS, strict=True)]
-        batch = broadcast(*batches, fixed.shape[:-1])
-        fixed = flatten(fixed, batch, device)
-        if any(batches):
+        if any(t.ndim > n for t, n in zip(theta, _NDIMS, strict=True)):
+            batches = (t.shape[: t.ndim - n] for t, n in zip(theta, _NDIMS, strict=True))
+            batch = broadcast(*batches, fixed.shape[:-1])
+            fixed = flatten(fixed, batch, device)
             return cls._flat([tensor.detach() for tensor in theta], batch, fixed), batch
+        batch = fixed.shape[:-1]
+        fixed = flatten(fixed, batch, device)
         programs = _memo.get(theta, str(device), lambda *own: cls._shared(own, fixed[:1]))
         known, n_qps = programs._known, fixed.shape[0]
         if "group" not in known or len(known["group"]) != n_qps:

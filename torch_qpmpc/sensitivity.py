@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -242,10 +243,19 @@ solution_op.register_autograd(_backward, setup_context=_setup_context)
 def signed(forward: Callable[..., Any]) -> Any:
     """A Function's ``forward`` that knows its own signature.
 
-    ``apply`` asks for it at each call; to work it out takes as long as solving some ten QPs.
+    ``apply`` asks for it at each call; to work it out takes as long as solving some ten QPs, and
+    to bind all of its arguments to their names as long as a few.
     """
-    forward.__signature__ = inspect.signature(forward)  # pyright: ignore[reportFunctionMemberAccess]
+    parameters = [*inspect.signature(forward).parameters.values()]
+    forward.__signature__ = _Positional(parameters)  # pyright: ignore[reportFunctionMemberAccess]
     return forward
+
+
+class _Positional(inspect.Signature):
+    """Of what is called with all of its arguments by position."""
+
+    def bind(self, *arguments: Any) -> Any:
+        return SimpleNamespace(args=arguments, kwargs={}, apply_defaults=lambda: None)
 
 
 class SolutionGradient(torch.autograd.Function):
@@ -304,6 +314,8 @@ def traceable(eager: Any, compiled: Any, operator: Any) -> Any:
     """
     transforms = _transforms()
     if not torch.compiler.is_compiling():
+        if not transforms and forward_ad._current_level < 0:
+            return compiled.apply  # to get ready for forward mode takes time
         if transforms.count("Jvp") > 1:
             raise QPError.expected(
                 "derivative", "jvp in jvp", "one forward mode", "Use hessian, or jacrev inside."

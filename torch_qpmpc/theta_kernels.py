@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from torch_qpmpc.kernels import add, compiled, products
+from torch_qpmpc.kernels import add_product, compiled, products, summing
 
 
 @compiled
@@ -36,7 +36,7 @@ def inspect(H, C, G, group, q, c, b, lb, ub, w):
     M = len(H)
     finite = np.empty(M, np.bool_)
     for m in range(M):
-        finite[m] = np.isfinite(H[m].sum() + C[m].sum() + G[m].sum())
+        finite[m] = np.isfinite(_sum(H[m]) + _sum(C[m]) + _sum(G[m]))
     shared = max(max(len(q), len(c), len(b)), max(len(lb), len(ub), len(w)))
     valid = np.empty(shared if M == 1 else len(group), np.bool_)
     for i in range(len(valid)):
@@ -48,6 +48,15 @@ def inspect(H, C, G, group, q, c, b, lb, ub, w):
         valid[i] = good
     some = None if valid.all() else valid
     return some, M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
+
+
+@summing
+def _sum(matrix):
+    total = 0.0
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            total += matrix[i, j]
+    return total
 
 
 @compiled
@@ -113,14 +122,16 @@ def _sizes(vectors, group, M):
     return largest
 
 
-@compiled
+@summing
 def _sums(matrices):
     """The absolute sums of rows, ``(M, i, j)`` to ``(M, i)``."""
-    sums = np.zeros(matrices.shape[:2])
+    sums = np.empty(matrices.shape[:2])
     for m in range(matrices.shape[0]):
         for i in range(matrices.shape[1]):
+            total = 0.0
             for j in range(matrices.shape[2]):
-                sums[m, i] += abs(matrices[m, i, j])
+                total += abs(matrices[m, i, j])
+            sums[m, i] = total
     return sums
 
 
@@ -220,13 +231,11 @@ def _eliminate(C, keep, independent, T, Y_neg):
             k += 1
     for i in range(n_c):
         right[i, n_y + i] = 1.0
-        for j in range(i):
-            add(right[i], -factors[j, i], right[j])
+        add_product(right[i], -factors[:i, i], right)
         for j in range(n_z):
             right[i, j] /= factors[i, i]
     for i in range(n_c - 1, -1, -1):
-        for j in range(i + 1, n_c):
-            add(right[i], -factors[j, i], right[j])
+        add_product(right[i], -factors[i + 1 : n_c, i], right[i + 1 :])
         dependent = order[keep + i]
         for j in range(n_y):
             T[dependent, j] = right[i, j]
