@@ -137,8 +137,9 @@ class Reduced:
         d, r = a.H.shape[-1], len(a.rows)
         if not p.q.is_cpu:
             moved = p.multiply(self.matrix, p.fixed, transposed=True) + self.constant
-            vectors = (*moved.split_with_sizes((d, r, r), dim=-1), self.w.expand(len(p), -1))
-            return SoftQPs(self.H, self.G, p.group, *vectors)
+            g, lower, upper = moved.split_with_sizes((d, r, r), dim=-1)
+            w = self.w.expand(len(p), -1)
+            return SoftQPs(self.H, self.G, p.group, g, lower, upper, w)
         group, fixed = p.sample_arrays
         moved, w = kernels.affine(fixed, a.matrix, group, a.constant), a.w
         if len(w) != len(p):  # for each QP the same row
@@ -186,7 +187,10 @@ def condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
 
     The last few results are remembered by the content of the matrices.
     """
-    return _memo.get((C, H, G), keep, lambda C, H, G: _condense(H, C, G, keep))
+    device = C.device
+    return _memo.get(
+        (H, C, G), keep, lambda *own: _condense(*kernels.tensors(own, device), keep=keep)
+    )
 
 
 _memo = ContentMemo()
@@ -197,7 +201,9 @@ def _condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
         given = kernels.arrays(H, C, G)
         *found, regular, convex = theta_kernels.condense(*given, keep, RANK_TOLERANCE, CONVEX)
         if regular:
-            condensed = Condensed(keep, False, *kernels.tensors(found, C.device), convex)
+            condensed = Condensed(
+                keep, False, *kernels.tensors(found, C.device), surely_convex=convex
+            )
             vars(condensed)["arrays"] = found  # need not be worked out
             return condensed
     eliminated = _eliminate(C, keep)

@@ -30,21 +30,22 @@ class ContentMemo(threading.local):
     SIZE = 4
 
     def __init__(self) -> None:
-        self.entries: list[tuple[tuple[Tensor, ...], Any, Any]] = []
+        self.entries: list[tuple[list[bytes], Any, Any]] = []
 
     def get(self, tensors: Sequence[Tensor], options: Any, make: Callable[..., T]) -> T:
-        """What ``make(*tensors)`` returned for equal tensors and ``options``, or returns now.
+        """What ``make`` returned for equal tensors and ``options``, or returns now.
 
-        It gets copies, so that its result may contain them.
+        It gets them as arrays of their own, so that its result may contain them.
         """
-        kind = (options, tensors[0].dtype, tensors[0].device)
-        for position, (known, of_kind, result) in enumerate(self.entries):
-            if of_kind == kind and all(map(torch.equal, known, tensors)):
+        arrays = kernels.arrays(*(tensor.detach() for tensor in tensors))
+        content = [array.tobytes() for array in arrays]
+        kind = (options, arrays[0].dtype, tensors[0].device, [array.shape for array in arrays])
+        for position, (of_content, of_kind, result) in enumerate(self.entries):
+            if of_content == content and of_kind == kind:
                 self.entries.insert(0, self.entries.pop(position))
                 return result
-        own = tuple(tensor.detach().clone() for tensor in tensors)
-        result = make(*own)
-        self.entries.insert(0, (own, kind, result))
+        result = make(*(array.copy() for array in arrays))
+        self.entries.insert(0, (content, kind, result))
         del self.entries[self.SIZE :]
         return result
 
@@ -102,14 +103,16 @@ class FlatPrograms:
         return programs._with(known["group"], fixed), batch
 
     @classmethod
-    def _shared(cls, theta: Sequence[Tensor], fixed: Tensor) -> FlatPrograms:
+    def _shared(cls, theta: Sequence[np.ndarray], fixed: Tensor) -> FlatPrograms:
         """A single QP, as the form of all that have this theta."""
-        H, lb, ub = theta[0], *theta[6:8]
-        same_kind = H.dtype == fixed.dtype and H.is_cpu and fixed.is_cpu
-        if not same_kind or not theta_kernels.is_regular(*kernels.arrays(H, lb, ub)):
-            theta = _prepared(theta, fixed)
-        H, q, c, C, b, G, lb, ub, w = (x.unsqueeze(0) for x in theta)
-        group = torch.zeros(1, dtype=torch.int64, device=fixed.device)
+        device, group = fixed.device, fixed.new_zeros(1, dtype=torch.int64)
+        H, q, c, C, b, G, lb, ub, w = (x[np.newaxis] for x in theta)
+        if H.dtype == np.float64 and theta_kernels.is_regular(H[0], lb[0], ub[0]):
+            arrays = ProgramArrays(H, C, G, q, c, b, lb, ub, w)
+            H, C, G, *vectors = kernels.tensors(arrays, device)
+            return cls(H, C, G, group, *vectors, fixed=fixed, _known={"arrays": arrays})
+        given = (x.unsqueeze(0) for x in _prepared(kernels.tensors(theta, device), fixed))
+        H, q, c, C, b, G, lb, ub, w = given
         return cls(H, C, G, group, q, c, b, lb, ub, w, fixed)
 
     @classmethod

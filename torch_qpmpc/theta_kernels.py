@@ -19,12 +19,12 @@ def is_regular(H, lb, ub):
     """Whether one H is symmetric, and lb <= ub."""
     for i in range(H.shape[0]):
         for j in range(i):
-            if not H[i, j] == H[j, i]:
+            if H[i, j] != H[j, i]:
                 return False
+    ordered = True
     for i in range(len(lb)):
-        if not lb[i] <= ub[i]:
-            return False
-    return True
+        ordered = ordered and lb[i] <= ub[i]
+    return ordered
 
 
 @compiled
