@@ -36,7 +36,7 @@ from torch_qpmpc.sensitivity import (
     traceable,
 )
 from torch_qpmpc.solvers import backend
-from torch_qpmpc.solvers.chain import RawSolution, solve_programs
+from torch_qpmpc.solvers.chain import CACHED, RawSolution, solve_programs
 from torch_qpmpc.tangents import value_tangent
 
 ON_FAILURE = ("raise", "warn", "mask")
@@ -300,10 +300,14 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
 
 
 def _is_summed(theta: list[Tensor], z: Tensor) -> bool:
-    """Whether one theta is shared by a batch on the CPU, and no further derivative is asked for."""
-    if not z.is_cpu or z.dtype != torch.float64 or is_differentiating():
+    """Whether one small theta is shared by a batch on the CPU, and no second derivative asked for.
+
+    The products of large ones are for BLAS, and all cores.
+    """
+    if not z.is_cpu or z.dtype != torch.float64 or z.ndim != 2 or is_differentiating():
         return False
-    return all(x.ndim == n for x, n in zip(theta[:-1], EVENT_NDIMS, strict=False)) and z.ndim == 2
+    shared = all(x.ndim == n for x, n in zip(theta[:-1], EVENT_NDIMS, strict=False))
+    return shared and max(x.numel() for x in theta[:-1]) <= CACHED
 
 
 def _tied(

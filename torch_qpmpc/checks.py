@@ -67,14 +67,6 @@ def check_tensor(
         device: where it is to be; anywhere by default.
         remedy: for another shape.
     """
-    if (
-        isinstance(value, Tensor)
-        and value.is_floating_point()
-        and batched
-        and value.shape[-len(event) :] == event
-        and device in (None, value.device)
-    ):
-        return value
     if not isinstance(value, Tensor) or not value.is_floating_point():
         got = value.dtype if isinstance(value, Tensor) else type(value).__name__
         how = f"Convert it: torch.as_tensor({name}).float()."

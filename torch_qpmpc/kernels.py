@@ -110,6 +110,15 @@ def is_finite(vectors):
 
 
 @compiled
+def are_equal(x, y):
+    """Whether two vectors of one length are."""
+    different = 0
+    for i in range(len(x)):
+        different += x[i] != y[i]
+    return different == 0
+
+
+@compiled
 def affine(vectors, matrices, group, constant):
     """`products` plus ``constant`` ``(B or 1, j)``."""
     found = products(vectors, matrices, group, False)
@@ -267,8 +276,8 @@ def add_product(x, factors, matrix):
 def envelope(incoming, status, z, sigma, chi, lam, xi, needed):
     """`autograd.envelope_gradients` of a theta that the batch shares.
 
-    ``incoming`` and ``status`` are ``(B,)``; of the ten, the matrices that are not ``needed`` are
-    empty.
+    ``incoming`` and ``status`` are ``(B,)``. Of the ten gradients, matrices that are not ``needed``
+    are empty.
     """
     n_qps, n_z = z.shape
     weight, weighted_z = np.empty(n_qps), np.empty(z.shape)

@@ -29,9 +29,9 @@ def is_regular(H, lb, ub):
 
 @compiled
 def inspect(H, C, G, group, q, c, b, lb, ub, w):
-    """Which QPs have finite data and lb <= ub, ``(B or 1,)``, and whether H and G are diagonal.
+    """Which QPs have finite data and lb <= ub, ``(B or 1,)``, or None if all have.
 
-    Instead of the former None, if all have.
+    And whether H and G are diagonal.
     """
     M = len(H)
     finite = np.empty(M, np.bool_)
