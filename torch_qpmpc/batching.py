@@ -22,11 +22,10 @@ def broadcast(*shapes: Sequence[int]) -> torch.Size:
 
 def flatten(vectors: Tensor, batch: torch.Size, device: torch.device | str = "cpu") -> Tensor:
     """``(*batch, n)``, or what broadcasts to it, as ``(B, n)``: detached, float64."""
-    n = vectors.shape[-1]
     flat = vectors.detach().to(device, torch.float64)
     if flat.ndim == 2 and flat.shape[:1] == batch:
         return flat
-    return listed(flat.expand(*batch, n))
+    return listed(flat.expand(*batch, vectors.shape[-1]))
 
 
 def align(in_dims: tuple, args: tuple, event_ndims: Sequence[int]) -> list[Any]:

@@ -100,13 +100,13 @@ class FlatPrograms:
         programs = _memo.get(theta, str(device), lambda *own: cls._shared(own, fixed[:1]))
         known, n_qps = programs._known, fixed.shape[0]
         if "group" not in known or len(known["group"]) != n_qps:
-            known["group"] = torch.zeros(n_qps, dtype=torch.int64, device=fixed.device)
+            known["group"] = _zeros(n_qps, fixed.device)
         return programs._with(known["group"], fixed), batch
 
     @classmethod
     def _shared(cls, theta: Sequence[np.ndarray], fixed: Tensor) -> FlatPrograms:
         """A single QP, as the form of all that have this theta."""
-        device, group = fixed.device, fixed.new_zeros(1, dtype=torch.int64)
+        device, group = fixed.device, _zeros(1, fixed.device)
         H, q, c, C, b, G, lb, ub, w = (x[np.newaxis] for x in theta)
         if H.dtype == np.float64 and theta_kernels.is_regular(H[0], lb[0], ub[0]):
             arrays = ProgramArrays(H, C, G, q, c, b, lb, ub, w)
@@ -230,6 +230,10 @@ class FlatPrograms:
         if matrices.shape[0] == 1:
             return torch.addmm(constant, vectors, matrices[0].mT)
         return self.multiply(matrices, vectors) + constant
+
+
+def _zeros(n: int, device: torch.device) -> Tensor:
+    return kernels.tensors([np.zeros(n, np.int64)], device)[0]
 
 
 def _prepared(theta: Sequence[Tensor], like: Tensor) -> tuple[Tensor, ...]:

@@ -253,7 +253,8 @@ def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawS
 
     def of_theta() -> list[Any]:
         a, diagonal = p.arrays(), (p.is_diagonal("H"), p.is_diagonal("G"))
-        T_T, C_T, G_T = (np.ascontiguousarray(M.swapaxes(1, 2)) for M in (x.T, a.C, a.G))
+        T_T, C_T = (np.ascontiguousarray(M.swapaxes(1, 2)) for M in (x.T, a.C))
+        G_T = a.G if diagonal[1] else np.ascontiguousarray(a.G.swapaxes(1, 2))
         matrices = [T_T, x.Y_neg, a.C, C_T, a.H, a.G, G_T, diagonal]
         return [*matrices, x.z_0, a.q, a.c, a.b, a.lb, a.ub, a.w]
 
