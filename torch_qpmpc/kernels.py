@@ -120,11 +120,15 @@ def are_equal(x, y):
 
 @compiled
 def affine(vectors, matrices, group, constant):
-    """`products` plus ``constant`` ``(B or 1, j)``."""
-    found = products(vectors, matrices, group, False)
-    for i in range(found.shape[0]):
+    """`products` plus ``constant`` ``(B or 1, j)``, of few entries: not by BLAS.
+
+    So what a sample alone is rounded to, it is rounded to in a batch.
+    """
+    found = np.empty((len(vectors), constant.shape[1]))
+    for i in range(len(vectors)):
         for j in range(found.shape[1]):
-            found[i, j] += constant[i % len(constant), j]
+            found[i, j] = constant[i % len(constant), j]
+        add_product(found[i], vectors[i], matrices[group[i]])
     return found
 
 
