@@ -119,8 +119,8 @@ class Reduced:
 
     @classmethod
     def of(cls, condensed: Condensed, p: FlatPrograms, n_f: int) -> Reduced:
-        x, a, (group, _) = condensed, p.arrays(), p.sample_arrays
-        given = (*x.arrays, group, a.G, a.q, a.b, a.lb, a.ub, a.w, n_f, ENTERS)
+        x, a = condensed, p.arrays()
+        given = (*x.arrays, p.group_array, a.G, a.q, a.b, a.lb, a.ub, a.w, n_f, ENTERS)
         arrays = ReducedArrays(*theta_kernels.reduce(*given), *x.arrays[:2])
         convex = None
         if not x.surely_convex:
@@ -140,13 +140,12 @@ class Reduced:
             g, lower, upper = moved.split_with_sizes((d, r, r), dim=-1)
             w = self.w.expand(len(p), -1)
             return SoftQPs(self.H, self.G, p.group, g, lower, upper, w)
-        group, fixed = p.sample_arrays
-        moved, w = kernels.affine(fixed, a.matrix, group, a.constant), a.w
+        moved, w = kernels.affine(p.fixed_array, a.matrix, p.group_array, a.constant), a.w
         if len(w) != len(p):  # for each QP the same row
             w = np.ndarray((len(p), r), buffer=w, strides=(0, w.itemsize))
         of_samples = (moved[:, :d], moved[:, d : d + r], moved[:, d + r :], w)
         qps = SoftQPs(self.H, self.G, p.group, *kernels.tensors(of_samples, p.q.device))
-        vars(qps)["arrays"] = SoftArrays(a.H, a.G, group, *of_samples)  # need not be worked out
+        vars(qps)["arrays"] = SoftArrays(a.H, a.G, p.group_array, *of_samples)  # need not be worked out
         return qps
 
     def expand(self, p: FlatPrograms, v: Tensor) -> Tensor:

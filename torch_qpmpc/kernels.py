@@ -1,7 +1,8 @@
 """Loops over QPs, compiled by Numba for the CPU: what takes torch dozens of small operations.
 
 For the QP of eq:qp2 and eq:qp3: the full solution from that of its condensed form, the certificate,
-active sets tried again, and which QP to solve after which. A torch operation costs some
+active sets tried again, which QP to solve after which, and the gradient of the value in a theta
+that the batch shares (eq:gradq). A torch operation costs some
 microseconds whatever its size, as much as a whole QP here. On other devices the torch forms beside
 the callers do the same; tests hold the two against each other.
 
@@ -105,7 +106,8 @@ def recover(
 
 @compiled
 def is_finite(vectors):
-    """Whether all entries are: their sum is, but for overflow, which no solver survives either."""
+    """Whether all entries are."""
+    # Their sum is, but for overflow, which no solver survives either.
     return np.isfinite(vectors.sum())
 
 

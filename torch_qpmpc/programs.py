@@ -173,17 +173,24 @@ class FlatPrograms:
         return self.known("arrays", lambda: ProgramArrays.of(self))
 
     @cached_property
-    def sample_arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """group and fixed for the kernels."""
-        group, fixed = kernels.arrays(self.group, self.fixed)
-        return group, fixed
+    def group_array(self) -> np.ndarray:
+        """group for the kernels."""
+        return kernels.arrays(self.group)[0]
+
+    @cached_property
+    def fixed_array(self) -> np.ndarray:
+        """fixed for the kernels."""
+        return kernels.arrays(self.fixed)[0]
 
     def valid(self) -> Tensor | None:
         """Which QPs have finite data and lb <= ub, ``(B,)``, or None if all do."""
         valid = self._inspected.valid
-        if valid is None and kernels.is_finite(self.sample_arrays[1]):
+        if valid is None and self.fixed.is_cpu and kernels.is_finite(self.fixed_array):
             return None
+        # A sum is finite if its terms are (but for overflow, which no solver survives either).
         finite = self.fixed.sum(-1).isfinite()
+        if valid is None and finite.all():
+            return None
         return finite if valid is None else valid & finite
 
     @property
@@ -274,7 +281,7 @@ class _Inspected(NamedTuple):
 
     @classmethod
     def of(cls, p: FlatPrograms) -> _Inspected:
-        a, (group, _) = p.arrays(), p.sample_arrays
+        a, group = p.arrays(), p.group_array
         valid, H, G = theta_kernels.inspect(a.H, a.C, a.G, group, a.q, a.c, a.b, a.lb, a.ub, a.w)
         some = None if valid is None else kernels.tensors([valid], p.q.device)[0]
         return cls(some, {"H": H, "G": G})

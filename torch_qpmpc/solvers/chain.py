@@ -261,7 +261,7 @@ def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawS
     claim, x = kernels.arrays(answer.v, answer.lam), reduced.arrays
     # V and Q of a theta share its T, unless C has dependent rows.
     theta = p.known(("kernel", reduced.T), of_theta)
-    given = (*claim, *p.sample_arrays, x.rows, x.others, *theta, VIOLATED)
+    given = (*claim, p.group_array, p.fixed_array, x.rows, x.others, *theta, VIOLATED)
     *found, worst = kernels.recover(*given)
     value, z, sigma, chi, lam, xi, status, residual = kernels.tensors(found, p.q.device)
     return RawSolution(value, z, sigma, chi, lam, xi, status, residual, answer.iterations, worst)

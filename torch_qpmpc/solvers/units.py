@@ -39,8 +39,8 @@ class Units:
         """The units of ``p``, or None where all of them are one."""
         if not len(p) or not p.q.shape[-1]:
             return None
-        a, (group, _) = p.arrays(), p.sample_arrays
-        given = (a.H, a.C, a.G, group, a.q, a.b, a.lb, a.ub, a.w)
+        a = p.arrays()
+        given = (a.H, a.C, a.G, p.group_array, a.q, a.b, a.lb, a.ub, a.w)
         units = theta_kernels.units(*given, SMALL, LARGE)
         return None if units is None else cls(*kernels.tensors(units, p.q.device))
 
