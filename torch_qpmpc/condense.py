@@ -145,7 +145,8 @@ class Reduced:
             w = np.ndarray((len(p), r), buffer=w, strides=(0, w.itemsize))
         of_samples = (moved[:, :d], moved[:, d : d + r], moved[:, d + r :], w)
         qps = SoftQPs(self.H, self.G, p.group, *kernels.tensors(of_samples, p.q.device))
-        vars(qps)["arrays"] = SoftArrays(a.H, a.G, p.group_array, *of_samples)  # need not be worked out
+        # They need not be worked out of the tensors again.
+        vars(qps)["arrays"] = SoftArrays(a.H, a.G, p.group_array, *of_samples)
         return qps
 
     def expand(self, p: FlatPrograms, v: Tensor) -> Tensor:
@@ -203,7 +204,8 @@ def _condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
             condensed = Condensed(
                 keep, False, *kernels.tensors(found, C.device), surely_convex=convex
             )
-            vars(condensed)["arrays"] = found  # need not be worked out
+            # They need not be worked out of the tensors again.
+            vars(condensed)["arrays"] = found
             return condensed
     eliminated = _eliminate(C, keep)
     T, Y, padding = _null_space(C, keep) if eliminated is None else (*eliminated, None)
