@@ -11,7 +11,15 @@ from torch.func import functional_call, grad, jacrev, vmap
 from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states, solution_of
-from torch_qpmpc import QPError, QPSolution, QuadraticProgram, SolverError, Status, solve_qp
+from torch_qpmpc import (
+    QPError,
+    QPSolution,
+    QuadraticProgram,
+    SolverError,
+    Status,
+    autograd,
+    solve_qp,
+)
 from torch_qpmpc.autograd import solve_op
 from torch_qpmpc.qp import EVENT_SHAPES
 from torch_qpmpc.sensitivity import solution_op
@@ -208,6 +216,22 @@ def test_gradient_is_the_same_whatever_is_kept():
 
 
 # Unsolved elements
+
+
+def test_a_large_theta_has_the_gradient_that_a_small_one_has(monkeypatch):
+    mpc = random_mpc(5, learn=(*EVENT_SHAPES, "H_f"), on_failure="mask")
+    s, incoming = random_states(20), normal(20)
+    s[3, 0] = torch.nan  # without a solution
+    operands = (*mpc.parameters(), s.requires_grad_())
+
+    def gradients() -> tuple[Tensor, ...]:
+        return torch.autograd.grad(mpc.value(s), operands, incoming)
+
+    small = gradients()
+    assert min(gradient.abs().max() for gradient in small) > 1e-3
+    assert (small[-1][3] == 0).all()
+    monkeypatch.setattr(autograd, "CACHED", -1)
+    assert_close(small, gradients())
 
 
 @pytest.mark.parametrize("incoming", [1.0, torch.inf, torch.nan])
