@@ -155,7 +155,7 @@ class _Chain:
         """Ask for what is still to be solved, and keep what the certificate accepts.
 
         With active sets ``start``, ``solve`` is only asked for what `recall` makes nothing of.
-        Returns the solutions so far, and ``todo``, None if there is nothing left at once.
+        Returns the solutions so far, and ``todo``: None if all were accepted at once.
         """
         if self.raw is not None and self.todo is not None and not len(self.todo):
             return self.raw, self.todo
@@ -249,7 +249,7 @@ def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
 
 
 def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
-    """`_recover` QP by QP, which keeps all of one in the cache."""
+    """`_recover` in one kernel."""
 
     def of_theta() -> list[Any]:
         a, diagonal = p.arrays(), (p.is_diagonal("H"), p.is_diagonal("G"))
