@@ -20,7 +20,7 @@ from tests.problems import (
     reduced_of,
     soft_qps,
 )
-from torch_qpmpc import certificate, kernels, solve_qp
+from torch_qpmpc import autograd, certificate, kernels, solve_qp, theta_kernels
 from torch_qpmpc.autograd import envelope_gradients
 from torch_qpmpc.certificate import Products, certify
 from torch_qpmpc.condense import condensed_for
@@ -206,6 +206,39 @@ def test_the_gradient_of_shared_data_is_that_of_torch(n_qps, unneeded):
         else:
             like = z.new_empty(shape) if i < 9 else xi
             assert_close(torch.from_numpy(gradient), of_torch(like))
+
+
+@pytest.mark.parametrize("shift", [0.0, -1.0])
+@pytest.mark.parametrize("n_r", [0, 3, 9])
+def test_the_forces_of_a_theta_are_those_of_torch(n_r, shift):
+    root, G = normal(2, 5, 5), normal(2, n_r, 5, seed=1)
+    H = root @ root.mT
+    H[1] += shift * torch.linalg.eigvalsh(H[1])[-1] * torch.eye(5).double()
+    vectors = normal(4, 5), normal(4, n_r), normal(4, n_r), normal(4, n_r)
+    qps = SoftQPs(H, G, torch.tensor([0, 1, 1, 0]), *vectors)
+    rise, push = map(torch.from_numpy, theta_kernels.forces(H.numpy(), G.numpy()))
+    of_torch = _Forces(qps)
+    convex = slice(1 if shift else 2)
+    assert_close(rise[convex], of_torch.rise.mT[convex])
+    assert_close(push[convex], of_torch.push.mT[convex])
+    assert not shift or rise[1].isnan().all()
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_active_sets_are_those_of_torch(monkeypatch, large):
+    mpc, s, a = random_mpc(3, horizon=6), random_states(48).double(), random_states(48, 1)
+    s[5, 0] = torch.nan
+    mpc.on_failure = "mask"
+    if large:
+        monkeypatch.setattr(autograd, "CACHED", -1)
+    for inputs in ((s,), (s, a.double())):
+        solution = mpc.solve(*inputs)
+        value, active = mpc.value_and_active_set(*inputs)
+        assert torch.equal(value, solution.value)
+        assert torch.equal(active, solution.active)
+        assert {*active.unique().tolist()} >= {-2, -1, 0, 1, 2, UNKNOWN}
+        again, _ = mpc.value_and_active_set(*inputs, warm_start=active)
+        assert_close(again, value)
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])

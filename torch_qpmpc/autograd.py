@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -27,7 +27,7 @@ from torch_qpmpc.batching import align, broadcast, listed, outer, sum_to, weight
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.programs import FlatPrograms
-from torch_qpmpc.qp import QPSolution, QuadraticProgram, Status, slacks
+from torch_qpmpc.qp import UNKNOWN, QPSolution, QuadraticProgram, Status, slacks
 from torch_qpmpc.sensitivity import (
     differentiable,
     is_differentiating,
@@ -107,6 +107,28 @@ def optimal_value(
     """The optimal cost alone, ``(*batch,)``: `solve_qp` without the rest of the solution."""
     keep = _checked_keep(qp, fixed, keep)
     return _solve(*_operands(qp, fixed), None, keep, solver, on_failure)[0]
+
+
+def value_and_active_set(
+    qp: QuadraticProgram,
+    fixed: Tensor,
+    *,
+    solver: str,
+    on_failure: str,
+    warm_start: Tensor | None,
+    keep: int | None = None,
+) -> tuple[Tensor, Tensor]:
+    """``value`` and ``active`` of `solve_qp`, of which only the former is differentiable."""
+    theta = _operands(qp, fixed)
+    start = _checked_start(qp, fixed, warm_start)
+    keep = _checked_keep(qp, fixed, keep)
+    found = _solve(*theta, start, keep, solver, on_failure)
+    value, z, _, chi, lam, xi, status, residual, iterations = found
+    if _is_for_kernels(theta, z) and not is_traced((*theta, z)):
+        given = kernels.arrays(z, lam, status, *(x.detach() for x in (qp.G, qp.lb, qp.ub, qp.w)))
+        return value, torch.from_numpy(kernels.active_sets(*given, UNKNOWN))
+    solution = QPSolution(qp, value, z, chi, lam, xi, status, residual, iterations)
+    return value, solution.active
 
 
 def _solve(*arguments: Any) -> Outputs:
@@ -287,7 +309,7 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
     if is_differentiating() and not torch.compiler.is_compiling():
         z, sigma, chi, lam, xi = _tied(ctx.keep, theta, z, chi, lam, xi, status)
     needed = ctx.needs_input_grad[:N_THETA]
-    if _is_summed(theta, z) and not is_traced((grad_value, z)):
+    if _is_for_kernels(theta, z) and not is_differentiating() and not is_traced((grad_value, z)):
         given = kernels.arrays(grad_value, status, z, sigma, chi, lam, xi)
         pairs = zip(kernels.envelope(*given, needed), needed, strict=True)
         found = (torch.from_numpy(gradient) if need else None for gradient, need in pairs)
@@ -299,12 +321,12 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
     return (*found, *(None,) * N_OTHERS)
 
 
-def _is_summed(theta: list[Tensor], z: Tensor) -> bool:
-    """Whether one small theta is shared by a batch on the CPU, and no second derivative asked for.
+def _is_for_kernels(theta: Sequence[Tensor], z: Tensor) -> bool:
+    """Whether one small theta is shared by a batch in float64 on the CPU.
 
     The products of large ones are for BLAS, and all cores.
     """
-    if not z.is_cpu or z.dtype != torch.float64 or z.ndim != 2 or is_differentiating():
+    if not z.is_cpu or z.dtype != torch.float64 or z.ndim != 2:
         return False
     shared = all(x.ndim == n for x, n in zip(theta[:-1], EVENT_NDIMS, strict=False))
     return shared and max(x.numel() for x in theta[:-1]) <= CACHED

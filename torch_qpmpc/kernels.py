@@ -327,6 +327,22 @@ def _summed_outer(left, right, needed):
     return found
 
 
+@compiled
+def active_sets(z, lam, status, G, lb, ub, w, unknown):
+    """`qp.QPSolution.active` of a theta that the batch shares, ``(B, n_g)``."""
+    y, codes = np.dot(z, G.T), np.empty(lam.shape, np.int8)
+    for i in range(len(z)):
+        for j in range(lam.shape[1]):
+            at = y[i, j] + lam[i, j]
+            excess = at - min(max(at, lb[j]), ub[j])
+            held = min(max(excess, -w[j]), w[j])
+            code = np.sign(held) * 2
+            if held == excess and (excess != 0 or lb[j] == ub[j]):
+                code = np.sign(lam[i, j])
+            codes[i, j] = code if status[i] == 0 else unknown
+    return codes
+
+
 def tour(vectors: np.ndarray, near: int) -> np.ndarray:
     """An order of vectors ``(B, n)``: from each to the nearest of the next ``near`` that are left.
 

@@ -23,7 +23,7 @@ from torch_qpmpc.arguments import (
     check_pair,
     check_structure,
 )
-from torch_qpmpc.autograd import optimal_value, solve_qp
+from torch_qpmpc.autograd import optimal_value, solve_qp, value_and_active_set
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.parametrizations import SIGNED, Banded, Tied, kept
@@ -246,6 +246,26 @@ class QPMPC(nn.Module):
             warm_start=warm_start,
             keep=self.n_x + self.n_u,
         )
+
+    def value_and_active_set(
+        self, s: Tensor, a: Tensor | None = None, warm_start: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """`value`, or `action_value`, with the active set ``(*batch, n_g)`` of its solution.
+
+        ``warm_start`` is one of nearly the same QPs, as in `solve`; this does not prepare the
+        gradient of the rest of the solution.
+        """
+        fixed = self._checked(s, a)
+        qp = self.quadratic_program()
+        value, active = value_and_active_set(
+            qp,
+            fixed.to(qp.C.dtype),
+            solver=self.solver,
+            on_failure=self.on_failure,
+            warm_start=warm_start,
+            keep=self.n_x + self.n_u,
+        )
+        return value.to(fixed.dtype), active
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """The states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""

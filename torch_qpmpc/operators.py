@@ -46,9 +46,8 @@ class _QPOperator(TensorDictModuleBase):
             cost = self.module(*inputs)
         else:
             start = tensordict.get(self.active_set_key, None)
-            solution = self.module.solve(*inputs, warm_start=start)
-            tensordict.set(self.active_set_key, solution.active)
-            cost = solution.value.to(inputs[0].dtype)
+            cost, active = self.module.value_and_active_set(*inputs, warm_start=start)
+            tensordict.set(self.active_set_key, active)
         return tensordict.set(self.out_keys[0], -cost.unsqueeze(-1))
 
 

@@ -264,15 +264,52 @@ def _has_factor(H, convex):
     L = H.copy()
     for j in range(len(H)):
         L[j, j] += convex * (1.0 + shift)
+    return _factorise(L)
+
+
+@compiled
+def _factorise(L):
+    """Put Cholesky's factor into the lower triangle; whether there is one."""
+    for j in range(len(L)):
         for k in range(j):
-            for i in range(j, len(H)):
+            for i in range(j, len(L)):
                 L[i, j] -= L[j, k] * L[i, k]
         if not L[j, j] > 0:
             return False
         root = math.sqrt(L[j, j])
-        for i in range(j, len(H)):
+        for i in range(j, len(L)):
             L[i, j] /= root
     return True
+
+
+@compiled
+def forces(H, G):
+    """The transposes of `solvers.recall._Forces`: what g and lam do to (v, y).
+
+    ``rise`` ``(M, d, d + r)`` and ``push`` ``(M, r, d + r)``; NaN where H has no Cholesky factor.
+    """
+    M, r, d = G.shape
+    rise, push = np.full((M, d, d + r), np.nan), np.full((M, r, d + r), np.nan)
+    for m in range(M):
+        L, inverse = H[m].copy(), np.eye(d)
+        if not _factorise(L):
+            continue
+        for i in range(d):
+            add_product(inverse[i], -L[i, :i], inverse)
+            inverse[i] /= L[i, i]
+        for i in range(d - 1, -1, -1):
+            add_product(inverse[i], -L[i + 1 :, i], inverse[i + 1 :])
+            inverse[i] /= L[i, i]
+        y = np.dot(G[m], inverse)
+        K = np.dot(y, G[m].T)
+        for i in range(d):
+            rise[m, i, :d] = inverse[i]
+            for j in range(r):
+                rise[m, i, d + j] = y[j, i]
+        for j in range(r):
+            push[m, j, :d] = y[j]
+            push[m, j, d:] = K[j]
+    return rise, push
 
 
 @compiled

@@ -10,10 +10,14 @@ which no set is known starts from the empty one, and mostly comes to its end fro
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc import kernels
+from torch_qpmpc import kernels, theta_kernels
+from torch_qpmpc.condense import SMALL
 from torch_qpmpc.programs import SoftQPs, multiply
 from torch_qpmpc.solvers.answer import Answer
 
@@ -30,10 +34,24 @@ def recall(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
 
     The codes are those of `QPSolution.active`; a set with any other code begins as the empty one.
     """
-    forces = _Forces(qps)
     if qps.g.is_cpu:
-        return forces.recall(qps, active)
-    return _recall(forces, qps, active)
+        return _recall_compiled(qps, active)
+    return _recall(_Forces(qps), qps, active)
+
+
+def _recall_compiled(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
+    """`recall` by kernels."""
+    H, G, group, g, lower, upper, w = map(np.ascontiguousarray, qps.arrays)
+    if max(math.prod(H.shape[1:]), math.prod(G.shape[1:])) <= SMALL:
+        rise, push = theta_kernels.forces(H, G)
+    else:
+        forces = _Forces(qps)
+        rise, push = kernels.arrays(forces.rise.mT, forces.push.mT)
+    free, codes = -kernels.products(g, rise, group, False), kernels.arrays(active)[0]
+    limits = (SLIP, MAX_STEPS, MAX_PASSES)
+    found = kernels.recall(free, push, group, codes, lower, upper, w, *limits)
+    v, lam, steps, done = kernels.tensors(found, qps.g.device)
+    return Answer(v, lam, steps), done
 
 
 def _recall(forces: _Forces, qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
@@ -90,14 +108,6 @@ class _Forces:
         inverse = torch.cholesky_solve(unit, torch.linalg.cholesky_ex(qps.H).L)
         self.rise = torch.cat((inverse, G @ inverse), dim=-2)
         self.push = self.rise @ G.mT
-
-    def recall(self, qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
-        free = -multiply(self.rise, qps.group, qps.g)
-        given = (free, self.push.mT, qps.group, active, qps.l, qps.u, qps.w)
-        limits = (SLIP, MAX_STEPS, MAX_PASSES)
-        found = kernels.recall(*kernels.arrays(*given), *limits)
-        v, lam, steps, done = map(torch.from_numpy, found)
-        return Answer(v, lam, steps), done
 
     def solve(self, qps: SoftQPs, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """v, lam and y with held rows at their bounds, and saturated ones at lam = +w or -w."""
