@@ -231,13 +231,13 @@ def test_active_sets_are_those_of_torch(monkeypatch, large):
     mpc.on_failure = "mask"
     if large:
         monkeypatch.setattr(autograd, "CACHED", -1)
-    for inputs in ((s,), (s, a.double())):
-        solution = mpc.solve(*inputs)
-        value, active = mpc.value_and_active_set(*inputs)
+    for action in (None, a.double()):
+        solution = mpc.solve(s, action)
+        value, active = mpc.value_and_active_set(s, action)
         assert torch.equal(value, solution.value)
         assert torch.equal(active, solution.active)
         assert {*active.unique().tolist()} >= {-2, -1, 0, 1, 2, UNKNOWN}
-        again, _ = mpc.value_and_active_set(*inputs, warm_start=active)
+        again, _ = mpc.value_and_active_set(s, action, warm_start=active)
         assert_close(again, value)
 
 
