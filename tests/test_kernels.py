@@ -27,6 +27,7 @@ from torch_qpmpc.condense import condensed_for
 from torch_qpmpc.programs import FlatPrograms, SoftArrays, SoftQPs
 from torch_qpmpc.qp import UNKNOWN
 from torch_qpmpc.solvers import Answer, chain, daqp
+from torch_qpmpc.solvers import recall as recall_module
 from torch_qpmpc.solvers.recall import _Forces, _recall, recall
 
 BATCH = 6
@@ -124,8 +125,10 @@ def assert_same_recall(qps: SoftQPs, active: Tensor) -> int:
     return int(done.sum())
 
 
+@pytest.mark.parametrize("small", [-1, recall_module.SMALL])
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])
-def test_recall_is_that_of_torch(matrices):
+def test_recall_is_that_of_torch(monkeypatch, matrices, small):
+    monkeypatch.setattr(recall_module, "SMALL", small)
     for seed in range(4):
         known = known_qp(seed, batch=(BATCH,), matrices=matrices)
         active = solve_qp(known.qp, known.fixed, solver="torch").active[:, reduced_of(known).rows]

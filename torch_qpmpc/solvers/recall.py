@@ -44,11 +44,12 @@ def _recall_compiled(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
     H, G, group, g, lower, upper, w = map(np.ascontiguousarray, qps.arrays)
     if max(math.prod(H.shape[1:]), math.prod(G.shape[1:])) <= SMALL:
         rise, push = theta_kernels.forces(H, G)
-    else:
+        free = -kernels.products(g, rise, group, False)
+    else:  # for BLAS, and all cores
         forces = _Forces(qps)
-        rise, push = kernels.arrays(forces.rise.mT, forces.push.mT)
-    free, codes = -kernels.products(g, rise, group, False), kernels.arrays(active)[0]
-    limits = (SLIP, MAX_STEPS, MAX_PASSES)
+        free = -multiply(forces.rise, qps.group, qps.g)
+        free, push = kernels.arrays(free, forces.push.mT)
+    codes, limits = kernels.arrays(active)[0], (SLIP, MAX_STEPS, MAX_PASSES)
     found = kernels.recall(free, push, group, codes, lower, upper, w, *limits)
     v, lam, steps, done = kernels.tensors(found, qps.g.device)
     return Answer(v, lam, steps), done
