@@ -2,9 +2,9 @@
 
 For the QP of eq:qp2 and eq:qp3: the full solution from that of its condensed form, the certificate,
 active sets tried again, which QP to solve after which, and the gradient of the value in a theta
-that the batch shares (eq:gradq). A torch operation costs some
-microseconds whatever its size, as much as a whole QP here. On other devices the torch forms beside
-the callers do the same; tests hold the two against each other.
+that the batch shares (eq:gradq). A torch operation costs some microseconds whatever its size, as
+much as a whole QP here. On other devices the torch forms beside the callers do the same; tests hold
+the two against each other.
 
 Arrays are float64 and contiguous. Of a vector ``(B or 1, n)``, all QPs share a single row.
 """
@@ -330,7 +330,9 @@ def _summed_outer(left, right, needed):
 @compiled
 def active_sets(z, lam, status, G, lb, ub, w, unknown):
     """`qp.QPSolution.active` of a theta that the batch shares, ``(B, n_g)``."""
-    y, codes = np.dot(z, G.T), np.empty(lam.shape, np.int8)
+    G_T, group = np.ascontiguousarray(G.T), np.zeros(len(z), np.int64)
+    y = products(z, G_T.reshape((1, *G_T.shape)), group, False)
+    codes = np.empty(lam.shape, np.int8)
     for i in range(len(z)):
         for j in range(lam.shape[1]):
             at = y[i, j] + lam[i, j]

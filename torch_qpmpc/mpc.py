@@ -238,14 +238,7 @@ class QPMPC(nn.Module):
         """
         fixed = self._checked(s, a)
         qp = self._today(qp)
-        return solve_qp(
-            qp,
-            fixed.to(qp.C.dtype),
-            solver=self.solver,
-            on_failure=self.on_failure,
-            warm_start=warm_start,
-            keep=self.n_x + self.n_u,
-        )
+        return solve_qp(qp, fixed.to(qp.C.dtype), warm_start=warm_start, **self._options())
 
     def value_and_active_set(
         self, s: Tensor, a: Tensor | None = None, warm_start: Tensor | None = None
@@ -258,12 +251,7 @@ class QPMPC(nn.Module):
         fixed = self._checked(s, a)
         qp = self.quadratic_program()
         value, active = value_and_active_set(
-            qp,
-            fixed.to(qp.C.dtype),
-            solver=self.solver,
-            on_failure=self.on_failure,
-            warm_start=warm_start,
-            keep=self.n_x + self.n_u,
+            qp, fixed.to(qp.C.dtype), warm_start=warm_start, **self._options()
         )
         return value.to(fixed.dtype), active
 
@@ -411,11 +399,12 @@ class QPMPC(nn.Module):
 
     def _value(self, fixed: Tensor, qp: QuadraticProgram | None) -> Tensor:
         qp = self._today(qp)
+        return optimal_value(qp, fixed.to(qp.C.dtype), **self._options()).to(fixed.dtype)
+
+    def _options(self) -> dict[str, Any]:
+        """What V, Q and the policy ask of every solve; one ``keep``, to share one elimination."""
         keep = self.n_x + self.n_u
-        value = optimal_value(
-            qp, fixed.to(qp.C.dtype), solver=self.solver, on_failure=self.on_failure, keep=keep
-        )
-        return value.to(fixed.dtype)
+        return {"solver": self.solver, "on_failure": self.on_failure, "keep": keep}
 
     def _limits(self, bounds: Tensor) -> Tensor:
         """lb or ub, which an MPC scheme does not learn on hard rows: those are known (eq:v1c3)."""

@@ -184,13 +184,11 @@ class FlatPrograms:
 
     def valid(self) -> Tensor | None:
         """Which QPs have finite data and lb <= ub, ``(B,)``, or None if all do."""
-        valid = self._inspected.valid
-        if valid is None and self.fixed.is_cpu and kernels.is_finite(self.fixed_array):
-            return None
+        valid, fixed = self._inspected.valid, self.fixed
         # A sum is finite if its terms are (but for overflow, which no solver survives either).
-        finite = self.fixed.sum(-1).isfinite()
-        if valid is None and finite.all():
-            return None
+        if kernels.is_finite(self.fixed_array) if fixed.is_cpu else fixed.sum().isfinite():
+            return valid
+        finite = fixed.sum(-1).isfinite()
         return finite if valid is None else valid & finite
 
     @property
