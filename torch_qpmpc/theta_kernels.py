@@ -42,9 +42,10 @@ def inspect(H, C, G, group, q, c, b, lb, ub, w):
     for i in range(len(valid)):
         vectors = q[i % len(q)].sum() + b[i % len(b)].sum() + c[i % len(c)]
         good = np.isfinite(vectors) and finite[0 if M == 1 else group[i]]
+        of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
         for j in range(lb.shape[1]):
             # False for NaN, as of inf - inf where both bounds are the same infinity.
-            good = good and ub[i % len(ub), j] - lb[i % len(lb), j] >= 0 and w[i % len(w), j] >= 0
+            good = good and ub[of_ub, j] - lb[of_lb, j] >= 0 and w[of_w, j] >= 0
         valid[i] = good
     some = None if valid.all() else valid
     return some, M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
@@ -115,8 +116,9 @@ def _sizes(vectors, group, M):
     largest = np.zeros((M, vectors.shape[1]))
     for i in range(max(len(vectors), M)):
         m = i if len(vectors) == 1 else group[i]
+        of_vector = i % len(vectors)
         for j in range(vectors.shape[1]):
-            size = abs(vectors[i % len(vectors), j])
+            size = abs(vectors[of_vector, j])
             if size < np.inf:  # neither is NaN
                 largest[m, j] = max(largest[m, j], size)
     return largest
@@ -362,13 +364,13 @@ def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
     of_q, of_b = products(q, by_q, group, False), products(b, by_b, group, False)
     constant, z_0 = np.empty((count, d + 2 * r)), np.empty((len(b), n_z))
     for k in range(count):
-        of_lb, of_ub = k % len(lb), k % len(ub)
+        k_q, k_b, k_lb, k_ub = k % len(q), k % len(b), k % len(lb), k % len(ub)
         for i in range(d):
-            constant[k, i] = of_q[k % len(q), i] + of_b[k % len(b), i]
+            constant[k, i] = of_q[k_q, i] + of_b[k_b, i]
         for i in range(r):
-            y = of_b[k % len(b), d + i]
-            constant[k, d + i] = lb[of_lb, rows[i]] - y
-            constant[k, d + r + i] = ub[of_ub, rows[i]] - y
+            y = of_b[k_b, d + i]
+            constant[k, d + i] = lb[k_lb, rows[i]] - y
+            constant[k, d + r + i] = ub[k_ub, rows[i]] - y
     for k in range(len(b)):
         for i in range(n_z):
             z_0[k, i] = of_b[k, d + r + i]
@@ -380,8 +382,7 @@ def _repeated(vectors, count):
     """A row for each QP."""
     repeated = np.empty((count, vectors.shape[1]))
     for i in range(count):
-        for j in range(vectors.shape[1]):
-            repeated[i, j] = vectors[i % len(vectors), j]
+        repeated[i] = vectors[i % len(vectors)]
     return repeated
 
 
