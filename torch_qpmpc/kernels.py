@@ -25,6 +25,8 @@ from torch import Tensor
 
 #: Entries of the matrix times vectors up to which a product by BLAS stays in one thread.
 ONE_THREAD = 2**18
+#: QPs at a time whose full solutions stay in a core's cache while they are worked out.
+TOGETHER = 64
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
@@ -59,6 +61,38 @@ def recover(
     ``at_zero`` ``(B or 1, n_z)`` is z where the fixed entries and v are zero, ``T_T``, ``C_T`` and
     ``G_T`` are transposes, and ``diagonal`` says of H and G whether they have nothing else.
     """
+    n_qps = len(fixed)
+    value, residual = np.empty(n_qps), np.empty(n_qps)
+    z, chi, xi = np.empty((n_qps, H.shape[1])), np.empty((n_qps, C.shape[1])), np.empty(fixed.shape)
+    sigma, lam = np.empty((n_qps, G.shape[1])), np.empty((n_qps, G.shape[1]))
+    worst = 0.0
+    for i in range(0, n_qps, TOGETHER):
+        k = min(i + TOGETHER, n_qps)
+        _recover_some(
+            value[i:k], z[i:k], sigma[i:k], chi[i:k], lam[i:k], xi[i:k], residual[i:k],
+            v[i:k], lam_v[i:k], group[i:k], fixed[i:k], rows, others,
+            T_T, Y_neg, C, C_T, H, G, G_T, diagonal, _some(at_zero, i, k), _some(q, i, k),
+            c if len(c) == 1 else c[i:k], _some(b, i, k), _some(lb, i, k), _some(ub, i, k),
+            _some(w, i, k), violated,
+        )  # fmt: skip
+        for j in range(i, k):
+            worst = max(worst, residual[j])
+    return value, z, sigma, chi, lam, xi, np.zeros(n_qps, np.int64), residual, worst
+
+
+@compiled
+def _some(vectors, i, k):
+    """What the QPs from i to k have of ``(B or 1, n)``."""
+    return vectors if len(vectors) == 1 else vectors[i:k]
+
+
+@compiled
+def _recover_some(
+    value, z, sigma, chi, lam, xi, residual,
+    v, lam_v, group, fixed, rows, others, T_T, Y_neg, C, C_T, H, G, G_T, diagonal, at_zero,
+    q, c, b, lb, ub, w, violated,
+):  # fmt: skip
+    """Fill in what `recover` finds of a few QPs."""
     n_qps, n_f = fixed.shape
     kept = np.empty((n_qps, T_T.shape[1]))
     for i in range(n_qps):
@@ -66,13 +100,13 @@ def recover(
             kept[i, j] = fixed[i, j]
         for j in range(v.shape[1]):
             kept[i, n_f + j] = v[i, j]
-    z = products(kept, T_T, group, False)
+    _fill(z, kept, T_T, group, False)
     for i in range(n_qps):
         of_z = i % len(at_zero)
         for j in range(z.shape[1]):
             z[i, j] += at_zero[of_z, j]
     Hz, y = products(z, H, group, diagonal[0]), products(z, G_T, group, diagonal[1])
-    lam = np.zeros(y.shape)
+    lam[:] = 0.0
     for i in range(n_qps):
         of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
         for k in range(len(rows)):
@@ -90,22 +124,18 @@ def recover(
         of_q = i % len(q)
         for j in range(z.shape[1]):
             left[i, j] = Hz[i, j] + q[of_q, j] + G_lam[i, j]
-    chi = products(left, Y_neg, group, False)
+    _fill(chi, left, Y_neg, group, False)
     C_chi = products(chi, C, group, False)
-    xi = np.empty(fixed.shape)
     for i in range(n_qps):
         for j in range(z.shape[1]):
             left[i, j] += C_chi[i, j]
         for j in range(n_f):
             xi[i, j], left[i, j] = -left[i, j], 0.0 * left[i, j]
     Cz = products(z, C_T, group, False)
-    value, sigma, residual = judge(
-        z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w
-    )
-    worst = 0.0
-    for i in range(n_qps):
-        worst = max(worst, residual[i])
-    return value, z, sigma, chi, lam, xi, np.zeros(n_qps, np.int64), residual, worst
+    _judge(
+        value, sigma, residual, z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed,
+        q, c, b, lb, ub, w,
+    )  # fmt: skip
 
 
 @compiled
@@ -143,6 +173,13 @@ def affine(vectors, matrices, group, constant):
 def products(vectors, matrices, group, diagonal):
     """Each QP's transposed matrix times its vector, ``(M, i, j)`` and ``(B, i)`` to ``(B, j)``."""
     found = np.empty((len(vectors), matrices.shape[2]))
+    _fill(found, vectors, matrices, group, diagonal)
+    return found
+
+
+@compiled
+def _fill(found, vectors, matrices, group, diagonal):
+    """`products`, to ``found``."""
     if diagonal:
         factors = np.diag(matrices[0]).copy()
         for i in range(len(vectors)):
@@ -156,15 +193,25 @@ def products(vectors, matrices, group, diagonal):
         found[:] = 0.0
         for i in range(len(vectors) if matrices.size else 0):
             add_product(found[i], vectors[i], matrices[group[i]])
-    return found
 
 
 @compiled
 def judge(z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w):
     """Value ``(B,)``, sigma ``(B, n_g)`` and residual ``(B,)`` of `certificate.certify`."""
-    n_qps = len(z)
-    value, residual, sigma = np.empty(n_qps), np.empty(n_qps), np.empty(y.shape)
-    for i in range(n_qps):
+    value, residual, sigma = np.empty(len(z)), np.empty(len(z)), np.empty(y.shape)
+    _judge(
+        value, sigma, residual, z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed,
+        q, c, b, lb, ub, w,
+    )  # fmt: skip
+    return value, sigma, residual
+
+
+@compiled
+def _judge(
+    value, sigma, residual, z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w
+):
+    """`judge`, to ``value``, ``sigma`` and ``residual``."""
+    for i in range(len(z)):
         of_q, of_b = i % len(q), i % len(b)
         of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
         cost, slip = _cost(z, Hz, left, q, i, of_q)
@@ -180,7 +227,6 @@ def judge(z, Hz, G_lam, C_chi, left, y, lam, chi, Cz, fixed, q, c, b, lb, ub, w)
         value[i] = cost + c[i % len(c)]
         # A NaN of any entry is in the sums; the largest sizes know nothing of it.
         residual[i] = worst if slip < np.inf and worst < np.inf else np.inf
-    return value, sigma, residual
 
 
 # Four entries at a time: sums in any order, and largest sizes as if nothing were NaN.
@@ -245,8 +291,8 @@ def _forces(z, Hz, G_lam, C_chi, left, q, i, k):
     """The largest sizes of the terms of stationarity, of what they leave, and of z."""
     force = slope = length = 0.0
     for j in range(z.shape[1]):
-        costs, rows = larger(abs(q[k, j]), abs(Hz[i, j])), larger(abs(G_lam[i, j]), abs(C_chi[i, j]))
-        force = larger(force, larger(costs, rows))
+        force = larger(force, larger(abs(q[k, j]), abs(Hz[i, j])))
+        force = larger(force, larger(abs(G_lam[i, j]), abs(C_chi[i, j])))
         slope, length = larger(slope, abs(left[i, j])), larger(length, abs(z[i, j]))
     return force, slope, length
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from tests.benchmarks.peers import PEERS, Values
@@ -42,7 +43,8 @@ class Gradient:
         with torch.no_grad():
             V = self.value(self.batch.following, qp)
         Q = self.action_value(self.batch.s, self.batch.a, qp)
-        (0.5 * (self.batch.cost + GAMMA * V - Q).square().mean()).backward()
+        target = torch.add(self.batch.cost, V, alpha=GAMMA)
+        (0.5 * F.mse_loss(Q, target)).backward()
         return V, Q.detach()
 
     def flat(self) -> Tensor:
