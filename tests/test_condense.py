@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from torch import Tensor
 from torch.func import functional_call
 from torch.testing import assert_close
 
@@ -19,14 +20,14 @@ from torch_qpmpc.programs import ContentMemo, FlatPrograms
 
 
 @pytest.fixture
-def eliminations(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
+def eliminations(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """The matrices that were factorised since the test began."""
     factorised = []
     condense_anew = condense_module._condense
 
-    def counting(H: Tensor, C: Tensor, G: Tensor, keep: int):
-        factorised.append(C)
-        return condense_anew(H, C, G, keep)
+    def counting(matrices: Sequence[np.ndarray], device: torch.device, keep: int):
+        factorised.append(matrices[1])
+        return condense_anew(matrices, device, keep)
 
     monkeypatch.setattr(condense_module, "_condense", counting)
     return factorised

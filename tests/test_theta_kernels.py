@@ -11,16 +11,18 @@ from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, programs_of, random_mpc, reduced_of, times
 from torch_qpmpc import condense as condense_module
+from torch_qpmpc import kernels
 from torch_qpmpc.condense import Condensed, _condense
 
 BATCH = 6
 
 
 def assert_condensed_alike(monkeypatch, H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
-    ours = _condense(H, C, G, keep)
+    given = kernels.arrays(H, C, G), H.device, keep
+    ours = _condense(*given)
     with monkeypatch.context() as patch:
         patch.setattr(condense_module, "SMALL", -1)
-        of_lapack = _condense(H, C, G, keep)
+        of_lapack = _condense(*given)
     for field in fields(Condensed):
         one, other = getattr(ours, field.name), getattr(of_lapack, field.name)
         if isinstance(one, Tensor):

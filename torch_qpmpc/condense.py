@@ -7,8 +7,9 @@ Y, T'HT and GT; fixing the first n_f <= keep entries then only changes a linear 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from torch_qpmpc import kernels, theta_kernels
 from torch_qpmpc.programs import ContentMemo, FlatPrograms, SoftArrays, SoftQPs
+from torch_qpmpc.twofold import Twofold
 
 #: A pivot below this fraction of its row's norm means that the rows of C depend on each other.
 RANK_TOLERANCE = 1e-10
@@ -34,8 +36,19 @@ SMALL = 2**12
 _getrf, _getrs, _potrf = get_lapack_funcs(("getrf", "getrs", "potrf"), dtype=np.float64)
 
 
+class CondensedArrays(NamedTuple):
+    """Those of `Condensed` for the kernels."""
+
+    T: np.ndarray
+    Y_neg: np.ndarray
+    H: np.ndarray
+    G: np.ndarray
+    H_b: np.ndarray
+    G_b: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
-class Condensed:
+class Condensed(Twofold[CondensedArrays]):
     """The part of condensing that depends on (H, C, G) alone.
 
     T ``(M, n_z, n_y)``, Y_neg = -Y ``(M, n_z, n_c)``, H = T'HT ``(M, n_y, n_y)``, G = GT
@@ -44,6 +57,8 @@ class Condensed:
     at. Where the columns after ``keep`` do not have full row rank, ``deficient`` says so: then it
     is valid only for QPs that fix exactly ``keep`` entries.
     """
+
+    Arrays = CondensedArrays
 
     keep: int
     deficient: bool
@@ -55,11 +70,6 @@ class Condensed:
     G_b: Tensor
     surely_convex: bool
 
-    @cached_property
-    def arrays(self) -> list[np.ndarray]:
-        """T, Y_neg, H, G, H_b and G_b for the kernels."""
-        return kernels.arrays(self.T, self.Y_neg, self.H, self.G, self.H_b, self.G_b)
-
     def reduced(self, programs: FlatPrograms) -> Reduced:
         """The problem in what is free of ``programs``."""
         n_f = programs.fixed.shape[-1]
@@ -67,7 +77,7 @@ class Condensed:
 
 
 class ReducedArrays(NamedTuple):
-    """Those of `Reduced` for the kernels."""
+    """Those of `Reduced` for the kernels, in the order of `theta_kernels.reduce`."""
 
     rows: np.ndarray
     others: np.ndarray
@@ -81,13 +91,8 @@ class ReducedArrays(NamedTuple):
     Y_neg: np.ndarray
 
 
-def _tensor(name: str) -> cached_property[Tensor]:
-    """An array of `Reduced` as a tensor, made when it is asked for."""
-    return cached_property(lambda x: kernels.tensors([getattr(x.arrays, name)], x.device)[0])
-
-
 @dataclass(frozen=True, eq=False)
-class Reduced:
+class Reduced(Twofold[ReducedArrays]):
     """The condensed problem with the first n_f entries fixed, in v, the rest of y.
 
     Of the rows of G, ``rows`` are its own, and ``others`` those that no free variable enters or
@@ -99,43 +104,40 @@ class Reduced:
             make of g, l and u is ``constant + matrix' fixed``.
         z_0: ``(B, n_z)``, z where the fixed entries and v are zero.
         w: ``(B, r)``.
-        T, Y_neg: those of `Condensed`.
+        T, Y_neg, keep: those of `Condensed`.
         convex: where H is positive semidefinite, ``(M,)``, or None if it is everywhere.
     """
 
+    Arrays = ReducedArrays
+
+    rows: Tensor
+    others: Tensor
+    H: Tensor
+    G: Tensor
+    matrix: Tensor
+    constant: Tensor
+    z_0: Tensor
+    w: Tensor
     T: Tensor
     Y_neg: Tensor
-    arrays: ReducedArrays
+    keep: int
     convex: Tensor | None
-
-    rows = _tensor("rows")
-    others = _tensor("others")
-    H = _tensor("H")
-    G = _tensor("G")
-    matrix = _tensor("matrix")
-    constant = _tensor("constant")
-    z_0 = _tensor("z_0")
-    w = _tensor("w")
 
     @classmethod
     def of(cls, condensed: Condensed, p: FlatPrograms, n_f: int) -> Reduced:
-        x, a = condensed, p.arrays()
-        given = (*x.arrays, p.group_array, a.G, a.q, a.b, a.lb, a.ub, a.w, n_f, ENTERS)
-        arrays = ReducedArrays(*theta_kernels.reduce(*given), *x.arrays[:2])
+        x, a = condensed.arrays, p.arrays
+        given = (*x, p.group_array, a.G, a.q, a.b, a.lb, a.ub, a.w, n_f, ENTERS)
+        arrays = ReducedArrays(*theta_kernels.reduce(*given), x.T, x.Y_neg)
         convex = None
-        if not x.surely_convex:
-            convex = _convex(*kernels.tensors([arrays.H], p.q.device))
-        return cls(x.T, x.Y_neg, arrays, convex)
-
-    @property
-    def device(self) -> torch.device:
-        return self.T.device
+        if not condensed.surely_convex:
+            convex = _convex(*kernels.tensors([arrays.H], p.device))
+        return cls.of_arrays(arrays, p.device, keep=condensed.keep, convex=convex)
 
     def at(self, programs: FlatPrograms) -> SoftQPs:
         """What a backend solves, with the rows ``rows``."""
         p, a = programs, self.arrays
         d, r = a.H.shape[-1], len(a.rows)
-        if not p.q.is_cpu:
+        if p.device.type != "cpu":
             moved = p.multiply(self.matrix, p.fixed, transposed=True) + self.constant
             g, lower, upper = moved.split_with_sizes((d, r, r), dim=-1)
             w = self.w.expand(len(p), -1)
@@ -144,10 +146,7 @@ class Reduced:
         if len(w) != len(p):  # for each QP the same row
             w = np.ndarray((len(p), r), buffer=w, strides=(0, w.itemsize))
         of_samples = (moved[:, :d], moved[:, d : d + r], moved[:, d + r :], w)
-        qps = SoftQPs(self.H, self.G, p.group, *kernels.tensors(of_samples, p.q.device))
-        # They need not be worked out of the tensors again.
-        vars(qps)["arrays"] = SoftArrays(a.H, a.G, p.group_array, *of_samples)
-        return qps
+        return SoftQPs.of_arrays(SoftArrays(a.H, a.G, p.group_array, *of_samples), p.device)
 
     def expand(self, p: FlatPrograms, v: Tensor) -> Tensor:
         """The full z ``(B, n_z)`` from the free variables v ``(B, d)``."""
@@ -187,26 +186,19 @@ def condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
 
     The last few results are remembered by the content of the matrices.
     """
-    device = C.device
-    return _memo.get(
-        (H, C, G), keep, lambda *own: _condense(*kernels.tensors(own, device), keep=keep)
-    )
+    return _memo.get((H, C, G), keep, lambda *own: _condense(own, C.device, keep))
 
 
 _memo = ContentMemo()
 
 
-def _condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
-    if max(x.shape[1:].numel() for x in (H, C, G)) <= SMALL:
-        given = kernels.arrays(H, C, G)
-        *found, regular, convex = theta_kernels.condense(*given, keep, RANK_TOLERANCE, CONVEX)
+def _condense(matrices: Sequence[np.ndarray], device: torch.device, keep: int) -> Condensed:
+    if max(math.prod(x.shape[1:]) for x in matrices) <= SMALL:
+        *found, regular, convex = theta_kernels.condense(*matrices, keep, RANK_TOLERANCE, CONVEX)
         if regular:
-            condensed = Condensed(
-                keep, False, *kernels.tensors(found, C.device), surely_convex=convex
-            )
-            # They need not be worked out of the tensors again.
-            vars(condensed)["arrays"] = found
-            return condensed
+            others = {"keep": keep, "deficient": False, "surely_convex": convex}
+            return Condensed.of_arrays(CondensedArrays(*found), device, **others)
+    H, C, G = kernels.tensors(matrices, device)
     eliminated = _eliminate(C, keep)
     T, Y, padding = _null_space(C, keep) if eliminated is None else (*eliminated, None)
     H_T = H.bmm(T)
@@ -221,9 +213,13 @@ def _condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
 def condensed_for(programs: FlatPrograms, keep: int) -> Condensed:
     """Condensed with ``keep`` entries kept, or just the fixed ones where C does not allow more."""
     p, n_f = programs, programs.fixed.shape[-1]
-    # QPs of one theta are found again by it, with all that is known of them.
-    make = _condense if p.share_theta else condense
-    condensed: Condensed = p.known(("condensed", keep), lambda: make(p.H, p.C, p.G, keep))
+
+    def make() -> Condensed:
+        if p.share_theta:  # found again by all of theta, with what is known of it
+            return _condense(p.arrays[:3], p.device, keep)
+        return condense(p.H, p.C, p.G, keep)
+
+    condensed = p.known(("condensed", keep), make)
     return condensed_for(p, n_f) if condensed.deficient and keep > n_f else condensed
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch_qpmpc import kernels, theta_kernels
 from torch_qpmpc.batching import broadcast, flatten
 from torch_qpmpc.qp import EVENT_SHAPES, crossed
+from torch_qpmpc.twofold import Twofold
 
 T = TypeVar("T")
 
@@ -56,8 +57,22 @@ _memo = ContentMemo()
 _NDIMS = tuple(len(event) for event in EVENT_SHAPES.values())
 
 
+class ProgramArrays(NamedTuple):
+    """`FlatPrograms` but for group and fixed, as NumPy arrays."""
+
+    H: np.ndarray
+    C: np.ndarray
+    G: np.ndarray
+    q: np.ndarray
+    c: np.ndarray
+    b: np.ndarray
+    lb: np.ndarray
+    ub: np.ndarray
+    w: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
-class FlatPrograms:
+class FlatPrograms(Twofold[ProgramArrays]):
     """A batch of B QPs over M distinct matrix triples, float64 on one device.
 
     H ``(M, n_z, n_z)``, C ``(M, n_c, n_z)``, G ``(M, n_g, n_z)``; ``group`` ``(B,)`` says which
@@ -65,6 +80,8 @@ class FlatPrograms:
     ``(B, n_f)``. A vector that the batch shares has one row (q, c, b, lb, ub, w, not fixed). H is
     symmetric: its antisymmetric part, if any, is no part of the cost.
     """
+
+    Arrays = ProgramArrays
 
     H: Tensor
     C: Tensor
@@ -110,8 +127,7 @@ class FlatPrograms:
         H, q, c, C, b, G, lb, ub, w = (x[np.newaxis] for x in theta)
         if H.dtype == np.float64 and theta_kernels.is_regular(H[0], lb[0], ub[0]):
             arrays = ProgramArrays(H, C, G, q, c, b, lb, ub, w)
-            H, C, G, *vectors = kernels.tensors(arrays, device)
-            return cls(H, C, G, group, *vectors, fixed=fixed, _known={"arrays": arrays})
+            return cls.of_arrays(arrays, device, group=group, fixed=fixed, _known={})
         given = (x.unsqueeze(0) for x in _prepared(kernels.tensors(theta, device), fixed))
         H, q, c, C, b, G, lb, ub, w = given
         return cls(H, C, G, group, q, c, b, lb, ub, w, fixed)
@@ -150,27 +166,23 @@ class FlatPrograms:
         q, c, b, lb, ub, w = (v if len(v) == 1 else v[index] for v in vectors)
         return FlatPrograms(self.H, self.C, self.G, group, q, c, b, lb, ub, w, fixed)
 
-    @property
+    @cached_property
     def share_theta(self) -> bool:
         """Whether they differ in nothing but their fixed entries."""
-        theta = (self.H, self.q, self.c, self.b, self.lb, self.ub, self.w)
-        return all(x.shape[0] == 1 for x in theta)
+        return all(len(x) == 1 for x in self.arrays)
 
     def _with(self, group: Tensor, fixed: Tensor) -> FlatPrograms:
         """QPs of the same theta, which share what is known of it."""
-        p = self
-        return FlatPrograms(
-            p.H, p.C, p.G, group, p.q, p.c, p.b, p.lb, p.ub, p.w, fixed, self._known
-        )
+        own = ("group", "group_array", "fixed", "fixed_array")
+        shared = {name: x for name, x in vars(self).items() if name not in own}
+        others = object.__new__(FlatPrograms)
+        vars(others).update(shared, group=group, fixed=fixed)
+        return others
 
     def without_nan(self) -> FlatPrograms:
         """The same, with zeros for NaN and inf in matrices whose QPs are not going to be solved."""
         finite = {name: getattr(self, name).nan_to_num(0, 0, 0) for name in ("H", "C", "G")}
         return replace(self, **finite, _known={})
-
-    def arrays(self) -> ProgramArrays:
-        """The same for the kernels."""
-        return self.known("arrays", lambda: ProgramArrays.of(self))
 
     @cached_property
     def group_array(self) -> np.ndarray:
@@ -253,24 +265,6 @@ def _prepared(theta: Sequence[Tensor], like: Tensor) -> tuple[Tensor, ...]:
     return (H + H.mT) / 2.0, q, c, C, b, G, lb, ub, w
 
 
-class ProgramArrays(NamedTuple):
-    """`FlatPrograms` but for group and fixed, as NumPy arrays."""
-
-    H: np.ndarray
-    C: np.ndarray
-    G: np.ndarray
-    q: np.ndarray
-    c: np.ndarray
-    b: np.ndarray
-    lb: np.ndarray
-    ub: np.ndarray
-    w: np.ndarray
-
-    @classmethod
-    def of(cls, p: FlatPrograms) -> ProgramArrays:
-        return cls(*kernels.arrays(*(getattr(p, name) for name in cls._fields)))
-
-
 class _Inspected(NamedTuple):
     """`FlatPrograms.valid` of all but the fixed entries, and `FlatPrograms.is_diagonal`."""
 
@@ -279,9 +273,9 @@ class _Inspected(NamedTuple):
 
     @classmethod
     def of(cls, p: FlatPrograms) -> _Inspected:
-        a, group = p.arrays(), p.group_array
+        a, group = p.arrays, p.group_array
         valid, H, G = theta_kernels.inspect(a.H, a.C, a.G, group, a.q, a.c, a.b, a.lb, a.ub, a.w)
-        some = None if valid is None else kernels.tensors([valid], p.q.device)[0]
+        some = None if valid is None else kernels.tensors([valid], p.device)[0]
         return cls(some, {"H": H, "G": G})
 
 
@@ -293,35 +287,6 @@ def multiply(matrices: Tensor, group: Tensor, vectors: Tensor) -> Tensor:
     return torch.bmm(matrices[group], vectors.unsqueeze(-1)).squeeze(-1)
 
 
-@dataclass(frozen=True)
-class SoftQPs:
-    """What a backend solves: B problems of d variables and r rows, float64 on one device,
-
-        min over v:  1/2 v'Hv + g'v + sum_i w_i dist(G_i v, [l_i, u_i]),
-
-    with H ``(M, d, d)``, G ``(M, r, d)``, group ``(B,)``, g ``(B, d)``, l, u, w ``(B, r)``;
-    ``w_i = inf`` means a hard row.
-    """
-
-    H: Tensor
-    G: Tensor
-    group: Tensor
-    g: Tensor
-    l: Tensor  # noqa: E741 - the literature's name for the lower bound
-    u: Tensor
-    w: Tensor
-
-    def take(self, index: Tensor) -> SoftQPs:
-        """The problems at ``index``, with the matrices as they are."""
-        vectors = (v[index] for v in (self.group, self.g, self.l, self.u, self.w))
-        return SoftQPs(self.H, self.G, *vectors)
-
-    @cached_property
-    def arrays(self) -> SoftArrays:
-        """The same for solvers that know nothing of tensors."""
-        return SoftArrays(*(getattr(self, name).cpu().numpy() for name in SoftArrays._fields))
-
-
 class SoftArrays(NamedTuple):
     """`SoftQPs` as NumPy arrays."""
 
@@ -329,6 +294,32 @@ class SoftArrays(NamedTuple):
     G: np.ndarray
     group: np.ndarray
     g: np.ndarray
-    l: np.ndarray  # noqa: E741
+    l: np.ndarray  # noqa: E741 - the literature's name for the lower bound
     u: np.ndarray
     w: np.ndarray
+
+
+@dataclass(frozen=True)
+class SoftQPs(Twofold[SoftArrays]):
+    """What a backend solves: B problems of d variables and r rows, float64 on one device,
+
+        min over v:  1/2 v'Hv + g'v + sum_i w_i dist(G_i v, [l_i, u_i]),
+
+    with H ``(M, d, d)``, G ``(M, r, d)``, group ``(B,)``, g ``(B, d)``, l, u, w ``(B, r)``;
+    ``w_i = inf`` means a hard row. The arrays need not be contiguous.
+    """
+
+    Arrays = SoftArrays
+
+    H: Tensor
+    G: Tensor
+    group: Tensor
+    g: Tensor
+    l: Tensor  # noqa: E741
+    u: Tensor
+    w: Tensor
+
+    def take(self, index: Tensor) -> SoftQPs:
+        """The problems at ``index``, with the matrices as they are."""
+        vectors = (v[index] for v in (self.group, self.g, self.l, self.u, self.w))
+        return SoftQPs(self.H, self.G, *vectors)

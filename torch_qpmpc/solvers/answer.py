@@ -4,19 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from torch_qpmpc import kernels
+from torch_qpmpc.twofold import Twofold
+
+
+class AnswerArrays(NamedTuple):
+    """`Answer` as NumPy arrays."""
+
+    v: np.ndarray
+    lam: np.ndarray
+    iterations: np.ndarray
 
 
 @dataclass(frozen=True)
-class Answer:
+class Answer(Twofold[AnswerArrays]):
     """v ``(B, d)``, signed row multipliers lam = eta - upsilon ``(B, r)``, iterations ``(B,)``.
 
     There is no status: the project's own certificate decides what is solved.
     """
+
+    Arrays = AnswerArrays
 
     v: Tensor
     lam: Tensor
@@ -26,10 +38,15 @@ class Answer:
         """Replace what there is at ``index``."""
         self.v[index], self.lam[index] = other.v, other.lam
         self.iterations[index] = other.iterations
+        vars(self).pop("arrays", None)  # those of the tensors before, unless they share memory
 
     @classmethod
-    def like(
-        cls, g: Tensor, v: np.ndarray, lam: np.ndarray, iterations: np.ndarray | Sequence[int]
+    def on(
+        cls,
+        device: torch.device,
+        v: np.ndarray,
+        lam: np.ndarray,
+        iterations: np.ndarray | Sequence[int],
     ) -> Answer:
-        """From what a solver of arrays found, on the device of ``g``."""
-        return cls(*kernels.tensors((v, lam, np.asarray(iterations, np.int64)), g.device))
+        """What a solver of arrays found."""
+        return cls.of_arrays(AnswerArrays(v, lam, np.asarray(iterations, np.int64)), device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextvars
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -163,7 +164,7 @@ class _Chain:
         reduced = self.reduced_for(part)
         qps, recover = reduced.at(part), partial(_recover, part, reduced)
         recalled = None
-        if not qps.l.shape[1]:
+        if not qps.arrays.l.shape[1]:
             answer = _unconstrained(qps)
         elif start is None:
             answer = solve(qps)
@@ -228,7 +229,7 @@ def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
     The multipliers that condensing eliminated come from the stationarity of the Lagrangian: chi by
     the transpose of the same elimination, xi from what is left in the fixed entries.
     """
-    if p.q.is_cpu and p.C.shape[1:].numel() <= CACHED:
+    if p.device.type == "cpu" and math.prod(p.arrays.C.shape[1:]) <= CACHED:
         return _recover_compiled(p, reduced, answer)
     z = reduced.expand(p, answer.v)
     Hz, y = p.times_H(z), p.times_G(z)
@@ -252,18 +253,18 @@ def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawS
     """`_recover` in one kernel."""
 
     def of_theta() -> list[Any]:
-        a, diagonal = p.arrays(), (p.is_diagonal("H"), p.is_diagonal("G"))
+        a, diagonal = p.arrays, (p.is_diagonal("H"), p.is_diagonal("G"))
         T_T, C_T = (np.ascontiguousarray(M.swapaxes(1, 2)) for M in (x.T, a.C))
         G_T = a.G if diagonal[1] else np.ascontiguousarray(a.G.swapaxes(1, 2))
         matrices = [T_T, x.Y_neg, a.C, C_T, a.H, a.G, G_T, diagonal]
         return [*matrices, x.z_0, a.q, a.c, a.b, a.lb, a.ub, a.w]
 
-    claim, x = kernels.arrays(answer.v, answer.lam), reduced.arrays
+    claim, x = answer.arrays, reduced.arrays
     # V and Q of a theta share its T, unless C has dependent rows.
-    theta = p.known(("kernel", reduced.T), of_theta)
-    given = (*claim, p.group_array, p.fixed_array, x.rows, x.others, *theta, VIOLATED)
+    theta = p.known(("kernel", reduced.keep), of_theta)
+    given = (claim.v, claim.lam, p.group_array, p.fixed_array, x.rows, x.others, *theta, VIOLATED)
     *found, worst = kernels.recover(*given)
-    value, z, sigma, chi, lam, xi, status, residual = kernels.tensors(found, p.q.device)
+    value, z, sigma, chi, lam, xi, status, residual = kernels.tensors(found, p.device)
     return RawSolution(value, z, sigma, chi, lam, xi, status, residual, answer.iterations, worst)
 
 

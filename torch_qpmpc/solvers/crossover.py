@@ -36,7 +36,7 @@ def refine(qps: SoftQPs, start: Answer, which: Tensor) -> Answer:
             previous = states
             v[i], lam[i] = _solve_kkt(H, G, arrays.g[i], bound, active, states[1])
             iterations[i] += 1
-    return Answer.like(qps.g, v, lam, iterations)
+    return Answer.on(qps.device, v, lam, iterations)
 
 
 def _solve_kkt(H, G, g, bound, active, held) -> tuple[np.ndarray, np.ndarray]:

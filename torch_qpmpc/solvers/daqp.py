@@ -27,13 +27,13 @@ def solve(qps: SoftQPs) -> Answer:
     arrays = qps.arrays
     kinds = _alike(arrays)
     if len(kinds) == 1:
-        return Answer.like(qps.g, *_solve_alike(arrays))
+        return Answer.on(qps.device, *_solve_alike(arrays))
     v, lam = np.zeros_like(arrays.g), np.zeros_like(arrays.l)
     iterations = np.zeros(len(v), dtype=np.int64)
     for i in kinds:
         part = SoftArrays(arrays.H, arrays.G, *(vectors[i] for vectors in arrays[2:]))
         v[i], lam[i], iterations[i] = _solve_alike(part)
-    return Answer.like(qps.g, v, lam, iterations)
+    return Answer.on(qps.device, v, lam, iterations)
 
 
 def _alike(arrays: SoftArrays) -> list[np.ndarray]:

@@ -62,8 +62,8 @@ def solve(qps: SoftQPs) -> Answer:
         # ProxSuite sets the thread count of the OpenMP runtime that torch uses too: keep torch's.
         proxqp.sparse.solve_in_parallel(batch, threads)
     found = [qp.results for qp in handles]
-    return Answer.like(
-        qps.g,
+    return Answer.on(
+        qps.device,
         np.array([result.x[: form.n_v] for result in found]).reshape(arrays.g.shape),
         np.array([result.z[: form.n_rows] for result in found]).reshape(arrays.l.shape),
         [result.info.iter for result in found],

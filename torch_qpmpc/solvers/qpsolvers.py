@@ -53,4 +53,4 @@ def solve(qps: SoftQPs, *, name: str) -> Answer:
         v[i] = solution.x[: form.n_v]
         lam[i, has_upper] += solution.z[: len(has_upper)]
         lam[i, has_lower] -= solution.z[len(has_upper) :]
-    return Answer.like(qps.g, v, lam, np.zeros(len(v), dtype=np.int64))
+    return Answer.on(qps.device, v, lam, np.zeros(len(v), dtype=np.int64))

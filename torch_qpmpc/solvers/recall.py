@@ -34,7 +34,7 @@ def recall(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
 
     The codes are those of `QPSolution.active`; a set with any other code begins as the empty one.
     """
-    if qps.g.is_cpu:
+    if qps.device.type == "cpu":
         return _recall_compiled(qps, active)
     return _recall(_Forces(qps), qps, active)
 
@@ -51,8 +51,8 @@ def _recall_compiled(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
         free, push = kernels.arrays(free, forces.push.mT)
     codes, limits = kernels.arrays(active)[0], (SLIP, MAX_STEPS, MAX_PASSES)
     found = kernels.recall(free, push, group, codes, lower, upper, w, *limits)
-    v, lam, steps, done = kernels.tensors(found, qps.g.device)
-    return Answer(v, lam, steps), done
+    *answer, done = found
+    return Answer.on(qps.device, *answer), torch.from_numpy(done)
 
 
 def _recall(forces: _Forces, qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:

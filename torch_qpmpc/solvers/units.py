@@ -37,12 +37,12 @@ class Units:
     @classmethod
     def of(cls, p: FlatPrograms) -> Units | None:
         """The units of ``p``, or None where all of them are one."""
-        if not len(p) or not p.q.shape[-1]:
+        if not len(p) or not p.arrays.q.shape[-1]:
             return None
-        a = p.arrays()
+        a = p.arrays
         given = (a.H, a.C, a.G, p.group_array, a.q, a.b, a.lb, a.ub, a.w)
         units = theta_kernels.units(*given, SMALL, LARGE)
-        return None if units is None else cls(*kernels.tensors(units, p.q.device))
+        return None if units is None else cls(*kernels.tensors(units, p.device))
 
     def scaled(self, p: FlatPrograms) -> FlatPrograms:
         """The same QPs in these units."""

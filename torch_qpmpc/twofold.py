@@ -1,0 +1,48 @@
+"""Data that torch sees as tensors and the kernels as arrays: each form is made when asked for.
+
+To turn the one into the other takes as long as a kernel spends on a QP, and most are never asked
+for.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, ClassVar, Generic, Self, TypeVar
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc import kernels
+
+A = TypeVar("A")
+
+
+class Twofold(Generic[A]):
+    """A dataclass of tensors on one device, or of the named tuple ``Arrays`` of their arrays."""
+
+    Arrays: ClassVar[Any]
+
+    @classmethod
+    def of_arrays(cls, arrays: A, device: torch.device, **others: Any) -> Self:
+        """From arrays, and ``others``, fields that are none."""
+        made = object.__new__(cls)
+        vars(made).update(others, arrays=arrays, device=device)
+        return made
+
+    @cached_property
+    def arrays(self) -> A:
+        """The tensors as the kernels take them."""
+        return self.Arrays(*kernels.arrays(*(getattr(self, name) for name in self.Arrays._fields)))
+
+    @cached_property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return getattr(self, self.Arrays._fields[0]).device
+
+    def __getattr__(self, name: str) -> Tensor:
+        # Asked for what is not there, or not yet.
+        if "arrays" not in vars(self) or name not in self.Arrays._fields:
+            raise AttributeError(f"{type(self).__name__} has no {name!r}")
+        (made,) = kernels.tensors([getattr(self.arrays, name)], self.device)
+        vars(self)[name] = made
+        return made
