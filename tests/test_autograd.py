@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import gc
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -7,11 +9,13 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jacrev, vmap
 from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states, solution_of
 from torch_qpmpc import (
+    QPMPC,
     QPError,
     QPSolution,
     QuadraticProgram,
@@ -232,6 +236,65 @@ def test_a_large_theta_has_the_gradient_that_a_small_one_has(monkeypatch):
     assert (small[-1][3] == 0).all()
     monkeypatch.setattr(autograd, "CACHED", -1)
     assert_close(small, gradients())
+
+
+# The value alone, of which the rest of the solution stays arrays
+
+
+def test_the_value_alone_is_that_of_the_whole_solution_with_its_derivatives():
+    mpc, s = random_mpc(6, learn=EVENT_SHAPES), random_states(5).requires_grad_()
+    operands, incoming = (*mpc.parameters(), s), normal(3, 5)
+    alone, whole = mpc.value(s), mpc.solve(s).value
+    assert torch.equal(alone, whole)
+    for options in ({}, {"create_graph": True}):
+        found, expected = (
+            torch.autograd.grad(value, operands, incoming[0], retain_graph=True, **options)
+            for value in (alone, whole)
+        )
+        assert_close(found, expected)
+    second, expected = (
+        torch.autograd.grad(g[-1].square().sum(), operands[:-1], allow_unused=True)
+        for g in (found, expected)
+    )
+    assert max(gradient.abs().max() for gradient in second if gradient is not None) > 1e-3
+    assert_close(second, expected)
+
+
+@pytest.mark.parametrize("value_of", [QPMPC.value, lambda mpc, s: mpc.solve(s).value])
+def test_gradients_are_batched_as_torch_autograd_grad_does(value_of):
+    mpc, s, incoming = random_mpc(6), random_states(5).requires_grad_(), normal(3, 5)
+    value = value_of(mpc, s)
+    rows = torch.autograd.grad(value, s, incoming, is_grads_batched=True, retain_graph=True)[0]
+    for row, weight in zip(rows, incoming, strict=True):
+        assert_close(row, torch.autograd.grad(value, s, weight, retain_graph=True)[0])
+
+
+def test_the_value_alone_in_forward_mode():
+    mpc, s, tangent = random_mpc(6), random_states(5), random_states(5, seed=1)
+    with forward_ad.dual_level():
+        value = mpc.value(forward_ad.make_dual(s, tangent))
+        derivative = forward_ad.unpack_dual(value).tangent
+    step = 1e-6 * tangent
+    assert_close(derivative, (mpc.value(s + step) - mpc.value(s - step)).detach() / 2e-6)
+
+
+def test_a_value_that_is_let_go_is_freed_at_once():
+    mpc, s = random_mpc(6), random_states(5)
+    gc.collect()
+    gc.disable()
+    try:
+        value = mpc.value(s)
+        known = weakref.ref(value), weakref.ref(value.grad_fn)
+        del value
+        assert [ref() for ref in known] == [None, None]
+    finally:
+        gc.enable()
+
+
+def test_a_value_that_is_changed_in_place_keeps_its_gradient():
+    mpc, s = random_mpc(6), random_states(5)
+    expected = torch.autograd.grad(mpc.value(s).sum(), mpc.C)
+    assert_close(torch.autograd.grad(mpc.value(s).mul_(2.0).sum() / 2.0, mpc.C), expected)
 
 
 @pytest.mark.parametrize("incoming", [1.0, torch.inf, torch.nan])

@@ -201,7 +201,7 @@ def test_the_gradient_of_shared_data_is_that_of_torch(n_qps, unneeded):
     incoming[3:4] = torch.inf
     shapes = ((n_z, n_z), (n_z,), (), (n_c, n_z), (n_c,), (n_g, n_z), *((n_g,),) * 3, z.shape)
     in_torch = envelope_gradients(weight, z, sigma, chi, lam, xi).values()
-    given = kernels.arrays(incoming, status, z, sigma, chi, lam, xi)
+    given = kernels.arrays(incoming, z, sigma, chi, lam, xi, status)
     ours = kernels.envelope(*given, tuple(i not in unneeded for i in range(10)))
     for i, (gradient, of_torch, shape) in enumerate(zip(ours, in_torch, shapes, strict=True)):
         if i in unneeded:

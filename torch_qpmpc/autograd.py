@@ -16,11 +16,13 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torch_qpmpc import kernels
 from torch_qpmpc.batching import align, broadcast, listed, outer, sum_to, weighted_sum
@@ -36,7 +38,8 @@ from torch_qpmpc.sensitivity import (
     traceable,
 )
 from torch_qpmpc.solvers import backend
-from torch_qpmpc.solvers.chain import CACHED, RawSolution, solve_programs
+from torch_qpmpc.solvers.chain import CACHED, solve_programs
+from torch_qpmpc.solvers.raw import RawArrays, RawSolution
 from torch_qpmpc.tangents import value_tangent
 
 ON_FAILURE = ("raise", "warn", "mask")
@@ -105,8 +108,8 @@ def optimal_value(
     qp: QuadraticProgram, fixed: Tensor, *, solver: str, on_failure: str, keep: int | None = None
 ) -> Tensor:
     """The optimal cost alone, ``(*batch,)``: `solve_qp` without the rest of the solution."""
-    keep = _checked_keep(qp, fixed, keep)
-    return _solve(*_operands(qp, fixed), None, keep, solver, on_failure)[0]
+    given = (*_operands(qp, fixed), None, _checked_keep(qp, fixed, keep), solver, on_failure)
+    return _solve_plain(given)[0] if _is_plain(given) else _solve(*given)[0]
 
 
 def value_and_active_set(
@@ -119,16 +122,43 @@ def value_and_active_set(
     keep: int | None = None,
 ) -> tuple[Tensor, Tensor]:
     """``value`` and ``active`` of `solve_qp`, of which only the former is differentiable."""
-    theta = _operands(qp, fixed)
     start = _checked_start(qp, fixed, warm_start)
     keep = _checked_keep(qp, fixed, keep)
-    found = _solve(*theta, start, keep, solver, on_failure)
-    value, z, _, chi, lam, xi, status, residual, iterations = found
-    if _is_for_kernels(theta, z) and not is_traced((*theta, z)):
-        given = kernels.arrays(z, lam, status, *(x.detach() for x in (qp.G, qp.lb, qp.ub, qp.w)))
-        return value, torch.from_numpy(kernels.active_sets(*given, UNKNOWN))
+    given = (*_operands(qp, fixed), start, keep, solver, on_failure)
+    if _is_plain(given):
+        value, found = _solve_plain(given)
+        rows = kernels.arrays(*(x.detach() for x in (qp.G, qp.lb, qp.ub, qp.w)))
+        sets = kernels.active_sets(found.z, found.lam, found.status, *rows, UNKNOWN)
+        return value, torch.from_numpy(sets)
+    value, z, _, chi, lam, xi, status, residual, iterations = _solve(*given)
     solution = QPSolution(qp, value, z, chi, lam, xi, status, residual, iterations)
     return value, solution.active
+
+
+def _is_plain(given: Sequence[Any]) -> bool:
+    """Whether the operator's arguments are for kernels, and no more than reverse mode looks on."""
+    theta = given[:N_THETA]
+    return _is_for_kernels(theta) and forward_ad._current_level < 0 and not is_traced(theta)
+
+
+def _is_for_kernels(theta: Sequence[Tensor]) -> bool:
+    """Whether one small theta is shared by a batch in float64 on the CPU.
+
+    The products of large ones are for BLAS, and all cores.
+    """
+    *shared, fixed = theta
+    if not fixed.is_cpu or fixed.ndim != 2 or not fixed.dtype == shared[0].dtype == torch.float64:
+        return False
+    one = all(x.ndim == n for x, n in zip(shared, EVENT_NDIMS, strict=False))
+    return one and max(x.numel() for x in shared) <= CACHED
+
+
+def _solve_plain(given: Sequence[Any]) -> tuple[Tensor, RawArrays]:
+    """The value alone, and the rest of the solution as arrays, which nobody else can change."""
+    raw, _ = _solve_flat(*given)
+    if not is_differentiating():
+        return raw.value, raw.arrays
+    return Envelope.apply(raw, given[KEEP], *given[:N_THETA]), raw.arrays
 
 
 def _solve(*arguments: Any) -> Outputs:
@@ -212,21 +242,7 @@ def _solve_now(
     solver: str,
     on_failure: str,
 ) -> Outputs:
-    """Solve in float64, whatever comes in, on the CPU, or for "torch" on CUDA where q is.
-
-    Failures are dealt with here.
-    """
-    backend(solver)
-    if on_failure not in ON_FAILURE:
-        raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
-    device = q.device if solver == "torch" and q.is_cuda else torch.device("cpu")
-    programs, batch = FlatPrograms.of(H, q, c, C, b, G, lb, ub, w, fixed, device=device)
-    if start is not None:
-        start = listed(start.to(device).expand(*batch, -1))
-    raw = solve_programs(programs, keep, solver, start)
-    if on_failure != "mask":
-        _report(raw, batch, on_failure)
-
+    raw, batch = _solve_flat(H, q, c, C, b, G, lb, ub, w, fixed, start, keep, solver, on_failure)
     outputs = (
         raw.value,
         raw.z,
@@ -246,6 +262,26 @@ def _solve_now(
         return tensor.reshape((*batch, *tensor.shape[1:])).to(q.device, dtype)
 
     return tuple(map(out, outputs))  # pyright: ignore[reportReturnType] - nine of them
+
+
+def _solve_flat(*arguments: Any) -> tuple[RawSolution, torch.Size]:
+    """Solve in float64, whatever comes in, on the CPU, or for "torch" on CUDA where q is.
+
+    Failures are dealt with here. Returns the batch shape too.
+    """
+    *theta, start, keep, solver, on_failure = arguments
+    q = theta[1]
+    backend(solver)
+    if on_failure not in ON_FAILURE:
+        raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
+    device = q.device if solver == "torch" and q.is_cuda else torch.device("cpu")
+    programs, batch = FlatPrograms.of(*theta, device=device)
+    if start is not None:
+        start = listed(start.to(device).expand(*batch, -1))
+    raw = solve_programs(programs, keep, solver, start)
+    if on_failure != "mask":
+        _report(raw, batch, on_failure)
+    return raw, batch
 
 
 solve_op = torch.library.custom_op("torch_qpmpc::solve", _solve_now, mutates_args=())
@@ -305,35 +341,51 @@ def _setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
 def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
     if grad_value is None:
         return (None,) * (N_THETA + N_OTHERS)
-    *theta, z, sigma, chi, lam, xi, status = ctx.saved_tensors
-    if is_differentiating() and not torch.compiler.is_compiling():
-        z, sigma, chi, lam, xi = _tied(ctx.keep, theta, z, chi, lam, xi, status)
-    needed = ctx.needs_input_grad[:N_THETA]
-    if _is_for_kernels(theta, z) and not is_differentiating() and not is_traced((grad_value, z)):
-        given = kernels.arrays(grad_value, status, z, sigma, chi, lam, xi)
-        pairs = zip(kernels.envelope(*given, needed), needed, strict=True)
-        found = (torch.from_numpy(gradient) if need else None for gradient, need in pairs)
-        return (*found, *(None,) * N_OTHERS)
-    # An unsolved element has zeros here, but zero times an infinite incoming gradient is NaN.
-    weight = torch.where(status.eq(int(Status.SOLVED)), grad_value, 0)
-    gradients = envelope_gradients(weight, z, sigma, chi, lam, xi).values()
-    found = (f(x) if need else None for f, x, need in zip(gradients, theta, needed, strict=True))
+    saved = ctx.saved_tensors
+    theta, solution, needed = saved[:N_THETA], saved[N_THETA:], ctx.needs_input_grad[:N_THETA]
+    given = (grad_value, *solution)
+    if _is_for_kernels(theta) and not is_differentiating() and not is_traced(given):
+        found = _gradients_by_kernel(needed, *kernels.arrays(*given))
+    else:
+        found = _gradients(needed, theta, ctx.keep, *given)
     return (*found, *(None,) * N_OTHERS)
 
 
-def _is_for_kernels(theta: Sequence[Tensor], z: Tensor) -> bool:
-    """Whether one small theta is shared by a batch in float64 on the CPU.
+def _gradients_by_kernel(needed: Sequence[bool], *given: np.ndarray) -> Iterator[Tensor | None]:
+    """`_gradients` of one theta, without derivatives of their own."""
+    pairs = zip(kernels.envelope(*given, needed), needed, strict=True)
+    return (torch.from_numpy(gradient) if need else None for gradient, need in pairs)
 
-    The products of large ones are for BLAS, and all cores.
-    """
-    if not z.is_cpu or z.dtype != torch.float64 or z.ndim != 2:
-        return False
-    shared = all(x.ndim == n for x, n in zip(theta[:-1], EVENT_NDIMS, strict=False))
-    return shared and max(x.numel() for x in theta[:-1]) <= CACHED
+
+def _gradients(
+    needed: Sequence[bool],
+    theta: Sequence[Tensor],
+    keep: int,
+    grad_value: Tensor,
+    z: Tensor,
+    sigma: Tensor,
+    chi: Tensor,
+    lam: Tensor,
+    xi: Tensor,
+    status: Tensor,
+) -> Iterator[Tensor | None]:
+    """The envelope gradient in theta where it is ``needed``, from the solution."""
+    if is_differentiating() and not torch.compiler.is_compiling():
+        z, sigma, chi, lam, xi = _tied(keep, theta, z, chi, lam, xi, status)
+    # An unsolved element has zeros here, but zero times an infinite incoming gradient is NaN.
+    weight = torch.where(status.eq(int(Status.SOLVED)), grad_value, 0)
+    gradients = envelope_gradients(weight, z, sigma, chi, lam, xi).values()
+    return (f(x) if need else None for f, x, need in zip(gradients, theta, needed, strict=True))
 
 
 def _tied(
-    keep: int, theta: list[Tensor], z: Tensor, chi: Tensor, lam: Tensor, xi: Tensor, status: Tensor
+    keep: int,
+    theta: Sequence[Tensor],
+    z: Tensor,
+    chi: Tensor,
+    lam: Tensor,
+    xi: Tensor,
+    status: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """z, sigma, chi, lam, xi as second derivatives need them: dependent on the data."""
     z, lam, chi, xi = differentiable(z, lam, chi, xi, status, *theta, keep)
@@ -385,6 +437,30 @@ class QPValue(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
         return QPValue.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9
+
+
+class Envelope(torch.autograd.Function):
+    """The value of a solution that is known, with its gradient (eq:gradq): for `_solve_plain`."""
+
+    @staticmethod
+    def forward(ctx: Any, raw: RawSolution, keep: int, *theta: Tensor) -> Tensor:
+        ctx.set_materialize_grads(False)
+        ctx.raw, ctx.keep = raw, keep
+        ctx.save_for_backward(*theta)
+        # Not the solution's own tensor, which would keep itself alive by way of its gradient.
+        return torch.from_numpy(raw.arrays.value)
+
+    @staticmethod
+    def backward(ctx: Any, grad_value: Tensor | None) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if grad_value is None:
+            return (None,) * (2 + N_THETA)
+        theta, needed, x = ctx.saved_tensors, ctx.needs_input_grad[2:], ctx.raw
+        if is_differentiating() or is_traced((grad_value,)):
+            given = (grad_value, x.z, x.sigma, x.chi, x.lam, x.xi, x.status)
+            return None, None, *_gradients(needed, theta, ctx.keep, *given)
+        (incoming,), x = kernels.arrays(grad_value), x.arrays
+        given = (incoming, x.z, x.sigma, x.chi, x.lam, x.xi, x.status)
+        return None, None, *_gradients_by_kernel(needed, *given)
 
 
 class QPTangent(QPValue):

@@ -127,7 +127,7 @@ class Reduced(Twofold[ReducedArrays]):
     def of(cls, condensed: Condensed, p: FlatPrograms, n_f: int) -> Reduced:
         x, a = condensed.arrays, p.arrays
         given = (*x, p.group_array, a.G, a.q, a.b, a.lb, a.ub, a.w, n_f, ENTERS)
-        arrays = ReducedArrays(*theta_kernels.reduce(*given), x.T, x.Y_neg)
+        arrays = ReducedArrays._make((*theta_kernels.reduce(*given), x.T, x.Y_neg))
         convex = None
         if not condensed.surely_convex:
             convex = _convex(*kernels.tensors([arrays.H], p.device))

@@ -234,18 +234,19 @@ summing = partial(compiled, fastmath={"reassoc", "contract"})
 _comparing = partial(compiled, fastmath={"nnan", "nsz"})
 
 
-@intrinsic
-def larger(_: Any, x: Any, y: Any) -> Any:
-    """max(x, y), which the compiler takes four at a time in a loop, and Python's it does not."""
+def _larger(_, x, y):
+    """max(x, y), which the compiler takes four at a time in a loop; Python's it does not."""
 
-    def generate(_: Any, builder: Any, signature: Any, numbers: Any) -> Any:
+    def generate(_, builder, signature, numbers):
         double = ir.DoubleType()
         kind = ir.FunctionType(double, (double, double))
-        return builder.call(
-            builder.module.declare_intrinsic("llvm.maxnum", (double,), kind), numbers
-        )
+        maximum = builder.module.declare_intrinsic("llvm.maxnum", (double,), kind)
+        return builder.call(maximum, numbers)
 
     return numba.float64(numba.float64, numba.float64), generate
+
+
+larger: Any = intrinsic(_larger)
 
 
 @summing
@@ -344,7 +345,7 @@ def add_product(x, factors, matrix):
 
 
 @compiled
-def envelope(incoming, status, z, sigma, chi, lam, xi, needed):
+def envelope(incoming, z, sigma, chi, lam, xi, status, needed):
     """`autograd.envelope_gradients` of a theta that the batch shares.
 
     ``incoming`` and ``status`` are ``(B,)``. Of the ten gradients, matrices that are not ``needed``

@@ -74,12 +74,19 @@ class Layout:
         terminal = z[..., None, self.horizon * self.n :]
         return torch.cat((stages[..., : self.n_x], terminal), -2), stages[..., self.n_x :]
 
-    def hessian(self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor) -> Tensor:
-        """H ``(n_z, n_z)`` (eq:qpH) from those of the stages and of x_N, or from itself if full."""
+    def hessian(
+        self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor, stages: Tensor
+    ) -> Tensor:
+        """H ``(n_z, n_z)`` (eq:qpH) from those of the stages and of x_N, or from itself if full.
+
+        ``stages`` is ``ties("q")``, for a diagonal H that all stages share.
+        """
         H = blocks[0]
         if kind == "diagonal":
-            stages = H.expand(self.horizon, self.n).flatten()
-            return torch.diag_embed(discount * torch.cat((stages, blocks[1])))
+            entries = torch.cat((H.flatten(), blocks[1]))
+            if H.ndim == 1:  # to expand it takes longer
+                entries = entries.index_select(0, stages)
+            return torch.diag_embed(discount * entries)
         if kind == "block":
             H = torch.block_diag(*H.expand(self.horizon, self.n, self.n), blocks[1])
         root = discount.sqrt()

@@ -112,6 +112,7 @@ class QPMPC(nn.Module):
     slack_discount: Tensor
     soft: Tensor
     hardness: Tensor
+    stages: Tensor
 
     def __init__(
         self,
@@ -322,7 +323,7 @@ class QPMPC(nn.Module):
         with full_precision(self.C_0):
             blocks = (self.H,) if self.hessian == "full" else (self.H, self.H_f)
             return QuadraticProgram(
-                H=self._layout.hessian(self.hessian, blocks, self.discount),
+                H=self._layout.hessian(self.hessian, blocks, self.discount, self.stages),
                 q=self.discount * self.q,
                 c=self.c,
                 C=self.C,
@@ -381,6 +382,8 @@ class QPMPC(nn.Module):
         derived = {"discount": discount, "slack_discount": weights, "hardness": hardness}
         for name, buffer in derived.items():
             self.register_buffer(name, buffer.to(self.C_0), persistent=False)
+        stages = self._layout.ties("q").to(self.C_0.device)
+        self.register_buffer("stages", stages, persistent=False)
         for part in self.modules():
             if isinstance(part, Tied):
                 part.place(self.C_0.device)

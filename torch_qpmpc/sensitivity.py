@@ -38,6 +38,8 @@ from torch_qpmpc.tangents import right_side, times
 
 #: The tensors that nothing but autograd looks at.
 PLAIN = (Tensor, nn.Parameter)
+#: On while `torch.autograd.grad` is asked for gradients with ``is_grads_batched``.
+BATCHED_GRADIENTS = torch._C._dispatch_key_parse("VmapMode")
 #: Residual of the KKT system from which on it counts as singular.
 SINGULAR = 1e-8
 #: Event dimensions of the operator's tensors: four gradients; z, lam, status; the QP's data.
@@ -341,6 +343,7 @@ def is_traced(tensors: Iterable[Tensor]) -> bool:
         or core._len_torch_dispatch_stack() > 0  # fake tensors, traces
         or core._len_torch_function_stack() > 0  # a default device
         or core._get_tracing_state() is not None
+        or core._dispatch_tls_is_dispatch_key_included(BATCHED_GRADIENTS)
         or bool(_transforms())
         or any(type(x) not in PLAIN or x.is_meta for x in tensors)
     )

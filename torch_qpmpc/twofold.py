@@ -39,6 +39,10 @@ class Twofold(Generic[A]):
         """Where the tensors are."""
         return getattr(self, self.Arrays._fields[0]).device
 
+    def forget_arrays(self) -> None:
+        """The tensors have changed, all of them: copies of what they were are of no use."""
+        vars(self).pop("arrays", None)
+
     def __getattr__(self, name: str) -> Tensor:
         # Asked for what is not there, or not yet.
         if "arrays" not in vars(self) or name not in self.Arrays._fields:

@@ -38,7 +38,7 @@ class Answer(Twofold[AnswerArrays]):
         """Replace what there is at ``index``."""
         self.v[index], self.lam[index] = other.v, other.lam
         self.iterations[index] = other.iterations
-        vars(self).pop("arrays", None)  # those of the tensors before, unless they share memory
+        self.forget_arrays()
 
     @classmethod
     def on(

@@ -22,7 +22,7 @@ from torch_qpmpc.qp import Status
 from torch_qpmpc.solvers import Answer, Backend, backend, fallbacks
 from torch_qpmpc.solvers.crossover import refine
 from torch_qpmpc.solvers.diagnose import diagnose
-from torch_qpmpc.solvers.raw import RawSolution, unsolved
+from torch_qpmpc.solvers.raw import RawArrays, RawSolution, unsolved
 from torch_qpmpc.solvers.recall import recall
 from torch_qpmpc.solvers.units import units_of
 
@@ -264,8 +264,8 @@ def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawS
     theta = p.known(("kernel", reduced.keep), of_theta)
     given = (claim.v, claim.lam, p.group_array, p.fixed_array, x.rows, x.others, *theta, VIOLATED)
     *found, worst = kernels.recover(*given)
-    value, z, sigma, chi, lam, xi, status, residual = kernels.tensors(found, p.device)
-    return RawSolution(value, z, sigma, chi, lam, xi, status, residual, answer.iterations, worst)
+    arrays = RawArrays._make((*found, claim.iterations))
+    return RawSolution.of_arrays(arrays, p.device, worst=worst)
 
 
 def _reasons(part: FlatPrograms, reduced: Reduced) -> Tensor:

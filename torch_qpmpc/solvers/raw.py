@@ -3,22 +3,41 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torch_qpmpc.certificate import TOLERANCE
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.qp import Status
+from torch_qpmpc.twofold import Twofold
+
+
+class RawArrays(NamedTuple):
+    """`RawSolution` as NumPy arrays."""
+
+    value: np.ndarray
+    z: np.ndarray
+    sigma: np.ndarray
+    chi: np.ndarray
+    lam: np.ndarray
+    xi: np.ndarray
+    status: np.ndarray
+    residual: np.ndarray
+    iterations: np.ndarray
 
 
 @dataclass
-class RawSolution:
+class RawSolution(Twofold[RawArrays]):
     """Certified primal-dual solutions of B QPs, float64; lam = eta - upsilon.
 
     No residual is larger than ``worst``; up to the tolerance, that says that all are solved.
     """
+
+    Arrays = RawArrays
 
     value: Tensor
     z: Tensor
@@ -47,9 +66,10 @@ class RawSolution:
         for own, others in zip(self._tensors(), other._tensors(), strict=True):
             own[index] = others
         self.worst = math.inf
+        self.forget_arrays()
 
     def _tensors(self) -> list[Tensor]:
-        return [getattr(self, field.name) for field in fields(self) if field.name != "worst"]
+        return [getattr(self, name) for name in RawArrays._fields]
 
 
 def unsolved(p: FlatPrograms, status: Status = Status.INVALID_DATA) -> RawSolution:
