@@ -29,7 +29,7 @@ from torch_qpmpc.batching import align, broadcast, listed, outer, sum_to, weight
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.programs import FlatPrograms
-from torch_qpmpc.qp import UNKNOWN, QPSolution, QuadraticProgram, Status, slacks
+from torch_qpmpc.qp import NDIMS, UNKNOWN, QPSolution, QuadraticProgram, Sizes, Status, slacks
 from torch_qpmpc.sensitivity import (
     differentiable,
     is_differentiating,
@@ -44,7 +44,7 @@ from torch_qpmpc.tangents import value_tangent
 
 ON_FAILURE = ("raise", "warn", "mask")
 #: Event dimensions of the operator's tensors: H, q, c, C, b, G, lb, ub, w, fixed, a warm start.
-EVENT_NDIMS = (2, 1, 0, 2, 1, 2, 1, 1, 1, 1, 1)
+EVENT_NDIMS = (*NDIMS, 1, 1)
 N_THETA = 10
 #: Position of ``keep`` among the operator's arguments, and how many follow theirs.
 KEEP = 11
@@ -109,7 +109,7 @@ def optimal_value(
 ) -> Tensor:
     """The optimal cost alone, ``(*batch,)``: `solve_qp` without the rest of the solution."""
     given = (*_operands(qp, fixed), None, _checked_keep(qp, fixed, keep), solver, on_failure)
-    return _solve_plain(given)[0] if _is_plain(given) else _solve(*given)[0]
+    return _solve_plain(given)[0] if _is_plain(qp, given) else _solve(*given)[0]
 
 
 def value_and_active_set(
@@ -125,7 +125,7 @@ def value_and_active_set(
     start = _checked_start(qp, fixed, warm_start)
     keep = _checked_keep(qp, fixed, keep)
     given = (*_operands(qp, fixed), start, keep, solver, on_failure)
-    if _is_plain(given):
+    if _is_plain(qp, given):
         value, found = _solve_plain(given)
         rows = kernels.arrays(*(x.detach() for x in (qp.G, qp.lb, qp.ub, qp.w)))
         sets = kernels.active_sets(found.z, found.lam, found.status, *rows, UNKNOWN)
@@ -135,22 +135,21 @@ def value_and_active_set(
     return value, solution.active
 
 
-def _is_plain(given: Sequence[Any]) -> bool:
+def _is_plain(qp: QuadraticProgram, given: Sequence[Any]) -> bool:
     """Whether the operator's arguments are for kernels, and no more than reverse mode looks on."""
-    theta = given[:N_THETA]
-    return _is_for_kernels(theta) and forward_ad._current_level < 0 and not is_traced(theta)
+    if not _is_for_kernels(qp.sizes, qp.H, given[N_THETA - 1]):
+        return False
+    return forward_ad._current_level < 0 and not is_traced(given[:N_THETA])
 
 
-def _is_for_kernels(theta: Sequence[Tensor]) -> bool:
-    """Whether one small theta is shared by a batch in float64 on the CPU.
+def _is_for_kernels(sizes: Sizes, *tensors: Tensor) -> bool:
+    """Whether one small theta is shared by a batch in float64 on the CPU, as one of theta shows.
 
     The products of large ones are for BLAS, and all cores.
     """
-    *shared, fixed = theta
-    if not fixed.is_cpu or fixed.ndim != 2 or not fixed.dtype == shared[0].dtype == torch.float64:
-        return False
-    one = all(x.ndim == n for x, n in zip(shared, EVENT_NDIMS, strict=False))
-    return one and max(x.numel() for x in shared) <= CACHED
+    *_, of_batch = tensors
+    one = not sizes.batch_shape and of_batch.ndim == 2 and sizes.largest <= CACHED
+    return one and all(x.is_cpu and x.dtype == torch.float64 for x in tensors)
 
 
 def _solve_plain(given: Sequence[Any]) -> tuple[Tensor, RawArrays]:
@@ -344,7 +343,8 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
     saved = ctx.saved_tensors
     theta, solution, needed = saved[:N_THETA], saved[N_THETA:], ctx.needs_input_grad[:N_THETA]
     given = (grad_value, *solution)
-    if _is_for_kernels(theta) and not is_differentiating() and not is_traced(given):
+    small = _is_for_kernels(Sizes.of(theta[:-1]), theta[0], theta[-1])
+    if small and not is_differentiating() and not is_traced(given):
         found = _gradients_by_kernel(needed, *kernels.arrays(*given))
     else:
         found = _gradients(needed, theta, ctx.keep, *given)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_qpmpc import kernels, theta_kernels
 from torch_qpmpc.batching import broadcast, flatten
-from torch_qpmpc.qp import EVENT_SHAPES, crossed
+from torch_qpmpc.qp import NDIMS, crossed
 from torch_qpmpc.twofold import Twofold
 
 T = TypeVar("T")
@@ -53,8 +53,6 @@ class ContentMemo(threading.local):
 
 
 _memo = ContentMemo()
-#: Trailing dimensions of H, q, c, C, b, G, lb, ub, w that are no batch.
-_NDIMS = tuple(len(event) for event in EVENT_SHAPES.values())
 
 
 class ProgramArrays(NamedTuple):
@@ -107,8 +105,8 @@ class FlatPrograms(Twofold[ProgramArrays]):
         What was worked out for the same theta is found again where the batch shares all of it.
         """
         *theta, fixed = operands
-        if any(t.ndim > n for t, n in zip(theta, _NDIMS, strict=True)):
-            batches = (t.shape[: t.ndim - n] for t, n in zip(theta, _NDIMS, strict=True))
+        if any(t.ndim > n for t, n in zip(theta, NDIMS, strict=True)):
+            batches = (t.shape[: t.ndim - n] for t, n in zip(theta, NDIMS, strict=True))
             batch = broadcast(*batches, fixed.shape[:-1])
             fixed = flatten(fixed, batch, device)
             return cls._flat([tensor.detach() for tensor in theta], batch, fixed), batch

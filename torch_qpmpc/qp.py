@@ -14,9 +14,10 @@ have it reversed. A row with w_i = inf is hard: its sigma_i is zero.
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, fields
 from enum import IntEnum
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -37,6 +38,8 @@ EVENT_SHAPES: dict[str, tuple[str, ...]] = {
     "ub": ("n_g",),
     "w": ("n_g",),
 }
+#: How many trailing dimensions of each are no batch.
+NDIMS = tuple(len(event) for event in EVENT_SHAPES.values())
 
 
 class Status(IntEnum):
@@ -65,8 +68,35 @@ _EXPLANATIONS = {
 }
 
 
-#: Shapes and dtypes that were found to fit lately: training asks for the same again and again.
-_accepted: deque[tuple] = deque(maxlen=16)
+class Sizes(NamedTuple):
+    """What follows from the shapes of a QP's tensors: the batch's, and the most entries of one."""
+
+    batch_shape: torch.Size
+    largest: int
+
+    @classmethod
+    def of(cls, tensors: Sequence[Tensor]) -> Sizes:
+        """Of H, q, c, C, b, G, lb, ub, w; `RuntimeError` where batches do not broadcast."""
+        batches = (x.shape[: x.ndim - n] for x, n in zip(tensors, NDIMS, strict=True))
+        return cls(broadcast(*batches), max(x.numel() for x in tensors))
+
+
+#: Of shapes, dtypes and devices that were found to fit: training asks for the same all the time.
+_accepted: dict[tuple | None, Sizes] = {}
+#: How many of them are remembered.
+_MOST = 16
+
+
+def _kind(tensors: Sequence[Tensor]) -> tuple | None:
+    """What they are remembered by; None of what is no tensor, or has a symbolic shape."""
+    if torch.compiler.is_compiling():
+        return None
+    try:
+        kind = tuple([(x.shape, x.dtype, x.device) for x in tensors])
+        hash(kind)
+    except (AttributeError, TypeError):
+        return None
+    return kind
 
 
 @dataclass(frozen=True)
@@ -123,12 +153,7 @@ class QuadraticProgram:
     check_values: InitVar[bool] = True
 
     def __post_init__(self, check_values: bool) -> None:
-        names = ("shape", "dtype", "device")
-        kind = tuple(tuple(getattr(x, name, None) for name in names) for x in self.tensors())
-        if torch.compiler.is_compiling() or kind not in _accepted:
-            self._check_shapes()
-            if not torch.compiler.is_compiling():
-                _accepted.append(kind)
+        self._check_shapes()
         if check_values:
             self._check_values()
 
@@ -138,18 +163,29 @@ class QuadraticProgram:
 
     @property
     def batch_shape(self) -> torch.Size:
-        return broadcast(
-            *(
-                getattr(self, n).shape[: getattr(self, n).ndim - len(e)]
-                for n, e in EVENT_SHAPES.items()
-            )
-        )
+        return self.sizes.batch_shape
+
+    @property
+    def sizes(self) -> Sizes:
+        """Worked out once for all QPs of the same shapes."""
+        tensors = self.tensors()
+        return _accepted.get(_kind(tensors)) or Sizes.of(tensors)
 
     def tensors(self) -> tuple[Tensor, ...]:
         """H, q, c, C, b, G, lb, ub, w."""
-        return tuple(getattr(self, name) for name in EVENT_SHAPES)
+        return (self.H, self.q, self.c, self.C, self.b, self.G, self.lb, self.ub, self.w)
 
     def _check_shapes(self) -> None:
+        kind = _kind(self.tensors())
+        if kind is not None and kind in _accepted:
+            return
+        self._check_each_shape()
+        if kind is not None:
+            if len(_accepted) >= _MOST:
+                _accepted.clear()
+            _accepted[kind] = self.sizes
+
+    def _check_each_shape(self) -> None:
         for field in fields(self):
             tensor = getattr(self, field.name)
             if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
@@ -189,7 +225,7 @@ class QuadraticProgram:
                         f"shape {want} with {symbol} = {known} as in {source}",
                     )
         try:
-            _ = self.batch_shape
+            _ = self.sizes
         except RuntimeError as error:
             shapes = {name: tuple(getattr(self, name).shape) for name in EVENT_SHAPES}
             raise QPError.expected(

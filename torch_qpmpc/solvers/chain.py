@@ -120,7 +120,8 @@ class _Chain:
         self.programs, self.keep = programs, keep
         self.recalled = self.rejected = 0
         # First-order conditions certify an optimum only where the QP is convex.
-        convex = self.reduced_for(programs).convex
+        self.reduced = self.reduced_for(programs)
+        convex = self.reduced.convex
         if convex is not None:
             of_qps = convex[programs.group]
             valid = of_qps if valid is None else valid & of_qps
@@ -161,7 +162,7 @@ class _Chain:
         if self.raw is not None and self.todo is not None and not len(self.todo):
             return self.raw, self.todo
         part = self.part()
-        reduced = self.reduced_for(part)
+        reduced = self.reduced if self.todo is None else self.reduced_for(part)
         qps, recover = reduced.at(part), partial(_recover, part, reduced)
         recalled = None
         if not qps.arrays.l.shape[1]:
