@@ -39,6 +39,12 @@ def test_tensors_are_made_of_arrays_once():
     assert "x" not in vars(pair)
 
 
+def test_all_tensors_can_be_made_at_once():
+    pair = of_arrays()
+    pair.make_tensors()
+    assert {"x", "y"} <= set(vars(pair))
+
+
 def test_arrays_are_made_of_tensors_once():
     columns = torch.arange(6.0).reshape(2, 3).mT
     pair = Pair(columns, torch.ones(3))

@@ -125,7 +125,10 @@ class FlatPrograms(Twofold[ProgramArrays]):
         H, q, c, C, b, G, lb, ub, w = (x[np.newaxis] for x in theta)
         if H.dtype == np.float64 and theta_kernels.is_regular(H[0], lb[0], ub[0]):
             arrays = ProgramArrays(H, C, G, q, c, b, lb, ub, w)
-            return cls.of_arrays(arrays, device, group=group, fixed=fixed, _known={})
+            made = cls.of_arrays(arrays, device, group=group, fixed=fixed, _known={})
+            if device.type != "cpu":  # moved once, for all that share theta
+                made.make_tensors()
+            return made
         given = (x.unsqueeze(0) for x in _prepared(kernels.tensors(theta, device), fixed))
         H, q, c, C, b, G, lb, ub, w = given
         return cls(H, C, G, group, q, c, b, lb, ub, w, fixed)

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, fields
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -82,7 +82,7 @@ class Sizes(NamedTuple):
 
 
 #: Of shapes, dtypes and devices that were found to fit: training asks for the same all the time.
-_accepted: dict[tuple | None, Sizes] = {}
+_accepted: dict[Any, Sizes] = {}
 #: How many of them are remembered.
 _MOST = 16
 

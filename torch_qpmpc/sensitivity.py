@@ -20,7 +20,8 @@ with a zero multiplier) the solution has a kink, and this is one of its one-side
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
+from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any
 
@@ -36,8 +37,10 @@ from torch_qpmpc.qp import Status, active_rows
 from torch_qpmpc.solvers.units import units_of
 from torch_qpmpc.tangents import right_side, times
 
+_functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue] - has no stub
+
 #: The tensors that nothing but autograd looks at.
-PLAIN = (Tensor, nn.Parameter)
+PLAIN = frozenset((Tensor, nn.Parameter))
 #: On while `torch.autograd.grad` is asked for gradients with ``is_grads_batched``.
 BATCHED_GRADIENTS = torch._C._dispatch_key_parse("VmapMode")
 #: Residual of the KKT system from which on it counts as singular.
@@ -335,7 +338,7 @@ def traceable(eager: Any, compiled: Any, operator: Any) -> Any:
     return compiled.apply
 
 
-def is_traced(tensors: Iterable[Tensor]) -> bool:
+def is_traced(tensors: Sequence[Tensor]) -> bool:
     """Whether anything but plain tensors may be at work, from which the solvers must be hidden."""
     core = torch._C
     return (
@@ -344,14 +347,14 @@ def is_traced(tensors: Iterable[Tensor]) -> bool:
         or core._len_torch_function_stack() > 0  # a default device
         or core._get_tracing_state() is not None
         or core._dispatch_tls_is_dispatch_key_included(BATCHED_GRADIENTS)
-        or bool(_transforms())
-        or any(type(x) not in PLAIN or x.is_meta for x in tensors)
+        or _functorch.peek_interpreter_stack() is not None  # `torch.func`
+        or not PLAIN.issuperset(map(type, tensors))
+        or any(map(attrgetter("is_meta"), tensors))
     )
 
 
 @torch.compiler.assume_constant_result
 def _transforms() -> tuple[str, ...]:
     """The `torch.func` transforms that we are in, from the outermost."""
-    functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue] - has no stub
-    stack = functorch.get_interpreter_stack() or ()
+    stack = _functorch.get_interpreter_stack() or ()
     return tuple(interpreter.key().name for interpreter in stack)

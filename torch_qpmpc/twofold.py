@@ -39,8 +39,14 @@ class Twofold(Generic[A]):
         """Where the tensors are."""
         return getattr(self, self.Arrays._fields[0]).device
 
+    def make_tensors(self) -> None:
+        """Make all that are not there yet."""
+        for name in self.Arrays._fields:
+            getattr(self, name)
+
     def forget_arrays(self) -> None:
-        """The tensors have changed, all of them: copies of what they were are of no use."""
+        """Tensors have changed: copies of what they were are of no use."""
+        self.make_tensors()
         vars(self).pop("arrays", None)
 
     def __getattr__(self, name: str) -> Tensor:

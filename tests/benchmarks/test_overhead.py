@@ -56,7 +56,7 @@ def test_share_outside_the_solver(
         shares.append(1 - sum(inside) / (time.perf_counter() - began))
         return len(inside)
 
-    calls = interleaved(step, rounds=10, warmup=2, before=lambda: nudge(gradient.mpc))
+    calls = interleaved(step, rounds=50, warmup=2, before=lambda: nudge(gradient.mpc))
     benchmark.extra_info |= {
         "row": solver + start,
         "batch": batch,

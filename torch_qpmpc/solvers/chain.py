@@ -165,7 +165,7 @@ class _Chain:
         reduced = self.reduced if self.todo is None else self.reduced_for(part)
         qps, recover = reduced.at(part), partial(_recover, part, reduced)
         recalled = None
-        if not qps.arrays.l.shape[1]:
+        if not len(reduced.arrays.rows):
             answer = _unconstrained(qps)
         elif start is None:
             answer = solve(qps)
