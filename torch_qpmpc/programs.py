@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -53,6 +53,8 @@ class ContentMemo(threading.local):
 
 
 _memo = ContentMemo()
+#: The group of a single QP.
+_ONE = np.zeros(1, np.int64)
 
 
 class ProgramArrays(NamedTuple):
@@ -123,9 +125,11 @@ class FlatPrograms(Twofold[ProgramArrays]):
         """A single QP, as the form of all that have this theta."""
         device, group = fixed.device, _zeros(1, fixed.device)
         H, q, c, C, b, G, lb, ub, w = (x[np.newaxis] for x in theta)
-        if H.dtype == np.float64 and theta_kernels.is_regular(H[0], lb[0], ub[0]):
-            arrays = ProgramArrays(H, C, G, q, c, b, lb, ub, w)
-            made = cls.of_arrays(arrays, device, group=group, fixed=fixed, _known={})
+        arrays = ProgramArrays(H, C, G, q, c, b, lb, ub, w)
+        inspected = _Inspected.of(arrays, _ONE, device) if H.dtype == np.float64 else None
+        if inspected is not None and inspected.regular:
+            known = {"inspected": inspected}
+            made = cls.of_arrays(arrays, device, group=group, fixed=fixed, _known=known)
             if device.type != "cpu":  # moved once, for all that share theta
                 made.make_tensors()
             return made
@@ -206,7 +210,8 @@ class FlatPrograms(Twofold[ProgramArrays]):
 
     @property
     def _inspected(self) -> _Inspected:
-        return self.known("inspected", lambda: _Inspected.of(self))
+        make = partial(_Inspected.of, self.arrays, self.group_array, self.device)
+        return self.known("inspected", make)
 
     def times_H(self, z: Tensor) -> Tensor:
         """H z, ``(B, n_z)``."""
@@ -267,17 +272,21 @@ def _prepared(theta: Sequence[Tensor], like: Tensor) -> tuple[Tensor, ...]:
 
 
 class _Inspected(NamedTuple):
-    """`FlatPrograms.valid` of all but the fixed entries, and `FlatPrograms.is_diagonal`."""
+    """`FlatPrograms.valid` of all but the fixed entries, and `FlatPrograms.is_diagonal`.
+
+    ``regular`` says that all are valid, and all of H symmetric.
+    """
 
     valid: Tensor | None
     diagonal: dict[str, bool]
+    regular: bool
 
     @classmethod
-    def of(cls, p: FlatPrograms) -> _Inspected:
-        a, group = p.arrays, p.group_array
-        valid, H, G = theta_kernels.inspect(a.H, a.C, a.G, group, a.q, a.c, a.b, a.lb, a.ub, a.w)
-        some = None if valid is None else kernels.tensors([valid], p.device)[0]
-        return cls(some, {"H": H, "G": G})
+    def of(cls, a: ProgramArrays, group: np.ndarray, device: torch.device) -> _Inspected:
+        given = (a.H, a.C, a.G, group, a.q, a.c, a.b, a.lb, a.ub, a.w)
+        valid, H, G, symmetric = theta_kernels.inspect(*given)
+        some = None if valid is None else kernels.tensors([valid], device)[0]
+        return cls(some, {"H": H, "G": G}, symmetric and valid is None)
 
 
 def multiply(matrices: Tensor, group: Tensor, vectors: Tensor) -> Tensor:

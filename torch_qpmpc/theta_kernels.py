@@ -15,23 +15,10 @@ from torch_qpmpc.kernels import add_product, compiled, products, summing
 
 
 @compiled
-def is_regular(H, lb, ub):
-    """Whether one H is symmetric, and lb <= ub."""
-    for i in range(H.shape[0]):
-        for j in range(i):
-            if H[i, j] != H[j, i]:
-                return False
-    ordered = True
-    for i in range(len(lb)):
-        ordered = ordered and lb[i] <= ub[i]
-    return ordered
-
-
-@compiled
 def inspect(H, C, G, group, q, c, b, lb, ub, w):
     """Which QPs have finite data and lb <= ub, ``(B or 1,)``, or None if all have.
 
-    And whether H and G are diagonal.
+    And whether H and G are diagonal, and all of H symmetric.
     """
     M = len(H)
     finite = np.empty(M, np.bool_)
@@ -48,7 +35,18 @@ def inspect(H, C, G, group, q, c, b, lb, ub, w):
             good = good and ub[of_ub, j] - lb[of_lb, j] >= 0 and w[of_w, j] >= 0
         valid[i] = good
     some = None if valid.all() else valid
-    return some, M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
+    one_H, one_G = M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
+    return some, one_H, one_G, one_H or _are_symmetric(H)
+
+
+@compiled
+def _are_symmetric(matrices):
+    for m in range(matrices.shape[0]):
+        for i in range(matrices.shape[1]):
+            for j in range(i):
+                if matrices[m, i, j] != matrices[m, j, i]:
+                    return False
+    return True
 
 
 @summing
