@@ -219,9 +219,6 @@ def test_gradient_is_the_same_whatever_is_kept():
         assert_close(other, gradients[0], rtol=1e-5, atol=1e-5)
 
 
-# Unsolved elements
-
-
 def test_a_large_theta_has_the_gradient_that_a_small_one_has(monkeypatch):
     mpc = random_mpc(5, learn=(*EVENT_SHAPES, "H_f"), on_failure="mask")
     s, incoming = random_states(20), normal(20)
@@ -295,6 +292,9 @@ def test_a_value_that_is_changed_in_place_keeps_its_gradient():
     mpc, s = random_mpc(6), random_states(5)
     expected = torch.autograd.grad(mpc.value(s).sum(), mpc.C)
     assert_close(torch.autograd.grad(mpc.value(s).mul_(2.0).sum() / 2.0, mpc.C), expected)
+
+
+# Unsolved elements
 
 
 @pytest.mark.parametrize("incoming", [1.0, torch.inf, torch.nan])

@@ -41,8 +41,9 @@ def test_tensors_are_made_of_arrays_once():
 
 def test_all_tensors_can_be_made_at_once():
     pair = of_arrays()
-    pair.make_tensors()
-    assert {"x", "y"} <= set(vars(pair))
+    x, y = pair.all_tensors()
+    assert x is pair.x
+    assert y is pair.y
 
 
 def test_arrays_are_made_of_tensors_once():

@@ -242,17 +242,7 @@ def _solve_now(
     on_failure: str,
 ) -> Outputs:
     raw, batch = _solve_flat(H, q, c, C, b, G, lb, ub, w, fixed, start, keep, solver, on_failure)
-    outputs = (
-        raw.value,
-        raw.z,
-        raw.sigma,
-        raw.chi,
-        raw.lam,
-        raw.xi,
-        raw.status,
-        raw.residual,
-        raw.iterations,
-    )
+    outputs: Any = tuple(raw.all_tensors())
     if len(batch) == 1 and q.dtype == raw.value.dtype and q.device == raw.value.device:
         return outputs
 

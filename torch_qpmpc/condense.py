@@ -196,8 +196,10 @@ def _condense(matrices: Sequence[np.ndarray], device: torch.device, keep: int) -
     if max(math.prod(x.shape[1:]) for x in matrices) <= SMALL:
         *found, regular, convex = theta_kernels.condense(*matrices, keep, RANK_TOLERANCE, CONVEX)
         if regular:
-            others = {"keep": keep, "deficient": False, "surely_convex": convex}
-            return Condensed.of_arrays(CondensedArrays(*found), device, **others)
+            found = CondensedArrays(*found)
+            return Condensed.of_arrays(
+                found, device, keep=keep, deficient=False, surely_convex=convex
+            )
     H, C, G = kernels.tensors(matrices, device)
     eliminated = _eliminate(C, keep)
     T, Y, padding = _null_space(C, keep) if eliminated is None else (*eliminated, None)

@@ -235,7 +235,7 @@ _comparing = partial(compiled, fastmath={"nnan", "nsz"})
 
 
 def _larger(_, x, y):
-    """max(x, y), which the compiler takes four at a time in a loop; Python's it does not."""
+    """max(x, y) of what is not NaN, four at a time in a loop; Python's is compiled one by one."""
 
     def generate(_, builder, signature, numbers):
         double = ir.DoubleType()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_qpmpc import kernels, theta_kernels
 from torch_qpmpc.batching import broadcast, flatten
-from torch_qpmpc.qp import NDIMS, crossed
+from torch_qpmpc.qp import NDIMS, Sizes, crossed
 from torch_qpmpc.twofold import Twofold
 
 T = TypeVar("T")
@@ -108,8 +108,7 @@ class FlatPrograms(Twofold[ProgramArrays]):
         """
         *theta, fixed = operands
         if any(t.ndim > n for t, n in zip(theta, NDIMS, strict=True)):
-            batches = (t.shape[: t.ndim - n] for t, n in zip(theta, NDIMS, strict=True))
-            batch = broadcast(*batches, fixed.shape[:-1])
+            batch = broadcast(Sizes.of(theta).batch_shape, fixed.shape[:-1])
             fixed = flatten(fixed, batch, device)
             return cls._flat([tensor.detach() for tensor in theta], batch, fixed), batch
         batch = fixed.shape[:-1]
@@ -131,7 +130,7 @@ class FlatPrograms(Twofold[ProgramArrays]):
             known = {"inspected": inspected}
             made = cls.of_arrays(arrays, device, group=group, fixed=fixed, _known=known)
             if device.type != "cpu":  # moved once, for all that share theta
-                made.make_tensors()
+                made.all_tensors()
             return made
         given = (x.unsqueeze(0) for x in _prepared(kernels.tensors(theta, device), fixed))
         H, q, c, C, b, G, lb, ub, w = given
@@ -210,8 +209,9 @@ class FlatPrograms(Twofold[ProgramArrays]):
 
     @property
     def _inspected(self) -> _Inspected:
-        make = partial(_Inspected.of, self.arrays, self.group_array, self.device)
-        return self.known("inspected", make)
+        return self.known(
+            "inspected", lambda: _Inspected.of(self.arrays, self.group_array, self.device)
+        )
 
     def times_H(self, z: Tensor) -> Tensor:
         """H z, ``(B, n_z)``."""
@@ -274,7 +274,7 @@ def _prepared(theta: Sequence[Tensor], like: Tensor) -> tuple[Tensor, ...]:
 class _Inspected(NamedTuple):
     """`FlatPrograms.valid` of all but the fixed entries, and `FlatPrograms.is_diagonal`.
 
-    ``regular`` says that all are valid, and all of H symmetric.
+    ``regular`` says of a single QP that it is valid, and H symmetric.
     """
 
     valid: Tensor | None

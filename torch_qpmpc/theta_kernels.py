@@ -18,7 +18,7 @@ from torch_qpmpc.kernels import add_product, compiled, products, summing
 def inspect(H, C, G, group, q, c, b, lb, ub, w):
     """Which QPs have finite data and lb <= ub, ``(B or 1,)``, or None if all have.
 
-    And whether H and G are diagonal, and all of H symmetric.
+    And of one H and G that all share, whether they are diagonal, and H symmetric.
     """
     M = len(H)
     finite = np.empty(M, np.bool_)
@@ -35,17 +35,16 @@ def inspect(H, C, G, group, q, c, b, lb, ub, w):
             good = good and ub[of_ub, j] - lb[of_lb, j] >= 0 and w[of_w, j] >= 0
         valid[i] = good
     some = None if valid.all() else valid
-    one_H, one_G = M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
-    return some, one_H, one_G, one_H or _are_symmetric(H)
+    of_H, of_G = M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
+    return some, of_H, of_G, of_H or (M == 1 and _is_symmetric(H[0]))
 
 
 @compiled
-def _are_symmetric(matrices):
-    for m in range(matrices.shape[0]):
-        for i in range(matrices.shape[1]):
-            for j in range(i):
-                if matrices[m, i, j] != matrices[m, j, i]:
-                    return False
+def _is_symmetric(matrix):
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            if matrix[i, j] != matrix[j, i]:
+                return False
     return True
 
 

@@ -32,21 +32,20 @@ class Twofold(Generic[A]):
     @cached_property
     def arrays(self) -> A:
         """The tensors as the kernels take them."""
-        return self.Arrays(*kernels.arrays(*(getattr(self, name) for name in self.Arrays._fields)))
+        return self.Arrays(*kernels.arrays(*self.all_tensors()))
 
     @cached_property
     def device(self) -> torch.device:
         """Where the tensors are."""
         return getattr(self, self.Arrays._fields[0]).device
 
-    def make_tensors(self) -> None:
-        """Make all that are not there yet."""
-        for name in self.Arrays._fields:
-            getattr(self, name)
+    def all_tensors(self) -> list[Tensor]:
+        """Those of ``Arrays``; makes what is not there yet."""
+        return [getattr(self, name) for name in self.Arrays._fields]
 
     def forget_arrays(self) -> None:
         """Tensors have changed: copies of what they were are of no use."""
-        self.make_tensors()
+        self.all_tensors()
         vars(self).pop("arrays", None)
 
     def __getattr__(self, name: str) -> Tensor:

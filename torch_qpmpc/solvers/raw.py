@@ -60,16 +60,13 @@ class RawSolution(Twofold[RawArrays]):
 
     def at(self, index: Tensor) -> RawSolution:
         """The solutions at ``index``."""
-        return RawSolution(*(x[index] for x in self._tensors()))  # pyright: ignore[reportArgumentType]
+        return RawSolution(*(x[index] for x in self.all_tensors()))  # pyright: ignore[reportArgumentType]
 
     def put(self, index: Tensor, other: RawSolution) -> None:
-        for own, others in zip(self._tensors(), other._tensors(), strict=True):
+        for own, others in zip(self.all_tensors(), other.all_tensors(), strict=True):
             own[index] = others
         self.worst = math.inf
         self.forget_arrays()
-
-    def _tensors(self) -> list[Tensor]:
-        return [getattr(self, name) for name in RawArrays._fields]
 
 
 def unsolved(p: FlatPrograms, status: Status = Status.INVALID_DATA) -> RawSolution:
