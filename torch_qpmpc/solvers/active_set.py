@@ -1,9 +1,9 @@
 """Active-set Newton steps for a whole batch: the end of the interior point.
 
-With the rows' states held (see `crossover`), the KKT conditions are linear. The method of
-multipliers solves them: a large curvature holds the active rows at their bounds, and its error
-falls by orders of magnitude a pass, so one Cholesky factor of d x d and no pivoting suffices,
-dependent active rows included.
+With the rows' states held (see `crossover`), the KKT conditions of the condensed QP (eq:qp2,
+eq:qp3) are linear. The method of multipliers solves them: a large curvature holds the active rows
+at their bounds, and its error falls by orders of magnitude a pass, so one Cholesky factor of d x d
+and no pivoting suffices, dependent active rows included.
 """
 
 from __future__ import annotations

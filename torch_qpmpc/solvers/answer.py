@@ -1,4 +1,4 @@
-"""What a backend hands back: a claim, which the certificate judges."""
+"""What a backend hands back of a condensed QP (eq:qp2, eq:qp3): a claim, which is judged."""
 
 from __future__ import annotations
 
