@@ -335,7 +335,14 @@ def traceable(eager: Any, compiled: Any, operator: Any) -> Any:
             "vmap, or one grad, jacrev or vjp of a scalar",
             "Leave this function out: torch.compiler.disable.",
         )
-    return compiled.apply
+
+    def apply(*arguments: Any) -> Any:
+        # Of a tensor that `grad` differentiates in, and that is no result, Dynamo takes the
+        # gradient for zero, or fails.
+        own = (x.view_as(x) if isinstance(x, Tensor) else x for x in arguments)
+        return compiled.apply(*own)
+
+    return apply
 
 
 def is_traced(tensors: Sequence[Tensor]) -> bool:

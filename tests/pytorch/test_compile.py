@@ -13,7 +13,8 @@ from torch.func import grad, jvp, vmap
 from torch.testing import assert_close
 
 from tests.problems import random_mpc, random_states
-from torch_qpmpc import QPMPC
+from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
+from torch_qpmpc.qp import EVENT_SHAPES
 
 Function = Callable[[Tensor, Tensor], Tensor]
 
@@ -61,6 +62,24 @@ def test_a_gradient_inside_of_what_is_compiled():
     function = functions(mpc)["dV/ds"]
     compiled = torch.compile(function, fullgraph=True, backend="aot_eager")
     assert_close(compiled(s, s), function(s, s))
+
+
+@pytest.mark.parametrize("of", ["fixed", "q"])
+@pytest.mark.parametrize("output", ["value", "z"])
+def test_a_gradient_in_what_is_passed_as_it_is(output, of):
+    qp, s = random_mpc(3).quadratic_program(), random_states(4)
+    given = {name: x.detach() for name, x in zip(EVENT_SHAPES, qp.tensors(), strict=True)}
+    given["fixed"] = s
+
+    def total(x: Tensor) -> Tensor:
+        theta = given | {of: x}
+        fixed = theta.pop("fixed")
+        return getattr(solve_qp(QuadraticProgram(**theta, check_values=False), fixed), output).sum()
+
+    compiled = torch.compile(grad(total), fullgraph=True, backend="aot_eager")
+    expected = grad(total)(given[of])
+    assert expected.abs().max() > 0.1
+    assert_close(compiled(given[of]), expected)
 
 
 def test_compiled_by_inductor_equals_eager():
