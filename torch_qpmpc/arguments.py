@@ -19,6 +19,7 @@ from torch_qpmpc.checks import (
     check_whole,
 )
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.precision import to_dtype
 from torch_qpmpc.steps import check_step
 
 HESSIANS = ("diagonal", "block", "full")
@@ -177,4 +178,4 @@ def check_pair(s: Tensor, a: Tensor, n_x: int, n_u: int, device: torch.device) -
         raise QPError.expected("a", got, want) from error
     if not s.shape[:-1] == a.shape[:-1] == batch:
         s, a = s.expand(*batch, -1), a.expand(*batch, -1)
-    return torch.cat((s, a.to(s.dtype)), dim=-1)
+    return torch.cat((s, to_dtype(a, s.dtype)), dim=-1)

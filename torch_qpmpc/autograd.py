@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from torch_qpmpc import kernels
 from torch_qpmpc.batching import align, broadcast, listed, outer, sum_to, weighted_sum
@@ -33,6 +32,7 @@ from torch_qpmpc.qp import NDIMS, UNKNOWN, QPSolution, QuadraticProgram, Sizes, 
 from torch_qpmpc.sensitivity import (
     differentiable,
     is_differentiating,
+    is_plain,
     is_traced,
     signed,
     traceable,
@@ -93,7 +93,7 @@ def solve_qp(
             raise QPError.expected(name, repr(choice), "a name")
     if fixed is None:
         fixed = qp.q.new_zeros(0)
-    theta = _operands(qp, fixed)
+    theta = _operands(qp, fixed, qp.sizes)
     start = _checked_start(qp, fixed, warm_start)
     keep = _checked_keep(qp, fixed, keep)
     value, z, _, chi, lam, xi, status, residual, iterations = _solve(
@@ -108,8 +108,9 @@ def optimal_value(
     qp: QuadraticProgram, fixed: Tensor, *, solver: str, on_failure: str, keep: int | None = None
 ) -> Tensor:
     """The optimal cost alone, ``(*batch,)``: `solve_qp` without the rest of the solution."""
-    given = (*_operands(qp, fixed), None, _checked_keep(qp, fixed, keep), solver, on_failure)
-    return _solve_plain(given)[0] if _is_plain(qp, given) else _solve(*given)[0]
+    theta = _operands(qp, fixed, sizes := qp.sizes)
+    given = (*theta, None, _checked_keep(qp, fixed, keep), solver, on_failure)
+    return _solve_plain(given)[0] if _is_plain(sizes, given) else _solve(*given)[0]
 
 
 def value_and_active_set(
@@ -124,10 +125,10 @@ def value_and_active_set(
     """``value`` and ``active`` of `solve_qp`, of which only the former is differentiable."""
     start = _checked_start(qp, fixed, warm_start)
     keep = _checked_keep(qp, fixed, keep)
-    given = (*_operands(qp, fixed), start, keep, solver, on_failure)
-    if _is_plain(qp, given):
+    given = (*_operands(qp, fixed, sizes := qp.sizes), start, keep, solver, on_failure)
+    if _is_plain(sizes, given):
         value, found = _solve_plain(given)
-        rows = kernels.arrays(*(x.detach() for x in (qp.G, qp.lb, qp.ub, qp.w)))
+        rows = kernels.arrays(qp.G, qp.lb, qp.ub, qp.w)
         sets = kernels.active_sets(found.z, found.lam, found.status, *rows, UNKNOWN)
         return value, torch.from_numpy(sets)
     value, z, _, chi, lam, xi, status, residual, iterations = _solve(*given)
@@ -135,11 +136,9 @@ def value_and_active_set(
     return value, solution.active
 
 
-def _is_plain(qp: QuadraticProgram, given: Sequence[Any]) -> bool:
+def _is_plain(sizes: Sizes, given: Sequence[Any]) -> bool:
     """Whether the operator's arguments are for kernels, and no more than reverse mode looks on."""
-    if not _is_for_kernels(qp.sizes, qp.H, given[N_THETA - 1]):
-        return False
-    return forward_ad._current_level < 0 and not is_traced(given[:N_THETA])
+    return _is_for_kernels(sizes, given[0], given[N_THETA - 1]) and is_plain(given[:N_THETA])
 
 
 def _is_for_kernels(sizes: Sizes, *tensors: Tensor) -> bool:
@@ -156,7 +155,7 @@ def _solve_plain(given: Sequence[Any]) -> tuple[Tensor, RawArrays]:
     """The value alone, and the rest of the solution as arrays, which nobody else can change."""
     raw, _ = _solve_flat(*given)
     if not is_differentiating():
-        return raw.value, raw.arrays
+        return torch.from_numpy(raw.arrays.value), raw.arrays
     return Envelope.apply(raw, given[KEEP], *given[:N_THETA]), raw.arrays
 
 
@@ -167,7 +166,7 @@ def _solve(*arguments: Any) -> Outputs:
     return traceable(QPTangent, QPValue, solve_op)(*arguments)
 
 
-def _operands(qp: QuadraticProgram, fixed: Tensor) -> tuple[Tensor, ...]:
+def _operands(qp: QuadraticProgram, fixed: Tensor, sizes: Sizes) -> tuple[Tensor, ...]:
     if not isinstance(fixed, Tensor) or not fixed.is_floating_point():
         got = fixed.dtype if isinstance(fixed, Tensor) else type(fixed).__name__
         raise QPError.expected("fixed", got, "a floating-point torch.Tensor", "Convert it first.")
@@ -181,12 +180,12 @@ def _operands(qp: QuadraticProgram, fixed: Tensor) -> tuple[Tensor, ...]:
             f"shape (*batch, n_f) with n_f <= n_z = {qp.n_z}",
         )
     try:
-        broadcast(qp.batch_shape, fixed.shape[:-1])
+        broadcast(sizes.batch_shape, fixed.shape[:-1])
     except RuntimeError as error:
         raise QPError.expected(
             "fixed",
             f"shape {tuple(fixed.shape)}",
-            f"leading dimensions that broadcast with the QP's batch {tuple(qp.batch_shape)}",
+            f"leading dimensions that broadcast with the QP's batch {tuple(sizes.batch_shape)}",
         ) from error
     return (*qp.tensors(), fixed)
 

@@ -13,16 +13,18 @@ from torch import Tensor
 def broadcast(*shapes: Sequence[int]) -> torch.Size:
     """`torch.broadcast_shapes`, at once where there is nothing to broadcast."""
     common: Sequence[int] = ()
-    for shape in shapes:
-        if len(shape) and len(common) and tuple(shape) != tuple(common):
+    for shape in filter(len, shapes):
+        if len(common) and tuple(shape) != tuple(common):
             return torch.broadcast_shapes(*shapes)
-        common = shape if len(shape) else common
+        common = shape
     return torch.Size(common)
 
 
 def flatten(vectors: Tensor, batch: torch.Size, device: torch.device | str = "cpu") -> Tensor:
     """``(*batch, n)``, or what broadcasts to it, as ``(B, n)``: detached, float64."""
-    flat = vectors.detach().to(device, torch.float64)
+    flat = vectors.detach()
+    if flat.dtype != torch.float64 or flat.device != device:
+        flat = flat.to(device, torch.float64)
     if flat.ndim == 2 and flat.shape[:1] == batch:
         return flat
     return listed(flat.expand(*batch, vectors.shape[-1]))

@@ -72,10 +72,11 @@ def check_tensor(
         how = f"Convert it: torch.as_tensor({name}).float()."
         raise QPError.expected(name, got, "a floating-point torch.Tensor", how)
     lead = value.ndim - len(event)
-    sizes = value.shape[max(lead, 0) :]
-    pairs = zip(event, sizes, strict=False)
     fits = lead == 0 or (batched and lead > 0)
-    if not fits or any(n != size for n, size in pairs if isinstance(n, int)):
+    if fits and value.shape[lead:] != event:
+        pairs = zip(event, value.shape[lead:], strict=True)
+        fits = all(n == size for n, size in pairs if isinstance(n, int))
+    if not fits:
         raise QPError.expected(
             name, f"shape {tuple(value.shape)}", f"shape {_shape(event, batched)}", remedy
         )

@@ -38,11 +38,9 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
 
 
 def arrays(*tensors: Tensor) -> list[np.ndarray]:
-    """The tensors of any device as a kernel takes them."""
+    """The tensors of any device as a kernel takes them, detached; those on the CPU not copied."""
     # Each step of the way costs as much as a kernel spends on a QP: none without need.
-    return [
-        (x if x.is_cpu and x.is_contiguous() else x.cpu().contiguous()).numpy() for x in tensors
-    ]
+    return [(x if x.is_contiguous() else x.contiguous()).numpy(force=True) for x in tensors]
 
 
 def tensors(found: Iterable[np.ndarray], device: torch.device) -> list[Tensor]:

@@ -25,9 +25,10 @@ from torch_qpmpc.arguments import (
 )
 from torch_qpmpc.autograd import optimal_value, solve_qp, value_and_active_set
 from torch_qpmpc.checks import check_kind, check_tensor
+from torch_qpmpc.cost import Cost, Discounts, diagonal_cost, discounted
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.parametrizations import SIGNED, Banded, Tied, kept
-from torch_qpmpc.precision import full_precision
+from torch_qpmpc.precision import full_precision, to_dtype
 from torch_qpmpc.qp import QPSolution, QuadraticProgram
 from torch_qpmpc.solvers import backend
 from torch_qpmpc.steps import CHOLESKY, NEAREST
@@ -220,7 +221,7 @@ class QPMPC(nn.Module):
 
     def policy(self, s: Tensor) -> Tensor:
         """pi(s), the u_0 of V's solution: s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
-        return self.solve(s).z[..., self.n_x : self.n_x + self.n_u].to(s.dtype)
+        return to_dtype(self.solve(s).z[..., self.n_x : self.n_x + self.n_u], s.dtype)
 
     def forward(self, s: Tensor, a: Tensor | None = None) -> Tensor:
         """V(s), or Q(s, a) where an action is given."""
@@ -239,7 +240,8 @@ class QPMPC(nn.Module):
         """
         fixed = self._checked(s, a)
         qp = self._today(qp)
-        return solve_qp(qp, fixed.to(qp.C.dtype), warm_start=warm_start, **self._options())
+        fixed = to_dtype(fixed, qp.C.dtype)
+        return solve_qp(qp, fixed, warm_start=warm_start, **self._options())
 
     def value_and_active_set(
         self, s: Tensor, a: Tensor | None = None, warm_start: Tensor | None = None
@@ -252,9 +254,9 @@ class QPMPC(nn.Module):
         fixed = self._checked(s, a)
         qp = self.quadratic_program()
         value, active = value_and_active_set(
-            qp, fixed.to(qp.C.dtype), warm_start=warm_start, **self._options()
+            qp, to_dtype(fixed, qp.C.dtype), warm_start=warm_start, **self._options()
         )
-        return value.to(fixed.dtype), active
+        return to_dtype(value, fixed.dtype), active
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """The states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
@@ -321,17 +323,17 @@ class QPMPC(nn.Module):
     def quadratic_program(self) -> QuadraticProgram:
         """Today's theta as a QuadraticProgram, discounts included (eq:qpH)."""
         with full_precision(self.C_0):
-            blocks = (self.H,) if self.hessian == "full" else (self.H, self.H_f)
+            H, q, w = self._cost()
             return QuadraticProgram(
-                H=self._layout.hessian(self.hessian, blocks, self.discount, self.stages),
-                q=self.discount * self.q,
+                H=H,
+                q=q,
                 c=self.c,
                 C=self.C,
                 b=self.b,
                 G=self.G,
                 lb=self._limits(self.lb),
                 ub=self._limits(self.ub),
-                w=torch.addcmul(self.hardness, self.slack_discount, self.w),
+                w=w,
                 check_values=False,
             )
 
@@ -402,12 +404,24 @@ class QPMPC(nn.Module):
 
     def _value(self, fixed: Tensor, qp: QuadraticProgram | None) -> Tensor:
         qp = self._today(qp)
-        return optimal_value(qp, fixed.to(qp.C.dtype), **self._options()).to(fixed.dtype)
+        value = optimal_value(qp, to_dtype(fixed, qp.C.dtype), **self._options())
+        return to_dtype(value, fixed.dtype)
 
     def _options(self) -> dict[str, Any]:
         """What V, Q and the policy ask of every solve; one ``keep``, to share one elimination."""
         keep = self.n_x + self.n_u
         return {"solver": self.solver, "on_failure": self.on_failure, "keep": keep}
+
+    def _cost(self) -> Cost:
+        """H, q and w of the QP."""
+        by = Discounts(self.discount, self.slack_discount, self.hardness, self.stages)
+        if self.hessian == "diagonal":
+            factors, squared = zip(*(parts.factor(self, x) for x in ("H", "H_f", "w")), strict=True)
+            found = diagonal_cost(self._layout, (*factors, self.q), squared, by)
+            if found is not None:
+                return found
+        blocks = (self.H,) if self.hessian == "full" else (self.H, self.H_f)
+        return discounted(self._layout, self.hessian, blocks, self.q, self.w, by)
 
     def _limits(self, bounds: Tensor) -> Tensor:
         """lb or ub, which an MPC scheme does not learn on hard rows: those are known (eq:v1c3)."""

@@ -16,7 +16,7 @@ from torch.nn.utils import parametrize
 from torch_qpmpc.arguments import CONSTRAINTS, COST
 from torch_qpmpc.checks import check_number
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.parametrizations import Banded, LinearRows, Tied
+from torch_qpmpc.parametrizations import Banded, LinearRows, SquareRoot, Tied
 
 
 def register(module: nn.Module, name: str, value: Tensor, learned: bool) -> None:
@@ -56,6 +56,15 @@ def leaves(module: nn.Module, name: str) -> list[nn.Parameter]:
     if not parametrize.is_parametrized(module, name):
         return [module.get_parameter(name)]
     return list(module.get_submodule(f"parametrizations.{name}").parameters(recurse=False))
+
+
+def factor(module: nn.Module, name: str) -> tuple[Tensor, bool]:
+    """What a part is the square of, and True where it is a square; else the part."""
+    kept: Any = module._modules.get("parametrizations", {})
+    of_part = kept[name] if name in kept else ()  # noqa: SIM401 - a ModuleDict has no get
+    if len(of_part) == 1 and type(of_part[0]) is SquareRoot:
+        return of_part.original, True
+    return getattr(module, name), False
 
 
 def readable(module: nn.Module, learned: Collection[str]) -> dict[str, Tensor]:

@@ -8,6 +8,11 @@ import torch
 from torch import Tensor
 
 
+def to_dtype(tensor: Tensor, dtype: torch.dtype) -> Tensor:
+    """``tensor.to(dtype)``, which to ask for takes longer than to see that nothing is to do."""
+    return tensor if tensor.dtype == dtype else tensor.to(dtype)
+
+
 def full_precision(like: Tensor) -> AbstractContextManager[object]:
     """A block without autocast on the device of ``like``."""
     device = like.device.type

@@ -38,7 +38,7 @@ class ContentMemo(threading.local):
 
         It gets them as arrays of their own, so that its result may contain them.
         """
-        arrays = kernels.arrays(*(tensor.detach() for tensor in tensors))
+        arrays = kernels.arrays(*tensors)
         kind = (options, arrays[0].dtype, tensors[0].device, [x.shape for x in arrays])
         flat = [x.reshape(-1) for x in arrays]
         for position, (known, of_kind, result) in enumerate(self.entries):
@@ -113,7 +113,7 @@ class FlatPrograms(Twofold[ProgramArrays]):
             return cls._flat([tensor.detach() for tensor in theta], batch, fixed), batch
         batch = fixed.shape[:-1]
         fixed = flatten(fixed, batch, device)
-        programs = _memo.get(theta, str(device), lambda *own: cls._shared(own, fixed[:1]))
+        programs = _memo.get(theta, str(device), lambda *own: cls._shared(own, fixed))
         known, n_qps = programs._known, fixed.shape[0]
         if "group" not in known or len(known["group"]) != n_qps:
             known["group"] = _zeros(n_qps, fixed.device)
@@ -121,20 +121,20 @@ class FlatPrograms(Twofold[ProgramArrays]):
 
     @classmethod
     def _shared(cls, theta: Sequence[np.ndarray], fixed: Tensor) -> FlatPrograms:
-        """A single QP, as the form of all that have this theta."""
-        device, group = fixed.device, _zeros(1, fixed.device)
+        """What all QPs of this theta share, for `_with`, on the device of ``fixed``."""
+        device = fixed.device
         H, q, c, C, b, G, lb, ub, w = (x[np.newaxis] for x in theta)
         arrays = ProgramArrays(H, C, G, q, c, b, lb, ub, w)
         inspected = _Inspected.of(arrays, _ONE, device) if H.dtype == np.float64 else None
         if inspected is not None and inspected.regular:
             known = {"inspected": inspected}
-            made = cls.of_arrays(arrays, device, group=group, fixed=fixed, _known=known)
+            made = cls.of_arrays(arrays, device, _known=known)
             if device.type != "cpu":  # moved once, for all that share theta
                 made.all_tensors()
             return made
         given = (x.unsqueeze(0) for x in _prepared(kernels.tensors(theta, device), fixed))
         H, q, c, C, b, G, lb, ub, w = given
-        return cls(H, C, G, group, q, c, b, lb, ub, w, fixed)
+        return cls(H, C, G, _zeros(1, device), q, c, b, lb, ub, w, fixed[:1])
 
     @classmethod
     def _flat(cls, theta: Sequence[Tensor], batch: torch.Size, fixed: Tensor) -> FlatPrograms:

@@ -41,6 +41,8 @@ _functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIs
 
 #: The tensors that nothing but autograd looks at.
 PLAIN = frozenset((Tensor, nn.Parameter))
+#: Of a tensor.
+IS_META = attrgetter("is_meta")
 #: On while `torch.autograd.grad` is asked for gradients with ``is_grads_batched``.
 BATCHED_GRADIENTS = torch._C._dispatch_key_parse("VmapMode")
 #: Residual of the KKT system from which on it counts as singular.
@@ -345,6 +347,11 @@ def traceable(eager: Any, compiled: Any, operator: Any) -> Any:
     return apply
 
 
+def is_plain(tensors: Sequence[Tensor]) -> bool:
+    """Whether nothing looks on at what is done with the tensors, but for reverse mode."""
+    return forward_ad._current_level < 0 and not is_traced(tensors)
+
+
 def is_traced(tensors: Sequence[Tensor]) -> bool:
     """Whether anything but plain tensors may be at work, from which the solvers must be hidden."""
     core = torch._C
@@ -356,7 +363,7 @@ def is_traced(tensors: Sequence[Tensor]) -> bool:
         or core._dispatch_tls_is_dispatch_key_included(BATCHED_GRADIENTS)
         or _functorch.peek_interpreter_stack() is not None  # `torch.func`
         or not PLAIN.issuperset(map(type, tensors))
-        or any(map(attrgetter("is_meta"), tensors))
+        or any(map(IS_META, tensors))
     )
 
 

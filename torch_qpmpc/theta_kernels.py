@@ -15,6 +15,41 @@ from torch_qpmpc.kernels import add_product, compiled, products, summing
 
 
 @compiled
+def diagonal_cost(H, H_f, w, q, of_z, of_rows, hardness, stages, H_squared, H_f_squared, w_squared):
+    """H, q and w of `cost.diagonal_cost`."""
+    n_z, n = len(of_z), len(H)
+    found, q_found, w_found = np.zeros((n_z, n_z)), np.empty(n_z), np.empty(len(w))
+    for i in range(n_z):
+        k = stages[i]
+        weight, is_squared = (H[k], H_squared) if k < n else (H_f[k - n], H_f_squared)
+        found[i, i] = of_z[i] * (weight * weight if is_squared else weight)
+        q_found[i] = of_z[i] * q[i]
+    for i in range(len(w)):
+        w_found[i] = hardness[i] + of_rows[i] * (w[i] * w[i] if w_squared else w[i])
+    return found, q_found, w_found
+
+
+@compiled
+def diagonal_cost_gradient(
+    of_H, of_q, of_w,
+    H, H_f, w, q, of_z, of_rows, hardness, stages, H_squared, H_f_squared, w_squared,
+):  # fmt: skip
+    """In H, H_f, w and q, or what they are the squares of, from that in what it makes of them."""
+    n = len(H)
+    to_H, to_H_f, to_w, to_q = np.zeros(n), np.zeros(len(H_f)), np.empty(len(w)), np.empty(len(q))
+    for i in range(len(of_z)):
+        k, pull = stages[i], of_z[i] * of_H[i, i]
+        if k < n:
+            to_H[k] += pull * (2 * H[k] if H_squared else 1.0)
+        else:
+            to_H_f[k - n] += pull * (2 * H_f[k - n] if H_f_squared else 1.0)
+        to_q[i] = of_z[i] * of_q[i]
+    for i in range(len(w)):
+        to_w[i] = of_rows[i] * of_w[i] * (2 * w[i] if w_squared else 1.0)
+    return to_H, to_H_f, to_w, to_q
+
+
+@compiled
 def inspect(H, C, G, group, q, c, b, lb, ub, w):
     """Which QPs have finite data and lb <= ub, ``(B or 1,)``, or None if all have.
 

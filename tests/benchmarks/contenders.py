@@ -43,8 +43,9 @@ class Gradient:
             V = self.value(self.batch.following, qp)
         Q = self.action_value(self.batch.s, self.batch.a, qp)
         with torch.no_grad():
-            minus_delta = Q - torch.add(self.batch.cost, V, alpha=GAMMA)
-        Q.backward(minus_delta / len(V))
+            minus_delta = torch.sub(Q - self.batch.cost, V, alpha=GAMMA)
+            incoming = minus_delta / float(len(V))  # of an integer, torch would make a tensor
+        Q.backward(incoming)
         return V, Q.detach()
 
     def flat(self) -> Tensor:

@@ -1,0 +1,181 @@
+"""The QP's cost of theta (eq:qpH): one kernel for it and its gradient, equal to torch's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call, jacrev, jvp
+from torch.nn.utils import parametrize
+from torch.testing import assert_close
+
+from tests.problems import MIXED, normal, random_mpc
+from torch_qpmpc import QPMPC, parts
+from torch_qpmpc import mpc as mpc_module
+from torch_qpmpc.cost import DiagonalCost
+
+COST = ("H", "H_f", "q", "w")
+OPTIONS = {
+    "free": {},
+    "tied": {"structure": "tied"},
+    "discounted slacks": {"discount_slack": True, **MIXED},
+    "H": {"learn": ("H", "c", "C")},
+    "w": {"learn": ("w",)},
+    "projected": {"step": "projection"},
+    "weights of each stage": {"stage_weight": normal(3, 3).abs()},
+    "block": {"hessian": "block"},
+}
+
+
+def example(name: str) -> QPMPC:
+    return random_mpc(4, **{"learn": (*COST, "C"), "gamma": 0.7, **OPTIONS[name]})
+
+
+def cost(mpc: QPMPC) -> tuple[Tensor, Tensor, Tensor]:
+    qp = mpc.quadratic_program()
+    return qp.H, qp.q, qp.w
+
+
+def is_by_kernel(*of_qp: Tensor) -> bool:
+    return any(x.grad_fn is not None and "DiagonalCost" in x.grad_fn.name() for x in of_qp)
+
+
+@pytest.fixture
+def by_torch(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """From the call on, the cost is made by torch's operations."""
+    return lambda: monkeypatch.setattr(mpc_module, "diagonal_cost", lambda *_: None)
+
+
+class Weighted(nn.Module):
+    """`weighted`, for `functional_call`."""
+
+    def __init__(self, mpc: QPMPC) -> None:
+        super().__init__()
+        self.mpc = mpc
+
+    def forward(self) -> Tensor:
+        return weighted(self.mpc, "H", "q", "w")
+
+
+def weighted(mpc: QPMPC, *names: str) -> Tensor:
+    """A number in which every entry of H, q or w has a weight of its own; inf aside."""
+    found = dict(zip(("H", "q", "w"), cost(mpc), strict=True))
+    asked = (x[x.isfinite()] for name, x in found.items() if name in names)
+    return torch.stack([normal(len(x), seed=len(x)) @ x for x in asked]).sum()
+
+
+@pytest.mark.parametrize("differentiated", [True, False])
+@pytest.mark.parametrize("name", OPTIONS)
+def test_the_kernel_makes_what_torch_makes(by_torch, name, differentiated):
+    mpc = example(name)
+    with torch.set_grad_enabled(differentiated):
+        ours = cost(mpc)
+        by_torch()
+        others = cost(mpc)
+    expected = differentiated and name not in ("weights of each stage", "block")
+    assert is_by_kernel(*ours) == expected
+    assert not is_by_kernel(*others)
+    for one, other in zip(ours, others, strict=True):
+        assert_close(one, other, rtol=1e-14, atol=0.0)
+        assert one.requires_grad == other.requires_grad
+
+
+@pytest.mark.parametrize("of", [("H", "q", "w"), ("H",), ("q",), ("w",)])
+@pytest.mark.parametrize("name", OPTIONS)
+def test_its_gradient_is_that_of_torch(by_torch, name, of):
+    mpc = example(name)
+
+    def gradients() -> tuple[Tensor | None, ...]:
+        total = weighted(mpc, *of)
+        if not total.requires_grad:
+            return ()
+        return torch.autograd.grad(total, [*mpc.parameters()], allow_unused=True)
+
+    ours = gradients()
+    by_torch()
+    others = gradients()
+    assert len(ours) == len(others)
+    for one, other in zip(ours, others, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None:
+            assert_close(one, other, rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["free", "tied", "H", "projected"])
+def test_it_and_its_gradient_pass_finite_differences(name):
+    mpc = example(name)
+    names, start = zip(*mpc.named_parameters(), strict=True)
+
+    def program(*theta: Tensor) -> Tensor:
+        return functional_call(
+            Weighted(mpc), dict(zip((f"mpc.{x}" for x in names), theta, strict=True))
+        )
+
+    assert is_by_kernel(*cost(mpc))
+    leaves = [x.detach().clone().requires_grad_() for x in start]
+    assert torch.autograd.gradcheck(program, leaves)
+    assert torch.autograd.gradgradcheck(program, leaves)
+
+
+def test_gradients_may_be_batched():
+    mpc = example("free")
+    H, leaves = cost(mpc)[0], [*parts.leaves(mpc, "H"), *parts.leaves(mpc, "H_f")]
+    incoming = normal(5, *H.shape)
+    batched = torch.autograd.grad(H, leaves, incoming, is_grads_batched=True, retain_graph=True)
+    for i in range(5):
+        alone = torch.autograd.grad(H, leaves, incoming[i], retain_graph=True)
+        assert_close([x[i] for x in batched], [*alone])
+
+
+@pytest.mark.parametrize("create_graph", [True, False])
+def test_theta_that_has_changed_since_is_noticed(create_graph):
+    mpc = example("free")
+    total = weighted(mpc, "H")
+    with torch.no_grad():
+        parts.leaves(mpc, "H")[0].mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        torch.autograd.grad(total, [*mpc.parameters()], create_graph=create_graph)
+
+
+def test_transforms_and_forward_mode_see_torch_alone(by_torch):
+    mpc = example("free")
+    leaves = {"mpc." + name: x.detach() for name, x in mpc.named_parameters()}
+
+    def program(theta: dict[str, Tensor]) -> Tensor:
+        return functional_call(Weighted(mpc), theta)
+
+    ones = {name: torch.ones_like(x) for name, x in leaves.items()}
+    found = jacrev(program)(leaves), jvp(program, (leaves,), (ones,))
+    by_torch()
+    assert_close(found, (jacrev(program)(leaves), jvp(program, (leaves,), (ones,))))
+
+
+def test_another_parametrization_of_a_part_is_heard():
+    class Doubled(nn.Module):
+        def forward(self, weight: Tensor) -> Tensor:
+            return 2 * weight
+
+    mpc = example("free")
+    before = cost(mpc)
+    for part in ("H", "H_f", "q"):
+        parametrize.register_parametrization(mpc, part, Doubled())
+    after = cost(mpc)
+    assert is_by_kernel(*after)
+    assert_close(after, (2 * before[0], 2 * before[1], before[2]))
+
+
+def test_single_precision_is_left_to_torch():
+    mpc = example("free").float()
+    H, q, w = cost(mpc)
+    assert H.dtype == q.dtype == w.dtype == torch.float32
+    assert not is_by_kernel(H, q, w)
+
+
+def test_what_is_not_learned_has_no_gradient_asked_for():
+    mpc = random_mpc(4, learn=("H", "C"))
+    H, q, w = cost(mpc)
+    assert (H.requires_grad, q.requires_grad, w.requires_grad) == (True, False, False)
+    assert H.grad_fn is not None
+    assert H.grad_fn.name() == DiagonalCost.__name__ + "Backward"
