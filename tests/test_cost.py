@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -48,14 +49,16 @@ def by_torch(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     return lambda: monkeypatch.setattr(mpc_module, "diagonal_cost", lambda *_: None)
 
 
-class Weighted(nn.Module):
-    """`weighted`, for `functional_call`."""
+class Of(nn.Module):
+    """A function of a QPMPC, `weighted` or another, for `functional_call`."""
 
-    def __init__(self, mpc: QPMPC) -> None:
+    def __init__(self, mpc: QPMPC, function: Callable[[QPMPC], Any] | None = None) -> None:
         super().__init__()
-        self.mpc = mpc
+        self.mpc, self.function = mpc, function
 
-    def forward(self) -> Tensor:
+    def forward(self) -> Any:
+        if self.function is not None:
+            return self.function(self.mpc)
         return weighted(self.mpc, "H", "q", "w")
 
 
@@ -109,9 +112,7 @@ def test_it_and_its_gradient_pass_finite_differences(name):
     names, start = zip(*mpc.named_parameters(), strict=True)
 
     def program(*theta: Tensor) -> Tensor:
-        return functional_call(
-            Weighted(mpc), dict(zip((f"mpc.{x}" for x in names), theta, strict=True))
-        )
+        return functional_call(Of(mpc), dict(zip((f"mpc.{x}" for x in names), theta, strict=True)))
 
     assert is_by_kernel(*cost(mpc))
     leaves = [x.detach().clone().requires_grad_() for x in start]
@@ -144,7 +145,7 @@ def test_transforms_and_forward_mode_see_torch_alone(by_torch):
     leaves = {"mpc." + name: x.detach() for name, x in mpc.named_parameters()}
 
     def program(theta: dict[str, Tensor]) -> Tensor:
-        return functional_call(Weighted(mpc), theta)
+        return functional_call(Of(mpc), theta)
 
     ones = {name: torch.ones_like(x) for name, x in leaves.items()}
     found = jacrev(program)(leaves), jvp(program, (leaves,), (ones,))
@@ -171,6 +172,21 @@ def test_single_precision_is_left_to_torch():
     H, q, w = cost(mpc)
     assert H.dtype == q.dtype == w.dtype == torch.float32
     assert not is_by_kernel(H, q, w)
+
+
+@pytest.mark.parametrize("name", ["q", "parametrizations.H.original"])
+def test_other_shapes_are_left_to_torch(name):
+    """Several q make a batch of QPs; an H of another size does not fit."""
+    mpc = example("free")
+    parameter = mpc.get_parameter(name).detach()
+    if name == "q":
+        _, alone, _ = cost(mpc)
+        several = torch.stack((parameter, 2 * parameter))
+        _, q, _ = functional_call(Of(mpc, cost), {"mpc.q": several})
+        assert_close(q, torch.stack((alone, 2 * alone)))
+    else:
+        with pytest.raises(IndexError, match="index out of range"):
+            functional_call(Of(mpc, cost), {f"mpc.{name}": parameter[:-1]})
 
 
 def test_what_is_not_learned_has_no_gradient_asked_for():

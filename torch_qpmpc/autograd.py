@@ -110,7 +110,7 @@ def optimal_value(
     """The optimal cost alone, ``(*batch,)``: `solve_qp` without the rest of the solution."""
     theta = _operands(qp, fixed, sizes := qp.sizes)
     given = (*theta, None, _checked_keep(qp, fixed, keep), solver, on_failure)
-    return _solve_plain(given)[0] if _is_plain(sizes, given) else _solve(*given)[0]
+    return _solve_plain(given)[0] if _takes_kernels(sizes, given) else _solve(*given)[0]
 
 
 def value_and_active_set(
@@ -126,7 +126,7 @@ def value_and_active_set(
     start = _checked_start(qp, fixed, warm_start)
     keep = _checked_keep(qp, fixed, keep)
     given = (*_operands(qp, fixed, sizes := qp.sizes), start, keep, solver, on_failure)
-    if _is_plain(sizes, given):
+    if _takes_kernels(sizes, given):
         value, found = _solve_plain(given)
         rows = kernels.arrays(qp.G, qp.lb, qp.ub, qp.w)
         sets = kernels.active_sets(found.z, found.lam, found.status, *rows, UNKNOWN)
@@ -136,7 +136,7 @@ def value_and_active_set(
     return value, solution.active
 
 
-def _is_plain(sizes: Sizes, given: Sequence[Any]) -> bool:
+def _takes_kernels(sizes: Sizes, given: Sequence[Any]) -> bool:
     """Whether the operator's arguments are for kernels, and no more than reverse mode looks on."""
     return _is_for_kernels(sizes, given[0], given[N_THETA - 1]) and is_plain(given[:N_THETA])
 

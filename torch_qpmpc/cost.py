@@ -52,7 +52,11 @@ def diagonal_cost(
         squared: which of H, H_f and w are.
         by: the discounts.
     """
-    fits = factors[0].ndim == 1 and all(x.is_cpu and x.dtype == torch.float64 for x in factors)
+    shapes = ((layout.n,), (layout.n_x,), by.of_rows.shape, by.of_z.shape)
+    fits = all(
+        x.shape == shape and x.is_cpu and x.dtype == torch.float64
+        for x, shape in zip(factors, shapes, strict=True)
+    )
     if not (fits and is_plain(factors)):
         return None
     given = kernels.arrays(*factors, *by)

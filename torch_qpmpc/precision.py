@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def to_dtype(tensor: Tensor, dtype: torch.dtype) -> Tensor:
-    """``tensor.to(dtype)``, which to ask for takes longer than to see that nothing is to do."""
+    """``tensor.to(dtype)``, sooner where there is nothing to do."""
     return tensor if tensor.dtype == dtype else tensor.to(dtype)
 
 

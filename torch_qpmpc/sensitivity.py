@@ -339,8 +339,8 @@ def traceable(eager: Any, compiled: Any, operator: Any) -> Any:
         )
 
     def apply(*arguments: Any) -> Any:
-        # Of a tensor that `grad` differentiates in, and that is no result, Dynamo takes the
-        # gradient for zero, or fails.
+        # Dynamo takes the gradient in a tensor for zero, or fails, if it is what `grad`
+        # differentiates in and nothing was done to it before.
         own = (x.view_as(x) if isinstance(x, Tensor) else x for x in arguments)
         return compiled.apply(*own)
 
