@@ -11,10 +11,11 @@ from torch import Tensor, nn
 from torch.func import functional_call, jacrev, jvp
 from torch.nn.utils import parametrize
 from torch.testing import assert_close
+from torch.utils.flop_counter import FlopCounterMode
 
 from tests.problems import MIXED, normal, random_mpc
 from torch_qpmpc import QPMPC, parts
-from torch_qpmpc import mpc as mpc_module
+from torch_qpmpc import cost as cost_module
 from torch_qpmpc.cost import DiagonalCost
 
 COST = ("H", "H_f", "q", "w")
@@ -46,7 +47,7 @@ def is_by_kernel(*of_qp: Tensor) -> bool:
 @pytest.fixture
 def by_torch(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """From the call on, the cost is made by torch's operations."""
-    return lambda: monkeypatch.setattr(mpc_module, "diagonal_cost", lambda *_: None)
+    return lambda: monkeypatch.setattr(cost_module, "_suit_the_kernel", lambda *_: False)
 
 
 class Of(nn.Module):
@@ -131,13 +132,115 @@ def test_gradients_may_be_batched():
 
 
 @pytest.mark.parametrize("create_graph", [True, False])
-def test_theta_that_has_changed_since_is_noticed(create_graph):
+@pytest.mark.parametrize("changed", ["parametrizations.H.original", "discount"])
+def test_what_the_gradient_depends_on_and_has_changed_since_is_noticed(changed, create_graph):
     mpc = example("free")
     total = weighted(mpc, "H")
     with torch.no_grad():
-        parts.leaves(mpc, "H")[0].mul_(2)
+        dict([*mpc.named_parameters(), *mpc.named_buffers()])[changed].mul_(2)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        torch.autograd.grad(total, [*mpc.parameters()], create_graph=create_graph)
+        torch.autograd.grad(
+            total, [*mpc.parameters()], create_graph=create_graph, allow_unused=True
+        )
+
+
+@pytest.mark.parametrize("create_graph", [True, False])
+def test_what_the_gradient_does_not_depend_on_may_change(create_graph):
+    mpc = random_mpc(4, learn=("H", "q"))
+    leaves = [*mpc.parameters()]
+    expected = torch.autograd.grad(weighted(mpc, "H", "q", "w"), leaves)
+    total = weighted(mpc, "H", "q", "w")
+    with torch.no_grad():
+        for part in (mpc.q, mpc.H_f, mpc.w):
+            part.add_(1.0)
+    assert_close(torch.autograd.grad(total, leaves, create_graph=create_graph), expected)
+
+
+def gradients_of(mpc: QPMPC, theta: Callable[[], dict[str, Tensor]], leaf: Tensor) -> list[Tensor]:
+    """In a leaf of theta: alone, differentiable, batched, seen by a mode; a row of the Hessian."""
+    total = functional_call(Of(mpc), {f"mpc.{name}": x for name, x in theta().items()})
+    (plain,) = torch.autograd.grad(total, leaf, retain_graph=True)
+    (kept,) = torch.autograd.grad(total, leaf, create_graph=True)
+    rows = torch.autograd.grad(kept[0], leaf, retain_graph=True, allow_unused=True)
+    (batched,) = torch.autograd.grad(
+        total, leaf, torch.ones(2).double(), is_grads_batched=True, retain_graph=True
+    )
+    with FlopCounterMode(display=False):
+        (seen,) = torch.autograd.grad(total, leaf)
+    return [plain, kept.detach(), batched, seen, *(x for x in rows if x is not None)]
+
+
+@pytest.mark.parametrize("case", ["depending on each other", "the same", "hooked"])
+def test_factors_have_the_graph_and_the_hooks_that_they_have(by_torch, case):
+    """What differentiates in them again must not go through these twice."""
+    mpc = random_mpc(4, action_slack=50.0, learn=("C",) if case != "hooked" else ("H", "C"))
+    leaf = normal(mpc.n_z).requires_grad_()
+    if case == "depending on each other":
+
+        def theta() -> dict[str, Tensor]:
+            H = leaf[:3] * leaf[:3]
+            return {"H": H, "H_f": H[:2] * H[1:]}
+    elif case == "the same":
+
+        def theta() -> dict[str, Tensor]:
+            return dict.fromkeys(("q", "w"), leaf * leaf)
+    else:
+        leaf = parts.leaves(mpc, "H")[0]
+        leaf.register_hook(lambda gradient: 2 * gradient)
+        theta = dict
+    ours = gradients_of(mpc, theta, leaf)
+    by_torch()
+    assert_close(ours, gradients_of(mpc, theta, leaf))
+
+
+def test_a_discount_may_be_learned():
+    mpc = example("H")
+    gamma = torch.tensor(0.8, dtype=torch.float64, requires_grad=True)
+    mpc.discount = gamma ** torch.arange(mpc.n_z).double()
+    assert torch.autograd.grad(weighted(mpc, "H", "q"), gamma)[0] != 0
+
+
+def test_a_module_without_its_buffers_yet_says_what_to_do():
+    mpc = example("free")
+    mpc.stages.fill_(99)
+    with pytest.raises(IndexError, match="load a state_dict, or call reset_parameters"):
+        mpc.quadratic_program()
+    total = weighted(example("free"), "H")
+    mpc = example("free")
+    total = weighted(mpc, "H")
+    mpc.stages.data.fill_(-1)  # of which autograd knows nothing
+    with pytest.raises(IndexError, match="load a state_dict, or call reset_parameters"):
+        total.backward()
+
+
+@pytest.mark.parametrize("of", ["cache", "hook", "hook of the root"])
+def test_a_part_that_someone_looks_on_is_used_as_it_is(of):
+    mpc = example("free")
+    of_H = mpc.get_submodule("parametrizations.H")
+    if of == "cache":
+        with parametrize.cached():
+            (gradient,) = torch.autograd.grad(cost(mpc)[0].diagonal().sum(), mpc.H)
+        assert (gradient > 1).all()
+        return
+    hooked = of_H if of == "hook" else of_H.get_submodule("0")
+    hooked.register_forward_hook(lambda *of_call: 10 * of_call[-1])
+    assert_close(cost(mpc)[0].diagonal()[:3], mpc.H)
+    assert is_by_kernel(*cost(mpc))
+
+
+def test_a_parametrization_is_asked_once():
+    class Counted(nn.Module):
+        calls = 0
+
+        def forward(self, weight: Tensor) -> Tensor:
+            self.calls += 1
+            return weight
+
+    mpc, counted = example("free").float(), Counted()
+    parametrize.register_parametrization(mpc, "H", counted)
+    counted.calls = 0
+    cost(mpc)
+    assert counted.calls == 1
 
 
 def test_transforms_and_forward_mode_see_torch_alone(by_torch):

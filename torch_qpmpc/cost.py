@@ -41,8 +41,8 @@ def discounted(
 
 def diagonal_cost(
     layout: Layout, factors: Sequence[Tensor], squared: Sequence[bool], by: Discounts
-) -> Cost | None:
-    """`discounted` for a diagonal H in one kernel; None where that would hide it from PyTorch.
+) -> Cost:
+    """`discounted` for a diagonal H: by one kernel, or by torch where that has to look on.
 
     With its gradient it is some thirty operations of torch, which take as long as 40 QPs.
 
@@ -52,19 +52,36 @@ def diagonal_cost(
         squared: which of H, H_f and w are.
         by: the discounts.
     """
-    shapes = ((layout.n,), (layout.n_x,), by.of_rows.shape, by.of_z.shape)
-    fits = all(
-        x.shape == shape and x.is_cpu and x.dtype == torch.float64
-        for x, shape in zip(factors, shapes, strict=True)
-    )
-    if not (fits and is_plain(factors)):
-        return None
+    if not _suit_the_kernel(layout, factors, by):
+        return _by_torch(layout, factors, squared, by)
     given = kernels.arrays(*factors, *by)
     found = kernels.tensors(theta_kernels.diagonal_cost(*given, *squared), factors[0].device)
     if is_differentiating():
         found = DiagonalCost.apply(found, given, layout, squared, by, *factors)
     H, q, w = found
     return H, q, w
+
+
+def _suit_the_kernel(layout: Layout, factors: Sequence[Tensor], by: Discounts) -> bool:
+    """Whether they are plain tensors on the CPU, as the layout has them, and no discount learns."""
+    tensors, n_z, n_g = (*factors, *by), (layout.n_z,), (layout.n_z + layout.n_linear,)
+    shapes = ((layout.n,), (layout.n_x,), n_g, n_z, n_z, n_g, n_g, n_z)
+    fit = all(
+        x.shape == shape and x.is_cpu and x.dtype == dtype
+        for x, shape, dtype in zip(tensors, shapes, _DTYPES, strict=True)
+    )
+    return fit and not any(x.requires_grad for x in by) and is_plain(tensors)
+
+
+_DTYPES = (*[torch.float64] * 7, torch.int64)
+
+
+def _by_torch(
+    layout: Layout, factors: Sequence[Tensor], squared: Sequence[bool], by: Discounts
+) -> Cost:
+    *roots, q = factors
+    H, H_f, w = (x * x if square else x for x, square in zip(roots, squared, strict=True))
+    return discounted(layout, "diagonal", (H, H_f), q, w, by)
 
 
 class DiagonalCost(torch.autograd.Function):
@@ -81,23 +98,24 @@ class DiagonalCost(torch.autograd.Function):
         *factors: Tensor,
     ) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
-        ctx.given, ctx.constants = given, (layout, squared, by)
-        ctx.save_for_backward(*factors)
-        of_H, of_H_f, of_w, of_q = ctx.needs_input_grad[5:]
-        learned = (of_H or of_H_f, of_q, of_w)
-        ctx.mark_non_differentiable(
-            *(x for x, is_learned in zip(found, learned, strict=True) if not is_learned)
-        )
+        ctx.given, ctx.layout, ctx.squared = given, layout, squared
+        of_H, of_H_f, of_w, of_q = needed = ctx.needs_input_grad[5:]
+        # The rest may change before the gradient is asked for, which does not depend on it.
+        counts = zip(factors, needed, (*squared, False), strict=True)
+        ctx.save_for_backward(*(x if need and square else None for x, need, square in counts), *by)
+        learned = zip(found, (of_H or of_H_f, of_q, of_w), strict=True)
+        ctx.mark_non_differentiable(*(x for x, is_learned in learned if not is_learned))
         return tuple(found)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
         # Asked for even where the arrays do: autograd looks whether they have changed since.
-        factors, needed = ctx.saved_tensors, ctx.needs_input_grad[5:]
+        saved, needed = ctx.saved_tensors, ctx.needs_input_grad[5:]
         if is_differentiating() or is_traced([x for x in gradients if x is not None]):
-            found = _gradients(factors, needed, gradients, *ctx.constants)
+            factors, by = _aliases(saved[:4], needed, ctx.given), Discounts(*saved[4:])
+            found = _gradients(factors, gradients, ctx.layout, ctx.squared, by)
         else:
-            found = _gradients_by_kernel(needed, gradients, ctx.given, ctx.constants[1])
+            found = _gradients_by_kernel(needed, gradients, ctx.given, ctx.squared)
         return (*(None,) * 5, *found)
 
 
@@ -120,27 +138,39 @@ def _gradients_by_kernel(
     return [torch.from_numpy(x) if need and has else None for x, need, has in asked]
 
 
+@torch.enable_grad()
+def _aliases(
+    saved: Sequence[Tensor | None], needed: Sequence[bool], given: Sequence[np.ndarray]
+) -> list[Tensor]:
+    """The factors, in which alone to differentiate: their own graphs and hooks are autograd's.
+
+    Of what is not saved the values do not count.
+    """
+    return [
+        torch.zeros(like.shape, dtype=torch.float64).requires_grad_(need)
+        if x is None
+        else x.view_as(x)
+        for x, need, like in zip(saved, needed, given, strict=False)
+    ]
+
+
 def _gradients(
     factors: Sequence[Tensor],
-    needed: Sequence[bool],
     gradients: Sequence[Tensor | None],
     layout: Layout,
     squared: Sequence[bool],
     by: Discounts,
 ) -> list[Tensor | None]:
-    """Of the factors, and differentiable: those of `discounted`."""
+    """Of the factors where they require one, and differentiable."""
     with torch.enable_grad():
-        pairs = zip(factors[:3], squared, strict=True)
-        H, H_f, w = (x * x if is_squared else x for x, is_squared in pairs)
-        found = discounted(layout, "diagonal", (H, H_f), factors[3], w, by)
-    asked = [x for x, need in zip(factors, needed, strict=True) if need]
+        found = _by_torch(layout, factors, squared, by)
     pairs = [(x, y) for x, y in zip(found, gradients, strict=True) if y is not None]
     pulled = torch.autograd.grad(
         [x for x, _ in pairs],
-        asked,
+        [x for x in factors if x.requires_grad],
         [y for _, y in pairs],
         create_graph=is_differentiating(),
         allow_unused=True,
     )
     rest = iter(pulled)
-    return [next(rest) if need else None for need in needed]
+    return [next(rest) if x.requires_grad else None for x in factors]

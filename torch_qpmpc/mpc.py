@@ -417,9 +417,7 @@ class QPMPC(nn.Module):
         by = Discounts(self.discount, self.slack_discount, self.hardness, self.stages)
         if self.hessian == "diagonal":
             factors, squared = zip(*(parts.factor(self, x) for x in ("H", "H_f", "w")), strict=True)
-            found = diagonal_cost(self._layout, (*factors, self.q), squared, by)
-            if found is not None:
-                return found
+            return diagonal_cost(self._layout, (*factors, self.q), squared, by)
         blocks = (self.H,) if self.hessian == "full" else (self.H, self.H_f)
         return discounted(self._layout, self.hessian, blocks, self.q, self.w, by)
 

@@ -59,12 +59,26 @@ def leaves(module: nn.Module, name: str) -> list[nn.Parameter]:
 
 
 def factor(module: nn.Module, name: str) -> tuple[Tensor, bool]:
-    """What a part is the square of, and True where it is a square; else the part."""
+    """What a part is the square of, and True where it is a square and no more; else the part.
+
+    It is the part where someone looks on: by a hook, or `parametrize.cached`.
+    """
     kept: Any = module._modules.get("parametrizations", {})
-    of_part = kept[name] if name in kept else ()  # noqa: SIM401 - a ModuleDict has no get
-    if len(of_part) == 1 and type(of_part[0]) is SquareRoot:
-        return of_part.original, True
+    if name in kept and not parametrize._cache_enabled:
+        of_part = kept[name]
+        unseen = len(of_part) == 1 and type(of_part[0]) is SquareRoot
+        if unseen and not any(map(_has_hooks, (of_part, of_part[0]))):
+            return of_part.original, True
     return getattr(module, name), False
+
+
+def _has_hooks(module: nn.Module) -> bool:
+    return bool(
+        module._forward_hooks
+        or module._forward_pre_hooks
+        or module._backward_hooks
+        or module._backward_pre_hooks
+    )
 
 
 def readable(module: nn.Module, learned: Collection[str]) -> dict[str, Tensor]:

@@ -18,6 +18,7 @@ from torch_qpmpc.kernels import add_product, compiled, products, summing
 def diagonal_cost(H, H_f, w, q, of_z, of_rows, hardness, stages, H_squared, H_f_squared, w_squared):
     """H, q and w of `cost.diagonal_cost`."""
     n_z, n = len(of_z), len(H)
+    _check_range(stages, n + len(H_f))
     found, q_found, w_found = np.zeros((n_z, n_z)), np.empty(n_z), np.empty(len(w))
     for i in range(n_z):
         k = stages[i]
@@ -36,6 +37,7 @@ def diagonal_cost_gradient(
 ):  # fmt: skip
     """In H, H_f, w and q, or what they are the squares of, from that in what it makes of them."""
     n = len(H)
+    _check_range(stages, n + len(H_f))
     to_H, to_H_f, to_w, to_q = np.zeros(n), np.zeros(len(H_f)), np.empty(len(w)), np.empty(len(q))
     for i in range(len(of_z)):
         k, pull = stages[i], of_z[i] * of_H[i, i]
@@ -47,6 +49,14 @@ def diagonal_cost_gradient(
     for i in range(len(w)):
         to_w[i] = of_rows[i] * of_w[i] * (2 * w[i] if w_squared else 1.0)
     return to_H, to_H_f, to_w, to_q
+
+
+@compiled
+def _check_range(indices, n):
+    """Compiled loops do not look: a module that was on "meta" may not have its buffers yet."""
+    for i in indices:
+        if not 0 <= i < n:
+            raise IndexError("index out of range: load a state_dict, or call reset_parameters")
 
 
 @compiled
