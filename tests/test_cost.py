@@ -51,16 +51,14 @@ def by_torch(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 
 
 class Of(nn.Module):
-    """A function of a QPMPC, `weighted` or another, for `functional_call`."""
+    """A function of a QPMPC for `functional_call`."""
 
-    def __init__(self, mpc: QPMPC, function: Callable[[QPMPC], Any] | None = None) -> None:
+    def __init__(self, mpc: QPMPC, function: Callable[[QPMPC], Any]) -> None:
         super().__init__()
         self.mpc, self.function = mpc, function
 
     def forward(self) -> Any:
-        if self.function is not None:
-            return self.function(self.mpc)
-        return weighted(self.mpc, "H", "q", "w")
+        return self.function(self.mpc)
 
 
 def weighted(mpc: QPMPC, *names: str) -> Tensor:
@@ -68,6 +66,10 @@ def weighted(mpc: QPMPC, *names: str) -> Tensor:
     found = dict(zip(("H", "q", "w"), cost(mpc), strict=True))
     asked = (x[x.isfinite()] for name, x in found.items() if name in names)
     return torch.stack([normal(len(x), seed=len(x)) @ x for x in asked]).sum()
+
+
+def whole(mpc: QPMPC) -> Tensor:
+    return weighted(mpc, "H", "q", "w")
 
 
 @pytest.mark.parametrize("differentiated", [True, False])
@@ -113,7 +115,9 @@ def test_it_and_its_gradient_pass_finite_differences(name):
     names, start = zip(*mpc.named_parameters(), strict=True)
 
     def program(*theta: Tensor) -> Tensor:
-        return functional_call(Of(mpc), dict(zip((f"mpc.{x}" for x in names), theta, strict=True)))
+        return functional_call(
+            Of(mpc, whole), dict(zip((f"mpc.{x}" for x in names), theta, strict=True))
+        )
 
     assert is_by_kernel(*cost(mpc))
     leaves = [x.detach().clone().requires_grad_() for x in start]
@@ -148,8 +152,8 @@ def test_what_the_gradient_depends_on_and_has_changed_since_is_noticed(changed, 
 def test_what_the_gradient_does_not_depend_on_may_change(create_graph):
     mpc = random_mpc(4, learn=("H", "q"))
     leaves = [*mpc.parameters()]
-    expected = torch.autograd.grad(weighted(mpc, "H", "q", "w"), leaves)
-    total = weighted(mpc, "H", "q", "w")
+    expected = torch.autograd.grad(whole(mpc), leaves)
+    total = whole(mpc)
     with torch.no_grad():
         for part in (mpc.q, mpc.H_f, mpc.w):
             part.add_(1.0)
@@ -158,7 +162,7 @@ def test_what_the_gradient_does_not_depend_on_may_change(create_graph):
 
 def gradients_of(mpc: QPMPC, theta: Callable[[], dict[str, Tensor]], leaf: Tensor) -> list[Tensor]:
     """In a leaf of theta: alone, differentiable, batched, seen by a mode; a row of the Hessian."""
-    total = functional_call(Of(mpc), {f"mpc.{name}": x for name, x in theta().items()})
+    total = functional_call(Of(mpc, whole), {f"mpc.{name}": x for name, x in theta().items()})
     (plain,) = torch.autograd.grad(total, leaf, retain_graph=True)
     (kept,) = torch.autograd.grad(total, leaf, create_graph=True)
     rows = torch.autograd.grad(kept[0], leaf, retain_graph=True, allow_unused=True)
@@ -205,7 +209,6 @@ def test_a_module_without_its_buffers_yet_says_what_to_do():
     mpc.stages.fill_(99)
     with pytest.raises(IndexError, match="load a state_dict, or call reset_parameters"):
         mpc.quadratic_program()
-    total = weighted(example("free"), "H")
     mpc = example("free")
     total = weighted(mpc, "H")
     mpc.stages.data.fill_(-1)  # of which autograd knows nothing
@@ -213,17 +216,17 @@ def test_a_module_without_its_buffers_yet_says_what_to_do():
         total.backward()
 
 
-@pytest.mark.parametrize("of", ["cache", "hook", "hook of the root"])
-def test_a_part_that_someone_looks_on_is_used_as_it_is(of):
+def test_a_part_that_is_cached_is_what_the_cost_is_made_of():
     mpc = example("free")
-    of_H = mpc.get_submodule("parametrizations.H")
-    if of == "cache":
-        with parametrize.cached():
-            (gradient,) = torch.autograd.grad(cost(mpc)[0].diagonal().sum(), mpc.H)
-        assert (gradient > 1).all()
-        return
-    hooked = of_H if of == "hook" else of_H.get_submodule("0")
-    hooked.register_forward_hook(lambda *of_call: 10 * of_call[-1])
+    with parametrize.cached():
+        (gradient,) = torch.autograd.grad(cost(mpc)[0].diagonal().sum(), mpc.H)
+    assert (gradient > 1).all()
+
+
+@pytest.mark.parametrize("hooked", ["parametrizations.H", "parametrizations.H.0"])
+def test_a_hook_on_a_parametrization_is_heard(hooked):
+    mpc = example("free")
+    mpc.get_submodule(hooked).register_forward_hook(lambda *of_call: 10 * of_call[-1])
     assert_close(cost(mpc)[0].diagonal()[:3], mpc.H)
     assert is_by_kernel(*cost(mpc))
 
@@ -248,7 +251,7 @@ def test_transforms_and_forward_mode_see_torch_alone(by_torch):
     leaves = {"mpc." + name: x.detach() for name, x in mpc.named_parameters()}
 
     def program(theta: dict[str, Tensor]) -> Tensor:
-        return functional_call(Of(mpc), theta)
+        return functional_call(Of(mpc, whole), theta)
 
     ones = {name: torch.ones_like(x) for name, x in leaves.items()}
     found = jacrev(program)(leaves), jvp(program, (leaves,), (ones,))

@@ -17,8 +17,12 @@ from torch_qpmpc.sensitivity import is_differentiating, is_plain, is_traced
 Cost = tuple[Tensor, Tensor, Tensor]
 
 
+#: Of H, H_f, w and q, and of the `Discounts`.
+_DTYPES = (*[torch.float64] * 7, torch.int64)
+
+
 class Discounts(NamedTuple):
-    """What theta's cost is multiplied by, float64.
+    """What theta's cost is multiplied by.
 
     ``of_z`` ``(n_z,)`` and ``of_rows`` ``(n_g,)`` are gamma^k, or one. ``hardness`` ``(n_g,)`` is
     added to w: inf for a hard row, whose w is a placeholder, and else zero. ``stages`` is
@@ -71,9 +75,6 @@ def _suit_the_kernel(layout: Layout, factors: Sequence[Tensor], by: Discounts) -
         for x, shape, dtype in zip(tensors, shapes, _DTYPES, strict=True)
     )
     return fit and not any(x.requires_grad for x in by) and is_plain(tensors)
-
-
-_DTYPES = (*[torch.float64] * 7, torch.int64)
 
 
 def _by_torch(
