@@ -1,4 +1,7 @@
-"""A batch of QPs as plain tensors: what the solvers' pipeline passes from step to step."""
+"""A batch of QPs (eq:qp2, eq:qp3), and what condensing leaves of it, from step to step.
+
+Plain tensors or arrays, without anything that autograd looks on.
+"""
 
 from __future__ import annotations
 

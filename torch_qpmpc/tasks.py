@@ -1,4 +1,4 @@
-"""The tasks of train.py: a plant, the QP that learning starts from, and the one that it aims at."""
+"""The tasks of train.py: a plant, the QP (eq:qp5) that learning starts from, and its aim."""
 
 from __future__ import annotations
 

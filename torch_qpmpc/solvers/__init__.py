@@ -1,4 +1,4 @@
-"""Backends, one a file, and the chain that turns their claims into certified solutions.
+"""Backends, one a file, and the chain that makes certified solutions (eq:qp2, eq:qp3) of claims.
 
 A backend is a function ``solve(qps: SoftQPs) -> Answer``. To add one, write its file and name it in
 `BACKENDS`.
