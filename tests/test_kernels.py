@@ -191,7 +191,7 @@ def test_a_tour_visits_each_of_any_vectors_once(vectors):
 
 
 @pytest.mark.parametrize("n_qps", [0, 1, 5, 3000])
-@pytest.mark.parametrize("unneeded", [(), (0, 3, 5)])
+@pytest.mark.parametrize("unneeded", [(), (3,), (0, 3, 5)])
 def test_the_gradient_of_shared_data_is_that_of_torch(n_qps, unneeded):
     n_z, n_c, n_g, n_f = 12, 4, 9, 3
     z, sigma, chi, lam, xi = (normal(n_qps, n, seed=n) for n in (n_z, n_g, n_c, n_g, n_f))
@@ -202,13 +202,33 @@ def test_the_gradient_of_shared_data_is_that_of_torch(n_qps, unneeded):
     shapes = ((n_z, n_z), (n_z,), (), (n_c, n_z), (n_c,), (n_g, n_z), *((n_g,),) * 3, z.shape)
     in_torch = envelope_gradients(weight, z, sigma, chi, lam, xi).values()
     given = kernels.arrays(incoming, z, sigma, chi, lam, xi, status)
-    ours = kernels.envelope(*given, tuple(i not in unneeded for i in range(10)))
+    ours = kernels.envelope(*given, *(i not in unneeded for i in (0, 3, 5)))
     for i, (gradient, of_torch, shape) in enumerate(zip(ours, in_torch, shapes, strict=True)):
         if i in unneeded:
             assert not gradient.size
         else:
             like = z.new_empty(shape) if i < 9 else xi
             assert_close(torch.from_numpy(gradient), of_torch(like))
+
+
+@pytest.mark.parametrize("shape", [(0,), (), (9,), (kernels.FIRST + 1,), (3, kernels.FIRST)])
+def test_arrays_are_equal_where_no_entry_differs(shape):
+    one = normal(*shape).numpy()
+    other = one.copy()
+    assert kernels.are_equal(one, other)
+    for at in (0, -1) if one.size else ():
+        for value in (one.flat[at] + 1, np.nan):
+            other.flat[at] = value
+            assert not kernels.are_equal(one, other)
+        other.flat[at] = one.flat[at]
+
+
+@pytest.mark.parametrize("n", range(10))
+def test_a_product_takes_every_row(n):
+    x, factors, matrix = normal(5).numpy(), normal(n).numpy(), normal(n, 5, seed=1).numpy()
+    expected = x + matrix.T @ factors
+    kernels.add_product(x, factors, matrix)
+    np.testing.assert_allclose(x, expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("shift", [0.0, -1.0])

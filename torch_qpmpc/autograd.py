@@ -30,6 +30,7 @@ from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.qp import NDIMS, UNKNOWN, QPSolution, QuadraticProgram, Sizes, Status, slacks
 from torch_qpmpc.sensitivity import (
+    apply_plain,
     differentiable,
     is_differentiating,
     is_plain,
@@ -46,6 +47,7 @@ ON_FAILURE = ("raise", "warn", "mask")
 #: Event dimensions of the operator's tensors: H, q, c, C, b, G, lb, ub, w, fixed, a warm start.
 EVENT_NDIMS = (*NDIMS, 1, 1)
 N_THETA = 10
+CPU = torch.device("cpu")
 #: Position of ``keep`` among the operator's arguments, and how many follow theirs.
 KEEP = 11
 N_OTHERS = 4
@@ -156,7 +158,7 @@ def _solve_plain(given: Sequence[Any]) -> tuple[Tensor, RawArrays]:
     raw, _ = _solve_flat(*given)
     if not is_differentiating():
         return torch.from_numpy(raw.arrays.value), raw.arrays
-    return Envelope.apply(raw, given[KEEP], *given[:N_THETA]), raw.arrays
+    return apply_plain(Envelope, raw, given[KEEP], *given[:N_THETA]), raw.arrays
 
 
 def _solve(*arguments: Any) -> Outputs:
@@ -262,7 +264,7 @@ def _solve_flat(*arguments: Any) -> tuple[RawSolution, torch.Size]:
     backend(solver)
     if on_failure not in ON_FAILURE:
         raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
-    device = q.device if solver == "torch" and q.is_cuda else torch.device("cpu")
+    device = q.device if solver == "torch" and q.is_cuda else CPU
     programs, batch = FlatPrograms.of(*theta, device=device)
     if start is not None:
         start = listed(start.to(device).expand(*batch, -1))
@@ -277,7 +279,9 @@ solve_op = torch.library.custom_op("torch_qpmpc::solve", _solve_now, mutates_arg
 
 def _solve_opaque(*arguments: Any) -> Outputs:
     """`solve_op`, or where nothing looks on that needs an operator, what it does: sooner."""
-    return (solve_op if is_traced(arguments[:N_THETA]) else _solve_now)(*arguments)
+    theta = arguments[:N_THETA]
+    hidden = is_traced(theta) or any(x.is_meta for x in theta)
+    return (solve_op if hidden else _solve_now)(*arguments)
 
 
 def _report(raw: RawSolution, batch: torch.Size, on_failure: str) -> None:
@@ -342,7 +346,8 @@ def _backward(ctx: Any, grad_value: Tensor | None, *_: Any) -> tuple:
 
 def _gradients_by_kernel(needed: Sequence[bool], *given: np.ndarray) -> Iterator[Tensor | None]:
     """`_gradients` of one theta, without derivatives of their own."""
-    pairs = zip(kernels.envelope(*given, needed), needed, strict=True)
+    of_H, _, _, of_C, _, of_G, *_ = needed
+    pairs = zip(kernels.envelope(*given, of_H, of_C, of_G), needed, strict=True)
     return (torch.from_numpy(gradient) if need else None for gradient, need in pairs)
 
 

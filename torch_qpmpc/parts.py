@@ -66,8 +66,9 @@ def factor(module: nn.Module, name: str) -> tuple[Tensor, bool]:
     kept: Any = module._modules.get("parametrizations", {})
     if name in kept and not parametrize._cache_enabled:
         of_part = kept[name]
-        unseen = len(of_part) == 1 and type(of_part[0]) is SquareRoot
-        if unseen and not any(map(_has_hooks, (of_part, of_part[0]))):
+        first, *others = of_part._modules.values()  # sooner than by index
+        seen = others or type(first) is not SquareRoot or _has_hooks(of_part) or _has_hooks(first)
+        if not seen:
             return of_part.original, True
     return getattr(module, name), False
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -43,14 +43,13 @@ class ContentMemo(threading.local):
         """
         arrays = kernels.arrays(*tensors)
         kind = (options, arrays[0].dtype, tensors[0].device, [x.shape for x in arrays])
-        flat = [x.reshape(-1) for x in arrays]
         for position, (known, of_kind, result) in enumerate(self.entries):
-            if of_kind == kind and all(map(kernels.are_equal, known, flat)):
+            if of_kind == kind and all(map(kernels.are_equal, known, arrays)):
                 self.entries.insert(0, self.entries.pop(position))
                 return result
         own = [x.copy() for x in arrays]
         result = make(*own)
-        self.entries.insert(0, ([x.reshape(-1) for x in own], kind, result))
+        self.entries.insert(0, (own, kind, result))
         del self.entries[self.SIZE :]
         return result
 
@@ -117,10 +116,7 @@ class FlatPrograms(Twofold[ProgramArrays]):
         batch = fixed.shape[:-1]
         fixed = flatten(fixed, batch, device)
         programs = _memo.get(theta, str(device), lambda *own: cls._shared(own, fixed))
-        known, n_qps = programs._known, fixed.shape[0]
-        if "group" not in known or len(known["group"]) != n_qps:
-            known["group"] = _zeros(n_qps, fixed.device)
-        return programs._with(known["group"], fixed), batch
+        return programs._with(_zeros(len(fixed), fixed.device), fixed), batch
 
     @classmethod
     def _shared(cls, theta: Sequence[np.ndarray], fixed: Tensor) -> FlatPrograms:
@@ -180,10 +176,11 @@ class FlatPrograms(Twofold[ProgramArrays]):
 
     def _with(self, group: Tensor, fixed: Tensor) -> FlatPrograms:
         """QPs of the same theta, which share what is known of it."""
-        own = ("group", "group_array", "fixed", "fixed_array")
-        shared = {name: x for name, x in vars(self).items() if name not in own}
         others = object.__new__(FlatPrograms)
-        vars(others).update(shared, group=group, fixed=fixed)
+        known = vars(others)
+        known.update(vars(self), group=group, fixed=fixed)
+        for name in ("group_array", "fixed_array"):
+            known.pop(name, None)
         return others
 
     def without_nan(self) -> FlatPrograms:
@@ -258,7 +255,9 @@ class FlatPrograms(Twofold[ProgramArrays]):
         return self.multiply(matrices, vectors) + constant
 
 
+@lru_cache(maxsize=16)
 def _zeros(n: int, device: torch.device) -> Tensor:
+    """For all who read them."""
     return kernels.tensors([np.zeros(n, np.int64)], device)[0]
 
 

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any
 
@@ -41,8 +40,6 @@ _functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIs
 
 #: The tensors that nothing but autograd looks at.
 PLAIN = frozenset((Tensor, nn.Parameter))
-#: Of a tensor.
-IS_META = attrgetter("is_meta")
 #: On while `torch.autograd.grad` is asked for gradients with ``is_grads_batched``.
 BATCHED_GRADIENTS = torch._C._dispatch_key_parse("VmapMode")
 #: Residual of the KKT system from which on it counts as singular.
@@ -352,6 +349,11 @@ def is_plain(tensors: Sequence[Tensor]) -> bool:
     return forward_ad._current_level < 0 and not is_traced(tensors)
 
 
+def apply_plain(function: type[torch.autograd.Function], *arguments: Any) -> Any:
+    """``function.apply`` of what `is_plain`: without its look for transforms, sooner."""
+    return super(torch.autograd.Function, function).apply(*arguments)  # pyright: ignore[reportAttributeAccessIssue] - the one of C
+
+
 def is_traced(tensors: Sequence[Tensor]) -> bool:
     """Whether anything but plain tensors may be at work, from which the solvers must be hidden."""
     core = torch._C
@@ -363,7 +365,6 @@ def is_traced(tensors: Sequence[Tensor]) -> bool:
         or core._dispatch_tls_is_dispatch_key_included(BATCHED_GRADIENTS)
         or _functorch.peek_interpreter_stack() is not None  # `torch.func`
         or not PLAIN.issuperset(map(type, tensors))
-        or any(map(IS_META, tensors))
     )
 
 

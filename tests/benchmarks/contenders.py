@@ -42,11 +42,10 @@ class Gradient:
         with torch.no_grad():
             V = self.value(self.batch.following, qp)
         Q = self.action_value(self.batch.s, self.batch.a, qp)
-        with torch.no_grad():
-            minus_delta = torch.sub(Q - self.batch.cost, V, alpha=GAMMA)
-            incoming = minus_delta / float(len(V))  # of an integer, torch would make a tensor
-        Q.backward(incoming)
-        return V, Q.detach()
+        value = Q.detach()
+        minus_delta = (value - self.batch.cost).sub_(V, alpha=GAMMA)
+        Q.backward(minus_delta.div_(float(len(V))))  # by an integer, torch would make a tensor
+        return V, value
 
     def flat(self) -> Tensor:
         """The gradient in all of theta, as one vector."""

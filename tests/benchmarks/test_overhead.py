@@ -17,6 +17,16 @@ from torch_qpmpc.solvers import BACKENDS, chain
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
 
 STARTS = {"": cold, ", warm": warm}
+#: How long to look: a machine that others share is busier in one second than in the next.
+SECONDS = 5.0
+
+
+def rounds_of(timed: Callable[[], object]) -> int:
+    """How many of ``timed`` take some `SECONDS`, between 50 and 1,000."""
+    timed()  # the first one may compile
+    began = time.perf_counter()
+    timed()
+    return min(1000, max(50, round(SECONDS / (time.perf_counter() - began))))
 
 
 @pytest.mark.parametrize("batch", [32, 256])
@@ -56,11 +66,12 @@ def test_share_outside_the_solver(
         shares.append(1 - sum(inside) / (time.perf_counter() - began))
         return len(inside)
 
-    calls = interleaved(step, rounds=50, warmup=2, before=lambda: nudge(gradient.mpc))
+    rounds = rounds_of(step)
+    calls = interleaved(step, rounds=rounds, warmup=2, before=lambda: nudge(gradient.mpc))
     benchmark.extra_info |= {
         "row": solver + start,
         "batch": batch,
-        "outside": median(shares[2:]),
+        "outside": median(shares[-rounds:]),
     }
     assert calls >= 2  # for V and for Q: what is timed is all there is
 
@@ -75,7 +86,7 @@ def test_decisions(benchmark: Any, interleaved: Callable[..., Any], solver: str)
     def decide() -> torch.Tensor:
         return mpc.policy(states)
 
-    actions = interleaved(decide, rounds=100, warmup=5)
+    actions = interleaved(decide, rounds=rounds_of(decide), warmup=5)
     benchmark.extra_info |= {"row": solver, "batch": 32}
     for i in (0, 31):
         alone = mpc.policy(states[i : i + 1])
