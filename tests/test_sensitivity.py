@@ -125,6 +125,24 @@ def test_dependent_active_rows_have_a_finite_gradient():
     assert_close(of_upper.sum(), torch.tensor(1.0).double(), atol=1e-6, rtol=0)
 
 
+def test_where_all_of_z_is_fixed_it_moves_with_what_fixes_it():
+    one, none = torch.ones(1).double(), torch.zeros(0, 1).double()
+    qp = QuadraticProgram(
+        H=torch.eye(1).double(),
+        q=one,
+        c=one[0],
+        C=none,
+        b=none[:, 0],
+        G=torch.eye(1).double(),
+        lb=-2 * one,
+        ub=2 * one,
+        w=torch.inf * one,
+    )
+    fixed = normal(3, 1).clamp(-1, 1).requires_grad_()
+    (slope,) = torch.autograd.grad(solve_qp(qp, fixed).z.sum(), fixed)
+    assert_close(slope, torch.ones_like(fixed))
+
+
 def test_the_values_second_derivative_agrees_with_differences_of_its_first():
     mpc, s = random_mpc(1), random_states(6)
 

@@ -30,7 +30,6 @@ from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.qp import NDIMS, UNKNOWN, QPSolution, QuadraticProgram, Sizes, Status, slacks
 from torch_qpmpc.sensitivity import (
-    apply_plain,
     differentiable,
     is_differentiating,
     is_plain,
@@ -158,7 +157,7 @@ def _solve_plain(given: Sequence[Any]) -> tuple[Tensor, RawArrays]:
     raw, _ = _solve_flat(*given)
     if not is_differentiating():
         return torch.from_numpy(raw.arrays.value), raw.arrays
-    return apply_plain(Envelope, raw, given[KEEP], *given[:N_THETA]), raw.arrays
+    return Envelope.apply(raw, given[KEEP], *given[:N_THETA]), raw.arrays
 
 
 def _solve(*arguments: Any) -> Outputs:
@@ -280,8 +279,8 @@ solve_op = torch.library.custom_op("torch_qpmpc::solve", _solve_now, mutates_arg
 def _solve_opaque(*arguments: Any) -> Outputs:
     """`solve_op`, or where nothing looks on that needs an operator, what it does: sooner."""
     theta = arguments[:N_THETA]
-    hidden = is_traced(theta) or any(x.is_meta for x in theta)
-    return (solve_op if hidden else _solve_now)(*arguments)
+    must_hide = is_traced(theta) or any(x.is_meta for x in theta)
+    return (solve_op if must_hide else _solve_now)(*arguments)
 
 
 def _report(raw: RawSolution, batch: torch.Size, on_failure: str) -> None:

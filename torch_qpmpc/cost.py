@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_qpmpc import kernels, theta_kernels
 from torch_qpmpc.layout import Layout
-from torch_qpmpc.sensitivity import apply_plain, is_differentiating, is_plain, is_traced
+from torch_qpmpc.sensitivity import is_differentiating, is_plain, is_traced
 
 #: H ``(n_z, n_z)``, q ``(n_z,)`` and w ``(n_g,)`` of the QP.
 Cost = tuple[Tensor, Tensor, Tensor]
@@ -61,7 +61,7 @@ def diagonal_cost(
     given = kernels.arrays(*factors, *by)
     found = kernels.tensors(theta_kernels.diagonal_cost(*given, *squared), factors[0].device)
     if is_differentiating():
-        found = apply_plain(DiagonalCost, found, given, layout, squared, by, *factors)
+        found = DiagonalCost.apply(found, given, layout, squared, by, *factors)
     H, q, w = found
     return H, q, w
 

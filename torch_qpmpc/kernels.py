@@ -25,7 +25,7 @@ from torch import Tensor
 
 #: Entries of the matrix times vectors up to which a product by BLAS stays in one thread.
 ONE_THREAD = 2**18
-#: Entries that are compared before the others are looked at.
+#: Entries that are compared before the others are: of another theta, some of them mostly differ.
 FIRST = 64
 #: QPs at a time whose full solutions stay in a core's cache while they are worked out.
 TOGETHER = 64
@@ -53,42 +53,31 @@ def tensors(found: Iterable[np.ndarray], device: torch.device) -> list[Tensor]:
 
 @compiled
 def recover(
-    v, lam_v, group, fixed, rows, others, T, Y_neg, z_0, H, C, G, H_is_diagonal, G_is_diagonal,
+    v, lam_v, group, fixed, rows, others, T_T, Y_neg, C, C_T, H, G, G_T, diagonal, at_zero,
     q, c, b, lb, ub, w, violated,
 ):  # fmt: skip
     """Value, z, sigma, chi, lam, xi, status, residual and worst of `solvers.chain._recover`.
 
-    ``T``, ``Y_neg`` and ``z_0`` are those of `condense.Reduced`.
+    ``at_zero`` ``(B or 1, n_z)`` is z where the fixed entries and v are zero, ``T_T``, ``C_T`` and
+    ``G_T`` are transposes, and ``diagonal`` says of H and G whether they have nothing else.
     """
     n_qps = len(fixed)
     value, residual = np.empty(n_qps), np.empty(n_qps)
     z, chi, xi = np.empty((n_qps, H.shape[1])), np.empty((n_qps, C.shape[1])), np.empty(fixed.shape)
     sigma, lam = np.empty((n_qps, G.shape[1])), np.empty((n_qps, G.shape[1]))
-    T_T, C_T, G_T = _turned(T), _turned(C), G if G_is_diagonal else _turned(G)
     worst = 0.0
     for i in range(0, n_qps, TOGETHER):
         k = min(i + TOGETHER, n_qps)
         _recover_some(
             value[i:k], z[i:k], sigma[i:k], chi[i:k], lam[i:k], xi[i:k], residual[i:k],
             v[i:k], lam_v[i:k], group[i:k], fixed[i:k], rows, others,
-            T_T, Y_neg, _some(z_0, i, k), H, C, C_T, G, G_T, H_is_diagonal, G_is_diagonal,
-            _some(q, i, k), c if len(c) == 1 else c[i:k], _some(b, i, k), _some(lb, i, k),
-            _some(ub, i, k), _some(w, i, k), violated,
+            T_T, Y_neg, C, C_T, H, G, G_T, diagonal, _some(at_zero, i, k), _some(q, i, k),
+            c if len(c) == 1 else c[i:k], _some(b, i, k), _some(lb, i, k), _some(ub, i, k),
+            _some(w, i, k), violated,
         )  # fmt: skip
         for j in range(i, k):
             worst = max(worst, residual[j])
     return value, z, sigma, chi, lam, xi, np.zeros(n_qps, np.int64), residual, worst
-
-
-@compiled
-def _turned(matrices):
-    """Their transposes, ``(M, i, j)`` to ``(M, j, i)``."""
-    turned = np.empty((len(matrices), matrices.shape[2], matrices.shape[1]))
-    for m in range(len(matrices)):
-        for i in range(matrices.shape[1]):
-            for j in range(matrices.shape[2]):
-                turned[m, j, i] = matrices[m, i, j]
-    return turned
 
 
 @compiled
@@ -100,10 +89,10 @@ def _some(vectors, i, k):
 @compiled
 def _recover_some(
     value, z, sigma, chi, lam, xi, residual,
-    v, lam_v, group, fixed, rows, others, T_T, Y_neg, z_0, H, C, C_T, G, G_T, H_is_diagonal,
-    G_is_diagonal, q, c, b, lb, ub, w, violated,
+    v, lam_v, group, fixed, rows, others, T_T, Y_neg, C, C_T, H, G, G_T, diagonal, at_zero,
+    q, c, b, lb, ub, w, violated,
 ):  # fmt: skip
-    """Fill in what `recover` finds of a few QPs, with the transposes of T, C and G."""
+    """Fill in what `recover` finds of a few QPs."""
     n_qps, n_f = fixed.shape
     kept = np.empty((n_qps, T_T.shape[1]))
     for i in range(n_qps):
@@ -113,16 +102,17 @@ def _recover_some(
             kept[i, n_f + j] = v[i, j]
     _fill(z, kept, T_T, group, False)
     for i in range(n_qps):
-        of_z = i % len(z_0)
+        of_z = i % len(at_zero)
         for j in range(z.shape[1]):
-            z[i, j] += z_0[of_z, j]
-    Hz, y = products(z, H, group, H_is_diagonal), products(z, G_T, group, G_is_diagonal)
+            z[i, j] += at_zero[of_z, j]
+    Hz, y = products(z, H, group, diagonal[0]), products(z, G_T, group, diagonal[1])
     lam[:] = 0.0
     for i in range(n_qps):
         of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
         for k in range(len(rows)):
             lam[i, rows[k]] = lam_v[i, k]
-        for j in range(lam.shape[1]):  # apart, four at a time
+        # A loop of its own, to be compiled four at a time; what is zero stays so.
+        for j in range(lam.shape[1]):
             push, most = lam[i, j], w[of_w, j]
             lam[i, j] = most if push > most else -most if push < -most else push
         for j in others:
@@ -131,7 +121,7 @@ def _recover_some(
                     lam[i, j] = w[of_w, j]
                 elif lb[of_lb, j] - y[i, j] > violated:
                     lam[i, j] = -w[of_w, j]
-    G_lam = products(lam, G, group, G_is_diagonal)
+    G_lam = products(lam, G, group, diagonal[1])
     left = np.empty(z.shape)
     for i in range(n_qps):
         of_q = i % len(q)
@@ -417,8 +407,8 @@ def _summed_outer(left, right, needed):
 @compiled
 def active_sets(z, lam, status, G, lb, ub, w, unknown):
     """`qp.QPSolution.active` of a theta that the batch shares, ``(B, n_g)``."""
-    G_T = _turned(G.reshape((1, *G.shape)))
-    y = products(z, G_T, np.zeros(len(z), np.int64), False)
+    G_T, group = np.ascontiguousarray(G.T), np.zeros(len(z), np.int64)
+    y = products(z, G_T.reshape((1, *G_T.shape)), group, False)
     codes = np.empty(lam.shape, np.int8)
     for i in range(len(z)):
         for j in range(lam.shape[1]):

@@ -66,9 +66,9 @@ def factor(module: nn.Module, name: str) -> tuple[Tensor, bool]:
     kept: Any = module._modules.get("parametrizations", {})
     if name in kept and not parametrize._cache_enabled:
         of_part = kept[name]
-        first, *others = of_part._modules.values()  # sooner than by index
-        seen = others or type(first) is not SquareRoot or _has_hooks(of_part) or _has_hooks(first)
-        if not seen:
+        first, *others = of_part._modules.values()  # faster than by index
+        is_square = not others and type(first) is SquareRoot
+        if is_square and not (_has_hooks(of_part) or _has_hooks(first)):
             return of_part.original, True
     return getattr(module, name), False
 

@@ -116,7 +116,7 @@ class FlatPrograms(Twofold[ProgramArrays]):
         batch = fixed.shape[:-1]
         fixed = flatten(fixed, batch, device)
         programs = _memo.get(theta, str(device), lambda *own: cls._shared(own, fixed))
-        return programs._with(_zeros(len(fixed), fixed.device), fixed), batch
+        return programs._with(_one_group(len(fixed), fixed.device), fixed), batch
 
     @classmethod
     def _shared(cls, theta: Sequence[np.ndarray], fixed: Tensor) -> FlatPrograms:
@@ -133,7 +133,7 @@ class FlatPrograms(Twofold[ProgramArrays]):
             return made
         given = (x.unsqueeze(0) for x in _prepared(kernels.tensors(theta, device), fixed))
         H, q, c, C, b, G, lb, ub, w = given
-        return cls(H, C, G, _zeros(1, device), q, c, b, lb, ub, w, fixed[:1])
+        return cls(H, C, G, _one_group(1, device), q, c, b, lb, ub, w, fixed[:1])
 
     @classmethod
     def _flat(cls, theta: Sequence[Tensor], batch: torch.Size, fixed: Tensor) -> FlatPrograms:
@@ -177,10 +177,10 @@ class FlatPrograms(Twofold[ProgramArrays]):
     def _with(self, group: Tensor, fixed: Tensor) -> FlatPrograms:
         """QPs of the same theta, which share what is known of it."""
         others = object.__new__(FlatPrograms)
-        known = vars(others)
-        known.update(vars(self), group=group, fixed=fixed)
+        own = vars(others)
+        own.update(vars(self), group=group, fixed=fixed)
         for name in ("group_array", "fixed_array"):
-            known.pop(name, None)
+            own.pop(name, None)
         return others
 
     def without_nan(self) -> FlatPrograms:
@@ -256,8 +256,8 @@ class FlatPrograms(Twofold[ProgramArrays]):
 
 
 @lru_cache(maxsize=16)
-def _zeros(n: int, device: torch.device) -> Tensor:
-    """For all who read them."""
+def _one_group(n: int, device: torch.device) -> Tensor:
+    """``group`` of n QPs that share their matrices, made once: not to be written to."""
     return kernels.tensors([np.zeros(n, np.int64)], device)[0]
 
 

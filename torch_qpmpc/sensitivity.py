@@ -122,8 +122,8 @@ def _solve(
     kkt = torch.cat((top, torch.cat((G, torch.diag_embed(idle)), dim=-1)), dim=-2)
     right = torch.cat((right_v, right_t[:, rows]), dim=-1).unsqueeze(-1)
     solution = torch.linalg.solve_ex(kkt, right)[0]
-    error = (kkt @ solution - right).abs().amax(dim=(-2, -1)) if len(kkt) else right.new_zeros(0)
-    bound = SINGULAR * (1 + right.abs().amax(dim=(-2, -1))) if len(kkt) else error
+    error = (kkt @ solution - right).abs().amax(dim=(-2, -1)) if kkt.numel() else right.new_zeros(0)
+    bound = SINGULAR * (1 + right.abs().amax(dim=(-2, -1))) if kkt.numel() else error
     singular = ~(error <= bound)
     if singular.any():
         # Dependent active rows, or directions without curvature: the solution of least norm.
@@ -349,13 +349,11 @@ def is_plain(tensors: Sequence[Tensor]) -> bool:
     return forward_ad._current_level < 0 and not is_traced(tensors)
 
 
-def apply_plain(function: type[torch.autograd.Function], *arguments: Any) -> Any:
-    """``function.apply`` of what `is_plain`: without its look for transforms, sooner."""
-    return super(torch.autograd.Function, function).apply(*arguments)  # pyright: ignore[reportAttributeAccessIssue] - the one of C
-
-
 def is_traced(tensors: Sequence[Tensor]) -> bool:
-    """Whether anything but plain tensors may be at work, from which the solvers must be hidden."""
+    """Whether a trace, a transform or another class of tensor may be at work.
+
+    The solvers must be hidden from these.
+    """
     core = torch._C
     return (
         torch.compiler.is_compiling()

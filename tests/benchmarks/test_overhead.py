@@ -17,12 +17,12 @@ from torch_qpmpc.solvers import BACKENDS, chain
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
 
 STARTS = {"": cold, ", warm": warm}
-#: How long to look: a machine that others share is busier in one second than in the next.
+#: About how long to look: a shared machine is busier in one second than in the next.
 SECONDS = 5.0
 
 
 def rounds_of(timed: Callable[[], object]) -> int:
-    """How many of ``timed`` take some `SECONDS`, between 50 and 1,000."""
+    """How many of ``timed`` take about `SECONDS`; at least 50, at most 1,000."""
     timed()  # the first one may compile
     began = time.perf_counter()
     timed()

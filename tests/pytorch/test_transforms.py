@@ -215,3 +215,20 @@ def test_a_functional_call_never_gets_what_was_worked_out_for_another_theta():
         stacked = {name: torch.stack([part, part]) for name, part in theta.items()}
         both = vmap(lambda theta: functional_call(mpc, theta, (s,)))(stacked)
         assert_close(both[k % 2], fresh.value(s))
+
+
+def test_what_is_kept_from_inside_a_transform_still_has_its_gradient():
+    mpc, states = random_mpc(), random_states(3).requires_grad_()
+    theta = {name: p.detach().clone().requires_grad_() for name, p in mpc.named_parameters()}
+    kept: list = []
+
+    def loss(theta: dict[str, Tensor], s: Tensor) -> Tensor:
+        kept[:] = theta, s
+        return functional_call(mpc, theta, (s,)).sum()
+
+    grad(loss, argnums=(0, 1))(theta, states)
+    inner_theta, inner_states = kept
+    functional_call(mpc, inner_theta, (inner_states,)).sum().backward()
+    expected = grad(loss, argnums=(0, 1))(theta, states)
+    assert_close({name: x.grad for name, x in theta.items()}, expected[0])
+    assert_close(states.grad, expected[1])

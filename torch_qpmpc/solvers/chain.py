@@ -8,7 +8,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -250,11 +252,19 @@ def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
 
 def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
     """`_recover` in one kernel."""
-    claim, x, a = answer.arrays, reduced.arrays, p.arrays
-    given = (claim.v, claim.lam, p.group_array, p.fixed_array, x.rows, x.others)
-    eliminated, diagonal = (x.T, x.Y_neg, x.z_0), (p.is_diagonal("H"), p.is_diagonal("G"))
-    theta = (a.H, a.C, a.G, *diagonal, a.q, a.c, a.b, a.lb, a.ub, a.w)
-    *found, worst = kernels.recover(*given, *eliminated, *theta, VIOLATED)
+
+    def of_theta() -> list[Any]:
+        a, diagonal = p.arrays, (p.is_diagonal("H"), p.is_diagonal("G"))
+        T_T, C_T = (np.ascontiguousarray(M.swapaxes(1, 2)) for M in (x.T, a.C))
+        G_T = a.G if diagonal[1] else np.ascontiguousarray(a.G.swapaxes(1, 2))
+        matrices = [T_T, x.Y_neg, a.C, C_T, a.H, a.G, G_T, diagonal]
+        return [*matrices, x.z_0, a.q, a.c, a.b, a.lb, a.ub, a.w]
+
+    claim, x = answer.arrays, reduced.arrays
+    # V and Q of a theta share its T, unless C has dependent rows.
+    theta = p.known(("kernel", reduced.keep), of_theta)
+    given = (claim.v, claim.lam, p.group_array, p.fixed_array, x.rows, x.others, *theta, VIOLATED)
+    *found, worst = kernels.recover(*given)
     arrays = RawArrays._make((*found, claim.iterations))
     return RawSolution.of_arrays(arrays, p.device, worst=worst)
 
