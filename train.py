@@ -28,6 +28,7 @@ import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from numba.core.event import install_timer
 from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 from tqdm import tqdm
@@ -134,9 +135,10 @@ def _train(
             total=cfg.updates,
             disable=quiet,
         )
+        compile_seconds: list[float] = []
         for update in progress:
             began = time.perf_counter()
-            with tally.qps:
+            with tally.qps, install_timer("numba:compile", compile_seconds.append):
                 batch = next(stream)
                 if cfg.replay:
                     replay.extend(batch)
@@ -152,7 +154,8 @@ def _train(
                     learner.target.step()
             ended = time.perf_counter()
             tally.update = update
-            tally.seconds += ended - began
+            tally.seconds += ended - began - sum(compile_seconds)
+            compile_seconds.clear()
             tally.costs.append(-batch["next", "reward"].mean().item())
             tally.violation += physics.violation(batch["observation"]).sum().item()
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import pandas as pd
 import pytest
 import torch
 from matplotlib.image import imread
+from numba.core import event
 from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -76,6 +78,20 @@ WHOLE = (
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("runs") / "whole"
     return folder, train.train(make_config(*WHOLE), str(folder))
+
+
+def test_what_is_compiled_meanwhile_is_not_counted_as_training(small, tmp_path, monkeypatch):
+    clock, batches = itertools.count(step=1000.0), train.batches
+
+    def compiling(collector: Any) -> Iterator[Any]:
+        for batch in batches(collector):
+            with event.trigger_event("numba:compile"):
+                pass
+            yield batch
+
+    monkeypatch.setattr(event, "timer", lambda: next(clock))
+    monkeypatch.setattr(train, "batches", compiling)
+    assert run_small(tmp_path, "updates=2")["train_seconds"] < 0
 
 
 def test_a_short_run_learns(whole):

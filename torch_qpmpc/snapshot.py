@@ -40,7 +40,7 @@ class Tally:
         costs: the mean cost of a step, of each update.
         violation: of the states' bounds, summed over all steps.
         qps: what has been solved since the last row of metrics; ``unsolved``, before that.
-        seconds: of training.
+        seconds: of training, but for what the kernels took to compile, once for an installation.
     """
 
     update: int = 0
