@@ -135,10 +135,9 @@ def _train(
             total=cfg.updates,
             disable=quiet,
         )
-        compile_seconds: list[float] = []
         for update in progress:
             began = time.perf_counter()
-            with tally.qps, install_timer("numba:compile", compile_seconds.append):
+            with tally.qps, install_timer("numba:compile", tally.leave_out):
                 batch = next(stream)
                 if cfg.replay:
                     replay.extend(batch)
@@ -154,8 +153,7 @@ def _train(
                     learner.target.step()
             ended = time.perf_counter()
             tally.update = update
-            tally.seconds += ended - began - sum(compile_seconds)
-            compile_seconds.clear()
+            tally.seconds += ended - began
             tally.costs.append(-batch["next", "reward"].mean().item())
             tally.violation += physics.violation(batch["observation"]).sum().item()
 

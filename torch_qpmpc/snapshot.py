@@ -50,6 +50,10 @@ class Tally:
     unsolved: int = 0
     seconds: float = 0.0
 
+    def leave_out(self, seconds: float) -> None:
+        """Do not count these, which the next update is going to add."""
+        self.seconds -= seconds
+
     def summary(self) -> dict[str, float]:
         """What learning itself cost: over all updates, and over the last tenth of them."""
         last = self.costs[-max(1, len(self.costs) // 10) :]
