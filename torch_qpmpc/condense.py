@@ -202,13 +202,22 @@ def _condense(matrices: Sequence[np.ndarray], device: torch.device, keep: int) -
             )
     H, C, G = kernels.tensors(matrices, device)
     eliminated = _eliminate(C, keep)
-    T, Y, padding = _null_space(C, keep) if eliminated is None else (*eliminated, None)
+    if eliminated is not None:
+        return _products(H, G, *eliminated, keep)
+    T, Y, padding = _null_space(C, keep)
+    return _products(H, G, T, Y, keep, padding)
+
+
+def _products(
+    H: Tensor, G: Tensor, T: Tensor, Y: Tensor, keep: int, padding: Tensor | None = None
+) -> Condensed:
+    """The condensed problem of T and Y; ``padding`` is that of `_null_space`."""
     H_T = H.bmm(T)
     H_y = T.mT.bmm(H_T)
     H_y = (H_y + H_y.mT) / 2.0
     if padding is not None:
         H_y = H_y + torch.diag_embed(padding)
-    deficient, convex = eliminated is None, _surely_convex(H_y)
+    deficient, convex = padding is not None, _surely_convex(H_y)
     return Condensed(keep, deficient, T, -Y, H_y, G.bmm(T), H_T.mT.bmm(Y), G.bmm(Y), convex)
 
 
@@ -223,6 +232,53 @@ def condensed_for(programs: FlatPrograms, keep: int) -> Condensed:
 
     condensed = p.known(("condensed", keep), make)
     return condensed_for(p, n_f) if condensed.deficient and keep > n_f else condensed
+
+
+def condensed_in_order(programs: FlatPrograms) -> Condensed | None:
+    """Condensed by solving the equations in their order; None where C has no such order.
+
+    Each is solved for the variables that no earlier one contains: x_1..x_N of a linear MPC scheme,
+    by its own recursion. Pivoting keeps T small, so that it serves an unstable model whose actions
+    stabilise it; where they cannot, as at their bounds, only the recursion is accurate, entry by
+    entry, whatever it grows to.
+    """
+    keep = programs.fixed.shape[-1]
+    own = [_eliminate_in_order(C, keep) for C in programs.arrays.C]
+    if not all(own):
+        return None
+    T, Y = (programs.H.new_tensor(np.stack(part)) for part in zip(*own, strict=True))
+    condensed = _products(programs.H, programs.G, T, Y, keep)
+    return condensed if condensed.H.isfinite().all() else None
+
+
+def _eliminate_in_order(C: np.ndarray, keep: int) -> tuple[np.ndarray, np.ndarray] | None:
+    n_c, n_z = C.shape
+    # Rows are C z - b = 0, with the unit for b; the columns of z that may be solved for come last.
+    W = np.concatenate((C, -np.eye(n_c)), axis=1)
+    nonzero = C != 0
+    first = np.where(nonzero.any(0), nonzero.argmax(0), -1)
+    first[:keep] = -1
+    pivots = []
+    for k in range(n_c):
+        entries = np.where(first >= 0, np.abs(W[k, :n_z]), 0.0)
+        possible = entries > RANK_TOLERANCE * np.linalg.norm(C[k])
+        if not possible.any():
+            return None
+        newest = possible & (first == first[possible].max())
+        pivot = int(np.where(newest, entries, 0.0).argmax())
+        first[pivot] = -1
+        pivots.append(pivot)
+        W[k] /= W[k, pivot]
+        below = k + 1 + W[k + 1 :, pivot].nonzero()[0]
+        W[below] -= np.outer(W[below, pivot], W[k])
+    for k in range(n_c - 1, -1, -1):
+        above = W[:k, pivots[k]].nonzero()[0]
+        W[above] -= np.outer(W[above, pivots[k]], W[k])
+    columns = np.setdiff1d(np.arange(n_z), pivots)
+    T, Y = np.zeros((n_z, len(columns))), np.zeros((n_z, n_c))
+    T[columns, np.arange(len(columns))] = 1.0
+    T[pivots], Y[pivots] = -W[:, columns], -W[:, n_z:]
+    return T, Y
 
 
 def _eliminate(C: Tensor, keep: int) -> tuple[Tensor, Tensor] | None:

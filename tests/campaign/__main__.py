@@ -25,7 +25,14 @@ from torch_qpmpc.solvers import BACKENDS
 #: QPs a batch; few of those families whose QPs take every solver's time, so that a batch does not
 #: take as long as no QP may.
 BATCH, FEW = 128, 16
-LONG = ("unbounded", "mixed", "scaled mixed")
+LONG = (
+    "unbounded",
+    "mixed",
+    "scaled mixed",
+    "unstable model",
+    "runaway prediction",
+    "hopeless plant",
+)
 CONTRIBUTING = README.with_name("CONTRIBUTING.md")
 RESULTS = README.parent / "runs" / "campaign"
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from tests.campaign.trained import trained
 from tests.problems import BRINK, HARD_ROWS, SOFT_ROWS, WEAK, KnownQP, known_qp, times
 from torch_qpmpc import QuadraticProgram, Status
+from torch_qpmpc.banded import banded_matrix
 
 #: Of a value, relative to the terms of the Lagrangian (see `tests.campaign.outcomes`).
 ACCURACY, FLOAT32 = 1e-5, 1e-3
@@ -360,6 +361,119 @@ def after_training(draw: Draw, count: int) -> Case:
     return solvable(draw.known(count, n_z=len(H), n_f=n_f, H=H, C=C, G=G, soft=soft, hard=()))
 
 
+@dataclass(frozen=True)
+class Plant:
+    """An unstable model x+ = A x + B u over a horizon."""
+
+    A: Tensor
+    B: Tensor
+    horizon: int
+
+    @classmethod
+    def of(cls, draw: Draw) -> Plant:
+        """A spectral radius of 1 to 2, or a Jordan block of such an eigenvalue."""
+        n_x, n_u, radius = draw.randint(1, 3), draw.randint(1, 2), draw.uniform(1.0, 2.0)
+        A = draw.normal(n_x, n_x)
+        if draw.random() < 0.5:
+            A = torch.diag(torch.full((n_x - 1,), draw.uniform(0.0, 0.5)), 1)
+            A = A.double() + radius * torch.eye(n_x).double()
+        A = A * radius / torch.linalg.eigvals(A).abs().max()
+        B = draw.powers(-1, 0) * draw.normal(n_x, n_u)
+        return cls(A, B, draw.choice([5, 10, 20, 30, 40, 50]))
+
+    @property
+    def C(self) -> Tensor:
+        return banded_matrix(self.A, self.B, self.horizon)
+
+    @property
+    def states(self) -> Tensor:
+        """Which entries of z are states, ``(n_z,)``."""
+        n_x, n = len(self.A), sum(self.B.shape)
+        return torch.arange(self.C.shape[1]) % n < n_x
+
+    def roll_out(self, s: Tensor, u: Tensor) -> Tensor:
+        """z ``(B, n_z)`` from x_0 ``(B, n_x)`` and the actions ``(B, N, n_u)``."""
+        parts = [s]
+        for action in u.unbind(1):
+            s = s @ self.A.mT + action @ self.B.mT
+            parts += [action, s]
+        return torch.cat(parts, -1)
+
+
+def unstable_model(draw: Draw, count: int) -> Case:
+    """Predictions that stay small though the model is unstable."""
+    plant = Plant.of(draw)
+    C = plant.C
+    soft, n_z = draw.rows(SOFT_ROWS, C.shape[1] - 2, C.shape[1] - 2), C.shape[1]
+    options = {"C": C, "G": torch.eye(n_z).double(), "soft": soft, "hard": ("inside", "at_upper")}
+    n_f = len(plant.A) + draw.choice([0, plant.B.shape[1]])
+    return solvable(draw.known(count, n_z=n_z, n_f=n_f, matrices=(), **options))
+
+
+def runaway_prediction(draw: Draw, count: int) -> Case:
+    """A linear MPC scheme whose actions are at their bounds, and whose states grow all the same.
+
+    The multipliers of the dynamics follow backwards from stationarity; those of the actions say at
+    which of their bounds they are.
+    """
+    plant = Plant.of(draw)
+    (n_x, n_u), N = plant.B.shape, plant.horizon
+    u = draw.normal(count, N, n_u)
+    z = plant.roll_out(draw.powers(-2, 1, count, 1) * draw.normal(count, n_x), u)
+    n_z, states = z.shape[-1], plant.states
+    h = torch.where(states, draw.powers(-1, 1, n_z), draw.powers(-3, 0, n_z))
+    limit, w = draw.powers(0, 1), draw.powers(0, 2)
+    lam = torch.where(states & (z.abs() > limit), w * z.sign(), 0)
+    force = (h * z + lam)[:, : N * (n_x + n_u)].unflatten(-1, (N, -1))
+    chi = [(h * z + lam)[:, -n_x:]]
+    for k in range(N - 1, 0, -1):
+        chi.insert(0, force[:, k, :n_x] + chi[0] @ plant.A)
+    pull = force[:, :, n_x:] + torch.stack([x @ plant.B for x in chi], 1)
+    at_x, far = torch.zeros(count, N, n_x).double(), torch.zeros(count, n_x).double()
+    lam = lam - torch.cat((torch.cat((at_x, pull), -1).flatten(1), far), -1)
+    width = draw.powers(-1, 1)
+    qp = QuadraticProgram(
+        H=torch.diag(h),
+        q=torch.zeros(n_z).double(),
+        c=torch.zeros(()).double(),
+        C=plant.C,
+        b=torch.zeros(N * n_x).double(),
+        G=torch.eye(n_z).double(),
+        lb=torch.where(states, -limit, torch.where(lam > 0, z - width, z)),
+        ub=torch.where(states, limit, torch.where(lam > 0, z, z + width)),
+        w=torch.where(states, w, torch.inf),
+        check_values=False,
+    )
+    chi, sigma = torch.cat(chi, -1), torch.where(states, (z.abs() - limit).clamp(min=0), 0)
+    value = (h * z.square()).sum(-1) / 2 + w * sigma.sum(-1)
+    xi = -(times(plant.C.mT, chi) + h * z + lam)[:, :n_x]
+    return solvable(KnownQP(qp, z[:, :n_x], value, z, sigma, chi, lam, xi))
+
+
+def hopeless_plant(draw: Draw, count: int) -> Case:
+    """An unstable model whose next state no allowed action keeps within its hard bounds."""
+    plant = Plant.of(draw)
+    n_x, n_z = len(plant.A), plant.C.shape[1]
+    sizes = {"n_z": n_z, "n_f": n_x, "C": plant.C, "G": torch.eye(n_z).double()}
+    known = draw.known(count, matrices=(), soft=("inside",) * n_z, hard=(), **sizes)
+    states, i = plant.states, draw.randrange(n_x)
+    s = draw.normal(count, n_x)
+    following = times(plant.A, s)[:, i].abs()
+    limit = following / (1 + draw.powers(-2, 1, count))
+    action = (following - limit) / plant.B[i].abs().sum() / 2
+    bound = torch.where(states, limit[:, None], action[:, None])
+    # x_0 itself is within wider ones.
+    bound[:, :n_x] = torch.inf
+    data = {
+        "b": torch.zeros(len(plant.C)).double(),
+        "lb": -bound,
+        "ub": bound,
+        "w": torch.full((n_z,), torch.inf).double(),
+    }
+    known = replace(changed(known, **data), fixed=s)
+    return Case(known, torch.full((count,), int(Status.INFEASIBLE)))
+
+
 FAMILIES: dict[str, Callable[[Draw, int], Case]] = {
     family.__name__.replace("_", " "): family
     for family in (
@@ -388,5 +502,8 @@ FAMILIES: dict[str, Callable[[Draw, int], Case]] = {
         float32,
         empty_or_single,
         after_training,
+        unstable_model,
+        runaway_prediction,
+        hopeless_plant,
     )
 }

@@ -41,9 +41,13 @@ def backend(name: str) -> Backend:
     )
 
 
+#: The order in which others try what one has not solved: the first to give up are the quickest.
+QUICKEST = ("daqp", "torch", "proxqp")
+
+
 def fallbacks(name: str) -> list[Backend]:
-    """Who solves what the certificate rejects: every other backend, cold."""
-    return [other for known, other in BACKENDS.items() if known != name]
+    """Return the other backends, which solve, cold, what the certificate rejects."""
+    return [BACKENDS[other] for other in QUICKEST if other != name]
 
 
 __all__ = ["BACKENDS", "Answer", "Backend", "backend", "fallbacks"]

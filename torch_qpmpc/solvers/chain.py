@@ -6,7 +6,7 @@ import contextvars
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc import kernels
-from torch_qpmpc.certificate import TOLERANCE, Products, certify
-from torch_qpmpc.condense import VIOLATED, Reduced, condensed_for
+from torch_qpmpc.certificate import Products, certify
+from torch_qpmpc.condense import VIOLATED, Reduced, condensed_for, condensed_in_order
 from torch_qpmpc.programs import FlatPrograms, SoftQPs
 from torch_qpmpc.qp import Status
-from torch_qpmpc.solvers import Answer, Backend, backend, fallbacks
+from torch_qpmpc.solvers import BACKENDS, Answer, Backend, backend, fallbacks
 from torch_qpmpc.solvers.crossover import refine
 from torch_qpmpc.solvers.diagnose import diagnose
 from torch_qpmpc.solvers.raw import RawArrays, RawSolution, unsolved
@@ -136,10 +136,10 @@ class _Chain:
         raw, todo = self.attempt(backend(solver), start)
         self.rejected = 0 if todo is None else len(todo)
         if todo is not None and self.rejected:
-            part = self.part()
-            # What is proved to be infeasible need not be tried by every other solver.
-            raw.status[todo] = _reasons(part, self.reduced_for(part))
-            self.todo = todo[raw.status[todo] != Status.INFEASIBLE]
+            raw.status[todo] = diagnose(self.part())
+            # What is proved to have no solution need not be tried by every other solver.
+            self.todo = todo[raw.status[todo] == Status.NOT_CONVERGED]
+            self.attempt_in_order()
             for other in fallbacks(solver):
                 self.attempt(other)
         return raw
@@ -163,6 +163,24 @@ class _Chain:
             return self.raw, self.todo
         part = self.part()
         reduced = self.reduced if self.todo is None else self.reduced_for(part)
+        return self._attempt(part, reduced, solve, start)
+
+    def attempt_in_order(self) -> None:
+        """Attempt what is left with C z = b solved in the order of its rows.
+
+        Serves predictions that grow over the horizon and that no action holds.
+        """
+        if self.todo is None or not len(self.todo):
+            return
+        # What is known of theta belongs to the other elimination.
+        part = replace(self.part(), _known={})
+        condensed = condensed_in_order(part)
+        if condensed is not None:
+            self._attempt(part, condensed.reduced(part), BACKENDS["torch"], None)
+
+    def _attempt(
+        self, part: FlatPrograms, reduced: Reduced, solve: Backend, start: Tensor | None
+    ) -> tuple[RawSolution, Tensor | None]:
         qps, recover = reduced.at(part), partial(_recover, part, reduced)
         recalled = None
         if not len(reduced.arrays.rows):
@@ -267,19 +285,3 @@ def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawS
     *found, worst = kernels.recover(*given)
     arrays = RawArrays._make((*found, claim.iterations))
     return RawSolution.of_arrays(arrays, p.device, worst=worst)
-
-
-def _reasons(part: FlatPrograms, reduced: Reduced) -> Tensor:
-    """What is the matter with QPs that a solver did not solve: their status, ``(B,)``."""
-    qps = reduced.at(part)
-    particular = reduced.expand(part, qps.g.new_zeros(qps.g.shape))
-    inconsistent = (part.multiply(part.C, particular) - part.b).abs() > TOLERANCE * (
-        1 + part.b.abs() + particular.abs().amax(-1, keepdim=True)
-    )
-    y = part.multiply(part.G, particular)
-    unreachable = (torch.maximum(part.lb - y, y - part.ub) > TOLERANCE) & part.w.isinf()
-    unreachable[:, reduced.rows] = False
-    impossible = inconsistent.any(-1) | unreachable.any(-1)
-    if not qps.g.shape[1]:
-        return torch.where(impossible, int(Status.INFEASIBLE), int(Status.NOT_CONVERGED))
-    return torch.where(impossible, int(Status.INFEASIBLE), diagnose(qps))
