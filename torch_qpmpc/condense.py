@@ -8,7 +8,7 @@ Y, T'HT and GT; fixing the first n_f <= keep entries then only changes a linear 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -234,21 +234,23 @@ def condensed_for(programs: FlatPrograms, keep: int) -> Condensed:
     return condensed_for(p, n_f) if condensed.deficient and keep > n_f else condensed
 
 
-def condensed_in_order(programs: FlatPrograms) -> Condensed | None:
-    """Condensed by solving the equations in their order; None where C has no such order.
+def other_eliminations(programs: FlatPrograms) -> Iterator[Condensed]:
+    """Condense in two other ways, for what no solver makes accurate after `condensed_for`.
 
-    Each is solved for the variables that no earlier one contains: x_1..x_N of a linear MPC scheme,
-    by its own recursion. Pivoting keeps T small, so that it serves an unstable model whose actions
-    stabilise it; where they cannot, as at their bounds, only the recursion is accurate, entry by
-    entry, whatever it grows to.
+    In an orthonormal basis, for an unstable model that the actions stabilise: the best conditioned
+    way, though not the sparsest. And in the order of the equations, each solved for variables that
+    no earlier one contains, x_1..x_N of a linear MPC scheme: where actions are at their bounds and
+    the states grow, only this recursion is accurate in every entry.
     """
-    keep = programs.fixed.shape[-1]
-    own = [_eliminate_in_order(C, keep) for C in programs.arrays.C]
-    if not all(own):
-        return None
-    T, Y = (programs.H.new_tensor(np.stack(part)) for part in zip(*own, strict=True))
-    condensed = _products(programs.H, programs.G, T, Y, keep)
-    return condensed if condensed.H.isfinite().all() else None
+    p, keep = programs, programs.fixed.shape[-1]
+    T, Y, padding = _null_space(p.C, keep)
+    yield _products(p.H, p.G, T, Y, keep, padding)
+    own = [_eliminate_in_order(C, keep) for C in p.arrays.C]
+    if all(own):
+        T, Y = (p.H.new_tensor(np.stack(part)) for part in zip(*own, strict=True))
+        condensed = _products(p.H, p.G, T, Y, keep)
+        if condensed.H.isfinite().all():
+            yield condensed
 
 
 def _eliminate_in_order(C: np.ndarray, keep: int) -> tuple[np.ndarray, np.ndarray] | None:

@@ -224,11 +224,10 @@ def test_an_unknown_backend_is_named(name, message):
         backend(name)
 
 
-def test_every_other_backend_is_a_fallback():
+def test_a_backend_falls_back_on_others():
     for name, solve in BACKENDS.items():
+        assert fallbacks(name)
         assert solve not in fallbacks(name)
-        assert len(fallbacks(name)) == len(BACKENDS) - 1
-    assert len(fallbacks("qpsolvers:clarabel")) == len(BACKENDS)
 
 
 def test_rows_that_are_hard_in_some_of_a_batch_only(solver):

@@ -1,17 +1,19 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
 from tests.campaign.families import FAMILIES, Draw
 from tests.campaign.tally import alone
-from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, random_mpc, soft_qps
-from torch_qpmpc import QuadraticProgram, Status, solve_qp
-from torch_qpmpc.condense import condensed_for
-from torch_qpmpc.programs import FlatPrograms, SoftQPs
+from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, programs_of, random_mpc
+from torch_qpmpc import QPMPC, QuadraticProgram, SolverError, Status, solve_qp
+from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.solvers.diagnose import diagnose
 
 pytestmark = pytest.mark.filterwarnings("ignore:Clarabel.rs terminated with status")
@@ -119,10 +121,10 @@ def test_fixed_entries_that_break_an_equality_are_infeasible():
         assert solution.status == status
 
 
-def only(qp: QuadraticProgram) -> SoftQPs:
-    """One QP without fixed entries, condensed."""
-    programs, _ = FlatPrograms.of(*qp.tensors(), torch.zeros(0).double())
-    return condensed_for(programs, 0).reduced(programs).at(programs)
+def programs(qp: QuadraticProgram, fixed: Tensor | None = None) -> FlatPrograms:
+    """QPs as the chain has them; by default with nothing fixed."""
+    fixed = torch.zeros(0).double() if fixed is None else fixed
+    return FlatPrograms.of(*qp.tensors(), fixed)[0]
 
 
 def doubles(entries) -> Tensor:
@@ -133,41 +135,44 @@ def doubles(entries) -> Tensor:
 @pytest.mark.parametrize("weight", [1e-2, 5.0, 1e4])
 def test_solvable_programs_are_neither_infeasible_nor_unbounded(rank, weight):
     options = {"rank": rank, "weight": weight, "soft": SOFT_ROWS, "hard": HARD_ROWS}
-    status = diagnose(soft_qps(known_qp(1, batch=(4,), **options))[0])
+    status = diagnose(programs_of(known_qp(1, batch=(4,), **options)))
     assert (status == Status.NOT_CONVERGED).all()
 
 
 def test_each_element_of_a_batch_has_its_own_diagnosis():
-    qps = SoftQPs(
-        H=torch.zeros(1, 2, 2).double(),
-        G=doubles([[[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]]),
-        group=torch.zeros(3, dtype=torch.int64),
-        g=doubles([[0.0, 0.0], [0.0, 0.0], [0.0, 5.0]]),
-        l=doubles([[-1.0, -1.0, -1.0], [-1.0, 3.0, -1.0], [-1.0, -1.0, -1.0]]),
-        u=doubles([[1.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 1.0]]),
-        w=doubles([[INF, INF, 1.0]] * 3),
-    )
-    assert diagnose(qps).tolist() == [Status.NOT_CONVERGED, Status.INFEASIBLE, Status.UNBOUNDED]
+    rows = [[1, 0], [1, 0], [0, 1]]
+    qp = program(NONE, [0, 0], rows, [0] * 3, [0] * 3, [INF, INF, 1])
+    q = doubles([[0.0, 0.0], [0.0, 0.0], [0.0, 5.0]])
+    lb = doubles([[-1.0, -1.0, -1.0], [-1.0, 3.0, -1.0], [-1.0, -1.0, -1.0]])
+    ub = doubles([[1.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 1.0]])
+    qp = replace(qp, q=q, lb=lb, ub=ub, check_values=False)
+    expected = [Status.NOT_CONVERGED, Status.INFEASIBLE, Status.UNBOUNDED]
+    assert diagnose(programs(qp)).tolist() == expected
 
 
 def test_matrices_of_its_own_for_each_element():
-    qps = SoftQPs(
-        H=torch.stack([torch.eye(2), torch.zeros(2, 2)]).double(),
-        G=doubles([[[1.0, 1.0], [1.0, 1.0]], [[1.0, 0.0], [2.0, 0.0]]]),
-        group=torch.tensor([1, 0, 1]),
-        g=doubles([[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]]),
-        l=doubles([[-1.0, -1.0], [-1.0, 3.0], [-1.0, -1.0]]),
-        u=doubles([[1.0, 1.0], [1.0, 4.0], [1.0, 1.0]]),
-        w=torch.full((3, 2), INF).double(),
+    flat, steep = program(UNIT, [1, 1], TWICE, [0, 0], [0, 0], [INF, INF]), doubles(NONE)
+    parallel = doubles(
+        [[[1.0, 1.0], [1.0, 1.0]], [[1.0, 0.0], [2.0, 0.0]], [[1.0, 0.0], [2.0, 0.0]]]
     )
-    assert diagnose(qps).tolist() == [Status.UNBOUNDED, Status.INFEASIBLE, Status.NOT_CONVERGED]
+    qp = replace(
+        flat,
+        H=torch.stack([doubles(UNIT), steep, steep]),
+        G=parallel,
+        q=doubles([[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]]),
+        lb=doubles([[-1.0, 3.0], [-1.0, -1.0], [-1.0, -1.0]]),
+        ub=doubles([[1.0, 4.0], [1.0, 1.0], [1.0, 1.0]]),
+        check_values=False,
+    )
+    expected = [Status.INFEASIBLE, Status.UNBOUNDED, Status.NOT_CONVERGED]
+    assert diagnose(programs(qp)).tolist() == expected
 
 
 @pytest.mark.parametrize("curvature", [1e-4, 1e-8])
 def test_little_curvature_is_not_called_unbounded(curvature):
     far = [1e9, 1e9]
     qp = program([[1, 0], [0, curvature]], [0, 1], [[1, 0], [0, 1]], [-1e9, -1e9], far, [1, 1])
-    assert diagnose(only(qp)).tolist() == [Status.NOT_CONVERGED]
+    assert diagnose(programs(qp)).tolist() == [Status.NOT_CONVERGED]
 
 
 @pytest.mark.parametrize(
@@ -192,4 +197,73 @@ def test_what_was_once_called_not_converged_has_its_proof(family, count, seed, i
 def test_hard_rows_that_hold_only_far_away_are_not_called_infeasible(far):
     rows = [[1, 0], [0, 1]]
     qp = program(rows, [0, 0], rows, [far, far], [2 * far, 2 * far], [INF, INF])
-    assert diagnose(only(qp)).tolist() == [Status.NOT_CONVERGED]
+    assert diagnose(programs(qp)).tolist() == [Status.NOT_CONVERGED]
+
+
+#: Soft states, and actions within hard bounds, so that no state makes it infeasible or unbounded.
+BOUNDED: dict[str, Any] = {
+    "stage_weight": [1.0, 0.1, 0.01],
+    "state_bounds": ([-2, -10], [2, 10]),
+    "action_bounds": ([-1.0], [1.0]),
+}
+
+
+def growing(radius: float, horizon: int, **options: Any) -> QPMPC:
+    """An unstable plant, a Jordan block."""
+    A = [[radius, 0.1], [0.0, radius]]
+    return QPMPC.from_model(A, [[0.0], [0.1]], horizon, **(BOUNDED | options))
+
+
+@pytest.mark.parametrize(
+    ("radius", "horizon", "value"),
+    # By two solvers and two eliminations, which agree to all digits given.
+    [(1.5, 30, 741101226.75), (1.5, 50, 3.557525499e14), (2.0, 50, 2.65969067e27)],
+)
+def test_states_that_no_action_holds_are_solved(solver, radius, horizon, value):
+    mpc = growing(radius, horizon, solver=solver)
+    assert_close(mpc.value(doubles([[1.0, 0.0]])), doubles([value]), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("horizon", [10, 30, 50])
+def test_an_unstable_plant_that_the_actions_hold_is_solved(solver, horizon):
+    mpc = growing(1.5, horizon, solver=solver)
+    s = doubles([[0.01, 0.01], [0.0, 0.05]])
+    held = mpc.solve(s)
+    states, _ = mpc.predicted(held.z)
+    assert states.abs().max() < 1
+    assert_close(held.value, doubles([0.0111, 0.0048]), rtol=0.05, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("A", "horizon"),
+    [
+        ([[2.0, 0.1], [0.0, 2.0]], 40),  # at the edge of what |u| <= 1 holds
+        ([[800.0, 600.0], [-600.0, 800.0]], 30),  # a norm of 1,000, and states of 1e90
+        ([[1.0, 1e3], [1e3, 1.0]], 20),
+    ],
+)
+def test_what_float64_cannot_solve_is_not_called_infeasible(solver, A, horizon):
+    mpc = QPMPC.from_model(A, [[0.0], [0.1]], horizon, solver=solver, on_failure="mask", **BOUNDED)
+    status = mpc.solve(doubles([[0.0, 0.05], [1.0, 0.0], [-1.5, 3.0]])).status
+    assert not ((status == Status.INFEASIBLE) | (status == Status.UNBOUNDED)).any()
+
+
+def test_not_converged_speaks_of_conditioning_and_of_what_helps():
+    mpc = growing(2.0, 40, solver="daqp")
+    message = "1 NOT_CONVERGED.*unstable model over a long horizon.*shorten the horizon"
+    with pytest.raises(SolverError, match=message):
+        mpc.value(doubles([[0.0, 0.05]]))
+
+
+def test_an_unstable_plant_that_is_infeasible_has_its_proof(solver):
+    options = {"state_slack": torch.inf, "on_failure": "mask", "solver": solver}
+    mpc = growing(1.5, 30, **options)
+    s = doubles([[1.9, 9.9], [-1.9, 0.0]])
+    assert (mpc.solve(s).status == Status.INFEASIBLE).all()
+
+
+@pytest.mark.parametrize("slope", [1e-7, 1e-9, 1e-11])
+def test_rows_that_meet_far_away_are_not_called_infeasible(slope):
+    # x >= 1 and y <= 0 with x <= y (1 - slope) + .. meet where y is -1 / slope.
+    qp = program(UNIT, [0, 0], [[1, -1], [1, slope - 1]], [-INF, 1], [0, INF], [INF, INF])
+    assert diagnose(programs(qp)).tolist() == [Status.NOT_CONVERGED]

@@ -41,13 +41,13 @@ def backend(name: str) -> Backend:
     )
 
 
-#: The order in which others try what one has not solved: the first to give up are the quickest.
-QUICKEST = ("daqp", "torch", "proxqp")
+#: The solvers that give up soonest, and solve what ProxQP does.
+FALLBACKS = ("daqp", "torch")
 
 
 def fallbacks(name: str) -> list[Backend]:
-    """Return the other backends, which solve, cold, what the certificate rejects."""
-    return [BACKENDS[other] for other in QUICKEST if other != name]
+    """Return the backends that solve, cold, what the certificate rejects of another one."""
+    return [BACKENDS[other] for other in FALLBACKS if other != name]
 
 
 __all__ = ["BACKENDS", "Answer", "Backend", "backend", "fallbacks"]

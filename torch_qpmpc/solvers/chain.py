@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torch_qpmpc import kernels
 from torch_qpmpc.certificate import Products, certify
-from torch_qpmpc.condense import VIOLATED, Reduced, condensed_for, condensed_in_order
+from torch_qpmpc.condense import VIOLATED, Reduced, condensed_for, other_eliminations
 from torch_qpmpc.programs import FlatPrograms, SoftQPs
 from torch_qpmpc.qp import Status
 from torch_qpmpc.solvers import BACKENDS, Answer, Backend, backend, fallbacks
@@ -28,6 +28,8 @@ from torch_qpmpc.solvers.units import units_of
 
 #: A rejected claim with a relative residual up to this is worth sharpening.
 NEARLY = 1e-2
+#: How often what an ill-conditioned elimination left over is solved for again.
+PASSES = 2
 #: Entries of a C that fits into a core's cache, with what else a QP has: larger ones are for BLAS.
 CACHED = 2**15
 
@@ -139,7 +141,7 @@ class _Chain:
             raw.status[todo] = diagnose(self.part())
             # What is proved to have no solution need not be tried by every other solver.
             self.todo = todo[raw.status[todo] == Status.NOT_CONVERGED]
-            self.attempt_in_order()
+            self.attempt_otherwise()
             for other in fallbacks(solver):
                 self.attempt(other)
         return raw
@@ -165,23 +167,26 @@ class _Chain:
         reduced = self.reduced if self.todo is None else self.reduced_for(part)
         return self._attempt(part, reduced, solve, start)
 
-    def attempt_in_order(self) -> None:
-        """Attempt what is left with C z = b solved in the order of its rows.
-
-        Serves predictions that grow over the horizon and that no action holds.
-        """
+    def attempt_otherwise(self) -> None:
+        """Attempt what is left with C z = b eliminated in other ways, for ill-conditioned ones."""
         if self.todo is None or not len(self.todo):
             return
-        # What is known of theta belongs to the other elimination.
-        part = replace(self.part(), _known={})
-        condensed = condensed_in_order(part)
-        if condensed is not None:
-            self._attempt(part, condensed.reduced(part), BACKENDS["torch"], None)
+        for condensed in other_eliminations(self.part()):
+            # What is known of theta belongs to another elimination.
+            part = replace(self.part(), _known={})
+            self._attempt(part, condensed.reduced(part), BACKENDS["torch"], passes=PASSES)
+            if not len(self.todo):
+                return
 
     def _attempt(
-        self, part: FlatPrograms, reduced: Reduced, solve: Backend, start: Tensor | None
+        self,
+        part: FlatPrograms,
+        reduced: Reduced,
+        solve: Backend,
+        start: Tensor | None = None,
+        passes: int = 0,
     ) -> tuple[RawSolution, Tensor | None]:
-        qps, recover = reduced.at(part), partial(_recover, part, reduced)
+        qps, recover = reduced.at(part), partial(_recover, part, reduced, passes=passes)
         recalled = None
         if not len(reduced.arrays.rows):
             answer = _unconstrained(qps)
@@ -242,21 +247,28 @@ def _unconstrained(qps: SoftQPs) -> Answer:
     return Answer(v, qps.l, torch.zeros_like(qps.group))
 
 
-def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
+def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer, passes: int = 0) -> RawSolution:
     """The full primal-dual solution from a backend's answer, certified.
 
     The multipliers that condensing eliminated come from the stationarity of the Lagrangian: chi by
-    the transpose of the same elimination, xi from what is left in the fixed entries.
+    the transpose of the same elimination, xi from what is left in the fixed entries. Each of
+    ``passes`` solves C z = b and for chi again, against the errors that the elimination made.
     """
-    if p.device.type == "cpu" and math.prod(p.arrays.C.shape[1:]) <= CACHED:
+    small = math.prod(p.arrays.C.shape[1:]) <= CACHED
+    if p.device.type == "cpu" and small and not passes:
         return _recover_compiled(p, reduced, answer)
     z = reduced.expand(p, answer.v)
+    for _ in range(passes):
+        z = z + p.multiply(reduced.Y_neg, p.multiply(p.C, z) - p.b)
     Hz, y = p.times_H(z), p.times_G(z)
     lam = reduced.all_rows(p, answer.lam, y)
     G_lam = p.times_G(lam, transposed=True)
     slope = Hz + p.q + G_lam
     chi = p.multiply(reduced.Y_neg, slope, transposed=True)
     C_chi = p.multiply(p.C, chi, transposed=True)
+    for _ in range(passes):
+        chi = chi + p.multiply(reduced.Y_neg, slope + C_chi, transposed=True)
+        C_chi = p.multiply(p.C, chi, transposed=True)
     slope += C_chi
     of_fixed = slope[:, : p.fixed.shape[-1]]
     xi = -of_fixed

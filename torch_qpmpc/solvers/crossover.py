@@ -9,6 +9,7 @@ steps from a good start.
 from __future__ import annotations
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from torch_qpmpc.programs import SoftQPs
@@ -45,7 +46,9 @@ def _solve_kkt(H, G, g, bound, active, held) -> tuple[np.ndarray, np.ndarray]:
     G_a = G[active]
     kkt = np.block([[H, G_a.T], [G_a, np.zeros((len(G_a), len(G_a)))]])
     right = np.concatenate([-g - G.T @ held, bound[active]])
-    solution = np.linalg.lstsq(kkt, right, rcond=1e-13)[0]
+    # By torch, which has the caller's number of threads.
+    system = torch.from_numpy(kkt), torch.from_numpy(right).unsqueeze(-1)
+    solution = torch.linalg.lstsq(*system, rcond=1e-13, driver="gelsd").solution[:, 0].numpy()
     lam = held.copy()
     lam[active] = solution[d:]
     return solution[:d], lam

@@ -23,8 +23,9 @@ import torch
 from scipy.optimize import lsq_linear, nnls
 from torch import Tensor
 
-from torch_qpmpc.programs import FlatPrograms
+from torch_qpmpc.programs import FlatPrograms, SoftQPs
 from torch_qpmpc.qp import Status
+from torch_qpmpc.solvers import daqp
 
 #: Relative to the sum of the absolute terms: what counts as zero, and what does not.
 ROUNDING, SIGNIFICANT = 1e-12, 1e-7
@@ -56,7 +57,8 @@ class _Range:
 
     @classmethod
     def of(cls, C: np.ndarray) -> _Range:
-        left, singular, right = np.linalg.svd(C, full_matrices=True)
+        # By torch, which has the caller's number of threads.
+        left, singular, right = (x.numpy() for x in torch.linalg.svd(torch.from_numpy(C)))
         rank = int((singular > RANK * singular.max(initial=0.0)).sum())
         inverse = (right[:rank].T / singular[:rank]) @ left[:, :rank].T
         return cls(inverse, right[rank:].T)
@@ -119,32 +121,49 @@ def _status(qp: _FreeQP, of_C: _Range) -> Status:
 def _nearest_feasible(qp: _FreeQP, z: np.ndarray, of_C: _Range) -> tuple[np.ndarray, np.ndarray]:
     """The feasible point nearest to z, where C z = b, or multipliers that deny that there is one.
 
-    Lawson and Hanson's least distance programming: of the rows ``A v >= h``, the residual of
-    ``min |[A'; h'] lam - e|`` over ``lam >= 0`` is that point, or zero where there is none.
+    DAQP finds the point sooner. Where it finds none, Lawson and Hanson's least distance programming
+    decides: of the rows ``A v >= h``, the residual of ``min |[A'; h'] lam - e|`` over ``lam >= 0``
+    is the point, or zero where there is none.
     """
     hard, y = np.isinf(qp.w), qp.G @ z
-    upper, lower = hard & np.isfinite(qp.ub), hard & np.isfinite(qp.lb)
-    A = _product(np.concatenate((-qp.G[upper], qp.G[lower])), of_C.null)
-    h = np.concatenate(((y - qp.ub)[upper], (qp.lb - y)[lower]))
-    norms = np.linalg.norm(np.concatenate((qp.G[upper], qp.G[lower])), axis=1)
-    lam, length = np.zeros(len(hard)), h.max(initial=0.0)
-    if not length > 0:
-        return z, lam
+    no_multipliers = np.zeros(len(hard))
+    lower, upper = (qp.lb - y)[hard], (qp.ub - y)[hard]
+    if not (lower > 0).any() and not (upper < 0).any():
+        return z, no_multipliers
+    norms = np.linalg.norm(qp.G[hard], axis=1)
     norms[norms == 0] = 1.0
-    E = np.concatenate((A / norms[:, None], (h / norms / length)[:, None]), axis=1).T
+    A = _product(qp.G[hard], of_C.null) / norms[:, None]
+    lower, upper = lower / norms, upper / norms
+    length = max(lower.max(), -upper.min())
+    nearest = z + of_C.null @ _least_distance(A, lower / length, upper / length) * length
+    if _is_feasible(qp, nearest):
+        return nearest, no_multipliers
+    below, above = np.isfinite(lower), np.isfinite(upper)
+    h = np.concatenate((lower[below], -upper[above])) / length
+    E = np.concatenate((np.concatenate((A[below], -A[above])).T, h[None]))
     unit = np.zeros(len(E))
     unit[-1] = 1.0
     try:
         weights, _ = nnls(E, unit)
     except RuntimeError:  # it did not settle: nothing is known
-        return z, lam
+        return z, no_multipliers
     left = E @ weights - unit
     if left[-1] < 0:
         z = z + of_C.null @ (left[:-1] / -left[-1]) * length
-    weights = weights / norms
-    lam[upper] += weights[: upper.sum()]
-    lam[lower] -= weights[upper.sum() :]
+    of_rows = np.zeros(len(norms))
+    of_rows[above] = weights[below.sum() :]
+    of_rows[below] -= weights[: below.sum()]
+    lam = no_multipliers
+    lam[hard] = of_rows / norms
     return z, lam
+
+
+def _least_distance(A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """The shortest v with ``lower <= A v <= upper``, if DAQP finds it."""
+    unit, zero = np.eye(A.shape[1]), np.zeros((1, A.shape[1]))
+    w = np.full((1, len(A)), np.inf)
+    rows = (A[None], np.zeros(1, np.int64), zero, lower[None], upper[None], w)
+    return daqp.solve(SoftQPs(*map(torch.from_numpy, (unit[None], *rows)))).arrays.v[0]
 
 
 def _contradict(qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, of_C: _Range) -> bool:
@@ -168,7 +187,7 @@ def _contradict(qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, of_C: _Range) -> 
 def _reach(qp: _FreeQP) -> np.ndarray:
     """Bounds of |z| by the hard rows of one entry each; inf where there is none."""
     rows = np.isinf(qp.w) & ((qp.G != 0).sum(1) == 1)
-    entry = (qp.G[rows] != 0).argmax(1)
+    entry = qp.G[rows].nonzero()[1]
     widest = np.maximum(np.abs(qp.lb), np.abs(qp.ub))[rows] / np.abs(qp.G[rows, entry])
     reach = np.full(len(qp.q), np.inf)
     np.minimum.at(reach, entry, widest)

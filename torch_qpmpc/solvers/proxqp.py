@@ -21,7 +21,7 @@ EPS_ABS = 1e-9
 #: ProxQP's default, 1e-4, calls one soft (always feasible) QP in fifty infeasible.
 EPS_INFEASIBLE = 1e-12
 #: Its defaults, 10,000 x 1,500, can keep one infeasible QP busy for half a minute.
-MAX_ITER, MAX_ITER_IN = 100, 50
+MAX_ITER, MAX_ITER_IN = 60, 50
 #: Of 10 by default, which take a tenth of the time and save no iteration.
 REFINEMENTS = 2
 
