@@ -17,6 +17,7 @@ from torchrl.objectives.utils import _GAMMA_LMBDA_DEPREC_ERROR, dispatch_value_e
 from torch_qpmpc.checks import check_flag, check_number
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.operators import QPActorValueOperator, QPValueOperator
+from torch_qpmpc.restoring import call_with
 
 
 def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Tensor:
@@ -242,8 +243,7 @@ class QPQLearningLoss(LossModule):
         weights = self._maybe_get_priority_weight(tensordict)
         active_set = self.value_network.active_set_key
         visited = tensordict.select(*_read_by(self.value_network), strict=False).detach()
-        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
-            self.value_network(visited)
+        call_with(self.value_network_params, self.value_network, visited)
         if active_set is not None:
             tensordict.set(active_set, visited.get(active_set))
         prediction = visited[self.tensor_keys.state_action_value].squeeze(-1)
@@ -293,10 +293,7 @@ class QPQLearningLoss(LossModule):
         """-V(s+), ``(*batch, 1)``; zero after a termination, where it is not used."""
         active_set = self.state_value_network.active_set_key
         following = tensordict.get("next").select(*_read_by(self.state_value_network), strict=False)
-        with self.target_value_network_params.to_module(
-            self.state_value_network, preserve_module_state=False
-        ):
-            self.state_value_network(following)
+        call_with(self.target_value_network_params, self.state_value_network, following)
         if active_set is not None:
             tensordict.set(unravel_key(("next", active_set)), following.get(active_set))
         done = tensordict.get(("next", self.tensor_keys.done))

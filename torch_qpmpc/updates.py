@@ -19,6 +19,7 @@ from torch_qpmpc.gauss_newton import GaussNewton
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.objectives import QPQLearningLoss, td_loss, td_metadata
 from torch_qpmpc.penalties import DeviationPenalty, SystemIdentificationPenalty
+from torch_qpmpc.restoring import restored
 
 Scalars = Mapping[str, Tensor]
 Update = Callable[[TensorDictBase, Tensor | None], tuple[dict[str, Tensor], Scalars]]
@@ -48,7 +49,8 @@ def first_order(
         by_gradient, proximal = deviation, None
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
-        losses = loss_module(batch)
+        with restored(loss_module):
+            losses = loss_module(batch)
         terms = {name.replace("_", "/", 1): x for name, x in losses.items() if "loss_" in name}
         if si is not None and windows is not None:
             terms["loss/si"] = si(mpc.C, windows)
