@@ -209,7 +209,7 @@ def without_writers(given: threading.ExceptHookArgs) -> None:
 # A run that goes on stays in its folder.
 OmegaConf.register_new_resolver("folder_of", folder_of, replace=True)
 #: What the loss module tells of itself.
-LOGGED = ("td_error", "pred_value", "target_value", "unsolved")
+LOGGED = ("td_error", "pred_value", "target_value", "unsolved", "invalid_reward")
 
 
 @hydra.main(version_base="1.3", config_path="configs", config_name="config")

@@ -241,8 +241,10 @@ def test_a_loss_that_is_not_finite_moves_nothing_and_is_counted(algo):
     before = copy.deepcopy(learner.loss_module.state_dict())
     broken = batch.clone()
     broken["next", "reward"][:2] = math.nan
-    _, losses = learner.learn(broken, None)
-    assert losses["unsolved"] == 2
+    rewards = r"\('next', 'reward'\): 2 of 12 rewards are NaN or infinite\. The batch moves nothing"
+    with pytest.warns(RuntimeWarning, match=rewards):
+        _, losses = learner.learn(broken, None)
+    assert (losses["invalid_reward"], losses["unsolved"]) == (2, 0)
     assert not moved(before, learner.loss_module.state_dict())
     learner.learn(batch.clone(), None)
     assert moved(before, learner.loss_module.state_dict())

@@ -583,3 +583,38 @@ def test_threads_that_solve_at_once_get_their_own_answers(solver):
 def test_a_choice_that_is_no_name_is_refused(name):
     with pytest.raises(QPError, match=f"{name}: got None, expected a name"):
         solution(*operands_of(known_qp(0)), **{name: None})
+
+
+ALLOCATIONS = [
+    MemoryError("Unable to allocate 8.00 TiB for an array"),
+    RuntimeError(
+        "[enforce fail at alloc_cpu.cpp:124] . DefaultCPUAllocator: can't allocate memory"
+    ),
+    torch.OutOfMemoryError("CUDA out of memory."),
+]
+
+
+@pytest.mark.parametrize("error", ALLOCATIONS, ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize("differentiated", [False, True])
+def test_a_batch_that_is_too_large_for_memory_is_named(error, differentiated, monkeypatch):
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("torch_qpmpc.autograd.solve_programs", fail)
+    known = known_qp(1, batch=(4, 3))
+    fixed = known.fixed.clone().requires_grad_(differentiated)
+    message = r"batch: got 12 QPs of n_z = 12, expected as many as .* Solve it in chunks, .*memory"
+    if "array" in str(error):
+        message = message.replace("memory", "array")
+    with pytest.raises(QPError, match=message):
+        solve_qp(known.qp, fixed)
+
+
+def test_another_runtime_error_stays_as_it_is(monkeypatch):
+    def fail(*_: object) -> None:
+        raise RuntimeError("of another kind")
+
+    monkeypatch.setattr("torch_qpmpc.autograd.solve_programs", fail)
+    known = known_qp(1, batch=(3,))
+    with pytest.raises(RuntimeError, match="of another kind"):
+        solve_qp(known.qp, known.fixed)

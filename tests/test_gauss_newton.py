@@ -291,3 +291,45 @@ def test_a_penalty_needs_a_free_C():
     mpc = random_mpc(learn=("H", "c"))
     with pytest.raises(QPError, match="penalty: got a C that is not free, expected C among the"):
         GaussNewton(mpc).step(*pairs(), targets(mpc), penalty=torch.eye(mpc.n_z).double())
+
+
+@pytest.mark.parametrize("trust_region", [True, False])
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_a_batch_without_a_usable_pair_moves_nothing(bad, trust_region):
+    mpc = random_mpc(15, on_failure="mask")
+    optimizer = GaussNewton(mpc, memory=3, trust_region=trust_region)
+    before, (s, a) = copy.deepcopy(mpc.state_dict()), pairs()
+    a[1] = 9.0  # beyond a hard bound
+    penalty = SystemIdentificationPenalty(1e-2).curvature(normal(5, mpc.n_z))
+    message = "None of the 7 pairs can be learned from: 1 have a QP .*, 6 a target that is not fin"
+    with pytest.warns(RuntimeWarning, match=message):
+        report = optimizer.step(s, a, torch.full((COUNT,), bad), penalty=penalty)
+    assert not report.accepted
+    assert math.isnan(report.ratio)
+    assert (report.unsolved, report.without_target) == (1, 6)
+    assert report.damping == optimizer.param_groups[0]["damping"] == 0.03
+    assert_close(mpc.state_dict(), before, rtol=0, atol=0)
+    assert not optimizer.state
+
+
+@pytest.mark.filterwarnings("error")
+def test_pairs_that_are_left_out_are_counted():
+    mpc = random_mpc(15, on_failure="mask")
+    (s, a), target = pairs(), targets(mpc)
+    a[1], target[1], target[3], target[4] = 9.0, torch.inf, torch.nan, torch.inf
+    report = GaussNewton(mpc).step(s, a, target)
+    assert report.accepted
+    assert (report.unsolved, report.without_target) == (1, 2)
+
+
+def test_a_report_is_shown_without_tensors():
+    mpc = random_mpc(15, on_failure="mask")
+    (s, a), target = pairs(), targets(mpc)
+    a[1], target[3] = 9.0, torch.nan
+    text = repr(GaussNewton(mpc).step(s, a, target))
+    assert text.startswith("StepReport(damping=0.03, ratio=")
+    assert "accepted=True, unsolved=1, without_target=1, solution=QPSolution(" in text
+    assert "solved 6 of 7, 1 INFEASIBLE" in text
+    assert "tensor" not in text
+    assert len(text.splitlines()) < 10
+    assert len(text) < 800

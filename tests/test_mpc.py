@@ -462,7 +462,7 @@ def test_it_shows_what_it_is():
         ),
         (
             {"constraints": (torch.ones(1, 3), [1.0], [0.0])},
-            "state_bounds, action_bounds, constraints: got lower > upper",
+            "constraints, bounds: got lower 1 > upper 0 at entry 0, expected lower <= upper",
         ),
         ({"constraint_slack": -1.0}, "constraint_slack: got -1.0, expected a non-negative weight"),
         ({"on_failure": "skip"}, "on_failure: got 'skip', expected one of raise, warn, mask"),
@@ -500,12 +500,19 @@ def test_it_shows_what_it_is():
             r"state_bounds: got shape \(1,\), expected shape \(2,\)",
         ),
         ({"action_bounds": (-1.0, 1.0)}, r"action_bounds: got shape \(\), .* on each side"),
-        ({"action_bounds": ([torch.nan], [1.0])}, "action_bounds: got NaN or inf, expected finite"),
+        (
+            {"action_bounds": ([torch.nan], [1.0])},
+            "action_bounds: got NaN, expected no NaN; inf for",
+        ),
         ({"action_bounds": ([torch.inf], [torch.inf])}, "action_bounds: .* lower bounds below inf"),
         ({"action_bounds": ([-torch.inf], [-torch.inf])}, "action_bounds: .* upper bounds above"),
         (
             {"action_bounds": ([1.0], [-1.0])},
-            "state_bounds, action_bounds: got lower > upper, expected lower <= upper",
+            r"^action_bounds: got lower 1 > upper -1 at entry 0, .* The pair is \(lower, upper\)",
+        ),
+        (
+            {"state_bounds": ([-1.0, 2.0], [1.0, 1.5])},
+            "^state_bounds: got lower 2 > upper 1.5 at entry 1, expected lower <= upper",
         ),
     ],
 )

@@ -140,7 +140,7 @@ def test_output_has_the_dtype_of_the_batch(dtype):
 def test_metadata_are_detached_scalars():
     operator, td = make_operator(), make_batch(6)
     out = make_loss(operator=operator)(td)
-    assert set(out.keys()) == {"loss_value", "unsolved", *METADATA}
+    assert set(out.keys()) == {"loss_value", "unsolved", "invalid_reward", *METADATA}
     assert out["loss_value"].requires_grad
     target = hand_target(operator.module, td, 0.0)
     prediction = hand_prediction(operator.module, td).detach()
@@ -151,6 +151,7 @@ def test_metadata_are_detached_scalars():
         "pred_value_max": prediction.max(),
         "target_value_max": target.max(),
         "unsolved": torch.tensor(0),
+        "invalid_reward": torch.tensor(0),
     }
     for key, value in expected.items():
         assert not out[key].requires_grad

@@ -121,7 +121,7 @@ def test_dispatch_without_a_tensordict():
     }
     assert {"_".join(unravel_keys(key)) for key in loss.in_keys} == set(arguments)
     results = loss(**arguments)
-    assert len(results) == len(loss.out_keys) == 7
+    assert len(results) == len(loss.out_keys) == 8
     for key, value in zip(loss.out_keys, results, strict=True):
         assert torch.equal(value, out[key]), key
 

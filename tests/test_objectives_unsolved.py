@@ -59,8 +59,11 @@ def test_unsolved_samples_are_masked(where, bad):
 def test_a_batch_without_any_solved_sample():
     operator, td = hard_operator(), feasible_batch(3)
     td["observation"] += 5.0
-    out, total = gradients(make_loss(operator=operator), td)
+    message = "None of the batch's 3 transitions can be learned from: 3 have a QP .*, 0 an invalid"
+    with pytest.warns(RuntimeWarning, match=message):
+        out, total = gradients(make_loss(operator=operator), td)
     assert out["unsolved"].item() == 3
+    assert out["invalid_reward"].item() == 0
     assert all(out[key].item() == 0 for key in ("loss_value", *METADATA))
     assert all(torch.equal(g, torch.zeros_like(g)) for g in total)
 
@@ -112,3 +115,77 @@ def test_without_masking_an_unsolved_qp_raises():
     td["observation"][0] = 5.0
     with pytest.raises(RuntimeError, match="1 of 3 QPs have no certified solution"):
         make_loss(operator=operator)(td)
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+def test_invalid_rewards_are_left_out_and_counted(bad, reduction):
+    operator, td = hard_operator(), feasible_batch(6)
+    solved = td[torch.tensor([0, 1, 3, 5])]
+    expected, step = gradients(make_loss(operator=operator, reduction="sum"), solved)
+    td["next", "reward"][2] = bad
+    td["next", "observation"][4] = 5.0  # and one without a solution
+    loss = make_loss(operator=operator, reduction=reduction)
+    message = r"\('next', 'reward'\): 1 of 6 rewards are NaN or infinite\. Those transitions are"
+    with pytest.warns(RuntimeWarning, match=message) as caught:
+        out, total = gradients(loss, td)
+    assert len(caught) == 1
+    assert (out["invalid_reward"].item(), out["unsolved"].item()) == (1, 1)
+    count = 6 if reduction == "mean" else 1
+    torch.testing.assert_close(out["loss_value"], expected["loss_value"] / count)
+    for gradient, other in zip(total, step, strict=True):
+        torch.testing.assert_close(gradient, other / count)
+    for key in METADATA:
+        torch.testing.assert_close(out[key], expected[key], msg=key)
+    assert td["td_error"][2] == 0
+
+
+def test_a_batch_of_invalid_rewards_alone():
+    operator, td = hard_operator(), feasible_batch(3)
+    td["next", "reward"][:] = torch.nan
+    message = "None of the batch's 3 transitions .*: 0 have a QP .*, 3 an invalid reward"
+    with (
+        pytest.warns(RuntimeWarning, match=message),
+        pytest.warns(RuntimeWarning, match="3 of 3 rewards"),
+    ):
+        out, total = gradients(make_loss(operator=operator), td)
+    assert (out["invalid_reward"].item(), out["unsolved"].item()) == (3, 0)
+    assert all(out[key].item() == 0 for key in ("loss_value", *METADATA))
+    assert all(torch.equal(g, torch.zeros_like(g)) for g in total)
+
+
+@pytest.mark.parametrize("estimator", ["td1", "tdlambda"])
+def test_an_invalid_reward_spoils_only_the_returns_that_contain_it(estimator):
+    operator, td = hard_operator(), make_batch(2, 6)
+    parts: list[Any] = [td, td["next"]]
+    for part in parts:
+        part["observation"] *= 0.3
+    td["action"] *= 0.3
+    td["next", "terminated"] = td["next", "done"] = torch.zeros(2, 6, 1, dtype=torch.bool)
+    td["next", "done"][0, 1] = True
+    expected = make_loss(estimator, operator, reduction="none")(td.clone())["loss_value"]
+    td["next", "reward"][0, 3], td["next", "observation"][0, 5] = torch.inf, 5.0
+    loss = make_loss(estimator, operator, reduction="none")
+    with pytest.warns(RuntimeWarning, match="1 of 12 rewards"):
+        out = loss(td)
+    with pytest.warns(RuntimeWarning, match="1 of 12 rewards"):
+        target = loss.target(td)
+    invalid, unsolved = torch.zeros(2, 2, 6, dtype=torch.bool)
+    invalid[0, [2, 3]] = True  # it, and the step before it in its episode
+    unsolved[0, [4, 5]] = True
+    assert torch.equal(target.isnan(), invalid)
+    assert torch.equal(target == -torch.inf, unsolved)
+    assert (out["invalid_reward"].item(), out["unsolved"].item()) == (2, 2)
+    kept = ~(invalid | unsolved)
+    torch.testing.assert_close(out["loss_value"][kept], expected[kept])
+    assert (out["loss_value"][~kept] == 0).all()
+
+
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt:FutureWarning")
+def test_invalid_rewards_are_counted_in_a_compiled_loss():
+    td = feasible_batch(6)
+    td["next", "reward"][2] = torch.nan
+    loss = make_loss(operator=hard_operator())
+    out = torch.compile(loss, fullgraph=True, backend="aot_eager")(td)
+    assert (out["invalid_reward"].item(), out["unsolved"].item()) == (1, 0)
+    assert out["loss_value"].isfinite()

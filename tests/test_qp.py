@@ -148,3 +148,34 @@ def test_the_examples_in_the_docstrings_run(module):
     results = doctest.testmod(importlib.import_module(f"torch_qpmpc.{module}"))
     assert results.attempted > 0
     assert results.failed == 0
+
+
+def test_a_program_is_shown_by_its_sizes():
+    expected = (
+        "QuadraticProgram(batch_shape=(5,), n_z=12, n_c=3, n_g=13, dtype=torch.float64, "
+        "device='cpu')"
+    )
+    assert repr(known_qp(0, batch=(5,)).qp) == expected
+
+
+def test_a_solution_is_shown_by_its_outcome():
+    known = known_qp(0, batch=(5,))
+    fixed = known.fixed.clone()
+    fixed[2] = torch.nan
+    text = repr(solve_qp(known.qp, fixed, on_failure="mask"))
+    first, shape, qp, outcome, values, last = text.splitlines()
+    assert (first, last) == ("QPSolution(", ")")
+    assert shape == f"    batch_shape=(5,), n_f={fixed.shape[-1]},"
+    assert qp == f"    qp={known.qp!r},"
+    assert outcome == "    solved 4 of 5, 1 INVALID_DATA,"
+    value = known.value[[0, 1, 3, 4]]
+    assert values.startswith(f"    value from {value.min():.4g} to {value.max():.4g}, residual up")
+
+
+def test_a_solution_without_values_or_elements_is_shown():
+    known = known_qp(0, batch=(3,))
+    meta = QuadraticProgram(*(x.to("meta") for x in known.qp.tensors()), check_values=False)
+    assert "device='meta'" in repr(solve_qp(meta, known.fixed.to("meta")))
+    assert "solved 0 of 0" in repr(solve_qp(known_qp(0, batch=(0,)).qp))
+    none = solve_qp(known.qp, known.fixed * torch.nan, on_failure="mask")
+    assert "solved 0 of 3, 3 INVALID_DATA" in repr(none)

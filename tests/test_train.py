@@ -135,7 +135,15 @@ def test_folder_is_complete(whole):
     assert (table["eval/J_true_model"].dropna() == summary["J_true_model"]).all()
     logged = table.drop(index=[0, 75])
     columns = ["loss/value", "loss/si", "train/td_error", "train/reward", "train/unsolved"]
-    columns += ["qp/solves", "qp/unsolved", "qp/residual", "time/collect", "time/update", "time/qp"]
+    columns += [
+        "train/invalid_reward",
+        "qp/solves",
+        "qp/unsolved",
+        "qp/residual",
+        "time/collect",
+        "time/update",
+        "time/qp",
+    ]
     for column in columns:
         assert np.isfinite(logged[column]).all(), column
     assert logged["qp/residual"].max() < 1e-6

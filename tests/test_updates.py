@@ -89,6 +89,39 @@ def test_what_is_not_solved_is_counted():
     assert all(term.isfinite() for term in terms.values())
 
 
+@pytest.mark.parametrize("second", [True, False])
+def test_invalid_rewards_are_counted_under_their_own_name(second):
+    mpc = random_mpc(3, on_failure="mask")
+    loss, batch = make_loss(mpc), transitions()
+    batch["action"][2] = 9.0  # beyond a hard bound
+    batch["next", "reward"][4] = torch.nan
+    if second:
+        update = second_order(mpc, loss, GaussNewton(mpc), None, None)
+    else:
+        update = first_order(mpc, loss, torch.optim.SGD(mpc.parameters(), 1e-3), None, None)
+    before = mpc.C.detach().clone()
+    with pytest.warns(RuntimeWarning, match=r"\('next', 'reward'\): 1 of \d+ rewards are NaN"):
+        terms, scalars = update(batch, None)
+    assert (scalars["unsolved"], scalars["invalid_reward"]) == (1, 1)
+    assert all(term.isfinite() for term in terms.values())
+    assert not torch.equal(mpc.C, before)
+
+
+def test_a_second_order_update_without_a_usable_pair_is_named():
+    mpc = random_mpc(3)
+    batch, before = transitions(), copy.deepcopy(mpc.state_dict())
+    batch["next", "reward"][:] = torch.inf
+    update = second_order(mpc, make_loss(mpc), GaussNewton(mpc), None, None)
+    with (
+        pytest.warns(RuntimeWarning, match=r"None of the \d+ pairs can be learned from: 0 have"),
+        pytest.warns(RuntimeWarning, match=r"\('next', 'reward'\): (\d+) of \1 rewards"),
+    ):
+        terms, scalars = update(batch, None)
+    assert terms["train/accepted"] == 0
+    assert scalars["invalid_reward"] == len(batch)
+    assert_close(mpc.state_dict(), before, rtol=0, atol=0)
+
+
 RATES = {"cost": 1e-2, "constraints": 1e-3}
 
 

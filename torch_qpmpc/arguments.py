@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,7 @@ def check_structure(
     **_: Any,
 ) -> None:
     for name, size in (("n_x", n_x), ("n_u", n_u), ("horizon", horizon)):
-        if not isinstance(size, int) or isinstance(size, bool) or size < 1:
+        if not isinstance(size, Integral) or isinstance(size, bool) or int(size) < 1:
             raise QPError.expected(name, repr(size), "a positive integer")
     check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
     check_choice("hessian", hessian, HESSIANS)
@@ -86,12 +87,16 @@ def as_tensor(name: str, value: Any) -> Tensor:
         of_tensor = isinstance(value, Tensor) and (value.is_complex() or value.is_meta)
         if of_tensor or (isinstance(value, np.ndarray) and np.iscomplexobj(value)):
             raise TypeError
-        tensor = torch.as_tensor(value, dtype=torch.float64)
+        # Whatever the default device is: one of meta would make lists tensors without values.
+        tensor = torch.as_tensor(value, dtype=torch.float64, device="cpu")
     except (TypeError, ValueError, RuntimeError) as error:
         raise QPError.expected(
             name, _brief(value), "a tensor, or what torch.as_tensor takes, of real numbers"
         ) from error
-    if tensor.isnan().any() or (tensor.isinf().any() and not name.endswith("bounds")):
+    if name.endswith("bounds"):
+        if tensor.isnan().any():
+            raise QPError.expected(name, "NaN", "no NaN; inf for no bound")
+    elif not tensor.isfinite().all():
         raise QPError.expected(name, "NaN or inf", "finite entries")
     return tensor
 
@@ -117,6 +122,17 @@ def bound(name: str, bounds: tuple[Any, Any] | None, side: int, size: int) -> Te
             name, f"{given.tolist()}", ("lower bounds below inf", "upper bounds above -inf")[side]
         )
     return given
+
+
+def bound_pair(name: str, bounds: tuple[Any, Any] | None, size: int) -> tuple[Tensor, Tensor]:
+    """Both sides of `bound`, none of which crosses the other."""
+    lower, upper = bound(name, bounds, 0, size), bound(name, bounds, 1, size)
+    crossing = (lower > upper).nonzero()
+    if len(crossing):
+        i = int(crossing[0])
+        got = f"lower {lower[i]:g} > upper {upper[i]:g} at entry {i}"
+        raise QPError.expected(name, got, "lower <= upper", "The pair is (lower, upper).")
+    return lower, upper
 
 
 def cost_weights(

@@ -17,6 +17,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -216,9 +217,9 @@ def _checked_keep(qp: QuadraticProgram, fixed: Tensor, keep: int | None) -> int:
     n_f = fixed.shape[-1]
     if keep is None:
         return n_f
-    if not isinstance(keep, int) or not n_f <= keep <= qp.n_z:
+    if not isinstance(keep, Integral) or not n_f <= int(keep) <= qp.n_z:
         raise QPError.expected("keep", repr(keep), f"n_f = {n_f} <= keep <= n_z = {qp.n_z}")
-    return keep
+    return int(keep)
 
 
 # OpenMP's threads do not survive a fork: in the child torch, too, would wait for them for ever.
@@ -264,13 +265,27 @@ def _solve_flat(*arguments: Any) -> tuple[RawSolution, torch.Size]:
     if on_failure not in ON_FAILURE:
         raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
     device = q.device if solver == "torch" and q.is_cuda else CPU
-    programs, batch = FlatPrograms.of(*theta, device=device)
-    if start is not None:
-        start = listed(start.to(device).expand(*batch, -1))
-    raw = solve_programs(programs, keep, solver, start)
+    try:
+        programs, batch = FlatPrograms.of(*theta, device=device)
+        if start is not None:
+            start = listed(start.to(device).expand(*batch, -1))
+        raw = solve_programs(programs, keep, solver, start)
+    except (MemoryError, RuntimeError) as error:
+        if not _is_out_of_memory(error):
+            raise
+        shapes = (x.shape[: x.ndim - n] for x, n in zip(theta, EVENT_NDIMS, strict=False))
+        got = f"{broadcast(*shapes).numel():,} QPs of n_z = {q.shape[-1]}"
+        remedy = f"Solve it in chunks, as of torch.split. The allocation said: {error}."
+        raise QPError.expected("batch", got, "as many as memory has room for", remedy) from error
     if on_failure != "mask":
         _report(raw, batch, on_failure)
     return raw, batch
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """True for a failed allocation, which torch's CPU allocator names only in its message."""
+    kinds = (MemoryError, torch.OutOfMemoryError)
+    return isinstance(error, kinds) or "DefaultCPUAllocator" in str(error)
 
 
 solve_op = torch.library.custom_op("torch_qpmpc::solve", _solve_now, mutates_args=())

@@ -6,7 +6,7 @@ Only types, shapes and plain numbers: to look at a tensor's values would cost ti
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -24,8 +24,8 @@ def check_kind(name: str, value: Any, kind: type, remedy: str = "") -> None:
 
 
 def check_whole(name: str, value: Any, least: int, remedy: str = "") -> None:
-    """Raise `QPError` unless ``value`` is an integer that is at least ``least``."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+    """Raise `QPError` unless ``value`` is an integer, NumPy's included, of at least ``least``."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or int(value) < least:
         raise QPError.expected(name, repr(value), f"a whole number >= {least}", remedy)
 
 

@@ -14,8 +14,9 @@ curvatures' sum, so that the penalty is part of the same step.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor, nn
@@ -35,7 +36,7 @@ def _positive(x: float) -> bool:
     return 0 < x < math.inf
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StepReport:
     """What a step did.
 
@@ -43,13 +44,23 @@ class StepReport:
         solution: of Q(s, a) before the step.
         damping: mu as a fraction of the mean of K's diagonal, as it was used.
         ratio: the decrease of the squared errors over the predicted one; nan without trust region.
-        accepted: whether theta has moved.
+        accepted: True if theta has moved.
+        unsolved: pairs that were left out because their QP has no solution.
+        without_target: other pairs that were left out because their target is not finite.
     """
 
     solution: QPSolution
     damping: float
     ratio: float
     accepted: bool
+    unsolved: int = 0
+    without_target: int = 0
+
+    def __repr__(self) -> str:
+        """Each field in one line, the solution in its own few."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        numbers = (f"{name}={x!r}" for name, x in values.items() if name != "solution")
+        return f"StepReport({', '.join(numbers)}, solution={self.solution!r})"
 
 
 class GaussNewton(torch.optim.Optimizer):
@@ -129,16 +140,19 @@ class GaussNewton(torch.optim.Optimizer):
         Args:
             s, a: visited pairs, ``(B, n_x)`` and ``(B, n_u)``.
             target: costs to go, L + gamma V(s+), ``(B,)``; where it is not finite, the pair is
-                left out. That a target has the wrong sign, as a reward or TorchRL's values have,
-                cannot be told from its numbers.
+                left out and counted. If no pair is left, nothing moves, with a `RuntimeWarning`.
+                That a target has the wrong sign, as a reward or TorchRL's values have, cannot be
+                told from its numbers.
             penalty: S ``(n_z, n_z)`` of a penalty ``1/2 tr(C S C')`` against the batch's mean of
                 ``1/2 delta^2``, such as `SystemIdentificationPenalty.curvature`; for a free C.
             warm_start: active sets of Q(s, a), ``(B, n_g)``.
 
         Raises:
-            QPError: a shape that does not fit, or a penalty without a free C.
+            QPError: a shape that does not fit, a penalty without a free C, or a QPMPC that got
+                other parameters, as by `QPMPC.release`.
         """
         mpc = self._mpc
+        self._check_parameters()
         check_tensor("s", s, "B", mpc.n_x, batched=False)
         check_tensor("a", a, len(s), mpc.n_u, batched=False)
         check_tensor("target", target, len(s), batched=False, remedy="Squeeze its last dimension.")
@@ -152,11 +166,20 @@ class GaussNewton(torch.optim.Optimizer):
             qp = self._mpc.quadratic_program()
         solution = self._mpc.solve(s, a, warm_start, qp)
         use = solution.solved & target.isfinite()
+        unsolved = int((~solution.solved).sum())
+        left_out = unsolved, len(s) - unsolved - int(use.sum())
+        if sum(left_out) == len(s):
+            message = (
+                f"None of the {len(s)} pairs can be learned from: {left_out[0]} have a QP without "
+                f"a solution, {left_out[1]} a target that is not finite. Theta stays."
+            )
+            warnings.warn(message, RuntimeWarning, stacklevel=2)
+            return StepReport(solution, group["damping"], math.nan, False, *left_out)
         delta = torch.where(use, target.to(solution.value) - solution.value, 0)
         if self._clip is not None:
             delta = delta.clamp(-self._clip, self._clip)
         if penalty is not None:
-            penalty = max(int(use.sum()), 1) * penalty
+            penalty = (len(s) - sum(left_out)) * penalty
         lr, damping = group["lr"], group["damping"]
         blocks = self._blocks(solution, use, penalty)
         for block in blocks:
@@ -170,11 +193,11 @@ class GaussNewton(torch.optim.Optimizer):
             # Numbers too large to be squared: more damping, and nothing of them in the memory.
             self._adapt(math.nan)
             self.state.clear()
-            return StepReport(solution, damping, math.nan, False)
+            return StepReport(solution, damping, math.nan, False, *left_out)
         if not self._trust_region:
             _move(blocks, steps, lr)
             self._mpc.project_()
-            return StepReport(solution, damping, math.nan, True)
+            return StepReport(solution, damping, math.nan, True, *left_out)
         old = [block.leaf.clone() for block in blocks]
         before = _objective(delta, blocks)
         _move(blocks, steps, lr)
@@ -193,7 +216,17 @@ class GaussNewton(torch.optim.Optimizer):
             for block, value in zip(blocks, old, strict=True):
                 block.leaf.copy_(value)
         self._adapt(ratio)
-        return StepReport(solution, damping, ratio, accepted)
+        return StepReport(solution, damping, ratio, accepted, *left_out)
+
+    def _check_parameters(self) -> None:
+        """Raise `QPError` if the QPMPC's parameters are no longer those of this optimiser."""
+        own = {id(parameter) for parameter in self._mpc.parameters()}
+        groups = self.param_groups
+        lost = [x["name"] for x in groups if not own.issuperset(map(id, x["params"]))]
+        if lost:
+            got = f"a QPMPC that has other parameters of {', '.join(lost)} by now"
+            remedy = "QPMPC.release gives it new ones: make the GaussNewton anew after it."
+            raise QPError.expected("mpc", got, "the parameters of this optimiser", remedy)
 
     def _project(self, blocks: list[_Dense | _OuterProducts], change: Tensor) -> Tensor:
         """Project theta; ``change`` of Q with what that adds to it at first order, ``(B,)``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,8 @@ from torchrl.objectives.utils import _GAMMA_LMBDA_DEPREC_ERROR, dispatch_value_e
 from torch_qpmpc.checks import check_flag, check_number
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.operators import QPActorValueOperator, QPValueOperator
+from torch_qpmpc.restoring import call_with
+from torch_qpmpc.tracing import has_values
 
 
 def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Tensor:
@@ -33,16 +36,18 @@ def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Te
 def td_metadata(prediction: Tensor, target: Tensor) -> dict[str, Tensor]:
     """Detached scalars that describe a batch of values and their targets, ``(*batch,)`` each.
 
-    What is not finite, that is not solved, is counted and left out.
+    What is not finite is left out, and counted: a NaN target as an invalid reward, all else as a QP
+    without a solution.
     """
-    solved = prediction.isfinite() & target.isfinite()
-    prediction, target = torch.where(solved, prediction, 0), torch.where(solved, target, 0)
+    use = prediction.isfinite() & target.isfinite()
+    invalid = target.isnan()
+    prediction, target = torch.where(use, prediction, 0), torch.where(use, target, 0)
 
     def mean(x: Tensor) -> Tensor:
-        return x.sum() / solved.sum().clamp(min=1)
+        return x.sum() / use.sum().clamp(min=1)
 
     def largest(x: Tensor) -> Tensor:
-        return x.masked_fill(~solved, -torch.inf).max().nan_to_num(neginf=0.0)
+        return x.masked_fill(~use, -torch.inf).max().nan_to_num(neginf=0.0)
 
     return {
         "td_error": mean((target - prediction).abs()),
@@ -50,8 +55,25 @@ def td_metadata(prediction: Tensor, target: Tensor) -> dict[str, Tensor]:
         "target_value": mean(target),
         "pred_value_max": largest(prediction),
         "target_value_max": largest(target),
-        "unsolved": (~solved).sum(),
+        "unsolved": (~use & ~invalid).sum(),
+        "invalid_reward": invalid.sum(),
     }
+
+
+def invalid_rewards(tensordict: TensorDictBase, reward: NestedKey, effect: str) -> Tensor:
+    """Where the rewards are NaN or infinite, ``(*batch, 1)``; if anywhere, a `RuntimeWarning`.
+
+    Args:
+        tensordict: a batch of transitions.
+        reward: the key of the rewards under ``"next"``.
+        effect: what the warning says that they do.
+    """
+    key = unravel_key(("next", reward))
+    invalid = ~tensordict.get(key).isfinite()
+    if has_values(invalid) and (count := int(invalid.sum())):
+        message = f"{key}: {count} of {invalid.numel()} rewards are NaN or infinite. {effect}"
+        warnings.warn(message, RuntimeWarning, stacklevel=3)
+    return invalid
 
 
 class QPQLearningLoss(LossModule):
@@ -60,7 +82,8 @@ class QPQLearningLoss(LossModule):
     V and Q are the same QP with and without u_0 fixed, so V(s+) is exactly min over a of Q(s+, a).
     In TorchRL's signs, reward = -L. Truncation bootstraps, termination does not. Samples whose QP
     has no certified solution (``on_failure="mask"`` in the QPMPC) add nothing to loss or gradient
-    and are counted in ``unsolved``.
+    and are counted in ``unsolved``. So do those whose return contains a reward that is NaN or
+    infinite, which are counted in ``invalid_reward``, with a `RuntimeWarning`.
 
     Args:
         value_network: the critic, whose parameters are learned.
@@ -125,6 +148,7 @@ class QPQLearningLoss(LossModule):
         "pred_value_max",
         "target_value_max",
         "unsolved",
+        "invalid_reward",
     ]
 
     value_network: QPActorValueOperator
@@ -242,17 +266,23 @@ class QPQLearningLoss(LossModule):
         weights = self._maybe_get_priority_weight(tensordict)
         active_set = self.value_network.active_set_key
         visited = tensordict.select(*_read_by(self.value_network), strict=False).detach()
-        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
-            self.value_network(visited)
+        call_with(self.value_network_params, self.value_network, visited)
         if active_set is not None:
             tensordict.set(active_set, visited.get(active_set))
         prediction = visited[self.tensor_keys.state_action_value].squeeze(-1)
         target = self.target(tensordict)
         metadata = td_metadata(prediction.detach(), target)
-        # An unsolved QP's cost is infinite.
-        solved = prediction.isfinite() & target.isfinite()
-        prediction = torch.where(solved, prediction, 0)
-        target = torch.where(solved, target, 0)
+        # An unsolved QP's cost is infinite, the target of an invalid reward is NaN.
+        use = prediction.isfinite() & target.isfinite()
+        if has_values(use) and not use.any():
+            unsolved, invalid = int(metadata["unsolved"]), int(metadata["invalid_reward"])
+            message = (
+                f"None of the batch's {use.numel()} transitions can be learned from: {unsolved} "
+                f"have a QP without a solution, {invalid} an invalid reward. The loss is zero."
+            )
+            warnings.warn(message, RuntimeWarning, stacklevel=2)
+        prediction = torch.where(use, prediction, 0)
+        target = torch.where(use, target, 0)
         priority = (target - prediction).detach().square()
         tensordict.set(self.tensor_keys.priority, priority, inplace=True)
         loss = td_loss(prediction, target, self.td_error_clip)
@@ -276,27 +306,45 @@ class QPQLearningLoss(LossModule):
                 )
             if key != keys.reward and value.dtype != torch.bool:
                 raise QPError.expected(str(path), value.dtype, "torch.bool", "Convert: .bool().")
+        following: TensorDictBase = tensordict.get("next")
+        for key in self.state_value_network.in_keys:
+            if following.get(key, None) is None:
+                found = ", ".join(sorted(str(name) for name in following.keys(True, True)))
+                remedy = "Collect what follows each step, or name it by the operator's keys."
+                name, got = str(unravel_key(("next", key))), f"no such entry beside {found}"
+                raise QPError.expected(name, got, "the state after the step", remedy)
         if 0 in tensordict.batch_size:
             raise QPError.expected("tensordict", "an empty batch", "at least one transition")
 
     @torch.no_grad()
     def target(self, tensordict: TensorDictBase) -> Tensor:
-        """What the estimator makes of V(s+), ``(*batch,)``; -inf where V(s+) has no solution.
+        """What the estimator makes of V(s+), ``(*batch,)``.
 
-        With TD(0), r + gamma (1 - terminated) V(s+) in TorchRL's signs.
+        With TD(0), r + gamma (1 - terminated) V(s+) in TorchRL's signs. It is -inf where it
+        contains a V(s+) without a solution, and NaN where it contains an invalid reward.
         """
+        reward = tensordict.get(("next", self.tensor_keys.reward))
+        effect = "Those transitions are left out of the loss and its gradient."
+        invalid = invalid_rewards(tensordict, self.tensor_keys.reward, effect)
         next_value = self._next_value(tensordict)
-        value = self.value_estimator.value_estimate(tensordict.copy(), next_value=next_value)
-        return value.squeeze(-1)
+        target = self._estimate(tensordict, reward.masked_fill(invalid, 0), next_value)
+        target = torch.where(target.isfinite(), target, -torch.inf)
+        if not has_values(invalid) or invalid.any():
+            # The returns of rewards that are one where they are invalid, and zero elsewhere.
+            spoilt = self._estimate(tensordict, invalid.to(reward), torch.zeros_like(next_value))
+            target = target.masked_fill(spoilt != 0, torch.nan)
+        return target
+
+    def _estimate(self, tensordict: TensorDictBase, reward: Tensor, next_value: Tensor) -> Tensor:
+        """The returns of these rewards, ``(*batch,)``, along the batch's transitions."""
+        batch = tensordict.copy().set(("next", self.tensor_keys.reward), reward)
+        return self.value_estimator.value_estimate(batch, next_value=next_value).squeeze(-1)
 
     def _next_value(self, tensordict: TensorDictBase) -> Tensor:
         """-V(s+), ``(*batch, 1)``; zero after a termination, where it is not used."""
         active_set = self.state_value_network.active_set_key
         following = tensordict.get("next").select(*_read_by(self.state_value_network), strict=False)
-        with self.target_value_network_params.to_module(
-            self.state_value_network, preserve_module_state=False
-        ):
-            self.state_value_network(following)
+        call_with(self.target_value_network_params, self.state_value_network, following)
         if active_set is not None:
             tensordict.set(unravel_key(("next", active_set)), following.get(active_set))
         done = tensordict.get(("next", self.tensor_keys.done))

@@ -25,6 +25,7 @@ from torch import Tensor
 from torch_qpmpc.batching import broadcast
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.precision import full_precision
+from torch_qpmpc.tracing import has_values
 
 #: Trailing (event) dimensions of each tensor of a QP, in the order of the constructor.
 EVENT_SHAPES: dict[str, tuple[str, ...]] = {
@@ -101,7 +102,7 @@ def _kind(tensors: Sequence[Tensor]) -> tuple | None:
     return kind
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class QuadraticProgram:
     """A validated batch of parametric QPs (eq:qp2).
 
@@ -172,6 +173,12 @@ class QuadraticProgram:
         """Worked out once for all QPs of the same shapes."""
         tensors = self.tensors()
         return _accepted.get(_kind(tensors)) or Sizes.of(tensors)
+
+    def __repr__(self) -> str:
+        """Sizes, dtype and device, without the tensors' entries."""
+        sizes = f"n_z={self.n_z}, n_c={self.b.shape[-1]}, n_g={self.lb.shape[-1]}"
+        kind = f"dtype={self.H.dtype}, device={str(self.H.device)!r}"
+        return f"QuadraticProgram(batch_shape={tuple(self.batch_shape)}, {sizes}, {kind})"
 
     def tensors(self) -> tuple[Tensor, ...]:
         """H, q, c, C, b, G, lb, ub, w."""
@@ -313,7 +320,7 @@ def row_states(p, lower, upper, w) -> tuple:
     return bound, active, held
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class QPSolution:
     """Primal-dual solution of a batch of QPs.
 
@@ -342,6 +349,26 @@ class QPSolution:
     status: Tensor
     residual: Tensor
     iterations: Tensor
+
+    def __repr__(self) -> str:
+        """Sizes, how many elements have each status, and the range of the values."""
+        lines = [
+            f"batch_shape={tuple(self.status.shape)}, n_f={self.xi.shape[-1]}",
+            f"qp={self.qp!r}",
+        ]
+        if has_values(self.status):
+            solved = self.solved
+            outcome = [f"solved {int(solved.sum())} of {solved.numel()}"]
+            for status in list(Status)[1:]:
+                if count := int((self.status == status).sum()):
+                    outcome.append(f"{count} {status.name}")
+            lines.append(", ".join(outcome))
+            if solved.any():
+                value, residual = self.value.detach()[solved], self.residual[solved].max()
+                of_values = f"value from {value.min():.4g} to {value.max():.4g}"
+                lines.append(f"{of_values}, residual up to {residual:.2g}")
+        body = ",\n".join(f"    {line}" for line in lines)
+        return f"QPSolution(\n{body},\n)"
 
     @property
     def solved(self) -> Tensor:

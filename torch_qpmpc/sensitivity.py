@@ -25,7 +25,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd import forward_ad
 
 from torch_qpmpc.batching import align, broadcast, flatten, outer, sum_to
@@ -35,13 +35,10 @@ from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.qp import Status, active_rows
 from torch_qpmpc.solvers.units import units_of
 from torch_qpmpc.tangents import right_side, times
+from torch_qpmpc.tracing import is_hidden
 
 _functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue] - has no stub
 
-#: The tensors that nothing but autograd looks at.
-PLAIN = frozenset((Tensor, nn.Parameter))
-#: On while `torch.autograd.grad` is asked for gradients with ``is_grads_batched``.
-BATCHED_GRADIENTS = torch._C._dispatch_key_parse("VmapMode")
 #: Residual of the KKT system from which on it counts as singular.
 SINGULAR = 1e-8
 #: Event dimensions of the operator's tensors: four gradients; z, lam, status; the QP's data.
@@ -354,16 +351,7 @@ def is_traced(tensors: Sequence[Tensor]) -> bool:
 
     The solvers must be hidden from these.
     """
-    core = torch._C
-    return (
-        torch.compiler.is_compiling()
-        or core._len_torch_dispatch_stack() > 0  # fake tensors, traces
-        or core._len_torch_function_stack() > 0  # a default device
-        or core._get_tracing_state() is not None
-        or core._dispatch_tls_is_dispatch_key_included(BATCHED_GRADIENTS)
-        or _functorch.peek_interpreter_stack() is not None  # `torch.func`
-        or not PLAIN.issuperset(map(type, tensors))
-    )
+    return is_hidden(tensors) or torch._C._len_torch_function_stack() > 0  # a default device
 
 
 @torch.compiler.assume_constant_result

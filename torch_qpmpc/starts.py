@@ -9,7 +9,7 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from torch_qpmpc.arguments import as_tensor, bound, check_model, check_slack, cost_weights
+from torch_qpmpc.arguments import as_tensor, bound_pair, check_model, check_slack, cost_weights
 from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.layout import Layout
@@ -43,6 +43,7 @@ def theta(
     **_: Any,
 ) -> tuple[Layout, dict[str, Tensor]]:
     """All parts of theta by name, for the arguments of `QPMPC`; w is inf on hard rows."""
+    n_x, n_u, horizon, seed = map(int, (n_x, n_u, horizon, seed))  # may be NumPy's
     D = _linear_rows("constraints", constraints, n_x + n_u)
     D_f = _linear_rows("terminal_constraints", terminal_constraints, n_x)
     layout = Layout(n_x, n_u, horizon, len(D[0]), len(D_f[0]))
@@ -90,8 +91,8 @@ def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dic
     return {
         "structure": "tied",
         "hessian": hessian,
-        "stage_weight": torch.ones(n_x + n_u),
-        "terminal_weight": torch.ones(n_x) if hessian == "diagonal" else RICCATI,
+        "stage_weight": [1.0] * (n_x + n_u),
+        "terminal_weight": [1.0] * n_x if hessian == "diagonal" else RICCATI,
         "discount_slack": True,
         "learn": learn,
     }
@@ -164,8 +165,7 @@ def _linear_rows(name: str, rows: tuple[Any, Any, Any] | None, width: int) -> tu
     matrix = as_tensor(name, matrix)
     if matrix.ndim != 2 or matrix.shape[1] != width:
         raise QPError.expected(name, f"D of shape {tuple(matrix.shape)}", f"shape (n_d, {width})")
-    pair = (lower, upper)
-    return matrix, *(bound(f"{name}, bounds", pair, side, len(matrix)) for side in (0, 1))
+    return matrix, *bound_pair(f"{name}, bounds", (lower, upper), len(matrix))
 
 
 def _bounds(
@@ -176,16 +176,9 @@ def _bounds(
     D_f: tuple[Tensor, ...],
 ) -> dict[str, Tensor]:
     """lb and ub ``(n_g,)``."""
-    both = []
-    for side in (0, 1):
-        x = bound("state_bounds", state_bounds, side, layout.n_x)
-        u = bound("action_bounds", action_bounds, side, layout.n_u)
-        both.append(layout.rows(x, u, D[1 + side], D_f[1 + side]))
-    lower, upper = both
-    if not (lower <= upper).all():
-        names = "state_bounds, action_bounds"
-        names += ", constraints" * bool(layout.n_d or layout.n_d_f)
-        raise QPError.expected(names, "lower > upper", "lower <= upper")
+    x = bound_pair("state_bounds", state_bounds, layout.n_x)
+    u = bound_pair("action_bounds", action_bounds, layout.n_u)
+    lower, upper = (layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], strict=True))
     return {"lb": lower, "ub": upper}
 
 

@@ -9,6 +9,7 @@ deviation penalty's proximal step (eq:sdp2).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -17,8 +18,9 @@ from torchrl.objectives import LossModule
 
 from torch_qpmpc.gauss_newton import GaussNewton
 from torch_qpmpc.mpc import QPMPC
-from torch_qpmpc.objectives import QPQLearningLoss, td_loss, td_metadata
+from torch_qpmpc.objectives import QPQLearningLoss, invalid_rewards, td_loss, td_metadata
 from torch_qpmpc.penalties import DeviationPenalty, SystemIdentificationPenalty
+from torch_qpmpc.restoring import restored
 
 Scalars = Mapping[str, Tensor]
 Update = Callable[[TensorDictBase, Tensor | None], tuple[dict[str, Tensor], Scalars]]
@@ -35,8 +37,8 @@ def first_order(
 ) -> Update:
     """The gradient of the loss and of the penalties, for any torch optimiser.
 
-    A batch whose loss or gradient is not finite moves nothing; of such a loss, what is not finite
-    is counted as unsolved.
+    A batch whose loss or gradient is not finite moves nothing. Of such a loss, the transitions with
+    an invalid reward are counted, with a `RuntimeWarning`, and the unsolved among the others.
 
     Args:
         loss_module: any of TorchRL's; its ``loss_*`` are summed.
@@ -48,7 +50,8 @@ def first_order(
         by_gradient, proximal = deviation, None
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
-        losses = loss_module(batch)
+        with restored(loss_module):
+            losses = loss_module(batch)
         terms = {name.replace("_", "/", 1): x for name, x in losses.items() if "loss_" in name}
         if si is not None and windows is not None:
             terms["loss/si"] = si(mpc.C, windows)
@@ -59,9 +62,14 @@ def first_order(
         optimizer.zero_grad()
         if not total.isfinite():
             if losses.get("unsolved", None) is None:
+                effect = "The batch moves nothing."
+                keys: Any = loss_module.tensor_keys
+                invalid = invalid_rewards(batch, keys.reward, effect).view(-1)
                 error = losses["pred_value"] - losses["target_value"]
                 # An ensemble has an error of each critic for a transition.
-                losses["unsolved"] = (~error.isfinite()).reshape(-1, len(batch)).any(0).sum()
+                lost = (~error.isfinite()).reshape(-1, len(batch)).any(0)
+                losses["unsolved"] = (lost & ~invalid).sum()
+                losses["invalid_reward"] = invalid.sum()
             return terms, losses
         total.backward()
         of_each = [x.grad for group in optimizer.param_groups for x in group["params"]]

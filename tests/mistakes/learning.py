@@ -19,6 +19,14 @@ from tests.problems import random_mpc
 from tests.transitions import make_batch, make_loss
 from torch_qpmpc.replay import make_replay, windows_to_tau
 
+
+def released_step() -> None:
+    tied = random_mpc(0, structure="tied")
+    optimizer = qm.GaussNewton(tied)
+    tied.release()
+    optimizer.step(S, Aa, torch.zeros(4))
+
+
 MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "QPActorValueOperator: model": (
         lambda: qm.QPActorValueOperator(torch.nn.Linear(2, 1)),
@@ -116,7 +124,8 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPQLearningLoss: no next obs": (
         lambda: make_loss()(batch_without(("next", "observation"))),
-        "observation: got no such entry, expected one beside nothing. Rename the ope",
+        "('next', 'observation'): got no such entry beside done, reward, terminated, truncated, "
+        "expected the state after the step. Collect",
     ),
     "QPQLearningLoss: flat reward": (
         lambda: make_loss()(batch_with(("next", "reward"), torch.zeros(3).double())),
@@ -245,6 +254,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "GaussNewton: 3d": (
         lambda: gn.step(torch.zeros(2, 2, 2), torch.zeros(2, 2, 1), torch.zeros(2, 2)),
         "s: got shape (2, 2, 2), expected shape (B, 2).",
+    ),
+    "GaussNewton: released": (
+        released_step,
+        "mpc: got a QPMPC that has other parameters of C by now, expected the parameters of this "
+        "optimiser. QPMPC.release gives it new ones: make the GaussNewton anew after it.",
     ),
     "GaussNewton: empty": (
         lambda: gn.step(S[:0], Aa[:0], torch.zeros(0)).accepted,

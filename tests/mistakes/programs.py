@@ -126,9 +126,13 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         M(n_x=2.0),
         "n_x: got 2.0, expected a positive integer.",
     ),
-    "QPMPC: n_x numpy": (
-        M(n_x=np.int64(2)),
-        f"n_x: got {np.int64(2)!r}, expected a positive integer.",  # by NumPy 1 as 2
+    "QPMPC: n_x numpy bool": (
+        M(n_x=np.True_),
+        f"n_x: got {np.True_!r}, expected a positive integer.",  # by NumPy 1 as True
+    ),
+    "QPMPC: n_x numpy float": (
+        M(n_x=np.float64(2)),
+        f"n_x: got {np.float64(2)!r}, expected a positive integer.",
     ),
     "QPMPC: horizon str": (
         M(horizon="3"),
