@@ -63,8 +63,8 @@ _EXPLANATIONS = {
     "finite w, or check b, lb and ub",
     Status.UNBOUNDED: "the cost decreases without bound; add curvature to H or bounds to G",
     Status.NOT_CONVERGED: "no solver reached the certificate's tolerance, and nothing proves that "
-    "there is no solution; the QP may be ill-conditioned, as is the prediction of an unstable model "
-    "over a long horizon: shorten the horizon, give the model a stabilising feedback u = K x + v, or "
+    "there is no solution; the QP may be ill-conditioned, as predictions of an unstable model are "
+    "over a long horizon: shorten it, give the model a stabilising feedback u = K x + v, or "
     "rescale the QP",
     Status.INVALID_DATA: "NaN or inf in the data, lb > ub, or an H that is not positive "
     "semidefinite; look at the parameters and the state",
