@@ -35,7 +35,7 @@ from torch_qpmpc import (
 from torch_qpmpc.banded import band_distance
 from torch_qpmpc.checkpoint import load_checkpoint, save_checkpoint
 from torch_qpmpc.config import flatten
-from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.envs import LinearSystem, PointMass
 from torch_qpmpc.experiment import evaluate
 from torch_qpmpc.lock import LOCK, locked
 from torch_qpmpc.tasks import make_mpc, make_physics
@@ -650,3 +650,50 @@ def test_runs_that_start_in_the_same_second_have_folders_of_their_own():
     assert re.fullmatch(
         r"runs/point_mass/gaussian-deviation/seed1-\d{8}-\d{6}-\d{6}", hydras[0].run.dir
     )
+
+
+# --- Gymnasium -----------------------------------------------------------------------------------
+
+PENDULUM = (
+    "task.A=[[1,0,0],[0,1.0375,.05],[0,.75,1]]",
+    "task.B=[[0],[.0075],[.15]]",
+    "task.stage_weight=[[0,0,0,0],[0,2,0,0],[0,0,.2,0],[0,0,0,.1]]",
+)
+SHORT = ("solver=daqp", "updates=3", "eval_interval=3", "warmup_steps=12", "task.eval_steps=5")
+
+
+@pytest.mark.parametrize("id", ["Pendulum-v1", "torch_qpmpc/PointMass-v0"])
+def test_any_gymnasium_environment_is_a_task(command, tmp_path, monkeypatch, capsys, id):
+    monkeypatch.chdir(tmp_path)
+    model = PENDULUM
+    if id != "Pendulum-v1":
+        A, B = PointMass().A.tolist(), PointMass().B.tolist()
+        W = torch.eye(6).tolist()
+        model = (f"task.A={A}", f"task.B={B}", f"task.stage_weight={W}")
+    command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false")
+    folder = Path(capsys.readouterr().out.splitlines()[-1])
+    assert folder.parent == tmp_path / "runs" / "gymnasium" / id / "none-deviation"
+    assert folder.name.startswith("seed1-")
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["task"], summary["updates"], summary["unsolved"]) == ("gymnasium", 3, 0)
+    assert math.isfinite(summary["J_final"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ((), r"^task.id: got '\?\?\?', expected the id of a Gymnasium env.* task.id=Pendulum-v1"),
+        (("task.id=Pendulum-v9",), "^task.id: got 'Pendulum-v9', expected an environment that Gym"),
+        (("task.id=CartPole-v1",), r"^task.id: got 'CartPole-v1', whose action space is Discrete"),
+        (("task.id=Pendulum-v1",), r"^task.A: got null, expected the rows of a matrix \(3, 3\)"),
+        (
+            ("task.id=Pendulum-v1", *PENDULUM[:1]),
+            r"^task.B: got null, .* \(3, 1\) .* least squares .*'task.B=\[\[0\],\[.1\]\]'",
+        ),
+        (("task.id=Pendulum-v1", *PENDULUM[:2]), r"^task.stage_weight: got null, .* \(4, 4\)"),
+    ],
+)
+def test_what_a_gymnasium_task_lacks_is_said(command, tmp_path, monkeypatch, overrides, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=message):
+        command("task=gymnasium", *overrides, *SHORT)
