@@ -21,6 +21,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Collection
 from functools import partial
 from typing import Any
 
@@ -48,9 +49,18 @@ from torch_qpmpc.experiment import (
     theta_metrics,
 )
 from torch_qpmpc.interrupt import Interrupt
+from torch_qpmpc.lock import ELSEWHERE, ELSEWHERE_IN_SWEEP, locked
 from torch_qpmpc.plots import summary_figure
 from torch_qpmpc.replay import ACTIVE_SET, make_replay
-from torch_qpmpc.snapshot import Tally, folder_of, restore, resumed, snapshot
+from torch_qpmpc.snapshot import (
+    Tally,
+    check_fresh,
+    check_own_folder,
+    folder_of,
+    restore,
+    resumed,
+    snapshot,
+)
 from torch_qpmpc.sweeps import finished_run, stopped_run
 from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc, true_model
 from torch_qpmpc.tracking import RunFolder, unwritable
@@ -206,6 +216,29 @@ def without_writers(given: threading.ExceptHookArgs) -> None:
         threading.__excepthook__(given)
 
 
+def train_in(
+    folder: str, cfg: DictConfig, overrides: Collection[str], sweep: bool
+) -> dict[str, Any]:
+    """Start a run in ``folder``, go on with the one there, or skip a sweep's finished one.
+
+    Returns:
+        What summary.json holds.
+    """
+    resume, state = cfg.resume, None
+    if resume is not None:
+        cfg, state = resumed(resume, overrides)
+    check_config(cfg)
+    if sweep:
+        if (done := finished_run(folder, cfg)) is not None:
+            return done
+        state = stopped_run(folder, cfg)
+    elif resume is None:
+        check_fresh(folder)
+    else:
+        check_own_folder(resume, folder)
+    return train(cfg, folder, state, quiet=sweep)
+
+
 # A run that goes on stays in its folder.
 OmegaConf.register_new_resolver("folder_of", folder_of, replace=True)
 #: What the loss module tells of itself.
@@ -217,16 +250,10 @@ def main(cfg: DictConfig) -> float:
     """Train; a sweep's optimiser maximises the closed gap that this returns."""
     threading.excepthook = without_writers
     ours = HydraConfig.get()
-    folder, sweep, state = ours.runtime.output_dir, ours.mode is RunMode.MULTIRUN, None
+    folder, sweep = ours.runtime.output_dir, ours.mode is RunMode.MULTIRUN
     try:
-        if cfg.resume is not None:
-            cfg, state = resumed(cfg.resume, list(ours.overrides.task))
-        check_config(cfg)
-        if sweep:
-            if (done := finished_run(folder, cfg)) is not None:
-                return done["closed_gap"]
-            state = stopped_run(folder, cfg)
-        return train(cfg, folder, state, quiet=sweep)["closed_gap"]
+        with locked(folder, ELSEWHERE_IN_SWEEP if sweep else ELSEWHERE):
+            return train_in(folder, cfg, list(ours.overrides.task), sweep)["closed_gap"]
     except QPError as error:
         if sweep:
             raise  # an exit would end the other runs, too

@@ -95,7 +95,10 @@ def test_each_key_is_read(tmp_path, monkeypatch):
 def test_each_choice_of_groups_is_accepted(names):
     """But for a noise of another task, and windows for the SI penalty without a replay."""
     choice = dict(zip(GROUPS, names, strict=True))
-    cfg = make_config(*(f"{group}={name}" for group, name in choice.items()), "warmup_steps=10")
+    more = ["task.id=Pendulum-v1"] if choice["task"] == "gymnasium" else []
+    cfg = make_config(
+        *(f"{group}={name}" for group, name in choice.items()), *more, "warmup_steps=10"
+    )
     if choice["noise"] not in NOISES[cfg.task.name]:
         key = "noise.name"
     elif choice["optimizer"] == "recursive" and cfg.constraint.si is not None:
@@ -137,7 +140,7 @@ REAL = [-1.0, math.nan, math.inf, True, "much", None]
 FRACTION = [0, -0.5, 1.1, math.nan, False, "half", None]
 FLAG = [0, 1, "yes", None]
 NAME = [3, True, None]
-MATRIX = [1.0, [1.0], [[1.0], [1.0, 2.0]], [["a"]], [[math.nan]], [[True]], None]
+MATRIX = [1.0, [1.0], [[1.0], [1.0, 2.0]], [["a"]], [[math.nan]], [[True]], "???"]
 BAD: dict[str, list[Any]] = {
     "seed": [*WHOLE[1:], 2**63],
     "solver": NAME,
@@ -167,7 +170,7 @@ BAD: dict[str, list[Any]] = {
     "collector.sync": FLAG,
     "collector.num_cpus": [0, *REAL],
     "task.name": ["pendulum", *NAME],
-    "task.id": NAME,
+    "task.id": ["???", *NAME],
     "task.A": MATRIX,
     "task.B": MATRIX,
     "task.stage_weight": MATRIX,

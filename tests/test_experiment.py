@@ -124,7 +124,30 @@ def test_table():
     assert lines[0].split() == ["start", "learned", "true", "model", "closed", "gap"]
     assert lines[1].split() == ["J", "100.0", "60.0", "50.0", "0.800"]
     assert lines[2].split() == ["J", "discounted", "95.0", "57.0", "47.5", "0.800"]
-    assert "no gap" in table(gap_summary(loops_with(50, 60, 50)))
+
+
+@pytest.mark.parametrize(
+    ("ends", "J", "discounted"),
+    [
+        ((50, 60, 50), "no gap; J rose by 10.0", "no gap; J discounted rose by 9.5"),
+        ((48, 40, 50), "no gap; J fell by 8.0", "no gap; J discounted fell by 7.6"),
+        ((50, 50, 50), "no gap; J did not change", "no gap; J discounted did not change"),
+        (
+            (50, 60, math.nan),
+            "no true model; J rose by 10.0",
+            "no true model; J discounted rose by 9.5",
+        ),
+        (
+            (50, math.inf, 50),
+            "no gap; J went from 50.0 to inf",
+            "no gap; J discounted went from 47.5 to inf",
+        ),
+    ],
+)
+def test_table_says_how_J_changed_where_there_is_no_gap(ends, J, discounted):
+    lines = table(gap_summary(loops_with(*ends))).splitlines()
+    assert lines[1].endswith(f"  {J}")
+    assert lines[2].endswith(f"  {discounted}")
 
 
 def test_the_numbers_of_theta_are_logged_where_they_are_few():

@@ -13,6 +13,7 @@ from torch_qpmpc import QPError
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment import evaluate
 from torch_qpmpc.finished import FinishedRun, collect, prediction_error
+from torch_qpmpc.lock import LOCK
 from torch_qpmpc.reading import canonical
 from torch_qpmpc.structure import Model
 
@@ -38,6 +39,15 @@ def test_a_sweeps_own_folder_gives_its_name(study):
 
 def test_one_run_will_do(study):
     assert len(collect(study / "small" / "gaussian-free-seed1")) == 1
+
+
+def test_a_lock_file_that_was_left_is_ignored(study):
+    folder = study / "small" / "gaussian-free-seed1"
+    (folder / LOCK).touch()
+    try:
+        assert len(collect(folder)) == 1
+    finally:
+        (folder / LOCK).unlink()
 
 
 def test_the_learned_qp_is_the_one_that_was_evaluated(study):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,11 @@ def test_every_run_is_in_the_long_table():
         "| a | gaussian | free | 2 | 285.0 | 50.0 | 47.0 | 0.920 | 0.200 | 0.0400 | 0.0500 | 0 "
         "| 3.2 |"
     )
+
+
+def test_a_run_without_a_gap_says_how_J_changed():
+    frame = made_up({("gaussian", "free"): [math.nan]}).assign(J_start=46.97, J_final=50.0)
+    assert "| 47.0 | 50.0 | 47.0 | no gap; J rose by 3.0 |" in report.runs_table(frame)
 
 
 def test_the_learned_cases_come_to_one_number_in_which_each_weighs_alike():

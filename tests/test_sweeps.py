@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
+from torch_qpmpc.lock import locked
 from torch_qpmpc.sweeps import SweepProgress, finished_run, number_of_runs, stopped_run
 
 ROOT = Path(__file__).parents[1]
@@ -87,6 +88,16 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path):
     assert changed.returncode == 1
     assert "a finished run with exploration_std=0.3, expected exploration_std=0.2" in changed.stderr
     assert (first / "checkpoint.pt").stat().st_mtime_ns == before
+
+
+def test_a_sweep_does_not_write_where_another_run_does(tmp_path):
+    folder = tmp_path / "gaussian-free-seed1"
+    folder.mkdir()
+    with locked(folder):
+        refused = sweep(tmp_path, "hydra/launcher=basic", "seed=1")
+    assert refused.returncode == 1
+    assert f"got {folder}, in use by process {os.getpid()}" in refused.stderr
+    assert not (folder / "config.yaml").exists()
 
 
 # --- Runs that have finished ---------------------------------------------------------------------

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests.runs import linear_system, make_config, true_mpc
+from torch_qpmpc import QPError
 from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.experiment import evaluate
@@ -131,3 +132,34 @@ def test_the_value_of_a_state_has_its_violation():
     sigma = mpc.solve(torch.tensor([[-0.2, 1.3]]).double()).sigma
     violation = physics.violation(torch.tensor([[-0.2, 1.3]]))
     torch.testing.assert_close(sigma[:, :2].sum(-1), violation)
+
+
+# Gymnasium
+
+
+def test_a_model_of_other_dimensions_is_an_error_of_the_environment():
+    cfg = make_config("task=pendulum", "task.id=MountainCarContinuous-v0")
+    message = (
+        r"^task\.id: got 'MountainCarContinuous-v0', whose observation has 2 entries and whose "
+        r"action has 1, with task\.A of shape \(3, 3\), task\.B of shape \(3, 1\), "
+        r"task\.stage_weight of shape \(4, 4\), expected task\.A of shape \(2, 2\), task\.B of "
+        r"shape \(2, 1\), task\.stage_weight of shape \(3, 3\)\. Find a model .* finite differences"
+    )
+    with pytest.raises(QPError, match=message):
+        make_mpc(cfg, make_physics(cfg))
+
+
+def test_a_model_on_the_command_line_is_that_of_the_qp():
+    model = (
+        "task.A=[[1,1],[0,1]]",
+        "task.B=[[0],[.1]]",
+        "task.stage_weight=[[2,0,0],[0,1,0],[0,0,1]]",
+    )
+    cfg = make_config(
+        "task=gymnasium", "task.id=MountainCarContinuous-v0", *model, "task.horizon=4"
+    )
+    mpc = make_mpc(cfg, make_physics(cfg))
+    A, B = torch.tensor([[1, 1], [0, 1]]).double(), torch.tensor([[0], [0.1]], dtype=torch.float64)
+    assert torch.equal(mpc.C_0, banded_matrix(A, B, 4))
+    W = mpc.quadratic_program().H[:3, :3]
+    torch.testing.assert_close(W, torch.diag(torch.tensor([2.0, 1, 1])).double())

@@ -20,6 +20,7 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests.runs import CONFIGS, SMALL, make_config
+from torch_qpmpc import QPError
 from torch_qpmpc.checkpoint import load_checkpoint
 from torch_qpmpc.config import flatten
 from torch_qpmpc.tracking import RunFolder, read_metrics, unwritable
@@ -138,6 +139,45 @@ def test_relative_folder_is_kept_when_the_working_directory_changes(tmp_path, mo
         run.log({"eval/J": 1.0}, 1)
     assert (tmp_path / "run" / "metrics.csv").exists()
     assert scalars(events(tmp_path / "run"), "eval/J") == {1: 1.0}
+
+
+# --- Going on ------------------------------------------------------------------------------------
+
+ROWS = "update,eval/J\n0,3.0\n2,2.0\n4,1.0\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        (None, r"\[Errno 2\] No such file or directory"),
+        ("", "its last line is cut off"),
+        (ROWS[:-3], "its last line is cut off"),
+        (ROWS[:-6], "no row of update 4"),
+        (ROWS[:14], "no row of update 0, 2, 4"),
+        ("some,table\n1,2\n", ".*'update' not found in columns"),
+        (ROWS.replace("2.0", "two"), "could not convert string to float: 'two'"),
+        (ROWS.replace("2.0", "2.0,7,8"), "Error tokenizing data"),
+        (ROWS + ROWS[14:], "updates that do not increase"),
+    ],
+)
+def test_a_run_does_not_go_on_from_damaged_metrics(tmp_path, text, wrong):
+    cfg = make_config("eval_interval=2", "log_interval=4")
+    if text is not None:
+        (tmp_path / "metrics.csv").write_text(text)
+    sentence = (
+        rf"^metrics\.csv: got {re.escape(str(tmp_path))}/metrics\.csv \({wrong}.*\), "
+        r"expected the table that a run wrote\. Put a whole copy of it there, go on from a copy "
+        r"of the folder, or start anew in another one by hydra\.run\.dir=FOLDER\.$"
+    )
+    with pytest.raises(QPError, match=sentence):
+        RunFolder(tmp_path, cfg, after=4)
+    assert not (tmp_path / "tensorboard").exists(), "nothing has been written"
+
+
+def test_whole_metrics_go_on(tmp_path):
+    (tmp_path / "metrics.csv").write_text(ROWS + "6,0.5\n")
+    with RunFolder(tmp_path, make_config("eval_interval=2", "log_interval=4"), after=4) as run:
+        assert run.column("eval/J") == ([0, 2, 4], [3.0, 2.0, 1.0])
 
 
 # --- Faults --------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 from matplotlib.image import imread
 from numba.core import event
 from omegaconf import DictConfig, OmegaConf
@@ -31,10 +33,11 @@ from torch_qpmpc import (
     SystemIdentificationPenalty,
 )
 from torch_qpmpc.banded import band_distance
-from torch_qpmpc.checkpoint import load_checkpoint
+from torch_qpmpc.checkpoint import load_checkpoint, save_checkpoint
 from torch_qpmpc.config import flatten
-from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.envs import LinearSystem, PointMass
 from torch_qpmpc.experiment import evaluate
+from torch_qpmpc.lock import LOCK, locked
 from torch_qpmpc.tasks import make_mpc, make_physics
 from torch_qpmpc.tracking import read_metrics
 
@@ -539,3 +542,166 @@ def test_misspelt_key_on_the_command_line(tmp_path, monkeypatch, capsys, mistake
         train.main()
     assert error.value.code not in (0, None)
     assert sentence in capsys.readouterr().err + str(error.value.code)
+
+
+# --- Folders that are in use or hold a run ------------------------------------------------------
+
+TINY = (*SMALL, "figures=false", "task.eval_steps=5")
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """`python train.py ..` in this process."""
+
+    def run(*arguments: str) -> None:
+        argv = ["train.py", "--config-path", str(CONFIGS), *QUIET, *arguments]
+        monkeypatch.setattr(sys, "argv", argv)
+        train.main()
+
+    return run
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def stopped(tmp_path: Path) -> Path:
+    """A run that has a checkpoint of its second update."""
+    folder = tmp_path / "run"
+
+    def killed(*given: Any) -> None:
+        save_checkpoint(*given)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "save_checkpoint", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train.train(make_config(*TINY), str(folder))
+    return folder
+
+
+def test_a_finished_run_is_not_overwritten(command, tmp_path):
+    folder = tmp_path / "run"
+    (folder / ".hydra").mkdir(parents=True)
+    for name in ("train.log", ".hydra/config.yaml", LOCK):  # Hydra's, and a killed run's
+        (folder / name).touch()
+    command(*TINY, f"hydra.run.dir={folder}")
+    before = contents(folder)
+    message = (
+        f"^folder: got {folder}, which holds a finished run, expected one without a run. "
+        "Choose another folder by hydra.run.dir=FOLDER.$"
+    )
+    with pytest.raises(SystemExit, match=message):
+        command(*TINY, "seed=2", f"hydra.run.dir={folder}")
+    assert contents(folder) == before
+    assert not (folder / LOCK).exists()
+
+
+def test_a_stopped_run_is_not_overwritten_but_goes_on(command, stopped):
+    before = contents(stopped)
+    message = (
+        f"^folder: got {stopped}, which holds a run that was stopped, expected one without a run. "
+        f"Go on with it by resume={stopped}, or choose another folder by hydra.run.dir=FOLDER.$"
+    )
+    with pytest.raises(SystemExit, match=message):
+        command(*TINY, f"hydra.run.dir={stopped}")
+    assert contents(stopped) == before
+    command(f"resume={stopped}")
+    assert (stopped / "summary.json").exists()
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "checkpoint.pt"])
+def test_a_run_that_cannot_go_on_is_not_offered_for_it(command, stopped, name):
+    (stopped / name).write_text("[: garbage")
+    message = "a run that was stopped, expected one without a run. Choose another folder by hydra"
+    with pytest.raises(SystemExit, match=message):
+        command(*TINY, f"hydra.run.dir={stopped}")
+
+
+def test_a_folder_in_use_is_refused(command, stopped, tmp_path):
+    before = contents(stopped)
+    for overrides in ((*TINY, f"hydra.run.dir={stopped}"), (f"resume={stopped}",)):
+        with locked(stopped), pytest.raises(SystemExit, match=f"got {stopped}, in use by process "):
+            command(*overrides)
+    assert contents(stopped) == before
+
+
+def test_a_run_holds_the_lock(command, tmp_path, monkeypatch):
+    def busy(cfg: DictConfig, folder: str, *_: Any, **__: Any) -> dict[str, Any]:
+        with pytest.raises(QPError, match="in use by process"), locked(folder):
+            pass
+        return {"closed_gap": 0.5}
+
+    monkeypatch.setattr(train, "train", busy)
+    command(*TINY, f"hydra.run.dir={tmp_path}")
+    assert not (tmp_path / LOCK).exists()
+
+
+def test_a_run_goes_on_in_its_own_folder_only(command, stopped, tmp_path):
+    message = f"got {tmp_path}/other with resume={stopped}, expected {stopped}. A run goes on in i"
+    with pytest.raises(SystemExit, match=message):
+        command(f"resume={stopped}", f"hydra.run.dir={tmp_path}/other")
+
+
+def test_damaged_metrics_are_said_in_a_sentence(command, stopped):
+    (stopped / "metrics.csv").write_bytes(b"\xff\x00 garbage")
+    with pytest.raises(SystemExit, match=r"^metrics.csv: got .*metrics.csv \('utf-8' codec"):
+        command(f"resume={stopped}")
+
+
+def test_runs_that_start_in_the_same_second_have_folders_of_their_own():
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONFIGS)):
+        hydras = [compose("config", return_hydra_config=True).hydra for _ in range(3)]
+    assert len({hydra.run.dir for hydra in hydras}) == 3
+    assert len({hydra.sweep.dir for hydra in hydras}) == 3
+    assert re.fullmatch(
+        r"runs/point_mass/gaussian-deviation/seed1-\d{8}-\d{6}-\d{6}", hydras[0].run.dir
+    )
+
+
+# --- Gymnasium -----------------------------------------------------------------------------------
+
+PENDULUM = (
+    "task.A=[[1,0,0],[0,1.0375,.05],[0,.75,1]]",
+    "task.B=[[0],[.0075],[.15]]",
+    "task.stage_weight=[[0,0,0,0],[0,2,0,0],[0,0,.2,0],[0,0,0,.1]]",
+)
+SHORT = ("solver=daqp", "updates=3", "eval_interval=3", "warmup_steps=12", "task.eval_steps=5")
+
+
+@pytest.mark.parametrize("id", ["Pendulum-v1", "torch_qpmpc/PointMass-v0"])
+def test_any_gymnasium_environment_is_a_task(command, tmp_path, monkeypatch, capsys, id):
+    monkeypatch.chdir(tmp_path)
+    model = PENDULUM
+    if id != "Pendulum-v1":
+        A, B = PointMass().A.tolist(), PointMass().B.tolist()
+        W = torch.eye(6).tolist()
+        model = (f"task.A={A}", f"task.B={B}", f"task.stage_weight={W}")
+    command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false")
+    folder = Path(capsys.readouterr().out.splitlines()[-1])
+    assert folder.parent == tmp_path / "runs" / "gymnasium" / id / "none-deviation"
+    assert folder.name.startswith("seed1-")
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["task"], summary["updates"], summary["unsolved"]) == ("gymnasium", 3, 0)
+    assert math.isfinite(summary["J_final"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ((), r"^task.id: got '\?\?\?', expected the id of a Gymnasium env.* task.id=Pendulum-v1"),
+        (("task.id=Pendulum-v9",), "^task.id: got 'Pendulum-v9', expected an environment that Gym"),
+        (("task.id=CartPole-v1",), r"^task.id: got 'CartPole-v1', whose action space is Discrete"),
+        (("task.id=Pendulum-v1",), r"^task.A: got null, expected the rows of a matrix \(3, 3\)"),
+        (
+            ("task.id=Pendulum-v1", *PENDULUM[:1]),
+            r"^task.B: got null, .* \(3, 1\) .* least squares .*'task.B=\[\[0\],\[.1\]\]'",
+        ),
+        (("task.id=Pendulum-v1", *PENDULUM[:2]), r"^task.stage_weight: got null, .* \(4, 4\)"),
+    ],
+)
+def test_what_a_gymnasium_task_lacks_is_said(command, tmp_path, monkeypatch, overrides, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=message):
+        command("task=gymnasium", *overrides, *SHORT)

@@ -66,6 +66,8 @@ MATRIX: Rule = (
     ),
     "a list of equally long rows of finite numbers",
 )
+#: null until the user gives one: tasks.py then says what is missing.
+MODEL: Rule = lambda x: x is None or MATRIX[0](x), MATRIX[1]
 
 RULES: dict[str, Rule] = {
     "seed": (lambda x: _whole(0)[0](x) and x < 2**63, "a whole number >= 0 and < 2^63"),
@@ -105,10 +107,13 @@ RULES: dict[str, Rule] = {
     "collector.sync": FLAG,
     "collector.num_cpus": POSITIVE,
     "task.name": _one_of("point_mass", "gros_zanon", "gymnasium"),
-    "task.id": NAME,
-    "task.A": MATRIX,
-    "task.B": MATRIX,
-    "task.stage_weight": MATRIX,
+    "task.id": (
+        lambda x: NAME[0](x) and x != "???",
+        "the id of a Gymnasium environment, as in task.id=Pendulum-v1",
+    ),
+    "task.A": MODEL,
+    "task.B": MODEL,
+    "task.stage_weight": MODEL,
     "task.horizon": _whole(1),
     "task.gamma": FRACTION,
     "task.episode_steps": _whole(1),

@@ -146,6 +146,30 @@ def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:
     return (J_start - J_final) / gap if gap > 0 else math.nan
 
 
+def gap_text(
+    gap: float, J_start: float, J_final: float, J_true_model: float, name: str = "J"
+) -> str:
+    """Write a closed gap to three decimals or, if it is nan, why, and how J changed.
+
+    Args:
+        gap: `closed_gap` of the three J.
+        name: of J, for the sentence.
+
+    Example:
+        >>> gap_text(math.nan, 50.0, 62.3, 50.0)
+        'no gap; J rose by 12.3'
+    """
+    if not math.isnan(gap):
+        return f"{gap:.3f}"
+    reason = "no true model" if math.isnan(J_true_model) else "no gap"
+    change = J_final - J_start
+    if not math.isfinite(change):
+        return f"{reason}; {name} went from {J_start:.1f} to {J_final:.1f}"
+    if f"{abs(change):.1f}" == "0.0":
+        return f"{reason}; {name} did not change"
+    return f"{reason}; {name} {'rose' if change > 0 else 'fell'} by {abs(change):.1f}"
+
+
 def _check(policy: object, steps: int, starts: int, seed: int, gamma: float) -> None:
     if not callable(policy):
         remedy = "Pass a function of states, such as mpc.policy."

@@ -17,7 +17,13 @@ from torchrl.objectives import LossModule, SoftUpdate
 from torch_qpmpc.actor_critic import actor_groups, critic_groups, make_actor_critic_loss
 from torch_qpmpc.canonical import prediction_form
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
-from torch_qpmpc.evaluation import ClosedLoop, closed_gap, closed_loop, gymnasium_loop
+from torch_qpmpc.evaluation import (
+    ClosedLoop,
+    closed_gap,
+    closed_loop,
+    gap_text,
+    gymnasium_loop,
+)
 from torch_qpmpc.gauss_newton import GaussNewton
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.objectives import QPQLearningLoss
@@ -272,11 +278,10 @@ def gap_summary(loops: dict[str, ClosedLoop]) -> dict[str, float]:
 def table(summary: Mapping[str, Any]) -> str:
     """The outcome for the terminal."""
     lines = [f"{'':14}{'start':>10}{'learned':>10}{'true model':>12}{'closed gap':>12}"]
-    for name, tag, gap in (
-        ("J", "J", "closed_gap"),
-        ("J discounted", "J_discounted", "closed_gap_discounted"),
-    ):
-        values = [summary[f"{tag}_{end}"] for end in ("start", "final", "true_model")]
-        share = "  no gap" if math.isnan(summary[gap]) else f"{summary[gap]:.3f}"
-        lines.append(f"{name:14}{values[0]:10.1f}{values[1]:10.1f}{values[2]:12.1f}{share:>12}")
+    for name, tag in (("J", "J"), ("J discounted", "J_discounted")):
+        start, final, true = (summary[f"{tag}_{end}"] for end in ("start", "final", "true_model"))
+        gap = summary[f"closed_gap{tag.removeprefix('J')}"]
+        share = gap_text(gap, start, final, true, name)
+        cell = f"  {share}" if math.isnan(gap) else f"{share:>12}"
+        lines.append(f"{name:14}{start:10.1f}{final:10.1f}{true:12.1f}{cell}")
     return "\n".join(lines)

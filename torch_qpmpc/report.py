@@ -16,6 +16,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.evaluation import gap_text
 from torch_qpmpc.finished import CASES, REAL_GAP, collect, has_real
 from torch_qpmpc.markdown import replaced, table
 from torch_qpmpc.statistics import bootstrap_interval, interquartile_mean
@@ -54,9 +55,11 @@ def runs_table(frame: pd.DataFrame) -> str:
     digits: dict[str, str] = dict.fromkeys(
         ("J_start", "J_final", "J_true_model", "train_seconds"), ".1f"
     )
-    digits |= dict.fromkeys(("closed_gap", "canonical_distance"), ".3f")
+    digits["canonical_distance"] = ".3f"
     digits |= dict.fromkeys(("prediction_error", "prediction_error_start"), ".4f")
-    rows = frame.assign(case=frame["label"])[head].itertuples(index=False)
+    ends = (frame[name] for name in ("closed_gap", "J_start", "J_final", "J_true_model"))
+    gaps = [gap_text(*values) for values in zip(*ends, strict=True)]
+    rows = frame.assign(case=frame["label"], closed_gap=gaps)[head].itertuples(index=False)
     lines = [
         [f"{value:{digits.get(name, '')}}" for name, value in zip(head, row, strict=True)]
         for row in rows

@@ -17,11 +17,12 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl.collectors import BaseCollector, Collector
 
-from torch_qpmpc.checkpoint import CHECKPOINT, load_checkpoint
+from torch_qpmpc.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
 from torch_qpmpc.config import differences, load_config, settings
 from torch_qpmpc.envs import LinearSystemEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment import Learner
+from torch_qpmpc.lock import ELSEWHERE
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.replay import Replay
 from torch_qpmpc.solvers.chain import SolveLog
@@ -29,6 +30,8 @@ from torch_qpmpc.solvers.chain import SolveLog
 #: The parts of a snapshot.
 STATE = ("config", "update", "structure", "mpc", "loss_module", "optimizer", "schedule")
 STATE += ("replay", "collector", "tally", "rng")
+#: The files by which a run is known before its first checkpoint.
+WRITTEN = ("config.yaml", "metrics.csv")
 
 
 @dataclass
@@ -176,10 +179,36 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
     return cfg, state
 
 
+def check_fresh(folder: str | Path) -> None:
+    """Raise `QPError` where a run, finished or stopped, has already written to ``folder``."""
+    folder = Path(folder)
+    remedy = f"Choose another folder by {ELSEWHERE}."
+    if (folder / "summary.json").exists():
+        got = "which holds a finished run"
+    elif any((folder / name).exists() for name in (*WRITTEN, CHECKPOINT, PREVIOUS)):
+        got = "which holds a run that was stopped"
+        with contextlib.suppress(Exception):  # a damaged file can make its readers raise anything
+            resumed(folder, [])
+            remedy = f"Go on with it by resume={folder}, or choose another folder by {ELSEWHERE}."
+    else:
+        return
+    raise QPError.expected("folder", f"{folder}, {got}", "one without a run", remedy)
+
+
+def check_own_folder(path: str | Path, folder: str | Path) -> None:
+    """Raise `QPError` unless ``folder`` is that of the run that goes on from ``path``."""
+    own = Path(folder_of(str(path), ""))
+    if own.resolve() != Path(folder).resolve():
+        remedy = (
+            "A run goes on in its own folder: leave hydra.run.dir out, or copy the folder first."
+        )
+        raise QPError.expected("folder", f"{folder} with resume={path}", f"{own}", remedy)
+
+
 def folder_of(resume: str | None, fresh: str) -> str:
     """Where a run writes: into the folder that it goes on with, or into a ``fresh`` one."""
     if resume is None:
-        return fresh
+        return str(Path(fresh))
     return str(Path(resume) if Path(resume).is_dir() else Path(resume).parent)
 
 

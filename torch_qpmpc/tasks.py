@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torch_qpmpc.envs import GrosZanonLTI, GymnasiumPlant, LinearSystem, PointMass
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import QPMPC
 
 
@@ -49,12 +50,38 @@ def make_true_mpc(cfg: DictConfig, physics: LinearSystem | GymnasiumPlant) -> QP
     return _make(cfg, physics, _true_scheme(physics), ())
 
 
+#: Where a model comes from, and how the command line gives it.
+MODEL = (
+    "Find a model x+ = A x + B u of it around its target, by finite differences of its dynamics or "
+    "by least squares on logged transitions (x, u, x+), and the weight of its cost "
+    "1/2 [x; u]' W [x; u]; then, as for two states and one action, override "
+    "'task.A=[[1,.1],[0,1]]' 'task.B=[[0],[.1]]' 'task.stage_weight=[[1,0,0],[0,1,0],[0,0,.1]]'."
+)
+
+
 def _given_scheme(cfg: DictConfig, physics: GymnasiumPlant) -> Scheme:
-    """The model and the weight in the task's configuration, the bounds of the plant's spaces."""
-    A, B, weight = (
-        torch.tensor(cfg.task[name], dtype=torch.float64) for name in ("A", "B", "stage_weight")
-    )
-    return Scheme(A, B, torch.zeros_like(physics.lb_s), weight, physics.lb_s, physics.ub_s)
+    """Read the model and the weight from the task's configuration, the bounds from the spaces.
+
+    Raises:
+        QPError: one of them is missing, or has another shape than the environment's spaces.
+    """
+    n_x, n_u = len(physics.lb_s), len(physics.lb_a)
+    needed = {"A": (n_x, n_x), "B": (n_x, n_u), "stage_weight": (n_x + n_u, n_x + n_u)}
+    spaces = f"{physics.id!r}, whose observation has {n_x} entries and whose action has {n_u}"
+    for name, shape in needed.items():
+        if cfg.task[name] is None:
+            expected = f"the rows of a matrix {shape} for {spaces}"
+            raise QPError.expected(f"task.{name}", "null", expected, MODEL)
+    given = {name: torch.tensor(cfg.task[name], dtype=torch.float64) for name in needed}
+    shapes = {name: tuple(matrix.shape) for name, matrix in given.items()}
+    if shapes != needed:
+        found, want = (
+            ", ".join(f"task.{name} of shape {shape}" for name, shape in sizes.items())
+            for sizes in (shapes, needed)
+        )
+        raise QPError.expected("task.id", f"{spaces}, with {found}", want, MODEL)
+    bounds = physics.lb_s, physics.ub_s
+    return Scheme(given["A"], given["B"], torch.zeros(n_x).double(), given["stage_weight"], *bounds)
 
 
 def true_model(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Mapping
@@ -30,6 +31,7 @@ class RunFolder:
             is written anew. None starts from nothing.
 
     Raises:
+        QPError: the rows of the updates up to ``after`` are missing or damaged.
         OSError: here and in what follows, something cannot be written; all other files are whole.
     """
 
@@ -37,6 +39,8 @@ class RunFolder:
         # Absolute, as the event writer's thread outlives changes of the working directory.
         self.path = Path(folder).resolve()
         self.path.mkdir(parents=True, exist_ok=True)
+        # Before the first event, as a run whose rows are damaged does not go on.
+        earlier: Any = None if after is None else _read_until(self.path, cfg, after)
         self.cfg = cfg
         self.rows: list[dict[str, float]] = []
         self.logger = TensorboardLogger(exp_name="tensorboard", log_dir=str(self.path))
@@ -50,7 +54,6 @@ class RunFolder:
             write_whole(self.path / "config.yaml", text.encode())
             self.logger.experiment.add_text("config", f"```yaml\n{text}```")
         else:
-            earlier: Any = read_metrics(self.path).loc[:after]
             for update, row in earlier.iterrows():
                 self.rows.append({"update": update, **row.dropna()})
 
@@ -111,10 +114,44 @@ class RunFolder:
 
 
 def read_metrics(folder: str | Path) -> pd.DataFrame:
-    """A run's metrics.csv by update, to the last digit."""
-    # First as text: before 3.1, pandas rounds what it reads as numbers.
-    table = pd.read_csv(Path(folder) / "metrics.csv", dtype=str).astype(float)
-    return table.astype({"update": int}).set_index("update")
+    """Read a run's metrics.csv by update, to the last digit.
+
+    Raises:
+        QPError: it is missing, or is not the table that a run writes.
+    """
+    file = Path(folder) / "metrics.csv"
+    try:
+        text = file.read_text(encoding="utf-8")
+        if not text.endswith("\n"):
+            raise ValueError("its last line is cut off")
+        # First as text: before 3.1, pandas rounds what it reads as numbers.
+        table = pd.read_csv(io.StringIO(text), dtype=str).astype(float)
+        return table.astype({"update": int}).set_index("update")
+    except (OSError, ValueError, KeyError) as error:
+        raise _damaged(file, str(error).strip().partition("\n")[0]) from error
+
+
+def _read_until(folder: Path, cfg: DictConfig, update: int) -> pd.DataFrame:
+    """Read the rows up to ``update``, and check that there are all that ``cfg`` makes a run log."""
+    table = read_metrics(folder)
+    due = {0, *range(cfg.log_interval, update + 1, cfg.log_interval)}
+    due |= {*range(cfg.eval_interval, update + 1, cfg.eval_interval)}
+    if missing := sorted(due - {*table.index}):
+        lost = ", ".join(map(str, missing[:5])) + (", .." if len(missing) > 5 else "")
+        raise _damaged(folder / "metrics.csv", f"no row of update {lost}")
+    if not table.index.is_monotonic_increasing or table.index.has_duplicates:
+        raise _damaged(folder / "metrics.csv", "updates that do not increase")
+    return table.loc[:update]
+
+
+def _damaged(file: Path, wrong: str) -> QPError:
+    remedy = (
+        "Put a whole copy of it there, go on from a copy of the folder, or start anew in another "
+        "one by hydra.run.dir=FOLDER."
+    )
+    return QPError.expected(
+        "metrics.csv", f"{file} ({wrong})", "the table that a run wrote", remedy
+    )
 
 
 class WritableFolder(Callback):

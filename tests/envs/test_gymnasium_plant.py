@@ -53,7 +53,8 @@ def test_the_bounds_are_those_of_its_spaces():
     assert plant.lb_s.dtype == plant.lb_a.dtype == torch.float64
 
 
-@pytest.mark.parametrize("id", ["Pendulum-v9", "NoSuchThing-v0", "no such thing"])
+@pytest.mark.filterwarnings("ignore:.*out of date")
+@pytest.mark.parametrize("id", ["Pendulum-v9", "NoSuchThing-v0", "no such thing", "Ant-v2"])
 def test_an_unknown_environment_is_an_error(id):
     match = f"task.id: got '{id}', expected an environment that Gymnasium can make"
     with pytest.raises(QPError, match=match):
@@ -63,7 +64,11 @@ def test_an_unknown_environment_is_an_error(id):
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"actions": Discrete(2)}, r"whose action space is Discrete\(2\), expected spaces that"),
+        (
+            {"actions": Discrete(2)},
+            r"whose action space is Discrete\(2\), expected spaces that are boxes of one dim.+ "
+            "Choose an environment whose observations and actions are real vectors",
+        ),
         ({"observations": Discrete(5)}, r"whose observation space is Discrete\(5\), expected"),
         (
             {"observations": Box(0, 255, (8, 8, 3), np.uint8)},

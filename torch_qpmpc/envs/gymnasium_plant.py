@@ -40,7 +40,7 @@ class GymnasiumPlant:
         self.id = id
         try:
             env = gymnasium.make(id)
-        except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        except (gymnasium.error.Error, ImportError) as error:
             expected = "an environment that Gymnasium can make"
             raise QPError.expected("task.id", repr(id), expected, str(error)) from error
         self.lb_s, self.ub_s = self._bounds("observation", env.observation_space)
@@ -50,7 +50,8 @@ class GymnasiumPlant:
     def _bounds(self, name: str, space: Any) -> tuple[Tensor, Tensor]:
         if not isinstance(space, Box) or len(space.shape) != 1:
             got = f"{self.id!r}, whose {name} space is {space}"
-            raise QPError.expected("task.id", got, "spaces that are boxes of one dimension")
+            remedy = "Choose an environment whose observations and actions are real vectors."
+            raise QPError.expected("task.id", got, "spaces that are boxes of one dimension", remedy)
         low, high = (torch.as_tensor(x, dtype=torch.float64) for x in (space.low, space.high))
         return low, high
 

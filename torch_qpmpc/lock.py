@@ -1,0 +1,85 @@
+"""The lock on a run's folder: one process at a time writes to it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+from torch_qpmpc.errors import QPError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+#: The locked file. The lock is the operating system's, so a killed process leaves only the file.
+LOCK = ".lock"
+
+
+#: Where another folder comes from: of one run, and of a sweep's.
+ELSEWHERE = "hydra.run.dir=FOLDER"
+ELSEWHERE_IN_SWEEP = (
+    "hydra.sweep.dir=FOLDER, or by hydra.sweep.subdir if runs of this sweep share it"
+)
+
+
+@contextlib.contextmanager
+def locked(folder: str | Path, elsewhere: str = ELSEWHERE) -> Iterator[None]:
+    """Hold the lock on ``folder`` inside a ``with`` block.
+
+    Platforms without ``fcntl`` and file systems without locks do not lock.
+
+    Args:
+        folder: a run's folder, which exists.
+        elsewhere: the settings that choose another folder, for the message.
+
+    Raises:
+        QPError: another run holds the lock.
+        OSError: the file to lock cannot be written.
+    """
+    path = Path(folder) / LOCK
+    file = None if fcntl is None else _acquire(path, elsewhere)
+    try:
+        yield
+    finally:
+        if file is not None:
+            # Unlink before unlocking; a process that has opened the old file then tries again.
+            with contextlib.suppress(OSError):
+                path.unlink()
+            os.close(file)
+
+
+def _acquire(path: Path, elsewhere: str) -> int | None:
+    """Open and lock ``path``; return its descriptor, or None if the file system has no locks."""
+    assert fcntl is not None
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = os.read(file, 1000).decode(errors="replace") or "another process"
+            os.close(file)
+            remedy = f"Wait until that run has ended, or choose another folder by {elsewhere}."
+            got = f"{path.parent}, in use by {owner}"
+            raise QPError.expected("folder", got, "one that no run is using", remedy) from None
+        except OSError:
+            os.close(file)
+            return None
+        if _is_at(path, file):
+            break
+        os.close(file)
+    with contextlib.suppress(OSError):  # on a full disk the owner stays unnamed
+        os.truncate(file, 0)
+        os.write(file, f"process {os.getpid()} on {socket.gethostname()}".encode())
+    return file
+
+
+def _is_at(path: Path, file: int) -> bool:
+    """True unless another run has removed ``path`` since it was opened as ``file``."""
+    try:
+        return os.path.samestat(os.fstat(file), path.stat())
+    except FileNotFoundError:
+        return False
