@@ -132,7 +132,8 @@ def test_dispatch():
     policy, value = operator.get_policy_operator(), operator.get_value_operator()
     assert torch.equal(policy(s), operator.module.policy(s))
     assert torch.equal(value(observation=s), -operator.module.value(s).unsqueeze(-1))
-    assert torch.equal(value(s[0]), value(s)[0])
+    # BLAS may round otherwise for a batch of another size.
+    torch.testing.assert_close(value(s[0]), value(s)[0], rtol=1e-12, atol=0)
 
 
 def evaluate(operator: QPActorValueOperator, td: TensorDict) -> list[torch.Tensor]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from numbers import Integral
+from collections.abc import Collection, Mapping, Sequence
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -73,6 +73,27 @@ def check_structure(
         )
 
 
+def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The masks among the values of ``learn``, by part: true where an entry is learned."""
+    if not isinstance(learn, Mapping):
+        return {}
+    masks = {}
+    for part, mask in learn.items():
+        if mask is True:
+            continue
+        name, shape = f"learn[{part!r}]", tuple(theta[part].shape)
+        want = f"True, or a mask of bools of shape {shape}"
+        try:
+            mask = torch.as_tensor(mask)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise QPError.expected(name, repr(mask), want) from error
+        if mask.dtype != torch.bool or tuple(mask.shape) != shape or mask.ndim == 0:
+            got = f"{mask.dtype} of shape {tuple(mask.shape)}"
+            raise QPError.expected(name, got, want, "True marks the entries to be learned.")
+        masks[part] = mask.detach().cpu().clone()
+    return masks
+
+
 def check_model(A: Any, B: Any) -> tuple[Tensor, Tensor]:
     """A and B as matrices, from which n_x and n_u can be read."""
     A, B = as_tensor("A", A), as_tensor("B", B)
@@ -83,22 +104,24 @@ def check_model(A: Any, B: Any) -> tuple[Tensor, Tensor]:
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
+    """Read a tensor of finite numbers."""
+    tensor = _read(name, value)
+    if not tensor.isfinite().all():
+        raise QPError.expected(name, "NaN or inf", "finite entries")
+    return tensor
+
+
+def _read(name: str, value: Any) -> Tensor:
     try:
         of_tensor = isinstance(value, Tensor) and (value.is_complex() or value.is_meta)
         if of_tensor or (isinstance(value, np.ndarray) and np.iscomplexobj(value)):
             raise TypeError
         # Whatever the default device is: one of meta would make lists tensors without values.
-        tensor = torch.as_tensor(value, dtype=torch.float64, device="cpu")
+        return torch.as_tensor(value, dtype=torch.float64, device="cpu")
     except (TypeError, ValueError, RuntimeError) as error:
         raise QPError.expected(
             name, _brief(value), "a tensor, or what torch.as_tensor takes, of real numbers"
         ) from error
-    if name.endswith("bounds"):
-        if tensor.isnan().any():
-            raise QPError.expected(name, "NaN", "no NaN; inf for no bound")
-    elif not tensor.isfinite().all():
-        raise QPError.expected(name, "NaN or inf", "finite entries")
-    return tensor
 
 
 def _brief(value: Any) -> str:
@@ -114,7 +137,9 @@ def bound(name: str, bounds: tuple[Any, Any] | None, side: int, size: int) -> Te
         lower, upper = bounds
     except (TypeError, ValueError) as error:
         raise QPError.expected(name, repr(bounds), "the pair (lower, upper)") from error
-    given = as_tensor(name, (lower, upper)[side])
+    given = _read(name, (lower, upper)[side])
+    if given.isnan().any():
+        raise QPError.expected(name, "NaN", "no NaN; inf for no bound")
     if tuple(given.shape) != (size,):
         raise QPError.expected(name, f"shape {tuple(given.shape)}", f"shape ({size},) on each side")
     if (given == (1 - 2 * side) * torch.inf).any():
@@ -178,8 +203,18 @@ def check_weight(name: str, weight: Tensor, diagonal: bool) -> None:
         raise QPError.expected(name, got, "a positive semidefinite weight", remedy)
 
 
-def check_slack(name: str, weight: float) -> None:
-    check_number(name, weight, lambda x: x >= 0, "a non-negative weight, or inf for hard rows")
+def slack_weight(name: str, weight: Any, size: int | None = None) -> Tensor:
+    """Slack weights ``(size,)`` from one for all rows, or from one for each if there is a size."""
+    one, each = "a non-negative weight, or inf for hard rows", f"; or one for each of the {size}"
+    expected = one if size is None else one + each
+    if isinstance(weight, Real) or size is None:
+        check_number(name, weight, lambda x: x >= 0, expected)
+        return torch.full((size or 1,), float(weight), dtype=torch.float64)
+    if isinstance(weight, Sequence | np.ndarray | Tensor) and not isinstance(weight, str):
+        weights = _read(name, weight)
+        if tuple(weights.shape) == (size,) and (weights >= 0).all():
+            return weights
+    raise QPError.expected(name, repr(weight), expected)
 
 
 def check_pair(s: Tensor, a: Tensor, n_x: int, n_u: int, device: torch.device) -> Tensor:

@@ -25,6 +25,7 @@ from torch_qpmpc.autograd import envelope_gradients
 from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import QPMPC
+from torch_qpmpc.parts import matrix
 from torch_qpmpc.qp import EVENT_SHAPES, QPSolution
 
 #: Decrease over predicted decrease: below the first the damping rises, above the second it falls.
@@ -257,11 +258,16 @@ class GaussNewton(torch.optim.Optimizer):
         gradients = envelope_gradients(weight, z, sigma, chi, lam, solution.xi)
         pairs = [(leaf, group["scale"]) for group in self.param_groups for leaf in group["params"]]
         pairs = [(leaf, scale) for leaf, scale in pairs if leaf.requires_grad]
-        factored = next((leaf for leaf, _ in pairs if leaf is mpc._parameters.get("C")), None)
+        C, mask = matrix(mpc, "C")
+        factored = next((leaf for leaf, _ in pairs if leaf is C), None)
+        if factored is not None and mask is not None:
+            factored.copy_(mpc.C)  # another optimiser may have moved entries that are not learned
         if penalty is not None and factored is None:
             raise QPError.expected("penalty", "a C that is not free", "C among the learned parts")
         parts = {name: getattr(solution.qp, name) for name in EVENT_SHAPES}
-        parts = {n: x for n, x in parts.items() if x.requires_grad and x is not factored}
+        if factored is not None:
+            parts.pop("C")
+        parts = {n: x for n, x in parts.items() if x.requires_grad}
         # Of a tensor for each pair, the gradient is that of each pair.
         of_each = [gradients[n](x.expand(len(z), *x.shape)) for n, x in parts.items()]
         dense = [leaf for leaf, _ in pairs if leaf is not factored]
@@ -277,7 +283,7 @@ class GaussNewton(torch.optim.Optimizer):
                 )
             )
         return [
-            _OuterProducts(leaf, scale, weight.unsqueeze(-1) * chi, z, penalty)
+            _OuterProducts(leaf, scale, weight.unsqueeze(-1) * chi, z, penalty, mask)
             if leaf is factored
             else _Dense(leaf, scale, next(found).reshape(len(z), -1))
             for leaf, scale in pairs
@@ -320,14 +326,22 @@ class _Dense:
 class _OuterProducts:
     """The gradients ``chi_i z_i'`` in C, with the metric P ``(n_z, n_z)`` of its rows.
 
-    The penalty ``1/2 tr(C S C')`` draws C by ``drift`` before any TD error does.
+    The penalty ``1/2 tr(C S C')`` draws C by ``drift`` before any TD error does. Where a ``mask``
+    says which entries of C are learned, rows of the same pattern have a P of their own.
     """
 
     def __init__(
-        self, leaf: nn.Parameter, scale: float, chi: Tensor, z: Tensor, S: Tensor | None
+        self,
+        leaf: nn.Parameter,
+        scale: float,
+        chi: Tensor,
+        z: Tensor,
+        S: Tensor | None,
+        mask: Tensor | None = None,
     ) -> None:
         self.leaf, self.scale, self.chi, self.z, self.S = leaf, scale, chi, z, S
         self.drift = torch.zeros_like(leaf)
+        self.patterns = _patterns(leaf, mask)
 
     def __len__(self) -> int:
         return len(self.z)
@@ -339,25 +353,53 @@ class _OuterProducts:
             state["chi"], state["z"] = self.chi[:count], self.z[:count]
 
     def diagonal(self) -> Tensor:
-        return self.scale * self.chi.square().sum(-1) * self.z.square().sum(-1)
+        chi, z = self.chi.square(), self.z.square()
+        found = (chi[:, i].sum(-1) * z[:, j].sum(-1) for i, j in self.patterns)
+        return self.scale * sum(found, torch.zeros_like(z[:, 0]))
 
     def damp(self, mu: Tensor) -> Tensor:
-        self.z_P = self.scale * self.z
+        drifted = self.z.new_zeros(len(self.z))
+        self.z_P = [self.scale * self.z[:, j] for _, j in self.patterns]
         if self.S is None:
-            return self.z.new_zeros(len(self.z))
-        precision = mu / self.scale * torch.eye(len(self.S)).to(self.S) + self.S
-        inverse = torch.linalg.inv_ex(precision).inverse
-        self.z_P, self.drift = mu * self.z @ inverse, -(self.leaf @ self.S) @ inverse
-        return ((self.chi @ self.drift) * self.z).sum(-1)
+            return drifted
+        force = self.leaf @ self.S
+        for k, (i, j) in enumerate(self.patterns):
+            z, S = self.z[:, j], self.S[j][:, j]
+            precision = mu / self.scale * torch.eye(len(S)).to(S) + S
+            inverse = torch.linalg.inv_ex(precision).inverse
+            drift = -force[i][:, j] @ inverse
+            self.z_P[k], self.drift[i.unsqueeze(-1), j] = mu * z @ inverse, drift
+            drifted = drifted + ((self.chi[:, i] @ drift) * z).sum(-1)
+        return drifted
 
     def kernel(self) -> Tensor:
-        return (self.chi @ self.chi.mT) * (self.z_P @ self.z.mT)
+        K = self.z.new_zeros(len(self.z), len(self.z))
+        for (i, j), z_P in zip(self.patterns, self.z_P, strict=True):
+            chi = self.chi[:, i]
+            K = K + (chi @ chi.mT) * (z_P @ self.z[:, j].mT)
+        return K
 
     def step(self, alpha: Tensor) -> Tensor:
-        return (alpha.unsqueeze(-1) * self.chi).mT @ self.z_P + self.drift
+        found = self.drift.clone()
+        for (i, j), z_P in zip(self.patterns, self.z_P, strict=True):
+            found[i.unsqueeze(-1), j] += (alpha.unsqueeze(-1) * self.chi[:, i]).mT @ z_P
+        return found
 
     def penalty(self) -> Tensor | float:
         return 0.0 if self.S is None else 0.5 * ((self.leaf @ self.S) * self.leaf).sum()
+
+
+def _patterns(C: Tensor, mask: Tensor | None) -> list[tuple[Tensor, Tensor]]:
+    """The rows of C that learn the same entries, and which, as indices."""
+    if mask is None:
+        rows, columns = (torch.arange(n, device=C.device) for n in C.shape)
+        return [(rows, columns)]
+    kinds, kind = torch.unique(mask, dim=0, return_inverse=True)
+    return [
+        ((kind == k).nonzero().squeeze(-1), columns.nonzero().squeeze(-1))
+        for k, columns in enumerate(kinds)
+        if columns.any()
+    ]
 
 
 def _solve(

@@ -22,16 +22,21 @@ from torch_qpmpc.arguments import (
     check_model,
     check_pair,
     check_structure,
+    learned_entries,
 )
 from torch_qpmpc.autograd import optimal_value, solve_qp, value_and_active_set
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.cost import Cost, Discounts, diagonal_cost, discounted
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.parametrizations import SIGNED, Banded, Tied, kept
+from torch_qpmpc.identity import check_identity, digest, written
+from torch_qpmpc.parametrizations import SIGNED, Banded, Masked, Tied, kept
 from torch_qpmpc.precision import full_precision, to_dtype
 from torch_qpmpc.qp import QPSolution, QuadraticProgram
 from torch_qpmpc.solvers import backend
 from torch_qpmpc.steps import CHOLESKY, NEAREST
+
+#: What the constructor, or `QPMPC.release`, decides once and for all.
+FIXED = ("n_x", "n_u", "n_z", "horizon", "gamma", "hessian", "structure", "step", "learned")
 
 
 class QPMPC(nn.Module):
@@ -57,19 +62,22 @@ class QPMPC(nn.Module):
         structure: what the learned parts of theta tie. ``"free"``: nothing, C is a matrix (eq:qp5).
             ``"tied"``: they are those of a linear MPC scheme (eq:q1), with one A, B, D and one
             entry of b, q, lb, ub and w for all stages; ``"varying"``: with one for each stage.
-            In both, the bounds of hard rows are not learned, as they are known limits (eq:v1c3).
+            In both, the bounds of hard rows stay as they are, as they are known limits (eq:v1c3).
         hessian: ``"diagonal"``, ``"block"`` (one dense block a stage) or ``"full"`` (dense in z).
         stage_weight: start of H_k, ``(n_x + n_u,)`` if diagonal, else ``(n_x + n_u, n_x + n_u)``,
             with an optional leading N for a weight of each stage's own; by default diagonal
-            random entries uniform in (0.5, 5) on the states and zero on the actions.
+            random entries uniform in (0.5, 5) on the states and zero on the actions. The cost of a
+            stage is *half* of ``[x_k; u_k]' H_k [x_k; u_k]`` (eq:qpH): a plant's ``s'Ws`` is 2 W.
         terminal_weight: start of H_f, ``(n_x,)`` or ``(n_x, n_x)``; the identity by default.
             ``"riccati"``: the cost to go of the linear quadratic regulator of A, B and the stage
             weight; not for a diagonal hessian.
         state_slack, action_slack, constraint_slack: the slack weights w of the rows of states, of
             actions, and of mixed and terminal constraints; ``inf`` makes them hard. Hard actions
-            by default, and the others soft.
+            by default, and the others soft. One for all, or for states and actions one for each.
         discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
         learn: which of H, H_f, q, c, C, b, G, lb, ub, w are parameters; the others are buffers.
+            As a mapping, ``{"H": True, "C": mask}``, only the entries where a mask is true are
+            learned, such as all but the rows of a constant reference. A mask has the part's shape.
         step: how H and H_f stay positive semidefinite and w non-negative while they are learned
             (eq:sdp1). ``"cholesky"``: theta is a factor of them. ``"projection"`` and ``"sdp"``:
             theta is H itself, and `project_` after each step puts it back, by eigenvalues or by a
@@ -133,8 +141,8 @@ class QPMPC(nn.Module):
         hessian: str = "diagonal",
         stage_weight: Any = None,
         terminal_weight: Any = None,
-        state_slack: float = 100.0,
-        action_slack: float = torch.inf,
+        state_slack: Any = 100.0,
+        action_slack: Any = torch.inf,
         constraint_slack: float = 100.0,
         discount_slack: bool = False,
         learn: Collection[str] = ("H", "c", "C"),
@@ -147,8 +155,9 @@ class QPMPC(nn.Module):
             name: value for name, value in locals().items() if name not in ("self", "__class__")
         }
         super().__init__()
-        self._arguments = arguments
         check_structure(**arguments)
+        arguments |= {name: int(arguments[name]) for name in ("n_x", "n_u", "horizon", "seed")}
+        self._arguments = arguments
         backend(solver)
         with torch.device("cpu"):
             self._start(learn)
@@ -163,8 +172,10 @@ class QPMPC(nn.Module):
         self.structure, self.step = given["structure"], given["step"]
         self.solver, self.on_failure = given["solver"], given["on_failure"]
         self.learned = tuple(name for name in (*COST, *CONSTRAINTS) if name in learn)
+        self._masks = learned_entries(learn, theta)
         self.register_buffer("C_0", theta["C"].to(torch.float64))
         self.register_buffer("soft", theta["w"].isfinite())
+        self._hard_rows = digest(theta["w"].isinf())
         self._derive()
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
@@ -292,7 +303,7 @@ class QPMPC(nn.Module):
             expected = f"one that is freer than {self.structure!r}"
             remedy = f"Those are: {', '.join(freer) or 'none'}."
             raise QPError.expected("structure", repr(structure), expected, remedy)
-        self.structure = structure
+        vars(self)["structure"] = structure
         self._arguments = {**self._arguments, "structure": structure}
         for part in self.learned:
             if parametrize.is_parametrized(self, part) and part not in ("H", "H_f"):
@@ -331,8 +342,8 @@ class QPMPC(nn.Module):
                 C=self.C,
                 b=self.b,
                 G=self.G,
-                lb=self._limits(self.lb),
-                ub=self._limits(self.ub),
+                lb=self.lb,
+                ub=self.ub,
                 w=w,
                 check_values=False,
             )
@@ -349,6 +360,13 @@ class QPMPC(nn.Module):
             QPError: a learned part without a rate, or a name that is neither.
         """
         return parts.groups(self, self.learned, rates)
+
+    def leaves(self, part: str) -> list[nn.Parameter]:
+        """The parameters that an optimiser moves for a learned part: behind H its factor."""
+        if part not in self.learned:
+            expected = f"one of the learned parts: {', '.join(self.learned) or 'none'}"
+            raise QPError.expected("part", repr(part), expected)
+        return parts.leaves(self, part)
 
     def reset_parameters(self) -> None:
         """Return theta to where the constructor put it."""
@@ -372,8 +390,36 @@ class QPMPC(nn.Module):
         twin.__dict__.update(self.__dict__)  # as every module's: the parameters are shared
         return twin
 
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        super()._load_from_state_dict(*args, **kwargs)
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in FIXED and name in vars(self):
+            remedy = "Make another QPMPC; release() frees the structure of this one."
+            raise QPError.expected(name, repr(value), f"{vars(self)[name]!r}, as made", remedy)
+        super().__setattr__(name, value)
+
+    def get_extra_state(self) -> Tensor:
+        """What a state_dict tells of the QPMPC that its parameters belong to, as JSON in bytes."""
+        return written(self._identity())
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """`_load_from_state_dict` has compared it already."""
+
+    def _identity(self) -> dict[str, Any]:
+        """What the values depend on beside the parameters and buffers, by the arguments' names."""
+        names = ("n_x", "n_u", "horizon", "gamma", "structure", "hessian", "step", "discount_slack")
+        masks = {name: digest(mask) for name, mask in self._masks.items()}
+        return {
+            **{name: self._arguments[name] for name in names} | {"gamma": float(self.gamma)},
+            "constraints": self._layout.n_d,
+            "terminal_constraints": self._layout.n_d_f,
+            "learn": {name: masks.get(name, True) for name in self.learned},
+            "hard rows": self._hard_rows,
+        }
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        key = f"{prefix}_extra_state"
+        state_dict = {key: self.get_extra_state()} | state_dict  # an older one has none
+        check_identity(state_dict[key], self._identity())
+        super()._load_from_state_dict(state_dict, prefix, *args)
         self._derive()
 
     def _derive(self) -> None:
@@ -387,7 +433,7 @@ class QPMPC(nn.Module):
         stages = self._layout.ties("q").to(self.C_0.device)
         self.register_buffer("stages", stages, persistent=False)
         for part in self.modules():
-            if isinstance(part, Tied):
+            if isinstance(part, Masked | Tied):
                 part.place(self.C_0.device)
 
     def _checked(self, s: Tensor, a: Tensor | None = None) -> Tensor:
@@ -421,15 +467,12 @@ class QPMPC(nn.Module):
         blocks = (self.H,) if self.hessian == "full" else (self.H, self.H_f)
         return discounted(self._layout, self.hessian, blocks, self.q, self.w, by)
 
-    def _limits(self, bounds: Tensor) -> Tensor:
-        """lb or ub, which an MPC scheme does not learn on hard rows: those are known (eq:v1c3)."""
-        if self.structure == "free" or not bounds.requires_grad:
-            return bounds
-        return torch.where(self.soft, bounds, bounds.detach())
-
     def _kept(self, name: str) -> list[nn.Module]:
-        value = getattr(self, name).detach()
-        return kept(name, value, self._layout, self.structure, self.hessian, self.step)
+        value, mask = getattr(self, name).detach(), self._masks.get(name)
+        if self.structure != "free" and name in ("lb", "ub"):
+            soft = self.soft.cpu()
+            mask = soft if mask is None else mask & soft
+        return kept(name, value, self._layout, self.structure, self.hessian, self.step, mask)
 
     def _projected(self) -> dict[str, nn.Parameter]:
         """The parameters that `project_` acts on, by part."""

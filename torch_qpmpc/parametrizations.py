@@ -22,9 +22,18 @@ SIGNED = ("H", "H_f", "w")
 
 
 def kept(
-    name: str, value: Tensor, layout: Layout, structure: str, hessian: str, step: str
+    name: str,
+    value: Tensor,
+    layout: Layout,
+    structure: str,
+    hessian: str,
+    step: str,
+    mask: Tensor | None = None,
 ) -> list[nn.Module]:
-    """What a learned part of `QPMPC` keeps: its structure, its sign or what projecting it needs."""
+    """What a learned part of `QPMPC` keeps: its structure, its sign or what projecting it needs.
+
+    ``mask`` is true at the entries that are learned; None if all are.
+    """
     found, tied = [], structure == "tied"
     if structure != "free" and name in ("C", "G"):
         found.append((Banded if name == "C" else LinearRows)(layout, tied))
@@ -35,6 +44,9 @@ def kept(
         found.append(Cholesky() if dense else SquareRoot())
     elif name in ("H", "H_f"):
         found.append(Symmetric() if dense else Support(value))
+    if mask is not None and not mask.all():
+        _check_mask(name, mask, layout, found)
+        found.append(Masked(mask, value))
     return found
 
 
@@ -107,6 +119,31 @@ class Cholesky(nn.Module):
         return upper.mT * sign.unsqueeze(-2)
 
 
+class Masked(nn.Module):
+    """A part of which only the entries in ``mask`` are learned; no optimiser moves the others."""
+
+    mask: Tensor
+    frozen: Tensor
+
+    def __init__(self, mask: Tensor, value: Tensor) -> None:
+        super().__init__()
+        self.cpu_mask = mask.cpu()
+        self.place(value.device)
+        self.register_buffer("frozen", value.detach().clone())
+
+    def place(self, device: torch.device) -> None:
+        """Put the mask on a device; a module that was on "meta" has lost it."""
+        self.register_buffer("mask", self.cpu_mask.to(device), persistent=False)
+
+    def forward(self, value: Tensor) -> Tensor:
+        return torch.where(self.mask, value, self.frozen)
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        """``value``, whose frozen entries become those that it has."""
+        self.frozen.copy_(value.detach())
+        return value
+
+
 class Banded(nn.Module):
     """C of a model (eq:cband): A and B, of all stages, or with a leading N where they vary."""
 
@@ -176,6 +213,26 @@ class LinearRows(nn.Module):
         D_f = G[last:, n_z - n_x :].contiguous()
         _check_tied("G", G, self(D, D_f))
         return D, D_f
+
+
+def _check_mask(name: str, mask: Tensor, layout: Layout, found: list[nn.Module]) -> None:
+    """Raise `QPError` if a mask parts what the other parametrizations join."""
+    what = f"learn[{name!r}]"
+    if any(isinstance(part, Cholesky | Symmetric) for part in found):
+        want = "True, or a mask with hessian='diagonal'"
+        raise QPError.expected(what, "a mask of a dense H", want, "It has to stay semidefinite.")
+    tied = True
+    for part in found:
+        if isinstance(part, Tied):
+            tied = torch.equal(mask, mask[part.first][part.index])
+        elif isinstance(part, Banded | LinearRows) and part.tied:
+            n_z, N = layout.n_z, layout.horizon
+            rows = mask if name == "C" else mask[n_z : n_z + N * layout.n_d]
+            blocks = _stage_blocks(rows, layout, tied=False)
+            tied = bool((blocks == blocks[:1]).all())
+    if not tied:
+        want = "one that is the same for all stages, as structure='tied' gives them one value"
+        raise QPError.expected(what, "a mask that differs between stages", want)
 
 
 def _stage_blocks(rows: Tensor, layout: Layout, tied: bool) -> Tensor:

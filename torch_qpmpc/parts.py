@@ -16,7 +16,7 @@ from torch.nn.utils import parametrize
 from torch_qpmpc.arguments import CONSTRAINTS, COST
 from torch_qpmpc.checks import check_number
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.parametrizations import Banded, LinearRows, SquareRoot, Tied
+from torch_qpmpc.parametrizations import Banded, LinearRows, Masked, SquareRoot, Tied
 
 
 def register(module: nn.Module, name: str, value: Tensor, learned: bool) -> None:
@@ -56,6 +56,20 @@ def leaves(module: nn.Module, name: str) -> list[nn.Parameter]:
     if not parametrize.is_parametrized(module, name):
         return [module.get_parameter(name)]
     return list(module.get_submodule(f"parametrizations.{name}").parameters(recurse=False))
+
+
+def matrix(module: nn.Module, name: str) -> tuple[nn.Parameter | None, Tensor | None]:
+    """The parameter whose entries are a part's own, and the mask of those that are learned.
+
+    The parameter is None where the part is computed from others, or is not learned; the mask is
+    None where all entries are learned.
+    """
+    if not parametrize.is_parametrized(module, name):
+        return module._parameters.get(name), None
+    found = list(module.get_submodule(f"parametrizations.{name}").children())
+    if len(found) == 1 and isinstance(found[0], Masked):
+        return leaves(module, name)[0], found[0].mask
+    return None, None
 
 
 def factor(module: nn.Module, name: str) -> tuple[Tensor, bool]:

@@ -26,7 +26,9 @@ def reduce(
             raise QPError.expected("pickle", got, "QPMPC's own", remedy)
     plain = parametrize.type_before_parametrizations(module)
     frozen = [name for name, part in module.named_parameters() if not part.requires_grad]
-    return _rebuild, (plain, arguments, module.state_dict(), frozen, module.training)
+    # The arguments say whose state it is; a tensor made for that could not be shared with a child.
+    state = {name: x for name, x in module.state_dict().items() if name != "_extra_state"}
+    return _rebuild, (plain, arguments, state, frozen, module.training)
 
 
 def _rebuild(

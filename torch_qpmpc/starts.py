@@ -9,7 +9,7 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from torch_qpmpc.arguments import as_tensor, bound_pair, check_model, check_slack, cost_weights
+from torch_qpmpc.arguments import as_tensor, bound_pair, check_model, cost_weights, slack_weight
 from torch_qpmpc.banded import banded_matrix
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.layout import Layout
@@ -36,8 +36,8 @@ def theta(
     learn: Collection[str],
     stage_weight: Any,
     terminal_weight: Any,
-    state_slack: float,
-    action_slack: float,
+    state_slack: Any,
+    action_slack: Any,
     constraint_slack: float,
     seed: int,
     **_: Any,
@@ -182,14 +182,11 @@ def _bounds(
     return {"lb": lower, "ub": upper}
 
 
-def _slack_weights(layout: Layout, state: float, action: float, constraint: float) -> Tensor:
+def _slack_weights(layout: Layout, state: Any, action: Any, constraint: Any) -> Tensor:
     """w ``(n_g,)``, inf on hard rows."""
-    given = {"state_slack": state, "action_slack": action, "constraint_slack": constraint}
-    for name, weight in given.items():
-        check_slack(name, weight)
-    sizes = (layout.n_x, layout.n_u, layout.n_d, layout.n_d_f)
-    of_each = (state, action, constraint, constraint)
-    parts = (
-        torch.full((n,), float(w), dtype=torch.float64) for n, w in zip(sizes, of_each, strict=True)
+    return layout.rows(
+        slack_weight("state_slack", state, layout.n_x),
+        slack_weight("action_slack", action, layout.n_u),
+        slack_weight("constraint_slack", constraint).expand(layout.n_d),
+        slack_weight("constraint_slack", constraint).expand(layout.n_d_f),
     )
-    return layout.rows(*parts)

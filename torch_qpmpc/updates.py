@@ -19,6 +19,7 @@ from torchrl.objectives import LossModule
 from torch_qpmpc.gauss_newton import GaussNewton
 from torch_qpmpc.mpc import QPMPC
 from torch_qpmpc.objectives import QPQLearningLoss, invalid_rewards, td_loss, td_metadata
+from torch_qpmpc.parts import matrix
 from torch_qpmpc.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.restoring import restored
 
@@ -79,7 +80,7 @@ def first_order(
         if due:
             mpc.project_()
             if proximal is not None:
-                proximal.proximal_step_(mpc.C, share_of_rate(optimizer))
+                proximal.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
         return terms, losses
 
     return update
@@ -108,7 +109,7 @@ def second_order(
         s, a = batch.get(observation), batch.get(action)
         report = optimizer.step(s, a, -target, penalty=penalty, warm_start=start)
         if deviation is not None:
-            deviation.proximal_step_(mpc.C, share_of_rate(optimizer))
+            deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
         if network.active_set_key is not None:
             batch.set(network.active_set_key, report.solution.active)
         prediction = -report.solution.value.to(target)
@@ -121,6 +122,12 @@ def second_order(
         return terms, losses
 
     return update
+
+
+def entries_of_C(mpc: QPMPC) -> Tensor:
+    """C, or its parameter where only some of its entries are learned."""
+    parameter, _ = matrix(mpc, "C")
+    return mpc.C if parameter is None else parameter
 
 
 def share_of_rate(optimizer: torch.optim.Optimizer) -> float:

@@ -203,8 +203,8 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         "state_slack: got 'inf', expected a non-negative weight, or inf for hard row",
     ),
     "QPMPC: slack vec": (
-        M(state_slack=[1.0, 1.0]),
-        "state_slack: got [1.0, 1.0], expected a non-negative weight, or inf for har",
+        M(state_slack=[1.0] * 3),
+        "state_slack: got [1.0, 1.0, 1.0], expected a non-negative weight, or inf for har",
     ),
     "QPMPC: slack None": (
         M(state_slack=None),

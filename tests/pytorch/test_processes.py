@@ -95,7 +95,7 @@ def test_threads_that_solve_at_once_get_the_same_answers(solver):
 
 def test_shared_memory_shows_an_update_of_theta():
     mpc, s = random_mpc(0).share_memory(), random_states(4)
-    assert all(part.is_shared() for part in mpc.state_dict().values())
+    assert all(part.is_shared() for part in (*mpc.parameters(), *mpc.buffers()))
     before = mpc.value(s).detach()
     with torch.no_grad():
         mpc.C[:, 0].add_(0.1)  # a multiple of C would be the same QP

@@ -147,6 +147,7 @@ def _nearest_feasible(qp: _FreeQP, z: np.ndarray, of_C: _Range) -> tuple[np.ndar
         weights, _ = nnls(E, unit)
     except RuntimeError:  # it did not settle: nothing is known
         return z, no_multipliers
+    weights[weights < ROUNDING * weights.max()] = 0.0
     left = E @ weights - unit
     if left[-1] < 0:
         z = z + of_C.null @ (left[:-1] / -left[-1]) * length
