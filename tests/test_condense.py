@@ -15,7 +15,7 @@ from tests.problems import known_qp, normal, programs_of, random_mpc, random_sta
 from torch_qpmpc import Status, solve_qp
 from torch_qpmpc import condense as condense_module
 from torch_qpmpc.banded import banded_matrix
-from torch_qpmpc.condense import condense
+from torch_qpmpc.condense import condense, other_eliminations
 from torch_qpmpc.programs import ContentMemo, FlatPrograms
 
 
@@ -279,3 +279,49 @@ def test_a_row_of_any_scale_counts():
     C, b = scale[:, None] * known.qp.C, scale * known.qp.b
     solution = solve_qp(replace(known.qp, C=C, b=b), known.fixed, solver="daqp")
     assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("matrices", [(), (2,)])
+@pytest.mark.parametrize("name", ["independent", "dependent", "zero"])
+def test_other_eliminations_solve_the_same_equations(name, matrices):
+    C = (REGULAR | DEFICIENT)[name]
+    C = C.expand(*matrices, *C.shape)
+    programs = programs_of(known_qp(0, batch=(2,), matrices=matrices, n_z=8, n_f=3, C=C))
+    found = list(other_eliminations(programs))
+    assert len(found) == (2 if name == "independent" else 1)
+    for condensed in found:
+        T, Y = condensed.T, -condensed.Y_neg
+        b = programs.multiply(programs.C, programs.C.new_ones(len(programs), 8))
+        assert_close(programs.C @ T, torch.zeros_like(programs.C @ T))
+        if name == "independent":
+            assert_close(programs.multiply(programs.C, programs.multiply(Y, b)), b)
+        assert_close(T[:, :3, :3], torch.eye(3).double().expand(len(T), 3, 3))
+
+
+def test_without_equations_there_is_nothing_to_eliminate_otherwise():
+    known = known_qp(0, batch=(2,), n_z=8, n_f=3, C=NONE)
+    assert list(other_eliminations(programs_of(known))) == []
+
+
+def test_in_the_order_of_its_rows_C_gives_the_prediction_form():
+    """However unstable the model is, x_k is that of the recursion, entry by entry."""
+    horizon, A, B = 50, torch.tensor([[2.0, 0.1], [0.0, 1.5]]), torch.tensor([[0.3], [5.0]])
+    C = banded_matrix(A.double(), B.double(), horizon)
+    n_z = C.shape[1]
+    qp = known_qp(0, batch=(1,), n_z=n_z, n_f=2, C=C, soft=(), hard=()).qp
+    u = normal(horizon, seed=3)
+    programs, _ = FlatPrograms.of(*qp.tensors(), torch.tensor([[1.0, -1.0]]).double())
+    condensed = list(other_eliminations(programs))[1]
+    actions = torch.arange(n_z) % 3 == 2
+    assert (condensed.T[0, actions] != 0).sum(-1).eq(1).all()
+    z = programs.multiply(condensed.T, torch.cat((programs.fixed, u[None]), -1))[0]
+    x = programs.fixed[0]
+    for k in range(horizon):
+        x = A.double() @ x + B.double()[:, 0] * u[k]
+        assert_close(z[3 * k + 3 : 3 * k + 5], x, rtol=1e-11, atol=0)
+
+
+def test_a_prediction_beyond_float64_has_no_recursion():
+    C = banded_matrix(1e20 * torch.eye(1).double(), torch.eye(1).double(), 20)
+    known = known_qp(0, batch=(1,), n_z=41, n_f=1, C=C, soft=(), hard=())
+    assert len(list(other_eliminations(programs_of(known)))) == 1

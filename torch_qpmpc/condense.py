@@ -24,6 +24,8 @@ from torch_qpmpc.twofold import Twofold
 
 #: A pivot below this fraction of its row's norm means that the rows of C depend on each other.
 RANK_TOLERANCE = 1e-10
+#: A pivot of at least this fraction of the largest serves as well, in the order of equations.
+THRESHOLD = 1e-2
 #: A coefficient below this fraction of its row's absolute sum is rounding.
 ENTERS = 1e-12
 #: A row that no free variable enters is violated from here on.
@@ -243,6 +245,8 @@ def other_eliminations(programs: FlatPrograms) -> Iterator[Condensed]:
     the states grow, only this recursion is accurate in every entry.
     """
     p, keep = programs, programs.fixed.shape[-1]
+    if not p.C.shape[1]:
+        return
     T, Y, padding = _null_space(p.C, keep)
     yield _products(p.H, p.G, T, Y, keep, padding)
     own = [_eliminate_in_order(C, keep) for C in p.arrays.C]
@@ -266,8 +270,9 @@ def _eliminate_in_order(C: np.ndarray, keep: int) -> tuple[np.ndarray, np.ndarra
         possible = entries > RANK_TOLERANCE * np.linalg.norm(C[k])
         if not possible.any():
             return None
-        newest = possible & (first == first[possible].max())
-        pivot = int(np.where(newest, entries, 0.0).argmax())
+        newest = np.where(possible & (first == first[possible].max()), entries, 0.0)
+        # In z, x_{k+1} comes after the action u_k that is as new.
+        pivot = int((newest >= THRESHOLD * newest.max()).nonzero()[0][-1])
         first[pivot] = -1
         pivots.append(pivot)
         W[k] /= W[k, pivot]
