@@ -239,7 +239,7 @@ def test_a_large_theta_has_the_gradient_that_a_small_one_has(monkeypatch):
 
 
 def test_the_value_alone_is_that_of_the_whole_solution_with_its_derivatives():
-    mpc, s = random_mpc(6, learn=EVENT_SHAPES), random_states(5).requires_grad_()
+    mpc, s = random_mpc(6, learn=tuple(EVENT_SHAPES)), random_states(5).requires_grad_()
     operands, incoming = (*mpc.parameters(), s), normal(3, 5)
     alone, whole = mpc.value(s), mpc.solve(s).value
     assert torch.equal(alone, whole)

@@ -14,7 +14,7 @@ from torch_qpmpc.errors import QPError
 
 def written(identity: dict[str, Any]) -> Tensor:
     """JSON in bytes: a tensor, as code that walks through a state_dict expects."""
-    return torch.tensor(list(json.dumps(identity).encode()), dtype=torch.uint8)
+    return torch.tensor(list(json.dumps(identity).encode()), dtype=torch.uint8, device="cpu")
 
 
 def digest(mask: Tensor) -> str:
