@@ -233,7 +233,7 @@ def test_vectors_and_diagonals(part):
             r"learn\['C'\]: got torch.bool of shape \(2, 11\), expected",
         ),
         ({"learn": {"C": rows().float()}}, r"learn\['C'\]: got torch.float32 of shape \(6, 11\)"),
-        ({"learn": {"c": False}}, r"learn\['c'\]: got torch.bool of shape \(\), expected True"),
+        ({"learn": {"H": False}}, r"learn\['H'\]: got torch.bool of shape \(\), expected True"),
         ({"learn": {"C": "rows"}}, r"learn\['C'\]: got 'rows', expected True, or a mask of bools"),
         ({"learn": {"D": True}}, "learn: got .*'D'.*, expected a collection of names among"),
         (
@@ -344,3 +344,108 @@ def test_what_the_constructor_decides_is_not_assigned(name, value):
     with pytest.raises(QPError, match=f"{name}: got .*, expected .*, as made. Make another QPMPC"):
         setattr(mpc, name, value)
     assert getattr(mpc, name) == own
+
+
+def test_arguments_are_kept_by_value():
+    A, mask = np.array([[1.0, 0.1], [0.0, 0.9]]), rows()
+    options = {"learn": {"C": mask}, "seed": 1}
+    mpc = QPMPC.from_model(A, [[0.0], [0.1]], HORIZON, **options)
+    start = mpc.C.detach().clone()
+    A *= 2
+    mask.logical_not_()
+    options["learn"].clear()
+    mpc.reset_parameters()
+    assert torch.equal(mpc.C, start)
+    assert torch.equal(pickle.loads(pickle.dumps(mpc)).C, start)
+
+
+@pytest.mark.parametrize("convert", [lambda x: x.double(), lambda x: x.float() + 1e-3])
+def test_a_converted_state_dict_is_loaded(convert):
+    mpc = random_mpc(0)
+    state = {
+        name: convert(x) if name == "_extra_state" else x for name, x in mpc.state_dict().items()
+    }
+    mpc.load_state_dict(state)
+    with pytest.raises(QPError, match=r"state_dict: got a state_dict with gamma = 0\.9"):
+        random_mpc(0, gamma=0.5).load_state_dict(state)
+
+
+@pytest.mark.parametrize("junk", [None, torch.zeros(3), torch.tensor([91, 93])])
+def test_an_identity_that_cannot_be_read_is_named(junk):
+    mpc = random_mpc(0)
+    message = "state_dict: got an _extra_state that cannot be read .*, expected what a QPMPC wrote"
+    with pytest.raises(QPError, match=message):
+        mpc.load_state_dict(mpc.state_dict() | {"_extra_state": junk})
+
+
+@pytest.mark.parametrize("delay", [False, True])
+def test_the_state_of_another_qpmpcs_loss_is_refused(delay):
+    def loss(**options: Any) -> QPQLearningLoss:
+        operator = QPActorValueOperator(random_mpc(0, **options))
+        made = QPQLearningLoss(operator, delay_value=delay)
+        made.make_value_estimator(gamma=0.9)
+        return made
+
+    state = loss().state_dict()
+    loss().load_state_dict(state)
+    for name in ("gamma", "hard rows", "discount_slack"):
+        with pytest.raises(QPError, match=f"state_dict with {name} = "):
+            loss(**OTHERS[name]).load_state_dict(state)
+    older = {name: x for name, x in state.items() if name != "_extra_state"}
+    loss().load_state_dict(older)
+
+
+def test_a_masked_C_is_not_called_tied():
+    mpc = masked(rows())
+    penalty = DeviationPenalty(mpc.C_0, 2, 1)
+    with pytest.raises(QPError, match=r"pass mpc.leaves\('C'\)\[0\]"):
+        penalty.proximal_step_(mpc.C)
+    with pytest.raises(QPError, match="part: got 'b', expected one of the learned parts: H, c, C"):
+        mpc.leaves("b")
+
+
+def test_what_the_constructor_decided_may_be_assigned_again():
+    mpc = random_mpc(0)
+    mpc.gamma = mpc.gamma
+    mpc.structure = "free"
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_a_gauss_newton_is_not_copied_without_its_qpmpc(copied):
+    message = "GaussNewton: got a copy or a pickle, expected its state_dict. Make another one"
+    with pytest.raises(QPError, match=message):
+        copied(GaussNewton(random_mpc(0)))
+
+
+def test_a_gauss_newton_step_with_everything_frozen_moves_nothing():
+    mpc = random_mpc(0)
+    s, a, target = targets(mpc)
+    mpc.requires_grad_(False)
+    before = mpc.C.clone()
+    GaussNewton(mpc).step(s, a, target)
+    assert torch.equal(mpc.C, before)
+
+
+def test_errors_that_cannot_be_squared_move_nothing():
+    mpc = random_mpc(0)
+    s, a, target = targets(mpc)
+    before = mpc.C.detach().clone()
+    assert not GaussNewton(mpc).step(s, a, 1e160 * target).accepted
+    assert torch.equal(mpc.C, before)
+
+
+def test_a_memory_of_another_horizon_is_named():
+    short, long = (GaussNewton(random_mpc(0, horizon=n), memory=4) for n in (2, 3))
+    for optimizer in (short, long):
+        optimizer.step(*targets(optimizer._mpc))
+    long.load_state_dict(short.state_dict())
+    with pytest.raises(QPError, match=r"got a memory of gradients of .* entries, expected"):
+        long.step(*targets(long._mpc))
+
+
+def test_weights_that_are_not_finite_are_named():
+    loss = QPQLearningLoss(QPActorValueOperator(random_mpc(0, action_slack=10.0)))
+    loss.make_value_estimator(gamma=0.9)
+    batch = make_batch(4).set("priority_weight", torch.tensor([1.0, torch.nan, 1.0, 1.0]))
+    with pytest.raises(QPError, match="priority_weight: got NaN or inf, expected finite weights"):
+        loss(batch)

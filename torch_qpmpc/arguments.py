@@ -73,13 +73,26 @@ def check_structure(
         )
 
 
+def own(value: Any) -> Any:
+    """A copy of an argument that its caller may change: arrays, tensors, and what holds them."""
+    if isinstance(value, Tensor):
+        return value.detach().clone()
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, Mapping):
+        return {key: own(item) for key, item in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(map(own, value))
+    return value
+
+
 def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The masks among the values of ``learn``, by part: true where an entry is learned."""
     if not isinstance(learn, Mapping):
         return {}
     masks = {}
     for part, mask in learn.items():
-        if mask is True:
+        if isinstance(mask, bool | np.bool_) and mask:
             continue
         name, shape = f"learn[{part!r}]", tuple(theta[part].shape)
         want = f"True, or a mask of bools of shape {shape}"
@@ -87,7 +100,7 @@ def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict
             mask = torch.as_tensor(mask)
         except (TypeError, ValueError, RuntimeError) as error:
             raise QPError.expected(name, repr(mask), want) from error
-        if mask.dtype != torch.bool or tuple(mask.shape) != shape or mask.ndim == 0:
+        if mask.dtype != torch.bool or tuple(mask.shape) != shape:
             got = f"{mask.dtype} of shape {tuple(mask.shape)}"
             raise QPError.expected(name, got, want, "True marks the entries to be learned.")
         masks[part] = mask.detach().cpu().clone()

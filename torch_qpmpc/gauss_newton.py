@@ -17,6 +17,7 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -190,7 +191,8 @@ class GaussNewton(torch.optim.Optimizer):
         alpha, change = _solve(blocks, torch.cat((delta, past)), damping)
         change = change[: len(delta)]
         steps = [block.step(alpha) for block in blocks]
-        if not all(step.isfinite().all() for step in steps):
+        before = _objective(delta, blocks)
+        if not before.isfinite() or not all(step.isfinite().all() for step in steps):
             # Numbers too large to be squared: more damping, and nothing of them in the memory.
             self._adapt(math.nan)
             self.state.clear()
@@ -200,7 +202,6 @@ class GaussNewton(torch.optim.Optimizer):
             self._mpc.project_()
             return StepReport(solution, damping, math.nan, True, *left_out)
         old = [block.leaf.clone() for block in blocks]
-        before = _objective(delta, blocks)
         _move(blocks, steps, lr)
         proposed = lr * change
         change = self._project(blocks, proposed)
@@ -219,6 +220,15 @@ class GaussNewton(torch.optim.Optimizer):
         self._adapt(ratio)
         return StepReport(solution, damping, ratio, accepted, *left_out)
 
+    def __reduce__(self) -> tuple:
+        # The module would be another one than that which its owner copies or saves beside it.
+        raise QPError.expected(
+            "GaussNewton",
+            "a copy or a pickle",
+            "its state_dict",
+            "Make another one for the copied QPMPC, and load the state_dict into it.",
+        )
+
     def _check_parameters(self) -> None:
         """Raise `QPError` if the QPMPC's parameters are no longer those of this optimiser."""
         own = {id(parameter) for parameter in self._mpc.parameters()}
@@ -226,7 +236,10 @@ class GaussNewton(torch.optim.Optimizer):
         lost = [x["name"] for x in groups if not own.issuperset(map(id, x["params"]))]
         if lost:
             got = f"a QPMPC that has other parameters of {', '.join(lost)} by now"
-            remedy = "QPMPC.release gives it new ones: make the GaussNewton anew after it."
+            remedy = (
+                "QPMPC.release, and load_state_dict with assign=True, give it new ones: make the "
+                "GaussNewton anew after it."
+            )
             raise QPError.expected("mpc", got, "the parameters of this optimiser", remedy)
 
     def _project(self, blocks: list[_Dense | _OuterProducts], change: Tensor) -> Tensor:
@@ -290,6 +303,17 @@ class GaussNewton(torch.optim.Optimizer):
         ]
 
 
+def _past(state: dict[str, Tensor], name: str, today: Tensor) -> Tensor:
+    """The remembered rows of the kind of ``today`` ``(B, n)``; none at first."""
+    past = state.get(name, today[:0])
+    if past.shape[1:] != today.shape[1:]:
+        got = f"a memory of gradients of {past.shape[1]} entries"
+        want = f"{today.shape[1]}, as this QPMPC has"
+        remedy = "Load the state of a GaussNewton of the same QPMPC."
+        raise QPError.expected("state_dict", got, want, remedy)
+    return past
+
+
 class _Dense:
     """The gradients in one parameter, as rows ``(B, n)``; its metric is ``scale``."""
 
@@ -302,7 +326,7 @@ class _Dense:
     def remember(self, state: dict[str, Tensor], count: int) -> None:
         """Append up to ``count`` gradients of the past, and keep the newest for the next step."""
         if count:
-            self.rows = torch.cat((self.rows, state.get("rows", self.rows[:0])))
+            self.rows = torch.cat((self.rows, _past(state, "rows", self.rows)))
             state["rows"] = self.rows[:count]
 
     def diagonal(self) -> Tensor:
@@ -341,65 +365,61 @@ class _OuterProducts:
     ) -> None:
         self.leaf, self.scale, self.chi, self.z, self.S = leaf, scale, chi, z, S
         self.drift = torch.zeros_like(leaf)
-        self.patterns = _patterns(leaf, mask)
+        self.patterns = _patterns(mask)
 
     def __len__(self) -> int:
         return len(self.z)
 
     def remember(self, state: dict[str, Tensor], count: int) -> None:
         if count:
-            self.chi = torch.cat((self.chi, state.get("chi", self.chi[:0])))
-            self.z = torch.cat((self.z, state.get("z", self.z[:0])))
+            self.chi = torch.cat((self.chi, _past(state, "chi", self.chi)))
+            self.z = torch.cat((self.z, _past(state, "z", self.z)))
             state["chi"], state["z"] = self.chi[:count], self.z[:count]
 
     def diagonal(self) -> Tensor:
         chi, z = self.chi.square(), self.z.square()
-        found = (chi[:, i].sum(-1) * z[:, j].sum(-1) for i, j in self.patterns)
+        found = (chi[:, i].sum(-1) * z[:, j].sum(-1) for i, j, _ in self.patterns)
         return self.scale * sum(found, torch.zeros_like(z[:, 0]))
 
     def damp(self, mu: Tensor) -> Tensor:
         drifted = self.z.new_zeros(len(self.z))
-        self.z_P = [self.scale * self.z[:, j] for _, j in self.patterns]
+        self.z_P = [self.scale * self.z[:, j] for _, j, _ in self.patterns]
         if self.S is None:
             return drifted
         force = self.leaf @ self.S
-        for k, (i, j) in enumerate(self.patterns):
+        for k, (i, j, entries) in enumerate(self.patterns):
             z, S = self.z[:, j], self.S[j][:, j]
             precision = mu / self.scale * torch.eye(len(S)).to(S) + S
             inverse = torch.linalg.inv_ex(precision).inverse
-            drift = -force[i][:, j] @ inverse
-            self.z_P[k], self.drift[i.unsqueeze(-1), j] = mu * z @ inverse, drift
+            drift = -force[entries] @ inverse
+            self.z_P[k], self.drift[entries] = mu * z @ inverse, drift
             drifted = drifted + ((self.chi[:, i] @ drift) * z).sum(-1)
         return drifted
 
     def kernel(self) -> Tensor:
         K = self.z.new_zeros(len(self.z), len(self.z))
-        for (i, j), z_P in zip(self.patterns, self.z_P, strict=True):
+        for (i, j, _), z_P in zip(self.patterns, self.z_P, strict=True):
             chi = self.chi[:, i]
             K = K + (chi @ chi.mT) * (z_P @ self.z[:, j].mT)
         return K
 
     def step(self, alpha: Tensor) -> Tensor:
         found = self.drift.clone()
-        for (i, j), z_P in zip(self.patterns, self.z_P, strict=True):
-            found[i.unsqueeze(-1), j] += (alpha.unsqueeze(-1) * self.chi[:, i]).mT @ z_P
+        for (i, _, entries), z_P in zip(self.patterns, self.z_P, strict=True):
+            found[entries] += (alpha.unsqueeze(-1) * self.chi[:, i]).mT @ z_P
         return found
 
     def penalty(self) -> Tensor | float:
         return 0.0 if self.S is None else 0.5 * ((self.leaf @ self.S) * self.leaf).sum()
 
 
-def _patterns(C: Tensor, mask: Tensor | None) -> list[tuple[Tensor, Tensor]]:
-    """The rows of C that learn the same entries, and which, as indices."""
+def _patterns(mask: Tensor | None) -> list[tuple[Any, Any, Any]]:
+    """The rows of C that learn the same entries, which these are, and the index of both in C."""
     if mask is None:
-        rows, columns = (torch.arange(n, device=C.device) for n in C.shape)
-        return [(rows, columns)]
+        return [(slice(None), slice(None), (slice(None), slice(None)))]
     kinds, kind = torch.unique(mask, dim=0, return_inverse=True)
-    return [
-        ((kind == k).nonzero().squeeze(-1), columns.nonzero().squeeze(-1))
-        for k, columns in enumerate(kinds)
-        if columns.any()
-    ]
+    pairs = [((kind == k).nonzero()[:, 0], x.nonzero()[:, 0]) for k, x in enumerate(kinds)]
+    return [(i, j, (i.unsqueeze(-1), j)) for i, j in pairs if len(j)]
 
 
 def _solve(
@@ -409,7 +429,7 @@ def _solve(
     mu = damping * sum((block.diagonal() for block in blocks), torch.zeros_like(delta)).mean()
     mu = mu.clamp(min=torch.finfo(mu.dtype).tiny)
     drifted = sum((block.damp(mu) for block in blocks), torch.zeros_like(delta))
-    K = sum((block.kernel() for block in blocks), torch.zeros(1).to(delta))
+    K = sum((block.kernel() for block in blocks), delta.new_zeros(len(delta), len(delta)))
     damped = K + mu * torch.eye(len(delta)).to(delta)
     factor, failed = torch.linalg.cholesky_ex(damped)
     alpha = torch.cholesky_solve((delta - drifted).unsqueeze(-1), factor).squeeze(-1)

@@ -23,6 +23,7 @@ from torch_qpmpc.arguments import (
     check_pair,
     check_structure,
     learned_entries,
+    own,
 )
 from torch_qpmpc.autograd import optimal_value, solve_qp, value_and_active_set
 from torch_qpmpc.checks import check_kind, check_tensor
@@ -151,16 +152,16 @@ class QPMPC(nn.Module):
         on_failure: str = "raise",
         seed: int = 0,
     ) -> None:
-        arguments = {
-            name: value for name, value in locals().items() if name not in ("self", "__class__")
-        }
+        given = {name: x for name, x in locals().items() if name not in ("self", "__class__")}
+        # Copies: reset_parameters and pickle make it anew, whatever becomes of the caller's arrays.
+        arguments = {name: own(value) for name, value in given.items()}
         super().__init__()
         check_structure(**arguments)
         arguments |= {name: int(arguments[name]) for name in ("n_x", "n_u", "horizon", "seed")}
         self._arguments = arguments
         backend(solver)
         with torch.device("cpu"):
-            self._start(learn)
+            self._start(arguments["learn"])
         if (device := torch.get_default_device()).type != "cpu":
             self.to(device)
 
@@ -391,7 +392,7 @@ class QPMPC(nn.Module):
         return twin
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in FIXED and name in vars(self):
+        if name in FIXED and name in vars(self) and value != vars(self)[name]:
             remedy = "Make another QPMPC; release() frees the structure of this one."
             raise QPError.expected(name, repr(value), f"{vars(self)[name]!r}, as made", remedy)
         super().__setattr__(name, value)
@@ -415,11 +416,15 @@ class QPMPC(nn.Module):
             "hard rows": self._hard_rows,
         }
 
-    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+    def checked_state(self, state_dict: dict[str, Any], prefix: str) -> dict[str, Any]:
+        """``state_dict``; `QPError` if it tells of another QPMPC. An older one tells nothing."""
         key = f"{prefix}_extra_state"
-        state_dict = {key: self.get_extra_state()} | state_dict  # an older one has none
+        state_dict = {key: self.get_extra_state()} | state_dict
         check_identity(state_dict[key], self._identity())
-        super()._load_from_state_dict(state_dict, prefix, *args)
+        return state_dict
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        super()._load_from_state_dict(self.checked_state(state_dict, prefix), prefix, *args)
         self._derive()
 
     def _derive(self) -> None:

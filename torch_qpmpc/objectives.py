@@ -199,6 +199,18 @@ class QPQLearningLoss(LossModule):
         view = self.value_network.get_value_operator()
         object.__setattr__(self, "state_value_network", view)
 
+    def get_extra_state(self) -> Tensor:
+        """What the state_dict tells of the QPMPC that it belongs to."""
+        return self.value_network.module.get_extra_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """`_load_from_state_dict` has compared it already."""
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        super()._load_from_state_dict(
+            self.value_network.module.checked_state(state_dict, prefix), prefix, *args
+        )
+
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         if self._value_estimator is not None:
             self._value_estimator.set_keys(**self._estimator_keys())
@@ -264,6 +276,9 @@ class QPQLearningLoss(LossModule):
         """
         self._check_batch(tensordict)
         weights = self._maybe_get_priority_weight(tensordict)
+        if weights is not None and has_values(weights) and not weights.isfinite().all():
+            name = str(self.tensor_keys.priority_weight)
+            raise QPError.expected(name, "NaN or inf", "finite weights", "Look at the priorities.")
         active_set = self.value_network.active_set_key
         visited = tensordict.select(*_read_by(self.value_network), strict=False).detach()
         call_with(self.value_network_params, self.value_network, visited)

@@ -135,7 +135,10 @@ class DeviationPenalty(nn.Module):
         """
         check_tensor("C", C, *self.C_0.shape, batched=False, remedy="Pass mpc.C.")
         if C.grad_fn is not None:
-            remedy = "A tied C is computed from A and B: release() it first."
+            remedy = (
+                "Of a QPMPC that learns some entries of C, pass mpc.leaves('C')[0]; a tied C is "
+                "computed from A and B: release() it first."
+            )
             raise QPError.expected("C", "a computed tensor", "a parameter", remedy)
         check_number("scale", scale, _finite, "a finite number >= 0")
         excess = C - self.C_0

@@ -22,6 +22,7 @@ from tqdm import tqdm
 from torch_qpmpc.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
 from torch_qpmpc.config import differences, load_config, settings
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.lock import ELSEWHERE_IN_SWEEP
 from torch_qpmpc.snapshot import check_state
 
 #: Seconds between two looks at what has ended.
@@ -44,7 +45,7 @@ def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
     saved = settings(load_config(folder / "config.yaml"))
     if changed := differences(saved, settings(cfg)):
         then, now = changed
-        remedy = "Remove it, or choose another folder by hydra.sweep.dir=FOLDER."
+        remedy = f"Remove it, or choose another folder by {ELSEWHERE_IN_SWEEP}."
         raise QPError.expected(f"{folder}", f"a finished run with {then}", now, remedy)
     return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
 

@@ -258,7 +258,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "GaussNewton: released": (
         released_step,
         "mpc: got a QPMPC that has other parameters of C by now, expected the parameters of this "
-        "optimiser. QPMPC.release gives it new ones: make the GaussNewton anew after it.",
+        "optimiser. QPMPC.release, and load_state_dict with",
     ),
     "GaussNewton: empty": (
         lambda: gn.step(S[:0], Aa[:0], torch.zeros(0)).accepted,
@@ -332,7 +332,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: (lambda m: qm.DeviationPenalty(m.C_0, 2, 1).proximal_step_(m.C))(
             qm.QPMPC.linear_mpc(A2, B1, 3)
         ),
-        "C: got a computed tensor, expected a parameter. A tied C is computed from A",
+        "C: got a computed tensor, expected a parameter. Of a QPMPC that learns some",
     ),
     "DeviationPenalty: prox list": (
         lambda: qm.DeviationPenalty(mpc.C_0, 2, 1).proximal_step_([1.0]),

@@ -71,7 +71,7 @@ def scenario(method: str) -> None:
     assert torch.get_num_threads() == 2
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+@pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_a_child_has_the_answers_of_its_parent(method):
     if method not in torch.multiprocessing.get_all_start_methods():
         pytest.skip(f"the platform has no {method}")

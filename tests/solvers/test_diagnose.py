@@ -262,6 +262,26 @@ def test_an_unstable_plant_that_is_infeasible_has_its_proof(solver):
     assert (mpc.solve(s).status == Status.INFEASIBLE).all()
 
 
+def test_noise_beside_large_numbers_spoils_no_proof(solver):
+    flat = QPMPC.from_model(
+        [[1.0]],
+        [[1.0, 1.0]],
+        1,
+        stage_weight=[1.0, 0.1, 0.0],
+        terminal_weight=[0.0],
+        learn=("q",),
+        solver=solver,
+        on_failure="mask",
+    )
+    with torch.no_grad():
+        flat.q[2] = 1.0
+    assert flat.solve(doubles([0.0])).status == Status.UNBOUNDED
+    options = {"state_bounds": ([-2, -2], [2, 2]), "state_slack": torch.inf}
+    A, B = [[1.5, 0.1], [0.0, 1.2]], [[0.0], [1.0]]
+    mpc = QPMPC.from_model(A, B, 3, solver=solver, on_failure="mask", **options)
+    assert mpc.solve(doubles([1.9, 0.0])).status == Status.INFEASIBLE
+
+
 @pytest.mark.parametrize("slope", [1e-7, 1e-9, 1e-11])
 def test_rows_that_meet_far_away_are_not_called_infeasible(slope):
     # x >= 1 and y <= 0 with x <= y (1 - slope) + .. meet where y is -1 / slope.

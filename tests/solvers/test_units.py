@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from tests.campaign.families import in_units
 from tests.problems import KnownQP, known_qp, programs_of, random_mpc
-from torch_qpmpc import QuadraticProgram, SolveLog, Status, solve_qp
+from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
 from torch_qpmpc.programs import FlatPrograms
 from torch_qpmpc.solvers.chain import solve_programs
 from torch_qpmpc.solvers.units import Units
@@ -50,6 +50,34 @@ def test_units_are_powers_of_two_and_make_sizes_ordinary(matrices):
     for unit in vars(units).values():
         assert (torch.frexp(unit).mantissa == 0.5).all()
     assert Units.of(units.scaled(programs)) is None
+
+
+@pytest.mark.parametrize("bound", [1e3, 1e5, 1e6, 1e8, 1e10])
+def test_bounds_that_are_far_away_change_no_answer(solver, bound):
+    """Large numbers in the place of no bound once made units in which every error was small."""
+    A, B, s = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], torch.tensor([[1.0, -0.5], [0.1, 0.2]])
+    options = {"stage_weight": [1.0, 0.1, 0.01], "action_bounds": ([-1.0], [1.0])}
+    free, far = (
+        QPMPC.from_model(A, B, 10, state_bounds=bounds, solver=solver, **options)
+        for bounds in (None, ([-bound] * 2, [bound] * 2))
+    )
+    assert_close(far.value(s.double()), free.value(s.double()), rtol=1e-6, atol=0)
+    assert_close(far.policy(s.double()), free.policy(s.double()), rtol=1e-5, atol=0)
+
+
+def test_a_hard_bound_holds_where_states_are_large_and_actions_small(solver):
+    options = {"stage_weight": [1.0, 1.0, 0.1], "state_bounds": ([-1e4] * 2, [1e4] * 2)}
+    mpc = QPMPC.from_model(
+        [[1.0, 0.1], [0.0, 0.9]],
+        [[0.0], [1e5]],
+        10,
+        action_bounds=([-0.01], [0.01]),
+        solver=solver,
+        **options,
+    )
+    s = torch.tensor([1e4, -1e3]).double()
+    assert mpc.policy(s).abs() <= 0.01 * (1 + 1e-6)
+    assert_close(mpc.value(s), torch.tensor(3.04986581e8).double(), rtol=1e-6, atol=0)
 
 
 def test_solutions_come_back_in_the_numbers_of_the_qp():

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc import kernels
-from torch_qpmpc.certificate import Products, certify
+from torch_qpmpc.certificate import TOLERANCE, Products, certify
 from torch_qpmpc.condense import VIOLATED, Reduced, condensed_for, other_eliminations
 from torch_qpmpc.programs import FlatPrograms, SoftQPs
 from torch_qpmpc.qp import Status
@@ -24,7 +24,7 @@ from torch_qpmpc.solvers.crossover import refine
 from torch_qpmpc.solvers.diagnose import diagnose
 from torch_qpmpc.solvers.raw import RawArrays, RawSolution, unsolved
 from torch_qpmpc.solvers.recall import recall
-from torch_qpmpc.solvers.units import units_of
+from torch_qpmpc.solvers.units import Units, units_of
 
 #: A rejected claim with a relative residual up to this is worth sharpening.
 NEARLY = 1e-2
@@ -91,7 +91,7 @@ def solve_programs(
     chain = _Chain(programs if units is None else units.scaled(programs), keep)
     raw = chain.run(solver, start)
     if units is not None:
-        raw = units.restored(programs, raw)
+        raw = _settled(programs, units, keep, solver, units.restored(programs, raw))
     if (log := _active_log.get()) is not None:
         residual, worst = raw.residual, raw.worst
         if not raw.all_accepted:
@@ -105,6 +105,35 @@ def solve_programs(
         log.residual = max(log.residual, worst)
         log.seconds += time.perf_counter() - began
     return raw
+
+
+def _settled(
+    programs: FlatPrograms, units: Units, keep: int, solver: str, raw: RawSolution
+) -> RawSolution:
+    """Certify what was solved in ``units`` in the QPs' own numbers, too; solve again what fails.
+
+    Units follow from bounds, among others. Where a bound is far from every solution, as a large
+    number in the place of none is, they are large, and a certificate in them misses errors.
+    """
+    accepted = raw.accepted().nonzero().squeeze(-1)
+    failed = accepted[_certify_at(programs, raw, accepted)]
+    if len(failed):
+        again = _Chain(programs.take(failed), keep).run(solver, None)
+        raw.put(failed, again)
+        scaled, again = units.scaled(programs), units.inverse.restored(programs, raw)
+        failed = failed[raw.accepted()[failed]]
+        failed = failed[_certify_at(scaled, again, failed)]
+        raw.put(failed, unsolved(programs.take(failed), Status.NOT_CONVERGED))
+    raw.worst = float(raw.residual.max()) if len(raw.residual) else 0.0
+    return raw
+
+
+def _certify_at(programs: FlatPrograms, raw: RawSolution, at: Tensor) -> Tensor:
+    """Raise the residuals at the indices ``at`` to what they are here; where that is too much."""
+    found = raw.at(at)
+    judged = certify(programs.take(at), found.z, found.lam, found.chi, found.xi)
+    raw.residual[at] = found.residual.maximum(judged.residual)
+    return judged.residual > TOLERANCE
 
 
 class _Chain:

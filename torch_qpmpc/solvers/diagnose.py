@@ -172,6 +172,8 @@ def _contradict(qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, of_C: _Range) -> 
     pull = qp.G.T @ lam
     for _ in range(3):
         chi = chi - of_C.inverse.T @ (qp.C.T @ chi + pull)
+    largest = max(np.abs(chi).max(initial=0.0), np.abs(lam).max(initial=0.0))
+    chi = _without_noise(chi, largest)
     up, down, size = np.maximum(lam, 0), np.maximum(-lam, 0), np.abs(chi)
     # A multiplier of zero has no bound to multiply, which may be infinite.
     with np.errstate(invalid="ignore"):
@@ -183,6 +185,11 @@ def _contradict(qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, of_C: _Range) -> 
     excess = (left * np.where(zero, 0, reach)).sum()
     demand = qp.b @ chi + charge.sum() + excess
     return bool(demand < -SIGNIFICANT * (qp.b_size @ size + terms.sum()))
+
+
+def _without_noise(x: np.ndarray, largest: float) -> np.ndarray:
+    """x with zero for what rounding makes of a zero beside numbers as large as ``largest``."""
+    return np.where(np.abs(x) <= ROUNDING * largest, 0.0, x)
 
 
 def _reach(qp: _FreeQP) -> np.ndarray:
@@ -238,6 +245,7 @@ def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 def _falls(qp: _FreeQP, d: np.ndarray) -> bool:
     """True if the cost falls for ever along d, which no curvature, C or hard row ends."""
+    d = _without_noise(d, np.abs(d).max(initial=0.0))
     y, size = qp.G @ d, np.abs(d)
     row_size = np.abs(qp.G) @ size
     outwards = np.maximum(

@@ -68,6 +68,11 @@ class Units:
             p.fixed,
         )
 
+    @property
+    def inverse(self) -> Units:
+        """The units of these units' numbers, in which they are the QPs' own."""
+        return Units(1 / self.cost, 1 / self.length, 1 / self.rows, 1 / self.equalities)
+
     def restored(self, p: FlatPrograms, raw: RawSolution) -> RawSolution:
         """The solutions in the QPs' own numbers; residuals stay as they are, relative."""
         cost, length = self._of(p, self.cost), self._of(p, self.length)
