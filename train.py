@@ -35,10 +35,7 @@ from torchrl import torchrl_logger
 from tqdm import tqdm
 
 from torch_qpmpc import QPActorValueOperator, QPError, SolveLog
-from torch_qpmpc.checkpoint import CHECKPOINT, drop_previous, save_checkpoint
-from torch_qpmpc.collection import batches, make_collector, num_columns
-from torch_qpmpc.config import check_config
-from torch_qpmpc.experiment import (
+from torch_qpmpc.experiment.algorithms import (
     act,
     evaluate,
     gap_summary,
@@ -48,11 +45,14 @@ from torch_qpmpc.experiment import (
     table,
     theta_metrics,
 )
-from torch_qpmpc.interrupt import Interrupt
-from torch_qpmpc.lock import ELSEWHERE, ELSEWHERE_IN_SWEEP, locked
-from torch_qpmpc.plots import summary_figure
-from torch_qpmpc.replay import ACTIVE_SET, make_replay
-from torch_qpmpc.snapshot import (
+from torch_qpmpc.experiment.checkpoint import CHECKPOINT, drop_previous, save_checkpoint
+from torch_qpmpc.experiment.collection import batches, make_collector, num_columns
+from torch_qpmpc.experiment.config import check_config
+from torch_qpmpc.experiment.interrupt import Interrupt
+from torch_qpmpc.experiment.lock import ELSEWHERE, ELSEWHERE_IN_SWEEP, locked
+from torch_qpmpc.experiment.plots import summary_figure
+from torch_qpmpc.experiment.run_folder import RunFolder, unwritable
+from torch_qpmpc.experiment.run_state import (
     Tally,
     check_fresh,
     check_own_folder,
@@ -61,9 +61,9 @@ from torch_qpmpc.snapshot import (
     resumed,
     snapshot,
 )
-from torch_qpmpc.sweeps import finished_run, stopped_run
-from torch_qpmpc.tasks import make_mpc, make_physics, make_true_mpc, true_model
-from torch_qpmpc.tracking import RunFolder, unwritable
+from torch_qpmpc.experiment.sweeps import finished_run, stopped_run
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics, make_true_mpc, true_model
+from torch_qpmpc.learning.replay import ACTIVE_SET, make_replay
 
 
 def train(

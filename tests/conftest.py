@@ -8,7 +8,7 @@ import torch
 
 import train
 from tests.runs import SMALL, make_config
-from torch_qpmpc.solvers import BACKENDS
+from torch_qpmpc.qp.solvers import BACKENDS
 
 # Test workers side by side are the parallelism; threads of each would only wait for one another.
 torch.set_num_threads(1)

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc import QPMPC, QuadraticProgram
-from torch_qpmpc.condense import Reduced, condensed_for
-from torch_qpmpc.programs import FlatPrograms, SoftQPs
-from torch_qpmpc.solvers import Answer
+from torch_qpmpc.qp.pipeline.batch import FlatPrograms, SoftQPs
+from torch_qpmpc.qp.pipeline.condensing import Reduced, condensed_for
+from torch_qpmpc.qp.solvers import Answer
 
 #: What a row does at the solution: strictly inside, at a bound, or beyond one (then it is soft).
 SOFT_ROWS = ("inside", "at_lower", "at_upper", "below", "above", "equality", "no_upper", "free")

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from torch_qpmpc import QPMPC
 from torch_qpmpc.envs import LinearSystem
-from torch_qpmpc.tasks import make_physics, make_true_mpc
+from torch_qpmpc.experiment.tasks import make_physics, make_true_mpc
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: Everything shrinks but the point mass itself.
@@ -69,6 +69,6 @@ def skip_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     def blank(*_: object) -> Figure:
         return Figure(figsize=(1, 1))
 
-    for owner in ("train", "torch_qpmpc.experiment"):
+    for owner in ("train", "torch_qpmpc.experiment.algorithms"):
         for name in ("closed_loop_figure", "constraint_figure", "summary_figure"):
             monkeypatch.setattr(f"{owner}.{name}", blank, raising=False)

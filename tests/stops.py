@@ -15,9 +15,9 @@ from omegaconf import DictConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train
-from torch_qpmpc.snapshot import resumed
-from torch_qpmpc.solvers.chain import SolveLog
-from torch_qpmpc.tracking import read_metrics
+from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.experiment.run_state import resumed
+from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 
 def stop(

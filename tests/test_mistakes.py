@@ -16,7 +16,7 @@ from tests.mistakes import learning, plants, programs, reading
 from tests.mistakes.objects import A2, B1, M, mpc, op
 from tests.runs import make_config
 from torch_qpmpc.envs import PointMass, PointMassEnv
-from torch_qpmpc.replay import make_replay
+from torch_qpmpc.learning.replay import make_replay
 
 TABLE = programs.MISTAKES | learning.MISTAKES | reading.MISTAKES | plants.MISTAKES
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from tests.benchmarks.peers import PEERS, Values
 from tests.benchmarks.problems import GAMMA, PAPER, Transitions, make_mpc, move, transitions
 from torch_qpmpc import QPMPC, QuadraticProgram
-from torch_qpmpc.solvers import BACKENDS
+from torch_qpmpc.qp.solvers import BACKENDS
 
 BATCHES = (1, 32, 256, 1024)
 REFERENCE = next(iter(PEERS))

@@ -24,9 +24,9 @@ from tests.benchmarks.table import README
 from tests.runs import make_config
 from torch_qpmpc import GaussNewton
 from torch_qpmpc.envs import GrosZanonLTI
-from torch_qpmpc.experiment import make_optimizer, make_schedule
-from torch_qpmpc.markdown import replaced, table
-from torch_qpmpc.tasks import make_mpc
+from torch_qpmpc.experiment.algorithms import make_optimizer, make_schedule
+from torch_qpmpc.experiment.tasks import make_mpc
+from torch_qpmpc.study.markdown import replaced, table
 
 SEEDS, STEPS, LAST = (69, 1, 2, 3), 5000, 500
 #: Untimed steps of each contender before: what is compiled at its first use is no step's time.

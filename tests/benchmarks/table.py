@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from torch_qpmpc.markdown import replaced, table
+from torch_qpmpc.study.markdown import replaced, table
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"

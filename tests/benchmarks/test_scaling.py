@@ -18,8 +18,8 @@ from tests.benchmarks.full_space import FullSpace
 from tests.benchmarks.peers import piqp_solver
 from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
 from tests.benchmarks.reference import WRONG, reference_values, relative_error
-from torch_qpmpc.condense import condense
-from torch_qpmpc.solvers import BACKENDS
+from torch_qpmpc.qp.pipeline.condensing import condense
+from torch_qpmpc.qp.solvers import BACKENDS
 
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
 

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from tests.benchmarks.table import README, replaced, table
 from tests.campaign.families import FAMILIES, Draw
 from tests.campaign.tally import SLOW, Tally
-from torch_qpmpc.solvers import BACKENDS
+from torch_qpmpc.qp.solvers import BACKENDS
 
 #: QPs a batch; few of those families whose QPs take every solver's time, so that a batch does not
 #: take as long as no QP may.

@@ -16,7 +16,7 @@ from torch import Tensor
 from tests.campaign.trained import trained
 from tests.problems import BRINK, HARD_ROWS, SOFT_ROWS, WEAK, KnownQP, known_qp, times
 from torch_qpmpc import QuadraticProgram, Status
-from torch_qpmpc.banded import banded_matrix
+from torch_qpmpc.mpc.banded import banded_matrix
 
 #: Of a value, relative to the terms of the Lagrangian (see `tests.campaign.outcomes`).
 ACCURACY, FLOAT32 = 1e-5, 1e-3

@@ -14,7 +14,7 @@ import torch
 from tqdm import tqdm
 
 from tests.problems import random_mpc, random_states
-from torch_qpmpc.solvers import BACKENDS
+from torch_qpmpc.qp.solvers import BACKENDS
 
 BATCH, GROWTH = 256, 0.05
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from tests.campaign.families import Case
 from tests.campaign.outcomes import finite_gradients, judge
 from torch_qpmpc import QPSolution, QuadraticProgram, Status, solve_qp
-from torch_qpmpc.batching import broadcast
-from torch_qpmpc.qp import EVENT_SHAPES, UNKNOWN
+from torch_qpmpc.qp.batching import broadcast
+from torch_qpmpc.qp.program import EVENT_SHAPES, UNKNOWN
 
 #: Seconds of one core that no QP may take.
 SLOW = 0.5

@@ -9,7 +9,7 @@ from tensordict.nn import AddStateIndependentNormalScale
 from torch import nn
 
 from torch_qpmpc import QPMPC, QPActorValueOperator
-from torch_qpmpc.arguments import CONSTRAINTS, COST
+from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
 
 
 class Theta(QPMPC):

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from torch_qpmpc.envs import PointMass, PointMassEnv, PointMassGymEnv
+from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.evaluation import closed_loop
 
 # The state after three steps without an action, from seed 0, by TorchRL's environment, Gymnasium's,
 # and the evaluation: computed once, since another stream would make old runs incomparable.

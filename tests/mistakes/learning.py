@@ -17,7 +17,7 @@ import torch_qpmpc as qm
 from tests.mistakes.objects import A2, B1, Aa, G, S, batch_with, batch_without, free, gn, mpc, op
 from tests.problems import random_mpc
 from tests.transitions import make_batch, make_loss
-from torch_qpmpc.replay import make_replay, windows_to_tau
+from torch_qpmpc.learning.replay import make_replay, windows_to_tau
 
 
 def released_step() -> None:

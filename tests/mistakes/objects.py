@@ -11,9 +11,9 @@ from tensordict import TensorDict
 import torch_qpmpc as qm
 from tests.problems import known_qp, random_mpc
 from tests.transitions import make_batch, make_operator
-from torch_qpmpc.banded import banded_matrix
-from torch_qpmpc.canonical import prediction_form
+from torch_qpmpc.analysis.prediction_form import prediction_form
 from torch_qpmpc.envs import PointMass
+from torch_qpmpc.mpc.banded import banded_matrix
 
 A2 = torch.tensor([[1.0, 0.1], [0, 0.9]]).double()
 B1 = torch.tensor([[0.0], [1.0]]).double()

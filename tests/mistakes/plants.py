@@ -23,9 +23,9 @@ from torch_qpmpc.envs import (
     PointMassEnv,
     PointMassGymEnv,
 )
-from torch_qpmpc.evaluation import closed_gap, closed_loop, gymnasium_loop
-from torch_qpmpc.snapshot import resumed
-from torch_qpmpc.statistics import bootstrap_interval, interquartile_mean
+from torch_qpmpc.envs.closed_loop import closed_gap, closed_loop, gymnasium_loop
+from torch_qpmpc.experiment.run_state import resumed
+from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
 
 MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "closed_loop: plant": (

@@ -116,7 +116,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "solve_qp: solver class": (
         lambda: qm.solve_qp(qp, fixed, solver=qm.QPMPC),
-        "solver: got <class 'torch_qpmpc.mpc.QPMPC'>, expected a name.",
+        "solver: got <class 'torch_qpmpc.mpc.module.QPMPC'>, expected a name.",
     ),
     "QPMPC: n_x bool": (
         M(n_x=True),

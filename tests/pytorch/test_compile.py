@@ -14,7 +14,7 @@ from torch.testing import assert_close
 
 from tests.problems import random_mpc, random_states
 from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
-from torch_qpmpc.qp import EVENT_SHAPES
+from torch_qpmpc.qp.program import EVENT_SHAPES
 
 Function = Callable[[Tensor, Tensor], Tensor]
 

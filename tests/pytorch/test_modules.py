@@ -16,7 +16,7 @@ from torch.testing import assert_close
 
 from tests.problems import MIXED, random_mpc, random_states, step
 from torch_qpmpc import QPMPC, QPError
-from torch_qpmpc.solvers import BACKENDS
+from torch_qpmpc.qp.solvers import BACKENDS
 
 KINDS = {
     "diagonal": {},

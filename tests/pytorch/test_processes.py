@@ -19,7 +19,7 @@ from torch.testing import assert_close
 
 from tests.problems import random_mpc, random_states
 from torch_qpmpc import QPMPC
-from torch_qpmpc.solvers import BACKENDS
+from torch_qpmpc.qp.solvers import BACKENDS
 
 ROOT = Path(__file__).parents[2]
 #: A child that hangs is ended after this many seconds.

@@ -24,7 +24,7 @@ from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, QPError, QuadraticProgram, solve_qp
-from torch_qpmpc.qp import EVENT_SHAPES
+from torch_qpmpc.qp.program import EVENT_SHAPES
 
 OPERANDS = (*EVENT_SHAPES, "fixed")
 PARTS = ("value", "z", "sigma", "chi", "upsilon", "eta", "xi")

@@ -1,0 +1,155 @@
+"""The prediction form is that of stepping the model, in any gauge; the canonical matrix is C_0."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.problems import normal, random_mpc, random_states, times
+from torch_qpmpc import QPError
+from torch_qpmpc.analysis.prediction_form import canonical_matrix, model_form, prediction_form
+from torch_qpmpc.analysis.structure import stage_models
+from torch_qpmpc.mpc.banded import banded_matrix
+
+N_X, N_U, N = 3, 2, 5
+OFFSET = normal(N, N_X, seed=7)
+
+
+def scheme(stages: tuple[int, ...] = (), seed: int = 0) -> tuple[Tensor, Tensor]:
+    """A and B of one model, or of one per stage."""
+    return 0.6 * normal(*stages, N_X, N_X, seed=seed), normal(*stages, N_X, N_U, seed=seed + 1)
+
+
+def constraints(kind: str, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """C and b of a scheme, or of none."""
+    A, B = scheme((N,) if kind == "varying" else (), seed)
+    C = banded_matrix(A, B, N)
+    if kind == "free":
+        C = C + 0.1 * normal(*C.shape, seed=seed + 2)
+    return C, -OFFSET.flatten()
+
+
+def gauge(seed: int) -> Tensor:
+    return normal(N * N_X, N * N_X, seed=100 + seed)
+
+
+@pytest.mark.parametrize("stages", [(), (N,)], ids=["tied", "varying"])
+def test_predictions_are_those_of_stepping_the_model(stages):
+    A, B = scheme(stages)
+    form = model_form(A, B, N, OFFSET)
+    assert (form.n_x, form.n_u, form.horizon) == (N_X, N_U, N)
+    x_0, U = normal(4, N_X), normal(4, N, N_U, seed=1)
+    predicted = form.predict(x_0, U)
+    A, B = A.expand(N, N_X, N_X), B.expand(N, N_X, N_U)
+    x = x_0
+    for k in range(N):
+        x = x @ A[k].mT + U[:, k] @ B[k].mT + OFFSET[k]
+        torch.testing.assert_close(predicted[:, k], x, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["tied", "varying", "free"])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_form_does_not_depend_on_the_gauge(kind, seed):
+    C, b = constraints(kind, seed)
+    T = gauge(seed)
+    form, other = prediction_form(C, N_X, N_U, b), prediction_form(T @ C, N_X, N_U, T @ b)
+    for part in ("Phi", "Gamma", "phi"):
+        expected = getattr(form, part)
+        assert (getattr(other, part) - expected).norm() < 1e-10 * expected.norm()
+
+
+def test_blocks_and_maps_are_the_form():
+    form = prediction_form(*_of("free"))
+    x_0, U = normal(N_X), normal(N, N_U, seed=1)
+    predicted = form.predict(x_0, U)
+    by_blocks = torch.einsum("kjxu,ju->kx", form.blocks, U)
+    by_blocks += times(form.Phi, x_0).view(N, N_X) + form.phi.view(N, N_X)
+    torch.testing.assert_close(by_blocks, predicted)
+    by_maps = times(form.maps, torch.cat((x_0, U.flatten(), torch.ones(1).double())))
+    torch.testing.assert_close(by_maps[0], x_0)
+    torch.testing.assert_close(by_maps[1:], predicted)
+
+
+def test_a_batch_is_its_elements():
+    both = [constraints("free", seed) for seed in (0, 1)]
+    C, b = (torch.stack(parts) for parts in zip(*both, strict=True))
+    form = prediction_form(C, N_X, N_U, b)
+    for i, (C_i, b_i) in enumerate(both):
+        alone = prediction_form(C_i, N_X, N_U, b_i)
+        for part in ("Phi", "Gamma", "phi", "condition", "maps", "blocks"):
+            torch.testing.assert_close(getattr(form, part)[i], getattr(alone, part))
+
+
+def test_solutions_of_the_qp_are_predicted():
+    mpc = random_mpc(learn=("H", "c", "C", "b"))
+    states, actions = mpc.predicted(mpc.solve(random_states(8)).z.detach())
+    form = prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
+    predicted = form.predict(states[:, 0], actions)
+    torch.testing.assert_close(predicted, states[:, 1:], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["tied", "varying"])
+def test_the_canonical_matrix_of_a_scheme_is_banded_in_any_gauge(kind):
+    C_0, b_0 = constraints(kind)
+    T = gauge(0)
+    form = prediction_form(T @ C_0, N_X, N_U, T @ b_0)
+    C, b = canonical_matrix(form, stage_models(form).A)
+    torch.testing.assert_close(C, C_0, rtol=0, atol=1e-9)
+    torch.testing.assert_close(b, b_0, rtol=0, atol=1e-9)
+
+
+def test_the_canonical_matrix_is_the_same_constraints():
+    C, b = constraints("free")
+    form = prediction_form(C, N_X, N_U, b)
+    canonical = canonical_matrix(form, stage_models(form).A)
+    again = prediction_form(canonical[0], N_X, N_U, canonical[1])
+    for part in ("Phi", "Gamma", "phi"):
+        torch.testing.assert_close(getattr(again, part), getattr(form, part))
+    assert not torch.allclose(canonical[0], C)
+
+
+def _of(kind: str) -> tuple[Tensor, int, int, Tensor]:
+    C, b = constraints(kind)
+    return C, N_X, N_U, b
+
+
+def test_a_small_C_is_as_good_as_any():
+    C, n_x, n_u, b = _of("free")
+    scale = torch.logspace(-12, 3, len(C)).double().unsqueeze(-1)
+    form = prediction_form(C, n_x, n_u, b)
+    scaled = prediction_form(scale * C, n_x, n_u, scale[:, 0] * b)
+    torch.testing.assert_close(scaled.Gamma, form.Gamma)
+    torch.testing.assert_close(scaled.condition, form.condition)
+
+
+def test_a_C_that_does_not_determine_the_states_says_so():
+    C, n_x, n_u, _ = _of("tied")
+    dependent = C.clone()
+    dependent[4] = dependent[2] - dependent[7]
+    with pytest.raises(QPError, match=r"C: got state columns of rank 14 of 15 \(condition number"):
+        prediction_form(dependent, n_x, n_u)
+    unseen = C.clone()
+    unseen[:, [N_X + N_U, -1]] = 0  # entries of x_1 and of x_N
+    with pytest.raises(QPError, match=r"of rank 13 of 15.*have no prediction form"):
+        prediction_form(unseen, n_x, n_u)
+    with pytest.raises(QPError, match="of rank 0 of 15"):
+        prediction_form(torch.zeros_like(C), n_x, n_u)
+    with pytest.raises(QPError, match="of rank 14 of 15"):
+        prediction_form(torch.stack((C, dependent)), n_x, n_u)
+
+
+@pytest.mark.parametrize(
+    ("C", "b", "message"),
+    [
+        (torch.zeros(15, 27), None, r"C: got shape \(15, 27\)"),
+        (torch.zeros(14, 28), None, r"C: got shape \(14, 28\)"),
+        (torch.zeros(0, 3), None, r"C: got shape \(0, 3\)"),
+        (torch.zeros(15, 28), torch.zeros(3), r"b: got shape \(3,\)"),
+        (torch.full((15, 28), torch.nan), None, "C, b: got NaN or inf"),
+        (torch.eye(15, 28), torch.full((15,), torch.inf), "C, b: got NaN or inf"),
+    ],
+)
+def test_bad_input(C, b, message):
+    with pytest.raises(QPError, match=message):
+        prediction_form(C, N_X, N_U, b)

@@ -1,0 +1,115 @@
+"""The report of a known scheme has its numbers; one that cannot be read says so."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from tests.problems import normal
+from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc.analysis.report import read, structure_metrics
+
+A = torch.tensor([[1.0, 0.1], [0.0, 0.9]], dtype=torch.float64)
+B = torch.tensor([[0.0], [0.1]], dtype=torch.float64)
+WRONG_A, WRONG_B = A + torch.tensor([[0.0, 0.03], [-0.04, 0.0]]), 1.5 * B
+
+
+def scheme() -> QPMPC:
+    return QPMPC.linear_mpc(WRONG_A, WRONG_B, 6, structure="free", solver="daqp")
+
+
+def test_a_scheme_is_read_in_any_gauge():
+    mpc = scheme()
+    before = read(mpc, (A, B))
+    T = normal(len(mpc.C), len(mpc.C))
+    with torch.no_grad():
+        mpc.C.copy_(T @ mpc.C)
+        mpc.b.copy_(T @ mpc.b)
+    found = read(mpc, (A, B))
+    torch.testing.assert_close(found.nearest.A, WRONG_A, rtol=0, atol=1e-9)
+    torch.testing.assert_close(found.nearest.B, WRONG_B, rtol=0, atol=1e-9)
+    expected = {
+        "causality": 0.0,
+        "toeplitz": 0.0,
+        "non_markov": 0.0,
+        "order": 1.0,
+        "distance_to_mpc": 0.0,
+        "gain_to_lqr": 0.0,
+        "model_error": 0.005**0.5,
+        "model_error_max": 0.05,
+        "first_stage_error": 0.005**0.5,
+    }
+    scalars = found.scalars()
+    assert {name: scalars[name] for name in expected} == pytest.approx(expected, abs=1e-6)
+    for name, K, plant in (
+        ("radius", found.K, (A, B)),
+        ("radius_predicted", found.K, (WRONG_A, WRONG_B)),
+    ):
+        eigenvalues = torch.linalg.eigvals(plant[0] - plant[1] @ K)
+        assert scalars[name] == pytest.approx(eigenvalues.abs().max().item(), abs=1e-6)
+    assert before.scalars() == pytest.approx(scalars | {"condition": before.condition}, abs=1e-6)
+
+
+def test_what_is_not_known_is_nan():
+    scalars = read(scheme()).scalars()
+    unknown = {"radius", "model_error", "model_error_max", "first_stage_error"}
+    assert {name for name, value in scalars.items() if math.isnan(value)} == unknown
+
+
+def test_a_report_without_a_regulator():
+    """The first state is not weighed and not stabilised: the Riccati equation has no solution."""
+    mpc = QPMPC.from_model(
+        [[1.2, 0.0], [0.0, 0.5]], [[0.0], [1.0]], 3, stage_weight=[0.0, 1.0, 1.0], solver="daqp"
+    )
+    found = read(mpc)
+    assert found.K_lqr is None
+    assert math.isnan(found.gain_to_lqr)
+
+
+def test_the_gain_is_taken_where_asked():
+    mpc = QPMPC.from_model(
+        A, B, 4, action_bounds=([-0.5], [0.5]), stage_weight=[9.0, 1.0, 0.01], solver="daqp"
+    )
+    assert (read(mpc, at=torch.tensor([1.5, 1.0])).K == 0).all()
+    assert (read(mpc).K != 0).any()
+
+
+def test_printed_as_a_table():
+    found = read(scheme(), (A, B))
+    lines = str(found).splitlines()
+    table = dict(line.split() for line in lines[: len(found.scalars())])
+    assert {name: float(text) for name, text in table.items()} == pytest.approx(
+        found.scalars(), rel=1e-3, abs=1e-12
+    )
+    assert lines[len(table)].split() == ["A", "1.0000", "0.1300"]
+    assert len(lines) == len(table) + 2 + 2 + 1
+
+
+def test_metrics_are_those_of_the_report():
+    mpc = scheme()
+    with torch.no_grad():
+        mpc.C += 0.05 * normal(*mpc.C.shape)
+    found, metrics = read(mpc, (A, B)), structure_metrics(mpc, (A, B))
+    expected = {
+        "causality_defect": found.causality,
+        "toeplitz_defect": found.toeplitz,
+        "distance_to_mpc": found.distance_to_mpc,
+        "model_error": found.model_error,
+    }
+    assert metrics == pytest.approx(expected)
+    del expected["model_error"]
+    assert structure_metrics(mpc) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("value", [0.0, torch.nan])
+def test_metrics_of_a_C_that_cannot_be_read_are_nan(value):
+    mpc = scheme()
+    with torch.no_grad():
+        mpc.C[:, -1] = value
+    metrics = structure_metrics(mpc, (A, B))
+    assert len(metrics) == 4
+    assert all(math.isnan(number) for number in metrics.values())
+    with pytest.raises(QPError, match=r"^C"):
+        read(mpc)

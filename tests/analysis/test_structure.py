@@ -1,0 +1,251 @@
+"""Defects against loops over blocks, and models, distances and orders of known schemes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import least_squares
+from torch import Tensor
+
+from tests.problems import normal
+from torch_qpmpc.analysis.prediction_form import (
+    PredictionForm,
+    canonical_matrix,
+    model_form,
+    prediction_form,
+)
+from torch_qpmpc.analysis.structure import (
+    causality_defect,
+    distance_by_band,
+    gamma_energies,
+    markov_order,
+    memory_energies,
+    nearest_model,
+    stage_models,
+    toeplitz_defect,
+)
+from torch_qpmpc.mpc.banded import banded_matrix
+
+N_X, N_U, N = 3, 2, 4
+generator = torch.Generator().manual_seed(0)
+A = torch.randn(N_X, N_X, generator=generator, dtype=torch.float64)
+B = torch.randn(N_X, N_U, generator=generator, dtype=torch.float64)
+C_0 = banded_matrix(A, B, N)
+C = C_0 + torch.randn(C_0.shape, generator=generator, dtype=torch.float64)
+
+
+def test_distances_are_the_blocks_sums():
+    expected = {"on": 0.0, "above": 0.0, "below": 0.0}
+    for k in range(N):
+        rows = slice(k * N_X, (k + 1) * N_X)
+        first, last = k * (N_X + N_U), (k + 1) * (N_X + N_U) + N_X
+        deviation = (C - C_0)[rows].abs()
+        expected["below"] += deviation[:, :first].sum().item()
+        expected["on"] += deviation[:, first:last].sum().item()
+        expected["above"] += deviation[:, last:].sum().item()
+    found = distance_by_band(C, C_0, N_X, N_U)
+    assert found.keys() == expected.keys()
+    for band, value in expected.items():
+        assert isinstance(found[band], float)
+        assert abs(found[band] - value) < 1e-12 * value
+    assert abs(sum(found.values()) - (C - C_0).abs().sum().item()) < 1e-9
+
+
+def test_the_start_has_no_distance():
+    parameter = torch.nn.Parameter(C_0.clone())
+    assert distance_by_band(parameter, C_0, N_X, N_U) == {"on": 0, "above": 0, "below": 0}
+
+
+def test_one_entry_is_in_one_band():
+    for row, column, band in ((0, 0, "on"), (0, N_X + N_U + N_X, "above"), (N_X, 0, "below")):
+        other = C_0.clone()
+        other[row, column] += 2.0
+        nothing = dict.fromkeys(("on", "above", "below"), 0.0)
+        assert distance_by_band(other, C_0, N_X, N_U) == nothing | {band: 2.0}
+
+
+def test_distances_depend_on_the_gauge():
+    """T C is the same QP, and yet far away: why the docstring warns."""
+    T = torch.linalg.qr(torch.randn(N * N_X, N * N_X, generator=generator).double()).Q
+    assert distance_by_band(T @ C_0, C_0, N_X, N_U)["above"] > 1
+
+
+def form_of(C: Tensor, b: Tensor | None = None) -> PredictionForm:
+    return prediction_form(C, N_X, N_U, b)
+
+
+def free_form(seed: int = 0) -> PredictionForm:
+    """Of constraints that are no scheme's: every block of Gamma is full."""
+    return form_of(banded_matrix(0.5 * A, B, N) + 0.1 * normal(*C_0.shape, seed=seed))
+
+
+def scheme_with(*past: Tensor) -> Tensor:
+    """C of x_{k+1} = A x_k + B u_k, and of what (x_j, u_j) for j = k - 1, k - 2, .. add to it."""
+    C, n = banded_matrix(0.3 * A, B, N), N_X + N_U
+    for back, block in enumerate(past, start=1):
+        for k in range(back, N):
+            first = (k - back) * n
+            C[k * N_X : (k + 1) * N_X, first : first + n] = block
+    return C
+
+
+def test_defects_are_sums_over_blocks():
+    form = free_form()
+    total = above = departure = 0.0
+    by_lag = {lag: [] for lag in range(1 - N, N)}
+    for k in range(N):
+        for j in range(N):
+            block = form.Gamma[k * N_X : (k + 1) * N_X, j * N_U : (j + 1) * N_U]
+            by_lag[k - j].append(block)
+            total += block.square().sum().item()
+            above += block.square().sum().item() if j > k else 0.0
+    for blocks in by_lag.values():
+        mean = sum(blocks) / len(blocks)
+        departure += sum((block - mean).square().sum().item() for block in blocks)
+    assert causality_defect(form).item() == pytest.approx((above / total) ** 0.5, rel=1e-12)
+    assert toeplitz_defect(form).item() == pytest.approx((departure / total) ** 0.5, rel=1e-12)
+    energies = [sum(b.square().sum().item() for b in blocks) for blocks in by_lag.values()]
+    assert gamma_energies(form).tolist() == pytest.approx(energies, rel=1e-12)
+    assert above > 0.01 * total
+
+
+def test_defects_of_a_batch():
+    forms = [free_form(seed) for seed in (0, 1)]
+    C = torch.stack([canonical_matrix(form, stage_models(form).A)[0] for form in forms])
+    for defect in (causality_defect, toeplitz_defect, gamma_energies):
+        torch.testing.assert_close(defect(form_of(C)), torch.stack([defect(f) for f in forms]))
+
+
+def test_a_scheme_in_any_gauge_is_a_scheme():
+    T, offset = normal(N * N_X, N * N_X, seed=1), normal(N_X, seed=2)
+    form = form_of(T @ C_0, -T @ offset.repeat(N))
+    assert causality_defect(form) < 1e-10
+    assert toeplitz_defect(form) < 1e-10
+    found = nearest_model(form)
+    assert found.residual < 1e-9
+    for part, expected in (("A", A), ("B", B), ("offset", offset)):
+        torch.testing.assert_close(getattr(found, part), expected, rtol=0, atol=1e-9)
+    stages = stage_models(form)
+    assert stages.residual.shape == (N,)
+    assert stages.residual.max() < 1e-9
+    torch.testing.assert_close(stages.A, A.expand(N, -1, -1), rtol=0, atol=1e-9)
+    assert markov_order(memory_energies(form)) == 1
+
+
+def test_a_time_varying_scheme_is_markovian_but_no_tied_one():
+    A_k, B_k = A + 0.1 * normal(N, N_X, N_X, seed=3), B + 0.1 * normal(N, N_X, N_U, seed=4)
+    c_k = normal(N, N_X, seed=5)
+    form = model_form(A_k, B_k, N, c_k)
+    found = stage_models(form)
+    for part, expected in (("A", A_k), ("B", B_k), ("offset", c_k)):
+        torch.testing.assert_close(getattr(found, part), expected, rtol=0, atol=1e-9)
+    assert found.residual.max() < 1e-9
+    assert markov_order(memory_energies(form)) == 1
+    assert causality_defect(form) < 1e-12
+    assert toeplitz_defect(form) > 0.01
+    assert nearest_model(form).residual > 0.01
+
+
+def test_the_nearest_of_schemes_that_differ_in_B_alone_has_its_mean():
+    gains = torch.tensor([0.9, 1.3, 1.0, 0.8], dtype=torch.float64)
+    form = model_form(torch.zeros(1, 1).double(), gains.view(N, 1, 1), N)
+    found = nearest_model(form)
+    assert found.B.item() == pytest.approx(1.0, abs=1e-9)
+    assert found.A.abs().item() < 1e-9
+    expected = ((gains - 1).norm() / gains.norm()).item()
+    assert found.residual.item() == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_other_search_finds_a_nearer_model(seed):
+    form = free_form(seed)
+    scale = form.maps[1:, :, :-1].norm()
+
+    def distance(flat):
+        A, B, offset = torch.as_tensor(flat).view(N_X, -1).split((N_X, N_U, 1), -1)
+        return ((model_form(A, B, N, offset[:, 0]).maps - form.maps) / scale).flatten().numpy()
+
+    found = nearest_model(form)
+    flat = torch.cat((found.A, found.B, found.offset.unsqueeze(-1)), -1).flatten()
+    assert np.linalg.norm(distance(flat)) == pytest.approx(found.residual.item(), rel=1e-9)
+    for start in (flat, flat + 0.1 * normal(len(flat), seed=seed)):
+        other = least_squares(distance, start.numpy())
+        assert np.sqrt(2 * other.cost) > found.residual.item() - 1e-7
+    assert 0.01 < found.residual < 1
+
+
+def test_the_distance_grows_with_the_perturbation():
+    noise = normal(*C_0.shape, seed=6)
+    forms = [form_of(C_0 + size * noise) for size in (1e-6, 1e-4, 1e-2)]
+    distances = [nearest_model(form).residual.item() for form in forms]
+    assert 1e-8 < distances[0] < 1e-4
+    assert distances[1] / distances[0] == pytest.approx(100, rel=0.01)
+    assert distances[2] > 50 * distances[1]
+
+
+@pytest.mark.parametrize(("stages", "most"), [((1.0, 1e4), 0.01), ((1.0, 1e6, 1e-6) * 20, 1.0)])
+def test_a_one_step_fit_that_explodes_is_no_start(stages, most):
+    """Over the horizon it predicts worse than nothing does, or overflows."""
+    A_k = torch.tensor(stages, dtype=torch.float64).view(-1, 1, 1)
+    found = nearest_model(model_form(A_k, torch.zeros_like(A_k), len(stages)))
+    assert found.residual <= most
+
+
+def test_directions_that_no_prediction_reaches_are_not_made_up():
+    """x_1 has forgotten x_0's second entry, which no action moves."""
+    nilpotent = torch.tensor([[0.5, 1.0], [0.0, 0.0]], dtype=torch.float64)
+    B = torch.tensor([[1.0], [0.0]], dtype=torch.float64)
+    form = model_form(nilpotent, B, N)
+    found = stage_models(form)
+    torch.testing.assert_close(found.A[0], nilpotent)
+    expected = torch.tensor([[0.5, 0.0], [0.0, 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(found.A[1:], expected.expand(N - 1, 2, 2))
+    assert nearest_model(form).residual < 1e-12
+    torch.testing.assert_close(nearest_model(form).A, nilpotent)
+
+
+PAIR = 0.3 * torch.randn(N_X, N_X + N_U, generator=generator, dtype=torch.float64)
+ACTION = PAIR * (torch.arange(N_X + N_U) >= N_X)
+
+
+@pytest.mark.parametrize(
+    ("past", "order"),
+    [
+        ((), 1),
+        ((PAIR,), 2),
+        ((ACTION,), 2),
+        ((0 * PAIR, ACTION), 3),
+        ((0 * PAIR, 0 * PAIR, ACTION), 4),
+    ],
+    ids=["none", "pair", "action", "two back", "three back"],
+)
+def test_the_order_is_how_far_back_the_constraints_look(past, order):
+    """With two actions and three states, all that the last pairs do not tell is new."""
+    T = normal(N * N_X, N * N_X, seed=8)
+    form = form_of(T @ scheme_with(*past))
+    energies = memory_energies(form)
+    assert energies.shape == (N + 1,)
+    assert energies.sum().item() == pytest.approx(1, abs=1e-12)
+    assert markov_order(energies) == order
+    assert (energies[order:] < 1e-12).all()
+    assert (stage_models(form).residual.max() > 1e-3) == (order > 1)
+    assert causality_defect(form) < 1e-10
+
+
+def test_later_actions_are_no_memory():
+    C = C_0.clone()
+    C[0, 2 * N_X + N_U : 2 * (N_X + N_U)] += 1.0  # u_1 enters x_1
+    energies = memory_energies(form_of(C))
+    assert energies[-1] > 1e-3
+    assert markov_order(energies) == math.inf
+    assert markov_order(energies, tolerance=1.0) == 1
+
+
+def test_the_first_entry_of_memory_is_what_the_stage_models_explain():
+    form = free_form()
+    size = form.maps[1:, :, :-1].square().sum((-1, -2))
+    left = (stage_models(form).residual.square() * size).sum() / size.sum()
+    assert memory_energies(form)[1:].sum().item() == pytest.approx(left.item(), rel=1e-9)

@@ -1,0 +1,165 @@
+"""Closed loops against a second, plain implementation of the same protocol."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.envs.registration import EnvSpec
+
+from torch_qpmpc.envs import GrosZanonLTI, GymnasiumPlant, PointMass
+from torch_qpmpc.envs.closed_loop import closed_gap, closed_loop, gymnasium_loop
+from torch_qpmpc.errors import QPError
+
+K = torch.tensor([[1.5, 0.0, 1.0, 0.0], [0.0, 1.5, 0.0, 1.0]], dtype=torch.float64)
+
+
+def in_numpy(kind: str, std: float, steps: int = 50) -> tuple[np.ndarray, np.ndarray]:
+    """States and costs of the policy -K s, written out without the package."""
+    rng = np.random.default_rng(123)
+    s = np.hstack([rng.uniform(-1.5, 1.5, (32, 2)), rng.uniform(-0.5, 0.5, (32, 2))])
+    A = np.eye(4) + 0.1 * np.eye(4, k=2) - 0.1 * np.diag([0, 0, 1, 1])
+    B, bound = 0.1 * np.eye(4, 2, k=-2), np.array([2, 2, 10, 10])
+    nu, states, costs = np.zeros((32, 4)), [s], []
+    for _ in range(steps):
+        a = np.clip(-s @ K.numpy().T, -1, 1)
+        costs.append((s**2) @ [3, 3, 0.25, 0.25])
+        step = std * rng.normal(size=(32, 4))
+        nu = nu + step if kind == "brownian" else step
+        s = np.clip(s @ A.T + a @ B.T + nu, -bound, bound)
+        states.append(s)
+    return np.array(states), np.array(costs)
+
+
+@pytest.mark.parametrize(("kind", "std"), [("gaussian", 0.01), ("brownian", 0.002)])
+def test_closed_loop_follows_the_protocol(kind, std):
+    run = closed_loop(lambda s: -s @ K.T, PointMass(kind))
+    states, costs = in_numpy(kind, std)
+    np.testing.assert_allclose(run.states.numpy(), states, atol=1e-12)
+    np.testing.assert_allclose(run.costs.numpy(), costs, atol=1e-12)
+    assert run.states.shape == (51, 32, 4)
+    assert run.actions.shape == (50, 32, 2)
+    assert run.actions.abs().max() == 1, "as applied: clipped"
+    assert pytest.approx(costs.sum(0).mean()) == run.J
+    discounted = (0.9 ** np.arange(50)[:, None] * costs).sum(0).mean()
+    assert pytest.approx(discounted) == run.J_discounted
+
+
+def test_closed_loop_takes_any_linear_system():
+    run = closed_loop(lambda s: -4 * s[:, 1:], GrosZanonLTI(), steps=20, starts=3, seed=1)
+    rng, s = np.random.default_rng(1), np.tile([0, 0.15], (3, 1))
+    for k in range(20):
+        np.testing.assert_allclose(run.states[k], s, atol=1e-12)
+        a = np.clip(-4 * s[:, 1:], -1, 1)
+        violation = np.maximum([0, -1] - s, 0).sum(1) + np.maximum(s - 1, 0).sum(1)
+        cost = ((s**2).sum(1) + 0.5 * a[:, 0] ** 2 + 100 * violation) / 2
+        np.testing.assert_allclose(run.costs[k], cost, atol=1e-12)
+        s = s @ np.array([[0.9, 0], [0.35, 1.1]]) + a @ [[0.0813, 0.2]]
+        s[:, 0] += rng.uniform(-0.1, 0.0, size=3)
+    assert run.actions.shape == (20, 3, 1)
+
+
+def test_arguments_change_the_experiment():
+    run = closed_loop(lambda s: -s @ K.T, PointMass(), steps=3, starts=2, seed=1, gamma=0.0)
+    assert run.states.shape == (4, 2, 4)
+    assert run.J_discounted == pytest.approx(run.costs[0].mean().item())
+    other = closed_loop(lambda s: -s @ K.T, PointMass(), steps=3, starts=2, seed=2)
+    assert not torch.equal(run.states[0], other.states[0])
+
+
+def test_policy_gets_float64_and_leaves_no_graph():
+    seen = []
+    net = torch.nn.Linear(4, 2)
+
+    def policy(s):
+        seen.append((s.dtype, s.shape, torch.is_grad_enabled()))
+        return net(s.float())
+
+    run = closed_loop(policy, PointMass(), steps=2, starts=3)
+    assert seen == [(torch.float64, (3, 4), False)] * 2
+    assert run.actions.dtype == torch.float64
+    assert not run.costs.requires_grad
+
+
+@pytest.mark.parametrize("shape", [(32,), (2,), (1, 2), (32, 1)])
+def test_policy_of_another_shape_is_an_error(shape):
+    match = rf"policy\(s\): got shape \({shape[0]},.*\), expected shape \(32, 2\)"
+    with pytest.raises(QPError, match=match):
+        closed_loop(lambda s: torch.zeros(shape), PointMass())
+
+
+PENDULUM = GymnasiumPlant("Pendulum-v1")
+
+
+def swing(s):
+    return 4 * s[:, 2:]
+
+
+def test_gymnasium_loop_is_one_episode_of_each_start():
+    run = gymnasium_loop(swing, PENDULUM, steps=30, starts=3, seed=7, gamma=0.9)
+    assert run.states.shape == (31, 3, 3)
+    assert run.actions.shape == (30, 3, 1)
+    for i in range(3):
+        env = gymnasium.make("Pendulum-v1")
+        s, _ = env.reset(seed=7 + i)
+        for k in range(30):
+            np.testing.assert_allclose(run.states[k, i], s, rtol=1e-6)
+            a = np.clip(4 * s[2:], -2, 2)
+            np.testing.assert_allclose(run.actions[k, i], a, rtol=1e-6)
+            s, reward, *_ = env.step(a)
+            assert run.costs[k, i] == pytest.approx(-float(reward), rel=1e-6)
+        env.close()
+    assert run.actions.abs().max() == 2, "as applied: clipped"
+    assert (0.9 ** np.arange(30) @ run.costs.numpy()).mean() == pytest.approx(run.J_discounted)
+
+
+def test_the_same_seed_is_the_same_gymnasium_loop():
+    def costs(seed):
+        return gymnasium_loop(swing, PENDULUM, steps=5, starts=3, seed=seed).costs
+
+    assert torch.equal(costs(1), costs(1))
+    assert torch.equal(costs(1)[:, 1:], costs(2)[:, :2]), "start i is of the seed seed + i"
+    assert not torch.equal(costs(1), costs(4))
+
+
+class Ends(gymnasium.Env):
+    """Each step costs 1, and the episode ends when the observation, 0, 1, .., reaches 3."""
+
+    observation_space = gymnasium.spaces.Box(0.0, 10.0, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        self.k = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.k += 1
+        return np.full(1, self.k, np.float32), -1.0, self.k == 3, False, {}
+
+
+@pytest.mark.parametrize(("steps", "reached"), [(6, [0, 1, 2, 3, 3, 3, 3]), (2, [0, 1, 2])])
+def test_after_a_termination_nothing_costs_and_nothing_moves(monkeypatch, steps, reached):
+    monkeypatch.setitem(gymnasium.registry, "Ends-v0", EnvSpec("Ends-v0", lambda **_: Ends()))
+    run = gymnasium_loop(torch.zeros_like, GymnasiumPlant("Ends-v0"), steps=steps, starts=2)
+    assert run.states[..., 0].T.tolist() == [reached] * 2
+    assert min(steps, 3) == run.J
+    assert run.costs[3:].abs().sum() == 0
+
+
+@pytest.mark.parametrize("shape", [(32,), (1,), (1, 1), (32, 3)])
+def test_a_policy_of_another_shape_is_an_error_in_gymnasium_too(shape):
+    match = rf"policy\(s\): got shape \({shape[0]},.*\), expected shape \(32, 1\)"
+    with pytest.raises(QPError, match=match):
+        gymnasium_loop(lambda s: torch.zeros(shape), PENDULUM)
+
+
+def test_closed_gap():
+    assert closed_gap(100, 100, 50) == 0
+    assert closed_gap(100, 50, 50) == 1
+    assert closed_gap(100, 75, 50) == 0.5
+    assert closed_gap(100, 125, 50) == -0.5
+    assert all(map(math.isnan, (closed_gap(50, 40, 50), closed_gap(40, 40, 50))))
+    assert math.isnan(closed_gap(math.nan, 1, 0))

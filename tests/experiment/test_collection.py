@@ -1,0 +1,103 @@
+"""Batches of transitions under today's policy, whichever process they come from."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import DictConfig
+
+import train
+from tests.runs import SMALL, make_config, skip_figures
+from torch_qpmpc import QPActorValueOperator, QPError
+from torch_qpmpc.experiment.collection import batches, make_collector, num_columns
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+
+
+def collect(cfg: DictConfig, count: int) -> tuple[Any, Any]:
+    """``count`` batches one after the other, and the QP of the policy."""
+    physics = make_physics(cfg)
+    mpc = make_mpc(cfg, physics)
+    collector = make_collector(cfg, physics, QPActorValueOperator(mpc).get_policy_operator())
+    torch.manual_seed(0)
+    try:
+        found: list[Any] = [b.clone() for b in itertools.islice(batches(collector), count)]
+    finally:
+        collector.shutdown()
+    return torch.cat(found, dim=1), mpc
+
+
+def test_a_collector_follows_the_policy_with_exploration():
+    cfg = make_config(*SMALL, "num_envs=50", "steps_per_update=3", "seed=2")
+    data, mpc = collect(cfg, 6)
+    assert data.shape == (50, 18)
+    assert data["step_count"].max() == 11, "episodes of 12 steps"
+    best = mpc.policy(data["observation"]).detach()
+    noise = (data["action"] - best)[best.abs() < 0.1]
+    assert 0.25 < noise.std() < 0.35
+    assert torch.equal(data["observation"], collect(cfg, 6)[0]["observation"])
+    cfg.exploration_std = 0.0
+    quiet, _ = collect(cfg, 6)
+    assert torch.allclose(quiet["action"], mpc.policy(quiet["observation"]), atol=1e-6)
+    other, _ = collect(make_config(*SMALL, "num_envs=50", "steps_per_update=3", "seed=3"), 1)
+    assert not torch.equal(other["observation"][:, 0], quiet["observation"][:, 0])
+
+
+WORKERS = ("collector.workers=2", "num_envs=4", "steps_per_update=5", "exploration_std=0")
+
+
+@pytest.mark.parametrize("name", ["multi", pytest.param("ray", marks=pytest.mark.cluster)])
+def test_workers_share_the_environments_and_follow_theta(name):
+    if name == "ray":
+        pytest.importorskip("ray", reason="the extra ray is not installed")
+    cfg = make_config(*SMALL, f"collector={name}", *WORKERS)
+    physics = make_physics(cfg)
+    mpc = make_mpc(cfg, physics)
+    collector = make_collector(cfg, physics, QPActorValueOperator(mpc).get_policy_operator())
+    stream = batches(collector)
+    try:
+        first = next(stream).clone()
+        before = mpc.policy(first["observation"])
+        with torch.no_grad():
+            mpc.q.zero_() if "q" in mpc.learned else mpc.C.add_(0.3 * torch.randn_like(mpc.C))
+        second = next(stream).clone()
+    finally:
+        collector.shutdown()
+    assert first.shape == second.shape == (num_columns(cfg), 5) == (4, 5)
+    torch.testing.assert_close(first["action"], before.detach())
+    torch.testing.assert_close(second["action"], mpc.policy(second["observation"]).detach())
+    assert not torch.allclose(mpc.policy(first["observation"]), before, atol=1e-3)
+    # Each environment goes on where it was, and no two are alike.
+    torch.testing.assert_close(first["next", "observation"][:, -1], second["observation"][:, 0])
+    assert len(first["observation"][:, 0].unique(dim=0)) == 4
+
+
+@pytest.mark.parametrize("name", ["multi", pytest.param("ray", marks=pytest.mark.cluster)])
+def test_workers_that_do_not_wait_bring_their_own_environments(tmp_path, monkeypatch, name):
+    """A run learns from each batch as it comes: half of the environments at a time."""
+    if name == "ray":
+        pytest.importorskip("ray", reason="the extra ray is not installed")
+    skip_figures(monkeypatch)
+    overrides = (*SMALL, f"collector={name}", "collector.sync=false", "num_envs=4", "constraint=si")
+    cfg = make_config(*overrides, "steps_per_update=5", "warmup_steps=10", "updates=6")
+    assert num_columns(cfg) == 2
+    seen = []
+    monkeypatch.setattr(
+        train, "batches", lambda collector: (seen.append(b.shape) or b for b in batches(collector))
+    )
+    summary = train.train(cfg, str(tmp_path))
+    assert seen == [(2, 5)] * 8
+    assert summary["updates"] == 6
+    assert summary["J_final"] != summary["J_start"]
+
+
+def test_ray_must_be_there(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    cfg = make_config(*SMALL, "collector=ray")
+    with pytest.raises(
+        QPError, match=r"collector: got ray, which is not installed, .* '\.\[ray\]'"
+    ):
+        collect(cfg, 1)

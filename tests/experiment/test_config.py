@@ -1,0 +1,421 @@
+"""Every key has a rule and a reader, every rule a key, and each bad value its sentence."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import sys
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+from torchrl.collectors import distributed
+
+import train
+from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
+from torch_qpmpc import QPActorValueOperator, QPError
+from torch_qpmpc.experiment.collection import make_collector, num_columns
+from torch_qpmpc.experiment.config import NOISES, OF_CHOICE, OPTIONAL, RULES, check_config, flatten
+from torch_qpmpc.experiment.run_folder import RunFolder
+from torch_qpmpc.experiment.run_state import snapshot
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+
+GROUPS = ("constraint", "noise", "optimizer", "task")
+
+
+def keys_of_the_files() -> set[str]:
+    """Dotted keys of every file in configs/, but for Hydra's own."""
+    keys = set()
+    for path in set(CONFIGS.rglob("*.yaml")) - set((CONFIGS / "hydra").rglob("*.yaml")):
+        tree = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+        assert isinstance(tree, dict)
+        whole = "# @package _global_" in path.read_text(encoding="utf-8")
+        group = "" if whole or path.parent == CONFIGS else path.parent.name
+        keys |= set(
+            flatten({k: v for k, v in tree.items() if k not in ("defaults", "hydra")}, group)
+        )
+    return keys
+
+
+def test_each_key_has_a_rule_and_each_rule_a_key():
+    assert keys_of_the_files() - set(OPTIONAL) == set(RULES)
+
+
+class Recorder:
+    """A configuration that notes which of its leaves are read."""
+
+    def __init__(self, cfg: DictConfig, seen: set[str], prefix: str = "") -> None:
+        self.__dict__.update(_cfg=cfg, _seen=seen, _prefix=prefix)
+
+    def __getattr__(self, name: str) -> Any:
+        key, value = f"{self._prefix}{name}", self._cfg[name]
+        if isinstance(value, DictConfig):
+            return Recorder(value, self._seen, f"{key}.")
+        self._seen.add(key)
+        return value
+
+    __getitem__ = __getattr__
+
+    def keys(self) -> list[Any]:
+        return list(self._cfg)
+
+
+def test_each_key_is_read(tmp_path, monkeypatch):
+    """By a run of one order or the other, or by the names of the run's folder."""
+    seen: set[str] = set()
+    skip_figures(monkeypatch)
+    # These two read everything at once, which proves nothing.
+    monkeypatch.setattr(train, "check_config", lambda _: None)
+    for name, overrides in {
+        "first": ("optimizer=adam", "constraint=combined", "constraint.si.windows=4"),
+        "second": ("optimizer=gauss_newton", "constraint=combined", "batch_size=8"),
+        "actor": ("algo=td3", "task=pendulum", "constraint=free", "batch_size=8"),
+        "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
+    }.items():
+        cfg = make_config(*SMALL, "delay_value=true", *overrides)
+        monkeypatch.setattr(
+            train, "RunFolder", lambda folder, _, after, cfg=cfg: RunFolder(folder, cfg, after)
+        )
+        monkeypatch.setattr(train, "snapshot", lambda _, *parts, cfg=cfg: snapshot(cfg, *parts))
+        recorder: Any = Recorder(cfg, seen)
+        train.train(recorder, str(tmp_path / name))
+    monkeypatch.setattr(distributed, "RayCollector", lambda *_, **__: None)
+    elsewhere: Any = Recorder(make_config("collector=ray"), seen)
+    physics = make_physics(elsewhere)
+    operator = QPActorValueOperator(make_mpc(elsewhere, physics))
+    make_collector(elsewhere, physics, operator.get_policy_operator())
+    assert num_columns(elsewhere) == 16
+    text = (CONFIGS / "config.yaml").read_text(encoding="utf-8").partition("hydra:")[2]
+    seen |= set(re.findall(r"\$\{([\w.]+)\}", text))
+    assert seen - set(OPTIONAL) == set(RULES)
+
+
+@pytest.mark.parametrize("names", list(itertools.product(*map(choices, GROUPS))))
+def test_each_choice_of_groups_is_accepted(names):
+    """But for a noise of another task, and windows for the SI penalty without a replay."""
+    choice = dict(zip(GROUPS, names, strict=True))
+    more = ["task.id=Pendulum-v1"] if choice["task"] == "gymnasium" else []
+    cfg = make_config(
+        *(f"{group}={name}" for group, name in choice.items()), *more, "warmup_steps=10"
+    )
+    if choice["noise"] not in NOISES[cfg.task.name]:
+        key = "noise.name"
+    elif choice["optimizer"] == "recursive" and cfg.constraint.si is not None:
+        key = "replay"
+    else:
+        check_config(cfg)
+        return
+    with pytest.raises(QPError, match=f"^({key}|replay): got"):
+        check_config(cfg)
+
+
+@pytest.mark.parametrize("task", ["point_mass", "pendulum"])
+@pytest.mark.parametrize("collector", choices("collector"))
+@pytest.mark.parametrize("algo", choices("algo"))
+def test_each_algorithm_goes_with_each_collector(algo, collector, task):
+    check_config(make_config(f"algo={algo}", f"collector={collector}", f"task={task}"))
+
+
+def test_an_actor_has_the_first_order_by_itself():
+    assert make_config("algo=ddpg").optimizer.name == "adam"
+    assert make_config("algo=td3", "optimizer=sgd").optimizer.name == "sgd"
+
+
+def choices_with(key: str) -> list[str]:
+    """The choices of groups with which a configuration has the key."""
+    group = key.partition(".")[0]
+    if group == "optimizer":
+        second = key in OF_CHOICE["optimizer"]["gauss_newton"]
+        return [f"optimizer={'gauss_newton' if second else 'adam'}"]
+    having = {"algo": ["algo=td3"], "collector": ["collector=ray"], "task": ["task=pendulum"]}
+    known = (
+        {name for names in OF_CHOICE[group].values() for name in names} if group in having else {}
+    )
+    return having[group] if key in known else ["optimizer=adam"]
+
+
+WHOLE = [0, -1, 1.5, True, "three", None, math.nan]
+REAL = [-1.0, math.nan, math.inf, True, "much", None]
+FRACTION = [0, -0.5, 1.1, math.nan, False, "half", None]
+FLAG = [0, 1, "yes", None]
+NAME = [3, True, None]
+MATRIX = [1.0, [1.0], [[1.0], [1.0, 2.0]], [["a"]], [[math.nan]], [[True]], "???"]
+BAD: dict[str, list[Any]] = {
+    "seed": [*WHOLE[1:], 2**63],
+    "solver": NAME,
+    "warm_start": FLAG,
+    "replay": FLAG,
+    "release": [*WHOLE[:-2], math.nan],
+    "exploration_std": REAL,
+    "td_error_clip": [0, *REAL[:-1]],
+    "delay_value": FLAG,
+    "target_rate": FRACTION,
+    "step": ["newton", *NAME],
+    "penalty_step": ["newton", *NAME],
+    "ablation": [3, True],
+    "figures": FLAG,
+    "resume": [3, True],
+    "algo.name": ["sac", *NAME],
+    "algo.actor": ["net", *NAME],
+    "algo.critic": ["net", *NAME],
+    "algo.actor_rate": [0, *REAL],
+    "algo.lr_network": [0, *REAL],
+    "algo.width": WHOLE,
+    "algo.policy_delay": WHOLE,
+    "algo.policy_noise": REAL,
+    "algo.noise_clip": REAL,
+    "collector.name": ["many", *NAME],
+    "collector.workers": WHOLE,
+    "collector.sync": FLAG,
+    "collector.num_cpus": [0, *REAL],
+    "task.name": ["pendulum", *NAME],
+    "task.id": ["???", *NAME],
+    "task.A": MATRIX,
+    "task.B": MATRIX,
+    "task.stage_weight": MATRIX,
+    "task.gamma": FRACTION,
+    "task.hessian": ["dense", *NAME],
+    "task.terminal_weight": ["lqr", *NAME],
+    "constraint.structure": ["banded", *NAME],
+    "optimizer.lr": FRACTION,
+    "optimizer.memory": WHOLE[1:],
+    "task.learn_cost": ["H", ["H", "C"], ["h"], [["H"]], None, 3],
+    "task.state_slack": [*REAL[:2], *REAL[3:]],
+    "task.action_slack": [*REAL[:2], *REAL[3:]],
+    "task.discount_slack": FLAG,
+    "noise.name": ["pink", *NAME],
+    "noise.std": REAL[:-1],
+    "constraint.name": NAME,
+    "constraint.learn": ["C", ["C", "H"], ["c"], [{"C": 1}], None, 3],
+    "constraint.si.normalised": FLAG,
+    "optimizer.name": ["rmsprop", *NAME],
+    "optimizer.betas": [0.9, [0.9], [0.9, 1.0], [-0.1, 0.9], ["a", "b"], [0.9] * 3, None],
+    "optimizer.final_fraction": FRACTION,
+}
+for _name in ("threads", "updates", "batch_size", "num_envs", "steps_per_update"):
+    BAD[_name] = WHOLE
+BAD["warmup_steps"] = WHOLE[1:]
+for _name in ("replay_capacity", "eval_interval", "log_interval", "constraint.si.windows"):
+    BAD[_name] = WHOLE
+for _name in ("task.horizon", "task.episode_steps", "task.eval_steps"):
+    BAD[_name] = WHOLE
+for _name in ("scale_cost", "scale_constraints", "damping"):
+    BAD[f"optimizer.{_name}"] = [0, *REAL]
+BAD["optimizer.trust_region"] = FLAG
+for _name in ("lr_cost", "lr_constraints"):
+    BAD[f"optimizer.{_name}"] = REAL
+for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.growth", "si.beta"):
+    BAD[f"constraint.{_name}"] = REAL
+
+
+@pytest.mark.parametrize("key", RULES)
+def test_impossible_values_are_rejected_by_name(key):
+    assert key in BAD, "a new rule: add what it rejects"
+    good = make_config("constraint=combined", *choices_with(key))
+    for value in BAD[key]:
+        cfg = good.copy()
+        OmegaConf.update(cfg, key, value)
+        sentence = f"{key}: got {value!r}, expected {RULES[key][1]}."
+        with pytest.raises(QPError, match=f"^{re.escape(sentence)}"):
+            check_config(cfg)
+
+
+def test_rules_accept_the_edges():
+    cfg = make_config(
+        "constraint=combined",
+        "optimizer=adam",
+        "seed=0",
+        "updates=1",
+        "td_error_clip=null",
+        "exploration_std=0",
+        "target_rate=1",
+        "task.gamma=1",
+        "task.state_slack=inf",
+        "task.learn_cost=[]",
+        "noise.std=0",
+        "constraint.deviation.c_2=0",
+        "constraint.si.beta=0",
+        "optimizer.lr_cost=0",
+        "optimizer.betas=[0,0]",
+    )
+    check_config(cfg)
+
+
+@pytest.mark.parametrize(
+    ("key", "remedy"),
+    [
+        ("batchsize", "Did you mean batch_size?"),
+        ("task.horizn", "Did you mean task.horizon?"),
+        ("constraint.deviaton.c_1", "Did you mean constraint.deviation.c_1?"),
+        ("zzz", "See configs/config.yaml."),
+    ],
+)
+def test_unknown_keys(key, remedy):
+    cfg = make_config()
+    OmegaConf.update(cfg, key, 3, force_add=True)
+    sentence = f"{key}: got an unknown key, expected a key of configs/. {remedy}"
+    with pytest.raises(QPError, match=re.escape(sentence)):
+        check_config(cfg)
+
+
+@pytest.mark.parametrize("key", [*RULES, *OPTIONAL, *GROUPS, "algo", "collector"])
+def test_missing_keys(key):
+    cfg = make_config("constraint=combined", *choices_with(key))
+    owner, _, leaf = key.rpartition(".")
+    OmegaConf.set_struct(cfg, False)
+    del (OmegaConf.select(cfg, owner) if owner else cfg)[leaf]
+    with pytest.raises(QPError, match=rf"^{re.escape(key)}(\.\w+)*: got nothing, expected \w+"):
+        check_config(cfg)
+
+
+def test_betas_are_adams():
+    cfg = make_config("optimizer=sgd")
+    assert "betas" not in cfg.optimizer
+    check_config(cfg)
+
+
+def test_solver_must_be_known():
+    with pytest.raises(QPError, match="solver: got 'cplex'"):
+        check_config(make_config("solver=cplex"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["constraint.learn=[b]"], r"constraint.learn: got \['b'\], expected C among them"),
+        (
+            ["constraint=deviation", "constraint.learn=[]"],
+            r"constraint.learn: got \[\], expected C .* Set the penalty to null, or learn C",
+        ),
+        (
+            ["constraint=si", "task.episode_steps=5"],
+            r"task.episode_steps: got 5, expected at least task.horizon = 10",
+        ),
+        (
+            ["constraint=si", "warmup_steps=7"],
+            r"warmup_steps: got 7, expected at least task.horizon = 10",
+        ),
+        (
+            ["constraint=fixed", "task.learn_cost=[]"],
+            r"task.learn_cost: got \[\], expected something to learn, here or in constraint.learn",
+        ),
+        (
+            ["optimizer=gauss_newton", "penalty_step=subgradient"],
+            r"penalty_step: got 'subgradient', expected proximal. gauss_newton has no subgrad",
+        ),
+        (
+            ["optimizer=gauss_newton", "constraint=si", "constraint.si.normalised=true"],
+            r"constraint.si.normalised: got True, expected False. gauss_newton takes the pen",
+        ),
+        (["constraint=si", "replay=false"], "replay: got False, expected true. The windows of"),
+        (
+            ["constraint=deviation", "constraint.structure=tied"],
+            "constraint.structure: got 'tied', expected free. A tied C has nothing off its band",
+        ),
+        (
+            ["constraint=si", "constraint.structure=varying"],
+            "constraint.structure: got 'varying', expected free. .* SI penalty no free C",
+        ),
+        (
+            ["constraint=mpc", "constraint.learn=[C,G]"],
+            r"constraint.learn: got \['C', 'G'\], expected no G. No task has mixed",
+        ),
+        (["release=10"], "release: got 10, expected null. Nothing is tied: choose constraint=mpc"),
+        (
+            ["task.terminal_weight=riccati"],
+            "task.terminal_weight: got 'riccati', expected identity. With task.hessian=block it",
+        ),
+        (["noise=uniform"], "noise.name: got 'uniform', expected a noise that point_mass has. The"),
+        (
+            ["task=gros_zanon", "noise=gaussian"],
+            "noise.name: got 'gaussian', expected a noise that gros_zanon has. .* uniform",
+        ),
+        (
+            ["algo=td3", "optimizer=gauss_newton"],
+            "optimizer.name: got 'gauss_newton', expected adam or sgd. td3 has no second order",
+        ),
+        (["algo=ddpg", "warm_start=true"], "warm_start: got True, expected false. ddpg solves at"),
+        (["algo=ddpg", "replay=false"], "replay: got False, expected true. ddpg learns from a"),
+        (
+            ["algo=ddpg", "algo.actor=mlp"],
+            "algo.actor: got 'mlp', expected qp. The penalties are on",
+        ),
+        (["algo=ddpg", "step=projection"], "step: got 'projection', expected cholesky. The crit"),
+        (
+            ["algo=ddpg", "constraint=mpc", "release=5"],
+            "release: got 5, expected null. ddpg has more parameters than the QP's",
+        ),
+        (
+            ["collector=multi", "constraint=mpc", "release=5"],
+            "release: got 5, expected null. The workers of collector=multi would keep",
+        ),
+        (
+            ["collector=ray", "collector.workers=3"],
+            "num_envs: got 16, expected a multiple of collector.workers = 3",
+        ),
+        (
+            ["collector=multi", "collector.sync=false", "constraint=si"],
+            "steps_per_update: got 4, expected at least task.horizon = 10. The windows of",
+        ),
+        (
+            ["task=gros_zanon", "noise.std=0.1"],
+            "noise.std: got 0.1, expected null. The noise of gros_zanon cannot be changed",
+        ),
+        (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
+    ],
+)
+def test_values_that_do_not_fit_each_other(overrides, message):
+    with pytest.raises(QPError, match=message):
+        check_config(make_config(*overrides))
+
+
+def test_short_episodes_do_without_the_si_penalty():
+    check_config(make_config("constraint=free", "task.episode_steps=5", "warmup_steps=1"))
+
+
+def test_flatten():
+    tree = {"a": 1, "b": {"c": [1, 2], "d": {"e": None}}}
+    assert flatten(tree) == {"a": 1, "b.c": [1, 2], "b.d.e": None}
+    assert flatten({"e": None}, "b.d") == {"b.d.e": None}
+
+
+def test_the_step_rule_needs_its_solver(monkeypatch):
+    monkeypatch.setitem(sys.modules, "clarabel", None)
+    with pytest.raises(QPError, match=r"step: got 'sdp' without Clarabel, .* pip install"):
+        check_config(make_config("step=sdp"))
+
+
+#: What each differs in, beside its name: from the defaults, or from those of its optimiser.
+ABLATIONS: dict[str, tuple[list[str], dict[str, Any]]] = {
+    "reference": ([], {}),
+    "adam_proximal": (["optimizer=adam"], {}),
+    "adam_subgradient": (["optimizer=adam"], {"penalty_step": "subgradient"}),
+    "sgd": (["optimizer=sgd"], {"step": "projection"}),
+    "target_network": (["optimizer=adam"], {"delay_value": True}),
+    "markov": ([], {"constraint.deviation.c_3": 1.0}),
+    "si_raw": (["optimizer=adam", "constraint=si"], {}),
+    "si_normalised": (["optimizer=adam", "constraint=si"], {"constraint.si.normalised": True}),
+    "soft_actions": ([], {"task.action_slack": 100.0}),
+    "horizon_5": ([], {"task.horizon": 5}),
+    "horizon_20": ([], {"task.horizon": 20, "warmup_steps": 20}),
+    "projection": ([], {"step": "projection"}),
+    "sdp": ([], {"step": "sdp"}),
+}
+
+
+@pytest.mark.parametrize("name", choices("ablation"))
+def test_an_ablation_differs_in_what_it_says(name):
+    base, expected = ABLATIONS[name]
+    found = make_config(f"+ablation={name}")
+    check_config(found)
+    found, usual = (flatten(OmegaConf.to_container(x)) for x in (found, make_config(*base)))
+    differing = {key: value for key, value in found.items() if value != usual[key]}
+    assert differing == {"ablation": name, **expected}
+
+
+@pytest.mark.parametrize("name", choices("ablation"))
+def test_an_ablation_goes_with_both_penalties_and_a_step_rule(name):
+    check_config(make_config(f"+ablation={name}", "constraint=combined", "optimizer=adam"))
+    cfg = make_config(f"+ablation={name}", "step=projection")
+    assert (cfg.step, cfg.ablation) == ("projection", name)

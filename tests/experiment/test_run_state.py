@@ -1,0 +1,208 @@
+"""A run that was stopped and goes on is the run that was not, number for number."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+import train
+from tests.runs import SMALL, make_config, skip_figures
+from tests.stops import assert_events_are_whole, assert_same_numbers, go_on, stop
+from torch_qpmpc import QPError
+from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
+from torch_qpmpc.experiment.run_state import resumed
+
+#: Neither of the stops is at an evaluation or a row of metrics.
+RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3", "task.eval_steps=10")
+STOPS = (2, 7)
+STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
+ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    skip_figures(monkeypatch)
+
+
+@pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("optimizer=adam", "constraint=combined"),
+        ("optimizer=sgd", "constraint=combined", "penalty_step=subgradient"),
+        ("optimizer=gauss_newton", "constraint=combined"),
+        ("optimizer=gauss_newton", "constraint=mpc", "release=5"),
+        ("optimizer=adam", "constraint=mpc", "release=9"),
+        ("optimizer=recursive", *STREAM),
+        ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
+        ("delay_value=true", "noise=brownian", "steps_per_update=3"),
+        ("warm_start=false", "replay_capacity=48"),
+        ("solver=proxqp", "optimizer=gauss_newton"),
+        ("solver=torch", "step=projection"),
+        ("algo=ddpg", *ACTOR_CRITIC),
+        ("algo=td3", *ACTOR_CRITIC),
+        ("algo=td3", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
+    ],
+    ids=" ".join,
+)
+def test_a_run_that_goes_on_is_the_one_that_never_stopped(tmp_path, monkeypatch, overrides):
+    cfg = make_config(*RUN, "figures=false", *overrides)
+    train.train(cfg, str(tmp_path / "whole"))
+    for update in STOPS:
+        torch.manual_seed(update)
+        assert stop(monkeypatch, cfg, tmp_path / "stopped", update) == 128 + signal.SIGTERM
+    go_on(tmp_path / "stopped")
+    assert_same_numbers(tmp_path / "stopped", tmp_path / "whole")
+    assert_events_are_whole(tmp_path / "stopped")
+
+
+@pytest.fixture
+def stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run that was stopped in its third update, with a checkpoint of the second before."""
+    folder, cfg = tmp_path / "run", make_config(*RUN, "eval_interval=2", "figures=false")
+    stop(monkeypatch, cfg, folder, 3)
+    return folder
+
+
+def test_figures_are_not_drawn_twice(tmp_path, monkeypatch):
+    stop(monkeypatch, make_config(*RUN), tmp_path, 9)
+    (tmp_path / "checkpoint.pt").unlink()
+    (tmp_path / "checkpoint-previous.pt").rename(tmp_path / "checkpoint.pt")
+    go_on(tmp_path)
+    assert_events_are_whole(tmp_path)
+
+
+def test_a_run_that_has_no_checkpoint_yet_begins_anew(tmp_path, stopped):
+    for checkpoint in stopped.glob("checkpoint*"):
+        checkpoint.unlink()
+    go_on(stopped)
+    train.train(OmegaConf.load(stopped / "config.yaml"), str(tmp_path / "whole"))  # pyright: ignore[reportArgumentType] -- a DictConfig
+    assert_same_numbers(stopped, tmp_path / "whole")
+    assert_events_are_whole(stopped)
+
+
+@pytest.mark.parametrize("when", ["finish", "drop_previous"])
+def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch, when):
+    """Killed after the last update, before or after the summary is written."""
+    cfg = make_config(*RUN)
+    train.train(cfg, str(tmp_path / "whole"))
+
+    def killed(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(f"train.{'RunFolder.' * (when == 'finish')}{when}", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train.train(cfg, str(tmp_path / "run"))
+    if when == "finish":
+        assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["update"] == 11
+        go_on(tmp_path / "run")
+        assert not (tmp_path / "run" / "checkpoint-previous.pt").exists()
+    assert_same_numbers(tmp_path / "run", tmp_path / "whole")
+    assert_events_are_whole(tmp_path / "run")
+
+
+def test_a_finished_run_keeps_what_it_learned_and_no_data(tmp_path, stopped):
+    big = (stopped / "checkpoint.pt").stat().st_size
+    assert load_checkpoint(stopped / "checkpoint.pt")["replay"] is not None
+    go_on(stopped)
+    state = load_checkpoint(stopped / "checkpoint.pt")
+    assert (state["replay"], state["collector"], state["update"]) == (None, None, 11)
+    assert (stopped / "checkpoint.pt").stat().st_size < big
+    assert sorted(path.name for path in stopped.iterdir()) == [
+        "checkpoint.pt",
+        "config.yaml",
+        "metrics.csv",
+        "summary.json",
+        "tensorboard",
+    ]
+
+
+def test_several_processes_begin_new_episodes_and_learn_on(tmp_path, monkeypatch, capsys):
+    cfg = make_config(*RUN, "collector=multi", "figures=false", "updates=6")
+    assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
+    go_on(tmp_path)
+    assert "New episodes: the environments' own state cannot be saved." in capsys.readouterr().out
+    assert json.loads((tmp_path / "summary.json").read_text())["updates"] == 6
+    assert_events_are_whole(tmp_path)
+
+
+# --- What is refused -----------------------------------------------------------------------------
+
+
+def test_only_a_run_that_was_stopped_goes_on(tmp_path, stopped):
+    with pytest.raises(QPError, match=r"resume: got seed=3, too, expected nothing else"):
+        resumed(stopped, ["resume=x", "seed=3"])
+    with pytest.raises(QPError, match=r"resume: got .*without config.yaml, expected a folder of t"):
+        resumed(tmp_path, [])
+    (stopped / "summary.json").touch()
+    with pytest.raises(QPError, match=r"resume: got .*which is finished, expected a run that was"):
+        resumed(stopped, [])
+
+
+def test_a_damaged_checkpoint_offers_the_one_before_which_goes_on(tmp_path, stopped):
+    (stopped / "checkpoint.pt").write_bytes(b"PK" + bytes(1000))
+    before = stopped / "checkpoint-previous.pt"
+    with pytest.raises(QPError, match=rf"cannot be read .*use the one before, {before}\.$"):
+        resumed(stopped, [])
+    cfg, state = resumed(before, [])
+    assert state is not None
+    assert state["update"] == 2
+    train.train(cfg, str(stopped), state)
+    train.train(cfg, str(tmp_path / "whole"))
+    assert_same_numbers(stopped, tmp_path / "whole")
+
+
+def test_a_checkpoint_of_another_run_is_refused(stopped):
+    cfg = make_config(*RUN, "task.horizon=4", "seed=2", "eval_interval=2", "figures=false")
+    OmegaConf.save(cfg, stopped / "config.yaml", resolve=True)
+    with pytest.raises(QPError) as error:
+        resumed(stopped, [])
+    assert str(error.value) == (
+        "checkpoint: got one of a run with seed=1, task.horizon=3, expected config.yaml's seed=2, "
+        "task.horizon=4. A run goes on with its own configuration, and from its own checkpoints."
+    )
+
+
+@pytest.mark.parametrize("key", ["config", "mpc", "tally", "rng"])
+def test_a_checkpoint_of_another_layout_is_refused(stopped, key):
+    state = load_checkpoint(stopped / "checkpoint.pt")
+    del state[key]
+    save_checkpoint(stopped / "checkpoint.pt", state)
+    with pytest.raises(QPError, match=rf"checkpoint: got one without {key}, .*Another version"):
+        resumed(stopped, [])
+
+
+def test_what_is_no_state_is_refused(stopped):
+    torch.save([1, 2], stopped / "checkpoint.pt")
+    with pytest.raises(QPError, match=r"checkpoint: got a list, expected a run's state"):
+        resumed(stopped, [])
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [
+        ("loss_module", {"more": torch.zeros(2)}),
+        ("mpc", {"C": torch.zeros(2, 2)}),
+        ("optimizer", {"param_groups": []}),
+        ("schedule", {"last_epoch": None}),
+        ("replay", {"storage": {}}),
+        ("replay", {"generator": torch.zeros(3, dtype=torch.uint8)}),
+        ("collector", {"rng": torch.zeros(3, dtype=torch.uint8)}),
+        ("collector", {"episodes": {}}),
+        ("tally", {"weather": 1.0}),
+        ("tally", {"qps": {"weather": 1.0}}),
+    ],
+)
+def test_a_part_that_does_not_fit_is_named(tmp_path, stopped, part, change):
+    cfg, state = resumed(stopped, [])
+    assert state is not None
+    state[part].update(change)
+    with pytest.raises(QPError, match=rf"checkpoint: got '{part}' that does not fit \(.*the state"):
+        train.train(cfg, str(stopped), state)

@@ -1,0 +1,184 @@
+"""Sweeps: what launches them, what is not done again, and the line of progress."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from hydra.core.utils import JobStatus
+from omegaconf import OmegaConf
+
+from tests.runs import SMALL, make_config
+from torch_qpmpc import QPError
+from torch_qpmpc.experiment.lock import locked
+from torch_qpmpc.experiment.sweeps import SweepProgress, finished_run, number_of_runs, stopped_run
+
+ROOT = Path(__file__).parents[2]
+#: What each launcher needs beside a name, and the plugin that an extra brings.
+LAUNCHERS = {
+    "cores": ("joblib", ["hydra.launcher.n_jobs=2"]),
+    "submitit_local": ("submitit", ["hydra.launcher.cpus_per_task=1"]),
+    "ray": (
+        "ray",
+        [
+            "+hydra.launcher.ray.init.num_cpus=1",
+            "+hydra.launcher.ray.init.include_dashboard=false",
+            "hydra.launcher.ray.init.address=local",
+        ],
+    ),
+}
+
+
+def sweep(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
+    """``train.py -m +study=paper`` with small runs, in a process that cannot hang for ever."""
+    command = [sys.executable, "train.py", "-m", "+study=paper", *SMALL, *overrides]
+    command += [f"hydra.sweep.dir={folder}", "constraint=free", "noise=gaussian"]
+    # Workers of Ray are nice by default, and would wait for all other tests.
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
+    return subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False
+    )
+
+
+@pytest.mark.parametrize(
+    "launcher",
+    [
+        pytest.param(name, marks=() if name == "cores" else pytest.mark.cluster)
+        for name in LAUNCHERS
+    ],
+)
+def test_every_launcher_runs_the_study_and_shows_one_line(launcher, tmp_path):
+    package, settings = LAUNCHERS[launcher]
+    if not importlib.util.find_spec(f"hydra_plugins.hydra_{package}_launcher"):
+        pytest.skip(f"hydra-{package}-launcher is not installed, which an extra brings")
+    ended = sweep(tmp_path, f"hydra/launcher={launcher}", "seed=1,2", *settings)
+    assert ended.returncode == 0, ended.stderr
+    summaries = [json.loads(path.read_text()) for path in tmp_path.glob("*/summary.json")]
+    assert sorted(summary["seed"] for summary in summaries) == [1, 2]
+    assert "2/2" in ended.stderr
+    assert "done=2" in ended.stderr
+    assert "free, gaussian" not in ended.stderr, "a run's own bar"
+    assert "closed gap" not in ended.stdout, "a run's own table"
+
+
+def test_a_sweep_goes_on_where_it_stopped(tmp_path):
+    """One run has finished, one was stopped; then the settings change."""
+    basic = "hydra/launcher=basic"
+    assert sweep(tmp_path, basic, "seed=1").returncode == 0
+    first, second = (tmp_path / f"gaussian-free-seed{seed}" for seed in (1, 2))
+    before = (first / "checkpoint.pt").stat().st_mtime_ns
+    (second / "tensorboard").mkdir(parents=True)
+    (second / "tensorboard" / "stale").touch()
+
+    again = sweep(tmp_path, basic, "seed=1,2")
+    assert again.returncode == 0, again.stderr
+    assert "finished before=1" in again.stderr
+    assert "done=1" in again.stderr
+    assert (first / "checkpoint.pt").stat().st_mtime_ns == before
+    assert (second / "summary.json").exists()
+    assert not (second / "tensorboard" / "stale").exists()
+
+    changed = sweep(tmp_path, basic, "seed=1", "exploration_std=0.2")
+    assert changed.returncode == 1
+    assert "a finished run with exploration_std=0.3, expected exploration_std=0.2" in changed.stderr
+    assert (first / "checkpoint.pt").stat().st_mtime_ns == before
+
+
+def test_a_sweep_does_not_write_where_another_run_does(tmp_path):
+    folder = tmp_path / "gaussian-free-seed1"
+    folder.mkdir()
+    with locked(folder):
+        refused = sweep(tmp_path, "hydra/launcher=basic", "seed=1")
+    assert refused.returncode == 1
+    assert f"got {folder}, in use by process {os.getpid()}" in refused.stderr
+    assert not (folder / "config.yaml").exists()
+
+
+# --- Runs that have finished ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def finished(tmp_path: Path) -> Path:
+    OmegaConf.save(make_config(*SMALL), tmp_path / "config.yaml", resolve=True)
+    (tmp_path / "summary.json").write_text('{"closed_gap": 0.5}')
+    return tmp_path
+
+
+def test_a_finished_run_is_known_by_its_settings(finished):
+    assert finished_run(finished, make_config(*SMALL)) == {"closed_gap": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("override", "difference"),
+    [
+        ("seed=2", r"seed=1, expected seed=2"),
+        ("constraint=si", r"constraint.name=deviation, .* expected constraint.name=si,"),
+    ],
+)
+def test_other_settings_are_another_run(finished, override, difference):
+    with pytest.raises(QPError, match=f"a finished run with .*{difference}.*hydra.sweep.dir"):
+        finished_run(finished, make_config(*SMALL, override))
+
+
+def test_a_run_that_was_stopped_has_not_finished(finished):
+    (finished / "summary.json").unlink()
+    (finished / "tensorboard").mkdir()
+    assert finished_run(finished, make_config(*SMALL)) is None
+    assert stopped_run(finished, make_config(*SMALL)) is None
+    assert not (finished / "tensorboard").exists()
+    assert (finished / "config.yaml").exists()
+
+
+# --- Progress ------------------------------------------------------------------------------------
+
+
+def hydra_config(folder: Path, params: dict[str, str], task: list[str]):
+    hydra = {"sweep": {"dir": str(folder)}, "sweeper": {"params": params}}
+    hydra |= {"overrides": {"task": task}, "runtime": {"output_dir": str(folder)}}
+    return OmegaConf.create({"hydra": hydra | {"job": {"num": 0}}})
+
+
+@pytest.mark.parametrize(
+    ("params", "task", "number"),
+    [
+        ({}, ["seed=3"], 1),
+        ({"seed": "range(1,11)", "noise": "a,b"}, ["+study=paper"], 20),
+        ({"seed": "range(1,11)", "noise": "a,b"}, ["seed=1,2"], 4),
+        ({"seed": "range(1,11)", "noise": "a,b"}, ["noise=a"], 10),
+        ({}, ["a.b={c: 1, d: 2},{c: 3, d: 4}"], 2),
+        ({}, ["lr=interval(0,1)"], None),
+    ],
+)
+def test_runs_are_counted_before_they_begin(tmp_path, params, task, number):
+    assert number_of_runs(hydra_config(tmp_path, params, task)) == number
+
+
+def test_failed_runs_are_counted_apart(tmp_path, capsys):
+    config = hydra_config(tmp_path, {"seed": "1,2,3"}, [])
+    progress = SweepProgress()
+    progress.on_multirun_start(config)
+    for number, status in enumerate([JobStatus.COMPLETED, JobStatus.FAILED, JobStatus.COMPLETED]):
+        config.hydra.job.num = number
+        if number == 2:
+            (tmp_path / "summary.json").touch()
+        progress.on_job_start(config)
+        progress.on_job_end(config, SimpleNamespace(status=status))  # pyright: ignore[reportArgumentType] -- only that is read
+    progress.on_multirun_end()
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "3/3" in last
+    for outcome in ("done=1", "failed=1", "finished before=1"):
+        assert outcome in last
+
+
+def test_a_single_run_leaves_no_note(tmp_path):
+    config = hydra_config(tmp_path, {}, [])
+    progress = SweepProgress()
+    progress.on_job_start(config)
+    progress.on_job_end(config, SimpleNamespace(status=JobStatus.COMPLETED))  # pyright: ignore[reportArgumentType] -- only that is read
+    assert not list(tmp_path.iterdir())

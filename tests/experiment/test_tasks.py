@@ -1,0 +1,165 @@
+"""The tasks' plants and QPs are what the configuration and the papers say."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.runs import linear_system, make_config, true_mpc
+from torch_qpmpc import QPError
+from torch_qpmpc.envs import GrosZanonLTI, PointMass
+from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.mpc.banded import banded_matrix
+
+
+@pytest.mark.parametrize(("noise", "std"), [("gaussian", 0.01), ("brownian", 0.002)])
+def test_physics_has_the_noise(noise, std):
+    physics = make_physics(make_config(f"noise={noise}"))
+    assert isinstance(physics, PointMass)
+    assert (physics.noise_kind, physics.std) == (noise, std)
+    quiet = make_physics(make_config(f"noise={noise}", "noise.std=0"))
+    assert isinstance(quiet, PointMass)
+    assert quiet.std == 0
+
+
+#: Undiscounted J before learning, by the seed of the corruption, and with the true model.
+J_START = {1: 285, 2: 172, 3: 547, 4: 58, 5: 507}
+J_TRUE_MODEL = 47
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_ends_of_the_experiment_are_the_known_ones(seed):
+    """The numbers that everyone who draws, starts and rolls out alike gets."""
+    cfg = make_config(f"seed={seed}", "solver=daqp")
+    physics = linear_system(cfg)
+    assert round(evaluate(cfg, make_mpc(cfg, physics).policy, physics).J) == J_START[seed]
+    assert round(evaluate(cfg, true_mpc(cfg, physics).policy, physics).J) == J_TRUE_MODEL
+
+
+def test_start_is_the_corrupted_model_and_a_random_cost():
+    cfg, true = make_config("seed=3", "constraint=free"), PointMass()
+    mpc = make_mpc(cfg, make_physics(cfg))
+    rng = np.random.default_rng(3)
+    A = true.A + torch.as_tensor(rng.uniform(-0.05, 0.05, (4, 4)))
+    B = true.B + torch.as_tensor(rng.uniform(-0.05, 0.05, (4, 2)))
+    theta = rng.uniform(0.5, 5, 4)
+    assert torch.equal(mpc.C_0, banded_matrix(A, B, 10))
+    assert torch.equal(mpc.C, mpc.C_0)
+    torch.testing.assert_close(mpc.H, torch.as_tensor([*theta, 0, 0]))
+    qp = mpc.quadratic_program()
+    expected = torch.cat([0.9**k * mpc.H for k in range(10)] + [0.9**10 * torch.ones(4)])
+    torch.testing.assert_close(qp.H.diagonal(), expected)
+    assert torch.equal(qp.G, torch.eye(64, dtype=torch.float64))
+    stage = torch.tensor([2, 2, 10, 10, 1, 1], dtype=torch.float64)
+    assert torch.equal(qp.ub[:12], stage.repeat(2))
+    assert torch.equal(qp.lb[:12], -stage.repeat(2))
+    assert qp.w[:6].tolist() == [100.0] * 4 + [math.inf] * 2
+    assert mpc.on_failure == "mask", "training goes on where a QP is not solved"
+
+
+def test_true_model_has_the_true_cost_and_learns_nothing():
+    cfg = make_config()
+    physics = linear_system(cfg)
+    mpc = true_mpc(cfg, physics)
+    assert mpc.H.tolist() == [6, 6, 0.5, 0.5, 0, 0]
+    assert torch.equal(mpc.C, banded_matrix(physics.A, physics.B, 10))
+    assert list(mpc.parameters()) == []
+
+
+def test_configuration_reaches_the_qp():
+    cfg = make_config(
+        "solver=daqp",
+        "task.horizon=4",
+        "task.gamma=0.5",
+        "task.hessian=block",
+        "task.learn_cost=[H,H_f,q]",
+        "task.state_slack=7",
+        "task.action_slack=3",
+        "task.discount_slack=true",
+        "constraint=free",
+        "constraint.learn=[C,ub]",
+    )
+    mpc = make_mpc(cfg, make_physics(cfg))
+    assert (mpc.horizon, mpc.gamma, mpc.hessian, mpc.solver) == (4, 0.5, "block", "daqp")
+    assert set(mpc.learned) == {"H", "H_f", "q", "C", "ub"}
+    w = mpc.quadratic_program().w
+    assert w[:12].tolist() == [7.0] * 4 + [3.0] * 2 + [3.5] * 4 + [1.5] * 2
+
+
+# Gros and Zanon's system
+
+
+def test_the_other_task_starts_from_the_original_wrong_model():
+    cfg = make_config("task=gros_zanon")
+    physics = linear_system(cfg)
+    assert isinstance(physics, GrosZanonLTI)
+    mpc = make_mpc(cfg, physics)
+    A, B = physics.wrong_model()
+    assert torch.equal(mpc.C_0, banded_matrix(A, B, 10))
+    assert mpc.learned == ("q", "c", "C", "b", "lb", "ub")
+    learned = sum(part.numel() for part in mpc.readable().values())
+    # V0, A, B, b, f with one for x_N, and the bounds, of which those of the actions are kept.
+    assert learned == 1 + 4 + 2 + 2 + (3 + 2) + (3 + 3)
+    qp = mpc.quadratic_program()
+    assert qp.ub[:6].tolist() == [2, 1, 1, 2, 1, 1]
+    assert qp.lb[:6].tolist() == [0, -1, -1, 0, -1, -1]
+    assert qp.w[:6].tolist() == [50, 50, math.inf, 45, 45, math.inf]
+    stages = torch.tensor([1, 1, 0.5, 0.9, 0.9, 0.45]).double()
+    torch.testing.assert_close(qp.H.diagonal()[:6], stages)
+
+
+def test_its_other_end_knows_the_mean_of_the_noise():
+    cfg = make_config("task=gros_zanon")
+    physics = linear_system(cfg)
+    mpc = true_mpc(cfg, physics)
+    s, a = torch.tensor([[0.3, 0.2]]).double(), torch.tensor([[-0.4]]).double()
+    states, _ = mpc.predicted(mpc.solve(s, a).z)
+    mean = torch.tensor([[-0.05, 0.0]]).double()
+    torch.testing.assert_close(states[:, 1], physics.step(s, a, mean))
+    assert mpc.ub[:3].tolist() == [1, 1, 1]
+
+
+def test_the_value_of_a_state_has_its_violation():
+    """The slacks of x_0 are the plant's own price of leaving the bounds."""
+    cfg = make_config("task=gros_zanon", "solver=daqp")
+    physics = linear_system(cfg)
+    assert isinstance(physics, GrosZanonLTI)
+    mpc = true_mpc(cfg, physics)
+    sigma = mpc.solve(torch.tensor([[-0.2, 1.3]]).double()).sigma
+    violation = physics.violation(torch.tensor([[-0.2, 1.3]]))
+    torch.testing.assert_close(sigma[:, :2].sum(-1), violation)
+
+
+# Gymnasium
+
+
+def test_a_model_of_other_dimensions_is_an_error_of_the_environment():
+    cfg = make_config("task=pendulum", "task.id=MountainCarContinuous-v0")
+    message = (
+        r"^task\.id: got 'MountainCarContinuous-v0', whose observation has 2 entries and whose "
+        r"action has 1, with task\.A of shape \(3, 3\), task\.B of shape \(3, 1\), "
+        r"task\.stage_weight of shape \(4, 4\), expected task\.A of shape \(2, 2\), task\.B of "
+        r"shape \(2, 1\), task\.stage_weight of shape \(3, 3\)\. Find a model .* finite differences"
+    )
+    with pytest.raises(QPError, match=message):
+        make_mpc(cfg, make_physics(cfg))
+
+
+def test_a_model_on_the_command_line_is_that_of_the_qp():
+    model = (
+        "task.A=[[1,1],[0,1]]",
+        "task.B=[[0],[.1]]",
+        "task.stage_weight=[[2,0,0],[0,1,0],[0,0,1]]",
+    )
+    cfg = make_config(
+        "task=gymnasium", "task.id=MountainCarContinuous-v0", *model, "task.horizon=4"
+    )
+    mpc = make_mpc(cfg, make_physics(cfg))
+    A, B = torch.tensor([[1, 1], [0, 1]]).double(), torch.tensor([[0], [0.1]], dtype=torch.float64)
+    assert torch.equal(mpc.C_0, banded_matrix(A, B, 4))
+    W = mpc.quadratic_program().H[:3, :3]
+    torch.testing.assert_close(W, torch.diag(torch.tensor([2.0, 1, 1])).double())

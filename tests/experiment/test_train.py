@@ -1,0 +1,707 @@
+"""train.py from the configuration to the run's folder."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from matplotlib.image import imread
+from numba.core import event
+from omegaconf import DictConfig, OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import train
+from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
+from torch_qpmpc import (
+    QPMPC,
+    DeviationPenalty,
+    QPError,
+    QPQLearningLoss,
+    SystemIdentificationPenalty,
+)
+from torch_qpmpc.envs import LinearSystem, PointMass
+from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
+from torch_qpmpc.experiment.config import flatten
+from torch_qpmpc.experiment.lock import LOCK, locked
+from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.mpc.banded import band_distance
+
+SUMMARY = {"seed", "constraint", "noise", "solver", "unsolved", "updates", "train_seconds"}
+SUMMARY |= {"ablation", "step", "penalty_step"}
+for _tag in ("J", "J_discounted"):
+    SUMMARY |= {f"{_tag}_start", f"{_tag}_final", f"{_tag}_true_model"}
+SUMMARY |= {"closed_gap", "closed_gap_discounted"}
+SUMMARY |= {"train_cost", "train_cost_last_tenth", "train_violation"}
+
+
+def run_small(folder: Path, *overrides: str) -> dict[str, Any]:
+    return train.train(make_config(*SMALL, *overrides), str(folder))
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    skip_figures(monkeypatch)
+
+
+#: A run's numbers; pandas' types know too many kinds of columns.
+metrics: Callable[[Path], Any] = read_metrics
+
+
+def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """C - C_0 at the end, and the signed distance of its entries from the band."""
+    state = load_checkpoint(folder / "checkpoint.pt")["mpc"]
+    horizon = state["C_0"].shape[0] // 4
+    return (state["C"] - state["C_0"]).numpy(), band_distance(4, 2, horizon).numpy()
+
+
+# --- One whole run -------------------------------------------------------------------------------
+
+WHOLE = (
+    *("optimizer=adam", "solver=daqp", "seed=5", "constraint=combined"),
+    *("updates=150", "eval_interval=75"),
+)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    return folder, train.train(make_config(*WHOLE), str(folder))
+
+
+def test_what_is_compiled_meanwhile_is_not_counted_as_training(small, tmp_path, monkeypatch):
+    clock, batches = itertools.count(step=1000.0), train.batches
+
+    def compiling(collector: Any) -> Iterator[Any]:
+        for batch in batches(collector):
+            with event.trigger_event("numba:compile"):
+                pass
+            yield batch
+
+    monkeypatch.setattr(event, "timer", lambda: next(clock))
+    monkeypatch.setattr(train, "batches", compiling)
+    assert run_small(tmp_path, "updates=2")["train_seconds"] < 0
+
+
+def test_a_short_run_learns(whole):
+    folder, summary = whole
+    assert summary["J_final"] < 0.5 * summary["J_start"]
+    assert summary["closed_gap"] > 0.5
+    assert summary["J_discounted_final"] < summary["J_discounted_start"]
+    assert summary["unsolved"] == 0
+    deviation, distance = learned_C(folder)
+    assert np.abs(deviation[distance == 0]).max() > 0, "on the band it has learned"
+
+
+def test_summary_is_complete(whole):
+    folder, returned = whole
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary == returned
+    assert set(summary) >= SUMMARY
+    assert summary["ablation"] is None
+    assert all(math.isfinite(v) for v in summary.values() if not isinstance(v, str | None))
+    names = {"step": "cholesky", "penalty_step": "proximal"}
+    names |= {"seed": 5, "constraint": "combined", "noise": "gaussian", "solver": "daqp"}
+    assert {**summary, **names, "updates": 150} == summary
+    assert 0 < summary["train_seconds"] < 600
+    gap = (summary["J_start"] - summary["J_final"]) / (summary["J_start"] - summary["J_true_model"])
+    assert summary["closed_gap"] == pytest.approx(gap)
+
+
+def test_folder_is_complete(whole):
+    folder, summary = whole
+    files = {"config.yaml", "metrics.csv", "checkpoint.pt", "summary.png", "summary.json"}
+    assert files <= {path.name for path in folder.iterdir()}
+    assert not list(folder.rglob("*.partial"))
+    assert OmegaConf.load(folder / "config.yaml") == make_config(*WHOLE)
+    assert np.ptp(imread(folder / "summary.png")[..., :3]) > 0.5
+
+    table = metrics(folder)
+    assert sorted(table.index) == sorted({*range(0, 151, 10), 75})
+    J = table["eval/J"].dropna()
+    assert list(J.index) == [0, 75, 150]
+    assert (J[0], J[150]) == (summary["J_start"], summary["J_final"])
+    assert (table["eval/J_true_model"].dropna() == summary["J_true_model"]).all()
+    logged = table.drop(index=[0, 75])
+    columns = ["loss/value", "loss/si", "train/td_error", "train/reward", "train/unsolved"]
+    columns += [
+        "train/invalid_reward",
+        "qp/solves",
+        "qp/unsolved",
+        "qp/residual",
+        "time/collect",
+        "time/update",
+        "time/qp",
+    ]
+    for column in columns:
+        assert np.isfinite(logged[column]).all(), column
+    assert logged["qp/residual"].max() < 1e-6
+    assert (logged["train/reward"] < 0).all()
+
+
+def test_checkpoint_is_the_learned_qp(whole):
+    folder, summary = whole
+    cfg = OmegaConf.load(folder / "config.yaml")
+    assert isinstance(cfg, DictConfig)
+    physics = make_physics(cfg)
+    mpc = make_mpc(cfg, physics)
+    state = load_checkpoint(folder / "checkpoint.pt")
+    mpc.load_state_dict(state["mpc"])
+    assert state["update"] == 150
+    loop = evaluate(cfg, mpc.policy, physics)
+    np.testing.assert_allclose(loop.J, summary["J_final"], rtol=1e-9)
+
+
+def test_events_are_complete(whole):
+    folder, summary = whole
+    sizes = {"scalars": 0, "images": 0}
+    events = EventAccumulator(str(folder / "tensorboard"), size_guidance=sizes)
+    events.Reload()
+    table = metrics(folder)
+    for column in table:
+        expected = table[column].dropna()
+        found = {event.step: event.value for event in events.Scalars(column)}
+        assert list(found) == list(expected.index), column
+        np.testing.assert_allclose(list(found.values()), expected, rtol=1e-6)
+    drawn = {tag: [event.step for event in events.Images(tag)] for tag in events.Tags()["images"]}
+    assert drawn == {
+        "structure/C": [75, 150],
+        "eval/closed_loop": [75, 150],
+        "eval/predictions": [150],
+        "eval/policy": [150],
+    }
+    text = events.Tensors("config/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert "constraint:" in text
+    plugin = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    for key in flatten(OmegaConf.to_container(make_config(*WHOLE))):
+        assert key.encode() in plugin
+    assert events.Scalars("hparam/J_final")[0].value == pytest.approx(summary["J_final"])
+
+
+def test_proximal_step_leaves_nothing_above_the_band(whole):
+    folder, _ = whole
+    deviation, distance = learned_C(folder)
+    assert np.abs(deviation[distance > 0]).max() == 0
+    assert np.abs(deviation[distance < 0]).max() > 0, "what is below is free"
+    last = metrics(folder).iloc[-1]
+    assert last["structure/above"] == 0
+    assert last["structure/below"] == pytest.approx(np.abs(deviation[distance < 0]).sum())
+
+
+# --- Small runs ----------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("noise", ["gaussian", "brownian"])
+@pytest.mark.parametrize("constraint", ["fixed", "free", "deviation", "si", "combined"])
+def test_each_case_runs(tmp_path, constraint, noise):
+    summary = run_small(tmp_path, f"constraint={constraint}", f"noise={noise}")
+    assert (summary["constraint"], summary["noise"]) == (constraint, noise)
+    table, losses = metrics(tmp_path), {"loss/value"}
+    if constraint in ("si", "combined"):
+        losses.add("loss/si")
+    if constraint in ("deviation", "combined"):
+        losses.add("loss/deviation")
+    assert {column for column in table if column.startswith("loss/")} == losses
+    assert np.isfinite(table.drop(index=0)[sorted(losses)]).all(axis=None)
+    deviation, distance = learned_C(tmp_path)
+    moved = {side: np.abs(deviation[np.sign(distance) == side]).max() > 0 for side in (-1, 0, 1)}
+    free = constraint in ("free", "si")
+    assert moved == {-1: constraint != "fixed", 0: constraint != "fixed", 1: free}
+
+
+STREAM = ("task=gros_zanon", "solver=daqp", "task.horizon=4", "task.eval_steps=20")
+
+
+@pytest.mark.usefixtures("small")
+def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
+    cfg = make_config(*STREAM, "updates=40", "eval_interval=20", "seed=69")
+    summary = train.train(cfg, str(tmp_path))
+    names = {"constraint": "mpc", "noise": "uniform", "updates": 40}
+    assert {**summary, **names} == summary
+    assert summary["unsolved"] == 0
+    assert summary["J_final"] < 0.5 * summary["J_start"]
+    assert summary["train_cost_last_tenth"] < summary["train_cost"] < 0.6
+    assert 0 < summary["train_violation"] < 3
+    table = metrics(tmp_path)
+    assert sorted(table.index) == list(range(41))
+    theta = table[[f"theta/{name}" for name in ("c", "A_0", "B_1", "b_0", "lb_0", "q_4")]]
+    assert (theta.dropna().std() > 0).all()
+    hard = table[["theta/lb_2", "theta/ub_2"]].dropna()
+    assert (hard == [-1.0, 1.0]).all(axis=None)
+    violation = table["train/violation"].dropna()
+    assert (violation.diff().dropna() >= 0).all()
+    assert violation[40] == pytest.approx(summary["train_violation"])
+
+
+@pytest.mark.usefixtures("small")
+def test_the_stream_can_be_replayed(tmp_path):
+    replayed = ("optimizer=sliding", "exploration_std=0.05")
+    cfg = make_config(*STREAM, *replayed, "updates=30", "eval_interval=15")
+    assert train.train(cfg, str(tmp_path))["unsolved"] == 0
+    assert metrics(tmp_path)["qp/recalled"].iloc[-1] > 0
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("optimizer", ["adam", "gauss_newton"])
+@pytest.mark.parametrize("structure", ["tied", "varying"])
+def test_a_scheme_is_released_in_mid_training(tmp_path, monkeypatch, optimizer, structure):
+    seen = []
+
+    def release(mpc: QPMPC) -> None:
+        s = torch.linspace(-1, 1, 20).double().reshape(5, 4)
+        before = mpc.value(s), mpc.policy(s)
+        QPMPC.release(mpc)
+        seen.append((before, (mpc.value(s), mpc.policy(s))))
+
+    def make(cfg: DictConfig, physics: LinearSystem) -> QPMPC:
+        mpc = make_mpc(cfg, physics)
+        monkeypatch.setattr(mpc, "release", partial(release, mpc))
+        return mpc
+
+    monkeypatch.setattr(train, "make_mpc", make)
+    options = ("constraint=mpc", f"constraint.structure={structure}", "release=2")
+    run_small(tmp_path, *options, f"optimizer={optimizer}", "updates=4", "batch_size=8")
+    ((before, after),) = seen
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-9)
+    state = load_checkpoint(tmp_path / "checkpoint.pt")
+    assert state["structure"] == "free"
+    deviation, distance = learned_C(tmp_path)
+    assert np.abs(deviation[distance > 0]).max() > 0, "it has learned what an MPC scheme cannot"
+
+
+def frame_without_times(folder: Path) -> Any:
+    table = metrics(folder)
+    return table.drop(columns=[column for column in table if column.startswith("time/")])
+
+
+@pytest.mark.usefixtures("small")
+def test_a_seed_determines_every_number(tmp_path):
+    for name, seed in (("first", 3), ("again", 3), ("other", 4)):
+        torch.manual_seed(len(name))  # what happened before plays no part
+        run_small(tmp_path / name, f"seed={seed}")
+    first, again, other = (frame_without_times(tmp_path / n) for n in ("first", "again", "other"))
+    pd.testing.assert_frame_equal(first, again, check_exact=True)
+    assert not np.allclose(first["loss/value"][1:], other["loss/value"][1:])
+    assert first["eval/J"][0] != other["eval/J"][0]
+
+
+@pytest.mark.usefixtures("small")
+def test_subgradient_step(tmp_path):
+    run_small(tmp_path, "constraint=deviation", "penalty_step=subgradient")
+    deviation, distance = learned_C(tmp_path)
+    assert np.abs(deviation[distance > 0]).max() > 0
+    assert metrics(tmp_path)["loss/deviation"][1] == 0, "it starts at C_0"
+    assert (metrics(tmp_path)["loss/deviation"][2:] > 0).all()
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
+@pytest.mark.parametrize("name", choices("ablation"))
+def test_each_ablation_runs(tmp_path, name):
+    small = [override for override in SMALL if not override.startswith(("optimizer", "task.hor"))]
+    more = ("updates=2", "warmup_steps=20", "task.episode_steps=20", "task.eval_steps=5")
+    cfg = make_config(*small, f"+ablation={name}", *more)
+    summary = train.train(cfg, str(tmp_path))
+    assert (summary["ablation"], summary["step"]) == (name, cfg.step)
+    assert summary["unsolved"] == 0
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("optimizer", ["adam", "recursive"])
+@pytest.mark.parametrize("rule", ["projection", "sdp"])
+def test_a_scheme_with_dense_weights_learns_them_by_each_rule(tmp_path, rule, optimizer):
+    """And is released in the middle of it."""
+    dense = ("task.learn_cost=[H,H_f,q,c,w]", "updates=12", "eval_interval=12", "release=6")
+    cfg = make_config(*STREAM, *dense, f"optimizer={optimizer}", f"step={rule}", "batch_size=4")
+    assert train.train(cfg, str(tmp_path))["unsolved"] == 0
+    state = load_checkpoint(tmp_path / "checkpoint.pt")["mpc"]
+    for part in ("H", "H_f"):
+        H = state[f"parametrizations.{part}.original"]
+        assert torch.equal(H, H.mT)
+        assert torch.linalg.eigvalsh(H)[0] > -1e-12
+    assert (state["w"] >= 0).all()
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
+def test_target_network(tmp_path):
+    """It changes the targets from the second update on, not the first."""
+    for name, rate in (("slow", 0.01), ("fast", 1.0), ("none", None)):
+        more = (
+            ["delay_value=false"] if rate is None else ["delay_value=true", f"target_rate={rate}"]
+        )
+        run_small(tmp_path / name, *more)
+    slow, fast, none = (metrics(tmp_path / n)["loss/value"] for n in ("slow", "fast", "none"))
+    assert slow[1] == fast[1] == none[1]
+    assert slow[2] != fast[2]
+    np.testing.assert_allclose(fast[2:], none[2:], rtol=1e-6)
+
+
+@pytest.mark.usefixtures("small")
+def test_plain_gradient_step(tmp_path):
+    run_small(tmp_path / "free", "optimizer=sgd", "constraint=free")
+    deviation, _ = learned_C(tmp_path / "free")
+    assert 0 < np.abs(deviation).max() < 0.1
+    quiet = ("optimizer.lr_cost=0", "optimizer.lr_constraints=0")
+    run_small(tmp_path / "still", "optimizer=sgd", "constraint=free", *quiet)
+    assert np.abs(learned_C(tmp_path / "still")[0]).max() == 0
+
+
+@pytest.mark.usefixtures("small")
+def test_uneven_intervals_and_steps(tmp_path):
+    """The end is always evaluated and saved, whatever the intervals."""
+    more = (
+        "updates=5",
+        "eval_interval=3",
+        "log_interval=2",
+        "steps_per_update=3",
+        "warmup_steps=5",
+    )
+    summary = run_small(tmp_path, *more)
+    assert list(metrics(tmp_path)["eval/J"].dropna().index) == [0, 3, 5]
+    assert list(metrics(tmp_path)["loss/value"].dropna().index) == [2, 4]
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["update"] == 5
+    assert summary["updates"] == 5
+
+
+@pytest.mark.usefixtures("small")
+def test_another_solver_reaches_the_same(tmp_path):
+    for solver in ("daqp", "proxqp"):
+        assert run_small(tmp_path / solver, f"solver={solver}", "updates=2")["solver"] == solver
+    first, other = (metrics(tmp_path / name)["loss/value"] for name in ("daqp", "proxqp"))
+    np.testing.assert_allclose(first, other, rtol=1e-4)
+
+
+@pytest.mark.usefixtures("small")
+def test_configuration_reaches_the_parts(tmp_path, monkeypatch):
+    losses, windows, scales = [], [], []
+    loss_value = QPQLearningLoss.loss_value
+    si, proximal = SystemIdentificationPenalty.forward, DeviationPenalty.proximal_step_
+
+    def spy_loss(self, tensordict):
+        gamma = self.value_estimator.gamma.item()
+        losses.append((gamma, self.td_error_clip, self.delay_value, tuple(tensordict.shape)))
+        return loss_value(self, tensordict)
+
+    def spy_si(self, C, tau):
+        windows.append(tuple(tau.shape))
+        return si(self, C, tau)
+
+    def spy_proximal(self, C, scale):
+        scales.append(scale)
+        return proximal(self, C, scale)
+
+    monkeypatch.setattr(QPQLearningLoss, "loss_value", spy_loss)
+    monkeypatch.setattr(SystemIdentificationPenalty, "forward", spy_si)
+    monkeypatch.setattr(DeviationPenalty, "proximal_step_", spy_proximal)
+    more = (
+        "constraint=combined",
+        "task.gamma=0.5",
+        "td_error_clip=7.0",
+        "constraint.si.windows=5",
+        "batch_size=6",
+    )
+    run_small(tmp_path, *more, "optimizer.final_fraction=0.2", "optimizer.lr_cost=0.125")
+    assert losses == [(0.5, 7.0, False, (6,))] * 4
+    assert windows == [(5, 22)] * 4
+    assert scales == pytest.approx([1.0, 0.8, 0.6, 0.4]), "it falls with the rates"
+    groups = load_checkpoint(tmp_path / "checkpoint.pt")["optimizer"]["param_groups"]
+    assert groups[0]["lr"] == pytest.approx(0.125 * 0.2)
+
+
+@pytest.mark.usefixtures("small")
+def test_training_goes_on_past_unsolved_qps(tmp_path):
+    """Hard states, and velocities too high for the action to keep them within their bounds."""
+    more = ("task.state_slack=inf", "noise.std=0.5", "constraint=free")
+    summary = run_small(tmp_path, *more, "task.episode_steps=5", "eval_interval=9")
+    table = metrics(tmp_path).drop(index=0)
+    assert summary["unsolved"] == table["qp/unsolved"].sum() > 0
+    assert table["train/unsolved"].sum() > 0
+    assert np.isfinite(table["loss/value"]).all()
+    state = load_checkpoint(tmp_path / "checkpoint.pt")["mpc"]
+    assert all(value.isfinite().all() for value in state.values())
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("constraint", ["free", "combined"])
+def test_the_second_order_learns_in_tens_of_updates(tmp_path, constraint):
+    overrides = ("solver=daqp", "seed=5", f"constraint={constraint}", "eval_interval=40")
+    summary = train.train(make_config(*overrides, "updates=40"), str(tmp_path))
+    assert summary["closed_gap"] > 0.85
+    assert summary["unsolved"] == 0
+    table = metrics(tmp_path)
+    errors = table["train/td_error"]
+    assert errors.iloc[-10:].mean() < 0.5 * errors.iloc[1:6].mean()
+    assert (table["train/accepted"].dropna() == 1).mean() > 0.7
+    assert table["train/damping"].min() >= 0.03
+    if constraint == "combined":
+        deviation, distance = learned_C(tmp_path)
+        assert (deviation[distance > 0] == 0).all(), "the proximal step holds it exactly"
+        assert np.isfinite(table["loss/si"].dropna()).all()
+
+
+@pytest.mark.usefixtures("small")
+def test_an_interruption_leaves_what_was_logged(tmp_path, monkeypatch):
+    calls, forward = [], QPQLearningLoss.loss_value
+
+    def interrupted(self, tensordict):
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return forward(self, tensordict)
+
+    monkeypatch.setattr(QPQLearningLoss, "loss_value", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_small(tmp_path)
+    table = metrics(tmp_path)
+    assert list(table.index) == [0, 1, 2, 3]
+    assert np.isfinite(table["loss/value"][1:]).all()
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("loss/value")] == [1, 2, 3]
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["update"] == 2
+    assert not (tmp_path / "summary.json").exists()
+
+
+def test_a_bad_configuration_writes_nothing(tmp_path):
+    with pytest.raises(QPError, match=r"task.horizon: got 0, expected a whole number >= 1"):
+        run_small(tmp_path / "run", "task.horizon=0")
+    assert not (tmp_path / "run").exists()
+
+
+# --- The command ---------------------------------------------------------------------------------
+
+
+QUIET = ("hydra/job_logging=disabled", "hydra/hydra_logging=disabled")
+
+
+def test_command(tmp_path, monkeypatch, capsys):
+    """`python train.py ..` makes the folder that it names at the end, below a table."""
+    skip_figures(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    # Hydra finds the folder by itself only for a script, not for an imported module.
+    arguments = [
+        "--config-path",
+        str(CONFIGS),
+        *SMALL,
+        "constraint=combined",
+        "noise=brownian",
+        *QUIET,
+    ]
+    monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
+    train.main()
+    lines = capsys.readouterr().out.splitlines()
+    folder = Path(lines[-1])
+    assert folder.parent == tmp_path / "runs" / "point_mass" / "brownian-combined"
+    assert folder.name.startswith("seed1-")
+    assert json.loads((folder / "summary.json").read_text())["noise"] == "brownian"
+    assert any(line.startswith("J discounted") for line in lines)
+
+
+def test_impossible_value_on_the_command_line(tmp_path):
+    """One sentence, no traceback."""
+    process = subprocess.run(
+        [sys.executable, str(Path(train.__file__).resolve()), "task.gamma=1.5"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert process.returncode != 0
+    assert process.stderr.strip() == "task.gamma: got 1.5, expected a number in (0, 1]."
+
+
+@pytest.mark.parametrize(
+    ("mistake", "sentence"),
+    [
+        ("batchsize=3", "Could not override 'batchsize'"),
+        ("+batchsize=3", "Did you mean batch_size?"),
+        ("constraint=none", "Could not find 'constraint/none'"),
+    ],
+)
+def test_misspelt_key_on_the_command_line(tmp_path, monkeypatch, capsys, mistake, sentence):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", "--config-path", str(CONFIGS), mistake, *QUIET])
+    with pytest.raises(SystemExit) as error:
+        train.main()
+    assert error.value.code not in (0, None)
+    assert sentence in capsys.readouterr().err + str(error.value.code)
+
+
+# --- Folders that are in use or hold a run ------------------------------------------------------
+
+TINY = (*SMALL, "figures=false", "task.eval_steps=5")
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """`python train.py ..` in this process."""
+
+    def run(*arguments: str) -> None:
+        argv = ["train.py", "--config-path", str(CONFIGS), *QUIET, *arguments]
+        monkeypatch.setattr(sys, "argv", argv)
+        train.main()
+
+    return run
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def stopped(tmp_path: Path) -> Path:
+    """A run that has a checkpoint of its second update."""
+    folder = tmp_path / "run"
+
+    def killed(*given: Any) -> None:
+        save_checkpoint(*given)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "save_checkpoint", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train.train(make_config(*TINY), str(folder))
+    return folder
+
+
+def test_a_finished_run_is_not_overwritten(command, tmp_path):
+    folder = tmp_path / "run"
+    (folder / ".hydra").mkdir(parents=True)
+    for name in ("train.log", ".hydra/config.yaml", LOCK):  # Hydra's, and a killed run's
+        (folder / name).touch()
+    command(*TINY, f"hydra.run.dir={folder}")
+    before = contents(folder)
+    message = (
+        f"^folder: got {folder}, which holds a finished run, expected one without a run. "
+        "Choose another folder by hydra.run.dir=FOLDER.$"
+    )
+    with pytest.raises(SystemExit, match=message):
+        command(*TINY, "seed=2", f"hydra.run.dir={folder}")
+    assert contents(folder) == before
+    assert not (folder / LOCK).exists()
+
+
+def test_a_stopped_run_is_not_overwritten_but_goes_on(command, stopped):
+    before = contents(stopped)
+    message = (
+        f"^folder: got {stopped}, which holds a run that was stopped, expected one without a run. "
+        f"Go on with it by resume={stopped}, or choose another folder by hydra.run.dir=FOLDER.$"
+    )
+    with pytest.raises(SystemExit, match=message):
+        command(*TINY, f"hydra.run.dir={stopped}")
+    assert contents(stopped) == before
+    command(f"resume={stopped}")
+    assert (stopped / "summary.json").exists()
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "checkpoint.pt"])
+def test_a_run_that_cannot_go_on_is_not_offered_for_it(command, stopped, name):
+    (stopped / name).write_text("[: garbage")
+    message = "a run that was stopped, expected one without a run. Choose another folder by hydra"
+    with pytest.raises(SystemExit, match=message):
+        command(*TINY, f"hydra.run.dir={stopped}")
+
+
+def test_a_folder_in_use_is_refused(command, stopped, tmp_path):
+    before = contents(stopped)
+    for overrides in ((*TINY, f"hydra.run.dir={stopped}"), (f"resume={stopped}",)):
+        with locked(stopped), pytest.raises(SystemExit, match=f"got {stopped}, in use by process "):
+            command(*overrides)
+    assert contents(stopped) == before
+
+
+def test_a_run_holds_the_lock(command, tmp_path, monkeypatch):
+    def busy(cfg: DictConfig, folder: str, *_: Any, **__: Any) -> dict[str, Any]:
+        with pytest.raises(QPError, match="in use by process"), locked(folder):
+            pass
+        return {"closed_gap": 0.5}
+
+    monkeypatch.setattr(train, "train", busy)
+    command(*TINY, f"hydra.run.dir={tmp_path}")
+    assert not (tmp_path / LOCK).exists()
+
+
+def test_a_run_goes_on_in_its_own_folder_only(command, stopped, tmp_path):
+    message = f"got {tmp_path}/other with resume={stopped}, expected {stopped}. A run goes on in i"
+    with pytest.raises(SystemExit, match=message):
+        command(f"resume={stopped}", f"hydra.run.dir={tmp_path}/other")
+
+
+def test_damaged_metrics_are_said_in_a_sentence(command, stopped):
+    (stopped / "metrics.csv").write_bytes(b"\xff\x00 garbage")
+    with pytest.raises(SystemExit, match=r"^metrics.csv: got .*metrics.csv \('utf-8' codec"):
+        command(f"resume={stopped}")
+
+
+def test_runs_that_start_in_the_same_second_have_folders_of_their_own():
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONFIGS)):
+        hydras = [compose("config", return_hydra_config=True).hydra for _ in range(3)]
+    assert len({hydra.run.dir for hydra in hydras}) == 3
+    assert len({hydra.sweep.dir for hydra in hydras}) == 3
+    assert re.fullmatch(
+        r"runs/point_mass/gaussian-deviation/seed1-\d{8}-\d{6}-\d{6}", hydras[0].run.dir
+    )
+
+
+# --- Gymnasium -----------------------------------------------------------------------------------
+
+PENDULUM = (
+    "task.A=[[1,0,0],[0,1.0375,.05],[0,.75,1]]",
+    "task.B=[[0],[.0075],[.15]]",
+    "task.stage_weight=[[0,0,0,0],[0,2,0,0],[0,0,.2,0],[0,0,0,.1]]",
+)
+SHORT = ("solver=daqp", "updates=3", "eval_interval=3", "warmup_steps=12", "task.eval_steps=5")
+
+
+@pytest.mark.parametrize("id", ["Pendulum-v1", "torch_qpmpc/PointMass-v0"])
+def test_any_gymnasium_environment_is_a_task(command, tmp_path, monkeypatch, capsys, id):
+    monkeypatch.chdir(tmp_path)
+    model = PENDULUM
+    if id != "Pendulum-v1":
+        A, B = PointMass().A.tolist(), PointMass().B.tolist()
+        W = torch.eye(6).tolist()
+        model = (f"task.A={A}", f"task.B={B}", f"task.stage_weight={W}")
+    command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false")
+    folder = Path(capsys.readouterr().out.splitlines()[-1])
+    assert folder.parent == tmp_path / "runs" / "gymnasium" / id / "none-deviation"
+    assert folder.name.startswith("seed1-")
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["task"], summary["updates"], summary["unsolved"]) == ("gymnasium", 3, 0)
+    assert math.isfinite(summary["J_final"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ((), r"^task.id: got '\?\?\?', expected the id of a Gymnasium env.* task.id=Pendulum-v1"),
+        (("task.id=Pendulum-v9",), "^task.id: got 'Pendulum-v9', expected an environment that Gym"),
+        (("task.id=CartPole-v1",), r"^task.id: got 'CartPole-v1', whose action space is Discrete"),
+        (("task.id=Pendulum-v1",), r"^task.A: got null, expected the rows of a matrix \(3, 3\)"),
+        (
+            ("task.id=Pendulum-v1", *PENDULUM[:1]),
+            r"^task.B: got null, .* \(3, 1\) .* least squares .*'task.B=\[\[0\],\[.1\]\]'",
+        ),
+        (("task.id=Pendulum-v1", *PENDULUM[:2]), r"^task.stage_weight: got null, .* \(4, 4\)"),
+    ],
+)
+def test_what_a_gymnasium_task_lacks_is_said(command, tmp_path, monkeypatch, overrides, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=message):
+        command("task=gymnasium", *overrides, *SHORT)

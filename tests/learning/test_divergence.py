@@ -1,0 +1,80 @@
+"""Far too large a learning rate spoils what is learned, not the run."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pandas as pd
+import pytest
+import torch
+
+import train
+from tests.runs import SMALL, make_config
+from torch_qpmpc import QPMPC, GaussNewton
+from torch_qpmpc.experiment.checkpoint import load_checkpoint
+from torch_qpmpc.learning.updates import first_order
+
+#: The factors by which the rates are too large are a thousand and more.
+RATES = {
+    "adam": ("optimizer.lr_cost=10", "optimizer.lr_constraints=10"),
+    "sgd": ("optimizer.lr_cost=1", "optimizer.lr_constraints=1"),
+    "gauss_newton": ("optimizer.scale_constraints=1e6",),
+    "recursive": ("optimizer.scale_constraints=1e6", "optimizer.lr=1", "replay=true"),
+}
+
+
+@pytest.mark.parametrize("slack", ["100", "inf"])
+@pytest.mark.parametrize("optimizer", RATES)
+def test_a_run_with_far_too_large_a_rate_ends_with_a_summary(tmp_path, optimizer, slack):
+    sizes = ("updates=25", "eval_interval=25", "task.eval_steps=5", f"task.state_slack={slack}")
+    rates = (f"optimizer={optimizer}", *RATES[optimizer], "optimizer.final_fraction=1")
+    cfg = make_config(*SMALL, *sizes, "constraint=free", "figures=false", *rates)
+    train.train(cfg, str(tmp_path))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["J_final"] > summary["J_true_model"], "what it has learned is no good"
+    for key in ("J_start", "J_final", "train_cost", "train_violation", "unsolved"):
+        assert math.isfinite(summary[key]), key
+    state = load_checkpoint(tmp_path / "checkpoint.pt")["mpc"]
+    assert not any(value.isnan().any() for value in state.values())
+    assert state["C"].isfinite().all()
+    table = pd.read_csv(tmp_path / "metrics.csv")
+    assert len(table) == 26, "each update has reported"
+    assert summary["unsolved"] == table["qp/unsolved"].sum()
+
+
+@pytest.mark.parametrize("trust_region", [True, False])
+@pytest.mark.parametrize("memory", [0, 4])
+def test_gauss_newton_takes_no_step_that_is_not_finite(trust_region, memory):
+    mpc = QPMPC(2, 1, 3, solver="daqp")
+    optimizer = GaussNewton(mpc, trust_region=trust_region, memory=memory)
+    before = {name: value.clone() for name, value in mpc.state_dict().items()}
+    s, a = torch.ones(2, 2).double(), torch.zeros(2, 1).double()
+    target = torch.full((2,), 1e308, dtype=torch.float64)
+    S = 1e308 * torch.eye(mpc.n_z, dtype=torch.float64)
+    report = optimizer.step(s, a, target, penalty=S)
+    assert not report.accepted
+    assert all(torch.equal(value, before[name]) for name, value in mpc.state_dict().items())
+    assert optimizer.param_groups[0]["damping"] > report.damping
+    assert optimizer.step(s, a, mpc.action_value(s, a).detach() + 1).accepted
+
+
+class Steep(torch.nn.Module):
+    """A loss that is finite, with a gradient that is not."""
+
+    def __init__(self, mpc: QPMPC) -> None:
+        super().__init__()
+        self.mpc = mpc
+
+    def forward(self, batch: object) -> dict[str, torch.Tensor]:
+        return {"loss_value": (self.mpc.C - self.mpc.C.detach()).abs().sum().sqrt()}
+
+
+def test_a_gradient_that_is_not_finite_moves_nothing():
+    mpc = QPMPC(2, 1, 3, learn=["C"], solver="daqp")
+    optimizer = torch.optim.SGD(mpc.parameter_groups({"cost": 1.0, "constraints": 1.0}))
+    before = mpc.C.detach().clone()
+    update = first_order(mpc, Steep(mpc), optimizer, None, None)  # pyright: ignore[reportArgumentType] -- what is used of a loss is there
+    terms, _ = update(None, None)  # pyright: ignore[reportArgumentType] -- no batch is looked at
+    assert terms["loss/value"] == 0
+    assert torch.equal(mpc.C, before)

@@ -1,0 +1,335 @@
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.optim.lr_scheduler import LambdaLR
+from torch.testing import assert_close
+
+from tests.problems import MIXED, normal, random_mpc, random_states
+from torch_qpmpc import QPMPC, GaussNewton, QPError, SystemIdentificationPenalty
+from torch_qpmpc.learning.gauss_newton import FALL, RISE
+
+COUNT, DAMPING = 7, 0.2
+ALL = ("H", "H_f", "q", "c", "C", "b", "G", "lb", "ub", "w")
+PARTS = {
+    "default": {},
+    "no C": {"learn": ("H", "c", "b")},
+    "C alone": {"learn": ("C",)},
+    "everything": {"learn": ALL, "free": 0.01},
+    "block": {"hessian": "block", "stage_weight": torch.eye(3), "learn": ("H", "H_f", "C")},
+    "full": {"hessian": "full", "stage_weight": torch.eye(3), "learn": ("H", "C")},
+    "projected": {"step": "projection", "hessian": "full", "learn": ("H", "w"), "free": 0.01},
+    "tied": {"structure": "tied", "learn": ("c", "q", "C", "b", "lb", "ub", "w"), "free": 0.01},
+    "varying": {"structure": "varying", "learn": ("C", "G"), **MIXED},
+}
+
+
+def pairs(count: int = COUNT) -> tuple[Tensor, Tensor]:
+    return random_states(count, size=0.9), random_states(count, 1, size=0.45, seed=1)
+
+
+def targets(mpc: QPMPC, size: float = 0.1) -> Tensor:
+    s, a = pairs()
+    return mpc.action_value(s, a).detach() + size * normal(COUNT, seed=2)
+
+
+def leaves_of(optimizer: GaussNewton) -> list[Tensor]:
+    return [leaf for group in optimizer.param_groups for leaf in group["params"]]
+
+
+def dense_gradients(mpc: QPMPC, leaves: list[Tensor]) -> list[Tensor]:
+    """dQ_i/dleaf as rows ``(B, n)``, a pair at a time."""
+    s, a = pairs()
+    rows = []
+    for i in range(COUNT):
+        value = mpc.action_value(s[i], a[i])
+        found = torch.autograd.grad(value, leaves, allow_unused=True, materialize_grads=True)
+        rows.append([part.flatten() for part in found])
+    return [torch.stack(part) for part in zip(*rows, strict=True)]
+
+
+def expected_steps(mpc: QPMPC, optimizer: GaussNewton, S: Tensor | None) -> list[Tensor]:
+    """The damped least-squares step in theta itself, as large as theta is."""
+    leaves = leaves_of(optimizer)
+    scales = [group["scale"] for group in optimizer.param_groups for _ in group["params"]]
+    gradients = dense_gradients(mpc, leaves)
+    sizes = [scale * g.square().sum(-1) for scale, g in zip(scales, gradients, strict=True)]
+    mu = DAMPING * torch.stack(sizes).sum(0).mean()
+    G = torch.cat(gradients, dim=1)
+    scale = torch.cat([torch.full_like(g[0], d) for g, d in zip(gradients, scales, strict=True)])
+    s, a = pairs()
+    delta = targets(mpc) - mpc.action_value(s, a).detach()
+    normal_matrix, right = G.mT @ G + torch.diag(mu / scale), G.mT @ delta
+    if S is not None:
+        at = 0
+        for leaf in leaves:
+            if leaf is mpc.C:
+                of_rows = torch.block_diag(*[COUNT * S] * len(leaf))
+                part = slice(at, at + leaf.numel())
+                normal_matrix[part, part] += of_rows
+                right[part] -= of_rows @ leaf.detach().flatten()
+            at += leaf.numel()
+    step = torch.linalg.solve(normal_matrix, right)
+    parts = step.split([leaf.numel() for leaf in leaves])
+    return [x.reshape(leaf.shape) for x, leaf in zip(parts, leaves, strict=True)]
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_the_step_is_the_damped_least_squares_step(name):
+    mpc = random_mpc(2, **PARTS[name])
+    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
+    leaves = leaves_of(optimizer)
+    before = [leaf.detach().clone() for leaf in leaves]
+    expected = expected_steps(mpc, optimizer, None)
+    report = optimizer.step(*pairs(), targets(mpc))
+    assert report.accepted
+    assert math.isnan(report.ratio)
+    assert max(step.abs().max() for step in expected) > 1e-4
+    for leaf, old, step in zip(leaves, before, expected, strict=True):
+        assert_close(leaf.detach() - old, step, rtol=1e-5, atol=1e-9)
+
+
+def test_the_si_penalty_is_part_of_the_step():
+    mpc = random_mpc(3)
+    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
+    S = SystemIdentificationPenalty(1e-2).curvature(normal(5, mpc.n_z))
+    leaves = leaves_of(optimizer)
+    before = [leaf.detach().clone() for leaf in leaves]
+    expected = expected_steps(mpc, optimizer, S)
+    optimizer.step(*pairs(), targets(mpc), penalty=S)
+    for leaf, old, step in zip(leaves, before, expected, strict=True):
+        assert_close(leaf.detach() - old, step, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_memory_keeps_what_past_pairs_know(name):
+    """A stream of single pairs: as if the past were in the batch, without errors and unchanged."""
+    mpc = random_mpc(2, **PARTS[name])
+    optimizer = GaussNewton(mpc, damping=DAMPING, memory=3, trust_region=False)
+    leaves, (s, a), target = leaves_of(optimizer), pairs(), targets(mpc)
+    scales = [group["scale"] for group in optimizer.param_groups for _ in group["params"]]
+    scale = torch.cat([torch.full((x.numel(),), d) for x, d in zip(leaves, scales, strict=True)])
+    rows = torch.zeros(0, len(scale)).double()
+    for i in range(COUNT):
+        value = mpc.action_value(s[i], a[i])
+        found = torch.autograd.grad(value, leaves, allow_unused=True, materialize_grads=True)
+        rows = torch.cat((torch.cat([part.flatten() for part in found]).unsqueeze(0), rows))[:4]
+        mu = DAMPING * (scale * rows.square()).sum(-1).mean()
+        matrix = rows.mT @ rows + torch.diag(mu / scale)
+        expected = torch.linalg.solve(matrix, rows[0] * (target[i] - value).detach())
+        before = torch.cat([leaf.detach().flatten() for leaf in leaves])
+        optimizer.step(s[i : i + 1], a[i : i + 1], target[i : i + 1])
+        after = torch.cat([leaf.detach().flatten() for leaf in leaves])
+        assert_close(after - before, expected, rtol=1e-4, atol=1e-8)
+        rows = rows[:3]
+
+
+def test_a_memory_is_part_of_the_state():
+    mpc = random_mpc(2)
+    optimizer = GaussNewton(mpc, memory=4)
+    optimizer.step(*pairs(), targets(mpc))
+    twin = copy.deepcopy(mpc)
+    other = GaussNewton(twin, memory=4)
+    other.load_state_dict(optimizer.state_dict())
+    for m, o in ((mpc, optimizer), (twin, other)):
+        o.step(*pairs(), targets(m, size=-0.2))
+    assert_close(twin.state_dict(), mpc.state_dict(), rtol=0, atol=0)
+    forgetful = GaussNewton(copy.deepcopy(twin), memory=4)
+    assert not forgetful.state
+
+
+def test_errors_fall_step_by_step():
+    mpc, other = random_mpc(4), random_mpc(4, free=0.2)
+    target = other.action_value(*pairs()).detach()
+    optimizer = GaussNewton(mpc)
+    errors = []
+    for _ in range(10):
+        errors.append((mpc.action_value(*pairs()) - target).square().sum().item())
+        optimizer.step(*pairs(), target)
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 0.05 * errors[0]
+
+
+def test_a_step_that_raises_the_errors_is_taken_back():
+    mpc = random_mpc(5)
+    target = targets(mpc, 300.0)
+    optimizer = GaussNewton(mpc, damping=1e-9)
+    before = copy.deepcopy(mpc.state_dict())
+    report = optimizer.step(*pairs(), target)
+    assert not report.accepted
+    assert not report.ratio > 0
+    assert_close(mpc.state_dict(), before, rtol=0, atol=0)
+    assert optimizer.param_groups[0]["damping"] == RISE * report.damping
+
+
+def test_the_damping_comes_back_to_its_least():
+    mpc = random_mpc(6)
+    target = targets(mpc, 1e-3)
+    optimizer = GaussNewton(mpc, damping=0.05)
+    for group in optimizer.param_groups:
+        group["damping"] = 0.06 / FALL
+    used = [optimizer.step(*pairs(), target).damping for _ in range(3)]
+    assert used == [0.06 / FALL, 0.06, 0.05]
+
+
+def test_the_trust_region_counts_the_penalty():
+    """Where the targets are met, the penalty alone moves C, and is seen to fall."""
+    mpc = random_mpc(7)
+    S = SystemIdentificationPenalty(1e-3).curvature(normal(5, mpc.n_z))
+
+    def penalty() -> float:
+        return ((mpc.C @ S) * mpc.C).sum().item()
+
+    before = penalty()
+    report = GaussNewton(mpc).step(*pairs(), targets(mpc, 0.0), penalty=S)
+    assert report.accepted
+    assert penalty() < before
+
+
+def test_pairs_without_a_solution_or_a_target_are_left_out():
+    mpc = random_mpc(8, on_failure="mask")
+    twin = copy.deepcopy(mpc)
+    s, a = pairs()
+    target = targets(mpc)
+    bad_a, bad_target = a.clone(), target.clone()
+    bad_a[1], bad_target[3] = 9.0, torch.inf  # beyond a hard bound; no value of s+
+    keep = [0, 2, 4, 5, 6]
+    one, other = GaussNewton(mpc), GaussNewton(twin)
+    one.step(s, bad_a, bad_target)
+    for group in other.param_groups:  # the mean of the kernel's diagonal counts all seven
+        group["damping"] *= len(keep) / COUNT
+    other.step(s[keep], a[keep], target[keep])
+    assert_close(mpc.state_dict(), twin.state_dict(), rtol=1e-6, atol=1e-9)
+
+
+def test_a_clipped_error_moves_theta_as_far_as_the_clip():
+    mpc = random_mpc(9)
+    twin = copy.deepcopy(mpc)
+    s, a = pairs(1)
+    value = mpc.action_value(s, a).detach()
+    GaussNewton(mpc, td_error_clip=0.1).step(s, a, value + 5.0)
+    GaussNewton(twin).step(s, a, value + 0.1)
+    assert_close(mpc.state_dict(), twin.state_dict(), rtol=1e-9, atol=1e-12)
+
+
+def test_schedulers_change_the_part_of_the_step_that_is_taken():
+    mpc = random_mpc(10)
+    optimizer = GaussNewton(mpc, trust_region=False, lr=1.0)
+    schedule = LambdaLR(optimizer, lambda update: 1 / (1 + update))
+    target = targets(mpc)
+    before = mpc.C.detach().clone()
+    twin = copy.deepcopy(mpc)
+    optimizer.step(*pairs(), target)
+    whole = mpc.C.detach() - before
+    schedule.step()
+    with torch.no_grad():
+        mpc.load_state_dict(twin.state_dict())
+    optimizer.step(*pairs(), target)
+    assert_close(mpc.C.detach() - before, whole / 2)
+
+
+def test_frozen_parts_stay():
+    mpc = random_mpc(14)
+    mpc.C.requires_grad_(False)
+    before, target = copy.deepcopy(mpc.state_dict()), targets(mpc)
+    GaussNewton(mpc).step(*pairs(), target)
+    assert torch.equal(mpc.C, before["C"])
+    assert not torch.equal(mpc.c, before["c"])
+
+
+def test_its_state_can_be_saved():
+    mpc = random_mpc(11)
+    optimizer = GaussNewton(mpc)
+    for group in optimizer.param_groups:
+        group["damping"] = 0.7
+    fresh = GaussNewton(mpc)
+    fresh.load_state_dict(optimizer.state_dict())
+    assert fresh.step(*pairs(), targets(mpc)).damping == 0.7
+
+
+def test_a_warm_start_saves_time_only():
+    mpc = random_mpc(12, solver="proxqp")
+    twin, s_a, target = copy.deepcopy(mpc), pairs(), targets(mpc)
+    first = GaussNewton(mpc).step(*s_a, target)
+    again = GaussNewton(twin).step(*s_a, target, warm_start=first.solution.active)
+    assert again.solution.iterations.sum() < first.solution.iterations.sum()
+    assert_close(mpc.state_dict(), twin.state_dict(), rtol=1e-5, atol=1e-7)
+
+
+def test_without_any_error_theta_stays():
+    mpc = random_mpc(13)
+    before = copy.deepcopy(mpc.state_dict())
+    assert GaussNewton(mpc).step(*pairs(), targets(mpc, 0.0)).accepted
+    assert_close(mpc.state_dict(), before, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("memory", -1, "a whole number >= 0"),
+        ("lr", 0.0, r"a number in \(0, 1\]"),
+        ("lr", 1.1, r"a number in \(0, 1\]"),
+        ("damping", -1.0, "a finite number > 0"),
+        ("td_error_clip", math.inf, "a finite number > 0"),
+    ],
+)
+def test_numbers_out_of_range_are_named(name, value, expected):
+    with pytest.raises(QPError, match=f"{name}: got {value}, expected {expected}"):
+        GaussNewton(random_mpc(), **{name: value})
+
+
+def test_unknown_scales_are_named():
+    with pytest.raises(QPError, match=r"rates: got \['A'\], expected names among"):
+        GaussNewton(random_mpc(), scales={"A": 1.0})
+
+
+def test_a_penalty_needs_a_free_C():
+    mpc = random_mpc(learn=("H", "c"))
+    with pytest.raises(QPError, match="penalty: got a C that is not free, expected C among the"):
+        GaussNewton(mpc).step(*pairs(), targets(mpc), penalty=torch.eye(mpc.n_z).double())
+
+
+@pytest.mark.parametrize("trust_region", [True, False])
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_a_batch_without_a_usable_pair_moves_nothing(bad, trust_region):
+    mpc = random_mpc(15, on_failure="mask")
+    optimizer = GaussNewton(mpc, memory=3, trust_region=trust_region)
+    before, (s, a) = copy.deepcopy(mpc.state_dict()), pairs()
+    a[1] = 9.0  # beyond a hard bound
+    penalty = SystemIdentificationPenalty(1e-2).curvature(normal(5, mpc.n_z))
+    message = "None of the 7 pairs can be learned from: 1 have a QP .*, 6 a target that is not fin"
+    with pytest.warns(RuntimeWarning, match=message):
+        report = optimizer.step(s, a, torch.full((COUNT,), bad), penalty=penalty)
+    assert not report.accepted
+    assert math.isnan(report.ratio)
+    assert (report.unsolved, report.without_target) == (1, 6)
+    assert report.damping == optimizer.param_groups[0]["damping"] == 0.03
+    assert_close(mpc.state_dict(), before, rtol=0, atol=0)
+    assert not optimizer.state
+
+
+@pytest.mark.filterwarnings("error")
+def test_pairs_that_are_left_out_are_counted():
+    mpc = random_mpc(15, on_failure="mask")
+    (s, a), target = pairs(), targets(mpc)
+    a[1], target[1], target[3], target[4] = 9.0, torch.inf, torch.nan, torch.inf
+    report = GaussNewton(mpc).step(s, a, target)
+    assert report.accepted
+    assert (report.unsolved, report.without_target) == (1, 2)
+
+
+def test_a_report_is_shown_without_tensors():
+    mpc = random_mpc(15, on_failure="mask")
+    (s, a), target = pairs(), targets(mpc)
+    a[1], target[3] = 9.0, torch.nan
+    text = repr(GaussNewton(mpc).step(s, a, target))
+    assert text.startswith("StepReport(damping=0.03, ratio=")
+    assert "accepted=True, unsolved=1, without_target=1, solution=QPSolution(" in text
+    assert "solved 6 of 7, 1 INFEASIBLE" in text
+    assert "tensor" not in text
+    assert len(text.splitlines()) < 10
+    assert len(text) < 800

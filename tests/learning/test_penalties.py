@@ -1,0 +1,294 @@
+"""The penalties against the paper's formulas, written out entry by entry."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from torch_qpmpc import QPMPC, DeviationPenalty, QPError, SystemIdentificationPenalty
+from torch_qpmpc.envs import PointMass
+from torch_qpmpc.learning.penalties import deviation_penalty, system_identification_penalty
+from torch_qpmpc.mpc.banded import banded_matrix
+
+N_X, N_U, N = 2, 1, 4
+N_Z = N * (N_X + N_U) + N_X
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def normal(generator: torch.Generator, *shape: int) -> torch.Tensor:
+    return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+
+def make_C_0(generator: torch.Generator) -> torch.Tensor:
+    return banded_matrix(normal(generator, N_X, N_X), normal(generator, N_X, N_U), N)
+
+
+# --- Deviation -----------------------------------------------------------------------------------
+
+
+def test_mask_is_the_printed_one():
+    """eq:sdp2's C_mask for z = [x_0, u_0, .., u_2, x_3]; then with blocks for entries."""
+    a, o, b = 3.0, 5.0, 7.0  # c_1 above, c_2 on, c_3 below the band
+    scalar = torch.tensor(
+        [
+            [o, o, o, a, a, a, a],
+            [b, b, o, o, o, a, a],
+            [b, b, b, b, o, o, o],
+        ]
+    )
+    penalty = DeviationPenalty(torch.zeros(3, 7), 1, 1, c_1=a, c_2=o, c_3=b)
+    assert torch.equal(penalty.C_mask, scalar)
+
+    n_x, n_u = 4, 2
+    widths = torch.tensor([n_x, n_u] * 3 + [n_x])
+    blocks = scalar.repeat_interleave(n_x, dim=0).repeat_interleave(widths, dim=1)
+    penalty = DeviationPenalty(torch.zeros(blocks.shape), n_x, n_u, c_1=a, c_2=o, c_3=b)
+    assert torch.equal(penalty.C_mask, blocks)
+
+
+def test_mask_grows_with_the_distance():
+    """Weights off the band rise by growth with every stage beyond the first."""
+    a, o, b, g = 3.0, 5.0, 7.0, 0.5
+    a_2, b_2 = a * (1 + g), b * (1 + g)
+    expected = torch.tensor(
+        [
+            [o, o, o, a, a, a_2, a_2],
+            [b, b, o, o, o, a, a],
+            [b_2, b_2, b, b, o, o, o],
+        ]
+    )
+    penalty = DeviationPenalty(torch.zeros(3, 7), 1, 1, c_1=a, c_2=o, c_3=b, growth=g)
+    assert torch.equal(penalty.C_mask, expected)
+
+
+def test_default_weights_are_the_papers():
+    penalty = DeviationPenalty(torch.zeros(3, 7, dtype=torch.float64), 1, 1)
+    assert penalty.C_mask[0].tolist() == [1e-4] * 3 + [1.0] * 4
+    assert penalty.C_mask[2].tolist() == [0.0] * 4 + [1e-4] * 3
+
+
+def test_deviation_penalty_entry_by_entry(generator):
+    C_0 = make_C_0(generator)
+    C, mask = C_0 + normal(generator, *C_0.shape), normal(generator, *C_0.shape).abs()
+    total = sum(
+        abs(mask[i, j] * (C[i, j] - C_0[i, j])).item()
+        for i in range(C.shape[0])
+        for j in range(C.shape[1])
+    )
+    assert deviation_penalty(C, C_0, mask).item() == pytest.approx(total, rel=1e-12)
+    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=2.0, c_2=0.5, c_3=0.25)
+    expected = deviation_penalty(C, C_0, penalty.C_mask)
+    assert penalty(C).item() == expected.item() > 0
+    assert penalty(C_0).item() == 0
+
+
+def test_deviation_penalty_has_the_right_gradient(generator):
+    C_0 = make_C_0(generator)
+    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=2.0, c_2=0.5, c_3=0.25)
+    C = (C_0 + normal(generator, *C_0.shape)).requires_grad_()
+    assert torch.autograd.gradcheck(penalty, C, atol=1e-7)
+    (gradient,) = torch.autograd.grad(penalty(C), C)
+    assert torch.equal(gradient, penalty.C_mask * (C - C_0).sign())
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_proximal_step_is_the_minimiser_entry_by_entry(generator, scale):
+    """Against a search over a fine grid, and over the kink, for every entry."""
+    C_0 = make_C_0(generator)
+    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=1.0, c_2=0.2, c_3=0.0, growth=0.1)
+    start = C_0 + normal(generator, *C_0.shape)
+    C = torch.nn.Parameter(start.clone())
+    penalty.proximal_step_(C, scale)
+
+    grid = torch.linspace(-5, 5, 20001, dtype=torch.float64).unsqueeze(1)
+    c, c_0, weight = start.flatten(), C_0.flatten(), scale * penalty.C_mask.flatten()
+
+    def cost(x):
+        return 0.5 * (x - c) ** 2 + weight * (x - c_0).abs()
+
+    # About the start and about the kink, as the minimiser may lie at either.
+    candidates = torch.cat([c_0 + grid, c_0.unsqueeze(0)])
+    best = cost(candidates).min(0)
+    found = C.detach().flatten()
+    assert (cost(found) <= best.values + 1e-15).all(), "no candidate is better"
+    nearest = candidates.gather(0, best.indices.unsqueeze(0)).squeeze(0)
+    assert (found - nearest).abs().max() <= 2.5e-4, "and it is the one: within a grid step"
+
+
+def test_proximal_step_reaches_C_0_exactly(generator):
+    C_0 = make_C_0(generator)
+    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=1.0, c_2=0.01, c_3=0.0)
+    start = C_0 + 0.1 * normal(generator, *C_0.shape)
+    C = torch.nn.Parameter(start.clone())
+    pointer = C.data_ptr()
+    assert penalty.proximal_step_(C) is None
+    above, free = penalty.C_mask == 1, penalty.C_mask == 0
+    assert torch.equal(C[above], C_0[above])
+    assert torch.equal(C[free], start[free]), "a weight of zero leaves an entry alone"
+    on = penalty.C_mask == 0.01
+    shrunk = (C - C_0)[on].abs()
+    torch.testing.assert_close(shrunk, ((start - C_0)[on].abs() - 0.01).clamp(min=0))
+    assert C.data_ptr() == pointer
+    assert C.requires_grad
+    assert C.is_leaf
+    C.grad = None
+    C.square().sum().backward()  # still usable
+
+
+def test_the_subgradient_with_adam_leaves_what_the_proximal_step_removes(generator):
+    C_0 = make_C_0(generator)
+    penalty = DeviationPenalty(C_0, N_X, N_U)
+    totals = {}
+    for step in ("subgradient", "proximal"):
+        C = torch.nn.Parameter(C_0 + 0.1 * normal(generator, *C_0.shape))
+        optimizer = torch.optim.Adam([C], lr=2e-3)
+        for _ in range(200):
+            optimizer.zero_grad()
+            force = 0.1 * normal(generator, *C_0.shape)
+            loss = (force * C).sum()
+            (loss + penalty(C) if step == "subgradient" else loss).backward()
+            optimizer.step()
+            if step == "proximal":
+                penalty.proximal_step_(C)
+        totals[step] = (C - C_0)[penalty.C_mask == 1].abs().sum().item()
+    assert totals["proximal"] == 0
+    assert totals["subgradient"] > 1e-3
+
+
+def test_deviation_penalty_keeps_its_own_C_0(generator):
+    mpc = QPMPC.from_model(normal(generator, N_X, N_X), normal(generator, N_X, N_U), N)
+    penalty = DeviationPenalty(mpc.C_0, N_X, N_U)
+    twin = copy.deepcopy(penalty)
+    expected = penalty(mpc.C_0 + 1)
+    with torch.no_grad():
+        mpc.C += 1
+        mpc.C_0 += 1
+    assert penalty(mpc.C).item() == twin(mpc.C).item() == pytest.approx(expected.item())
+    assert {"C_0", "C_mask"} == set(penalty.state_dict())
+    assert penalty.to(torch.float32).C_mask.dtype == torch.float32
+
+
+@pytest.mark.parametrize("name", ["c_1", "c_2", "c_3", "growth"])
+@pytest.mark.parametrize("weight", [-1.0, math.inf, math.nan])
+def test_impossible_deviation_weights(name, weight):
+    with pytest.raises(QPError, match=rf"{name}: got {weight}, expected a finite weight >= 0"):
+        DeviationPenalty(torch.zeros(3, 7), 1, 1, **{name: weight})
+
+
+@pytest.mark.parametrize(("shape", "horizon"), [((3, 8), 1), ((5, 8), 2), ((6, 3), 3)])
+def test_C_0_of_no_horizon(shape, horizon):
+    with pytest.raises(QPError, match=rf"C_0: got shape \({shape[0]}, .* for N = {horizon}"):
+        DeviationPenalty(torch.zeros(shape), 2, 1)
+
+
+# --- System identification -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_system_identification_penalty_window_by_window(generator, normalised):
+    C, windows = normal(generator, N * N_X, N_Z), normal(generator, 7, N_Z)
+    rows = C.numpy()
+    if normalised:
+        rows = rows / np.sqrt((rows**2).sum(1, keepdims=True))
+    total = sum(np.linalg.norm(rows @ tau) ** 2 for tau in windows.numpy())
+    found = system_identification_penalty(C, windows, normalised=normalised)
+    assert found.item() == pytest.approx(total, rel=1e-12)
+    module = SystemIdentificationPenalty(1e-3, normalised=normalised)
+    assert module(C, windows).item() == pytest.approx(1e-3 * total, rel=1e-12)
+    assert SystemIdentificationPenalty()(C, windows).item() == pytest.approx(
+        1e-6 * system_identification_penalty(C, windows).item()
+    )
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_system_identification_penalty_has_the_right_gradient(generator, normalised):
+    C = normal(generator, N * N_X, N_Z).requires_grad_()
+    windows = normal(generator, 7, N_Z)
+    penalty = SystemIdentificationPenalty(0.1, normalised=normalised)
+    assert torch.autograd.gradcheck(lambda x: penalty(x, windows), C)
+
+
+def test_normalised_penalty_does_not_reward_shrinking_C(generator):
+    C, windows = normal(generator, N * N_X, N_Z), normal(generator, 7, N_Z)
+    scaled = torch.linspace(0.1, 3, N * N_X, dtype=torch.float64).unsqueeze(1) * C
+    raw, normalised = (
+        SystemIdentificationPenalty(1.0),
+        SystemIdentificationPenalty(1.0, normalised=True),
+    )
+    torch.testing.assert_close(normalised(scaled, windows), normalised(C, windows))
+    torch.testing.assert_close(raw(0.1 * C, windows), 0.01 * raw(C, windows))
+    C = C.requires_grad_()
+    (gradient,) = torch.autograd.grad(normalised(C, windows), C)
+    torch.testing.assert_close(
+        (gradient * C).sum(-1), torch.zeros(N * N_X, dtype=torch.float64), atol=1e-12, rtol=0
+    )
+
+
+def test_normalised_penalty_of_a_zero_row_is_finite(generator):
+    C = normal(generator, N * N_X, N_Z)
+    C[1] = 0
+    C.requires_grad_()
+    value = system_identification_penalty(C, normal(generator, 7, N_Z), normalised=True)
+    value.backward()
+    assert value.isfinite()
+    assert C.grad is not None
+    assert C.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_true_model_explains_noise_free_windows(generator, normalised):
+    physics, horizon = PointMass(noise_std=0.0), 5
+    s, entries = 0.5 * normal(generator, 6, 4), []
+    for _ in range(horizon):
+        a = (0.5 * normal(generator, 6, 2)).clamp(-1, 1)
+        entries += [s, a]
+        s = physics.step(s, a, torch.zeros(4))
+    windows = torch.cat([*entries, s], dim=-1)
+    penalty = SystemIdentificationPenalty(1.0, normalised=normalised)
+    assert penalty(banded_matrix(physics.A, physics.B, horizon), windows).item() < 1e-25
+    A, B, _ = physics.corrupted(1)
+    assert penalty(banded_matrix(A, B, horizon), windows).item() > 1e-2
+    # Its gradient at the corrupted model leads towards the true one.
+    C = banded_matrix(A, B, horizon).requires_grad_()
+    (gradient,) = torch.autograd.grad(penalty(C, windows), C)
+    towards = banded_matrix(physics.A, physics.B, horizon) - C
+    assert (gradient * towards).sum() < 0
+
+
+def test_float32_windows_of_the_replay(generator):
+    C, windows = normal(generator, N * N_X, N_Z), normal(generator, 7, N_Z)
+    found = system_identification_penalty(C, windows.float())
+    assert found.dtype == torch.float64
+    torch.testing.assert_close(found, system_identification_penalty(C, windows), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("shape", [(N_Z,), (3, N_Z - 1), (2, 3, N_Z)])
+def test_windows_of_another_shape(generator, shape):
+    match = rf"windows: got shape \({shape[0]},.*, expected shape \(M, {N_Z}\)"
+    with pytest.raises(QPError, match=match):
+        system_identification_penalty(normal(generator, N * N_X, N_Z), normal(generator, *shape))
+
+
+@pytest.mark.parametrize("beta", [-1e-6, math.inf, math.nan])
+def test_impossible_beta(beta):
+    with pytest.raises(QPError, match=rf"beta: got {beta}, expected a finite weight >= 0"):
+        SystemIdentificationPenalty(beta)
+
+
+def test_the_si_penalty_as_a_quadratic_in_C():
+    generator = torch.Generator().manual_seed(0)
+    C, windows = normal(generator, 3, 8), normal(generator, 5, 8)
+    penalty = SystemIdentificationPenalty(0.3)
+    S = penalty.curvature(windows)
+    assert_close(0.5 * ((C @ S) * C).sum(), penalty(C, windows))
+    with pytest.raises(QPError, match=r"normalised: got True, expected False\. Only then"):
+        SystemIdentificationPenalty(0.3, normalised=True).curvature(windows)

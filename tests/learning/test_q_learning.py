@@ -1,0 +1,276 @@
+"""The Q-learning loss: its values, its gradients, and the paper's update."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import SoftUpdate
+
+from tests.transitions import (
+    GAMMA,
+    LEARN,
+    METADATA,
+    TRACE,
+    hand_prediction,
+    hand_target,
+    learned_leaves,
+    make_batch,
+    make_loss,
+    make_operator,
+    perturb,
+)
+from torch_qpmpc import QPMPC, QPError, QPQLearningLoss
+from torch_qpmpc.learning.q_learning import td_loss
+
+
+@pytest.mark.parametrize("delay_value", [False, True])
+@pytest.mark.parametrize("estimator", TRACE)
+def test_loss_and_its_gradients(estimator, delay_value):
+    operator = make_operator()
+    start = copy.deepcopy(operator.module)
+    loss = make_loss(estimator, operator, delay_value=delay_value, reduction="none")
+    if delay_value:
+        SoftUpdate(loss, tau=0.1)
+    perturb(loss)
+    td = make_batch(6, 5)
+    before = td.clone()
+
+    out = loss(td)
+    target = hand_target(start if delay_value else operator.module, td, TRACE[estimator])
+    delta = target - hand_prediction(operator.module, td)
+    torch.testing.assert_close(out["loss_value"], 0.5 * delta**2, atol=1e-9, rtol=0)
+    torch.testing.assert_close(td["td_error"], delta.detach() ** 2, atol=1e-9, rtol=0)
+    assert (td.exclude("td_error") == before).all(), "the input but for the priority"
+    assert set(td.keys(True, True)) == {*before.keys(True, True), "td_error"}
+
+    out["loss_value"].mean().backward()
+    leaves = learned_leaves(loss)
+    assert len(leaves) == len(LEARN)
+    for key, leaf in leaves.items():
+        assert leaf.grad is not None, key
+        assert leaf.grad.isfinite().all(), key
+        assert leaf.grad.norm() > 0, key
+    for key, frozen in loss.target_value_network_params.items(True, True):
+        online = loss.value_network_params.get(key)
+        assert not frozen.requires_grad
+        assert frozen.grad is None
+        if isinstance(online, torch.nn.Parameter):
+            assert torch.equal(frozen, online) != delay_value
+            assert (frozen.data_ptr() == online.data_ptr()) != delay_value
+
+
+def test_input_is_left_alone_by_an_estimator_that_rewrites_rewards():
+    loss, td = make_loss(), make_batch(6)
+    loss.make_value_estimator("td0", average_rewards=True)
+    before = td.clone()
+    loss(td)
+    assert (td.exclude("td_error") == before).all()
+
+
+def test_the_operators_follow_the_loss():
+    """The critic given to the loss, and the policy on it, share the learned parameters."""
+    operator = make_operator()
+    loss, td = make_loss(operator=operator), make_batch(8)
+    policy = operator.get_policy_operator()
+    before = policy(td.clone())["action"]
+    optimizer = torch.optim.SGD(loss.parameters(), lr=1e-2)
+    loss(td)["loss_value"].backward()
+    optimizer.step()
+    assert {id(p) for p in loss.parameters()} == {id(p) for p in operator.parameters()}
+    assert not torch.equal(policy(td.clone())["action"], before)
+
+
+def test_reduction():
+    td = make_batch(6)
+    none = make_loss(reduction="none")(td)["loss_value"]
+    assert none.shape == (6,)
+    torch.testing.assert_close(make_loss(reduction="sum")(td)["loss_value"], none.sum())
+    torch.testing.assert_close(make_loss(reduction="mean")(td)["loss_value"], none.mean())
+    torch.testing.assert_close(make_loss()(td)["loss_value"], none.mean())
+
+
+def test_priority_weights():
+    td = make_batch(6)
+    none = make_loss(reduction="none")(td)["loss_value"]
+    td["priority_weight"] = weight = torch.arange(1.0, 7.0)
+    for use in ("auto", True):
+        loss = make_loss(use_prioritized_weights=use)
+        expected = (weight * none).sum() / weight.sum()
+        torch.testing.assert_close(loss(td)["loss_value"], expected)
+        assert ("priority_weight" in loss.in_keys) == (use is True)
+    torch.testing.assert_close(make_loss(reduction="sum")(td)["loss_value"], (weight * none).sum())
+    unweighted = make_loss(use_prioritized_weights=False)(td)["loss_value"]
+    torch.testing.assert_close(unweighted, none.mean())
+
+
+def test_padding_mask_of_the_collector():
+    td = make_batch(4, 3)
+    none = make_loss(reduction="none")(td)["loss_value"]
+    mask = torch.ones(4, 3, dtype=torch.bool)
+    mask[1, 2] = mask[3, 0] = False
+    td["collector", "mask"] = mask
+    td["observation"][~mask] = torch.nan
+    torch.testing.assert_close(make_loss()(td)["loss_value"], none[mask].mean())
+    torch.testing.assert_close(make_loss(reduction="sum")(td)["loss_value"], none[mask].sum())
+
+
+def test_cast_to_float32():
+    loss, td = make_loss(), make_batch(6)
+    expected = loss(td.clone())["loss_value"].item()
+    loss = loss.to(torch.float32)
+    assert {p.dtype for p in loss.parameters()} == {torch.float32}
+    out = loss(make_batch(6, dtype=torch.float32))["loss_value"]
+    assert out.dtype == torch.float32
+    assert out.item() == pytest.approx(expected, rel=1e-4)
+    out.backward()
+    assert all(p.grad is not None and p.grad.dtype == p.dtype for p in loss.parameters())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_output_has_the_dtype_of_the_batch(dtype):
+    out = make_loss()(make_batch(6, dtype=dtype))
+    assert {out[key].dtype for key in ("loss_value", *METADATA)} == {dtype}
+
+
+def test_metadata_are_detached_scalars():
+    operator, td = make_operator(), make_batch(6)
+    out = make_loss(operator=operator)(td)
+    assert set(out.keys()) == {"loss_value", "unsolved", "invalid_reward", *METADATA}
+    assert out["loss_value"].requires_grad
+    target = hand_target(operator.module, td, 0.0)
+    prediction = hand_prediction(operator.module, td).detach()
+    expected = {
+        "td_error": (target - prediction).abs().mean(),
+        "pred_value": prediction.mean(),
+        "target_value": target.mean(),
+        "pred_value_max": prediction.max(),
+        "target_value_max": target.max(),
+        "unsolved": torch.tensor(0),
+        "invalid_reward": torch.tensor(0),
+    }
+    for key, value in expected.items():
+        assert not out[key].requires_grad
+        assert out[key].shape == ()
+        torch.testing.assert_close(out[key], value, atol=1e-9, rtol=0)
+
+
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt:FutureWarning")
+def test_compiled_without_graph_breaks():
+    loss = make_loss(reduction="none")
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    for seed in (0, 1):
+        first, second = make_batch(6, seed=seed), make_batch(6, seed=seed)
+        expected = loss(first)
+        expected["loss_value"].mean().backward()
+        gradients = [p.grad for p in loss.parameters()]
+        loss.zero_grad(set_to_none=True)
+        out = compiled(second)
+        out["loss_value"].mean().backward()
+        for key in loss.out_keys:
+            torch.testing.assert_close(out[key], expected[key])
+        torch.testing.assert_close(second["td_error"], first["td_error"])
+        for parameter, gradient in zip(loss.parameters(), gradients, strict=True):
+            torch.testing.assert_close(parameter.grad, gradient)
+        loss.zero_grad()
+
+
+def test_bad_arguments():
+    operator = make_operator()
+    with pytest.raises(TypeError, match="gamma"):
+        QPQLearningLoss(operator, gamma=0.9)
+    with pytest.raises(QPError, match=r"value_network: got \w*QPMPC, .* Wrap the QPMPC"):
+        QPQLearningLoss(operator.module)  # pyright: ignore[reportArgumentType] - what is tested
+    for clip in (0.0, -1.0, math.nan):
+        with pytest.raises(QPError, match=rf"td_error_clip: got {clip}, expected a positive"):
+            QPQLearningLoss(operator, td_error_clip=clip)
+    with pytest.raises(QPError, match="reduction: got 'median', expected 'mean', 'sum' or 'none'"):
+        QPQLearningLoss(operator, reduction="median")
+
+
+def test_termination_stops_the_bootstrap_and_truncation_does_not():
+    operator = make_operator()
+    td = make_batch(3)
+    done, terminated = torch.tensor([[0, 0], [1, 0], [1, 1]], dtype=torch.bool).T
+    td["next", "done"], td["next", "terminated"] = done.unsqueeze(-1), terminated.unsqueeze(-1)
+    out = make_loss(operator=operator, reduction="none")(td)
+    L: Tensor = -td["next", "reward"].squeeze(-1)
+    V = operator.module.value(td["next", "observation"])
+    Q = operator.module.action_value(td["observation"], td["action"])
+    bootstraps = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+    delta = L + GAMMA * bootstraps * V - Q
+    torch.testing.assert_close(out["loss_value"], 0.5 * delta**2, atol=0, rtol=0)
+
+
+def expected_step(mpc: QPMPC, td: TensorDictBase, clip: float = math.inf) -> list[Tensor]:
+    """E[delta grad Q] by one gradient of Q at a time."""
+    L = -td["next", "reward"].squeeze(-1)
+    go_on = 1 - td["next", "terminated"].squeeze(-1).double()
+    V, Q = mpc.value(td["next", "observation"]), mpc.action_value(td["observation"], td["action"])
+    delta = (L + GAMMA * go_on * V - Q).detach().clamp(-clip, clip)
+    parameters = list(mpc.parameters())
+    total = [torch.zeros_like(p) for p in parameters]
+    for i in range(len(Q)):
+        gradients = torch.autograd.grad(Q[i], parameters, retain_graph=True)
+        for sum_, gradient in zip(total, gradients, strict=True):
+            sum_ += delta[i] * gradient / len(Q)
+    return total
+
+
+@pytest.mark.parametrize("clip", [None, 0.5])
+def test_one_sgd_step_is_the_papers_update(clip):
+    """theta + alpha E[delta grad Q] (eq:thup), semi-gradient: nothing flows through V(s+)."""
+    operator, td, alpha = make_operator(), make_batch(6), 1e-3
+    mpc = operator.module
+    L = -td["next", "reward"].squeeze(-1)
+    Q = mpc.action_value(td["observation"], td["action"])
+    V = mpc.value(td["next", "observation"])
+    assert all(g.norm() > 0 for g in torch.autograd.grad(V.sum(), list(mpc.parameters())))
+    delta = L + GAMMA * V - Q
+    assert delta.abs().min() < 0.5 < delta.abs().max(), "the clip is felt by some samples"
+
+    step = expected_step(mpc, td, clip or math.inf)
+    before = [p.detach().clone() for p in mpc.parameters()]
+    loss = make_loss(operator=operator, td_error_clip=clip)
+    optimizer = torch.optim.SGD(loss.parameters(), lr=alpha)
+    loss(td)["loss_value"].backward()
+    optimizer.step()
+    for old, new, direction in zip(before, mpc.parameters(), step, strict=True):
+        torch.testing.assert_close(new - old, alpha * direction, atol=1e-13, rtol=1e-7)
+
+
+def test_gradient_against_finite_differences():
+    """With the target held, the loss' gradient is its derivative in every learned entry."""
+    operator, td = make_operator(), make_batch(5)
+    mpc = operator.module
+    loss = make_loss(operator=operator)
+    loss(td)["loss_value"].backward()
+    target = hand_target(mpc, td, 0.0)
+    generator = torch.Generator().manual_seed(0)
+    for name, parameter in mpc.named_parameters():
+        direction = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+        values = []
+        for sign in (1, -1):
+            with torch.no_grad():
+                parameter += sign * 1e-6 * direction
+                values.append((0.5 * (target - hand_prediction(mpc, td)) ** 2).mean().item())
+                parameter -= sign * 1e-6 * direction
+        slope = (values[0] - values[1]) / 2e-6
+        assert parameter.grad is not None
+        assert (parameter.grad * direction).sum().item() == pytest.approx(slope, 1e-5, 1e-8), name
+
+
+def test_td_loss_is_huber_beyond_the_clip():
+    prediction = torch.linspace(-4, 4, 33, dtype=torch.float64, requires_grad=True)
+    target = torch.zeros(33, dtype=torch.float64)
+    for clip in (None, 1.5):
+        loss = td_loss(prediction, target, clip)
+        (gradient,) = torch.autograd.grad(loss.sum(), prediction)
+        bound = math.inf if clip is None else clip
+        assert torch.equal(gradient, prediction.clamp(-bound, bound))
+        assert (loss >= 0).all()
+        assert loss[16] == 0

@@ -1,0 +1,191 @@
+"""Windows that never cross episodes, however the ring lies, and reproducible sampling."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
+
+from torch_qpmpc.envs import PointMass, PointMassEnv
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.learning.replay import Replay, make_replay, windows_to_tau
+
+ENVS, N = 8, 4
+
+
+class StaggeredEnv(PointMassEnv):
+    """The episodes' clocks start apart, so that they also end apart."""
+
+    def _reset(self, tensordict=None, **kwargs):
+        out = super()._reset(tensordict, **kwargs)
+        if tensordict is None or "_reset" not in tensordict:
+            out["step_count"] = torch.arange(self.batch_size[0]).unsqueeze(-1) % self.max_steps
+        return out
+
+
+def batches(count: int, steps: int, max_steps: int) -> list[TensorDictBase]:
+    """Noiseless ``(ENVS, steps)`` batches, so that the physics can be checked."""
+    torch.manual_seed(0)
+    env = StaggeredEnv(ENVS, PointMass(noise_std=0.0), max_steps=max_steps, seed=0)
+    net = torch.nn.Sequential(torch.nn.Linear(4, 2), torch.nn.Tanh())
+    collector = Collector(
+        env,
+        TensorDictModule(net, in_keys=["observation"], out_keys=["action"]),
+        frames_per_batch=steps * ENVS,
+        total_frames=count * steps * ENVS,
+        auto_register_policy_transforms=False,
+    )
+    data = [batch.clone() for batch in collector]
+    collector.shutdown()
+    return data
+
+
+def filled(data: list[TensorDictBase], rows: int, num_windows: int = 400, seed: int = 0) -> Replay:
+    replay = make_replay(rows * ENVS, ENVS, 32, N, num_windows, seed=seed)
+    for batch in data:
+        replay.extend(batch)
+    return replay
+
+
+def check_windows(replay: Replay) -> torch.Tensor:
+    """Windows are consecutive steps of one episode. Returns their row indices ``(M, N)``."""
+    sample, info = replay.windows.sample(return_info=True)
+    sample = sample.reshape(-1, N)
+    first = sample[:, :1]
+    ids, counts = sample["collector", "traj_ids"], sample["step_count"].squeeze(-1)
+    assert (ids == first["collector", "traj_ids"]).all()
+    assert (counts - counts[:, :1] == torch.arange(N)).all()
+    assert not sample["next", "done"][:, :-1].any()
+
+    tau, physics = windows_to_tau(sample).double(), PointMass(noise_std=0.0)
+    states = torch.cat([tau[:, :-4].unflatten(1, (N, 6))[..., :4], tau[:, None, -4:]], dim=1)
+    actions = tau[:, :-4].unflatten(1, (N, 6))[..., 4:]
+    following = physics.step(states[:, :-1], actions, torch.zeros(4))
+    torch.testing.assert_close(states[:, 1:], following, atol=1e-6, rtol=0)
+    return info["index"][0].reshape(-1, N)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+@pytest.mark.parametrize("max_steps", [N, 7, 50])
+@pytest.mark.parametrize("rows", [15, 40])
+def test_windows_never_cross_episodes(steps, max_steps, rows):
+    replay = make_replay(rows * ENVS, ENVS, 32, N, 200)
+    wrapped = False
+    for batch in batches(60 // steps, steps, max_steps):
+        replay.extend(batch)
+        if replay.has_windows():
+            index = check_windows(replay)
+            wrapped |= bool((index.diff(dim=1) < 0).any())
+    assert len(replay) == rows * ENVS
+    assert wrapped, "some window lay over the ring's end"
+
+
+def test_every_window_is_found():
+    """Of 7-step episodes each start 0..3 occurs, and the end of an episode is not lost."""
+    replay = filled(batches(40, 2, max_steps=7), rows=40, num_windows=2000)
+    sample = replay.windows.sample().reshape(-1, N)
+    assert sample["step_count"][:, 0].unique().tolist() == [0, 1, 2, 3]
+    assert sample["next", "done"][:, -1].any()
+
+
+def test_sampling_leaves_the_stored_flags_alone():
+    replay = filled(batches(30, 2, max_steps=7), rows=40)
+    before = replay.transitions.storage[:].clone()
+    sample = replay.windows.sample().reshape(-1, N)
+    replay.sample()
+    assert (replay.transitions.storage[:] == before).all()
+    assert torch.equal(sample["next", "done"], sample["next", "step_count"] == 7)
+    assert torch.equal(sample["next", "truncated"], sample["next", "done"])
+    assert not sample["next", "terminated"].any()
+    with pytest.raises(RuntimeError, match="doesn't allow writing"):
+        replay.windows.extend(sample)
+
+
+def test_transitions_are_sampled_uniformly_from_what_is_stored():
+    data = batches(30, 2, max_steps=50)
+    replay = filled(data, rows=10)
+    assert replay.sample().shape == (32,)
+    stored = torch.cat([batch["observation"] for batch in data], dim=1)[:, -10:].flatten(0, 1)
+    draws = torch.cat([replay.sample()["observation"] for _ in range(250)])
+    hits = (draws[:, None] == stored).all(-1)
+    assert hits.any(1).all(), "only the newest 10 rows are there"
+    assert hits.sum(0).min() > 60, "each of 80 is expected 100 times in 8000"
+    assert hits.sum(0).max() < 145
+
+
+def test_tau_has_the_order_of_z():
+    z = torch.arange(2 * (N * 6 + 4), dtype=torch.float32).reshape(2, -1)
+    pairs = z[:, :-4].unflatten(1, (N, 6))
+    following = torch.cat([pairs[:, 1:, :4], z[:, None, -4:]], dim=1)
+    td = TensorDict(
+        {
+            "observation": pairs[..., :4],
+            "action": pairs[..., 4:],
+            "next": {"observation": following},
+        },
+        batch_size=[2, N],
+    )
+    assert torch.equal(windows_to_tau(td), z)
+
+
+def test_sampling_depends_on_the_seed_alone():
+    data = batches(20, 2, max_steps=50)
+
+    def draws(seed):
+        torch.seed()  # torch's global generator plays no part
+        replay = filled(data, rows=40, num_windows=5, seed=seed)
+        return torch.cat([replay.sample()["action"].flatten(), replay.sample_tau().flatten()])
+
+    assert torch.equal(draws(1), draws(1))
+    assert not torch.equal(draws(1), draws(2))
+    assert filled(data, rows=40, num_windows=5).sample_tau().shape == (5, N * 6 + 4)
+
+
+@pytest.mark.parametrize("count", [5, 33])
+def test_a_restored_replay_continues_as_if_never_stopped(count):
+    """With episodes longer than the ring, both sides of its seam have one trajectory id."""
+    data = batches(count + 10, 2, max_steps=500)
+    first = filled(data[:count], rows=15)
+    first.sample()
+    first.sample_tau()
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second = filled([], rows=15, seed=99)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    assert len(second) == len(first) == min(15, 2 * count) * ENVS
+    check_windows(second)
+    check_windows(first)
+    for batch in data[count:]:
+        assert torch.equal(first.sample_tau(), second.sample_tau())
+        assert (first.sample() == second.sample()).all()
+        first.extend(batch)
+        second.extend(batch)
+
+
+def test_asking_for_windows_too_early_is_an_error():
+    replay = filled([], rows=40)
+    match = "replay: got {} transitions without such a trajectory, expected 4 consecutive"
+    with pytest.raises(QPError, match=match.format(0)):
+        replay.sample_tau()
+    for batch in batches(2, 1, max_steps=50):
+        replay.extend(batch)
+    assert not replay.has_windows()
+    with pytest.raises(QPError, match=match.format(16)):
+        replay.sample_tau()
+
+
+def test_a_flattened_batch_is_an_error():
+    batch = batches(1, 2, max_steps=50)[0]
+    with pytest.raises(QPError, match=r"batch: got shape \(16,\), expected \(num_envs, T\)"):
+        filled([], rows=40).extend(batch.reshape(-1))
+
+
+@pytest.mark.parametrize("capacity", [33, 24, 0])
+def test_bad_capacity_is_an_error(capacity):
+    with pytest.raises(QPError, match=rf"capacity: got {capacity}, .* 32 is the least"):
+        make_replay(capacity, ENVS, 32, N, 5)

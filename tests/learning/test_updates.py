@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+import copy
+
+import cvxpy as cp
+import pytest
+import torch
+from torch.optim.lr_scheduler import LambdaLR
+from torch.testing import assert_close
+
+from tests.learning.test_warm_start import transitions
+from tests.problems import normal, random_mpc
+from torch_qpmpc import (
+    QPMPC,
+    DeviationPenalty,
+    GaussNewton,
+    QPActorValueOperator,
+    QPQLearningLoss,
+    SystemIdentificationPenalty,
+)
+from torch_qpmpc.learning.replay import ACTIVE_SET
+from torch_qpmpc.learning.updates import first_order, second_order, share_of_rate
+
+
+def make_loss(mpc, key: str | None = None, **options) -> QPQLearningLoss:
+    loss = QPQLearningLoss(QPActorValueOperator(mpc, active_set_key=key), **options)
+    loss.make_value_estimator(gamma=0.9)
+    return loss
+
+
+def test_the_first_order_descends_the_sum_of_its_terms():
+    mpc = random_mpc(3)
+    twin, loss = copy.deepcopy(mpc), make_loss(mpc)
+    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u)
+    si, windows = SystemIdentificationPenalty(1e-2), normal(5, mpc.n_z)
+    optimizer = torch.optim.SGD(mpc.parameters(), lr=1e-3)
+    update = first_order(mpc, loss, optimizer, deviation, si, "subgradient")
+    terms, scalars = update(transitions(), windows)
+    assert set(terms) == {"loss/value", "loss/si", "loss/deviation"}
+    assert scalars["unsolved"] == 0
+    total = make_loss(twin)(transitions())["loss_value"] + si(twin.C, windows) + deviation(twin.C)
+    total.backward()
+    assert_close(sum(terms.values()), total)
+    for moved, still in zip(mpc.parameters(), twin.parameters(), strict=True):
+        assert still.grad is not None
+        assert_close(moved.detach(), still.detach() - 1e-3 * still.grad)
+
+
+@pytest.mark.parametrize("with_si", [False, True])
+@pytest.mark.parametrize("clip", [None, 0.5])
+def test_the_second_order_steps_towards_the_loss_modules_targets(with_si, clip):
+    mpc = random_mpc(3)
+    twin, loss = copy.deepcopy(mpc), make_loss(mpc, td_error_clip=clip)
+    si, windows = SystemIdentificationPenalty(1e-2), normal(5, mpc.n_z)
+    update = second_order(
+        mpc, loss, GaussNewton(mpc, td_error_clip=clip), None, si if with_si else None
+    )
+    batch = transitions()
+    terms, scalars = update(batch, windows if with_si else None)
+    expected = make_loss(twin, td_error_clip=clip)(transitions())
+    assert_close(terms["loss/value"], expected["loss_value"].detach())
+    assert ("loss/si" in terms) == with_si
+    for name in ("td_error", "pred_value", "target_value", "unsolved"):
+        assert_close(scalars[name], expected[name])
+    with torch.no_grad():
+        target = make_loss(twin).target(transitions())
+        s, a = batch["observation"], batch["action"]
+        penalty = si.curvature(windows) if with_si else None
+        GaussNewton(twin, td_error_clip=clip).step(s, a, -target, penalty=penalty)
+    assert_close(mpc.state_dict(), twin.state_dict(), rtol=1e-9, atol=1e-12)
+
+
+def test_the_second_order_keeps_active_sets():
+    mpc = random_mpc(3)
+    loss = make_loss(mpc, ACTIVE_SET)
+    batch = transitions()
+    expected = mpc.solve(batch["observation"], batch["action"]).active
+    second_order(mpc, loss, GaussNewton(mpc), None, None)(batch, None)
+    assert torch.equal(batch[ACTIVE_SET], expected)
+    assert ACTIVE_SET in batch["next"]
+
+
+def test_what_is_not_solved_is_counted():
+    mpc = random_mpc(3, on_failure="mask")
+    batch = transitions()
+    batch["action"][2] = 9.0  # beyond a hard bound
+    terms, scalars = second_order(mpc, make_loss(mpc), GaussNewton(mpc), None, None)(batch, None)
+    assert scalars["unsolved"] == 1
+    assert all(term.isfinite() for term in terms.values())
+
+
+@pytest.mark.parametrize("second", [True, False])
+def test_invalid_rewards_are_counted_under_their_own_name(second):
+    mpc = random_mpc(3, on_failure="mask")
+    loss, batch = make_loss(mpc), transitions()
+    batch["action"][2] = 9.0  # beyond a hard bound
+    batch["next", "reward"][4] = torch.nan
+    if second:
+        update = second_order(mpc, loss, GaussNewton(mpc), None, None)
+    else:
+        update = first_order(mpc, loss, torch.optim.SGD(mpc.parameters(), 1e-3), None, None)
+    before = mpc.C.detach().clone()
+    with pytest.warns(RuntimeWarning, match=r"\('next', 'reward'\): 1 of \d+ rewards are NaN"):
+        terms, scalars = update(batch, None)
+    assert (scalars["unsolved"], scalars["invalid_reward"]) == (1, 1)
+    assert all(term.isfinite() for term in terms.values())
+    assert not torch.equal(mpc.C, before)
+
+
+def test_a_second_order_update_without_a_usable_pair_is_named():
+    mpc = random_mpc(3)
+    batch, before = transitions(), copy.deepcopy(mpc.state_dict())
+    batch["next", "reward"][:] = torch.inf
+    update = second_order(mpc, make_loss(mpc), GaussNewton(mpc), None, None)
+    with (
+        pytest.warns(RuntimeWarning, match=r"None of the \d+ pairs can be learned from: 0 have"),
+        pytest.warns(RuntimeWarning, match=r"\('next', 'reward'\): (\d+) of \1 rewards"),
+    ):
+        terms, scalars = update(batch, None)
+    assert terms["train/accepted"] == 0
+    assert scalars["invalid_reward"] == len(batch)
+    assert_close(mpc.state_dict(), before, rtol=0, atol=0)
+
+
+RATES = {"cost": 1e-2, "constraints": 1e-3}
+
+
+def make_update(name: str, mpc: QPMPC, deviation: DeviationPenalty, penalty_step: str):
+    """An update by the optimiser, and the optimiser."""
+    loss = make_loss(mpc, td_error_clip=1.0)
+    if name == "gauss_newton":
+        optimizer = GaussNewton(mpc, td_error_clip=1.0)
+        return second_order(mpc, loss, optimizer, deviation, None), optimizer
+    kind = torch.optim.Adam if name == "adam" else torch.optim.SGD
+    optimizer = kind(mpc.parameter_groups(RATES))
+    return first_order(mpc, loss, optimizer, deviation, None, penalty_step), optimizer
+
+
+@pytest.mark.parametrize("rule", ["cholesky", "projection"])
+@pytest.mark.parametrize(
+    ("optimizer", "penalty_step"),
+    [
+        ("sgd", "proximal"),
+        ("adam", "proximal"),
+        ("gauss_newton", "proximal"),
+        ("adam", "subgradient"),
+    ],
+)
+def test_only_the_proximal_step_holds_entries_above_the_band_at_zero(optimizer, penalty_step, rule):
+    mpc = random_mpc(3, free=0.0, step=rule)
+    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, c_2=1e-5)
+    update, _ = make_update(optimizer, mpc, deviation, penalty_step)
+    for seed in range(20):
+        terms, _ = update(transitions(seed=seed), None)
+    assert ("loss/deviation" in terms) == (penalty_step == "subgradient")
+    moved = (mpc.C - mpc.C_0).detach().abs()
+    above, below = deviation.C_mask == 1, deviation.C_mask == 0
+    assert (moved[below] > 0).all()
+    if penalty_step == "proximal":
+        assert (moved[above] == 0).all()
+    else:
+        assert (moved[above] > 1e-5).float().mean() > 0.9
+
+
+def test_a_gradient_step_with_its_proximal_step_is_the_papers():
+    mpc = random_mpc(3)
+    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, c_1=1e-2, c_2=1e-4)
+    twin = copy.deepcopy(mpc)
+    make_update("sgd", mpc, deviation, "proximal")[0](transitions(), None)
+    make_loss(twin, td_error_clip=1.0)(transitions())["loss_value"].backward()
+    assert twin.C.grad is not None
+    start, gradient = twin.C.detach().numpy(), twin.C.grad.numpy()
+    step = cp.Variable(start.shape)
+    penalty = cp.sum(cp.abs(cp.multiply(deviation.C_mask, start + step - deviation.C_0)))
+    descent = cp.sum(cp.multiply(RATES["constraints"] * gradient, step))
+    problem = cp.Problem(cp.Minimize(0.5 * cp.sum_squares(step) + descent + penalty))
+    problem.solve(cp.CLARABEL, **dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), 1e-12))
+    expected = torch.as_tensor(start + step.value)
+    assert_close(mpc.C.detach(), expected, rtol=0, atol=1e-6)
+    assert (mpc.C == mpc.C_0)[deviation.C_mask == 1e-2].float().mean() > 0.05
+
+
+@pytest.mark.filterwarnings("ignore:Detected call of `lr_scheduler.step")
+@pytest.mark.parametrize("optimizer", ["sgd", "adam", "gauss_newton"])
+def test_the_penaltys_weight_falls_with_the_rate_of_C(optimizer):
+    mpc = random_mpc(3)
+    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u)
+    _, made = make_update(optimizer, mpc, deviation, "proximal")
+    assert share_of_rate(made) == 1, "without a schedule"
+    schedule, shares = LambdaLR(made, lambda update: 1 / (1 + update)), []
+    for _ in range(3):
+        shares.append(share_of_rate(made))
+        made.param_groups[0]["lr"] = 0.5  # of H
+        schedule.step()
+    assert shares == pytest.approx([1, 1 / 2, 1 / 3])
+    still = torch.optim.SGD(mpc.parameter_groups(RATES | {"C": 0.0}))
+    LambdaLR(still, lambda update: 0.5)
+    assert share_of_rate(still) == 1, "a C that does not move has no share"

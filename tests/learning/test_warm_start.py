@@ -1,0 +1,140 @@
+"""The replay cache: active sets that travel with the transitions, from visit to visit."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+
+import train
+from tests.problems import normal, random_mpc, random_states
+from tests.runs import SMALL, make_config, skip_figures
+from torch_qpmpc import QPActorValueOperator, QPQLearningLoss, SolveLog
+from torch_qpmpc.learning.replay import ACTIVE_SET, ACTIVE_SETS, make_replay
+from torch_qpmpc.qp.program import UNKNOWN
+
+COUNT = 12
+
+
+def transitions(count: int = COUNT, seed: int = 0) -> TensorDict:
+    following = TensorDict(
+        observation=random_states(count, seed=seed + 1),
+        reward=normal(count, 1, seed=seed + 2),
+        done=torch.zeros(count, 1, dtype=torch.bool),
+        terminated=torch.zeros(count, 1, dtype=torch.bool),
+        batch_size=count,
+    )
+    return TensorDict(
+        observation=random_states(count, seed=seed + 3),
+        action=random_states(count, 1, size=0.5, seed=seed + 4),
+        next=following,
+        batch_size=count,
+    )
+
+
+def make_loss(key: str | None, solver: str = "daqp", **options) -> QPQLearningLoss:
+    operator = QPActorValueOperator(random_mpc(3, solver=solver), active_set_key=key)
+    loss = QPQLearningLoss(operator, **options)
+    loss.make_value_estimator(gamma=0.9)
+    return loss
+
+
+def test_an_operator_reads_and_writes_the_active_set():
+    mpc = random_mpc(3, solver="proxqp")
+    operator = QPActorValueOperator(mpc, active_set_key="codes")
+    assert operator.out_keys == ["state_action_value", "codes"]
+    assert operator.get_value_operator().out_keys == ["state_value", "codes"]
+    assert operator.get_policy_operator().out_keys == ["action"]
+    td = transitions().select("observation", "action")
+    with SolveLog() as first:
+        operator(td)
+    assert torch.equal(td["codes"], mpc.solve(td["observation"], td["action"]).active)
+    before = td["state_action_value"].clone()
+    with SolveLog() as second:
+        operator(td)
+    assert (first.recalled, second.recalled) == (0, COUNT)
+    assert_close(td["state_action_value"], before, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+@pytest.mark.parametrize("delay_value", [False, True])
+def test_the_loss_keeps_the_active_sets_of_both_problems(solver, delay_value):
+    loss = make_loss(ACTIVE_SET, solver, delay_value=delay_value)
+    td = transitions()
+    mpc = copy.deepcopy(loss.value_network.module)
+    with SolveLog() as first:
+        cold = loss(td)["loss_value"]
+    cold.backward()
+    gradients = [p.grad.clone() for p in loss.parameters() if p.grad is not None]
+    loss.zero_grad()
+    s, a, following = td["observation"], td["action"], td["next", "observation"]
+    assert torch.equal(td[ACTIVE_SET], mpc.solve(s, a).active)
+    assert torch.equal(td["next", ACTIVE_SET], mpc.solve(following).active)
+    with SolveLog() as second:
+        warm = loss(td)["loss_value"]
+    warm.backward()
+    assert (first.recalled, first.solves) == (0, 2 * COUNT)
+    assert second.recalled == 2 * COUNT
+    assert_close(warm, cold, rtol=1e-6, atol=1e-6)
+    again = [p.grad for p in loss.parameters() if p.grad is not None]
+    assert gradients
+    for one, other in zip(again, gradients, strict=True):
+        assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_without_a_key_nothing_is_written():
+    td = transitions()
+    make_loss(None)(td)
+    assert ACTIVE_SET not in td
+    assert ACTIVE_SET not in td["next"]
+
+
+def test_a_replay_brings_back_what_it_was_told_to_remember():
+    replay = make_replay(8 * 4, 4, 6, 2, 5, active_rows=3)
+    batch = transitions(20).reshape(4, 5)
+    batch["collector", "traj_ids"] = torch.arange(4).unsqueeze(-1).expand(4, 5).clone()
+    replay.extend(batch)
+    assert ACTIVE_SET not in batch
+    assert (replay.transitions[:][ACTIVE_SET] == UNKNOWN).all()
+    told = {}
+    for i in range(40):
+        sample = replay.sample()
+        for place, row in zip(sample["index"].tolist(), sample.unbind(0), strict=True):
+            expected = told.get(tuple(place), (UNKNOWN, UNKNOWN))
+            got = tuple(int(row[key][0]) for key in ACTIVE_SETS)
+            assert got == expected
+        for key, code in zip(ACTIVE_SETS, (i % 3, -(i % 2)), strict=True):
+            sample[key] = torch.full((6, 3), code, dtype=torch.int8)
+        replay.remember(sample)
+        told |= {tuple(place): (i % 3, -(i % 2)) for place in sample["index"].tolist()}
+    assert len(told) == 20
+    replay.extend(batch)
+    assert (replay.transitions[:][ACTIVE_SET] == UNKNOWN).any()
+
+
+def test_a_replay_without_active_sets_has_nothing_to_remember():
+    replay = make_replay(32, 4, 6, 2, 5)
+    replay.extend(transitions(20).reshape(4, 5))
+    sample = replay.sample()
+    assert ACTIVE_SET not in sample
+    replay.remember(sample)
+
+
+def test_training_is_the_same_without_the_cache(tmp_path, monkeypatch):
+    """But for the certificate's tolerance."""
+    skip_figures(monkeypatch)
+    options = (*SMALL, "updates=15", "batch_size=64", "eval_interval=15")
+    runs = [
+        train.train(make_config(*options, f"warm_start={on}"), str(tmp_path / on))
+        for on in ("true", "false")
+    ]
+    for name in ("J_start", "J_final", "J_discounted_final"):
+        assert runs[0][name] == pytest.approx(runs[1][name], rel=1e-5)
+    for on in ("true", "false"):
+        recalled = pd.read_csv(tmp_path / on / "metrics.csv")["qp/recalled"].to_numpy()
+        assert (np.nansum(recalled) > 0) == (on == "true"), "as the optimiser is of the first order"

@@ -1,0 +1,451 @@
+"""Entries of theta that ``learn={"C": mask}`` leaves as they are."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.problems import random_mpc, random_states
+from tests.transitions import make_batch
+from torch_qpmpc import (
+    QPMPC,
+    DeviationPenalty,
+    GaussNewton,
+    QPActorValueOperator,
+    QPError,
+    QPQLearningLoss,
+    SystemIdentificationPenalty,
+)
+from torch_qpmpc.learning.updates import first_order
+
+HORIZON, N_Z = 3, 11
+
+
+def rows() -> Tensor:
+    """All rows of C but those of the second state: a constant reference, say."""
+    return (torch.arange(2 * HORIZON) % 2 == 0).unsqueeze(-1).expand(-1, N_Z).clone()
+
+
+def entries() -> Tensor:
+    """Another pattern in each row."""
+    generator = torch.Generator().manual_seed(3)
+    return torch.rand(2 * HORIZON, N_Z, generator=generator) < 0.6
+
+
+MASKS = {"rows": rows, "entries": entries}
+
+
+def masked(mask: Any, **options: Any) -> QPMPC:
+    return random_mpc(
+        1, free=0.0, horizon=HORIZON, learn={"H": True, "c": True, "C": mask}, **options
+    )
+
+
+def targets(mpc: QPMPC) -> tuple[Tensor, Tensor, Tensor]:
+    s, a = random_states(24), random_states(24, 1, size=0.4)
+    return s, a, mpc.action_value(s, a).detach() + random_states(24, 1, seed=4).squeeze(-1)
+
+
+def moves(mpc: QPMPC, C: Tensor, mask: Tensor) -> None:
+    """Assert that C has moved where the mask says so, and nowhere else."""
+    moved = mpc.C.detach() != C
+    assert not moved[~mask].any()
+    assert moved[mask].float().mean() > 0.5
+
+
+OPTIMIZERS = {
+    "sgd": lambda mpc: torch.optim.SGD(mpc.parameters(), lr=1e-3, momentum=0.9, weight_decay=0.1),
+    "adamw": lambda mpc: torch.optim.AdamW(mpc.parameters(), lr=1e-2, weight_decay=1.0),
+    "rmsprop": lambda mpc: torch.optim.RMSprop(mpc.parameters(), lr=1e-2, weight_decay=0.1),
+}
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+@pytest.mark.parametrize("kind", MASKS)
+def test_no_optimiser_moves_frozen_entries(kind, name):
+    mask = MASKS[kind]()
+    mpc = masked(mask)
+    s, a, target = targets(mpc)
+    C, optimizer = mpc.C.detach().clone(), OPTIMIZERS[name](mpc)
+    for _ in range(5):
+        optimizer.zero_grad()
+        (mpc.action_value(s, a) - target).square().mean().backward()
+        optimizer.step()
+    moves(mpc, C, mask)
+
+
+@pytest.mark.parametrize("memory", [0, 16])
+@pytest.mark.parametrize("kind", MASKS)
+def test_a_gauss_newton_step_is_that_in_the_learned_entries_alone(kind, memory):
+    """By the dense system of all learned numbers, built from autograd's gradients."""
+    mask = MASKS[kind]()
+    mpc = masked(mask)
+    s, a, target = targets(mpc)
+    damping, scale = 0.1, 1e-2
+    optimizer = GaussNewton(
+        mpc,
+        scales={"cost": 1.0, "constraints": scale},
+        damping=damping,
+        trust_region=False,
+        memory=memory,
+    )
+    leaves = list(mpc.parameters())
+    names = [name for name, _ in mpc.named_parameters()]
+    rates = torch.cat(
+        [
+            torch.full((p.numel(),), scale if ".C." in n else 1.0).double()
+            for n, p in zip(names, leaves, strict=True)
+        ]
+    )
+    values = mpc.action_value(s, a)
+    J = torch.stack(
+        [
+            torch.cat([g.flatten() for g in torch.autograd.grad(v, leaves, retain_graph=True)])
+            for v in values
+        ]
+    )
+    K = J * rates @ J.mT
+    mu = damping * K.diagonal().mean()
+    alpha = torch.linalg.solve(K + mu * torch.eye(len(K)), target - values.detach())
+    expected = torch.nn.utils.parameters_to_vector(leaves).detach() + rates * (alpha @ J)
+    C = mpc.C.detach().clone()
+    assert optimizer.step(s, a, target).accepted
+    assert_close(torch.nn.utils.parameters_to_vector(leaves).detach(), expected)
+    moves(mpc, C, mask)
+
+
+@pytest.mark.parametrize("kind", MASKS)
+def test_the_si_penalty_in_a_gauss_newton_step_leaves_frozen_entries(kind):
+    mask = MASKS[kind]()
+    mpc, whole = masked(mask), masked(True)
+    S = SystemIdentificationPenalty(1.0).curvature(random_states(20, N_Z))
+    s, a, target = targets(mpc)
+    C, before = mpc.C.detach().clone(), ((mpc.C @ S) * mpc.C).sum()
+    report = GaussNewton(mpc).step(s, a, target, penalty=S)
+    assert report.accepted
+    assert report.ratio == pytest.approx(1, abs=0.5)
+    assert ((mpc.C @ S) * mpc.C).sum() < before
+    moves(mpc, C, mask)
+    # With all entries learned, a mask of all is no mask.
+    all_of_it = masked(torch.ones_like(mask))
+    for one in (whole, all_of_it):
+        GaussNewton(one).step(s, a, target, penalty=S)
+    assert_close(whole.C, all_of_it.C, rtol=0, atol=0)
+
+
+def test_the_proximal_step_of_an_update_leaves_frozen_entries():
+    mask = rows()
+    mpc = masked(mask, action_slack=10.0)
+    with torch.no_grad():
+        mpc.leaves("C")[0].add_(0.3)
+    loss = QPQLearningLoss(QPActorValueOperator(mpc))
+    loss.make_value_estimator(gamma=0.9)
+    groups = mpc.parameter_groups({"cost": 0.0, "constraints": 0.0})
+    penalty = DeviationPenalty(mpc.C_0, 2, 1, c_1=0.1, c_2=0.1, c_3=0.1)
+    update = first_order(mpc, loss, torch.optim.SGD(groups, lr=0.0), penalty, None)
+    C = mpc.C.detach().clone()
+    update(make_batch(4), None)
+    moves(mpc, C, mask)
+    assert_close(mpc.C[mask].detach(), C[mask] - 0.1)
+
+
+def test_gradients_are_those_of_an_unmasked_qpmpc_in_the_learned_entries():
+    mask = entries()
+    one, other = masked(mask), masked(True)
+    s, a, _ = targets(one)
+    for mpc in (one, other):
+        mpc.action_value(s, a).sum().backward()
+    (kept,), (free,) = one.leaves("C"), other.leaves("C")
+    assert kept.grad is not None
+    assert free.grad is not None
+    assert_close(kept.grad, torch.where(mask, free.grad, 0))
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [copy.deepcopy, lambda mpc: pickle.loads(pickle.dumps(mpc))],
+    ids=["deepcopy", "pickle"],
+)
+def test_copies_and_state_dicts_keep_what_is_frozen(copied):
+    mpc = masked(rows())
+    mpc.C = mpc.C.detach() + 0.01
+    twin = copied(mpc)
+    assert_close(twin.C, mpc.C, rtol=0, atol=0)
+    fresh = masked(rows())
+    fresh.load_state_dict(mpc.state_dict())
+    assert_close(fresh.C, mpc.C, rtol=0, atol=0)
+    moved = mpc.C.detach().clone()
+    torch.optim.AdamW(twin.parameters(), lr=0.1, weight_decay=1.0)
+    mpc.reset_parameters()
+    assert_close(mpc.C, masked(True).C, rtol=0, atol=0)
+    assert not torch.equal(mpc.C, moved)
+
+
+def test_a_tied_model_with_a_known_row():
+    """x_1 is the integral of x_2 in every stage: its row of A and B is known."""
+    A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
+    learn = {"C": rows().logical_not(), "H": True}
+    mpc = QPMPC.linear_mpc(A, B, HORIZON, learn=learn, solver="daqp")
+    optimizer = torch.optim.AdamW(mpc.parameters(), lr=0.01, weight_decay=0.1)
+    for _ in range(3):
+        optimizer.zero_grad()
+        mpc.value(random_states(8)).sum().backward()
+        optimizer.step()
+    learned = mpc.model()
+    for matrix, start in zip(learned, (A, B), strict=True):
+        start = torch.tensor(start).double()
+        assert_close(matrix[0], start[0])
+        assert not torch.equal(matrix[1].detach(), start[1])
+    values = mpc.value(random_states(8))
+    mpc.release()
+    assert_close(mpc.value(random_states(8)), values)
+    frozen = mpc.C[~learn["C"]].detach().clone()
+    torch.optim.AdamW(mpc.parameters(), lr=0.1, weight_decay=1.0).step()
+    assert torch.equal(mpc.C[~learn["C"]].detach(), frozen)
+
+
+@pytest.mark.parametrize("part", ["H", "H_f", "q", "b", "lb", "w"])
+def test_vectors_and_diagonals(part):
+    mpc = random_mpc(2, learn=(part,))
+    value = getattr(mpc, part).detach()
+    mask = torch.arange(len(value)) % 2 == 0
+    mpc = random_mpc(2, learn={part: mask.tolist()}, free=0.0)
+    start = getattr(mpc, part).detach().clone()
+    optimizer = torch.optim.SGD(mpc.parameters(), lr=0.1, weight_decay=0.5)
+    mpc.value(random_states(16)).sum().backward()
+    optimizer.step()
+    assert torch.equal(getattr(mpc, part)[~mask].detach(), start[~mask])
+    assert not torch.equal(getattr(mpc, part)[mask].detach(), start[mask])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"learn": {"C": rows()[:2]}},
+            r"learn\['C'\]: got torch.bool of shape \(2, 11\), expected",
+        ),
+        ({"learn": {"C": rows().float()}}, r"learn\['C'\]: got torch.float32 of shape \(6, 11\)"),
+        ({"learn": {"H": False}}, r"learn\['H'\]: got torch.bool of shape \(\), expected True"),
+        ({"learn": {"C": "rows"}}, r"learn\['C'\]: got 'rows', expected True, or a mask of bools"),
+        ({"learn": {"D": True}}, "learn: got .*'D'.*, expected a collection of names among"),
+        (
+            {"learn": {"H": torch.eye(3).bool()}, "hessian": "block"},
+            r"learn\['H'\]: got a mask of a dense H, expected True, or a mask with hessian",
+        ),
+        (
+            {"learn": {"C": torch.arange(66).reshape(6, 11) > 30}, "structure": "tied"},
+            r"learn\['C'\]: got a mask that differs between stages, expected one that is the same",
+        ),
+        (
+            {"learn": {"lb": torch.arange(11) > 4}, "structure": "tied"},
+            r"learn\['lb'\]: got a mask that differs between stages",
+        ),
+    ],
+)
+def test_masks_that_do_not_fit_are_named(options, message):
+    with pytest.raises(QPError, match=message):
+        random_mpc(0, horizon=HORIZON, free=0.0, **options)
+
+
+def test_a_mask_may_be_an_array():
+    mask = rows()
+    assert torch.equal(masked(mask.numpy()).C, masked(np.asarray(mask).tolist()).C)
+
+
+# Slack weights
+
+
+def test_a_slack_weight_for_each_state():
+    mpc = random_mpc(0, free=0.0, state_slack=[3.0, torch.inf], action_slack=np.array([2.0]))
+    w = mpc.quadratic_program().w
+    assert_close(w[:3], torch.tensor([3.0, torch.inf, 2.0]).double())
+    assert_close(w[-2:], torch.tensor([3.0, torch.inf]).double())
+
+
+@pytest.mark.parametrize(
+    ("slack", "got"),
+    [
+        ([1.0], r"\[1.0\]"),
+        ([1.0, -1.0], r"\[1.0, -1.0\]"),
+        ([1.0, torch.nan], "nan"),
+        (-1.0, "-1.0"),
+    ],
+)
+def test_slack_weights_that_do_not_fit_are_named(slack, got):
+    message = f"state_slack: got .*{got}.*, expected a non-negative weight, .*one for each of the 2"
+    with pytest.raises(QPError, match=message):
+        random_mpc(0, state_slack=slack)
+
+
+# What a state_dict belongs to
+
+
+OTHERS = {
+    "gamma": {"gamma": 0.5},
+    "discount_slack": {"discount_slack": True},
+    "structure": {"structure": "tied"},
+    "hessian": {"hessian": "block"},
+    "step": {"step": "projection"},
+    "horizon": {"horizon": 4},
+    "learn": {"learn": ("H", "C")},
+    "constraints": {"constraints": ([[1.0, 1.0, 0.0]], [-1.0], [1.0])},
+    "terminal_constraints": {"terminal_constraints": ([[1.0, 1.0]], [-1.0], [1.0])},
+    "hard rows": {"state_slack": [torch.inf, 100.0]},
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_state_dict_of_another_qpmpc_is_refused_by_name(name):
+    mpc = random_mpc(0)
+    before = mpc.value(random_states(4)).detach()
+    other = random_mpc(0, **OTHERS[name])
+    message = f"state_dict: got a state_dict with {name} = .*, expected this module's"
+    with pytest.raises(QPError, match=message):
+        mpc.load_state_dict(other.state_dict())
+    assert torch.equal(mpc.value(random_states(4)), before)
+
+
+def test_a_state_dict_of_other_frozen_entries_is_refused():
+    with pytest.raises(QPError, match=r"state_dict with learn = .*'C': '33 of 66"):
+        masked(entries()).load_state_dict(masked(rows()).state_dict())
+
+
+def test_a_state_dict_says_what_it_belongs_to_in_tensors(tmp_path):
+    mpc = random_mpc(0)
+    state = {name: tensor.clone() for name, tensor in mpc.state_dict().items()}
+    torch.save(state, tmp_path / "state.pt")
+    random_mpc(0, solver="torch", free=0.0).load_state_dict(
+        torch.load(tmp_path / "state.pt", weights_only=True)
+    )
+
+
+def test_a_state_dict_from_before_is_loaded():
+    mpc, other = random_mpc(0), random_mpc(0, free=0.0)
+    state = {name: x for name, x in mpc.state_dict().items() if name != "_extra_state"}
+    other.load_state_dict(state)
+    assert torch.equal(other.C, mpc.C)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("gamma", 0.5), ("horizon", 5), ("n_x", 3), ("structure", "tied"), ("learned", ("H",))],
+)
+def test_what_the_constructor_decides_is_not_assigned(name, value):
+    mpc = random_mpc(0)
+    own = getattr(mpc, name)
+    with pytest.raises(QPError, match=f"{name}: got .*, expected .*, as made. Make another QPMPC"):
+        setattr(mpc, name, value)
+    assert getattr(mpc, name) == own
+
+
+def test_arguments_are_kept_by_value():
+    A, mask = np.array([[1.0, 0.1], [0.0, 0.9]]), rows()
+    options = {"learn": {"C": mask}, "seed": 1}
+    mpc = QPMPC.from_model(A, [[0.0], [0.1]], HORIZON, **options)
+    start = mpc.C.detach().clone()
+    A *= 2
+    mask.logical_not_()
+    options["learn"].clear()
+    mpc.reset_parameters()
+    assert torch.equal(mpc.C, start)
+    assert torch.equal(pickle.loads(pickle.dumps(mpc)).C, start)
+
+
+@pytest.mark.parametrize("convert", [lambda x: x.double(), lambda x: x.float() + 1e-3])
+def test_a_converted_state_dict_is_loaded(convert):
+    mpc = random_mpc(0)
+    state = {
+        name: convert(x) if name == "_extra_state" else x for name, x in mpc.state_dict().items()
+    }
+    mpc.load_state_dict(state)
+    with pytest.raises(QPError, match=r"state_dict: got a state_dict with gamma = 0\.9"):
+        random_mpc(0, gamma=0.5).load_state_dict(state)
+
+
+@pytest.mark.parametrize("junk", [None, torch.zeros(3), torch.tensor([91, 93])])
+def test_an_identity_that_cannot_be_read_is_named(junk):
+    mpc = random_mpc(0)
+    message = "state_dict: got an _extra_state that cannot be read .*, expected what a QPMPC wrote"
+    with pytest.raises(QPError, match=message):
+        mpc.load_state_dict(mpc.state_dict() | {"_extra_state": junk})
+
+
+@pytest.mark.parametrize("delay", [False, True])
+def test_the_state_of_another_qpmpcs_loss_is_refused(delay):
+    def loss(**options: Any) -> QPQLearningLoss:
+        operator = QPActorValueOperator(random_mpc(0, **options))
+        made = QPQLearningLoss(operator, delay_value=delay)
+        made.make_value_estimator(gamma=0.9)
+        return made
+
+    state = loss().state_dict()
+    loss().load_state_dict(state)
+    for name in ("gamma", "hard rows", "discount_slack"):
+        with pytest.raises(QPError, match=f"state_dict with {name} = "):
+            loss(**OTHERS[name]).load_state_dict(state)
+    older = {name: x for name, x in state.items() if name != "_extra_state"}
+    loss().load_state_dict(older)
+
+
+def test_a_masked_C_is_not_called_tied():
+    mpc = masked(rows())
+    penalty = DeviationPenalty(mpc.C_0, 2, 1)
+    with pytest.raises(QPError, match=r"pass mpc.leaves\('C'\)\[0\]"):
+        penalty.proximal_step_(mpc.C)
+    with pytest.raises(QPError, match="part: got 'b', expected one of the learned parts: H, c, C"):
+        mpc.leaves("b")
+
+
+def test_what_the_constructor_decided_may_be_assigned_again():
+    mpc = random_mpc(0)
+    mpc.gamma = mpc.gamma
+    mpc.structure = "free"
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_a_gauss_newton_is_not_copied_without_its_qpmpc(copied):
+    message = "GaussNewton: got a copy or a pickle, expected its state_dict. Make another one"
+    with pytest.raises(QPError, match=message):
+        copied(GaussNewton(random_mpc(0)))
+
+
+def test_a_gauss_newton_step_with_everything_frozen_moves_nothing():
+    mpc = random_mpc(0)
+    s, a, target = targets(mpc)
+    mpc.requires_grad_(False)
+    before = mpc.C.clone()
+    GaussNewton(mpc).step(s, a, target)
+    assert torch.equal(mpc.C, before)
+
+
+def test_errors_that_cannot_be_squared_move_nothing():
+    mpc = random_mpc(0)
+    s, a, target = targets(mpc)
+    before = mpc.C.detach().clone()
+    assert not GaussNewton(mpc).step(s, a, 1e160 * target).accepted
+    assert torch.equal(mpc.C, before)
+
+
+def test_a_memory_of_another_horizon_is_named():
+    short, long = (GaussNewton(random_mpc(0, horizon=n), memory=4) for n in (2, 3))
+    for optimizer in (short, long):
+        optimizer.step(*targets(optimizer._mpc))
+    long.load_state_dict(short.state_dict())
+    with pytest.raises(QPError, match=r"got a memory of gradients of .* entries, expected"):
+        long.step(*targets(long._mpc))
+
+
+def test_weights_that_are_not_finite_are_named():
+    loss = QPQLearningLoss(QPActorValueOperator(random_mpc(0, action_slack=10.0)))
+    loss.make_value_estimator(gamma=0.9)
+    batch = make_batch(4).set("priority_weight", torch.tensor([1.0, torch.nan, 1.0, 1.0]))
+    with pytest.raises(QPError, match="priority_weight: got NaN or inf, expected finite weights"):
+        loss(batch)

@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+from torch.nn.utils import parametrize
+from torch.testing import assert_close
+
+from tests.problems import normal
+from torch_qpmpc import QPError
+from torch_qpmpc.mpc.parametrizations import Cholesky, SquareRoot
+
+FACTOR = normal(4, 4)
+DIRECTION = normal(4, 1)
+MATRICES = {
+    "positive definite": FACTOR @ FACTOR.mT,
+    "rank one": DIRECTION @ DIRECTION.mT,
+    "zero": torch.zeros(4, 4).double(),
+    "diagonal with zeros": torch.diag(torch.tensor([0.0, 2.0, 0.0, 3.0])).double(),
+    "batch": torch.stack((FACTOR @ FACTOR.mT, DIRECTION @ DIRECTION.mT)),
+    "tiny": 1e-12 * FACTOR @ FACTOR.mT,
+}
+
+
+@pytest.mark.parametrize("name", MATRICES)
+def test_cholesky_factor_of_any_semidefinite_matrix(name):
+    H = MATRICES[name]
+    factor = Cholesky().right_inverse(H)
+    scale = float(H.abs().max())
+    assert_close(Cholesky()(factor), H, rtol=0, atol=1e-12 * scale)
+    assert (factor.triu(1) == 0).all()
+    assert (factor.diagonal(dim1=-2, dim2=-1) >= 0).all()
+
+
+def test_cholesky_factor_is_the_usual_one_where_that_exists():
+    H = MATRICES["positive definite"]
+    assert_close(Cholesky().right_inverse(H), torch.linalg.cholesky(H))
+
+
+@pytest.mark.parametrize("name", ["rank one", "diagonal with zeros"])
+def test_cholesky_factor_of_singular_matrices_in_single_precision(name):
+    H = MATRICES[name].float()
+    assert_close(Cholesky()(Cholesky().right_inverse(H)), H)
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (3, 4, 4)])
+def test_any_factor_gives_a_symmetric_semidefinite_matrix(shape):
+    H = Cholesky()(10 * normal(*shape))
+    assert_close(H, H.mT, rtol=0, atol=0)
+    assert (torch.linalg.eigvalsh(H) > -1e-12).all()
+
+
+def test_the_entries_above_the_diagonal_do_not_count():
+    factor = normal(4, 4).requires_grad_()
+    H = Cholesky()(factor)
+    assert_close(H, Cholesky()(factor.tril()))
+    H.sum().backward()
+    assert factor.grad is not None
+    assert (factor.grad.triu(1) == 0).all()
+
+
+def test_square_root_squares_entries_of_any_shape_and_sign():
+    assert_close(SquareRoot()(torch.tensor([[-2.0], [0.0]])), torch.tensor([[4.0], [0.0]]))
+    h = torch.tensor([[3.0, 0.0], [1e-12, 2.0]])
+    assert_close(SquareRoot()(SquareRoot().right_inverse(h)), h)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "message"),
+    [
+        (SquareRoot(), torch.tensor([1.0, -0.5]), "diagonal: got -0.5, expected non-negative"),
+        (
+            Cholesky(),
+            torch.diag(torch.tensor([1.0, -0.5])),
+            "H: got smallest eigenvalue -0.5, expected a positive semidefinite matrix",
+        ),
+    ],
+)
+def test_a_start_that_is_not_semidefinite_is_named(kind, value, message):
+    with pytest.raises(QPError, match=message):
+        kind.right_inverse(value)
+
+
+@pytest.mark.parametrize("rate", [0.1, 10.0])
+def test_gradient_steps_leave_the_matrix_semidefinite(rate):
+    module = nn.Linear(4, 4).double()
+    module.weight.data.copy_(MATRICES["rank one"])
+    parametrize.register_parametrization(module, "weight", Cholesky())
+    optimizer = torch.optim.SGD(module.parameters(), lr=rate)
+    for _ in range(3):
+        (module.weight * normal(4, 4)).sum().backward()
+        optimizer.step()
+        H = module.weight.detach()
+        assert torch.linalg.eigvalsh(H)[0] > -1e-9 * H.abs().max()

@@ -1,0 +1,46 @@
+"""What `QPMPC` accepts as numbers and tensors: NumPy's integers, lists, and any default device."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc.checks import check_whole
+from torch_qpmpc.mpc.validation import as_tensor
+
+A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint8])
+def test_numpys_integers_are_integers(kind):
+    check_whole("count", kind(3), 1)
+    mpc = QPMPC(kind(2), kind(1), kind(3), seed=kind(4))
+    expected, s = QPMPC(2, 1, 3, seed=4), torch.ones(2, 2)
+    assert_close(mpc.value(s), expected.value(s), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("value", [True, np.True_, 2.0, np.float64(2.0), "2", None, np.int64(0)])
+def test_what_is_no_whole_number_is_named(value):
+    with pytest.raises(QPError, match=r"count: got .*, expected a whole number >= 1"):
+        check_whole("count", value, 1)
+
+
+@pytest.mark.parametrize("name", ["from_model", "linear_mpc"])
+def test_lists_are_read_on_a_default_device_of_meta(name):
+    make = getattr(QPMPC, name)
+    expected = make(A, B, 3).state_dict()
+    with torch.device("meta"):
+        mpc = make(A, B, 3)
+    assert {x.device.type for x in (*mpc.parameters(), *mpc.buffers())} == {"meta"}
+    mpc.to_empty(device="cpu").reset_parameters()
+    assert_close(mpc.state_dict(), expected, rtol=0, atol=0)
+
+
+def test_a_tensor_without_values_is_named():
+    with torch.device("meta"):
+        value = torch.eye(2)
+        with pytest.raises(QPError, match=r"A: got a tensor of torch.float32 on meta, expected"):
+            as_tensor("A", value)

@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, programs_of, times
+from torch_qpmpc.qp.pipeline.batch import FlatPrograms
+from torch_qpmpc.qp.pipeline.certificate import TOLERANCE, Certificate, certify
+
+BATCH, SPOILT = 5, 2
+N_Z, N_C, N_F = 12, 3, 2
+
+
+def judge(known: KnownQP, **claim: Tensor) -> Certificate:
+    """The certificate of the exact solution, but for what ``claim`` says."""
+    exact = {"z": known.z, "lam": known.lam, "chi": known.chi, "xi": known.xi}
+    parts = exact | claim
+    return certify(programs_of(known), parts["z"], parts["lam"], parts["chi"], parts["xi"])
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_solutions_are_accepted(seed, matrices):
+    known = known_qp(seed, batch=(BATCH,), matrices=matrices)
+    certificate = judge(known)
+    assert certificate.residual.max() < 1e-12
+    assert_close(certificate.value, known.value)
+    assert_close(certificate.sigma, known.sigma)
+
+
+@pytest.mark.parametrize("rank", [0, 3])
+def test_exact_solutions_of_degenerate_costs_are_accepted(rank):
+    assert judge(known_qp(0, batch=(BATCH,), rank=rank)).residual.max() < 1e-12
+
+
+def first_row(known: KnownQP, condition: Tensor) -> int:
+    """The first row of the spoilt element where the condition holds."""
+    return int(condition[SPOILT].nonzero()[0, 0])
+
+
+def shifted(tensor: Tensor, entry: int, by: float) -> Tensor:
+    out = tensor.clone()
+    out[SPOILT, entry] += by
+    return out
+
+
+def without_sign(known: KnownQP) -> dict[str, Tensor]:
+    lam = known.lam.clone()
+    lam[SPOILT] *= -1
+    return {"lam": lam}
+
+
+SPOILERS: dict[str, Callable[[KnownQP], dict[str, Tensor]]] = {
+    "z moved off C z = b": lambda known: {"z": shifted(known.z, N_Z - 1, 1e-3)},
+    "fixed entry moved": lambda known: {"z": shifted(known.z, 0, 1e-3)},
+    "lam's sign flipped": without_sign,
+    "one multiplier changed": lambda known: {
+        "lam": shifted(known.lam, first_row(known, known.lam != 0), 1e-3)
+    },
+    "inside row with a multiplier": lambda known: {
+        "lam": shifted(known.lam, first_row(known, known.lam == 0), 1e-3)
+    },
+    "chi wrong": lambda known: {"chi": shifted(known.chi, 1, 1e-3)},
+    "xi wrong": lambda known: {"xi": shifted(known.xi, 1, 1e-3)},
+    "NaN in z": lambda known: {"z": shifted(known.z, 3, torch.nan)},
+    "infinite multiplier": lambda known: {"lam": shifted(known.lam, 3, torch.inf)},
+}
+
+
+@pytest.mark.parametrize("name", SPOILERS)
+def test_one_wrong_part_is_rejected_and_only_there(name):
+    known = known_qp(1, batch=(BATCH,))
+    residual = judge(known, **SPOILERS[name](known)).residual
+    assert residual[SPOILT] > 10 * TOLERANCE
+    assert not residual.isnan().any()
+    others = torch.arange(BATCH) != SPOILT
+    assert residual[others].max() < 1e-12
+
+
+def consistent(known: KnownQP, z: Tensor, lam: Tensor, **bounds: Tensor) -> Certificate:
+    """Judge z and lam with q and b adapted, so that only the rows can be wrong."""
+    H, _, _, C, _, G, lb, ub, _ = known.qp.tensors()
+    q = -(times(H, z) + times(G.mT, lam) + times(C.mT, known.chi))
+    q[:, :N_F] -= known.xi
+    lb, ub = bounds.get("lb", lb), bounds.get("ub", ub)
+    changed = replace(
+        known, qp=replace(known.qp, q=q, b=times(C, z), lb=lb, ub=ub), fixed=z[:, :N_F]
+    )
+    return certify(programs_of(changed), z, lam, known.chi, known.xi)
+
+
+def where(known: KnownQP, kinds: tuple[str, ...], *, hard: bool) -> Tensor:
+    """Which rows are of these kinds, by what the multipliers, slacks and bounds say."""
+    qp, y = known.qp, known.z @ known.qp.G.mT
+    is_kind = {
+        "inside": (known.lam == 0) & qp.lb.isfinite() & qp.ub.isfinite(),
+        "at_upper": (known.lam > 0) & (y - qp.ub).abs().lt(1e-9) & (qp.lb < qp.ub),
+        "at_lower": (known.lam < 0) & (y - qp.lb).abs().lt(1e-9) & (qp.lb < qp.ub),
+        "above": (known.sigma > 0) & (known.lam > 0),
+        "no_upper": (known.lam == 0) & qp.lb.isfinite() & qp.ub.isinf(),
+    }
+    return torch.stack([is_kind[kind] for kind in kinds]).any(0) & (qp.w.isinf() == hard)
+
+
+@pytest.mark.parametrize(
+    ("kind", "hard", "change"),
+    [
+        ("inside", True, 0.05),  # a multiplier where there is room
+        ("at_upper", True, -12.0),  # pulls away from its own bound
+        ("at_lower", False, 12.0),
+        ("at_upper", False, 12.0),  # at its bound, but more than the slack's weight
+        ("above", False, 0.05),  # more than the slack's weight
+        ("above", False, -0.05),  # less than it, though violated
+        ("no_upper", True, 0.05),  # of a bound that does not exist
+        ("no_upper", False, 0.05),
+    ],
+)
+def test_multipliers_that_do_not_fit_their_rows_are_rejected(kind, hard, change):
+    known = known_qp(2, batch=(BATCH,))
+    row = first_row(known, where(known, (kind,), hard=hard))
+    residual = consistent(known, known.z, shifted(known.lam, row, change)).residual
+    assert residual[SPOILT] > 10 * TOLERANCE
+    assert residual[torch.arange(BATCH) != SPOILT].max() < 1e-12
+
+
+@pytest.mark.parametrize("hard", [False, True])
+def test_a_multiplier_without_its_bound_active_is_rejected(hard):
+    known = known_qp(3, batch=(BATCH,))
+    row = first_row(known, where(known, ("at_upper",), hard=hard))
+    ub = shifted(known.qp.ub, row, 1e-3)
+    residual = consistent(known, known.z, known.lam, ub=ub).residual
+    assert residual[SPOILT] > 10 * TOLERANCE
+    assert residual[torch.arange(BATCH) != SPOILT].max() < 1e-12
+
+
+def test_a_violated_hard_row_is_rejected_and_a_soft_one_is_not():
+    for hard in (True, False):
+        known = known_qp(4, batch=(BATCH,))
+        row = first_row(known, where(known, ("inside",), hard=hard))
+        y = known.z @ known.qp.G.mT
+        ub = known.qp.ub.clone()
+        ub[SPOILT, row] = y[SPOILT, row] - 1e-3
+        weight = 0.0 if hard else float(known.qp.w[SPOILT, row])
+        certificate = consistent(known, known.z, shifted(known.lam, row, weight), ub=ub)
+        assert (certificate.residual[SPOILT] > 10 * TOLERANCE) == hard
+        assert_close(certificate.sigma[SPOILT, row].item(), 0.0 if hard else 1e-3)
+
+
+def unit_programs(q: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> FlatPrograms:
+    """min 1/2 z'z + q'z over lb <= z <= ub."""
+    unit, none = torch.eye(len(q)), torch.zeros(0)
+    C = none.reshape(0, len(q))
+    return FlatPrograms.of(unit, q, none.sum(), C, none, unit, lb, ub, w, none)[0]
+
+
+@pytest.mark.parametrize("weight", [1.0, torch.inf])
+def test_a_multiplier_of_a_bound_that_does_not_exist_is_rejected_at_zero_too(weight):
+    z, lam = torch.zeros(1, 1).double(), torch.full((1, 1), 1e-3).double()
+    infinite = torch.full((1,), torch.inf)
+    programs = unit_programs(-lam[0], -torch.ones(1), infinite, torch.full((1,), weight))
+    assert certify(programs, z, lam, z[:, :0], z[:, :0]).residual > 10 * TOLERANCE
+
+
+def test_complementarity_gaps_of_opposite_sign_do_not_cancel():
+    # min 1/2 z'z + q'z with z <= 0: the first row is violated, by less than the tolerance, and
+    # the second has room; lam'(ub - z), the summed gap, is zero.
+    z = torch.tensor([[5e-7, -5e-7]]).double()
+    lam = torch.tensor([[1e3, 1e3]]).double()
+    hard = torch.full((2,), torch.inf)
+    programs = unit_programs(-(z + lam)[0], -torch.ones(2), torch.zeros(2), hard)
+    assert abs((lam * (0 - z)).sum()) < 1e-12
+    empty = z[:, :0]
+    assert certify(programs, z, lam, empty, empty).residual > 10 * TOLERANCE
+    assert certify(programs, 0 * z, lam, empty, empty).residual < TOLERANCE
+
+
+def test_absurd_multipliers_excuse_nothing():
+    # min 1/2 z'z - 2 z_2 with z_1 = 0, once in C and once in G: z_2 is 2, not 1.9.
+    C, none = torch.tensor([[1.0, 0.0]]), torch.zeros(1)
+    q, hard = torch.tensor([0.0, -2.0]), torch.full((1,), torch.inf)
+    programs, _ = FlatPrograms.of(
+        torch.eye(2), q, none.sum(), C, none, C, none, none, hard, none[:0]
+    )
+    huge = torch.full((1, 1), 1e12).double()
+    for z_2, accepted in ((2.0, True), (1.9, False)):
+        z = torch.tensor([[0.0, z_2]]).double()
+        residual = certify(programs, z, huge, -huge, z[:, :0]).residual
+        assert bool(residual <= TOLERANCE) == accepted
+
+
+def test_the_constant_is_part_of_the_value_but_loosens_nothing():
+    known = known_qp(5, batch=(BATCH,))
+    lifted = replace(known, qp=replace(known.qp, c=known.qp.c + 1e9))
+    claim = {"lam": shifted(known.lam, first_row(known, known.lam == 0), 1e-3)}
+    assert_close(judge(lifted).value, known.value + 1e9)
+    assert_close(judge(lifted, **claim).residual, judge(known, **claim).residual)
+
+
+@pytest.mark.parametrize("missing", ["rows", "equalities", "fixed", "all"])
+def test_parts_of_a_program_may_be_missing(missing):
+    known = known_qp(
+        6,
+        batch=(BATCH,),
+        soft=() if missing in ("rows", "all") else SOFT_ROWS,
+        hard=() if missing in ("rows", "all") else HARD_ROWS,
+        n_c=0 if missing in ("equalities", "all") else N_C,
+        n_f=0 if missing in ("fixed", "all") else N_F,
+    )
+    assert judge(known).residual.max() < 1e-12
+    assert judge(known, z=shifted(known.z, 5, 1e-3)).residual[SPOILT] > 10 * TOLERANCE

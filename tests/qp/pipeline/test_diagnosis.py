@@ -1,0 +1,289 @@
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.campaign.families import FAMILIES, Draw
+from tests.campaign.tally import alone
+from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, programs_of, random_mpc
+from torch_qpmpc import QPMPC, QuadraticProgram, SolverError, Status, solve_qp
+from torch_qpmpc.qp.pipeline.batch import FlatPrograms
+from torch_qpmpc.qp.pipeline.diagnosis import diagnose
+
+pytestmark = pytest.mark.filterwarnings("ignore:Clarabel.rs terminated with status")
+
+INF = torch.inf
+
+
+def program(H, q, G=(), lb=(), ub=(), w=(), *, C=(), b=()) -> QuadraticProgram:
+    """A QP in two variables, from lists."""
+
+    def matrix(rows) -> Tensor:
+        return torch.tensor(rows, dtype=torch.float64).reshape(-1, 2)
+
+    def vector(entries) -> Tensor:
+        return torch.tensor(entries, dtype=torch.float64)
+
+    return QuadraticProgram(
+        matrix(H),
+        vector(q),
+        vector(0.0),
+        matrix(C),
+        vector(b),
+        matrix(G),
+        vector(lb),
+        vector(ub),
+        vector(w),
+        check_values=False,
+    )
+
+
+UNIT, FLAT, NONE = [[1, 0], [0, 1]], [[1, 0], [0, 0]], [[0, 0], [0, 0]]
+TWICE = [[1, 1], [1, 1]]
+INFEASIBLE = {
+    "two rows": program(UNIT, [1, 1], TWICE, [-INF, 2], [1, INF], [INF, INF]),
+    "by a little": program(UNIT, [1, 1], TWICE, [-INF, 1.001], [1, INF], [INF, INF]),
+    "far away": program(UNIT, [1, 1], TWICE, [-INF, 2e6], [1e6, INF], [INF, INF]),
+    "badly scaled": program(
+        UNIT, [1, 1], [[1e4, 1e4], [1e-4, 1e-4]], [-INF, 2e-4], [1e4, INF], [INF, INF]
+    ),
+    "beside a soft row": program(
+        UNIT, [1, 1], [*TWICE, [1, 0]], [-INF, 2, 5], [1, INF, 6], [INF, INF, 1e6]
+    ),
+    "no variable": program(UNIT, [1, 1], [[0, 0]], [1], [2], [INF]),
+    "unbounded too": program(NONE, [0, 1], [[1, 0], [1, 0]], [-INF, 2], [1, INF], [INF, INF]),
+    "equalities": program(UNIT, [1, 1], C=[[1, 1], [1, 1]], b=[1, 2]),
+    "equality and row": program(UNIT, [1, 1], [[1, 1]], [2], [3], [INF], C=[[1, 1]], b=[1]),
+}
+UNBOUNDED = {
+    "no rows": program(NONE, [1, 1]),
+    "flat direction": program(FLAT, [1, 1], [[1, 0]], [-1], [1], [INF]),
+    "one side open": program(FLAT, [1, 1], [[0, 1]], [-INF], [1], [INF]),
+    "weak slack": program(FLAT, [1, 10], [[0, 1]], [-1], [1], [2]),
+    "free slack": program(FLAT, [1, 10], [[0, 1]], [-1], [1], [0]),
+    "small slope": program(FLAT, [1, 1e-2], [[1, 0]], [-1], [1], [INF]),
+    "large cost": program([[1e6, 0], [0, 0]], [1e6, 1e6], [[1, 0]], [-1], [1], [INF]),
+}
+INVALID = {
+    "NaN in q": program(UNIT, [1, torch.nan]),
+    "NaN in H": program([[torch.nan, 0], [0, 1]], [1, 1]),
+    "NaN in ub": program(UNIT, [1, 1], [[1, 0]], [0], [torch.nan], [1]),
+    "infinite G": program(UNIT, [1, 1], [[INF, 0]], [0], [1], [1]),
+    "crossed bounds": program(UNIT, [1, 1], [[1, 0]], [1], [0], [1]),
+    "empty interval": program(UNIT, [1, 1], [[1, 0]], [INF], [INF], [1]),
+    "negative weight": program(UNIT, [1, 1], [[1, 0]], [0], [1], [-1]),
+}
+CASES = [
+    *((name, qp, Status.INFEASIBLE) for name, qp in INFEASIBLE.items()),
+    *((name, qp, Status.UNBOUNDED) for name, qp in UNBOUNDED.items()),
+    *((name, qp, Status.INVALID_DATA) for name, qp in INVALID.items()),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "qp", "status"), CASES, ids=[f"{s.name} {n}" for n, _, s in CASES]
+)
+def test_what_cannot_be_solved_is_named_and_soon(solver, name, qp, status):
+    # Of this process's own time: a busy machine is not slow.
+    began = time.process_time()
+    solution = solve_qp(qp, solver=solver, on_failure="mask")
+    assert time.process_time() - began < 2
+    assert Status(int(solution.status)) == status
+    assert solution.value == torch.inf
+
+
+def test_an_infeasible_mpc_batch_is_named_and_soon(solver):
+    options = {"horizon": 20, "state_slack": torch.inf, "action_slack": 1.0, "on_failure": "mask"}
+    mpc = random_mpc(0, free=0.0, solver=solver, **options)
+    began = time.process_time()
+    solution = mpc.solve(torch.tensor([[2.0, 2.0], [5.0, 5.0], [-5.0, 5.0]]))
+    assert time.process_time() - began < 2
+    assert (solution.status == Status.INFEASIBLE).all()
+
+
+@pytest.mark.parametrize("fixed", [[2.0], [2.0, 1.0]])
+def test_fixed_entries_beyond_a_hard_row_are_infeasible(fixed):
+    qp = program(UNIT, [1, 1], UNIT, [-1, -1], [1, 1], [INF, 5])
+    solution = solve_qp(qp, torch.tensor(fixed).double(), solver="daqp", on_failure="mask")
+    assert solution.status == Status.INFEASIBLE
+
+
+def test_fixed_entries_that_break_an_equality_are_infeasible():
+    qp = program(UNIT, [1, 1], C=[[1, 0]], b=[1])
+    for s, status in ((1.0, Status.SOLVED), (2.0, Status.INFEASIBLE)):
+        solution = solve_qp(qp, torch.tensor([s]).double(), solver="daqp", on_failure="mask")
+        assert solution.status == status
+
+
+def programs(qp: QuadraticProgram, fixed: Tensor | None = None) -> FlatPrograms:
+    """QPs as the chain has them; by default with nothing fixed."""
+    fixed = torch.zeros(0).double() if fixed is None else fixed
+    return FlatPrograms.of(*qp.tensors(), fixed)[0]
+
+
+def doubles(entries) -> Tensor:
+    return torch.tensor(entries, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("rank", [None, 3, 0])
+@pytest.mark.parametrize("weight", [1e-2, 5.0, 1e4])
+def test_solvable_programs_are_neither_infeasible_nor_unbounded(rank, weight):
+    options = {"rank": rank, "weight": weight, "soft": SOFT_ROWS, "hard": HARD_ROWS}
+    status = diagnose(programs_of(known_qp(1, batch=(4,), **options)))
+    assert (status == Status.NOT_CONVERGED).all()
+
+
+def test_each_element_of_a_batch_has_its_own_diagnosis():
+    rows = [[1, 0], [1, 0], [0, 1]]
+    qp = program(NONE, [0, 0], rows, [0] * 3, [0] * 3, [INF, INF, 1])
+    q = doubles([[0.0, 0.0], [0.0, 0.0], [0.0, 5.0]])
+    lb = doubles([[-1.0, -1.0, -1.0], [-1.0, 3.0, -1.0], [-1.0, -1.0, -1.0]])
+    ub = doubles([[1.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 1.0]])
+    qp = replace(qp, q=q, lb=lb, ub=ub, check_values=False)
+    expected = [Status.NOT_CONVERGED, Status.INFEASIBLE, Status.UNBOUNDED]
+    assert diagnose(programs(qp)).tolist() == expected
+
+
+def test_matrices_of_its_own_for_each_element():
+    flat, steep = program(UNIT, [1, 1], TWICE, [0, 0], [0, 0], [INF, INF]), doubles(NONE)
+    parallel = doubles(
+        [[[1.0, 1.0], [1.0, 1.0]], [[1.0, 0.0], [2.0, 0.0]], [[1.0, 0.0], [2.0, 0.0]]]
+    )
+    qp = replace(
+        flat,
+        H=torch.stack([doubles(UNIT), steep, steep]),
+        G=parallel,
+        q=doubles([[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]]),
+        lb=doubles([[-1.0, 3.0], [-1.0, -1.0], [-1.0, -1.0]]),
+        ub=doubles([[1.0, 4.0], [1.0, 1.0], [1.0, 1.0]]),
+        check_values=False,
+    )
+    expected = [Status.INFEASIBLE, Status.UNBOUNDED, Status.NOT_CONVERGED]
+    assert diagnose(programs(qp)).tolist() == expected
+
+
+@pytest.mark.parametrize("curvature", [1e-4, 1e-8])
+def test_little_curvature_is_not_called_unbounded(curvature):
+    far = [1e9, 1e9]
+    qp = program([[1, 0], [0, curvature]], [0, 1], [[1, 0], [0, 1]], [-1e9, -1e9], far, [1, 1])
+    assert diagnose(programs(qp)).tolist() == [Status.NOT_CONVERGED]
+
+
+@pytest.mark.parametrize(
+    ("family", "count", "seed", "index"),
+    [
+        ("infeasible", 128, 6, 70),  # rows that contradict each other by 1e-4
+        ("infeasible", 16, 4, 2),
+        ("infeasible", 16, 153, 0),  # ... and lead far away to another
+        ("unbounded", 16, 42, 5),  # a slope of 1 on curvatures of 1 and 0
+        ("unbounded", 16, 74, 6),
+        ("scaled mixed", 16, 108, 4),
+    ],
+)
+def test_what_was_once_called_not_converged_has_its_proof(family, count, seed, index):
+    case = FAMILIES[family](Draw(seed), count)
+    qp, fixed = alone(case, index)
+    solution = solve_qp(qp, fixed, solver="daqp", on_failure="mask")
+    assert solution.status == case.expected[index]
+
+
+@pytest.mark.parametrize("far", [1.0, 1e2, 1e4, 1e6])
+def test_hard_rows_that_hold_only_far_away_are_not_called_infeasible(far):
+    rows = [[1, 0], [0, 1]]
+    qp = program(rows, [0, 0], rows, [far, far], [2 * far, 2 * far], [INF, INF])
+    assert diagnose(programs(qp)).tolist() == [Status.NOT_CONVERGED]
+
+
+#: Soft states, and actions within hard bounds, so that no state makes it infeasible or unbounded.
+BOUNDED: dict[str, Any] = {
+    "stage_weight": [1.0, 0.1, 0.01],
+    "state_bounds": ([-2, -10], [2, 10]),
+    "action_bounds": ([-1.0], [1.0]),
+}
+
+
+def growing(radius: float, horizon: int, **options: Any) -> QPMPC:
+    """An unstable plant, a Jordan block."""
+    A = [[radius, 0.1], [0.0, radius]]
+    return QPMPC.from_model(A, [[0.0], [0.1]], horizon, **(BOUNDED | options))
+
+
+@pytest.mark.parametrize(
+    ("radius", "horizon", "value"),
+    # By two solvers and two eliminations, which agree to all digits given.
+    [(1.5, 30, 741101226.75), (1.5, 50, 3.557525499e14), (2.0, 50, 2.65969067e27)],
+)
+def test_states_that_no_action_holds_are_solved(solver, radius, horizon, value):
+    mpc = growing(radius, horizon, solver=solver)
+    assert_close(mpc.value(doubles([[1.0, 0.0]])), doubles([value]), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("horizon", [10, 30, 50])
+def test_an_unstable_plant_that_the_actions_hold_is_solved(solver, horizon):
+    mpc = growing(1.5, horizon, solver=solver)
+    s = doubles([[0.01, 0.01], [0.0, 0.05]])
+    held = mpc.solve(s)
+    states, _ = mpc.predicted(held.z)
+    assert states.abs().max() < 1
+    assert_close(held.value, doubles([0.0111, 0.0048]), rtol=0.05, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("A", "horizon"),
+    [
+        ([[2.0, 0.1], [0.0, 2.0]], 40),  # at the edge of what |u| <= 1 holds
+        ([[800.0, 600.0], [-600.0, 800.0]], 30),  # a norm of 1,000, and states of 1e90
+        ([[1.0, 1e3], [1e3, 1.0]], 20),
+    ],
+)
+def test_what_float64_cannot_solve_is_not_called_infeasible(solver, A, horizon):
+    mpc = QPMPC.from_model(A, [[0.0], [0.1]], horizon, solver=solver, on_failure="mask", **BOUNDED)
+    status = mpc.solve(doubles([[0.0, 0.05], [1.0, 0.0], [-1.5, 3.0]])).status
+    assert not ((status == Status.INFEASIBLE) | (status == Status.UNBOUNDED)).any()
+
+
+def test_not_converged_speaks_of_conditioning_and_of_what_helps():
+    mpc = growing(2.0, 40, solver="daqp")
+    message = "1 NOT_CONVERGED.*unstable model are over a long horizon: shorten it"
+    with pytest.raises(SolverError, match=message):
+        mpc.value(doubles([[0.0, 0.05]]))
+
+
+def test_an_unstable_plant_that_is_infeasible_has_its_proof(solver):
+    options = {"state_slack": torch.inf, "on_failure": "mask", "solver": solver}
+    mpc = growing(1.5, 30, **options)
+    s = doubles([[1.9, 9.9], [-1.9, 0.0]])
+    assert (mpc.solve(s).status == Status.INFEASIBLE).all()
+
+
+def test_noise_beside_large_numbers_spoils_no_proof(solver):
+    flat = QPMPC.from_model(
+        [[1.0]],
+        [[1.0, 1.0]],
+        1,
+        stage_weight=[1.0, 0.1, 0.0],
+        terminal_weight=[0.0],
+        learn=("q",),
+        solver=solver,
+        on_failure="mask",
+    )
+    with torch.no_grad():
+        flat.q[2] = 1.0
+    assert flat.solve(doubles([0.0])).status == Status.UNBOUNDED
+    options = {"state_bounds": ([-2, -2], [2, 2]), "state_slack": torch.inf}
+    A, B = [[1.5, 0.1], [0.0, 1.2]], [[0.0], [1.0]]
+    mpc = QPMPC.from_model(A, B, 3, solver=solver, on_failure="mask", **options)
+    assert mpc.solve(doubles([1.9, 0.0])).status == Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("slope", [1e-7, 1e-9, 1e-11])
+def test_rows_that_meet_far_away_are_not_called_infeasible(slope):
+    # x >= 1 and y <= 0 with x <= y (1 - slope) + .. meet where y is -1 / slope.
+    qp = program(UNIT, [0, 0], [[1, -1], [1, slope - 1]], [-INF, 1], [0, INF], [INF, INF])
+    assert diagnose(programs(qp)).tolist() == [Status.NOT_CONVERGED]

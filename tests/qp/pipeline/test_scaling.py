@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.campaign.families import in_units
+from tests.problems import KnownQP, known_qp, programs_of, random_mpc
+from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
+from torch_qpmpc.qp.pipeline.batch import FlatPrograms
+from torch_qpmpc.qp.pipeline.scaling import Units
+from torch_qpmpc.qp.pipeline.solve import solve_programs
+
+BATCH = 4
+
+
+def in_size(known: KnownQP, **sizes: float) -> KnownQP:
+    parts = {"cost": 1.0, "variables": 1.0, "rows": 1.0, "equalities": 1.0} | sizes
+    return in_units(known, **{name: torch.tensor(x).double() for name, x in parts.items()})
+
+
+@pytest.mark.parametrize("size", [1e-8, 1e-4, 1e4, 1e8])
+@pytest.mark.parametrize("unit", ["cost", "variables", "rows", "equalities"])
+def test_a_qp_of_any_size_is_solved_without_help(solver, unit, size):
+    known = in_size(known_qp(0, batch=(BATCH,)), **{unit: size})
+    with SolveLog() as log:
+        solution = solve_qp(known.qp, known.fixed, solver=solver)
+    assert log.fallback == 0
+    for name in ("value", "z", "lam", "chi", "xi", "sigma"):
+        expected = getattr(known, name)
+        tolerance = 1e-4 * float(expected.abs().max())
+        assert_close(getattr(solution, name), expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+def test_ordinary_sizes_have_no_units(matrices):
+    assert Units.of(programs_of(known_qp(0, batch=(BATCH,), matrices=matrices))) is None
+    qp = random_mpc(0).quadratic_program()
+    assert Units.of(FlatPrograms.of(*qp.tensors(), torch.zeros(2).double())[0]) is None
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+def test_units_are_powers_of_two_and_make_sizes_ordinary(matrices):
+    known = in_size(known_qp(0, batch=(BATCH,), matrices=matrices), cost=1e-9, variables=1e5)
+    programs = programs_of(known)
+    units = Units.of(programs)
+    assert units is not None
+    for unit in vars(units).values():
+        assert (torch.frexp(unit).mantissa == 0.5).all()
+    assert Units.of(units.scaled(programs)) is None
+
+
+@pytest.mark.parametrize("bound", [1e3, 1e5, 1e6, 1e8, 1e10])
+def test_bounds_that_are_far_away_change_no_answer(solver, bound):
+    """Large numbers in the place of no bound once made units in which every error was small."""
+    A, B, s = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], torch.tensor([[1.0, -0.5], [0.1, 0.2]])
+    options = {"stage_weight": [1.0, 0.1, 0.01], "action_bounds": ([-1.0], [1.0])}
+    free, far = (
+        QPMPC.from_model(A, B, 10, state_bounds=bounds, solver=solver, **options)
+        for bounds in (None, ([-bound] * 2, [bound] * 2))
+    )
+    assert_close(far.value(s.double()), free.value(s.double()), rtol=1e-6, atol=0)
+    assert_close(far.policy(s.double()), free.policy(s.double()), rtol=1e-5, atol=0)
+
+
+def test_a_hard_bound_holds_where_states_are_large_and_actions_small(solver):
+    options = {"stage_weight": [1.0, 1.0, 0.1], "state_bounds": ([-1e4] * 2, [1e4] * 2)}
+    mpc = QPMPC.from_model(
+        [[1.0, 0.1], [0.0, 0.9]],
+        [[0.0], [1e5]],
+        10,
+        action_bounds=([-0.01], [0.01]),
+        solver=solver,
+        **options,
+    )
+    s = torch.tensor([1e4, -1e3]).double()
+    assert mpc.policy(s).abs() <= 0.01 * (1 + 1e-6)
+    assert_close(mpc.value(s), torch.tensor(3.04986581e8).double(), rtol=1e-6, atol=0)
+
+
+def test_solutions_come_back_in_the_numbers_of_the_qp():
+    known = in_size(known_qp(1, batch=(BATCH,)), cost=1e-7, rows=1e6)
+    raw = solve_programs(programs_of(known), known.fixed.shape[-1], "torch")
+    assert (raw.status == Status.SOLVED).all()
+    for name in ("value", "z", "sigma", "chi", "lam", "xi"):
+        expected = getattr(known, name)
+        assert_close(getattr(raw, name), expected, rtol=1e-6, atol=1e-9 * expected.abs().max())
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+@pytest.mark.parametrize("spoilt", [torch.nan, torch.inf])
+def test_what_is_not_finite_is_left_to_its_own_status(matrices, spoilt):
+    known = in_size(known_qp(2, batch=(BATCH,), matrices=matrices), cost=1e-7)
+    q = known.qp.q.clone()
+    q[1] = spoilt
+    qp = QuadraticProgram(**(vars(known.qp) | {"q": q}), check_values=False)
+    solution = solve_qp(qp, known.fixed, on_failure="mask")
+    assert solution.status.tolist() == [0, Status.INVALID_DATA, 0, 0]
+    assert_close(solution.value[[0, 2, 3]], known.value[[0, 2, 3]], rtol=1e-5, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-8, 1e8])
+def test_small_and_large_contradictions_are_infeasible(size):
+    known = known_qp(3, batch=(BATCH,), n_c=1)
+    C, b = known.qp.C.repeat(2, 1), torch.cat((known.qp.b, known.qp.b + 1), -1)
+    twice = replace(known, qp=replace(known.qp, C=C, b=b), chi=torch.zeros_like(b))
+    small = in_size(twice, equalities=size, variables=size)
+    solution = solve_qp(small.qp, small.fixed, on_failure="mask")
+    assert (solution.status == Status.INFEASIBLE).all()

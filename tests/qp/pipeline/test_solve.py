@@ -1,0 +1,409 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.problems import KnownQP, known_qp
+from torch_qpmpc import QPMPC, QPSolution, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
+from torch_qpmpc.envs import PointMass
+from torch_qpmpc.qp.pipeline import solve as chain
+from torch_qpmpc.qp.pipeline.batch import SoftQPs
+from torch_qpmpc.qp.program import UNKNOWN
+from torch_qpmpc.qp.solvers import BACKENDS, Answer, Backend, daqp
+
+BATCH = 6
+
+
+def doctored(change: Callable[[Answer], Answer]) -> Backend:
+    """A backend that solves, and then changes its answer."""
+
+    def solve(qps: SoftQPs) -> Answer:
+        return change(daqp.solve(qps))
+
+    return solve
+
+
+LIES = {
+    "zeros": lambda answer: replace(answer, v=0 * answer.v, lam=0 * answer.lam),
+    "NaN": lambda answer: replace(answer, v=torch.nan * answer.v),
+    "v off": lambda answer: replace(answer, v=answer.v + 1.0),
+    "lam off": lambda answer: replace(answer, lam=answer.lam + 1.0),
+    "lam's sign": lambda answer: replace(answer, lam=-answer.lam),
+    "one's answer for all": lambda answer: replace(answer, v=answer.v[:1] + 0 * answer.v),
+}
+
+INACCURACIES = {
+    "v off": lambda answer: replace(answer, v=answer.v + 1e-4),
+    "lam off": lambda answer: replace(answer, lam=answer.lam + 1e-4),
+}
+
+
+@pytest.fixture
+def liar(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str:
+    """The name of a backend that tells the test's lie."""
+    monkeypatch.setitem(BACKENDS, "liar", doctored(LIES[request.param]))
+    return "liar"
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many QPs the backend "recorder", which is DAQP, is asked for at a time."""
+    counts = []
+
+    def recording(qps: SoftQPs) -> Answer:
+        counts.append(len(qps.g))
+        return daqp.solve(qps)
+
+    monkeypatch.setitem(BACKENDS, "recorder", recording)
+    return counts
+
+
+def solve(known: KnownQP, **options) -> QPSolution:
+    return solve_qp(known.qp, known.fixed, **options)
+
+
+def assert_right(solution: QPSolution, known: KnownQP) -> None:
+    assert (solution.status == Status.SOLVED).all()
+    assert_close(solution.value, known.value)
+    assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)
+
+
+# What the certificate rejects is solved by another
+
+
+@pytest.mark.parametrize("liar", LIES, indirect=True)
+def test_wrong_answers_are_caught_and_replaced(liar):
+    known = known_qp(0, batch=(BATCH,))
+    with SolveLog() as log:
+        solution = solve(known, solver=liar)
+    assert_right(solution, known)
+    assert (log.solves, log.unsolved) == (BATCH, 0)
+    assert log.fallback >= BATCH - 1  # where one's answer stands for all, that one is right
+
+
+@pytest.mark.parametrize("name", INACCURACIES)
+def test_inaccurate_answers_are_sharpened(monkeypatch, name):
+    monkeypatch.setitem(BACKENDS, "coarse", doctored(INACCURACIES[name]))
+    known = known_qp(0, batch=(BATCH,), matrices=(BATCH,))
+    with SolveLog() as log:
+        solution = solve(known, solver="coarse")
+    assert_right(solution, known)
+    assert log.fallback == 0
+    assert solution.residual.max() < 1e-9
+
+
+def test_only_what_is_rejected_is_solved_again(monkeypatch, asked):
+    wrong = torch.tensor([False, True, False, False, True, True])
+
+    def lie(answer: Answer) -> Answer:
+        return replace(answer, v=answer.v + wrong[:, None])
+
+    monkeypatch.setitem(BACKENDS, "torch", BACKENDS["recorder"])
+    monkeypatch.setitem(BACKENDS, "liar", doctored(lie))
+    known = known_qp(1, batch=(BATCH,), matrices=(BATCH,))
+    with SolveLog() as log:
+        solution = solve(known, solver="liar")
+    assert_right(solution, known)
+    assert asked == [3]
+    assert log.fallback == 3
+
+
+def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, asked):
+    def misled(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
+        return LIES["v off"](daqp.solve(qps)), torch.ones(len(active), dtype=torch.bool)
+
+    monkeypatch.setattr(chain, "recall", misled)
+    known = known_qp(2, batch=(BATCH,))
+    active = solve(known, solver="daqp").active
+    with SolveLog() as log:
+        assert_right(solve(known, solver="recorder", warm_start=active), known)
+    assert asked == [BATCH]
+    assert (log.fallback, log.recalled) == (0, 0)
+
+
+def test_a_known_active_set_spares_the_backend(asked):
+    known = known_qp(3, batch=(BATCH,))
+    active = solve(known, solver="daqp").active
+    with SolveLog() as log:
+        assert_right(solve(known, solver="recorder", warm_start=active), known)
+    assert asked == []
+    assert (log.fallback, log.recalled) == (0, BATCH)
+
+
+def test_what_recall_does_not_finish_is_for_the_backend(monkeypatch, asked):
+    def half(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
+        finished = torch.arange(len(active)) % 2 == 0
+        answer = daqp.solve(qps)
+        return replace(answer, v=answer.v.where(finished[:, None], torch.nan)), finished
+
+    monkeypatch.setattr(chain, "recall", half)
+    known = known_qp(3, batch=(BATCH,))
+    active = solve(known, solver="daqp").active
+    with SolveLog() as log:
+        assert_right(solve(known, solver="recorder", warm_start=active), known)
+    assert asked == [BATCH // 2]
+    assert (log.fallback, log.recalled) == (0, BATCH // 2)
+
+
+def test_a_solver_is_not_asked_twice_for_what_it_got_wrong(monkeypatch):
+    asked = []
+
+    def liar(qps: SoftQPs) -> Answer:
+        asked.append(len(qps.g))
+        return LIES["v off"](daqp.solve(qps))
+
+    monkeypatch.setitem(BACKENDS, "liar", liar)
+    known = known_qp(3, batch=(BATCH,))
+    nothing = torch.full(known.lam.shape, UNKNOWN, dtype=torch.int8)
+    with SolveLog() as log:
+        assert_right(solve(known, solver="liar", warm_start=nothing), known)
+    assert asked == [BATCH]
+    assert (log.fallback, log.recalled) == (BATCH, 0)
+
+
+@pytest.mark.parametrize("one", range(BATCH))
+def test_a_part_of_a_batch_may_have_other_rows(one):
+    """Rows without a bound are left out, and which they are differs from element to element."""
+    known = known_qp(3, batch=(BATCH,))
+    active = solve(known, solver="torch").active
+    unknown = torch.full_like(active, UNKNOWN)
+    unknown[one] = active[one]
+    with SolveLog() as log:
+        assert_right(solve(known, solver="torch", warm_start=unknown), known)
+    assert log.recalled == 1
+
+
+def test_the_active_set_of_what_is_not_solved_is_unknown():
+    known = spoil(known_qp(3, batch=(BATCH,)), 4)
+    active = solve(known, solver="daqp", on_failure="mask").active
+    assert (active[4] == UNKNOWN).all()
+    assert (active[:4].abs() <= 2).all()
+    assert solve(known_qp(3, batch=(BATCH,)), warm_start=active).solved.all()
+
+
+@pytest.fixture
+def nobody_solves(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in list(BACKENDS):
+        monkeypatch.setitem(BACKENDS, name, doctored(LIES["zeros"]))
+
+
+@pytest.mark.usefixtures("nobody_solves")
+def test_what_nobody_solves_is_not_converged():
+    known = known_qp(4, batch=(2, 3))
+    message = (
+        r"6 of 6 QPs have no certified solution. 6 NOT_CONVERGED, first at batch index \(0, 0\): "
+        r"no solver reached the certificate's tolerance, and nothing proves"
+    )
+    with pytest.raises(SolverError, match=message):
+        solve(known)
+    with pytest.warns(RuntimeWarning, match=message):
+        solve(known, on_failure="warn")
+
+
+@pytest.mark.usefixtures("nobody_solves")
+def test_what_nobody_solves_is_masked_on_request(recwarn):
+    known = known_qp(4, batch=(2, 3))
+    with SolveLog() as log:
+        solution = solve(known, on_failure="mask")
+    assert not recwarn
+    assert (solution.status == Status.NOT_CONVERGED).all()
+    assert (solution.value == torch.inf).all()
+    assert (solution.residual > 1e-6).all()
+    assert not solution.solved.any()
+    assert (log.solves, log.unsolved) == (6, 6)
+
+
+# The log
+
+
+def spoil(known: KnownQP, index: int) -> KnownQP:
+    """The same batch with NaN in one element."""
+    q = known.qp.q.clone()
+    q[index] = torch.nan
+    return replace(known, qp=replace(known.qp, q=q, check_values=False))
+
+
+def test_the_log_adds_up_all_solves_of_its_block():
+    known = known_qp(5, batch=(BATCH,))
+    with SolveLog() as log:
+        first = solve(known)
+        second = solve(spoil(known, 1), on_failure="mask")
+    solve(known)
+    assert log.solves == 2 * BATCH
+    assert log.unsolved == 1
+    assert log.fallback == 0
+    assert log.iterations == int(first.iterations.sum() + second.iterations.sum())
+    assert log.residual == max(first.residual.max(), second.residual[second.solved].max())
+    assert log.seconds > 0
+
+
+def test_the_log_reports_the_metrics_of_training():
+    log = SolveLog(
+        solves=4,
+        unsolved=1,
+        fallback=2,
+        recalled=3,
+        iterations=10,
+        residual=1e-8,
+        seconds=0.5,
+    )
+    assert log.metrics() == {
+        "qp/solves": 4,
+        "qp/unsolved": 1,
+        "qp/fallback": 2,
+        "qp/recalled": 3,
+        "qp/iterations": 2.5,
+        "qp/residual": 1e-8,
+        "time/qp": 0.5,
+    }
+    assert SolveLog().metrics()["qp/iterations"] == 0
+
+
+def test_an_inner_log_takes_over_for_its_block():
+    known = known_qp(5, batch=(BATCH,))
+    with SolveLog() as outer:
+        solve(known)
+        with SolveLog() as inner:
+            solve(known)
+        solve(known)
+    assert (outer.solves, inner.solves) == (2 * BATCH, BATCH)
+
+
+def test_the_log_ends_with_its_block_even_by_an_error():
+    known = known_qp(5, batch=(BATCH,))
+    with pytest.raises(KeyError, match="stop"), SolveLog() as log:
+        raise KeyError("stop")
+    solve(known)
+    assert log.solves == 0
+
+
+def test_the_log_counts_its_own_thread_only():
+    known = known_qp(5, batch=(BATCH,))
+
+    def logged() -> int:
+        with SolveLog() as log:
+            solve(known)
+        return log.solves
+
+    with SolveLog() as log, ThreadPoolExecutor(2) as pool:
+        counts = list(pool.map(lambda _: logged(), range(4)))
+    assert counts == [BATCH] * 4
+    assert log.solves == 0
+
+
+# What never reaches a backend
+
+
+def test_rows_without_a_bound_or_a_free_variable_are_left_out(monkeypatch):
+    shapes = []
+
+    def recording(qps: SoftQPs) -> Answer:
+        shapes.append(qps.l.shape)
+        return daqp.solve(qps)
+
+    monkeypatch.setitem(BACKENDS, "recorder", recording)
+    known = known_qp(6, soft=("free", "inside", "above"), hard=("at_upper",))
+    assert_right(solve(known, solver="recorder"), known)
+    assert shapes == [(1, 3)]
+
+
+@pytest.mark.parametrize(("s", "kind"), [(0.5, "inside"), (1.5, "above"), (-3.0, "below")])
+def test_rows_of_fixed_entries_are_charged_in_closed_form(s, kind):
+    # min 1/2 (x^2 + u^2) + 7 dist(x, [-1, 1]) + u, with x fixed.
+    unit, none = torch.eye(2).double(), torch.zeros(0).double()
+    bound, w = torch.ones(2).double(), torch.tensor([7.0, torch.inf]).double()
+    q = torch.tensor([0.0, 1.0]).double()
+    C = none.reshape(0, 2)
+    qp = QuadraticProgram(unit, q, none.sum(), C, none, unit, -2 * bound, bound, w)
+    solution = solve_qp(qp, torch.tensor([s]).double(), solver="daqp")
+    sigma = {"inside": 0.0, "above": s - 1, "below": -2 - s}[kind]
+    lam = {"inside": 0.0, "above": 7.0, "below": -7.0}[kind]
+    assert_close(solution.value.item(), 0.5 * s**2 + 7 * sigma - 0.5)
+    assert_close(solution.sigma.tolist(), [sigma, 0.0])
+    assert_close((solution.eta - solution.upsilon).tolist(), [lam, 0.0])
+    assert_close(solution.xi.item(), -s - lam)
+
+
+@pytest.mark.parametrize("w", [torch.inf, 10.0], ids=["hard", "soft"])
+@pytest.mark.parametrize("side", [-1.0, 1.0], ids=["lower", "upper"])
+def test_a_bound_on_one_side_is_a_bound(side, w):
+    # min 1/2 (z - 3 side)^2 with z <= 1, or z >= -1.
+    unit, none = torch.ones(1, 1).double(), torch.zeros(0).double()
+    lb, ub = torch.tensor([[-torch.inf], [1.0]] if side > 0 else [[-1.0], [torch.inf]]).double()
+    weight = torch.tensor([w]).double()
+    q, C = -3 * side * unit[0], none.reshape(0, 1)
+    qp = QuadraticProgram(unit, q, none.sum(), C, none, unit, lb, ub, weight)
+    solution = solve_qp(qp, none, solver="daqp")
+    assert_close(solution.z.item(), side)
+    assert_close((solution.eta - solution.upsilon).item(), 2 * side)
+
+
+def test_invalid_elements_reach_no_backend(monkeypatch):
+    seen: list[Tensor] = []
+
+    def recording(qps: SoftQPs) -> Answer:
+        seen.append(qps.g)
+        return daqp.solve(qps)
+
+    monkeypatch.setitem(BACKENDS, "recorder", recording)
+    known = spoil(known_qp(7, batch=(BATCH,)), 2)
+    solution = solve(known, solver="recorder", on_failure="mask")
+    assert len(seen) == 1
+    assert seen[0].shape[0] == BATCH - 1
+    assert seen[0].isfinite().all()
+    assert solution.status.tolist() == [0, 0, Status.INVALID_DATA, 0, 0, 0]
+
+
+def test_a_batch_of_invalid_elements_reaches_no_backend(monkeypatch):
+    def refuse(qps: SoftQPs) -> Answer:
+        raise AssertionError("asked to solve nothing")
+
+    for name in list(BACKENDS):
+        monkeypatch.setitem(BACKENDS, name, refuse)
+    known = spoil(known_qp(8, batch=(1,)), 0)
+    assert solve(known, on_failure="mask").status.tolist() == [Status.INVALID_DATA]
+    assert solve(known_qp(8, batch=(0,))).status.shape == (0,)
+
+
+def test_an_indefinite_hessian_is_not_certified(solver):
+    """A stationary point of a concave cost satisfies every first-order condition."""
+    known = known_qp(0)
+    H = known.qp.H - 1e3 * torch.eye(known.qp.n_z).double()
+    indefinite = QuadraticProgram(H, *known.qp.tensors()[1:], check_values=False)
+    found = solve_qp(indefinite, known.fixed, solver=solver, on_failure="mask")
+    assert found.status == Status.INVALID_DATA
+    with pytest.raises(ValueError, match="not positive semidefinite"):
+        solve_qp(indefinite, known.fixed, solver=solver)
+
+
+@pytest.mark.parametrize("solver", ["proxqp", "daqp"])
+def test_a_row_that_the_fixed_entries_decide_but_for_rounding_is_no_row(solver):
+    """Q of a banded C: x_1 is decided by x_0 and u_0, and eliminating C leaves traces of rounding.
+
+    Its multiplier belongs to no free variable, so that no solver can be asked for it.
+    """
+    physics = PointMass()
+    A, B, theta = physics.corrupted(1)
+    mpc = QPMPC.from_model(
+        A,
+        B,
+        10,
+        stage_weight=torch.cat((theta, torch.zeros(2))),
+        state_bounds=(physics.lb_s, physics.ub_s),
+        action_bounds=(physics.lb_a, physics.ub_a),
+        solver=solver,
+    )
+    s = torch.tensor([[-2.0, 0.42, -0.7, 0.23], [2.0, 0.06, 0.63, -0.42]]).double()
+    a = torch.tensor([[-0.23, -1.0], [0.82, -0.36]]).double()
+    solution = mpc.solve(s, a)
+    x_1 = slice(mpc.n_x + mpc.n_u, mpc.n_x + mpc.n_u + 1)
+    assert (solution.sigma[:, x_1] > 0).all()
+    assert_close((solution.upsilon + solution.eta)[:, x_1], torch.full((2, 1), 100.0).double())
+    assert solution.residual.max() < 1e-8
+    assert solution.iterations.max() < 100

@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.problems import known_qp, normal, random_mpc, random_states, reduced_of, soft_qps
+from torch_qpmpc import SolveLog, solve_qp
+from torch_qpmpc.qp.pipeline.warm_start import recall
+from torch_qpmpc.qp.program import UNKNOWN
+
+BATCH = 6
+
+
+def true_set(seed: int, matrices: tuple[int, ...] = ()):
+    """Condensed QPs, the exact answer, and its active set."""
+    known = known_qp(seed, batch=(BATCH,), matrices=matrices)
+    solution = solve_qp(known.qp, known.fixed, solver="torch")
+    return *soft_qps(known), solution.active[:, reduced_of(known).rows]
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_right_active_set_is_exact_at_once(seed, matrices):
+    qps, exact, active = true_set(seed, matrices)
+    answer, finished = recall(qps, active)
+    assert finished.all()
+    assert_close(answer.v, exact.v, rtol=0, atol=1e-10)
+    assert_close(answer.lam, exact.lam, rtol=0, atol=1e-10)
+    assert (answer.iterations == 1).all()
+
+
+def test_codes_say_what_each_row_does():
+    known = known_qp(4, batch=(BATCH,))
+    active = solve_qp(known.qp, known.fixed, solver="torch").active
+    assert active.dtype == torch.int8
+    assert torch.equal(active.sign(), known.lam.sign().to(torch.int8))
+    saturated = known.sigma > 0
+    assert saturated.any()
+    assert torch.equal(active.abs() == 2, saturated)
+
+
+@pytest.mark.parametrize("change", [(1, 0), (-1, 0), (1, -1)])
+def test_a_row_in_a_wrong_state_is_corrected(change):
+    mpc, s = random_mpc(4, horizon=6), random_states(48, size=0.7)
+    solution = mpc.solve(s)
+    active, count = solution.active, 0
+    for codes in active:
+        where = (codes[2:] == change[0]).nonzero()
+        if len(where):
+            codes[2 + where[len(where) // 2]], count = change[1], count + 1
+    assert count > 4
+    mpc.solver = "torch"
+    with SolveLog() as log:
+        again = mpc.solve(s, warm_start=active)
+    assert_close(again.value, solution.value)
+    assert log.recalled >= 48 - count // 3
+    assert again.iterations.max() > 1
+
+
+def test_the_active_sets_given_are_not_changed():
+    qps, _, active = true_set(6)
+    wrong = -active
+    before = wrong.clone()
+    recall(qps, wrong)
+    assert torch.equal(wrong, before)
+
+
+def test_of_an_unknown_set_the_empty_one_is_tried():
+    qps, _, active = true_set(5)
+    empty = active.clone()
+    empty[[1, 2, 4]] = 0
+    active[1:3, 4] = UNKNOWN
+    active[4, 0] = -128
+    (answer, finished), (of_empty, expected) = recall(qps, active), recall(qps, empty)
+    assert torch.equal(finished, expected)
+    assert torch.equal(answer.iterations, of_empty.iterations)
+    assert torch.equal(answer.v[finished], of_empty.v[finished])
+    assert answer.iterations[[1, 2, 4]].min() > 1
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_cost_without_curvature_is_left_to_the_solver(rank):
+    known = known_qp(7, batch=(BATCH,), rank=rank)
+    active = solve_qp(known.qp, known.fixed, solver="daqp").active
+    solution = solve_qp(known.qp, known.fixed, solver="torch", warm_start=active)
+    assert_close(solution.value, known.value)
+
+
+def test_nonsense_does_no_harm(solver):
+    known = known_qp(8, batch=(BATCH,))
+    codes = (5 * normal(BATCH, 13)).clamp(-100, 100).to(torch.int8)
+    solution = solve_qp(known.qp, known.fixed, solver=solver, warm_start=codes)
+    assert_close(solution.value, known.value)
+
+
+def moved(solver: str, size: float) -> tuple[Tensor, Tensor, SolveLog]:
+    """Values without and with the active sets of a theta that was another, and the latter's log."""
+    mpc, s = random_mpc(9, solver=solver, horizon=8), random_states(64, size=0.7)
+    active = mpc.solve(s).active
+    with torch.no_grad():
+        mpc.C += size * normal(*mpc.C.shape)
+    with SolveLog() as log:
+        warm = mpc.solve(s, warm_start=active)
+    return mpc.value(s), warm.value, log
+
+
+@pytest.mark.parametrize("size", [1e-4, 1e-2, 0.3])
+def test_active_sets_of_another_theta_lead_to_the_same_values(solver, size):
+    cold, warm, log = moved(solver, size)
+    assert_close(warm, cold, rtol=1e-6, atol=1e-6)
+    assert log.fallback == 0
+    if size < 1e-3:
+        assert log.recalled > 0.9 * log.solves
+
+
+def test_without_a_known_set_the_values_are_the_same(solver):
+    mpc, s = random_mpc(10, solver=solver), random_states(64)
+    start = torch.full((64, mpc.n_z), UNKNOWN, dtype=torch.int8)
+    with SolveLog() as log:
+        warm = mpc.solve(s, warm_start=start)
+    assert_close(warm.value, mpc.value(s), rtol=1e-6, atol=1e-6)
+    assert log.fallback == 0
+    assert 32 < log.recalled < 64

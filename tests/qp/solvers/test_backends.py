@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.problems import (
+    KnownQP,
+    known_qp,
+    normal,
+    random_mpc,
+    random_states,
+    soft_qps,
+    solution_of,
+)
+from tests.references import by_cvxpy, by_quadprog
+from torch_qpmpc import QPError, SolveLog, solve_qp
+from torch_qpmpc.qp.program import EVENT_SHAPES
+from torch_qpmpc.qp.solvers import BACKENDS, backend, fallbacks
+
+BATCHES = [
+    ((), ()),
+    ((1,), ()),
+    ((6,), ()),
+    ((6,), (6,)),
+    ((3, 4), (3, 1)),
+    ((3, 4), (4,)),
+]
+
+
+def assert_solves(
+    known: KnownQP, solver: str, *, only_value: bool = False, scale: float = 1.0
+) -> None:
+    """Solve without the help of another solver, and compare with the known answer."""
+    with SolveLog() as log:
+        solution = solve_qp(known.qp, known.fixed, solver=solver)
+    assert log.fallback == 0
+    assert solution.residual.max() < 1e-6
+    for name, expected in solution_of(known).items():
+        if name == "value" or not only_value:
+            tolerance = 1e-6 if name == "value" else 1e-4
+            actual = getattr(solution, name)
+            atol = scale * tolerance
+            assert_close(
+                actual, expected, rtol=tolerance, atol=atol, msg=lambda m, n=name: f"{n} {m}"
+            )
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("batch", "matrices"), BATCHES)
+def test_known_solutions_are_found(solver, batch, matrices, seed):
+    assert_solves(known_qp(seed, batch=batch, matrices=matrices), solver)
+
+
+@pytest.mark.parametrize("batch", [(0,), (2, 0)])
+def test_an_empty_batch_is_solved(solver, batch):
+    known = known_qp(0, batch=batch)
+    solution = solve_qp(known.qp, known.fixed, solver=solver)
+    assert solution.value.shape == batch
+    again = solve_qp(known.qp, known.fixed, solver=solver, warm_start=solution)
+    assert again.value.shape == batch
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"hard": ()},
+        {"soft": ()},
+        {"soft": (), "hard": ()},
+        {"soft": ("free",), "hard": ()},
+        {"soft": ("no_upper",), "hard": ("no_upper",)},
+        {"n_c": 0},
+        {"n_f": 0},
+        {"n_c": 0, "n_f": 0},
+        {"n_f": 9, "soft": ("inside", "above", "below"), "hard": ("inside",)},  # no free variable
+        {"n_z": 30, "n_c": 12, "n_f": 4},
+    ],
+    ids=str,
+)
+def test_parts_of_a_program_may_be_missing(solver, options):
+    assert_solves(known_qp(1, batch=(4,), **options), solver)
+
+
+@pytest.mark.parametrize("weight", [1e-2, 1.0, 1e2, 1e4])
+def test_slack_weights_of_any_size(solver, weight):
+    assert_solves(known_qp(2, batch=(6,), weight=weight), solver, scale=max(weight, 1.0))
+
+
+@pytest.mark.parametrize("rank", [0, 1, 5])
+def test_costs_without_curvature(solver, rank):
+    assert_solves(known_qp(3, batch=(6,), rank=rank), solver, only_value=True)
+
+
+def test_a_batch_is_solved_as_each_of_its_elements(solver):
+    known = known_qp(4, batch=(5,), matrices=(5,))
+    together = solve_qp(known.qp, known.fixed, solver=solver)
+    for i in range(5):
+        parts = {name: getattr(known.qp, name)[i] for name in EVENT_SHAPES}
+        alone = solve_qp(replace(known.qp, **parts), known.fixed[i], solver=solver)
+        assert_close(alone.value, together.value[i], rtol=1e-7, atol=1e-8)
+        assert_close(alone.z, together.z[i], rtol=1e-5, atol=1e-6)
+
+
+def test_the_answer_does_not_depend_on_what_was_solved_before(solver):
+    known, other = known_qp(5, batch=(3,)), known_qp(6, batch=(3,))
+    first = solve_qp(known.qp, known.fixed, solver=solver)
+    solve_qp(other.qp, other.fixed, solver=solver)
+    again = solve_qp(known.qp, known.fixed, solver=solver)
+    assert_close(again.z, first.z, rtol=0, atol=0)
+    assert_close(again.chi, first.chi, rtol=0, atol=0)
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_solving_in_parallel_changes_nothing_but_the_time(solver):
+    known = known_qp(7, batch=(16,))
+    assert_solves(known, solver)
+    assert torch.get_num_threads() == 2
+
+
+# Against other solvers, on programs that were not made from their solution
+
+
+@pytest.fixture(scope="module", params=["V", "Q"])
+def mpc_case(request):
+    """A QP with dense C, states (and actions), and the references' values and solutions."""
+    learn = ("H", "H_f", "q", "c", "C", "b")
+    mpc = random_mpc(1, free=0.2, learn=learn)
+    s, a = random_states(8), random_states(8, 1, size=0.5)
+    fixed = torch.cat((s, a), -1) if request.param == "Q" else s
+    qp = mpc.quadratic_program()
+    return qp, fixed, [(by_cvxpy(qp, one), by_quadprog(qp, one)) for one in fixed]
+
+
+def test_two_other_solvers_of_the_printed_program_agree(solver, mpc_case):
+    qp, fixed, references = mpc_case
+    with SolveLog() as log:
+        solution = solve_qp(qp, fixed, solver=solver)
+    assert log.fallback == 0
+    for i, both in enumerate(references):
+        for value, z in both:
+            assert_close(solution.value[i].item(), value, rtol=1e-6, atol=1e-6)
+            assert_close(solution.z[i].detach(), z, rtol=1e-4, atol=1e-4)
+
+
+def test_the_programs_compared_have_rows_of_every_kind(mpc_case):
+    qp, fixed, _ = mpc_case
+    solution = solve_qp(qp, fixed, solver="daqp")
+    active = (solution.upsilon + solution.eta) > 1e-6
+    softened = solution.sigma > 1e-6
+    hard = qp.w.isinf()
+    assert (active & hard).any()
+    assert (active & ~hard & ~softened).any()
+    assert softened.any()
+    assert (~active & hard).any()
+    assert (~active & ~hard).any()
+
+
+# Warm starts
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-3, 0.3])
+def test_a_warm_start_leads_to_the_same_answer(solver, size):
+    known = known_qp(9, batch=(6,))
+    start = solve_qp(known.qp, known.fixed, solver=solver)
+    qp = replace(known.qp, q=known.qp.q + size * normal(*known.qp.q.shape))
+    cold = solve_qp(qp, known.fixed, solver=solver)
+    warm = solve_qp(qp, known.fixed, solver=solver, warm_start=start)
+    assert_close(warm.value, cold.value)
+    assert_close(warm.z, cold.z, rtol=1e-4, atol=1e-4)
+    assert_close(warm.xi, cold.xi, rtol=1e-4, atol=1e-4)
+
+
+def test_a_warm_start_from_an_unrelated_solution_does_no_harm(solver):
+    known, unrelated = known_qp(10, batch=(6,)), known_qp(11, batch=(6,))
+    start = solve_qp(unrelated.qp, unrelated.fixed, solver=solver)
+    solution = solve_qp(known.qp, known.fixed, solver=solver, warm_start=start)
+    assert_close(solution.value, known.value)
+    assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)
+
+
+def test_a_warm_start_from_an_unsolved_element_does_no_harm(solver):
+    known = known_qp(12, batch=(3,))
+    invalid = replace(known.qp, q=torch.nan * known.qp.q, check_values=False)
+    start = solve_qp(invalid, known.fixed, on_failure="mask", solver=solver)
+    solution = solve_qp(known.qp, known.fixed, solver=solver, warm_start=start)
+    assert_close(solution.value, known.value)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_a_warm_start_from_the_solution_saves_iterations(name):
+    mpc, s = random_mpc(13, solver=name, horizon=8), random_states(12, size=0.7)
+    cold = mpc.solve(s)
+    warm = mpc.solve(s, warm_start=cold.active)
+    assert warm.iterations.sum() < 0.7 * cold.iterations.sum()
+
+
+# The table of backends
+
+
+def test_a_backend_answers_with_one_row_per_program(solver):
+    known = known_qp(14, batch=(4,))
+    qps, _ = soft_qps(known)
+    found = backend(solver)(qps)
+    assert found.v.shape == qps.g.shape
+    assert found.lam.shape == qps.l.shape
+    assert found.iterations.shape == (4,)
+    assert found.v.dtype == found.lam.dtype == torch.float64
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("daq", r"solver: got 'daq', expected one of proxqp, daqp, .* Did you mean 'daqp'\?"),
+        ("simplex", r"solver: got 'simplex', expected one of proxqp, daqp, .*qpsolvers:NAME\.$"),
+        (None, r"solver: got None, expected one of proxqp, daqp"),
+        ("qpsolvers:nothing", r"solver: got 'qpsolvers:nothing', expected one of \[.*'clarabel'"),
+        ("qpsolvers:", r"solver: got 'qpsolvers:', .* pip install qpsolvers\[\]"),
+    ],
+)
+def test_an_unknown_backend_is_named(name, message):
+    with pytest.raises(QPError, match=message):
+        backend(name)
+
+
+def test_a_backend_falls_back_on_others():
+    for name, solve in BACKENDS.items():
+        assert fallbacks(name)
+        assert solve not in fallbacks(name)
+
+
+def test_rows_that_are_hard_in_some_of_a_batch_only(solver):
+    """A model that is updated from one pattern of soft rows to another must not be relied on."""
+    known = known_qp(5, batch=(24,))
+    w = known.qp.w.expand(24, -1).clone()
+    inside = (known.sigma == 0) & w.isfinite()
+    harden = inside & (torch.arange(24) % 3 == 0).unsqueeze(-1)
+    mixed = replace(known.qp, w=torch.where(harden, torch.inf, w))
+    for _ in range(3):
+        solution = solve_qp(mixed, known.fixed, solver=solver)
+    assert harden.any()
+    assert_close(solution.value, known.value)

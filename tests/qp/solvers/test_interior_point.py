@@ -1,0 +1,425 @@
+from __future__ import annotations
+
+import inspect
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, soft_qps
+from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
+from torch_qpmpc.qp.pipeline.batch import SoftArrays, SoftQPs
+from torch_qpmpc.qp.program import row_states
+from torch_qpmpc.qp.solvers import Answer, active_set, batched, interior_point
+from torch_qpmpc.qp.solvers.active_set import SETTLED, settle
+from torch_qpmpc.qp.solvers.batched import BatchedQPs
+
+MAX_ITERATIONS = sum(limit + interior_point.LAST_STEPS for _, limit in interior_point.TARGETS)
+COUNT = 32
+
+
+# The paper's QP
+
+
+def paper_mpc(*, perturb: float = 0.05, stage: float = 1.0, velocity: float = 1.0, **options: Any):
+    """The paper's QP with a dense C, horizon 10, states soft and actions hard by default."""
+    random = np.random.default_rng(0)
+    A = np.eye(4) + 0.1 * np.eye(4, k=2)
+    B = np.vstack([0.005 * np.eye(2), 0.1 * np.eye(2)])
+    weights = stage * random.uniform(0.5, 5, 4) * [1, 1, velocity, velocity]
+    bounds = np.array(options.pop("bounds", [2.0, 2.0, 10.0, 10.0]))
+    settings: dict[str, Any] = {
+        "state_bounds": (-bounds, bounds),
+        "action_bounds": ([-1.0, -1.0], [1.0, 1.0]),
+        "stage_weight": np.r_[weights, 0, 0],
+        "solver": "torch",
+    }
+    mpc = QPMPC.from_model(A, B, 10, **(settings | options))
+    with torch.no_grad():
+        mpc.C += perturb * torch.from_numpy(random.standard_normal(tuple(mpc.C.shape)))
+    return mpc
+
+
+def paper_inputs(far: float = 1.0, *, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+    """States, ``far`` times those that the experiment starts from, and actions, some at bounds."""
+    random = np.random.default_rng(seed)
+    positions, speeds = random.uniform(-1.5, 1.5, (COUNT, 2)), random.uniform(-0.5, 0.5, (COUNT, 2))
+    actions = np.clip(random.standard_normal((COUNT, 2)), -1, 1)
+    return torch.from_numpy(far * np.hstack([positions, speeds])), torch.from_numpy(actions)
+
+
+HOSTILE: dict[str, tuple[dict[str, Any], float]] = {
+    "as in the paper": ({}, 1.0),
+    "w = 1": ({"state_slack": 1.0}, 1.0),
+    "w = 1e4": ({"state_slack": 1e4}, 1.0),
+    "w = 1e6": ({"state_slack": 1e6}, 1.0),
+    "no weight on velocities": ({"velocity": 0.0}, 1.0),
+    "no stage weights": ({"stage": 0.0}, 1.0),
+    "no cost but of slack": ({"stage": 0.0, "terminal_weight": np.zeros(4)}, 1.0),
+    "C off by 0.1": ({"perturb": 0.1}, 1.0),
+    "C off by 0.3": ({"perturb": 0.3}, 1.0),
+    "x_0 far outside": ({}, 5.0),
+    "x_0 far outside, w = 1e6": ({"state_slack": 1e6}, 5.0),
+    "x_0 far beyond": ({}, 100.0),
+    "all rows soft": ({"action_slack": 100.0}, 1.0),
+    "all rows soft, far": ({"action_slack": 100.0}, 5.0),
+    "all rows hard": ({"state_slack": torch.inf, "bounds": [50.0] * 4}, 1.0),
+    "rows of no weight": ({"state_slack": 0.0}, 1.0),
+}
+
+
+@pytest.mark.parametrize("kind", ["V", "Q"])
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_cases_are_solved_to_rounding_and_agree_with_daqp(case, kind):
+    options, far = HOSTILE[case]
+    mpc = paper_mpc(**options)
+    s, a = paper_inputs(far)
+    with SolveLog() as log:
+        solution = mpc.solve(s, a if kind == "Q" else None)
+    assert log.fallback == 0
+    assert solution.residual.max() <= 1e-9
+    assert solution.iterations.max() <= 40
+    mpc.solver = "daqp"
+    reference = mpc.solve(s, a if kind == "Q" else None)
+    difference = (solution.value - reference.value).abs() / (1 + reference.value.abs())
+    assert (difference <= reference.residual.clamp(min=1e-8)).all()
+
+
+def test_actions_at_their_bounds_are_no_harder():
+    mpc = paper_mpc()
+    s, a = paper_inputs()
+    solution = mpc.solve(s, a.sign())
+    assert solution.residual.max() <= 1e-9
+    assert (mpc.action_value(s, a.sign()) >= mpc.value(s) - 1e-9).all()
+
+
+def test_multipliers_of_inactive_rows_are_zero():
+    solution = paper_mpc().solve(paper_inputs()[0])
+    lam = solution.eta - solution.upsilon
+    assert 0 < (lam != 0).sum(-1).double().mean() < 20
+    assert ((lam == 0) | (lam.abs() > 1e-8)).all()
+
+
+# Programs with a known answer
+
+
+def moved(qps: SoftQPs, device: str) -> SoftQPs:
+    return SoftQPs(*(getattr(qps, name).to(device) for name in SoftArrays._fields))
+
+
+def residual(qps: SoftQPs, answer: Answer) -> Tensor:
+    return BatchedQPs.of(qps).residual(answer.v, answer.lam)
+
+
+SINGLE_KINDS = [((kind,), ()) for kind in SOFT_ROWS] + [((), (kind,)) for kind in HARD_ROWS]
+
+
+@pytest.mark.parametrize("count", [1, 7])
+@pytest.mark.parametrize("matrices", [False, True])
+@pytest.mark.parametrize("weight", [1e-2, 1.0, 1e4])
+def test_rows_of_all_kinds_at_once(count, matrices, weight):
+    batch = (count,)
+    qps, exact = soft_qps(
+        known_qp(1, batch=batch, matrices=batch if matrices else (), weight=weight)
+    )
+    answer = interior_point.solve(qps)
+    assert_allclose(answer.v, exact.v, atol=1e-8)
+    assert_allclose(answer.lam, exact.lam, atol=1e-8 * max(weight, 1.0))
+
+
+@pytest.mark.parametrize(("soft", "hard"), SINGLE_KINDS, ids=str)
+def test_rows_of_one_kind(soft, hard):
+    qps, exact = soft_qps(known_qp(2, batch=(5,), soft=soft, hard=hard))
+    if qps.l.shape[1]:
+        answer = interior_point.solve(qps)
+        assert_allclose(answer.v, exact.v, atol=1e-9)
+        assert_allclose(answer.lam, exact.lam, atol=1e-9)
+
+
+def as_tensors(**arrays: np.ndarray) -> SoftQPs:
+    return SoftQPs(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+
+
+def random_qps(
+    seed: int, *, count: int = 16, d: int = 6, rank: int | None = None, twice: bool = True
+) -> SoftQPs:
+    """Feasible and bounded QPs, half of whose bounds meet in a vertex, with rows given twice."""
+    random = np.random.default_rng(seed)
+    factor = random.standard_normal((1, d, d if rank is None else rank))
+    G = random.standard_normal((1, 6, d))
+    G = np.concatenate([G, G if twice else random.standard_normal((1, 6, d)), np.eye(d)[None]], 1)
+    v = random.standard_normal((count, d))
+    y = v @ G[0].T
+    room = random.uniform(0, 1, (2, *y.shape)) * (random.random((2, *y.shape)) < 0.5)
+    w = 10.0 ** random.choice([-1, 0, 2], y.shape)
+    w[random.random(y.shape) < 0.3] = np.inf
+    room[:, :, -d:], w[:, -d:] = 3.0, np.inf
+    return as_tensors(
+        H=factor @ factor.transpose(0, 2, 1) / d,
+        G=G,
+        group=np.zeros(count, dtype=np.int64),
+        g=random.standard_normal((count, d)) * 10 ** random.uniform(-1, 2, (count, 1)),
+        l=y - room[0],
+        u=y + room[1],
+        w=w,
+    )
+
+
+@pytest.mark.parametrize("rank", [None, 0, 2], ids=["convex", "linear", "rank 2"])
+@pytest.mark.parametrize("d", [1, 6])
+def test_vertices_dependent_rows_and_flat_costs(d, rank):
+    for seed in range(6):
+        qps = random_qps(seed, d=d, rank=rank)
+        answer = interior_point.solve(qps)
+        assert residual(qps, answer).max() <= SETTLED
+        assert answer.iterations.max() <= 40
+
+
+def test_matrices_of_each_group_are_used():
+    several = [random_qps(seed, count=4, twice=False) for seed in range(3)]
+    order = np.array([2, 0, 1, 0, 2, 2, 1, 1, 0, 0, 1, 2])
+    place = np.array([order[:i].tolist().count(m) for i, m in enumerate(order)])
+    vectors = {
+        name: torch.stack([getattr(several[m], name)[i] for m, i in zip(order, place, strict=True)])
+        for name in ("g", "l", "u", "w")
+    }
+    mixed = SoftQPs(
+        H=torch.cat([qps.H for qps in several]),
+        G=torch.cat([qps.G for qps in several]),
+        group=torch.from_numpy(order),
+        **vectors,
+    )
+    answer = interior_point.solve(mixed)
+    for m, qps in enumerate(several):
+        assert_allclose(answer.v.numpy()[order == m], interior_point.solve(qps).v, atol=1e-8)
+
+
+def test_units_change_nothing():
+    qps = random_qps(3)
+    plain = interior_point.solve(qps)
+    cost, length = 1e5, 1e-3
+    scaled = replace(
+        qps,
+        H=qps.H * cost / length**2,
+        g=qps.g * cost / length,
+        l=qps.l * length,
+        u=qps.u * length,
+        w=qps.w * cost / length,
+    )
+    answer = interior_point.solve(scaled)
+    assert abs(answer.iterations - plain.iterations).max() <= 3
+    assert_allclose(answer.v / length, plain.v, atol=1e-7)
+
+
+# Shapes at the edge
+
+
+@pytest.mark.parametrize("matrices", [0, 1, 3])
+def test_an_empty_batch(matrices):
+    none = np.zeros((0, 4))
+    qps = as_tensors(
+        H=np.zeros((matrices, 2, 2)),
+        G=np.zeros((matrices, 4, 2)),
+        group=np.zeros(0, dtype=np.int64),
+        g=np.zeros((0, 2)),
+        l=none,
+        u=none,
+        w=none,
+    )
+    answer = interior_point.solve(qps)
+    assert answer.v.shape == (0, 2)
+    assert answer.lam.shape == (0, 4)
+    assert answer.iterations.shape == (0,)
+
+
+def one_row(count: int = 3, **changes: Any) -> SoftQPs:
+    """min 1/2 |v|^2 + (9, 9)'v with v_1 in [-1, 1], a hard row, and a soft row of zeros."""
+    ones = np.ones((count, 2))
+    arrays: dict[str, np.ndarray] = {
+        "H": np.eye(2)[None],
+        "G": np.array([[[1.0, 0.0], [0.0, 0.0]]]),
+        "group": np.zeros(count, dtype=np.int64),
+        "g": 9 * ones,
+        "l": -ones,
+        "u": ones,
+        "w": np.tile([np.inf, 5.0], (count, 1)),
+    }
+    return as_tensors(**(arrays | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "v_1", "lam_1"),
+    [
+        ({}, -1, -8),
+        ({"w": np.full((3, 2), 5.0)}, -4, -5),
+        ({"w": np.zeros((3, 2))}, -9, 0),
+        ({"l": np.full((3, 2), -np.inf)}, -9, 0),
+        ({"l": np.full((3, 2), -1e30), "u": np.full((3, 2), 1e30)}, -9, 0),
+        ({"l": np.full((3, 2), -np.inf), "u": np.full((3, 2), np.inf)}, -9, 0),
+        ({"l": np.zeros((3, 2)), "u": np.zeros((3, 2))}, 0, -9),
+        ({"l": np.zeros((3, 2)), "u": np.zeros((3, 2)), "w": np.full((3, 2), 5.0)}, -4, -5),
+    ],
+    ids=["hard", "soft", "weightless", "one-sided", "far bounds", "free", "equal", "soft equal"],
+)
+def test_one_row(changes, v_1, lam_1):
+    answer = interior_point.solve(one_row(**changes))
+    assert_allclose(answer.v, np.tile([v_1, -9.0], (3, 1)), atol=1e-9)
+    assert_allclose(answer.lam, np.tile([lam_1, 0.0], (3, 1)), atol=1e-9)
+
+
+def test_without_rows_the_answer_is_that_of_a_linear_system():
+    none = np.zeros((3, 0))
+    answer = interior_point.solve(one_row(G=np.zeros((1, 0, 2)), l=none, u=none, w=none))
+    assert_allclose(answer.v, np.full((3, 2), -9.0), atol=1e-9)
+    assert answer.lam.shape == (3, 0)
+
+
+def test_without_variables_the_rows_are_only_judged():
+    answer = interior_point.solve(
+        one_row(H=np.zeros((1, 0, 0)), G=np.zeros((1, 2, 0)), g=np.zeros((3, 0)))
+    )
+    assert_allclose(answer.lam, np.zeros((3, 2)), atol=1e-9)
+
+
+# QPs without a solution
+
+HOPELESS = {
+    "infeasible": one_row(
+        G=np.ones((1, 2, 2)),
+        l=np.tile([-np.inf, 2.0], (3, 1)),
+        u=np.tile([1.0, np.inf], (3, 1)),
+        w=np.full((3, 2), np.inf),
+    ),
+    "equalities that conflict": one_row(
+        G=np.ones((1, 2, 2)),
+        l=np.tile([1.0, 2.0], (3, 1)),
+        u=np.tile([1.0, 2.0], (3, 1)),
+        w=np.full((3, 2), np.inf),
+    ),
+    "unbounded": one_row(H=np.zeros((1, 2, 2))),
+    "unbounded beyond soft rows": one_row(H=np.zeros((1, 2, 2)), w=np.ones((3, 2))),
+}
+
+
+@pytest.mark.parametrize("case", HOPELESS)
+def test_without_a_solution_the_answer_is_finite_and_soon(case):
+    qps = HOPELESS[case]
+    answer = interior_point.solve(qps)
+    assert answer.v.isfinite().all()
+    assert answer.lam.isfinite().all()
+    assert answer.iterations.max() <= MAX_ITERATIONS
+    assert residual(qps, answer).min() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("case", "status"),
+    [("infeasible", Status.INFEASIBLE), ("unbounded", Status.UNBOUNDED)],
+)
+def test_the_chain_says_what_is_the_matter(case, status):
+    qps = HOPELESS[case]
+    H, G, g, lower, upper, w = (part[0] for part in (qps.H, qps.G, qps.g, qps.l, qps.u, qps.w))
+    C, none = torch.zeros(0, 2).double(), torch.zeros(0).double()
+    qp = QuadraticProgram(H, g, torch.zeros(()).double(), C, none, G, lower, upper, w)
+    solution = solve_qp(qp, solver="torch", on_failure="mask")
+    assert solution.status == status
+
+
+def test_nan_in_the_data_ends_in_a_finite_answer():
+    answer = interior_point.solve(one_row(g=np.full((3, 2), np.nan)))
+    assert answer.v.isfinite().all()
+    assert answer.lam.isfinite().all()
+
+
+def test_hopeless_neighbours_do_no_harm():
+    good = random_qps(5)
+    lower, upper, w = good.l.clone(), good.u.clone(), good.w.clone()
+    w[:, [0, 6]] = torch.inf  # the same row twice, ..
+    lower[:, 6], upper[:, 6] = upper[:, 0] + 1, upper[:, 0] + 2  # .. with bounds far apart
+    both = replace(
+        good,
+        group=torch.zeros(32, dtype=torch.int64),
+        **{
+            name: torch.stack([getattr(good, name), bad], 1).reshape(32, -1)
+            for name, bad in (("g", good.g), ("l", lower), ("u", upper), ("w", w))
+        },
+    )
+    answer = interior_point.solve(both)
+    assert_allclose(answer.v[::2], interior_point.solve(good).v, atol=1e-7)
+    assert residual(both, answer)[::2].max() <= SETTLED
+    assert residual(both, answer)[1::2].min() > 1e-3
+
+
+# Its active-set steps
+
+
+def test_settling_keeps_what_is_better():
+    qps = random_qps(9)
+    form, cold = BatchedQPs.of(qps), interior_point.solve(qps)
+    v, lam = cold.v, cold.lam
+    for noise in (0.0, 1e-6, 1.0):
+        near = v + noise * torch.randn(v.shape, generator=torch.Generator().manual_seed(0)).double()
+        found = settle(form, near, lam, 2)
+        assert (found.residual <= form.residual(near, lam)).all()
+        assert_close(found.residual, form.residual(found.v, found.lam), rtol=0, atol=1e-15)
+
+
+def test_states_of_rows_are_the_same_for_arrays_and_tensors():
+    p = np.array([0.0, 1.5, 4.0, -1.5, -4.0, 2.0, 1.0, 9.0, 1.0])
+    lower = np.array([-1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, -np.inf, -np.inf])
+    upper = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, np.inf])
+    w = np.array([2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, np.inf, np.inf])
+    bound, active, held = row_states(p, lower, upper, w)
+    assert active.tolist() == [False, True, False, True, False, True, True, True, False]
+    assert bound[active].tolist() == [1, -1, 1, 1, 1]
+    assert held[~active].tolist() == [0, 2, -2, 0]
+    for array, tensor in zip(
+        (bound, active, held),
+        row_states(*(torch.from_numpy(x) for x in (p, lower, upper, w))),
+        strict=True,
+    ):
+        assert_allclose(tensor.numpy(), array, rtol=0, atol=0)
+
+
+# One code for all devices
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_the_core_stays_on_its_device_in_float64(device):
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    qps = random_qps(10)
+    expected = interior_point.solve(qps)
+    answer = interior_point.solve(moved(qps, device))
+    v, lam, iterations = answer.v, answer.lam, answer.iterations
+    assert v.dtype == lam.dtype == torch.float64
+    assert {v.device.type, lam.device.type, iterations.device.type} == {device}
+    assert_allclose(v.cpu(), expected.v, atol=1e-8)
+    assert_allclose(lam.cpu(), expected.lam, atol=1e-7)
+
+
+def test_the_core_never_leaves_the_device_nor_loops_over_the_batch():
+    functions = [
+        interior_point.solve,
+        interior_point._begin,
+        interior_point._follow,
+        interior_point._step,
+    ]
+    sources = [inspect.getsource(part) for part in (active_set, batched, *functions)]
+    for source in sources:
+        for word in (".numpy(", ".cpu(", ".tolist(", "float32", "in range(len("):
+            assert word not in source
+
+
+def test_gradients_are_not_recorded():
+    qps = random_qps(11, count=2)
+    for field in fields(qps):
+        if field.name != "group":
+            getattr(qps, field.name).requires_grad_()
+    answer = interior_point.solve(qps)
+    assert not answer.v.requires_grad
+    assert not answer.lam.requires_grad

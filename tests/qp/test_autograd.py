@@ -1,0 +1,612 @@
+from __future__ import annotations
+
+import gc
+import weakref
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+from torch.func import functional_call, grad, jacrev, vmap
+from torch.testing import assert_close
+
+from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states, solution_of
+from torch_qpmpc import QPMPC, QPError, QPSolution, QuadraticProgram, SolverError, Status, solve_qp
+from torch_qpmpc.qp import autograd
+from torch_qpmpc.qp.autograd import solve_op
+from torch_qpmpc.qp.program import EVENT_SHAPES
+from torch_qpmpc.qp.sensitivity import solution_op
+
+SOLUTION = (
+    *("value", "z", "sigma", "chi", "upsilon", "eta", "mu", "xi"),
+    *("active", "status", "residual"),
+)
+OPERANDS = (*EVENT_SHAPES, "fixed")
+#: Without equality rows, whose bounds cannot be moved one at a time.
+SOFT = ("inside", "at_lower", "at_upper", "below", "above", "no_upper", "free")
+HARD = ("inside", "at_lower", "at_upper", "no_upper")
+
+
+def solution(*operands: Tensor, **options: Any) -> QPSolution:
+    """The solution as a function of the tensors named in `OPERANDS`."""
+    qp = QuadraticProgram(*operands[:-1], check_values=False)
+    options.setdefault("solver", "daqp")
+    return solve_qp(qp, operands[-1], **options)
+
+
+def value(*operands: Tensor, **options: Any) -> Tensor:
+    return solution(*operands, **options).value
+
+
+def operands_of(known: KnownQP, *, differentiable: bool = False) -> list[Tensor]:
+    tensors = (*known.qp.tensors(), known.fixed)
+    return [tensor.clone().requires_grad_(differentiable) for tensor in tensors]
+
+
+def infeasible(known: KnownQP, index: int) -> KnownQP:
+    """The same batch, but one element has hard rows that exclude each other."""
+    qp = known.qp
+    G, w = qp.G.clone(), qp.w.clone()
+    G[index, 1] = G[index, 0]
+    w[index, :2] = torch.inf
+    lb, ub = qp.lb.clone(), qp.ub.clone()
+    lb[index, 0], ub[index, 0] = 1.0, 2.0
+    lb[index, 1], ub[index, 1] = 3.0, 4.0
+    return replace(known, qp=replace(qp, G=G, lb=lb, ub=ub, w=w))
+
+
+# What the gradient is
+
+
+def test_gradient_is_that_of_the_lagrangian_at_the_solution(solver):
+    known = known_qp(0, batch=(4,), matrices=(4,))
+    operands = operands_of(known, differentiable=True)
+    weight = torch.tensor([1.0, -2.0, 0.5, 3.0]).double()
+    value(*operands, solver=solver).backward(weight)
+    z, lam, chi = known.z, known.lam, known.chi
+
+    def outer(left: Tensor, right: Tensor) -> Tensor:
+        return left.unsqueeze(-1) * right.unsqueeze(-2)
+
+    expected = {
+        "H": 0.5 * outer(z, z),
+        "q": z,
+        "c": torch.ones(4).double(),
+        "C": outer(chi, z),
+        "b": -chi,
+        "G": outer(lam, z),
+        "lb": known.upsilon,
+        "ub": -known.eta,
+        "w": known.sigma,
+        "fixed": -known.xi,
+    }
+    for name, operand in zip(OPERANDS, operands, strict=True):
+        weighted = weight.reshape(-1, *(1,) * (operand.ndim - 1)) * expected[name]
+        assert_close(
+            operand.grad, weighted, rtol=1e-4, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}"
+        )
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("name", OPERANDS)
+def test_gradient_agrees_with_finite_differences(name, seed):
+    known = known_qp(seed, batch=(3,), soft=SOFT, hard=HARD)
+    operands = operands_of(known)
+    index = OPERANDS.index(name)
+    direction = normal(*operands[index].shape, seed=seed)
+    if name == "H":
+        direction = direction + direction.mT
+    weight = torch.tensor([1.0, -2.0, 0.5]).double()
+
+    def along(step: float) -> Tensor:
+        moved = list(operands)
+        moved[index] = operands[index] + step * direction
+        return value(*moved) @ weight
+
+    operands[index].requires_grad_()
+    (gradient,) = torch.autograd.grad(value(*operands) @ weight, operands[index])
+    operands[index].requires_grad_(False)
+    step = 1e-4
+    central = (along(step) - along(-step)) / (2 * step)
+    assert_close((gradient * direction).sum(), central, rtol=1e-5, atol=1e-5)
+    assert central.abs() > 1e-2
+
+
+def test_gradcheck_of_every_operand():
+    kinds = ("inside", "at_lower", "at_upper", "below", "above")
+    known = known_qp(1, n_z=6, n_c=1, n_f=2, soft=kinds, hard=())
+    operands = operands_of(known, differentiable=True)
+    assert torch.autograd.gradcheck(value, operands, eps=1e-5, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("of_action", [False, True])
+def test_gradient_in_state_and_action_agrees_with_finite_differences(of_action):
+    mpc, s, a = random_mpc(0), random_states(6), random_states(6, 1, size=0.4)
+    s.requires_grad_()
+    a.requires_grad_()
+    if of_action:
+        assert torch.autograd.gradcheck(mpc.action_value, (s, a), eps=1e-5, atol=1e-4)
+    else:
+        assert torch.autograd.gradcheck(mpc.value, (s,), eps=1e-5, atol=1e-4)
+
+
+def test_gradient_of_a_shared_tensor_is_the_sum_over_the_batch():
+    known = known_qp(2, batch=(5,))
+    shared = operands_of(known, differentiable=True)
+    separate = operands_of(known_qp(2, batch=(5,)), differentiable=False)
+    for i, name in enumerate(OPERANDS):
+        if name in ("H", "C", "G"):
+            separate[i] = separate[i].expand(5, -1, -1).clone()
+        separate[i].requires_grad_()
+    weight = torch.arange(1, 6).double()
+    value(*shared).backward(weight)
+    value(*separate).backward(weight)
+    for name, one, many in zip(OPERANDS, shared, separate, strict=True):
+        assert one.grad is not None
+        assert many.grad is not None
+        expected = many.grad.sum(0) if name in ("H", "C", "G") else many.grad
+        assert_close(one.grad, expected)
+
+
+def test_batch_dimensions_broadcast_in_value_and_gradient():
+    K, B = 3, 4
+    shapes = {"H": (K, 1), "q": (B,), "c": (K, 1), "C": (1, B), "b": (), "G": (), "w": (K, 1)}
+    known = known_qp(3, soft=("inside", "above", "at_upper"), hard=())
+    generator = torch.Generator().manual_seed(0)
+    operands = []
+    for name, operand in zip(OPERANDS, operands_of(known), strict=True):
+        scale = 0.02 * torch.rand(shapes.get(name, (B,)), generator=generator).double()
+        scale = scale.reshape(*scale.shape, *(1,) * operand.ndim)
+        operands.append(((1 + scale) * operand).requires_grad_())
+    values = value(*operands)
+    assert values.shape == (K, B)
+    values.square().sum().backward()
+
+    loop = [operand.detach().clone().requires_grad_() for operand in operands]
+    for k in range(K):
+        for j in range(B):
+            one = []
+            for name, operand in zip(OPERANDS, loop, strict=True):
+                n_event = len(EVENT_SHAPES.get(name, ("n_f",)))
+                expanded = operand.expand(K, B, *operand.shape[operand.ndim - n_event :])
+                one.append(expanded[k, j])
+            single = value(*one)
+            assert_close(values[k, j], single)
+            single.square().backward()
+    for name, together, alone in zip(OPERANDS, operands, loop, strict=True):
+        assert_close(together.grad, alone.grad, msg=lambda m, n=name: f"{n}: {m}")
+
+
+@pytest.mark.parametrize("name", OPERANDS)
+def test_one_batched_operand_makes_a_batch(name):
+    known = known_qp(3, soft=("inside", "above", "at_upper"), hard=("inside",))
+    operands, index = operands_of(known), OPERANDS.index(name)
+    scale = torch.tensor([0.99, 1.0, torch.nan, 1.01]).double()
+    batched = torch.stack([factor * operands[index] for factor in scale])
+
+    def of_one(operand: Tensor) -> QPSolution:
+        changed = [*operands[:index], operand, *operands[index + 1 :]]
+        return solution(*changed, on_failure="mask")
+
+    together = of_one(batched)
+    for i, operand in enumerate(batched):
+        alone = of_one(operand)
+        for name in SOLUTION:
+            part, expected = getattr(together, name)[i], getattr(alone, name)
+            assert_close(part, expected, rtol=1e-6, atol=1e-7, equal_nan=True)  # mu is w's NaN
+    assert together.solved.tolist() == [True, True, False, True]
+
+
+def test_gradient_is_the_same_whatever_is_kept():
+    known = known_qp(4, batch=(3,))
+    gradients = []
+    for keep in (None, 2, 5):
+        operands = operands_of(known, differentiable=True)
+        value(*operands, keep=keep).sum().backward()
+        gradients.append([operand.grad for operand in operands])
+    for other in gradients[1:]:
+        assert_close(other, gradients[0], rtol=1e-5, atol=1e-5)
+
+
+def test_a_large_theta_has_the_gradient_that_a_small_one_has(monkeypatch):
+    mpc = random_mpc(5, learn=(*EVENT_SHAPES, "H_f"), on_failure="mask")
+    s, incoming = random_states(20), normal(20)
+    s[3, 0] = torch.nan  # without a solution
+    operands = (*mpc.parameters(), s.requires_grad_())
+
+    def gradients() -> tuple[Tensor, ...]:
+        return torch.autograd.grad(mpc.value(s), operands, incoming)
+
+    small = gradients()
+    assert min(gradient.abs().max() for gradient in small) > 1e-3
+    assert (small[-1][3] == 0).all()
+    monkeypatch.setattr(autograd, "CACHED", -1)
+    assert_close(small, gradients())
+
+
+# The value alone, of which the rest of the solution stays arrays
+
+
+def test_the_value_alone_is_that_of_the_whole_solution_with_its_derivatives():
+    mpc, s = random_mpc(6, learn=tuple(EVENT_SHAPES)), random_states(5).requires_grad_()
+    operands, incoming = (*mpc.parameters(), s), normal(3, 5)
+    alone, whole = mpc.value(s), mpc.solve(s).value
+    assert torch.equal(alone, whole)
+    for options in ({}, {"create_graph": True}):
+        found, expected = (
+            torch.autograd.grad(value, operands, incoming[0], retain_graph=True, **options)
+            for value in (alone, whole)
+        )
+        assert_close(found, expected)
+    second, expected = (
+        torch.autograd.grad(g[-1].square().sum(), operands[:-1], allow_unused=True)
+        for g in (found, expected)
+    )
+    assert max(gradient.abs().max() for gradient in second if gradient is not None) > 1e-3
+    assert_close(second, expected)
+
+
+@pytest.mark.parametrize("value_of", [QPMPC.value, lambda mpc, s: mpc.solve(s).value])
+def test_gradients_are_batched_as_torch_autograd_grad_does(value_of):
+    mpc, s, incoming = random_mpc(6), random_states(5).requires_grad_(), normal(3, 5)
+    value = value_of(mpc, s)
+    rows = torch.autograd.grad(value, s, incoming, is_grads_batched=True, retain_graph=True)[0]
+    for row, weight in zip(rows, incoming, strict=True):
+        assert_close(row, torch.autograd.grad(value, s, weight, retain_graph=True)[0])
+
+
+def test_the_value_alone_in_forward_mode():
+    mpc, s, tangent = random_mpc(6), random_states(5), random_states(5, seed=1)
+    with forward_ad.dual_level():
+        value = mpc.value(forward_ad.make_dual(s, tangent))
+        derivative = forward_ad.unpack_dual(value).tangent
+    step = 1e-6 * tangent
+    assert_close(derivative, (mpc.value(s + step) - mpc.value(s - step)).detach() / 2e-6)
+
+
+def test_a_value_that_is_let_go_is_freed_at_once():
+    mpc, s = random_mpc(6), random_states(5)
+    gc.collect()
+    gc.disable()
+    try:
+        value = mpc.value(s)
+        known = weakref.ref(value), weakref.ref(value.grad_fn)
+        del value
+        assert [ref() for ref in known] == [None, None]
+    finally:
+        gc.enable()
+
+
+def test_a_value_that_is_changed_in_place_keeps_its_gradient():
+    mpc, s = random_mpc(6), random_states(5)
+    expected = torch.autograd.grad(mpc.value(s).sum(), mpc.C)
+    assert_close(torch.autograd.grad(mpc.value(s).mul_(2.0).sum() / 2.0, mpc.C), expected)
+
+
+# Unsolved elements
+
+
+@pytest.mark.parametrize("incoming", [1.0, torch.inf, torch.nan])
+def test_an_unsolved_element_has_no_gradient_whatever_comes_in(incoming):
+    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
+    operands = operands_of(known, differentiable=True)
+    values = value(*operands, on_failure="mask")
+    assert values[1] == torch.inf
+    values.backward(torch.tensor([1.0, incoming, 1.0]).double())
+    for name, operand in zip(OPERANDS, operands, strict=True):
+        assert operand.grad is not None
+        assert operand.grad.isfinite().all(), name
+        assert (operand.grad[1] == 0).all(), name
+    assert (operands[0].grad[0] != 0).any()  # pyright: ignore[reportOptionalSubscript] - seen above
+
+
+def test_an_unsolved_element_adds_nothing_to_a_shared_tensors_gradient():
+    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
+    shared = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    operands = operands_of(known)
+    value(*(operand + shared for operand in operands), on_failure="mask").square().sum().backward()
+    assert shared.grad is not None
+    assert shared.grad.isfinite()
+
+
+def test_invalid_elements_have_no_gradient_and_spoil_no_other():
+    known = known_qp(6, batch=(3,), matrices=(3,))
+    operands = operands_of(known)
+    for i in range(len(operands)):
+        spoilt = [operand.clone() for operand in operands]
+        spoilt[i][1].fill_(torch.nan)
+        for operand in spoilt:
+            operand.requires_grad_()
+        values = value(*spoilt, on_failure="mask")
+        assert_close(values, torch.where(torch.arange(3) == 1, torch.inf, known.value))
+        values[values.isfinite()].sum().backward()
+        for operand in spoilt:
+            assert operand.grad is not None
+            assert operand.grad.isfinite().all(), OPERANDS[i]
+
+
+def test_an_unsolved_element_carries_infinite_cost_and_its_fixed_entries():
+    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
+    found = solve_qp(known.qp, known.fixed, solver="daqp", on_failure="mask")
+    assert found.solved.tolist() == [True, False, True]
+    assert found.status[1] == Status.INFEASIBLE
+    assert found.value[1] == torch.inf
+    assert_close(found.z[1, :2], known.fixed[1])
+    for name in ("sigma", "chi", "upsilon", "eta", "xi"):
+        assert (getattr(found, name)[1] == 0).all()
+    assert (found.z[1, 2:] == 0).all()
+
+
+# torch.func and torch.compile
+
+
+def test_vmap_over_states_equals_the_batch():
+    mpc, s, a = random_mpc(1), random_states(5), random_states(5, 1, size=0.4)
+    assert_close(vmap(mpc.value)(s), mpc.value(s))
+    assert_close(vmap(mpc.action_value)(s, a), mpc.action_value(s, a))
+    assert_close(vmap(mpc.action_value, in_dims=(None, 0))(s[0], a), mpc.action_value(s[:1], a))
+    assert_close(vmap(mpc.value, in_dims=1)(s.mT), mpc.value(s))
+    assert_close(vmap(mpc.policy)(s), mpc.policy(s))
+
+
+def test_nested_vmap_makes_a_grid():
+    mpc, s, a = random_mpc(1), random_states(3), random_states(4, 1, size=0.4)
+    grid = vmap(lambda s: vmap(lambda a: mpc.action_value(s, a))(a))(s)
+    assert_close(grid, mpc.action_value(s.unsqueeze(1), a))
+
+
+@pytest.mark.parametrize("name", OPERANDS)
+def test_vmap_over_one_operand_equals_a_loop(name):
+    known = known_qp(8, batch=(2,), soft=("inside", "above", "at_lower"), hard=())
+    operands = operands_of(known)
+    index = OPERANDS.index(name)
+    scales = torch.tensor([0.95, 1.0, 1.05]).double()
+    stack = torch.stack([scale * operands[index] for scale in scales], dim=-1)
+
+    def of_one(operand: Tensor) -> Tensor:
+        return value(*operands[:index], operand, *operands[index + 1 :])
+
+    expected = torch.stack([of_one(scale * operands[index]) for scale in scales])
+    assert_close(vmap(of_one, in_dims=-1)(stack), expected)
+
+
+def test_per_sample_gradients_equal_a_loop():
+    mpc, s, a = random_mpc(2), random_states(4), random_states(4, 1, size=0.4)
+    parameters = {name: part.detach() for name, part in mpc.named_parameters()}
+
+    def of_one(parameters: dict[str, Tensor], s: Tensor, a: Tensor) -> Tensor:
+        return functional_call(mpc, parameters, (s, a))
+
+    together = vmap(grad(of_one), in_dims=(None, 0, 0))(parameters, s, a)
+    jacobian = jacrev(of_one)(parameters, s, a)
+    for i in range(len(s)):
+        mpc.zero_grad()
+        mpc.action_value(s[i], a[i]).backward()
+        alone = grad(of_one)(parameters, s[i], a[i])
+        for name, parameter in mpc.named_parameters():
+            assert parameter.grad is not None
+            for other in (together[name][i], jacobian[name][i], alone[name]):
+                assert_close(other, parameter.grad)
+
+
+def test_ensembles_of_parameters_are_vmapped():
+    modules, s = [random_mpc(seed) for seed in range(3)], random_states(4)
+    states = [dict(mpc.named_parameters()) for mpc in modules]
+    parameters = {name: torch.stack([state[name] for state in states]) for name in states[0]}
+
+    def of_one(parameters: dict[str, Tensor]) -> Tensor:
+        return functional_call(modules[0], parameters, (s,))
+
+    ensemble = vmap(of_one)(parameters)
+    assert_close(ensemble, torch.stack([mpc.value(s) for mpc in modules]))
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_the_operator_keeps_torchs_contract(batch):
+    known = known_qp(9, batch=batch)
+    operands = operands_of(known, differentiable=True)
+    active = torch.zeros(known.lam.shape, dtype=torch.int8)
+    arguments = (*operands, active, 2, "daqp", "mask")
+    torch.library.opcheck(solve_op, arguments)
+    solution = [part.detach() for part in (known.z, known.lam, known.chi)]
+    found = [*solution, torch.zeros_like(known.fixed), torch.zeros(batch, dtype=torch.int64)]
+    torch.library.opcheck(solution_op, (*found, *operands, 2))
+
+
+# What comes out
+
+
+@pytest.mark.parametrize("batch", [(), (0,), (1,), (5,), (2, 3)])
+@pytest.mark.parametrize("of_matrices", [False, True])
+def test_shapes_of_the_solution(batch, of_matrices):
+    known = known_qp(10, batch=batch, matrices=batch if of_matrices else ())
+    found = solve_qp(known.qp, known.fixed, solver="daqp")
+    for name, part in solution_of(known).items():
+        assert getattr(found, name).shape == part.shape, name
+    for name in ("status", "residual", "iterations"):
+        assert getattr(found, name).shape == batch, name
+    assert found.mu.shape == known.sigma.shape
+
+
+def test_a_constant_cost_of_its_own_makes_a_batch_too():
+    known = known_qp(10)
+    lift = torch.arange(3).double()
+    found = solve_qp(replace(known.qp, c=known.qp.c + lift), known.fixed, solver="daqp")
+    assert_close(found.value, known.value + lift)
+    assert found.z.shape == (3, 12)
+    assert found.status.shape == (3,)
+
+
+def test_multipliers_of_a_row_sum_to_its_weight():
+    known = known_qp(11, batch=(4,))
+    found = solve_qp(known.qp, known.fixed, solver="daqp")
+    soft = known.qp.w.isfinite()
+    total = found.upsilon + found.eta + found.mu
+    assert_close(total[soft], known.qp.w[soft])
+    assert (found.mu[~soft] == torch.inf).all()
+    assert (torch.minimum(found.upsilon, found.eta) == 0).all()
+    assert (found.mu >= -1e-9).all()
+    assert (found.sigma[~soft] == 0).all()
+
+
+def test_single_precision_in_single_precision_out(solver):
+    known = known_qp(12, batch=(4,), dtype=torch.float32)
+    operands = operands_of(known, differentiable=True)
+    found = solution(*operands, solver=solver)
+    for name, part in solution_of(known).items():
+        assert getattr(found, name).dtype == torch.float32
+        assert_close(getattr(found, name), part, rtol=1e-3, atol=1e-3)
+    found.value.sum().backward()
+    for operand in operands:
+        assert operand.grad is not None
+        assert operand.grad.dtype == torch.float32
+
+
+def test_an_asymmetry_within_the_tolerance_of_single_precision_does_no_harm():
+    H, unit = torch.eye(2), torch.ones(2)
+    H[0, 1] = 8e-6
+    none = torch.zeros(0)
+    qp = QuadraticProgram(
+        H, -100 * unit, torch.zeros(()), none.reshape(0, 2), none, H, -1e9 * unit, 1e9 * unit, unit
+    )
+    assert_close(solve_qp(qp, solver="daqp").z, 100 * unit, rtol=1e-5, atol=0)
+
+
+def test_everything_may_be_fixed():
+    known = known_qp(13, n_c=0, n_f=12, soft=("above", "below", "inside"), hard=("inside",))
+    found = solve_qp(known.qp, known.fixed, solver="daqp")
+    assert_close(found.value, known.value)
+    assert_close(found.z, known.z)
+
+
+# What goes wrong
+
+
+GOOD, OTHER = known_qp(14, batch=(3,)), known_qp(14)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"fixed": [1.0, 2.0]}, "fixed: got list, expected a floating-point torch.Tensor"),
+        ({"fixed": torch.ones(2, dtype=torch.int64)}, "fixed: got torch.int64, expected a float"),
+        ({"fixed": torch.tensor(1.0)}, r"fixed: got shape \(\), expected shape \(\*batch, n_f\)"),
+        ({"fixed": torch.ones(13)}, r"fixed: got shape \(13,\), .* with n_f <= n_z = 12"),
+        ({"fixed": torch.ones(4, 2)}, r"fixed: got shape \(4, 2\), .* the QP's batch \(3,\)"),
+        ({"keep": 1}, "keep: got 1, expected n_f = 2 <= keep <= n_z = 12"),
+        ({"keep": 13}, "keep: got 13, expected n_f = 2 <= keep <= n_z = 12"),
+        ({"solver": "prox"}, r"solver: got 'prox', expected one of .* Did you mean 'proxqp'\?"),
+        ({"on_failure": "ignore"}, "on_failure: got 'ignore', expected one of raise, warn, mask"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(QPError, match=message):
+        solve_qp(GOOD.qp, **({"fixed": GOOD.fixed} | arguments))
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [
+        (solve_qp(OTHER.qp, OTHER.fixed, solver="daqp"), r"shape \(13,\) of torch.int8"),
+        (torch.zeros(3, 12, dtype=torch.int8), r"shape \(3, 12\) of torch.int8"),
+        (torch.zeros(3, 13), r"shape \(3, 13\) of torch.float32"),
+    ],
+)
+def test_a_warm_start_that_does_not_fit_is_named(start, message):
+    expected = r", expected \(3, 13\) of torch.int8. Pass the solution of the same batch"
+    with pytest.raises(QPError, match="warm_start: got " + message + expected):
+        solve_qp(GOOD.qp, GOOD.fixed, warm_start=start)
+
+
+@pytest.mark.parametrize("on_failure", ["raise", "warn"])
+def test_failures_are_counted_and_located(on_failure):
+    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
+    b = known.qp.b.clone()
+    b[2] = torch.nan
+    operands = operands_of(known)
+    operands[OPERANDS.index("b")] = b
+    message = (
+        r"2 of 3 QPs have no certified solution. 1 INFEASIBLE, first at batch index \(1,\): .*; "
+        r"soften rows with a finite w.* 1 INVALID_DATA, first at batch index \(2,\): NaN or inf"
+    )
+    if on_failure == "raise":
+        with pytest.raises(SolverError, match=message):
+            value(*operands, on_failure=on_failure)
+    else:
+        with pytest.warns(RuntimeWarning, match=message):
+            values = value(*operands, on_failure=on_failure)
+        assert values.isinf().tolist() == [False, True, True]
+
+
+def test_invalid_data_alone_is_bad_input():
+    operands = operands_of(known_qp(5))
+    operands[OPERANDS.index("lb")].fill_(torch.nan)
+    with pytest.raises(QPError, match=r"1 of 1 QPs .* 1 INVALID_DATA: NaN or inf in the data"):
+        value(*operands)
+
+
+def test_masked_failures_are_silent(recwarn):
+    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
+    assert value(*operands_of(known), on_failure="mask").isinf().tolist() == [False, True, False]
+    assert not recwarn
+
+
+# Threads and processes
+
+
+def test_threads_that_solve_at_once_get_their_own_answers(solver):
+    problems = [known_qp(seed, batch=(3,)) for seed in range(8)]
+
+    def solve(known: KnownQP) -> QPSolution:
+        return solve_qp(known.qp, known.fixed, solver=solver)
+
+    alone = [solve(known) for known in problems]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(solve, problems))
+    for one, other in zip(alone, together, strict=True):
+        for name in SOLUTION:
+            assert_close(getattr(other, name), getattr(one, name), rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["solver", "on_failure"])
+def test_a_choice_that_is_no_name_is_refused(name):
+    with pytest.raises(QPError, match=f"{name}: got None, expected a name"):
+        solution(*operands_of(known_qp(0)), **{name: None})
+
+
+ALLOCATIONS = [
+    MemoryError("Unable to allocate 8.00 TiB for an array"),
+    RuntimeError(
+        "[enforce fail at alloc_cpu.cpp:124] . DefaultCPUAllocator: can't allocate memory"
+    ),
+    torch.OutOfMemoryError("CUDA out of memory."),
+]
+
+
+@pytest.mark.parametrize("error", ALLOCATIONS, ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize("differentiated", [False, True])
+def test_a_batch_that_is_too_large_for_memory_is_named(error, differentiated, monkeypatch):
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("torch_qpmpc.qp.autograd.solve_programs", fail)
+    known = known_qp(1, batch=(4, 3))
+    fixed = known.fixed.clone().requires_grad_(differentiated)
+    message = r"batch: got 12 QPs of n_z = 12, expected as many as .* Solve it in chunks, .*memory"
+    if "array" in str(error):
+        message = message.replace("memory", "array")
+    with pytest.raises(QPError, match=message):
+        solve_qp(known.qp, fixed)
+
+
+def test_another_runtime_error_stays_as_it_is(monkeypatch):
+    def fail(*_: object) -> None:
+        raise RuntimeError("of another kind")
+
+    monkeypatch.setattr("torch_qpmpc.qp.autograd.solve_programs", fail)
+    known = known_qp(1, batch=(3,))
+    with pytest.raises(RuntimeError, match="of another kind"):
+        solve_qp(known.qp, known.fixed)

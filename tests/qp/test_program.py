@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+import doctest
+import importlib
+from dataclasses import FrozenInstanceError, replace
+from typing import Any
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.problems import known_qp
+from torch_qpmpc import QPError, QuadraticProgram, Status, solve_qp
+from torch_qpmpc.qp.program import EVENT_SHAPES, crossed
+
+GOOD: dict[str, Any] = dict(zip(EVENT_SHAPES, known_qp(0).qp.tensors(), strict=True))
+
+
+def with_entry(name: str, value: float) -> Any:
+    tensor = GOOD[name].clone()
+    tensor.view(-1)[0] = value
+    return tensor
+
+
+def with_eigenvalue(lowest: float) -> Any:
+    n_z = GOOD["q"].shape[0]
+    eigenvalues = torch.ones(n_z, dtype=torch.float64)
+    eigenvalues[0] = lowest
+    vectors = torch.linalg.eigh(GOOD["H"]).eigenvectors
+    H = vectors * eigenvalues @ vectors.mT
+    return (H + H.mT) / 2
+
+
+SHAPE_ERRORS = [
+    ({"H": [[1.0]]}, r"H: got list, expected a floating-point torch.Tensor. Convert it"),
+    ({"q": torch.ones(12, dtype=torch.int64)}, r"q: got torch.int64, expected a floating-point"),
+    ({"b": GOOD["b"].float()}, r"b: got torch.float32, expected H's dtype torch.float64"),
+    ({"q": torch.tensor(1.0).double()}, r"q: got shape \(\), expected shape \(\*batch, n_z\)"),
+    ({"H": GOOD["H"][:, :-1]}, r"H: got shape \(12, 11\), .* with n_z = 12 as in H"),
+    ({"C": GOOD["C"][:, :-1]}, r"C: got shape \(3, 11\), .* with n_z = 12 as in H"),
+    ({"b": GOOD["b"][:-1]}, r"b: got shape \(2,\), .* with n_c = 3 as in C"),
+    ({"G": GOOD["G"][:-1]}, r"lb: got shape \(13,\), .* with n_g = 12 as in G"),
+    ({"w": GOOD["w"][:-1]}, r"w: got shape \(12,\), .* with n_g = 13 as in G"),
+    (
+        {"q": GOOD["q"].expand(2, -1), "b": GOOD["b"].expand(3, -1)},
+        r"batch: got shapes .*'q': \(2, 12\).*, expected leading dimensions that broadcast",
+    ),
+]
+VALUE_ERRORS = [
+    *(
+        ({name: with_entry(name, bad)}, rf"{name}: got NaN or inf, expected finite entries")
+        for name in ("H", "q", "c", "C", "b", "G")
+        for bad in (torch.nan, torch.inf)
+    ),
+    *(({name: with_entry(name, torch.nan)}, f"{name}: got NaN or") for name in ("lb", "ub", "w")),
+    ({"lb": with_entry("lb", torch.inf)}, "lb: got NaN or inf, expected no NaN, and no such"),
+    ({"ub": with_entry("ub", -torch.inf)}, "ub: got NaN or -inf, expected no NaN, and no such"),
+    (
+        {"lb": torch.zeros(13).double(), "ub": -2 * torch.ones(13).double()},
+        "lb: got lb > ub by up to 2, expected lb <= ub in every row",
+    ),
+    ({"w": with_entry("w", -1.0)}, "w: got -1, expected non-negative .* Use inf for a hard row"),
+    (
+        {"H": with_entry("H", 1.0) + GOOD["H"].triu(1)},
+        r"H: got asymmetry .* Pass \(H \+ H.mT\) / 2",
+    ),
+    ({"H": with_eigenvalue(-0.5)}, "H: got smallest eigenvalue -0.5, .* by its Cholesky factor"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), SHAPE_ERRORS + VALUE_ERRORS)
+def test_bad_data_is_named(changes, message):
+    with pytest.raises(QPError, match=message):
+        QuadraticProgram(**(GOOD | changes))
+
+
+@pytest.mark.parametrize(("changes", "message"), SHAPE_ERRORS)
+def test_shapes_are_checked_even_where_values_are_not(changes, message):
+    with pytest.raises(QPError, match=message):
+        QuadraticProgram(**(GOOD | changes), check_values=False)
+
+
+@pytest.mark.parametrize(("changes", "message"), VALUE_ERRORS)
+def test_values_are_not_checked_on_request(changes, message):
+    assert QuadraticProgram(**(GOOD | changes), check_values=False).n_z == 12
+
+
+def test_one_bad_element_of_a_batch_is_found():
+    lb: Any = GOOD["lb"].clone().expand(4, -1).clone()
+    lb[2] = GOOD["ub"].clamp(max=9.0) + 1
+    with pytest.raises(QPError, match="lb: got lb > ub by up to"):
+        QuadraticProgram(**(GOOD | {"lb": lb}))
+
+
+@pytest.mark.parametrize("lowest", [0.0, -1e-12])
+def test_a_singular_hessian_is_accepted_up_to_rounding(lowest):
+    QuadraticProgram(**(GOOD | {"H": with_eigenvalue(lowest)}))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bounds_that_cross_by_rounding_are_accepted_as_equal(dtype):
+    known = known_qp(0, batch=(3,), soft=("equality",), hard=("equality",), dtype=dtype)
+    up = torch.nextafter(known.qp.lb, torch.full_like(known.qp.lb, torch.inf))
+    solution = solve_qp(replace(known.qp, lb=up), known.fixed, solver="daqp")
+    rounding = 1e-4 if dtype == torch.float32 else 1e-9
+    assert_close(solution.value, known.value, rtol=rounding, atol=rounding)
+    assert not crossed(up, known.qp.ub).any()
+    assert crossed(up + 1e-3, known.qp.ub).all()
+
+
+def test_infinite_bounds_and_weights_are_accepted():
+    qp = known_qp(0, soft=("free", "no_upper"), hard=("no_upper",)).qp
+    assert qp.lb.isinf().any()
+    assert qp.ub.isinf().any()
+    assert qp.w.isinf().any()
+
+
+@pytest.mark.parametrize("batch", [(), (0,), (1,), (5,), (2, 3)])
+def test_batch_shape_is_that_of_the_broadcast_tensors(batch):
+    qp = known_qp(0, batch=batch).qp
+    assert qp.H.ndim == 2
+    assert qp.batch_shape == torch.Size(batch)
+
+
+def test_batch_shape_counts_every_tensor():
+    changes = {"c": torch.zeros(3, 1).double(), "q": GOOD["q"].expand(4, -1)}
+    assert QuadraticProgram(**(GOOD | changes)).batch_shape == (3, 4)
+
+
+def test_tensors_come_in_the_order_of_the_constructor():
+    qp = QuadraticProgram(**GOOD)
+    again = QuadraticProgram(*qp.tensors(), check_values=False)
+    assert all(getattr(again, name) is tensor for name, tensor in GOOD.items())
+
+
+def test_a_program_cannot_be_changed():
+    with pytest.raises(FrozenInstanceError, match="cannot assign"):
+        QuadraticProgram(**GOOD).q = GOOD["q"]  # pyright: ignore[reportAttributeAccessIssue] - that
+
+
+@pytest.mark.parametrize("status", Status)
+def test_every_status_explains_itself(status):
+    assert len(status.explanation) > 20
+
+
+@pytest.mark.parametrize("module", ["qp", "mpc"])
+def test_the_examples_in_the_docstrings_run(module):
+    results = doctest.testmod(importlib.import_module(f"torch_qpmpc.{module}"))
+    assert results.attempted > 0
+    assert results.failed == 0
+
+
+def test_a_program_is_shown_by_its_sizes():
+    expected = (
+        "QuadraticProgram(batch_shape=(5,), n_z=12, n_c=3, n_g=13, dtype=torch.float64, "
+        "device='cpu')"
+    )
+    assert repr(known_qp(0, batch=(5,)).qp) == expected
+
+
+def test_a_solution_is_shown_by_its_outcome():
+    known = known_qp(0, batch=(5,))
+    fixed = known.fixed.clone()
+    fixed[2] = torch.nan
+    text = repr(solve_qp(known.qp, fixed, on_failure="mask"))
+    first, shape, qp, outcome, values, last = text.splitlines()
+    assert (first, last) == ("QPSolution(", ")")
+    assert shape == f"    batch_shape=(5,), n_f={fixed.shape[-1]},"
+    assert qp == f"    qp={known.qp!r},"
+    assert outcome == "    solved 4 of 5, 1 INVALID_DATA,"
+    value = known.value[[0, 1, 3, 4]]
+    assert values.startswith(f"    value from {value.min():.4g} to {value.max():.4g}, residual up")
+
+
+def test_a_solution_without_values_or_elements_is_shown():
+    known = known_qp(0, batch=(3,))
+    meta = QuadraticProgram(*(x.to("meta") for x in known.qp.tensors()), check_values=False)
+    assert "device='meta'" in repr(solve_qp(meta, known.fixed.to("meta")))
+    assert "solved 0 of 0" in repr(solve_qp(known_qp(0, batch=(0,)).qp))
+    none = solve_qp(known.qp, known.fixed * torch.nan, on_failure="mask")
+    assert "solved 0 of 3, 3 INVALID_DATA" in repr(none)

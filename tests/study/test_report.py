@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from torch_qpmpc.study import report
+from torch_qpmpc.study.plots import GAP_LEFT
+from torch_qpmpc.study.runs import collect
+
+
+def made_up(gaps: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
+    """Runs by noise and case, of which the last of each had no real gap."""
+    rows = []
+    for (noise, case), values in gaps.items():
+        for seed, gap in enumerate(values, 1):
+            row = {"sweep": "a", "noise": noise, "constraint": case, "label": case, "seed": seed}
+            row |= {"closed_gap": gap, "real": seed < len(values), "canonical_distance": 0.1 * seed}
+            row |= {"zeros_above": 1.0}
+            row |= {"prediction_error": 0.02 * seed, "prediction_error_start": 0.05}
+            for name in ("J", "J_discounted"):
+                row |= {f"{name}_start": 285.04, f"{name}_final": 50.0, f"{name}_true_model": 46.97}
+            rows.append(row | {"unsolved": 0, "train_seconds": 3.21})
+    return pd.DataFrame(rows)
+
+
+def test_a_case_is_a_row_with_median_interval_and_both_ends():
+    frame = made_up({("gaussian", "free"): [0.9, 0.9, 0.9, 0.1], ("brownian", "si"): [0.5]})
+    *_, free, si = report.cases_table(frame).splitlines()
+    ends = "285.0 to 50.0 (47.0) | 285.0 to 50.0 (47.0)"
+    errors = "0.250 | 1.00 | 0.050 to 0.050 (2 of 4)"
+    assert free == f"| gaussian | free | 0.900 [0.900, 0.900] (3 of 4) | {ends} | {errors} |"
+    assert si == f"| brownian | si | - (0 of 1) | {ends} | 0.100 | 1.00 | 0.050 to 0.020 (1 of 1) |"
+
+
+def test_every_run_is_in_the_long_table():
+    frame = made_up({("gaussian", "free"): [0.91, 0.92]})
+    assert report.runs_table(frame).splitlines()[-1] == (
+        "| a | gaussian | free | 2 | 285.0 | 50.0 | 47.0 | 0.920 | 0.200 | 0.0400 | 0.0500 | 0 "
+        "| 3.2 |"
+    )
+
+
+def test_a_run_without_a_gap_says_how_J_changed():
+    frame = made_up({("gaussian", "free"): [math.nan]}).assign(J_start=46.97, J_final=50.0)
+    assert "| 47.0 | 50.0 | 47.0 | no gap; J rose by 3.0 |" in report.runs_table(frame)
+
+
+def test_the_learned_cases_come_to_one_number_in_which_each_weighs_alike():
+    gaps = {"free": 0.9, "deviation": 0.8, "si": 1.0, "combined": 0.9, "fixed": -3.0}
+    frame = made_up({("gaussian", case): [gap] * 5 for case, gap in gaps.items()})
+    text = report.overall(frame)
+    # Each case is a stratum without spread, so that there is no doubt about the mean.
+    assert text.endswith("four cases that learn C: gaussian noise 0.900 [0.900, 0.900].")
+    assert report.overall(frame.query("label != 'si'")) == ""
+
+
+def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
+    readme = tmp_path / "README.md"
+    readme.write_text(f"# A\n<!-- {study.name} -->\nold\n<!-- /{study.name} -->\nend\n")
+    (tmp_path / "notebooks").mkdir()
+    report.main([str(study), "--readme", str(readme)])
+
+    printed = capsys.readouterr().out
+    frame = collect(study)
+    for name, sweep in frame.groupby("sweep"):
+        table = report.cases_table(sweep)
+        for text in (printed, (study / "report" / "report.md").read_text(), readme.read_text()):
+            assert table in text
+        kinds = ("learning", "constraints", "trajectories", "policies")
+        figures = {f"{kind}-{noise}.png" for kind in kinds for noise in {*sweep["noise"]}}
+        figures |= {"meaning.png"}
+        drawn = {path.name for path in (study / "report" / str(name)).iterdir()}
+        assert drawn == figures
+        for figure in drawn:
+            assert f"]({name}/{figure})" in (study / "report" / "report.md").read_text()
+    assert len((study / "report" / "runs.md").read_text().splitlines()) == 2 + len(frame)
+    assert "old" not in readme.read_text()
+    assert readme.read_text().endswith(f"<!-- /{study.name} -->\nend\n")
+    assert 5_000 < (tmp_path / "notebooks" / f"{study.name}.png").stat().st_size < 200_000
+    # Its own folder is no run.
+    assert len(collect(study)) == len(frame)
+
+
+def test_many_settings_are_a_frontier_and_ablations_have_their_figure():
+    gaps = {("gaussian", f"combined, c_2={i}"): [0.9, 0.8] for i in range(9)}
+    frame = made_up(gaps)
+    assert [name for name, _ in report.figures(frame)] == ["frontier"]
+    ablations = frame.assign(ablation=np.where(frame["label"] < "combined, c_2=4", "a", "b"))
+    assert [name for name, _ in report.figures(ablations)] == ["frontier", "ablation"]
+    labels = [report.headline(sweep).axes[0].get_xlabel() for sweep in (frame, ablations)]
+    assert labels == ["distance of the predictions to an MPC scheme's", GAP_LEFT]
+
+
+def test_what_is_wrong_is_said_in_one_line(study, tmp_path):
+    with pytest.raises(SystemExit, match="without a finished run"):
+        report.main([str(tmp_path)])
+    (tmp_path / "README.md").touch()
+    with pytest.raises(SystemExit, match="expected one line <!-- weights -->"):
+        report.main([str(study / "weights"), "--readme", str(Path(tmp_path) / "README.md")])

@@ -1,0 +1,143 @@
+from __future__ import annotations
+
+import math
+import shutil
+
+import pytest
+import torch
+
+import train
+from tests.problems import normal
+from tests.runs import SMALL, make_config
+from torch_qpmpc import QPError
+from torch_qpmpc.analysis.report import canonical
+from torch_qpmpc.analysis.structure import Model
+from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.lock import LOCK
+from torch_qpmpc.study.runs import FinishedRun, collect, prediction_error
+
+
+def test_every_run_is_a_row_in_the_papers_order(study):
+    frame = collect(study)
+    columns = (frame[name] for name in ("sweep", "noise", "label", "seed"))
+    assert list(zip(*columns, strict=True)) == [
+        ("small", "brownian", "free", 1),
+        ("small", "gaussian", "fixed", 1),
+        ("small", "gaussian", "fixed", 4),
+        ("small", "gaussian", "free", 1),
+        ("small", "gaussian", "free", 4),
+        ("weights", "gaussian", "deviation, c_2=0.0", 1),
+        ("weights", "gaussian", "deviation, c_2=0.5", 1),
+    ]
+    assert frame["real"].tolist() == [True, True, False, True, False, True, True]
+
+
+def test_a_sweeps_own_folder_gives_its_name(study):
+    assert set(collect(study / "small")["sweep"]) == {"small"}
+
+
+def test_one_run_will_do(study):
+    assert len(collect(study / "small" / "gaussian-free-seed1")) == 1
+
+
+def test_a_lock_file_that_was_left_is_ignored(study):
+    folder = study / "small" / "gaussian-free-seed1"
+    (folder / LOCK).touch()
+    try:
+        assert len(collect(folder)) == 1
+    finally:
+        (folder / LOCK).unlink()
+
+
+def test_the_learned_qp_is_the_one_that_was_evaluated(study):
+    for row in collect(study / "small").to_dict("records"):
+        run = row["run"]
+        for mpc, then in ((run.start, row["J_start"]), (run.learned, row["J_final"])):
+            now = evaluate(run.cfg, mpc.policy, run.physics).J
+            assert now == pytest.approx(then, rel=1e-6)
+
+
+def test_where_C_is_fixed_its_model_is_the_corrupted_one(study):
+    frame = collect(study / "small")
+    fixed, free = (frame.query(f"constraint == {case!r}") for case in ("fixed", "free"))
+    assert fixed["canonical_distance"].tolist() == pytest.approx([0, 0], abs=1e-9)
+    assert fixed["prediction_error"].tolist() == pytest.approx(
+        fixed["prediction_error_start"].tolist()
+    )
+    assert min(free["canonical_distance"]) > 1e-4
+    assert all(free["prediction_error"] != free["prediction_error_start"])
+
+
+def test_readings_do_not_depend_on_the_gauge(study):
+    run = FinishedRun(study / "small" / "gaussian-free-seed1")
+    before, matrix = run.readings(), canonical(run.learned)
+    T = torch.eye(len(run.learned.C)) + 0.1 * normal(*2 * [len(run.learned.C)])
+    with torch.no_grad():
+        run.learned.C.copy_(T @ run.learned.C)
+    assert run.readings() == pytest.approx(before, rel=1e-6)
+    torch.testing.assert_close(canonical(run.learned), matrix, rtol=1e-6, atol=1e-8)
+
+
+def test_constraints_that_determine_no_states_have_no_readings(study):
+    run = FinishedRun(study / "small" / "gaussian-free-seed1")
+    with torch.no_grad():
+        run.learned.C.zero_()
+    readings = run.readings()
+    assert math.isnan(readings["prediction_error"])
+
+
+def test_the_models_error_is_that_of_one_step(study):
+    """An offset of 0.3 in one state is an error of 0.3, a gain of 1 on it its spread."""
+    physics = FinishedRun(study / "small" / "gaussian-free-seed1").physics
+    assert isinstance(physics, LinearSystem)
+    none = torch.zeros(4, dtype=torch.float64)
+    A, B = physics.A, physics.B
+    assert prediction_error(Model(A, B, none, none[0]), physics) == 0
+    offset = none.index_fill(0, torch.tensor([2]), 0.3)
+    assert prediction_error(Model(A, B, offset, none[0]), physics) == pytest.approx(0.3)
+    spread = prediction_error(Model(A - torch.eye(4), B, none, none[0]), physics)
+    assert spread == pytest.approx(math.sqrt(2 * (1.5**2 + 0.5**2) / 3), rel=0.05)
+
+
+def test_exact_zeros_above_the_band_are_counted(study):
+    frame = collect(study / "small")
+    assert set(frame.query("constraint == 'fixed'")["zeros_above"]) == {1.0}
+    assert max(frame.query("constraint == 'free'")["zeros_above"]) < 0.1
+
+
+def test_an_ablation_gives_its_name(study, tmp_path):
+    for name in ("one", "two"):
+        shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / name)
+        config = tmp_path / name / "config.yaml"
+        config.write_text(config.read_text().replace("ablation: null", f"ablation: {name}"))
+    assert collect(tmp_path)["label"].tolist() == ["free, one", "free, two"]
+
+
+def test_a_scheme_released_in_training_is_read(tmp_path):
+    cfg = make_config(*SMALL, "constraint=mpc", "release=2", "figures=false")
+    summary = train.train(cfg, str(tmp_path), quiet=True)
+    run = FinishedRun(tmp_path)
+    assert run.learned.structure == "free"
+    now = evaluate(cfg, run.learned.policy, run.physics).J
+    assert now == pytest.approx(summary["J_final"], rel=1e-6)
+
+
+def test_a_folder_without_runs_is_named(tmp_path):
+    with pytest.raises(QPError, match=r"RUNS_FOLDER: got .* without a finished run"):
+        collect(tmp_path)
+
+
+def test_a_checkpoint_that_is_lost_is_named(study, tmp_path):
+    shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
+    (tmp_path / "run" / "checkpoint.pt").unlink()
+    with pytest.raises(QPError, match=r"checkpoint: got .*checkpoint.pt, which is not there"):
+        collect(tmp_path)
+
+
+def test_a_run_with_other_keys_than_todays_is_named(study, tmp_path):
+    shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
+    config = tmp_path / "run" / "config.yaml"
+    config.write_text(config.read_text().replace("step: cholesky\n", "", 1))
+    with pytest.raises(QPError, match=r"run: got .*step: got nothing.* expected one of this"):
+        collect(tmp_path)

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import trim_mean
+
+from torch_qpmpc import QPError
+from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([7.0], 7.0),
+        ([1.0, 2.0], 1.5),
+        ([0.0, 1.0, 3.0, 1000.0], 2.0),
+        # Of six, the middle three: two whole values, and half of each of their neighbours.
+        ([0.0, 1.0, 2.0, 4.0, 8.0, 100.0], (0.5 * 1 + 2 + 4 + 0.5 * 8) / 3),
+    ],
+)
+def test_the_middle_half_counts_in_any_order(rng, values, expected):
+    assert interquartile_mean(rng.permutation(values)) == pytest.approx(expected)
+
+
+def test_with_multiples_of_four_it_is_scipys_trimmed_mean(rng):
+    x = rng.normal(size=(3, 20, 2))
+    np.testing.assert_allclose(interquartile_mean(x, axis=1), trim_mean(x, 0.25, axis=1))
+
+
+def test_the_interval_of_the_mean_is_the_normal_one(rng):
+    x = rng.normal(loc=5.0, scale=2.0, size=400)
+    low, high = bootstrap_interval([x], np.mean, level=0.9)
+    half = 1.645 * x.std() / np.sqrt(len(x))
+    assert low == pytest.approx(x.mean() - half, abs=0.05)
+    assert high == pytest.approx(x.mean() + half, abs=0.05)
+
+
+def test_it_covers_the_truth_as_often_as_it_says(rng):
+    hits = 0
+    for seed in range(200):
+        x = rng.normal(size=30)
+        low, high = bootstrap_interval([x], np.mean, level=0.8, resamples=300, seed=seed)
+        hits += int(low <= 0 <= high)
+    assert 0.7 < hits / 200 < 0.88
+
+
+def test_strata_keep_their_size():
+    """What differs only between strata leaves no doubt; the same runs as one stratum leave much."""
+    strata = [np.zeros(5), np.ones(5)]
+    assert bootstrap_interval(strata, np.mean) == (0.5, 0.5)
+    low, high = bootstrap_interval([np.concatenate(strata)], np.mean)
+    assert low < 0.3 < 0.7 < high
+
+
+def test_curves_have_an_interval_at_each_point(rng):
+    x = rng.normal(size=(10, 7))
+    low, high = bootstrap_interval([x], interquartile_mean)
+    assert low.shape == high.shape == (7,)
+    assert (low < interquartile_mean(x)).all()
+    assert (interquartile_mean(x) < high).all()
+
+
+def test_a_seed_gives_one_interval(rng):
+    x = rng.normal(size=12)
+    assert bootstrap_interval([x], np.mean, seed=3) == bootstrap_interval([x], np.mean, seed=3)
+    assert bootstrap_interval([x], np.mean, seed=3) != bootstrap_interval([x], np.mean, seed=4)
+
+
+@pytest.mark.parametrize("strata", [[], [np.ones(3), np.ones(0)]])
+def test_an_empty_stratum_is_refused(strata):
+    with pytest.raises(QPError, match=r"strata: got sizes \[.*\], expected at least one run"):
+        bootstrap_interval(strata)

@@ -1,0 +1,65 @@
+"""The layers of the package, and what each of them may import."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "torch_qpmpc"
+#: Of each folder, or module beside them, the others that it may import.
+LAYERS = {
+    "errors": set(),
+    "checks": {"errors"},
+    "qp": {"errors", "checks"},
+    "mpc": {"errors", "checks", "qp"},
+    "learning": {"errors", "checks", "qp", "mpc"},
+    "envs": {"errors", "checks"},
+    "analysis": {"errors", "checks", "qp", "mpc"},
+    "experiment": {"errors", "checks", "qp", "mpc", "learning", "envs", "analysis"},
+    "study": {"errors", "checks", "qp", "mpc", "learning", "envs", "analysis", "experiment"},
+    "report": {"study"},  # `python -m torch_qpmpc.report`
+}
+#: Libraries that only some layers may import.
+RESERVED = {
+    "hydra": {"experiment", "study"},
+    "omegaconf": {"experiment", "study"},
+    "torchrl": {"learning", "envs", "experiment"},
+    "matplotlib": {"analysis", "experiment", "study"},
+}
+FILES = [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "__init__.py"]
+
+
+def layer_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def imported(path: Path) -> set[str]:
+    """The modules that a file imports, anywhere in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: a relative import"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_a_module_imports_only_what_its_layer_may(path):
+    own = layer_of(path)
+    assert own in LAYERS, f"{path} belongs to no layer"
+    for name in imported(path):
+        first, *rest = name.split(".")
+        if first == "torch_qpmpc":
+            assert rest[0] in LAYERS[own] | {own}, f"{path} imports {name}"
+        elif first in RESERVED:
+            assert own in RESERVED[first], f"{path} imports {name}"
+
+
+def test_layers_are_in_order():
+    order = list(LAYERS)
+    for position, (name, allowed) in enumerate(LAYERS.items()):
+        assert allowed <= set(order[:position]), name

@@ -1,0 +1,1 @@
+"""What a learned QP means: its predictions, its nearest model, its policy."""

@@ -1,0 +1,239 @@
+"""Figures of what a learned QP says: its canonical form, its predictions, its policy's regions."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import torch
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import SymLogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from torch import Tensor
+
+from torch_qpmpc.analysis.policy import PolicyMap, policy_map
+from torch_qpmpc.analysis.prediction_form import PredictionForm, canonical_matrix, prediction_form
+from torch_qpmpc.analysis.report import canonical, predictions
+from torch_qpmpc.analysis.structure import (
+    causality_defect,
+    gamma_energies,
+    memory_energies,
+    nearest_model,
+    stage_models,
+)
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.module import QPMPC
+
+COLOURS = {"start": "tab:red", "learned": "tab:blue", "true model": "tab:green"}
+
+
+def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
+    """A heatmap of a constraint matrix, symmetric and logarithmic beyond 0.01, with stage lines."""
+    image = axes.imshow(
+        C.detach().cpu().numpy(),
+        cmap="RdBu_r",
+        norm=SymLogNorm(linthresh=1e-2, vmin=-1, vmax=1),
+        interpolation="nearest",
+    )
+    n = mpc.n_x + mpc.n_u
+    for k in range(1, mpc.horizon):
+        axes.axhline(k * mpc.n_x - 0.5, color="0.85", linewidth=0.4)
+    for k in range(1, mpc.horizon + 1):
+        axes.axvline(k * n - 0.5, color="0.85", linewidth=0.4)
+    axes.set_title(title)
+    stages = range(0, mpc.horizon + 1, max(1, mpc.horizon // 5))
+    axes.set_xticks([k * n for k in stages], [f"$x_{{{k}}}$" for k in stages])
+    rows = [k for k in stages if k < mpc.horizon]
+    axes.set_yticks([k * mpc.n_x for k in rows], [f"$k={k}$" for k in rows])
+    axes.figure.colorbar(image, ax=axes, shrink=0.7, ticks=[-1, -0.1, -0.01, 0, 0.01, 0.1, 1])
+
+
+def constraint_figure(mpc: QPMPC) -> Figure:
+    """C_0, C raw as in the paper's figures, and C's canonical form, which has no gauge.
+
+    One above the other: TensorBoard's cards are narrow.
+    """
+    figure = Figure(figsize=(6, 10.5), layout="constrained")
+    top, middle, bottom = figure.subplots(3, 1)
+    draw_matrix(top, mpc.C_0, mpc, "$C_0$, the start")
+    draw_matrix(middle, mpc.C, mpc, r"$C_\theta$, learned")
+    try:
+        C = canonical(mpc)
+    except QPError as error:
+        bottom.text(0.5, 0.5, f"No canonical form:\n{error}", ha="center", va="center", wrap=True)
+        bottom.set_axis_off()
+        return figure
+    draw_matrix(bottom, C, mpc, r"$C_\theta$ in canonical form")
+    return figure
+
+
+def forms(mpc: QPMPC) -> dict[str, PredictionForm]:
+    """The prediction forms of C at the start and of the learned one.
+
+    Raises:
+        QPError: C cannot be put into prediction form.
+    """
+    return {
+        "start": prediction_form(mpc.C_0, mpc.n_x, mpc.n_u),
+        "learned": predictions(mpc),
+    }
+
+
+def draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
+    """``[Phi, Gamma]`` as a heatmap: what x_0 and each u_j do to each x_k."""
+    N, n_x, n_u = form.horizon, form.n_x, form.n_u
+    entries = torch.cat((form.Phi, form.Gamma), dim=-1)
+    image = axes.imshow(
+        entries.numpy(),
+        cmap="RdBu_r",
+        norm=SymLogNorm(linthresh=1e-2, vmin=-1, vmax=1),
+        interpolation="nearest",
+        aspect="auto",
+    )
+    axes.axvline(n_x - 0.5, color="black", linewidth=0.8)
+    for k in range(1, N):
+        axes.axhline(k * n_x - 0.5, color="0.85", linewidth=0.4)
+        axes.axvline(n_x + k * n_u - 0.5, color="0.85", linewidth=0.4)
+        # Above this staircase an action would act on the past.
+        edge, row = n_x + k * n_u - 0.5, k * n_x - 0.5
+        axes.plot([edge, edge], [row - n_x, row], color="black", linewidth=0.8)
+        axes.plot([edge, edge + n_u], [row, row], color="black", linewidth=0.8)
+    axes.set(xlim=(-0.5, entries.shape[1] - 0.5), ylim=(len(entries) - 0.5, -0.5), title=title)
+    shown = range(0, N, max(1, N // 5))
+    axes.set_xticks(
+        [0, *(n_x + k * n_u for k in shown)], ["$x_0$", *(f"$u_{{{k}}}$" for k in shown)]
+    )
+    axes.set_yticks([k * n_x for k in shown], [f"$x_{{{k + 1}}}$" for k in shown])
+    axes.figure.colorbar(image, ax=axes, shrink=0.7, ticks=[-1, -0.1, 0, 0.1, 1])
+
+
+def canonical_figure(mpc: QPMPC) -> Figure:
+    """C raw beside its canonical form, and the predictions at the start beside the learned ones.
+
+    Raises:
+        QPError: C cannot be put into prediction form.
+    """
+    start, learned = forms(mpc).values()
+    figure = Figure(figsize=(14, 9), layout="constrained")
+    (raw, canonical), (before, after) = figure.subplots(2, 2)
+    draw_matrix(raw, mpc.C, mpc, r"$C_\theta$ as learned")
+    C, _ = canonical_matrix(learned, stage_models(learned).A)
+    draw_matrix(canonical, C, mpc, r"the same constraints in canonical form, $T C_\theta$")
+    draw_prediction_form(before, start, r"$[\Phi, \Gamma]$ at the start")
+    defect, distance = causality_defect(learned).item(), nearest_model(learned).residual.item()
+    numbers = f"causality defect {defect:.2g}, distance to MPC {distance:.2g}"
+    draw_prediction_form(after, learned, rf"$[\Phi, \Gamma]$, learned: {numbers}")
+    return figure
+
+
+def energies_figure(mpc: QPMPC) -> Figure:
+    """How the predictions' energy falls on block diagonals, and how far back they look.
+
+    Raises:
+        QPError: C cannot be put into prediction form.
+    """
+    figure = Figure(figsize=(12, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    N, floor = mpc.horizon, 1e-12
+    for i, (name, form) in enumerate(forms(mpc).items()):
+        style = {"width": 0.4, "color": COLOURS[name], "label": name}
+        share = gamma_energies(form)
+        lags = torch.arange(1 - N, N) + 0.4 * i - 0.2
+        left.bar(lags.numpy(), (share / share.sum()).clamp(min=floor).numpy(), **style)
+        back = torch.arange(N + 1) + 0.4 * i - 0.2
+        right.bar(back.numpy(), memory_energies(form).clamp(min=floor).numpy(), **style)
+    for axes in (left, right):
+        axes.set(yscale="log", ylim=(floor, 2), ylabel="share of the energy")
+        axes.legend(fontsize="small")
+    left.axvspan(-N + 0.4, -0.5, color="0.93", zorder=0)
+    left.set(
+        xlabel="$k - j$ of block $(k, j)$, grey: not causal",
+        title=r"$\Gamma$ by block diagonals: $u_j$ in $x_{k+1}$",
+        xlim=(-N + 0.4, N - 0.4),
+    )
+    left.xaxis.set_major_locator(MaxNLocator(integer=True))
+    right.set(xlabel="stages before the latest pair $(x_k, u_k)$", title="What explains $x_{k+1}$")
+    step = max(1, N // 5)
+    ticks = [back for back in range(0, N, step) if N - back >= step or back == 0]
+    right.set_xticks([*ticks, N], [*map(str, ticks), "later\nactions"])
+    return figure
+
+
+def slice_between(mpc: QPMPC, starts: Tensor, points: int = 21) -> PolicyMap:
+    """The policy on a grid as wide as ``starts`` ``(n, n_x)``, of two states; the others are zero.
+
+    These are the first state and the one half-way: a position and its speed, where all positions
+    come first. A state that all starts share is taken from one below to one above.
+    """
+    axes = (0, mpc.n_x // 2)
+    low, high = (ends.double() for ends in starts.aminmax(dim=0))
+    wide = (high == low).double()
+    low, high = low - wide, high + wide
+    x, y = (torch.linspace(low[i].item(), high[i].item(), points) for i in axes)
+    return policy_map(mpc, x, y, axes=axes)
+
+
+def draw_slice(axes: Axes, found: PolicyMap, field: Tensor, title: str, **style: Any) -> QuadMesh:
+    """A field on the grid, ``(n, m)``; where it is nan, nothing."""
+    grid = (part.numpy() for part in (found.x, found.y, field.mT))
+    image = axes.pcolormesh(*grid, shading="nearest", rasterized=True, **style)
+    first, second = (axis + 1 for axis in found.axes)
+    axes.set(xlabel=f"$s_{{{first}}}$", ylabel=f"$s_{{{second}}}$", title=title)
+    return image
+
+
+def draw_regions(axes: Axes, found: PolicyMap) -> None:
+    """The regions with one active set each, and their borders; colours repeat."""
+    title = f"Active sets: {len(found.active_sets)} regions on this grid"
+    colours = (found.regions % 20).double().masked_fill(found.regions < 0, torch.nan)
+    draw_slice(axes, found, colours, title, cmap="tab20", vmin=-0.5, vmax=19.5)
+    for line in _borders(found):
+        axes.plot(*line, color="black", linewidth=0.5, alpha=0.6)
+
+
+def policy_figure(found: PolicyMap, action: int = 0) -> Figure:
+    """The value, an action, its local gain and the active sets on a slice of the state space."""
+    figure = Figure(figsize=(12, 9), layout="constrained")
+    (value, policy), (gain, sets) = figure.subplots(2, 2)
+    u, name = found.actions[..., action], f"{{{action + 1}}}"
+    images = [draw_slice(value, found, found.values, "Value $V(s)$", cmap="viridis")]
+    size = max(1e-12, u.nan_to_num().abs().max().item())
+    title = rf"Policy $\pi_{name}(s)$"
+    images.append(draw_slice(policy, found, u, title, cmap="RdBu_r", vmin=-size, vmax=size))
+    slope = found.gains[..., action, :].norm(dim=-1)
+    title = rf"Local gain $\|d\pi_{name} / ds\|$"
+    images.append(draw_slice(gain, found, slope, title, cmap="magma"))
+    for axes, image in zip((value, policy, gain), images, strict=True):
+        figure.colorbar(image, ax=axes, shrink=0.85)
+    draw_regions(sets, found)
+    return figure
+
+
+def _borders(found: PolicyMap) -> list[tuple[list[float], list[float]]]:
+    """Segments between neighbouring grid points with different active sets, for one plot each axis.
+
+    Two lists of coordinates each, in which nan separates the segments.
+    """
+    edges = [_edges(axis) for axis in (found.x, found.y)]
+    lines = []
+    for axis in (0, 1):
+        across, along = edges[axis], edges[1 - axis]
+        regions = found.regions if axis == 0 else found.regions.mT
+        at: list[float] = []
+        along_at: list[float] = []
+        for i, j in (regions[1:] != regions[:-1]).nonzero().tolist():
+            at += [across[i + 1], across[i + 1], float("nan")]
+            along_at += [along[j], along[j + 1], float("nan")]
+        lines.append((at, along_at) if axis == 0 else (along_at, at))
+    return lines
+
+
+def _edges(points: Tensor) -> list[float]:
+    """Half-way between the points, and as far beyond the first and the last."""
+    values = points.tolist()
+    if len(values) == 1:
+        return [values[0] - 0.5, values[0] + 0.5]
+    middle = [(a + b) / 2 for a, b in pairwise(values)]
+    return [2 * values[0] - middle[0], *middle, 2 * values[-1] - middle[-1]]

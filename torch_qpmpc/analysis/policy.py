@@ -1,0 +1,189 @@
+"""The policy as control engineers look at it: its gain, and where which rows are active.
+
+On each region of the state space with one active set the policy is affine in the state. Its slope
+is what the solution's gradient gives (see `sensitivity`); the rest is linear algebra.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.initial import riccati_weight
+from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.validation import as_tensor, check_weight
+from torch_qpmpc.qp.program import QPSolution
+
+GRID = "Pass torch.linspace(lower, upper, n)."
+
+
+def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
+    """K with ``u_0 = pi(s) - K ds`` near s: ``-d pi / d s``, of the active set at s.
+
+    Args:
+        mpc: the QP.
+        s: ``(*batch, n_x)``.
+
+    Returns:
+        ``(*batch, n_u, n_x)``; zero where the QP is not solved.
+    """
+    check_kind("mpc", mpc, QPMPC)
+    return _solve_with_gain(mpc, check_tensor("s", s, mpc.n_x))[1]
+
+
+def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
+    """K ``(n_u, n_x)`` of the discounted linear quadratic regulator u = -K x.
+
+    Args:
+        A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
+        W: of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
+        gamma: discount of the stage costs.
+
+    Raises:
+        QPError: shapes that do not fit, a W that is no cost (not positive semidefinite), or a
+            Riccati equation without a stabilising solution.
+    """
+    check_tensor("A", A, "n_x", "n_x", batched=False)
+    n_x = len(A)
+    check_tensor("A", A, n_x, n_x, batched=False)
+    check_tensor("B", B, n_x, "n_u", batched=False)
+    n = n_x + B.shape[-1]
+    check_tensor("W", W, n, n, batched=False, remedy="Of [x; u], as stage_weight(mpc) gives it.")
+    check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
+    B, W = B.to(A), W.to(A)
+    check_weight("W", W, diagonal=False)
+    P = riccati_weight(A, B, W, gamma)
+    left = W[n_x:, n_x:] + gamma * B.mT @ P @ B
+    return torch.linalg.solve(left, gamma * B.mT @ P @ A + W[n_x:, :n_x])
+
+
+def stage_weight(mpc: QPMPC) -> Tensor:
+    """The weight of (x_0, u_0), ``(n_x + n_u, n_x + n_u)``: the first block of H (eq:qpH)."""
+    check_kind("mpc", mpc, QPMPC)
+    n = mpc.n_x + mpc.n_u
+    return mpc.quadratic_program().H.detach()[:n, :n]
+
+
+def spectral_radius(A: Tensor, B: Tensor, K: Tensor) -> Tensor:
+    """Largest modulus of the eigenvalues of A - B K, ``(*batch,)``: below 1 it is stable."""
+    check_tensor("A", A, "n_x", "n_x")
+    n_x = A.shape[-1]
+    check_tensor("B", B, n_x, "n_u")
+    check_tensor("K", K, B.shape[-1], n_x)
+    closed = A - B.to(A) @ K.to(A)
+    if not closed.isfinite().all():
+        raise QPError.expected("A, B, K", "NaN or inf", "finite entries")
+    return torch.linalg.eigvals(closed).abs().amax(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyMap:
+    """V and the policy on a grid over two states; ``[i, j]`` is ``x[i]``, ``y[j]``.
+
+    Attributes:
+        axes: the indices of the two states.
+        x, y: their values, ``(n,)`` and ``(m,)``.
+        states: ``(n, m, n_x)``.
+        values: V, ``(n, m)``; nan where the QP is not solved.
+        actions: ``(n, m, n_u)``, likewise.
+        gains: ``-d u_0 / d s``, ``(n, m, n_u, n_x)``, likewise.
+        regions: which of ``active_sets`` holds, ``(n, m)``; -1 where the QP is not solved.
+        active_sets: the active sets found, the most frequent first, ``(count, n_g)``, coded as in
+            `QPSolution.active`.
+    """
+
+    axes: tuple[int, int]
+    x: Tensor
+    y: Tensor
+    states: Tensor
+    values: Tensor
+    actions: Tensor
+    gains: Tensor
+    regions: Tensor
+    active_sets: Tensor
+
+
+def policy_map(
+    mpc: QPMPC,
+    x: Any,
+    y: Any,
+    *,
+    axes: tuple[int, int] = (0, 1),
+    at: Any = None,
+) -> PolicyMap:
+    """The policy, its gain and its active sets on a slice of the state space, in one batched solve.
+
+    Args:
+        mpc: the QP.
+        x, y: the values of the two states, ``(n,)`` and ``(m,)``.
+        axes: which states these are.
+        at: the other states, ``(n_x,)``; zero by default.
+
+    Raises:
+        QPError: axes that are not two different states, or values that are no vector.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> mpc = qm.QPMPC.from_model(
+        ...     [[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], 5, action_bounds=([-1.0], [1.0])
+        ... )
+        >>> found = policy_map(mpc, torch.linspace(-1, 1, 9), torch.linspace(-1, 1, 5))
+        >>> found.actions.shape, found.gains.shape, bool((found.regions >= 0).all())
+        (torch.Size([9, 5, 1]), torch.Size([9, 5, 1, 2]), True)
+    """
+    check_kind("mpc", mpc, QPMPC)
+    if not isinstance(axes, tuple | list) or len(axes) != 2:
+        raise QPError.expected("axes", repr(axes), "a pair of indices, such as (0, 1)")
+    for axis in axes:
+        check_whole("axes", axis, 0)
+    first, second = axes
+    if first == second or not all(0 <= axis < mpc.n_x for axis in axes):
+        raise QPError.expected("axes", axes, f"two different states among 0 to {mpc.n_x - 1}")
+    x, y = as_tensor("x", x), as_tensor("y", y)
+    if x.ndim != 1 or y.ndim != 1 or not len(x) or not len(y):
+        got = f"shapes {tuple(x.shape)} and {tuple(y.shape)}"
+        raise QPError.expected("x, y", got, "vectors that are not empty", GRID)
+    states = torch.zeros(mpc.n_x) if at is None else as_tensor("at", at)
+    if tuple(states.shape) != (mpc.n_x,):
+        raise QPError.expected("at", f"shape {tuple(states.shape)}", f"shape ({mpc.n_x},)")
+    states = states.double().repeat(len(x), len(y), 1)
+    states[..., first], states[..., second] = x.unsqueeze(-1), y
+    solution, gains = _solve_with_gain(mpc, states)
+    solved = solution.solved
+    sets, regions, counts = solution.active.flatten(0, 1).unique(
+        dim=0, return_inverse=True, return_counts=True
+    )
+    # An active set that stands for "not solved" is no region: it comes last, and becomes -1.
+    failed = regions.new_zeros(len(sets), dtype=torch.bool)
+    failed[regions[~solved.flatten()]] = True
+    order = counts.masked_fill(failed, 0).argsort(descending=True, stable=True)
+    regions = order.argsort()[regions].view(solved.shape).masked_fill(~solved, -1)
+    u = solution.z.detach()[..., mpc.n_x : mpc.n_x + mpc.n_u]
+    return PolicyMap(
+        axes,
+        x,
+        y,
+        states,
+        solution.value.detach().masked_fill(~solved, torch.nan),
+        u.masked_fill(~solved.unsqueeze(-1), torch.nan),
+        gains.masked_fill(~solved[..., None, None], torch.nan),
+        regions,
+        sets[order][: len(sets) - int(failed.sum())],
+    )
+
+
+def _solve_with_gain(mpc: QPMPC, s: Tensor) -> tuple[QPSolution, Tensor]:
+    """V's solution at s, and -du_0/ds; a state's action depends on no other state of the batch."""
+    with torch.enable_grad():
+        s = s.detach().clone().requires_grad_()
+        solution = mpc.solve(s)
+        u = solution.z[..., mpc.n_x : mpc.n_x + mpc.n_u]
+        slopes = [
+            torch.autograd.grad(u[..., i].sum(), s, retain_graph=True)[0] for i in range(mpc.n_u)
+        ]
+    return solution, -torch.stack(slopes, dim=-2)

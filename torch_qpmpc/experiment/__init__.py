@@ -1,0 +1,1 @@
+"""What train.py is made of: the home of Hydra, files and signals."""

@@ -1,0 +1,247 @@
+"""All that a run needs to go on as if it had never stopped, as tensors and plain numbers.
+
+Exact for one collector in this process over a `LinearSystem`: its episodes, and every random
+number, continue. Other environments cannot be saved, and start new episodes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from torchrl.collectors import BaseCollector, Collector
+
+from torch_qpmpc.envs import LinearSystemEnv
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.algorithms import Learner
+from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
+from torch_qpmpc.experiment.config import differences, load_config, settings
+from torch_qpmpc.experiment.lock import ELSEWHERE
+from torch_qpmpc.learning.replay import Replay
+from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.qp.pipeline.solve import SolveLog
+
+#: The parts of a snapshot.
+STATE = ("config", "update", "structure", "mpc", "loss_module", "optimizer", "schedule")
+STATE += ("replay", "collector", "tally", "rng")
+#: The files by which a run is known before its first checkpoint.
+WRITTEN = ("config.yaml", "metrics.csv")
+
+
+@dataclass
+class Tally:
+    """What a run adds up.
+
+    Attributes:
+        update: how many there have been.
+        costs: the mean cost of a step, of each update.
+        violation: of the states' bounds, summed over all steps.
+        qps: what has been solved since the last row of metrics; ``unsolved``, before that.
+        seconds: of training, but for what the kernels took to compile, once for an installation.
+    """
+
+    update: int = 0
+    costs: list[float] = field(default_factory=list)
+    violation: float = 0.0
+    qps: SolveLog = field(default_factory=SolveLog)
+    unsolved: int = 0
+    seconds: float = 0.0
+
+    def leave_out(self, seconds: float) -> None:
+        """Do not count these, which the next update is going to add."""
+        self.seconds -= seconds
+
+    def summary(self) -> dict[str, float]:
+        """What learning itself cost: over all updates, and over the last tenth of them."""
+        last = self.costs[-max(1, len(self.costs) // 10) :]
+        return {
+            "train_seconds": self.seconds,
+            "train_cost": sum(self.costs) / len(self.costs),
+            "train_cost_last_tenth": sum(last) / len(last),
+            "train_violation": self.violation,
+            "unsolved": self.unsolved + self.qps.unsolved,
+        }
+
+
+def snapshot(
+    cfg: DictConfig,
+    mpc: QPMPC,
+    learner: Learner,
+    collector: BaseCollector,
+    replay: Replay,
+    tally: Tally,
+) -> dict[str, Any]:
+    """The state of a run between two updates, for `checkpoint.save_checkpoint`.
+
+    After the last update without the data, which is most of it: nothing will be collected or
+    sampled any more.
+    """
+    over = tally.update == cfg.updates
+    return {
+        "config": settings(cfg),
+        "update": tally.update,
+        "structure": mpc.structure,
+        "mpc": mpc.state_dict(),
+        "loss_module": learner.loss_module.state_dict(),
+        "optimizer": learner.optimizer.state_dict(),
+        "schedule": {"last_epoch": learner.schedule.last_epoch},
+        "replay": replay.state_dict() if len(replay) and not over else None,
+        "collector": None if over else _collector_state(collector),
+        "tally": asdict(tally),
+        "rng": torch.get_rng_state(),
+    }
+
+
+def restore(
+    state: dict[str, Any],
+    mpc: QPMPC,
+    learner: Learner,
+    collector: BaseCollector,
+    replay: Replay,
+) -> Tally:
+    """Bring the parts of a new run, made from the same configuration, to a `snapshot`.
+
+    Raises:
+        QPError: a part does not fit the snapshot's.
+    """
+    with _part("loss_module"):
+        learner.loss_module.load_state_dict(state["loss_module"])
+    with _part("mpc"):
+        mpc.load_state_dict(state["mpc"])
+    with _part("optimizer"):
+        learner.optimizer.load_state_dict(state["optimizer"])
+    with _part("schedule"):
+        learner.schedule.last_epoch = int(state["schedule"]["last_epoch"])
+    with _part("replay"):
+        if state["replay"] is not None:
+            replay.load_state_dict(state["replay"])
+    with _part("collector"):
+        _restore_collector(collector, state["collector"])
+    with _part("rng"):
+        torch.set_rng_state(state["rng"])
+    with _part("tally"):
+        tally = Tally(**state["tally"])
+        tally.qps = SolveLog(**state["tally"]["qps"])
+    return tally
+
+
+def check_state(state: Any, cfg: DictConfig) -> None:
+    """Raise `QPError` unless ``state`` is a `snapshot` of a run with the configuration ``cfg``."""
+    remedy = "Another version of train.py has written it: go on with that one, or start anew."
+    if not isinstance(state, dict):
+        raise QPError.expected("checkpoint", f"a {type(state).__name__}", "a run's state", remedy)
+    if missing := [key for key in STATE if key not in state]:
+        raise QPError.expected(
+            "checkpoint", f"one without {', '.join(missing)}", "a run's state", remedy
+        )
+    if changed := differences(state["config"], settings(cfg)):
+        then, now = changed
+        remedy = "A run goes on with its own configuration, and from its own checkpoints."
+        raise QPError.expected(
+            "checkpoint", f"one of a run with {then}", f"config.yaml's {now}", remedy
+        )
+
+
+def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, dict | None]:
+    """The configuration of a run that was stopped, and its last state; None before the first.
+
+    Args:
+        path: the run's folder, or one of its checkpoints.
+        overrides: what train.py was called with.
+
+    Raises:
+        QPError: there is no run to go on with, it cannot be read or is another's, or something
+            else was asked for, too.
+    """
+    if others := [override for override in overrides if not override.startswith("resume=")]:
+        remedy = "A run goes on with its own configuration."
+        raise QPError.expected("resume", f"{', '.join(others)}, too", "nothing else", remedy)
+    if not isinstance(path, str | Path):
+        raise QPError.expected("resume", repr(path), "a path")
+    path = Path(path)
+    checkpoint = path / CHECKPOINT if path.is_dir() else path
+    config = checkpoint.with_name("config.yaml")
+    if not config.exists():
+        raise QPError.expected("resume", f"{path}, without config.yaml", "a folder of train.py's")
+    if checkpoint.with_name("summary.json").exists():
+        raise QPError.expected("resume", f"{path}, which is finished", "a run that was stopped")
+    cfg = load_config(config)
+    if path.is_dir() and not checkpoint.exists():
+        return cfg, None
+    state = load_checkpoint(checkpoint)
+    check_state(state, cfg)
+    return cfg, state
+
+
+def check_fresh(folder: str | Path) -> None:
+    """Raise `QPError` where a run, finished or stopped, has already written to ``folder``."""
+    folder = Path(folder)
+    remedy = f"Choose another folder by {ELSEWHERE}."
+    if (folder / "summary.json").exists():
+        got = "which holds a finished run"
+    elif any((folder / name).exists() for name in (*WRITTEN, CHECKPOINT, PREVIOUS)):
+        got = "which holds a run that was stopped"
+        with contextlib.suppress(Exception):  # a damaged file can make its readers raise anything
+            resumed(folder, [])
+            remedy = f"Go on with it by resume={folder}, or choose another folder by {ELSEWHERE}."
+    else:
+        return
+    raise QPError.expected("folder", f"{folder}, {got}", "one without a run", remedy)
+
+
+def check_own_folder(path: str | Path, folder: str | Path) -> None:
+    """Raise `QPError` unless ``folder`` is that of the run that goes on from ``path``."""
+    own = Path(folder_of(str(path), ""))
+    if own.resolve() != Path(folder).resolve():
+        remedy = (
+            "A run goes on in its own folder: leave hydra.run.dir out, or copy the folder first."
+        )
+        raise QPError.expected("folder", f"{folder} with resume={path}", f"{own}", remedy)
+
+
+def folder_of(resume: str | None, fresh: str) -> str:
+    """Where a run writes: into the folder that it goes on with, or into a ``fresh`` one."""
+    if resume is None:
+        return str(Path(fresh))
+    return str(Path(resume) if Path(resume).is_dir() else Path(resume).parent)
+
+
+@contextlib.contextmanager
+def _part(name: str) -> Iterator[None]:
+    try:
+        yield
+    except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
+        said = str(error).strip().partition("\n")[0]
+        got = f"{name!r} that does not fit ({type(error).__name__}: {said})"
+        remedy = "The checkpoint before may: resume=FOLDER/checkpoint-previous.pt."
+        raise QPError.expected("checkpoint", got, "the state of this run", remedy) from error
+
+
+def _collector_state(collector: BaseCollector) -> dict[str, Any] | None:
+    if not isinstance(collector, Collector) or not isinstance(collector.env, LinearSystemEnv):
+        return None
+    # TorchRL's own state of a collector has neither where its episodes are nor whose they are.
+    return {
+        "episodes": collector._carrier.to_dict(),
+        "trajectories": collector._traj_pool.state_dict(),
+        "rng": collector.env.get_rng_state(),
+    }
+
+
+def _restore_collector(collector: BaseCollector, state: dict[str, Any] | None) -> None:
+    if state is None:
+        return
+    assert isinstance(collector, Collector)
+    assert isinstance(collector.env, LinearSystemEnv)
+    episodes = TensorDict(state["episodes"], batch_size=collector._carrier.batch_size)
+    if missing := set(collector._carrier.keys(True, True)) - set(episodes.keys(True, True)):
+        raise KeyError(f"no {missing}")
+    collector._carrier.update(episodes)
+    collector._traj_pool.load_state_dict(state["trajectories"])
+    collector.env.set_rng_state(state["rng"])

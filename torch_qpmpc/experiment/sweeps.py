@@ -1,0 +1,137 @@
+"""Sweeps: a run that has finished is not done again, and one line shows how far the sweep is."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import shutil
+import signal
+import threading
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
+from torch_qpmpc.experiment.config import differences, load_config, settings
+from torch_qpmpc.experiment.lock import ELSEWHERE_IN_SWEEP
+from torch_qpmpc.experiment.run_state import check_state
+
+#: Seconds between two looks at what has ended.
+PERIOD = 0.5
+
+
+def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
+    """The summary of the run in ``folder``, or None where none has finished.
+
+    Args:
+        folder: of one run.
+        cfg: the settings that it must have had.
+
+    Raises:
+        QPError: it has finished with other settings.
+    """
+    folder = Path(folder)
+    if not (folder / "summary.json").exists():
+        return None
+    saved = settings(load_config(folder / "config.yaml"))
+    if changed := differences(saved, settings(cfg)):
+        then, now = changed
+        remedy = f"Remove it, or choose another folder by {ELSEWHERE_IN_SWEEP}."
+        raise QPError.expected(f"{folder}", f"a finished run with {then}", now, remedy)
+    return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+
+
+def stopped_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
+    """The state from which the run in ``folder`` can go on, or None where it has to begin anew.
+
+    That is where there is none, or one that cannot be read or had other settings. What such a run
+    left for TensorBoard is removed.
+    """
+    folder = Path(folder)
+    for checkpoint in (folder / CHECKPOINT, folder / PREVIOUS):
+        with contextlib.suppress(QPError):
+            state = load_checkpoint(checkpoint)
+            check_state(state, cfg)
+            return state
+    shutil.rmtree(folder / "tensorboard", ignore_errors=True)
+    return None
+
+
+def number_of_runs(config: DictConfig) -> int | None:
+    """How many runs a sweep has: those of its file and those of the command line, which go first.
+
+    Returns:
+        None where a sweeper is free to choose, as from an interval.
+    """
+    params = config.hydra.sweeper.get("params") or {}
+    arguments = [f"{key}={value}" for key, value in params.items()]
+    overrides = OverridesParser.create().parse_overrides([*arguments, *config.hydra.overrides.task])
+    latest = {override.get_key_element(): override for override in overrides}
+    axes = [override for override in latest.values() if override.is_sweep_override()]
+    if not all(override.is_discrete_sweep() for override in axes):
+        return None
+    return math.prod(len(list(axis.sweep_string_iterator())) for axis in axes)
+
+
+class SweepProgress(Callback):
+    """One line for a sweep, whatever launches its runs: each leaves a note when it has ended.
+
+    Runs are other processes, perhaps of other machines, that share the sweep's folder.
+    """
+
+    def __init__(self) -> None:
+        self.notes: Path | None = None
+        self.launcher = os.getpid()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a run needs of it."""
+        return {"notes": self.notes, "launcher": self.launcher}
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        folder = Path(config.hydra.sweep.dir).resolve()
+        self.notes = folder / ".ended"
+        shutil.rmtree(self.notes, ignore_errors=True)
+        self.notes.mkdir(parents=True)
+        self.over = threading.Event()
+        arguments = self.notes, number_of_runs(config), self.over
+        self.line = threading.Thread(target=_show, args=arguments, daemon=True)
+        self.line.start()
+
+    def on_job_start(self, config: DictConfig, **_: Any) -> None:
+        self.before = (Path(config.hydra.runtime.output_dir) / "summary.json").exists()
+        main_thread = threading.current_thread() is threading.main_thread()
+        if os.getpid() != self.launcher and main_thread:
+            # Ctrl-C is the launcher's, which then ends its runs.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **_: Any) -> None:
+        if self.notes is None:
+            return
+        failed = job_return.status is not JobStatus.COMPLETED
+        outcome = "failed" if failed else "finished before" if self.before else "done"
+        (self.notes / f"{config.hydra.job.num} {outcome}").touch()
+
+    def on_multirun_end(self, **_: Any) -> None:
+        self.over.set()
+        self.line.join()
+
+
+def _show(notes: Path, total: int | None, over: threading.Event) -> None:
+    with tqdm(total=total, desc=notes.parent.name, unit="run", dynamic_ncols=True) as line:
+        while True:
+            last = over.wait(PERIOD)
+            outcomes = Counter(note.name.partition(" ")[2] for note in notes.iterdir())
+            if outcomes.total() > line.n:
+                line.set_postfix(outcomes, refresh=False)
+                line.update(outcomes.total() - line.n)
+            if last:
+                return

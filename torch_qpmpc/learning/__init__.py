@@ -1,0 +1,1 @@
+"""Q-learning and its relatives for a QPMPC, in TorchRL."""

@@ -1,0 +1,178 @@
+"""The two penalties that pull C towards an MPC scheme's: deviation and system identification.
+
+Each is a pure function of C, and a thin module that holds its constants. Both are differentiable
+regularisers to add to the Q-learning loss; the deviation penalty also has its exact proximal step.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from torch_qpmpc.checks import check_number, check_tensor, check_whole
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.banded import band_distance
+
+WINDOWS = "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}."
+
+
+def _finite(x: float) -> bool:
+    return 0 <= x < torch.inf
+
+
+def deviation_penalty(C: Tensor, C_0: Tensor, C_mask: Tensor) -> Tensor:
+    """``sum |C_mask * (C - C_0)|`` (eq:sdp2): C, C_0, C_mask ``(n_c, n_z)`` to a scalar."""
+    return (C_mask * (C - C_0)).abs().sum()
+
+
+def system_identification_penalty(
+    C: Tensor, windows: Tensor, *, normalised: bool = False
+) -> Tensor:
+    """``sum_i ||C tau_i||^2`` (eq:sdp3).
+
+    C has a gauge: T C with any invertible T is the same QP, so the penalty can be made small by
+    shrinking C. With ``normalised`` the rows of C are scaled to unit norm first.
+
+    Args:
+        C: ``(n_c, n_z)``.
+        windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}], ``(M, n_z)``.
+        normalised: whether to scale the rows of C to unit norm.
+
+    Returns:
+        A scalar.
+    """
+    check_tensor("C", C, "n_c", "n_z", batched=False, remedy="Pass mpc.C.")
+    check_tensor("windows", windows, "M", C.shape[-1], batched=False, remedy=WINDOWS)
+    if normalised:
+        C = F.normalize(C, dim=-1)
+    return (windows.to(C.dtype) @ C.mT).square().sum()
+
+
+class DeviationPenalty(nn.Module):
+    """The deviation penalty ``sum |C_mask * (C - C_0)|`` (eq:sdp2).
+
+    (1, 1, 1) holds C at C_0, (0, 0, 0) frees it. With c_3 = 0 everything below the band is free:
+    the prediction stays causal, but need not be Markovian.
+
+    Args:
+        C_0: the banded matrix, ``(N n_x, N (n_x + n_u) + n_x)``.
+        n_x: number of states.
+        n_u: number of actions.
+        c_1: weight above the band, where the future would act on the past.
+        c_2: weight on the band.
+        c_3: weight below the band.
+        growth: how much the weights off the band grow with each further stage of distance,
+            ``c (1 + growth (distance - 1))``.
+
+    Raises:
+        QPError: a negative weight, or a C_0 whose shape is no horizon's.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> mpc = qm.QPMPC.from_model(torch.eye(1), torch.eye(1), 3)
+        >>> penalty = qm.DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u)
+        >>> penalty(mpc.C).item()
+        0.0
+    """
+
+    C_0: Tensor
+    C_mask: Tensor
+
+    def __init__(
+        self,
+        C_0: Tensor,
+        n_x: int,
+        n_u: int,
+        *,
+        c_1: float = 1.0,
+        c_2: float = 1e-4,
+        c_3: float = 0.0,
+        growth: float = 0.0,
+    ) -> None:
+        super().__init__()
+        weights = {"c_1": c_1, "c_2": c_2, "c_3": c_3, "growth": growth}
+        for name, weight in weights.items():
+            check_number(name, weight, _finite, "a finite weight >= 0")
+        check_whole("n_x", n_x, 1)
+        check_whole("n_u", n_u, 1)
+        remedy = "Pass the C_0 of a QPMPC."
+        check_tensor("C_0", C_0, "N n_x", "n_z", batched=False, remedy=remedy)
+        if not C_0.isfinite().all():
+            raise QPError.expected("C_0", "NaN or inf", "finite entries", remedy)
+        horizon = C_0.shape[0] // n_x
+        distance = band_distance(n_x, n_u, horizon)
+        if distance.shape != C_0.shape:
+            raise QPError.expected(
+                "C_0",
+                f"shape {tuple(C_0.shape)}",
+                f"shape {tuple(distance.shape)} for N = {horizon}",
+            )
+        distance = distance.to(C_0)
+        mask = torch.full_like(distance, c_2)
+        mask[distance > 0], mask[distance < 0] = c_1, c_3
+        mask *= 1 + growth * (distance.abs() - 1).clamp(min=0)
+        self.register_buffer("C_0", C_0.detach().clone())
+        self.register_buffer("C_mask", mask)
+
+    def forward(self, C: Tensor) -> Tensor:
+        """The penalty of C ``(N n_x, n_z)``, a scalar."""
+        check_tensor("C", C, *self.C_0.shape, batched=False, remedy="Pass mpc.C.")
+        return deviation_penalty(C, self.C_0, self.C_mask)
+
+    @torch.no_grad()
+    def proximal_step_(self, C: Tensor, scale: float = 1.0) -> None:
+        """Soft-threshold C towards C_0, in place: the minimiser of eq:sdp2 in Delta theta.
+
+        After any optimiser's step to C it solves
+        ``min_X 1/2 |X - C|^2 + scale |C_mask * (X - C_0)|``. Unlike the subgradient it reaches C_0
+        exactly. After SGD's step it is the paper's program. Adam's and Gauss-Newton's metrics are
+        not in it: in Adam's, an entry with a smaller step would have a smaller threshold.
+
+        Args:
+            C: the parameter.
+            scale: weight of the penalty against the step; 1 is the paper's program.
+        """
+        check_tensor("C", C, *self.C_0.shape, batched=False, remedy="Pass mpc.C.")
+        if C.grad_fn is not None:
+            remedy = (
+                "Of a QPMPC that learns some entries of C, pass mpc.leaves('C')[0]; a tied C is "
+                "computed from A and B: release() it first."
+            )
+            raise QPError.expected("C", "a computed tensor", "a parameter", remedy)
+        check_number("scale", scale, _finite, "a finite number >= 0")
+        excess = C - self.C_0
+        C.copy_(self.C_0 + excess.sign() * (excess.abs() - scale * self.C_mask).clamp(min=0))
+
+
+class SystemIdentificationPenalty(nn.Module):
+    """The system-identification (SI) penalty ``beta sum_i ||C tau_i||^2`` (eq:sdp3).
+
+    Args:
+        beta: its weight.
+        normalised: scale the rows of C to unit norm, against the gauge freedom of C.
+
+    Raises:
+        QPError: a negative beta.
+    """
+
+    def __init__(self, beta: float = 1e-6, *, normalised: bool = False) -> None:
+        super().__init__()
+        check_number("beta", beta, _finite, "a finite weight >= 0")
+        self.beta, self.normalised = beta, normalised
+
+    def curvature(self, windows: Tensor) -> Tensor:
+        """S ``(n_z, n_z)`` of the penalty as ``1/2 tr(C S C')``, which it is if not normalised.
+
+        Raises:
+            QPError: it is normalised.
+        """
+        if self.normalised:
+            raise QPError.expected("normalised", True, "False", "Only then it is a quadratic in C.")
+        check_tensor("windows", windows, "M", "n_z", batched=False, remedy=WINDOWS)
+        windows = windows.to(torch.float64)
+        return 2 * self.beta * windows.mT @ windows
+
+    def forward(self, C: Tensor, windows: Tensor) -> Tensor:
+        """The penalty of C ``(n_c, n_z)`` on windows ``(M, n_z)``, a scalar."""
+        return self.beta * system_identification_penalty(C, windows, normalised=self.normalised)

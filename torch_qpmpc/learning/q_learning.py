@@ -1,0 +1,378 @@
+"""Q-learning for a QP (eq:thup) as a TorchRL loss module."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import _GAMMA_LMBDA_DEPREC_ERROR, dispatch_value_estimator
+
+from torch_qpmpc.checks import check_flag, check_number
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.learning.operators import QPActorValueOperator, QPValueOperator
+from torch_qpmpc.learning.restoring import call_with
+from torch_qpmpc.qp.tracing import has_values
+
+
+def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Tensor:
+    """The loss of one TD error delta = target - prediction, elementwise, ``(*batch,)``.
+
+    ``1/2 delta^2``, whose gradient step with rate alpha is the paper's update alpha delta grad Q
+    (eq:thup). With ``clip`` the delta of the update is clipped to plus or minus it (Huber's loss).
+    """
+    if clip is None:
+        return 0.5 * (target - prediction).square()
+    return F.huber_loss(prediction, target, reduction="none", delta=clip)
+
+
+def td_metadata(prediction: Tensor, target: Tensor) -> dict[str, Tensor]:
+    """Detached scalars that describe a batch of values and their targets, ``(*batch,)`` each.
+
+    What is not finite is left out, and counted: a NaN target as an invalid reward, all else as a QP
+    without a solution.
+    """
+    use = prediction.isfinite() & target.isfinite()
+    invalid = target.isnan()
+    prediction, target = torch.where(use, prediction, 0), torch.where(use, target, 0)
+
+    def mean(x: Tensor) -> Tensor:
+        return x.sum() / use.sum().clamp(min=1)
+
+    def largest(x: Tensor) -> Tensor:
+        return x.masked_fill(~use, -torch.inf).max().nan_to_num(neginf=0.0)
+
+    return {
+        "td_error": mean((target - prediction).abs()),
+        "pred_value": mean(prediction),
+        "target_value": mean(target),
+        "pred_value_max": largest(prediction),
+        "target_value_max": largest(target),
+        "unsolved": (~use & ~invalid).sum(),
+        "invalid_reward": invalid.sum(),
+    }
+
+
+def invalid_rewards(tensordict: TensorDictBase, reward: NestedKey, effect: str) -> Tensor:
+    """Where the rewards are NaN or infinite, ``(*batch, 1)``; if anywhere, a `RuntimeWarning`.
+
+    Args:
+        tensordict: a batch of transitions.
+        reward: the key of the rewards under ``"next"``.
+        effect: what the warning says that they do.
+    """
+    key = unravel_key(("next", reward))
+    invalid = ~tensordict.get(key).isfinite()
+    if has_values(invalid) and (count := int(invalid.sum())):
+        message = f"{key}: {count} of {invalid.numel()} rewards are NaN or infinite. {effect}"
+        warnings.warn(message, RuntimeWarning, stacklevel=3)
+    return invalid
+
+
+class QPQLearningLoss(LossModule):
+    """Semi-gradient Q-learning, delta = L + gamma (1 - terminated) V(s+) - Q(s, a) (eq:thup).
+
+    V and Q are the same QP with and without u_0 fixed, so V(s+) is exactly min over a of Q(s+, a).
+    In TorchRL's signs, reward = -L. Truncation bootstraps, termination does not. Samples whose QP
+    has no certified solution (``on_failure="mask"`` in the QPMPC) add nothing to loss or gradient
+    and are counted in ``unsolved``. So do those whose return contains a reward that is NaN or
+    infinite, which are counted in ``invalid_reward``, with a `RuntimeWarning`.
+
+    Args:
+        value_network: the critic, whose parameters are learned.
+        delay_value: evaluate V(s+) with a target network. Off, as in the paper: a transition is
+            evaluated at today's theta.
+        td_error_clip: bound of the TD error in the update; none by default.
+        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        use_prioritized_weights: weight the samples by ``priority_weight`` where a buffer gives it.
+
+    The discount factor is set as everywhere in TorchRL, by ``make_value_estimator(gamma=0.9)``;
+    without it TorchRL's own 0.99 holds, whatever the QP's gamma is. Rewards are ``-L``: that they
+    have the wrong sign, costs in their place, cannot be told from their numbers.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> from tensordict import TensorDict
+        >>> loss = qm.QPQLearningLoss(qm.QPActorValueOperator(qm.QPMPC(2, 1, 5)))
+        >>> loss.make_value_estimator(gamma=0.9)
+        >>> step = dict(
+        ...     observation=torch.ones(3, 2),
+        ...     reward=-torch.ones(3, 1),
+        ...     done=torch.zeros(3, 1).bool(),
+        ...     terminated=torch.zeros(3, 1).bool(),
+        ... )
+        >>> batch = TensorDict(
+        ...     observation=torch.zeros(3, 2),
+        ...     action=torch.zeros(3, 1),
+        ...     next=TensorDict(step, 3),
+        ...     batch_size=3,
+        ... )
+        >>> loss(batch)["loss_value"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can rename; defaults as in TorchRL's other losses."""
+
+        advantage: NestedKey = "advantage"
+        value_target: NestedKey = "value_target"
+        value: NestedKey = "state_value"
+        state_action_value: NestedKey = "state_action_value"
+        action: NestedKey = "action"
+        priority: NestedKey = "td_error"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        priority_weight: NestedKey = "priority_weight"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    SUPPORTED_VALUE_ESTIMATORS = (
+        ValueEstimators.TD0,
+        ValueEstimators.TD1,
+        ValueEstimators.TDLambda,
+    )
+    out_keys = [  # noqa: RUF012  # pyright: ignore[reportAssignmentType] - TorchRL's convention
+        "loss_value",
+        "td_error",
+        "pred_value",
+        "target_value",
+        "pred_value_max",
+        "target_value_max",
+        "unsolved",
+        "invalid_reward",
+    ]
+
+    value_network: QPActorValueOperator
+    state_value_network: QPValueOperator
+    value_network_params: TensorDictParams
+    target_value_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        value_network: QPActorValueOperator,
+        *,
+        delay_value: bool = False,
+        td_error_clip: float | None = None,
+        gamma: float | None = None,
+        reduction: str | None = None,
+        use_prioritized_weights: str | bool = "auto",
+    ) -> None:
+        self._in_keys = None
+        super().__init__()
+        if gamma is not None:
+            raise TypeError(_GAMMA_LMBDA_DEPREC_ERROR)
+        if not isinstance(value_network, QPActorValueOperator):
+            raise QPError.expected(
+                "value_network",
+                type(value_network).__name__,
+                "a QPActorValueOperator",
+                "Wrap the QPMPC: QPActorValueOperator(mpc).",
+            )
+        if td_error_clip is not None:
+            expected = "a positive number or None"
+            check_number("td_error_clip", td_error_clip, lambda x: x > 0, expected)
+        if reduction not in (None, "mean", "sum", "none"):
+            raise QPError.expected("reduction", repr(reduction), "'mean', 'sum' or 'none'")
+        check_flag("delay_value", delay_value)
+        if use_prioritized_weights not in ("auto", True, False):
+            got = repr(use_prioritized_weights)
+            raise QPError.expected("use_prioritized_weights", got, "'auto', True or False")
+        self.delay_value = delay_value
+        self.td_error_clip = td_error_clip
+        self.reduction = reduction or "mean"
+        self.use_prioritized_weights = use_prioritized_weights
+        self.convert_to_functional(
+            value_network,  # pyright: ignore[reportArgumentType] - any TensorDict module will do
+            "value_network",
+            create_target_params=delay_value,
+        )
+        # Outside the module's registry, as its parameters are the value network's.
+        view = self.value_network.get_value_operator()
+        object.__setattr__(self, "state_value_network", view)
+
+    def get_extra_state(self) -> Tensor:
+        """What the state_dict tells of the QPMPC that it belongs to."""
+        return self.value_network.module.get_extra_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """`_load_from_state_dict` has compared it already."""
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        super()._load_from_state_dict(
+            self.value_network.module.checked_state(state_dict, prefix), prefix, *args
+        )
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(**self._estimator_keys())
+        self._set_in_keys()
+
+    def _estimator_keys(self) -> dict[str, NestedKey]:
+        names = ("advantage", "value_target", "value", "reward", "done", "terminated")
+        return {name: getattr(self.tensor_keys, name) for name in names}
+
+    def _set_in_keys(self) -> None:
+        observation = self.state_value_network.in_keys
+        steps = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
+        keys = {
+            *self.value_network.in_keys,
+            *(unravel_key(("next", key)) for key in (*steps, *observation)),
+        }
+        if self.use_prioritized_weights is True:
+            keys.add(unravel_key(self.tensor_keys.priority_weight))
+        self._in_keys = sorted(keys, key=str)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        if self._in_keys is None:
+            self._set_in_keys()
+        return self._in_keys  # pyright: ignore[reportReturnType]
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | str | None = None, **hyperparams: Any
+    ) -> Any:
+        """Choose how V(s+) enters the target: TD0 (default), TD1 or TDLambda."""
+        for name in {"gamma", "lmbda"} & hyperparams.keys():
+            _check_factor(name, hyperparams[name])
+        value_type, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if options is None:
+            return self
+        dispatch_value_estimator(
+            self,
+            value_type,
+            supported=self.SUPPORTED_VALUE_ESTIMATORS,
+            tensor_keys=self._estimator_keys(),
+            value_network=self.state_value_network,
+            **options,
+        )
+        return None
+
+    @dispatch()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The loss of a batch of transitions, and detached scalars that describe it."""
+        loss_value, metadata = self.loss_value(tensordict)
+        out = TensorDict({"loss_value": loss_value, **metadata}, batch_size=[])
+        self._clear_weakrefs(tensordict, out, "value_network_params", "target_value_network_params")
+        return out
+
+    def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """`forward` with the loss apart; writes the squared TD error under the priority key.
+
+        If the value network has an ``active_set_key``, the active sets of Q(s, a) and, under
+        ``"next"``, of V(s+) are read from there where they are, and written.
+        """
+        self._check_batch(tensordict)
+        weights = self._maybe_get_priority_weight(tensordict)
+        if weights is not None and has_values(weights) and not weights.isfinite().all():
+            name = str(self.tensor_keys.priority_weight)
+            raise QPError.expected(name, "NaN or inf", "finite weights", "Look at the priorities.")
+        active_set = self.value_network.active_set_key
+        visited = tensordict.select(*_read_by(self.value_network), strict=False).detach()
+        call_with(self.value_network_params, self.value_network, visited)
+        if active_set is not None:
+            tensordict.set(active_set, visited.get(active_set))
+        prediction = visited[self.tensor_keys.state_action_value].squeeze(-1)
+        target = self.target(tensordict)
+        metadata = td_metadata(prediction.detach(), target)
+        # An unsolved QP's cost is infinite, the target of an invalid reward is NaN.
+        use = prediction.isfinite() & target.isfinite()
+        if has_values(use) and not use.any():
+            unsolved, invalid = int(metadata["unsolved"]), int(metadata["invalid_reward"])
+            message = (
+                f"None of the batch's {use.numel()} transitions can be learned from: {unsolved} "
+                f"have a QP without a solution, {invalid} an invalid reward. The loss is zero."
+            )
+            warnings.warn(message, RuntimeWarning, stacklevel=2)
+        prediction = torch.where(use, prediction, 0)
+        target = torch.where(use, target, 0)
+        priority = (target - prediction).detach().square()
+        tensordict.set(self.tensor_keys.priority, priority, inplace=True)
+        loss = td_loss(prediction, target, self.td_error_clip)
+        return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
+
+    def _check_batch(self, tensordict: TensorDictBase) -> None:
+        """Raise `QPError` where an entry is missing, or would broadcast against the values."""
+        keys, shape = self.tensor_keys, (*tensordict.batch_size, 1)
+        for key in (keys.reward, keys.done, keys.terminated):
+            path = unravel_key(("next", key))
+            value = tensordict.get(path, None)
+            if value is None:
+                if key == keys.terminated and tensordict.get(("next", keys.done), None) is not None:
+                    continue  # then done says it
+                remedy = "Name another by set_keys, or collect transitions."
+                raise QPError.expected(str(path), "no such entry", f"one of shape {shape}", remedy)
+            if value.shape != shape:
+                remedy = "Unsqueeze its last dimension: TorchRL's rewards and flags have it."
+                raise QPError.expected(
+                    str(path), f"shape {tuple(value.shape)}", f"shape {shape}", remedy
+                )
+            if key != keys.reward and value.dtype != torch.bool:
+                raise QPError.expected(str(path), value.dtype, "torch.bool", "Convert: .bool().")
+        following: TensorDictBase = tensordict.get("next")
+        for key in self.state_value_network.in_keys:
+            if following.get(key, None) is None:
+                found = ", ".join(sorted(str(name) for name in following.keys(True, True)))
+                remedy = "Collect what follows each step, or name it by the operator's keys."
+                name, got = str(unravel_key(("next", key))), f"no such entry beside {found}"
+                raise QPError.expected(name, got, "the state after the step", remedy)
+        if 0 in tensordict.batch_size:
+            raise QPError.expected("tensordict", "an empty batch", "at least one transition")
+
+    @torch.no_grad()
+    def target(self, tensordict: TensorDictBase) -> Tensor:
+        """What the estimator makes of V(s+), ``(*batch,)``.
+
+        With TD(0), r + gamma (1 - terminated) V(s+) in TorchRL's signs. It is -inf where it
+        contains a V(s+) without a solution, and NaN where it contains an invalid reward.
+        """
+        reward = tensordict.get(("next", self.tensor_keys.reward))
+        effect = "Those transitions are left out of the loss and its gradient."
+        invalid = invalid_rewards(tensordict, self.tensor_keys.reward, effect)
+        next_value = self._next_value(tensordict)
+        target = self._estimate(tensordict, reward.masked_fill(invalid, 0), next_value)
+        target = torch.where(target.isfinite(), target, -torch.inf)
+        if not has_values(invalid) or invalid.any():
+            # The returns of rewards that are one where they are invalid, and zero elsewhere.
+            spoilt = self._estimate(tensordict, invalid.to(reward), torch.zeros_like(next_value))
+            target = target.masked_fill(spoilt != 0, torch.nan)
+        return target
+
+    def _estimate(self, tensordict: TensorDictBase, reward: Tensor, next_value: Tensor) -> Tensor:
+        """The returns of these rewards, ``(*batch,)``, along the batch's transitions."""
+        batch = tensordict.copy().set(("next", self.tensor_keys.reward), reward)
+        return self.value_estimator.value_estimate(batch, next_value=next_value).squeeze(-1)
+
+    def _next_value(self, tensordict: TensorDictBase) -> Tensor:
+        """-V(s+), ``(*batch, 1)``; zero after a termination, where it is not used."""
+        active_set = self.state_value_network.active_set_key
+        following = tensordict.get("next").select(*_read_by(self.state_value_network), strict=False)
+        call_with(self.target_value_network_params, self.state_value_network, following)
+        if active_set is not None:
+            tensordict.set(unravel_key(("next", active_set)), following.get(active_set))
+        done = tensordict.get(("next", self.tensor_keys.done))
+        terminated = tensordict.get(("next", self.tensor_keys.terminated), default=done)
+        return following[self.tensor_keys.value].masked_fill(terminated, 0.0)
+
+
+def _check_factor(name: str, value: Any) -> None:
+    if isinstance(value, Tensor):
+        value = value.item() if value.numel() == 1 else value.tolist()
+    check_number(name, value, lambda x: 0 <= x <= 1, "a number in [0, 1]")
+
+
+def _read_by(network: QPActorValueOperator | QPValueOperator) -> list[NestedKey]:
+    start = [] if network.active_set_key is None else [network.active_set_key]
+    return [*network.in_keys, *start]

@@ -1,0 +1,198 @@
+"""Where theta starts: the arguments as the tensors of a QP (eq:qp5), before discounts (eq:qpH)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import scipy.linalg
+import torch
+from torch import Tensor
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.parametrizations import LinearRows
+from torch_qpmpc.mpc.validation import (
+    as_tensor,
+    bound_pair,
+    check_model,
+    cost_weights,
+    slack_weight,
+)
+
+RICCATI = "riccati"
+
+
+def theta(
+    n_x: int,
+    n_u: int,
+    horizon: int,
+    *,
+    gamma: float,
+    A: Any,
+    B: Any,
+    offset: Any,
+    state_bounds: tuple[Any, Any] | None,
+    action_bounds: tuple[Any, Any] | None,
+    constraints: tuple[Any, Any, Any] | None,
+    terminal_constraints: tuple[Any, Any, Any] | None,
+    structure: str,
+    hessian: str,
+    learn: Collection[str],
+    stage_weight: Any,
+    terminal_weight: Any,
+    state_slack: Any,
+    action_slack: Any,
+    constraint_slack: float,
+    seed: int,
+    **_: Any,
+) -> tuple[Layout, dict[str, Tensor]]:
+    """All parts of theta by name, for the arguments of `QPMPC`; w is inf on hard rows."""
+    n_x, n_u, horizon, seed = map(int, (n_x, n_u, horizon, seed))  # may be NumPy's
+    D = _linear_rows("constraints", constraints, n_x + n_u)
+    D_f = _linear_rows("terminal_constraints", terminal_constraints, n_x)
+    layout = Layout(n_x, n_u, horizon, len(D[0]), len(D_f[0]))
+    if "G" in learn and structure != "free" and not layout.n_linear:
+        remedy = "Give constraints, or structure='free'."
+        raise QPError.expected("learn", "'G'", "parts that there are", remedy)
+    random = torch.Generator().manual_seed(seed)
+    A, B = _model(A, B, n_x, n_u, random)
+    C = banded_matrix(A, B, horizon)
+    offset = torch.zeros(n_x) if offset is None else as_tensor("offset", offset)
+    if tuple(offset.shape) != (n_x,):
+        raise QPError.expected("offset", f"shape {tuple(offset.shape)}", f"shape ({n_x},)")
+    if stage_weight is None:
+        states = 0.5 + 4.5 * torch.rand(n_x, generator=random, dtype=torch.float32)
+        stage_weight = torch.cat((states, torch.zeros(n_u)))
+    if terminal_weight is None:
+        terminal_weight = torch.ones(n_x)
+    elif isinstance(terminal_weight, str):
+        if terminal_weight != RICCATI or hessian == "diagonal":
+            got = f"{terminal_weight!r} with hessian={hessian!r}"
+            want = f"a tensor, or {RICCATI!r} with hessian='block' or 'full'"
+            raise QPError.expected("terminal_weight", got, want)
+        terminal_weight = _riccati_weight(A, B, stage_weight, gamma, layout)
+    return layout, {
+        **cost_weights(stage_weight, terminal_weight, hessian, n_x, n_u, horizon),
+        "q": torch.zeros(layout.n_z),
+        "c": torch.zeros(()),
+        "C": C,
+        "b": -offset.repeat(horizon),
+        "G": LinearRows(layout, tied=True)(D[0], D_f[0]),
+        **_bounds(layout, state_bounds, action_bounds, D, D_f),
+        "w": _slack_weights(layout, state_slack, action_slack, constraint_slack),
+    }
+
+
+def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dict[str, Any]:
+    """What `QPMPC.linear_mpc` chooses where ``options`` do not."""
+    A, B = check_model(A, B)
+    n_x, n_u = A.shape[-1], B.shape[-1]
+    learn = ["H", "H_f", "q", "c", "C", "b", "lb", "ub", "w"]
+    if hessian == "full":
+        learn.remove("H_f")
+    if {"constraints", "terminal_constraints"} & options.keys():
+        learn.append("G")
+    return {
+        "structure": "tied",
+        "hessian": hessian,
+        "stage_weight": [1.0] * (n_x + n_u),
+        "terminal_weight": [1.0] * n_x if hessian == "diagonal" else RICCATI,
+        "discount_slack": True,
+        "learn": learn,
+    }
+
+
+def _model(A: Any, B: Any, n_x: int, n_u: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
+    """A and B as given, or random."""
+    if A is None:
+        A = torch.eye(n_x, dtype=torch.float32) + 0.1 * torch.randn(
+            n_x, n_x, generator=random, dtype=torch.float32
+        )
+    if B is None:
+        B = 0.1 * torch.randn(n_x, n_u, generator=random, dtype=torch.float32)
+    A, B = as_tensor("A", A), as_tensor("B", B)
+    if A.shape[-1:] != (n_x,) or B.shape[-1:] != (n_u,):
+        got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
+        raise QPError.expected("A, B", got, f"({n_x}, {n_x}) and ({n_x}, {n_u})")
+    return A, B
+
+
+def _riccati_weight(
+    A: Tensor, B: Tensor, stage_weight: Any, gamma: float, layout: Layout
+) -> Tensor:
+    W = as_tensor("stage_weight", stage_weight)
+    W = torch.diag(W) if W.shape == (layout.n,) else W
+    sizes = {"A": (A, layout.n_x, layout.n_x), "B": (B, layout.n_x, layout.n_u)}
+    for name, (matrix, *shape) in (sizes | {"stage_weight": (W, layout.n, layout.n)}).items():
+        if list(matrix.shape) != shape:
+            got, remedy = f"shape {tuple(matrix.shape)}", "The Riccati equation has one stage."
+            raise QPError.expected(name, got, f"shape {tuple(shape)}", remedy)
+    return riccati_weight(A, B, W, gamma)
+
+
+def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
+    """P ``(n_x, n_x)`` of the discounted linear quadratic regulator, whose cost to go is 1/2 x'Px.
+
+    Without active bounds, an MPC scheme that has it as H_f is that regulator, at any horizon.
+
+    Args:
+        A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
+        W: of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
+        gamma: discount of the stage costs.
+
+    Raises:
+        QPError: the discrete Riccati equation has no stabilising solution.
+    """
+    n_x, root = A.shape[-1], gamma**0.5
+    Q, S, R = W[:n_x, :n_x], W[:n_x, n_x:], W[n_x:, n_x:]
+    try:
+        P = scipy.linalg.solve_discrete_are(
+            *(x.detach().numpy() for x in (root * A, root * B, Q, R)), s=S.detach().numpy()
+        )
+    except (ValueError, scipy.linalg.LinAlgError) as error:
+        raise QPError.expected(
+            "terminal_weight",
+            f"a Riccati equation without a solution ({error})",
+            "a stabilisable model and a positive definite weight of the actions",
+            "Give the actions some weight, or pass a matrix.",
+        ) from error
+    return torch.as_tensor((P + P.T) / 2).to(A)
+
+
+def _linear_rows(name: str, rows: tuple[Any, Any, Any] | None, width: int) -> tuple[Tensor, ...]:
+    if rows is None:
+        return torch.zeros(0, width), torch.zeros(0), torch.zeros(0)
+    try:
+        matrix, lower, upper = rows
+    except (TypeError, ValueError) as error:
+        raise QPError.expected(name, repr(rows), "the triple (D, lower, upper)") from error
+    matrix = as_tensor(name, matrix)
+    if matrix.ndim != 2 or matrix.shape[1] != width:
+        raise QPError.expected(name, f"D of shape {tuple(matrix.shape)}", f"shape (n_d, {width})")
+    return matrix, *bound_pair(f"{name}, bounds", (lower, upper), len(matrix))
+
+
+def _bounds(
+    layout: Layout,
+    state_bounds: tuple[Any, Any] | None,
+    action_bounds: tuple[Any, Any] | None,
+    D: tuple[Tensor, ...],
+    D_f: tuple[Tensor, ...],
+) -> dict[str, Tensor]:
+    """lb and ub ``(n_g,)``."""
+    x = bound_pair("state_bounds", state_bounds, layout.n_x)
+    u = bound_pair("action_bounds", action_bounds, layout.n_u)
+    lower, upper = (layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], strict=True))
+    return {"lb": lower, "ub": upper}
+
+
+def _slack_weights(layout: Layout, state: Any, action: Any, constraint: Any) -> Tensor:
+    """w ``(n_g,)``, inf on hard rows."""
+    return layout.rows(
+        slack_weight("state_slack", state, layout.n_x),
+        slack_weight("action_slack", action, layout.n_u),
+        slack_weight("constraint_slack", constraint).expand(layout.n_d),
+        slack_weight("constraint_slack", constraint).expand(layout.n_d_f),
+    )

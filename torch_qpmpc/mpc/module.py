@@ -1,0 +1,487 @@
+"""QPMPC: the module that owns theta and turns it into V, Q and the policy (eq:qp4, eq:qp5).
+
+A generic QP whose constraint matrix C starts as that of a linear MPC scheme (eq:cband) and may
+leave it, or stays one (eq:v1, eq:q1). Everything here is a cost to go, as in the paper; rewards
+begin in `operators`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils import parametrize
+
+from torch_qpmpc.checks import check_kind, check_tensor
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc import initial as starts
+from torch_qpmpc.mpc import parameters as parts
+from torch_qpmpc.mpc import pickling
+from torch_qpmpc.mpc.cost import Cost, Discounts, diagonal_cost, discounted
+from torch_qpmpc.mpc.identity import check_identity, digest, written
+from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, kept
+from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST
+from torch_qpmpc.mpc.validation import (
+    CONSTRAINTS,
+    COST,
+    STRUCTURES,
+    check_model,
+    check_pair,
+    check_structure,
+    learned_entries,
+    own,
+)
+from torch_qpmpc.qp.autograd import optimal_value, solve_qp, value_and_active_set
+from torch_qpmpc.qp.precision import full_precision, to_dtype
+from torch_qpmpc.qp.program import QPSolution, QuadraticProgram
+from torch_qpmpc.qp.solvers import backend
+
+#: What the constructor, or `QPMPC.release`, decides once and for all.
+FIXED = ("n_x", "n_u", "n_z", "horizon", "gamma", "hessian", "structure", "step", "learned")
+
+
+class QPMPC(nn.Module):
+    """A parametric QP in z = [x_0, u_0, x_1, .., x_N], n_z = N (n_x + n_u) + n_x (eq:qp5).
+
+    The cost (eq:qpH) has a stage block H_k, q_k for (x_k, u_k), discounted by gamma^k, and a
+    terminal block H_f, q_f for x_N, discounted by gamma^N. Parameters and buffers are float64,
+    inputs of any float dtype; outputs have the dtype of the input.
+
+    Args:
+        n_x: number of states.
+        n_u: number of actions.
+        horizon: N, at least 1.
+        gamma: discount of the stage costs, 0 < gamma <= 1.
+        A, B: the model that C starts from, ``(n_x, n_x)`` and ``(n_x, n_u)``, or one per stage,
+            ``(N, n_x, n_x)`` and ``(N, n_x, n_u)``. By default random: A the identity plus, and B,
+            normal entries with standard deviation 0.1.
+        offset: of the model, x+ = A x + B u + offset, ``(n_x,)``, where b starts; zero by default.
+        state_bounds, action_bounds: pairs of ``(n_x,)`` and ``(n_u,)``; unbounded by default.
+        constraints: mixed constraints of each stage, ``lower <= D [x_k; u_k] <= upper`` (eq:v1c4),
+            as the triple of D ``(n_d, n_x + n_u)`` and its bounds ``(n_d,)``.
+        terminal_constraints: likewise of x_N, with D^f ``(n_d_f, n_x)``.
+        structure: what the learned parts of theta tie. ``"free"``: nothing, C is a matrix (eq:qp5).
+            ``"tied"``: they are those of a linear MPC scheme (eq:q1), with one A, B, D and one
+            entry of b, q, lb, ub and w for all stages; ``"varying"``: with one for each stage.
+            In both, the bounds of hard rows stay as they are, as they are known limits (eq:v1c3).
+        hessian: ``"diagonal"``, ``"block"`` (one dense block a stage) or ``"full"`` (dense in z).
+        stage_weight: start of H_k, ``(n_x + n_u,)`` if diagonal, else ``(n_x + n_u, n_x + n_u)``,
+            with an optional leading N for a weight of each stage's own; by default diagonal
+            random entries uniform in (0.5, 5) on the states and zero on the actions. The cost of a
+            stage is *half* of ``[x_k; u_k]' H_k [x_k; u_k]`` (eq:qpH): a plant's ``s'Ws`` is 2 W.
+        terminal_weight: start of H_f, ``(n_x,)`` or ``(n_x, n_x)``; the identity by default.
+            ``"riccati"``: the cost to go of the linear quadratic regulator of A, B and the stage
+            weight; not for a diagonal hessian.
+        state_slack, action_slack, constraint_slack: the slack weights w of the rows of states, of
+            actions, and of mixed and terminal constraints; ``inf`` makes them hard. Hard actions
+            by default, and the others soft. One for all, or for states and actions one for each.
+        discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
+        learn: which of H, H_f, q, c, C, b, G, lb, ub, w are parameters; the others are buffers.
+            As a mapping, ``{"H": True, "C": mask}``, only the entries where a mask is true are
+            learned, such as all but the rows of a constant reference. A mask has the part's shape.
+        step: how H and H_f stay positive semidefinite and w non-negative while they are learned
+            (eq:sdp1). ``"cholesky"``: theta is a factor of them. ``"projection"`` and ``"sdp"``:
+            theta is H itself, and `project_` after each step puts it back, by eigenvalues or by a
+            semidefinite program; see `torch_qpmpc.mpc.projections`.
+        solver, on_failure: as in `solve_qp`.
+        seed: of the random starts.
+
+    Attributes:
+        C_0: the banded matrix that C started from, ``(N n_x, n_z)``.
+
+    Raises:
+        QPError: an argument that does not fit, by name.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> mpc = qm.QPMPC.from_model(
+        ...     torch.eye(1),
+        ...     torch.eye(1),
+        ...     3,
+        ...     action_bounds=([-1.0], [1.0]),
+        ...     stage_weight=[1.0, 0.1],
+        ...     state_bounds=([-5.0], [5.0]),
+        ... )
+        >>> mpc.policy(torch.tensor([[0.1], [4.0]])).detach()
+        tensor([[-0.0908],
+                [-1.0000]])
+    """
+
+    H: Tensor
+    H_f: Tensor
+    q: Tensor
+    c: Tensor
+    C: Tensor
+    b: Tensor
+    G: Tensor
+    lb: Tensor
+    ub: Tensor
+    w: Tensor
+    C_0: Tensor
+    discount: Tensor
+    slack_discount: Tensor
+    soft: Tensor
+    hardness: Tensor
+    stages: Tensor
+
+    def __init__(
+        self,
+        n_x: int,
+        n_u: int,
+        horizon: int,
+        *,
+        gamma: float = 0.9,
+        A: Any = None,
+        B: Any = None,
+        offset: Any = None,
+        state_bounds: tuple[Any, Any] | None = None,
+        action_bounds: tuple[Any, Any] | None = None,
+        constraints: tuple[Any, Any, Any] | None = None,
+        terminal_constraints: tuple[Any, Any, Any] | None = None,
+        structure: str = "free",
+        hessian: str = "diagonal",
+        stage_weight: Any = None,
+        terminal_weight: Any = None,
+        state_slack: Any = 100.0,
+        action_slack: Any = torch.inf,
+        constraint_slack: float = 100.0,
+        discount_slack: bool = False,
+        learn: Collection[str] = ("H", "c", "C"),
+        step: str = CHOLESKY,
+        solver: str = "proxqp",
+        on_failure: str = "raise",
+        seed: int = 0,
+    ) -> None:
+        given = {name: x for name, x in locals().items() if name not in ("self", "__class__")}
+        # Copies: reset_parameters and pickle make it anew, whatever becomes of the caller's arrays.
+        arguments = {name: own(value) for name, value in given.items()}
+        super().__init__()
+        check_structure(**arguments)
+        arguments |= {name: int(arguments[name]) for name in ("n_x", "n_u", "horizon", "seed")}
+        self._arguments = arguments
+        backend(solver)
+        with torch.device("cpu"):
+            self._start(arguments["learn"])
+        if (device := torch.get_default_device()).type != "cpu":
+            self.to(device)
+
+    def _start(self, learn: Collection[str]) -> None:
+        given = self._arguments
+        self._layout, theta = starts.theta(**given)
+        self.n_x, self.n_u, self.horizon = (given[name] for name in ("n_x", "n_u", "horizon"))
+        self.n_z, self.gamma, self.hessian = self._layout.n_z, given["gamma"], given["hessian"]
+        self.structure, self.step = given["structure"], given["step"]
+        self.solver, self.on_failure = given["solver"], given["on_failure"]
+        self.learned = tuple(name for name in (*COST, *CONSTRAINTS) if name in learn)
+        self._masks = learned_entries(learn, theta)
+        self.register_buffer("C_0", theta["C"].to(torch.float64))
+        self.register_buffer("soft", theta["w"].isfinite())
+        self._hard_rows = digest(theta["w"].isinf())
+        self._derive()
+        # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
+        theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
+        for name, start in theta.items():
+            parts.register(self, name, start.to(torch.float64).clone(), name in self.learned)
+            if name in self.learned:
+                parts.keep(self, name, self._kept(name))
+
+    @classmethod
+    def from_model(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
+        """A QPMPC whose C starts at the banded C_0 of the model x+ = A x + B u (eq:cband).
+
+        Args:
+            A, B: as for `QPMPC`, from which n_x and n_u are read.
+            horizon: N.
+            options: the keyword arguments of `QPMPC`.
+        """
+        A, B = check_model(A, B)
+        return cls(A.shape[-1], B.shape[-1], horizon, A=A, B=B, **options)
+
+    @classmethod
+    def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
+        """The MPC end of the bridge: a linear MPC scheme, all of which is learned (eq:v1, eq:q1).
+
+        `from_model` with other defaults: ``structure="tied"``, dense weights that start as the
+        identity and, for x_N, from the Riccati equation, discounted slack weights, and all parts
+        of theta among those to ``learn``. `release` leaves it.
+
+        Args:
+            A, B, horizon, options: as for `from_model`.
+
+        Example:
+            >>> import torch, torch_qpmpc as qm
+            >>> A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]), torch.tensor([[0.0], [0.1]])
+            >>> mpc = qm.QPMPC.linear_mpc(A, B, 10, action_bounds=([-1.0], [1.0]))
+            >>> [tuple(part.shape) for part in mpc.model()]
+            [(2, 2), (2, 1)]
+        """
+        return cls.from_model(A, B, horizon, **(starts.linear_mpc(A, B, **options) | options))
+
+    def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
+        """V(s) (eq:qp4), a cost to go: s ``(*batch, n_x)`` to ``(*batch,)``.
+
+        ``qp`` is `quadratic_program`, where that has been made for today's theta already.
+        """
+        return self._value(self._checked(s), qp)
+
+    def action_value(self, s: Tensor, a: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
+        """Q(s, a) (eq:qp5), a cost to go: ``(*batch, n_x)``, ``(*batch, n_u)`` to ``(*batch,)``.
+
+        ``qp`` is as for `value`.
+        """
+        return self._value(self._checked(s, a), qp)
+
+    def policy(self, s: Tensor) -> Tensor:
+        """pi(s), the u_0 of V's solution: s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
+        return to_dtype(self.solve(s).z[..., self.n_x : self.n_x + self.n_u], s.dtype)
+
+    def forward(self, s: Tensor, a: Tensor | None = None) -> Tensor:
+        """V(s), or Q(s, a) where an action is given."""
+        return self.value(s) if a is None else self.action_value(s, a)
+
+    def solve(
+        self,
+        s: Tensor,
+        a: Tensor | None = None,
+        warm_start: QPSolution | Tensor | None = None,
+        qp: QuadraticProgram | None = None,
+    ) -> QPSolution:
+        """The whole solution of V's QP, or of Q's where an action is given, in theta's dtype.
+
+        ``qp`` is as for `value`.
+        """
+        fixed = self._checked(s, a)
+        qp = self._today(qp)
+        fixed = to_dtype(fixed, qp.C.dtype)
+        return solve_qp(qp, fixed, warm_start=warm_start, **self._options())
+
+    def value_and_active_set(
+        self, s: Tensor, a: Tensor | None = None, warm_start: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """`value`, or `action_value`, with the active set ``(*batch, n_g)`` of its solution.
+
+        ``warm_start`` is one of nearly the same QPs, as in `solve`; this does not prepare the
+        gradient of the rest of the solution.
+        """
+        fixed = self._checked(s, a)
+        qp = self.quadratic_program()
+        value, active = value_and_active_set(
+            qp, to_dtype(fixed, qp.C.dtype), warm_start=warm_start, **self._options()
+        )
+        return to_dtype(value, fixed.dtype), active
+
+    def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """The states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
+        return self._layout.predicted(check_tensor("z", z, self.n_z))
+
+    def model(self) -> tuple[Tensor, Tensor]:
+        """A and B, ``(n_x, n_x)`` and ``(n_x, n_u)``, or with a leading N where they vary.
+
+        Raises:
+            QPError: C is free to be more than a model.
+        """
+        if self.structure == "free":
+            raise QPError.expected("structure", "'free'", "'tied' or 'varying', which have a model")
+        return Banded(self._layout, self.structure == "tied").right_inverse(self.C)
+
+    def readable(self) -> dict[str, Tensor]:
+        """The learned parts of theta, detached: what stages share, once; A, B and D for C and G."""
+        return parts.readable(self, self.learned)
+
+    def release(self, structure: str = "free") -> None:
+        """Free what a linear MPC scheme ties, in place; the values stay as they are.
+
+        The learned parts get other parameters: make the loss module and the optimiser anew.
+
+        Args:
+            structure: ``"free"`` or ``"varying"``, and freer than today's.
+
+        Raises:
+            QPError: it is not.
+        """
+        freer = STRUCTURES[: STRUCTURES.index(self.structure)]
+        if structure not in freer:
+            expected = f"one that is freer than {self.structure!r}"
+            remedy = f"Those are: {', '.join(freer) or 'none'}."
+            raise QPError.expected("structure", repr(structure), expected, remedy)
+        vars(self)["structure"] = structure
+        self._arguments = {**self._arguments, "structure": structure}
+        for part in self.learned:
+            if parametrize.is_parametrized(self, part) and part not in ("H", "H_f"):
+                parts.replace(self, part, self._kept(part))
+
+    @torch.no_grad()
+    def project_(self) -> None:
+        """Put H, H_f and w back to where they are >= 0, in place: what ends a step (eq:sdp1).
+
+        To be called after each step of an optimiser; `GaussNewton` does so itself. With
+        ``step="cholesky"`` nothing can be outside, and nothing is done.
+
+        Example:
+            >>> import torch, torch_qpmpc as qm
+            >>> mpc = qm.QPMPC(2, 1, 3, step="projection", stage_weight=[1.0, 2.0, 0.1])
+            >>> optimizer = torch.optim.SGD(mpc.parameters(), lr=1.0)
+            >>> mpc.H.sum().mul(1.5).backward()
+            >>> optimizer.step()
+            >>> mpc.project_()
+            >>> mpc.H.detach()
+            tensor([0.0000, 0.5000, 0.0000], dtype=torch.float64)
+        """
+        for name, leaf in self._projected().items():
+            dense = self.hessian != "diagonal" and name != "w"
+            matrices = leaf if dense else leaf[..., None, None]
+            leaf.copy_(NEAREST[self.step](matrices).view_as(leaf))
+
+    def quadratic_program(self) -> QuadraticProgram:
+        """Today's theta as a QuadraticProgram, discounts included (eq:qpH)."""
+        with full_precision(self.C_0):
+            H, q, w = self._cost()
+            return QuadraticProgram(
+                H=H,
+                q=q,
+                c=self.c,
+                C=self.C,
+                b=self.b,
+                G=self.G,
+                lb=self.lb,
+                ub=self.ub,
+                w=w,
+                check_values=False,
+            )
+
+    def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
+        """Parameter groups for an optimiser, one for each learned part of theta.
+
+        Args:
+            rates: learning rates by part (``"H"``, ``"C"``, ..), or for the rest of the
+                ``"cost"`` (H, H_f, q, c, w) and of the ``"constraints"`` (C, b, G, lb, ub), which
+                the paper advises to learn at rates of their own.
+
+        Raises:
+            QPError: a learned part without a rate, or a name that is neither.
+        """
+        return parts.groups(self, self.learned, rates)
+
+    def leaves(self, part: str) -> list[nn.Parameter]:
+        """The parameters that an optimiser moves for a learned part: behind H its factor."""
+        if part not in self.learned:
+            expected = f"one of the learned parts: {', '.join(self.learned) or 'none'}"
+            raise QPError.expected("part", repr(part), expected)
+        return parts.leaves(self, part)
+
+    def reset_parameters(self) -> None:
+        """Return theta to where the constructor put it."""
+        fresh = parametrize.type_before_parametrizations(self)(**self._arguments)
+        for name, start in (*fresh.named_parameters(), *fresh.named_buffers()):
+            owner, _, leaf = name.rpartition(".")
+            # By attribute: a functional call puts plain tensors in the place of parameters.
+            getattr(self.get_submodule(owner), leaf).data.copy_(start.detach())
+
+    def extra_repr(self) -> str:
+        return (
+            f"n_x={self.n_x}, n_u={self.n_u}, horizon={self.horizon}, hessian={self.hessian!r}, "
+            f"structure={self.structure!r}, learned={self.learned}, solver={self.solver!r}"
+        )
+
+    def __reduce_ex__(self, protocol: Any) -> tuple:
+        return pickling.reduce(self, self._arguments, self._kept)
+
+    def __copy__(self) -> QPMPC:
+        twin = type(self).__new__(type(self))
+        twin.__dict__.update(self.__dict__)  # as every module's: the parameters are shared
+        return twin
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in FIXED and name in vars(self) and value != vars(self)[name]:
+            remedy = "Make another QPMPC; release() frees the structure of this one."
+            raise QPError.expected(name, repr(value), f"{vars(self)[name]!r}, as made", remedy)
+        super().__setattr__(name, value)
+
+    def get_extra_state(self) -> Tensor:
+        """What a state_dict tells of the QPMPC that its parameters belong to, as JSON in bytes."""
+        return written(self._identity())
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """`_load_from_state_dict` has compared it already."""
+
+    def _identity(self) -> dict[str, Any]:
+        """What the values depend on beside the parameters and buffers, by the arguments' names."""
+        names = ("n_x", "n_u", "horizon", "gamma", "structure", "hessian", "step", "discount_slack")
+        masks = {name: digest(mask) for name, mask in self._masks.items()}
+        return {
+            **{name: self._arguments[name] for name in names} | {"gamma": float(self.gamma)},
+            "constraints": self._layout.n_d,
+            "terminal_constraints": self._layout.n_d_f,
+            "learn": {name: masks.get(name, True) for name in self.learned},
+            "hard rows": self._hard_rows,
+        }
+
+    def checked_state(self, state_dict: dict[str, Any], prefix: str) -> dict[str, Any]:
+        """``state_dict``; `QPError` if it tells of another QPMPC. An older one tells nothing."""
+        key = f"{prefix}_extra_state"
+        state_dict = {key: self.get_extra_state()} | state_dict
+        check_identity(state_dict[key], self._identity())
+        return state_dict
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        super()._load_from_state_dict(self.checked_state(state_dict, prefix), prefix, *args)
+        self._derive()
+
+    def _derive(self) -> None:
+        """What follows from the arguments and is no part of the state, like C_0."""
+        discount, of_rows = self._layout.discounts(self.gamma)
+        weights = of_rows if self._arguments["discount_slack"] else torch.ones_like(of_rows)
+        hardness = torch.where(self.soft, 0.0, torch.inf)
+        derived = {"discount": discount, "slack_discount": weights, "hardness": hardness}
+        for name, buffer in derived.items():
+            self.register_buffer(name, buffer.to(self.C_0), persistent=False)
+        stages = self._layout.ties("q").to(self.C_0.device)
+        self.register_buffer("stages", stages, persistent=False)
+        for part in self.modules():
+            if isinstance(part, Masked | Tied):
+                part.place(self.C_0.device)
+
+    def _checked(self, s: Tensor, a: Tensor | None = None) -> Tensor:
+        """What is fixed of z: s, or s and a side by side."""
+        if a is None:
+            return check_tensor("s", s, self.n_x, device=self.C_0.device)
+        return check_pair(s, a, self.n_x, self.n_u, self.C_0.device)
+
+    def _today(self, qp: QuadraticProgram | None) -> QuadraticProgram:
+        if qp is None:
+            return self.quadratic_program()
+        check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or nothing.")
+        return qp
+
+    def _value(self, fixed: Tensor, qp: QuadraticProgram | None) -> Tensor:
+        qp = self._today(qp)
+        value = optimal_value(qp, to_dtype(fixed, qp.C.dtype), **self._options())
+        return to_dtype(value, fixed.dtype)
+
+    def _options(self) -> dict[str, Any]:
+        """What V, Q and the policy ask of every solve; one ``keep``, to share one elimination."""
+        keep = self.n_x + self.n_u
+        return {"solver": self.solver, "on_failure": self.on_failure, "keep": keep}
+
+    def _cost(self) -> Cost:
+        """H, q and w of the QP."""
+        by = Discounts(self.discount, self.slack_discount, self.hardness, self.stages)
+        if self.hessian == "diagonal":
+            factors, squared = zip(*(parts.factor(self, x) for x in ("H", "H_f", "w")), strict=True)
+            return diagonal_cost(self._layout, (*factors, self.q), squared, by)
+        blocks = (self.H,) if self.hessian == "full" else (self.H, self.H_f)
+        return discounted(self._layout, self.hessian, blocks, self.q, self.w, by)
+
+    def _kept(self, name: str) -> list[nn.Module]:
+        value, mask = getattr(self, name).detach(), self._masks.get(name)
+        if self.structure != "free" and name in ("lb", "ub"):
+            soft = self.soft.cpu()
+            mask = soft if mask is None else mask & soft
+        return kept(name, value, self._layout, self.structure, self.hessian, self.step, mask)
+
+    def _projected(self) -> dict[str, nn.Parameter]:
+        """The parameters that `project_` acts on, by part."""
+        names = () if self.step == CHOLESKY else SIGNED
+        return {name: parts.leaves(self, name)[0] for name in names if name in self.learned}

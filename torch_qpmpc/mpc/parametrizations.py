@@ -1,0 +1,271 @@
+"""What theta keeps while it is learned, in the idiom of `torch.nn.utils.parametrize`.
+
+With H = L L' any gradient step on L leaves H positive semidefinite, so that the update of eq:thup
+needs no semidefinite program (eq:sdp1); where `torch_qpmpc.mpc.projections` projects H instead, it
+is kept symmetric. And a linear MPC scheme (eq:v1) ties: its C has nothing but a model in its band,
+and its stages share their values.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.projections import CHOLESKY
+
+#: The parts of theta that a convex QP does not leave free.
+SIGNED = ("H", "H_f", "w")
+
+
+def kept(
+    name: str,
+    value: Tensor,
+    layout: Layout,
+    structure: str,
+    hessian: str,
+    step: str,
+    mask: Tensor | None = None,
+) -> list[nn.Module]:
+    """What a learned part of `QPMPC` keeps: its structure, its sign or what projecting it needs.
+
+    ``mask`` is true at the entries that are learned; None if all are.
+    """
+    found, tied = [], structure == "tied"
+    if structure != "free" and name in ("C", "G"):
+        found.append((Banded if name == "C" else LinearRows)(layout, tied))
+    if tied and name in ("q", "b", "lb", "ub", "w"):
+        found.append(Tied(name, layout.ties(name)))
+    dense = hessian != "diagonal" and name != "w"
+    if name in SIGNED and step == CHOLESKY:
+        found.append(Cholesky() if dense else SquareRoot())
+    elif name in ("H", "H_f"):
+        found.append(Symmetric() if dense else Support(value))
+    if mask is not None and not mask.all():
+        _check_mask(name, mask, layout, found)
+        found.append(Masked(mask, value))
+    return found
+
+
+class SquareRoot(nn.Module):
+    """The Cholesky factor of a diagonal: non-negative entries ``h = l * l``, any shape.
+
+    An entry that starts at exactly zero stays there, as its gradient is zero: the paper's
+    diag(theta_1, .., theta_4, 0, 0) keeps its zero action weights.
+    """
+
+    def forward(self, factor: Tensor) -> Tensor:
+        return factor * factor
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        """A factor of ``value``; `QPError` if an entry is negative."""
+        _check_diagonal(value)
+        return value.sqrt()
+
+
+class Support(nn.Module):
+    """A diagonal, any shape, whose zero entries are no part of theta, as with `SquareRoot`.
+
+    An entry that a step has brought to zero can leave it again.
+    """
+
+    support: Tensor
+
+    def __init__(self, start: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("support", start != 0)
+
+    def forward(self, entries: Tensor) -> Tensor:
+        return self.support * entries
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        """``value``; `QPError` if an entry is negative."""
+        _check_diagonal(value)
+        return value
+
+
+class Symmetric(nn.Module):
+    """The symmetric part of matrices ``(*batch, n, n)``; so is the gradient that they get."""
+
+    def forward(self, matrix: Tensor) -> Tensor:
+        return (matrix + matrix.mT) / 2
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        """``value``; `QPError` if it is not positive semidefinite."""
+        _spectrum(value)
+        return value
+
+
+class Cholesky(nn.Module):
+    """Positive semidefinite matrices ``H = L L'`` from lower triangular L, ``(*batch, n, n)``."""
+
+    def forward(self, factor: Tensor) -> Tensor:
+        lower = factor.tril()
+        return lower @ lower.mT
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        """A lower triangular factor of a possibly singular ``value``.
+
+        By a QR factorisation of the symmetric square root, as the usual Cholesky algorithm needs
+        a positive definite matrix. `QPError` if ``value`` is not positive semidefinite.
+        """
+        eigenvalues, vectors = _spectrum(value)
+        root = vectors * eigenvalues.clamp(min=0).sqrt().unsqueeze(-2)
+        upper = torch.linalg.qr(root.mT).R
+        sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0)
+        return upper.mT * sign.unsqueeze(-2)
+
+
+class Masked(nn.Module):
+    """A part of which only the entries in ``mask`` are learned; no optimiser moves the others."""
+
+    mask: Tensor
+    frozen: Tensor
+
+    def __init__(self, mask: Tensor, value: Tensor) -> None:
+        super().__init__()
+        self.cpu_mask = mask.cpu()
+        self.place(value.device)
+        self.register_buffer("frozen", value.detach().clone())
+
+    def place(self, device: torch.device) -> None:
+        """Put the mask on a device; a module that was on "meta" has lost it."""
+        self.register_buffer("mask", self.cpu_mask.to(device), persistent=False)
+
+    def forward(self, value: Tensor) -> Tensor:
+        return torch.where(self.mask, value, self.frozen)
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        """``value``, whose frozen entries become those that it has."""
+        self.frozen.copy_(value.detach())
+        return value
+
+
+class Banded(nn.Module):
+    """C of a model (eq:cband): A and B, of all stages, or with a leading N where they vary."""
+
+    def __init__(self, layout: Layout, tied: bool) -> None:
+        super().__init__()
+        self.layout, self.tied = layout, tied
+
+    def forward(self, A: Tensor, B: Tensor) -> Tensor:
+        return banded_matrix(A, B, self.layout.horizon)
+
+    def right_inverse(self, C: Tensor) -> tuple[Tensor, Tensor]:
+        """The model in the band of C; `QPError` if there is more in C than that."""
+        n_x, blocks = self.layout.n_x, _stage_blocks(C, self.layout, self.tied)
+        A, B = blocks[..., :n_x].contiguous(), blocks[..., n_x:].contiguous()
+        _check_tied("C", C, self(A, B))
+        return A, B
+
+
+class Tied(nn.Module):
+    """A vector whose entry i is the value ``index[i]`` of a shorter one."""
+
+    index: Tensor
+    first: Tensor
+
+    def __init__(self, name: str, index: Tensor) -> None:
+        super().__init__()
+        self.name, self.ties = name, index.tolist()
+        self.place(index.device)
+
+    def place(self, device: torch.device) -> None:
+        """Put the index on a device; a module that was on "meta" has lost it."""
+        first = [self.ties.index(i) for i in range(max(self.ties) + 1)]
+        for name, index in (("index", self.ties), ("first", first)):
+            self.register_buffer(name, torch.tensor(index, device=device), persistent=False)
+
+    def forward(self, values: Tensor) -> Tensor:
+        return values[..., self.index]
+
+    def right_inverse(self, entries: Tensor) -> Tensor:
+        """The first entry of each value; `QPError` if the others differ."""
+        values = entries[self.first]
+        _check_tied(self.name, entries, self(values))
+        return values
+
+
+class LinearRows(nn.Module):
+    """G of mixed constraints (eq:v1c4): the identity, D for each stage, and D^f for x_N.
+
+    D is ``(n_d, n_x + n_u)``, or ``(N, n_d, n_x + n_u)`` where the stages' own vary.
+    """
+
+    def __init__(self, layout: Layout, tied: bool) -> None:
+        super().__init__()
+        self.layout, self.tied = layout, tied
+
+    def forward(self, D: Tensor, D_f: Tensor) -> Tensor:
+        n_x, n_z = self.layout.n_x, self.layout.n_z
+        stages = torch.block_diag(*D.expand(self.layout.horizon, -1, self.layout.n))
+        unit = torch.eye(n_z).to(D)
+        return torch.cat((unit, F.pad(stages, (0, n_x)), F.pad(D_f, (n_z - n_x, 0))))
+
+    def right_inverse(self, G: Tensor) -> tuple[Tensor, Tensor]:
+        """D and D^f; `QPError` if there is more in G than they make."""
+        n_x, n_z = self.layout.n_x, self.layout.n_z
+        last = n_z + self.layout.horizon * self.layout.n_d
+        D = _stage_blocks(G[n_z:last], self.layout, self.tied).contiguous()
+        D_f = G[last:, n_z - n_x :].contiguous()
+        _check_tied("G", G, self(D, D_f))
+        return D, D_f
+
+
+def _check_mask(name: str, mask: Tensor, layout: Layout, found: list[nn.Module]) -> None:
+    """Raise `QPError` if a mask parts what the other parametrizations join."""
+    what = f"learn[{name!r}]"
+    if any(isinstance(part, Cholesky | Symmetric) for part in found):
+        want = "True, or a mask with hessian='diagonal'"
+        raise QPError.expected(what, "a mask of a dense H", want, "It has to stay semidefinite.")
+    tied = True
+    for part in found:
+        if isinstance(part, Tied):
+            tied = torch.equal(mask, mask[part.first][part.index])
+        elif isinstance(part, Banded | LinearRows) and part.tied:
+            n_z, N = layout.n_z, layout.horizon
+            rows = mask if name == "C" else mask[n_z : n_z + N * layout.n_d]
+            blocks = _stage_blocks(rows, layout, tied=False)
+            tied = bool((blocks == blocks[:1]).all())
+    if not tied:
+        want = "one that is the same for all stages, as structure='tied' gives them one value"
+        raise QPError.expected(what, "a mask that differs between stages", want)
+
+
+def _stage_blocks(rows: Tensor, layout: Layout, tied: bool) -> Tensor:
+    """What equally many rows for each stage have in its (x_k, u_k), ``(N, n, n_x + n_u)``.
+
+    Of the first stage alone if they are tied.
+    """
+    horizon, n = layout.horizon, layout.n
+    stages = rows[:, : horizon * n].unflatten(0, (horizon, len(rows) // horizon))
+    blocks = stages.unflatten(-1, (horizon, n)).diagonal(dim1=0, dim2=2).movedim(-1, 0)
+    return blocks[0] if tied else blocks
+
+
+def _check_diagonal(value: Tensor) -> None:
+    if (value < 0).any():
+        raise QPError.expected("diagonal", f"{value.min():.3g}", "non-negative entries")
+
+
+def _spectrum(H: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues and -vectors; `QPError` if H is not positive semidefinite."""
+    eigenvalues, vectors = torch.linalg.eigh((H + H.mT) / 2)
+    tolerance = 1e-5 if H.dtype == torch.float32 else 1e-9
+    if (eigenvalues < -tolerance * eigenvalues.abs().amax(-1, keepdim=True)).any():
+        got = f"smallest eigenvalue {eigenvalues.min():.3g}"
+        raise QPError.expected("H", got, "a positive semidefinite matrix")
+    return eigenvalues, vectors
+
+
+def _check_tied(name: str, given: Tensor, tied: Tensor) -> None:
+    if not torch.equal(given, tied):
+        raise QPError.expected(
+            name,
+            "entries that a linear MPC scheme does not have",
+            "what its stages tie",
+            "Call release() first to free them.",
+        )

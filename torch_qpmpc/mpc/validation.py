@@ -1,0 +1,245 @@
+"""What `QPMPC` accepts: its arguments and inputs, checked at the boundary."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_qpmpc.checks import (
+    check_choice,
+    check_flag,
+    check_number,
+    check_tensor,
+    check_whole,
+)
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.projections import check_step
+from torch_qpmpc.qp.autograd import ON_FAILURE
+from torch_qpmpc.qp.batching import broadcast
+from torch_qpmpc.qp.precision import to_dtype
+
+HESSIANS = ("diagonal", "block", "full")
+#: From the least tied to the most.
+STRUCTURES = ("free", "varying", "tied")
+#: The parts of theta by family; the paper advises a learning rate for each of the two.
+COST = ("H", "H_f", "q", "c", "w")
+CONSTRAINTS = ("C", "b", "G", "lb", "ub")
+
+
+def check_structure(
+    n_x: int,
+    n_u: int,
+    horizon: int,
+    gamma: float,
+    hessian: str,
+    structure: str,
+    learn: Collection[str],
+    step: str,
+    on_failure: str,
+    discount_slack: bool,
+    seed: int,
+    **_: Any,
+) -> None:
+    for name, size in (("n_x", n_x), ("n_u", n_u), ("horizon", horizon)):
+        if not isinstance(size, Integral) or isinstance(size, bool) or int(size) < 1:
+            raise QPError.expected(name, repr(size), "a positive integer")
+    check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
+    check_choice("hessian", hessian, HESSIANS)
+    check_choice("structure", structure, STRUCTURES)
+    check_choice("on_failure", on_failure, ON_FAILURE)
+    check_step(step)
+    check_flag("discount_slack", discount_slack)
+    check_whole("seed", seed, 0)
+    parts = (*COST, *CONSTRAINTS)
+    if (
+        not isinstance(learn, Collection)
+        or isinstance(learn, str)
+        or not all(isinstance(part, str) and part in parts for part in learn)
+    ):
+        raise QPError.expected(
+            "learn", repr(learn), f"a collection of names among {', '.join(parts)}"
+        )
+    if hessian == "full" and "H_f" in learn:
+        raise QPError.expected(
+            "learn",
+            "'H_f' with hessian='full'",
+            "'H' alone",
+            "A full H contains the terminal block.",
+        )
+
+
+def own(value: Any) -> Any:
+    """A copy of an argument that its caller may change: arrays, tensors, and what holds them."""
+    if isinstance(value, Tensor):
+        return value.detach().clone()
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, Mapping):
+        return {key: own(item) for key, item in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(map(own, value))
+    return value
+
+
+def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The masks among the values of ``learn``, by part: true where an entry is learned."""
+    if not isinstance(learn, Mapping):
+        return {}
+    masks = {}
+    for part, mask in learn.items():
+        if isinstance(mask, bool | np.bool_) and mask:
+            continue
+        name, shape = f"learn[{part!r}]", tuple(theta[part].shape)
+        want = f"True, or a mask of bools of shape {shape}"
+        try:
+            mask = torch.as_tensor(mask)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise QPError.expected(name, repr(mask), want) from error
+        if mask.dtype != torch.bool or tuple(mask.shape) != shape:
+            got = f"{mask.dtype} of shape {tuple(mask.shape)}"
+            raise QPError.expected(name, got, want, "True marks the entries to be learned.")
+        masks[part] = mask.detach().cpu().clone()
+    return masks
+
+
+def check_model(A: Any, B: Any) -> tuple[Tensor, Tensor]:
+    """A and B as matrices, from which n_x and n_u can be read."""
+    A, B = as_tensor("A", A), as_tensor("B", B)
+    if A.ndim < 2 or B.ndim < 2:
+        got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
+        raise QPError.expected("A, B", got, "matrices (n_x, n_x) and (n_x, n_u)")
+    return A, B
+
+
+def as_tensor(name: str, value: Any) -> Tensor:
+    """Read a tensor of finite numbers."""
+    tensor = _read(name, value)
+    if not tensor.isfinite().all():
+        raise QPError.expected(name, "NaN or inf", "finite entries")
+    return tensor
+
+
+def _read(name: str, value: Any) -> Tensor:
+    try:
+        of_tensor = isinstance(value, Tensor) and (value.is_complex() or value.is_meta)
+        if of_tensor or (isinstance(value, np.ndarray) and np.iscomplexobj(value)):
+            raise TypeError
+        # Whatever the default device is: one of meta would make lists tensors without values.
+        return torch.as_tensor(value, dtype=torch.float64, device="cpu")
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise QPError.expected(
+            name, _brief(value), "a tensor, or what torch.as_tensor takes, of real numbers"
+        ) from error
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"a tensor of {value.dtype} on {value.device}"
+    return repr(value)
+
+
+def bound(name: str, bounds: tuple[Any, Any] | None, side: int, size: int) -> Tensor:
+    if bounds is None:
+        return torch.full((size,), (2 * side - 1) * torch.inf)
+    try:
+        lower, upper = bounds
+    except (TypeError, ValueError) as error:
+        raise QPError.expected(name, repr(bounds), "the pair (lower, upper)") from error
+    given = _read(name, (lower, upper)[side])
+    if given.isnan().any():
+        raise QPError.expected(name, "NaN", "no NaN; inf for no bound")
+    if tuple(given.shape) != (size,):
+        raise QPError.expected(name, f"shape {tuple(given.shape)}", f"shape ({size},) on each side")
+    if (given == (1 - 2 * side) * torch.inf).any():
+        raise QPError.expected(
+            name, f"{given.tolist()}", ("lower bounds below inf", "upper bounds above -inf")[side]
+        )
+    return given
+
+
+def bound_pair(name: str, bounds: tuple[Any, Any] | None, size: int) -> tuple[Tensor, Tensor]:
+    """Both sides of `bound`, none of which crosses the other."""
+    lower, upper = bound(name, bounds, 0, size), bound(name, bounds, 1, size)
+    crossing = (lower > upper).nonzero()
+    if len(crossing):
+        i = int(crossing[0])
+        got = f"lower {lower[i]:g} > upper {upper[i]:g} at entry {i}"
+        raise QPError.expected(name, got, "lower <= upper", "The pair is (lower, upper).")
+    return lower, upper
+
+
+def cost_weights(
+    stage_weight: Any, terminal_weight: Any, hessian: str, n_x: int, n_u: int, horizon: int
+) -> dict[str, Tensor]:
+    """The starts of H and H_f in the shapes that the kind of ``hessian`` has; one H if full."""
+    stage = as_tensor("stage_weight", stage_weight)
+    terminal = as_tensor("terminal_weight", terminal_weight)
+    n, diagonal = n_x + n_u, hessian == "diagonal"
+    event = (n,) if diagonal else (n, n)
+    terminal_event = (n_x,) * len(event)
+    # A square matrix is one dense block, even where the horizon happens to be its size.
+    diagonals = ((n,), (horizon, n)) if horizon != n else ((n,),)
+    if not diagonal and tuple(stage.shape) in diagonals:
+        stage = torch.diag_embed(stage)
+    if not diagonal and tuple(terminal.shape) == (n_x,):
+        terminal = torch.diag(terminal)
+    per_stage = (horizon, *event)
+    if tuple(stage.shape) not in (event, per_stage):
+        got = f"shape {tuple(stage.shape)}"
+        raise QPError.expected("stage_weight", got, f"shape {event} or {per_stage}")
+    if tuple(terminal.shape) != terminal_event:
+        got = f"shape {tuple(terminal.shape)}"
+        raise QPError.expected("terminal_weight", got, f"shape {terminal_event}")
+    check_weight("stage_weight", stage, diagonal)
+    check_weight("terminal_weight", terminal, diagonal)
+    if hessian == "full":
+        return {"H": torch.block_diag(*stage.expand(horizon, n, n), terminal)}
+    return {"H": stage, "H_f": terminal}
+
+
+def check_weight(name: str, weight: Tensor, diagonal: bool) -> None:
+    """Raise unless a cost weight, or the diagonal of one, is symmetric positive semidefinite."""
+    if not diagonal and not torch.allclose(weight, weight.mT):
+        asymmetry = (weight - weight.mT).abs().max()
+        raise QPError.expected(
+            name, f"asymmetry {asymmetry:.3g}", "a symmetric matrix", "Pass (W + W.mT) / 2."
+        )
+    eigenvalues = weight if diagonal else torch.linalg.eigvalsh(weight)
+    if (eigenvalues < (0.0 if diagonal else -1e-9 * eigenvalues.abs().max())).any():
+        got = f"smallest eigenvalue {eigenvalues.min():.3g}"
+        remedy = "It weighs a cost: turn the sign of a reward's."
+        raise QPError.expected(name, got, "a positive semidefinite weight", remedy)
+
+
+def slack_weight(name: str, weight: Any, size: int | None = None) -> Tensor:
+    """Slack weights ``(size,)`` from one for all rows, or from one for each if there is a size."""
+    one, each = "a non-negative weight, or inf for hard rows", f"; or one for each of the {size}"
+    expected = one if size is None else one + each
+    if isinstance(weight, Real) or size is None:
+        check_number(name, weight, lambda x: x >= 0, expected)
+        return torch.full((size or 1,), float(weight), dtype=torch.float64)
+    if isinstance(weight, Sequence | np.ndarray | Tensor) and not isinstance(weight, str):
+        weights = _read(name, weight)
+        if tuple(weights.shape) == (size,) and (weights >= 0).all():
+            return weights
+    raise QPError.expected(name, repr(weight), expected)
+
+
+def check_pair(s: Tensor, a: Tensor, n_x: int, n_u: int, device: torch.device) -> Tensor:
+    """s and a side by side, ``(*batch, n_x + n_u)``, in the dtype of s."""
+    check_tensor("s", s, n_x, device=device)
+    check_tensor("a", a, n_u, device=device)
+    try:
+        batch = broadcast(s.shape[:-1], a.shape[:-1])
+    except RuntimeError as error:
+        got = f"shape {tuple(a.shape)}"
+        want = f"leading dimensions that broadcast with those of s, {tuple(s.shape[:-1])}"
+        raise QPError.expected("a", got, want) from error
+    if not s.shape[:-1] == a.shape[:-1] == batch:
+        s, a = s.expand(*batch, -1), a.expand(*batch, -1)
+    return torch.cat((s, to_dtype(a, s.dtype)), dim=-1)

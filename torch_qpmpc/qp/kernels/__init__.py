@@ -1,0 +1,1 @@
+"""Loops compiled for the CPU: over QPs, and over what follows from a theta."""

@@ -1,0 +1,455 @@
+"""Loops of what is worked out once for a theta, compiled by Numba as those of `kernels` are.
+
+What theta is inspected for, its units, and the problem (eq:qp2, eq:qp3) that is left without
+C z = b (eq:qp2c1) and the fixed entries; torch takes a hundred small operations for it. Arrays, and
+vectors that all QPs share, are as in `kernels`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from torch_qpmpc.qp.kernels.per_sample import add_product, compiled, products, summing
+
+
+@compiled
+def diagonal_cost(H, H_f, w, q, of_z, of_rows, hardness, stages, H_squared, H_f_squared, w_squared):
+    """H, q and w of `cost.diagonal_cost`."""
+    n_z, n = len(of_z), len(H)
+    _check_range(stages, n + len(H_f))
+    found, q_found, w_found = np.zeros((n_z, n_z)), np.empty(n_z), np.empty(len(w))
+    for i in range(n_z):
+        k = stages[i]
+        weight, is_squared = (H[k], H_squared) if k < n else (H_f[k - n], H_f_squared)
+        found[i, i] = of_z[i] * (weight * weight if is_squared else weight)
+        q_found[i] = of_z[i] * q[i]
+    for i in range(len(w)):
+        w_found[i] = hardness[i] + of_rows[i] * (w[i] * w[i] if w_squared else w[i])
+    return found, q_found, w_found
+
+
+@compiled
+def diagonal_cost_gradient(
+    of_H, of_q, of_w,
+    H, H_f, w, q, of_z, of_rows, hardness, stages, H_squared, H_f_squared, w_squared,
+):  # fmt: skip
+    """In H, H_f, w and q, or what they are the squares of, from that in what it makes of them."""
+    n = len(H)
+    _check_range(stages, n + len(H_f))
+    to_H, to_H_f, to_w, to_q = np.zeros(n), np.zeros(len(H_f)), np.empty(len(w)), np.empty(len(q))
+    for i in range(len(of_z)):
+        k, pull = stages[i], of_z[i] * of_H[i, i]
+        if k < n:
+            to_H[k] += pull * (2 * H[k] if H_squared else 1.0)
+        else:
+            to_H_f[k - n] += pull * (2 * H_f[k - n] if H_f_squared else 1.0)
+        to_q[i] = of_z[i] * of_q[i]
+    for i in range(len(w)):
+        to_w[i] = of_rows[i] * of_w[i] * (2 * w[i] if w_squared else 1.0)
+    return to_H, to_H_f, to_w, to_q
+
+
+@compiled
+def _check_range(indices, n):
+    """Compiled loops do not look: a module that was on "meta" may not have its buffers yet."""
+    for i in indices:
+        if not 0 <= i < n:
+            raise IndexError("index out of range: load a state_dict, or call reset_parameters")
+
+
+@compiled
+def inspect(H, C, G, group, q, c, b, lb, ub, w):
+    """Which QPs have finite data and lb <= ub, ``(B or 1,)``, or None if all have.
+
+    And of one H and G that all share, whether they are diagonal, and H symmetric.
+    """
+    M = len(H)
+    finite = np.empty(M, np.bool_)
+    for m in range(M):
+        finite[m] = np.isfinite(_sum(H[m]) + _sum(C[m]) + _sum(G[m]))
+    shared = max(max(len(q), len(c), len(b)), max(len(lb), len(ub), len(w)))
+    valid = np.empty(shared if M == 1 else len(group), np.bool_)
+    for i in range(len(valid)):
+        vectors = q[i % len(q)].sum() + b[i % len(b)].sum() + c[i % len(c)]
+        good = np.isfinite(vectors) and finite[0 if M == 1 else group[i]]
+        of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
+        for j in range(lb.shape[1]):
+            # False for NaN, as of inf - inf where both bounds are the same infinity.
+            good = good and ub[of_ub, j] - lb[of_lb, j] >= 0 and w[of_w, j] >= 0
+        valid[i] = good
+    some = None if valid.all() else valid
+    of_H, of_G = M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
+    return some, of_H, of_G, of_H or (M == 1 and _is_symmetric(H[0]))
+
+
+@compiled
+def _is_symmetric(matrix):
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            if matrix[i, j] != matrix[j, i]:
+                return False
+    return True
+
+
+@summing
+def _sum(matrix):
+    total = 0.0
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            total += matrix[i, j]
+    return total
+
+
+@compiled
+def _is_diagonal(matrix):
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            if i != j and matrix[i, j] != 0:
+                return False
+    return matrix.shape[0] == matrix.shape[1]
+
+
+@compiled
+def units(H, C, G, group, q, b, lb, ub, w, small, large):
+    """cost, length, rows and equalities of `solvers.units.Units`, or None if all are one."""
+    M, n_g, n_c = len(H), G.shape[1], C.shape[1]
+    of_G, of_C = _sums(G), _sums(C)
+    of_q, of_b = _sizes(q, group, M), _sizes(b, group, M)
+    of_lb, of_ub, of_w = _sizes(lb, group, M), _sizes(ub, group, M), _sizes(w, group, M)
+    cost, length = np.empty((M, 1)), np.empty((M, 1))
+    rows, equalities, reach = np.empty((M, n_g)), np.empty((M, n_c)), np.empty(n_g + n_c)
+    extreme = False
+    for m in range(M):
+        for j in range(n_g):
+            reach[j] = max(of_lb[m, j], of_ub[m, j]) / of_G[m, j]
+        for j in range(n_c):
+            reach[n_g + j] = of_b[m, j] / of_C[m, j]
+        long = _typical(reach, small, large)
+        size = 0.0
+        for j in range(H.shape[1]):
+            size = _larger(size, of_q[m, j] * long)
+            for k in range(H.shape[2]):
+                size = _larger(size, abs(H[m, j, k]) * long**2)
+        if not size > 0:  # a QP without any other cost
+            for j in range(n_g):
+                size = _larger(size, of_w[m, j] * of_G[m, j] * long)
+        cost[m, 0], length[m, 0] = _power_above(size, small, large), long
+        extreme = extreme or cost[m, 0] != 1 or long != 1
+        for j in range(n_g):
+            rows[m, j] = _power_above(of_G[m, j] * long, small, large)
+            extreme = extreme or rows[m, j] != 1
+        for j in range(n_c):
+            equalities[m, j] = _power_above(of_C[m, j] * long, small, large)
+            extreme = extreme or equalities[m, j] != 1
+    return (cost, length, rows, equalities) if extreme else None
+
+
+@compiled
+def _larger(x, y):
+    """The larger one, or NaN where either is."""
+    return x if x >= y or x != x else y
+
+
+@compiled
+def _sizes(vectors, group, M):
+    """The largest finite sizes ``(M, n)`` of the QPs that share their matrices."""
+    largest = np.zeros((M, vectors.shape[1]))
+    for i in range(max(len(vectors), M)):
+        m = i if len(vectors) == 1 else group[i]
+        of_vector = i % len(vectors)
+        for j in range(vectors.shape[1]):
+            size = abs(vectors[of_vector, j])
+            if size < np.inf:  # neither is NaN
+                largest[m, j] = max(largest[m, j], size)
+    return largest
+
+
+@summing
+def _sums(matrices):
+    """The absolute sums of rows, ``(M, i, j)`` to ``(M, i)``."""
+    sums = np.empty(matrices.shape[:2])
+    for m in range(matrices.shape[0]):
+        for i in range(matrices.shape[1]):
+            total = 0.0
+            for j in range(matrices.shape[2]):
+                total += abs(matrices[m, i, j])
+            sums[m, i] = total
+    return sums
+
+
+@compiled
+def _typical(sizes, small, large):
+    """`_power_above` of the lower median of the sizes that are positive and finite."""
+    counts, known = np.zeros(2200, np.int64), 0
+    for size in sizes:
+        if 0 < size < np.inf:
+            # Their powers have the same order, and are sorted by being counted.
+            counts[1100 + math.frexp(_power_above(size, small, large))[1]] += 1
+            known += 1
+    at, passed = 0, counts[0]
+    while known and passed <= (known - 1) // 2:
+        at += 1
+        passed += counts[at]
+    return math.ldexp(1.0, at - 1101) if known else 1.0
+
+
+@compiled
+def _power_above(size, small, large):
+    """The power of two next above a size, or one if that is ordinary, zero or not finite."""
+    if 0 < size < small or large < size < np.inf:
+        return math.ldexp(1.0, math.frexp(size)[1])
+    return 1.0
+
+
+@compiled
+def condense(H, C, G, keep, independent, convex):
+    """T, Y_neg, H, G, H_b and G_b of `condense.Condensed`, and what it says of them.
+
+    That is whether all rows of C are independent of each other in the columns after ``keep``, as
+    is needed for the rest, and whether all of H surely are convex.
+    """
+    M, n_c, n_z = C.shape
+    n_y, n_g = max(0, n_z - n_c), G.shape[1]
+    T, Y_neg, regular = np.zeros((M, n_z, n_y)), np.zeros((M, n_z, n_c)), n_c <= n_z - keep
+    H_y, G_y = np.empty((M, n_y, n_y)), np.empty((M, n_g, n_y))
+    H_b, G_b = np.empty((M, n_y, n_c)), np.empty((M, n_g, n_c))
+    surely_convex = True
+    for m in range(M):
+        regular = regular and _eliminate(C[m], keep, independent, T[m], Y_neg[m])
+        if regular:
+            H_is_diagonal, G_is_diagonal = _is_diagonal(H[m]), _is_diagonal(G[m])
+            H_T, G_T = _times(H[m], T[m], H_is_diagonal), _times(G[m], T[m], G_is_diagonal)
+            T_HT, TH_Y = np.dot(T[m].T, H_T), np.dot(H_T.T, Y_neg[m])
+            G_Y = _times(G[m], Y_neg[m], G_is_diagonal)
+            for i in range(n_y):
+                for j in range(n_y):
+                    H_y[m, i, j] = (T_HT[i, j] + T_HT[j, i]) / 2.0
+                for j in range(n_c):
+                    H_b[m, i, j] = -TH_Y[i, j]
+            for i in range(n_g):
+                for j in range(n_y):
+                    G_y[m, i, j] = G_T[i, j]
+                for j in range(n_c):
+                    G_b[m, i, j] = -G_Y[i, j]
+            surely_convex = surely_convex and _has_factor(H_y[m], convex)
+    return T, Y_neg, H_y, G_y, H_b, G_b, regular, surely_convex
+
+
+@compiled
+def _eliminate(C, keep, independent, T, Y_neg):
+    """T and -Y of one C, by LU as `condense._eliminate_one`; whether there are such."""
+    n_c, n_z = C.shape
+    n_y, n_rest = n_z - n_c, n_z - keep
+    factors, order, stays = np.empty((n_rest, n_c)), np.arange(n_z), np.ones(n_z, np.bool_)
+    for i in range(n_c):
+        for j in range(n_rest):
+            factors[j, i] = C[i, keep + j]
+    for k in range(n_c):
+        pivot, size = k, 0.0
+        for j in range(n_rest):
+            size += C[k, keep + j] ** 2
+        for j in range(k + 1, n_rest):
+            if abs(factors[j, k]) > abs(factors[pivot, k]):
+                pivot = j
+        if not abs(factors[pivot, k]) > independent * math.sqrt(size):
+            return False
+        if pivot != k:
+            for i in range(n_c):
+                factors[k, i], factors[pivot, i] = factors[pivot, i], factors[k, i]
+            order[keep + k], order[keep + pivot] = order[keep + pivot], order[keep + k]
+        stays[order[keep + k]] = False
+        for j in range(k + 1, n_rest):
+            factors[j, k] /= factors[k, k]
+            for i in range(k + 1, n_c):
+                factors[j, i] -= factors[j, k] * factors[k, i]
+    # -C of the columns that stay, and the unit: solved for by the dependent columns, which are the
+    # transpose of the first n_c rows of L times U.
+    right, k = np.zeros((n_c, n_z)), 0
+    for j in range(n_z):
+        if stays[j]:
+            T[j, k] = 1.0
+            for i in range(n_c):
+                right[i, k] = -C[i, j]
+            k += 1
+    for i in range(n_c):
+        right[i, n_y + i] = 1.0
+        add_product(right[i], -factors[:i, i], right)
+        for j in range(n_z):
+            right[i, j] /= factors[i, i]
+    for i in range(n_c - 1, -1, -1):
+        add_product(right[i], -factors[i + 1 : n_c, i], right[i + 1 :])
+        dependent = order[keep + i]
+        for j in range(n_y):
+            T[dependent, j] = right[i, j]
+        for j in range(n_c):
+            Y_neg[dependent, j] = -right[i, n_y + j]
+    return True
+
+
+@compiled
+def _times(left, right, diagonal):
+    if not diagonal:
+        return np.dot(left, right)
+    product = np.empty(right.shape)
+    for i in range(right.shape[0]):
+        for j in range(right.shape[1]):
+            product[i, j] = left[i, i] * right[i, j]
+    return product
+
+
+@compiled
+def _has_factor(H, convex):
+    """`condense._has_factor`."""
+    shift = 0.0
+    for j in range(len(H)):
+        shift = max(shift, H[j, j])
+    L = H.copy()
+    for j in range(len(H)):
+        L[j, j] += convex * (1.0 + shift)
+    return _factorise(L)
+
+
+@compiled
+def _factorise(L):
+    """Put Cholesky's factor into the lower triangle; whether there is one."""
+    for j in range(len(L)):
+        for k in range(j):
+            for i in range(j, len(L)):
+                L[i, j] -= L[j, k] * L[i, k]
+        if not L[j, j] > 0:
+            return False
+        root = math.sqrt(L[j, j])
+        for i in range(j, len(L)):
+            L[i, j] /= root
+    return True
+
+
+@compiled
+def forces(H, G):
+    """The transposes of `solvers.recall._Forces`: what g and lam do to (v, y).
+
+    ``rise`` ``(M, d, d + r)`` and ``push`` ``(M, r, d + r)``; NaN where H has no Cholesky factor.
+    """
+    M, r, d = G.shape
+    rise, push = np.full((M, d, d + r), np.nan), np.full((M, r, d + r), np.nan)
+    for m in range(M):
+        L, inverse = H[m].copy(), np.eye(d)
+        if not _factorise(L):
+            continue
+        for i in range(d):
+            add_product(inverse[i], -L[i, :i], inverse)
+            inverse[i] /= L[i, i]
+        for i in range(d - 1, -1, -1):
+            add_product(inverse[i], -L[i + 1 :, i], inverse[i + 1 :])
+            inverse[i] /= L[i, i]
+        y = np.dot(G[m], inverse)
+        K = np.dot(y, G[m].T)
+        for i in range(d):
+            rise[m, i, :d] = inverse[i]
+            for j in range(r):
+                rise[m, i, d + j] = y[j, i]
+        for j in range(r):
+            push[m, j, :d] = y[j]
+            push[m, j, d:] = K[j]
+    return rise, push
+
+
+@compiled
+def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
+    """rows, others, H, G, matrix, constant, z_0 and w of `condense.Reduced`.
+
+    The arguments are those of `condense.Condensed` and of the QPs, whose G is ``G_z``.
+    """
+    M, n_z, n_y = T.shape
+    n_g, n_c, d = G.shape[1], b.shape[1], n_y - n_f
+    last, r, s = _last_entered(G, G_z, T, lb, ub, enters), 0, 0
+    for i in range(n_g):
+        r += last[i] > n_f
+    rows, others, w_v = np.empty(r, np.int64), np.empty(n_g - r, np.int64), np.empty((len(w), r))
+    for i in range(n_g):
+        if last[i] > n_f:
+            rows[i - s] = i
+            for k in range(len(w)):
+                w_v[k, i - s] = w[k, i]
+        else:
+            others[s] = i
+            s += 1
+    H_v, G_v, matrix = np.empty((M, d, d)), np.empty((M, r, d)), np.empty((M, n_f, d + 2 * r))
+    # What q makes of g, and what b makes of g, of y and of z.
+    by_q, by_b = np.empty((M, n_z, d)), np.empty((M, n_c, d + r + n_z))
+    for m in range(M):
+        for i in range(d):
+            for j in range(d):
+                H_v[m, i, j] = H[m, n_f + i, n_f + j]
+            for j in range(n_f):
+                matrix[m, j, i] = H[m, n_f + i, j]
+            for j in range(n_c):
+                by_b[m, j, i] = H_b[m, n_f + i, j]
+        for i in range(r):
+            for j in range(d):
+                G_v[m, i, j] = G[m, rows[i], n_f + j]
+            for j in range(n_f):
+                matrix[m, j, d + i] = matrix[m, j, d + r + i] = -G[m, rows[i], j]
+            for j in range(n_c):
+                by_b[m, j, d + i] = G_b[m, rows[i], j]
+        for i in range(n_z):
+            for j in range(d):
+                by_q[m, i, j] = T[m, i, n_f + j]
+            for j in range(n_c):
+                by_b[m, j, d + r + i] = -Y_neg[m, i, j]
+    count = max(max(len(q), len(b)), max(len(lb), len(ub)))
+    if M != 1:
+        count = len(group)
+        q, b = _repeated(q, count), _repeated(b, count)
+    of_q, of_b = products(q, by_q, group, False), products(b, by_b, group, False)
+    constant, z_0 = np.empty((count, d + 2 * r)), np.empty((len(b), n_z))
+    for k in range(count):
+        k_q, k_b, k_lb, k_ub = k % len(q), k % len(b), k % len(lb), k % len(ub)
+        for i in range(d):
+            constant[k, i] = of_q[k_q, i] + of_b[k_b, i]
+        for i in range(r):
+            y = of_b[k_b, d + i]
+            constant[k, d + i] = lb[k_lb, rows[i]] - y
+            constant[k, d + r + i] = ub[k_ub, rows[i]] - y
+    for k in range(len(b)):
+        for i in range(n_z):
+            z_0[k, i] = of_b[k, d + r + i]
+    return rows, others, H_v, G_v, matrix, constant, z_0, w_v
+
+
+@compiled
+def _repeated(vectors, count):
+    """A row for each QP."""
+    repeated = np.empty((count, vectors.shape[1]))
+    for i in range(count):
+        repeated[i] = vectors[i % len(vectors)]
+    return repeated
+
+
+@compiled
+def _last_entered(G, G_z, T, lb, ub, enters):
+    """How many variables there are up to the last that enters a row of G ``(M, n_g, n_y)``.
+
+    Zero for a row without a finite bound. Rounding in the elimination leaves traces of variables
+    that a row does not contain. A row that C implies has nothing else, so their sizes are compared
+    with those before it was eliminated, of G_z and T.
+    """
+    last = np.zeros(G.shape[1], np.int64)
+    for j in range(len(last)):
+        bounded = False
+        for i in range(max(len(lb), len(ub))):
+            bounded = bounded or lb[i % len(lb), j] > -np.inf or ub[i % len(ub), j] < np.inf
+        if not bounded:
+            continue
+        for m in range(len(G)):
+            whole = 0.0
+            for k in range(G_z.shape[2]):
+                if G_z[m, j, k] != 0:
+                    whole += abs(G_z[m, j, k]) * np.abs(T[m, k]).sum()
+            for k in range(G.shape[2] - 1, last[j] - 1, -1):
+                if abs(G[m, j, k]) > enters * whole:
+                    last[j] = k + 1
+                    break
+    return last

@@ -1,0 +1,53 @@
+"""Backends, one a file, and the chain that makes certified solutions (eq:qp2, eq:qp3) of claims.
+
+A backend is a function ``solve(qps: SoftQPs) -> Answer``. To add one, write its file and name it in
+`BACKENDS`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from functools import partial
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.qp.pipeline.batch import SoftQPs
+from torch_qpmpc.qp.solvers import daqp, interior_point, proxqp, qpsolvers
+from torch_qpmpc.qp.solvers.base import Answer
+
+Backend = Callable[[SoftQPs], Answer]
+
+BACKENDS: dict[str, Backend] = {
+    "proxqp": proxqp.solve,
+    "daqp": daqp.solve,
+    "torch": interior_point.solve,
+}
+
+
+def backend(name: str) -> Backend:
+    """The backend called ``name``; `QPError` if there is none."""
+    if name in BACKENDS:
+        return BACKENDS[name]
+    if isinstance(name, str) and name.startswith("qpsolvers:"):
+        wrapped = name.removeprefix("qpsolvers:")
+        qpsolvers.check_available(wrapped)
+        return partial(qpsolvers.solve, name=wrapped)
+    close = difflib.get_close_matches(str(name), BACKENDS, n=1)
+    raise QPError.expected(
+        "solver",
+        repr(name),
+        f"one of {', '.join(BACKENDS)}, qpsolvers:NAME",
+        f"Did you mean {close[0]!r}?" if close else "",
+    )
+
+
+#: The solvers that give up soonest, and solve what ProxQP does.
+FALLBACKS = ("daqp", "torch")
+
+
+def fallbacks(name: str) -> list[Backend]:
+    """Return the backends that solve, cold, what the certificate rejects of another one."""
+    return [BACKENDS[other] for other in FALLBACKS if other != name]
+
+
+__all__ = ["BACKENDS", "Answer", "Backend", "backend", "fallbacks"]

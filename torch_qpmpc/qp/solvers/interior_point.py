@@ -1,0 +1,208 @@
+"""A primal-dual interior point for a whole batch, in pure torch: the same code on CPU and GPU.
+
+The soft rows need no slack variables. Each of a row's sides, ``y <= u`` and ``l <= y``, has a
+distance s, an excess t and a multiplier lam, and what is left of its weight, mu:
+
+    u - y = s - t,     s lam = 0,     t mu = 0,     lam + mu = w,     s, t, lam, mu >= 0.
+
+Mehrotra's method (1992, doi:10.1137/0802028) lets both products shrink together. Eliminated side by
+side, they leave ``(H + G'DG) dv = right`` with the diagonal ``1 / D = s / lam + t / mu``: an
+iteration costs one batched product and one Cholesky factor of d x d, used twice. An infinite weight
+or bound is a huge one, whose pair then is inert; a hard equality, which has no interior, is held by
+a penalty and a multiplier of its own. At the end the active set is read off and solved for (see
+`active_set`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.qp.pipeline.batch import SoftQPs
+from torch_qpmpc.qp.solvers.active_set import SETTLED, Found, settle
+from torch_qpmpc.qp.solvers.base import Answer
+from torch_qpmpc.qp.solvers.batched import HUGE, BatchedQPs
+
+#: Gaps, relative to a typical cost, at which the active set is tried; and iterations up to there.
+TARGETS = ((1e-4, 40), (1e-8, 15), (1e-12, 10))
+LAST_STEPS = 3
+#: Part of the way to the boundary that a step may go.
+STEP = 0.995
+#: A side's distance begins with at least this part of the row's width, ..
+ROOM = 0.25
+#: .. but with the true one if it is soft and the QP has a row violated by more than this part.
+MILD = 0.3
+#: After so many steps, which may then be circling, one aims at no less than this part of the gap.
+LATE, CAUTION = 20, 0.3
+#: Solved QPs leave the computation when no more than this part is unsolved.
+SHRINK = 0.75
+
+
+@torch.no_grad()
+def solve(qps: SoftQPs) -> Answer:
+    """Solve a batch on its own device.
+
+    The answers are finite, but those of infeasible and unbounded QPs are not solutions: that is for
+    the certificate to say.
+    """
+    if not qps.w.shape[-1]:  # a row without weight, since reductions over no rows have no value
+        none, row = qps.g.new_zeros(len(qps.g), 1), torch.zeros_like(qps.H[:, :1])
+        answer = solve(replace(qps, G=row, l=none, u=none, w=none))
+        return replace(answer, lam=answer.lam[:, 1:])
+    form = BatchedQPs.of(qps)
+    found, todo = Found.nothing(form), torch.arange(len(form), device=qps.g.device)
+    point = _begin(form)
+    for target, limit in TARGETS:
+        if not len(todo):
+            break
+        before = point.steps.clone()
+        _follow(form, point, target, limit)
+        last = settle(form, point.v, point.lam, LAST_STEPS)
+        found.offer(todo, last.v, last.lam, last.residual)
+        found.steps[todo] += last.steps + point.steps - before
+        going = ~(last.residual <= SETTLED)
+        form, point, todo = form.take(going), point.take(going), todo[going]
+    return Answer(found.v, found.lam, found.steps)
+
+
+@dataclass
+class Point:
+    """Where an interior point is.
+
+    v ``(B, d)``; ``primal`` and ``dual``, the pairs ``(B, 2, 2, r)`` of (s, t) with (lam, mu) for
+    (upper, lower) sides, with signs that let one formula serve all (see `_begin`), and the sides'
+    ``bound`` ``(B, 2, r)``. Hard equalities, ``y = level``, have the penalty ``hold`` and the
+    multiplier ``equality``, ``(B, r)``, zero in other rows. ``astray`` is what is left of the
+    initial error in the linear equations, ``steps`` counts, ``lost`` is where arithmetic failed.
+    """
+
+    v: Tensor
+    primal: Tensor
+    dual: Tensor
+    bound: Tensor
+    level: Tensor
+    hold: Tensor
+    equality: Tensor
+    astray: Tensor
+    steps: Tensor
+    lost: Tensor
+
+    @property
+    def lam(self) -> Tensor:
+        """Multipliers of the rows, ``(B, r)``, positive at the upper bound."""
+        return self.dual[:, 0].sum(1) + self.equality
+
+    def take(self, index: Tensor) -> Point:
+        """A copy of the points at ``index``."""
+        return Point(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def put(self, index: Tensor, other: Point) -> None:
+        for field in fields(self):
+            getattr(self, field.name)[index] = getattr(other, field.name)
+
+
+def _begin(qps: BatchedQPs) -> Point:
+    """v = 0, and s, t, lam and mu such that all products are equal.
+
+    Upper sides store (s, -t) and (lam, -mu), lower ones (-s, t) and (-lam, mu): then ``bound - y``
+    is the sum of the first pair on either side, a step in lam adds to all four duals, and the
+    products and ratios of the pairs are positive.
+    """
+    dead, equal = qps.w == 0, (qps.lower == qps.upper) & (qps.w == HUGE)
+    bound = torch.stack((qps.upper, qps.lower), 1)
+    sign = torch.tensor([[1.0], [-1.0]], dtype=bound.dtype, device=bound.device)
+    bound = torch.where((dead | equal).unsqueeze(1), sign * HUGE, bound)
+    cap = qps.w.masked_fill(dead, 1).unsqueeze(1)
+    hard, room, width = cap == HUGE, sign * bound, qps.width.unsqueeze(1)
+    short = (-room).clamp(min=0)
+    mild = (short <= MILD * width).all(-1).all(-1)[:, None, None]
+    charge = torch.where(hard, qps.force.unsqueeze(1), cap) * short
+    product = qps.cost[:, None, None] + charge.amax((1, 2), keepdim=True) * ~mild
+    room = torch.where(mild | hard, room.maximum(ROOM * width), room)
+    # The solution of s - t = room and s lam = t (w - lam) = product, without cancellation.
+    offset = product / cap
+    root = torch.hypot(room, 2 * offset)
+    s, t = (root + room) / 2 + offset, (root - room) / 2 + offset
+    primal = torch.stack((sign * s, -sign * t), 1)
+    return Point(
+        v=torch.zeros_like(qps.g),
+        primal=primal,
+        dual=product.unsqueeze(1) / primal,
+        bound=bound,
+        level=torch.where(equal, qps.lower, 0),
+        hold=qps.penalty * equal,
+        equality=torch.zeros_like(qps.w),
+        astray=torch.ones_like(qps.cost),
+        steps=torch.zeros_like(qps.cost, dtype=torch.int64),
+        lost=torch.zeros_like(qps.cost, dtype=torch.bool),
+    )
+
+
+def _follow(qps: BatchedQPs, end: Point, target: float, limit: int) -> None:
+    """Move ``end`` until the gaps are below ``target``, for no more than ``limit`` iterations."""
+    todo, point = torch.arange(len(qps), device=end.v.device), end
+    for _ in range(limit):
+        products = point.primal * point.dual
+        gap = products.sum((1, 2, 3))
+        going = ((gap > target * qps.cost) | (point.astray > target)) & ~point.lost
+        count = int(going.sum())
+        if not count:
+            break
+        if count <= SHRINK * len(todo):
+            if point is not end:
+                end.put(todo, point)
+            qps, point, todo = qps.take(going), point.take(going), todo[going]
+            products, gap, going = products[going], gap[going], going[going]
+        _step(qps, point, products, gap, going)
+    if point is not end:
+        end.put(todo, point)
+
+
+def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: Tensor) -> None:
+    """One iteration of Mehrotra's method, in place, for the QPs that are ``going``."""
+    v, primal, dual, hold = point.v, point.primal, point.dual, point.hold
+    y, inverse = qps.rows(v), dual.reciprocal()
+    ratio = primal * inverse
+    D = ratio.sum(1).reciprocal_().minimum(qps.penalty.unsqueeze(1))
+    factor = qps.factor(D.sum(1) + hold)
+    short = point.level - y
+    right = qps.pull(hold * short - point.lam) - qps.bend(v) - qps.g
+    room = point.bound - y.unsqueeze(1)
+
+    def direction(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """dv, dy = G dv and dlam = D (dy - offset) that solve the Newton equations."""
+        total = right + qps.pull((D * offset).sum(1))
+        dv = torch.cholesky_solve(total.unsqueeze(-1), factor).squeeze(-1)
+        dy = qps.rows(dv)
+        return dv, dy, (dy.unsqueeze(1) - offset).mul_(D).unsqueeze(1)
+
+    # The predictor aims at products of zero. How far that goes decides what to aim at instead.
+    _, _, dlam = direction(room)
+    relative = inverse * dlam
+    low, high = relative.flatten(1).amin(1), relative.flatten(1).amax(1)
+    reach = torch.maximum(1 + high, -low).clamp(min=1).reciprocal()
+    second = relative.addcmul_(relative, relative)
+    left = (1 - reach) * gap - reach.square() * products.mul_(second).sum((1, 2, 3))
+    share = ((left / gap).clamp(0, 1) ** 3).maximum(CAUTION * (point.steps > LATE))
+    centre = share * gap / products[0].numel()
+
+    # The corrector aims at products of ``centre``, with the predictor's second-order term.
+    goal = second.mul_(primal).addcmul_(inverse, centre[:, None, None, None])
+    dv, dy, dlam = direction(room - goal.sum(1))
+    change = goal.sub_(primal).addcmul_(ratio, dlam, value=-1)
+    ends = (change / primal).flatten(1).amin(1), inverse.mul_(dlam).flatten(1).amin(1)
+    ahead = STEP / -torch.minimum(*ends).clamp(max=-STEP)
+    failed = ~ahead.isfinite()
+    if failed.any():
+        point.lost |= failed
+        for part in (dv, dy, dlam, change, ahead):
+            part[failed] = 0
+    ahead *= going
+    v.addcmul_(ahead[:, None], dv)
+    primal.addcmul_(ahead[:, None, None, None], change)
+    dual.addcmul_(ahead[:, None, None, None], dlam)
+    point.equality.addcmul_(ahead[:, None], hold * (dy - short))
+    point.astray.mul_(1 - ahead)
+    point.steps += going

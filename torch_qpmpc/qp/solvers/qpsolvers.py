@@ -1,0 +1,56 @@
+"""Any solver of the `qpsolvers` package, as a second opinion: ``solver="qpsolvers:NAME"``."""
+
+from __future__ import annotations
+
+import numpy as np
+import qpsolvers
+import scipy.sparse as sp
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.qp.pipeline.batch import SoftQPs
+from torch_qpmpc.qp.solvers.base import Answer
+from torch_qpmpc.qp.solvers.split_slack import SplitSlack
+
+
+def check_available(name: str) -> None:
+    """Raise `QPError` unless qpsolvers has the solver called ``name`` installed."""
+    if name not in qpsolvers.available_solvers:
+        raise QPError.expected(
+            "solver",
+            f"'qpsolvers:{name}'",
+            f"one of {sorted(qpsolvers.available_solvers)} after 'qpsolvers:'",
+            f"Install the solver's package, for example with pip install qpsolvers[{name}].",
+        )
+
+
+def solve(qps: SoftQPs, *, name: str) -> Answer:
+    """Solve a batch one by one."""
+    arrays = qps.arrays
+    form = SplitSlack.of(arrays)
+    v, lam = np.zeros_like(arrays.g), np.zeros_like(arrays.l)
+    sparse = name in qpsolvers.sparse_solvers
+    for i, m in enumerate(arrays.group):
+        lower, upper = form.bounds(arrays.l[i], arrays.u[i], arrays.w[i])
+        rows = form.rows[m][: form.n_rows]
+        has_upper = np.flatnonzero(np.isfinite(upper[: form.n_rows]))
+        has_lower = np.flatnonzero(np.isfinite(lower[: form.n_rows]))
+        one_sided = sp.csc_matrix(sp.vstack([rows[has_upper], -rows[has_lower]]))
+        box = np.full(form.n_v, np.inf)
+        problem = qpsolvers.Problem(
+            form.H[m] if sparse else form.H[m].toarray(),
+            form.gradient(arrays.g[i], arrays.w[i]),
+            one_sided if sparse else one_sided.toarray(),
+            np.concatenate([upper[has_upper], -lower[has_lower]]),
+            lb=np.concatenate([-box, lower[form.n_rows :]]),
+            ub=np.concatenate([box, upper[form.n_rows :]]),
+        )
+        try:
+            solution = qpsolvers.solve_problem(problem, solver=name)
+        except (qpsolvers.QPError, ValueError, ArithmeticError):
+            continue  # The zeros that stand for it do not pass the certificate.
+        if solution.x is None or solution.z is None:
+            continue
+        v[i] = solution.x[: form.n_v]
+        lam[i, has_upper] += solution.z[: len(has_upper)]
+        lam[i, has_lower] -= solution.z[len(has_upper) :]
+    return Answer.on(qps.device, v, lam, np.zeros(len(v), dtype=np.int64))

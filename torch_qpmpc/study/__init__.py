@@ -1,0 +1,1 @@
+"""Finished runs, tabulated and drawn."""

@@ -1,0 +1,205 @@
+"""Tables and figures of finished runs: ``python -m torch_qpmpc.report RUNS_FOLDER``.
+
+They go to RUNS_FOLDER/report, a folder for each sweep: the paper's four figures, with intervals
+over seeds (learning-NOISE.png are its figures 1 and 3, constraints-NOISE.png its 2 and 4),
+closed-loop paths, slices of value and policy, what the learned C means, and, where settings were
+swept, the frontier and the ablations.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from torch_qpmpc.envs.closed_loop import gap_text
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.plots import (
+    ablation_figure,
+    constraints_figure,
+    frontier_figure,
+    learning_figure,
+    meaning_figure,
+    policies_figure,
+    readme_figure,
+    trajectories_figure,
+)
+from torch_qpmpc.study.runs import CASES, REAL_GAP, collect, has_real
+from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
+
+#: So many settings fit side by side in a figure.
+SIDE_BY_SIDE = 8
+CAPTION = f"""\
+Closed gap: median and 95% interval (bootstrapped over seeds) of the runs with a real gap, J_start -
+J_true_model >= {REAL_GAP:.0f}; how many of all these are. The others are medians over all runs.
+J: from the start to what was learned, and in brackets that of the true model. Distance: of C's
+predictions to those of the nearest time-invariant MPC scheme, as a share. Zeros: the share of C's
+entries above the band that are exactly zero. Prediction error: of one step, root mean square, with
+the corrupted (A, B), and with that scheme's; how often the latter is the smaller."""
+
+
+def runs_table(frame: pd.DataFrame) -> str:
+    """Every run with its two ends, as Markdown."""
+    head = ["sweep", "noise", "case", "seed", "J_start", "J_final", "J_true_model", "closed_gap"]
+    head += [
+        "canonical_distance",
+        "prediction_error",
+        "prediction_error_start",
+        "unsolved",
+        "train_seconds",
+    ]
+    digits: dict[str, str] = dict.fromkeys(
+        ("J_start", "J_final", "J_true_model", "train_seconds"), ".1f"
+    )
+    digits["canonical_distance"] = ".3f"
+    digits |= dict.fromkeys(("prediction_error", "prediction_error_start"), ".4f")
+    ends = (frame[name] for name in ("closed_gap", "J_start", "J_final", "J_true_model"))
+    gaps = [gap_text(*values) for values in zip(*ends, strict=True)]
+    rows = frame.assign(case=frame["label"], closed_gap=gaps)[head].itertuples(index=False)
+    lines = [
+        [f"{value:{digits.get(name, '')}}" for name, value in zip(head, row, strict=True)]
+        for row in rows
+    ]
+    return table(head, lines)
+
+
+def cases_table(sweep: pd.DataFrame) -> str:
+    """A sweep by noise and case, as Markdown."""
+    lines = []
+    for noise, label in dict.fromkeys(zip(sweep["noise"], sweep["label"], strict=True)):
+        runs = sweep.query(f"noise == {noise!r} and label == {label!r}")
+        real = runs.query("real")["closed_gap"].to_numpy()
+        median = runs.median(numeric_only=True)
+        nearer = (runs["prediction_error"] < runs["prediction_error_start"]).sum()
+        gap = "-"
+        if len(real):
+            low, high = bootstrap_interval([real])
+            gap = f"{pd.Series(real).median():.3f} [{low:.3f}, {high:.3f}]"
+        errors = f"{median['prediction_error_start']:.3f} to {median['prediction_error']:.3f}"
+        lines.append(
+            [
+                noise,
+                label,
+                f"{gap} ({len(real)} of {len(runs)})",
+                _ends(median, "J"),
+                _ends(median, "J_discounted"),
+                f"{median['canonical_distance']:.3f}",
+                f"{median['zeros_above']:.2f}",
+                f"{errors} ({nearer} of {len(runs)})",
+            ]
+        )
+    head = ["noise", "case", "closed gap", "J", "J discounted", "distance", "zeros"]
+    head += ["prediction error"]
+    return table(head, lines)
+
+
+def _ends(median: pd.Series, name: str) -> str:
+    start, final, true = (median[f"{name}_{end}"] for end in ("start", "final", "true_model"))
+    return f"{start:.1f} to {final:.1f} ({true:.1f})"
+
+
+def overall(sweep: pd.DataFrame) -> str:
+    """The closed gap of the paper's learned cases together, each a stratum of the bootstrap."""
+    lines = []
+    for noise, runs in sweep.query("real").groupby("noise"):
+        cases = [runs.query(f"label == {case!r}")["closed_gap"].to_numpy() for case in CASES[1:]]
+        if not all(map(len, cases)):
+            continue
+        low, high = bootstrap_interval(cases, interquartile_mean)
+        mean = interquartile_mean(pd.Series([gap for case in cases for gap in case]).to_numpy())
+        lines.append(f"{noise} noise {mean:.3f} [{low:.3f}, {high:.3f}]")
+    if not lines:
+        return ""
+    return f"Interquartile mean over the four cases that learn C: {'; '.join(lines)}."
+
+
+def has_ablations(sweep: pd.DataFrame) -> bool:
+    """Whether it compares ablations, of runs that had a gap to close."""
+    return "ablation" in sweep and len({*sweep["ablation"]}) > 1 and has_real(sweep)
+
+
+def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
+    """The figures of a sweep, each with its name."""
+    if len({*sweep["label"]}) <= SIDE_BY_SIDE:
+        for noise, runs in sweep.groupby("noise"):
+            yield f"learning-{noise}", learning_figure(runs)
+            yield f"constraints-{noise}", constraints_figure(runs.query("constraint != 'fixed'"))
+            yield f"trajectories-{noise}", trajectories_figure(runs)
+            if runs["run"].iloc[0].start.n_x > 1:
+                yield f"policies-{noise}", policies_figure(runs)
+        yield "meaning", meaning_figure(sweep)
+    elif has_real(sweep):
+        yield "frontier", frontier_figure(sweep)
+    if has_ablations(sweep):
+        yield "ablation", ablation_figure(sweep)
+
+
+def write(frame: pd.DataFrame, folder: Path) -> str:
+    """Everything into ``folder``; returns the tables by case."""
+    parts = []
+    for name, sweep in frame.groupby("sweep"):
+        place = folder / str(name)
+        place.mkdir(parents=True, exist_ok=True)
+        links = []
+        for title, figure in figures(sweep):
+            figure.savefig(place / f"{title}.png", dpi=100)
+            links.append(f"![{title}]({(Path(str(name)) / title).as_posix()}.png)")
+        parts.append(((f"## {name}", section(sweep)), links))
+    tables = "\n\n".join("\n\n".join(text) for text, _ in parts)
+    whole = "\n\n".join("\n\n".join([*text, *links]) for text, links in parts)
+    (folder / "report.md").write_text(f"{CAPTION}\n\n{whole}\n", encoding="utf-8")
+    (folder / "runs.md").write_text(runs_table(frame) + "\n", encoding="utf-8")
+    return f"{CAPTION}\n\n{tables}"
+
+
+def section(sweep: pd.DataFrame) -> str:
+    """A sweep's table, and what its learned cases come to."""
+    return "\n\n".join(text for text in (cases_table(sweep), overall(sweep)) if text)
+
+
+def write_readme(frame: pd.DataFrame, readme: Path, name: str) -> None:
+    """The tables between the markers ``name`` of a README, and notebooks/NAME.png beside it."""
+    text = readme.read_text(encoding="utf-8")
+    tables = [f"**{title}**\n\n{section(sweep)}" for title, sweep in frame.groupby("sweep")]
+    readme.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), name), encoding="utf-8")
+    first = max(frame.groupby("sweep"), key=lambda pair: pair[1]["closed_gap"].median())[1]
+    headline(first).savefig(readme.parent / "notebooks" / f"{name}.png", dpi=90)
+
+
+def headline(sweep: pd.DataFrame) -> Figure:
+    """A sweep in one figure."""
+    if has_ablations(sweep):
+        return ablation_figure(sweep)
+    if len({*sweep["label"]}) > SIDE_BY_SIDE:
+        return frontier_figure(sweep)
+    return readme_figure(sweep)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m torch_qpmpc.report",
+        description="Tables and figures of finished runs.",
+    )
+    parser.add_argument(
+        "folder", type=Path, metavar="RUNS_FOLDER", help="searched with all its subfolders"
+    )
+    parser.add_argument(
+        "--readme", type=Path, help="write the tables between its lines <!-- RUNS_FOLDER -->, too"
+    )
+    options = parser.parse_args(arguments)
+    try:
+        frame = collect(options.folder)
+        if options.readme:
+            write_readme(frame, options.readme, options.folder.resolve().name)
+        print(write(frame, options.folder / "report"))
+    except QPError as error:
+        raise SystemExit(str(error)) from None
+    print(f"\n{options.folder / 'report'}")
+
+
+if __name__ == "__main__":
+    main()

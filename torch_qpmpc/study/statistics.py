@@ -1,0 +1,91 @@
+"""Robust averages over seeds, and how sure they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from torch_qpmpc.checks import check_number, check_whole
+from torch_qpmpc.errors import QPError
+
+
+def interquartile_mean(x: np.ndarray, axis: int = 0) -> np.ndarray:
+    """The mean of the middle half along ``axis``: of an order statistic, the part that lies there.
+
+    It uses more of the data than the median, and like it does not see a few outliers.
+
+    Args:
+        x: ``(.., n, ..)``; where n is no multiple of four, two values count in part.
+
+    Example:
+        >>> import numpy as np
+        >>> from torch_qpmpc.study.statistics import interquartile_mean
+        >>> float(interquartile_mean(np.array([0.0, 1.0, 3.0, 1000.0])))
+        2.0
+    """
+    try:
+        ordered = np.sort(np.moveaxis(np.asarray(x, dtype=float), axis, -1), axis=-1)
+    except ValueError as error:  # also of an axis that there is not
+        raise QPError.expected("x", f"{error}", f"numbers along axis {axis}") from error
+    if not ordered.shape[-1]:
+        raise QPError.expected("x", "no values", f"at least one along axis {axis}")
+    n = ordered.shape[-1]
+    edges = np.clip(np.arange(n + 1), n / 4, 3 * n / 4)
+    return ordered @ np.diff(edges) / (n / 2)
+
+
+def bootstrap_interval(
+    strata: Sequence[np.ndarray],
+    statistic: Callable[..., np.ndarray] = np.median,
+    *,
+    level: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The stratified percentile bootstrap interval of a statistic of all runs.
+
+    Each stratum, as the seeds of one case, is resampled by itself, so that every case keeps its
+    number of runs.
+
+    Args:
+        strata: arrays ``(n_i, ...)``.
+        statistic: of an array, along ``axis``.
+        level: of confidence.
+        resamples, seed: of the bootstrap.
+
+    Returns:
+        The lower and the upper end, each ``(...)``.
+
+    Raises:
+        QPError: a stratum is empty, or an argument is of another kind.
+
+    Example:
+        >>> import numpy as np
+        >>> from torch_qpmpc.study.statistics import bootstrap_interval
+        >>> low, high = bootstrap_interval([np.full(5, 0.9), np.full(7, 0.9)])
+        >>> float(low), float(high)
+        (0.9, 0.9)
+    """
+    if isinstance(strata, np.ndarray) or not isinstance(strata, Sequence):
+        got = type(strata).__name__
+        raise QPError.expected("strata", got, "a list of arrays", "Pass [x] for a single stratum.")
+    strata = [np.asarray(stratum) for stratum in strata]
+    if any(s.ndim == 0 or s.shape[1:] != strata[0].shape[1:] for s in strata):
+        shapes = [s.shape for s in strata]
+        raise QPError.expected("strata", f"shapes {shapes}", "(n_i, ...) with ... the same for all")
+    if not callable(statistic):
+        raise QPError.expected("statistic", repr(statistic), "a function", "Such as numpy.median.")
+    check_number("level", level, lambda x: 0 < x < 1, "a level in (0, 1)", "95% is 0.95.")
+    check_whole("resamples", resamples, 1)
+    check_whole("seed", seed, 0)
+    if not strata or not all(len(stratum) for stratum in strata):
+        sizes = [len(stratum) for stratum in strata]
+        raise QPError.expected("strata", f"sizes {sizes}", "at least one run in each")
+    rng = np.random.default_rng(seed)
+    drawn = [
+        stratum[rng.integers(len(stratum), size=(resamples, len(stratum)))] for stratum in strata
+    ]
+    values = statistic(np.concatenate(drawn, axis=1), axis=1)
+    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    return low, high
