@@ -109,3 +109,17 @@ def test_small_and_large_contradictions_are_infeasible(size):
     small = in_size(twice, equalities=size, variables=size)
     solution = solve_qp(small.qp, small.fixed, on_failure="mask")
     assert (solution.status == Status.INFEASIBLE).all()
+
+
+def test_what_is_solved_again_does_not_see_the_matrices_of_invalid_qps(solver):
+    """Of three QPs whose units are too large, one has NaN in its matrices."""
+    options = {"stage_weight": [1.0, 0.1, 0.01], "action_bounds": ([-1.0], [1.0])}
+    A, B, far = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], ([-1e6] * 2, [1e6] * 2)
+    qp = QPMPC.from_model(A, B, 10, state_bounds=far, **options).quadratic_program()
+    H = qp.H.detach().expand(3, -1, -1).clone()
+    H[1, 0, 0] = torch.nan
+    s = torch.tensor([[1.0, -0.5], [0.0, 0.0], [0.1, 0.2]]).double()
+    three = replace(qp, H=H, check_values=False)
+    solution = solve_qp(three, s, solver=solver, on_failure="mask")
+    assert solution.status.tolist() == [0, Status.INVALID_DATA, 0]
+    assert_close(solution.value[[0, 2]], torch.tensor([2.28345503, 0.05404678]).double())

@@ -118,7 +118,8 @@ def _settled(
     accepted = raw.accepted().nonzero().squeeze(-1)
     failed = accepted[_certify_at(programs, raw, accepted)]
     if len(failed):
-        again = _Chain(programs.take(failed), keep).run(solver, None)
+        # Matrices of QPs that are left out may be invalid.
+        again = _Chain(programs.without_nan().take(failed), keep).run(solver, None)
         raw.put(failed, again)
         scaled, again = units.scaled(programs), units.inverse.restored(programs, raw)
         failed = failed[raw.accepted()[failed]]
