@@ -143,7 +143,7 @@ def test_every_status_explains_itself(status):
     assert len(status.explanation) > 20
 
 
-@pytest.mark.parametrize("module", ["qp", "mpc"])
+@pytest.mark.parametrize("module", ["qp.program", "mpc.module"])
 def test_the_examples_in_the_docstrings_run(module):
     results = doctest.testmod(importlib.import_module(f"torch_qpmpc.{module}"))
     assert results.attempted > 0
