@@ -21,8 +21,8 @@ EPS_ABS = 1e-9
 #: ProxQP's default, 1e-4, calls one soft (always feasible) QP in fifty infeasible.
 EPS_INFEASIBLE = 1e-12
 #: Its defaults, 10,000 x 1,500, can keep one infeasible QP busy for half a minute. Others solve
-#: sooner what takes more than these.
-MAX_ITER, MAX_ITER_IN = 30, 25
+#: sooner what takes more than these. (An inner limit of 25 made ProxQP hang.)
+MAX_ITER, MAX_ITER_IN = 30, 100
 #: Of 10 by default, which take a tenth of the time and save no iteration.
 REFINEMENTS = 2
 
