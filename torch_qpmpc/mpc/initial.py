@@ -49,7 +49,6 @@ def theta(
     **_: Any,
 ) -> tuple[Layout, dict[str, Tensor]]:
     """All parts of theta by name, for the arguments of `QPMPC`; w is inf on hard rows."""
-    n_x, n_u, horizon, seed = map(int, (n_x, n_u, horizon, seed))  # may be NumPy's
     D = _linear_rows("constraints", constraints, n_x + n_u)
     D_f = _linear_rows("terminal_constraints", terminal_constraints, n_x)
     layout = Layout(n_x, n_u, horizon, len(D[0]), len(D_f[0]))

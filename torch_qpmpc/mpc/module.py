@@ -16,9 +16,7 @@ from torch.nn.utils import parametrize
 
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc import initial as starts
-from torch_qpmpc.mpc import parameters as parts
-from torch_qpmpc.mpc import pickling
+from torch_qpmpc.mpc import initial, parameters, pickling
 from torch_qpmpc.mpc.cost import Cost, Discounts, diagonal_cost, discounted
 from torch_qpmpc.mpc.identity import check_identity, digest, written
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, kept
@@ -169,7 +167,7 @@ class QPMPC(nn.Module):
 
     def _start(self, learn: Collection[str]) -> None:
         given = self._arguments
-        self._layout, theta = starts.theta(**given)
+        self._layout, theta = initial.theta(**given)
         self.n_x, self.n_u, self.horizon = (given[name] for name in ("n_x", "n_u", "horizon"))
         self.n_z, self.gamma, self.hessian = self._layout.n_z, given["gamma"], given["hessian"]
         self.structure, self.step = given["structure"], given["step"]
@@ -183,9 +181,9 @@ class QPMPC(nn.Module):
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
         for name, start in theta.items():
-            parts.register(self, name, start.to(torch.float64).clone(), name in self.learned)
+            parameters.register(self, name, start.to(torch.float64).clone(), name in self.learned)
             if name in self.learned:
-                parts.keep(self, name, self._kept(name))
+                parameters.keep(self, name, self._kept(name))
 
     @classmethod
     def from_model(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
@@ -217,7 +215,7 @@ class QPMPC(nn.Module):
             >>> [tuple(part.shape) for part in mpc.model()]
             [(2, 2), (2, 1)]
         """
-        return cls.from_model(A, B, horizon, **(starts.linear_mpc(A, B, **options) | options))
+        return cls.from_model(A, B, horizon, **(initial.linear_mpc(A, B, **options) | options))
 
     def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
         """V(s) (eq:qp4), a cost to go: s ``(*batch, n_x)`` to ``(*batch,)``.
@@ -288,7 +286,7 @@ class QPMPC(nn.Module):
 
     def readable(self) -> dict[str, Tensor]:
         """The learned parts of theta, detached: what stages share, once; A, B and D for C and G."""
-        return parts.readable(self, self.learned)
+        return parameters.readable(self, self.learned)
 
     def release(self, structure: str = "free") -> None:
         """Free what a linear MPC scheme ties, in place; the values stay as they are.
@@ -310,7 +308,7 @@ class QPMPC(nn.Module):
         self._arguments = {**self._arguments, "structure": structure}
         for part in self.learned:
             if parametrize.is_parametrized(self, part) and part not in ("H", "H_f"):
-                parts.replace(self, part, self._kept(part))
+                parameters.replace(self, part, self._kept(part))
 
     @torch.no_grad()
     def project_(self) -> None:
@@ -362,14 +360,14 @@ class QPMPC(nn.Module):
         Raises:
             QPError: a learned part without a rate, or a name that is neither.
         """
-        return parts.groups(self, self.learned, rates)
+        return parameters.groups(self, self.learned, rates)
 
     def leaves(self, part: str) -> list[nn.Parameter]:
         """The parameters that an optimiser moves for a learned part: behind H its factor."""
         if part not in self.learned:
             expected = f"one of the learned parts: {', '.join(self.learned) or 'none'}"
             raise QPError.expected("part", repr(part), expected)
-        return parts.leaves(self, part)
+        return parameters.leaves(self, part)
 
     def reset_parameters(self) -> None:
         """Return theta to where the constructor put it."""
@@ -420,9 +418,9 @@ class QPMPC(nn.Module):
 
     def checked_state(self, state_dict: dict[str, Any], prefix: str) -> dict[str, Any]:
         """``state_dict``; `QPError` if it tells of another QPMPC. An older one tells nothing."""
-        key = f"{prefix}_extra_state"
-        state_dict = {key: self.get_extra_state()} | state_dict
-        check_identity(state_dict[key], self._identity())
+        key, identity = f"{prefix}_extra_state", self._identity()
+        state_dict = {key: written(identity)} | state_dict
+        check_identity(state_dict[key], identity)
         return state_dict
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
@@ -469,7 +467,9 @@ class QPMPC(nn.Module):
         """H, q and w of the QP."""
         by = Discounts(self.discount, self.slack_discount, self.hardness, self.stages)
         if self.hessian == "diagonal":
-            factors, squared = zip(*(parts.factor(self, x) for x in ("H", "H_f", "w")), strict=True)
+            factors, squared = zip(
+                *(parameters.factor(self, x) for x in ("H", "H_f", "w")), strict=True
+            )
             return diagonal_cost(self._layout, (*factors, self.q), squared, by)
         blocks = (self.H,) if self.hessian == "full" else (self.H, self.H_f)
         return discounted(self._layout, self.hessian, blocks, self.q, self.w, by)
@@ -484,4 +484,4 @@ class QPMPC(nn.Module):
     def _projected(self) -> dict[str, nn.Parameter]:
         """The parameters that `project_` acts on, by part."""
         names = () if self.step == CHOLESKY else SIGNED
-        return {name: parts.leaves(self, name)[0] for name in names if name in self.learned}
+        return {name: parameters.leaves(self, name)[0] for name in names if name in self.learned}

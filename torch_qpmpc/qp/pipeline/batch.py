@@ -169,6 +169,12 @@ class FlatPrograms(Twofold[ProgramArrays]):
         q, c, b, lb, ub, w = (v if len(v) == 1 else v[index] for v in vectors)
         return FlatPrograms(self.H, self.C, self.G, group, q, c, b, lb, ub, w, fixed)
 
+    def compacted(self) -> FlatPrograms:
+        """The same QPs with no matrices but their own, and nothing known of them."""
+        used, group = self.group.unique(return_inverse=True)
+        H, C, G = self.H[used], self.C[used], self.G[used]
+        return replace(self, H=H, C=C, G=G, group=group, _known={})
+
     @cached_property
     def share_theta(self) -> bool:
         """Whether they differ in nothing but their fixed entries."""

@@ -206,14 +206,14 @@ def _condense(matrices: Sequence[np.ndarray], device: torch.device, keep: int) -
     eliminated = _eliminate(C, keep)
     if eliminated is not None:
         return _products(H, G, *eliminated, keep)
-    T, Y, padding = _null_space(C, keep)
+    T, Y, padding = null_space(C, keep)
     return _products(H, G, T, Y, keep, padding)
 
 
 def _products(
     H: Tensor, G: Tensor, T: Tensor, Y: Tensor, keep: int, padding: Tensor | None = None
 ) -> Condensed:
-    """The condensed problem of T and Y; ``padding`` is that of `_null_space`."""
+    """The condensed problem of T and Y; ``padding`` is that of `null_space`."""
     H_T = H.bmm(T)
     H_y = T.mT.bmm(H_T)
     H_y = (H_y + H_y.mT) / 2.0
@@ -247,7 +247,7 @@ def other_eliminations(programs: FlatPrograms) -> Iterator[Condensed]:
     p, keep = programs, programs.fixed.shape[-1]
     if not p.C.shape[1]:
         return
-    T, Y, padding = _null_space(p.C, keep)
+    T, Y, padding = null_space(p.C, keep)
     yield _products(p.H, p.G, T, Y, keep, padding)
     own = [_eliminate_in_order(C, keep) for C in p.arrays.C]
     if all(own):
@@ -328,7 +328,7 @@ def _eliminate_one(C: np.ndarray, keep: int) -> tuple[np.ndarray, np.ndarray] | 
     return T, Y
 
 
-def _null_space(C: Tensor, keep: int) -> tuple[Tensor, Tensor, Tensor]:
+def null_space(C: Tensor, keep: int) -> tuple[Tensor, Tensor, Tensor]:
     """T and Y from the SVD, for a C of any rank, and the padding of T.
 
     Where ranks differ within the batch, the T of a higher rank gets zero columns; ``padding``

@@ -24,15 +24,13 @@ from scipy.optimize import lsq_linear, nnls
 from torch import Tensor
 
 from torch_qpmpc.qp.pipeline.batch import FlatPrograms, SoftQPs
+from torch_qpmpc.qp.pipeline.certificate import TOLERANCE
+from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solvers import daqp
 
 #: Relative to the sum of the absolute terms: what counts as zero, and what does not.
 ROUNDING, SIGNIFICANT = 1e-12, 1e-7
-#: A point that violates rows by no more than this, relative to their terms, is feasible.
-FEASIBLE = 1e-6
-#: Singular values of C below this fraction of the largest are zero.
-RANK = 1e-10
 
 
 def diagnose(programs: FlatPrograms) -> Tensor:
@@ -57,11 +55,8 @@ class _Range:
 
     @classmethod
     def of(cls, C: np.ndarray) -> _Range:
-        # By torch, which has the caller's number of threads.
-        left, singular, right = (x.numpy() for x in torch.linalg.svd(torch.from_numpy(C)))
-        rank = int((singular > RANK * singular.max(initial=0.0)).sum())
-        inverse = (right[:rank].T / singular[:rank]) @ left[:, :rank].T
-        return cls(inverse, right[rank:].T)
+        null, inverse, _ = null_space(torch.from_numpy(C).unsqueeze(0), 0)
+        return cls(inverse[0].numpy(), null[0].numpy())
 
 
 @dataclass(frozen=True)
@@ -209,8 +204,8 @@ def _is_feasible(qp: _FreeQP, z: np.ndarray) -> bool:
     short = np.abs(qp.C @ z - qp.b)
     C_size = np.abs(qp.C) @ np.abs(z) + qp.b_size
     return bool(
-        (short <= FEASIBLE * (1 + C_size)).all()
-        and (beyond <= FEASIBLE * (1 + size[np.isinf(qp.w)])).all()
+        (short <= TOLERANCE * (1 + C_size)).all()
+        and (beyond <= TOLERANCE * (1 + size[np.isinf(qp.w)])).all()
     )
 
 

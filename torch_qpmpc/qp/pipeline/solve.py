@@ -119,7 +119,7 @@ def _settled(
     failed = accepted[_certify_at(programs, raw, accepted)]
     if len(failed):
         # Matrices of QPs that are left out may be invalid.
-        again = _Chain(programs.without_nan().take(failed), keep).run(solver, None)
+        again = _Chain(programs.take(failed).compacted(), keep).run(solver, None)
         raw.put(failed, again)
         scaled, again = units.scaled(programs), units.inverse.restored(programs, raw)
         failed = failed[raw.accepted()[failed]]
@@ -201,10 +201,12 @@ class _Chain:
         """Attempt what is left with C z = b eliminated in other ways, for ill-conditioned ones."""
         if self.todo is None or not len(self.todo):
             return
-        for condensed in other_eliminations(self.part()):
+        first, part = self.todo, self.part().compacted()
+        for condensed in other_eliminations(part):
+            left = part.take(torch.isin(first, self.todo).nonzero().squeeze(-1))
             # What is known of theta belongs to another elimination.
-            part = replace(self.part(), _known={})
-            self._attempt(part, condensed.reduced(part), BACKENDS["torch"], passes=PASSES)
+            left = replace(left, _known={})
+            self._attempt(left, condensed.reduced(left), BACKENDS["torch"], passes=PASSES)
             if not len(self.todo):
                 return
 
