@@ -22,7 +22,6 @@ import sys
 import threading
 import time
 from collections.abc import Collection
-from functools import partial
 from typing import Any
 
 import hydra
@@ -36,7 +35,6 @@ from tqdm import tqdm
 
 from torch_qpmpc import QPActorValueOperator, QPError, SolveLog
 from torch_qpmpc.experiment.algorithms import (
-    act,
     evaluate,
     gap_summary,
     make_learner,
@@ -63,6 +61,7 @@ from torch_qpmpc.experiment.run_state import (
 )
 from torch_qpmpc.experiment.sweeps import finished_run, stopped_run
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics, make_true_mpc, true_model
+from torch_qpmpc.learning.operators import in_closed_loop, warm_policy
 from torch_qpmpc.learning.replay import ACTIVE_SET, make_replay
 
 
@@ -92,10 +91,10 @@ def _train(
     # The QP, between its two ends: the wrong model it starts from, and the true one.
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
-    start = evaluate(cfg, mpc.policy, physics)
+    start = evaluate(cfg, warm_policy(mpc), physics)
     loops = {"start": start, "learned": start}
     if (true_mpc := make_true_mpc(cfg, physics)) is not None:
-        loops["true model"] = evaluate(cfg, true_mpc.policy, physics)
+        loops["true model"] = evaluate(cfg, warm_policy(true_mpc), physics)
 
     # Q-learning, by gradients or of the second order, or a policy gradient.
     operator = QPActorValueOperator(mpc, active_set_key=ACTIVE_SET if cfg.warm_start else None)
@@ -128,7 +127,7 @@ def _train(
             tally = restore(state, mpc, learner, collector, replay)
             if state["collector"] is None and tally.update < cfg.updates and not quiet:
                 print("New episodes: the environments' own state cannot be saved.")
-            loops["learned"] = evaluate(cfg, partial(act, learner.actor), physics)
+            loops["learned"] = evaluate(cfg, in_closed_loop(learner.actor), physics)
         else:
             tally = Tally()
             report(run, learned_mpc, loops, 0)
@@ -183,7 +182,7 @@ def _train(
                 learner = make_learner(cfg, operator, physics, done=update)
             last = update == cfg.updates
             if update % cfg.eval_interval == 0 or last:
-                loops["learned"] = evaluate(cfg, partial(act, learner.actor), physics)
+                loops["learned"] = evaluate(cfg, in_closed_loop(learner.actor), physics)
                 summary = report(run, learned_mpc, loops, update)
                 progress.set_postfix(J=summary["J_final"], closed_gap=summary["closed_gap"])
             if update % cfg.eval_interval == 0 or last or interrupt.signum is not None:

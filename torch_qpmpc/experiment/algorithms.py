@@ -27,11 +27,16 @@ from torch_qpmpc.envs.closed_loop import (
     gap_text,
     gymnasium_loop,
 )
-from torch_qpmpc.experiment.actor_critic import actor_groups, critic_groups, make_actor_critic_loss
+from torch_qpmpc.experiment.actor_critic import (
+    actor_groups,
+    critic_groups,
+    make_acting,
+    make_actor_critic_loss,
+)
 from torch_qpmpc.experiment.plots import closed_loop_figure, predictions_figure
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.learning.gauss_newton import GaussNewton
-from torch_qpmpc.learning.operators import QPActorValueOperator
+from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, QPActorValueOperator
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.updates import Update, first_order, second_order
@@ -78,10 +83,11 @@ def make_learner(
         loss_module = QPQLearningLoss(
             operator, delay_value=cfg.delay_value, td_error_clip=cfg.td_error_clip
         )
-        actor = operator.get_policy_operator()
+        actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
     else:
-        loss_module = make_actor_critic_loss(cfg, mpc, physics.lb_a, physics.ub_a)
-        actor = loss_module.actor_network
+        bounds = physics.lb_a, physics.ub_a
+        loss_module = make_actor_critic_loss(cfg, mpc, *bounds)
+        actor = make_acting(cfg, mpc, loss_module, *bounds)
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
     deviation, si = make_penalties(cfg, mpc)
     optimizer = make_optimizer(cfg, mpc, loss_module)
@@ -174,11 +180,6 @@ def make_schedule(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int =
 def decay(update: int, updates: int, last: float) -> float:
     """What a rate is multiplied by after ``update`` of ``updates``: from 1 linearly to ``last``."""
     return 1 - (1 - last) * min(update / updates, 1)
-
-
-def act(actor: TensorDictModuleBase, s: Tensor) -> Tensor:
-    """The policy of ``actor``, as a function: s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
-    return actor(observation=s)
 
 
 def evaluate(

@@ -15,6 +15,7 @@ from torchrl.modules import AdditiveGaussianModule
 
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
 
 #: TorchRL's collectors through Ray need a number; -1 would be none.
 ENDLESS = 2**62
@@ -73,11 +74,15 @@ def make_collector(
 
 
 def batches(collector: BaseCollector) -> Iterator[TensorDictBase]:
-    """``(num_columns, steps_per_update)`` transitions for ever, under the newest theta."""
+    """``(num_columns, steps_per_update)`` transitions for ever, under the newest theta.
+
+    Without the policy's active sets, which are of use to its next step alone.
+    """
     alone = isinstance(collector, Collector)
     if not alone:
         collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]
-    for batch in collector:
+    for collected in collector:
+        batch = collected.exclude(POLICY_ACTIVE_SET)
         yield batch if alone else batch.reshape(-1, batch.shape[-1])
         if not alone:
             collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]
