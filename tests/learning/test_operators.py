@@ -21,7 +21,7 @@ from torchrl.modules import (
 )
 from torchrl.objectives import DDPGLoss, IQLLoss
 
-from torch_qpmpc import QPMPC, QPActorValueOperator, QPError, SolveLog
+from torch_qpmpc import QPMPC, QPActorValueOperator, SolveLog, SolverError
 from torch_qpmpc.envs import PointMass, PointMassEnv
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, warm_policy
@@ -243,7 +243,7 @@ def test_steps_that_could_not_be_solved_leave_nothing_to_start_from():
     policy(td.set("observation", torch.stack((inside, inside))))
     torch.testing.assert_close(td["action"][1], mpc.policy(inside))
     mpc.on_failure = "raise"
-    with pytest.raises(QPError, match="1 of 2"):
+    with pytest.raises(SolverError, match="1 of 2"):
         policy(td.set("observation", torch.stack((inside, far))))
 
 
