@@ -155,6 +155,7 @@ BAD: dict[str, list[Any]] = {
     "penalty_step": ["newton", *NAME],
     "ablation": [3, True],
     "figures": FLAG,
+    "logger": ["aim", *NAME],
     "resume": [3, True],
     "algo.name": ["sac", *NAME],
     "algo.actor": ["net", *NAME],

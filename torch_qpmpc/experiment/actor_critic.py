@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig
@@ -34,9 +34,9 @@ def make_acting(
 ) -> TensorDictModuleBase:
     """The loss's actor as it acts in closed loop: a QP's starts each step from the one before."""
     if cfg.algo.actor == "mlp":
-        return loss_module.actor_network
-    policy = QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
-    clip = TensorDictModule(partial(clipped, low=low, high=high), ["action"], ["action"])
+        return cast("TensorDictModuleBase", loss_module.actor_network)
+    policy: Any = QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
+    clip: Any = TensorDictModule(partial(clipped, low=low, high=high), ["action"], ["action"])
     return TensorDictSequential(policy, clip)
 
 

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torch_qpmpc.envs.point_mass import NOISE_STD
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.loggers import LOGGERS
 from torch_qpmpc.mpc.projections import STEPS, check_step
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST, HESSIANS, STRUCTURES
 from torch_qpmpc.qp.solvers import backend
@@ -91,6 +92,7 @@ RULES: dict[str, Rule] = {
     "resume": (lambda x: x is None or NAME[0](x), "a path, or null"),
     "ablation": (lambda x: x is None or NAME[0](x), "a name, or null"),
     "figures": FLAG,
+    "logger": _one_of(*LOGGERS),
     "eval_interval": _whole(1),
     "log_interval": _whole(1),
     "algo.name": _one_of("qlearning", "ddpg", "td3"),
