@@ -69,6 +69,6 @@ def skip_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     def blank(*_: object) -> Figure:
         return Figure(figsize=(1, 1))
 
-    for owner in ("train", "torch_qpmpc.experiment.algorithms"):
+    for owner in ("train", "torch_qpmpc.experiment.metrics"):
         for name in ("closed_loop_figure", "constraint_figure", "summary_figure"):
             monkeypatch.setattr(f"{owner}.{name}", blank, raising=False)

@@ -88,6 +88,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     assert num_columns(elsewhere) == 16
     text = (CONFIGS / "config.yaml").read_text(encoding="utf-8").partition("hydra:")[2]
     seen |= set(re.findall(r"\$\{([\w.]+)\}", text))
+    seen |= {"logger"}  # RunFolder reads it, and gets the configuration itself
     assert seen - set(OPTIONAL) == set(RULES)
 
 

@@ -1,4 +1,4 @@
-"""Where transitions come from: TorchRL's collectors, in this process, in others, or through Ray."""
+"""Transitions: TorchRL's collectors, in this process, in others, or through Ray; and the replay."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from torchrl.modules import AdditiveGaussianModule
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
+from torch_qpmpc.learning.replay import Replay, make_replay
+from torch_qpmpc.mpc.module import QPMPC
 
 #: TorchRL's collectors through Ray need a number; -1 would be none.
 ENDLESS = 2**62
@@ -70,6 +72,20 @@ def make_collector(
         sync=cfg.collector.sync,
         remote_configs={"num_cpus": cfg.collector.num_cpus},
         collector_kwargs=options,
+    )
+
+
+def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
+    """The replay of a run: of transitions and, for the SI penalty, of windows."""
+    si = cfg.constraint.si
+    return make_replay(
+        cfg.replay_capacity,
+        num_columns(cfg),
+        cfg.batch_size,
+        cfg.task.horizon,
+        1 if si is None else si.windows,
+        seed=cfg.seed,
+        active_rows=len(mpc.G) if cfg.warm_start else None,
     )
 
 

@@ -35,7 +35,7 @@ CASES = ("fixed", "free", "deviation", "si", "combined")
 #: The least J_start - J_true_model of a run whose closed gap says something.
 REAL_GAP = 50.0
 #: What differs between runs of one kind, or does not bear on what is learned.
-_NO_SETTING = ("seed", "figures", "logger", "threads", "log_interval", "eval_interval")
+_NO_SETTING = ("seed", "figures", "threads", "log_interval", "eval_interval", "logger")
 
 
 @dataclass(frozen=True, eq=False)
