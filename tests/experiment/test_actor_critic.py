@@ -5,10 +5,11 @@ from __future__ import annotations
 import copy
 import itertools
 import math
+from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -25,6 +26,7 @@ from torch_qpmpc.experiment.actor_critic import (
 from torch_qpmpc.experiment.algorithms import Learner, make_learner
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.learning.actor_critic import BoundedPolicy, Clip, ClippedPolicy
+from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
 
 TASKS = ("point_mass", "pendulum")
 NETWORKS = ("qp", "mlp")
@@ -182,6 +184,24 @@ def test_a_qp_with_soft_action_rows_acts_within_the_plants_bounds():
     assert (free[1].abs() < 1).all()
     assert_close(actor(observation=s), free.clamp(-1, 1))
     assert isinstance(actor.module, ClippedPolicy)
+
+
+@pytest.mark.parametrize("actor", NETWORKS)
+def test_in_closed_loop_the_actor_acts_as_in_the_loss(actor):
+    """The QP's is warm and clipped, for either dtype, and has the loss's parameters."""
+    learner, _, batch = make(*settings("td3", actor, "mlp"), "task.action_slack=0.001")
+    for _ in range(4):
+        learner.learn(batch.clone(), None)
+    in_loss: Any = learner.loss_module.actor_network
+    s = torch.tensor([[2.0, 0.0, 5.0, 0.0], [0.01, 0.0, 0.0, 0.0]])
+    for states in (s, s.double()):
+        td = TensorDict(observation=states, batch_size=2)
+        expected = in_loss(td.clone())["action"]
+        for _ in range(2):
+            a = learner.actor(td)["action"]
+            assert_close(a, expected)
+            assert a.dtype == states.dtype
+        assert (POLICY_ACTIVE_SET in td) == (actor == "qp")
 
 
 @pytest.mark.parametrize("done", [0, 1, 5])

@@ -1,4 +1,4 @@
-"""What ``python train.py`` does before and after a run: its folder, its lock, its errors."""
+"""The frame of ``python train.py``: the run's folder, its lock, and errors in one sentence."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Launch:
     def settle(
         self, cfg: DictConfig
     ) -> tuple[DictConfig, dict[str, Any] | None, dict[str, Any] | None]:
-        """Decide what is to do: start a run, go on with one, or nothing, as it has finished.
+        """Choose between a new run, one to go on with, and one that has finished.
 
         Returns:
             The run's own configuration, the state to go on from, and the summary of a sweep's

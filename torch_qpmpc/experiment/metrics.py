@@ -22,7 +22,7 @@ from torch_qpmpc.experiment.tally import Stopwatch, Tally
 from torch_qpmpc.learning.updates import Scalars
 from torch_qpmpc.mpc.module import QPMPC
 
-#: What is logged of what a loss returns beside its terms.
+#: The entries of a loss that are logged beside its terms.
 LOGGED = ("td_error", "pred_value", "target_value", "unsolved", "invalid_reward")
 #: The most numbers that a part of theta may have to be logged one by one.
 FEW = 16
@@ -54,7 +54,7 @@ def run_summary(
     mpc: QPMPC | None,
     true_model: Sequence[Tensor] | None,
 ) -> dict[str, Any]:
-    """What summary.json holds; ``mpc`` is None where the learned policy is no QP's."""
+    """The content of summary.json; ``mpc`` is None where the learned policy is no QP's."""
     summary: dict[str, Any] = gap_summary(loops)
     summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
     summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
@@ -66,7 +66,7 @@ def run_summary(
 def report(
     run: RunFolder, mpc: QPMPC | None, loops: dict[str, ClosedLoop], update: int
 ) -> dict[str, Any]:
-    """Log an evaluation: J between its two ends, what C says, and figures if wanted.
+    """Log an evaluation: J between its two ends, the structure of C, and figures if wanted.
 
     Before the first update, J alone; after the last, the predictions and the policy, too.
 

@@ -1,4 +1,4 @@
-"""What a run adds up over its updates: costs, violations, QPs and seconds."""
+"""Running sums of a run: costs, violations, QPs and seconds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torch_qpmpc.qp.pipeline.solve import SolveLog
 class Stopwatch:
     """Seconds of one update: until its data were collected, and until its end."""
 
-    began: float = field(default_factory=time.perf_counter)
+    began: float
     data: float = 0.0
     total: float = 0.0
 
@@ -33,13 +33,13 @@ class Stopwatch:
 
 @dataclass
 class Tally:
-    """What a run adds up.
+    """Running sums over the updates of a run.
 
     Attributes:
-        update: how many there have been.
+        update: the number of the last one.
         costs: the mean cost of a step, of each update.
         violation: of the states' bounds, summed over all steps.
-        qps: what has been solved since the last row of metrics; ``unsolved``, before that.
+        qps: counts of solves since the last row of metrics; ``unsolved``: failures before that.
         seconds: of training, without the compilation of kernels, once for an installation.
     """
 
@@ -52,7 +52,7 @@ class Tally:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> Self:
-        """Return to what `state` was called on."""
+        """The tally of a checkpoint, from `state`."""
         parts: dict[str, Any] = state | {"qps": SolveLog(**state["qps"])}
         return cls(**parts)
 
@@ -63,14 +63,14 @@ class Tally:
     @contextmanager
     def timed(self) -> Iterator[Stopwatch]:
         """Count the QPs of an update, and its seconds."""
-        watch = Stopwatch()
+        watch = Stopwatch(time.perf_counter())
         with self.qps, install_timer("numba:compile", self._leave_out):
             yield watch
         watch.total = time.perf_counter() - watch.began
         self.seconds += watch.total
 
     def _leave_out(self, seconds: float) -> None:
-        """Subtract a compilation, which `timed` is going to add."""
+        """Subtract a compilation, as `timed` adds it with the rest."""
         self.seconds -= seconds
 
     def add(self, batch: TensorDictBase, violation: Tensor) -> None:
@@ -80,14 +80,14 @@ class Tally:
         self.violation += violation.sum().item()
 
     def metrics(self) -> dict[str, float]:
-        """The scalars since the last call, which begin anew."""
+        """The scalars of a row; those of the QPs count from the row before."""
         row = {"train/reward": -self.costs[-1], "train/violation": self.violation}
         row |= self.qps.metrics()
         self.unsolved, self.qps = self.unsolved + self.qps.unsolved, SolveLog()
         return row
 
     def summary(self) -> dict[str, float]:
-        """What learning itself cost: over all updates, and over the last tenth of them."""
+        """The cost of learning itself: over all updates, and over the last tenth of them."""
         last = self.costs[-max(1, len(self.costs) // 10) :]
         return {
             "train_seconds": self.seconds,

@@ -1,0 +1,65 @@
+"""A tally adds up, begins its rows anew, and survives a checkpoint."""
+
+from __future__ import annotations
+
+import itertools
+from types import SimpleNamespace
+
+import pytest
+import torch
+from numba.core import event
+from tensordict import TensorDict
+
+from tests.problems import random_mpc, random_states
+from torch_qpmpc.experiment import tally as module
+from torch_qpmpc.experiment.tally import Tally
+
+
+def batch(reward: float) -> TensorDict:
+    return TensorDict({"next": {"reward": torch.full((3, 2, 1), reward)}}, batch_size=[3, 2])
+
+
+def test_costs_and_violations_are_summed():
+    tally = Tally()
+    for update in range(1, 21):
+        tally.add(batch(-float(update)), torch.tensor([0.5, 0.25]))
+    assert (tally.update, tally.violation) == (20, 15)
+    row = tally.metrics()
+    assert (row["train/reward"], row["train/violation"]) == (-20, 15)
+    summary = tally.summary()
+    assert (summary["train_cost"], summary["train_cost_last_tenth"]) == (10.5, 19.5)
+
+
+def test_a_row_has_the_qps_since_the_one_before():
+    tally, mpc = Tally(), random_mpc(3, on_failure="mask")
+    for count in (4, 2):
+        with tally.timed():
+            mpc.value(random_states(count))
+        tally.add(batch(0.0), torch.zeros(1))
+        tally.qps.unsolved += 1
+        row = tally.metrics()
+        assert (row["qp/solves"], row["qp/unsolved"]) == (count, 1)
+    mpc.value(random_states(3))
+    assert (tally.qps.solves, tally.summary()["unsolved"]) == (0, 2)
+
+
+def test_seconds_are_split_and_leave_compilation_out(monkeypatch: pytest.MonkeyPatch):
+    clock, compiler = itertools.count(step=1.0), itertools.count(step=0.25)
+    monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr(event, "timer", lambda: next(compiler))
+    tally = Tally()
+    with tally.timed() as watch:
+        watch.collected()
+        with event.trigger_event("numba:compile"):
+            pass
+    assert watch.metrics() == {"time/collect": 1, "time/update": 1}
+    assert tally.seconds == 2 - 0.25
+
+
+def test_a_tally_goes_on_from_its_state():
+    tally = Tally()
+    tally.add(batch(-1.0), torch.ones(2))
+    tally.qps.solves = 7
+    twin = Tally.from_state(tally.state())
+    assert twin == tally
+    assert twin.qps is not tally.qps
