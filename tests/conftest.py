@@ -35,10 +35,10 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     runs = [("small", "gaussian", case, seed) for case in ("fixed", "free") for seed in (1, 4)]
     for sweep, noise, case, seed in [*runs, ("small", "brownian", "free", 1)]:
-        settings = (f"constraint={case}", f"noise={noise}", f"seed={seed}", "figures=false")
+        settings = (f"constraint={case}", f"noise={noise}", f"seed={seed}", "task.eval_steps=50")
         place = folder / sweep / f"{noise}-{case}-seed{seed}"
         train.train(make_config(*SMALL, *settings), str(place), quiet=True)
     for c_2 in (0.0, 0.5):
-        settings = (f"constraint.deviation.c_2={c_2}", "figures=false")
+        settings = (f"constraint.deviation.c_2={c_2}", "task.eval_steps=50")
         train.train(make_config(*SMALL, *settings), str(folder / "weights" / f"{c_2}"), quiet=True)
     return folder

@@ -6,9 +6,7 @@ import copy
 import functools
 from pathlib import Path
 
-import pytest
 from hydra import compose, initialize_config_dir
-from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
 from torch_qpmpc import QPMPC
@@ -16,7 +14,8 @@ from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment.tasks import make_physics, make_true_mpc
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-#: Everything shrinks but the point mass itself.
+#: Everything shrinks but the point mass itself, and nothing is drawn: figures are most of the time
+#: of a small run.
 SMALL = (
     "optimizer=adam",
     "solver=daqp",
@@ -29,6 +28,8 @@ SMALL = (
     "log_interval=1",
     "task.horizon=3",
     "task.episode_steps=12",
+    "task.eval_steps=10",
+    "figures=false",
 )
 
 
@@ -61,14 +62,3 @@ def true_mpc(cfg: DictConfig, physics: LinearSystem) -> QPMPC:
     mpc = make_true_mpc(cfg, physics)
     assert mpc is not None
     return mpc
-
-
-def skip_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave drawing, the larger part of a small run's time, to the tests that look at it."""
-
-    def blank(*_: object) -> Figure:
-        return Figure(figsize=(1, 1))
-
-    for owner in ("train", "torch_qpmpc.experiment.algorithms"):
-        for name in ("closed_loop_figure", "constraint_figure", "summary_figure"):
-            monkeypatch.setattr(f"{owner}.{name}", blank, raising=False)

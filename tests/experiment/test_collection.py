@@ -11,7 +11,7 @@ import torch
 from omegaconf import DictConfig
 
 import train
-from tests.runs import SMALL, make_config, skip_figures
+from tests.runs import SMALL, make_config
 from torch_qpmpc import QPActorValueOperator, QPError
 from torch_qpmpc.experiment.collection import batches, make_collector, num_columns
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
@@ -80,7 +80,6 @@ def test_workers_that_do_not_wait_bring_their_own_environments(tmp_path, monkeyp
     """A run learns from each batch as it comes: half of the environments at a time."""
     if name == "ray":
         pytest.importorskip("ray", reason="the extra ray is not installed")
-    skip_figures(monkeypatch)
     overrides = (*SMALL, f"collector={name}", "collector.sync=false", "num_envs=4", "constraint=si")
     cfg = make_config(*overrides, "steps_per_update=5", "warmup_steps=10", "updates=6")
     assert num_columns(cfg) == 2

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.collectors import distributed
 
 import train
-from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
+from tests.runs import CONFIGS, SMALL, choices, make_config
 from torch_qpmpc import QPActorValueOperator, QPError
 from torch_qpmpc.experiment.collection import make_collector, num_columns
 from torch_qpmpc.experiment.config import NOISES, OF_CHOICE, OPTIONAL, RULES, check_config, flatten
@@ -64,7 +64,6 @@ class Recorder:
 def test_each_key_is_read(tmp_path, monkeypatch):
     """By a run of one order or the other, or by the names of the run's folder."""
     seen: set[str] = set()
-    skip_figures(monkeypatch)
     # These two read everything at once, which proves nothing.
     monkeypatch.setattr(train, "check_config", lambda _: None)
     for name, overrides in {

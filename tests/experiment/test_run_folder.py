@@ -194,7 +194,7 @@ def command(folder: Path, *more: str) -> subprocess.CompletedProcess[str]:
         "train.save_checkpoint = limit\n"
         "train.main()\n"
     )
-    arguments = ["--config-path", str(CONFIGS), *SMALL, "figures=false", "task.eval_steps=5"]
+    arguments = ["--config-path", str(CONFIGS), *SMALL, "task.eval_steps=5"]
     return subprocess.run(
         [sys.executable, "-c", limited, *arguments, f"hydra.run.dir={folder}", *more],
         cwd=CONFIGS.parent,
