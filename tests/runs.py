@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
+import sys
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
+import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
+import train
 from torch_qpmpc import QPMPC
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment.tasks import make_physics, make_true_mpc
@@ -43,6 +49,31 @@ def make_config(*overrides: str) -> DictConfig:
 def _composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(version_base="1.3", config_dir=str(CONFIGS)):
         return compose("config", overrides=list(overrides))
+
+
+def run_command(*arguments: str) -> None:
+    """``python train.py ..`` in this process.
+
+    Hydra finds the folder by itself only for a script, not for an imported module.
+    """
+    quiet = ("hydra/job_logging=disabled", "hydra/hydra_logging=disabled")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["train.py", "--config-path", str(CONFIGS), *arguments, *quiet])
+        train.main()
+
+
+def covering(combinations: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """A few of the combinations that have every pair of choices which one of them has."""
+
+    def pairs(combination: tuple[str, ...]) -> set[Any]:
+        return set(itertools.combinations(enumerate(combination), 2))
+
+    given, chosen = list(combinations), []
+    left = set().union(*map(pairs, given))
+    while left:
+        chosen.append(max(given, key=lambda combination: len(pairs(combination) & left)))
+        left -= pairs(chosen[-1])
+    return chosen
 
 
 def choices(group: str) -> list[str]:
