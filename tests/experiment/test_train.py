@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train
-from tests.runs import CONFIGS, SMALL, choices, make_config
+from tests.runs import CONFIGS, SMALL, choices, make_config, run_command
 from torch_qpmpc import (
     QPMPC,
     DeviationPenalty,
@@ -254,7 +254,7 @@ def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
 def test_the_stream_can_be_replayed(tmp_path):
     """And drawn: two states and one action, where the point mass has four and two."""
     replayed = ("optimizer=sliding", "exploration_std=0.05", "figures=true")
-    cfg = make_config(*STREAM, *replayed, "updates=30", "eval_interval=30")
+    cfg = make_config(*STREAM, *replayed, "updates=15", "eval_interval=15")
     assert train.train(cfg, str(tmp_path))["unsolved"] == 0
     assert metrics(tmp_path)["qp/recalled"].iloc[-1] > 0
 
@@ -477,23 +477,10 @@ def test_a_bad_configuration_writes_nothing(tmp_path):
 # --- The command ---------------------------------------------------------------------------------
 
 
-QUIET = ("hydra/job_logging=disabled", "hydra/hydra_logging=disabled")
-
-
 def test_command(tmp_path, monkeypatch, capsys):
     """`python train.py ..` makes the folder that it names at the end, below a table."""
     monkeypatch.chdir(tmp_path)
-    # Hydra finds the folder by itself only for a script, not for an imported module.
-    arguments = [
-        "--config-path",
-        str(CONFIGS),
-        *SMALL,
-        "constraint=combined",
-        "noise=brownian",
-        *QUIET,
-    ]
-    monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
-    train.main()
+    run_command(*SMALL, "constraint=combined", "noise=brownian")
     lines = capsys.readouterr().out.splitlines()
     folder = Path(lines[-1])
     assert folder.parent == tmp_path / "runs" / "point_mass" / "brownian-combined"
@@ -520,15 +507,17 @@ def test_impossible_value_on_the_command_line(tmp_path):
     ("mistake", "sentence"),
     [
         ("batchsize=3", "Could not override 'batchsize'"),
-        ("+batchsize=3", "Did you mean batch_size?"),
+        (
+            "+batchsize=3",
+            "batchsize: got an unknown key, expected a key of configs/. Did you mean batch_size?",
+        ),
         ("constraint=none", "Could not find 'constraint/none'"),
     ],
 )
 def test_misspelt_key_on_the_command_line(tmp_path, monkeypatch, capsys, mistake, sentence):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["train.py", "--config-path", str(CONFIGS), mistake, *QUIET])
     with pytest.raises(SystemExit) as error:
-        train.main()
+        run_command(mistake)
     assert error.value.code not in (0, None)
     assert sentence in capsys.readouterr().err + str(error.value.code)
 
@@ -536,18 +525,6 @@ def test_misspelt_key_on_the_command_line(tmp_path, monkeypatch, capsys, mistake
 # --- Folders that are in use or hold a run ------------------------------------------------------
 
 TINY = (*SMALL, "task.eval_steps=5")
-
-
-@pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """`python train.py ..` in this process."""
-
-    def run(*arguments: str) -> None:
-        argv = ["train.py", "--config-path", str(CONFIGS), *QUIET, *arguments]
-        monkeypatch.setattr(sys, "argv", argv)
-        train.main()
-
-    return run
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -570,73 +547,73 @@ def stopped(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_finished_run_is_not_overwritten(command, tmp_path):
+def test_a_finished_run_is_not_overwritten(tmp_path):
     folder = tmp_path / "run"
     (folder / ".hydra").mkdir(parents=True)
     for name in ("train.log", ".hydra/config.yaml", LOCK):  # Hydra's, and a killed run's
         (folder / name).touch()
-    command(*TINY, f"hydra.run.dir={folder}")
+    run_command(*TINY, f"hydra.run.dir={folder}")
     before = contents(folder)
     message = (
         f"^folder: got {folder}, which holds a finished run, expected one without a run. "
         "Choose another folder by hydra.run.dir=FOLDER.$"
     )
     with pytest.raises(SystemExit, match=message):
-        command(*TINY, "seed=2", f"hydra.run.dir={folder}")
+        run_command(*TINY, "seed=2", f"hydra.run.dir={folder}")
     assert contents(folder) == before
     assert not (folder / LOCK).exists()
 
 
-def test_a_stopped_run_is_not_overwritten_but_goes_on(command, stopped):
+def test_a_stopped_run_is_not_overwritten_but_goes_on(stopped):
     before = contents(stopped)
     message = (
         f"^folder: got {stopped}, which holds a run that was stopped, expected one without a run. "
         f"Go on with it by resume={stopped}, or choose another folder by hydra.run.dir=FOLDER.$"
     )
     with pytest.raises(SystemExit, match=message):
-        command(*TINY, f"hydra.run.dir={stopped}")
+        run_command(*TINY, f"hydra.run.dir={stopped}")
     assert contents(stopped) == before
-    command(f"resume={stopped}")
+    run_command(f"resume={stopped}")
     assert (stopped / "summary.json").exists()
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "checkpoint.pt"])
-def test_a_run_that_cannot_go_on_is_not_offered_for_it(command, stopped, name):
+def test_a_run_that_cannot_go_on_is_not_offered_for_it(stopped, name):
     (stopped / name).write_text("[: garbage")
     message = "a run that was stopped, expected one without a run. Choose another folder by hydra"
     with pytest.raises(SystemExit, match=message):
-        command(*TINY, f"hydra.run.dir={stopped}")
+        run_command(*TINY, f"hydra.run.dir={stopped}")
 
 
-def test_a_folder_in_use_is_refused(command, stopped, tmp_path):
+def test_a_folder_in_use_is_refused(stopped, tmp_path):
     before = contents(stopped)
     for overrides in ((*TINY, f"hydra.run.dir={stopped}"), (f"resume={stopped}",)):
         with locked(stopped), pytest.raises(SystemExit, match=f"got {stopped}, in use by process "):
-            command(*overrides)
+            run_command(*overrides)
     assert contents(stopped) == before
 
 
-def test_a_run_holds_the_lock(command, tmp_path, monkeypatch):
+def test_a_run_holds_the_lock(tmp_path, monkeypatch):
     def busy(cfg: DictConfig, folder: str, *_: Any, **__: Any) -> dict[str, Any]:
         with pytest.raises(QPError, match="in use by process"), locked(folder):
             pass
         return {"closed_gap": 0.5}
 
     monkeypatch.setattr(train, "train", busy)
-    command(*TINY, f"hydra.run.dir={tmp_path}")
+    run_command(*TINY, f"hydra.run.dir={tmp_path}")
     assert not (tmp_path / LOCK).exists()
 
 
-def test_a_run_goes_on_in_its_own_folder_only(command, stopped, tmp_path):
+def test_a_run_goes_on_in_its_own_folder_only(stopped, tmp_path):
     message = f"got {tmp_path}/other with resume={stopped}, expected {stopped}. A run goes on in i"
     with pytest.raises(SystemExit, match=message):
-        command(f"resume={stopped}", f"hydra.run.dir={tmp_path}/other")
+        run_command(f"resume={stopped}", f"hydra.run.dir={tmp_path}/other")
 
 
-def test_damaged_metrics_are_said_in_a_sentence(command, stopped):
+def test_damaged_metrics_are_said_in_a_sentence(stopped):
     (stopped / "metrics.csv").write_bytes(b"\xff\x00 garbage")
     with pytest.raises(SystemExit, match=r"^metrics.csv: got .*metrics.csv \('utf-8' codec"):
-        command(f"resume={stopped}")
+        run_command(f"resume={stopped}")
 
 
 def test_runs_that_start_in_the_same_second_have_folders_of_their_own():
@@ -660,14 +637,14 @@ SHORT = ("solver=daqp", "updates=3", "eval_interval=3", "warmup_steps=12", "task
 
 
 @pytest.mark.parametrize("id", ["Pendulum-v1", "torch_qpmpc/PointMass-v0"])
-def test_any_gymnasium_environment_is_a_task(command, tmp_path, monkeypatch, capsys, id):
+def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys, id):
     monkeypatch.chdir(tmp_path)
     model = PENDULUM
     if id != "Pendulum-v1":
         A, B = PointMass().A.tolist(), PointMass().B.tolist()
         W = torch.eye(6).tolist()
         model = (f"task.A={A}", f"task.B={B}", f"task.stage_weight={W}")
-    command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false")
+    run_command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false")
     folder = Path(capsys.readouterr().out.splitlines()[-1])
     assert folder.parent == tmp_path / "runs" / "gymnasium" / id / "none-deviation"
     assert folder.name.startswith("seed1-")
@@ -690,7 +667,7 @@ def test_any_gymnasium_environment_is_a_task(command, tmp_path, monkeypatch, cap
         (("task.id=Pendulum-v1", *PENDULUM[:2]), r"^task.stage_weight: got null, .* \(4, 4\)"),
     ],
 )
-def test_what_a_gymnasium_task_lacks_is_said(command, tmp_path, monkeypatch, overrides, message):
+def test_what_a_gymnasium_task_lacks_is_said(tmp_path, monkeypatch, overrides, message):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=message):
-        command("task=gymnasium", *overrides, *SHORT)
+        run_command("task=gymnasium", *overrides, *SHORT)
