@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,8 +9,14 @@ import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc.qp.solvers import BACKENDS
 
-# Test workers side by side are the parallelism; threads of each would only wait for one another.
-torch.set_num_threads(1)
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    """Keep torch to one thread: test workers are the parallelism, and their threads would compete.
+
+    Before every test, as TorchRL's ``check_env_specs`` leaves another number behind.
+    """
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(params=[*BACKENDS, "qpsolvers:clarabel"])
@@ -21,12 +26,9 @@ def solver(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def two_threads() -> Iterator[None]:
+def two_threads(one_thread: None) -> None:
     """Let torch, and with it ProxQP, use two threads."""
-    before = torch.get_num_threads()
     torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")
