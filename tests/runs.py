@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import copy
 import functools
-import itertools
 import sys
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -60,20 +57,6 @@ def run_command(*arguments: str) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["train.py", "--config-path", str(CONFIGS), *arguments, *quiet])
         train.main()
-
-
-def covering(combinations: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """A few of the combinations that have every pair of choices which one of them has."""
-
-    def pairs(combination: tuple[str, ...]) -> set[Any]:
-        return set(itertools.combinations(enumerate(combination), 2))
-
-    given, chosen = list(combinations), []
-    left = set().union(*map(pairs, given))
-    while left:
-        chosen.append(max(given, key=lambda combination: len(pairs(combination) & left)))
-        left -= pairs(chosen[-1])
-    return chosen
 
 
 def choices(group: str) -> list[str]:

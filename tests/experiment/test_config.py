@@ -13,7 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.collectors import distributed
 
 import train
-from tests.runs import CONFIGS, SMALL, choices, covering, make_config
+from tests.covering import covering
+from tests.runs import CONFIGS, SMALL, choices, make_config
 from torch_qpmpc import QPActorValueOperator, QPError
 from torch_qpmpc.experiment.collection import make_collector, num_columns
 from torch_qpmpc.experiment.config import OF_CHOICE, OPTIONAL, RULES, check_config, flatten
