@@ -120,6 +120,14 @@ class LinearSystem(ABC):
     def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
         """The next nu ``(*batch, n_x)`` from the last one and a :meth:`draw`."""
 
+    def mean_noise(self) -> Tensor:
+        """The mean of nu ``(n_x,)``: 0, if a plant does not say otherwise."""
+        return torch.zeros_like(self.lb_s)
+
+    def true_model(self) -> tuple[Tensor, Tensor, Tensor]:
+        """A, B and the offset, the mean of the noise."""
+        return self.A, self.B, self.mean_noise()
+
     def applied(self, a: Tensor) -> Tensor:
         """The action that the system gets ``(*batch, n_u)``: a clipped to its bounds."""
         check_tensor("a", a, len(self.lb_a))
