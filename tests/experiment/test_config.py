@@ -16,7 +16,7 @@ import train
 from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
 from torch_qpmpc import QPActorValueOperator, QPError
 from torch_qpmpc.experiment.collection import make_collector, num_columns
-from torch_qpmpc.experiment.config import check_config, differences, flatten, load_config, settings
+from torch_qpmpc.experiment.config import check_config, flatten, settings
 from torch_qpmpc.experiment.config.messages import keys
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import snapshot
@@ -342,8 +342,14 @@ def test_solver_must_be_known():
             ["task.terminal_weight=riccati"],
             "task.terminal_weight: got 'riccati', expected identity. With task.hessian=block it",
         ),
-        (["noise=uniform"], "noise.name: got 'uniform', expected a noise that point_mass has: gauss"),
-        (["noise.name=pink"], "noise.name: got 'pink', expected a noise that .* gaussian, brownian"),
+        (
+            ["noise=uniform"],
+            "noise.name: got 'uniform', expected a noise that point_mass has: gauss",
+        ),
+        (
+            ["noise.name=pink"],
+            "noise.name: got 'pink', expected a noise that .* gaussian, brownian",
+        ),
         (
             ["task=gros_zanon", "noise=gaussian"],
             "noise.name: got 'gaussian', expected a noise that gros_zanon has: uniform.",

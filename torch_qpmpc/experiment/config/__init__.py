@@ -9,7 +9,6 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from pydantic import ValidationError
 
-from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config.messages import first_of, flatten
 from torch_qpmpc.experiment.config.model import Config
 

@@ -28,9 +28,7 @@ Beta = Annotated[float, Field(ge=0, lt=1)]
 
 class Noise(Group):
     name: Name
-    std: Annotated[
-        NonNegative | None, Expected("a finite number >= 0, or null for the task's own")
-    ]
+    std: Annotated[NonNegative | None, Expected("a finite number >= 0, or null for the task's own")]
 
 
 class Deviation(Group):

@@ -13,32 +13,32 @@ from torch_qpmpc.experiment.config.model import Config
 from torch_qpmpc.experiment.fields import Expected
 from torch_qpmpc.experiment.tasks import TASKS
 
-#: The order in which errors are reported, by pydantic's types; a misspelt key goes before the one
-#: that is missing therefore, and conflicts go last.
+#: The order in which errors are reported, by pydantic's types: a misspelt key before the missing
+#: one, values (1) before missing keys, and conflicts last.
 ORDER = {"extra_forbidden": 0, "missing": 2, "union_tag_not_found": 2, "value_error": 3}
-VALUE = 1
 
 
 def first_of(error: ValidationError) -> QPError:
     """The first error, in a sentence."""
-    return _in_a_sentence(min(error.errors(), key=lambda found: ORDER.get(found["type"], VALUE)))
+    return _in_a_sentence(min(error.errors(), key=lambda found: ORDER.get(found["type"], 1)))
 
 
 def _in_a_sentence(error: Any) -> QPError:
-    kind, value, (group, *rest) = error["type"], error["input"], error["loc"] or (None,)
-    if kind == "value_error":
+    kind, value, path = error["type"], error["input"], error["loc"]
+    if kind == "value_error" and isinstance(error["ctx"]["error"], QPError):
         return error["ctx"]["error"]
-    if rest and Config.model_fields[group].discriminator:
-        rest = rest[1:]  # in between is the name of the choice
-    key, known = ".".join((group, *rest)), keys()
+    if len(path) > 1 and Config.model_fields[path[0]].discriminator:
+        path = path[:1] + path[2:]  # in between is the name of the choice
+    key, known = ".".join(map(str, path)), keys()
     if kind == "extra_forbidden":
         if key in known:
-            return QPError.expected(key, "a key of another choice", f"a key of this {group}")
+            return QPError.expected(key, "a key of another choice", f"a key of this {path[0]}")
         return unknown_key(next(iter(flatten(value, key)), key), known)
     if kind.startswith("union_tag"):
         key, value = f"{key}.name", value.get("name")
     got = "nothing" if kind in ("missing", "union_tag_not_found") else repr(value)
-    return QPError.expected(key, got, known.get(key, "its keys, as in configs/"))
+    sentence = known.get(key, "its keys, as in configs/")
+    return QPError.expected(key, got, sentence or error["msg"])
 
 
 def unknown_key(key: str, known: Mapping[str, str]) -> QPError:
@@ -57,9 +57,11 @@ def _keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, st
     for name, info in model.model_fields.items():
         key, kinds = f"{prefix}{name}", (info.annotation, *get_args(info.annotation))
         groups = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)]
-        names = [get_args(group.model_fields["name"].annotation)[0] for group in groups if info.discriminator]
+        names = []
         if key == "task":
             groups, names = [task.settings for task in TASKS.values()], list(TASKS)
+        elif info.discriminator:
+            names = [get_args(group.model_fields["name"].annotation)[0] for group in groups]
         for group in groups:
             yield from _keys_of(group, f"{key}.")
         if names:

@@ -154,9 +154,9 @@ class Config(Group):
 
     @model_validator(mode="after")
     def actor_critic_is_of_first_order_with_a_replay(self) -> Self:
-        name = self.algo.name
-        if name == "qlearning":
+        if self.algo.name == "qlearning":
             return self
+        name = self.algo.name
         if self.second_order:
             remedy = f"{name} has no second order: say optimizer=adam."
             self.conflict("optimizer.name", "adam or sgd", remedy)
@@ -181,7 +181,9 @@ class Config(Group):
             remedy = f"{self.algo.name} has more parameters than the QP's."
             self.conflict("release", "null", remedy)
         if self.collector.name != "single":
-            remedy = f"The workers of collector={self.collector.name} would keep the old parameters."
+            remedy = (
+                f"The workers of collector={self.collector.name} would keep the old parameters."
+            )
             self.conflict("release", "null", remedy)
         return self
 
