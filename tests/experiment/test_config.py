@@ -16,7 +16,13 @@ import train
 from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
 from torch_qpmpc import QPActorValueOperator, QPError
 from torch_qpmpc.experiment.collection import make_collector, num_columns
-from torch_qpmpc.experiment.config import check_config, flatten, settings
+from torch_qpmpc.experiment.config import (
+    check_config,
+    differences,
+    flatten,
+    load_config,
+    settings,
+)
 from torch_qpmpc.experiment.config.messages import keys
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import snapshot
@@ -102,7 +108,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     assert num_columns(elsewhere) == 16
     text = (CONFIGS / "config.yaml").read_text(encoding="utf-8").partition("hydra:")[2]
     seen |= set(re.findall(r"\$\{([\w.]+)\}", text))
-    seen |= {"logger"}  # TODO
+    seen |= {"logger"}  # RunFolder reads it, and gets the configuration itself
     assert seen - set(OPTIONAL) == set(KEYS) - {"task.file"}
 
 
@@ -289,6 +295,66 @@ def test_betas_are_adams():
     cfg = make_config("optimizer=sgd")
     assert "betas" not in cfg.optimizer
     check_config(cfg)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["+optimizer.damping=1"],
+            "optimizer.damping: got a key of another choice, expected a key",
+        ),
+        (
+            ["+task.id=Pendulum-v1"],
+            "task.id: got a key of another choice, expected a key of this t",
+        ),
+        (["+optimizer.lr_cots=1"], "optimizer.lr_cots: got an unknown key, .* optimizer.lr_cost?"),
+        (
+            ["optimizer.name=rmsprop"],
+            "optimizer.name: got 'rmsprop', expected one of adam, sgd, ",
+        ),
+        (["task.name=mine"], "task.name: got 'mine', expected one of .*point_mass"),
+        (["constraint.si=3"], "constraint.si: got 3, expected its keys, as in configs/."),
+    ],
+)
+def test_keys_of_groups(overrides, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        check_config(make_config("optimizer=adam", *overrides))
+
+
+@pytest.mark.parametrize("group", [*GROUPS, "algo", "collector"])
+def test_a_group_has_keys(group):
+    cfg = make_config()
+    OmegaConf.update(cfg, group, 3, merge=False)
+    with pytest.raises(QPError, match=f"^{group}: got 3, expected its keys, as in configs/"):
+        check_config(cfg)
+
+
+def test_a_misspelt_key_is_named_before_the_missing_one_and_that_before_a_conflict():
+    cfg = make_config("constraint=fixed", "task.learn_cost=[]")
+    OmegaConf.set_struct(cfg, False)
+    for message in (
+        r"^task.learn_cost: got \[\]",
+        "^updates: got nothing",
+        "^update: got an unknown",
+    ):
+        with pytest.raises(QPError, match=message):
+            check_config(cfg)
+        if "updates" in cfg:
+            del cfg["updates"]
+        else:
+            cfg["update"] = 3
+
+
+def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
+    cfg, file = make_config(), tmp_path / "config.yaml"
+    now = settings(cfg)
+    OmegaConf.set_struct(cfg, False)
+    del cfg["logger"], cfg["eval_seed"]
+    OmegaConf.save(cfg, file)
+    assert differences(settings(cfg), now) is None
+    assert settings(load_config(file)) == now
+    assert differences(settings(cfg), {**now, "eval_seed": 3}) == ("eval_seed=None", "eval_seed=3")
 
 
 def test_solver_must_be_known():

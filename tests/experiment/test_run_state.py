@@ -87,6 +87,19 @@ def test_a_run_that_has_no_checkpoint_yet_begins_anew(tmp_path, stopped):
     assert_events_are_whole(stopped)
 
 
+def test_a_run_of_an_earlier_version_goes_on(tmp_path, stopped):
+    """Without the keys that came later, in its configuration and in its checkpoint."""
+    file, checkpoint = stopped / "config.yaml", stopped / "checkpoint.pt"
+    cfg, state = OmegaConf.load(file), load_checkpoint(checkpoint)
+    for key in ("logger", "eval_seed"):
+        del cfg[key], state["config"][key]
+    OmegaConf.save(cfg, file)
+    save_checkpoint(checkpoint, state)
+    go_on(stopped)
+    train.train(make_config(*RUN, "eval_interval=2", "figures=false"), str(tmp_path / "whole"))
+    assert_same_numbers(stopped, tmp_path / "whole")
+
+
 @pytest.mark.parametrize("when", ["finish", "drop_previous"])
 def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch, when):
     """Killed after the last update, before or after the summary is written."""

@@ -72,7 +72,7 @@ class GymnasiumPlant:
         return env
 
     def true_model(self) -> None:
-        """There is none."""
+        """None: the plant can only be stepped."""
 
     def violation(self, s: Tensor) -> Tensor:
         """How far s ``(*batch, n_x)`` is outside the bounds of its space, summed: 0."""

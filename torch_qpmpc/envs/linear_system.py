@@ -66,7 +66,7 @@ class LinearSystem(ABC):
         lb_s, ub_s, lb_a, ub_a: bounds of the state ``(n_x,)`` and of the action ``(n_u,)``.
     """
 
-    #: Whether a step clips s+ to its bounds. Where not, they are soft: observations have none.
+    #: True if a step clips s+ to its bounds; else they are soft, and observations have none.
     clips_states: ClassVar[bool] = True
 
     A: Tensor

@@ -1,4 +1,7 @@
-"""What a run's configuration may hold: each key, and a sentence for what it must be."""
+"""A run's configuration, checked, loaded and compared.
+
+`model` and `groups` have its keys, and `messages` makes sentences of pydantic's errors.
+"""
 
 from __future__ import annotations
 
@@ -27,19 +30,22 @@ def check_config(cfg: DictConfig) -> None:
 
 
 def load_config(file: Path) -> DictConfig:
-    """The configuration that a run has saved, perhaps in an earlier version."""
-    cfg = OmegaConf.merge(LATER, OmegaConf.load(file))
+    """Load the configuration that a run has saved, and complete one of an earlier version."""
+    cfg = OmegaConf.load(file)
     assert isinstance(cfg, DictConfig)
+    for key, value in LATER.items():
+        if key not in cfg:
+            cfg[key] = value
     return cfg
 
 
 def settings(cfg: DictConfig) -> dict[str, Any]:
-    """Every setting by its dotted key, as on the command line."""
+    """Return every setting by its dotted key, as on the command line."""
     return flatten(OmegaConf.to_container(cfg, resolve=True))
 
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[str, str] | None:
-    """The `settings` in which two differ, as ``key=value`` of either, for a message."""
+    """List the `settings` in which two differ, as ``key=value`` of either, for a message."""
     then, now = {**LATER, **then}, {**LATER, **now}
     changed = [key for key in {**then, **now} if then.get(key) != now.get(key)]
     if not changed:

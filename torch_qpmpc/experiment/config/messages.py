@@ -19,7 +19,7 @@ ORDER = {"extra_forbidden": 0, "missing": 2, "union_tag_not_found": 2, "value_er
 
 
 def first_of(error: ValidationError) -> QPError:
-    """The first error, in a sentence."""
+    """Write the first error in a sentence."""
     return _in_a_sentence(min(error.errors(), key=lambda found: ORDER.get(found["type"], 1)))
 
 
@@ -38,18 +38,18 @@ def _in_a_sentence(error: Any) -> QPError:
         key, value = f"{key}.name", value.get("name")
     got = "nothing" if kind in ("missing", "union_tag_not_found") else repr(value)
     sentence = known.get(key, "its keys, as in configs/")
-    return QPError.expected(key, got, sentence or error["msg"])
+    return QPError.expected(key, got, sentence or f"an allowed value ({error['msg']})")
 
 
 def unknown_key(key: str, known: Mapping[str, str]) -> QPError:
-    """The error of a misspelt key, with the nearest one."""
+    """Make the error of a misspelt key, with the nearest one."""
     close = difflib.get_close_matches(key, known, n=1)
     hint = f"Did you mean {close[0]}?" if close else "See configs/config.yaml."
     return QPError.expected(key, "an unknown key", "a key of configs/", hint)
 
 
 def keys() -> dict[str, str]:
-    """Every dotted key, of all choices, and what its value must be."""
+    """Return every dotted key, of all choices, with what its value must be."""
     return dict(_keys_of(Config))
 
 
@@ -71,7 +71,7 @@ def _keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, st
 
 
 def flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one, with dotted keys."""
+    """Make one mapping of nested ones, with dotted keys."""
     if not isinstance(tree, Mapping):
         return {prefix: tree}
     pairs = (flatten(value, f"{prefix}.{key}".lstrip(".")) for key, value in tree.items())

@@ -126,7 +126,7 @@ def register(task: Task) -> None:
     TASKS[task.name] = task
     if task.defaults is None:
         return
-    # Other processes, such as those of a sweep, run the caller's file to register the task.
+    # Other processes, such as a sweep's, run the caller's file to register the task.
     file = Path(sys._getframe(1).f_code.co_filename).resolve()
     own = {"name": task.name, "file": str(file) if file.exists() else None}
     node = {
@@ -138,7 +138,7 @@ def register(task: Task) -> None:
 
 
 def find_task(settings: Mapping[str, Any]) -> Task:
-    """The task of the keys under ``task``; its file registers it where that is still to be done.
+    """Find the task that the keys under ``task`` name; if it is unknown, run its file.
 
     Raises:
         QPError: there is none.
@@ -146,7 +146,7 @@ def find_task(settings: Mapping[str, Any]) -> Task:
     name, file = settings.get("name"), settings.get("file")
     if name not in TASKS and isinstance(file, str):
         if not Path(file).exists():
-            remedy = "Go on where it is, or say task.file=PATH."
+            remedy = "Put it there, or set task.file to where it is."
             expected = f"the file that registers task={name}"
             raise QPError.expected("task.file", f"{file!r}, which does not exist", expected, remedy)
         runpy.run_path(file, run_name="task_file")
