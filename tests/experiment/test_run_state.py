@@ -16,6 +16,7 @@ from tests.runs import SMALL, make_config, skip_figures
 from tests.stops import assert_events_are_whole, assert_same_numbers, go_on, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
+from torch_qpmpc.experiment.config import load_config
 from torch_qpmpc.experiment.run_state import resumed
 
 #: Neither of the stops is at an evaluation or a row of metrics.
@@ -90,7 +91,7 @@ def test_a_run_that_has_no_checkpoint_yet_begins_anew(tmp_path, stopped):
 def test_a_run_of_an_earlier_version_goes_on(tmp_path, stopped):
     """Without the keys that came later, in its configuration and in its checkpoint."""
     file, checkpoint = stopped / "config.yaml", stopped / "checkpoint.pt"
-    cfg, state = OmegaConf.load(file), load_checkpoint(checkpoint)
+    cfg, state = load_config(file), load_checkpoint(checkpoint)
     for key in ("logger", "eval_seed"):
         del cfg[key], state["config"][key]
     OmegaConf.save(cfg, file)
