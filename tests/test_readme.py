@@ -16,6 +16,7 @@ import pytest
 
 import torch_qpmpc
 from tests.runs import SMALL
+from torch_qpmpc.experiment.tasks import TASKS
 
 README = Path(__file__).parents[1] / "README.md"
 MODULES = sorted(
@@ -38,6 +39,7 @@ def test_blocks_are_found():
 def test_readme_runs(tmp_path, monkeypatch):
     """Block after block, as a reader would paste them into one session."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(TASKS, "pole", raising=False)  # and again afterwards
     blocks = python_blocks(README.read_text(encoding="utf-8"))
     assert blocks, "README.md shows no Python"
     namespace: dict[str, object] = {"__name__": "readme"}
