@@ -23,6 +23,7 @@ import threading
 import time
 from collections.abc import Collection
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -245,7 +246,11 @@ OmegaConf.register_new_resolver("folder_of", folder_of, replace=True)
 LOGGED = ("td_error", "pred_value", "target_value", "unsolved", "invalid_reward")
 
 
-@hydra.main(version_base="1.3", config_path="configs", config_name="config")
+# Absolute, so that a script with a task of its own can call main.
+CONFIGS = str(Path(__file__).with_name("configs"))
+
+
+@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="config")
 def main(cfg: DictConfig) -> float:
     """Train; a sweep's optimiser maximises the closed gap that this returns."""
     threading.excepthook = without_writers

@@ -20,16 +20,11 @@ from torch_qpmpc.analysis.prediction_form import prediction_form
 from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.analysis.structure import distance_by_band, nearest_model
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
-from torch_qpmpc.envs.closed_loop import (
-    ClosedLoop,
-    closed_gap,
-    closed_loop,
-    gap_text,
-    gymnasium_loop,
-)
+from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_gap, gap_text
 from torch_qpmpc.experiment.actor_critic import actor_groups, critic_groups, make_actor_critic_loss
 from torch_qpmpc.experiment.plots import closed_loop_figure, predictions_figure
 from torch_qpmpc.experiment.run_folder import RunFolder
+from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import QPActorValueOperator
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
@@ -184,11 +179,11 @@ def act(actor: TensorDictModuleBase, s: Tensor) -> Tensor:
 def evaluate(
     cfg: DictConfig, policy: Callable[[Tensor], Tensor], physics: LinearSystem | GymnasiumPlant
 ) -> ClosedLoop:
-    """``policy`` from the fixed starts and with the fixed noise."""
-    steps, gamma = cfg.task.eval_steps, cfg.task.gamma
-    if isinstance(physics, LinearSystem):
-        return closed_loop(policy, physics, steps=steps, gamma=gamma)
-    return gymnasium_loop(policy, physics, steps=steps, gamma=gamma)
+    """``policy`` from the starts and with the noise of ``cfg.eval_seed``."""
+    options = {} if cfg.eval_seed is None else {"seed": cfg.eval_seed}
+    return find_task(cfg.task).closed_loop(
+        policy, physics, steps=cfg.task.eval_steps, gamma=cfg.task.gamma, **options
+    )
 
 
 def report(
