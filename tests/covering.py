@@ -1,4 +1,4 @@
-"""Fewer combinations of parameters than all, where what is tested depends on two of them at most."""
+"""Fewer combinations of parameters than all, where a test depends on at most two of them."""
 
 from __future__ import annotations
 

@@ -12,9 +12,12 @@ from omegaconf import DictConfig
 
 import train
 from tests.runs import SMALL, make_config
-from torch_qpmpc import QPActorValueOperator, QPError
+from torch_qpmpc import QPActorValueOperator, QPError, SolveLog
 from torch_qpmpc.experiment.collection import batches, make_collector, num_columns
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
+
+NOISES = {"point_mass": "gaussian", "gros_zanon": "uniform", "pendulum": "none"}
 
 
 def collect(cfg: DictConfig, count: int) -> tuple[Any, Any]:
@@ -46,6 +49,27 @@ def test_a_collector_follows_the_policy_with_exploration():
     assert not torch.equal(other["observation"][:, 0], quiet["observation"][:, 0])
 
 
+@pytest.mark.parametrize("task", ["point_mass", "gros_zanon", "pendulum"])
+def test_a_collector_carries_active_sets_from_step_to_step(task):
+    cfg = make_config(*SMALL, f"task={task}", f"noise={NOISES[task]}", "steps_per_update=5")
+    physics = make_physics(cfg)
+    mpc = make_mpc(cfg, physics)
+    policy = QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
+    collector: Any = make_collector(cfg, physics, policy)
+    torch.manual_seed(0)
+    try:
+        with SolveLog() as log:
+            for batch, _ in zip(batches(collector), range(4), strict=False):
+                assert POLICY_ACTIVE_SET not in batch
+                assert POLICY_ACTIVE_SET not in batch["next"]
+                last = batch["observation"][:, -1]
+                carried = collector._carrier[POLICY_ACTIVE_SET]
+                assert torch.equal(carried, mpc.solve(last).active)
+    finally:
+        collector.shutdown()
+    assert log.recalled > 0.5 * log.solves
+
+
 #: The collectors whose environments are in other processes.
 ELSEWHERE = [
     pytest.param("multi", marks=pytest.mark.slow),
@@ -61,7 +85,8 @@ def test_workers_share_the_environments_and_follow_theta(name):
     cfg = make_config(*SMALL, f"collector={name}", *WORKERS)
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
-    collector = make_collector(cfg, physics, QPActorValueOperator(mpc).get_policy_operator())
+    policy = QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
+    collector = make_collector(cfg, physics, policy)
     stream = batches(collector)
     try:
         first = next(stream).clone()

@@ -49,7 +49,7 @@ def test_the_first_signal_is_noted_and_the_second_acts(signum):
 def test_a_block_without_a_signal_changes_nothing(capsys):
     before = [signal.getsignal(signum) for signum in SIGNALS]
     with Interrupt() as interrupt:
-        interrupt.grant("never said")
+        interrupt.exit_if_signalled("never said")
     assert interrupt.signum is None
     assert [signal.getsignal(signum) for signum in SIGNALS] == before
     assert capsys.readouterr().out == ""

@@ -21,8 +21,12 @@ from torchrl.modules import (
 )
 from torchrl.objectives import DDPGLoss, IQLLoss
 
-from torch_qpmpc import QPMPC, QPActorValueOperator
+from torch_qpmpc import QPMPC, QPActorValueOperator, SolveLog, SolverError
 from torch_qpmpc.envs import PointMass, PointMassEnv
+from torch_qpmpc.envs.closed_loop import closed_loop
+from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, warm_policy
+from torch_qpmpc.qp.program import UNKNOWN
+from torch_qpmpc.qp.solvers import BACKENDS
 
 BATCHES = [(), (3,), (2, 3)]
 
@@ -198,6 +202,73 @@ def test_gradients_pass_through_the_critic():
     torch.testing.assert_close(td["observation"].grad, ds)
     torch.testing.assert_close(td["action"].grad, da)
     assert da.norm() > 0
+
+
+# --- A policy that starts each step from the active set of the one before ------------------------
+
+
+def make_corridor(solver: str, **options: Any) -> QPMPC:
+    """A QP of the point mass in which, from fixed starts, many rows are active at first."""
+    plant = PointMass()
+    options = {"state_bounds": (plant.lb_s, plant.ub_s), "horizon": 8, "solver": solver} | options
+    bounds, weight = (plant.lb_a, plant.ub_a), torch.tensor([6, 6, 0.5, 0.5, 0.1, 0.1])
+    return QPMPC.from_model(plant.A, plant.B, action_bounds=bounds, stage_weight=weight, **options)
+
+
+@pytest.mark.parametrize("solver", BACKENDS)
+def test_warm_actions_are_the_cold_ones(solver):
+    """On the states of one closed loop, the most violated first; and in a loop of their own."""
+    mpc = make_corridor(solver)
+    policy = QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
+    cold = closed_loop(mpc.policy, PointMass(), steps=20, starts=8)
+    td, recalled = TensorDict(), []
+    for s in cold.states:
+        with SolveLog() as log:
+            policy(td.set("observation", s))
+        torch.testing.assert_close(td["action"], mpc.policy(s), rtol=0, atol=1e-8)
+        assert torch.equal(td[POLICY_ACTIVE_SET], mpc.solve(s).active)
+        recalled.append(log.recalled)
+    assert sum(recalled) > 0.9 * 8 * len(recalled), "few steps need the solver"
+    warm = closed_loop(warm_policy(mpc), PointMass(), steps=20, starts=8)
+    torch.testing.assert_close(warm.actions, cold.actions, rtol=0, atol=1e-7)
+
+
+def test_steps_that_could_not_be_solved_leave_nothing_to_start_from():
+    mpc = make_corridor("daqp", state_slack=torch.inf, on_failure="mask")
+    inside = torch.tensor([0.1, 0.1, 0.0, 0.0])
+    far = 3 * PointMass().ub_s.float()
+    policy, td = QPActorValueOperator(mpc).get_policy_operator("codes"), TensorDict()
+    policy(td.set("observation", torch.stack((inside, far))))
+    assert (td["codes"] == UNKNOWN).all(-1).tolist() == [False, True]
+    policy(td.set("observation", torch.stack((inside, inside))))
+    torch.testing.assert_close(td["action"][1], mpc.policy(inside))
+    mpc.on_failure = "raise"
+    with pytest.raises(SolverError, match="1 of 2"):
+        policy(td.set("observation", torch.stack((inside, far))))
+
+
+def test_warm_policies_under_vmap_and_compiled():
+    mpc, td = make_mpc(), make_inputs(4)
+    s, active = td["observation"], mpc.solve(td["observation"].flip(0)).active
+    expected = mpc.policy(s)
+
+    def act(s: torch.Tensor, active: torch.Tensor) -> torch.Tensor:
+        policy: Any = QPActorValueOperator(mpc).get_policy_operator("codes")
+        return policy(TensorDict(observation=s, codes=active))["action"]
+
+    torch.testing.assert_close(torch.vmap(act)(s, active), expected)
+    warm = torch.compile(mpc.policy, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(warm(s, active), expected)
+
+
+def test_a_gradient_passes_through_a_warm_policy():
+    mpc, s = make_mpc(), make_inputs(4)["observation"]
+    start = mpc.solve(s.flip(0)).active
+    warm, cold = (
+        torch.autograd.grad(mpc.policy(s, warm_start=start).square().sum(), mpc.C)
+        for start in (start, None)
+    )
+    torch.testing.assert_close(warm, cold)
 
 
 # --- In TorchRL's collectors and losses ----------------------------------------------------------

@@ -136,4 +136,7 @@ def test_training_is_the_same_without_the_cache(tmp_path, monkeypatch):
         assert runs[0][name] == pytest.approx(runs[1][name], rel=1e-5)
     for on in ("true", "false"):
         recalled = pd.read_csv(tmp_path / on / "metrics.csv")["qp/recalled"].to_numpy()
-        assert (np.nansum(recalled) > 0) == (on == "true"), "as the optimiser is of the first order"
+        collected = 4  # one step of each environment, which starts from the one before
+        assert (np.nanmax(recalled) > collected) == (on == "true"), (
+            "as the optimiser is first-order"
+        )

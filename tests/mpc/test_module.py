@@ -385,6 +385,16 @@ def test_a_copy_gives_the_same_answers_and_is_independent(copied, name):
     twin.reset_parameters()
 
 
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_qp_without_values_is_pickled(name):
+    """As TorchRL sends policies to workers: on the meta device, the weights apart."""
+    mpc = random_mpc(12, **SETTINGS[name])
+    step(mpc)
+    twin = round_trip(copy.deepcopy(mpc).to("meta")).to_empty(device="cpu")
+    twin.load_state_dict(mpc.state_dict())
+    assert_close(twin.C, mpc.C, rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("copied", [copy.deepcopy, round_trip], ids=["deepcopy", "pickle"])
 @pytest.mark.parametrize("learn", [("H", "C"), ("C",), ()])
 def test_a_copy_keeps_mode_dtype_and_what_is_frozen(copied, learn):

@@ -57,6 +57,14 @@ def test_strata_keep_their_size():
     assert low < 0.3 < 0.7 < high
 
 
+def test_a_stratum_of_one_run_is_in_every_resample(rng):
+    assert bootstrap_interval([np.array([0.3])]) == (0.3, 0.3)
+    several = rng.normal(size=(9, 2))
+    low, high = bootstrap_interval([several, np.full((1, 2), 100.0)], np.mean)
+    alone = bootstrap_interval([several], np.mean)
+    np.testing.assert_allclose([low, high], 0.9 * np.array(alone) + 10, rtol=1e-12)
+
+
 def test_curves_have_an_interval_at_each_point(rng):
     x = rng.normal(size=(10, 7))
     low, high = bootstrap_interval([x], interquartile_mean)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.objectives import DDPGLoss, LossModule, TD3Loss
 
-from torch_qpmpc.learning.actor_critic import ActionValue, BoundedPolicy, ClippedPolicy
-from torch_qpmpc.learning.operators import QPActorValueOperator
+from torch_qpmpc.learning.actor_critic import ActionValue, BoundedPolicy, ClippedPolicy, clipped
+from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, QPActorValueOperator
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import COST
 
@@ -26,6 +27,17 @@ def make_actor(cfg: DictConfig, mpc: QPMPC, low: Tensor, high: Tensor) -> Tensor
         return TensorDictModule(ClippedPolicy(mpc, low, high), ["observation"], ["action"])
     network = BoundedPolicy(mpc.n_x, low, high, cfg.algo.width)
     return TensorDictModule(network, ["observation"], ["action"])
+
+
+def make_acting(
+    cfg: DictConfig, mpc: QPMPC, loss_module: LossModule, low: Tensor, high: Tensor
+) -> TensorDictModuleBase:
+    """The loss's actor as it acts in closed loop: a QP's starts each step from the one before."""
+    if cfg.algo.actor == "mlp":
+        return cast("TensorDictModuleBase", loss_module.actor_network)
+    policy: Any = QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
+    clip: Any = TensorDictModule(partial(clipped, low=low, high=high), ["action"], ["action"])
+    return TensorDictSequential(policy, clip)
 
 
 def make_critic(cfg: DictConfig, mpc: QPMPC) -> Any:

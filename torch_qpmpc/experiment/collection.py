@@ -1,4 +1,4 @@
-"""Where transitions come from: TorchRL's collectors, in this process, in others, or through Ray."""
+"""Transitions: TorchRL's collectors, in this process, in others, or through Ray; and the replay."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from torchrl.modules import AdditiveGaussianModule
 
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
+from torch_qpmpc.learning.replay import Replay, make_replay
+from torch_qpmpc.mpc.module import QPMPC
 
 #: TorchRL's collectors through Ray need a number; -1 would be none.
 ENDLESS = 2**62
@@ -72,12 +75,30 @@ def make_collector(
     )
 
 
+def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
+    """The replay of a run: of transitions and, for the SI penalty, of windows."""
+    si = cfg.constraint.si
+    return make_replay(
+        cfg.replay_capacity,
+        num_columns(cfg),
+        cfg.batch_size,
+        cfg.task.horizon,
+        1 if si is None else si.windows,
+        seed=cfg.seed,
+        active_rows=len(mpc.G) if cfg.warm_start else None,
+    )
+
+
 def batches(collector: BaseCollector) -> Iterator[TensorDictBase]:
-    """``(num_columns, steps_per_update)`` transitions for ever, under the newest theta."""
+    """``(num_columns, steps_per_update)`` transitions for ever, under the newest theta.
+
+    Without the policy's active sets, which are of use to its next step alone.
+    """
     alone = isinstance(collector, Collector)
     if not alone:
         collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]
-    for batch in collector:
+    for collected in collector:
+        batch = collected.exclude(POLICY_ACTIVE_SET)
         yield batch if alone else batch.reshape(-1, batch.shape[-1])
         if not alone:
             collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]

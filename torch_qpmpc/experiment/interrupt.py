@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a wish to stop, which a loop grants between two updates."""
+"""Ctrl-C and SIGTERM, deferred until a loop is between two updates."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Interrupt:
             signal.signal(signum, handler)
         self._usual = {}
 
-    def grant(self, sentence: str) -> None:
-        """Where there is a wish to stop, leave with ``sentence`` and the signal's exit code."""
+    def exit_if_signalled(self, sentence: str) -> None:
+        """After a signal, print ``sentence`` and exit with the signal's code."""
         if self.signum is not None:
             print(f"\n{sentence}", flush=True)
             raise SystemExit(128 + self.signum)

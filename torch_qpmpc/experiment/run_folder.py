@@ -1,4 +1,4 @@
-"""A run's folder: config.yaml, metrics.csv, TensorBoard events, checkpoint.pt, summary.json."""
+"""A run's folder: config.yaml, metrics.csv, what its logger writes, checkpoint.pt, summary.json."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ import pandas as pd
 from hydra.experimental.callback import Callback
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
-from tensorboard.compat.proto import event_pb2
-from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, write_whole
 from torch_qpmpc.experiment.config import settings
+from torch_qpmpc.experiment.loggers import RunLogger
 
 
 class RunFolder:
@@ -43,19 +42,14 @@ class RunFolder:
         earlier: Any = None if after is None else _read_until(self.path, cfg, after)
         self.cfg = cfg
         self.rows: list[dict[str, float]] = []
-        self.logger = TensorboardLogger(exp_name="tensorboard", log_dir=str(self.path))
-        # TensorBoard drops what earlier event files have from here on.
-        event: Any = event_pb2  # its classes are made at run time
-        start = event.SessionLog(status=event.SessionLog.START)
-        writer = self.logger.experiment.file_writer.event_writer
-        writer.add_event(event.Event(step=0 if after is None else after + 1, session_log=start))
+        if after is not None:
+            for update, row in earlier.iterrows():
+                self.rows.append({"update": update, **row.dropna()})
+        self.logger = RunLogger(cfg.logger, self.path, settings(cfg), self.rows, after)
         if after is None:
             text = OmegaConf.to_yaml(cfg, resolve=True)
             write_whole(self.path / "config.yaml", text.encode())
-            self.logger.experiment.add_text("config", f"```yaml\n{text}```")
-        else:
-            for update, row in earlier.iterrows():
-                self.rows.append({"update": update, **row.dropna()})
+            self.logger.text("config", f"```yaml\n{text}```")
 
     def __enter__(self) -> RunFolder:
         return self
@@ -64,19 +58,18 @@ class RunFolder:
         try:
             self.flush()
         finally:
-            self.logger.experiment.close()
+            self.logger.close()
 
     def log(self, metrics: Mapping[str, float], update: int) -> None:
-        """Scalars at an update: a row of metrics.csv, and TensorBoard."""
+        """Scalars at an update: a row of metrics.csv, and the logger."""
         if not self.rows or self.rows[-1]["update"] != update:
             self.rows.append({"update": update})
         self.rows[-1].update(metrics)
-        for name, value in metrics.items():
-            self.logger.log_scalar(name, value, step=update)
+        self.logger.log(metrics, update)
 
     def figure(self, name: str, figure: Figure, update: int) -> None:
-        """A figure for TensorBoard."""
-        self.logger.experiment.add_figure(name, figure, update)
+        """A figure for the logger."""
+        self.logger.figure(name, figure, update)
 
     def column(self, name: str) -> tuple[list[float], list[float]]:
         """The updates at which ``name`` was logged, and its values."""
@@ -84,26 +77,18 @@ class RunFolder:
         return [row["update"] for row in rows], [row[name] for row in rows]
 
     def flush(self) -> None:
-        """Write metrics.csv, and what TensorBoard still holds."""
+        """Write metrics.csv, and what the logger still holds."""
         table = pd.DataFrame(self.rows).to_csv(index=False)
         write_whole(self.path / "metrics.csv", table.encode())
-        self.logger.experiment.flush()
+        self.logger.flush()
 
     def finish(self, summary: Mapping[str, float | int | str]) -> None:
-        """Write the hyper-parameters with the outcome to TensorBoard, and summary.json.
+        """Write the outcome to the logger, and summary.json.
 
         JSON knows neither nan (no gap to close) nor inf: there they are null.
         """
-        plain = (bool, int, float, str)
-        hparams = {
-            key: value if isinstance(value, plain) else str(value)
-            for key, value in settings(self.cfg).items()
-        }
-        outcome = {
-            f"hparam/{key}": value for key, value in summary.items() if isinstance(value, float)
-        }
-        self.logger.experiment.add_hparams(hparams, outcome, run_name=".")
-        self.logger.experiment.flush()
+        self.logger.finish(summary)
+        self.logger.flush()
         finite = {
             key: None if isinstance(value, float) and not math.isfinite(value) else value
             for key, value in summary.items()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Collection, Iterator
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,50 +22,15 @@ from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
 from torch_qpmpc.experiment.config import differences, load_config, settings
 from torch_qpmpc.experiment.lock import ELSEWHERE
+from torch_qpmpc.experiment.tally import Tally
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 #: The parts of a snapshot.
 STATE = ("config", "update", "structure", "mpc", "loss_module", "optimizer", "schedule")
 STATE += ("replay", "collector", "tally", "rng")
 #: The files by which a run is known before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
-
-
-@dataclass
-class Tally:
-    """What a run adds up.
-
-    Attributes:
-        update: how many there have been.
-        costs: the mean cost of a step, of each update.
-        violation: of the states' bounds, summed over all steps.
-        qps: what has been solved since the last row of metrics; ``unsolved``, before that.
-        seconds: of training, but for what the kernels took to compile, once for an installation.
-    """
-
-    update: int = 0
-    costs: list[float] = field(default_factory=list)
-    violation: float = 0.0
-    qps: SolveLog = field(default_factory=SolveLog)
-    unsolved: int = 0
-    seconds: float = 0.0
-
-    def leave_out(self, seconds: float) -> None:
-        """Do not count these, which the next update is going to add."""
-        self.seconds -= seconds
-
-    def summary(self) -> dict[str, float]:
-        """What learning itself cost: over all updates, and over the last tenth of them."""
-        last = self.costs[-max(1, len(self.costs) // 10) :]
-        return {
-            "train_seconds": self.seconds,
-            "train_cost": sum(self.costs) / len(self.costs),
-            "train_cost_last_tenth": sum(last) / len(last),
-            "train_violation": self.violation,
-            "unsolved": self.unsolved + self.qps.unsolved,
-        }
 
 
 def snapshot(
@@ -93,7 +57,7 @@ def snapshot(
         "schedule": {"last_epoch": learner.schedule.last_epoch},
         "replay": replay.state_dict() if len(replay) and not over else None,
         "collector": None if over else _collector_state(collector),
-        "tally": asdict(tally),
+        "tally": tally.state(),
         "rng": torch.get_rng_state(),
     }
 
@@ -126,9 +90,7 @@ def restore(
     with _part("rng"):
         torch.set_rng_state(state["rng"])
     with _part("tally"):
-        tally = Tally(**state["tally"])
-        tally.qps = SolveLog(**state["tally"]["qps"])
-    return tally
+        return Tally.from_state(state["tally"])
 
 
 def check_state(state: Any, cfg: DictConfig) -> None:

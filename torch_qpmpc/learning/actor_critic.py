@@ -52,6 +52,11 @@ class Clip(torch.autograd.Function):
         return grad.masked_fill(further_out, 0.0), None, None
 
 
+def clipped(a: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """a ``(*batch, n_u)`` between its bounds ``(n_u,)``, with the gradient of `Clip`."""
+    return cast("Tensor", Clip.apply(a, low.to(a), high.to(a)))
+
+
 class ClippedPolicy(nn.Module):
     """pi(s) of a QP, clipped as plants do it: with soft action rows it may exceed the bounds."""
 
@@ -66,7 +71,7 @@ class ClippedPolicy(nn.Module):
 
     def forward(self, s: Tensor) -> Tensor:
         """s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
-        return cast("Tensor", Clip.apply(self.module.policy(s), self.low.to(s), self.high.to(s)))
+        return clipped(self.module.policy(s), self.low, self.high)
 
 
 class ActionValue(nn.Module):

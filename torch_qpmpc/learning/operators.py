@@ -6,9 +6,10 @@ state_action_value = -Q(s, a), both with the trailing dimension of one that Torc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
-from tensordict import TensorDictBase
+import torch
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -16,6 +17,9 @@ from torch import Tensor
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
+
+#: Where a policy in closed loop leaves its active sets from step to step.
+POLICY_ACTIVE_SET = "policy_active_set"
 
 
 class _QPOperator(TensorDictModuleBase):
@@ -62,13 +66,25 @@ def _read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 class QPPolicyOperator(_QPOperator):
-    """pi(s): observation ``(*batch, n_x)`` to action ``(*batch, n_u)``."""
+    """pi(s): observation ``(*batch, n_x)`` to action ``(*batch, n_u)``.
+
+    With an ``active_set_key`` each call starts from the active sets under that key, or from the
+    empty ones where there are none, and leaves its own there. Rollouts and collectors carry them to
+    the next step.
+    """
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set(
-            self.out_keys[0], self.module.policy(_read(tensordict, self.in_keys[0]))
-        )
+        s = _read(tensordict, self.in_keys[0])
+        if self.active_set_key is None:
+            return tensordict.set(self.out_keys[0], self.module.policy(s))
+        start = tensordict.get(self.active_set_key, None)
+        if start is None:
+            rows = len(self.module.G)
+            start = torch.zeros((*s.shape[:-1], rows), dtype=torch.int8, device=s.device)
+        action, active = self.module.policy_and_active_set(s, start)
+        tensordict.set(self.active_set_key, active)
+        return tensordict.set(self.out_keys[0], action)
 
 
 class QPValueOperator(_QPOperator):
@@ -117,9 +133,13 @@ class QPActorValueOperator(_QPOperator):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self._set_value(tensordict)
 
-    def get_policy_operator(self) -> QPPolicyOperator:
-        """The actor: observation to action."""
-        return QPPolicyOperator(self.module, self.in_keys[:1], self.in_keys[1])
+    def get_policy_operator(self, active_set_key: NestedKey | None = None) -> QPPolicyOperator:
+        """The actor: observation to action.
+
+        ``active_set_key``, where each step of an episode leaves its active set for the next one, is
+        another one than that of Q. None starts each step cold.
+        """
+        return QPPolicyOperator(self.module, self.in_keys[:1], self.in_keys[1], active_set_key)
 
     def get_value_operator(self) -> QPValueOperator:
         """The state value: observation to state_value."""
@@ -129,3 +149,30 @@ class QPActorValueOperator(_QPOperator):
     def get_critic_operator(self) -> QPActorValueOperator:
         """The critic: (observation, action) to state_action_value, this operator itself."""
         return self
+
+
+def warm_policy(mpc: QPMPC) -> Callable[[Tensor], Tensor]:
+    """`QPMPC.policy` for one closed loop: each call starts from the last call's active sets.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> from torch_qpmpc.envs import PointMass
+        >>> from torch_qpmpc.envs.closed_loop import closed_loop
+        >>> physics = PointMass()
+        >>> mpc = qm.QPMPC.from_model(physics.A, physics.B, 5, action_bounds=([-1, -1], [1, 1]))
+        >>> loop = closed_loop(warm_policy(mpc), physics, steps=10)
+    """
+    return in_closed_loop(QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET))
+
+
+def in_closed_loop(actor: TensorDictModuleBase) -> Callable[[Tensor], Tensor]:
+    """An actor as a function s to a, for one closed loop.
+
+    What the actor writes beside the action, such as active sets, is there at its next call.
+    """
+    carried = TensorDict()
+
+    def policy(s: Tensor) -> Tensor:
+        return actor(carried.set("observation", s))["action"]
+
+    return policy

@@ -231,9 +231,12 @@ class QPMPC(nn.Module):
         """
         return self._value(self._checked(s, a), qp)
 
-    def policy(self, s: Tensor) -> Tensor:
-        """pi(s), the u_0 of V's solution: s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
-        return to_dtype(self.solve(s).z[..., self.n_x : self.n_x + self.n_u], s.dtype)
+    def policy(self, s: Tensor, warm_start: QPSolution | Tensor | None = None) -> Tensor:
+        """pi(s), the u_0 of V's solution: s ``(*batch, n_x)`` to ``(*batch, n_u)``.
+
+        ``warm_start`` is as for `solve`.
+        """
+        return self._action(self.solve(s, warm_start=warm_start), s.dtype)
 
     def forward(self, s: Tensor, a: Tensor | None = None) -> Tensor:
         """V(s), or Q(s, a) where an action is given."""
@@ -269,6 +272,13 @@ class QPMPC(nn.Module):
             qp, to_dtype(fixed, qp.C.dtype), warm_start=warm_start, **self._options()
         )
         return to_dtype(value, fixed.dtype), active
+
+    def policy_and_active_set(
+        self, s: Tensor, warm_start: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """`policy`, with the active set ``(*batch, n_g)`` that the next step can start from."""
+        solution = self.solve(s, warm_start=warm_start)
+        return self._action(solution, s.dtype), solution.active
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """The states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
@@ -457,6 +467,10 @@ class QPMPC(nn.Module):
         qp = self._today(qp)
         value = optimal_value(qp, to_dtype(fixed, qp.C.dtype), **self._options())
         return to_dtype(value, fixed.dtype)
+
+    def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:
+        """u_0 of a solution of V's QP."""
+        return to_dtype(solution.z[..., self.n_x : self.n_x + self.n_u], dtype)
 
     def _options(self) -> dict[str, Any]:
         """What V, Q and the policy ask of every solve; one ``keep``, to share one elimination."""

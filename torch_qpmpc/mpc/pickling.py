@@ -18,7 +18,9 @@ def reduce(
     module: nn.Module, arguments: dict[str, Any], kept: Callable[[str], list[nn.Module]]
 ) -> tuple:
     """What ``__reduce_ex__`` returns; ``kept`` is what a part of ``module`` keeps by itself."""
-    for name in getattr(module, "parametrizations", ()):
+    # TorchRL sends a policy to its workers on the meta device, without values to compare.
+    real = not any(part.is_meta for part in module.buffers())
+    for name in getattr(module, "parametrizations", ()) if real else ():
         found = module.get_submodule(f"parametrizations.{name}").children()
         if [type(part) for part in found] != [type(part) for part in kept(name)]:
             got = f"a parametrization of {name} that is not QPMPC's own"

@@ -13,6 +13,7 @@ from torch_qpmpc.analysis.plots import draw_slice, slice_between
 from torch_qpmpc.analysis.report import canonical
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.plots import draw_matrix, draw_positions
+from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.study.runs import CASES, FinishedRun, has_real
 from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
 
@@ -116,7 +117,7 @@ def trajectories_figure(frame: pd.DataFrame) -> Figure:
     ):
         ends = {"start": run.start, "learned": run.learned, "true model": run.true}
         loops = {
-            name: evaluate(run.cfg, mpc.policy, run.physics)
+            name: evaluate(run.cfg, warm_policy(mpc), run.physics)
             for name, mpc in ends.items()
             if mpc is not None
         }
@@ -134,7 +135,7 @@ def policies_figure(frame: pd.DataFrame) -> Figure:
     shown |= {label: run.learned for label, run in zip(runs["label"], runs["run"], strict=True)}
     if first.true is not None:
         shown["true model"] = first.true
-    starts = evaluate(first.cfg, first.start.policy, first.physics).states[0]
+    starts = evaluate(first.cfg, warm_policy(first.start), first.physics).states[0]
     slices = {label: slice_between(mpc, starts) for label, mpc in shown.items()}
     figure = Figure(figsize=(3.2 * len(slices), 6), layout="constrained")
     values, actions = figure.subplots(2, len(slices), squeeze=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.stats import bootstrap
 
 from torch_qpmpc.checks import check_number, check_whole
 from torch_qpmpc.errors import QPError
@@ -82,10 +83,19 @@ def bootstrap_interval(
     if not strata or not all(len(stratum) for stratum in strata):
         sizes = [len(stratum) for stratum in strata]
         raise QPError.expected("strata", f"sizes {sizes}", "at least one run in each")
-    rng = np.random.default_rng(seed)
-    drawn = [
-        stratum[rng.integers(len(stratum), size=(resamples, len(stratum)))] for stratum in strata
-    ]
-    values = statistic(np.concatenate(drawn, axis=1), axis=1)
-    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    # scipy resamples two runs at least: a single one is doubled, and its twin left out again.
+    doubled = [np.repeat(stratum, 1 + (len(stratum) == 1), axis=0) for stratum in strata]
+
+    def of_all(*drawn: np.ndarray, axis: int) -> np.ndarray:
+        runs = [x[..., : len(stratum)] for x, stratum in zip(drawn, strata, strict=True)]
+        return statistic(np.concatenate(runs, axis=axis), axis=axis)
+
+    low, high = bootstrap(
+        doubled,
+        of_all,
+        confidence_level=level,
+        n_resamples=resamples,
+        method="percentile",
+        rng=seed,
+    ).confidence_interval
     return low, high

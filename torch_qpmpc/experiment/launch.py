@@ -1,0 +1,93 @@
+"""What ``python train.py`` does before and after a run: its folder, its lock, its errors."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.config import check_config
+from torch_qpmpc.experiment.lock import ELSEWHERE, ELSEWHERE_IN_SWEEP, locked
+from torch_qpmpc.experiment.run_folder import unwritable
+from torch_qpmpc.experiment.run_state import check_fresh, check_own_folder, folder_of, resumed
+from torch_qpmpc.experiment.sweeps import finished_run, stopped_run
+
+# A run that goes on stays in its folder: configs/config.yaml calls this.
+OmegaConf.register_new_resolver("folder_of", folder_of, replace=True)
+
+
+@dataclass(frozen=True)
+class Launch:
+    """One call of train.py.
+
+    Attributes:
+        folder: of the run.
+        overrides: of the command line.
+        sweep: the run is one of a sweep's.
+    """
+
+    folder: str
+    overrides: Collection[str]
+    sweep: bool
+
+    def settle(
+        self, cfg: DictConfig
+    ) -> tuple[DictConfig, dict[str, Any] | None, dict[str, Any] | None]:
+        """Decide what is to do: start a run, go on with one, or nothing, as it has finished.
+
+        Returns:
+            The run's own configuration, the state to go on from, and the summary of a sweep's
+            finished run; the latter two are None where there are none.
+
+        Raises:
+            QPError: an impossible configuration, or a folder that holds another run.
+        """
+        resume, state = cfg.resume, None
+        if resume is not None:
+            cfg, state = resumed(resume, self.overrides)
+        check_config(cfg)
+        if self.sweep:
+            if (summary := finished_run(self.folder, cfg)) is not None:
+                return cfg, None, summary
+            state = stopped_run(self.folder, cfg)
+        elif resume is None:
+            check_fresh(self.folder)
+        else:
+            check_own_folder(resume, self.folder)
+        return cfg, state, None
+
+
+@contextmanager
+def launched() -> Iterator[Launch]:
+    """Lock the folder that Hydra made for this run; turn errors of the user into one sentence.
+
+    In a sweep they are raised as they are, as an exit would end the other runs, too.
+    """
+    threading.excepthook = _print_unless_writing
+    hydra = HydraConfig.get()
+    sweep = hydra.mode is RunMode.MULTIRUN
+    launch = Launch(hydra.runtime.output_dir, list(hydra.overrides.task), sweep)
+    try:
+        with locked(launch.folder, ELSEWHERE_IN_SWEEP if sweep else ELSEWHERE):
+            yield launch
+    except QPError as error:
+        if sweep:
+            raise
+        raise SystemExit(str(error)) from None
+    except OSError as error:
+        if sweep or isinstance(error, ConnectionError):  # a lost worker is not a file error
+            raise
+        raise SystemExit(str(unwritable(launch.folder, error))) from None
+
+
+def _print_unless_writing(error: threading.ExceptHookArgs) -> None:
+    """Print a thread's error, but for those of TensorBoard's files: the run raises them, too."""
+    if not isinstance(error.exc_value, OSError):
+        threading.__excepthook__(error)

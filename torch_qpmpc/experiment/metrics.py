@@ -1,0 +1,159 @@
+"""The numbers and figures of a run: of each update, of each evaluation, and of the whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from omegaconf import DictConfig
+from torch import Tensor
+
+from torch_qpmpc.analysis.model_error import one_step_error
+from torch_qpmpc.analysis.plots import constraint_figure, policy_figure, slice_between
+from torch_qpmpc.analysis.prediction_form import prediction_form
+from torch_qpmpc.analysis.report import structure_metrics
+from torch_qpmpc.analysis.structure import distance_by_band, nearest_model
+from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_gap, gap_text
+from torch_qpmpc.experiment.algorithms import Learner
+from torch_qpmpc.experiment.plots import closed_loop_figure, predictions_figure
+from torch_qpmpc.experiment.run_folder import RunFolder
+from torch_qpmpc.experiment.tally import Stopwatch, Tally
+from torch_qpmpc.learning.updates import Scalars
+from torch_qpmpc.mpc.module import QPMPC
+
+#: What is logged of what a loss returns beside its terms.
+LOGGED = ("td_error", "pred_value", "target_value", "unsolved", "invalid_reward")
+#: The most numbers that a part of theta may have to be logged one by one.
+FEW = 16
+
+
+def update_metrics(
+    terms: Mapping[str, Tensor],
+    losses: Scalars,
+    tally: Tally,
+    watch: Stopwatch,
+    mpc: QPMPC,
+    learner: Learner,
+) -> dict[str, float]:
+    """The scalars of an update; the tally's are those since the last row."""
+    metrics = {name: term.item() for name, term in terms.items()}
+    metrics |= {
+        f"train/{name}": x.double().mean().item() for name, x in losses.items() if name in LOGGED
+    }
+    metrics |= tally.metrics() | theta_metrics(mpc)
+    if learner.deviation is not None:
+        metrics.setdefault("loss/deviation", learner.deviation(mpc.C).item())
+    return metrics | watch.metrics()
+
+
+def run_summary(
+    cfg: DictConfig,
+    loops: dict[str, ClosedLoop],
+    tally: Tally,
+    mpc: QPMPC | None,
+    true_model: Sequence[Tensor] | None,
+) -> dict[str, Any]:
+    """What summary.json holds; ``mpc`` is None where the learned policy is no QP's."""
+    summary: dict[str, Any] = gap_summary(loops)
+    summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
+    summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
+    summary |= {"ablation": cfg.ablation, "step": cfg.step, "penalty_step": cfg.penalty_step}
+    summary |= {"updates": cfg.updates, **tally.summary()}
+    return summary if mpc is None else summary | structure_summary(mpc, true_model)
+
+
+def report(
+    run: RunFolder, mpc: QPMPC | None, loops: dict[str, ClosedLoop], update: int
+) -> dict[str, Any]:
+    """Log an evaluation: J between its two ends, what C says, and figures if wanted.
+
+    Before the first update, J alone; after the last, the predictions and the policy, too.
+
+    Args:
+        mpc: None where the learned policy is no QP's.
+
+    Returns:
+        `gap_summary` of ``loops``.
+    """
+    summary = gap_summary(loops)
+    run.log({f"eval/{name}": summary[key] for name, key in LOGGED_OF_LOOPS.items()}, update)
+    if mpc is None or update == 0:
+        return summary
+    distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
+    distances |= structure_metrics(mpc)
+    run.log({f"structure/{name}": distance for name, distance in distances.items()}, update)
+    if run.cfg.figures:
+        run.figure("structure/C", constraint_figure(mpc), update)
+        run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
+    if run.cfg.figures and update == run.cfg.updates:
+        states = loops["learned"].states
+        if states.isfinite().all():
+            run.figure("eval/predictions", predictions_figure(mpc, loops["learned"]), update)
+        if mpc.n_x > 1:
+            run.figure("eval/policy", policy_figure(slice_between(mpc, states[0])), update)
+    return summary
+
+
+#: The names of an evaluation's scalars, and which of `gap_summary` they are.
+LOGGED_OF_LOOPS = {
+    "J": "J_final",
+    "J_true_model": "J_true_model",
+    "J_discounted": "J_discounted_final",
+    "closed_gap": "closed_gap",
+}
+
+
+def structure_summary(mpc: QPMPC, true_model: Sequence[Tensor] | None) -> dict[str, float]:
+    """How far the learned constraints are from an MPC scheme's, and from the true model if any.
+
+    Returns:
+        ``canonical_distance``, to the nearest scheme, and ``model_error``, of that scheme's model
+        in one step (see `one_step_error`), with ``model_error_start``, that of C_0.
+    """
+    if true_model is None:
+        return {"canonical_distance": structure_metrics(mpc)["distance_to_mpc"]}
+    metrics = structure_metrics(mpc, true_model)
+    start = nearest_model(prediction_form(mpc.C_0, mpc.n_x, mpc.n_u))
+    return {
+        "canonical_distance": metrics["distance_to_mpc"],
+        "model_error": metrics["model_error"],
+        "model_error_start": one_step_error(start, *true_model).item(),
+    }
+
+
+def theta_metrics(mpc: QPMPC) -> dict[str, float]:
+    """The learned numbers of the parts that have few, by name."""
+    few = {name: part for name, part in mpc.readable().items() if part.numel() <= FEW}
+    return {
+        f"theta/{name}_{i}" if part.ndim else f"theta/{name}": value
+        for name, part in few.items()
+        for i, value in enumerate(part.flatten().tolist())
+    }
+
+
+def gap_summary(loops: dict[str, ClosedLoop]) -> dict[str, float]:
+    """J at the start, at the end and with the true model, and the closed gap; both discountings.
+
+    nan for what there is not, as a plant without a true model.
+    """
+    summary = {}
+    for tag, suffix in (("J", ""), ("J_discounted", "_discounted")):
+        start, final, true = (
+            getattr(loops.get(name), tag, math.nan) for name in ("start", "learned", "true model")
+        )
+        summary |= {f"{tag}_start": start, f"{tag}_final": final, f"{tag}_true_model": true}
+        summary[f"closed_gap{suffix}"] = closed_gap(start, final, true)
+    return summary
+
+
+def table(summary: Mapping[str, Any]) -> str:
+    """The outcome for the terminal."""
+    lines = [f"{'':14}{'start':>10}{'learned':>10}{'true model':>12}{'closed gap':>12}"]
+    for name, tag in (("J", "J"), ("J discounted", "J_discounted")):
+        start, final, true = (summary[f"{tag}_{end}"] for end in ("start", "final", "true_model"))
+        gap = summary[f"closed_gap{tag.removeprefix('J')}"]
+        share = gap_text(gap, start, final, true, name)
+        cell = f"  {share}" if math.isnan(gap) else f"{share:>12}"
+        lines.append(f"{name:14}{start:10.1f}{final:10.1f}{true:12.1f}{cell}")
+    return "\n".join(lines)
