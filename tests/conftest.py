@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -8,6 +11,26 @@ import torch
 import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc.qp.solvers import BACKENDS
+
+COMPILING = pytest.StashKey[subprocess.Popen[bytes]]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the kernels while xdist's workers start: each would compile all of them.
+
+    A worker without tests takes some of the other's, where the default leaves long ones to the end.
+    """
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        command = [sys.executable, "-m", "tests.kernels"]
+        config.stash[COMPILING] = subprocess.Popen(command, cwd=config.rootpath)
+        config.option.dist = "worksteal"
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished(node: Any) -> None:
+    """Wait for the kernels before the first test."""
+    if (compiling := node.config.stash.get(COMPILING, None)) is not None:
+        compiling.wait()
 
 
 @pytest.fixture(autouse=True)
