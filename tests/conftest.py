@@ -1,7 +1,9 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -10,8 +12,34 @@ import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc.qp.solvers import BACKENDS
 
-# Test workers side by side are the parallelism; threads of each would only wait for one another.
-torch.set_num_threads(1)
+COMPILING = pytest.StashKey[subprocess.Popen[bytes]]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the kernels while xdist's workers start: each would compile all of them.
+
+    A worker without tests takes some of the other's, where the default leaves long ones to the end.
+    """
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        command = [sys.executable, "-m", "tests.kernels"]
+        config.stash[COMPILING] = subprocess.Popen(command, cwd=config.rootpath)
+        config.option.dist = "worksteal"
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished(node: Any) -> None:
+    """Wait for the kernels before the first test."""
+    if (compiling := node.config.stash.get(COMPILING, None)) is not None:
+        compiling.wait()
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    """Keep torch to one thread: test workers are the parallelism, and their threads would compete.
+
+    Before every test, as TorchRL's ``check_env_specs`` leaves another number behind.
+    """
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(params=[*BACKENDS, "qpsolvers:clarabel"])
@@ -21,12 +49,9 @@ def solver(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def two_threads() -> Iterator[None]:
+def two_threads(one_thread: None) -> None:
     """Let torch, and with it ProxQP, use two threads."""
-    before = torch.get_num_threads()
     torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")
@@ -35,10 +60,10 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     runs = [("small", "gaussian", case, seed) for case in ("fixed", "free") for seed in (1, 4)]
     for sweep, noise, case, seed in [*runs, ("small", "brownian", "free", 1)]:
-        settings = (f"constraint={case}", f"noise={noise}", f"seed={seed}", "figures=false")
+        settings = (f"constraint={case}", f"noise={noise}", f"seed={seed}", "task.eval_steps=50")
         place = folder / sweep / f"{noise}-{case}-seed{seed}"
         train.train(make_config(*SMALL, *settings), str(place), quiet=True)
     for c_2 in (0.0, 0.5):
-        settings = (f"constraint.deviation.c_2={c_2}", "figures=false")
+        settings = (f"constraint.deviation.c_2={c_2}", "task.eval_steps=50")
         train.train(make_config(*SMALL, *settings), str(folder / "weights" / f"{c_2}"), quiet=True)
     return folder

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
 import math
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
 import pytest
 from omegaconf import DictConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer import event_file_writer
 
 import train
 from torch_qpmpc.experiment.run_folder import read_metrics
@@ -41,8 +46,7 @@ def stop(
         return enter(log)
 
     enter = SolveLog.__enter__
-    _next_second()
-    with monkeypatch.context() as patch:
+    with monkeypatch.context() as patch, _a_second_later():
         patch.setattr(SolveLog, "__enter__", count)
         with pytest.raises(SystemExit) as ended:
             train.train(cfg, str(folder), state)
@@ -53,13 +57,21 @@ def stop(
 def go_on(folder: Path) -> None:
     """Finish the run that was stopped."""
     cfg, state = resumed(folder, [])
-    _next_second()
-    train.train(cfg, str(folder), state)
+    with _a_second_later():
+        train.train(cfg, str(folder), state)
 
 
-def _next_second() -> None:
-    """TensorBoard knows the order of event files by the second in which each was begun."""
-    time.sleep(1.01 - time.time() % 1)
+@contextlib.contextmanager
+def _a_second_later() -> Iterator[None]:
+    """TensorBoard orders event files by the second in their names: move its clock on by one."""
+    ahead = next(_seconds)
+    clock = SimpleNamespace(time=lambda: time.time() + ahead)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(event_file_writer, "time", clock)
+        yield
+
+
+_seconds = itertools.count(1)
 
 
 def assert_same_numbers(folder: Path, whole: Path) -> None:

@@ -25,6 +25,7 @@ LAYERS = {
 RESERVED = {
     "hydra": {"experiment", "study"},
     "omegaconf": {"experiment", "study"},
+    "pydantic": {"experiment"},
     "torchrl": {"learning", "envs", "experiment"},
     "matplotlib": {"analysis", "experiment", "study"},
 }

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -60,13 +57,3 @@ def test_a_misspelt_keyword_is_named(call):
 def test_a_misspelt_override_is_named_by_hydra(override, message):
     with pytest.raises(HydraException, match=message):
         make_config(override)
-
-
-def test_a_mistake_on_the_command_line_is_a_sentence(tmp_path):
-    train = Path(__file__).parents[1] / "train.py"
-    command = [sys.executable, train, "+foo=1", f"hydra.run.dir={tmp_path}"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    said = done.stdout + done.stderr
-    assert done.returncode != 0
-    assert "foo: got an unknown key, expected a key of configs/." in said
-    assert "Traceback" not in said

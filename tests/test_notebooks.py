@@ -16,6 +16,7 @@ SMALL = {"UPDATES": "2"}
 pytestmark = pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks, as in a wheel's tests")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path, monkeypatch):
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import doctest
 import importlib
+import json
+import os
 import pkgutil
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 import torch_qpmpc
+from tests.runs import SMALL
+from torch_qpmpc.experiment.tasks import TASKS
 
 README = Path(__file__).parents[1] / "README.md"
 MODULES = sorted(
@@ -33,12 +39,36 @@ def test_blocks_are_found():
 def test_readme_runs(tmp_path, monkeypatch):
     """Block after block, as a reader would paste them into one session."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(TASKS, "pole", raising=False)  # and again afterwards
     blocks = python_blocks(README.read_text(encoding="utf-8"))
     assert blocks, "README.md shows no Python"
     namespace: dict[str, object] = {"__name__": "readme"}
     for line, code in blocks:
         # Blank lines first, so that a traceback names README.md's own line.
         exec(compile("\n" * line + code, str(README), "exec"), namespace)
+
+
+@pytest.mark.skipif(not README.exists(), reason="README.md is not there, as in a wheel's tests")
+def test_the_readmes_own_task_trains(tmp_path):
+    """As a script, in the runs of a sweep, which are processes of their own."""
+    blocks = [code for _, code in python_blocks(README.read_text(encoding="utf-8"))]
+    (script,) = (code for code in blocks if "register(" in code)
+    (tmp_path / "my_task.py").write_text(script, encoding="utf-8")
+    small = (*SMALL, "task.horizon=10", "figures=false", "hydra.launcher.n_jobs=2")
+    command = [sys.executable, "my_task.py", "-m", "task=pole", "seed=1,2", *small]
+    ended = subprocess.run(
+        [*command, "hydra.sweep.dir=sweep"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(README.parent)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+    summary = json.loads((tmp_path / "sweep/none-deviation-seed2/summary.json").read_text())
+    assert (summary["task"], summary["seed"], summary["updates"]) == ("pole", 2, 4)
+    assert summary["J_true_model"] < summary["J_start"]
 
 
 @pytest.mark.skipif(not README.exists(), reason="README.md is not there, as in a wheel's tests")

@@ -88,6 +88,15 @@ def test_gymnasium_environment_draws_one_number_a_step_and_none_at_a_reset():
             np.testing.assert_allclose(observation, s, atol=1e-6)
 
 
+def test_the_true_model_has_the_mean_of_the_noise():
+    plant = GrosZanonLTI()
+    A, B, offset = plant.true_model()
+    assert A is plant.A
+    assert B is plant.B
+    draws = plant.noise(torch.zeros(1001, 2), torch.linspace(0, 1, 1001)[:, None])
+    torch.testing.assert_close(offset, draws.mean(0), rtol=0, atol=1e-9)
+
+
 def test_environments_are_of_5000_steps_with_unbounded_observations():
     one = gymnasium.make("torch_qpmpc/GrosZanonLTI-v0")
     assert one.spec is not None

@@ -146,6 +146,13 @@ def test_corrupted_stays_as_it_was():
     np.testing.assert_allclose(theta, expected, atol=1e-14)
 
 
+def test_the_true_model_has_no_offset():
+    A, B, offset = PointMass().true_model()
+    assert torch.equal(A, PointMass().A)
+    assert torch.equal(B, PointMass().B)
+    assert offset.tolist() == [0] * 4
+
+
 def test_environments_are_of_fifty_steps_with_the_papers_bounds():
     one = gymnasium.make("torch_qpmpc/PointMass-v0")
     assert one.spec is not None

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
 from tests.runs import SMALL, choices, linear_system, make_config
 from torch_qpmpc import QPActorValueOperator
+from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
 from torch_qpmpc.experiment.algorithms import (
     evaluate,
     make_learner,
@@ -87,3 +90,23 @@ def test_evaluation_is_without_exploration_and_repeatable():
     assert torch.equal(first.states, second.states)
     torch.testing.assert_close(first.actions[0], mpc.policy(first.states[0]).detach())
     assert first.gamma == 0.5
+
+
+@pytest.mark.parametrize("task", ["point_mass", "gros_zanon", "pendulum"])
+def test_the_evaluation_has_a_seed_of_its_own(task):
+    """null is the seed that `closed_loop` has by default."""
+
+    physics: Any = make_physics(make_config(f"task={task}"))
+
+    def policy(s: torch.Tensor) -> torch.Tensor:
+        return -s[:, : len(physics.lb_a)]
+
+    def costs(*overrides: str) -> torch.Tensor:
+        cfg = make_config(f"task={task}", "task.eval_steps=3", *overrides)
+        return evaluate(cfg, policy, physics).costs
+
+    assert not torch.equal(costs("eval_seed=4"), costs())
+    assert torch.equal(costs("eval_seed=4"), costs("eval_seed=4", "seed=2"))
+    assert torch.equal(costs("eval_seed=123"), costs())
+    loop = gymnasium_loop if task == "pendulum" else closed_loop
+    assert torch.equal(loop(policy, physics, steps=3).costs, costs("eval_seed=null"))

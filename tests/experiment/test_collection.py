@@ -11,7 +11,7 @@ import torch
 from omegaconf import DictConfig
 
 import train
-from tests.runs import SMALL, make_config, skip_figures
+from tests.runs import SMALL, make_config
 from torch_qpmpc import QPActorValueOperator, QPError, SolveLog
 from torch_qpmpc.experiment.collection import batches, make_collector, num_columns
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
@@ -70,10 +70,15 @@ def test_a_collector_carries_active_sets_from_step_to_step(task):
     assert log.recalled > 0.5 * log.solves
 
 
+#: The collectors whose environments are in other processes.
+ELSEWHERE = [
+    pytest.param("multi", marks=pytest.mark.slow),
+    pytest.param("ray", marks=pytest.mark.cluster),
+]
 WORKERS = ("collector.workers=2", "num_envs=4", "steps_per_update=5", "exploration_std=0")
 
 
-@pytest.mark.parametrize("name", ["multi", pytest.param("ray", marks=pytest.mark.cluster)])
+@pytest.mark.parametrize("name", ELSEWHERE)
 def test_workers_share_the_environments_and_follow_theta(name):
     if name == "ray":
         pytest.importorskip("ray", reason="the extra ray is not installed")
@@ -100,12 +105,11 @@ def test_workers_share_the_environments_and_follow_theta(name):
     assert len(first["observation"][:, 0].unique(dim=0)) == 4
 
 
-@pytest.mark.parametrize("name", ["multi", pytest.param("ray", marks=pytest.mark.cluster)])
+@pytest.mark.parametrize("name", ELSEWHERE)
 def test_workers_that_do_not_wait_bring_their_own_environments(tmp_path, monkeypatch, name):
     """A run learns from each batch as it comes: half of the environments at a time."""
     if name == "ray":
         pytest.importorskip("ray", reason="the extra ray is not installed")
-    skip_figures(monkeypatch)
     overrides = (*SMALL, f"collector={name}", "collector.sync=false", "num_envs=4", "constraint=si")
     cfg = make_config(*overrides, "steps_per_update=5", "warmup_steps=10", "updates=6")
     assert num_columns(cfg) == 2

@@ -13,15 +13,29 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.collectors import distributed
 
 import train
-from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
+from tests.covering import covering
+from tests.runs import CONFIGS, SMALL, choices, make_config
 from torch_qpmpc import QPActorValueOperator, QPError
 from torch_qpmpc.experiment.collection import make_collector, num_columns
-from torch_qpmpc.experiment.config import NOISES, OF_CHOICE, OPTIONAL, RULES, check_config, flatten
+from torch_qpmpc.experiment.config import (
+    check_config,
+    differences,
+    flatten,
+    load_config,
+    settings,
+)
+from torch_qpmpc.experiment.config.messages import keys
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import snapshot
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 
 GROUPS = ("constraint", "noise", "optimizer", "task")
+#: A penalty that is null is off.
+OPTIONAL = ("constraint.deviation", "constraint.si")
+#: The keys that a configuration of an earlier version lacks, and that of a built-in task.
+NOT_NEEDED = ("eval_seed", "logger", "task.file")
+#: What each key must be; those of a user's tasks may come and go.
+KEYS = keys()
 
 
 def keys_of_the_files() -> set[str]:
@@ -38,8 +52,9 @@ def keys_of_the_files() -> set[str]:
     return keys
 
 
-def test_each_key_has_a_rule_and_each_rule_a_key():
-    assert keys_of_the_files() - set(OPTIONAL) == set(RULES)
+def test_each_key_of_the_files_is_one_of_the_models():
+    assert keys_of_the_files() - set(OPTIONAL) == set(KEYS) - {"task.file"}
+    assert all(KEYS.values()), "each says what its value must be"
 
 
 class Recorder:
@@ -60,11 +75,16 @@ class Recorder:
     def keys(self) -> list[Any]:
         return list(self._cfg)
 
+    def get(self, name: str) -> Any:
+        return self[name] if name in self._cfg else None
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._cfg
+
 
 def test_each_key_is_read(tmp_path, monkeypatch):
     """By a run of one order or the other, or by the names of the run's folder."""
     seen: set[str] = set()
-    skip_figures(monkeypatch)
     # These two read everything at once, which proves nothing.
     monkeypatch.setattr(train, "check_config", lambda _: None)
     for name, overrides in {
@@ -89,26 +109,49 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     text = (CONFIGS / "config.yaml").read_text(encoding="utf-8").partition("hydra:")[2]
     seen |= set(re.findall(r"\$\{([\w.]+)\}", text))
     seen |= {"logger"}  # RunFolder reads it, and gets the configuration itself
-    assert seen - set(OPTIONAL) == set(RULES)
+    assert seen - set(OPTIONAL) == set(KEYS) - {"task.file"}
 
 
-@pytest.mark.parametrize("names", list(itertools.product(*map(choices, GROUPS))))
+#: The noises of each task's plant, and the constraints with a penalty on windows of the replay.
+NOISES = {
+    "point_mass": {"gaussian", "brownian"},
+    "gros_zanon": {"uniform"},
+    "gymnasium": {"none"},
+    "pendulum": {"none"},
+}
+WINDOWS = ("si", "combined", "identified")
+
+
+def faults(constraint: str, noise: str, optimizer: str, task: str) -> list[str]:
+    """The keys that do not fit: recursive learns without a replay."""
+    found = {"noise.name": noise not in NOISES[task]}
+    found["replay"] = optimizer == "recursive" and constraint in WINDOWS
+    return [key for key, wrong in found.items() if wrong]
+
+
+def chosen(constraint: str, noise: str, optimizer: str, task: str) -> DictConfig:
+    groups = dict(zip(GROUPS, (constraint, noise, optimizer, task), strict=True))
+    more = ["task.id=Pendulum-v1"] if task == "gymnasium" else []
+    return make_config(*(f"{key}={x}" for key, x in groups.items()), *more, "warmup_steps=10")
+
+
+PRODUCT = list(itertools.product(*map(choices, GROUPS)))
+
+
+@pytest.mark.parametrize("names", covering(x for x in PRODUCT if not faults(*x)), ids="-".join)
 def test_each_choice_of_groups_is_accepted(names):
-    """But for a noise of another task, and windows for the SI penalty without a replay."""
-    choice = dict(zip(GROUPS, names, strict=True))
-    more = ["task.id=Pendulum-v1"] if choice["task"] == "gymnasium" else []
-    cfg = make_config(
-        *(f"{group}={name}" for group, name in choice.items()), *more, "warmup_steps=10"
-    )
-    if choice["noise"] not in NOISES[cfg.task.name]:
-        key = "noise.name"
-    elif choice["optimizer"] == "recursive" and cfg.constraint.si is not None:
-        key = "replay"
-    else:
-        check_config(cfg)
-        return
-    with pytest.raises(QPError, match=f"^({key}|replay): got"):
-        check_config(cfg)
+    """Every pair of choices that fit each other: no rule is about three."""
+    check_config(chosen(*names))
+
+
+@pytest.mark.parametrize(
+    "names", covering(x for x in PRODUCT if len(faults(*x)) == 1), ids="-".join
+)
+def test_choices_that_do_not_fit_are_refused(names):
+    """A noise of another task, or windows for the SI penalty without a replay."""
+    (key,) = faults(*names)
+    with pytest.raises(QPError, match=f"^{key}: got"):
+        check_config(chosen(*names))
 
 
 @pytest.mark.parametrize("task", ["point_mass", "pendulum"])
@@ -125,15 +168,10 @@ def test_an_actor_has_the_first_order_by_itself():
 
 def choices_with(key: str) -> list[str]:
     """The choices of groups with which a configuration has the key."""
-    group = key.partition(".")[0]
-    if group == "optimizer":
-        second = key in OF_CHOICE["optimizer"]["gauss_newton"]
-        return [f"optimizer={'gauss_newton' if second else 'adam'}"]
-    having = {"algo": ["algo=td3"], "collector": ["collector=ray"], "task": ["task=pendulum"]}
-    known = (
-        {name for names in OF_CHOICE[group].values() for name in names} if group in having else {}
-    )
-    return having[group] if key in known else ["optimizer=adam"]
+    if key in settings(make_config("optimizer=gauss_newton")):
+        return ["optimizer=gauss_newton"]
+    having = {"algo": "algo=td3", "collector": "collector=ray", "task": "task=pendulum"}
+    return ["optimizer=adam", *(c for group, c in having.items() if key.startswith(f"{group}."))]
 
 
 WHOLE = [0, -1, 1.5, True, "three", None, math.nan]
@@ -155,8 +193,9 @@ BAD: dict[str, list[Any]] = {
     "step": ["newton", *NAME],
     "penalty_step": ["newton", *NAME],
     "ablation": [3, True],
+    "eval_seed": WHOLE[1:-2],
+    "logger": ["visdom", *NAME],
     "figures": FLAG,
-    "logger": ["aim", *NAME],
     "resume": [3, True],
     "algo.name": ["sac", *NAME],
     "algo.actor": ["net", *NAME],
@@ -173,6 +212,7 @@ BAD: dict[str, list[Any]] = {
     "collector.num_cpus": [0, *REAL],
     "task.name": ["pendulum", *NAME],
     "task.id": ["???", *NAME],
+    "task.file": [3, True],
     "task.A": MATRIX,
     "task.B": MATRIX,
     "task.stage_weight": MATRIX,
@@ -186,7 +226,7 @@ BAD: dict[str, list[Any]] = {
     "task.state_slack": [*REAL[:2], *REAL[3:]],
     "task.action_slack": [*REAL[:2], *REAL[3:]],
     "task.discount_slack": FLAG,
-    "noise.name": ["pink", *NAME],
+    "noise.name": NAME,
     "noise.std": REAL[:-1],
     "constraint.name": NAME,
     "constraint.learn": ["C", ["C", "H"], ["c"], [{"C": 1}], None, 3],
@@ -211,19 +251,19 @@ for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.grow
     BAD[f"constraint.{_name}"] = REAL
 
 
-@pytest.mark.parametrize("key", RULES)
+@pytest.mark.parametrize("key", KEYS)
 def test_impossible_values_are_rejected_by_name(key):
-    assert key in BAD, "a new rule: add what it rejects"
+    assert key in BAD, "a new key: add what it rejects"
     good = make_config("constraint=combined", *choices_with(key))
     for value in BAD[key]:
         cfg = good.copy()
-        OmegaConf.update(cfg, key, value)
-        sentence = f"{key}: got {value!r}, expected {RULES[key][1]}."
+        OmegaConf.update(cfg, key, value, force_add=True)
+        sentence = f"{key}: got {value!r}, expected {keys()[key]}."
         with pytest.raises(QPError, match=f"^{re.escape(sentence)}"):
             check_config(cfg)
 
 
-def test_rules_accept_the_edges():
+def test_the_edges_are_accepted():
     cfg = make_config(
         "constraint=combined",
         "optimizer=adam",
@@ -261,7 +301,10 @@ def test_unknown_keys(key, remedy):
         check_config(cfg)
 
 
-@pytest.mark.parametrize("key", [*RULES, *OPTIONAL, *GROUPS, "algo", "collector"])
+NEEDED = [key for key in KEYS if key not in NOT_NEEDED]
+
+
+@pytest.mark.parametrize("key", [*NEEDED, *OPTIONAL, *GROUPS, "algo", "collector"])
 def test_missing_keys(key):
     cfg = make_config("constraint=combined", *choices_with(key))
     owner, _, leaf = key.rpartition(".")
@@ -275,6 +318,66 @@ def test_betas_are_adams():
     cfg = make_config("optimizer=sgd")
     assert "betas" not in cfg.optimizer
     check_config(cfg)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["+optimizer.damping=1"],
+            "optimizer.damping: got a key of another choice, expected a key",
+        ),
+        (
+            ["+task.id=Pendulum-v1"],
+            "task.id: got a key of another choice, expected a key of this t",
+        ),
+        (["+optimizer.lr_cots=1"], "optimizer.lr_cots: got an unknown key, .* optimizer.lr_cost?"),
+        (
+            ["optimizer.name=rmsprop"],
+            "optimizer.name: got 'rmsprop', expected one of adam, sgd, ",
+        ),
+        (["task.name=mine"], "task.name: got 'mine', expected one of .*point_mass"),
+        (["constraint.si=3"], "constraint.si: got 3, expected its keys, as in configs/."),
+    ],
+)
+def test_keys_of_groups(overrides, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        check_config(make_config("optimizer=adam", *overrides))
+
+
+@pytest.mark.parametrize("group", [*GROUPS, "algo", "collector"])
+def test_a_group_has_keys(group):
+    cfg = make_config()
+    OmegaConf.update(cfg, group, 3, merge=False)
+    with pytest.raises(QPError, match=f"^{group}: got 3, expected its keys, as in configs/"):
+        check_config(cfg)
+
+
+def test_a_misspelt_key_is_named_before_the_missing_one_and_that_before_a_conflict():
+    cfg = make_config("constraint=fixed", "task.learn_cost=[]")
+    OmegaConf.set_struct(cfg, False)
+    for message in (
+        r"^task.learn_cost: got \[\]",
+        "^updates: got nothing",
+        "^update: got an unknown",
+    ):
+        with pytest.raises(QPError, match=message):
+            check_config(cfg)
+        if "updates" in cfg:
+            del cfg["updates"]
+        else:
+            cfg["update"] = 3
+
+
+def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
+    cfg, file = make_config(), tmp_path / "config.yaml"
+    now = settings(cfg)
+    OmegaConf.set_struct(cfg, False)
+    del cfg["logger"], cfg["eval_seed"]
+    OmegaConf.save(cfg, file)
+    assert differences(settings(cfg), now) is None
+    assert settings(load_config(file)) == now
+    assert differences(settings(cfg), {**now, "eval_seed": 3}) == ("eval_seed=None", "eval_seed=3")
 
 
 def test_solver_must_be_known():
@@ -317,7 +420,7 @@ def test_solver_must_be_known():
         ),
         (
             ["constraint=si", "constraint.structure=varying"],
-            "constraint.structure: got 'varying', expected free. .* SI penalty no free C",
+            "constraint.structure: got 'varying', expected free. gauss_newton needs a free C",
         ),
         (
             ["constraint=mpc", "constraint.learn=[C,G]"],
@@ -328,10 +431,17 @@ def test_solver_must_be_known():
             ["task.terminal_weight=riccati"],
             "task.terminal_weight: got 'riccati', expected identity. With task.hessian=block it",
         ),
-        (["noise=uniform"], "noise.name: got 'uniform', expected a noise that point_mass has. The"),
+        (
+            ["noise=uniform"],
+            "noise.name: got 'uniform', expected a noise that point_mass has: gauss",
+        ),
+        (
+            ["noise.name=pink"],
+            "noise.name: got 'pink', expected a noise that .* gaussian, brownian",
+        ),
         (
             ["task=gros_zanon", "noise=gaussian"],
-            "noise.name: got 'gaussian', expected a noise that gros_zanon has. .* uniform",
+            "noise.name: got 'gaussian', expected a noise that gros_zanon has: uniform.",
         ),
         (
             ["algo=td3", "optimizer=gauss_newton"],

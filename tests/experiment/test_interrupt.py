@@ -18,7 +18,7 @@ from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-RUN = (*SMALL, "figures=false", "updates=5", "eval_interval=3", "task.eval_steps=5")
+RUN = (*SMALL, "updates=5", "eval_interval=3", "task.eval_steps=5")
 
 
 @pytest.fixture(autouse=True)

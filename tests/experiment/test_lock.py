@@ -12,13 +12,17 @@ from pathlib import Path
 
 import pytest
 
+import torch_qpmpc
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment import lock
 from torch_qpmpc.experiment.lock import ELSEWHERE_IN_SWEEP, LOCK, locked
 
-ROOT = Path(__file__).parents[2]
+PACKAGE = Path(torch_qpmpc.__file__).parent
+#: The package without its ``__init__``, whose imports (torch, TorchRL) take seconds.
 HOLD = """
-import sys
+import sys, types
+sys.modules["torch_qpmpc"] = package = types.ModuleType("torch_qpmpc")
+package.__path__ = [sys.argv[2]]
 from torch_qpmpc.experiment.lock import locked
 with locked(sys.argv[1]):
     print("held", flush=True)
@@ -29,8 +33,7 @@ with locked(sys.argv[1]):
 def hold(folder: Path) -> subprocess.Popen[str]:
     """Start a process that holds the lock until it reads a line or dies."""
     process = subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(folder)],
-        cwd=ROOT,
+        [sys.executable, "-c", HOLD, str(folder), str(PACKAGE)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -12,22 +12,18 @@ import torch
 from omegaconf import OmegaConf
 
 import train
-from tests.runs import SMALL, make_config, skip_figures
+from tests.runs import SMALL, make_config
 from tests.stops import assert_events_are_whole, assert_same_numbers, go_on, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
+from torch_qpmpc.experiment.config import load_config
 from torch_qpmpc.experiment.run_state import resumed
 
 #: Neither of the stops is at an evaluation or a row of metrics.
-RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3", "task.eval_steps=10")
+RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3")
 STOPS = (2, 7)
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
 ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    skip_figures(monkeypatch)
 
 
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
@@ -52,7 +48,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     ids=" ".join,
 )
 def test_a_run_that_goes_on_is_the_one_that_never_stopped(tmp_path, monkeypatch, overrides):
-    cfg = make_config(*RUN, "figures=false", *overrides)
+    cfg = make_config(*RUN, *overrides)
     train.train(cfg, str(tmp_path / "whole"))
     for update in STOPS:
         torch.manual_seed(update)
@@ -65,13 +61,13 @@ def test_a_run_that_goes_on_is_the_one_that_never_stopped(tmp_path, monkeypatch,
 @pytest.fixture
 def stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run that was stopped in its third update, with a checkpoint of the second before."""
-    folder, cfg = tmp_path / "run", make_config(*RUN, "eval_interval=2", "figures=false")
+    folder, cfg = tmp_path / "run", make_config(*RUN, "eval_interval=2")
     stop(monkeypatch, cfg, folder, 3)
     return folder
 
 
 def test_figures_are_not_drawn_twice(tmp_path, monkeypatch):
-    stop(monkeypatch, make_config(*RUN), tmp_path, 9)
+    stop(monkeypatch, make_config(*RUN, "figures=true"), tmp_path, 9)
     (tmp_path / "checkpoint.pt").unlink()
     (tmp_path / "checkpoint-previous.pt").rename(tmp_path / "checkpoint.pt")
     go_on(tmp_path)
@@ -85,6 +81,19 @@ def test_a_run_that_has_no_checkpoint_yet_begins_anew(tmp_path, stopped):
     train.train(OmegaConf.load(stopped / "config.yaml"), str(tmp_path / "whole"))  # pyright: ignore[reportArgumentType] -- a DictConfig
     assert_same_numbers(stopped, tmp_path / "whole")
     assert_events_are_whole(stopped)
+
+
+def test_a_run_of_an_earlier_version_goes_on(tmp_path, stopped):
+    """Without the keys that came later, in its configuration and in its checkpoint."""
+    file, checkpoint = stopped / "config.yaml", stopped / "checkpoint.pt"
+    cfg, state = load_config(file), load_checkpoint(checkpoint)
+    for key in ("logger", "eval_seed"):
+        del cfg[key], state["config"][key]
+    OmegaConf.save(cfg, file)
+    save_checkpoint(checkpoint, state)
+    go_on(stopped)
+    train.train(make_config(*RUN, "eval_interval=2", "figures=false"), str(tmp_path / "whole"))
+    assert_same_numbers(stopped, tmp_path / "whole")
 
 
 @pytest.mark.parametrize("when", ["finish", "drop_previous"])
@@ -124,8 +133,10 @@ def test_a_finished_run_keeps_what_it_learned_and_no_data(tmp_path, stopped):
     ]
 
 
+@pytest.mark.slow
 def test_several_processes_begin_new_episodes_and_learn_on(tmp_path, monkeypatch, capsys):
-    cfg = make_config(*RUN, "collector=multi", "figures=false", "updates=6")
+    """One worker: what cannot be saved is another process's, however many there are."""
+    cfg = make_config(*RUN, "collector=multi", "collector.workers=1", "updates=6")
     assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
     go_on(tmp_path)
     assert "New episodes: the environments' own state cannot be saved." in capsys.readouterr().out
@@ -160,7 +171,7 @@ def test_a_damaged_checkpoint_offers_the_one_before_which_goes_on(tmp_path, stop
 
 
 def test_a_checkpoint_of_another_run_is_refused(stopped):
-    cfg = make_config(*RUN, "task.horizon=4", "seed=2", "eval_interval=2", "figures=false")
+    cfg = make_config(*RUN, "task.horizon=4", "seed=2", "eval_interval=2")
     OmegaConf.save(cfg, stopped / "config.yaml", resolve=True)
     with pytest.raises(QPError) as error:
         resumed(stopped, [])

@@ -14,7 +14,7 @@ import pytest
 from hydra.core.utils import JobStatus
 from omegaconf import OmegaConf
 
-from tests.runs import SMALL, make_config
+from tests.runs import SMALL, make_config, run_command
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.lock import locked
 from torch_qpmpc.experiment.sweeps import SweepProgress, finished_run, number_of_runs, stopped_run
@@ -35,21 +35,16 @@ LAUNCHERS = {
 }
 
 
-def sweep(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
-    """``train.py -m +study=paper`` with small runs, in a process that cannot hang for ever."""
-    command = [sys.executable, "train.py", "-m", "+study=paper", *SMALL, *overrides]
-    command += [f"hydra.sweep.dir={folder}", "constraint=free", "noise=gaussian"]
-    # Workers of Ray are nice by default, and would wait for all other tests.
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
-    return subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False
-    )
+def arguments(folder: Path, *overrides: str) -> list[str]:
+    """``-m +study=paper`` with small runs."""
+    study = ("-m", "+study=paper", "constraint=free", "noise=gaussian")
+    return [*study, *SMALL, f"hydra.sweep.dir={folder}", *overrides]
 
 
 @pytest.mark.parametrize(
     "launcher",
     [
-        pytest.param(name, marks=() if name == "cores" else pytest.mark.cluster)
+        pytest.param(name, marks=pytest.mark.slow if name == "cores" else pytest.mark.cluster)
         for name in LAUNCHERS
     ],
 )
@@ -57,7 +52,18 @@ def test_every_launcher_runs_the_study_and_shows_one_line(launcher, tmp_path):
     package, settings = LAUNCHERS[launcher]
     if not importlib.util.find_spec(f"hydra_plugins.hydra_{package}_launcher"):
         pytest.skip(f"hydra-{package}-launcher is not installed, which an extra brings")
-    ended = sweep(tmp_path, f"hydra/launcher={launcher}", "seed=1,2", *settings)
+    overrides = arguments(tmp_path, f"hydra/launcher={launcher}", "seed=1,2", *settings)
+    # Workers of Ray are nice by default, and would wait for all other tests.
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
+    ended = subprocess.run(
+        [sys.executable, "train.py", *overrides],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
     assert ended.returncode == 0, ended.stderr
     summaries = [json.loads(path.read_text()) for path in tmp_path.glob("*/summary.json")]
     assert sorted(summary["seed"] for summary in summaries) == [1, 2]
@@ -67,36 +73,43 @@ def test_every_launcher_runs_the_study_and_shows_one_line(launcher, tmp_path):
     assert "closed gap" not in ended.stdout, "a run's own table"
 
 
-def test_a_sweep_goes_on_where_it_stopped(tmp_path):
+def sweep(folder: Path, *overrides: str) -> None:
+    """A sweep of small runs in this process, one after the other."""
+    run_command(*arguments(folder, "hydra/launcher=basic", *overrides))
+
+
+def test_a_sweep_goes_on_where_it_stopped(tmp_path, capsys):
     """One run has finished, one was stopped; then the settings change."""
-    basic = "hydra/launcher=basic"
-    assert sweep(tmp_path, basic, "seed=1").returncode == 0
+    sweep(tmp_path, "seed=1")
     first, second = (tmp_path / f"gaussian-free-seed{seed}" for seed in (1, 2))
     before = (first / "checkpoint.pt").stat().st_mtime_ns
     (second / "tensorboard").mkdir(parents=True)
     (second / "tensorboard" / "stale").touch()
 
-    again = sweep(tmp_path, basic, "seed=1,2")
-    assert again.returncode == 0, again.stderr
-    assert "finished before=1" in again.stderr
-    assert "done=1" in again.stderr
+    capsys.readouterr()
+    sweep(tmp_path, "seed=1,2")
+    line = capsys.readouterr().err
+    assert "finished before=1" in line
+    assert "done=1" in line
     assert (first / "checkpoint.pt").stat().st_mtime_ns == before
     assert (second / "summary.json").exists()
     assert not (second / "tensorboard" / "stale").exists()
 
-    changed = sweep(tmp_path, basic, "seed=1", "exploration_std=0.2")
-    assert changed.returncode == 1
-    assert "a finished run with exploration_std=0.3, expected exploration_std=0.2" in changed.stderr
+    with pytest.raises(SystemExit) as changed:
+        sweep(tmp_path, "seed=1", "exploration_std=0.2")
+    assert changed.value.code == 1
+    sentence = "a finished run with exploration_std=0.3, expected exploration_std=0.2"
+    assert sentence in capsys.readouterr().err
     assert (first / "checkpoint.pt").stat().st_mtime_ns == before
 
 
-def test_a_sweep_does_not_write_where_another_run_does(tmp_path):
+def test_a_sweep_does_not_write_where_another_run_does(tmp_path, capsys):
     folder = tmp_path / "gaussian-free-seed1"
     folder.mkdir()
-    with locked(folder):
-        refused = sweep(tmp_path, "hydra/launcher=basic", "seed=1")
-    assert refused.returncode == 1
-    assert f"got {folder}, in use by process {os.getpid()}" in refused.stderr
+    with locked(folder), pytest.raises(SystemExit) as refused:
+        sweep(tmp_path, "seed=1")
+    assert refused.value.code == 1
+    assert f"got {folder}, in use by process {os.getpid()}" in capsys.readouterr().err
     assert not (folder / "config.yaml").exists()
 
 

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import runpy
 
 import numpy as np
 import pytest
 import torch
+from pydantic import Field
 
 from tests.runs import linear_system, make_config, true_mpc
 from torch_qpmpc import QPError
 from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.experiment.config import check_config
+from torch_qpmpc.experiment.fields import Name
+from torch_qpmpc.experiment.tasks import (
+    TASKS,
+    TaskSettings,
+    find_task,
+    make_mpc,
+    make_physics,
+    make_true_mpc,
+    register,
+)
 from torch_qpmpc.mpc.banded import banded_matrix
 
 
@@ -163,3 +176,92 @@ def test_a_model_on_the_command_line_is_that_of_the_qp():
     assert torch.equal(mpc.C_0, banded_matrix(A, B, 4))
     W = mpc.quadratic_program().H[:3, :3]
     torch.testing.assert_close(W, torch.diag(torch.tensor([2.0, 1, 1])).double())
+
+
+# A user's own
+
+
+TASK = """
+from torch_qpmpc.envs import GrosZanonLTI
+from torch_qpmpc.experiment.tasks import Task, register
+from torch_qpmpc.experiment.tasks.gros_zanon import true_scheme
+
+register(
+    Task("mine", lambda cfg: GrosZanonLTI(w=7), lambda cfg, plant: true_scheme(plant), {options})
+)
+"""
+
+
+@pytest.fixture
+def own_task(tmp_path, monkeypatch):
+    """Writes and runs the file of a task with some options; afterwards it is forgotten."""
+    monkeypatch.delitem(TASKS, "mine", raising=False)
+
+    def write(options: str) -> str:
+        file = tmp_path / "mine.py"
+        file.write_text(TASK.replace("{options}", options))
+        runpy.run_path(str(file))
+        return str(file)
+
+    return write
+
+
+def test_a_registered_task_has_the_point_masss_defaults_but_for_its_own(own_task):
+    file = own_task('defaults={"num_envs": 3, "task": {"horizon": 4}}')
+    cfg = make_config("task=mine", "replay_capacity=300")
+    check_config(cfg)
+    assert cfg.task == {**make_config().task, "name": "mine", "file": file, "horizon": 4}
+    assert (cfg.num_envs, cfg.noise.name) == (3, "none")
+    assert make_config("task=mine", "task.horizon=5", "num_envs=2").task.horizon == 5
+    physics = linear_system(cfg)
+    assert isinstance(physics, GrosZanonLTI)
+    assert physics.w == 7
+    assert make_mpc(cfg, physics).horizon == 4
+    assert make_true_mpc(cfg, physics) is None
+
+
+def test_another_process_finds_a_task_by_its_file(own_task):
+    file = own_task("")
+    del TASKS["mine"]
+    with pytest.raises(QPError, match=r"task\.name: got 'mine', expected one of .*point_mass"):
+        find_task({"name": "mine"})
+    assert find_task({"name": "mine", "file": file}).name == "mine"
+    del TASKS["mine"]
+    message = r"task\.file: got '.*gone\.py', which does not exist, expected the file that"
+    with pytest.raises(QPError, match=message):
+        find_task({"name": "mine", "file": file.replace("mine.py", "gone.py")})
+
+
+def test_a_task_has_noises_and_keys_of_its_own(own_task, tmp_path):
+    own_task('noises=("brownian", "gaussian"), takes_noise_std=True')
+    cfg = make_config("task=mine", "noise.std=3")
+    check_config(cfg)
+    assert cfg.noise.name == "brownian"
+    with pytest.raises(QPError, match=r"noise\.name: got 'uniform', expected a noise that mine"):
+        check_config(make_config("task=mine", "noise=uniform"))
+
+    class Settings(TaskSettings):
+        mass: float = Field(gt=0)
+        colour: Name
+
+    register(dataclasses.replace(TASKS["mine"], settings=Settings))
+    for overrides, message in (
+        (["+task.mass=1"], "task.colour: got nothing, expected a name"),
+        (
+            ["+task.mass=0", "+task.colour=red"],
+            "task.mass: got 0, expected an allowed value .Input",
+        ),
+        (["+task.mas=1"], "task.mas: got an unknown key, .* Did you mean task.mass?"),
+    ):
+        with pytest.raises(QPError, match=message):
+            check_config(make_config("task=mine", *overrides))
+    check_config(make_config("task=mine", "+task.mass=1.5", "+task.colour=red"))
+
+
+def test_what_cannot_be_registered(own_task):
+    own_task("")
+    register(TASKS["mine"])
+    with pytest.raises(QPError, match=r"task\.name: got 'point_mass', which exists, expected a"):
+        register(dataclasses.replace(TASKS["mine"], name="point_mass"))
+    with pytest.raises(QPError, match="task: got str, expected a Task"):
+        register("mine")  # pyright: ignore[reportArgumentType] (the mistake)

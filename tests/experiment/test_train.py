@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train
-from tests.runs import CONFIGS, SMALL, choices, make_config, skip_figures
+from tests.runs import CONFIGS, SMALL, choices, make_config, run_command
 from torch_qpmpc import (
     QPMPC,
     DeviationPenalty,
@@ -53,11 +53,6 @@ def run_small(folder: Path, *overrides: str) -> dict[str, Any]:
     return train.train(make_config(*SMALL, *overrides), str(folder))
 
 
-@pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    skip_figures(monkeypatch)
-
-
 #: A run's numbers; pandas' types know too many kinds of columns.
 metrics: Callable[[Path], Any] = read_metrics
 
@@ -83,7 +78,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     return folder, train.train(make_config(*WHOLE), str(folder))
 
 
-def test_what_is_compiled_meanwhile_is_not_counted_as_training(small, tmp_path, monkeypatch):
+def test_what_is_compiled_meanwhile_is_not_counted_as_training(tmp_path, monkeypatch):
     clock, batches = itertools.count(step=1000.0), train.batches
 
     def compiling(collector: Any) -> Iterator[Any]:
@@ -205,11 +200,20 @@ def test_proximal_step_leaves_nothing_above_the_band(whole):
 # --- Small runs ----------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("small")
-@pytest.mark.parametrize("noise", ["gaussian", "brownian"])
-@pytest.mark.parametrize("constraint", ["fixed", "free", "deviation", "si", "combined"])
-def test_each_case_runs(tmp_path, constraint, noise):
-    summary = run_small(tmp_path, f"constraint={constraint}", f"noise={noise}")
+@pytest.mark.parametrize(
+    ("constraint", "noise", "figures"),
+    [
+        ("fixed", "gaussian", "true"),
+        ("free", "brownian", "false"),
+        ("deviation", "gaussian", "false"),
+        ("si", "brownian", "false"),
+        ("combined", "gaussian", "false"),
+    ],
+)
+def test_each_case_runs(tmp_path, constraint, noise, figures):
+    """Under one noise each: the constraint does not know which it is."""
+    chosen = (f"constraint={constraint}", f"noise={noise}", f"figures={figures}")
+    summary = run_small(tmp_path, *chosen)
     assert (summary["constraint"], summary["noise"]) == (constraint, noise)
     table, losses = metrics(tmp_path), {"loss/value"}
     if constraint in ("si", "combined"):
@@ -224,10 +228,9 @@ def test_each_case_runs(tmp_path, constraint, noise):
     assert moved == {-1: constraint != "fixed", 0: constraint != "fixed", 1: free}
 
 
-STREAM = ("task=gros_zanon", "solver=daqp", "task.horizon=4", "task.eval_steps=20")
+STREAM = ("task=gros_zanon", "solver=daqp", "task.horizon=4", "task.eval_steps=20", "figures=false")
 
 
-@pytest.mark.usefixtures("small")
 def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
     cfg = make_config(*STREAM, "updates=40", "eval_interval=20", "seed=69")
     summary = train.train(cfg, str(tmp_path))
@@ -248,15 +251,14 @@ def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
     assert violation[40] == pytest.approx(summary["train_violation"])
 
 
-@pytest.mark.usefixtures("small")
 def test_the_stream_can_be_replayed(tmp_path):
-    replayed = ("optimizer=sliding", "exploration_std=0.05")
-    cfg = make_config(*STREAM, *replayed, "updates=30", "eval_interval=15")
+    """And drawn: two states and one action, where the point mass has four and two."""
+    replayed = ("optimizer=sliding", "exploration_std=0.05", "figures=true")
+    cfg = make_config(*STREAM, *replayed, "updates=15", "eval_interval=15")
     assert train.train(cfg, str(tmp_path))["unsolved"] == 0
     assert metrics(tmp_path)["qp/recalled"].iloc[-1] > 0
 
 
-@pytest.mark.usefixtures("small")
 @pytest.mark.parametrize("optimizer", ["adam", "gauss_newton"])
 @pytest.mark.parametrize("structure", ["tied", "varying"])
 def test_a_scheme_is_released_in_mid_training(tmp_path, monkeypatch, optimizer, structure):
@@ -289,7 +291,6 @@ def frame_without_times(folder: Path) -> Any:
     return table.drop(columns=[column for column in table if column.startswith("time/")])
 
 
-@pytest.mark.usefixtures("small")
 def test_a_seed_determines_every_number(tmp_path):
     for name, seed in (("first", 3), ("again", 3), ("other", 4)):
         torch.manual_seed(len(name))  # what happened before plays no part
@@ -300,7 +301,6 @@ def test_a_seed_determines_every_number(tmp_path):
     assert first["eval/J"][0] != other["eval/J"][0]
 
 
-@pytest.mark.usefixtures("small")
 def test_subgradient_step(tmp_path):
     run_small(tmp_path, "constraint=deviation", "penalty_step=subgradient")
     deviation, distance = learned_C(tmp_path)
@@ -309,7 +309,6 @@ def test_subgradient_step(tmp_path):
     assert (metrics(tmp_path)["loss/deviation"][2:] > 0).all()
 
 
-@pytest.mark.usefixtures("small")
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
 @pytest.mark.parametrize("name", choices("ablation"))
 def test_each_ablation_runs(tmp_path, name):
@@ -321,7 +320,6 @@ def test_each_ablation_runs(tmp_path, name):
     assert summary["unsolved"] == 0
 
 
-@pytest.mark.usefixtures("small")
 @pytest.mark.parametrize("optimizer", ["adam", "recursive"])
 @pytest.mark.parametrize("rule", ["projection", "sdp"])
 def test_a_scheme_with_dense_weights_learns_them_by_each_rule(tmp_path, rule, optimizer):
@@ -337,7 +335,6 @@ def test_a_scheme_with_dense_weights_learns_them_by_each_rule(tmp_path, rule, op
     assert (state["w"] >= 0).all()
 
 
-@pytest.mark.usefixtures("small")
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
 def test_target_network(tmp_path):
     """It changes the targets from the second update on, not the first."""
@@ -352,7 +349,6 @@ def test_target_network(tmp_path):
     np.testing.assert_allclose(fast[2:], none[2:], rtol=1e-6)
 
 
-@pytest.mark.usefixtures("small")
 def test_plain_gradient_step(tmp_path):
     run_small(tmp_path / "free", "optimizer=sgd", "constraint=free")
     deviation, _ = learned_C(tmp_path / "free")
@@ -362,7 +358,6 @@ def test_plain_gradient_step(tmp_path):
     assert np.abs(learned_C(tmp_path / "still")[0]).max() == 0
 
 
-@pytest.mark.usefixtures("small")
 def test_uneven_intervals_and_steps(tmp_path):
     """The end is always evaluated and saved, whatever the intervals."""
     more = (
@@ -379,7 +374,6 @@ def test_uneven_intervals_and_steps(tmp_path):
     assert summary["updates"] == 5
 
 
-@pytest.mark.usefixtures("small")
 def test_another_solver_reaches_the_same(tmp_path):
     for solver in ("daqp", "proxqp"):
         assert run_small(tmp_path / solver, f"solver={solver}", "updates=2")["solver"] == solver
@@ -387,7 +381,6 @@ def test_another_solver_reaches_the_same(tmp_path):
     np.testing.assert_allclose(first, other, rtol=1e-4)
 
 
-@pytest.mark.usefixtures("small")
 def test_configuration_reaches_the_parts(tmp_path, monkeypatch):
     losses, windows, scales = [], [], []
     loss_value = QPQLearningLoss.loss_value
@@ -424,7 +417,6 @@ def test_configuration_reaches_the_parts(tmp_path, monkeypatch):
     assert groups[0]["lr"] == pytest.approx(0.125 * 0.2)
 
 
-@pytest.mark.usefixtures("small")
 def test_training_goes_on_past_unsolved_qps(tmp_path):
     """Hard states, and velocities too high for the action to keep them within their bounds."""
     more = ("task.state_slack=inf", "noise.std=0.5", "constraint=free")
@@ -437,11 +429,10 @@ def test_training_goes_on_past_unsolved_qps(tmp_path):
     assert all(value.isfinite().all() for value in state.values())
 
 
-@pytest.mark.usefixtures("small")
 @pytest.mark.parametrize("constraint", ["free", "combined"])
 def test_the_second_order_learns_in_tens_of_updates(tmp_path, constraint):
-    overrides = ("solver=daqp", "seed=5", f"constraint={constraint}", "eval_interval=40")
-    summary = train.train(make_config(*overrides, "updates=40"), str(tmp_path))
+    overrides = ("solver=daqp", "seed=5", f"constraint={constraint}", "figures=false")
+    summary = train.train(make_config(*overrides, "updates=40", "eval_interval=40"), str(tmp_path))
     assert summary["closed_gap"] > 0.85
     assert summary["unsolved"] == 0
     table = metrics(tmp_path)
@@ -455,7 +446,6 @@ def test_the_second_order_learns_in_tens_of_updates(tmp_path, constraint):
         assert np.isfinite(table["loss/si"].dropna()).all()
 
 
-@pytest.mark.usefixtures("small")
 def test_an_interruption_leaves_what_was_logged(tmp_path, monkeypatch):
     calls, forward = [], QPQLearningLoss.loss_value
 
@@ -487,24 +477,10 @@ def test_a_bad_configuration_writes_nothing(tmp_path):
 # --- The command ---------------------------------------------------------------------------------
 
 
-QUIET = ("hydra/job_logging=disabled", "hydra/hydra_logging=disabled")
-
-
 def test_command(tmp_path, monkeypatch, capsys):
     """`python train.py ..` makes the folder that it names at the end, below a table."""
-    skip_figures(monkeypatch)
     monkeypatch.chdir(tmp_path)
-    # Hydra finds the folder by itself only for a script, not for an imported module.
-    arguments = [
-        "--config-path",
-        str(CONFIGS),
-        *SMALL,
-        "constraint=combined",
-        "noise=brownian",
-        *QUIET,
-    ]
-    monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
-    train.main()
+    run_command(*SMALL, "constraint=combined", "noise=brownian")
     lines = capsys.readouterr().out.splitlines()
     folder = Path(lines[-1])
     assert folder.parent == tmp_path / "runs" / "point_mass" / "brownian-combined"
@@ -531,34 +507,24 @@ def test_impossible_value_on_the_command_line(tmp_path):
     ("mistake", "sentence"),
     [
         ("batchsize=3", "Could not override 'batchsize'"),
-        ("+batchsize=3", "Did you mean batch_size?"),
+        (
+            "+batchsize=3",
+            "batchsize: got an unknown key, expected a key of configs/. Did you mean batch_size?",
+        ),
         ("constraint=none", "Could not find 'constraint/none'"),
     ],
 )
 def test_misspelt_key_on_the_command_line(tmp_path, monkeypatch, capsys, mistake, sentence):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["train.py", "--config-path", str(CONFIGS), mistake, *QUIET])
     with pytest.raises(SystemExit) as error:
-        train.main()
+        run_command(mistake)
     assert error.value.code not in (0, None)
     assert sentence in capsys.readouterr().err + str(error.value.code)
 
 
 # --- Folders that are in use or hold a run ------------------------------------------------------
 
-TINY = (*SMALL, "figures=false", "task.eval_steps=5")
-
-
-@pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """`python train.py ..` in this process."""
-
-    def run(*arguments: str) -> None:
-        argv = ["train.py", "--config-path", str(CONFIGS), *QUIET, *arguments]
-        monkeypatch.setattr(sys, "argv", argv)
-        train.main()
-
-    return run
+TINY = (*SMALL, "task.eval_steps=5")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -581,73 +547,73 @@ def stopped(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_finished_run_is_not_overwritten(command, tmp_path):
+def test_a_finished_run_is_not_overwritten(tmp_path):
     folder = tmp_path / "run"
     (folder / ".hydra").mkdir(parents=True)
     for name in ("train.log", ".hydra/config.yaml", LOCK):  # Hydra's, and a killed run's
         (folder / name).touch()
-    command(*TINY, f"hydra.run.dir={folder}")
+    run_command(*TINY, f"hydra.run.dir={folder}")
     before = contents(folder)
     message = (
         f"^folder: got {folder}, which holds a finished run, expected one without a run. "
         "Choose another folder by hydra.run.dir=FOLDER.$"
     )
     with pytest.raises(SystemExit, match=message):
-        command(*TINY, "seed=2", f"hydra.run.dir={folder}")
+        run_command(*TINY, "seed=2", f"hydra.run.dir={folder}")
     assert contents(folder) == before
     assert not (folder / LOCK).exists()
 
 
-def test_a_stopped_run_is_not_overwritten_but_goes_on(command, stopped):
+def test_a_stopped_run_is_not_overwritten_but_goes_on(stopped):
     before = contents(stopped)
     message = (
         f"^folder: got {stopped}, which holds a run that was stopped, expected one without a run. "
         f"Go on with it by resume={stopped}, or choose another folder by hydra.run.dir=FOLDER.$"
     )
     with pytest.raises(SystemExit, match=message):
-        command(*TINY, f"hydra.run.dir={stopped}")
+        run_command(*TINY, f"hydra.run.dir={stopped}")
     assert contents(stopped) == before
-    command(f"resume={stopped}")
+    run_command(f"resume={stopped}")
     assert (stopped / "summary.json").exists()
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "checkpoint.pt"])
-def test_a_run_that_cannot_go_on_is_not_offered_for_it(command, stopped, name):
+def test_a_run_that_cannot_go_on_is_not_offered_for_it(stopped, name):
     (stopped / name).write_text("[: garbage")
     message = "a run that was stopped, expected one without a run. Choose another folder by hydra"
     with pytest.raises(SystemExit, match=message):
-        command(*TINY, f"hydra.run.dir={stopped}")
+        run_command(*TINY, f"hydra.run.dir={stopped}")
 
 
-def test_a_folder_in_use_is_refused(command, stopped, tmp_path):
+def test_a_folder_in_use_is_refused(stopped, tmp_path):
     before = contents(stopped)
     for overrides in ((*TINY, f"hydra.run.dir={stopped}"), (f"resume={stopped}",)):
         with locked(stopped), pytest.raises(SystemExit, match=f"got {stopped}, in use by process "):
-            command(*overrides)
+            run_command(*overrides)
     assert contents(stopped) == before
 
 
-def test_a_run_holds_the_lock(command, tmp_path, monkeypatch):
+def test_a_run_holds_the_lock(tmp_path, monkeypatch):
     def busy(cfg: DictConfig, folder: str, *_: Any, **__: Any) -> dict[str, Any]:
         with pytest.raises(QPError, match="in use by process"), locked(folder):
             pass
         return {"closed_gap": 0.5}
 
     monkeypatch.setattr(train, "train", busy)
-    command(*TINY, f"hydra.run.dir={tmp_path}")
+    run_command(*TINY, f"hydra.run.dir={tmp_path}")
     assert not (tmp_path / LOCK).exists()
 
 
-def test_a_run_goes_on_in_its_own_folder_only(command, stopped, tmp_path):
+def test_a_run_goes_on_in_its_own_folder_only(stopped, tmp_path):
     message = f"got {tmp_path}/other with resume={stopped}, expected {stopped}. A run goes on in i"
     with pytest.raises(SystemExit, match=message):
-        command(f"resume={stopped}", f"hydra.run.dir={tmp_path}/other")
+        run_command(f"resume={stopped}", f"hydra.run.dir={tmp_path}/other")
 
 
-def test_damaged_metrics_are_said_in_a_sentence(command, stopped):
+def test_damaged_metrics_are_said_in_a_sentence(stopped):
     (stopped / "metrics.csv").write_bytes(b"\xff\x00 garbage")
     with pytest.raises(SystemExit, match=r"^metrics.csv: got .*metrics.csv \('utf-8' codec"):
-        command(f"resume={stopped}")
+        run_command(f"resume={stopped}")
 
 
 def test_runs_that_start_in_the_same_second_have_folders_of_their_own():
@@ -671,14 +637,14 @@ SHORT = ("solver=daqp", "updates=3", "eval_interval=3", "warmup_steps=12", "task
 
 
 @pytest.mark.parametrize("id", ["Pendulum-v1", "torch_qpmpc/PointMass-v0"])
-def test_any_gymnasium_environment_is_a_task(command, tmp_path, monkeypatch, capsys, id):
+def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys, id):
     monkeypatch.chdir(tmp_path)
     model = PENDULUM
     if id != "Pendulum-v1":
         A, B = PointMass().A.tolist(), PointMass().B.tolist()
         W = torch.eye(6).tolist()
         model = (f"task.A={A}", f"task.B={B}", f"task.stage_weight={W}")
-    command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false")
+    run_command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false")
     folder = Path(capsys.readouterr().out.splitlines()[-1])
     assert folder.parent == tmp_path / "runs" / "gymnasium" / id / "none-deviation"
     assert folder.name.startswith("seed1-")
@@ -701,7 +667,7 @@ def test_any_gymnasium_environment_is_a_task(command, tmp_path, monkeypatch, cap
         (("task.id=Pendulum-v1", *PENDULUM[:2]), r"^task.stage_weight: got null, .* \(4, 4\)"),
     ],
 )
-def test_what_a_gymnasium_task_lacks_is_said(command, tmp_path, monkeypatch, overrides, message):
+def test_what_a_gymnasium_task_lacks_is_said(tmp_path, monkeypatch, overrides, message):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=message):
-        command("task=gymnasium", *overrides, *SHORT)
+        run_command("task=gymnasium", *overrides, *SHORT)

@@ -25,7 +25,7 @@ from tests.runs import CONFIGS, SMALL
 from tests.stops import assert_events_are_whole, assert_same_numbers
 
 #: A checkpoint every few updates.
-RUN = (*SMALL, "figures=false", "constraint=combined", "updates=200", "eval_interval=4")
+RUN = (*SMALL, "constraint=combined", "updates=200", "eval_interval=4")
 RUN += ("log_interval=3", "num_envs=16", "replay_capacity=4000", "task.eval_steps=5")
 #: When a process is killed, and how often.
 MOMENTS = {"starting": 1, "training": 2, "writing a checkpoint": 2}

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 
 import train
 from tests.problems import normal, random_mpc, random_states
-from tests.runs import SMALL, make_config, skip_figures
+from tests.runs import SMALL, make_config
 from torch_qpmpc import QPActorValueOperator, QPQLearningLoss, SolveLog
 from torch_qpmpc.learning.replay import ACTIVE_SET, ACTIVE_SETS, make_replay
 from torch_qpmpc.qp.program import UNKNOWN
@@ -127,7 +127,6 @@ def test_a_replay_without_active_sets_has_nothing_to_remember():
 
 def test_training_is_the_same_without_the_cache(tmp_path, monkeypatch):
     """But for the certificate's tolerance."""
-    skip_figures(monkeypatch)
     options = (*SMALL, "updates=15", "batch_size=64", "eval_interval=15")
     runs = [
         train.train(make_config(*options, f"warm_start={on}"), str(tmp_path / on))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import pickle
 import sys
 from typing import Any
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
+from tests.covering import covering
 from tests.problems import normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SolverError
 from torch_qpmpc.mpc import projections as steps
@@ -205,11 +207,17 @@ def learn(mpc: QPMPC, optimizer: torch.optim.Optimizer, target: Tensor, seed: in
     return loss.item()
 
 
-@pytest.mark.parametrize("optimizer", ["adam", "sgd", "gauss_newton"])
-@pytest.mark.parametrize("name", HESSIANS)
-@pytest.mark.parametrize("rule", STEPS)
+OPTIMIZERS = ("adam", "sgd", "gauss_newton")
+
+
+@pytest.mark.parametrize(
+    ("rule", "name", "optimizer"), covering(itertools.product(STEPS, HESSIANS, OPTIMIZERS))
+)
 def test_the_weights_keep_their_sign_for_as_long_as_it_learns(rule, name, optimizer):
-    """The targets fall, so that the weights are drawn below zero."""
+    """The targets fall, so that the weights are drawn below zero.
+
+    Every pair of rule, form of H and optimizer: the rule holds one part at a time.
+    """
     weights = {part for part in ("H", "H_f", "w") if part in HESSIANS[name]["learn"]}
     options = HESSIANS[name] | {"learn": weights, "action_slack": 1.0, "horizon": 2}
     mpc = random_mpc(4, step=rule, **options)
@@ -226,7 +234,7 @@ def test_the_weights_keep_their_sign_for_as_long_as_it_learns(rule, name, optimi
     assert min(lowest) < 0.05, "they have come to the boundary"
 
 
-@pytest.mark.parametrize("optimizer", ["adam", "sgd", "gauss_newton"])
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
 @pytest.mark.parametrize("rule", STEPS)
 def test_every_rule_learns(rule, optimizer):
     mpc, other = random_mpc(4, step=rule, **HESSIANS["block"]), random_mpc(9, free=0.3)

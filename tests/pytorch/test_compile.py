@@ -82,6 +82,7 @@ def test_a_gradient_in_what_is_passed_as_it_is(output, of):
     assert_close(compiled(given[of]), expected)
 
 
+@pytest.mark.slow
 def test_compiled_by_inductor_equals_eager():
     mpc, s = random_mpc(3), random_states(4)
     value = lambda s, a: mpc.value(s)  # noqa: E731 - has the form of the others

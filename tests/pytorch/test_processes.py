@@ -71,6 +71,7 @@ def scenario(method: str) -> None:
     assert torch.get_num_threads() == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_a_child_has_the_answers_of_its_parent(method):
     if method not in torch.multiprocessing.get_all_start_methods():

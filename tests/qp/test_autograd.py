@@ -510,15 +510,15 @@ def test_bad_arguments_are_named(arguments, message):
 @pytest.mark.parametrize(
     ("start", "message"),
     [
-        (solve_qp(OTHER.qp, OTHER.fixed, solver="daqp"), r"shape \(13,\) of torch.int8"),
-        (torch.zeros(3, 12, dtype=torch.int8), r"shape \(3, 12\) of torch.int8"),
-        (torch.zeros(3, 13), r"shape \(3, 13\) of torch.float32"),
+        (lambda: solve_qp(OTHER.qp, OTHER.fixed, solver="daqp"), r"shape \(13,\) of torch.int8"),
+        (lambda: torch.zeros(3, 12, dtype=torch.int8), r"shape \(3, 12\) of torch.int8"),
+        (lambda: torch.zeros(3, 13), r"shape \(3, 13\) of torch.float32"),
     ],
 )
 def test_a_warm_start_that_does_not_fit_is_named(start, message):
     expected = r", expected \(3, 13\) of torch.int8. Pass the solution of the same batch"
     with pytest.raises(QPError, match="warm_start: got " + message + expected):
-        solve_qp(GOOD.qp, GOOD.fixed, warm_start=start)
+        solve_qp(GOOD.qp, GOOD.fixed, warm_start=start())
 
 
 @pytest.mark.parametrize("on_failure", ["raise", "warn"])

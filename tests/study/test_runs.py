@@ -115,7 +115,7 @@ def test_an_ablation_gives_its_name(study, tmp_path):
 
 
 def test_a_scheme_released_in_training_is_read(tmp_path):
-    cfg = make_config(*SMALL, "constraint=mpc", "release=2", "figures=false")
+    cfg = make_config(*SMALL, "constraint=mpc", "release=2")
     summary = train.train(cfg, str(tmp_path), quiet=True)
     run = FinishedRun(tmp_path)
     assert run.learned.structure == "free"

@@ -80,6 +80,10 @@ class GrosZanonLTI(LinearSystem):
         e = -0.1 + 0.1 * draw.to(self.A)
         return torch.cat((e, torch.zeros_like(e)), -1)
 
+    def mean_noise(self) -> Tensor:
+        """[-0.05, 0]."""
+        return self.noise(torch.zeros_like(self.lb_s), self.A.new_tensor([0.5]))
+
     def wrong_model(self) -> tuple[Tensor, Tensor]:
         """The model that learning starts from: A_0 ``(2, 2)`` and B_0 ``(2, 1)``."""
         as_A = self.A.new_tensor

@@ -71,6 +71,9 @@ class GymnasiumPlant:
         env.set_seed(seed)
         return env
 
+    def true_model(self) -> None:
+        """None: the plant can only be stepped."""
+
     def violation(self, s: Tensor) -> Tensor:
         """How far s ``(*batch, n_x)`` is outside the bounds of its space, summed: 0."""
         s = check_tensor("s", s, len(self.lb_s)).to(self.lb_s)

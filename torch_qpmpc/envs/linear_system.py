@@ -66,7 +66,7 @@ class LinearSystem(ABC):
         lb_s, ub_s, lb_a, ub_a: bounds of the state ``(n_x,)`` and of the action ``(n_u,)``.
     """
 
-    #: Whether a step clips s+ to its bounds. Where not, they are soft: observations have none.
+    #: True if a step clips s+ to its bounds; else they are soft, and observations have none.
     clips_states: ClassVar[bool] = True
 
     A: Tensor
@@ -119,6 +119,14 @@ class LinearSystem(ABC):
     @abstractmethod
     def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
         """The next nu ``(*batch, n_x)`` from the last one and a :meth:`draw`."""
+
+    def mean_noise(self) -> Tensor:
+        """The mean of nu ``(n_x,)``: 0, if a plant does not say otherwise."""
+        return torch.zeros_like(self.lb_s)
+
+    def true_model(self) -> tuple[Tensor, Tensor, Tensor]:
+        """A, B and the offset, the mean of the noise."""
+        return self.A, self.B, self.mean_noise()
 
     def applied(self, a: Tensor) -> Tensor:
         """The action that the system gets ``(*batch, n_u)``: a clipped to its bounds."""

@@ -13,17 +13,14 @@ from torch.optim.lr_scheduler import LambdaLR
 from torchrl.objectives import LossModule, SoftUpdate
 
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
-from torch_qpmpc.envs.closed_loop import (
-    ClosedLoop,
-    closed_loop,
-    gymnasium_loop,
-)
+from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.actor_critic import (
     actor_groups,
     critic_groups,
     make_acting,
     make_actor_critic_loss,
 )
+from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, QPActorValueOperator
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
@@ -177,8 +174,8 @@ def decay(update: int, updates: int, last: float) -> float:
 def evaluate(
     cfg: DictConfig, policy: Callable[[Tensor], Tensor], physics: LinearSystem | GymnasiumPlant
 ) -> ClosedLoop:
-    """``policy`` from the fixed starts and with the fixed noise."""
-    steps, gamma = cfg.task.eval_steps, cfg.task.gamma
-    if isinstance(physics, LinearSystem):
-        return closed_loop(policy, physics, steps=steps, gamma=gamma)
-    return gymnasium_loop(policy, physics, steps=steps, gamma=gamma)
+    """``policy`` from the starts and with the noise of ``cfg.eval_seed``."""
+    options = {} if cfg.eval_seed is None else {"seed": cfg.eval_seed}
+    return find_task(cfg.task).closed_loop(
+        policy, physics, steps=cfg.task.eval_steps, gamma=cfg.task.gamma, **options
+    )

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -115,11 +115,12 @@ class FinishedRun:
             "prediction_error": math.nan,
             "prediction_error_start": math.nan,
         }
-        if isinstance(self.physics, LinearSystem):
+        if true_model(self.physics) is not None:
+            physics = cast(LinearSystem, self.physics)  # no other plant has a true model
             with contextlib.suppress(QPError):
                 learned, start = (nearest_model(predictions(m)) for m in (mpc, self.start))
-                readings["prediction_error"] = prediction_error(learned, self.physics)
-                readings["prediction_error_start"] = prediction_error(start, self.physics)
+                readings["prediction_error"] = prediction_error(learned, physics)
+                readings["prediction_error_start"] = prediction_error(start, physics)
         return readings
 
 
@@ -134,9 +135,7 @@ def prediction_error(model: Model, physics: LinearSystem) -> float:
     s = physics.starts(rng, 1024)
     share = torch.as_tensor(rng.random((1024, physics.B.shape[1])))
     a = physics.lb_a + (physics.ub_a - physics.lb_a) * share
-    truth = true_model(physics)
-    assert truth is not None
-    return one_step_error(model, *truth, moment=second_moment(s, a)).item()
+    return one_step_error(model, *physics.true_model(), moment=second_moment(s, a)).item()
 
 
 def collect(folder: str | Path) -> pd.DataFrame:

@@ -1,0 +1,137 @@
+"""The groups of keys that configs/ chooses by name."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.fields import (
+    Count,
+    Expected,
+    Flag,
+    Fraction,
+    Group,
+    Name,
+    NonNegative,
+    Positive,
+    Whole,
+    one_of,
+    some_of,
+)
+from torch_qpmpc.mpc.validation import CONSTRAINTS, STRUCTURES
+
+Network = Annotated[str, one_of(("qp", "mlp"))]
+Beta = Annotated[float, Field(ge=0, lt=1)]
+
+
+class Noise(Group):
+    name: Name
+    std: Annotated[NonNegative | None, Expected("a finite number >= 0, or null for the task's own")]
+
+
+class Deviation(Group):
+    c_1: NonNegative
+    c_2: NonNegative
+    c_3: NonNegative
+    growth: NonNegative
+
+
+class SystemIdentification(Group):
+    beta: NonNegative
+    windows: Count
+    normalised: Flag
+
+
+class Constraint(Group):
+    """Which constraints learn; a penalty that is null is off."""
+
+    name: Name
+    structure: Annotated[str, one_of(STRUCTURES)]
+    learn: Annotated[list[str], some_of(CONSTRAINTS)]
+    deviation: Deviation | None
+    si: SystemIdentification | None
+
+    @model_validator(mode="after")
+    def penalties_are_on_a_free_C(self) -> Self:
+        if (self.deviation is not None or self.si is not None) and "C" not in self.learn:
+            expected = "C among them, as a penalty on C is on"
+            remedy = "Set the penalty to null, or learn C."
+            raise QPError.expected("constraint.learn", repr(self.learn), expected, remedy)
+        if self.deviation is not None and self.structure != "free":
+            remedy = "A tied C has nothing off its band to penalise."
+            raise QPError.expected("constraint.structure", repr(self.structure), "free", remedy)
+        return self
+
+    @model_validator(mode="after")
+    def ties_have_no_mixed_constraints(self) -> Self:
+        if self.structure != "free" and "G" in self.learn:
+            remedy = "No task has mixed constraints to learn."
+            raise QPError.expected("constraint.learn", repr(self.learn), "no G", remedy)
+        return self
+
+
+class SGD(Group):
+    name: Literal["sgd"]
+    lr_cost: NonNegative
+    lr_constraints: NonNegative
+    final_fraction: Fraction
+
+
+class Adam(SGD):
+    name: Literal["adam"]
+    betas: Annotated[
+        list[Beta], Field(min_length=2, max_length=2), Expected("two numbers in [0, 1)")
+    ]
+
+
+class GaussNewton(Group):
+    name: Literal["gauss_newton"]
+    lr: Fraction
+    scale_cost: Positive
+    scale_constraints: Positive
+    damping: Positive
+    memory: Whole
+    trust_region: Flag
+    final_fraction: Fraction
+
+
+class QLearning(Group):
+    name: Literal["qlearning"]
+
+
+class DDPG(Group):
+    name: Literal["ddpg"]
+    actor: Network
+    critic: Network
+    actor_rate: Positive
+    lr_network: Positive
+    width: Count
+
+
+class TD3(DDPG):
+    name: Literal["td3"]
+    policy_delay: Count
+    policy_noise: NonNegative
+    noise_clip: NonNegative
+
+
+class SingleProcess(Group):
+    name: Literal["single"]
+
+
+class Workers(Group):
+    name: Literal["multi"]
+    workers: Count
+    sync: Flag
+
+
+class RayWorkers(Workers):
+    name: Literal["ray"]
+    num_cpus: Positive
+
+
+Optimizer = Annotated[Adam | SGD | GaussNewton, Field(discriminator="name")]
+Algorithm = Annotated[QLearning | DDPG | TD3, Field(discriminator="name")]
+Collector = Annotated[SingleProcess | Workers | RayWorkers, Field(discriminator="name")]

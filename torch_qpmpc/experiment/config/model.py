@@ -1,0 +1,198 @@
+"""A run's configuration: its keys, and which of their values go together."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from typing import Annotated, Any, NoReturn, Self
+
+from pydantic import AfterValidator, Field, PlainValidator, model_validator
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.config.groups import (
+    Algorithm,
+    Collector,
+    Constraint,
+    Noise,
+    Optimizer,
+)
+from torch_qpmpc.experiment.fields import (
+    Count,
+    Expected,
+    Flag,
+    Fraction,
+    Group,
+    Name,
+    NonNegative,
+    Positive,
+    Whole,
+    one_of,
+)
+from torch_qpmpc.experiment.tasks import TaskSettings, find_task
+from torch_qpmpc.mpc.projections import STEPS, check_step
+from torch_qpmpc.qp.solvers import backend
+
+LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")
+
+
+def _known_solver(name: str) -> str:
+    backend(name)
+    return name
+
+
+def _installed_step(name: str) -> str:
+    check_step(name)
+    return name
+
+
+def _settings_of_the_task(value: Any) -> TaskSettings:
+    if not isinstance(value, Mapping):
+        raise QPError.expected("task", repr(value), "its keys, as in configs/task/")
+    return find_task(value).settings.model_validate(value)
+
+
+class Config(Group):
+    """All keys of configs/, but for Hydra's own; those with a default came after the first runs."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**63), Expected("a whole number >= 0 and < 2^63")]
+    eval_seed: Annotated[Whole | None, Expected("a whole number >= 0, or null")] = None
+    solver: Annotated[Name, AfterValidator(_known_solver)]
+    warm_start: Flag
+    threads: Count
+    updates: Count
+    batch_size: Count
+    num_envs: Count
+    steps_per_update: Count
+    warmup_steps: Whole
+    replay: Flag
+    replay_capacity: Count
+    exploration_std: NonNegative
+    td_error_clip: Annotated[Positive | None, Expected("a finite number > 0, or null")]
+    delay_value: Flag
+    target_rate: Fraction
+    step: Annotated[str, one_of(STEPS), AfterValidator(_installed_step)]
+    penalty_step: Annotated[str, one_of(("proximal", "subgradient"))]
+    release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
+    resume: Annotated[str | None, Expected("a path, or null")]
+    ablation: Annotated[str | None, Expected("a name, or null")]
+    logger: Annotated[str, one_of(LOGGERS)] = "tensorboard"
+    figures: Flag
+    eval_interval: Count
+    log_interval: Count
+    algo: Algorithm
+    collector: Collector
+    task: Annotated[TaskSettings, PlainValidator(_settings_of_the_task)]
+    noise: Noise
+    constraint: Constraint
+    optimizer: Optimizer
+
+    @property
+    def second_order(self) -> bool:
+        return self.optimizer.name == "gauss_newton"
+
+    @property
+    def penalised(self) -> bool:
+        return self.constraint.deviation is not None or self.constraint.si is not None
+
+    def conflict(self, key: str, expected: str, remedy: str = "") -> NoReturn:
+        """Raise the error of a value that does not go with others."""
+        value = functools.reduce(getattr, key.split("."), self)
+        raise QPError.expected(key, repr(value), expected, remedy)
+
+    @model_validator(mode="after")
+    def something_learns(self) -> Self:
+        if not self.constraint.learn and not self.task.learn_cost:
+            self.conflict("task.learn_cost", "something to learn, here or in constraint.learn")
+        return self
+
+    @model_validator(mode="after")
+    def si_penalty_has_windows(self) -> Self:
+        """Its windows are as long as the horizon, and come from the replay."""
+        if self.constraint.si is None:
+            return self
+        long_enough = f"at least task.horizon = {self.task.horizon}"
+        remedy = "constraint.si needs windows of task.horizon steps."
+        if self.task.episode_steps < self.task.horizon:
+            self.conflict("task.episode_steps", long_enough, remedy)
+        if self.warmup_steps < self.task.horizon:
+            self.conflict("warmup_steps", long_enough, remedy)
+        if not self.replay:
+            self.conflict("replay", "true", "The windows of constraint.si come from there.")
+        if (
+            self.collector.name != "single"
+            and not self.collector.sync
+            and self.steps_per_update < self.task.horizon
+        ):
+            remedy = "The windows of constraint.si lie within one batch of a worker."
+            self.conflict("steps_per_update", long_enough, remedy)
+        return self
+
+    @model_validator(mode="after")
+    def second_order_has_quadratic_penalties(self) -> Self:
+        """gauss_newton takes a penalty as a quadratic in a free C, or by its proximal step."""
+        penalties = self.constraint
+        if not self.second_order:
+            return self
+        if penalties.deviation is not None and self.penalty_step != "proximal":
+            self.conflict("penalty_step", "proximal", "gauss_newton has no subgradients.")
+        if penalties.si is not None and penalties.si.normalised:
+            remedy = "gauss_newton takes the penalty as a quadratic in C, which this is not."
+            self.conflict("constraint.si.normalised", "False", remedy)
+        if penalties.si is not None and penalties.structure != "free":
+            remedy = "gauss_newton needs a free C for constraint.si."
+            self.conflict("constraint.structure", "free", remedy)
+        return self
+
+    @model_validator(mode="after")
+    def task_has_the_noise(self) -> Self:
+        task = find_task(self.task.model_dump())
+        if self.noise.name not in task.noises:
+            self.conflict("noise.name", f"a noise that {task.name} has: {', '.join(task.noises)}")
+        if self.noise.std is not None and not task.takes_noise_std:
+            self.conflict("noise.std", "null", f"The noise of {task.name} cannot be changed.")
+        return self
+
+    @model_validator(mode="after")
+    def actor_critic_is_of_first_order_with_a_replay(self) -> Self:
+        if self.algo.name == "qlearning":
+            return self
+        name = self.algo.name
+        if self.second_order:
+            remedy = f"{name} has no second order: say optimizer=adam."
+            self.conflict("optimizer.name", "adam or sgd", remedy)
+        if self.warm_start:
+            self.conflict("warm_start", "false", f"{name} solves at other actions than it replays.")
+        if not self.replay:
+            self.conflict("replay", "true", f"{name} learns from a replay.")
+        if self.algo.actor == "mlp" and self.penalised:
+            remedy = "The penalties are on a QP's C: choose constraint=free."
+            self.conflict("algo.actor", "qp", remedy)
+        if self.step != "cholesky":
+            self.conflict("step", "cholesky", f"The critics of {name} know no other.")
+        return self
+
+    @model_validator(mode="after")
+    def release_has_ties_and_reaches_all(self) -> Self:
+        if self.release is None:
+            return self
+        if self.constraint.structure == "free":
+            self.conflict("release", "null", "Nothing is tied: choose constraint=mpc.")
+        if self.algo.name != "qlearning":
+            remedy = f"{self.algo.name} has more parameters than the QP's."
+            self.conflict("release", "null", remedy)
+        if self.collector.name != "single":
+            remedy = (
+                f"The workers of collector={self.collector.name} would keep the old parameters."
+            )
+            self.conflict("release", "null", remedy)
+        return self
+
+    @model_validator(mode="after")
+    def environments_divide_evenly(self) -> Self:
+        """Among the workers, and in the replay."""
+        if self.collector.name != "single" and self.num_envs % self.collector.workers:
+            workers = self.collector.workers
+            self.conflict("num_envs", f"a multiple of collector.workers = {workers}")
+        if self.replay_capacity % self.num_envs:
+            self.conflict("replay_capacity", f"a multiple of num_envs = {self.num_envs}")
+        return self

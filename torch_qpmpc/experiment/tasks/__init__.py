@@ -1,0 +1,89 @@
+"""The tasks of train.py: a plant, the QP (eq:qp5) that learning starts from, and its aim.
+
+A task is one file that registers it. A script of the user's own can register others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from omegaconf import DictConfig
+from torch import Tensor
+
+from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
+from torch_qpmpc.experiment.tasks import gros_zanon, gymnasium, point_mass  # noqa: F401 (register)
+from torch_qpmpc.experiment.tasks.registry import (
+    TASKS,
+    Scheme,
+    Task,
+    TaskSettings,
+    find_task,
+    register,
+)
+from torch_qpmpc.mpc.module import QPMPC
+
+__all__ = [
+    "TASKS",
+    "Scheme",
+    "Task",
+    "TaskSettings",
+    "find_task",
+    "make_mpc",
+    "make_physics",
+    "make_true_mpc",
+    "register",
+    "true_model",
+]
+
+
+def make_physics(cfg: DictConfig) -> LinearSystem | GymnasiumPlant:
+    """The true system, with the run's noise where that can be chosen."""
+    return find_task(cfg.task).make_plant(cfg)
+
+
+def make_mpc(cfg: DictConfig, physics: LinearSystem | GymnasiumPlant) -> QPMPC:
+    """The QP that learns: it starts from the task's wrong scheme."""
+    learn = (*cfg.task.learn_cost, *cfg.constraint.learn)
+    return _make(cfg, physics, find_task(cfg.task).wrong_scheme(cfg, physics), learn)
+
+
+def make_true_mpc(cfg: DictConfig, physics: LinearSystem | GymnasiumPlant) -> QPMPC | None:
+    """The other end: the same QP with the true model, cost and bounds; None where there is none."""
+    true_scheme = find_task(cfg.task).true_scheme
+    return None if true_scheme is None else _make(cfg, physics, true_scheme(physics), ())
+
+
+def true_model(
+    physics: LinearSystem | GymnasiumPlant,
+) -> tuple[Tensor, Tensor, Tensor] | None:
+    """A, B and the offset of the plant, the mean of its noise; None where it has no such model."""
+    return physics.true_model()
+
+
+def _make(
+    cfg: DictConfig,
+    physics: LinearSystem | GymnasiumPlant,
+    scheme: Scheme,
+    learn: Collection[str],
+) -> QPMPC:
+    task = cfg.task
+    return QPMPC.from_model(
+        scheme.A,
+        scheme.B,
+        task.horizon,
+        offset=scheme.offset,
+        gamma=task.gamma,
+        state_bounds=(scheme.lb_s, scheme.ub_s),
+        action_bounds=(physics.lb_a, physics.ub_a),
+        structure=cfg.constraint.structure,
+        hessian=task.hessian,
+        stage_weight=scheme.stage_weight,
+        terminal_weight="riccati" if task.terminal_weight == "riccati" else None,
+        state_slack=task.state_slack,
+        action_slack=task.action_slack,
+        discount_slack=task.discount_slack,
+        learn=learn,
+        step=cfg.step,
+        solver=cfg.solver,
+        on_failure="mask",
+    )

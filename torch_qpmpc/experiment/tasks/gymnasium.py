@@ -1,0 +1,83 @@
+"""``task=gymnasium``: any Gymnasium environment, from a linear model of it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import torch
+from omegaconf import DictConfig
+from pydantic import AfterValidator
+
+from torch_qpmpc.envs import GymnasiumPlant
+from torch_qpmpc.envs.closed_loop import gymnasium_loop
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.fields import MATRIX, Expected, Matrix
+from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
+
+
+def _is_chosen(id: str) -> str:
+    if id == "???":
+        raise ValueError
+    return id
+
+
+#: null until the user has one: `given_scheme` then says what is missing.
+Model = Annotated[Matrix | None, MATRIX]
+
+
+class GymnasiumSettings(TaskSettings):
+    """The environment, and the linear model of it."""
+
+    id: Annotated[
+        str,
+        AfterValidator(_is_chosen),
+        Expected("the id of a Gymnasium environment, as in task.id=Pendulum-v1"),
+    ]
+    A: Model
+    B: Model
+    stage_weight: Model
+
+
+#: How to get a model, and to pass it on the command line.
+REMEDY = (
+    "Find a model x+ = A x + B u of it around its target, by finite differences of its dynamics or "
+    "by least squares on logged transitions (x, u, x+), and the weight of its cost "
+    "1/2 [x; u]' W [x; u]; then, as for two states and one action, override "
+    "'task.A=[[1,.1],[0,1]]' 'task.B=[[0],[.1]]' 'task.stage_weight=[[1,0,0],[0,1,0],[0,0,.1]]'."
+)
+
+
+def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
+    """Read the model and the weight from the task's configuration, the bounds from the spaces.
+
+    Raises:
+        QPError: one of them is missing, or has another shape than the environment's spaces.
+    """
+    n_x, n_u = len(plant.lb_s), len(plant.lb_a)
+    needed = {"A": (n_x, n_x), "B": (n_x, n_u), "stage_weight": (n_x + n_u, n_x + n_u)}
+    spaces = f"{plant.id!r}, whose observation has {n_x} entries and whose action has {n_u}"
+    for name, shape in needed.items():
+        if cfg.task[name] is None:
+            expected = f"the rows of a matrix {shape} for {spaces}"
+            raise QPError.expected(f"task.{name}", "null", expected, REMEDY)
+    given = {name: torch.tensor(cfg.task[name], dtype=torch.float64) for name in needed}
+    shapes = {name: tuple(matrix.shape) for name, matrix in given.items()}
+    if shapes != needed:
+        found, want = (
+            ", ".join(f"task.{name} of shape {shape}" for name, shape in sizes.items())
+            for sizes in (shapes, needed)
+        )
+        raise QPError.expected("task.id", f"{spaces}, with {found}", want, REMEDY)
+    return Scheme(**given, lb_s=plant.lb_s, ub_s=plant.ub_s)
+
+
+register(
+    Task(
+        "gymnasium",
+        lambda cfg: GymnasiumPlant(cfg.task.id),
+        given_scheme,
+        closed_loop=gymnasium_loop,
+        settings=GymnasiumSettings,
+        defaults=None,
+    )
+)

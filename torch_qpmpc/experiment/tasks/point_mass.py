@@ -1,0 +1,39 @@
+"""``task=point_mass``: the paper's, from a corrupted model and a random cost."""
+
+from __future__ import annotations
+
+import torch
+from omegaconf import DictConfig
+
+from torch_qpmpc.envs import PointMass
+from torch_qpmpc.envs.point_mass import NOISE_STD
+from torch_qpmpc.experiment.tasks.registry import Scheme, Task, register
+
+
+def make_plant(cfg: DictConfig) -> PointMass:
+    return PointMass(noise_kind=cfg.noise.name, noise_std=cfg.noise.std)
+
+
+def wrong_scheme(cfg: DictConfig, plant: PointMass) -> Scheme:
+    """The corruption and the cost are those of the seed."""
+    A, B, theta = plant.corrupted(cfg.seed)
+    weight = torch.cat((theta, torch.zeros_like(plant.lb_a)))
+    return Scheme(A, B, weight, plant.lb_s, plant.ub_s)
+
+
+def true_scheme(plant: PointMass) -> Scheme:
+    weight = torch.cat((2 * plant.W.diagonal(), torch.zeros_like(plant.lb_a)))
+    return Scheme.true(plant, weight)
+
+
+register(
+    Task(
+        "point_mass",
+        make_plant,
+        wrong_scheme,
+        true_scheme,
+        noises=tuple(NOISE_STD),
+        takes_noise_std=True,
+        defaults=None,
+    )
+)
