@@ -94,7 +94,7 @@ class RunFolder:
             for key, value in summary.items()
         }
         text = json.dumps(finite, indent=2, allow_nan=False)
-        # At last and all at once: it is what tells that the run need not be done again.
+        # Last, and all at once: its presence marks the run as finished.
         write_whole(self.path / "summary.json", f"{text}\n".encode())
 
 
@@ -159,7 +159,7 @@ class WritableFolder(Callback):
 
 
 def unwritable(folder: str | Path, error: OSError, key: str = "hydra.run.dir") -> QPError:
-    """What to tell whose run in ``folder``, chosen by ``key``, ended with ``error``."""
+    """The message for a run in ``folder``, chosen by ``key``, that ended with ``error``."""
     checkpoint = Path(folder) / CHECKPOINT
     remedy = f"Choose another folder by {key}=FOLDER."
     if checkpoint.exists():
