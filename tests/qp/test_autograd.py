@@ -12,13 +12,13 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jacrev, vmap
 from torch.testing import assert_close
+from torch_qpmpc.qp.sensitivity import solution_op
 
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states, solution_of
 from torch_qpmpc import QPMPC, QPError, QPSolution, QuadraticProgram, SolverError, Status, solve_qp
 from torch_qpmpc.qp import autograd
 from torch_qpmpc.qp.autograd import solve_op
 from torch_qpmpc.qp.program import EVENT_SHAPES
-from torch_qpmpc.qp.sensitivity import solution_op
 
 SOLUTION = (
     *("value", "z", "sigma", "chi", "upsilon", "eta", "mu", "xi"),
