@@ -132,7 +132,9 @@ def assert_recovered_alike(
         if name == "active":
             solved = others.residual < 1e-3
             one, other = one[solved], other[solved]
-        assert_close(one, other, rtol=1e-9, atol=1e-9, equal_nan=True, msg=lambda m: f"{name} {m}")
+        assert_close(
+            one, other, rtol=1e-9, atol=1e-9, equal_nan=True, msg=lambda m, n=name: f"{n} {m}"
+        )
 
 
 @pytest.mark.parametrize("passes", [0, 2])
