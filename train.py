@@ -161,10 +161,6 @@ def _train(
     return summary
 
 
-# Absolute, so that a script with a task of its own can call main.
-CONFIGS = str(Path(__file__).with_name("configs"))
-
-
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="config")
 def main(cfg: DictConfig) -> float:
     """Train; a sweep's optimiser maximises the closed gap that this returns."""

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc import QPMPC, QuadraticProgram
-from torch_qpmpc.qp.pipeline.batch import FlatPrograms, SoftQPs
-from torch_qpmpc.qp.pipeline.condensing import Reduced, condensed_for
-from torch_qpmpc.qp.solvers import Answer
+from torch_qpmpc.qp.kernels import sample_torch
+from torch_qpmpc.qp.pipeline.batch import Programs, SoftQPs
+from torch_qpmpc.qp.pipeline.condensing import Reduced
+from torch_qpmpc.qp.solvers import BackendSolution
 
 #: What a row does at the solution: strictly inside, at a bound, or beyond one (then it is soft).
 SOFT_ROWS = ("inside", "at_lower", "at_upper", "below", "above", "equality", "no_upper", "free")
@@ -144,25 +145,35 @@ def known_qp(
     )
 
 
-def programs_of(known: KnownQP) -> FlatPrograms:
-    """The known QP as the solvers get it."""
-    return FlatPrograms.of(*known.qp.tensors(), known.fixed)[0]
+CPU = torch.device("cpu")
 
 
-def soft_qps(known: KnownQP) -> tuple[SoftQPs, Answer]:
-    """What a backend is asked, and the exact answer to it."""
-    reduced, programs = reduced_of(known), programs_of(known)
-    d = reduced.H.shape[-1]
-    v = known.z - reduced.expand(programs, known.z.new_zeros(len(programs), d))
-    v = times(torch.linalg.pinv(reduced.T[:, :, -d:]), v)
-    lam = known.lam.reshape(len(programs), -1)[:, reduced.rows]
-    return reduced.at(programs), Answer(v, lam, torch.zeros_like(programs.group))
+def programs_of(known: KnownQP, device: torch.device | None = CPU) -> Programs:
+    """The known QP as the pipeline gets it: in tensors, or in NumPy's arrays without a device."""
+    return Programs.of(*known.qp.tensors(), known.fixed, device=device)[0]
 
 
 def reduced_of(known: KnownQP) -> Reduced:
-    """The known QP condensed, with no more entries kept than are fixed."""
-    programs = programs_of(known)
-    return condensed_for(programs, known.fixed.shape[-1]).reduced(programs)
+    """The known QP condensed, in tensors, with no more entries kept than are fixed."""
+    return programs_of(known).prepared.reduced(known.fixed.shape[-1])
+
+
+def soft_qps(known: KnownQP) -> tuple[SoftQPs, BackendSolution]:
+    """What a backend solves, in tensors, and the exact solution."""
+    reduced, programs = reduced_of(known), programs_of(known)
+    v = known.z.reshape(len(programs), -1) - expanded(programs)
+    v = times(torch.linalg.pinv(reduced.T[:, :, -reduced.H.shape[-1] :]), v)
+    lam = known.lam.reshape(len(programs), -1)[:, reduced.rows]
+    return programs.reduced_qps(), BackendSolution(v, lam, torch.zeros_like(programs.group))
+
+
+def expanded(programs: Programs, v: Tensor | None = None) -> Tensor:
+    """z ``(B, n_z)`` of free variables ``(B, d)``, zero by default."""
+    reduced = programs.prepared.reduced(programs.n_f)
+    if v is None:
+        v = programs.fixed.new_zeros(len(programs), reduced.H.shape[-1])
+    free = torch.cat((programs.fixed, v), dim=-1)
+    return sample_torch.multiply(reduced.T, programs.group, free) + reduced.z_0
 
 
 def solution_of(known: KnownQP) -> dict[str, Tensor]:

@@ -7,9 +7,10 @@ from torch_qpmpc.learning.operators import QPActorValueOperator
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.qp.autograd import solve_qp
 from torch_qpmpc.qp.pipeline.solve import SolveLog
-from torch_qpmpc.qp.program import QPSolution, QuadraticProgram, Status
+from torch_qpmpc.qp.program import QuadraticProgram, Status
+from torch_qpmpc.qp.solution import QPSolution
+from torch_qpmpc.qp.solve import solve_qp
 
 __all__ = [
     "QPMPC",

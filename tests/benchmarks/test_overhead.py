@@ -53,7 +53,7 @@ def test_share_outside_the_solver(
 
         return timed_solve
 
-    monkeypatch.setattr(chain, "recall", timed(chain.recall))
+    monkeypatch.setattr(chain, "try_active_sets", timed(chain.try_active_sets))
     monkeypatch.setitem(BACKENDS, solver, timed(BACKENDS[solver]))
     gradient = STARTS[start](
         make_mpc(PAPER, dense=True, solver=solver),

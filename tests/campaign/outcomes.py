@@ -17,8 +17,8 @@ from torch import Tensor
 from tests.campaign.families import Case
 from tests.problems import times
 from torch_qpmpc import QPSolution, Status
-from torch_qpmpc.qp.autograd import EVENT_NDIMS
-from torch_qpmpc.qp.program import slacks
+from torch_qpmpc.qp.operator import EVENT_NDIMS
+from torch_qpmpc.qp.solution import slacks
 
 
 @dataclass(frozen=True)

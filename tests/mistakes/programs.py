@@ -90,14 +90,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: qm.solve_qp(qp, fixed.to("meta")),
         "fixed: got a tensor on meta, expected one on the QP's cpu. Move it: fixed.t",
     ),
-    "solve_qp: keep float": (
-        lambda: qm.solve_qp(qp, fixed, keep=2.5),
-        "keep: got 2.5, expected n_f = 2 ",
-    ),
-    "solve_qp: keep bool": (
-        lambda: qm.solve_qp(qp, fixed, keep="3"),
-        "keep: got '3', expected n_f = 2 ",
-    ),
     "solve_qp: warm list": (
         lambda: qm.solve_qp(qp, fixed, warm_start=[0]),
         "warm_start: got list, expected a QPSolution, or its `active`.",

@@ -15,10 +15,9 @@ from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states, solution_of
 from torch_qpmpc import QPMPC, QPError, QPSolution, QuadraticProgram, SolverError, Status, solve_qp
-from torch_qpmpc.qp import autograd
-from torch_qpmpc.qp.autograd import solve_op
+from torch_qpmpc.qp.operator import kkt_op, solve_op
 from torch_qpmpc.qp.program import EVENT_SHAPES
-from torch_qpmpc.qp.sensitivity import solution_op
+from torch_qpmpc.qp.solve import solve
 
 SOLUTION = (
     *("value", "z", "sigma", "chi", "upsilon", "eta", "mu", "xi"),
@@ -203,31 +202,16 @@ def test_one_batched_operand_makes_a_batch(name):
 def test_gradient_is_the_same_whatever_is_kept():
     known = known_qp(4, batch=(3,))
     gradients = []
-    for keep in (None, 2, 5):
+    for n_kept in (None, 2, 5):
         operands = operands_of(known, differentiable=True)
-        value(*operands, keep=keep).sum().backward()
+        qp = QuadraticProgram(*operands[:-1], check_values=False)
+        solve(qp, operands[-1], n_kept, "daqp", "raise", None).value.sum().backward()
         gradients.append([operand.grad for operand in operands])
     for other in gradients[1:]:
         assert_close(other, gradients[0], rtol=1e-5, atol=1e-5)
 
 
-def test_a_large_theta_has_the_gradient_that_a_small_one_has(monkeypatch):
-    mpc = random_mpc(5, learn=(*EVENT_SHAPES, "H_f"), on_failure="mask")
-    s, incoming = random_states(20), normal(20)
-    s[3, 0] = torch.nan  # without a solution
-    operands = (*mpc.parameters(), s.requires_grad_())
-
-    def gradients() -> tuple[Tensor, ...]:
-        return torch.autograd.grad(mpc.value(s), operands, incoming)
-
-    small = gradients()
-    assert min(gradient.abs().max() for gradient in small) > 1e-3
-    assert (small[-1][3] == 0).all()
-    monkeypatch.setattr(autograd, "CACHED", -1)
-    assert_close(small, gradients())
-
-
-# The value alone, of which the rest of the solution stays arrays
+# The value alone
 
 
 def test_the_value_alone_is_that_of_the_whole_solution_with_its_derivatives():
@@ -411,9 +395,10 @@ def test_the_operator_keeps_torchs_contract(batch):
     active = torch.zeros(known.lam.shape, dtype=torch.int8)
     arguments = (*operands, active, 2, "daqp", "mask")
     torch.library.opcheck(solve_op, arguments)
-    solution = [part.detach() for part in (known.z, known.lam, known.chi)]
-    found = [*solution, torch.zeros_like(known.fixed), torch.zeros(batch, dtype=torch.int64)]
-    torch.library.opcheck(solution_op, (*found, *operands, 2))
+    gradients = [torch.ones_like(x) for x in (known.z, known.lam, known.chi, known.xi)]
+    solution = (known.z, known.lam, torch.zeros(batch, dtype=torch.int64))
+    theta = [x.detach() for x in operands]
+    torch.library.opcheck(kkt_op, (*gradients, *solution, *theta, 2))
 
 
 # What comes out
@@ -496,8 +481,6 @@ GOOD, OTHER = known_qp(14, batch=(3,)), known_qp(14)
         ({"fixed": torch.tensor(1.0)}, r"fixed: got shape \(\), expected shape \(\*batch, n_f\)"),
         ({"fixed": torch.ones(13)}, r"fixed: got shape \(13,\), .* with n_f <= n_z = 12"),
         ({"fixed": torch.ones(4, 2)}, r"fixed: got shape \(4, 2\), .* the QP's batch \(3,\)"),
-        ({"keep": 1}, "keep: got 1, expected n_f = 2 <= keep <= n_z = 12"),
-        ({"keep": 13}, "keep: got 13, expected n_f = 2 <= keep <= n_z = 12"),
         ({"solver": "prox"}, r"solver: got 'prox', expected one of .* Did you mean 'proxqp'\?"),
         ({"on_failure": "ignore"}, "on_failure: got 'ignore', expected one of raise, warn, mask"),
     ],
@@ -592,7 +575,7 @@ def test_a_batch_that_is_too_large_for_memory_is_named(error, differentiated, mo
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("torch_qpmpc.qp.autograd.solve_programs", fail)
+    monkeypatch.setattr("torch_qpmpc.qp.boundary.solve_programs", fail)
     known = known_qp(1, batch=(4, 3))
     fixed = known.fixed.clone().requires_grad_(differentiated)
     message = r"batch: got 12 QPs of n_z = 12, expected as many as .* Solve it in chunks, .*memory"
@@ -606,7 +589,7 @@ def test_another_runtime_error_stays_as_it_is(monkeypatch):
     def fail(*_: object) -> None:
         raise RuntimeError("of another kind")
 
-    monkeypatch.setattr("torch_qpmpc.qp.autograd.solve_programs", fail)
+    monkeypatch.setattr("torch_qpmpc.qp.boundary.solve_programs", fail)
     known = known_qp(1, batch=(3,))
     with pytest.raises(RuntimeError, match="of another kind"):
         solve_qp(known.qp, known.fixed)

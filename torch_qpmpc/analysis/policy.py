@@ -17,7 +17,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.initial import riccati_weight
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
-from torch_qpmpc.qp.program import QPSolution
+from torch_qpmpc.qp.solution import QPSolution
 
 GRID = "Pass torch.linspace(lower, upper, n)."
 

@@ -26,8 +26,9 @@ from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tenso
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
-from torch_qpmpc.qp.autograd import envelope_gradients
-from torch_qpmpc.qp.program import EVENT_SHAPES, QPSolution
+from torch_qpmpc.qp.derivatives import envelope_gradients
+from torch_qpmpc.qp.program import EVENT_SHAPES
+from torch_qpmpc.qp.solution import QPSolution
 
 #: Decrease over predicted decrease: below the first the damping rises, above the second it falls.
 POOR, GOOD = 0.25, 0.75

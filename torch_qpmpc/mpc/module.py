@@ -17,7 +17,7 @@ from torch.nn.utils import parametrize
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import initial, parameters, pickling
-from torch_qpmpc.mpc.cost import Cost, Discounts, diagonal_cost, discounted
+from torch_qpmpc.mpc.cost import Discounts, discounted
 from torch_qpmpc.mpc.identity import check_identity, digest, written
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, kept
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST
@@ -31,9 +31,10 @@ from torch_qpmpc.mpc.validation import (
     learned_entries,
     own,
 )
-from torch_qpmpc.qp.autograd import optimal_value, solve_qp, value_and_active_set
 from torch_qpmpc.qp.precision import full_precision, to_dtype
-from torch_qpmpc.qp.program import QPSolution, QuadraticProgram
+from torch_qpmpc.qp.program import QuadraticProgram
+from torch_qpmpc.qp.solution import QPSolution
+from torch_qpmpc.qp.solve import solve
 from torch_qpmpc.qp.solvers import backend
 
 #: What the constructor, or `QPMPC.release`, decides once and for all.
@@ -253,25 +254,18 @@ class QPMPC(nn.Module):
 
         ``qp`` is as for `value`.
         """
-        fixed = self._checked(s, a)
-        qp = self._today(qp)
-        fixed = to_dtype(fixed, qp.C.dtype)
-        return solve_qp(qp, fixed, warm_start=warm_start, **self._options())
+        return self._solve(self._checked(s, a), qp, warm_start)
 
     def value_and_active_set(
         self, s: Tensor, a: Tensor | None = None, warm_start: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """`value`, or `action_value`, with the active set ``(*batch, n_g)`` of its solution.
 
-        ``warm_start`` is one of nearly the same QPs, as in `solve`; this does not prepare the
-        gradient of the rest of the solution.
+        ``warm_start`` is one of nearly the same QPs, as in `solve`.
         """
         fixed = self._checked(s, a)
-        qp = self.quadratic_program()
-        value, active = value_and_active_set(
-            qp, to_dtype(fixed, qp.C.dtype), warm_start=warm_start, **self._options()
-        )
-        return to_dtype(value, fixed.dtype), active
+        solution = self._solve(fixed, None, warm_start)
+        return to_dtype(solution.value, fixed.dtype), solution.active
 
     def policy_and_active_set(
         self, s: Tensor, warm_start: Tensor | None = None
@@ -464,27 +458,26 @@ class QPMPC(nn.Module):
         return qp
 
     def _value(self, fixed: Tensor, qp: QuadraticProgram | None) -> Tensor:
+        return to_dtype(self._solve(fixed, qp).value, fixed.dtype)
+
+    def _solve(
+        self,
+        fixed: Tensor,
+        qp: QuadraticProgram | None,
+        warm_start: QPSolution | Tensor | None = None,
+    ) -> QPSolution:
         qp = self._today(qp)
-        value = optimal_value(qp, to_dtype(fixed, qp.C.dtype), **self._options())
-        return to_dtype(value, fixed.dtype)
+        n_kept = self.n_x + self.n_u  # V, Q and the policy share one elimination
+        fixed = to_dtype(fixed, qp.C.dtype)
+        return solve(qp, fixed, n_kept, self.solver, self.on_failure, warm_start)
 
     def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:
         """u_0 of a solution of V's QP."""
         return to_dtype(solution.z[..., self.n_x : self.n_x + self.n_u], dtype)
 
-    def _options(self) -> dict[str, Any]:
-        """What V, Q and the policy ask of every solve; one ``keep``, to share one elimination."""
-        keep = self.n_x + self.n_u
-        return {"solver": self.solver, "on_failure": self.on_failure, "keep": keep}
-
-    def _cost(self) -> Cost:
+    def _cost(self) -> tuple[Tensor, Tensor, Tensor]:
         """H, q and w of the QP."""
         by = Discounts(self.discount, self.slack_discount, self.hardness, self.stages)
-        if self.hessian == "diagonal":
-            factors, squared = zip(
-                *(parameters.factor(self, x) for x in ("H", "H_f", "w")), strict=True
-            )
-            return diagonal_cost(self._layout, (*factors, self.q), squared, by)
         blocks = (self.H,) if self.hessian == "full" else (self.H, self.H_f)
         return discounted(self._layout, self.hessian, blocks, self.q, self.w, by)
 

@@ -15,7 +15,7 @@ from torch.nn.utils import parametrize
 
 from torch_qpmpc.checks import check_number
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.parametrizations import Banded, LinearRows, Masked, SquareRoot, Tied
+from torch_qpmpc.mpc.parametrizations import Banded, LinearRows, Masked, Tied
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
 
 
@@ -70,30 +70,6 @@ def matrix(module: nn.Module, name: str) -> tuple[nn.Parameter | None, Tensor | 
     if len(found) == 1 and isinstance(found[0], Masked):
         return leaves(module, name)[0], found[0].mask
     return None, None
-
-
-def factor(module: nn.Module, name: str) -> tuple[Tensor, bool]:
-    """What a part is the square of, and True where it is a square and no more; else the part.
-
-    It is the part where someone looks on: by a hook, or `parametrize.cached`.
-    """
-    kept: Any = module._modules.get("parametrizations", {})
-    if name in kept and not parametrize._cache_enabled:
-        of_part = kept[name]
-        first, *others = of_part._modules.values()  # faster than by index
-        is_square = not others and type(first) is SquareRoot
-        if is_square and not (_has_hooks(of_part) or _has_hooks(first)):
-            return of_part.original, True
-    return getattr(module, name), False
-
-
-def _has_hooks(module: nn.Module) -> bool:
-    return bool(
-        module._forward_hooks
-        or module._forward_pre_hooks
-        or module._backward_hooks
-        or module._backward_pre_hooks
-    )
 
 
 def readable(module: nn.Module, learned: Collection[str]) -> dict[str, Tensor]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -18,16 +19,6 @@ def broadcast(*shapes: Sequence[int]) -> torch.Size:
             return torch.broadcast_shapes(*shapes)
         common = shape
     return torch.Size(common)
-
-
-def flatten(vectors: Tensor, batch: torch.Size, device: torch.device | str = "cpu") -> Tensor:
-    """``(*batch, n)``, or what broadcasts to it, as ``(B, n)``: detached, float64."""
-    flat = vectors.detach()
-    if flat.dtype != torch.float64 or flat.device != device:
-        flat = flat.to(device, torch.float64)
-    if flat.ndim == 2 and flat.shape[:1] == batch:
-        return flat
-    return listed(flat.expand(*batch, vectors.shape[-1]))
 
 
 def align(in_dims: tuple, args: tuple, event_ndims: Sequence[int]) -> list[Any]:
@@ -70,6 +61,19 @@ def outer(left: Tensor, right: Tensor, like: Tensor) -> Tensor:
     if like.ndim == 2:
         return listed(left).mT @ listed(right)
     return sum_to(left.unsqueeze(-1) * right.unsqueeze(-2), like)
+
+
+def multiply(matrices: Tensor, group: Tensor, vectors: Tensor) -> Tensor:
+    """Multiply ``(M, i, j)`` by ``(B or 1, j)`` to ``(B, i)``, by the matrix ``group`` of each."""
+    if matrices.shape[0] == 1:
+        return F.linear(vectors, matrices[0])
+    vectors = vectors.expand(len(group), -1)
+    return torch.bmm(matrices[group], vectors.unsqueeze(-1)).squeeze(-1)
+
+
+def times(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Multiply ``(*batch, i, j)`` by ``(*batch, j)`` to ``(*batch, i)``, broadcasting."""
+    return (vector.unsqueeze(-2) @ matrix.mT).squeeze(-2)
 
 
 def listed(vectors: Tensor) -> Tensor:

@@ -17,15 +17,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, fields
 from enum import IntEnum
-from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import broadcast
-from torch_qpmpc.qp.precision import full_precision
-from torch_qpmpc.qp.tracing import has_values
 
 #: Trailing (event) dimensions of each tensor of a QP, in the order of the constructor.
 EVENT_SHAPES: dict[str, tuple[str, ...]] = {
@@ -39,6 +36,8 @@ EVENT_SHAPES: dict[str, tuple[str, ...]] = {
     "ub": ("n_g",),
     "w": ("n_g",),
 }
+#: The dtypes that have factorisations.
+DTYPES = (torch.float32, torch.float64)
 #: How many trailing dimensions of each are no batch.
 NDIMS = tuple(len(event) for event in EVENT_SHAPES.values())
 
@@ -71,35 +70,9 @@ _EXPLANATIONS = {
 }
 
 
-class Sizes(NamedTuple):
-    """What follows from the shapes of a QP's tensors: the batch's, and the most entries of one."""
-
-    batch_shape: torch.Size
-    largest: int
-
-    @classmethod
-    def of(cls, tensors: Sequence[Tensor]) -> Sizes:
-        """Of H, q, c, C, b, G, lb, ub, w; `RuntimeError` where batches do not broadcast."""
-        batches = (x.shape[: x.ndim - n] for x, n in zip(tensors, NDIMS, strict=True))
-        return cls(broadcast(*batches), max(x.numel() for x in tensors))
-
-
-#: Of shapes, dtypes and devices that were found to fit: training asks for the same all the time.
-_accepted: dict[Any, Sizes] = {}
-#: How many of them are remembered.
-_MOST = 16
-
-
-def _kind(tensors: Sequence[Tensor]) -> tuple | None:
-    """What they are remembered by; None of what is no tensor, or has a symbolic shape."""
-    if torch.compiler.is_compiling():
-        return None
-    try:
-        kind = tuple([(x.shape, x.dtype, x.device) for x in tensors])
-        hash(kind)
-    except (AttributeError, TypeError):
-        return None
-    return kind
+def batch_shape(tensors: Sequence[Tensor]) -> torch.Size:
+    """Batch shape of H, q, c, C, b, G, lb, ub, w; `RuntimeError` if they do not broadcast."""
+    return broadcast(*(x.shape[: x.ndim - n] for x, n in zip(tensors, NDIMS, strict=True)))
 
 
 @dataclass(frozen=True, repr=False)
@@ -166,13 +139,7 @@ class QuadraticProgram:
 
     @property
     def batch_shape(self) -> torch.Size:
-        return self.sizes.batch_shape
-
-    @property
-    def sizes(self) -> Sizes:
-        """Worked out once for all QPs of the same shapes."""
-        tensors = self.tensors()
-        return _accepted.get(_kind(tensors)) or Sizes.of(tensors)
+        return batch_shape(self.tensors())
 
     def __repr__(self) -> str:
         """Sizes, dtype and device, without the tensors' entries."""
@@ -185,16 +152,31 @@ class QuadraticProgram:
         return (self.H, self.q, self.c, self.C, self.b, self.G, self.lb, self.ub, self.w)
 
     def _check_shapes(self) -> None:
-        kind = _kind(self.tensors())
-        if kind is not None and kind in _accepted:
-            return
-        self._check_each_shape()
-        if kind is not None:
-            if len(_accepted) >= _MOST:
-                _accepted.clear()
-            _accepted[kind] = self.sizes
+        if not self._fits():
+            self._name_what_does_not_fit()
+        try:
+            _ = self.batch_shape
+        except RuntimeError as error:
+            shapes = {name: tuple(getattr(self, name).shape) for name in EVENT_SHAPES}
+            raise QPError.expected(
+                "batch", f"shapes {shapes}", "leading dimensions that broadcast"
+            ) from error
 
-    def _check_each_shape(self) -> None:
+    def _fits(self) -> bool:
+        """True if dtypes, devices and event shapes fit each other: the common case, at once."""
+        tensors = self.tensors()
+        if not all(isinstance(x, Tensor) for x in tensors):
+            return False
+        if len({(x.dtype, x.device) for x in tensors}) > 1 or self.H.dtype not in DTYPES:
+            return False
+        n_z, n_c, n_g = (x.shape[-1] if x.ndim else 0 for x in (self.q, self.b, self.lb))
+        events = (n_z, n_z), (n_z,), (), (n_c, n_z), (n_c,), (n_g, n_z), (n_g,), (n_g,), (n_g,)
+        return all(
+            x.ndim >= n and x.shape[x.ndim - n :] == event
+            for x, n, event in zip(tensors, NDIMS, events, strict=True)
+        )
+
+    def _name_what_does_not_fit(self) -> None:
         for field in fields(self):
             tensor = getattr(self, field.name)
             if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
@@ -205,7 +187,7 @@ class QuadraticProgram:
                     "a floating-point torch.Tensor",
                     "Convert it with torch.as_tensor(..., dtype=torch.float64).",
                 )
-            if tensor.dtype not in (torch.float32, torch.float64):
+            if tensor.dtype not in DTYPES:
                 remedy = "Half precision has no factorisations: use torch.float64."
                 got = tensor.dtype
                 raise QPError.expected(field.name, got, "torch.float32 or torch.float64", remedy)
@@ -233,13 +215,6 @@ class QuadraticProgram:
                         f"shape {tuple(tensor.shape)}",
                         f"shape {want} with {symbol} = {known} as in {source}",
                     )
-        try:
-            _ = self.sizes
-        except RuntimeError as error:
-            shapes = {name: tuple(getattr(self, name).shape) for name in EVENT_SHAPES}
-            raise QPError.expected(
-                "batch", f"shapes {shapes}", "leading dimensions that broadcast"
-            ) from error
 
     def _check_values(self) -> None:
         for name in ("H", "q", "c", "C", "b", "G"):
@@ -284,6 +259,9 @@ class QuadraticProgram:
             )
 
 
+#: In the place of a row's state in an active set: nothing is known of an unsolved QP.
+UNKNOWN = 127
+
 #: Units of rounding by which bounds that should be equal may cross.
 CROSSING = 4.0
 
@@ -292,133 +270,3 @@ def crossed(lb: Tensor, ub: Tensor) -> Tensor:
     """Where lb > ub, and not by rounding alone."""
     size, gap = lb.abs().maximum(ub.abs()), lb - ub
     return (gap > CROSSING * torch.finfo(lb.dtype).eps * size) | (gap == torch.inf)
-
-
-#: A multiplier below this fraction of the largest is zero; one as near to w is saturated.
-ACTIVE_FRACTION = 1e-8
-#: In the place of a row's state: nothing is known, as before an element is solved.
-UNKNOWN = 127
-
-
-def active_rows(lam: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-    """Which rows are held at a bound, and which are saturated at |lam| = w, ``(*batch, n_g)``."""
-    size = lam.abs()
-    saturated = w.isfinite() & (size >= (1 - ACTIVE_FRACTION) * w)
-    largest = size.amax(-1, keepdim=True) if size.shape[-1] else size
-    return (size > ACTIVE_FRACTION * (1 + largest)) & ~saturated, saturated
-
-
-def row_states(p, lower, upper, w) -> tuple:
-    """Each row's nearest bound, whether it is active there, and lam if not; arrays or tensors.
-
-    The excess of ``p = y + lam`` over the bounds would be the multiplier; |lam| <= w caps it.
-    """
-    bound = p.clip(lower, upper)
-    excess = p - bound
-    held = excess.clip(-w, w)
-    active = (held == excess) & ((excess != 0) | (lower == upper))
-    return bound, active, held
-
-
-@dataclass(frozen=True, repr=False)
-class QPSolution:
-    """Primal-dual solution of a batch of QPs.
-
-    All but ``active`` and the last three is differentiable in the tensors of the QP and in the
-    fixed entries. An element that is not solved (``status != 0``; only with ``on_failure`` "warn"
-    or "mask") has ``value = inf``, the fixed entries in ``z``, zeros elsewhere, and no gradient.
-
-    Attributes:
-        qp: the problems that this solves.
-        value: optimal cost, ``(*batch,)``.
-        z: minimiser, ``(*batch, n_z)``.
-        chi: multipliers of C z = b, ``(*batch, n_c)``.
-        lam: signed multipliers eta - upsilon of the rows, ``(*batch, n_g)``.
-        xi: multipliers of the fixed entries, ``(*batch, n_f)``: the paper's xi, then zeta.
-        status: `Status` as integers, ``(*batch,)``.
-        residual: relative KKT residual found by the certificate, ``(*batch,)``.
-        iterations: the solver's iterations, ``(*batch,)``.
-    """
-
-    qp: QuadraticProgram
-    value: Tensor
-    z: Tensor
-    chi: Tensor
-    lam: Tensor
-    xi: Tensor
-    status: Tensor
-    residual: Tensor
-    iterations: Tensor
-
-    def __repr__(self) -> str:
-        """Sizes, how many elements have each status, and the range of the values."""
-        lines = [
-            f"batch_shape={tuple(self.status.shape)}, n_f={self.xi.shape[-1]}",
-            f"qp={self.qp!r}",
-        ]
-        if has_values(self.status):
-            solved = self.solved
-            outcome = [f"solved {int(solved.sum())} of {solved.numel()}"]
-            for status in list(Status)[1:]:
-                if count := int((self.status == status).sum()):
-                    outcome.append(f"{count} {status.name}")
-            lines.append(", ".join(outcome))
-            if solved.any():
-                value, residual = self.value.detach()[solved], self.residual[solved].max()
-                of_values = f"value from {value.min():.4g} to {value.max():.4g}"
-                lines.append(f"{of_values}, residual up to {residual:.2g}")
-        body = ",\n".join(f"    {line}" for line in lines)
-        return f"QPSolution(\n{body},\n)"
-
-    @property
-    def solved(self) -> Tensor:
-        """Which elements are certified solutions, ``(*batch,)``."""
-        return self.status == Status.SOLVED
-
-    @property
-    def sigma(self) -> Tensor:
-        """Slacks, ``(*batch, n_g)``, zero on hard rows."""
-        qp = self.qp
-        return self._where_solved(slacks(self.z, qp.G, qp.lb, qp.ub, qp.w))
-
-    @property
-    def upsilon(self) -> Tensor:
-        """Multipliers of the lower bounds, ``(*batch, n_g)``, non-negative."""
-        return (-self.lam).clamp(min=0)
-
-    @property
-    def eta(self) -> Tensor:
-        """Multipliers of the upper bounds, ``(*batch, n_g)``, non-negative."""
-        return self.lam.clamp(min=0)
-
-    @property
-    def mu(self) -> Tensor:
-        """Multipliers of sigma >= 0, ``w - upsilon - eta``, ``(*batch, n_g)``; inf on hard rows."""
-        return self._where_solved(self.qp.w - self.upsilon - self.eta)
-
-    @property
-    def active(self) -> Tensor:
-        """The active set as int8 ``(*batch, n_g)``, which is a warm start for a nearly equal QP.
-
-        0 is a row without multiplier, 1 one that is held at ub and -1 one at lb; 2 and -2 are rows
-        saturated there, at eta = w or upsilon = w. All rows of an unsolved element are `UNKNOWN`.
-        """
-        z, lam, qp = self.z.detach(), self.lam.detach(), self.qp
-        y = _rows(z, qp.G)
-        _, held, fixed = row_states(y + lam, qp.lb, qp.ub, qp.w)
-        active = torch.where(held, lam.sign(), 2 * fixed.sign()).detach().to(torch.int8)
-        return active.masked_fill_(~self.solved.unsqueeze(-1), UNKNOWN)
-
-    def _where_solved(self, rows: Tensor) -> Tensor:
-        return torch.where(self.solved.unsqueeze(-1), rows, 0)
-
-
-def slacks(z: Tensor, G: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
-    """sigma of z: how far soft rows are outside their bounds, ``(*batch, n_g)``."""
-    y = _rows(z, G)
-    return torch.where(w.isinf(), 0, torch.maximum(lb - y, y - ub).clamp(min=0))
-
-
-def _rows(z: Tensor, G: Tensor) -> Tensor:
-    with full_precision(z):
-        return z @ G.mT if G.ndim == 2 else (z.unsqueeze(-2) @ G.mT).squeeze(-2)

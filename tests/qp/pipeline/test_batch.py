@@ -1,104 +1,78 @@
 from __future__ import annotations
 
-import copy
-from concurrent.futures import ThreadPoolExecutor
-
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
-from torch_qpmpc.qp.pipeline.batch import ContentMemo, FlatPrograms
+from tests.problems import CPU, known_qp, normal, programs_of
+from torch_qpmpc.qp.pipeline.arrays import Theta, to_tensor
+from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import EVENT_SHAPES
 
 
-def test_a_memo_finds_equal_tensors_and_nothing_else():
-    memo, made = ContentMemo(), []
-
-    def get(x, options=None):
-        return memo.get((x,), options, lambda own: made.append(own) or len(made))
-
-    x = normal(3)
-    assert [get(x), get(x.clone()), get(x + 1), get(x, "other"), get(x.float())] == [1, 1, 2, 3, 4]
-    x[0] += 1
-    assert [get(x), get(x[None])] == [5, 6]
-
-
-def test_a_memo_keeps_copies():
-    memo, x = ContentMemo(), normal(3)
-    kept = memo.get((x,), None, lambda own: own)
-    before = x.clone()
-    x += 1
-    assert_close(torch.from_numpy(kept), before)
-    assert memo.get((before,), None, lambda own: own) is kept
+def test_programs_of_any_batch_shapes_are_flattened_alike():
+    known = known_qp(0, batch=(3, 4), matrices=(3, 1))
+    programs, batch = Programs.of(*known.qp.tensors(), known.fixed, device=CPU)
+    assert batch == (3, 4)
+    assert len(programs) == 12
+    data = programs.theta
+    assert data.H.shape == (3, 12, 12)  # not repeated for the four that share it
+    assert programs.group.tolist() == [0] * 4 + [1] * 4 + [2] * 4
+    assert_close(data.C[programs.group[7]], known.qp.C[1, 0])
+    assert_close(data.q[7], known.qp.q[1, 3])
+    assert_close(data.c[7], known.qp.c[1, 3])
+    assert_close(programs.fixed[7], known.fixed[1, 3])
 
 
-def test_a_memo_forgets_the_oldest():
-    memo = ContentMemo()
-    keys = [normal(2, seed=i) for i in range(ContentMemo.SIZE + 1)]
-    for i, key in enumerate(keys):
-        memo.get((key,), None, lambda own, i=i: i)
-    assert len(memo.entries) == ContentMemo.SIZE
-    assert memo.get((keys[0],), None, lambda own: "made again") == "made again"
-    assert memo.get((keys[-1],), None, lambda own: "made again") == len(keys) - 1
-
-
-def test_a_theta_shared_by_the_batch_is_prepared_once():
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_asymmetric_hessian_counts_by_its_symmetric_part(dtype):
     known = known_qp(0)
-    fixed = normal(5, 2)
-    one, _ = FlatPrograms.of(*known.qp.tensors(), fixed)
-    two, _ = FlatPrograms.of(*known.qp.tensors(), fixed[:2])
-    assert one.known("x", lambda: 1) == two.known("x", lambda: 2) == 1
-    other, _ = FlatPrograms.of(*known_qp(1).qp.tensors(), fixed)
-    assert other.known("x", lambda: 3) == 3
+    H = (known.qp.H + normal(12, 12).triu(1)).to(dtype)
+    programs, _ = Programs.of(H, *known.qp.tensors()[1:], known.fixed)
+    assert_close(to_tensor(programs.theta.H[0]), (H.double() + H.double().mT) / 2)
 
 
-def test_programs_that_differ_in_vectors_share_nothing():
-    known = known_qp(0, batch=(4,))
-    one, two = programs_of(known), programs_of(known)
-    assert one.known("x", lambda: 1) == 1
-    assert two.known("x", lambda: 2) == 2
-    assert one.take(torch.tensor([0])).known("x", lambda: 3) == 3
+def test_bounds_that_cross_by_rounding_alone_are_equal():
+    known = known_qp(0, dtype=torch.float32)
+    lb = torch.full_like(known.qp.lb, 0.1)
+    ub = lb.clone()
+    ub[0], ub[1] = torch.nextafter(lb[0], torch.zeros(())), 0.09
+    H, q, c, C, b, G, _, _, w = known.qp.tensors()
+    theta = Programs.of(H, q, c, C, b, G, lb, ub, w, known.fixed)[0].theta
+    assert theta.lb[0, 0] == theta.ub[0, 0] == ub[0].double()
+    assert theta.lb[0, 1] > theta.ub[0, 1]
 
 
-def test_an_update_in_place_and_back_is_followed():
-    mpc, s = random_mpc(1), random_states(4)
-    before, C = mpc.value(s), mpc.C.detach().clone()
-    twin = copy.deepcopy(mpc)
-    with torch.no_grad():
-        mpc.C += 0.1 * normal(*C.shape)
-    assert (mpc.value(s) - before).abs().min() > 1e-6
-    assert_close(twin.value(s), before, rtol=0, atol=0)
-    mpc.C.data.copy_(C)  # unseen by version counters
-    assert_close(mpc.value(s), before, rtol=0, atol=0)
+@pytest.mark.parametrize("device", [None, CPU])
+@pytest.mark.parametrize("matrices", [(), (6,)])
+def test_taken_programs_have_their_own_matrices(matrices, device):
+    programs = programs_of(known_qp(0, batch=(6,), matrices=matrices), device)
+    index = np.array([4, 1])
+    part = programs.take(index)
+    assert len(part) == 2
+    assert len(part.theta.H) == min(len(programs.theta.H), 2)
+    for name, of in (("H", programs.group), ("q", np.arange(6)), ("c", np.arange(6))):
+        whole, own = getattr(programs.theta, name), getattr(part.theta, name)
+        own = own[part.group] if name == "H" else own
+        assert_close(to_tensor(own), to_tensor(whole[of][index]))
+    assert_close(to_tensor(part.fixed), to_tensor(programs.fixed[index]))
+    assert isinstance(part.fixed, type(programs.fixed))
 
 
-def test_threads_prepare_for_themselves():
+def test_taken_programs_of_one_theta_share_what_follows_from_it():
     known = known_qp(0)
-    here, _ = FlatPrograms.of(*known.qp.tensors(), known.fixed)
-    assert here.known("thread", lambda: "here") == "here"
-    with ThreadPoolExecutor(1) as pool:
-        there, _ = pool.submit(FlatPrograms.of, *known.qp.tensors(), known.fixed).result()
-    assert there.known("thread", lambda: "there") == "there"
-
-
-def test_diagonal_matrices_are_multiplied_as_such():
-    known = known_qp(0)
-    H = torch.diag(torch.arange(12.0).double())
-    programs, _ = FlatPrograms.of(H, *known.qp.tensors()[1:], known.fixed)
-    z, lam = normal(3, 12), normal(3, 13)
-    assert_close(programs.times_H(z), z @ H)
-    assert_close(programs.times_G(z), z @ known.qp.G.mT)
-    assert_close(programs.times_G(lam, transposed=True), lam @ known.qp.G)
+    programs, _ = Programs.of(*known.qp.tensors(), normal(5, 2))
+    assert programs.take(np.array([3, 0])).prepared is programs.prepared
 
 
 @pytest.mark.parametrize("matrices", [(), (4,)])
 @pytest.mark.parametrize("batch", [(), (4,)])
-def test_what_is_no_data_is_found_in_every_tensor(batch, matrices):
+def test_invalid_data_is_found_in_every_tensor(batch, matrices):
     known = known_qp(2, batch=batch, matrices=matrices)
     parts = dict(zip(EVENT_SHAPES, known.qp.tensors(), strict=True))
     fixed = known.fixed.expand(4, -1)
-    assert FlatPrograms.of(*parts.values(), fixed)[0].valid() is None
+    assert Programs.of(*parts.values(), fixed)[0].valid() is None
     spoilt = dict.fromkeys(("H", "q", "c", "C", "b", "G"), (torch.nan, torch.inf))
     spoilt |= {"lb": (torch.nan, torch.inf), "ub": (torch.nan, -torch.inf), "w": (torch.nan, -1.0)}
     for name, values in spoilt.items():
@@ -106,27 +80,34 @@ def test_what_is_no_data_is_found_in_every_tensor(batch, matrices):
             bad = parts[name].clone()
             of_one = bad[2] if bad.ndim > len(EVENT_SHAPES[name]) else bad
             of_one.view(-1)[-1] = value
-            valid = FlatPrograms.of(*(parts | {name: bad}).values(), fixed)[0].valid()
+            valid = Programs.of(*(parts | {name: bad}).values(), fixed)[0].valid()
             assert valid is not None
             alone = bad.ndim > len(EVENT_SHAPES[name])
-            assert valid.expand(4).tolist() == [alone, alone, False, alone], (name, value)
+            assert valid.tolist() == [alone, alone, False, alone], (name, value)
     bad = fixed.clone()
     bad[1, 0] = torch.nan
-    valid = FlatPrograms.of(*parts.values(), bad)[0].valid()
-    assert valid is not None
-    assert valid.tolist() == [True, False, True, True]
+    for device in (None, CPU):
+        valid = Programs.of(*parts.values(), bad, device=device)[0].valid()
+        assert valid is not None
+        assert valid.tolist() == [True, False, True, True]
 
 
 def test_a_diagonal_is_one_of_a_single_square_matrix():
     known = known_qp(0)
     H = torch.diag(torch.arange(12.0).double())
     theta = known.qp.tensors()[1:]
-    one, _ = FlatPrograms.of(H, *theta, known.fixed)
-    assert one.is_diagonal("H")
-    assert not one.is_diagonal("G")  # of 13 rows
-    assert one.diagonal("G") is None
-    assert_close(one.diagonal("H"), H.diagonal())
+    assert Programs.of(H, *theta, known.fixed)[0].prepared.diagonal == (
+        True,
+        False,
+    )  # G has 13 rows
     H[3, 5] = H[5, 3] = 1e-300
-    assert not FlatPrograms.of(H, *theta, known.fixed)[0].is_diagonal("H")
-    many, _ = FlatPrograms.of(torch.eye(12).double().expand(3, 12, 12), *theta, known.fixed)
-    assert not many.is_diagonal("H")
+    assert Programs.of(H, *theta, known.fixed)[0].prepared.diagonal == (False, False)
+    many = torch.eye(12).double().expand(3, 12, 12)
+    assert Programs.of(many, *theta, known.fixed)[0].prepared.diagonal == (False, False)
+
+
+def test_theta_in_float32_is_solved_in_float64():
+    known = known_qp(0, dtype=torch.float32)
+    theta = Programs.of(*known.qp.tensors(), known.fixed)[0].theta
+    assert {x.dtype for x in theta} == {np.dtype(np.float64)}
+    assert isinstance(theta, Theta)

@@ -13,7 +13,7 @@ from tests.campaign.families import FAMILIES, Draw
 from tests.campaign.tally import alone
 from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, programs_of, random_mpc
 from torch_qpmpc import QPMPC, QuadraticProgram, SolverError, Status, solve_qp
-from torch_qpmpc.qp.pipeline.batch import FlatPrograms
+from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 
 pytestmark = pytest.mark.filterwarnings("ignore:Clarabel.rs terminated with status")
@@ -121,10 +121,10 @@ def test_fixed_entries_that_break_an_equality_are_infeasible():
         assert solution.status == status
 
 
-def programs(qp: QuadraticProgram, fixed: Tensor | None = None) -> FlatPrograms:
+def programs(qp: QuadraticProgram, fixed: Tensor | None = None) -> Programs:
     """QPs as the chain has them; by default with nothing fixed."""
     fixed = torch.zeros(0).double() if fixed is None else fixed
-    return FlatPrograms.of(*qp.tensors(), fixed)[0]
+    return Programs.of(*qp.tensors(), fixed)[0]
 
 
 def doubles(entries) -> Tensor:
@@ -135,7 +135,7 @@ def doubles(entries) -> Tensor:
 @pytest.mark.parametrize("weight", [1e-2, 5.0, 1e4])
 def test_solvable_programs_are_neither_infeasible_nor_unbounded(rank, weight):
     options = {"rank": rank, "weight": weight, "soft": SOFT_ROWS, "hard": HARD_ROWS}
-    status = diagnose(programs_of(known_qp(1, batch=(4,), **options)))
+    status = diagnose(programs_of(known_qp(1, batch=(4,), **options), None))
     assert (status == Status.NOT_CONVERGED).all()
 
 

@@ -4,43 +4,43 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from torch import Tensor
 from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp
 from torch_qpmpc import QPMPC, QPSolution, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.qp.pipeline import solve as chain
-from torch_qpmpc.qp.pipeline.batch import SoftQPs
+from torch_qpmpc.qp.pipeline.batch import Programs, SoftQPs
 from torch_qpmpc.qp.program import UNKNOWN
-from torch_qpmpc.qp.solvers import BACKENDS, Answer, Backend, daqp
+from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, daqp
 
 BATCH = 6
 
 
-def doctored(change: Callable[[Answer], Answer]) -> Backend:
+def doctored(change: Callable[[BackendSolution], BackendSolution]) -> Backend:
     """A backend that solves, and then changes its answer."""
 
-    def solve(qps: SoftQPs) -> Answer:
+    def solve(qps: SoftQPs) -> BackendSolution:
         return change(daqp.solve(qps))
 
     return solve
 
 
 LIES = {
-    "zeros": lambda answer: replace(answer, v=0 * answer.v, lam=0 * answer.lam),
-    "NaN": lambda answer: replace(answer, v=torch.nan * answer.v),
-    "v off": lambda answer: replace(answer, v=answer.v + 1.0),
-    "lam off": lambda answer: replace(answer, lam=answer.lam + 1.0),
-    "lam's sign": lambda answer: replace(answer, lam=-answer.lam),
-    "one's answer for all": lambda answer: replace(answer, v=answer.v[:1] + 0 * answer.v),
+    "zeros": lambda answer: answer._replace(v=0 * answer.v, lam=0 * answer.lam),
+    "NaN": lambda answer: answer._replace(v=np.nan * answer.v),
+    "v off": lambda answer: answer._replace(v=answer.v + 1.0),
+    "lam off": lambda answer: answer._replace(lam=answer.lam + 1.0),
+    "lam's sign": lambda answer: answer._replace(lam=-answer.lam),
+    "one's answer for all": lambda answer: answer._replace(v=answer.v[:1] + 0 * answer.v),
 }
 
 INACCURACIES = {
-    "v off": lambda answer: replace(answer, v=answer.v + 1e-4),
-    "lam off": lambda answer: replace(answer, lam=answer.lam + 1e-4),
+    "v off": lambda answer: answer._replace(v=answer.v + 1e-4),
+    "lam off": lambda answer: answer._replace(lam=answer.lam + 1e-4),
 }
 
 
@@ -56,7 +56,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many QPs the backend "recorder", which is DAQP, is asked for at a time."""
     counts = []
 
-    def recording(qps: SoftQPs) -> Answer:
+    def recording(qps: SoftQPs) -> BackendSolution:
         counts.append(len(qps.g))
         return daqp.solve(qps)
 
@@ -99,10 +99,10 @@ def test_inaccurate_answers_are_sharpened(monkeypatch, name):
 
 
 def test_only_what_is_rejected_is_solved_again(monkeypatch, asked):
-    wrong = torch.tensor([False, True, False, False, True, True])
+    wrong = np.array([False, True, False, False, True, True])
 
-    def lie(answer: Answer) -> Answer:
-        return replace(answer, v=answer.v + wrong[:, None])
+    def lie(answer: BackendSolution) -> BackendSolution:
+        return answer._replace(v=answer.v + wrong[:, None])
 
     monkeypatch.setitem(BACKENDS, "torch", BACKENDS["recorder"])
     monkeypatch.setitem(BACKENDS, "liar", doctored(lie))
@@ -115,10 +115,10 @@ def test_only_what_is_rejected_is_solved_again(monkeypatch, asked):
 
 
 def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, asked):
-    def misled(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
-        return LIES["v off"](daqp.solve(qps)), torch.ones(len(active), dtype=torch.bool)
+    def misled(p: Programs, qps: SoftQPs, active: np.ndarray) -> tuple:
+        return LIES["v off"](daqp.solve(qps)), np.ones(len(active), dtype=np.bool_)
 
-    monkeypatch.setattr(chain, "recall", misled)
+    monkeypatch.setattr(chain, "try_active_sets", misled)
     known = known_qp(2, batch=(BATCH,))
     active = solve(known, solver="daqp").active
     with SolveLog() as log:
@@ -137,12 +137,12 @@ def test_a_known_active_set_spares_the_backend(asked):
 
 
 def test_what_recall_does_not_finish_is_for_the_backend(monkeypatch, asked):
-    def half(qps: SoftQPs, active: Tensor) -> tuple[Answer, Tensor]:
-        finished = torch.arange(len(active)) % 2 == 0
+    def half(p: Programs, qps: SoftQPs, active: np.ndarray) -> tuple:
+        finished = np.arange(len(active)) % 2 == 0
         answer = daqp.solve(qps)
-        return replace(answer, v=answer.v.where(finished[:, None], torch.nan)), finished
+        return answer._replace(v=np.where(finished[:, None], answer.v, np.nan)), finished
 
-    monkeypatch.setattr(chain, "recall", half)
+    monkeypatch.setattr(chain, "try_active_sets", half)
     known = known_qp(3, batch=(BATCH,))
     active = solve(known, solver="daqp").active
     with SolveLog() as log:
@@ -154,7 +154,7 @@ def test_what_recall_does_not_finish_is_for_the_backend(monkeypatch, asked):
 def test_a_solver_is_not_asked_twice_for_what_it_got_wrong(monkeypatch):
     asked = []
 
-    def liar(qps: SoftQPs) -> Answer:
+    def liar(qps: SoftQPs) -> BackendSolution:
         asked.append(len(qps.g))
         return LIES["v off"](daqp.solve(qps))
 
@@ -303,7 +303,7 @@ def test_the_log_counts_its_own_thread_only():
 def test_rows_without_a_bound_or_a_free_variable_are_left_out(monkeypatch):
     shapes = []
 
-    def recording(qps: SoftQPs) -> Answer:
+    def recording(qps: SoftQPs) -> BackendSolution:
         shapes.append(qps.l.shape)
         return daqp.solve(qps)
 
@@ -345,9 +345,9 @@ def test_a_bound_on_one_side_is_a_bound(side, w):
 
 
 def test_invalid_elements_reach_no_backend(monkeypatch):
-    seen: list[Tensor] = []
+    seen: list[np.ndarray] = []
 
-    def recording(qps: SoftQPs) -> Answer:
+    def recording(qps: SoftQPs) -> BackendSolution:
         seen.append(qps.g)
         return daqp.solve(qps)
 
@@ -356,12 +356,12 @@ def test_invalid_elements_reach_no_backend(monkeypatch):
     solution = solve(known, solver="recorder", on_failure="mask")
     assert len(seen) == 1
     assert seen[0].shape[0] == BATCH - 1
-    assert seen[0].isfinite().all()
+    assert np.isfinite(seen[0]).all()
     assert solution.status.tolist() == [0, 0, Status.INVALID_DATA, 0, 0, 0]
 
 
 def test_a_batch_of_invalid_elements_reaches_no_backend(monkeypatch):
-    def refuse(qps: SoftQPs) -> Answer:
+    def refuse(qps: SoftQPs) -> BackendSolution:
         raise AssertionError("asked to solve nothing")
 
     for name in list(BACKENDS):

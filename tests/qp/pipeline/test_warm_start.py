@@ -5,26 +5,32 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import known_qp, normal, random_mpc, random_states, reduced_of, soft_qps
+from tests.problems import known_qp, normal, programs_of, random_mpc, random_states, soft_qps
 from torch_qpmpc import SolveLog, solve_qp
-from torch_qpmpc.qp.pipeline.warm_start import recall
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.warm_start import try_active_sets
 from torch_qpmpc.qp.program import UNKNOWN
+from torch_qpmpc.qp.solvers import BackendSolution
 
 BATCH = 6
 
 
 def true_set(seed: int, matrices: tuple[int, ...] = ()):
-    """Condensed QPs, the exact answer, and its active set."""
+    """QPs in tensors, their exact solution when condensed, and its active set."""
     known = known_qp(seed, batch=(BATCH,), matrices=matrices)
     solution = solve_qp(known.qp, known.fixed, solver="torch")
-    return *soft_qps(known), solution.active[:, reduced_of(known).rows]
+    return programs_of(known), soft_qps(known)[1], solution.active
+
+
+def tried(p: Programs, active: Tensor) -> tuple[BackendSolution, Tensor]:
+    return try_active_sets(p, p.reduced_qps(), active)
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])
 @pytest.mark.parametrize("seed", range(3))
 def test_the_right_active_set_is_exact_at_once(seed, matrices):
-    qps, exact, active = true_set(seed, matrices)
-    answer, finished = recall(qps, active)
+    p, exact, active = true_set(seed, matrices)
+    answer, finished = tried(p, active)
     assert finished.all()
     assert_close(answer.v, exact.v, rtol=0, atol=1e-10)
     assert_close(answer.lam, exact.lam, rtol=0, atol=1e-10)
@@ -60,20 +66,20 @@ def test_a_row_in_a_wrong_state_is_corrected(change):
 
 
 def test_the_active_sets_given_are_not_changed():
-    qps, _, active = true_set(6)
+    p, _, active = true_set(6)
     wrong = -active
     before = wrong.clone()
-    recall(qps, wrong)
+    tried(p, wrong)
     assert torch.equal(wrong, before)
 
 
 def test_of_an_unknown_set_the_empty_one_is_tried():
-    qps, _, active = true_set(5)
+    p, _, active = true_set(5)
     empty = active.clone()
     empty[[1, 2, 4]] = 0
     active[1:3, 4] = UNKNOWN
     active[4, 0] = -128
-    (answer, finished), (of_empty, expected) = recall(qps, active), recall(qps, empty)
+    (answer, finished), (of_empty, expected) = tried(p, active), tried(p, empty)
     assert torch.equal(finished, expected)
     assert torch.equal(answer.iterations, of_empty.iterations)
     assert torch.equal(answer.v[finished], of_empty.v[finished])

@@ -206,7 +206,7 @@ def test_a_backend_answers_with_one_row_per_program(solver):
     assert found.v.shape == qps.g.shape
     assert found.lam.shape == qps.l.shape
     assert found.iterations.shape == (4,)
-    assert found.v.dtype == found.lam.dtype == torch.float64
+    assert torch.as_tensor(found.v).dtype == torch.as_tensor(found.lam).dtype == torch.float64
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,9 @@ from torch.testing import assert_close
 
 from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, soft_qps
 from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
-from torch_qpmpc.qp.pipeline.batch import SoftArrays, SoftQPs
-from torch_qpmpc.qp.program import row_states
-from torch_qpmpc.qp.solvers import Answer, active_set, batched, interior_point
+from torch_qpmpc.qp.pipeline.batch import SoftQPs
+from torch_qpmpc.qp.solution import row_states
+from torch_qpmpc.qp.solvers import BackendSolution, active_set, batched, interior_point
 from torch_qpmpc.qp.solvers.active_set import SETTLED, settle
 from torch_qpmpc.qp.solvers.batched import BatchedQPs
 
@@ -109,10 +109,10 @@ def test_multipliers_of_inactive_rows_are_zero():
 
 
 def moved(qps: SoftQPs, device: str) -> SoftQPs:
-    return SoftQPs(*(getattr(qps, name).to(device) for name in SoftArrays._fields))
+    return SoftQPs._make(x.to(device) for x in qps)
 
 
-def residual(qps: SoftQPs, answer: Answer) -> Tensor:
+def residual(qps: SoftQPs, answer: BackendSolution) -> Tensor:
     return BatchedQPs.of(qps).residual(answer.v, answer.lam)
 
 
@@ -203,8 +203,7 @@ def test_units_change_nothing():
     qps = random_qps(3)
     plain = interior_point.solve(qps)
     cost, length = 1e5, 1e-3
-    scaled = replace(
-        qps,
+    scaled = qps._replace(
         H=qps.H * cost / length**2,
         g=qps.g * cost / length,
         l=qps.l * length,
@@ -340,8 +339,7 @@ def test_hopeless_neighbours_do_no_harm():
     lower, upper, w = good.l.clone(), good.u.clone(), good.w.clone()
     w[:, [0, 6]] = torch.inf  # the same row twice, ..
     lower[:, 6], upper[:, 6] = upper[:, 0] + 1, upper[:, 0] + 2  # .. with bounds far apart
-    both = replace(
-        good,
+    both = good._replace(
         group=torch.zeros(32, dtype=torch.int64),
         **{
             name: torch.stack([getattr(good, name), bad], 1).reshape(32, -1)

@@ -1,87 +1,65 @@
-"""Certified solutions of a flat batch, and what stands for those that are missing."""
+"""Certified solutions of a batch of QPs, and what stands for those that have none."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from torch_qpmpc.qp.pipeline.batch import FlatPrograms
-from torch_qpmpc.qp.pipeline.certificate import TOLERANCE
-from torch_qpmpc.qp.program import Status
-from torch_qpmpc.qp.twofold import Twofold
+from torch_qpmpc.qp.pipeline.arrays import Array, to_numpy
+from torch_qpmpc.qp.program import UNKNOWN, Status
 
-
-class RawArrays(NamedTuple):
-    """`RawSolution` as NumPy arrays."""
-
-    value: np.ndarray
-    z: np.ndarray
-    sigma: np.ndarray
-    chi: np.ndarray
-    lam: np.ndarray
-    xi: np.ndarray
-    status: np.ndarray
-    residual: np.ndarray
-    iterations: np.ndarray
+#: A claimed solution with a larger relative residual is not a solution.
+TOLERANCE = 1e-6
 
 
-@dataclass
-class RawSolution(Twofold[RawArrays]):
-    """Certified primal-dual solutions of B QPs, float64; lam = eta - upsilon.
+class BatchSolution(NamedTuple):
+    """Primal-dual solutions of B QPs, see `torch_qpmpc.QPSolution`; lam = eta - upsilon."""
 
-    No residual is larger than ``worst``; up to the tolerance, that says that all are solved.
-    """
+    value: Array
+    z: Array
+    chi: Array
+    lam: Array
+    xi: Array
+    status: Array
+    residual: Array
+    iterations: Array
+    active: Array
 
-    Arrays = RawArrays
-
-    value: Tensor
-    z: Tensor
-    sigma: Tensor
-    chi: Tensor
-    lam: Tensor
-    xi: Tensor
-    status: Tensor
-    residual: Tensor
-    iterations: Tensor
-    worst: float = math.inf
-
-    def accepted(self) -> Tensor:
-        """Which of them the certificate accepts, ``(B,)``."""
+    def accepted(self) -> Array:
+        """Where the certificate accepts the solution, ``(B,)``."""
         return self.residual <= TOLERANCE
 
     @property
     def all_accepted(self) -> bool:
-        return self.worst <= TOLERANCE
+        return bool(self.accepted().all())
 
-    def at(self, index: Tensor) -> RawSolution:
-        """The solutions at ``index``."""
-        return RawSolution(*(x[index] for x in self.all_tensors()))  # pyright: ignore[reportArgumentType]
+    def at(self, index: np.ndarray) -> BatchSolution:
+        """Copies of the solutions at ``index``."""
+        return BatchSolution._make(x[index] for x in self)
 
-    def put(self, index: Tensor, other: RawSolution) -> None:
-        for own, others in zip(self.all_tensors(), other.all_tensors(), strict=True):
-            own[index] = others
-        self.worst = math.inf
-        self.forget_arrays()
+    def put(self, index: np.ndarray, others: BatchSolution) -> None:
+        """Replace the solutions at ``index``."""
+        for own, new in zip(self, others, strict=True):
+            own[index] = new
+
+    def on_cpu(self) -> BatchSolution:
+        return BatchSolution._make(map(to_numpy, self))
 
 
-def unsolved(p: FlatPrograms, status: Status = Status.INVALID_DATA) -> RawSolution:
-    """What an element carries that has no solution: an infinite cost, and zeros."""
-    n, zeros = len(p), p.q.new_zeros
-    z = zeros(n, p.q.shape[-1])
-    z[:, : p.fixed.shape[-1]] = p.fixed.nan_to_num(0, 0, 0)
-    return RawSolution(
-        value=p.q.new_full((n,), torch.inf),
+def unsolved(fixed: np.ndarray, n_z: int, n_c: int, n_g: int, status: Status) -> BatchSolution:
+    """What QPs without a solution carry: an infinite cost, the fixed entries, and zeros."""
+    n = len(fixed)
+    z = np.zeros((n, n_z))
+    z[:, : fixed.shape[1]] = np.nan_to_num(fixed, posinf=0.0, neginf=0.0)
+    return BatchSolution(
+        value=np.full(n, np.inf),
         z=z,
-        sigma=zeros(n, p.lb.shape[-1]),
-        chi=zeros(n, p.b.shape[-1]),
-        lam=zeros(n, p.lb.shape[-1]),
-        xi=torch.zeros_like(p.fixed),
-        status=p.group.new_full((n,), int(status)),
-        residual=p.q.new_full((n,), torch.inf),
-        iterations=p.group.new_zeros(n),
+        chi=np.zeros((n, n_c)),
+        lam=np.zeros((n, n_g)),
+        xi=np.zeros_like(fixed),
+        status=np.full(n, int(status)),
+        residual=np.full(n, np.inf),
+        iterations=np.zeros(n, np.int64),
+        active=np.full((n, n_g), UNKNOWN, np.int8),
     )

@@ -1,26 +1,21 @@
 """Condensing: eliminate C z = b once per theta, so that a sample only moves vectors.
 
-With y = (z[:keep], v), the kept leading entries and the independent ones among the rest, every
+With y = (z[:n_kept], v), the kept leading entries and the independent ones among the rest, every
 solution of C z = b is ``z = Y b + T y``. All samples of a batch, and V, Q and the policy, share T,
-Y, T'HT and GT; fixing the first n_f <= keep entries then only changes a linear term and offsets.
+Y, T'HT and GT; fixing the first n_f <= n_kept entries then only changes a linear term and offsets.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
-from scipy.linalg import get_lapack_funcs
-from torch import Tensor
 
-from torch_qpmpc.qp.kernels import per_sample, per_theta
-from torch_qpmpc.qp.pipeline.batch import ContentMemo, FlatPrograms, SoftArrays, SoftQPs
-from torch_qpmpc.qp.twofold import Twofold
+from torch_qpmpc.qp.kernels import theta as loops
+from torch_qpmpc.qp.pipeline.arrays import Array, Theta
 
 #: A pivot below this fraction of its row's norm means that the rows of C depend on each other.
 RANK_TOLERANCE = 1e-10
@@ -28,18 +23,25 @@ RANK_TOLERANCE = 1e-10
 THRESHOLD = 1e-2
 #: A coefficient below this fraction of its row's absolute sum is rounding.
 ENTERS = 1e-12
-#: A row that no free variable enters is violated from here on.
-VIOLATED = 1e-9
 #: H is indefinite if an eigenvalue is below minus this fraction of the largest.
 CONVEX = 1e-9
-#: Entries of a matrix up to which one kernel does it all; for larger ones BLAS would start threads.
-SMALL = 2**12
 
-_getrf, _getrs, _potrf = get_lapack_funcs(("getrf", "getrs", "potrf"), dtype=np.float64)
+
+class Elimination(NamedTuple):
+    """The solutions ``z = Y b + T y`` of C z = b.
+
+    T ``(M, n_z, n_y)`` and Y ``(M, n_z, n_c)``. ``padding`` ``(M, n_y)`` marks columns of T that
+    are zero, because C has a lower rank elsewhere in the batch; None if C has full row rank in the
+    columns after ``n_kept``.
+    """
+
+    T: np.ndarray
+    Y_neg: np.ndarray
+    padding: np.ndarray | None
 
 
 class CondensedArrays(NamedTuple):
-    """Those of `Condensed` for the kernels."""
+    """T, -Y, T'HT, GT, and what b adds to them: T'HY and GY. All have a leading M."""
 
     T: np.ndarray
     Y_neg: np.ndarray
@@ -50,220 +52,107 @@ class CondensedArrays(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Condensed(Twofold[CondensedArrays]):
-    """The part of condensing that depends on (H, C, G) alone.
+class Condensed:
+    """The QPs' matrices in y.
 
-    T ``(M, n_z, n_y)``, Y_neg = -Y ``(M, n_z, n_c)``, H = T'HT ``(M, n_y, n_y)``, G = GT
-    ``(M, n_g, n_y)``, and what b contributes: H_b = T'HY ``(M, n_y, n_c)``, G_b = GY
-    ``(M, n_g, n_c)``. ``surely_convex`` says that all of H is, so that no part of it need be looked
-    at. Where the columns after ``keep`` do not have full row rank, ``deficient`` says so: then it
-    is valid only for QPs that fix exactly ``keep`` entries.
+    ``surely_convex`` says that all of H is, so that no part of it need be checked. With
+    ``deficient``, the columns of C after ``n_kept`` do not have full row rank: the arrays are valid
+    only for QPs that fix exactly ``n_kept`` entries.
     """
 
-    Arrays = CondensedArrays
-
-    keep: int
+    arrays: CondensedArrays
+    n_kept: int
     deficient: bool
-    T: Tensor
-    Y_neg: Tensor
-    H: Tensor
-    G: Tensor
-    H_b: Tensor
-    G_b: Tensor
     surely_convex: bool
 
-    def reduced(self, programs: FlatPrograms) -> Reduced:
-        """The problem in what is free of ``programs``."""
-        n_f = programs.fixed.shape[-1]
-        return programs.known(("reduced", self.keep, n_f), lambda: Reduced.of(self, programs, n_f))
 
+class Reduced(NamedTuple):
+    """The QPs in v, the rest of y with the first n_f entries fixed.
 
-class ReducedArrays(NamedTuple):
-    """Those of `Reduced` for the kernels, in the order of `per_theta.reduce`."""
-
-    rows: np.ndarray
-    others: np.ndarray
-    H: np.ndarray
-    G: np.ndarray
-    matrix: np.ndarray
-    constant: np.ndarray
-    z_0: np.ndarray
-    w: np.ndarray
-    T: np.ndarray
-    Y_neg: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Reduced(Twofold[ReducedArrays]):
-    """The condensed problem with the first n_f entries fixed, in v, the rest of y.
-
-    Of the rows of G, ``rows`` are its own, and ``others`` those that no free variable enters or
-    that have no finite bound. A leading B is 1 where the batch shares it.
+    ``rows`` are those of G with a finite bound that a free variable enters, ``others`` the rest. A
+    leading B is 1 where the batch shares the vector.
 
     Attributes:
         H, G: ``(M, d, d)`` and ``(M, r, d)``.
-        matrix, constant: ``(M, n_f, d + 2 r)`` and ``(B, d + 2 r)``. What a sample's fixed entries
-            make of g, l and u is ``constant + matrix' fixed``.
+        matrix, constant: ``(M, n_f, d + 2 r)`` and ``(B, d + 2 r)``. The g, l and u of a sample are
+            ``constant + matrix' fixed``.
         z_0: ``(B, n_z)``, z where the fixed entries and v are zero.
         w: ``(B, r)``.
-        T, Y_neg, keep: those of `Condensed`.
-        convex: where H is positive semidefinite, ``(M,)``, or None if it is everywhere.
+        T, Y_neg: those of `Elimination`.
     """
 
-    Arrays = ReducedArrays
-
-    rows: Tensor
-    others: Tensor
-    H: Tensor
-    G: Tensor
-    matrix: Tensor
-    constant: Tensor
-    z_0: Tensor
-    w: Tensor
-    T: Tensor
-    Y_neg: Tensor
-    keep: int
-    convex: Tensor | None
-
-    @classmethod
-    def of(cls, condensed: Condensed, p: FlatPrograms, n_f: int) -> Reduced:
-        x, a = condensed.arrays, p.arrays
-        given = (*x, p.group_array, a.G, a.q, a.b, a.lb, a.ub, a.w, n_f, ENTERS)
-        arrays = ReducedArrays._make((*per_theta.reduce(*given), x.T, x.Y_neg))
-        convex = None
-        if not condensed.surely_convex:
-            convex = _convex(*per_sample.tensors([arrays.H], p.device))
-        return cls.of_arrays(arrays, p.device, keep=condensed.keep, convex=convex)
-
-    def at(self, programs: FlatPrograms) -> SoftQPs:
-        """What a backend solves, with the rows ``rows``."""
-        p, a = programs, self.arrays
-        d, r = a.H.shape[-1], len(a.rows)
-        if p.device.type != "cpu":
-            moved = p.multiply(self.matrix, p.fixed, transposed=True) + self.constant
-            g, lower, upper = moved.split_with_sizes((d, r, r), dim=-1)
-            w = self.w.expand(len(p), -1)
-            return SoftQPs(self.H, self.G, p.group, g, lower, upper, w)
-        moved, w = per_sample.affine(p.fixed_array, a.matrix, p.group_array, a.constant), a.w
-        if len(w) != len(p):  # for each QP the same row
-            w = np.ndarray((len(p), r), buffer=w, strides=(0, w.itemsize))
-        of_samples = (moved[:, :d], moved[:, d : d + r], moved[:, d + r :], w)
-        return SoftQPs.of_arrays(SoftArrays(a.H, a.G, p.group_array, *of_samples), p.device)
-
-    def expand(self, p: FlatPrograms, v: Tensor) -> Tensor:
-        """The full z ``(B, n_z)`` from the free variables v ``(B, d)``."""
-        return p.affine(self.T, torch.cat((p.fixed, v), dim=-1), self.z_0)
-
-    def all_rows(self, p: FlatPrograms, lam: Tensor, y: Tensor) -> Tensor:
-        """Multipliers ``(B, n_g)`` from those of ``rows``, ``(B, r)``, and y = G z ``(B, n_g)``.
-
-        A row that no free variable enters has w where it is violated.
-        """
-        beyond = F.hardshrink(y - y.clamp(p.lb, p.ub), VIOLATED)
-        # Violated, a hard row stays so.
-        full = beyond.sign() * p.w.masked_fill(p.w.isinf(), 0.0)
-        full[:, self.rows] = lam.clamp(-self.w, self.w)
-        return full
+    rows: Array
+    others: Array
+    H: Array
+    G: Array
+    matrix: Array
+    constant: Array
+    z_0: Array
+    w: Array
+    T: Array
+    Y_neg: Array
 
 
-def _convex(H: Tensor) -> Tensor:
-    """Where H is positive semidefinite but for rounding, ``(M,)``."""
-    eigenvalues = torch.linalg.eigvalsh(H) if H.shape[-1] else H.new_zeros(len(H), 1)
-    return eigenvalues[:, 0] >= -CONVEX * (1 + eigenvalues.abs().amax(-1))
+class Forces(NamedTuple):
+    """What g and multipliers do to (v, y = G v) of an unconstrained QP: ``-rise'g - push'lam``.
 
-
-def _surely_convex(H: Tensor) -> bool:
-    """Whether Cholesky factors prove it of all, in a fraction of the time."""
-    return not H.shape[-1] or all(map(_has_factor, H.cpu().numpy()))
-
-
-def _has_factor(H: np.ndarray) -> bool:
-    shifted = H.copy()
-    shifted.ravel()[:: len(H) + 1] += CONVEX * (1.0 + H.diagonal().max())
-    return _potrf(shifted)[1] == 0
-
-
-def condense(H: Tensor, C: Tensor, G: Tensor, keep: int) -> Condensed:
-    """Condense M matrix triples, keeping the first ``keep`` entries of z as they are.
-
-    The last few results are remembered by the content of the matrices.
+    ``rise`` ``(M, d, d + r)`` and ``push`` ``(M, r, d + r)``.
     """
-    return _memo.get((H, C, G), keep, lambda *own: _condense(own, C.device, keep))
+
+    rise: Array
+    push: Array
 
 
-_memo = ContentMemo()
+def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) -> Condensed:
+    """Condense M matrix triples, with the first ``n_kept`` entries of z kept as they are."""
+    T, Y_neg, padding = elimination or eliminate(theta.C, n_kept)
+    H, G, H_b, G_b, convex = loops.condense(theta.H, theta.G, T, Y_neg, CONVEX)
+    if padding is not None:  # a unit curvature pins the variables of zero columns
+        H = H + padding[:, :, None] * np.eye(H.shape[1])
+        convex = False
+    arrays = CondensedArrays(T, Y_neg, H, G, H_b, G_b)
+    return Condensed(arrays, n_kept, padding is not None, convex)
 
 
-def _condense(matrices: Sequence[np.ndarray], device: torch.device, keep: int) -> Condensed:
-    if max(math.prod(x.shape[1:]) for x in matrices) <= SMALL:
-        *found, regular, convex = per_theta.condense(*matrices, keep, RANK_TOLERANCE, CONVEX)
-        if regular:
-            found = CondensedArrays(*found)
-            return Condensed.of_arrays(
-                found, device, keep=keep, deficient=False, surely_convex=convex
-            )
-    H, C, G = per_sample.tensors(matrices, device)
-    eliminated = _eliminate(C, keep)
-    if eliminated is not None:
-        return _products(H, G, *eliminated, keep)
-    T, Y, padding = null_space(C, keep)
-    return _products(H, G, T, Y, keep, padding)
+def reduce(condensed: Condensed, theta: Theta, group: np.ndarray, n_f: int) -> Reduced:
+    """Fix the first n_f entries."""
+    x = condensed.arrays
+    return Reduced(*loops.reduce(x, theta, group, n_f, ENTERS), x.T, x.Y_neg)
 
 
-def _products(
-    H: Tensor, G: Tensor, T: Tensor, Y: Tensor, keep: int, padding: Tensor | None = None
-) -> Condensed:
-    """The condensed problem of T and Y; ``padding`` is that of `null_space`."""
-    H_T = H.bmm(T)
-    H_y = T.mT.bmm(H_T)
-    H_y = (H_y + H_y.mT) / 2.0
-    if padding is not None:
-        H_y = H_y + torch.diag_embed(padding)
-    deficient, convex = padding is not None, _surely_convex(H_y)
-    return Condensed(keep, deficient, T, -Y, H_y, G.bmm(T), H_T.mT.bmm(Y), G.bmm(Y), convex)
+def convex(H: np.ndarray) -> np.ndarray:
+    """Where H ``(M, d, d)`` is positive semidefinite but for rounding."""
+    eigenvalues = np.linalg.eigvalsh(H) if H.shape[-1] else np.zeros((len(H), 1))
+    return eigenvalues[:, 0] >= -CONVEX * (1 + np.abs(eigenvalues).max(-1))
 
 
-def condensed_for(programs: FlatPrograms, keep: int) -> Condensed:
-    """Condensed with ``keep`` entries kept, or just the fixed ones where C does not allow more."""
-    p, n_f = programs, programs.fixed.shape[-1]
-
-    def make() -> Condensed:
-        if p.share_theta:  # found again by all of theta, with what is known of it
-            return _condense(p.arrays[:3], p.device, keep)
-        return condense(p.H, p.C, p.G, keep)
-
-    condensed = p.known(("condensed", keep), make)
-    return condensed_for(p, n_f) if condensed.deficient and keep > n_f else condensed
+def eliminate(C: np.ndarray, n_kept: int) -> Elimination:
+    """Eliminate C z = b by LU, or where rows of C ``(M, n_c, n_z)`` are dependent, by the SVD."""
+    T, Y_neg, regular = loops.eliminate(C, n_kept, RANK_TOLERANCE)
+    return Elimination(T, Y_neg, None) if regular else null_space(C, n_kept)
 
 
-def other_eliminations(programs: FlatPrograms) -> Iterator[Condensed]:
-    """Condense in two other ways, for what no solver makes accurate after `condensed_for`.
+def in_order(C: np.ndarray, n_kept: int) -> Elimination | None:
+    """Eliminate C z = b in the order of the equations; None if rows of C are dependent.
 
-    In an orthonormal basis, for an unstable model that the actions stabilise: the best conditioned
-    way, though not the sparsest. And in the order of the equations, each solved for variables that
-    no earlier one contains, x_1..x_N of a linear MPC scheme: where actions are at their bounds and
-    the states grow, only this recursion is accurate in every entry.
+    Each is solved for a variable that no earlier one contains, x_1..x_N of a linear MPC scheme.
+    Where an unstable model's actions are at their bounds and its states grow, only this recursion
+    is accurate in every entry.
     """
-    p, keep = programs, programs.fixed.shape[-1]
-    if not p.C.shape[1]:
-        return
-    T, Y, padding = null_space(p.C, keep)
-    yield _products(p.H, p.G, T, Y, keep, padding)
-    own = [_eliminate_in_order(C, keep) for C in p.arrays.C]
-    if all(own):
-        T, Y = (p.H.new_tensor(np.stack(part)) for part in zip(*own, strict=True))
-        condensed = _products(p.H, p.G, T, Y, keep)
-        if condensed.H.isfinite().all():
-            yield condensed
+    own = [_in_order(one, n_kept) for one in C]
+    if not C.shape[1] or not all(own):
+        return None
+    T, Y = (np.stack(part) for part in zip(*own, strict=True))
+    return Elimination(T, -Y, None) if np.isfinite(T).all() and np.isfinite(Y).all() else None
 
 
-def _eliminate_in_order(C: np.ndarray, keep: int) -> tuple[np.ndarray, np.ndarray] | None:
+def _in_order(C: np.ndarray, n_kept: int) -> tuple[np.ndarray, np.ndarray] | None:
     n_c, n_z = C.shape
     # Rows are C z - b = 0, with the unit for b; the columns of z that may be solved for come last.
     W = np.concatenate((C, -np.eye(n_c)), axis=1)
     nonzero = C != 0
     first = np.where(nonzero.any(0), nonzero.argmax(0), -1)
-    first[:keep] = -1
+    first[:n_kept] = -1
     pivots = []
     for k in range(n_c):
         entries = np.where(first >= 0, np.abs(W[k, :n_z]), 0.0)
@@ -288,69 +177,38 @@ def _eliminate_in_order(C: np.ndarray, keep: int) -> tuple[np.ndarray, np.ndarra
     return T, Y
 
 
-def _eliminate(C: Tensor, keep: int) -> tuple[Tensor, Tensor] | None:
-    """T and Y with the dependent columns chosen by LU pivoting; None if rows of C depend."""
-    eliminated = [_eliminate_one(one, keep) for one in C.cpu().numpy()]
-    if not all(eliminated):
-        return None
-    M, n_c, n_z = C.shape
-    if not M:
-        return C.new_zeros(M, n_z, n_z - n_c), C.new_zeros(M, n_z, n_c)
-    T, Y = (np.stack(part) for part in zip(*eliminated, strict=True))
-    return torch.from_numpy(T).to(C), torch.from_numpy(Y).to(C)
+def null_space(C: np.ndarray, n_kept: int) -> Elimination:
+    """Eliminate C z = b in an orthonormal basis, from the SVD, for a C of any rank.
 
-
-def _eliminate_one(C: np.ndarray, keep: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Row pivoting on the transpose of C picks columns of C that are safe to solve for.
-
-    For a linear MPC scheme they are x_1..x_N, and then T is its prediction form.
-    """
-    n_c, n_z = C.shape
-    rest = C[:, keep:]
-    if n_c > rest.shape[1]:
-        return None
-    order = list(range(keep, n_z))
-    if n_c:
-        factors, pivots, _ = _getrf(rest.T)
-        norms = np.sqrt((rest * rest).sum(axis=1))
-        if (np.abs(factors.diagonal()) <= RANK_TOLERANCE * norms).any():
-            return None
-        for i, pivot in enumerate(pivots.tolist()):
-            order[i], order[pivot] = order[pivot], order[i]
-    dependent, columns = order[:n_c], [*range(keep), *sorted(order[n_c:])]
-    Y, T = np.zeros((n_z, n_c)), np.zeros((n_z, n_z - n_c))
-    if n_c:
-        right = np.concatenate((np.eye(n_c), -C[:, columns]), axis=1)
-        # The dependent columns are the transpose of the first n_c rows of L times U.
-        solved, _ = _getrs(factors[:n_c], np.arange(n_c), right, trans=1)
-        Y[dependent], T[dependent] = solved[:, :n_c], solved[:, n_c:]
-    T[columns, np.arange(n_z - n_c)] = 1
-    return T, Y
-
-
-def null_space(C: Tensor, keep: int) -> tuple[Tensor, Tensor, Tensor]:
-    """T and Y from the SVD, for a C of any rank, and the padding of T.
-
-    Where ranks differ within the batch, the T of a higher rank gets zero columns; ``padding``
-    ``(M, n_y)`` marks them, so that a unit curvature can pin their variables at zero. Y is then the
-    pseudo-inverse: an inconsistent C z = b shows in the certificate.
+    The best conditioned way, though not the sparsest. Y is the pseudo-inverse: an inconsistent
+    C z = b shows in the certificate.
     """
     M, n_c, n_z = C.shape
-    n_rest = n_z - keep
-    left, singular, right = torch.linalg.svd(C[:, :, keep:], full_matrices=True)
-    scale = singular.amax(-1, keepdim=True) if singular.shape[-1] else singular.new_zeros(M, 1)
+    n_rest = n_z - n_kept
+    # By torch, which has the caller's number of threads.
+    parts = torch.linalg.svd(torch.from_numpy(C[:, :, n_kept:].copy()), full_matrices=True)
+    left, singular, right = (x.numpy() for x in parts)
+    scale = singular.max(-1, keepdims=True, initial=0.0)
     significant = singular > RANK_TOLERANCE * scale
     rank = significant.sum(-1)
-    lowest = int(rank.min()) if M else 0
-    k = singular.shape[-1]
-    inverse = torch.where(significant, 1 / singular, 0.0)
-    pseudo_inverse = (right[:, :k].mT * inverse.unsqueeze(-2)) @ left[:, :, :k].mT
-    padded = torch.arange(lowest, n_rest, device=C.device) < rank.unsqueeze(-1)
-    basis = right[:, lowest:].mT * ~padded.unsqueeze(-2)
-    identity = torch.eye(keep).to(C).expand(M, -1, -1)
-    top = torch.cat((identity, C.new_zeros(M, keep, n_rest - lowest)), dim=-1)
-    bottom = torch.cat((-pseudo_inverse @ C[:, :, :keep], basis), dim=-1)
-    T = torch.cat((top, bottom), dim=-2)
-    Y = torch.cat((C.new_zeros(M, keep, n_c), pseudo_inverse), dim=-2)
-    padding = torch.cat((C.new_zeros(M, keep), padded.to(C)), dim=-1)
-    return T, Y, padding
+    lowest, k = int(rank.min(initial=n_rest)) if M else 0, singular.shape[-1]
+    inverse = np.zeros_like(singular)
+    inverse[significant] = 1 / singular[significant]
+    basis = right.swapaxes(1, 2)
+    pseudo_inverse = (basis[:, :, :k] * inverse[:, None]) @ left[:, :, :k].swapaxes(1, 2)
+    padded = np.arange(lowest, n_rest) < rank[:, None]
+    T = np.zeros((M, n_z, n_kept + n_rest - lowest))
+    T[:, :n_kept, :n_kept] = np.eye(n_kept)
+    T[:, n_kept:, :n_kept] = -pseudo_inverse @ C[:, :, :n_kept]
+    T[:, n_kept:, n_kept:] = basis[:, :, lowest:] * ~padded[:, None]
+    Y_neg = np.zeros((M, n_z, n_c))
+    Y_neg[:, n_kept:] = -pseudo_inverse
+    padding = np.concatenate((np.zeros((M, n_kept)), padded), axis=1)
+    return Elimination(T, Y_neg, padding)
+
+
+#: Ways to eliminate C z = b for QPs that no solver makes accurate after `eliminate`.
+OTHER_ELIMINATIONS: tuple[Callable[[np.ndarray, int], Elimination | None], ...] = (
+    null_space,
+    in_order,
+)

@@ -19,12 +19,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.optimize import lsq_linear, nnls
-from torch import Tensor
 
-from torch_qpmpc.qp.pipeline.batch import FlatPrograms, SoftQPs
-from torch_qpmpc.qp.pipeline.certificate import TOLERANCE
+from torch_qpmpc.qp.pipeline.batch import Programs, SoftQPs
+from torch_qpmpc.qp.pipeline.batch_solution import TOLERANCE
 from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solvers import daqp
@@ -33,17 +31,17 @@ from torch_qpmpc.qp.solvers import daqp
 ROUNDING, SIGNIFICANT = 1e-12, 1e-7
 
 
-def diagnose(programs: FlatPrograms) -> Tensor:
+def diagnose(p: Programs) -> np.ndarray:
     """`Status` of each QP, ``(B,)``, one of INFEASIBLE, UNBOUNDED and NOT_CONVERGED."""
-    p = programs
-    a, group, n_f = p.arrays, p.group_array, p.fixed.shape[-1]
-    ranges = {m: _Range.of(a.C[m][:, n_f:]) for m in set(group.tolist())}
+    H, C, G, q, _, b, lb, ub, w = p.theta
+    ranges = {m: _Range.of(C[m][:, p.n_f :]) for m in set(p.group.tolist())}
     found = []
-    for i, m in enumerate(group.tolist()):
-        q, b, lb, ub, w = (x[i % len(x)] for x in (a.q, a.b, a.lb, a.ub, a.w))
-        qp = _FreeQP.of(a.H[m], q, a.C[m], b, a.G[m], lb, ub, w, p.fixed_array[i])
+    for i, m in enumerate(p.group.tolist()):
+        vectors = (x[i % len(x)] for x in (b, lb, ub, w))
+        of_b, of_lb, of_ub, of_w = vectors
+        qp = _FreeQP.of(H[m], q[i % len(q)], C[m], of_b, G[m], of_lb, of_ub, of_w, p.fixed[i])
         found.append(int(_status(qp, ranges[m])))
-    return torch.tensor(found, dtype=torch.int64, device=p.device)
+    return np.array(found, np.int64)
 
 
 @dataclass(frozen=True)
@@ -55,8 +53,8 @@ class _Range:
 
     @classmethod
     def of(cls, C: np.ndarray) -> _Range:
-        null, inverse, _ = null_space(torch.from_numpy(C).unsqueeze(0), 0)
-        return cls(inverse[0].numpy(), null[0].numpy())
+        T, Y_neg, _ = null_space(C[None], 0)
+        return cls(-Y_neg[0], T[0])
 
 
 @dataclass(frozen=True)
@@ -159,7 +157,7 @@ def _least_distance(A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.n
     unit, zero = np.eye(A.shape[1]), np.zeros((1, A.shape[1]))
     w = np.full((1, len(A)), np.inf)
     rows = (A[None], np.zeros(1, np.int64), zero, lower[None], upper[None], w)
-    return daqp.solve(SoftQPs(*map(torch.from_numpy, (unit[None], *rows)))).arrays.v[0]
+    return daqp.solve(SoftQPs(unit[None], *rows)).v[0]
 
 
 def _contradict(qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, of_C: _Range) -> bool:

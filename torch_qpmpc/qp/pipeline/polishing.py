@@ -1,4 +1,4 @@
-"""Active-set crossover: from nearly right to right, for answers that the certificate rejected.
+"""Active-set crossover: from nearly right to right, for solutions that the certificate rejected.
 
 The rows' state is read off ``y + lam`` (the argument of the proximal map of w dist(y, [l, u])):
 inactive, active at a bound, or saturated at |lam| = w. With the states held, the KKT conditions are
@@ -10,34 +10,30 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torch_qpmpc.qp.pipeline.batch import SoftQPs
-from torch_qpmpc.qp.program import row_states
-from torch_qpmpc.qp.solvers.base import Answer
+from torch_qpmpc.qp.solution import row_states
+from torch_qpmpc.qp.solvers.base import BackendSolution
 
 MAX_STEPS = 10
 
 
-def refine(qps: SoftQPs, start: Answer, which: Tensor) -> Answer:
-    """Sharpen the answers at the indices ``which``; where steps do not settle, the last stays."""
-    arrays = qps.arrays
-    v, lam, iterations = (
-        tensor.cpu().numpy().copy() for tensor in (start.v, start.lam, start.iterations)
-    )
-    for i in which.tolist():
-        H, G = arrays.H[arrays.group[i]], arrays.G[arrays.group[i]]
+def refine(qps: SoftQPs, start: BackendSolution, which: np.ndarray) -> BackendSolution:
+    """Sharpen the solutions at the indices ``which``; where steps do not settle, the last stays."""
+    v, lam, iterations = (x.copy() for x in start)
+    for i in which:
+        H, G = qps.H[qps.group[i]], qps.G[qps.group[i]]
         previous = None
         for _ in range(MAX_STEPS):
             p = G @ v[i] + lam[i]
-            bound, active, held = row_states(p, arrays.l[i], arrays.u[i], arrays.w[i])
+            bound, active, held = row_states(p, qps.l[i], qps.u[i], qps.w[i])
             states = np.where(active, bound, np.inf), np.where(active, 0, held)
             if previous is not None and np.array_equal(states, previous):
                 break
             previous = states
-            v[i], lam[i] = _solve_kkt(H, G, arrays.g[i], bound, active, states[1])
+            v[i], lam[i] = _solve_kkt(H, G, qps.g[i], bound, active, states[1])
             iterations[i] += 1
-    return Answer.on(qps.device, v, lam, iterations)
+    return BackendSolution(v, lam, iterations)
 
 
 def _solve_kkt(H, G, g, bound, active, held) -> tuple[np.ndarray, np.ndarray]:

@@ -3,35 +3,27 @@
 from __future__ import annotations
 
 import contextvars
-import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from torch_qpmpc.qp.kernels import per_sample
-from torch_qpmpc.qp.pipeline.batch import FlatPrograms, SoftQPs
-from torch_qpmpc.qp.pipeline.batch_solution import RawArrays, RawSolution, unsolved
-from torch_qpmpc.qp.pipeline.certificate import TOLERANCE, Products, certify
-from torch_qpmpc.qp.pipeline.condensing import VIOLATED, Reduced, condensed_for, other_eliminations
+from torch_qpmpc.qp.pipeline.arrays import Array, of_group, on_device, to_numpy
+from torch_qpmpc.qp.pipeline.batch import Programs, SoftQPs
+from torch_qpmpc.qp.pipeline.batch_solution import TOLERANCE, BatchSolution, unsolved
+from torch_qpmpc.qp.pipeline.certificate import certify, recover
+from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.polishing import refine
-from torch_qpmpc.qp.pipeline.scaling import Units, units_of
-from torch_qpmpc.qp.pipeline.warm_start import recall
+from torch_qpmpc.qp.pipeline.warm_start import try_active_sets
 from torch_qpmpc.qp.program import Status
-from torch_qpmpc.qp.solvers import BACKENDS, Answer, Backend, backend, fallbacks
+from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
 
-#: A rejected claim with a relative residual up to this is worth sharpening.
+#: A rejected solution with a relative residual up to this is worth refining.
 NEARLY = 1e-2
-#: How often what an ill-conditioned elimination left over is solved for again.
+#: Steps of iterative refinement after an ill-conditioned elimination.
 PASSES = 2
-#: Entries of a C that fits into a core's cache, with what else a QP has: larger ones are for BLAS.
-CACHED = 2**15
 
 
 @dataclass
@@ -71,261 +63,189 @@ class SolveLog:
             "time/qp": self.seconds,
         }
 
+    def add(self, solution: BatchSolution, seconds: float) -> None:
+        """Count a batch."""
+        accepted = solution.residual[solution.accepted()]
+        self.solves += len(solution.residual)
+        self.unsolved += len(solution.residual) - len(accepted)
+        self.iterations += int(solution.iterations.sum())
+        self.residual = max(self.residual, float(accepted.max()) if len(accepted) else 0.0)
+        self.seconds += seconds
 
-_active_log: contextvars.ContextVar[SolveLog | None] = contextvars.ContextVar("log", default=None)
+
+_active_log: contextvars.ContextVar[SolveLog] = contextvars.ContextVar("log")
 
 
-def solve_programs(
-    programs: FlatPrograms, keep: int, solver: str, start: Tensor | None = None
-) -> RawSolution:
+def solve_programs(p: Programs, solver: str, start: Array | None = None) -> BatchSolution:
     """Solve and certify B QPs; what cannot be certified has a status that says why.
 
     Args:
-        programs: the QPs.
-        keep: leading entries of z that the elimination of C z = b leaves alone, at least n_f.
+        p: the QPs.
         solver: a backend's name, see `torch_qpmpc.qp.solvers`.
         start: active sets ``(B, n_g)`` of nearly these QPs, see `warm_start`.
     """
     began = time.perf_counter()
-    units = units_of(programs)
-    chain = _Chain(programs if units is None else units.scaled(programs), keep)
-    raw = chain.run(solver, start)
-    if units is not None:
-        raw = _settled(programs, units, keep, solver, units.restored(programs, raw))
-    if (log := _active_log.get()) is not None:
-        residual, worst = raw.residual, raw.worst
-        if not raw.all_accepted:
-            residual = residual[raw.accepted()]
-            worst = float(residual.max()) if len(residual) else 0.0
-        log.solves += len(programs)
-        log.unsolved += len(programs) - len(residual)
-        log.fallback += chain.rejected
-        log.recalled += chain.recalled
-        log.iterations += int(raw.iterations.sum())
-        log.residual = max(log.residual, worst)
-        log.seconds += time.perf_counter() - began
-    return raw
+    log = _active_log.get(unread := SolveLog())
+    units = p.prepared.units
+    if units is None:
+        solution = _solve(p, solver, start, log)
+    else:
+        scaled = _scaled(p)
+        solution = units.restored(_solve(scaled, solver, start, log), scaled.group)
+        solution = _settled(p.on_cpu(), solver, solution.on_cpu())
+    if log is not unread:
+        log.add(solution, time.perf_counter() - began)
+    return solution
 
 
-def _settled(
-    programs: FlatPrograms, units: Units, keep: int, solver: str, raw: RawSolution
-) -> RawSolution:
-    """Certify what was solved in ``units`` in the QPs' own numbers, too; solve again what fails.
+def _scaled(p: Programs) -> Programs:
+    """The QPs in their own units."""
+    prepared = p.prepared.scaled
+    assert p.prepared.units is not None
+    return Programs(prepared, p.group, p.fixed / of_group(p.prepared.units.length, p.group))
+
+
+def _settled(p: Programs, solver: str, solution: BatchSolution) -> BatchSolution:
+    """Certify solutions found in units in the QPs' own numbers, too; solve again what fails.
 
     Units follow from bounds, among others. Where a bound is far from every solution, as a large
     number in the place of none is, they are large, and a certificate in them misses errors.
     """
-    accepted = raw.accepted().nonzero().squeeze(-1)
-    failed = accepted[_certify_at(programs, raw, accepted)]
+    units = p.prepared.units
+    assert units is not None
+    accepted = np.flatnonzero(solution.accepted())
+    failed = accepted[_certify_at(p, solution, accepted)]
     if len(failed):
-        # Matrices of QPs that are left out may be invalid.
-        again = _Chain(programs.take(failed).compacted(), keep).run(solver, None)
-        raw.put(failed, again)
-        scaled, again = units.scaled(programs), units.inverse.restored(programs, raw)
-        failed = failed[raw.accepted()[failed]]
-        failed = failed[_certify_at(scaled, again, failed)]
-        raw.put(failed, unsolved(programs.take(failed), Status.NOT_CONVERGED))
-    raw.worst = float(raw.residual.max()) if len(raw.residual) else 0.0
-    return raw
+        part = p.take(failed)
+        again = _solve(part, solver, None, SolveLog())
+        solution.put(failed, again)
+        in_units = units.inverse().restored(solution, p.group)
+        failed = failed[solution.accepted()[failed]]
+        failed = failed[_certify_at(_scaled(p), in_units, failed)]
+        solution.put(failed, _unsolved(p.take(failed), Status.NOT_CONVERGED))
+    return solution
 
 
-def _certify_at(programs: FlatPrograms, raw: RawSolution, at: Tensor) -> Tensor:
-    """Raise the residuals at the indices ``at`` to what they are here; where that is too much."""
-    found = raw.at(at)
-    judged = certify(programs.take(at), found.z, found.lam, found.chi, found.xi)
-    raw.residual[at] = found.residual.maximum(judged.residual)
-    return judged.residual > TOLERANCE
+def _certify_at(p: Programs, solution: BatchSolution, at: np.ndarray) -> np.ndarray:
+    """Raise the residuals at the indices ``at`` to what they are here; True where too much."""
+    found = solution.at(at)
+    _, residual = certify(p.take(at), found.z, found.lam, found.chi, found.xi)
+    solution.residual[at] = np.maximum(found.residual, residual)
+    return residual > TOLERANCE
 
 
-class _Chain:
-    """One batch on its way from attempt to attempt: what one leaves, the next one gets.
-
-    ``todo`` are the indices of the QPs that are still to be solved, or None for the whole batch.
-    ``recalled`` counts what the active sets of ``start`` solved, ``rejected`` the claims of the
-    chosen solver that the certificate rejected.
-    """
-
-    def __init__(self, programs: FlatPrograms, keep: int) -> None:
-        valid = programs.valid()
-        if valid is not None:
-            programs = programs.without_nan()
-        self.programs, self.keep = programs, keep
-        self.recalled = self.rejected = 0
-        # First-order conditions certify an optimum only where the QP is convex.
-        self.reduced = self.reduced_for(programs)
-        convex = self.reduced.convex
-        if convex is not None:
-            of_qps = convex[programs.group]
-            valid = of_qps if valid is None else valid & of_qps
-        self.raw: RawSolution | None = None
-        self.todo: Tensor | None = None
-        if valid is not None and not valid.all():
-            self.raw = unsolved(programs)
-            self.todo = valid.nonzero().squeeze(-1)
-            self.raw.status[self.todo] = Status.NOT_CONVERGED
-
-    def run(self, solver: str, start: Tensor | None) -> RawSolution:
-        raw, todo = self.attempt(backend(solver), start)
-        self.rejected = 0 if todo is None else len(todo)
-        if todo is not None and self.rejected:
-            raw.status[todo] = diagnose(self.part())
-            # What is proved to have no solution need not be tried by every other solver.
-            self.todo = todo[raw.status[todo] == Status.NOT_CONVERGED]
-            self.attempt_otherwise()
-            for other in fallbacks(solver):
-                self.attempt(other)
-        return raw
-
-    def part(self) -> FlatPrograms:
-        """The programs that are still to be solved."""
-        return self.programs if self.todo is None else self.programs.take(self.todo)
-
-    def reduced_for(self, part: FlatPrograms) -> Reduced:
-        return condensed_for(part, self.keep).reduced(part)
-
-    def attempt(
-        self, solve: Backend, start: Tensor | None = None
-    ) -> tuple[RawSolution, Tensor | None]:
-        """Ask for what is still to be solved, and keep what the certificate accepts.
-
-        With active sets ``start``, ``solve`` is only asked for what `recall` makes nothing of.
-        Returns the solutions so far, and ``todo``: None if all were accepted at once.
-        """
-        if self.raw is not None and self.todo is not None and not len(self.todo):
-            return self.raw, self.todo
-        part = self.part()
-        reduced = self.reduced if self.todo is None else self.reduced_for(part)
-        return self._attempt(part, reduced, solve, start)
-
-    def attempt_otherwise(self) -> None:
-        """Attempt what is left with C z = b eliminated in other ways, for ill-conditioned ones."""
-        if self.todo is None or not len(self.todo):
-            return
-        first, part = self.todo, self.part().compacted()
-        for condensed in other_eliminations(part):
-            left = part.take(torch.isin(first, self.todo).nonzero().squeeze(-1))
-            # What is known of theta belongs to another elimination.
-            left = replace(left, _known={})
-            self._attempt(left, condensed.reduced(left), BACKENDS["torch"], passes=PASSES)
-            if not len(self.todo):
-                return
-
-    def _attempt(
-        self,
-        part: FlatPrograms,
-        reduced: Reduced,
-        solve: Backend,
-        start: Tensor | None = None,
-        passes: int = 0,
-    ) -> tuple[RawSolution, Tensor | None]:
-        qps, recover = reduced.at(part), partial(_recover, part, reduced, passes=passes)
-        recalled = None
-        if not len(reduced.arrays.rows):
-            answer = _unconstrained(qps)
-        elif start is None:
-            answer = solve(qps)
-        else:
-            start = start if self.todo is None else start[self.todo]
-            # A part of a batch may have fewer rows with a bound than the whole.
-            answer, recalled = recall(qps, start[:, reduced.rows])
-            _replace(answer, ~recalled, qps, solve)
-        claim = recover(answer)
-        all_accepted = claim.all_accepted
-        if recalled is not None:
-            kept = recalled if all_accepted else recalled & claim.accepted()
-            self.recalled = int(kept.sum())
-            if not all_accepted and _replace(answer, recalled & ~kept, qps, solve):
-                claim = recover(answer)
-                all_accepted = claim.all_accepted
-        if all_accepted and self.todo is None:
-            self.raw = claim
-            return self.raw, None
-        if not all_accepted:
-            _sharpen(claim, qps, answer, recover)
-        if self.raw is None or self.todo is None:
-            self.raw = unsolved(self.programs, Status.NOT_CONVERGED)
-            self.todo = torch.arange(len(part), device=part.q.device)
-        accepted = claim.accepted()
-        self.raw.put(self.todo[accepted], claim.at(accepted))
-        self.todo = self.todo[~accepted]
-        self.raw.residual[self.todo] = claim.residual[~accepted]
-        return self.raw, self.todo
-
-
-def _replace(answer: Answer, where: Tensor, qps: SoftQPs, solve: Backend) -> bool:
-    """Put the answers of ``solve`` where ``where`` ``(B,)`` says so; whether that is anywhere."""
-    index = where.nonzero().squeeze(-1)
+def _solve(p: Programs, solver: str, start: Array | None, log: SolveLog) -> BatchSolution:
+    """Solve with the chosen solver, and in other ways what its certificate rejects."""
+    index = _solvable(p)
+    if index is None:
+        solution = _attempt(p, backend(solver), start, log)
+        if not solution.all_accepted:
+            solution = _solved_otherwise(p.on_cpu(), solution.on_cpu(), solver, log)
+        return solution
+    solution = _unsolved(p.on_cpu(), Status.INVALID_DATA)
     if len(index):
-        answer.put(index, solve(qps.take(index)))
-    return len(index) > 0
+        start = None if start is None else start[on_device(index, p.prepared.device)]
+        solution.put(index, _solve(p.take(index), solver, start, log).on_cpu())
+    return solution
 
 
-def _sharpen(
-    claim: RawSolution, qps: SoftQPs, answer: Answer, recover: Callable[[Answer], RawSolution]
-) -> None:
-    """Improve in place, where that is likely, what the certificate rejects by little."""
-    nearly = ~claim.accepted() & (claim.residual <= NEARLY)
-    if not nearly.any():
-        return
-    second = recover(refine(qps, answer, nearly.nonzero().squeeze(-1)))
-    improved = (second.residual < claim.residual).nonzero().squeeze(-1)
-    claim.put(improved, second.at(improved))
+def _solvable(p: Programs) -> np.ndarray | None:
+    """The indices of QPs with valid data and a convex cost; None for all.
 
-
-def _unconstrained(qps: SoftQPs) -> Answer:
-    """Without rows there is a closed form; where it is unbounded, the certificate sees that."""
-    inverse = torch.linalg.pinv(qps.H, hermitian=True)
-    v = torch.einsum("bij,bj->bi", inverse[qps.group], -qps.g)
-    return Answer(v, qps.l, torch.zeros_like(qps.group))
-
-
-def _recover(p: FlatPrograms, reduced: Reduced, answer: Answer, passes: int = 0) -> RawSolution:
-    """The full primal-dual solution from a backend's answer, certified.
-
-    The multipliers that condensing eliminated come from the stationarity of the Lagrangian: chi by
-    the transpose of the same elimination, xi from what is left in the fixed entries. Each of
-    ``passes`` solves C z = b and for chi again, against the errors that the elimination made.
+    First-order conditions certify an optimum only where the QP is convex.
     """
-    small = math.prod(p.arrays.C.shape[1:]) <= CACHED
-    if p.device.type == "cpu" and small and not passes:
-        return _recover_compiled(p, reduced, answer)
-    z = reduced.expand(p, answer.v)
-    for _ in range(passes):
-        z = z + p.multiply(reduced.Y_neg, p.multiply(p.C, z) - p.b)
-    Hz, y = p.times_H(z), p.times_G(z)
-    lam = reduced.all_rows(p, answer.lam, y)
-    G_lam = p.times_G(lam, transposed=True)
-    slope = Hz + p.q + G_lam
-    chi = p.multiply(reduced.Y_neg, slope, transposed=True)
-    C_chi = p.multiply(p.C, chi, transposed=True)
-    for _ in range(passes):
-        chi = chi + p.multiply(reduced.Y_neg, slope + C_chi, transposed=True)
-        C_chi = p.multiply(p.C, chi, transposed=True)
-    slope += C_chi
-    of_fixed = slope[:, : p.fixed.shape[-1]]
-    xi = -of_fixed
-    of_fixed += xi
-    certificate = certify(p, z, lam, chi, xi, Products(Hz, G_lam, C_chi, slope, y))
-    value, sigma, residual = certificate.value, certificate.sigma, certificate.residual
-    worst = float(residual.max()) if len(residual) else 0.0
-    status = torch.zeros_like(p.group)
-    return RawSolution(value, z, sigma, chi, lam, xi, status, residual, answer.iterations, worst)
+    valid = p.valid()
+    if valid is None:
+        convex = p.prepared.convex(p.n_f)
+        return None if convex is None else np.flatnonzero(convex[to_numpy(p.group)])
+    index = np.flatnonzero(valid)
+    rest = _solvable(p.take(index)) if len(index) else None
+    return index if rest is None else index[rest]
 
 
-def _recover_compiled(p: FlatPrograms, reduced: Reduced, answer: Answer) -> RawSolution:
-    """`_recover` in one kernel."""
+def _attempt(
+    p: Programs, solve: Backend, start: Array | None, log: SolveLog, passes: int = 0
+) -> BatchSolution:
+    """Solve once, from the active sets ``start`` if there are any, and certify the result."""
+    qps = p.reduced_qps()
+    settled = None
+    if not qps.l.shape[-1]:
+        found = _unconstrained(qps).like(p.fixed)
+    elif start is None:
+        found = solve(qps).like(p.fixed)
+    else:
+        found, settled = try_active_sets(p, qps, start)
+        _replace(found, ~settled, qps, solve)
+    solution = recover(p, found, passes)
+    if settled is not None:
+        kept = settled & solution.accepted()
+        log.recalled += int(kept.sum())
+        if _replace(found, settled & ~kept, qps, solve):
+            solution = recover(p, found, passes)
+    if not solution.all_accepted:
+        solution = _refined(p.on_cpu(), qps.in_numpy(), found, solution.on_cpu(), passes)
+    return solution
 
-    def of_theta() -> list[Any]:
-        a, diagonal = p.arrays, (p.is_diagonal("H"), p.is_diagonal("G"))
-        T_T, C_T = (np.ascontiguousarray(M.swapaxes(1, 2)) for M in (x.T, a.C))
-        G_T = a.G if diagonal[1] else np.ascontiguousarray(a.G.swapaxes(1, 2))
-        matrices = [T_T, x.Y_neg, a.C, C_T, a.H, a.G, G_T, diagonal]
-        return [*matrices, x.z_0, a.q, a.c, a.b, a.lb, a.ub, a.w]
 
-    claim, x = answer.arrays, reduced.arrays
-    # V and Q of a theta share its T, unless C has dependent rows.
-    theta = p.known(("kernel", reduced.keep), of_theta)
-    given = (claim.v, claim.lam, p.group_array, p.fixed_array, x.rows, x.others, *theta, VIOLATED)
-    *found, worst = per_sample.recover(*given)
-    arrays = RawArrays._make((*found, claim.iterations))
-    return RawSolution.of_arrays(arrays, p.device, worst=worst)
+def _replace(found: BackendSolution, where: Array, qps: SoftQPs, solve: Backend) -> bool:
+    """Solve the QPs ``where`` ``(B,)`` anew, in place; False if there are none."""
+    if not where.any():
+        return False
+    found.put(where, solve(qps.take(where)).like(where))
+    return True
+
+
+def _refined(
+    p: Programs, qps: SoftQPs, found: BackendSolution, solution: BatchSolution, passes: int
+) -> BatchSolution:
+    """Refine what the certificate rejects by little."""
+    nearly = ~solution.accepted() & (solution.residual <= NEARLY)
+    if nearly.any():
+        second = recover(p, refine(qps, found.like(p.fixed), np.flatnonzero(nearly)), passes)
+        better = np.flatnonzero(second.residual < solution.residual)
+        solution.put(better, second.at(better))
+    return solution
+
+
+def _unconstrained(qps: SoftQPs) -> BackendSolution:
+    """Solve QPs without rows in closed form; the certificate rejects what is unbounded."""
+    H, _, group, g, lam, _, _ = qps.in_torch()
+    v = torch.einsum("bij,bj->bi", torch.linalg.pinv(H, hermitian=True)[group], -g)
+    return BackendSolution(v, lam, torch.zeros_like(group))
+
+
+def _solved_otherwise(
+    p: Programs, solution: BatchSolution, solver: str, log: SolveLog
+) -> BatchSolution:
+    """Diagnose what is not accepted, and solve it in other ways unless it has no solution.
+
+    Other eliminations of C z = b come first, for ill-conditioned ones, then the other solvers.
+    """
+    todo = np.flatnonzero(~solution.accepted())
+    log.fallback += len(todo)
+    part = p.take(todo)
+    failed = _unsolved(part, Status.NOT_CONVERGED)._replace(residual=solution.residual[todo])
+    solution.put(todo, failed._replace(status=diagnose(part)))
+    todo = todo[solution.status[todo] == Status.NOT_CONVERGED]
+    ways = [(eliminate, BACKENDS["torch"], PASSES) for eliminate in OTHER_ELIMINATIONS]
+    for eliminate, solve, passes in (*ways, *((None, other, 0) for other in fallbacks(solver))):
+        if not len(todo):
+            break
+        part = p.take(todo)
+        if eliminate is not None:
+            elimination = eliminate(part.theta.C, part.n_f) if part.theta.C.size else None
+            if elimination is None:
+                continue
+            prepared = part.prepared.eliminated(elimination, part.n_f)
+            part = Programs(prepared, part.group, part.fixed)
+        found = _attempt(part, solve, None, log, passes)
+        accepted = found.accepted()
+        solution.put(todo[accepted], found.at(accepted))
+        todo = todo[~accepted]
+        solution.residual[todo] = found.residual[~accepted]
+    return solution
+
+
+def _unsolved(p: Programs, status: Status) -> BatchSolution:
+    _, C, G, q, *_ = p.theta
+    return unsolved(p.fixed, q.shape[-1], C.shape[1], G.shape[1], status)

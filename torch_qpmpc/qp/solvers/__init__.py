@@ -1,7 +1,7 @@
-"""Backends, one a file, and the chain that makes certified solutions (eq:qp2, eq:qp3) of claims.
+"""Backends, one a file: what solves a condensed QP (eq:qp2, eq:qp3).
 
-A backend is a function ``solve(qps: SoftQPs) -> Answer``. To add one, write its file and name it in
-`BACKENDS`.
+A backend is a function ``solve(qps: SoftQPs) -> BackendSolution``. To add one, write its file and
+name it in `BACKENDS`.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from functools import partial
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.pipeline.batch import SoftQPs
 from torch_qpmpc.qp.solvers import daqp, interior_point, proxqp, qpsolvers
-from torch_qpmpc.qp.solvers.base import Answer
+from torch_qpmpc.qp.solvers.base import BackendSolution
 
-Backend = Callable[[SoftQPs], Answer]
+Backend = Callable[[SoftQPs], BackendSolution]
 
 BACKENDS: dict[str, Backend] = {
     "proxqp": proxqp.solve,
@@ -50,4 +50,4 @@ def fallbacks(name: str) -> list[Backend]:
     return [BACKENDS[other] for other in FALLBACKS if other != name]
 
 
-__all__ = ["BACKENDS", "Answer", "Backend", "backend", "fallbacks"]
+__all__ = ["BACKENDS", "Backend", "BackendSolution", "backend", "fallbacks"]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.program import row_states
+from torch_qpmpc.qp.solution import row_states
 from torch_qpmpc.qp.solvers.batched import BatchedQPs
 
 #: Relative residual of an answer that needs no further step.

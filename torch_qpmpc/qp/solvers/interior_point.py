@@ -15,14 +15,14 @@ a penalty and a multiplier of its own. At the end the active set is read off and
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
 from torch_qpmpc.qp.pipeline.batch import SoftQPs
 from torch_qpmpc.qp.solvers.active_set import SETTLED, Found, settle
-from torch_qpmpc.qp.solvers.base import Answer
+from torch_qpmpc.qp.solvers.base import BackendSolution
 from torch_qpmpc.qp.solvers.batched import HUGE, BatchedQPs
 
 #: Gaps, relative to a typical cost, at which the active set is tried; and iterations up to there.
@@ -41,16 +41,16 @@ SHRINK = 0.75
 
 
 @torch.no_grad()
-def solve(qps: SoftQPs) -> Answer:
+def solve(qps: SoftQPs) -> BackendSolution:
     """Solve a batch on its own device.
 
-    The answers are finite, but those of infeasible and unbounded QPs are not solutions: that is for
-    the certificate to say.
+    The result is finite for infeasible and unbounded QPs, too, which the certificate rejects.
     """
+    qps = qps.in_torch()
     if not qps.w.shape[-1]:  # a row without weight, since reductions over no rows have no value
         none, row = qps.g.new_zeros(len(qps.g), 1), torch.zeros_like(qps.H[:, :1])
-        answer = solve(replace(qps, G=row, l=none, u=none, w=none))
-        return replace(answer, lam=answer.lam[:, 1:])
+        found = solve(qps._replace(G=row, l=none, u=none, w=none))
+        return found._replace(lam=found.lam[:, 1:])
     form = BatchedQPs.of(qps)
     found, todo = Found.nothing(form), torch.arange(len(form), device=qps.g.device)
     point = _begin(form)
@@ -64,7 +64,7 @@ def solve(qps: SoftQPs) -> Answer:
         found.steps[todo] += last.steps + point.steps - before
         going = ~(last.residual <= SETTLED)
         form, point, todo = form.take(going), point.take(going), todo[going]
-    return Answer(found.v, found.lam, found.steps)
+    return BackendSolution(found.v, found.lam, found.steps)
 
 
 @dataclass

@@ -14,7 +14,7 @@ import torch
 from proxsuite import proxqp
 
 from torch_qpmpc.qp.pipeline.batch import SoftQPs
-from torch_qpmpc.qp.solvers.base import Answer
+from torch_qpmpc.qp.solvers.base import BackendSolution
 from torch_qpmpc.qp.solvers.split_slack import SplitSlack
 
 EPS_ABS = 1e-9
@@ -38,17 +38,15 @@ def _mark_forked() -> None:
 os.register_at_fork(after_in_child=_mark_forked)
 
 
-def solve(qps: SoftQPs) -> Answer:
+def solve(qps: SoftQPs) -> BackendSolution:
     """Solve a batch, by as many threads as torch may use."""
-    arrays = qps.arrays
-    form = SplitSlack.of(arrays)
+    qps = qps.in_numpy()
+    form = SplitSlack.of(qps)
     n_x, n_in = form.n_x, form.n_in
-    n_qps = len(arrays.group)
+    n_qps = len(qps.group)
     batch = proxqp.sparse.BatchQP(n_qps)
     handles = []
-    for m, g, lower, upper, w in zip(
-        arrays.group, arrays.g, arrays.l, arrays.u, arrays.w, strict=True
-    ):
+    for m, g, lower, upper, w in zip(*qps[2:], strict=True):
         qp = batch.init_qp_in_place(n_x, 0, n_in)
         _configure(qp.settings)
         bounds = form.bounds(lower, upper, w)
@@ -63,11 +61,10 @@ def solve(qps: SoftQPs) -> Answer:
         # ProxSuite sets the thread count of the OpenMP runtime that torch uses too: keep torch's.
         proxqp.sparse.solve_in_parallel(batch, threads)
     found = [qp.results for qp in handles]
-    return Answer.on(
-        qps.device,
-        np.array([result.x[: form.n_v] for result in found]).reshape(arrays.g.shape),
-        np.array([result.z[: form.n_rows] for result in found]).reshape(arrays.l.shape),
-        [result.info.iter for result in found],
+    return BackendSolution(
+        np.array([result.x[: form.n_v] for result in found]).reshape(qps.g.shape),
+        np.array([result.z[: form.n_rows] for result in found]).reshape(qps.l.shape),
+        np.array([result.info.iter for result in found], np.int64),
     )
 
 

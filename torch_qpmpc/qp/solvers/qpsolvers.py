@@ -8,7 +8,7 @@ import scipy.sparse as sp
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.pipeline.batch import SoftQPs
-from torch_qpmpc.qp.solvers.base import Answer
+from torch_qpmpc.qp.solvers.base import BackendSolution
 from torch_qpmpc.qp.solvers.split_slack import SplitSlack
 
 
@@ -23,14 +23,14 @@ def check_available(name: str) -> None:
         )
 
 
-def solve(qps: SoftQPs, *, name: str) -> Answer:
+def solve(qps: SoftQPs, *, name: str) -> BackendSolution:
     """Solve a batch one by one."""
-    arrays = qps.arrays
-    form = SplitSlack.of(arrays)
-    v, lam = np.zeros_like(arrays.g), np.zeros_like(arrays.l)
+    qps = qps.in_numpy()
+    form = SplitSlack.of(qps)
+    v, lam = np.zeros_like(qps.g), np.zeros_like(qps.l)
     sparse = name in qpsolvers.sparse_solvers
-    for i, m in enumerate(arrays.group):
-        lower, upper = form.bounds(arrays.l[i], arrays.u[i], arrays.w[i])
+    for i, m in enumerate(qps.group):
+        lower, upper = form.bounds(qps.l[i], qps.u[i], qps.w[i])
         rows = form.rows[m][: form.n_rows]
         has_upper = np.flatnonzero(np.isfinite(upper[: form.n_rows]))
         has_lower = np.flatnonzero(np.isfinite(lower[: form.n_rows]))
@@ -38,7 +38,7 @@ def solve(qps: SoftQPs, *, name: str) -> Answer:
         box = np.full(form.n_v, np.inf)
         problem = qpsolvers.Problem(
             form.H[m] if sparse else form.H[m].toarray(),
-            form.gradient(arrays.g[i], arrays.w[i]),
+            form.gradient(qps.g[i], qps.w[i]),
             one_sided if sparse else one_sided.toarray(),
             np.concatenate([upper[has_upper], -lower[has_lower]]),
             lb=np.concatenate([-box, lower[form.n_rows :]]),
@@ -53,4 +53,4 @@ def solve(qps: SoftQPs, *, name: str) -> Answer:
         v[i] = solution.x[: form.n_v]
         lam[i, has_upper] += solution.z[: len(has_upper)]
         lam[i, has_lower] -= solution.z[len(has_upper) :]
-    return Answer.on(qps.device, v, lam, np.zeros(len(v), dtype=np.int64))
+    return BackendSolution(v, lam, np.zeros(len(v), dtype=np.int64))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from torch_qpmpc.qp.pipeline.batch import SoftArrays
+from torch_qpmpc.qp.pipeline.batch import SoftQPs
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class SplitSlack:
     rows: list[sp.csc_matrix]
 
     @classmethod
-    def of(cls, qps: SoftArrays) -> SplitSlack:
+    def of(cls, qps: SoftQPs) -> SplitSlack:
         n_rows, n_v = qps.G.shape[1:]
         soft = np.isfinite(qps.w).any(axis=0)
         over = np.flatnonzero(soft & np.isfinite(qps.u).any(axis=0))

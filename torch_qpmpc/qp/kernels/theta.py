@@ -1,8 +1,8 @@
-"""Loops of what is worked out once for a theta, compiled by Numba as those of `kernels` are.
+"""What follows from theta alone, in loops that Numba compiles for the CPU.
 
-What theta is inspected for, its units, and the problem (eq:qp2, eq:qp3) that is left without
-C z = b (eq:qp2c1) and the fixed entries; torch takes a hundred small operations for it. Arrays, and
-vectors that all QPs share, are as in `kernels`.
+The checks of theta, its units, and the QPs (eq:qp2, eq:qp3) without C z = b (eq:qp2c1) and without
+their fixed entries: dozens of operations on small arrays, each of which takes NumPy or torch some
+microseconds. Arrays are float64 and contiguous; a vector that the whole batch shares has one row.
 """
 
 from __future__ import annotations
@@ -11,60 +11,24 @@ import math
 
 import numpy as np
 
-from torch_qpmpc.qp.kernels.per_sample import add_product, compiled, products, summing
+from torch_qpmpc.qp.kernels.linalg import (
+    add_product,
+    compiled,
+    factorise,
+    summing,
+    transposed_products,
+)
 
 
 @compiled
-def diagonal_cost(H, H_f, w, q, of_z, of_rows, hardness, stages, H_squared, H_f_squared, w_squared):
-    """H, q and w of `cost.diagonal_cost`."""
-    n_z, n = len(of_z), len(H)
-    _check_range(stages, n + len(H_f))
-    found, q_found, w_found = np.zeros((n_z, n_z)), np.empty(n_z), np.empty(len(w))
-    for i in range(n_z):
-        k = stages[i]
-        weight, is_squared = (H[k], H_squared) if k < n else (H_f[k - n], H_f_squared)
-        found[i, i] = of_z[i] * (weight * weight if is_squared else weight)
-        q_found[i] = of_z[i] * q[i]
-    for i in range(len(w)):
-        w_found[i] = hardness[i] + of_rows[i] * (w[i] * w[i] if w_squared else w[i])
-    return found, q_found, w_found
+def inspect(theta, group):
+    """Find the QPs with finite data, lb <= ub and w >= 0, and shared diagonal matrices.
 
-
-@compiled
-def diagonal_cost_gradient(
-    of_H, of_q, of_w,
-    H, H_f, w, q, of_z, of_rows, hardness, stages, H_squared, H_f_squared, w_squared,
-):  # fmt: skip
-    """In H, H_f, w and q, or what they are the squares of, from that in what it makes of them."""
-    n = len(H)
-    _check_range(stages, n + len(H_f))
-    to_H, to_H_f, to_w, to_q = np.zeros(n), np.zeros(len(H_f)), np.empty(len(w)), np.empty(len(q))
-    for i in range(len(of_z)):
-        k, pull = stages[i], of_z[i] * of_H[i, i]
-        if k < n:
-            to_H[k] += pull * (2 * H[k] if H_squared else 1.0)
-        else:
-            to_H_f[k - n] += pull * (2 * H_f[k - n] if H_f_squared else 1.0)
-        to_q[i] = of_z[i] * of_q[i]
-    for i in range(len(w)):
-        to_w[i] = of_rows[i] * of_w[i] * (2 * w[i] if w_squared else 1.0)
-    return to_H, to_H_f, to_w, to_q
-
-
-@compiled
-def _check_range(indices, n):
-    """Compiled loops do not look: a module that was on "meta" may not have its buffers yet."""
-    for i in indices:
-        if not 0 <= i < n:
-            raise IndexError("index out of range: load a state_dict, or call reset_parameters")
-
-
-@compiled
-def inspect(H, C, G, group, q, c, b, lb, ub, w):
-    """Which QPs have finite data and lb <= ub, ``(B or 1,)``, or None if all have.
-
-    And of one H and G that all share, whether they are diagonal, and H symmetric.
+    Returns:
+        Where the data is valid, ``(B or 1,)``, or None if it is everywhere; and for H and for G,
+        True if all QPs share one that is diagonal.
     """
+    H, C, G, q, c, b, lb, ub, w = theta
     M = len(H)
     finite = np.empty(M, np.bool_)
     for m in range(M):
@@ -72,6 +36,7 @@ def inspect(H, C, G, group, q, c, b, lb, ub, w):
     shared = max(max(len(q), len(c), len(b)), max(len(lb), len(ub), len(w)))
     valid = np.empty(shared if M == 1 else len(group), np.bool_)
     for i in range(len(valid)):
+        # A sum is finite if its terms are (but for overflow, which no solver survives either).
         vectors = q[i % len(q)].sum() + b[i % len(b)].sum() + c[i % len(c)]
         good = np.isfinite(vectors) and finite[0 if M == 1 else group[i]]
         of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
@@ -80,17 +45,7 @@ def inspect(H, C, G, group, q, c, b, lb, ub, w):
             good = good and ub[of_ub, j] - lb[of_lb, j] >= 0 and w[of_w, j] >= 0
         valid[i] = good
     some = None if valid.all() else valid
-    of_H, of_G = M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
-    return some, of_H, of_G, of_H or (M == 1 and _is_symmetric(H[0]))
-
-
-@compiled
-def _is_symmetric(matrix):
-    for i in range(matrix.shape[0]):
-        for j in range(i):
-            if matrix[i, j] != matrix[j, i]:
-                return False
-    return True
+    return some, M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
 
 
 @summing
@@ -112,8 +67,9 @@ def _is_diagonal(matrix):
 
 
 @compiled
-def units(H, C, G, group, q, b, lb, ub, w, small, large):
-    """cost, length, rows and equalities of `solvers.units.Units`, or None if all are one."""
+def units(theta, group, small, large):
+    """Return the fields of `torch_qpmpc.qp.pipeline.scaling.Units`, or None if all are one."""
+    H, C, G, q, _, b, lb, ub, w = theta
     M, n_g, n_c = len(H), G.shape[1], C.shape[1]
     of_G, of_C = _sums(G), _sums(C)
     of_q, of_b = _sizes(q, group, M), _sizes(b, group, M)
@@ -148,7 +104,7 @@ def units(H, C, G, group, q, b, lb, ub, w, small, large):
 
 @compiled
 def _larger(x, y):
-    """The larger one, or NaN where either is."""
+    """The larger of two numbers, or NaN."""
     return x if x >= y or x != x else y
 
 
@@ -204,52 +160,41 @@ def _power_above(size, small, large):
 
 
 @compiled
-def condense(H, C, G, keep, independent, convex):
-    """T, Y_neg, H, G, H_b and G_b of `condense.Condensed`, and what it says of them.
+def eliminate(C, n_kept, independent):
+    """Solve C z = b for some of its columns: T and -Y with ``z = T y + Y b``.
 
-    That is whether all rows of C are independent of each other in the columns after ``keep``, as
-    is needed for the rest, and whether all of H surely are convex.
+    LU with row pivoting on the transpose of C picks columns that are safe to solve for. For a
+    linear MPC scheme they are x_1..x_N, and then T is its prediction form.
+
+    Args:
+        C: ``(M, n_c, n_z)``.
+        n_kept: leading columns that are not solved for.
+        independent: smallest pivot, relative to its row's norm, of independent rows.
+
+    Returns:
+        T ``(M, n_z, n_y)``, -Y ``(M, n_z, n_c)``, and False if rows of C depend on each other in
+        the columns that may be solved for.
     """
     M, n_c, n_z = C.shape
-    n_y, n_g = max(0, n_z - n_c), G.shape[1]
-    T, Y_neg, regular = np.zeros((M, n_z, n_y)), np.zeros((M, n_z, n_c)), n_c <= n_z - keep
-    H_y, G_y = np.empty((M, n_y, n_y)), np.empty((M, n_g, n_y))
-    H_b, G_b = np.empty((M, n_y, n_c)), np.empty((M, n_g, n_c))
-    surely_convex = True
+    regular = n_c <= n_z - n_kept
+    T, Y_neg = np.zeros((M, n_z, max(0, n_z - n_c))), np.zeros((M, n_z, n_c))
     for m in range(M):
-        regular = regular and _eliminate(C[m], keep, independent, T[m], Y_neg[m])
-        if regular:
-            H_is_diagonal, G_is_diagonal = _is_diagonal(H[m]), _is_diagonal(G[m])
-            H_T, G_T = _times(H[m], T[m], H_is_diagonal), _times(G[m], T[m], G_is_diagonal)
-            T_HT, TH_Y = np.dot(T[m].T, H_T), np.dot(H_T.T, Y_neg[m])
-            G_Y = _times(G[m], Y_neg[m], G_is_diagonal)
-            for i in range(n_y):
-                for j in range(n_y):
-                    H_y[m, i, j] = (T_HT[i, j] + T_HT[j, i]) / 2.0
-                for j in range(n_c):
-                    H_b[m, i, j] = -TH_Y[i, j]
-            for i in range(n_g):
-                for j in range(n_y):
-                    G_y[m, i, j] = G_T[i, j]
-                for j in range(n_c):
-                    G_b[m, i, j] = -G_Y[i, j]
-            surely_convex = surely_convex and _has_factor(H_y[m], convex)
-    return T, Y_neg, H_y, G_y, H_b, G_b, regular, surely_convex
+        regular = regular and _eliminate(C[m], n_kept, independent, T[m], Y_neg[m])
+    return T, Y_neg, regular
 
 
 @compiled
-def _eliminate(C, keep, independent, T, Y_neg):
-    """T and -Y of one C, by LU as `condense._eliminate_one`; whether there are such."""
+def _eliminate(C, n_kept, independent, T, Y_neg):
     n_c, n_z = C.shape
-    n_y, n_rest = n_z - n_c, n_z - keep
+    n_y, n_rest = n_z - n_c, n_z - n_kept
     factors, order, stays = np.empty((n_rest, n_c)), np.arange(n_z), np.ones(n_z, np.bool_)
     for i in range(n_c):
         for j in range(n_rest):
-            factors[j, i] = C[i, keep + j]
+            factors[j, i] = C[i, n_kept + j]
     for k in range(n_c):
         pivot, size = k, 0.0
         for j in range(n_rest):
-            size += C[k, keep + j] ** 2
+            size += C[k, n_kept + j] ** 2
         for j in range(k + 1, n_rest):
             if abs(factors[j, k]) > abs(factors[pivot, k]):
                 pivot = j
@@ -258,8 +203,8 @@ def _eliminate(C, keep, independent, T, Y_neg):
         if pivot != k:
             for i in range(n_c):
                 factors[k, i], factors[pivot, i] = factors[pivot, i], factors[k, i]
-            order[keep + k], order[keep + pivot] = order[keep + pivot], order[keep + k]
-        stays[order[keep + k]] = False
+            order[n_kept + k], order[n_kept + pivot] = order[n_kept + pivot], order[n_kept + k]
+        stays[order[n_kept + k]] = False
         for j in range(k + 1, n_rest):
             factors[j, k] /= factors[k, k]
             for i in range(k + 1, n_c):
@@ -280,12 +225,34 @@ def _eliminate(C, keep, independent, T, Y_neg):
             right[i, j] /= factors[i, i]
     for i in range(n_c - 1, -1, -1):
         add_product(right[i], -factors[i + 1 : n_c, i], right[i + 1 :])
-        dependent = order[keep + i]
+        dependent = order[n_kept + i]
         for j in range(n_y):
             T[dependent, j] = right[i, j]
         for j in range(n_c):
             Y_neg[dependent, j] = -right[i, n_y + j]
     return True
+
+
+@compiled
+def condense(H, G, T, Y_neg, convex):
+    """The QPs' matrices in y: T'HT, GT, what b adds, T'HY and GY, and True if all T'HT are convex.
+
+    ``convex`` is the smallest eigenvalue, relative to the largest entry, of what counts as convex.
+    """
+    M, _, n_y = T.shape
+    n_g, n_c = G.shape[1], Y_neg.shape[2]
+    H_y, G_y = np.empty((M, n_y, n_y)), np.empty((M, n_g, n_y))
+    H_b, G_b = np.empty((M, n_y, n_c)), np.empty((M, n_g, n_c))
+    surely_convex = True
+    for m in range(M):
+        H_is_diagonal, G_is_diagonal = _is_diagonal(H[m]), _is_diagonal(G[m])
+        H_T, G_y[m] = _times(H[m], T[m], H_is_diagonal), _times(G[m], T[m], G_is_diagonal)
+        T_HT = np.dot(T[m].T, H_T)
+        H_y[m] = (T_HT + T_HT.T) / 2.0
+        H_b[m] = -np.dot(H_T.T, Y_neg[m])
+        G_b[m] = -_times(G[m], Y_neg[m], G_is_diagonal)
+        surely_convex = surely_convex and _has_factor(H_y[m], convex)
+    return H_y, G_y, H_b, G_b, surely_convex
 
 
 @compiled
@@ -301,42 +268,27 @@ def _times(left, right, diagonal):
 
 @compiled
 def _has_factor(H, convex):
-    """`condense._has_factor`."""
+    """True if a Cholesky factor proves that H is convex, in a fraction of its eigenvalues' time."""
     shift = 0.0
     for j in range(len(H)):
         shift = max(shift, H[j, j])
     L = H.copy()
     for j in range(len(H)):
         L[j, j] += convex * (1.0 + shift)
-    return _factorise(L)
-
-
-@compiled
-def _factorise(L):
-    """Put Cholesky's factor into the lower triangle; whether there is one."""
-    for j in range(len(L)):
-        for k in range(j):
-            for i in range(j, len(L)):
-                L[i, j] -= L[j, k] * L[i, k]
-        if not L[j, j] > 0:
-            return False
-        root = math.sqrt(L[j, j])
-        for i in range(j, len(L)):
-            L[i, j] /= root
-    return True
+    return factorise(L)
 
 
 @compiled
 def forces(H, G):
-    """The transposes of `solvers.recall._Forces`: what g and lam do to (v, y).
+    """Return the fields of `torch_qpmpc.qp.pipeline.condensing.Forces`.
 
-    ``rise`` ``(M, d, d + r)`` and ``push`` ``(M, r, d + r)``; NaN where H has no Cholesky factor.
+    They are NaN where H has no Cholesky factor.
     """
     M, r, d = G.shape
     rise, push = np.full((M, d, d + r), np.nan), np.full((M, r, d + r), np.nan)
     for m in range(M):
         L, inverse = H[m].copy(), np.eye(d)
-        if not _factorise(L):
+        if not factorise(L):
             continue
         for i in range(d):
             add_product(inverse[i], -L[i, :i], inverse)
@@ -357,14 +309,16 @@ def forces(H, G):
 
 
 @compiled
-def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
-    """rows, others, H, G, matrix, constant, z_0 and w of `condense.Reduced`.
+def reduce(condensed, theta, group, n_f, enters):
+    """Return the fields of `torch_qpmpc.qp.pipeline.condensing.Reduced`, but for T and Y_neg.
 
-    The arguments are those of `condense.Condensed` and of the QPs, whose G is ``G_z``.
+    ``enters`` is the smallest coefficient, relative to its row, that is not rounding.
     """
+    T, Y_neg, H, G, H_b, G_b = condensed
+    q, b, lb, ub, w = theta.q, theta.b, theta.lb, theta.ub, theta.w
     M, n_z, n_y = T.shape
     n_g, n_c, d = G.shape[1], b.shape[1], n_y - n_f
-    last, r, s = _last_entered(G, G_z, T, lb, ub, enters), 0, 0
+    last, r, s = _last_entered(G, theta.G, T, lb, ub, enters), 0, 0
     for i in range(n_g):
         r += last[i] > n_f
     rows, others, w_v = np.empty(r, np.int64), np.empty(n_g - r, np.int64), np.empty((len(w), r))
@@ -377,7 +331,7 @@ def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
             others[s] = i
             s += 1
     H_v, G_v, matrix = np.empty((M, d, d)), np.empty((M, r, d)), np.empty((M, n_f, d + 2 * r))
-    # What q makes of g, and what b makes of g, of y and of z.
+    # By q to g, and by b to g, y and z.
     by_q, by_b = np.empty((M, n_z, d)), np.empty((M, n_c, d + r + n_z))
     for m in range(M):
         for i in range(d):
@@ -403,7 +357,8 @@ def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
     if M != 1:
         count = len(group)
         q, b = _repeated(q, count), _repeated(b, count)
-    of_q, of_b = products(q, by_q, group, False), products(b, by_b, group, False)
+    of_q = transposed_products(by_q, group, q, False)
+    of_b = transposed_products(by_b, group, b, False)
     constant, z_0 = np.empty((count, d + 2 * r)), np.empty((len(b), n_z))
     for k in range(count):
         k_q, k_b, k_lb, k_ub = k % len(q), k % len(b), k % len(lb), k % len(ub)
@@ -421,7 +376,7 @@ def reduce(T, Y_neg, H, G, H_b, G_b, group, G_z, q, b, lb, ub, w, n_f, enters):
 
 @compiled
 def _repeated(vectors, count):
-    """A row for each QP."""
+    """Repeat a shared vector for each QP."""
     repeated = np.empty((count, vectors.shape[1]))
     for i in range(count):
         repeated[i] = vectors[i % len(vectors)]
@@ -430,11 +385,11 @@ def _repeated(vectors, count):
 
 @compiled
 def _last_entered(G, G_z, T, lb, ub, enters):
-    """How many variables there are up to the last that enters a row of G ``(M, n_g, n_y)``.
+    """The number of variables up to the last that enters a row of G ``(M, n_g, n_y)``.
 
     Zero for a row without a finite bound. Rounding in the elimination leaves traces of variables
-    that a row does not contain. A row that C implies has nothing else, so their sizes are compared
-    with those before it was eliminated, of G_z and T.
+    that a row does not contain, and nothing else of a row that C implies: sizes are compared with
+    those before the elimination, of G_z and T.
     """
     last = np.zeros(G.shape[1], np.int64)
     for j in range(len(last)):

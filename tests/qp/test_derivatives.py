@@ -9,7 +9,7 @@ from torch.testing import assert_close
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states
 from torch_qpmpc import QPError, QuadraticProgram, solve_qp
 from torch_qpmpc.qp.program import EVENT_SHAPES
-from torch_qpmpc.qp.sensitivity import active_rows
+from torch_qpmpc.qp.solution import active_rows
 
 OPERANDS = (*EVENT_SHAPES, "fixed")
 PARTS = ("value", "z", "sigma", "chi", "upsilon", "eta", "xi")

@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import copy
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from torch.func import functional_call
+from torch.testing import assert_close
+
+from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
+from torch_qpmpc.qp.kernels import theta as loops
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.prepared import _Latest
+
+
+@pytest.fixture
+def eliminations(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """The matrices that were eliminated since the test began."""
+    eliminated, eliminate = [], loops.eliminate
+
+    def counting(C: np.ndarray, *arguments):
+        eliminated.append(C)
+        return eliminate(C, *arguments)
+
+    monkeypatch.setattr(loops, "eliminate", counting)
+    return eliminated
+
+
+def test_a_theta_that_the_batch_shares_is_prepared_once():
+    theta, fixed = known_qp(0).qp.tensors(), normal(5, 2)
+    one = Programs.of(*theta, fixed)[0].prepared
+    assert Programs.of(*(x.clone() for x in theta), fixed[:2])[0].prepared is one
+    assert Programs.of(*theta, fixed, n_kept=4)[0].prepared is not one
+    assert Programs.of(*known_qp(1).qp.tensors(), fixed)[0].prepared is not one
+    assert Programs.of(*theta, fixed)[0].prepared is one
+
+
+@pytest.mark.parametrize("i", range(9))
+def test_a_change_in_place_is_another_theta_and_back_the_same(i):
+    theta, fixed = [x.clone() for x in known_qp(0).qp.tensors()], normal(5, 2)
+    one = Programs.of(*theta, fixed)[0].prepared
+    before = theta[i].clone()
+    theta[i] += 1
+    other = Programs.of(*theta, fixed)[0].prepared
+    assert other is not one
+    assert all(np.array_equal(x, y) for x, y in zip(one.theta, other.theta, strict=True)) is False
+    theta[i].copy_(before)
+    assert Programs.of(*theta, fixed)[0].prepared is one
+
+
+def test_the_dtype_is_part_of_a_theta():
+    theta, fixed = known_qp(0).qp.tensors(), normal(5, 2)
+    one = Programs.of(*theta, fixed)[0].prepared
+    assert Programs.of(*(x.float() for x in theta), fixed.float())[0].prepared is not one
+
+
+def test_only_the_latest_are_remembered():
+    fixed = normal(5, 2)
+    known = [known_qp(100 + i).qp.tensors() for i in range(_Latest.SIZE + 1)]
+    prepared = [Programs.of(*theta, fixed)[0].prepared for theta in known]
+    assert Programs.of(*known[-1], fixed)[0].prepared is prepared[-1]
+    assert Programs.of(*known[0], fixed)[0].prepared is not prepared[0]
+
+
+def test_programs_that_differ_in_vectors_share_nothing():
+    known = known_qp(0, batch=(4,))
+    assert programs_of(known).prepared is not programs_of(known).prepared
+
+
+def test_threads_prepare_for_themselves():
+    theta, fixed = known_qp(0).qp.tensors(), normal(5, 2)
+    here = Programs.of(*theta, fixed)[0].prepared
+    with ThreadPoolExecutor(1) as pool:
+        there = pool.submit(Programs.of, *theta, fixed).result()[0].prepared
+    assert there is not here
+
+
+def test_value_action_value_and_policy_share_one_elimination(eliminations):
+    mpc = random_mpc(40)
+    s, a = random_states(6), random_states(6, 1, size=0.5)
+    for solve in (mpc.value, mpc.policy, lambda s: mpc.action_value(s, a)):
+        solve(s)
+    assert len(eliminations) == 1
+    with torch.no_grad():
+        mpc.C += 0.01
+    mpc.action_value(s, a)
+    mpc.value(s)
+    assert len(eliminations) == 2
+
+
+def test_an_update_in_place_and_back_is_followed():
+    mpc, s = random_mpc(1), random_states(4)
+    before, C = mpc.value(s), mpc.C.detach().clone()
+    twin = copy.deepcopy(mpc)
+    with torch.no_grad():
+        mpc.C += 0.1 * normal(*C.shape)
+    assert (mpc.value(s) - before).abs().min() > 1e-6
+    assert_close(twin.value(s), before, rtol=0, atol=0)
+    mpc.C.data.copy_(C)  # unseen by version counters
+    assert_close(mpc.value(s), before, rtol=0, atol=0)
+
+
+def test_the_answer_follows_parameters_changed_in_place():
+    mpc, s = random_mpc(41), random_states(4)
+    before = mpc.value(s)
+    with torch.no_grad():
+        mpc.C += 0.05 * normal(*mpc.C.shape)
+    fresh = copy.deepcopy(mpc)
+    assert (mpc.value(s) - before).abs().min() > 1e-6
+    assert_close(mpc.value(s), fresh.value(s), rtol=0, atol=0)
+
+
+def test_the_answer_follows_the_module():
+    online, s = random_mpc(42), random_states(4)
+    target = copy.deepcopy(online)
+    with torch.no_grad():
+        online.C += 0.05 * normal(*online.C.shape)
+    expected = [online.value(s), target.value(s)]
+    assert (expected[0] - expected[1]).abs().min() > 1e-6
+    for _ in range(2):
+        assert_close([online.value(s), target.value(s)], expected, rtol=0, atol=0)
+
+
+def test_the_answer_follows_the_parameters_of_a_functional_call():
+    mpc, other, s = random_mpc(43), random_mpc(44), random_states(4)
+    parameters = {name: part.detach() for name, part in other.named_parameters()}
+    own = mpc.value(s)
+    called = functional_call(mpc, parameters, (s,))
+    assert_close(called, other.value(s), rtol=0, atol=0)
+    assert (called - own).abs().min() > 1e-6
+    assert_close(mpc.value(s), own, rtol=0, atol=0)

@@ -1,0 +1,110 @@
+"""The boundary of the pipeline: tensors become arrays, and failures become errors.
+
+Everything behind it is in float64, without autograd, and runs once per batch.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.qp.batching import broadcast, listed
+from torch_qpmpc.qp.pipeline.arrays import to_tensor
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.batch_solution import BatchSolution
+from torch_qpmpc.qp.pipeline.solve import solve_programs
+from torch_qpmpc.qp.program import NDIMS, Status
+from torch_qpmpc.qp.solvers import backend
+
+ON_FAILURE = ("raise", "warn", "mask")
+#: value, z, chi, lam, xi, status, residual, iterations, active
+Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+# OpenMP's threads do not survive a fork: in the child torch, too, would wait for them for ever.
+os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
+
+
+def solve_now(
+    H: Tensor,
+    q: Tensor,
+    c: Tensor,
+    C: Tensor,
+    b: Tensor,
+    G: Tensor,
+    lb: Tensor,
+    ub: Tensor,
+    w: Tensor,
+    fixed: Tensor,
+    start: Tensor | None,
+    n_kept: int,
+    solver: str,
+    on_failure: str,
+) -> Outputs:
+    """Solve a batch: on the CPU, or with ``solver="torch"`` on the device of q.
+
+    Raises:
+        QPError: an unknown solver or ``on_failure``, invalid data, or a batch beyond memory.
+        SolverError: QPs without a certified solution, with ``on_failure="raise"``.
+    """
+    backend(solver)
+    if on_failure not in ON_FAILURE:
+        raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
+    device = q.device if solver == "torch" and q.is_cuda else None
+    theta = (H, q, c, C, b, G, lb, ub, w)
+    try:
+        programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=device)
+        if start is not None:
+            start = listed(start.detach().to(q.device).expand(*batch, -1)).contiguous()
+            start = start.numpy(force=True) if device is None else start
+        solution = solve_programs(programs, solver, start)
+    except (MemoryError, RuntimeError) as error:
+        if not _is_out_of_memory(error):
+            raise
+        shapes = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
+        count = broadcast(*shapes, fixed.shape[:-1]).numel()
+        got = f"{count:,} QPs of n_z = {q.shape[-1]}"
+        remedy = f"Solve it in chunks, as of torch.split. The allocation said: {error}."
+        raise QPError.expected("batch", got, "as many as memory has room for", remedy) from error
+    if on_failure != "mask" and not solution.all_accepted:
+        _report(solution, batch, on_failure)
+
+    outputs: Any = tuple(map(to_tensor, solution))
+    if len(batch) == 1 and q.dtype == torch.float64 and q.device == outputs[0].device:
+        return outputs
+
+    def out(x: Tensor) -> Tensor:
+        dtype = q.dtype if x.is_floating_point() else x.dtype
+        return x.reshape((*batch, *x.shape[1:])).to(q.device, dtype)
+
+    return tuple(map(out, outputs))  # pyright: ignore[reportReturnType] - nine of them
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """True for a failed allocation, which torch's CPU allocator names only in its message."""
+    kinds = (MemoryError, torch.OutOfMemoryError)
+    return isinstance(error, kinds) or "DefaultCPUAllocator" in str(error)
+
+
+def _report(solution: BatchSolution, batch: torch.Size, on_failure: str) -> None:
+    statuses = torch.as_tensor(solution.status).cpu()
+    failed = statuses.nonzero().squeeze(-1)
+    reasons = []
+    for status in Status:
+        where = (statuses == status).nonzero().squeeze(-1)
+        if status != Status.SOLVED and len(where):
+            first = torch.unravel_index(where[0], batch) if batch else ()
+            at = f", first at batch index {tuple(int(i) for i in first)}" if batch else ""
+            reasons.append(f"{len(where)} {status.name}{at}: {status.explanation}")
+    message = f"{len(failed)} of {len(statuses)} QPs have no certified solution. " + ". ".join(
+        reasons
+    )
+    if on_failure == "raise":
+        if (statuses[failed] == Status.INVALID_DATA).all():
+            raise QPError(message)
+        raise SolverError(message)
+    warnings.warn(message, RuntimeWarning, stacklevel=2)

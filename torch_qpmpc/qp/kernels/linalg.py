@@ -1,0 +1,135 @@
+"""Linear algebra in loops that Numba compiles for the CPU. Arrays are float64 and contiguous."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.extending import intrinsic
+
+#: Most entries of matrix times vectors in one call of BLAS, so that it stays in one thread.
+ONE_THREAD = 2**18
+
+
+def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """Compile ``function``; the machine code is kept on disk if its folder can be written."""
+    try:
+        return numba.njit(cache=True, error_model="numpy", **options)(function)
+    except RuntimeError:
+        return numba.njit(error_model="numpy", **options)(function)
+
+
+# LLVM works on four entries at a time if sums may be reordered, or if no entry is NaN.
+summing = partial(compiled, fastmath={"reassoc", "contract"})
+comparing = partial(compiled, fastmath={"nnan", "nsz"})
+
+
+def _larger(_, x, y):
+    """max(x, y) of numbers that are not NaN; Python's max is not vectorised."""
+
+    def generate(_, builder, signature, numbers):
+        double = ir.DoubleType()
+        kind = ir.FunctionType(double, (double, double))
+        maximum = builder.module.declare_intrinsic("llvm.maxnum", (double,), kind)
+        return builder.call(maximum, numbers)
+
+    return numba.float64(numba.float64, numba.float64), generate
+
+
+larger: Any = intrinsic(_larger)
+
+
+@compiled
+def add(x, factor, y):
+    """x += factor y."""
+    for j in range(len(x)):
+        x[j] += factor * y[j]
+
+
+@compiled
+def add_product(x, factors, matrix):
+    """x += matrix' factors, four rows at a time: x is read and written a quarter as often."""
+    whole = len(factors) - len(factors) % 4
+    for j in range(0, whole, 4):
+        f, g, h, p = factors[j], factors[j + 1], factors[j + 2], factors[j + 3]
+        for k in range(len(x)):
+            x[k] += (f * matrix[j, k] + g * matrix[j + 1, k]) + (
+                h * matrix[j + 2, k] + p * matrix[j + 3, k]
+            )
+    if whole + 2 <= len(factors):
+        f, g = factors[whole], factors[whole + 1]
+        for k in range(len(x)):
+            x[k] += f * matrix[whole, k] + g * matrix[whole + 1, k]
+    if len(factors) % 2:
+        for k in range(len(x)):
+            x[k] += factors[-1] * matrix[len(factors) - 1, k]
+
+
+@summing
+def dot(x, y):
+    total = 0.0
+    for j in range(len(x)):
+        total += x[j] * y[j]
+    return total
+
+
+@compiled
+def products(matrices, group, vectors, diagonal):
+    """Multiply each QP's matrix by its vector: ``(M, i, j)`` and ``(B, j)`` to ``(B, i)``."""
+    found = np.empty((len(vectors), matrices.shape[1]))
+    if diagonal:
+        _scale(matrices[0], vectors, found)
+    elif len(matrices) == 1 and matrices.size:
+        some = max(1, ONE_THREAD // matrices.size)
+        for i in range(0, len(vectors), some):
+            np.dot(vectors[i : i + some], matrices[0].T, found[i : i + some])
+    else:
+        for i in range(len(vectors)):
+            for j in range(found.shape[1]):
+                found[i, j] = dot(matrices[group[i], j], vectors[i])
+    return found
+
+
+@compiled
+def transposed_products(matrices, group, vectors, diagonal):
+    """As `products`, by the transposed matrices: ``(M, i, j)`` and ``(B, i)`` to ``(B, j)``."""
+    found = np.empty((len(vectors), matrices.shape[2]))
+    if diagonal:
+        _scale(matrices[0], vectors, found)
+    elif len(matrices) == 1 and matrices.size:
+        some = max(1, ONE_THREAD // matrices.size)
+        for i in range(0, len(vectors), some):
+            np.dot(vectors[i : i + some], matrices[0], found[i : i + some])
+    else:
+        found[:] = 0.0
+        for i in range(len(vectors) if matrices.size else 0):
+            add_product(found[i], vectors[i], matrices[group[i]])
+    return found
+
+
+@compiled
+def _scale(matrix, vectors, found):
+    factors = np.diag(matrix).copy()
+    for i in range(len(vectors)):
+        for j in range(len(factors)):
+            found[i, j] = vectors[i, j] * factors[j]
+
+
+@compiled
+def factorise(L):
+    """Replace the lower triangle by its Cholesky factor; False if there is none."""
+    for j in range(len(L)):
+        for k in range(j):
+            for i in range(j, len(L)):
+                L[i, j] -= L[j, k] * L[i, k]
+        if not L[j, j] > 0:
+            return False
+        root = math.sqrt(L[j, j])
+        for i in range(j, len(L)):
+            L[i, j] /= root
+    return True

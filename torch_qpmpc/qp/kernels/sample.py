@@ -1,0 +1,350 @@
+"""What each QP of a batch needs, in loops that Numba compiles for the CPU.
+
+The torch forms of `torch_qpmpc.qp.kernels.sample_torch` do the same on other devices. Arrays are
+float64 and contiguous; a vector that the whole batch shares has one row.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from torch_qpmpc.qp.kernels.linalg import (
+    add,
+    add_product,
+    comparing,
+    compiled,
+    larger,
+    products,
+    summing,
+    transposed_products,
+)
+
+#: Violation from which a row that no free variable enters has its whole weight as multiplier.
+VIOLATED = 1e-9
+#: Most active sets of one QP that a warm start tries before the backend solves it.
+MAX_STEPS = 10
+#: Solves with one active set: the first, and those that refine it.
+MAX_PASSES = 3
+#: Relative errors up to which bounds are kept, and up to which signs are right.
+SLIP = 1e-9
+
+
+@compiled
+def offsets(fixed, group, matrix, constant):
+    """The linear cost and the bounds of the reduced QPs, ``constant + matrix' fixed``."""
+    # Not by BLAS, which rounds a sample alone differently from one in a batch.
+    found = np.empty((len(fixed), constant.shape[1]))
+    for i in range(len(fixed)):
+        found[i] = constant[i % len(constant)]
+        add_product(found[i], fixed[i], matrix[group[i]])
+    return found
+
+
+def recover(v, lam, group, fixed, theta, reduced, diagonal, passes=0) -> tuple[Any, ...]:
+    """Complete and certify solutions of reduced QPs.
+
+    The multipliers of C z = b and of the fixed entries follow from the stationarity of the
+    Lagrangian: chi by the transpose of the elimination, xi from the rest in the fixed entries.
+
+    Args:
+        v, lam: solutions ``(B, d)`` and signed multipliers ``(B, r)`` of the reduced QPs.
+        group, fixed, theta, reduced: of the QPs, see `torch_qpmpc.qp.pipeline.batch`.
+        diagonal: True for H and for G if the batch shares one that is diagonal.
+        passes: steps of iterative refinement of z and chi against the elimination's errors.
+
+    Returns:
+        value, z, chi, lam, xi, the active set's codes, and the certificate's residual.
+    """
+    return _recover(v, lam, group, fixed, theta, reduced, diagonal, passes)
+
+
+@compiled
+def _recover(v, lam_v, group, fixed, theta, reduced, diagonal, passes):
+    n_qps, n_f = fixed.shape
+    H, C, G, q = theta.H, theta.C, theta.G, theta.q
+    kept = np.empty((n_qps, n_f + v.shape[1]))
+    kept[:, :n_f] = fixed
+    kept[:, n_f:] = v
+    z = products(reduced.T, group, kept, False)
+    for i in range(n_qps):
+        add(z[i], 1.0, reduced.z_0[i % len(reduced.z_0)])
+    Cz = products(C, group, z, False)
+    for _ in range(passes):
+        for i in range(n_qps):
+            add(Cz[i], -1.0, theta.b[i % len(theta.b)])
+        z += products(reduced.Y_neg, group, Cz, False)
+        Cz = products(C, group, z, False)
+    Hz, y = products(H, group, z, diagonal[0]), products(G, group, z, diagonal[1])
+    lam, codes = _all_multipliers(lam_v, y, theta, reduced.rows, reduced.others)
+    G_lam = transposed_products(G, group, lam, diagonal[1])
+    left = Hz + G_lam
+    for i in range(n_qps):
+        add(left[i], 1.0, q[i % len(q)])
+    chi = transposed_products(reduced.Y_neg, group, left, False)
+    C_chi = transposed_products(C, group, chi, False)
+    for _ in range(passes):
+        chi += transposed_products(reduced.Y_neg, group, left + C_chi, False)
+        C_chi = transposed_products(C, group, chi, False)
+    left += C_chi
+    xi = -left[:, :n_f]
+    left[:, :n_f] += xi
+    value, residual = _judge(z, lam, chi, fixed, theta, Hz, G_lam, C_chi, left, y, Cz)
+    return value, z, chi, lam, xi, codes, residual
+
+
+@compiled
+def _all_multipliers(lam_v, y, theta, rows, others):
+    """Multipliers of all rows ``(B, n_g)``, and the active set's codes."""
+    lb, ub, w = theta.lb, theta.ub, theta.w
+    lam, codes = np.zeros(y.shape), np.empty(y.shape, np.int8)
+    for i in range(len(y)):
+        of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
+        for k in range(len(rows)):
+            lam[i, rows[k]] = lam_v[i, k]
+        # A loop of its own, to be compiled four at a time.
+        for j in range(lam.shape[1]):
+            push, most = lam[i, j], w[of_w, j]
+            lam[i, j] = most if push > most else -most if push < -most else push
+        for j in others:
+            if w[of_w, j] < np.inf:  # a violated hard row stays violated: the residual shows it
+                if y[i, j] - ub[of_ub, j] > VIOLATED:
+                    lam[i, j] = w[of_w, j]
+                elif lb[of_lb, j] - y[i, j] > VIOLATED:
+                    lam[i, j] = -w[of_w, j]
+        for j in range(lam.shape[1]):
+            below, above, most = lb[of_lb, j], ub[of_ub, j], w[of_w, j]
+            at = y[i, j] + lam[i, j]
+            excess = at - min(max(at, below), above)
+            held = min(max(excess, -most), most)
+            if held == excess and (excess != 0 or below == above):
+                codes[i, j] = np.sign(lam[i, j])
+            else:
+                codes[i, j] = 2 * np.sign(held)
+    return lam, codes
+
+
+def certify(z, lam, chi, xi, group, fixed, theta, diagonal) -> tuple[Any, Any]:
+    """Value and relative KKT residual ``(B,)``, see `torch_qpmpc.qp.pipeline.certificate`."""
+    return _certify(z, lam, chi, xi, group, fixed, theta, diagonal)
+
+
+@compiled
+def _certify(z, lam, chi, xi, group, fixed, theta, diagonal):
+    H, C, G, q = theta.H, theta.C, theta.G, theta.q
+    Hz, y = products(H, group, z, diagonal[0]), products(G, group, z, diagonal[1])
+    G_lam = transposed_products(G, group, lam, diagonal[1])
+    C_chi, Cz = transposed_products(C, group, chi, False), products(C, group, z, False)
+    left = Hz + G_lam + C_chi
+    left[:, : xi.shape[1]] += xi
+    for i in range(len(z)):
+        add(left[i], 1.0, q[i % len(q)])
+    return _judge(z, lam, chi, fixed, theta, Hz, G_lam, C_chi, left, y, Cz)
+
+
+@compiled
+def _judge(z, lam, chi, fixed, theta, Hz, G_lam, C_chi, left, y, Cz):
+    """Value and residual from the terms of the KKT conditions; ``left`` is the stationarity's."""
+    q, c, b, lb, ub, w = theta.q, theta.c, theta.b, theta.lb, theta.ub, theta.w
+    value, residual = np.empty(len(z)), np.empty(len(z))
+    for i in range(len(z)):
+        of_q, of_b = q[i % len(q)], b[i % len(b)]
+        of_lb, of_ub, of_w = lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)]
+        cost, slip = _cost(z[i], Hz[i], left[i], of_q)
+        charge, gap = _charge(y[i], lam[i], of_lb, of_ub, of_w)
+        cost, slip = cost + charge, slip + gap + _shortage(Cz[i], of_b, chi[i])
+        force, slope, length = _forces(z[i], Hz[i], G_lam[i], C_chi[i], left[i], of_q)
+        short, size = _distance(Cz[i], of_b)
+        error = max(slope / (1.0 + force), short / (1.0 + size + length))
+        error = max(error, _distance(z[i, : fixed.shape[1]], fixed[i])[0])
+        error = max(error, _excess(y[i], lam[i], of_lb, of_ub, of_w))
+        slip /= 1.0 + abs(cost)
+        worst = max(error, slip)
+        value[i] = cost + c[i % len(c)]
+        # A NaN in any entry is in the sums; the largest sizes ignore it.
+        residual[i] = worst if slip < np.inf and worst < np.inf else np.inf
+    return value, residual
+
+
+@summing
+def _cost(z, Hz, left, q):
+    """Return (q + Hz / 2)'z, and what the rest of stationarity is worth."""
+    cost = slip = 0.0
+    for j in range(len(z)):
+        cost += (q[j] + 0.5 * Hz[j]) * z[j]
+        slip += abs(left[j] * z[j])
+    return cost, slip
+
+
+@summing
+def _charge(y, lam, lb, ub, w):
+    """Return w'sigma and the sum of the rows' complementarity gaps."""
+    total = slip = 0.0
+    for j in range(len(y)):
+        at, push, weight, above, below = y[j], lam[j], w[j], ub[j], lb[j]
+        outside = at - above if at > above else below - at if at < below else 0.0
+        charge = outside * (0.0 if weight == np.inf else weight)
+        # NaN is neither, and stays.
+        up, down = 0.0 if push < 0 else push, 0.0 if push > 0 else push
+        above, below = 0.0 if above == np.inf else above, 0.0 if below == -np.inf else below
+        total += charge
+        slip += abs(charge + (above - at) * up + (below - at) * down)
+    return total, slip
+
+
+@summing
+def _shortage(Cz, b, chi):
+    """What C z - b is worth."""
+    slip = 0.0
+    for j in range(len(b)):
+        slip += abs((Cz[j] - b[j]) * chi[j])
+    return slip
+
+
+@comparing
+def _forces(z, Hz, G_lam, C_chi, left, q):
+    """Return the largest terms of stationarity, of its rest, and of z."""
+    force = slope = length = 0.0
+    for j in range(len(z)):
+        force = larger(force, larger(abs(q[j]), abs(Hz[j])))
+        force = larger(force, larger(abs(G_lam[j]), abs(C_chi[j])))
+        slope, length = larger(slope, abs(left[j])), larger(length, abs(z[j]))
+    return force, slope, length
+
+
+@comparing
+def _distance(x, y):
+    """Return the largest entry of x - y, and of y."""
+    difference = size = 0.0
+    for j in range(len(y)):
+        difference, size = larger(difference, abs(x[j] - y[j])), larger(size, abs(y[j]))
+    return difference, size
+
+
+@comparing
+def _excess(y, lam, lb, ub, w):
+    """The largest violation of a hard row, multiplier beyond w, or multiplier of no bound."""
+    error = 0.0
+    for j in range(len(y)):
+        at, push, weight = y[j], lam[j], w[j]
+        above, below = ub[j], lb[j]
+        hard = weight == np.inf
+        excess = larger(at - above, below - at) if hard else abs(push) - weight
+        excess /= 1.0 + (abs(at) if hard else weight)
+        astray = larger(push if above == np.inf else 0.0, -push if below == -np.inf else 0.0)
+        error = larger(error, larger(excess, astray))
+    return error
+
+
+def try_active_sets(qps, forces, active) -> tuple[Any, ...]:
+    """Try active sets ``(B, r)``, as `torch_qpmpc.qp.pipeline.warm_start` says.
+
+    Returns:
+        v ``(B, d)``, lam ``(B, r)``, the steps, and True where they came to an end, ``(B,)``.
+    """
+    g, lower, upper, w = map(np.ascontiguousarray, (qps.g, qps.l, qps.u, qps.w))
+    return _try_active_sets(forces.rise, forces.push, qps.group, g, lower, upper, w, active)
+
+
+@compiled
+def _try_active_sets(rise, push, group, g, lower, upper, w, active):
+    n_qps, r = lower.shape
+    d = g.shape[1]
+    free = -transposed_products(rise, group, g, False)  # (v, y) without multipliers
+    lam, vy, steps = np.zeros((n_qps, r)), free.copy(), np.zeros(n_qps, np.int64)
+    done = np.zeros(n_qps, np.bool_)
+    code, held, pull = np.empty(r, np.int8), np.empty(r, np.int64), np.empty(r)
+    factor = np.empty((r, r))
+    for i in range(n_qps):
+        code[:] = active[i]
+        by = push[group[i]]
+        for j in range(r):
+            if not -2 <= code[j] <= 2:
+                code[:] = 0
+        while not done[i] and steps[i] < MAX_STEPS:
+            steps[i] += 1
+            vy[i] = free[i]
+            k = 0
+            for j in range(r):
+                lam[i, j] = 0.0
+                if abs(code[j]) == 2:
+                    lam[i, j] = math.copysign(w[i, j], code[j])
+                    add(vy[i], -lam[i, j], by[j])
+                elif code[j] != 0:
+                    held[k] = j
+                    k += 1
+            if not _factorise_held(by, held, k, d, factor):
+                break
+            for _ in range(MAX_PASSES):
+                unmet = False
+                for a in range(k):
+                    j = held[a]
+                    level = upper[i, j] if code[j] > 0 else lower[i, j]
+                    pull[a] = vy[i, d + j] - level
+                    unmet = unmet or not abs(pull[a]) <= SLIP * (1.0 + abs(level))
+                if not unmet:
+                    break
+                _solve_factorised(factor, pull, k)
+                for a in range(k):
+                    lam[i, held[a]] += pull[a]
+                    add(vy[i], -pull[a], by[held[a]])
+            done[i] = not _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i])
+    return vy[:, :d].copy(), lam, steps, done
+
+
+@compiled
+def _factorise_held(by, held, k, d, factor):
+    """Factorise the held rows and columns of K, upper triangle; False if there is no factor."""
+    for a in range(k):
+        for b in range(a, k):
+            factor[a, b] = by[held[a], d + held[b]]
+    for a in range(k):
+        if not factor[a, a] > 0:
+            return False
+        root = math.sqrt(factor[a, a])
+        for b in range(a, k):
+            factor[a, b] /= root
+        # Slices of rows, to pass on, would take as long as such loops.
+        for b in range(a + 1, k):
+            for e in range(b, k):
+                factor[b, e] -= factor[a, b] * factor[a, e]
+    return True
+
+
+@compiled
+def _solve_factorised(factor, x, k):
+    for a in range(k):
+        x[a] /= factor[a, a]
+        for b in range(a + 1, k):
+            x[b] -= x[a] * factor[a, b]
+    for a in range(k - 1, -1, -1):
+        for b in range(a + 1, k):
+            x[a] -= factor[a, b] * x[b]
+        x[a] /= factor[a, a]
+
+
+@compiled
+def _correct(code, lam, y, lower, upper, w):
+    """Correct the codes in place by lam and y; True if they contradicted the old ones."""
+    contradicted = False
+    for j in range(len(code)):
+        small = SLIP * (1.0 + abs(y[j]))
+        above, below = y[j] > upper[j] + small, y[j] < lower[j] - small
+        over = abs(lam[j]) > (1.0 + SLIP) * w[j]
+        inwards = lam[j] * code[j] < -SLIP * (1.0 + abs(lam[j]))
+        if over or inwards or ((above or below) and abs(code[j]) < 2):
+            contradicted = True
+        if code[j] == 0:
+            code[j] = 1 if above else -1 if below else 0
+        elif abs(code[j]) == 2:
+            # A saturated row that is back within its bounds is held.
+            if y[j] < upper[j] - small if code[j] > 0 else y[j] > lower[j] + small:
+                code[j] //= 2
+        elif over:
+            code[j] = 2 if lam[j] > 0 else -2
+        elif inwards and lower[j] < upper[j]:
+            # A row whose multiplier points inwards is released, unless its bounds are equal.
+            code[j] = 0
+    return contradicted

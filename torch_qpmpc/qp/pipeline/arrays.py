@@ -1,0 +1,69 @@
+"""The arrays that the pipeline works on: NumPy's on the CPU, tensors on other devices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_qpmpc.qp.program import crossed
+
+#: ``np.ndarray`` on the CPU, ``torch.Tensor`` elsewhere.
+Array = Any
+
+
+class Theta(NamedTuple):
+    """The data of B QPs over M distinct matrix triples, in float64.
+
+    H ``(M, n_z, n_z)``, symmetric, C ``(M, n_c, n_z)``, G ``(M, n_g, n_z)``, q ``(B, n_z)``, c
+    ``(B,)``, b ``(B, n_c)``, lb, ub, w ``(B, n_g)``. A vector that the batch shares has one row.
+    """
+
+    H: Array
+    C: Array
+    G: Array
+    q: Array
+    c: Array
+    b: Array
+    lb: Array
+    ub: Array
+    w: Array
+
+    @classmethod
+    def of(cls, data: Sequence[np.ndarray]) -> Theta:
+        """From H, q, c, C, b, G, lb, ub, w of float32 or float64, with their leading dimension.
+
+        H becomes its symmetric part, and lb = ub where rounding alone has them cross.
+        """
+        swapped = data[6] > data[7]
+        H, q, c, C, b, G, lb, ub, w = (np.ascontiguousarray(x, np.float64) for x in data)
+        if swapped.any():
+            bounds = torch.from_numpy(data[6].copy()), torch.from_numpy(data[7].copy())
+            lb = np.where(swapped & ~crossed(*bounds).numpy(), ub, lb)
+        return cls((H + H.swapaxes(1, 2)) / 2.0, C, G, q, c, b, lb, ub, w)
+
+
+def to_numpy(x: Array) -> np.ndarray:
+    """``x`` on the CPU, not copied if it is there."""
+    return x if isinstance(x, np.ndarray) else x.numpy(force=True)
+
+
+def to_tensor(x: Array) -> Tensor:
+    """``x`` as a tensor where it is, not copied."""
+    return torch.from_numpy(x) if isinstance(x, np.ndarray) else x
+
+
+def on_device(x: np.ndarray, device: torch.device | None) -> Array:
+    """``x`` as a tensor on ``device``, or as it is if that is None."""
+    return x if device is None else torch.from_numpy(x).to(device)
+
+
+def of_group(unit: np.ndarray, group: Array) -> Array:
+    """Rows of ``unit`` ``(M, n)`` for each QP, ``(B, n)``, or the one row of all, ``(1, n)``."""
+    if isinstance(group, np.ndarray):
+        return unit if len(unit) == 1 else unit[group]
+    unit = torch.from_numpy(unit).to(group.device)
+    return unit if len(unit) == 1 else unit[group]

@@ -1,0 +1,136 @@
+"""The solution of a batch of QPs, and its active set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.qp.precision import full_precision
+from torch_qpmpc.qp.program import QuadraticProgram, Status
+from torch_qpmpc.qp.tracing import has_values
+
+#: A multiplier below this fraction of the largest is zero; one as near to w is saturated.
+ACTIVE_FRACTION = 1e-8
+
+
+def active_rows(lam: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Which rows are held at a bound, and which are saturated at |lam| = w, ``(*batch, n_g)``."""
+    size = lam.abs()
+    saturated = w.isfinite() & (size >= (1 - ACTIVE_FRACTION) * w)
+    largest = size.amax(-1, keepdim=True) if size.shape[-1] else size
+    return (size > ACTIVE_FRACTION * (1 + largest)) & ~saturated, saturated
+
+
+def row_states(p, lower, upper, w) -> tuple:
+    """Each row's nearest bound, whether it is active there, and lam if not; arrays or tensors.
+
+    The excess of ``p = y + lam`` over the bounds would be the multiplier; |lam| <= w caps it.
+    """
+    bound = p.clip(lower, upper)
+    excess = p - bound
+    held = excess.clip(-w, w)
+    active = (held == excess) & ((excess != 0) | (lower == upper))
+    return bound, active, held
+
+
+def active_codes(y: Tensor, lam: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
+    """`QPSolution.active` of rows y = G z with multipliers lam, ``(*batch, n_g)``."""
+    _, held, fixed = row_states(y + lam, lb, ub, w)
+    return torch.where(held, lam.sign(), 2 * fixed.sign()).to(torch.int8)
+
+
+@dataclass(frozen=True, repr=False)
+class QPSolution:
+    """Primal-dual solution of a batch of QPs.
+
+    All but the last four are differentiable in the tensors of the QP and in the fixed entries. An
+    element that is not solved (``status != 0``; only with ``on_failure`` "warn" or "mask") has
+    ``value = inf``, the fixed entries in ``z``, zeros elsewhere, and no gradient.
+
+    Attributes:
+        qp: the problems that this solves.
+        value: optimal cost, ``(*batch,)``.
+        z: minimiser, ``(*batch, n_z)``.
+        chi: multipliers of C z = b, ``(*batch, n_c)``.
+        lam: signed multipliers eta - upsilon of the rows, ``(*batch, n_g)``.
+        xi: multipliers of the fixed entries, ``(*batch, n_f)``: the paper's xi, then zeta.
+        status: `Status` as integers, ``(*batch,)``.
+        residual: relative KKT residual found by the certificate, ``(*batch,)``.
+        iterations: the solver's iterations, ``(*batch,)``.
+        active: the active set as int8 ``(*batch, n_g)``, a warm start for a nearly equal QP. 0 is a
+            row without multiplier, 1 one that is held at ub and -1 one at lb; 2 and -2 are rows
+            saturated there, at eta = w or upsilon = w. All rows of an unsolved element are 127.
+    """
+
+    qp: QuadraticProgram
+    value: Tensor
+    z: Tensor
+    chi: Tensor
+    lam: Tensor
+    xi: Tensor
+    status: Tensor
+    residual: Tensor
+    iterations: Tensor
+    active: Tensor
+
+    def __repr__(self) -> str:
+        """Sizes, how many elements have each status, and the range of the values."""
+        lines = [
+            f"batch_shape={tuple(self.status.shape)}, n_f={self.xi.shape[-1]}",
+            f"qp={self.qp!r}",
+        ]
+        if has_values(self.status):
+            solved = self.solved
+            outcome = [f"solved {int(solved.sum())} of {solved.numel()}"]
+            for status in list(Status)[1:]:
+                if count := int((self.status == status).sum()):
+                    outcome.append(f"{count} {status.name}")
+            lines.append(", ".join(outcome))
+            if solved.any():
+                value, residual = self.value.detach()[solved], self.residual[solved].max()
+                of_values = f"value from {value.min():.4g} to {value.max():.4g}"
+                lines.append(f"{of_values}, residual up to {residual:.2g}")
+        body = ",\n".join(f"    {line}" for line in lines)
+        return f"QPSolution(\n{body},\n)"
+
+    @property
+    def solved(self) -> Tensor:
+        """Which elements are certified solutions, ``(*batch,)``."""
+        return self.status == Status.SOLVED
+
+    @property
+    def sigma(self) -> Tensor:
+        """Slacks, ``(*batch, n_g)``, zero on hard rows."""
+        qp = self.qp
+        return self._where_solved(slacks(self.z, qp.G, qp.lb, qp.ub, qp.w))
+
+    @property
+    def upsilon(self) -> Tensor:
+        """Multipliers of the lower bounds, ``(*batch, n_g)``, non-negative."""
+        return (-self.lam).clamp(min=0)
+
+    @property
+    def eta(self) -> Tensor:
+        """Multipliers of the upper bounds, ``(*batch, n_g)``, non-negative."""
+        return self.lam.clamp(min=0)
+
+    @property
+    def mu(self) -> Tensor:
+        """Multipliers of sigma >= 0, ``w - upsilon - eta``, ``(*batch, n_g)``; inf on hard rows."""
+        return self._where_solved(self.qp.w - self.upsilon - self.eta)
+
+    def _where_solved(self, rows: Tensor) -> Tensor:
+        return torch.where(self.solved.unsqueeze(-1), rows, 0)
+
+
+def slacks(z: Tensor, G: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
+    """sigma of z: how far soft rows are outside their bounds, ``(*batch, n_g)``."""
+    y = _rows(z, G)
+    return torch.where(w.isinf(), 0, torch.maximum(lb - y, y - ub).clamp(min=0))
+
+
+def _rows(z: Tensor, G: Tensor) -> Tensor:
+    with full_precision(z):
+        return z @ G.mT if G.ndim == 2 else (z.unsqueeze(-2) @ G.mT).squeeze(-2)
