@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torch_qpmpc import QPMPC, QuadraticProgram
 from torch_qpmpc.qp.kernels import sample_torch
+from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs, SoftQPs
 from torch_qpmpc.qp.pipeline.condensing import Reduced
 from torch_qpmpc.qp.solvers import BackendSolution
@@ -170,9 +171,10 @@ def soft_qps(known: KnownQP) -> tuple[SoftQPs, BackendSolution]:
 def expanded(programs: Programs, v: Tensor | None = None) -> Tensor:
     """z ``(B, n_z)`` of free variables ``(B, d)``, zero by default."""
     reduced = programs.prepared.reduced(programs.n_f)
+    fixed = to_tensor(programs.fixed)
     if v is None:
-        v = programs.fixed.new_zeros(len(programs), reduced.H.shape[-1])
-    free = torch.cat((programs.fixed, v), dim=-1)
+        v = fixed.new_zeros(len(programs), reduced.H.shape[-1])
+    free = torch.cat((fixed, v), dim=-1)
     return sample_torch.multiply(reduced.T, programs.group, free) + reduced.z_0
 
 

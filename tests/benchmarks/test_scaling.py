@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from tests.benchmarks.full_space import FullSpace
 from tests.benchmarks.peers import piqp_solver
 from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
 from tests.benchmarks.reference import WRONG, reference_values, relative_error
-from torch_qpmpc.qp.pipeline.condensing import condense
+from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers import BACKENDS
 
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
@@ -80,11 +81,11 @@ def test_value(
 def test_condensing(benchmark: Any, interleaved: Callable[..., Any], size: Size) -> None:
     """Condensing alone, of a theta that has moved since the last time."""
     mpc = make_mpc(size, dense=True)
-    n = size.n_x + size.n_u
+    n, s = size.n_x + size.n_u, torch.zeros(1, size.n_x).double()
 
-    def once() -> Tensor:
-        qp = mpc.quadratic_program()
-        return condense(qp.H[None].detach(), qp.C[None].detach(), qp.G[None].detach(), n).T
+    def once() -> np.ndarray:
+        programs, _ = Programs.of(*mpc.quadratic_program().tensors(), s, n_kept=n)
+        return programs.prepared.condensed(n).arrays.T
 
     T = interleaved(once, rounds=4 * ROUNDS, before=lambda: nudge(mpc))
     benchmark.extra_info |= {
@@ -94,7 +95,9 @@ def test_condensing(benchmark: Any, interleaved: Callable[..., Any], size: Size)
         "dimensions": [size.n_x, size.n_u],
         "batch": 1,
     }
-    assert (mpc.C.detach() @ T[0]).abs().max() < 1e-9  # T spans the null space of C
+    assert (
+        mpc.C.detach() @ torch.from_numpy(T[0])
+    ).abs().max() < 1e-9  # T spans the null space of C
 
 
 @cache

@@ -60,8 +60,8 @@ def solve_now(
         programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=device)
         if start is not None:
             start = listed(start.detach().to(q.device).expand(*batch, -1)).contiguous()
-            start = start.numpy(force=True) if device is None else start
-        solution = solve_programs(programs, solver, start)
+        sets = start.numpy(force=True) if start is not None and device is None else start
+        solution = solve_programs(programs, solver, sets)
     except (MemoryError, RuntimeError) as error:
         if not _is_out_of_memory(error):
             raise

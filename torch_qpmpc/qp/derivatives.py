@@ -36,7 +36,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.batching import broadcast, multiply, outer, sum_to, times, weighted_sum
+from torch_qpmpc.qp.batching import broadcast, listed, multiply, outer, sum_to, times, weighted_sum
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solution import active_rows, slacks
@@ -241,10 +241,10 @@ def solve_kkt(
         part = programs.take(solved.nonzero().squeeze(-1).numpy(force=True))
 
     def flat(x: Tensor) -> Tensor:
-        return x.expand(*batch, x.shape[-1]).reshape(-1, x.shape[-1])[solved].double()
+        return listed(x.expand(*batch, x.shape[-1]))[solved].double()
 
-    given = (grad_z, grad_lam, grad_chi, grad_xi, lam)
-    parts = _solve_kkt(part, *map(flat, given), z.device) if len(part) else ()
+    right = flat(grad_z), flat(grad_lam), flat(grad_chi), flat(grad_xi)
+    parts = _solve_kkt(part, *right, flat(lam), z.device) if len(part) else ()
     found = tuple(z.new_zeros(len(solved), x.shape[-1]) for x in (z, b, lb, fixed))
     for x, solution in zip(found, parts, strict=False):
         x[solved] = solution.to(x)

@@ -43,10 +43,10 @@ def both(known: KnownQP) -> tuple[Programs, Programs]:
     return programs_of(known, None), programs_of(known)
 
 
-def reference(known: KnownQP, z: Tensor, lam: Tensor, chi: Tensor, xi: Tensor) -> float:
+def reference(known: KnownQP, *claim: Tensor) -> float:
     """The certificate's residual of one QP, as its docstring says it."""
     H, q, _, C, b, G, lb, ub, w = (x.numpy() for x in known.qp.tensors())
-    z, lam, chi, xi = (np.asarray(x) for x in (z, lam, chi, xi))
+    z, lam, chi, xi = (x.numpy() for x in claim)
     n_f = len(xi)
 
     def largest(*vectors: np.ndarray) -> float:

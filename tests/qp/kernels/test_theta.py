@@ -92,5 +92,5 @@ def test_the_reduced_problem_is_the_problem_in_fewer_variables(batch, matrices):
         assert_close(y[..., rows] - data.lb[..., rows], Gv - qps.l)
         assert_close(data.ub[..., rows] - y[..., rows], qps.u - Gv)
         assert_close(qps.w, data.w[..., rows].expand(len(p), -1))
-        bounded = (data.lb.isfinite() | data.ub.isfinite())[..., others].any(0)
+        bounded = torch.isfinite(torch.maximum(data.lb, -data.ub))[..., others].any(0)
         assert_close(y[0][..., others][:, bounded], y[1][..., others][:, bounded])

@@ -99,7 +99,7 @@ def _recover(v, lam_v, group, fixed, theta, reduced, diagonal, passes):
 def _all_multipliers(lam_v, y, theta, rows, others):
     """Multipliers of all rows ``(B, n_g)``, and the active set's codes."""
     lb, ub, w = theta.lb, theta.ub, theta.w
-    lam, codes = np.zeros(y.shape), np.empty(y.shape, np.int8)
+    lam, codes = np.zeros_like(y), np.empty_like(y, np.int8)
     for i in range(len(y)):
         of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
         for k in range(len(rows)):

@@ -65,5 +65,5 @@ def of_group(unit: np.ndarray, group: Array) -> Array:
     """Rows of ``unit`` ``(M, n)`` for each QP, ``(B, n)``, or the one row of all, ``(1, n)``."""
     if isinstance(group, np.ndarray):
         return unit if len(unit) == 1 else unit[group]
-    unit = torch.from_numpy(unit).to(group.device)
-    return unit if len(unit) == 1 else unit[group]
+    rows = torch.from_numpy(unit).to(group.device)
+    return rows if len(rows) == 1 else rows[group]

@@ -25,9 +25,9 @@ def recover(p: Programs, found: BackendSolution, passes: int = 0) -> BatchSoluti
     """
     reduced, diagonal = p.prepared.reduced(p.n_f), p.prepared.diagonal
     data = (p.group, p.fixed, p.theta, reduced, diagonal)
-    *solution, active, residual = p.kernels.recover(found.v, found.lam, *data, passes)
+    value, z, chi, lam, xi, active, residual = p.kernels.recover(found.v, found.lam, *data, passes)
     status = 0 * found.iterations  # SOLVED, until the residual is judged
-    return BatchSolution(*solution, status, residual, found.iterations, active)
+    return BatchSolution(value, z, chi, lam, xi, status, residual, found.iterations, active)
 
 
 def certify(p: Programs, z: Array, lam: Array, chi: Array, xi: Array) -> tuple[Array, Array]:

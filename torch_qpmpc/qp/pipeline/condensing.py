@@ -117,7 +117,7 @@ def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) 
 def reduce(condensed: Condensed, theta: Theta, group: np.ndarray, n_f: int) -> Reduced:
     """Fix the first n_f entries."""
     x = condensed.arrays
-    return Reduced(*loops.reduce(x, theta, group, n_f, ENTERS), x.T, x.Y_neg)
+    return Reduced._make((*loops.reduce(x, theta, group, n_f, ENTERS), x.T, x.Y_neg))
 
 
 def convex(H: np.ndarray) -> np.ndarray:
@@ -139,8 +139,8 @@ def in_order(C: np.ndarray, n_kept: int) -> Elimination | None:
     Where an unstable model's actions are at their bounds and its states grow, only this recursion
     is accurate in every entry.
     """
-    own = [_in_order(one, n_kept) for one in C]
-    if not C.shape[1] or not all(own):
+    own = [_in_order(one, n_kept) for one in C] if C.shape[1] else [None]
+    if not all(own):
         return None
     T, Y = (np.stack(part) for part in zip(*own, strict=True))
     return Elimination(T, -Y, None) if np.isfinite(T).all() and np.isfinite(Y).all() else None
