@@ -26,11 +26,11 @@ def is_hidden(tensors: Sequence[Tensor]) -> bool:
     core = torch._C
     return (
         torch.compiler.is_compiling()
-        or core._len_torch_dispatch_stack() > 0  # fake tensors, traces
-        or core._get_tracing_state() is not None
+        or core._len_torch_dispatch_stack() > 0  # fake tensors, `make_fx`
+        or core._get_tracing_state() is not None  # `torch.jit.trace`
         or core._dispatch_tls_is_dispatch_key_included(BATCHED_GRADIENTS)
         or _functorch.peek_interpreter_stack() is not None  # `torch.func`
-        or not PLAIN.issuperset(map(type, tensors))
+        or not PLAIN.issuperset(map(type, tensors))  # tensors that fake or wrap others
     )
 
 
@@ -50,7 +50,7 @@ def is_eager(tensors: Sequence[Tensor]) -> bool:
 
 def is_forward_mode() -> bool:
     """True inside `torch.autograd.forward_ad.dual_level` or `torch.func.jvp`."""
-    return forward_ad._current_level >= 0
+    return forward_ad._current_level >= 0  # -1 outside of every level
 
 
 def is_differentiating() -> bool:

@@ -1,0 +1,133 @@
+"""One test for each read of torch's internals: it fails when torch changes what is read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.autograd import forward_ad
+from torch.func import grad, jvp, vmap
+
+from torch_qpmpc.qp import tracing
+
+X = torch.ones(3, dtype=torch.float64)
+
+
+class Seen:
+    """Records what a read says at the place where an instance is called; returns its argument."""
+
+    def __init__(self, read: Any) -> None:
+        self.read, self.values = read, []
+
+    def __call__(self, x: Tensor) -> Tensor:
+        self.values.append(self.read(x))
+        return x.sum()
+
+
+def hidden() -> Seen:
+    return Seen(lambda x: tracing.is_hidden(()))
+
+
+class Subclass(Tensor):
+    pass
+
+
+def test_plain_tensors_are_not_hidden():
+    assert not tracing.is_hidden((X, nn.Parameter(X), X.clone().requires_grad_()))
+    assert tracing.has_values(X)
+    assert tracing.is_eager((X,))
+    assert tracing.transforms() == ()
+
+
+def test_a_dispatch_mode_hides():
+    with FakeTensorMode():
+        assert tracing.is_hidden(())
+    assert not tracing.is_hidden(())
+
+
+def test_a_tensor_class_hides():
+    assert tracing.is_hidden((X, X.as_subclass(Subclass)))
+    assert tracing.is_hidden((FakeTensorMode().from_tensor(X),))
+
+
+def test_a_jit_trace_hides():
+    seen = hidden()
+    torch.jit.trace(seen.__call__, X, check_trace=False)
+    assert seen.values == [True]
+
+
+def test_a_compiled_function_hides():
+    @torch.compile(backend="eager", fullgraph=True)
+    def compiled(x: Tensor) -> Tensor:
+        return x + 1 if tracing.is_hidden((x,)) else x - 1
+
+    assert compiled(X)[0] == 2
+
+
+@pytest.mark.parametrize("transform", [vmap, grad, lambda f: lambda x: jvp(f, (x,), (x,))])
+def test_a_transform_of_torch_func_hides(transform):
+    seen = hidden()
+    transform(seen)(X[:, None] if transform is vmap else X)
+    assert seen.values == [True]
+
+
+class Doubled(torch.autograd.Function):
+    """Its backward records `tracing.is_hidden`."""
+
+    seen: Seen
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return 2 * x
+
+    @staticmethod
+    def backward(ctx: Any, incoming: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        Doubled.seen(incoming)
+        return 2 * incoming
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_a_batch_of_gradients_hides(batched):
+    Doubled.seen = hidden()
+    x = X.clone().requires_grad_()
+    incoming = torch.eye(3).double() if batched else X
+    torch.autograd.grad(Doubled.apply(x), x, incoming, is_grads_batched=batched)
+    assert Doubled.seen.values == [batched]
+
+
+def test_meta_tensors_have_no_values():
+    assert not tracing.has_values(X, X.to("meta"))
+
+
+def test_a_function_mode_is_not_eager():
+    with torch.device("cpu"):
+        assert not tracing.is_eager((X,))
+    assert tracing.is_eager((X,))
+
+
+def test_forward_mode():
+    assert not tracing.is_forward_mode()
+    with forward_ad.dual_level():
+        assert tracing.is_forward_mode()
+        assert not tracing.is_eager((X,))
+        with torch.no_grad():
+            assert tracing.is_differentiating()
+    seen = Seen(lambda x: tracing.is_forward_mode())
+    jvp(seen, (X,), (X,))
+    assert seen.values == [True]
+
+
+def test_reverse_mode_is_differentiating_unless_it_is_off():
+    assert tracing.is_differentiating()
+    with torch.no_grad():
+        assert not tracing.is_differentiating()
+
+
+def test_transforms_from_the_outermost():
+    seen = Seen(lambda x: tracing.transforms())
+    vmap(grad(seen))(X[:, None])
+    jvp(grad(seen), (X,), (X,))
+    assert seen.values == [("Vmap", "Grad"), ("Jvp", "Grad")]
