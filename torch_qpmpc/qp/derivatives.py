@@ -106,9 +106,10 @@ def _of_value(
     incoming: Tensor, theta: Sequence[Tensor], solution: Sequence[Tensor], needed: Sequence[bool]
 ) -> Iterator[Tensor | None]:
     z, chi, lam, xi, status = solution
-    sigma = slacks(z, *theta[5:9]) if needed[8] else z
-    # An unsolved element has zeros here, but zero times an infinite incoming gradient is NaN.
-    weight = torch.where(status == int(Status.SOLVED), incoming, 0)
+    solved = status == int(Status.SOLVED)
+    # An unsolved element has zeros here, but zero times what is infinite or NaN is NaN.
+    weight = torch.where(solved, incoming, 0)
+    sigma = torch.where(solved.unsqueeze(-1), slacks(z, *theta[5:9]), 0) if needed[8] else z
     of_theta = envelope_gradients(weight, z, sigma, chi, lam, xi).values()
     return (f(x) if need else None for f, x, need in zip(of_theta, theta, needed, strict=True))
 

@@ -43,10 +43,10 @@ def both(known: KnownQP) -> tuple[Programs, Programs]:
     return programs_of(known, None), programs_of(known)
 
 
-def reference(known: KnownQP, *claim: Tensor) -> float:
+def reference(known: KnownQP, **claim: Tensor) -> float:
     """The certificate's residual of one QP, as its docstring says it."""
     H, q, _, C, b, G, lb, ub, w = (x.numpy() for x in known.qp.tensors())
-    z, lam, chi, xi = (x.numpy() for x in claim)
+    z, lam, chi, xi = (claim[n].numpy() for n in ("z", "lam", "chi", "xi"))
     n_f = len(xi)
 
     def largest(*vectors: np.ndarray) -> float:
