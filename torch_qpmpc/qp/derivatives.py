@@ -123,7 +123,7 @@ def _of_solution(
     solve: SolveKKT,
 ) -> Iterator[Tensor | None]:
     z, chi, lam, xi, status = solution
-    H, q, _, C, b, G, lb, ub, w, fixed = theta
+    H, q, c, C, b, G, lb, ub, w, fixed = theta
     parts = zip((z, chi, lam, xi), incoming, strict=True)
     pulls = [torch.zeros_like(x) if pull is None else pull for x, pull in parts]
     grad_z, grad_chi, grad_lam, grad_xi = pulls
@@ -133,7 +133,7 @@ def _of_solution(
     of_theta = (
         lambda: -0.5 * (outer(p, z, H) + outer(z, p, H)),
         lambda: sum_to(-p, q),
-        lambda: None,
+        lambda: torch.zeros_like(c),
         lambda: -(outer(chi, p, C) + outer(r, z, C)),
         lambda: sum_to(r, b),
         lambda: -(outer(lam, p, G) + outer(t, z, G)),
