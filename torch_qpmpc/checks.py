@@ -68,7 +68,7 @@ def check_tensor(
         remedy: the message's end if the shape is wrong.
 
     Raises:
-        QPError: it is not.
+        QPError: its type, shape or device is wrong.
     """
     if not isinstance(value, Tensor) or not value.is_floating_point():
         got = value.dtype if isinstance(value, Tensor) else type(value).__name__

@@ -76,7 +76,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "solve_qp: dict": (
         lambda: qm.solve_qp(GOOD),
-        "qp: got dict, expected a QuadraticProgram. Pass mpc.quadratic_dratic_progra",
+        "qp: got dict, expected a QuadraticProgram. Pass mpc.quadratic_progra",
     ),
     "solve_qp: fixed numpy": (
         lambda: qm.solve_qp(qp, fixed.numpy()),

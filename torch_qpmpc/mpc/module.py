@@ -1,8 +1,8 @@
 """QPMPC: the module that holds theta and computes V, Q and the policy (eq:qp4, eq:qp5).
 
 It is a generic QP whose constraint matrix C starts as that of a linear MPC scheme (eq:cband) and
-becomes free, or stays one (eq:v1, eq:q1). All values are costs to go, as in the paper; rewards are
-the matter of `torch_qpmpc.learning.operators`.
+becomes free, or stays one (eq:v1, eq:q1). All values are costs to go, as in the paper; rewards
+appear only in `torch_qpmpc.learning`.
 """
 
 from __future__ import annotations
@@ -157,9 +157,9 @@ class QPMPC(nn.Module):
         on_failure: str = "raise",
         seed: int = 0,
     ) -> None:
-        given = {name: x for name, x in locals().items() if name not in ("self", "__class__")}
+        passed = {name: x for name, x in locals().items() if name not in ("self", "__class__")}
         # Copies for reset_parameters and pickle, as the caller may change its arrays.
-        arguments = {name: own(value) for name, value in given.items()}
+        arguments = {name: own(value) for name, value in passed.items()}
         super().__init__()
         check_structure(**arguments)
         arguments |= {name: int(arguments[name]) for name in ("n_x", "n_u", "horizon", "seed")}
@@ -171,12 +171,13 @@ class QPMPC(nn.Module):
             self.to(device)
 
     def _start(self, learn: Collection[str]) -> None:
-        given = self._arguments
-        self._layout, theta = initial.theta(**given)
-        self.n_x, self.n_u, self.horizon = (given[name] for name in ("n_x", "n_u", "horizon"))
-        self.n_z, self.gamma, self.hessian = self._layout.n_z, given["gamma"], given["hessian"]
-        self.structure, self.step = given["structure"], given["step"]
-        self.solver, self.on_failure = given["solver"], given["on_failure"]
+        arguments = self._arguments
+        self._layout, theta = initial.theta(**arguments)
+        self.n_x, self.n_u, self.horizon = (arguments[name] for name in ("n_x", "n_u", "horizon"))
+        self.n_z, self.gamma = self._layout.n_z, arguments["gamma"]
+        self.hessian, self.structure = arguments["hessian"], arguments["structure"]
+        self.step = arguments["step"]
+        self.solver, self.on_failure = arguments["solver"], arguments["on_failure"]
         self.learned = tuple(name for name in (*COST, *CONSTRAINTS) if name in learn)
         self._masks = learned_entries(learn, theta)
         self.register_buffer("C_0", theta["C"].to(torch.float64))
@@ -270,7 +271,8 @@ class QPMPC(nn.Module):
             qp: the `quadratic_program` of the current theta, if it is available.
 
         Raises:
-            QPError: an argument is invalid, or theta or the states are not finite.
+            QPError: an argument is invalid, or (with ``on_failure="raise"``) all unsolved QPs have
+                invalid data.
             SolverError: with ``on_failure="raise"``, a QP has no certified solution.
         """
         return self._solve(self._checked(s, a), qp, warm_start)

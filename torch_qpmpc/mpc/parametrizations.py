@@ -264,8 +264,8 @@ def _spectrum(H: Tensor) -> tuple[Tensor, Tensor]:
     return eigenvalues, vectors
 
 
-def _check_tied(name: str, given: Tensor, tied: Tensor) -> None:
-    if not torch.equal(given, tied):
+def _check_tied(name: str, entries: Tensor, tied: Tensor) -> None:
+    if not torch.equal(entries, tied):
         raise QPError.expected(
             name,
             "entries that break the structure of a linear MPC scheme",

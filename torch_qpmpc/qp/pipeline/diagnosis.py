@@ -1,4 +1,4 @@
-"""The cause if a QP (eq:qp2, eq:qp3) is unsolved: infeasible, unbounded, or not converged.
+"""The cause of an unsolved QP (eq:qp2, eq:qp3): infeasible, unbounded, or not converged.
 
 A diagnosis needs a proof in the QP's own numbers, checked in all entries of z. A proof that could
 result from rounding, or that has an error larger than rounding, does not count:

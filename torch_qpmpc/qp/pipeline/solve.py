@@ -22,7 +22,7 @@ from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, 
 
 #: Rejected solutions with a relative residual up to this are refined.
 NEARLY = 1e-2
-#: Number of iterative refinements after another elimination.
+#: Number of iterative refinements after an alternative elimination.
 PASSES = 2
 
 
@@ -76,7 +76,7 @@ class SolveLog:
         }
 
     def add(self, solution: BatchSolution, seconds: float) -> None:
-        """Count a batch."""
+        """Count a solved batch, and its seconds."""
         accepted = solution.residual[solution.accepted()]
         self.solves += len(solution.residual)
         self.unsolved += len(solution.residual) - len(accepted)
@@ -229,7 +229,7 @@ def _unconstrained(qps: SoftQPs) -> BackendSolution:
 def _solved_otherwise(
     p: Programs, solution: BatchSolution, solver: str, log: SolveLog
 ) -> BatchSolution:
-    """Diagnose rejected QPs, and solve those without a proof by fallbacks.
+    """Diagnose rejected QPs, and solve those that may have a solution by fallbacks.
 
     Other eliminations of C z = b come first, for ill-conditioned QPs, then the other solvers.
     """

@@ -1,10 +1,10 @@
 """The warm start of every solver: the active set of a nearly equal QP, tried for a whole batch.
 
-Between two visits to a transition theta changes little, and most active sets stay. With a fixed
-set, the KKT conditions are linear in its multipliers, and need one Cholesky factor per QP, of the
-active part of K = G H^-1 G'. If the signs of the solution contradict the set, the rows concerned
-change their state, and the new set is tried. QPs that do not settle go to the backend; the
-certificate judges every result. A QP without a known set starts from the empty one, and usually
+Between two visits to a transition theta changes little, and most active sets stay the same. With a
+fixed set, the KKT conditions are linear in its multipliers, and need one Cholesky factor per QP, of
+the active part of K = G H^-1 G'. If the signs of the solution contradict the set, the rows
+concerned change their state, and the new set is tried. QPs that do not settle go to the backend;
+the certificate judges every result. A QP without a known set starts from the empty one, and usually
 settles.
 """
 

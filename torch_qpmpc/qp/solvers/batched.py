@@ -136,5 +136,5 @@ class BatchedQPs:
 
 
 def _largest(x: Tensor) -> Tensor:
-    """Return the largest absolute entry along the last dimension, which has size one."""
+    """Return the largest absolute entry along the last dimension, which is kept."""
     return largest(x).unsqueeze(-1)
