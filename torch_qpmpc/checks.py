@@ -1,6 +1,6 @@
-"""Checks of what a caller passes, at the public boundary; each names the argument and the remedy.
+"""Checks of arguments at the public boundary.
 
-Only types, shapes and plain numbers: to look at a tensor's values would cost time in every call.
+They cover types, shapes and plain numbers; reading a tensor's values would slow down every call.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def check_whole(name: str, value: Any, least: int, remedy: str = "") -> None:
 def check_number(
     name: str, value: Any, accepts: Callable[[Any], bool], expected: str, remedy: str = ""
 ) -> None:
-    """Raise `QPError` unless ``value`` is a number that ``accepts`` does; nan is to be refused."""
+    """Raise `QPError` unless ``value`` is a number with ``accepts(value)``, False for NaN."""
     if not isinstance(value, Real) or isinstance(value, bool) or not accepts(value):
         raise QPError.expected(name, repr(value), expected, remedy)
 
@@ -44,7 +44,7 @@ def check_flag(name: str, value: Any) -> None:
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Raise `QPError` unless ``value`` is one of some names."""
+    """Raise `QPError` unless ``value`` is one of ``choices``."""
     if not isinstance(value, str) or value not in choices:
         raise QPError.expected(name, repr(value), f"one of {', '.join(choices)}")
 
@@ -57,15 +57,18 @@ def check_tensor(
     device: torch.device | None = None,
     remedy: str = "",
 ) -> Tensor:
-    """``value``; `QPError` unless it is a floating-point tensor that fits.
+    """Return ``value`` if it is a floating-point tensor of the expected shape and device.
 
     Args:
-        name: of the argument.
-        value: what came.
-        event: the trailing dimensions; a name stands for any size.
-        batched: whether there may be others before them.
-        device: where it is to be; anywhere by default.
-        remedy: for another shape.
+        name: the argument's name.
+        value: the argument.
+        event: its trailing dimensions; a string stands for any size.
+        batched: accept leading batch dimensions.
+        device: the required device; any by default.
+        remedy: the message's end if the shape is wrong.
+
+    Raises:
+        QPError: its type, shape or device is wrong.
     """
     if not isinstance(value, Tensor) or not value.is_floating_point():
         got = value.dtype if isinstance(value, Tensor) else type(value).__name__

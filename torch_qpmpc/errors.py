@@ -1,17 +1,35 @@
-"""The two exceptions of the package: bad input, and a QP that could not be solved."""
+"""The package's two exceptions: invalid input, and a QP without a certified solution."""
 
 from __future__ import annotations
 
 
 class QPError(ValueError):
-    """Bad input: names the argument, what came, what was expected, and the remedy."""
+    """Invalid input. The message names the argument, what it got, what it expected, and a remedy.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> qm.QPMPC(2, 1, horizon=0)
+        Traceback (most recent call last):
+        ...
+        torch_qpmpc.errors.QPError: horizon: got 0, expected a positive integer.
+    """
 
     @classmethod
     def expected(cls, name: str, got: object, expected: str, remedy: str = "") -> QPError:
-        """The one form that every message about bad input takes."""
+        """Return the error with the message ``NAME: got GOT, expected EXPECTED. REMEDY``."""
         tail = f" {remedy}" if remedy else ""
         return cls(f"{name}: got {got}, expected {expected}.{tail}")
 
 
 class SolverError(RuntimeError):
-    """A QP has no certified solution: infeasible, unbounded, or not solved to tolerance."""
+    """A QP has no certified solution: it is infeasible, unbounded, or not solved to tolerance.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> bounds = {"state_bounds": ([-1.0], [1.0]), "state_slack": torch.inf}
+        >>> mpc = qm.QPMPC(1, 1, 3, **bounds)
+        >>> mpc.value(torch.tensor([2.0]))  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        torch_qpmpc.errors.SolverError: 1 of 1 QPs have no certified solution. 1 INFEASIBLE: ...
+    """

@@ -44,7 +44,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QuadraticProgram: device": (
         Q(q=GOOD["q"].to("meta")),
-        "q: got a tensor on meta, expected one on H's cpu. Move all nine to one devi",
+        "q: got a tensor on meta, expected one on H's device, cpu. Move all nine to",
     ),
     "QuadraticProgram: H negative": (
         Q(H=-GOOD["H"]),
@@ -72,11 +72,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "solve_qp: mpc": (
         lambda: qm.solve_qp(mpc),
-        "qp: got ParametrizedQPMPC, expected a QuadraticProgram. Of a QPMPC: mpc.qua",
+        "qp: got ParametrizedQPMPC, expected a QuadraticProgram. Pass mpc.quadratic_",
     ),
     "solve_qp: dict": (
         lambda: qm.solve_qp(GOOD),
-        "qp: got dict, expected a QuadraticProgram. Of a QPMPC: mpc.quadratic_progra",
+        "qp: got dict, expected a QuadraticProgram. Pass mpc.quadratic_progra",
     ),
     "solve_qp: fixed numpy": (
         lambda: qm.solve_qp(qp, fixed.numpy()),
@@ -269,7 +269,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "QPMPC.from_model: a reward's weight": (
         lambda: qm.QPMPC.from_model(A2, B1, 3, stage_weight=[-1.0, -1.0, -0.1]),
         "stage_weight: got smallest eigenvalue -1, expected a positive semidefinite weight. It "
-        "weighs a cost: turn the sign of a reward's.",
+        "weights a cost: negate a reward's weight.",
     ),
     "QPMPC.from_model: swapped": (
         lambda: qm.QPMPC.from_model(torch.ones(2, 1), torch.eye(2), 3),
@@ -401,6 +401,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPMPC.parameter_groups: unlearned": (
         lambda: mpc.parameter_groups({"cost": 1.0, "constraints": 1.0, "G": 1.0}),
-        "rates: got ['G'], expected parts that are learned: H, c, C. Name them in le",
+        "rates: got ['G'], expected parts that are learned: H, c, C. Add them to lear",
     ),
 }

@@ -341,7 +341,9 @@ def test_a_state_dict_from_before_is_loaded():
 def test_what_the_constructor_decides_is_not_assigned(name, value):
     mpc = random_mpc(0)
     own = getattr(mpc, name)
-    with pytest.raises(QPError, match=f"{name}: got .*, expected .*, as made. Make another QPMPC"):
+    with pytest.raises(
+        QPError, match=f"{name}: got .*, expected .*, as created. Create another QPMPC"
+    ):
         setattr(mpc, name, value)
     assert getattr(mpc, name) == own
 
@@ -373,7 +375,9 @@ def test_a_converted_state_dict_is_loaded(convert):
 @pytest.mark.parametrize("junk", [None, torch.zeros(3), torch.tensor([91, 93])])
 def test_an_identity_that_cannot_be_read_is_named(junk):
     mpc = random_mpc(0)
-    message = "state_dict: got an _extra_state that cannot be read .*, expected what a QPMPC wrote"
+    message = (
+        "state_dict: got an _extra_state that cannot be read .*, expected one that QPMPC wrote"
+    )
     with pytest.raises(QPError, match=message):
         mpc.load_state_dict(mpc.state_dict() | {"_extra_state": junk})
 

@@ -451,11 +451,11 @@ def test_it_shows_what_it_is():
         ({"structure": "banded"}, "structure: got 'banded', expected one of free, varying, tied"),
         (
             {"structure": "tied", "learn": ["G"]},
-            "learn: got 'G', expected parts that there are. Give constraints, or structure='free'",
+            "learn: got 'G' without constraints, expected other parts. Pass constraints, or ",
         ),
         (
             {"structure": "tied", "A": torch.eye(2) * torch.ones(3, 1, 1).cumsum(0)},
-            "C: got entries that a linear MPC scheme does not have, expected what its stages tie",
+            "C: got entries that break the structure of a linear MPC scheme, expected entries",
         ),
         ({"constraints": 1.0}, r"constraints: got 1.0, expected the triple \(D, lower, upper\)"),
         (

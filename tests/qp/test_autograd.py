@@ -578,7 +578,9 @@ def test_a_batch_that_is_too_large_for_memory_is_named(error, differentiated, mo
     monkeypatch.setattr("torch_qpmpc.qp.boundary.solve_programs", fail)
     known = known_qp(1, batch=(4, 3))
     fixed = known.fixed.clone().requires_grad_(differentiated)
-    message = r"batch: got 12 QPs of n_z = 12, expected as many as .* Solve it in chunks, .*memory"
+    message = (
+        r"batch: got 12 QPs of n_z = 12, expected as many as .* Solve the batch in chunks, .*memory"
+    )
     if "array" in str(error):
         message = message.replace("memory", "array")
     with pytest.raises(QPError, match=message):

@@ -182,7 +182,7 @@ def test_second_derivative_of_the_value_in_every_operand(name):
 def test_a_third_derivative_is_refused():
     mpc, s = random_mpc(0), random_states(1)[0].requires_grad_()
     (first,) = torch.autograd.grad(mpc.policy(s).sum(), s, create_graph=True)
-    with pytest.raises(QPError, match="derivative: got a second one of the solution, or a third"):
+    with pytest.raises(QPError, match="derivative: got the second of the solution, or the third"):
         first.sum().backward()
 
 

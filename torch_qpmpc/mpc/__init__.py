@@ -1,1 +1,1 @@
-"""Theta as the parameters of a module, and the linear MPC schemes it starts from or stays in."""
+"""Theta as the parameters of a module that starts as a linear MPC scheme, and may stay one."""

@@ -1,7 +1,7 @@
-"""The banded constraint matrix of a linear MPC scheme (eq:cband), and where its band is.
+"""The banded constraint matrix of a linear MPC scheme (eq:cband), and distances from its band.
 
 Rows are grouped in N blocks of n_x, columns in the order of z = [x_0, u_0, x_1, .., x_N]. In row
-block k the band is (x_k, u_k, x_{k+1}); what is right of it is above the band, what is left below.
+block k the band is (x_k, u_k, x_{k+1}); columns to its right are above it, those to its left below.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch_qpmpc.errors import QPError
 
 
 def banded_matrix(A: Tensor, B: Tensor, horizon: int) -> Tensor:
-    """C_0 of the model x+ = A x + B u, so that ``C_0 z = 0`` is the model over the horizon.
+    """Return C_0 for the model x+ = A x + B u: ``C_0 z = 0`` is the model over the horizon.
 
     Args:
         A: ``(n_x, n_x)``, or ``(N, n_x, n_x)`` for one per stage.
@@ -25,7 +25,7 @@ def banded_matrix(A: Tensor, B: Tensor, horizon: int) -> Tensor:
         ``(N n_x, N (n_x + n_u) + n_x)``.
 
     Raises:
-        QPError: A and B do not fit each other or the horizon.
+        QPError: the shapes of A and B do not match each other or the horizon.
     """
     n_x, n_u = A.shape[-1], B.shape[-1]
     for name, matrix, shape in (("A", A, (n_x, n_x)), ("B", B, (n_x, n_u))):
@@ -39,7 +39,7 @@ def banded_matrix(A: Tensor, B: Tensor, horizon: int) -> Tensor:
 
 
 def band_distance(n_x: int, n_u: int, horizon: int) -> Tensor:
-    """Signed distance from the band in stages, ``(N n_x, n_z)``: 0 on it, positive above it."""
+    """Return the signed distance from the band in stages, ``(N n_x, n_z)``, > 0 above it."""
     row = torch.arange(horizon).repeat_interleave(n_x).unsqueeze(1)
     n_z = horizon * (n_x + n_u) + n_x
     column = torch.arange(n_z)

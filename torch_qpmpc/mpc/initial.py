@@ -1,4 +1,4 @@
-"""Where theta starts: the arguments as the tensors of a QP (eq:qp5), before discounts (eq:qpH)."""
+"""The initial theta: arguments as the tensors of a QP (eq:qp5), before discounts (eq:qpH)."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def theta(
     seed: int,
     **_: Any,
 ) -> tuple[Layout, dict[str, Tensor]]:
-    """All parts of theta by name, for the arguments of `QPMPC`; w is inf on hard rows."""
+    """Return the layout and theta by part, from the arguments of `QPMPC`; w is inf on hard rows."""
     D = _linear_rows("constraints", constraints, n_x + n_u)
     D_f = _linear_rows("terminal_constraints", terminal_constraints, n_x)
     layout = Layout(n_x, n_u, horizon, len(D[0]), len(D_f[0]))
     if "G" in learn and structure != "free" and not layout.n_linear:
-        remedy = "Give constraints, or structure='free'."
-        raise QPError.expected("learn", "'G'", "parts that there are", remedy)
+        remedy = "Pass constraints, or structure='free'."
+        raise QPError.expected("learn", "'G' without constraints", "other parts", remedy)
     random = torch.Generator().manual_seed(seed)
     A, B = _model(A, B, n_x, n_u, random)
     C = banded_matrix(A, B, horizon)
@@ -85,7 +85,7 @@ def theta(
 
 
 def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dict[str, Any]:
-    """What `QPMPC.linear_mpc` chooses where ``options`` do not."""
+    """Return the defaults of `QPMPC.linear_mpc` for ``options``."""
     A, B = check_model(A, B)
     n_x, n_u = A.shape[-1], B.shape[-1]
     learn = ["H", "H_f", "q", "c", "C", "b", "lb", "ub", "w"]
@@ -104,7 +104,7 @@ def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dic
 
 
 def _model(A: Any, B: Any, n_x: int, n_u: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
-    """A and B as given, or random."""
+    """Return A and B as tensors, or random ones for None."""
     if A is None:
         A = torch.eye(n_x, dtype=torch.float32) + 0.1 * torch.randn(
             n_x, n_x, generator=random, dtype=torch.float32
@@ -126,19 +126,19 @@ def _riccati_weight(
     sizes = {"A": (A, layout.n_x, layout.n_x), "B": (B, layout.n_x, layout.n_u)}
     for name, (matrix, *shape) in (sizes | {"stage_weight": (W, layout.n, layout.n)}).items():
         if list(matrix.shape) != shape:
-            got, remedy = f"shape {tuple(matrix.shape)}", "The Riccati equation has one stage."
+            got, remedy = f"shape {tuple(matrix.shape)}", "The Riccati equation has one stage only."
             raise QPError.expected(name, got, f"shape {tuple(shape)}", remedy)
     return riccati_weight(A, B, W, gamma)
 
 
 def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
-    """P ``(n_x, n_x)`` of the discounted linear quadratic regulator, whose cost to go is 1/2 x'Px.
+    """Return P ``(n_x, n_x)`` of the discounted linear quadratic regulator's cost to go 1/2 x'Px.
 
-    Without active bounds, an MPC scheme that has it as H_f is that regulator, at any horizon.
+    Without active bounds, an MPC scheme with H_f = P is that regulator, for any horizon.
 
     Args:
         A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
-        W: of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
+        W: weight of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
         gamma: discount of the stage costs.
 
     Raises:
@@ -180,7 +180,7 @@ def _bounds(
     D: tuple[Tensor, ...],
     D_f: tuple[Tensor, ...],
 ) -> dict[str, Tensor]:
-    """lb and ub ``(n_g,)``."""
+    """Return lb and ub ``(n_g,)`` by name."""
     x = bound_pair("state_bounds", state_bounds, layout.n_x)
     u = bound_pair("action_bounds", action_bounds, layout.n_u)
     lower, upper = (layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], strict=True))
@@ -188,7 +188,7 @@ def _bounds(
 
 
 def _slack_weights(layout: Layout, state: Any, action: Any, constraint: Any) -> Tensor:
-    """w ``(n_g,)``, inf on hard rows."""
+    """Return w ``(n_g,)``, inf on hard rows."""
     return layout.rows(
         slack_weight("state_slack", state, layout.n_x),
         slack_weight("action_slack", action, layout.n_u),

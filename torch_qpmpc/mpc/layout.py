@@ -1,4 +1,4 @@
-"""Where a stage's entries are, in z and among the rows of G, and what a linear MPC scheme ties.
+"""The order of the stages in z and in the rows of G, and the ties of a linear MPC scheme.
 
 The rows of G are one for each entry of z, then those of D on (x_k, u_k) for each stage, then those
 of D^f on x_N (eq:v1c4).
@@ -14,7 +14,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Layout:
-    """N, n_x and n_u, and how many rows D and D^f have."""
+    """The sizes N, n_x and n_u, and the numbers of rows of D and D^f."""
 
     n_x: int
     n_u: int
@@ -29,31 +29,32 @@ class Layout:
 
     @property
     def n_z(self) -> int:
+        """Entries of z, N (n_x + n_u) + n_x."""
         return self.horizon * self.n + self.n_x
 
     @property
     def n_linear(self) -> int:
-        """Rows of G that are no bounds."""
+        """Rows of G other than bounds."""
         return self.horizon * self.n_d + self.n_d_f
 
     def entries(self, x: Tensor, u: Tensor) -> Tensor:
-        """``(n_z,)`` from values of x ``(N + 1, n_x)`` and u ``(N + 1, n_u)``; there is no u_N."""
+        """Arrange x ``(N + 1, n_x)`` and u ``(N + 1, n_u)`` as z ``(n_z,)``, without u_N."""
         x, u = (part.expand(self.horizon + 1, -1) for part in (x, u))
         return torch.cat((x, u), dim=-1).flatten()[: self.n_z]
 
     def rows(self, x: Tensor, u: Tensor, d: Tensor, d_f: Tensor) -> Tensor:
-        """``(n_g,)`` from those values, and from those of D ``(N, n_d)`` and D^f ``(n_d_f,)``."""
+        """Arrange values of x, u, D ``(N, n_d)`` and D^f ``(n_d_f,)`` as rows of G ``(n_g,)``."""
         return torch.cat((self.entries(x, u), d.expand(self.horizon, -1).flatten(), d_f))
 
     def discounts(self, gamma: float) -> tuple[Tensor, Tensor]:
-        """gamma^k of the entries of z ``(n_z,)`` and of the rows of G ``(n_g,)``."""
+        """Return gamma^k for the entries of z ``(n_z,)`` and for the rows of G ``(n_g,)``."""
         powers = gamma ** torch.arange(self.horizon + 1, dtype=torch.float64).unsqueeze(-1)
         x, u = powers.expand(-1, self.n_x), powers.expand(-1, self.n_u)
         d, d_f = powers[:-1].expand(-1, self.n_d), powers[-1].expand(self.n_d_f)
         return self.entries(x, u), self.rows(x, u, d, d_f)
 
     def ties(self, part: str) -> Tensor:
-        """Which of its values each entry of a tied q, b, lb, ub or w has.
+        """Return the index of the value of each entry of a tied q, b, lb, ub or w.
 
         x_N has values of its own in q and w, as w^f in eq:v1c0, but not in lb and ub.
         """
@@ -69,7 +70,7 @@ class Layout:
         return self.rows(x, u, n + d, n + self.n_d + d_f)
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """The states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
+        """Return the states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
         stages = z[..., : self.horizon * self.n].unflatten(-1, (self.horizon, self.n))
         terminal = z[..., None, self.horizon * self.n :]
         return torch.cat((stages[..., : self.n_x], terminal), -2), stages[..., self.n_x :]
@@ -77,14 +78,14 @@ class Layout:
     def hessian(
         self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor, stages: Tensor
     ) -> Tensor:
-        """H ``(n_z, n_z)`` (eq:qpH) from those of the stages and of x_N, or from itself if full.
+        """Return H ``(n_z, n_z)`` (eq:qpH) from those of the stages and of x_N, or from a full H.
 
         ``stages`` is ``ties("q")``, for a diagonal H that all stages share.
         """
         H = blocks[0]
         if kind == "diagonal":
             entries = torch.cat((H.flatten(), blocks[1]))
-            if H.ndim == 1:  # to expand it takes longer
+            if H.ndim == 1:  # faster than expand
                 entries = entries.index_select(0, stages)
             return torch.diag_embed(discount * entries)
         if kind == "block":

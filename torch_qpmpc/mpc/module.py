@@ -1,8 +1,8 @@
-"""QPMPC: the module that owns theta and turns it into V, Q and the policy (eq:qp4, eq:qp5).
+"""QPMPC: the module that holds theta and computes V, Q and the policy (eq:qp4, eq:qp5).
 
-A generic QP whose constraint matrix C starts as that of a linear MPC scheme (eq:cband) and may
-leave it, or stays one (eq:v1, eq:q1). Everything here is a cost to go, as in the paper; rewards
-begin in `operators`.
+It is a generic QP whose constraint matrix C starts as that of a linear MPC scheme (eq:cband) and
+becomes free, or stays one (eq:v1, eq:q1). All values are costs to go, as in the paper; rewards
+appear only in `torch_qpmpc.learning`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import initial, parameters, pickling
 from torch_qpmpc.mpc.cost import Discounts, discounted
-from torch_qpmpc.mpc.identity import check_identity, digest, written
-from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, kept
+from torch_qpmpc.mpc.identity import check_identity, digest, encoded
+from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST
 from torch_qpmpc.mpc.validation import (
     CONSTRAINTS,
@@ -37,7 +37,7 @@ from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
 from torch_qpmpc.qp.solvers import backend
 
-#: What the constructor, or `QPMPC.release`, decides once and for all.
+#: Attributes that only the constructor and `QPMPC.release` set.
 FIXED = ("n_x", "n_u", "n_z", "horizon", "gamma", "hessian", "structure", "step", "learned")
 
 
@@ -53,45 +53,49 @@ class QPMPC(nn.Module):
         n_u: number of actions.
         horizon: N, at least 1.
         gamma: discount of the stage costs, 0 < gamma <= 1.
-        A, B: the model that C starts from, ``(n_x, n_x)`` and ``(n_x, n_u)``, or one per stage,
-            ``(N, n_x, n_x)`` and ``(N, n_x, n_u)``. By default random: A the identity plus, and B,
-            normal entries with standard deviation 0.1.
-        offset: of the model, x+ = A x + B u + offset, ``(n_x,)``, where b starts; zero by default.
-        state_bounds, action_bounds: pairs of ``(n_x,)`` and ``(n_u,)``; unbounded by default.
+        A, B: the initial model in C, ``(n_x, n_x)`` and ``(n_x, n_u)``, or one per stage,
+            ``(N, n_x, n_x)`` and ``(N, n_x, n_u)``. By default, A is the identity plus, and B is,
+            random normal entries with standard deviation 0.1.
+        offset: the offset of the model x+ = A x + B u + offset, ``(n_x,)``, which gives the initial
+            b; zero by default.
+        state_bounds, action_bounds: pairs (lower, upper) of ``(n_x,)`` and of ``(n_u,)``; unbounded
+            by default.
         constraints: mixed constraints of each stage, ``lower <= D [x_k; u_k] <= upper`` (eq:v1c4),
-            as the triple of D ``(n_d, n_x + n_u)`` and its bounds ``(n_d,)``.
-        terminal_constraints: likewise of x_N, with D^f ``(n_d_f, n_x)``.
-        structure: what the learned parts of theta tie. ``"free"``: nothing, C is a matrix (eq:qp5).
-            ``"tied"``: they are those of a linear MPC scheme (eq:q1), with one A, B, D and one
+            as the triple (D, lower, upper) of ``(n_d, n_x + n_u)`` and ``(n_d,)`` twice.
+        terminal_constraints: the same for x_N, with D^f ``(n_d_f, n_x)``.
+        structure: the ties between learned parts of theta. ``"free"``: none, C is any matrix
+            (eq:qp5). ``"tied"``: those of a linear MPC scheme (eq:q1), with one A, B, D and one
             entry of b, q, lb, ub and w for all stages; ``"varying"``: with one for each stage.
-            In both, the bounds of hard rows stay as they are, as they are known limits (eq:v1c3).
+            In both, the bounds of hard rows are known limits (eq:v1c3), and are not learned.
         hessian: ``"diagonal"``, ``"block"`` (one dense block a stage) or ``"full"`` (dense in z).
-        stage_weight: start of H_k, ``(n_x + n_u,)`` if diagonal, else ``(n_x + n_u, n_x + n_u)``,
-            with an optional leading N for a weight of each stage's own; by default diagonal
-            random entries uniform in (0.5, 5) on the states and zero on the actions. The cost of a
-            stage is *half* of ``[x_k; u_k]' H_k [x_k; u_k]`` (eq:qpH): a plant's ``s'Ws`` is 2 W.
-        terminal_weight: start of H_f, ``(n_x,)`` or ``(n_x, n_x)``; the identity by default.
+        stage_weight: the initial H_k, ``(n_x + n_u,)`` if diagonal, else
+            ``(n_x + n_u, n_x + n_u)``, with an optional leading N for one weight per stage; by
+            default diagonal, random uniform in (0.5, 5) for states and zero for actions. The cost
+            of a stage is *half* of ``[x_k; u_k]' H_k [x_k; u_k]`` (eq:qpH): for a plant's cost
+            ``s'Ws``, pass 2 W.
+        terminal_weight: the initial H_f, ``(n_x,)`` or ``(n_x, n_x)``; the identity by default.
             ``"riccati"``: the cost to go of the linear quadratic regulator of A, B and the stage
             weight; not for a diagonal hessian.
         state_slack, action_slack, constraint_slack: the slack weights w of the rows of states, of
-            actions, and of mixed and terminal constraints; ``inf`` makes them hard. Hard actions
-            by default, and the others soft. One for all, or for states and actions one for each.
+            actions, and of mixed and terminal constraints; ``inf`` makes them hard. By default,
+            actions are hard and the others soft. Pass one weight, or for states and actions one
+            per entry.
         discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
-        learn: which of H, H_f, q, c, C, b, G, lb, ub, w are parameters; the others are buffers.
-            As a mapping, ``{"H": True, "C": mask}``, only the entries where a mask is true are
-            learned, such as all but the rows of a constant reference. A mask has the part's shape.
-        step: how H and H_f stay positive semidefinite and w non-negative while they are learned
-            (eq:sdp1). ``"cholesky"``: theta is a factor of them. ``"projection"`` and ``"sdp"``:
-            theta is H itself, and `project_` after each step puts it back, by eigenvalues or by a
-            semidefinite program; see `torch_qpmpc.mpc.projections`.
-        solver, on_failure: as in `solve_qp`.
-        seed: of the random starts.
+        learn: the parameters among H, H_f, q, c, C, b, G, lb, ub, w; the others are buffers. In a
+            mapping, ``{"H": True, "C": mask}``, a mask of the part's shape is True at the entries
+            that are learned, for example at all but the rows of a constant reference.
+        step: the rule that keeps H and H_f positive semidefinite and w non-negative (eq:sdp1).
+            ``"cholesky"``: theta is a factor of them. ``"projection"`` and ``"sdp"``: theta is H
+            itself, which `project_` corrects after each step, by eigenvalues or by a semidefinite
+            program; see `torch_qpmpc.mpc.projections`.
+        solver, on_failure: see `solve_qp`.
+        seed: the seed of random initial values.
 
     Attributes:
-        C_0: the banded matrix that C started from, ``(N n_x, n_z)``.
+        C_0: the initial banded C, ``(N n_x, n_z)``.
 
     Raises:
-        QPError: an argument that does not fit, by name.
+        QPError: an argument is invalid.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -153,9 +157,9 @@ class QPMPC(nn.Module):
         on_failure: str = "raise",
         seed: int = 0,
     ) -> None:
-        given = {name: x for name, x in locals().items() if name not in ("self", "__class__")}
-        # Copies: reset_parameters and pickle make it anew, whatever becomes of the caller's arrays.
-        arguments = {name: own(value) for name, value in given.items()}
+        passed = {name: x for name, x in locals().items() if name not in ("self", "__class__")}
+        # Copies for reset_parameters and pickle, as the caller may change its arrays.
+        arguments = {name: own(value) for name, value in passed.items()}
         super().__init__()
         check_structure(**arguments)
         arguments |= {name: int(arguments[name]) for name in ("n_x", "n_u", "horizon", "seed")}
@@ -167,12 +171,13 @@ class QPMPC(nn.Module):
             self.to(device)
 
     def _start(self, learn: Collection[str]) -> None:
-        given = self._arguments
-        self._layout, theta = initial.theta(**given)
-        self.n_x, self.n_u, self.horizon = (given[name] for name in ("n_x", "n_u", "horizon"))
-        self.n_z, self.gamma, self.hessian = self._layout.n_z, given["gamma"], given["hessian"]
-        self.structure, self.step = given["structure"], given["step"]
-        self.solver, self.on_failure = given["solver"], given["on_failure"]
+        arguments = self._arguments
+        self._layout, theta = initial.theta(**arguments)
+        self.n_x, self.n_u, self.horizon = (arguments[name] for name in ("n_x", "n_u", "horizon"))
+        self.n_z, self.gamma = self._layout.n_z, arguments["gamma"]
+        self.hessian, self.structure = arguments["hessian"], arguments["structure"]
+        self.step = arguments["step"]
+        self.solver, self.on_failure = arguments["solver"], arguments["on_failure"]
         self.learned = tuple(name for name in (*COST, *CONSTRAINTS) if name in learn)
         self._masks = learned_entries(learn, theta)
         self.register_buffer("C_0", theta["C"].to(torch.float64))
@@ -184,30 +189,36 @@ class QPMPC(nn.Module):
         for name, start in theta.items():
             parameters.register(self, name, start.to(torch.float64).clone(), name in self.learned)
             if name in self.learned:
-                parameters.keep(self, name, self._kept(name))
+                parameters.attach(self, name, self._parametrizations_for(name))
 
     @classmethod
     def from_model(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
-        """A QPMPC whose C starts at the banded C_0 of the model x+ = A x + B u (eq:cband).
+        """Return a QPMPC whose C starts as the banded C_0 of the model x+ = A x + B u (eq:cband).
 
         Args:
-            A, B: as for `QPMPC`, from which n_x and n_u are read.
+            A, B: see `QPMPC`; their shapes give n_x and n_u.
             horizon: N.
             options: the keyword arguments of `QPMPC`.
+
+        Raises:
+            QPError: an argument is invalid.
         """
         A, B = check_model(A, B)
         return cls(A.shape[-1], B.shape[-1], horizon, A=A, B=B, **options)
 
     @classmethod
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
-        """The MPC end of the bridge: a linear MPC scheme, all of which is learned (eq:v1, eq:q1).
+        """Return a linear MPC scheme with all parts learned (eq:v1, eq:q1).
 
-        `from_model` with other defaults: ``structure="tied"``, dense weights that start as the
-        identity and, for x_N, from the Riccati equation, discounted slack weights, and all parts
-        of theta among those to ``learn``. `release` leaves it.
+        It is `from_model` with other defaults: ``structure="tied"``, dense weights that start as
+        the identity and, for x_N, from the Riccati equation, discounted slack weights, and all
+        parts of theta in ``learn``. `release` frees C.
 
         Args:
-            A, B, horizon, options: as for `from_model`.
+            A, B, horizon, options: see `from_model`.
+
+        Raises:
+            QPError: an argument is invalid, or the Riccati equation has no solution.
 
         Example:
             >>> import torch, torch_qpmpc as qm
@@ -219,28 +230,29 @@ class QPMPC(nn.Module):
         return cls.from_model(A, B, horizon, **(initial.linear_mpc(A, B, **options) | options))
 
     def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
-        """V(s) (eq:qp4), a cost to go: s ``(*batch, n_x)`` to ``(*batch,)``.
+        """Return V(s) (eq:qp4), a cost to go: s ``(*batch, n_x)`` to ``(*batch,)``.
 
-        ``qp`` is `quadratic_program`, where that has been made for today's theta already.
+        ``qp`` is the `quadratic_program` of the current theta, if it is available. Errors are as in
+        `solve`.
         """
         return self._value(self._checked(s), qp)
 
     def action_value(self, s: Tensor, a: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
-        """Q(s, a) (eq:qp5), a cost to go: ``(*batch, n_x)``, ``(*batch, n_u)`` to ``(*batch,)``.
+        """Return Q(s, a) (eq:qp5), a cost to go, from ``(*batch, n_x)`` and ``(*batch, n_u)``.
 
-        ``qp`` is as for `value`.
+        ``qp`` and errors are as in `value`.
         """
         return self._value(self._checked(s, a), qp)
 
     def policy(self, s: Tensor, warm_start: QPSolution | Tensor | None = None) -> Tensor:
-        """pi(s), the u_0 of V's solution: s ``(*batch, n_x)`` to ``(*batch, n_u)``.
+        """Return pi(s), the u_0 of V's solution: s ``(*batch, n_x)`` to ``(*batch, n_u)``.
 
-        ``warm_start`` is as for `solve`.
+        ``warm_start`` and errors are as in `solve`.
         """
         return self._action(self.solve(s, warm_start=warm_start), s.dtype)
 
     def forward(self, s: Tensor, a: Tensor | None = None) -> Tensor:
-        """V(s), or Q(s, a) where an action is given."""
+        """Return V(s), or Q(s, a) for an action."""
         return self.value(s) if a is None else self.action_value(s, a)
 
     def solve(
@@ -250,18 +262,27 @@ class QPMPC(nn.Module):
         warm_start: QPSolution | Tensor | None = None,
         qp: QuadraticProgram | None = None,
     ) -> QPSolution:
-        """The whole solution of V's QP, or of Q's where an action is given, in theta's dtype.
+        """Return the solution of V's QP, or of Q's for an action, in theta's dtype.
 
-        ``qp`` is as for `value`.
+        Args:
+            s: states ``(*batch, n_x)``.
+            a: actions ``(*batch, n_u)``.
+            warm_start: see `solve_qp`.
+            qp: the `quadratic_program` of the current theta, if it is available.
+
+        Raises:
+            QPError: an argument is invalid, or (with ``on_failure="raise"``) all unsolved QPs have
+                invalid data.
+            SolverError: with ``on_failure="raise"``, a QP has no certified solution.
         """
         return self._solve(self._checked(s, a), qp, warm_start)
 
     def value_and_active_set(
         self, s: Tensor, a: Tensor | None = None, warm_start: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """`value`, or `action_value`, with the active set ``(*batch, n_g)`` of its solution.
+        """Return `value`, or `action_value`, and the active set ``(*batch, n_g)`` of its solution.
 
-        ``warm_start`` is one of nearly the same QPs, as in `solve`.
+        ``warm_start`` is an active set of nearly equal QPs, as in `solve`.
         """
         fixed = self._checked(s, a)
         solution = self._solve(fixed, None, warm_start)
@@ -270,38 +291,38 @@ class QPMPC(nn.Module):
     def policy_and_active_set(
         self, s: Tensor, warm_start: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """`policy`, with the active set ``(*batch, n_g)`` that the next step can start from."""
+        """Return `policy`, and the active set ``(*batch, n_g)`` as the next step's warm start."""
         solution = self.solve(s, warm_start=warm_start)
         return self._action(solution, s.dtype), solution.active
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """The states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
+        """Return the states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
         return self._layout.predicted(check_tensor("z", z, self.n_z))
 
     def model(self) -> tuple[Tensor, Tensor]:
-        """A and B, ``(n_x, n_x)`` and ``(n_x, n_u)``, or with a leading N where they vary.
+        """Return A and B, ``(n_x, n_x)`` and ``(n_x, n_u)``, with a leading N if they vary.
 
         Raises:
-            QPError: C is free to be more than a model.
+            QPError: C is free, and need not contain a model.
         """
         if self.structure == "free":
             raise QPError.expected("structure", "'free'", "'tied' or 'varying', which have a model")
         return Banded(self._layout, self.structure == "tied").right_inverse(self.C)
 
     def readable(self) -> dict[str, Tensor]:
-        """The learned parts of theta, detached: what stages share, once; A, B and D for C and G."""
+        """Return the learned parts, detached: A, B and D for C and G, and shared values once."""
         return parameters.readable(self, self.learned)
 
     def release(self, structure: str = "free") -> None:
-        """Free what a linear MPC scheme ties, in place; the values stay as they are.
+        """Remove ties of a linear MPC scheme in place, without a change of values.
 
-        The learned parts get other parameters: make the loss module and the optimiser anew.
+        The learned parts get new parameters: create the loss module and the optimiser again.
 
         Args:
-            structure: ``"free"`` or ``"varying"``, and freer than today's.
+            structure: ``"free"`` or ``"varying"``, freer than the current structure.
 
         Raises:
-            QPError: it is not.
+            QPError: ``structure`` is not freer.
         """
         freer = STRUCTURES[: STRUCTURES.index(self.structure)]
         if structure not in freer:
@@ -312,14 +333,14 @@ class QPMPC(nn.Module):
         self._arguments = {**self._arguments, "structure": structure}
         for part in self.learned:
             if parametrize.is_parametrized(self, part) and part not in ("H", "H_f"):
-                parameters.replace(self, part, self._kept(part))
+                parameters.replace(self, part, self._parametrizations_for(part))
 
     @torch.no_grad()
     def project_(self) -> None:
-        """Put H, H_f and w back to where they are >= 0, in place: what ends a step (eq:sdp1).
+        """Project H, H_f and w in place to where they are >= 0, the end of a step (eq:sdp1).
 
-        To be called after each step of an optimiser; `GaussNewton` does so itself. With
-        ``step="cholesky"`` nothing can be outside, and nothing is done.
+        Call it after each step of an optimiser; `GaussNewton` does so itself. With
+        ``step="cholesky"`` it does nothing.
 
         Example:
             >>> import torch, torch_qpmpc as qm
@@ -337,7 +358,7 @@ class QPMPC(nn.Module):
             leaf.copy_(NEAREST[self.step](matrices).view_as(leaf))
 
     def quadratic_program(self) -> QuadraticProgram:
-        """Today's theta as a QuadraticProgram, discounts included (eq:qpH)."""
+        """Return the current theta as a QuadraticProgram, with discounts (eq:qpH)."""
         with full_precision(self.C_0):
             H, q, w = self._cost()
             return QuadraticProgram(
@@ -354,31 +375,35 @@ class QPMPC(nn.Module):
             )
 
     def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
-        """Parameter groups for an optimiser, one for each learned part of theta.
+        """Return parameter groups for an optimiser, one for each learned part of theta.
 
         Args:
-            rates: learning rates by part (``"H"``, ``"C"``, ..), or for the rest of the
-                ``"cost"`` (H, H_f, q, c, w) and of the ``"constraints"`` (C, b, G, lb, ub), which
-                the paper advises to learn at rates of their own.
+            rates: learning rates by part (``"H"``, ``"C"``, ..), and for other parts by family,
+                ``"cost"`` (H, H_f, q, c, w) and ``"constraints"`` (C, b, G, lb, ub), for which the
+                paper advises different rates.
 
         Raises:
-            QPError: a learned part without a rate, or a name that is neither.
+            QPError: a learned part has no rate, or a name or a rate is invalid.
         """
         return parameters.groups(self, self.learned, rates)
 
     def leaves(self, part: str) -> list[nn.Parameter]:
-        """The parameters that an optimiser moves for a learned part: behind H its factor."""
+        """Return the parameters of a learned part, such as the factor of H.
+
+        Raises:
+            QPError: ``part`` is not learned.
+        """
         if part not in self.learned:
             expected = f"one of the learned parts: {', '.join(self.learned) or 'none'}"
             raise QPError.expected("part", repr(part), expected)
         return parameters.leaves(self, part)
 
     def reset_parameters(self) -> None:
-        """Return theta to where the constructor put it."""
+        """Reset theta to its initial values."""
         fresh = parametrize.type_before_parametrizations(self)(**self._arguments)
         for name, start in (*fresh.named_parameters(), *fresh.named_buffers()):
             owner, _, leaf = name.rpartition(".")
-            # By attribute: a functional call puts plain tensors in the place of parameters.
+            # By attribute, as a functional call replaces parameters with plain tensors.
             getattr(self.get_submodule(owner), leaf).data.copy_(start.detach())
 
     def extra_repr(self) -> str:
@@ -388,28 +413,28 @@ class QPMPC(nn.Module):
         )
 
     def __reduce_ex__(self, protocol: Any) -> tuple:
-        return pickling.reduce(self, self._arguments, self._kept)
+        return pickling.reduce(self, self._arguments, self._parametrizations_for)
 
     def __copy__(self) -> QPMPC:
         twin = type(self).__new__(type(self))
-        twin.__dict__.update(self.__dict__)  # as every module's: the parameters are shared
+        twin.__dict__.update(self.__dict__)  # a shallow copy, which shares the parameters
         return twin
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name in FIXED and name in vars(self) and value != vars(self)[name]:
-            remedy = "Make another QPMPC; release() frees the structure of this one."
-            raise QPError.expected(name, repr(value), f"{vars(self)[name]!r}, as made", remedy)
+            remedy = "Create another QPMPC; release() frees the structure of this one."
+            raise QPError.expected(name, repr(value), f"{vars(self)[name]!r}, as created", remedy)
         super().__setattr__(name, value)
 
     def get_extra_state(self) -> Tensor:
-        """What a state_dict tells of the QPMPC that its parameters belong to, as JSON in bytes."""
-        return written(self._identity())
+        """Return the identity of this QPMPC for its state_dict, as JSON bytes."""
+        return encoded(self._identity())
 
     def set_extra_state(self, state: Tensor) -> None:
-        """`_load_from_state_dict` has compared it already."""
+        """Do nothing: `_load_from_state_dict` has compared the identities already."""
 
     def _identity(self) -> dict[str, Any]:
-        """What the values depend on beside the parameters and buffers, by the arguments' names."""
+        """Return all that values depend on besides parameters and buffers, by argument."""
         names = ("n_x", "n_u", "horizon", "gamma", "structure", "hessian", "step", "discount_slack")
         masks = {name: digest(mask) for name, mask in self._masks.items()}
         return {
@@ -421,9 +446,13 @@ class QPMPC(nn.Module):
         }
 
     def checked_state(self, state_dict: dict[str, Any], prefix: str) -> dict[str, Any]:
-        """``state_dict``; `QPError` if it tells of another QPMPC. An older one tells nothing."""
+        """Return ``state_dict``, with this identity if it has none.
+
+        Raises:
+            QPError: it belongs to another QPMPC.
+        """
         key, identity = f"{prefix}_extra_state", self._identity()
-        state_dict = {key: written(identity)} | state_dict
+        state_dict = {key: encoded(identity)} | state_dict
         check_identity(state_dict[key], identity)
         return state_dict
 
@@ -432,7 +461,7 @@ class QPMPC(nn.Module):
         self._derive()
 
     def _derive(self) -> None:
-        """What follows from the arguments and is no part of the state, like C_0."""
+        """Register the buffers that follow from the arguments and are not in the state_dict."""
         discount, of_rows = self._layout.discounts(self.gamma)
         weights = of_rows if self._arguments["discount_slack"] else torch.ones_like(of_rows)
         hardness = torch.where(self.soft, 0.0, torch.inf)
@@ -446,15 +475,15 @@ class QPMPC(nn.Module):
                 part.place(self.C_0.device)
 
     def _checked(self, s: Tensor, a: Tensor | None = None) -> Tensor:
-        """What is fixed of z: s, or s and a side by side."""
+        """Return the fixed entries of z: s, or s and a side by side."""
         if a is None:
             return check_tensor("s", s, self.n_x, device=self.C_0.device)
         return check_pair(s, a, self.n_x, self.n_u, self.C_0.device)
 
-    def _today(self, qp: QuadraticProgram | None) -> QuadraticProgram:
+    def _current_qp(self, qp: QuadraticProgram | None) -> QuadraticProgram:
         if qp is None:
             return self.quadratic_program()
-        check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or nothing.")
+        check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or omit it.")
         return qp
 
     def _value(self, fixed: Tensor, qp: QuadraticProgram | None) -> Tensor:
@@ -466,29 +495,30 @@ class QPMPC(nn.Module):
         qp: QuadraticProgram | None,
         warm_start: QPSolution | Tensor | None = None,
     ) -> QPSolution:
-        qp = self._today(qp)
+        qp = self._current_qp(qp)
         n_kept = self.n_x + self.n_u  # V, Q and the policy share one elimination
         fixed = to_dtype(fixed, qp.C.dtype)
         return solve(qp, fixed, n_kept, self.solver, self.on_failure, warm_start)
 
     def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:
-        """u_0 of a solution of V's QP."""
+        """Return u_0 of a solution of V's QP."""
         return to_dtype(solution.z[..., self.n_x : self.n_x + self.n_u], dtype)
 
     def _cost(self) -> tuple[Tensor, Tensor, Tensor]:
-        """H, q and w of the QP."""
-        by = Discounts(self.discount, self.slack_discount, self.hardness, self.stages)
+        """Return H, q and w of the QP."""
+        discounts = Discounts(self.discount, self.slack_discount, self.hardness, self.stages)
         blocks = (self.H,) if self.hessian == "full" else (self.H, self.H_f)
-        return discounted(self._layout, self.hessian, blocks, self.q, self.w, by)
+        return discounted(self._layout, self.hessian, blocks, self.q, self.w, discounts)
 
-    def _kept(self, name: str) -> list[nn.Module]:
+    def _parametrizations_for(self, name: str) -> list[nn.Module]:
         value, mask = getattr(self, name).detach(), self._masks.get(name)
         if self.structure != "free" and name in ("lb", "ub"):
             soft = self.soft.cpu()
             mask = soft if mask is None else mask & soft
-        return kept(name, value, self._layout, self.structure, self.hessian, self.step, mask)
+        options = (self._layout, self.structure, self.hessian, self.step, mask)
+        return parametrizations_for(name, value, *options)
 
     def _projected(self) -> dict[str, nn.Parameter]:
-        """The parameters that `project_` acts on, by part."""
+        """Return the parameters that `project_` projects, by part."""
         names = () if self.step == CHOLESKY else SIGNED
         return {name: parameters.leaves(self, name)[0] for name in names if name in self.learned}

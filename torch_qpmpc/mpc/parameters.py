@@ -1,7 +1,7 @@
-"""The parts of theta in the module that owns them, behind the parametrizations that they keep.
+"""The parts of theta as parameters or buffers of a module, with their parametrizations.
 
 A learned part is a parameter, or is computed from parameters, its leaves: H from a factor, a C
-that is tied from A and B. The others are buffers.
+that is tied from A and B. The other parts are buffers.
 """
 
 from __future__ import annotations
@@ -20,78 +20,78 @@ from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
 
 
 def register(module: nn.Module, name: str, value: Tensor, learned: bool) -> None:
-    """Make ``value`` a part: a parameter if it is learned, else a buffer."""
+    """Register a part: a parameter if it is learned, else a buffer."""
     if learned:
         module.register_parameter(name, nn.Parameter(value))
     else:
         module.register_buffer(name, value)
 
 
-def keep(module: nn.Module, name: str, kept: list[nn.Module]) -> None:
-    """Put a parameter behind ``kept``, the last of which the optimiser moves."""
+def attach(module: nn.Module, name: str, parametrizations: list[nn.Module]) -> None:
+    """Attach parametrizations to a parameter; its value stays."""
     value = getattr(module, name).detach()
-    for parametrization in kept:
+    for parametrization in parametrizations:
         parametrize.register_parametrization(module, name, parametrization)
-    if len(kept) > 1:  # each but the first has changed the value
+    if len(parametrizations) > 1:  # each but the first has changed the value
         setattr(module, name, value)
 
 
-def replace(module: nn.Module, name: str, kept: list[nn.Module]) -> None:
-    """Put a part behind other parametrizations; its value stays, and whether it is frozen."""
+def replace(module: nn.Module, name: str, parametrizations: list[nn.Module]) -> None:
+    """Replace the parametrizations of a part; its value and its ``requires_grad`` stay."""
     value = getattr(module, name).detach()
-    # A deep copy has the same class, which remove_parametrizations would change.
+    # remove_parametrizations would change the class, which deep copies share.
     own = type(type(module).__name__, type(module).__bases__, {**vars(type(module))})
-    module.__class__ = own  # pyright: ignore[reportAttributeAccessIssue] - the same but by id
+    module.__class__ = own  # pyright: ignore[reportAttributeAccessIssue] - equal but for its identity
     frozen = not any(leaf.requires_grad for leaf in leaves(module, name))
     parametrize.remove_parametrizations(module, name)
     delattr(module, name)
     register(module, name, value.clone(), True)
-    keep(module, name, kept)
+    attach(module, name, parametrizations)
     for leaf in leaves(module, name):
         leaf.requires_grad_(not frozen)
 
 
 def leaves(module: nn.Module, name: str) -> list[nn.Parameter]:
-    """The parameters that the optimiser moves for a learned part: behind H its factor."""
+    """Return the parameters of a learned part, such as the factor of H."""
     if not parametrize.is_parametrized(module, name):
         return [module.get_parameter(name)]
     return list(module.get_submodule(f"parametrizations.{name}").parameters(recurse=False))
 
 
 def matrix(module: nn.Module, name: str) -> tuple[nn.Parameter | None, Tensor | None]:
-    """The parameter whose entries are a part's own, and the mask of those that are learned.
+    """Return the parameter with the entries of a part, and the mask of those that are learned.
 
-    The parameter is None where the part is computed from others, or is not learned; the mask is
-    None where all entries are learned.
+    The parameter is None if the part is computed from others, or is not learned; the mask is None
+    if all entries are learned.
     """
     if not parametrize.is_parametrized(module, name):
         return module._parameters.get(name), None
-    found = list(module.get_submodule(f"parametrizations.{name}").children())
-    if len(found) == 1 and isinstance(found[0], Masked):
-        return leaves(module, name)[0], found[0].mask
+    own = list(module.get_submodule(f"parametrizations.{name}").children())
+    if len(own) == 1 and isinstance(own[0], Masked):
+        return leaves(module, name)[0], own[0].mask
     return None, None
 
 
 def readable(module: nn.Module, learned: Collection[str]) -> dict[str, Tensor]:
-    """The learned parts, detached: what stages share, once; A, B and D for C and G."""
-    found = {}
+    """Return the learned parts, detached: A, B and D for C and G, and shared values once."""
+    values = {}
     for part in learned:
         value = getattr(module, part).detach()
-        kept = None
+        first = None
         if parametrize.is_parametrized(module, part):
-            kept = next(iter(module.get_submodule(f"parametrizations.{part}").children()))
-        if isinstance(kept, Banded | LinearRows):
+            first = next(iter(module.get_submodule(f"parametrizations.{part}").children()))
+        if isinstance(first, Banded | LinearRows):
             names = ("A", "B") if part == "C" else ("D", "D_f")
-            found |= zip(names, kept.right_inverse(value), strict=True)
+            values |= zip(names, first.right_inverse(value), strict=True)
         else:
-            found[part] = value[kept.first] if isinstance(kept, Tied) else value
-    return found
+            values[part] = value[first.first] if isinstance(first, Tied) else value
+    return values
 
 
 def groups(
     module: nn.Module, learned: Collection[str], rates: Mapping[str, float]
 ) -> list[dict[str, Any]]:
-    """Parameter groups for an optimiser, one for each learned part."""
+    """Return parameter groups for an optimiser, one for each learned part."""
     if not isinstance(rates, Mapping):
         got = type(rates).__name__
         raise QPError.expected("rates", got, "a mapping such as {'cost': .., 'constraints': ..}")
@@ -100,8 +100,8 @@ def groups(
         raise QPError.expected("rates", sorted(unknown), f"names among {sorted(known)}")
     if unused := set(rates) - {*learned, "cost", "constraints"}:
         expected = f"parts that are learned: {', '.join(learned) or 'none'}"
-        raise QPError.expected("rates", sorted(unused), expected, "Name them in learn, too.")
-    found = []
+        raise QPError.expected("rates", sorted(unused), expected, "Add them to learn.")
+    result = []
     for part in learned:
         rate = rates.get(part, rates.get("cost" if part in COST else "constraints"))
         if rate is None:
@@ -109,5 +109,5 @@ def groups(
                 "rates", f"nothing for {part}", "a rate for every learned part, or its family"
             )
         check_number(f"rates[{part}]", rate, lambda x: 0 <= x < math.inf, "a finite number >= 0")
-        found.append({"params": leaves(module, part), "lr": rate, "name": part})
-    return found
+        result.append({"params": leaves(module, part), "lr": rate, "name": part})
+    return result

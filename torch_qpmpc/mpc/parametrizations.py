@@ -1,9 +1,9 @@
-"""What theta keeps while it is learned, in the idiom of `torch.nn.utils.parametrize`.
+"""Parametrizations that keep the sign and structure of theta (`torch.nn.utils.parametrize`).
 
 With H = L L' any gradient step on L leaves H positive semidefinite, so that the update of eq:thup
-needs no semidefinite program (eq:sdp1); where `torch_qpmpc.mpc.projections` projects H instead, it
-is kept symmetric. And a linear MPC scheme (eq:v1) ties: its C has nothing but a model in its band,
-and its stages share their values.
+needs no semidefinite program (eq:sdp1); if `torch_qpmpc.mpc.projections` projects H instead, it
+stays symmetric. In a linear MPC scheme (eq:v1), C has only a model in its band, and the stages
+share their values.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.projections import CHOLESKY
 
-#: The parts of theta that a convex QP does not leave free.
+#: The parts of theta whose sign a convex QP constrains.
 SIGNED = ("H", "H_f", "w")
 
 
-def kept(
+def parametrizations_for(
     name: str,
     value: Tensor,
     layout: Layout,
@@ -30,24 +30,24 @@ def kept(
     step: str,
     mask: Tensor | None = None,
 ) -> list[nn.Module]:
-    """What a learned part of `QPMPC` keeps: its structure, its sign or what projecting it needs.
+    """Return the parametrizations of a learned part of `QPMPC`: for structure, sign and mask.
 
-    ``mask`` is true at the entries that are learned; None if all are.
+    ``mask`` is True at the entries that are learned; None if all are.
     """
-    found, tied = [], structure == "tied"
+    chain, tied = [], structure == "tied"
     if structure != "free" and name in ("C", "G"):
-        found.append((Banded if name == "C" else LinearRows)(layout, tied))
+        chain.append((Banded if name == "C" else LinearRows)(layout, tied))
     if tied and name in ("q", "b", "lb", "ub", "w"):
-        found.append(Tied(name, layout.ties(name)))
+        chain.append(Tied(name, layout.ties(name)))
     dense = hessian != "diagonal" and name != "w"
     if name in SIGNED and step == CHOLESKY:
-        found.append(Cholesky() if dense else SquareRoot())
+        chain.append(Cholesky() if dense else SquareRoot())
     elif name in ("H", "H_f"):
-        found.append(Symmetric() if dense else Support(value))
+        chain.append(Symmetric() if dense else Support(value))
     if mask is not None and not mask.all():
-        _check_mask(name, mask, layout, found)
-        found.append(Masked(mask, value))
-    return found
+        _check_mask(name, mask, layout, chain)
+        chain.append(Masked(mask, value))
+    return chain
 
 
 class SquareRoot(nn.Module):
@@ -61,15 +61,15 @@ class SquareRoot(nn.Module):
         return factor * factor
 
     def right_inverse(self, value: Tensor) -> Tensor:
-        """A factor of ``value``; `QPError` if an entry is negative."""
+        """Return a factor of ``value``; raise `QPError` if an entry is negative."""
         _check_diagonal(value)
         return value.sqrt()
 
 
 class Support(nn.Module):
-    """A diagonal, any shape, whose zero entries are no part of theta, as with `SquareRoot`.
+    """A diagonal, any shape, whose initial zeros stay zero, as with `SquareRoot`.
 
-    An entry that a step has brought to zero can leave it again.
+    An entry that a step has brought to zero can become positive again.
     """
 
     support: Tensor
@@ -82,19 +82,19 @@ class Support(nn.Module):
         return self.support * entries
 
     def right_inverse(self, value: Tensor) -> Tensor:
-        """``value``; `QPError` if an entry is negative."""
+        """Return ``value``; raise `QPError` if an entry is negative."""
         _check_diagonal(value)
         return value
 
 
 class Symmetric(nn.Module):
-    """The symmetric part of matrices ``(*batch, n, n)``; so is the gradient that they get."""
+    """The symmetric part of matrices ``(*batch, n, n)``, whose gradient is symmetric, too."""
 
     def forward(self, matrix: Tensor) -> Tensor:
         return (matrix + matrix.mT) / 2
 
     def right_inverse(self, value: Tensor) -> Tensor:
-        """``value``; `QPError` if it is not positive semidefinite."""
+        """Return ``value``; raise `QPError` if it is not positive semidefinite."""
         _spectrum(value)
         return value
 
@@ -107,10 +107,13 @@ class Cholesky(nn.Module):
         return lower @ lower.mT
 
     def right_inverse(self, value: Tensor) -> Tensor:
-        """A lower triangular factor of a possibly singular ``value``.
+        """Return a lower triangular factor of a possibly singular ``value``.
 
-        By a QR factorisation of the symmetric square root, as the usual Cholesky algorithm needs
-        a positive definite matrix. `QPError` if ``value`` is not positive semidefinite.
+        It comes from a QR factorisation of the symmetric square root, since the usual Cholesky
+        algorithm needs a positive definite matrix.
+
+        Raises:
+            QPError: ``value`` is not positive semidefinite.
         """
         eigenvalues, vectors = _spectrum(value)
         root = vectors * eigenvalues.clamp(min=0).sqrt().unsqueeze(-2)
@@ -120,7 +123,7 @@ class Cholesky(nn.Module):
 
 
 class Masked(nn.Module):
-    """A part of which only the entries in ``mask`` are learned; no optimiser moves the others."""
+    """A part of theta in which only the entries in ``mask`` are learned."""
 
     mask: Tensor
     frozen: Tensor
@@ -132,20 +135,20 @@ class Masked(nn.Module):
         self.register_buffer("frozen", value.detach().clone())
 
     def place(self, device: torch.device) -> None:
-        """Put the mask on a device; a module that was on "meta" has lost it."""
+        """Put the mask on a device; a module moved to "meta" has lost it."""
         self.register_buffer("mask", self.cpu_mask.to(device), persistent=False)
 
     def forward(self, value: Tensor) -> Tensor:
         return torch.where(self.mask, value, self.frozen)
 
     def right_inverse(self, value: Tensor) -> Tensor:
-        """``value``, whose frozen entries become those that it has."""
+        """Return ``value``, and freeze its entries outside the mask."""
         self.frozen.copy_(value.detach())
         return value
 
 
 class Banded(nn.Module):
-    """C of a model (eq:cband): A and B, of all stages, or with a leading N where they vary."""
+    """C of a model (eq:cband) from A and B, with a leading N if they vary by stage."""
 
     def __init__(self, layout: Layout, tied: bool) -> None:
         super().__init__()
@@ -155,7 +158,7 @@ class Banded(nn.Module):
         return banded_matrix(A, B, self.layout.horizon)
 
     def right_inverse(self, C: Tensor) -> tuple[Tensor, Tensor]:
-        """The model in the band of C; `QPError` if there is more in C than that."""
+        """Return the model in the band of C; raise `QPError` if C has other entries."""
         n_x, blocks = self.layout.n_x, _stage_blocks(C, self.layout, self.tied)
         A, B = blocks[..., :n_x].contiguous(), blocks[..., n_x:].contiguous()
         _check_tied("C", C, self(A, B))
@@ -163,7 +166,7 @@ class Banded(nn.Module):
 
 
 class Tied(nn.Module):
-    """A vector whose entry i is the value ``index[i]`` of a shorter one."""
+    """A vector whose entry i is entry ``index[i]`` of a shorter one."""
 
     index: Tensor
     first: Tensor
@@ -174,7 +177,7 @@ class Tied(nn.Module):
         self.place(index.device)
 
     def place(self, device: torch.device) -> None:
-        """Put the index on a device; a module that was on "meta" has lost it."""
+        """Put the index on a device; a module moved to "meta" has lost it."""
         first = [self.ties.index(i) for i in range(max(self.ties) + 1)]
         for name, index in (("index", self.ties), ("first", first)):
             self.register_buffer(name, torch.tensor(index, device=device), persistent=False)
@@ -183,7 +186,7 @@ class Tied(nn.Module):
         return values[..., self.index]
 
     def right_inverse(self, entries: Tensor) -> Tensor:
-        """The first entry of each value; `QPError` if the others differ."""
+        """Return the first of each group of tied entries; raise `QPError` if the others differ."""
         values = entries[self.first]
         _check_tied(self.name, entries, self(values))
         return values
@@ -192,7 +195,7 @@ class Tied(nn.Module):
 class LinearRows(nn.Module):
     """G of mixed constraints (eq:v1c4): the identity, D for each stage, and D^f for x_N.
 
-    D is ``(n_d, n_x + n_u)``, or ``(N, n_d, n_x + n_u)`` where the stages' own vary.
+    D is ``(n_d, n_x + n_u)``, or ``(N, n_d, n_x + n_u)`` if it varies by stage.
     """
 
     def __init__(self, layout: Layout, tied: bool) -> None:
@@ -206,7 +209,7 @@ class LinearRows(nn.Module):
         return torch.cat((unit, F.pad(stages, (0, n_x)), F.pad(D_f, (n_z - n_x, 0))))
 
     def right_inverse(self, G: Tensor) -> tuple[Tensor, Tensor]:
-        """D and D^f; `QPError` if there is more in G than they make."""
+        """Return D and D^f; raise `QPError` if G has other entries."""
         n_x, n_z = self.layout.n_x, self.layout.n_z
         last = n_z + self.layout.horizon * self.layout.n_d
         D = _stage_blocks(G[n_z:last], self.layout, self.tied).contiguous()
@@ -215,14 +218,14 @@ class LinearRows(nn.Module):
         return D, D_f
 
 
-def _check_mask(name: str, mask: Tensor, layout: Layout, found: list[nn.Module]) -> None:
-    """Raise `QPError` if a mask parts what the other parametrizations join."""
+def _check_mask(name: str, mask: Tensor, layout: Layout, chain: list[nn.Module]) -> None:
+    """Raise `QPError` if a mask separates entries that the other parametrizations join."""
     what = f"learn[{name!r}]"
-    if any(isinstance(part, Cholesky | Symmetric) for part in found):
+    if any(isinstance(part, Cholesky | Symmetric) for part in chain):
         want = "True, or a mask with hessian='diagonal'"
-        raise QPError.expected(what, "a mask of a dense H", want, "It has to stay semidefinite.")
+        raise QPError.expected(what, "a mask of a dense H", want, "H must stay semidefinite.")
     tied = True
-    for part in found:
+    for part in chain:
         if isinstance(part, Tied):
             tied = torch.equal(mask, mask[part.first][part.index])
         elif isinstance(part, Banded | LinearRows) and part.tied:
@@ -231,14 +234,14 @@ def _check_mask(name: str, mask: Tensor, layout: Layout, found: list[nn.Module])
             blocks = _stage_blocks(rows, layout, tied=False)
             tied = bool((blocks == blocks[:1]).all())
     if not tied:
-        want = "one that is the same for all stages, as structure='tied' gives them one value"
+        want = "one that is the same for all stages, which structure='tied' ties"
         raise QPError.expected(what, "a mask that differs between stages", want)
 
 
 def _stage_blocks(rows: Tensor, layout: Layout, tied: bool) -> Tensor:
-    """What equally many rows for each stage have in its (x_k, u_k), ``(N, n, n_x + n_u)``.
+    """Return the blocks of rows that belong to each stage's (x_k, u_k), ``(N, n, n_x + n_u)``.
 
-    Of the first stage alone if they are tied.
+    All stages have n rows. If they are tied, return the first block.
     """
     horizon, n = layout.horizon, layout.n
     stages = rows[:, : horizon * n].unflatten(0, (horizon, len(rows) // horizon))
@@ -252,7 +255,7 @@ def _check_diagonal(value: Tensor) -> None:
 
 
 def _spectrum(H: Tensor) -> tuple[Tensor, Tensor]:
-    """Eigenvalues and -vectors; `QPError` if H is not positive semidefinite."""
+    """Return eigenvalues and eigenvectors; raise `QPError` if H is not positive semidefinite."""
     eigenvalues, vectors = torch.linalg.eigh((H + H.mT) / 2)
     tolerance = 1e-5 if H.dtype == torch.float32 else 1e-9
     if (eigenvalues < -tolerance * eigenvalues.abs().amax(-1, keepdim=True)).any():
@@ -261,11 +264,11 @@ def _spectrum(H: Tensor) -> tuple[Tensor, Tensor]:
     return eigenvalues, vectors
 
 
-def _check_tied(name: str, given: Tensor, tied: Tensor) -> None:
-    if not torch.equal(given, tied):
+def _check_tied(name: str, entries: Tensor, tied: Tensor) -> None:
+    if not torch.equal(entries, tied):
         raise QPError.expected(
             name,
-            "entries that a linear MPC scheme does not have",
-            "what its stages tie",
+            "entries that break the structure of a linear MPC scheme",
+            "entries that keep it",
             "Call release() first to free them.",
         )

@@ -1,6 +1,6 @@
-"""How a `QPMPC` is pickled: by its constructor's arguments and its state.
+"""Pickling of a `QPMPC` by its constructor's arguments and its state.
 
-A parametrised module refuses to be pickled, which would bar it from spawned collectors.
+torch does not pickle parametrised modules, but spawned collectors need it.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from torch_qpmpc.errors import QPError
 
 
 def reduce(
-    module: nn.Module, arguments: dict[str, Any], kept: Callable[[str], list[nn.Module]]
+    module: nn.Module, arguments: dict[str, Any], expected: Callable[[str], list[nn.Module]]
 ) -> tuple:
-    """What ``__reduce_ex__`` returns; ``kept`` is what a part of ``module`` keeps by itself."""
+    """Return the value of ``__reduce_ex__``; ``expected`` gives a part's own parametrizations."""
     # TorchRL sends a policy to its workers on the meta device, without values to compare.
     real = not any(part.is_meta for part in module.buffers())
     for name in getattr(module, "parametrizations", ()) if real else ():
-        found = module.get_submodule(f"parametrizations.{name}").children()
-        if [type(part) for part in found] != [type(part) for part in kept(name)]:
+        attached = module.get_submodule(f"parametrizations.{name}").children()
+        if [type(x) for x in attached] != [type(x) for x in expected(name)]:
             got = f"a parametrization of {name} that is not QPMPC's own"
             remedy = "Save the state_dict, or remove_parametrizations first."
             raise QPError.expected("pickle", got, "QPMPC's own", remedy)
     plain = parametrize.type_before_parametrizations(module)
     frozen = [name for name, part in module.named_parameters() if not part.requires_grad]
-    # The arguments say whose state it is; a tensor made for that could not be shared with a child.
+    # The arguments identify the state; a child process cannot share the tensor of _extra_state.
     state = {name: x for name, x in module.state_dict().items() if name != "_extra_state"}
     return _rebuild, (plain, arguments, state, frozen, module.training)
 

@@ -4,22 +4,22 @@ The program, with 1/2 |dtheta|^2 for the printed dtheta^2 (whose minimum is half
 
     min over dtheta:  1/2 |dtheta|^2 - alpha g'dtheta   subject to   H(theta + dtheta) >= 0
 
-asks for the point next to theta + alpha g, which is the optimiser's proposal, where H >= 0. All
-parts of theta but H take the plain step. Where theta lists every entry of H, |dtheta| is the
-Frobenius norm, and the next point is known: the proposal without its negative eigenvalues. With a
-block-diagonal H it is that of each block, and with a diagonal one the entries cut off at zero; that
-the stages share a block, or discount it, changes nothing. So ``"projection"`` and ``"sdp"`` make
-the same step, and ``"cholesky"`` makes another, in the factor of H, which needs neither.
+has as its solution the point with H >= 0 nearest to the optimiser's proposal theta + alpha g. All
+parts of theta but H take the plain step. If theta lists every entry of H, |dtheta| is the Frobenius
+norm, and the nearest point has a closed form: the proposal without its negative eigenvalues, for
+each block of a block-diagonal H; a diagonal H is clipped at zero. It makes no difference if stages
+share a block or discount it. So ``"projection"`` and ``"sdp"`` make the same step, and
+``"cholesky"`` makes another, in the factor of H, which needs neither.
 
-Projection and program differ where |dtheta| is another norm:
+Projection and program differ if |dtheta| is another norm:
 
-* Where theta lists the upper triangle once, an entry off the diagonal counts once, not twice.
-* In the metric of Adam, whose step sizes differ by entry, the next point of a block is another.
-  That of a diagonal is the same, as it is in every diagonal metric.
+* If theta lists the upper triangle only, entries off the diagonal count once, not twice.
+* In the metric of Adam, whose step sizes differ by entry, the nearest point of a block is another.
+  That of a diagonal is the same, as in every diagonal metric.
 * In the metric of Gauss-Newton, which couples all of theta, it is another even for a diagonal.
 
-Both rules take the next point in the Frobenius norm, whatever optimiser has made the proposal;
-`GaussNewton` judges its step by where they leave it.
+Both rules take the nearest point in the Frobenius norm, for the proposal of any optimiser;
+`GaussNewton` judges the projected step.
 """
 
 from __future__ import annotations
@@ -36,15 +36,18 @@ from torch_qpmpc.checks import check_choice, check_tensor
 from torch_qpmpc.errors import QPError, SolverError
 
 CHOLESKY = "cholesky"
-#: Clarabel's, of a program whose entries are at most one: what it aims at, and what it may miss.
+#: Clarabel's full and reduced tolerances, for a program with entries of at most one.
 TOLERANCE, LOOSE = 1e-10, 1e-7
 
 
 def nearest_psd(H: Tensor) -> Tensor:
-    """The positive semidefinite matrices next to H ``(*batch, n, n)`` in the Frobenius norm.
+    """Return the positive semidefinite matrices nearest to H ``(*batch, n, n)``, Frobenius norm.
 
-    To the symmetric part of H, if it has another. A matrix that is semidefinite stays as it is, to
-    the last bit; one that is not finite stays for the QP's solver to find.
+    An asymmetric H is replaced by its symmetric part. Semidefinite matrices stay the same to the
+    last bit. Matrices with NaN or inf stay as well; the solve of the QP rejects them.
+
+    Raises:
+        QPError: H is not a floating-point tensor of square matrices.
 
     Example:
         >>> import torch
@@ -56,13 +59,13 @@ def nearest_psd(H: Tensor) -> Tensor:
 
 
 def nearest_psd_by_sdp(H: Tensor) -> Tensor:
-    """`nearest_psd` as the semidefinite program that it is, solved by Clarabel (eq:sdp1).
+    """Return `nearest_psd`, computed as a semidefinite program by Clarabel (eq:sdp1).
 
-    Its cost grows with the sixth power of n: a block of six takes milliseconds, a full H of 64
+    The cost grows with the sixth power of n: a block of six takes milliseconds, a full H of 64
     (ten stages of six) half a minute.
 
     Raises:
-        QPError: Clarabel is not installed.
+        QPError: Clarabel is not installed, or H is invalid, as in `nearest_psd`.
         SolverError: Clarabel has not solved the program.
     """
     return _replaced(H, _solve_sdp)
@@ -74,7 +77,7 @@ def _without_negative_eigenvalues(H: Tensor) -> Tensor:
 
 
 def _solve_sdp(H: Tensor) -> Tensor:
-    """min 1/2 |X - H|^2 subject to X >= 0, for all blocks ``(K, n, n)`` in one program."""
+    """Solve min 1/2 |X - H|^2 subject to X >= 0, for all blocks ``(K, n, n)`` at once."""
     clarabel = _clarabel()
     scale = H.abs().amax((-2, -1), keepdim=True)
     count, n = len(H), H.shape[-1]
@@ -89,20 +92,20 @@ def _solve_sdp(H: Tensor) -> Tensor:
         setattr(settings, name, TOLERANCE)
         setattr(settings, f"reduced_{name}", LOOSE)
     cones = [clarabel.PSDTriangleConeT(n)] * count
-    found = clarabel.DefaultSolver(unit, -proposal, -unit, zero, cones, settings).solve()
-    if str(found.status) not in ("Solved", "AlmostSolved"):
-        raise SolverError(f"Clarabel has not solved the program of eq:sdp1: {found.status}.")
-    # Its slack, unlike its x, is inside the cone whatever the tolerance.
-    entries = (torch.tensor(found.s, dtype=torch.float64).reshape(count, -1) / weight).to(H)
+    solution = clarabel.DefaultSolver(unit, -proposal, -unit, zero, cones, settings).solve()
+    if str(solution.status) not in ("Solved", "AlmostSolved"):
+        raise SolverError(f"Clarabel has not solved the program of eq:sdp1: {solution.status}.")
+    # The slack, unlike x, is inside the cone at any tolerance.
+    entries = (torch.tensor(solution.s, dtype=torch.float64).reshape(count, -1) / weight).to(H)
     if n == 1:
-        # Not a curvature of 1e-11, which no QP could be solved with.
+        # A curvature of 1e-11 would make the QP unsolvable.
         entries = torch.where(entries > LOOSE, entries, 0)
     nearest = torch.empty_like(H)
     nearest[:, rows, columns] = nearest[:, columns, rows] = entries
     return scale * nearest
 
 
-#: How the rules that project find the next point; ``"cholesky"`` has none to find.
+#: The projections by step rule; ``"cholesky"`` needs none.
 NEAREST: dict[str, Callable[[Tensor], Tensor]] = {
     "projection": nearest_psd,
     "sdp": nearest_psd_by_sdp,
@@ -111,7 +114,7 @@ STEPS = (CHOLESKY, *NEAREST)
 
 
 def check_step(step: str) -> None:
-    """Raise `QPError` unless ``step`` is a rule, and what it needs is installed."""
+    """Raise `QPError` unless ``step`` is a rule whose dependencies are installed."""
     check_choice("step", step, STEPS)
     if step == "sdp":
         _clarabel()
@@ -121,13 +124,13 @@ def _clarabel() -> ModuleType:
     try:
         import clarabel
     except ImportError as error:
-        remedy = "Run pip install 'torch-qpmpc[sdp]'; 'projection' makes the same step without."
+        remedy = "Run pip install 'torch-qpmpc[sdp]', or use 'projection': the step is the same."
         raise QPError.expected("step", "'sdp' without Clarabel", "Clarabel", remedy) from error
     return clarabel
 
 
 def _replaced(H: Tensor, nearest: Callable[[Tensor], Tensor]) -> Tensor:
-    """The symmetric part of H, with ``nearest`` of those that have a negative eigenvalue."""
+    """Return the symmetric part of H, with ``nearest`` where an eigenvalue is negative."""
     check_tensor("H", H, "n", "n")
     check_tensor("H", H, "n", H.shape[-2])
     H = (H + H.mT) / 2
@@ -138,5 +141,5 @@ def _replaced(H: Tensor, nearest: Callable[[Tensor], Tensor]) -> Tensor:
     outside = eigenvalues[:, 0] < -rounding
     if not outside.any():
         return H
-    found = nearest(blocks[outside])
-    return blocks.index_put((outside,), (found + found.mT) / 2).view_as(H)
+    replacement = nearest(blocks[outside])
+    return blocks.index_put((outside,), (replacement + replacement.mT) / 2).view_as(H)

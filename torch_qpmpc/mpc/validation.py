@@ -1,4 +1,4 @@
-"""What `QPMPC` accepts: its arguments and inputs, checked at the boundary."""
+"""Checks of the arguments and inputs of `QPMPC`."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from torch_qpmpc.qp.boundary import ON_FAILURE
 from torch_qpmpc.qp.precision import to_dtype
 
 HESSIANS = ("diagonal", "block", "full")
-#: From the least tied to the most.
+#: In order, from the least tied to the most.
 STRUCTURES = ("free", "varying", "tied")
-#: The parts of theta by family; the paper advises a learning rate for each of the two.
+#: The parts of theta by family; the paper advises a different learning rate for each.
 COST = ("H", "H_f", "q", "c", "w")
 CONSTRAINTS = ("C", "b", "G", "lb", "ub")
 
@@ -45,6 +45,7 @@ def check_structure(
     seed: int,
     **_: Any,
 ) -> None:
+    """Raise `QPError` unless the sizes and choices among the arguments of `QPMPC` are valid."""
     for name, size in (("n_x", n_x), ("n_u", n_u), ("horizon", horizon)):
         if not isinstance(size, Integral) or isinstance(size, bool) or int(size) < 1:
             raise QPError.expected(name, repr(size), "a positive integer")
@@ -74,7 +75,7 @@ def check_structure(
 
 
 def own(value: Any) -> Any:
-    """A copy of an argument that its caller may change: arrays, tensors, and what holds them."""
+    """Copy an argument that its caller may change: arrays, tensors, and containers of them."""
     if isinstance(value, Tensor):
         return value.detach().clone()
     if isinstance(value, np.ndarray):
@@ -87,7 +88,7 @@ def own(value: Any) -> Any:
 
 
 def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The masks among the values of ``learn``, by part: true where an entry is learned."""
+    """Return the masks in ``learn`` by part, True where an entry is learned."""
     if not isinstance(learn, Mapping):
         return {}
     masks = {}
@@ -108,7 +109,7 @@ def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict
 
 
 def check_model(A: Any, B: Any) -> tuple[Tensor, Tensor]:
-    """A and B as matrices, from which n_x and n_u can be read."""
+    """Return A and B as tensors with at least two dimensions, which give n_x and n_u."""
     A, B = as_tensor("A", A), as_tensor("B", B)
     if A.ndim < 2 or B.ndim < 2:
         got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
@@ -117,7 +118,7 @@ def check_model(A: Any, B: Any) -> tuple[Tensor, Tensor]:
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
-    """Read a tensor of finite numbers."""
+    """Convert to a float64 tensor on the CPU; raise `QPError` unless it is finite."""
     tensor = _read(name, value)
     if not tensor.isfinite().all():
         raise QPError.expected(name, "NaN or inf", "finite entries")
@@ -129,7 +130,7 @@ def _read(name: str, value: Any) -> Tensor:
         of_tensor = isinstance(value, Tensor) and (value.is_complex() or value.is_meta)
         if of_tensor or (isinstance(value, np.ndarray) and np.iscomplexobj(value)):
             raise TypeError
-        # Whatever the default device is: one of meta would make lists tensors without values.
+        # On the CPU: a default device of "meta" would drop the values of lists.
         return torch.as_tensor(value, dtype=torch.float64, device="cpu")
     except (TypeError, ValueError, RuntimeError) as error:
         raise QPError.expected(
@@ -144,26 +145,29 @@ def _brief(value: Any) -> str:
 
 
 def bound(name: str, bounds: tuple[Any, Any] | None, side: int, size: int) -> Tensor:
+    """Return the lower bounds ``(size,)`` for side 0, or the upper ones for side 1."""
     if bounds is None:
         return torch.full((size,), (2 * side - 1) * torch.inf)
     try:
         lower, upper = bounds
     except (TypeError, ValueError) as error:
         raise QPError.expected(name, repr(bounds), "the pair (lower, upper)") from error
-    given = _read(name, (lower, upper)[side])
-    if given.isnan().any():
+    values = _read(name, (lower, upper)[side])
+    if values.isnan().any():
         raise QPError.expected(name, "NaN", "no NaN; inf for no bound")
-    if tuple(given.shape) != (size,):
-        raise QPError.expected(name, f"shape {tuple(given.shape)}", f"shape ({size},) on each side")
-    if (given == (1 - 2 * side) * torch.inf).any():
+    if tuple(values.shape) != (size,):
         raise QPError.expected(
-            name, f"{given.tolist()}", ("lower bounds below inf", "upper bounds above -inf")[side]
+            name, f"shape {tuple(values.shape)}", f"shape ({size},) on each side"
         )
-    return given
+    if (values == (1 - 2 * side) * torch.inf).any():
+        raise QPError.expected(
+            name, f"{values.tolist()}", ("lower bounds below inf", "upper bounds above -inf")[side]
+        )
+    return values
 
 
 def bound_pair(name: str, bounds: tuple[Any, Any] | None, size: int) -> tuple[Tensor, Tensor]:
-    """Both sides of `bound`, none of which crosses the other."""
+    """Return both sides of `bound`; raise `QPError` if they cross."""
     lower, upper = bound(name, bounds, 0, size), bound(name, bounds, 1, size)
     crossing = (lower > upper).nonzero()
     if len(crossing):
@@ -176,7 +180,7 @@ def bound_pair(name: str, bounds: tuple[Any, Any] | None, size: int) -> tuple[Te
 def cost_weights(
     stage_weight: Any, terminal_weight: Any, hessian: str, n_x: int, n_u: int, horizon: int
 ) -> dict[str, Tensor]:
-    """The starts of H and H_f in the shapes that the kind of ``hessian`` has; one H if full."""
+    """Return the initial H and H_f in the shapes for ``hessian``; only H if it is full."""
     stage = as_tensor("stage_weight", stage_weight)
     terminal = as_tensor("terminal_weight", terminal_weight)
     n, diagonal = n_x + n_u, hessian == "diagonal"
@@ -203,7 +207,7 @@ def cost_weights(
 
 
 def check_weight(name: str, weight: Tensor, diagonal: bool) -> None:
-    """Raise unless a cost weight, or the diagonal of one, is symmetric positive semidefinite."""
+    """Raise `QPError` unless a weight, or its diagonal, is symmetric positive semidefinite."""
     if not diagonal and not torch.allclose(weight, weight.mT):
         asymmetry = (weight - weight.mT).abs().max()
         raise QPError.expected(
@@ -212,12 +216,12 @@ def check_weight(name: str, weight: Tensor, diagonal: bool) -> None:
     eigenvalues = weight if diagonal else torch.linalg.eigvalsh(weight)
     if (eigenvalues < (0.0 if diagonal else -1e-9 * eigenvalues.abs().max())).any():
         got = f"smallest eigenvalue {eigenvalues.min():.3g}"
-        remedy = "It weighs a cost: turn the sign of a reward's."
+        remedy = "It weights a cost: negate a reward's weight."
         raise QPError.expected(name, got, "a positive semidefinite weight", remedy)
 
 
 def slack_weight(name: str, weight: Any, size: int | None = None) -> Tensor:
-    """Slack weights ``(size,)`` from one for all rows, or from one for each if there is a size."""
+    """Return slack weights ``(size,)`` from one for all rows, or from one for each."""
     one, each = "a non-negative weight, or inf for hard rows", f"; or one for each of the {size}"
     expected = one if size is None else one + each
     if isinstance(weight, Real) or size is None:
@@ -231,7 +235,7 @@ def slack_weight(name: str, weight: Any, size: int | None = None) -> Tensor:
 
 
 def check_pair(s: Tensor, a: Tensor, n_x: int, n_u: int, device: torch.device) -> Tensor:
-    """s and a side by side, ``(*batch, n_x + n_u)``, in the dtype of s."""
+    """Return s and a side by side, ``(*batch, n_x + n_u)``, in the dtype of s."""
     check_tensor("s", s, n_x, device=device)
     check_tensor("a", a, n_u, device=device)
     try:

@@ -1,1 +1,1 @@
-"""The QP layer: a batch of QPs, solved, certified, and differentiable; no module, no RL."""
+"""The QP layer: batches of QPs, solved, certified and differentiable; no modules and no RL."""

@@ -1,4 +1,4 @@
-"""The eager way in: solve, then attach the derivative by one autograd Function."""
+"""The eager path: solve, then attach the derivative with one autograd Function."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch_qpmpc.qp.operator import N_THETA, kkt
 def solve_eager(
     theta: Sequence[Tensor], start: Tensor | None, n_kept: int, solver: str, on_failure: str
 ) -> Outputs:
-    """Solve; value, z, chi, lam and xi are differentiable in H, q, c, C, b, G, lb, ub, w, fixed."""
+    """Solve; value, z, chi, lam and xi are differentiable in ``theta``, H to w and fixed."""
     outputs = solve_now(*theta, start, n_kept, solver, on_failure)  # pyright: ignore[reportCallIssue]
     if torch.is_grad_enabled() and any(x.requires_grad for x in theta):
         outputs = (*Solution.apply(outputs[:6], n_kept, *theta), *outputs[5:])
@@ -24,14 +24,14 @@ def solve_eager(
 
 
 class Solution(torch.autograd.Function):
-    """A solution that is known, tied to the data that it depends on."""
+    """The derivatives of a computed solution in theta."""
 
     @staticmethod
     def forward(ctx: Any, known: Sequence[Tensor], n_kept: int, *theta: Tensor) -> tuple:
         *solution, status = known
         ctx.set_materialize_grads(False)
         ctx.n_kept = n_kept
-        # z, chi, lam and xi are outputs: a second derivative follows them by this same backward.
+        # Saving z, chi, lam and xi, which are outputs, makes this backward differentiable.
         ctx.save_for_backward(*theta, *solution[1:], status)
         return tuple(solution)
 

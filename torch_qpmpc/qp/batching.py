@@ -1,4 +1,4 @@
-"""Batch dimensions: flattened, reduced, aligned under vmap, summed in gradients."""
+"""Batch dimensions: broadcasting, flattening, alignment under vmap, sums in gradients."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def broadcast(*shapes: Sequence[int]) -> torch.Size:
-    """`torch.broadcast_shapes`, at once where there is nothing to broadcast."""
+    """Return `torch.broadcast_shapes`, faster for shapes that are equal or empty."""
     common: Sequence[int] = ()
     for shape in filter(len, shapes):
         if len(common) and tuple(shape) != tuple(common):
@@ -25,9 +25,9 @@ def align(in_dims: tuple, args: tuple, event_ndims: Sequence[int]) -> list[Any]:
     """Move the vmapped dimension of each tensor to the front, and align the batch ranks.
 
     Args:
-        in_dims, args: as a vmap rule gets them.
-        event_ndims: trailing dimensions of each tensor that are no batch; arguments beyond these
-            are passed on as they are.
+        in_dims, args: the arguments of a vmap rule.
+        event_ndims: the number of event dimensions of each tensor; further arguments are returned
+            unchanged.
     """
     tensors = [
         (i, tensor, dim, n)
@@ -45,26 +45,26 @@ def align(in_dims: tuple, args: tuple, event_ndims: Sequence[int]) -> list[Any]:
 
 
 def sum_to(tensor: Tensor, like: Tensor) -> Tensor:
-    """Sum a batched gradient to the shape of the operand it belongs to."""
+    """Sum a batched gradient to the shape of its operand."""
     return tensor.sum_to_size(like.shape)
 
 
 def weighted_sum(weight: Tensor, vectors: Tensor, like: Tensor) -> Tensor:
-    """``weight`` ``(*batch,)`` times ``(*batch, n)``, summed over the dimensions ``like`` lacks."""
+    """Sum ``weight`` ``(*batch,)`` times ``(*batch, n)`` over the dimensions ``like`` lacks."""
     if like.ndim == 1:
-        return weight.reshape(-1) @ listed(vectors)
+        return weight.reshape(-1) @ flatten_batch(vectors)
     return sum_to(weight.unsqueeze(-1) * vectors, like)
 
 
 def outer(left: Tensor, right: Tensor, like: Tensor) -> Tensor:
-    """The outer products ``left right'`` summed over the batch dimensions that ``like`` lacks."""
+    """Sum the outer products ``left right'`` over the batch dimensions ``like`` lacks."""
     if like.ndim == 2:
-        return listed(left).mT @ listed(right)
+        return flatten_batch(left).mT @ flatten_batch(right)
     return sum_to(left.unsqueeze(-1) * right.unsqueeze(-2), like)
 
 
 def multiply(matrices: Tensor, group: Tensor, vectors: Tensor) -> Tensor:
-    """Multiply ``(M, i, j)`` by ``(B or 1, j)`` to ``(B, i)``, by the matrix ``group`` of each."""
+    """Multiply each of ``(B or 1, j)`` by its group's matrix of ``(M, i, j)``, to ``(B, i)``."""
     if matrices.shape[0] == 1:
         return F.linear(vectors, matrices[0])
     vectors = vectors.expand(len(group), -1)
@@ -76,14 +76,14 @@ def times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (vector.unsqueeze(-2) @ matrix.mT).squeeze(-2)
 
 
-def listed(vectors: Tensor) -> Tensor:
-    """``(*batch, n)`` as ``(B, n)``; with n = 0 too, where -1 could be any size."""
+def flatten_batch(vectors: Tensor) -> Tensor:
+    """Flatten ``(*batch, n)`` to ``(B, n)``, also for n = 0, where -1 would be ambiguous."""
     return vectors.reshape(math.prod(vectors.shape[:-1]), vectors.shape[-1])
 
 
 def largest(x: Tensor, *, keepdim: bool = False) -> Tensor:
-    """Largest absolute entry along the last dimension; zero where that is empty."""
+    """Return the largest absolute entry along the last dimension; zero if that is empty."""
     if x.shape[-1]:
-        # vector_norm is one operation, but takes several times as long for a large batch.
+        # vector_norm is one operation, but several times slower for a large batch.
         return x.abs().amax(-1, keepdim=keepdim)
     return x.new_zeros((*x.shape[:-1], 1) if keepdim else x.shape[:-1])

@@ -1,6 +1,6 @@
 """The boundary of the pipeline: tensors become arrays, and failures become errors.
 
-Everything behind it is in float64, without autograd, and runs once per batch.
+Everything behind it works in float64 without autograd, once per batch.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError, SolverError
-from torch_qpmpc.qp.batching import broadcast, listed
+from torch_qpmpc.qp.batching import broadcast, flatten_batch
 from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.batch_solution import BatchSolution
@@ -22,10 +22,10 @@ from torch_qpmpc.qp.program import NDIMS, Status
 from torch_qpmpc.qp.solvers import backend
 
 ON_FAILURE = ("raise", "warn", "mask")
-#: value, z, chi, lam, xi, status, residual, iterations, active
+#: The tensors of a `QPSolution`: value, z, chi, lam, xi, status, residual, iterations, active.
 Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
-# OpenMP's threads do not survive a fork: in the child torch, too, would wait for them for ever.
+# OpenMP's threads do not survive a fork; with more than one, torch would hang in the child.
 os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
@@ -45,11 +45,18 @@ def solve_now(
     solver: str,
     on_failure: str,
 ) -> Outputs:
-    """Solve a batch: on the CPU, or with ``solver="torch"`` on the device of q.
+    """Solve a batch, on the CPU or, with ``solver="torch"``, on the device of q.
+
+    Args:
+        H, q, c, C, b, G, lb, ub, w: see `QuadraticProgram`.
+        fixed, solver, on_failure: see `torch_qpmpc.solve_qp`.
+        start: active sets ``(*batch, n_g)`` of a warm start.
+        n_kept: see `Programs.of`.
 
     Raises:
-        QPError: an unknown solver or ``on_failure``, invalid data, or a batch beyond memory.
-        SolverError: QPs without a certified solution, with ``on_failure="raise"``.
+        QPError: the solver or ``on_failure`` is unknown, the data are invalid, or the batch
+            exceeds the memory.
+        SolverError: with ``on_failure="raise"``, a QP has no certified solution.
     """
     backend(solver)
     if on_failure not in ON_FAILURE:
@@ -59,7 +66,7 @@ def solve_now(
     try:
         programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=device)
         if start is not None:
-            start = listed(start.detach().to(q.device).expand(*batch, -1)).contiguous()
+            start = flatten_batch(start.detach().to(q.device).expand(*batch, -1)).contiguous()
         sets = start.numpy(force=True) if start is not None and device is None else start
         solution = solve_programs(programs, solver, sets)
     except (MemoryError, RuntimeError) as error:
@@ -68,8 +75,8 @@ def solve_now(
         shapes = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
         count = broadcast(*shapes, fixed.shape[:-1]).numel()
         got = f"{count:,} QPs of n_z = {q.shape[-1]}"
-        remedy = f"Solve it in chunks, as of torch.split. The allocation said: {error}."
-        raise QPError.expected("batch", got, "as many as memory has room for", remedy) from error
+        remedy = f"Solve the batch in chunks, with torch.split. The allocation failed: {error}."
+        raise QPError.expected("batch", got, "as many as fit in memory", remedy) from error
     if on_failure != "mask" and not solution.all_accepted:
         _report(solution, batch, on_failure)
 
@@ -81,11 +88,11 @@ def solve_now(
         dtype = q.dtype if x.is_floating_point() else x.dtype
         return x.reshape((*batch, *x.shape[1:])).to(q.device, dtype)
 
-    return tuple(map(out, outputs))  # pyright: ignore[reportReturnType] - nine of them
+    return tuple(map(out, outputs))  # pyright: ignore[reportReturnType] - a tuple of nine
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """True for a failed allocation, which torch's CPU allocator names only in its message."""
+    """True for a failed allocation, which torch's CPU allocator reports only in the message."""
     kinds = (MemoryError, torch.OutOfMemoryError)
     return isinstance(error, kinds) or "DefaultCPUAllocator" in str(error)
 

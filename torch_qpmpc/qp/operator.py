@@ -1,8 +1,8 @@
-"""The traced way in: the solve as one operator of torch, with its rules side by side.
+"""The traced path: the solve as one torch operator, with its rules side by side.
 
 A custom operator keeps the solver opaque to `torch.compile`, fake tensors and `vmap`. The autograd
-Function round it makes it differentiable under `torch.func` and in forward mode as well, which a
-custom operator alone is not. The formulas are in `torch_qpmpc.qp.derivatives`.
+Function around it makes it differentiable under `torch.func` and in forward mode, which a custom
+operator alone is not. The formulas are in `torch_qpmpc.qp.derivatives`.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from torch_qpmpc.qp.derivatives import gradients, solve_kkt, tangents
 from torch_qpmpc.qp.program import NDIMS
 from torch_qpmpc.qp.tracing import has_values, is_differentiating, is_forward_mode, transforms
 
-#: Event dimensions of the operator's tensors: H, q, c, C, b, G, lb, ub, w, fixed, a warm start.
+#: Event dimensions of the operator's tensors: H, q, c, C, b, G, lb, ub, w, fixed, start.
 EVENT_NDIMS = (*NDIMS, 1, 1)
-#: Those of the KKT system's: four gradients; z, lam, status; H, .., fixed.
+#: Event dimensions of the KKT operator's: four gradients; z, lam, status; H, .., fixed.
 KKT_NDIMS = (1, 1, 1, 1, 1, 1, 0, *NDIMS, 1)
-#: Derivatives follow H, .., fixed, but not the start, n_kept, solver and on_failure.
+#: The number of differentiable arguments, H to fixed, and of start, n_kept, solver, on_failure.
 N_THETA, N_OTHERS = 10, 4
 
 solve_op = torch.library.custom_op("torch_qpmpc::solve", solve_now, mutates_args=())
@@ -31,32 +31,34 @@ kkt_op = torch.library.custom_op("torch_qpmpc::solve_kkt", solve_kkt, mutates_ar
 
 
 def solve_traced(*arguments: Any) -> Outputs:
-    """Call `solve_now` in the form that PyTorch can trace or differentiate now.
+    """Call `solve_now` in the form that the current trace or transform supports.
 
-    Dynamo traces no Function that has a jvp, none at all under `vmap`, and no custom operator under
-    `grad`. It would drop the outer derivative of nested transforms without a word.
+    Dynamo traces no Function that has a jvp, no Function under `vmap`, and no custom operator under
+    `grad`. It would silently drop the outer derivative of nested transforms.
+
+    Raises:
+        QPError: the combination of transforms is not supported.
     """
     if not is_differentiating():
         return solve_op(*arguments)
-    around = transforms()
+    stack = transforms()
     if not torch.compiler.is_compiling():
-        if around.count("Jvp") > 1:
+        if stack.count("Jvp") > 1:
             raise QPError.expected(
                 "derivative", "jvp in jvp", "one forward mode", "Use hessian, or jacrev inside."
             )
-        forward = around or is_forward_mode()
+        forward = stack or is_forward_mode()
         return (TracedForward if forward else Traced).apply(*arguments)
-    if set(around) <= {"Vmap"}:
-        return solve_op(*arguments) if around else Traced.apply(*arguments)
-    if around != ("Grad",):
+    if set(stack) <= {"Vmap"}:
+        return solve_op(*arguments) if stack else Traced.apply(*arguments)
+    if stack != ("Grad",):
         raise QPError.expected(
             "torch.compile",
-            f"{' in '.join(reversed(around))}, transforms inside of what is compiled",
+            f"{' in '.join(reversed(stack))} inside a compiled function",
             "vmap, or one grad, jacrev or vjp of a scalar",
-            "Leave this function out: torch.compiler.disable.",
+            "Exclude this function with torch.compiler.disable.",
         )
-    # Dynamo takes the gradient in a tensor for zero, or fails, if it is what `grad` differentiates
-    # in and nothing was done to it before.
+    # Without an operation on an argument of `grad`, Dynamo fails or takes its gradient to be zero.
     return Traced.apply(*(x.view_as(x) if isinstance(x, Tensor) else x for x in arguments))
 
 
@@ -83,15 +85,15 @@ def _setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
     _, z, chi, lam, xi, status, *_ = output
     ctx.set_materialize_grads(False)
     ctx.n_kept = inputs[N_THETA + 1]
-    # z, chi, lam and xi are outputs: a second derivative follows them by this same backward.
+    # Saving z, chi, lam and xi, which are outputs, makes this backward differentiable.
     ctx.save_for_backward(*inputs[:N_THETA], z, chi, lam, xi, status)
 
 
 def _backward(ctx: Any, *incoming: Tensor | None) -> tuple:
     theta, solution = ctx.saved_tensors[:N_THETA], ctx.saved_tensors[N_THETA:]
     needed = ctx.needs_input_grad[:N_THETA]
-    found = gradients(incoming[:5], theta, solution, needed, ctx.n_kept, kkt)
-    return (*found, *(None,) * N_OTHERS)
+    grads = gradients(incoming[:5], theta, solution, needed, ctx.n_kept, kkt)
+    return (*grads, *(None,) * N_OTHERS)
 
 
 solve_op.register_autograd(_backward, setup_context=_setup_context)
@@ -100,7 +102,7 @@ solve_op.register_autograd(_backward, setup_context=_setup_context)
 class Traced(torch.autograd.Function):
     """`solve_op`, differentiable under `torch.func`."""
 
-    # Dynamo counts the parameters to tell this style of Function: no *args here.
+    # No *args: Dynamo recognises this style of Function by its number of parameters.
     @staticmethod
     def forward(H, q, c, C, b, G, lb, ub, w, fixed, start, n_kept, solver, on_failure) -> Outputs:
         return solve_op(H, q, c, C, b, G, lb, ub, w, fixed, start, n_kept, solver, on_failure)
@@ -118,7 +120,7 @@ class Traced(torch.autograd.Function):
 
 
 class TracedForward(Traced):
-    """And in forward mode, which Dynamo does not trace."""
+    """`Traced`, differentiable in forward mode as well, which Dynamo does not trace."""
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
@@ -126,21 +128,21 @@ class TracedForward(Traced):
         ctx.save_for_forward(*ctx.to_save)
 
     @staticmethod
-    def jvp(ctx: Any, *of_inputs: Tensor | None) -> tuple:
+    def jvp(ctx: Any, *d_inputs: Tensor | None) -> tuple:
         theta, solution = ctx.saved_tensors[:N_THETA], ctx.saved_tensors[N_THETA:]
-        found = tangents(of_inputs[:N_THETA], theta, solution, ctx.n_kept, kkt)
-        return *found, *(None,) * 4
+        d_outputs = tangents(d_inputs[:N_THETA], theta, solution, ctx.n_kept, kkt)
+        return *d_outputs, *(None,) * 4
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
         return TracedForward.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9
 
 
-# The KKT system behind the derivatives of the solution, hidden from traces likewise
+# The KKT system for the derivatives of the solution, hidden from traces in the same way
 
 
 def kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Call `solve_kkt` in the form that PyTorch can trace now; a further derivative raises."""
+    """Call `solve_kkt` in the form that the current trace supports; its derivative raises."""
     if torch.compiler.is_compiling():
         return kkt_op(*arguments)
     if not is_differentiating() and has_values(*arguments[:-1]):
@@ -159,7 +161,7 @@ def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
 
 
 class KKTSolution(torch.autograd.Function):
-    """`kkt_op`, whose derivative would be a second one of the solution."""
+    """`kkt_op`, not differentiable: its derivative is the second of the solution."""
 
     @staticmethod
     def forward(*args):
@@ -173,9 +175,9 @@ class KKTSolution(torch.autograd.Function):
     def backward(ctx: Any, *_: Tensor) -> tuple:
         raise QPError.expected(
             "derivative",
-            "a second one of the solution, or a third one of the value",
-            "one of the solution, or two of the value",
-            "Detach what need not be differentiated.",
+            "the second of the solution, or the third of the value",
+            "at most the first of the solution, or the second of the value",
+            "Detach the tensors that need no gradient.",
         )
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""Autocast is kept out: a matrix product in half precision is too coarse for a QP's data."""
+"""Conversion of dtypes, and protection from autocast: half precision is too coarse for a QP."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from torch import Tensor
 
 
 def to_dtype(tensor: Tensor, dtype: torch.dtype) -> Tensor:
-    """``tensor.to(dtype)``, sooner where there is nothing to do."""
+    """Return ``tensor.to(dtype)``, faster if the dtype is the same."""
     return tensor if tensor.dtype == dtype else tensor.to(dtype)
 
 
 def full_precision(like: Tensor) -> AbstractContextManager[object]:
-    """A block without autocast on the device of ``like``."""
+    """Return a context without autocast on the device of ``like``."""
     device = like.device.type
     if device == "meta" or not torch.is_autocast_enabled(device):
         return nullcontext()

@@ -1,4 +1,4 @@
-"""The quadratic program of the paper (eq:qp2, eq:qp3), its solution, and its symbols.
+"""The paper's quadratic program (eq:qp2, eq:qp3), its symbols, and the status of its solution.
 
     min over z, sigma:   1/2 z'Hz + q'z + c + w'sigma                                 (eq:qp2c0)
     subject to           C z = b                              chi                     (eq:qp2c1)
@@ -7,9 +7,9 @@
                          x_0 = s                              xi                      (eq:qp2c4)
                          u_0 = a   (action value only)        zeta                    (eq:qp3c2)
 
-The inequality terms of the Lagrangian (eq:lag) are used with the sign that non-negative
-multipliers need, upsilon'(lb - sigma - Gz) + eta'(Gz - ub - sigma) - mu'sigma; the printed ones
-have it reversed. A row with w_i = inf is hard: its sigma_i is zero.
+The inequality terms of the Lagrangian (eq:lag) have the sign that non-negative multipliers need,
+upsilon'(lb - sigma - Gz) + eta'(Gz - ub - sigma) - mu'sigma; the paper prints the opposite sign.
+A row with w_i = inf is hard: its sigma_i is zero.
 """
 
 from __future__ import annotations
@@ -36,14 +36,20 @@ EVENT_SHAPES: dict[str, tuple[str, ...]] = {
     "ub": ("n_g",),
     "w": ("n_g",),
 }
-#: The dtypes that have factorisations.
+#: The dtypes for which torch factorises matrices.
 DTYPES = (torch.float32, torch.float64)
-#: How many trailing dimensions of each are no batch.
+#: The number of event dimensions of each tensor.
 NDIMS = tuple(len(event) for event in EVENT_SHAPES.values())
 
 
 class Status(IntEnum):
-    """Outcome of one QP of a batch; everything but ``SOLVED`` carries no solution."""
+    """Outcome of one QP of a batch; only ``SOLVED`` has a solution.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> qm.Status.UNBOUNDED.explanation
+        'the cost decreases without bound; add curvature to H or bounds to G'
+    """
 
     SOLVED = 0
     INFEASIBLE = 1
@@ -53,6 +59,7 @@ class Status(IntEnum):
 
     @property
     def explanation(self) -> str:
+        """Cause of the status, with a remedy."""
         return _EXPLANATIONS[self]
 
 
@@ -61,17 +68,17 @@ _EXPLANATIONS = {
     Status.INFEASIBLE: "no z satisfies C z = b and the hard rows (w = inf); soften rows with a "
     "finite w, or check b, lb and ub",
     Status.UNBOUNDED: "the cost decreases without bound; add curvature to H or bounds to G",
-    Status.NOT_CONVERGED: "no solver reached the certificate's tolerance, and nothing proves that "
-    "there is no solution; the QP may be ill-conditioned, as predictions of an unstable model are "
-    "over a long horizon: shorten it, give the model a stabilising feedback u = K x + v, or "
-    "rescale the QP",
+    Status.NOT_CONVERGED: "no solver reached the certificate's tolerance, and the QP is neither "
+    "provably infeasible nor unbounded; it may be ill-conditioned, like the predictions of an "
+    "unstable model over a long horizon: shorten the horizon, give the model a stabilising "
+    "feedback u = K x + v, or rescale the QP",
     Status.INVALID_DATA: "NaN or inf in the data, lb > ub, or an H that is not positive "
-    "semidefinite; look at the parameters and the state",
+    "semidefinite; check the parameters and the state",
 }
 
 
 def batch_shape(tensors: Sequence[Tensor]) -> torch.Size:
-    """Batch shape of H, q, c, C, b, G, lb, ub, w; `RuntimeError` if they do not broadcast."""
+    """Return the batch shape of H, q, .., w; raise `RuntimeError` if they do not broadcast."""
     return broadcast(*(x.shape[: x.ndim - n] for x, n in zip(tensors, NDIMS, strict=True)))
 
 
@@ -80,7 +87,7 @@ class QuadraticProgram:
     """A validated batch of parametric QPs (eq:qp2).
 
     Every tensor may have leading batch dimensions; they broadcast against each other. A tensor
-    without them is shared by the whole batch, and its gradient is the batch's sum.
+    without them is shared by the whole batch, and its gradient is summed over it.
 
     Args:
         H: cost matrix, ``(*batch, n_z, n_z)``, symmetric positive semidefinite.
@@ -92,12 +99,12 @@ class QuadraticProgram:
         lb: lower bounds, ``(*batch, n_g)``; ``-inf`` where there is none.
         ub: upper bounds, ``(*batch, n_g)``; ``inf`` where there is none.
         w: weights of the l1 relaxation, ``(*batch, n_g)``, non-negative; ``inf`` is a hard row.
-        check_values: also check the values (finite, H symmetric and positive semidefinite,
-            lb <= ub, w >= 0), not only the shapes. `QPMPC` passes ``False``: its parametrisation
-            guarantees them, and whatever training makes of theta is caught by the solve.
+        check_values: check the values, too (finite, H symmetric and positive semidefinite,
+            lb <= ub, w >= 0). `QPMPC` passes ``False``: its parametrisations guarantee them, and
+            the solve detects values that training has made invalid.
 
     Raises:
-        QPError: a shape, a dtype or a value that is none; the message names the argument.
+        QPError: a tensor's type, shape, dtype, device or values are invalid.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -135,25 +142,27 @@ class QuadraticProgram:
 
     @property
     def n_z(self) -> int:
+        """Number of variables."""
         return self.H.shape[-1]
 
     @property
     def batch_shape(self) -> torch.Size:
+        """Common batch shape of all tensors."""
         return batch_shape(self.tensors())
 
     def __repr__(self) -> str:
-        """Sizes, dtype and device, without the tensors' entries."""
+        """Show sizes, dtype and device, without the tensors' entries."""
         sizes = f"n_z={self.n_z}, n_c={self.b.shape[-1]}, n_g={self.lb.shape[-1]}"
         kind = f"dtype={self.H.dtype}, device={str(self.H.device)!r}"
         return f"QuadraticProgram(batch_shape={tuple(self.batch_shape)}, {sizes}, {kind})"
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """H, q, c, C, b, G, lb, ub, w."""
+        """Return H, q, c, C, b, G, lb, ub, w."""
         return (self.H, self.q, self.c, self.C, self.b, self.G, self.lb, self.ub, self.w)
 
     def _check_shapes(self) -> None:
         if not self._fits():
-            self._name_what_does_not_fit()
+            self._raise_mismatch()
         try:
             _ = self.batch_shape
         except RuntimeError as error:
@@ -163,7 +172,7 @@ class QuadraticProgram:
             ) from error
 
     def _fits(self) -> bool:
-        """True if dtypes, devices and event shapes fit each other: the common case, at once."""
+        """True if dtypes, devices and event shapes match: a fast test of the common case."""
         tensors = self.tensors()
         if not all(isinstance(x, Tensor) for x in tensors):
             return False
@@ -176,7 +185,7 @@ class QuadraticProgram:
             for x, n, event in zip(tensors, NDIMS, events, strict=True)
         )
 
-    def _name_what_does_not_fit(self) -> None:
+    def _raise_mismatch(self) -> None:
         for field in fields(self):
             tensor = getattr(self, field.name)
             if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
@@ -188,12 +197,13 @@ class QuadraticProgram:
                     "Convert it with torch.as_tensor(..., dtype=torch.float64).",
                 )
             if tensor.dtype not in DTYPES:
-                remedy = "Half precision has no factorisations: use torch.float64."
+                remedy = "Half precision has no matrix factorisations: use torch.float64."
                 got = tensor.dtype
                 raise QPError.expected(field.name, got, "torch.float32 or torch.float64", remedy)
             if tensor.device != self.H.device:
                 got, remedy = f"a tensor on {tensor.device}", "Move all nine to one device."
-                raise QPError.expected(field.name, got, f"one on H's {self.H.device}", remedy)
+                expected = f"one on H's device, {self.H.device}"
+                raise QPError.expected(field.name, got, expected, remedy)
             if tensor.dtype != self.H.dtype:
                 raise QPError.expected(
                     field.name,
@@ -223,7 +233,7 @@ class QuadraticProgram:
         for name, forbidden in (("lb", torch.inf), ("ub", -torch.inf), ("w", -torch.inf)):
             tensor = getattr(self, name)
             if (tensor.isnan() | (tensor == forbidden)).any():
-                raise QPError.expected(name, f"NaN or {forbidden}", "no NaN, and no such infinity")
+                raise QPError.expected(name, f"NaN or {forbidden}", f"numbers or {-forbidden}")
         if crossed(self.lb, self.ub).any():
             excess = (self.lb - self.ub).max().item()
             raise QPError.expected("lb", f"lb > ub by up to {excess:.3g}", "lb <= ub in every row")
@@ -259,14 +269,14 @@ class QuadraticProgram:
             )
 
 
-#: In the place of a row's state in an active set: nothing is known of an unsolved QP.
+#: The code of every row in the active set of an unsolved QP.
 UNKNOWN = 127
 
-#: Units of rounding by which bounds that should be equal may cross.
+#: Bounds that cross by at most this many machine epsilons are equal.
 CROSSING = 4.0
 
 
 def crossed(lb: Tensor, ub: Tensor) -> Tensor:
-    """Where lb > ub, and not by rounding alone."""
+    """Return the mask of rows where lb exceeds ub by more than rounding, ``(*batch, n_g)``."""
     size, gap = lb.abs().maximum(ub.abs()), lb - ub
     return (gap > CROSSING * torch.finfo(lb.dtype).eps * size) | (gap == torch.inf)

@@ -11,12 +11,12 @@ from torch_qpmpc.qp.precision import full_precision
 from torch_qpmpc.qp.program import QuadraticProgram, Status
 from torch_qpmpc.qp.tracing import has_values
 
-#: A multiplier below this fraction of the largest is zero; one as near to w is saturated.
+#: A multiplier below this fraction of the largest is zero; one this close to w is saturated.
 ACTIVE_FRACTION = 1e-8
 
 
 def active_rows(lam: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-    """Which rows are held at a bound, and which are saturated at |lam| = w, ``(*batch, n_g)``."""
+    """Return the masks of rows held at a bound and saturated at |lam| = w, ``(*batch, n_g)``."""
     size = lam.abs()
     saturated = w.isfinite() & (size >= (1 - ACTIVE_FRACTION) * w)
     largest = size.amax(-1, keepdim=True) if size.shape[-1] else size
@@ -24,44 +24,52 @@ def active_rows(lam: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def row_states(p, lower, upper, w) -> tuple:
-    """Each row's nearest bound, whether it is active there, and lam if not; arrays or tensors.
+    """Return each row's nearest bound, True if it is active there, and its multiplier.
 
-    The excess of ``p = y + lam`` over the bounds would be the multiplier; |lam| <= w caps it.
+    ``p = y + lam`` is an array or a tensor. Its excess over the bounds, clipped to [-w, w], is the
+    multiplier.
     """
     bound = p.clip(lower, upper)
     excess = p - bound
-    held = excess.clip(-w, w)
-    active = (held == excess) & ((excess != 0) | (lower == upper))
-    return bound, active, held
+    multiplier = excess.clip(-w, w)
+    active = (multiplier == excess) & ((excess != 0) | (lower == upper))
+    return bound, active, multiplier
 
 
 def active_codes(y: Tensor, lam: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
-    """`QPSolution.active` of rows y = G z with multipliers lam, ``(*batch, n_g)``."""
-    _, held, fixed = row_states(y + lam, lb, ub, w)
-    return torch.where(held, lam.sign(), 2 * fixed.sign()).to(torch.int8)
+    """Return `QPSolution.active` of rows y = G z with multipliers lam, ``(*batch, n_g)``."""
+    _, active, multiplier = row_states(y + lam, lb, ub, w)
+    return torch.where(active, lam.sign(), 2 * multiplier.sign()).to(torch.int8)
 
 
 @dataclass(frozen=True, repr=False)
 class QPSolution:
     """Primal-dual solution of a batch of QPs.
 
-    All but the last four are differentiable in the tensors of the QP and in the fixed entries. An
-    element that is not solved (``status != 0``; only with ``on_failure`` "warn" or "mask") has
+    value, z, chi, lam and xi are differentiable in the tensors of the QP and in the fixed entries.
+    An unsolved element (``status != 0``; only with ``on_failure`` "warn" or "mask") has
     ``value = inf``, the fixed entries in ``z``, zeros elsewhere, and no gradient.
 
     Attributes:
-        qp: the problems that this solves.
+        qp: the solved QPs.
         value: optimal cost, ``(*batch,)``.
         z: minimiser, ``(*batch, n_z)``.
         chi: multipliers of C z = b, ``(*batch, n_c)``.
         lam: signed multipliers eta - upsilon of the rows, ``(*batch, n_g)``.
         xi: multipliers of the fixed entries, ``(*batch, n_f)``: the paper's xi, then zeta.
         status: `Status` as integers, ``(*batch,)``.
-        residual: relative KKT residual found by the certificate, ``(*batch,)``.
+        residual: relative KKT residual, from the certificate, ``(*batch,)``.
         iterations: the solver's iterations, ``(*batch,)``.
-        active: the active set as int8 ``(*batch, n_g)``, a warm start for a nearly equal QP. 0 is a
-            row without multiplier, 1 one that is held at ub and -1 one at lb; 2 and -2 are rows
-            saturated there, at eta = w or upsilon = w. All rows of an unsolved element are 127.
+        active: the active set as int8 ``(*batch, n_g)``, a warm start for a nearly equal QP. Rows
+            are 0 without a multiplier, 1 if held at ub, -1 if held at lb, 2 and -2 if saturated
+            there (eta = w, upsilon = w), and 127 in unsolved elements.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> mpc = qm.QPMPC(1, 1, 1, A=[[1.0]], B=[[1.0]], action_bounds=([-1.0], [1.0]))
+        >>> solution = mpc.solve(torch.tensor([3.0]))  # z = (x_0, u_0, x_1)
+        >>> solution.z.detach().round(decimals=3).tolist(), solution.active.tolist()
+        ([3.0, -1.0, 2.0], [0, -1, 0])
     """
 
     qp: QuadraticProgram
@@ -76,7 +84,7 @@ class QPSolution:
     active: Tensor
 
     def __repr__(self) -> str:
-        """Sizes, how many elements have each status, and the range of the values."""
+        """Show sizes, the count of each status, and the range of the values."""
         lines = [
             f"batch_shape={tuple(self.status.shape)}, n_f={self.xi.shape[-1]}",
             f"qp={self.qp!r}",
@@ -97,7 +105,7 @@ class QPSolution:
 
     @property
     def solved(self) -> Tensor:
-        """Which elements are certified solutions, ``(*batch,)``."""
+        """Mask of elements with a certified solution, ``(*batch,)``."""
         return self.status == Status.SOLVED
 
     @property
@@ -126,7 +134,7 @@ class QPSolution:
 
 
 def slacks(z: Tensor, G: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
-    """sigma of z: how far soft rows are outside their bounds, ``(*batch, n_g)``."""
+    """Return sigma, the violation of soft rows by z, ``(*batch, n_g)``; zero on hard rows."""
     y = _rows(z, G)
     return torch.where(w.isinf(), 0, torch.maximum(lb - y, y - ub).clamp(min=0))
 

@@ -1,4 +1,4 @@
-"""`solve_qp`: a batch of QPs and its certified, differentiable solution."""
+"""`solve_qp`: the certified, differentiable solution of a batch of QPs."""
 
 from __future__ import annotations
 
@@ -23,30 +23,40 @@ def solve_qp(
     on_failure: str = "raise",
     warm_start: QPSolution | Tensor | None = None,
 ) -> QPSolution:
-    """Solve a batch of QPs (eq:qp2, eq:qp3); every answer is certified.
+    """Solve a batch of QPs (eq:qp2, eq:qp3); every solution is certified.
 
     Args:
-        qp: the problems.
+        qp: the QPs.
         fixed: values of the first n_f entries of z, ``(*batch, n_f)``: s for V, (s, a) for Q.
-        solver: ``"proxqp"``, ``"daqp"``, ``"torch"`` or ``"qpsolvers:NAME"``. What its answer's
-            certificate rejects is solved again by the others.
-        on_failure: what an unsolved element does. ``"raise"`` a `SolverError`; ``"warn"`` and
-            ``"mask"`` give it ``value = inf`` and no gradient, with and without a warning.
-        warm_start: a solution of nearly the same QPs, or its ``active`` ``(*batch, n_g)``: tried
-            before the solver is, for the whole batch at once. Saves time only.
+        solver: ``"proxqp"``, ``"daqp"``, ``"torch"`` or ``"qpsolvers:NAME"``. QPs that the
+            certificate rejects are solved again by the others.
+        on_failure: the treatment of unsolved elements. ``"raise"`` raises `SolverError`; ``"warn"``
+            and ``"mask"`` give them ``value = inf`` and no gradient, with and without a warning.
+        warm_start: a solution of nearly equal QPs, or its ``active`` ``(*batch, n_g)``, tried
+            before the solver. It saves time, and changes the result only within the tolerance.
 
     Returns:
         The solution, differentiable in every tensor of ``qp`` and in ``fixed``: ``value`` by the
         envelope theorem, and twice; the rest by the KKT system (`torch_qpmpc.qp.derivatives`).
 
     Raises:
-        QPError: ``fixed`` or ``warm_start`` does not fit, or an argument is unknown.
+        QPError: an argument is invalid, or (with ``on_failure="raise"``) elements are unsolved only
+            because of invalid data.
         SolverError: with ``on_failure="raise"``, an element is infeasible, unbounded or not solved.
 
     References:
         Büskens and Maurer (2001), as cited at eq:gradq.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> qp = qm.QPMPC(1, 1, 3, A=[[1.0]], B=[[1.0]], hessian="full").quadratic_program()
+        >>> s = torch.ones(1, dtype=torch.float64, requires_grad=True)
+        >>> solution = qm.solve_qp(qp, s, solver="daqp")
+        >>> solution.value.backward()
+        >>> torch.allclose(s.grad, -solution.xi)  # eq:gradq
+        True
     """
-    check_kind("qp", qp, QuadraticProgram, "Of a QPMPC: mpc.quadratic_program(), or mpc.solve(s).")
+    check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or call mpc.solve(s).")
     for name, choice in (("solver", solver), ("on_failure", on_failure)):
         if not isinstance(choice, str):
             raise QPError.expected(name, repr(choice), "a name")
@@ -63,9 +73,9 @@ def solve(
     on_failure: str,
     warm_start: QPSolution | Tensor | None,
 ) -> QPSolution:
-    """`solve_qp`, for callers whose V and Q keep the same ``n_kept`` leading entries of z.
+    """Solve as `solve_qp`, with ``n_kept`` leading entries of z kept when C z = b is eliminated.
 
-    They share one elimination of C z = b. None keeps the fixed entries.
+    V and Q that keep the same entries share one elimination. None keeps the fixed entries.
     """
     batch = _checked_batch(qp, fixed)
     start = _checked_start(qp, batch, warm_start)

@@ -1,7 +1,7 @@
-"""Every read of torch's internals: traces, transforms, forward mode, tensor classes.
+"""All reads of torch's internals: traces, transforms, forward mode, tensor classes.
 
-The solver must be hidden from whatever records operations instead of running them, and torch has no
-public way to find out. A test of each function fails if torch changes what it reads.
+The solver must be hidden from traces and transforms, which torch has no public way to detect. A
+test of each function fails if torch changes the internals that it reads.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from torch.autograd import forward_ad
 
 _functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue] - has no stub
 
-#: The classes of tensors that only autograd records.
+#: The tensor classes without a dispatch of their own.
 PLAIN = frozenset((Tensor, nn.Parameter))
 #: The dispatch key of `torch.autograd.grad` with ``is_grads_batched``.
 BATCHED_GRADIENTS = torch._C._dispatch_key_parse("VmapMode")
 
 
 def is_hidden(tensors: Sequence[Tensor]) -> bool:
-    """True if a trace, a transform or a tensor class may keep the values from the program."""
+    """True if a trace, a transform or a tensor class may hide the values."""
     core = torch._C
     return (
         torch.compiler.is_compiling()
@@ -35,12 +35,12 @@ def is_hidden(tensors: Sequence[Tensor]) -> bool:
 
 
 def has_values(*tensors: Tensor) -> bool:
-    """True if the program may branch on the tensors' values."""
+    """True if Python may branch on the tensors' values."""
     return not is_hidden(tensors) and not any(x.is_meta for x in tensors)
 
 
 def is_eager(tensors: Sequence[Tensor]) -> bool:
-    """True if operations run as they are called, and nothing but reverse mode records them."""
+    """True if operations run when called, and only reverse mode records them."""
     return (
         not is_forward_mode()
         and has_values(*tensors)
@@ -54,12 +54,12 @@ def is_forward_mode() -> bool:
 
 
 def is_differentiating() -> bool:
-    """True if a derivative of what is computed now may follow, in either mode."""
+    """True if the result may be differentiated, in either mode."""
     return torch.is_grad_enabled() or is_forward_mode()  # `torch.no_grad` leaves forward mode on
 
 
 @torch.compiler.assume_constant_result
 def transforms() -> tuple[str, ...]:
-    """The `torch.func` transforms around the program, such as "Grad", from the outermost."""
+    """Return the `torch.func` transforms in effect, such as "Grad", from the outermost."""
     stack = _functorch.get_interpreter_stack() or ()
     return tuple(interpreter.key().name for interpreter in stack)

@@ -250,7 +250,7 @@ def test_what_float64_cannot_solve_is_not_called_infeasible(solver, A, horizon):
 
 def test_not_converged_speaks_of_conditioning_and_of_what_helps():
     mpc = growing(2.0, 40, solver="daqp")
-    message = "1 NOT_CONVERGED.*unstable model are over a long horizon: shorten it"
+    message = "1 NOT_CONVERGED.*unstable model over a long horizon: shorten the horizon"
     with pytest.raises(SolverError, match=message):
         mpc.value(doubles([[0.0, 0.05]]))
 

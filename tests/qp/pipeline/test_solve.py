@@ -198,7 +198,7 @@ def test_what_nobody_solves_is_not_converged():
     known = known_qp(4, batch=(2, 3))
     message = (
         r"6 of 6 QPs have no certified solution. 6 NOT_CONVERGED, first at batch index \(0, 0\): "
-        r"no solver reached the certificate's tolerance, and nothing proves"
+        r"no solver reached the certificate's tolerance, and the QP is neither"
     )
     with pytest.raises(SolverError, match=message):
         solve(known)

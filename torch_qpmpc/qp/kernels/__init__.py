@@ -1,1 +1,1 @@
-"""Loops compiled for the CPU: over QPs, and over what follows from a theta."""
+"""Loops compiled for the CPU, per QP and per theta, and torch forms for other devices."""

@@ -1,4 +1,4 @@
-"""Linear algebra in loops that Numba compiles for the CPU. Arrays are float64 and contiguous."""
+"""Linear algebra as loops that Numba compiles for the CPU. Arrays are float64 and contiguous."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ import numpy as np
 from llvmlite import ir
 from numba.extending import intrinsic
 
-#: Most entries of matrix times vectors in one call of BLAS, so that it stays in one thread.
+#: Largest matrix size times number of vectors in one call of BLAS, which then uses one thread.
 ONE_THREAD = 2**18
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """Compile ``function``; the machine code is kept on disk if its folder can be written."""
+    """Compile ``function``; cache the machine code on disk if its folder is writable."""
     try:
         return numba.njit(cache=True, error_model="numpy", **options)(function)
     except RuntimeError:
         return numba.njit(error_model="numpy", **options)(function)
 
 
-# LLVM works on four entries at a time if sums may be reordered, or if no entry is NaN.
+# LLVM vectorises loops whose sums may be reordered, or whose entries are never NaN.
 summing = partial(compiled, fastmath={"reassoc", "contract"})
 comparing = partial(compiled, fastmath={"nnan", "nsz"})
 
 
 def _larger(_, x, y):
-    """max(x, y) of numbers that are not NaN; Python's max is not vectorised."""
+    """Return max(x, y) of numbers that are not NaN; Python's max is not vectorised."""
 
     def generate(_, builder, signature, numbers):
         double = ir.DoubleType()
@@ -46,14 +46,14 @@ larger: Any = intrinsic(_larger)
 
 @compiled
 def add(x, factor, y):
-    """x += factor y."""
+    """Add ``factor y`` to x in place."""
     for j in range(len(x)):
         x[j] += factor * y[j]
 
 
 @compiled
 def add_product(x, factors, matrix):
-    """x += matrix' factors, four rows at a time: x is read and written a quarter as often."""
+    """Add ``matrix' factors`` to x in place, four rows at a time to save reads and writes of x."""
     whole = len(factors) - len(factors) % 4
     for j in range(0, whole, 4):
         f, g, h, p = factors[j], factors[j + 1], factors[j + 2], factors[j + 3]
@@ -72,6 +72,7 @@ def add_product(x, factors, matrix):
 
 @summing
 def dot(x, y):
+    """Return x'y."""
     total = 0.0
     for j in range(len(x)):
         total += x[j] * y[j]
@@ -80,49 +81,52 @@ def dot(x, y):
 
 @compiled
 def products(matrices, group, vectors, diagonal):
-    """Multiply each QP's matrix by its vector: ``(M, i, j)`` and ``(B, j)`` to ``(B, i)``."""
-    found = np.empty((len(vectors), matrices.shape[1]))
+    """Multiply each QP's matrix by its vector: ``(M, i, j)`` and ``(B, j)`` to ``(B, i)``.
+
+    With ``diagonal``, all QPs share one diagonal matrix.
+    """
+    out = np.empty((len(vectors), matrices.shape[1]))
     if diagonal:
-        _scale(matrices[0], vectors, found)
+        _scale(matrices[0], vectors, out)
     elif len(matrices) == 1 and matrices.size:
-        some = max(1, ONE_THREAD // matrices.size)
-        for i in range(0, len(vectors), some):
-            np.dot(vectors[i : i + some], matrices[0].T, found[i : i + some])
+        chunk = max(1, ONE_THREAD // matrices.size)
+        for i in range(0, len(vectors), chunk):
+            np.dot(vectors[i : i + chunk], matrices[0].T, out[i : i + chunk])
     else:
         for i in range(len(vectors)):
-            for j in range(found.shape[1]):
-                found[i, j] = dot(matrices[group[i], j], vectors[i])
-    return found
+            for j in range(out.shape[1]):
+                out[i, j] = dot(matrices[group[i], j], vectors[i])
+    return out
 
 
 @compiled
 def transposed_products(matrices, group, vectors, diagonal):
-    """As `products`, by the transposed matrices: ``(M, i, j)`` and ``(B, i)`` to ``(B, j)``."""
-    found = np.empty((len(vectors), matrices.shape[2]))
+    """Do as `products` with transposed matrices: ``(M, i, j)`` and ``(B, i)`` to ``(B, j)``."""
+    out = np.empty((len(vectors), matrices.shape[2]))
     if diagonal:
-        _scale(matrices[0], vectors, found)
+        _scale(matrices[0], vectors, out)
     elif len(matrices) == 1 and matrices.size:
-        some = max(1, ONE_THREAD // matrices.size)
-        for i in range(0, len(vectors), some):
-            np.dot(vectors[i : i + some], matrices[0], found[i : i + some])
+        chunk = max(1, ONE_THREAD // matrices.size)
+        for i in range(0, len(vectors), chunk):
+            np.dot(vectors[i : i + chunk], matrices[0], out[i : i + chunk])
     else:
-        found[:] = 0.0
+        out[:] = 0.0
         for i in range(len(vectors) if matrices.size else 0):
-            add_product(found[i], vectors[i], matrices[group[i]])
-    return found
+            add_product(out[i], vectors[i], matrices[group[i]])
+    return out
 
 
 @compiled
-def _scale(matrix, vectors, found):
+def _scale(matrix, vectors, out):
     factors = np.diag(matrix).copy()
     for i in range(len(vectors)):
         for j in range(len(factors)):
-            found[i, j] = vectors[i, j] * factors[j]
+            out[i, j] = vectors[i, j] * factors[j]
 
 
 @compiled
 def factorise(L):
-    """Replace the lower triangle by its Cholesky factor; False if there is none."""
+    """Replace the lower triangle by its Cholesky factor; return False if there is none."""
     for j in range(len(L)):
         for k in range(j):
             for i in range(j, len(L)):

@@ -1,7 +1,7 @@
-"""What each QP of a batch needs, in loops that Numba compiles for the CPU.
+"""Computations for each QP of a batch, as loops that Numba compiles for the CPU.
 
-The torch forms of `torch_qpmpc.qp.kernels.sample_torch` do the same on other devices. Arrays are
-float64 and contiguous; a vector that the whole batch shares has one row.
+`torch_qpmpc.qp.kernels.sample_torch` has the same functions for other devices. Arrays are float64
+and contiguous; a vector that the whole batch shares has one row.
 """
 
 from __future__ import annotations
@@ -22,41 +22,41 @@ from torch_qpmpc.qp.kernels.linalg import (
     transposed_products,
 )
 
-#: Violation from which a row that no free variable enters has its whole weight as multiplier.
+#: A row without free variables that is violated by more has its weight as multiplier.
 VIOLATED = 1e-9
-#: Most active sets of one QP that a warm start tries before the backend solves it.
+#: Largest number of active sets that a warm start tries for one QP.
 MAX_STEPS = 10
-#: Solves with one active set: the first, and those that refine it.
+#: Largest number of solves with one active set: the first, and refinements.
 MAX_PASSES = 3
-#: Relative errors up to which bounds are kept, and up to which signs are right.
+#: Relative tolerance for bounds and for signs of multipliers in a warm start.
 SLIP = 1e-9
 
 
 @compiled
 def offsets(fixed, group, matrix, constant):
-    """The linear cost and the bounds of the reduced QPs, ``constant + matrix' fixed``."""
-    # Not by BLAS, which rounds a sample alone differently from one in a batch.
-    found = np.empty((len(fixed), constant.shape[1]))
+    """Return the linear costs and bounds of the reduced QPs, ``constant + matrix' fixed``."""
+    # Not by BLAS, which rounds a single sample differently from one in a batch.
+    out = np.empty((len(fixed), constant.shape[1]))
     for i in range(len(fixed)):
-        found[i] = constant[i % len(constant)]
-        add_product(found[i], fixed[i], matrix[group[i]])
-    return found
+        out[i] = constant[i % len(constant)]
+        add_product(out[i], fixed[i], matrix[group[i]])
+    return out
 
 
 def recover(v, lam, group, fixed, theta, reduced, diagonal, passes=0) -> tuple[Any, ...]:
     """Complete and certify solutions of reduced QPs.
 
     The multipliers of C z = b and of the fixed entries follow from the stationarity of the
-    Lagrangian: chi by the transpose of the elimination, xi from the rest in the fixed entries.
+    Lagrangian: chi by the transposed elimination, xi from the residual in the fixed entries.
 
     Args:
         v, lam: solutions ``(B, d)`` and signed multipliers ``(B, r)`` of the reduced QPs.
-        group, fixed, theta, reduced: of the QPs, see `torch_qpmpc.qp.pipeline.batch`.
-        diagonal: True for H and for G if the batch shares one that is diagonal.
-        passes: steps of iterative refinement of z and chi against the elimination's errors.
+        group, fixed, theta, reduced: the QPs, see `torch_qpmpc.qp.pipeline.batch`.
+        diagonal: two flags, True if the batch shares one diagonal H, and one diagonal G.
+        passes: the number of iterative refinements of z and chi after the elimination.
 
     Returns:
-        value, z, chi, lam, xi, the active set's codes, and the certificate's residual.
+        value, z, chi, lam, xi, the codes of the active set, and the certificate's residual.
     """
     return _recover(v, lam, group, fixed, theta, reduced, diagonal, passes)
 
@@ -97,28 +97,28 @@ def _recover(v, lam_v, group, fixed, theta, reduced, diagonal, passes):
 
 @compiled
 def _all_multipliers(lam_v, y, theta, rows, others):
-    """Multipliers of all rows ``(B, n_g)``, and the active set's codes."""
+    """Return the multipliers of all rows ``(B, n_g)`` and the codes of the active set."""
     lb, ub, w = theta.lb, theta.ub, theta.w
     lam, codes = np.zeros_like(y), np.empty_like(y, np.int8)
     for i in range(len(y)):
-        of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
+        i_lb, i_ub, i_w = i % len(lb), i % len(ub), i % len(w)
         for k in range(len(rows)):
             lam[i, rows[k]] = lam_v[i, k]
-        # A loop of its own, to be compiled four at a time.
+        # A separate loop, which LLVM vectorises.
         for j in range(lam.shape[1]):
-            push, most = lam[i, j], w[of_w, j]
-            lam[i, j] = most if push > most else -most if push < -most else push
+            push, weight = lam[i, j], w[i_w, j]
+            lam[i, j] = weight if push > weight else -weight if push < -weight else push
         for j in others:
-            if w[of_w, j] < np.inf:  # a violated hard row stays violated: the residual shows it
-                if y[i, j] - ub[of_ub, j] > VIOLATED:
-                    lam[i, j] = w[of_w, j]
-                elif lb[of_lb, j] - y[i, j] > VIOLATED:
-                    lam[i, j] = -w[of_w, j]
+            if w[i_w, j] < np.inf:  # a violated hard row stays violated: the residual shows it
+                if y[i, j] - ub[i_ub, j] > VIOLATED:
+                    lam[i, j] = w[i_w, j]
+                elif lb[i_lb, j] - y[i, j] > VIOLATED:
+                    lam[i, j] = -w[i_w, j]
         for j in range(lam.shape[1]):
-            below, above, most = lb[of_lb, j], ub[of_ub, j], w[of_w, j]
+            below, above, weight = lb[i_lb, j], ub[i_ub, j], w[i_w, j]
             at = y[i, j] + lam[i, j]
             excess = at - min(max(at, below), above)
-            held = min(max(excess, -most), most)
+            held = min(max(excess, -weight), weight)
             if held == excess and (excess != 0 or below == above):
                 codes[i, j] = np.sign(lam[i, j])
             else:
@@ -127,7 +127,7 @@ def _all_multipliers(lam_v, y, theta, rows, others):
 
 
 def certify(z, lam, chi, xi, group, fixed, theta, diagonal) -> tuple[Any, Any]:
-    """Value and relative KKT residual ``(B,)``, see `torch_qpmpc.qp.pipeline.certificate`."""
+    """Return value and KKT residual ``(B,)``, see `torch_qpmpc.qp.pipeline.certificate`."""
     return _certify(z, lam, chi, xi, group, fixed, theta, diagonal)
 
 
@@ -146,31 +146,31 @@ def _certify(z, lam, chi, xi, group, fixed, theta, diagonal):
 
 @compiled
 def _judge(z, lam, chi, fixed, theta, Hz, G_lam, C_chi, left, y, Cz):
-    """Value and residual from the terms of the KKT conditions; ``left`` is the stationarity's."""
+    """Return value and residual from the KKT terms; ``left`` is the residual of stationarity."""
     q, c, b, lb, ub, w = theta.q, theta.c, theta.b, theta.lb, theta.ub, theta.w
     value, residual = np.empty(len(z)), np.empty(len(z))
     for i in range(len(z)):
-        of_q, of_b = q[i % len(q)], b[i % len(b)]
-        of_lb, of_ub, of_w = lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)]
-        cost, slip = _cost(z[i], Hz[i], left[i], of_q)
-        charge, gap = _charge(y[i], lam[i], of_lb, of_ub, of_w)
-        cost, slip = cost + charge, slip + gap + _shortage(Cz[i], of_b, chi[i])
-        force, slope, length = _forces(z[i], Hz[i], G_lam[i], C_chi[i], left[i], of_q)
-        short, size = _distance(Cz[i], of_b)
+        q_i, b_i = q[i % len(q)], b[i % len(b)]
+        lb_i, ub_i, w_i = lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)]
+        cost, slip = _cost(z[i], Hz[i], left[i], q_i)
+        charge, gap = _charge(y[i], lam[i], lb_i, ub_i, w_i)
+        cost, slip = cost + charge, slip + gap + _shortage(Cz[i], b_i, chi[i])
+        force, slope, length = _forces(z[i], Hz[i], G_lam[i], C_chi[i], left[i], q_i)
+        short, size = _distance(Cz[i], b_i)
         error = max(slope / (1.0 + force), short / (1.0 + size + length))
         error = max(error, _distance(z[i, : fixed.shape[1]], fixed[i])[0])
-        error = max(error, _excess(y[i], lam[i], of_lb, of_ub, of_w))
+        error = max(error, _excess(y[i], lam[i], lb_i, ub_i, w_i))
         slip /= 1.0 + abs(cost)
         worst = max(error, slip)
         value[i] = cost + c[i % len(c)]
-        # A NaN in any entry is in the sums; the largest sizes ignore it.
+        # Sums propagate a NaN in any entry; maxima ignore it.
         residual[i] = worst if slip < np.inf and worst < np.inf else np.inf
     return value, residual
 
 
 @summing
 def _cost(z, Hz, left, q):
-    """Return (q + Hz / 2)'z, and what the rest of stationarity is worth."""
+    """Return (q + Hz / 2)'z, and the stationarity residual weighted by |z|."""
     cost = slip = 0.0
     for j in range(len(z)):
         cost += (q[j] + 0.5 * Hz[j]) * z[j]
@@ -186,7 +186,7 @@ def _charge(y, lam, lb, ub, w):
         at, push, weight, above, below = y[j], lam[j], w[j], ub[j], lb[j]
         outside = at - above if at > above else below - at if at < below else 0.0
         charge = outside * (0.0 if weight == np.inf else weight)
-        # NaN is neither, and stays.
+        # NaN fails both comparisons, and stays.
         up, down = 0.0 if push < 0 else push, 0.0 if push > 0 else push
         above, below = 0.0 if above == np.inf else above, 0.0 if below == -np.inf else below
         total += charge
@@ -196,7 +196,7 @@ def _charge(y, lam, lb, ub, w):
 
 @summing
 def _shortage(Cz, b, chi):
-    """What C z - b is worth."""
+    """Return the sum of |C z - b| weighted by |chi|."""
     slip = 0.0
     for j in range(len(b)):
         slip += abs((Cz[j] - b[j]) * chi[j])
@@ -205,7 +205,7 @@ def _shortage(Cz, b, chi):
 
 @comparing
 def _forces(z, Hz, G_lam, C_chi, left, q):
-    """Return the largest terms of stationarity, of its rest, and of z."""
+    """Return the largest absolute terms of stationarity, its residual, and z."""
     force = slope = length = 0.0
     for j in range(len(z)):
         force = larger(force, larger(abs(q[j]), abs(Hz[j])))
@@ -216,7 +216,7 @@ def _forces(z, Hz, G_lam, C_chi, left, q):
 
 @comparing
 def _distance(x, y):
-    """Return the largest entry of x - y, and of y."""
+    """Return the largest absolute entries of x - y and of y."""
     difference = size = 0.0
     for j in range(len(y)):
         difference, size = larger(difference, abs(x[j] - y[j])), larger(size, abs(y[j]))
@@ -225,7 +225,7 @@ def _distance(x, y):
 
 @comparing
 def _excess(y, lam, lb, ub, w):
-    """The largest violation of a hard row, multiplier beyond w, or multiplier of no bound."""
+    """Return the largest violation of a hard row, of |lam| <= w, or of lam at an absent bound."""
     error = 0.0
     for j in range(len(y)):
         at, push, weight = y[j], lam[j], w[j]
@@ -239,10 +239,10 @@ def _excess(y, lam, lb, ub, w):
 
 
 def try_active_sets(qps, forces, active) -> tuple[Any, ...]:
-    """Try active sets ``(B, r)``, as `torch_qpmpc.qp.pipeline.warm_start` says.
+    """Try active sets ``(B, r)`` as in `torch_qpmpc.qp.pipeline.warm_start`.
 
     Returns:
-        v ``(B, d)``, lam ``(B, r)``, the steps, and True where they came to an end, ``(B,)``.
+        v ``(B, d)``, lam ``(B, r)``, the number of steps, and True where they settled, ``(B,)``.
     """
     g, lower, upper, w = map(np.ascontiguousarray, (qps.g, qps.l, qps.u, qps.w))
     return _try_active_sets(forces.rise, forces.push, qps.group, g, lower, upper, w, active)
@@ -259,7 +259,7 @@ def _try_active_sets(rise, push, group, g, lower, upper, w, active):
     factor = np.empty((r, r))
     for i in range(n_qps):
         code[:] = active[i]
-        by = push[group[i]]
+        push_i = push[group[i]]
         for j in range(r):
             if not -2 <= code[j] <= 2:
                 code[:] = 0
@@ -271,11 +271,11 @@ def _try_active_sets(rise, push, group, g, lower, upper, w, active):
                 lam[i, j] = 0.0
                 if abs(code[j]) == 2:
                     lam[i, j] = math.copysign(w[i, j], code[j])
-                    add(vy[i], -lam[i, j], by[j])
+                    add(vy[i], -lam[i, j], push_i[j])
                 elif code[j] != 0:
                     held[k] = j
                     k += 1
-            if not _factorise_held(by, held, k, d, factor):
+            if not _factorise_held(push_i, held, k, d, factor):
                 break
             for _ in range(MAX_PASSES):
                 unmet = False
@@ -289,24 +289,24 @@ def _try_active_sets(rise, push, group, g, lower, upper, w, active):
                 _solve_factorised(factor, pull, k)
                 for a in range(k):
                     lam[i, held[a]] += pull[a]
-                    add(vy[i], -pull[a], by[held[a]])
+                    add(vy[i], -pull[a], push_i[held[a]])
             done[i] = not _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i])
     return vy[:, :d].copy(), lam, steps, done
 
 
 @compiled
-def _factorise_held(by, held, k, d, factor):
-    """Factorise the held rows and columns of K, upper triangle; False if there is no factor."""
+def _factorise_held(push, held, k, d, factor):
+    """Factorise the held rows and columns of K in place; return False if there is no factor."""
     for a in range(k):
         for b in range(a, k):
-            factor[a, b] = by[held[a], d + held[b]]
+            factor[a, b] = push[held[a], d + held[b]]
     for a in range(k):
         if not factor[a, a] > 0:
             return False
         root = math.sqrt(factor[a, a])
         for b in range(a, k):
             factor[a, b] /= root
-        # Slices of rows, to pass on, would take as long as such loops.
+        # A call with slices of rows would take as long as these loops.
         for b in range(a + 1, k):
             for e in range(b, k):
                 factor[b, e] -= factor[a, b] * factor[a, e]
@@ -327,7 +327,7 @@ def _solve_factorised(factor, x, k):
 
 @compiled
 def _correct(code, lam, y, lower, upper, w):
-    """Correct the codes in place by lam and y; True if they contradicted the old ones."""
+    """Correct the codes in place; return True if lam and y contradicted them."""
     contradicted = False
     for j in range(len(code)):
         small = SLIP * (1.0 + abs(y[j]))

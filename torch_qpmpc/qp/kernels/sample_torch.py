@@ -1,6 +1,7 @@
-"""What each QP of a batch needs, in torch for devices other than the CPU.
+"""Computations for each QP of a batch, in torch for devices other than the CPU.
 
-The same functions as in `torch_qpmpc.qp.kernels.sample`, of tensors on one device.
+The functions and their arguments are those of `torch_qpmpc.qp.kernels.sample`, with tensors on one
+device in place of arrays.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ def recover(v, lam, group, fixed, theta, reduced, diagonal, passes=0) -> tuple[T
     for _ in range(passes):
         z = z + multiply(Y_neg, group, multiply(C, group, z) - theta.b)
     Hz, y = multiply(theta.H, group, z), multiply(theta.G, group, z)
-    # A row that no free variable enters has w where it is violated; a hard one stays violated.
+    # A violated row without free variables has lam = w or -w; a hard one stays violated.
     beyond = F.hardshrink(y - y.clamp(theta.lb, theta.ub), VIOLATED)
     all_lam = beyond.sign() * theta.w.masked_fill(theta.w.isinf(), 0.0)
     all_lam[:, reduced.rows] = lam.clamp(-reduced.w, reduced.w)
@@ -57,11 +58,11 @@ def _judge(z, lam, chi, group, fixed, theta, Hz, G_lam, C_chi, left, y) -> tuple
     up, down = lam.clamp(min=0.0), lam.clamp(max=0.0)
     outside = (y - y.clamp(lb, ub)).abs()
     charge = outside * w.masked_fill(hard, 0.0)
-    # Row by row h(y) + h*(lam) - lam y, where h* charges the bound that lam pushes from.
+    # h(y) + h*(lam) - lam y for each row, see `torch_qpmpc.qp.pipeline.certificate`.
     gap = charge + (ub.masked_fill(no_ub, 0.0) - y) * up + (lb.masked_fill(no_lb, 0.0) - y) * down
     cost = torch.linalg.vecdot(theta.q + 0.5 * Hz, z) + charge.sum(-1)
     short = multiply(theta.C, group, z) - theta.b
-    # An absurd z or chi makes relative errors small that are large in the cost.
+    # With a huge z or chi, relative errors can be small but matter to the cost.
     slip = torch.linalg.vecdot(left.abs(), z.abs())
     slip = slip + torch.linalg.vecdot(short.abs(), chi.abs()) + gap.abs().sum(-1)
     forces = torch.cat((Hz, G_lam, C_chi, theta.q.expand_as(z)), dim=-1)
@@ -88,17 +89,17 @@ def try_active_sets(qps, forces, active) -> tuple[Tensor, ...]:
     for _ in range(MAX_STEPS - 1):
         if not len(todo):
             break
-        part = qps.take(todo)
-        active[todo] = _corrected(part, active[todo], lam[todo], y[todo])
-        v[todo], lam[todo], y[todo] = found = _solve(part, forces, active[todo])
+        rest = qps.take(todo)
+        active[todo] = _corrected(rest, active[todo], lam[todo], y[todo])
+        v[todo], lam[todo], y[todo] = new = _solve(rest, forces, active[todo])
         steps[todo] += 1
-        todo = todo[_contradicted(part, active[todo], *found[1:])]
+        todo = todo[_contradicted(rest, active[todo], *new[1:])]
     done[todo] = False
     return v, lam, steps, done
 
 
 def _contradicted(qps, active: Tensor, lam: Tensor, y: Tensor) -> Tensor:
-    """Where lam or y contradicts the active set, ``(B,)``.
+    """Return the mask of QPs whose lam or y contradicts the active set, ``(B,)``.
 
     A saturated row that is back within its bounds is left to the certificate.
     """
@@ -116,7 +117,7 @@ def _corrected(qps, active: Tensor, lam: Tensor, y: Tensor) -> Tensor:
     over = held & (lam.abs() > (1 + SLIP) * qps.w)
     # A held row whose multiplier points inwards is released, unless its bounds are equal.
     loose = held & (lam * active < -SLIP * (1 + lam.abs())) & (qps.l < qps.u)
-    # A saturated row that is back within its bounds is held; an idle one outside of them, too.
+    # A saturated row that is back within its bounds is held, like an inactive one outside them.
     back = ((active == 2) & (y < qps.u - slip)) | ((active == -2) & (y > qps.l + slip))
     corrected = torch.where(over, 2 * lam.sign().to(torch.int8), active)
     corrected = torch.where(back, active.sign(), corrected).masked_fill_(loose & ~over, 0)
@@ -124,7 +125,7 @@ def _corrected(qps, active: Tensor, lam: Tensor, y: Tensor) -> Tensor:
 
 
 def _solve(qps, forces, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """v, lam and y with held rows at their bounds, and saturated ones at lam = +w or -w."""
+    """Return v, lam and y with held rows at their bounds, and saturated ones at lam = w or -w."""
     d, size = qps.g.shape[-1], active.abs()
     vy = -multiply(forces.rise.mT, qps.group, qps.g)
     lam, saturated = torch.zeros_like(qps.l), size == 2
@@ -147,23 +148,23 @@ def _solve(qps, forces, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _order(held: Tensor) -> tuple[Tensor, Tensor]:
-    """The indices of the held rows ``(B, k)``, k the most in any QP, and which of them are real.
+    """Return the indices of the held rows, padded with r, and the mask of real ones, ``(B, k)``.
 
-    The others are r, which is no row.
+    k is the largest number of held rows in a QP.
     """
     n_qps, r = held.shape
     position = held.cumsum(-1)
     k = int(position[:, -1].max()) if n_qps else 0
     order = torch.full((n_qps, k + 1), r, device=held.device)
-    # Rows that are not held go to a last column, which is cut off.
+    # Rows that are not held are written to an extra last column.
     index = torch.arange(r, device=held.device).expand(n_qps, r)
     order.scatter_(1, torch.where(held, position - 1, k), index)
     return order[:, :k], torch.arange(k, device=held.device) < position[:, -1:]
 
 
 def _factor_held(K: Tensor, group: Tensor, order: Tensor, real: Tensor) -> Tensor:
-    """The factor of K's rows and columns ``order`` ``(B, k)``, of the unit where not real."""
-    K = F.pad(K, (0, 1, 0, 1))  # for what is not real
+    """Return the factor of K's rows and columns ``order`` ``(B, k)``; padding is an identity."""
+    K = F.pad(K, (0, 1, 0, 1))  # for the padding
     n = K.shape[-1]
     index = order.unsqueeze(-1) * n + order.unsqueeze(-2)
     if len(K) > 1:

@@ -1,8 +1,8 @@
-"""What follows from theta alone, in loops that Numba compiles for the CPU.
+"""Computations on theta alone, as loops that Numba compiles for the CPU.
 
-The checks of theta, its units, and the QPs (eq:qp2, eq:qp3) without C z = b (eq:qp2c1) and without
-their fixed entries: dozens of operations on small arrays, each of which takes NumPy or torch some
-microseconds. Arrays are float64 and contiguous; a vector that the whole batch shares has one row.
+They check theta, choose its units, and eliminate C z = b (eq:qp2c1) and the fixed entries from the
+QPs (eq:qp2, eq:qp3): dozens of operations on small arrays, each of which takes microseconds in
+NumPy or torch. Arrays are float64 and contiguous; a vector that the whole batch shares has one row.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def inspect(theta, group):
     """Find the QPs with finite data, lb <= ub and w >= 0, and shared diagonal matrices.
 
     Returns:
-        Where the data is valid, ``(B or 1,)``, or None if it is everywhere; and for H and for G,
-        True if all QPs share one that is diagonal.
+        The mask of QPs with valid data, ``(B or 1,)``, or None if all are valid; and two flags,
+        True if all QPs share one diagonal H, and one diagonal G.
     """
     H, C, G, q, c, b, lb, ub, w = theta
     M = len(H)
@@ -36,16 +36,16 @@ def inspect(theta, group):
     shared = max(max(len(q), len(c), len(b)), max(len(lb), len(ub), len(w)))
     valid = np.empty(shared if M == 1 else len(group), np.bool_)
     for i in range(len(valid)):
-        # A sum is finite if its terms are (but for overflow, which no solver survives either).
+        # A sum is finite if its terms are (except on overflow, which no solver survives either).
         vectors = q[i % len(q)].sum() + b[i % len(b)].sum() + c[i % len(c)]
-        good = np.isfinite(vectors) and finite[0 if M == 1 else group[i]]
-        of_lb, of_ub, of_w = i % len(lb), i % len(ub), i % len(w)
+        ok = np.isfinite(vectors) and finite[0 if M == 1 else group[i]]
+        i_lb, i_ub, i_w = i % len(lb), i % len(ub), i % len(w)
         for j in range(lb.shape[1]):
-            # False for NaN, as of inf - inf where both bounds are the same infinity.
-            good = good and ub[of_ub, j] - lb[of_lb, j] >= 0 and w[of_w, j] >= 0
-        valid[i] = good
-    some = None if valid.all() else valid
-    return some, M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
+            # False for NaN, such as inf - inf where both bounds are the same infinity.
+            ok = ok and ub[i_ub, j] - lb[i_lb, j] >= 0 and w[i_w, j] >= 0
+        valid[i] = ok
+    mask = None if valid.all() else valid
+    return mask, M == 1 and _is_diagonal(H[0]), M == 1 and _is_diagonal(G[0])
 
 
 @summing
@@ -68,63 +68,66 @@ def _is_diagonal(matrix):
 
 @compiled
 def units(theta, group, small, large):
-    """Return the fields of `torch_qpmpc.qp.pipeline.scaling.Units`, or None if all are one."""
+    """Return the fields of `torch_qpmpc.qp.pipeline.scaling.Units`, or None if all are one.
+
+    Sizes from ``small`` to ``large`` have the unit one.
+    """
     H, C, G, q, _, b, lb, ub, w = theta
     M, n_g, n_c = len(H), G.shape[1], C.shape[1]
-    of_G, of_C = _sums(G), _sums(C)
-    of_q, of_b = _sizes(q, group, M), _sizes(b, group, M)
-    of_lb, of_ub, of_w = _sizes(lb, group, M), _sizes(ub, group, M), _sizes(w, group, M)
+    G_sums, C_sums = _sums(G), _sums(C)
+    q_sizes, b_sizes = _sizes(q, group, M), _sizes(b, group, M)
+    lb_sizes, ub_sizes, w_sizes = _sizes(lb, group, M), _sizes(ub, group, M), _sizes(w, group, M)
     cost, length = np.empty((M, 1)), np.empty((M, 1))
     rows, equalities, reach = np.empty((M, n_g)), np.empty((M, n_c)), np.empty(n_g + n_c)
     extreme = False
     for m in range(M):
         for j in range(n_g):
-            reach[j] = max(of_lb[m, j], of_ub[m, j]) / of_G[m, j]
+            reach[j] = max(lb_sizes[m, j], ub_sizes[m, j]) / G_sums[m, j]
         for j in range(n_c):
-            reach[n_g + j] = of_b[m, j] / of_C[m, j]
-        long = _typical(reach, small, large)
+            reach[n_g + j] = b_sizes[m, j] / C_sums[m, j]
+        unit = _typical(reach, small, large)
         size = 0.0
         for j in range(H.shape[1]):
-            size = _larger(size, of_q[m, j] * long)
+            size = _larger(size, q_sizes[m, j] * unit)
             for k in range(H.shape[2]):
-                size = _larger(size, abs(H[m, j, k]) * long**2)
-        if not size > 0:  # a QP without any other cost
+                size = _larger(size, abs(H[m, j, k]) * unit**2)
+        if not size > 0:  # the slacks are the only cost
             for j in range(n_g):
-                size = _larger(size, of_w[m, j] * of_G[m, j] * long)
-        cost[m, 0], length[m, 0] = _power_above(size, small, large), long
-        extreme = extreme or cost[m, 0] != 1 or long != 1
+                size = _larger(size, w_sizes[m, j] * G_sums[m, j] * unit)
+        cost[m, 0], length[m, 0] = _power_above(size, small, large), unit
+        extreme = extreme or cost[m, 0] != 1 or unit != 1
         for j in range(n_g):
-            rows[m, j] = _power_above(of_G[m, j] * long, small, large)
+            rows[m, j] = _power_above(G_sums[m, j] * unit, small, large)
             extreme = extreme or rows[m, j] != 1
         for j in range(n_c):
-            equalities[m, j] = _power_above(of_C[m, j] * long, small, large)
+            equalities[m, j] = _power_above(C_sums[m, j] * unit, small, large)
             extreme = extreme or equalities[m, j] != 1
     return (cost, length, rows, equalities) if extreme else None
 
 
 @compiled
 def _larger(x, y):
-    """The larger of two numbers, or NaN."""
+    """Return the larger of two numbers, or NaN."""
     return x if x >= y or x != x else y
 
 
 @compiled
 def _sizes(vectors, group, M):
-    """The largest finite sizes ``(M, n)`` of the QPs that share their matrices."""
+    """Return the largest finite absolute entries over the QPs of each matrix, ``(M, n)``."""
     largest = np.zeros((M, vectors.shape[1]))
     for i in range(max(len(vectors), M)):
         m = i if len(vectors) == 1 else group[i]
-        of_vector = i % len(vectors)
+        row = i % len(vectors)
         for j in range(vectors.shape[1]):
-            size = abs(vectors[of_vector, j])
-            if size < np.inf:  # neither is NaN
+            size = abs(vectors[row, j])
+            if size < np.inf:  # false for NaN
                 largest[m, j] = max(largest[m, j], size)
     return largest
 
 
 @summing
 def _sums(matrices):
-    """The absolute sums of rows, ``(M, i, j)`` to ``(M, i)``."""
+    """Return the absolute sums of rows, ``(M, i, j)`` to ``(M, i)``."""
     sums = np.empty(matrices.shape[:2])
     for m in range(matrices.shape[0]):
         for i in range(matrices.shape[1]):
@@ -137,11 +140,11 @@ def _sums(matrices):
 
 @compiled
 def _typical(sizes, small, large):
-    """`_power_above` of the lower median of the sizes that are positive and finite."""
+    """Return `_power_above` of the lower median of the positive, finite sizes."""
     counts, known = np.zeros(2200, np.int64), 0
     for size in sizes:
         if 0 < size < np.inf:
-            # Their powers have the same order, and are sorted by being counted.
+            # The powers have the same order as the sizes; counting sorts them.
             counts[1100 + math.frexp(_power_above(size, small, large))[1]] += 1
             known += 1
     at, passed = 0, counts[0]
@@ -153,7 +156,7 @@ def _typical(sizes, small, large):
 
 @compiled
 def _power_above(size, small, large):
-    """The power of two next above a size, or one if that is ordinary, zero or not finite."""
+    """Return the next larger power of two, or one for an ordinary, zero or infinite size."""
     if 0 < size < small or large < size < np.inf:
         return math.ldexp(1.0, math.frexp(size)[1])
     return 1.0
@@ -161,19 +164,19 @@ def _power_above(size, small, large):
 
 @compiled
 def eliminate(C, n_kept, independent):
-    """Solve C z = b for some of its columns: T and -Y with ``z = T y + Y b``.
+    """Solve C z = b for some entries of z: return T and -Y with ``z = T y + Y b``.
 
     LU with row pivoting on the transpose of C picks columns that are safe to solve for. For a
     linear MPC scheme they are x_1..x_N, and then T is its prediction form.
 
     Args:
         C: ``(M, n_c, n_z)``.
-        n_kept: leading columns that are not solved for.
-        independent: smallest pivot, relative to its row's norm, of independent rows.
+        n_kept: the number of leading columns that are not solved for.
+        independent: smallest pivot, relative to its row's norm, of linearly independent rows.
 
     Returns:
-        T ``(M, n_z, n_y)``, -Y ``(M, n_z, n_c)``, and False if rows of C depend on each other in
-        the columns that may be solved for.
+        T ``(M, n_z, n_y)``, -Y ``(M, n_z, n_c)``, and False if the rows of C are linearly
+        dependent in the columns after ``n_kept``.
     """
     M, n_c, n_z = C.shape
     regular = n_c <= n_z - n_kept
@@ -209,8 +212,8 @@ def _eliminate(C, n_kept, independent, T, Y_neg):
             factors[j, k] /= factors[k, k]
             for i in range(k + 1, n_c):
                 factors[j, i] -= factors[j, k] * factors[k, i]
-    # -C of the columns that stay, and the unit: solved for by the dependent columns, which are the
-    # transpose of the first n_c rows of L times U.
+    # The right-hand sides are -C in the remaining columns, and the identity. The system's matrix is
+    # C in the dependent columns, the transpose of the first n_c rows of L times U.
     right, k = np.zeros((n_c, n_z)), 0
     for j in range(n_z):
         if stays[j]:
@@ -235,9 +238,9 @@ def _eliminate(C, n_kept, independent, T, Y_neg):
 
 @compiled
 def condense(H, G, T, Y_neg, convex):
-    """The QPs' matrices in y: T'HT, GT, what b adds, T'HY and GY, and True if all T'HT are convex.
+    """Return the QPs' matrices in y, T'HT, GT, T'HY and GY, and True if all T'HT are convex.
 
-    ``convex`` is the smallest eigenvalue, relative to the largest entry, of what counts as convex.
+    Eigenvalues down to minus ``convex``, relative to the largest entry, count as convex.
     """
     M, _, n_y = T.shape
     n_g, n_c = G.shape[1], Y_neg.shape[2]
@@ -268,7 +271,7 @@ def _times(left, right, diagonal):
 
 @compiled
 def _has_factor(H, convex):
-    """True if a Cholesky factor proves that H is convex, in a fraction of its eigenvalues' time."""
+    """True if a Cholesky factor, which is faster than eigenvalues, proves that H is convex."""
     shift = 0.0
     for j in range(len(H)):
         shift = max(shift, H[j, j])
@@ -282,7 +285,7 @@ def _has_factor(H, convex):
 def forces(H, G):
     """Return the fields of `torch_qpmpc.qp.pipeline.condensing.Forces`.
 
-    They are NaN where H has no Cholesky factor.
+    They are NaN if H has no Cholesky factor.
     """
     M, r, d = G.shape
     rise, push = np.full((M, d, d + r), np.nan), np.full((M, r, d + r), np.nan)
@@ -310,9 +313,9 @@ def forces(H, G):
 
 @compiled
 def reduce(condensed, theta, group, n_f, enters):
-    """Return the fields of `torch_qpmpc.qp.pipeline.condensing.Reduced`, but for T and Y_neg.
+    """Return the fields of `torch_qpmpc.qp.pipeline.condensing.Reduced`, except T and Y_neg.
 
-    ``enters`` is the smallest coefficient, relative to its row, that is not rounding.
+    Coefficients up to ``enters``, relative to their row, count as rounding.
     """
     T, Y_neg, H, G, H_b, G_b = condensed
     q, b, lb, ub, w = theta.q, theta.b, theta.lb, theta.ub, theta.w
@@ -331,8 +334,8 @@ def reduce(condensed, theta, group, n_f, enters):
             others[s] = i
             s += 1
     H_v, G_v, matrix = np.empty((M, d, d)), np.empty((M, r, d)), np.empty((M, n_f, d + 2 * r))
-    # By q to g, and by b to g, y and z.
-    by_q, by_b = np.empty((M, n_z, d)), np.empty((M, n_c, d + r + n_z))
+    # map_q takes q to g, and map_b takes b to g, y and z.
+    map_q, map_b = np.empty((M, n_z, d)), np.empty((M, n_c, d + r + n_z))
     for m in range(M):
         for i in range(d):
             for j in range(d):
@@ -340,43 +343,43 @@ def reduce(condensed, theta, group, n_f, enters):
             for j in range(n_f):
                 matrix[m, j, i] = H[m, n_f + i, j]
             for j in range(n_c):
-                by_b[m, j, i] = H_b[m, n_f + i, j]
+                map_b[m, j, i] = H_b[m, n_f + i, j]
         for i in range(r):
             for j in range(d):
                 G_v[m, i, j] = G[m, rows[i], n_f + j]
             for j in range(n_f):
                 matrix[m, j, d + i] = matrix[m, j, d + r + i] = -G[m, rows[i], j]
             for j in range(n_c):
-                by_b[m, j, d + i] = G_b[m, rows[i], j]
+                map_b[m, j, d + i] = G_b[m, rows[i], j]
         for i in range(n_z):
             for j in range(d):
-                by_q[m, i, j] = T[m, i, n_f + j]
+                map_q[m, i, j] = T[m, i, n_f + j]
             for j in range(n_c):
-                by_b[m, j, d + r + i] = -Y_neg[m, i, j]
+                map_b[m, j, d + r + i] = -Y_neg[m, i, j]
     count = max(max(len(q), len(b)), max(len(lb), len(ub)))
     if M != 1:
         count = len(group)
         q, b = _repeated(q, count), _repeated(b, count)
-    of_q = transposed_products(by_q, group, q, False)
-    of_b = transposed_products(by_b, group, b, False)
+    mapped_q = transposed_products(map_q, group, q, False)
+    mapped_b = transposed_products(map_b, group, b, False)
     constant, z_0 = np.empty((count, d + 2 * r)), np.empty((len(b), n_z))
     for k in range(count):
         k_q, k_b, k_lb, k_ub = k % len(q), k % len(b), k % len(lb), k % len(ub)
         for i in range(d):
-            constant[k, i] = of_q[k_q, i] + of_b[k_b, i]
+            constant[k, i] = mapped_q[k_q, i] + mapped_b[k_b, i]
         for i in range(r):
-            y = of_b[k_b, d + i]
+            y = mapped_b[k_b, d + i]
             constant[k, d + i] = lb[k_lb, rows[i]] - y
             constant[k, d + r + i] = ub[k_ub, rows[i]] - y
     for k in range(len(b)):
         for i in range(n_z):
-            z_0[k, i] = of_b[k, d + r + i]
+            z_0[k, i] = mapped_b[k, d + r + i]
     return rows, others, H_v, G_v, matrix, constant, z_0, w_v
 
 
 @compiled
 def _repeated(vectors, count):
-    """Repeat a shared vector for each QP."""
+    """Return the vectors ``(count, n)``, a shared one repeated for each QP."""
     repeated = np.empty((count, vectors.shape[1]))
     for i in range(count):
         repeated[i] = vectors[i % len(vectors)]
@@ -385,11 +388,11 @@ def _repeated(vectors, count):
 
 @compiled
 def _last_entered(G, G_z, T, lb, ub, enters):
-    """The number of variables up to the last that enters a row of G ``(M, n_g, n_y)``.
+    """Return one plus the index of the last variable in each row of G ``(M, n_g, n_y)``.
 
-    Zero for a row without a finite bound. Rounding in the elimination leaves traces of variables
-    that a row does not contain, and nothing else of a row that C implies: sizes are compared with
-    those before the elimination, of G_z and T.
+    It is zero for a row without a finite bound. The elimination leaves rounding errors on variables
+    that a row does not contain, and only those in a row that C implies: coefficients are compared
+    with the row's size before the elimination, from G_z and T.
     """
     last = np.zeros(G.shape[1], np.int64)
     for j in range(len(last)):

@@ -11,10 +11,10 @@ from torch_qpmpc.qp.kernels.linalg import compiled
 
 
 def tour(vectors: np.ndarray, near: int) -> np.ndarray:
-    """Order vectors ``(B, n)``: each is followed by the nearest of the next ``near`` that are left.
+    """Return an order of vectors ``(B, n)`` in which each is followed by a near one.
 
-    A nearest-neighbour tour in units of the entries' standard deviations; of more than ``near``
-    vectors, the next ones are those in the order of their first entry.
+    It is a nearest-neighbour tour in units of the entries' standard deviations. Of more than
+    ``near`` vectors, each step compares the next ``near`` in the order of their first entry.
     """
     few = len(vectors) <= near or not vectors.shape[1]
     order = np.arange(len(vectors)) if few else vectors[:, 0].argsort()
@@ -22,7 +22,7 @@ def tour(vectors: np.ndarray, near: int) -> np.ndarray:
     return order
 
 
-# Several entries at a time, in any order; a tour of NaN is as good as any.
+# Vectorised, with sums in any order; vectors with NaN need no particular order.
 @partial(compiled, fastmath={"reassoc", "nsz", "nnan", "contract"})
 def _walk(vectors, order, near):
     n_qps, n = vectors.shape

@@ -1,1 +1,1 @@
-"""What a batch of QPs passes through, in order; `solve` puts the steps together."""
+"""The steps that solve and certify a batch of QPs; `solve` combines them."""

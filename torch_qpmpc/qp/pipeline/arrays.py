@@ -1,4 +1,4 @@
-"""The arrays that the pipeline works on: NumPy's on the CPU, tensors on other devices."""
+"""The pipeline's arrays: NumPy's on the CPU, tensors on other devices."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class Theta(NamedTuple):
 
     @classmethod
     def of(cls, data: Sequence[np.ndarray]) -> Theta:
-        """From H, q, c, C, b, G, lb, ub, w of float32 or float64, with their leading dimension.
+        """Convert H, q, c, C, b, G, lb, ub, w, each with its leading dimension, to float64.
 
-        H becomes its symmetric part, and lb = ub where rounding alone has them cross.
+        H becomes its symmetric part, and lb becomes ub where they cross by rounding alone.
         """
         swapped = data[6] > data[7]
         H, q, c, C, b, G, lb, ub, w = (np.ascontiguousarray(x, np.float64) for x in data)
@@ -47,22 +47,22 @@ class Theta(NamedTuple):
 
 
 def to_numpy(x: Array) -> np.ndarray:
-    """``x`` on the CPU, not copied if it is there."""
+    """Return ``x`` as an array on the CPU, without a copy if it is there already."""
     return x if isinstance(x, np.ndarray) else x.numpy(force=True)
 
 
 def to_tensor(x: Array) -> Tensor:
-    """``x`` as a tensor where it is, not copied."""
+    """Return ``x`` as a tensor on its device, without a copy."""
     return torch.from_numpy(x) if isinstance(x, np.ndarray) else x
 
 
 def on_device(x: np.ndarray, device: torch.device | None) -> Array:
-    """``x`` as a tensor on ``device``, or as it is if that is None."""
+    """Return ``x`` as a tensor on ``device``, or unchanged if ``device`` is None."""
     return x if device is None else torch.from_numpy(x).to(device)
 
 
-def of_group(unit: np.ndarray, group: Array) -> Array:
-    """Rows of ``unit`` ``(M, n)`` for each QP, ``(B, n)``, or the one row of all, ``(1, n)``."""
+def per_qp(unit: np.ndarray, group: Array) -> Array:
+    """Return the row of ``unit`` ``(M, n)`` for each QP, ``(B, n)``, or ``(1, n)`` if M = 1."""
     if isinstance(group, np.ndarray):
         return unit if len(unit) == 1 else unit[group]
     rows = torch.from_numpy(unit).to(group.device)

@@ -1,7 +1,7 @@
-"""A batch of QPs as arrays (eq:qp2, eq:qp3), from step to step of the pipeline.
+"""A batch of QPs as arrays (eq:qp2, eq:qp3), the data of the pipeline.
 
 Arrays are NumPy's on the CPU and tensors elsewhere, float64 and contiguous, without autograd. They
-are made here, once; with them is chosen who works on them: `torch_qpmpc.qp.kernels.sample` or
+are made here, once, and determine the kernels: `torch_qpmpc.qp.kernels.sample` or
 `torch_qpmpc.qp.kernels.sample_torch`.
 """
 
@@ -25,9 +25,9 @@ from torch_qpmpc.qp.program import NDIMS
 
 @dataclass(frozen=True, eq=False)
 class Programs:
-    """B QPs: what follows from their theta, and the values ``fixed`` ``(B, n_f)`` of leading z.
+    """B QPs: their prepared theta, and the values ``fixed`` ``(B, n_f)`` of the first entries of z.
 
-    ``group`` ``(B,)`` says which of theta's M matrices a QP has.
+    ``group`` ``(B,)`` is the index of each QP's matrices among the M of theta.
     """
 
     prepared: Prepared
@@ -38,11 +38,16 @@ class Programs:
     def of(
         cls, *operands: Tensor, n_kept: int | None = None, device: torch.device | None = None
     ) -> tuple[Programs, torch.Size]:
-        """Flatten H, q, c, C, b, G, lb, ub, w, fixed of any batch shapes; also the batch shape.
+        """Return the QPs of H, q, c, C, b, G, lb, ub, w, fixed, flattened, and their batch shape.
 
-        Matrices are not repeated for the QPs that share them. What follows from a theta that the
-        whole batch shares is found again for the next batch. ``device`` is where to solve in
-        tensors; None for NumPy's arrays.
+        QPs that share matrices share one copy. The preparation of a theta that the whole batch
+        shares is cached.
+
+        Args:
+            operands: the tensors, of any batch shapes.
+            n_kept: the number of leading entries of z that the elimination of C z = b keeps; by
+                default those that are fixed.
+            device: the device for tensors; None for NumPy arrays.
         """
         *theta, fixed = operands
         n_f = fixed.shape[-1]
@@ -52,7 +57,7 @@ class Programs:
         if not shared:
             batches = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
             batch = broadcast(batch, *batches)
-        fixed = _listed(fixed.detach(), batch, (n_f,)).to(device, torch.float64).contiguous()
+        fixed = _flattened(fixed.detach(), batch, (n_f,)).to(device, torch.float64).contiguous()
         if shared:
             prepared = prepared_for([to_numpy(x) for x in theta], n_kept, device)
             group = np.zeros(len(fixed), np.int64)
@@ -71,15 +76,16 @@ class Programs:
 
     @property
     def theta(self) -> Theta:
-        """The data of `Prepared`, on this batch's device."""
+        """Theta on the batch's device."""
         return self.prepared.native_theta
 
     @property
     def kernels(self) -> ModuleType:
+        """Functions for the batch's arrays."""
         return sample if isinstance(self.fixed, np.ndarray) else sample_torch
 
     def take(self, index: np.ndarray) -> Programs:
-        """The QPs at ``index``."""
+        """Return the QPs at ``index``."""
         group = to_numpy(self.group)[index]
         prepared = self.prepared
         if not prepared.shared:
@@ -89,23 +95,23 @@ class Programs:
         return Programs(prepared, on_device(group, device), self.fixed[at])
 
     def on_cpu(self) -> Programs:
-        """The same QPs in NumPy's arrays."""
+        """Return the same QPs as NumPy arrays."""
         if isinstance(self.fixed, np.ndarray):
             return self
         prepared = self.prepared.on_cpu()
         return Programs(prepared, to_numpy(self.group), to_numpy(self.fixed))
 
     def valid(self) -> np.ndarray | None:
-        """Where the data is finite, lb <= ub and w >= 0, ``(B,)``; None if it is everywhere."""
+        """Return the mask of QPs with valid data, ``(B,)``; None if all are valid."""
         valid = self.prepared.valid
-        # A sum is finite if its terms are (but for overflow, which no solver survives either).
+        # A sum is finite if its terms are (except on overflow, which no solver survives either).
         if np.isfinite(float(self.fixed.sum())):
             return valid if valid is None or len(valid) == len(self) else valid.repeat(len(self))
         finite = np.isfinite(to_numpy(self.fixed.sum(-1)))
         return finite if valid is None else finite & valid
 
     def reduced_qps(self) -> SoftQPs:
-        """What a backend solves: C z = b and the fixed entries are eliminated."""
+        """Return the QPs for a backend, with C z = b and the fixed entries eliminated."""
         reduced = self.prepared.reduced(self.n_f)
         d, r = reduced.H.shape[-1], len(reduced.rows)
         g_l_u = self.kernels.offsets(self.fixed, self.group, reduced.matrix, reduced.constant)
@@ -120,7 +126,7 @@ class Programs:
 
 
 class SoftQPs(NamedTuple):
-    """What a backend solves: B problems of d variables and r rows,
+    """The input of a backend: B problems of d variables and r rows,
 
         min over v:  1/2 v'Hv + g'v + sum_i w_i dist(G_i v, [l_i, u_i]),
 
@@ -137,7 +143,7 @@ class SoftQPs(NamedTuple):
     w: Array
 
     def take(self, index: Array) -> SoftQPs:
-        """The problems at ``index``, with the matrices as they are."""
+        """Return the problems at ``index``, with the same matrices."""
         return SoftQPs(self.H, self.G, *(x[index] for x in self[2:]))
 
     def in_numpy(self) -> SoftQPs:
@@ -147,25 +153,25 @@ class SoftQPs(NamedTuple):
         return SoftQPs._make(map(to_tensor, self))
 
 
-def _listed(x: Tensor, batch: torch.Size, event: Sequence[int]) -> Tensor:
-    """``x``, broadcast to the batch, with one leading dimension for it."""
+def _flattened(x: Tensor, batch: torch.Size, event: Sequence[int]) -> Tensor:
+    """Broadcast ``x`` to the batch, and flatten the batch to one leading dimension."""
     if len(batch) == 1 and x.shape == (*batch, *event):
         return x
     return x.expand(*batch, *event).reshape(batch.numel(), *event)
 
 
 def _flat_theta(theta: Sequence[Tensor], batch: torch.Size) -> tuple[list[np.ndarray], np.ndarray]:
-    """Theta with one leading dimension, and the group of each QP.
+    """Return theta with one leading dimension, and the group of each QP.
 
     A vector that the batch shares has one row.
     """
     events = [x.shape[x.ndim - n :] for x, n in zip(theta, NDIMS, strict=True)]
-    of_matrices = broadcast(*(theta[i].shape[:-2] for i in (0, 3, 5)))  # of H, C and G
+    matrix_batch = broadcast(*(theta[i].shape[:-2] for i in (0, 3, 5)))  # of H, C and G
     flat = []
     for x, event in zip(theta, events, strict=True):
         shared = len(event) < 2 and x.numel() == event.numel()
-        shape = torch.Size([1]) if shared else of_matrices if len(event) == 2 else batch
+        shape = torch.Size([1]) if shared else matrix_batch if len(event) == 2 else batch
         x = x.reshape(event) if shared else x
-        flat.append(to_numpy(_listed(x, shape, event)))
-    group = np.arange(of_matrices.numel()).reshape(of_matrices)
+        flat.append(to_numpy(_flattened(x, shape, event)))
+    group = np.arange(matrix_batch.numel()).reshape(matrix_batch)
     return flat, np.broadcast_to(group, batch).reshape(-1).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Certified solutions of a batch of QPs, and what stands for those that have none."""
+"""The solutions of a batch of QPs, and placeholders for unsolved ones."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from torch_qpmpc.qp.pipeline.arrays import Array, to_numpy
 from torch_qpmpc.qp.program import UNKNOWN, Status
 
-#: A claimed solution with a larger relative residual is not a solution.
+#: The certificate rejects a solution with a larger relative residual.
 TOLERANCE = 1e-6
 
 
@@ -27,7 +27,7 @@ class BatchSolution(NamedTuple):
     active: Array
 
     def accepted(self) -> Array:
-        """Where the certificate accepts the solution, ``(B,)``."""
+        """Return the mask of solutions that the certificate accepts, ``(B,)``."""
         return self.residual <= TOLERANCE
 
     @property
@@ -35,7 +35,7 @@ class BatchSolution(NamedTuple):
         return bool(self.accepted().all())
 
     def at(self, index: np.ndarray) -> BatchSolution:
-        """Copies of the solutions at ``index``."""
+        """Return copies of the solutions at ``index``."""
         return BatchSolution._make(x[index] for x in self)
 
     def put(self, index: np.ndarray, others: BatchSolution) -> None:
@@ -48,7 +48,7 @@ class BatchSolution(NamedTuple):
 
 
 def unsolved(fixed: np.ndarray, n_z: int, n_c: int, n_g: int, status: Status) -> BatchSolution:
-    """What QPs without a solution carry: an infinite cost, the fixed entries, and zeros."""
+    """Return placeholders for unsolved QPs: infinite costs, the fixed entries, and zeros."""
     n = len(fixed)
     z = np.zeros((n, n_z))
     z[:, : fixed.shape[1]] = np.nan_to_num(fixed, posinf=0.0, neginf=0.0)

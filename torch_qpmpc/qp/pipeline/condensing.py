@@ -1,8 +1,8 @@
-"""Condensing: eliminate C z = b once per theta, so that a sample only moves vectors.
+"""Condensing: eliminate C z = b once per theta, so that samples differ only in vectors.
 
 With y = (z[:n_kept], v), the kept leading entries and the independent ones among the rest, every
 solution of C z = b is ``z = Y b + T y``. All samples of a batch, and V, Q and the policy, share T,
-Y, T'HT and GT; fixing the first n_f <= n_kept entries then only changes a linear term and offsets.
+Y, T'HT and GT; fixing the first n_f <= n_kept entries then only changes the linear cost and bounds.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import torch
 from torch_qpmpc.qp.kernels import theta as loops
 from torch_qpmpc.qp.pipeline.arrays import Array, Theta
 
-#: A pivot below this fraction of its row's norm means that the rows of C depend on each other.
+#: A pivot below this fraction of its row's norm means that rows of C are linearly dependent.
 RANK_TOLERANCE = 1e-10
-#: A pivot of at least this fraction of the largest serves as well, in the order of equations.
+#: `in_order` accepts a pivot of at least this fraction of the largest.
 THRESHOLD = 1e-2
-#: A coefficient below this fraction of its row's absolute sum is rounding.
+#: A coefficient up to this fraction of its row's absolute sum counts as rounding.
 ENTERS = 1e-12
 #: H is indefinite if an eigenvalue is below minus this fraction of the largest.
 CONVEX = 1e-9
@@ -30,9 +30,9 @@ CONVEX = 1e-9
 class Elimination(NamedTuple):
     """The solutions ``z = Y b + T y`` of C z = b.
 
-    T ``(M, n_z, n_y)`` and Y ``(M, n_z, n_c)``. ``padding`` ``(M, n_y)`` marks columns of T that
-    are zero, because C has a lower rank elsewhere in the batch; None if C has full row rank in the
-    columns after ``n_kept``.
+    T ``(M, n_z, n_y)`` and Y ``(M, n_z, n_c)``. ``padding`` ``(M, n_y)`` marks zero columns of T,
+    where C has a lower rank elsewhere in the batch; None if C has full row rank in the columns
+    after ``n_kept``.
     """
 
     T: np.ndarray
@@ -41,7 +41,7 @@ class Elimination(NamedTuple):
 
 
 class CondensedArrays(NamedTuple):
-    """T, -Y, T'HT, GT, and what b adds to them: T'HY and GY. All have a leading M."""
+    """T, -Y, T'HT, GT, and the factors T'HY and GY of b. All have a leading M."""
 
     T: np.ndarray
     Y_neg: np.ndarray
@@ -55,9 +55,9 @@ class CondensedArrays(NamedTuple):
 class Condensed:
     """The QPs' matrices in y.
 
-    ``surely_convex`` says that all of H is, so that no part of it need be checked. With
-    ``deficient``, the columns of C after ``n_kept`` do not have full row rank: the arrays are valid
-    only for QPs that fix exactly ``n_kept`` entries.
+    ``surely_convex`` is True if all of H is known to be convex. If ``deficient``, the columns of C
+    after ``n_kept`` do not have full row rank, and the arrays are valid only for QPs that fix
+    exactly ``n_kept`` entries.
     """
 
     arrays: CondensedArrays
@@ -67,16 +67,17 @@ class Condensed:
 
 
 class Reduced(NamedTuple):
-    """The QPs in v, the rest of y with the first n_f entries fixed.
+    """The QPs in v, the entries of y after the n_f fixed ones.
 
-    ``rows`` are those of G with a finite bound that a free variable enters, ``others`` the rest. A
-    leading B is 1 where the batch shares the vector.
+    A leading B is 1 where the batch shares the vector.
 
     Attributes:
+        rows, others: the indices of G's rows with a finite bound and a free variable, ``(r,)``, and
+            of the rest.
         H, G: ``(M, d, d)`` and ``(M, r, d)``.
         matrix, constant: ``(M, n_f, d + 2 r)`` and ``(B, d + 2 r)``. The g, l and u of a sample are
             ``constant + matrix' fixed``.
-        z_0: ``(B, n_z)``, z where the fixed entries and v are zero.
+        z_0: ``(B, n_z)``, z if the fixed entries and v are zero.
         w: ``(B, r)``.
         T, Y_neg: those of `Elimination`.
     """
@@ -94,9 +95,9 @@ class Reduced(NamedTuple):
 
 
 class Forces(NamedTuple):
-    """What g and multipliers do to (v, y = G v) of an unconstrained QP: ``-rise'g - push'lam``.
+    """The response ``-rise'g - push'lam`` of (v, y = G v) to g and multipliers.
 
-    ``rise`` ``(M, d, d + r)`` and ``push`` ``(M, r, d + r)``.
+    ``rise = H^-1 [I, G']`` is ``(M, d, d + r)``, and ``push = G rise`` is ``(M, r, d + r)``.
     """
 
     rise: Array
@@ -104,10 +105,10 @@ class Forces(NamedTuple):
 
 
 def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) -> Condensed:
-    """Condense M matrix triples, with the first ``n_kept`` entries of z kept as they are."""
+    """Condense M matrix triples, keeping the first ``n_kept`` entries of z."""
     T, Y_neg, padding = elimination or eliminate(theta.C, n_kept)
     H, G, H_b, G_b, convex = loops.condense(theta.H, theta.G, T, Y_neg, CONVEX)
-    if padding is not None:  # a unit curvature pins the variables of zero columns
+    if padding is not None:  # a unit curvature sets the variables of zero columns to zero
         H = H + padding[:, :, None] * np.eye(H.shape[1])
         convex = False
     arrays = CondensedArrays(T, Y_neg, H, G, H_b, G_b)
@@ -115,19 +116,19 @@ def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) 
 
 
 def reduce(condensed: Condensed, theta: Theta, group: np.ndarray, n_f: int) -> Reduced:
-    """Fix the first n_f entries."""
+    """Reduce condensed QPs to those with the first n_f entries fixed."""
     x = condensed.arrays
     return Reduced._make((*loops.reduce(x, theta, group, n_f, ENTERS), x.T, x.Y_neg))
 
 
 def convex(H: np.ndarray) -> np.ndarray:
-    """Where H ``(M, d, d)`` is positive semidefinite but for rounding."""
+    """Return the mask of H ``(M, d, d)`` that are positive semidefinite up to rounding."""
     eigenvalues = np.linalg.eigvalsh(H) if H.shape[-1] else np.zeros((len(H), 1))
     return eigenvalues[:, 0] >= -CONVEX * (1 + np.abs(eigenvalues).max(-1))
 
 
 def eliminate(C: np.ndarray, n_kept: int) -> Elimination:
-    """Eliminate C z = b by LU, or where rows of C ``(M, n_c, n_z)`` are dependent, by the SVD."""
+    """Eliminate C z = b by LU, or by the SVD if rows of C ``(M, n_c, n_z)`` are dependent."""
     T, Y_neg, regular = loops.eliminate(C, n_kept, RANK_TOLERANCE)
     return Elimination(T, Y_neg, None) if regular else null_space(C, n_kept)
 
@@ -135,20 +136,20 @@ def eliminate(C: np.ndarray, n_kept: int) -> Elimination:
 def in_order(C: np.ndarray, n_kept: int) -> Elimination | None:
     """Eliminate C z = b in the order of the equations; None if rows of C are dependent.
 
-    Each is solved for a variable that no earlier one contains, x_1..x_N of a linear MPC scheme.
-    Where an unstable model's actions are at their bounds and its states grow, only this recursion
-    is accurate in every entry.
+    Each equation is solved for a variable that no earlier C_m contains, in a linear MPC scheme
+    x_1..x_N. If the actions of an unstable model are at their bounds and its states grow, only this
+    recursion is accurate in every entry.
     """
-    own = [_in_order(one, n_kept) for one in C] if C.shape[1] else [None]
-    if not all(own):
+    results = [_in_order(C_m, n_kept) for C_m in C] if C.shape[1] else [None]
+    if not all(results):
         return None
-    T, Y = (np.stack(part) for part in zip(*own, strict=True))
+    T, Y = (np.stack(x) for x in zip(*results, strict=True))
     return Elimination(T, -Y, None) if np.isfinite(T).all() and np.isfinite(Y).all() else None
 
 
 def _in_order(C: np.ndarray, n_kept: int) -> tuple[np.ndarray, np.ndarray] | None:
     n_c, n_z = C.shape
-    # Rows are C z - b = 0, with the unit for b; the columns of z that may be solved for come last.
+    # The rows of W stand for C z - b = 0, which is not solved for the first n_kept entries of z.
     W = np.concatenate((C, -np.eye(n_c)), axis=1)
     nonzero = C != 0
     first = np.where(nonzero.any(0), nonzero.argmax(0), -1)
@@ -160,7 +161,7 @@ def _in_order(C: np.ndarray, n_kept: int) -> tuple[np.ndarray, np.ndarray] | Non
         if not possible.any():
             return None
         newest = np.where(possible & (first == first[possible].max()), entries, 0.0)
-        # In z, x_{k+1} comes after the action u_k that is as new.
+        # The last of the newest variables: in z, x_{k+1} comes after u_k.
         pivot = int((newest >= THRESHOLD * newest.max()).nonzero()[0][-1])
         first[pivot] = -1
         pivots.append(pivot)
@@ -180,12 +181,12 @@ def _in_order(C: np.ndarray, n_kept: int) -> tuple[np.ndarray, np.ndarray] | Non
 def null_space(C: np.ndarray, n_kept: int) -> Elimination:
     """Eliminate C z = b in an orthonormal basis, from the SVD, for a C of any rank.
 
-    The best conditioned way, though not the sparsest. Y is the pseudo-inverse: an inconsistent
-    C z = b shows in the certificate.
+    This elimination is the best conditioned, though not the sparsest. Y is the pseudo-inverse: the
+    certificate rejects an inconsistent C z = b.
     """
     M, n_c, n_z = C.shape
     n_rest = n_z - n_kept
-    # By torch, which has the caller's number of threads.
+    # In torch, which uses the caller's number of threads.
     parts = torch.linalg.svd(torch.from_numpy(C[:, :, n_kept:].copy()), full_matrices=True)
     left, singular, right = (x.numpy() for x in parts)
     scale = singular.max(-1, keepdims=True, initial=0.0)
@@ -207,7 +208,7 @@ def null_space(C: np.ndarray, n_kept: int) -> Elimination:
     return Elimination(T, Y_neg, padding)
 
 
-#: Ways to eliminate C z = b for QPs that no solver makes accurate after `eliminate`.
+#: Alternatives for QPs that no solver solves accurately after `eliminate`.
 OTHER_ELIMINATIONS: tuple[Callable[[np.ndarray, int], Elimination | None], ...] = (
     null_space,
     in_order,

@@ -1,17 +1,17 @@
-"""Why a QP (eq:qp2, eq:qp3) has no certified solution: infeasible, unbounded, or not converged.
+"""The cause of an unsolved QP (eq:qp2, eq:qp3): infeasible, unbounded, or not converged.
 
-A verdict needs a proof that holds in the QP's own numbers, checked in all entries of z. A proof
-that rounding could have made, or that leaves an error larger than rounding, proves nothing:
+A diagnosis needs a proof in the QP's own numbers, checked in all entries of z. A proof that could
+result from rounding, or that has an error larger than rounding, does not count:
 
 * *Infeasible* (Farkas' lemma): multipliers chi and lam of the hard rows with ``C'chi + G'lam = 0``
-  off the fixed entries and ``b'chi + ub'max(lam, 0) - lb'max(-lam, 0) < 0``, while every feasible
-  z makes the latter at least zero.
+  except in the fixed entries, and ``b'chi + ub'max(lam, 0) - lb'max(-lam, 0) < 0``, which every
+  feasible z makes non-negative.
 * *Unbounded*: a feasible point, and a direction d with ``H d = 0`` and ``C d = 0`` that no hard row
-  ends and along which the cost falls.
+  limits and along which the cost decreases.
 
 Both come from least squares with bounds (Lawson and Hanson, "Solving least squares problems",
-chapter 23), in an orthonormal basis of the null space of C, however ill-conditioned the elimination
-is that the solvers used.
+chapter 23), in an orthonormal basis of the null space of C, which is accurate even if the solvers'
+elimination is ill-conditioned.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solvers import daqp
 
-#: Relative to the sum of the absolute terms: what counts as zero, and what does not.
+#: A sum counts as zero, or as significant, relative to the sum of its absolute terms.
 ROUNDING, SIGNIFICANT = 1e-12, 1e-7
 
 
 def diagnose(p: Programs) -> np.ndarray:
-    """`Status` of each QP, ``(B,)``, one of INFEASIBLE, UNBOUNDED and NOT_CONVERGED."""
+    """Return the `Status` of each QP, ``(B,)``: INFEASIBLE, UNBOUNDED or NOT_CONVERGED."""
     H, C, G, q, _, b, lb, ub, w = p.theta
     ranges = {m: _Range.of(C[m][:, p.n_f :]) for m in set(p.group.tolist())}
-    found = []
+    statuses = []
     for i, m in enumerate(p.group.tolist()):
         vectors = (x[i % len(x)] for x in (b, lb, ub, w))
-        of_b, of_lb, of_ub, of_w = vectors
-        qp = _FreeQP.of(H[m], q[i % len(q)], C[m], of_b, G[m], of_lb, of_ub, of_w, p.fixed[i])
-        found.append(int(_status(qp, ranges[m])))
-    return np.array(found, np.int64)
+        b_i, lb_i, ub_i, w_i = vectors
+        qp = _FreeQP.of(H[m], q[i % len(q)], C[m], b_i, G[m], lb_i, ub_i, w_i, p.fixed[i])
+        statuses.append(int(_status(qp, ranges[m])))
+    return np.array(statuses, np.int64)
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class _Range:
 class _FreeQP:
     """One QP in the entries of z that are not fixed.
 
-    ``b``, ``lb`` and ``ub`` have the fixed entries' part subtracted, and ``b_size``, ``lb_size``
-    and ``ub_size`` are the sums of the absolute terms: rounding errors are relative to those.
+    The contribution of the fixed entries is subtracted from ``b``, ``lb`` and ``ub``. Rounding
+    errors are relative to ``b_size``, ``lb_size`` and ``ub_size``, the sums of absolute terms.
     """
 
     H: np.ndarray
@@ -97,26 +97,26 @@ class _FreeQP:
         )
 
 
-def _status(qp: _FreeQP, of_C: _Range) -> Status:
-    z = of_C.inverse @ qp.b
-    z = z + of_C.inverse @ (qp.b - qp.C @ z)
+def _status(qp: _FreeQP, C_range: _Range) -> Status:
+    z = C_range.inverse @ qp.b
+    z = z + C_range.inverse @ (qp.b - qp.C @ z)
     no_rows = np.zeros(len(qp.w))
-    if _contradict(qp, qp.C @ z - qp.b, no_rows, of_C):
+    if _contradict(qp, qp.C @ z - qp.b, no_rows, C_range):
         return Status.INFEASIBLE
-    nearest, lam = _nearest_feasible(qp, z, of_C)
-    if _contradict(qp, np.zeros(len(qp.b)), lam, of_C):
+    nearest, lam = _nearest_feasible(qp, z, C_range)
+    if _contradict(qp, np.zeros(len(qp.b)), lam, C_range):
         return Status.INFEASIBLE
-    if _is_feasible(qp, nearest) and _falls(qp, _steepest_recession(qp, of_C)):
+    if _is_feasible(qp, nearest) and _falls(qp, _steepest_recession(qp, C_range)):
         return Status.UNBOUNDED
     return Status.NOT_CONVERGED
 
 
-def _nearest_feasible(qp: _FreeQP, z: np.ndarray, of_C: _Range) -> tuple[np.ndarray, np.ndarray]:
-    """The feasible point nearest to z, where C z = b, or multipliers that deny that there is one.
+def _nearest_feasible(qp: _FreeQP, z: np.ndarray, C_range: _Range) -> tuple[np.ndarray, np.ndarray]:
+    """Return the feasible point nearest to z, where C z = b, and multipliers against feasibility.
 
-    DAQP finds the point sooner. Where it finds none, Lawson and Hanson's least distance programming
-    decides: of the rows ``A v >= h``, the residual of ``min |[A'; h'] lam - e|`` over ``lam >= 0``
-    is the point, or zero where there is none.
+    DAQP is faster, and tried first. If it fails, Lawson and Hanson's least distance programming
+    decides: for rows ``A v >= h``, the residual of ``min |[A'; h'] lam - e|`` over ``lam >= 0``
+    gives the point, or is zero if there is none.
     """
     hard, y = np.isinf(qp.w), qp.G @ z
     no_multipliers = np.zeros(len(hard))
@@ -125,10 +125,10 @@ def _nearest_feasible(qp: _FreeQP, z: np.ndarray, of_C: _Range) -> tuple[np.ndar
         return z, no_multipliers
     norms = np.linalg.norm(qp.G[hard], axis=1)
     norms[norms == 0] = 1.0
-    A = _product(qp.G[hard], of_C.null) / norms[:, None]
+    A = _product(qp.G[hard], C_range.null) / norms[:, None]
     lower, upper = lower / norms, upper / norms
     length = max(lower.max(), -upper.min())
-    nearest = z + of_C.null @ _least_distance(A, lower / length, upper / length) * length
+    nearest = z + C_range.null @ _least_distance(A, lower / length, upper / length) * length
     if _is_feasible(qp, nearest):
         return nearest, no_multipliers
     below, above = np.isfinite(lower), np.isfinite(upper)
@@ -138,55 +138,55 @@ def _nearest_feasible(qp: _FreeQP, z: np.ndarray, of_C: _Range) -> tuple[np.ndar
     unit[-1] = 1.0
     try:
         weights, _ = nnls(E, unit)
-    except RuntimeError:  # it did not settle: nothing is known
+    except RuntimeError:  # nnls did not converge: neither proof
         return z, no_multipliers
     weights[weights < ROUNDING * weights.max()] = 0.0
-    left = E @ weights - unit
-    if left[-1] < 0:
-        z = z + of_C.null @ (left[:-1] / -left[-1]) * length
-    of_rows = np.zeros(len(norms))
-    of_rows[above] = weights[below.sum() :]
-    of_rows[below] -= weights[: below.sum()]
+    residual = E @ weights - unit
+    if residual[-1] < 0:
+        z = z + C_range.null @ (residual[:-1] / -residual[-1]) * length
+    multipliers = np.zeros(len(norms))
+    multipliers[above] = weights[below.sum() :]
+    multipliers[below] -= weights[: below.sum()]
     lam = no_multipliers
-    lam[hard] = of_rows / norms
+    lam[hard] = multipliers / norms
     return z, lam
 
 
 def _least_distance(A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """The shortest v with ``lower <= A v <= upper``, if DAQP finds it."""
+    """Return the shortest v with ``lower <= A v <= upper``, if DAQP finds it."""
     unit, zero = np.eye(A.shape[1]), np.zeros((1, A.shape[1]))
     w = np.full((1, len(A)), np.inf)
     rows = (A[None], np.zeros(1, np.int64), zero, lower[None], upper[None], w)
     return daqp.solve(SoftQPs(unit[None], *rows)).v[0]
 
 
-def _contradict(qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, of_C: _Range) -> bool:
+def _contradict(qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, C_range: _Range) -> bool:
     """True if chi, completed to ``C'chi + G'lam = 0``, and lam prove that no z is feasible."""
-    pull = qp.G.T @ lam
+    G_lam = qp.G.T @ lam
     for _ in range(3):
-        chi = chi - of_C.inverse.T @ (qp.C.T @ chi + pull)
+        chi = chi - C_range.inverse.T @ (qp.C.T @ chi + G_lam)
     largest = max(np.abs(chi).max(initial=0.0), np.abs(lam).max(initial=0.0))
     chi = _without_noise(chi, largest)
     up, down, size = np.maximum(lam, 0), np.maximum(-lam, 0), np.abs(chi)
-    # A multiplier of zero has no bound to multiply, which may be infinite.
+    # Zero multipliers are skipped: their bounds may be infinite.
     with np.errstate(invalid="ignore"):
         charge = np.where(up > 0, up * qp.ub, 0) - np.where(down > 0, down * qp.lb, 0)
         terms = np.where(up > 0, up * qp.ub_size, 0) + np.where(down > 0, down * qp.lb_size, 0)
-    left, reach = np.abs(qp.C.T @ chi + pull), _reach(qp)
-    zero = left <= ROUNDING * (np.abs(qp.C).T @ size + np.abs(qp.G).T @ (up + down))
-    # What is left over counts for as much as the rest of the hard rows lets z make of it.
-    excess = (left * np.where(zero, 0, reach)).sum()
+    residual, reach = np.abs(qp.C.T @ chi + G_lam), _reach(qp)
+    zero = residual <= ROUNDING * (np.abs(qp.C).T @ size + np.abs(qp.G).T @ (up + down))
+    # The residual is charged at the largest |z| that the hard rows allow.
+    excess = (residual * np.where(zero, 0, reach)).sum()
     demand = qp.b @ chi + charge.sum() + excess
     return bool(demand < -SIGNIFICANT * (qp.b_size @ size + terms.sum()))
 
 
 def _without_noise(x: np.ndarray, largest: float) -> np.ndarray:
-    """x with zero for what rounding makes of a zero beside numbers as large as ``largest``."""
+    """Return x with entries set to zero that are rounding errors relative to ``largest``."""
     return np.where(np.abs(x) <= ROUNDING * largest, 0.0, x)
 
 
 def _reach(qp: _FreeQP) -> np.ndarray:
-    """Bounds of |z| by the hard rows of one entry each; inf where there is none."""
+    """Return the bounds of |z| by hard rows with one entry each; inf without such a row."""
     rows = np.isinf(qp.w) & ((qp.G != 0).sum(1) == 1)
     entry = qp.G[rows].nonzero()[1]
     widest = np.maximum(np.abs(qp.lb), np.abs(qp.ub))[rows] / np.abs(qp.G[rows, entry])
@@ -207,14 +207,14 @@ def _is_feasible(qp: _FreeQP, z: np.ndarray) -> bool:
     )
 
 
-def _steepest_recession(qp: _FreeQP, of_C: _Range) -> np.ndarray:
-    """The direction, in all free entries, along which the cost of a QP without end falls most.
+def _steepest_recession(qp: _FreeQP, C_range: _Range) -> np.ndarray:
+    """Return the direction in which the cost of an unbounded QP decreases fastest.
 
-    It is the residual of the multipliers that balance the slope best; zero where they balance it.
+    It is the residual of the multipliers that best balance the slope; zero if they balance it.
     """
-    curvatures, basis = np.linalg.eigh(of_C.null.T @ qp.H @ of_C.null)
+    curvatures, basis = np.linalg.eigh(C_range.null.T @ qp.H @ C_range.null)
     flat = np.abs(curvatures) <= ROUNDING * np.abs(curvatures).max(initial=0.0)
-    F = of_C.null @ basis[:, flat]
+    F = C_range.null @ basis[:, flat]
     slope = F.T @ qp.q
     scale = np.abs(slope).max(initial=0.0)
     if not scale > 0:
@@ -230,14 +230,14 @@ def _steepest_recession(qp: _FreeQP, of_C: _Range) -> np.ndarray:
 
 
 def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """The matrix product, with zero where it is only rounding."""
+    """Return the matrix product, with zeros for entries that are only rounding errors."""
     product = left @ right
     product[np.abs(product) <= ROUNDING * (np.abs(left) @ np.abs(right))] = 0.0
     return product
 
 
 def _falls(qp: _FreeQP, d: np.ndarray) -> bool:
-    """True if the cost falls for ever along d, which no curvature, C or hard row ends."""
+    """True if the cost decreases without bound along d, by H, C and the hard rows."""
     d = _without_noise(d, np.abs(d).max(initial=0.0))
     y, size = qp.G @ d, np.abs(d)
     row_size = np.abs(qp.G) @ size

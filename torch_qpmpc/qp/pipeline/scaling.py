@@ -1,13 +1,13 @@
-"""A QP's own units: a QP of unusual size is solved, and certified, in these.
+"""Scaling: a QP of unusual size is solved and certified in units of its own.
 
-Tolerances are relative, but to no less than one: to the solvers and the certificate a QP whose
-cost, variables or rows are of size 1e-8 is a QP of zeros. With units of cost kappa, of length l,
+Tolerances are relative, but to no less than one: without units, solvers and certificate cannot
+distinguish costs, variables or rows of size 1e-8 from zeros. With units of cost kappa, of length l,
 and of the rows rho (of G) and gamma (of C),
 
     z = l z',  H' = H l^2 / kappa,  q' = q l / kappa,  C' = C l / gamma,  b' = b / gamma,
     G' = G l / rho,  (lb, ub)' = (lb, ub) / rho,  w' = w rho / kappa,
 
-is the same QP. All units are powers of two, so that rounding is the same, too.
+is the same QP. All units are powers of two, so that rounding does not change.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 
 from torch_qpmpc.qp.kernels import theta as loops
-from torch_qpmpc.qp.pipeline.arrays import Array, Theta, of_group
+from torch_qpmpc.qp.pipeline.arrays import Array, Theta, per_qp
 from torch_qpmpc.qp.pipeline.batch_solution import BatchSolution
 
-#: Sizes in between have the unit one.
+#: Sizes between these have the unit one.
 SMALL, LARGE = 2.0**-7, 2.0**10
 
 
@@ -37,15 +37,15 @@ class Units(NamedTuple):
 
     @classmethod
     def of(cls, theta: Theta, group: np.ndarray) -> Units | None:
-        """The units of theta; None if all of them are one."""
+        """Return the units of theta; None if all of them are one."""
         if not len(group) or not theta.q.shape[-1]:
             return None
         units = loops.units(theta, group, SMALL, LARGE)
         return None if units is None else cls(*units)
 
     def scaled(self, theta: Theta, group: np.ndarray) -> Theta:
-        """The same theta in these units."""
-        cost, length, rows, equalities = (of_group(unit, group) for unit in self)
+        """Return theta in these units."""
+        cost, length, rows, equalities = (per_qp(unit, group) for unit in self)
         by_row = (self.length / self.rows)[:, :, None]
         by_equality = (self.length / self.equalities)[:, :, None]
         return Theta(
@@ -61,12 +61,12 @@ class Units(NamedTuple):
         )
 
     def inverse(self) -> Units:
-        """The units in which the scaled QPs are the original ones."""
+        """Return the units that convert the scaled QPs to the original ones."""
         return Units(*(1 / unit for unit in self))
 
     def restored(self, solution: BatchSolution, group: Array) -> BatchSolution:
-        """Solutions in the QPs' own numbers; residuals are relative, and stay as they are."""
-        cost, length, rows, equalities = (of_group(unit, group) for unit in self)
+        """Return solutions in the original numbers, with the same relative residuals."""
+        cost, length, rows, equalities = (per_qp(unit, group) for unit in self)
         return solution._replace(
             value=solution.value * cost[:, 0],
             z=solution.z * length,
@@ -76,5 +76,5 @@ class Units(NamedTuple):
         )
 
     def multipliers(self, lam: Array, group: Array) -> Array:
-        """Multipliers ``(B, n_g)`` of the rows in these units."""
-        return lam * of_group(self.rows / self.cost, group)
+        """Return multipliers ``(B, n_g)`` of the rows in these units."""
+        return lam * per_qp(self.rows / self.cost, group)

@@ -1,4 +1,4 @@
-"""QPs (eq:qp2, eq:qp3) and their certified solutions: condense, solve, certify, fall back."""
+"""Solve and certify QPs (eq:qp2, eq:qp3): condense, solve, certify, fall back."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torch_qpmpc.qp.pipeline.arrays import Array, of_group, on_device, to_numpy
+from torch_qpmpc.qp.pipeline.arrays import Array, on_device, per_qp, to_numpy
 from torch_qpmpc.qp.pipeline.batch import Programs, SoftQPs
 from torch_qpmpc.qp.pipeline.batch_solution import TOLERANCE, BatchSolution, unsolved
 from torch_qpmpc.qp.pipeline.certificate import certify, recover
@@ -20,20 +20,32 @@ from torch_qpmpc.qp.pipeline.warm_start import try_active_sets
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
 
-#: A rejected solution with a relative residual up to this is worth refining.
+#: Rejected solutions with a relative residual up to this are refined.
 NEARLY = 1e-2
-#: Steps of iterative refinement after an ill-conditioned elimination.
+#: Number of iterative refinements after an alternative elimination.
 PASSES = 2
 
 
 @dataclass
 class SolveLog:
-    """Counts what is solved inside a ``with`` block, by this thread.
+    """Counts of the QPs that this thread solves inside a ``with`` block.
+
+    Attributes:
+        solves: QPs, solved or not.
+        unsolved: QPs without a certified solution.
+        fallback: QPs whose first solution was rejected.
+        recalled: QPs solved by their warm start alone.
+        iterations: the solvers' iterations.
+        residual: largest residual of a certified solution.
+        seconds: wall-clock time of the solves, in seconds.
 
     Example:
-        >>> with SolveLog() as log:  # doctest: +SKIP
-        ...     loss(batch)
-        >>> log.solves, log.unsolved, log.seconds  # doctest: +SKIP
+        >>> import torch, torch_qpmpc as qm
+        >>> mpc = qm.QPMPC(2, 1, 5)
+        >>> with qm.SolveLog() as log:
+        ...     values = mpc.value(torch.zeros(8, 2))
+        >>> log.solves, log.unsolved
+        (8, 0)
     """
 
     solves: int = 0
@@ -52,7 +64,7 @@ class SolveLog:
         _active_log.reset(self._token)
 
     def metrics(self) -> dict[str, float]:
-        """The scalars that training logs under ``qp/``."""
+        """Return the scalars that training logs, with iterations per QP."""
         return {
             "qp/solves": self.solves,
             "qp/unsolved": self.unsolved,
@@ -64,7 +76,7 @@ class SolveLog:
         }
 
     def add(self, solution: BatchSolution, seconds: float) -> None:
-        """Count a batch."""
+        """Count a solved batch, and its seconds."""
         accepted = solution.residual[solution.accepted()]
         self.solves += len(solution.residual)
         self.unsolved += len(solution.residual) - len(accepted)
@@ -77,15 +89,15 @@ _active_log: contextvars.ContextVar[SolveLog] = contextvars.ContextVar("log")
 
 
 def solve_programs(p: Programs, solver: str, start: Array | None = None) -> BatchSolution:
-    """Solve and certify B QPs; what cannot be certified has a status that says why.
+    """Solve and certify B QPs; the status of an unsolved one is its diagnosis.
 
     Args:
         p: the QPs.
         solver: a backend's name, see `torch_qpmpc.qp.solvers`.
-        start: active sets ``(B, n_g)`` of nearly these QPs, see `warm_start`.
+        start: active sets ``(B, n_g)`` of nearly equal QPs, see `warm_start`.
     """
     began = time.perf_counter()
-    log = _active_log.get(unread := SolveLog())
+    log = _active_log.get(unused := SolveLog())
     units = p.prepared.units
     if units is None:
         solution = _solve(p, solver, start, log)
@@ -93,32 +105,32 @@ def solve_programs(p: Programs, solver: str, start: Array | None = None) -> Batc
         scaled = _scaled(p)
         solution = units.restored(_solve(scaled, solver, start, log), scaled.group)
         solution = _settled(p.on_cpu(), solver, solution.on_cpu())
-    if log is not unread:
+    if log is not unused:
         log.add(solution, time.perf_counter() - began)
     return solution
 
 
 def _scaled(p: Programs) -> Programs:
-    """The QPs in their own units."""
+    """Return the QPs in their own units."""
     prepared = p.prepared.scaled
     assert p.prepared.units is not None
-    return Programs(prepared, p.group, p.fixed / of_group(p.prepared.units.length, p.group))
+    return Programs(prepared, p.group, p.fixed / per_qp(p.prepared.units.length, p.group))
 
 
 def _settled(p: Programs, solver: str, solution: BatchSolution) -> BatchSolution:
-    """Certify solutions found in units in the QPs' own numbers, too; solve again what fails.
+    """Certify scaled solutions in the original numbers, too; solve second those that fail.
 
-    Units follow from bounds, among others. Where a bound is far from every solution, as a large
-    number in the place of none is, they are large, and a certificate in them misses errors.
+    The units depend on the bounds. A bound that is far from every solution, such as a large number
+    in place of inf, makes them so large that a certificate in these units misses errors.
     """
     units = p.prepared.units
     assert units is not None
     accepted = np.flatnonzero(solution.accepted())
     failed = accepted[_certify_at(p, solution, accepted)]
     if len(failed):
-        part = p.take(failed)
-        again = _solve(part, solver, None, SolveLog())
-        solution.put(failed, again)
+        failing = p.take(failed)
+        second = _solve(failing, solver, None, SolveLog())
+        solution.put(failed, second)
         in_units = units.inverse().restored(solution, p.group)
         failed = failed[solution.accepted()[failed]]
         failed = failed[_certify_at(_scaled(p), in_units, failed)]
@@ -127,15 +139,15 @@ def _settled(p: Programs, solver: str, solution: BatchSolution) -> BatchSolution
 
 
 def _certify_at(p: Programs, solution: BatchSolution, at: np.ndarray) -> np.ndarray:
-    """Raise the residuals at the indices ``at`` to what they are here; True where too much."""
-    found = solution.at(at)
-    _, residual = certify(p.take(at), found.z, found.lam, found.chi, found.xi)
-    solution.residual[at] = np.maximum(found.residual, residual)
+    """Raise the residuals at the indices ``at`` to those of ``p``; return the mask of failures."""
+    solved = solution.at(at)
+    _, residual = certify(p.take(at), solved.z, solved.lam, solved.chi, solved.xi)
+    solution.residual[at] = np.maximum(solved.residual, residual)
     return residual > TOLERANCE
 
 
 def _solve(p: Programs, solver: str, start: Array | None, log: SolveLog) -> BatchSolution:
-    """Solve with the chosen solver, and in other ways what its certificate rejects."""
+    """Solve with the chosen solver, and by fallbacks if the certificate rejects the result."""
     index = _solvable(p)
     if index is None:
         solution = _attempt(p, backend(solver), start, log)
@@ -150,7 +162,7 @@ def _solve(p: Programs, solver: str, start: Array | None, log: SolveLog) -> Batc
 
 
 def _solvable(p: Programs) -> np.ndarray | None:
-    """The indices of QPs with valid data and a convex cost; None for all.
+    """Return the indices of QPs with valid data and a convex cost; None for all.
 
     First-order conditions certify an optimum only where the QP is convex.
     """
@@ -166,49 +178,49 @@ def _solvable(p: Programs) -> np.ndarray | None:
 def _attempt(
     p: Programs, solve: Backend, start: Array | None, log: SolveLog, passes: int = 0
 ) -> BatchSolution:
-    """Solve once, from the active sets ``start`` if there are any, and certify the result."""
+    """Solve once, from the active sets ``start`` unless None, and certify the result."""
     qps = p.reduced_qps()
     settled = None
     if not qps.l.shape[-1]:
-        found = _unconstrained(qps).like(p.fixed)
+        claim = _unconstrained(qps).like(p.fixed)
     elif start is None:
-        found = solve(qps).like(p.fixed)
+        claim = solve(qps).like(p.fixed)
     else:
-        found, settled = try_active_sets(p, qps, start)
-        _replace(found, ~settled, qps, solve)
-    solution = recover(p, found, passes)
+        claim, settled = try_active_sets(p, qps, start)
+        _replace(claim, ~settled, qps, solve)
+    solution = recover(p, claim, passes)
     if settled is not None:
         kept = settled & solution.accepted()
         log.recalled += int(kept.sum())
-        if _replace(found, settled & ~kept, qps, solve):
-            solution = recover(p, found, passes)
+        if _replace(claim, settled & ~kept, qps, solve):
+            solution = recover(p, claim, passes)
     if not solution.all_accepted:
-        solution = _refined(p.on_cpu(), qps.in_numpy(), found, solution.on_cpu(), passes)
+        solution = _refined(p.on_cpu(), qps.in_numpy(), claim, solution.on_cpu(), passes)
     return solution
 
 
-def _replace(found: BackendSolution, where: Array, qps: SoftQPs, solve: Backend) -> bool:
-    """Solve the QPs ``where`` ``(B,)`` anew, in place; False if there are none."""
+def _replace(claim: BackendSolution, where: Array, qps: SoftQPs, solve: Backend) -> bool:
+    """Solve the QPs in the mask ``where`` again, in place; return False if there are none."""
     if not where.any():
         return False
-    found.put(where, solve(qps.take(where)).like(where))
+    claim.put(where, solve(qps.take(where)).like(where))
     return True
 
 
 def _refined(
-    p: Programs, qps: SoftQPs, found: BackendSolution, solution: BatchSolution, passes: int
+    p: Programs, qps: SoftQPs, claim: BackendSolution, solution: BatchSolution, passes: int
 ) -> BatchSolution:
-    """Refine what the certificate rejects by little."""
+    """Refine solutions that the certificate narrowly rejects."""
     nearly = ~solution.accepted() & (solution.residual <= NEARLY)
     if nearly.any():
-        second = recover(p, refine(qps, found.like(p.fixed), np.flatnonzero(nearly)), passes)
+        second = recover(p, refine(qps, claim.like(p.fixed), np.flatnonzero(nearly)), passes)
         better = np.flatnonzero(second.residual < solution.residual)
         solution.put(better, second.at(better))
     return solution
 
 
 def _unconstrained(qps: SoftQPs) -> BackendSolution:
-    """Solve QPs without rows in closed form; the certificate rejects what is unbounded."""
+    """Solve QPs without rows in closed form; the certificate rejects unbounded ones."""
     H, _, group, g, lam, _, _ = qps.in_torch()
     v = torch.einsum("bij,bj->bi", torch.linalg.pinv(H, hermitian=True)[group], -g)
     return BackendSolution(v, lam, torch.zeros_like(group))
@@ -217,32 +229,32 @@ def _unconstrained(qps: SoftQPs) -> BackendSolution:
 def _solved_otherwise(
     p: Programs, solution: BatchSolution, solver: str, log: SolveLog
 ) -> BatchSolution:
-    """Diagnose what is not accepted, and solve it in other ways unless it has no solution.
+    """Diagnose rejected QPs, and solve those that may have a solution by fallbacks.
 
-    Other eliminations of C z = b come first, for ill-conditioned ones, then the other solvers.
+    Other eliminations of C z = b come first, for ill-conditioned QPs, then the other solvers.
     """
     todo = np.flatnonzero(~solution.accepted())
     log.fallback += len(todo)
-    part = p.take(todo)
-    failed = _unsolved(part, Status.NOT_CONVERGED)._replace(residual=solution.residual[todo])
-    solution.put(todo, failed._replace(status=diagnose(part)))
+    rest = p.take(todo)
+    failed = _unsolved(rest, Status.NOT_CONVERGED)._replace(residual=solution.residual[todo])
+    solution.put(todo, failed._replace(status=diagnose(rest)))
     todo = todo[solution.status[todo] == Status.NOT_CONVERGED]
-    ways = [(eliminate, BACKENDS["torch"], PASSES) for eliminate in OTHER_ELIMINATIONS]
-    for eliminate, solve, passes in (*ways, *((None, other, 0) for other in fallbacks(solver))):
+    first = [(eliminate, BACKENDS["torch"], PASSES) for eliminate in OTHER_ELIMINATIONS]
+    for eliminate, solve, passes in (*first, *((None, other, 0) for other in fallbacks(solver))):
         if not len(todo):
             break
-        part = p.take(todo)
+        rest = p.take(todo)
         if eliminate is not None:
-            elimination = eliminate(part.theta.C, part.n_f) if part.theta.C.size else None
+            elimination = eliminate(rest.theta.C, rest.n_f) if rest.theta.C.size else None
             if elimination is None:
                 continue
-            prepared = part.prepared.eliminated(elimination, part.n_f)
-            part = Programs(prepared, part.group, part.fixed)
-        found = _attempt(part, solve, None, log, passes)
-        accepted = found.accepted()
-        solution.put(todo[accepted], found.at(accepted))
+            prepared = rest.prepared.eliminated(elimination, rest.n_f)
+            rest = Programs(prepared, rest.group, rest.fixed)
+        second = _attempt(rest, solve, None, log, passes)
+        accepted = second.accepted()
+        solution.put(todo[accepted], second.at(accepted))
         todo = todo[~accepted]
-        solution.residual[todo] = found.residual[~accepted]
+        solution.residual[todo] = second.residual[~accepted]
     return solution
 
 

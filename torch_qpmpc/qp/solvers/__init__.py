@@ -1,7 +1,7 @@
-"""Backends, one a file: what solves a condensed QP (eq:qp2, eq:qp3).
+"""The backends, one per file, which solve condensed QPs (eq:qp2, eq:qp3).
 
 A backend is a function ``solve(qps: SoftQPs) -> BackendSolution``. To add one, write its file and
-name it in `BACKENDS`.
+list it in `BACKENDS`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BACKENDS: dict[str, Backend] = {
 
 
 def backend(name: str) -> Backend:
-    """The backend called ``name``; `QPError` if there is none."""
+    """Return the backend called ``name``; raise `QPError` if there is none."""
     if name in BACKENDS:
         return BACKENDS[name]
     if isinstance(name, str) and name.startswith("qpsolvers:"):
@@ -41,12 +41,12 @@ def backend(name: str) -> Backend:
     )
 
 
-#: The solvers that give up soonest, and solve what ProxQP does.
+#: Solvers that give up soonest, and solve every QP that ProxQP solves.
 FALLBACKS = ("daqp", "torch")
 
 
 def fallbacks(name: str) -> list[Backend]:
-    """Return the backends that solve, cold, what the certificate rejects of another one."""
+    """Return the backends that solve again, cold, the QPs for which ``name`` was rejected."""
     return [BACKENDS[other] for other in FALLBACKS if other != name]
 
 

@@ -1,9 +1,9 @@
-"""Active-set Newton steps for a whole batch: the end of the interior point.
+"""Active-set Newton steps for a whole batch, the last phase of the interior-point method.
 
-With the rows' states held (see `crossover`), the KKT conditions of the condensed QP (eq:qp2,
-eq:qp3) are linear. The method of multipliers solves them: a large curvature holds the active rows
-at their bounds, and its error falls by orders of magnitude a pass, so one Cholesky factor of d x d
-and no pivoting suffices, dependent active rows included.
+With fixed states of the rows (see `torch_qpmpc.qp.pipeline.polishing`), the KKT conditions of the
+condensed QP (eq:qp2, eq:qp3) are linear. The method of multipliers solves them: a large curvature
+holds the active rows at their bounds, and each pass reduces its error by orders of magnitude. One
+d x d Cholesky factor without pivoting suffices, even for dependent active rows.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from torch import Tensor
 from torch_qpmpc.qp.solution import row_states
 from torch_qpmpc.qp.solvers.batched import BatchedQPs
 
-#: Relative residual of an answer that needs no further step.
+#: A solution with this relative residual needs no further step.
 SETTLED = 1e-9
-#: Of the method of multipliers, a Newton step.
+#: Passes of the method of multipliers per Newton step.
 PASSES = 3
 
 
 @dataclass
-class Found:
+class Best:
     """The best v ``(B, d)`` and lam ``(B, r)`` so far, their residuals and steps, ``(B,)``."""
 
     v: Tensor
@@ -32,42 +32,44 @@ class Found:
     steps: Tensor
 
     @classmethod
-    def nothing(cls, qps: BatchedQPs) -> Found:
-        """Zeros, and what any answer betters."""
+    def initial(cls, qps: BatchedQPs) -> Best:
+        """Return zeros with infinite residuals."""
         residual = torch.full_like(qps.cost, torch.inf)
         steps = torch.zeros_like(qps.cost, dtype=torch.int64)
         return cls(torch.zeros_like(qps.g), torch.zeros_like(qps.w), residual, steps)
 
-    def offer(self, index: Tensor, v: Tensor, lam: Tensor, residual: Tensor) -> None:
-        """Take the answers for ``index`` where they lower the residual."""
+    def update(self, index: Tensor, v: Tensor, lam: Tensor, residual: Tensor) -> None:
+        """Take the solutions at ``index`` that lower the residual."""
         better = residual < self.residual[index]
         chosen = index[better]
         self.v[chosen], self.lam[chosen] = v[better], lam[better]
         self.residual[chosen] = residual[better]
 
 
-def settle(qps: BatchedQPs, v: Tensor, lam: Tensor, max_steps: int) -> Found:
-    """Newton steps from v and lam, at least one, for each QP until it is solved as if exactly."""
+def settle(qps: BatchedQPs, v: Tensor, lam: Tensor, max_steps: int) -> Best:
+    """Take one or more Newton steps from v and lam, until the residual of each QP is `SETTLED`."""
     todo = torch.arange(len(qps), device=v.device)
-    found = Found(v.clone(), lam.clone(), qps.residual(v, lam), torch.zeros_like(todo))
+    best = Best(v.clone(), lam.clone(), qps.residual(v, lam), torch.zeros_like(todo))
     for _ in range(max_steps):
         v, lam = _step(qps, v, lam)
         residual = qps.residual(v, lam)
-        found.offer(todo, v, lam, residual)
-        found.steps[todo] += 1
+        best.update(todo, v, lam, residual)
+        best.steps[todo] += 1
         going = ~(residual <= SETTLED)
         if not going.any():
             break
         if not going.all():
             qps, todo, v, lam = qps.take(going), todo[going], v[going], lam[going]
-    return found
+    return best
 
 
 def _step(qps: BatchedQPs, v: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
-    """v and lam with the active rows at their bounds, and lam as held elsewhere."""
+    """Return v and lam with active rows at their bounds, and fixed lam in the others."""
     y, stiffness = qps.rows(v), qps.force / qps.width
-    nearest, active, held = row_states(y + lam / stiffness, qps.lower, qps.upper, qps.w / stiffness)
-    lam = torch.where(active, lam, held * stiffness)
+    nearest, active, multiplier = row_states(
+        y + lam / stiffness, qps.lower, qps.upper, qps.w / stiffness
+    )
+    lam = torch.where(active, lam, multiplier * stiffness)
     weight = active * qps.penalty
     factor = qps.factor(weight)
     for _ in range(PASSES):

@@ -1,4 +1,4 @@
-"""What a backend returns for condensed QPs (eq:qp2, eq:qp3): a claim, which is certified."""
+"""The result of a backend for condensed QPs (eq:qp2, eq:qp3), before its certification."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch_qpmpc.qp.pipeline.arrays import Array, to_numpy
 class BackendSolution(NamedTuple):
     """v ``(B, d)``, signed row multipliers lam = eta - upsilon ``(B, r)``, iterations ``(B,)``.
 
-    There is no status: the project's own certificate decides what is solved.
+    It has no status: the certificate decides which QPs are solved.
     """
 
     v: Array
@@ -26,7 +26,7 @@ class BackendSolution(NamedTuple):
             own[index] = new
 
     def like(self, x: Array) -> BackendSolution:
-        """The same in NumPy's arrays, or in tensors on one device, as ``x`` is."""
+        """Return the same as arrays, or as tensors on one device, like ``x``."""
         if isinstance(x, np.ndarray):
             return BackendSolution._make(map(to_numpy, self))
-        return BackendSolution._make(torch.as_tensor(part, device=x.device) for part in self)
+        return BackendSolution._make(torch.as_tensor(field, device=x.device) for field in self)

@@ -1,6 +1,6 @@
-"""The soft QPs as the batched algorithms ask for them, on any device.
+"""Soft QPs in the form of the batched algorithms, on any device.
 
-Neither this module nor `active_set` and `interior_point`, which build on it, loop over the batch.
+This module, and `active_set` and `interior_point`, which use it, do not loop over the batch.
 """
 
 from __future__ import annotations
@@ -13,28 +13,29 @@ from torch import Tensor
 from torch_qpmpc.qp.batching import largest
 from torch_qpmpc.qp.pipeline.batch import SoftQPs
 
-#: Stands for infinity: its reciprocal vanishes in sums, and its square does not overflow.
+#: Replaces infinity: its reciprocal vanishes in sums, and its square does not overflow.
 HUGE = 1e100
-#: Of the larger bound: the width of a row that is an equality rather than an interval.
+#: A row up to this narrow, relative to its larger bound, counts as an equality.
 NARROW = 1e-6
-#: A multiplier's typical part of the largest force.
+#: A typical multiplier, relative to the largest force.
 TYPICAL = 0.05
-#: Typical curvature is H's, or where that is flat this part of the largest force over a length.
+#: Least typical curvature, relative to the largest force over a length.
 FLAT = 1e-2
-#: Times the typical curvature: what holds a row at its bound, and what damps every step.
+#: Curvatures that hold a row at its bound and damp every step, relative to the typical one.
 PENALTY, DAMPING = 1e10, 1e-10
-#: Of the largest diagonal entry: makes a matrix positive definite that rounding has spoilt.
+#: Added to a matrix that is indefinite by rounding, relative to its largest diagonal entry.
 ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
 class BatchedQPs:
-    """`SoftQPs` with `HUGE` for infinity, and what is typical of each.
+    """`SoftQPs` with `HUGE` for infinity, and typical sizes.
 
-    H and G are ``(1, ..)`` where the batch shares them, and then ``products`` holds the outer
-    products of G's rows, ``(r, d d)``; else they are ``(B, ..)``. Typical sizes make all decisions
-    independent of units: ``width`` between a row's bounds, ``force`` of its multiplier, ``penalty``
-    that holds it, ``(B, r)``; ``cost``, the least width times force, and ``curvature``, ``(B,)``.
+    H and G are ``(1, ..)`` if the batch shares them, and ``products`` then holds the outer products
+    of G's rows, ``(r, d d)``; else they are ``(B, ..)``. Typical sizes make all decisions
+    independent of units: the ``width`` between a row's bounds, the ``force`` of its multiplier, the
+    ``penalty`` that holds it, ``(B, r)``; the ``cost``, or least width times force, and the
+    ``curvature``, ``(B,)``.
     """
 
     H: Tensor
@@ -80,25 +81,25 @@ class BatchedQPs:
         return len(self.g)
 
     def take(self, index: Tensor) -> BatchedQPs:
-        """The QPs at ``index``."""
+        """Return the QPs at ``index``."""
         same = ("H", "G", "products") if self.products is not None else ("products",)
-        parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        return BatchedQPs(**{n: t if n in same else t[index] for n, t in parts.items()})
+        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
+        return BatchedQPs(**{n: t if n in same else t[index] for n, t in tensors.items()})
 
     def bend(self, v: Tensor) -> Tensor:
-        """H v, ``(B, d)``."""
+        """Return H v, ``(B, d)``."""
         return self._multiply(self.H, v)
 
     def rows(self, v: Tensor) -> Tensor:
-        """y = G v, ``(B, r)``."""
+        """Return y = G v, ``(B, r)``."""
         return self._multiply(self.G, v)
 
     def pull(self, lam: Tensor) -> Tensor:
-        """G' lam, ``(B, d)``."""
+        """Return G' lam, ``(B, d)``."""
         return self._multiply(self.G.mT, lam)
 
     def factor(self, weight: Tensor) -> Tensor:
-        """Cholesky factors of ``H + G' diag(weight) G``, slightly damped, ``(B, d, d)``."""
+        """Return Cholesky factors of ``H + G' diag(weight) G``, slightly damped, ``(B, d, d)``."""
         if self.products is not None:
             normal = torch.addmm(self.H.flatten(1), weight, self.products)
             normal = normal.unflatten(1, self.H.shape[1:])
@@ -113,7 +114,7 @@ class BatchedQPs:
         return factor
 
     def residual(self, v: Tensor, lam: Tensor) -> Tensor:
-        """The certificate's relative KKT residual, of the condensed problem, ``(B,)``."""
+        """Return the certificate's relative KKT residual for the condensed QPs, ``(B,)``."""
         Hv, y, pull = self.bend(v), self.rows(v), self.pull(lam)
         stationarity = _largest(Hv + self.g + pull)
         stationarity /= 1 + _largest(torch.cat((Hv, self.g, pull), dim=-1))
@@ -125,8 +126,8 @@ class BatchedQPs:
         gap = charge + lam.clamp(min=0) * (self.upper - y) + lam.clamp(max=0) * (self.lower - y)
         cost = (v * (Hv / 2 + self.g)).sum(-1, keepdim=True) + charge.sum(-1, keepdim=True)
         gap = gap.abs().sum(-1, keepdim=True) / (1 + cost.abs())
-        parts = (stationarity, violation, excess, gap)
-        return torch.cat(parts, dim=-1).amax(-1).nan_to_num(torch.inf, torch.inf)
+        errors = (stationarity, violation, excess, gap)
+        return torch.cat(errors, dim=-1).amax(-1).nan_to_num(torch.inf, torch.inf)
 
     def _multiply(self, matrices: Tensor, vectors: Tensor) -> Tensor:
         if self.products is not None:
@@ -135,5 +136,5 @@ class BatchedQPs:
 
 
 def _largest(x: Tensor) -> Tensor:
-    """Largest absolute entry along the last dimension, which stays; zero where it is empty."""
+    """Return the largest absolute entry along the last dimension, which is kept."""
     return largest(x).unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""DAQP, the fast path: a dual active-set solver with soft constraints of its own, no slacks."""
+"""DAQP, the fast backend: a dual active-set solver with built-in soft constraints, no slacks."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from torch_qpmpc.qp.kernels.tour import tour
 from torch_qpmpc.qp.pipeline.batch import SoftQPs
 from torch_qpmpc.qp.solvers.base import BackendSolution
 
-#: A soft row, in DAQP's ``sense``.
+#: The code of a soft row in DAQP's ``sense``.
 SOFT = 8
 #: Smallest batch that is warm-started from neighbours, which saves a third to half of the
 #: iterations.
 MANY = 16
-#: The next QP is the nearest of so many.
+#: The next QP is the nearest of this many.
 NEAR = 256
-#: DAQP's reciprocal quadratic slack weight; 1e4 to 1e8 are right to 1e-7, outside it errs.
+#: DAQP's reciprocal quadratic slack weight; 1e4 to 1e8 are accurate to 1e-7, others less.
 RECIPROCAL_RHO = 1e6
 #: DAQP's infinity.
 NO_BOUND = 1e30
@@ -24,19 +24,19 @@ SETTINGS = {"primal_tol": 1e-9, "dual_tol": 1e-12, "iter_limit": 2000, "time_lim
 
 
 def solve(qps: SoftQPs) -> BackendSolution:
-    """Solve a batch; of a large one, each QP from the active set of one much like it."""
+    """Solve a batch; in a large one, start each QP from the active set of a similar one."""
     qps = qps.in_numpy()
     kinds = _alike(qps)
     if len(kinds) == 1:
         return _solve_alike(qps)
-    found = BackendSolution(np.zeros_like(qps.g), np.zeros_like(qps.l), np.zeros_like(qps.group))
+    solution = BackendSolution(np.zeros_like(qps.g), np.zeros_like(qps.l), np.zeros_like(qps.group))
     for index in kinds:
-        found.put(index, _solve_alike(qps.take(index)))
-    return found
+        solution.put(index, _solve_alike(qps.take(index)))
+    return solution
 
 
 def _alike(qps: SoftQPs) -> list[np.ndarray]:
-    """The indices of QPs that share their matrices and their pattern of hard rows."""
+    """Return the indices of QPs grouped by their matrices and their pattern of hard rows."""
     group, hard = qps.group, np.isinf(_distinct(qps.w))
     if len(qps.H) == 1 and len(group) and (hard == hard[0]).all():
         return [np.arange(len(group))]
@@ -48,17 +48,17 @@ def _alike(qps: SoftQPs) -> list[np.ndarray]:
 
 
 def _distinct(vectors: np.ndarray) -> np.ndarray:
-    """One row where it is repeated for the batch, without a copy."""
+    """Return a single row if it is repeated for the batch without a copy."""
     return vectors[:1] if vectors.strides[0] == 0 else vectors
 
 
 def _solve_alike(qps: SoftQPs) -> BackendSolution:
-    """Solve with one model; with another pattern of soft rows, it corrupts memory."""
+    """Solve with one model, which another pattern of soft rows would corrupt."""
     H, G, (m, *_), g, lower, upper, w = qps
     v, lam = np.zeros(g.shape), np.zeros(lower.shape)
     iterations = np.zeros(len(g), dtype=np.int64)
     upper, lower = np.minimum(upper, NO_BOUND), np.maximum(lower, -NO_BOUND)
-    # A row that may be violated for nothing is no row; DAQP would hold it with its small rho.
+    # A row with zero weight is no constraint, but DAQP would hold it with its small rho.
     w = _distinct(w)
     hard = np.isinf(w[0])
     if not w.all():
@@ -71,14 +71,14 @@ def _solve_alike(qps: SoftQPs) -> BackendSolution:
     model = daqp.Model()
     flag, _ = model.setup(H[m], g[0], G[m], upper[0], lower[0], empty.copy())
     if flag < 0:
-        return BackendSolution(v, lam, iterations)  # zeros, which do not pass the certificate
+        return BackendSolution(v, lam, iterations)  # zeros, which the certificate rejects
     model.settings = SETTINGS
     if len(hard):  # soft_weights refuses empty arrays
         model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[0], w_u=weight[0])
     many = len(g) >= MANY
     update, solve_one, failed = model.update, model.solve, False
     for k in tour(g, NEAR).tolist() if many else range(len(g)):
-        # Without a ``sense``, the model begins with the active set that it ended with.
+        # Without a ``sense``, the model starts from its last active set.
         sense = None if many and not failed else empty
         if not len(hard):
             update(f=g[k])

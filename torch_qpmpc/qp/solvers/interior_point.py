@@ -1,16 +1,16 @@
-"""A primal-dual interior point for a whole batch, in pure torch: the same code on CPU and GPU.
+"""A primal-dual interior-point method for whole batches, in torch, the same on CPU and GPU.
 
-The soft rows need no slack variables. Each of a row's sides, ``y <= u`` and ``l <= y``, has a
-distance s, an excess t and a multiplier lam, and what is left of its weight, mu:
+The soft rows need no slack variables. Each side of a row, ``y <= u`` and ``l <= y``, has a distance
+s, an excess t, a multiplier lam, and the rest mu of its weight:
 
     u - y = s - t,     s lam = 0,     t mu = 0,     lam + mu = w,     s, t, lam, mu >= 0.
 
-Mehrotra's method (1992, doi:10.1137/0802028) lets both products shrink together. Eliminated side by
-side, they leave ``(H + G'DG) dv = right`` with the diagonal ``1 / D = s / lam + t / mu``: an
-iteration costs one batched product and one Cholesky factor of d x d, used twice. An infinite weight
-or bound is a huge one, whose pair then is inert; a hard equality, which has no interior, is held by
-a penalty and a multiplier of its own. At the end the active set is read off and solved for (see
-`active_set`).
+Mehrotra's method (1992, doi:10.1137/0802028) reduces both products together. Eliminating them side
+by side leaves ``(H + G'DG) dv = right`` with the diagonal ``1 / D = s / lam + t / mu``: an
+iteration costs one batched product and one d x d Cholesky factor, used twice. Infinite weights and
+bounds are huge numbers, whose pairs are inert; a hard equality, which has no interior, has a
+penalty and a multiplier of its own. At the end, `active_set` identifies the active set and solves
+for it.
 """
 
 from __future__ import annotations
@@ -21,22 +21,23 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.qp.pipeline.batch import SoftQPs
-from torch_qpmpc.qp.solvers.active_set import SETTLED, Found, settle
+from torch_qpmpc.qp.solvers.active_set import SETTLED, Best, settle
 from torch_qpmpc.qp.solvers.base import BackendSolution
 from torch_qpmpc.qp.solvers.batched import HUGE, BatchedQPs
 
-#: Gaps, relative to a typical cost, at which the active set is tried; and iterations up to there.
+#: Gaps, relative to a typical cost, at which active sets are tried, each with its iteration limit.
 TARGETS = ((1e-4, 40), (1e-8, 15), (1e-12, 10))
+#: Largest number of active-set steps at each gap.
 LAST_STEPS = 3
-#: Part of the way to the boundary that a step may go.
+#: Largest step, relative to that to the boundary.
 STEP = 0.995
-#: A side's distance begins with at least this part of the row's width, ..
+#: The initial distance of a side is at least this fraction of the row's width, ..
 ROOM = 0.25
-#: .. but with the true one if it is soft and the QP has a row violated by more than this part.
+#: .. but exact for soft sides of a QP with a row violated by more than this fraction.
 MILD = 0.3
-#: After so many steps, which may then be circling, one aims at no less than this part of the gap.
+#: After this many steps, which may be cycling, the target is at least this fraction of the gap.
 LATE, CAUTION = 20, 0.3
-#: Solved QPs leave the computation when no more than this part is unsolved.
+#: Solved QPs are removed from the computation if at most this fraction is unsolved.
 SHRINK = 0.75
 
 
@@ -44,15 +45,15 @@ SHRINK = 0.75
 def solve(qps: SoftQPs) -> BackendSolution:
     """Solve a batch on its own device.
 
-    The result is finite for infeasible and unbounded QPs, too, which the certificate rejects.
+    Infeasible and unbounded QPs have finite results, which the certificate rejects.
     """
     qps = qps.in_torch()
-    if not qps.w.shape[-1]:  # a row without weight, since reductions over no rows have no value
+    if not qps.w.shape[-1]:  # add a row without weight: an empty dimension has no maximum
         none, row = qps.g.new_zeros(len(qps.g), 1), torch.zeros_like(qps.H[:, :1])
-        found = solve(qps._replace(G=row, l=none, u=none, w=none))
-        return found._replace(lam=found.lam[:, 1:])
+        solution = solve(qps._replace(G=row, l=none, u=none, w=none))
+        return solution._replace(lam=solution.lam[:, 1:])
     form = BatchedQPs.of(qps)
-    found, todo = Found.nothing(form), torch.arange(len(form), device=qps.g.device)
+    best, todo = Best.initial(form), torch.arange(len(form), device=qps.g.device)
     point = _begin(form)
     for target, limit in TARGETS:
         if not len(todo):
@@ -60,22 +61,23 @@ def solve(qps: SoftQPs) -> BackendSolution:
         before = point.steps.clone()
         _follow(form, point, target, limit)
         last = settle(form, point.v, point.lam, LAST_STEPS)
-        found.offer(todo, last.v, last.lam, last.residual)
-        found.steps[todo] += last.steps + point.steps - before
+        best.update(todo, last.v, last.lam, last.residual)
+        best.steps[todo] += last.steps + point.steps - before
         going = ~(last.residual <= SETTLED)
         form, point, todo = form.take(going), point.take(going), todo[going]
-    return BackendSolution(found.v, found.lam, found.steps)
+    return BackendSolution(best.v, best.lam, best.steps)
 
 
 @dataclass
 class Point:
-    """Where an interior point is.
+    """The current iterates of a batch.
 
     v ``(B, d)``; ``primal`` and ``dual``, the pairs ``(B, 2, 2, r)`` of (s, t) with (lam, mu) for
-    (upper, lower) sides, with signs that let one formula serve all (see `_begin`), and the sides'
+    (upper, lower) sides, with signs that make all formulas the same (see `_begin`), and the sides'
     ``bound`` ``(B, 2, r)``. Hard equalities, ``y = level``, have the penalty ``hold`` and the
-    multiplier ``equality``, ``(B, r)``, zero in other rows. ``astray`` is what is left of the
-    initial error in the linear equations, ``steps`` counts, ``lost`` is where arithmetic failed.
+    multiplier ``equality``, ``(B, r)``, zero in other rows. ``astray`` is the remaining fraction of
+    the initial error in the linear equations, ``steps`` the number of iterations, and ``lost`` True
+    where arithmetic failed, ``(B,)``.
     """
 
     v: Tensor
@@ -95,16 +97,17 @@ class Point:
         return self.dual[:, 0].sum(1) + self.equality
 
     def take(self, index: Tensor) -> Point:
-        """A copy of the points at ``index``."""
+        """Return a copy of the points at ``index``."""
         return Point(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def put(self, index: Tensor, other: Point) -> None:
+        """Replace the points at ``index``."""
         for field in fields(self):
             getattr(self, field.name)[index] = getattr(other, field.name)
 
 
 def _begin(qps: BatchedQPs) -> Point:
-    """v = 0, and s, t, lam and mu such that all products are equal.
+    """Return the start: v = 0, and s, t, lam and mu with equal products.
 
     Upper sides store (s, -t) and (lam, -mu), lower ones (-s, t) and (-lam, mu): then ``bound - y``
     is the sum of the first pair on either side, a step in lam adds to all four duals, and the
@@ -141,7 +144,7 @@ def _begin(qps: BatchedQPs) -> Point:
 
 
 def _follow(qps: BatchedQPs, end: Point, target: float, limit: int) -> None:
-    """Move ``end`` until the gaps are below ``target``, for no more than ``limit`` iterations."""
+    """Iterate ``end`` in place until its gaps are below ``target``, at most ``limit`` times."""
     todo, point = torch.arange(len(qps), device=end.v.device), end
     for _ in range(limit):
         products = point.primal * point.dual
@@ -161,7 +164,7 @@ def _follow(qps: BatchedQPs, end: Point, target: float, limit: int) -> None:
 
 
 def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: Tensor) -> None:
-    """One iteration of Mehrotra's method, in place, for the QPs that are ``going``."""
+    """Do one iteration of Mehrotra's method in place, for the QPs in the mask ``going``."""
     v, primal, dual, hold = point.v, point.primal, point.dual, point.hold
     y, inverse = qps.rows(v), dual.reciprocal()
     ratio = primal * inverse
@@ -172,13 +175,13 @@ def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: T
     room = point.bound - y.unsqueeze(1)
 
     def direction(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """dv, dy = G dv and dlam = D (dy - offset) that solve the Newton equations."""
+        """Return dv, dy = G dv and dlam = D (dy - offset), which solve the Newton equations."""
         total = right + qps.pull((D * offset).sum(1))
         dv = torch.cholesky_solve(total.unsqueeze(-1), factor).squeeze(-1)
         dy = qps.rows(dv)
         return dv, dy, (dy.unsqueeze(1) - offset).mul_(D).unsqueeze(1)
 
-    # The predictor aims at products of zero. How far that goes decides what to aim at instead.
+    # The predictor's target is zero products. Its step length determines the corrector's target.
     _, _, dlam = direction(room)
     relative = inverse * dlam
     low, high = relative.flatten(1).amin(1), relative.flatten(1).amax(1)
@@ -188,7 +191,7 @@ def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: T
     share = ((left / gap).clamp(0, 1) ** 3).maximum(CAUTION * (point.steps > LATE))
     centre = share * gap / products[0].numel()
 
-    # The corrector aims at products of ``centre``, with the predictor's second-order term.
+    # The corrector's target is products of ``centre``, with the predictor's second-order term.
     goal = second.mul_(primal).addcmul_(inverse, centre[:, None, None, None])
     dv, dy, dlam = direction(room - goal.sum(1))
     change = goal.sub_(primal).addcmul_(ratio, dlam, value=-1)
@@ -197,8 +200,8 @@ def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: T
     failed = ~ahead.isfinite()
     if failed.any():
         point.lost |= failed
-        for part in (dv, dy, dlam, change, ahead):
-            part[failed] = 0
+        for x in (dv, dy, dlam, change, ahead):
+            x[failed] = 0
     ahead *= going
     v.addcmul_(ahead[:, None], dv)
     primal.addcmul_(ahead[:, None, None, None], change)

@@ -1,8 +1,8 @@
-"""ProxQP, the default: the sparse batched solver of ProxSuite on the split-slack form.
+"""ProxQP, the default backend: the sparse batched solver of ProxSuite on the split-slack form.
 
 This is the only file that imports ProxSuite. Its handles are local to a call: a copied or pickled
-handle crashes the process, so none may reach a module, and a fresh one makes the answer independent
-of what was solved before.
+handle crashes the process, so none may reach a module, and a new one makes the result independent
+of earlier solves.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from torch_qpmpc.qp.solvers.split_slack import SplitSlack
 EPS_ABS = 1e-9
 #: ProxQP's default, 1e-4, calls one soft (always feasible) QP in fifty infeasible.
 EPS_INFEASIBLE = 1e-12
-#: Its defaults, 10,000 x 1,500, can keep one infeasible QP busy for half a minute. Others solve
-#: sooner what takes more than these. (An inner limit of 25 made ProxQP hang.)
+#: With the defaults, 10,000 x 1,500, one infeasible QP can take half a minute. Fallbacks are faster
+#: beyond these limits. (An inner limit of 25 made ProxQP hang.)
 MAX_ITER, MAX_ITER_IN = 30, 100
-#: Of 10 by default, which take a tenth of the time and save no iteration.
+#: The default, 10, takes a tenth of the time and saves no iteration.
 REFINEMENTS = 2
 
 _forked = False
@@ -34,12 +34,12 @@ def _mark_forked() -> None:
     _forked = True
 
 
-# OpenMP's threads do not survive a fork: solving in parallel in the child would wait for ever.
+# OpenMP's threads do not survive a fork: solving in parallel would hang in the child.
 os.register_at_fork(after_in_child=_mark_forked)
 
 
 def solve(qps: SoftQPs) -> BackendSolution:
-    """Solve a batch, by as many threads as torch may use."""
+    """Solve a batch on torch's number of threads."""
     qps = qps.in_numpy()
     form = SplitSlack.of(qps)
     n_x, n_in = form.n_x, form.n_in
@@ -50,7 +50,7 @@ def solve(qps: SoftQPs) -> BackendSolution:
         qp = batch.init_qp_in_place(n_x, 0, n_in)
         _configure(qp.settings)
         bounds = form.bounds(lower, upper, w)
-        # Its preconditioner takes as long as a third of the solve, and saves no iteration.
+        # No preconditioner: it takes a third of the time of the solve and saves no iteration.
         qp.init(form.H[m], form.gradient(g, w), None, None, form.rows[m], *bounds, False)
         handles.append(qp)
     threads = torch.get_num_threads()
@@ -58,13 +58,13 @@ def solve(qps: SoftQPs) -> BackendSolution:
         for qp in handles:
             qp.solve()
     else:
-        # ProxSuite sets the thread count of the OpenMP runtime that torch uses too: keep torch's.
+        # ProxSuite sets the thread count of the OpenMP runtime, which torch shares: keep torch's.
         proxqp.sparse.solve_in_parallel(batch, threads)
-    found = [qp.results for qp in handles]
+    results = [qp.results for qp in handles]
     return BackendSolution(
-        np.array([result.x[: form.n_v] for result in found]).reshape(qps.g.shape),
-        np.array([result.z[: form.n_rows] for result in found]).reshape(qps.l.shape),
-        np.array([result.info.iter for result in found], np.int64),
+        np.array([result.x[: form.n_v] for result in results]).reshape(qps.g.shape),
+        np.array([result.z[: form.n_rows] for result in results]).reshape(qps.l.shape),
+        np.array([result.info.iter for result in results], np.int64),
     )
 
 
@@ -76,5 +76,5 @@ def _configure(settings: proxqp.Settings) -> None:
     settings.eps_duality_gap_rel = EPS_ABS
     settings.max_iter, settings.max_iter_in = MAX_ITER, MAX_ITER_IN
     settings.nb_iterative_refinement = REFINEMENTS
-    # Spares an iteration in ten against none. Without equalities, it is the unconstrained optimum.
+    # Saves one iteration in ten. Without equalities, the guess is the unconstrained optimum.
     settings.initial_guess = proxqp.InitialGuess.EQUALITY_CONSTRAINED_INITIAL_GUESS

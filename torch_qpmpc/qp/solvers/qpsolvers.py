@@ -24,7 +24,7 @@ def check_available(name: str) -> None:
 
 
 def solve(qps: SoftQPs, *, name: str) -> BackendSolution:
-    """Solve a batch one by one."""
+    """Solve the QPs one by one."""
     qps = qps.in_numpy()
     form = SplitSlack.of(qps)
     v, lam = np.zeros_like(qps.g), np.zeros_like(qps.l)
@@ -47,7 +47,7 @@ def solve(qps: SoftQPs, *, name: str) -> BackendSolution:
         try:
             solution = qpsolvers.solve_problem(problem, solver=name)
         except (qpsolvers.QPError, ValueError, ArithmeticError):
-            continue  # The zeros that stand for it do not pass the certificate.
+            continue  # Its zeros are rejected by the certificate.
         if solution.x is None or solution.z is None:
             continue
         v[i] = solution.x[: form.n_v]

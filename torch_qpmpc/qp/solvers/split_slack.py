@@ -1,11 +1,11 @@
-"""The split-slack form: soft rows as linear ones, for solvers that know only hard constraints.
+"""The split-slack form: soft rows as linear ones, for solvers with hard constraints only.
 
     min over v, t+, t-:   1/2 v'Hv + g'v + w'(t+ + t-)
     subject to            l <= G v - t+ + t- <= u,   0 <= t+, t-
 
-One slack a side, not the paper's one sigma a row: the optimum is the same, ProxQP needs half the
-iterations, and its false infeasibilities are gone. Sides without a finite bound, and hard rows,
-get no slack.
+There is one slack per side instead of the paper's one sigma per row: the optimum is the same, and
+ProxQP needs half the iterations and reports no false infeasibility. Sides without a finite bound,
+and hard rows, have no slack.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ class SplitSlack:
         )
 
     def gradient(self, g: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Linear cost of x for one QP; a hard row's slack costs nothing and is bounded at zero."""
+        """Return the linear cost of x for one QP; a hard row's slack is fixed at zero."""
         weight = np.where(np.isfinite(w), w, 0.0)
         return np.concatenate([g, weight[self.over], weight[self.under]])
 
     def bounds(
         self, lower: np.ndarray, upper: np.ndarray, w: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bounds of the rows for one QP."""
+        """Return lower and upper bounds of the rows for one QP."""
         limit = np.where(np.isfinite(w), np.inf, 0.0)
         slack_upper = np.concatenate([limit[self.over], limit[self.under]])
         return (
