@@ -11,9 +11,10 @@ from torch import Tensor
 from torch_qpmpc import QPMPC, QuadraticProgram
 from torch_qpmpc.qp.kernels import sample_torch
 from torch_qpmpc.qp.pipeline.arrays import to_tensor
-from torch_qpmpc.qp.pipeline.batch import Programs, SoftQPs
+from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import Reduced
 from torch_qpmpc.qp.solvers import BackendSolution
+from torch_qpmpc.qp.solvers.base import SoftQPs
 
 #: What a row does at the solution: strictly inside, at a bound, or beyond one (then it is soft).
 SOFT_ROWS = ("inside", "at_lower", "at_upper", "below", "above", "equality", "no_upper", "free")

@@ -17,7 +17,7 @@ from torch import Tensor
 from tests.benchmarks.table import README, replaced, table
 from tests.problems import KnownQP, known_qp, normal
 from torch_qpmpc import QuadraticProgram, solve_qp
-from torch_qpmpc.qp.pipeline.batch_solution import TOLERANCE
+from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.solvers import BACKENDS
 
 #: Of the differences, and how near to a kink "near" is: so near that they do not cross it.

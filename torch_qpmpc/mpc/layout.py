@@ -1,4 +1,4 @@
-"""The order of the stages in z and in the rows of G, and the ties of a linear MPC scheme.
+"""The order of the stages in z and in the rows of G, their ties, and the discounted cost (eq:qpH).
 
 The rows of G are one for each entry of z, then those of D on (x_k, u_k) for each stage, then those
 of D^f on x_N (eq:v1c4).
@@ -7,6 +7,7 @@ of D^f on x_N (eq:v1c4).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -92,3 +93,33 @@ class Layout:
             H = torch.block_diag(*H.expand(self.horizon, self.n, self.n), blocks[1])
         root = discount.sqrt()
         return root.unsqueeze(-1) * H * root
+
+
+class Discounts(NamedTuple):
+    """The discount factors of theta's cost.
+
+    ``z`` ``(n_z,)`` and ``rows`` ``(n_g,)`` are gamma^k, or one. ``hardness`` ``(n_g,)`` is added
+    to w: inf for a hard row, whose w is a placeholder, and zero otherwise. ``stages`` is
+    ``ties("q")`` of `Layout`.
+    """
+
+    z: Tensor
+    rows: Tensor
+    hardness: Tensor
+    stages: Tensor
+
+
+def discounted(
+    layout: Layout,
+    kind: str,
+    blocks: tuple[Tensor, ...],
+    q: Tensor,
+    w: Tensor,
+    discounts: Discounts,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return H ``(n_z, n_z)``, q ``(n_z,)`` and w ``(n_g,)`` of the QP.
+
+    ``blocks`` are theta's H of the stages and of x_N, or a full one.
+    """
+    H = layout.hessian(kind, blocks, discounts.z, discounts.stages)
+    return H, discounts.z * q, torch.addcmul(discounts.hardness, discounts.rows, w)

@@ -17,8 +17,8 @@ from torch.nn.utils import parametrize
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import initial, parameters, pickling
-from torch_qpmpc.mpc.cost import Discounts, discounted
 from torch_qpmpc.mpc.identity import check_identity, digest, encoded
+from torch_qpmpc.mpc.layout import Discounts, discounted
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST
 from torch_qpmpc.mpc.validation import (
@@ -31,7 +31,7 @@ from torch_qpmpc.mpc.validation import (
     learned_entries,
     own,
 )
-from torch_qpmpc.qp.precision import full_precision, to_dtype
+from torch_qpmpc.qp.batching import full_precision, to_dtype
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve

@@ -1,9 +1,10 @@
-"""Batch dimensions: broadcasting, flattening, alignment under vmap, sums in gradients."""
+"""Batch dimensions and dtypes: broadcasting, alignment under vmap, sums in gradients."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -87,3 +88,16 @@ def largest(x: Tensor, *, keepdim: bool = False) -> Tensor:
         # vector_norm is one operation, but several times slower for a large batch.
         return x.abs().amax(-1, keepdim=keepdim)
     return x.new_zeros((*x.shape[:-1], 1) if keepdim else x.shape[:-1])
+
+
+def to_dtype(tensor: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return ``tensor.to(dtype)``, faster if the dtype is the same."""
+    return tensor if tensor.dtype == dtype else tensor.to(dtype)
+
+
+def full_precision(like: Tensor) -> AbstractContextManager[object]:
+    """Return a context without autocast on the device of ``like``."""
+    device = like.device.type
+    if device == "meta" or not torch.is_autocast_enabled(device):
+        return nullcontext()
+    return torch.autocast(device, enabled=False)

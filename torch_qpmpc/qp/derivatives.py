@@ -31,30 +31,19 @@ solution has a kink, and this is one of its one-sided derivatives.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.batching import (
-    broadcast,
-    flatten_batch,
-    multiply,
-    outer,
-    sum_to,
-    times,
-    weighted_sum,
-)
-from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.batching import outer, sum_to, times, weighted_sum
+from torch_qpmpc.qp.kkt import kkt
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solution import active_rows, slacks
 
-#: A KKT system whose solution has a larger relative residual counts as singular.
-SINGULAR = 1e-8
 #: Tangents of H, q, c, C, b, G, lb, ub, w, fixed; None for zero.
 Tangents = Sequence[Tensor | None]
-#: The type of `solve_kkt` and of the operator that hides it from traces.
-SolveKKT = Callable[..., tuple[Tensor, Tensor, Tensor, Tensor]]
+#: The number of differentiable tensors, H to fixed.
+N_THETA = 10
 
 
 def envelope_gradients(
@@ -85,7 +74,6 @@ def gradients(
     solution: Sequence[Tensor],
     needed: Sequence[bool],
     n_kept: int,
-    solve: SolveKKT,
 ) -> list[Tensor | None]:
     """Return the gradients in H, q, c, C, b, G, lb, ub, w, fixed, None where not ``needed``.
 
@@ -95,14 +83,13 @@ def gradients(
         solution: z, chi, lam, xi and status.
         needed: True for each tensor of theta whose gradient is computed.
         n_kept: see `Programs.of`.
-        solve: the solver of the KKT system, see `SolveKKT`.
     """
     grad_value, *grad_solution = incoming
     grads: list[Tensor | None] = [None] * len(theta)
     if grad_value is not None:
         grads = list(_value_gradients(grad_value, theta, solution, needed))
     if any(x is not None for x in grad_solution):
-        rest = _solution_gradients(grad_solution, theta, solution, needed, n_kept, solve)
+        rest = _solution_gradients(grad_solution, theta, solution, needed, n_kept)
         pairs = zip(grads, rest, strict=True)
         grads = [x if y is None else y if x is None else x + y for x, y in pairs]
     return grads
@@ -126,14 +113,13 @@ def _solution_gradients(
     solution: Sequence[Tensor],
     needed: Sequence[bool],
     n_kept: int,
-    solve: SolveKKT,
 ) -> Iterator[Tensor | None]:
     z, chi, lam, xi, status = solution
     H, q, c, C, b, G, lb, ub, w, fixed = theta
     pairs = zip((z, chi, lam, xi), incoming, strict=True)
     grads = [torch.zeros_like(x) if grad is None else grad for x, grad in pairs]
     grad_z, grad_chi, grad_lam, grad_xi = grads
-    p, r, t, u = solve(grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, n_kept)
+    p, r, t, u = kkt(grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, n_kept)
     _, saturated = active_rows(lam, w)
     slope = torch.where(saturated, lam.sign() * (grad_lam - times(G, p)), 0)
     formulas = (
@@ -156,14 +142,13 @@ def tangents(
     theta: Sequence[Tensor],
     solution: Sequence[Tensor],
     n_kept: int,
-    solve: SolveKKT,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return the tangents of value, z, chi, lam and xi from ``d_theta``, those of theta."""
     z, chi, lam, xi, status = solution
     sigma = slacks(z, *theta[5:9])
     value = torch.where(status == 0, _value_tangent(d_theta, z, sigma, chi, lam, xi), 0)
     *right, saturated = _right_side(d_theta, z, lam, chi, xi, theta[5], theta[8])
-    dz, dchi, dlam, dxi = solve(*right, z, lam, status, *theta, n_kept)
+    dz, dchi, dlam, dxi = kkt(*right, z, lam, status, *theta, n_kept)
     return value, dz, dchi, dlam + saturated, dxi
 
 
@@ -209,116 +194,3 @@ def _right_side(
     if dG is not None:
         right_z, right_lam = right_z - times(dG.mT, lam), right_lam - times(dG, z)
     return right_z, right_lam, right_chi, right_xi, saturated
-
-
-def solve_kkt(
-    grad_z: Tensor,
-    grad_lam: Tensor,
-    grad_chi: Tensor,
-    grad_xi: Tensor,
-    z: Tensor,
-    lam: Tensor,
-    status: Tensor,
-    H: Tensor,
-    q: Tensor,
-    c: Tensor,
-    C: Tensor,
-    b: Tensor,
-    G: Tensor,
-    lb: Tensor,
-    ub: Tensor,
-    w: Tensor,
-    fixed: Tensor,
-    n_kept: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Solve the KKT system for p, r, t and u, in condensed form for the whole batch at once.
-
-    Returns:
-        p ``(*batch, n_z)``, r ``(*batch, n_c)``, t ``(*batch, n_g)``, u ``(*batch, n_f)``; zero
-        for unsolved elements.
-    """
-    # Under vmap the gradients may have batch dimensions that the QP lacks.
-    vectors = (grad_z, grad_lam, grad_chi, grad_xi, z, lam, fixed)
-    batch = broadcast(*(x.shape[:-1] for x in vectors), status.shape)
-    fixed = fixed.expand(*batch, fixed.shape[-1])
-    theta = (H, q, c, C, b, G, lb, ub, w, fixed)
-    device = z.device if z.is_cuda else None
-    programs, batch = Programs.of(*theta, n_kept=n_kept, device=device)
-    solved = (status == Status.SOLVED).expand(batch).reshape(-1)
-    solvable = programs
-    if not solved.all():
-        solvable = programs.take(solved.nonzero().squeeze(-1).numpy(force=True))
-
-    def flat(x: Tensor) -> Tensor:
-        return flatten_batch(x.expand(*batch, x.shape[-1]))[solved].double()
-
-    right = flat(grad_z), flat(grad_lam), flat(grad_chi), flat(grad_xi)
-    solutions = _solve_kkt(solvable, *right, flat(lam), z.device) if len(solvable) else ()
-    results = tuple(z.new_zeros(len(solved), x.shape[-1]) for x in (z, b, lb, fixed))
-    for x, solution in zip(results, solutions, strict=False):
-        x[solved] = solution.to(x)
-    return tuple(x.reshape(*batch, x.shape[-1]) for x in results)  # pyright: ignore[reportReturnType] - a tuple of four
-
-
-def _solve_kkt(
-    p: Programs,
-    grad_z: Tensor,
-    grad_lam: Tensor,
-    grad_chi: Tensor,
-    grad_xi: Tensor,
-    lam: Tensor,
-    device: torch.device,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    n_f = p.n_f
-
-    def tensor(x: Any) -> Tensor:
-        return torch.as_tensor(x, device=device)
-
-    theta, group, w = p.prepared.theta, tensor(p.group), tensor(p.theta.w)
-    H, C, G = tensor(theta.H), tensor(theta.C), tensor(theta.G)
-    T, Y_neg, H_y, G_y, _, _ = map(tensor, p.prepared.condensed(n_f).arrays)
-    multipliers, weight = lam, w
-    if (units := p.prepared.units) is not None:  # a zero multiplier is zero relative to these
-        scale = tensor(units.rows / units.cost)[group]
-        multipliers, weight = lam * scale, w * scale
-    active, _ = active_rows(multipliers, weight)
-    T_f, T = T[:, :, :n_f], T[:, :, n_f:]
-    # A particular solution of C p = dl/dchi and E p = dl/dxi; the condensed system gives the rest.
-    particular = multiply(T_f, group, grad_xi) - multiply(Y_neg, group, grad_chi)
-    right_v = multiply(T.mT, group, grad_z - multiply(H, group, particular))
-    right_t = (grad_lam - multiply(G, group, particular)) * active
-    v, t = _solve_active(
-        H_y[group, n_f:, n_f:],
-        G_y[group, :, n_f:] * active.unsqueeze(-1),
-        active,
-        right_v,
-        right_t,
-    )
-    p_z = particular + multiply(T, group, v)
-    left = grad_z - multiply(H, group, p_z) - multiply(G.mT, group, t)
-    r = -multiply(Y_neg.mT, group, left)
-    u = (left - multiply(C.mT, group, r))[:, :n_f]
-    return p_z, r, t, u
-
-
-def _solve_active(
-    H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Solve ``H v + G't = right_v, G v = right_t``; G and right_t are zero in inactive rows."""
-    d = H.shape[-1]
-    rows = active.any(dim=0).nonzero().squeeze(-1)
-    G, idle = G[:, rows], (~active[:, rows]).to(H.dtype)
-    top = torch.cat((H, G.mT), dim=-1)
-    kkt = torch.cat((top, torch.cat((G, torch.diag_embed(idle)), dim=-1)), dim=-2)
-    right = torch.cat((right_v, right_t[:, rows]), dim=-1).unsqueeze(-1)
-    solution = torch.linalg.solve_ex(kkt, right)[0]
-    error = (kkt @ solution - right).abs().amax(dim=(-2, -1)) if kkt.numel() else right.new_zeros(0)
-    bound = SINGULAR * (1 + right.abs().amax(dim=(-2, -1))) if kkt.numel() else error
-    singular = ~(error <= bound)
-    if singular.any():
-        # Dependent active rows or directions without curvature: take the least-norm solution.
-        inverse = torch.linalg.pinv(kkt[singular], hermitian=True)
-        solution[singular] = inverse @ right[singular]
-    t = torch.zeros_like(right_t)
-    t[:, rows] = solution[:, d:, 0]
-    return solution[:, :d, 0], t

@@ -13,21 +13,18 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.qp.autograd import Outputs, solve_now
 from torch_qpmpc.qp.batching import align, broadcast
-from torch_qpmpc.qp.boundary import Outputs, solve_now
-from torch_qpmpc.qp.derivatives import gradients, solve_kkt, tangents
+from torch_qpmpc.qp.derivatives import N_THETA, gradients, tangents
 from torch_qpmpc.qp.program import NDIMS
-from torch_qpmpc.qp.tracing import has_values, is_differentiating, is_forward_mode, transforms
+from torch_qpmpc.qp.tracing import is_differentiating, is_forward_mode, transforms
 
 #: Event dimensions of the operator's tensors: H, q, c, C, b, G, lb, ub, w, fixed, start.
 EVENT_NDIMS = (*NDIMS, 1, 1)
-#: Event dimensions of the KKT operator's: four gradients; z, lam, status; H, .., fixed.
-KKT_NDIMS = (1, 1, 1, 1, 1, 1, 0, *NDIMS, 1)
-#: The number of differentiable arguments, H to fixed, and of start, n_kept, solver, on_failure.
-N_THETA, N_OTHERS = 10, 4
+#: The number of arguments after those: start, n_kept, solver, on_failure.
+N_OTHERS = 4
 
 solve_op = torch.library.custom_op("torch_qpmpc::solve", solve_now, mutates_args=())
-kkt_op = torch.library.custom_op("torch_qpmpc::solve_kkt", solve_kkt, mutates_args=())
 
 
 def solve_traced(*arguments: Any) -> Outputs:
@@ -92,7 +89,7 @@ def _setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
 def _backward(ctx: Any, *incoming: Tensor | None) -> tuple:
     theta, solution = ctx.saved_tensors[:N_THETA], ctx.saved_tensors[N_THETA:]
     needed = ctx.needs_input_grad[:N_THETA]
-    grads = gradients(incoming[:5], theta, solution, needed, ctx.n_kept, kkt)
+    grads = gradients(incoming[:5], theta, solution, needed, ctx.n_kept)
     return (*grads, *(None,) * N_OTHERS)
 
 
@@ -130,60 +127,9 @@ class TracedForward(Traced):
     @staticmethod
     def jvp(ctx: Any, *d_inputs: Tensor | None) -> tuple:
         theta, solution = ctx.saved_tensors[:N_THETA], ctx.saved_tensors[N_THETA:]
-        d_outputs = tangents(d_inputs[:N_THETA], theta, solution, ctx.n_kept, kkt)
+        d_outputs = tangents(d_inputs[:N_THETA], theta, solution, ctx.n_kept)
         return *d_outputs, *(None,) * 4
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
         return TracedForward.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9
-
-
-# The KKT system for the derivatives of the solution, hidden from traces in the same way
-
-
-def kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Call `solve_kkt` in the form that the current trace supports; its derivative raises."""
-    if torch.compiler.is_compiling():
-        return kkt_op(*arguments)
-    if not is_differentiating() and has_values(*arguments[:-1]):
-        return solve_kkt(*arguments)
-    return KKTSolution.apply(*arguments)
-
-
-@kkt_op.register_fake
-def _(grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta):
-    return tuple(torch.empty_like(x) for x in (grad_z, grad_chi, grad_lam, grad_xi))
-
-
-@kkt_op.register_vmap
-def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
-    return kkt_op(*align(in_dims, args, KKT_NDIMS)), (0,) * 4
-
-
-class KKTSolution(torch.autograd.Function):
-    """`kkt_op`, not differentiable: its derivative is the second of the solution."""
-
-    @staticmethod
-    def forward(*args):
-        return kkt_op(*args)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *_: Tensor) -> tuple:
-        raise QPError.expected(
-            "derivative",
-            "the second of the solution, or the third of the value",
-            "at most the first of the solution, or the second of the value",
-            "Detach the tensors that need no gradient.",
-        )
-
-    @staticmethod
-    def jvp(ctx: Any, *_: Tensor) -> tuple:
-        return KKTSolution.backward(ctx)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
-        return KKTSolution.apply(*align(in_dims, args, KKT_NDIMS)), (0,) * 4

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.precision import full_precision
+from torch_qpmpc.qp.batching import full_precision
 from torch_qpmpc.qp.program import QuadraticProgram, Status
 from torch_qpmpc.qp.tracing import has_values
 

@@ -12,9 +12,8 @@ from torch.testing import assert_close
 
 from tests.problems import CPU, KnownQP, known_qp, programs_of, random_mpc, random_states
 from torch_qpmpc import QuadraticProgram, solve_qp
-from torch_qpmpc.qp.pipeline.arrays import to_tensor
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.batch_solution import BatchSolution
 from torch_qpmpc.qp.pipeline.certificate import certify, recover
 from torch_qpmpc.qp.pipeline.solve import solve_programs
 from torch_qpmpc.qp.pipeline.warm_start import try_active_sets

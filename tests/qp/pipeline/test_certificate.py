@@ -11,8 +11,8 @@ from torch.testing import assert_close
 
 from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, programs_of, times
 from torch_qpmpc.qp.pipeline import certificate as certificate_module
+from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.batch_solution import TOLERANCE
 
 BATCH, SPOILT = 5, 2
 N_Z, N_C, N_F = 12, 3, 2

@@ -5,9 +5,9 @@ import pytest
 from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp, normal, soft_qps
-from torch_qpmpc.qp.pipeline.batch import SoftQPs
 from torch_qpmpc.qp.pipeline.polishing import MAX_STEPS, refine
 from torch_qpmpc.qp.solvers import BackendSolution
+from torch_qpmpc.qp.solvers.base import SoftQPs
 
 BATCH = 5
 

@@ -1,4 +1,4 @@
-"""The pipeline's arrays: NumPy's on the CPU, tensors on other devices."""
+"""A batch of QPs and its solutions as arrays: NumPy's on the CPU, tensors on other devices."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.program import crossed
+from torch_qpmpc.qp.program import UNKNOWN, Status, crossed
 
+#: The certificate rejects a solution with a larger relative residual.
+TOLERANCE = 1e-6
 #: ``np.ndarray`` on the CPU, ``torch.Tensor`` elsewhere.
 Array = Any
 
@@ -44,6 +46,58 @@ class Theta(NamedTuple):
             bounds = torch.from_numpy(data[6].copy()), torch.from_numpy(data[7].copy())
             lb = np.where(swapped & ~crossed(*bounds).numpy(), ub, lb)
         return cls((H + H.swapaxes(1, 2)) / 2.0, C, G, q, c, b, lb, ub, w)
+
+
+class BatchSolution(NamedTuple):
+    """Primal-dual solutions of B QPs, see `torch_qpmpc.QPSolution`; lam = eta - upsilon."""
+
+    value: Array
+    z: Array
+    chi: Array
+    lam: Array
+    xi: Array
+    status: Array
+    residual: Array
+    iterations: Array
+    active: Array
+
+    def accepted(self) -> Array:
+        """Return the mask of solutions that the certificate accepts, ``(B,)``."""
+        return self.residual <= TOLERANCE
+
+    @property
+    def all_accepted(self) -> bool:
+        return bool(self.accepted().all())
+
+    def at(self, index: np.ndarray) -> BatchSolution:
+        """Return copies of the solutions at ``index``."""
+        return BatchSolution._make(x[index] for x in self)
+
+    def put(self, index: np.ndarray, others: BatchSolution) -> None:
+        """Replace the solutions at ``index``."""
+        for own, new in zip(self, others, strict=True):
+            own[index] = new
+
+    def on_cpu(self) -> BatchSolution:
+        return BatchSolution._make(map(to_numpy, self))
+
+
+def unsolved(fixed: np.ndarray, n_z: int, n_c: int, n_g: int, status: Status) -> BatchSolution:
+    """Return placeholders for unsolved QPs: infinite costs, the fixed entries, and zeros."""
+    n = len(fixed)
+    z = np.zeros((n, n_z))
+    z[:, : fixed.shape[1]] = np.nan_to_num(fixed, posinf=0.0, neginf=0.0)
+    return BatchSolution(
+        value=np.full(n, np.inf),
+        z=z,
+        chi=np.zeros((n, n_c)),
+        lam=np.zeros((n, n_g)),
+        xi=np.zeros_like(fixed),
+        status=np.full(n, int(status)),
+        residual=np.full(n, np.inf),
+        iterations=np.zeros(n, np.int64),
+        active=np.full((n, n_g), UNKNOWN, np.int8),
+    )
 
 
 def to_numpy(x: Array) -> np.ndarray:

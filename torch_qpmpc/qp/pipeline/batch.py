@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,9 +17,10 @@ from torch import Tensor
 
 from torch_qpmpc.qp.batching import broadcast
 from torch_qpmpc.qp.kernels import sample, sample_torch
-from torch_qpmpc.qp.pipeline.arrays import Array, Theta, on_device, to_numpy, to_tensor
+from torch_qpmpc.qp.pipeline.arrays import Array, Theta, on_device, to_numpy
 from torch_qpmpc.qp.pipeline.prepared import Prepared, prepared_for
 from torch_qpmpc.qp.program import NDIMS
+from torch_qpmpc.qp.solvers.base import SoftQPs
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,34 +123,6 @@ class Programs:
                 w = w.expand(len(self), r)
         g, lower, upper = g_l_u[:, :d], g_l_u[:, d : d + r], g_l_u[:, d + r :]
         return SoftQPs(reduced.H, reduced.G, self.group, g, lower, upper, w)
-
-
-class SoftQPs(NamedTuple):
-    """The input of a backend: B problems of d variables and r rows,
-
-        min over v:  1/2 v'Hv + g'v + sum_i w_i dist(G_i v, [l_i, u_i]),
-
-    with H ``(M, d, d)``, G ``(M, r, d)``, group ``(B,)``, g ``(B, d)``, l, u, w ``(B, r)``;
-    ``w_i = inf`` means a hard row. The vectors need not be contiguous.
-    """
-
-    H: Array
-    G: Array
-    group: Array
-    g: Array
-    l: Array  # noqa: E741 - the literature's name for the lower bound
-    u: Array
-    w: Array
-
-    def take(self, index: Array) -> SoftQPs:
-        """Return the problems at ``index``, with the same matrices."""
-        return SoftQPs(self.H, self.G, *(x[index] for x in self[2:]))
-
-    def in_numpy(self) -> SoftQPs:
-        return SoftQPs._make(map(to_numpy, self))
-
-    def in_torch(self) -> SoftQPs:
-        return SoftQPs._make(map(to_tensor, self))
 
 
 def _flattened(x: Tensor, batch: torch.Size, event: Sequence[int]) -> Tensor:

@@ -12,9 +12,8 @@ backend, `certify` certifies a complete one.
 
 from __future__ import annotations
 
-from torch_qpmpc.qp.pipeline.arrays import Array
+from torch_qpmpc.qp.pipeline.arrays import Array, BatchSolution
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.batch_solution import BatchSolution
 from torch_qpmpc.qp.solvers.base import BackendSolution
 
 

@@ -21,11 +21,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import lsq_linear, nnls
 
-from torch_qpmpc.qp.pipeline.batch import Programs, SoftQPs
-from torch_qpmpc.qp.pipeline.batch_solution import TOLERANCE
+from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
+from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solvers import daqp
+from torch_qpmpc.qp.solvers.base import SoftQPs
 
 #: A sum counts as zero, or as significant, relative to the sum of its absolute terms.
 ROUNDING, SIGNIFICANT = 1e-12, 1e-7

@@ -11,9 +11,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from torch_qpmpc.qp.pipeline.batch import SoftQPs
 from torch_qpmpc.qp.solution import row_states
-from torch_qpmpc.qp.solvers.base import BackendSolution
+from torch_qpmpc.qp.solvers.base import BackendSolution, SoftQPs
 
 MAX_STEPS = 10
 

@@ -17,8 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torch_qpmpc.qp.kernels import theta as loops
-from torch_qpmpc.qp.pipeline.arrays import Array, Theta, per_qp
-from torch_qpmpc.qp.pipeline.batch_solution import BatchSolution
+from torch_qpmpc.qp.pipeline.arrays import Array, BatchSolution, Theta, per_qp
 
 #: Sizes between these have the unit one.
 SMALL, LARGE = 2.0**-7, 2.0**10

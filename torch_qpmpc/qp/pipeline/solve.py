@@ -9,9 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torch_qpmpc.qp.pipeline.arrays import Array, on_device, per_qp, to_numpy
-from torch_qpmpc.qp.pipeline.batch import Programs, SoftQPs
-from torch_qpmpc.qp.pipeline.batch_solution import TOLERANCE, BatchSolution, unsolved
+from torch_qpmpc.qp.pipeline.arrays import (
+    TOLERANCE,
+    Array,
+    BatchSolution,
+    on_device,
+    per_qp,
+    to_numpy,
+    unsolved,
+)
+from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.certificate import certify, recover
 from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
@@ -19,6 +26,7 @@ from torch_qpmpc.qp.pipeline.polishing import refine
 from torch_qpmpc.qp.pipeline.warm_start import try_active_sets
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
+from torch_qpmpc.qp.solvers.base import SoftQPs
 
 #: Rejected solutions with a relative residual up to this are refined.
 NEARLY = 1e-2

@@ -11,8 +11,8 @@ settles.
 from __future__ import annotations
 
 from torch_qpmpc.qp.pipeline.arrays import Array
-from torch_qpmpc.qp.pipeline.batch import Programs, SoftQPs
-from torch_qpmpc.qp.solvers.base import BackendSolution
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.solvers.base import BackendSolution, SoftQPs
 
 
 def try_active_sets(p: Programs, qps: SoftQPs, active: Array) -> tuple[BackendSolution, Array]:

@@ -6,8 +6,7 @@ import daqp
 import numpy as np
 
 from torch_qpmpc.qp.kernels.tour import tour
-from torch_qpmpc.qp.pipeline.batch import SoftQPs
-from torch_qpmpc.qp.solvers.base import BackendSolution
+from torch_qpmpc.qp.solvers.base import BackendSolution, SoftQPs
 
 #: The code of a soft row in DAQP's ``sense``.
 SOFT = 8

@@ -13,8 +13,7 @@ import numpy as np
 import torch
 from proxsuite import proxqp
 
-from torch_qpmpc.qp.pipeline.batch import SoftQPs
-from torch_qpmpc.qp.solvers.base import BackendSolution
+from torch_qpmpc.qp.solvers.base import BackendSolution, SoftQPs
 from torch_qpmpc.qp.solvers.split_slack import SplitSlack
 
 EPS_ABS = 1e-9

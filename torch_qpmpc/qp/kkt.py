@@ -1,0 +1,187 @@
+"""The KKT system of the derivatives, as an operator that traces see and do not enter.
+
+`torch_qpmpc.qp.derivatives` has its formula.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, multiply
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.program import NDIMS, Status
+from torch_qpmpc.qp.solution import active_rows
+from torch_qpmpc.qp.tracing import has_values, is_differentiating
+
+#: A KKT system whose solution has a larger relative residual counts as singular.
+SINGULAR = 1e-8
+#: Event dimensions of the operator's tensors: four gradients; z, lam, status; H, .., fixed.
+KKT_NDIMS = (1, 1, 1, 1, 1, 1, 0, *NDIMS, 1)
+
+
+def kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Call `solve_kkt` in the form that the current trace supports; its derivative raises."""
+    if torch.compiler.is_compiling():
+        return kkt_op(*arguments)
+    if not is_differentiating() and has_values(*arguments[:-1]):
+        return solve_kkt(*arguments)
+    return KKTSolution.apply(*arguments)
+
+
+def solve_kkt(
+    grad_z: Tensor,
+    grad_lam: Tensor,
+    grad_chi: Tensor,
+    grad_xi: Tensor,
+    z: Tensor,
+    lam: Tensor,
+    status: Tensor,
+    H: Tensor,
+    q: Tensor,
+    c: Tensor,
+    C: Tensor,
+    b: Tensor,
+    G: Tensor,
+    lb: Tensor,
+    ub: Tensor,
+    w: Tensor,
+    fixed: Tensor,
+    n_kept: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Solve the KKT system for p, r, t and u, in condensed form for the whole batch at once.
+
+    Returns:
+        p ``(*batch, n_z)``, r ``(*batch, n_c)``, t ``(*batch, n_g)``, u ``(*batch, n_f)``; zero
+        for unsolved elements.
+    """
+    # Under vmap the gradients may have batch dimensions that the QP lacks.
+    vectors = (grad_z, grad_lam, grad_chi, grad_xi, z, lam, fixed)
+    batch = broadcast(*(x.shape[:-1] for x in vectors), status.shape)
+    fixed = fixed.expand(*batch, fixed.shape[-1])
+    theta = (H, q, c, C, b, G, lb, ub, w, fixed)
+    device = z.device if z.is_cuda else None
+    programs, batch = Programs.of(*theta, n_kept=n_kept, device=device)
+    solved = (status == Status.SOLVED).expand(batch).reshape(-1)
+    solvable = programs
+    if not solved.all():
+        solvable = programs.take(solved.nonzero().squeeze(-1).numpy(force=True))
+
+    def flat(x: Tensor) -> Tensor:
+        return flatten_batch(x.expand(*batch, x.shape[-1]))[solved].double()
+
+    right = flat(grad_z), flat(grad_lam), flat(grad_chi), flat(grad_xi)
+    solutions = _solve_kkt(solvable, *right, flat(lam), z.device) if len(solvable) else ()
+    results = tuple(z.new_zeros(len(solved), x.shape[-1]) for x in (z, b, lb, fixed))
+    for x, solution in zip(results, solutions, strict=False):
+        x[solved] = solution.to(x)
+    return tuple(x.reshape(*batch, x.shape[-1]) for x in results)  # pyright: ignore[reportReturnType] - a tuple of four
+
+
+def _solve_kkt(
+    p: Programs,
+    grad_z: Tensor,
+    grad_lam: Tensor,
+    grad_chi: Tensor,
+    grad_xi: Tensor,
+    lam: Tensor,
+    device: torch.device,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    n_f = p.n_f
+
+    def tensor(x: Any) -> Tensor:
+        return torch.as_tensor(x, device=device)
+
+    theta, group, w = p.prepared.theta, tensor(p.group), tensor(p.theta.w)
+    H, C, G = tensor(theta.H), tensor(theta.C), tensor(theta.G)
+    T, Y_neg, H_y, G_y, _, _ = map(tensor, p.prepared.condensed(n_f).arrays)
+    multipliers, weight = lam, w
+    if (units := p.prepared.units) is not None:  # a zero multiplier is zero relative to these
+        scale = tensor(units.rows / units.cost)[group]
+        multipliers, weight = lam * scale, w * scale
+    active, _ = active_rows(multipliers, weight)
+    T_f, T = T[:, :, :n_f], T[:, :, n_f:]
+    # A particular solution of C p = dl/dchi and E p = dl/dxi; the condensed system gives the rest.
+    particular = multiply(T_f, group, grad_xi) - multiply(Y_neg, group, grad_chi)
+    right_v = multiply(T.mT, group, grad_z - multiply(H, group, particular))
+    right_t = (grad_lam - multiply(G, group, particular)) * active
+    v, t = _solve_active(
+        H_y[group, n_f:, n_f:],
+        G_y[group, :, n_f:] * active.unsqueeze(-1),
+        active,
+        right_v,
+        right_t,
+    )
+    p_z = particular + multiply(T, group, v)
+    left = grad_z - multiply(H, group, p_z) - multiply(G.mT, group, t)
+    r = -multiply(Y_neg.mT, group, left)
+    u = (left - multiply(C.mT, group, r))[:, :n_f]
+    return p_z, r, t, u
+
+
+def _solve_active(
+    H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Solve ``H v + G't = right_v, G v = right_t``; G and right_t are zero in inactive rows."""
+    d = H.shape[-1]
+    rows = active.any(dim=0).nonzero().squeeze(-1)
+    G, idle = G[:, rows], (~active[:, rows]).to(H.dtype)
+    top = torch.cat((H, G.mT), dim=-1)
+    kkt = torch.cat((top, torch.cat((G, torch.diag_embed(idle)), dim=-1)), dim=-2)
+    right = torch.cat((right_v, right_t[:, rows]), dim=-1).unsqueeze(-1)
+    solution = torch.linalg.solve_ex(kkt, right)[0]
+    error = (kkt @ solution - right).abs().amax(dim=(-2, -1)) if kkt.numel() else right.new_zeros(0)
+    bound = SINGULAR * (1 + right.abs().amax(dim=(-2, -1))) if kkt.numel() else error
+    singular = ~(error <= bound)
+    if singular.any():
+        # Dependent active rows or directions without curvature: take the least-norm solution.
+        inverse = torch.linalg.pinv(kkt[singular], hermitian=True)
+        solution[singular] = inverse @ right[singular]
+    t = torch.zeros_like(right_t)
+    t[:, rows] = solution[:, d:, 0]
+    return solution[:, :d, 0], t
+
+
+kkt_op = torch.library.custom_op("torch_qpmpc::solve_kkt", solve_kkt, mutates_args=())
+
+
+@kkt_op.register_fake
+def _(grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta):
+    return tuple(torch.empty_like(x) for x in (grad_z, grad_chi, grad_lam, grad_xi))
+
+
+@kkt_op.register_vmap
+def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
+    return kkt_op(*align(in_dims, args, KKT_NDIMS)), (0,) * 4
+
+
+class KKTSolution(torch.autograd.Function):
+    """`kkt_op`, not differentiable: its derivative is the second of the solution."""
+
+    @staticmethod
+    def forward(*args):
+        return kkt_op(*args)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> tuple:
+        raise QPError.expected(
+            "derivative",
+            "the second of the solution, or the third of the value",
+            "at most the first of the solution, or the second of the value",
+            "Detach the tensors that need no gradient.",
+        )
+
+    @staticmethod
+    def jvp(ctx: Any, *_: Tensor) -> tuple:
+        return KKTSolution.backward(ctx)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
+        return KKTSolution.apply(*align(in_dims, args, KKT_NDIMS)), (0,) * 4
