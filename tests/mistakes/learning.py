@@ -257,8 +257,8 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "GaussNewton: released": (
         released_step,
-        "mpc: got a QPMPC that has other parameters of C by now, expected the parameters of this "
-        "optimiser. QPMPC.release, and load_state_dict with",
+        "mpc: got a QPMPC with new parameters of C, expected the parameters of this optimiser. "
+        "QPMPC.release and load_state_dict(assign=True) replace",
     ),
     "GaussNewton: empty": (
         lambda: gn.step(S[:0], Aa[:0], torch.zeros(0)).accepted,

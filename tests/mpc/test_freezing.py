@@ -412,7 +412,7 @@ def test_what_the_constructor_decided_may_be_assigned_again():
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
 def test_a_gauss_newton_is_not_copied_without_its_qpmpc(copied):
-    message = "GaussNewton: got a copy or a pickle, expected its state_dict. Make another one"
+    message = "GaussNewton: got a copy or a pickle, expected its state_dict. Make a GaussNewton"
     with pytest.raises(QPError, match=message):
         copied(GaussNewton(random_mpc(0)))
 
