@@ -145,7 +145,7 @@ def entries_of_C(mpc: QPMPC) -> Tensor:
 
 
 def share_of_rate(optimizer: torch.optim.Optimizer) -> float:
-    """Return C's learning rate over its initial one, 1 without a schedule: the penalty's weight."""
+    """Return C's learning rate over its initial one, 1 without a schedule: the penalty's scale."""
     group = next(group for group in optimizer.param_groups if group["name"] == "C")
     initial = group.get("initial_lr", 0.0)
     return group["lr"] / initial if initial else 1.0
