@@ -83,7 +83,7 @@ def toeplitz_defect(form: PredictionForm) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """x+ = A x + B u + offset, as read from the constraints.
+    """A model x+ = A x + B u + offset that is read from the constraints.
 
     Attributes:
         A, B, offset: ``(n_x, n_x)``, ``(n_x, n_u)``, ``(n_x,)``; with a leading N, one per stage.

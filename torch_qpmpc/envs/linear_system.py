@@ -171,12 +171,18 @@ class LinearSystemGymEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; return its observation, float32 ``(n_x,)``, and no information."""
         super().reset(seed=seed)
         self._s = self.physics.starts(self.np_random, 1)[0]
         self._nu = torch.zeros_like(self._s)
         return self._s.numpy().astype(np.float32), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply ``action`` ``(n_u,)``, clipped; return the observation, the reward and the flags.
+
+        Raises:
+            QPError: if ``reset`` has not been called, or the action does not fit or is not finite.
+        """
         if self._s is None:
             raise QPError.expected(
                 "step", "no episode", "one that has started", "Call reset() first."

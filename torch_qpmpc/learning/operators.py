@@ -78,6 +78,7 @@ class QPPolicyOperator(_QPOperator):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write pi(s) to the action key."""
         s = _read(tensordict, self.in_keys[0])
         if self.active_set_key is None:
             return tensordict.set(self.out_keys[0], self.module.policy(s))
@@ -95,6 +96,7 @@ class QPValueOperator(_QPOperator):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write -V(s) to the value key."""
         return self._set_value(tensordict)
 
 
@@ -140,6 +142,7 @@ class QPActorValueOperator(_QPOperator):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write -Q(s, a) to the action value's key."""
         return self._set_value(tensordict)
 
     def get_policy_operator(self, active_set_key: NestedKey | None = None) -> QPPolicyOperator:
