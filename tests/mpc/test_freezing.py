@@ -439,7 +439,7 @@ def test_a_memory_of_another_horizon_is_named():
     for optimizer in (short, long):
         optimizer.step(*targets(optimizer._mpc))
     long.load_state_dict(short.state_dict())
-    with pytest.raises(QPError, match=r"got a memory of gradients of .* entries, expected"):
+    with pytest.raises(QPError, match=r"got a memory of gradients with .* entries, expected"):
         long.step(*targets(long._mpc))
 
 

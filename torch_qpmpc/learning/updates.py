@@ -76,8 +76,8 @@ def first_order(
                 losses["unsolved"] = (lost & ~invalid).sum()
                 losses["invalid_reward"] = invalid.sum()
             return terms, losses
-        left_out = sum(losses.get(name, 0) for name in ("unsolved", "invalid_reward"))
-        if left_out == batch.numel():
+        unsolved = losses.get("unsolved", None)
+        if unsolved is not None and unsolved + losses["invalid_reward"] == batch.numel():
             return terms, losses
         total.backward()
         gradients = [x.grad for group in optimizer.param_groups for x in group["params"]]
