@@ -66,15 +66,15 @@ def test_an_unknown_environment_is_an_error(id):
     [
         (
             {"actions": Discrete(2)},
-            r"whose action space is Discrete\(2\), expected spaces that are boxes of one dim.+ "
-            "Choose an environment whose observations and actions are real vectors",
+            r"whose action space is Discrete\(2\), expected Box spaces of one dim.+ "
+            "Choose an environment with real vectors as observations",
         ),
         ({"observations": Discrete(5)}, r"whose observation space is Discrete\(5\), expected"),
         (
             {"observations": Box(0, 255, (8, 8, 3), np.uint8)},
-            r"whose observation space is Box\(0, 255, \(8, 8, 3\), uint8\), expected spaces that",
+            r"whose observation space is Box\(0, 255, \(8, 8, 3\), uint8\), expected Box spaces",
         ),
-        ({"actions": Box(-1, 1, (2, 2))}, "whose action space is .* boxes of one dimension"),
+        ({"actions": Box(-1, 1, (2, 2))}, "whose action space is .* Box spaces of one dimension"),
     ],
 )
 def test_other_spaces_are_an_error(register, options, match):

@@ -301,7 +301,7 @@ def test_a_batch_without_a_usable_pair_moves_nothing(bad, trust_region):
     before, (s, a) = copy.deepcopy(mpc.state_dict()), pairs()
     a[1] = 9.0  # beyond a hard bound
     penalty = SystemIdentificationPenalty(1e-2).curvature(normal(5, mpc.n_z))
-    message = "None of the 7 pairs can be learned from: 1 have a QP .*, 6 a target that is not fin"
+    message = "None of the 7 pairs is usable: 1 without a QP .*, 6 without a finite target. Theta"
     with pytest.warns(RuntimeWarning, match=message):
         report = optimizer.step(s, a, torch.full((COUNT,), bad), penalty=penalty)
     assert not report.accepted

@@ -59,7 +59,7 @@ def test_unsolved_samples_are_masked(where, bad):
 def test_a_batch_without_any_solved_sample():
     operator, td = hard_operator(), feasible_batch(3)
     td["observation"] += 5.0
-    message = "None of the batch's 3 transitions can be learned from: 3 have a QP .*, 0 an invalid"
+    message = "None of the batch's 3 transitions is usable: 3 without a QP .*, 0 with an invalid"
     with pytest.warns(RuntimeWarning, match=message):
         out, total = gradients(make_loss(operator=operator), td)
     assert out["unsolved"].item() == 3
@@ -143,7 +143,7 @@ def test_invalid_rewards_are_left_out_and_counted(bad, reduction):
 def test_a_batch_of_invalid_rewards_alone():
     operator, td = hard_operator(), feasible_batch(3)
     td["next", "reward"][:] = torch.nan
-    message = "None of the batch's 3 transitions .*: 0 have a QP .*, 3 an invalid reward"
+    message = "None of the batch's 3 transitions .*: 0 without a QP .*, 3 with an invalid reward"
     with (
         pytest.warns(RuntimeWarning, match=message),
         pytest.warns(RuntimeWarning, match="3 of 3 rewards"),

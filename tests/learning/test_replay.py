@@ -169,7 +169,7 @@ def test_a_restored_replay_continues_as_if_never_stopped(count):
 
 def test_asking_for_windows_too_early_is_an_error():
     replay = filled([], rows=40)
-    match = "replay: got {} transitions without such a trajectory, expected 4 consecutive"
+    match = "replay: got no window in {} transitions, expected 4 consecutive transitions"
     with pytest.raises(QPError, match=match.format(0)):
         replay.sample_tau()
     for batch in batches(2, 1, max_steps=50):
@@ -187,5 +187,5 @@ def test_a_flattened_batch_is_an_error():
 
 @pytest.mark.parametrize("capacity", [33, 24, 0])
 def test_bad_capacity_is_an_error(capacity):
-    with pytest.raises(QPError, match=rf"capacity: got {capacity}, .* 32 is the least"):
+    with pytest.raises(QPError, match=rf"capacity: got {capacity}, .* The smallest is 32\."):
         make_replay(capacity, ENVS, 32, N, 5)

@@ -107,19 +107,52 @@ def test_invalid_rewards_are_counted_under_their_own_name(second):
     assert not torch.equal(mpc.C, before)
 
 
-def test_a_second_order_update_without_a_usable_pair_is_named():
+def test_a_second_order_update_without_a_usable_pair_moves_nothing():
     mpc = random_mpc(3)
+    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, c_2=1e-2, c_3=1e-2)
     batch, before = transitions(), copy.deepcopy(mpc.state_dict())
     batch["next", "reward"][:] = torch.inf
-    update = second_order(mpc, make_loss(mpc), GaussNewton(mpc), None, None)
+    update = second_order(mpc, make_loss(mpc), GaussNewton(mpc), deviation, None)
     with (
-        pytest.warns(RuntimeWarning, match=r"None of the \d+ pairs can be learned from: 0 have"),
+        pytest.warns(RuntimeWarning, match=r"None of the \d+ pairs is usable: 0 without a QP sol"),
         pytest.warns(RuntimeWarning, match=r"\('next', 'reward'\): (\d+) of \1 rewards"),
     ):
         terms, scalars = update(batch, None)
     assert terms["train/accepted"] == 0
     assert scalars["invalid_reward"] == len(batch)
     assert_close(mpc.state_dict(), before, rtol=0, atol=0)
+
+
+def test_no_proximal_step_follows_a_second_order_step_that_was_taken_back():
+    mpc = random_mpc(5)
+    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, c_2=1e-2, c_3=1e-2)
+    batch, before = transitions(), copy.deepcopy(mpc.state_dict())
+    batch["next", "reward"] -= 300.0  # far targets, and next to no damping
+    update = second_order(mpc, make_loss(mpc), GaussNewton(mpc, damping=1e-9), deviation, None)
+    terms, _ = update(batch, None)
+    assert terms["train/accepted"] == 0
+    assert_close(mpc.state_dict(), before, rtol=0, atol=0)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("cause", ["reward", "action"])
+def test_a_first_order_update_without_a_usable_transition_moves_nothing(cause):
+    mpc = random_mpc(3, on_failure="mask")
+    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, c_2=1e-2, c_3=1e-2)
+    si, windows = SystemIdentificationPenalty(1e-2), normal(5, mpc.n_z)
+    optimizer = torch.optim.Adam(mpc.parameter_groups(RATES), weight_decay=0.1)
+    update = first_order(mpc, make_loss(mpc), optimizer, deviation, si)
+    update(transitions(), windows)
+    before = copy.deepcopy((mpc.state_dict(), optimizer.state_dict()["state"]))
+    batch = transitions()
+    if cause == "reward":
+        batch["next", "reward"][:] = torch.nan
+    else:
+        batch["action"][:] = 9.0  # beyond a hard bound
+    _, scalars = update(batch, windows)
+    assert scalars["unsolved"] + scalars["invalid_reward"] == len(batch)
+    after = (mpc.state_dict(), optimizer.state_dict()["state"])
+    assert_close(after, before, rtol=0, atol=0)
 
 
 RATES = {"cost": 1e-2, "constraints": 1e-3}

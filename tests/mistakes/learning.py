@@ -38,19 +38,19 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPActorValueOperator: missing action": (
         lambda: op(TensorDict(observation=S, batch_size=4)),
-        "action: got no such entry, expected one beside observation. Rename the oper",
+        "action: got a TensorDict with observation, expected one with action. Rename the operator",
     ),
     "QPActorValueOperator: missing obs": (
         lambda: op(TensorDict(action=Aa, batch_size=4)),
-        "observation: got no such entry, expected one beside action. Rename the oper",
+        "observation: got a TensorDict with action, expected one with observation. Rename the op",
     ),
     "QPPolicyOperator: missing obs": (
         lambda: op.get_policy_operator()(TensorDict(state=S, batch_size=4)),
-        "observation: got no such entry, expected one beside state. Rename the opera",
+        "observation: got a TensorDict with state, expected one with observation. Rename the ope",
     ),
     "QPActorValueOperator: tensor": (
         lambda: op(S),
-        "action: got no such entry, expected one beside observation. Rename the oper",
+        "action: got a TensorDict with observation, expected one with action. Rename the operator",
     ),
     "QPActorValueOperator: int action": (
         lambda: op(TensorDict(observation=S, action=Aa.long(), batch_size=4)),
@@ -116,7 +116,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPQLearningLoss: no action": (
         lambda: make_loss()(batch_without("action")),
-        "action: got no such entry, expected one beside observation. Rename the oper",
+        "action: got a TensorDict with observation, expected one with action. Rename the operator",
     ),
     "QPQLearningLoss: no done": (
         lambda: make_loss()(batch_without(("next", "done"), ("next", "terminated"))),
@@ -124,32 +124,32 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPQLearningLoss: no next obs": (
         lambda: make_loss()(batch_without(("next", "observation"))),
-        "('next', 'observation'): got no such entry beside done, reward, terminated, truncated, "
-        "expected the state after the step. Collect",
+        "('next', 'observation'): got a TensorDict with done, reward, terminated, truncated, "
+        "expected one with observation. Collect the next",
     ),
     "QPQLearningLoss: flat reward": (
         lambda: make_loss()(batch_with(("next", "reward"), torch.zeros(3).double())),
-        "('next', 'reward'): got shape (3,), expected shape (3, 1). Unsqueeze its la",
+        "('next', 'reward'): got shape (3,), expected shape (3, 1). TorchRL's rewa",
     ),
     "QPQLearningLoss: reward 2": (
         lambda: make_loss()(batch_with(("next", "reward"), torch.zeros(3, 2).double())),
-        "('next', 'reward'): got shape (3, 2), expected shape (3, 1). Unsqueeze its ",
+        "('next', 'reward'): got shape (3, 2), expected shape (3, 1). TorchRL's rew",
     ),
     "QPQLearningLoss: term float": (
         lambda: make_loss()(batch_with(("next", "terminated"), torch.zeros(3, 1))),
-        "('next', 'terminated'): got torch.float32, expected torch.bool. Convert: .b",
+        "('next', 'terminated'): got torch.float32, expected torch.bool. Convert it: .b",
     ),
     "QPQLearningLoss: term flat": (
         lambda: make_loss()(batch_with(("next", "terminated"), torch.zeros(3).bool())),
-        "('next', 'terminated'): got shape (3,), expected shape (3, 1). Unsqueeze it",
+        "('next', 'terminated'): got shape (3,), expected shape (3, 1). TorchRL's re",
     ),
     "QPQLearningLoss: done flat": (
         lambda: make_loss()(batch_with(("next", "done"), torch.zeros(3).bool())),
-        "('next', 'done'): got shape (3,), expected shape (3, 1). Unsqueeze its last",
+        "('next', 'done'): got shape (3,), expected shape (3, 1). TorchRL's rewards",
     ),
     "QPQLearningLoss: done float": (
         lambda: make_loss()(batch_with(("next", "done"), torch.zeros(3, 1))),
-        "('next', 'done'): got torch.float32, expected torch.bool. Convert: .bool().",
+        "('next', 'done'): got torch.float32, expected torch.bool. Convert it: .bool().",
     ),
     "QPQLearningLoss: action int": (
         lambda: make_loss()(batch_with("action", torch.zeros(3, 1).long())),
@@ -257,8 +257,8 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "GaussNewton: released": (
         released_step,
-        "mpc: got a QPMPC that has other parameters of C by now, expected the parameters of this "
-        "optimiser. QPMPC.release, and load_state_dict with",
+        "mpc: got a QPMPC with new parameters of C, expected the parameters of this optimiser. "
+        "QPMPC.release and load_state_dict(assign=True) replace",
     ),
     "GaussNewton: empty": (
         lambda: gn.step(S[:0], Aa[:0], torch.zeros(0)).accepted,
@@ -332,7 +332,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: (lambda m: qm.DeviationPenalty(m.C_0, 2, 1).proximal_step_(m.C))(
             qm.QPMPC.linear_mpc(A2, B1, 3)
         ),
-        "C: got a computed tensor, expected a parameter. Of a QPMPC that learns some",
+        "C: got a computed tensor, expected a parameter. If only some entries of C",
     ),
     "DeviationPenalty: prox list": (
         lambda: qm.DeviationPenalty(mpc.C_0, 2, 1).proximal_step_([1.0]),
@@ -424,11 +424,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "make_replay: sample empty": (
         lambda: make_replay(64, 2, 4, 3, 2).sample(),
-        "replay: got nothing stored, expected transitions. extend() it first.",
+        "replay: got nothing stored, expected transitions. Call extend() first.",
     ),
     "make_replay: tau empty": (
         lambda: make_replay(64, 2, 4, 3, 2).sample_tau(),
-        "replay: got 0 transitions without such a trajectory, expected 3 consecutive",
+        "replay: got no window in 0 transitions, expected 3 consecutive transitions.",
     ),
     "make_replay: extend tensor": (
         lambda: make_replay(64, 2, 4, 3, 2).extend(S),
@@ -442,11 +442,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: (lambda r: (r.extend(make_batch(2, 3)), r.extend(make_batch(3, 2))))(
             make_replay(64, 2, 4, 3, 2)
         ),
-        "batch: got shape (3, 2), expected (num_envs, T) with num_envs = 2. Is it (T",
+        "batch: got shape (3, 2), expected (num_envs, T) with num_envs = 2. Transpose it",
     ),
     "make_replay: extend envs first": (
         lambda: (lambda r: (r.extend(make_batch(3, 2)), r.sample()))(make_replay(64, 2, 4, 3, 2)),
-        "batch: got shape (3, 2), expected (num_envs, T) with num_envs = 2. Is it (T",
+        "batch: got shape (3, 2), expected (num_envs, T) with num_envs = 2. Transpose it",
     ),
     "make_replay: remember": (
         lambda: make_replay(64, 2, 4, 3, 2, active_rows=3).remember(make_batch(3)),

@@ -30,7 +30,7 @@ from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
 MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "closed_loop: plant": (
         lambda: closed_loop(mpc.policy, mpc),
-        "physics: got ParametrizedQPMPC, expected a LinearSystem. Of a GymnasiumPlan",
+        "physics: got ParametrizedQPMPC, expected a LinearSystem. Use gymnasium_loop",
     ),
     "closed_loop: policy mpc": (
         lambda: closed_loop(mpc, pm),
@@ -78,11 +78,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "closed_loop: gymplant": (
         lambda: closed_loop(lambda s: s, GymnasiumPlant("Pendulum-v1")),
-        "physics: got GymnasiumPlant, expected a LinearSystem. Of a GymnasiumPlant: ",
+        "physics: got GymnasiumPlant, expected a LinearSystem. Use gymnasium_loop",
     ),
     "gymnasium_loop: linear": (
         lambda: gymnasium_loop(lambda s: s[:, :1], pm),
-        "plant: got PointMass, expected a GymnasiumPlant. Of a LinearSystem: closed_",
+        "plant: got PointMass, expected a GymnasiumPlant. Use closed_loop for a Line",
     ),
     "gymnasium_loop: shape": (
         lambda: gymnasium_loop(lambda s: s[:, 0], GymnasiumPlant("Pendulum-v1"), steps=2, starts=2),
@@ -90,7 +90,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "gymnasium_loop: id": (
         lambda: gymnasium_loop(lambda s: s[:, :1], "Pendulum-v1"),
-        "plant: got str, expected a GymnasiumPlant. Of a LinearSystem: closed_loop.",
+        "plant: got str, expected a GymnasiumPlant. Use closed_loop for a LinearSystem.",
     ),
     "gymnasium_loop: steps": (
         lambda: gymnasium_loop(lambda s: s[:, :1], GymnasiumPlant("Pendulum-v1"), steps=0),
@@ -178,19 +178,19 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "PointMassEnv: num f": (
         lambda: PointMassEnv(1.5),
-        "num_envs: got 1.5, expected a whole number >= 1. Ask for at least one.",
+        "num_envs: got 1.5, expected a whole number >= 1.",
     ),
     "PointMassEnv: num str": (
         lambda: PointMassEnv("2"),
-        "num_envs: got '2', expected a whole number >= 1. Ask for at least one.",
+        "num_envs: got '2', expected a whole number >= 1.",
     ),
     "PointMassEnv: num bool": (
         lambda: PointMassEnv(True),
-        "num_envs: got True, expected a whole number >= 1. Ask for at least one.",
+        "num_envs: got True, expected a whole number >= 1.",
     ),
     "PointMassEnv: max f": (
         lambda: PointMassEnv(2, max_steps=1.5),
-        "max_steps: got 1.5, expected a whole number >= 1. Ask for at least one.",
+        "max_steps: got 1.5, expected a whole number >= 1.",
     ),
     "PointMassEnv: physics first": (
         lambda: PointMassEnv(pm),
@@ -290,11 +290,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "PointMass: starts seed": (
         lambda: pm.starts(1, 3),
-        "rng: got 1, expected a generator of numpy's or torch's. Of a seed: numpy.ra",
+        "rng: got 1, expected a NumPy or torch generator. From a seed: numpy.ra",
     ),
     "PointMass: draw seed": (
         lambda: pm.draw(1, 3),
-        "rng: got 1, expected a generator of numpy's or torch's. Of a seed: numpy.ra",
+        "rng: got 1, expected a NumPy or torch generator. From a seed: numpy.ra",
     ),
     "PointMass: viol": (
         lambda: pm.violation(torch.zeros(5, 1)).shape,
@@ -326,23 +326,23 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "PointMassGymEnv: action shape": (
         lambda: (lambda e: (e.reset(seed=0), e.step(np.zeros(3))))(PointMassGymEnv()),
-        "action: got array([0., 0., 0.]), expected finite numbers of shape (2,). Of ",
+        "action: got array([0., 0., 0.]), expected finite numbers of shape (2,). Pass one",
     ),
     "PointMassGymEnv: action scalar": (
         lambda: (lambda e: (e.reset(seed=0), e.step(0.0)))(PointMassGymEnv()),
-        "action: got 0.0, expected finite numbers of shape (2,). Of a batch of actio",
+        "action: got 0.0, expected finite numbers of shape (2,). Pass one action, not",
     ),
     "PointMassGymEnv: before reset": (
         lambda: PointMassGymEnv().step(np.zeros(2)),
-        "step: got no episode, expected one that has begun. Call reset() first.",
+        "step: got no episode, expected one that has started. Call reset() first.",
     ),
     "PointMassGymEnv: action str": (
         lambda: (lambda e: (e.reset(seed=0), e.step("a")))(PointMassGymEnv()),
-        "action: got 'a', expected finite numbers of shape (2,). Of a batch of actio",
+        "action: got 'a', expected finite numbers of shape (2,). Pass one action, not",
     ),
     "PointMassGymEnv: action nan": (
         lambda: (lambda e: (e.reset(seed=0), e.step(np.full(2, np.nan))))(PointMassGymEnv()),
-        "action: got array([nan, nan]), expected finite numbers of shape (2,). Of a ",
+        "action: got array([nan, nan]), expected finite numbers of shape (2,). Pass one",
     ),
     "PointMassGymEnv: physics": (
         lambda: PointMassGymEnv("brownian"),
@@ -350,7 +350,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "PointMassGymEnv: (1,2)": (
         lambda: (lambda e: (e.reset(seed=0), e.step(np.zeros((1, 2)))))(PointMassGymEnv()),
-        "action: got array([[0., 0.]]), expected finite numbers of shape (2,). Of a ",
+        "action: got array([[0., 0.]]), expected finite numbers of shape (2,). Pass one",
     ),
     "GrosZanonLTI: w str": (
         lambda: GrosZanonLTI("1"),
@@ -358,7 +358,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "GrosZanonLTI: num": (
         lambda: GrosZanonLTIEnv(0),
-        "num_envs: got 0, expected a whole number >= 1. Ask for at least one.",
+        "num_envs: got 0, expected a whole number >= 1.",
     ),
     "GrosZanonLTI: A": (
         lambda: GrosZanonLTI(A=torch.eye(3)),
@@ -370,7 +370,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "GymnasiumPlant: discrete": (
         lambda: GymnasiumPlant("CartPole-v1"),
-        "task.id: got 'CartPole-v1', whose action space is Discrete(2), expected spa",
+        "task.id: got 'CartPole-v1', whose action space is Discrete(2), expected Box",
     ),
     "GymnasiumPlant: vec 0": (
         lambda: GymnasiumPlant("Pendulum-v1").vectorised(0, 5, 1),

@@ -172,7 +172,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: canonical_matrix(
             prediction_form(torch.stack([mpc.C] * 2), 2, 1), torch.zeros(3, 2, 2).double()
         ),
-        "form.Phi: got shape (2, 6, 2), expected shape (N n_x, n_x). Take one at a t",
+        "form.Phi: got shape (2, 6, 2), expected shape (N n_x, n_x). Pass the form",
     ),
     "distance_by_band: shape": (
         lambda: distance_by_band(mpc.C, mpc.C_0[:4], 2, 1),
@@ -284,7 +284,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "lqr_gain: W shape": (
         lambda: lqr_gain(A2, B1, torch.eye(2).double()),
-        "W: got shape (2, 2), expected shape (3, 3). Of [x; u], as stage_weight(mpc)",
+        "W: got shape (2, 2), expected shape (3, 3). Pass stage_weight(mpc), the",
     ),
     "lqr_gain: swapped": (
         lambda: lqr_gain(B1, A2, torch.eye(3).double()),
@@ -356,7 +356,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "policy_map: empty": (
         lambda: policy_map(mpc, [], [0.0]),
-        "x, y: got shapes (0,) and (1,), expected vectors that are not empty. Pass t",
+        "x, y: got shapes (0,) and (1,), expected non-empty vectors. Pass torch.lin",
     ),
     "policy_map: axes str": (
         lambda: policy_map(mpc, [1.0], [0.0], axes="xy"),

@@ -416,7 +416,7 @@ def test_what_the_constructor_decided_may_be_assigned_again():
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
 def test_a_gauss_newton_is_not_copied_without_its_qpmpc(copied):
-    message = "GaussNewton: got a copy or a pickle, expected its state_dict. Make another one"
+    message = "GaussNewton: got a copy or a pickle, expected its state_dict. Make a GaussNewton"
     with pytest.raises(QPError, match=message):
         copied(GaussNewton(random_mpc(0)))
 
@@ -443,7 +443,7 @@ def test_a_memory_of_another_horizon_is_named():
     for optimizer in (short, long):
         optimizer.step(*targets(optimizer._mpc))
     long.load_state_dict(short.state_dict())
-    with pytest.raises(QPError, match=r"got a memory of gradients of .* entries, expected"):
+    with pytest.raises(QPError, match=r"got a memory of gradients with .* entries, expected"):
         long.step(*targets(long._mpc))
 
 

@@ -1,1 +1,1 @@
-"""What a learned QP means: its predictions, its nearest model, its policy."""
+"""Analysis of a learned QP: its predictions, its nearest model and its policy."""

@@ -1,4 +1,4 @@
-"""Figures of what a learned QP says: its canonical form, its predictions, its policy's regions."""
+"""Figures of a learned QP: its canonical form, its predictions and its policy's regions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ COLOURS = {"start": "tab:red", "learned": "tab:blue", "true model": "tab:green"}
 
 
 def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
-    """A heatmap of a constraint matrix, symmetric and logarithmic beyond 0.01, with stage lines."""
+    """Draw a constraint matrix as a heatmap, logarithmic beyond 0.01, with lines between stages."""
     image = axes.imshow(
         C.detach().cpu().numpy(),
         cmap="RdBu_r",
@@ -51,9 +51,9 @@ def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
 
 
 def constraint_figure(mpc: QPMPC) -> Figure:
-    """C_0, C raw as in the paper's figures, and C's canonical form, which has no gauge.
+    """Plot C_0, C as in the paper's figures, and C's canonical form, which has no gauge.
 
-    One above the other: TensorBoard's cards are narrow.
+    The panels are stacked because TensorBoard's cards are narrow.
     """
     figure = Figure(figsize=(6, 10.5), layout="constrained")
     top, middle, bottom = figure.subplots(3, 1)
@@ -70,10 +70,10 @@ def constraint_figure(mpc: QPMPC) -> Figure:
 
 
 def forms(mpc: QPMPC) -> dict[str, PredictionForm]:
-    """The prediction forms of C at the start and of the learned one.
+    """Return the prediction forms of C at the start and of the learned C.
 
     Raises:
-        QPError: C cannot be put into prediction form.
+        QPError: if C has no prediction form.
     """
     return {
         "start": prediction_form(mpc.C_0, mpc.n_x, mpc.n_u),
@@ -82,7 +82,7 @@ def forms(mpc: QPMPC) -> dict[str, PredictionForm]:
 
 
 def draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
-    """``[Phi, Gamma]`` as a heatmap: what x_0 and each u_j do to each x_k."""
+    """Draw ``[Phi, Gamma]``, the effect of x_0 and each u_j on each x_k, as a heatmap."""
     N, n_x, n_u = form.horizon, form.n_x, form.n_u
     entries = torch.cat((form.Phi, form.Gamma), dim=-1)
     image = axes.imshow(
@@ -96,7 +96,7 @@ def draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
     for k in range(1, N):
         axes.axhline(k * n_x - 0.5, color="0.85", linewidth=0.4)
         axes.axvline(n_x + k * n_u - 0.5, color="0.85", linewidth=0.4)
-        # Above this staircase an action would act on the past.
+        # Above this staircase an action would affect earlier states.
         edge, row = n_x + k * n_u - 0.5, k * n_x - 0.5
         axes.plot([edge, edge], [row - n_x, row], color="black", linewidth=0.8)
         axes.plot([edge, edge + n_u], [row, row], color="black", linewidth=0.8)
@@ -110,10 +110,10 @@ def draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
 
 
 def canonical_figure(mpc: QPMPC) -> Figure:
-    """C raw beside its canonical form, and the predictions at the start beside the learned ones.
+    """Plot C beside its canonical form, and the predictions at the start beside the learned ones.
 
     Raises:
-        QPError: C cannot be put into prediction form.
+        QPError: if C has no prediction form.
     """
     start, learned = forms(mpc).values()
     figure = Figure(figsize=(14, 9), layout="constrained")
@@ -129,10 +129,10 @@ def canonical_figure(mpc: QPMPC) -> Figure:
 
 
 def energies_figure(mpc: QPMPC) -> Figure:
-    """How the predictions' energy falls on block diagonals, and how far back they look.
+    """Plot the predictions' energy by block diagonal, and by the pair that explains it.
 
     Raises:
-        QPError: C cannot be put into prediction form.
+        QPError: if C has no prediction form.
     """
     figure = Figure(figsize=(12, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -162,10 +162,10 @@ def energies_figure(mpc: QPMPC) -> Figure:
 
 
 def slice_between(mpc: QPMPC, starts: Tensor, points: int = 21) -> PolicyMap:
-    """The policy on a grid as wide as ``starts`` ``(n, n_x)``, of two states; the others are zero.
+    """Evaluate the policy on a grid that spans ``starts`` ``(n, n_x)`` in two states; others are 0.
 
-    These are the first state and the one half-way: a position and its speed, where all positions
-    come first. A state that all starts share is taken from one below to one above.
+    The two are the first state and the one half-way: a position and its speed, if all positions
+    come first. A state in which all starts agree is gridded from one below to one above.
     """
     axes = (0, mpc.n_x // 2)
     low, high = (ends.double() for ends in starts.aminmax(dim=0))
@@ -176,7 +176,7 @@ def slice_between(mpc: QPMPC, starts: Tensor, points: int = 21) -> PolicyMap:
 
 
 def draw_slice(axes: Axes, found: PolicyMap, field: Tensor, title: str, **style: Any) -> QuadMesh:
-    """A field on the grid, ``(n, m)``; where it is nan, nothing."""
+    """Draw a field on the grid, ``(n, m)``, blank where it is nan."""
     grid = (part.numpy() for part in (found.x, found.y, field.mT))
     image = axes.pcolormesh(*grid, shading="nearest", rasterized=True, **style)
     first, second = (axis + 1 for axis in found.axes)
@@ -185,7 +185,7 @@ def draw_slice(axes: Axes, found: PolicyMap, field: Tensor, title: str, **style:
 
 
 def draw_regions(axes: Axes, found: PolicyMap) -> None:
-    """The regions with one active set each, and their borders; colours repeat."""
+    """Draw the regions of one active set each, with their borders; colours repeat."""
     title = f"Active sets: {len(found.active_sets)} regions on this grid"
     colours = (found.regions % 20).double().masked_fill(found.regions < 0, torch.nan)
     draw_slice(axes, found, colours, title, cmap="tab20", vmin=-0.5, vmax=19.5)
@@ -194,7 +194,12 @@ def draw_regions(axes: Axes, found: PolicyMap) -> None:
 
 
 def policy_figure(found: PolicyMap, action: int = 0) -> Figure:
-    """The value, an action, its local gain and the active sets on a slice of the state space."""
+    """Plot the value, an action, its local gain and the active sets on a slice of the states.
+
+    Args:
+        found: a `policy_map`.
+        action: index of the action.
+    """
     figure = Figure(figsize=(12, 9), layout="constrained")
     (value, policy), (gain, sets) = figure.subplots(2, 2)
     u, name = found.actions[..., action], f"{{{action + 1}}}"
@@ -212,9 +217,9 @@ def policy_figure(found: PolicyMap, action: int = 0) -> Figure:
 
 
 def _borders(found: PolicyMap) -> list[tuple[list[float], list[float]]]:
-    """Segments between neighbouring grid points with different active sets, for one plot each axis.
+    """Return the segments between grid points of different active sets, as one line per axis.
 
-    Two lists of coordinates each, in which nan separates the segments.
+    A line is a pair of coordinate lists, with nan between the segments.
     """
     edges = [_edges(axis) for axis in (found.x, found.y)]
     lines = []
@@ -231,7 +236,7 @@ def _borders(found: PolicyMap) -> list[tuple[list[float], list[float]]]:
 
 
 def _edges(points: Tensor) -> list[float]:
-    """Half-way between the points, and as far beyond the first and the last."""
+    """Return the midpoints of neighbours, and points as far beyond the first and the last."""
     values = points.tolist()
     if len(values) == 1:
         return [values[0] - 0.5, values[0] + 0.5]

@@ -1,7 +1,7 @@
-"""The policy as control engineers look at it: its gain, and where which rows are active.
+"""The policy in terms of control engineering: its gain, and its regions of one active set each.
 
-On each region of the state space with one active set the policy is affine in the state. Its slope
-is what the solution's gradient gives (see `sensitivity`); the rest is linear algebra.
+On each of these regions of the state space the policy is affine in the state. Its slope is the
+gradient of the QP's solution (see `torch_qpmpc.qp.derivatives`).
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
 from torch_qpmpc.qp.solution import QPSolution
 
-GRID = "Pass torch.linspace(lower, upper, n)."
+GRID_REMEDY = "Pass torch.linspace(lower, upper, n)."
 
 
 def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
-    """K with ``u_0 = pi(s) - K ds`` near s: ``-d pi / d s``, of the active set at s.
+    """Return K = ``-d pi / d s`` for the active set at s: near s, u_0 = pi(s) - K ds.
 
     Args:
         mpc: the QP.
@@ -31,29 +31,35 @@ def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
 
     Returns:
         ``(*batch, n_u, n_x)``; zero where the QP is not solved.
+
+    Raises:
+        QPError: if the shape of s does not fit.
+        SolverError: if a QP has no solution, and ``mpc.on_failure`` is ``"raise"``.
     """
     check_kind("mpc", mpc, QPMPC)
     return _solve_with_gain(mpc, check_tensor("s", s, mpc.n_x))[1]
 
 
 def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
-    """K ``(n_u, n_x)`` of the discounted linear quadratic regulator u = -K x.
+    """Return K ``(n_u, n_x)`` of the discounted linear quadratic regulator u = -K x.
 
     Args:
         A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
-        W: of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
+        W: weight of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
         gamma: discount of the stage costs.
 
     Raises:
-        QPError: shapes that do not fit, a W that is no cost (not positive semidefinite), or a
-            Riccati equation without a stabilising solution.
+        QPError: if a shape does not fit, W is not positive semidefinite, or the Riccati equation
+            has no stabilising solution.
     """
     check_tensor("A", A, "n_x", "n_x", batched=False)
     n_x = len(A)
     check_tensor("A", A, n_x, n_x, batched=False)
     check_tensor("B", B, n_x, "n_u", batched=False)
     n = n_x + B.shape[-1]
-    check_tensor("W", W, n, n, batched=False, remedy="Of [x; u], as stage_weight(mpc) gives it.")
+    check_tensor(
+        "W", W, n, n, batched=False, remedy="Pass stage_weight(mpc), the weight of [x; u]."
+    )
     check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
     B, W = B.to(A), W.to(A)
     check_weight("W", W, diagonal=False)
@@ -63,14 +69,14 @@ def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
 
 
 def stage_weight(mpc: QPMPC) -> Tensor:
-    """The weight of (x_0, u_0), ``(n_x + n_u, n_x + n_u)``: the first block of H (eq:qpH)."""
+    """Return the weight of (x_0, u_0), ``(n_x + n_u, n_x + n_u)``: H's first block (eq:qpH)."""
     check_kind("mpc", mpc, QPMPC)
     n = mpc.n_x + mpc.n_u
     return mpc.quadratic_program().H.detach()[:n, :n]
 
 
 def spectral_radius(A: Tensor, B: Tensor, K: Tensor) -> Tensor:
-    """Largest modulus of the eigenvalues of A - B K, ``(*batch,)``: below 1 it is stable."""
+    """Return the largest eigenvalue modulus of A - B K, ``(*batch,)``; below 1 it is stable."""
     check_tensor("A", A, "n_x", "n_x")
     n_x = A.shape[-1]
     check_tensor("B", B, n_x, "n_u")
@@ -83,18 +89,18 @@ def spectral_radius(A: Tensor, B: Tensor, K: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class PolicyMap:
-    """V and the policy on a grid over two states; ``[i, j]`` is ``x[i]``, ``y[j]``.
+    """V and the policy on a grid over two states; index ``[i, j]`` is at ``x[i]``, ``y[j]``.
 
     Attributes:
         axes: the indices of the two states.
         x, y: their values, ``(n,)`` and ``(m,)``.
-        states: ``(n, m, n_x)``.
+        states: the grid points, ``(n, m, n_x)``.
         values: V, ``(n, m)``; nan where the QP is not solved.
-        actions: ``(n, m, n_u)``, likewise.
-        gains: ``-d u_0 / d s``, ``(n, m, n_u, n_x)``, likewise.
-        regions: which of ``active_sets`` holds, ``(n, m)``; -1 where the QP is not solved.
-        active_sets: the active sets found, the most frequent first, ``(count, n_g)``, coded as in
-            `QPSolution.active`.
+        actions: pi(s), ``(n, m, n_u)``; likewise.
+        gains: ``-d u_0 / d s``, ``(n, m, n_u, n_x)``; likewise.
+        regions: the index in ``active_sets``, ``(n, m)``; -1 where the QP is not solved.
+        active_sets: the distinct active sets, the most frequent first, ``(count, n_g)``, coded as
+            in `QPSolution.active`.
     """
 
     axes: tuple[int, int]
@@ -116,16 +122,17 @@ def policy_map(
     axes: tuple[int, int] = (0, 1),
     at: Any = None,
 ) -> PolicyMap:
-    """The policy, its gain and its active sets on a slice of the state space, in one batched solve.
+    """Evaluate the policy, its gain and its active sets on a slice of the states, in one batch.
 
     Args:
         mpc: the QP.
-        x, y: the values of the two states, ``(n,)`` and ``(m,)``.
-        axes: which states these are.
-        at: the other states, ``(n_x,)``; zero by default.
+        x, y: the values of two states, ``(n,)`` and ``(m,)``.
+        axes: the indices of these states.
+        at: a state with the values of the others, ``(n_x,)``; zero by default.
 
     Raises:
-        QPError: axes that are not two different states, or values that are no vector.
+        QPError: if ``axes`` are not two different states, or ``x`` or ``y`` is not a vector.
+        SolverError: if a QP has no solution, and ``mpc.on_failure`` is ``"raise"``.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -147,7 +154,7 @@ def policy_map(
     x, y = as_tensor("x", x), as_tensor("y", y)
     if x.ndim != 1 or y.ndim != 1 or not len(x) or not len(y):
         got = f"shapes {tuple(x.shape)} and {tuple(y.shape)}"
-        raise QPError.expected("x, y", got, "vectors that are not empty", GRID)
+        raise QPError.expected("x, y", got, "non-empty vectors", GRID_REMEDY)
     states = torch.zeros(mpc.n_x) if at is None else as_tensor("at", at)
     if tuple(states.shape) != (mpc.n_x,):
         raise QPError.expected("at", f"shape {tuple(states.shape)}", f"shape ({mpc.n_x},)")
@@ -158,7 +165,7 @@ def policy_map(
     sets, regions, counts = solution.active.flatten(0, 1).unique(
         dim=0, return_inverse=True, return_counts=True
     )
-    # An active set that stands for "not solved" is no region: it comes last, and becomes -1.
+    # The placeholder active set of unsolved QPs is sorted last and becomes region -1.
     failed = regions.new_zeros(len(sets), dtype=torch.bool)
     failed[regions[~solved.flatten()]] = True
     order = counts.masked_fill(failed, 0).argsort(descending=True, stable=True)
@@ -178,11 +185,12 @@ def policy_map(
 
 
 def _solve_with_gain(mpc: QPMPC, s: Tensor) -> tuple[QPSolution, Tensor]:
-    """V's solution at s, and -du_0/ds; a state's action depends on no other state of the batch."""
+    """Return V's solution at s, and -du_0/ds ``(*batch, n_u, n_x)``."""
     with torch.enable_grad():
         s = s.detach().clone().requires_grad_()
         solution = mpc.solve(s)
         u = solution.z[..., mpc.n_x : mpc.n_x + mpc.n_u]
+        # Each action depends on its own state alone, so the sum's gradient is each one's.
         slopes = [
             torch.autograd.grad(u[..., i].sum(), s, retain_graph=True)[0] for i in range(mpc.n_u)
         ]

@@ -1,12 +1,12 @@
 """Forms of the constraints that do not depend on their gauge.
 
-``C z = b`` and ``T C z = T b`` are the same constraints for any invertible T, so the entries of C
-by themselves say little. What they determine is the *prediction form*, which exists once only,
+``C z = b`` and ``T C z = T b`` are the same constraints for any invertible T, so single entries of
+C mean little. Independent of T is the *prediction form*,
 
     X = Phi x_0 + Gamma U + phi,    X = [x_1, .., x_N],    U = [u_0, .., u_{N-1}],
 
-and whatever is computed from it alone. The *canonical matrix* is the T C whose row block k reads
-``x_{k+1} = A_k x_k + ..`` as that of an MPC scheme does: for such a scheme it is C_0 (eq:cband).
+and all that follows from it. The *canonical matrix* is the T C whose row block k reads
+``x_{k+1} = A_k x_k + ..``, as in an MPC scheme: for such a scheme it is C_0 (eq:cband).
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.qp.batching import broadcast
 
-#: The remedy for what is no prediction form.
-FORM = "Pass prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)."
-#: The largest condition number of C's state columns (after scaling its rows) that can be read: the
-#: relative error of what is read is about 1e-16 times it.
+FORM_REMEDY = "Pass prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)."
+#: The largest accepted condition number of C's state columns, after scaling its rows. The relative
+#: error of a prediction form is about 1e-16 times that number.
 LARGEST_CONDITION = 1e12
 
 
@@ -34,9 +33,9 @@ class PredictionForm:
 
     Attributes:
         Phi: ``(*batch, N n_x, n_x)``.
-        Gamma: ``(*batch, N n_x, N n_u)``; block (k, j) is what u_j does to x_{k+1}.
-        phi: the offset, ``(*batch, N n_x)``; zero where b is.
-        condition: how far C's state columns are from singular, ``(*batch,)``; not gauge-free.
+        Gamma: ``(*batch, N n_x, N n_u)``; block (k, j) is the effect of u_j on x_{k+1}.
+        phi: the offset, ``(*batch, N n_x)``; zero if b is.
+        condition: condition number of C's state columns, ``(*batch,)``; depends on the gauge.
     """
 
     Phi: Tensor
@@ -46,29 +45,31 @@ class PredictionForm:
 
     @property
     def n_x(self) -> int:
+        """The number of states."""
         return self.Phi.shape[-1]
 
     @property
     def horizon(self) -> int:
-        """N."""
+        """The horizon N."""
         return self.Phi.shape[-2] // self.n_x
 
     @property
     def n_u(self) -> int:
+        """The number of actions."""
         return self.Gamma.shape[-1] // self.horizon
 
     @property
     def blocks(self) -> Tensor:
-        """Gamma by blocks, ``(*batch, N, N, n_x, n_u)``: [k, j] is what u_j does to x_{k+1}."""
+        """Gamma by blocks, ``(*batch, N, N, n_x, n_u)``: [k, j] is the effect of u_j on x_{k+1}."""
         N = self.horizon
         rows = self.Gamma.unflatten(-1, (N, self.n_u)).unflatten(-3, (N, self.n_x))
         return rows.movedim(-2, -3)
 
     @property
     def maps(self) -> Tensor:
-        """Each x_0, .., x_N as a linear map of (x_0, U, 1), ``(*batch, N + 1, n_x, n_v)``.
+        """The states x_0, .., x_N as linear maps of (x_0, U, 1), ``(*batch, N + 1, n_x, n_v)``.
 
-        n_v = n_x + N n_u + 1.
+        n_v is n_x + N n_u + 1.
         """
         following = torch.cat((self.Phi, self.Gamma, self.phi.unsqueeze(-1)), dim=-1)
         first = torch.eye(self.n_x, following.shape[-1]).to(following)
@@ -76,7 +77,11 @@ class PredictionForm:
         return torch.cat((first.expand(*stages.shape[:-3], 1, -1, -1), stages), dim=-3)
 
     def predict(self, x_0: Tensor, U: Tensor) -> Tensor:
-        """x_1, .., x_N ``(*batch, N, n_x)`` from x_0 ``(*batch, n_x)``, U ``(*batch, N, n_u)``."""
+        """Predict ``(*batch, N, n_x)`` from x_0 ``(*batch, n_x)`` and U ``(*batch, N, n_u)``.
+
+        Raises:
+            QPError: if a shape does not fit.
+        """
         check_tensor("x_0", x_0, self.n_x)
         check_tensor("U", U, self.horizon, self.n_u)
         x_0, U = x_0.to(self.Phi), U.to(self.Phi)
@@ -90,15 +95,16 @@ class PredictionForm:
 
 
 def check_form(form: PredictionForm) -> None:
-    """Raise `QPError` unless ``form`` is one of a single C, without batch dimensions."""
-    check_kind("form", form, PredictionForm, FORM)
-    check_tensor("form.Phi", form.Phi, "N n_x", "n_x", batched=False, remedy="Take one at a time.")
+    """Raise `QPError` unless ``form`` is a prediction form without batch dimensions."""
+    check_kind("form", form, PredictionForm, FORM_REMEDY)
+    remedy = "Pass the form of a single C."
+    check_tensor("form.Phi", form.Phi, "N n_x", "n_x", batched=False, remedy=remedy)
 
 
 def prediction_form(C: Tensor, n_x: int, n_u: int, b: Tensor | None = None) -> PredictionForm:
     """Solve ``C z = b`` for x_1, .., x_N.
 
-    The result is that of T C and T b for any invertible T, up to rounding.
+    T C and T b have the same prediction form for any invertible T, up to rounding.
 
     Args:
         C: ``(*batch, N n_x, N (n_x + n_u) + n_x)``.
@@ -106,8 +112,8 @@ def prediction_form(C: Tensor, n_x: int, n_u: int, b: Tensor | None = None) -> P
         b: ``(*batch, N n_x)``; zero by default.
 
     Raises:
-        QPError: the shapes do not fit, or C's state columns are singular: then the constraints
-            do not determine the states from x_0 and the actions, and there is no such form.
+        QPError: if the shapes do not fit, or C's state columns are singular, so that x_0 and the
+            actions do not determine the states.
 
     Example:
         >>> import torch
@@ -137,7 +143,7 @@ def prediction_form(C: Tensor, n_x: int, n_u: int, b: Tensor | None = None) -> P
     C, b = (x.detach().to("cpu", torch.float64) for x in (C, b))
     if not (C.isfinite().all() and b.isfinite().all()):
         raise QPError.expected("C, b", "NaN or inf", "finite entries")
-    # Rows of unit norm, so that a mere scale does not count as bad condition.
+    # Rows of unit norm, so that their scale does not affect the condition number.
     size = C.norm(dim=-1, keepdim=True).clamp(min=torch.finfo(C.dtype).tiny)
     C, b = C / size, b.unsqueeze(-1) / size
     following, x_0, u = (C[..., columns] for columns in _columns(n_x, n_u, N))
@@ -148,15 +154,15 @@ def prediction_form(C: Tensor, n_x: int, n_u: int, b: Tensor | None = None) -> P
 
 
 def model_form(A: Tensor, B: Tensor, horizon: int, offset: Tensor | None = None) -> PredictionForm:
-    """The prediction form of x+ = A x + B u + offset.
+    """Return the prediction form of x+ = A x + B u + offset.
 
     Args:
-        A, B: ``(n_x, n_x)`` and ``(n_x, n_u)``, or with a leading N for one per stage.
+        A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``, or with a leading N for one per stage.
         horizon: N.
         offset: ``(n_x,)``, or ``(N, n_x)``; zero by default.
 
     Raises:
-        QPError: shapes that do not fit each other or the horizon.
+        QPError: if the shapes do not fit each other or the horizon.
     """
     check_whole("horizon", horizon, 1)
     check_tensor("A", A, "n_x", "n_x")
@@ -171,19 +177,22 @@ def model_form(A: Tensor, B: Tensor, horizon: int, offset: Tensor | None = None)
 
 
 def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
-    """The same constraints with row blocks ``A_k x_k + .. - x_{k+1}``, in x_0 and the actions.
+    """Return the same constraints with row blocks ``A_k x_k + .. - x_{k+1}``.
 
-    That is ``T C`` and ``T b`` for a T that follows from the constraints: of the rows of
-    ``[Phi, Gamma, -I]``, each block has A_k times the one before subtracted. With the
-    `stage_models` of an MPC scheme whose A_k can be told from its predictions, only the band is
-    left, and this is C_0; in general, what a row has besides is what (x_k, u_k) do not explain.
+    They are ``T C`` and ``T b`` for a T that follows from the constraints: from each row block of
+    ``[Phi, Gamma, -I]``, A_k times the block before it is subtracted. For an MPC scheme whose
+    predictions determine its A_k, as `stage_models`, only the band remains, and the result is C_0.
+    In general, a row's other entries, in x_0 and the actions, are what (x_k, u_k) do not explain.
 
     Args:
-        form: of the constraints.
-        A: ``(N, n_x, n_x)``, as `stage_models` finds them; the first does not matter.
+        form: the prediction form of the constraints.
+        A: ``(N, n_x, n_x)``, such as ``stage_models(form).A``; the first is not used.
 
     Returns:
         C ``(N n_x, N (n_x + n_u) + n_x)`` and b ``(N n_x,)``.
+
+    Raises:
+        QPError: if ``form`` has batch dimensions, or the shape of A does not fit.
     """
     check_form(form)
     n_x, n_u, N = form.n_x, form.n_u, form.horizon
@@ -199,17 +208,17 @@ def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _columns(n_x: int, n_u: int, horizon: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The columns of z = [x_0, u_0, x_1, ..] that hold x_1, .., x_N, those of x_0, those of U."""
+    """Return the columns of x_1, .., x_N, of x_0 and of U in z = [x_0, u_0, x_1, ..]."""
     z = torch.arange(horizon * (n_x + n_u) + n_x)
     is_state = z % (n_x + n_u) < n_x
     return z[is_state & (z >= n_x)], z[:n_x], z[~is_state]
 
 
 def _condition(following: Tensor) -> Tensor:
-    """Of C's state columns ``(*batch, n_c, n_c)``; `QPError` if they cannot be solved for."""
+    """Return the condition number of ``(*batch, n_c, n_c)``; raise `QPError` if it is too large."""
     values = torch.linalg.svdvals(following)
     condition = values[..., 0] / values[..., -1]
-    # Not the negation: 0 / 0 is nan, which is no good condition either.
+    # Written so that nan, from 0 / 0, is rejected, too.
     if not (condition <= LARGEST_CONDITION).all():
         worst = values.reshape(-1, values.shape[-1])[values[..., -1].argmin()]
         rank = int((worst > worst[0] / LARGEST_CONDITION).sum())
@@ -219,7 +228,7 @@ def _condition(following: Tensor) -> Tensor:
             "C",
             got,
             f"a condition number of at most {LARGEST_CONDITION:.0e}",
-            "These constraints do not determine x_1, .., x_N from x_0 and the actions, so have no "
-            "prediction form. Penalise the deviation from C_0, or learn C at a smaller rate.",
+            "The constraints do not determine x_1, .., x_N from x_0 and the actions, so they have "
+            "no prediction form. Penalise the deviation from C_0, or learn C at a smaller rate.",
         )
     return condition

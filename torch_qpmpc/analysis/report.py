@@ -1,4 +1,4 @@
-"""Everything that can be read from a QPMPC, in one report."""
+"""A report on the predictions and the policy of a QPMPC."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ from torch_qpmpc.mpc.module import QPMPC
 
 @dataclass(frozen=True, eq=False)
 class StructureReport:
-    """What a QP's constraints are as a prediction model, and its policy near a state.
+    """A QP's constraints as a prediction model, and its policy near a state.
 
     Attributes:
         form: the prediction form.
         nearest: the nearest time-invariant scheme (A, B, offset).
-        stages: (A_k, B_k, offset_k).
+        stages: the model of each stage (A_k, B_k, offset_k).
         memory: `memory_energies`.
         K: the policy's gain at the state, ``(n_u, n_x)``, u_0 = pi(s) - K ds.
-        K_lqr: that of the regulator of the nearest model and the stage weight, or None where the
-            Riccati equation has no solution.
-        condition: of C's state columns.
+        K_lqr: the LQR gain of the nearest model and the stage weight, or None if the Riccati
+            equation has no solution.
+        condition: condition number of C's state columns.
         causality: `causality_defect`.
         toeplitz: `toeplitz_defect`.
-        non_markov: share of the predictions' norm that the pair before does not explain.
+        non_markov: share of the predictions' norm that the latest pair (x_k, u_k) does not explain.
         order: `markov_order`.
-        distance_to_mpc: of the predictions to those of ``nearest``, relative.
+        distance_to_mpc: relative distance of the predictions to those of ``nearest``.
         gain_to_lqr: ``||K - K_lqr|| / ||K_lqr||``, or nan.
         radius_predicted: spectral radius of the nearest model's A - B K.
-        radius: likewise with the true A and B; nan without.
-        model_error: of ``nearest`` against the true model in one step, `one_step_error` with
-            (s, a) of unit variance; nan without a true model, as are the next two.
-        model_error_max: the largest entry of the difference in A and B.
-        first_stage_error: as ``model_error``, of A_0 and B_0.
+        radius: spectral radius of the true A - B K; nan without a true model, as are the next.
+        model_error: `one_step_error` of ``nearest`` against the true model, with (s, a) of unit
+            variance.
+        model_error_max: largest difference of an entry of A or B.
+        first_stage_error: ``model_error`` of A_0, B_0.
     """
 
     form: PredictionForm = field(repr=False)
@@ -72,7 +72,7 @@ class StructureReport:
     first_stage_error: float
 
     def scalars(self) -> dict[str, float]:
-        """The numbers by name."""
+        """Return the numbers by name."""
         return {
             f.name: value for f in fields(self) if isinstance(value := getattr(self, f.name), float)
         }
@@ -87,19 +87,19 @@ class StructureReport:
 
 
 def predictions(mpc: QPMPC) -> PredictionForm:
-    """What the constraints say of the states: X = Phi x_0 + Gamma U + phi.
+    """Return the prediction form of the constraints, X = Phi x_0 + Gamma U + phi.
 
     Raises:
-        QPError: C cannot be put into prediction form.
+        QPError: if C has no prediction form.
     """
     return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
 
 
 def canonical(mpc: QPMPC) -> Tensor:
-    """C in the gauge in which that of an MPC scheme is banded, ``(m_c, n)``.
+    """Return C ``(n_c, n_z)`` in the gauge in which an MPC scheme's is banded.
 
     Raises:
-        QPError: C cannot be put into prediction form.
+        QPError: if C has no prediction form.
     """
     form = predictions(mpc)
     return canonical_matrix(form, stage_models(form).A)[0]
@@ -112,12 +112,12 @@ def read(
 
     Args:
         mpc: the QP.
-        true_model: of the plant, where it is known: A, B, and its offset if it has one.
-        at: the state at which the policy's gain is taken, ``(n_x,)``; the origin by default.
+        true_model: the plant's A, B and, if it has one, offset; None if they are unknown.
+        at: the state of the policy's gain, ``(n_x,)``; the origin by default.
 
     Raises:
-        QPError: C cannot be put into prediction form.
-        SolverError: the QP has no solution there, and ``mpc.on_failure`` is ``"raise"``.
+        QPError: if C has no prediction form, or an argument does not fit.
+        SolverError: if the QP has no solution there, and ``mpc.on_failure`` is ``"raise"``.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -169,11 +169,14 @@ def read(
 
 
 def structure_metrics(mpc: QPMPC, true_model: Sequence[Tensor] | None = None) -> dict[str, float]:
-    """The numbers of `read` that tell how far the constraints are from an MPC scheme's, for logs.
+    """Return the numbers of `read` that measure the distance to an MPC scheme, for logs.
 
     Returns:
         ``causality_defect``, ``toeplitz_defect``, ``distance_to_mpc`` and, with a true model,
-        ``model_error``; all nan where C has no prediction form, so that training goes on.
+        ``model_error``; all nan if C has no prediction form, so that training continues.
+
+    Raises:
+        QPError: if an argument does not fit.
     """
     check_kind("mpc", mpc, QPMPC)
     if true_model is not None:
@@ -192,6 +195,7 @@ def structure_metrics(mpc: QPMPC, true_model: Sequence[Tensor] | None = None) ->
 
 
 def _checked_model(mpc: QPMPC, true_model: Sequence[Tensor]) -> Sequence[Tensor]:
+    """Return ``true_model``; raise `QPError` if it does not fit."""
     if not isinstance(true_model, tuple | list) or len(true_model) not in (2, 3):
         got = type(true_model).__name__
         got += f" of {len(true_model)}" if isinstance(true_model, tuple | list) else ""

@@ -1,8 +1,8 @@
-"""What kind of MPC scheme, if any, the constraints are: read from their prediction form alone.
+"""Measures of how far the constraints are from an MPC scheme, from their prediction form alone.
 
-All but `distance_by_band` is free of C's gauge (see `canonical`): T C for any invertible T is the
-same QP, and gives the same numbers. Norms are Frobenius norms over the maps from (x_0, U) to the
-states, which weighs all entries of x_0 and U alike, in the units that the QP has.
+All but `distance_by_band` are free of C's gauge (see `prediction_form`): T C is the same QP for any
+invertible T, and has the same numbers. Norms are Frobenius norms of the maps from (x_0, U) to the
+states: all entries of x_0 and U weigh the same, in the QP's units.
 """
 
 from __future__ import annotations
@@ -15,16 +15,19 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from torch_qpmpc.analysis.prediction_form import FORM, PredictionForm, check_form
+from torch_qpmpc.analysis.prediction_form import FORM_REMEDY, PredictionForm, check_form
 from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
 
 
 def distance_by_band(C: Tensor, C_0: Tensor, n_x: int, n_u: int) -> dict[str, float]:
-    """``sum |C - C_0|`` on, above and below the band: C, C_0 ``(N n_x, n_z)``.
+    """Return ``sum |C - C_0|`` on, above and below the band, for C, C_0 ``(N n_x, n_z)``.
 
-    A raw distance, as in the paper: it depends on the gauge of C, unless C is a canonical matrix.
+    This distance, the paper's, depends on the gauge of C, unless C is a canonical matrix.
+
+    Raises:
+        QPError: if a shape does not fit.
     """
     check_whole("n_x", n_x, 1)
     check_whole("n_u", n_u, 1)
@@ -43,20 +46,20 @@ def distance_by_band(C: Tensor, C_0: Tensor, n_x: int, n_u: int) -> dict[str, fl
 
 
 def causality_defect(form: PredictionForm) -> Tensor:
-    """``||Gamma above its block diagonal|| / ||Gamma||``, ``(*batch,)``.
+    """Return ``||Gamma above its block diagonal|| / ||Gamma||``, ``(*batch,)``.
 
-    Zero if no u_j enters an x_k with k <= j; at most 1.
+    It is zero if no u_j enters an x_k with k <= j, and at most 1.
     """
     energy = gamma_energies(form)
     return (energy[..., : form.horizon - 1].sum(-1) / energy.sum(-1)).sqrt()
 
 
 def gamma_energies(form: PredictionForm) -> Tensor:
-    """Squared norm of each block diagonal of Gamma, ``(*batch, 2 N - 1)``, by lag k - j.
+    """Return the squared norm of each block diagonal of Gamma, ``(*batch, 2 N - 1)``, by lag k - j.
 
-    From lag -(N - 1), which is u_{N-1} in x_1, to N - 1, u_0 in x_N. Negative lags are not causal.
+    Lags run from -(N - 1), u_{N-1} in x_1, to N - 1, u_0 in x_N. Negative ones are not causal.
     """
-    check_kind("form", form, PredictionForm, FORM)
+    check_kind("form", form, PredictionForm, FORM_REMEDY)
     N = form.horizon
     squares = form.blocks.square().sum((-1, -2))
     diagonals = [squares.diagonal(offset=-lag, dim1=-2, dim2=-1).sum(-1) for lag in range(1 - N, N)]
@@ -64,11 +67,11 @@ def gamma_energies(form: PredictionForm) -> Tensor:
 
 
 def toeplitz_defect(form: PredictionForm) -> Tensor:
-    """``||Gamma - its nearest block Toeplitz matrix|| / ||Gamma||``, ``(*batch,)``.
+    """Return ``||Gamma - its nearest block Toeplitz matrix|| / ||Gamma||``, ``(*batch,)``.
 
-    Zero if what an action does depends on how long ago it was only, as in a time-invariant scheme.
+    It is zero if an action's effect depends on its lag alone, as in a time-invariant scheme.
     """
-    check_kind("form", form, PredictionForm, FORM)
+    check_kind("form", form, PredictionForm, FORM_REMEDY)
     N, blocks = form.horizon, form.blocks
     means = torch.zeros_like(blocks)
     for lag in range(1 - N, N):
@@ -80,12 +83,12 @@ def toeplitz_defect(form: PredictionForm) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """x+ = A x + B u + offset, as read from the constraints.
+    """A model x+ = A x + B u + offset that is read from the constraints.
 
     Attributes:
         A, B, offset: ``(n_x, n_x)``, ``(n_x, n_u)``, ``(n_x,)``; with a leading N, one per stage.
-        residual: the part of the predictions that it does not explain, as a share of their norm;
-            ``()``, or ``(N,)``.
+        residual: share of the predictions' norm that the model does not explain, ``()`` or
+            ``(N,)``.
     """
 
     A: Tensor
@@ -95,13 +98,13 @@ class Model:
 
 
 def stage_models(form: PredictionForm) -> Model:
-    """The model A_k, B_k by which the predictions go from stage k to k + 1.
+    """Fit the model A_k, B_k of each step of the predictions, from stage k to k + 1.
 
-    Predictions are maps of (x_0, U); A_k, B_k and the offset are the least-squares fit of that of
-    x_{k+1} by those of x_k, u_k and a constant. If u_k does not enter x_k, as in causal
-    constraints, B_k is block (k, k) of Gamma. The residual is what x_{k+1} takes from elsewhere,
-    earlier pairs or later actions: zero in all stages means Markovian. Directions of the state that
-    no prediction for stage k reaches are unknown, and zero in A_k (the smallest solution).
+    Predictions are maps of (x_0, U). A_k, B_k and the offset are the least-squares fit of the map
+    of x_{k+1} by those of x_k, u_k and a constant. If u_k does not enter x_k, as in causal
+    constraints, B_k is block (k, k) of Gamma. The residual is the part of x_{k+1} from earlier
+    pairs or later actions: zero in all stages means Markovian. A_k is zero in directions of the
+    state that no prediction of x_k reaches (the minimum-norm solution).
     """
     check_form(form)
     maps, regressors = form.maps, _regressors(form)
@@ -113,12 +116,12 @@ def stage_models(form: PredictionForm) -> Model:
 
 
 def nearest_model(form: PredictionForm) -> Model:
-    """The time-invariant scheme whose predictions are nearest, and the distance to it.
+    """Fit the time-invariant scheme with the nearest predictions; its residual is the distance.
 
     Minimises ``||[Phi, Gamma, phi] - [Phi, Gamma, phi](A, B, offset)||`` by Levenberg-Marquardt
-    from the one-step fit that all stages share; the residual is that over ``||[Phi, Gamma]||``. For
-    a scheme with tied stages the start is exact, and the residual is zero up to rounding. Otherwise
-    it is a local minimum, and an upper bound on the distance to the MPC schemes.
+    from the one-step fit of all stages; the residual is the minimum over ``||[Phi, Gamma]||``. For
+    a scheme with tied stages the start is exact, and the residual zero up to rounding. Otherwise it
+    is a local minimum, and an upper bound on the distance to the MPC schemes.
     """
     check_form(form)
     maps, N = form.maps, form.horizon
@@ -149,11 +152,11 @@ def nearest_model(form: PredictionForm) -> Model:
             slopes.append(slope)
         return torch.stack(slopes, dim=2).flatten(2).flatten(0, 1).mT.numpy()
 
-    # The predictions of an unstable fit may be far off, or no numbers: then no model is better.
+    # The predictions of an unstable fit may be far off or overflow: then zero is a better start.
     candidates = [np.zeros(start.numel()), start.flatten().numpy()]
     begin = min(candidates, key=lambda flat: np.linalg.norm(residuals(flat)))
     tight = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-12}
-    found = least_squares(residuals, begin, jac=jacobian, method="lm", **tight)  # pyright: ignore[reportArgumentType] - a function is meant
+    found = least_squares(residuals, begin, jac=jacobian, method="lm", **tight)  # pyright: ignore[reportArgumentType] - jac may be a function
     theta = torch.as_tensor(found.x).view(shape)
     scale = _without_offset(maps[1:]).sum().sqrt()
     A, B, offset = _split(theta, form)
@@ -161,17 +164,20 @@ def nearest_model(form: PredictionForm) -> Model:
 
 
 def memory_energies(form: PredictionForm, rtol: float = 1e-9) -> Tensor:
-    """How far back the predictions look, ``(N + 1,)``; adds up to 1.
+    """Return the shares of the predictions' energy by past pair, ``(N + 1,)``, which sum to 1.
 
-    How x_{k+1} depends on x_k, u_k, x_{k-1}, .. is not unique, as x_k follows from earlier ones. So
-    the pair (x_k, u_k) explains all that it can, in least squares over (x_0, U); then what
-    (x_{k-1}, u_{k-1}) adds to it is counted; and so on. Entry m is the share of the energy of
-    x_1, .., x_N that the pair m stages before the latest adds. The last entry is what not even all
-    of the past explains: dependence on later actions.
+    The dependence of x_{k+1} on x_k, u_k, x_{k-1}, .. is not unique, as x_k follows from earlier
+    pairs. Therefore (x_k, u_k) first explains as much as it can, in least squares over (x_0, U);
+    then (x_{k-1}, u_{k-1}) explains part of the rest, and so on. Entry m is the share of the energy
+    of x_1, .., x_N that the pair m stages before the latest explains. The last entry is the share
+    that the whole past does not explain: dependence on later actions.
 
     Args:
-        form: of the constraints.
-        rtol: directions of the regressors below this share of the largest are not told from zero.
+        form: the prediction form of the constraints.
+        rtol: singular values of the regressors below this share of the largest count as zero.
+
+    Raises:
+        QPError: if ``form`` has batch dimensions, or ``rtol`` is not in [0, 1).
     """
     check_form(form)
     check_number("rtol", rtol, lambda x: 0 <= x < 1, "a number in [0, 1)")
@@ -193,25 +199,28 @@ def memory_energies(form: PredictionForm, rtol: float = 1e-9) -> Tensor:
 
 
 def markov_order(energies: Tensor, tolerance: float = 1e-6) -> float:
-    """Of how many pairs (x_k, u_k), .. the next state is a function, by `memory_energies`.
+    """Return the number of latest pairs (x_k, u_k), .. that determine the next state.
 
-    1 is a Markovian scheme, as MPC is; inf is one that looks at later actions. An order above 1 is
-    not always how far back the rows of C reach: some pairs may tell all that was before them.
+    1 is a Markovian scheme, such as MPC; inf means that later actions matter. An order above 1 may
+    be less than the reach of C's rows, because pairs may determine all earlier ones.
 
     Args:
-        energies: ``(N + 1,)``.
-        tolerance: of the norm, as a share, that the pairs need not explain.
+        energies: `memory_energies`, ``(N + 1,)``.
+        tolerance: share of the norm that the pairs need not explain.
+
+    Raises:
+        QPError: if an argument does not fit.
     """
     check_tensor("energies", energies, "N + 1", batched=False, remedy="Pass memory_energies(form).")
     check_number("tolerance", tolerance, lambda x: 0 <= x <= 1, "a number in [0, 1]")
-    # Not as 1 minus what is explained, which has only half the digits.
+    # Summing the unexplained shares avoids the cancellation in 1 minus the explained ones.
     left = energies.flip(0).cumsum(0).flip(0)[1:].sqrt()
     enough = (left <= tolerance).nonzero()
     return float(enough[0, 0] + 1) if len(enough) else math.inf
 
 
 def _regressors(form: PredictionForm) -> Tensor:
-    """x_k, u_k and 1 as maps of (x_0, U, 1) for k < N, ``(N, n_x + n_u + 1, n_v)``."""
+    """Return x_k, u_k and 1 as maps of (x_0, U, 1), k < N, ``(N, n_x + n_u + 1, n_v)``."""
     maps, n_x, n_u, N = form.maps, form.n_x, form.n_u, form.horizon
     unit = torch.eye(maps.shape[-1]).to(maps)
     actions = unit[n_x:-1].unflatten(0, (N, n_u))
@@ -219,22 +228,23 @@ def _regressors(form: PredictionForm) -> Tensor:
 
 
 def _fit(regressors: Tensor, target: Tensor) -> Tensor:
-    """The smallest least-squares solution X of ``X regressors = target``."""
-    # Of the drivers, this one stands rank deficiency.
+    """Return the minimum-norm least-squares solution X of ``X regressors = target``."""
+    # Unlike the default driver, gelsd handles rank deficiency.
     return torch.linalg.lstsq(regressors.mT, target.mT, driver="gelsd").solution.mT
 
 
 def _split(fit: Tensor, form: PredictionForm) -> tuple[Tensor, Tensor, Tensor]:
+    """Return A, B and the offset of a fit."""
     A, B, offset = fit.split((form.n_x, form.n_u, 1), dim=-1)
     return A, B, offset.squeeze(-1)
 
 
 def _without_offset(maps: Tensor) -> Tensor:
-    """Squared norms of the maps of (x_0, U), without the constant."""
+    """Return the squared norms of the maps of (x_0, U), without the constant."""
     return maps[..., :-1].square().sum((-1, -2))
 
 
 def _row_space(rows: Tensor, rtol: float) -> Tensor:
-    """An orthonormal basis, as rows."""
+    """Return an orthonormal basis of the row space, as rows."""
     _, values, basis = torch.linalg.svd(rows, full_matrices=False)
     return basis[values > rtol * values[0]]

@@ -1,4 +1,4 @@
-"""The experiments' environments; importing this registers them, as ``torch_qpmpc/PointMass-v0``."""
+"""Plants and environments; importing this registers Gymnasium ids, as torch_qpmpc/PointMass-v0."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ for _name, _module, _steps in (
     ("PointMass", "point_mass", 50),
     ("GrosZanonLTI", "gros_zanon", 5000),
 ):
-    # Registering an id twice warns, and a reload or a spawned worker imports this again.
+    # Registering an id twice warns, and a reload or a spawned worker runs this again.
     if f"torch_qpmpc/{_name}-v0" not in gymnasium.registry:
         gymnasium.register(
             id=f"torch_qpmpc/{_name}-v0",

@@ -1,4 +1,4 @@
-"""Closed-loop evaluation: the same starts and the same noise for everyone, and the closed gap."""
+"""Closed-loop evaluation, with the same starts and noise for every policy, and the closed gap."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.linear_system import LinearSystem
 from torch_qpmpc.errors import QPError
 
-POLICY = "Map a batch of states to a batch of actions."
+POLICY_REMEDY = "Map a batch of states to a batch of actions."
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """Trajectories of one policy, in float64, and its cumulative cost J.
+    """Trajectories of one policy in float64, and its cumulative costs.
 
     Attributes:
         states: ``(steps + 1, starts, n_x)``.
@@ -37,12 +37,12 @@ class ClosedLoop:
 
     @property
     def J(self) -> float:
-        """Mean over the starts of the sum of costs."""
+        """The mean over the starts of the sum of costs."""
         return self.costs.sum(0).mean().item()
 
     @property
     def J_discounted(self) -> float:
-        """Mean over the starts of the sum of gamma^k L(s_k, a_k)."""
+        """The mean over the starts of the sum of gamma^k L(s_k, a_k)."""
         weights = self.gamma ** torch.arange(len(self.costs)).to(self.costs)
         return (weights @ self.costs).mean().item()
 
@@ -59,28 +59,35 @@ def closed_loop(
 ) -> ClosedLoop:
     """Run ``policy`` from ``starts`` fixed starts side by side, without gradients.
 
-    One seed is one experiment: ``numpy.random.default_rng(seed)`` draws the starts, then the
-    noise's random numbers ``(starts, n_noise)`` each step.
+    The seed determines the experiment: ``numpy.random.default_rng(seed)`` draws the starts, then at
+    each step the numbers ``(starts, n_noise)`` of the noise.
 
     Args:
-        policy: from states ``(starts, n_x)`` in float64 to actions ``(starts, n_u)``.
+        policy: maps states ``(starts, n_x)`` in float64 to actions ``(starts, n_u)``.
         physics: the true system, its noise and its start distribution.
-        steps, starts, seed: of the experiment.
+        steps, starts: numbers of steps and of starts.
+        seed: seed of the starts and the noise.
         gamma: the discount factor of ``J_discounted``.
 
     Raises:
-        QPError: ``policy`` returns another shape, or an argument is of another kind.
+        QPError: if ``policy`` returns another shape, or an argument does not fit.
+
+    Example:
+        >>> from torch_qpmpc.envs import PointMass
+        >>> loop = closed_loop(lambda s: -s[:, :2] - s[:, 2:], PointMass(), steps=20, starts=4)
+        >>> tuple(loop.states.shape), bool(loop.costs[-1].mean() < loop.costs[0].mean())
+        ((21, 4, 4), True)
     """
     _check(policy, steps, starts, seed, gamma)
-    check_kind("physics", physics, LinearSystem, "Of a GymnasiumPlant: gymnasium_loop.")
+    check_kind("physics", physics, LinearSystem, "Use gymnasium_loop for a GymnasiumPlant.")
     rng = np.random.default_rng(seed)
     s = physics.starts(rng, starts)
     nu = torch.zeros_like(s)
     expected = starts, physics.B.shape[1]
     states, actions, costs = [s], [], []
     for _ in range(steps):
-        # A (starts,) or (n_u,) result would broadcast without a sound.
-        a = check_tensor("policy(s)", policy(s), *expected, batched=False, remedy=POLICY)
+        # A result of shape (starts,) or (n_u,) would broadcast silently.
+        a = check_tensor("policy(s)", policy(s), *expected, batched=False, remedy=POLICY_REMEDY)
         a = physics.applied(a)
         costs.append(physics.cost(s, a))
         nu = physics.noise(nu, physics.draw(rng, starts))
@@ -100,15 +107,15 @@ def gymnasium_loop(
     seed: int = 123,
     gamma: float = 0.99,
 ) -> ClosedLoop:
-    """`closed_loop` in a Gymnasium environment: start i is that of the seed ``seed + i``.
+    """Run ``policy`` as `closed_loop` does, in a Gymnasium environment; start i has seed + i.
 
-    After an episode's end its state stays, at no cost.
+    After an episode's end its state stays constant, at no cost.
 
     Raises:
-        QPError: as of `closed_loop`.
+        QPError: as in `closed_loop`.
     """
     _check(policy, steps, starts, seed, gamma)
-    check_kind("plant", plant, GymnasiumPlant, "Of a LinearSystem: closed_loop.")
+    check_kind("plant", plant, GymnasiumPlant, "Use closed_loop for a LinearSystem.")
     expected = starts, len(plant.lb_a)
     envs = [gymnasium.make(plant.id, max_episode_steps=steps) for _ in range(starts)]
     s = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(envs)])
@@ -117,7 +124,7 @@ def gymnasium_loop(
     low, high = plant.lb_a.numpy(), plant.ub_a.numpy()
     for _ in range(steps):
         a = policy(torch.as_tensor(s, dtype=torch.float64))
-        check_tensor("policy(s)", a, *expected, batched=False, remedy=POLICY)
+        check_tensor("policy(s)", a, *expected, batched=False, remedy=POLICY_REMEDY)
         a = a.numpy().clip(low, high)
         s, cost = s.copy(), np.zeros(starts)
         for i in np.flatnonzero(~over):
@@ -133,12 +140,17 @@ def gymnasium_loop(
 
 
 def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:
-    """The share of the way from the start to the true-model MPC that learning went.
+    """Return the share of the gap from the start to the true-model MPC that learning has closed.
 
-    (J_start - J_final) / (J_start - J_true_model): 0 is no gain, 1 is as good as knowing the model.
+    It is (J_start - J_final) / (J_start - J_true_model): 0 is no gain, 1 equals the true model. It
+    is nan if the start is no worse than the true model, or a J is nan.
 
-    Returns:
-        nan where the start is no worse than the true model (or a J is nan): no gap to close.
+    Raises:
+        QPError: if a J is not a number.
+
+    Example:
+        >>> closed_gap(J_start=100.0, J_final=60.0, J_true_model=50.0)
+        0.8
     """
     for name, J in (("J_start", J_start), ("J_final", J_final), ("J_true_model", J_true_model)):
         check_number(name, J, lambda _: True, "a number, or nan")
@@ -149,11 +161,12 @@ def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:
 def gap_text(
     gap: float, J_start: float, J_final: float, J_true_model: float, name: str = "J"
 ) -> str:
-    """Write a closed gap to three decimals or, if it is nan, why, and how J changed.
+    """Return a closed gap to three decimals or, if it is nan, the reason and the change of J.
 
     Args:
         gap: `closed_gap` of the three J.
-        name: of J, for the sentence.
+        J_start, J_final, J_true_model: the costs.
+        name: name of J in the text.
 
     Example:
         >>> gap_text(math.nan, 50.0, 62.3, 50.0)
@@ -171,6 +184,7 @@ def gap_text(
 
 
 def _check(policy: object, steps: int, starts: int, seed: int, gamma: float) -> None:
+    """Raise `QPError` unless these arguments of both loops fit."""
     if not callable(policy):
         remedy = "Pass a function of states, such as mpc.policy."
         raise QPError.expected("policy", type(policy).__name__, "a function", remedy)

@@ -1,9 +1,9 @@
-"""Gros and Zanon's linear system, and its Gymnasium and TorchRL environments.
+"""Gros and Zanon's linear system, with its Gymnasium and TorchRL environments.
 
     s+ = A s + B a + [e, 0],    e uniform in (-0.1, 0),    s_0 = [0, 0.15]
 
-From "Data-driven economic NMPC using reinforcement learning" (IEEE TAC 2020, arXiv 1904.04152); the
-example of on-policy Q-learning of the package mpcrl learns on it.
+From "Data-driven economic NMPC using reinforcement learning" (IEEE TAC 2020, arXiv 1904.04152). The
+package mpcrl uses it in its example of on-policy Q-learning.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from torch_qpmpc.envs.linear_system import (
 
 @dataclass(frozen=True, eq=False)
 class GrosZanonLTI(LinearSystem):
-    """The physics, in float64; every tensor that a method gets is converted to that.
+    """The physics in float64, to which methods convert their tensors.
 
-    It pays to be near the origin, a corner of the bounds of the state, and the noise pushes across
-    the edge.
+    The cost is least at the origin, a corner of the state bounds, and the noise pushes the state
+    out of them.
 
     Args:
         w: weight of the violation in the cost.
         A, B: dynamics ``(2, 2)`` and ``(2, 1)``.
-        lb_s, ub_s: soft bounds of the state ``(2,)``; it is not clipped to them.
-        lb_a, ub_a: bounds of the action ``(1,)``, which is clipped to them.
+        lb_s, ub_s: soft bounds of the state ``(2,)``, to which it is not clipped.
+        lb_a, ub_a: bounds of the action ``(1,)``, to which it is clipped.
 
     Raises:
-        QPError: negative or not finite ``w``.
+        QPError: if ``w`` is negative or not finite, or a tensor does not fit.
     """
 
     clips_states: ClassVar[bool] = False
@@ -60,7 +60,7 @@ class GrosZanonLTI(LinearSystem):
         check_number("w", self.w, lambda x: 0 <= x < math.inf, "a finite number >= 0", remedy)
 
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
-        """L(s, a) = 1/2 (|s|^2 + 1/2 a^2 + w violation(s)) ``(*batch,)``, of a as applied."""
+        """Return L(s, a) = 1/2 (|s|^2 + 1/2 a^2 + w violation(s)) ``(*batch,)``, with a clipped."""
         squares = (
             check_tensor("s", s, len(self.A)).to(self.A).square().sum(-1)
             + self.applied(a).square().sum(-1) / 2
@@ -68,44 +68,44 @@ class GrosZanonLTI(LinearSystem):
         return (squares + self.w * self.violation(s)) / 2
 
     def starts(self, rng: Rng, count: int) -> Tensor:
-        """``count`` times s_0 ``(count, 2)``; draws nothing."""
+        """Return ``count`` copies of s_0, ``(count, 2)``, without drawing from ``rng``."""
         return self.A.new_tensor([[0, 0.15]]).repeat(count, 1)
 
     def draw(self, rng: Rng, count: int) -> Tensor:
-        """Numbers uniform in [0, 1) ``(count, 1)``, one an episode."""
+        """Draw numbers uniform in [0, 1), ``(count, 1)``, one per episode."""
         return uniform(rng, count, 1)
 
     def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
-        """[e, 0] ``(*batch, 2)``, as numpy's ``uniform(-0.1, 0.0)`` makes e of the draw."""
+        """Return [e, 0] ``(*batch, 2)``, with e scaled as by numpy's ``uniform(-0.1, 0.0)``."""
         e = -0.1 + 0.1 * draw.to(self.A)
         return torch.cat((e, torch.zeros_like(e)), -1)
 
     def mean_noise(self) -> Tensor:
-        """[-0.05, 0]."""
+        """Return [-0.05, 0]."""
         return self.noise(torch.zeros_like(self.lb_s), self.A.new_tensor([0.5]))
 
     def wrong_model(self) -> tuple[Tensor, Tensor]:
-        """The model that learning starts from: A_0 ``(2, 2)`` and B_0 ``(2, 1)``."""
+        """Return the model that learning starts from: A_0 ``(2, 2)`` and B_0 ``(2, 1)``."""
         as_A = self.A.new_tensor
         return as_A([[1, 0.25], [0, 1]]), as_A([[0.0312], [0.25]])
 
 
 class GrosZanonLTIGymEnv(LinearSystemGymEnv):
-    """``torch_qpmpc/GrosZanonLTI-v0``: never terminates, truncated at 5000 steps."""
+    """``torch_qpmpc/GrosZanonLTI-v0``, which never terminates and is truncated at 5000 steps."""
 
     def __init__(self, physics: GrosZanonLTI | None = None) -> None:
         super().__init__(GrosZanonLTI() if physics is None else physics)
 
 
 class GrosZanonLTIEnv(LinearSystemEnv):
-    """``num_envs`` such systems in one :class:`LinearSystemEnv`.
+    """A :class:`LinearSystemEnv` of a `GrosZanonLTI`.
 
     Args:
-        physics: ``None`` for ``GrosZanonLTI()``.
-        num_envs, max_steps, dtype, device, seed: as of :class:`LinearSystemEnv`.
+        physics: the system; None for ``GrosZanonLTI()``.
+        num_envs, max_steps, dtype, device, seed: as in :class:`LinearSystemEnv`.
 
     Raises:
-        QPError: ``num_envs`` or ``max_steps`` below 1.
+        QPError: if an argument does not fit.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 """Any Gymnasium environment with continuous observations and actions as the plant of a task.
 
-Unlike a `LinearSystem` it cannot be looked into: it can be reset and stepped, and that is all.
+Unlike a `LinearSystem` it is a black box: it can only be reset and stepped.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from torch_qpmpc.errors import QPError
 
 
 class GymnasiumPlant:
-    """The environment ``id``: its observation is the state s, its reward -L.
+    """A Gymnasium environment as a plant: its observation is the state s, its reward -L.
 
     Args:
-        id: of a registered environment whose spaces are boxes of one dimension.
+        id: id of a registered environment with Box spaces of one dimension.
 
     Attributes:
+        id: the id.
         lb_s, ub_s, lb_a, ub_a: the bounds of its spaces, ``(n_x,)`` and ``(n_u,)``.
 
     Raises:
-        QPError: it cannot be made, or has other spaces.
+        QPError: if the environment cannot be made, or has other spaces.
 
     Example:
         >>> GymnasiumPlant("Pendulum-v1").ub_a
@@ -50,20 +51,20 @@ class GymnasiumPlant:
     def _bounds(self, name: str, space: Any) -> tuple[Tensor, Tensor]:
         if not isinstance(space, Box) or len(space.shape) != 1:
             got = f"{self.id!r}, whose {name} space is {space}"
-            remedy = "Choose an environment whose observations and actions are real vectors."
-            raise QPError.expected("task.id", got, "spaces that are boxes of one dimension", remedy)
+            remedy = "Choose an environment with real vectors as observations and actions."
+            raise QPError.expected("task.id", got, "Box spaces of one dimension", remedy)
         low, high = (torch.as_tensor(x, dtype=torch.float64) for x in (space.low, space.high))
         return low, high
 
     def vectorised(self, num_envs: int, max_steps: int, seed: int) -> EnvBase:
-        """``num_envs`` episodes of at most ``max_steps`` in one TorchRL environment."""
+        """Make a TorchRL environment of ``num_envs`` episodes of at most ``max_steps`` steps."""
         check_whole("num_envs", num_envs, 1)
         check_whole("max_steps", max_steps, 1)
         envs = gymnasium.make_vec(
             self.id,
             num_envs,
             vectorization_mode="sync",
-            # TorchRL resets by itself; else an episode's last observation would be lost.
+            # TorchRL resets by itself; Gymnasium's reset would lose an episode's last observation.
             vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED},
             max_episode_steps=max_steps,
         )
@@ -72,9 +73,9 @@ class GymnasiumPlant:
         return env
 
     def true_model(self) -> None:
-        """None: the plant can only be stepped."""
+        """Return None, as the plant can only be stepped."""
 
     def violation(self, s: Tensor) -> Tensor:
-        """How far s ``(*batch, n_x)`` is outside the bounds of its space, summed: 0."""
+        """Return how far s ``(*batch, n_x)`` is outside its space, summed, ``(*batch,)``."""
         s = check_tensor("s", s, len(self.lb_s)).to(self.lb_s)
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)

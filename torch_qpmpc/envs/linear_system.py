@@ -1,9 +1,9 @@
-"""Linear systems with additive noise, and their Gymnasium and TorchRL environments.
+"""Linear systems with additive noise, with their Gymnasium and TorchRL environments.
 
     s+ = A s + B a + nu
 
-A concrete plant says what it costs, what its noise is and where it starts. Both environments return
-the reward -L(s, a): the paper minimises a cost, they maximise.
+A concrete plant defines the cost, the noise and the starts. Both environments return the reward
+-L(s, a), because the paper minimises a cost.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from torchrl.envs import EnvBase
 from torch_qpmpc.checks import check_kind, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 
-#: What random numbers come from: the TorchRL environments hold a generator of torch's, the
-#: Gymnasium environments and the evaluation one of numpy's.
+#: A random generator: torch's in the TorchRL environments, numpy's in the Gymnasium environments
+#: and in the evaluation.
 Rng = np.random.Generator | torch.Generator
 
 
 def float64(*values: Any) -> Callable[[], Tensor]:
-    """What makes the tensor of ``values``: the default factory of a plant's field."""
+    """Return a function that makes a tensor of ``values``, the default factory of a field."""
     return lambda: torch.tensor(values, dtype=torch.float64)
 
 
 def normal(rng: Rng, *shape: int) -> Tensor:
-    """Standard normal numbers in float64."""
+    """Draw standard normal numbers of shape ``shape``, in float64."""
     check_rng(rng)
     if isinstance(rng, torch.Generator):
         return torch.randn(shape, generator=rng, dtype=torch.float64, device=rng.device)
@@ -43,7 +43,7 @@ def normal(rng: Rng, *shape: int) -> Tensor:
 
 
 def uniform(rng: Rng, *shape: int) -> Tensor:
-    """Numbers uniform in [0, 1), in float64."""
+    """Draw numbers uniform in [0, 1) of shape ``shape``, in float64."""
     check_rng(rng)
     if isinstance(rng, torch.Generator):
         return torch.rand(shape, generator=rng, dtype=torch.float64, device=rng.device)
@@ -53,20 +53,23 @@ def uniform(rng: Rng, *shape: int) -> Tensor:
 def check_rng(rng: Rng) -> None:
     """Raise `QPError` unless ``rng`` is a generator."""
     if not isinstance(rng, Rng):
-        got, remedy = repr(rng), "Of a seed: numpy.random.default_rng(seed)."
-        raise QPError.expected("rng", got, "a generator of numpy's or torch's", remedy)
+        remedy = "From a seed: numpy.random.default_rng(seed)."
+        raise QPError.expected("rng", repr(rng), "a NumPy or torch generator", remedy)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearSystem(ABC):
-    """The physics, in float64; every tensor that a method gets is converted to that.
+    """The physics in float64, to which methods convert their tensors.
 
     Args:
         A, B: dynamics ``(n_x, n_x)`` and ``(n_x, n_u)``.
         lb_s, ub_s, lb_a, ub_a: bounds of the state ``(n_x,)`` and of the action ``(n_u,)``.
+
+    Raises:
+        QPError: if a tensor has another shape or dtype, A or B is not finite, or bounds cross.
     """
 
-    #: True if a step clips s+ to its bounds; else they are soft, and observations have none.
+    #: True if a step clips s+ to its bounds; if False, they are soft and observations unbounded.
     clips_states: ClassVar[bool] = True
 
     A: Tensor
@@ -99,59 +102,59 @@ class LinearSystem(ABC):
                 raise QPError.expected(f"lb_{of}", f"lb_{of} > ub_{of}", "lower bounds <= upper")
 
     def to(self, device: torch.device | str | None) -> Self:
-        """The same physics with its tensors on ``device``."""
+        """Return the same physics with its tensors on ``device``."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         tensors = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
         return replace(self, **tensors)
 
     @abstractmethod
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
-        """L(s, a) ``(*batch,)`` of the current s ``(*batch, n_x)`` and of a ``(*batch, n_u)``."""
+        """Return L(s, a) ``(*batch,)`` of the current s ``(*batch, n_x)``, a ``(*batch, n_u)``."""
 
     @abstractmethod
     def starts(self, rng: Rng, count: int) -> Tensor:
-        """Start states ``(count, n_x)``."""
+        """Draw start states ``(count, n_x)``."""
 
     @abstractmethod
     def draw(self, rng: Rng, count: int) -> Tensor:
-        """The random numbers ``(count, n_noise)`` that one step of ``count`` episodes needs."""
+        """Draw the random numbers ``(count, n_noise)`` for one step of ``count`` episodes."""
 
     @abstractmethod
     def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
-        """The next nu ``(*batch, n_x)`` from the last one and a :meth:`draw`."""
+        """Return the next nu ``(*batch, n_x)`` from the last one and a :meth:`draw`."""
 
     def mean_noise(self) -> Tensor:
-        """The mean of nu ``(n_x,)``: 0, if a plant does not say otherwise."""
+        """Return the mean of nu ``(n_x,)``; 0 unless overridden."""
         return torch.zeros_like(self.lb_s)
 
     def true_model(self) -> tuple[Tensor, Tensor, Tensor]:
-        """A, B and the offset, the mean of the noise."""
+        """Return A, B and the offset, which is the mean of the noise."""
         return self.A, self.B, self.mean_noise()
 
     def applied(self, a: Tensor) -> Tensor:
-        """The action that the system gets ``(*batch, n_u)``: a clipped to its bounds."""
+        """Return the applied action ``(*batch, n_u)``: a clipped to its bounds."""
         check_tensor("a", a, len(self.lb_a))
         return a.to(self.A).clamp(self.lb_a, self.ub_a)
 
     def violation(self, s: Tensor) -> Tensor:
-        """How far s ``(*batch, n_x)`` is outside its bounds, summed over the states."""
+        """Return how far s ``(*batch, n_x)`` is outside its bounds, summed, ``(*batch,)``."""
         s = check_tensor("s", s, len(self.A)).to(self.A)
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
 
     def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
-        """s+ = A s + B a + nu ``(*batch, n_x)``; a is clipped, s+ where the system clips states."""
+        """Return s+ = A s + B a + nu ``(*batch, n_x)``; clips a and, if `clips_states`, s+."""
         check_tensor("s", s, len(self.A))
         check_tensor("nu", nu, len(self.A))
         following = s.to(self.A) @ self.A.mT + self.applied(a) @ self.B.mT + nu.to(self.A)
         return following.clamp(self.lb_s, self.ub_s) if self.clips_states else following
 
     def vectorised(self, num_envs: int, max_steps: int, seed: int) -> LinearSystemEnv:
-        """``num_envs`` episodes of ``max_steps`` in one TorchRL environment."""
+        """Make a TorchRL environment of ``num_envs`` episodes of ``max_steps`` steps."""
         return LinearSystemEnv(self, num_envs, max_steps, seed=seed)
 
 
 class LinearSystemGymEnv(gymnasium.Env):
-    """One episode of ``physics``: never terminates, its registration truncates it."""
+    """A Gymnasium environment of ``physics``, truncated by its registration, never terminated."""
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own convention)
 
@@ -168,15 +171,21 @@ class LinearSystemGymEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; return its observation, float32 ``(n_x,)``, and no information."""
         super().reset(seed=seed)
         self._s = self.physics.starts(self.np_random, 1)[0]
         self._nu = torch.zeros_like(self._s)
         return self._s.numpy().astype(np.float32), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply ``action`` ``(n_u,)``, clipped; return the observation, the reward and the flags.
+
+        Raises:
+            QPError: if ``reset`` has not been called, or the action does not fit or is not finite.
+        """
         if self._s is None:
             raise QPError.expected(
-                "step", "no episode", "one that has begun", "Call reset() first."
+                "step", "no episode", "one that has started", "Call reset() first."
             )
         try:
             a = torch.as_tensor(np.asarray(action, dtype=np.float64))
@@ -184,7 +193,7 @@ class LinearSystemGymEnv(gymnasium.Env):
             a = torch.tensor(torch.nan)
         if a.shape != self.action_space.shape or not a.isfinite().all():
             expected = f"finite numbers of shape {self.action_space.shape}"
-            remedy = "Of a batch of actions, pass one."
+            remedy = "Pass one action, not a batch."
             raise QPError.expected("action", repr(action), expected, remedy)
         reward = -self.physics.cost(self._s, a).item()
         self._nu = self.physics.noise(self._nu, self.physics.draw(self.np_random, 1)[0])
@@ -193,26 +202,26 @@ class LinearSystemGymEnv(gymnasium.Env):
 
 
 class LinearSystemEnv(EnvBase):
-    """``num_envs`` episodes in one vectorised TorchRL environment, without a Python loop.
+    """A TorchRL environment of ``num_envs`` vectorised episodes, without a Python loop.
 
-    The environment holds no state but its generator. What a step needs beside the observation
-    travels in the TensorDict: ``noise``, the last nu ``(num_envs, n_x)``, and ``step_count``
-    ``(num_envs, 1)``. So TorchRL's own merging by mask at a partial reset restarts exactly those
-    episodes' noise and clocks. A policy must not read ``noise``.
+    Its only state is the generator. Beside the observation, the TensorDict carries the inputs of a
+    step: ``noise``, the last nu ``(num_envs, n_x)``, and ``step_count`` ``(num_envs, 1)``. At a
+    partial reset, TorchRL's merging by mask therefore restarts the noise and step count of exactly
+    the episodes that are reset. A policy must not read ``noise``.
 
-    It truncates itself at ``max_steps`` (no ``StepCounter`` needed), so that the collector sees the
-    end of an episode, resets it and changes its trajectory id; it never terminates.
+    Episodes are truncated at ``max_steps`` (no ``StepCounter`` needed), so that a collector resets
+    them and changes their trajectory ids; they never terminate.
 
     Args:
         physics: the system.
         num_envs: number of episodes run side by side, the batch size.
         max_steps: steps of an episode.
-        dtype: of observation, action and reward; the physics stays in float64.
-        device: of the TensorDicts and of the generator; ``None`` for the CPU.
-        seed: of the generator; ``None`` draws one from torch's global generator.
+        dtype: dtype of observation, action and reward; the physics stays in float64.
+        device: device of the TensorDicts and of the generator; None for the CPU.
+        seed: seed of the generator; None draws one from torch's global generator.
 
     Raises:
-        QPError: ``num_envs`` or ``max_steps`` below 1.
+        QPError: if an argument does not fit, such as ``num_envs`` or ``max_steps`` below 1.
     """
 
     def __init__(
@@ -225,8 +234,8 @@ class LinearSystemEnv(EnvBase):
         seed: int | None = None,
     ) -> None:
         check_kind("physics", physics, LinearSystem)
-        check_whole("num_envs", num_envs, 1, "Ask for at least one.")
-        check_whole("max_steps", max_steps, 1, "Ask for at least one.")
+        check_whole("num_envs", num_envs, 1)
+        check_whole("max_steps", max_steps, 1)
         if seed is not None:
             check_whole("seed", seed, 0)
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
@@ -248,7 +257,7 @@ class LinearSystemEnv(EnvBase):
         s = box(p.lb_s, p.ub_s) if p.clips_states else nu.clone()
         count = Unbounded(one, dtype=torch.int64, device=self.device)
         flag = Categorical(2, shape=one, dtype=torch.bool, device=self.device)
-        # The hidden entries are inputs of a step (state) and outputs of it (observation).
+        # The hidden entries are inputs (state) and outputs (observation) of a step.
         self.state_spec = composite(noise=nu, step_count=count)
         self.observation_spec = composite(observation=s, noise=nu.clone(), step_count=count.clone())
         self.action_spec = box(p.lb_a, p.ub_a)
@@ -257,11 +266,11 @@ class LinearSystemEnv(EnvBase):
         self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
 
     def get_rng_state(self) -> Tensor:
-        """State of the generator, a uint8 tensor for a checkpoint."""
+        """Return the generator's state, a uint8 tensor for a checkpoint."""
         return self.rng.get_state()
 
     def set_rng_state(self, state: Tensor) -> None:
-        """Continue the random stream from what :meth:`get_rng_state` returned."""
+        """Restore the generator's state, a result of :meth:`get_rng_state`."""
         self.rng.set_state(state.cpu())
 
     def _set_seed(self, seed: int | None) -> None:
@@ -269,7 +278,7 @@ class LinearSystemEnv(EnvBase):
             self.rng.manual_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        # Fresh values for every environment: where only some are reset, TorchRL keeps the others'.
+        # Reset every environment: at a partial reset, TorchRL keeps the old values of the others.
         s = self.physics.starts(self.rng, self.batch_size[0])
         count = torch.zeros((*self.batch_size, 1), dtype=torch.int64, device=s.device)
         return self._pack(s, torch.zeros_like(s), count)

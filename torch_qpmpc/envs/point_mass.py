@@ -1,4 +1,4 @@
-"""The paper's point mass (section "Point-Mass"), once, and its Gymnasium and TorchRL environments.
+"""The paper's point mass (section "Point-Mass"), with its Gymnasium and TorchRL environments.
 
 s+ = A s + B a + nu,    s = [x, y, vx, vy],    a = [F_x, F_y],    L(s, a) = s'Ws
 """
@@ -25,7 +25,7 @@ from torch_qpmpc.envs.linear_system import (
 )
 from torch_qpmpc.errors import QPError
 
-#: Standard deviation of the noise by kind; the paper leaves it open.
+#: Standard deviation of the noise by kind, which the paper does not specify.
 NOISE_STD = {"gaussian": 0.01, "brownian": 0.002}
 
 
@@ -35,20 +35,29 @@ def _finite(x: float) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PointMass(LinearSystem):
-    """The physics, in float64; every tensor that a method gets is converted to that.
+    """The physics in float64, to which methods convert their tensors.
 
     Args:
         noise_kind: ``"gaussian"`` (independent in time) or ``"brownian"`` (a random walk over the
             episode, from 0 at its start).
         noise_std: standard deviation per state of the Gaussian noise, or of the random walk's
-            increments; ``None`` for :data:`NOISE_STD`.
-        start_position, start_velocity: an episode starts uniformly within plus or minus these.
+            increments; None for :data:`NOISE_STD`.
+        start_position, start_velocity: episodes start uniformly within plus or minus these.
         A, B, W: dynamics ``(4, 4)``, ``(4, 2)`` and weight of the cost ``(4, 4)``.
-        lb_s, ub_s, lb_a, ub_a: bounds of the state ``(4,)`` and of the action ``(2,)``; both are
-            clipped to them.
+        lb_s, ub_s, lb_a, ub_a: bounds of the state ``(4,)`` and of the action ``(2,)``, to which
+            both are clipped.
 
     Raises:
-        QPError: unknown ``noise_kind``, or negative or not finite ``noise_std``.
+        QPError: if ``noise_kind`` is unknown, a tensor does not fit, or ``noise_std`` or a start
+            range is negative or not finite.
+
+    Example:
+        >>> import torch
+        >>> physics = PointMass(noise_std=0.0)
+        >>> s, a = torch.tensor([1.0, 0.0, 0.0, 0.0]), torch.tensor([-2.0, 0.0])  # clipped to -1
+        >>> physics.step(s, a, nu=torch.zeros(4)), physics.cost(s, a)
+        (tensor([ 1.0000,  0.0000, -0.1000,  0.0000], dtype=torch.float64),
+         tensor(3., dtype=torch.float64))
     """
 
     noise_kind: str = "gaussian"
@@ -81,24 +90,24 @@ class PointMass(LinearSystem):
 
     @property
     def std(self) -> float:
-        """The standard deviation in force."""
+        """The noise's standard deviation: ``noise_std``, or the default of its kind."""
         return NOISE_STD[self.noise_kind] if self.noise_std is None else self.noise_std
 
     @property
     def start_range(self) -> Tensor:
-        """Half-widths ``(4,)`` of the start distribution."""
+        """The half-widths ``(4,)`` of the start distribution."""
         p, v = self.start_position, self.start_velocity
         return self.A.new_tensor([p, p, v, v])
 
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
-        """L(s, a) = s'Ws ``(*batch,)`` of the current s ``(*batch, 4)``; a does not enter."""
+        """Return L(s, a) = s'Ws ``(*batch,)`` of the current s ``(*batch, 4)``; a has no effect."""
         s = check_tensor("s", s, len(self.W)).to(self.W)
         return ((s @ self.W) * s).sum(-1)
 
     def starts(self, rng: Rng, count: int) -> Tensor:
-        """Start states ``(count, 4)``.
+        """Draw start states ``(count, 4)``.
 
-        numpy's generator draws the positions, then the velocities; torch's each state at once.
+        A NumPy generator draws all positions, then all velocities; a torch generator, whole states.
         """
         if isinstance(rng, torch.Generator):
             return self.start_range * (2 * uniform(rng, count, 4) - 1)
@@ -108,20 +117,23 @@ class PointMass(LinearSystem):
         return torch.as_tensor(np.hstack(draws)).to(self.A)
 
     def draw(self, rng: Rng, count: int) -> Tensor:
-        """Standard normal numbers ``(count, 4)``."""
+        """Draw standard normal numbers ``(count, 4)``."""
         return normal(rng, count, 4)
 
     def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
-        """The next nu ``(*batch, 4)`` from the last one and a standard normal draw."""
+        """Return the next nu ``(*batch, 4)`` from the last one and a standard normal draw."""
         step = self.std * draw.to(self.A)
         return nu.to(self.A) + step if self.noise_kind == "brownian" else step
 
     def corrupted(self, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The wrong model that learning starts from, and the first cost parameters.
+        """Draw the wrong model that learning starts from, and the initial cost parameters.
 
         Returns:
             A_hat ``(4, 4)`` and B_hat ``(4, 2)``, the true ones plus entries uniform in
             [-0.05, 0.05], and theta_1..theta_4 ``(4,)`` uniform in [0.5, 5]; drawn in this order.
+
+        Raises:
+            QPError: if ``seed`` is not a whole number >= 0.
         """
         check_whole("seed", seed, 0)
         rng = np.random.default_rng(seed)
@@ -132,21 +144,25 @@ class PointMass(LinearSystem):
 
 
 class PointMassGymEnv(LinearSystemGymEnv):
-    """``torch_qpmpc/PointMass-v0``: never terminates, its registration truncates it at 50 steps."""
+    """``torch_qpmpc/PointMass-v0``, which never terminates and is truncated at 50 steps."""
 
     def __init__(self, physics: PointMass | None = None) -> None:
         super().__init__(PointMass() if physics is None else physics)
 
 
 class PointMassEnv(LinearSystemEnv):
-    """``num_envs`` point masses in one :class:`LinearSystemEnv`.
+    """A :class:`LinearSystemEnv` of a `PointMass`.
 
     Args:
-        physics: ``None`` for ``PointMass()``.
-        num_envs, max_steps, dtype, device, seed: as of :class:`LinearSystemEnv`.
+        physics: the system; None for ``PointMass()``.
+        num_envs, max_steps, dtype, device, seed: as in :class:`LinearSystemEnv`.
 
     Raises:
-        QPError: ``num_envs`` or ``max_steps`` below 1.
+        QPError: if an argument does not fit.
+
+    Example:
+        >>> PointMassEnv(num_envs=2, seed=0).rollout(3)["observation"].shape
+        torch.Size([2, 3, 4])
     """
 
     def __init__(

@@ -1,1 +1,1 @@
-"""Q-learning and its relatives for a QPMPC, in TorchRL."""
+"""Q-learning and related algorithms for a QPMPC, on TorchRL."""

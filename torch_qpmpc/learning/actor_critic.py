@@ -1,7 +1,7 @@
-"""DDPG and TD3 with the QP as actor: TorchRL's losses, and the networks beside the QP.
+"""Policies and critics for TorchRL's losses of DDPG and TD3.
 
-The policy gradient goes through the solution's gradient, dpi/dtheta (`sensitivity`). A critic is a
-QP of its own, or a network, as is usual; the actor may be a network, too, to compare with.
+The policy gradient contains the gradient of the QP's solution, dpi/dtheta. The critic is a second
+QP or a network; the actor may be a network, too, for comparison.
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ from torch_qpmpc.mpc.module import QPMPC
 
 
 class BoundedPolicy(nn.Module):
-    """A network whose actions tanh keeps between their bounds, for any float dtype."""
+    """A network policy, with ``width`` units in each layer and actions bounded by tanh.
+
+    Its parameters are float32; it accepts states of any float dtype, and returns actions of it.
+    """
 
     low: Tensor
     high: Tensor
@@ -28,15 +31,16 @@ class BoundedPolicy(nn.Module):
         self.register_buffer("high", high.float())
 
     def forward(self, s: Tensor) -> Tensor:
-        """s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
+        """Map states ``(*batch, n_x)`` to actions ``(*batch, n_u)``."""
         share = (self.net(s.to(self.low)).tanh() + 1) / 2
         return (self.low + share * (self.high - self.low)).to(s.dtype)
 
 
 class Clip(torch.autograd.Function):
-    """a between its bounds; a gradient that would drive it further out is dropped, others pass.
+    """A clamp with a gradient that can bring an action back from outside its bounds.
 
-    A clamp's own gradient is zero outside, from where nothing would come back.
+    Outside the bounds, only gradients whose descent would move the action further out are zeroed. A
+    plain clamp zeroes all of them, so that an action outside would stay there.
     """
 
     @staticmethod
@@ -47,18 +51,18 @@ class Clip(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
         (below, above), (grad,) = ctx.saved_tensors, grads
-        # A descent moves a against its gradient.
+        # Descent moves a against its gradient.
         further_out = (below & (grad > 0)) | (above & (grad < 0))
         return grad.masked_fill(further_out, 0.0), None, None
 
 
 def clipped(a: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """a ``(*batch, n_u)`` between its bounds ``(n_u,)``, with the gradient of `Clip`."""
+    """Clip a ``(*batch, n_u)`` to its bounds ``(n_u,)``, with the gradient of `Clip`."""
     return cast("Tensor", Clip.apply(a, low.to(a), high.to(a)))
 
 
 class ClippedPolicy(nn.Module):
-    """pi(s) of a QP, clipped as plants do it: with soft action rows it may exceed the bounds."""
+    """A QP's policy pi(s), clipped to the action bounds, which soft rows let it exceed."""
 
     low: Tensor
     high: Tensor
@@ -70,12 +74,12 @@ class ClippedPolicy(nn.Module):
         self.register_buffer("high", high)
 
     def forward(self, s: Tensor) -> Tensor:
-        """s ``(*batch, n_x)`` to ``(*batch, n_u)``."""
+        """Map states ``(*batch, n_x)`` to actions ``(*batch, n_u)``."""
         return clipped(self.module.policy(s), self.low, self.high)
 
 
 class ActionValue(nn.Module):
-    """A network for -Q(s, a), in units of ``scale``."""
+    """A network for -Q(s, a), with ``width`` units in each layer and an output in ``scale``s."""
 
     def __init__(self, n_x: int, n_u: int, width: int, scale: float) -> None:
         super().__init__()
@@ -83,5 +87,5 @@ class ActionValue(nn.Module):
         self.net = MLP(n_x + n_u, 1, num_cells=[width, width], activation_class=nn.ReLU)
 
     def forward(self, s: Tensor, a: Tensor) -> Tensor:
-        """``(*batch, n_x)`` and ``(*batch, n_u)`` to ``(*batch, 1)``."""
+        """Map states ``(*batch, n_x)`` and actions ``(*batch, n_u)`` to ``(*batch, 1)``."""
         return self.scale * self.net(torch.cat((s, a), -1))

@@ -4,11 +4,11 @@ With g_i = dQ(s_i, a_i)/dtheta by the envelope theorem and a metric D on theta, 
 
     min over dtheta:  1/2 sum_i (delta_i - g_i'dtheta)^2 + 1/2 mu dtheta'D^-1 dtheta
 
-by its dual, ``dtheta = D sum_i alpha_i g_i``, ``(K + mu I) alpha = delta``, ``K_ij = g_i'D g_j``:
-a system as large as the batch. For a free C, whose gradients are the outer products chi_i z_i',
-``K = (chi chi') * (z P z')``, and none of them is formed. P is the metric of C's rows: a multiple
-of the identity, or with the SI penalty (eq:sdp3), a quadratic in each row, the inverse of the two
-curvatures' sum, so that the penalty is part of the same step.
+by its dual, ``dtheta = D sum_i alpha_i g_i``, ``(K + mu I) alpha = delta``, ``K_ij = g_i'D g_j``,
+a system of the batch's size. The gradients in a free C are the outer products chi_i z_i', so that
+``K = (chi chi') * (z P z')`` is computed without forming them. P is the metric of C's rows: a
+multiple of the identity or, with the SI penalty (eq:sdp3), which is quadratic in each row, the
+inverse of the summed curvatures of damping and penalty. The penalty thus enters the same step.
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ from torch_qpmpc.qp.derivatives import envelope_gradients
 from torch_qpmpc.qp.program import EVENT_SHAPES
 from torch_qpmpc.qp.solution import QPSolution
 
-#: Decrease over predicted decrease: below the first the damping rises, above the second it falls.
+#: A ratio of actual to predicted decrease below POOR raises the damping; one above GOOD lowers it.
 POOR, GOOD = 0.25, 0.75
-RISE, FALL, MOST_DAMPING = 4.0, 0.5, 1e6
+#: Factors by which the damping rises and falls, and its upper bound.
+RISE, FALL, MAX_DAMPING = 4.0, 0.5, 1e6
 
 
 def _positive(x: float) -> bool:
@@ -41,15 +42,15 @@ def _positive(x: float) -> bool:
 
 @dataclass(frozen=True, repr=False)
 class StepReport:
-    """What a step did.
+    """The outcome of a `GaussNewton.step`.
 
     Attributes:
-        solution: of Q(s, a) before the step.
-        damping: mu as a fraction of the mean of K's diagonal, as it was used.
-        ratio: the decrease of the squared errors over the predicted one; nan without trust region.
+        solution: the solution of Q(s, a) before the step.
+        damping: mu as a fraction of the mean of K's diagonal, as used by the step.
+        ratio: actual over predicted decrease of the objective; nan without a trust region.
         accepted: True if theta has moved.
-        unsolved: pairs that were left out because their QP has no solution.
-        without_target: other pairs that were left out because their target is not finite.
+        unsolved: number of pairs left out because their QP has no solution.
+        without_target: number of other pairs left out because their target is not finite.
     """
 
     solution: QPSolution
@@ -60,34 +61,34 @@ class StepReport:
     without_target: int = 0
 
     def __repr__(self) -> str:
-        """Each field in one line, the solution in its own few."""
+        """Return the numbers on one line, followed by the solution's summary."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         numbers = (f"{name}={x!r}" for name, x in values.items() if name != "solution")
         return f"StepReport({', '.join(numbers)}, solution={self.solution!r})"
 
 
 class GaussNewton(torch.optim.Optimizer):
-    """Levenberg-Marquardt steps for the learned parts of a `QPMPC`, whichever they are.
+    """A Levenberg-Marquardt optimiser of the learned parts of a `QPMPC`.
 
-    Its ``lr``, which torch's schedulers change, is the part of the step that is taken.
+    ``lr``, the fraction of each step that is taken, follows torch's schedulers.
 
     Args:
         mpc: the QPMPC. With ``on_failure="mask"``, pairs without a solution are left out.
         scales: the metric D, a factor for each learned part of theta or for the ``"cost"`` and the
             ``"constraints"``, as in `QPMPC.parameter_groups`. Only their ratios matter.
-        lr: the part of the step at first, in (0, 1].
-        damping: mu, as a fraction of the mean of K's diagonal; the least that the trust region
-            comes back to. It also says how far the noise of one batch is to be believed.
-        td_error_clip: bound of the TD error; none by default.
-        memory: how many gradients of past pairs a step respects: it changes their Q as little as
-            their part of the sum says, though nothing of them is solved again. For small batches,
-            down to a stream of single transitions; the recursive form of least squares.
-        trust_region: solve the batch again after a step and its projection (`QPMPC.project_`); take
-            back one that raised the squared errors (the targets held), and adapt the damping to how
-            well they were predicted.
+        lr: the initial fraction, in (0, 1].
+        damping: mu as a fraction of the mean of K's diagonal, and the trust region's lower bound
+            on it. A larger one makes a step less sensitive to its batch's noise.
+        td_error_clip: bound on the absolute TD error; none by default.
+        memory: number of past pairs whose gradients each step keeps, to penalise changes of their
+            Q at first order, without solving their QPs again. It serves small batches, down to
+            single transitions, as in recursive least squares.
+        trust_region: solve the batch again after each step and its projection (`QPMPC.project_`),
+            with the targets fixed; undo a step that raised the squared errors, and adapt the
+            damping to the ratio of actual to predicted decrease.
 
     Raises:
-        QPError: a number out of its range, or scales that do not fit the learned parts.
+        QPError: if a number is out of range, or the scales do not fit the learned parts.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -138,21 +139,23 @@ class GaussNewton(torch.optim.Optimizer):
         penalty: Tensor | None = None,
         warm_start: Tensor | None = None,
     ) -> StepReport:
-        """Move theta so that Q(s, a) approaches ``target``, as far as the damping lets it.
+        """Move theta so that Q(s, a) approaches ``target``, within the limits of the damping.
 
         Args:
             s, a: visited pairs, ``(B, n_x)`` and ``(B, n_u)``.
-            target: costs to go, L + gamma V(s+), ``(B,)``; where it is not finite, the pair is
-                left out and counted. If no pair is left, nothing moves, with a `RuntimeWarning`.
-                That a target has the wrong sign, as a reward or TorchRL's values have, cannot be
-                told from its numbers.
-            penalty: S ``(n_z, n_z)`` of a penalty ``1/2 tr(C S C')`` against the batch's mean of
-                ``1/2 delta^2``, such as `SystemIdentificationPenalty.curvature`; for a free C.
-            warm_start: active sets of Q(s, a), ``(B, n_g)``.
+            target: costs to go, L + gamma V(s+), ``(B,)``. Pairs with a target that is not finite
+                are left out and counted; if none is left, theta stays, with a `RuntimeWarning`.
+                The sign is not checked: negate rewards and TorchRL's values.
+            penalty: S ``(n_z, n_z)`` of a penalty ``1/2 tr(C S C')`` added to the batch's mean of
+                ``1/2 delta^2``, such as `SystemIdentificationPenalty.curvature`; for a free C only.
+            warm_start: active sets of Q(s, a) to start from, ``(B, n_g)``.
+
+        Returns:
+            The outcome of the step.
 
         Raises:
-            QPError: a shape that does not fit, a penalty without a free C, or a QPMPC that got
-                other parameters, as by `QPMPC.release`.
+            QPError: if a shape does not fit, C is not free but penalised, or the QPMPC has new
+                parameters, as after `QPMPC.release`.
         """
         mpc = self._mpc
         self._check_parameters()
@@ -173,8 +176,8 @@ class GaussNewton(torch.optim.Optimizer):
         left_out = unsolved, len(s) - unsolved - int(use.sum())
         if sum(left_out) == len(s):
             message = (
-                f"None of the {len(s)} pairs can be learned from: {left_out[0]} have a QP without "
-                f"a solution, {left_out[1]} a target that is not finite. Theta stays."
+                f"None of the {len(s)} pairs is usable: {left_out[0]} without a QP solution, "
+                f"{left_out[1]} without a finite target. Theta stays unchanged."
             )
             warnings.warn(message, RuntimeWarning, stacklevel=2)
             return StepReport(solution, group["damping"], math.nan, False, *left_out)
@@ -187,14 +190,14 @@ class GaussNewton(torch.optim.Optimizer):
         blocks = self._blocks(solution, use, penalty)
         for block in blocks:
             block.remember(self.state[block.leaf], self._memory)
-        # The past has no errors: only its curvature is known.
+        # Past pairs have no TD errors: they contribute their curvature alone.
         past = delta.new_zeros(len(blocks[0]) - len(delta) if blocks else 0)
         alpha, change = _solve(blocks, torch.cat((delta, past)), damping)
         change = change[: len(delta)]
         steps = [block.step(alpha) for block in blocks]
         before = _objective(delta, blocks)
         if not before.isfinite() or not all(step.isfinite().all() for step in steps):
-            # Numbers too large to be squared: more damping, and nothing of them in the memory.
+            # Overflow: raise the damping and clear the memory.
             self._adapt(math.nan)
             self.state.clear()
             return StepReport(solution, damping, math.nan, False, *left_out)
@@ -207,14 +210,14 @@ class GaussNewton(torch.optim.Optimizer):
         proposed = lr * change
         change = self._project(blocks, proposed)
         predicted = before - _objective(delta - change, blocks)
-        again = self._mpc.solve(s, a, warm_start=solution.active)
+        after = self._mpc.solve(s, a, warm_start=solution.active)
         decrease = before - _objective(
-            delta - torch.where(use, again.value - solution.value, 0), blocks
+            delta - torch.where(use, after.value - solution.value, 0), blocks
         )
-        # With nothing to gain there is nothing to judge, but a projection can make it a loss.
+        # Without a predicted decrease, reject the step only if the projection raised the objective.
         lost = not torch.equal(change, proposed) and not decrease >= 0
         ratio = float(decrease / predicted) if predicted > 0 else float(not lost)
-        accepted = ratio > 0  # false for the NaN of an infinite cost
+        accepted = ratio > 0  # False for nan, which an infinite cost causes
         if not accepted:
             for block, value in zip(blocks, old, strict=True):
                 block.leaf.copy_(value)
@@ -222,29 +225,29 @@ class GaussNewton(torch.optim.Optimizer):
         return StepReport(solution, damping, ratio, accepted, *left_out)
 
     def __reduce__(self) -> tuple:
-        # The module would be another one than that which its owner copies or saves beside it.
+        # The copy would hold a QPMPC of its own, apart from its owner's copy of it.
         raise QPError.expected(
             "GaussNewton",
             "a copy or a pickle",
             "its state_dict",
-            "Make another one for the copied QPMPC, and load the state_dict into it.",
+            "Make a GaussNewton for the copied QPMPC, and load the state_dict into it.",
         )
 
     def _check_parameters(self) -> None:
         """Raise `QPError` if the QPMPC's parameters are no longer those of this optimiser."""
         own = {id(parameter) for parameter in self._mpc.parameters()}
         groups = self.param_groups
-        lost = [x["name"] for x in groups if not own.issuperset(map(id, x["params"]))]
-        if lost:
-            got = f"a QPMPC that has other parameters of {', '.join(lost)} by now"
+        replaced = [x["name"] for x in groups if not own.issuperset(map(id, x["params"]))]
+        if replaced:
+            got = f"a QPMPC with new parameters of {', '.join(replaced)}"
             remedy = (
-                "QPMPC.release, and load_state_dict with assign=True, give it new ones: make the "
-                "GaussNewton anew after it."
+                "QPMPC.release and load_state_dict(assign=True) replace parameters: make a new "
+                "GaussNewton after them."
             )
             raise QPError.expected("mpc", got, "the parameters of this optimiser", remedy)
 
     def _project(self, blocks: list[_Dense | _OuterProducts], change: Tensor) -> Tensor:
-        """Project theta; ``change`` of Q with what that adds to it at first order, ``(B,)``."""
+        """Project theta; return Q's ``change`` ``(B,)`` plus the projection's at first order."""
         leaves = {id(leaf) for leaf in self._mpc._projected().values()}
         dense = [x for x in blocks if isinstance(x, _Dense) and id(x.leaf) in leaves]
         proposed = [block.leaf.clone() for block in dense]
@@ -254,20 +257,21 @@ class GaussNewton(torch.optim.Optimizer):
         return change
 
     def _adapt(self, ratio: float) -> None:
+        """Adapt the damping to the ratio of actual to predicted decrease; nan raises it."""
         for group in self.param_groups:
             if not ratio >= POOR:
-                group["damping"] = min(RISE * group["damping"], MOST_DAMPING)
+                group["damping"] = min(RISE * group["damping"], MAX_DAMPING)
             elif ratio > GOOD:
                 group["damping"] = max(FALL * group["damping"], self._least_damping)
 
     def _blocks(
         self, solution: QPSolution, use: Tensor, penalty: Tensor | None
     ) -> list[_Dense | _OuterProducts]:
-        """The gradients of Q in each learned part that is not frozen, zero where not in ``use``."""
+        """Return Q's gradients in each learned part that is not frozen, zero outside ``use``."""
         mpc = self._mpc
         weight = use.to(solution.z)
         z, chi, lam = solution.z, solution.chi, solution.lam
-        # The slacks are only asked for by a w that is learned.
+        # Only the gradient in a learned w needs the slacks.
         sigma = solution.sigma if solution.qp.w.requires_grad else torch.zeros_like(lam)
         gradients = envelope_gradients(weight, z, sigma, chi, lam, solution.xi)
         pairs = [(leaf, group["scale"]) for group in self.param_groups for leaf in group["params"]]
@@ -282,16 +286,16 @@ class GaussNewton(torch.optim.Optimizer):
         if factored is not None:
             parts.pop("C")
         parts = {n: x for n, x in parts.items() if x.requires_grad}
-        # Of a tensor for each pair, the gradient is that of each pair.
-        of_each = [gradients[n](x.expand(len(z), *x.shape)) for n, x in parts.items()]
+        # Expanded to one copy per pair, each part has one gradient per pair.
+        in_parts = [gradients[n](x.expand(len(z), *x.shape)) for n, x in parts.items()]
         dense = [leaf for leaf, _ in pairs if leaf is not factored]
-        found = iter(())
+        in_leaves = iter(())
         if dense:
-            found = iter(
+            in_leaves = iter(
                 torch.autograd.grad(
                     list(parts.values()),
                     dense,
-                    of_each,
+                    in_parts,
                     is_grads_batched=True,
                     materialize_grads=True,
                 )
@@ -299,24 +303,24 @@ class GaussNewton(torch.optim.Optimizer):
         return [
             _OuterProducts(leaf, scale, weight.unsqueeze(-1) * chi, z, penalty, mask)
             if leaf is factored
-            else _Dense(leaf, scale, next(found).reshape(len(z), -1))
+            else _Dense(leaf, scale, next(in_leaves).reshape(len(z), -1))
             for leaf, scale in pairs
         ]
 
 
-def _past(state: dict[str, Tensor], name: str, today: Tensor) -> Tensor:
-    """The remembered rows of the kind of ``today`` ``(B, n)``; none at first."""
-    past = state.get(name, today[:0])
-    if past.shape[1:] != today.shape[1:]:
-        got = f"a memory of gradients of {past.shape[1]} entries"
-        want = f"{today.shape[1]}, as this QPMPC has"
+def _past(state: dict[str, Tensor], name: str, current: Tensor) -> Tensor:
+    """Return the remembered rows for ``current`` ``(B, n)``, ``(M, n)``; empty at first."""
+    past = state.get(name, current[:0])
+    if past.shape[1:] != current.shape[1:]:
+        got = f"a memory of gradients with {past.shape[1]} entries"
+        want = f"{current.shape[1]}, as in this QPMPC"
         remedy = "Load the state of a GaussNewton of the same QPMPC."
         raise QPError.expected("state_dict", got, want, remedy)
     return past
 
 
 class _Dense:
-    """The gradients in one parameter, as rows ``(B, n)``; its metric is ``scale``."""
+    """The gradients in one parameter as rows ``(B, n)``, with the metric ``scale``."""
 
     def __init__(self, leaf: nn.Parameter, scale: float, rows: Tensor) -> None:
         self.leaf, self.scale, self.rows = leaf, scale, rows
@@ -325,34 +329,37 @@ class _Dense:
         return len(self.rows)
 
     def remember(self, state: dict[str, Tensor], count: int) -> None:
-        """Append up to ``count`` gradients of the past, and keep the newest for the next step."""
+        """Append the remembered gradients, and remember the newest ``count`` for the next step."""
         if count:
             self.rows = torch.cat((self.rows, _past(state, "rows", self.rows)))
             state["rows"] = self.rows[:count]
 
     def diagonal(self) -> Tensor:
-        """Of the kernel, ``(B,)``."""
+        """Return the kernel's diagonal without a penalty, ``(B,)``."""
         return self.scale * self.rows.square().sum(-1)
 
     def damp(self, mu: Tensor) -> Tensor:
-        """What the parameter's own penalty makes of Q, ``(B,)``: it has none."""
+        """Set the damping; return the change of Q ``(B,)`` by the penalty alone, here zero."""
         return self.rows.new_zeros(len(self.rows))
 
     def kernel(self) -> Tensor:
+        """Return the kernel ``(B, B)``."""
         return self.scale * self.rows @ self.rows.mT
 
     def step(self, alpha: Tensor) -> Tensor:
+        """Return the parameter's step for the dual solution ``alpha`` ``(B,)``."""
         return (self.scale * alpha @ self.rows).reshape(self.leaf.shape)
 
     def penalty(self) -> Tensor | float:
+        """Return the penalty of the parameter, here none."""
         return 0.0
 
 
 class _OuterProducts:
     """The gradients ``chi_i z_i'`` in C, with the metric P ``(n_z, n_z)`` of its rows.
 
-    The penalty ``1/2 tr(C S C')`` draws C by ``drift`` before any TD error does. Where a ``mask``
-    says which entries of C are learned, rows of the same pattern have a P of their own.
+    The penalty ``1/2 tr(C S C')`` by itself moves C by ``drift``. With a ``mask`` of the learned
+    entries of C, each pattern of learned entries in a row has its own P. Methods as in `_Dense`.
     """
 
     def __init__(
@@ -379,8 +386,8 @@ class _OuterProducts:
 
     def diagonal(self) -> Tensor:
         chi, z = self.chi.square(), self.z.square()
-        found = (chi[:, i].sum(-1) * z[:, j].sum(-1) for i, j, _ in self.patterns)
-        return self.scale * sum(found, torch.zeros_like(z[:, 0]))
+        diagonals = (chi[:, i].sum(-1) * z[:, j].sum(-1) for i, j, _ in self.patterns)
+        return self.scale * sum(diagonals, torch.zeros_like(z[:, 0]))
 
     def damp(self, mu: Tensor) -> Tensor:
         drifted = self.z.new_zeros(len(self.z))
@@ -405,17 +412,17 @@ class _OuterProducts:
         return K
 
     def step(self, alpha: Tensor) -> Tensor:
-        found = self.drift.clone()
+        step = self.drift.clone()
         for (i, _, entries), z_P in zip(self.patterns, self.z_P, strict=True):
-            found[entries] += (alpha.unsqueeze(-1) * self.chi[:, i]).mT @ z_P
-        return found
+            step[entries] += (alpha.unsqueeze(-1) * self.chi[:, i]).mT @ z_P
+        return step
 
     def penalty(self) -> Tensor | float:
         return 0.0 if self.S is None else 0.5 * ((self.leaf @ self.S) * self.leaf).sum()
 
 
 def _patterns(mask: Tensor | None) -> list[tuple[Any, Any, Any]]:
-    """The rows of C that learn the same entries, which these are, and the index of both in C."""
+    """Group the rows of C by learned entries: return their rows, columns, and index in C."""
     if mask is None:
         return [(slice(None), slice(None), (slice(None), slice(None)))]
     kinds, kind = torch.unique(mask, dim=0, return_inverse=True)
@@ -426,7 +433,7 @@ def _patterns(mask: Tensor | None) -> list[tuple[Any, Any, Any]]:
 def _solve(
     blocks: list[_Dense | _OuterProducts], delta: Tensor, damping: float
 ) -> tuple[Tensor, Tensor]:
-    """alpha ``(B,)``, and the change of Q that the whole step is expected to make, ``(B,)``."""
+    """Solve the dual; return alpha ``(B,)`` and the step's predicted change of Q ``(B,)``."""
     mu = damping * sum((block.diagonal() for block in blocks), torch.zeros_like(delta)).mean()
     mu = mu.clamp(min=torch.finfo(mu.dtype).tiny)
     drifted = sum((block.damp(mu) for block in blocks), torch.zeros_like(delta))
@@ -439,10 +446,11 @@ def _solve(
 
 
 def _move(blocks: list[_Dense | _OuterProducts], steps: list[Tensor], lr: float) -> None:
+    """Add ``lr`` times its step to each parameter."""
     for block, step in zip(blocks, steps, strict=True):
         block.leaf.add_(step, alpha=lr)
 
 
-def _objective(left: Tensor, blocks: list[_Dense | _OuterProducts]) -> Tensor:
-    """What a step is to decrease: half the squared errors, and the penalties."""
-    return 0.5 * left.square().sum() + sum(block.penalty() for block in blocks)
+def _objective(errors: Tensor, blocks: list[_Dense | _OuterProducts]) -> Tensor:
+    """Return what a step minimises: half the sum of squared errors, plus the penalties."""
+    return 0.5 * errors.square().sum() + sum(block.penalty() for block in blocks)

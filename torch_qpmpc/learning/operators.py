@@ -1,7 +1,7 @@
-"""TensorDict modules over a QPMPC: the QP as critic, value and actor of a TorchRL script.
+"""TensorDict modules that make a QPMPC the critic, value or actor of a TorchRL script.
 
-Here, and only here, costs become rewards: TorchRL maximises, so state_value = -V(s) and
-state_action_value = -Q(s, a), both with the trailing dimension of one that TorchRL wants.
+Only here do costs become rewards: TorchRL maximises, so state_value = -V(s) and
+state_action_value = -Q(s, a), both with TorchRL's trailing dimension of one.
 """
 
 from __future__ import annotations
@@ -18,13 +18,16 @@ from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 
-#: Where a policy in closed loop leaves its active sets from step to step.
+#: The key of the active sets that a policy in closed loop passes from step to step.
 POLICY_ACTIVE_SET = "policy_active_set"
 
 
 class _QPOperator(TensorDictModuleBase):
-    """A view of a QPMPC. Every view holds it as ``module``, so that the parameters of one, such as
-    a target network's, can drive any other."""
+    """A view of a QPMPC.
+
+    Every view holds the QPMPC as ``module``, so that the parameters of one view, such as those of
+    a target network, fit any other.
+    """
 
     module: QPMPC
 
@@ -44,7 +47,7 @@ class _QPOperator(TensorDictModuleBase):
         self.out_keys = out_keys  # pyright: ignore[reportAttributeAccessIssue]
 
     def _set_value(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Minus V, or minus Q where there is an action to read, under the first out-key."""
+        """Write -V, or -Q if the in-keys include an action, to the first out-key."""
         inputs = [_read(tensordict, key) for key in self.in_keys]
         if self.active_set_key is None:
             cost = self.module(*inputs)
@@ -56,25 +59,26 @@ class _QPOperator(TensorDictModuleBase):
 
 
 def _read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """An entry; without this check, the Q of a missing action would be V."""
+    """Return the entry ``key``; raise `QPError` if it is missing, where V would pass for Q."""
     value = tensordict.get(key, None)
     if value is None:
-        found = ", ".join(map(str, tensordict.keys(True, True))) or "nothing"
+        present = ", ".join(map(str, tensordict.keys(True, True))) or "no entry"
         remedy = "Rename the operator's keys, such as action_key, or the TensorDict's."
-        raise QPError.expected(str(key), "no such entry", f"one beside {found}", remedy)
+        raise QPError.expected(str(key), f"a TensorDict with {present}", f"one with {key}", remedy)
     return value
 
 
 class QPPolicyOperator(_QPOperator):
-    """pi(s): observation ``(*batch, n_x)`` to action ``(*batch, n_u)``.
+    """The policy pi(s): observation ``(*batch, n_x)`` to action ``(*batch, n_u)``.
 
-    With an ``active_set_key`` each call starts from the active sets under that key, or from the
-    empty ones where there are none, and leaves its own there. Rollouts and collectors carry them to
-    the next step.
+    With an ``active_set_key`` each call starts from the active sets under that key, or from empty
+    ones if there are none, and writes its own there. Rollouts and collectors carry them to the next
+    step.
     """
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write pi(s) to the action key."""
         s = _read(tensordict, self.in_keys[0])
         if self.active_set_key is None:
             return tensordict.set(self.out_keys[0], self.module.policy(s))
@@ -88,23 +92,30 @@ class QPPolicyOperator(_QPOperator):
 
 
 class QPValueOperator(_QPOperator):
-    """-V(s): observation ``(*batch, n_x)`` to state_value ``(*batch, 1)``."""
+    """The state value -V(s): observation ``(*batch, n_x)`` to state_value ``(*batch, 1)``."""
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write -V(s) to the value key."""
         return self._set_value(tensordict)
 
 
 class QPActorValueOperator(_QPOperator):
-    """-Q(s, a), and the views that share its parameters.
+    """The critic -Q(s, a): (observation, action) to state_action_value ``(*batch, 1)``.
+
+    The observation is ``(*batch, n_x)``, the action ``(*batch, n_u)``. The views of the value and
+    of the policy share its parameters.
 
     Args:
         mpc: the QPMPC.
-        observation_key, action_key: what it reads.
-        state_value_key, state_action_value_key: what the value and the critic write.
-        active_set_key: where the value and the critic write the QP's active set, int8
-            ``(*batch, n_g)``, and read one to start from if there is any, as from a replay buffer
-            that kept it. None, the default, starts cold.
+        observation_key, action_key: the keys of its inputs.
+        state_value_key, state_action_value_key: the output keys of the value and the critic.
+        active_set_key: the key where the value and the critic write the QP's active set, int8
+            ``(*batch, n_g)``, after starting from the one they find there, such as one stored in a
+            replay buffer. None, the default, starts cold.
+
+    Raises:
+        QPError: if ``mpc`` is not a QPMPC, or a call lacks an input.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -131,28 +142,29 @@ class QPActorValueOperator(_QPOperator):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write -Q(s, a) to the action value's key."""
         return self._set_value(tensordict)
 
     def get_policy_operator(self, active_set_key: NestedKey | None = None) -> QPPolicyOperator:
-        """The actor: observation to action.
+        """Return the actor: observation to action.
 
-        ``active_set_key``, where each step of an episode leaves its active set for the next one, is
-        another one than that of Q. None starts each step cold.
+        ``active_set_key`` is the key of the active set that each step of an episode passes to the
+        next; it must not be the critic's. None starts each step cold.
         """
         return QPPolicyOperator(self.module, self.in_keys[:1], self.in_keys[1], active_set_key)
 
     def get_value_operator(self) -> QPValueOperator:
-        """The state value: observation to state_value."""
+        """Return the state value: observation to state_value."""
         keys = self.state_value_key, self.active_set_key
         return QPValueOperator(self.module, self.in_keys[:1], *keys)
 
     def get_critic_operator(self) -> QPActorValueOperator:
-        """The critic: (observation, action) to state_action_value, this operator itself."""
+        """Return the critic, this operator: (observation, action) to state_action_value."""
         return self
 
 
 def warm_policy(mpc: QPMPC) -> Callable[[Tensor], Tensor]:
-    """`QPMPC.policy` for one closed loop: each call starts from the last call's active sets.
+    """Return `QPMPC.policy` for one closed loop: each call starts from the last active sets.
 
     Example:
         >>> import torch_qpmpc as qm
@@ -166,9 +178,9 @@ def warm_policy(mpc: QPMPC) -> Callable[[Tensor], Tensor]:
 
 
 def in_closed_loop(actor: TensorDictModuleBase) -> Callable[[Tensor], Tensor]:
-    """An actor as a function s to a, for one closed loop.
+    """Return an actor as a function from s to a, for one closed loop.
 
-    What the actor writes beside the action, such as active sets, is there at its next call.
+    Other entries that the actor writes, such as active sets, are inputs of its next call.
     """
     carried = TensorDict()
 

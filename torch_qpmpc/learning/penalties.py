@@ -1,7 +1,7 @@
-"""The two penalties that pull C towards an MPC scheme's: deviation and system identification.
+"""The penalties that pull C towards an MPC scheme's: deviation and system identification (SI).
 
 Each is a pure function of C, and a thin module that holds its constants. Both are differentiable
-regularisers to add to the Q-learning loss; the deviation penalty also has its exact proximal step.
+terms of a Q-learning loss; the deviation penalty also has an exact proximal step.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch_qpmpc.checks import check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
 
-WINDOWS = "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}."
+WINDOWS_REMEDY = "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}."
 
 
 def _finite(x: float) -> bool:
@@ -22,28 +22,28 @@ def _finite(x: float) -> bool:
 
 
 def deviation_penalty(C: Tensor, C_0: Tensor, C_mask: Tensor) -> Tensor:
-    """``sum |C_mask * (C - C_0)|`` (eq:sdp2): C, C_0, C_mask ``(n_c, n_z)`` to a scalar."""
+    """Return the scalar ``sum |C_mask * (C - C_0)|`` (eq:sdp2) of C, C_0, C_mask ``(n_c, n_z)``."""
     return (C_mask * (C - C_0)).abs().sum()
 
 
 def system_identification_penalty(
     C: Tensor, windows: Tensor, *, normalised: bool = False
 ) -> Tensor:
-    """``sum_i ||C tau_i||^2`` (eq:sdp3).
+    """Return ``sum_i ||C tau_i||^2`` (eq:sdp3), a scalar.
 
-    C has a gauge: T C with any invertible T is the same QP, so the penalty can be made small by
-    shrinking C. With ``normalised`` the rows of C are scaled to unit norm first.
+    C has a gauge: T C is the same QP for any invertible T, so that shrinking C alone lowers the
+    penalty. ``normalised`` prevents that.
 
     Args:
         C: ``(n_c, n_z)``.
         windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}], ``(M, n_z)``.
-        normalised: whether to scale the rows of C to unit norm.
+        normalised: scale the rows of C to unit norm first.
 
-    Returns:
-        A scalar.
+    Raises:
+        QPError: if a shape does not fit.
     """
     check_tensor("C", C, "n_c", "n_z", batched=False, remedy="Pass mpc.C.")
-    check_tensor("windows", windows, "M", C.shape[-1], batched=False, remedy=WINDOWS)
+    check_tensor("windows", windows, "M", C.shape[-1], batched=False, remedy=WINDOWS_REMEDY)
     if normalised:
         C = F.normalize(C, dim=-1)
     return (windows.to(C.dtype) @ C.mT).square().sum()
@@ -52,8 +52,8 @@ def system_identification_penalty(
 class DeviationPenalty(nn.Module):
     """The deviation penalty ``sum |C_mask * (C - C_0)|`` (eq:sdp2).
 
-    (1, 1, 1) holds C at C_0, (0, 0, 0) frees it. With c_3 = 0 everything below the band is free:
-    the prediction stays causal, but need not be Markovian.
+    Weights (c_1, c_2, c_3) of (1, 1, 1) hold C at C_0; those of (0, 0, 0) free it. With c_3 = 0
+    everything below the band is free: the prediction stays causal, but need not be Markovian.
 
     Args:
         C_0: the banded matrix, ``(N n_x, N (n_x + n_u) + n_x)``.
@@ -62,11 +62,11 @@ class DeviationPenalty(nn.Module):
         c_1: weight above the band, where the future would act on the past.
         c_2: weight on the band.
         c_3: weight below the band.
-        growth: how much the weights off the band grow with each further stage of distance,
+        growth: relative growth of the weights off the band with the distance to it in stages,
             ``c (1 + growth (distance - 1))``.
 
     Raises:
-        QPError: a negative weight, or a C_0 whose shape is no horizon's.
+        QPError: if a weight is negative or not finite, or the shape of C_0 fits no horizon.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -116,7 +116,7 @@ class DeviationPenalty(nn.Module):
         self.register_buffer("C_mask", mask)
 
     def forward(self, C: Tensor) -> Tensor:
-        """The penalty of C ``(N n_x, n_z)``, a scalar."""
+        """Return the penalty of C ``(N n_x, n_z)``, a scalar."""
         check_tensor("C", C, *self.C_0.shape, batched=False, remedy="Pass mpc.C.")
         return deviation_penalty(C, self.C_0, self.C_mask)
 
@@ -124,20 +124,23 @@ class DeviationPenalty(nn.Module):
     def proximal_step_(self, C: Tensor, scale: float = 1.0) -> None:
         """Soft-threshold C towards C_0, in place: the minimiser of eq:sdp2 in Delta theta.
 
-        After any optimiser's step to C it solves
-        ``min_X 1/2 |X - C|^2 + scale |C_mask * (X - C_0)|``. Unlike the subgradient it reaches C_0
-        exactly. After SGD's step it is the paper's program. Adam's and Gauss-Newton's metrics are
-        not in it: in Adam's, an entry with a smaller step would have a smaller threshold.
+        After an optimiser's step to C it solves
+        ``min_X 1/2 |X - C|^2 + scale |C_mask * (X - C_0)|``. Unlike a subgradient step it reaches
+        C_0 exactly. After a step of SGD it solves the paper's program. It ignores the metrics of
+        Adam and Gauss-Newton: in Adam's, an entry with a smaller step has a smaller threshold.
 
         Args:
-            C: the parameter.
+            C: the parameter, ``(N n_x, n_z)``.
             scale: weight of the penalty against the step; 1 is the paper's program.
+
+        Raises:
+            QPError: if C is computed from parameters or does not fit, or ``scale`` is negative.
         """
         check_tensor("C", C, *self.C_0.shape, batched=False, remedy="Pass mpc.C.")
         if C.grad_fn is not None:
             remedy = (
-                "Of a QPMPC that learns some entries of C, pass mpc.leaves('C')[0]; a tied C is "
-                "computed from A and B: release() it first."
+                "If only some entries of C are learned, pass mpc.leaves('C')[0]; a tied C is "
+                "computed from A and B: call release() first."
             )
             raise QPError.expected("C", "a computed tensor", "a parameter", remedy)
         check_number("scale", scale, _finite, "a finite number >= 0")
@@ -149,11 +152,19 @@ class SystemIdentificationPenalty(nn.Module):
     """The system-identification (SI) penalty ``beta sum_i ||C tau_i||^2`` (eq:sdp3).
 
     Args:
-        beta: its weight.
-        normalised: scale the rows of C to unit norm, against the gauge freedom of C.
+        beta: weight of the penalty.
+        normalised: scale the rows of C to unit norm, as shrinking C would lower the penalty.
 
     Raises:
-        QPError: a negative beta.
+        QPError: if beta is negative or not finite.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> mpc = qm.QPMPC.from_model(torch.eye(1), torch.eye(1), horizon=1)
+        >>> penalty = qm.SystemIdentificationPenalty(beta=0.5)
+        >>> windows = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 5.0]])  # [s_0, a_0, s_1]
+        >>> penalty(mpc.C, windows).item()  # the second is 2 off the model s_1 = s_0 + a_0
+        2.0
     """
 
     def __init__(self, beta: float = 1e-6, *, normalised: bool = False) -> None:
@@ -162,17 +173,17 @@ class SystemIdentificationPenalty(nn.Module):
         self.beta, self.normalised = beta, normalised
 
     def curvature(self, windows: Tensor) -> Tensor:
-        """S ``(n_z, n_z)`` of the penalty as ``1/2 tr(C S C')``, which it is if not normalised.
+        """Return S ``(n_z, n_z)``: the penalty on windows ``(M, n_z)`` is ``1/2 tr(C S C')``.
 
         Raises:
-            QPError: it is normalised.
+            QPError: if the penalty is normalised, so not quadratic in C, or a shape does not fit.
         """
         if self.normalised:
-            raise QPError.expected("normalised", True, "False", "Only then it is a quadratic in C.")
-        check_tensor("windows", windows, "M", "n_z", batched=False, remedy=WINDOWS)
+            raise QPError.expected("normalised", True, "False", "Only then is it quadratic in C.")
+        check_tensor("windows", windows, "M", "n_z", batched=False, remedy=WINDOWS_REMEDY)
         windows = windows.to(torch.float64)
         return 2 * self.beta * windows.mT @ windows
 
     def forward(self, C: Tensor, windows: Tensor) -> Tensor:
-        """The penalty of C ``(n_c, n_z)`` on windows ``(M, n_z)``, a scalar."""
+        """Return the penalty of C ``(n_c, n_z)`` on windows ``(M, n_z)``, a scalar."""
         return self.beta * system_identification_penalty(C, windows, normalised=self.normalised)

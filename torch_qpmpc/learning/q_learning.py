@@ -23,10 +23,10 @@ from torch_qpmpc.qp.tracing import has_values
 
 
 def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Tensor:
-    """The loss of one TD error delta = target - prediction, elementwise, ``(*batch,)``.
+    """Return the loss of each TD error delta = target - prediction, ``(*batch,)``.
 
-    ``1/2 delta^2``, whose gradient step with rate alpha is the paper's update alpha delta grad Q
-    (eq:thup). With ``clip`` the delta of the update is clipped to plus or minus it (Huber's loss).
+    It is ``1/2 delta^2``, whose gradient step with rate alpha is the paper's update alpha delta
+    grad Q (eq:thup). With ``clip`` it is Huber's loss, which clips that delta to plus or minus it.
     """
     if clip is None:
         return 0.5 * (target - prediction).square()
@@ -34,10 +34,10 @@ def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Te
 
 
 def td_metadata(prediction: Tensor, target: Tensor) -> dict[str, Tensor]:
-    """Detached scalars that describe a batch of values and their targets, ``(*batch,)`` each.
+    """Return detached scalars that describe a batch of values and their targets, ``(*batch,)``.
 
-    What is not finite is left out, and counted: a NaN target as an invalid reward, all else as a QP
-    without a solution.
+    Entries that are not finite are left out and counted: NaN targets as invalid rewards, the others
+    as QPs without a solution.
     """
     use = prediction.isfinite() & target.isfinite()
     invalid = target.isnan()
@@ -61,12 +61,12 @@ def td_metadata(prediction: Tensor, target: Tensor) -> dict[str, Tensor]:
 
 
 def invalid_rewards(tensordict: TensorDictBase, reward: NestedKey, effect: str) -> Tensor:
-    """Where the rewards are NaN or infinite, ``(*batch, 1)``; if anywhere, a `RuntimeWarning`.
+    """Return True where a reward is NaN or infinite, ``(*batch, 1)``, and warn if any is.
 
     Args:
         tensordict: a batch of transitions.
         reward: the key of the rewards under ``"next"``.
-        effect: what the warning says that they do.
+        effect: the consequence, a sentence for the `RuntimeWarning`.
     """
     key = unravel_key(("next", reward))
     invalid = ~tensordict.get(key).isfinite()
@@ -77,25 +77,32 @@ def invalid_rewards(tensordict: TensorDictBase, reward: NestedKey, effect: str) 
 
 
 class QPQLearningLoss(LossModule):
-    """Semi-gradient Q-learning, delta = L + gamma (1 - terminated) V(s+) - Q(s, a) (eq:thup).
+    """The loss of semi-gradient Q-learning with a QP (eq:thup).
 
-    V and Q are the same QP with and without u_0 fixed, so V(s+) is exactly min over a of Q(s+, a).
-    In TorchRL's signs, reward = -L. Truncation bootstraps, termination does not. Samples whose QP
-    has no certified solution (``on_failure="mask"`` in the QPMPC) add nothing to loss or gradient
-    and are counted in ``unsolved``. So do those whose return contains a reward that is NaN or
-    infinite, which are counted in ``invalid_reward``, with a `RuntimeWarning`.
+    The TD error is delta = L + gamma (1 - terminated) V(s+) - Q(s, a), with reward = -L in TorchRL.
+    V and Q are the same QP without and with u_0 fixed, so V(s+) is exactly min over a of Q(s+, a).
+    Truncation bootstraps, termination does not.
+
+    Samples whose QP has no certified solution (``on_failure="mask"`` in the QPMPC) add nothing to
+    the loss or its gradient and are counted in ``unsolved``. So are, in ``invalid_reward`` and with
+    a `RuntimeWarning`, those with a NaN or infinite reward in their return.
+
+    The discount factor is set as for any TorchRL loss, by ``make_value_estimator(gamma=0.9)``; its
+    default is TorchRL's 0.99, independent of the QP's gamma. The sign of the rewards is not
+    checked: pass -L, not L.
 
     Args:
-        value_network: the critic, whose parameters are learned.
-        delay_value: evaluate V(s+) with a target network. Off, as in the paper: a transition is
-            evaluated at today's theta.
-        td_error_clip: bound of the TD error in the update; none by default.
+        value_network: the critic to learn.
+        delay_value: evaluate V(s+) with a target network. By default, as in the paper, with the
+            current theta.
+        td_error_clip: bound on the absolute TD error in the update; none by default.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
-        use_prioritized_weights: weight the samples by ``priority_weight`` where a buffer gives it.
+        use_prioritized_weights: weight the samples by ``priority_weight``; by default ``"auto"``,
+            if the batch contains it.
 
-    The discount factor is set as everywhere in TorchRL, by ``make_value_estimator(gamma=0.9)``;
-    without it TorchRL's own 0.99 holds, whatever the QP's gamma is. Rewards are ``-L``: that they
-    have the wrong sign, costs in their place, cannot be told from their numbers.
+    Raises:
+        QPError: if an argument or, in a call, an entry of the batch does not fit.
+        TypeError: if ``gamma`` is passed here.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -119,7 +126,7 @@ class QPQLearningLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that ``set_keys`` can rename; defaults as in TorchRL's other losses."""
+        """The keys that ``set_keys`` can rename; the defaults are those of TorchRL's losses."""
 
         advantage: NestedKey = "advantage"
         value_target: NestedKey = "value_target"
@@ -191,20 +198,20 @@ class QPQLearningLoss(LossModule):
         self.reduction = reduction or "mean"
         self.use_prioritized_weights = use_prioritized_weights
         self.convert_to_functional(
-            value_network,  # pyright: ignore[reportArgumentType] - any TensorDict module will do
+            value_network,  # pyright: ignore[reportArgumentType] - any TensorDict module is accepted
             "value_network",
             create_target_params=delay_value,
         )
-        # Outside the module's registry, as its parameters are the value network's.
+        # Not registered as a submodule, because its parameters are the value network's.
         view = self.value_network.get_value_operator()
         object.__setattr__(self, "state_value_network", view)
 
     def get_extra_state(self) -> Tensor:
-        """What the state_dict tells of the QPMPC that it belongs to."""
+        """Return the part of the state_dict that identifies its QPMPC."""
         return self.value_network.module.get_extra_state()
 
     def set_extra_state(self, state: Tensor) -> None:
-        """`_load_from_state_dict` has compared it already."""
+        """Do nothing: `_load_from_state_dict` has compared it already."""
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         super()._load_from_state_dict(
@@ -244,7 +251,11 @@ class QPQLearningLoss(LossModule):
     def make_value_estimator(
         self, value_type: ValueEstimators | str | None = None, **hyperparams: Any
     ) -> Any:
-        """Choose how V(s+) enters the target: TD0 (default), TD1 or TDLambda."""
+        """Choose how V(s+) enters the target: TD0 (default), TD1 or TDLambda.
+
+        Raises:
+            QPError: if ``gamma`` or ``lmbda`` is not in [0, 1].
+        """
         for name in {"gamma", "lmbda"} & hyperparams.keys():
             _check_factor(name, hyperparams[name])
         value_type, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
@@ -262,25 +273,25 @@ class QPQLearningLoss(LossModule):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The loss of a batch of transitions, and detached scalars that describe it."""
+        """Return the loss of a batch of transitions, with detached scalars that describe it."""
         loss_value, metadata = self.loss_value(tensordict)
         out = TensorDict({"loss_value": loss_value, **metadata}, batch_size=[])
         self._clear_weakrefs(tensordict, out, "value_network_params", "target_value_network_params")
         return out
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """`forward` with the loss apart; writes the squared TD error under the priority key.
+        """Return `forward`'s loss and scalars; write the squared TD error as the priority.
 
         If the value network has an ``active_set_key``, the active sets of Q(s, a) and, under
-        ``"next"``, of V(s+) are read from there where they are, and written.
+        ``"next"``, of V(s+) are read from there if present, and written there.
         """
         self._check_batch(tensordict)
         weights = self._maybe_get_priority_weight(tensordict)
         if weights is not None and has_values(weights) and not weights.isfinite().all():
             name = str(self.tensor_keys.priority_weight)
-            raise QPError.expected(name, "NaN or inf", "finite weights", "Look at the priorities.")
+            raise QPError.expected(name, "NaN or inf", "finite weights", "Check the priorities.")
         active_set = self.value_network.active_set_key
-        visited = tensordict.select(*_read_by(self.value_network), strict=False).detach()
+        visited = tensordict.select(*_reads(self.value_network), strict=False).detach()
         call_with(self.value_network_params, self.value_network, visited)
         if active_set is not None:
             tensordict.set(active_set, visited.get(active_set))
@@ -292,8 +303,8 @@ class QPQLearningLoss(LossModule):
         if has_values(use) and not use.any():
             unsolved, invalid = int(metadata["unsolved"]), int(metadata["invalid_reward"])
             message = (
-                f"None of the batch's {use.numel()} transitions can be learned from: {unsolved} "
-                f"have a QP without a solution, {invalid} an invalid reward. The loss is zero."
+                f"None of the batch's {use.numel()} transitions is usable: {unsolved} without a "
+                f"QP solution, {invalid} with an invalid reward. The loss is zero."
             )
             warnings.warn(message, RuntimeWarning, stacklevel=2)
         prediction = torch.where(use, prediction, 0)
@@ -304,39 +315,39 @@ class QPQLearningLoss(LossModule):
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
 
     def _check_batch(self, tensordict: TensorDictBase) -> None:
-        """Raise `QPError` where an entry is missing, or would broadcast against the values."""
+        """Raise `QPError` if an entry is missing or would broadcast against the values."""
         keys, shape = self.tensor_keys, (*tensordict.batch_size, 1)
         for key in (keys.reward, keys.done, keys.terminated):
             path = unravel_key(("next", key))
             value = tensordict.get(path, None)
             if value is None:
                 if key == keys.terminated and tensordict.get(("next", keys.done), None) is not None:
-                    continue  # then done says it
-                remedy = "Name another by set_keys, or collect transitions."
+                    continue  # done replaces it
+                remedy = "Name another with set_keys, or collect transitions."
                 raise QPError.expected(str(path), "no such entry", f"one of shape {shape}", remedy)
             if value.shape != shape:
-                remedy = "Unsqueeze its last dimension: TorchRL's rewards and flags have it."
+                remedy = "TorchRL's rewards and flags have a last dimension of one."
                 raise QPError.expected(
                     str(path), f"shape {tuple(value.shape)}", f"shape {shape}", remedy
                 )
             if key != keys.reward and value.dtype != torch.bool:
-                raise QPError.expected(str(path), value.dtype, "torch.bool", "Convert: .bool().")
+                raise QPError.expected(str(path), value.dtype, "torch.bool", "Convert it: .bool().")
         following: TensorDictBase = tensordict.get("next")
         for key in self.state_value_network.in_keys:
             if following.get(key, None) is None:
-                found = ", ".join(sorted(str(name) for name in following.keys(True, True)))
-                remedy = "Collect what follows each step, or name it by the operator's keys."
-                name, got = str(unravel_key(("next", key))), f"no such entry beside {found}"
-                raise QPError.expected(name, got, "the state after the step", remedy)
+                present = ", ".join(sorted(str(name) for name in following.keys(True, True)))
+                remedy = "Collect the next observations, or set the operator's observation_key."
+                name, got = str(unravel_key(("next", key))), f"a TensorDict with {present}"
+                raise QPError.expected(name, got, f"one with {key}", remedy)
         if 0 in tensordict.batch_size:
             raise QPError.expected("tensordict", "an empty batch", "at least one transition")
 
     @torch.no_grad()
     def target(self, tensordict: TensorDictBase) -> Tensor:
-        """What the estimator makes of V(s+), ``(*batch,)``.
+        """Return the value estimator's target, ``(*batch,)``, in TorchRL's signs.
 
-        With TD(0), r + gamma (1 - terminated) V(s+) in TorchRL's signs. It is -inf where it
-        contains a V(s+) without a solution, and NaN where it contains an invalid reward.
+        With TD(0) it is -(L + gamma (1 - terminated) V(s+)). It is -inf where it contains a V(s+)
+        without a solution, and NaN where it contains an invalid reward.
         """
         reward = tensordict.get(("next", self.tensor_keys.reward))
         effect = "Those transitions are left out of the loss and its gradient."
@@ -345,20 +356,20 @@ class QPQLearningLoss(LossModule):
         target = self._estimate(tensordict, reward.masked_fill(invalid, 0), next_value)
         target = torch.where(target.isfinite(), target, -torch.inf)
         if not has_values(invalid) or invalid.any():
-            # The returns of rewards that are one where they are invalid, and zero elsewhere.
-            spoilt = self._estimate(tensordict, invalid.to(reward), torch.zeros_like(next_value))
-            target = target.masked_fill(spoilt != 0, torch.nan)
+            # With rewards of one if invalid and else zero, returns are nonzero if they contain one.
+            tainted = self._estimate(tensordict, invalid.to(reward), torch.zeros_like(next_value))
+            target = target.masked_fill(tainted != 0, torch.nan)
         return target
 
     def _estimate(self, tensordict: TensorDictBase, reward: Tensor, next_value: Tensor) -> Tensor:
-        """The returns of these rewards, ``(*batch,)``, along the batch's transitions."""
+        """Return the value estimates ``(*batch,)`` of the batch with these rewards."""
         batch = tensordict.copy().set(("next", self.tensor_keys.reward), reward)
         return self.value_estimator.value_estimate(batch, next_value=next_value).squeeze(-1)
 
     def _next_value(self, tensordict: TensorDictBase) -> Tensor:
-        """-V(s+), ``(*batch, 1)``; zero after a termination, where it is not used."""
+        """Return -V(s+), ``(*batch, 1)``; zero after a termination, where it is not used."""
         active_set = self.state_value_network.active_set_key
-        following = tensordict.get("next").select(*_read_by(self.state_value_network), strict=False)
+        following = tensordict.get("next").select(*_reads(self.state_value_network), strict=False)
         call_with(self.target_value_network_params, self.state_value_network, following)
         if active_set is not None:
             tensordict.set(unravel_key(("next", active_set)), following.get(active_set))
@@ -373,6 +384,7 @@ def _check_factor(name: str, value: Any) -> None:
     check_number(name, value, lambda x: 0 <= x <= 1, "a number in [0, 1]")
 
 
-def _read_by(network: QPActorValueOperator | QPValueOperator) -> list[NestedKey]:
+def _reads(network: QPActorValueOperator | QPValueOperator) -> list[NestedKey]:
+    """Return the network's in-keys, and its active-set key if it has one."""
     start = [] if network.active_set_key is None else [network.active_set_key]
     return [*network.in_keys, *start]

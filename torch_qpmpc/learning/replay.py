@@ -2,8 +2,8 @@
 
 The storage is two-dimensional, time by environment. A collector's ``[num_envs, T]`` batch adds T
 rows, so that neighbouring rows of a column are neighbouring steps of one environment, however small
-T is. (Flattened, the environments interleave, and no window fits into T < N steps.) A window ends
-where the column's trajectory id changes, and at the ring's seam.
+T is. (In a flat storage the environments interleave, and no window fits into T < N steps.) No
+window crosses a change of its column's trajectory id, or the ring buffer's seam.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from torch_qpmpc.checks import check_kind, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.program import UNKNOWN
 
-#: Where a transition's active sets are: that of Q(s, a), and that of V(s+).
+#: The keys of a transition's active sets: of Q(s, a), and of V(s+).
 ACTIVE_SET = "active_set"
 ACTIVE_SETS = (ACTIVE_SET, ("next", ACTIVE_SET))
 
 
 def windows_to_tau(windows: TensorDictBase) -> Tensor:
-    """tau = [s_j, a_j, s_{j+1}, ..., s_{j+N}] of eq:sdp3, in the order of z.
+    """Return tau = [s_j, a_j, s_{j+1}, ..., s_{j+N}] of eq:sdp3, in the order of z.
 
     Args:
         windows: ``(M, N)`` consecutive transitions along the last dimension, with
@@ -40,6 +40,9 @@ def windows_to_tau(windows: TensorDictBase) -> Tensor:
 
     Returns:
         ``(M, N (n_x + n_u) + n_x)``.
+
+    Raises:
+        QPError: if an entry is missing.
     """
     check_kind("windows", windows, TensorDictBase)
     for key in ("observation", "action", ("next", "observation")):
@@ -55,16 +58,16 @@ def windows_to_tau(windows: TensorDictBase) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Two TorchRL buffers over one storage, and the one generator that both sample with.
+    """Two TorchRL buffers with one storage and one random generator.
 
     Attributes:
-        transitions: written by :meth:`extend`; samples single transitions uniformly.
-        windows: read-only; samples a trajectory of at least N steps, then a start in it, both
-            uniformly. It leaves the stored done flags as they are.
-        generator: see :func:`make_replay`.
-        window: N.
-        num_envs: columns of the storage.
-        active_rows: n_g, if the active sets of a transition's QPs are kept with it, else None.
+        transitions: the buffer that :meth:`extend` writes; samples single transitions uniformly.
+        windows: the read-only buffer that samples a trajectory of at least N steps, then a start in
+            it, both uniformly, without changing the stored done flags.
+        generator: the generator of all sampling.
+        window: N, the number of transitions in a window.
+        num_envs: number of columns of the storage.
+        active_rows: n_g if active sets are stored with the transitions, else None.
     """
 
     transitions: ReplayBuffer
@@ -78,10 +81,10 @@ class Replay:
         return len(self.transitions)
 
     def extend(self, batch: TensorDictBase) -> None:
-        """Store a collector's batch ``(num_envs, T)``; the oldest rows make room.
+        """Store a collector's batch ``(num_envs, T)``; a full storage drops its oldest rows.
 
         Raises:
-            QPError: ``batch`` is no TensorDict, or has another shape.
+            QPError: if ``batch`` is not a TensorDict or has another shape.
         """
         check_kind("batch", batch, TensorDictBase, "Pass the collector's batch as it comes.")
         if batch.batch_dims != 2:
@@ -92,7 +95,7 @@ class Replay:
                 f"shape {tuple(batch.shape)}",
                 f"(num_envs, T) with num_envs = {self.num_envs}",
             )
-            raise QPError.expected("batch", got, want, "Is it (T, num_envs)? Transpose it.")
+            raise QPError.expected("batch", got, want, "Transpose it if it is (T, num_envs).")
         if self.active_rows is not None:
             batch = batch.copy()
             for key in ACTIVE_SETS:
@@ -101,14 +104,24 @@ class Replay:
         self.transitions.extend(batch)
 
     def sample(self) -> TensorDictBase:
-        """``(batch_size,)`` transitions, with their ``"index"`` ``(batch_size, 2)``."""
+        """Sample ``(batch_size,)`` transitions, with their ``"index"`` ``(batch_size, 2)``.
+
+        Raises:
+            QPError: if nothing is stored.
+        """
         if not len(self):
-            raise QPError.expected("replay", "nothing stored", "transitions", "extend() it first.")
+            raise QPError.expected(
+                "replay", "nothing stored", "transitions", "Call extend() first."
+            )
         sample, info = self.transitions.sample(return_info=True)
         return sample.set("index", torch.stack(info["index"], dim=-1))
 
     def remember(self, sample: TensorDictBase) -> None:
-        """Keep the active sets that the loss found for a sample, for the next time it is drawn."""
+        """Store the active sets that the loss wrote into a sample, for the next time it is drawn.
+
+        Raises:
+            QPError: if they or the sample's index are missing.
+        """
         if self.active_rows is None:
             return
         for key in ("index", *ACTIVE_SETS):
@@ -121,29 +134,29 @@ class Replay:
             stored.get(key)[index] = sample.get(key)
 
     def has_windows(self) -> bool:
-        """Whether any stored trajectory has the N steps of a window."""
+        """Return True if a stored trajectory has the N steps of a window."""
         return self.windows.can_sample()
 
     def sample_tau(self) -> Tensor:
-        """``(num_windows, N (n_x + n_u) + n_x)`` windows; see :func:`windows_to_tau`.
+        """Sample windows ``(num_windows, N (n_x + n_u) + n_x)``; see :func:`windows_to_tau`.
 
         Raises:
-            QPError: no stored trajectory has N steps yet.
+            QPError: if no stored trajectory has N steps yet.
         """
         try:
             sample = self.windows.sample()
         except RuntimeError as error:
-            # Asked afterwards only: looking for windows costs as much as sampling them.
+            # Checked only now, because looking for windows costs as much as sampling them.
             if self.has_windows():
                 raise
-            got = f"{len(self)} transitions without such a trajectory"
-            remedy = "Collect more before sampling; has_windows() tells when."
+            got = f"no window in {len(self)} transitions"
+            remedy = "Collect more, until has_windows() is True."
             expected = f"{self.window} consecutive transitions"
             raise QPError.expected("replay", got, expected, remedy) from error
         return windows_to_tau(sample.reshape(-1, self.window))
 
     def state_dict(self) -> dict[str, Any]:
-        """Stored data (not copied: save it at once), write position and generator."""
+        """Return the stored data (not copied: save them at once), write position and generator."""
         return {
             "storage": self.transitions.storage.state_dict(),
             "writer": self.transitions.writer.state_dict(),
@@ -151,7 +164,11 @@ class Replay:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`, into a replay made with the same arguments."""
+        """Restore a :meth:`state_dict` into a replay made with the same arguments.
+
+        Raises:
+            QPError: if ``state`` lacks an entry.
+        """
         missing = {"storage", "writer", "generator"} - set(state)
         if missing:
             got = f"no {', '.join(sorted(missing))}"
@@ -161,8 +178,8 @@ class Replay:
         writer.load_state_dict(state["writer"])
         self.generator.set_state(state["generator"].cpu())
         if len(self) == storage.max_size:
-            # TorchRL saves the writer's position but not the storage's own record of it, which
-            # keeps windows from crossing the ring's seam. Writing the newest row again restores it.
+            # TorchRL saves the writer's position but not the storage's copy of it, which keeps
+            # windows from crossing the ring's seam. Writing the newest row again restores the copy.
             newest = (state["writer"]["_cursor"] - 1) % storage.shape[0]
             storage.set(newest, storage.get(newest))
 
@@ -178,21 +195,22 @@ def make_replay(
     device: torch.device | str = "cpu",
     active_rows: int | None = None,
 ) -> Replay:
-    """The replay of a training run; filled by :meth:`Replay.extend`.
+    """Make the empty replay of a training run, to be filled by :meth:`Replay.extend`.
 
     Args:
-        capacity: transitions kept, over all environments; a multiple of ``num_envs``.
+        capacity: number of stored transitions over all environments; a multiple of ``num_envs``.
         num_envs: batch size of the collector's environment.
-        batch_size: transitions a sample.
-        window: N, transitions a window.
-        num_windows: M, windows a sample.
-        seed: of the replay's own generator. All sampling uses that one, never torch's global one.
-        device: of the stored data and of the generator.
-        active_rows: n_g, to keep the active sets of Q(s, a) and V(s+) with each transition, n_g
+        batch_size: transitions per sample.
+        window: N, transitions per window.
+        num_windows: M, windows per sample.
+        seed: seed of the replay's generator, which all sampling uses instead of torch's global one.
+        device: device of the stored data and of the generator.
+        active_rows: n_g, to store the active sets of Q(s, a) and V(s+) with each transition, n_g
             bytes each, under `ACTIVE_SETS`; see :meth:`Replay.remember`.
 
     Raises:
-        QPError: ``capacity`` is no multiple of ``num_envs``, or has fewer than ``window`` rows.
+        QPError: if a number is out of range, ``capacity`` is not a multiple of ``num_envs``, or it
+            holds fewer than ``window`` rows.
     """
     sizes = {"num_envs": num_envs, "batch_size": batch_size, "window": window}
     for name, size in (sizes | {"num_windows": num_windows}).items():
@@ -203,7 +221,7 @@ def make_replay(
         check_whole("active_rows", active_rows, 0)
     if capacity % num_envs or capacity // num_envs < window:
         expected = f"a multiple of num_envs = {num_envs}, at least window * num_envs"
-        remedy = f"{window * num_envs} is the least."
+        remedy = f"The smallest is {window * num_envs}."
         raise QPError.expected("capacity", capacity, expected, remedy)
     generator = torch.Generator(device=device).manual_seed(seed)
     storage = LazyTensorStorage(capacity, ndim=2, device=device)
@@ -216,7 +234,7 @@ def make_replay(
         sampler=SliceSampler(
             slice_len=window,
             traj_key=("collector", "traj_ids"),
-            truncated_key=None,  # otherwise each window's last step comes back as truncated
+            truncated_key=None,  # a key would mark each window's last step as truncated
             init_key=None,
             strict_length=True,
         ),

@@ -1,7 +1,7 @@
-"""Call a module with other parameters; its own come back, also after an error.
+"""Calls of a module with other parameters that restore its own, even after an error.
 
-tensordict's ``with params.to_module(module)`` leaves ``params`` in the module if an exception
-passes it: the module then has no parameters, and its state_dict lacks them without a word.
+After an exception, tensordict's ``with params.to_module(module)`` leaves ``params`` in the module,
+which then has no parameters of its own: its state_dict silently lacks them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def call_with(
     """Call ``module`` on ``tensordict``, in place, with ``params`` instead of its own tensors."""
     failure = None
     with params.to_module(module, preserve_module_state=False):
-        # The context is left without an exception, as only then it takes ``params`` out again.
+        # The context removes ``params`` only if no exception passes through it.
         try:
             module(tensordict)
         except Exception as error:
@@ -32,15 +32,15 @@ def call_with(
 
 @contextmanager
 def restored(loss_module: LossModule) -> Iterator[None]:
-    """Give the networks of a loss of TorchRL's their own tensors back if an exception is raised.
+    """Restore the networks' own tensors in a TorchRL loss if an exception is raised.
 
     Example:
         >>> import torch_qpmpc as qm
         >>> loss = qm.QPQLearningLoss(qm.QPActorValueOperator(qm.QPMPC(2, 1, 3)))
         >>> with restored(loss):
-        ...     pass  # loss(batch), of DDPGLoss, TD3Loss, ..
+        ...     pass  # loss(batch), or that of DDPGLoss, TD3Loss, ..
     """
-    # They are kept outside the loss module's registry.
+    # The loss module does not register its networks as submodules.
     networks = [x for x in vars(loss_module).values() if isinstance(x, nn.Module)]
     parts = {id(part): part for network in networks for part in network.modules()}.values()
     before = [(part, part._parameters.copy(), part._buffers.copy()) for part in parts]
@@ -49,6 +49,6 @@ def restored(loss_module: LossModule) -> Iterator[None]:
     except Exception:
         for part, parameters, buffers in before:
             for name in (*parameters, *buffers):
-                part.__dict__.pop(name, None)  # where a swap puts what is no parameter
+                part.__dict__.pop(name, None)  # a swap puts plain tensors there
             part._parameters, part._buffers = parameters, buffers
         raise

@@ -1,9 +1,9 @@
-"""One update of theta from a batch of transitions: of the first order (eq:thup), or of the second.
+"""Updates of theta from a batch of transitions, of first order (eq:thup) or of second order.
 
-An update takes a batch and the windows for the SI penalty (None without it), moves theta, and
-returns what there is to log: the terms of the loss, and scalars that describe the batch. Each step
-is an optimiser's proposal, then what the step rules make of it: `QPMPC.project_` (eq:sdp1), and the
-deviation penalty's proximal step (eq:sdp2).
+An update takes a batch and the windows of the SI penalty (None without it), moves theta, and
+returns the terms of the loss and scalars that describe the batch, for logging. It is an optimiser's
+step followed by `QPMPC.project_` (eq:sdp1) and the deviation penalty's proximal step (eq:sdp2). A
+batch without a usable transition leaves theta and the optimiser's state unchanged.
 """
 
 from __future__ import annotations
@@ -36,15 +36,19 @@ def first_order(
     penalty_step: str = "proximal",
     actor_due: Callable[[], bool] = lambda: True,
 ) -> Update:
-    """The gradient of the loss and of the penalties, for any torch optimiser.
+    """Return an update by a torch optimiser on the gradient of the loss and the penalties.
 
-    A batch whose loss or gradient is not finite moves nothing. Of such a loss, the transitions with
-    an invalid reward are counted, with a `RuntimeWarning`, and the unsolved among the others.
+    A loss or gradient that is not finite changes nothing either. The transitions in such a loss are
+    counted: those with an invalid reward, with a `RuntimeWarning`, and the unsolved ones.
 
     Args:
-        loss_module: any of TorchRL's; its ``loss_*`` are summed.
-        penalty_step: with ``"subgradient"`` the deviation penalty is one of the loss's terms.
-        actor_due: whether this update is the actor's, too, which TD3 delays; else the critics'.
+        mpc: the QPMPC that is penalised and projected.
+        loss_module: any TorchRL loss; its ``loss_*`` entries are summed.
+        optimizer: any torch optimiser of the parameters in ``loss_module``.
+        deviation, si: the penalties on C; None for none.
+        penalty_step: ``"proximal"``, or ``"subgradient"`` to add the deviation penalty to the loss.
+        actor_due: returns True for an update of actor and critics, False for the critics alone, as
+            TD3 delays its actor.
     """
     by_gradient, proximal = None, deviation
     if penalty_step == "subgradient":
@@ -67,14 +71,17 @@ def first_order(
                 keys: Any = loss_module.tensor_keys
                 invalid = invalid_rewards(batch, keys.reward, effect).view(-1)
                 error = losses["pred_value"] - losses["target_value"]
-                # An ensemble has an error of each critic for a transition.
+                # An ensemble has one error per critic and transition.
                 lost = (~error.isfinite()).reshape(-1, len(batch)).any(0)
                 losses["unsolved"] = (lost & ~invalid).sum()
                 losses["invalid_reward"] = invalid.sum()
             return terms, losses
+        unsolved = losses.get("unsolved", None)
+        if unsolved is not None and unsolved + losses["invalid_reward"] == batch.numel():
+            return terms, losses
         total.backward()
-        of_each = [x.grad for group in optimizer.param_groups for x in group["params"]]
-        if not all(gradient is None or gradient.isfinite().all() for gradient in of_each):
+        gradients = [x.grad for group in optimizer.param_groups for x in group["params"]]
+        if not all(gradient is None or gradient.isfinite().all() for gradient in gradients):
             return terms, losses
         optimizer.step()
         if due:
@@ -93,9 +100,16 @@ def second_order(
     deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
 ) -> Update:
-    """A Gauss-Newton step towards the loss module's targets, the SI penalty in the same step.
+    """Return an update by a `GaussNewton` step towards the loss module's targets.
 
-    The projection is part of it, too; the deviation penalty's proximal step follows.
+    The SI penalty and the projection are part of that step; the deviation penalty's proximal step
+    follows if it is accepted.
+
+    Args:
+        mpc: the QPMPC that ``loss_module`` and ``optimizer`` learn.
+        loss_module: the loss that defines the targets.
+        optimizer: the optimiser of ``mpc``.
+        deviation, si: the penalties on C; None for none.
     """
     network = loss_module.value_network
     observation, action = network.in_keys
@@ -108,15 +122,15 @@ def second_order(
         start = None if network.active_set_key is None else batch.get(network.active_set_key, None)
         s, a = batch.get(observation), batch.get(action)
         report = optimizer.step(s, a, -target, penalty=penalty, warm_start=start)
-        if deviation is not None:
+        if deviation is not None and report.accepted:
             deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
         if network.active_set_key is not None:
             batch.set(network.active_set_key, report.solution.active)
         prediction = -report.solution.value.to(target)
         losses = td_metadata(prediction, target)
         solved = prediction.isfinite() & target.isfinite()
-        of_each = td_loss(prediction, target, loss_module.td_error_clip)
-        terms["loss/value"] = of_each[solved].sum() / solved.sum().clamp(min=1)
+        elementwise = td_loss(prediction, target, loss_module.td_error_clip)
+        terms["loss/value"] = elementwise[solved].sum() / solved.sum().clamp(min=1)
         terms["train/damping"] = torch.tensor(report.damping, dtype=torch.float64)
         terms["train/accepted"] = torch.tensor(float(report.accepted))
         return terms, losses
@@ -125,13 +139,13 @@ def second_order(
 
 
 def entries_of_C(mpc: QPMPC) -> Tensor:
-    """C, or its parameter where only some of its entries are learned."""
+    """Return C, or its parameter if only some of its entries are learned."""
     parameter, _ = matrix(mpc, "C")
     return mpc.C if parameter is None else parameter
 
 
 def share_of_rate(optimizer: torch.optim.Optimizer) -> float:
-    """What a schedule has left of C's rate, which the penalty's weight follows: 1 without one."""
+    """Return C's learning rate over its initial one, 1 without a schedule: the penalty's scale."""
     group = next(group for group in optimizer.param_groups if group["name"] == "C")
     initial = group.get("initial_lr", 0.0)
     return group["lr"] / initial if initial else 1.0
