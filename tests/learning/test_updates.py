@@ -123,17 +123,6 @@ def test_a_second_order_update_without_a_usable_pair_moves_nothing():
     assert_close(mpc.state_dict(), before, rtol=0, atol=0)
 
 
-def test_no_proximal_step_follows_a_second_order_step_that_was_taken_back():
-    mpc = random_mpc(5)
-    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, c_2=1e-2, c_3=1e-2)
-    batch, before = transitions(), copy.deepcopy(mpc.state_dict())
-    batch["next", "reward"] -= 300.0  # far targets, and next to no damping
-    update = second_order(mpc, make_loss(mpc), GaussNewton(mpc, damping=1e-9), deviation, None)
-    terms, _ = update(batch, None)
-    assert terms["train/accepted"] == 0
-    assert_close(mpc.state_dict(), before, rtol=0, atol=0)
-
-
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("cause", ["reward", "action"])
 def test_a_first_order_update_without_a_usable_transition_moves_nothing(cause):

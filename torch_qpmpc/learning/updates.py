@@ -103,7 +103,7 @@ def second_order(
     """Return an update by a `GaussNewton` step towards the loss module's targets.
 
     The SI penalty and the projection are part of that step; the deviation penalty's proximal step
-    follows if it is accepted.
+    follows, even if that step is not accepted.
 
     Args:
         mpc: the QPMPC that ``loss_module`` and ``optimizer`` learn.
@@ -122,13 +122,13 @@ def second_order(
         start = None if network.active_set_key is None else batch.get(network.active_set_key, None)
         s, a = batch.get(observation), batch.get(action)
         report = optimizer.step(s, a, -target, penalty=penalty, warm_start=start)
-        if deviation is not None and report.accepted:
-            deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
         if network.active_set_key is not None:
             batch.set(network.active_set_key, report.solution.active)
         prediction = -report.solution.value.to(target)
         losses = td_metadata(prediction, target)
         solved = prediction.isfinite() & target.isfinite()
+        if deviation is not None and solved.any():
+            deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
         elementwise = td_loss(prediction, target, loss_module.td_error_clip)
         terms["loss/value"] = elementwise[solved].sum() / solved.sum().clamp(min=1)
         terms["train/damping"] = torch.tensor(report.damping, dtype=torch.float64)
