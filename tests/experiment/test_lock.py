@@ -65,7 +65,7 @@ def test_a_live_process_is_named_and_a_killed_one_leaves_no_lock(tmp_path):
 def test_a_sweep_is_offered_its_own_settings(tmp_path):
     with (
         locked(tmp_path),
-        pytest.raises(QPError, match=r"by hydra\.sweep\.dir=FOLDER, or by hydra\.sweep\.subdir"),
+        pytest.raises(QPError, match=r"by hydra\.sweep\.dir=FOLDER\."),
         locked(tmp_path, ELSEWHERE_IN_SWEEP),
     ):
         pass

@@ -17,7 +17,13 @@ from omegaconf import OmegaConf
 from tests.runs import SMALL, make_config, run_command
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.lock import locked
-from torch_qpmpc.experiment.sweeps import SweepProgress, finished_run, number_of_runs, stopped_run
+from torch_qpmpc.experiment.sweeps import (
+    SweepProgress,
+    finished_run,
+    number_of_runs,
+    stopped_run,
+    sub_folder,
+)
 
 ROOT = Path(__file__).parents[2]
 #: What each launcher needs beside a name, and the plugin that an extra brings.
@@ -111,6 +117,15 @@ def test_a_sweep_does_not_write_where_another_run_does(tmp_path, capsys):
     assert refused.value.code == 1
     assert f"got {folder}, in use by process {os.getpid()}" in capsys.readouterr().err
     assert not (folder / "config.yaml").exists()
+
+
+def test_sub_folders_are_named_by_what_the_sweep_varies(tmp_path):
+    sweep(tmp_path, "seed=1", "exploration_std=0.1,0.2", "+ablation=reference")
+    found = sorted(file.parent.name for file in tmp_path.glob("*/summary.json"))
+    assert found == [f"gaussian-free-seed1-exploration_std={std}" for std in (0.1, 0.2)]
+    name = sub_folder("seed1", "+ablation=sdp,a.b={c: 1}")
+    assert name == "seed1-ablation=sdp,a.b=_c_1_"
+    assert sub_folder("seed1", "") == "seed1"
 
 
 # --- Runs that have finished ---------------------------------------------------------------------

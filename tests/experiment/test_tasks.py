@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 import math
 import runpy
+import signal
 
 import numpy as np
 import pytest
 import torch
 from pydantic import Field
 
-from tests.runs import linear_system, make_config, true_mpc
+import train
+from tests.runs import SMALL, linear_system, make_config, run_command, true_mpc
+from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.experiment.algorithms import evaluate
@@ -230,6 +233,16 @@ def test_another_process_finds_a_task_by_its_file(own_task):
     message = r"task\.file: got '.*gone\.py', which does not exist, expected the file that"
     with pytest.raises(QPError, match=message):
         find_task({"name": "mine", "file": file.replace("mine.py", "gone.py")})
+
+
+def test_train_resumes_a_run_of_an_own_task(own_task, tmp_path, monkeypatch):
+    own_task('defaults={"task": {"horizon": 3}}')
+    cfg, whole, cut = make_config("task=mine", *SMALL), tmp_path / "whole", tmp_path / "cut"
+    train.train(cfg, str(whole), quiet=True)
+    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
+    del TASKS["mine"]
+    run_command(f"resume={cut}")
+    assert_same_numbers(cut, whole)
 
 
 def test_a_task_has_noises_and_keys_of_its_own(own_task, tmp_path):

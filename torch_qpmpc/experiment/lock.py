@@ -18,12 +18,8 @@ except ImportError:  # Windows
 #: The locked file. The lock is the operating system's, so a killed process leaves only the file.
 LOCK = ".lock"
 
-
-#: Where another folder comes from: of one run, and of a sweep's.
-ELSEWHERE = "hydra.run.dir=FOLDER"
-ELSEWHERE_IN_SWEEP = (
-    "hydra.sweep.dir=FOLDER, or by hydra.sweep.subdir if runs of this sweep share it"
-)
+#: Settings that choose another folder: for a single run, and for a sweep.
+ELSEWHERE, ELSEWHERE_IN_SWEEP = "hydra.run.dir=FOLDER", "hydra.sweep.dir=FOLDER"
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import threading
@@ -14,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from tqdm import tqdm
 
 from torch_qpmpc.errors import QPError
@@ -66,20 +68,49 @@ def stopped_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
     return None
 
 
-def number_of_runs(config: DictConfig) -> int | None:
-    """How many runs a sweep has: those of its file and those of the command line, which go first.
-
-    Returns:
-        None where a sweeper is free to choose, as from an interval.
-    """
+def _overrides(config: DictConfig) -> dict[str, Override]:
+    """Return a sweep's overrides by key: those of the command line replace those of its file."""
     params = config.hydra.sweeper.get("params") or {}
     arguments = [f"{key}={value}" for key, value in params.items()]
     overrides = OverridesParser.create().parse_overrides([*arguments, *config.hydra.overrides.task])
-    latest = {override.get_key_element(): override for override in overrides}
-    axes = [override for override in latest.values() if override.is_sweep_override()]
+    return {override.get_key_element(): override for override in overrides}
+
+
+def number_of_runs(config: DictConfig) -> int | None:
+    """Count the runs of a sweep; return None if its sweeper draws values, as from an interval."""
+    axes = [override for override in _overrides(config).values() if override.is_sweep_override()]
     if not all(override.is_discrete_sweep() for override in axes):
         return None
     return math.prod(len(list(axis.sweep_string_iterator())) for axis in axes)
+
+
+class SubFolders(Callback):
+    """Reduces Hydra's ``override_dirname`` to the overrides that the sweep varies.
+
+    The noise, the constraint and the seed are already in the sub-folder's name.
+    """
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        varied = config.hydra.sweeper.get("params") or {}
+        excluded = ["noise", "constraint", "seed"]
+        for key, override in _overrides(config).items():
+            if not override.is_sweep_override() and key not in varied:
+                excluded.append(override.key_or_group)
+        # Each run composes its configuration from these overrides and its own.
+        with open_dict(config), read_write(config):
+            config.hydra.overrides.hydra.append(
+                f"hydra.job.config.override_dirname.exclude_keys={excluded}"
+            )
+
+
+def sub_folder(*names: str) -> str:
+    """Join ``names`` to a folder's name, without characters that some file systems refuse."""
+    joined = "-".join(filter(None, names)).replace("+", "")
+    return re.sub(r"[^\w.,=-]+", "_", joined)
+
+
+# configs/config.yaml calls this.
+OmegaConf.register_new_resolver("sub_folder", sub_folder, replace=True)
 
 
 class SweepProgress(Callback):
