@@ -17,8 +17,8 @@ from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.actor_critic import (
     actor_groups,
     critic_groups,
-    make_closed_loop_actor,
     make_actor_critic_loss,
+    make_closed_loop_actor,
 )
 from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.learning.gauss_newton import GaussNewton

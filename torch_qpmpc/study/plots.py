@@ -30,7 +30,7 @@ def colours(frame: pd.DataFrame) -> dict[str, tuple]:
 
 
 def curves(frame: pd.DataFrame, column: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the updates at which all runs logged ``column``, and its values ``(runs, updates)``."""
+    """Return the updates that all runs logged of ``column``, and its values ``(runs, updates)``."""
     logged = [run.metrics[column].dropna() for run in frame["run"]]
     together = pd.concat(logged, axis=1, join="inner")
     return together.index.to_numpy(), together.to_numpy().T
