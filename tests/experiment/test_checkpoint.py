@@ -137,7 +137,7 @@ def test_a_flipped_bit_is_found_or_changes_nothing(tmp_path, bit):
         else:
             assert same(found, state), position
     assert len(refused) > len(positions) / 4
-    assert all("use the one before" in sentence for sentence in refused)
+    assert all("use the previous one" in sentence for sentence in refused)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.9, 0.999])
@@ -162,7 +162,7 @@ def test_something_else_is_an_error(tmp_path):
 
 
 def test_a_missing_checkpoint_is_an_error(tmp_path):
-    with pytest.raises(QPError, match=r"checkpoint: got .*none.pt, which is not there"):
+    with pytest.raises(QPError, match=r"checkpoint: got .*none.pt, which does not exist"):
         load_checkpoint(tmp_path / "none.pt")
 
 

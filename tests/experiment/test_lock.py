@@ -49,7 +49,7 @@ def test_a_live_process_is_named_and_a_killed_one_leaves_no_lock(tmp_path):
         message = (
             rf"^folder: got {re.escape(str(tmp_path))}, in use by process {process.pid} on .+, "
             r"expected one that no run is using\. Wait until that run has ended, or choose "
-            r"another folder by hydra\.run\.dir=FOLDER\.$"
+            r"another folder with hydra\.run\.dir=FOLDER\.$"
         )
         with pytest.raises(QPError, match=message), locked(tmp_path):
             pass
@@ -65,7 +65,7 @@ def test_a_live_process_is_named_and_a_killed_one_leaves_no_lock(tmp_path):
 def test_a_sweep_is_offered_its_own_settings(tmp_path):
     with (
         locked(tmp_path),
-        pytest.raises(QPError, match=r"by hydra\.sweep\.dir=FOLDER\."),
+        pytest.raises(QPError, match=r"with hydra\.sweep\.dir=FOLDER\."),
         locked(tmp_path, ELSEWHERE_IN_SWEEP),
     ):
         pass

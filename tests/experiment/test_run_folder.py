@@ -152,12 +152,12 @@ ROWS = "update,eval/J\n0,3.0\n2,2.0\n4,1.0\n"
         (None, r"\[Errno 2\] No such file or directory"),
         ("", "its last line is cut off"),
         (ROWS[:-3], "its last line is cut off"),
-        (ROWS[:-6], "no row of update 4"),
-        (ROWS[:14], "no row of update 0, 2, 4"),
+        (ROWS[:-6], "no row for update 4"),
+        (ROWS[:14], "no row for update 0, 2, 4"),
         ("some,table\n1,2\n", ".*'update' not found in columns"),
         (ROWS.replace("2.0", "two"), "could not convert string to float: 'two'"),
         (ROWS.replace("2.0", "2.0,7,8"), "Error tokenizing data"),
-        (ROWS + ROWS[14:], "updates that do not increase"),
+        (ROWS + ROWS[14:], "its updates do not increase"),
     ],
 )
 def test_a_run_does_not_go_on_from_damaged_metrics(tmp_path, text, wrong):
@@ -166,8 +166,8 @@ def test_a_run_does_not_go_on_from_damaged_metrics(tmp_path, text, wrong):
         (tmp_path / "metrics.csv").write_text(text)
     sentence = (
         rf"^metrics\.csv: got {re.escape(str(tmp_path))}/metrics\.csv \({wrong}.*\), "
-        r"expected the table that a run wrote\. Put a whole copy of it there, go on from a copy "
-        r"of the folder, or start anew in another one by hydra\.run\.dir=FOLDER\.$"
+        r"expected the table that a run wrote\. Restore the file, resume from a copy of the "
+        r"folder, or start a new run with hydra\.run\.dir=FOLDER\.$"
     )
     with pytest.raises(QPError, match=sentence):
         RunFolder(tmp_path, cfg, after=4)
@@ -223,7 +223,7 @@ def test_what_could_not_be_written_is_said(tmp_path):
     error = unwritable(tmp_path, OSError(errno.EROFS, "Read-only file system", "x.csv"))
     assert str(error) == (
         f"folder: got {tmp_path}, where writing failed ([Errno 30] Read-only file system: 'x.csv')"
-        ", expected one that can be written to. Choose another folder by hydra.run.dir=FOLDER."
+        ", expected a writable folder. Choose another folder with hydra.run.dir=FOLDER."
     )
 
 
@@ -233,8 +233,8 @@ def test_a_folder_that_cannot_be_made_is_said_in_one_sentence(tmp_path, mode):
     (tmp_path / "file").touch()
     sentence = (
         r"^folder: got .*/file/run, where writing failed \(.*Not a directory.*\), "
-        r"expected one that can be written to\. "
-        rf"Choose another folder by hydra\.{key}\.dir=FOLDER\.$"
+        r"expected a writable folder\. "
+        rf"Choose another folder with hydra\.{key}\.dir=FOLDER\.$"
     )
     with pytest.raises(SystemExit, match=sentence):
         run_command(*multirun, f"hydra.{key}.dir={tmp_path}/file/run")

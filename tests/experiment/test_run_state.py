@@ -139,7 +139,8 @@ def test_several_processes_begin_new_episodes_and_learn_on(tmp_path, monkeypatch
     cfg = make_config(*RUN, "collector=multi", "collector.workers=1", "updates=6")
     assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
     go_on(tmp_path)
-    assert "New episodes: the environments' own state cannot be saved." in capsys.readouterr().out
+    expected = "Starting new episodes: the state of the environments is not saved."
+    assert expected in capsys.readouterr().out
     assert json.loads((tmp_path / "summary.json").read_text())["updates"] == 6
     assert_events_are_whole(tmp_path)
 
@@ -148,7 +149,8 @@ def test_several_processes_begin_new_episodes_and_learn_on(tmp_path, monkeypatch
 
 
 def test_only_a_run_that_was_stopped_goes_on(tmp_path, stopped):
-    with pytest.raises(QPError, match=r"resume: got seed=3, too, expected nothing else"):
+    message = r"resume: got it together with seed=3, expected no other override"
+    with pytest.raises(QPError, match=message):
         resumed(stopped, ["resume=x", "seed=3"])
     with pytest.raises(QPError, match=r"resume: got .*without config.yaml, expected a folder of t"):
         resumed(tmp_path, [])
@@ -160,7 +162,7 @@ def test_only_a_run_that_was_stopped_goes_on(tmp_path, stopped):
 def test_a_damaged_checkpoint_offers_the_one_before_which_goes_on(tmp_path, stopped):
     (stopped / "checkpoint.pt").write_bytes(b"PK" + bytes(1000))
     before = stopped / "checkpoint-previous.pt"
-    with pytest.raises(QPError, match=rf"cannot be read .*use the one before, {before}\.$"):
+    with pytest.raises(QPError, match=rf"cannot be read .*use the previous one, {before}\.$"):
         resumed(stopped, [])
     cfg, state = resumed(before, [])
     assert state is not None
@@ -177,7 +179,7 @@ def test_a_checkpoint_of_another_run_is_refused(stopped):
         resumed(stopped, [])
     assert str(error.value) == (
         "checkpoint: got one of a run with seed=1, task.horizon=3, expected config.yaml's seed=2, "
-        "task.horizon=4. A run goes on with its own configuration, and from its own checkpoints."
+        "task.horizon=4. A run resumes with its own configuration, from its own checkpoints."
     )
 
 

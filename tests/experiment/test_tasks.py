@@ -250,7 +250,7 @@ def test_a_task_has_noises_and_keys_of_its_own(own_task, tmp_path):
     cfg = make_config("task=mine", "noise.std=3")
     check_config(cfg)
     assert cfg.noise.name == "brownian"
-    with pytest.raises(QPError, match=r"noise\.name: got 'uniform', expected a noise that mine"):
+    with pytest.raises(QPError, match=r"noise\.name: got 'uniform', expected a noise of task mine"):
         check_config(make_config("task=mine", "noise=uniform"))
 
     class Settings(TaskSettings):
@@ -274,7 +274,7 @@ def test_a_task_has_noises_and_keys_of_its_own(own_task, tmp_path):
 def test_what_cannot_be_registered(own_task):
     own_task("")
     register(TASKS["mine"])
-    with pytest.raises(QPError, match=r"task\.name: got 'point_mass', which exists, expected a"):
+    with pytest.raises(QPError, match=r"task\.name: got 'point_mass', which is built in, expected a"):
         register(dataclasses.replace(TASKS["mine"], name="point_mass"))
     with pytest.raises(QPError, match="task: got str, expected a Task"):
         register("mine")  # pyright: ignore[reportArgumentType] (the mistake)

@@ -556,7 +556,7 @@ def test_a_finished_run_is_not_overwritten(tmp_path):
     before = contents(folder)
     message = (
         f"^folder: got {folder}, which holds a finished run, expected one without a run. "
-        "Choose another folder by hydra.run.dir=FOLDER.$"
+        "Choose another folder with hydra.run.dir=FOLDER.$"
     )
     with pytest.raises(SystemExit, match=message):
         run_command(*TINY, "seed=2", f"hydra.run.dir={folder}")
@@ -567,8 +567,8 @@ def test_a_finished_run_is_not_overwritten(tmp_path):
 def test_a_stopped_run_is_not_overwritten_but_goes_on(stopped):
     before = contents(stopped)
     message = (
-        f"^folder: got {stopped}, which holds a run that was stopped, expected one without a run. "
-        f"Go on with it by resume={stopped}, or choose another folder by hydra.run.dir=FOLDER.$"
+        f"^folder: got {stopped}, which holds a stopped run, expected one without a run. "
+        f"Resume it with resume={stopped}, or choose another folder with hydra.run.dir=FOLDER.$"
     )
     with pytest.raises(SystemExit, match=message):
         run_command(*TINY, f"hydra.run.dir={stopped}")
@@ -580,7 +580,7 @@ def test_a_stopped_run_is_not_overwritten_but_goes_on(stopped):
 @pytest.mark.parametrize("name", ["config.yaml", "checkpoint.pt"])
 def test_a_run_that_cannot_go_on_is_not_offered_for_it(stopped, name):
     (stopped / name).write_text("[: garbage")
-    message = "a run that was stopped, expected one without a run. Choose another folder by hydra"
+    message = "a stopped run, expected one without a run. Choose another folder with hydra"
     with pytest.raises(SystemExit, match=message):
         run_command(*TINY, f"hydra.run.dir={stopped}")
 
@@ -605,7 +605,7 @@ def test_a_run_holds_the_lock(tmp_path, monkeypatch):
 
 
 def test_a_run_goes_on_in_its_own_folder_only(stopped, tmp_path):
-    message = f"got {tmp_path}/other with resume={stopped}, expected {stopped}. A run goes on in i"
+    message = f"got {tmp_path}/other with resume={stopped}, expected {stopped}. A run resumes in i"
     with pytest.raises(SystemExit, match=message):
         run_command(f"resume={stopped}", f"hydra.run.dir={tmp_path}/other")
 

@@ -131,7 +131,7 @@ def test_a_folder_without_runs_is_named(tmp_path):
 def test_a_checkpoint_that_is_lost_is_named(study, tmp_path):
     shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
     (tmp_path / "run" / "checkpoint.pt").unlink()
-    with pytest.raises(QPError, match=r"checkpoint: got .*checkpoint.pt, which is not there"):
+    with pytest.raises(QPError, match=r"checkpoint: got .*checkpoint.pt, which does not exist"):
         collect(tmp_path)
 
 
