@@ -1,4 +1,4 @@
-"""One process at a time holds a folder's lock, and a killed one leaves it free."""
+"""One process at a time holds a folder's lock, and a killed process releases it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torch_qpmpc.experiment import lock
 from torch_qpmpc.experiment.lock import ELSEWHERE_IN_SWEEP, LOCK, locked
 
 PACKAGE = Path(torch_qpmpc.__file__).parent
-#: The package without its ``__init__``, whose imports (torch, TorchRL) take seconds.
+#: Imports the lock without the package's ``__init__``, which imports torch for seconds.
 HOLD = """
 import sys, types
 sys.modules["torch_qpmpc"] = package = types.ModuleType("torch_qpmpc")
@@ -78,8 +78,8 @@ def test_an_error_inside_frees_the_lock(tmp_path):
         assert f"process {os.getpid()} on " in (tmp_path / LOCK).read_text()
 
 
-def test_a_file_that_its_holder_has_just_removed_is_not_the_lock(tmp_path, monkeypatch):
-    """The holder removes it between this process's opening and locking it."""
+def test_a_lock_file_that_was_removed_meanwhile_is_opened_again(tmp_path, monkeypatch):
+    """The holder removes the file after this process has opened it."""
     flock, opened = fcntl.flock, []
 
     def late(file: int, operation: int) -> None:

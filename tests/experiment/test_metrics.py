@@ -1,4 +1,4 @@
-"""The numbers that a run logs and sums up."""
+"""The numbers that a run logs, and its summary."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from torch_qpmpc.mpc.banded import banded_matrix
 
 
 def loops_with(start: float, learned: float, true: float) -> dict[str, ClosedLoop]:
-    """Two steps of two starts whose costs add up to J; the second step counts 0.9."""
+    """Make loops of two steps from two starts with total cost J, discounted by 0.9."""
 
     def loop(J: float) -> ClosedLoop:
         costs = torch.full((2, 2), J / 2, dtype=torch.float64)

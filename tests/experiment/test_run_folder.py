@@ -1,4 +1,4 @@
-"""What a run's folder holds is what was logged, also when the run is cut short."""
+"""A run's folder holds everything that was logged, also if the run is interrupted."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_relative_folder_is_kept_when_the_working_directory_changes(tmp_path, mo
     assert scalars(events(tmp_path / "run"), "eval/J") == {1: 1.0}
 
 
-# --- Going on ------------------------------------------------------------------------------------
+# --- Resuming ------------------------------------------------------------------------------------
 
 ROWS = "update,eval/J\n0,3.0\n2,2.0\n4,1.0\n"
 
@@ -160,7 +160,7 @@ ROWS = "update,eval/J\n0,3.0\n2,2.0\n4,1.0\n"
         (ROWS + ROWS[14:], "its updates do not increase"),
     ],
 )
-def test_a_run_does_not_go_on_from_damaged_metrics(tmp_path, text, wrong):
+def test_a_run_does_not_resume_from_damaged_metrics(tmp_path, text, wrong):
     cfg = make_config("eval_interval=2", "log_interval=4")
     if text is not None:
         (tmp_path / "metrics.csv").write_text(text)
@@ -174,7 +174,7 @@ def test_a_run_does_not_go_on_from_damaged_metrics(tmp_path, text, wrong):
     assert not (tmp_path / "tensorboard").exists(), "nothing has been written"
 
 
-def test_whole_metrics_go_on(tmp_path):
+def test_later_rows_are_dropped_on_resume(tmp_path):
     (tmp_path / "metrics.csv").write_text(ROWS + "6,0.5\n")
     with RunFolder(tmp_path, make_config("eval_interval=2", "log_interval=4"), after=4) as run:
         assert run.column("eval/J") == ([0, 2, 4], [3.0, 2.0, 1.0])
@@ -184,7 +184,7 @@ def test_whole_metrics_go_on(tmp_path):
 
 
 def command(folder: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    """train.py in ``folder``, with files of at most 1000 bytes after the first checkpoint."""
+    """Run train.py in ``folder`` with files limited to 1000 bytes after the first checkpoint."""
     limited = (
         "import resource, sys, train\n"
         "save = train.save_checkpoint\n"
@@ -206,7 +206,7 @@ def command(folder: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_said_in_a_sentence_and_keeps_the_last_checkpoint(tmp_path):
+def test_a_full_disk_ends_in_a_sentence_and_keeps_the_last_checkpoint(tmp_path):
     ended = command(tmp_path / "run")
     assert ended.returncode == 1
     sentence = ended.stderr.splitlines()[-1]

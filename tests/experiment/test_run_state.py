@@ -1,4 +1,4 @@
-"""A run that was stopped and goes on is the run that was not, number for number."""
+"""A stopped and resumed run equals an undisturbed one, number for number."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
 from torch_qpmpc.experiment.config import load_config
 from torch_qpmpc.experiment.run_state import resumed
 
-#: Neither of the stops is at an evaluation or a row of metrics.
+#: Settings in which neither stop is at an evaluation or a row of metrics.
 RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3")
 STOPS = (2, 7)
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
@@ -60,7 +60,7 @@ def test_a_run_that_goes_on_is_the_one_that_never_stopped(tmp_path, monkeypatch,
 
 @pytest.fixture
 def stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A run that was stopped in its third update, with a checkpoint of the second before."""
+    """Stop a run in its third update, after the checkpoint of the second."""
     folder, cfg = tmp_path / "run", make_config(*RUN, "eval_interval=2")
     stop(monkeypatch, cfg, folder, 3)
     return folder
@@ -83,8 +83,8 @@ def test_a_run_that_has_no_checkpoint_yet_begins_anew(tmp_path, stopped):
     assert_events_are_whole(stopped)
 
 
-def test_a_run_of_an_earlier_version_goes_on(tmp_path, stopped):
-    """Without the keys that came later, in its configuration and in its checkpoint."""
+def test_a_run_of_an_earlier_version_resumes(tmp_path, stopped):
+    """Its configuration and its checkpoint lack the keys added since."""
     file, checkpoint = stopped / "config.yaml", stopped / "checkpoint.pt"
     cfg, state = load_config(file), load_checkpoint(checkpoint)
     for key in ("logger", "eval_seed"):
@@ -98,7 +98,7 @@ def test_a_run_of_an_earlier_version_goes_on(tmp_path, stopped):
 
 @pytest.mark.parametrize("when", ["finish", "drop_previous"])
 def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch, when):
-    """Killed after the last update, before or after the summary is written."""
+    """The run is killed after its last update, before or after writing the summary."""
     cfg = make_config(*RUN)
     train.train(cfg, str(tmp_path / "whole"))
 
@@ -134,8 +134,8 @@ def test_a_finished_run_keeps_what_it_learned_and_no_data(tmp_path, stopped):
 
 
 @pytest.mark.slow
-def test_several_processes_begin_new_episodes_and_learn_on(tmp_path, monkeypatch, capsys):
-    """One worker: what cannot be saved is another process's, however many there are."""
+def test_worker_processes_start_new_episodes_on_resume(tmp_path, monkeypatch, capsys):
+    """One worker suffices: another process's state cannot be saved."""
     cfg = make_config(*RUN, "collector=multi", "collector.workers=1", "updates=6")
     assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
     go_on(tmp_path)

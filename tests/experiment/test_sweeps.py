@@ -1,4 +1,4 @@
-"""Sweeps: what launches them, what is not done again, and the line of progress."""
+"""Sweeps: launchers, finished and stopped runs, sub-folders, and the progress line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from torch_qpmpc.experiment.sweeps import (
 )
 
 ROOT = Path(__file__).parents[2]
-#: What each launcher needs beside a name, and the plugin that an extra brings.
+#: The plugin of each launcher, and its settings.
 LAUNCHERS = {
     "cores": ("joblib", ["hydra.launcher.n_jobs=2"]),
     "submitit_local": ("submitit", ["hydra.launcher.cpus_per_task=1"]),
@@ -42,7 +42,7 @@ LAUNCHERS = {
 
 
 def arguments(folder: Path, *overrides: str) -> list[str]:
-    """``-m +study=paper`` with small runs."""
+    """Return the arguments of ``-m +study=paper`` with small runs."""
     study = ("-m", "+study=paper", "constraint=free", "noise=gaussian")
     return [*study, *SMALL, f"hydra.sweep.dir={folder}", *overrides]
 
@@ -59,7 +59,7 @@ def test_every_launcher_runs_the_study_and_shows_one_line(launcher, tmp_path):
     if not importlib.util.find_spec(f"hydra_plugins.hydra_{package}_launcher"):
         pytest.skip(f"hydra-{package}-launcher is not installed, which an extra brings")
     overrides = arguments(tmp_path, f"hydra/launcher={launcher}", "seed=1,2", *settings)
-    # Workers of Ray are nice by default, and would wait for all other tests.
+    # Ray's workers have a low priority by default and would wait for other tests.
     environment = os.environ | {"PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
     ended = subprocess.run(
         [sys.executable, "train.py", *overrides],
@@ -80,12 +80,12 @@ def test_every_launcher_runs_the_study_and_shows_one_line(launcher, tmp_path):
 
 
 def sweep(folder: Path, *overrides: str) -> None:
-    """A sweep of small runs in this process, one after the other."""
+    """Run a sweep of small runs in this process, one after the other."""
     run_command(*arguments(folder, "hydra/launcher=basic", *overrides))
 
 
-def test_a_sweep_goes_on_where_it_stopped(tmp_path, capsys):
-    """One run has finished, one was stopped; then the settings change."""
+def test_a_sweep_resumes(tmp_path, capsys):
+    """Of two runs one has finished and one was stopped; later the settings change."""
     sweep(tmp_path, "seed=1")
     first, second = (tmp_path / f"gaussian-free-seed{seed}" for seed in (1, 2))
     before = (first / "checkpoint.pt").stat().st_mtime_ns
@@ -109,7 +109,7 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path, capsys):
     assert (first / "checkpoint.pt").stat().st_mtime_ns == before
 
 
-def test_a_sweep_does_not_write_where_another_run_does(tmp_path, capsys):
+def test_a_sweep_does_not_write_to_a_folder_in_use(tmp_path, capsys):
     folder = tmp_path / "gaussian-free-seed1"
     folder.mkdir()
     with locked(folder), pytest.raises(SystemExit) as refused:

@@ -1,4 +1,4 @@
-"""A tally adds up, begins its rows anew, and survives a checkpoint."""
+"""A tally sums over the run, counts QPs per row, and is restored from a checkpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tasks' plants and QPs are what the configuration and the papers say."""
+"""The tasks' plants and QPs match the configuration and the papers."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ J_TRUE_MODEL = 47
 
 @pytest.mark.parametrize("seed", [1, 4])
 def test_ends_of_the_experiment_are_the_known_ones(seed):
-    """The numbers that everyone who draws, starts and rolls out alike gets."""
+    """J depends only on the paper's random draws, starts and rollout."""
     cfg = make_config(f"seed={seed}", "solver=daqp")
     physics = linear_system(cfg)
     assert round(evaluate(cfg, make_mpc(cfg, physics).policy, physics).J) == J_START[seed]
@@ -118,7 +118,7 @@ def test_the_other_task_starts_from_the_original_wrong_model():
     assert torch.equal(mpc.C_0, banded_matrix(A, B, 10))
     assert mpc.learned == ("q", "c", "C", "b", "lb", "ub")
     learned = sum(part.numel() for part in mpc.readable().values())
-    # V0, A, B, b, f with one for x_N, and the bounds, of which those of the actions are kept.
+    # V0, A, B, b, f (with its part for x_N), and the bounds, of which those of actions stay fixed.
     assert learned == 1 + 4 + 2 + 2 + (3 + 2) + (3 + 3)
     qp = mpc.quadratic_program()
     assert qp.ub[:6].tolist() == [2, 1, 1, 2, 1, 1]
@@ -140,7 +140,7 @@ def test_its_other_end_knows_the_mean_of_the_noise():
 
 
 def test_the_value_of_a_state_has_its_violation():
-    """The slacks of x_0 are the plant's own price of leaving the bounds."""
+    """The slacks of x_0 equal the plant's violation of its bounds."""
     cfg = make_config("task=gros_zanon", "solver=daqp")
     physics = linear_system(cfg)
     assert isinstance(physics, GrosZanonLTI)
@@ -181,7 +181,7 @@ def test_a_model_on_the_command_line_is_that_of_the_qp():
     torch.testing.assert_close(W, torch.diag(torch.tensor([2.0, 1, 1])).double())
 
 
-# A user's own
+# A user's task
 
 
 TASK = """
@@ -197,7 +197,7 @@ register(
 
 @pytest.fixture
 def own_task(tmp_path, monkeypatch):
-    """Writes and runs the file of a task with some options; afterwards it is forgotten."""
+    """Return a function that writes and runs a task's file; unregister the task afterwards."""
     monkeypatch.delitem(TASKS, "mine", raising=False)
 
     def write(options: str) -> str:
@@ -209,7 +209,7 @@ def own_task(tmp_path, monkeypatch):
     return write
 
 
-def test_a_registered_task_has_the_point_masss_defaults_but_for_its_own(own_task):
+def test_a_registered_task_inherits_the_defaults_of_the_point_mass(own_task):
     file = own_task('defaults={"num_envs": 3, "task": {"horizon": 4}}')
     cfg = make_config("task=mine", "replay_capacity=300")
     check_config(cfg)
@@ -274,7 +274,7 @@ def test_a_task_has_noises_and_keys_of_its_own(own_task, tmp_path):
 def test_what_cannot_be_registered(own_task):
     own_task("")
     register(TASKS["mine"])
-    with pytest.raises(QPError, match=r"task\.name: got 'point_mass', which is built in, expected a"):
+    with pytest.raises(QPError, match=r"task\.name: got 'point_mass', which is built in, exp"):
         register(dataclasses.replace(TASKS["mine"], name="point_mass"))
     with pytest.raises(QPError, match="task: got str, expected a Task"):
         register("mine")  # pyright: ignore[reportArgumentType] (the mistake)

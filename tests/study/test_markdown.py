@@ -23,6 +23,6 @@ def test_only_what_is_between_the_markers_changes():
 @pytest.mark.parametrize(
     "text", ["", "<!-- it -->", "<!-- /it --><!-- it -->", 2 * "<!-- it --><!-- /it -->"]
 )
-def test_without_its_place_nothing_is_replaced(text):
+def test_missing_markers_are_refused(text):
     with pytest.raises(QPError, match="expected one line <!-- it --> and below it one line"):
         replaced(text, "new", "it")

@@ -37,7 +37,7 @@ def test_a_sweeps_own_folder_gives_its_name(study):
     assert set(collect(study / "small")["sweep"]) == {"small"}
 
 
-def test_one_run_will_do(study):
+def test_one_run_is_enough(study):
     assert len(collect(study / "small" / "gaussian-free-seed1")) == 1
 
 
@@ -88,7 +88,7 @@ def test_constraints_that_determine_no_states_have_no_readings(study):
 
 
 def test_the_models_error_is_that_of_one_step(study):
-    """An offset of 0.3 in one state is an error of 0.3, a gain of 1 on it its spread."""
+    """An offset of 0.3 in one state gives an error of 0.3, a gain of 1 the state's spread."""
     physics = FinishedRun(study / "small" / "gaussian-free-seed1").physics
     assert isinstance(physics, LinearSystem)
     none = torch.zeros(4, dtype=torch.float64)
@@ -135,7 +135,7 @@ def test_a_checkpoint_that_is_lost_is_named(study, tmp_path):
         collect(tmp_path)
 
 
-def test_a_run_with_other_keys_than_todays_is_named(study, tmp_path):
+def test_a_run_with_other_keys_is_named(study, tmp_path):
     shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
     config = tmp_path / "run" / "config.yaml"
     config.write_text(config.read_text().replace("step: cholesky\n", "", 1))
