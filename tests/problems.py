@@ -83,9 +83,9 @@ def known_qp(
 ) -> KnownQP:
     """Make a QP with rows of the kinds ``soft`` and ``hard``, ordered randomly in each element.
 
-    H, C and G are drawn with the batch shape ``matrices`` unless given. H has the given ``rank``, or
-    is positive definite. With H positive definite and C of full row rank, the solution is unique, and
-    without `WEAK` or dependent rows, so are the multipliers.
+    H, C and G are drawn with the batch shape ``matrices`` unless given. H has the given ``rank``,
+    or is positive definite. With H positive definite and C of full row rank, the solution is
+    unique, and without `WEAK` or dependent rows, so are the multipliers.
     """
     generator = torch.Generator().manual_seed(seed)
 

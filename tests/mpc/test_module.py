@@ -387,7 +387,7 @@ def test_a_copy_gives_the_same_answers_and_is_independent(copied, name):
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_qp_without_values_is_pickled(name):
-    """As TorchRL sends policies to workers: on the meta device, the weights apart."""
+    """TorchRL sends policies to workers on the meta device, with separate weights."""
     mpc = random_mpc(12, **SETTINGS[name])
     step(mpc)
     twin = round_trip(copy.deepcopy(mpc).to("meta")).to_empty(device="cpu")

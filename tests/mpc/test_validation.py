@@ -1,4 +1,4 @@
-"""What `QPMPC` accepts as numbers and tensors: NumPy's integers, lists, and any default device."""
+"""Arguments that `QPMPC` accepts: NumPy integers, lists, and tensors on any default device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`torch.compile(fullgraph=True)`: the same numbers, and an error where there would be others."""
+"""`torch.compile(fullgraph=True)` gives the eager numbers, or an error."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ NAMES = list(functions(random_mpc(0)))
 
 
 def outcome(mpc: QPMPC, function: Function, s: Tensor, a: Tensor) -> tuple[Tensor, list]:
-    """What a function returns, and the gradient of its square in theta."""
+    """Return a function's result and the gradient of its square in theta."""
     mpc.zero_grad()
     out = function(s, a)
     out.square().sum().backward()

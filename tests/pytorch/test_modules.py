@@ -1,4 +1,4 @@
-"""What PyTorch does with modules and tensors: meta, fake, dtypes, autocast, modes, copies."""
+"""QPMPC under PyTorch's features: meta and fake tensors, dtypes, autocast, modes, copies."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ S, A = random_states(4), random_states(4, 1, size=0.4)
 
 
 def outcome(mpc: QPMPC, s: Tensor, a: Tensor) -> list[Tensor]:
-    """V, Q, pi, sigma, and the gradients of V and Q in theta."""
+    """Return V, Q, pi, sigma, and the gradients of V and Q in theta."""
     mpc.zero_grad()
     solution = mpc.solve(s)
     out = [mpc.value(s), mpc.action_value(s, a), mpc.policy(s), solution.sigma]

@@ -22,7 +22,7 @@ INF = torch.inf
 
 
 def program(H, q, G=(), lb=(), ub=(), w=(), *, C=(), b=()) -> QuadraticProgram:
-    """A QP in two variables, from lists."""
+    """Make a QP in two variables from lists."""
 
     def matrix(rows) -> Tensor:
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, 2)
@@ -90,7 +90,7 @@ CASES = [
     ("name", "qp", "status"), CASES, ids=[f"{s.name} {n}" for n, _, s in CASES]
 )
 def test_what_cannot_be_solved_is_named_and_soon(solver, name, qp, status):
-    # Of this process's own time: a busy machine is not slow.
+    # In processor time, so that other load does not matter.
     began = time.process_time()
     solution = solve_qp(qp, solver=solver, on_failure="mask")
     assert time.process_time() - began < 2
@@ -122,7 +122,7 @@ def test_fixed_entries_that_break_an_equality_are_infeasible():
 
 
 def programs(qp: QuadraticProgram, fixed: Tensor | None = None) -> Programs:
-    """QPs as the chain has them; by default with nothing fixed."""
+    """Make the pipeline's QPs, by default without fixed entries."""
     fixed = torch.zeros(0).double() if fixed is None else fixed
     return Programs.of(*qp.tensors(), fixed)[0]
 
@@ -200,7 +200,7 @@ def test_hard_rows_that_hold_only_far_away_are_not_called_infeasible(far):
     assert diagnose(programs(qp)).tolist() == [Status.NOT_CONVERGED]
 
 
-#: Soft states, and actions within hard bounds, so that no state makes it infeasible or unbounded.
+#: Settings with soft states and hard action bounds, feasible and bounded for every state.
 BOUNDED: dict[str, Any] = {
     "stage_weight": [1.0, 0.1, 0.01],
     "state_bounds": ([-2, -10], [2, 10]),
@@ -209,14 +209,14 @@ BOUNDED: dict[str, Any] = {
 
 
 def growing(radius: float, horizon: int, **options: Any) -> QPMPC:
-    """An unstable plant, a Jordan block."""
+    """Make an unstable plant, a Jordan block."""
     A = [[radius, 0.1], [0.0, radius]]
     return QPMPC.from_model(A, [[0.0], [0.1]], horizon, **(BOUNDED | options))
 
 
 @pytest.mark.parametrize(
     ("radius", "horizon", "value"),
-    # By two solvers and two eliminations, which agree to all digits given.
+    # Computed by two solvers and two eliminations, which agree to the digits given.
     [(1.5, 30, 741101226.75), (1.5, 50, 3.557525499e14), (2.0, 50, 2.65969067e27)],
 )
 def test_states_that_no_action_holds_are_solved(solver, radius, horizon, value):

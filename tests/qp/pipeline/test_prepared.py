@@ -17,7 +17,7 @@ from torch_qpmpc.qp.pipeline.prepared import _Latest
 
 @pytest.fixture
 def eliminations(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
-    """The matrices that were eliminated since the test began."""
+    """Record the matrices that are eliminated during the test."""
     eliminated, eliminate = [], loops.eliminate
 
     def counting(C: np.ndarray, *arguments):

@@ -53,7 +53,7 @@ def test_units_are_powers_of_two_and_make_sizes_ordinary(matrices):
 
 @pytest.mark.parametrize("bound", [1e3, 1e5, 1e6, 1e8, 1e10])
 def test_bounds_that_are_far_away_change_no_answer(solver, bound):
-    """Large numbers in the place of no bound once made units in which every error was small."""
+    """Large numbers in place of infinite bounds once led to units that hid every error."""
     A, B, s = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], torch.tensor([[1.0, -0.5], [0.1, 0.2]])
     options = {"stage_weight": [1.0, 0.1, 0.01], "action_bounds": ([-1.0], [1.0])}
     free, far = (
@@ -116,7 +116,7 @@ def test_small_and_large_contradictions_are_infeasible(size):
 
 
 def test_what_is_solved_again_does_not_see_the_matrices_of_invalid_qps(solver):
-    """Of three QPs whose units are too large, one has NaN in its matrices."""
+    """One of three QPs with too large units has NaN in its matrices."""
     options = {"stage_weight": [1.0, 0.1, 0.01], "action_bounds": ([-1.0], [1.0])}
     A, B, far = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], ([-1e6] * 2, [1e6] * 2)
     qp = QPMPC.from_model(A, B, 10, state_bounds=far, **options).quadratic_program()

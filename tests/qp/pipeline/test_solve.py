@@ -21,7 +21,7 @@ BATCH = 6
 
 
 def doctored(change: Callable[[BackendSolution], BackendSolution]) -> Backend:
-    """A backend that solves, and then changes its answer."""
+    """Make a backend that changes its solution afterwards."""
 
     def solve(qps: SoftQPs) -> BackendSolution:
         return change(daqp.solve(qps))
@@ -46,14 +46,14 @@ INACCURACIES = {
 
 @pytest.fixture
 def liar(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str:
-    """The name of a backend that tells the test's lie."""
+    """Register a backend that returns the test's wrong solution."""
     monkeypatch.setitem(BACKENDS, "liar", doctored(LIES[request.param]))
     return "liar"
 
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many QPs the backend "recorder", which is DAQP, is asked for at a time."""
+    """Record the batch sizes that the backend "recorder", a DAQP, gets."""
     counts = []
 
     def recording(qps: SoftQPs) -> BackendSolution:
@@ -74,7 +74,7 @@ def assert_right(solution: QPSolution, known: KnownQP) -> None:
     assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)
 
 
-# What the certificate rejects is solved by another
+# Solutions rejected by the certificate go to another solver
 
 
 @pytest.mark.parametrize("liar", LIES, indirect=True)
@@ -84,7 +84,7 @@ def test_wrong_answers_are_caught_and_replaced(liar):
         solution = solve(known, solver=liar)
     assert_right(solution, known)
     assert (log.solves, log.unsolved) == (BATCH, 0)
-    assert log.fallback >= BATCH - 1  # where one's answer stands for all, that one is right
+    assert log.fallback >= BATCH - 1  # the one whose solution stands for all is right
 
 
 @pytest.mark.parametrize("name", INACCURACIES)
@@ -169,7 +169,7 @@ def test_a_solver_is_not_asked_twice_for_what_it_got_wrong(monkeypatch):
 
 @pytest.mark.parametrize("one", range(BATCH))
 def test_a_part_of_a_batch_may_have_other_rows(one):
-    """Rows without a bound are left out, and which they are differs from element to element."""
+    """Rows without bounds are left out; they differ between elements."""
     known = known_qp(3, batch=(BATCH,))
     active = solve(known, solver="torch").active
     unknown = torch.full_like(active, UNKNOWN)
@@ -223,7 +223,7 @@ def test_what_nobody_solves_is_masked_on_request(recwarn):
 
 
 def spoil(known: KnownQP, index: int) -> KnownQP:
-    """The same batch with NaN in one element."""
+    """Put NaN into one element of a batch."""
     q = known.qp.q.clone()
     q[index] = torch.nan
     return replace(known, qp=replace(known.qp, q=q, check_values=False))
@@ -297,7 +297,7 @@ def test_the_log_counts_its_own_thread_only():
     assert log.solves == 0
 
 
-# What never reaches a backend
+# QPs that never reach a backend
 
 
 def test_rows_without_a_bound_or_a_free_variable_are_left_out(monkeypatch):
@@ -372,7 +372,7 @@ def test_a_batch_of_invalid_elements_reaches_no_backend(monkeypatch):
 
 
 def test_an_indefinite_hessian_is_not_certified(solver):
-    """A stationary point of a concave cost satisfies every first-order condition."""
+    """A stationary point of a concave cost satisfies all first-order conditions."""
     known = known_qp(0)
     H = known.qp.H - 1e3 * torch.eye(known.qp.n_z).double()
     indefinite = QuadraticProgram(H, *known.qp.tensors()[1:], check_values=False)
@@ -384,9 +384,9 @@ def test_an_indefinite_hessian_is_not_certified(solver):
 
 @pytest.mark.parametrize("solver", ["proxqp", "daqp"])
 def test_a_row_that_the_fixed_entries_decide_but_for_rounding_is_no_row(solver):
-    """Q of a banded C: x_1 is decided by x_0 and u_0, and eliminating C leaves traces of rounding.
+    """In Q with a banded C, x_0 and u_0 determine x_1 up to rounding.
 
-    Its multiplier belongs to no free variable, so that no solver can be asked for it.
+    The multiplier of such a row belongs to no free variable, so no solver can determine it.
     """
     physics = PointMass()
     A, B, theta = physics.corrupted(1)

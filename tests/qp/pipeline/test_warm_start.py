@@ -16,7 +16,7 @@ BATCH = 6
 
 
 def true_set(seed: int, matrices: tuple[int, ...] = ()):
-    """QPs in tensors, their exact solution when condensed, and its active set."""
+    """Return QPs in tensors, their exact condensed solution, and its active set."""
     known = known_qp(seed, batch=(BATCH,), matrices=matrices)
     solution = solve_qp(known.qp, known.fixed, solver="torch")
     return programs_of(known), soft_qps(known)[1], solution.active
@@ -102,7 +102,7 @@ def test_nonsense_does_no_harm(solver):
 
 
 def moved(solver: str, size: float) -> tuple[Tensor, Tensor, SolveLog]:
-    """Values without and with the active sets of a theta that was another, and the latter's log."""
+    """Solve cold and from the active sets of another theta; return both values and the warm log."""
     mpc, s = random_mpc(9, solver=solver, horizon=8), random_states(64, size=0.7)
     active = mpc.solve(s).active
     with torch.no_grad():

@@ -26,7 +26,7 @@ COUNT = 32
 
 
 def paper_mpc(*, perturb: float = 0.05, stage: float = 1.0, velocity: float = 1.0, **options: Any):
-    """The paper's QP with a dense C, horizon 10, states soft and actions hard by default."""
+    """Make the paper's QP with a dense C, horizon 10, soft states and hard actions."""
     random = np.random.default_rng(0)
     A = np.eye(4) + 0.1 * np.eye(4, k=2)
     B = np.vstack([0.005 * np.eye(2), 0.1 * np.eye(2)])
@@ -45,7 +45,7 @@ def paper_mpc(*, perturb: float = 0.05, stage: float = 1.0, velocity: float = 1.
 
 
 def paper_inputs(far: float = 1.0, *, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
-    """States, ``far`` times those that the experiment starts from, and actions, some at bounds."""
+    """Draw states, ``far`` times the experiment's starts, and actions, some at their bounds."""
     random = np.random.default_rng(seed)
     positions, speeds = random.uniform(-1.5, 1.5, (COUNT, 2)), random.uniform(-0.5, 0.5, (COUNT, 2))
     actions = np.clip(random.standard_normal((COUNT, 2)), -1, 1)
@@ -147,7 +147,7 @@ def as_tensors(**arrays: np.ndarray) -> SoftQPs:
 def random_qps(
     seed: int, *, count: int = 16, d: int = 6, rank: int | None = None, twice: bool = True
 ) -> SoftQPs:
-    """Feasible and bounded QPs, half of whose bounds meet in a vertex, with rows given twice."""
+    """Draw feasible and bounded QPs with repeated rows; half of their bounds meet in a vertex."""
     random = np.random.default_rng(seed)
     factor = random.standard_normal((1, d, d if rank is None else rank))
     G = random.standard_normal((1, 6, d))
@@ -214,7 +214,7 @@ def test_units_change_nothing():
     assert_allclose(answer.v / length, plain.v, atol=1e-7)
 
 
-# Shapes at the edge
+# Degenerate shapes
 
 
 @pytest.mark.parametrize("matrices", [0, 1, 3])
@@ -236,7 +236,7 @@ def test_an_empty_batch(matrices):
 
 
 def one_row(count: int = 3, **changes: Any) -> SoftQPs:
-    """min 1/2 |v|^2 + (9, 9)'v with v_1 in [-1, 1], a hard row, and a soft row of zeros."""
+    """Make min 1/2 |v|^2 + (9, 9)'v with v_1 in [-1, 1], a hard row, and a soft row of zeros."""
     ones = np.ones((count, 2))
     arrays: dict[str, np.ndarray] = {
         "H": np.eye(2)[None],
