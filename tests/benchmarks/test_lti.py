@@ -1,4 +1,4 @@
-"""Our side of the comparison with mpcrl, in short, and its table on results made up."""
+"""Our side of the comparison with mpcrl on short runs, and its table on made-up results."""
 
 from __future__ import annotations
 
