@@ -27,7 +27,7 @@ def thread_count() -> Iterator[None]:
 
 @pytest.fixture
 def interleaved(benchmark: Any) -> Callable[..., Any]:
-    """Return `Interleaved` on pytest-benchmark's fixture."""
+    """Return `Interleaved.run` on pytest-benchmark's fixture."""
     return Interleaved(benchmark).run
 
 

@@ -35,7 +35,7 @@ class Stream:
 
     #: ``(steps,)``
     costs: np.ndarray
-    #: ``(steps,)``: by how much the state that a cost is charged at is outside the box, in total.
+    #: ``(steps,)``: total violation of the box by the state of each cost.
     violations: np.ndarray
     #: The learning loop's wall time, without building the problem.
     seconds: float

@@ -23,7 +23,7 @@ pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[b
 #: Rounds of a fast contender by batch, and the number of them between two of the reference.
 ROUNDS = {1: (60, 15), 32: (60, 15), 256: (60, 15), 1024: (9, 3)}
 SLOW_ROUNDS = {1: 5, 32: 3, 256: 1, 1024: 1}
-#: Largest batch with interleaved rounds of the reference.
+#: Batches with interleaved rounds of the reference.
 INTERLEAVED = (1, 32, 256)
 
 CASES = [

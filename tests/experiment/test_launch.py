@@ -62,7 +62,7 @@ def test_a_lost_worker_is_no_file_error(hydra):
 
 @pytest.mark.parametrize("error", [OSError("disk"), ValueError("bug")])
 def test_a_threads_error_is_printed_unless_the_run_raises_it(capsys, error):
-    module._print_unless_writing(
+    module._print_unless_os_error(
         threading.ExceptHookArgs((type(error), error, None, threading.current_thread()))
     )
     assert ("bug" in capsys.readouterr().err) == isinstance(error, ValueError)
