@@ -64,7 +64,7 @@ def test_energies_figure_shows_shares(mpc):
     rendered(figure)
 
 
-def test_a_C_without_canonical_form_says_why():
+def test_a_C_without_canonical_form_shows_the_reason():
     mpc = make_mpc()
     with torch.no_grad():
         mpc.C.zero_()

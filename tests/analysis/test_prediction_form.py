@@ -123,7 +123,7 @@ def test_a_small_C_is_as_good_as_any():
     torch.testing.assert_close(scaled.condition, form.condition)
 
 
-def test_a_C_that_does_not_determine_the_states_says_so():
+def test_a_C_that_does_not_determine_the_states_is_refused():
     C, n_x, n_u, _ = _of("tied")
     dependent = C.clone()
     dependent[4] = dependent[2] - dependent[7]

@@ -68,7 +68,7 @@ def test_a_report_without_a_regulator():
     assert math.isnan(found.gain_to_lqr)
 
 
-def test_the_gain_is_taken_where_asked():
+def test_the_gain_is_taken_at_the_given_state():
     mpc = QPMPC.from_model(
         A, B, 4, action_bounds=([-0.5], [0.5]), stage_weight=[9.0, 1.0, 0.01], solver="daqp"
     )

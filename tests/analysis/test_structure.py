@@ -244,7 +244,7 @@ def test_later_actions_are_no_memory():
     assert markov_order(energies, tolerance=1.0) == 1
 
 
-def test_the_first_entry_of_memory_is_what_the_stage_models_explain():
+def test_the_first_entry_of_memory_is_explained_by_the_stage_models():
     form = free_form()
     size = form.maps[1:, :, :-1].square().sum((-1, -2))
     left = (stage_models(form).residual.square() * size).sum() / size.sum()

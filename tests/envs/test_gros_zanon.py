@@ -52,7 +52,7 @@ def test_noise_is_one_uniform_number_for_the_first_state():
         assert e.std().item() == pytest.approx(0.1 / 12**0.5, rel=0.02)
 
 
-def test_episodes_start_at_one_state_that_nothing_is_drawn_for():
+def test_episodes_start_at_one_state_without_a_draw():
     for rng, untouched in (
         (np.random.default_rng(3), np.random.default_rng(3)),
         (torch.Generator().manual_seed(3), torch.Generator().manual_seed(3)),

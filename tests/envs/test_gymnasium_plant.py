@@ -126,7 +126,7 @@ def test_violation_is_the_distance_to_the_box():
     assert plant.violation(s).tolist() == [0, 1.75]
 
 
-def test_nobody_knows_its_model():
+def test_it_has_no_true_model():
     assert GymnasiumPlant("Pendulum-v1").true_model() is None
 
 

@@ -213,7 +213,7 @@ def test_partial_resets_in_a_collector_restart_exactly_the_finished_episodes(pla
         assert data["next", "noise"].std().item() > 0.13
 
 
-def test_same_seed_same_rollouts_whatever_the_global_generator_does(plant):
+def test_rollouts_depend_on_the_seed_only(plant):
     def rollout(seed):
         env = LinearSystemEnv(plant, 4, 50, seed=seed)
         torch.manual_seed(seed + torch.seed() % 1000)

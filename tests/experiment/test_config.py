@@ -517,7 +517,7 @@ ABLATIONS: dict[str, tuple[list[str], dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("name", choices("ablation"))
-def test_an_ablation_differs_in_what_it_says(name):
+def test_an_ablation_differs_in_its_named_settings(name):
     base, expected = ABLATIONS[name]
     found = make_config(f"+ablation={name}")
     check_config(found)

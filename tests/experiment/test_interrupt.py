@@ -109,7 +109,7 @@ def test_a_signal_in_the_last_update_lets_the_run_finish(tmp_path, monkeypatch):
     assert (tmp_path / "summary.json").exists()
 
 
-def test_a_second_ctrl_c_keeps_what_was_logged_and_the_last_checkpoint(tmp_path, monkeypatch):
+def test_a_second_ctrl_c_keeps_the_log_and_the_last_checkpoint(tmp_path, monkeypatch):
     entered, enter = [], SolveLog.__enter__
 
     def twice(log: SolveLog) -> SolveLog:

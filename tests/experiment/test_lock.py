@@ -62,7 +62,7 @@ def test_a_live_process_is_named_and_a_killed_one_leaves_no_lock(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_sweep_is_offered_its_own_settings(tmp_path):
+def test_a_sweeps_message_names_its_own_setting(tmp_path):
     with (
         locked(tmp_path),
         pytest.raises(QPError, match=r"with hydra\.sweep\.dir=FOLDER\."),
@@ -95,7 +95,7 @@ def test_a_lock_file_that_was_removed_meanwhile_is_opened_again(tmp_path, monkey
             pass
 
 
-def test_without_locks_runs_go_on(tmp_path, monkeypatch):
+def test_without_locks_runs_continue(tmp_path, monkeypatch):
     def unsupported(*_: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 

@@ -101,7 +101,7 @@ def test_constraint_figure_of_any_horizon(horizon):
     rendered(constraint_figure(make_mpc(horizon)))
 
 
-def test_constraint_figure_says_why_there_is_no_canonical_form():
+def test_constraint_figure_shows_why_there_is_no_canonical_form():
     mpc = make_mpc()
     with torch.no_grad():
         mpc.C[:, -1] = 0

@@ -96,7 +96,7 @@ def test_summary_is_strict_json(tmp_path):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
-def test_what_was_logged_survives_an_interruption(tmp_path, error):
+def test_the_log_survives_an_interruption(tmp_path, error):
     def interrupted() -> None:
         with RunFolder(tmp_path, make_config()) as run:
             for update in range(1, 20):
@@ -219,7 +219,7 @@ def test_a_full_disk_ends_in_a_sentence_and_keeps_the_last_checkpoint(tmp_path):
     assert not list((tmp_path / "run").glob("*.partial"))
 
 
-def test_what_could_not_be_written_is_said(tmp_path):
+def test_a_failed_write_is_reported(tmp_path):
     error = unwritable(tmp_path, OSError(errno.EROFS, "Read-only file system", "x.csv"))
     assert str(error) == (
         f"folder: got {tmp_path}, where writing failed ([Errno 30] Read-only file system: 'x.csv')"
@@ -228,7 +228,7 @@ def test_what_could_not_be_written_is_said(tmp_path):
 
 
 @pytest.mark.parametrize("mode", [("run",), ("sweep", "-m")], ids=lambda mode: mode[0])
-def test_a_folder_that_cannot_be_made_is_said_in_one_sentence(tmp_path, mode):
+def test_a_folder_that_cannot_be_made_ends_in_a_sentence(tmp_path, mode):
     key, *multirun = mode
     (tmp_path / "file").touch()
     sentence = (

@@ -47,7 +47,7 @@ ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
     ],
     ids=" ".join,
 )
-def test_a_run_that_goes_on_is_the_one_that_never_stopped(tmp_path, monkeypatch, overrides):
+def test_a_resumed_run_equals_an_undisturbed_one(tmp_path, monkeypatch, overrides):
     cfg = make_config(*RUN, *overrides)
     train.train(cfg, str(tmp_path / "whole"))
     for update in STOPS:
@@ -117,7 +117,7 @@ def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch, when):
     assert_events_are_whole(tmp_path / "run")
 
 
-def test_a_finished_run_keeps_what_it_learned_and_no_data(tmp_path, stopped):
+def test_a_finished_run_saves_theta_without_data(tmp_path, stopped):
     big = (stopped / "checkpoint.pt").stat().st_size
     assert load_checkpoint(stopped / "checkpoint.pt")["replay"] is not None
     go_on(stopped)
@@ -148,7 +148,7 @@ def test_worker_processes_start_new_episodes_on_resume(tmp_path, monkeypatch, ca
 # --- What is refused -----------------------------------------------------------------------------
 
 
-def test_only_a_run_that_was_stopped_goes_on(tmp_path, stopped):
+def test_only_a_stopped_run_resumes(tmp_path, stopped):
     message = r"resume: got it together with seed=3, expected no other override"
     with pytest.raises(QPError, match=message):
         resumed(stopped, ["resume=x", "seed=3"])
@@ -159,7 +159,7 @@ def test_only_a_run_that_was_stopped_goes_on(tmp_path, stopped):
         resumed(stopped, [])
 
 
-def test_a_damaged_checkpoint_offers_the_one_before_which_goes_on(tmp_path, stopped):
+def test_a_damaged_checkpoint_names_the_previous_one_which_resumes(tmp_path, stopped):
     (stopped / "checkpoint.pt").write_bytes(b"PK" + bytes(1000))
     before = stopped / "checkpoint-previous.pt"
     with pytest.raises(QPError, match=rf"cannot be read .*use the previous one, {before}\.$"):
@@ -192,7 +192,7 @@ def test_a_checkpoint_of_another_layout_is_refused(stopped, key):
         resumed(stopped, [])
 
 
-def test_what_is_no_state_is_refused(stopped):
+def test_an_invalid_state_is_refused(stopped):
     torch.save([1, 2], stopped / "checkpoint.pt")
     with pytest.raises(QPError, match=r"checkpoint: got a list, expected a run's state"):
         resumed(stopped, [])

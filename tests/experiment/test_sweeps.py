@@ -138,7 +138,7 @@ def finished(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_finished_run_is_known_by_its_settings(finished):
+def test_a_finished_run_is_recognised_by_its_settings(finished):
     assert finished_run(finished, make_config(*SMALL)) == {"closed_gap": 0.5}
 
 

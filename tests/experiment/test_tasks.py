@@ -48,7 +48,7 @@ J_TRUE_MODEL = 47
 
 
 @pytest.mark.parametrize("seed", [1, 4])
-def test_ends_of_the_experiment_are_the_known_ones(seed):
+def test_J_of_start_and_true_model_are_the_known_ones(seed):
     """J depends only on the paper's random draws, starts and rollout."""
     cfg = make_config(f"seed={seed}", "solver=daqp")
     physics = linear_system(cfg)
@@ -128,7 +128,7 @@ def test_the_other_task_starts_from_the_original_wrong_model():
     torch.testing.assert_close(qp.H.diagonal()[:6], stages)
 
 
-def test_its_other_end_knows_the_mean_of_the_noise():
+def test_the_true_scheme_has_the_mean_of_the_noise():
     cfg = make_config("task=gros_zanon")
     physics = linear_system(cfg)
     mpc = true_mpc(cfg, physics)
@@ -271,7 +271,7 @@ def test_a_task_has_noises_and_keys_of_its_own(own_task, tmp_path):
     check_config(make_config("task=mine", "+task.mass=1.5", "+task.colour=red"))
 
 
-def test_what_cannot_be_registered(own_task):
+def test_invalid_registrations_are_refused(own_task):
     own_task("")
     register(TASKS["mine"])
     with pytest.raises(QPError, match=r"task\.name: got 'point_mass', which is built in, exp"):

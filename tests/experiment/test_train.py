@@ -78,7 +78,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     return folder, train.train(make_config(*WHOLE), str(folder))
 
 
-def test_what_is_compiled_meanwhile_is_not_counted_as_training(tmp_path, monkeypatch):
+def test_compilation_is_not_counted_as_training(tmp_path, monkeypatch):
     clock, batches = itertools.count(step=1000.0), train.batches
 
     def compiling(collector: Any) -> Iterator[Any]:
@@ -446,7 +446,7 @@ def test_the_second_order_learns_in_tens_of_updates(tmp_path, constraint):
         assert np.isfinite(table["loss/si"].dropna()).all()
 
 
-def test_an_interruption_leaves_what_was_logged(tmp_path, monkeypatch):
+def test_an_interruption_keeps_the_log(tmp_path, monkeypatch):
     calls, forward = [], QPQLearningLoss.loss_value
 
     def interrupted(self, tensordict):
@@ -564,7 +564,7 @@ def test_a_finished_run_is_not_overwritten(tmp_path):
     assert not (folder / LOCK).exists()
 
 
-def test_a_stopped_run_is_not_overwritten_but_goes_on(stopped):
+def test_a_stopped_run_is_not_overwritten_but_resumes(stopped):
     before = contents(stopped)
     message = (
         f"^folder: got {stopped}, which holds a stopped run, expected one without a run. "
@@ -578,7 +578,7 @@ def test_a_stopped_run_is_not_overwritten_but_goes_on(stopped):
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "checkpoint.pt"])
-def test_a_run_that_cannot_go_on_is_not_offered_for_it(stopped, name):
+def test_the_message_offers_no_resume_of_a_broken_run(stopped, name):
     (stopped / name).write_text("[: garbage")
     message = "a stopped run, expected one without a run. Choose another folder with hydra"
     with pytest.raises(SystemExit, match=message):
@@ -604,7 +604,7 @@ def test_a_run_holds_the_lock(tmp_path, monkeypatch):
     assert not (tmp_path / LOCK).exists()
 
 
-def test_a_run_goes_on_in_its_own_folder_only(stopped, tmp_path):
+def test_a_run_resumes_only_in_its_own_folder(stopped, tmp_path):
     message = f"got {tmp_path}/other with resume={stopped}, expected {stopped}. A run resumes in i"
     with pytest.raises(SystemExit, match=message):
         run_command(f"resume={stopped}", f"hydra.run.dir={tmp_path}/other")
@@ -667,7 +667,7 @@ def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys, id):
         (("task.id=Pendulum-v1", *PENDULUM[:2]), r"^task.stage_weight: got null, .* \(4, 4\)"),
     ],
 )
-def test_what_a_gymnasium_task_lacks_is_said(tmp_path, monkeypatch, overrides, message):
+def test_missing_keys_of_a_gymnasium_task_are_named(tmp_path, monkeypatch, overrides, message):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=message):
         run_command("task=gymnasium", *overrides, *SHORT)

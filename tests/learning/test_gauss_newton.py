@@ -106,7 +106,7 @@ def test_the_si_penalty_is_part_of_the_step():
 
 
 @pytest.mark.parametrize("name", PARTS)
-def test_a_memory_keeps_what_past_pairs_know(name):
+def test_a_memory_preserves_past_pairs(name):
     """A stream of single pairs steps as if past pairs were in the batch with zero error."""
     mpc = random_mpc(2, **PARTS[name])
     optimizer = GaussNewton(mpc, damping=DAMPING, memory=3, trust_region=False)

@@ -233,7 +233,7 @@ def test_warm_actions_are_the_cold_ones(solver):
     torch.testing.assert_close(warm.actions, cold.actions, rtol=0, atol=1e-7)
 
 
-def test_steps_that_could_not_be_solved_leave_nothing_to_start_from():
+def test_unsolved_steps_leave_no_active_set():
     mpc = make_corridor("daqp", state_slack=torch.inf, on_failure="mask")
     inside = torch.tensor([0.1, 0.1, 0.0, 0.0])
     far = 3 * PointMass().ub_s.float()

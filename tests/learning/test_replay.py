@@ -105,7 +105,7 @@ def test_sampling_leaves_the_stored_flags_alone():
         replay.windows.extend(sample)
 
 
-def test_transitions_are_sampled_uniformly_from_what_is_stored():
+def test_stored_transitions_are_sampled_uniformly():
     data = batches(30, 2, max_steps=50)
     replay = filled(data, rows=10)
     assert replay.sample().shape == (32,)
@@ -167,7 +167,7 @@ def test_a_restored_replay_equals_an_undisturbed_one(count):
         second.extend(batch)
 
 
-def test_asking_for_windows_too_early_is_an_error():
+def test_sampling_windows_too_early_is_an_error():
     replay = filled([], rows=40)
     match = "replay: got {} transitions without such a trajectory, expected 4 consecutive"
     with pytest.raises(QPError, match=match.format(0)):

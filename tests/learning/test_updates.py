@@ -80,7 +80,7 @@ def test_the_second_order_keeps_active_sets():
     assert ACTIVE_SET in batch["next"]
 
 
-def test_what_is_not_solved_is_counted():
+def test_unsolved_qps_are_counted():
     mpc = random_mpc(3, on_failure="mask")
     batch = transitions()
     batch["action"][2] = 9.0  # beyond a hard bound

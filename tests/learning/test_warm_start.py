@@ -94,7 +94,7 @@ def test_without_a_key_nothing_is_written():
     assert ACTIVE_SET not in td["next"]
 
 
-def test_a_replay_brings_back_what_it_was_told_to_remember():
+def test_a_replay_returns_remembered_active_sets():
     replay = make_replay(8 * 4, 4, 6, 2, 5, active_rows=3)
     batch = transitions(20).reshape(4, 5)
     batch["collector", "traj_ids"] = torch.arange(4).unsqueeze(-1).expand(4, 5).clone()

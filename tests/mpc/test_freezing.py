@@ -318,7 +318,7 @@ def test_a_state_dict_of_other_frozen_entries_is_refused():
         masked(entries()).load_state_dict(masked(rows()).state_dict())
 
 
-def test_a_state_dict_says_what_it_belongs_to_in_tensors(tmp_path):
+def test_a_state_dict_has_the_settings_as_tensors(tmp_path):
     mpc = random_mpc(0)
     state = {name: tensor.clone() for name, tensor in mpc.state_dict().items()}
     torch.save(state, tmp_path / "state.pt")
@@ -338,7 +338,7 @@ def test_a_state_dict_from_before_is_loaded():
     ("name", "value"),
     [("gamma", 0.5), ("horizon", 5), ("n_x", 3), ("structure", "tied"), ("learned", ("H",))],
 )
-def test_what_the_constructor_decides_is_not_assigned(name, value):
+def test_settings_of_the_constructor_cannot_be_changed(name, value):
     mpc = random_mpc(0)
     own = getattr(mpc, name)
     with pytest.raises(QPError, match=f"{name}: got .*, expected .*, as made. Make another QPMPC"):
@@ -395,7 +395,7 @@ def test_the_state_of_another_qpmpcs_loss_is_refused(delay):
     loss().load_state_dict(older)
 
 
-def test_a_masked_C_is_not_called_tied():
+def test_a_masked_C_is_not_tied():
     mpc = masked(rows())
     penalty = DeviationPenalty(mpc.C_0, 2, 1)
     with pytest.raises(QPError, match=r"pass mpc.leaves\('C'\)\[0\]"):
@@ -404,7 +404,7 @@ def test_a_masked_C_is_not_called_tied():
         mpc.leaves("b")
 
 
-def test_what_the_constructor_decided_may_be_assigned_again():
+def test_settings_of_the_constructor_may_be_assigned_unchanged():
     mpc = random_mpc(0)
     mpc.gamma = mpc.gamma
     mpc.structure = "free"

@@ -195,7 +195,7 @@ def test_a_release_changes_neither_values_nor_policy(name, way):
         count = more
 
 
-def test_what_is_released_is_free_to_move():
+def test_released_entries_can_change():
     mpc, s = scheme(4), random_states(6)
     mpc.release()
     assert dict(mpc.named_parameters())["C"].shape == mpc.C_0.shape
@@ -223,7 +223,7 @@ def test_a_released_module_can_be_copied_saved_and_reset():
     assert_close(mpc.value(s), scheme(free=0.0).value(s))
 
 
-def test_what_is_frozen_stays_frozen():
+def test_frozen_entries_stay_frozen():
     mpc = scheme(7)
     for name, parameter in mpc.named_parameters():
         if name.split(".")[1:2] in (["C"], ["q"]):

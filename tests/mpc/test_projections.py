@@ -105,7 +105,7 @@ def test_the_program_for_a_proposal_is_its_projection(shape):
 
 
 @pytest.mark.parametrize("solver", [cp.CLARABEL, cp.SCS])
-def test_the_projection_is_what_other_solvers_find(solver):
+def test_the_projection_agrees_with_other_solvers(solver):
     H = symmetric(5, 5)
     X = cp.Variable((5, 5), symmetric=True)
     options = {"eps_abs": 1e-8, "eps_rel": 1e-8} if solver == cp.SCS else {}
@@ -133,7 +133,7 @@ def test_another_metric_has_another_nearest_matrix():
 
 
 @pytest.mark.parametrize("nearest", NEAREST.values())
-def test_what_is_semidefinite_stays_to_the_last_bit(nearest):
+def test_semidefinite_matrices_are_unchanged_to_the_last_bit(nearest):
     factor = normal(3, 4, 2)
     H = factor @ factor.mT  # of rank two
     H = (H + H.mT) / 2
@@ -152,7 +152,7 @@ def test_of_a_matrix_that_is_not_symmetric_the_symmetric_part_counts(nearest):
 
 
 @pytest.mark.parametrize("nearest", NEAREST.values())
-def test_what_is_not_finite_is_left_to_the_solver(nearest):
+def test_non_finite_qps_go_to_the_solver(nearest):
     H = -torch.eye(2).repeat(2, 1, 1)
     H[0, 0, 0] = torch.nan
     moved = nearest(H)
@@ -213,7 +213,7 @@ OPTIMIZERS = ("adam", "sgd", "gauss_newton")
 @pytest.mark.parametrize(
     ("rule", "name", "optimizer"), covering(itertools.product(STEPS, HESSIANS, OPTIMIZERS))
 )
-def test_the_weights_keep_their_sign_for_as_long_as_it_learns(rule, name, optimizer):
+def test_the_weights_keep_their_sign_while_learning(rule, name, optimizer):
     """Falling targets pull the weights below zero.
 
     Pairs of rule, form of H and optimizer suffice: the rule applies to each part separately.

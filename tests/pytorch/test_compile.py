@@ -66,7 +66,7 @@ def test_a_gradient_inside_of_what_is_compiled():
 
 @pytest.mark.parametrize("of", ["fixed", "q"])
 @pytest.mark.parametrize("output", ["value", "z"])
-def test_a_gradient_in_what_is_passed_as_it_is(output, of):
+def test_a_gradient_in_an_argument_passed_unchanged(output, of):
     qp, s = random_mpc(3).quadratic_program(), random_states(4)
     given = {name: x.detach() for name, x in zip(EVENT_SHAPES, qp.tensors(), strict=True)}
     given["fixed"] = s

@@ -124,7 +124,7 @@ def test_a_cast_of_the_module_is_a_cast_of_theta_alone(dtype):
 
 
 @pytest.mark.parametrize("solver", BACKENDS)
-def test_what_was_solved_in_inference_mode_can_be_differentiated_after_it(solver):
+def test_solutions_of_inference_mode_are_differentiable_afterwards(solver):
     mpc, twin = random_mpc(0, solver=solver), random_mpc(0, solver=solver)
     with torch.inference_mode():
         value = mpc.value(S)
@@ -132,7 +132,7 @@ def test_what_was_solved_in_inference_mode_can_be_differentiated_after_it(solver
     assert_close(outcome(mpc, S, A), outcome(twin, S, A))
 
 
-def test_nothing_is_recorded_where_nothing_is_to_be():
+def test_no_gradient_is_recorded_where_none_is_needed():
     mpc = random_mpc(0)
     with torch.no_grad():
         assert not mpc.value(S).requires_grad

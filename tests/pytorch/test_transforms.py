@@ -204,7 +204,7 @@ def test_derivatives_that_there_are_not_are_refused(function, message):
         function(mpc)(random_states(1)[0])
 
 
-def test_a_functional_call_never_gets_what_was_worked_out_for_another_theta():
+def test_a_functional_call_never_reuses_another_thetas_preparation():
     mpc, s = random_mpc(0), random_states(4)
     theta = {name: part.detach().clone() for name, part in mpc.named_parameters()}
     for k in range(6):
@@ -217,7 +217,7 @@ def test_a_functional_call_never_gets_what_was_worked_out_for_another_theta():
         assert_close(both[k % 2], fresh.value(s))
 
 
-def test_what_is_kept_from_inside_a_transform_still_has_its_gradient():
+def test_a_value_kept_from_inside_a_transform_has_its_gradient():
     mpc, states = random_mpc(), random_states(3).requires_grad_()
     theta = {name: p.detach().clone().requires_grad_() for name, p in mpc.named_parameters()}
     kept: list = []

@@ -199,7 +199,7 @@ def test_one_batched_operand_makes_a_batch(name):
     assert together.solved.tolist() == [True, True, False, True]
 
 
-def test_gradient_is_the_same_whatever_is_kept():
+def test_gradient_does_not_depend_on_the_kept_entries():
     known = known_qp(4, batch=(3,))
     gradients = []
     for n_kept in (None, 2, 5):
@@ -540,7 +540,7 @@ def test_masked_failures_are_silent(recwarn):
 # Threads and processes
 
 
-def test_threads_that_solve_at_once_get_their_own_answers(solver):
+def test_concurrent_solves_get_their_own_solutions(solver):
     problems = [known_qp(seed, batch=(3,)) for seed in range(8)]
 
     def solve(known: KnownQP) -> QPSolution:

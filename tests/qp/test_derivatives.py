@@ -125,7 +125,7 @@ def test_dependent_active_rows_have_a_finite_gradient():
     assert_close(of_upper.sum(), torch.tensor(1.0).double(), atol=1e-6, rtol=0)
 
 
-def test_where_all_of_z_is_fixed_it_moves_with_what_fixes_it():
+def test_a_fully_fixed_z_moves_with_the_fixed_entries():
     one, none = torch.ones(1).double(), torch.zeros(0, 1).double()
     qp = QuadraticProgram(
         H=torch.eye(1).double(),

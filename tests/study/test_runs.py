@@ -33,7 +33,7 @@ def test_every_run_is_a_row_in_the_papers_order(study):
     assert frame["real"].tolist() == [True, True, False, True, False, True, True]
 
 
-def test_a_sweeps_own_folder_gives_its_name(study):
+def test_a_sweep_is_named_by_its_folder(study):
     assert set(collect(study / "small")["sweep"]) == {"small"}
 
 
@@ -106,7 +106,7 @@ def test_exact_zeros_above_the_band_are_counted(study):
     assert max(frame.query("constraint == 'free'")["zeros_above"]) < 0.1
 
 
-def test_an_ablation_gives_its_name(study, tmp_path):
+def test_an_ablation_is_labelled_by_its_name(study, tmp_path):
     for name in ("one", "two"):
         shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / name)
         config = tmp_path / name / "config.yaml"

@@ -40,7 +40,7 @@ def test_the_interval_of_the_mean_is_the_normal_one(rng):
     assert high == pytest.approx(x.mean() + half, abs=0.05)
 
 
-def test_it_covers_the_truth_as_often_as_it_says(rng):
+def test_it_covers_the_truth_at_its_level(rng):
     hits = 0
     for seed in range(200):
         x = rng.normal(size=30)

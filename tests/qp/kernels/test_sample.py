@@ -75,7 +75,7 @@ def reference(known: KnownQP, *claim: Tensor) -> float:
 
 
 @pytest.mark.parametrize("name", ["nothing", "z", "lam", "chi", "xi", "large"])
-def test_the_residual_is_what_the_certificate_says(name):
+def test_the_residual_is_the_certificates(name):
     for seed in range(4):
         known = known_qp(seed)
         claim = {n: getattr(known, n).clone() for n in ("z", "lam", "chi", "xi")}

@@ -190,7 +190,7 @@ def test_complementarity_gaps_of_opposite_sign_do_not_cancel():
     assert certify(programs, 0 * z, lam, empty, empty).residual < TOLERANCE
 
 
-def test_absurd_multipliers_excuse_nothing():
+def test_absurd_multipliers_do_not_hide_errors():
     # min 1/2 z'z - 2 z_2 with z_1 = 0, once in C and once in G: z_2 is 2, not 1.9.
     C, none = torch.tensor([[1.0, 0.0]]), torch.zeros(1)
     q, hard = torch.tensor([0.0, -2.0]), torch.full((1,), torch.inf)
@@ -202,7 +202,7 @@ def test_absurd_multipliers_excuse_nothing():
         assert bool(residual <= TOLERANCE) == accepted
 
 
-def test_the_constant_is_part_of_the_value_but_loosens_nothing():
+def test_the_constant_is_part_of_the_value_but_not_of_the_tolerance():
     known = known_qp(5, batch=(BATCH,))
     lifted = replace(known, qp=replace(known.qp, c=known.qp.c + 1e9))
     claim = {"lam": shifted(known.lam, first_row(known, known.lam == 0), 1e-3)}

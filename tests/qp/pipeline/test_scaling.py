@@ -95,7 +95,7 @@ def test_solutions_come_back_in_the_numbers_of_the_qp():
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])
 @pytest.mark.parametrize("spoilt", [torch.nan, torch.inf])
-def test_what_is_not_finite_is_left_to_its_own_status(matrices, spoilt):
+def test_non_finite_qps_get_their_own_status(matrices, spoilt):
     known = in_size(known_qp(2, batch=(BATCH,), matrices=matrices), cost=1e-7)
     q = known.qp.q.clone()
     q[1] = spoilt
@@ -115,7 +115,7 @@ def test_small_and_large_contradictions_are_infeasible(size):
     assert (solution.status == Status.INFEASIBLE).all()
 
 
-def test_what_is_solved_again_does_not_see_the_matrices_of_invalid_qps(solver):
+def test_retries_exclude_the_matrices_of_invalid_qps(solver):
     """One of three QPs with too large units has NaN in its matrices."""
     options = {"stage_weight": [1.0, 0.1, 0.01], "action_bounds": ([-1.0], [1.0])}
     A, B, far = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], ([-1e6] * 2, [1e6] * 2)

@@ -98,7 +98,7 @@ def test_inaccurate_answers_are_sharpened(monkeypatch, name):
     assert solution.residual.max() < 1e-9
 
 
-def test_only_what_is_rejected_is_solved_again(monkeypatch, asked):
+def test_only_rejected_solutions_are_solved_again(monkeypatch, asked):
     wrong = np.array([False, True, False, False, True, True])
 
     def lie(answer: BackendSolution) -> BackendSolution:
@@ -127,7 +127,7 @@ def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, asked)
     assert (log.fallback, log.recalled) == (0, 0)
 
 
-def test_a_known_active_set_spares_the_backend(asked):
+def test_a_correct_active_set_avoids_the_backend(asked):
     known = known_qp(3, batch=(BATCH,))
     active = solve(known, solver="daqp").active
     with SolveLog() as log:
@@ -136,7 +136,7 @@ def test_a_known_active_set_spares_the_backend(asked):
     assert (log.fallback, log.recalled) == (0, BATCH)
 
 
-def test_what_recall_does_not_finish_is_for_the_backend(monkeypatch, asked):
+def test_qps_that_the_warm_start_does_not_settle_go_to_the_backend(monkeypatch, asked):
     def half(p: Programs, qps: SoftQPs, active: np.ndarray) -> tuple:
         finished = np.arange(len(active)) % 2 == 0
         answer = daqp.solve(qps)
@@ -151,7 +151,7 @@ def test_what_recall_does_not_finish_is_for_the_backend(monkeypatch, asked):
     assert (log.fallback, log.recalled) == (0, BATCH // 2)
 
 
-def test_a_solver_is_not_asked_twice_for_what_it_got_wrong(monkeypatch):
+def test_a_solver_does_not_get_its_failures_again(monkeypatch):
     asked = []
 
     def liar(qps: SoftQPs) -> BackendSolution:
@@ -179,7 +179,7 @@ def test_a_part_of_a_batch_may_have_other_rows(one):
     assert log.recalled == 1
 
 
-def test_the_active_set_of_what_is_not_solved_is_unknown():
+def test_the_active_set_of_an_unsolved_qp_is_unknown():
     known = spoil(known_qp(3, batch=(BATCH,)), 4)
     active = solve(known, solver="daqp", on_failure="mask").active
     assert (active[4] == UNKNOWN).all()
@@ -194,7 +194,7 @@ def nobody_solves(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("nobody_solves")
-def test_what_nobody_solves_is_not_converged():
+def test_unsolved_qps_are_not_converged():
     known = known_qp(4, batch=(2, 3))
     message = (
         r"6 of 6 QPs have no certified solution. 6 NOT_CONVERGED, first at batch index \(0, 0\): "
@@ -207,7 +207,7 @@ def test_what_nobody_solves_is_not_converged():
 
 
 @pytest.mark.usefixtures("nobody_solves")
-def test_what_nobody_solves_is_masked_on_request(recwarn):
+def test_unsolved_qps_are_masked_on_request(recwarn):
     known = known_qp(4, batch=(2, 3))
     with SolveLog() as log:
         solution = solve(known, on_failure="mask")

@@ -37,7 +37,7 @@ def test_the_right_active_set_is_exact_at_once(seed, matrices):
     assert (answer.iterations == 1).all()
 
 
-def test_codes_say_what_each_row_does():
+def test_codes_describe_each_rows_state():
     known = known_qp(4, batch=(BATCH,))
     active = solve_qp(known.qp, known.fixed, solver="torch").active
     assert active.dtype == torch.int8
@@ -73,7 +73,7 @@ def test_the_active_sets_given_are_not_changed():
     assert torch.equal(wrong, before)
 
 
-def test_of_an_unknown_set_the_empty_one_is_tried():
+def test_an_unknown_active_set_is_tried_as_empty():
     p, _, active = true_set(5)
     empty = active.clone()
     empty[[1, 2, 4]] = 0

@@ -277,7 +277,7 @@ def test_without_rows_the_answer_is_that_of_a_linear_system():
     assert answer.lam.shape == (3, 0)
 
 
-def test_without_variables_the_rows_are_only_judged():
+def test_without_variables_the_rows_are_only_checked():
     answer = interior_point.solve(
         one_row(H=np.zeros((1, 0, 0)), G=np.zeros((1, 2, 0)), g=np.zeros((3, 0)))
     )
@@ -318,7 +318,7 @@ def test_without_a_solution_the_answer_is_finite_and_soon(case):
     ("case", "status"),
     [("infeasible", Status.INFEASIBLE), ("unbounded", Status.UNBOUNDED)],
 )
-def test_the_chain_says_what_is_the_matter(case, status):
+def test_the_pipeline_diagnoses_failures(case, status):
     qps = HOPELESS[case]
     H, G, g, lower, upper, w = (part[0] for part in (qps.H, qps.G, qps.g, qps.l, qps.u, qps.w))
     C, none = torch.zeros(0, 2).double(), torch.zeros(0).double()
@@ -333,7 +333,7 @@ def test_nan_in_the_data_ends_in_a_finite_answer():
     assert answer.lam.isfinite().all()
 
 
-def test_hopeless_neighbours_do_no_harm():
+def test_unsolvable_neighbours_do_no_harm():
     good = random_qps(5)
     lower, upper, w = good.l.clone(), good.u.clone(), good.w.clone()
     w[:, [0, 6]] = torch.inf  # the same row twice, ..
@@ -354,7 +354,7 @@ def test_hopeless_neighbours_do_no_harm():
 # Its active-set steps
 
 
-def test_settling_keeps_what_is_better():
+def test_settling_keeps_the_better_solution():
     qps = random_qps(9)
     form, cold = BatchedQPs.of(qps), interior_point.solve(qps)
     v, lam = cold.v, cold.lam
