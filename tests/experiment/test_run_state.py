@@ -152,10 +152,10 @@ def test_only_a_stopped_run_resumes(tmp_path, stopped):
     message = r"resume: got it together with seed=3, expected no other override"
     with pytest.raises(QPError, match=message):
         resumed(stopped, ["resume=x", "seed=3"])
-    with pytest.raises(QPError, match=r"resume: got .*without config.yaml, expected a folder of t"):
+    with pytest.raises(QPError, match=r"resume: got .*without config.yaml, expected a run's"):
         resumed(tmp_path, [])
     (stopped / "summary.json").touch()
-    with pytest.raises(QPError, match=r"resume: got .*which is finished, expected a run that was"):
+    with pytest.raises(QPError, match=r"resume: got .*which is finished, expected a stopped run"):
         resumed(stopped, [])
 
 
@@ -178,8 +178,8 @@ def test_a_checkpoint_of_another_run_is_refused(stopped):
     with pytest.raises(QPError) as error:
         resumed(stopped, [])
     assert str(error.value) == (
-        "checkpoint: got one of a run with seed=1, task.horizon=3, expected config.yaml's seed=2, "
-        "task.horizon=4. A run resumes with its own configuration, from its own checkpoints."
+        "checkpoint: got one from a run with seed=1, task.horizon=3, expected config.yaml's "
+        "seed=2, task.horizon=4. A run resumes with its own configuration, from its own checkpoints."
     )
 
 

@@ -139,5 +139,5 @@ def test_a_run_with_other_keys_is_named(study, tmp_path):
     shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
     config = tmp_path / "run" / "config.yaml"
     config.write_text(config.read_text().replace("step: cholesky\n", "", 1))
-    with pytest.raises(QPError, match=r"run: got .*step: got nothing.* expected one of this"):
+    with pytest.raises(QPError, match=r"run: got .*step: got nothing.* expected a run of this"):
         collect(tmp_path)

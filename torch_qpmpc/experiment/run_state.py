@@ -104,7 +104,9 @@ def check_state(state: Any, cfg: DictConfig) -> None:
     if changed := differences(state["config"], settings(cfg)):
         then, now = changed
         remedy = "A run resumes with its own configuration, from its own checkpoints."
-        raise QPError.expected("checkpoint", f"a run with {then}", f"config.yaml's {now}", remedy)
+        raise QPError.expected(
+            "checkpoint", f"one from a run with {then}", f"config.yaml's {now}", remedy
+        )
 
 
 def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, dict | None]:
