@@ -179,7 +179,8 @@ def test_a_checkpoint_of_another_run_is_refused(stopped):
         resumed(stopped, [])
     assert str(error.value) == (
         "checkpoint: got one from a run with seed=1, task.horizon=3, expected config.yaml's "
-        "seed=2, task.horizon=4. A run resumes with its own configuration, from its own checkpoints."
+        "seed=2, task.horizon=4. A run resumes with its own configuration, from its own "
+        "checkpoints."
     )
 
 
