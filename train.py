@@ -1,13 +1,13 @@
 """Learn a quadratic program as value function by Q-learning.
 
     python train.py                                     the paper's point mass: deviation, seed 1
-    python train.py constraint=free noise=brownian      one of the paper's cases
-    python train.py constraint=mpc                      its linear MPC scheme, tied
-    python train.py task=gros_zanon solver=daqp         another plant, from one long episode
+    python train.py constraint=free noise=brownian      another of the paper's cases
+    python train.py constraint=mpc                      a linear MPC scheme with learned model
+    python train.py task=gros_zanon solver=daqp         another plant, in one long episode
     python train.py -m constraint=fixed,free seed=1,2   a sweep
-    python train.py resume=runs/point_mass/..           go on with a run that was stopped
-    python train.py -m +study=paper                     the paper's study; goes on where it stopped
-    tensorboard --logdir runs                           watch it
+    python train.py resume=runs/point_mass/..           resume a stopped run
+    python train.py -m +study=paper                     start or resume the paper's study
+    tensorboard --logdir runs                           watch the runs
 
 configs/ holds every key. The run's folder gets config.yaml, metrics.csv, TensorBoard events,
 checkpoint.pt, summary.png and summary.json.
@@ -44,16 +44,16 @@ from torch_qpmpc.experiment.tasks import make_mpc, make_physics, make_true_mpc, 
 from torch_qpmpc.learning.operators import in_closed_loop, warm_policy
 from torch_qpmpc.learning.replay import ACTIVE_SET
 
-# Absolute, so that a script with a task of its own can call main.
+# Absolute, so that a user's script can call main.
 CONFIGS = str(Path(__file__).with_name("configs"))
 
 
 def train(
     cfg: DictConfig, folder: str, state: dict[str, Any] | None = None, quiet: bool = False
 ) -> dict[str, Any]:
-    """Run from the beginning, or from the ``state`` of a checkpoint.
+    """Train from the beginning, or from the ``state`` of a checkpoint.
 
-    ``quiet``, as the runs of a sweep are: without output, and signals are left to the launcher.
+    A ``quiet`` run, as in a sweep, prints nothing and leaves signals to the launcher.
 
     Returns:
         The content of summary.json.
@@ -71,7 +71,7 @@ def _train(
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
 
-    # The QP, between its two ends: the wrong model it starts from, and the true one.
+    # The QP, and its J before learning and with the true model.
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
     start = evaluate(cfg, warm_policy(mpc), physics)
@@ -79,7 +79,7 @@ def _train(
     if (true_mpc := make_true_mpc(cfg, physics)) is not None:
         loops["true model"] = evaluate(cfg, warm_policy(true_mpc), physics)
 
-    # Q-learning, by gradients or of the second order, or a policy gradient.
+    # The learner: Q-learning of first or second order, or actor-critic.
     operator = QPActorValueOperator(mpc, active_set_key=ACTIVE_SET if cfg.warm_start else None)
     released = state is not None and state["structure"] != mpc.structure
     if released:
@@ -87,7 +87,7 @@ def _train(
     learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
     learned_mpc = mpc if cfg.algo.name == "qlearning" or cfg.algo.actor == "qp" else None
 
-    # Data: vectorised episodes under today's policy, and one replay for transitions and windows.
+    # The data: vectorised episodes under the current policy, and their replay.
     collector = make_collector(cfg, physics, learner.actor)
     replay = make_run_replay(cfg, mpc)
     stream = batches(collector)
@@ -96,25 +96,25 @@ def _train(
         stack.callback(collector.shutdown)
         after = None if state is None else state["update"]
         run = stack.enter_context(RunFolder(folder, cfg, after))
-        go_on = f"python train.py resume={run.path}"
+        command = f"python train.py resume={run.path}"
 
-        # Warm up, or go on.
+        # Warm up, or resume.
         if state is None:
             tally = Tally()
             report(run, learned_mpc, loops, 0)
             for batch in itertools.islice(stream, -(-cfg.warmup_steps // cfg.steps_per_update)):
                 if cfg.replay:
                     replay.extend(batch)
-                interrupt.exit_if_signalled(f"Stopped before the first update: {go_on}")
+                interrupt.exit_if_signalled(f"Stopped before the first update: {command}")
         else:
             tally = restore(state, mpc, learner, collector, replay)
             if state["collector"] is None and tally.update < cfg.updates and not quiet:
-                print("New episodes: the environments' own state cannot be saved.")
+                print("Starting new episodes: the state of the environments is not saved.")
             loops["learned"] = evaluate(cfg, in_closed_loop(learner.actor), physics)
-        interrupt.exit_if_signalled(f"Stopped after update {tally.update}: {go_on}")
+        interrupt.exit_if_signalled(f"Stopped after update {tally.update}: {command}")
 
-        what = f"{cfg.constraint.name}, {cfg.noise.name}"
-        bar = tqdm(desc=what, initial=tally.update, total=cfg.updates, disable=quiet)
+        label = f"{cfg.constraint.name}, {cfg.noise.name}"
+        bar = tqdm(desc=label, initial=tally.update, total=cfg.updates, disable=quiet)
         progress = stack.enter_context(bar)
         for update in range(tally.update + 1, cfg.updates + 1):
             with tally.timed() as watch:
@@ -141,14 +141,14 @@ def _train(
             evaluated = last or update % cfg.eval_interval == 0
             if evaluated:
                 loops["learned"] = evaluate(cfg, in_closed_loop(learner.actor), physics)
-                ends = report(run, learned_mpc, loops, update)
-                progress.set_postfix(J=ends["J_final"], closed_gap=ends["closed_gap"])
+                gap = report(run, learned_mpc, loops, update)
+                progress.set_postfix(J=gap["J_final"], closed_gap=gap["closed_gap"])
             if evaluated or interrupt.signum is not None:
                 run.flush()
                 state = snapshot(cfg, mpc, learner, collector, replay, tally)
                 save_checkpoint(run.path / CHECKPOINT, state)
             if not last:
-                interrupt.exit_if_signalled(f"Stopped after update {update}: {go_on}")
+                interrupt.exit_if_signalled(f"Stopped after update {update}: {command}")
 
         summary = run_summary(cfg, loops, tally, learned_mpc, true_model(physics))
         if cfg.figures and learned_mpc is not None:
@@ -163,7 +163,7 @@ def _train(
 
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="config")
 def main(cfg: DictConfig) -> float:
-    """Train; a sweep's optimiser maximises the closed gap that this returns."""
+    """Train, and return the closed gap, which an optimising sweeper can maximise."""
     with launched() as launch:
         cfg, state, summary = launch.settle(cfg)
         if summary is None:

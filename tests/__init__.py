@@ -1,4 +1,4 @@
-"""The tests. Workers side by side are the parallelism: BLAS threads would only get in their way."""
+"""The tests. BLAS uses one thread: parallelism comes from pytest-xdist's workers."""
 
 import os
 

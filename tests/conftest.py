@@ -16,9 +16,9 @@ COMPILING = pytest.StashKey[subprocess.Popen[bytes]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile the kernels while xdist's workers start: each would compile all of them.
+    """Compile the kernels while xdist's workers start, instead of once in each worker.
 
-    A worker without tests takes some of the other's, where the default leaves long ones to the end.
+    Idle workers steal tests, because by default long ones may run last on one worker.
     """
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
         command = [sys.executable, "-m", "tests.kernels"]
@@ -35,16 +35,16 @@ def pytest_xdist_node_collection_finished(node: Any) -> None:
 
 @pytest.fixture(autouse=True)
 def one_thread() -> None:
-    """Keep torch to one thread: test workers are the parallelism, and their threads would compete.
+    """Limit torch to one thread: test workers run in parallel.
 
-    Before every test, as TorchRL's ``check_env_specs`` leaves another number behind.
+    Set before every test, because TorchRL's ``check_env_specs`` changes the number.
     """
     torch.set_num_threads(1)
 
 
 @pytest.fixture(params=[*BACKENDS, "qpsolvers:clarabel"])
 def solver(request: pytest.FixtureRequest) -> str:
-    """The name of each backend in turn."""
+    """Return the name of each backend in turn."""
     return request.param
 
 
@@ -56,7 +56,7 @@ def two_threads(one_thread: None) -> None:
 
 @pytest.fixture(scope="session")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two sweeps of small finished runs; seed 4 starts without a gap worth closing."""
+    """Train two sweeps of small runs; seed 4 starts without a real gap."""
     folder = tmp_path_factory.mktemp("runs")
     runs = [("small", "gaussian", case, seed) for case in ("fixed", "free") for seed in (1, 4)]
     for sweep, noise, case, seed in [*runs, ("small", "brownian", "free", 1)]:

@@ -1,4 +1,4 @@
-"""Fewer combinations of parameters than all, where a test depends on at most two of them."""
+"""Covering sets of parameter combinations: every pair of choices, but not every combination."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def covering(combinations: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """A few of the combinations that have every pair of choices which one of them has."""
+    """Choose a few combinations that cover every pair of choices in ``combinations``."""
 
     def pairs(combination: tuple[str, ...]) -> set[Any]:
         return set(itertools.combinations(enumerate(combination), 2))

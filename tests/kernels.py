@@ -9,7 +9,7 @@ from tests.runs import SMALL, make_config
 
 
 def compile_kernels() -> None:
-    """Run a small training of either order: together they call nearly every kernel."""
+    """Train briefly with either order of optimiser, which calls nearly every kernel."""
     for optimizer in ("gauss_newton", "adam"):
         with tempfile.TemporaryDirectory() as folder:
             train.train(make_config(*SMALL, f"optimizer={optimizer}"), folder, quiet=True)

@@ -1,4 +1,4 @@
-"""TorchRL's losses, small, with the QP in one or more of their roles."""
+"""Small TorchRL losses with the QP in one or more roles."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ GRID = torch.linspace(-BOUND, BOUND, 5).unsqueeze(-1)
 
 
 def make_mpc(seed: int) -> QPMPC:
-    """A QP with a start of its own; its bounds are buffers."""
+    """Make a QP initialised by ``seed``; its bounds are buffers."""
     learn = ("H", "q", "c", "C", "b")
     bounds = ([-BOUND], [BOUND])
     return random_mpc(seed, learn=learn, state_slack=5.0, action_bounds=bounds)
@@ -58,7 +58,7 @@ def critic(seed: int = 1, **keys: Any) -> Any:
 
 
 def critics(count: int = 2) -> Any:
-    """An ensemble: a list, as TorchRL would fill copies of one module with random numbers."""
+    """Make an ensemble as a list: TorchRL fills copies of a single module with random numbers."""
     return [critic(seed) for seed in range(1, count + 1)]
 
 
@@ -103,7 +103,7 @@ def network_critic() -> Any:
 
 
 def stochastic(location: Any) -> Any:
-    """A policy that explores by itself, around what ``location`` writes."""
+    """Make a stochastic policy around the output of ``location``."""
     return ProbabilisticActor(
         location,
         in_keys=["loc", "scale"],
@@ -120,7 +120,7 @@ def network_gaussian() -> Any:
 
 
 def qp_gaussian() -> Any:
-    """The QP as the mean of a stochastic policy, with a learned scale."""
+    """Make a stochastic policy with the QP as its mean and a learned scale."""
     scale: Any = TensorDictModule(AddStateIndependentNormalScale(1), ["loc"], ["loc", "scale"])
     return stochastic(TensorDictSequential(policy(action_key="loc"), scale))
 
@@ -129,7 +129,7 @@ def grid_critic() -> Any:
     return QValueActor(GridCritic(), in_keys=["observation"], action_space="one_hot")
 
 
-#: By what is a QP and where.
+#: Losses, named by the role of the QP.
 LOSSES: dict[str, Callable[[], LossModule]] = {
     "critic of DDPG": lambda: DDPGLoss(network_policy(), critic(), delay_actor=True),
     "critics of TD3": lambda: TD3Loss(network_policy(), critics(), bounds=BOUNDS),
@@ -152,14 +152,14 @@ LOSSES: dict[str, Callable[[], LossModule]] = {
     "value of REINFORCE": lambda: ReinforceLoss(network_gaussian(), value()),
     "mean and value of PPO": lambda: ClipPPOLoss(qp_gaussian(), value()),
 }
-#: Those whose estimator is GAE by default, as they learn from whole trajectories of the policy.
+#: On-policy losses, whose default estimator is GAE.
 ON_POLICY = [name for name in LOSSES if any(x in name for x in ("A2C", "PPO", "REINFORCE"))]
-#: Those that call an ensemble under vmap.
+#: Losses that call an ensemble under vmap.
 ENSEMBLES = [name for name in LOSSES if "critics" in name or "TD3" in name]
 
 
 def make_loss(name: str, estimator: str | None = None, seed: int = 0) -> LossModule:
-    """One of `LOSSES`, with its networks drawn and its estimator made."""
+    """Make one of `LOSSES` with its value estimator."""
     torch.manual_seed(seed)
     loss = LOSSES[name]()
     loss.make_value_estimator(estimator, gamma=GAMMA)  # pyright: ignore[reportArgumentType] - names are accepted
@@ -167,7 +167,7 @@ def make_loss(name: str, estimator: str | None = None, seed: int = 0) -> LossMod
 
 
 def make_batch(loss: LossModule | None = None, *shape: int) -> TensorDict:
-    """Transitions along the last dimension, some of which end; with log-probabilities if asked."""
+    """Make transitions along the last dimension, some of them terminal, as ``loss`` needs them."""
     *batch, steps = shape or (2, 4)
     s = random_states(20 * (steps + 1), seed=3)[: torch.Size((*batch, steps + 1)).numel()]
     s = s.float().view(*batch, steps + 1, 2)
@@ -199,7 +199,7 @@ def make_batch(loss: LossModule | None = None, *shape: int) -> TensorDict:
 
 
 def total(loss: LossModule, batch: TensorDict, seed: int = 0) -> Tensor:
-    """The sum of a loss module's losses, whose noise is seeded."""
+    """Sum the losses of a module, with seeded noise."""
     torch.manual_seed(seed)
     out = loss(batch.copy())
     return torch.stack([x for key, x in out.items() if key.startswith("loss")]).sum()

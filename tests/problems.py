@@ -1,4 +1,4 @@
-"""Random problems whose answer is known, because they are built from a KKT point."""
+"""Random QPs with known solutions, built from KKT points, and random QPMPCs."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from torch_qpmpc.qp.pipeline.condensing import Reduced
 from torch_qpmpc.qp.solvers import BackendSolution
 from torch_qpmpc.qp.solvers.base import SoftQPs
 
-#: What a row does at the solution: strictly inside, at a bound, or beyond one (then it is soft).
+#: Positions of a row at the solution: inside its bounds, at one, or (if soft) beyond one.
 SOFT_ROWS = ("inside", "at_lower", "at_upper", "below", "above", "equality", "no_upper", "free")
 HARD_ROWS = ("inside", "at_lower", "at_upper", "equality", "no_upper")
 
-#: Rows at a bound with no multiplier, and soft ones with all of w but no slack: where the exact
-#: penalty begins to pay.
+#: Rows at a bound with zero multiplier, and soft rows at a bound with multiplier w and zero slack,
+#: the threshold of the exact penalty.
 WEAK = ("weak_lower", "weak_upper")
 BRINK = ("brink_lower", "brink_upper")
 
@@ -33,13 +33,13 @@ MIXED: dict[str, Any] = {
 
 
 def normal(*shape: int, seed: int = 0) -> Tensor:
-    """Standard normal entries."""
+    """Draw standard normal entries."""
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(shape, generator=generator, dtype=torch.float64)
 
 
 def times(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Matrix-vector products over any batch dimensions."""
+    """Multiply matrices and vectors over any batch dimensions."""
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
@@ -82,11 +82,11 @@ def known_qp(
     G: Tensor | None = None,
     dtype: torch.dtype = torch.float64,
 ) -> KnownQP:
-    """A QP whose rows are, in an order of each batch element's own, as ``soft`` and ``hard`` say.
+    """Make a QP with rows of the kinds ``soft`` and ``hard``, ordered randomly in each element.
 
-    H, C and G have the batch shape ``matrices``, where they are not given. H has the given rank, or
-    is positive definite. With H positive definite and C of full row rank, the solution is unique,
-    and with rows that are neither `WEAK` nor too many, so are the multipliers.
+    H, C and G are drawn with the batch shape ``matrices`` unless given. H has the given ``rank``,
+    or is positive definite. With H positive definite and C of full row rank, the solution is
+    unique, and without `WEAK` or dependent rows, so are the multipliers.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -151,17 +151,17 @@ CPU = torch.device("cpu")
 
 
 def programs_of(known: KnownQP, device: torch.device | None = CPU) -> Programs:
-    """The known QP as the pipeline gets it: in tensors, or in NumPy's arrays without a device."""
+    """Convert a known QP to the pipeline's input: tensors, or NumPy arrays without a device."""
     return Programs.of(*known.qp.tensors(), known.fixed, device=device)[0]
 
 
 def reduced_of(known: KnownQP) -> Reduced:
-    """The known QP condensed, in tensors, with no more entries kept than are fixed."""
+    """Condense a known QP in tensors, keeping only the fixed entries."""
     return programs_of(known).prepared.reduced(known.fixed.shape[-1])
 
 
 def soft_qps(known: KnownQP) -> tuple[SoftQPs, BackendSolution]:
-    """What a backend solves, in tensors, and the exact solution."""
+    """Make a backend's input in tensors, and its exact solution."""
     reduced, programs = reduced_of(known), programs_of(known)
     v = known.z.reshape(len(programs), -1) - expanded(programs)
     v = times(torch.linalg.pinv(reduced.T[:, :, -reduced.H.shape[-1] :]), v)
@@ -170,7 +170,7 @@ def soft_qps(known: KnownQP) -> tuple[SoftQPs, BackendSolution]:
 
 
 def expanded(programs: Programs, v: Tensor | None = None) -> Tensor:
-    """z ``(B, n_z)`` of free variables ``(B, d)``, zero by default."""
+    """Expand free variables ``(B, d)``, zero by default, to z ``(B, n_z)``."""
     reduced = programs.prepared.reduced(programs.n_f)
     fixed = to_tensor(programs.fixed)
     if v is None:
@@ -180,13 +180,13 @@ def expanded(programs: Programs, v: Tensor | None = None) -> Tensor:
 
 
 def solution_of(known: KnownQP) -> dict[str, Tensor]:
-    """The known solution under the names of `QPSolution`."""
+    """Return the known solution under the names of `QPSolution`."""
     names = ("value", "z", "sigma", "chi", "upsilon", "eta", "xi")
     return {name: getattr(known, name) for name in names}
 
 
 def random_mpc(seed: int = 0, *, free: float = 0.1, horizon: int = 3, **options: Any) -> QPMPC:
-    """A bounded QPMPC of two states and an action; learned entries are moved by up to ``free``."""
+    """Make a bounded QPMPC of two states and one action; shift theta by up to ``free``."""
     settings: dict[str, Any] = {
         "state_bounds": ([-1.0, -1.0], [1.0, 1.0]),
         "action_bounds": ([-0.5], [0.5]),
@@ -204,13 +204,13 @@ def random_mpc(seed: int = 0, *, free: float = 0.1, horizon: int = 3, **options:
 
 
 def random_states(count: int, n: int = 2, *, size: float = 1.5, seed: int = 0) -> Tensor:
-    """States, or actions, uniform in plus or minus ``size``: some beyond `random_mpc`'s bounds."""
+    """Draw states or actions within ``size``, some of them beyond `random_mpc`'s bounds."""
     generator = torch.Generator().manual_seed(seed)
     return size * (2 * torch.rand(count, n, generator=generator, dtype=torch.float64) - 1)
 
 
 def step(mpc: QPMPC, rate: float = 1e-3) -> None:
-    """One training step on the sum of some values."""
+    """Take one training step on the sum of some values."""
     optimizer = torch.optim.Adam(mpc.parameters(), lr=rate)
     mpc(random_states(4)).sum().backward()
     optimizer.step()

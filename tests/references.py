@@ -1,4 +1,4 @@
-"""The paper's programs stated a second and a third time, for solvers of no part in the package."""
+"""The paper's programs written for independent solvers: cvxpy and quadprog."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torch_qpmpc import QuadraticProgram
 
 
 def arrays(qp: QuadraticProgram) -> tuple[np.ndarray, ...]:
-    """H, q, c, C, b, G, lb, ub, w of one QP."""
+    """Return H, q, c, C, b, G, lb, ub, w of one QP."""
     return tuple(tensor.detach().numpy().astype(float) for tensor in qp.tensors())
 
 
 def by_cvxpy(qp: QuadraticProgram, fixed: Tensor) -> tuple[float, Tensor]:
-    """Value and z of one QP as eq:qp2 and eq:qp3 print it, with the explicit sigma."""
+    """Solve one QP as printed in eq:qp2 and eq:qp3, with explicit sigma; return value and z."""
     H, q, c, C, b, G, lb, ub, w = arrays(qp)
     z, sigma = cp.Variable(len(q)), cp.Variable(len(w))
     hard, lower, upper = np.isinf(w), np.isfinite(lb), np.isfinite(ub)
@@ -43,12 +43,12 @@ def by_cvxpy(qp: QuadraticProgram, fixed: Tensor) -> tuple[float, Tensor]:
 
 
 def by_quadprog(qp: QuadraticProgram, fixed: Tensor) -> tuple[float, Tensor]:
-    """Value and z of one QP with positive definite H, by the dual method of Goldfarb and Idnani."""
+    """Solve one QP with positive definite H by Goldfarb and Idnani's method; return value and z."""
     H, q, c, C, b, G, lb, ub, w = arrays(qp)
     n_z, n_g, n_f = len(q), len(w), fixed.shape[-1]
     hard, lower, upper = np.isinf(w), np.isfinite(lb), np.isfinite(ub)
     weight = np.where(hard, 0.0, w)
-    curvature = 1e-8 * np.eye(n_g)  # quadprog needs some on sigma too
+    curvature = 1e-8 * np.eye(n_g)  # quadprog needs curvature on sigma, too
     unit = np.eye(n_z + n_g)
     equalities = np.vstack([np.hstack([C, np.zeros((len(b), n_g))]), unit[:n_f], unit[n_z:][hard]])
     rows = np.vstack(

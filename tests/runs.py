@@ -1,4 +1,4 @@
-"""Configurations for the tests: composed as train.py does, and small enough to run in a second."""
+"""Configurations for the tests, composed as by train.py and small enough to run in a second."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment.tasks import make_physics, make_true_mpc
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-#: Everything shrinks but the point mass itself, and nothing is drawn: figures are most of the time
-#: of a small run.
+#: Overrides of a small run, without figures, which would take most of its time.
 SMALL = (
     "optimizer=adam",
     "solver=daqp",
@@ -37,7 +36,7 @@ SMALL = (
 
 
 def make_config(*overrides: str) -> DictConfig:
-    """configs/ with overrides as on the command line, of which the last for a key counts."""
+    """Compose configs/ with overrides; the last override of a key counts."""
     latest = {override.partition("=")[0]: override for override in overrides}
     return copy.deepcopy(_composed(*latest.values()))
 
@@ -49,9 +48,9 @@ def _composed(*overrides: str) -> DictConfig:
 
 
 def run_command(*arguments: str) -> None:
-    """``python train.py ..`` in this process.
+    """Run ``python train.py ..`` in this process.
 
-    Hydra finds the folder by itself only for a script, not for an imported module.
+    Hydra finds the folder of configurations only for a script, not for an imported module.
     """
     quiet = ("hydra/job_logging=disabled", "hydra/hydra_logging=disabled")
     with pytest.MonkeyPatch.context() as patch:
@@ -60,19 +59,19 @@ def run_command(*arguments: str) -> None:
 
 
 def choices(group: str) -> list[str]:
-    """The names that a group can be set to."""
+    """List the choices of a group."""
     return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
 
 
 def linear_system(cfg: DictConfig) -> LinearSystem:
-    """A plant that has a true model."""
+    """Make a plant with a true model."""
     physics = make_physics(cfg)
     assert isinstance(physics, LinearSystem)
     return physics
 
 
 def true_mpc(cfg: DictConfig, physics: LinearSystem) -> QPMPC:
-    """The MPC that knows the plant."""
+    """Make the MPC with the true model."""
     mpc = make_true_mpc(cfg, physics)
     assert mpc is not None
     return mpc

@@ -1,4 +1,4 @@
-"""Runs that are stopped and go on, and the comparison with the one that was not."""
+"""Stopping and resuming runs, and comparing them with undisturbed ones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def stop(
     update: int,
     signum: int = signal.SIGTERM,
 ) -> int:
-    """The exit code of a run, a new one or one that goes on, that gets a signal in ``update``."""
+    """Run or resume until ``update``, send a signal there, and return the exit code."""
     state = None
     if (folder / "config.yaml").exists():
         cfg, state = resumed(folder, [])
@@ -55,7 +55,7 @@ def stop(
 
 
 def go_on(folder: Path) -> None:
-    """Finish the run that was stopped."""
+    """Resume a stopped run and finish it."""
     cfg, state = resumed(folder, [])
     with _a_second_later():
         train.train(cfg, str(folder), state)
@@ -63,7 +63,7 @@ def go_on(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _a_second_later() -> Iterator[None]:
-    """TensorBoard orders event files by the second in their names: move its clock on by one."""
+    """Advance TensorBoard's clock by a second: it orders event files by the seconds in names."""
     ahead = next(_seconds)
     clock = SimpleNamespace(time=lambda: time.time() + ahead)
     with pytest.MonkeyPatch.context() as patch:
@@ -75,7 +75,7 @@ _seconds = itertools.count(1)
 
 
 def assert_same_numbers(folder: Path, whole: Path) -> None:
-    """What the runs in both folders wrote is equal to the last digit, but for the times."""
+    """Assert that both folders have the same numbers to the last digit, except times."""
     found, expected = (
         pd.read_csv(path / "metrics.csv", dtype=str).filter(regex="^(?!time/)").sort_index(axis=1)
         for path in (folder, whole)
@@ -88,7 +88,7 @@ def assert_same_numbers(folder: Path, whole: Path) -> None:
 
 
 def assert_events_are_whole(folder: Path) -> None:
-    """TensorBoard shows each number of metrics.csv, and each once."""
+    """Assert that TensorBoard has every number of metrics.csv exactly once."""
     found = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0, "images": 0})
     found.Reload()
     table: Any = read_metrics(folder)

@@ -28,11 +28,11 @@ def _little_training(monkeypatch):
     deadline=None,
     database=None,
     max_examples=60,
-    # What the fixtures are does not depend on the example.
+    # The fixtures do not depend on the example.
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(data=st.data())
-def test_no_qp_is_called_what_it_is_not(solver, data):
+def test_no_status_is_wrong(solver, data):
     family = data.draw(st.sampled_from(sorted(FAMILIES)))
     seed, count = data.draw(st.integers(0, 2**32)), data.draw(st.integers(1, 6))
     solver, tally = solver + data.draw(st.sampled_from(("", ", warm"))), Tally()
@@ -48,8 +48,8 @@ def test_a_family_is_the_same_for_the_same_seed(name):
         assert torch.equal(a.nan_to_num(), b.nan_to_num())
 
 
-def test_hard_rows_that_C_implies_are_not_called_infeasible():
-    # Rounding left of such rows in the condensed problem once passed for a contradiction.
+def test_hard_rows_implied_by_C_are_not_infeasible():
+    # Rounding in such rows of the condensed problem once looked like a contradiction.
     case = FAMILIES["dependent rows"](Draw(2000003), 128)
     solution = solve_qp(case.known.qp, case.known.fixed, solver="torch", on_failure="mask")
     assert judge(case, solution).certified.all()
@@ -76,7 +76,7 @@ def test_the_judge_notices_what_is_wrong(name):
     assert judge(case, changed).wrong.all()
 
 
-def test_a_solution_of_what_has_none_is_wrong_and_giving_up_is_not():
+def test_a_solution_of_an_unsolvable_qp_is_wrong_and_giving_up_is_not():
     case, solution = solved()
     hopeless = families.Case(case.known, torch.full_like(case.expected, int(Status.INFEASIBLE)))
     assert judge(hopeless, solution).wrong.all()

@@ -1,4 +1,4 @@
-"""The layers of the package, and what each of them may import."""
+"""The layers of the package and their allowed imports."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "torch_qpmpc"
-#: Of each folder, or module beside them, the others that it may import.
+#: For each folder or top-level module, those that it may import.
 LAYERS = {
     "errors": set(),
     "checks": {"errors"},
@@ -37,7 +37,7 @@ def layer_of(path: Path) -> str:
 
 
 def imported(path: Path) -> set[str]:
-    """The modules that a file imports, anywhere in it."""
+    """List the modules that a file imports anywhere."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):

@@ -1,4 +1,4 @@
-"""The user's mistakes: each is named, with what came, what was expected, and the remedy."""
+"""Error messages for users' mistakes: the argument, its value, the expected one and the remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The notebooks run, with small settings; their outputs are kept, and small."""
+"""The notebooks run with small settings, and their stored outputs are small."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-#: What shortens them, by the names that they read from the environment.
+#: Environment variables that shorten the notebooks.
 SMALL = {"UPDATES": "2"}
 
 pytestmark = pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks, as in a wheel's tests")

@@ -1,4 +1,4 @@
-"""What the documentation shows runs: README.md's Python, and every docstring's example."""
+"""The documentation's examples run: README.md's Python and every docstring's example."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MODULES = sorted(
 
 
 def python_blocks(text: str) -> list[tuple[int, str]]:
-    """Fenced Python blocks, each with the line that it starts on."""
+    """List the fenced Python blocks, each with its first line's number."""
     fence = re.compile(r"^```python[^\n]*\n(.*?)^```", re.DOTALL | re.MULTILINE)
     return [(text.count("\n", 0, m.start(1)), m.group(1)) for m in fence.finditer(text)]
 
@@ -37,20 +37,20 @@ def test_blocks_are_found():
 
 @pytest.mark.skipif(not README.exists(), reason="README.md is not there, as in a wheel's tests")
 def test_readme_runs(tmp_path, monkeypatch):
-    """Block after block, as a reader would paste them into one session."""
+    """Run all blocks in one session, as a reader would paste them."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delitem(TASKS, "pole", raising=False)  # and again afterwards
+    monkeypatch.delitem(TASKS, "pole", raising=False)  # monkeypatch also removes it afterwards
     blocks = python_blocks(README.read_text(encoding="utf-8"))
     assert blocks, "README.md shows no Python"
     namespace: dict[str, object] = {"__name__": "readme"}
     for line, code in blocks:
-        # Blank lines first, so that a traceback names README.md's own line.
+        # Leading blank lines give tracebacks README.md's line numbers.
         exec(compile("\n" * line + code, str(README), "exec"), namespace)
 
 
 @pytest.mark.skipif(not README.exists(), reason="README.md is not there, as in a wheel's tests")
 def test_the_readmes_own_task_trains(tmp_path):
-    """As a script, in the runs of a sweep, which are processes of their own."""
+    """Run the script as a sweep, whose runs are separate processes."""
     blocks = [code for _, code in python_blocks(README.read_text(encoding="utf-8"))]
     (script,) = (code for code in blocks if "register(" in code)
     (tmp_path / "my_task.py").write_text(script, encoding="utf-8")
@@ -72,7 +72,7 @@ def test_the_readmes_own_task_trains(tmp_path):
 
 
 @pytest.mark.skipif(not README.exists(), reason="README.md is not there, as in a wheel's tests")
-def test_every_test_that_the_readme_names_exists():
+def test_every_test_named_in_the_readme_exists():
     text = README.read_text(encoding="utf-8")
     table = text.split("<!-- pytorch -->")[1].split("<!-- /pytorch -->")[0]
     named = re.findall(r"\[(test_\w+)\]\((tests/[\w/]+\.py)\)", table)

@@ -1,4 +1,4 @@
-"""Transitions for the Q-learning loss, a small QP to learn from them, and its targets by hand."""
+"""Transitions for the Q-learning loss, a small QP to learn, and reference targets."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from torch import Tensor
 
 from torch_qpmpc import QPMPC, QPActorValueOperator, QPQLearningLoss
 
-#: Exact in float32, in which TorchRL keeps them.
+#: Exactly representable in float32, TorchRL's dtype.
 GAMMA, LMBDA = 0.875, 0.75
 LEARN = ("H", "H_f", "q", "c", "w", "C", "b", "G", "lb", "ub")
-#: The trace parameter lambda that makes each estimator a TD(lambda).
+#: The lambda for which each estimator equals TD(lambda).
 TRACE = {"td0": 0.0, "td1": 1.0, "tdlambda": LMBDA}
 METADATA = ["td_error", "pred_value", "target_value", "pred_value_max", "target_value_max"]
 
 
 def make_operator(keys: dict[str, Any] | None = None, **options: Any) -> QPActorValueOperator:
-    """A small QP that learns everything, on a double integrator with friction."""
+    """Make a small QP of a double integrator with friction, with all of theta learned."""
     settings = {
         "gamma": GAMMA,
         "state_bounds": ([-1.0, -1.0], [1.0, 1.0]),
@@ -42,7 +42,7 @@ def make_loss(estimator: Any = "td0", operator=None, **options: Any) -> QPQLearn
 
 
 def make_batch(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> TensorDict:
-    """Transitions of episodes along the last dimension; some end inside, by either flag."""
+    """Make transitions of episodes along the last dimension; some end inside, by either flag."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(bound: float, *size: int) -> Tensor:
@@ -69,7 +69,7 @@ def make_batch(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -
 
 
 def hand_target(mpc: QPMPC, td: TensorDictBase, trace: float) -> Tensor:
-    """-L - gamma (1 - terminated) V(s+), and TD(lambda) beyond it, in a loop over time."""
+    """Compute -L - gamma (1 - terminated) V(s+), and TD(lambda) beyond it, in a loop over time."""
     with torch.no_grad():
         V = mpc.value(td["next", "observation"])
     reward, done, terminated = (td["next", k].squeeze(-1) for k in ("reward", "done", "terminated"))

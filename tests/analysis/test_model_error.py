@@ -43,7 +43,7 @@ def test_error_over_unit_variance_is_the_frobenius_norm():
     assert one_step_error(right, A, B).item() == pytest.approx(OFFSET.norm().item())
 
 
-def test_what_the_policy_expects_next():
+def test_the_policys_predicted_next_state():
     A, B = normal(2, 2, seed=1), normal(2, 1, seed=2)
     settings = {"action_bounds": ([-0.5], [0.5]), "solver": "daqp", "offset": [0.1, 0.2]}
     mpc, s = QPMPC.from_model(A, B, 3, **settings), random_states(20)

@@ -1,4 +1,4 @@
-"""Figures of what a QP says show the numbers that the analysis finds."""
+"""Figures of a QP show the numbers of its analysis."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_energies_figure_shows_shares(mpc):
     rendered(figure)
 
 
-def test_a_C_without_canonical_form_says_why():
+def test_a_C_without_canonical_form_shows_the_reason():
     mpc = make_mpc()
     with torch.no_grad():
         mpc.C.zero_()
@@ -73,7 +73,7 @@ def test_a_C_without_canonical_form_says_why():
             draw(mpc)
 
 
-def test_predictions_figure_shows_the_loop_and_what_was_expected(mpc):
+def test_predictions_figure_shows_the_loop_and_the_predictions(mpc):
     loop = make_loops(mpc)["learned"]
     figure = predictions_figure(mpc, loop, every=2, start=3)
     assert len(figure.axes) == 6

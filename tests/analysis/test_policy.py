@@ -22,7 +22,7 @@ B = torch.tensor([[0.0, 0.1], [0.3, 0.1]], dtype=torch.float64)
 
 
 def free_regulator(horizon: int = 4, **options: Any) -> QPMPC:
-    """An MPC scheme whose bounds are far away: it is the regulator at any horizon."""
+    """Make an MPC scheme with inactive bounds, which equals the regulator at any horizon."""
     weight = torch.diag(torch.tensor([2.0, 1.0, 0.3, 0.5])) + 0.1
     settings: dict[str, Any] = {"gamma": 0.9, "stage_weight": weight, "solver": "daqp"}
     return QPMPC.linear_mpc(A, B, horizon, **(settings | options))

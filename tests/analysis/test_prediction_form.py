@@ -1,4 +1,4 @@
-"""The prediction form is that of stepping the model, in any gauge; the canonical matrix is C_0."""
+"""The prediction form equals stepping the model in any gauge; the canonical matrix is C_0."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ OFFSET = normal(N, N_X, seed=7)
 
 
 def scheme(stages: tuple[int, ...] = (), seed: int = 0) -> tuple[Tensor, Tensor]:
-    """A and B of one model, or of one per stage."""
+    """Draw A and B of one model, or of one per stage."""
     return 0.6 * normal(*stages, N_X, N_X, seed=seed), normal(*stages, N_X, N_U, seed=seed + 1)
 
 
 def constraints(kind: str, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """C and b of a scheme, or of none."""
+    """Make C and b of an MPC scheme, or of none."""
     A, B = scheme((N,) if kind == "varying" else (), seed)
     C = banded_matrix(A, B, N)
     if kind == "free":
@@ -123,7 +123,7 @@ def test_a_small_C_is_as_good_as_any():
     torch.testing.assert_close(scaled.condition, form.condition)
 
 
-def test_a_C_that_does_not_determine_the_states_says_so():
+def test_a_C_that_does_not_determine_the_states_is_refused():
     C, n_x, n_u, _ = _of("tied")
     dependent = C.clone()
     dependent[4] = dependent[2] - dependent[7]

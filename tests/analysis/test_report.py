@@ -1,4 +1,4 @@
-"""The report of a known scheme has its numbers; one that cannot be read says so."""
+"""The report of a known scheme has its numbers; an unreadable C is refused."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ def test_a_scheme_is_read_in_any_gauge():
     assert before.scalars() == pytest.approx(scalars | {"condition": before.condition}, abs=1e-6)
 
 
-def test_what_is_not_known_is_nan():
+def test_unknown_numbers_are_nan():
     scalars = read(scheme()).scalars()
     unknown = {"radius", "model_error", "model_error_max", "first_stage_error"}
     assert {name for name, value in scalars.items() if math.isnan(value)} == unknown
 
 
 def test_a_report_without_a_regulator():
-    """The first state is not weighed and not stabilised: the Riccati equation has no solution."""
+    """Without weight on an unstable first state the Riccati equation has no solution."""
     mpc = QPMPC.from_model(
         [[1.2, 0.0], [0.0, 0.5]], [[0.0], [1.0]], 3, stage_weight=[0.0, 1.0, 1.0], solver="daqp"
     )
@@ -68,7 +68,7 @@ def test_a_report_without_a_regulator():
     assert math.isnan(found.gain_to_lqr)
 
 
-def test_the_gain_is_taken_where_asked():
+def test_the_gain_is_taken_at_the_given_state():
     mpc = QPMPC.from_model(
         A, B, 4, action_bounds=([-0.5], [0.5]), stage_weight=[9.0, 1.0, 0.01], solver="daqp"
     )

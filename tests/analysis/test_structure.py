@@ -1,4 +1,4 @@
-"""Defects against loops over blocks, and models, distances and orders of known schemes."""
+"""Structural defects against loops over blocks, and known schemes' models and orders."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_one_entry_is_in_one_band():
 
 
 def test_distances_depend_on_the_gauge():
-    """T C is the same QP, and yet far away: why the docstring warns."""
+    """T C is the same QP at a large distance, as the docstring warns."""
     T = torch.linalg.qr(torch.randn(N * N_X, N * N_X, generator=generator).double()).Q
     assert distance_by_band(T @ C_0, C_0, N_X, N_U)["above"] > 1
 
@@ -78,12 +78,12 @@ def form_of(C: Tensor, b: Tensor | None = None) -> PredictionForm:
 
 
 def free_form(seed: int = 0) -> PredictionForm:
-    """Of constraints that are no scheme's: every block of Gamma is full."""
+    """Make a prediction form of no MPC scheme: every block of Gamma is full."""
     return form_of(banded_matrix(0.5 * A, B, N) + 0.1 * normal(*C_0.shape, seed=seed))
 
 
 def scheme_with(*past: Tensor) -> Tensor:
-    """C of x_{k+1} = A x_k + B u_k, and of what (x_j, u_j) for j = k - 1, k - 2, .. add to it."""
+    """Make C of x_{k+1} = A x_k + B u_k plus terms in (x_j, u_j) for j = k - 1, k - 2, ..."""
     C, n = banded_matrix(0.3 * A, B, N), N_X + N_U
     for back, block in enumerate(past, start=1):
         for k in range(back, N):
@@ -188,14 +188,14 @@ def test_the_distance_grows_with_the_perturbation():
 
 @pytest.mark.parametrize(("stages", "most"), [((1.0, 1e4), 0.01), ((1.0, 1e6, 1e-6) * 20, 1.0)])
 def test_a_one_step_fit_that_explodes_is_no_start(stages, most):
-    """Over the horizon it predicts worse than nothing does, or overflows."""
+    """Over the horizon it predicts worse than zero, or overflows."""
     A_k = torch.tensor(stages, dtype=torch.float64).view(-1, 1, 1)
     found = nearest_model(model_form(A_k, torch.zeros_like(A_k), len(stages)))
     assert found.residual <= most
 
 
 def test_directions_that_no_prediction_reaches_are_not_made_up():
-    """x_1 has forgotten x_0's second entry, which no action moves."""
+    """x_1 does not depend on x_0's second entry, which no action changes."""
     nilpotent = torch.tensor([[0.5, 1.0], [0.0, 0.0]], dtype=torch.float64)
     B = torch.tensor([[1.0], [0.0]], dtype=torch.float64)
     form = model_form(nilpotent, B, N)
@@ -222,8 +222,8 @@ ACTION = PAIR * (torch.arange(N_X + N_U) >= N_X)
     ],
     ids=["none", "pair", "action", "two back", "three back"],
 )
-def test_the_order_is_how_far_back_the_constraints_look(past, order):
-    """With two actions and three states, all that the last pairs do not tell is new."""
+def test_the_order_is_the_number_of_past_pairs(past, order):
+    """With two actions and three states, older pairs add information."""
     T = normal(N * N_X, N * N_X, seed=8)
     form = form_of(T @ scheme_with(*past))
     energies = memory_energies(form)
@@ -244,7 +244,7 @@ def test_later_actions_are_no_memory():
     assert markov_order(energies, tolerance=1.0) == 1
 
 
-def test_the_first_entry_of_memory_is_what_the_stage_models_explain():
+def test_the_first_entry_of_memory_is_explained_by_the_stage_models():
     form = free_form()
     size = form.maps[1:, :, :-1].square().sum((-1, -2))
     left = (stage_models(form).residual.square() * size).sum() / size.sum()

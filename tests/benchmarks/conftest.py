@@ -10,7 +10,7 @@ import torch
 
 from tests.benchmarks.interleaved import Interleaved
 
-#: What is timed, and what the times depend on.
+#: Packages that are timed, or that times depend on.
 PACKAGES = (
     *("torch", "numpy", "proxsuite", "daqp"),
     *("qpth", "cvxpylayers", "diffcp", "clarabel", "qpsolvers", "piqp"),
@@ -19,7 +19,7 @@ PACKAGES = (
 
 @pytest.fixture(autouse=True)
 def thread_count() -> Iterator[None]:
-    """What a benchmark does to torch's thread count ends with it."""
+    """Restore torch's thread count after a benchmark."""
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
@@ -27,7 +27,7 @@ def thread_count() -> Iterator[None]:
 
 @pytest.fixture
 def interleaved(benchmark: Any) -> Callable[..., Any]:
-    """`Interleaved.run` on pytest-benchmark's fixture."""
+    """Return `Interleaved.run` on pytest-benchmark's fixture."""
     return Interleaved(benchmark).run
 
 

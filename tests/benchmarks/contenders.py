@@ -1,4 +1,4 @@
-"""Who takes part in the gradient benchmark: our solvers from their table, cold and warm, and peers.
+"""Contenders of the gradient benchmark: our solvers, cold and warm, and other packages' layers.
 
 A contender's `Gradient` computes one Q-learning gradient (eq:thup): V on the next states, Q on the
 visited pairs, and the gradient of half the mean squared TD error in all of theta.
@@ -19,13 +19,13 @@ from torch_qpmpc.qp.solvers import BACKENDS
 
 BATCHES = (1, 32, 256, 1024)
 REFERENCE = next(iter(PEERS))
-#: How far theta has moved, relatively, since the solutions that a warm start uses.
+#: Relative change of theta since the solutions that warm starts use.
 MOVED = 1e-3
 
 
 @dataclass
 class Gradient:
-    """One gradient at a time: `step` returns V(s+) and Q(s, a), and leaves theta's ``grad``."""
+    """A gradient: `step` returns V(s+) and Q(s, a), and sets theta's ``grad``."""
 
     mpc: QPMPC
     batch: Transitions
@@ -48,7 +48,7 @@ class Gradient:
         return V, value
 
     def flat(self) -> Tensor:
-        """The gradient in all of theta, as one vector."""
+        """Return the gradient in all of theta as one vector."""
         gradients = (p.grad for p in self.parameters)
         return torch.cat([g.flatten() for g in gradients if g is not None])
 
@@ -79,7 +79,7 @@ def cold(mpc: QPMPC, batch: Transitions) -> Gradient:
 
 
 def warm(mpc: QPMPC, batch: Transitions) -> Gradient:
-    """From the active sets of the same transitions at a theta that was 0.1 % different."""
+    """Warm-start from the same transitions' active sets at a theta changed by 0.1 %."""
     with torch.no_grad():
         theta = {name: p.clone() for name, p in mpc.named_parameters()}
         move(mpc, MOVED)
@@ -117,7 +117,7 @@ def _ours() -> list[Contender]:
     return contenders
 
 
-#: The largest batch of the peers for whom a larger one takes minutes.
+#: Largest batch of peers for which larger ones take minutes.
 PATIENCE = {"qpth": 256, "cvxpylayers": 256}
 
 CONTENDERS: list[Contender] = [

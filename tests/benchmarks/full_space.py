@@ -1,4 +1,4 @@
-"""The QP as the user of a QP layer states it: x_0 (and u_0) substituted, one sigma a soft row."""
+"""The QP in full space, as for a general QP layer: x_0 (and u_0) substituted, sigma explicit."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class FullSpace:
 
     @classmethod
     def of(cls, qp: QuadraticProgram, fixed: Tensor) -> FullSpace:
-        """Of a QP with unbatched tensors whose first rows of G, as many as are fixed, have no y."""
+        """Convert a QP with unbatched tensors whose first n_f rows of G do not involve y."""
         n, B = fixed.shape[-1], len(fixed)
         if (qp.G[:n, n:] != 0).any():
             raise ValueError("G: its first rows contain free entries of z, expected the identity's")
@@ -63,13 +63,13 @@ class FullSpace:
         )
 
     def one_sided(self) -> tuple[Tensor, Tensor]:
-        """The inequalities as ``G x <= h``: G ``(m, n)`` and h ``(B, m)``."""
+        """Write the inequalities as ``G x <= h``: G ``(m, n)`` and h ``(B, m)``."""
         upper, lower = self.u[0] < INFINITE, self.l[0] > -INFINITE
         G = torch.cat((self.G[upper], -self.G[lower]))
         return G, torch.cat((self.u[:, upper], -self.l[:, lower]), dim=1)
 
     def value(self, x: Tensor) -> Tensor:
-        """The cost ``(B,)`` of a minimiser x ``(B, n)``, with what the fixed entries cost."""
+        """Compute the cost ``(B,)`` of a minimiser x ``(B, n)``, including the fixed entries'."""
         qp, n = self.qp, self.fixed.shape[-1]
         n_y = qp.n_z - n
         z, sigma = torch.cat((self.fixed, x[:, :n_y]), dim=1), x[:, n_y:]

@@ -1,4 +1,4 @@
-"""Timing two things in turn, so that their ratio does not depend on what else the machine does."""
+"""Interleaved timing of two functions, so that other load does not affect their ratio."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 
 class Interleaved:
-    """pytest-benchmark's pedantic mode, with rounds of a reference between those that count."""
+    """pytest-benchmark's pedantic mode, with rounds of a reference in between."""
 
     def __init__(self, benchmark: Any) -> None:
         self._benchmark = benchmark

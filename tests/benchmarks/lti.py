@@ -1,4 +1,4 @@
-"""Gros and Zanon's linear system, beside mpcrl: ``python -m tests.benchmarks.lti``.
+"""Gros and Zanon's linear system, compared with mpcrl: ``python -m tests.benchmarks.lti``.
 
 Both learn all numbers of a linear MPC scheme from one endless episode, on the same noise. The
 schemes are the same but for the terminal cost, an undiscounted regulator's there and the discounted
@@ -29,14 +29,14 @@ from torch_qpmpc.experiment.tasks import make_mpc
 from torch_qpmpc.study.markdown import replaced, table
 
 SEEDS, STEPS, LAST = (69, 1, 2, 3), 5000, 500
-#: Untimed steps of each contender before: what is compiled at its first use is no step's time.
+#: Untimed steps of each contender at first, during which kernels are compiled.
 WARMUP = 50
-#: Where the replay's settings differ from those of the stream.
+#: Settings of the replay that differ from those of the stream.
 REPLAYED = ("optimizer=sliding", "exploration_std=0.05")
 
 
 def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = True) -> Stream:
-    """One episode under the learning QP, or under the one that learning starts from."""
+    """Run one episode under the learning QP, or under the initial one."""
     cfg, physics = make_config("task=gros_zanon", "solver=daqp", *REPLAYED * replay), GrosZanonLTI()
     every, exploration = cfg.steps_per_update, cfg.exploration_std
     cfg.updates = steps // every
@@ -83,7 +83,7 @@ CONTENDERS: dict[str, Callable[[int, int], Stream]] = {
 
 
 def tables(streams: dict[str, list[Stream]], seeds: list[int]) -> str:
-    """For each contender the streams of the seeds, in the order of the latter, as Markdown."""
+    """Format each contender's streams, in the order of the seeds, as Markdown."""
     blocks = []
     for caption, of, digits in (
         ("total cost", lambda stream: stream.costs.sum(), 0),
@@ -108,7 +108,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--readme", type=Path, default=README, help="where the tables go")
     options = parser.parse_args(arguments)
     readme = options.readme.read_text(encoding="utf-8")
-    replaced(readme, "", "mpcrl")  # before waiting for minutes
+    replaced(readme, "", "mpcrl")  # fail before the runs, which take minutes
     torch.set_num_threads(1)
     for contender in CONTENDERS.values():
         contender(options.seeds[0], WARMUP)

@@ -13,7 +13,7 @@ from scipy.linalg import solve_discrete_are
 from tests.benchmarks.peers import needs
 from torch_qpmpc.envs import GrosZanonLTI
 
-#: The plant: s+ = A s + B a + (e, 0), of which the MPC starts from a wrong model.
+#: The plant s+ = A s + B a + (e, 0); the MPC starts from a wrong model.
 PHYSICS = GrosZanonLTI()
 A, B = PHYSICS.A.numpy(), PHYSICS.B.numpy()
 A_0, B_0 = (matrix.numpy() for matrix in PHYSICS.wrong_model())
@@ -31,18 +31,18 @@ QUIET = {
 
 @dataclass(frozen=True)
 class Stream:
-    """What one agent met on one noise sequence."""
+    """Costs, violations and time of one agent on one noise sequence."""
 
     #: ``(steps,)``
     costs: np.ndarray
-    #: ``(steps,)``: by how much the state that a cost is charged at is outside the box, in total.
+    #: ``(steps,)``: total violation of the box by the state of each cost.
     violations: np.ndarray
     #: The learning loop's wall time, without building the problem.
     seconds: float
 
 
 def run(seed: int, steps: int = 5000, learn: bool = True) -> Stream:
-    """One episode under the learning agent, or under the MPC at the first parameters.
+    """Run one episode under the learning agent, or under the MPC at the initial parameters.
 
     mpcrl seeds the plant with ``default_rng(seed).integers(2**32)``. The closed loop is chaotic:
     rounding alone moves a total by hundreds, so that other versions, solvers or processors agree
@@ -59,7 +59,7 @@ def run(seed: int, steps: int = 5000, learn: bool = True) -> Stream:
             optimizer=optim.NewtonMethod(learning_rate=LEARNING_RATE),
             learnable_parameters=mpcrl.LearnableParametersDict(shaped),
             hessian_type="approx",
-            # As published: Q of an action on its bound would have no interior.
+            # As published: Q of an action at its bound would have no interior.
             remove_bounds_on_initial_action=True,
         )
         follow = agent.train
@@ -73,7 +73,7 @@ def run(seed: int, steps: int = 5000, learn: bool = True) -> Stream:
 
 
 class _Plant(gymnasium.Env):
-    """The linear system, which keeps the costs and the violations that it charged."""
+    """The linear system, which records its costs and violations."""
 
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64)
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
@@ -105,7 +105,7 @@ class _Plant(gymnasium.Env):
 
 
 def _first() -> dict[str, np.ndarray]:
-    """The parameters that learning starts from: 16 scalars."""
+    """Return the 16 initial parameters."""
     return {
         "V0": np.zeros(1),
         "x_lb": np.zeros(2),
@@ -118,7 +118,7 @@ def _first() -> dict[str, np.ndarray]:
 
 
 def _mpc() -> Any:
-    """The soft-constrained MPC, as mpcrl's wrapper of an NLP."""
+    """Make the soft-constrained MPC as mpcrl's wrapper of an NLP."""
     cs, csnlp, wrappers = needs("casadi"), needs("csnlp"), needs("csnlp.wrappers")
     mpc = wrappers.Mpc(csnlp.Nlp("SX"), HORIZON)
     theta = {}
@@ -129,7 +129,7 @@ def _mpc() -> Any:
     u, _ = mpc.action("u", 1, lb=-1.0, ub=1.0)
     slack, _, _ = mpc.variable("slack", (2, HORIZON), lb=0.0)
     mpc.set_affine_dynamics(theta["A"], theta["B"], c=theta["b"])
-    # One slack for both sides of an entry.
+    # One slack serves both bounds of an entry.
     mpc.constraint("x_lower", x[:, 1:], ">=", LOWER + theta["x_lb"] - slack)
     mpc.constraint("x_upper", x[:, 1:], "<=", UPPER + theta["x_ub"] + slack)
 

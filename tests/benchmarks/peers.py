@@ -16,19 +16,19 @@ from torch import Tensor
 from tests.benchmarks.full_space import INFINITE, FullSpace
 from torch_qpmpc import QuadraticProgram
 
-#: Optimal values ``(B,)``, differentiable in the QP's tensors, of a QP and fixed entries.
+#: Maps a QP and fixed entries to optimal values ``(B,)``, differentiable in the QP's tensors.
 Values = Callable[[QuadraticProgram, Tensor], Tensor]
-#: qpth refuses a singular Q, and sigma has no curvature.
+#: Curvature of sigma for qpth, which refuses a singular Q.
 CURVATURE = 1e-8
 
 
 def needs(module: str) -> Any:
-    """The module, or the test is skipped."""
+    """Import the module, or skip the test."""
     return pytest.importorskip(module, reason=f"{module} is not installed: pip install '.[peers]'")
 
 
 def proxsuite() -> Values:
-    """ProxSuite's own torch layer, with its default settings."""
+    """Make ProxSuite's own torch layer, with its default settings."""
     layer = needs("proxsuite.torch.qplayer").QPFunction()
 
     def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
@@ -45,7 +45,7 @@ def qpth() -> Values:
         full = FullSpace.of(qp, fixed)
         G, h = full.one_sided()
         Q = full.Q + CURVATURE * torch.eye(len(full.Q)).to(full.Q)
-        # It would give matrices that the batch shares the mean of the batch's gradients.
+        # ProxSuite would return the mean of the batch's gradients for shared matrices.
         Q, G, A = (matrix.expand(len(fixed), -1, -1) for matrix in (Q, G, full.A))
         return full.value(layer(Q, full.p, G, h, A, full.b))
 
@@ -53,7 +53,7 @@ def qpth() -> Values:
 
 
 def cvxpylayers() -> Values:
-    """The QP as eq:qp2 prints it, compiled once for V and once for Q; its solver is Clarabel."""
+    """Compile the QP as printed in eq:qp2 once for V and once for Q; the solver is Clarabel."""
     CvxpyLayer = needs("cvxpylayers.torch").CvxpyLayer
     layers: dict[int, Any] = {}
 
@@ -62,7 +62,7 @@ def cvxpylayers() -> Values:
         n_f = fixed.shape[-1]
         if n_f not in layers:
             layers[n_f] = _cvxpy_layer(CvxpyLayer, qp, n_f)
-        # H is diagonal; a root has no derivative at zero.
+        # H is diagonal; a square root has no derivative at zero.
         root = (qp.H.diagonal() + 1e-12).sqrt()
         operands = root, qp.q, qp.C, qp.b, qp.G, qp.lb, qp.ub, qp.w[soft], fixed
         z, sigma = layers[n_f](*operands)
@@ -83,7 +83,7 @@ def _cvxpy_layer(CvxpyLayer: Any, qp: QuadraticProgram, n_f: int) -> Any:
     slack = np.eye(len(soft))[:, soft] @ sigma
     cost = 0.5 * cp.sum_squares(cp.multiply(root, z)) + q @ z + w @ sigma
     constraints = [C @ z == b, lb - slack <= G @ z, G @ z <= ub + slack, sigma >= 0]
-    # The hard rows of what is fixed hold by themselves; stated again, they leave no interior.
+    # Hard rows of fixed entries are left out: they would leave no interior.
     free = np.arange(len(soft)) >= n_f
     keep = (soft | free).nonzero()[0]
     constraints[1] = lb[keep] - slack[keep] <= (G @ z)[keep]
@@ -94,7 +94,7 @@ def _cvxpy_layer(CvxpyLayer: Any, qp: QuadraticProgram, n_f: int) -> Any:
 
 
 def clarabel() -> Values:
-    """Clarabel through qpsolvers, a QP at a time; differentiated as this package does it.
+    """Solve with Clarabel through qpsolvers, one QP at a time, with this package's gradient.
 
     The Lagrangian with x and the multipliers held has the value's gradient.
     """
@@ -125,7 +125,7 @@ PEERS: dict[str, Callable[[], Values]] = {
 
 
 def piqp_solver(full: FullSpace) -> Callable[[], Tensor]:
-    """PIQP's sparse solver on the full space: set up once, a solve a sample; its values ``(B,)``.
+    """Make PIQP's sparse solver in full space: one setup, a solve per sample, values ``(B,)``.
 
     The rows of sigma >= 0, and those of hard rows, are bounds on x.
     """

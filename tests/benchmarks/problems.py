@@ -1,4 +1,4 @@
-"""What the benchmarks solve: the paper's QP at any size, and random transitions."""
+"""Problems of the benchmarks: the paper's QP at any size, and random transitions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STATE_RANGE, ACTION_RANGE = 2.2, 0.9
 
 @dataclass(frozen=True)
 class Size:
-    """Horizon N, number of states and of actions."""
+    """Horizon N and numbers of states and actions."""
 
     horizon: int
     n_x: int
@@ -52,7 +52,7 @@ class Transitions:
 
 @cache
 def model(n_x: int, n_u: int) -> tuple[Tensor, Tensor]:
-    """A and B: the point mass's corrupted model for (4, 2), else a random stable system's."""
+    """Return A and B: the corrupted point mass for (4, 2), else a random stable system."""
     if (n_x, n_u) == (4, 2):
         A, B, _ = PointMass().corrupted(1)
         return A, B
@@ -63,7 +63,7 @@ def model(n_x: int, n_u: int) -> tuple[Tensor, Tensor]:
 
 
 def make_mpc(size: Size, *, dense: bool, solver: str = "daqp") -> QPMPC:
-    """The QP with all of theta learned; soft states, hard actions, no weight on actions."""
+    """Make the QP with all of theta learned, soft states, hard actions and unweighted actions."""
     generator = torch.Generator().manual_seed(1)
     A, B = model(size.n_x, size.n_u)
     if (size.n_x, size.n_u) == (4, 2):
@@ -93,7 +93,7 @@ def make_mpc(size: Size, *, dense: bool, solver: str = "daqp") -> QPMPC:
 
 @cache
 def transitions(n_x: int, n_u: int, count: int) -> Transitions:
-    """Uniform states and actions, what the model makes of them with noise, and a quadratic cost."""
+    """Draw uniform states and actions, noisy next states of the model, and a quadratic cost."""
     generator = torch.Generator().manual_seed(2)
 
     def uniform(n: int, size: float) -> Tensor:
@@ -107,7 +107,7 @@ def transitions(n_x: int, n_u: int, count: int) -> Transitions:
 
 @torch.no_grad()
 def nudge(mpc: QPMPC) -> None:
-    """Move theta in its last digits: the answers stay, but nothing remembered of it may be used."""
+    """Change theta in its last digits, so that nothing computed from it can be reused."""
     for parameter in mpc.parameters():
         parameter *= 1 + 1e-13
 

@@ -1,4 +1,4 @@
-"""The values that every contender's are compared with, from outside the package."""
+"""Reference values for all contenders, computed outside the package."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WRONG = 1e-6
 
 @torch.no_grad()
 def reference_values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
-    """Optimal values ``(B,)`` by Clarabel in the full space, at tight tolerances."""
+    """Compute optimal values ``(B,)`` by Clarabel in full space, at tight tolerances."""
     clarabel = needs("clarabel")
     full = FullSpace.of(qp, fixed)
     settings = clarabel.DefaultSettings()
@@ -36,6 +36,6 @@ def reference_values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
 
 
 def relative_error(values: Tensor, reference: Tensor) -> Tensor:
-    """Elementwise, relative to the reference or to 1 where that is larger."""
+    """Compute errors relative to the reference, or to 1 where that is larger."""
     error = (values - reference).abs() / reference.abs().clamp(min=1)
     return error.nan_to_num(torch.inf)

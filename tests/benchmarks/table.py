@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 RESULTS = ROOT / "runs" / "benchmark.json"
 REFERENCE = "ProxSuite's QPFunction"
-#: The horizons between which growth is fitted.
+#: Horizons between which the growth exponent is fitted.
 FITTED = (10, 40)
 
 Row = dict[str, Any]
@@ -35,18 +35,18 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     replaced(
         options.readme.read_text(encoding="utf-8"), "", "benchmark"
-    )  # before waiting for minutes
+    )  # fail before the runs, which take minutes
     results = json.loads((options.json or run()).read_text(encoding="utf-8"))
     text = replaced(options.readme.read_text(encoding="utf-8"), tables(results), "benchmark")
     options.readme.write_text(text, encoding="utf-8")
 
 
 def run() -> Path:
-    """Run the benchmarks in a process of their own; the file of their results."""
+    """Run the benchmarks in a separate process; return the file of their results."""
     RESULTS.parent.mkdir(exist_ok=True)
     command = [sys.executable, "-m", "pytest", "-q", str(Path(__file__).parent)]
     options = [f"--benchmark-json={RESULTS}", "--benchmark-columns=median,rounds"]
-    # NumPy's own threads would come on top of those that a row is allowed.
+    # NumPy's threads would add to a row's number of threads.
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     ended = subprocess.run(command + options, cwd=ROOT, env=environment, check=False)
     if ended.returncode:
@@ -56,7 +56,7 @@ def run() -> Path:
 
 
 def tables(results: dict[str, Any]) -> str:
-    """The Markdown of all results."""
+    """Format all results as Markdown."""
     rows = [
         {**b["extra_info"], "test": b["name"].split("[")[0], "seconds": b["stats"]["median"]}
         for b in results["benchmarks"]
@@ -131,7 +131,7 @@ def _kind(row: Row) -> str:
 def growth(values: list[Row], condensing: list[Row]) -> str:
     if not values:
         return ""
-    # By dimensions, then dense before banded; a stable sort leaves the solvers in their order.
+    # By dimensions, then dense before banded; the stable sort keeps the order of solvers.
     rows = sorted(values, key=lambda row: (row["dimensions"], not row["dense"])) + condensing
     horizons = sorted(_unique(row["horizon"] for row in rows))
     lines = []
@@ -209,14 +209,14 @@ def _unique(items: Iterable[Any]) -> list[Any]:
 
 
 def _digits(x: float) -> str:
-    """Three significant digits below a hundred, whole numbers above."""
+    """Format three significant digits below a hundred, whole numbers above."""
     if x >= 100:
         return f"{_round(x):,}"
     return f"{x:.{max(0, 2 - math.floor(math.log10(x)))}f}"
 
 
 def _round(x: float) -> int:
-    """To three significant digits."""
+    """Round to three significant digits."""
     return int(float(f"{x:.3g}"))
 
 

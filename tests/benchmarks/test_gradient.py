@@ -20,10 +20,10 @@ from tests.benchmarks.reference import WRONG, reference_values, relative_error
 
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
 
-#: Rounds of a fast contender by batch, and how many of them go between two of the reference.
+#: Rounds of a fast contender by batch, and the number of them between two of the reference.
 ROUNDS = {1: (60, 15), 32: (60, 15), 256: (60, 15), 1024: (9, 3)}
 SLOW_ROUNDS = {1: 5, 32: 3, 256: 1, 1024: 1}
-#: At the largest batch, the reference's own row has to do.
+#: Batches with interleaved rounds of the reference.
 INTERLEAVED = (1, 32, 256)
 
 CASES = [
@@ -68,7 +68,7 @@ def test_gradient(
         "gradient_error": float((gradient.flat() - direction).norm() / direction.norm()),
     }
     if contender.ours:
-        # The certificate bounds the KKT residual by 1e-6; the table counts the values beyond that.
+        # The certificate bounds the KKT residual by 1e-6; the table counts larger errors of values.
         assert error.max() < 1e-5
         assert benchmark.extra_info["gradient_error"] < 1e-4
 
@@ -94,7 +94,7 @@ def _true_values(dense: bool, batch: int) -> tuple[Tensor, Tensor]:
 
 @cache
 def _true_gradient(dense: bool, batch: int) -> Tensor:
-    """DAQP's: an active-set solver's multipliers are right to rounding."""
+    """Compute the gradient by DAQP: an active-set solver's multipliers are exact up to rounding."""
     contender = next(c for c in CONTENDERS if c.label == "daqp")
     gradient = contender.gradient(dense, batch)
     gradient.step()

@@ -1,4 +1,4 @@
-"""Our side of the comparison with mpcrl, in short, and its table on results made up."""
+"""Our side of the comparison with mpcrl on short runs, and its table on made-up results."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from tests.benchmarks.lti import Stream, run, tables
 
 
-def test_streams_are_those_of_the_noise_and_of_what_learns() -> None:
+def test_streams_depend_on_the_noise_and_the_learner() -> None:
     fixed, again, learned = run(1, 60, learn=False), run(1, 60), run(1, 60)
     np.testing.assert_array_equal(again.costs, learned.costs)
     assert fixed.costs[0] == learned.costs[0]

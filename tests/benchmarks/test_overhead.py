@@ -1,4 +1,4 @@
-"""What is left of a gradient outside the solver's own calls, and how fast the policy decides."""
+"""The share of a gradient's time outside the solver's calls, and the policy's speed."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from torch_qpmpc.qp.solvers import BACKENDS
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
 
 STARTS = {"": cold, ", warm": warm}
-#: About how long to look: a shared machine is busier in one second than in the next.
+#: Approximate seconds of a measurement, long enough to average a shared machine's load.
 SECONDS = 5.0
 
 
 def rounds_of(timed: Callable[[], object]) -> int:
-    """How many of ``timed`` take about `SECONDS`; at least 50, at most 1,000."""
+    """Return the number of rounds that take about `SECONDS`, between 50 and 1,000."""
     timed()  # the first one may compile
     began = time.perf_counter()
     timed()
@@ -41,7 +41,7 @@ def test_share_outside_the_solver(
     start: str,
     batch: int,
 ) -> None:
-    """The backend's call is what hands QPs to the solver's own code, its Python loop included."""
+    """A backend's call includes its Python loop around the solver's own code."""
     inside, shares = [], []
 
     def timed(solve: Callable[..., Any]) -> Callable[..., Any]:
@@ -74,12 +74,12 @@ def test_share_outside_the_solver(
         "batch": batch,
         "outside": median(shares[-rounds:]),
     }
-    assert calls >= 2  # for V and for Q: what is timed is all there is
+    assert calls >= 2  # for V and for Q: nothing else is timed
 
 
 @pytest.mark.parametrize("solver", BACKENDS)
 def test_decisions(benchmark: Any, interleaved: Callable[..., Any], solver: str) -> None:
-    """The collection loop's policy: batches of 32 with theta at rest."""
+    """Time the collection loop's policy on batches of 32 with constant theta."""
     mpc = make_mpc(PAPER, dense=True, solver=solver)
     states = transitions(PAPER.n_x, PAPER.n_u, 32).s
 

@@ -26,13 +26,13 @@ pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[b
 
 YARDSTICK = "PIQP, sparse"
 BATCH, ROUNDS = 64, 5
-#: A smaller batch for those that would take seconds; what is reported is the time a QP.
+#: Smaller batch for problems that would take seconds; the table has the time per QP.
 SMALL_BATCH = {"proxqp": 8, YARDSTICK: 8}
-#: How many of the batch are compared with the reference, which takes seconds for each large QP.
+#: Number of QPs compared with the reference, which takes seconds for each large one.
 CHECKED = 2
 DIMENSIONS = ((4, 2), (12, 4))
 HORIZONS = (10, 20, 40)
-#: Where a solver that is linear in N should be ahead of one that condenses, if it ever is.
+#: Horizons at which a solver linear in N should be faster than condensing, if at any.
 FURTHER = [Size(80, 4, 2), Size(160, 4, 2)]
 SIZES = [Size(horizon, *dimension) for dimension in DIMENSIONS for horizon in HORIZONS]
 
@@ -79,7 +79,7 @@ def test_value(
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_condensing(benchmark: Any, interleaved: Callable[..., Any], size: Size) -> None:
-    """Condensing alone, of a theta that has moved since the last time."""
+    """Time condensing alone, of a theta that has changed since the last round."""
     mpc = make_mpc(size, dense=True)
     n, s = size.n_x + size.n_u, torch.zeros(1, size.n_x).double()
 

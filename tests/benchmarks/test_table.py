@@ -46,7 +46,7 @@ def results(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_tables_replace_what_is_between_the_markers(results: Path, tmp_path: Path) -> None:
+def test_the_tables_replace_text_between_the_markers(results: Path, tmp_path: Path) -> None:
     readme = tmp_path / "README.md"
     readme.write_text(f"above\n{BEGIN}\nold\n{END}\nbelow\n")
     for _ in range(2):

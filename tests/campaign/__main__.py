@@ -22,8 +22,7 @@ from tests.campaign.families import FAMILIES, Draw
 from tests.campaign.tally import SLOW, Tally
 from torch_qpmpc.qp.solvers import BACKENDS
 
-#: QPs a batch; few of those families whose QPs take every solver's time, so that a batch does not
-#: take as long as no QP may.
+#: QPs per batch; few for slow families, so that a batch stays below the time limit of a QP.
 BATCH, FEW = 128, 16
 LONG = (
     "unbounded",
@@ -61,7 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def campaign(solver: str, families: list[str], count: int, seed: int, folder: Path) -> None:
-    """Solve ``count`` QPs, as many of each family, and keep what became of them in a file."""
+    """Solve ``count`` QPs, equally many of each family, and save the counts to a file."""
     share = -(-count // len(families))
     with tqdm(total=share * len(families), desc=solver, mininterval=5) as progress:
         tallies = {}
@@ -85,7 +84,7 @@ def campaign(solver: str, families: list[str], count: int, seed: int, folder: Pa
 
 
 def load(folder: Path) -> dict[str, dict[str, Tally]]:
-    """The latest counts of each solver, in the order of `BACKENDS`."""
+    """Load the latest counts of each solver, in the order of `BACKENDS`."""
     records = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")]
     names = [*BACKENDS, *sorted(r["solver"] for r in records if r["solver"] not in BACKENDS)]
     records.sort(key=lambda record: names.index(record["solver"]))
@@ -96,7 +95,7 @@ def load(folder: Path) -> dict[str, dict[str, Tally]]:
 
 
 def by_family(tallies: dict[str, dict[str, Tally]]) -> str:
-    """The table of families by solvers."""
+    """Format the table of families by solvers."""
     families = [name for name in FAMILIES if any(name in of_one for of_one in tallies.values())]
     lines = []
     for family in families:
@@ -106,7 +105,7 @@ def by_family(tallies: dict[str, dict[str, Tally]]) -> str:
 
 
 def totals(tallies: dict[str, dict[str, Tally]]) -> str:
-    """The table of all families together, by solvers."""
+    """Format the table of all families together, by solvers."""
     sums = [functools.reduce(Tally.plus, of_one.values()) for of_one in tallies.values()]
     lines = [
         ["QPs", *(f"{total.count:,}" for total in sums)],

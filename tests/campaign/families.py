@@ -1,6 +1,6 @@
-"""Families of QPs whose outcome is known: a solution built from a KKT point, or why there is none.
+"""Families of QPs with known outcomes: a solution built from a KKT point, or a reason for none.
 
-A family is a function of a `Draw` and a count. It returns a `Case`, a batch of so many QPs.
+A family is a function of a `Draw` and a count. It returns a `Case`, a batch of that size.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from tests.problems import BRINK, HARD_ROWS, SOFT_ROWS, WEAK, KnownQP, known_qp,
 from torch_qpmpc import QuadraticProgram, Status
 from torch_qpmpc.mpc.banded import banded_matrix
 
-#: Of a value, relative to the terms of the Lagrangian (see `tests.campaign.outcomes`).
+#: Tolerance of a value, relative to the terms of the Lagrangian (see `tests.campaign.outcomes`).
 ACCURACY, FLOAT32 = 1e-5, 1e-3
 
 
 @dataclass(frozen=True)
 class Case:
-    """QPs, and the status that is true of each, ``(B,)``; ``known`` is their solution if SOLVED."""
+    """QPs with their true status ``(B,)``; ``known`` has the solutions of solvable ones."""
 
     known: KnownQP
     expected: Tensor
@@ -32,7 +32,7 @@ class Case:
 
 
 class Draw(random.Random):
-    """The numbers that a family draws, all from one seed."""
+    """The random numbers of a family, all from one seed."""
 
     def __init__(self, seed: int) -> None:
         super().__init__(seed)
@@ -42,12 +42,12 @@ class Draw(random.Random):
         return torch.randn(shape, generator=self.generator, dtype=torch.float64)
 
     def powers(self, low: float, high: float, *shape: int) -> Tensor:
-        """Ten to the power of what is uniform between ``low`` and ``high``."""
+        """Draw powers of ten with uniform exponents between ``low`` and ``high``."""
         exponent = torch.rand(shape, generator=self.generator, dtype=torch.float64)
         return 10 ** (low + (high - low) * exponent)
 
     def known(self, count: int, **options: Any) -> KnownQP:
-        """A batch of any size of QP, with matrices of their own or shared; few hard rows."""
+        """Draw a batch of QPs of any size, with shared or separate matrices and few hard rows."""
         n_z = self.randint(3, 14)
         n_f = self.randint(0, min(4, n_z - 2))
         n_c = self.randint(0, (n_z - n_f) // 2)
@@ -67,7 +67,7 @@ class Draw(random.Random):
         return tuple(self.choices(kinds, k=self.randint(least, most)))
 
     def combinations(self, rows: Tensor, count: int) -> Tensor:
-        """``count`` rows, each one of ``rows`` times a factor, or a sum of them."""
+        """Draw ``count`` rows, each a multiple of one of ``rows`` or a sum of them."""
         mix = self.normal(count, len(rows))
         single = torch.rand(count, generator=self.generator) < 0.5
         one = torch.eye(len(rows)).double()[torch.arange(count) % len(rows)]
@@ -80,7 +80,7 @@ def solvable(known: KnownQP, accuracy: float = ACCURACY) -> Case:
 
 
 def changed(known: KnownQP, **tensors: Tensor) -> KnownQP:
-    """The same with other data, unchecked."""
+    """Replace tensors of a QP without checks."""
     parts = dict(vars(known.qp)) | tensors
     return replace(known, qp=QuadraticProgram(**parts, check_values=False))
 
@@ -97,13 +97,13 @@ def degenerate(draw: Draw, count: int) -> Case:
 
 
 def weakly_active(draw: Draw, count: int) -> Case:
-    """Rows at a bound that they do not need."""
+    """Rows at a bound with zero multiplier."""
     soft, hard = draw.rows((*WEAK, *SOFT_ROWS), 1, 8), draw.rows((*WEAK, "at_upper"), 1, 6)
     return solvable(draw.known(count, soft=(*soft, WEAK[0]), hard=hard))
 
 
 def exact_penalty_threshold(draw: Draw, count: int) -> Case:
-    """Multipliers that are all of w, without a slack."""
+    """Rows with multiplier w and zero slack."""
     soft = draw.rows((*BRINK, "above", "inside"), 1, 8)
     return solvable(draw.known(count, soft=(*soft, BRINK[0])))
 
@@ -159,7 +159,7 @@ def absent_and_equal_bounds(draw: Draw, count: int) -> Case:
 
 
 def crossing_bounds(draw: Draw, count: int) -> Case:
-    """Equal bounds that rounding has made cross."""
+    """Equal bounds that cross by rounding."""
     known = draw.known(count, soft=("equality", "above"), hard=("equality",))
     lb, ub = known.qp.lb, known.qp.ub
     up = torch.nextafter(lb, torch.full_like(lb, torch.inf))
@@ -190,7 +190,7 @@ def mixed(draw: Draw, count: int) -> Case:
 
 
 def widened(known: KnownQP) -> KnownQP:
-    """With four more rows, without bounds, for what makes a QP hopeless."""
+    """Add four rows without bounds, which a family then makes infeasible or unbounded."""
     qp, more = known.qp, 4
     batch = known.value.shape
     G = torch.cat((qp.G.new_ones(*qp.G.shape[:-2], more, qp.n_z), qp.G), dim=-2)
@@ -210,7 +210,7 @@ def widened(known: KnownQP) -> KnownQP:
 
 
 def contradicted(draw: Draw, known: KnownQP, at: Tensor) -> Case:
-    """Farkas' lemma: hard rows whose positive combination, with C's, asks for 0 < 0, where ``at``.
+    """Contradict rows by Farkas' lemma where ``at``: a positive combination, with C's, gives 0 < 0.
 
     lam > 0 and chi with ``G'lam + C'chi = 0`` off the fixed entries, and ``lam'ub + chi'b`` below
     what those give.
@@ -237,7 +237,7 @@ def contradicted(draw: Draw, known: KnownQP, at: Tensor) -> Case:
 def falling(
     draw: Draw, known: KnownQP, choose: Callable[..., Any], expected: Tensor | None = None
 ) -> Case:
-    """Along a direction without curvature, that C and the hard rows allow, the cost falls."""
+    """Make the cost fall along a direction without curvature that C and the hard rows allow."""
     qp, n_f = known.qp, known.fixed.shape[-1]
     at = torch.ones(known.value.shape, dtype=torch.bool) if choose is all else choose(known)
     null = torch.linalg.svd(qp.C[..., n_f:], full_matrices=True)[2][..., -1, :]
@@ -271,7 +271,7 @@ def falling(
 def in_units(
     known: KnownQP, cost: Tensor, variables: Tensor, rows: Tensor, equalities: Tensor
 ) -> KnownQP:
-    """The same QP in other units, given per matrix triple: ``()`` or ``(B,)``."""
+    """Convert a QP to other units, one per matrix triple: ``()`` or ``(B,)``."""
     qp = known.qp
 
     def of(factor: Tensor, tensor: Tensor, ndim: int) -> Tensor:
@@ -355,7 +355,7 @@ def empty_or_single(draw: Draw, count: int) -> Case:
 
 
 def after_training(draw: Draw, count: int) -> Case:
-    """The matrices that training with an absurd learning rate leaves behind."""
+    """Matrices after training with an absurd learning rate."""
     H, C, G, n_f = draw.choice(trained())
     soft = draw.rows(SOFT_ROWS, len(G), len(G))
     return solvable(draw.known(count, n_z=len(H), n_f=n_f, H=H, C=C, G=G, soft=soft, hard=()))
@@ -371,7 +371,7 @@ class Plant:
 
     @classmethod
     def of(cls, draw: Draw) -> Plant:
-        """A spectral radius of 1 to 2, or a Jordan block of such an eigenvalue."""
+        """Draw a plant of spectral radius 1 to 2, or a Jordan block with such an eigenvalue."""
         n_x, n_u, radius = draw.randint(1, 3), draw.randint(1, 2), draw.uniform(1.0, 2.0)
         A = draw.normal(n_x, n_x)
         if draw.random() < 0.5:
@@ -387,12 +387,12 @@ class Plant:
 
     @property
     def states(self) -> Tensor:
-        """Which entries of z are states, ``(n_z,)``."""
+        """Return the mask of the states in z, ``(n_z,)``."""
         n_x, n = len(self.A), sum(self.B.shape)
         return torch.arange(self.C.shape[1]) % n < n_x
 
     def roll_out(self, s: Tensor, u: Tensor) -> Tensor:
-        """z ``(B, n_z)`` from x_0 ``(B, n_x)`` and the actions ``(B, N, n_u)``."""
+        """Compute z ``(B, n_z)`` from x_0 ``(B, n_x)`` and the actions ``(B, N, n_u)``."""
         parts = [s]
         for action in u.unbind(1):
             s = s @ self.A.mT + action @ self.B.mT
@@ -401,7 +401,7 @@ class Plant:
 
 
 def unstable_model(draw: Draw, count: int) -> Case:
-    """Predictions that stay small though the model is unstable."""
+    """Small predictions of an unstable model."""
     plant = Plant.of(draw)
     C = plant.C
     soft, n_z = draw.rows(SOFT_ROWS, C.shape[1] - 2, C.shape[1] - 2), C.shape[1]
@@ -411,10 +411,10 @@ def unstable_model(draw: Draw, count: int) -> Case:
 
 
 def runaway_prediction(draw: Draw, count: int) -> Case:
-    """A linear MPC scheme whose actions are at their bounds, and whose states grow all the same.
+    """A linear MPC scheme whose states grow although the actions are at their bounds.
 
-    The multipliers of the dynamics follow backwards from stationarity; those of the actions say at
-    which of their bounds they are.
+    The multipliers of the dynamics follow backwards from stationarity; those of the actions
+    determine the active bounds.
     """
     plant = Plant.of(draw)
     (n_x, n_u), N = plant.B.shape, plant.horizon
@@ -451,7 +451,7 @@ def runaway_prediction(draw: Draw, count: int) -> Case:
 
 
 def hopeless_plant(draw: Draw, count: int) -> Case:
-    """An unstable model whose next state no allowed action keeps within its hard bounds."""
+    """An unstable model whose next state leaves its hard bounds for every allowed action."""
     plant = Plant.of(draw)
     n_x, n_z = len(plant.A), plant.C.shape[1]
     sizes = {"n_z": n_z, "n_f": n_x, "C": plant.C, "G": torch.eye(n_z).double()}

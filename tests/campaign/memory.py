@@ -1,7 +1,7 @@
 """Memory over many QPs: ``python -m tests.campaign.memory --count 1000000 --solver daqp``.
 
-Training's pattern: theta moves, and with it what is remembered; V, and its gradient. After a tenth
-of the QPs the process may grow by no more than `GROWTH`.
+As in training, theta changes, and V and its gradient are computed. After a tenth of the QPs the
+process may grow by no more than `GROWTH`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def resident(solver: str, batches: int) -> list[float]:
-    """MiB of memory after each batch."""
+    """Measure the memory in MiB after each batch."""
     mpc = random_mpc(0, horizon=10, solver=solver, on_failure="mask")
     optimizer = torch.optim.SGD(mpc.parameters(), lr=1e-9)
     sizes = []

@@ -1,4 +1,4 @@
-"""The gradient's error beside finite differences: ``python -m tests.campaign.numerics``.
+"""Solvers' accuracy and gradient errors: ``python -m tests.campaign.numerics``.
 
 Away from kinks every row of the known QPs is clearly active or clearly not; near one, a hard row is
 `NEAR` to its bound; at one, it is at its bound with no multiplier, and the gradient has to be
@@ -20,11 +20,11 @@ from torch_qpmpc import QuadraticProgram, solve_qp
 from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.solvers import BACKENDS
 
-#: Of the differences, and how near to a kink "near" is: so near that they do not cross it.
+#: Step of the finite differences, and a distance to kinks that they do not cross.
 STEP, NEAR = 1e-6, 1e-4
 COUNT, SEEDS = 32, 6
 SOFT = ("inside", "at_lower", "at_upper", "below", "above")
-#: Hard rows, apart from those that decide where: "away" from kinks, "near" them or "at" them.
+#: Kinds of the hard rows, apart from those "away" from, "near" or "at" a kink.
 KINDS = {"away": ("at_upper",), "near": ("weak_upper",), "at": ("weak_upper",)}
 NAMES = (
     "residual",
@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def measure(solver: str) -> list[str]:
-    """The solver's figures, in the order of `NAMES`."""
+    """Measure a solver, in the order of `NAMES`."""
     double, single = (accuracy(solver, dtype) for dtype in (torch.float64, torch.float32))
     gradients = [gradient(solver, part, place) for part in ("value", "z") for place in KINDS]
     figures = (*double, *single[1:], *gradients)
@@ -59,7 +59,7 @@ def measure(solver: str) -> list[str]:
 
 
 def accuracy(solver: str, dtype: torch.dtype) -> tuple[float, float, float]:
-    """The largest residual, and relative errors of value and z, of well-posed QPs."""
+    """Return the largest residual and relative errors of value and z of well-posed QPs."""
     worst = [0.0, 0.0, 0.0]
     for seed in range(SEEDS):
         known = known_qp(seed, batch=(COUNT,), dtype=dtype)
@@ -79,9 +79,9 @@ def error(found: Tensor, exact: Tensor, floor: float) -> Tensor:
 
 
 def gradient(solver: str, part: str, place: str) -> float:
-    """The largest error of a directional derivative, relative to the largest derivative.
+    """Return the largest error of a directional derivative, relative to the largest derivative.
 
-    At a kink: how far it is outside the interval between the one-sided differences.
+    At a kink, the error is the distance from the interval between the one-sided differences.
     """
     worst = 0.0
     for seed in range(SEEDS):
@@ -98,7 +98,7 @@ def gradient(solver: str, part: str, place: str) -> float:
 
         leaf = torch.zeros(COUNT, 1).double().requires_grad_()
         (slope,) = torch.autograd.grad(along(leaf, solver).sum(), leaf)
-        # A difference magnifies errors of the solver: it is the most accurate one's, for all.
+        # Differences magnify the solver's errors: the most accurate solver computes them for all.
         ahead, here, behind = (along(step, "torch").detach() for step in (STEP, 0.0, -STEP))
         one_sided = torch.stack(((ahead - here) / STEP, (here - behind) / STEP))
         if place == "at":
@@ -111,7 +111,7 @@ def gradient(solver: str, part: str, place: str) -> float:
 
 
 def placed(known: KnownQP, place: str) -> KnownQP:
-    """Rows that are weakly active, moved away from their bound by `NEAR`, if so asked."""
+    """Move weakly active rows away from their bounds by `NEAR` where "near" a kink."""
     if place != "near":
         return known
     weak = (known.lam == 0) & known.qp.w.isinf()

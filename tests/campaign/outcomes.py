@@ -1,10 +1,9 @@
-"""What became of each QP of a case, judged by what is known of it and not by the package.
+"""The outcome of each QP of a case, judged by its known solution instead of the package.
 
 A solution is right if it satisfies C z = b, the fixed entries and the hard rows, if its value and
-the cost of its z are the known value, and if z is near the known one in the norm of H, which says
-as much of z as the value does: 1/2 (z - z*)'H(z - z*) is at most what z costs too much. All of it
-relative to the sum of the absolute terms of the Lagrangian at the known solution, which has the
-QP's own units.
+the cost of its z equal the known value, and if z is near the known z* in the norm of H:
+1/2 (z - z*)'H(z - z*) is at most the excess cost of z. All errors are relative to the sum of the
+absolute terms of the Lagrangian at the known solution.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from torch_qpmpc.qp.solution import slacks
 
 @dataclass(frozen=True)
 class Outcome:
-    """Masks ``(B,)``, each QP in one of them; and the relative error of what is called solved."""
+    """Masks ``(B,)``, with each QP in one of them, and the error of certified solutions."""
 
     certified: Tensor
     named: Tensor
@@ -44,7 +43,7 @@ def judge(case: Case, solution: QPSolution) -> Outcome:
 
 
 def relative_errors(case: Case, solution: QPSolution) -> Tensor:
-    """The largest relative error of each solution, ``(B,)``; infinite if it is not finite."""
+    """Compute the largest relative error of each solution, ``(B,)``; inf for non-finite ones."""
     known = case.known
     H, q, c, C, b, G, lb, ub, w = (x.double() for x in known.qp.tensors())
     star, z, fixed = known.z.double(), solution.z.detach().double(), known.fixed.double()
@@ -87,9 +86,9 @@ def _largest(x: Tensor) -> Tensor:
 
 
 def finite_gradients(solution: QPSolution, operands: tuple[Tensor, ...]) -> Tensor:
-    """Where all gradients of a masked batch's values and z are finite, ``(B,)``.
+    """Find where all gradients of a masked batch's values and z are finite, ``(B,)``.
 
-    A gradient of what the batch shares is finite for all or for none.
+    The gradient of a shared tensor counts for all elements.
     """
     finite = torch.ones(solution.status.shape, dtype=torch.bool)
     for part in (solution.value, solution.z):

@@ -1,4 +1,4 @@
-"""What became of the QPs of a family, counted, and how long the slowest of them takes alone."""
+"""Counts of the outcomes of a family, and the time of its slowest QP."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torch_qpmpc import QPSolution, QuadraticProgram, Status, solve_qp
 from torch_qpmpc.qp.batching import broadcast
 from torch_qpmpc.qp.program import EVENT_SHAPES, UNKNOWN
 
-#: Seconds of one core that no QP may take.
+#: Largest allowed time of a QP in seconds of one core.
 SLOW = 0.5
 
 
 @dataclass
 class Tally:
-    """Counts; ``error`` is a certified QP's largest, ``slowest`` in seconds, measured alone."""
+    """Counts, the largest ``error`` of certified QPs, and the seconds of the ``slowest``, alone."""
 
     count: int = 0
     certified: int = 0
@@ -36,11 +36,11 @@ class Tally:
 
     @property
     def failures(self) -> int:
-        """What may not happen at all."""
+        """The outcomes that must not occur."""
         return self.wrong + self.not_finite + self.slow
 
     def add(self, case: Case, solver: str) -> list[str]:
-        """Solve and count a case; a line on each failure."""
+        """Solve and count a case; return a line for each failure."""
         tensors = (*case.known.qp.tensors(), case.known.fixed)
         *theta, fixed = operands = tuple(x.detach().requires_grad_() for x in tensors)
         qp = QuadraticProgram(*theta, check_values=False)
@@ -48,7 +48,7 @@ class Tally:
         solution = solve(qp, fixed, solver)
         taken = time.process_time() - began
         outcome, finite = judge(case, solution), finite_gradients(solution, operands)
-        # An empty batch counts as one: it was handed back as it came.
+        # An empty batch counts as one certified QP.
         self.count += max(1, len(case.expected))
         self.certified += int(outcome.certified.sum()) + (not len(case.expected))
         for name in ("named", "missed", "wrong"):
@@ -97,7 +97,7 @@ class Tally:
 
 
 def solve(qp: QuadraticProgram, fixed: Tensor, solver: str) -> QPSolution:
-    """By a solver's name; with "NAME, warm", from active sets of which nothing is known yet."""
+    """Solve by a solver's name; with "NAME, warm", from empty active sets."""
     name, _, warm = solver.partition(", ")
     start = None
     if warm:
@@ -107,7 +107,7 @@ def solve(qp: QuadraticProgram, fixed: Tensor, solver: str) -> QPSolution:
 
 
 def alone(case: Case, i: int) -> tuple[QuadraticProgram, Tensor]:
-    """The QP at ``i`` and its fixed entries."""
+    """Return the QP at ``i`` and its fixed entries."""
     qp = case.known.qp
     parts = {
         name: tensor[i] if tensor.ndim > len(event) else tensor

@@ -1,4 +1,4 @@
-"""Matrices from training itself, with a learning rate that no one would choose."""
+"""Matrices from training with an absurd learning rate."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ UPDATES, SNAPSHOTS, RATE = 2000, 8, 1.0
 
 @functools.cache
 def trained(updates: int = UPDATES) -> list[tuple[Tensor, Tensor, Tensor, int]]:
-    """H, C, G and n_f of V and of Q, at equal distances on the way of semi-gradient Q-learning."""
+    """Record H, C, G and n_f of V and Q at equal intervals of semi-gradient Q-learning."""
     mpc = random_mpc(0, learn=("H", "H_f", "q", "c", "C"), on_failure="mask")
     optimizer = torch.optim.Adam(mpc.parameters(), lr=RATE)
     found = []

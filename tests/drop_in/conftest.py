@@ -1,4 +1,4 @@
-"""Which of TorchRL's tests are left out, and why; and a table of the counts."""
+"""The excluded ones of TorchRL's tests with the reasons, and a table of counts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torchrl
 
-#: By the end of a test's name.
+#: Reasons by the end of a test's name.
 LEFT_OUT = {
     "prioritized_weights": (
         "makes its own networks, so that it tests none of ours; and TorchRL's C++ extension, "

@@ -15,8 +15,8 @@ from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
 class Theta(QPMPC):
     """A QPMPC whose constants are not buffers.
 
-    TorchRL's tests ask of every leaf of a network, buffers too, that it has a gradient and that it
-    moves. A QPMPC's buffers are constants (C_0, the discounts, which rows are soft) or parts of
+    TorchRL's tests require that every leaf of a network, including buffers, has a gradient and
+    changes. A QPMPC's buffers are constants (C_0, the discounts, which rows are soft) or parts of
     theta that are not learned. Here the constants are plain attributes, and all parts are learned.
     """
 
@@ -28,13 +28,13 @@ class Theta(QPMPC):
 
 
 def make_theta(n_x: int, n_u: int, unused: str | None = None) -> Theta:
-    """A small QP that learns all that enters, and of which all has a gradient in any batch.
+    """Make a small QP that learns all parts, each with a gradient in any batch.
 
     Its linear cost pushes some actions to a bound and some beyond it. All entries of a part lie
-    between its smallest and its largest, in any order, without harm: where TorchRL is given one
-    module for an ensemble it fills the copies with such numbers. (In a script, give it a list.)
+    between its smallest and its largest in any order: TorchRL fills the copies of an ensemble's
+    module with such numbers. (In a script, pass a list of modules.)
     """
-    # Each call draws another start from the generator that the tests seed.
+    # Each call draws from the generator that the tests seed.
     theta = Theta(
         n_x,
         n_u,
@@ -54,23 +54,23 @@ def make_theta(n_x: int, n_u: int, unused: str | None = None) -> Theta:
 
 
 def make_policy(n_x: int, n_u: int, observation: Any = "observation") -> Any:
-    """A deterministic actor. It learns nothing of c, as no action depends on it."""
+    """Make a deterministic actor, without learning c, which no action depends on."""
     mpc = make_theta(n_x, n_u, unused="c")
     return QPActorValueOperator(mpc, observation_key=observation).get_policy_operator()
 
 
 def make_gaussian(n_x: int, n_u: int) -> nn.Module:
-    """The QP's action as the location of a distribution, and a learned scale."""
+    """Make a stochastic actor: the QP's action as location, and a learned scale."""
     return nn.Sequential(make_policy(n_x, n_u), AddStateIndependentNormalScale(n_u))
 
 
 def make_critic(n_x: int, n_u: int, **keys: Any) -> Any:
-    """-Q, under the keys that a test may rename."""
+    """Make a critic, -Q, with keys that a test may rename."""
     return QPActorValueOperator(make_theta(n_x, n_u), **keys)
 
 
 def make_value(n_x: int, n_u: int, **keys: Any) -> Any:
-    """-V, below -Q at first: where it is above, IQL with an expectile of one learns nothing."""
+    """Make a value, -V, initially below -Q: above it, IQL with expectile one learns nothing."""
     operator = make_critic(n_x, n_u, **keys)
     operator.module.c.data += 100
     return operator.get_value_operator()

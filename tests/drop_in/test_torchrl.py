@@ -2,8 +2,8 @@
 
     TORCHRL_CHECKOUT=folder pytest tests/drop_in
 
-where the folder is a checkout of TorchRL's repository, near the installed version. Its test classes
-are imported from there, and what makes their networks is replaced.
+The folder is a checkout of TorchRL's repository near the installed version. Its test classes are
+imported, and the functions that make their networks are replaced.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ OBJECTIVES = Path(CHECKOUT) / "test" / "objectives"
 if not OBJECTIVES.is_dir():
     raise FileNotFoundError(f"TORCHRL_CHECKOUT: {OBJECTIVES} is not there")
 sys.path.insert(0, str(OBJECTIVES))
-#: Of the mixins, which stand before a test class of TorchRL's and are not checked against it.
+#: Base of the mixins, whose signatures are not checked against TorchRL's test classes.
 Base: Any = object
 ddpg, sac, iql = (importlib.import_module(f"test_{name}") for name in ("ddpg", "sac", "iql"))
 
 
 class Deterministic(Base):
-    """For DDPG and TD3: the QP as actor and as critic, each with a theta of its own."""
+    """Networks for DDPG and TD3: the QP as actor and as critic, with separate thetas."""
 
     def _create_mock_actor(
         self, obs_dim: int = 3, action_dim: int = 4, device="cpu", in_keys=None, **other: Any
@@ -80,7 +80,7 @@ class Deterministic(Base):
 
 class TestDDPG(Deterministic, ddpg.TestDDPG):
     def _create_mock_value(self, obs_dim: int = 3, state_dim: int = 8, **other: Any) -> Any:
-        """The critic of these tests sees a state beside the observation."""
+        """Make a critic that takes a state in addition to the observation."""
         both: Any = TensorDictModule(
             lambda *parts: torch.cat(parts, -1), ["observation", "state"], ["both"]
         )
@@ -93,7 +93,7 @@ class TestTD3(Deterministic, ddpg.TestTD3):
 
 
 class Stochastic(Base):
-    """For SAC and IQL: the QP as critic and as state value, and as the mean of the policy."""
+    """Networks for SAC and IQL: the QP as critic, state value and mean of the policy."""
 
     composite = False
 

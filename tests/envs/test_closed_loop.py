@@ -1,4 +1,4 @@
-"""Closed loops against a second, plain implementation of the same protocol."""
+"""Closed loops against a plain reference implementation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ K = torch.tensor([[1.5, 0.0, 1.0, 0.0], [0.0, 1.5, 0.0, 1.0]], dtype=torch.float
 
 
 def in_numpy(kind: str, std: float, steps: int = 50) -> tuple[np.ndarray, np.ndarray]:
-    """States and costs of the policy -K s, written out without the package."""
+    """Compute states and costs of the policy -K s in NumPy."""
     rng = np.random.default_rng(123)
     s = np.hstack([rng.uniform(-1.5, 1.5, (32, 2)), rng.uniform(-0.5, 0.5, (32, 2))])
     A = np.eye(4) + 0.1 * np.eye(4, k=2) - 0.1 * np.diag([0, 0, 1, 1])

@@ -1,4 +1,4 @@
-"""Gros and Zanon's own: dynamics, cost, violations, noise and starts, by hand."""
+"""Gros and Zanon's system: dynamics, cost, violations, noise and starts, by hand."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_step_cost_and_violation_are_those_of_the_paper():
     nu = torch.tensor([[-0.05, 0], [0, 0], [-0.1, 0]], dtype=torch.float64)
     expected = torch.tensor([[0.5513, 0.42], [0.39435, 1.55], [0.525, -1.43]]).double()
     torch.testing.assert_close(p.step(s, a, nu), expected, atol=1e-7, rtol=0)
-    # Outside by nothing, by 0.1 below and 0.5 above, by 0.2 above and 0.3 below.
+    # Violations: none, 0.1 below and 0.5 above, 0.2 above and 0.3 below.
     violations = torch.tensor([0, 0.6, 0.5], dtype=torch.float64)
     torch.testing.assert_close(p.violation(s), violations)
     costs = torch.tensor([0.395, 31.1925, 26.565], dtype=torch.float64)
@@ -52,7 +52,7 @@ def test_noise_is_one_uniform_number_for_the_first_state():
         assert e.std().item() == pytest.approx(0.1 / 12**0.5, rel=0.02)
 
 
-def test_episodes_start_at_one_state_that_nothing_is_drawn_for():
+def test_episodes_start_at_one_state_without_a_draw():
     for rng, untouched in (
         (np.random.default_rng(3), np.random.default_rng(3)),
         (torch.Generator().manual_seed(3), torch.Generator().manual_seed(3)),

@@ -1,4 +1,4 @@
-"""Any Gymnasium environment as a plant: what it must be, and what its episodes are."""
+"""Gymnasium environments as plants: requirements, and episodes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch_qpmpc.errors import QPError
 
 
 class Counter(gymnasium.Env):
-    """Its state counts the steps; it terminates at ``last``."""
+    """An environment whose state counts the steps and which terminates at ``last``."""
 
     def __init__(self, observations=None, actions=None, last: int = 1000) -> None:
         self.observation_space = observations or Box(0.0, 1000.0, (1,), np.float32)
@@ -35,7 +35,7 @@ class Counter(gymnasium.Env):
 
 @pytest.fixture
 def register(monkeypatch):
-    """Register a `Counter` with other spaces or another end, for one test."""
+    """Register a `Counter` with given spaces or end, for one test."""
 
     def add(**options):
         spec = EnvSpec("Counter-v0", lambda **_: Counter(**options))
@@ -126,7 +126,7 @@ def test_violation_is_the_distance_to_the_box():
     assert plant.violation(s).tolist() == [0, 1.75]
 
 
-def test_nobody_knows_its_model():
+def test_it_has_no_true_model():
     assert GymnasiumPlant("Pendulum-v1").true_model() is None
 
 

@@ -1,4 +1,4 @@
-"""What every plant has in common, and that the environments are nothing but the physics."""
+"""Properties common to all plants, and the environments' agreement with their physics."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ IDS = ["torch_qpmpc/PointMass-v0", "torch_qpmpc/GrosZanonLTI-v0"]
 
 @pytest.fixture(params=PLANTS)
 def plant(request: pytest.FixtureRequest) -> LinearSystem:
-    """Each plant in turn, with each kind of noise."""
+    """Return each plant in turn, with each kind of noise."""
     return PLANTS[request.param]
 
 
 class StaggeredEnv(LinearSystemEnv):
-    """The episodes' clocks start apart, so that every later reset is a partial one."""
+    """A plant whose episodes start at different steps, so that every later reset is partial."""
 
     def _reset(self, tensordict=None, **kwargs):
         out = super()._reset(tensordict, **kwargs)
@@ -60,7 +60,7 @@ def linear_policy(plant: LinearSystem) -> TensorDictModule:
 
 
 def collect(env: LinearSystemEnv, batches: int, steps: int) -> Any:
-    """TensorDict of ``(num_envs, batches * steps)`` transitions."""
+    """Collect a TensorDict of ``(num_envs, batches * steps)`` transitions."""
     collector = Collector(
         env,
         linear_policy(env.physics),
@@ -123,7 +123,7 @@ def test_moving_keeps_every_field(plant):
 def test_gymnasium_finds_nothing_to_complain_about(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Soft bounds leave the observation without any, which Gymnasium doubts is meant.
+        # With soft bounds the observation space is unbounded, about which Gymnasium warns.
         warnings.filterwarnings("ignore", ".*(minimum|maximum) value is -?infinity")
         check_env(gymnasium.make(name).unwrapped)
 
@@ -204,7 +204,7 @@ def test_partial_resets_in_a_collector_restart_exactly_the_finished_episodes(pla
     )
     assert ((now["collector", "traj_ids"] != then["collector", "traj_ids"]) == ended).all()
 
-    # What was stored as nu is what entered the dynamics.
+    # The stored nu entered the dynamics.
     following = plant.step(data["observation"], data["action"], data["next", "noise"])
     torch.testing.assert_close(data["next", "observation"], following.float())
     if plant is PLANTS["brownian"]:
@@ -213,7 +213,7 @@ def test_partial_resets_in_a_collector_restart_exactly_the_finished_episodes(pla
         assert data["next", "noise"].std().item() > 0.13
 
 
-def test_same_seed_same_rollouts_whatever_the_global_generator_does(plant):
+def test_rollouts_depend_on_the_seed_only(plant):
     def rollout(seed):
         env = LinearSystemEnv(plant, 4, 50, seed=seed)
         torch.manual_seed(seed + torch.seed() % 1000)

@@ -1,4 +1,4 @@
-"""The point mass's own: dynamics, cost, noise, starts, and random streams that stay as they are."""
+"""The point mass: dynamics, cost, noise, starts, and random streams, which must not change."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.errors import QPError
 
 # The state after three steps without an action, from seed 0, by TorchRL's environment, Gymnasium's,
-# and the evaluation: computed once, since another stream would make old runs incomparable.
+# and the evaluation. Another random stream would make old runs incomparable.
 STREAMS = {
     "gaussian": (
         [

@@ -1,4 +1,4 @@
-"""DDPG and TD3 with QPs or networks as actor and critics: who learns, when, and at which rate."""
+"""DDPG and TD3 with QPs or networks as actor and critics: learned parameters, rates and delays."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COMBINATIONS = list(itertools.product(ALGOS, NETWORKS, NETWORKS))
 
 
 def make(*overrides: str, seed: int = 0, done: int = 0) -> tuple[Learner, QPMPC, TensorDictBase]:
-    """A learner, the QP of its actor, and a batch of random transitions of its task."""
+    """Make a learner, its actor's QP, and a batch of random transitions."""
     torch.manual_seed(seed)
     cfg = make_config(*SMALL, "constraint=free", *overrides)
     physics = make_physics(cfg)
@@ -52,7 +52,7 @@ def settings(algo: str, actor: str, critic: str, task: str = "point_mass") -> tu
 
 
 def parameters(learner: Learner, name: str) -> dict[str, Tensor]:
-    """Copies of what learns under a name of the loss module's."""
+    """Copy the learned parameters under ``name`` in the loss module."""
     params = getattr(learner.loss_module, name).flatten_keys(".")
     return {key: leaf.detach().clone() for key, leaf in params.items() if leaf.requires_grad}
 
@@ -188,7 +188,7 @@ def test_a_qp_with_soft_action_rows_acts_within_the_plants_bounds():
 
 @pytest.mark.parametrize("actor", NETWORKS)
 def test_in_closed_loop_the_actor_acts_as_in_the_loss(actor):
-    """The QP's is warm and clipped, for either dtype, and has the loss's parameters."""
+    """A QP is warm-started and clipped, in either dtype, and shares the loss's parameters."""
     learner, _, batch = make(*settings("td3", actor, "mlp"), "task.action_slack=0.001")
     for _ in range(4):
         learner.learn(batch.clone(), None)
@@ -206,7 +206,7 @@ def test_in_closed_loop_the_actor_acts_as_in_the_loss(actor):
 
 @pytest.mark.parametrize("done", [0, 1, 5])
 @pytest.mark.parametrize("delay", [1, 2, 3])
-def test_td3_moves_its_actor_every_so_many_updates_also_when_it_goes_on(delay, done):
+def test_td3_delays_its_actor_also_after_a_resume(delay, done):
     learner, mpc, batch = make(
         *settings("td3", "qp", "mlp"), f"algo.policy_delay={delay}", done=done
     )
@@ -271,7 +271,7 @@ def test_a_loss_that_is_not_finite_moves_nothing_and_is_counted(algo):
 @pytest.mark.parametrize("critic", NETWORKS)
 @pytest.mark.parametrize("algo", ALGOS)
 def test_gradient_of_theta_agrees_with_finite_differences_of_the_loss(algo, critic):
-    # In float64, as a network's rounding is larger than the differences.
+    # In float64: a network's rounding in float32 exceeds the differences.
     torch.set_default_dtype(torch.float64)
     try:
         learner, mpc, batch = make(*settings(algo, "qp", critic), seed=3)
@@ -287,7 +287,7 @@ def test_gradient_of_theta_agrees_with_finite_differences_of_the_loss(algo, crit
 
     loss().backward()
     compared = 0
-    # A list, as a functional call exchanges the parameters that an iterator walks through.
+    # A list, because functional calls exchange the parameters during the iteration.
     for leaf in list(mpc.parameters()):
         gradient = leaf.grad
         if gradient is None:

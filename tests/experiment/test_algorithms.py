@@ -1,4 +1,4 @@
-"""The parts of a run are what the configuration and the paper's experiment say."""
+"""The parts of a run match the configuration and the paper's experiment."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_evaluation_is_without_exploration_and_repeatable():
 
 @pytest.mark.parametrize("task", ["point_mass", "gros_zanon", "pendulum"])
 def test_the_evaluation_has_a_seed_of_its_own(task):
-    """null is the seed that `closed_loop` has by default."""
+    """null selects the default seed of `closed_loop`."""
 
     physics: Any = make_physics(make_config(f"task={task}"))
 

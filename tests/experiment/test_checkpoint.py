@@ -1,4 +1,4 @@
-"""Checkpoints are whole or they are the previous one, and reading one runs no code."""
+"""Checkpoints are written atomically, keep the previous one, and are read without running code."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def same(first: object, second: object) -> bool:
 
 
 def make_state(update: int = 3) -> dict:
-    """A module and an optimiser that has a step behind it."""
+    """Make the state of a module and an optimiser after one step."""
     mpc = QPMPC(2, 1, 3, solver="daqp")
     optimizer = torch.optim.Adam(mpc.parameter_groups({"cost": 2e-2, "constraints": 2e-3}))
     mpc.value(torch.ones(4, 2)).mean().backward()
@@ -84,7 +84,7 @@ def test_a_crash_keeps_the_previous_one(tmp_path, monkeypatch, when):
     monkeypatch.undo()
     assert path.read_bytes() == before
     assert load_checkpoint(path)["update"] == 1
-    save_checkpoint(path, make_state(3))  # what the crash left is no obstacle
+    save_checkpoint(path, make_state(3))  # the crash's leftovers do not interfere
     assert load_checkpoint(path)["update"] == 3
 
 
@@ -98,10 +98,8 @@ def test_the_checkpoint_before_is_kept_and_dropped_at_the_end(tmp_path):
     assert [found.name for found in tmp_path.iterdir()] == ["checkpoint.pt"]
 
 
-def test_a_damaged_checkpoint_does_not_replace_the_one_before_until_there_is_a_newer(
-    tmp_path, monkeypatch
-):
-    """One goes on from the one before, and the disk is full."""
+def test_a_damaged_checkpoint_does_not_replace_the_previous_one(tmp_path, monkeypatch):
+    """Resume from the previous checkpoint on a full disk."""
     path = tmp_path / "checkpoint.pt"
     for update in (1, 2):
         save_checkpoint(path, make_state(update))
@@ -124,7 +122,7 @@ def test_a_flipped_bit_is_found_or_changes_nothing(tmp_path, bit):
     save_checkpoint(tmp_path / PREVIOUS, state)
     save_checkpoint(path, state)
     whole, refused = path.read_bytes(), []
-    # The directory at the end, whose every byte means something, and a share of the rest.
+    # All bytes of the archive's directory at the end, and some of the rest.
     positions = sorted({*range(0, len(whole), 61), *range(len(whole) - 300, len(whole))})
     for position in positions:
         data = bytearray(whole)
@@ -137,7 +135,7 @@ def test_a_flipped_bit_is_found_or_changes_nothing(tmp_path, bit):
         else:
             assert same(found, state), position
     assert len(refused) > len(positions) / 4
-    assert all("use the one before" in sentence for sentence in refused)
+    assert all("use the previous one" in sentence for sentence in refused)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.9, 0.999])
@@ -162,12 +160,12 @@ def test_something_else_is_an_error(tmp_path):
 
 
 def test_a_missing_checkpoint_is_an_error(tmp_path):
-    with pytest.raises(QPError, match=r"checkpoint: got .*none.pt, which is not there"):
+    with pytest.raises(QPError, match=r"checkpoint: got .*none.pt, which does not exist"):
         load_checkpoint(tmp_path / "none.pt")
 
 
 class Touch:
-    """What a malicious file would hold: unpickling it runs code."""
+    """Content of a malicious file: unpickling it runs code."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -179,7 +177,7 @@ class Touch:
 def test_loading_runs_no_code(tmp_path):
     victim, path = tmp_path / "victim", tmp_path / "checkpoint.pt"
     torch.save({"mpc": Touch(victim)}, path)
-    with pytest.raises(QPError, match=r"UnpicklingError.* something other than tensors"):
+    with pytest.raises(QPError, match=r"UnpicklingError.* more than tensors"):
         load_checkpoint(path)
     assert not victim.exists()
     pickle.loads(pickle.dumps(Touch(victim)))
@@ -187,7 +185,7 @@ def test_loading_runs_no_code(tmp_path):
 
 
 def test_no_member_of_the_file_is_run(tmp_path):
-    """Each member in turn is replaced by such a pickle."""
+    """Replace each member of the file in turn by a malicious pickle."""
     victim, path = tmp_path / "victim", tmp_path / "checkpoint.pt"
     save_checkpoint(path, make_state())
     with zipfile.ZipFile(path) as file:

@@ -1,4 +1,4 @@
-"""Batches of transitions under today's policy, whichever process they come from."""
+"""Batches of transitions under the newest policy, from one process or several."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NOISES = {"point_mass": "gaussian", "gros_zanon": "uniform", "pendulum": "none"}
 
 
 def collect(cfg: DictConfig, count: int) -> tuple[Any, Any]:
-    """``count`` batches one after the other, and the QP of the policy."""
+    """Collect ``count`` batches; return them and the policy's QP."""
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
     collector = make_collector(cfg, physics, QPActorValueOperator(mpc).get_policy_operator())
@@ -70,7 +70,7 @@ def test_a_collector_carries_active_sets_from_step_to_step(task):
     assert log.recalled > 0.5 * log.solves
 
 
-#: The collectors whose environments are in other processes.
+#: Collectors with environments in other processes.
 ELSEWHERE = [
     pytest.param("multi", marks=pytest.mark.slow),
     pytest.param("ray", marks=pytest.mark.cluster),
@@ -100,14 +100,14 @@ def test_workers_share_the_environments_and_follow_theta(name):
     torch.testing.assert_close(first["action"], before.detach())
     torch.testing.assert_close(second["action"], mpc.policy(second["observation"]).detach())
     assert not torch.allclose(mpc.policy(first["observation"]), before, atol=1e-3)
-    # Each environment goes on where it was, and no two are alike.
+    # Each environment continues its episode, and no two are equal.
     torch.testing.assert_close(first["next", "observation"][:, -1], second["observation"][:, 0])
     assert len(first["observation"][:, 0].unique(dim=0)) == 4
 
 
 @pytest.mark.parametrize("name", ELSEWHERE)
-def test_workers_that_do_not_wait_bring_their_own_environments(tmp_path, monkeypatch, name):
-    """A run learns from each batch as it comes: half of the environments at a time."""
+def test_asynchronous_workers_return_batches_of_their_environments(tmp_path, monkeypatch, name):
+    """Each batch has the environments of one of two workers."""
     if name == "ray":
         pytest.importorskip("ray", reason="the extra ray is not installed")
     overrides = (*SMALL, f"collector={name}", "collector.sync=false", "num_envs=4", "constraint=si")

@@ -1,4 +1,4 @@
-"""Every key has a rule and a reader, every rule a key, and each bad value its sentence."""
+"""Every key has a rule and is read, every rule has a key, and each bad value has a message."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from torch_qpmpc.experiment.run_state import snapshot
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 
 GROUPS = ("constraint", "noise", "optimizer", "task")
-#: A penalty that is null is off.
+#: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
-#: The keys that a configuration of an earlier version lacks, and that of a built-in task.
+#: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
 NOT_NEEDED = ("eval_seed", "logger", "task.file")
-#: What each key must be; those of a user's tasks may come and go.
+#: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
 
 def keys_of_the_files() -> set[str]:
-    """Dotted keys of every file in configs/, but for Hydra's own."""
+    """List the dotted keys of every file in configs/, except Hydra's."""
     keys = set()
     for path in set(CONFIGS.rglob("*.yaml")) - set((CONFIGS / "hydra").rglob("*.yaml")):
         tree = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
@@ -58,7 +58,7 @@ def test_each_key_of_the_files_is_one_of_the_models():
 
 
 class Recorder:
-    """A configuration that notes which of its leaves are read."""
+    """A configuration that records which leaves are read."""
 
     def __init__(self, cfg: DictConfig, seen: set[str], prefix: str = "") -> None:
         self.__dict__.update(_cfg=cfg, _seen=seen, _prefix=prefix)
@@ -83,9 +83,9 @@ class Recorder:
 
 
 def test_each_key_is_read(tmp_path, monkeypatch):
-    """By a run of one order or the other, or by the names of the run's folder."""
+    """A run of first or second order reads the key, or the run folder's name has it."""
     seen: set[str] = set()
-    # These two read everything at once, which proves nothing.
+    # These two read all keys at once, which proves nothing.
     monkeypatch.setattr(train, "check_config", lambda _: None)
     for name, overrides in {
         "first": ("optimizer=adam", "constraint=combined", "constraint.si.windows=4"),
@@ -107,12 +107,12 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     make_collector(elsewhere, physics, operator.get_policy_operator())
     assert num_columns(elsewhere) == 16
     text = (CONFIGS / "config.yaml").read_text(encoding="utf-8").partition("hydra:")[2]
-    seen |= set(re.findall(r"\$\{([\w.]+)\}", text))
-    seen |= {"logger"}  # RunFolder reads it, and gets the configuration itself
+    seen |= set(re.findall(r"\$\{(?!hydra\.)([\w.]+)\}", text))
+    seen |= {"logger"}  # RunFolder reads it from the configuration itself
     assert seen - set(OPTIONAL) == set(KEYS) - {"task.file"}
 
 
-#: The noises of each task's plant, and the constraints with a penalty on windows of the replay.
+#: The noises of each task, and the constraints whose penalty needs windows of the replay.
 NOISES = {
     "point_mass": {"gaussian", "brownian"},
     "gros_zanon": {"uniform"},
@@ -123,7 +123,7 @@ WINDOWS = ("si", "combined", "identified")
 
 
 def faults(constraint: str, noise: str, optimizer: str, task: str) -> list[str]:
-    """The keys that do not fit: recursive learns without a replay."""
+    """List the conflicting keys of a choice of groups; recursive learns without a replay."""
     found = {"noise.name": noise not in NOISES[task]}
     found["replay"] = optimizer == "recursive" and constraint in WINDOWS
     return [key for key, wrong in found.items() if wrong]
@@ -140,15 +140,15 @@ PRODUCT = list(itertools.product(*map(choices, GROUPS)))
 
 @pytest.mark.parametrize("names", covering(x for x in PRODUCT if not faults(*x)), ids="-".join)
 def test_each_choice_of_groups_is_accepted(names):
-    """Every pair of choices that fit each other: no rule is about three."""
+    """Every compatible pair of choices is tested: no rule involves three."""
     check_config(chosen(*names))
 
 
 @pytest.mark.parametrize(
     "names", covering(x for x in PRODUCT if len(faults(*x)) == 1), ids="-".join
 )
-def test_choices_that_do_not_fit_are_refused(names):
-    """A noise of another task, or windows for the SI penalty without a replay."""
+def test_incompatible_choices_are_refused(names):
+    """Another task's noise is refused, as are SI windows without a replay."""
     (key,) = faults(*names)
     with pytest.raises(QPError, match=f"^{key}: got"):
         check_config(chosen(*names))
@@ -167,7 +167,7 @@ def test_an_actor_has_the_first_order_by_itself():
 
 
 def choices_with(key: str) -> list[str]:
-    """The choices of groups with which a configuration has the key."""
+    """Return the choices of groups that have the key."""
     if key in settings(make_config("optimizer=gauss_newton")):
         return ["optimizer=gauss_newton"]
     having = {"algo": "algo=td3", "collector": "collector=ray", "task": "task=pendulum"}
@@ -388,10 +388,10 @@ def test_solver_must_be_known():
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["constraint.learn=[b]"], r"constraint.learn: got \['b'\], expected C among them"),
+        (["constraint.learn=[b]"], r"constraint.learn: got \['b'\], expected a list with C"),
         (
             ["constraint=deviation", "constraint.learn=[]"],
-            r"constraint.learn: got \[\], expected C .* Set the penalty to null, or learn C",
+            r"constraint.learn: got \[\], expected a list with C.* or learn C",
         ),
         (
             ["constraint=si", "task.episode_steps=5"],
@@ -407,13 +407,13 @@ def test_solver_must_be_known():
         ),
         (
             ["optimizer=gauss_newton", "penalty_step=subgradient"],
-            r"penalty_step: got 'subgradient', expected proximal. gauss_newton has no subgrad",
+            r"penalty_step: got 'subgradient', expected proximal. gauss_newton takes no subg",
         ),
         (
             ["optimizer=gauss_newton", "constraint=si", "constraint.si.normalised=true"],
-            r"constraint.si.normalised: got True, expected False. gauss_newton takes the pen",
+            r"constraint.si.normalised: got True, expected False. gauss_newton needs a penal",
         ),
-        (["constraint=si", "replay=false"], "replay: got False, expected true. The windows of"),
+        (["constraint=si", "replay=false"], "replay: got False, expected true. constraint.si"),
         (
             ["constraint=deviation", "constraint.structure=tied"],
             "constraint.structure: got 'tied', expected free. A tied C has nothing off its band",
@@ -429,23 +429,23 @@ def test_solver_must_be_known():
         (["release=10"], "release: got 10, expected null. Nothing is tied: choose constraint=mpc"),
         (
             ["task.terminal_weight=riccati"],
-            "task.terminal_weight: got 'riccati', expected identity. With task.hessian=block it",
+            "task.terminal_weight: got 'riccati', expected identity. The Riccati weight needs",
         ),
         (
             ["noise=uniform"],
-            "noise.name: got 'uniform', expected a noise that point_mass has: gauss",
+            "noise.name: got 'uniform', expected a noise of task point_mass: gauss",
         ),
         (
             ["noise.name=pink"],
-            "noise.name: got 'pink', expected a noise that .* gaussian, brownian",
+            "noise.name: got 'pink', expected a noise of .* gaussian, brownian",
         ),
         (
             ["task=gros_zanon", "noise=gaussian"],
-            "noise.name: got 'gaussian', expected a noise that gros_zanon has: uniform.",
+            "noise.name: got 'gaussian', expected a noise of task gros_zanon: uniform.",
         ),
         (
             ["algo=td3", "optimizer=gauss_newton"],
-            "optimizer.name: got 'gauss_newton', expected adam or sgd. td3 has no second order",
+            "optimizer.name: got 'gauss_newton', expected adam or sgd. td3 needs a first-order",
         ),
         (["algo=ddpg", "warm_start=true"], "warm_start: got True, expected false. ddpg solves at"),
         (["algo=ddpg", "replay=false"], "replay: got False, expected true. ddpg learns from a"),
@@ -456,11 +456,11 @@ def test_solver_must_be_known():
         (["algo=ddpg", "step=projection"], "step: got 'projection', expected cholesky. The crit"),
         (
             ["algo=ddpg", "constraint=mpc", "release=5"],
-            "release: got 5, expected null. ddpg has more parameters than the QP's",
+            "release: got 5, expected null. ddpg does not support release",
         ),
         (
             ["collector=multi", "constraint=mpc", "release=5"],
-            "release: got 5, expected null. The workers of collector=multi would keep",
+            "release: got 5, expected null. Workers of collector=multi would keep",
         ),
         (
             ["collector=ray", "collector.workers=3"],
@@ -468,7 +468,7 @@ def test_solver_must_be_known():
         ),
         (
             ["collector=multi", "collector.sync=false", "constraint=si"],
-            "steps_per_update: got 4, expected at least task.horizon = 10. The windows of",
+            "steps_per_update: got 4, expected at least task.horizon = 10. constraint.si",
         ),
         (
             ["task=gros_zanon", "noise.std=0.1"],
@@ -498,7 +498,7 @@ def test_the_step_rule_needs_its_solver(monkeypatch):
         check_config(make_config("step=sdp"))
 
 
-#: What each differs in, beside its name: from the defaults, or from those of its optimiser.
+#: Settings of each ablation that differ from its optimiser's defaults, beside its name.
 ABLATIONS: dict[str, tuple[list[str], dict[str, Any]]] = {
     "reference": ([], {}),
     "adam_proximal": (["optimizer=adam"], {}),
@@ -517,7 +517,7 @@ ABLATIONS: dict[str, tuple[list[str], dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("name", choices("ablation"))
-def test_an_ablation_differs_in_what_it_says(name):
+def test_an_ablation_differs_in_its_named_settings(name):
     base, expected = ABLATIONS[name]
     found = make_config(f"+ablation={name}")
     check_config(found)

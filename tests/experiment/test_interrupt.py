@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM stop a run where it can go on from; a second one stops it at once."""
+"""Ctrl-C and SIGTERM stop a run between updates with a checkpoint; a second one acts at once."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RUN = (*SMALL, "updates=5", "eval_interval=3", "task.eval_steps=5")
 
 @pytest.fixture(autouse=True)
 def listening() -> Iterator[None]:
-    """As in a terminal: a shell's background jobs begin with Ctrl-C ignored, and so do theirs."""
+    """Restore Ctrl-C's default handler, which a shell's background jobs and children lack."""
     usual = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, usual)
@@ -71,7 +71,7 @@ def test_a_block_without_a_signal_changes_nothing(capsys):
 def test_a_run_stops_cleanly_wherever_the_signal_comes(
     tmp_path, monkeypatch, capsys, where, call, said, signum
 ):
-    """Starting, warming up, learning, evaluating and saving."""
+    """The signal arrives at start, or while warming up, learning, evaluating or saving."""
     cfg, folder, calls = make_config(*RUN), tmp_path / "run", []
     with monkeypatch.context() as patch:
         signal_at(patch, where, call, signum, calls)
@@ -89,7 +89,7 @@ def test_a_run_stops_cleanly_wherever_the_signal_comes(
 
 
 def signal_at(patch: pytest.MonkeyPatch, where: str, call: int, signum: int, calls: list) -> None:
-    """Send ``signum`` in that call of the function named ``where``."""
+    """Send ``signum`` in the given call of the function named ``where``."""
     name = where.rpartition(".")[2]
     module: Any = train if where.startswith("train.") else Replay
     function = getattr(module, name)
@@ -109,7 +109,7 @@ def test_a_signal_in_the_last_update_lets_the_run_finish(tmp_path, monkeypatch):
     assert (tmp_path / "summary.json").exists()
 
 
-def test_a_second_ctrl_c_keeps_what_was_logged_and_the_last_checkpoint(tmp_path, monkeypatch):
+def test_a_second_ctrl_c_keeps_the_log_and_the_last_checkpoint(tmp_path, monkeypatch):
     entered, enter = [], SolveLog.__enter__
 
     def twice(log: SolveLog) -> SolveLog:

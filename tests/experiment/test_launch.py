@@ -1,6 +1,6 @@
-"""Errors around a run: one sentence for the user's, a traceback for the others.
+"""Errors of a launch: one sentence for users' errors, a traceback for others.
 
-The folders and the lock are tested by the command, in test_train.py and test_sweeps.py.
+test_train.py and test_sweeps.py test the folders and the lock.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch_qpmpc.experiment.lock import LOCK
 
 @pytest.fixture
 def hydra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Hydra's record of a single run in ``tmp_path``."""
+    """Set Hydra's configuration to a single run in ``tmp_path``."""
     hydra: Any = SimpleNamespace(
         mode=RunMode.RUN,
         runtime=SimpleNamespace(output_dir=str(tmp_path)),
@@ -62,7 +62,7 @@ def test_a_lost_worker_is_no_file_error(hydra):
 
 @pytest.mark.parametrize("error", [OSError("disk"), ValueError("bug")])
 def test_a_threads_error_is_printed_unless_the_run_raises_it(capsys, error):
-    module._print_unless_writing(
+    module._print_unless_os_error(
         threading.ExceptHookArgs((type(error), error, None, threading.current_thread()))
     )
     assert ("bug" in capsys.readouterr().err) == isinstance(error, ValueError)

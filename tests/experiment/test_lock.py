@@ -1,4 +1,4 @@
-"""One process at a time holds a folder's lock, and a killed one leaves it free."""
+"""One process at a time holds a folder's lock, and a killed process releases it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torch_qpmpc.experiment import lock
 from torch_qpmpc.experiment.lock import ELSEWHERE_IN_SWEEP, LOCK, locked
 
 PACKAGE = Path(torch_qpmpc.__file__).parent
-#: The package without its ``__init__``, whose imports (torch, TorchRL) take seconds.
+#: Imports the lock without the package's ``__init__``, which imports torch for seconds.
 HOLD = """
 import sys, types
 sys.modules["torch_qpmpc"] = package = types.ModuleType("torch_qpmpc")
@@ -49,7 +49,7 @@ def test_a_live_process_is_named_and_a_killed_one_leaves_no_lock(tmp_path):
         message = (
             rf"^folder: got {re.escape(str(tmp_path))}, in use by process {process.pid} on .+, "
             r"expected one that no run is using\. Wait until that run has ended, or choose "
-            r"another folder by hydra\.run\.dir=FOLDER\.$"
+            r"another folder with hydra\.run\.dir=FOLDER\.$"
         )
         with pytest.raises(QPError, match=message), locked(tmp_path):
             pass
@@ -62,10 +62,10 @@ def test_a_live_process_is_named_and_a_killed_one_leaves_no_lock(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_sweep_is_offered_its_own_settings(tmp_path):
+def test_a_sweeps_message_names_its_own_setting(tmp_path):
     with (
         locked(tmp_path),
-        pytest.raises(QPError, match=r"by hydra\.sweep\.dir=FOLDER, or by hydra\.sweep\.subdir"),
+        pytest.raises(QPError, match=r"with hydra\.sweep\.dir=FOLDER\."),
         locked(tmp_path, ELSEWHERE_IN_SWEEP),
     ):
         pass
@@ -78,8 +78,8 @@ def test_an_error_inside_frees_the_lock(tmp_path):
         assert f"process {os.getpid()} on " in (tmp_path / LOCK).read_text()
 
 
-def test_a_file_that_its_holder_has_just_removed_is_not_the_lock(tmp_path, monkeypatch):
-    """The holder removes it between this process's opening and locking it."""
+def test_a_lock_file_that_was_removed_meanwhile_is_opened_again(tmp_path, monkeypatch):
+    """The holder removes the file after this process has opened it."""
     flock, opened = fcntl.flock, []
 
     def late(file: int, operation: int) -> None:
@@ -95,7 +95,7 @@ def test_a_file_that_its_holder_has_just_removed_is_not_the_lock(tmp_path, monke
             pass
 
 
-def test_without_locks_runs_go_on(tmp_path, monkeypatch):
+def test_without_locks_runs_continue(tmp_path, monkeypatch):
     def unsupported(*_: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 

@@ -1,4 +1,4 @@
-"""Each logger has what was logged, in the run's folder, also of a run that goes on."""
+"""Each logger writes everything logged into the run's folder, also after a resume."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from torch_qpmpc.experiment.run_folder import RunFolder
 
 @pytest.fixture(autouse=True)
 def local(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing leaves the machine."""
+    """Keep the loggers offline."""
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
 
 
 def stop_and_go_on(folder: Path, name: str) -> None:
-    """A run that was stopped after a checkpoint of its third update, and then went on."""
+    """Log a run that stops after its third update's checkpoint, and resume it."""
     cfg = make_config(f"logger={name}", "log_interval=1", "eval_interval=3", "seed=7")
     with RunFolder(folder, cfg) as run:
         for update in range(5):

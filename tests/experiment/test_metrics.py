@@ -1,4 +1,4 @@
-"""The numbers that a run logs and sums up."""
+"""The numbers that a run logs, and its summary."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from torch_qpmpc.mpc.banded import banded_matrix
 
 
 def loops_with(start: float, learned: float, true: float) -> dict[str, ClosedLoop]:
-    """Two steps of two starts whose costs add up to J; the second step counts 0.9."""
+    """Make loops of two steps from two starts with total cost J, discounted by 0.9."""
 
     def loop(J: float) -> ClosedLoop:
         costs = torch.full((2, 2), J / 2, dtype=torch.float64)
@@ -67,7 +67,7 @@ def test_table():
         ),
     ],
 )
-def test_table_says_how_J_changed_where_there_is_no_gap(ends, J, discounted):
+def test_table_shows_the_change_of_J_without_a_gap(ends, J, discounted):
     lines = table(gap_summary(loops_with(*ends))).splitlines()
     assert lines[1].endswith(f"  {J}")
     assert lines[2].endswith(f"  {discounted}")
@@ -86,7 +86,7 @@ def test_the_numbers_of_theta_are_logged_where_they_are_few():
     assert set(theta_metrics(make_mpc(free, make_physics(free)))) == names
 
 
-def test_structure_summary_tells_the_models_error_before_and_after():
+def test_structure_summary_has_the_models_error_before_and_after():
     cfg = make_config(*SMALL, "constraint=free")
     physics = linear_system(cfg)
     mpc = make_mpc(cfg, physics)
@@ -102,7 +102,7 @@ def test_structure_summary_tells_the_models_error_before_and_after():
     assert structure_summary(mpc, (A, B, offset)) == pytest.approx(after, abs=1e-9)
 
 
-def test_a_run_whose_C_cannot_be_read_goes_on():
+def test_a_run_continues_if_its_C_cannot_be_read():
     cfg = make_config(*SMALL, "constraint=free")
     physics = linear_system(cfg)
     mpc = make_mpc(cfg, physics)

@@ -1,4 +1,4 @@
-"""Figures show the numbers they are given, and leave matplotlib's global state alone."""
+"""Figures show their data, and do not change matplotlib's global state."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_constraint_figure_of_any_horizon(horizon):
     rendered(constraint_figure(make_mpc(horizon)))
 
 
-def test_constraint_figure_says_why_there_is_no_canonical_form():
+def test_constraint_figure_shows_why_there_is_no_canonical_form():
     mpc = make_mpc()
     with torch.no_grad():
         mpc.C[:, -1] = 0
@@ -129,7 +129,7 @@ def test_closed_loop_figure_shows_paths_costs_and_J(mpc, loops):
     start = loops["start"].states[0, 2]
     with torch.no_grad():
         predicted = mpc.predicted(mpc.solve(start).z)[0]
-    # Not exactly, as one state is solved alone here and with others there.
+    # Not exactly: here one state is solved alone, there in a batch.
     expected = predicted[:, :2].numpy()
     assert any(len(line) == 5 and np.allclose(line, expected, atol=1e-6) for line in lines)
     assert legend_of(right) == list(loops)
@@ -154,5 +154,5 @@ def test_summary_figure(mpc, loops):
 
 
 def test_summary_figure_of_a_run_without_finite_costs(mpc, loops):
-    """A run that diverged still gets its picture."""
+    """A run that diverged still has a figure."""
     rendered(summary_figure(mpc, loops, [0, 10], [300.0, math.nan]))

@@ -1,4 +1,4 @@
-"""What a run's folder holds is what was logged, also when the run is cut short."""
+"""A run's folder holds everything that was logged, also if the run is interrupted."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_summary_is_strict_json(tmp_path):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
-def test_what_was_logged_survives_an_interruption(tmp_path, error):
+def test_the_log_survives_an_interruption(tmp_path, error):
     def interrupted() -> None:
         with RunFolder(tmp_path, make_config()) as run:
             for update in range(1, 20):
@@ -141,7 +141,7 @@ def test_relative_folder_is_kept_when_the_working_directory_changes(tmp_path, mo
     assert scalars(events(tmp_path / "run"), "eval/J") == {1: 1.0}
 
 
-# --- Going on ------------------------------------------------------------------------------------
+# --- Resuming ------------------------------------------------------------------------------------
 
 ROWS = "update,eval/J\n0,3.0\n2,2.0\n4,1.0\n"
 
@@ -152,29 +152,29 @@ ROWS = "update,eval/J\n0,3.0\n2,2.0\n4,1.0\n"
         (None, r"\[Errno 2\] No such file or directory"),
         ("", "its last line is cut off"),
         (ROWS[:-3], "its last line is cut off"),
-        (ROWS[:-6], "no row of update 4"),
-        (ROWS[:14], "no row of update 0, 2, 4"),
+        (ROWS[:-6], "no row for update 4"),
+        (ROWS[:14], "no row for update 0, 2, 4"),
         ("some,table\n1,2\n", ".*'update' not found in columns"),
         (ROWS.replace("2.0", "two"), "could not convert string to float: 'two'"),
         (ROWS.replace("2.0", "2.0,7,8"), "Error tokenizing data"),
-        (ROWS + ROWS[14:], "updates that do not increase"),
+        (ROWS + ROWS[14:], "its updates do not increase"),
     ],
 )
-def test_a_run_does_not_go_on_from_damaged_metrics(tmp_path, text, wrong):
+def test_a_run_does_not_resume_from_damaged_metrics(tmp_path, text, wrong):
     cfg = make_config("eval_interval=2", "log_interval=4")
     if text is not None:
         (tmp_path / "metrics.csv").write_text(text)
     sentence = (
         rf"^metrics\.csv: got {re.escape(str(tmp_path))}/metrics\.csv \({wrong}.*\), "
-        r"expected the table that a run wrote\. Put a whole copy of it there, go on from a copy "
-        r"of the folder, or start anew in another one by hydra\.run\.dir=FOLDER\.$"
+        r"expected the table that a run wrote\. Restore the file, resume from a copy of the "
+        r"folder, or start a new run with hydra\.run\.dir=FOLDER\.$"
     )
     with pytest.raises(QPError, match=sentence):
         RunFolder(tmp_path, cfg, after=4)
     assert not (tmp_path / "tensorboard").exists(), "nothing has been written"
 
 
-def test_whole_metrics_go_on(tmp_path):
+def test_later_rows_are_dropped_on_resume(tmp_path):
     (tmp_path / "metrics.csv").write_text(ROWS + "6,0.5\n")
     with RunFolder(tmp_path, make_config("eval_interval=2", "log_interval=4"), after=4) as run:
         assert run.column("eval/J") == ([0, 2, 4], [3.0, 2.0, 1.0])
@@ -184,7 +184,7 @@ def test_whole_metrics_go_on(tmp_path):
 
 
 def command(folder: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    """train.py in ``folder``, with files of at most 1000 bytes after the first checkpoint."""
+    """Run train.py in ``folder`` with files limited to 1000 bytes after the first checkpoint."""
     limited = (
         "import resource, sys, train\n"
         "save = train.save_checkpoint\n"
@@ -206,7 +206,7 @@ def command(folder: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_said_in_a_sentence_and_keeps_the_last_checkpoint(tmp_path):
+def test_a_full_disk_ends_in_a_sentence_and_keeps_the_last_checkpoint(tmp_path):
     ended = command(tmp_path / "run")
     assert ended.returncode == 1
     sentence = ended.stderr.splitlines()[-1]
@@ -219,22 +219,22 @@ def test_a_full_disk_is_said_in_a_sentence_and_keeps_the_last_checkpoint(tmp_pat
     assert not list((tmp_path / "run").glob("*.partial"))
 
 
-def test_what_could_not_be_written_is_said(tmp_path):
+def test_a_failed_write_is_reported(tmp_path):
     error = unwritable(tmp_path, OSError(errno.EROFS, "Read-only file system", "x.csv"))
     assert str(error) == (
         f"folder: got {tmp_path}, where writing failed ([Errno 30] Read-only file system: 'x.csv')"
-        ", expected one that can be written to. Choose another folder by hydra.run.dir=FOLDER."
+        ", expected a writable folder. Choose another folder with hydra.run.dir=FOLDER."
     )
 
 
 @pytest.mark.parametrize("mode", [("run",), ("sweep", "-m")], ids=lambda mode: mode[0])
-def test_a_folder_that_cannot_be_made_is_said_in_one_sentence(tmp_path, mode):
+def test_a_folder_that_cannot_be_made_ends_in_a_sentence(tmp_path, mode):
     key, *multirun = mode
     (tmp_path / "file").touch()
     sentence = (
         r"^folder: got .*/file/run, where writing failed \(.*Not a directory.*\), "
-        r"expected one that can be written to\. "
-        rf"Choose another folder by hydra\.{key}\.dir=FOLDER\.$"
+        r"expected a writable folder\. "
+        rf"Choose another folder with hydra\.{key}\.dir=FOLDER\.$"
     )
     with pytest.raises(SystemExit, match=sentence):
         run_command(*multirun, f"hydra.{key}.dir={tmp_path}/file/run")

@@ -1,4 +1,4 @@
-"""A run that was stopped and goes on is the run that was not, number for number."""
+"""A stopped and resumed run equals an undisturbed one, number for number."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
 from torch_qpmpc.experiment.config import load_config
 from torch_qpmpc.experiment.run_state import resumed
 
-#: Neither of the stops is at an evaluation or a row of metrics.
+#: Settings in which neither stop is at an evaluation or a row of metrics.
 RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3")
 STOPS = (2, 7)
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
@@ -47,7 +47,7 @@ ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
     ],
     ids=" ".join,
 )
-def test_a_run_that_goes_on_is_the_one_that_never_stopped(tmp_path, monkeypatch, overrides):
+def test_a_resumed_run_equals_an_undisturbed_one(tmp_path, monkeypatch, overrides):
     cfg = make_config(*RUN, *overrides)
     train.train(cfg, str(tmp_path / "whole"))
     for update in STOPS:
@@ -60,7 +60,7 @@ def test_a_run_that_goes_on_is_the_one_that_never_stopped(tmp_path, monkeypatch,
 
 @pytest.fixture
 def stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A run that was stopped in its third update, with a checkpoint of the second before."""
+    """Stop a run in its third update, after the checkpoint of the second."""
     folder, cfg = tmp_path / "run", make_config(*RUN, "eval_interval=2")
     stop(monkeypatch, cfg, folder, 3)
     return folder
@@ -83,8 +83,8 @@ def test_a_run_that_has_no_checkpoint_yet_begins_anew(tmp_path, stopped):
     assert_events_are_whole(stopped)
 
 
-def test_a_run_of_an_earlier_version_goes_on(tmp_path, stopped):
-    """Without the keys that came later, in its configuration and in its checkpoint."""
+def test_a_run_of_an_earlier_version_resumes(tmp_path, stopped):
+    """Its configuration and its checkpoint lack the keys added since."""
     file, checkpoint = stopped / "config.yaml", stopped / "checkpoint.pt"
     cfg, state = load_config(file), load_checkpoint(checkpoint)
     for key in ("logger", "eval_seed"):
@@ -98,7 +98,7 @@ def test_a_run_of_an_earlier_version_goes_on(tmp_path, stopped):
 
 @pytest.mark.parametrize("when", ["finish", "drop_previous"])
 def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch, when):
-    """Killed after the last update, before or after the summary is written."""
+    """The run is killed after its last update, before or after writing the summary."""
     cfg = make_config(*RUN)
     train.train(cfg, str(tmp_path / "whole"))
 
@@ -117,7 +117,7 @@ def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch, when):
     assert_events_are_whole(tmp_path / "run")
 
 
-def test_a_finished_run_keeps_what_it_learned_and_no_data(tmp_path, stopped):
+def test_a_finished_run_saves_theta_without_data(tmp_path, stopped):
     big = (stopped / "checkpoint.pt").stat().st_size
     assert load_checkpoint(stopped / "checkpoint.pt")["replay"] is not None
     go_on(stopped)
@@ -134,12 +134,13 @@ def test_a_finished_run_keeps_what_it_learned_and_no_data(tmp_path, stopped):
 
 
 @pytest.mark.slow
-def test_several_processes_begin_new_episodes_and_learn_on(tmp_path, monkeypatch, capsys):
-    """One worker: what cannot be saved is another process's, however many there are."""
+def test_worker_processes_start_new_episodes_on_resume(tmp_path, monkeypatch, capsys):
+    """One worker suffices: another process's state cannot be saved."""
     cfg = make_config(*RUN, "collector=multi", "collector.workers=1", "updates=6")
     assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
     go_on(tmp_path)
-    assert "New episodes: the environments' own state cannot be saved." in capsys.readouterr().out
+    expected = "Starting new episodes: the state of the environments is not saved."
+    assert expected in capsys.readouterr().out
     assert json.loads((tmp_path / "summary.json").read_text())["updates"] == 6
     assert_events_are_whole(tmp_path)
 
@@ -147,20 +148,21 @@ def test_several_processes_begin_new_episodes_and_learn_on(tmp_path, monkeypatch
 # --- What is refused -----------------------------------------------------------------------------
 
 
-def test_only_a_run_that_was_stopped_goes_on(tmp_path, stopped):
-    with pytest.raises(QPError, match=r"resume: got seed=3, too, expected nothing else"):
+def test_only_a_stopped_run_resumes(tmp_path, stopped):
+    message = r"resume: got it together with seed=3, expected no other override"
+    with pytest.raises(QPError, match=message):
         resumed(stopped, ["resume=x", "seed=3"])
-    with pytest.raises(QPError, match=r"resume: got .*without config.yaml, expected a folder of t"):
+    with pytest.raises(QPError, match=r"resume: got .*without config.yaml, expected a run's"):
         resumed(tmp_path, [])
     (stopped / "summary.json").touch()
-    with pytest.raises(QPError, match=r"resume: got .*which is finished, expected a run that was"):
+    with pytest.raises(QPError, match=r"resume: got .*which is finished, expected a stopped run"):
         resumed(stopped, [])
 
 
-def test_a_damaged_checkpoint_offers_the_one_before_which_goes_on(tmp_path, stopped):
+def test_a_damaged_checkpoint_names_the_previous_one_which_resumes(tmp_path, stopped):
     (stopped / "checkpoint.pt").write_bytes(b"PK" + bytes(1000))
     before = stopped / "checkpoint-previous.pt"
-    with pytest.raises(QPError, match=rf"cannot be read .*use the one before, {before}\.$"):
+    with pytest.raises(QPError, match=rf"cannot be read .*use the previous one, {before}\.$"):
         resumed(stopped, [])
     cfg, state = resumed(before, [])
     assert state is not None
@@ -176,8 +178,9 @@ def test_a_checkpoint_of_another_run_is_refused(stopped):
     with pytest.raises(QPError) as error:
         resumed(stopped, [])
     assert str(error.value) == (
-        "checkpoint: got one of a run with seed=1, task.horizon=3, expected config.yaml's seed=2, "
-        "task.horizon=4. A run goes on with its own configuration, and from its own checkpoints."
+        "checkpoint: got one from a run with seed=1, task.horizon=3, expected config.yaml's "
+        "seed=2, task.horizon=4. A run resumes with its own configuration, from its own "
+        "checkpoints."
     )
 
 
@@ -190,7 +193,7 @@ def test_a_checkpoint_of_another_layout_is_refused(stopped, key):
         resumed(stopped, [])
 
 
-def test_what_is_no_state_is_refused(stopped):
+def test_an_invalid_state_is_refused(stopped):
     torch.save([1, 2], stopped / "checkpoint.pt")
     with pytest.raises(QPError, match=r"checkpoint: got a list, expected a run's state"):
         resumed(stopped, [])

@@ -1,4 +1,4 @@
-"""Sweeps: what launches them, what is not done again, and the line of progress."""
+"""Sweeps: launchers, finished and stopped runs, sub-folders, and the progress line."""
 
 from __future__ import annotations
 
@@ -17,10 +17,16 @@ from omegaconf import OmegaConf
 from tests.runs import SMALL, make_config, run_command
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.lock import locked
-from torch_qpmpc.experiment.sweeps import SweepProgress, finished_run, number_of_runs, stopped_run
+from torch_qpmpc.experiment.sweeps import (
+    SweepProgress,
+    finished_run,
+    number_of_runs,
+    stopped_run,
+    sub_folder,
+)
 
 ROOT = Path(__file__).parents[2]
-#: What each launcher needs beside a name, and the plugin that an extra brings.
+#: The plugin of each launcher, and its settings.
 LAUNCHERS = {
     "cores": ("joblib", ["hydra.launcher.n_jobs=2"]),
     "submitit_local": ("submitit", ["hydra.launcher.cpus_per_task=1"]),
@@ -36,7 +42,7 @@ LAUNCHERS = {
 
 
 def arguments(folder: Path, *overrides: str) -> list[str]:
-    """``-m +study=paper`` with small runs."""
+    """Return the arguments of ``-m +study=paper`` with small runs."""
     study = ("-m", "+study=paper", "constraint=free", "noise=gaussian")
     return [*study, *SMALL, f"hydra.sweep.dir={folder}", *overrides]
 
@@ -53,7 +59,7 @@ def test_every_launcher_runs_the_study_and_shows_one_line(launcher, tmp_path):
     if not importlib.util.find_spec(f"hydra_plugins.hydra_{package}_launcher"):
         pytest.skip(f"hydra-{package}-launcher is not installed, which an extra brings")
     overrides = arguments(tmp_path, f"hydra/launcher={launcher}", "seed=1,2", *settings)
-    # Workers of Ray are nice by default, and would wait for all other tests.
+    # Ray's workers have a low priority by default and would wait for other tests.
     environment = os.environ | {"PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
     ended = subprocess.run(
         [sys.executable, "train.py", *overrides],
@@ -74,12 +80,12 @@ def test_every_launcher_runs_the_study_and_shows_one_line(launcher, tmp_path):
 
 
 def sweep(folder: Path, *overrides: str) -> None:
-    """A sweep of small runs in this process, one after the other."""
+    """Run a sweep of small runs in this process, one after the other."""
     run_command(*arguments(folder, "hydra/launcher=basic", *overrides))
 
 
-def test_a_sweep_goes_on_where_it_stopped(tmp_path, capsys):
-    """One run has finished, one was stopped; then the settings change."""
+def test_a_sweep_resumes(tmp_path, capsys):
+    """Of two runs one has finished and one was stopped; later the settings change."""
     sweep(tmp_path, "seed=1")
     first, second = (tmp_path / f"gaussian-free-seed{seed}" for seed in (1, 2))
     before = (first / "checkpoint.pt").stat().st_mtime_ns
@@ -103,7 +109,7 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path, capsys):
     assert (first / "checkpoint.pt").stat().st_mtime_ns == before
 
 
-def test_a_sweep_does_not_write_where_another_run_does(tmp_path, capsys):
+def test_a_sweep_does_not_write_to_a_folder_in_use(tmp_path, capsys):
     folder = tmp_path / "gaussian-free-seed1"
     folder.mkdir()
     with locked(folder), pytest.raises(SystemExit) as refused:
@@ -111,6 +117,15 @@ def test_a_sweep_does_not_write_where_another_run_does(tmp_path, capsys):
     assert refused.value.code == 1
     assert f"got {folder}, in use by process {os.getpid()}" in capsys.readouterr().err
     assert not (folder / "config.yaml").exists()
+
+
+def test_sub_folders_are_named_by_what_the_sweep_varies(tmp_path):
+    sweep(tmp_path, "seed=1", "exploration_std=0.1,0.2", "+ablation=reference")
+    found = sorted(file.parent.name for file in tmp_path.glob("*/summary.json"))
+    assert found == [f"gaussian-free-seed1-exploration_std={std}" for std in (0.1, 0.2)]
+    name = sub_folder("seed1", "+ablation=sdp,a.b={c: 1}")
+    assert name == "seed1-ablation=sdp,a.b=_c_1_"
+    assert sub_folder("seed1", "") == "seed1"
 
 
 # --- Runs that have finished ---------------------------------------------------------------------
@@ -123,7 +138,7 @@ def finished(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_finished_run_is_known_by_its_settings(finished):
+def test_a_finished_run_is_recognised_by_its_settings(finished):
     assert finished_run(finished, make_config(*SMALL)) == {"closed_gap": 0.5}
 
 

@@ -1,4 +1,4 @@
-"""A tally adds up, begins its rows anew, and survives a checkpoint."""
+"""A tally sums over the run, counts QPs per row, and is restored from a checkpoint."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_seconds_are_split_and_leave_compilation_out(monkeypatch: pytest.MonkeyP
     assert tally.seconds == 2 - 0.25
 
 
-def test_a_tally_goes_on_from_its_state():
+def test_a_tally_is_restored_from_its_state():
     tally = Tally()
     tally.add(batch(-1.0), torch.ones(2))
     tally.qps.solves = 7

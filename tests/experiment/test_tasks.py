@@ -1,17 +1,20 @@
-"""The tasks' plants and QPs are what the configuration and the papers say."""
+"""The tasks' plants and QPs match the configuration and the papers."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import runpy
+import signal
 
 import numpy as np
 import pytest
 import torch
 from pydantic import Field
 
-from tests.runs import linear_system, make_config, true_mpc
+import train
+from tests.runs import SMALL, linear_system, make_config, run_command, true_mpc
+from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.experiment.algorithms import evaluate
@@ -45,8 +48,8 @@ J_TRUE_MODEL = 47
 
 
 @pytest.mark.parametrize("seed", [1, 4])
-def test_ends_of_the_experiment_are_the_known_ones(seed):
-    """The numbers that everyone who draws, starts and rolls out alike gets."""
+def test_J_of_start_and_true_model_are_the_known_ones(seed):
+    """J depends only on the paper's random draws, starts and rollout."""
     cfg = make_config(f"seed={seed}", "solver=daqp")
     physics = linear_system(cfg)
     assert round(evaluate(cfg, make_mpc(cfg, physics).policy, physics).J) == J_START[seed]
@@ -115,7 +118,7 @@ def test_the_other_task_starts_from_the_original_wrong_model():
     assert torch.equal(mpc.C_0, banded_matrix(A, B, 10))
     assert mpc.learned == ("q", "c", "C", "b", "lb", "ub")
     learned = sum(part.numel() for part in mpc.readable().values())
-    # V0, A, B, b, f with one for x_N, and the bounds, of which those of the actions are kept.
+    # V0, A, B, b, f (with its part for x_N), and the bounds, of which those of actions stay fixed.
     assert learned == 1 + 4 + 2 + 2 + (3 + 2) + (3 + 3)
     qp = mpc.quadratic_program()
     assert qp.ub[:6].tolist() == [2, 1, 1, 2, 1, 1]
@@ -125,7 +128,7 @@ def test_the_other_task_starts_from_the_original_wrong_model():
     torch.testing.assert_close(qp.H.diagonal()[:6], stages)
 
 
-def test_its_other_end_knows_the_mean_of_the_noise():
+def test_the_true_scheme_has_the_mean_of_the_noise():
     cfg = make_config("task=gros_zanon")
     physics = linear_system(cfg)
     mpc = true_mpc(cfg, physics)
@@ -137,7 +140,7 @@ def test_its_other_end_knows_the_mean_of_the_noise():
 
 
 def test_the_value_of_a_state_has_its_violation():
-    """The slacks of x_0 are the plant's own price of leaving the bounds."""
+    """The slacks of x_0 equal the plant's violation of its bounds."""
     cfg = make_config("task=gros_zanon", "solver=daqp")
     physics = linear_system(cfg)
     assert isinstance(physics, GrosZanonLTI)
@@ -178,7 +181,7 @@ def test_a_model_on_the_command_line_is_that_of_the_qp():
     torch.testing.assert_close(W, torch.diag(torch.tensor([2.0, 1, 1])).double())
 
 
-# A user's own
+# A user's task
 
 
 TASK = """
@@ -194,7 +197,7 @@ register(
 
 @pytest.fixture
 def own_task(tmp_path, monkeypatch):
-    """Writes and runs the file of a task with some options; afterwards it is forgotten."""
+    """Return a function that writes and runs a task's file; unregister the task afterwards."""
     monkeypatch.delitem(TASKS, "mine", raising=False)
 
     def write(options: str) -> str:
@@ -206,7 +209,7 @@ def own_task(tmp_path, monkeypatch):
     return write
 
 
-def test_a_registered_task_has_the_point_masss_defaults_but_for_its_own(own_task):
+def test_a_registered_task_inherits_the_defaults_of_the_point_mass(own_task):
     file = own_task('defaults={"num_envs": 3, "task": {"horizon": 4}}')
     cfg = make_config("task=mine", "replay_capacity=300")
     check_config(cfg)
@@ -232,12 +235,22 @@ def test_another_process_finds_a_task_by_its_file(own_task):
         find_task({"name": "mine", "file": file.replace("mine.py", "gone.py")})
 
 
+def test_train_resumes_a_run_of_an_own_task(own_task, tmp_path, monkeypatch):
+    own_task('defaults={"task": {"horizon": 3}}')
+    cfg, whole, cut = make_config("task=mine", *SMALL), tmp_path / "whole", tmp_path / "cut"
+    train.train(cfg, str(whole), quiet=True)
+    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
+    del TASKS["mine"]
+    run_command(f"resume={cut}")
+    assert_same_numbers(cut, whole)
+
+
 def test_a_task_has_noises_and_keys_of_its_own(own_task, tmp_path):
     own_task('noises=("brownian", "gaussian"), takes_noise_std=True')
     cfg = make_config("task=mine", "noise.std=3")
     check_config(cfg)
     assert cfg.noise.name == "brownian"
-    with pytest.raises(QPError, match=r"noise\.name: got 'uniform', expected a noise that mine"):
+    with pytest.raises(QPError, match=r"noise\.name: got 'uniform', expected a noise of task mine"):
         check_config(make_config("task=mine", "noise=uniform"))
 
     class Settings(TaskSettings):
@@ -258,10 +271,10 @@ def test_a_task_has_noises_and_keys_of_its_own(own_task, tmp_path):
     check_config(make_config("task=mine", "+task.mass=1.5", "+task.colour=red"))
 
 
-def test_what_cannot_be_registered(own_task):
+def test_invalid_registrations_are_refused(own_task):
     own_task("")
     register(TASKS["mine"])
-    with pytest.raises(QPError, match=r"task\.name: got 'point_mass', which exists, expected a"):
+    with pytest.raises(QPError, match=r"task\.name: got 'point_mass', which is built in, exp"):
         register(dataclasses.replace(TASKS["mine"], name="point_mass"))
     with pytest.raises(QPError, match="task: got str, expected a Task"):
         register("mine")  # pyright: ignore[reportArgumentType] (the mistake)

@@ -1,4 +1,4 @@
-"""train.py from the configuration to the run's folder."""
+"""train.py, from the configuration to the run's folder."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def run_small(folder: Path, *overrides: str) -> dict[str, Any]:
     return train.train(make_config(*SMALL, *overrides), str(folder))
 
 
-#: A run's numbers; pandas' types know too many kinds of columns.
+#: A table of a run's numbers; pandas' own annotations are too wide.
 metrics: Callable[[Path], Any] = read_metrics
 
 
 def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """C - C_0 at the end, and the signed distance of its entries from the band."""
+    """Return the learned C - C_0 and the signed distance of its entries from the band."""
     state = load_checkpoint(folder / "checkpoint.pt")["mpc"]
     horizon = state["C_0"].shape[0] // 4
     return (state["C"] - state["C_0"]).numpy(), band_distance(4, 2, horizon).numpy()
@@ -78,7 +78,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     return folder, train.train(make_config(*WHOLE), str(folder))
 
 
-def test_what_is_compiled_meanwhile_is_not_counted_as_training(tmp_path, monkeypatch):
+def test_compilation_is_not_counted_as_training(tmp_path, monkeypatch):
     clock, batches = itertools.count(step=1000.0), train.batches
 
     def compiling(collector: Any) -> Iterator[Any]:
@@ -211,7 +211,7 @@ def test_proximal_step_leaves_nothing_above_the_band(whole):
     ],
 )
 def test_each_case_runs(tmp_path, constraint, noise, figures):
-    """Under one noise each: the constraint does not know which it is."""
+    """One noise for each constraint suffices: they are independent."""
     chosen = (f"constraint={constraint}", f"noise={noise}", f"figures={figures}")
     summary = run_small(tmp_path, *chosen)
     assert (summary["constraint"], summary["noise"]) == (constraint, noise)
@@ -252,7 +252,7 @@ def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
 
 
 def test_the_stream_can_be_replayed(tmp_path):
-    """And drawn: two states and one action, where the point mass has four and two."""
+    """It can be drawn, too: it has two states and one action instead of four and two."""
     replayed = ("optimizer=sliding", "exploration_std=0.05", "figures=true")
     cfg = make_config(*STREAM, *replayed, "updates=15", "eval_interval=15")
     assert train.train(cfg, str(tmp_path))["unsolved"] == 0
@@ -293,7 +293,7 @@ def frame_without_times(folder: Path) -> Any:
 
 def test_a_seed_determines_every_number(tmp_path):
     for name, seed in (("first", 3), ("again", 3), ("other", 4)):
-        torch.manual_seed(len(name))  # what happened before plays no part
+        torch.manual_seed(len(name))  # earlier use of the generator has no effect
         run_small(tmp_path / name, f"seed={seed}")
     first, again, other = (frame_without_times(tmp_path / n) for n in ("first", "again", "other"))
     pd.testing.assert_frame_equal(first, again, check_exact=True)
@@ -323,7 +323,7 @@ def test_each_ablation_runs(tmp_path, name):
 @pytest.mark.parametrize("optimizer", ["adam", "recursive"])
 @pytest.mark.parametrize("rule", ["projection", "sdp"])
 def test_a_scheme_with_dense_weights_learns_them_by_each_rule(tmp_path, rule, optimizer):
-    """And is released in the middle of it."""
+    """The scheme is released in mid-training."""
     dense = ("task.learn_cost=[H,H_f,q,c,w]", "updates=12", "eval_interval=12", "release=6")
     cfg = make_config(*STREAM, *dense, f"optimizer={optimizer}", f"step={rule}", "batch_size=4")
     assert train.train(cfg, str(tmp_path))["unsolved"] == 0
@@ -337,7 +337,7 @@ def test_a_scheme_with_dense_weights_learns_them_by_each_rule(tmp_path, rule, op
 
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
 def test_target_network(tmp_path):
-    """It changes the targets from the second update on, not the first."""
+    """A target network changes the targets from the second update on."""
     for name, rate in (("slow", 0.01), ("fast", 1.0), ("none", None)):
         more = (
             ["delay_value=false"] if rate is None else ["delay_value=true", f"target_rate={rate}"]
@@ -359,7 +359,7 @@ def test_plain_gradient_step(tmp_path):
 
 
 def test_uneven_intervals_and_steps(tmp_path):
-    """The end is always evaluated and saved, whatever the intervals."""
+    """The last update is always evaluated and saved."""
     more = (
         "updates=5",
         "eval_interval=3",
@@ -417,8 +417,8 @@ def test_configuration_reaches_the_parts(tmp_path, monkeypatch):
     assert groups[0]["lr"] == pytest.approx(0.125 * 0.2)
 
 
-def test_training_goes_on_past_unsolved_qps(tmp_path):
-    """Hard states, and velocities too high for the action to keep them within their bounds."""
+def test_training_continues_past_unsolved_qps(tmp_path):
+    """Hard state bounds are infeasible at high velocities."""
     more = ("task.state_slack=inf", "noise.std=0.5", "constraint=free")
     summary = run_small(tmp_path, *more, "task.episode_steps=5", "eval_interval=9")
     table = metrics(tmp_path).drop(index=0)
@@ -446,7 +446,7 @@ def test_the_second_order_learns_in_tens_of_updates(tmp_path, constraint):
         assert np.isfinite(table["loss/si"].dropna()).all()
 
 
-def test_an_interruption_leaves_what_was_logged(tmp_path, monkeypatch):
+def test_an_interruption_keeps_the_log(tmp_path, monkeypatch):
     calls, forward = [], QPQLearningLoss.loss_value
 
     def interrupted(self, tensordict):
@@ -478,7 +478,7 @@ def test_a_bad_configuration_writes_nothing(tmp_path):
 
 
 def test_command(tmp_path, monkeypatch, capsys):
-    """`python train.py ..` makes the folder that it names at the end, below a table."""
+    """`python train.py ..` prints a table and below it the run's folder."""
     monkeypatch.chdir(tmp_path)
     run_command(*SMALL, "constraint=combined", "noise=brownian")
     lines = capsys.readouterr().out.splitlines()
@@ -490,7 +490,7 @@ def test_command(tmp_path, monkeypatch, capsys):
 
 
 def test_impossible_value_on_the_command_line(tmp_path):
-    """One sentence, no traceback."""
+    """The message is one sentence without a traceback."""
     process = subprocess.run(
         [sys.executable, str(Path(train.__file__).resolve()), "task.gamma=1.5"],
         cwd=tmp_path,
@@ -533,7 +533,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture
 def stopped(tmp_path: Path) -> Path:
-    """A run that has a checkpoint of its second update."""
+    """Stop a run after the checkpoint of its second update."""
     folder = tmp_path / "run"
 
     def killed(*given: Any) -> None:
@@ -550,13 +550,13 @@ def stopped(tmp_path: Path) -> Path:
 def test_a_finished_run_is_not_overwritten(tmp_path):
     folder = tmp_path / "run"
     (folder / ".hydra").mkdir(parents=True)
-    for name in ("train.log", ".hydra/config.yaml", LOCK):  # Hydra's, and a killed run's
+    for name in ("train.log", ".hydra/config.yaml", LOCK):  # left by Hydra and by a killed run
         (folder / name).touch()
     run_command(*TINY, f"hydra.run.dir={folder}")
     before = contents(folder)
     message = (
         f"^folder: got {folder}, which holds a finished run, expected one without a run. "
-        "Choose another folder by hydra.run.dir=FOLDER.$"
+        "Choose another folder with hydra.run.dir=FOLDER.$"
     )
     with pytest.raises(SystemExit, match=message):
         run_command(*TINY, "seed=2", f"hydra.run.dir={folder}")
@@ -564,11 +564,11 @@ def test_a_finished_run_is_not_overwritten(tmp_path):
     assert not (folder / LOCK).exists()
 
 
-def test_a_stopped_run_is_not_overwritten_but_goes_on(stopped):
+def test_a_stopped_run_is_not_overwritten_but_resumes(stopped):
     before = contents(stopped)
     message = (
-        f"^folder: got {stopped}, which holds a run that was stopped, expected one without a run. "
-        f"Go on with it by resume={stopped}, or choose another folder by hydra.run.dir=FOLDER.$"
+        f"^folder: got {stopped}, which holds a stopped run, expected one without a run. "
+        f"Resume it with resume={stopped}, or choose another folder with hydra.run.dir=FOLDER.$"
     )
     with pytest.raises(SystemExit, match=message):
         run_command(*TINY, f"hydra.run.dir={stopped}")
@@ -578,9 +578,9 @@ def test_a_stopped_run_is_not_overwritten_but_goes_on(stopped):
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "checkpoint.pt"])
-def test_a_run_that_cannot_go_on_is_not_offered_for_it(stopped, name):
+def test_the_message_offers_no_resume_of_a_broken_run(stopped, name):
     (stopped / name).write_text("[: garbage")
-    message = "a run that was stopped, expected one without a run. Choose another folder by hydra"
+    message = "a stopped run, expected one without a run. Choose another folder with hydra"
     with pytest.raises(SystemExit, match=message):
         run_command(*TINY, f"hydra.run.dir={stopped}")
 
@@ -604,13 +604,13 @@ def test_a_run_holds_the_lock(tmp_path, monkeypatch):
     assert not (tmp_path / LOCK).exists()
 
 
-def test_a_run_goes_on_in_its_own_folder_only(stopped, tmp_path):
-    message = f"got {tmp_path}/other with resume={stopped}, expected {stopped}. A run goes on in i"
+def test_a_run_resumes_only_in_its_own_folder(stopped, tmp_path):
+    message = f"got {tmp_path}/other with resume={stopped}, expected {stopped}. A run resumes in i"
     with pytest.raises(SystemExit, match=message):
         run_command(f"resume={stopped}", f"hydra.run.dir={tmp_path}/other")
 
 
-def test_damaged_metrics_are_said_in_a_sentence(stopped):
+def test_damaged_metrics_end_in_a_sentence(stopped):
     (stopped / "metrics.csv").write_bytes(b"\xff\x00 garbage")
     with pytest.raises(SystemExit, match=r"^metrics.csv: got .*metrics.csv \('utf-8' codec"):
         run_command(f"resume={stopped}")
@@ -667,7 +667,7 @@ def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys, id):
         (("task.id=Pendulum-v1", *PENDULUM[:2]), r"^task.stage_weight: got null, .* \(4, 4\)"),
     ],
 )
-def test_what_a_gymnasium_task_lacks_is_said(tmp_path, monkeypatch, overrides, message):
+def test_missing_keys_of_a_gymnasium_task_are_named(tmp_path, monkeypatch, overrides, message):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=message):
         run_command("task=gymnasium", *overrides, *SHORT)

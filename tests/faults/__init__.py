@@ -1,1 +1,1 @@
-"""Runs that are killed, and runs that are long: commands, which the tests do not run."""
+"""Commands that kill runs or train for long; pytest does not collect them."""

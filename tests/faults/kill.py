@@ -1,9 +1,9 @@
-"""Kill runs and let them go on: ``python -m tests.faults.kill --count 20``.
+"""Kill and resume runs: ``python -m tests.faults.kill --count 20``.
 
 SIGKILL comes at seeded random moments: while the run starts, between two updates, or while a
-checkpoint is written. Each run goes on by ``train.py resume=FOLDER`` until it has finished, and
-must have the numbers of the run that was left alone. The processes are forks of this one, which
-has imported everything: to start takes them a second.
+checkpoint is written. Each run is resumed by ``train.py resume=FOLDER`` until it has finished, and
+must have the numbers of an undisturbed run. The processes are forks of this one, which has imported
+everything, so that they start within a second.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import train
 from tests.runs import CONFIGS, SMALL
 from tests.stops import assert_events_are_whole, assert_same_numbers
 
-#: A checkpoint every few updates.
+#: Overrides that write a checkpoint every few updates.
 RUN = (*SMALL, "constraint=combined", "updates=200", "eval_interval=4")
 RUN += ("log_interval=3", "num_envs=16", "replay_capacity=4000", "task.eval_steps=5")
 #: When a process is killed, and how often.
@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def campaign(folder: Path, count: int, rng: random.Random, settings: tuple[str, ...] = RUN) -> None:
-    """Runs in ``folder``, each killed until it finishes, until there have been ``count`` kills."""
+    """Run, kill and resume runs in ``folder`` until there have been ``count`` kills."""
     finish(start(folder / "whole", settings))
     kills, runs = Counter(), 0
     while kills.total() < count:
@@ -60,7 +60,7 @@ def campaign(folder: Path, count: int, rng: random.Random, settings: tuple[str, 
 
 
 def start(place: Path, settings: tuple[str, ...]) -> Process:
-    """A process that begins the run in ``place``, or goes on with it."""
+    """Start a process that begins or resumes the run in ``place``."""
     if (place / "config.yaml").exists():
         settings = (f"resume={place}",)
     else:
@@ -71,14 +71,14 @@ def start(place: Path, settings: tuple[str, ...]) -> Process:
 
 
 def command(settings: tuple[str, ...]) -> None:
-    """``python train.py settings``, without what it prints."""
+    """Run ``python train.py settings`` without its output."""
     sys.argv = ["train.py", "--config-path", str(CONFIGS), "hydra/job_logging=disabled", *settings]
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         train.main()
 
 
 def kill(process: Process, place: Path, rng: random.Random) -> str | None:
-    """Kill the process at some moment, and say at which; None if it has ended before."""
+    """Kill the process at a random moment and describe it; None if it ended before."""
     (moment,) = rng.choices(list(MOMENTS), list(MOMENTS.values()))
     began, before = time.monotonic(), files(place)
     delay = rng.uniform(*(STARTS if moment == "starting" else TRAINS))
@@ -98,7 +98,7 @@ def kill(process: Process, place: Path, rng: random.Random) -> str | None:
 
 
 def files(place: Path) -> int:
-    """How many files of events there are: a process that trains has one of its own."""
+    """Count the event files: each training process writes its own."""
     return len(list((place / "tensorboard").glob("*")))
 
 

@@ -1,7 +1,7 @@
-"""A long run: ``python -m tests.faults.long``, with settings of train.py after it.
+"""Train for long: ``python -m tests.faults.long [key=value ..]``, with overrides of train.py.
 
 It fails if memory grows by more than 5 % after the first tenth, if the last tenth's updates take
-over 10 % more of the processor's time than the second's, or if more QPs stay unsolved at the end.
+over 10 % more processor time than the second's, or if more QPs are unsolved at the end.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SETTINGS = ("optimizer=adam", "solver=daqp", "figures=false")
 
 
 class Watch:
-    """In place of the progress bar: what the process has used when each hundredth begins."""
+    """A progress bar that records time and memory at each hundredth of the updates."""
 
     def __init__(self, updates: Iterable[int], total: int, **_: object) -> None:
         self.updates, self.every = updates, total // 100
@@ -44,11 +44,11 @@ class Watch:
             print(f"{len(self.memory) - 1:3} %: {self.memory[-1]:.1f} MB", flush=True)
 
     def set_postfix(self, **_: float) -> None:
-        """Nothing is shown."""
+        """Show nothing."""
 
 
 def resident() -> float:
-    """The memory of this process in MB."""
+    """Return the memory of this process in MB."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) / 1024

@@ -1,4 +1,4 @@
-"""Far too large a learning rate spoils what is learned, not the run."""
+"""Far too large a learning rate spoils theta, but does not end the run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch_qpmpc import QPMPC, GaussNewton
 from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.learning.updates import first_order
 
-#: The factors by which the rates are too large are a thousand and more.
+#: Factors of a thousand and more by which the rates are too large.
 RATES = {
     "adam": ("optimizer.lr_cost=10", "optimizer.lr_constraints=10"),
     "sgd": ("optimizer.lr_cost=1", "optimizer.lr_constraints=1"),
@@ -60,7 +60,7 @@ def test_gauss_newton_takes_no_step_that_is_not_finite(trust_region, memory):
 
 
 class Steep(torch.nn.Module):
-    """A loss that is finite, with a gradient that is not."""
+    """A finite loss with an infinite gradient."""
 
     def __init__(self, mpc: QPMPC) -> None:
         super().__init__()

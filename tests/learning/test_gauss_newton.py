@@ -42,7 +42,7 @@ def leaves_of(optimizer: GaussNewton) -> list[Tensor]:
 
 
 def dense_gradients(mpc: QPMPC, leaves: list[Tensor]) -> list[Tensor]:
-    """dQ_i/dleaf as rows ``(B, n)``, a pair at a time."""
+    """Compute dQ_i/dleaf as rows ``(B, n)``, one pair at a time."""
     s, a = pairs()
     rows = []
     for i in range(COUNT):
@@ -53,7 +53,7 @@ def dense_gradients(mpc: QPMPC, leaves: list[Tensor]) -> list[Tensor]:
 
 
 def expected_steps(mpc: QPMPC, optimizer: GaussNewton, S: Tensor | None) -> list[Tensor]:
-    """The damped least-squares step in theta itself, as large as theta is."""
+    """Compute the damped least-squares step with a dense system in theta."""
     leaves = leaves_of(optimizer)
     scales = [group["scale"] for group in optimizer.param_groups for _ in group["params"]]
     gradients = dense_gradients(mpc, leaves)
@@ -106,8 +106,8 @@ def test_the_si_penalty_is_part_of_the_step():
 
 
 @pytest.mark.parametrize("name", PARTS)
-def test_a_memory_keeps_what_past_pairs_know(name):
-    """A stream of single pairs: as if the past were in the batch, without errors and unchanged."""
+def test_a_memory_preserves_past_pairs(name):
+    """A stream of single pairs steps as if past pairs were in the batch with zero error."""
     mpc = random_mpc(2, **PARTS[name])
     optimizer = GaussNewton(mpc, damping=DAMPING, memory=3, trust_region=False)
     leaves, (s, a), target = leaves_of(optimizer), pairs(), targets(mpc)
@@ -177,7 +177,7 @@ def test_the_damping_comes_back_to_its_least():
 
 
 def test_the_trust_region_counts_the_penalty():
-    """Where the targets are met, the penalty alone moves C, and is seen to fall."""
+    """Where the targets are met, only the penalty moves C, and it decreases."""
     mpc = random_mpc(7)
     S = SystemIdentificationPenalty(1e-3).curvature(normal(5, mpc.n_z))
 

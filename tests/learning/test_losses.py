@@ -47,7 +47,7 @@ UPDATERS: dict[str, Any] = {
 
 
 def learned(loss: Any) -> dict[str, Tensor]:
-    """What a loss learns; of an actor all but c, on which no action depends."""
+    """Return a loss's learned parameters, without an actor's c, which no action depends on."""
     return {
         name: parameter
         for name, parameter in loss.named_parameters()
@@ -171,7 +171,7 @@ def test_pickle(name):
         assert not differ(loss, pickle.loads(pickle.dumps(loss)))
 
 
-# --- What single losses and the modules around them do with a QP ---------------------------------
+# --- Single losses and modules around them -------------------------------------------------------
 
 
 def test_an_ensemble_of_modules_keeps_their_starts_and_shares_no_bounds():
@@ -185,7 +185,7 @@ def test_an_ensemble_of_modules_keeps_their_starts_and_shares_no_bounds():
 
 
 def test_copies_of_one_module_are_filled_with_random_numbers_by_torchrl():
-    """Why an ensemble should be a list: nothing is left of the model in C."""
+    """An ensemble must be a list: filled copies have no model left in C."""
     loss = TD3Loss(network_policy(), critic(), bounds=BOUNDS, num_qvalue_nets=2)
     stacked, mpc = loss.qvalue_network_params["module", "C"], critic().module
     assert ((mpc.C_0 == 0) & (stacked == 0)).sum() == 0
@@ -193,7 +193,7 @@ def test_copies_of_one_module_are_filled_with_random_numbers_by_torchrl():
 
 
 def test_actions_beyond_a_critics_hard_bounds_are_refused_by_name():
-    """CQL draws actions from plus or minus one whatever the action's bounds are."""
+    """CQL draws actions between -1 and 1, regardless of the action's bounds."""
     narrow = [critic(seed) for seed in (1, 2)]
     for operator in narrow:
         for bound in (operator.module.lb, operator.module.ub):
@@ -204,7 +204,7 @@ def test_actions_beyond_a_critics_hard_bounds_are_refused_by_name():
 
 
 def renamed(td: TensorDict) -> TensorDict:
-    """A batch with its observation, action, reward and ends under other, nested keys."""
+    """Rename a batch's observation, action, reward and ends to nested keys."""
     new = td.select("observation", "action", ("next", "observation")).clone()
     new.rename_key_("observation", ("agent", "s"))
     new.rename_key_("action", ("agent", "a"))

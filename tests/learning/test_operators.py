@@ -1,4 +1,4 @@
-"""The QP in TorchRL's clothes: signs, shapes, shared parameters, and use in its losses."""
+"""The QP as TorchRL modules: signs, shapes, shared parameters, and use in losses."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def make_inputs(*batch: int, dtype: torch.dtype = torch.float64) -> TensorDict:
 
 
 def make_views(mpc: QPMPC) -> tuple[Any, Any, Any]:
-    """Critic, value and policy. (TorchRL annotates more narrowly than it accepts.)"""
+    """Make critic, value and policy; TorchRL's annotations are too narrow for them."""
     operator = QPActorValueOperator(mpc)
     return operator, operator.get_value_operator(), operator.get_policy_operator()
 
@@ -68,7 +68,7 @@ def make_transitions(count: int) -> TensorDict:
 
 @torch.no_grad()
 def change(mpc: QPMPC) -> None:
-    """Another QP, in place. (Scaling rows of C would not be one.)"""
+    """Change the QP in place; scaling rows of C would not change it."""
     mpc.C *= torch.linspace(0.5, 1.5, mpc.n_z)
 
 
@@ -136,13 +136,13 @@ def test_dispatch():
     policy, value = operator.get_policy_operator(), operator.get_value_operator()
     assert torch.equal(policy(s), operator.module.policy(s))
     assert torch.equal(value(observation=s), -operator.module.value(s).unsqueeze(-1))
-    # BLAS may round otherwise for a batch of another size.
+    # BLAS may round differently for another batch size.
     torch.testing.assert_close(value(s[0]), value(s)[0], rtol=1e-12, atol=0)
 
 
 def evaluate(operator: QPActorValueOperator, td: TensorDict) -> list[torch.Tensor]:
     views = (operator, operator.get_value_operator(), operator.get_policy_operator())
-    # The policy last, as it writes the action.
+    # The policy runs last because it writes the action.
     data = td.clone()
     return [view(data)[view.out_keys[0]].detach().clone() for view in views]
 
@@ -161,7 +161,7 @@ def test_views_share_the_parameters():
 
 
 def test_one_set_of_parameters_drives_every_view():
-    """As a target network's do: through `to_module`, for Q, V and the policy alike."""
+    """As for a target network, through `to_module`, for Q, V and the policy."""
     mpc, td = make_mpc(), make_inputs(4)
     operator, other = QPActorValueOperator(mpc), QPActorValueOperator(copy.deepcopy(mpc))
     change(other.module)
@@ -204,11 +204,11 @@ def test_gradients_pass_through_the_critic():
     assert da.norm() > 0
 
 
-# --- A policy that starts each step from the active set of the one before ------------------------
+# --- Policies with warm starts in closed loop ----------------------------------------------------
 
 
 def make_corridor(solver: str, **options: Any) -> QPMPC:
-    """A QP of the point mass in which, from fixed starts, many rows are active at first."""
+    """Make a QP of the point mass in which many rows are active at first."""
     plant = PointMass()
     options = {"state_bounds": (plant.lb_s, plant.ub_s), "horizon": 8, "solver": solver} | options
     bounds, weight = (plant.lb_a, plant.ub_a), torch.tensor([6, 6, 0.5, 0.5, 0.1, 0.1])
@@ -217,7 +217,7 @@ def make_corridor(solver: str, **options: Any) -> QPMPC:
 
 @pytest.mark.parametrize("solver", BACKENDS)
 def test_warm_actions_are_the_cold_ones(solver):
-    """On the states of one closed loop, the most violated first; and in a loop of their own."""
+    """Compared on the states of one closed loop, from the most violated, and in separate loops."""
     mpc = make_corridor(solver)
     policy = QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
     cold = closed_loop(mpc.policy, PointMass(), steps=20, starts=8)
@@ -233,7 +233,7 @@ def test_warm_actions_are_the_cold_ones(solver):
     torch.testing.assert_close(warm.actions, cold.actions, rtol=0, atol=1e-7)
 
 
-def test_steps_that_could_not_be_solved_leave_nothing_to_start_from():
+def test_unsolved_steps_leave_no_active_set():
     mpc = make_corridor("daqp", state_slack=torch.inf, on_failure="mask")
     inside = torch.tensor([0.1, 0.1, 0.0, 0.0])
     far = 3 * PointMass().ub_s.float()
@@ -365,7 +365,7 @@ def test_policy_as_the_actor_of_ddpg():
     mpc = operator.module
     s = td["observation"]
     leaves = dict(mpc.named_parameters())
-    # The critic is a detached copy: only what flows through the action counts.
+    # The critic is a detached copy: the gradient flows through the action only.
     critic = copy.deepcopy(mpc).requires_grad_(False)
     expected = critic.action_value(s, mpc.policy(s)).mean()
     for name, gradient in zip(

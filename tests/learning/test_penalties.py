@@ -56,7 +56,7 @@ def test_mask_is_the_printed_one():
 
 
 def test_mask_grows_with_the_distance():
-    """Weights off the band rise by growth with every stage beyond the first."""
+    """Weights off the band increase by ``growth`` with every stage beyond the first."""
     a, o, b, g = 3.0, 5.0, 7.0, 0.5
     a_2, b_2 = a * (1 + g), b * (1 + g)
     expected = torch.tensor(
@@ -115,7 +115,7 @@ def test_proximal_step_is_the_minimiser_entry_by_entry(generator, scale):
     def cost(x):
         return 0.5 * (x - c) ** 2 + weight * (x - c_0).abs()
 
-    # About the start and about the kink, as the minimiser may lie at either.
+    # Around the start and the kink, because the minimiser may be at either.
     candidates = torch.cat([c_0 + grid, c_0.unsqueeze(0)])
     best = cost(candidates).min(0)
     found = C.detach().flatten()
@@ -257,7 +257,7 @@ def test_true_model_explains_noise_free_windows(generator, normalised):
     assert penalty(banded_matrix(physics.A, physics.B, horizon), windows).item() < 1e-25
     A, B, _ = physics.corrupted(1)
     assert penalty(banded_matrix(A, B, horizon), windows).item() > 1e-2
-    # Its gradient at the corrupted model leads towards the true one.
+    # Its gradient at the corrupted model points towards the true one.
     C = banded_matrix(A, B, horizon).requires_grad_()
     (gradient,) = torch.autograd.grad(penalty(C, windows), C)
     towards = banded_matrix(physics.A, physics.B, horizon) - C

@@ -207,7 +207,7 @@ def test_termination_stops_the_bootstrap_and_truncation_does_not():
 
 
 def expected_step(mpc: QPMPC, td: TensorDictBase, clip: float = math.inf) -> list[Tensor]:
-    """E[delta grad Q] by one gradient of Q at a time."""
+    """Compute E[delta grad Q], one gradient of Q at a time."""
     L = -td["next", "reward"].squeeze(-1)
     go_on = 1 - td["next", "terminated"].squeeze(-1).double()
     V, Q = mpc.value(td["next", "observation"]), mpc.action_value(td["observation"], td["action"])
@@ -223,7 +223,7 @@ def expected_step(mpc: QPMPC, td: TensorDictBase, clip: float = math.inf) -> lis
 
 @pytest.mark.parametrize("clip", [None, 0.5])
 def test_one_sgd_step_is_the_papers_update(clip):
-    """theta + alpha E[delta grad Q] (eq:thup), semi-gradient: nothing flows through V(s+)."""
+    """theta + alpha E[delta grad Q] (eq:thup) has no gradient through V(s+)."""
     operator, td, alpha = make_operator(), make_batch(6), 1e-3
     mpc = operator.module
     L = -td["next", "reward"].squeeze(-1)

@@ -46,7 +46,7 @@ def test_keys_can_be_set_and_reset():
 @pytest.mark.parametrize("when", ["before", "after"])
 def test_keys_reach_the_estimator(estimator, when):
     names = ("advantage", "value_target", "value", "reward", "done", "terminated")
-    # The estimator insists that the value is a key that its network writes.
+    # The estimator requires its network to write the value's key.
     loss = QPQLearningLoss(make_operator({"state_value_key": "value_2"}))
     loss.set_keys(value="value_2")
     assert ("next", "reward") in loss.in_keys
@@ -75,7 +75,7 @@ RENAMED = {
 
 
 def make_renamed(estimator: str) -> tuple[QPQLearningLoss, QPQLearningLoss, TensorDict, TensorDict]:
-    """The same loss and batch, under the default keys and under renamed, nested ones."""
+    """Make the same loss and batch with default keys and with renamed, nested ones."""
     names = ("observation", "action", "state_value", "state_action_value")
     operator = make_operator()
     renamed = QPActorValueOperator(

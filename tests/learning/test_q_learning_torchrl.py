@@ -84,7 +84,7 @@ def test_state_dict_round_trip(delay_value):
 def test_multi_step_returns(n):
     """r_t + gamma r_{t+1} + .., and gamma^k V(s_{t+k}) k steps on, cut at an episode's end.
 
-    Truncations only, as `MultiStep` leaves the flags of the first step where they are.
+    Episodes are only truncated, because `MultiStep` keeps the flags of the first step.
     """
     td = make_batch(3, 6)
     td["next", "terminated"] = torch.zeros(3, 6, 1, dtype=torch.bool)

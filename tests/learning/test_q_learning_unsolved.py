@@ -14,7 +14,7 @@ from torch_qpmpc import QPActorValueOperator, QPQLearningLoss
 
 
 def hard_operator() -> QPActorValueOperator:
-    """States are hard, so that a start outside their bounds is infeasible."""
+    """Make an operator with hard states: a start outside their bounds is infeasible."""
     return make_operator(state_slack=torch.inf, learn=("H", "c", "C"))
 
 
@@ -52,7 +52,7 @@ def test_unsolved_samples_are_masked(where, bad):
         torch.testing.assert_close(out[key], expected[key], msg=key)
     assert td["td_error"][2] == 0
     assert td["td_error"].isfinite().all()
-    # In the mean it counts as a sample without an error: alpha keeps its meaning.
+    # In the mean it counts with zero error, so that alpha keeps its meaning.
     torch.testing.assert_close(mean(td)["loss_value"], expected["loss_value"] / 6)
 
 
@@ -70,7 +70,7 @@ def test_a_batch_without_any_solved_sample():
 
 @pytest.mark.parametrize("estimator", TRACE)
 def test_an_unsolved_value_after_termination_is_not_needed(estimator):
-    """The target is -L alone, so the sample counts whatever the state after the end is."""
+    """The target is -L alone, so the sample counts for any state after the end."""
     operator = hard_operator()
     td = feasible_batch(4)
     td["next", "done"] = torch.tensor([[False], [True], [False], [True]])
@@ -84,7 +84,7 @@ def test_an_unsolved_value_after_termination_is_not_needed(estimator):
     Q = operator.module.action_value(td["observation"], td["action"])
     delta = -td["next", "reward"].squeeze(-1) - Q
     torch.testing.assert_close(out["loss_value"][[1, 3]], 0.5 * delta[[1, 3]] ** 2)
-    td["next", "terminated"][1] = False  # truncated instead: now its value matters
+    td["next", "terminated"][1] = False  # truncated instead, so that its value is needed
     assert make_loss(estimator, operator)(td)["unsolved"].item() >= 1
 
 

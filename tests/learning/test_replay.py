@@ -1,4 +1,4 @@
-"""Windows that never cross episodes, however the ring lies, and reproducible sampling."""
+"""Windows that never cross episodes, at any position of the ring, and reproducible sampling."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ENVS, N = 8, 4
 
 
 class StaggeredEnv(PointMassEnv):
-    """The episodes' clocks start apart, so that they also end apart."""
+    """A plant whose episodes start, and therefore end, at different steps."""
 
     def _reset(self, tensordict=None, **kwargs):
         out = super()._reset(tensordict, **kwargs)
@@ -52,7 +52,7 @@ def filled(data: list[TensorDictBase], rows: int, num_windows: int = 400, seed: 
 
 
 def check_windows(replay: Replay) -> torch.Tensor:
-    """Windows are consecutive steps of one episode. Returns their row indices ``(M, N)``."""
+    """Check that windows are consecutive steps of one episode; return row indices ``(M, N)``."""
     sample, info = replay.windows.sample(return_info=True)
     sample = sample.reshape(-1, N)
     first = sample[:, :1]
@@ -85,7 +85,7 @@ def test_windows_never_cross_episodes(steps, max_steps, rows):
 
 
 def test_every_window_is_found():
-    """Of 7-step episodes each start 0..3 occurs, and the end of an episode is not lost."""
+    """In 7-step episodes every start 0..3 occurs, including the episode's end."""
     replay = filled(batches(40, 2, max_steps=7), rows=40, num_windows=2000)
     sample = replay.windows.sample().reshape(-1, N)
     assert sample["step_count"][:, 0].unique().tolist() == [0, 1, 2, 3]
@@ -105,7 +105,7 @@ def test_sampling_leaves_the_stored_flags_alone():
         replay.windows.extend(sample)
 
 
-def test_transitions_are_sampled_uniformly_from_what_is_stored():
+def test_stored_transitions_are_sampled_uniformly():
     data = batches(30, 2, max_steps=50)
     replay = filled(data, rows=10)
     assert replay.sample().shape == (32,)
@@ -136,7 +136,7 @@ def test_sampling_depends_on_the_seed_alone():
     data = batches(20, 2, max_steps=50)
 
     def draws(seed):
-        torch.seed()  # torch's global generator plays no part
+        torch.seed()  # torch's global generator has no effect
         replay = filled(data, rows=40, num_windows=5, seed=seed)
         return torch.cat([replay.sample()["action"].flatten(), replay.sample_tau().flatten()])
 
@@ -146,8 +146,8 @@ def test_sampling_depends_on_the_seed_alone():
 
 
 @pytest.mark.parametrize("count", [5, 33])
-def test_a_restored_replay_continues_as_if_never_stopped(count):
-    """With episodes longer than the ring, both sides of its seam have one trajectory id."""
+def test_a_restored_replay_equals_an_undisturbed_one(count):
+    """Episodes exceed the ring, so that both sides of its seam have one trajectory id."""
     data = batches(count + 10, 2, max_steps=500)
     first = filled(data[:count], rows=15)
     first.sample()
@@ -167,7 +167,7 @@ def test_a_restored_replay_continues_as_if_never_stopped(count):
         second.extend(batch)
 
 
-def test_asking_for_windows_too_early_is_an_error():
+def test_sampling_windows_too_early_is_an_error():
     replay = filled([], rows=40)
     match = "replay: got no window in {} transitions, expected 4 consecutive transitions"
     with pytest.raises(QPError, match=match.format(0)):

@@ -1,4 +1,4 @@
-"""After an error inside a loss, its networks have their own tensors, and go on as before."""
+"""After an error inside a loss, its networks have their own tensors and still work."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch_qpmpc.learning.restoring import restored
 
 
 class SolveFailedError(Exception):
-    """Stands for any error in a solve."""
+    """An error in a solve."""
 
 
 def fail(*_: object, **__: object) -> None:
@@ -28,7 +28,7 @@ def networks(loss: LossModule) -> dict[str, nn.Module]:
 
 
 def contents(loss: LossModule) -> dict[str, tuple[list[str], list[int], dict[str, Tensor]]]:
-    """Names and identities of the networks' parameters, and copies of their states."""
+    """Return names and identities of the networks' parameters, and copies of their states."""
     found = {}
     for name, network in networks(loss).items():
         named = dict(network.named_parameters())

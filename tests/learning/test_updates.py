@@ -80,7 +80,7 @@ def test_the_second_order_keeps_active_sets():
     assert ACTIVE_SET in batch["next"]
 
 
-def test_what_is_not_solved_is_counted():
+def test_unsolved_qps_are_counted():
     mpc = random_mpc(3, on_failure="mask")
     batch = transitions()
     batch["action"][2] = 9.0  # beyond a hard bound
@@ -148,7 +148,7 @@ RATES = {"cost": 1e-2, "constraints": 1e-3}
 
 
 def make_update(name: str, mpc: QPMPC, deviation: DeviationPenalty, penalty_step: str):
-    """An update by the optimiser, and the optimiser."""
+    """Make an update and its optimiser."""
     loss = make_loss(mpc, td_error_clip=1.0)
     if name == "gauss_newton":
         optimizer = GaussNewton(mpc, td_error_clip=1.0)

@@ -1,4 +1,4 @@
-"""The replay cache: active sets that travel with the transitions, from visit to visit."""
+"""Warm starts of replayed transitions from the active sets stored with them."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_without_a_key_nothing_is_written():
     assert ACTIVE_SET not in td["next"]
 
 
-def test_a_replay_brings_back_what_it_was_told_to_remember():
+def test_a_replay_returns_remembered_active_sets():
     replay = make_replay(8 * 4, 4, 6, 2, 5, active_rows=3)
     batch = transitions(20).reshape(4, 5)
     batch["collector", "traj_ids"] = torch.arange(4).unsqueeze(-1).expand(4, 5).clone()
@@ -126,7 +126,7 @@ def test_a_replay_without_active_sets_has_nothing_to_remember():
 
 
 def test_training_is_the_same_without_the_cache(tmp_path, monkeypatch):
-    """But for the certificate's tolerance."""
+    """Equal up to the certificate's tolerance."""
     options = (*SMALL, "updates=15", "batch_size=64", "eval_interval=15")
     runs = [
         train.train(make_config(*options, f"warm_start={on}"), str(tmp_path / on))
@@ -136,7 +136,7 @@ def test_training_is_the_same_without_the_cache(tmp_path, monkeypatch):
         assert runs[0][name] == pytest.approx(runs[1][name], rel=1e-5)
     for on in ("true", "false"):
         recalled = pd.read_csv(tmp_path / on / "metrics.csv")["qp/recalled"].to_numpy()
-        collected = 4  # one step of each environment, which starts from the one before
+        collected = 4  # one step of each environment, warm-started from the previous one
         assert (np.nanmax(recalled) > collected) == (on == "true"), (
             "as the optimiser is first-order"
         )

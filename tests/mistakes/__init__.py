@@ -1,1 +1,1 @@
-"""Tables of what users get wrong, by kind: the mistake, and how its message begins."""
+"""Tables of users' mistakes by kind, each with the beginning of its error message."""

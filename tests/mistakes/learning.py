@@ -1,6 +1,6 @@
 """Mistakes with operators, losses, the optimiser, penalties and the replay."""
 
-# The mistakes are what is tested, so their types are wrong.
+# The wrong types are the mistakes under test.
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnhashable=false
 

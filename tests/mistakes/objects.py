@@ -1,4 +1,4 @@
-"""Good objects, to make mistakes with."""
+"""Valid objects that the mistakes start from."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Mistakes with plants, their evaluation, statistics, and resuming."""
 
-# The mistakes are what is tested, so their types are wrong.
+# The wrong types are the mistakes under test.
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnhashable=false
 
@@ -154,7 +154,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "bootstrap_interval: stat": (
         lambda: bootstrap_interval([np.ones(3)], "median"),
-        "statistic: got 'median', expected a function. Such as numpy.median.",
+        "statistic: got 'median', expected a function, such as numpy.median.",
     ),
     "bootstrap_interval: 2d array": (
         lambda: bootstrap_interval(np.ones((2, 3))),
@@ -390,11 +390,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "resumed: none": (
         lambda: resumed("/nonexistent", []),
-        "resume: got /nonexistent, without config.yaml, expected a folder of train.p",
+        "resume: got /nonexistent, without config.yaml, expected a run's folder.",
     ),
     "resumed: others": (
         lambda: resumed("/x", ["seed=2"]),
-        "resume: got seed=2, too, expected nothing else. A run goes on with its own ",
+        "resume: got it together with seed=2, expected no other override. A run resu",
     ),
     "resumed: type": (
         lambda: resumed(None, []),

@@ -1,6 +1,6 @@
-"""Mistakes with what reads a learned QP."""
+"""Mistakes with the analysis of a learned QP."""
 
-# The mistakes are what is tested, so their types are wrong.
+# The wrong types are the mistakes under test.
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnhashable=false
 

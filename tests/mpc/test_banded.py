@@ -33,7 +33,7 @@ def test_trajectories_of_the_model_are_its_null_space(stages):
     assert_close(C @ torch.cat(z), torch.zeros(N * N_X).double())
 
 
-def test_a_matrix_of_its_own_for_one_of_the_two():
+def test_one_matrix_may_vary_with_the_stage():
     A, B = model()
     C = banded_matrix(A.expand(N, N_X, N_X), B, N)
     assert_close(C, banded_matrix(A, B, N))

@@ -1,4 +1,4 @@
-"""Entries of theta that ``learn={"C": mask}`` leaves as they are."""
+"""Entries of theta that ``learn={"C": mask}`` keeps fixed."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ HORIZON, N_Z = 3, 11
 
 
 def rows() -> Tensor:
-    """All rows of C but those of the second state: a constant reference, say."""
+    """Make the mask of all rows of C except the second state's, such as a constant reference."""
     return (torch.arange(2 * HORIZON) % 2 == 0).unsqueeze(-1).expand(-1, N_Z).clone()
 
 
 def entries() -> Tensor:
-    """Another pattern in each row."""
+    """Make a mask with a different pattern in each row."""
     generator = torch.Generator().manual_seed(3)
     return torch.rand(2 * HORIZON, N_Z, generator=generator) < 0.6
 
@@ -54,7 +54,7 @@ def targets(mpc: QPMPC) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def moves(mpc: QPMPC, C: Tensor, mask: Tensor) -> None:
-    """Assert that C has moved where the mask says so, and nowhere else."""
+    """Assert that C has changed where the mask is true, and nowhere else."""
     moved = mpc.C.detach() != C
     assert not moved[~mask].any()
     assert moved[mask].float().mean() > 0.5
@@ -84,7 +84,7 @@ def test_no_optimiser_moves_frozen_entries(kind, name):
 @pytest.mark.parametrize("memory", [0, 16])
 @pytest.mark.parametrize("kind", MASKS)
 def test_a_gauss_newton_step_is_that_in_the_learned_entries_alone(kind, memory):
-    """By the dense system of all learned numbers, built from autograd's gradients."""
+    """The reference is the dense system of all learned entries, from autograd's gradients."""
     mask = MASKS[kind]()
     mpc = masked(mask)
     s, a, target = targets(mpc)
@@ -133,7 +133,7 @@ def test_the_si_penalty_in_a_gauss_newton_step_leaves_frozen_entries(kind):
     assert report.ratio == pytest.approx(1, abs=0.5)
     assert ((mpc.C @ S) * mpc.C).sum() < before
     moves(mpc, C, mask)
-    # With all entries learned, a mask of all is no mask.
+    # A mask with all entries is the same as no mask.
     all_of_it = masked(torch.ones_like(mask))
     for one in (whole, all_of_it):
         GaussNewton(one).step(s, a, target, penalty=S)
@@ -189,7 +189,7 @@ def test_copies_and_state_dicts_keep_what_is_frozen(copied):
 
 
 def test_a_tied_model_with_a_known_row():
-    """x_1 is the integral of x_2 in every stage: its row of A and B is known."""
+    """x_1 integrates x_2 in every stage, so its row of A and B is known."""
     A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
     learn = {"C": rows().logical_not(), "H": True}
     mpc = QPMPC.linear_mpc(A, B, HORIZON, learn=learn, solver="daqp")
@@ -285,7 +285,7 @@ def test_slack_weights_that_do_not_fit_are_named(slack, got):
         random_mpc(0, state_slack=slack)
 
 
-# What a state_dict belongs to
+# State dicts of other settings
 
 
 OTHERS = {
@@ -318,7 +318,7 @@ def test_a_state_dict_of_other_frozen_entries_is_refused():
         masked(entries()).load_state_dict(masked(rows()).state_dict())
 
 
-def test_a_state_dict_says_what_it_belongs_to_in_tensors(tmp_path):
+def test_a_state_dict_has_the_settings_as_tensors(tmp_path):
     mpc = random_mpc(0)
     state = {name: tensor.clone() for name, tensor in mpc.state_dict().items()}
     torch.save(state, tmp_path / "state.pt")
@@ -338,7 +338,7 @@ def test_a_state_dict_from_before_is_loaded():
     ("name", "value"),
     [("gamma", 0.5), ("horizon", 5), ("n_x", 3), ("structure", "tied"), ("learned", ("H",))],
 )
-def test_what_the_constructor_decides_is_not_assigned(name, value):
+def test_settings_of_the_constructor_cannot_be_changed(name, value):
     mpc = random_mpc(0)
     own = getattr(mpc, name)
     with pytest.raises(
@@ -399,7 +399,7 @@ def test_the_state_of_another_qpmpcs_loss_is_refused(delay):
     loss().load_state_dict(older)
 
 
-def test_a_masked_C_is_not_called_tied():
+def test_a_masked_C_is_not_tied():
     mpc = masked(rows())
     penalty = DeviationPenalty(mpc.C_0, 2, 1)
     with pytest.raises(QPError, match=r"pass mpc.leaves\('C'\)\[0\]"):
@@ -408,7 +408,7 @@ def test_a_masked_C_is_not_called_tied():
         mpc.leaves("b")
 
 
-def test_what_the_constructor_decided_may_be_assigned_again():
+def test_settings_of_the_constructor_may_be_assigned_unchanged():
     mpc = random_mpc(0)
     mpc.gamma = mpc.gamma
     mpc.structure = "free"

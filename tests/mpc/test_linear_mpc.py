@@ -27,7 +27,7 @@ SCHEMES: dict[str, dict[str, Any]] = {
 
 
 def scheme(seed: int = 0, *, free: float = 0.05, horizon: int = 4, **options: Any) -> QPMPC:
-    """A linear MPC scheme whose learned entries are moved by up to ``free``."""
+    """Make a linear MPC scheme; shift its learned entries by up to ``free``."""
     settings = {
         "state_bounds": ([-1.0, -1.0], [1.0, 1.0]),
         "action_bounds": ([-0.5], [0.5]),
@@ -91,7 +91,7 @@ def test_the_riccati_weight_solves_its_equation():
 def test_mixed_constraints_hold_and_cost_what_they_should():
     rows = ([[1.0, 0.0, 1.0]], [-0.3], [0.3])
     s = torch.tensor([[0.6, -0.2]]).double()
-    # The first row's u_0 can be chosen, with or without the bounds of the actions.
+    # u_0 in the first row is free, with or without action bounds.
     hard = scheme(free=0.0, constraints=rows, constraint_slack=torch.inf).solve(s)
     soft = scheme(free=0.0, constraints=rows, constraint_slack=0.01, gamma=1.0).solve(s)
     for solution in (hard, soft):
@@ -195,7 +195,7 @@ def test_a_release_changes_neither_values_nor_policy(name, way):
         count = more
 
 
-def test_what_is_released_is_free_to_move():
+def test_released_entries_can_change():
     mpc, s = scheme(4), random_states(6)
     mpc.release()
     assert dict(mpc.named_parameters())["C"].shape == mpc.C_0.shape
@@ -223,7 +223,7 @@ def test_a_released_module_can_be_copied_saved_and_reset():
     assert_close(mpc.value(s), scheme(free=0.0).value(s))
 
 
-def test_what_is_frozen_stays_frozen():
+def test_frozen_entries_stay_frozen():
     mpc = scheme(7)
     for name, parameter in mpc.named_parameters():
         if name.split(".")[1:2] in (["C"], ["q"]):

@@ -304,7 +304,7 @@ def test_hard_rows_and_missing_bounds_leave_the_gradient_finite():
         assert parameter.grad.isfinite().all(), name
 
 
-def test_nothing_need_be_learned():
+def test_learning_nothing_is_allowed():
     mpc = random_mpc(9, learn=())
     assert list(mpc.parameters()) == []
     assert not mpc.value(random_states(3)).requires_grad
@@ -387,7 +387,7 @@ def test_a_copy_gives_the_same_answers_and_is_independent(copied, name):
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_qp_without_values_is_pickled(name):
-    """As TorchRL sends policies to workers: on the meta device, the weights apart."""
+    """TorchRL sends policies to workers on the meta device, with separate weights."""
     mpc = random_mpc(12, **SETTINGS[name])
     step(mpc)
     twin = round_trip(copy.deepcopy(mpc).to("meta")).to_empty(device="cpu")
@@ -421,7 +421,7 @@ def test_a_checkpoint_restores_a_module_from_another_seed(name):
     assert_close(other.value(s), mpc.value(s), rtol=0, atol=0)
 
 
-def test_it_shows_what_it_is():
+def test_repr():
     text = repr(random_mpc(15))
     assert (
         "n_x=2, n_u=1, horizon=3, hessian='diagonal', structure='free', learned=('H', 'c', 'C')"

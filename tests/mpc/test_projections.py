@@ -21,7 +21,7 @@ from torch_qpmpc.mpc import projections as steps
 from torch_qpmpc.mpc.parameters import leaves
 from torch_qpmpc.mpc.projections import NEAREST, STEPS, nearest_psd, nearest_psd_by_sdp
 
-#: Both kinds of dense block, and the paper's diagonal; ``w`` learns with them.
+#: Both dense forms of H and the paper's diagonal, with learned ``w``.
 HESSIANS: dict[str, dict[str, Any]] = {
     "diagonal": {"hessian": "diagonal", "learn": ("H", "H_f", "q", "c", "C", "w")},
     "block": {"hessian": "block", "learn": ("H", "H_f", "q", "c", "C", "w")},
@@ -41,7 +41,7 @@ def solve(cost: Any, constraints: list[Any]) -> None:
 
 
 def hessian_of(mpc: QPMPC, H: Any, H_f: Any) -> Any:
-    """The undiscounted H of the QP, as the paper writes it, in cvxpy."""
+    """Write the QP's undiscounted H in cvxpy, as in the paper."""
     if mpc.hessian == "full":
         return H
     dense = [cp.diag(x) if mpc.hessian == "diagonal" else x for x in (H, H_f)]
@@ -59,7 +59,7 @@ def hessian_of(mpc: QPMPC, H: Any, H_f: Any) -> Any:
 
 
 def papers_step(mpc: QPMPC, rate: float) -> dict[str, Tensor]:
-    """Where eq:sdp1 puts the parameters, which have their gradients, entry by entry of theta."""
+    """Solve eq:sdp1 for the parameters, given their gradients, entry by entry of theta."""
     root = mpc.discount.sqrt()
     parameters = {name: leaves(mpc, name)[0] for name in mpc.learned}
     step = {
@@ -67,7 +67,7 @@ def papers_step(mpc: QPMPC, rate: float) -> dict[str, Tensor]:
         for name, p in parameters.items()
     }
     theta = {name: p.detach().numpy() + step[name] for name, p in parameters.items()}
-    # The paper's cost but for a constant: with its linear term apart, cvxpy 1.7 finds no minimum.
+    # The paper's cost up to a constant: cvxpy 1.7 fails with a separate linear term.
     cost = sum(
         0.5 * cp.sum_squares(step[name] + rate * p.grad.numpy())
         for name, p in parameters.items()
@@ -105,7 +105,7 @@ def test_the_program_for_a_proposal_is_its_projection(shape):
 
 
 @pytest.mark.parametrize("solver", [cp.CLARABEL, cp.SCS])
-def test_the_projection_is_what_other_solvers_find(solver):
+def test_the_projection_agrees_with_other_solvers(solver):
     H = symmetric(5, 5)
     X = cp.Variable((5, 5), symmetric=True)
     options = {"eps_abs": 1e-8, "eps_rel": 1e-8} if solver == cp.SCS else {}
@@ -114,14 +114,14 @@ def test_the_projection_is_what_other_solvers_find(solver):
 
 
 def next_point(H: Tensor, weight: Tensor) -> Tensor:
-    """In the norm that weighs the entries."""
+    """Find the nearest positive semidefinite matrix in the weighted norm."""
     X = cp.Variable(tuple(H.shape), symmetric=True)
     distance = cp.sum(cp.multiply(weight.numpy(), cp.square(X - H.numpy())))
     solve(distance, [X >> 0])
     return torch.as_tensor(X.value)
 
 
-def test_a_triangle_listed_once_or_the_metric_of_adam_has_another_next_point():
+def test_another_metric_has_another_nearest_matrix():
     H = torch.tensor([[1.0, 2.0], [2.0, 0.5]]).double()
     assert_close(next_point(H, torch.ones(2, 2)), nearest_psd(H), rtol=0, atol=1e-6)
     once = torch.tensor([[1.0, 0.5], [0.5, 1.0]])
@@ -133,7 +133,7 @@ def test_a_triangle_listed_once_or_the_metric_of_adam_has_another_next_point():
 
 
 @pytest.mark.parametrize("nearest", NEAREST.values())
-def test_what_is_semidefinite_stays_to_the_last_bit(nearest):
+def test_semidefinite_matrices_are_unchanged_to_the_last_bit(nearest):
     factor = normal(3, 4, 2)
     H = factor @ factor.mT  # of rank two
     H = (H + H.mT) / 2
@@ -152,7 +152,7 @@ def test_of_a_matrix_that_is_not_symmetric_the_symmetric_part_counts(nearest):
 
 
 @pytest.mark.parametrize("nearest", NEAREST.values())
-def test_what_is_not_finite_is_left_to_the_solver(nearest):
+def test_non_finite_qps_go_to_the_solver(nearest):
     H = -torch.eye(2).repeat(2, 1, 1)
     H[0, 0, 0] = torch.nan
     moved = nearest(H)
@@ -161,7 +161,7 @@ def test_what_is_not_finite_is_left_to_the_solver(nearest):
 
 
 def test_the_gradient_of_a_matrix_is_symmetric():
-    """Also where a loss is not: it asks for one entry of H, or differentiates the solution."""
+    """Also for asymmetric losses, such as one entry of H or a function of the solution."""
     mpc = random_mpc(2, step="projection", **HESSIANS["block"])
     (leaf,) = leaves(mpc, "H")
     (mpc.H[0, 1] + mpc.policy(random_states(3)).sum()).backward()
@@ -171,7 +171,7 @@ def test_the_gradient_of_a_matrix_is_symmetric():
 
 
 def test_zero_weights_of_a_diagonal_are_no_part_of_theta():
-    """The paper's diag(theta_1, .., 0, 0), whatever the rule; others may come back from zero."""
+    """The zeros of diag(theta_1, .., 0, 0) stay zero for every rule; others may grow again."""
     mpc = random_mpc(2, step="projection", stage_weight=[1.0, 0.5, 0.0], free=0.0)
     optimizer = torch.optim.SGD(mpc.parameters(), lr=1.0)
     for sign, expected in ((5.0, [0.0, 0.0, 0.0]), (-1.0, [1.0, 1.0, 0.0])):
@@ -194,7 +194,7 @@ def make_optimizer(name: str, mpc: QPMPC) -> torch.optim.Optimizer:
 
 
 def learn(mpc: QPMPC, optimizer: torch.optim.Optimizer, target: Tensor, seed: int = 0) -> float:
-    """One update towards the costs to go; the squared errors before it."""
+    """Update towards the costs to go; return the squared errors before."""
     s, a = random_states(len(target), size=0.9, seed=seed), random_states(len(target), 1, size=0.4)
     if isinstance(optimizer, GaussNewton):
         report = optimizer.step(s, a, target)
@@ -213,10 +213,10 @@ OPTIMIZERS = ("adam", "sgd", "gauss_newton")
 @pytest.mark.parametrize(
     ("rule", "name", "optimizer"), covering(itertools.product(STEPS, HESSIANS, OPTIMIZERS))
 )
-def test_the_weights_keep_their_sign_for_as_long_as_it_learns(rule, name, optimizer):
-    """The targets fall, so that the weights are drawn below zero.
+def test_the_weights_keep_their_sign_while_learning(rule, name, optimizer):
+    """Falling targets pull the weights below zero.
 
-    Every pair of rule, form of H and optimizer: the rule holds one part at a time.
+    Pairs of rule, form of H and optimizer suffice: the rule applies to each part separately.
     """
     weights = {part for part in ("H", "H_f", "w") if part in HESSIANS[name]["learn"]}
     options = HESSIANS[name] | {"learn": weights, "action_slack": 1.0, "horizon": 2}

@@ -1,4 +1,4 @@
-"""What `QPMPC` accepts as numbers and tensors: NumPy's integers, lists, and any default device."""
+"""Arguments that `QPMPC` accepts: NumPy integers, lists, and tensors on any default device."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_numpys_integers_are_integers(kind):
 
 
 @pytest.mark.parametrize("value", [True, np.True_, 2.0, np.float64(2.0), "2", None, np.int64(0)])
-def test_what_is_no_whole_number_is_named(value):
+def test_other_than_whole_numbers_are_named(value):
     with pytest.raises(QPError, match=r"count: got .*, expected a whole number >= 1"):
         check_whole("count", value, 1)
 

@@ -1,4 +1,4 @@
-"""`torch.compile(fullgraph=True)`: the same numbers, and an error where there would be others."""
+"""`torch.compile(fullgraph=True)` gives the eager numbers, or an error."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ NAMES = list(functions(random_mpc(0)))
 
 
 def outcome(mpc: QPMPC, function: Function, s: Tensor, a: Tensor) -> tuple[Tensor, list]:
-    """What a function returns, and the gradient of its square in theta."""
+    """Return a function's result and the gradient of its square in theta."""
     mpc.zero_grad()
     out = function(s, a)
     out.square().sum().backward()
@@ -66,7 +66,7 @@ def test_a_gradient_inside_of_what_is_compiled():
 
 @pytest.mark.parametrize("of", ["fixed", "q"])
 @pytest.mark.parametrize("output", ["value", "z"])
-def test_a_gradient_in_what_is_passed_as_it_is(output, of):
+def test_a_gradient_in_an_argument_passed_unchanged(output, of):
     qp, s = random_mpc(3).quadratic_program(), random_states(4)
     given = {name: x.detach() for name, x in zip(EVENT_SHAPES, qp.tensors(), strict=True)}
     given["fixed"] = s

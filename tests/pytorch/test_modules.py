@@ -1,4 +1,4 @@
-"""What PyTorch does with modules and tensors: meta, fake, dtypes, autocast, modes, copies."""
+"""QPMPC under PyTorch's features: meta and fake tensors, dtypes, autocast, modes, copies."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ S, A = random_states(4), random_states(4, 1, size=0.4)
 
 
 def outcome(mpc: QPMPC, s: Tensor, a: Tensor) -> list[Tensor]:
-    """V, Q, pi, sigma, and the gradients of V and Q in theta."""
+    """Return V, Q, pi, sigma, and the gradients of V and Q in theta."""
     mpc.zero_grad()
     solution = mpc.solve(s)
     out = [mpc.value(s), mpc.action_value(s, a), mpc.policy(s), solution.sigma]
@@ -124,7 +124,7 @@ def test_a_cast_of_the_module_is_a_cast_of_theta_alone(dtype):
 
 
 @pytest.mark.parametrize("solver", BACKENDS)
-def test_what_was_solved_in_inference_mode_can_be_differentiated_after_it(solver):
+def test_solutions_of_inference_mode_are_differentiable_afterwards(solver):
     mpc, twin = random_mpc(0, solver=solver), random_mpc(0, solver=solver)
     with torch.inference_mode():
         value = mpc.value(S)
@@ -132,7 +132,7 @@ def test_what_was_solved_in_inference_mode_can_be_differentiated_after_it(solver
     assert_close(outcome(mpc, S, A), outcome(twin, S, A))
 
 
-def test_nothing_is_recorded_where_nothing_is_to_be():
+def test_no_gradient_is_recorded_where_none_is_needed():
     mpc = random_mpc(0)
     with torch.no_grad():
         assert not mpc.value(S).requires_grad

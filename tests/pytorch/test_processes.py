@@ -1,4 +1,4 @@
-"""Threads and processes: every solver, whatever was solved before, in the parent or at once."""
+"""Solving in threads and processes with every solver, after and during other solves."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from torch_qpmpc import QPMPC
 from torch_qpmpc.qp.solvers import BACKENDS
 
 ROOT = Path(__file__).parents[2]
-#: A child that hangs is ended after this many seconds.
+#: Seconds after which a hanging child is killed.
 WATCHDOG = 120
 
 
@@ -58,7 +58,7 @@ def check(mpcs: list[QPMPC], expected: list[dict[str, Tensor]]) -> None:
 
 
 def scenario(method: str) -> None:
-    """Solve with two threads, in a child made by ``method``, and again; modules are shared."""
+    """Solve with two threads, in a child started by ``method``, and again, with shared modules."""
     torch.set_num_threads(2)
     mpcs = [random_mpc(0, solver=name).share_memory() for name in BACKENDS]
     expected = [answers(mpc) for mpc in mpcs]
@@ -77,7 +77,7 @@ def test_a_child_has_the_answers_of_its_parent(method):
     if method not in torch.multiprocessing.get_all_start_methods():
         pytest.skip(f"the platform has no {method}")
     code = f"from tests.pytorch.test_processes import scenario; scenario({method!r})"
-    # A session of its own, so that a child that hangs can be ended too.
+    # In a separate session, so that hanging grandchildren can be killed, too.
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, start_new_session=True)
     try:
         assert process.wait(2 * WATCHDOG) == 0

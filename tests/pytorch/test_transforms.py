@@ -45,12 +45,12 @@ def dV_ds(mpc: QPMPC, theta: dict[str, Tensor], s: Tensor) -> Tensor:
 
 
 def q_loss(mpc: QPMPC, theta: dict[str, Tensor], s: Tensor, a: Tensor) -> Tensor:
-    """The squared TD error of a transition from (s, a) to -s, as a function of theta."""
+    """Return the squared TD error of a transition from (s, a) to -s."""
     target = 1.0 + 0.9 * call(mpc, {name: part.detach() for name, part in theta.items()}, -s)
     return (call(mpc, theta, s, a) - target).square()
 
 
-#: Each a function of one sample, to be batched over theta and over the samples.
+#: Functions of one sample, to be batched over theta and samples.
 FEATURES: Features = {
     "value": lambda mpc, theta, s, a: call(mpc, theta, s),
     "action value": lambda mpc, theta, s, a: call(mpc, theta, s, a),
@@ -76,7 +76,7 @@ def ensemble() -> tuple[list[QPMPC], dict[str, Tensor]]:
 
 @pytest.mark.parametrize("name", FEATURES)
 def test_vmap_over_theta_and_samples_equals_loops(name):
-    """Both nestings, batched over theta, over samples, and over both."""
+    """Both nestings are batched over theta, over samples, and over both."""
     feature, (mpcs, stacked) = FEATURES[name], ensemble()
     s, a = random_states(4), random_states(4, 1, size=0.4)
     mpc = mpcs[0]
@@ -96,7 +96,7 @@ def test_vmap_over_theta_and_samples_equals_loops(name):
 
 
 def test_stacked_modules_are_those_of_an_ensemble():
-    """`stack_module_state` wants one class: that of deep copies."""
+    """`stack_module_state` needs modules of one class, as deep copies are."""
     mpcs, s = [random_mpc(0)], random_states(4)
     for seed in (1, 2):
         mpcs.append(copy.deepcopy(mpcs[0]))
@@ -204,7 +204,7 @@ def test_derivatives_that_there_are_not_are_refused(function, message):
         function(mpc)(random_states(1)[0])
 
 
-def test_a_functional_call_never_gets_what_was_worked_out_for_another_theta():
+def test_a_functional_call_never_reuses_another_thetas_preparation():
     mpc, s = random_mpc(0), random_states(4)
     theta = {name: part.detach().clone() for name, part in mpc.named_parameters()}
     for k in range(6):
@@ -217,7 +217,7 @@ def test_a_functional_call_never_gets_what_was_worked_out_for_another_theta():
         assert_close(both[k % 2], fresh.value(s))
 
 
-def test_what_is_kept_from_inside_a_transform_still_has_its_gradient():
+def test_a_value_kept_from_inside_a_transform_has_its_gradient():
     mpc, states = random_mpc(), random_states(3).requires_grad_()
     theta = {name: p.detach().clone().requires_grad_() for name, p in mpc.named_parameters()}
     kept: list = []

@@ -25,13 +25,13 @@ SOLUTION = (
     *("active", "status", "residual"),
 )
 OPERANDS = (*EVENT_SHAPES, "fixed")
-#: Without equality rows, whose bounds cannot be moved one at a time.
+#: Row kinds without equalities, whose bounds cannot be changed one at a time.
 SOFT = ("inside", "at_lower", "at_upper", "below", "above", "no_upper", "free")
 HARD = ("inside", "at_lower", "at_upper", "no_upper")
 
 
 def solution(*operands: Tensor, **options: Any) -> QPSolution:
-    """The solution as a function of the tensors named in `OPERANDS`."""
+    """Return the solution as a function of the tensors in `OPERANDS`."""
     qp = QuadraticProgram(*operands[:-1], check_values=False)
     options.setdefault("solver", "daqp")
     return solve_qp(qp, operands[-1], **options)
@@ -47,7 +47,7 @@ def operands_of(known: KnownQP, *, differentiable: bool = False) -> list[Tensor]
 
 
 def infeasible(known: KnownQP, index: int) -> KnownQP:
-    """The same batch, but one element has hard rows that exclude each other."""
+    """Make one element of a batch infeasible by contradictory hard rows."""
     qp = known.qp
     G, w = qp.G.clone(), qp.w.clone()
     G[index, 1] = G[index, 0]
@@ -58,7 +58,7 @@ def infeasible(known: KnownQP, index: int) -> KnownQP:
     return replace(known, qp=replace(qp, G=G, lb=lb, ub=ub, w=w))
 
 
-# What the gradient is
+# Values of the gradient
 
 
 def test_gradient_is_that_of_the_lagrangian_at_the_solution(solver):
@@ -200,7 +200,7 @@ def test_one_batched_operand_makes_a_batch(name):
     assert together.solved.tolist() == [True, True, False, True]
 
 
-def test_gradient_is_the_same_whatever_is_kept():
+def test_gradient_does_not_depend_on_the_kept_entries():
     known = known_qp(4, batch=(3,))
     gradients = []
     for n_kept in (None, 2, 5):
@@ -402,7 +402,7 @@ def test_the_operator_keeps_torchs_contract(batch):
     torch.library.opcheck(kkt_op, (*gradients, *solution, *theta, 2))
 
 
-# What comes out
+# Outputs
 
 
 @pytest.mark.parametrize("batch", [(), (0,), (1,), (5,), (2, 3)])
@@ -468,7 +468,7 @@ def test_everything_may_be_fixed():
     assert_close(found.z, known.z)
 
 
-# What goes wrong
+# Errors
 
 
 GOOD, OTHER = known_qp(14, batch=(3,)), known_qp(14)
@@ -541,7 +541,7 @@ def test_masked_failures_are_silent(recwarn):
 # Threads and processes
 
 
-def test_threads_that_solve_at_once_get_their_own_answers(solver):
+def test_concurrent_solves_get_their_own_solutions(solver):
     problems = [known_qp(seed, batch=(3,)) for seed in range(8)]
 
     def solve(known: KnownQP) -> QPSolution:

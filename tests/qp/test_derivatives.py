@@ -125,7 +125,7 @@ def test_dependent_active_rows_have_a_finite_gradient():
     assert_close(of_upper.sum(), torch.tensor(1.0).double(), atol=1e-6, rtol=0)
 
 
-def test_where_all_of_z_is_fixed_it_moves_with_what_fixes_it():
+def test_a_fully_fixed_z_moves_with_the_fixed_entries():
     one, none = torch.ones(1).double(), torch.zeros(0, 1).double()
     qp = QuadraticProgram(
         H=torch.eye(1).double(),
@@ -213,7 +213,7 @@ def test_compiled_policy_and_its_gradient():
 @pytest.mark.parametrize("length", [1e-8, 1.0, 1e8])
 @pytest.mark.parametrize("cost", [1e-12, 1e-8, 1.0, 1e8])
 def test_the_gradient_of_z_does_not_depend_on_the_units(cost, length):
-    """A multiplier of a cost of 1e-8 is small, but no rounding: its row is active."""
+    """With a cost of 1e-8 a multiplier is small, but not rounding: its row is active."""
     M = normal(6, 6)
     H, q = M @ M.mT + torch.eye(6, dtype=torch.float64), 5 * normal(6)
     w = torch.tensor([torch.inf] * 3 + [4.0] * 3, dtype=torch.float64)

@@ -15,7 +15,7 @@ def test_a_table_has_its_numbers_to_the_right():
     ]
 
 
-def test_only_what_is_between_the_markers_changes():
+def test_only_text_between_the_markers_changes():
     text = "before\n<!-- it -->\nold\n<!-- /it -->\nafter <!-- other -->\n"
     assert replaced(text, "new", "it") == text.replace("old", "new")
 
@@ -23,6 +23,6 @@ def test_only_what_is_between_the_markers_changes():
 @pytest.mark.parametrize(
     "text", ["", "<!-- it -->", "<!-- /it --><!-- it -->", 2 * "<!-- it --><!-- /it -->"]
 )
-def test_without_its_place_nothing_is_replaced(text):
+def test_missing_markers_are_refused(text):
     with pytest.raises(QPError, match="expected one line <!-- it --> and below it one line"):
         replaced(text, "new", "it")

@@ -13,7 +13,7 @@ from torch_qpmpc.study.runs import collect
 
 
 def made_up(gaps: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
-    """Runs by noise and case, of which the last of each had no real gap."""
+    """Make up runs by noise and case; the last of each has no real gap."""
     rows = []
     for (noise, case), values in gaps.items():
         for seed, gap in enumerate(values, 1):
@@ -44,16 +44,16 @@ def test_every_run_is_in_the_long_table():
     )
 
 
-def test_a_run_without_a_gap_says_how_J_changed():
+def test_a_run_without_a_gap_shows_the_change_of_J():
     frame = made_up({("gaussian", "free"): [math.nan]}).assign(J_start=46.97, J_final=50.0)
     assert "| 47.0 | 50.0 | 47.0 | no gap; J rose by 3.0 |" in report.runs_table(frame)
 
 
-def test_the_learned_cases_come_to_one_number_in_which_each_weighs_alike():
+def test_the_overall_gap_weighs_the_learned_cases_equally():
     gaps = {"free": 0.9, "deviation": 0.8, "si": 1.0, "combined": 0.9, "fixed": -3.0}
     frame = made_up({("gaussian", case): [gap] * 5 for case, gap in gaps.items()})
     text = report.overall(frame)
-    # Each case is a stratum without spread, so that there is no doubt about the mean.
+    # Each case is a stratum without spread, so the interval has zero width.
     assert text.endswith("four cases that learn C: gaussian noise 0.900 [0.900, 0.900].")
     assert report.overall(frame.query("label != 'si'")) == ""
 
@@ -81,7 +81,7 @@ def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
     assert "old" not in readme.read_text()
     assert readme.read_text().endswith(f"<!-- /{study.name} -->\nend\n")
     assert 5_000 < (tmp_path / "notebooks" / f"{study.name}.png").stat().st_size < 200_000
-    # Its own folder is no run.
+    # The report's folder is not a run.
     assert len(collect(study)) == len(frame)
 
 
@@ -95,7 +95,7 @@ def test_many_settings_are_a_frontier_and_ablations_have_their_figure():
     assert labels == ["distance of the predictions to an MPC scheme's", GAP_LEFT]
 
 
-def test_what_is_wrong_is_said_in_one_line(study, tmp_path):
+def test_errors_are_one_line(study, tmp_path):
     with pytest.raises(SystemExit, match="without a finished run"):
         report.main([str(tmp_path)])
     (tmp_path / "README.md").touch()

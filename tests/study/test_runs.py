@@ -33,11 +33,11 @@ def test_every_run_is_a_row_in_the_papers_order(study):
     assert frame["real"].tolist() == [True, True, False, True, False, True, True]
 
 
-def test_a_sweeps_own_folder_gives_its_name(study):
+def test_a_sweep_is_named_by_its_folder(study):
     assert set(collect(study / "small")["sweep"]) == {"small"}
 
 
-def test_one_run_will_do(study):
+def test_one_run_is_enough(study):
     assert len(collect(study / "small" / "gaussian-free-seed1")) == 1
 
 
@@ -88,7 +88,7 @@ def test_constraints_that_determine_no_states_have_no_readings(study):
 
 
 def test_the_models_error_is_that_of_one_step(study):
-    """An offset of 0.3 in one state is an error of 0.3, a gain of 1 on it its spread."""
+    """An offset of 0.3 in one state gives an error of 0.3, a gain of 1 the state's spread."""
     physics = FinishedRun(study / "small" / "gaussian-free-seed1").physics
     assert isinstance(physics, LinearSystem)
     none = torch.zeros(4, dtype=torch.float64)
@@ -106,7 +106,7 @@ def test_exact_zeros_above_the_band_are_counted(study):
     assert max(frame.query("constraint == 'free'")["zeros_above"]) < 0.1
 
 
-def test_an_ablation_gives_its_name(study, tmp_path):
+def test_an_ablation_is_labelled_by_its_name(study, tmp_path):
     for name in ("one", "two"):
         shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / name)
         config = tmp_path / name / "config.yaml"
@@ -131,13 +131,13 @@ def test_a_folder_without_runs_is_named(tmp_path):
 def test_a_checkpoint_that_is_lost_is_named(study, tmp_path):
     shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
     (tmp_path / "run" / "checkpoint.pt").unlink()
-    with pytest.raises(QPError, match=r"checkpoint: got .*checkpoint.pt, which is not there"):
+    with pytest.raises(QPError, match=r"checkpoint: got .*checkpoint.pt, which does not exist"):
         collect(tmp_path)
 
 
-def test_a_run_with_other_keys_than_todays_is_named(study, tmp_path):
+def test_a_run_with_other_keys_is_named(study, tmp_path):
     shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
     config = tmp_path / "run" / "config.yaml"
     config.write_text(config.read_text().replace("step: cholesky\n", "", 1))
-    with pytest.raises(QPError, match=r"run: got .*step: got nothing.* expected one of this"):
+    with pytest.raises(QPError, match=r"run: got .*step: got nothing.* expected a run of this"):
         collect(tmp_path)

@@ -19,7 +19,7 @@ def rng():
         ([7.0], 7.0),
         ([1.0, 2.0], 1.5),
         ([0.0, 1.0, 3.0, 1000.0], 2.0),
-        # Of six, the middle three: two whole values, and half of each of their neighbours.
+        # The middle half of six values: two whole ones and half of each neighbour.
         ([0.0, 1.0, 2.0, 4.0, 8.0, 100.0], (0.5 * 1 + 2 + 4 + 0.5 * 8) / 3),
     ],
 )
@@ -40,7 +40,7 @@ def test_the_interval_of_the_mean_is_the_normal_one(rng):
     assert high == pytest.approx(x.mean() + half, abs=0.05)
 
 
-def test_it_covers_the_truth_as_often_as_it_says(rng):
+def test_it_covers_the_truth_at_its_level(rng):
     hits = 0
     for seed in range(200):
         x = rng.normal(size=30)
@@ -50,7 +50,7 @@ def test_it_covers_the_truth_as_often_as_it_says(rng):
 
 
 def test_strata_keep_their_size():
-    """What differs only between strata leaves no doubt; the same runs as one stratum leave much."""
+    """Differences between strata do not widen the interval, unlike those within one stratum."""
     strata = [np.zeros(5), np.ones(5)]
     assert bootstrap_interval(strata, np.mean) == (0.5, 0.5)
     low, high = bootstrap_interval([np.concatenate(strata)], np.mean)

@@ -1,1 +1,1 @@
-"""What train.py is made of: the home of Hydra, files and signals."""
+"""The parts of train.py: configuration, tasks, run folders and sweeps."""

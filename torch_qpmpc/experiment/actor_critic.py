@@ -1,4 +1,4 @@
-"""DDPG and TD3 from the configuration: TorchRL's losses, actors and critics, and their rates."""
+"""DDPG and TD3 from the configuration: TorchRL's losses, actors, critics and learning rates."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, QPActorValueOperat
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import COST
 
-#: Relative standard deviation of the differences between the critics of one ensemble at the start.
+#: Relative standard deviation of a QP critic's initial parameters around the actor's.
 SPREAD = 0.01
 
 
 def make_actor(cfg: DictConfig, mpc: QPMPC, low: Tensor, high: Tensor) -> TensorDictModule:
-    """Observation to action, for actions between ``low`` and ``high`` ``(n_u,)``."""
+    """Make the module from observation to action, for bounds ``low`` and ``high`` ``(n_u,)``."""
     if cfg.algo.actor == "qp":
         return TensorDictModule(ClippedPolicy(mpc, low, high), ["observation"], ["action"])
     network = BoundedPolicy(mpc.n_x, low, high, cfg.algo.width)
     return TensorDictModule(network, ["observation"], ["action"])
 
 
-def make_acting(
+def make_closed_loop_actor(
     cfg: DictConfig, mpc: QPMPC, loss_module: LossModule, low: Tensor, high: Tensor
 ) -> TensorDictModuleBase:
-    """The loss's actor as it acts in closed loop: a QP's starts each step from the one before."""
+    """Make the actor for the closed loop; a QP is warm-started from the previous step."""
     if cfg.algo.actor == "mlp":
         return cast("TensorDictModuleBase", loss_module.actor_network)
     policy: Any = QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
@@ -41,14 +41,14 @@ def make_acting(
 
 
 def make_critic(cfg: DictConfig, mpc: QPMPC) -> Any:
-    """(observation, action) to state_action_value, a module that TorchRL's losses take."""
+    """Make the module from (observation, action) to state_action_value for TorchRL's losses."""
     if cfg.algo.critic == "qp":
         critic = copy.deepcopy(mpc)
         with torch.no_grad():
             for parameter in critic.parameters():
                 parameter.mul_(1 + SPREAD * torch.randn_like(parameter))
         return QPActorValueOperator(critic)
-    # What rewards of one sum up to: outputs of another order of magnitude would be learned slowly.
+    # The network's output scale is the return of unit rewards; a wrong scale slows learning.
     scale = sum(cfg.task.gamma**k for k in range(cfg.task.episode_steps))
     network = ActionValue(mpc.n_x, mpc.n_u, cfg.algo.width, scale)
     return TensorDictModule(network, ["observation", "action"], ["state_action_value"])
@@ -57,11 +57,11 @@ def make_critic(cfg: DictConfig, mpc: QPMPC) -> Any:
 def make_actor_critic_loss(
     cfg: DictConfig, mpc: QPMPC, low: Tensor, high: Tensor
 ) -> DDPGLoss | TD3Loss:
-    """TorchRL's loss for ``cfg.algo``, with target networks; ``mpc`` is the actor's QP."""
+    """Make TorchRL's loss for ``cfg.algo``, with target networks; ``mpc`` is the actor's QP."""
     actor = make_actor(cfg, mpc, low, high)
     if cfg.algo.name == "ddpg":
         return DDPGLoss(actor, make_critic(cfg, mpc), delay_actor=True, delay_value=True)
-    bounds: Any = (low.float(), high.float())  # its annotation is tuple[float]
+    bounds: Any = (low.float(), high.float())  # TD3Loss annotates tuple[float]
     return TD3Loss(
         actor,
         [make_critic(cfg, mpc) for _ in range(2)],
@@ -73,7 +73,7 @@ def make_actor_critic_loss(
 
 
 def actor_groups(cfg: DictConfig, mpc: QPMPC, loss_module: LossModule) -> list[dict[str, Any]]:
-    """Parameter groups of the actor, at ``cfg.algo.actor_rate`` of the rates of such a critic."""
+    """Make the actor's parameter groups, with ``cfg.algo.actor_rate`` times a critic's rates."""
     share, rates = cfg.algo.actor_rate, cfg.optimizer
     if cfg.algo.actor == "qp":
         return mpc.parameter_groups(
@@ -85,9 +85,9 @@ def actor_groups(cfg: DictConfig, mpc: QPMPC, loss_module: LossModule) -> list[d
 
 
 def critic_groups(cfg: DictConfig, loss_module: LossModule) -> list[dict[str, Any]]:
-    """Parameter groups of the critics: a QP's at the optimiser's two rates, a network's at its own.
+    """Make the critics' parameter groups: two rates for a QP, ``lr_network`` for a network.
 
-    An ensemble's parameters are stacked, so that no QPMPC has them as its own.
+    TorchRL stacks an ensemble's parameters, so `QPMPC.parameter_groups` does not apply.
     """
     name = "value_network" if isinstance(loss_module, DDPGLoss) else "qvalue_network"
     groups = []

@@ -1,4 +1,4 @@
-"""The parts that train.py puts together, each made from the configuration."""
+"""The learner of train.py, made from the configuration: loss, actor, optimiser, penalties."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.actor_critic import (
     actor_groups,
     critic_groups,
-    make_acting,
     make_actor_critic_loss,
+    make_closed_loop_actor,
 )
 from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.learning.gauss_newton import GaussNewton
@@ -31,14 +31,14 @@ from torch_qpmpc.mpc.module import QPMPC
 
 @dataclass(frozen=True)
 class Learner:
-    """What moves theta, for as long as its parameters are the same.
+    """The objects that update theta; `QPMPC.release` requires a new one.
 
     Attributes:
-        learn: what a batch does to theta.
-        loss_module: with the target networks and the critics that there are.
-        actor: observation to action, without exploration.
-        deviation, si: the penalties that are on.
-        target: the soft update of the target network, if there is one.
+        learn: updates theta from a batch.
+        loss_module: the loss, with its target networks and critics.
+        actor: maps observation to action, without exploration.
+        deviation, si: the penalties; None if off.
+        target: the soft update of the target network; None without one.
     """
 
     learn: Update
@@ -51,7 +51,7 @@ class Learner:
     target: SoftUpdate | None
 
     def advance(self) -> None:
-        """End an update: the rates fall, and the target network follows."""
+        """Advance the learning-rate schedule and the target network by one update."""
         self.schedule.step()
         if self.target is not None:
             self.target.step()
@@ -63,10 +63,7 @@ def make_learner(
     physics: LinearSystem | GymnasiumPlant,
     done: int = 0,
 ) -> Learner:
-    """What ``cfg.algo`` says, two learning rates, and the penalties on C.
-
-    ``done`` updates have been made before, for the schedule of the rates.
-    """
+    """Make the learner of ``cfg.algo``; its rates continue after ``done`` updates."""
     mpc = operator.module
     if cfg.algo.name == "qlearning":
         loss_module = QPQLearningLoss(
@@ -76,7 +73,7 @@ def make_learner(
     else:
         bounds = physics.lb_a, physics.ub_a
         loss_module = make_actor_critic_loss(cfg, mpc, *bounds)
-        actor = make_acting(cfg, mpc, loss_module, *bounds)
+        actor = make_closed_loop_actor(cfg, mpc, loss_module, *bounds)
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
     deviation, si = make_penalties(cfg, mpc)
     optimizer = make_optimizer(cfg, mpc, loss_module)
@@ -97,7 +94,7 @@ def make_learner(
 def make_penalties(
     cfg: DictConfig, mpc: QPMPC
 ) -> tuple[DeviationPenalty | None, SystemIdentificationPenalty | None]:
-    """The penalties that are on."""
+    """Make the deviation and the SI penalty; None for each that is off."""
     deviation, si = cfg.constraint.deviation, cfg.constraint.si
     return (
         None if deviation is None else DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, **deviation),
@@ -108,9 +105,9 @@ def make_penalties(
 def make_optimizer(
     cfg: DictConfig, mpc: QPMPC, loss_module: LossModule | None = None
 ) -> torch.optim.Optimizer:
-    """The optimiser, with one rate for the cost and one for the constraints.
+    """Make the optimiser, with one rate for the cost and one for the constraints.
 
-    ``loss_module`` is that of an actor, whose critics learn, too.
+    ``loss_module`` is needed for actor-critic algorithms, whose critics are optimised, too.
     """
     options = cfg.optimizer
     if options.name == "gauss_newton":
@@ -143,7 +140,7 @@ def make_update(
     si: SystemIdentificationPenalty | None,
     done: int,
 ) -> Update:
-    """What a batch does to theta, by the optimiser's order."""
+    """Make the function that updates theta from a batch, of first or second order."""
     if isinstance(optimizer, GaussNewton):
         assert isinstance(loss_module, QPQLearningLoss)
         return second_order(mpc, loss_module, optimizer, deviation, si)
@@ -160,21 +157,21 @@ def make_update(
 
 
 def make_schedule(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int = 0) -> LambdaLR:
-    """The rates fall with the updates, of which ``done`` have been made before."""
-    # A configuration's values take longer to look up than such a function to evaluate.
+    """Make the linear decay of the learning rates, continued after ``done`` updates."""
+    # Read once: OmegaConf's lookups are slower than the function itself.
     last, updates = cfg.optimizer.final_fraction, cfg.updates
     return LambdaLR(optimizer, lambda update: decay(done + update, updates, last))
 
 
 def decay(update: int, updates: int, last: float) -> float:
-    """What a rate is multiplied by after ``update`` of ``updates``: from 1 linearly to ``last``."""
+    """Return the factor of the learning rates, which falls linearly from 1 to ``last``."""
     return 1 - (1 - last) * min(update / updates, 1)
 
 
 def evaluate(
     cfg: DictConfig, policy: Callable[[Tensor], Tensor], physics: LinearSystem | GymnasiumPlant
 ) -> ClosedLoop:
-    """``policy`` from the starts and with the noise of ``cfg.eval_seed``."""
+    """Run ``policy`` in closed loop, with the starts and the noise of ``cfg.eval_seed``."""
     options = {} if cfg.eval_seed is None else {"seed": cfg.eval_seed}
     return find_task(cfg.task).closed_loop(
         policy, physics, steps=cfg.task.eval_steps, gamma=cfg.task.gamma, **options

@@ -1,4 +1,4 @@
-"""Checkpoints: written so that a crash leaves the previous one, read without running code."""
+"""Checkpoints: written atomically, with the previous one kept, and read without running code."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from torch_qpmpc.errors import QPError
 
 #: The newest checkpoint of a run's folder, and the one before.
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint-previous.pt"
-#: What the newest one is also called while it becomes the one before.
+#: Temporary second link to the newest checkpoint, later renamed to `PREVIOUS`.
 SECOND = "checkpoint.second"
 
 
 def write_whole(path: Path, data: bytes | memoryview) -> None:
-    """Write ``data`` to ``path`` so that at all times the file is the old one or the new one.
+    """Write ``data`` to ``path`` atomically.
 
     Raises:
-        OSError: it cannot be written, as on a full disk; the file is as it was.
+        OSError: writing failed, as on a full disk; the old file is unchanged.
     """
     partial = path.with_name(f"{path.name}.partial")
     try:
@@ -39,10 +39,10 @@ def write_whole(path: Path, data: bytes | memoryview) -> None:
 
 
 def save_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
-    """Write ``state`` to ``path`` atomically, and keep what was there as `PREVIOUS` beside it.
+    """Write ``state`` to ``path`` atomically, and keep the old checkpoint as `PREVIOUS`.
 
     Raises:
-        OSError: it cannot be written, as on a full disk; both files are as they were.
+        OSError: writing failed, as on a full disk; both files are unchanged.
     """
     path = Path(path)
     buffer = io.BytesIO()
@@ -56,13 +56,13 @@ def save_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
     except OSError:
         _remove(second)
         raise
-    # Only now: until there is a newer one, the one before may be the only one that can be read.
+    # Only after the write: PREVIOUS may be the only readable checkpoint until then.
     if second.exists():
         second.replace(path.with_name(PREVIOUS))
 
 
 def drop_previous(path: str | Path) -> None:
-    """Leave of the checkpoints beside ``path`` only that one, as nobody goes back from the end."""
+    """Remove the other checkpoints beside ``path``, which a finished run no longer needs."""
     for name in (PREVIOUS, SECOND):
         _remove(Path(path).with_name(name))
 
@@ -70,7 +70,7 @@ def drop_previous(path: str | Path) -> None:
 def _duplicate(path: Path, second: Path) -> None:
     try:
         os.link(path, second)
-    except OSError:  # a file system without links
+    except OSError:  # the file system has no hard links
         shutil.copyfile(path, second)
 
 
@@ -83,23 +83,23 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     """Read a checkpoint with ``weights_only=True``.
 
     Raises:
-        QPError: it is missing, damaged, or holds something other than tensors and numbers.
+        QPError: the file is missing or damaged, or holds more than tensors and numbers.
     """
     path = Path(path)
     try:
-        with zipfile.ZipFile(path) as file:  # torch.load does not look at the checksums
+        with zipfile.ZipFile(path) as file:  # torch.load does not verify checksums
             if damaged := file.testzip():
                 raise zipfile.BadZipFile(damaged)
         return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
-        raise QPError.expected("checkpoint", f"{path}, which is not there", "a file") from error
-    except Exception as error:  # a damaged file can make its readers raise anything
-        remedy = "It may be damaged, or hold something other than tensors and numbers"
+        raise QPError.expected("checkpoint", f"{path}, which does not exist", "a file") from error
+    except Exception as error:  # damaged files raise errors of any type
+        reason = "It may be damaged, or hold more than tensors and numbers"
         previous = path.with_name(PREVIOUS)
-        found = path.name != PREVIOUS and previous.exists()
+        usable = path.name != PREVIOUS and previous.exists()
         raise QPError.expected(
             "checkpoint",
             f"{path}, which cannot be read ({type(error).__name__})",
             "a checkpoint that train.py wrote",
-            f"{remedy}; use {f'the one before, {previous}' if found else 'another one'}.",
+            f"{reason}; use {f'the previous one, {previous}' if usable else 'another one'}.",
         ) from error

@@ -1,4 +1,4 @@
-"""Transitions: TorchRL's collectors, in this process, in others, or through Ray; and the replay."""
+"""Collection of transitions: TorchRL's collectors (one process, several, or Ray) and the replay."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
 from torch_qpmpc.learning.replay import Replay, make_replay
 from torch_qpmpc.mpc.module import QPMPC
 
-#: TorchRL's collectors through Ray need a number; -1 would be none.
+#: Number of frames for RayCollector, which does not accept -1 for endless collection.
 ENDLESS = 2**62
 
 
 def num_columns(cfg: DictConfig) -> int:
-    """How many environments a batch has: all, or one worker's where they do not wait for others."""
+    """Return the number of environments in a batch: all, or one worker's if not synchronous."""
     asynchronous = cfg.collector.name != "single" and not cfg.collector.sync
     return cfg.num_envs // cfg.collector.workers if asynchronous else cfg.num_envs
 
@@ -32,13 +32,13 @@ def num_columns(cfg: DictConfig) -> int:
 def make_collector(
     cfg: DictConfig, physics: LinearSystem | GymnasiumPlant, actor: TensorDictModuleBase
 ) -> BaseCollector:
-    """Vectorised episodes under ``actor`` with Gaussian exploration, by ``cfg.collector``.
+    """Make the collector of ``actor``'s vectorised episodes with Gaussian exploration.
 
-    The environments are shared out among the workers, each of which has a copy of the actor; those
-    of worker i have the seed ``cfg.seed + i``.
+    The environments are split evenly among the workers, each with a copy of the actor and, for
+    worker i, the seed ``cfg.seed + i``.
 
     Raises:
-        QPError: ``collector=ray`` without Ray.
+        QPError: ``collector=ray`` but Ray is not installed.
     """
     name, steps = cfg.collector.name, cfg.steps_per_update
     workers = 1 if name == "single" else cfg.collector.workers
@@ -76,7 +76,7 @@ def make_collector(
 
 
 def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
-    """The replay of a run: of transitions and, for the SI penalty, of windows."""
+    """Make a run's replay of transitions and, for the SI penalty, of windows."""
     si = cfg.constraint.si
     return make_replay(
         cfg.replay_capacity,
@@ -90,15 +90,15 @@ def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
 
 
 def batches(collector: BaseCollector) -> Iterator[TensorDictBase]:
-    """``(num_columns, steps_per_update)`` transitions for ever, under the newest theta.
+    """Yield batches of ``(num_columns, steps_per_update)`` transitions under the newest theta.
 
-    Without the policy's active sets, which are of use to its next step alone.
+    The policy's active sets are left out: only its next step uses them.
     """
-    alone = isinstance(collector, Collector)
-    if not alone:
+    in_process = isinstance(collector, Collector)
+    if not in_process:
         collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]
     for collected in collector:
         batch = collected.exclude(POLICY_ACTIVE_SET)
-        yield batch if alone else batch.reshape(-1, batch.shape[-1])
-        if not alone:
+        yield batch if in_process else batch.reshape(-1, batch.shape[-1])
+        if not in_process:
             collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]

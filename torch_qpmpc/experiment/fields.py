@@ -1,4 +1,4 @@
-"""The kinds of values in a configuration, each with the sentence of its error message."""
+"""Types of configuration values, each with the phrase for its error message."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 
 class Group(BaseModel):
-    """A group of keys, with no others; values are not converted, so that an int is no bool."""
+    """A group of keys that forbids unknown keys and converts no values."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
 @dataclass(frozen=True)
 class Expected:
-    """Says what a value must be, in place of pydantic's own words.
+    """An annotation that replaces pydantic's error message.
 
     Attributes:
-        sentence: of the error message.
-        schema: checks the value in place of its type's schema.
+        phrase: the allowed values, for the message.
+        schema: replaces the schema of the annotated type.
     """
 
-    sentence: str
+    phrase: str
     schema: CoreSchema | None = field(default=None, compare=False)
 
     def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -36,17 +36,17 @@ class Expected:
         try:
             return inner(value)
         except Invalid:
-            context = {"expected": self.sentence}
+            context = {"expected": self.phrase}
             raise PydanticCustomError("unexpected", "{expected}", context) from None
 
 
 def one_of(names: tuple[str, ...]) -> Expected:
-    """One of ``names``."""
+    """Allow one of ``names``."""
     return Expected(f"one of {', '.join(names)}", core_schema.literal_schema(list(names)))
 
 
 def some_of(names: tuple[str, ...]) -> Expected:
-    """A list of some of ``names``."""
+    """Allow a list of some of ``names``."""
     known = core_schema.literal_schema(list(names))
     return Expected(f"a list of {', '.join(names)}", core_schema.list_schema(known))
 
@@ -65,7 +65,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[Finite, Field(gt=0), Expected("a finite number > 0")]
 NonNegative = Annotated[Finite, Field(ge=0), Expected("a finite number >= 0")]
 Fraction = Annotated[Finite, Field(gt=0, le=1), Expected("a number in (0, 1]")]
-#: Of a slack.
+#: Weight of a slack; inf makes the row hard.
 Weight = Annotated[
     float,
     Field(ge=0),

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, deferred until a loop is between two updates."""
+"""Deferred Ctrl-C and SIGTERM: a run stops between two updates."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from types import FrameType
 
 
 class Interrupt:
-    """Notes the first SIGINT or SIGTERM inside a ``with`` block; a second one acts as usual.
+    """Records the first SIGINT or SIGTERM inside a ``with`` block; a second one acts as usual.
 
-    Only in the main thread, where Python delivers signals; elsewhere it notes nothing.
+    It records nothing outside the main thread, where Python delivers signals.
 
     Example:
         >>> with Interrupt() as interrupt:
@@ -35,7 +35,7 @@ class Interrupt:
         self._usual = {}
 
     def exit_if_signalled(self, sentence: str) -> None:
-        """After a signal, print ``sentence`` and exit with the signal's code."""
+        """Print ``sentence`` and exit with the signal's code if one was recorded."""
         if self.signum is not None:
             print(f"\n{sentence}", flush=True)
             raise SystemExit(128 + self.signum)

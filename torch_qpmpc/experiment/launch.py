@@ -1,4 +1,4 @@
-"""The frame of ``python train.py``: the run's folder, its lock, and errors in one sentence."""
+"""Launch of a run: its folder, its lock, and its errors as one-sentence messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torch_qpmpc.experiment.run_folder import unwritable
 from torch_qpmpc.experiment.run_state import check_fresh, check_own_folder, folder_of, resumed
 from torch_qpmpc.experiment.sweeps import finished_run, stopped_run
 
-# A run that goes on stays in its folder: configs/config.yaml calls this.
+# For hydra.run.dir in configs/config.yaml: a resumed run keeps its folder.
 OmegaConf.register_new_resolver("folder_of", folder_of, replace=True)
 
 
@@ -28,9 +28,9 @@ class Launch:
     """One call of train.py.
 
     Attributes:
-        folder: of the run.
-        overrides: of the command line.
-        sweep: the run is one of a sweep's.
+        folder: the run's folder.
+        overrides: the command line's overrides.
+        sweep: True if the run is part of a sweep.
     """
 
     folder: str
@@ -40,14 +40,14 @@ class Launch:
     def settle(
         self, cfg: DictConfig
     ) -> tuple[DictConfig, dict[str, Any] | None, dict[str, Any] | None]:
-        """Choose between a new run, one to go on with, and one that has finished.
+        """Decide between a new run, one to resume, and a finished one of a sweep.
 
         Returns:
-            The run's own configuration, the state to go on from, and the summary of a sweep's
-            finished run; the latter two are None where there are none.
+            The run's configuration, the state to resume from or None, and the summary of a
+            finished run or None.
 
         Raises:
-            QPError: an impossible configuration, or a folder that holds another run.
+            QPError: the configuration is invalid, or the folder holds another run.
         """
         resume, state = cfg.resume, None
         if resume is not None:
@@ -66,11 +66,11 @@ class Launch:
 
 @contextmanager
 def launched() -> Iterator[Launch]:
-    """Lock the folder that Hydra made for this run; turn errors of the user into one sentence.
+    """Lock the run's folder, and exit with one sentence on a user's error.
 
-    In a sweep they are raised as they are, as an exit would end the other runs, too.
+    In a sweep the error is raised instead, because an exit would end the other runs.
     """
-    threading.excepthook = _print_unless_writing
+    threading.excepthook = _print_unless_os_error
     hydra = HydraConfig.get()
     sweep = hydra.mode is RunMode.MULTIRUN
     launch = Launch(hydra.runtime.output_dir, list(hydra.overrides.task), sweep)
@@ -87,7 +87,7 @@ def launched() -> Iterator[Launch]:
         raise SystemExit(str(unwritable(launch.folder, error))) from None
 
 
-def _print_unless_writing(error: threading.ExceptHookArgs) -> None:
-    """Print a thread's error, but for those of TensorBoard's files: the run raises them, too."""
+def _print_unless_os_error(error: threading.ExceptHookArgs) -> None:
+    """Print a thread's error, except TensorBoard's file errors, which the run raises again."""
     if not isinstance(error.exc_value, OSError):
         threading.__excepthook__(error)

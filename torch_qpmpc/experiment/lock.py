@@ -1,4 +1,4 @@
-"""The lock on a run's folder: one process at a time writes to it."""
+"""A lock on a run's folder, so that only one process writes to it."""
 
 from __future__ import annotations
 
@@ -15,15 +15,11 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-#: The locked file. The lock is the operating system's, so a killed process leaves only the file.
+#: The locked file. The operating system releases the lock of a killed process.
 LOCK = ".lock"
 
-
-#: Where another folder comes from: of one run, and of a sweep's.
-ELSEWHERE = "hydra.run.dir=FOLDER"
-ELSEWHERE_IN_SWEEP = (
-    "hydra.sweep.dir=FOLDER, or by hydra.sweep.subdir if runs of this sweep share it"
-)
+#: Settings that choose another folder: for a single run, and for a sweep.
+ELSEWHERE, ELSEWHERE_IN_SWEEP = "hydra.run.dir=FOLDER", "hydra.sweep.dir=FOLDER"
 
 
 @contextlib.contextmanager
@@ -33,12 +29,12 @@ def locked(folder: str | Path, elsewhere: str = ELSEWHERE) -> Iterator[None]:
     Platforms without ``fcntl`` and file systems without locks do not lock.
 
     Args:
-        folder: a run's folder, which exists.
-        elsewhere: the settings that choose another folder, for the message.
+        folder: a run's existing folder.
+        elsewhere: the setting that chooses another folder, for the message.
 
     Raises:
         QPError: another run holds the lock.
-        OSError: the file to lock cannot be written.
+        OSError: the lock file cannot be written.
     """
     path = Path(folder) / LOCK
     file = None if fcntl is None else _acquire(path, elsewhere)
@@ -46,7 +42,7 @@ def locked(folder: str | Path, elsewhere: str = ELSEWHERE) -> Iterator[None]:
         yield
     finally:
         if file is not None:
-            # Unlink before unlocking; a process that has opened the old file then tries again.
+            # Unlink before unlocking: a process that has opened the old file then retries.
             with contextlib.suppress(OSError):
                 path.unlink()
             os.close(file)
@@ -62,7 +58,7 @@ def _acquire(path: Path, elsewhere: str) -> int | None:
         except BlockingIOError:
             owner = os.read(file, 1000).decode(errors="replace") or "another process"
             os.close(file)
-            remedy = f"Wait until that run has ended, or choose another folder by {elsewhere}."
+            remedy = f"Wait until that run has ended, or choose another folder with {elsewhere}."
             got = f"{path.parent}, in use by {owner}"
             raise QPError.expected("folder", got, "one that no run is using", remedy) from None
         except OSError:
@@ -71,14 +67,14 @@ def _acquire(path: Path, elsewhere: str) -> int | None:
         if _is_at(path, file):
             break
         os.close(file)
-    with contextlib.suppress(OSError):  # on a full disk the owner stays unnamed
+    with contextlib.suppress(OSError):  # on a full disk, the owner remains unnamed
         os.truncate(file, 0)
         os.write(file, f"process {os.getpid()} on {socket.gethostname()}".encode())
     return file
 
 
 def _is_at(path: Path, file: int) -> bool:
-    """True unless another run has removed ``path`` since it was opened as ``file``."""
+    """Return False if another run has removed ``path`` since it was opened as ``file``."""
     try:
         return os.path.samestat(os.fstat(file), path.stat())
     except FileNotFoundError:

@@ -1,7 +1,7 @@
-"""TorchRL's loggers for a run, by name: TensorBoard, CSV, Weights & Biases and MLflow.
+"""TorchRL's loggers by name: TensorBoard, CSV, Weights & Biases and MLflow.
 
-Each writes into the run's folder. What TorchRL's interface lacks, such as figures and the end of a
-run, is here.
+Each writes into the run's folder. `RunLogger` adds what TorchRL's interface lacks: figures, texts
+and the end of a run.
 """
 
 from __future__ import annotations
@@ -21,23 +21,24 @@ from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 from torch_qpmpc.errors import QPError
 
 LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")
-#: Those that need a package which is not installed with torch_qpmpc, but with an extra of its name.
+#: Loggers that need the extra of the same name.
 EXTRAS = ("wandb", "mlflow")
 
 
 class RunLogger:
-    """One of TorchRL's loggers in the folder of a run, which may go on.
+    """One of TorchRL's loggers, for a new or a resumed run.
 
-    TensorBoard and W&B continue; CSV and MLflow, which cannot, begin anew with the rows so far.
+    TensorBoard and W&B continue; CSV and MLflow start again from the rows logged so far.
 
     Args:
         name: one of `LOGGERS`.
-        folder: of the run.
-        settings: of the run, by their dotted keys.
-        rows: what was logged up to the update ``after``; None for ``after`` is a new run.
+        folder: the run's folder.
+        settings: the run's settings by dotted key.
+        rows: the rows logged up to update ``after``.
+        after: the update to resume after; None for a new run.
 
     Raises:
-        QPError: the package of ``name`` is not installed.
+        QPError: the package ``name`` is not installed.
     """
 
     def __init__(
@@ -54,8 +55,8 @@ class RunLogger:
         self.name, self.folder, self.settings = name, folder, plain(settings)
         self.logger: Logger = self._make()
         if isinstance(self.logger, TensorboardLogger):
-            # TensorBoard drops what earlier event files have from here on.
-            event: Any = event_pb2  # its classes are made at run time
+            # TensorBoard drops later steps from earlier event files.
+            event: Any = event_pb2  # its classes are created at run time
             start = event.SessionLog(status=event.SessionLog.START)
             writer = self.logger.experiment.file_writer.event_writer
             writer.add_event(event.Event(step=0 if after is None else after + 1, session_log=start))
@@ -69,42 +70,42 @@ class RunLogger:
     def _make(self) -> Any:
         if self.name == "wandb":
             options = {"id": self._wandb_id(), "log_env_packages": False}
-            place = str(self.folder)
-            return get_logger("wandb", place, self.folder.name, wandb_kwargs=options)
+            folder, run_name = str(self.folder), self.folder.name
+            return get_logger("wandb", folder, run_name, wandb_kwargs=options)
         if self.name == "mlflow":
-            # Its successor, a database, needs more packages than a folder of files.
+            # MLflow's default, a database, needs more packages.
             os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
             return get_logger("mlflow", str(self.folder / "mlflow"), "torch_qpmpc")
         if self.name == "csv":
             shutil.rmtree(self.folder / "csv", ignore_errors=True)
-        name: Any = self.name  # of the literals that TorchRL's annotation lists
+        name: Any = self.name  # TorchRL annotates a Literal
         return get_logger(name, str(self.folder), self.name)
 
     def _wandb_id(self) -> str:
-        """The run's id at W&B, by which it goes on there."""
+        """Return the run's id at W&B, which a resumed run reuses."""
         file = self.folder / "wandb-id.txt"
         if not file.exists():
             file.write_text(uuid.uuid4().hex, encoding="utf-8")
         return file.read_text(encoding="utf-8")
 
     def log(self, metrics: Mapping[str, float], update: int) -> None:
-        """Scalars at an update."""
+        """Log scalars at an update."""
         self.logger.log_metrics(dict(metrics), step=update)
 
     def text(self, name: str, text: str) -> None:
-        """A text in Markdown, for TensorBoard, which has no other place for the settings so early.
+        """Log a text in Markdown to TensorBoard.
 
-        The others have the settings as hyper-parameters.
+        The other loggers get the settings as hyper-parameters at the start.
         """
         if isinstance(self.logger, TensorboardLogger):
             self.logger.experiment.add_text(name, text)
 
     def figure(self, name: str, figure: Figure, update: int) -> None:
-        """A figure at an update."""
+        """Log a figure at an update."""
         if isinstance(self.logger, TensorboardLogger):
             self.logger.experiment.add_figure(name, figure, update)
         elif self.name == "wandb":
-            import matplotlib.pyplot  # noqa: F401 - wandb.Image needs it imported
+            import matplotlib.pyplot  # noqa: F401 - wandb.Image requires the import
             import wandb
 
             self.logger.log_metrics({name: wandb.Image(figure)}, step=update)
@@ -118,7 +119,7 @@ class RunLogger:
             figure.savefig(file, dpi=100)
 
     def finish(self, summary: Mapping[str, Any]) -> None:
-        """The outcome of a run, beside its hyper-parameters."""
+        """Log a run's outcome beside its hyper-parameters."""
         outcome = {
             f"hparam/{key}": value for key, value in summary.items() if isinstance(value, float)
         }
@@ -136,12 +137,12 @@ class RunLogger:
 
             mlflow.end_run()
         elif isinstance(self.logger, TensorboardLogger):
-            self.logger.experiment.close()  # also where flushing fails
+            self.logger.experiment.close()  # closes the file even if flushing fails
         else:
             self.logger.close()
 
 
 def plain(settings: Mapping[str, Any]) -> dict[str, bool | int | float | str]:
-    """Settings as hyper-parameters: what is no number, name or flag as text."""
+    """Convert settings to hyper-parameters: numbers, flags and text."""
     kinds = (bool, int, float, str)
     return {key: x if isinstance(x, kinds) else str(x) for key, x in settings.items()}

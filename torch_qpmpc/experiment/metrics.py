@@ -1,4 +1,4 @@
-"""The numbers and figures of a run: of each update, of each evaluation, and of the whole."""
+"""A run's metrics and figures: per update, per evaluation, and in the summary."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from torch_qpmpc.experiment.tally import Stopwatch, Tally
 from torch_qpmpc.learning.updates import Scalars
 from torch_qpmpc.mpc.module import QPMPC
 
-#: The entries of a loss that are logged beside its terms.
+#: Entries of the loss's output that are logged in addition to its terms.
 LOGGED = ("td_error", "pred_value", "target_value", "unsolved", "invalid_reward")
-#: The most numbers that a part of theta may have to be logged one by one.
+#: Largest number of entries in a part of theta that is logged entry by entry.
 FEW = 16
 
 
@@ -36,7 +36,7 @@ def update_metrics(
     mpc: QPMPC,
     learner: Learner,
 ) -> dict[str, float]:
-    """The scalars of an update; the tally's are those since the last row."""
+    """Return the scalars of an update; the QPs are counted since the last row."""
     metrics = {name: term.item() for name, term in terms.items()}
     metrics |= {
         f"train/{name}": x.double().mean().item() for name, x in losses.items() if name in LOGGED
@@ -54,7 +54,7 @@ def run_summary(
     mpc: QPMPC | None,
     true_model: Sequence[Tensor] | None,
 ) -> dict[str, Any]:
-    """The content of summary.json; ``mpc`` is None where the learned policy is no QP's."""
+    """Return the content of summary.json; ``mpc`` is None if the policy is a network."""
     summary: dict[str, Any] = gap_summary(loops)
     summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
     summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
@@ -66,18 +66,18 @@ def run_summary(
 def report(
     run: RunFolder, mpc: QPMPC | None, loops: dict[str, ClosedLoop], update: int
 ) -> dict[str, Any]:
-    """Log an evaluation: J between its two ends, the structure of C, and figures if wanted.
+    """Log an evaluation: J, the structure of C and, if configured, figures.
 
-    Before the first update, J alone; after the last, the predictions and the policy, too.
+    Before the first update only J is logged; after the last, predictions and policy are added.
 
     Args:
-        mpc: None where the learned policy is no QP's.
+        mpc: the learned QP; None if the policy is a network.
 
     Returns:
         `gap_summary` of ``loops``.
     """
     summary = gap_summary(loops)
-    run.log({f"eval/{name}": summary[key] for name, key in LOGGED_OF_LOOPS.items()}, update)
+    run.log({f"eval/{name}": summary[key] for name, key in EVALUATION_SCALARS.items()}, update)
     if mpc is None or update == 0:
         return summary
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
@@ -95,8 +95,8 @@ def report(
     return summary
 
 
-#: The names of an evaluation's scalars, and which of `gap_summary` they are.
-LOGGED_OF_LOOPS = {
+#: Names of an evaluation's scalars, and their keys in `gap_summary`.
+EVALUATION_SCALARS = {
     "J": "J_final",
     "J_true_model": "J_true_model",
     "J_discounted": "J_discounted_final",
@@ -105,11 +105,11 @@ LOGGED_OF_LOOPS = {
 
 
 def structure_summary(mpc: QPMPC, true_model: Sequence[Tensor] | None) -> dict[str, float]:
-    """How far the learned constraints are from an MPC scheme's, and from the true model if any.
+    """Measure the distance of the learned constraints from an MPC scheme and the true model.
 
     Returns:
-        ``canonical_distance``, to the nearest scheme, and ``model_error``, of that scheme's model
-        in one step (see `one_step_error`), with ``model_error_start``, that of C_0.
+        ``canonical_distance`` to the nearest scheme; with a true model also ``model_error``, that
+        scheme's `one_step_error`, and ``model_error_start``, the one of C_0.
     """
     if true_model is None:
         return {"canonical_distance": structure_metrics(mpc)["distance_to_mpc"]}
@@ -123,7 +123,7 @@ def structure_summary(mpc: QPMPC, true_model: Sequence[Tensor] | None) -> dict[s
 
 
 def theta_metrics(mpc: QPMPC) -> dict[str, float]:
-    """The learned numbers of the parts that have few, by name."""
+    """Return the entries of theta's small parts by name."""
     few = {name: part for name, part in mpc.readable().items() if part.numel() <= FEW}
     return {
         f"theta/{name}_{i}" if part.ndim else f"theta/{name}": value
@@ -133,9 +133,9 @@ def theta_metrics(mpc: QPMPC) -> dict[str, float]:
 
 
 def gap_summary(loops: dict[str, ClosedLoop]) -> dict[str, float]:
-    """J at the start, at the end and with the true model, and the closed gap; both discountings.
+    """Return J of the start, the learned and the true model, and the closed gap.
 
-    nan for what there is not, as a plant without a true model.
+    Each also with discounted costs. Missing values are nan, as for a plant without a true model.
     """
     summary = {}
     for tag, suffix in (("J", ""), ("J_discounted", "_discounted")):
@@ -148,7 +148,7 @@ def gap_summary(loops: dict[str, ClosedLoop]) -> dict[str, float]:
 
 
 def table(summary: Mapping[str, Any]) -> str:
-    """The outcome for the terminal."""
+    """Format the outcome for the terminal."""
     lines = [f"{'':14}{'start':>10}{'learned':>10}{'true model':>12}{'closed gap':>12}"]
     for name, tag in (("J", "J"), ("J discounted", "J_discounted")):
         start, final, true = (summary[f"{tag}_{end}"] for end in ("start", "final", "true_model"))

@@ -1,4 +1,4 @@
-"""Figures of a run: the constraint matrix, closed-loop and predicted trajectories, learning."""
+"""Figures of a run: constraint matrix, closed-loop and predicted trajectories, learning curve."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch_qpmpc.mpc.module import QPMPC
 
 
 def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, shown: int = 6) -> None:
-    """Closed-loop paths in the plane from a few starts, and the learned QP's first predictions."""
+    """Draw closed-loop paths in the plane from a few starts, and the learned QP's predictions."""
     for name, loop in loops.items():
         paths = loop.states[:, :shown]
         colour = COLOURS.get(name)
@@ -33,13 +33,13 @@ def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, show
 
 
 def predictions_figure(mpc: QPMPC, loop: ClosedLoop, every: int = 8, start: int = 0) -> Figure:
-    """One closed-loop trajectory, and what the QP predicted at every so many of its steps.
+    """Draw one closed-loop trajectory and the QP's predictions along it.
 
     Args:
         mpc: the QP.
         loop: its closed loop.
-        every: steps between the predictions shown.
-        start: which of the loop's starts.
+        every: number of steps between two predictions.
+        start: index of the loop's start.
     """
     names = [f"$s_{{{i + 1}}}$" for i in range(mpc.n_x)]
     names += [f"$a_{{{i + 1}}}$" for i in range(mpc.n_u)]
@@ -67,7 +67,7 @@ def predictions_figure(mpc: QPMPC, loop: ClosedLoop, every: int = 8, start: int 
 
 
 def draw_stage_costs(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
-    """Mean stage cost over time."""
+    """Draw the mean stage cost over time."""
     for name, loop in loops.items():
         axes.plot(loop.costs.mean(1), color=COLOURS.get(name), label=name)
     axes.set(xlabel="step", ylabel="L(s, a), mean over starts", title="Stage cost", yscale="log")
@@ -75,7 +75,7 @@ def draw_stage_costs(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
 
 
 def closed_loop_figure(loops: Mapping[str, ClosedLoop], mpc: QPMPC) -> Figure:
-    """Paths in the plane with predictions, and the stage cost over time."""
+    """Draw paths in the plane with predictions, and the stage cost over time."""
     figure = Figure(figsize=(6, 9), layout="constrained")
     top, bottom = figure.subplots(2, 1, height_ratios=(3, 2))
     draw_positions(top, loops, mpc)
@@ -84,7 +84,7 @@ def closed_loop_figure(loops: Mapping[str, ClosedLoop], mpc: QPMPC) -> Figure:
 
 
 def draw_learning(axes: Axes, updates: Sequence[float], J: Sequence[float], ends: Mapping) -> None:
-    """J against updates, between its two ends."""
+    """Draw J over updates, with the start's and the true model's J as lines."""
     axes.plot(updates, J, color=COLOURS["learned"], marker="o", markersize=3, label="learned")
     for name, value in ends.items():
         axes.axhline(value, color=COLOURS.get(name), linestyle="--", label=name)
@@ -100,7 +100,7 @@ def draw_learning(axes: Axes, updates: Sequence[float], J: Sequence[float], ends
 def summary_figure(
     mpc: QPMPC, loops: Mapping[str, ClosedLoop], updates: Sequence[float], J: Sequence[float]
 ) -> Figure:
-    """One picture of a run: learning, the learned matrix, and what it does in closed loop."""
+    """Draw a run's learning curve, learned matrix and closed loop side by side."""
     figure = Figure(figsize=(15, 4), layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1.5, 1))
     ends = {name: loops[name].J for name in ("start", "true model") if name in loops}

@@ -1,4 +1,4 @@
-"""A run's folder: config.yaml, metrics.csv, what its logger writes, checkpoint.pt, summary.json."""
+"""A run's folder: config.yaml, metrics.csv, the logger's files, checkpoint.pt, summary.json."""
 
 from __future__ import annotations
 
@@ -21,24 +21,23 @@ from torch_qpmpc.experiment.loggers import RunLogger
 
 
 class RunFolder:
-    """Where one run writes; a context manager, so that no event is lost.
+    """The output of one run; a context manager, which flushes at its end.
 
     Args:
-        folder: created if it does not exist.
+        folder: the folder, created if it does not exist.
         cfg: the run's configuration.
-        after: go on after this update: what the folder has of it and before is kept, what is later
-            is written anew. None starts from nothing.
+        after: the update to resume after, whose earlier rows are kept; None for a new run.
 
     Raises:
-        QPError: the rows of the updates up to ``after`` are missing or damaged.
-        OSError: here and in what follows, something cannot be written; all other files are whole.
+        QPError: rows of updates up to ``after`` are missing or damaged.
+        OSError: writing failed, here or in a method; no other file is damaged.
     """
 
     def __init__(self, folder: str | Path, cfg: DictConfig, after: int | None = None) -> None:
-        # Absolute, as the event writer's thread outlives changes of the working directory.
+        # Absolute, so that changes of the working directory do not affect the event writer.
         self.path = Path(folder).resolve()
         self.path.mkdir(parents=True, exist_ok=True)
-        # Before the first event, as a run whose rows are damaged does not go on.
+        # Read before the first event is written: damaged rows stop the run.
         earlier: Any = None if after is None else _read_until(self.path, cfg, after)
         self.cfg = cfg
         self.rows: list[dict[str, float]] = []
@@ -61,31 +60,31 @@ class RunFolder:
             self.logger.close()
 
     def log(self, metrics: Mapping[str, float], update: int) -> None:
-        """Scalars at an update: a row of metrics.csv, and the logger."""
+        """Log scalars at an update, to metrics.csv and the logger."""
         if not self.rows or self.rows[-1]["update"] != update:
             self.rows.append({"update": update})
         self.rows[-1].update(metrics)
         self.logger.log(metrics, update)
 
     def figure(self, name: str, figure: Figure, update: int) -> None:
-        """A figure for the logger."""
+        """Log a figure."""
         self.logger.figure(name, figure, update)
 
     def column(self, name: str) -> tuple[list[float], list[float]]:
-        """The updates at which ``name`` was logged, and its values."""
+        """Return the updates at which ``name`` was logged, and its values."""
         rows = [row for row in self.rows if name in row]
         return [row["update"] for row in rows], [row[name] for row in rows]
 
     def flush(self) -> None:
-        """Write metrics.csv, and what the logger still holds."""
+        """Write metrics.csv and flush the logger."""
         table = pd.DataFrame(self.rows).to_csv(index=False)
         write_whole(self.path / "metrics.csv", table.encode())
         self.logger.flush()
 
     def finish(self, summary: Mapping[str, float | int | str]) -> None:
-        """Write the outcome to the logger, and summary.json.
+        """Write the outcome to the logger and to summary.json.
 
-        JSON knows neither nan (no gap to close) nor inf: there they are null.
+        JSON has no nan (no gap to close) and no inf; both are written as null.
         """
         self.logger.finish(summary)
         self.logger.flush()
@@ -94,7 +93,7 @@ class RunFolder:
             for key, value in summary.items()
         }
         text = json.dumps(finite, indent=2, allow_nan=False)
-        # Last, and all at once: its presence marks the run as finished.
+        # Written last and atomically: its presence marks the run as finished.
         write_whole(self.path / "summary.json", f"{text}\n".encode())
 
 
@@ -102,14 +101,14 @@ def read_metrics(folder: str | Path) -> pd.DataFrame:
     """Read a run's metrics.csv by update, to the last digit.
 
     Raises:
-        QPError: it is missing, or is not the table that a run writes.
+        QPError: the file is missing or damaged.
     """
     file = Path(folder) / "metrics.csv"
     try:
         text = file.read_text(encoding="utf-8")
         if not text.endswith("\n"):
             raise ValueError("its last line is cut off")
-        # First as text: before 3.1, pandas rounds what it reads as numbers.
+        # Read as text first: pandas before 3.1 rounds numbers that it reads.
         table = pd.read_csv(io.StringIO(text), dtype=str).astype(float)
         return table.astype({"update": int}).set_index("update")
     except (OSError, ValueError, KeyError) as error:
@@ -117,30 +116,30 @@ def read_metrics(folder: str | Path) -> pd.DataFrame:
 
 
 def _read_until(folder: Path, cfg: DictConfig, update: int) -> pd.DataFrame:
-    """Read the rows up to ``update``, and check that there are all that ``cfg`` makes a run log."""
+    """Read the rows up to ``update``, and check that none that ``cfg`` demands is missing."""
     table = read_metrics(folder)
     due = {0, *range(cfg.log_interval, update + 1, cfg.log_interval)}
     due |= {*range(cfg.eval_interval, update + 1, cfg.eval_interval)}
     if missing := sorted(due - {*table.index}):
         lost = ", ".join(map(str, missing[:5])) + (", .." if len(missing) > 5 else "")
-        raise _damaged(folder / "metrics.csv", f"no row of update {lost}")
+        raise _damaged(folder / "metrics.csv", f"no row for update {lost}")
     if not table.index.is_monotonic_increasing or table.index.has_duplicates:
-        raise _damaged(folder / "metrics.csv", "updates that do not increase")
+        raise _damaged(folder / "metrics.csv", "its updates do not increase")
     return table.loc[:update]
 
 
-def _damaged(file: Path, wrong: str) -> QPError:
+def _damaged(file: Path, reason: str) -> QPError:
     remedy = (
-        "Put a whole copy of it there, go on from a copy of the folder, or start anew in another "
-        "one by hydra.run.dir=FOLDER."
+        "Restore the file, resume from a copy of the folder, or start a new run with "
+        "hydra.run.dir=FOLDER."
     )
     return QPError.expected(
-        "metrics.csv", f"{file} ({wrong})", "the table that a run wrote", remedy
+        "metrics.csv", f"{file} ({reason})", "the table that a run wrote", remedy
     )
 
 
 class WritableFolder(Callback):
-    """Makes the folder of a run or of a sweep, or says why not before Hydra's own traceback."""
+    """Creates the folder of a run or a sweep; on failure, exits with one sentence."""
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         self._make("hydra.run.dir", config)
@@ -154,15 +153,15 @@ class WritableFolder(Callback):
         try:
             Path(folder).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            # Of a callback's errors, Hydra makes warnings; not of its exit.
+            # Hydra turns a callback's errors into warnings, but not SystemExit.
             raise SystemExit(str(unwritable(folder, error, key))) from None
 
 
 def unwritable(folder: str | Path, error: OSError, key: str = "hydra.run.dir") -> QPError:
-    """The message for a run in ``folder``, chosen by ``key``, that ended with ``error``."""
+    """Make the error of a run in ``folder``, set by ``key``, that ended with ``error``."""
     checkpoint = Path(folder) / CHECKPOINT
-    remedy = f"Choose another folder by {key}=FOLDER."
+    remedy = f"Choose another folder with {key}=FOLDER."
     if checkpoint.exists():
-        remedy = f"{checkpoint} is whole: make room, then python train.py resume={folder}."
+        remedy = f"{checkpoint} is intact: free space, then python train.py resume={folder}."
     got = f"{folder}, where writing failed ({error})"
-    return QPError.expected("folder", got, "one that can be written to", remedy)
+    return QPError.expected("folder", got, "a writable folder", remedy)

@@ -1,7 +1,7 @@
-"""All that a run needs to go on as if it had never stopped, as tensors and plain numbers.
+"""The state of a run, as tensors and plain numbers, from which it resumes.
 
-Exact for one collector in this process over a `LinearSystem`: its episodes, and every random
-number, continue. Other environments cannot be saved, and start new episodes.
+With one collector in this process over a `LinearSystem` the resumed run is exact, down to every
+random number. Other environments cannot be saved and start new episodes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from torch_qpmpc.mpc.module import QPMPC
 #: The parts of a snapshot.
 STATE = ("config", "update", "structure", "mpc", "loss_module", "optimizer", "schedule")
 STATE += ("replay", "collector", "tally", "rng")
-#: The files by which a run is known before its first checkpoint.
+#: Files that a run writes before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
 
 
@@ -41,12 +41,11 @@ def snapshot(
     replay: Replay,
     tally: Tally,
 ) -> dict[str, Any]:
-    """The state of a run between two updates, for `checkpoint.save_checkpoint`.
+    """Return the state of a run between two updates, for `checkpoint.save_checkpoint`.
 
-    After the last update without the data, which is most of it: nothing will be collected or
-    sampled any more.
+    After the last update the replay and the collector's state are left out.
     """
-    over = tally.update == cfg.updates
+    finished = tally.update == cfg.updates
     return {
         "config": settings(cfg),
         "update": tally.update,
@@ -55,8 +54,8 @@ def snapshot(
         "loss_module": learner.loss_module.state_dict(),
         "optimizer": learner.optimizer.state_dict(),
         "schedule": {"last_epoch": learner.schedule.last_epoch},
-        "replay": replay.state_dict() if len(replay) and not over else None,
-        "collector": None if over else _collector_state(collector),
+        "replay": replay.state_dict() if len(replay) and not finished else None,
+        "collector": None if finished else _collector_state(collector),
         "tally": tally.state(),
         "rng": torch.get_rng_state(),
     }
@@ -69,10 +68,10 @@ def restore(
     collector: BaseCollector,
     replay: Replay,
 ) -> Tally:
-    """Bring the parts of a new run, made from the same configuration, to a `snapshot`.
+    """Load a `snapshot` into the parts of a new run with the same configuration.
 
     Raises:
-        QPError: a part does not fit the snapshot's.
+        QPError: a part does not match the snapshot.
     """
     with _part("loss_module"):
         learner.loss_module.load_state_dict(state["loss_module"])
@@ -95,7 +94,7 @@ def restore(
 
 def check_state(state: Any, cfg: DictConfig) -> None:
     """Raise `QPError` unless ``state`` is a `snapshot` of a run with the configuration ``cfg``."""
-    remedy = "Another version of train.py has written it: go on with that one, or start anew."
+    remedy = "Another version of train.py wrote it: resume with that version, or start a new run."
     if not isinstance(state, dict):
         raise QPError.expected("checkpoint", f"a {type(state).__name__}", "a run's state", remedy)
     if missing := [key for key in STATE if key not in state]:
@@ -104,35 +103,36 @@ def check_state(state: Any, cfg: DictConfig) -> None:
         )
     if changed := differences(state["config"], settings(cfg)):
         then, now = changed
-        remedy = "A run goes on with its own configuration, and from its own checkpoints."
+        remedy = "A run resumes with its own configuration, from its own checkpoints."
         raise QPError.expected(
-            "checkpoint", f"one of a run with {then}", f"config.yaml's {now}", remedy
+            "checkpoint", f"one from a run with {then}", f"config.yaml's {now}", remedy
         )
 
 
 def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, dict | None]:
-    """The configuration of a run that was stopped, and its last state; None before the first.
+    """Load a stopped run's configuration and last state, or None before its first checkpoint.
 
     Args:
         path: the run's folder, or one of its checkpoints.
-        overrides: what train.py was called with.
+        overrides: the command line's overrides, only ``resume=..`` among them.
 
     Raises:
-        QPError: there is no run to go on with, it cannot be read or is another's, or something
-            else was asked for, too.
+        QPError: there is no stopped run, its state is damaged or another run's, or there are
+            other overrides.
     """
     if others := [override for override in overrides if not override.startswith("resume=")]:
-        remedy = "A run goes on with its own configuration."
-        raise QPError.expected("resume", f"{', '.join(others)}, too", "nothing else", remedy)
+        remedy = "A run resumes with its own configuration."
+        got = f"it together with {', '.join(others)}"
+        raise QPError.expected("resume", got, "no other override", remedy)
     if not isinstance(path, str | Path):
         raise QPError.expected("resume", repr(path), "a path")
     path = Path(path)
     checkpoint = path / CHECKPOINT if path.is_dir() else path
     config = checkpoint.with_name("config.yaml")
     if not config.exists():
-        raise QPError.expected("resume", f"{path}, without config.yaml", "a folder of train.py's")
+        raise QPError.expected("resume", f"{path}, without config.yaml", "a run's folder")
     if checkpoint.with_name("summary.json").exists():
-        raise QPError.expected("resume", f"{path}, which is finished", "a run that was stopped")
+        raise QPError.expected("resume", f"{path}, which is finished", "a stopped run")
     cfg = load_config(config)
     if path.is_dir() and not checkpoint.exists():
         return cfg, None
@@ -142,33 +142,31 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
 
 
 def check_fresh(folder: str | Path) -> None:
-    """Raise `QPError` where a run, finished or stopped, has already written to ``folder``."""
+    """Raise `QPError` if ``folder`` already holds a run, finished or stopped."""
     folder = Path(folder)
-    remedy = f"Choose another folder by {ELSEWHERE}."
+    remedy = f"Choose another folder with {ELSEWHERE}."
     if (folder / "summary.json").exists():
         got = "which holds a finished run"
     elif any((folder / name).exists() for name in (*WRITTEN, CHECKPOINT, PREVIOUS)):
-        got = "which holds a run that was stopped"
-        with contextlib.suppress(Exception):  # a damaged file can make its readers raise anything
+        got = "which holds a stopped run"
+        with contextlib.suppress(Exception):  # damaged files raise errors of any type
             resumed(folder, [])
-            remedy = f"Go on with it by resume={folder}, or choose another folder by {ELSEWHERE}."
+            remedy = f"Resume it with resume={folder}, or choose another folder with {ELSEWHERE}."
     else:
         return
     raise QPError.expected("folder", f"{folder}, {got}", "one without a run", remedy)
 
 
 def check_own_folder(path: str | Path, folder: str | Path) -> None:
-    """Raise `QPError` unless ``folder`` is that of the run that goes on from ``path``."""
+    """Raise `QPError` unless ``folder`` is the one of the run resumed from ``path``."""
     own = Path(folder_of(str(path), ""))
     if own.resolve() != Path(folder).resolve():
-        remedy = (
-            "A run goes on in its own folder: leave hydra.run.dir out, or copy the folder first."
-        )
+        remedy = "A run resumes in its own folder: omit hydra.run.dir, or copy the folder first."
         raise QPError.expected("folder", f"{folder} with resume={path}", f"{own}", remedy)
 
 
 def folder_of(resume: str | None, fresh: str) -> str:
-    """Where a run writes: into the folder that it goes on with, or into a ``fresh`` one."""
+    """Return the run's folder: the resumed run's, or ``fresh`` for a new run."""
     if resume is None:
         return str(Path(fresh))
     return str(Path(resume) if Path(resume).is_dir() else Path(resume).parent)
@@ -179,16 +177,16 @@ def _part(name: str) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
-        said = str(error).strip().partition("\n")[0]
-        got = f"{name!r} that does not fit ({type(error).__name__}: {said})"
-        remedy = "The checkpoint before may: resume=FOLDER/checkpoint-previous.pt."
+        reason = str(error).strip().partition("\n")[0]
+        got = f"{name!r} that does not fit ({type(error).__name__}: {reason})"
+        remedy = "Try the previous checkpoint: resume=FOLDER/checkpoint-previous.pt."
         raise QPError.expected("checkpoint", got, "the state of this run", remedy) from error
 
 
 def _collector_state(collector: BaseCollector) -> dict[str, Any] | None:
     if not isinstance(collector, Collector) or not isinstance(collector.env, LinearSystemEnv):
         return None
-    # TorchRL's own state of a collector has neither where its episodes are nor whose they are.
+    # TorchRL's collector state lacks the current steps and the ids of the episodes.
     return {
         "episodes": collector._carrier.to_dict(),
         "trajectories": collector._traj_pool.state_dict(),

@@ -1,4 +1,4 @@
-"""Sweeps: a run that has finished is not done again, and one line shows how far the sweep is."""
+"""Sweeps: they skip finished runs, resume stopped ones, and show their progress in one line."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import threading
@@ -14,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from tqdm import tqdm
 
 from torch_qpmpc.errors import QPError
@@ -25,19 +27,19 @@ from torch_qpmpc.experiment.config import differences, load_config, settings
 from torch_qpmpc.experiment.lock import ELSEWHERE_IN_SWEEP
 from torch_qpmpc.experiment.run_state import check_state
 
-#: Seconds between two looks at what has ended.
+#: Seconds between two updates of the progress line.
 PERIOD = 0.5
 
 
 def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
-    """The summary of the run in ``folder``, or None where none has finished.
+    """Read the summary of the run in ``folder``; return None if the run has not finished.
 
     Args:
-        folder: of one run.
-        cfg: the settings that it must have had.
+        folder: the run's folder.
+        cfg: the settings that the run must have.
 
     Raises:
-        QPError: it has finished with other settings.
+        QPError: the run has finished with other settings.
     """
     folder = Path(folder)
     if not (folder / "summary.json").exists():
@@ -45,7 +47,7 @@ def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
     saved = settings(load_config(folder / "config.yaml"))
     if changed := differences(saved, settings(cfg)):
         then, now = changed
-        remedy = f"Remove it, or choose another folder by {ELSEWHERE_IN_SWEEP}."
+        remedy = f"Remove it, or choose another folder with {ELSEWHERE_IN_SWEEP}."
         raise QPError.expected(f"{folder}", f"a finished run with {then}", now, remedy)
     return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
 
@@ -66,26 +68,55 @@ def stopped_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
     return None
 
 
-def number_of_runs(config: DictConfig) -> int | None:
-    """How many runs a sweep has: those of its file and those of the command line, which go first.
-
-    Returns:
-        None where a sweeper is free to choose, as from an interval.
-    """
+def _overrides(config: DictConfig) -> dict[str, Override]:
+    """Return a sweep's overrides by key; the command line takes precedence over the file."""
     params = config.hydra.sweeper.get("params") or {}
     arguments = [f"{key}={value}" for key, value in params.items()]
     overrides = OverridesParser.create().parse_overrides([*arguments, *config.hydra.overrides.task])
-    latest = {override.get_key_element(): override for override in overrides}
-    axes = [override for override in latest.values() if override.is_sweep_override()]
+    return {override.get_key_element(): override for override in overrides}
+
+
+def number_of_runs(config: DictConfig) -> int | None:
+    """Count the runs of a sweep; return None if the sweeper draws values from an interval."""
+    axes = [override for override in _overrides(config).values() if override.is_sweep_override()]
     if not all(override.is_discrete_sweep() for override in axes):
         return None
     return math.prod(len(list(axis.sweep_string_iterator())) for axis in axes)
 
 
-class SweepProgress(Callback):
-    """One line for a sweep, whatever launches its runs: each leaves a note when it has ended.
+class SubFolders(Callback):
+    """Reduces Hydra's ``override_dirname`` to the overrides that the sweep varies.
 
-    Runs are other processes, perhaps of other machines, that share the sweep's folder.
+    The noise, the constraint and the seed are already in the sub-folder's name.
+    """
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        varied = config.hydra.sweeper.get("params") or {}
+        excluded = ["noise", "constraint", "seed"]
+        for key, override in _overrides(config).items():
+            if not override.is_sweep_override() and key not in varied:
+                excluded.append(override.key_or_group)
+        # Each run composes its configuration from these overrides and its own.
+        with open_dict(config), read_write(config):
+            config.hydra.overrides.hydra.append(
+                f"hydra.job.config.override_dirname.exclude_keys={excluded}"
+            )
+
+
+def sub_folder(*names: str) -> str:
+    """Join ``names`` to a folder's name, without characters that some file systems refuse."""
+    joined = "-".join(filter(None, names)).replace("+", "")
+    return re.sub(r"[^\w.,=-]+", "_", joined)
+
+
+# configs/config.yaml calls this.
+OmegaConf.register_new_resolver("sub_folder", sub_folder, replace=True)
+
+
+class SweepProgress(Callback):
+    """A sweep's progress line, for any launcher.
+
+    Each run, perhaps on another machine, leaves a note in the sweep's folder when it ends.
     """
 
     def __init__(self) -> None:
@@ -93,7 +124,7 @@ class SweepProgress(Callback):
         self.launcher = os.getpid()
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a run needs of it."""
+        """Return what the processes of the runs need."""
         return {"notes": self.notes, "launcher": self.launcher}
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
@@ -101,34 +132,34 @@ class SweepProgress(Callback):
         self.notes = folder / ".ended"
         shutil.rmtree(self.notes, ignore_errors=True)
         self.notes.mkdir(parents=True)
-        self.over = threading.Event()
-        arguments = self.notes, number_of_runs(config), self.over
+        self.ended = threading.Event()
+        arguments = self.notes, number_of_runs(config), self.ended
         self.line = threading.Thread(target=_show, args=arguments, daemon=True)
         self.line.start()
 
     def on_job_start(self, config: DictConfig, **_: Any) -> None:
-        self.before = (Path(config.hydra.runtime.output_dir) / "summary.json").exists()
+        self.skipped = (Path(config.hydra.runtime.output_dir) / "summary.json").exists()
         main_thread = threading.current_thread() is threading.main_thread()
         if os.getpid() != self.launcher and main_thread:
-            # Ctrl-C is the launcher's, which then ends its runs.
+            # The launcher handles Ctrl-C and ends its runs.
             signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **_: Any) -> None:
         if self.notes is None:
             return
         failed = job_return.status is not JobStatus.COMPLETED
-        outcome = "failed" if failed else "finished before" if self.before else "done"
+        outcome = "failed" if failed else "finished before" if self.skipped else "done"
         (self.notes / f"{config.hydra.job.num} {outcome}").touch()
 
     def on_multirun_end(self, **_: Any) -> None:
-        self.over.set()
+        self.ended.set()
         self.line.join()
 
 
-def _show(notes: Path, total: int | None, over: threading.Event) -> None:
+def _show(notes: Path, total: int | None, ended: threading.Event) -> None:
     with tqdm(total=total, desc=notes.parent.name, unit="run", dynamic_ncols=True) as line:
         while True:
-            last = over.wait(PERIOD)
+            last = ended.wait(PERIOD)
             outcomes = Counter(note.name.partition(" ")[2] for note in notes.iterdir())
             if outcomes.total() > line.n:
                 line.set_postfix(outcomes, refresh=False)

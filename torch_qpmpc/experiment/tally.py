@@ -1,4 +1,4 @@
-"""Running sums of a run: costs, violations, QPs and seconds."""
+"""Running totals of a run: costs, violations, QPs and seconds."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 @dataclass
 class Stopwatch:
-    """Seconds of one update: until its data were collected, and until its end."""
+    """The seconds of one update, split into collection and learning."""
 
     began: float
     data: float = 0.0
     total: float = 0.0
 
     def collected(self) -> None:
-        """End the collection; what follows is the learning."""
+        """Mark the end of the collection."""
         self.data = time.perf_counter() - self.began
 
     def metrics(self) -> dict[str, float]:
@@ -33,14 +33,15 @@ class Stopwatch:
 
 @dataclass
 class Tally:
-    """Running sums over the updates of a run.
+    """Running totals over the updates of a run.
 
     Attributes:
-        update: the number of the last one.
-        costs: the mean cost of a step, of each update.
-        violation: of the states' bounds, summed over all steps.
-        qps: counts of solves since the last row of metrics; ``unsolved``: failures before that.
-        seconds: of training, without the compilation of kernels, once for an installation.
+        update: number of the last update.
+        costs: mean stage cost of each update.
+        violation: violation of the state bounds, summed over all steps.
+        qps: counts of solves since the last row of metrics.
+        unsolved: number of unsolved QPs before that.
+        seconds: training time without the compilation of kernels.
     """
 
     update: int = 0
@@ -52,42 +53,42 @@ class Tally:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> Self:
-        """The tally of a checkpoint, from `state`."""
+        """Restore a tally from `state`."""
         parts: dict[str, Any] = state | {"qps": SolveLog(**state["qps"])}
         return cls(**parts)
 
     def state(self) -> dict[str, Any]:
-        """Plain numbers, for a checkpoint."""
+        """Return the tally as plain numbers, for a checkpoint."""
         return asdict(self)
 
     @contextmanager
     def timed(self) -> Iterator[Stopwatch]:
-        """Count the QPs of an update, and its seconds."""
+        """Count an update's QPs and measure its time."""
         watch = Stopwatch(time.perf_counter())
-        with self.qps, install_timer("numba:compile", self._leave_out):
+        with self.qps, install_timer("numba:compile", self._subtract):
             yield watch
         watch.total = time.perf_counter() - watch.began
         self.seconds += watch.total
 
-    def _leave_out(self, seconds: float) -> None:
-        """Subtract a compilation, as `timed` adds it with the rest."""
+    def _subtract(self, seconds: float) -> None:
+        """Subtract the time of a compilation, which `timed` includes."""
         self.seconds -= seconds
 
     def add(self, batch: TensorDictBase, violation: Tensor) -> None:
-        """Count an update, with the batch that it collected, and the violation of each state."""
+        """Add an update with its collected batch and the violation of each state."""
         self.update += 1
         self.costs.append(-batch["next", "reward"].mean().item())
         self.violation += violation.sum().item()
 
     def metrics(self) -> dict[str, float]:
-        """The scalars of a row; those of the QPs count from the row before."""
+        """Return the scalars of a row; QPs are counted since the previous row."""
         row = {"train/reward": -self.costs[-1], "train/violation": self.violation}
         row |= self.qps.metrics()
         self.unsolved, self.qps = self.unsolved + self.qps.unsolved, SolveLog()
         return row
 
     def summary(self) -> dict[str, float]:
-        """The cost of learning itself: over all updates, and over the last tenth of them."""
+        """Return the totals: time, violation, unsolved QPs, and the mean cost during training."""
         last = self.costs[-max(1, len(self.costs) // 10) :]
         return {
             "train_seconds": self.seconds,

@@ -1,1 +1,1 @@
-"""Finished runs, tabulated and drawn."""
+"""Tables and figures of finished runs."""

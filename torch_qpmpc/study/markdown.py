@@ -1,4 +1,4 @@
-"""Tables in Markdown, and their place in a file."""
+"""Markdown tables, and their insertion between markers."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from torch_qpmpc.errors import QPError
 
 
 def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """The first column to the left and the others to the right."""
+    """Format a table with the first column left-aligned and the others right-aligned."""
     rule = ["---"] + ["---:"] * (len(head) - 1)
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, rule, *lines))
 
 
 def replaced(text: str, new: str, marker: str) -> str:
-    """``text`` with ``new`` between the lines ``<!-- marker -->`` and ``<!-- /marker -->``.
+    """Replace what ``text`` has between ``<!-- marker -->`` and ``<!-- /marker -->`` by ``new``.
 
     Raises:
-        QPError: it has not one of each, in this order.
+        QPError: ``text`` does not have one of each, in this order.
     """
     begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
     counts = text.count(begin), text.count(end)

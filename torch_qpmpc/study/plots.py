@@ -1,4 +1,4 @@
-"""Figures of many finished runs: learning curves, learned matrices, paths, and what they mean."""
+"""Figures of many finished runs: learning curves, learned matrices, paths and model errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TICKS = [0, 0.02, 0.05, 0.1, 0.2, 0.5, 1], ["0", ".02", ".05", ".1", ".2", ".5",
 
 
 def colours(frame: pd.DataFrame) -> dict[str, tuple]:
-    """One for each label; the paper's cases always have the same."""
+    """Assign a colour to each label; the paper's cases always keep theirs."""
     labels = frame["label"].unique().tolist()
     palette = colormaps["tab10"].colors  # pyright: ignore[reportAttributeAccessIssue] -- no stubs
     order = [*CASES, *(label for label in labels if label not in CASES)]
@@ -30,21 +30,21 @@ def colours(frame: pd.DataFrame) -> dict[str, tuple]:
 
 
 def curves(frame: pd.DataFrame, column: str) -> tuple[np.ndarray, np.ndarray]:
-    """The updates at which all runs logged ``column``, and its values ``(runs, updates)``."""
+    """Return the updates that all runs logged of ``column``, and its values ``(runs, updates)``."""
     logged = [run.metrics[column].dropna() for run in frame["run"]]
     together = pd.concat(logged, axis=1, join="inner")
     return together.index.to_numpy(), together.to_numpy().T
 
 
 def draw_band(axes: Axes, x: np.ndarray, runs: np.ndarray, label: str, colour: tuple) -> None:
-    """The interquartile mean over runs ``(runs, len(x))``, and its bootstrapped interval."""
+    """Draw the interquartile mean over ``runs`` ``(runs, len(x))`` with its bootstrap interval."""
     axes.plot(x, interquartile_mean(runs), color=colour, label=label)
     low, high = bootstrap_interval([runs], interquartile_mean)
     axes.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
 
 
 def draw_J(axes: Axes, frame: pd.DataFrame) -> None:
-    """The paper's J against updates, between the means of its two ends."""
+    """Draw J over updates, with the means of the start's and the true model's J as lines."""
     for label, runs in frame.groupby("label", sort=False):
         x, J = curves(runs, "eval/J")
         draw_band(axes, x, J, str(label), colours(frame)[str(label)])
@@ -57,7 +57,7 @@ def draw_J(axes: Axes, frame: pd.DataFrame) -> None:
 
 
 def draw_gap(axes: Axes, frame: pd.DataFrame) -> None:
-    """What is left of the gap against updates, for the seeds with a real one."""
+    """Draw the gap left over updates, for the seeds with a real gap."""
     real = frame.query("real")
     for label, runs in real.groupby("label", sort=False):
         start, true = (runs[name].to_numpy()[:, None] for name in ("J_start", "J_true_model"))
@@ -72,7 +72,7 @@ def draw_gap(axes: Axes, frame: pd.DataFrame) -> None:
 
 
 def learning_figure(frame: pd.DataFrame) -> Figure:
-    """The paper's figures 1 and 3: J for each case, here with what is left of each seed's gap."""
+    """Draw the paper's figures 1 and 3, J for each case, and beside it the gap left."""
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     draw_J(left, frame)
@@ -84,13 +84,13 @@ def learning_figure(frame: pd.DataFrame) -> Figure:
 
 
 def shown_seed(frame: pd.DataFrame) -> int:
-    """The first seed that had a real gap; the first, if none had."""
+    """Return the first seed with a real gap, or the first seed if none has one."""
     seeds: list[int] = (frame.query("real") if has_real(frame) else frame)["seed"].tolist()
     return min(seeds)
 
 
 def constraints_figure(frame: pd.DataFrame) -> Figure:
-    """The paper's figures 2 and 4: C_theta of each case beside C_0, raw and, below, canonical."""
+    """Draw the paper's figures 2 and 4, C_theta of each case beside C_0; below, canonical."""
     runs = frame.query(f"seed == {shown_seed(frame)}")
     figure = Figure(figsize=(4 * (len(runs) + 1), 6), layout="constrained")
     panels = figure.subplots(2, len(runs) + 1, squeeze=False)
@@ -109,7 +109,7 @@ def constraints_figure(frame: pd.DataFrame) -> Figure:
 
 
 def trajectories_figure(frame: pd.DataFrame) -> Figure:
-    """Closed-loop paths of each case between its two ends, and the QP's first predictions."""
+    """Draw closed-loop paths of the start, each case and the true model, with predictions."""
     runs = frame.query(f"seed == {shown_seed(frame)}")
     figure = Figure(figsize=(4 * len(runs), 4.5), layout="constrained")
     for axes, label, run in zip(
@@ -128,7 +128,7 @@ def trajectories_figure(frame: pd.DataFrame) -> Figure:
 
 
 def policies_figure(frame: pd.DataFrame) -> Figure:
-    """A slice of the value and of the first action: each case between its two ends."""
+    """Draw slices of value and first action of the start, each case and the true model."""
     runs = frame.query(f"seed == {shown_seed(frame)}")
     first: FinishedRun = runs["run"].iloc[0]
     shown = {"start": first.start}
@@ -153,7 +153,7 @@ def policies_figure(frame: pd.DataFrame) -> Figure:
 
 
 def draw_meaning(axes: Axes, frame: pd.DataFrame) -> None:
-    """The error of the model read from C against that of the start's."""
+    """Draw the error of the model read from C over the error of the corrupted model."""
     for label, runs in frame.groupby("label", sort=False):
         colour = [colours(frame)[str(label)]]
         axes.scatter(
@@ -169,7 +169,7 @@ def draw_meaning(axes: Axes, frame: pd.DataFrame) -> None:
 
 
 def draw_use(axes: Axes, frame: pd.DataFrame) -> None:
-    """What is left of the gap against how much nearer the truth the model came."""
+    """Draw the gap left over the ratio of the learned to the corrupted model's error."""
     real = frame.query("real")
     for label, runs in real.groupby("label", sort=False):
         ratio = runs["prediction_error"] / runs["prediction_error_start"]
@@ -182,7 +182,7 @@ def draw_use(axes: Axes, frame: pd.DataFrame) -> None:
 
 
 def meaning_figure(frame: pd.DataFrame) -> Figure:
-    """Does the learned C mean anything: is its model nearer the truth, and does J need that?"""
+    """Draw the model errors of the learned C, and the gap left over their ratio."""
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
     draw_meaning(left, frame)
@@ -191,9 +191,9 @@ def meaning_figure(frame: pd.DataFrame) -> Figure:
 
 
 def frontier_figure(frame: pd.DataFrame) -> Figure:
-    """Return, structure and prediction: each setting's medians over its runs with a real gap.
+    """Draw each setting's medians of gap left, distance and model error over runs with a real gap.
 
-    To the left is structure, below is return, and bright is a model that predicts. The settings are
+    Better is to the left (distance), below (gap) and brighter (model error). The settings are
     numbered in the order of the table.
     """
     real = frame.query("real").assign(
@@ -229,7 +229,7 @@ def frontier_figure(frame: pd.DataFrame) -> Figure:
 
 
 def ablation_figure(frame: pd.DataFrame) -> Figure:
-    """What each ablation leaves of the gap: every run, the median and its interval, by noise."""
+    """Draw the gap left by each ablation: every run, the median and its interval, by noise."""
     real = frame.query("real")
     noises = sorted(real["noise"].unique())
     figure = Figure(figsize=(5 * len(noises), 0.4 * len({*real["ablation"]}) + 1.5))
@@ -253,7 +253,7 @@ def ablation_figure(frame: pd.DataFrame) -> Figure:
 
 
 def readme_figure(frame: pd.DataFrame) -> Figure:
-    """The study in one picture: what is left of the gap under each noise, and what C means."""
+    """Draw the study in one figure: the gap left under each noise, and the model errors."""
     noises = sorted(frame["noise"].unique(), reverse=True)
     figure = Figure(figsize=(4 * (len(noises) + 1), 3.6), layout="constrained")
     panels = figure.subplots(1, len(noises) + 1)

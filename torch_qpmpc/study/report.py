@@ -1,9 +1,9 @@
 """Tables and figures of finished runs: ``python -m torch_qpmpc.report RUNS_FOLDER``.
 
-They go to RUNS_FOLDER/report, a folder for each sweep: the paper's four figures, with intervals
-over seeds (learning-NOISE.png are its figures 1 and 3, constraints-NOISE.png its 2 and 4),
-closed-loop paths, slices of value and policy, what the learned C means, and, where settings were
-swept, the frontier and the ablations.
+The report is written to RUNS_FOLDER/report, with a folder for each sweep: the paper's figures with
+intervals over seeds (1 and 3: learning-NOISE.png, 2 and 4: constraints-NOISE.png), closed-loop
+paths, slices of value and policy, model errors, and for swept settings the frontier and the
+ablations.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from torch_qpmpc.study.plots import (
 from torch_qpmpc.study.runs import CASES, REAL_GAP, collect, has_real
 from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
 
-#: So many settings fit side by side in a figure.
+#: Largest number of settings that fit side by side in a figure.
 SIDE_BY_SIDE = 8
 CAPTION = f"""\
 Closed gap: median and 95% interval (bootstrapped over seeds) of the runs with a real gap, J_start -
-J_true_model >= {REAL_GAP:.0f}; how many of all these are. The others are medians over all runs.
-J: from the start to what was learned, and in brackets that of the true model. Distance: of C's
-predictions to those of the nearest time-invariant MPC scheme, as a share. Zeros: the share of C's
-entries above the band that are exactly zero. Prediction error: of one step, root mean square, with
-the corrupted (A, B), and with that scheme's; how often the latter is the smaller."""
+J_true_model >= {REAL_GAP:.0f}, and their number. All other entries are medians over all runs.
+J: start to learned, with the true model in brackets. Distance: relative distance of C's predictions
+from those of the nearest time-invariant MPC scheme. Zeros: share of C's entries above the band that
+are exactly zero. Prediction error: root mean square over one step, of the corrupted (A, B) and of
+that scheme's, and the number of runs in which the latter is smaller."""
 
 
 def runs_table(frame: pd.DataFrame) -> str:
-    """Every run with its two ends, as Markdown."""
+    """Format all runs as a Markdown table."""
     head = ["sweep", "noise", "case", "seed", "J_start", "J_final", "J_true_model", "closed_gap"]
     head += [
         "canonical_distance",
@@ -68,7 +68,7 @@ def runs_table(frame: pd.DataFrame) -> str:
 
 
 def cases_table(sweep: pd.DataFrame) -> str:
-    """A sweep by noise and case, as Markdown."""
+    """Format a sweep by noise and case as a Markdown table."""
     lines = []
     for noise, label in dict.fromkeys(zip(sweep["noise"], sweep["label"], strict=True)):
         runs = sweep.query(f"noise == {noise!r} and label == {label!r}")
@@ -103,7 +103,7 @@ def _ends(median: pd.Series, name: str) -> str:
 
 
 def overall(sweep: pd.DataFrame) -> str:
-    """The closed gap of the paper's learned cases together, each a stratum of the bootstrap."""
+    """Format the closed gap over the paper's cases that learn C, bootstrapped by case."""
     lines = []
     for noise, runs in sweep.query("real").groupby("noise"):
         cases = [runs.query(f"label == {case!r}")["closed_gap"].to_numpy() for case in CASES[1:]]
@@ -118,12 +118,12 @@ def overall(sweep: pd.DataFrame) -> str:
 
 
 def has_ablations(sweep: pd.DataFrame) -> bool:
-    """Whether it compares ablations, of runs that had a gap to close."""
+    """Return True if the sweep compares ablations and has a real gap."""
     return "ablation" in sweep and len({*sweep["ablation"]}) > 1 and has_real(sweep)
 
 
 def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
-    """The figures of a sweep, each with its name."""
+    """Yield the figures of a sweep, each with its name."""
     if len({*sweep["label"]}) <= SIDE_BY_SIDE:
         for noise, runs in sweep.groupby("noise"):
             yield f"learning-{noise}", learning_figure(runs)
@@ -139,14 +139,14 @@ def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
 
 
 def write(frame: pd.DataFrame, folder: Path) -> str:
-    """Everything into ``folder``; returns the tables by case."""
+    """Write the report into ``folder``; return its tables."""
     parts = []
     for name, sweep in frame.groupby("sweep"):
-        place = folder / str(name)
-        place.mkdir(parents=True, exist_ok=True)
+        own_folder = folder / str(name)
+        own_folder.mkdir(parents=True, exist_ok=True)
         links = []
         for title, figure in figures(sweep):
-            figure.savefig(place / f"{title}.png", dpi=100)
+            figure.savefig(own_folder / f"{title}.png", dpi=100)
             links.append(f"![{title}]({(Path(str(name)) / title).as_posix()}.png)")
         parts.append(((f"## {name}", section(sweep)), links))
     tables = "\n\n".join("\n\n".join(text) for text, _ in parts)
@@ -157,12 +157,12 @@ def write(frame: pd.DataFrame, folder: Path) -> str:
 
 
 def section(sweep: pd.DataFrame) -> str:
-    """A sweep's table, and what its learned cases come to."""
+    """Format a sweep's table and, below it, its overall closed gap."""
     return "\n\n".join(text for text in (cases_table(sweep), overall(sweep)) if text)
 
 
 def write_readme(frame: pd.DataFrame, readme: Path, name: str) -> None:
-    """The tables between the markers ``name`` of a README, and notebooks/NAME.png beside it."""
+    """Write the tables between a README's markers ``name``, and notebooks/NAME.png beside it."""
     text = readme.read_text(encoding="utf-8")
     tables = [f"**{title}**\n\n{section(sweep)}" for title, sweep in frame.groupby("sweep")]
     readme.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), name), encoding="utf-8")
@@ -171,7 +171,7 @@ def write_readme(frame: pd.DataFrame, readme: Path, name: str) -> None:
 
 
 def headline(sweep: pd.DataFrame) -> Figure:
-    """A sweep in one figure."""
+    """Draw a sweep in one figure."""
     if has_ablations(sweep):
         return ablation_figure(sweep)
     if len({*sweep["label"]}) > SIDE_BY_SIDE:
@@ -182,13 +182,13 @@ def headline(sweep: pd.DataFrame) -> Figure:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m torch_qpmpc.report",
-        description="Tables and figures of finished runs.",
+        description="Write tables and figures of finished runs.",
     )
     parser.add_argument(
-        "folder", type=Path, metavar="RUNS_FOLDER", help="searched with all its subfolders"
+        "folder", type=Path, metavar="RUNS_FOLDER", help="folder of the runs, at any depth"
     )
     parser.add_argument(
-        "--readme", type=Path, help="write the tables between its lines <!-- RUNS_FOLDER -->, too"
+        "--readme", type=Path, help="file whose <!-- RUNS_FOLDER --> section gets the tables"
     )
     options = parser.parse_args(arguments)
     try:

@@ -1,6 +1,6 @@
-"""Finished runs: what they wrote, as one table, and the QP that each has learned.
+"""Finished runs: their results as one table, and the QP that each has learned.
 
-What is read from a learned C here does not depend on its gauge.
+All readings of a learned C are independent of its gauge.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ from torch_qpmpc.experiment.tasks import make_mpc, make_physics, make_true_mpc, 
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
 
-#: The paper's, in its order.
+#: The paper's cases, in its order.
 CASES = ("fixed", "free", "deviation", "si", "combined")
-#: The least J_start - J_true_model of a run whose closed gap says something.
+#: Smallest J_start - J_true_model for which the closed gap is meaningful.
 REAL_GAP = 50.0
-#: What differs between runs of one kind, or does not bear on what is learned.
-_NO_SETTING = ("seed", "figures", "threads", "log_interval", "eval_interval", "logger")
+#: Settings that labels leave out: they vary within a case, or do not affect learning.
+_UNLABELLED = ("seed", "figures", "threads", "log_interval", "eval_interval", "logger")
 
 
 @dataclass(frozen=True, eq=False)
 class FinishedRun:
-    """A run's folder, read again.
+    """A finished run, read from its folder.
 
     Attributes:
-        folder: with config.yaml and checkpoint.pt.
+        folder: the run's folder, with config.yaml and checkpoint.pt.
     """
 
     folder: Path
 
     @cached_property
     def cfg(self) -> DictConfig:
-        """Its settings.
+        """The run's configuration.
 
         Raises:
-            QPError: they are not those of today's configs/.
+            QPError: it does not match this version's configs/.
         """
         cfg = load_config(self.folder / "config.yaml")
         try:
@@ -62,8 +62,8 @@ class FinishedRun:
             raise QPError.expected(
                 str(self.folder),
                 f"a run with other keys ({error})",
-                "one of this version",
-                "Repeat it, or move it away.",
+                "a run of this version",
+                "Repeat it, or move it elsewhere.",
             ) from None
         return cfg
 
@@ -78,12 +78,12 @@ class FinishedRun:
 
     @cached_property
     def true(self) -> QPMPC | None:
-        """The QP with the true model, if there is one."""
+        """The QP with the true model; None if that is unknown."""
         return make_true_mpc(self.cfg, self.physics)
 
     @cached_property
     def learned(self) -> QPMPC:
-        """The QP that was learned."""
+        """The learned QP."""
         state = load_checkpoint(self.folder / CHECKPOINT)
         mpc = make_mpc(self.cfg, self.physics)
         if state["structure"] != mpc.structure:
@@ -93,20 +93,20 @@ class FinishedRun:
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """metrics.csv by update."""
+        """The content of metrics.csv by update."""
         return read_metrics(self.folder)
 
     def readings(self) -> dict[str, float]:
-        """What the learned constraints say.
+        """Read zeros and model errors from the learned constraints.
 
-        The model read from them is the time-invariant one whose predictions are nearest. Its error
-        is the root mean square of ``A x + B u`` minus the true one's, over start states x and
+        Their model is the time-invariant one with the nearest predictions. Its error is the root
+        mean square difference of ``A x + B u`` from the true model's, over start states x and
         actions u drawn uniformly from their bounds.
 
         Returns:
-            ``zeros_above``, the share of C's entries above the band that are exactly zero;
-            ``prediction_error`` and, of the model at the start, ``prediction_error_start``: nan
-            where the constraints do not determine the states, or the plant has no such model.
+            ``zeros_above``, the share of C's entries above the band that are exactly zero, and
+            ``prediction_error`` and ``prediction_error_start`` of the learned and the initial
+            model, nan if the constraints do not determine the states or the true model is unknown.
         """
         mpc = self.learned
         above = band_distance(mpc.n_x, mpc.n_u, mpc.horizon) > 0
@@ -116,7 +116,7 @@ class FinishedRun:
             "prediction_error_start": math.nan,
         }
         if true_model(self.physics) is not None:
-            physics = cast(LinearSystem, self.physics)  # no other plant has a true model
+            physics = cast(LinearSystem, self.physics)  # the only plants with a true model
             with contextlib.suppress(QPError):
                 learned, start = (nearest_model(predictions(m)) for m in (mpc, self.start))
                 readings["prediction_error"] = prediction_error(learned, physics)
@@ -125,12 +125,12 @@ class FinishedRun:
 
 
 def has_real(frame: pd.DataFrame) -> bool:
-    """Whether any of `collect`'s runs had a gap worth closing."""
+    """Return True if any of `collect`'s runs has a real gap."""
     return any(frame["real"])
 
 
 def prediction_error(model: Model, physics: LinearSystem) -> float:
-    """`one_step_error` over start states and uniform actions, in units of the state."""
+    """Compute `one_step_error` over start states and uniform actions, in units of the state."""
     rng = np.random.default_rng(123)
     s = physics.starts(rng, 1024)
     share = torch.as_tensor(rng.random((1024, physics.B.shape[1])))
@@ -139,14 +139,15 @@ def prediction_error(model: Model, physics: LinearSystem) -> float:
 
 
 def collect(folder: str | Path) -> pd.DataFrame:
-    """Every finished run below ``folder``: summary.json, what is read from the learned QP, and
+    """Collect every finished run below ``folder``.
 
-    ``run``, a `FinishedRun`; ``sweep``, the folder that it is in; ``label``, its case, and its
-    ablation or in what settings it differs from others of the same case in that sweep; ``real``,
-    whether there was a gap worth closing.
+    Returns:
+        A row for each run: the entries of summary.json, `FinishedRun.readings`, ``run``, a
+        `FinishedRun`, ``sweep``, the folder that contains the run, ``label``, its case with its
+        ablation or the settings that vary in the sweep, and ``real``, True if the gap is real.
 
     Raises:
-        QPError: there is none.
+        QPError: there is no finished run.
     """
     folder = Path(folder)
     files = sorted(folder.rglob("summary.json"))
@@ -163,7 +164,7 @@ def collect(folder: str | Path) -> pd.DataFrame:
         rows.append({**summary, "run": run, "sweep": sweep, **run.readings()})
     frame = pd.DataFrame(rows)
     for name in ("closed_gap", "J_true_model", "J_discounted_true_model", "canonical_distance"):
-        # JSON's null where there is no gap, no true model or no QP.
+        # These are null without a gap, a true model or a QP.
         frame[name] = frame[name].astype(float) if name in frame else math.nan
     frame["real"] = frame["J_start"] - frame["J_true_model"] >= REAL_GAP
     frame["label"] = ""
@@ -176,24 +177,24 @@ def collect(folder: str | Path) -> pd.DataFrame:
 
 
 def _labels(sweep: pd.DataFrame) -> list[str]:
-    kinds = [_kind(run.cfg) for run in sweep["run"]]
+    labelled = [_labelled_settings(run.cfg) for run in sweep["run"]]
     values: dict[tuple[str, str], set[str]] = {}
-    for case, of_run in zip(sweep["constraint"], kinds, strict=True):
+    for case, of_run in zip(sweep["constraint"], labelled, strict=True):
         for key, value in of_run.items():
             values.setdefault((case, key), set()).add(str(value))
     labels = []
-    for case, of_run in zip(sweep["constraint"], kinds, strict=True):
+    for case, of_run in zip(sweep["constraint"], labelled, strict=True):
         varied = [key for key in of_run if len(values[case, key]) > 1]
-        told = [f"{key.split('.')[-1]}={of_run[key]}" for key in varied]
+        details = [f"{key.split('.')[-1]}={of_run[key]}" for key in varied]
         if of_run["ablation"] is not None:
-            told = [of_run["ablation"]]
-        labels.append(", ".join([case, *told]))
+            details = [of_run["ablation"]]
+        labels.append(", ".join([case, *details]))
     return labels
 
 
-def _kind(cfg: DictConfig) -> dict[str, Any]:
+def _labelled_settings(cfg: DictConfig) -> dict[str, Any]:
     return {
         key: value
         for key, value in settings(cfg).items()
-        if key not in _NO_SETTING and not key.startswith("noise.")
+        if key not in _UNLABELLED and not key.startswith("noise.")
     }

@@ -1,4 +1,4 @@
-"""Robust averages over seeds, and how sure they are."""
+"""Robust averages over seeds, and their confidence intervals."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from torch_qpmpc.errors import QPError
 
 
 def interquartile_mean(x: np.ndarray, axis: int = 0) -> np.ndarray:
-    """The mean of the middle half along ``axis``: of an order statistic, the part that lies there.
+    """Compute the mean of the middle half of the values along ``axis``.
 
-    It uses more of the data than the median, and like it does not see a few outliers.
+    It uses more of the data than the median, and ignores outliers like the median.
 
     Args:
-        x: ``(.., n, ..)``; where n is no multiple of four, two values count in part.
+        x: the values ``(.., n, ..)``; unless n is a multiple of four, two are weighted in part.
+        axis: the axis of n.
 
     Example:
         >>> import numpy as np
@@ -27,7 +28,7 @@ def interquartile_mean(x: np.ndarray, axis: int = 0) -> np.ndarray:
     """
     try:
         ordered = np.sort(np.moveaxis(np.asarray(x, dtype=float), axis, -1), axis=-1)
-    except ValueError as error:  # also of an axis that there is not
+    except ValueError as error:  # no numbers, or no such axis
         raise QPError.expected("x", f"{error}", f"numbers along axis {axis}") from error
     if not ordered.shape[-1]:
         raise QPError.expected("x", "no values", f"at least one along axis {axis}")
@@ -44,22 +45,23 @@ def bootstrap_interval(
     resamples: int = 2000,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The stratified percentile bootstrap interval of a statistic of all runs.
+    """Compute the stratified percentile bootstrap interval of a statistic of all runs.
 
-    Each stratum, as the seeds of one case, is resampled by itself, so that every case keeps its
-    number of runs.
+    Each stratum, such as the seeds of one case, is resampled separately, so that every case keeps
+    its number of runs.
 
     Args:
         strata: arrays ``(n_i, ...)``.
-        statistic: of an array, along ``axis``.
-        level: of confidence.
-        resamples, seed: of the bootstrap.
+        statistic: a function of an array and ``axis``.
+        level: the level of confidence.
+        resamples: number of resamples.
+        seed: seed of the resampling.
 
     Returns:
         The lower and the upper end, each ``(...)``.
 
     Raises:
-        QPError: a stratum is empty, or an argument is of another kind.
+        QPError: a stratum is empty, or an argument is invalid.
 
     Example:
         >>> import numpy as np
@@ -76,14 +78,14 @@ def bootstrap_interval(
         shapes = [s.shape for s in strata]
         raise QPError.expected("strata", f"shapes {shapes}", "(n_i, ...) with ... the same for all")
     if not callable(statistic):
-        raise QPError.expected("statistic", repr(statistic), "a function", "Such as numpy.median.")
+        raise QPError.expected("statistic", repr(statistic), "a function, such as numpy.median")
     check_number("level", level, lambda x: 0 < x < 1, "a level in (0, 1)", "95% is 0.95.")
     check_whole("resamples", resamples, 1)
     check_whole("seed", seed, 0)
     if not strata or not all(len(stratum) for stratum in strata):
         sizes = [len(stratum) for stratum in strata]
         raise QPError.expected("strata", f"sizes {sizes}", "at least one run in each")
-    # scipy resamples two runs at least: a single one is doubled, and its twin left out again.
+    # scipy needs two runs per stratum: repeat a single run, and drop the copy in the statistic.
     doubled = [np.repeat(stratum, 1 + (len(stratum) == 1), axis=0) for stratum in strata]
 
     def of_all(*drawn: np.ndarray, axis: int) -> np.ndarray:

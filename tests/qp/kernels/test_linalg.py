@@ -9,7 +9,7 @@ from torch_qpmpc.qp.kernels import linalg
 from torch_qpmpc.qp.kernels.linalg import products, transposed_products
 
 
-def test_where_nothing_can_be_written_kernels_are_compiled_each_time(monkeypatch):
+def test_without_a_writable_cache_kernels_are_compiled_each_time(monkeypatch):
     njit = numba.njit
 
     def refuses(*arguments, cache=False, **options):

@@ -38,12 +38,12 @@ SPOILERS = {
 
 
 def both(known: KnownQP) -> tuple[Programs, Programs]:
-    """For the compiled loops, and for their torch forms on the CPU."""
+    """Run the test for the compiled loops and for their torch forms on the CPU."""
     return programs_of(known, None), programs_of(known)
 
 
 def reference(known: KnownQP, **claim: Tensor) -> float:
-    """The certificate's residual of one QP, as its docstring says it."""
+    """Compute the certificate's residual of one QP by the formulas of its docstring."""
     H, q, _, C, b, G, lb, ub, w = (x.numpy() for x in known.qp.tensors())
     z, lam, chi, xi = (claim[n].numpy() for n in ("z", "lam", "chi", "xi"))
     n_f = len(xi)
@@ -74,7 +74,7 @@ def reference(known: KnownQP, **claim: Tensor) -> float:
 
 
 @pytest.mark.parametrize("name", ["nothing", "z", "lam", "chi", "xi", "large"])
-def test_the_residual_is_what_the_certificate_says(name):
+def test_the_residual_is_the_certificates(name):
     for seed in range(4):
         known = known_qp(seed)
         claim = {n: getattr(known, n).clone() for n in ("z", "lam", "chi", "xi")}
@@ -159,11 +159,11 @@ def test_the_full_solution_of_diagonal_matrices_is_that_of_torch():
 
 
 def assert_settled_alike(compiled: Programs, in_torch: Programs, active: Tensor) -> int:
-    """How many could be compared: those that do not settle need not be the same."""
+    """Compare the QPs that settle in both; return their number."""
     given = np.ascontiguousarray(active.numpy())
     ours, settled = try_active_sets(compiled, compiled.reduced_qps(), given)
     others, done = try_active_sets(in_torch, in_torch.reduced_qps(), active)
-    # Sets of rows that depend on each other have no solution at all.
+    # Linearly dependent sets of rows have no solution.
     done &= others.v.isfinite().all(-1)
     assert torch.equal(to_tensor(settled), done)
     for one, other in zip(map(to_tensor, ours), others, strict=True):
@@ -202,7 +202,7 @@ def test_the_reduced_problem_is_that_of_torch(matrices):
 @pytest.mark.parametrize("spoilt", [False, True])
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])
 def test_the_whole_pipeline_in_tensors_is_that_in_arrays(matrices, spoilt, start):
-    """What another device does, on the CPU: an invalid, an infeasible and solved QPs."""
+    """Run the other devices' path on the CPU, for invalid, infeasible and solvable QPs."""
     known = known_qp(2, batch=(BATCH,), matrices=matrices)
     q, lb = known.qp.q.clone(), known.qp.lb.clone()
     if spoilt:

@@ -1,4 +1,4 @@
-"""What follows from theta: equal to what it stands for, by NumPy."""
+"""The preparation of theta against NumPy."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_no_theta_at_all_is_condensed():
 @pytest.mark.parametrize("matrices", [(), (BATCH,), (1,)])
 @pytest.mark.parametrize("batch", [(), (BATCH,)])
 def test_the_reduced_problem_is_the_problem_in_fewer_variables(batch, matrices):
-    """Its cost differs by a constant, its rows' distances to their bounds not at all."""
+    """Its cost differs by a constant; the rows' distances to their bounds are equal."""
     for seed in range(4):
         known = known_qp(seed, batch=batch, matrices=matrices if batch else ())
         p, reduced = programs_of(known), reduced_of(known)

@@ -46,7 +46,7 @@ def test_bounds_that_cross_by_rounding_alone_are_equal():
 
 @pytest.mark.parametrize("device", [None, CPU])
 @pytest.mark.parametrize("matrices", [(), (6,)])
-def test_taken_programs_have_their_own_matrices(matrices, device):
+def test_taken_programs_have_separate_matrices(matrices, device):
     programs = programs_of(known_qp(0, batch=(6,), matrices=matrices), device)
     index = np.array([4, 1])
     part = programs.take(index)
@@ -60,7 +60,7 @@ def test_taken_programs_have_their_own_matrices(matrices, device):
     assert isinstance(part.fixed, type(programs.fixed))
 
 
-def test_taken_programs_of_one_theta_share_what_follows_from_it():
+def test_taken_programs_of_one_theta_share_its_preparation():
     known = known_qp(0)
     programs, _ = Programs.of(*known.qp.tensors(), normal(5, 2))
     assert programs.take(np.array([3, 0])).prepared is programs.prepared

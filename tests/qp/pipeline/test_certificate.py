@@ -24,13 +24,13 @@ class Certificate(NamedTuple):
 
 
 def certify(p: Programs, *claim: Tensor) -> Certificate:
-    """By the compiled loops; `tests.qp.kernels.test_sample` compares the others with them."""
+    """Certify with the compiled loops; `tests.qp.kernels.test_sample` compares the torch forms."""
     found = certificate_module.certify(p, *(x.numpy() for x in claim))
     return Certificate(*map(torch.from_numpy, found))
 
 
 def judge(known: KnownQP, **claim: Tensor) -> Certificate:
-    """The certificate of the exact solution, but for what ``claim`` says."""
+    """Certify the exact solution with the changes in ``claim``."""
     exact = {"z": known.z, "lam": known.lam, "chi": known.chi, "xi": known.xi}
     parts = exact | claim
     return certify(programs_of(known, None), parts["z"], parts["lam"], parts["chi"], parts["xi"])
@@ -51,7 +51,7 @@ def test_exact_solutions_of_degenerate_costs_are_accepted(rank):
 
 
 def first_row(known: KnownQP, condition: Tensor) -> int:
-    """The first row of the spoilt element where the condition holds."""
+    """Find the first row of the spoilt element where the condition holds."""
     return int(condition[SPOILT].nonzero()[0, 0])
 
 
@@ -107,7 +107,7 @@ def consistent(known: KnownQP, z: Tensor, lam: Tensor, **bounds: Tensor) -> Cert
 
 
 def where(known: KnownQP, kinds: tuple[str, ...], *, hard: bool) -> Tensor:
-    """Which rows are of these kinds, by what the multipliers, slacks and bounds say."""
+    """Find the rows of these kinds by their multipliers, slacks and bounds."""
     qp, y = known.qp, known.z @ known.qp.G.mT
     is_kind = {
         "inside": (known.lam == 0) & qp.lb.isfinite() & qp.ub.isfinite(),
@@ -163,7 +163,7 @@ def test_a_violated_hard_row_is_rejected_and_a_soft_one_is_not():
 
 
 def unit_programs(q: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Programs:
-    """min 1/2 z'z + q'z over lb <= z <= ub."""
+    """Make min 1/2 z'z + q'z over lb <= z <= ub."""
     unit, none = torch.eye(len(q)), torch.zeros(0)
     C = none.reshape(0, len(q))
     return Programs.of(unit, q, none.sum(), C, none, unit, lb, ub, w, none)[0]
@@ -190,7 +190,7 @@ def test_complementarity_gaps_of_opposite_sign_do_not_cancel():
     assert certify(programs, 0 * z, lam, empty, empty).residual < TOLERANCE
 
 
-def test_absurd_multipliers_excuse_nothing():
+def test_absurd_multipliers_do_not_hide_errors():
     # min 1/2 z'z - 2 z_2 with z_1 = 0, once in C and once in G: z_2 is 2, not 1.9.
     C, none = torch.tensor([[1.0, 0.0]]), torch.zeros(1)
     q, hard = torch.tensor([0.0, -2.0]), torch.full((1,), torch.inf)
@@ -202,7 +202,7 @@ def test_absurd_multipliers_excuse_nothing():
         assert bool(residual <= TOLERANCE) == accepted
 
 
-def test_the_constant_is_part_of_the_value_but_loosens_nothing():
+def test_the_constant_is_part_of_the_value_but_not_of_the_tolerance():
     known = known_qp(5, batch=(BATCH,))
     lifted = replace(known, qp=replace(known.qp, c=known.qp.c + 1e9))
     claim = {"lam": shifted(known.lam, first_row(known, known.lam == 0), 1e-3)}

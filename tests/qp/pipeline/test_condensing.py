@@ -15,7 +15,7 @@ from torch_qpmpc.qp.pipeline.arrays import Theta
 from torch_qpmpc.qp.pipeline.condensing import Elimination, condense, in_order, null_space
 from torch_qpmpc.qp.solve import solve
 
-# The rows of C, by the size (3 fixed of 8) of the problems below.
+# Rows of C for the problems below, with 3 of 8 entries fixed.
 INDEPENDENT = normal(3, 8)
 DEPENDENT = normal(5, 3, seed=1) @ normal(3, 8, seed=2)
 REPEATED = torch.cat((INDEPENDENT, INDEPENDENT))
@@ -34,7 +34,7 @@ REGULAR = {"independent": INDEPENDENT, "none": NONE}
 
 
 def theta_of(H: Tensor, C: Tensor, G: Tensor) -> Theta:
-    """Theta of these matrices, and of vectors that condensing does not read."""
+    """Make theta of these matrices, with vectors that condensing does not use."""
     none = np.zeros((1, 0))
     return Theta(H.numpy(), C.numpy(), G.numpy(), *[none] * 6)
 
@@ -51,7 +51,7 @@ def test_elimination_spans_the_solutions_of_the_equalities(name):
     n_free = 8 - n_kept - int(torch.linalg.matrix_rank(C[0, :, n_kept:]))
     assert T.shape[-1] - n_kept == n_free
     assert_close(C @ T[:, :, n_kept:], torch.zeros(1, C.shape[1], n_free).double())
-    # A right-hand side that the entries after the kept ones can meet is met.
+    # Any right-hand side that the eliminated entries can satisfy is satisfied.
     b = C[:, :, n_kept:] @ normal(1, 5, 1, seed=4)
     assert_close(-C @ Y_neg @ b, b)
     assert_close(H_y, T.mT @ (H + H.mT) @ T)
@@ -65,7 +65,7 @@ def test_ranks_may_differ_within_a_batch():
     T, H = torch.from_numpy(arrays.T), torch.from_numpy(arrays.H)
     assert T.shape[-1] == 1 + (7 - 3)
     assert_close(C @ T[:, :, 1:], torch.zeros(2, 6, 4).double())
-    # The columns that the higher rank does without are zero, and their variables pinned.
+    # Columns that the higher rank does not need are zero, and their variables fixed.
     unused = (T[0, :, 1:] == 0).all(0)
     assert int(unused.sum()) == 3
     assert torch.linalg.eigvalsh(H).min() > 0.5
@@ -118,7 +118,7 @@ def test_a_batch_of_mixed_rank_is_solved():
 
 
 def test_a_rank_lost_to_the_kept_columns_is_regained_by_keeping_fewer():
-    # Row 0 can be met by entries 0 to 2 only, so an elimination that keeps them cannot meet it.
+    # Only entries 0 to 2 can satisfy row 0, so an elimination that keeps them cannot.
     C = INDEPENDENT.clone()
     C[0, 3:] = 0
     known = known_qp(5, n_z=8, n_f=1, C=C, batch=(3,), hard=())
@@ -136,7 +136,7 @@ def test_inconsistent_equalities_are_infeasible(name):
 
 
 def test_a_row_of_any_scale_counts():
-    """C z = b is the same whatever its rows are multiplied by."""
+    """Scaling rows of C z = b does not change it."""
     known = known_qp(4)
     scale = torch.tensor([1.0, 1e-11, 1e9]).double()
     C, b = scale[:, None] * known.qp.C, scale * known.qp.b
@@ -167,7 +167,7 @@ def recursion(A: Tensor, B: Tensor, horizon: int) -> Elimination | None:
 
 
 def test_in_the_order_of_its_rows_C_gives_the_prediction_form():
-    """However unstable the model is, x_k is that of the recursion, entry by entry."""
+    """x_k equals the recursion entry by entry, even for unstable models."""
     A = torch.tensor([[2.0, 0.1], [0.0, 1.5]]).double()
     B, horizon = torch.tensor([[0.3], [5.0]]).double(), 50
     found = recursion(A, B, horizon)

@@ -22,7 +22,7 @@ INF = torch.inf
 
 
 def program(H, q, G=(), lb=(), ub=(), w=(), *, C=(), b=()) -> QuadraticProgram:
-    """A QP in two variables, from lists."""
+    """Make a QP in two variables from lists."""
 
     def matrix(rows) -> Tensor:
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, 2)
@@ -89,8 +89,8 @@ CASES = [
 @pytest.mark.parametrize(
     ("name", "qp", "status"), CASES, ids=[f"{s.name} {n}" for n, _, s in CASES]
 )
-def test_what_cannot_be_solved_is_named_and_soon(solver, name, qp, status):
-    # Of this process's own time: a busy machine is not slow.
+def test_unsolvable_qps_are_diagnosed_quickly(solver, name, qp, status):
+    # In processor time, so that other load does not matter.
     began = time.process_time()
     solution = solve_qp(qp, solver=solver, on_failure="mask")
     assert time.process_time() - began < 2
@@ -122,7 +122,7 @@ def test_fixed_entries_that_break_an_equality_are_infeasible():
 
 
 def programs(qp: QuadraticProgram, fixed: Tensor | None = None) -> Programs:
-    """QPs as the chain has them; by default with nothing fixed."""
+    """Make the pipeline's QPs, by default without fixed entries."""
     fixed = torch.zeros(0).double() if fixed is None else fixed
     return Programs.of(*qp.tensors(), fixed)[0]
 
@@ -169,7 +169,7 @@ def test_matrices_of_its_own_for_each_element():
 
 
 @pytest.mark.parametrize("curvature", [1e-4, 1e-8])
-def test_little_curvature_is_not_called_unbounded(curvature):
+def test_small_curvature_is_not_unbounded(curvature):
     far = [1e9, 1e9]
     qp = program([[1, 0], [0, curvature]], [0, 1], [[1, 0], [0, 1]], [-1e9, -1e9], far, [1, 1])
     assert diagnose(programs(qp)).tolist() == [Status.NOT_CONVERGED]
@@ -186,7 +186,7 @@ def test_little_curvature_is_not_called_unbounded(curvature):
         ("scaled mixed", 16, 108, 4),
     ],
 )
-def test_what_was_once_called_not_converged_has_its_proof(family, count, seed, index):
+def test_qps_formerly_not_converged_have_their_proof(family, count, seed, index):
     case = FAMILIES[family](Draw(seed), count)
     qp, fixed = alone(case, index)
     solution = solve_qp(qp, fixed, solver="daqp", on_failure="mask")
@@ -194,13 +194,13 @@ def test_what_was_once_called_not_converged_has_its_proof(family, count, seed, i
 
 
 @pytest.mark.parametrize("far", [1.0, 1e2, 1e4, 1e6])
-def test_hard_rows_that_hold_only_far_away_are_not_called_infeasible(far):
+def test_hard_rows_that_hold_only_far_away_are_not_infeasible(far):
     rows = [[1, 0], [0, 1]]
     qp = program(rows, [0, 0], rows, [far, far], [2 * far, 2 * far], [INF, INF])
     assert diagnose(programs(qp)).tolist() == [Status.NOT_CONVERGED]
 
 
-#: Soft states, and actions within hard bounds, so that no state makes it infeasible or unbounded.
+#: Settings with soft states and hard action bounds, feasible and bounded for every state.
 BOUNDED: dict[str, Any] = {
     "stage_weight": [1.0, 0.1, 0.01],
     "state_bounds": ([-2, -10], [2, 10]),
@@ -209,14 +209,14 @@ BOUNDED: dict[str, Any] = {
 
 
 def growing(radius: float, horizon: int, **options: Any) -> QPMPC:
-    """An unstable plant, a Jordan block."""
+    """Make an unstable plant, a Jordan block."""
     A = [[radius, 0.1], [0.0, radius]]
     return QPMPC.from_model(A, [[0.0], [0.1]], horizon, **(BOUNDED | options))
 
 
 @pytest.mark.parametrize(
     ("radius", "horizon", "value"),
-    # By two solvers and two eliminations, which agree to all digits given.
+    # Computed by two solvers and two eliminations, which agree to the digits given.
     [(1.5, 30, 741101226.75), (1.5, 50, 3.557525499e14), (2.0, 50, 2.65969067e27)],
 )
 def test_states_that_no_action_holds_are_solved(solver, radius, horizon, value):
@@ -242,13 +242,13 @@ def test_an_unstable_plant_that_the_actions_hold_is_solved(solver, horizon):
         ([[1.0, 1e3], [1e3, 1.0]], 20),
     ],
 )
-def test_what_float64_cannot_solve_is_not_called_infeasible(solver, A, horizon):
+def test_qps_beyond_float64_are_not_infeasible(solver, A, horizon):
     mpc = QPMPC.from_model(A, [[0.0], [0.1]], horizon, solver=solver, on_failure="mask", **BOUNDED)
     status = mpc.solve(doubles([[0.0, 0.05], [1.0, 0.0], [-1.5, 3.0]])).status
     assert not ((status == Status.INFEASIBLE) | (status == Status.UNBOUNDED)).any()
 
 
-def test_not_converged_speaks_of_conditioning_and_of_what_helps():
+def test_not_converged_names_conditioning_and_the_remedy():
     mpc = growing(2.0, 40, solver="daqp")
     message = "1 NOT_CONVERGED.*unstable model over a long horizon: shorten the horizon"
     with pytest.raises(SolverError, match=message):
@@ -283,7 +283,7 @@ def test_noise_beside_large_numbers_spoils_no_proof(solver):
 
 
 @pytest.mark.parametrize("slope", [1e-7, 1e-9, 1e-11])
-def test_rows_that_meet_far_away_are_not_called_infeasible(slope):
+def test_rows_that_meet_far_away_are_not_infeasible(slope):
     # x >= 1 and y <= 0 with x <= y (1 - slope) + .. meet where y is -1 / slope.
     qp = program(UNIT, [0, 0], [[1, -1], [1, slope - 1]], [-INF, 1], [0, INF], [INF, INF])
     assert diagnose(programs(qp)).tolist() == [Status.NOT_CONVERGED]

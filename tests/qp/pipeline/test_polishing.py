@@ -13,7 +13,7 @@ BATCH = 5
 
 
 def in_numpy(known: KnownQP) -> tuple[SoftQPs, BackendSolution]:
-    """What is refined, and the exact solution."""
+    """Return a backend's input and its exact solution as arrays."""
     qps, exact = soft_qps(known)
     return qps.in_numpy(), exact.like(np.empty(0))
 

@@ -17,7 +17,7 @@ from torch_qpmpc.qp.pipeline.prepared import _Latest
 
 @pytest.fixture
 def eliminations(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
-    """The matrices that were eliminated since the test began."""
+    """Record the matrices that are eliminated during the test."""
     eliminated, eliminate = [], loops.eliminate
 
     def counting(C: np.ndarray, *arguments):
@@ -64,7 +64,7 @@ def test_only_the_latest_are_remembered():
     assert Programs.of(*known[0], fixed)[0].prepared is not prepared[0]
 
 
-def test_programs_that_differ_in_vectors_share_nothing():
+def test_programs_with_batched_vectors_share_no_preparation():
     known = known_qp(0, batch=(4,))
     assert programs_of(known).prepared is not programs_of(known).prepared
 

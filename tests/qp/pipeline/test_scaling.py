@@ -53,7 +53,7 @@ def test_units_are_powers_of_two_and_make_sizes_ordinary(matrices):
 
 @pytest.mark.parametrize("bound", [1e3, 1e5, 1e6, 1e8, 1e10])
 def test_bounds_that_are_far_away_change_no_answer(solver, bound):
-    """Large numbers in the place of no bound once made units in which every error was small."""
+    """Large numbers in place of infinite bounds once led to units that hid every error."""
     A, B, s = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], torch.tensor([[1.0, -0.5], [0.1, 0.2]])
     options = {"stage_weight": [1.0, 0.1, 0.01], "action_bounds": ([-1.0], [1.0])}
     free, far = (
@@ -95,7 +95,7 @@ def test_solutions_come_back_in_the_numbers_of_the_qp():
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])
 @pytest.mark.parametrize("spoilt", [torch.nan, torch.inf])
-def test_what_is_not_finite_is_left_to_its_own_status(matrices, spoilt):
+def test_non_finite_qps_get_their_own_status(matrices, spoilt):
     known = in_size(known_qp(2, batch=(BATCH,), matrices=matrices), cost=1e-7)
     q = known.qp.q.clone()
     q[1] = spoilt
@@ -115,8 +115,8 @@ def test_small_and_large_contradictions_are_infeasible(size):
     assert (solution.status == Status.INFEASIBLE).all()
 
 
-def test_what_is_solved_again_does_not_see_the_matrices_of_invalid_qps(solver):
-    """Of three QPs whose units are too large, one has NaN in its matrices."""
+def test_retries_exclude_the_matrices_of_invalid_qps(solver):
+    """One of three QPs with too large units has NaN in its matrices."""
     options = {"stage_weight": [1.0, 0.1, 0.01], "action_bounds": ([-1.0], [1.0])}
     A, B, far = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], ([-1e6] * 2, [1e6] * 2)
     qp = QPMPC.from_model(A, B, 10, state_bounds=far, **options).quadratic_program()

@@ -22,7 +22,7 @@ BATCH = 6
 
 
 def doctored(change: Callable[[BackendSolution], BackendSolution]) -> Backend:
-    """A backend that solves, and then changes its answer."""
+    """Make a backend that changes its solution afterwards."""
 
     def solve(qps: SoftQPs) -> BackendSolution:
         return change(daqp.solve(qps))
@@ -47,14 +47,14 @@ INACCURACIES = {
 
 @pytest.fixture
 def liar(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str:
-    """The name of a backend that tells the test's lie."""
+    """Register a backend that returns the test's wrong solution."""
     monkeypatch.setitem(BACKENDS, "liar", doctored(LIES[request.param]))
     return "liar"
 
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many QPs the backend "recorder", which is DAQP, is asked for at a time."""
+    """Record the batch sizes that the backend "recorder", a DAQP, gets."""
     counts = []
 
     def recording(qps: SoftQPs) -> BackendSolution:
@@ -75,7 +75,7 @@ def assert_right(solution: QPSolution, known: KnownQP) -> None:
     assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)
 
 
-# What the certificate rejects is solved by another
+# Solutions rejected by the certificate go to another solver
 
 
 @pytest.mark.parametrize("liar", LIES, indirect=True)
@@ -85,7 +85,7 @@ def test_wrong_answers_are_caught_and_replaced(liar):
         solution = solve(known, solver=liar)
     assert_right(solution, known)
     assert (log.solves, log.unsolved) == (BATCH, 0)
-    assert log.fallback >= BATCH - 1  # where one's answer stands for all, that one is right
+    assert log.fallback >= BATCH - 1  # the one whose solution stands for all is right
 
 
 @pytest.mark.parametrize("name", INACCURACIES)
@@ -99,7 +99,7 @@ def test_inaccurate_answers_are_sharpened(monkeypatch, name):
     assert solution.residual.max() < 1e-9
 
 
-def test_only_what_is_rejected_is_solved_again(monkeypatch, asked):
+def test_only_rejected_solutions_are_solved_again(monkeypatch, asked):
     wrong = np.array([False, True, False, False, True, True])
 
     def lie(answer: BackendSolution) -> BackendSolution:
@@ -128,7 +128,7 @@ def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, asked)
     assert (log.fallback, log.recalled) == (0, 0)
 
 
-def test_a_known_active_set_spares_the_backend(asked):
+def test_a_correct_active_set_avoids_the_backend(asked):
     known = known_qp(3, batch=(BATCH,))
     active = solve(known, solver="daqp").active
     with SolveLog() as log:
@@ -137,7 +137,7 @@ def test_a_known_active_set_spares_the_backend(asked):
     assert (log.fallback, log.recalled) == (0, BATCH)
 
 
-def test_what_recall_does_not_finish_is_for_the_backend(monkeypatch, asked):
+def test_qps_that_the_warm_start_does_not_settle_go_to_the_backend(monkeypatch, asked):
     def half(p: Programs, qps: SoftQPs, active: np.ndarray) -> tuple:
         finished = np.arange(len(active)) % 2 == 0
         answer = daqp.solve(qps)
@@ -152,7 +152,7 @@ def test_what_recall_does_not_finish_is_for_the_backend(monkeypatch, asked):
     assert (log.fallback, log.recalled) == (0, BATCH // 2)
 
 
-def test_a_solver_is_not_asked_twice_for_what_it_got_wrong(monkeypatch):
+def test_a_solver_does_not_get_its_failures_again(monkeypatch):
     asked = []
 
     def liar(qps: SoftQPs) -> BackendSolution:
@@ -170,7 +170,7 @@ def test_a_solver_is_not_asked_twice_for_what_it_got_wrong(monkeypatch):
 
 @pytest.mark.parametrize("one", range(BATCH))
 def test_a_part_of_a_batch_may_have_other_rows(one):
-    """Rows without a bound are left out, and which they are differs from element to element."""
+    """Rows without bounds are left out; they differ between elements."""
     known = known_qp(3, batch=(BATCH,))
     active = solve(known, solver="torch").active
     unknown = torch.full_like(active, UNKNOWN)
@@ -180,7 +180,7 @@ def test_a_part_of_a_batch_may_have_other_rows(one):
     assert log.recalled == 1
 
 
-def test_the_active_set_of_what_is_not_solved_is_unknown():
+def test_the_active_set_of_an_unsolved_qp_is_unknown():
     known = spoil(known_qp(3, batch=(BATCH,)), 4)
     active = solve(known, solver="daqp", on_failure="mask").active
     assert (active[4] == UNKNOWN).all()
@@ -195,7 +195,7 @@ def nobody_solves(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("nobody_solves")
-def test_what_nobody_solves_is_not_converged():
+def test_unsolved_qps_are_not_converged():
     known = known_qp(4, batch=(2, 3))
     message = (
         r"6 of 6 QPs have no certified solution. 6 NOT_CONVERGED, first at batch index \(0, 0\): "
@@ -208,7 +208,7 @@ def test_what_nobody_solves_is_not_converged():
 
 
 @pytest.mark.usefixtures("nobody_solves")
-def test_what_nobody_solves_is_masked_on_request(recwarn):
+def test_unsolved_qps_are_masked_on_request(recwarn):
     known = known_qp(4, batch=(2, 3))
     with SolveLog() as log:
         solution = solve(known, on_failure="mask")
@@ -224,7 +224,7 @@ def test_what_nobody_solves_is_masked_on_request(recwarn):
 
 
 def spoil(known: KnownQP, index: int) -> KnownQP:
-    """The same batch with NaN in one element."""
+    """Put NaN into one element of a batch."""
     q = known.qp.q.clone()
     q[index] = torch.nan
     return replace(known, qp=replace(known.qp, q=q, check_values=False))
@@ -298,7 +298,7 @@ def test_the_log_counts_its_own_thread_only():
     assert log.solves == 0
 
 
-# What never reaches a backend
+# QPs that never reach a backend
 
 
 def test_rows_without_a_bound_or_a_free_variable_are_left_out(monkeypatch):
@@ -373,7 +373,7 @@ def test_a_batch_of_invalid_elements_reaches_no_backend(monkeypatch):
 
 
 def test_an_indefinite_hessian_is_not_certified(solver):
-    """A stationary point of a concave cost satisfies every first-order condition."""
+    """A stationary point of a concave cost satisfies all first-order conditions."""
     known = known_qp(0)
     H = known.qp.H - 1e3 * torch.eye(known.qp.n_z).double()
     indefinite = QuadraticProgram(H, *known.qp.tensors()[1:], check_values=False)
@@ -385,9 +385,9 @@ def test_an_indefinite_hessian_is_not_certified(solver):
 
 @pytest.mark.parametrize("solver", ["proxqp", "daqp"])
 def test_a_row_that_the_fixed_entries_decide_but_for_rounding_is_no_row(solver):
-    """Q of a banded C: x_1 is decided by x_0 and u_0, and eliminating C leaves traces of rounding.
+    """In Q with a banded C, x_0 and u_0 determine x_1 up to rounding.
 
-    Its multiplier belongs to no free variable, so that no solver can be asked for it.
+    The multiplier of such a row belongs to no free variable, so no solver can determine it.
     """
     physics = PointMass()
     A, B, theta = physics.corrupted(1)

@@ -16,7 +16,7 @@ BATCH = 6
 
 
 def true_set(seed: int, matrices: tuple[int, ...] = ()):
-    """QPs in tensors, their exact solution when condensed, and its active set."""
+    """Return QPs in tensors, their exact condensed solution, and its active set."""
     known = known_qp(seed, batch=(BATCH,), matrices=matrices)
     solution = solve_qp(known.qp, known.fixed, solver="torch")
     return programs_of(known), soft_qps(known)[1], solution.active
@@ -37,7 +37,7 @@ def test_the_right_active_set_is_exact_at_once(seed, matrices):
     assert (answer.iterations == 1).all()
 
 
-def test_codes_say_what_each_row_does():
+def test_codes_describe_each_rows_state():
     known = known_qp(4, batch=(BATCH,))
     active = solve_qp(known.qp, known.fixed, solver="torch").active
     assert active.dtype == torch.int8
@@ -73,7 +73,7 @@ def test_the_active_sets_given_are_not_changed():
     assert torch.equal(wrong, before)
 
 
-def test_of_an_unknown_set_the_empty_one_is_tried():
+def test_an_unknown_active_set_is_tried_as_empty():
     p, _, active = true_set(5)
     empty = active.clone()
     empty[[1, 2, 4]] = 0
@@ -102,7 +102,7 @@ def test_nonsense_does_no_harm(solver):
 
 
 def moved(solver: str, size: float) -> tuple[Tensor, Tensor, SolveLog]:
-    """Values without and with the active sets of a theta that was another, and the latter's log."""
+    """Solve cold and from the active sets of another theta; return both values and the warm log."""
     mpc, s = random_mpc(9, solver=solver, horizon=8), random_states(64, size=0.7)
     active = mpc.solve(s).active
     with torch.no_grad():

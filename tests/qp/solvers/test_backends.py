@@ -33,7 +33,7 @@ BATCHES = [
 def assert_solves(
     known: KnownQP, solver: str, *, only_value: bool = False, scale: float = 1.0
 ) -> None:
-    """Solve without the help of another solver, and compare with the known answer."""
+    """Solve without another solver's help, and compare with the known solution."""
     with SolveLog() as log:
         solution = solve_qp(known.qp, known.fixed, solver=solver)
     assert log.fallback == 0
@@ -119,12 +119,12 @@ def test_solving_in_parallel_changes_nothing_but_the_time(solver):
     assert torch.get_num_threads() == 2
 
 
-# Against other solvers, on programs that were not made from their solution
+# Against other solvers, on programs not made from a solution
 
 
 @pytest.fixture(scope="module", params=["V", "Q"])
 def mpc_case(request):
-    """A QP with dense C, states (and actions), and the references' values and solutions."""
+    """Make a QP with dense C, states (and actions), and reference values and solutions."""
     learn = ("H", "H_f", "q", "c", "C", "b")
     mpc = random_mpc(1, free=0.2, learn=learn)
     s, a = random_states(8), random_states(8, 1, size=0.5)
@@ -231,7 +231,7 @@ def test_a_backend_falls_back_on_others():
 
 
 def test_rows_that_are_hard_in_some_of_a_batch_only(solver):
-    """A model that is updated from one pattern of soft rows to another must not be relied on."""
+    """A backend's model must not be reused across patterns of soft rows."""
     known = known_qp(5, batch=(24,))
     w = known.qp.w.expand(24, -1).clone()
     inside = (known.sigma == 0) & w.isfinite()

@@ -26,7 +26,7 @@ COUNT = 32
 
 
 def paper_mpc(*, perturb: float = 0.05, stage: float = 1.0, velocity: float = 1.0, **options: Any):
-    """The paper's QP with a dense C, horizon 10, states soft and actions hard by default."""
+    """Make the paper's QP with a dense C, horizon 10, soft states and hard actions."""
     random = np.random.default_rng(0)
     A = np.eye(4) + 0.1 * np.eye(4, k=2)
     B = np.vstack([0.005 * np.eye(2), 0.1 * np.eye(2)])
@@ -45,7 +45,7 @@ def paper_mpc(*, perturb: float = 0.05, stage: float = 1.0, velocity: float = 1.
 
 
 def paper_inputs(far: float = 1.0, *, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
-    """States, ``far`` times those that the experiment starts from, and actions, some at bounds."""
+    """Draw states, ``far`` times the experiment's starts, and actions, some at their bounds."""
     random = np.random.default_rng(seed)
     positions, speeds = random.uniform(-1.5, 1.5, (COUNT, 2)), random.uniform(-0.5, 0.5, (COUNT, 2))
     actions = np.clip(random.standard_normal((COUNT, 2)), -1, 1)
@@ -147,7 +147,7 @@ def as_tensors(**arrays: np.ndarray) -> SoftQPs:
 def random_qps(
     seed: int, *, count: int = 16, d: int = 6, rank: int | None = None, twice: bool = True
 ) -> SoftQPs:
-    """Feasible and bounded QPs, half of whose bounds meet in a vertex, with rows given twice."""
+    """Draw feasible and bounded QPs with repeated rows; half of their bounds meet in a vertex."""
     random = np.random.default_rng(seed)
     factor = random.standard_normal((1, d, d if rank is None else rank))
     G = random.standard_normal((1, 6, d))
@@ -214,7 +214,7 @@ def test_units_change_nothing():
     assert_allclose(answer.v / length, plain.v, atol=1e-7)
 
 
-# Shapes at the edge
+# Degenerate shapes
 
 
 @pytest.mark.parametrize("matrices", [0, 1, 3])
@@ -236,7 +236,7 @@ def test_an_empty_batch(matrices):
 
 
 def one_row(count: int = 3, **changes: Any) -> SoftQPs:
-    """min 1/2 |v|^2 + (9, 9)'v with v_1 in [-1, 1], a hard row, and a soft row of zeros."""
+    """Make min 1/2 |v|^2 + (9, 9)'v with v_1 in [-1, 1], a hard row, and a soft row of zeros."""
     ones = np.ones((count, 2))
     arrays: dict[str, np.ndarray] = {
         "H": np.eye(2)[None],
@@ -277,7 +277,7 @@ def test_without_rows_the_answer_is_that_of_a_linear_system():
     assert answer.lam.shape == (3, 0)
 
 
-def test_without_variables_the_rows_are_only_judged():
+def test_without_variables_the_rows_are_only_checked():
     answer = interior_point.solve(
         one_row(H=np.zeros((1, 0, 0)), G=np.zeros((1, 2, 0)), g=np.zeros((3, 0)))
     )
@@ -318,7 +318,7 @@ def test_without_a_solution_the_answer_is_finite_and_soon(case):
     ("case", "status"),
     [("infeasible", Status.INFEASIBLE), ("unbounded", Status.UNBOUNDED)],
 )
-def test_the_chain_says_what_is_the_matter(case, status):
+def test_the_pipeline_diagnoses_failures(case, status):
     qps = HOPELESS[case]
     H, G, g, lower, upper, w = (part[0] for part in (qps.H, qps.G, qps.g, qps.l, qps.u, qps.w))
     C, none = torch.zeros(0, 2).double(), torch.zeros(0).double()
@@ -333,7 +333,7 @@ def test_nan_in_the_data_ends_in_a_finite_answer():
     assert answer.lam.isfinite().all()
 
 
-def test_hopeless_neighbours_do_no_harm():
+def test_unsolvable_neighbours_do_no_harm():
     good = random_qps(5)
     lower, upper, w = good.l.clone(), good.u.clone(), good.w.clone()
     w[:, [0, 6]] = torch.inf  # the same row twice, ..
@@ -354,7 +354,7 @@ def test_hopeless_neighbours_do_no_harm():
 # Its active-set steps
 
 
-def test_settling_keeps_what_is_better():
+def test_settling_keeps_the_better_solution():
     qps = random_qps(9)
     form, cold = BatchedQPs.of(qps), interior_point.solve(qps)
     v, lam = cold.v, cold.lam

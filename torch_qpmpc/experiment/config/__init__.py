@@ -1,6 +1,6 @@
-"""A run's configuration, checked, loaded and compared.
+"""A run's configuration: checking, loading and comparing it.
 
-`model` and `groups` have its keys, and `messages` makes sentences of pydantic's errors.
+`model` and `groups` define its keys; `messages` turns pydantic's errors into sentences.
 """
 
 from __future__ import annotations
@@ -12,25 +12,25 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from pydantic import ValidationError
 
-from torch_qpmpc.experiment.config.messages import first_of, flatten
+from torch_qpmpc.experiment.config.messages import first_error, flatten
 from torch_qpmpc.experiment.config.model import Config
 
 __all__ = ["check_config", "differences", "flatten", "load_config", "settings"]
 
-#: The keys that configurations of earlier versions lack, with what those versions did.
+#: Keys that older configurations lack, each with the value that keeps their behaviour.
 LATER = {key: info.default for key, info in Config.model_fields.items() if not info.is_required()}
 
 
 def check_config(cfg: DictConfig) -> None:
-    """Raise `QPError` on the first unknown or missing key or impossible value of ``cfg``."""
+    """Raise `QPError` on the first unknown key, missing key or invalid value of ``cfg``."""
     try:
         Config.model_validate(OmegaConf.to_container(cfg, resolve=True))
     except ValidationError as error:
-        raise first_of(error) from None
+        raise first_error(error) from None
 
 
 def load_config(file: Path) -> DictConfig:
-    """Load the configuration that a run has saved, and complete one of an earlier version."""
+    """Load a run's saved configuration, and add keys that older versions lacked."""
     cfg = OmegaConf.load(file)
     assert isinstance(cfg, DictConfig)
     for key, value in LATER.items():
@@ -40,12 +40,12 @@ def load_config(file: Path) -> DictConfig:
 
 
 def settings(cfg: DictConfig) -> dict[str, Any]:
-    """Return every setting by its dotted key, as on the command line."""
+    """Return every setting by its dotted key."""
     return flatten(OmegaConf.to_container(cfg, resolve=True))
 
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[str, str] | None:
-    """List the `settings` in which two differ, as ``key=value`` of either, for a message."""
+    """Return the differing `settings` of both as ``key=value, ..``; None if all are equal."""
     then, now = {**LATER, **then}, {**LATER, **now}
     changed = [key for key in {**then, **now} if then.get(key) != now.get(key)]
     if not changed:

@@ -1,4 +1,4 @@
-"""The groups of keys that configs/ chooses by name."""
+"""Models of the configuration groups in configs/."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class SystemIdentification(Group):
 
 
 class Constraint(Group):
-    """Which constraints learn; a penalty that is null is off."""
+    """The learned constraints and their penalties; a null penalty is off."""
 
     name: Name
     structure: Annotated[str, one_of(STRUCTURES)]
@@ -56,7 +56,7 @@ class Constraint(Group):
     @model_validator(mode="after")
     def penalties_are_on_a_free_C(self) -> Self:
         if (self.deviation is not None or self.si is not None) and "C" not in self.learn:
-            expected = "C among them, as a penalty on C is on"
+            expected = "a list with C, because a penalty on C is on"
             remedy = "Set the penalty to null, or learn C."
             raise QPError.expected("constraint.learn", repr(self.learn), expected, remedy)
         if self.deviation is not None and self.structure != "free":

@@ -1,4 +1,4 @@
-"""From pydantic's errors to the package's own: the key, what came, and what is expected."""
+"""Error messages of the configuration, made from pydantic's: key, value and expected value."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from torch_qpmpc.experiment.config.model import Config
 from torch_qpmpc.experiment.fields import Expected
 from torch_qpmpc.experiment.tasks import TASKS
 
-#: The order in which errors are reported, by pydantic's types: a misspelt key before the missing
-#: one, values (1) before missing keys, and conflicts last.
+#: Rank of pydantic's error types: misspelt keys come first, then invalid values (1), missing keys
+#: and conflicts. Only the first error is reported.
 ORDER = {"extra_forbidden": 0, "missing": 2, "union_tag_not_found": 2, "value_error": 3}
 
 
-def first_of(error: ValidationError) -> QPError:
-    """Write the first error in a sentence."""
-    return _in_a_sentence(min(error.errors(), key=lambda found: ORDER.get(found["type"], 1)))
+def first_error(error: ValidationError) -> QPError:
+    """Make a `QPError` of the first error by `ORDER`."""
+    return _make_error(min(error.errors(), key=lambda details: ORDER.get(details["type"], 1)))
 
 
-def _in_a_sentence(error: Any) -> QPError:
+def _make_error(error: Any) -> QPError:
     kind, value, path = error["type"], error["input"], error["loc"]
     if kind == "value_error" and isinstance(error["ctx"]["error"], QPError):
         return error["ctx"]["error"]
     if len(path) > 1 and Config.model_fields[path[0]].discriminator:
-        path = path[:1] + path[2:]  # in between is the name of the choice
+        path = path[:1] + path[2:]  # pydantic inserts the name of the choice
     key, known = ".".join(map(str, path)), keys()
     if kind == "extra_forbidden":
         if key in known:
@@ -37,19 +37,19 @@ def _in_a_sentence(error: Any) -> QPError:
     if kind.startswith("union_tag"):
         key, value = f"{key}.name", value.get("name")
     got = "nothing" if kind in ("missing", "union_tag_not_found") else repr(value)
-    sentence = known.get(key, "its keys, as in configs/")
-    return QPError.expected(key, got, sentence or f"an allowed value ({error['msg']})")
+    phrase = known.get(key, "its keys, as in configs/")
+    return QPError.expected(key, got, phrase or f"an allowed value ({error['msg']})")
 
 
 def unknown_key(key: str, known: Mapping[str, str]) -> QPError:
-    """Make the error of a misspelt key, with the nearest one."""
+    """Make the error of an unknown key, with the nearest known one."""
     close = difflib.get_close_matches(key, known, n=1)
     hint = f"Did you mean {close[0]}?" if close else "See configs/config.yaml."
     return QPError.expected(key, "an unknown key", "a key of configs/", hint)
 
 
 def keys() -> dict[str, str]:
-    """Return every dotted key, of all choices, with what its value must be."""
+    """Return every dotted key of all choices, with a phrase for its allowed values."""
     return dict(_keys_of(Config))
 
 
@@ -67,11 +67,11 @@ def _keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, st
         if names:
             yield f"{key}.name", f"one of {', '.join(names)}"
         if not groups:
-            yield key, next((x.sentence for x in info.metadata if isinstance(x, Expected)), "")
+            yield key, next((x.phrase for x in info.metadata if isinstance(x, Expected)), "")
 
 
 def flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """Make one mapping of nested ones, with dotted keys."""
+    """Flatten nested mappings into one with dotted keys."""
     if not isinstance(tree, Mapping):
         return {prefix: tree}
     pairs = (flatten(value, f"{prefix}.{key}".lstrip(".")) for key, value in tree.items())

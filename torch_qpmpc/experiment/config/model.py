@@ -1,4 +1,4 @@
-"""A run's configuration: its keys, and which of their values go together."""
+"""The model of a run's configuration: its keys, and the checks across keys."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _settings_of_the_task(value: Any) -> TaskSettings:
 
 
 class Config(Group):
-    """All keys of configs/, but for Hydra's own; those with a default came after the first runs."""
+    """All keys of configs/ but Hydra's; keys added in later versions have defaults."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63), Expected("a whole number >= 0 and < 2^63")]
     eval_seed: Annotated[Whole | None, Expected("a whole number >= 0, or null")] = None
@@ -95,7 +95,7 @@ class Config(Group):
         return self.constraint.deviation is not None or self.constraint.si is not None
 
     def conflict(self, key: str, expected: str, remedy: str = "") -> NoReturn:
-        """Raise the error of a value that does not go with others."""
+        """Raise the error of a value that conflicts with others."""
         value = functools.reduce(getattr, key.split("."), self)
         raise QPError.expected(key, repr(value), expected, remedy)
 
@@ -107,7 +107,7 @@ class Config(Group):
 
     @model_validator(mode="after")
     def si_penalty_has_windows(self) -> Self:
-        """Its windows are as long as the horizon, and come from the replay."""
+        """Check that windows of the horizon's length fit the episodes, warm-up and replay."""
         if self.constraint.si is None:
             return self
         long_enough = f"at least task.horizon = {self.task.horizon}"
@@ -117,26 +117,26 @@ class Config(Group):
         if self.warmup_steps < self.task.horizon:
             self.conflict("warmup_steps", long_enough, remedy)
         if not self.replay:
-            self.conflict("replay", "true", "The windows of constraint.si come from there.")
+            self.conflict("replay", "true", "constraint.si samples its windows from the replay.")
         if (
             self.collector.name != "single"
             and not self.collector.sync
             and self.steps_per_update < self.task.horizon
         ):
-            remedy = "The windows of constraint.si lie within one batch of a worker."
+            remedy = "constraint.si needs whole windows in each worker's batch."
             self.conflict("steps_per_update", long_enough, remedy)
         return self
 
     @model_validator(mode="after")
     def second_order_has_quadratic_penalties(self) -> Self:
-        """gauss_newton takes a penalty as a quadratic in a free C, or by its proximal step."""
+        """Check that gauss_newton can apply the penalties: proximal, or quadratic in a free C."""
         penalties = self.constraint
         if not self.second_order:
             return self
         if penalties.deviation is not None and self.penalty_step != "proximal":
-            self.conflict("penalty_step", "proximal", "gauss_newton has no subgradients.")
+            self.conflict("penalty_step", "proximal", "gauss_newton takes no subgradient steps.")
         if penalties.si is not None and penalties.si.normalised:
-            remedy = "gauss_newton takes the penalty as a quadratic in C, which this is not."
+            remedy = "gauss_newton needs a penalty that is quadratic in C."
             self.conflict("constraint.si.normalised", "False", remedy)
         if penalties.si is not None and penalties.structure != "free":
             remedy = "gauss_newton needs a free C for constraint.si."
@@ -147,7 +147,7 @@ class Config(Group):
     def task_has_the_noise(self) -> Self:
         task = find_task(self.task.model_dump())
         if self.noise.name not in task.noises:
-            self.conflict("noise.name", f"a noise that {task.name} has: {', '.join(task.noises)}")
+            self.conflict("noise.name", f"a noise of task {task.name}: {', '.join(task.noises)}")
         if self.noise.std is not None and not task.takes_noise_std:
             self.conflict("noise.std", "null", f"The noise of {task.name} cannot be changed.")
         return self
@@ -158,17 +158,17 @@ class Config(Group):
             return self
         name = self.algo.name
         if self.second_order:
-            remedy = f"{name} has no second order: say optimizer=adam."
+            remedy = f"{name} needs a first-order optimizer: set optimizer=adam."
             self.conflict("optimizer.name", "adam or sgd", remedy)
         if self.warm_start:
-            self.conflict("warm_start", "false", f"{name} solves at other actions than it replays.")
+            self.conflict("warm_start", "false", f"{name} solves at actions not in the replay.")
         if not self.replay:
             self.conflict("replay", "true", f"{name} learns from a replay.")
         if self.algo.actor == "mlp" and self.penalised:
             remedy = "The penalties are on a QP's C: choose constraint=free."
             self.conflict("algo.actor", "qp", remedy)
         if self.step != "cholesky":
-            self.conflict("step", "cholesky", f"The critics of {name} know no other.")
+            self.conflict("step", "cholesky", f"The critics of {name} support no other step.")
         return self
 
     @model_validator(mode="after")
@@ -178,18 +178,15 @@ class Config(Group):
         if self.constraint.structure == "free":
             self.conflict("release", "null", "Nothing is tied: choose constraint=mpc.")
         if self.algo.name != "qlearning":
-            remedy = f"{self.algo.name} has more parameters than the QP's."
-            self.conflict("release", "null", remedy)
+            self.conflict("release", "null", f"{self.algo.name} does not support release.")
         if self.collector.name != "single":
-            remedy = (
-                f"The workers of collector={self.collector.name} would keep the old parameters."
-            )
+            remedy = f"Workers of collector={self.collector.name} would keep the tied parameters."
             self.conflict("release", "null", remedy)
         return self
 
     @model_validator(mode="after")
     def environments_divide_evenly(self) -> Self:
-        """Among the workers, and in the replay."""
+        """Check that num_envs divides evenly among workers and divides the replay's capacity."""
         if self.collector.name != "single" and self.num_envs % self.collector.workers:
             workers = self.collector.workers
             self.conflict("num_envs", f"a multiple of collector.workers = {workers}")

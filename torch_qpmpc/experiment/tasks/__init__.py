@@ -1,6 +1,6 @@
-"""The tasks of train.py: a plant, the QP (eq:qp5) that learning starts from, and its aim.
+"""Tasks: a plant, the QP (eq:qp5) that learning starts from, and the QP with the true model.
 
-A task is one file that registers it. A script of the user's own can register others.
+Each task is one file that registers it. A user's script can register more.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ __all__ = [
 
 
 def make_physics(cfg: DictConfig) -> LinearSystem | GymnasiumPlant:
-    """The true system, with the run's noise where that can be chosen."""
+    """Make the plant of the run's task."""
     return find_task(cfg.task).make_plant(cfg)
 
 
 def make_mpc(cfg: DictConfig, physics: LinearSystem | GymnasiumPlant) -> QPMPC:
-    """The QP that learns: it starts from the task's wrong scheme."""
+    """Make the QP that learns, from the task's wrong scheme."""
     learn = (*cfg.task.learn_cost, *cfg.constraint.learn)
     return _make(cfg, physics, find_task(cfg.task).wrong_scheme(cfg, physics), learn)
 
 
 def make_true_mpc(cfg: DictConfig, physics: LinearSystem | GymnasiumPlant) -> QPMPC | None:
-    """The other end: the same QP with the true model, cost and bounds; None where there is none."""
+    """Make the same QP with the true model, cost and bounds; None if they are unknown."""
     true_scheme = find_task(cfg.task).true_scheme
     return None if true_scheme is None else _make(cfg, physics, true_scheme(physics), ())
 
@@ -56,7 +56,7 @@ def make_true_mpc(cfg: DictConfig, physics: LinearSystem | GymnasiumPlant) -> QP
 def true_model(
     physics: LinearSystem | GymnasiumPlant,
 ) -> tuple[Tensor, Tensor, Tensor] | None:
-    """A, B and the offset of the plant, the mean of its noise; None where it has no such model."""
+    """Return the plant's A, B and offset (the noise's mean); None if they are unknown."""
     return physics.true_model()
 
 

@@ -1,4 +1,4 @@
-"""``task=gros_zanon``: Gros and Zanon's linear system, from their wrong model."""
+"""``task=gros_zanon``: Gros and Zanon's linear system, learned from their wrong model."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch_qpmpc.experiment.tasks.registry import Scheme, Task, register
 
 
 def wrong_scheme(cfg: DictConfig, plant: GrosZanonLTI) -> Scheme:
-    """As in the original, the first upper bound is too wide by one."""
+    """Return their wrong model; as in the original, the first upper bound is too wide by one."""
     wide = plant.ub_s + torch.tensor([1.0, 0.0]).to(plant.ub_s)
     return Scheme(*plant.wrong_model(), true_scheme(plant).stage_weight, plant.lb_s, wide)
 

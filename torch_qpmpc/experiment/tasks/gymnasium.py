@@ -1,4 +1,4 @@
-"""``task=gymnasium``: any Gymnasium environment, from a linear model of it."""
+"""``task=gymnasium``: any Gymnasium environment, learned from a linear model of it."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def _is_chosen(id: str) -> str:
     return id
 
 
-#: null until the user has one: `given_scheme` then says what is missing.
+#: A matrix of the model; null by default, which `given_scheme` refuses with a remedy.
 Model = Annotated[Matrix | None, MATRIX]
 
 
 class GymnasiumSettings(TaskSettings):
-    """The environment, and the linear model of it."""
+    """The keys of the environment and its linear model."""
 
     id: Annotated[
         str,
@@ -38,11 +38,11 @@ class GymnasiumSettings(TaskSettings):
     stage_weight: Model
 
 
-#: How to get a model, and to pass it on the command line.
+#: Instructions for finding a model and passing it on the command line.
 REMEDY = (
-    "Find a model x+ = A x + B u of it around its target, by finite differences of its dynamics or "
-    "by least squares on logged transitions (x, u, x+), and the weight of its cost "
-    "1/2 [x; u]' W [x; u]; then, as for two states and one action, override "
+    "Find a model x+ = A x + B u around the target, by finite differences of the dynamics or by "
+    "least squares on logged transitions (x, u, x+), and the weight W of the cost "
+    "1/2 [x; u]' W [x; u]; then pass them, as here for two states and one action: "
     "'task.A=[[1,.1],[0,1]]' 'task.B=[[0],[.1]]' 'task.stage_weight=[[1,0,0],[0,1,0],[0,0,.1]]'."
 )
 
@@ -51,7 +51,7 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
     """Read the model and the weight from the task's configuration, the bounds from the spaces.
 
     Raises:
-        QPError: one of them is missing, or has another shape than the environment's spaces.
+        QPError: a matrix is missing, or does not have the shape of the environment's spaces.
     """
     n_x, n_u = len(plant.lb_s), len(plant.lb_a)
     needed = {"A": (n_x, n_x), "B": (n_x, n_u), "stage_weight": (n_x + n_u, n_x + n_u)}
@@ -60,15 +60,15 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
         if cfg.task[name] is None:
             expected = f"the rows of a matrix {shape} for {spaces}"
             raise QPError.expected(f"task.{name}", "null", expected, REMEDY)
-    given = {name: torch.tensor(cfg.task[name], dtype=torch.float64) for name in needed}
-    shapes = {name: tuple(matrix.shape) for name, matrix in given.items()}
+    matrices = {name: torch.tensor(cfg.task[name], dtype=torch.float64) for name in needed}
+    shapes = {name: tuple(matrix.shape) for name, matrix in matrices.items()}
     if shapes != needed:
-        found, want = (
+        got, expected = (
             ", ".join(f"task.{name} of shape {shape}" for name, shape in sizes.items())
             for sizes in (shapes, needed)
         )
-        raise QPError.expected("task.id", f"{spaces}, with {found}", want, REMEDY)
-    return Scheme(**given, lb_s=plant.lb_s, ub_s=plant.ub_s)
+        raise QPError.expected("task.id", f"{spaces}, with {got}", expected, REMEDY)
+    return Scheme(**matrices, lb_s=plant.lb_s, ub_s=plant.ub_s)
 
 
 register(

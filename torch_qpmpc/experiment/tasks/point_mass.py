@@ -1,4 +1,4 @@
-"""``task=point_mass``: the paper's, from a corrupted model and a random cost."""
+"""``task=point_mass``: the paper's plant, learned from a corrupted model and a random cost."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def make_plant(cfg: DictConfig) -> PointMass:
 
 
 def wrong_scheme(cfg: DictConfig, plant: PointMass) -> Scheme:
-    """The corruption and the cost are those of the seed."""
+    """Draw the corrupted model and the cost by ``cfg.seed``."""
     A, B, theta = plant.corrupted(cfg.seed)
     weight = torch.cat((theta, torch.zeros_like(plant.lb_a)))
     return Scheme(A, B, weight, plant.lb_s, plant.ub_s)

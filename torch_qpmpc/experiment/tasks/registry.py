@@ -1,4 +1,4 @@
-"""A task, and the registry by which a configuration finds it."""
+"""Tasks and their registry."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from torch_qpmpc.experiment.fields import (
 )
 from torch_qpmpc.mpc.validation import COST, HESSIANS
 
-#: Every task by its name.
+#: All registered tasks by name.
 TASKS: dict[str, Task] = {}
 
 
 class TaskSettings(Group):
-    """The keys that every task has under ``task``."""
+    """The keys under ``task`` that all tasks share."""
 
     name: Name
-    #: Registers a task that is not built in.
+    #: The script that registers a user's task.
     file: Annotated[str | None, Expected("a path, or null")] = None
     horizon: Count
     gamma: Fraction
@@ -55,20 +55,20 @@ class TaskSettings(Group):
     @model_validator(mode="after")
     def riccati_is_dense(self) -> Self:
         if self.terminal_weight == "riccati" and self.hessian == "diagonal":
-            remedy = "With task.hessian=block it can be."
+            remedy = "The Riccati weight needs task.hessian=block or full."
             raise QPError.expected("task.terminal_weight", "'riccati'", "identity", remedy)
         return self
 
 
 @dataclass(frozen=True)
 class Scheme:
-    """What an MPC scheme knows of a plant: x+ = A x + B u + offset, a cost, and bounds.
+    """A model x+ = A x + B u + offset, a stage cost and state bounds.
 
     Attributes:
-        A, B: ``(n_x, n_x)`` and ``(n_x, n_u)``.
+        A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
         stage_weight: W of the cost 1/2 [x; u]' W [x; u], or its diagonal.
-        lb_s, ub_s: bounds of the state ``(n_x,)``.
-        offset: ``(n_x,)``; None for zero.
+        lb_s, ub_s: the bounds of the state, ``(n_x,)``.
+        offset: the model's offset, ``(n_x,)``; None for zero.
     """
 
     A: Tensor
@@ -80,26 +80,26 @@ class Scheme:
 
     @classmethod
     def true(cls, plant: LinearSystem, stage_weight: Tensor) -> Scheme:
-        """The scheme that knows ``plant``; its offset is the mean of the noise."""
+        """Make the scheme with the model of ``plant``; its offset is the mean of the noise."""
         A, B, offset = plant.true_model()
         return cls(A, B, stage_weight, plant.lb_s, plant.ub_s, offset)
 
 
 @dataclass(frozen=True)
 class Task:
-    """A plant, the MPC scheme that learning starts from, and the one that it aims at.
+    """A plant, the MPC scheme that learning starts from, and the true scheme.
 
     Attributes:
-        name: of ``task=NAME``.
-        make_plant: makes a configuration's plant, a `LinearSystem` or a `GymnasiumPlant`.
-        wrong_scheme: the start, for a configuration and its plant.
-        true_scheme: the aim, for a plant; None where the plant's model is unknown.
+        name: the choice in ``task=NAME``.
+        make_plant: makes the plant of a configuration, a `LinearSystem` or a `GymnasiumPlant`.
+        wrong_scheme: makes the scheme that learning starts from, of a configuration and a plant.
+        true_scheme: makes the true scheme of a plant; None if its model is unknown.
         closed_loop: runs a policy on the plant, as `torch_qpmpc.envs.closed_loop.closed_loop`.
         noises: choices of ``noise.name``; the first is the default.
         takes_noise_std: True if ``make_plant`` reads ``noise.std``.
-        settings: the keys under ``task``.
-        defaults: settings that differ from those of ``task=point_mass``, of any group; None where
-            configs/task/NAME.yaml has them.
+        settings: the model of the keys under ``task``.
+        defaults: settings of any group that differ from ``task=point_mass``; None if they are in
+            configs/task/NAME.yaml.
     """
 
     name: str
@@ -114,19 +114,19 @@ class Task:
 
 
 def register(task: Task) -> None:
-    """Make ``task=NAME`` a choice of train.py; a second task of this name replaces the first.
+    """Make ``task=NAME`` a choice of train.py; registering it again replaces the task.
 
     Raises:
-        QPError: train.py itself has a task of this name.
+        QPError: the name is that of a built-in task.
     """
     check_kind("task", task, Task)
     known = TASKS.get(task.name)
     if known is not None and known.defaults is None:
-        raise QPError.expected("task.name", f"{task.name!r}, which exists", "a new name")
+        raise QPError.expected("task.name", f"{task.name!r}, which is built in", "a new name")
     TASKS[task.name] = task
     if task.defaults is None:
         return
-    # Other processes, such as a sweep's, run the caller's file to register the task.
+    # Other processes, such as those of a sweep, run the caller's file to register the task.
     file = Path(sys._getframe(1).f_code.co_filename).resolve()
     own = {"name": task.name, "file": str(file) if file.exists() else None}
     node = {
@@ -138,15 +138,15 @@ def register(task: Task) -> None:
 
 
 def find_task(settings: Mapping[str, Any]) -> Task:
-    """Find the task that the keys under ``task`` name; if it is unknown, run its file.
+    """Find a task by the keys under ``task``, running its file if it is not registered.
 
     Raises:
-        QPError: there is none.
+        QPError: there is no such task.
     """
     name, file = settings.get("name"), settings.get("file")
     if name not in TASKS and isinstance(file, str):
         if not Path(file).exists():
-            remedy = "Put it there, or set task.file to where it is."
+            remedy = "Set task.file to its path."
             expected = f"the file that registers task={name}"
             raise QPError.expected("task.file", f"{file!r}, which does not exist", expected, remedy)
         runpy.run_path(file, run_name="task_file")
