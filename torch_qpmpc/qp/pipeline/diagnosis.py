@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import lsq_linear, nnls
+import scipy  # imports scipy.optimize at its first use: a third of a second
 
 from torch_qpmpc.qp.pipeline.batch import Programs, SoftQPs
 from torch_qpmpc.qp.pipeline.batch_solution import TOLERANCE
@@ -137,7 +137,7 @@ def _nearest_feasible(qp: _FreeQP, z: np.ndarray, of_C: _Range) -> tuple[np.ndar
     unit = np.zeros(len(E))
     unit[-1] = 1.0
     try:
-        weights, _ = nnls(E, unit)
+        weights, _ = scipy.optimize.nnls(E, unit)
     except RuntimeError:  # it did not settle: nothing is known
         return z, no_multipliers
     weights[weights < ROUNDING * weights.max()] = 0.0
@@ -224,7 +224,8 @@ def _steepest_recession(qp: _FreeQP, of_C: _Range) -> np.ndarray:
     rows, slope = least < most, slope / scale
     A = _product(qp.G[rows], F).T
     if rows.any():
-        lam = lsq_linear(A, -slope, (least[rows], most[rows]), method="bvls", tol=1e-15).x
+        bounds = least[rows], most[rows]
+        lam = scipy.optimize.lsq_linear(A, -slope, bounds, method="bvls", tol=1e-15).x
         slope = slope + A @ lam
     return -F @ slope
 
