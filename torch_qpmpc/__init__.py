@@ -35,6 +35,8 @@ __all__ = [
     "solve_qp",
 ]
 
+__version__ = "0.1.0"
+
 if not TYPE_CHECKING:
     #: Imported at first use: they import TensorDict and TorchRL, which takes as long as torch does.
     _LAZY = {
