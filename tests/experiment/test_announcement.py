@@ -14,7 +14,7 @@ from torch_qpmpc.experiment.announcement import COMPILING, announcement, compila
 from torch_qpmpc.experiment.launch import Launch
 
 
-def test_a_run_says_what_it_does():
+def test_a_run_is_described():
     first, second = announcement(make_config("task=pendulum", "seed=3"), "runs/x").splitlines()
     assert first == (
         "qlearning, 100 updates: task gymnasium Pendulum-v1, noise none, constraint deviation, "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -35,7 +36,8 @@ class _Notice(event.Listener):
         function = data["dispatcher"].py_func
         if not self.printed and function.__module__.startswith("torch_qpmpc"):
             self.printed = True
-            tqdm.write(COMPILING)  # clears a progress bar
+            tqdm.write(COMPILING)  # above a progress bar, if there is one
+            sys.stdout.flush()
 
     def on_end(self, event: event.Event) -> None:
         """Do nothing: the kernels that follow are part of the same wait."""
