@@ -92,7 +92,7 @@ def test_docstrings_run(name, tmp_path, monkeypatch):
     assert results.failed == 0, f"{results.failed} of {results.attempted} examples of {name}"
 
 
-PUBLIC = [torch_qpmpc.__dict__[name] for name in torch_qpmpc.__all__]
+PUBLIC = [getattr(torch_qpmpc, name) for name in torch_qpmpc.__all__]
 
 
 @pytest.mark.parametrize("public", PUBLIC, ids=lambda x: x.__name__)

@@ -1,16 +1,23 @@
 """Quadratic programs as value functions, learned by Q-learning and readable as linear MPC."""
 
-from torch_qpmpc import envs as envs
+import pkgutil
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
-from torch_qpmpc.learning.operators import QPActorValueOperator
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
-from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 from torch_qpmpc.qp.program import QuadraticProgram, Status
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve_qp
+
+if TYPE_CHECKING:
+    from torch_qpmpc import envs as envs
+    from torch_qpmpc.learning.operators import QPActorValueOperator
+    from torch_qpmpc.learning.q_learning import QPQLearningLoss
 
 __all__ = [
     "QPMPC",
@@ -27,3 +34,35 @@ __all__ = [
     "SystemIdentificationPenalty",
     "solve_qp",
 ]
+
+__version__ = "0.1.0"
+
+if not TYPE_CHECKING:
+    #: Imported at first use: they import TensorDict and TorchRL, which takes as long as torch does.
+    _LAZY = {
+        "envs": "torch_qpmpc.envs:",
+        "QPActorValueOperator": "torch_qpmpc.learning.operators:QPActorValueOperator",
+        "QPQLearningLoss": "torch_qpmpc.learning.q_learning:QPQLearningLoss",
+    }
+
+    def __getattr__(name: str) -> Any:
+        if name not in _LAZY:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        globals()[name] = pkgutil.resolve_name(_LAZY[name])
+        return globals()[name]
+
+    def __dir__() -> list[str]:
+        return sorted(globals().keys() | _LAZY)
+
+
+for _name, _module, _steps in (
+    ("PointMass", "point_mass", 50),
+    ("GrosZanonLTI", "gros_zanon", 5000),
+):
+    # Registering an id twice warns, and a reload or a spawned worker imports this again.
+    if f"torch_qpmpc/{_name}-v0" not in gymnasium.registry:
+        gymnasium.register(
+            id=f"torch_qpmpc/{_name}-v0",
+            entry_point=f"torch_qpmpc.envs.{_module}:{_name}GymEnv",
+            max_episode_steps=_steps,
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.announcement import announcement, compilation_named
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.lock import ELSEWHERE, ELSEWHERE_IN_SWEEP, locked
 from torch_qpmpc.experiment.run_folder import unwritable
@@ -61,6 +63,8 @@ class Launch:
             check_fresh(self.folder)
         else:
             check_own_folder(resume, self.folder)
+        if not self.sweep:
+            print(announcement(cfg, self.folder, state["update"] if state else 0), flush=True)
         return cfg, state, None
 
 
@@ -75,7 +79,8 @@ def launched() -> Iterator[Launch]:
     sweep = hydra.mode is RunMode.MULTIRUN
     launch = Launch(hydra.runtime.output_dir, list(hydra.overrides.task), sweep)
     try:
-        with locked(launch.folder, ELSEWHERE_IN_SWEEP if sweep else ELSEWHERE):
+        named = contextlib.nullcontext() if sweep else compilation_named()
+        with locked(launch.folder, ELSEWHERE_IN_SWEEP if sweep else ELSEWHERE), named:
             yield launch
     except QPError as error:
         if sweep:

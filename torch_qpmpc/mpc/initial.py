@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
-import scipy.linalg
+import scipy
 import torch
 from torch import Tensor
 

@@ -58,8 +58,11 @@ def is_differentiating() -> bool:
     return torch.is_grad_enabled() or is_forward_mode()  # `torch.no_grad` leaves forward mode on
 
 
-@torch.compiler.assume_constant_result
 def transforms() -> tuple[str, ...]:
     """Return the `torch.func` transforms in effect, such as "Grad", from the outermost."""
     stack = _functorch.get_interpreter_stack() or ()
     return tuple(interpreter.key().name for interpreter in stack)
+
+
+# As `torch.compiler.assume_constant_result` does, which imports the compiler: that takes a second.
+vars(transforms)["_dynamo_marked_constant"] = True

@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import lsq_linear, nnls
+import scipy  # imports scipy.optimize at its first use: a third of a second
 
 from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.pipeline.batch import Programs
@@ -138,7 +138,7 @@ def _nearest_feasible(qp: _FreeQP, z: np.ndarray, C_range: _Range) -> tuple[np.n
     unit = np.zeros(len(E))
     unit[-1] = 1.0
     try:
-        weights, _ = nnls(E, unit)
+        weights, _ = scipy.optimize.nnls(E, unit)
     except RuntimeError:  # nnls did not converge: neither proof
         return z, no_multipliers
     weights[weights < ROUNDING * weights.max()] = 0.0
@@ -225,7 +225,8 @@ def _steepest_recession(qp: _FreeQP, C_range: _Range) -> np.ndarray:
     rows, slope = least < most, slope / scale
     A = _product(qp.G[rows], F).T
     if rows.any():
-        lam = lsq_linear(A, -slope, (least[rows], most[rows]), method="bvls", tol=1e-15).x
+        bounds = least[rows], most[rows]
+        lam = scipy.optimize.lsq_linear(A, -slope, bounds, method="bvls", tol=1e-15).x
         slope = slope + A @ lam
     return -F @ slope
 

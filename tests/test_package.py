@@ -1,0 +1,82 @@
+"""The sdist and the wheel: complete, minimal, and enough for README.md's examples."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import torch_qpmpc
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / ".github" / "readme_examples.py"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not EXAMPLES.exists(), reason="not a clone of the repository"),
+]
+
+
+def run(*command: str | Path, cwd: Path = ROOT, path: Path = ROOT) -> str:
+    ended = subprocess.run(
+        [sys.executable, *map(str, command)],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": str(path)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return ended.stdout
+
+
+def sources(folder: str) -> set[str]:
+    """The files of a folder that belong to the repository."""
+    found = (path.relative_to(ROOT) for path in (ROOT / folder).rglob("*") if path.is_file())
+    return {str(path) for path in found if "__pycache__" not in path.parts}
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The sdist and the wheel."""
+    folder = tmp_path_factory.mktemp("dist")
+    run("-m", "hatchling", "build", "-d", folder)
+    (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    return sdist, wheel
+
+
+def test_the_sdist_trains_and_tests(built):
+    with tarfile.open(built[0]) as archive:
+        top, files = archive.getnames()[0].split("/")[0], set(archive.getnames())
+    assert top == f"torch_qpmpc-{torch_qpmpc.__version__}"
+    files = {name.removeprefix(f"{top}/") for name in files}
+    alone = {"train.py", "pyproject.toml", "README.md", "LICENSE", "CITATION.cff"}
+    alone |= {"CHANGELOG.md", "CONTRIBUTING.md", "PKG-INFO", ".gitignore"}
+    assert files == alone | sources("torch_qpmpc") | sources("configs") | sources("tests")
+    assert built[0].stat().st_size < 1e6
+
+
+def test_the_wheel_is_the_package_alone(built):
+    with zipfile.ZipFile(built[1]) as archive:
+        files = set(archive.namelist())
+        (metadata,) = (name for name in files if name.endswith("/METADATA"))
+        text = archive.read(metadata).decode()
+    assert {name for name in files if ".dist-info/" not in name} == sources("torch_qpmpc")
+    assert built[1].stat().st_size < 5e5
+    assert re.findall(r"^Version: (.*)$", text, re.M) == [torch_qpmpc.__version__]
+    assert "torch_qpmpc/py.typed" in files
+
+
+def test_the_readmes_examples_run_with_the_wheel(built, tmp_path):
+    """Beside the libraries of this environment; a workflow installs it into an empty one."""
+    installed = tmp_path / "installed"
+    run("-m", "pip", "install", "-q", "--no-deps", "--target", installed, built[1])
+    printed = run(EXAMPLES, cwd=tmp_path, path=installed)
+    assert f"examples ran with {installed}" in printed
