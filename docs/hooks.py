@@ -1,0 +1,34 @@
+"""What mkdocs.yml cannot say: pages and scripts from outside docs/, and the docstrings' examples."""
+
+from __future__ import annotations
+
+import re
+from importlib.resources import files as package_files
+from pathlib import Path
+from typing import Any
+
+import griffe
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[1]
+
+
+@event_priority(100)  # before mkdocs-jupyter, which turns notebooks into pages
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the notebooks, and MathJax from its Python package."""
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        place = f"notebooks/{path.name}"
+        files.append(File(place, str(ROOT), config.site_dir, config.use_directory_urls))
+    mathjax = package_files("mathjax") / "static" / "mathjax" / "es5" / "tex-svg.js"
+    files.append(File.generated(config, "javascripts/tex-svg.js", abs_src_path=str(mathjax)))
+    return files
+
+
+class Examples(griffe.Extension):
+    """Read the section ``Example:`` as doctests, as Griffe does with ``Examples:``."""
+
+    def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
+        if obj.docstring is not None:
+            obj.docstring.value = re.sub(r"(?m)^Example:$", "Examples:", obj.docstring.value)
