@@ -1,4 +1,4 @@
-"""What mkdocs.yml cannot say: pages and scripts from outside docs/, and the docstrings' examples."""
+"""What mkdocs.yml cannot say: files from outside docs/, and the examples of docstrings."""
 
 from __future__ import annotations
 
