@@ -26,9 +26,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-class Examples(griffe.Extension):
-    """Read the section ``Example:`` as doctests, as Griffe does with ``Examples:``."""
+class Docstrings(griffe.Extension):
+    """Read ``Example:`` as doctests, and ``A, B: ..`` as two parameters, which Griffe does not."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
-        if obj.docstring is not None:
-            obj.docstring.value = re.sub(r"(?m)^Example:$", "Examples:", obj.docstring.value)
+        if obj.docstring is None:
+            return
+        text = re.sub(r"(?m)^Example:$", "Examples:", obj.docstring.value)
+        # What follows a space would be taken for the type; a no-break space is part of the name.
+        names = re.compile(r"(?m)^ {4}\w+(?:, \w+)+(?=:\s)")
+        obj.docstring.value = names.sub(lambda m: m[0].replace(", ", ",\u00a0"), text)

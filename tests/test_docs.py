@@ -46,7 +46,8 @@ def fenced(text: str, language: str) -> list[tuple[int, str]]:
 
 def commands(text: str) -> list[list[str]]:
     """Return the commands of a page's bash blocks, split into words."""
-    lines = [line for _, code in fenced(text, "bash") for line in code.splitlines()]
+    blocks = [code.replace("\\\n", "") for _, code in fenced(text, "bash")]
+    lines = [line for code in blocks for line in code.splitlines()]
     return [shlex.split(part, comments=True) for line in lines for part in line.split("&&")]
 
 
@@ -54,8 +55,8 @@ COMMANDS = {page: commands(text) for page, text in PAGES.items()}
 
 
 def test_blocks_are_found():
-    text = "a\n```bash\nls -l  # all\n```\n```python\nx = 1\n```\nb\n```python t\ny = 2\n```\n"
-    assert fenced(text, "python") == [(5, "x = 1\n"), (9, "y = 2\n")]
+    text = "a\n```bash\nls \\\n -l # all\n```\n```python\nx = 1\n```\nb\n```python t\ny = 2\n```\n"
+    assert fenced(text, "python") == [(6, "x = 1\n"), (10, "y = 2\n")]
     assert commands(text) == [["ls", "-l"]]
 
 
