@@ -3,7 +3,7 @@
 Both learn all numbers of a linear MPC scheme from one endless episode, on the same noise. The
 schemes are the same but for the terminal cost, an undiscounted regulator's there and the discounted
 one's here. Ours learns as `task=gros_zanon` does: from each transition once, or from the latest.
-The table goes into README.md.
+The tables go into docs/results/mpcrl.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 
 from tests.benchmarks import mpcrl_lti
 from tests.benchmarks.mpcrl_lti import Stream
-from tests.benchmarks.table import README
+from tests.benchmarks.table import DOCS
 from tests.runs import make_config
 from torch_qpmpc import GaussNewton
 from torch_qpmpc.envs import GrosZanonLTI
@@ -28,6 +28,7 @@ from torch_qpmpc.experiment.algorithms import make_optimizer, make_schedule
 from torch_qpmpc.experiment.tasks import make_mpc
 from torch_qpmpc.study.markdown import replaced, table
 
+PAGE = DOCS / "results" / "mpcrl.md"
 SEEDS, STEPS, LAST = (69, 1, 2, 3), 5000, 500
 #: Untimed steps of each contender at first, during which kernels are compiled.
 WARMUP = 50
@@ -105,10 +106,10 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument("--readme", type=Path, default=README, help="where the tables go")
+    parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
     options = parser.parse_args(arguments)
-    readme = options.readme.read_text(encoding="utf-8")
-    replaced(readme, "", "mpcrl")  # fail before the runs, which take minutes
+    page = options.page.read_text(encoding="utf-8")
+    replaced(page, "", "mpcrl")  # fail before the runs, which take minutes
     torch.set_num_threads(1)
     for contender in CONTENDERS.values():
         contender(options.seeds[0], WARMUP)
@@ -121,8 +122,8 @@ def main(arguments: list[str] | None = None) -> None:
             print(line, flush=True)
     versions = ", ".join(f"{name} {version(name)}" for name in ("mpcrl", "casadi", "daqp", "torch"))
     caption = f"{options.steps:,} steps, one thread, in one run with {versions}."
-    text = replaced(readme, f"{caption}\n\n{tables(streams, options.seeds)}", "mpcrl")
-    options.readme.write_text(text, encoding="utf-8")
+    text = replaced(page, f"{caption}\n\n{tables(streams, options.seeds)}", "mpcrl")
+    options.page.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Run the benchmarks and write their tables to README.md: ``python -m tests.benchmarks.table``."""
+"""Run the benchmarks and write their tables to the docs: ``python -m tests.benchmarks.table``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ import numpy as np
 from torch_qpmpc.study.markdown import replaced, table
 
 ROOT = Path(__file__).parents[2]
-README = ROOT / "README.md"
+DOCS = ROOT / "docs"
+PAGE = DOCS / "benchmarks.md"
 RESULTS = ROOT / "runs" / "benchmark.json"
 REFERENCE = "ProxSuite's QPFunction"
 #: Horizons between which the growth exponent is fitted.
@@ -31,14 +32,12 @@ def main(arguments: list[str] | None = None) -> None:
         prog="python -m tests.benchmarks.table", description="Write the benchmark's tables."
     )
     parser.add_argument("--json", type=Path, help="format these results instead of running")
-    parser.add_argument("--readme", type=Path, default=README, help="where the tables go")
+    parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
     options = parser.parse_args(arguments)
-    replaced(
-        options.readme.read_text(encoding="utf-8"), "", "benchmark"
-    )  # fail before the runs, which take minutes
+    page = options.page.read_text(encoding="utf-8")
+    replaced(page, "", "benchmark")  # fail before the runs, which take minutes
     results = json.loads((options.json or run()).read_text(encoding="utf-8"))
-    text = replaced(options.readme.read_text(encoding="utf-8"), tables(results), "benchmark")
-    options.readme.write_text(text, encoding="utf-8")
+    options.page.write_text(replaced(page, tables(results), "benchmark"), encoding="utf-8")
 
 
 def run() -> Path:
@@ -50,7 +49,7 @@ def run() -> Path:
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     ended = subprocess.run(command + options, cwd=ROOT, env=environment, check=False)
     if ended.returncode:
-        sys.exit(f"the benchmarks failed; {README.name} is as it was")
+        sys.exit("the benchmarks failed; no table was written")
     print(f"results: {RESULTS}")
     return RESULTS
 

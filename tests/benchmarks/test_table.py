@@ -47,12 +47,12 @@ def results(tmp_path: Path) -> Path:
 
 
 def test_the_tables_replace_text_between_the_markers(results: Path, tmp_path: Path) -> None:
-    readme = tmp_path / "README.md"
-    readme.write_text(f"above\n{BEGIN}\nold\n{END}\nbelow\n")
+    page = tmp_path / "benchmarks.md"
+    page.write_text(f"above\n{BEGIN}\nold\n{END}\nbelow\n")
     for _ in range(2):
-        main(["--json", str(results), "--readme", str(readme)])
-    text = readme.read_text()
-    assert text.startswith(f"above\n{BEGIN}\n")
+        main(["--json", str(results), "--page", str(page)])
+    text = page.read_text()
+    assert text.startswith(f"above\n{BEGIN}\n\n")
     assert text.endswith(f"{END}\nbelow\n")
     assert "old" not in text
     assert f"| {REFERENCE} | 400 | 2e-05, 17 of 64 wrong | 1e-09 |" in text
@@ -64,8 +64,8 @@ def test_the_tables_replace_text_between_the_markers(results: Path, tmp_path: Pa
     assert "torch 2.13" in text
 
 
-def test_a_readme_without_markers_is_refused(results: Path, tmp_path: Path) -> None:
-    readme = tmp_path / "README.md"
-    readme.write_text("nothing\n")
+def test_a_page_without_markers_is_refused(results: Path, tmp_path: Path) -> None:
+    page = tmp_path / "benchmarks.md"
+    page.write_text("nothing\n")
     with pytest.raises(QPError, match=f"expected one line {BEGIN} and below it one line {END}"):
-        main(["--json", str(results), "--readme", str(readme)])
+        main(["--json", str(results), "--page", str(page)])

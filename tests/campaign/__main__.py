@@ -1,7 +1,7 @@
 """Solve QPs whose outcome is known: ``python -m tests.campaign --count 100000 --solver daqp``.
 
-It ends with two tables in Markdown of the latest counts of each solver: the families, which
-``--write`` writes to CONTRIBUTING.md, and their sums, to README.md. ``--solver`` without a name
+It ends with two tables in Markdown of the latest counts of each solver: all families together, and
+each by itself. ``--write`` writes them to docs/reliability/campaign.md. ``--solver`` without a name
 solves nothing.
 """
 
@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from tests.benchmarks.table import README, replaced, table
+from tests.benchmarks.table import DOCS, ROOT, replaced, table
 from tests.campaign.families import FAMILIES, Draw
 from tests.campaign.tally import SLOW, Tally
 from torch_qpmpc.qp.solvers import BACKENDS
@@ -32,8 +32,8 @@ LONG = (
     "runaway prediction",
     "hopeless plant",
 )
-CONTRIBUTING = README.with_name("CONTRIBUTING.md")
-RESULTS = README.parent / "runs" / "campaign"
+PAGE = DOCS / "reliability" / "campaign.md"
+RESULTS = ROOT / "runs" / "campaign"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -45,17 +45,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--family", nargs="*", default=list(FAMILIES), help="names of families")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--results", type=Path, default=RESULTS, help="a folder for the counts")
-    parser.add_argument("--write", action="store_true", help="write the tables to the docs")
+    parser.add_argument("--write", action="store_true", help="write the tables to the page")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     for solver in options.solver:
         campaign(solver, options.family, options.count, options.seed, options.results)
     tallies = load(options.results)
-    for page, text in ((CONTRIBUTING, by_family(tallies)), (README, totals(tallies))):
+    parts = {"campaign": totals(tallies), "campaign-families": by_family(tallies)}
+    for marker, text in parts.items():
         print(text, end="\n\n")
         if options.write:
-            new = replaced(page.read_text(encoding="utf-8"), text, "campaign")
-            page.write_text(new, encoding="utf-8")
+            PAGE.write_text(replaced(PAGE.read_text(encoding="utf-8"), text, marker), "utf-8")
     return int(any(tally.failures for of_one in tallies.values() for tally in of_one.values()))
 
 

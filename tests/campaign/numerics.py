@@ -14,12 +14,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from tests.benchmarks.table import README, replaced, table
+from tests.benchmarks.table import DOCS, replaced, table
 from tests.problems import KnownQP, known_qp, normal
 from torch_qpmpc import QuadraticProgram, solve_qp
 from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.solvers import BACKENDS
 
+PAGE = DOCS / "reliability" / "numerics.md"
 #: Step of the finite differences, and a distance to kinks that they do not cross.
 STEP, NEAR = 1e-6, 1e-4
 COUNT, SEEDS = 32, 6
@@ -39,7 +40,7 @@ NAMES = (
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.campaign.numerics", description=__doc__)
     parser.add_argument("--solver", nargs="*", default=list(BACKENDS))
-    parser.add_argument("--write", action="store_true", help="write the table to README.md")
+    parser.add_argument("--write", action="store_true", help="write the table to the page")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     rows = [measure(solver) for solver in options.solver]
@@ -47,7 +48,7 @@ def main(arguments: list[str] | None = None) -> None:
     text = table(["largest relative error", *options.solver], lines)
     print(text)
     if options.write:
-        README.write_text(replaced(README.read_text(encoding="utf-8"), text, "numerics"), "utf-8")
+        PAGE.write_text(replaced(PAGE.read_text(encoding="utf-8"), text, "numerics"), "utf-8")
 
 
 def measure(solver: str) -> list[str]:

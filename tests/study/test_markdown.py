@@ -16,7 +16,7 @@ def test_a_table_has_its_numbers_to_the_right():
 
 
 def test_only_text_between_the_markers_changes():
-    text = "before\n<!-- it -->\nold\n<!-- /it -->\nafter <!-- other -->\n"
+    text = "before\n<!-- it -->\n\nold\n\n<!-- /it -->\nafter <!-- other -->\n"
     assert replaced(text, "new", "it") == text.replace("old", "new")
 
 

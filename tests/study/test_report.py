@@ -59,16 +59,15 @@ def test_the_overall_gap_weighs_the_learned_cases_equally():
 
 
 def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
-    readme = tmp_path / "README.md"
-    readme.write_text(f"# A\n<!-- {study.name} -->\nold\n<!-- /{study.name} -->\nend\n")
-    (tmp_path / "notebooks").mkdir()
-    report.main([str(study), "--readme", str(readme)])
+    page = tmp_path / "paper.md"
+    page.write_text(f"# A\n<!-- {study.name} -->\nold\n<!-- /{study.name} -->\nend\n")
+    report.main([str(study), "--page", str(page)])
 
     printed = capsys.readouterr().out
     frame = collect(study)
     for name, sweep in frame.groupby("sweep"):
         table = report.cases_table(sweep)
-        for text in (printed, (study / "report" / "report.md").read_text(), readme.read_text()):
+        for text in (printed, (study / "report" / "report.md").read_text(), page.read_text()):
             assert table in text
         kinds = ("learning", "constraints", "trajectories", "policies")
         figures = {f"{kind}-{noise}.png" for kind in kinds for noise in {*sweep["noise"]}}
@@ -78,9 +77,9 @@ def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
         for figure in drawn:
             assert f"]({name}/{figure})" in (study / "report" / "report.md").read_text()
     assert len((study / "report" / "runs.md").read_text().splitlines()) == 2 + len(frame)
-    assert "old" not in readme.read_text()
-    assert readme.read_text().endswith(f"<!-- /{study.name} -->\nend\n")
-    assert 5_000 < (tmp_path / "notebooks" / f"{study.name}.png").stat().st_size < 200_000
+    assert "old" not in page.read_text()
+    assert page.read_text().endswith(f"<!-- /{study.name} -->\nend\n")
+    assert 5_000 < (tmp_path / f"{study.name}.png").stat().st_size < 200_000
     # The report's folder is not a run.
     assert len(collect(study)) == len(frame)
 
@@ -98,6 +97,6 @@ def test_many_settings_are_a_frontier_and_ablations_have_their_figure():
 def test_errors_are_one_line(study, tmp_path):
     with pytest.raises(SystemExit, match="without a finished run"):
         report.main([str(tmp_path)])
-    (tmp_path / "README.md").touch()
+    (tmp_path / "paper.md").touch()
     with pytest.raises(SystemExit, match="expected one line <!-- weights -->"):
-        report.main([str(study / "weights"), "--readme", str(Path(tmp_path) / "README.md")])
+        report.main([str(study / "weights"), "--page", str(Path(tmp_path) / "paper.md")])

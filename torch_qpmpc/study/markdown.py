@@ -23,6 +23,6 @@ def replaced(text: str, new: str, marker: str) -> str:
     counts = text.count(begin), text.count(end)
     if counts != (1, 1) or text.index(begin) > text.index(end):
         expected = f"one line {begin} and below it one line {end}"
-        raise QPError.expected("README", f"{counts[0]} and {counts[1]}", expected, "Add them.")
+        raise QPError.expected("the page", f"{counts[0]} and {counts[1]}", expected, "Add them.")
     before, after = text.split(begin)[0], text.split(end)[1]
-    return f"{before}{begin}\n{new}\n{end}{after}"
+    return f"{before}{begin}\n\n{new}\n\n{end}{after}"

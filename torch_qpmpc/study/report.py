@@ -161,13 +161,13 @@ def section(sweep: pd.DataFrame) -> str:
     return "\n\n".join(text for text in (cases_table(sweep), overall(sweep)) if text)
 
 
-def write_readme(frame: pd.DataFrame, readme: Path, name: str) -> None:
-    """Write the tables between a README's markers ``name``, and notebooks/NAME.png beside it."""
-    text = readme.read_text(encoding="utf-8")
+def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:
+    """Write the tables between the markers ``name`` of a Markdown file, and NAME.png beside it."""
+    text = page.read_text(encoding="utf-8")
     tables = [f"**{title}**\n\n{section(sweep)}" for title, sweep in frame.groupby("sweep")]
-    readme.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), name), encoding="utf-8")
+    page.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), name), encoding="utf-8")
     first = max(frame.groupby("sweep"), key=lambda pair: pair[1]["closed_gap"].median())[1]
-    headline(first).savefig(readme.parent / "notebooks" / f"{name}.png", dpi=90)
+    headline(first).savefig(page.with_name(f"{name}.png"), dpi=90)
 
 
 def headline(sweep: pd.DataFrame) -> Figure:
@@ -188,13 +188,13 @@ def main(arguments: list[str] | None = None) -> None:
         "folder", type=Path, metavar="RUNS_FOLDER", help="folder of the runs, at any depth"
     )
     parser.add_argument(
-        "--readme", type=Path, help="file whose <!-- RUNS_FOLDER --> section gets the tables"
+        "--page", type=Path, help="Markdown file whose <!-- RUNS_FOLDER --> section gets the tables"
     )
     options = parser.parse_args(arguments)
     try:
         frame = collect(options.folder)
-        if options.readme:
-            write_readme(frame, options.readme, options.folder.resolve().name)
+        if options.page:
+            write_page(frame, options.page, options.folder.resolve().name)
         print(write(frame, options.folder / "report"))
     except QPError as error:
         raise SystemExit(str(error)) from None

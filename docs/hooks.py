@@ -1,0 +1,38 @@
+"""What mkdocs.yml cannot say: files from outside docs/, and the examples of docstrings."""
+
+from __future__ import annotations
+
+import re
+from importlib.resources import files as package_files
+from pathlib import Path
+from typing import Any
+
+import griffe
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[1]
+
+
+@event_priority(100)  # before mkdocs-jupyter, which turns notebooks into pages
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the notebooks, and MathJax from its Python package."""
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        place = f"notebooks/{path.name}"
+        files.append(File(place, str(ROOT), config.site_dir, config.use_directory_urls))
+    mathjax = package_files("mathjax") / "static" / "mathjax" / "es5" / "tex-svg.js"
+    files.append(File.generated(config, "javascripts/tex-svg.js", abs_src_path=str(mathjax)))
+    return files
+
+
+class Docstrings(griffe.Extension):
+    """Read ``Example:`` as doctests, and ``A, B: ..`` as two parameters, which Griffe does not."""
+
+    def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
+        if obj.docstring is None:
+            return
+        text = re.sub(r"(?m)^Example:$", "Examples:", obj.docstring.value)
+        # What follows a space would be taken for the type; a no-break space is part of the name.
+        names = re.compile(r"(?m)^ {4}\w+(?:, \w+)+(?=:\s)")
+        obj.docstring.value = names.sub(lambda m: m[0].replace(", ", ",\u00a0"), text)

@@ -1,0 +1,190 @@
+"""The documentation holds: its Python runs, its commands are possible, its names exist."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import importlib.util
+import json
+import os
+import pkgutil
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torch_qpmpc
+from tests.runs import SMALL, make_config
+from torch_qpmpc.experiment.config import check_config
+from torch_qpmpc.experiment.tasks import TASKS
+from torch_qpmpc.qp import solvers
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = {
+    path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md")))
+    if path.exists()
+}
+#: Pages whose Python takes more than a few seconds.
+SLOW = {"docs/guides/torchrl.md"}
+MODULES = sorted(
+    module.name for module in pkgutil.walk_packages(torch_qpmpc.__path__, "torch_qpmpc.")
+)
+
+needs_docs = pytest.mark.skipif(not DOCS.exists(), reason="no docs, as in a wheel's tests")
+
+
+def fenced(text: str, language: str) -> list[tuple[int, str]]:
+    """Return the fenced blocks in a language, each with the line that it starts on."""
+    fence = re.compile(rf"^```{language}[^\n]*\n(.*?)^```", re.DOTALL | re.MULTILINE)
+    return [(text.count("\n", 0, m.start(1)), m.group(1)) for m in fence.finditer(text)]
+
+
+def commands(text: str) -> list[list[str]]:
+    """Return the commands of a page's bash blocks, split into words."""
+    blocks = [code.replace("\\\n", "") for _, code in fenced(text, "bash")]
+    lines = [line for code in blocks for line in code.splitlines()]
+    return [shlex.split(part, comments=True) for line in lines for part in line.split("&&")]
+
+
+COMMANDS = {page: commands(text) for page, text in PAGES.items()}
+
+
+def test_blocks_are_found():
+    text = "a\n```bash\nls \\\n -l # all\n```\n```python\nx = 1\n```\nb\n```python t\ny = 2\n```\n"
+    assert fenced(text, "python") == [(6, "x = 1\n"), (10, "y = 2\n")]
+    assert commands(text) == [["ls", "-l"]]
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=pytest.mark.slow if page in SLOW else ())
+        for page, text in PAGES.items()
+        if fenced(text, "python")
+    ],
+)
+def test_python_of_a_page_runs(page, tmp_path, monkeypatch):
+    """Block after block, as a reader would paste them into one session."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(TASKS, "pole", raising=False)  # and again afterwards
+    monkeypatch.setattr(solvers, "BACKENDS", dict(solvers.BACKENDS))
+    namespace: dict[str, object] = {"__name__": "page"}
+    for line, code in fenced(PAGES[page], "python"):
+        # Blank lines first, so that a traceback names the page's own line.
+        exec(compile("\n" * line + code, page, "exec"), namespace)
+
+
+@pytest.mark.parametrize(
+    ("page", "command"),
+    [
+        pytest.param(page, words, id=f"{page}: {' '.join(words[:4])}")
+        for page, of_page in COMMANDS.items()
+        for words in of_page
+        if words[:2] == ["python", "train.py"] and "NAME" not in "".join(words)
+    ],
+)
+def test_train_commands_have_possible_settings(page, command):
+    overrides = [word for word in command[2:] if word != "-m" and not word.startswith("resume=")]
+    # Of a sweep, the first of each choice.
+    first = [re.sub(r"=([\w.]+),[^\[\]]*$", r"=\1", word) for word in overrides]
+    check_config(make_config(*first))
+
+
+@pytest.mark.parametrize(
+    "module",
+    sorted(
+        {
+            words[2]
+            for of_page in COMMANDS.values()
+            for words in of_page
+            if words[:2] == ["python", "-m"] and words[2].startswith(("tests", "torch_qpmpc"))
+        }
+    ),
+)
+def test_modules_that_commands_run_exist(module):
+    assert importlib.util.find_spec(module) is not None
+
+
+@needs_docs
+def test_the_task_of_the_guide_trains(tmp_path):
+    """As a script, in the runs of a sweep, which are processes of their own."""
+    blocks = [code for _, code in fenced(PAGES["docs/guides/task.md"], "python")]
+    (script,) = (code for code in blocks if "register(" in code)
+    (tmp_path / "my_task.py").write_text(script, encoding="utf-8")
+    small = (*SMALL, "task.horizon=10", "figures=false", "hydra.launcher.n_jobs=2")
+    command = [sys.executable, "my_task.py", "-m", "task=pole", "seed=1,2", *small]
+    ended = subprocess.run(
+        [*command, "hydra.sweep.dir=sweep"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+    summary = json.loads((tmp_path / "sweep/none-deviation-seed2/summary.json").read_text())
+    assert (summary["task"], summary["seed"], summary["updates"]) == ("pole", 2, 4)
+    assert summary["J_true_model"] < summary["J_start"]
+
+
+@needs_docs
+def test_every_test_that_a_page_names_exists():
+    text = PAGES["docs/reliability/pytorch.md"]
+    table = text.split("<!-- pytorch -->")[1].split("<!-- /pytorch -->")[0]
+    named = re.findall(r"^(\d+)\. `(tests/[\w/]+\.py)::(test_\w+)`$", table, re.MULTILINE)
+    assert {number for number, _, _ in named} == {*re.findall(r"\[(\d+)\]", table)}
+    for _, path, test in named:
+        source = (ROOT / path).read_text(encoding="utf-8")
+        assert f"\ndef {test}(" in source, f"{path}::{test}"
+
+
+@needs_docs
+def test_the_readmes_numbers_are_those_of_the_pages():
+    readme = PAGES["README.md"]
+    excerpts = re.findall(r"^<!-- excerpt (.+) -->\n\n((?:\|.*\n)+)", readme, re.MULTILINE)
+    assert len(excerpts) == 2
+    for page, excerpt in excerpts:
+        cells = {*re.split(r" *\| *", PAGES[page].replace("\n", "|"))}
+        _, _, *rows = excerpt.splitlines()
+        for row in rows:
+            _, *numbers = row.strip("| ").split(" | ")
+            assert {*numbers} <= cells, f"{page}: {row}"
+
+
+@needs_docs
+def test_the_readme_is_short_and_its_links_lead_somewhere():
+    readme = PAGES["README.md"]
+    assert len(readme.splitlines()) <= 150
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", readme):
+        assert target.startswith("https://") or (ROOT / target).exists(), target
+
+
+@needs_docs
+def test_the_reference_has_every_public_name():
+    index = PAGES["docs/api/index.md"]
+    assert {*re.findall(r"`qm\.(\w+)`", index)} - {"envs"} == {*torch_qpmpc.__all__}
+
+
+@pytest.mark.parametrize("name", ["torch_qpmpc", *MODULES])
+def test_docstrings_run(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    results = doctest.testmod(
+        importlib.import_module(name),
+        optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS,
+    )
+    assert results.failed == 0, f"{results.failed} of {results.attempted} examples of {name}"
+
+
+PUBLIC = [torch_qpmpc.__dict__[name] for name in torch_qpmpc.__all__]
+
+
+@pytest.mark.parametrize("public", PUBLIC, ids=lambda x: x.__name__)
+def test_public_names_are_documented(public):
+    assert public.__module__.startswith("torch_qpmpc")
+    assert len((public.__doc__ or "").strip().splitlines()[0]) > 20
