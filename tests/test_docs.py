@@ -111,6 +111,7 @@ def test_modules_that_commands_run_exist(module):
 
 
 @needs_docs
+@pytest.mark.slow
 def test_the_task_of_the_guide_trains(tmp_path):
     """As a script, in the runs of a sweep, which are processes of their own."""
     blocks = [code for _, code in fenced(PAGES["docs/guides/task.md"], "python")]
@@ -179,12 +180,3 @@ def test_docstrings_run(name, tmp_path, monkeypatch):
         optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS,
     )
     assert results.failed == 0, f"{results.failed} of {results.attempted} examples of {name}"
-
-
-PUBLIC = [torch_qpmpc.__dict__[name] for name in torch_qpmpc.__all__]
-
-
-@pytest.mark.parametrize("public", PUBLIC, ids=lambda x: x.__name__)
-def test_public_names_are_documented(public):
-    assert public.__module__.startswith("torch_qpmpc")
-    assert len((public.__doc__ or "").strip().splitlines()[0]) > 20
