@@ -32,7 +32,7 @@ def _little_training(monkeypatch):
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(data=st.data())
-def test_no_status_is_wrong(solver, data):
+def test_no_qp_is_called_what_it_is_not(solver, data):
     family = data.draw(st.sampled_from(sorted(FAMILIES)))
     seed, count = data.draw(st.integers(0, 2**32)), data.draw(st.integers(1, 6))
     solver, tally = solver + data.draw(st.sampled_from(("", ", warm"))), Tally()
