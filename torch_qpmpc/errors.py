@@ -16,7 +16,7 @@ class QPError(ValueError):
 
     @classmethod
     def expected(cls, name: str, got: object, expected: str, remedy: str = "") -> QPError:
-        """Return the error with the message ``NAME: got GOT, expected EXPECTED. REMEDY``."""
+        """Return the error ``{name}: got {got}, expected {expected}. {remedy}``."""
         tail = f" {remedy}" if remedy else ""
         return cls(f"{name}: got {got}, expected {expected}.{tail}")
 

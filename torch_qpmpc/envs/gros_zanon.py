@@ -72,11 +72,11 @@ class GrosZanonLTI(LinearSystem):
         return self.A.new_tensor([[0, 0.15]]).repeat(count, 1)
 
     def draw(self, rng: Rng, count: int) -> Tensor:
-        """Draw numbers uniform in [0, 1), ``(count, 1)``, one per episode."""
+        """Draw numbers uniform in [0, 1) from ``rng``, ``(count, 1)``, one per episode."""
         return uniform(rng, count, 1)
 
     def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
-        """Return [e, 0] ``(*batch, 2)``, with e scaled as by numpy's ``uniform(-0.1, 0.0)``."""
+        """Return [e, 0] ``(*batch, 2)``, with e = 0.1 ``draw`` - 0.1, uniform in [-0.1, 0)."""
         e = -0.1 + 0.1 * draw.to(self.A)
         return torch.cat((e, torch.zeros_like(e)), -1)
 

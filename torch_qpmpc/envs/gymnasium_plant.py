@@ -57,7 +57,10 @@ class GymnasiumPlant:
         return low, high
 
     def vectorised(self, num_envs: int, max_steps: int, seed: int) -> EnvBase:
-        """Make a TorchRL environment of ``num_envs`` episodes of at most ``max_steps`` steps."""
+        """Make a TorchRL environment of ``num_envs`` episodes of at most ``max_steps`` steps.
+
+        ``seed`` seeds all of them.
+        """
         check_whole("num_envs", num_envs, 1)
         check_whole("max_steps", max_steps, 1)
         envs = gymnasium.make_vec(

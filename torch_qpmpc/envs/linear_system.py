@@ -67,6 +67,26 @@ class LinearSystem(ABC):
 
     Raises:
         QPError: if a tensor has another shape or dtype, A or B is not finite, or bounds cross.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> class Integrator(qm.envs.LinearSystem):
+        ...     def cost(self, s, a):
+        ...         return (s.square() + a.square()).sum(-1)
+        ...
+        ...     def starts(self, rng, count):
+        ...         return torch.ones(count, 1).double()
+        ...
+        ...     def draw(self, rng, count):
+        ...         return torch.zeros(count, 0)
+        ...
+        ...     def noise(self, nu, draw):
+        ...         return nu
+        >>> one = torch.ones(1, 1).double()
+        >>> limits = {"lb_s": -5 * one[0], "ub_s": 5 * one[0], "lb_a": -one[0], "ub_a": one[0]}
+        >>> plant = Integrator(A=one, B=one, **limits)
+        >>> plant.step(one, -0.5 * one, 0 * one)
+        tensor([[0.5000]], dtype=torch.float64)
     """
 
     #: True if a step clips s+ to its bounds; if False, they are soft and observations unbounded.
@@ -113,15 +133,15 @@ class LinearSystem(ABC):
 
     @abstractmethod
     def starts(self, rng: Rng, count: int) -> Tensor:
-        """Draw start states ``(count, n_x)``."""
+        """Draw start states ``(count, n_x)`` from the generator ``rng``."""
 
     @abstractmethod
     def draw(self, rng: Rng, count: int) -> Tensor:
-        """Draw the random numbers ``(count, n_noise)`` for one step of ``count`` episodes."""
+        """Draw numbers ``(count, n_noise)`` from ``rng``, for one step of ``count`` episodes."""
 
     @abstractmethod
     def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
-        """Return the next nu ``(*batch, n_x)`` from the last one and a :meth:`draw`."""
+        """Return the next nu ``(*batch, n_x)`` from the last one and a ``draw`` of :meth:`draw`."""
 
     def mean_noise(self) -> Tensor:
         """Return the mean of nu ``(n_x,)``; 0 unless overridden."""
@@ -132,7 +152,7 @@ class LinearSystem(ABC):
         return self.A, self.B, self.mean_noise()
 
     def applied(self, a: Tensor) -> Tensor:
-        """Return the applied action ``(*batch, n_u)``: a clipped to its bounds."""
+        """Return the applied action: a ``(*batch, n_u)``, clipped to its bounds."""
         check_tensor("a", a, len(self.lb_a))
         return a.to(self.A).clamp(self.lb_a, self.ub_a)
 
@@ -142,19 +162,29 @@ class LinearSystem(ABC):
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
 
     def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
-        """Return s+ = A s + B a + nu ``(*batch, n_x)``; clips a and, if `clips_states`, s+."""
+        """Return s+ = A s + B a + nu, with a clipped and, if `clips_states`, s+ too.
+
+        s ``(*batch, n_x)``, a ``(*batch, n_u)`` and nu ``(*batch, n_x)`` broadcast.
+        """
         check_tensor("s", s, len(self.A))
         check_tensor("nu", nu, len(self.A))
         following = s.to(self.A) @ self.A.mT + self.applied(a) @ self.B.mT + nu.to(self.A)
         return following.clamp(self.lb_s, self.ub_s) if self.clips_states else following
 
     def vectorised(self, num_envs: int, max_steps: int, seed: int) -> LinearSystemEnv:
-        """Make a TorchRL environment of ``num_envs`` episodes of ``max_steps`` steps."""
+        """Make a TorchRL environment of ``num_envs`` episodes of ``max_steps`` steps.
+
+        ``seed`` seeds starts and noise.
+        """
         return LinearSystemEnv(self, num_envs, max_steps, seed=seed)
 
 
 class LinearSystemGymEnv(gymnasium.Env):
-    """A Gymnasium environment of ``physics``, truncated by its registration, never terminated."""
+    """A Gymnasium environment of ``physics``, truncated by its registration, never terminated.
+
+    Raises:
+        QPError: if ``physics`` is no `LinearSystem`.
+    """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own convention)
 
@@ -270,7 +300,7 @@ class LinearSystemEnv(EnvBase):
         return self.rng.get_state()
 
     def set_rng_state(self, state: Tensor) -> None:
-        """Restore the generator's state, a result of :meth:`get_rng_state`."""
+        """Restore the generator's ``state``, a result of :meth:`get_rng_state`."""
         self.rng.set_state(state.cpu())
 
     def _set_seed(self, seed: int | None) -> None:

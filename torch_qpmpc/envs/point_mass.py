@@ -105,7 +105,7 @@ class PointMass(LinearSystem):
         return ((s @ self.W) * s).sum(-1)
 
     def starts(self, rng: Rng, count: int) -> Tensor:
-        """Draw start states ``(count, 4)``.
+        """Draw start states ``(count, 4)`` from ``rng``.
 
         A NumPy generator draws all positions, then all velocities; a torch generator, whole states.
         """
@@ -117,16 +117,16 @@ class PointMass(LinearSystem):
         return torch.as_tensor(np.hstack(draws)).to(self.A)
 
     def draw(self, rng: Rng, count: int) -> Tensor:
-        """Draw standard normal numbers ``(count, 4)``."""
+        """Draw standard normal numbers ``(count, 4)`` from ``rng``."""
         return normal(rng, count, 4)
 
     def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
-        """Return the next nu ``(*batch, 4)`` from the last one and a standard normal draw."""
+        """Return the next nu ``(*batch, 4)`` from the last one and a standard normal ``draw``."""
         step = self.std * draw.to(self.A)
         return nu.to(self.A) + step if self.noise_kind == "brownian" else step
 
     def corrupted(self, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw the wrong model that learning starts from, and the initial cost parameters.
+        """Draw by ``seed`` the wrong model that learning starts from, and the initial cost.
 
         Returns:
             A_hat ``(4, 4)`` and B_hat ``(4, 2)``, the true ones plus entries uniform in

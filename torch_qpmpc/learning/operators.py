@@ -142,7 +142,11 @@ class QPActorValueOperator(_QPOperator):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write -Q(s, a) to the action value's key."""
+        """Write -Q(s, a) to the action value's key of ``tensordict``, and return it.
+
+        Raises:
+            QPError: if an entry is missing or does not fit.
+        """
         return self._set_value(tensordict)
 
     def get_policy_operator(self, active_set_key: NestedKey | None = None) -> QPPolicyOperator:

@@ -280,10 +280,13 @@ class QPQLearningLoss(LossModule):
         return out
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return `forward`'s loss and scalars; write the squared TD error as the priority.
+        """Return loss and scalars of ``tensordict``; write the squared TD errors as its priority.
 
         If the value network has an ``active_set_key``, the active sets of Q(s, a) and, under
         ``"next"``, of V(s+) are read from there if present, and written there.
+
+        Raises:
+            QPError: if an entry is missing, does not fit, or holds weights that are not finite.
         """
         self._check_batch(tensordict)
         weights = self._maybe_get_priority_weight(tensordict)
@@ -344,7 +347,7 @@ class QPQLearningLoss(LossModule):
 
     @torch.no_grad()
     def target(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the value estimator's target, ``(*batch,)``, in TorchRL's signs.
+        """Return the value estimator's target of ``tensordict``, ``(*batch,)``, in TorchRL's signs.
 
         With TD(0) it is -(L + gamma (1 - terminated) V(s+)). It is -inf where it contains a V(s+)
         without a solution, and NaN where it contains an invalid reward.

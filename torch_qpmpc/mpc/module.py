@@ -280,7 +280,7 @@ class QPMPC(nn.Module):
     def value_and_active_set(
         self, s: Tensor, a: Tensor | None = None, warm_start: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return `value`, or `action_value`, and the active set ``(*batch, n_g)`` of its solution.
+        """Return V(s) or Q(s, a), and the active set ``(*batch, n_g)`` of its solution.
 
         ``warm_start`` is an active set of nearly equal QPs, as in `solve`.
         """
@@ -291,12 +291,15 @@ class QPMPC(nn.Module):
     def policy_and_active_set(
         self, s: Tensor, warm_start: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return `policy`, and the active set ``(*batch, n_g)`` as the next step's warm start."""
+        """Return pi(s), and the active set ``(*batch, n_g)`` as the next step's ``warm_start``."""
         solution = self.solve(s, warm_start=warm_start)
         return self._action(solution, s.dtype), solution.active
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
+        """Return the states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of a plan.
+
+        The plan is z ``(*batch, n_z)``, such as that of `solve`.
+        """
         return self._layout.predicted(check_tensor("z", z, self.n_z))
 
     def model(self) -> tuple[Tensor, Tensor]:
@@ -388,7 +391,7 @@ class QPMPC(nn.Module):
         return parameters.groups(self, self.learned, rates)
 
     def leaves(self, part: str) -> list[nn.Parameter]:
-        """Return the parameters of a learned part, such as the factor of H.
+        """Return the parameters of the learned ``part``, such as the factor of ``"H"``.
 
         Raises:
             QPError: ``part`` is not learned.
@@ -446,7 +449,7 @@ class QPMPC(nn.Module):
         }
 
     def checked_state(self, state_dict: dict[str, Any], prefix: str) -> dict[str, Any]:
-        """Return ``state_dict``, with this identity if it has none.
+        """Return ``state_dict``, whose keys begin with ``prefix``, with an identity if it has none.
 
         Raises:
             QPError: it belongs to another QPMPC.

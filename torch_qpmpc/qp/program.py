@@ -45,6 +45,9 @@ NDIMS = tuple(len(event) for event in EVENT_SHAPES.values())
 class Status(IntEnum):
     """Outcome of one QP of a batch; only ``SOLVED`` has a solution.
 
+    ``INFEASIBLE`` and ``UNBOUNDED`` are proved, ``NOT_CONVERGED`` is neither proved nor solved, and
+    ``INVALID_DATA`` has NaN, crossing bounds or a cost that is not convex.
+
     Example:
         >>> import torch_qpmpc as qm
         >>> qm.Status.UNBOUNDED.explanation

@@ -84,7 +84,7 @@ class SolveLog:
         }
 
     def add(self, solution: BatchSolution, seconds: float) -> None:
-        """Count a solved batch, and its seconds."""
+        """Count the ``solution`` of a batch, solved in so many ``seconds``."""
         accepted = solution.residual[solution.accepted()]
         self.solves += len(solution.residual)
         self.unsolved += len(solution.residual) - len(accepted)
