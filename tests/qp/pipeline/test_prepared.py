@@ -10,7 +10,7 @@ from torch.func import functional_call
 from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
-from torch_qpmpc.qp.kernels import theta as loops
+from torch_qpmpc.qp.pipeline import condensing
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.prepared import _Latest
 
@@ -18,13 +18,13 @@ from torch_qpmpc.qp.pipeline.prepared import _Latest
 @pytest.fixture
 def eliminations(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """Record the matrices that are eliminated during the test."""
-    eliminated, eliminate = [], loops.eliminate
+    eliminated, eliminate = [], condensing.eliminate
 
     def counting(C: np.ndarray, *arguments):
         eliminated.append(C)
         return eliminate(C, *arguments)
 
-    monkeypatch.setattr(loops, "eliminate", counting)
+    monkeypatch.setattr(condensing, "eliminate", counting)
     return eliminated
 
 

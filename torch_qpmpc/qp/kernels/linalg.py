@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -122,18 +121,3 @@ def _scale(matrix, vectors, out):
     for i in range(len(vectors)):
         for j in range(len(factors)):
             out[i, j] = vectors[i, j] * factors[j]
-
-
-@compiled
-def factorise(L):
-    """Replace the lower triangle by its Cholesky factor; return False if there is none."""
-    for j in range(len(L)):
-        for k in range(j):
-            for i in range(j, len(L)):
-                L[i, j] -= L[j, k] * L[i, k]
-        if not L[j, j] > 0:
-            return False
-        root = math.sqrt(L[j, j])
-        for i in range(j, len(L)):
-            L[i, j] /= root
-    return True

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from torch_qpmpc.qp.kernels import theta as loops
+from torch_qpmpc.qp.kernels import theta as kernels
 from torch_qpmpc.qp.pipeline.arrays import Array, Theta
 
 #: A pivot below this fraction of its row's norm means that rows of C are linearly dependent.
@@ -57,10 +57,12 @@ class Condensed:
 
     ``surely_convex`` is True if all of H is known to be convex. If ``deficient``, the columns of C
     after ``n_kept`` do not have full row rank, and the arrays are valid only for QPs that fix
-    exactly ``n_kept`` entries.
+    exactly ``n_kept`` entries. ``enters`` ``(n_g, n_y)`` is True where a row of G
+    contains a variable of y, but for rounding.
     """
 
     arrays: CondensedArrays
+    enters: np.ndarray
     n_kept: int
     deficient: bool
     surely_convex: bool
@@ -104,21 +106,76 @@ class Forces(NamedTuple):
     push: Array
 
 
+@np.errstate(all="ignore")  # predictions of unstable models may overflow
 def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) -> Condensed:
     """Condense M matrix triples, keeping the first ``n_kept`` entries of z."""
     T, Y_neg, padding = elimination or eliminate(theta.C, n_kept)
-    H, G, H_b, G_b, convex = loops.condense(theta.H, theta.G, T, Y_neg, CONVEX)
+    H_T = theta.H @ T
+    H = T.swapaxes(1, 2) @ H_T
+    H = (H + H.swapaxes(1, 2)) / 2
+    H_b, G_b = -(H_T.swapaxes(1, 2) @ Y_neg), -(theta.G @ Y_neg)
     if padding is not None:  # a unit curvature sets the variables of zero columns to zero
         H = H + padding[:, :, None] * np.eye(H.shape[1])
-        convex = False
+    G = theta.G @ T
+    # Rounding leaves traces of variables that a row does not contain, and all of a row that C
+    # implies: sizes are compared with those before the elimination.
+    size = np.abs(theta.G) @ np.abs(T).sum(-1, keepdims=True)
+    enters = (np.abs(G) > ENTERS * size).any(0)
     arrays = CondensedArrays(T, Y_neg, H, G, H_b, G_b)
-    return Condensed(arrays, n_kept, padding is not None, convex)
+    return Condensed(
+        arrays, enters, n_kept, padding is not None, padding is None and _has_factor(H)
+    )
 
 
+def _has_factor(H: np.ndarray) -> bool:
+    """Return True if Cholesky factors prove all H convex; eigenvalues take many times as long."""
+    largest = H.diagonal(axis1=1, axis2=2).max(-1, initial=0.0)
+    shift = CONVEX * (1 + largest[:, None, None]) * np.eye(H.shape[1])
+    try:
+        np.linalg.cholesky(H + shift)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+@np.errstate(all="ignore")
 def reduce(condensed: Condensed, theta: Theta, group: np.ndarray, n_f: int) -> Reduced:
     """Reduce condensed QPs to those with the first n_f entries fixed."""
-    x = condensed.arrays
-    return Reduced._make((*loops.reduce(x, theta, group, n_f, ENTERS), x.T, x.Y_neg))
+    T, Y_neg, H, G, H_b, G_b = condensed.arrays
+    bounded = ((theta.lb > -np.inf) | (theta.ub < np.inf)).any(0)
+    entering = bounded & condensed.enters[:, n_f:].any(-1)
+    rows, others = np.flatnonzero(entering), np.flatnonzero(~entering)
+    H, H_b, G, G_b = H[:, n_f:], H_b[:, n_f:], G[:, rows], G_b[:, rows]
+    fixed_g, fixed_y = H[:, :, :n_f].swapaxes(1, 2), -G[:, :, :n_f].swapaxes(1, 2)
+    matrix = np.concatenate((fixed_g, fixed_y, fixed_y), axis=-1)
+    q, b, lb, ub = theta.q, theta.b, theta.lb[:, rows], theta.ub[:, rows]
+    d, r, y_b = H.shape[1], len(rows), _times(G_b, group, b)
+    count = max(map(len, (q, b, lb, ub))) if len(T) == 1 else len(group)
+    constant = np.empty((count, d + 2 * r))
+    constant[:, :d] = _times(T[:, :, n_f:].swapaxes(1, 2), group, q) + _times(H_b, group, b)
+    constant[:, d : d + r], constant[:, d + r :] = lb - y_b, ub - y_b
+    z_0 = -_times(Y_neg, group, b)
+    arrays = (H[:, :, n_f:], G[:, :, n_f:], matrix, constant, z_0, theta.w[:, rows])
+    return Reduced._make((rows, others, *map(np.ascontiguousarray, arrays), T, Y_neg))
+
+
+def _times(matrices: np.ndarray, group: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Multiply ``(M, i, j)`` by ``(B or 1, j)``, each by the matrix ``group`` of its QP."""
+    if len(matrices) == 1:
+        return vectors @ matrices[0].T
+    return (matrices[group] @ vectors[:, :, None])[:, :, 0]
+
+
+@np.errstate(all="ignore")
+def forces(reduced: Reduced) -> Forces:
+    """Return the `Forces` of reduced QPs, NaN if an H is singular."""
+    try:
+        inverse = np.linalg.inv(reduced.H)
+    except np.linalg.LinAlgError:
+        inverse = np.full_like(reduced.H, np.nan)
+    y = reduced.G @ inverse
+    rise = np.concatenate((inverse, y.swapaxes(1, 2)), axis=-1)
+    return Forces(rise, np.concatenate((y, y @ reduced.G.swapaxes(1, 2)), axis=-1))
 
 
 def convex(H: np.ndarray) -> np.ndarray:
@@ -129,10 +186,11 @@ def convex(H: np.ndarray) -> np.ndarray:
 
 def eliminate(C: np.ndarray, n_kept: int) -> Elimination:
     """Eliminate C z = b by LU, or by the SVD if rows of C ``(M, n_c, n_z)`` are dependent."""
-    T, Y_neg, regular = loops.eliminate(C, n_kept, RANK_TOLERANCE)
+    T, Y_neg, regular = kernels.eliminate(C, n_kept, RANK_TOLERANCE)
     return Elimination(T, Y_neg, None) if regular else null_space(C, n_kept)
 
 
+@np.errstate(all="ignore")
 def in_order(C: np.ndarray, n_kept: int) -> Elimination | None:
     """Eliminate C z = b in the order of the equations; None if rows of C are dependent.
 

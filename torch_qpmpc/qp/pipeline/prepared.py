@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from torch_qpmpc.qp.kernels import theta as loops
 from torch_qpmpc.qp.pipeline.arrays import Theta, on_device
 from torch_qpmpc.qp.pipeline.condensing import (
     Condensed,
@@ -24,6 +23,7 @@ from torch_qpmpc.qp.pipeline.condensing import (
     Reduced,
     condense,
     convex,
+    forces,
     reduce,
 )
 from torch_qpmpc.qp.pipeline.scaling import Units
@@ -78,7 +78,7 @@ class Prepared:
 
     @cached_property
     def _inspected(self) -> tuple[np.ndarray | None, bool, bool]:
-        return loops.inspect(self.theta, self.group)
+        return _inspect(self.theta, self.group)
 
     @cached_property
     def units(self) -> Units | None:
@@ -122,11 +122,7 @@ class Prepared:
     def forces(self, n_f: int) -> Forces:
         """Return the `Forces` of the reduced QPs, on the device."""
 
-        def make() -> Forces:
-            reduced = self._reduced(n_f)
-            return self._on_device(Forces(*loops.forces(reduced.H, reduced.G)))
-
-        return self._once(("forces", n_f), make)
+        return self._once(("forces", n_f), lambda: self._on_device(forces(self._reduced(n_f))))
 
     def part(self, group: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, Prepared]:
         """Return the new group and theta of the QPs at ``index``, whose matrices are ``group``."""
@@ -153,6 +149,25 @@ class Prepared:
         if name not in self._known:
             self._known[name] = make()
         return self._known[name]
+
+
+@np.errstate(all="ignore")
+def _inspect(theta: Theta, group: np.ndarray) -> tuple[np.ndarray | None, bool, bool]:
+    """Return `Prepared.valid` and `Prepared.diagonal`."""
+    H, C, G, q, c, b, lb, ub, w = theta
+    # A sum is finite if its terms are, but for overflow, which no solver survives either.
+    finite = np.isfinite(sum(x.sum((1, 2)) for x in (H, C, G)))
+    valid = np.isfinite(q.sum(-1) + b.sum(-1) + c) & (finite if len(H) == 1 else finite[group])
+    # False for NaN, such as inf - inf of two bounds of the same infinity.
+    valid = valid & (ub - lb >= 0).all(-1) & (w >= 0).all(-1)
+    shared = len(H) == 1
+    return None if valid.all() else valid, shared and _is_diagonal(H), shared and _is_diagonal(G)
+
+
+def _is_diagonal(matrices: np.ndarray) -> bool:
+    matrix = matrices[0]
+    square = matrix.shape[0] == matrix.shape[1]
+    return square and np.count_nonzero(matrix) == np.count_nonzero(matrix.diagonal())
 
 
 class _Latest(threading.local):

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torch_qpmpc.qp.kernels import theta as loops
 from torch_qpmpc.qp.pipeline.arrays import Array, BatchSolution, Theta, per_qp
 
 #: Sizes between these have the unit one.
@@ -35,12 +34,26 @@ class Units(NamedTuple):
     equalities: np.ndarray
 
     @classmethod
+    @np.errstate(all="ignore")
     def of(cls, theta: Theta, group: np.ndarray) -> Units | None:
         """Return the units of theta; None if all of them are one."""
         if not len(group) or not theta.q.shape[-1]:
             return None
-        units = loops.units(theta, group, SMALL, LARGE)
-        return None if units is None else cls(*units)
+        M, (rows, equalities) = len(theta.H), (np.abs(x).sum(-1) for x in (theta.G, theta.C))
+        q, b, lb, ub = (_sizes(x, group, M) for x in (theta.q, *theta[5:8]))
+        H, q = np.abs(theta.H).max(axis=(1, 2))[:, None], q.max(-1, keepdims=True)
+        reach = np.concatenate((np.maximum(lb, ub) / rows, b / equalities), axis=-1)
+        sizes = np.concatenate((np.maximum(H, q), rows, equalities, reach), axis=-1)
+        if (sizes[:, 0] > 0).all() and not _unusual(sizes).any():
+            return None
+        length = _typical(reach)
+        cost = np.maximum(H * length**2, q * length)
+        of_rows = (_sizes(theta.w, group, M) * rows * length).max(-1, keepdims=True, initial=0.0)
+        cost = np.where(cost > 0, cost, np.maximum(cost, of_rows))  # a QP without any other cost
+        powers = (_power_above(x) for x in (cost, rows * length, equalities * length))
+        cost, rows, equalities = powers
+        units = cls(cost, length, rows, equalities)
+        return units if any((unit != 1).any() for unit in units) else None
 
     def scaled(self, theta: Theta, group: np.ndarray) -> Theta:
         """Return theta in these units."""
@@ -77,3 +90,33 @@ class Units(NamedTuple):
     def multipliers(self, lam: Array, group: Array) -> Array:
         """Return multipliers ``(B, n_g)`` of the rows in these units."""
         return lam * per_qp(self.rows / self.cost, group)
+
+
+def _sizes(vectors: np.ndarray, group: np.ndarray, M: int) -> np.ndarray:
+    """Return the largest finite sizes ``(M, n)`` of the QPs that share their matrices."""
+    sizes = np.where(np.isfinite(vectors), np.abs(vectors), 0.0)
+    if M == 1:
+        return sizes.max(0, keepdims=True)
+    largest = np.zeros((M, sizes.shape[1]))
+    np.maximum.at(largest, group, sizes)
+    return largest
+
+
+def _typical(sizes: np.ndarray) -> np.ndarray:
+    """Return `_power_above` of the lower median of the positive, finite sizes, ``(M, 1)``."""
+    known = (sizes > 0) & (sizes < np.inf)
+    powers = np.sort(np.where(known, _power_above(sizes), np.inf), axis=-1)
+    count = known.sum(-1, keepdims=True)
+    if not powers.shape[-1]:
+        return np.ones((len(sizes), 1))
+    middle = np.take_along_axis(powers, np.maximum(count - 1, 0) // 2, axis=-1)
+    return np.where(count > 0, middle, 1.0)
+
+
+def _power_above(sizes: np.ndarray) -> np.ndarray:
+    """Return the powers of two next above sizes; one for ordinary, zero or not finite ones."""
+    return np.where(_unusual(sizes), np.ldexp(1.0, np.frexp(sizes)[1]), 1.0)
+
+
+def _unusual(sizes: np.ndarray) -> np.ndarray:
+    return ((sizes > 0) & (sizes < SMALL)) | ((sizes > LARGE) & (sizes < np.inf))
