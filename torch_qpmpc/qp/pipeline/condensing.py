@@ -150,7 +150,8 @@ def reduce(condensed: Condensed, theta: Theta, group: np.ndarray, n_f: int) -> R
     matrix = np.concatenate((fixed_g, fixed_y, fixed_y), axis=-1)
     q, b, lb, ub = theta.q, theta.b, theta.lb[:, rows], theta.ub[:, rows]
     d, r, y_b = H.shape[1], len(rows), _times(G_b, group, b)
-    count = max(map(len, (q, b, lb, ub))) if len(T) == 1 else len(group)
+    shared = np.broadcast_shapes(*(x.shape[:1] for x in (q, b, lb, ub)))
+    count = shared[0] if len(T) == 1 else len(group)
     constant = np.empty((count, d + 2 * r))
     constant[:, :d] = _times(T[:, :, n_f:].swapaxes(1, 2), group, q) + _times(H_b, group, b)
     constant[:, d : d + r], constant[:, d + r :] = lb - y_b, ub - y_b
