@@ -213,7 +213,7 @@ def test_a_full_disk_ends_in_a_sentence_and_keeps_the_last_checkpoint(tmp_path):
     assert re.match(
         r"folder: got .*/run, where writing failed \(.*File too large.*\), exp", sentence
     )
-    assert sentence.endswith(f"make room, then python train.py resume={tmp_path / 'run'}.")
+    assert sentence.endswith(f"free space, then python train.py resume={tmp_path / 'run'}.")
     assert "Traceback" not in ended.stderr
     assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["update"] == 2
     assert not list((tmp_path / "run").glob("*.partial"))
