@@ -87,9 +87,6 @@ class Units(NamedTuple):
             xi=solution.xi * (cost / length),
         )
 
-    def multipliers(self, lam: Array, group: Array) -> Array:
-        """Return multipliers ``(B, n_g)`` of the rows in these units."""
-        return lam * per_qp(self.rows / self.cost, group)
 
 
 def _sizes(vectors: np.ndarray, group: np.ndarray, M: int) -> np.ndarray:
