@@ -146,6 +146,15 @@ def test_every_test_that_a_page_names_exists():
 
 
 @needs_docs
+def test_every_file_and_module_that_a_page_names_exists():
+    for page, text in PAGES.items():
+        for path in re.findall(r"(?<![\w/])(?:torch_qpmpc|tests|configs|docs)/[\w/]+\.\w+", text):
+            assert "NAME" in path or (ROOT / path).exists(), f"{page}: {path}"
+        for module in re.findall(r"^::: ([\w.]+)", text, re.MULTILINE):
+            assert importlib.util.find_spec(module) is not None, f"{page}: {module}"
+
+
+@needs_docs
 def test_the_readmes_numbers_are_those_of_the_pages():
     readme = PAGES["README.md"]
     excerpts = re.findall(r"^<!-- excerpt (.+) -->\n\n((?:\|.*\n)+)", readme, re.MULTILINE)

@@ -88,7 +88,6 @@ class Units(NamedTuple):
         )
 
 
-
 def _sizes(vectors: np.ndarray, group: np.ndarray, M: int) -> np.ndarray:
     """Return the largest finite sizes ``(M, n)`` of the QPs that share their matrices."""
     sizes = np.where(np.isfinite(vectors), np.abs(vectors), 0.0)
