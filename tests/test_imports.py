@@ -34,6 +34,7 @@ def test_a_qp_alone_imports_nothing_heavy(code):
     assert loaded_after(code) == set()
 
 
+@pytest.mark.slow
 def test_torchrl_comes_with_the_names_that_need_it():
     assert "tensordict" in loaded_after("from torch_qpmpc import QPActorValueOperator")
     assert "torchrl" in loaded_after("import torch_qpmpc; torch_qpmpc.envs.PointMassEnv")

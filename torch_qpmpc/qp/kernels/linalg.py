@@ -44,6 +44,13 @@ larger: Any = intrinsic(_larger)
 
 
 @compiled
+def copy(x, y):
+    """x = y, as a loop: Numba's assignment to a slice takes seconds to compile."""
+    for j in range(len(x)):
+        x[j] = y[j]
+
+
+@compiled
 def add(x, factor, y):
     """Add ``factor y`` to x in place."""
     for j in range(len(x)):
@@ -101,7 +108,7 @@ def products(matrices, group, vectors, diagonal):
 @compiled
 def transposed_products(matrices, group, vectors, diagonal):
     """Do as `products` with transposed matrices: ``(M, i, j)`` and ``(B, i)`` to ``(B, j)``."""
-    out = np.empty((len(vectors), matrices.shape[2]))
+    out = np.zeros((len(vectors), matrices.shape[2]))
     if diagonal:
         _scale(matrices[0], vectors, out)
     elif len(matrices) == 1 and matrices.size:
@@ -109,7 +116,6 @@ def transposed_products(matrices, group, vectors, diagonal):
         for i in range(0, len(vectors), chunk):
             np.dot(vectors[i : i + chunk], matrices[0], out[i : i + chunk])
     else:
-        out[:] = 0.0
         for i in range(len(vectors) if matrices.size else 0):
             add_product(out[i], vectors[i], matrices[group[i]])
     return out
@@ -117,7 +123,6 @@ def transposed_products(matrices, group, vectors, diagonal):
 
 @compiled
 def _scale(matrix, vectors, out):
-    factors = np.diag(matrix).copy()
     for i in range(len(vectors)):
-        for j in range(len(factors)):
-            out[i, j] = vectors[i, j] * factors[j]
+        for j in range(len(matrix)):
+            out[i, j] = vectors[i, j] * matrix[j, j]

@@ -16,6 +16,7 @@ from torch_qpmpc.qp.kernels.linalg import (
     add_product,
     comparing,
     compiled,
+    copy,
     larger,
     products,
     summing,
@@ -38,7 +39,7 @@ def offsets(fixed, group, matrix, constant):
     # Not by BLAS, which rounds a single sample differently from one in a batch.
     out = np.empty((len(fixed), constant.shape[1]))
     for i in range(len(fixed)):
-        out[i] = constant[i % len(constant)]
+        copy(out[i], constant[i % len(constant)])
         add_product(out[i], fixed[i], matrix[group[i]])
     return out
 
@@ -66,8 +67,9 @@ def _recover(v, lam_v, group, fixed, theta, reduced, diagonal, passes):
     n_qps, n_f = fixed.shape
     H, C, G, q = theta.H, theta.C, theta.G, theta.q
     kept = np.empty((n_qps, n_f + v.shape[1]))
-    kept[:, :n_f] = fixed
-    kept[:, n_f:] = v
+    for i in range(n_qps):
+        copy(kept[i, :n_f], fixed[i])
+        copy(kept[i, n_f:], v[i])
     z = products(reduced.T, group, kept, False)
     for i in range(n_qps):
         add(z[i], 1.0, reduced.z_0[i % len(reduced.z_0)])
@@ -90,7 +92,8 @@ def _recover(v, lam_v, group, fixed, theta, reduced, diagonal, passes):
         C_chi = transposed_products(C, group, chi, False)
     left += C_chi
     xi = -left[:, :n_f]
-    left[:, :n_f] += xi
+    for i in range(n_qps):
+        add(left[i, :n_f], 1.0, xi[i])
     value, residual = _judge(z, lam, chi, fixed, theta, Hz, G_lam, C_chi, left, y, Cz)
     return value, z, chi, lam, xi, codes, residual
 
@@ -138,8 +141,8 @@ def _certify(z, lam, chi, xi, group, fixed, theta, diagonal):
     G_lam = transposed_products(G, group, lam, diagonal[1])
     C_chi, Cz = transposed_products(C, group, chi, False), products(C, group, z, False)
     left = Hz + G_lam + C_chi
-    left[:, : xi.shape[1]] += xi
     for i in range(len(z)):
+        add(left[i, : xi.shape[1]], 1.0, xi[i])
         add(left[i], 1.0, q[i % len(q)])
     return _judge(z, lam, chi, fixed, theta, Hz, G_lam, C_chi, left, y, Cz)
 
@@ -256,16 +259,16 @@ def _try_active_sets(rise, push, group, g, lower, upper, w, active):
     lam, vy, steps = np.zeros((n_qps, r)), free.copy(), np.zeros(n_qps, np.int64)
     done = np.zeros(n_qps, np.bool_)
     code, held, pull = np.empty(r, np.int8), np.empty(r, np.int64), np.empty(r)
-    factor = np.empty((r, r))
+    factor, nothing = np.empty((r, r)), np.zeros(r, np.int8)
     for i in range(n_qps):
-        code[:] = active[i]
+        copy(code, active[i])
         push_i = push[group[i]]
         for j in range(r):
             if not -2 <= code[j] <= 2:
-                code[:] = 0
+                copy(code, nothing)
         while not done[i] and steps[i] < MAX_STEPS:
             steps[i] += 1
-            vy[i] = free[i]
+            copy(vy[i], free[i])
             k = 0
             for j in range(r):
                 lam[i, j] = 0.0
