@@ -101,6 +101,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         recorder: Any = Recorder(cfg, seen)
         train.train(recorder, str(tmp_path / name))
     monkeypatch.setattr(distributed, "RayCollector", lambda *_, **__: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: True)  # Ray is optional
     elsewhere: Any = Recorder(make_config("collector=ray"), seen)
     physics = make_physics(elsewhere)
     operator = QPActorValueOperator(make_mpc(elsewhere, physics))
