@@ -1,0 +1,69 @@
+"""Plants of which some signals are known in advance, such as prices and forecasts, or are hidden.
+
+    x+ = f(x, u, w),    y = h(x, w),    cost L(x, u, w)
+
+x is the state, which may be hidden, y the measured output, and w the signals of a step: the known
+ones d come first, then those that no controller sees, such as noise.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from torch_qpmpc.checks import check_tensor, check_whole
+from torch_qpmpc.envs.linear_system import Rng
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plant(ABC):
+    """A plant in float64, and what its controller is shown.
+
+    Args:
+        lb_a, ub_a: bounds of the action, ``(n_u,)``.
+        n_y, n_d: the numbers of outputs and of known signals.
+        horizon: N; the controller sees the known signals d_k, .., d_{k+N}.
+        past: L; the controller sees the last L outputs and the L - 1 actions between them.
+    """
+
+    lb_a: Tensor
+    ub_a: Tensor
+    n_y: int
+    n_d: int = 0
+    horizon: int = 1
+    past: int = 1
+
+    def __post_init__(self) -> None:
+        for name, least in (("n_y", 1), ("n_d", 0), ("horizon", 1), ("past", 1)):
+            check_whole(name, getattr(self, name), least)
+
+    @abstractmethod
+    def signals(self, rng: Rng, count: int, length: int) -> Tensor:
+        """Draw the signals w of ``count`` episodes, ``(count, length, n_w)``."""
+
+    @abstractmethod
+    def starts(self, rng: Rng, count: int) -> Tensor:
+        """Draw start states ``(count, n_x)``."""
+
+    @abstractmethod
+    def output(self, x: Tensor, w: Tensor) -> Tensor:
+        """Return y ``(*batch, n_y)`` from x ``(*batch, n_x)`` and w ``(*batch, n_w)``."""
+
+    @abstractmethod
+    def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        """Return L(x, u, w) ``(*batch,)``, of the applied u ``(*batch, n_u)``."""
+
+    @abstractmethod
+    def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        """Return x+ ``(*batch, n_x)`` for the applied u."""
+
+    def violation(self, x: Tensor, w: Tensor) -> Tensor:
+        """Return how far the outputs are outside their bounds, summed, ``(*batch,)``; here 0."""
+        return x.new_zeros(x.shape[:-1])
+
+    def applied(self, a: Tensor) -> Tensor:
+        """Return the applied action: a ``(*batch, n_u)``, clipped to its bounds."""
+        check_tensor("a", a, len(self.lb_a))
+        return a.to(self.lb_a).clamp(self.lb_a, self.ub_a)
