@@ -13,7 +13,12 @@ from torch import Tensor
 from torchrl.objectives import DDPGLoss, LossModule, TD3Loss
 
 from torch_qpmpc.learning.actor_critic import ActionValue, BoundedPolicy, ClippedPolicy, clipped
-from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, QPActorValueOperator
+from torch_qpmpc.learning.operators import (
+    POLICY_ACTIVE_SET,
+    QPActorValueOperator,
+    known_keys,
+    preview_key,
+)
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import COST
 

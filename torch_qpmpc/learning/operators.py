@@ -21,6 +21,8 @@ from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 
+#: The key of the known signals, as environments emit them.
+PREVIEW = "preview"
 #: The key of the active sets that a policy in closed loop passes from step to step.
 POLICY_ACTIVE_SET = "policy_active_set"
 
@@ -192,6 +194,16 @@ class QPActorValueOperator(_QPOperator):
         return self
 
 
+def preview_key(mpc: QPMPC) -> str | None:
+    """Return `PREVIEW` if the QP has known signals, else None."""
+    return PREVIEW if mpc.n_d else None
+
+
+def known_keys(mpc: QPMPC) -> list[NestedKey]:
+    """Return the keys of p's parts, as environments emit them, in the order of p."""
+    return [PREVIEW, "observation"] if mpc.n_d else ["observation"]
+
+
 def warm_policy(mpc: QPMPC) -> Callable[[Tensor], Tensor]:
     """Return `QPMPC.policy` for one closed loop: each call starts from the last active sets.
 
@@ -206,9 +218,7 @@ def warm_policy(mpc: QPMPC) -> Callable[[Tensor], Tensor]:
     return in_closed_loop(QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET))
 
 
-def in_closed_loop(
-    actor: TensorDictModuleBase, n_preview: int = 0
-) -> Callable[[Tensor], Tensor]:
+def in_closed_loop(actor: TensorDictModuleBase, n_preview: int = 0) -> Callable[[Tensor], Tensor]:
     """Return an actor as a function from p to a, for one closed loop.
 
     The first ``n_preview`` entries of p are the actor's ``preview``, the others its
@@ -219,7 +229,7 @@ def in_closed_loop(
 
     def policy(p: Tensor) -> Tensor:
         if n_preview:
-            carried.set("preview", p[..., :n_preview])
+            carried.set(PREVIEW, p[..., :n_preview])
         return actor(carried.set("observation", p[..., n_preview:]))["action"]
 
     return policy

@@ -259,6 +259,4 @@ def make_replay(
         batch_size=num_windows * window,
         generator=generator,
     )
-    return Replay(
-        transitions, windows, generator, window, num_envs, active_rows, n_x, preview_key
-    )
+    return Replay(transitions, windows, generator, window, num_envs, active_rows, n_x, preview_key)
