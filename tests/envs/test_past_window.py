@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import (
+    Compose,
     DoubleToFloat,
     GymEnv,
     GymWrapper,
@@ -31,9 +32,8 @@ STEPS = 7
 
 
 def transformed(env: Any, *transforms: Any) -> Any:
-    for transform in transforms:
-        env = TransformedEnv(env, transform)
-    return env
+    compose: Any = Compose
+    return TransformedEnv(env, compose(*transforms))
 
 
 def pendulum() -> Any:
