@@ -85,15 +85,14 @@ class HeatedHouse(Plant):
     def signals(self, rng: Rng, count: int, length: int) -> Tensor:
         """Draw w ``(count, length, n_w)``; a greater ``length`` extends the same episodes."""
         draws = normal(rng, length, count, 1 + self.n_weather_draws)
-        hour = hours(length).expand(count, length)
+        hour = hours(length).to(draws).expand(count, length)
         peak = during(hour, 7, 9) | during(hour, 17, 20)
-        price = torch.where(peak, PEAK_PRICE, BASE_PRICE).double()
-        lower = torch.where(during(hour, 8, 22), BY_DAY, NIGHT).double()
-        upper = torch.full_like(lower, self.upper)
-        known = torch.stack((price, lower, upper), dim=-1)
-        gain = self._mean_gain(hour) + self._random_gain(draws[..., 0])
-        weather = self.weather(draws[..., 1:])
-        return torch.cat((known.to(draws.device), weather, gain.unsqueeze(-1)), dim=-1)
+        price = torch.where(peak, PEAK_PRICE, BASE_PRICE).to(draws)
+        lower = torch.where(during(hour, 8, 22), BY_DAY, NIGHT).to(draws)
+        known = torch.stack((price, lower, torch.full_like(lower, self.upper)), dim=-1)
+        evening = torch.where(during(hour, 18, 22), self.evening_gain, 0.0).to(draws)
+        gain = evening + self._random_gain(draws[..., 0])
+        return torch.cat((known, self.weather(draws[..., 1:]), gain.unsqueeze(-1)), dim=-1)
 
     def output(self, x: Tensor, w: Tensor) -> Tensor:
         return x[..., :1]
@@ -110,9 +109,6 @@ class HeatedHouse(Plant):
         """Return how far the air is outside the comfort band, in K, ``(*batch,)``."""
         y = x[..., 0]
         return (w[..., LOWER] - y).relu() + (y - w[..., UPPER]).relu()
-
-    def _mean_gain(self, hour: Tensor) -> Tensor:
-        return torch.where(during(hour, 18, 22), self.evening_gain, 0.0).double()
 
     def _random_gain(self, draws: Tensor) -> Tensor:
         """Return the AR(1) process, which starts at 0, ``(count, length)``."""

@@ -17,10 +17,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv1d, pad
 
-from torch_qpmpc.checks import check_choice, check_number
+from torch_qpmpc.checks import check_number
 from torch_qpmpc.envs.heated_house import DT, GAIN, OUTDOOR, HeatedHouse, hours
 from torch_qpmpc.envs.linear_system import Rng, float64
 
+#: The air's first temperature in degrees Celsius.
+START = 19.0
 #: The tutorial smooths the outdoor temperature's noise over two hours.
 WINDOW = torch.as_tensor(np.hanning(8) / np.hanning(8).sum())
 
@@ -59,7 +61,7 @@ class House(HeatedHouse):
             check_number(name, getattr(self, name), lambda x: 0 < x < math.inf, "a number > 0")
 
     def model(self) -> tuple[Tensor, Tensor, Tensor]:
-        E = torch.zeros(1, self.n_d + 1, dtype=torch.float64)
+        E = self.lb_a.new_zeros(1, self.n_d + 1)
         E[0, OUTDOOR], E[0, GAIN] = DT / (self.R * self.C), DT / self.C
         return 1 - E[:, OUTDOOR : OUTDOOR + 1], E[:, GAIN:], E
 
@@ -75,4 +77,4 @@ class House(HeatedHouse):
         return (8 + swing + noise.squeeze(1)).unsqueeze(-1)
 
     def starts(self, rng: Rng, count: int) -> Tensor:
-        return torch.full((count, 1), 19.0, dtype=torch.float64)
+        return self.lb_a.new_full((count, 1), START)

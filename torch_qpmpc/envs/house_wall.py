@@ -61,7 +61,7 @@ class HouseWall(HeatedHouse):
     def _model(self) -> tuple[Tensor, Tensor, Tensor]:
         """A, B and E, from the matrix exponential of the dynamics and of constant inputs."""
         n_w = self.n_d + 1
-        dynamics = torch.zeros(4 + n_w, 4 + n_w, dtype=torch.float64)
+        dynamics = self.lb_a.new_zeros(4 + n_w, 4 + n_w)
         dynamics[0, :3] = torch.tensor([-1 / R_HI - 1 / R_IE, 1 / R_HI, 1 / R_IE]) / C_I
         dynamics[1, :2] = torch.tensor([1 / R_HI, -1 / R_HI]) / C_H
         dynamics[2, :3] = torch.tensor([1 / R_IE, 0.0, -1 / R_IE - 1 / R_EA]) / C_E
@@ -86,4 +86,4 @@ class HouseWall(HeatedHouse):
 
     def starts(self, rng: Rng, count: int) -> Tensor:
         wall = (START / R_IE + MEAN_OUTDOOR / R_EA) / (1 / R_IE + 1 / R_EA)
-        return torch.tensor([START, START, wall], dtype=torch.float64).expand(count, 3).clone()
+        return self.lb_a.new_tensor([START, START, wall]).expand(count, 3).clone()
