@@ -48,9 +48,9 @@ def test_a_house_with_a_wall_follows_its_differential_equation():
             (-from_wall + (outdoor - T_e) / 0.00751396226986365) / 15545663.6743828,
         ]
 
-    end = solve_ivp(slope, (0, 900), x.numpy(), method="LSODA", rtol=1e-10, atol=1e-10).y[:, -1]
+    end = solve_ivp(slope, (0, 900), x.numpy(), method="LSODA", rtol=1e-12, atol=1e-12).y[:, -1]
     following = house.step(x, torch.tensor([q]), w)
-    torch.testing.assert_close(following, torch.as_tensor(end), rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(following, torch.as_tensor(end), rtol=1e-9, atol=1e-9)
     assert house.output(x, w).item() == 18.0
 
 
@@ -111,10 +111,11 @@ def test_each_day_of_the_house_with_a_wall_has_its_own_weather():
     outdoor, sun = w[..., OUTDOOR], w[..., SUN]
     by_day = outdoor.unflatten(1, (4, 96))
     assert outdoor.mean().item() == pytest.approx(2, abs=0.3)
-    assert (outdoor.diff(dim=1).abs() < 0.5).all()  # continuous at midnight, too
+    assert outdoor.diff(dim=1).abs().max() < 0.6  # continuous at midnight, too
     assert by_day[:, 1:, 0].std().item() == pytest.approx(3, rel=0.15)
     peak = sun.unflatten(1, (4, 96)).amax(-1)
-    assert 0 <= peak.min() < 0.01 and 0.24 < peak.max() <= 0.25
+    assert 0 <= peak.min() < 0.01
+    assert 0.24 < peak.max() <= 0.25
     night = sun.unflatten(1, (4, 96))[..., :32]
     assert (night == 0).all()
 

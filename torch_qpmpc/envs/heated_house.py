@@ -46,7 +46,7 @@ def during(hour: Tensor, start: float, end: float) -> Tensor:
 class HeatedHouse(Plant):
     """A linear house x+ = A x + B u + E w, of which y, the air temperature, is the first state.
 
-    The cost of a step, in EUR, is the heat's price plus 1 EUR for each K h outside the comfort band:
+    The cost of a step, in EUR, is the heat's price and 1 EUR for each K h outside the comfort band:
 
         L(x, u, w) = DT (price u + max(lower - y, 0) + max(y - upper, 0)).
 
@@ -77,7 +77,7 @@ class HeatedHouse(Plant):
 
     @abstractmethod
     def weather(self, draws: Tensor) -> Tensor:
-        """Return the weather ``(count, length, n_d - 3)``, of which the outdoor temperature is first.
+        """Return the outdoor temperature, then any other weather, ``(count, length, n_d - 3)``.
 
         ``draws`` ``(length, count, n_weather_draws)`` are standard normal numbers.
         """

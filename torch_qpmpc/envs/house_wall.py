@@ -30,8 +30,10 @@ C_I, C_H, C_E = 1914908.30860716 / 3.6e6, 4015.39425109821 / 3.6e6, 15545663.674
 R_HI, R_IE, R_EA = 76.1996125919563, 1.35151763922409, 7.51396226986365
 #: Effective area of the windows in m2.
 G_A = 10.1265729225269
-#: Mean outdoor temperature, and the air's first temperature, in degrees Celsius.
-MEAN_OUTDOOR, START = 2.0, 19.0
+#: Mean outdoor temperature in degrees Celsius.
+MEAN_OUTDOOR = 2.0
+#: Start of air, heater and wall in degrees Celsius, after a day of heating.
+START = (18.0, 18.0, 15.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,9 +42,9 @@ class HouseWall(HeatedHouse):
 
     The signals are w = [price, lower, upper, T_out, sun | gain], the sun in kW/m2; its forecast and
     that of T_out are exact, as in leap-c's house. T_out is 2 degrees, plus an offset with standard
-    deviation 3 that is drawn for each midnight, plus a swing of 2 to 5 K with its maximum at 15 h.
-    The sun shines from 8 to 16 h, with a cloud of its own each day, to at most 0.25 kW/m2. Episodes
-    start at 19 degrees, with the wall in equilibrium at 2 degrees outdoors.
+    deviation 3, plus a swing of 2 to 5 K with its maximum at 15 h; offset and swing are drawn for
+    each midnight and change linearly between. The sun shines from 8 to 16 h, with clouds of its own
+    each day, to at most 0.25 kW/m2.
     """
 
     n_weather_draws: ClassVar[int] = 3
@@ -62,9 +64,9 @@ class HouseWall(HeatedHouse):
         """A, B and E, from the matrix exponential of the dynamics and of constant inputs."""
         n_w = self.n_d + 1
         dynamics = self.lb_a.new_zeros(4 + n_w, 4 + n_w)
-        dynamics[0, :3] = torch.tensor([-1 / R_HI - 1 / R_IE, 1 / R_HI, 1 / R_IE]) / C_I
-        dynamics[1, :2] = torch.tensor([1 / R_HI, -1 / R_HI]) / C_H
-        dynamics[2, :3] = torch.tensor([1 / R_IE, 0.0, -1 / R_IE - 1 / R_EA]) / C_E
+        dynamics[0, :3] = dynamics.new_tensor([-1 / R_HI - 1 / R_IE, 1 / R_HI, 1 / R_IE]) / C_I
+        dynamics[1, :2] = dynamics.new_tensor([1 / R_HI, -1 / R_HI]) / C_H
+        dynamics[2, :3] = dynamics.new_tensor([1 / R_IE, 0.0, -1 / R_IE - 1 / R_EA]) / C_E
         inputs = dynamics[:, 4:]
         dynamics[1, 3] = 1 / C_H
         inputs[0, SUN], inputs[0, GAIN] = G_A / C_I, 1 / C_I
@@ -73,17 +75,16 @@ class HouseWall(HeatedHouse):
         return discrete[:, :3], discrete[:, 3:4], discrete[:, 4:]
 
     def weather(self, draws: Tensor) -> Tensor:
-        length, count = draws.shape[:2]
-        hour, day = hours(length).to(draws), torch.arange(length, device=draws.device) // DAY
-        days = draws[::DAY]
-        # The offset goes linearly from one midnight's to the next; the first is a number of its own.
-        offset = 3 * torch.cat((draws[1:2, :, 0], days[..., 0])).mT
-        swing, clear = torch.special.ndtr(days[..., 1:]).unbind(-1)
-        mean = MEAN_OUTDOOR + torch.lerp(offset[:, day], offset[:, day + 1], hour / 24)
-        outdoor = mean + (2 + 3 * swing.mT[:, day]) * torch.sin(2 * math.pi * (hour - 9) / 24)
+        hour = hours(len(draws)).to(draws)
+        day = torch.arange(len(draws), device=draws.device) // DAY
+        # Rows 0 and 1, then the first row of each later day, are those of the midnights.
+        midnights = torch.cat((draws[1:2], draws[::DAY])).movedim(1, 0)
+        offset, swing = 3 * midnights[..., 0], 2 + 3 * torch.special.ndtr(midnights[..., 1])
+        offset, swing = (torch.lerp(x[:, day], x[:, day + 1], hour / 24) for x in (offset, swing))
+        outdoor = MEAN_OUTDOOR + offset + swing * torch.sin(2 * math.pi * (hour - 9) / 24)
+        clear = torch.special.ndtr(draws[::DAY, :, 2]).mT[:, day]
         height = torch.sin(math.pi * (hour - 8) / 8).relu() * during(hour, 8, 16)
-        return torch.stack((outdoor, 0.25 * clear.mT[:, day] * height), dim=-1)
+        return torch.stack((outdoor, 0.25 * clear * height), dim=-1)
 
     def starts(self, rng: Rng, count: int) -> Tensor:
-        wall = (START / R_IE + MEAN_OUTDOOR / R_EA) / (1 / R_IE + 1 / R_EA)
-        return self.lb_a.new_tensor([START, START, wall]).expand(count, 3).clone()
+        return self.lb_a.new_tensor(START).expand(count, 3).clone()

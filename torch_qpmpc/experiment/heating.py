@@ -25,8 +25,9 @@ def heating_options(
 ) -> dict[str, Any]:
     """Return the arguments of `QPMPC` for the plant's own cost and any model.
 
-    The stage cost is DT (price_weight price u + violation) + regularisation u^2. The prices are cross terms of H
-    between d_k and u_k; the comfort band is two rows of D on [d_k; x_k; u_k], soft at DT per K.
+    The stage cost is DT (price_weight price u + violation) + regularisation u^2. The prices are
+    cross terms of H between d_k and u_k; the comfort band is two rows of D on [d_k; x_k; u_k], soft
+    at DT per K.
 
     Args:
         plant: bounds of the action, and N.

@@ -1,7 +1,7 @@
 """Rivals for the heated houses: a thermostat, and MPC that sees more than the learned QP.
 
-Each is a policy for `plant_loop`: ``begin(plant, x, w)`` starts a batch of episodes, and a call maps
-p ``(starts, n_p)``, the forecasts and the window, to heating powers ``(starts, 1)``.
+Each is a policy for `plant_loop`: ``begin(plant, x, w)`` starts a batch of episodes, and a call
+maps p ``(starts, n_p)``, the forecasts and the window, to heating powers ``(starts, 1)``.
 """
 
 from __future__ import annotations
@@ -54,23 +54,24 @@ class Omniscient:
 class KalmanMPC:
     """MPC with the true model of states that a Kalman filter estimates from the air alone.
 
-    The gain is a state of the filter, an AR(1) process as its random part, with ``gain_std``.
+    The gain is a state of the filter, an AR(1) process like its random part.
 
     Args:
         plant: the house.
-        gain_std: stationary standard deviation of the gain in the filter, in kW.
-        noise: standard deviation of the measurement in the filter, in K.
+        margin: distance to the lower comfort bound in K at which the planned violation begins.
     """
 
-    def __init__(self, plant: HeatedHouse, gain_std: float, noise: float = 1e-3) -> None:
+    #: Standard deviation of the measurement in the filter, in K; the air is measured exactly.
+    NOISE = 1e-3
+
+    def __init__(self, plant: HeatedHouse, margin: float = 0.0) -> None:
         A, B, E = plant.model()
         n_x = len(A)
         self._A = torch.block_diag(A, A.new_tensor([[CORRELATION]]))
         self._A[:n_x, -1] = E[:, GAIN]
         self._B, self._E = (torch.cat((M, M[:1] * 0)) for M in (B, E[:, : plant.n_d]))
-        self._variance = gain_std**2
-        self._noise = noise**2
-        self._mpc = make_mpc(plant, (self._A, self._B, self._E))
+        self._variance = plant.gain_std**2
+        self._mpc = make_mpc(plant, (self._A, self._B, self._E), margin=margin)
 
     def begin(self, plant: HeatedHouse, x: Tensor, w: Tensor) -> None:
         """Start at the true states ``x``, with an unknown gain."""
@@ -81,7 +82,7 @@ class KalmanMPC:
 
     def __call__(self, p: Tensor) -> Tensor:
         d, y = forecasts(self._plant, p), p[:, -1]
-        column = self._P[:, 0] / (self._P[0, 0] + self._noise)
+        column = self._P[:, 0] / (self._P[0, 0] + self.NOISE**2)
         x = self._x + torch.outer(y - self._x[:, 0], column)
         P = self._P - torch.outer(column, self._P[0])
         u = self._plant.applied(self._mpc.policy(torch.cat((d.flatten(1), x), -1)))

@@ -2,9 +2,9 @@
 
 Its parameters are the assumed resistance R, the weight of the prices and the margin to the lower
 comfort bound. As in leap-c's tutorial (notebook 08), Adam minimises the cost of closed loops of 12
-hours from four times of a day, by gradients that pass through each QP's solution and each step of the
-true house, whose gain is recorded. Two things differ: the violation costs what it does in the plant,
-in place of a steep quadratic, and its cost counts at x_k, in place of x_{k+1}.
+hours from four times of a day, by gradients that pass through each QP's solution and each step of
+the true house, whose gain is recorded. Two things differ: the planner's violation costs what it
+does in the plant, in place of a steep quadratic, and the violation counts at x_k, not at x_{k+1}.
 """
 
 from __future__ import annotations
