@@ -129,7 +129,7 @@ def _train(
                 if cfg.replay:
                     replay.remember(sample)
                 learner.advance()
-            tally.add(batch, physics.violation(batch["observation"]))
+            tally.add(batch, physics.violations(batch))
             progress.update()
 
             if update % cfg.log_interval == 0:
