@@ -62,7 +62,7 @@ def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
     )
     check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
     B, W = B.to(A), W.to(A)
-    check_weight("W", W, diagonal=False)
+    check_weight("W", W, diagonal=False, n_d=0)
     P = riccati_weight(A, B, W, gamma)
     left = W[n_x:, n_x:] + gamma * B.mT @ P @ B
     return torch.linalg.solve(left, gamma * B.mT @ P @ A + W[n_x:, :n_x])
