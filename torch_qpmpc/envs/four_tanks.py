@@ -75,6 +75,10 @@ class FourTanks(Plant):
         u = torch.linalg.solve(gain[:2], self.r)
         return gain @ u, u
 
+    def target(self, w: Tensor) -> Tensor:
+        """Return x_r for signals w ``(*batch, 6)``, ``(*batch, 4)``."""
+        return self.set_point()[0].expand(*w.shape[:-1], -1)
+
     def model(self, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return A, B and v ``(*batch, 4)`` of the step with signals w ``(*batch, 6)``."""
         return self.A, self.B, w[..., :4]

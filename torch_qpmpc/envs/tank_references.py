@@ -1,6 +1,7 @@
 """Four tanks that track references, which are known in advance (learning-qp's quadruple tank).
 
-    x+ = (A + dA) x + (B + dB) u + v,    y = x,    L(x, u, r) = |x - r|^2 + 0.1 |u|^2 + price violation(x)
+    x+ = (A + dA) x + (B + dB) u + v,    y = x
+    L(x, u, r) = |x - r|^2 + 0.1 |u|^2 + price violation(x)
 
 From Lu, Li, Zhou, Li and Mo, "MPC-inspired reinforcement learning for verifiable model-free
 control" (L4DC 2024, arXiv 2312.05332). Their code, github.com/yiwenlu66/learning-qp at 4e52b4d,
@@ -93,6 +94,10 @@ class TankReferences(Plant):
         """Return Q ``(4,)`` and R ``(2,)`` of L = (x - r)'Q(x - r) + u'Ru + price violation(x)."""
         return self.A.new_ones(4), self.A.new_full((2,), 0.1)
 
+    def target(self, w: Tensor) -> Tensor:
+        """Return the reference for signals w ``(*batch, 14)``, ``(*batch, 4)``."""
+        return w[..., :4]
+
     def model(self, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return A + dA, B + dB and v of the step with signals w ``(*batch, 14)``.
 
@@ -123,7 +128,7 @@ class TankReferences(Plant):
 
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         Q, R = self.weights()
-        tracking = (x - w[..., :4]).square() @ Q + u.square() @ R
+        tracking = (x - self.target(w)).square() @ Q + u.square() @ R
         return tracking + self.price * self.violation(x, w)
 
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:

@@ -1,1 +1,1 @@
-"""Controllers to compare with: policies for `torch_qpmpc.envs.closed_loop.plant_loop`."""
+"""Controllers that learned ones are compared with, as policies for `plant_loop`."""

@@ -1,30 +1,16 @@
-"""MPC schemes with a model that is given: the true one, a nominal one, or that of each episode."""
+"""Tracking MPC from the true state: with one model, or omniscient of each episode's signals."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from torch_qpmpc.envs.four_tanks import FourTanks
+from torch_qpmpc.envs.tank_references import TankReferences
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solve import solve_qp
-
-
-class LinearPlant(Protocol):
-    """A plant x+ = A x + B u + e, of which A, B and e may depend on the signals w."""
-
-    lb_a: Tensor
-    ub_a: Tensor
-
-    def model(self, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return A, B and e, with the leading dimensions of w."""
-        ...
-
-    def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor: ...
-
-    def applied(self, a: Tensor) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -47,6 +33,17 @@ class Tracking:
     lb_x: Tensor
     ub_x: Tensor
     price: float = 0.0
+
+    @classmethod
+    def of(cls, plant: FourTanks | TankReferences) -> Tracking:
+        """Make the plant's own cost and bounds."""
+        Q, R = plant.weights()
+        bounds = plant.lb_a, plant.ub_a
+        if isinstance(plant, TankReferences):
+            return cls(Q, R, torch.zeros_like(R), *bounds, plant.lb_x, plant.ub_x, plant.price)
+        _, u_r = plant.set_point()
+        free = torch.full((4,), torch.inf).to(Q)
+        return cls(torch.nn.functional.pad(Q, (0, 2)), R, u_r, *bounds, -free, free)
 
     def program(
         self, A: Tensor, B: Tensor, horizon: int, x_r: Tensor, e: Tensor
@@ -115,3 +112,36 @@ class LinearMPC:
     def __call__(self, x: Tensor) -> Tensor:
         """Return u_0 ``(*batch, n_u)`` of states ``(*batch, n_x)``."""
         return solve_qp(self._qp, x, solver=self._solver).z[..., self._actions]
+
+
+class OmniscientMPC:
+    """MPC that sees the state, and the model, the noise and the references of each episode.
+
+    Args:
+        plant: the plant.
+        horizon: N; it is shorter where the signals end.
+        solver: see `solve_qp`.
+    """
+
+    def __init__(
+        self, plant: FourTanks | TankReferences, horizon: int, solver: str = "daqp"
+    ) -> None:
+        self._plant, self._horizon, self._solver = plant, horizon, solver
+        self._cost = Tracking.of(plant)
+
+    def begin(self, plant: object, x: Tensor, w: Tensor) -> None:
+        """Start episodes at x with signals w."""
+        self._x, self._w, self._k = x, w, 0
+
+    def __call__(self, p: Tensor) -> Tensor:
+        """Return actions ``(starts, n_u)``, without a look at p."""
+        w = self._w[:, self._k : self._k + self._horizon + 1]
+        _, _, e = self._plant.model(w[:, :-1])
+        A, B, _ = self._plant.model(w[:, 0])
+        qp = self._cost.program(A, B, e.shape[1], self._plant.target(w), e)
+        n_x = self._x.shape[-1]
+        solution = solve_qp(qp, self._x, solver=self._solver)
+        u = self._plant.applied(solution.z[:, n_x : n_x + self._plant.n_u])
+        self._x = self._plant.step(self._x, u, w[:, 0])
+        self._k += 1
+        return u
