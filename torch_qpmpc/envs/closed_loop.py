@@ -26,16 +26,23 @@ class ClosedLoop:
     """Trajectories of one policy in float64, and its cumulative costs.
 
     Attributes:
-        states: ``(steps + 1, starts, n_x)``; the outputs where the state is hidden.
+        known: p, what the policy saw, ``(steps + 1, starts, n_p)``.
         actions: ``(steps, starts, n_u)``, as applied: clipped to their bounds.
         costs: ``(steps, starts)``, L(s_k, a_k).
         gamma: the discount factor of ``J_discounted``.
+        n_y: the last n_y entries of p are the state or, of a `Plant`, the output; None for all.
     """
 
-    states: Tensor
+    known: Tensor
     actions: Tensor
     costs: Tensor
     gamma: float
+    n_y: int | None = None
+
+    @property
+    def states(self) -> Tensor:
+        """The states ``(steps + 1, starts, n_x)``, or the outputs of a `Plant`."""
+        return self.known[..., -(self.n_y or 0) :]
 
     @property
     def J(self) -> float:
@@ -94,7 +101,7 @@ def closed_loop(
         s = physics.step(s, a, nu)
         return s, a, cost
 
-    return _run(policy, s, step, steps, (starts, *physics.lb_a.shape), s.shape[-1], gamma)
+    return _run(policy, s, step, steps, (starts, *physics.lb_a.shape), gamma)
 
 
 @torch.no_grad()
@@ -119,9 +126,6 @@ def plant_loop(
             all signals w, for rivals that see them and filters that need a reset.
         plant: the plant.
         steps, starts, seed, gamma: as in `closed_loop`.
-
-    Returns:
-        The closed loop, whose ``states`` are the outputs y ``(steps + 1, starts, n_y)``.
 
     Raises:
         QPError: as in `closed_loop`.
@@ -148,7 +152,7 @@ def plant_loop(
         window = next_window(window, u, plant.output(x, w[:, k]))
         return known(), u, cost
 
-    return _run(policy, known(), step, steps, (starts, plant.n_u), plant.n_y, gamma)
+    return _run(policy, known(), step, steps, (starts, plant.n_u), gamma, plant.n_y)
 
 
 @torch.no_grad()
@@ -185,7 +189,7 @@ def gymnasium_loop(
         return _float64(s), _float64(applied), _float64(cost)
 
     shape = starts, len(plant.lb_a)
-    loop = _run(policy, _float64(s), step, steps, shape, s.shape[-1], gamma)
+    loop = _run(policy, _float64(s), step, steps, shape, gamma)
     for env in envs:
         env.close()
     return loop
@@ -201,19 +205,19 @@ def _run(
     step: Callable[[Tensor], Step],
     steps: int,
     shape: tuple[int, ...],
-    n_y: int,
     gamma: float,
+    n_y: int | None = None,
 ) -> ClosedLoop:
-    """Run ``policy`` from p ``(starts, n_p)``, whose last n_y entries are the output."""
-    outputs, actions, costs = [p[:, -n_y:]], [], []
+    """Run ``policy``, which sees p ``(starts, n_p)`` first and returns actions of this shape."""
+    known, actions, costs = [p], [], []
     for _ in range(steps):
         # A result of shape (starts,) or (n_u,) would broadcast silently.
         a = check_tensor("policy(s)", policy(p), *shape, batched=False, remedy=POLICY_REMEDY)
         p, a, cost = step(a)
-        outputs.append(p[:, -n_y:])
+        known.append(p)
         actions.append(a)
         costs.append(cost)
-    return ClosedLoop(torch.stack(outputs), torch.stack(actions), torch.stack(costs), gamma)
+    return ClosedLoop(torch.stack(known), torch.stack(actions), torch.stack(costs), gamma, n_y)
 
 
 def _float64(x: np.ndarray) -> Tensor:

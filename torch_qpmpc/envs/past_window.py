@@ -93,7 +93,7 @@ class PastWindow(Transform):
         """Add the window to the inputs of a step, so that batched environments pass it on."""
         state_spec = input_spec["full_state_spec"]
         if state_spec is None:
-            state_spec = Composite(shape=input_spec.shape, device=input_spec.device)
+            state_spec = Composite(shape=input_spec.shape)
         assert self.parent is not None
         state_spec[self.observation_key] = self._window(self.parent.full_observation_spec)
         input_spec["full_state_spec"] = state_spec
