@@ -55,7 +55,7 @@ class DeePC:
         solver: str = "daqp",
     ) -> None:
         n_y, n_u = len(Q), len(R)
-        P, U, Y = windows(log, past, horizon)
+        P, U, Y = windows(log, past, horizon, n_y)
         n_p, n_known = len(P), len(P) + len(U)
         L = torch.linalg.qr(torch.cat((P, U, Y)).mT).R.mT
         n_gamma = L.shape[1]
@@ -92,10 +92,12 @@ class DeePC:
         return solve_qp(self._qp, p, solver=self._solver).z @ self._first.mT
 
 
-def windows(log: TensorDictBase, past: int, horizon: int) -> tuple[Tensor, Tensor, Tensor]:
+def windows(
+    log: TensorDictBase, past: int, horizon: int, n_y: int
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return P, U and Y, whose columns are the windows of past + horizon outputs of a log."""
-    outputs, actions = log["observation"], log["action"]
-    outputs = torch.cat((outputs, log["next", "observation"][:, -1:]), 1)
+    actions, last = log["action"].double(), log["next", "observation"][:, -1:]
+    outputs = torch.cat((log["observation"], last), 1)[..., -n_y:].double()
     steps = past + horizon - 1
     y = outputs.unfold(1, steps + 1, 1).mT.flatten(0, 1)  # (windows, steps + 1, n_y)
     u = actions.unfold(1, steps, 1).mT.flatten(0, 1)
