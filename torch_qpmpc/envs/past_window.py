@@ -68,7 +68,10 @@ class PastWindow(Transform):
         check_whole("past", past, 1)
         super().__init__(in_keys=[observation_key], out_keys=[observation_key])
         self.past = past
-        self.fill = torch.as_tensor(fill, dtype=torch.float64)
+        try:
+            self.fill = torch.as_tensor(fill, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise QPError.expected("fill", repr(fill), "a number or (n_u,) of them") from error
         self.observation_key, self.action_key = observation_key, action_key
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -81,7 +84,10 @@ class PastWindow(Transform):
     ) -> TensorDictBase:
         # At a partial reset, TorchRL keeps the old windows of the other episodes.
         y = tensordict_reset[self.observation_key]
-        window = first_window(y, self.past, self.fill.expand(self._n_u()))
+        n_u, shape = self._n_u(), tuple(self.fill.shape)
+        if shape not in ((), (n_u,)):
+            raise QPError.expected("fill", f"shape {shape}", f"shape ({n_u},)")
+        window = first_window(y, self.past, self.fill.expand(n_u))
         return tensordict_reset.set(self.observation_key, window)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
