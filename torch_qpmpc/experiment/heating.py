@@ -15,6 +15,12 @@ Model = tuple[Tensor, Tensor, Tensor]
 REGULARISATION = 1e-5
 
 
+def known_model(plant: HeatedHouse) -> Model:
+    """Return A, B, and E of the known signals: the true model, without the gain."""
+    A, B, E = plant.model()
+    return A, B, E[:, : plant.n_d]
+
+
 def heating_options(
     plant: HeatedHouse,
     model: Model,
@@ -23,20 +29,20 @@ def heating_options(
     margin: float = 0.0,
     regularisation: float = REGULARISATION,
 ) -> dict[str, Any]:
-    """Return the arguments of `QPMPC` for the plant's own cost and any model.
+    """Return the options of `QPMPC.from_model` for the plant's own cost and a model of it.
 
     The stage cost is DT (price_weight price u + violation) + regularisation u^2. The prices are
     cross terms of H between d_k and u_k; the comfort band is two rows of D on [d_k; x_k; u_k], soft
     at DT per K.
 
     Args:
-        plant: bounds of the action, and N.
+        plant: bounds of the action.
         model: E has as many columns as signals are known in advance, the first being `PRICE`,
             `LOWER` and `UPPER`. With a window A is [A_1, .., A_L] and B is [B_1, .., B_L].
         price_weight, regularisation: weights in the stage cost.
         margin: distance to the lower bound in K at which the violation begins.
     """
-    A, _, E = model
+    E = model[-1]
     n_x, n_d = E.shape
     H = torch.zeros(n_d + n_x + 1, n_d + n_x + 1, dtype=torch.float64)
     H[PRICE, -1] = H[-1, PRICE] = DT * price_weight
@@ -46,12 +52,8 @@ def heating_options(
     D[0, LOWER] = D[1, UPPER] = -1.0
     lower, upper = H.new_tensor([margin, -torch.inf]), H.new_tensor([torch.inf, 0.0])
     return {
-        "n_x": n_x,
-        "n_u": 1,
-        "horizon": plant.horizon,
-        "past": A.shape[-1] // n_x,
         "n_d": n_d,
-        **dict(zip("ABE", model, strict=True)),
+        "E": E,
         "hessian": "block",
         "stage_weight": H,
         "terminal_weight": torch.zeros(n_x, n_x, dtype=torch.float64),

@@ -99,10 +99,7 @@ def forecasts(plant: HeatedHouse, p: Tensor) -> Tensor:
 
 def make_mpc(plant: HeatedHouse, model: Model, *, gamma: float = 1.0, **options: float) -> QPMPC:
     """Make the MPC scheme of a model, with nothing to learn."""
-    return QPMPC(
-        **heating_options(plant, model, **options),
-        gamma=gamma,
-        discount_slack=True,
-        learn=(),
-        solver="daqp",
-    )
+    fixed = {"gamma": gamma, "discount_slack": True, "learn": (), "solver": "daqp"}
+    A, B, _ = model
+    options = heating_options(plant, model, **options)
+    return QPMPC.from_model(A, B, plant.horizon, **options, **fixed)
