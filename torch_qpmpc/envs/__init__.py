@@ -5,6 +5,9 @@ from __future__ import annotations
 from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIEnv, GrosZanonLTIGymEnv
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
+from torch_qpmpc.envs.past_window import PastWindow
+from torch_qpmpc.envs.plant import Plant
+from torch_qpmpc.envs.plant_env import PlantEnv
 from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
 
 __all__ = [
@@ -15,6 +18,9 @@ __all__ = [
     "LinearSystem",
     "LinearSystemEnv",
     "LinearSystemGymEnv",
+    "PastWindow",
+    "Plant",
+    "PlantEnv",
     "PointMass",
     "PointMassEnv",
     "PointMassGymEnv",

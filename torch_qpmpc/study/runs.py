@@ -21,12 +21,18 @@ from omegaconf import DictConfig
 from torch_qpmpc.analysis.model_error import one_step_error, second_moment
 from torch_qpmpc.analysis.report import predictions
 from torch_qpmpc.analysis.structure import Model, nearest_model
-from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
+from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import read_metrics
-from torch_qpmpc.experiment.tasks import make_mpc, make_physics, make_true_mpc, true_model
+from torch_qpmpc.experiment.tasks import (
+    AnyPlant,
+    make_mpc,
+    make_physics,
+    make_true_mpc,
+    true_model,
+)
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -68,7 +74,7 @@ class FinishedRun:
         return cfg
 
     @cached_property
-    def physics(self) -> LinearSystem | GymnasiumPlant:
+    def physics(self) -> AnyPlant:
         return make_physics(self.cfg)
 
     @cached_property

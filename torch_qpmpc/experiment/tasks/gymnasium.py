@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from omegaconf import DictConfig
@@ -60,7 +60,9 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
         if cfg.task[name] is None:
             expected = f"the rows of a matrix {shape} for {spaces}"
             raise QPError.expected(f"task.{name}", "null", expected, REMEDY)
-    matrices = {name: torch.tensor(cfg.task[name], dtype=torch.float64) for name in needed}
+    matrices: dict[str, Any] = {
+        name: torch.tensor(cfg.task[name], dtype=torch.float64) for name in needed
+    }
     shapes = {name: tuple(matrix.shape) for name, matrix in matrices.items()}
     if shapes != needed:
         got, expected = (
