@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -62,39 +63,58 @@ class Constraints(NamedTuple):
     b: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class Identified:
-    """An identified model, the constraints ``C z = b`` that start from it, and their errors.
-
-    The errors are those of cross-validation: each is of a fit without the part of the data that it
-    is in. They are NaN for steps that no part is long enough for, or if the data are too few.
-
-    Attributes:
-        layout: the sizes of z.
-        structure: that of C.
-        model: the ARX model.
-        constraints: C and b.
-        errors: y_{k+1} minus its prediction from each start, ``(starts, N, n_x)``; NaN after the
-            end of a trajectory.
-        spread: the standard deviation of each output in the data, ``(n_x,)``.
-        transitions, trajectories: their numbers.
-    """
+class Options(NamedTuple):
+    """How to fit: the sizes of z, and the arguments of `identify`; None chooses each ridge."""
 
     layout: Layout
-    structure: str
+    structure: str = "free"
+    causal: bool = True
+    ridge: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """An ARX model, the constraints ``C z = b`` that start from it, and their prediction errors.
+
+    ``print`` shows the errors, which are those of cross-validation: each is of a fit without the
+    part of the data that it is in. They are NaN for steps that no part is long enough for, and if
+    the other parts determine no model. Their root mean square is the standard deviation that a
+    back-off from bounds needs.
+
+    Attributes:
+        model: the ARX model.
+        constraints: C and b.
+        options: how they were fitted.
+        data: the trajectories.
+    """
+
     model: Model
     constraints: Constraints
-    errors: Tensor
-    spread: Tensor
-    transitions: int
-    trajectories: int
+    options: Options
+    data: Sequence[Trajectory]
 
     @property
     def arguments(self) -> dict[str, Any]:
         """The arguments of `QPMPC` that start it here: ``QPMPC(**identified.arguments, ..)``."""
-        sizes = {name: getattr(self.layout, name) for name in SIZES}
-        start = {} if self.structure == "tied" else {"start": self.constraints._asdict()}
-        return sizes | {"structure": self.structure} | self.model._asdict() | start
+        structure, start = self.options.structure, self.constraints._asdict()
+        sizes = {name: getattr(self.options.layout, name) for name in SIZES}
+        more = {} if structure == "tied" else {"start": start}
+        return {**sizes, "structure": structure, **self.model._asdict(), **more}
+
+    @cached_property
+    def errors(self) -> Tensor:
+        """y_{k+1} minus its prediction, ``(starts, N, n_x)``; NaN after a trajectory's end."""
+        layout, causal = self.options.layout, self.options.causal
+        total = sum(log.steps for log in self.data)
+        count = max(min(PARTS, total // (2 * (layout.past + layout.horizon))), 2)
+        parts = folds(self.data, count)
+        errors = [torch.full((1, layout.horizon, layout.n_x), torch.nan, dtype=torch.float64)]
+        for i, part in enumerate(parts):
+            others = [log for j, other in enumerate(parts) if j != i for log in other]
+            if _usable(others, layout) >= _needed(layout):
+                found = fit(others, self.options)[1]
+                errors.append(prediction_errors(part, found, layout, causal))
+        return torch.cat(errors)
 
     @property
     def rmse(self) -> Tensor:
@@ -104,7 +124,8 @@ class Identified:
     @property
     def R2(self) -> Tensor:
         """The share of each output's variance that is predicted 1, .., N steps ahead."""
-        return 1 - (self.rmse / self.spread).square()
+        outputs = torch.cat([log.y for log in self.data])
+        return 1 - (self.rmse / outputs.std(0, correction=0)).square()
 
     @property
     def covariance(self) -> Tensor:
@@ -114,18 +135,16 @@ class Identified:
         return e.mT @ e / len(e)
 
     def __str__(self) -> str:
-        layout, N = self.layout, self.layout.horizon
+        layout, N = self.options.layout, self.options.layout.horizon
+        total = sum(log.steps for log in self.data)
         lines = [
-            f"{self.structure} C of {self.transitions} transitions in {self.trajectories} "
-            f"trajectories: n_x={layout.n_x}, n_u={layout.n_u}, horizon={N}, past={layout.past}, "
-            f"n_d={layout.n_d}",
+            f"{self.options.structure} C from {total} transitions in {len(self.data)} trajectories,"
+            f" {', '.join(f'{name}={getattr(layout, name)}' for name in SIZES)}",
             f"{'steps':>6}  {'RMSE of each output, cross-validated':38}R2",
         ]
-        for k in sorted({1, 2, 5, 10, 20, 50, 100, N}):
-            if k <= N:
-                rmse, R2 = (x[k - 1].tolist() for x in (self.rmse, self.R2))
-                errors = " ".join(f"{x:.3g}" for x in rmse)
-                lines.append(f"{k:6}  {errors:38}{' '.join(f'{x:.3f}' for x in R2)}")
+        for k in sorted({k for k in (1, 2, 5, 10, 20, 50, 100) if k < N} | {N}):
+            errors = " ".join(f"{x:.3g}" for x in self.rmse[k - 1].tolist())
+            lines.append(f"{k:6}  {errors:38}{' '.join(f'{x:.3f}' for x in self.R2[k - 1])}")
         return "\n".join(lines)
 
 
@@ -180,22 +199,11 @@ def identify(
     check_flag("causal", causal)
     if ridge is not None:
         check_number("ridge", ridge, lambda x: 0 <= x < torch.inf, "a finite number >= 0, or None")
-    logs = read_trajectories(trajectories, n_x, n_d)
-    layout = Layout(logs[0].y.shape[-1], logs[0].u.shape[-1], int(horizon), int(past), int(n_d))
-    check_excitation(logs, layout)
-    options = (layout, structure, causal, ridge)
-    model, found = constraints(logs, *options)
-    outputs = torch.cat([log.y for log in logs])
-    return Identified(
-        layout,
-        structure,
-        model,
-        found,
-        _validated(logs, *options),
-        outputs.std(0, correction=0),
-        sum(log.steps for log in logs),
-        len(logs),
-    )
+    data = read_trajectories(trajectories, n_x, n_d)
+    layout = Layout(data[0].y.shape[-1], data[0].u.shape[-1], int(horizon), int(past), int(n_d))
+    check_excitation(data, layout)
+    options = Options(layout, structure, causal, ridge)
+    return Identified(*fit(data, options), options, data)
 
 
 def check_excitation(trajectories: Sequence[Trajectory], layout: Layout) -> None:
@@ -242,26 +250,6 @@ def _usable(trajectories: Sequence[Trajectory], layout: Layout) -> int:
     return sum(max(log.steps - layout.past + 1, 0) for log in trajectories)
 
 
-def _validated(
-    trajectories: Sequence[Trajectory],
-    layout: Layout,
-    structure: str,
-    causal: bool,
-    strength: float | None,
-) -> Tensor:
-    """Return the `prediction_errors` of each part of the data by a fit to the others."""
-    total = sum(log.steps for log in trajectories)
-    count = max(min(PARTS, total // (2 * (layout.past + layout.horizon))), 2)
-    parts = folds(trajectories, count)
-    found = [torch.full((1, layout.horizon, layout.n_x), torch.nan, dtype=torch.float64)]
-    for i, part in enumerate(parts):
-        others = [log for j, other in enumerate(parts) if j != i for log in other]
-        if _usable(others, layout) >= _needed(layout):
-            _, fitted = constraints(others, layout, structure, causal, strength)
-            found.append(prediction_errors(part, fitted, layout, causal))
-    return torch.cat(found)
-
-
 def arx(trajectories: Sequence[Trajectory], past: int, strength: float | None = None) -> Model:
     """Fit an ARX model with L = ``past`` lags by `ridge` regression of that ``strength``."""
     X, Y = transitions(trajectories, past)
@@ -272,23 +260,12 @@ def arx(trajectories: Sequence[Trajectory], past: int, strength: float | None = 
     return Model(A, B, E, mean - W @ middle)
 
 
-def constraints(
-    trajectories: Sequence[Trajectory],
-    layout: Layout,
-    structure: str = "free",
-    causal: bool = True,
-    strength: float | None = None,
-) -> tuple[Model, Constraints]:
-    """Fit an ARX model, and correct its banded C and b as ``structure`` allows.
+def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[Model, Constraints]:
+    """Fit an ARX model, and correct its banded C and b as the structure allows.
 
-    Args:
-        trajectories: the data.
-        layout: the sizes of z.
-        structure: ``"tied"`` for no correction, ``"varying"`` for one in the band, or ``"free"``.
-        causal: let row block k of a free C read only d_0, .., d_k and u_0, .., u_k.
-        strength: of all ridges; None to choose each by the evidence. A row block with no more
-            starts in the data than steps ahead is not corrected.
+    A row block with no more starts in the data than steps ahead is not corrected.
     """
+    layout, structure, causal, strength = options
     N, n_x = layout.horizon, layout.n_x
     model = arx(trajectories, layout.past, strength)
     C = banded_matrix(model.A, model.B, N, model.E)
@@ -361,13 +338,15 @@ def transitions(trajectories: Sequence[Trajectory], past: int) -> tuple[Tensor, 
     X, Y = [], []
     for log in trajectories:
         if log.steps >= past:
-            X.append(torch.cat((_lags(log.y[:-1], past), _lags(log.u, past), log.d[past - 1 :]), -1))
+            X.append(
+                torch.cat((_lags(log.y[:-1], past), _lags(log.u, past), log.d[past - 1 :]), -1)
+            )
             Y.append(log.y[past:])
     return torch.cat(X), torch.cat(Y)
 
 
 def _lags(x: Tensor, count: int) -> Tensor:
-    """Return the last ``count`` rows at each row, the newest first, ``(T - count + 1, count n)``."""
+    """Return the ``count`` rows up to each row, the newest first, ``(T - count + 1, count n)``."""
     return x.unfold(0, count, 1).flip(-1).mT.flatten(1)
 
 

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_qpmpc.mpc.projections import nearest_psd
-
-#: ADMM ends when an iteration changes the weight by less, relatively, or after so many iterations.
-TOLERANCE, ITERATIONS = 1e-11, 20_000
-#: A ridge, relative to the largest eigenvalue, that makes the weight unique.
-RIDGE = 1e-9
+#: A ridge, relative to the mean square of the products in v, that makes W unique.
+RIDGE = 1e-6
+#: L-BFGS: the smallest eigenvalue that it starts from, its tolerance and its iterations.
+FLOOR, TOLERANCE, ITERATIONS = 1e-2, 1e-9, 500
 
 
 class StageCost(NamedTuple):
@@ -27,8 +24,8 @@ class StageCost(NamedTuple):
 def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = False) -> StageCost:
     """Fit a stage cost whose W is positive semidefinite, except in its first rows and columns.
 
-    The problem is convex. ADMM alternates between its normal equations and the projection of W,
-    in units in which v has zero mean and unit variance.
+    The problem is convex. It is solved for a square root of W's other block, in units in which v
+    has zero mean and unit variance; all else follows by linear least squares.
 
     Args:
         v: the arguments of the cost, ``(m, n)``.
@@ -37,36 +34,29 @@ def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = Fa
             have any sign; they are zero in a diagonal W.
         diagonal: fit a diagonal W.
     """
-    n = v.shape[-1]
+    m, n = v.shape
     middle, size = v.mean(0), v.std(0, correction=0)
     scale = torch.where(size > 1e-12 * middle.abs(), 1 / size, 0.0)
     x = (v - middle) * scale
-    if diagonal:
-        rows = columns = torch.arange(n_free, n)
-    else:
-        rows, columns = torch.triu_indices(n, n)
-    # sqrt(2) W_ij off the diagonal: the norm of these entries is the Frobenius norm of W.
-    weight = torch.where(rows == columns, 1.0, 2**0.5).to(v)
-
-    def matrix(entries: Tensor) -> Tensor:
-        W = entries.new_zeros(n, n)
-        W[rows, columns] = W[columns, rows] = entries / weight
-        return W
-
-    def projected(entries: Tensor) -> Tensor:
-        W = matrix(entries)
-        W[n_free:, n_free:] = nearest_psd(W[n_free:, n_free:])
-        return W[rows, columns] * weight
-
-    quadratic = x[:, rows] * x[:, columns] * weight / 2
-    linear = torch.cat((x, torch.ones_like(x[:, :1])), dim=-1)
-    both = torch.cat((quadratic, cost.unsqueeze(-1)), dim=-1)
+    rows, columns = torch.triu_indices(n, n)
+    products = x[:, rows] * x[:, columns] * torch.where(rows == columns, 0.5, 1.0)
+    free = (rows < n_free) & (not diagonal)
+    convex = (rows >= n_free) & ((rows == columns) | (not diagonal))
+    linear = torch.cat((x, torch.ones(m, 1).to(x), products[:, free]), dim=-1)
+    both = torch.cat((products[:, convex], cost.unsqueeze(-1)), dim=-1)
     both = both - linear @ _least_squares(linear, both)
-    features, target = both[:, :-1], both[:, -1]
-    entries = _admm(features.mT @ features / len(v), features.mT @ target / len(v), projected)
-    rest = _least_squares(linear, (cost - quadratic @ entries).unsqueeze(-1)).flatten()
-    W, q, c = scale.unsqueeze(-1) * matrix(entries) * scale, scale * rest[:-1], rest[-1]
-    return StageCost(W, q - W @ middle, c - q @ middle + middle @ W @ middle / 2)
+    features, unit = both[:, :-1], both[:, -1].square().mean().sqrt()
+    W = x.new_zeros(n, n)
+    if unit > 0:
+        target = both[:, -1] / unit
+        entries = rows[convex] - n_free, columns[convex] - n_free
+        gram = features.mT @ features / m, features.mT @ target / m
+        W[n_free:, n_free:] = unit * _convex(*gram, *entries, n - n_free)
+    rest = cost - (x @ W * x).sum(-1) / 2
+    q, c, others = _least_squares(linear, rest.unsqueeze(-1)).flatten().split((n, 1, sum(free)))
+    W[rows[free], columns[free]] = W[columns[free], rows[free]] = others
+    W, q = scale.unsqueeze(-1) * W * scale, scale * q
+    return StageCost(W, q - W @ middle, c[0] - q @ middle + middle @ W @ middle / 2)
 
 
 def _least_squares(X: Tensor, Y: Tensor) -> Tensor:
@@ -74,17 +64,35 @@ def _least_squares(X: Tensor, Y: Tensor) -> Tensor:
     return torch.linalg.lstsq(X, Y, driver="gelsd").solution
 
 
-def _admm(gram: Tensor, target: Tensor, projected: Callable[[Tensor], Tensor]) -> Tensor:
-    """Minimise ``1/2 w'gram w - target'w`` over a convex cone, by its projection."""
-    largest = torch.linalg.eigvalsh(gram)[-1].clamp(min=torch.finfo(gram.dtype).tiny)
-    rho = gram.diagonal().mean().clamp(min=RIDGE * largest)
-    inverse = torch.linalg.inv(gram + (RIDGE * largest + rho) * torch.eye(len(gram)).to(gram))
-    z, dual = torch.zeros_like(target), torch.zeros_like(target)
-    for _ in range(ITERATIONS):
-        w = inverse @ (target + rho * (z - dual))
-        last, z = z, projected(w + dual)
-        dual = dual + w - z
-        change = torch.maximum((z - last).abs().amax(), (w - z).abs().amax())
-        if change <= TOLERANCE * z.abs().amax():
-            break
-    return z
+def _convex(gram: Tensor, target: Tensor, rows: Tensor, columns: Tensor, n: int) -> Tensor:
+    """Minimise ``1/2 w'gram w - target'w`` over W >= 0 with entries w at (rows, columns)."""
+    gram = gram + RIDGE * gram.diagonal().mean() * torch.eye(len(gram)).to(gram)
+    W = gram.new_zeros(n, n)
+    W[rows, columns] = W[columns, rows] = torch.linalg.solve(gram, target)
+    eigenvalues, vectors = torch.linalg.eigh(W)
+    if eigenvalues[0] >= 0:
+        return W
+    # Not at a root of zero, where the gradient is zero.
+    start = eigenvalues.clamp(min=FLOOR * eigenvalues.abs().amax()).sqrt()
+    root = (vectors * start).contiguous().requires_grad_()
+    optimizer = torch.optim.LBFGS(
+        [root],
+        max_iter=ITERATIONS,
+        tolerance_grad=TOLERANCE,
+        tolerance_change=0.0,
+        history_size=50,
+        line_search_fn="strong_wolfe",
+    )
+    kept = torch.zeros(n, n).to(W).index_put((rows, columns), torch.ones(len(rows)).to(W))
+    kept = torch.maximum(kept, kept.mT)
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        w = (root @ root.mT)[rows, columns]
+        loss = w @ gram @ w / 2 - target @ w
+        loss.backward()
+        return loss
+
+    with torch.enable_grad():
+        optimizer.step(closure)
+    return (root @ root.mT * kept).detach()

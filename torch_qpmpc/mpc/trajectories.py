@@ -1,4 +1,4 @@
-"""Logged trajectories as plain arrays: reading them from a TensorDict, checking and cutting them."""
+"""Logged trajectories as plain arrays: reading them from a TensorDict, and cutting them."""
 
 from __future__ import annotations
 
