@@ -87,6 +87,8 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
                 outputs = torch.cat((y[row, start:stop], following[row, stop - 1 : stop]))
                 found.append(Trajectory(outputs, u[row, start:stop], d[row, start:stop]))
             start = stop
+    if not found:
+        raise QPError.expected("trajectories", "no steps", "logged steps", REMEDY)
     return found
 
 
