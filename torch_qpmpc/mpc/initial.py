@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import scipy
@@ -23,6 +23,8 @@ from torch_qpmpc.mpc.validation import (
 )
 
 RICCATI = "riccati"
+#: The parts of theta that may start at any finite values.
+STARTED = ("q", "c", "C", "b")
 
 
 def theta(
@@ -47,6 +49,8 @@ def theta(
     learn: Collection[str],
     stage_weight: Any,
     terminal_weight: Any,
+    q: Any,
+    c: Any,
     state_slack: Any,
     action_slack: Any,
     constraint_slack: float,
@@ -81,14 +85,30 @@ def theta(
         terminal_weight = _riccati_weight(A, B, stage_weight, gamma, layout)
     return layout, {
         **cost_weights(stage_weight, terminal_weight, hessian, layout),
-        "q": torch.zeros(layout.n_z),
-        "c": torch.zeros(()),
+        "q": _linear_cost("q", q, layout.n_z),
+        "c": _linear_cost("c", c),
         "C": C,
         "b": -offset.repeat(horizon),
         "G": LinearRows(layout, tied=True)(D[0], D_f[0]),
         **_bounds(layout, state_bounds, action_bounds, D, D_f, rates),
         "w": _slack_weights(layout, state_slack, action_slack, constraint_slack, rate_slack),
     }
+
+
+def started(theta: Mapping[str, Tensor], start: Any, **_: Any) -> dict[str, Tensor]:
+    """Return the initial values in the argument ``start`` of `QPMPC`, by part of ``theta``."""
+    if start is None:
+        return {}
+    wanted = f"a mapping of values by name, of {', '.join(STARTED)}"
+    if not isinstance(start, Mapping) or not all(name in STARTED for name in start):
+        got = list(start) if isinstance(start, Mapping) else repr(start)
+        raise QPError.expected("start", got, wanted)
+    values = {name: as_tensor(f"start[{name!r}]", value) for name, value in start.items()}
+    for name, value in values.items():
+        if value.shape != theta[name].shape:
+            got, want = tuple(value.shape), tuple(theta[name].shape)
+            raise QPError.expected(f"start[{name!r}]", f"shape {got}", f"shape {want}")
+    return values
 
 
 def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dict[str, Any]:
@@ -108,6 +128,14 @@ def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dic
         "discount_slack": True,
         "learn": learn,
     }
+
+
+def _linear_cost(name: str, value: Any, *shape: int) -> Tensor:
+    """Return the initial q or c; zeros for None."""
+    value = torch.zeros(shape) if value is None else as_tensor(name, value)
+    if tuple(value.shape) != shape:
+        raise QPError.expected(name, f"shape {tuple(value.shape)}", f"shape {shape}")
+    return value
 
 
 def model_sizes(A: Tensor, B: Tensor) -> tuple[int, int, int]:
