@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Any
 
@@ -32,12 +33,16 @@ COLOURS = {"start": "tab:red", "learned": "tab:blue", "true model": "tab:green"}
 
 
 def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
-    """Draw a constraint matrix as a heatmap, logarithmic beyond 0.01, with lines between stages."""
+    """Draw a constraint matrix as a heatmap, logarithmic beyond 0.01, with lines between stages.
+
+    Dashed lines end the preview and the window before x_0, where they exist.
+    """
     image = axes.imshow(
         C.detach().cpu().numpy(),
         cmap="RdBu_r",
         norm=SymLogNorm(linthresh=1e-2, vmin=-1, vmax=1),
         interpolation="nearest",
+        aspect="equal" if mpc.n_p == mpc.n_x else "auto",
     )
     layout = Layout(mpc.n_x, mpc.n_u, mpc.horizon, mpc.past, mpc.n_d)
     for k in range(1, mpc.horizon):
@@ -48,11 +53,10 @@ def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
         axes.axvline(column - 0.5, color="0.85", linewidth=0.4)
     _draw_ends(axes, layout)
     axes.set_title(title)
-    stages = range(0, mpc.horizon + 1, max(1, mpc.horizon // 5))
-    known = _known_ticks(layout, layout.n_z)
-    plan = {layout.n_before + k * layout.n: f"$x_{{{k}}}$" for k in stages}
-    axes.set_xticks([*known, *plan], [*known.values(), *plan.values()])
-    rows = [k for k in stages if k < mpc.horizon]
+    plan = (layout.n_before, layout.n, range(mpc.horizon + 1), "x")
+    columns = _columns(layout, layout.n_z, plan)
+    axes.set_xticks(list(columns), list(columns.values()))
+    rows = range(0, mpc.horizon, max(1, mpc.horizon // 5))
     axes.set_yticks([k * mpc.n_x for k in rows], [f"$k={k}$" for k in rows])
     axes.figure.colorbar(image, ax=axes, shrink=0.7, ticks=[-1, -0.1, -0.01, 0, 0.01, 0.1, 1])
 
@@ -63,17 +67,22 @@ def _draw_ends(axes: Axes, layout: Layout) -> None:
         axes.axvline(end - 0.5, color="black", linewidth=0.8, linestyle="--")
 
 
-def _known_ticks(layout: Layout, width: int) -> dict[int, str]:
-    """Return the first columns of the preview and of the window, with their names.
+def _columns(layout: Layout, width: int, *plan: tuple[int, int, range, str]) -> dict[int, str]:
+    """Return the columns that get a tick, with its label, in a figure of ``width`` columns.
 
-    One that is too near the next, for a figure of ``width`` columns, is left out.
+    Each section, such as the preview, has its first column, the width of a stage, the stages and
+    their letter. Beside a preview or a window, ticks that would overlap are left out.
     """
-    starts = {0: "$d_0$"} if layout.n_d else {}
-    if layout.past > 1:
-        starts[layout.n_preview] = f"$x_{{{1 - layout.past}}}$"
-    ends = [*list(starts)[1:], layout.n_before]
-    near = zip(starts.items(), ends, strict=True) if starts else ()
-    return {start: name for (start, name), end in near if end - start >= width / 20}
+    preview = (0, layout.n_d, range(layout.horizon + 1 if layout.n_d else 0), "d")
+    window = (layout.n_preview, layout.n, range(1 - layout.past, 0), "x")
+    gap = width / 16 if layout.n_before else 0
+    ticks = {}
+    for first, size, stages, letter in (preview, window, *plan):
+        step = max(1, layout.horizon // 5, math.ceil(gap / max(size, 1)))
+        for stage in stages[::step]:
+            ticks[first + (stage - stages[0]) * size] = f"${letter}_{{{stage}}}$"
+    following = [*list(ticks)[1:], math.inf]
+    return {i: x for (i, x), end in zip(ticks.items(), following, strict=True) if end - i >= gap}
 
 
 def constraint_figure(mpc: QPMPC) -> Figure:
@@ -132,9 +141,9 @@ def draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
                 axes.plot([edge, edge + width], [row, row], color="black", linewidth=0.8)
     axes.set(xlim=(-0.5, entries.shape[1] - 0.5), ylim=(len(entries) - 0.5, -0.5), title=title)
     shown = range(0, N, max(1, N // 5))
-    known = _known_ticks(layout, entries.shape[1]) | {layout.n_before: "$x_0$"}
-    plan = {n_p + k * n_u: f"$u_{{{k}}}$" for k in shown}
-    axes.set_xticks([*known, *plan], [*known.values(), *plan.values()])
+    x_0, actions = (layout.n_before, n_x, range(1), "x"), (n_p, n_u, range(N), "u")
+    columns = _columns(layout, entries.shape[1], x_0, actions)
+    axes.set_xticks(list(columns), list(columns.values()))
     axes.set_yticks([k * n_x for k in shown], [f"$x_{{{k + 1}}}$" for k in shown])
     axes.figure.colorbar(image, ax=axes, shrink=0.7, ticks=[-1, -0.1, 0, 0.1, 1])
 

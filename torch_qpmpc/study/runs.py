@@ -6,6 +6,7 @@ All readings of a learned C are independent of its gauge.
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import math
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import (
     AnyPlant,
     make_mpc,
@@ -79,7 +81,8 @@ class FinishedRun:
     @cached_property
     def start(self) -> QPMPC:
         """The QP that learning started from."""
-        return make_mpc(self.cfg, self.physics)
+        start = make_start(self.cfg, self.physics, self.folder, written=True)
+        return make_mpc(self.cfg, self.physics, start)
 
     @cached_property
     def true(self) -> QPMPC | None:
@@ -90,7 +93,7 @@ class FinishedRun:
     def learned(self) -> QPMPC:
         """The learned QP."""
         state = load_checkpoint(self.folder / CHECKPOINT)
-        mpc = make_mpc(self.cfg, self.physics)
+        mpc = copy.deepcopy(self.start)
         if state["structure"] != mpc.structure:
             mpc.release(state["structure"])
         mpc.load_state_dict(state["mpc"])
