@@ -83,7 +83,8 @@ def test_lags_predict_as_the_house_with_a_wall_goes_on():
     house = HouseWall(evening_gain=0.0, gain_std=0.0)
     A, B, E = best_lags(HouseWall())
     w = house.signals(np.random.default_rng(0), 4, 2)[:, :1].expand(-1, 12, -1)
-    x, rng = house.starts(None, 4), np.random.default_rng(1)
+    rng = np.random.default_rng(1)
+    x = house.starts(rng, 4)
     y, u = [x[:, 0]], []
     for k in range(12):
         u.append(torch.as_tensor(5 * rng.random(4)))
