@@ -60,17 +60,21 @@ def reference_options(
     }
 
 
-def velocity_form(A: Tensor, B: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the model of the increments of y and u, which has one lag more.
+def offset_free(A: Tensor, B: Tensor, memory: int = 1) -> tuple[Tensor, Tensor]:
+    """Return the model with the mean of its last ``memory`` errors added to each prediction.
 
-    y_{k+1} = y_k + A_1 (y_k - y_{k-1}) + B_1 (u_k - u_{k-1}) + ..: any pair that stays the same is
-    predicted to stay. A constant error of the model or a constant disturbance therefore causes no
-    error in the steady state.
+    It has ``memory`` lags more. What stays the same is predicted to stay, so that a wrong model or
+    a constant disturbance causes no error in a steady state that can be reached. With one error it
+    is the velocity form, y_{k+1} = y_k + A_1 (y_k - y_{k-1}) + B_1 (u_k - u_{k-1}) + ..; with more
+    it passes on less noise.
     """
     n_x, n_u = len(A), B.shape[-1] * len(A) // A.shape[-1]
-    A = F.pad(A, (0, n_x)) - F.pad(A, (n_x, 0))
-    A[:, :n_x] += torch.eye(n_x).to(A)
-    return A, F.pad(B, (0, n_u)) - F.pad(B, (n_u, 0))
+    A_free, B_free = F.pad(A, (0, memory * n_x)), F.pad(B, (0, memory * n_u))
+    for lag in range(memory):
+        error = F.pad(torch.eye(n_x).to(A), (0, A.shape[-1])) - F.pad(A, (n_x, 0))
+        A_free += F.pad(error, (lag * n_x, (memory - 1 - lag) * n_x)) / memory
+        B_free -= F.pad(B, ((lag + 1) * n_u, (memory - 1 - lag) * n_u)) / memory
+    return A_free, B_free
 
 
 def window_model(
