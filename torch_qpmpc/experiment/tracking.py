@@ -14,6 +14,9 @@ from torch import Tensor
 from torch_qpmpc.envs.four_tanks import FourTanks
 from torch_qpmpc.envs.tank_references import TankReferences
 
+#: Factor of Q in the terminal cost of references: learning-qp's best, 1 + 10.
+TERMINAL_FACTOR = 11.0
+
 
 def set_point_options(plant: FourTanks, gamma: float) -> dict[str, Any]:
     """Return the arguments of `QPMPC` for the plant's own cost and bounds.
@@ -37,13 +40,11 @@ def set_point_options(plant: FourTanks, gamma: float) -> dict[str, Any]:
     }
 
 
-def reference_options(
-    plant: TankReferences, gamma: float, terminal_factor: float = 1.0
-) -> dict[str, Any]:
+def reference_options(plant: TankReferences, gamma: float) -> dict[str, Any]:
     """Return the arguments of `QPMPC` for the plant's own cost and bounds.
 
     The references d_k = r_k are cross terms of H, which make (x_k - r_k)'Q(x_k - r_k) with the
-    terms r_k'Q r_k. The terminal cost is that times ``terminal_factor``.
+    terms r_k'Q r_k. The terminal cost is `TERMINAL_FACTOR` times that.
     """
     Q, R = (torch.diag(2 * weight) for weight in plant.weights())
     tracking = torch.cat((torch.cat((Q, -Q), -1), torch.cat((-Q, Q), -1)))
@@ -52,7 +53,7 @@ def reference_options(
         "n_d": plant.n_d,
         "hessian": "block",
         "stage_weight": torch.block_diag(tracking, R),
-        "terminal_weight": terminal_factor * tracking,
+        "terminal_weight": TERMINAL_FACTOR * tracking,
         "state_bounds": (plant.lb_x, plant.ub_x),
         "state_slack": plant.price,
         "discount_slack": True,
