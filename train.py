@@ -5,6 +5,7 @@
     python train.py constraint=mpc                      a linear MPC scheme with learned model
     python train.py task=gros_zanon solver=daqp         another plant, in one long episode
     python train.py -m constraint=fixed,free seed=1,2   a sweep
+    python train.py task=gymnasium task.id=Pendulum-v1 start=data   from a log, without a model
     python train.py resume=runs/point_mass/..           resume a stopped run
     python train.py -m +study=paper                     start or resume the paper's study
     tensorboard --logdir runs                           watch the runs
@@ -39,6 +40,7 @@ from torch_qpmpc.experiment.metrics import report, run_summary, table, update_me
 from torch_qpmpc.experiment.plots import summary_figure
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
+from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tally import Tally
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics, make_true_mpc, true_model
 from torch_qpmpc.learning.operators import in_closed_loop, preview_key, warm_policy
@@ -73,7 +75,10 @@ def _train(
 
     # The QP, and its J before learning and with the true model.
     physics = make_physics(cfg)
-    mpc = make_mpc(cfg, physics)
+    identified = make_start(cfg, physics, folder, written=state is not None)
+    if identified is not None and not quiet:
+        print(identified.identified)
+    mpc = make_mpc(cfg, physics, identified)
     start = evaluate(cfg, warm_policy(mpc), physics)
     loops = {"start": start, "learned": start}
     if (true_mpc := make_true_mpc(cfg, physics)) is not None:

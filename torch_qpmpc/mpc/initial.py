@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import scipy
@@ -23,6 +23,8 @@ from torch_qpmpc.mpc.validation import (
 )
 
 RICCATI = "riccati"
+#: The parts of theta that may start at any finite values.
+STARTED = ("q", "c", "C", "b")
 
 
 def theta(
@@ -91,6 +93,22 @@ def theta(
         **_bounds(layout, state_bounds, action_bounds, D, D_f, rates),
         "w": _slack_weights(layout, state_slack, action_slack, constraint_slack, rate_slack),
     }
+
+
+def started(theta: Mapping[str, Tensor], start: Any, **_: Any) -> dict[str, Tensor]:
+    """Return the initial values in the argument ``start`` of `QPMPC`, by part of ``theta``."""
+    if start is None:
+        return {}
+    wanted = f"a mapping of values by name, of {', '.join(STARTED)}"
+    if not isinstance(start, Mapping) or not all(name in STARTED for name in start):
+        got = list(start) if isinstance(start, Mapping) else repr(start)
+        raise QPError.expected("start", got, wanted)
+    values = {name: as_tensor(f"start[{name!r}]", value) for name, value in start.items()}
+    for name, value in values.items():
+        if value.shape != theta[name].shape:
+            got, want = tuple(value.shape), tuple(theta[name].shape)
+            raise QPError.expected(f"start[{name!r}]", f"shape {got}", f"shape {want}")
+    return values
 
 
 def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dict[str, Any]:

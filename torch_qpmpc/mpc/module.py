@@ -17,6 +17,7 @@ from torch.nn.utils import parametrize
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import initial, parameters, pickling
+from torch_qpmpc.mpc.identification import identify
 from torch_qpmpc.mpc.identity import check_identity, digest, encoded
 from torch_qpmpc.mpc.layout import Discounts, discounted
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
@@ -108,10 +109,12 @@ class QPMPC(nn.Module):
             itself, which `project_` corrects after each step, by eigenvalues or by a semidefinite
             program; see `torch_qpmpc.mpc.projections`.
         solver, on_failure: see `solve_qp`.
+        start: initial values of some of q, c, C and b by name, without discounts, in place of those
+            that follow from the other arguments.
         seed: the seed of random initial values.
 
     Attributes:
-        C_0: the initial banded C, ``(N n_x, n_z)``.
+        C_0: the banded C of the initial model, ``(N n_x, n_z)``.
         n_p: the number of entries of p, (N + 1) n_d + (L - 1) (n_x + n_u) + n_x.
 
     Raises:
@@ -182,6 +185,7 @@ class QPMPC(nn.Module):
         step: str = CHOLESKY,
         solver: str = "proxqp",
         on_failure: str = "raise",
+        start: Mapping[str, Any] | None = None,
         seed: int = 0,
     ) -> None:
         passed = {name: x for name, x in locals().items() if name not in ("self", "__class__")}
@@ -213,6 +217,7 @@ class QPMPC(nn.Module):
         self.register_buffer("soft", theta["w"].isfinite())
         self._hard_rows = digest(theta["w"].isinf())
         self._derive()
+        theta |= initial.started(theta, **arguments)
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
         for name, start in theta.items():
@@ -237,6 +242,53 @@ class QPMPC(nn.Module):
         if (E := options.get("E")) is not None:
             options.setdefault("n_d", torch.as_tensor(E).shape[-1])
         return cls(n_x, n_u, horizon, **{"past": past, "A": A, "B": B} | options)
+
+    @classmethod
+    def from_data(
+        cls,
+        trajectories: Any,
+        horizon: int,
+        *,
+        past: int = 1,
+        n_d: int = 0,
+        n_x: int | None = None,
+        structure: str = "free",
+        causal: bool = True,
+        ridge: float | None = None,
+        **options: Any,
+    ) -> QPMPC:
+        """Return a QPMPC whose C and b start from least squares on logged trajectories.
+
+        C_0 is the banded matrix of an ARX model; `identify` returns it with its prediction errors.
+
+        Args:
+            trajectories, horizon, past, n_d, n_x, structure, causal, ridge: see `identify`.
+            options: the keyword arguments of `QPMPC`, such as cost and bounds.
+
+        Raises:
+            QPError: as in `identify` and `QPMPC`.
+
+        Example:
+            >>> import torch, torch_qpmpc as qm
+            >>> env = qm.envs.PointMassEnv(num_envs=4, max_steps=50, seed=0)
+            >>> log = env.rollout(50)  # random actions
+            >>> mpc = qm.QPMPC.from_data(
+            ...     log, 10, structure="tied", action_bounds=([-1] * 2, [1] * 2)
+            ... )
+            >>> tuple(mpc.model()[0].shape)
+            (4, 4)
+        """
+        found = identify(
+            trajectories,
+            horizon,
+            past=past,
+            n_d=n_d,
+            n_x=n_x,
+            structure=structure,
+            causal=causal,
+            ridge=ridge,
+        )
+        return cls(**found.arguments | options)
 
     @classmethod
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:

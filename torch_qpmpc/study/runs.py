@@ -6,12 +6,13 @@ All readings of a learned C are independent of its gauge.
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,12 +27,12 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import (
     AnyPlant,
     make_mpc,
     make_physics,
     make_true_mpc,
-    true_model,
 )
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
@@ -80,7 +81,8 @@ class FinishedRun:
     @cached_property
     def start(self) -> QPMPC:
         """The QP that learning started from."""
-        return make_mpc(self.cfg, self.physics)
+        start = make_start(self.cfg, self.physics, self.folder, written=True)
+        return make_mpc(self.cfg, self.physics, start)
 
     @cached_property
     def true(self) -> QPMPC | None:
@@ -91,7 +93,7 @@ class FinishedRun:
     def learned(self) -> QPMPC:
         """The learned QP."""
         state = load_checkpoint(self.folder / CHECKPOINT)
-        mpc = make_mpc(self.cfg, self.physics)
+        mpc = copy.deepcopy(self.start)
         if state["structure"] != mpc.structure:
             mpc.release(state["structure"])
         mpc.load_state_dict(state["mpc"])
@@ -115,14 +117,13 @@ class FinishedRun:
             model, nan if the constraints do not determine the states or the true model is unknown.
         """
         mpc = self.learned
-        above = band_distance(mpc.n_x, mpc.n_u, mpc.horizon) > 0
+        above = band_distance(mpc.n_x, mpc.n_u, mpc.horizon, mpc.past, mpc.n_d) > 0
         readings = {
             "zeros_above": (mpc.C[above] == 0).double().mean().item(),
             "prediction_error": math.nan,
             "prediction_error_start": math.nan,
         }
-        if true_model(self.physics) is not None:
-            physics = cast(LinearSystem, self.physics)  # the only plants with a true model
+        if isinstance(physics := self.physics, LinearSystem):
             with contextlib.suppress(QPError):
                 learned, start = (nearest_model(predictions(m)) for m in (mpc, self.start))
                 readings["prediction_error"] = prediction_error(learned, physics)

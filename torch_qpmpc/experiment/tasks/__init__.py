@@ -18,6 +18,7 @@ from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
     house_wall,
     point_mass,
 )
+from torch_qpmpc.experiment.tasks.identified import Start, identified_scheme
 from torch_qpmpc.experiment.tasks.registry import (
     TASKS,
     AnyPlant,
@@ -49,10 +50,13 @@ def make_physics(cfg: DictConfig) -> AnyPlant:
     return find_task(cfg.task).make_plant(cfg)
 
 
-def make_mpc(cfg: DictConfig, physics: AnyPlant) -> QPMPC:
-    """Make the QP that learns, from the task's wrong scheme."""
+def make_mpc(cfg: DictConfig, physics: AnyPlant, start: Start | None = None) -> QPMPC:
+    """Make the QP that learns, from the task's wrong scheme or, if there is one, from ``start``."""
     learn = (*cfg.task.learn_cost, *cfg.constraint.learn)
-    return _make(cfg, physics, find_task(cfg.task).wrong_scheme(cfg, physics), learn)
+    scheme = find_task(cfg.task).wrong_scheme(cfg, physics)
+    if start is not None:
+        scheme = identified_scheme(cfg, scheme, start)
+    return _make(cfg, physics, scheme, learn)
 
 
 def make_true_mpc(cfg: DictConfig, physics: AnyPlant) -> QPMPC | None:

@@ -70,7 +70,7 @@ class Scheme:
         A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``, or with a window of the past,
             [A_1, .., A_L] and [B_1, .., B_L].
         stage_weight: W of the cost 1/2 [x; u]' W [x; u], or its diagonal; W of [d; x; u] with a
-            preview d.
+            preview d. With ``start=data`` these three may be None.
         lb_s, ub_s: the bounds of the state, ``(n_x,)``.
         offset: the model's offset, ``(n_x,)``; None for zero.
         c: the initial constant of the cost.
@@ -78,9 +78,9 @@ class Scheme:
             the configuration.
     """
 
-    A: Tensor
-    B: Tensor
-    stage_weight: Tensor
+    A: Tensor | None
+    B: Tensor | None
+    stage_weight: Tensor | None
     lb_s: Tensor
     ub_s: Tensor
     offset: Tensor | None = None
