@@ -29,13 +29,16 @@ def set_point_options(plant: FourTanks, gamma: float) -> dict[str, Any]:
     N, weight, target = plant.horizon, torch.cat((Q, R)), torch.cat((plant.r, u_r))
     stage, terminal = weight @ target.square(), Q @ plant.r.square()
     linear = (-2 * weight * target).repeat(N + 1)[: -len(R)]
+    start = {
+        "q": F.pad(linear, ((plant.past - 1) * len(weight), 0)),
+        "c": sum(gamma**k for k in range(N)) * stage + gamma**N * terminal,
+    }
     return {
         "gamma": gamma,
         "hessian": "block",
         "stage_weight": torch.diag(2 * weight),
         "terminal_weight": torch.diag(2 * Q),
-        "q": F.pad(linear, ((plant.past - 1) * len(weight), 0)),
-        "c": sum(gamma**k for k in range(N)) * stage + gamma**N * terminal,
+        "start": start,
         "action_bounds": (plant.lb_a, plant.ub_a),
     }
 
