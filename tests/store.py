@@ -12,6 +12,7 @@ from torchrl.envs import TransformedEnv
 from torch_qpmpc import QPMPC, QPActorValueOperator
 from torch_qpmpc.envs import PastWindow, Plant, PlantEnv
 from torch_qpmpc.envs.linear_system import Rng, float64, normal, uniform
+from torch_qpmpc.experiment.tasks import Scheme
 
 LEARN = ("H", "H_f", "q", "c", "w", "C", "b", "G", "lb", "ub")
 
@@ -57,29 +58,34 @@ class Store(Plant):
         return (1 - x[..., 0]).relu() + (x[..., 0] - 2).relu()
 
 
-def make_mpc(plant: Store | None = None, **options: Any) -> QPMPC:
-    """Make the QP of a store, with an ARX model, prices in H, soft bounds and rate limits."""
-    plant = Store() if plant is None else plant
-    lags = plant.past - 1
-    A = [[1.5, *[-0.5][:lags], *[0.0] * (lags - 1)]]
-    B = [[0.0, *[0.5][:lags], *[0.0] * (lags - 1)]]
+def scheme(plant: Store) -> Scheme:
+    """Return an ARX model, prices in the cost, soft bounds and, with a window, rate limits."""
+    lags, one = plant.past - 1, torch.ones(1, dtype=torch.float64)
     weight = 0.1 * torch.eye(4, dtype=torch.float64)
     weight[0, 3] = weight[3, 0] = 1.0
+    A = torch.tensor([[1.5, *[-0.5][:lags], *[0.0] * (lags - 1)]], dtype=torch.float64)
+    B = torch.tensor([[0.0, *[0.5][:lags], *[0.0] * (lags - 1)]], dtype=torch.float64)
+    options: dict[str, Any] = {"E": torch.tensor([[0.0, -1.0]]), "state_slack": 2.0}
+    if lags:
+        options |= {"rate_bounds": (-0.6 * one, 0.6 * one), "rate_slack": 1.0}
+    return Scheme(A, B, weight, one, 2 * one, options=options)
+
+
+def make_mpc(plant: Store | None = None, **options: Any) -> QPMPC:
+    """Make the QP of a store's `scheme`, with all of theta learned."""
+    plant = Store() if plant is None else plant
+    start = scheme(plant)
     settings = {
-        "E": [[0.0, -1.0]],
         "hessian": "block",
-        "stage_weight": weight,
-        "state_bounds": ([1.0], [2.0]),
-        "action_bounds": ([0.0], [1.0]),
-        "state_slack": 2.0,
+        "stage_weight": start.stage_weight,
+        "state_bounds": (start.lb_s, start.ub_s),
+        "action_bounds": (plant.lb_a, plant.ub_a),
         "learn": LEARN,
         "solver": "daqp",
         "on_failure": "mask",
+        **start.options,
     }
-    if lags:
-        settings["rate_bounds"] = ([-0.6], [0.6])
-        settings["rate_slack"] = 1.0
-    return QPMPC.from_model(A, B, plant.horizon, **settings | options)
+    return QPMPC.from_model(start.A, start.B, plant.horizon, **settings | options)
 
 
 def make_operator(plant: Store | None = None, **keys: Any) -> QPActorValueOperator:

@@ -70,6 +70,8 @@ def test_closed_loop_takes_any_linear_system():
 class Recorded(Store):
     """A store with given signals and starts."""
 
+    given: tuple[Tensor, Tensor]
+
     def __init__(self, w: Tensor, x: Tensor, **options: Any) -> None:
         super().__init__(**options)
         object.__setattr__(self, "given", (w, x))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIEnv, GrosZanonLTIGymEnv
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
+from torch_qpmpc.envs.house import House
+from torch_qpmpc.envs.house_wall import HouseWall
 from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
 from torch_qpmpc.envs.past_window import PastWindow
 from torch_qpmpc.envs.plant import Plant
@@ -15,6 +17,8 @@ __all__ = [
     "GrosZanonLTIEnv",
     "GrosZanonLTIGymEnv",
     "GymnasiumPlant",
+    "House",
+    "HouseWall",
     "LinearSystem",
     "LinearSystemEnv",
     "LinearSystemGymEnv",

@@ -96,7 +96,7 @@ def make_penalties(
     """Make the deviation and the SI penalty; None for each that is off."""
     deviation, si = cfg.constraint.deviation, cfg.constraint.si
     return (
-        None if deviation is None else DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, **deviation),
+        None if deviation is None else DeviationPenalty.of(mpc, **deviation),
         None if si is None else SystemIdentificationPenalty(si.beta, normalised=si.normalised),
     )
 

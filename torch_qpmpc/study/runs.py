@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -33,7 +33,6 @@ from torch_qpmpc.experiment.tasks import (
     make_mpc,
     make_physics,
     make_true_mpc,
-    true_model,
 )
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
@@ -118,14 +117,13 @@ class FinishedRun:
             model, nan if the constraints do not determine the states or the true model is unknown.
         """
         mpc = self.learned
-        above = band_distance(mpc.n_x, mpc.n_u, mpc.horizon) > 0
+        above = band_distance(mpc.n_x, mpc.n_u, mpc.horizon, mpc.past, mpc.n_d) > 0
         readings = {
             "zeros_above": (mpc.C[above] == 0).double().mean().item(),
             "prediction_error": math.nan,
             "prediction_error_start": math.nan,
         }
-        if true_model(self.physics) is not None:
-            physics = cast(LinearSystem, self.physics)  # the only plants with a true model
+        if isinstance(physics := self.physics, LinearSystem):
             with contextlib.suppress(QPError):
                 learned, start = (nearest_model(predictions(m)) for m in (mpc, self.start))
                 readings["prediction_error"] = prediction_error(learned, physics)

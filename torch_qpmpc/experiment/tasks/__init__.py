@@ -11,7 +11,13 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torch_qpmpc.experiment.tasks import gros_zanon, gymnasium, point_mass  # noqa: F401 (register)
+from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
+    gros_zanon,
+    gymnasium,
+    house,
+    house_wall,
+    point_mass,
+)
 from torch_qpmpc.experiment.tasks.identified import Start, identified_scheme
 from torch_qpmpc.experiment.tasks.registry import (
     TASKS,
