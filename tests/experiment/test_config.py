@@ -33,7 +33,7 @@ GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
-NOT_NEEDED = ("eval_seed", "logger", "task.file")
+NOT_NEEDED = ("eval_seed", "logger", "start.name", "task.file")
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
@@ -93,6 +93,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "actor": ("algo=td3", "task=pendulum", "constraint=free", "batch_size=8"),
         "house": ("task=house", "warmup_steps=1"),
         "house_wall": ("task=house_wall", "warmup_steps=1"),
+        "data": ("start=data", "task=pendulum", "constraint=free", "start.transitions=40"),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
     }.items():
         cfg = make_config(*SMALL, "delay_value=true", *overrides)
@@ -120,9 +121,9 @@ NOISES = {
     "point_mass": {"gaussian", "brownian"},
     "gros_zanon": {"uniform"},
     "gymnasium": {"none"},
-    "pendulum": {"none"},
     "house": {"none"},
     "house_wall": {"none"},
+    "pendulum": {"none"},
 }
 WINDOWS = ("si", "combined", "identified")
 
@@ -186,6 +187,7 @@ def choices_with(key: str) -> list[str]:
     if key in settings(make_config("optimizer=gauss_newton")):
         return ["optimizer=gauss_newton"]
     having = {"algo": "algo=td3", "collector": "collector=ray", "task": "task=pendulum"}
+    having["start"] = "start=data"
     return ["optimizer=adam", *(c for group, c in having.items() if key.startswith(f"{group}."))]
 
 
@@ -221,6 +223,13 @@ BAD: dict[str, list[Any]] = {
     "algo.policy_delay": WHOLE,
     "algo.policy_noise": REAL,
     "algo.noise_clip": REAL,
+    "start.name": ["policy", *NAME],
+    "start.file": [3, True],
+    "start.transitions": WHOLE,
+    "start.levels": ["normal", *NAME],
+    "start.hold": [0.5, *REAL],
+    "start.causal": FLAG,
+    "start.ridge": REAL[:-1],
     "collector.name": ["many", *NAME],
     "collector.workers": WHOLE,
     "collector.sync": FLAG,
@@ -389,7 +398,7 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     cfg, file = make_config(), tmp_path / "config.yaml"
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
-    del cfg["logger"], cfg["eval_seed"]
+    del cfg["logger"], cfg["eval_seed"], cfg["start"]
     OmegaConf.save(cfg, file)
     assert differences(settings(cfg), now) is None
     assert settings(load_config(file)) == now
