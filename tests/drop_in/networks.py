@@ -80,5 +80,5 @@ def make_critic(n_p: int, n_u: int, **keys: Any) -> Any:
 def make_value(n_p: int, n_u: int, **keys: Any) -> Any:
     """Make a value, -V, initially below -Q: above it, IQL with expectile one learns nothing."""
     operator = make_critic(n_p, n_u, **keys)
-    operator.module.c.data += 100
+    operator.module.c.data += 1000
     return operator.get_value_operator()

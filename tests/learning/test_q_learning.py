@@ -70,6 +70,8 @@ def test_loss_and_its_gradients_with_a_window_and_a_preview(delay_value):
     operator = store.make_operator()
     twin = copy.deepcopy(operator.module)
     loss = make_loss(operator=operator, delay_value=delay_value)
+    if delay_value:
+        SoftUpdate(loss, tau=0.1)
     td = store.collect(3, 8).reshape(-1)
     assert {"preview", ("next", "preview")} <= set(loss.in_keys)
     loss(td)["loss_value"].backward()
