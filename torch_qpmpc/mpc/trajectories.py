@@ -66,7 +66,7 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
     valid = _flags(steps, MASKS, default=True)
     y = _entry(steps, ("observation",), valid, n_x)
     u = _entry(steps, ("action",), valid)
-    following = _entry(steps, NEXT, valid, y.shape[-1] if n_x is None else n_x)
+    following = _entry(steps, NEXT, valid, n_x)
     if y.shape[-1] != following.shape[-1]:
         got = f"{following.shape[-1]} entries, but {y.shape[-1]} in observation"
         raise QPError.expected(_name(NEXT), got, "the same number in both")
