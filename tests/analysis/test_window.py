@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -172,7 +173,8 @@ def test_errors_of_the_model_and_of_the_policys_next_state():
     mpc, p = scheme(), normal(20, LAYOUT.n_p)
     found = nearest_model(predictions(mpc))
     wrong = (A + 0.1 * normal(*A.shape), B + 0.1 * normal(*B.shape, seed=8), E + 0.1)
-    expected = sum((x - y).square().sum() for x, y in zip(wrong, (A, B, E), strict=True)).sqrt()
+    differences = [(x - y).flatten() for x, y in zip(wrong, (A, B, E), strict=True)]
+    expected = torch.cat(differences).norm()
     assert_close(one_step_error(found, *wrong[:2], OFFSET, E=wrong[2]), expected)
     s, a, d = normal(50, L * N_X), normal(50, L * N_U, seed=1), normal(50, N_D, seed=2)
     error = s @ (wrong[0] - A).mT + a @ (wrong[1] - B).mT + d @ (wrong[2] - E).mT
@@ -276,8 +278,9 @@ def test_figures_show_the_matrices_and_mark_what_is_known():
     shown += tuple(torch.cat((x.Phi, x.Gamma), -1) for x in (model(), form))
     for axes, matrix in zip(panels, shown, strict=True):
         assert_close(torch.as_tensor(image_of(axes)), matrix)
-        ends = [x.get_xdata()[0] + 0.5 for x in axes.lines if x.get_linestyle() == "--"]
-        assert sorted(ends) == [LAYOUT.n_preview, LAYOUT.n_before]
+        ends = [np.asarray(x.get_xdata()) for x in axes.lines if x.get_linestyle() == "--"]
+        expected = sorted((LAYOUT.n_preview - 0.5, LAYOUT.n_before - 0.5))
+        assert sorted(end[0] for end in ends) == expected
         labels = [x.get_text() for x in axes.get_xticklabels()]
         assert {"$d_{0}$", "$x_{-2}$"} <= {*labels}
     figures = (figure, constraint_figure(mpc), energies_figure(mpc))

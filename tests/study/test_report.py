@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from torch_qpmpc import QPMPC
 from torch_qpmpc.study import report
 from torch_qpmpc.study.plots import GAP_LEFT
 from torch_qpmpc.study.runs import collect
@@ -34,6 +36,16 @@ def test_a_case_is_a_row_with_median_interval_and_both_ends():
     errors = "0.250 | 1.00 | 0.050 to 0.050 (2 of 4)"
     assert free == f"| gaussian | free | 0.900 [0.900, 0.900] (3 of 4) | {ends} | {errors} |"
     assert si == f"| brownian | si | - (0 of 1) | {ends} | 0.100 | 1.00 | 0.050 to 0.020 (1 of 1) |"
+
+
+@pytest.mark.parametrize(("past", "shown"), [(1, {"trajectories", "policies"}), (2, set())])
+def test_paths_and_slices_are_shown_where_the_state_is_all_that_is_known(past, shown, monkeypatch):
+    for name in ("learning", "constraints", "trajectories", "policies", "meaning"):
+        monkeypatch.setattr(report, f"{name}_figure", lambda frame: None)
+    frame = made_up({("gaussian", "free"): [0.9, 0.9]})
+    frame["run"] = [SimpleNamespace(start=QPMPC(2, 1, 2, past=past))] * 2
+    names = {name.removesuffix("-gaussian") for name, _ in report.figures(frame)}
+    assert names == {"learning", "constraints", "meaning"} | shown
 
 
 def test_every_run_is_in_the_long_table():

@@ -84,8 +84,9 @@ class FourTanks(Plant):
         return self.A, self.B, w[..., :4]
 
     def signals(self, rng: Rng, count: int, length: int) -> Tensor:
+        """Draw w ``(count, length, 6)``; a greater length only adds steps at the end."""
         std = [self.state_std] * 4 + [self.output_std] * 2
-        return normal(rng, count, length, 6) * self.A.new_tensor(std)
+        return normal(rng, length, count, 6).movedim(0, 1) * self.A.new_tensor(std)
 
     def starts(self, rng: Rng, count: int) -> Tensor:
         """Return ``count`` zeros ``(count, 4)``, without drawing from ``rng``."""

@@ -41,9 +41,9 @@ class House(HeatedHouse):
 
     Example:
         >>> import numpy as np, torch_qpmpc as qm
-        >>> house = qm.envs.House()
-        >>> w = house.signals(np.random.default_rng(0), 20, 129)
-        >>> house.step(house.starts(None, 20), torch.zeros(20, 1), w[:, 0]).shape
+        >>> house, rng = qm.envs.House(), np.random.default_rng(0)
+        >>> w, T = house.signals(rng, 20, 129), house.starts(rng, 20)
+        >>> house.step(T, torch.zeros(20, 1), w[:, 0]).shape
         torch.Size([20, 1])
     """
 

@@ -166,7 +166,7 @@ class LinearSystem(ABC):
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
 
     def violations(self, batch: TensorDictBase) -> Tensor:
-        """Return the `violation` of each collected transition."""
+        """Return the `violation` of each transition of a collected ``batch``."""
         return self.violation(batch["observation"])
 
     def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:

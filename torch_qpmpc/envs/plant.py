@@ -32,6 +32,9 @@ class Plant(ABC):
         n_y, n_d: the numbers of outputs and of known signals.
         horizon: N; the controller sees the known signals d_k, .., d_{k+N}.
         past: L; the controller sees the last L outputs and the L - 1 actions between them.
+
+    Raises:
+        QPError: if a number is out of range.
     """
 
     lb_a: Tensor
@@ -66,11 +69,11 @@ class Plant(ABC):
 
     @abstractmethod
     def signals(self, rng: Rng, count: int, length: int) -> Tensor:
-        """Draw the signals w of ``count`` episodes, ``(count, length, n_w)``."""
+        """Draw the signals w of ``count`` episodes, ``(count, length, n_w)``, from ``rng``."""
 
     @abstractmethod
     def starts(self, rng: Rng, count: int) -> Tensor:
-        """Draw start states ``(count, n_x)``."""
+        """Draw start states ``(count, n_x)`` from ``rng``."""
 
     @abstractmethod
     def output(self, x: Tensor, w: Tensor) -> Tensor:
@@ -82,10 +85,10 @@ class Plant(ABC):
 
     @abstractmethod
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
-        """Return x+ ``(*batch, n_x)`` for the applied u."""
+        """Return x+ = f(x, u, w) ``(*batch, n_x)``, for the applied u."""
 
     def violation(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return how far the outputs are outside their bounds, summed, ``(*batch,)``; here 0."""
+        """Return how far ``x`` is outside its bounds under ``w``, summed, ``(*batch,)``; here 0."""
         return x.new_zeros(x.shape[:-1])
 
     def applied(self, a: Tensor) -> Tensor:
@@ -98,7 +101,7 @@ class Plant(ABC):
         return None
 
     def violations(self, batch: TensorDictBase) -> Tensor:
-        """Return the `violation` of each collected transition."""
+        """Return the `violation` of each transition of a collected ``batch``."""
         return batch["violation"]
 
     def vectorised(

@@ -14,6 +14,9 @@ from torch import Tensor
 from torch_qpmpc.envs.four_tanks import FourTanks
 from torch_qpmpc.envs.tank_references import TankReferences
 
+#: Factor of Q in the terminal cost of references: learning-qp's best, 1 + 10.
+TERMINAL_FACTOR = 11.0
+
 
 def set_point_options(plant: FourTanks, gamma: float) -> dict[str, Any]:
     """Return the arguments of `QPMPC` for the plant's own cost and bounds.
@@ -26,24 +29,25 @@ def set_point_options(plant: FourTanks, gamma: float) -> dict[str, Any]:
     N, weight, target = plant.horizon, torch.cat((Q, R)), torch.cat((plant.r, u_r))
     stage, terminal = weight @ target.square(), Q @ plant.r.square()
     linear = (-2 * weight * target).repeat(N + 1)[: -len(R)]
+    start = {
+        "q": F.pad(linear, ((plant.past - 1) * len(weight), 0)),
+        "c": sum(gamma**k for k in range(N)) * stage + gamma**N * terminal,
+    }
     return {
         "gamma": gamma,
         "hessian": "block",
         "stage_weight": torch.diag(2 * weight),
         "terminal_weight": torch.diag(2 * Q),
-        "q": F.pad(linear, ((plant.past - 1) * len(weight), 0)),
-        "c": sum(gamma**k for k in range(N)) * stage + gamma**N * terminal,
+        "start": start,
         "action_bounds": (plant.lb_a, plant.ub_a),
     }
 
 
-def reference_options(
-    plant: TankReferences, gamma: float, terminal_factor: float = 1.0
-) -> dict[str, Any]:
+def reference_options(plant: TankReferences, gamma: float) -> dict[str, Any]:
     """Return the arguments of `QPMPC` for the plant's own cost and bounds.
 
     The references d_k = r_k are cross terms of H, which make (x_k - r_k)'Q(x_k - r_k) with the
-    terms r_k'Q r_k. The terminal cost is that times ``terminal_factor``.
+    terms r_k'Q r_k. The terminal cost is `TERMINAL_FACTOR` times that.
     """
     Q, R = (torch.diag(2 * weight) for weight in plant.weights())
     tracking = torch.cat((torch.cat((Q, -Q), -1), torch.cat((-Q, Q), -1)))
@@ -52,7 +56,7 @@ def reference_options(
         "n_d": plant.n_d,
         "hessian": "block",
         "stage_weight": torch.block_diag(tracking, R),
-        "terminal_weight": terminal_factor * tracking,
+        "terminal_weight": TERMINAL_FACTOR * tracking,
         "state_bounds": (plant.lb_x, plant.ub_x),
         "state_slack": plant.price,
         "discount_slack": True,
@@ -60,17 +64,21 @@ def reference_options(
     }
 
 
-def velocity_form(A: Tensor, B: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the model of the increments of y and u, which has one lag more.
+def offset_free(A: Tensor, B: Tensor, memory: int = 1) -> tuple[Tensor, Tensor]:
+    """Return the model with the mean of its last ``memory`` errors added to each prediction.
 
-    y_{k+1} = y_k + A_1 (y_k - y_{k-1}) + B_1 (u_k - u_{k-1}) + ..: any pair that stays the same is
-    predicted to stay. A constant error of the model or a constant disturbance therefore causes no
-    error in the steady state.
+    It has ``memory`` lags more. What stays the same is predicted to stay, so that a wrong model or
+    a constant disturbance causes no error in a steady state that can be reached. With one error it
+    is the velocity form, y_{k+1} = y_k + A_1 (y_k - y_{k-1}) + B_1 (u_k - u_{k-1}) + ..; with more
+    it passes on less noise.
     """
     n_x, n_u = len(A), B.shape[-1] * len(A) // A.shape[-1]
-    A = F.pad(A, (0, n_x)) - F.pad(A, (n_x, 0))
-    A[:, :n_x] += torch.eye(n_x).to(A)
-    return A, F.pad(B, (0, n_u)) - F.pad(B, (n_u, 0))
+    A_free, B_free = F.pad(A, (0, memory * n_x)), F.pad(B, (0, memory * n_u))
+    for lag in range(memory):
+        error = F.pad(torch.eye(n_x).to(A), (0, A.shape[-1])) - F.pad(A, (n_x, 0))
+        A_free += F.pad(error, (lag * n_x, (memory - 1 - lag) * n_x)) / memory
+        B_free -= F.pad(B, ((lag + 1) * n_u, (memory - 1 - lag) * n_u)) / memory
+    return A_free, B_free
 
 
 def window_model(

@@ -49,8 +49,6 @@ def theta(
     learn: Collection[str],
     stage_weight: Any,
     terminal_weight: Any,
-    q: Any,
-    c: Any,
     state_slack: Any,
     action_slack: Any,
     constraint_slack: float,
@@ -85,8 +83,8 @@ def theta(
         terminal_weight = _riccati_weight(A, B, stage_weight, gamma, layout)
     return layout, {
         **cost_weights(stage_weight, terminal_weight, hessian, layout),
-        "q": _linear_cost("q", q, layout.n_z),
-        "c": _linear_cost("c", c),
+        "q": torch.zeros(layout.n_z),
+        "c": torch.zeros(()),
         "C": C,
         "b": -offset.repeat(horizon),
         "G": LinearRows(layout, tied=True)(D[0], D_f[0]),
@@ -128,14 +126,6 @@ def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dic
         "discount_slack": True,
         "learn": learn,
     }
-
-
-def _linear_cost(name: str, value: Any, *shape: int) -> Tensor:
-    """Return the initial q or c; zeros for None."""
-    value = torch.zeros(shape) if value is None else as_tensor(name, value)
-    if tuple(value.shape) != shape:
-        raise QPError.expected(name, f"shape {tuple(value.shape)}", f"shape {shape}")
-    return value
 
 
 def model_sizes(A: Tensor, B: Tensor) -> tuple[int, int, int]:

@@ -95,7 +95,6 @@ class QPMPC(nn.Module):
         terminal_weight: the initial H_f, ``(n_x,)`` or ``(n_x, n_x)``; the identity by default.
             ``"riccati"``: the cost to go of the linear quadratic regulator of A, B and the stage
             weight; not for a diagonal hessian.
-        q, c: the initial linear cost ``(n_z,)``, before discounts, and constant; zero by default.
         state_slack, action_slack, constraint_slack, rate_slack: the slack weights w of the rows of
             states, of actions, of mixed and terminal constraints, and of rates; ``inf`` makes them
             hard. By default, actions and rates are hard and the others soft. Pass one weight or,
@@ -174,8 +173,6 @@ class QPMPC(nn.Module):
         hessian: str = "diagonal",
         stage_weight: Any = None,
         terminal_weight: Any = None,
-        q: Any = None,
-        c: Any = None,
         state_slack: Any = 100.0,
         action_slack: Any = torch.inf,
         constraint_slack: float = 100.0,
@@ -288,7 +285,9 @@ class QPMPC(nn.Module):
             causal=causal,
             ridge=ridge,
         )
-        return cls(**found.arguments | options)
+        arguments = found.arguments
+        start = {**arguments.get("start", {}), **(options.pop("start", None) or {})}
+        return cls(**arguments | options, start=start)
 
     @classmethod
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:

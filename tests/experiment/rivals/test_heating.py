@@ -45,8 +45,8 @@ def test_the_filter_finds_state_and_gain_from_the_air():
     """Drives the house by a plan of its own, with another wall than the filter assumes."""
     house = HouseWall()
     kalman = KalmanMPC(house)
-    w = house.signals(np.random.default_rng(0), 2, 96 + 33)
-    x = house.starts(None, 2)
+    rng = np.random.default_rng(0)
+    w, x = house.signals(rng, 2, 96 + 33), house.starts(rng, 2)
     kalman.begin(house, x, w)
     w[..., GAIN] = 0.5
     for k in range(60):
@@ -74,6 +74,7 @@ def test_the_rollout_s_gradient_is_that_of_finite_differences():
     program = differentiable_program(house)
     theta = torch.tensor([1.5, 0.6, 0.5], dtype=torch.float64, requires_grad=True)
     rollout(house, program(theta), w).backward()
+    assert theta.grad is not None
     with torch.no_grad():
         for i, shift in enumerate(step * torch.eye(3).double()):
             ends = [rollout(house, program(theta + s * shift), w) for s in (1, -1)]

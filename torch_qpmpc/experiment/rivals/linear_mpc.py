@@ -23,6 +23,7 @@ class Tracking:
         lb_u, ub_u: hard bounds of the inputs, ``(n_u,)``.
         lb_x, ub_x: soft bounds of x_1, .., x_N, ``(n_x,)``; infinite for none.
         price: price of a unit of violation.
+        terminal_factor: factor of Q for x_N.
     """
 
     Q: Tensor
@@ -33,17 +34,29 @@ class Tracking:
     lb_x: Tensor
     ub_x: Tensor
     price: float = 0.0
+    terminal_factor: float = 1.0
 
     @classmethod
-    def of(cls, plant: FourTanks | TankReferences) -> Tracking:
+    def of(cls, plant: FourTanks | TankReferences, terminal_factor: float = 1.0) -> Tracking:
         """Make the plant's own cost and bounds."""
         Q, R = plant.weights()
         bounds = plant.lb_a, plant.ub_a
         if isinstance(plant, TankReferences):
-            return cls(Q, R, torch.zeros_like(R), *bounds, plant.lb_x, plant.ub_x, plant.price)
+            return cls(
+                Q,
+                R,
+                torch.zeros_like(R),
+                *bounds,
+                plant.lb_x,
+                plant.ub_x,
+                plant.price,
+                terminal_factor,
+            )
         _, u_r = plant.set_point()
         free = torch.full((4,), torch.inf).to(Q)
-        return cls(torch.nn.functional.pad(Q, (0, 2)), R, u_r, *bounds, -free, free)
+        return cls(
+            torch.nn.functional.pad(Q, (0, 2)), R, u_r, *bounds, -free, free, 0.0, terminal_factor
+        )
 
     def program(
         self, A: Tensor, B: Tensor, horizon: int, x_r: Tensor, e: Tensor
@@ -60,7 +73,8 @@ class Tracking:
         n_z = horizon * (n_x + n_u) + n_x
         u_r = self.u_r.expand(*x_r.shape[:-2], horizon + 1, n_u)
         r = torch.cat((x_r, u_r), -1).flatten(-2)[..., :n_z]
-        weight = torch.cat((self.Q, self.R)).repeat(horizon + 1)[:n_z]
+        stage = torch.cat((self.Q, self.R))
+        weight = torch.cat((stage.repeat(horizon), self.terminal_factor * self.Q))
         C = A.new_zeros(*A.shape[:-2], horizon * n_x, n_z)
         for k in range(horizon):
             rows, column = slice(k * n_x, (k + 1) * n_x), k * (n_x + n_u)
@@ -120,14 +134,19 @@ class OmniscientMPC:
     Args:
         plant: the plant.
         horizon: N; it is shorter where the signals end.
+        terminal_factor: factor of Q for x_N.
         solver: see `solve_qp`.
     """
 
     def __init__(
-        self, plant: FourTanks | TankReferences, horizon: int, solver: str = "daqp"
+        self,
+        plant: FourTanks | TankReferences,
+        horizon: int,
+        terminal_factor: float = 1.0,
+        solver: str = "daqp",
     ) -> None:
         self._plant, self._horizon, self._solver = plant, horizon, solver
-        self._cost = Tracking.of(plant)
+        self._cost = Tracking.of(plant, terminal_factor)
 
     def begin(self, plant: object, x: Tensor, w: Tensor) -> None:
         """Start episodes at x with signals w."""

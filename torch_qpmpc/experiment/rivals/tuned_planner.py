@@ -99,7 +99,7 @@ def differentiable_program(house: House) -> Callable[[Tensor], QuadraticProgram]
 def rollout(house: House, qp: QuadraticProgram, w: Tensor) -> Tensor:
     """Return the mean discounted cost of the closed loops with the signals ``w (length, n_w)``."""
     first = torch.tensor(FIRST)
-    x, J = house.starts(None, len(first)), w.new_zeros(())
+    x, J = house.starts(np.random.default_rng(), len(first)), w.new_zeros(())
     for k in range(STEPS):
         steps = first + k
         known = w[steps.unsqueeze(-1) + torch.arange(house.horizon + 1), : house.n_d]
