@@ -64,7 +64,7 @@ def test_a_log_is_of_the_runs_environments():
     cfg = make_config(*DATA, "num_envs=3")
     log = collect_log(cfg, make_physics(cfg))
     assert log.shape == (3, 67)
-    assert log["next", "done"].sum(1).flatten().tolist() == [5, 5, 5], "episodes of 12 steps"
+    assert log.get(("next", "done")).sum(1).flatten().tolist() == [5, 5, 5], "episodes of 12 steps"
     assert torch.equal(collect_log(cfg, make_physics(cfg))["action"], log["action"])
     cfg.seed = 2
     assert not torch.equal(collect_log(cfg, make_physics(cfg))["action"], log["action"])

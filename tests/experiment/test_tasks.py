@@ -6,6 +6,7 @@ import dataclasses
 import math
 import runpy
 import signal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -186,7 +187,7 @@ def test_a_model_on_the_command_line_is_that_of_the_qp():
 
 def test_a_scheme_passes_what_is_known_and_more(store_task):
     cfg = make_config("task=store", "task.horizon=4", "constraint=free")
-    plant = make_physics(cfg)
+    plant: Any = make_physics(cfg)
     mpc = make_mpc(cfg, plant)
     assert (mpc.n_p, mpc.past, mpc.n_d, mpc.horizon) == (plant.n_p, 2, 2, 4)
     assert mpc.quadratic_program().w[0] == 2, "an option replaces task.state_slack"

@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import io
 import pickle
+from typing import Any
 
 import pytest
 import torch
@@ -17,8 +18,8 @@ from torch_qpmpc.mpc.predictor import outputs_in, predict, windows
 from torch_qpmpc.mpc.trajectories import read_trajectories
 
 N = 6
-PAST = {"past": 2, "n_d": 1}
-COST = {"stage_weight": [1.0, 1.0, 0.1], "action_bounds": ([-1.0], [1.0]), "solver": "daqp"}
+PAST: Any = {"past": 2, "n_d": 1}
+COST: Any = {"stage_weight": [1.0, 1.0, 0.1], "action_bounds": ([-1.0], [1.0]), "solver": "daqp"}
 
 
 # QPMPC.from_data
@@ -152,7 +153,7 @@ def feedback(log: TensorDict) -> TensorDict:
 
 
 def two_equal_actions(log: TensorDict) -> TensorDict:
-    log["action"] = log["action"].repeat(1, 1, 2)
+    log["action"] = log.get("action").repeat(1, 1, 2)
     return log
 
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -48,7 +50,7 @@ def test_another_cost_gets_the_best_convex_one(diagonal):
     W, q, c = cp.Variable((4, 4), PSD=True), cp.Variable(4), cp.Variable()
     products = np.einsum("mi,mj->mij", x, x).reshape(len(x), -1)
     error = products @ cp.vec(W, order="C") / 2 + x.numpy() @ q + c - cost.numpy()
-    zeros = [cp.diag(cp.diag(W)) == W] if diagonal else []
+    zeros: Any = [cp.diag(cp.diag(W)) == W] if diagonal else []
     problem = cp.Problem(cp.Minimize(cp.sum_squares(error)), zeros)
     problem.solve(solver="CLARABEL")
     ours = (cost_of(found, v) - cost).square().sum().item()

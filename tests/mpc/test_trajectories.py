@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -50,8 +52,8 @@ def test_trajectories_end_at_flags_ids_and_gaps():
 
 
 def test_padded_steps_are_left_out():
-    log = arx_log(episodes=1)[0]
-    log["traj_ids"] = (torch.arange(40) >= 12).long()
+    log: Any = arx_log(episodes=1)[0]
+    log.set("traj_ids", (torch.arange(40) >= 12).long())
     padded = split_trajectories(log, trajectory_key="traj_ids")
     assert padded.shape == (2, 28)
     assert lengths(padded) == [12, 28]

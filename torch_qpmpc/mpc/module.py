@@ -285,8 +285,9 @@ class QPMPC(nn.Module):
             causal=causal,
             ridge=ridge,
         )
+        arguments: dict[str, Any] = {**found.arguments, **options}
         start = {**found.arguments.get("start", {}), **(options.get("start") or {})}
-        return cls(**found.arguments | options | {"start": start})
+        return cls(**{**arguments, "start": start})
 
     @classmethod
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:

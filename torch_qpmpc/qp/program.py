@@ -14,6 +14,7 @@ A row with w_i = inf is hard: its sigma_i is zero.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, fields
 from enum import IntEnum
@@ -140,7 +141,7 @@ class QuadraticProgram:
     ub: Tensor
     w: Tensor
     check_values: InitVar[bool] = True
-    n_known: InitVar[int] = 0
+    n_known: InitVar[int] = dataclasses.field(default=0, kw_only=True)
 
     def __post_init__(self, check_values: bool, n_known: int) -> None:
         self._check_shapes()

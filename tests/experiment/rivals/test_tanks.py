@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -74,7 +76,7 @@ def test_deepc_solves_its_definition(projected):
     log = uniform_log(p, 60, seed=2)
     Q, R = torch.tensor([35.0, 20.0]).double(), torch.tensor([0.1, 0.2]).double()
     y_r, u_r = p.r, p.set_point()[1]
-    weights = {"lambda_g": 0.3, "lambda_y": 7.0}
+    weights: Any = {"lambda_g": 0.3, "lambda_y": 7.0}
     options = {"Q": Q, "R": R, "y_r": y_r, "u_r": u_r, "lb_u": p.lb_a, "ub_u": 0.58 * p.ub_a}
     policy = DeePC(log, p.past, p.horizon, **options, **weights, projected=projected)
     window = torch.randn(6, p.n_p, generator=torch.Generator().manual_seed(0)).double() / 2
