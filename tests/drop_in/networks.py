@@ -34,9 +34,10 @@ PREVIEW = False
 def make_theta(n_p: int, n_u: int, unused: str | None = None) -> Theta:
     """Make a small QP that learns all parts, each with a gradient in any batch.
 
-    Its observation is p ``(*batch, n_p)``. Its linear cost pushes some actions to a bound and some beyond it. All entries of a part lie
-    between its smallest and its largest in any order: TorchRL fills the copies of an ensemble's
-    module with such numbers. (In a script, pass a list of modules.)
+    Its observation is p ``(*batch, n_p)``. Its linear cost pushes some actions to a bound and some
+    beyond it. All entries of a part lie between its smallest and its largest in any order: TorchRL
+    fills the copies of an ensemble's module with such numbers. (In a script, pass a list of
+    modules.)
     """
     n_d = int(PREVIEW and n_p > 2)
     n_x, horizon = n_p - 2 * n_d, 2 - n_d
