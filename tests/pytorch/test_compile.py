@@ -74,7 +74,7 @@ def test_a_gradient_in_an_argument_passed_unchanged(output, of):
     given["fixed"] = s
 
     def total(x: Tensor) -> Tensor:
-        theta = given | {of: x}
+        theta: dict[str, Any] = given | {of: x}
         fixed = theta.pop("fixed")
         return getattr(solve_qp(QuadraticProgram(**theta, check_values=False), fixed), output).sum()
 
