@@ -51,6 +51,9 @@ def test_options_go_to_the_qp():
     mpc = QPMPC.from_data(arx_log(), N, **PAST, **COST, gamma=0.8, learn=("C", "b"))
     assert (mpc.gamma, mpc.learned) == (0.8, ("C", "b"))
     assert mpc.H.tolist() == [1.0, 1.0, 0.1]
+    other = QPMPC.from_data(arx_log(), N, **PAST, **COST, start={"c": 3.0})
+    assert other.c.item() == 3.0
+    assert torch.equal(other.C, mpc.C)
 
 
 def test_the_start_survives_copies_and_resets():

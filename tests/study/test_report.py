@@ -2,13 +2,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from torch_qpmpc import QPMPC
+import train
+from tests.experiment.conftest import store_task  # noqa: F401 - a fixture
+from tests.runs import SMALL, make_config
 from torch_qpmpc.study import report
 from torch_qpmpc.study.plots import GAP_LEFT
 from torch_qpmpc.study.runs import collect
@@ -36,16 +37,6 @@ def test_a_case_is_a_row_with_median_interval_and_both_ends():
     errors = "0.250 | 1.00 | 0.050 to 0.050 (2 of 4)"
     assert free == f"| gaussian | free | 0.900 [0.900, 0.900] (3 of 4) | {ends} | {errors} |"
     assert si == f"| brownian | si | - (0 of 1) | {ends} | 0.100 | 1.00 | 0.050 to 0.020 (1 of 1) |"
-
-
-@pytest.mark.parametrize(("past", "shown"), [(1, {"trajectories", "policies"}), (2, set())])
-def test_paths_and_slices_are_shown_where_the_state_is_all_that_is_known(past, shown, monkeypatch):
-    for name in ("learning", "constraints", "trajectories", "policies", "meaning"):
-        monkeypatch.setattr(report, f"{name}_figure", lambda frame: None)
-    frame = made_up({("gaussian", "free"): [0.9, 0.9]})
-    frame["run"] = [SimpleNamespace(start=QPMPC(2, 1, 2, past=past))] * 2
-    names = {name.removesuffix("-gaussian") for name, _ in report.figures(frame)}
-    assert names == {"learning", "constraints", "meaning"} | shown
 
 
 def test_every_run_is_in_the_long_table():
@@ -94,6 +85,19 @@ def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
     assert 5_000 < (tmp_path / f"{study.name}.png").stat().st_size < 200_000
     # The report's folder is not a run.
     assert len(collect(study)) == len(frame)
+
+
+@pytest.mark.usefixtures("store_task")
+def test_a_report_of_runs_with_a_window_and_previews(tmp_path):
+    settings = ("task=store", "constraint=free", "task.eval_steps=5")
+    train.train(make_config(*SMALL, *settings), str(tmp_path / "free"), quiet=True)
+    frame = collect(tmp_path)
+    start = frame["run"].iloc[0].start
+    assert (start.past, start.n_d) == (2, 2)
+    assert frame["zeros_above"].item() < 1
+    assert "nan to nan (0 of 1)" in report.write(frame, tmp_path / "report")
+    drawn = {path.name for path in (tmp_path / "report" / tmp_path.name).iterdir()}
+    assert drawn == {"learning-none.png", "constraints-none.png", "trajectories-none.png"}
 
 
 def test_many_settings_are_a_frontier_and_ablations_have_their_figure():

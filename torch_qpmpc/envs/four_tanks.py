@@ -75,6 +75,11 @@ class FourTanks(Plant):
         u = torch.linalg.solve(gain[:2], self.r)
         return gain @ u, u
 
+    def measurement(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return C ``(2, 4)`` of y = C x + e, and the covariances of v and e."""
+        unit = torch.eye(4).to(self.A)
+        return unit[:2], self.state_std**2 * unit, self.output_std**2 * unit[:2, :2]
+
     def target(self, w: Tensor) -> Tensor:
         """Return x_r for signals w ``(*batch, 6)``, ``(*batch, 4)``."""
         return self.set_point()[0].expand(*w.shape[:-1], -1)

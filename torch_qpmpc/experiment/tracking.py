@@ -18,13 +18,22 @@ from torch_qpmpc.envs.tank_references import TankReferences
 TERMINAL_FACTOR = 11.0
 
 
-def set_point_options(plant: FourTanks, gamma: float) -> dict[str, Any]:
+def set_point_options(
+    plant: FourTanks, gamma: float, input_weight: float | None = None
+) -> dict[str, Any]:
     """Return the arguments of `QPMPC` for the plant's own cost and bounds.
 
     The set point is in q and c, which complete the squares of (y_k - r)'Q(y_k - r) and
     (u_k - u_r)'R(u_k - u_r); the terminal cost is (y_N - r)'Q(y_N - r).
+
+    Args:
+        plant: the plant.
+        gamma: the discount.
+        input_weight: replaces the entries of R. A larger one allows for errors of the model, whose
+            size DeePC's regularisation weighs in the same way.
     """
     Q, R = plant.weights()
+    R = R if input_weight is None else torch.full_like(R, input_weight)
     _, u_r = plant.set_point()
     N, weight, target = plant.horizon, torch.cat((Q, R)), torch.cat((plant.r, u_r))
     stage, terminal = weight @ target.square(), Q @ plant.r.square()

@@ -285,9 +285,8 @@ class QPMPC(nn.Module):
             causal=causal,
             ridge=ridge,
         )
-        arguments = found.arguments
-        start = {**arguments.get("start", {}), **(options.pop("start", None) or {})}
-        return cls(**arguments | options, start=start)
+        start = {**found.arguments.get("start", {}), **(options.get("start") or {})}
+        return cls(**found.arguments | options | {"start": start})
 
     @classmethod
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:

@@ -31,6 +31,10 @@ from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.ridge import ridge
 from torch_qpmpc.mpc.trajectories import Trajectory
 
+#: The correction of a prediction k steps ahead needs more than this many times k starts, because
+#: the errors of fewer than k starts overlap.
+SPANS = 3
+
 
 class Model(NamedTuple):
     """An ARX model: A ``(n_x, L n_x)``, B ``(n_x, L n_u)``, E ``(n_x, n_d)``, offset ``(n_x,)``.
@@ -73,7 +77,7 @@ def arx(trajectories: Sequence[Trajectory], past: int, strength: float | None = 
 def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[Model, Constraints]:
     """Fit an ARX model, and correct its banded C and b as the structure allows.
 
-    A row block with no more starts in the data than steps ahead is not corrected.
+    A row block is not corrected if the data have too few starts.
     """
     layout, structure, causal, strength = options
     N, n_x = layout.horizon, layout.n_x
@@ -93,7 +97,7 @@ def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[Model, Co
         inside = [slice(max(len(z) - last, 0)) for z in Z]
         pairs = list(zip(Z, measured, inside, strict=True))
         X = torch.cat([z[i] for z, _, i in pairs])
-        if (k or last) and len(X) > last:
+        if (k or last) and len(X) > SPANS * last:
             Y = torch.cat([y[i, outputs[k]] for _, y, i in pairs]) - X @ C[rows].mT + b[rows]
             X = X[:, read]
             middle, mean = X.mean(0), Y.mean(0)

@@ -128,13 +128,11 @@ def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
         for noise, runs in sweep.groupby("noise"):
             yield f"learning-{noise}", learning_figure(runs)
             yield f"constraints-{noise}", constraints_figure(runs.query("constraint != 'fixed'"))
-            start = runs["run"].iloc[0].start
-            if start.n_p > start.n_x:  # the states do not determine the policy's action
-                continue
             yield f"trajectories-{noise}", trajectories_figure(runs)
-            if start.n_x > 1:
+            if runs["run"].iloc[0].start.n_x > 1:
                 yield f"policies-{noise}", policies_figure(runs)
-        yield "meaning", meaning_figure(sweep)
+        if any(sweep["prediction_error"].notna()):  # the true model is known
+            yield "meaning", meaning_figure(sweep)
     elif has_real(sweep):
         yield "frontier", frontier_figure(sweep)
     if has_ablations(sweep):

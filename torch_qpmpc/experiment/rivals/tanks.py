@@ -48,13 +48,8 @@ def tank_references_rivals(plant: TankReferences) -> Rivals:
 def kalman_mpc(plant: FourTanks, horizon: int) -> KalmanMPC:
     """Make the Kalman filter of the true model and noise, with MPC of the true model."""
     x_r, _ = plant.set_point()
-    unit = torch.eye(4).to(plant.A)
-    return KalmanMPC(
-        LinearMPC(Tracking.of(plant), plant.A, plant.B, horizon, x_r),
-        *(plant.A, plant.B, unit[:2]),
-        *(plant.state_std**2 * unit, plant.output_std**2 * unit[:2, :2]),
-        torch.zeros_like(x_r),
-    )
+    mpc = LinearMPC(Tracking.of(plant), plant.A, plant.B, horizon, x_r)
+    return KalmanMPC(mpc, plant.A, plant.B, *plant.measurement(), torch.zeros_like(x_r))
 
 
 def deepc(plant: FourTanks, log: TensorDictBase, horizon: int = 20) -> DeePC:

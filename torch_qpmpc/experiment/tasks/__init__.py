@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
 from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
+    four_tanks,
     gros_zanon,
     gymnasium,
     house,
     house_wall,
     point_mass,
+    tank_references,
 )
 from torch_qpmpc.experiment.tasks.identified import Start, identified_scheme
 from torch_qpmpc.experiment.tasks.registry import (
@@ -96,7 +97,6 @@ def _make(
         "solver": cfg.solver,
         "on_failure": "mask",
     }
-    mpc = QPMPC.from_model(scheme.A, scheme.B, task.horizon, **options | dict(scheme.options))
-    with torch.no_grad():
-        mpc.c.fill_(scheme.c)
-    return mpc
+    options |= scheme.options
+    options["start"] = {"c": scheme.c, **options.get("start", {})}
+    return QPMPC.from_model(scheme.A, scheme.B, task.horizon, **options)

@@ -42,8 +42,8 @@ def identified_start(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase) ->
 def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
     """Return ``scheme`` with the identified model and, if it has no weight, the log's cost."""
     arguments = start.identified.arguments
-    model = {name: arguments[name] for name in ("A", "B", "offset")}
-    options = {name: arguments[name] for name in ("past", "n_d", "E")}
+    model = {name: arguments[name] for name in ("A", "B")}
+    options = {name: arguments[name] for name in ("past", "n_d", "E", "offset")}
     values = {**scheme.options.get("start", {}), **arguments.get("start", {})}
     cost = {}
     if scheme.stage_weight is None:
