@@ -285,8 +285,9 @@ class QPMPC(nn.Module):
             causal=causal,
             ridge=ridge,
         )
-        start = {**found.arguments.get("start", {}), **(options.get("start") or {})}
-        return cls(**found.arguments | options | {"start": start})
+        arguments = found.arguments | options
+        arguments["start"] = {**found.arguments.get("start", {}), **(options.get("start") or {})}
+        return cls(**arguments)
 
     @classmethod
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
