@@ -179,7 +179,6 @@ def test_an_actor_has_the_first_order_by_itself():
 #: The tasks of keys that pendulum lacks.
 TASK_KEYS = {
     "task.disturbed": "task=tank_references",
-    "task.input_weight": "task=four_tanks",
     "task.margin": "task=house",
     "task.memory": "task=tank_references",
     "task.model_error": "task=tank_references",
@@ -279,7 +278,6 @@ for _name in ("scale_cost", "scale_constraints", "damping"):
 BAD["optimizer.trust_region"] = BAD["task.one_weather"] = BAD["task.disturbed"] = FLAG
 BAD["task.past"], BAD["task.memory"] = WHOLE, WHOLE[1:]
 BAD["task.margin"] = BAD["task.model_error"] = REAL
-BAD["task.input_weight"] = [0, *REAL]
 for _name in ("lr_cost", "lr_constraints"):
     BAD[f"optimizer.{_name}"] = REAL
 for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.growth", "si.beta"):
