@@ -10,6 +10,7 @@ import torchrl
 
 from tests.drop_in import networks
 
+
 @pytest.fixture(autouse=True, params=["state", "preview"])
 def known(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run every test with QPs that fix a state, and with QPs that fix a preview, too."""

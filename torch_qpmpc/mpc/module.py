@@ -285,9 +285,9 @@ class QPMPC(nn.Module):
             causal=causal,
             ridge=ridge,
         )
-        arguments = found.arguments | options
-        arguments["start"] = {**found.arguments.get("start", {}), **(options.get("start") or {})}
-        return cls(**arguments)
+        arguments: dict[str, Any] = {**found.arguments, **options}
+        start = {**found.arguments.get("start", {}), **(options.get("start") or {})}
+        return cls(**{**arguments, "start": start})
 
     @classmethod
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
