@@ -287,7 +287,7 @@ class QPMPC(nn.Module):
         )
         arguments = found.arguments
         start = {**arguments.get("start", {}), **(options.pop("start", None) or {})}
-        return cls(**arguments | options | {"start": start})
+        return cls(**{**arguments, **options, "start": start})
 
     @classmethod
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
