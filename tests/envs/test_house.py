@@ -74,9 +74,8 @@ def test_the_comfort_band_is_wider_at_night(house):
 def test_the_cost_is_the_heat_s_price_and_the_discomfort(house):
     w = signals(house)[0, [0, 40, 72]]
     air = torch.tensor([11.0, 17.0, 23.0]).double()
-    x = torch.stack((air, 0 * air, 0 * air), -1)[
-        :, : house.starts(np.random.default_rng(), 1).shape[-1]
-    ]
+    x = house.starts(np.random.default_rng(), 3)
+    x[:, 0] = air
     u = torch.tensor([[2.0], [4.0], [1.0]]).double()
     discomfort = torch.tensor([1.0, 0.0, 23.0 - house.upper]).double()
     torch.testing.assert_close(house.violation(x, w), discomfort)

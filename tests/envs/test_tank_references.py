@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -85,6 +87,6 @@ def test_seeds_are_apart_and_starts_are_in_the_range_of_the_original():
 @pytest.mark.parametrize("name", ["price", "noise_std", "mismatch"])
 def test_a_negative_number_is_refused(name):
     with pytest.raises(QPError, match=f"{name}: got -1, expected a finite number >= 0"):
-        TankReferences(**{name: -1})  # pyright: ignore[reportArgumentType]
+        TankReferences(**dict[str, Any]({name: -1}))
     with pytest.raises(QPError, match="hold: got 0, expected a whole number >= 1"):
         TankReferences(hold=0)

@@ -76,9 +76,10 @@ def test_deepc_solves_its_definition(projected):
     log = uniform_log(p, 60, seed=2)
     Q, R = torch.tensor([35.0, 20.0]).double(), torch.tensor([0.1, 0.2]).double()
     y_r, u_r = p.r, p.set_point()[1]
-    weights: Any = {"lambda_g": 0.3, "lambda_y": 7.0}
-    options = {"Q": Q, "R": R, "y_r": y_r, "u_r": u_r, "lb_u": p.lb_a, "ub_u": 0.58 * p.ub_a}
-    policy = DeePC(log, p.past, p.horizon, **options, **weights, projected=projected)
+    lambda_g, lambda_y = 0.3, 7.0
+    options: dict[str, Any] = {"Q": Q, "R": R, "lambda_g": lambda_g, "lambda_y": lambda_y}
+    options |= {"y_r": y_r, "u_r": u_r, "lb_u": p.lb_a, "ub_u": 0.58 * p.ub_a}
+    policy = DeePC(log, p.past, p.horizon, **options, projected=projected)
     window = torch.randn(6, p.n_p, generator=torch.Generator().manual_seed(0)).double() / 2
 
     P, U, Y = windows(log, p.past, p.horizon, p.n_y)
@@ -89,15 +90,14 @@ def test_deepc_solves_its_definition(projected):
     Pi = torch.eye(count).double()
     if projected:
         Pi = Pi - torch.linalg.pinv(known) @ known
-    H = 2 * weights["lambda_g"] * Pi.mT @ Pi + 1e-9 * torch.eye(count).double()
-    q = 0
+    H = 2 * lambda_g * Pi.mT @ Pi + 1e-9 * torch.eye(count).double()
+    q = torch.zeros(1, count).double()
     targets = {"Y": y_r.repeat(4), "U": u_r.repeat(4), "past": window[:, is_output]}
     parts = {"Y": (Y, Q.repeat(4)), "U": (U, R.repeat(4))}
-    parts["past"] = (P[is_output], torch.full((6,), weights["lambda_y"]).double())
+    parts["past"] = (P[is_output], torch.full((6,), lambda_y).double())
     for name, (rows, weight) in parts.items():
         H = H + 2 * rows.mT @ (weight.unsqueeze(-1) * rows)
         q = q - 2 * (weight * targets[name]) @ rows
-    assert isinstance(q, torch.Tensor)
     by_hand = qm.solve_qp(
         qm.QuadraticProgram(
             H=(H + H.mT) / 2,

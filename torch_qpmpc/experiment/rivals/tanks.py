@@ -29,9 +29,9 @@ HORIZONS = (20, 40, 60)
 
 def four_tanks_rivals(plant: FourTanks, log: TensorDictBase | None = None) -> Rivals:
     """Return the rivals for the set point; DeePC needs a ``log`` of actions and outputs."""
-    policies: dict[str, Policy] = {}
-    for N in HORIZONS:
-        policies[f"Kalman filter, N = {N}"] = kalman_mpc(plant, N)
+    policies: dict[str, Policy] = {
+        f"Kalman filter, N = {N}": kalman_mpc(plant, N) for N in HORIZONS
+    }
     if log is not None:
         policies["DeePC"] = deepc(plant, log)
     policies["omniscient"] = OmniscientMPC(plant, max(HORIZONS))
@@ -74,7 +74,7 @@ def deepc(plant: FourTanks, log: TensorDictBase, horizon: int = 20) -> DeePC:
     )
 
 
-def reference_mpc(plant: TankReferences, A: Tensor, B: Tensor) -> Callable[[Tensor], Tensor]:
+def reference_mpc(plant: TankReferences, A: Tensor, B: Tensor) -> Policy:
     """Make MPC of a model and the plant's own cost, without discount."""
     options = reference_options(plant, gamma=1.0)
     return QPMPC.from_model(A, B, plant.horizon, solver="daqp", **options).policy
