@@ -34,6 +34,7 @@ from torch_qpmpc.experiment.algorithms import evaluate, make_learner
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, drop_previous, save_checkpoint
 from torch_qpmpc.experiment.collection import batches, make_collector, make_run_replay
 from torch_qpmpc.experiment.config import check_config
+from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.interrupt import Interrupt
 from torch_qpmpc.experiment.launch import launched
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
@@ -43,7 +44,7 @@ from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tally import Tally
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics, make_true_mpc, true_model
-from torch_qpmpc.learning.operators import in_closed_loop, preview_key, warm_policy
+from torch_qpmpc.learning.operators import preview_key, warm_policy
 from torch_qpmpc.learning.replay import ACTIVE_SET
 
 # Absolute, so that a user's script can call main.
@@ -91,11 +92,10 @@ def _train(
     if released:
         mpc.release()
     learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
-    n_preview = (mpc.horizon + 1) * mpc.n_d
-    learned_mpc = mpc if cfg.algo.name == "qlearning" or cfg.algo.actor == "qp" else None
+    gate = RunGate(cfg, learner.actor, physics)
 
     # The data: vectorised episodes under the current policy, and their replay.
-    collector = make_collector(cfg, physics, learner.actor)
+    collector = make_collector(cfg, physics, gate.actor)
     replay = make_run_replay(cfg, mpc)
     stream = batches(collector)
 
@@ -108,16 +108,16 @@ def _train(
         # Warm up, or resume.
         if state is None:
             tally = Tally()
-            report(run, learned_mpc, loops, 0)
+            report(run, gate.mpc, loops, 0)
             for batch in itertools.islice(stream, -(-cfg.warmup_steps // cfg.steps_per_update)):
                 if cfg.replay:
                     replay.extend(batch)
                 interrupt.exit_if_signalled(f"Stopped before the first update: {command}")
         else:
-            tally = restore(state, mpc, learner, collector, replay)
+            tally = restore(state, mpc, learner, gate, collector, replay)
             if state["collector"] is None and tally.update < cfg.updates and not quiet:
                 print("Starting new episodes: the state of the environments is not saved.")
-            loops["learned"] = evaluate(cfg, in_closed_loop(learner.actor, n_preview), physics)
+            loops["learned"] = gate.closed_loop()
         interrupt.exit_if_signalled(f"Stopped after update {tally.update}: {command}")
 
         label = f"{cfg.constraint.name}, {cfg.noise.name}"
@@ -144,22 +144,26 @@ def _train(
             if update == cfg.release:
                 mpc.release()
                 learner = make_learner(cfg, operator, physics, done=update)
+                gate.release(learner.actor)
             last = update == cfg.updates
             evaluated = last or update % cfg.eval_interval == 0
             if evaluated:
-                loops["learned"] = evaluate(cfg, in_closed_loop(learner.actor, n_preview), physics)
-                gap = report(run, learned_mpc, loops, update)
-                progress.set_postfix(J=gap["J_final"], closed_gap=gap["closed_gap"])
+                run.log(gate.judge(learner.actor), update)
+                loops["learned"] = gate.closed_loop()
+                gap = report(run, gate.mpc, loops, update)
+                progress.set_postfix(J=gap["J_best"], closed_gap=gap["closed_gap"])
             if evaluated or interrupt.signum is not None:
                 run.flush()
-                state = snapshot(cfg, mpc, learner, collector, replay, tally)
+                state = snapshot(cfg, mpc, learner, gate, collector, replay, tally)
                 save_checkpoint(run.path / CHECKPOINT, state)
+                gate.save(run.path)
             if not last:
                 interrupt.exit_if_signalled(f"Stopped after update {update}: {command}")
 
-        summary = run_summary(cfg, loops, tally, learned_mpc, true_model(physics))
-        if cfg.figures and learned_mpc is not None:
-            figure = summary_figure(mpc, loops, *run.column("eval/J"))
+        loops["candidate"] = gate.closed_loop(learner.actor)
+        summary = run_summary(cfg, loops, tally, gate, true_model(physics))
+        if cfg.figures and gate.mpc is not None:
+            figure = summary_figure(gate.mpc, loops, *run.column("eval/J"))
             figure.savefig(run.path / "summary.png", dpi=110)
         run.finish(summary)
         drop_previous(run.path / CHECKPOINT)

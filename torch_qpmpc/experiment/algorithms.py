@@ -167,9 +167,15 @@ def decay(update: int, updates: int, last: float) -> float:
     return 1 - (1 - last) * min(update / updates, 1)
 
 
-def evaluate(cfg: DictConfig, policy: Callable[[Tensor], Tensor], physics: AnyPlant) -> ClosedLoop:
-    """Run ``policy`` in closed loop, with the starts and the noise of ``cfg.eval_seed``."""
-    options = {} if cfg.eval_seed is None else {"seed": cfg.eval_seed}
+def evaluate(
+    cfg: DictConfig,
+    policy: Callable[[Tensor], Tensor],
+    physics: AnyPlant,
+    seed: int | None = None,
+) -> ClosedLoop:
+    """Run ``policy`` in closed loop, with starts and noise of ``seed``, by default ``eval_seed``."""
+    seed = cfg.eval_seed if seed is None else seed
+    options = {} if seed is None else {"seed": seed}
     return find_task(cfg.task).closed_loop(
         policy, physics, steps=cfg.task.eval_steps, gamma=cfg.task.gamma, **options
     )

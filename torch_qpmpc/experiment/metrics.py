@@ -16,6 +16,7 @@ from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.analysis.structure import distance_by_band, nearest_model
 from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_gap, gap_text
 from torch_qpmpc.experiment.algorithms import Learner
+from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.plots import closed_loop_figure, predictions_figure
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tally import Stopwatch, Tally
@@ -51,16 +52,16 @@ def run_summary(
     cfg: DictConfig,
     loops: dict[str, ClosedLoop],
     tally: Tally,
-    mpc: QPMPC | None,
+    gate: RunGate,
     true_model: Sequence[Tensor] | None,
 ) -> dict[str, Any]:
-    """Return the content of summary.json; ``mpc`` is None if the policy is a network."""
-    summary: dict[str, Any] = gap_summary(loops)
+    """Return the content of summary.json, which is about the policy that acts."""
+    summary: dict[str, Any] = gap_summary(loops) | gate.summary()
     summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
     summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
     summary |= {"ablation": cfg.ablation, "step": cfg.step, "penalty_step": cfg.penalty_step}
     summary |= {"updates": cfg.updates, **tally.summary()}
-    return summary if mpc is None else summary | structure_summary(mpc, true_model)
+    return summary if gate.mpc is None else summary | structure_summary(gate.mpc, true_model)
 
 
 def report(
@@ -97,9 +98,9 @@ def report(
 
 #: Names of an evaluation's scalars, and their keys in `gap_summary`.
 EVALUATION_SCALARS = {
-    "J": "J_final",
+    "J": "J_best",
     "J_true_model": "J_true_model",
-    "J_discounted": "J_discounted_final",
+    "J_discounted": "J_discounted_best",
     "closed_gap": "closed_gap",
 }
 
@@ -137,15 +138,20 @@ def theta_metrics(mpc: QPMPC) -> dict[str, float]:
 def gap_summary(loops: dict[str, ClosedLoop]) -> dict[str, float]:
     """Return J of the start, the learned and the true model, and the closed gap.
 
-    Each also with discounted costs. Missing values are nan, as for a plant without a true model.
+    ``J_best`` is that of the learned policy, which acts, and ``J_final`` that of the last
+    candidate. Each also with discounted costs. Missing values are nan, as for a plant without a
+    true model.
     """
     summary = {}
+    loops = {"candidate": loops["learned"], **loops}
     for tag, suffix in (("J", ""), ("J_discounted", "_discounted")):
-        start, final, true = (
-            getattr(loops.get(name), tag, math.nan) for name in ("start", "learned", "true model")
-        )
-        summary |= {f"{tag}_start": start, f"{tag}_final": final, f"{tag}_true_model": true}
-        summary[f"closed_gap{suffix}"] = closed_gap(start, final, true)
+        names = "start", "learned", "candidate", "true model"
+        start, best, final, true = (getattr(loops.get(name), tag, math.nan) for name in names)
+        summary |= {f"{tag}_start": start, f"{tag}_best": best, f"{tag}_final": final}
+        summary |= {
+            f"{tag}_true_model": true,
+            f"closed_gap{suffix}": closed_gap(start, best, true),
+        }
     return summary
 
 
@@ -153,7 +159,7 @@ def table(summary: Mapping[str, Any]) -> str:
     """Format the outcome for the terminal."""
     lines = [f"{'':14}{'start':>10}{'learned':>10}{'true model':>12}{'closed gap':>12}"]
     for name, tag in (("J", "J"), ("J discounted", "J_discounted")):
-        start, final, true = (summary[f"{tag}_{end}"] for end in ("start", "final", "true_model"))
+        start, final, true = (summary[f"{tag}_{end}"] for end in ("start", "best", "true_model"))
         gap = summary[f"closed_gap{tag.removeprefix('J')}"]
         share = gap_text(gap, start, final, true, name)
         cell = f"  {share}" if math.isnan(gap) else f"{share:>12}"

@@ -22,6 +22,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
 from torch_qpmpc.experiment.config import differences, load_config, settings
+from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.lock import ELSEWHERE
 from torch_qpmpc.experiment.tally import Tally
 from torch_qpmpc.learning.replay import Replay
@@ -29,7 +30,7 @@ from torch_qpmpc.mpc.module import QPMPC
 
 #: The parts of a snapshot.
 STATE = ("config", "update", "structure", "mpc", "loss_module", "optimizer", "schedule")
-STATE += ("replay", "collector", "tally", "rng")
+STATE += ("gate", "replay", "collector", "tally", "rng")
 #: Files that a run writes before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
 
@@ -38,6 +39,7 @@ def snapshot(
     cfg: DictConfig,
     mpc: QPMPC,
     learner: Learner,
+    gate: RunGate,
     collector: BaseCollector,
     replay: Replay,
     tally: Tally,
@@ -55,6 +57,7 @@ def snapshot(
         "loss_module": learner.loss_module.state_dict(),
         "optimizer": learner.optimizer.state_dict(),
         "schedule": {"last_epoch": learner.schedule.last_epoch},
+        "gate": gate.state_dict(),
         "replay": replay.state_dict() if len(replay) and not finished else None,
         "collector": None if finished else _collector_state(collector),
         "tally": tally.state(),
@@ -66,6 +69,7 @@ def restore(
     state: dict[str, Any],
     mpc: QPMPC,
     learner: Learner,
+    gate: RunGate,
     collector: BaseCollector,
     replay: Replay,
 ) -> Tally:
@@ -82,6 +86,8 @@ def restore(
         learner.optimizer.load_state_dict(state["optimizer"])
     with _part("schedule"):
         learner.schedule.last_epoch = int(state["schedule"]["last_epoch"])
+    with _part("gate"):
+        gate.load_state_dict(state["gate"])
     with _part("replay"):
         if state["replay"] is not None:
             replay.load_state_dict(state["replay"])

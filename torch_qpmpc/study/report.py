@@ -44,7 +44,7 @@ that scheme's, and the number of runs in which the latter is smaller."""
 
 def runs_table(frame: pd.DataFrame) -> str:
     """Format all runs as a Markdown table."""
-    head = ["sweep", "noise", "case", "seed", "J_start", "J_final", "J_true_model", "closed_gap"]
+    head = ["sweep", "noise", "case", "seed", "J_start", "J_best", "J_true_model", "closed_gap"]
     head += [
         "canonical_distance",
         "prediction_error",
@@ -53,11 +53,11 @@ def runs_table(frame: pd.DataFrame) -> str:
         "train_seconds",
     ]
     digits: dict[str, str] = dict.fromkeys(
-        ("J_start", "J_final", "J_true_model", "train_seconds"), ".1f"
+        ("J_start", "J_best", "J_true_model", "train_seconds"), ".1f"
     )
     digits["canonical_distance"] = ".3f"
     digits |= dict.fromkeys(("prediction_error", "prediction_error_start"), ".4f")
-    ends = (frame[name] for name in ("closed_gap", "J_start", "J_final", "J_true_model"))
+    ends = (frame[name] for name in ("closed_gap", "J_start", "J_best", "J_true_model"))
     gaps = [gap_text(*values) for values in zip(*ends, strict=True)]
     rows = frame.assign(case=frame["label"], closed_gap=gaps)[head].itertuples(index=False)
     lines = [

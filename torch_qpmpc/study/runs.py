@@ -26,6 +26,7 @@ from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
 from torch_qpmpc.experiment.config import check_config, load_config, settings
+from torch_qpmpc.experiment.gating import BEST
 from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import (
@@ -91,12 +92,13 @@ class FinishedRun:
 
     @cached_property
     def learned(self) -> QPMPC:
-        """The learned QP."""
-        state = load_checkpoint(self.folder / CHECKPOINT)
+        """The learned QP, which acted at the run's end."""
+        best = self.folder / BEST
+        state = load_checkpoint(best if best.exists() else self.folder / CHECKPOINT)
         mpc = copy.deepcopy(self.start)
         if state["structure"] != mpc.structure:
             mpc.release(state["structure"])
-        mpc.load_state_dict(state["mpc"])
+        mpc.load_state_dict(state["policy" if best.exists() else "mpc"])
         return mpc
 
     @property
@@ -173,6 +175,8 @@ def collect(folder: str | Path) -> pd.DataFrame:
     for name in ("closed_gap", "J_true_model", "J_discounted_true_model", "canonical_distance"):
         # These are null without a gap, a true model or a QP.
         frame[name] = frame[name].astype(float) if name in frame else math.nan
+    if "J_best" not in frame:  # runs before there was a gate
+        frame["J_best"] = frame["J_final"]
     frame["real"] = frame["J_start"] - frame["J_true_model"] >= REAL_GAP
     frame["label"] = ""
     for _, sweep in frame.groupby("sweep"):

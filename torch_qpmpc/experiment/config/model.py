@@ -77,6 +77,7 @@ class Config(Group):
     release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
     resume: Annotated[str | None, Expected("a path, or null")]
     ablation: Annotated[str | None, Expected("a name, or null")]
+    gate: Flag = False
     logger: Annotated[str, one_of(LOGGERS)] = "tensorboard"
     figures: Flag
     eval_interval: Count
