@@ -1,0 +1,170 @@
+"""Direct search: a few scalars of theta by CMA-ES, on the cost of closed loops.
+
+Margins, slack weights, the price of an action or a terminal slope shape the policy more than they
+shape its TD error, and there are few of them: a search on J itself, with a library's evolution
+strategy, needs some tens of closed loops.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.utils import parametrize
+
+from torch_qpmpc.checks import check_kind, check_number, check_whole
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.module import QPMPC
+
+Theta = dict[str, Tensor]
+#: The parts of theta that the scalars move.
+PARTS = ("H", "H_f", "q", "b", "lb", "ub", "w")
+
+
+def _margin(mpc: QPMPC, theta: Theta, x: float) -> Theta:
+    return {
+        "lb": torch.where(mpc.soft, theta["lb"] + x, theta["lb"]),
+        "ub": torch.where(mpc.soft, theta["ub"] - x, theta["ub"]),
+    }
+
+
+def _slack_weight(mpc: QPMPC, theta: Theta, x: float) -> Theta:
+    return {"w": theta["w"] * np.exp(x)}
+
+
+def _action_weight(mpc: QPMPC, theta: Theta, x: float) -> Theta:
+    # A congruence: the block of the plan stays positive semidefinite.
+    return {"H": _scaled(mpc, theta["H"], np.exp(x / 2), action=True)}
+
+
+def _state_weight(mpc: QPMPC, theta: Theta, x: float) -> Theta:
+    return {"H": _scaled(mpc, theta["H"], np.exp(x / 2), action=False)}
+
+
+def _terminal_weight(mpc: QPMPC, theta: Theta, x: float) -> Theta:
+    return {"H_f": theta["H_f"] * np.exp(x)}
+
+
+def _terminal_slope(mpc: QPMPC, theta: Theta, x: float) -> Theta:
+    q = theta["q"].clone()
+    q[-mpc.n_x :] += x
+    return {"q": q}
+
+
+def _offset(mpc: QPMPC, theta: Theta, x: float) -> Theta:
+    return {"b": theta["b"] + x}
+
+
+def _scaled(mpc: QPMPC, H: Tensor, root: float, action: bool) -> Tensor:
+    """Scale rows and columns of actions or of states in stage blocks ``(.., n_x + n_u)``."""
+    size = H.shape[-1]
+    kinds = torch.arange(size) >= size - mpc.n_u
+    plan = torch.arange(size) >= size - mpc.n_x - mpc.n_u
+    factor = torch.where(plan & (kinds == action), root, 1.0).to(H)
+    if mpc.hessian == "diagonal":
+        return H * factor.square()
+    return factor.unsqueeze(-1) * H * factor
+
+
+#: Scalars that a search may move: functions of theta and x, without effect at x = 0.
+KNOBS: dict[str, Callable[[QPMPC, Theta, float], Theta]] = {
+    "margin": _margin,
+    "w": _slack_weight,
+    "H_u": _action_weight,
+    "H_x": _state_weight,
+    "H_f": _terminal_weight,
+    "q_f": _terminal_slope,
+    "b": _offset,
+}
+
+
+def search(
+    mpc: QPMPC,
+    costs: Callable[[QPMPC, int], Tensor],
+    knobs: Mapping[str, float],
+    *,
+    loops: int = 64,
+    seed: int = 0,
+) -> dict[str, float]:
+    """Move a few scalars of theta by CMA-ES to where closed loops cost least.
+
+    All candidates of a generation run with the same starts and disturbances, each generation with
+    new ones.
+
+    Args:
+        mpc: the QPMPC, which is changed in place.
+        costs: maps a QPMPC and a seed to the costs ``(starts,)`` of closed loops.
+        knobs: the initial standard deviation of each scalar: ``margin``, by which the bounds of all
+            soft rows are tightened, in their unit; ``b``, added to the model's offset; ``q_f``,
+            added to the terminal slope; and ``w``, ``H_x``, ``H_u`` and ``H_f``, the logarithms of
+            factors of the slack weights and of the weights of states, actions and x_N.
+        loops: the number of candidates, each one call of ``costs``.
+        seed: seeds the search, the starts and the disturbances.
+
+    Returns:
+        The scalars found; all zero stand for the theta that the search started from.
+
+    Raises:
+        QPError: an argument is invalid.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> from torch_qpmpc.envs import PointMass
+        >>> from torch_qpmpc.envs.closed_loop import closed_loop
+        >>> physics = PointMass()
+        >>> def costs(mpc, seed):
+        ...     return closed_loop(mpc.policy, physics, steps=20, seed=seed).costs.sum(0)
+        >>> mpc = qm.QPMPC.from_model(physics.A, physics.B, 5, action_bounds=([-1, -1], [1, 1]))
+        >>> found = search(mpc, costs, {"H_u": 0.5, "H_f": 0.5}, loops=12)
+        >>> sorted(found)
+        ['H_f', 'H_u']
+    """
+    from cma import CMAEvolutionStrategy
+
+    check_kind("mpc", mpc, QPMPC)
+    check_whole("loops", loops, 1)
+    check_whole("seed", seed, 0)
+    if not knobs or (unknown := set(knobs) - set(KNOBS)):
+        got = sorted(unknown) if knobs else "none"
+        raise QPError.expected("knobs", got, f"names among {', '.join(KNOBS)}")
+    for name, size in knobs.items():
+        check_number(f"knobs[{name}]", size, lambda x: x > 0, "a finite number > 0")
+    if mpc.hessian == "full" and {"H_x", "H_u"} & set(knobs):
+        raise QPError.expected("knobs", "H_x or H_u", "others", "A full H has no stage weights.")
+    theta = {part: getattr(mpc, part).detach().clone() for part in PARTS if hasattr(mpc, part)}
+    # CMA-ES needs two dimensions.
+    names, sizes = list(knobs), np.array([*knobs.values(), 1.0][: max(len(knobs), 2)])
+    options = {"seed": seed + 1, "verbose": -9, "maxfevals": loops}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        strategy = CMAEvolutionStrategy(np.zeros(len(sizes)), 1.0, options)
+    done = 0
+    while done < loops:
+        points = strategy.ask()
+        run = int(np.random.SeedSequence([seed, done]).generate_state(1)[0])
+        found = []
+        for x in points:
+            _set(mpc, theta, dict(zip(names, x * sizes, strict=False)))
+            cost = float(costs(mpc, run).mean())
+            found.append(cost if np.isfinite(cost) else np.inf)
+        strategy.tell(points, found)
+        done += len(points)
+    best = dict(zip(names, (strategy.result.xfavorite * sizes).tolist(), strict=False))
+    _set(mpc, theta, best)
+    return best
+
+
+@torch.no_grad()
+def _set(mpc: QPMPC, theta: Theta, scalars: Mapping[str, float]) -> None:
+    """Set theta, moved by ``scalars``."""
+    moved = dict(theta)
+    for name, x in scalars.items():
+        moved |= KNOBS[name](mpc, moved, float(x))
+    for part, value in moved.items():
+        if parametrize.is_parametrized(mpc, part):
+            setattr(mpc, part, value)
+        else:
+            getattr(mpc, part).copy_(value)
