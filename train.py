@@ -149,6 +149,8 @@ def _train(
             evaluated = last or update % cfg.eval_interval == 0
             if evaluated:
                 run.log(gate.judge(learner.actor), update)
+                if last:
+                    run.log(gate.search(mpc, learner.actor), update)
                 loops["learned"] = gate.closed_loop()
                 gap = report(run, gate.mpc, loops, update)
                 progress.set_postfix(J=gap["J_best"], closed_gap=gap["closed_gap"])

@@ -32,6 +32,7 @@ SMALL = (
     "task.episode_steps=12",
     "task.eval_steps=10",
     "figures=false",
+    "gate=false",
 )
 
 

@@ -28,12 +28,13 @@ from torch_qpmpc.experiment.config.messages import keys
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import snapshot
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.learning.search import KNOBS
 
 GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
-NOT_NEEDED = ("eval_seed", "logger", "start.name", "task.file")
+NOT_NEEDED = ("eval_seed", "gate", "logger", "start.name", "task.file")
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
@@ -55,6 +56,9 @@ def keys_of_the_files() -> set[str]:
 def test_each_key_of_the_files_is_one_of_the_models():
     assert keys_of_the_files() - set(OPTIONAL) == set(KEYS) - {"task.file"}
     assert all(KEYS.values()), "each says what its value must be"
+
+
+SEARCH = ("search.margin=0.1", "search.loops=2")
 
 
 class Recorder:
@@ -89,7 +93,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(train, "check_config", lambda _: None)
     for name, overrides in {
         "first": ("optimizer=adam", "constraint=combined", "constraint.si.windows=4"),
-        "second": ("optimizer=gauss_newton", "constraint=combined", "batch_size=8"),
+        "second": ("optimizer=gauss_newton", "constraint=combined", "batch_size=8", *SEARCH),
         "actor": ("algo=td3", "task=pendulum", "constraint=free", "batch_size=8"),
         "house": ("task=house", "warmup_steps=1"),
         "house_wall": ("task=house_wall", "warmup_steps=1"),
@@ -220,6 +224,9 @@ BAD: dict[str, list[Any]] = {
     "eval_seed": WHOLE[1:-2],
     "logger": ["visdom", *NAME],
     "figures": FLAG,
+    "gate": FLAG,
+    "search.loops": WHOLE,
+    **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
     "resume": [3, True],
     "algo.name": ["sac", *NAME],
     "algo.actor": ["net", *NAME],
@@ -403,10 +410,11 @@ def test_a_misspelt_key_is_named_before_the_missing_one_and_that_before_a_confli
 
 
 def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
-    cfg, file = make_config(), tmp_path / "config.yaml"
+    cfg, file = make_config("gate=false"), tmp_path / "config.yaml"
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
-    del cfg["logger"], cfg["eval_seed"], cfg["start"]
+    for key in ("logger", "eval_seed", "start", "gate", "search"):
+        del cfg[key]
     OmegaConf.save(cfg, file)
     assert differences(settings(cfg), now) is None
     assert settings(load_config(file)) == now

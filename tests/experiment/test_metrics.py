@@ -36,8 +36,9 @@ def loops_with(start: float, learned: float, true: float) -> dict[str, ClosedLoo
 
 def test_gap_summary():
     summary = gap_summary(loops_with(100, 60, 50))
-    expected = {"J_start": 100, "J_final": 60, "J_true_model": 50, "closed_gap": 0.8}
-    expected |= {"J_discounted_start": 95, "J_discounted_final": 57}
+    expected = {"J_start": 100, "J_best": 60, "J_final": 60, "J_true_model": 50, "closed_gap": 0.8}
+    expected |= {"J_discounted_start": 95}
+    expected |= {"J_discounted_best": 57, "J_discounted_final": 57}
     expected |= {"J_discounted_true_model": 47.5, "closed_gap_discounted": 0.8}
     assert summary == pytest.approx(expected)
 

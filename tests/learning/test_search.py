@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -8,16 +9,19 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests.problems import random_mpc
-from torch_qpmpc import QPError, QPMPC
+from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.learning.search import KNOBS, PARTS, _set, search
 
 
-def scheme(**options) -> QPMPC:
-    bounds = {"state_bounds": ([-2.0, -3.0], [2.0, 3.0]), "action_bounds": ([-1.0], [1.0])}
+def scheme(**options: Any) -> QPMPC:
+    bounds: dict[str, Any] = {
+        "state_bounds": ([-2.0, -3.0], [2.0, 3.0]),
+        "action_bounds": ([-1.0], [1.0]),
+    }
     dense = options.get("hessian", "diagonal") != "diagonal"
     weight = torch.tensor([2.0, 1.0, 0.5]).double()
-    weights = {"stage_weight": weight.diag() if dense else weight}
-    return QPMPC(2, 1, 3, **(bounds | weights | options))
+    weights: dict[str, Any] = {"stage_weight": weight.diag() if dense else weight}
+    return QPMPC(2, 1, 3, **{**bounds, **weights, **options})
 
 
 def values(mpc: QPMPC) -> dict[str, Tensor]:

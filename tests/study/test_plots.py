@@ -37,7 +37,7 @@ def test_curves_are_those_of_metrics_csv(gaussian):
     x, J = curves(gaussian, "eval/J")
     assert x.tolist() == [0, 2, 4]
     np.testing.assert_array_equal(J[:, 0], gaussian["J_start"])
-    np.testing.assert_array_equal(J[:, -1], gaussian["J_final"])
+    np.testing.assert_array_equal(J[:, -1], gaussian["J_best"])
 
 
 def test_J_is_drawn_as_interquartile_mean_between_its_ends(gaussian, axes):
@@ -87,7 +87,7 @@ def test_paths_are_shown_for_each_case_with_both_ends(gaussian):
     assert legend is not None
     labels = [text.get_text() for text in legend.get_texts()]
     row = gaussian[(gaussian["label"] == "free") & gaussian["real"]].iloc[0]
-    for name, J in (("start", "J_start"), ("learned", "J_final"), ("true model", "J_true_model")):
+    for name, J in (("start", "J_start"), ("learned", "J_best"), ("true model", "J_true_model")):
         assert f"{name}, J = {row[J]:.0f}" in labels
 
 

@@ -25,7 +25,7 @@ def made_up(gaps: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
             row |= {"zeros_above": 1.0}
             row |= {"prediction_error": 0.02 * seed, "prediction_error_start": 0.05}
             for name in ("J", "J_discounted"):
-                row |= {f"{name}_start": 285.04, f"{name}_final": 50.0, f"{name}_true_model": 46.97}
+                row |= {f"{name}_start": 285.04, f"{name}_best": 50.0, f"{name}_true_model": 46.97}
             rows.append(row | {"unsolved": 0, "train_seconds": 3.21})
     return pd.DataFrame(rows)
 
@@ -48,7 +48,7 @@ def test_every_run_is_in_the_long_table():
 
 
 def test_a_run_without_a_gap_shows_the_change_of_J():
-    frame = made_up({("gaussian", "free"): [math.nan]}).assign(J_start=46.97, J_final=50.0)
+    frame = made_up({("gaussian", "free"): [math.nan]}).assign(J_start=46.97, J_best=50.0)
     assert "| 47.0 | 50.0 | 47.0 | no gap; J rose by 3.0 |" in report.runs_table(frame)
 
 

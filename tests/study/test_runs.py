@@ -53,7 +53,7 @@ def test_a_lock_file_that_was_left_is_ignored(study):
 def test_the_learned_qp_is_the_one_that_was_evaluated(study):
     for row in collect(study / "small").to_dict("records"):
         run = row["run"]
-        for mpc, then in ((run.start, row["J_start"]), (run.learned, row["J_final"])):
+        for mpc, then in ((run.start, row["J_start"]), (run.learned, row["J_best"])):
             now = evaluate(run.cfg, mpc.policy, run.physics).J
             assert now == pytest.approx(then, rel=1e-6)
 
@@ -120,7 +120,7 @@ def test_a_scheme_released_in_training_is_read(tmp_path):
     run = FinishedRun(tmp_path)
     assert run.learned.structure == "free"
     now = evaluate(cfg, run.learned.policy, run.physics).J
-    assert now == pytest.approx(summary["J_final"], rel=1e-6)
+    assert now == pytest.approx(summary["J_best"], rel=1e-6)
 
 
 def test_a_folder_without_runs_is_named(tmp_path):

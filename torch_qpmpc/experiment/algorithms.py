@@ -173,7 +173,7 @@ def evaluate(
     physics: AnyPlant,
     seed: int | None = None,
 ) -> ClosedLoop:
-    """Run ``policy`` in closed loop, with starts and noise of ``seed``, by default ``eval_seed``."""
+    """Run ``policy`` in closed loop, with the starts and the noise of a seed, or ``eval_seed``."""
     seed = cfg.eval_seed if seed is None else seed
     options = {} if seed is None else {"seed": seed}
     return find_task(cfg.task).closed_loop(

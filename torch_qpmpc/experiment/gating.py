@@ -17,6 +17,7 @@ from torch_qpmpc.experiment.checkpoint import write_whole
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.learning.gate import Gate
 from torch_qpmpc.learning.operators import in_closed_loop
+from torch_qpmpc.learning.search import KNOBS, search
 from torch_qpmpc.mpc.module import QPMPC
 
 #: The file of the policy that acts, in a run's folder.
@@ -49,6 +50,23 @@ class RunGate:
         """Let ``candidate`` act if it costs less, and return the scalars of the comparison."""
         return {} if self._gate is None else self._gate.judge(candidate).metrics()
 
+    def search(self, mpc: QPMPC, candidate: TensorDictModuleBase) -> dict[str, float]:
+        """Search over ``cfg.search``'s scalars from the policy that acts, and `judge` the result.
+
+        Args:
+            mpc: the QP of the candidate.
+            candidate: the learner's actor.
+        """
+        sizes = {name: x for name in KNOBS if (x := self._cfg.search[name])}
+        if not sizes:
+            return {}
+        candidate.load_state_dict(self.actor.state_dict())
+        loops, seed = self._cfg.search.loops, self._cfg.seed
+        found = search(
+            mpc, lambda _, seed: self._costs(candidate, seed), sizes, loops=loops, seed=seed
+        )
+        return {f"search/{name}": x for name, x in found.items()} | self.judge(candidate)
+
     def release(self, candidate: TensorDictModuleBase) -> None:
         """Free the C of the policy that acts, as the candidate's is; without a gate it is one."""
         if self._gate is None:
@@ -63,7 +81,9 @@ class RunGate:
         return {"accepted": self._gate.accepted, "rejected": self._gate.rejected}
 
     def save(self, folder: Path) -> None:
-        """Write the policy that acts to best.pt."""
+        """Write the policy that acts to best.pt; without a gate, the checkpoint has it."""
+        if self._gate is None:
+            return
         mpc = self.mpc
         structure, state = (None, self.actor) if mpc is None else (mpc.structure, mpc)
         buffer = io.BytesIO()

@@ -98,8 +98,8 @@ def cases_table(sweep: pd.DataFrame) -> str:
 
 
 def _ends(median: pd.Series, name: str) -> str:
-    start, final, true = (median[f"{name}_{end}"] for end in ("start", "final", "true_model"))
-    return f"{start:.1f} to {final:.1f} ({true:.1f})"
+    start, best, true = (median[f"{name}_{end}"] for end in ("start", "best", "true_model"))
+    return f"{start:.1f} to {best:.1f} ({true:.1f})"
 
 
 def overall(sweep: pd.DataFrame) -> str:

@@ -93,12 +93,11 @@ class FinishedRun:
     @cached_property
     def learned(self) -> QPMPC:
         """The learned QP, which acted at the run's end."""
-        best = self.folder / BEST
-        state = load_checkpoint(best if best.exists() else self.folder / CHECKPOINT)
+        state = load_checkpoint(self.folder / (BEST if self.cfg.gate else CHECKPOINT))
         mpc = copy.deepcopy(self.start)
         if state["structure"] != mpc.structure:
             mpc.release(state["structure"])
-        mpc.load_state_dict(state["policy" if best.exists() else "mpc"])
+        mpc.load_state_dict(state["policy" if self.cfg.gate else "mpc"])
         return mpc
 
     @property
@@ -175,8 +174,9 @@ def collect(folder: str | Path) -> pd.DataFrame:
     for name in ("closed_gap", "J_true_model", "J_discounted_true_model", "canonical_distance"):
         # These are null without a gap, a true model or a QP.
         frame[name] = frame[name].astype(float) if name in frame else math.nan
-    if "J_best" not in frame:  # runs before there was a gate
-        frame["J_best"] = frame["J_final"]
+    for name in ("J", "J_discounted"):  # runs before there was a gate
+        if f"{name}_best" not in frame:
+            frame[f"{name}_best"] = frame[f"{name}_final"]
     frame["real"] = frame["J_start"] - frame["J_true_model"] >= REAL_GAP
     frame["label"] = ""
     for _, sweep in frame.groupby("sweep"):

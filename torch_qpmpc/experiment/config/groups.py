@@ -21,6 +21,7 @@ from torch_qpmpc.experiment.fields import (
     one_of,
     some_of,
 )
+from torch_qpmpc.learning.search import KNOBS
 from torch_qpmpc.mpc.validation import CONSTRAINTS, STRUCTURES
 
 Network = Annotated[str, one_of(("qp", "mlp"))]
@@ -134,6 +135,26 @@ class FromData(Group):
     hold: Annotated[Finite, Field(ge=1), Expected("a finite number >= 1")]
     causal: Flag
     ridge: Annotated[NonNegative | None, Expected("a finite number >= 0, or null")]
+
+
+Size = Annotated[Positive | None, Expected("a finite number > 0, or null")]
+
+
+class Search(Group):
+    """The initial standard deviations of a direct search; null leaves a scalar out."""
+
+    loops: Count
+    margin: Size
+    b: Size
+    w: Size
+    H_x: Size
+    H_u: Size
+    H_f: Size
+    q_f: Size
+
+
+#: No search, for configurations of versions without one.
+NO_SEARCH = Search(loops=64, **dict.fromkeys(KNOBS))
 
 
 class SingleProcess(Group):

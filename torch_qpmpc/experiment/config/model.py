@@ -10,12 +10,14 @@ from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config.groups import (
+    NO_SEARCH,
     Algorithm,
     Collector,
     Constraint,
     FromModel,
     Noise,
     Optimizer,
+    Search,
     Start,
 )
 from torch_qpmpc.experiment.fields import (
@@ -78,6 +80,7 @@ class Config(Group):
     resume: Annotated[str | None, Expected("a path, or null")]
     ablation: Annotated[str | None, Expected("a name, or null")]
     gate: Flag = False
+    search: Search = NO_SEARCH
     logger: Annotated[str, one_of(LOGGERS)] = "tensorboard"
     figures: Flag
     eval_interval: Count
