@@ -162,6 +162,7 @@ def _train(
             if not last:
                 interrupt.exit_if_signalled(f"Stopped after update {update}: {command}")
 
+        gate.save(run.path)
         loops["candidate"] = gate.closed_loop(learner.actor)
         summary = run_summary(cfg, loops, tally, gate, true_model(physics))
         if cfg.figures and gate.mpc is not None:

@@ -45,6 +45,8 @@ ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
         ("algo=td3", *ACTOR_CRITIC),
         ("algo=td3", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
         ("task=store", "optimizer=adam", "constraint=combined"),
+        ("gate=true", "optimizer=gauss_newton", "constraint=mpc", "release=5", "search.w=0.5"),
+        ("gate=true", "algo=td3", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
         ("task=store", "optimizer=gauss_newton", "constraint=si", "task.episode_steps=5"),
         ("task=store", "optimizer=recursive", "optimizer.memory=8", "task.episode_steps=6"),
         ("task=store", "algo=td3", *ACTOR_CRITIC),
@@ -92,8 +94,9 @@ def test_a_run_of_an_earlier_version_resumes(tmp_path, stopped):
     """Its configuration and its checkpoint lack the keys added since."""
     file, checkpoint = stopped / "config.yaml", stopped / "checkpoint.pt"
     cfg, state = load_config(file), load_checkpoint(checkpoint)
-    for key in ("logger", "eval_seed"):
+    for key in ("logger", "eval_seed", "gate"):
         del cfg[key], state["config"][key]
+    del state["gate"]
     OmegaConf.save(cfg, file)
     save_checkpoint(checkpoint, state)
     go_on(stopped)

@@ -39,7 +39,7 @@ class RunGate:
     def __init__(self, cfg: DictConfig, actor: Any, physics: AnyPlant) -> None:
         self._cfg, self._physics = cfg, physics
         self._gate = Gate(actor, self._costs, seed=cfg.seed) if cfg.gate else None
-        self.actor: TensorDictModuleBase = actor if self._gate is None else self._gate.actor
+        self.actor: Any = actor if self._gate is None else self._gate.actor
 
     @property
     def mpc(self) -> QPMPC | None:
@@ -65,7 +65,11 @@ class RunGate:
         found = search(
             mpc, lambda _, seed: self._costs(candidate, seed), sizes, loops=loops, seed=seed
         )
-        return {f"search/{name}": x for name, x in found.items()} | self.judge(candidate)
+        verdict = self.judge(candidate)
+        return {
+            **{f"search/{name}": x for name, x in found.items()},
+            **{name.replace("gate/", "search/"): x for name, x in verdict.items()},
+        }
 
     def release(self, candidate: TensorDictModuleBase) -> None:
         """Free the C of the policy that acts, as the candidate's is; without a gate it is one."""

@@ -30,7 +30,7 @@ from torch_qpmpc.mpc.module import QPMPC
 
 #: The parts of a snapshot.
 STATE = ("config", "update", "structure", "mpc", "loss_module", "optimizer", "schedule")
-STATE += ("gate", "replay", "collector", "tally", "rng")
+STATE += ("replay", "collector", "tally", "rng")
 #: Files that a run writes before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
 
@@ -87,7 +87,7 @@ def restore(
     with _part("schedule"):
         learner.schedule.last_epoch = int(state["schedule"]["last_epoch"])
     with _part("gate"):
-        gate.load_state_dict(state["gate"])
+        gate.load_state_dict(state.get("gate"))
     with _part("replay"):
         if state["replay"] is not None:
             replay.load_state_dict(state["replay"])

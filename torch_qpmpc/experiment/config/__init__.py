@@ -39,8 +39,9 @@ def load_config(file: Path) -> DictConfig:
     """Load a run's saved configuration, and add keys that older versions lacked."""
     cfg = OmegaConf.load(file)
     assert isinstance(cfg, DictConfig)
+    missing = {key.partition(".")[0] for key in LATER} - {str(key) for key in cfg}
     for key, value in LATER.items():
-        if key.partition(".")[0] not in cfg:
+        if key.partition(".")[0] in missing:
             OmegaConf.update(cfg, key, value)
     return cfg
 

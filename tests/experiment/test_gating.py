@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+import train
+from tests.runs import SMALL, make_config
+from torch_qpmpc import QPActorValueOperator
+from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.gating import BEST, RunGate
+from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
+from torch_qpmpc.study.runs import FinishedRun
+
+GATED = (*SMALL, "gate=true", "optimizer=gauss_newton", "batch_size=32", "steps_per_update=4")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("gated")
+    summary = train.train(
+        make_config(*GATED, "updates=8", "search.H_u=0.5", "search.loops=4"), str(folder)
+    )
+    return folder, summary
+
+
+def test_each_evaluation_and_the_search_are_judged(run):
+    folder, summary = run
+    assert summary["accepted"] + summary["rejected"] == 4 + 1
+    assert summary["accepted"] > 0
+    table = read_metrics(folder)
+    judged = table.dropna(subset=["gate/pairs"])
+    assert list(judged.index) == [2, 4, 6, 8]
+    accepted = judged["gate/accepted"] == 1
+    assert (judged["gate/high"][accepted] < 0).all()
+    assert table["search/H_u"].notna().sum() == 1
+
+
+def test_the_policy_that_acts_is_the_one_that_is_reported(run):
+    folder, summary = run
+    finished = FinishedRun(folder)
+    loop = evaluate(finished.cfg, finished.learned.policy, finished.physics)
+    assert summary["J_best"] == pytest.approx(loop.J, rel=1e-9)
+    assert summary["J_best"] < summary["J_start"]
+    assert read_metrics(folder)["eval/J"].iloc[-1] == summary["J_best"]
+    assert (folder / BEST).exists()
+
+
+def make_gate(*overrides: str) -> tuple[RunGate, Any]:
+    cfg = make_config(*SMALL, *overrides)
+    physics = make_physics(cfg)
+    operator = QPActorValueOperator(make_mpc(cfg, physics))
+    actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
+    return RunGate(cfg, actor, physics), actor
+
+
+def test_without_a_gate_the_learner_acts(tmp_path):
+    gate, actor = make_gate("gate=false")
+    assert gate.actor is actor
+    assert gate.judge(actor) == gate.summary() == {}
+    assert gate.state_dict() is None
+    gate.save(tmp_path)
+    assert not (tmp_path / BEST).exists()
+
+
+def test_a_candidate_that_got_worse_does_not_act():
+    gate, actor = make_gate("gate=true")
+    before = gate.actor.module.C.detach().clone()
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter.mul_(3.0)
+    assert gate.judge(actor)["gate/accepted"] == 0.0
+    assert_close(gate.actor.module.C.detach(), before)
+
+
+def test_a_search_starts_from_the_policy_that_acts():
+    gate, actor = make_gate("gate=true", "search.w=0.1", "search.loops=2")
+    with torch.no_grad():
+        actor.module.C.mul_(3.0)
+    found = gate.search(actor.module, actor)
+    assert "search/w" in found
+    assert_close(actor.module.C.detach(), gate.actor.module.C.detach())
