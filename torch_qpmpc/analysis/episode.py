@@ -124,8 +124,8 @@ def episode_figure(
         _draw_plan(list(panels), times, k, x, planned)
     if plans:
         panels[0].plot([], [], "k:", linewidth=1, label="planned")
-    panels[0].legend(fontsize="small", loc="upper right")
-    panels[-1].set_xlabel(xlabel)
+    panels[0].legend(fontsize="small", loc="lower right", bbox_to_anchor=(1, 1), ncols=4)
+    panels[-1].set(xlabel=xlabel, xlim=(times[0].item(), times[-1].item()))
     return figure
 
 

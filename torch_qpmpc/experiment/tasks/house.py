@@ -7,12 +7,14 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
+from torch import Tensor
 
 from torch_qpmpc.envs import House
 from torch_qpmpc.envs.closed_loop import plant_loop
-from torch_qpmpc.envs.heated_house import DAY, HeatedHouse
+from torch_qpmpc.envs.heated_house import DAY, DT, LOWER, OUTDOOR, PRICE, UPPER, HeatedHouse
 from torch_qpmpc.experiment.fields import Flag, NonNegative
 from torch_qpmpc.experiment.heating import Model, heating_options, known_model
+from torch_qpmpc.experiment.rivals.houses import HOUSE_RIVALS
 from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
 
 #: The resistance that the tutorial's planner assumes, in K/kW.
@@ -76,6 +78,18 @@ def heating_scheme(
     return Scheme(A, B, cost["stage_weight"], -free, free, c=c, options=cost | options)
 
 
+def episode(plant: HeatedHouse, d: Tensor) -> dict[str, Any]:
+    """Show the comfort band, the price and the weather over the hours of a day."""
+    return {
+        "times": DT * torch.arange(len(d)),
+        "xlabel": "hour",
+        "outputs": ["air, °C"],
+        "actions": ["heating, kW"],
+        "band": (d[:, LOWER : LOWER + 1], d[:, UPPER : UPPER + 1]),
+        "signals": {"price, EUR/kWh": d[:, PRICE], "outdoors, °C": d[:, OUTDOOR]},
+    }
+
+
 register(
     Task(
         "house",
@@ -83,6 +97,9 @@ register(
         wrong_scheme,
         true_scheme,
         closed_loop=plant_loop,
+        rivals=HOUSE_RIVALS,
+        episode=episode,
+        unit=(DAY, "days"),
         settings=HouseSettings,
         defaults=None,
     )

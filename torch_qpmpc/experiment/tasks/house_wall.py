@@ -7,11 +7,17 @@ from omegaconf import DictConfig
 
 from torch_qpmpc.envs import HouseWall
 from torch_qpmpc.envs.closed_loop import plant_loop
-from torch_qpmpc.envs.heated_house import DT, GAIN, OUTDOOR
+from torch_qpmpc.envs.heated_house import DAY, DT, GAIN, OUTDOOR
 from torch_qpmpc.envs.house_wall import C_E, C_I, G_A, R_EA, R_IE, SUN
 from torch_qpmpc.experiment.fields import Count
 from torch_qpmpc.experiment.heating import Model
-from torch_qpmpc.experiment.tasks.house import HeatingSettings, heating_scheme, learned_scheme
+from torch_qpmpc.experiment.rivals.houses import HOUSE_WALL_RIVALS
+from torch_qpmpc.experiment.tasks.house import (
+    HeatingSettings,
+    episode,
+    heating_scheme,
+    learned_scheme,
+)
 from torch_qpmpc.experiment.tasks.registry import Scheme, Task, register
 from torch_qpmpc.experiment.tracking import window_model
 
@@ -71,6 +77,9 @@ register(
         wrong_scheme,
         true_scheme,
         closed_loop=plant_loop,
+        rivals=HOUSE_WALL_RIVALS,
+        episode=episode,
+        unit=(DAY, "days"),
         settings=HouseWallSettings,
         defaults=None,
     )
