@@ -220,6 +220,7 @@ BAD: dict[str, list[Any]] = {
     "eval_seed": WHOLE[1:-2],
     "logger": ["visdom", *NAME],
     "figures": FLAG,
+    "rivals": ["DeePC", 3, None, [1], ["DeePC"], ["omniscient", "nobody"]],
     "resume": [3, True],
     "algo.name": ["sac", *NAME],
     "algo.actor": ["net", *NAME],

@@ -69,7 +69,7 @@ def learned_episode_figure(mpc: QPMPC, found: Evaluation) -> Figure:
         "actions": [f"$a_{{{i + 1}}}$" for i in range(mpc.n_u)],
     }
     options = {
-        "times": torch.arange(len(p)),
+        "times": torch.arange(len(p), dtype=torch.float64),
         **names,
         **task.episode(found.physics, p[:, : mpc.n_d]),
     }
@@ -99,17 +99,28 @@ def draw_learning(
 ) -> None:
     """Draw J over updates and experience, with the J of the others as lines."""
     axes.plot(updates, J, color=COLOURS["learned"], marker="o", markersize=3, label="learned")
-    colours = COLOURS | dict(zip(found.rivals, RIVAL_COLOURS, strict=False))
-    for name, value in found.lines().items():
-        line = ":" if name in found.rivals else "--"
-        label = f"{name}, {cost_text(value)}"
-        axes.axhline(value, color=colours.get(name), linestyle=line, label=label)
+    draw_lines(axes, found.lines())
     axes.set(xlabel="update", ylabel="J, mean over starts")
     scale_costs(axes)
-    first, each, unit = experience(found.cfg)
+    draw_experience(axes, found.cfg)
+    axes.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
+
+
+def draw_lines(axes: Axes, costs: Mapping[str, float]) -> None:
+    """Draw costs that learning does not change as horizontal lines, each with its number."""
+    others = (name for name in costs if name not in COLOURS)
+    colours = COLOURS | dict(zip(others, RIVAL_COLOURS, strict=False))
+    for name, J in costs.items():
+        line = "--" if name in COLOURS else ":"
+        label = f"{name}, {cost_text(J)}"
+        axes.axhline(J, color=colours.get(name), linestyle=line, label=label)
+
+
+def draw_experience(axes: Axes, cfg: DictConfig) -> None:
+    """Add an axis of the plant's experience above that of the updates."""
+    first, each, unit = experience(cfg)
     ticks: Any = (lambda k: first + each * k, lambda x: (x - first) / each)
     axes.secondary_xaxis("top", functions=ticks).set_xlabel(unit)
-    axes.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
 
 
 def scale_costs(axes: Axes) -> None:
