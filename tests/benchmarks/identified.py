@@ -19,7 +19,8 @@ from tests.benchmarks.table import DOCS
 from tests.runs import make_config
 from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.evaluation import rival_costs
+from torch_qpmpc.experiment.evaluation import Evaluation, rival_costs
+from torch_qpmpc.experiment.plots import learned_episode_figure
 from torch_qpmpc.experiment.rivals.tanks import deepc
 from torch_qpmpc.experiment.start import collect_log
 from torch_qpmpc.experiment.tasks import TASKS, make_mpc, make_physics, make_true_mpc
@@ -44,6 +45,7 @@ class Case(NamedTuple):
         reference: the rival that ratios are relative to.
         per: J is divided by this.
         fixed: part of J that no policy changes.
+        picture: name of the picture of the first log's free C, beside the page.
     """
 
     title: str
@@ -52,6 +54,7 @@ class Case(NamedTuple):
     reference: str
     per: float = 1.0
     fixed: float = 0.0
+    picture: str | None = None
 
 
 def days(count: int) -> tuple[str, ...]:
@@ -67,17 +70,40 @@ def episodes(count: int, length: int) -> tuple[str, ...]:
 
 
 HOUSE = ("task=house", "task.margin=0.1")
+WINDOW = "task.past=4"
 HOUSE_WALL = ("task=house_wall",)
 TANKS, REFERENCES = ("task=four_tanks",), ("task=tank_references",)
 CASES = {
     "house": [
-        Case("Room, 12 days", HOUSE, days(12), "omniscient"),
+        Case("Room, 12 days, L = 4", (*HOUSE, WINDOW), days(12), "omniscient", picture="house-day"),
+        Case("Room, 12 days, L = 1", HOUSE, days(12), "omniscient"),
         Case("House with a wall, 8 days", HOUSE_WALL, days(8), "omniscient", per=2),
-        Case("House with a wall, 20 days", HOUSE_WALL, days(20), "omniscient", per=2),
+        Case(
+            "House with a wall, 20 days",
+            HOUSE_WALL,
+            days(20),
+            "omniscient",
+            per=2,
+            picture="house-wall-days",
+        ),
     ],
     "tanks": [
-        Case("Set point", TANKS, episodes(1, 1000), "Kalman filter, N = 60", fixed=35.5),
-        Case("References", REFERENCES, episodes(10, 100), "exact MPC", per=200),
+        Case(
+            "Set point",
+            TANKS,
+            episodes(1, 1000),
+            "Kalman filter, N = 60",
+            fixed=35.5,
+            picture="tanks-set-point",
+        ),
+        Case(
+            "References",
+            REFERENCES,
+            episodes(10, 100),
+            "exact MPC",
+            per=200,
+            picture="tanks-references",
+        ),
         Case(
             "References, disturbed",
             (*REFERENCES, "task.disturbed=true"),
@@ -89,8 +115,11 @@ CASES = {
 }
 
 
-def evaluated(case: Case, seeds: Sequence[int]) -> dict[str, list[float]]:
-    """Return J by controller, the best first: of each seed's log, or once where no log is used."""
+def evaluated(case: Case, seeds: Sequence[int], folder: Path) -> dict[str, list[float]]:
+    """Return J by controller, the best first: of each seed's log, or once where no log is used.
+
+    Draws the case's picture into ``folder``.
+    """
     common = (*case.task, *case.log, "start=data", UNDISCOUNTED, f"eval_seed={EVAL_SEED}")
     cfg = make_config(*common)
     physics: Any = make_physics(cfg)
@@ -105,8 +134,13 @@ def evaluated(case: Case, seeds: Sequence[int]) -> dict[str, list[float]]:
             cfg = make_config(*common, constraint, f"seed={seed}")
             log = collect_log(cfg, physics)
             mpc = make_mpc(cfg, physics, identified_start(cfg, physics, log))
-            J = evaluate(cfg, warm_policy(mpc), physics).J
-            found.setdefault(f"from_data, {name} C", []).append(J)
+            loop = evaluate(cfg, warm_policy(mpc), physics)
+            found.setdefault(f"from_data, {name} C", []).append(loop.J)
+            if case.picture and name == "free" and seed == seeds[0]:
+                episode = learned_episode_figure(
+                    mpc, Evaluation(cfg, physics, {"learned": loop}, {})
+                )
+                episode.savefig(folder / f"{case.picture}.png", dpi=80)
             if "DeePC" in rivals and name == "free":
                 J = evaluate(cfg, deepc(physics, log), physics).J
                 found.setdefault("DeePC", []).append(J)
@@ -142,7 +176,7 @@ def main(arguments: list[str] | None = None) -> None:
     for name, page in pages.items():
         blocks = []
         for case in CASES[name]:
-            blocks.append(case_table(case, evaluated(case, options.seeds)))
+            blocks.append(case_table(case, evaluated(case, options.seeds, options.folder)))
             print(blocks[-1], flush=True)
         text = page.read_text(encoding="utf-8")
         page.write_text(replaced(text, "\n\n".join(blocks), "identified"), encoding="utf-8")

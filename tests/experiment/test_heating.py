@@ -10,7 +10,7 @@ from tests.runs import make_config
 from torch_qpmpc.envs import House, HouseWall
 from torch_qpmpc.envs.heated_house import DT
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.evaluation import rival_costs
+from torch_qpmpc.experiment.evaluation import Evaluation, rival_costs
 from torch_qpmpc.experiment.heating import REGULARISATION, known_model
 from torch_qpmpc.experiment.rivals.heating import make_mpc
 from torch_qpmpc.experiment.tasks import make_mpc as make_task_mpc
@@ -106,3 +106,16 @@ def test_the_rivals_of_the_room_are_in_order():
     J = evaluate(cfg, true.policy, house).J
     assert costs["omniscient"] < J < costs["tuned planner"]
     assert list(costs.values()) == sorted(costs.values())
+
+
+def test_a_window_changes_neither_the_schemes_of_the_room_nor_its_rivals():
+    J = []
+    for past in (1, 3):
+        more = ("task.horizon=8", "task.eval_steps=48", f"task.past={past}")
+        cfg = make_config("task=house", *more)
+        house = make_physics(cfg)
+        found = Evaluation.before(cfg, house, make_task_mpc(cfg, house))
+        assert found.loops["start"].known.shape[-1] == 9 * 4 + 2 * past - 1
+        J.append([loop.J for loop in found.loops.values()] + list(found.rivals.values()))
+    assert len(J[0]) == 8
+    assert J[0] == pytest.approx(J[1])

@@ -25,9 +25,9 @@ HOUSE_RIVALS = {
         lambda house: Thermostat(house, offset=0.75, gain=10.0, ahead=TIMER)
     ),
     "planner (R = 2)": Rival(
-        lambda house: make_mpc(house, known_model(replace(house, R=2.0))).policy
+        lambda house: make_mpc(house, known_model(replace(house, R=2.0))).policy, sees={"past": 1}
     ),
-    "tuned planner": Rival(lambda house: planner(house, TUNED).policy),
+    "tuned planner": Rival(lambda house: planner(house, TUNED).policy, sees={"past": 1}),
     "omniscient": Rival(Omniscient),
 }
 

@@ -9,7 +9,6 @@ from torch_qpmpc.envs import HouseWall
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.heated_house import DAY, DT, GAIN, OUTDOOR
 from torch_qpmpc.envs.house_wall import C_E, C_I, G_A, R_EA, R_IE, SUN
-from torch_qpmpc.experiment.fields import Count
 from torch_qpmpc.experiment.heating import Model
 from torch_qpmpc.experiment.rivals.houses import HOUSE_WALL_RIVALS
 from torch_qpmpc.experiment.tasks.house import (
@@ -23,13 +22,6 @@ from torch_qpmpc.experiment.tracking import window_model
 
 #: Typical cost of a day in EUR, for the initial c.
 COST = 5.0
-
-
-class HouseWallSettings(HeatingSettings):
-    """The keys of `HouseWall`."""
-
-    #: Number of outputs in the window.
-    past: Count
 
 
 def make_plant(cfg: DictConfig) -> HouseWall:
@@ -80,7 +72,7 @@ register(
         rivals=HOUSE_WALL_RIVALS,
         episode=episode,
         unit=(DAY, "days"),
-        settings=HouseWallSettings,
+        settings=HeatingSettings,
         defaults=None,
     )
 )
