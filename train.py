@@ -11,7 +11,7 @@
     tensorboard --logdir runs                           watch the runs
 
 configs/ holds every key. The run's folder gets config.yaml, metrics.csv, TensorBoard events,
-checkpoint.pt, summary.png and summary.json.
+checkpoint.pt, summary.png, episode.png and summary.json.
 """
 
 from __future__ import annotations
@@ -29,23 +29,20 @@ from omegaconf import DictConfig
 from torchrl import torchrl_logger
 from tqdm import tqdm
 
-from torch_qpmpc import QPActorValueOperator
-from torch_qpmpc.experiment.algorithms import evaluate, make_learner
+from torch_qpmpc.experiment.algorithms import make_learner, make_operator
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, drop_previous, save_checkpoint
 from torch_qpmpc.experiment.collection import batches, make_collector, make_run_replay
 from torch_qpmpc.experiment.config import check_config
+from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.interrupt import Interrupt
 from torch_qpmpc.experiment.launch import launched
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
-from torch_qpmpc.experiment.plots import summary_figure
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tally import Tally
-from torch_qpmpc.experiment.tasks import make_mpc, make_physics, make_true_mpc, true_model
-from torch_qpmpc.learning.operators import preview_key, warm_policy
-from torch_qpmpc.learning.replay import ACTIVE_SET
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 
 # Absolute, so that a user's script can call main.
 CONFIGS = str(Path(__file__).with_name("configs"))
@@ -74,25 +71,19 @@ def _train(
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
 
-    # The QP, and its J before learning and with the true model.
+    # The QP, and J of all that it is compared with.
     physics = make_physics(cfg)
-    identified = make_start(cfg, physics, folder, written=state is not None)
-    if identified is not None and not quiet:
-        print(identified.identified)
+    identified = make_start(cfg, physics, folder, written=state is not None, quiet=quiet)
     mpc = make_mpc(cfg, physics, identified)
-    start = evaluate(cfg, warm_policy(mpc), physics)
-    loops = {"start": start, "learned": start}
-    if (true_mpc := make_true_mpc(cfg, physics)) is not None:
-        loops["true model"] = evaluate(cfg, warm_policy(true_mpc), physics)
+    found = Evaluation.before(cfg, physics, mpc)
 
     # The learner: Q-learning of first or second order, or actor-critic.
-    active_set = ACTIVE_SET if cfg.warm_start else None
-    operator = QPActorValueOperator(mpc, preview_key=preview_key(mpc), active_set_key=active_set)
+    operator = make_operator(cfg, mpc)
     released = state is not None and state["structure"] != mpc.structure
     if released:
         mpc.release()
     learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
-    gate = RunGate(cfg, learner.actor, physics)
+    gate = RunGate(cfg, learner, physics)
 
     # The data: vectorised episodes under the current policy, and their replay.
     collector = make_collector(cfg, physics, gate.actor)
@@ -108,7 +99,7 @@ def _train(
         # Warm up, or resume.
         if state is None:
             tally = Tally()
-            report(run, gate.mpc, loops, 0)
+            report(run, gate.mpc, found, 0)
             for batch in itertools.islice(stream, -(-cfg.warmup_steps // cfg.steps_per_update)):
                 if cfg.replay:
                     replay.extend(batch)
@@ -117,7 +108,7 @@ def _train(
             tally = restore(state, mpc, learner, gate, collector, replay)
             if state["collector"] is None and tally.update < cfg.updates and not quiet:
                 print("Starting new episodes: the state of the environments is not saved.")
-            loops["learned"] = gate.closed_loop()
+            found.evaluate(gate.policy)
         interrupt.exit_if_signalled(f"Stopped after update {tally.update}: {command}")
 
         label = f"{cfg.constraint.name}, {cfg.noise.name}"
@@ -144,15 +135,13 @@ def _train(
             if update == cfg.release:
                 mpc.release()
                 learner = make_learner(cfg, operator, physics, done=update)
-                gate.release(learner.actor)
+                gate.release(learner)
             last = update == cfg.updates
             evaluated = last or update % cfg.eval_interval == 0
             if evaluated:
-                run.log(gate.judge(learner.actor), update)
-                if last:
-                    run.log(gate.search(mpc, learner.actor), update)
-                loops["learned"] = gate.closed_loop()
-                gap = report(run, gate.mpc, loops, update)
+                run.log(gate.judge(search=last), update)
+                found.evaluate(gate.policy)
+                gap = report(run, gate.mpc, found, update)
                 progress.set_postfix(J=gap["J_best"], closed_gap=gap["closed_gap"])
             if evaluated or interrupt.signum is not None:
                 run.flush()
@@ -163,11 +152,8 @@ def _train(
                 interrupt.exit_if_signalled(f"Stopped after update {update}: {command}")
 
         gate.save(run.path)
-        loops["candidate"] = gate.closed_loop(learner.actor)
-        summary = run_summary(cfg, loops, tally, gate, true_model(physics))
-        if cfg.figures and gate.mpc is not None:
-            figure = summary_figure(gate.mpc, loops, *run.column("eval/J"))
-            figure.savefig(run.path / "summary.png", dpi=110)
+        found.evaluate(learner.policy, "candidate")
+        summary = run_summary(found, tally, gate)
         run.finish(summary)
         drop_previous(run.path / CHECKPOINT)
     if not quiet:

@@ -99,7 +99,7 @@ def assert_events_are_whole(folder: Path) -> None:
         assert [event.value for event in shown] == pytest.approx(list(logged), rel=1e-6), column
     evaluations = [step for step in table["eval/J"].dropna().index if step]
     for image in found.Tags()["images"]:
-        at_the_end = image in ("eval/predictions", "eval/policy")
+        at_the_end = image in ("eval/episode", "eval/policy")
         steps = [event.step for event in found.Images(image)]
         assert steps == (evaluations[-1:] if at_the_end else evaluations), image
     texts = [event.tensor_proto.string_val[0] for event in found.Tensors("config/text_summary")]

@@ -81,3 +81,10 @@ def test_what_does_not_fit_is_named(options, message):
     arguments: dict[str, Any] = {"times": TIMES, "y": Y, "u": U}
     with pytest.raises(QPError, match=message):
         episode_figure(**(arguments | options))
+
+
+def test_rounding_errors_do_not_fill_a_panel():
+    y, u = torch.linspace(0, 1, 5).unsqueeze(-1), 1e-13 * torch.randn(4, 1)
+    _, panel = episode_figure(torch.arange(5.0), y, u).axes
+    low, high = panel.get_ylim()
+    assert 1 < high - low < 1.1

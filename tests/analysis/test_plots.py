@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.experiment.test_plots import image_of, legend_of, make_loops, make_mpc, rendered
+from tests.experiment.test_plots import image_of, legend_of, make_mpc, rendered
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.analysis.plots import (
     canonical_figure,
@@ -23,7 +23,6 @@ from torch_qpmpc.analysis.structure import (
     nearest_model,
     stage_models,
 )
-from torch_qpmpc.experiment.plots import predictions_figure
 
 
 @pytest.fixture(scope="module")
@@ -71,23 +70,6 @@ def test_a_C_without_canonical_form_shows_the_reason():
     for draw in (canonical_figure, energies_figure):
         with pytest.raises(QPError, match="of rank 0 of 16"):
             draw(mpc)
-
-
-def test_predictions_figure_shows_the_loop_and_the_predictions(mpc):
-    loop = make_loops(mpc)["learned"]
-    figure = predictions_figure(mpc, loop, every=2, start=3)
-    assert len(figure.axes) == 6
-    with torch.no_grad():
-        x, u = mpc.predicted(mpc.solve(loop.states[[0, 2, 4], 3]).z)
-    paths = [*x.unbind(-1), *u.unbind(-1)]
-    real = [*loop.states[:, 3].unbind(-1), *loop.actions[:, 3].unbind(-1)]
-    for axes, path, realised in zip(figure.axes, paths, real, strict=True):
-        assert np.array_equal(axes.lines[0].get_ydata(), realised)
-        for line, k, expected in zip(axes.lines[1:], (0, 2, 4), path, strict=True):
-            assert np.array_equal(line.get_xdata(), range(k, k + len(expected)))
-            assert np.allclose(line.get_ydata(), expected, atol=1e-6)
-    assert legend_of(figure.axes[0]) == ["realised", "predicted"]
-    rendered(figure)
 
 
 def test_policy_figure_shows_the_map(mpc):

@@ -227,6 +227,7 @@ BAD: dict[str, list[Any]] = {
     "gate": FLAG,
     "search.loops": WHOLE,
     **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
+    "rivals": ["DeePC", 3, None, [1], ["DeePC"], ["omniscient", "nobody"]],
     "resume": [3, True],
     "algo.name": ["sac", *NAME],
     "algo.actor": ["net", *NAME],

@@ -9,12 +9,10 @@ from torch.testing import assert_close
 
 import train
 from tests.runs import SMALL, make_config
-from torch_qpmpc import QPActorValueOperator
-from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.algorithms import evaluate, make_learner, make_operator
 from torch_qpmpc.experiment.gating import BEST, RunGate
 from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
 from torch_qpmpc.study.runs import FinishedRun
 
 GATED = (*SMALL, "gate=true", "optimizer=gauss_newton", "batch_size=32", "steps_per_update=4")
@@ -54,15 +52,14 @@ def test_the_policy_that_acts_is_the_one_that_is_reported(run):
 def make_gate(*overrides: str) -> tuple[RunGate, Any]:
     cfg = make_config(*SMALL, *overrides)
     physics = make_physics(cfg)
-    operator = QPActorValueOperator(make_mpc(cfg, physics))
-    actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
-    return RunGate(cfg, actor, physics), actor
+    learner = make_learner(cfg, make_operator(cfg, make_mpc(cfg, physics)), physics)
+    return RunGate(cfg, learner, physics), learner.actor
 
 
 def test_without_a_gate_the_learner_acts(tmp_path):
     gate, actor = make_gate("gate=false")
     assert gate.actor is actor
-    assert gate.judge(actor) == gate.summary() == {}
+    assert gate.judge() == gate.summary() == {}
     assert gate.state_dict() is None
     gate.save(tmp_path)
     assert not (tmp_path / BEST).exists()
@@ -74,7 +71,7 @@ def test_a_candidate_that_got_worse_does_not_act():
     with torch.no_grad():
         for parameter in actor.parameters():
             parameter.mul_(3.0)
-    assert gate.judge(actor)["gate/accepted"] == 0.0
+    assert gate.judge()["gate/accepted"] == 0.0
     assert_close(gate.actor.module.C.detach(), before)
 
 
@@ -82,6 +79,6 @@ def test_a_search_starts_from_the_policy_that_acts():
     gate, actor = make_gate("gate=true", "search.w=0.1", "search.loops=2")
     with torch.no_grad():
         actor.module.C.mul_(3.0)
-    found = gate.search(actor.module, actor)
-    assert "search/w" in found
+    found = gate.judge(search=True)
+    assert {"search/w", "search/accepted"} <= set(found)
     assert_close(actor.module.C.detach(), gate.actor.module.C.detach())

@@ -10,9 +10,9 @@ from tests.runs import make_config
 from torch_qpmpc.envs import House, HouseWall
 from torch_qpmpc.envs.heated_house import DT
 from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.evaluation import Evaluation, rival_costs
 from torch_qpmpc.experiment.heating import REGULARISATION, known_model
 from torch_qpmpc.experiment.rivals.heating import make_mpc
-from torch_qpmpc.experiment.rivals.houses import costs_of_a_day, house_rivals
 from torch_qpmpc.experiment.tasks import make_mpc as make_task_mpc
 from torch_qpmpc.experiment.tasks import make_physics, make_true_mpc
 from torch_qpmpc.experiment.tasks.house_wall import best_lags
@@ -97,7 +97,25 @@ def test_lags_predict_as_the_house_with_a_wall_goes_on():
 
 def test_the_rivals_of_the_room_are_in_order():
     """leap-c's tuning improves its planner, and knowledge is worth more."""
-    names = ("omniscient", "true model", "tuned planner", "planner (R = 2)", "thermostat")
-    rivals = house_rivals(House())
-    costs = [costs_of_a_day(*rivals[n], days=1, starts=8, seed=5).mean().item() for n in names]
-    assert costs == sorted(costs)
+    names = ["omniscient", "tuned planner", "planner (R = 2)", "thermostat"]
+    cfg = make_config("task=house", f"rivals=[{','.join(map(repr, names))}]", "eval_seed=5")
+    house = make_physics(cfg)
+    costs = rival_costs(cfg, house)
+    true = make_true_mpc(cfg, house)
+    assert true is not None
+    J = evaluate(cfg, true.policy, house).J
+    assert costs["omniscient"] < J < costs["tuned planner"]
+    assert list(costs.values()) == sorted(costs.values())
+
+
+def test_a_window_changes_neither_the_schemes_of_the_room_nor_its_rivals():
+    J = []
+    for past in (1, 3):
+        more = ("task.horizon=8", "task.eval_steps=48", f"task.past={past}")
+        cfg = make_config("task=house", *more)
+        house = make_physics(cfg)
+        found = Evaluation.before(cfg, house, make_task_mpc(cfg, house))
+        assert found.loops["start"].known.shape[-1] == 9 * 4 + 2 * past - 1
+        J.append([loop.J for loop in found.loops.values()] + list(found.rivals.values()))
+    assert len(J[0]) == 8
+    assert J[0] == pytest.approx(J[1])

@@ -8,68 +8,63 @@ import pandas as pd
 import pytest
 import torch
 
-from tests.runs import SMALL, linear_system, make_config, true_mpc
+from tests.runs import SMALL, linear_system, make_config
 from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.envs.closed_loop import ClosedLoop
-from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.metrics import (
-    gap_summary,
-    report,
-    structure_summary,
-    table,
-    theta_metrics,
-)
+from torch_qpmpc.experiment.evaluation import Evaluation
+from torch_qpmpc.experiment.metrics import report, structure_summary, table, theta_metrics
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics, true_model
 from torch_qpmpc.mpc.banded import banded_matrix
 
 
-def loops_with(start: float, learned: float, true: float) -> dict[str, ClosedLoop]:
-    """Make loops of two steps from two starts with total cost J, discounted by 0.9."""
+def evaluation(start: float, learned: float, true: float, **rivals: float) -> Evaluation:
+    """Make an evaluation of two steps from two starts with total cost J, discounted by 0.9."""
 
     def loop(J: float) -> ClosedLoop:
         costs = torch.full((2, 2), J / 2, dtype=torch.float64)
         return ClosedLoop(torch.zeros(3, 2, 4), torch.zeros(2, 2, 2), costs, 0.9)
 
-    return {"start": loop(start), "learned": loop(learned), "true model": loop(true)}
-
-
-def test_gap_summary():
-    summary = gap_summary(loops_with(100, 60, 50))
-    expected = {"J_start": 100, "J_best": 60, "J_final": 60, "J_true_model": 50, "closed_gap": 0.8}
-    expected |= {"J_discounted_start": 95}
-    expected |= {"J_discounted_best": 57, "J_discounted_final": 57}
-    expected |= {"J_discounted_true_model": 47.5, "closed_gap_discounted": 0.8}
-    assert summary == pytest.approx(expected)
+    cfg, loops = make_config(), {"start": start, "learned": learned, "true model": true}
+    return Evaluation(cfg, make_physics(cfg), {name: loop(J) for name, J in loops.items()}, rivals)
 
 
 def test_table():
-    lines = table(gap_summary(loops_with(100, 60, 50))).splitlines()
+    lines = table(evaluation(100, 60, 50).summary()).splitlines()
     assert lines[0].split() == ["start", "learned", "true", "model", "closed", "gap"]
-    assert lines[1].split() == ["J", "100.0", "60.0", "50.0", "0.800"]
-    assert lines[2].split() == ["J", "discounted", "95.0", "57.0", "47.5", "0.800"]
+    assert lines[1].split() == ["J", "100.0", "60.00", "50.00", "0.800"]
+    assert lines[2].split() == ["J", "discounted", "95.00", "57.00", "47.50", "0.800"]
+    assert len(lines) == 3
+
+
+def test_table_has_the_rivals_and_all_digits_of_large_costs():
+    found = evaluation(40827.4, 21.234, 1.0, omniscient=20.5, thermostat=1234.5)
+    lines = table(found.summary()).splitlines()
+    assert lines[1].split()[:4] == ["J", "40827", "21.23", "1.000"]
+    assert lines[4] == "J of the rivals"
+    assert [line.split() for line in lines[5:]] == [["omniscient", "20.50"], ["thermostat", "1234"]]
 
 
 @pytest.mark.parametrize(
     ("ends", "J", "discounted"),
     [
-        ((50, 60, 50), "no gap; J rose by 10.0", "no gap; J discounted rose by 9.5"),
-        ((48, 40, 50), "no gap; J fell by 8.0", "no gap; J discounted fell by 7.6"),
+        ((50, 60, 50), "no gap; J rose by 10.00", "no gap; J discounted rose by 9.500"),
+        ((48, 40, 50), "no gap; J fell by 8.000", "no gap; J discounted fell by 7.600"),
         ((50, 50, 50), "no gap; J did not change", "no gap; J discounted did not change"),
         (
             (50, 60, math.nan),
-            "no true model; J rose by 10.0",
-            "no true model; J discounted rose by 9.5",
+            "no true model; J rose by 10.00",
+            "no true model; J discounted rose by 9.500",
         ),
         (
             (50, math.inf, 50),
-            "no gap; J went from 50.0 to inf",
-            "no gap; J discounted went from 47.5 to inf",
+            "no gap; J went from 50.00 to inf",
+            "no gap; J discounted went from 47.50 to inf",
         ),
     ],
 )
 def test_table_shows_the_change_of_J_without_a_gap(ends, J, discounted):
-    lines = table(gap_summary(loops_with(*ends))).splitlines()
+    lines = table(evaluation(*ends).summary()).splitlines()
     assert lines[1].endswith(f"  {J}")
     assert lines[2].endswith(f"  {discounted}")
 
@@ -121,15 +116,16 @@ def test_report_logs_the_evaluation(tmp_path):
     mpc = make_mpc(cfg, physics)
     with torch.no_grad():
         mpc.C[0, -1] += 0.5
-    loop = evaluate(cfg, mpc.policy, physics)
-    truth = evaluate(cfg, true_mpc(cfg, physics).policy, physics)
-    loops = {"start": loop, "true model": truth, "learned": loop}
+    found = Evaluation.before(cfg, physics, mpc)
+    found.rivals["Kalman filter, N = 60"] = 5.0
     with RunFolder(tmp_path, cfg) as run:
-        summary = report(run, mpc, loops, 20)
-    assert summary == gap_summary(loops)
+        summary = report(run, mpc, found, 20)
+    assert summary == found.summary()
+    loop, truth = found.loops["learned"], found.loops["true model"]
     (row,) = pd.read_csv(tmp_path / "metrics.csv").to_dict("records")
     expected = {"update": 20, "eval/J": loop.J, "eval/J_true_model": truth.J}
     expected |= {"eval/J_discounted": loop.J_discounted, "eval/closed_gap": summary["closed_gap"]}
+    expected |= {"eval/J_Kalman_filter_N_60": 5.0}
     expected |= {"structure/on": 0, "structure/above": 0.5, "structure/below": 0}
     expected |= {f"structure/{name}": value for name, value in structure_metrics(mpc).items()}
     assert row["structure/causality_defect"] > 0.01

@@ -12,13 +12,23 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from tests.runs import make_config
 from torch_qpmpc import QPMPC
 from torch_qpmpc.analysis.plots import constraint_figure
 from torch_qpmpc.analysis.prediction_form import canonical_matrix, prediction_form
 from torch_qpmpc.analysis.structure import stage_models
 from torch_qpmpc.envs import PointMass
-from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_loop
-from torch_qpmpc.experiment.plots import closed_loop_figure, summary_figure
+from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_loop, cost_text
+from torch_qpmpc.experiment.evaluation import Evaluation
+from torch_qpmpc.experiment.plots import (
+    closed_loop_figure,
+    experience,
+    learned_episode_figure,
+    scale_costs,
+    summary_figure,
+)
+from torch_qpmpc.experiment.tasks import make_mpc as make_task_mpc
+from torch_qpmpc.experiment.tasks import make_physics
 
 
 def make_mpc(horizon: int = 4) -> QPMPC:
@@ -119,7 +129,7 @@ def test_closed_loop_figure_shows_paths_costs_and_J(mpc, loops):
     figure = closed_loop_figure(loops, mpc)
     left, right = figure.axes
     assert legend_of(left) == [
-        *(f"{name}, J = {loop.J:.0f}" for name, loop in loops.items()),
+        *(f"{name}, J = {cost_text(loop.J)}" for name, loop in loops.items()),
         "predicted at the start",
     ]
     lines = [np.asarray(line.get_xydata()) for line in left.lines]
@@ -139,20 +149,85 @@ def test_closed_loop_figure_shows_paths_costs_and_J(mpc, loops):
     rendered(figure)
 
 
-def test_summary_figure(mpc, loops):
+@pytest.fixture(scope="module")
+def found(loops) -> Evaluation:
+    cfg = make_config("warmup_steps=3", "num_envs=4")
+    return Evaluation(cfg, PointMass(), loops, {"omniscient": 41.0, "thermostat": 70.0})
+
+
+def test_summary_figure(mpc, found):
     updates, J = [0, 10, 20], [300.0, 120.0, 60.0]
-    figure = summary_figure(mpc, loops, updates, J)
-    learning, matrix, paths = (a for a in figure.axes if a.get_title())
-    assert legend_of(learning) == ["learned", "start", "true model"]
+    figure = summary_figure(mpc, found, updates, J)
+    learning, matrix, paths = (a for a in figure.axes if a.get_ylabel() or a.images)
+    ends = found.lines()
+    assert list(ends) == ["start", "true model", "omniscient", "thermostat"]
+    shown = [f"{name}, {cost_text(J)}" for name, J in ends.items()]
+    assert legend_of(learning) == ["learned", *shown]
     curve = np.asarray(learning.lines[0].get_xydata())
     assert curve.tolist() == [list(point) for point in zip(updates, J, strict=True)]
-    for line, name in zip(learning.lines[1:], ("start", "true model"), strict=True):
-        assert np.all(np.asarray(line.get_ydata()) == loops[name].J)
+    for line, J_end in zip(learning.lines[1:], ends.values(), strict=True):
+        assert np.all(np.asarray(line.get_ydata()) == J_end)
+    assert len({line.get_color() for line in learning.lines}) == 5
     assert np.array_equal(image_of(matrix), mpc.C.detach())
     assert len(legend_of(paths)) == 4
     rendered(figure)
 
 
-def test_summary_figure_of_a_run_without_finite_costs(mpc, loops):
+def test_summary_figure_of_a_run_without_finite_costs(mpc, found):
     """A run that diverged still has a figure."""
-    rendered(summary_figure(mpc, loops, [0, 10], [300.0, math.nan]))
+    rendered(summary_figure(mpc, found, [0, 10], [300.0, math.nan]))
+
+
+def test_experience_counts_the_log_and_the_warm_up():
+    house = ("task=house", "num_envs=4", "warmup_steps=96", "steps_per_update=24")
+    assert experience(make_config(*house)) == (4, 1, "days of experience")
+    log = ("start=data", "start.transitions=192")
+    assert experience(make_config(*house, *log)) == (6, 1, "days of experience")
+    read = experience(make_config(*house, "start=data", "start.file=log.pt"))
+    assert read == (4, 1, "days of experience")
+    assert experience(make_config()) == (192, 64, "transitions of experience")
+
+
+@pytest.mark.parametrize(("costs", "scale"), [([20.9, 24.0], "linear"), ([20.0, 60.0], "log")])
+def test_costs_that_hardly_differ_have_a_linear_scale(costs, scale):
+    axes = Figure().subplots()
+    axes.plot(costs)
+    scale_costs(axes)
+    assert axes.get_yscale() == scale
+
+
+def test_the_episode_has_the_loop_and_the_plans_of_every_half_horizon(mpc, found):
+    figure = learned_episode_figure(mpc, found)
+    loop = found.loops["learned"]
+    assert [axes.get_ylabel() for axes in figure.axes] == [
+        *(f"$s_{{{i}}}$" for i in range(1, 5)),
+        *("$a_{1}$", "$a_{2}$"),
+    ]
+    with torch.no_grad():
+        x, _ = mpc.predicted(mpc.solve(loop.known[:-1:2, 0]).z)
+    for axes, real, planned in zip(figure.axes, loop.states[:, 0].mT, x.unbind(-1), strict=False):
+        assert np.array_equal(axes.lines[0].get_ydata(), real)
+        for line, k, path in zip(axes.lines[1:], (0, 2, 4), planned, strict=False):
+            assert np.array_equal(line.get_xdata(), range(k, k + len(path)))
+            assert np.allclose(line.get_ydata(), path, atol=1e-6)
+    rendered(figure)
+
+
+@pytest.mark.parametrize(
+    ("task", "labels"),
+    [
+        ("house", ["air, °C", "heating, kW", "price, EUR/kWh", "outdoors, °C"]),
+        ("house_wall", ["air, °C", "heating, kW", "price, EUR/kWh", "outdoors, °C"]),
+        ("four_tanks", ["level 1", "level 2", "pump 1", "pump 2"]),
+        ("tank_references", [*(f"level {i}" for i in range(1, 5)), "pump 1", "pump 2"]),
+    ],
+)
+def test_a_task_shows_its_episode_in_its_own_terms(task, labels):
+    more = ("start=model", "rivals=false", "task.horizon=4", "task.eval_steps=6")
+    cfg = make_config(f"task={task}", *more)
+    physics = make_physics(cfg)
+    mpc = make_task_mpc(cfg, physics)
+    figure = learned_episode_figure(mpc, Evaluation.before(cfg, physics, mpc))
+    assert [axes.get_ylabel() for axes in figure.axes] == labels
+    assert {"realised", "planned"} <= {*legend_of(figure.axes[0])}
+    rendered(figure)

@@ -212,6 +212,7 @@ def test_train_learns_a_plants_qp(store_task, tmp_path, algo):
     assert summary["J_final"] != summary["J_start"]
     assert summary["J_start"] == summary["J_true_model"]
     assert (tmp_path / "summary.png").exists()
+    assert (tmp_path / "episode.png").exists()
 
 
 @pytest.mark.slow

@@ -45,7 +45,7 @@ SUMMARY = {"seed", "constraint", "noise", "solver", "unsolved", "updates", "trai
 SUMMARY |= {"ablation", "step", "penalty_step"}
 for _tag in ("J", "J_discounted"):
     SUMMARY |= {f"{_tag}_start", f"{_tag}_final", f"{_tag}_true_model"}
-SUMMARY |= {"closed_gap", "closed_gap_discounted"}
+SUMMARY |= {"closed_gap", "closed_gap_discounted", "rivals"}
 SUMMARY |= {"train_cost", "train_cost_last_tenth", "train_violation"}
 
 
@@ -108,7 +108,7 @@ def test_summary_is_complete(whole):
     assert summary == returned
     assert set(summary) >= SUMMARY
     assert summary["ablation"] is None
-    assert all(math.isfinite(v) for v in summary.values() if not isinstance(v, str | None))
+    assert all(math.isfinite(v) for v in summary.values() if isinstance(v, int | float))
     names = {"step": "cholesky", "penalty_step": "proximal"}
     names |= {"seed": 5, "constraint": "combined", "noise": "gaussian", "solver": "daqp"}
     assert {**summary, **names, "updates": 150} == summary
@@ -119,7 +119,8 @@ def test_summary_is_complete(whole):
 
 def test_folder_is_complete(whole):
     folder, summary = whole
-    files = {"config.yaml", "metrics.csv", "checkpoint.pt", "summary.png", "summary.json"}
+    files = {"config.yaml", "metrics.csv", "checkpoint.pt"}
+    files |= {"summary.png", "episode.png", "summary.json"}
     assert files <= {path.name for path in folder.iterdir()}
     assert not list(folder.rglob("*.partial"))
     assert OmegaConf.load(folder / "config.yaml") == make_config(*WHOLE)
@@ -176,7 +177,7 @@ def test_events_are_complete(whole):
     assert drawn == {
         "structure/C": [75, 150],
         "eval/closed_loop": [75, 150],
-        "eval/predictions": [150],
+        "eval/episode": [150],
         "eval/policy": [150],
     }
     text = events.Tensors("config/text_summary")[0].tensor_proto.string_val[0].decode()

@@ -6,6 +6,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from tests.study.test_report import made_up
+from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.study.plots import (
     ablation_figure,
     colours,
@@ -41,11 +42,14 @@ def test_curves_are_those_of_metrics_csv(gaussian):
 
 
 def test_J_is_drawn_as_interquartile_mean_between_its_ends(gaussian, axes):
-    draw_J(axes, gaussian)
-    lines = {line.get_label(): line for line in axes.lines}
+    rivals = [{"omniscient": 40.0, "thermostat": 60.0}] * len(gaussian)
+    draw_J(axes, gaussian.assign(rivals=rivals))
+    lines = {str(line.get_label()).partition(", ")[0]: line for line in axes.lines}
     _, J = curves(gaussian[gaussian["label"] == "free"], "eval/J")
     np.testing.assert_allclose(lines["free"].get_ydata(), interquartile_mean(J))
-    assert {"fixed", "free", "start", "true model"} <= set(lines)
+    assert set(lines) == {"fixed", "free", "start", "true model", "omniscient", "thermostat"}
+    assert set(lines["omniscient"].get_ydata()) == {40.0}
+    assert axes.child_axes[0].get_xlabel() == "transitions of experience"
     assert len(axes.collections) == 2, "an interval for each case"
 
 
@@ -88,7 +92,7 @@ def test_paths_are_shown_for_each_case_with_both_ends(gaussian):
     labels = [text.get_text() for text in legend.get_texts()]
     row = gaussian[(gaussian["label"] == "free") & gaussian["real"]].iloc[0]
     for name, J in (("start", "J_start"), ("learned", "J_best"), ("true model", "J_true_model")):
-        assert f"{name}, J = {row[J]:.0f}" in labels
+        assert f"{name}, J = {cost_text(row[J])}" in labels
 
 
 def test_meaning_shows_each_run_and_use_those_with_a_real_gap(gaussian, axes):

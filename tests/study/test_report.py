@@ -33,7 +33,7 @@ def made_up(gaps: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
 def test_a_case_is_a_row_with_median_interval_and_both_ends():
     frame = made_up({("gaussian", "free"): [0.9, 0.9, 0.9, 0.1], ("brownian", "si"): [0.5]})
     *_, free, si = report.cases_table(frame).splitlines()
-    ends = "285.0 to 50.0 (47.0) | 285.0 to 50.0 (47.0)"
+    ends = "285.0 to 50.00 (46.97) | 285.0 to 50.00 (46.97)"
     errors = "0.250 | 1.00 | 0.050 to 0.050 (2 of 4)"
     assert free == f"| gaussian | free | 0.900 [0.900, 0.900] (3 of 4) | {ends} | {errors} |"
     assert si == f"| brownian | si | - (0 of 1) | {ends} | 0.100 | 1.00 | 0.050 to 0.020 (1 of 1) |"
@@ -42,14 +42,14 @@ def test_a_case_is_a_row_with_median_interval_and_both_ends():
 def test_every_run_is_in_the_long_table():
     frame = made_up({("gaussian", "free"): [0.91, 0.92]})
     assert report.runs_table(frame).splitlines()[-1] == (
-        "| a | gaussian | free | 2 | 285.0 | 50.0 | 47.0 | 0.920 | 0.200 | 0.0400 | 0.0500 | 0 "
+        "| a | gaussian | free | 2 | 285.0 | 50.00 | 46.97 | 0.920 | 0.200 | 0.0400 | 0.0500 | 0 "
         "| 3.2 |"
     )
 
 
 def test_a_run_without_a_gap_shows_the_change_of_J():
     frame = made_up({("gaussian", "free"): [math.nan]}).assign(J_start=46.97, J_best=50.0)
-    assert "| 47.0 | 50.0 | 47.0 | no gap; J rose by 3.0 |" in report.runs_table(frame)
+    assert "| 46.97 | 50.00 | 46.97 | no gap; J rose by 3.030 |" in report.runs_table(frame)
 
 
 def test_the_overall_gap_weighs_the_learned_cases_equally():

@@ -19,6 +19,9 @@ Plans = Mapping[int, tuple[Tensor, Tensor]]
 #: Lower and upper bounds of the outputs, ``(n_y,)`` or ``(T + 1, n_y)``; infinite for none.
 Band = tuple[Tensor, Tensor]
 
+#: Smallest range of a panel that is not widened.
+FLAT = 1e-6
+
 
 @torch.no_grad()
 def plans_along(mpc: QPMPC, p: Tensor, every: int = 8) -> Plans:
@@ -124,8 +127,12 @@ def episode_figure(
         _draw_plan(list(panels), times, k, x, planned)
     if plans:
         panels[0].plot([], [], "k:", linewidth=1, label="planned")
-    panels[0].legend(fontsize="small", loc="upper right")
-    panels[-1].set_xlabel(xlabel)
+    panels[0].legend(fontsize="small", loc="lower right", bbox_to_anchor=(1, 1), ncols=4)
+    for axes in panels:  # otherwise rounding errors fill a panel
+        low, high = axes.get_ylim()
+        if high - low < FLAT:
+            axes.set_ylim(low - 0.5, high + 0.5)
+    panels[-1].set(xlabel=xlabel, xlim=(times[0].item(), times[-1].item()))
     return figure
 
 

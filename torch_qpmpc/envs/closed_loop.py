@@ -255,17 +255,27 @@ def gap_text(
 
     Example:
         >>> gap_text(math.nan, 50.0, 62.3, 50.0)
-        'no gap; J rose by 12.3'
+        'no gap; J rose by 12.30'
     """
     if not math.isnan(gap):
         return f"{gap:.3f}"
     reason = "no true model" if math.isnan(J_true_model) else "no gap"
     change = J_final - J_start
     if not math.isfinite(change):
-        return f"{reason}; {name} went from {J_start:.1f} to {J_final:.1f}"
-    if f"{abs(change):.1f}" == "0.0":
+        return f"{reason}; {name} went from {cost_text(J_start)} to {cost_text(J_final)}"
+    if cost_text(J_start) == cost_text(J_final):
         return f"{reason}; {name} did not change"
-    return f"{reason}; {name} {'rose' if change > 0 else 'fell'} by {abs(change):.1f}"
+    return f"{reason}; {name} {'rose' if change > 0 else 'fell'} by {cost_text(abs(change))}"
+
+
+def cost_text(J: float) -> str:
+    """Return a cost with four significant digits, or all digits before the point.
+
+    Example:
+        >>> cost_text(20.9), cost_text(0.12345), cost_text(40827.4)
+        ('20.90', '0.1235', '40827')
+    """
+    return f"{J:.0f}" if 999.95 <= abs(J) < math.inf else f"{J:#.4g}"
 
 
 def _check(policy: object, steps: int, starts: int, seed: int, gamma: float) -> None:

@@ -21,9 +21,15 @@ from torch_qpmpc.experiment.actor_critic import (
 )
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.learning.gauss_newton import GaussNewton
-from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, QPActorValueOperator
+from torch_qpmpc.learning.operators import (
+    POLICY_ACTIVE_SET,
+    QPActorValueOperator,
+    in_closed_loop,
+    preview_key,
+)
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
+from torch_qpmpc.learning.replay import ACTIVE_SET
 from torch_qpmpc.learning.updates import Update, first_order, second_order
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -38,6 +44,7 @@ class Learner:
         actor: maps observation to action, without exploration.
         deviation, si: the penalties; None if off.
         target: the soft update of the target network; None without one.
+        n_preview: entries of the preview, with which p begins.
     """
 
     learn: Update
@@ -48,12 +55,24 @@ class Learner:
     deviation: DeviationPenalty | None
     si: SystemIdentificationPenalty | None
     target: SoftUpdate | None
+    n_preview: int = 0
+
+    @property
+    def policy(self) -> Callable[[Tensor], Tensor]:
+        """The actor as a function from p to a, for one closed loop."""
+        return in_closed_loop(self.actor, self.n_preview)
 
     def advance(self) -> None:
         """Advance the learning-rate schedule and the target network by one update."""
         self.schedule.step()
         if self.target is not None:
             self.target.step()
+
+
+def make_operator(cfg: DictConfig, mpc: QPMPC) -> QPActorValueOperator:
+    """Make the operator of the run's QP, with the keys that the environments and replay have."""
+    active_set = ACTIVE_SET if cfg.warm_start else None
+    return QPActorValueOperator(mpc, preview_key=preview_key(mpc), active_set_key=active_set)
 
 
 def make_learner(
@@ -87,6 +106,7 @@ def make_learner(
         deviation,
         si,
         SoftUpdate(loss_module, tau=cfg.target_rate) if delayed else None,
+        (mpc.horizon + 1) * mpc.n_d,
     )
 
 

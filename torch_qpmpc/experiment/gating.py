@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torch_qpmpc.envs.closed_loop import ClosedLoop
-from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.algorithms import Learner, evaluate
 from torch_qpmpc.experiment.checkpoint import write_whole
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.learning.gate import Gate
@@ -29,52 +28,64 @@ class RunGate:
 
     Args:
         cfg: the run's configuration; ``gate`` switches the comparisons on.
-        actor: the learner's actor, which shares its parameters.
+        learner: the learner, whose actor is the candidate.
         physics: the plant.
 
     Attributes:
         actor: the policy that acts.
     """
 
-    def __init__(self, cfg: DictConfig, actor: Any, physics: AnyPlant) -> None:
-        self._cfg, self._physics = cfg, physics
-        self._gate = Gate(actor, self._costs, seed=cfg.seed) if cfg.gate else None
-        self.actor: Any = actor if self._gate is None else self._gate.actor
+    def __init__(self, cfg: DictConfig, learner: Learner, physics: AnyPlant) -> None:
+        self._cfg, self._learner, self._physics = cfg, learner, physics
+        self._gate = Gate(learner.actor, self._costs, seed=cfg.seed) if cfg.gate else None
+        self.actor: Any = learner.actor if self._gate is None else self._gate.actor
+
+    @property
+    def policy(self) -> Callable[[Tensor], Tensor]:
+        """The policy that acts, as a function from p to a, for one closed loop."""
+        return in_closed_loop(self.actor, self._learner.n_preview)
 
     @property
     def mpc(self) -> QPMPC | None:
         """The QP of the policy that acts; None if it is a network."""
-        return next((x for x in self.actor.modules() if isinstance(x, QPMPC)), None)
+        return _qp(self.actor)
 
-    def judge(self, candidate: TensorDictModuleBase) -> dict[str, float]:
-        """Let ``candidate`` act if it costs less, and return the scalars of the comparison."""
-        return {} if self._gate is None else self._gate.judge(candidate).metrics()
+    def judge(self, search: bool = False) -> dict[str, float]:
+        """Let the learner's policy act if it costs less; return the scalars of the comparison.
 
-    def search(self, mpc: QPMPC, candidate: TensorDictModuleBase) -> dict[str, float]:
-        """Search over ``cfg.search``'s scalars from the policy that acts, and `judge` the result.
-
-        Args:
-            mpc: the QP of the candidate.
-            candidate: the learner's actor.
+        With ``search``, a direct search over the scalars that the configuration chooses follows,
+        from the policy that acts, and its result is judged, too.
         """
-        sizes = {name: x for name in KNOBS if (x := self._cfg.search[name])}
-        if not sizes:
-            return {}
-        candidate.load_state_dict(self.actor.state_dict())
-        loops, seed = self._cfg.search.loops, self._cfg.seed
-        found = search(
-            mpc, lambda _, seed: self._costs(candidate, seed), sizes, loops=loops, seed=seed
-        )
-        verdict = self.judge(candidate)
-        return {
-            **{f"search/{name}": x for name, x in found.items()},
-            **{name.replace("gate/", "search/"): x for name, x in verdict.items()},
-        }
+        verdict = self._judge("gate")
+        return verdict | self._search() if search else verdict
 
-    def release(self, candidate: TensorDictModuleBase) -> None:
-        """Free the C of the policy that acts, as the candidate's is; without a gate it is one."""
+    def _judge(self, tag: str) -> dict[str, float]:
         if self._gate is None:
-            self.actor = candidate
+            return {}
+        verdict = self._gate.judge(self._learner.actor)
+        names = ("accepted", "mean", "low", "high", "pairs")
+        return {f"{tag}/{name}": float(getattr(verdict, name)) for name in names}
+
+    def _search(self) -> dict[str, float]:
+        sizes = {name: x for name in KNOBS if (x := self._cfg.search[name])}
+        actor: Any = self._learner.actor
+        mpc = _qp(actor)
+        if not sizes or mpc is None:
+            return {}
+        actor.load_state_dict(self.actor.state_dict())
+        loops, seed = self._cfg.search.loops, self._cfg.seed
+        found = search(mpc, lambda _, seed: self._costs(actor, seed), sizes, loops=loops, seed=seed)
+        return {f"search/{name}": x for name, x in found.items()} | self._judge("search")
+
+    def _costs(self, actor: Any, seed: int) -> Tensor:
+        policy = in_closed_loop(actor, self._learner.n_preview)
+        return evaluate(self._cfg, policy, self._physics, seed).costs.sum(0)
+
+    def release(self, learner: Learner) -> None:
+        """Free the C of the policy that acts, as the new ``learner``'s is."""
+        self._learner = learner
+        if self._gate is None:
+            self.actor = learner.actor
         elif self.mpc is not None:
             self.mpc.release()
 
@@ -95,7 +106,7 @@ class RunGate:
         write_whole(folder / BEST, buffer.getbuffer())
 
     def state_dict(self) -> dict[str, Any] | None:
-        """Return the state of a `Gate`; None without one."""
+        """Return the state of the gate; None without one."""
         return None if self._gate is None else self._gate.state_dict()
 
     def load_state_dict(self, state: dict[str, Any] | None) -> None:
@@ -103,10 +114,6 @@ class RunGate:
         if self._gate is not None and state is not None:
             self._gate.load_state_dict(state)
 
-    def closed_loop(self, actor: TensorDictModuleBase | None = None, **options: Any) -> ClosedLoop:
-        """Evaluate ``actor``, by default the one that acts; ``options`` are those of `evaluate`."""
-        policy = in_closed_loop(actor or self.actor, getattr(self._physics, "n_preview", 0))
-        return evaluate(self._cfg, policy, self._physics, **options)
 
-    def _costs(self, actor: Any, seed: int) -> Tensor:
-        return self.closed_loop(actor, seed=seed).costs.sum(0)
+def _qp(actor: Any) -> QPMPC | None:
+    return next((part for part in actor.modules() if isinstance(part, QPMPC)), None)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from omegaconf import DictConfig
 from torch import Tensor
 
 from torch_qpmpc.analysis.model_error import one_step_error
@@ -14,12 +14,18 @@ from torch_qpmpc.analysis.plots import constraint_figure, policy_figure, slice_b
 from torch_qpmpc.analysis.prediction_form import prediction_form
 from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.analysis.structure import distance_by_band, nearest_model
-from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_gap, gap_text
+from torch_qpmpc.envs.closed_loop import cost_text, gap_text
 from torch_qpmpc.experiment.algorithms import Learner
+from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.gating import RunGate
-from torch_qpmpc.experiment.plots import closed_loop_figure, predictions_figure
+from torch_qpmpc.experiment.plots import (
+    closed_loop_figure,
+    learned_episode_figure,
+    summary_figure,
+)
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tally import Stopwatch, Tally
+from torch_qpmpc.experiment.tasks import true_model
 from torch_qpmpc.learning.updates import Scalars
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -48,37 +54,36 @@ def update_metrics(
     return metrics | watch.metrics()
 
 
-def run_summary(
-    cfg: DictConfig,
-    loops: dict[str, ClosedLoop],
-    tally: Tally,
-    gate: RunGate,
-    true_model: Sequence[Tensor] | None,
-) -> dict[str, Any]:
+def run_summary(found: Evaluation, tally: Tally, gate: RunGate) -> dict[str, Any]:
     """Return the content of summary.json, which is about the policy that acts."""
-    summary: dict[str, Any] = gap_summary(loops) | gate.summary()
+    cfg, mpc = found.cfg, gate.mpc
+    summary = found.summary() | gate.summary()
     summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
     summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
     summary |= {"ablation": cfg.ablation, "step": cfg.step, "penalty_step": cfg.penalty_step}
     summary |= {"updates": cfg.updates, **tally.summary()}
-    return summary if gate.mpc is None else summary | structure_summary(gate.mpc, true_model)
+    return summary if mpc is None else summary | structure_summary(mpc, true_model(found.physics))
 
 
-def report(
-    run: RunFolder, mpc: QPMPC | None, loops: dict[str, ClosedLoop], update: int
-) -> dict[str, Any]:
+def report(run: RunFolder, mpc: QPMPC | None, found: Evaluation, update: int) -> dict[str, Any]:
     """Log an evaluation: J, the structure of C and, if configured, figures.
 
-    Before the first update only J is logged; after the last, predictions and policy are added.
+    Before the first update only J is logged; after the last, the figures of `draw_outcome` are
+    added.
 
     Args:
+        run: the run's folder.
         mpc: the learned QP; None if the policy is a network.
+        found: the evaluation.
+        update: the number of updates so far.
 
     Returns:
-        `gap_summary` of ``loops``.
+        `Evaluation.summary`.
     """
-    summary = gap_summary(loops)
-    run.log({f"eval/{name}": summary[key] for name, key in EVALUATION_SCALARS.items()}, update)
+    summary = found.summary()
+    scalars = {f"eval/{name}": summary[key] for name, key in EVALUATION_SCALARS.items()}
+    scalars |= {f"eval/J_{tag(name)}": J for name, J in found.rivals.items()}
+    run.log(scalars, update)
     if mpc is None or update == 0:
         return summary
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u, mpc.past, mpc.n_d)
@@ -86,17 +91,31 @@ def report(
     run.log({f"structure/{name}": distance for name, distance in distances.items()}, update)
     if run.cfg.figures:
         run.figure("structure/C", constraint_figure(mpc), update)
-        run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
-    if run.cfg.figures and update == run.cfg.updates:
-        known = loops["learned"].known
-        if known.isfinite().all():
-            run.figure("eval/predictions", predictions_figure(mpc, loops["learned"]), update)
-        if mpc.n_x > 1:
-            run.figure("eval/policy", policy_figure(slice_between(mpc, known[0])), update)
+        run.figure("eval/closed_loop", closed_loop_figure(found.loops, mpc), update)
+        if update == run.cfg.updates:
+            draw_outcome(run, mpc, found, update)
     return summary
 
 
-#: Names of an evaluation's scalars, and their keys in `gap_summary`.
+def draw_outcome(run: RunFolder, mpc: QPMPC, found: Evaluation, update: int) -> None:
+    """Draw summary.png and episode.png; log the episode and the policy."""
+    known = found.loops["learned"].known
+    summary = summary_figure(mpc, found, *run.column("eval/J"))
+    summary.savefig(run.path / "summary.png", dpi=110)
+    if known.isfinite().all():
+        episode = learned_episode_figure(mpc, found)
+        episode.savefig(run.path / "episode.png", dpi=110)
+        run.figure("eval/episode", episode, update)
+    if mpc.n_x > 1:
+        run.figure("eval/policy", policy_figure(slice_between(mpc, known[0])), update)
+
+
+def tag(name: str) -> str:
+    """Return a name with a single underscore for other characters than letters and digits."""
+    return re.sub(r"\W+", "_", name)
+
+
+#: Names of an evaluation's scalars, and their keys in `Evaluation.summary`.
 EVALUATION_SCALARS = {
     "J": "J_best",
     "J_true_model": "J_true_model",
@@ -135,26 +154,6 @@ def theta_metrics(mpc: QPMPC) -> dict[str, float]:
     }
 
 
-def gap_summary(loops: dict[str, ClosedLoop]) -> dict[str, float]:
-    """Return J of the start, the learned and the true model, and the closed gap.
-
-    ``J_best`` is that of the learned policy, which acts, and ``J_final`` that of the last
-    candidate. Each also with discounted costs. Missing values are nan, as for a plant without a
-    true model.
-    """
-    summary = {}
-    loops = {"candidate": loops["learned"], **loops}
-    for tag, suffix in (("J", ""), ("J_discounted", "_discounted")):
-        names = "start", "learned", "candidate", "true model"
-        start, best, final, true = (getattr(loops.get(name), tag, math.nan) for name in names)
-        summary |= {f"{tag}_start": start, f"{tag}_best": best, f"{tag}_final": final}
-        summary |= {
-            f"{tag}_true_model": true,
-            f"closed_gap{suffix}": closed_gap(start, best, true),
-        }
-    return summary
-
-
 def table(summary: Mapping[str, Any]) -> str:
     """Format the outcome for the terminal."""
     lines = [f"{'':14}{'start':>10}{'learned':>10}{'true model':>12}{'closed gap':>12}"]
@@ -163,5 +162,10 @@ def table(summary: Mapping[str, Any]) -> str:
         gap = summary[f"closed_gap{tag.removeprefix('J')}"]
         share = gap_text(gap, start, final, true, name)
         cell = f"  {share}" if math.isnan(gap) else f"{share:>12}"
-        lines.append(f"{name:14}{start:10.1f}{final:10.1f}{true:12.1f}{cell}")
+        start, final, true = map(cost_text, (start, final, true))
+        lines.append(f"{name:14}{start:>10}{final:>10}{true:>12}{cell}")
+    if rivals := summary["rivals"]:
+        width = max(map(len, rivals))
+        lines += ["", "J of the rivals"]
+        lines += [f"  {name:{width}}  {cost_text(J):>8}" for name, J in rivals.items()]
     return "\n".join(lines)

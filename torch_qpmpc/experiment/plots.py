@@ -1,4 +1,4 @@
-"""Figures of a run: constraint matrix, closed-loop and predicted trajectories, learning curve."""
+"""Figures of a run: learning curve, constraint matrix, closed loop and one episode."""
 
 from __future__ import annotations
 
@@ -9,11 +9,26 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
+from omegaconf import DictConfig
 from torch import Tensor
 
+from torch_qpmpc.analysis.episode import episode_figure, plans_along
 from torch_qpmpc.analysis.plots import COLOURS, draw_matrix
-from torch_qpmpc.envs.closed_loop import ClosedLoop
+from torch_qpmpc.envs.closed_loop import ClosedLoop, cost_text
+from torch_qpmpc.experiment.evaluation import Evaluation
+from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.mpc.module import QPMPC
+
+#: Colours of the rivals' lines, in their order.
+RIVAL_COLOURS = (
+    "0.2",
+    "tab:orange",
+    "tab:purple",
+    "tab:brown",
+    "tab:pink",
+    "tab:olive",
+    "tab:cyan",
+)
 
 
 def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, shown: int = 6) -> None:
@@ -31,7 +46,7 @@ def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, show
     for name, loop in loops.items():
         colour = COLOURS.get(name)
         draw(loop.states[:, :shown], color=colour, linewidth=1)
-        axes.plot([], [], color=colour, label=f"{name}, J = {loop.J:.0f}")
+        axes.plot([], [], color=colour, label=f"{name}, J = {cost_text(loop.J)}")
     first = next(iter(loops.values()))
     with torch.no_grad():
         predicted, _ = mpc.predicted(mpc.solve(first.known[0, :shown]).z)
@@ -45,38 +60,21 @@ def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, show
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
 
 
-def predictions_figure(mpc: QPMPC, loop: ClosedLoop, every: int = 8, start: int = 0) -> Figure:
-    """Draw one closed-loop trajectory and the QP's predictions along it.
-
-    Args:
-        mpc: the QP.
-        loop: its closed loop.
-        every: number of steps between two predictions.
-        start: index of the loop's start.
-    """
-    names = [f"$s_{{{i + 1}}}$" for i in range(mpc.n_x)]
-    names += [f"$a_{{{i + 1}}}$" for i in range(mpc.n_u)]
-    figure = Figure(figsize=(9, 1.7 * len(names)), layout="constrained")
-    rows = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-    times = range(0, len(loop.actions), every)
-    with torch.no_grad():
-        x, u = mpc.predicted(mpc.solve(loop.known[list(times), start]).z)
-    realised = [*loop.states[:, start].unbind(-1), *loop.actions[:, start].unbind(-1)]
-    predicted = [*x.unbind(-1), *u.unbind(-1)]
-    for axes, name, real, expected in zip(rows, names, realised, predicted, strict=True):
-        axes.plot(real, color=COLOURS["learned"], label="realised")
-        for i, (k, path) in enumerate(zip(times, expected, strict=True)):
-            style = {"color": "black", "linestyle": ":", "linewidth": 1}
-            axes.plot(
-                range(k, k + len(path)), path, label=None if i else "predicted", marker=".",
-                markevery=[0], **style,
-            )  # fmt: skip
-        axes.set_ylabel(name)
-        axes.grid(alpha=0.3)
-    rows[0].legend(fontsize="small", loc="upper right")
-    rows[0].set_title("Realised trajectory, and the predictions made on the way")
-    rows[-1].set_xlabel("step")
-    return figure
+def learned_episode_figure(mpc: QPMPC, found: Evaluation) -> Figure:
+    """Draw the first episode of the learned policy, and its plans after every half horizon."""
+    loop, task = found.loops["learned"], find_task(found.cfg.task)
+    p = loop.known[:, 0]
+    names = {
+        "outputs": [f"$s_{{{i + 1}}}$" for i in range(mpc.n_x)],
+        "actions": [f"$a_{{{i + 1}}}$" for i in range(mpc.n_u)],
+    }
+    options = {
+        "times": torch.arange(len(p), dtype=torch.float64),
+        **names,
+        **task.episode(found.physics, p[:, : mpc.n_d]),
+    }
+    plans = plans_along(mpc, p[:-1], every=max(mpc.horizon // 2, 1))
+    return episode_figure(y=loop.states[:, 0], u=loop.actions[:, 0], plans=plans, **options)
 
 
 def draw_stage_costs(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
@@ -96,28 +94,68 @@ def closed_loop_figure(loops: Mapping[str, ClosedLoop], mpc: QPMPC) -> Figure:
     return figure
 
 
-def draw_learning(axes: Axes, updates: Sequence[float], J: Sequence[float], ends: Mapping) -> None:
-    """Draw J over updates, with the start's and the true model's J as lines."""
+def draw_learning(
+    axes: Axes, updates: Sequence[float], J: Sequence[float], found: Evaluation
+) -> None:
+    """Draw J over updates and experience, with the J of the others as lines."""
     axes.plot(updates, J, color=COLOURS["learned"], marker="o", markersize=3, label="learned")
-    for name, value in ends.items():
-        axes.axhline(value, color=COLOURS.get(name), linestyle="--", label=name)
-    axes.set(xlabel="update", ylabel="J, mean over starts", title="Learning", yscale="log")
+    draw_lines(axes, found.lines())
+    axes.set(xlabel="update", ylabel="J, mean over starts")
+    scale_costs(axes)
+    draw_experience(axes, found.cfg)
+    axes.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
+
+
+def draw_lines(axes: Axes, costs: Mapping[str, float]) -> None:
+    """Draw costs that learning does not change as horizontal lines, each with its number."""
+    others = (name for name in costs if name not in COLOURS)
+    colours = COLOURS | dict(zip(others, RIVAL_COLOURS, strict=False))
+    for name, J in costs.items():
+        line = "--" if name in COLOURS else ":"
+        label = f"{name}, {cost_text(J)}"
+        axes.axhline(J, color=colours.get(name), linestyle=line, label=label)
+
+
+def draw_experience(axes: Axes, cfg: DictConfig) -> None:
+    """Add an axis of the plant's experience above that of the updates."""
+    first, each, unit = experience(cfg)
+    ticks: Any = (lambda k: first + each * k, lambda x: (x - first) / each)
+    axes.secondary_xaxis("top", functions=ticks).set_xlabel(unit)
+
+
+def scale_costs(axes: Axes) -> None:
+    """Scale the vertical axis: by the logarithm, with readable ticks, if costs differ by half."""
+    low, high = axes.get_ylim()
+    if not 0 < low < high / 1.5:
+        return
+    axes.set_yscale("log")
     low, high = axes.get_ylim()
     steps = (1, 1.5, 2, 3, 5, 7)
     ticks = [s * 10**k for k in range(-2, 5) for s in steps if low <= s * 10**k <= high]
     axes.set_yticks(ticks, [f"{t:g}" for t in ticks])
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.legend(fontsize="small")
+
+
+def experience(cfg: DictConfig) -> tuple[float, float, str]:
+    """Return the experience before the first update and that of each update, and its unit.
+
+    It is all that the plant has been run for: the log, the warm-up and the updates.
+    """
+    length, unit = find_task(cfg.task).unit
+    each = cfg.num_envs * cfg.steps_per_update
+    first = each * -(-cfg.warmup_steps // cfg.steps_per_update)
+    if cfg.start.name == "data" and cfg.start.file is None:
+        first += cfg.start.transitions
+    return first / length, each / length, f"{unit} of experience"
 
 
 def summary_figure(
-    mpc: QPMPC, loops: Mapping[str, ClosedLoop], updates: Sequence[float], J: Sequence[float]
+    mpc: QPMPC, found: Evaluation, updates: Sequence[float], J: Sequence[float]
 ) -> Figure:
     """Draw a run's learning curve, learned matrix and closed loop side by side."""
     figure = Figure(figsize=(15, 4), layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1.5, 1))
-    ends = {name: loops[name].J for name in ("start", "true model") if name in loops}
-    draw_learning(left, updates, J, ends)
+    draw_learning(left, updates, J, found)
     draw_matrix(middle, mpc.C, mpc, r"Learned constraint matrix $C_\theta$")
-    draw_positions(right, loops, mpc)
+    draw_positions(right, found.loops, mpc)
     return figure

@@ -66,7 +66,7 @@ class Exploration(nn.Module):
 
 
 def make_start(
-    cfg: DictConfig, physics: AnyPlant, folder: str | Path, written: bool
+    cfg: DictConfig, physics: AnyPlant, folder: str | Path, written: bool, quiet: bool = True
 ) -> Start | None:
     """Identify the start of a run from a log, and keep the log in the run's folder.
 
@@ -75,6 +75,7 @@ def make_start(
         physics: the plant.
         folder: the run's folder.
         written: read the log that the run has written there before.
+        quiet: do not print the report of the prediction errors.
 
     Returns:
         The start; None with ``start=model``.
@@ -86,13 +87,19 @@ def make_start(
         return None
     path = Path(folder) / LOG
     if written:
-        return identified_start(cfg, physics, read_log(path))
-    log = collect_log(cfg, physics) if cfg.start.file is None else read_log(Path(cfg.start.file))
+        log = read_log(path)
+    elif cfg.start.file is not None:
+        log = read_log(Path(cfg.start.file))
+    else:
+        log = collect_log(cfg, physics)
     start = identified_start(cfg, physics, log)
-    buffer = io.BytesIO()
-    torch.save(log.to_dict(), buffer)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, buffer.getbuffer())
+    if not written:
+        buffer = io.BytesIO()
+        torch.save(log.to_dict(), buffer)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, buffer.getbuffer())
+    if not quiet:
+        print(start.identified)
     return start
 
 

@@ -103,11 +103,6 @@ class Verdict:
     high: float
     pairs: int
 
-    def metrics(self) -> dict[str, float]:
-        """Return the scalars to log."""
-        names = ("accepted", "mean", "low", "high", "pairs")
-        return {f"gate/{name}": float(getattr(self, name)) for name in names}
-
 
 class Gate:
     """Holds the policy that acts, and replaces it by a candidate that is shown to cost less.

@@ -12,7 +12,14 @@ from matplotlib.figure import Figure
 from torch_qpmpc.analysis.plots import draw_slice, slice_between
 from torch_qpmpc.analysis.report import canonical
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.plots import draw_matrix, draw_positions
+from torch_qpmpc.experiment.plots import (
+    draw_experience,
+    draw_lines,
+    draw_matrix,
+    draw_positions,
+    experience,
+    scale_costs,
+)
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.study.runs import CASES, FinishedRun, has_real
 from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
@@ -44,16 +51,26 @@ def draw_band(axes: Axes, x: np.ndarray, runs: np.ndarray, label: str, colour: t
 
 
 def draw_J(axes: Axes, frame: pd.DataFrame) -> None:
-    """Draw J over updates, with the means of the start's and the true model's J as lines."""
+    """Draw J over updates, with means of the start's and the others' J as lines."""
     for label, runs in frame.groupby("label", sort=False):
         x, J = curves(runs, "eval/J")
         draw_band(axes, x, J, str(label), colours(frame)[str(label)])
-    for name, style in (("J_start", "k:"), ("J_true_model", "k--")):
-        end = interquartile_mean(frame.drop_duplicates("seed")[name].to_numpy())
-        axes.plot([], [], style, label={"J_start": "start"}.get(name, "true model"))
-        axes.axhline(float(end), color="k", linestyle=style[1:], linewidth=1)
-    axes.set(xlabel="update", ylabel="J", yscale="log")
+    draw_lines(axes, fixed_costs(frame))
+    axes.set(xlabel="update", ylabel="J")
+    scale_costs(axes)
+    if len({experience(run.cfg) for run in frame["run"]}) == 1:
+        draw_experience(axes, frame["run"].iloc[0].cfg)
     axes.legend(fontsize="small")
+
+
+def fixed_costs(frame: pd.DataFrame) -> dict[str, float]:
+    """Return the means over seeds of J of the start, the true model and the rivals."""
+    runs = frame.drop_duplicates("seed")
+    costs = {"start": runs["J_start"], "true model": runs["J_true_model"]}
+    rivals = runs["rivals"].dropna() if "rivals" in runs else pd.Series(dtype=object)
+    costs |= dict(pd.DataFrame(rivals.tolist()).items())
+    known = {str(name): J.dropna().to_numpy() for name, J in costs.items() if J.notna().any()}
+    return {name: float(interquartile_mean(J)) for name, J in known.items()}
 
 
 def draw_gap(axes: Axes, frame: pd.DataFrame) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 
-from torch_qpmpc.envs.closed_loop import gap_text
+from torch_qpmpc.envs.closed_loop import cost_text, gap_text
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.study.markdown import replaced, table
 from torch_qpmpc.study.plots import (
@@ -44,7 +44,8 @@ that scheme's, and the number of runs in which the latter is smaller."""
 
 def runs_table(frame: pd.DataFrame) -> str:
     """Format all runs as a Markdown table."""
-    head = ["sweep", "noise", "case", "seed", "J_start", "J_best", "J_true_model", "closed_gap"]
+    costs = ("J_start", "J_best", "J_true_model")
+    head = ["sweep", "noise", "case", "seed", *costs, "closed_gap"]
     head += [
         "canonical_distance",
         "prediction_error",
@@ -52,16 +53,16 @@ def runs_table(frame: pd.DataFrame) -> str:
         "unsolved",
         "train_seconds",
     ]
-    digits: dict[str, str] = dict.fromkeys(
-        ("J_start", "J_best", "J_true_model", "train_seconds"), ".1f"
-    )
-    digits["canonical_distance"] = ".3f"
+    digits = {"train_seconds": ".1f", "canonical_distance": ".3f"}
     digits |= dict.fromkeys(("prediction_error", "prediction_error_start"), ".4f")
-    ends = (frame[name] for name in ("closed_gap", "J_start", "J_best", "J_true_model"))
+    ends = (frame[name] for name in ("closed_gap", *costs))
     gaps = [gap_text(*values) for values in zip(*ends, strict=True)]
     rows = frame.assign(case=frame["label"], closed_gap=gaps)[head].itertuples(index=False)
     lines = [
-        [f"{value:{digits.get(name, '')}}" for name, value in zip(head, row, strict=True)]
+        [
+            cost_text(value) if name in costs else f"{value:{digits.get(name, '')}}"
+            for name, value in zip(head, row, strict=True)
+        ]
         for row in rows
     ]
     return table(head, lines)
@@ -99,7 +100,7 @@ def cases_table(sweep: pd.DataFrame) -> str:
 
 def _ends(median: pd.Series, name: str) -> str:
     start, best, true = (median[f"{name}_{end}"] for end in ("start", "best", "true_model"))
-    return f"{start:.1f} to {best:.1f} ({true:.1f})"
+    return f"{cost_text(start)} to {cost_text(best)} ({cost_text(true)})"
 
 
 def overall(sweep: pd.DataFrame) -> str:

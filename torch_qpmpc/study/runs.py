@@ -43,7 +43,7 @@ CASES = ("fixed", "free", "deviation", "si", "combined")
 #: Smallest J_start - J_true_model for which the closed gap is meaningful.
 REAL_GAP = 50.0
 #: Settings that labels leave out: they vary within a case, or do not affect learning.
-_UNLABELLED = ("seed", "figures", "threads", "log_interval", "eval_interval", "logger")
+_UNLABELLED = ("seed", "figures", "threads", "log_interval", "eval_interval", "logger", "rivals")
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,17 +13,16 @@ from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.experiment.rivals.deepc import DeePC, windows
 from torch_qpmpc.experiment.rivals.kalman_mpc import KalmanMPC
 from torch_qpmpc.experiment.rivals.logs import uniform_log
-from torch_qpmpc.experiment.rivals.tanks import four_tanks_rivals, tank_references_rivals
+from torch_qpmpc.experiment.rivals.tanks import FOUR_TANKS_RIVALS, TANK_REFERENCES_RIVALS
 from torch_qpmpc.experiment.tracking import INPUT_WEIGHT, set_point_options, window_model
 
 
 def test_more_knowledge_costs_less_at_the_set_point():
     """All costs have the 35.5 of x_0, which no policy changes."""
     p = FourTanks()
-    rivals = four_tanks_rivals(p, uniform_log(p, 1000, seed=0))
     J = {
-        name: plant_loop(policy, plant, steps=100, starts=16, seed=3).J
-        for name, (plant, policy) in rivals.items()
+        name: plant_loop(*rival.of(p), steps=100, starts=16, seed=3).J
+        for name, rival in FOUR_TANKS_RIVALS.items()
     }
     filters = [J[f"Kalman filter, N = {N}"] for N in (60, 40, 20)]
     assert filters == sorted(filters)
@@ -36,9 +35,8 @@ def test_more_knowledge_costs_less_at_the_set_point():
 def test_more_knowledge_costs_less_for_references():
     p = TankReferences(noise_std=0.1, mismatch=1.0)
     J = {}
-    for name, (plant, policy) in tank_references_rivals(p).items():
-        loop = plant_loop(policy, plant, steps=60, starts=16, seed=3)
-        J[name] = loop.J / 60
+    for name, rival in TANK_REFERENCES_RIVALS.items():
+        J[name] = plant_loop(*rival.of(p), steps=60, starts=16, seed=3).J / 60
     assert J["omniscient"] < min(J["offset-free"], J["exact MPC"])
     still = plant_loop(lambda y: torch.zeros(16, 2), p, steps=60, starts=16, seed=3).J / 60
     assert still > 1.2 * max(J.values())

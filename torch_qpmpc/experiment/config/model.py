@@ -83,6 +83,7 @@ class Config(Group):
     search: Search = NO_SEARCH
     logger: Annotated[str, one_of(LOGGERS)] = "tensorboard"
     figures: Flag
+    rivals: Annotated[bool | list[str], Expected("true, false or a list of names")] = True
     eval_interval: Count
     log_interval: Count
     algo: Algorithm
@@ -157,6 +158,14 @@ class Config(Group):
             self.conflict("noise.name", f"a noise of task {task.name}: {', '.join(task.noises)}")
         if self.noise.std is not None and not task.takes_noise_std:
             self.conflict("noise.std", "null", f"The noise of {task.name} cannot be changed.")
+        return self
+
+    @model_validator(mode="after")
+    def task_has_the_rivals(self) -> Self:
+        known = find_task(self.task.model_dump()).rivals
+        if isinstance(self.rivals, list) and not {*self.rivals} <= {*known}:
+            names = ", ".join(map(repr, known)) or "none"
+            self.conflict("rivals", f"a list of rivals of task {self.task.name}: {names}")
         return self
 
     @model_validator(mode="after")

@@ -5,8 +5,7 @@ Settings were chosen on logs and evaluations of other seeds than those that are 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
@@ -17,35 +16,15 @@ from torch_qpmpc.envs.tank_references import TankReferences
 from torch_qpmpc.experiment.rivals.deepc import DeePC
 from torch_qpmpc.experiment.rivals.kalman_mpc import KalmanMPC
 from torch_qpmpc.experiment.rivals.linear_mpc import LinearMPC, OmniscientMPC, Tracking
+from torch_qpmpc.experiment.rivals.logs import uniform_log
+from torch_qpmpc.experiment.rivals.rival import Policy, Rival
 from torch_qpmpc.experiment.tracking import TERMINAL_FACTOR, offset_free, reference_options
 from torch_qpmpc.mpc.module import QPMPC
 
-Policy = Callable[[Tensor], Tensor]
-#: Rivals by name, each with the plant that it sees.
-Rivals = dict[str, tuple[FourTanks | TankReferences, Policy]]
 #: The horizons of the Kalman filter's MPC.
 HORIZONS = (20, 40, 60)
-
-
-def four_tanks_rivals(plant: FourTanks, log: TensorDictBase | None = None) -> Rivals:
-    """Return the rivals for the set point; DeePC needs a ``log`` of actions and outputs."""
-    policies: dict[str, Policy] = {
-        f"Kalman filter, N = {N}": kalman_mpc(plant, N) for N in HORIZONS
-    }
-    if log is not None:
-        policies["DeePC"] = deepc(plant, log)
-    policies["omniscient"] = OmniscientMPC(plant, max(HORIZONS))
-    return {name: (plant, policy) for name, policy in policies.items()}
-
-
-def tank_references_rivals(plant: TankReferences) -> Rivals:
-    """Return the rivals for the references, all with the plant's N but for their window."""
-    short, long = replace(plant, past=1), replace(plant, past=5)
-    return {
-        "exact MPC": (short, reference_mpc(short, plant.A, plant.B)),
-        "offset-free": (long, reference_mpc(long, *offset_free(plant.A, plant.B, memory=4))),
-        "omniscient": (plant, OmniscientMPC(plant, plant.horizon, TERMINAL_FACTOR)),
-    }
+#: Steps and seed of the log that DeePC's data are.
+LOG_STEPS, LOG_SEED = 1000, 0
 
 
 def kalman_mpc(plant: FourTanks, horizon: int) -> KalmanMPC:
@@ -78,3 +57,23 @@ def reference_mpc(plant: TankReferences, A: Tensor, B: Tensor) -> Policy:
     """Make MPC of a model and the plant's own cost, without discount."""
     options = reference_options(plant, gamma=1.0)
     return QPMPC.from_model(A, B, plant.horizon, solver="daqp", **options).policy
+
+
+#: Rivals for the set point; DeePC has a log of its own.
+FOUR_TANKS_RIVALS = {
+    **{f"Kalman filter, N = {N}": Rival(partial(kalman_mpc, horizon=N)) for N in HORIZONS},
+    "DeePC": Rival(lambda plant: deepc(plant, uniform_log(plant, LOG_STEPS, LOG_SEED))),
+    "omniscient": Rival(lambda plant: OmniscientMPC(plant, max(HORIZONS))),
+}
+
+#: Rivals for the references, all with the plant's N.
+TANK_REFERENCES_RIVALS = {
+    "exact MPC": Rival(lambda plant: reference_mpc(plant, plant.A, plant.B), sees={"past": 1}),
+    "offset-free": Rival(
+        lambda plant: reference_mpc(plant, *offset_free(plant.A, plant.B, plant.past - 1)),
+        sees={"past": 5},
+    ),
+    "omniscient": Rival(
+        lambda plant: OmniscientMPC(plant, plant.horizon, TERMINAL_FACTOR), slow=True
+    ),
+}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from omegaconf import DictConfig
@@ -10,6 +12,7 @@ from torch import Tensor
 from torch_qpmpc.envs import FourTanks
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.experiment.fields import Count
+from torch_qpmpc.experiment.rivals.tanks import FOUR_TANKS_RIVALS
 from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
 from torch_qpmpc.experiment.tracking import INPUT_WEIGHT, set_point_options, window_model
 
@@ -49,6 +52,15 @@ def _scheme(plant: FourTanks, A: Tensor, B: Tensor, gamma: float) -> Scheme:
     return Scheme(*model, options["stage_weight"], -free, free, options=options)
 
 
+def episode(plant: FourTanks, d: Tensor) -> dict[str, Any]:
+    """Show the set point of the measured levels."""
+    return {
+        "outputs": ["level 1", "level 2"],
+        "actions": ["pump 1", "pump 2"],
+        "references": plant.r.expand(len(d), -1),
+    }
+
+
 register(
     Task(
         "four_tanks",
@@ -56,6 +68,8 @@ register(
         wrong_scheme,
         true_scheme,
         closed_loop=plant_loop,
+        rivals=FOUR_TANKS_RIVALS,
+        episode=episode,
         settings=FourTanksSettings,
         defaults=None,
     )

@@ -7,12 +7,15 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
+from torch import Tensor
+from torch.nn.functional import pad
 
 from torch_qpmpc.envs import House
 from torch_qpmpc.envs.closed_loop import plant_loop
-from torch_qpmpc.envs.heated_house import DAY, HeatedHouse
-from torch_qpmpc.experiment.fields import Flag, NonNegative
+from torch_qpmpc.envs.heated_house import DAY, DT, LOWER, OUTDOOR, PRICE, UPPER, HeatedHouse
+from torch_qpmpc.experiment.fields import Count, Flag, NonNegative
 from torch_qpmpc.experiment.heating import Model, heating_options, known_model
+from torch_qpmpc.experiment.rivals.houses import HOUSE_RIVALS
 from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
 
 #: The resistance that the tutorial's planner assumes, in K/kW.
@@ -24,6 +27,8 @@ COST = 21.0
 class HeatingSettings(TaskSettings):
     """The keys of the heated houses."""
 
+    #: Number of outputs in the window.
+    past: Count
     #: Distance to the lower comfort bound, in K, at which the planned violation begins.
     margin: NonNegative
 
@@ -35,16 +40,23 @@ class HouseSettings(HeatingSettings):
 
 
 def make_plant(cfg: DictConfig) -> House:
-    return House(horizon=cfg.task.horizon, one_weather=cfg.task.one_weather)
+    task = cfg.task
+    return House(horizon=task.horizon, past=task.past, one_weather=task.one_weather)
 
 
 def wrong_scheme(cfg: DictConfig, plant: House) -> Scheme:
-    return learned_scheme(cfg, plant, known_model(replace(plant, R=WRONG_R)), COST)
+    return learned_scheme(cfg, plant, lagged_model(replace(plant, R=WRONG_R)), COST)
 
 
 def true_scheme(plant: House) -> Scheme:
     """Return the scheme with the true model, without discount; it does not see the gain."""
-    return heating_scheme(plant, known_model(plant), gamma=1.0)
+    return heating_scheme(plant, lagged_model(plant), gamma=1.0)
+
+
+def lagged_model(plant: House) -> Model:
+    """Return the known model, with coefficients of zero for the earlier lags of the window."""
+    A, B, E = known_model(plant)
+    return pad(A, (0, plant.past - 1)), pad(B, (0, plant.past - 1)), E
 
 
 def learned_scheme(cfg: DictConfig, plant: HeatedHouse, model: Model, cost: float) -> Scheme:
@@ -76,6 +88,18 @@ def heating_scheme(
     return Scheme(A, B, cost["stage_weight"], -free, free, c=c, options=cost | options)
 
 
+def episode(plant: HeatedHouse, d: Tensor) -> dict[str, Any]:
+    """Show the comfort band, the price and the weather over the hours of a day."""
+    return {
+        "times": DT * torch.arange(len(d)),
+        "xlabel": "hour",
+        "outputs": ["air, °C"],
+        "actions": ["heating, kW"],
+        "band": (d[:, LOWER : LOWER + 1], d[:, UPPER : UPPER + 1]),
+        "signals": {"price, EUR/kWh": d[:, PRICE], "outdoors, °C": d[:, OUTDOOR]},
+    }
+
+
 register(
     Task(
         "house",
@@ -83,6 +107,9 @@ register(
         wrong_scheme,
         true_scheme,
         closed_loop=plant_loop,
+        rivals=HOUSE_RIVALS,
+        episode=episode,
+        unit=(DAY, "days"),
         settings=HouseSettings,
         defaults=None,
     )

@@ -7,23 +7,21 @@ from omegaconf import DictConfig
 
 from torch_qpmpc.envs import HouseWall
 from torch_qpmpc.envs.closed_loop import plant_loop
-from torch_qpmpc.envs.heated_house import DT, GAIN, OUTDOOR
+from torch_qpmpc.envs.heated_house import DAY, DT, GAIN, OUTDOOR
 from torch_qpmpc.envs.house_wall import C_E, C_I, G_A, R_EA, R_IE, SUN
-from torch_qpmpc.experiment.fields import Count
 from torch_qpmpc.experiment.heating import Model
-from torch_qpmpc.experiment.tasks.house import HeatingSettings, heating_scheme, learned_scheme
+from torch_qpmpc.experiment.rivals.houses import HOUSE_WALL_RIVALS
+from torch_qpmpc.experiment.tasks.house import (
+    HeatingSettings,
+    episode,
+    heating_scheme,
+    learned_scheme,
+)
 from torch_qpmpc.experiment.tasks.registry import Scheme, Task, register
 from torch_qpmpc.experiment.tracking import window_model
 
 #: Typical cost of a day in EUR, for the initial c.
 COST = 5.0
-
-
-class HouseWallSettings(HeatingSettings):
-    """The keys of `HouseWall`."""
-
-    #: Number of outputs in the window.
-    past: Count
 
 
 def make_plant(cfg: DictConfig) -> HouseWall:
@@ -71,7 +69,10 @@ register(
         wrong_scheme,
         true_scheme,
         closed_loop=plant_loop,
-        settings=HouseWallSettings,
+        rivals=HOUSE_WALL_RIVALS,
+        episode=episode,
+        unit=(DAY, "days"),
+        settings=HeatingSettings,
         defaults=None,
     )
 )

@@ -29,6 +29,7 @@ from torch_qpmpc.experiment.fields import (
     one_of,
     some_of,
 )
+from torch_qpmpc.experiment.rivals.rival import Rival
 from torch_qpmpc.mpc.validation import COST, HESSIANS
 
 #: A plant of any kind.
@@ -106,6 +107,11 @@ class Task:
         closed_loop: the function of `torch_qpmpc.envs.closed_loop` for the plant's kind.
         noises: choices of ``noise.name``; the first is the default.
         takes_noise_std: True if ``make_plant`` reads ``noise.std``.
+        rivals: controllers of a `Plant` that the learned one is compared with, by name.
+        episode: returns arguments of `episode_figure` that show an episode of a plant in its own
+            names and units, such as ``outputs`` or ``band``, from the known signals d of its steps
+            ``(T + 1, n_d)``.
+        unit: the unit of experience in figures: its length in transitions, and its name.
         settings: the model of the keys under ``task``.
         defaults: settings of any group that differ from ``task=point_mass``; None if they are in
             configs/task/NAME.yaml.
@@ -118,6 +124,9 @@ class Task:
     closed_loop: Callable[..., ClosedLoop] = closed_loop
     noises: tuple[str, ...] = ("none",)
     takes_noise_std: bool = False
+    rivals: Mapping[str, Rival] = field(default_factory=dict)
+    episode: Callable[[Any, Tensor], Mapping[str, Any]] = lambda plant, d: {}
+    unit: tuple[int, str] = (1, "transitions")
     settings: type[TaskSettings] = TaskSettings
     defaults: Mapping[str, Any] | None = field(default_factory=dict)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
@@ -11,6 +12,7 @@ from torch import Tensor
 from torch_qpmpc.envs import TankReferences
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.experiment.fields import Flag, NonNegative, Whole
+from torch_qpmpc.experiment.rivals.tanks import TANK_REFERENCES_RIVALS
 from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
 from torch_qpmpc.experiment.tracking import offset_free, reference_options
 
@@ -59,6 +61,16 @@ def _scheme(plant: TankReferences, A: Tensor, B: Tensor, gamma: float) -> Scheme
     return Scheme(A, B, options["stage_weight"], plant.lb_x, plant.ub_x, options=options)
 
 
+def episode(plant: TankReferences, d: Tensor) -> dict[str, Any]:
+    """Show the references and the bounds of the levels."""
+    return {
+        "outputs": [f"level {i}" for i in range(1, 5)],
+        "actions": ["pump 1", "pump 2"],
+        "band": (plant.lb_x, plant.ub_x),
+        "references": d,
+    }
+
+
 register(
     Task(
         "tank_references",
@@ -66,6 +78,8 @@ register(
         wrong_scheme,
         true_scheme,
         closed_loop=plant_loop,
+        rivals=TANK_REFERENCES_RIVALS,
+        episode=episode,
         settings=TankReferencesSettings,
         defaults=None,
     )

@@ -1,0 +1,80 @@
+"""A run's evaluation: J of the learned policy beside the start, the true model and the rivals.
+
+All have the same starts and disturbances. All but the learned policy are evaluated once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from omegaconf import DictConfig
+from torch import Tensor
+
+from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_gap
+from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_true_mpc
+from torch_qpmpc.learning.operators import warm_policy
+from torch_qpmpc.mpc.module import QPMPC
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Closed loops of a run's policies.
+
+    Attributes:
+        cfg, physics: the run's configuration and plant.
+        loops: those of ``start``, ``learned``, which acts, and, if they are there, of the last
+            ``candidate`` and the ``true model``.
+        rivals: J of the task's rivals by name.
+    """
+
+    cfg: DictConfig
+    physics: AnyPlant
+    loops: dict[str, ClosedLoop]
+    rivals: dict[str, float]
+
+    @classmethod
+    def before(cls, cfg: DictConfig, physics: AnyPlant, mpc: QPMPC) -> Evaluation:
+        """Evaluate before learning, when ``mpc`` is the start and what has been learned."""
+        start = evaluate(cfg, warm_policy(mpc), physics)
+        loops = {"start": start, "learned": start}
+        if (true_mpc := make_true_mpc(cfg, physics)) is not None:
+            loops["true model"] = evaluate(cfg, warm_policy(true_mpc), physics)
+        return cls(cfg, physics, loops, rival_costs(cfg, physics))
+
+    def evaluate(self, policy: Callable[[Tensor], Tensor], name: str = "learned") -> None:
+        """Evaluate what has been learned so far."""
+        self.loops[name] = evaluate(self.cfg, policy, self.physics)
+
+    def lines(self) -> dict[str, float]:
+        """Return J of the start, the true model and the rivals by name."""
+        ends = {name: self.loops[name].J for name in ("start", "true model") if name in self.loops}
+        return ends | self.rivals
+
+    def summary(self) -> dict[str, Any]:
+        """Return J of the start, the learned and the true model, the closed gap and the rivals.
+
+        ``J_best`` is that of the learned policy, which acts, and ``J_final`` that of the last
+        candidate. Costs and gap also with discounted costs. Missing values are nan, as for a plant
+        without a true model.
+        """
+        loops = {"candidate": self.loops["learned"], **self.loops}
+        summary: dict[str, Any] = {}
+        for tag, suffix in (("J", ""), ("J_discounted", "_discounted")):
+            names = ("start", "learned", "candidate", "true model")
+            start, best, final, true = (getattr(loops.get(name), tag, math.nan) for name in names)
+            summary |= {f"{tag}_start": start, f"{tag}_best": best, f"{tag}_final": final}
+            summary[f"{tag}_true_model"] = true
+            summary[f"closed_gap{suffix}"] = closed_gap(start, best, true)
+        return summary | {"rivals": dict(self.rivals)}
+
+
+def rival_costs(cfg: DictConfig, physics: AnyPlant) -> dict[str, float]:
+    """Return J of each rival of the task that ``cfg.rivals`` chooses."""
+    rivals, chosen = find_task(cfg.task).rivals, cfg.rivals
+    if isinstance(chosen, bool):
+        chosen = [name for name, rival in rivals.items() if chosen and not rival.slow]
+    return {name: evaluate(cfg, *rivals[name].of(physics)).J for name in chosen}

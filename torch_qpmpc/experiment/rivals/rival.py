@@ -1,0 +1,32 @@
+"""A controller that learned ones are compared with, as a task's file names it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from torch import Tensor
+
+#: Maps p ``(starts, n_p)`` to actions ``(starts, n_u)``; see `plant_loop`.
+Policy = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Rival:
+    """How to make a policy for a task's plant.
+
+    Attributes:
+        make: makes the policy for the plant that it sees.
+        sees: fields in which that plant differs from the task's, such as a longer ``horizon``.
+        slow: True if ``rivals=true`` leaves it out, because its closed loop takes many seconds.
+    """
+
+    make: Callable[[Any], Policy]
+    sees: Mapping[str, int] = field(default_factory=dict)
+    slow: bool = False
+
+    def of(self, plant: Any) -> tuple[Policy, Any]:
+        """Return the policy, and the plant that it sees."""
+        seen = replace(plant, **self.sees)
+        return self.make(seen), seen
