@@ -69,7 +69,7 @@ def fixed_costs(frame: pd.DataFrame) -> dict[str, float]:
     costs = {"start": runs["J_start"], "true model": runs["J_true_model"]}
     rivals = runs["rivals"].dropna() if "rivals" in runs else pd.Series(dtype=object)
     costs |= dict(pd.DataFrame(rivals.tolist()).items())
-    known = {str(name): J.dropna().to_numpy() for name, J in costs.items() if J.notna().any()}
+    known = {str(name): J.dropna().to_numpy() for name, J in costs.items() if len(J.dropna())}
     return {name: float(interquartile_mean(J)) for name, J in known.items()}
 
 
