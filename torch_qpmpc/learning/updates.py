@@ -16,6 +16,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.q_learning import QPQLearningLoss, invalid_rewards, td_loss, td_metadata
@@ -110,8 +111,16 @@ def second_order(
         loss_module: the loss that defines the targets.
         optimizer: the optimiser of ``mpc``.
         deviation, si: the penalties on C; None for none.
+
+    Raises:
+        QPError: the value network has other modules or ``theta_keys``: the step's curvature is that
+            of the QP's own theta.
     """
     network = loss_module.value_network
+    if network is not loss_module.operator or network.theta_keys:
+        remedy = "Learn with first_order and a torch optimiser."
+        got = "a value network with theta_keys or upstream modules"
+        raise QPError.expected("loss_module", got, "a QPActorValueOperator alone", remedy)
     action = network.in_keys[1]
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:

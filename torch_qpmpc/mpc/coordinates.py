@@ -1,12 +1,14 @@
 """The unconstrained coordinates of theta, and theta with residuals added to them.
 
-A learned part is computed from its coordinates, such as a factor L of H = L L', so that any residual
-keeps H positive semidefinite, w non-negative and a tied C a model. Other parts are coordinates.
+A learned part is computed from its coordinates, such as a factor L of H = L L', so that any
+residual keeps H positive semidefinite, w non-negative and a tied C a model. Other parts are
+coordinates themselves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +18,7 @@ from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, LinearRows
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
-from torch_qpmpc.qp.batching import broadcast
+from torch_qpmpc.qp.batching import broadcast, to_dtype
 
 #: The coordinates of a tied C and a tied G.
 MODELS: dict[type, tuple[str, ...]] = {Banded: ("A", "B", "E"), LinearRows: ("D", "D_f")}
@@ -44,7 +46,7 @@ def moved(module: nn.Module, residuals: Mapping[str, Tensor]) -> dict[str, Tenso
     Raises:
         QPError: a name, a shape or a device is wrong.
     """
-    check_kind("residuals", residuals, Mapping)
+    check_kind("residuals", residuals, Mapping, "Map names to tensors: {'q': ..}.")
     rest = dict(residuals)
     theta = {}
     for part in parts(module):
@@ -54,12 +56,18 @@ def moved(module: nn.Module, residuals: Mapping[str, Tensor]) -> dict[str, Tenso
             start = before[name]
             check_tensor(f"residuals[{name!r}]", residual, *start.shape, device=start.device)
         theta[part] = _with_residuals(module, part, before, own) if own else getattr(module, part)
-    if rest:
-        unlearned = [name for name in rest if name in SIGNED]
-        remedy = f"Add {unlearned[0]} to learn." if unlearned else ""
-        known = f"names among {', '.join(coordinates(module))}"
-        raise QPError.expected("residuals", ", ".join(map(repr, rest)), known, remedy)
+    check_names("residuals", rest, module)
     return theta
+
+
+def check_names(argument: str, names: Collection[str], module: nn.Module) -> None:
+    """Raise `QPError` if one of the ``names`` in an argument is not a coordinate's."""
+    known = coordinates(module)
+    if unknown := [name for name in names if name not in known]:
+        unlearned = [name for name in unknown if name in SIGNED and hasattr(module, name)]
+        remedy = f"Add {unlearned[0]} to learn." if unlearned else ""
+        expected = f"names among {', '.join(known)}"
+        raise QPError.expected(argument, ", ".join(map(repr, unknown)), expected, remedy)
 
 
 def for_each(
@@ -69,7 +77,12 @@ def for_each(
     leads = [x.ndim - n for x, n in zip(operands, ndims, strict=True)]
     if not any(leads):
         return function(*operands)
-    batch = broadcast(*(x.shape[:lead] for x, lead in zip(operands, leads, strict=True)))
+    batches = [x.shape[:lead] for x, lead in zip(operands, leads, strict=True)]
+    try:
+        batch = broadcast(*batches)
+    except RuntimeError as error:
+        got = f"batch dimensions {', '.join(str(tuple(shape)) for shape in batches)}"
+        raise QPError.expected("residuals", got, "ones that broadcast") from error
     flat = [
         x.expand(*batch, *x.shape[lead:]).reshape(batch.numel(), *x.shape[lead:])
         for x, lead in zip(operands, leads, strict=True)
@@ -81,7 +94,7 @@ def _of_part(module: nn.Module, part: str) -> dict[str, Tensor]:
     if not parametrize.is_parametrized(module, part):
         learned = part in module._parameters
         return {} if part in SIGNED and not learned else {part: getattr(module, part)}
-    chain = module.get_submodule(f"parametrizations.{part}")
+    chain: Any = module.get_submodule(f"parametrizations.{part}")
     names = MODELS.get(type(next(iter(chain.children()))), (part,))
     # By attribute, as a functional call replaces parameters with plain tensors.
     if hasattr(chain, "original"):
@@ -93,7 +106,10 @@ def _of_part(module: nn.Module, part: str) -> dict[str, Tensor]:
 def _with_residuals(
     module: nn.Module, part: str, before: dict[str, Tensor], residuals: dict[str, Tensor]
 ) -> Tensor:
-    after = [x + residuals[name] if name in residuals else x for name, x in before.items()]
+    after = [
+        x + to_dtype(residuals[name], x.dtype) if name in residuals else x
+        for name, x in before.items()
+    ]
     if not parametrize.is_parametrized(module, part):
         return after[0]
     first, *others = module.get_submodule(f"parametrizations.{part}").children()

@@ -342,7 +342,7 @@ class QPMPC(nn.Module):
     def forward(
         self, s: Tensor, a: Tensor | None = None, qp: QuadraticProgram | None = None
     ) -> Tensor:
-        """Return V(s), or Q(s, a) for an action."""
+        """Return V(s), or Q(s, a) for an action; ``qp`` is as in `value`."""
         return self.value(s, qp) if a is None else self.action_value(s, a, qp)
 
     def solve(
@@ -389,7 +389,10 @@ class QPMPC(nn.Module):
         warm_start: Tensor | None = None,
         qp: QuadraticProgram | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return pi(s), and the active set ``(*batch, n_g)`` as the next step's ``warm_start``."""
+        """Return pi(s), and the active set ``(*batch, n_g)`` as the next step's ``warm_start``.
+
+        ``qp`` is as in `solve`.
+        """
         solution = self.solve(s, warm_start=warm_start, qp=qp)
         return self._action(solution, s.dtype), solution.active
 
@@ -461,9 +464,7 @@ class QPMPC(nn.Module):
             of_plan = leaf[..., n_free:, n_free:] if dense else leaf[..., None, None]
             of_plan.copy_(NEAREST[self.step](of_plan))
 
-    def quadratic_program(
-        self, residuals: Mapping[str, Tensor] | None = None
-    ) -> QuadraticProgram:
+    def quadratic_program(self, residuals: Mapping[str, Tensor] | None = None) -> QuadraticProgram:
         """Return the current theta as a QuadraticProgram, with discounts (eq:qpH).
 
         Args:
@@ -482,13 +483,13 @@ class QPMPC(nn.Module):
             torch.Size([8])
         """
         with full_precision(self.C_0):
-            if residuals:
+            if residuals is not None:
                 theta = coordinates.moved(self, residuals)
             else:
                 theta = {part: getattr(self, part) for part in coordinates.parts(self)}
             H, q, w = self._cost(theta)
-            rest = {part: theta[part] for part in ("c", *CONSTRAINTS)}
-            return QuadraticProgram(H=H, q=q, w=w, **rest, check_values=False)
+            c, C, b, G, lb, ub = (theta[part] for part in ("c", *CONSTRAINTS))
+            return QuadraticProgram(H, q, c, C, b, G, lb, ub, w, check_values=False)
 
     def coordinates(self) -> dict[str, Tensor]:
         """Return the unconstrained coordinates of theta, those that residuals move, by name.
@@ -640,9 +641,10 @@ class QPMPC(nn.Module):
         def hessian(*blocks: Tensor) -> Tensor:
             return self._layout.hessian(self.hessian, blocks, self.discount, self.stages)
 
+        H = coordinates.for_each(hessian, blocks, self._block_ndims)
         # A hard row's w is a placeholder, to which its hardness adds inf.
         w = torch.addcmul(self.hardness, self.slack_discount, theta["w"])
-        return coordinates.for_each(hessian, blocks, self._block_ndims), self.discount * theta["q"], w
+        return H, self.discount * theta["q"], w
 
     def _parametrizations_for(self, name: str) -> list[nn.Module]:
         value, mask = getattr(self, name).detach(), self._masks.get(name)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +22,6 @@ from torch_qpmpc.qp.pipeline.arrays import Array, Theta, on_device, to_numpy
 from torch_qpmpc.qp.pipeline.prepared import Prepared, prepared_for
 from torch_qpmpc.qp.program import NDIMS
 from torch_qpmpc.qp.solvers.base import SoftQPs
-
 
 #: The positions of H, C and G.
 MATRICES = (0, 3, 5)
@@ -44,8 +44,8 @@ class Programs:
     ) -> tuple[Programs, torch.Size]:
         """Return the QPs of H, q, c, C, b, G, lb, ub, w, fixed, flattened, and their batch shape.
 
-        QPs that share matrices share one copy, as do those whose matrices are equal. The preparation
-        of what the whole batch shares is cached.
+        QPs that share matrices share one copy, as do those whose matrices are equal. The
+        preparation of a theta that the whole batch shares is cached.
 
         Args:
             operands: the tensors, of any batch shapes.
@@ -155,6 +155,6 @@ def _flat_theta(theta: Sequence[Tensor], batch: torch.Size) -> tuple[list[np.nda
         return flat, np.zeros(batch.numel(), np.int64)
     M = matrix_batch.numel()
     for i in MATRICES:
-        flat[i] = np.broadcast_to(flat[i], (M, *flat[i].shape[1:]))
+        flat[i] = flat[i] if len(flat[i]) == M else flat[i].repeat(M, axis=0)
     group = np.arange(M).reshape(matrix_batch)
     return flat, np.broadcast_to(group, batch).reshape(-1).astype(np.int64)
