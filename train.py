@@ -92,7 +92,7 @@ def _train(
         mpc.release()
     learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
     n_preview = (mpc.horizon + 1) * mpc.n_d
-    learned_mpc = mpc if cfg.algo.name == "qlearning" or cfg.algo.actor == "qp" else None
+    learned_mpc = None if cfg.algo.get("actor") == "mlp" else mpc
 
     # The data: vectorised episodes under the current policy, and their replay.
     collector = make_collector(cfg, physics, learner.actor)

@@ -75,8 +75,7 @@ def make_operator(
     keys["observation_key"] = observation_key
     if not SCHEDULED:
         return view(QPActorValueOperator(mpc, **keys))
-    theta = ThetaNetwork(mpc, {"q": 0.1, "b": 0.1}, width=4)
-    theta.in_keys = [observation_key]  # pyright: ignore[reportAttributeAccessIssue]
+    theta = ThetaNetwork(mpc, {"q": 0.1, "b": 0.1}, width=4, in_keys=[observation_key])
     # TorchRL's tests need a gradient in every layer, which a last layer of zeros does not give.
     last: Any = theta.net[-1]
     nn.init.normal_(last.weight)

@@ -285,7 +285,7 @@ def test_gauss_newton_takes_no_upstream_modules():
 
 def test_the_network_reads_other_keys():
     mpc, *_ = scheduled()
-    theta = ThetaNetwork(mpc, {"q": 0.5}, in_keys=["wind", ("nested", "load")])
+    theta = ThetaNetwork(mpc, {"q": 0.5}, in_keys=["wind", ("nested", "load")], n_in=3)
     td = TensorDict(wind=torch.ones(3, 2), nested=TensorDict(load=torch.ones(3, 1)), batch_size=3)
     assert theta(td)["theta", "q"].shape == (3, mpc.n_z)
 
@@ -302,6 +302,7 @@ def test_the_network_reads_other_keys():
             r"sizes\['q'\]: got 0.0, expected a n",
         ),
         (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, width=0), "width: got 0"),
+        (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, n_in=0), "n_in: got 0, expected a whole"),
         (
             lambda mpc: QPActorValueOperator(mpc, theta_keys={"w": "w"}),
             "theta_keys: got 'w', expected names among .* Add w to learn",

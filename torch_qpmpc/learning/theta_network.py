@@ -32,8 +32,8 @@ class ThetaNetwork(TensorDictModuleBase):
             ``{"q": 1.0, "b": 0.1}``. Residuals of vectors (q, c, b, lb, ub) are cheap. Those of
             matrices (H, H_f, C, G) need one factorisation per QP, ten and more times the time.
         width: units in each of the two hidden layers.
-        in_keys: the keys of the inputs, which are concatenated; by default those of p. The first
-            layer is then lazy: call the network once before it becomes part of a loss.
+        in_keys: the keys of the inputs, which are concatenated; by default those of p.
+        n_in: the number of their entries; by default n_p.
 
     Attributes:
         theta_keys: the key of each residual, an argument of `QPActorValueOperator`.
@@ -62,11 +62,14 @@ class ThetaNetwork(TensorDictModuleBase):
         *,
         width: int = 64,
         in_keys: Sequence[NestedKey] | None = None,
+        n_in: int | None = None,
     ) -> None:
         super().__init__()
         check_kind("mpc", mpc, QPMPC)
         check_kind("sizes", sizes, Mapping, "Map names to bounds: {'q': 1.0}.")
         check_whole("width", width, 1)
+        if n_in is not None:
+            check_whole("n_in", n_in, 1)
         known = mpc.coordinates()
         check_names("sizes", sizes, mpc)
         if not sizes:
@@ -81,7 +84,7 @@ class ThetaNetwork(TensorDictModuleBase):
         self.out_keys = list(self.theta_keys.values())  # pyright: ignore[reportAttributeAccessIssue]
         n_out, device = sum(shape.numel() for shape in self.shapes.values()), mpc.C_0.device
         cells, options = [width, width], {"activation_class": nn.Tanh, "device": device}
-        n_in = mpc.n_p if in_keys is None else None
+        n_in = mpc.n_p if n_in is None else n_in
         self.net = MLP(n_in, n_out, num_cells=cells, **options)
         last: Any = self.net[-1]
         nn.init.zeros_(last.weight)

@@ -71,9 +71,11 @@ def first_order(
                 effect = "The batch moves nothing."
                 keys: Any = loss_module.tensor_keys
                 invalid = invalid_rewards(batch, keys.reward, effect).view(-1)
-                error = losses["pred_value"] - losses["target_value"]
-                # An ensemble has one error per critic and transition.
-                lost = (~error.isfinite()).reshape(-1, len(batch)).any(0)
+                lost = invalid
+                if "pred_value" in losses:  # SAC's output has only sums
+                    error = losses["pred_value"] - losses["target_value"]
+                    # An ensemble has one error per critic and transition.
+                    lost = (~error.isfinite()).reshape(-1, len(batch)).any(0)
                 losses["unsolved"] = (lost & ~invalid).sum()
                 losses["invalid_reward"] = invalid.sum()
             return terms, losses
