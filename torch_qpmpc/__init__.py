@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from torch_qpmpc import envs as envs
     from torch_qpmpc.learning.operators import QPActorValueOperator
     from torch_qpmpc.learning.q_learning import QPQLearningLoss
+    from torch_qpmpc.learning.theta_network import ThetaNetwork
 
 __all__ = [
     "QPMPC",
@@ -34,6 +35,7 @@ __all__ = [
     "SolverError",
     "Status",
     "SystemIdentificationPenalty",
+    "ThetaNetwork",
     "identify",
     "solve_qp",
 ]
@@ -46,6 +48,7 @@ if not TYPE_CHECKING:
         "envs": "torch_qpmpc.envs:",
         "QPActorValueOperator": "torch_qpmpc.learning.operators:QPActorValueOperator",
         "QPQLearningLoss": "torch_qpmpc.learning.q_learning:QPQLearningLoss",
+        "ThetaNetwork": "torch_qpmpc.learning.theta_network:ThetaNetwork",
     }
 
     def __getattr__(name: str) -> Any:

@@ -11,10 +11,11 @@ import torchrl
 from tests.drop_in import networks
 
 
-@pytest.fixture(autouse=True, params=["state", "preview"])
-def known(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run every test with QPs that fix a state, and with QPs that fix a preview, too."""
+@pytest.fixture(autouse=True, params=["state", "preview", "scheduled"])
+def kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run every test with QPs of a state, of a preview, too, and of a theta from a network."""
     monkeypatch.setattr(networks, "PREVIEW", request.param == "preview")
+    monkeypatch.setattr(networks, "SCHEDULED", request.param == "scheduled")
 
 
 #: Reasons by the end of a test's name.

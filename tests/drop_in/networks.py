@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from tensordict.nn import AddStateIndependentNormalScale
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictSequential
 from torch import nn
 
-from torch_qpmpc import QPMPC, QPActorValueOperator
+from torch_qpmpc import QPMPC, QPActorValueOperator, ThetaNetwork
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
 
 
@@ -29,6 +30,8 @@ class Theta(QPMPC):
 
 #: True for QPs whose observation contains a preview [d_0, d_1], where it has the entries for one.
 PREVIEW = False
+#: True for QPs whose q and b a network schedules.
+SCHEDULED = False
 
 
 def make_theta(n_p: int, n_u: int, unused: str | None = None) -> Theta:
@@ -62,10 +65,29 @@ def make_theta(n_p: int, n_u: int, unused: str | None = None) -> Theta:
     return theta
 
 
+def make_operator(
+    mpc: Theta,
+    view: Callable[[QPActorValueOperator], Any],
+    observation_key: Any = "observation",
+    **keys: Any,
+) -> Any:
+    """Make a view of a QP, after the network of its theta if it is scheduled."""
+    keys["observation_key"] = observation_key
+    if not SCHEDULED:
+        return view(QPActorValueOperator(mpc, **keys))
+    theta = ThetaNetwork(mpc, {"q": 0.1, "b": 0.1}, width=4, in_keys=[observation_key])
+    # TorchRL's tests need a gradient in every layer, which a last layer of zeros does not give.
+    last: Any = theta.net[-1]
+    nn.init.normal_(last.weight)
+    operator = view(QPActorValueOperator(mpc, theta_keys=theta.theta_keys, **keys))
+    upstream: Any = theta
+    return TensorDictSequential(upstream, operator, selected_out_keys=operator.out_keys)
+
+
 def make_policy(n_p: int, n_u: int, observation: Any = "observation") -> Any:
     """Make a deterministic actor, without learning c, which no action depends on."""
     mpc = make_theta(n_p, n_u, unused="c")
-    return QPActorValueOperator(mpc, observation_key=observation).get_policy_operator()
+    return make_operator(mpc, lambda operator: operator.get_policy_operator(), observation)
 
 
 def make_gaussian(n_p: int, n_u: int) -> nn.Module:
@@ -75,11 +97,11 @@ def make_gaussian(n_p: int, n_u: int) -> nn.Module:
 
 def make_critic(n_p: int, n_u: int, **keys: Any) -> Any:
     """Make a critic, -Q, with keys that a test may rename."""
-    return QPActorValueOperator(make_theta(n_p, n_u), **keys)
+    return make_operator(make_theta(n_p, n_u), lambda operator: operator, **keys)
 
 
 def make_value(n_p: int, n_u: int, **keys: Any) -> Any:
     """Make a value, -V, initially below -Q: above it, IQL with expectile one learns nothing."""
-    operator = make_critic(n_p, n_u, **keys)
-    operator.module.c.data += 1000
-    return operator.get_value_operator()
+    mpc = make_theta(n_p, n_u)
+    mpc.c.data += 1000
+    return make_operator(mpc, lambda operator: operator.get_value_operator(), **keys)

@@ -25,6 +25,7 @@ from torch import nn
 from torchrl.data import Bounded
 
 from tests.drop_in.networks import make_critic, make_gaussian, make_policy, make_value
+from torch_qpmpc import QPMPC
 
 CHECKOUT = os.environ.get("TORCHRL_CHECKOUT")
 if not CHECKOUT:
@@ -148,7 +149,9 @@ class Stochastic(Base):
         action_key = ("action", "action1") if self.composite else "action"
         critic = make_critic(n_hidden, n_act, observation_key="hidden", action_key=action_key)
         # Of a batch of two, the clipped TD errors of a smooth L1 loss can cancel in c's gradient.
-        critic.module.c.data -= 5000  # its target has 0.99 of that
+        for part in critic.modules():
+            if isinstance(part, QPMPC):
+                part.c.data -= 5000  # its target has 0.99 of that
         value = make_value(n_hidden, n_act, observation_key="hidden")
         heads = [value, critic] if len(values) == 2 else [critic]
         return actor, *(TensorDictSequential(common, head) for head in heads), common, td

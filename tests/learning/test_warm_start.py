@@ -66,7 +66,7 @@ def test_an_operator_reads_and_writes_the_active_set():
 def test_the_loss_keeps_the_active_sets_of_both_problems(solver, delay_value):
     loss = make_loss(ACTIVE_SET, solver, delay_value=delay_value)
     td = transitions()
-    mpc = copy.deepcopy(loss.value_network.module)
+    mpc = copy.deepcopy(loss.operator.module)
     with SolveLog() as first:
         cold = loss(td)["loss_value"]
     cold.backward()

@@ -89,9 +89,8 @@ def make_learner(
         )
         actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
     else:
-        bounds = physics.lb_a, physics.ub_a
-        loss_module = make_actor_critic_loss(cfg, mpc, *bounds)
-        actor = make_closed_loop_actor(cfg, mpc, loss_module, *bounds)
+        loss_module = make_actor_critic_loss(cfg, mpc, physics)
+        actor = make_closed_loop_actor(cfg, mpc, loss_module, physics)
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
     deviation, si = make_penalties(cfg, mpc)
     optimizer = make_optimizer(cfg, mpc, loss_module)

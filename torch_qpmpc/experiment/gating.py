@@ -99,10 +99,10 @@ class RunGate:
         """Write the policy that acts to best.pt; without a gate, the checkpoint has it."""
         if self._gate is None:
             return
-        mpc = self.mpc
-        structure, state = (None, self.actor) if mpc is None else (mpc.structure, mpc)
-        buffer = io.BytesIO()
-        torch.save({"structure": structure, "policy": state.state_dict()}, buffer)
+        state, buffer = {"policy": self.actor.state_dict()}, io.BytesIO()
+        if self.mpc is not None:
+            state |= {"structure": self.mpc.structure, "mpc": self.mpc.state_dict()}
+        torch.save(state, buffer)
         write_whole(folder / BEST, buffer.getbuffer())
 
     def state_dict(self) -> dict[str, Any] | None:

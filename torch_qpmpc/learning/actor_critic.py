@@ -1,4 +1,4 @@
-"""Policies and critics for TorchRL's losses of DDPG and TD3.
+"""Policies and critics for TorchRL's losses of DDPG, TD3 and SAC.
 
 The policy gradient contains the gradient of the QP's solution, dpi/dtheta. The critic is a second
 QP or a network; the actor may be a network, too, for comparison.
@@ -6,13 +6,33 @@ QP or a network; the actor may be a network, too, for comparison.
 
 from __future__ import annotations
 
+import math
 from typing import Any, cast
 
 import torch
+from tensordict.nn import NormalParamExtractor
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from torch_qpmpc.mpc.module import QPMPC
+
+
+class Standardised(nn.Module):
+    """A module whose inputs are centred and scaled: ``module((x - centre) / spread)``."""
+
+    centre: Tensor
+    spread: Tensor
+
+    def __init__(self, centre: Tensor, spread: Tensor, module: nn.Module | None = None) -> None:
+        super().__init__()
+        self.module = nn.Identity() if module is None else module
+        self.register_buffer("centre", centre)
+        self.register_buffer("spread", spread)
+
+    def forward(self, *parts: Tensor) -> Tensor | tuple[Tensor, ...]:
+        """Map the parts of the input, side by side, to the module's outputs."""
+        x = torch.cat(parts, -1)
+        return self.module((x - self.centre.to(x)) / self.spread.to(x))
 
 
 class BoundedPolicy(nn.Module):
@@ -79,6 +99,48 @@ class ClippedPolicy(nn.Module):
         return clipped(self.module.policy(torch.cat(known, -1)), self.low, self.high)
 
 
+class Squashable(nn.Module):
+    """The location and scale of a TanhNormal distribution round an action within its bounds.
+
+    The distribution's mode is the action, up to a share of `REACH` of the way to each bound. The
+    scale is a parameter, which starts at ``std``, relative to half the distance of the bounds.
+    """
+
+    #: The tanh of the largest location.
+    REACH = 0.99
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, low: Tensor, high: Tensor, std: float) -> None:
+        super().__init__()
+        self.log_scale = nn.Parameter(torch.full((len(low),), math.log(std)))
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
+
+    def forward(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Map actions ``(*batch, n_u)`` to locations and scales."""
+        low, high = self.low.to(a), self.high.to(a)
+        share = (2 * a - (low + high)) / (high - low)
+        ends = torch.full_like(low, self.REACH)
+        return clipped(share, -ends, ends).atanh(), self.log_scale.exp().to(a).expand_as(a)
+
+
+class GaussianPolicy(nn.Module):
+    """A network for location and scale, ``width`` units a layer, in inputs of any float dtype."""
+
+    def __init__(self, n_p: int, n_u: int, width: int) -> None:
+        super().__init__()
+        self.net = MLP(n_p, 2 * n_u, num_cells=[width, width], activation_class=nn.ReLU)
+        self.split = NormalParamExtractor("biased_softplus_1.0", scale_lb=0.1)
+
+    def forward(self, *known: Tensor) -> tuple[Tensor, Tensor]:
+        """Map the parts of p, n_p entries in all, to a location and a scale ``(*batch, n_u)``."""
+        p = torch.cat(known, -1)
+        location, scale = self.split(self.net(p.float()))
+        return location.to(p.dtype), scale.to(p.dtype)
+
+
 class ActionValue(nn.Module):
     """A network for -Q(p, a), with ``width`` units in each layer and an output in ``scale``s."""
 
@@ -89,4 +151,4 @@ class ActionValue(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Map the parts of p and the action, n_p + n_u entries in all, to ``(*batch, 1)``."""
-        return self.scale * self.net(torch.cat(inputs, -1))
+        return self.scale * self.net(torch.cat(inputs, -1).float())

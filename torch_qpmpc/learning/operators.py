@@ -3,13 +3,17 @@
 What V fixes, p, is the entry ``observation``; with a ``preview_key``, it is the preview of known
 signals followed by the observation. Without either previews or past outputs it is the state s.
 
+With ``theta_keys``, entries that an upstream module writes, such as `ThetaNetwork`, are residuals
+of theta, and each QP of the batch has its own.
+
 Only here do costs become rewards: TorchRL maximises, so state_value = -V(s) and
 state_action_value = -Q(s, a), both with TorchRL's trailing dimension of one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -19,7 +23,9 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.coordinates import check_names
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.qp.program import QuadraticProgram
 
 #: The key of the known signals, as environments emit them.
 PREVIEW = "preview"
@@ -43,12 +49,14 @@ class _QPOperator(TensorDictModuleBase):
         out_key: NestedKey,
         active_set_key: NestedKey | None = None,
         preview_key: NestedKey | None = None,
+        theta_keys: Mapping[str, NestedKey] | None = None,
     ) -> None:
         super().__init__()
         check_kind("mpc", mpc, QPMPC)
         self.module = mpc
         self.active_set_key, self.preview_key = active_set_key, preview_key
-        in_keys = [*in_keys, *_if_any(preview_key)]
+        self.theta_keys = {} if theta_keys is None else _checked_keys(mpc, theta_keys)
+        in_keys = [*in_keys, *_if_any(preview_key), *self.theta_keys.values()]
         out_keys = [out_key, *_if_any(active_set_key)]
         self.in_keys = in_keys  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = out_keys  # pyright: ignore[reportAttributeAccessIssue]
@@ -64,20 +72,35 @@ class _QPOperator(TensorDictModuleBase):
             return observation
         return torch.cat((_read(tensordict, self.preview_key).to(observation), observation), -1)
 
+    def _program(self, tensordict: TensorDictBase) -> QuadraticProgram | None:
+        """Return the QPs with the residuals in ``tensordict``; None without ``theta_keys``."""
+        if not self.theta_keys:
+            return None
+        residuals = {name: _read(tensordict, key) for name, key in self.theta_keys.items()}
+        return self.module.quadratic_program(residuals)
+
     def _set_value(self, tensordict: TensorDictBase, *action_key: NestedKey) -> TensorDictBase:
         """Write -V, or -Q with the key of an action, to the first out-key."""
         inputs = [self.known(tensordict), *(_read(tensordict, key) for key in action_key)]
+        qp = self._program(tensordict)
         if self.active_set_key is None:
-            cost = self.module(*inputs)
+            cost = self.module(*inputs, qp=qp)
         else:
             start = tensordict.get(self.active_set_key, None)
-            cost, active = self.module.value_and_active_set(*inputs, warm_start=start)
+            cost, active = self.module.value_and_active_set(*inputs, warm_start=start, qp=qp)
             tensordict.set(self.active_set_key, active)
         return tensordict.set(self.out_keys[0], -cost.unsqueeze(-1))
 
 
 def _if_any(key: NestedKey | None) -> list[NestedKey]:
     return [] if key is None else [key]
+
+
+def _checked_keys(mpc: QPMPC, theta_keys: Any) -> dict[str, NestedKey]:
+    """Return ``theta_keys`` as a dict; raise `QPError` if a name is not a coordinate's."""
+    check_kind("theta_keys", theta_keys, Mapping, "Map names to keys: {'q': ('theta', 'q')}.")
+    check_names("theta_keys", theta_keys, mpc)
+    return dict(theta_keys)
 
 
 def _read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
@@ -101,14 +124,14 @@ class QPPolicyOperator(_QPOperator):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write pi(p) to the action key."""
-        p = self.known(tensordict)
+        p, qp = self.known(tensordict), self._program(tensordict)
         if self.active_set_key is None:
-            return tensordict.set(self.out_keys[0], self.module.policy(p))
+            return tensordict.set(self.out_keys[0], self.module.policy(p, qp=qp))
         start = tensordict.get(self.active_set_key, None)
         if start is None:
             rows = len(self.module.G)
             start = torch.zeros((*p.shape[:-1], rows), dtype=torch.int8, device=p.device)
-        action, active = self.module.policy_and_active_set(p, start)
+        action, active = self.module.policy_and_active_set(p, start, qp)
         tensordict.set(self.active_set_key, active)
         return tensordict.set(self.out_keys[0], action)
 
@@ -134,13 +157,18 @@ class QPActorValueOperator(_QPOperator):
         preview_key: the key of the known signals [d_k, .., d_{k+N}], ``(*batch, (N + 1) n_d)``; a
             third input, after the action. The observation is then the rest of p. None, the
             default, if there are none, or if the observation contains them.
+        theta_keys: the keys of residuals by their names in `QPMPC.coordinates`, such as
+            ``{"q": ("theta", "q")}``: further inputs ``(*batch, ..)``, which an upstream module
+            writes, see `ThetaNetwork` and `QPMPC.quadratic_program`. None, the default, shares
+            theta.
         state_value_key, state_action_value_key: the output keys of the value and the critic.
         active_set_key: the key where the value and the critic write the QP's active set, int8
             ``(*batch, n_g)``, after starting from the one they find there, such as one stored in a
             replay buffer. None, the default, starts cold.
 
     Raises:
-        QPError: if ``mpc`` is not a QPMPC, or a call lacks an input.
+        QPError: if ``mpc`` is not a QPMPC, a name in ``theta_keys`` is not a coordinate's, or a
+            call lacks an input.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -158,12 +186,14 @@ class QPActorValueOperator(_QPOperator):
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
         preview_key: NestedKey | None = None,
+        theta_keys: Mapping[str, NestedKey] | None = None,
         state_value_key: NestedKey = "state_value",
         state_action_value_key: NestedKey = "state_action_value",
         active_set_key: NestedKey | None = None,
     ) -> None:
         in_keys = [observation_key, action_key]
-        super().__init__(mpc, in_keys, state_action_value_key, active_set_key, preview_key)
+        keys = state_action_value_key, active_set_key, preview_key, theta_keys
+        super().__init__(mpc, in_keys, *keys)
         self.state_value_key = state_value_key
 
     @dispatch(auto_batch_size=False)
@@ -181,12 +211,12 @@ class QPActorValueOperator(_QPOperator):
         ``active_set_key`` is the key of the active set that each step of an episode passes to the
         next; it must not be the critic's. None starts each step cold.
         """
-        keys = self.in_keys[1], active_set_key, self.preview_key
+        keys = self.in_keys[1], active_set_key, self.preview_key, self.theta_keys
         return QPPolicyOperator(self.module, self.in_keys[:1], *keys)
 
     def get_value_operator(self) -> QPValueOperator:
         """Return the state value: observation, and preview if any, to state_value."""
-        keys = self.state_value_key, self.active_set_key, self.preview_key
+        keys = self.state_value_key, self.active_set_key, self.preview_key, self.theta_keys
         return QPValueOperator(self.module, self.in_keys[:1], *keys)
 
     def get_critic_operator(self) -> QPActorValueOperator:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import dispatch
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
@@ -92,7 +92,8 @@ class QPQLearningLoss(LossModule):
     checked: pass -L, not L.
 
     Args:
-        value_network: the critic to learn.
+        value_network: the critic to learn: a `QPActorValueOperator`, or a TensorDictSequential that
+            ends with one, whose other modules write its inputs, such as residuals of theta.
         delay_value: evaluate V(s+) with a target network. By default, as in the paper, with the
             current theta.
         td_error_clip: bound on the absolute TD error in the update; none by default.
@@ -158,14 +159,14 @@ class QPQLearningLoss(LossModule):
         "invalid_reward",
     ]
 
-    value_network: QPActorValueOperator
-    state_value_network: QPValueOperator
+    value_network: QPActorValueOperator | TensorDictSequential
+    state_value_network: QPValueOperator | TensorDictSequential
     value_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
 
     def __init__(
         self,
-        value_network: QPActorValueOperator,
+        value_network: QPActorValueOperator | TensorDictSequential,
         *,
         delay_value: bool = False,
         td_error_clip: float | None = None,
@@ -177,13 +178,12 @@ class QPQLearningLoss(LossModule):
         super().__init__()
         if gamma is not None:
             raise TypeError(_GAMMA_LMBDA_DEPREC_ERROR)
-        if not isinstance(value_network, QPActorValueOperator):
-            raise QPError.expected(
-                "value_network",
-                type(value_network).__name__,
-                "a QPActorValueOperator",
-                "Wrap the QPMPC: QPActorValueOperator(mpc).",
-            )
+        if not isinstance(last := _last(value_network), QPActorValueOperator):
+            got = type(last).__name__
+            if last is not value_network:
+                got = f"a TensorDictSequential that ends with {got}"
+            remedy = "Wrap the QPMPC: QPActorValueOperator(mpc)."
+            raise QPError.expected("value_network", got, "a QPActorValueOperator", remedy)
         if td_error_clip is not None:
             expected = "a positive number or None"
             check_number("td_error_clip", td_error_clip, lambda x: x > 0, expected)
@@ -203,19 +203,24 @@ class QPQLearningLoss(LossModule):
             create_target_params=delay_value,
         )
         # Not registered as a submodule, because its parameters are the value network's.
-        view = self.value_network.get_value_operator()
+        view = _in_place_of_last(self.value_network, self.operator.get_value_operator())
         object.__setattr__(self, "state_value_network", view)
+
+    @property
+    def operator(self) -> QPActorValueOperator:
+        """The operator of the QP, the last module of the value network."""
+        return _last(self.value_network)
 
     def get_extra_state(self) -> Tensor:
         """Return the part of the state_dict that identifies its QPMPC."""
-        return self.value_network.module.get_extra_state()
+        return self.operator.module.get_extra_state()
 
     def set_extra_state(self, state: Tensor) -> None:
         """Do nothing: `_load_from_state_dict` has compared it already."""
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         super()._load_from_state_dict(
-            self.value_network.module.checked_state(state_dict, prefix), prefix, *args
+            self.operator.module.checked_state(state_dict, prefix), prefix, *args
         )
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
@@ -293,8 +298,8 @@ class QPQLearningLoss(LossModule):
         if weights is not None and has_values(weights) and not weights.isfinite().all():
             name = str(self.tensor_keys.priority_weight)
             raise QPError.expected(name, "NaN or inf", "finite weights", "Check the priorities.")
-        active_set = self.value_network.active_set_key
-        visited = tensordict.select(*_reads(self.value_network), strict=False).detach()
+        active_set = self.operator.active_set_key
+        visited = tensordict.select(*self._reads(self.value_network), strict=False).detach()
         call_with(self.value_network_params, self.value_network, visited)
         if active_set is not None:
             tensordict.set(active_set, visited.get(active_set))
@@ -371,14 +376,19 @@ class QPQLearningLoss(LossModule):
 
     def _next_value(self, tensordict: TensorDictBase) -> Tensor:
         """Return -V(s+), ``(*batch, 1)``; zero after a termination, where it is not used."""
-        active_set = self.state_value_network.active_set_key
-        following = tensordict.get("next").select(*_reads(self.state_value_network), strict=False)
-        call_with(self.target_value_network_params, self.state_value_network, following)
+        active_set, network = self.operator.active_set_key, self.state_value_network
+        following = tensordict.get("next").select(*self._reads(network), strict=False)
+        call_with(self.target_value_network_params, network, following)
         if active_set is not None:
             tensordict.set(unravel_key(("next", active_set)), following.get(active_set))
         done = tensordict.get(("next", self.tensor_keys.done))
         terminated = tensordict.get(("next", self.tensor_keys.terminated), default=done)
         return following[self.tensor_keys.value].masked_fill(terminated, 0.0)
+
+    def _reads(self, network: TensorDictModuleBase) -> list[NestedKey]:
+        """Return the in-keys of a view of the QP, and its active-set key if there is one."""
+        key = self.operator.active_set_key
+        return [*network.in_keys, *([] if key is None else [key])]
 
 
 def _check_factor(name: str, value: Any) -> None:
@@ -387,7 +397,14 @@ def _check_factor(name: str, value: Any) -> None:
     check_number(name, value, lambda x: 0 <= x <= 1, "a number in [0, 1]")
 
 
-def _reads(network: QPActorValueOperator | QPValueOperator) -> list[NestedKey]:
-    """Return the network's in-keys, and its active-set key if it has one."""
-    start = [] if network.active_set_key is None else [network.active_set_key]
-    return [*network.in_keys, *start]
+def _last(network: Any) -> Any:
+    """Return the last module of a sequence, or the module itself."""
+    return network.module[-1] if isinstance(network, TensorDictSequential) else network
+
+
+def _in_place_of_last(network: Any, last: Any) -> Any:
+    """Return ``last``, or the sequence of which it replaces the last module."""
+    if not isinstance(network, TensorDictSequential):
+        return last
+    upstream: Any = network.module[:-1]
+    return TensorDictSequential(*upstream, last)

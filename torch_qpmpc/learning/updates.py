@@ -16,6 +16,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.q_learning import QPQLearningLoss, invalid_rewards, td_loss, td_metadata
@@ -70,9 +71,11 @@ def first_order(
                 effect = "The batch moves nothing."
                 keys: Any = loss_module.tensor_keys
                 invalid = invalid_rewards(batch, keys.reward, effect).view(-1)
-                error = losses["pred_value"] - losses["target_value"]
-                # An ensemble has one error per critic and transition.
-                lost = (~error.isfinite()).reshape(-1, len(batch)).any(0)
+                lost = invalid
+                if "pred_value" in losses:  # SAC's output has only sums
+                    error = losses["pred_value"] - losses["target_value"]
+                    # An ensemble has one error per critic and transition.
+                    lost = (~error.isfinite()).reshape(-1, len(batch)).any(0)
                 losses["unsolved"] = (lost & ~invalid).sum()
                 losses["invalid_reward"] = invalid.sum()
             return terms, losses
@@ -110,8 +113,16 @@ def second_order(
         loss_module: the loss that defines the targets.
         optimizer: the optimiser of ``mpc``.
         deviation, si: the penalties on C; None for none.
+
+    Raises:
+        QPError: the value network has other modules or ``theta_keys``: the step's curvature is that
+            of the QP's own theta.
     """
     network = loss_module.value_network
+    if network is not loss_module.operator or network.theta_keys:
+        remedy = "Learn with first_order and a torch optimiser."
+        got = "a value network with theta_keys or upstream modules"
+        raise QPError.expected("loss_module", got, "a QPActorValueOperator alone", remedy)
     action = network.in_keys[1]
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:

@@ -13,7 +13,6 @@ D^f on (d_N, x_N) (eq:v1c4), then one for each entry of the changes u_k - u_{k-1
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -210,33 +209,3 @@ def _diagonal_blocks(rows: Tensor, count: int, first: int, width: int, step: int
     columns = (start.unsqueeze(-1) + torch.arange(width, device=rows.device)).unsqueeze(1)
     blocks = rows.unflatten(0, (count, len(rows) // count))
     return blocks.gather(-1, columns.expand(-1, blocks.shape[1], -1))
-
-
-class Discounts(NamedTuple):
-    """The discount factors of theta's cost.
-
-    ``z`` ``(n_z,)`` and ``rows`` ``(n_g,)`` are gamma^k, or one. ``hardness`` ``(n_g,)`` is added
-    to w: inf for a hard row, whose w is a placeholder, and zero otherwise. ``stages`` is
-    `Layout.tied_stages`.
-    """
-
-    z: Tensor
-    rows: Tensor
-    hardness: Tensor
-    stages: Tensor
-
-
-def discounted(
-    layout: Layout,
-    kind: str,
-    blocks: tuple[Tensor, ...],
-    q: Tensor,
-    w: Tensor,
-    discounts: Discounts,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return H ``(n_z, n_z)``, q ``(n_z,)`` and w ``(n_g,)`` of the QP.
-
-    ``blocks`` are theta's H of the stages and of x_N, or a full one.
-    """
-    H = layout.hessian(kind, blocks, discounts.z, discounts.stages)
-    return H, discounts.z * q, torch.addcmul(discounts.hardness, discounts.rows, w)

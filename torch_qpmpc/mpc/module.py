@@ -16,10 +16,9 @@ from torch.nn.utils import parametrize
 
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc import initial, parameters, pickling
+from torch_qpmpc.mpc import coordinates, initial, parameters, pickling
 from torch_qpmpc.mpc.identification import identify
 from torch_qpmpc.mpc.identity import check_identity, digest, encoded
-from torch_qpmpc.mpc.layout import Discounts, discounted
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST
 from torch_qpmpc.mpc.validation import (
@@ -217,6 +216,7 @@ class QPMPC(nn.Module):
         theta |= initial.started(theta, **arguments)
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
+        self._block_ndims = [theta[name].ndim for name in ("H", "H_f") if name in theta]
         for name, start in theta.items():
             parameters.register(self, name, start.to(torch.float64).clone(), name in self.learned)
             if name in self.learned:
@@ -327,16 +327,23 @@ class QPMPC(nn.Module):
         """
         return self._value(self._checked(s, a), qp)
 
-    def policy(self, s: Tensor, warm_start: QPSolution | Tensor | None = None) -> Tensor:
+    def policy(
+        self,
+        s: Tensor,
+        warm_start: QPSolution | Tensor | None = None,
+        qp: QuadraticProgram | None = None,
+    ) -> Tensor:
         """Return pi(s), the u_0 of V's solution: s ``(*batch, n_p)`` to ``(*batch, n_u)``.
 
-        ``warm_start`` and errors are as in `solve`.
+        ``warm_start``, ``qp`` and errors are as in `solve`.
         """
-        return self._action(self.solve(s, warm_start=warm_start), s.dtype)
+        return self._action(self.solve(s, warm_start=warm_start, qp=qp), s.dtype)
 
-    def forward(self, s: Tensor, a: Tensor | None = None) -> Tensor:
-        """Return V(s), or Q(s, a) for an action."""
-        return self.value(s) if a is None else self.action_value(s, a)
+    def forward(
+        self, s: Tensor, a: Tensor | None = None, qp: QuadraticProgram | None = None
+    ) -> Tensor:
+        """Return V(s), or Q(s, a) for an action; ``qp`` is as in `value`."""
+        return self.value(s, qp) if a is None else self.action_value(s, a, qp)
 
     def solve(
         self,
@@ -351,7 +358,8 @@ class QPMPC(nn.Module):
             s: states ``(*batch, n_x)`` or, with more known, p ``(*batch, n_p)``.
             a: actions ``(*batch, n_u)``.
             warm_start: see `solve_qp`.
-            qp: the `quadratic_program` of the current theta, if it is available.
+            qp: the `quadratic_program` of the current theta, if it is available, or of the current
+                theta with residuals.
 
         Raises:
             QPError: an argument is invalid, or (with ``on_failure="raise"``) all unsolved QPs have
@@ -361,21 +369,31 @@ class QPMPC(nn.Module):
         return self._solve(self._checked(s, a), qp, warm_start)
 
     def value_and_active_set(
-        self, s: Tensor, a: Tensor | None = None, warm_start: Tensor | None = None
+        self,
+        s: Tensor,
+        a: Tensor | None = None,
+        warm_start: Tensor | None = None,
+        qp: QuadraticProgram | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return V(s) or Q(s, a), and the active set ``(*batch, n_g)`` of its solution.
 
-        ``warm_start`` is an active set of nearly equal QPs, as in `solve`.
+        ``warm_start`` is an active set of nearly equal QPs, as in `solve`; so is ``qp``.
         """
         fixed = self._checked(s, a)
-        solution = self._solve(fixed, None, warm_start)
+        solution = self._solve(fixed, qp, warm_start)
         return to_dtype(solution.value, fixed.dtype), solution.active
 
     def policy_and_active_set(
-        self, s: Tensor, warm_start: Tensor | None = None
+        self,
+        s: Tensor,
+        warm_start: Tensor | None = None,
+        qp: QuadraticProgram | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return pi(s), and the active set ``(*batch, n_g)`` as the next step's ``warm_start``."""
-        solution = self.solve(s, warm_start=warm_start)
+        """Return pi(s), and the active set ``(*batch, n_g)`` as the next step's ``warm_start``.
+
+        ``qp`` is as in `solve`.
+        """
+        solution = self.solve(s, warm_start=warm_start, qp=qp)
         return self._action(solution, s.dtype), solution.active
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -446,22 +464,41 @@ class QPMPC(nn.Module):
             of_plan = leaf[..., n_free:, n_free:] if dense else leaf[..., None, None]
             of_plan.copy_(NEAREST[self.step](of_plan))
 
-    def quadratic_program(self) -> QuadraticProgram:
-        """Return the current theta as a QuadraticProgram, with discounts (eq:qpH)."""
+    def quadratic_program(self, residuals: Mapping[str, Tensor] | None = None) -> QuadraticProgram:
+        """Return the current theta as a QuadraticProgram, with discounts (eq:qpH).
+
+        Args:
+            residuals: tensors ``(*batch, ..)``, such as the outputs of a network, that are added to
+                theta's `coordinates` of these names, before factors become H and w: the QPs of the
+                batch then have their own theta. Parts without residuals stay shared.
+
+        Raises:
+            QPError: a residual's name, shape or device is wrong.
+
+        Example:
+            >>> import torch, torch_qpmpc as qm
+            >>> mpc, s = qm.QPMPC(2, 1, 5), torch.zeros(8, 2)
+            >>> b = torch.zeros(8, 10)  # residuals of the model's offsets, one per state
+            >>> mpc.value(s, mpc.quadratic_program({"b": b})).shape
+            torch.Size([8])
+        """
         with full_precision(self.C_0):
-            H, q, w = self._cost()
-            return QuadraticProgram(
-                H=H,
-                q=q,
-                c=self.c,
-                C=self.C,
-                b=self.b,
-                G=self.G,
-                lb=self.lb,
-                ub=self.ub,
-                w=w,
-                check_values=False,
-            )
+            if residuals is not None:
+                theta = coordinates.moved(self, residuals)
+            else:
+                theta = {part: getattr(self, part) for part in coordinates.parts(self)}
+            H, q, w = self._cost(theta)
+            c, C, b, G, lb, ub = (theta[part] for part in ("c", *CONSTRAINTS))
+            return QuadraticProgram(H, q, c, C, b, G, lb, ub, w, check_values=False)
+
+    def coordinates(self) -> dict[str, Tensor]:
+        """Return the unconstrained coordinates of theta, those that residuals move, by name.
+
+        They are the parts, or the tensors that learned parts are computed from: the factors of H,
+        H_f and w, which are coordinates only if learned, the shorter vectors of tied parts, and A,
+        B, E and D, D_f of a tied C and G. H with ``step="projection"`` is its own coordinate.
+        """
+        return coordinates.coordinates(self)
 
     def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
         """Return parameter groups for an optimiser, one for each learned part of theta.
@@ -597,11 +634,17 @@ class QPMPC(nn.Module):
         """Return u_0 of a solution of V's QP."""
         return to_dtype(solution.z[..., self.n_p : self.n_p + self.n_u], dtype)
 
-    def _cost(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return H, q and w of the QP."""
-        discounts = Discounts(self.discount, self.slack_discount, self.hardness, self.stages)
-        blocks = (self.H,) if self.hessian == "full" else (self.H, self.H_f)
-        return discounted(self._layout, self.hessian, blocks, self.q, self.w, discounts)
+    def _cost(self, theta: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return H, q and w of the QP with the parts ``theta``."""
+        blocks = [theta[name] for name in ("H", "H_f") if name in theta]
+
+        def hessian(*blocks: Tensor) -> Tensor:
+            return self._layout.hessian(self.hessian, blocks, self.discount, self.stages)
+
+        H = coordinates.for_each(hessian, blocks, self._block_ndims)
+        # A hard row's w is a placeholder, to which its hardness adds inf.
+        w = torch.addcmul(self.hardness, self.slack_discount, theta["w"])
+        return H, self.discount * theta["q"], w
 
     def _parametrizations_for(self, name: str) -> list[nn.Module]:
         value, mask = getattr(self, name).detach(), self._masks.get(name)

@@ -97,7 +97,7 @@ class FinishedRun:
         mpc = copy.deepcopy(self.start)
         if state["structure"] != mpc.structure:
             mpc.release(state["structure"])
-        mpc.load_state_dict(state["policy" if self.cfg.gate else "mpc"])
+        mpc.load_state_dict(state["mpc"])
         return mpc
 
     @property

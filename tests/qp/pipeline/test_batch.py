@@ -102,7 +102,7 @@ def test_a_diagonal_is_one_of_a_single_square_matrix():
     )  # G has 13 rows
     H[3, 5] = H[5, 3] = 1e-300
     assert Programs.of(H, *theta, known.fixed)[0].prepared.diagonal == (False, False)
-    many = torch.eye(12).double().expand(3, 12, 12)
+    many = torch.arange(1.0, 4.0).double()[:, None, None] * torch.eye(12).double()
     assert Programs.of(many, *theta, known.fixed)[0].prepared.diagonal == (False, False)
 
 
@@ -111,3 +111,19 @@ def test_theta_in_float32_is_solved_in_float64():
     theta = Programs.of(*known.qp.tensors(), known.fixed)[0].theta
     assert {x.dtype for x in theta} == {np.dtype(np.float64)}
     assert isinstance(theta, Theta)
+
+
+def test_operands_with_equal_rows_are_shared():
+    known = known_qp(0)
+    batched = [x.expand(4, *x.shape).contiguous() for x in known.qp.tensors()]
+    programs, batch = Programs.of(*batched, known.fixed)
+    assert batch == (4,)
+    assert len(programs) == 4
+    assert programs.prepared.shared
+    assert programs.prepared is Programs.of(*known.qp.tensors(), known.fixed)[0].prepared
+    batched[1] = batched[1] + torch.arange(4.0).double()[:, None]
+    programs, _ = Programs.of(*batched, known.fixed)
+    assert [len(x) for x in programs.theta] == [1, 1, 1, 4, 1, 1, 1, 1, 1]
+    batched[0] = batched[0] * torch.arange(1.0, 5.0).double()[:, None, None]
+    programs, _ = Programs.of(*batched, known.fixed)
+    assert [len(x) for x in programs.theta[:4]] == [4, 4, 4, 4]

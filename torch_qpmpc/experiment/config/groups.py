@@ -24,7 +24,12 @@ from torch_qpmpc.experiment.fields import (
 from torch_qpmpc.learning.search import KNOBS
 from torch_qpmpc.mpc.validation import CONSTRAINTS, STRUCTURES
 
-Network = Annotated[str, one_of(("qp", "mlp"))]
+#: The coordinates of theta that an actor's network can move in any task.
+SCHEDULED = ("q", "b", "c", "lb", "ub")
+Sizes = Annotated[
+    dict[Literal[SCHEDULED], Positive],
+    Expected(f"a mapping of some of {', '.join(SCHEDULED)} to numbers > 0"),
+]
 Beta = Annotated[float, Field(ge=0, lt=1)]
 
 
@@ -104,12 +109,15 @@ class QLearning(Group):
 
 
 class DDPG(Group):
+    """The actor is a QP, a QP whose theta a network schedules, or a network."""
+
     name: Literal["ddpg"]
-    actor: Network
-    critic: Network
+    actor: Annotated[str, one_of(("qp", "scheduled", "mlp"))]
+    critic: Annotated[str, one_of(("qp", "mlp"))]
     actor_rate: Positive
     lr_network: Positive
     width: Count
+    theta: Sizes = Field(default={"q": 1.0, "b": 0.1}, min_length=1)
 
 
 class TD3(DDPG):
@@ -117,6 +125,10 @@ class TD3(DDPG):
     policy_delay: Count
     policy_noise: NonNegative
     noise_clip: NonNegative
+
+
+class SAC(DDPG):
+    name: Literal["sac"]
 
 
 class FromModel(Group):
@@ -173,6 +185,6 @@ class RayWorkers(Workers):
 
 
 Optimizer = Annotated[Adam | SGD | GaussNewton, Field(discriminator="name")]
-Algorithm = Annotated[QLearning | DDPG | TD3, Field(discriminator="name")]
+Algorithm = Annotated[QLearning | DDPG | TD3 | SAC, Field(discriminator="name")]
 Start = Annotated[FromModel | FromData, Field(discriminator="name")]
 Collector = Annotated[SingleProcess | Workers | RayWorkers, Field(discriminator="name")]

@@ -182,7 +182,7 @@ class Config(Group):
             self.conflict("replay", "true", f"{name} learns from a replay.")
         if self.algo.actor == "mlp" and self.penalised:
             remedy = "The penalties are on a QP's C: choose constraint=free."
-            self.conflict("algo.actor", "qp", remedy)
+            self.conflict("algo.actor", "qp or scheduled", remedy)
         if self.step != "cholesky":
             self.conflict("step", "cholesky", f"The critics of {name} support no other step.")
         return self

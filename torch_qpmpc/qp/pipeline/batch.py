@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +22,9 @@ from torch_qpmpc.qp.pipeline.arrays import Array, Theta, on_device, to_numpy
 from torch_qpmpc.qp.pipeline.prepared import Prepared, prepared_for
 from torch_qpmpc.qp.program import NDIMS
 from torch_qpmpc.qp.solvers.base import SoftQPs
+
+#: The positions of H, C and G.
+MATRICES = (0, 3, 5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +44,8 @@ class Programs:
     ) -> tuple[Programs, torch.Size]:
         """Return the QPs of H, q, c, C, b, G, lb, ub, w, fixed, flattened, and their batch shape.
 
-        QPs that share matrices share one copy. The preparation of a theta that the whole batch
-        shares is cached.
+        QPs that share matrices share one copy, as do those whose matrices are equal. The
+        preparation of a theta that the whole batch shares is cached.
 
         Args:
             operands: the tensors, of any batch shapes.
@@ -58,11 +62,12 @@ class Programs:
             batches = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
             batch = broadcast(batch, *batches)
         fixed = _flattened(fixed.detach(), batch, (n_f,)).to(device, torch.float64).contiguous()
-        if shared:
-            prepared = prepared_for([to_numpy(x) for x in theta], n_kept, device)
-            group = np.zeros(len(fixed), np.int64)
-        else:
+        flat, group = [to_numpy(x)[np.newaxis] for x in theta], np.zeros(len(fixed), np.int64)
+        if not shared:
             flat, group = _flat_theta(theta, batch)
+        if all(len(x) == 1 for x in flat):
+            prepared = prepared_for([x[0] for x in flat], n_kept, device)
+        else:
             prepared = Prepared(Theta.of(flat), group, n_kept, device)
         fixed = fixed.numpy(force=True) if device is None else fixed
         return cls(prepared, on_device(group, device), fixed), batch
@@ -135,15 +140,21 @@ def _flattened(x: Tensor, batch: torch.Size, event: Sequence[int]) -> Tensor:
 def _flat_theta(theta: Sequence[Tensor], batch: torch.Size) -> tuple[list[np.ndarray], np.ndarray]:
     """Return theta with one leading dimension, and the group of each QP.
 
-    A vector that the batch shares has one row.
+    A vector that the batch shares has one row, and so have all three matrices together.
     """
-    events = [x.shape[x.ndim - n :] for x, n in zip(theta, NDIMS, strict=True)]
-    matrix_batch = broadcast(*(theta[i].shape[:-2] for i in (0, 3, 5)))  # of H, C and G
-    flat = []
-    for x, event in zip(theta, events, strict=True):
-        shared = len(event) < 2 and x.numel() == event.numel()
-        shape = torch.Size([1]) if shared else matrix_batch if len(event) == 2 else batch
-        x = x.reshape(event) if shared else x
-        flat.append(to_numpy(_flattened(x, shape, event)))
-    group = np.arange(matrix_batch.numel()).reshape(matrix_batch)
+    flat: list[Any] = [None] * len(theta)
+    matrix_batch = broadcast(*(theta[i].shape[:-2] for i in MATRICES))
+    for i, (x, n) in enumerate(zip(theta, NDIMS, strict=True)):
+        event = x.shape[x.ndim - n :]
+        shape = matrix_batch if n == 2 else batch
+        rows = x.reshape(event) if x.numel() == event.numel() else x
+        flat[i] = to_numpy(_flattened(rows, torch.Size([1]) if rows.ndim == n else shape, event))
+        if len(flat[i]) > 1 and (flat[i] == flat[i][0]).all():
+            flat[i] = flat[i][:1]
+    if all(len(flat[i]) == 1 for i in MATRICES):
+        return flat, np.zeros(batch.numel(), np.int64)
+    M = matrix_batch.numel()
+    for i in MATRICES:
+        flat[i] = flat[i] if len(flat[i]) == M else flat[i].repeat(M, axis=0)
+    group = np.arange(M).reshape(matrix_batch)
     return flat, np.broadcast_to(group, batch).reshape(-1).astype(np.int64)

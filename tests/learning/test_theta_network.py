@@ -1,0 +1,328 @@
+"""A QP whose theta a network schedules, as TorchRL modules: ThetaNetwork, theta_keys, losses."""
+
+# TensorDict annotates less than its modules take, and wrong types are the mistakes under test.
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+# pyright: reportOptionalOperand=false, reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import (
+    AddStateIndependentNormalScale,
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torch import Tensor
+from torch.testing import assert_close
+from torchrl.collectors import Collector
+from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.modules import AdditiveGaussianModule, ProbabilisticActor, TanhNormal
+from torchrl.objectives import DDPGLoss, SACLoss, SoftUpdate, TD3Loss
+
+from tests.problems import random_mpc
+from torch_qpmpc import (
+    QPMPC,
+    GaussNewton,
+    QPActorValueOperator,
+    QPError,
+    QPQLearningLoss,
+    ThetaNetwork,
+)
+from torch_qpmpc.envs import PointMassEnv
+from torch_qpmpc.learning.updates import second_order
+
+SIZES = {"q": 0.3, "b": 0.1, "c": 1.0}
+
+
+def scheduled(
+    known: dict[str, Any] | None = None, moved: bool = True, **keys: Any
+) -> tuple[QPMPC, ThetaNetwork, QPActorValueOperator]:
+    """Make a QP, the network of its theta, and their operator; ``moved`` shifts the network."""
+    torch.manual_seed(0)
+    mpc = random_mpc(3, action_slack=5.0, **(known or {}))
+    theta = ThetaNetwork(mpc, SIZES, width=8)
+    if moved:
+        with torch.no_grad():
+            theta.net[-1].weight.normal_(std=0.5)
+    preview = {"preview_key": "preview"} if mpc.n_d else {}
+    return mpc, theta, QPActorValueOperator(mpc, theta_keys=theta.theta_keys, **preview, **keys)
+
+
+def critic_of(theta: Any, operator: Any) -> TensorDictSequential:
+    return TensorDictSequential(theta, operator)
+
+
+def actor_of(theta: Any, operator: Any, **options: Any) -> TensorDictSequential:
+    policy = operator.get_policy_operator(**options)
+    return TensorDictSequential(theta, policy, selected_out_keys=["action"])
+
+
+def transitions(mpc: QPMPC, count: int = 6) -> TensorDictBase:
+    generator = torch.Generator().manual_seed(1)
+
+    def known() -> dict[str, Tensor]:
+        p = torch.rand(count, mpc.n_p, generator=generator) - 0.5
+        n = (mpc.horizon + 1) * mpc.n_d
+        return {"observation": p[:, n:]} | ({"preview": p[:, :n]} if n else {})
+
+    flags = {name: torch.zeros(count, 1, dtype=torch.bool) for name in ("done", "terminated")}
+    following = TensorDict(known() | flags, [count])
+    following["reward"] = -torch.rand(count, 1, generator=generator)
+    action = 0.4 * torch.rand(count, mpc.n_u, generator=generator)
+    return TensorDict(known() | {"action": action, "next": following}, [count])
+
+
+def test_a_new_network_leaves_the_mpc_as_it_is():
+    mpc, theta, operator = scheduled(moved=False)
+    td = transitions(mpc)
+    assert theta(td.clone())["theta", "q"].abs().max() == 0
+    plain = QPActorValueOperator(mpc)
+    pairs = [
+        (critic_of(theta, operator), plain, "state_action_value"),
+        (actor_of(theta, operator), plain.get_policy_operator(), "action"),
+        (
+            TensorDictSequential(theta, operator.get_value_operator()),
+            plain.get_value_operator(),
+            "state_value",
+        ),
+    ]
+    for ours, other, key in pairs:
+        assert torch.equal(ours(td.clone())[key], other(td.clone())[key])
+
+
+@pytest.mark.parametrize("known", [{}, {"past": 2, "n_d": 1}], ids=["state", "window"])
+def test_values_and_policy_are_those_of_the_qp_with_residuals(known):
+    mpc, theta, operator = scheduled(known)
+    td = transitions(mpc)
+    assert theta.in_keys == (["preview", "observation"] if known else ["observation"])
+    p = torch.cat([td[key] for key in theta.in_keys], -1)
+    residuals = theta(td.clone())["theta"].to_dict()
+    assert all(0 < x.abs().max() <= SIZES[name] for name, x in residuals.items())
+    assert residuals["q"].shape == (6, mpc.n_z)
+    qp = mpc.quadratic_program(residuals)
+    assert torch.equal(
+        critic_of(theta, operator)(td.clone())["state_action_value"].squeeze(-1),
+        -mpc.action_value(p, td["action"], qp),
+    )
+    assert torch.equal(actor_of(theta, operator)(td.clone())["action"], mpc.policy(p, qp=qp))
+    assert not torch.equal(mpc.policy(p, qp=qp), mpc.policy(p))
+
+
+@pytest.mark.parametrize("output", ["state_value", "state_action_value", "action"])
+def test_finite_differences_through_theta_keys(output):
+    mpc, theta, operator = scheduled()
+    theta.double()
+    td = transitions(mpc).double()
+    views = {
+        "state_value": TensorDictSequential(theta, operator.get_value_operator()),
+        "state_action_value": critic_of(theta, operator),
+        "action": actor_of(theta, operator),
+    }
+
+    def total() -> Tensor:
+        return views[output](td.clone())[output].sum()
+
+    total().backward()
+    weight: Any = theta.net[-1].weight
+    eps = 1e-5
+    direction = torch.randn_like(weight)
+    slope = 0.0
+    with torch.no_grad():
+        for sign in (1, -1):
+            weight.add_(sign * eps * direction)
+            slope += sign * total().item() / (2 * eps)
+            weight.sub_(sign * eps * direction)
+    assert weight.grad is not None
+    assert (weight.grad * direction).sum().item() == pytest.approx(slope, rel=1e-4)
+
+
+def test_warm_starts_are_carried_with_a_scheduled_theta():
+    mpc, theta, operator = scheduled(active_set_key="active_set")
+    td = critic_of(theta, operator)(transitions(mpc))
+    again = critic_of(theta, operator)(td.clone())
+    assert_close(again["state_action_value"], td["state_action_value"])
+    actor = TensorDictSequential(
+        theta, operator.get_policy_operator("carried"), selected_out_keys=["action", "carried"]
+    )
+    first = actor(td.select("observation"))
+    assert first["carried"].dtype == torch.int8
+    assert_close(actor(first.clone())["action"], first["action"])
+
+
+@pytest.mark.parametrize("known", [{}, {"past": 2, "n_d": 1}], ids=["state", "window"])
+@pytest.mark.parametrize("delay_value", [False, True])
+def test_q_learning_trains_the_network_and_the_qp(delay_value, known):
+    mpc, theta, operator = scheduled(known, moved=False)
+    loss = QPQLearningLoss(critic_of(theta, operator), delay_value=delay_value)
+    loss.make_value_estimator(gamma=0.9)
+    assert ("theta", "q") not in loss.in_keys
+    td = transitions(mpc)
+    before = set(td.keys(True, True))
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    parts = [theta.net[-1].weight, *mpc.leaves("C")]
+    start = [x.detach().clone() for x in parts]
+    loss(td)["loss_value"].backward()
+    optimizer.step()
+    assert all((x != y).any() for x, y in zip(parts, start, strict=True))
+    assert set(td.keys(True, True)) - before == {"td_error"}  # theta is not stored
+
+
+def test_the_loss_is_that_of_the_residuals_by_hand():
+    mpc, theta, operator = scheduled()
+    loss = QPQLearningLoss(critic_of(theta, operator))
+    loss.make_value_estimator(gamma=0.9)
+    td = transitions(mpc)
+    value = TensorDictSequential(theta, operator.get_value_operator())(td["next"].clone())
+    target = td["next", "reward"] + 0.9 * value["state_value"]
+    prediction = critic_of(theta, operator)(td.clone())["state_action_value"]
+    assert_close(loss(td)["loss_value"], 0.5 * (target - prediction).square().mean())
+
+
+def test_target_networks_hold_the_network_and_move_softly():
+    _, theta, operator = scheduled()
+    loss = QPQLearningLoss(critic_of(theta, operator), delay_value=True)
+    loss.make_value_estimator(gamma=0.9)
+    update = SoftUpdate(loss, tau=0.25)
+
+    def last(params: Any) -> Tensor:
+        found = params.flatten_keys(".").to_dict()
+        return next(x for name, x in found.items() if name.endswith("net.4.weight"))
+
+    target, online = loss.target_value_network_params, loss.value_network_params
+    start = last(target).clone()
+    assert torch.equal(start, last(online))
+    with torch.no_grad():
+        theta.net[-1].weight.add_(1.0)
+    update.step()
+    assert_close(last(target), start + 0.25)
+
+
+def test_the_state_dict_holds_the_network():
+    def build(seed: int) -> tuple[ThetaNetwork, QPQLearningLoss]:
+        _, theta, operator = scheduled()
+        torch.manual_seed(seed)
+        with torch.no_grad():
+            theta.net[-1].weight.normal_()
+        loss = QPQLearningLoss(critic_of(theta, operator), delay_value=True)
+        loss.make_value_estimator(gamma=0.9)
+        return theta, loss
+
+    (theta, loss), (other, fresh) = build(1), build(2)
+    assert not torch.equal(theta.net[-1].weight, other.net[-1].weight)
+    fresh.load_state_dict(loss.state_dict())
+    assert torch.equal(theta.net[-1].weight, other.net[-1].weight)
+    for twin in (copy.deepcopy(theta), pickle.loads(pickle.dumps(theta))):
+        assert_close(twin.state_dict(), theta.state_dict())
+        assert twin.theta_keys == theta.theta_keys
+
+
+@pytest.mark.parametrize("kind", ["ddpg", "td3", "sac"])
+def test_losses_of_torchrl(kind):
+    mpc, theta, operator = scheduled(moved=False)
+    _, *of_critic = scheduled()
+    critic, td = critic_of(*of_critic), transitions(mpc)
+    actor: Any = actor_of(theta, operator)
+    if kind == "ddpg":
+        loss: Any = DDPGLoss(actor, critic, delay_actor=True, delay_value=True)
+    elif kind == "td3":
+        twins = [critic, copy.deepcopy(critic)]
+        loss = TD3Loss(actor, twins, bounds=(torch.tensor([-0.5]), torch.tensor([0.5])))
+    else:
+        spread: Any = TensorDictModule(
+            AddStateIndependentNormalScale(1), ["action"], ["loc", "scale"]
+        )
+        net = TensorDictSequential(actor, spread, selected_out_keys=["loc", "scale"])
+        stochastic = ProbabilisticActor(
+            net, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True
+        )
+        twins = [critic, copy.deepcopy(critic)]
+        loss = SACLoss(stochastic, twins, action_spec=Bounded(-0.5, 0.5, (1,)))
+    loss.make_value_estimator(gamma=0.9)
+    out = loss(td)
+    sum(x for name, x in out.items() if name.startswith("loss")).backward()
+    of_actor = loss.actor_network_params.flatten_keys(".").to_dict()
+    grads = {name: x.grad for name, x in of_actor.items() if "net.4" in name}
+    assert len(grads) == 2
+    assert all(grad is not None and grad.abs().max() > 0 for grad in grads.values())
+    name = "value_network_params" if kind == "ddpg" else "qvalue_network_params"
+    of_value = getattr(loss, name).flatten_keys(".").to_dict()
+    assert any(x.grad is not None and x.grad.abs().max() > 0 for x in of_value.values())
+    assert "theta" not in td
+    SoftUpdate(loss, tau=0.1).step()
+
+
+def test_a_replay_stores_observations_and_no_theta():
+    mpc = QPMPC(n_x=4, n_u=2, horizon=3, action_bounds=([-1.0] * 2, [1.0] * 2), solver="daqp")
+    theta = ThetaNetwork(mpc, {"q": 0.1})
+    operator = QPActorValueOperator(mpc, theta_keys=theta.theta_keys)
+    env = PointMassEnv(num_envs=2, seed=0)
+    noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
+    explorer: Any = TensorDictSequential(actor_of(theta, operator), noise)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(16), batch_size=4)
+    options: Any = {"frames_per_batch": 4, "auto_register_policy_transforms": False}
+    for batch in Collector(env, explorer, total_frames=8, **options):
+        replay.extend(batch.reshape(-1))
+    sample = replay.sample()
+    assert not any("theta" in str(key) for key in sample.keys(True, True))
+    loss = QPQLearningLoss(critic_of(theta, operator))
+    loss.make_value_estimator(gamma=0.9)
+    assert loss(sample)["loss_value"].isfinite()
+
+
+def test_gauss_newton_takes_no_upstream_modules():
+    mpc, theta, operator = scheduled()
+    for network in (critic_of(theta, operator), operator):
+        loss = QPQLearningLoss(network)
+        with pytest.raises(QPError, match="loss_module: got a value network with theta_keys"):
+            second_order(mpc, loss, GaussNewton(mpc), None, None)
+
+
+def test_the_network_reads_other_keys():
+    mpc, *_ = scheduled()
+    theta = ThetaNetwork(mpc, {"q": 0.5}, in_keys=["wind", ("nested", "load")], n_in=3)
+    td = TensorDict(wind=torch.ones(3, 2), nested=TensorDict(load=torch.ones(3, 1)), batch_size=3)
+    assert theta(td)["theta", "q"].shape == (3, mpc.n_z)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda mpc: ThetaNetwork(torch.nn.Linear(1, 1), {"q": 1.0}), "mpc: got Linear"),  # pyright: ignore[reportArgumentType]
+        (lambda mpc: ThetaNetwork(mpc, ["q"]), "sizes: got list, expected a Mapping. Map names"),
+        (lambda mpc: ThetaNetwork(mpc, {}), "sizes: got {}, expected bounds of some of H, q, c"),
+        (lambda mpc: ThetaNetwork(mpc, {"A": 1.0}), "sizes: got 'A', expected names among H, q"),
+        (
+            lambda mpc: ThetaNetwork(mpc, {"q": 0.0}),
+            r"sizes\['q'\]: got 0.0, expected a n",
+        ),
+        (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, width=0), "width: got 0"),
+        (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, n_in=0), "n_in: got 0, expected a whole"),
+        (
+            lambda mpc: QPActorValueOperator(mpc, theta_keys={"w": "w"}),
+            "theta_keys: got 'w', expected names among .* Add w to learn",
+        ),
+        (
+            lambda mpc: QPActorValueOperator(mpc, theta_keys="q"),
+            "theta_keys: got str, expected a Mapping. Map names to keys",
+        ),
+        (
+            lambda mpc: QPActorValueOperator(mpc, theta_keys={"q": ("theta", "q")})(
+                transitions(mpc)
+            ),
+            r"\('theta', 'q'\): got a TensorDict with .*, expected one with \('theta', 'q'\)",
+        ),
+        (
+            lambda mpc: QPQLearningLoss(TensorDictSequential(ThetaNetwork(mpc, {"q": 1.0}))),
+            "value_network: got a TensorDictSequential that ends with ThetaNetwork",
+        ),
+    ],
+)
+def test_mistakes(call, message):
+    with pytest.raises(QPError, match=message):
+        call(random_mpc(3))

@@ -1,0 +1,103 @@
+"""A network that moves theta with the observation: gain scheduling of the QP."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import nn
+from torchrl.modules import MLP
+
+from torch_qpmpc.checks import check_kind, check_number, check_whole
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.learning.operators import known_keys
+from torch_qpmpc.mpc.coordinates import check_names
+from torch_qpmpc.mpc.module import QPMPC
+
+
+class ThetaNetwork(TensorDictModuleBase):
+    """A network from p to residuals of theta, an upstream module for ``theta_keys``.
+
+    Each residual is ``size * tanh(..)``, which bounds it. The last layer starts at zero, so that
+    the QP is first the one of ``mpc`` alone. The parameters are float32; inputs may be of any float
+    dtype.
+
+    Args:
+        mpc: the QPMPC, of which only the shapes of its coordinates are used.
+        sizes: the bounds of the residuals by their names in `QPMPC.coordinates`, such as
+            ``{"q": 1.0, "b": 0.1}``. Residuals of vectors (q, c, b, lb, ub) are cheap. Those of
+            matrices (H, H_f, C, G) need one factorisation per QP, ten and more times the time.
+        width: units in each of the two hidden layers.
+        in_keys: the keys of the inputs, which are concatenated; by default those of p.
+        n_in: the number of their entries; by default n_p.
+
+    Attributes:
+        theta_keys: the key of each residual, an argument of `QPActorValueOperator`.
+
+    Raises:
+        QPError: an argument is invalid.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictSequential
+        >>> mpc = qm.QPMPC(2, 1, 5)
+        >>> theta = qm.ThetaNetwork(mpc, {"q": 1.0, "b": 0.1})
+        >>> operator = qm.QPActorValueOperator(mpc, theta_keys=theta.theta_keys)
+        >>> loss = qm.QPQLearningLoss(TensorDictSequential(theta, operator))
+        >>> policy = operator.get_policy_operator()
+        >>> actor = TensorDictSequential(theta, policy, selected_out_keys=["action"])
+        >>> actor(TensorDict(observation=torch.ones(3, 2), batch_size=3))["action"].shape
+        torch.Size([3, 1])
+    """
+
+    def __init__(
+        self,
+        mpc: QPMPC,
+        sizes: Mapping[str, float],
+        *,
+        width: int = 64,
+        in_keys: Sequence[NestedKey] | None = None,
+        n_in: int | None = None,
+    ) -> None:
+        super().__init__()
+        check_kind("mpc", mpc, QPMPC)
+        check_kind("sizes", sizes, Mapping, "Map names to bounds: {'q': 1.0}.")
+        check_whole("width", width, 1)
+        if n_in is not None:
+            check_whole("n_in", n_in, 1)
+        known = mpc.coordinates()
+        check_names("sizes", sizes, mpc)
+        if not sizes:
+            raise QPError.expected("sizes", "{}", f"bounds of some of {', '.join(known)}")
+        for name, size in sizes.items():
+            check_number(f"sizes[{name!r}]", size, lambda x: 0 < x < torch.inf, "a number > 0")
+        self.sizes = {name: float(size) for name, size in sizes.items()}
+        self.shapes = {name: known[name].shape for name in sizes}
+        self.theta_keys: dict[str, NestedKey] = {name: ("theta", name) for name in sizes}
+        keys = known_keys(mpc) if in_keys is None else in_keys
+        self.in_keys = list(keys)  # pyright: ignore[reportAttributeAccessIssue]
+        self.out_keys = list(self.theta_keys.values())  # pyright: ignore[reportAttributeAccessIssue]
+        n_out, device = sum(shape.numel() for shape in self.shapes.values()), mpc.C_0.device
+        cells, options = [width, width], {"activation_class": nn.Tanh, "device": device}
+        n_in = mpc.n_p if n_in is None else n_in
+        self.net = MLP(n_in, n_out, num_cells=cells, **options)
+        last: Any = self.net[-1]
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the residuals to ``theta_keys`` of ``tensordict``, and return it."""
+        dtype = self.net[-1].bias.dtype
+        inputs = torch.cat([tensordict.get(key).to(dtype) for key in self.in_keys], -1)
+        counts = [shape.numel() for shape in self.shapes.values()]
+        flat = self.net(inputs).tanh().split(counts, -1)
+        for (name, shape), entries in zip(self.shapes.items(), flat, strict=True):
+            residual = (self.sizes[name] * entries).reshape(*entries.shape[:-1], *shape)
+            tensordict.set(self.theta_keys[name], residual)
+        return tensordict
