@@ -1,0 +1,56 @@
+"""Random states of every kind for the self-test and the comparison with an exact solver."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torch_qpmpc.export.reference import Reference, sharpen
+from torch_qpmpc.export.tables import Array, Tables
+from torch_qpmpc.export.writer import Example
+from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.qp.program import Status
+
+#: Examples of each kind.
+EACH = 3
+
+
+def draw(tables: Tables, count: int, seed: int = 0) -> Array:
+    """Draw p ``(count, n_p)`` at sizes from a hundredth to ten times that which reaches the bounds.
+
+    An entry's size is the median, over the rows that contain it, of that at which the row without
+    multipliers is at its nearest bound.
+    """
+    rng = np.random.default_rng(seed)
+    rows = tables.rows
+    near = np.minimum(
+        *(np.where(np.abs(x) > 0, np.abs(x), np.inf) for x in (rows.lower, rows.upper))
+    )
+    scale = np.ones(tables.n_p)
+    for j, column in enumerate(np.abs(rows.Y).T):
+        reaches = np.isfinite(near) & (column > 1e-9 * column.max(initial=0))
+        if reaches.any():
+            scale[j] = np.median(near[reaches] / column[reaches])
+    sizes = 10 ** rng.uniform(-2, 1, (count, 1))
+    return sizes * scale * rng.standard_normal((count, tables.n_p))
+
+
+def choose(
+    mpc: QPMPC, tables: Tables, p: Array, coarse: Reference
+) -> tuple[list[Example], Reference]:
+    """Choose a few states of each kind, and return exact solutions of them."""
+    solved, states = coarse.status == Status.SOLVED, np.abs(coarse.active)
+    kinds = {
+        "interior": solved & (states == 0).all(-1),
+        "at bounds": solved & (states == 1).any(-1) & (states != 2).all(-1),
+        "saturated": solved & (states == 2).any(-1),
+        "infeasible": coarse.status == Status.INFEASIBLE,
+    }
+    chosen = {kind: np.flatnonzero(mask)[:EACH] for kind, mask in kinds.items()}
+    exact = sharpen(mpc, p, coarse, np.concatenate([chosen[kind] for kind in [*kinds][:3]]))
+    codes = {"infeasible": 2}
+    examples = [
+        Example(kind, p[i], codes.get(kind, 0), exact.u[i], float(exact.value[i]))
+        for kind, indices in chosen.items()
+        for i in indices
+    ]
+    return examples, exact
