@@ -30,12 +30,19 @@ static real larger(real a, real b) { return a > b ? a : b; }
 static real smaller(real a, real b) { return a < b ? a : b; }
 static int is_finite(real x) { return x - x == 0; }
 
+/* Four sums at once: a compiler may not reorder one. */
 static real dot(const real *a, const real *b, int n)
 {
-    real sum = 0;
+    real s0 = 0, s1 = 0, s2 = 0, s3 = 0;
     int i;
-    for (i = 0; i < n; i++) sum += a[i] * b[i];
-    return sum;
+    for (i = 0; i + 3 < n; i += 4) {
+        s0 += a[i] * b[i];
+        s1 += a[i + 1] * b[i + 1];
+        s2 += a[i + 2] * b[i + 2];
+        s3 += a[i + 3] * b[i + 3];
+    }
+    for (; i < n; i++) s0 += a[i] * b[i];
+    return (s0 + s1) + (s2 + s3);
 }
 
 static void add(real *a, real factor, const real *b, int n)
@@ -48,29 +55,47 @@ static void add(real *a, real factor, const real *b, int n)
 
 static real entry(int i, int j) { return dot(R[i], R[j], POLICY_D); }
 
+/* Update y to the multipliers that have changed since the last call. */
 static void respond(policy_state *s)
 {
     real *plan = s->work + 2 * POLICY_HELD_;
     int i;
     for (i = 0; i < POLICY_D; i++) plan[i] = 0;
-    for (i = 0; i < POLICY_ROWS; i++)
-        if (s->lambda[i] != 0) add(plan, s->lambda[i], R[i], POLICY_D);
-    for (i = 0; i < POLICY_ROWS; i++) s->y[i] = s->y_free[i] - dot(R[i], plan, POLICY_D);
+    for (i = 0; i < POLICY_ROWS; i++) {
+        if (s->lambda[i] == s->before[i]) continue;
+        add(plan, s->lambda[i] - s->before[i], R[i], POLICY_D);
+        s->before[i] = s->lambda[i];
+    }
+    for (i = 0; i < POLICY_ROWS; i++) s->y[i] -= dot(R[i], plan, POLICY_D);
 }
 
 #else
 
 static real entry(int i, int j) { return Q[i][j]; }
 
+/* Update y to the multipliers that have changed since the last call. */
 static void respond(policy_state *s)
 {
     int i;
-    for (i = 0; i < POLICY_ROWS; i++) s->y[i] = s->y_free[i];
-    for (i = 0; i < POLICY_ROWS; i++)
-        if (s->lambda[i] != 0) add(s->y, -s->lambda[i], Q[i], POLICY_ROWS);
+    for (i = 0; i < POLICY_ROWS; i++) {
+        if (s->lambda[i] == s->before[i]) continue;
+        add(s->y, s->before[i] - s->lambda[i], Q[i], POLICY_ROWS);
+        s->before[i] = s->lambda[i];
+    }
 }
 
 #endif
+
+/* Compute y from all multipliers. */
+static void respond_anew(policy_state *s)
+{
+    int i;
+    for (i = 0; i < POLICY_ROWS; i++) {
+        s->y[i] = s->y_free[i];
+        s->before[i] = 0;
+    }
+    respond(s);
+}
 
 /* Return the bound that a row is held at. */
 static real bound(const policy_state *s, int row)
@@ -89,22 +114,25 @@ static real highest(int row, int side)
     return side < 0 && Y_LOWER[row] < Y_UPPER[row] ? 0 : W[row];
 }
 
-/* The factor: row i of L, without its unit diagonal, begins at i (i - 1) / 2. */
-static real *factor_row(policy_state *s, int i) { return s->lower + (i * (i - 1)) / 2; }
+/* The factor: column i of L, from below its unit diagonal. */
+static real *column(policy_state *s, int i)
+{
+    return s->lower + i * (POLICY_HELD - 1) - (i * (i - 1)) / 2;
+}
 
 /* Solve L x = x. */
 static void solve_lower(policy_state *s, real *x, int n)
 {
     int i;
-    for (i = 1; i < n; i++) x[i] -= dot(factor_row(s, i), x, i);
+    for (i = 0; i < n; i++) add(x + i + 1, -x[i], column(s, i), n - 1 - i);
 }
 
 /* Solve D L' x = x. */
 static void solve_upper(policy_state *s, real *x, int n)
 {
     int i;
-    for (i = 0; i < n; i++) x[i] /= s->diagonal[i];
-    for (i = n - 1; i > 0; i--) add(x, -x[i], factor_row(s, i), i);
+    for (i = n - 1; i >= 0; i--)
+        x[i] = x[i] / s->diagonal[i] - dot(column(s, i), x + i + 1, n - 1 - i);
 }
 
 /* Append a row to the factor; return 0 if it depends on the held rows.
@@ -112,13 +140,13 @@ static void solve_upper(policy_state *s, real *x, int n)
    x becomes the solution of L x = Q[held][row] in either case. */
 static int append(policy_state *s, int row, real *x)
 {
-    real pivot = 1, *l = factor_row(s, s->n_held);
+    real pivot = 1;
     int i, n = s->n_held;
     for (i = 0; i < n; i++) x[i] = entry(row, s->held[i]);
     solve_lower(s, x, n);
     for (i = 0; i < n; i++) pivot -= x[i] * x[i] / s->diagonal[i];
     if (n == POLICY_HELD || pivot <= DEPENDENT) return 0;
-    for (i = 0; i < n; i++) l[i] = x[i] / s->diagonal[i];
+    for (i = 0; i < n; i++) column(s, i)[n - 1 - i] = x[i] / s->diagonal[i];
     s->diagonal[n] = pivot;
     s->held[n] = row;
     s->n_held++;
@@ -128,26 +156,29 @@ static int append(policy_state *s, int row, real *x)
 /* Remove the held row at a position, by a rank-one update of the rows after it. */
 static void drop(policy_state *s, int at)
 {
-    real *column = s->work + POLICY_HELD_, weight = s->diagonal[at];
+    real *removed = s->work + POLICY_HELD_, weight = s->diagonal[at];
     int i, j, n = --s->n_held;
-    for (i = at; i < n; i++) { /* move row i + 1 to i, without its entry in column `at` */
-        const real *from = factor_row(s, i + 1);
-        real *to = factor_row(s, i);
-        column[i] = from[at];
-        for (j = 0; j < at; j++) to[j] = from[j];
-        for (j = at; j < i; j++) to[j] = from[j + 1];
+    for (i = 0; i < at; i++) { /* the columns before it lose an entry */
+        real *l = column(s, i);
+        for (j = at - i - 1; j < n - i - 1; j++) l[j] = l[j + 1];
+    }
+    for (j = at; j < n; j++) removed[j] = column(s, at)[j - at];
+    for (i = at; i < n; i++) { /* those after it move */
+        const real *from = column(s, i + 1);
+        real *to = column(s, i);
+        for (j = 0; j < n - 1 - i; j++) to[j] = from[j];
         s->diagonal[i] = s->diagonal[i + 1];
         s->held[i] = s->held[i + 1];
     }
-    for (i = at; i < n; i++) { /* L D L' + weight column column' */
-        real old = s->diagonal[i], c = column[i], beta;
+    for (i = at; i < n; i++) { /* L D L' + weight removed removed' */
+        real *l = column(s, i), *v = removed + i + 1, c = removed[i];
+        real old = s->diagonal[i], beta;
         s->diagonal[i] = old + weight * c * c;
         beta = weight * c / s->diagonal[i];
         weight *= old / s->diagonal[i];
-        for (j = i + 1; j < n; j++) {
-            real *l = factor_row(s, j);
-            column[j] -= c * l[i];
-            l[i] += beta * column[j];
+        for (j = 0; j < n - 1 - i; j++) {
+            v[j] -= c * l[j];
+            l[j] += beta * v[j];
         }
     }
 }
@@ -293,13 +324,17 @@ static int worst(const policy_state *s, int *side, real *excess, int *settled)
 static int solve(policy_state *s, int *iterations)
 {
     int refinements = 0;
-    respond(s);
+    respond_anew(s);
     for (;;) {
         real excess = 0;
         int row, side = 0, settled;
         settle(s, iterations);
         respond(s);
         row = worst(s, &side, &excess, &settled);
+        if (row < 0) { /* judge y without the rounding of its updates */
+            respond_anew(s);
+            row = worst(s, &side, &excess, &settled);
+        }
         if (row < 0 && (settled || refinements++ == REFINEMENTS)) return POLICY_SOLVED;
         if (*iterations >= MAX_ITERATIONS) return POLICY_LIMIT;
         if (row < 0) continue;

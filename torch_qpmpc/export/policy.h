@@ -24,7 +24,8 @@ typedef struct {
     policy_real diagonal[POLICY_HELD_];        /* D */
     policy_real u[POLICY_N_U];                 /* the last action */
     policy_real y_free[POLICY_ROWS_];          /* rows without multipliers */
-    policy_real y[POLICY_ROWS_];               /* rows */
+    policy_real y[POLICY_ROWS_];               /* rows with the multipliers before[] */
+    policy_real before[POLICY_ROWS_];
     policy_real size[POLICY_ROWS_];            /* size of the terms of a row */
     policy_real work[2 * POLICY_HELD_ + POLICY_WORK];
     int held[POLICY_HELD_];                    /* rows held at a bound, in the order of the factor */

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.qp.program import QuadraticProgram, Status
+from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solution import row_states
 from torch_qpmpc.qp.solve import solve_qp
 

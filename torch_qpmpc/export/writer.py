@@ -224,7 +224,7 @@ def number(x: float, dtype: str) -> str:
 
 
 def _examples(tables: Tables, settings: Settings, examples: Sequence[Example]) -> str:
-    """Return the tables of the self-test, with tolerances relative to the largest expected number."""
+    """Return the tables of the self-test, relative to the largest expected number."""
     dtype, near = settings.dtype, NEAR[settings.dtype]
     solved = [example for example in examples if example.code == 0]
     u = np.array([e.u for e in solved]).reshape(-1, tables.n_u)
@@ -258,7 +258,7 @@ def table_bytes(tables: Tables, settings: Settings) -> int:
 def state_bytes(tables: Tables, settings: Settings) -> int:
     """Return the size of the state, with C's padding."""
     size = {k: int(v) for k, v in sizes_of(tables, settings).items()}
-    reals = 4 * size["ROWS_"] + size["TRIANGLE"] + 3 * size["HELD_"] + size["WORK"] + size["N_U"]
+    reals = 5 * size["ROWS_"] + size["TRIANGLE"] + 3 * size["HELD_"] + size["WORK"] + size["N_U"]
     real = np.dtype(settings.dtype).itemsize
     total = reals * real + 4 * (size["HELD_"] + 1) + size["ROWS_"]
     return -(-total // real) * real
