@@ -34,6 +34,7 @@ from torch_qpmpc.experiment.algorithms import evaluate, make_learner
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, drop_previous, save_checkpoint
 from torch_qpmpc.experiment.collection import batches, make_collector, make_run_replay
 from torch_qpmpc.experiment.config import check_config
+from torch_qpmpc.experiment.exporting import export_run
 from torch_qpmpc.experiment.interrupt import Interrupt
 from torch_qpmpc.experiment.launch import launched
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
@@ -161,6 +162,8 @@ def _train(
         if cfg.figures and learned_mpc is not None:
             figure = summary_figure(mpc, loops, *run.column("eval/J"))
             figure.savefig(run.path / "summary.png", dpi=110)
+        if cfg.export is not None:
+            export_run(mpc, run.path, quiet)
         run.finish(summary)
         drop_previous(run.path / CHECKPOINT)
     if not quiet:

@@ -21,7 +21,12 @@ LAYERS = {
     "experiment": {"errors", "checks", "qp", "mpc", "learning", "envs", "analysis"},
     "study": {"errors", "checks", "qp", "mpc", "learning", "envs", "analysis", "experiment"},
     "report": {"study"},  # `python -m torch_qpmpc.report`
-    "export/__main__": {"study"},  # `python -m torch_qpmpc.export`
+    "export/__main__": {
+        "errors",
+        "export",
+        "experiment",
+        "study",
+    },  # `python -m torch_qpmpc.export`
 }
 #: Imports against the layers' order, with the reason.
 EXCEPTIONS = {

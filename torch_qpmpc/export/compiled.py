@@ -1,106 +1,95 @@
-"""Compile exported C, and call it from Python."""
+"""`CompiledPolicy`: the exported C of a policy, loaded into Python."""
 
 from __future__ import annotations
 
-import ctypes
-import importlib.util
-import os
-import shlex
-import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from torch_qpmpc.errors import QPError
-from torch_qpmpc.export.writer import filled
+from torch_qpmpc.checks import check_kind, check_tensor
+from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.export.export import build
+from torch_qpmpc.export.library import Steps, required_compiler
+from torch_qpmpc.mpc.module import QPMPC
 
-FLAGS = ("-std=c99", "-O3", "-fPIC", "-shared")
-
-
-def compiler() -> list[str] | None:
-    """Return the command of a C compiler: that of $CC, cc, gcc, clang or ziglang's; None if none."""
-    if named := shlex.split(os.environ.get("CC", "")):
-        return named if shutil.which(named[0]) else None
-    for name in ("cc", "gcc", "clang"):
-        if found := shutil.which(name):
-            return [found]
-    if importlib.util.find_spec("ziglang"):
-        return [sys.executable, "-m", "ziglang", "cc"]
-    return None
+#: The causes of the codes.
+CODES = ("solved", "not certified within max_iterations", "infeasible", "invalid p")
 
 
-class Steps(NamedTuple):
-    """The results of one step of each of B controllers.
+class CompiledPolicy:
+    """The policy and value of a QPMPC in compiled C, for fast closed loops.
+
+    It holds the theta of its creation. Each row of a batch is a controller that starts from its own
+    last active set, so that a closed loop of B plants passes ``(B, n_p)`` at each step.
+
+    Args:
+        mpc: the QPMPC; its ``on_failure`` is that of the policy: ``"raise"`` raises on a step that
+            is not solved, and others return the action that C writes.
+        options: ``dtype``, ``storage`` and ``max_iterations``, as in `QPMPC.export_c`.
 
     Attributes:
-        u: the actions, ``(B, n_u)``.
-        codes: 0 if solved, 1 if not certified within the limit of iterations, 2 if infeasible, and
-            3 if p is invalid, ``(B,)``.
-        value, gap, violation, iterations: the costs to go, the bounds on their errors, the largest
-            violations of a hard row, and the changes of the active set, ``(B,)``.
+        export: sizes and measured agreement, an `Export`.
+        last: the results of the last step: actions, codes, values and their error bounds.
+
+    Raises:
+        QPError: no C compiler is installed, or as in `QPMPC.export_c`.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> mpc = qm.QPMPC(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
+        >>> policy = qm.CompiledPolicy(mpc)
+        >>> s = torch.tensor([[1.0, 0.0], [-0.5, 0.3]])
+        >>> torch.allclose(policy(s), mpc.policy(s))
+        True
     """
 
-    u: np.ndarray
-    codes: np.ndarray
-    value: np.ndarray
-    gap: np.ndarray
-    violation: np.ndarray
-    iterations: np.ndarray
-
-
-class Library:
-    """The functions of an exported policy, compiled into a shared library."""
-
-    def __init__(self, folder: Path, name: str, dtype: str, flags: tuple[str, ...] = FLAGS) -> None:
-        command = compiler()
-        if command is None:
+    def __init__(self, mpc: QPMPC, **options: Any) -> None:
+        check_kind("mpc", mpc, QPMPC)
+        chosen = {"dtype": "float64", "max_iterations": None, "storage": "fast"}
+        if unknown := options.keys() - chosen.keys():
             raise QPError.expected(
-                "compiler",
-                "none on the PATH",
-                "a C compiler: $CC, cc, gcc or clang",
-                "Install one, or pip install ziglang, which contains clang.",
+                "options", ", ".join(sorted(unknown)), f"some of {', '.join(chosen)}"
             )
-        self.real = np.dtype(dtype)
-        with tempfile.TemporaryDirectory() as temporary:
-            wrapper = Path(temporary) / "wrapper.c"
-            wrapper.write_text(filled("wrapper.c", name), encoding="utf-8")
-            target = Path(temporary) / f"{name}.so"
-            files = [str(folder / f"{name}.c"), str(wrapper), f"-I{folder}", "-o", str(target)]
-            ended = subprocess.run(
-                [*command, *flags, *files], capture_output=True, text=True, check=False
-            )
-            if ended.returncode:
-                got = f"an error of {' '.join(command)}: {ended.stderr.strip()[-500:]}"
-                raise QPError.expected("compiler", got, "a compiled policy")
-            library = ctypes.CDLL(str(target))
-        self._steps = library[f"{name}_steps"]
-        self._resets = library[f"{name}_resets"]
-        self.selftest = library[f"{name}_selftest"]
-        size = library[f"{name}_state_size"]
-        size.restype = ctypes.c_ulong
-        self.state_bytes = int(size())
-        pointer, long = ctypes.c_void_p, ctypes.c_long
-        self._steps.argtypes = [pointer] * 5 + [long]
-        self._resets.argtypes = [pointer, long]
-        self._info = np.dtype(
-            [(n, self.real) for n in ("value", "gap", "violation")] + [("iterations", np.int32)],
-            align=True,
-        )
+        chosen |= options
+        required_compiler()
+        with tempfile.TemporaryDirectory() as folder:
+            self.export, library = build(mpc, Path(folder), name="policy", **chosen)
+        assert library is not None
+        self._library = library
+        self._n_p, self._n_u, self._raises = mpc.n_p, mpc.n_u, mpc.on_failure == "raise"
+        self._states, self._count = library.states(1), 1
+        self.last: Steps | None = None
 
-    def states(self, count: int) -> np.ndarray:
-        """Return the reset states of ``count`` controllers, as bytes."""
-        states = np.zeros(count * self.state_bytes, dtype=np.uint8)
-        self._resets(states.ctypes.data, count)
-        return states
+    def __call__(self, s: Tensor) -> Tensor:
+        """Return pi(s): s ``(*batch, n_p)`` to ``(*batch, n_u)``.
 
-    def steps(self, states: np.ndarray, p: np.ndarray, n_u: int) -> Steps:
-        """Step each controller with its p ``(count, n_p)``."""
-        p = np.ascontiguousarray(p, dtype=self.real)
-        u = np.empty((len(p), n_u), dtype=self.real)
-        info, codes = np.empty(len(p), dtype=self._info), np.empty(len(p), dtype=np.int32)
-        self._steps(*(x.ctypes.data for x in (states, p, u, info, codes)), len(p))
-        return Steps(u, codes, *(info[name] for name in self._info.names or ()))
+        Raises:
+            QPError: the shape or type of s is wrong.
+            SolverError: with ``on_failure="raise"``, a step is not solved.
+        """
+        check_tensor("s", s, self._n_p)
+        p = s.detach().cpu().numpy().reshape(-1, self._n_p)
+        if len(p) != self._count:
+            self._states, self._count = self._library.states(len(p)), len(p)
+        self.last = self._library.steps(self._states, p, self._n_u)
+        if self._raises and self.last.codes.any():
+            codes = np.bincount(self.last.codes, minlength=len(CODES))
+            found = [f"{codes[i]} {CODES[i]}" for i in range(1, len(CODES)) if codes[i]]
+            total = f"{(self.last.codes != 0).sum()} of {len(p)}"
+            raise SolverError(f"{total} steps have no certified solution: {', '.join(found)}.")
+        u = torch.from_numpy(self.last.u).to(s)
+        return u.reshape(*s.shape[:-1], self._n_u)
+
+    def value(self, s: Tensor) -> Tensor:
+        """Return V(s), a cost to go: s ``(*batch, n_p)`` to ``(*batch,)``; errors as in a call."""
+        self(s)
+        assert self.last is not None
+        return torch.from_numpy(self.last.value).to(s).reshape(s.shape[:-1])
+
+    def reset(self) -> None:
+        """Forget the last active sets."""
+        self._states = self._library.states(self._count)

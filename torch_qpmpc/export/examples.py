@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.reference import Reference, sharpen
 from torch_qpmpc.export.tables import Array, Tables
 from torch_qpmpc.export.writer import Example
@@ -37,7 +38,11 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
 def choose(
     mpc: QPMPC, tables: Tables, p: Array, coarse: Reference
 ) -> tuple[list[Example], Reference]:
-    """Choose a few states of each kind, and return exact solutions of them."""
+    """Choose a few states of each kind, and return exact solutions of them.
+
+    Raises:
+        QPError: no state is solved or infeasible.
+    """
     solved, states = coarse.status == Status.SOLVED, np.abs(coarse.active)
     kinds = {
         "interior": solved & (states == 0).all(-1),
@@ -48,6 +53,9 @@ def choose(
     chosen = {kind: np.flatnonzero(mask)[:EACH] for kind, mask in kinds.items()}
     exact = sharpen(mpc, p, coarse, np.concatenate([chosen[kind] for kind in [*kinds][:3]]))
     codes = {"infeasible": 2}
+    if not any(map(len, chosen.values())):
+        got = f"no solution of its QP at {len(p)} states"
+        raise QPError.expected("mpc", got, "a QP that a solver solves", "See mpc.solve(s).")
     examples = [
         Example(kind, p[i], codes.get(kind, 0), exact.u[i], float(exact.value[i]))
         for kind, indices in chosen.items()

@@ -13,8 +13,8 @@ import numpy as np
 
 from torch_qpmpc.checks import check_choice, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.export.compiled import Library, compiler
 from torch_qpmpc.export.examples import choose, draw
+from torch_qpmpc.export.library import Library, compiler
 from torch_qpmpc.export.reference import Reference, reference, sharpen
 from torch_qpmpc.export.tables import Array, Tables, make_tables
 from torch_qpmpc.export.writer import (
