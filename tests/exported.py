@@ -131,7 +131,8 @@ def random_qp(seed: int) -> Any:
             G[i] = 0
             G[i, n_p + rng.integers(0, n_u)] = 1
     theta = (H, rng.standard_normal(n_z), rng.standard_normal(), C, b, G, lb, ub, w)
-    qp = QuadraticProgram(*map(torch.as_tensor, theta), check_values=False)
+    tensors = (torch.as_tensor(x, dtype=torch.float64) for x in theta)
+    qp = QuadraticProgram(*tensors, check_values=False)
     return SimpleNamespace(quadratic_program=lambda: qp, n_p=n_p, n_u=n_u)
 
 

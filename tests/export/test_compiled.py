@@ -62,7 +62,7 @@ def test_float32_and_a_limit():
     s = torch.tensor([[1.9, -0.5]])
     single = CompiledPolicy(mpc, dtype="float32")
     torch.testing.assert_close(single(s), mpc.policy(s).detach(), atol=1e-4, rtol=0)
-    with pytest.raises(SolverError, match="1 of 1 steps .* 1 not certified within max_iterations"):
+    with pytest.raises(SolverError, match=r"1 of 1 steps .* 1 not certified within"):
         CompiledPolicy(mpc, max_iterations=1)(s)
 
 
@@ -115,5 +115,5 @@ def test_the_compiler_is_the_first_of_cc_gcc_clang_and_ziglang(monkeypatch):
 def test_an_error_of_the_compiler_is_named(tmp_path):
     (tmp_path / "policy.c").write_text("int x = ;\n")
     (tmp_path / "policy.h").write_text("")
-    with pytest.raises(QPError, match=r"compiler: got an error of [^:]*: .*expected a compiled"):
+    with pytest.raises(QPError, match=r"(?s)compiler: got an error of .*expected a compiled"):
         library.Library(tmp_path, "policy", "float64")

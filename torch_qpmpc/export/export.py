@@ -32,6 +32,8 @@ from torch_qpmpc.qp.program import Status
 STORAGES = ("fast", "small")
 #: Number of random states that the compiled policy is compared at.
 COMPARED = 400
+#: Largest share of these states that may be uncertified.
+UNSOLVED = 0.1
 #: Differences above this, relative to the largest action or value, are worth an exact solution.
 DOUBTFUL = 1e-9
 #: The default limit of iterations is ``PER_ROW r + AT_LEAST``.
@@ -163,7 +165,9 @@ def build(
         agreement = _compare(mpc, tables, library, p, exact)
         if failed := library.selftest():
             kind = examples[failed - 1].kind if failed <= len(examples) else "invalid"
-            _refuse(dtype, f"a failed self-test at state {failed} ({kind}; {agreement})", tables)
+            _refuse(dtype, f"a failed self-test at state {failed} ({kind})", tables)
+        if max_iterations is None and agreement.unsolved > UNSOLVED * COMPARED:
+            _refuse(dtype, f"{agreement.unsolved} of {COMPARED} states not certified", tables)
     elif dtype == "float32":
         remedy = "Install one, or export float64."
         raise QPError.expected("dtype", "'float32' without a C compiler to test it", "one", remedy)

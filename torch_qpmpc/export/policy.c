@@ -352,15 +352,16 @@ static real distance(real y, real lower, real upper)
 /* Certify the multipliers: complete the value and the info; return 1 if they are optimal. */
 static int certify(const policy_state *s, real v_free, policy_info *info)
 {
-    real quadratic = 0, charges = 0;
+    real quadratic = 0, charges = 0, sum = 0;
     int i, holds = 1;
     info->gap = 0;
+    for (i = 0; i < POLICY_ROWS; i++) sum += absolute(s->lambda[i]);
     for (i = 0; i < POLICY_ROWS; i++) {
         real y = s->y[i], lambda = s->lambda[i], off = distance(y, Y_LOWER[i], Y_UPPER[i]);
         real charge = W[i] < BIG ? W[i] * off : 0;
         if (W[i] >= BIG) {
             info->violation = larger(info->violation, off * UNIT[i]);
-            if (!(off <= FEASIBLE * s->size[i])) holds = 0;
+            if (!(off <= FEASIBLE * s->size[i] + ROUNDING * sum)) holds = 0;
         }
         if (lambda != 0) {
             real at = lambda > 0 ? Y_UPPER[i] : Y_LOWER[i];

@@ -47,6 +47,10 @@ class Rows:
     def __len__(self) -> int:
         return len(self.Y)
 
+    def parts(self) -> tuple[Array, ...]:
+        """Return all six arrays."""
+        return self.Y, self.lower, self.upper, self.w, self.size, self.unit
+
 
 @dataclass(frozen=True, eq=False)
 class Tables:
@@ -190,11 +194,7 @@ def _implied(C: Array, T_p: Array, z_b: Array, b: Array) -> Rows:
 
 
 def _with(rows: Rows, more: Rows) -> Rows:
-    return Rows(*(np.concatenate(pair) for pair in zip(_parts(rows), _parts(more), strict=True)))
-
-
-def _parts(rows: Rows) -> tuple[Array, ...]:
-    return rows.Y, rows.lower, rows.upper, rows.w, rows.size, rows.unit
+    return Rows(*(np.concatenate(pair) for pair in zip(rows.parts(), more.parts(), strict=True)))
 
 
 def _action_bounds(G: Array, lb: Array, ub: Array, w: Array, u: slice) -> tuple[Array, Array]:
