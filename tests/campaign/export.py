@@ -95,7 +95,7 @@ def differences(steps, exact) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the differences of u and of the value, and the mask of those to look at."""
     u = np.abs(steps.u - exact.u).max(-1)
     value = np.abs(steps.value - exact.value) / (1 + np.abs(exact.value))
-    doubtful = (steps.codes == 0) & (exact.status == Status.SOLVED) & ((u > 1e-8) | (value > 1e-9))
+    doubtful = (steps.codes == 0) & (exact.status == Status.SOLVED) & ((u > 2e-9) | (value > 1e-9))
     return u, value, doubtful
 
 

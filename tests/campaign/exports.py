@@ -18,7 +18,7 @@ from tests.exported import rates, tied
 from tests.runs import make_config
 from torch_qpmpc import QPMPC
 from torch_qpmpc.envs import GrosZanonLTI, House, LinearSystem, PointMass
-from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_loop, plant_loop
+from torch_qpmpc.envs.closed_loop import closed_loop, plant_loop
 from torch_qpmpc.experiment.tasks import make_mpc as make_task_mpc
 from torch_qpmpc.experiment.tasks import make_physics
 from torch_qpmpc.study.runs import FinishedRun
@@ -28,11 +28,14 @@ Known = Callable[[np.random.Generator, int], np.ndarray]
 
 
 class Problem(NamedTuple):
-    """A QP, a function that draws p of ordinary size, and one that runs a policy on a plant."""
+    """A QP, a function that draws p of ordinary size, and one that runs a policy on a plant.
+
+    The latter returns the p of each step, ``(steps, starts, n_p)``.
+    """
 
     mpc: QPMPC
     known: Known
-    loop: Callable[[Policy], ClosedLoop]
+    loop: Callable[[Policy], Tensor]
 
 
 def box(size: list[float]) -> Known:
@@ -41,17 +44,22 @@ def box(size: list[float]) -> Known:
 
 
 def linear(mpc: QPMPC, plant: LinearSystem, size: list[float]) -> Problem:
-    return Problem(mpc, box(size), lambda policy: closed_loop(policy, plant))
+    return Problem(mpc, box(size), lambda policy: closed_loop(policy, plant).known[:-1])
 
 
 def simulated(mpc: QPMPC, size: list[float]) -> Problem:
-    """Return a scheme whose plant is its own model, with noise, from 32 random starts."""
+    """Return a scheme whose plant is its own model, with noise."""
     A, B = (x.detach() for x in mpc.model()[:2]) if mpc.structure != "free" else model(12, 4)
-    plant = LinearSystem(
-        A, B, *(side * torch.tensor(size) for side in (-10, 10)), -torch.ones(B.shape[-1]),
-        torch.ones(B.shape[-1]),
-    )  # fmt: skip
-    return linear(mpc, plant, size)
+
+    def loop(policy: Policy) -> Tensor:
+        rng = np.random.default_rng(1)
+        s = [torch.as_tensor(box(size)(rng, 32))]
+        for _ in range(50):
+            noise = 0.01 * torch.as_tensor(rng.standard_normal(s[-1].shape))
+            s.append(s[-1] @ A.mT + policy(s[-1]) @ B.mT + noise)
+        return torch.stack(s[:-1])
+
+    return Problem(mpc, box(size), loop)
 
 
 def mass(horizon: int) -> Problem:
@@ -63,7 +71,6 @@ def learned(constraint: str, seed: int) -> Problem:
     cfg = make_config(f"constraint={constraint}", f"seed={seed}", "solver=daqp", "figures=false")
     with tempfile.TemporaryDirectory() as folder:
         train.train(cfg, folder, quiet=True)
-        (Path(folder) / "config.yaml").exists()
         run = FinishedRun(Path(folder))
         return linear(run.learned, PointMass(), [2.2, 2.2, 3.0, 3.0])
 
@@ -74,18 +81,27 @@ def house() -> Problem:
     mpc, plant = make_task_mpc(cfg, make_physics(cfg)), House(horizon=cfg.task.horizon)
 
     def known(rng: np.random.Generator, count: int) -> np.ndarray:
-        loop = plant_loop(lambda p: 12 * torch.rand(len(p), 1).double(), plant, starts=-(-count // 97))
+        loop = plant_loop(
+            lambda p: 12 * torch.rand(len(p), 1).double(), plant, starts=-(-count // 97)
+        )
         p = loop.known.flatten(0, 1).numpy()[:count]
         p[:, -1] = rng.uniform(8, 26, count)
         return p
 
-    return Problem(mpc, known, lambda policy: plant_loop(policy, plant))
+    return Problem(mpc, known, lambda policy: plant_loop(policy, plant).known[:-1])
 
 
 def gros_zanon() -> Problem:
     cfg = make_config("task=gros_zanon")
     mpc = make_task_mpc(cfg, make_physics(cfg))
     return linear(mpc, GrosZanonLTI(), [1.2, 1.2])
+
+
+def rate_limits() -> Problem:
+    """Return the rate limits, whose loop is one of random windows."""
+    known = box([1.2, 1.2, 1.0, 1.2, 1.2])
+    draws = known(np.random.default_rng(1), 1600).reshape(50, 32, 5)
+    return Problem(rates(), known, lambda _: torch.as_tensor(draws))
 
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
@@ -98,7 +114,7 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "house, N = 32": house,
     "Gros and Zanon, N = 10": gros_zanon,
     "tied, mixed constraints, N = 8": lambda: simulated(tied(), [2.5, 1.5]),
-    "rate limits, N = 6": lambda: Problem(rates(), box([1.2, 1.2, 1.0, 1.2, 1.2]), NotImplemented),
+    "rate limits, N = 6": rate_limits,
     "learned, C free": functools.partial(learned, "free", 1),
     "learned, deviation": functools.partial(learned, "deviation", 2),
     "learned, linear MPC": functools.partial(learned, "mpc", 3),

@@ -161,7 +161,9 @@ def exported(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", COMPILERS)
-@pytest.mark.parametrize("level", ["-O0", "-O1", "-O2", "-O3"])
+@pytest.mark.parametrize(
+    "level", ["-O2", *(pytest.param(f"-O{i}", marks=pytest.mark.slow) for i in (0, 1, 3))]
+)
 def test_compilers_agree_without_a_warning(name, level, exported):
     folder, expected = exported
     assert {*expected[:, 0]} == {SOLVED, INFEASIBLE, INVALID}

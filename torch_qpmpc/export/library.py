@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,7 +68,7 @@ class Steps(NamedTuple):
 class Library:
     """The functions of an exported policy, compiled into a shared library."""
 
-    def __init__(self, folder: Path, name: str, dtype: str, flags: tuple[str, ...] = FLAGS) -> None:
+    def __init__(self, folder: Path, name: str, dtype: str, flags: Sequence[str] = ()) -> None:
         command = required_compiler()
         self.real = np.dtype(dtype)
         with tempfile.TemporaryDirectory() as temporary:
@@ -76,7 +77,7 @@ class Library:
             target = Path(temporary) / f"{name}.so"
             files = [str(folder / f"{name}.c"), str(wrapper), f"-I{folder}", "-o", str(target)]
             ended = subprocess.run(
-                [*command, *flags, *files], capture_output=True, text=True, check=False
+                [*command, *(flags or FLAGS), *files], capture_output=True, text=True, check=False
             )
             if ended.returncode:
                 got = f"an error of {' '.join(command)}: {ended.stderr.strip()[-500:]}"
