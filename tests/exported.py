@@ -18,7 +18,7 @@ from torch_qpmpc.export.export import AT_LEAST, PER_ROW
 from torch_qpmpc.export.library import Library
 from torch_qpmpc.export.reference import Reference, reference, sharpen
 from torch_qpmpc.export.tables import Tables, make_tables
-from torch_qpmpc.export.writer import Example, Settings, sources
+from torch_qpmpc.export.writer import Example, Examples, Settings, sources
 
 DRIVER = Path(__file__).parent / "export" / "driver.c"
 STRICT = ("-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -149,8 +149,9 @@ def load(
     tables = make_tables(mpc)
     limit = PER_ROW * len(tables.rows) + AT_LEAST
     chosen = Settings("policy", "float64", "fast", limit)._replace(**settings)
-    nothing = Example("origin", np.zeros(tables.n_p), 0, np.zeros(tables.n_u), 0.0)
-    for name, text in sources(tables, chosen, "", [nothing]).items():
+    origin = Example("origin", np.zeros(tables.n_p), 0, np.zeros(tables.n_u), 0.0)
+    nothing = Examples([origin], np.zeros(tables.n_u), 0.0)
+    for name, text in sources(tables, chosen, "", nothing).items():
         (folder / name).write_text(text, encoding="utf-8")
     return Library(folder, "policy", chosen.dtype, (*flags, "-std=c99", "-fPIC", "-shared")), tables
 

@@ -88,7 +88,7 @@ def judged(name: str, count: int, storage: str) -> tuple[list[str], bool]:
     row = [name, f"{export.rows}", f"{worst[0]:.0e}", f"{worst[1]:.0e}"]
     row += [f"{n:,}" for n in counts]
     row += [f"{most}", f"{size / 1e3:.0f}, {export.state_bytes / 1e3:.1f} kB"]
-    return row, not wrong and (worst <= LARGEST).all()
+    return row, not wrong and bool((worst <= LARGEST).all())
 
 
 def differences(steps, exact) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -16,8 +18,8 @@ def test_the_value_and_action_without_rows_are_those_of_the_equalities(name):
     mpc = SCHEMES[name]()
     tables = make_tables(mpc)
     qp = mpc.quadratic_program()
-    parts = [x.detach() for x in qp.tensors()]
-    without = type(qp)(*parts[:5], parts[5][:0], *(x[:0] for x in parts[6:]), check_values=False)
+    rows = {name: getattr(qp, name).detach()[:0] for name in ("G", "lb", "ub", "w")}
+    without = dataclasses.replace(qp, **rows, check_values=False)
     p = draw_known(mpc, 20)
     solution = solve_qp(without, torch.as_tensor(p))
     value = np.einsum("bi,ij,bj->b", p, tables.P, p) / 2 + p @ tables.g + tables.c

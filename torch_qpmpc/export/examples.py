@@ -7,7 +7,7 @@ import numpy as np
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.reference import Reference, sharpen
 from torch_qpmpc.export.tables import Array, Tables
-from torch_qpmpc.export.writer import Example
+from torch_qpmpc.export.writer import Example, Examples
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.qp.program import Status
 
@@ -36,9 +36,7 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
     return 10 ** exponents[:, None] * scale * rng.standard_normal((count, tables.n_p))
 
 
-def choose(
-    mpc: QPMPC, tables: Tables, p: Array, coarse: Reference
-) -> tuple[list[Example], Reference]:
+def choose(mpc: QPMPC, tables: Tables, p: Array, coarse: Reference) -> tuple[Examples, Reference]:
     """Choose a few states of each kind, and return exact solutions of them.
 
     Raises:
@@ -62,4 +60,9 @@ def choose(
         for kind, indices in chosen.items()
         for i in indices
     ]
-    return examples, exact
+    return Examples(examples, _size(exact.u, solved), float(_size(exact.value, solved))), exact
+
+
+def _size(x: Array, solved: Array) -> Array:
+    """Return a typical size of the solved x: those of far states are larger."""
+    return np.quantile(np.abs(x[solved]), 0.9, axis=0) if solved.any() else np.ones(x.shape[1:])

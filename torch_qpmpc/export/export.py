@@ -64,7 +64,7 @@ class Export:
     """What `QPMPC.export_c` has written.
 
     Attributes:
-        files: the paths of ``name.c`` and ``name.h``.
+        files: the paths of ``name.h`` and ``name.c``.
         dtype, storage, max_iterations: as in `QPMPC.export_c`.
         n_p, n_u: the numbers of entries of p and u.
         rows: the number of rows with multipliers.
@@ -79,7 +79,7 @@ class Export:
         >>> mpc = qm.QPMPC(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
         >>> export = mpc.export_c(tempfile.mkdtemp())
         >>> [file.name for file in export.files], export.rows
-        (['policy.c', 'policy.h'], 3)
+        (['policy.h', 'policy.c'], 3)
     """
 
     files: tuple[Path, ...]
@@ -164,8 +164,8 @@ def build(
         library = Library(folder, name, dtype)
         agreement = _compare(mpc, tables, library, p, exact)
         if failed := library.selftest():
-            kind = examples[failed - 1].kind if failed <= len(examples) else "invalid"
-            _refuse(dtype, f"a failed self-test at state {failed} ({kind})", tables)
+            kinds = [*(example.kind for example in examples.states), "invalid"]
+            _refuse(dtype, f"a failed self-test at state {failed} ({kinds[failed - 1]})", tables)
         if max_iterations is None and agreement.unsolved > UNSOLVED * COMPARED:
             _refuse(dtype, f"{agreement.unsolved} of {COMPARED} states not certified", tables)
     elif dtype == "float32":

@@ -102,7 +102,8 @@ def make_tables(mpc: QPMPC) -> Tables:
     H = (H + H.T) / 2
 
     # z = T_p p + T_v v + z_b, with an orthonormal basis of v.
-    T, Y_neg, _ = (x[0] if x is not None else None for x in null_space(C[None], n_p))
+    elimination = null_space(C[None], n_p)
+    T, Y_neg = elimination.T[0], elimination.Y_neg[0]
     T_p, T_v, z_b = T[:, :n_p], T[:, n_p:], -Y_neg @ b
     factor, condition = _factor(T_v.T @ H @ T_v)
 

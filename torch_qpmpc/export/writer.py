@@ -64,6 +64,14 @@ class Example(NamedTuple):
     value: float
 
 
+class Examples(NamedTuple):
+    """The states of the self-test, and the sizes of actions ``(n_u,)`` and of values there."""
+
+    states: Sequence[Example]
+    u: Array
+    value: float
+
+
 class Settings(NamedTuple):
     """Choices of `export_c`."""
 
@@ -73,10 +81,8 @@ class Settings(NamedTuple):
     max_iterations: int
 
 
-def sources(
-    tables: Tables, settings: Settings, header: str, examples: Sequence[Example]
-) -> dict[str, str]:
-    """Return the texts of ``name.c`` and ``name.h``."""
+def sources(tables: Tables, settings: Settings, header: str, examples: Examples) -> dict[str, str]:
+    """Return the texts of ``name.h`` and ``name.c``."""
     parts = {
         "/* @HEADER@ */": header,
         "@REAL@": REAL[settings.dtype],
@@ -92,7 +98,7 @@ def sources(
 
 def filled(template: str, name: str, parts: Mapping[str, str] | None = None) -> str:
     """Return a template of this folder with its names and parts replaced."""
-    text = resources.files(__package__).joinpath(template).read_text(encoding="utf-8")
+    text = resources.files("torch_qpmpc.export").joinpath(template).read_text(encoding="utf-8")
     text = text.replace("policy", name).replace("POLICY", name.upper())
     for mark, part in (parts or {}).items():
         text = text.replace(mark, part)
@@ -223,28 +229,22 @@ def number(x: float, dtype: str) -> str:
     return f"{text if {'.', 'e'} & {*text} else f'{text}.0'}f"
 
 
-def _examples(tables: Tables, settings: Settings, examples: Sequence[Example]) -> str:
-    """Return the tables of the self-test, relative to the largest expected number."""
-    dtype, near = settings.dtype, NEAR[settings.dtype]
-    solved = [example for example in examples if example.code == 0]
-    u = np.array([e.u for e in solved]).reshape(-1, tables.n_u)
-    value = np.array([e.value for e in solved])
+def _examples(tables: Tables, settings: Settings, examples: Examples) -> str:
+    """Return the tables of the self-test, with tolerances relative to the sizes."""
+    dtype, near, states = settings.dtype, NEAR[settings.dtype], examples.states
     arrays = {
-        "EXAMPLE_P": np.array([e.p for e in examples]).reshape(-1, tables.n_p),
-        "EXAMPLE_U": np.array([np.nan_to_num(e.u) for e in examples]).reshape(-1, tables.n_u),
-        "EXAMPLE_VALUE": np.array([np.nan_to_num(e.value) for e in examples]),
-        "NEAR_U": near.u * np.abs(u).max(0, initial=1e-9),
+        "EXAMPLE_P": np.array([e.p for e in states]).reshape(-1, tables.n_p),
+        "EXAMPLE_U": np.array([np.nan_to_num(e.u) for e in states]).reshape(-1, tables.n_u),
+        "EXAMPLE_VALUE": np.array([np.nan_to_num(e.value) for e in states]),
+        "NEAR_U": near.u * examples.u,
     }
-    codes = ", ".join(str(e.code) for e in examples) or "0"
-    kinds = ", ".join(e.kind for e in examples)
     return "\n".join(
         [
-            f"/* States of the self-test: {kinds}. */",
-            f"#define EXAMPLES {len(examples)}",
-            f"static const int EXAMPLE_CODE[] = {{{codes}}};",
+            f"/* States of the self-test: {', '.join(e.kind for e in states)}. */",
+            f"#define EXAMPLES {len(states)}",
+            f"static const int EXAMPLE_CODE[] = {{{', '.join(str(e.code) for e in states)}}};",
             *(array(name, x, dtype) for name, x in arrays.items()),
-            "static const real NEAR_VALUE = "
-            f"{number(near.value * np.abs(value).max(initial=1e-9), dtype)};",
+            f"static const real NEAR_VALUE = {number(near.value * examples.value, dtype)};",
         ]
     )
 
