@@ -1,8 +1,6 @@
 """Learn a quadratic program as value function by Q-learning.
 
     python train.py                                     the paper's point mass: deviation, seed 1
-    python train.py constraint=free noise=brownian      another of the paper's cases
-    python train.py constraint=mpc                      a linear MPC scheme with learned model
     python train.py task=gros_zanon solver=daqp         another plant, in one long episode
     python train.py -m constraint=fixed,free seed=1,2   a sweep
     python train.py task=gymnasium task.id=Pendulum-v1 start=data   from a log, without a model
@@ -35,6 +33,7 @@ from torch_qpmpc.experiment.collection import batches, make_collector, make_run_
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.gating import RunGate
+from torch_qpmpc.experiment.exporting import export_run
 from torch_qpmpc.experiment.interrupt import Interrupt
 from torch_qpmpc.experiment.launch import launched
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
@@ -154,6 +153,8 @@ def _train(
         gate.save(run.path)
         found.evaluate(learner.policy, "candidate")
         summary = run_summary(found, tally, gate)
+        if cfg.export is not None and gate.mpc is not None:
+            export_run(gate.mpc, run.path, quiet)
         run.finish(summary)
         drop_previous(run.path / CHECKPOINT)
     if not quiet:

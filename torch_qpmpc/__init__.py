@@ -17,13 +17,17 @@ from torch_qpmpc.qp.solve import solve_qp
 
 if TYPE_CHECKING:
     from torch_qpmpc import envs as envs
+    from torch_qpmpc.export.compiled import CompiledPolicy
+    from torch_qpmpc.export.export import Export
     from torch_qpmpc.learning.operators import QPActorValueOperator
     from torch_qpmpc.learning.q_learning import QPQLearningLoss
     from torch_qpmpc.learning.theta_network import ThetaNetwork
 
 __all__ = [
     "QPMPC",
+    "CompiledPolicy",
     "DeviationPenalty",
+    "Export",
     "GaussNewton",
     "Identified",
     "QPActorValueOperator",
@@ -43,8 +47,10 @@ __all__ = [
 __version__ = "0.1.0"
 
 if not TYPE_CHECKING:
-    #: Imported at first use: they import TensorDict and TorchRL, which takes as long as torch does.
+    #: Imported at first use: TensorDict and TorchRL take as long to import as torch does.
     _LAZY = {
+        "CompiledPolicy": "torch_qpmpc.export.compiled:CompiledPolicy",
+        "Export": "torch_qpmpc.export.export:Export",
         "envs": "torch_qpmpc.envs:",
         "QPActorValueOperator": "torch_qpmpc.learning.operators:QPActorValueOperator",
         "QPQLearningLoss": "torch_qpmpc.learning.q_learning:QPQLearningLoss",

@@ -223,6 +223,7 @@ BAD: dict[str, list[Any]] = {
     "ablation": [3, True],
     "eval_seed": WHOLE[1:-2],
     "logger": ["visdom", *NAME],
+    "export": ["python", 3, True],
     "figures": FLAG,
     "gate": FLAG,
     "search.loops": WHOLE,
@@ -494,6 +495,10 @@ def test_solver_must_be_known():
         (
             ["algo=ddpg", "algo.actor=mlp"],
             "algo.actor: got 'mlp', expected qp. The penalties are on",
+        ),
+        (
+            ["algo=ddpg", "algo.actor=mlp", "constraint=free", "export=c"],
+            "export: got 'c', expected null. The policy of algo.actor=mlp is a network",
         ),
         (["algo=ddpg", "step=projection"], "step: got 'projection', expected cholesky. The crit"),
         (

@@ -7,8 +7,9 @@ appear only in `torch_qpmpc.learning`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from typing import Any
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -36,6 +37,9 @@ from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
 from torch_qpmpc.qp.solvers import backend
+
+if TYPE_CHECKING:
+    from torch_qpmpc.export.export import Export
 
 #: Attributes that only the constructor and `QPMPC.release` set.
 FIXED = ("n_x", "n_u", "horizon", "past", "n_d", "n_p", "n_z", "gamma")
@@ -499,6 +503,43 @@ class QPMPC(nn.Module):
         B, E and D, D_f of a tied C and G. H with ``step="projection"`` is its own coordinate.
         """
         return coordinates.coordinates(self)
+
+    def export_c(
+        self,
+        folder: str | Path,
+        *,
+        dtype: str = "float64",
+        name: str = "policy",
+        max_iterations: int | None = None,
+        storage: str = "fast",
+        labels: Mapping[str, Sequence[str]] | None = None,
+    ) -> Export:
+        """Write the policy and value of the current theta as C99 without heap or dependencies.
+
+        The files are ``name.c`` and ``name.h``, whose ``name_step`` maps p to u_0 and V(p); they
+        are compared with an exact solver if a C compiler is installed.
+
+        Args:
+            folder: the folder of both files, created if it does not exist.
+            dtype: ``"float64"`` or ``"float32"``, the type of all numbers in C.
+            name: the beginning of the names of files and functions.
+            max_iterations: the limit of a step; by default 20 per row of G on the plan, plus 100.
+            storage: ``"fast"`` stores a table of rows by rows; ``"small"`` one of rows by free
+                variables if that is smaller.
+            labels: names of the entries of ``"x"``, ``"u"`` and ``"d"``, with units, for the
+                comment at the head.
+
+        Returns:
+            Sizes, conditioning, and the measured agreement.
+
+        Raises:
+            QPError: an argument is invalid, the cost is singular on the plan, or the self-test
+                fails.
+        """
+        from torch_qpmpc.export.export import export_c
+
+        options = {"dtype": dtype, "name": name, "storage": storage, "labels": labels}
+        return export_c(self, folder, max_iterations=max_iterations, **options)
 
     def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
         """Return parameter groups for an optimiser, one for each learned part of theta.

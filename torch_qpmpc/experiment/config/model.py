@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import Annotated, Any, NoReturn, Self
+from typing import Annotated, Any, Literal, NoReturn, Self
 
 from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
@@ -82,6 +82,7 @@ class Config(Group):
     gate: Flag = False
     search: Search = NO_SEARCH
     logger: Annotated[str, one_of(LOGGERS)] = "tensorboard"
+    export: Annotated[Literal["c"] | None, Expected("c, or null")] = None
     figures: Flag
     rivals: Annotated[bool | list[str], Expected("true, false or a list of names")] = True
     eval_interval: Count
@@ -185,6 +186,12 @@ class Config(Group):
             self.conflict("algo.actor", "qp or scheduled", remedy)
         if self.step != "cholesky":
             self.conflict("step", "cholesky", f"The critics of {name} support no other step.")
+        return self
+
+    @model_validator(mode="after")
+    def export_has_a_qp(self) -> Self:
+        if self.export and self.algo.name != "qlearning" and self.algo.actor != "qp":
+            self.conflict("export", "null", "The policy of algo.actor=mlp is a network.")
         return self
 
     @model_validator(mode="after")

@@ -1,0 +1,223 @@
+"""One step of the exported C beside ``mpc.policy`` and OSQP's generated code.
+
+    python -m tests.benchmarks.export --write
+
+Warm is a closed loop of 32 starts with 50 steps, cold random states without a warm start. A step's
+time is its median over several passes, in which the contenders take turns. OSQP is measured if
+``pip install osqp`` is there: its code solves the QP with z and split slacks, to 1e-3, its default,
+and to 1e-6.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import importlib.util
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from tests.campaign.exports import PROBLEMS
+from torch_qpmpc import QPMPC, CompiledPolicy
+from torch_qpmpc.export.library import required_compiler
+from torch_qpmpc.export.reference import reference
+from torch_qpmpc.study.markdown import replaced
+
+HERE = Path(__file__).parent
+PAGE = HERE.parents[1] / "docs" / "benchmarks.md"
+CHOSEN = (
+    "point mass, N = 5",
+    "point mass, N = 10",
+    "point mass, N = 40",
+    "12 states, 4 actions, N = 10",
+    "house, N = 32",
+)
+PASSES, COLD = 7, 1000
+#: Steps of the contenders in Python, and of OSQP.
+FEW = 200
+
+
+class Times(NamedTuple):
+    """Microseconds of each step, ``(steps,)``, and the actions if they are compared."""
+
+    steps: np.ndarray
+    u: np.ndarray | None = None
+
+    def __str__(self) -> str:
+        p50, p99 = np.percentile(self.steps, [50, 99])
+        return " / ".join(f"{x:.3g}" for x in (p50, p99, self.steps.max()))
+
+
+def library(folder: Path, source: Path, *more: str) -> ctypes.CDLL:
+    target = folder / f"{source.stem}.so"
+    flags = ["-std=c99", "-O3", "-fPIC", "-shared", f"-I{folder}", *more]
+    command = [*required_compiler(), *flags, str(source), "-o", str(target)]
+    subprocess.run(command, check=True)
+    return ctypes.CDLL(str(target))
+
+
+def pointer(x: np.ndarray) -> ctypes.c_void_p:
+    return x.ctypes.data_as(ctypes.c_void_p)
+
+
+def compiled(mpc: QPMPC, folder: Path, storage: str) -> Callable[[np.ndarray, bool], Times]:
+    """Return a function that times the exported C at p ``(steps, n_p)``, warm or cold."""
+    export = mpc.export_c(folder, storage=storage)
+    timed = library(folder, HERE / "timing.c", str(folder / "policy.c"))
+    state = np.zeros(export.state_bytes // 8 + 8)
+
+    def run(p: np.ndarray, cold: bool) -> Times:
+        p, n = np.ascontiguousarray(p), len(p)
+        u, times = np.empty((n, mpc.n_u)), np.empty(n)
+        codes, iterations = np.empty(n, np.int32), np.empty(n, np.int32)
+        arrays = [pointer(x) for x in (times, codes, iterations)]
+        starts = (ctypes.c_long(n), ctypes.c_int(cold))
+        timed.policy_timed(pointer(state), pointer(p), pointer(u), *starts, *arrays)
+        assert not codes.any()
+        return Times(times / 1e3, u)
+
+    return run
+
+
+def osqp(mpc: QPMPC, folder: Path, eps: float) -> Callable[[np.ndarray, bool], Times]:
+    """Return a function that times OSQP's generated code, which starts from its last solution."""
+    import osqp as package  # pyright: ignore[reportMissingImports] - optional
+    from scipy import sparse
+
+    data = (x.detach().numpy() for x in mpc.quadratic_program().tensors())
+    H, q, _, C, b, G, lb, ub, w = data
+    n, n_p, soft = len(q), mpc.n_p, np.flatnonzero(np.isfinite(w) & (w > 0))
+    r, m = len(soft), len(lb)
+    used = (np.isfinite(lb) | np.isfinite(ub)) & (w > 0)
+    T = np.zeros((m, r))
+    T[soft, np.arange(r)] = 1
+    P = sparse.block_diag((H, sparse.csc_matrix((2 * r, 2 * r)))).tocsc()
+    A = sparse.vstack(
+        [
+            sparse.hstack([sparse.eye(n_p, n), sparse.csc_matrix((n_p, 2 * r))]),
+            sparse.hstack([sparse.csc_matrix(C), sparse.csc_matrix((len(C), 2 * r))]),
+            sparse.csc_matrix(np.hstack([G, -T, T])[used]),
+            sparse.hstack([sparse.csc_matrix((2 * r, n)), sparse.eye(2 * r)]),
+        ]
+    ).tocsc()
+    lower = np.concatenate((np.zeros(n_p), b, lb[used], np.zeros(2 * r)))
+    upper = np.concatenate((np.zeros(n_p), b, ub[used], np.full(2 * r, np.inf)))
+    solver = package.OSQP()
+    cost = np.concatenate((q, w[soft], w[soft]))
+    options = {"eps_abs": eps, "eps_rel": eps, "max_iter": 4000, "verbose": False}
+    options |= {"adaptive_rho": True, "adaptive_rho_interval": 50}
+    solver.setup(sparse.triu(P).tocsc(), cost, A, lower, upper, **options)
+    solver.codegen(str(folder), parameters="matrices", force_rewrite=True, compile=False)
+    sources = [str(x) for x in (folder / "src").glob("*.c")] + [str(folder / "workspace.c")]
+    includes = [f"-I{folder}/inc/public", f"-I{folder}/inc/private", "-DOSQP_EMBEDDED_MODE=2"]
+    timed = library(folder, HERE / "timing_osqp.c", *sources, *includes, "-lm")
+
+    def run(p: np.ndarray, cold: bool) -> Times:
+        p, times, u = np.ascontiguousarray(p), np.empty(len(p)), np.empty((len(p), mpc.n_u))
+        bounds = lower.clip(-1e30), upper.clip(max=1e30)  # OSQP's infinity
+        sizes = [ctypes.c_long(x) for x in (len(p), n_p, mpc.n_u)]
+        arrays = [pointer(x) for x in (p, *bounds, u, times)]
+        timed.osqp_timed(*arrays, *sizes, ctypes.c_int(cold))
+        return Times(times / 1e3, u)
+
+    return run
+
+
+def in_python(mpc: QPMPC) -> Callable[[np.ndarray, bool], Times]:
+    """Return a function that times ``mpc.policy``, from the last active set or from none."""
+
+    @torch.no_grad()
+    def run(p: np.ndarray, cold: bool) -> Times:
+        times, active = np.empty(len(p)), None
+        for i, s in enumerate(torch.as_tensor(p)):
+            start = time.perf_counter()
+            _, active = mpc.policy_and_active_set(s, None if cold else active)
+            times[i] = time.perf_counter() - start
+        return Times(1e6 * times)
+
+    return run
+
+
+def through_ctypes(mpc: QPMPC) -> Callable[[np.ndarray, bool], Times]:
+    """Return a function that times `CompiledPolicy`."""
+    policy = CompiledPolicy(mpc)
+
+    def run(p: np.ndarray, cold: bool) -> Times:
+        times = np.empty(len(p))
+        policy.reset()
+        for i, s in enumerate(torch.as_tensor(p)):
+            if cold:
+                policy.reset()
+            start = time.perf_counter()
+            policy(s)
+            times[i] = time.perf_counter() - start
+        return Times(1e6 * times)
+
+    return run
+
+
+def measured(name: str) -> list[list[str]]:
+    """Measure all contenders on a problem: rows of the table."""
+    mpc, known, loop = PROBLEMS[name]()
+    mpc.solver = "daqp"
+    states = loop(CompiledPolicy(mpc)).transpose(0, 1)
+    warm = states.reshape(-1, mpc.n_p).numpy()
+    cold = known(np.random.default_rng(2), COLD)
+    with tempfile.TemporaryDirectory() as temporary:
+        folders = [Path(temporary) / x for x in ("fast", "small", "osqp", "osqp_6")]
+        for folder in folders:
+            folder.mkdir()
+        contenders: dict[str, Any] = {
+            "C, fast": compiled(mpc, folders[0], "fast"),
+            "C, small": compiled(mpc, folders[1], "small"),
+            "CompiledPolicy": through_ctypes(mpc),
+            "mpc.policy, daqp": in_python(mpc),
+        }
+        if importlib.util.find_spec("osqp"):
+            for eps, folder in zip((1e-3, 1e-6), folders[2:], strict=True):
+                contenders[f"OSQP's generated C, {eps:.0e}"] = osqp(mpc, folder, eps)
+        times: dict[str, list[list[Times]]] = {who: [] for who in contenders}
+        for _ in range(PASSES):
+            for who, run in contenders.items():
+                few = None if who.startswith("C, ") else FEW
+                times[who].append([run(warm[:few], False), run(cold[:few], True)])
+    rows = []
+    for who, passes in times.items():
+        both = [Times(np.median([x[i].steps for x in passes], axis=0)) for i in (0, 1)]
+        ratio = np.median([np.median(x[0].steps) for x in times["mpc.policy, daqp"]])
+        ratio /= np.median([np.median(x[0].steps) for x in passes])
+        error = ""
+        if (u := passes[-1][1].u) is not None:
+            error = f"{np.abs(u - reference(mpc, cold[: len(u)]).u).max():.0e}"
+        rows.append([name, who, *map(str, both), f"{ratio:.3g}x", error])
+    return rows
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.export", description=__doc__)
+    parser.add_argument("--problem", choices=CHOSEN)
+    parser.add_argument("--write", action="store_true", help="write the table into the docs")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    titles = ["problem", "step of", "warm: p50 / p99 / max, us", "cold", "warm p50", "error of u"]
+    rows = []
+    for name in [options.problem] if options.problem else CHOSEN:
+        rows += measured(name)
+        print("\n".join(" | ".join(row) for row in rows[-6:]), flush=True)
+    if options.write:
+        lines = [titles, ["---", "---", *["---:"] * 4], *rows]
+        table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+        text = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(replaced(text, table, "export"), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,12 @@
+"""Compile quickly in the tests of the export."""
+
+from __future__ import annotations
+
+import pytest
+
+from torch_qpmpc.export import library
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(library, "FLAGS", ("-std=c99", "-O1", "-fPIC", "-shared"))

@@ -1,0 +1,119 @@
+"""`CompiledPolicy`: the same actions and values from compiled C, and its errors."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from tests.exported import rates, tied
+from torch_qpmpc import QPMPC, CompiledPolicy, QPError, SolverError
+from torch_qpmpc.envs import PointMass
+from torch_qpmpc.envs.closed_loop import closed_loop
+from torch_qpmpc.export import library
+from torch_qpmpc.learning.operators import warm_policy
+
+needs_compiler = pytest.mark.skipif(library.compiler() is None, reason="no C compiler")
+
+
+@needs_compiler
+def test_actions_and_values_are_those_of_the_module():
+    mpc = tied()
+    policy = CompiledPolicy(mpc, storage="small")
+    s = torch.linspace(-1, 1, 12).reshape(2, 3, 2)
+    assert policy(s).shape == (2, 3, 1)
+    assert policy(s).dtype is torch.float32
+    torch.testing.assert_close(policy(s), mpc.policy(s).detach())
+    torch.testing.assert_close(policy.value(s.double()), mpc.value(s.double()).detach())
+    torch.testing.assert_close(policy(s[0, 0]), mpc.policy(s[0, 0]).detach())
+    assert policy.last is not None
+    assert policy.last.gap.max() < 1e-8
+
+
+@needs_compiler
+def test_each_row_of_a_batch_is_a_controller():
+    policy = CompiledPolicy(tied())
+    s = torch.tensor([[1.9, -0.5], [0.1, 0.0]])
+    policy(s)
+    assert policy.last is not None
+    first = policy.last.iterations.copy()
+    assert first[0] > 3
+    policy(s)
+    assert policy.last.iterations.max() == 0
+    policy.reset()
+    policy(s)
+    np.testing.assert_array_equal(policy.last.iterations, first)
+
+
+@needs_compiler
+def test_the_closed_loop_has_the_same_cost():
+    physics = PointMass()
+    bounds = {"action_bounds": ([-1, -1], [1, 1]), "state_bounds": (physics.lb_s, physics.ub_s)}
+    mpc = QPMPC.from_model(physics.A, physics.B, 5, solver="daqp", **bounds)
+    J = [closed_loop(f, physics, starts=4).J for f in (CompiledPolicy(mpc), warm_policy(mpc))]
+    assert J[0] == pytest.approx(J[1], rel=1e-9)
+
+
+@needs_compiler
+def test_float32_and_a_limit():
+    mpc = tied()
+    s = torch.tensor([[1.9, -0.5]])
+    single = CompiledPolicy(mpc, dtype="float32")
+    torch.testing.assert_close(single(s), mpc.policy(s).detach(), atol=1e-4, rtol=0)
+    with pytest.raises(SolverError, match=r"1 of 1 steps .* 1 not certified within"):
+        CompiledPolicy(mpc, max_iterations=1)(s)
+
+
+@needs_compiler
+def test_unsolved_steps_raise_or_return_an_action_within_bounds():
+    p = torch.tensor([[0.0, 0.0, -3.0, 0.0, 0.0], [torch.nan] * 5, [0.0] * 5])
+    match = "2 of 3 steps have no certified solution: 1 infeasible, 1 invalid p"
+    with pytest.raises(SolverError, match=match):
+        CompiledPolicy(rates())(p)
+    mpc = rates()
+    mpc.on_failure = "mask"
+    policy = CompiledPolicy(mpc)
+    assert (policy(p).abs() <= 1).all()
+    assert policy.last is not None
+    assert policy.last.codes.tolist() == [2, 3, 0]
+
+
+@needs_compiler
+def test_bad_arguments_are_refused():
+    with pytest.raises(QPError, match="mpc: got int, expected a QPMPC"):
+        CompiledPolicy(3)  # pyright: ignore[reportArgumentType] - wrong on purpose
+    with pytest.raises(QPError, match="options: got speed, expected some of dtype, max_iterations"):
+        CompiledPolicy(tied(), speed=1)
+    with pytest.raises(QPError, match=r"s: got shape \(3,\), expected shape \(\*batch, 2\)"):
+        CompiledPolicy(tied())(torch.ones(3))
+
+
+def test_without_a_compiler_there_is_none(monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    match = r"compiler: got none on the PATH, expected a C compiler: \$CC, cc, gcc or clang. Inst"
+    with pytest.raises(QPError, match=match):
+        CompiledPolicy(tied())
+
+
+def test_the_compiler_is_the_first_of_cc_gcc_clang_and_ziglang(monkeypatch):
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(library.shutil, "which", lambda name: f"/bin/{name}" * (name == "clang"))
+    assert library.compiler() == ["/bin/clang"]
+    monkeypatch.setattr(library.shutil, "which", lambda _: None)
+    monkeypatch.setattr(library.importlib.util, "find_spec", lambda _: None)
+    assert library.compiler() is None
+    monkeypatch.setattr(library.importlib.util, "find_spec", lambda _: object())
+    assert library.compiler() == [sys.executable, "-m", "ziglang", "cc"]
+    monkeypatch.setattr(library.shutil, "which", lambda name: name)
+    monkeypatch.setenv("CC", "gcc -m32")
+    assert library.compiler() == ["gcc", "-m32"]
+
+
+@needs_compiler
+def test_an_error_of_the_compiler_is_named(tmp_path):
+    (tmp_path / "policy.c").write_text("int x = ;\n")
+    (tmp_path / "policy.h").write_text("")
+    with pytest.raises(QPError, match=r"(?s)compiler: got an error of .*expected a compiled"):
+        library.Library(tmp_path, "policy", "float64")

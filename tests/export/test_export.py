@@ -1,0 +1,178 @@
+"""`QPMPC.export_c`: its files, its report, and its errors."""
+
+from __future__ import annotations
+
+import datetime
+import subprocess
+
+import pytest
+import torch
+
+import torch_qpmpc as qm
+from tests.exported import SCHEMES, house, rates, tied
+from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc.export import export as module
+from torch_qpmpc.export.library import Library, compiler
+
+needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
+
+
+@needs_compiler
+@pytest.mark.parametrize("options", [{}, {"storage": "small"}], ids=["fast", "small"])
+def test_the_report_has_sizes_and_agreement(options, tmp_path):
+    mpc = SCHEMES["point mass"]()
+    export = mpc.export_c(tmp_path / "deep" / "folder", name="mass", **options)
+    assert [file.name for file in export.files] == ["mass.h", "mass.c"]
+    assert all(file.exists() for file in export.files)
+    assert (export.n_p, export.n_u, export.rows, export.variables) == (4, 2, 60, 20)
+    agreement = export.agreement
+    assert agreement is not None
+    assert agreement.u < 1e-8
+    assert agreement.value < 1e-8
+    assert agreement.unsolved == 0
+    assert 20 < agreement.iterations < export.max_iterations == 1300
+    assert export.state_bytes == Library(tmp_path / "deep/folder", "mass", "float64").state_bytes
+    assert f"state {export.state_bytes:,} bytes" in str(export)
+    assert "at 400 states: actions within" in str(export)
+
+
+@needs_compiler
+def test_small_is_smaller_where_rows_outnumber_variables(tmp_path):
+    mpc = SCHEMES["12 states"]()
+    sizes = [mpc.export_c(tmp_path, storage=x).table_bytes for x in ("fast", "small")]
+    assert sizes[1] < 0.8 * sizes[0]
+
+
+@needs_compiler
+def test_float32_is_measured(tmp_path):
+    export = tied().export_c(tmp_path, dtype="float32", name="single")
+    assert export.agreement is not None
+    assert 1e-8 < export.agreement.u < 1e-3
+    assert "typedef float single_real;" in export.files[0].read_text()
+    library = Library(tmp_path, "single", "float32")
+    assert library.state_bytes == export.state_bytes
+
+
+@needs_compiler
+def test_float32_is_refused_where_the_self_test_fails(tmp_path):
+    match = r"dtype: got 'float32', with (a failed self-test|.* not certified).*Export float64"
+    with pytest.raises(QPError, match=match):
+        ill_conditioned().export_c(tmp_path, dtype="float32")
+    assert not [*tmp_path.iterdir()]
+    ill_conditioned().export_c(tmp_path)
+
+
+def ill_conditioned() -> QPMPC:
+    """Make an unstable scheme whose predictions grow by two orders of magnitude."""
+    return QPMPC.from_model(
+        [[1.1, 1.0], [0.0, 1.1]],
+        [[0.0], [1.0]],
+        20,
+        stage_weight=[1.0, 1.0, 1e-4],
+        action_bounds=([-1.0], [1.0]),
+        state_bounds=([-1.0, -1.0], [1.0, 1.0]),
+        solver="daqp",
+    )
+
+
+@needs_compiler
+def test_the_head_names_version_date_layout_and_hash(tmp_path):
+    mpc = rates()
+    labels = {"x": ["level [m]", "flow [m3/s] */"], "u": ["valve"]}
+    head = mpc.export_c(tmp_path, labels=labels).files[1].read_text().partition("*/\n")[0]
+    today = datetime.date.today().isoformat()
+    assert f"torch_qpmpc {qm.__version__} on {today}" in head
+    assert "p[0 .. 1]: x_-1 (level [m], flow [m3/s] * /)" in head
+    assert "p[2]: u_-1 (valve)" in head
+    assert "p[3 .. 4]: x_0" in head
+    assert "u[0]: u_0 (valve)" in head
+    same = mpc.export_c(tmp_path / "again", labels=labels)
+    assert same.digest in head
+    with torch.no_grad():
+        mpc.c += 1e-12
+    assert mpc.export_c(tmp_path / "other").digest != same.digest
+
+
+@needs_compiler
+def test_previews_are_in_the_head(tmp_path):
+    head = house(2).export_c(tmp_path).files[0].read_text()
+    assert "p[6 .. 8]: d_2\n   p[9]: x_0" in head
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"dtype": "float16"}, "dtype: got 'float16', expected one of float64, float32"),
+        ({"storage": "tiny"}, "storage: got 'tiny', expected one of fast, small"),
+        ({"name": "2nd"}, "name: got '2nd', expected a C identifier. It begins the names"),
+        ({"name": 3}, "name: got 3, expected a C identifier"),
+        ({"max_iterations": 0}, "max_iterations: got 0, expected a whole number >= 1"),
+        ({"labels": ["a"]}, "labels: got list, expected a mapping from x, u and d"),
+        ({"labels": {"y": []}}, "labels: got 'y', expected one of x, u, d"),
+        ({"labels": {"u": ["a", "b"]}}, r"labels\['u'\]: got \['a', 'b'\], expected 1 names"),
+    ],
+)
+def test_bad_arguments_are_refused(options, match, tmp_path):
+    with pytest.raises(QPError, match=match):
+        rates().export_c(tmp_path, **options)
+
+
+def test_a_qp_without_solutions_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "COMPARED", 5)
+    mpc = QPMPC(1, 1, 2, A=[[1.0]], B=[[1.0]], stage_weight=[1.0, 1.0])
+    solve = module.reference
+
+    def unsolved(*arguments):
+        found = solve(*arguments)
+        found.status[:] = 3
+        return found
+
+    monkeypatch.setattr(module, "reference", unsolved)
+    match = "mpc: got no solution of its QP at 5 states, expected a QP that a solver solves"
+    with pytest.raises(QPError, match=match):
+        mpc.export_c(tmp_path)
+
+
+def test_without_a_compiler_float64_is_written_and_float32_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "compiler", lambda: None)
+    export = tied().export_c(tmp_path)
+    assert export.agreement is None
+    assert "not compared with a solver: no C compiler was found" in str(export)
+    with pytest.raises(QPError, match="dtype: got 'float32' without a C compiler to test it"):
+        tied().export_c(tmp_path, dtype="float32")
+
+
+@needs_compiler
+def test_a_failed_self_test_of_float64_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "Library", lambda *_: Failing(*_))
+    match = r"dtype: got 'float64', with a failed self-test at state 1 \(interior.*condition"
+    with pytest.raises(QPError, match=match):
+        tied().export_c(tmp_path)
+
+
+class Failing(Library):
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.selftest = lambda: 1
+
+
+@needs_compiler
+def test_the_self_test_fails_for_other_tables(tmp_path):
+    (header, source) = tied().export_c(tmp_path).files
+    text = source.read_text()
+    start = text.index("U_OFFSET[1] =") + len("U_OFFSET[1] =\n")
+    source.write_text(f"{text[:start]}{{0.5}};{text[text.index(';', start) + 1 :]}")
+    assert Library(header.parent, "policy", "float64").selftest() == 1
+
+
+@needs_compiler
+def test_two_policies_link_into_one_program(tmp_path):
+    tied().export_c(tmp_path, name="one")
+    rates().export_c(tmp_path, name="two", storage="small")
+    main = '#include "one.h"\n#include "two.h"\nint main(void)\n'
+    main += "{ return one_selftest() + two_selftest(); }\n"
+    (tmp_path / "main.c").write_text(main)
+    files = [str(tmp_path / f"{name}.c") for name in ("main", "one", "two")]
+    command = ["cc", "-std=c99", *files, "-o", str(tmp_path / "main")]
+    subprocess.run(command, check=True, capture_output=True)
+    subprocess.run([str(tmp_path / "main")], check=True)

@@ -1,0 +1,237 @@
+"""`export_c`: a policy as two files of C, checked against an exact solver."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from torch_qpmpc.checks import check_choice, check_whole
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.export.examples import choose, draw
+from torch_qpmpc.export.library import Library, compiler
+from torch_qpmpc.export.reference import Reference, reference, sharpen
+from torch_qpmpc.export.tables import Array, Tables, make_tables
+from torch_qpmpc.export.writer import (
+    REAL,
+    Labels,
+    Settings,
+    header,
+    sources,
+    state_bytes,
+    table_bytes,
+)
+from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.qp.program import Status
+
+STORAGES = ("fast", "small")
+#: Number of random states that the compiled policy is compared at.
+COMPARED = 400
+#: Largest share of these states that may be uncertified.
+UNSOLVED = 0.1
+#: Differences above this, relative to the largest action or value, are worth an exact solution.
+DOUBTFUL = 1e-9
+#: The default limit of iterations is ``PER_ROW r + AT_LEAST``.
+PER_ROW, AT_LEAST = 20, 100
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """A compiled policy compared with an exact solver at random states, some far out of bounds.
+
+    Attributes:
+        states: the number of states.
+        u: the largest difference of an action.
+        value: the largest difference of a value, relative to the value.
+        unsolved: the number of states that the solver solves and the policy does not.
+        iterations: the most iterations from an empty active set.
+    """
+
+    states: int
+    u: float
+    value: float
+    unsolved: int
+    iterations: int
+
+
+@dataclass(frozen=True)
+class Export:
+    """What `QPMPC.export_c` has written.
+
+    Attributes:
+        files: the paths of ``name.h`` and ``name.c``.
+        dtype, storage, max_iterations: as in `QPMPC.export_c`.
+        n_p, n_u: the numbers of entries of p and u.
+        rows: the number of rows with multipliers.
+        variables: the number of free variables of a plan.
+        table_bytes, state_bytes: the sizes of the constant tables and of the state.
+        condition: the condition number of the cost on the plan.
+        agreement: the measured agreement with an exact solver; None without a compiler.
+        digest: the SHA-256 of the nine tensors.
+
+    Example:
+        >>> import tempfile, torch_qpmpc as qm
+        >>> mpc = qm.QPMPC(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
+        >>> export = mpc.export_c(tempfile.mkdtemp())
+        >>> [file.name for file in export.files], export.rows
+        (['policy.h', 'policy.c'], 3)
+    """
+
+    files: tuple[Path, ...]
+    dtype: str
+    storage: str
+    max_iterations: int
+    n_p: int
+    n_u: int
+    rows: int
+    variables: int
+    table_bytes: int
+    state_bytes: int
+    condition: float
+    agreement: Agreement | None
+    digest: str
+
+    def __str__(self) -> str:
+        """Return a report of a few lines."""
+        lines = [
+            f"{', '.join(str(file) for file in self.files)}",
+            f"{self.n_p} known entries, {self.n_u} actions, {self.rows} rows, "
+            f"{self.variables} variables; {self.dtype}, {self.storage}",
+            f"tables {self.table_bytes:,} bytes, state {self.state_bytes:,} bytes; condition "
+            f"{self.condition:.1e}",
+        ]
+        if (agreement := self.agreement) is None:
+            lines.append("not compared with a solver: no C compiler was found")
+        else:
+            lines.append(
+                f"at {agreement.states} states: actions within {agreement.u:.1e}, values within "
+                f"{agreement.value:.1e}, {agreement.unsolved} unsolved, at most "
+                f"{agreement.iterations} iterations"
+            )
+        return "\n".join(lines)
+
+
+def export_c(
+    mpc: QPMPC,
+    folder: str | Path,
+    *,
+    dtype: str = "float64",
+    name: str = "policy",
+    max_iterations: int | None = None,
+    storage: str = "fast",
+    labels: Labels | None = None,
+) -> Export:
+    """Write a policy as C; see `QPMPC.export_c`."""
+    with tempfile.TemporaryDirectory() as temporary:
+        export, _ = build(mpc, Path(temporary), dtype, name, max_iterations, storage, labels)
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        files = tuple(Path(shutil.copy(file, folder)) for file in export.files)
+    return Export(**{**vars(export), "files": files})
+
+
+def build(
+    mpc: QPMPC,
+    folder: Path,
+    dtype: str,
+    name: str,
+    max_iterations: int | None,
+    storage: str,
+    labels: Labels | None = None,
+) -> tuple[Export, Library | None]:
+    """Write, compile and check a policy in an existing folder."""
+    _check(mpc, dtype, name, storage, labels)
+    if max_iterations is not None:
+        check_whole("max_iterations", max_iterations, 1)
+    tables = make_tables(mpc)
+    limit = max_iterations or PER_ROW * len(tables.rows) + AT_LEAST
+    settings = Settings(name, dtype, storage, limit)
+    p = draw(tables, COMPARED).astype(dtype).astype(np.float64)
+    exact = reference(mpc, p)
+    examples, exact = choose(mpc, tables, p, exact)
+    texts = sources(tables, settings, header(mpc, tables, settings, labels or {}), examples)
+    files = []
+    for file, text in texts.items():
+        files.append(folder / file)
+        files[-1].write_text(text, encoding="utf-8")
+    library, agreement = None, None
+    if compiler() is not None:
+        library = Library(folder, name, dtype)
+        agreement = _compare(mpc, tables, library, p, exact)
+        if failed := library.selftest():
+            kinds = [*(example.kind for example in examples.states), "invalid"]
+            _refuse(dtype, f"a failed self-test at state {failed} ({kinds[failed - 1]})", tables)
+        if max_iterations is None and agreement.unsolved > UNSOLVED * COMPARED:
+            _refuse(dtype, f"{agreement.unsolved} of {COMPARED} states not certified", tables)
+    elif dtype == "float32":
+        remedy = "Install one, or export float64."
+        raise QPError.expected("dtype", "'float32' without a C compiler to test it", "one", remedy)
+    export = Export(
+        tuple(files),
+        dtype,
+        storage,
+        limit,
+        tables.n_p,
+        tables.n_u,
+        len(tables.rows),
+        tables.R.shape[1],
+        table_bytes(tables, settings),
+        state_bytes(tables, settings),
+        tables.condition,
+        agreement,
+        tables.digest,
+    )
+    return export, library
+
+
+def _compare(mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Reference) -> Agreement:
+    steps = library.steps(library.states(len(p)), p, tables.n_u)
+    solvable = exact.status == Status.SOLVED
+    both = solvable & (steps.codes == 0)
+
+    def differences(exact: Reference) -> tuple[Array, Array]:
+        u = np.abs(steps.u - exact.u).max(-1)
+        return u, np.abs(steps.value - exact.value) / (np.abs(exact.value) + 1e-300)
+
+    u, value = differences(exact)
+    size = np.nanmax(np.abs(exact.u), initial=1e-9)
+    doubtful = both & ((u > DOUBTFUL * size) | (value > DOUBTFUL))
+    if library.real == np.float64:
+        u, value = differences(sharpen(mpc, p, exact, np.flatnonzero(doubtful)))
+    return Agreement(
+        states=len(p),
+        u=float(u[both].max(initial=0)),
+        value=float(value[both].max(initial=0)),
+        unsolved=int((solvable & ~both).sum()),
+        iterations=int(steps.iterations.max(initial=0)),
+    )
+
+
+def _refuse(dtype: str, got: str, tables: Tables) -> None:
+    remedy = (
+        "Export float64."
+        if dtype == "float32"
+        else f"The cost on the plan has condition {tables.condition:.1e}: shorten the horizon, or "
+        "rescale the states."
+    )
+    raise QPError.expected("dtype", f"{dtype!r}, with {got}", "a policy that agrees", remedy)
+
+
+def _check(mpc: QPMPC, dtype: str, name: str, storage: str, labels: Labels | None) -> None:
+    check_choice("dtype", dtype, tuple(REAL))
+    check_choice("storage", storage, STORAGES)
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        remedy = "It begins the names of functions and files."
+        raise QPError.expected("name", repr(name), "a C identifier", remedy)
+    sizes = {"x": mpc.n_x, "u": mpc.n_u, "d": mpc.n_d}
+    if labels is not None and not isinstance(labels, Mapping):
+        raise QPError.expected("labels", type(labels).__name__, "a mapping from x, u and d")
+    for key, names in (labels or {}).items():
+        check_choice("labels", key, tuple(sizes))
+        if not isinstance(names, Sequence) or isinstance(names, str) or len(names) != sizes[key]:
+            raise QPError.expected(f"labels[{key!r}]", repr(names), f"{sizes[key]} names")

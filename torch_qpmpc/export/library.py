@@ -1,0 +1,112 @@
+"""Exported C, compiled and loaded into Python."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.export.writer import filled
+
+FLAGS = ("-std=c99", "-O3", "-fPIC", "-shared")
+
+
+def compiler() -> list[str] | None:
+    """Return the command of $CC, cc, gcc, clang or ziglang, the first that exists, else None."""
+    if named := shlex.split(os.environ.get("CC", "")):
+        return named if shutil.which(named[0]) else None
+    for name in ("cc", "gcc", "clang"):
+        if found := shutil.which(name):
+            return [found]
+    if importlib.util.find_spec("ziglang"):
+        return [sys.executable, "-m", "ziglang", "cc"]
+    return None
+
+
+def required_compiler() -> list[str]:
+    """Return the command of a C compiler.
+
+    Raises:
+        QPError: there is none.
+    """
+    if (command := compiler()) is None:
+        got, remedy = "none on the PATH", "Install one, or pip install ziglang, which has clang."
+        raise QPError.expected("compiler", got, "a C compiler: $CC, cc, gcc or clang", remedy)
+    return command
+
+
+class Steps(NamedTuple):
+    """The results of one step of each of B controllers.
+
+    Attributes:
+        u: the actions, ``(B, n_u)``.
+        codes: 0 if solved, 1 if not certified within the limit of iterations, 2 if infeasible, and
+            3 if p is invalid, ``(B,)``.
+        value, gap, violation, iterations: the costs to go, the bounds on their errors, the largest
+            violations of a hard row, and the changes of the active set, ``(B,)``.
+    """
+
+    u: np.ndarray
+    codes: np.ndarray
+    value: np.ndarray
+    gap: np.ndarray
+    violation: np.ndarray
+    iterations: np.ndarray
+
+
+class Library:
+    """The functions of an exported policy, compiled into a shared library."""
+
+    def __init__(self, folder: Path, name: str, dtype: str, flags: Sequence[str] = ()) -> None:
+        command = required_compiler()
+        self.real = np.dtype(dtype)
+        with tempfile.TemporaryDirectory() as temporary:
+            wrapper = Path(temporary) / "wrapper.c"
+            wrapper.write_text(filled("wrapper.c", name), encoding="utf-8")
+            target = Path(temporary) / f"{name}.so"
+            files = [str(folder / f"{name}.c"), str(wrapper), f"-I{folder}", "-o", str(target)]
+            ended = subprocess.run(
+                [*command, *(flags or FLAGS), *files], capture_output=True, text=True, check=False
+            )
+            if ended.returncode:
+                got = f"an error of {' '.join(command)}: {ended.stderr.strip()[-500:]}"
+                raise QPError.expected("compiler", got, "a compiled policy")
+            library = ctypes.CDLL(str(target))
+        self._steps = library[f"{name}_steps"]
+        self._resets = library[f"{name}_resets"]
+        self.selftest = library[f"{name}_selftest"]
+        size = library[f"{name}_state_size"]
+        size.restype = ctypes.c_ulong
+        self.state_bytes = int(size())
+        pointer, long = ctypes.c_void_p, ctypes.c_long
+        self._steps.argtypes = [pointer] * 5 + [long]
+        self._resets.argtypes = [pointer, long]
+        self._info = np.dtype(
+            [(n, self.real) for n in ("value", "gap", "violation")] + [("iterations", np.int32)],
+            align=True,
+        )
+
+    def states(self, count: int) -> np.ndarray:
+        """Return the reset states of ``count`` controllers, as bytes."""
+        states = np.zeros(count * self.state_bytes, dtype=np.uint8)
+        self._resets(states.ctypes.data, count)
+        return states
+
+    def steps(self, states: np.ndarray, p: np.ndarray, n_u: int) -> Steps:
+        """Step each controller with its p ``(count, n_p)``."""
+        p = np.ascontiguousarray(p, dtype=self.real)
+        u = np.empty((len(p), n_u), dtype=self.real)
+        info, codes = np.empty(len(p), dtype=self._info), np.empty(len(p), dtype=np.int32)
+        self._steps(*(x.ctypes.data for x in (states, p, u, info, codes)), len(p))
+        return Steps(u, codes, *(info[name] for name in self._info.names or ()))

@@ -1,0 +1,59 @@
+/* @HEADER@ */
+#ifndef POLICY_H
+#define POLICY_H
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef @REAL@ policy_real;
+
+/* The size of p and u, and of the state's arrays. */
+/* @SIZES@ */
+
+/* What policy_step returns. */
+#define POLICY_SOLVED 0     /* u is optimal, and certified to be */
+#define POLICY_LIMIT 1      /* not certified within the limit of iterations */
+#define POLICY_INFEASIBLE 2 /* no plan satisfies the hard rows */
+#define POLICY_INVALID 3    /* p has a NaN, an infinity, or numbers that overflow */
+
+/* The state of a controller: the active set of the last step, where the next one starts. */
+typedef struct {
+    policy_real lambda[POLICY_ROWS_];          /* multipliers of the rows */
+    policy_real lower[POLICY_TRIANGLE];        /* L of the factor L D L' of Q on the held rows */
+    policy_real diagonal[POLICY_HELD_];        /* D */
+    policy_real u[POLICY_N_U];                 /* the last action */
+    policy_real y_free[POLICY_ROWS_];          /* rows without multipliers */
+    policy_real y[POLICY_ROWS_];               /* rows with the multipliers before[] */
+    policy_real before[POLICY_ROWS_];
+    policy_real size[POLICY_ROWS_];            /* size of the terms of a row */
+    policy_real work[2 * POLICY_HELD_ + POLICY_WORK];
+    int held[POLICY_HELD_];                    /* rows held at a bound, in the order of the factor */
+    int n_held;
+    signed char kind[POLICY_ROWS_];            /* see policy.c */
+} policy_state;
+
+typedef struct {
+    policy_real value;     /* cost to go, c included */
+    policy_real gap;       /* bound on value minus the optimal value */
+    policy_real violation; /* largest violation of a hard row, in the units of the row */
+    int iterations;        /* changes of the active set */
+} policy_info;
+
+/* Forget the last active set; call it before the first step. */
+void policy_reset(policy_state *state);
+
+/* Write the action u for what is known, p; return one of the codes above.
+
+   u is always written, within the action bounds: the optimal action if the code is 0, that of the
+   last iterate with the codes 1 and 2, and with code 3 the last action. info may be a null pointer. */
+int policy_step(policy_state *state, const policy_real p[], policy_real u[], policy_info *info);
+
+/* Compare with actions of an exact solver; return 0, or the number of the first state that fails. */
+int policy_selftest(void);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,218 @@
+"""Tables of a QP whose first entries are known: all that a solver needs besides these entries p.
+
+C z = b leaves z = T_p p + T_v v + z_b with a free v. Where H_v = T_v'H T_v is positive definite, v
+and with it u_0 and the rows y = G z are affine in p and in the multipliers lam of the rows,
+
+    y = y_free(p) - Q lam,   Q = G_v H_v^-1 G_v',   G_v = G T_v,
+
+and the dual problem is a QP in lam alone, with -w <= lam <= w. The rows are scaled to Q_ii = 1.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.qp.pipeline.condensing import ENTERS, null_space
+from torch_qpmpc.qp.program import EVENT_SHAPES, QuadraticProgram, crossed
+
+#: H_v is singular if its smallest eigenvalue is below this fraction of the largest.
+SINGULAR = 1e-12
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows ``lower <= Y p + .. <= upper`` with weights w; the offset of y is in the bounds.
+
+    Attributes:
+        Y: ``(r, n_p)``, y without multipliers is ``Y p``.
+        lower, upper, w: ``(r,)``, infinite where there is no bound or the row is hard.
+        size: ``(r,)``, the size of the terms of y that do not depend on p.
+        unit: ``(r,)``, y in the units of G's row is ``unit`` times that of the table.
+    """
+
+    Y: Array
+    lower: Array
+    upper: Array
+    w: Array
+    size: Array
+    unit: Array
+
+    def __len__(self) -> int:
+        return len(self.Y)
+
+    def parts(self) -> tuple[Array, ...]:
+        """Return all six arrays."""
+        return self.Y, self.lower, self.upper, self.w, self.size, self.unit
+
+
+@dataclass(frozen=True, eq=False)
+class Tables:
+    """The tables of a policy in float64.
+
+    Attributes:
+        n_p, n_u: the numbers of known entries and of actions.
+        rows: the rows that v changes, scaled to Q_ii = 1.
+        known: the rows that p alone determines.
+        Q: ``(r, r)``.
+        R: ``(r, d)`` with Q = R R', where d is the size of v.
+        K, k: ``(n_u, n_p)`` and ``(n_u,)``; u_0 without multipliers is ``K p + k``.
+        F: ``(n_u, r)``, the response of u_0 to multipliers is ``-F lam``.
+        P, g, c: ``(n_p, n_p)``, ``(n_p,)`` and a number; the value without multipliers is
+            ``p'Pp / 2 + g'p + c``.
+        u_lower, u_upper: ``(n_u,)``, the hard bounds of rows that contain one action only.
+        condition: the condition number of H_v in an orthonormal basis of the plan.
+        digest: SHA-256 of the nine tensors of the QP.
+    """
+
+    n_p: int
+    n_u: int
+    rows: Rows
+    known: Rows
+    Q: Array
+    R: Array
+    K: Array
+    k: Array
+    F: Array
+    P: Array
+    g: Array
+    c: float
+    u_lower: Array
+    u_upper: Array
+    condition: float
+    digest: str
+
+
+def make_tables(mpc: QPMPC) -> Tables:
+    """Make the tables of the current theta.
+
+    Raises:
+        QPError: theta is not finite, has crossed bounds, or its cost is singular on the plan.
+    """
+    qp = mpc.quadratic_program()
+    H, q, c, C, b, G, lb, ub, w = (x.detach().double().cpu().numpy() for x in qp.tensors())
+    _check(qp)
+    n_p, n_u = mpc.n_p, mpc.n_u
+    H = (H + H.T) / 2
+
+    # z = T_p p + T_v v + z_b, with an orthonormal basis of v.
+    elimination = null_space(C[None], n_p)
+    T, Y_neg = elimination.T[0], elimination.Y_neg[0]
+    T_p, T_v, z_b = T[:, :n_p], T[:, n_p:], -Y_neg @ b
+    factor, condition = _factor(T_v.T @ H @ T_v)
+
+    # The minimiser without inequalities, z = Z p + z_0.
+    right = np.column_stack((H @ T_p, H @ z_b + q))
+    free = np.column_stack((T_p, z_b)) - T_v @ _solve(factor, T_v.T @ right)
+    Z, z_0 = free[:, :n_p], free[:, n_p]
+
+    G_v = G @ T_v
+    bounded = ((lb > -np.inf) | (ub < np.inf)) & (w > 0)
+    enters = (np.abs(G_v) > ENTERS * (np.abs(G) @ np.abs(T).sum(-1, keepdims=True))).any(-1)
+    on_plan = np.flatnonzero(bounded & enters)
+    R = np.linalg.solve(factor, G_v[on_plan].T).T
+    unit = np.linalg.norm(R, axis=1)
+    R = R / unit[:, None]
+    bounds = lb, ub, w
+    rows = _rows(G[on_plan] @ Z, G[on_plan] @ z_0, unit, *(x[on_plan] for x in bounds))
+    others = np.flatnonzero(bounded & ~enters)
+    known = _known(G[others] @ T_p, G[others] @ z_b, *(x[others] for x in bounds))
+    known = _with(known, _implied(C, T_p, z_b, b))
+    u = slice(n_p, n_p + n_u)
+    u_lower, u_upper = _action_bounds(G, lb, ub, w, u)
+    return Tables(
+        n_p,
+        n_u,
+        rows,
+        known,
+        R @ R.T,
+        R,
+        Z[u],
+        z_0[u],
+        np.linalg.solve(factor, T_v[u].T).T @ R.T,
+        Z.T @ H @ Z,
+        Z.T @ (H @ z_0 + q),
+        float(c + (q + H @ z_0 / 2) @ z_0),
+        u_lower,
+        u_upper,
+        condition,
+        _digest(qp),
+    )
+
+
+def _check(qp: QuadraticProgram) -> None:
+    for name, x in zip(EVENT_SHAPES, qp.tensors(), strict=True):
+        if x.isnan().any() or (name not in ("lb", "ub", "w") and x.isinf().any()):
+            remedy = "Export a theta that mpc.value can evaluate."
+            raise QPError.expected(name, "NaN or inf", "a finite theta", remedy)
+    if crossed(qp.lb, qp.ub).any():
+        raise QPError.expected("lb", "entries above ub", "lb <= ub in every row")
+
+
+def _factor(H_v: Array) -> tuple[Array, float]:
+    """Return the Cholesky factor of H_v and its condition number."""
+    eigenvalues = np.linalg.eigvalsh(H_v)
+    lowest, highest = eigenvalues[0], eigenvalues[-1]
+    if not lowest > SINGULAR * highest:
+        raise QPError.expected(
+            "H",
+            f"eigenvalues from {lowest:.3g} to {highest:.3g} on the plan",
+            "a cost that is positive definite on all plans that satisfy C z = b",
+            "Add a small weight of the actions, such as 1e-5, to stage_weight (and learn H with "
+            "it): without one u_0 is not unique, and the exported policy could not be exact.",
+        )
+    return np.linalg.cholesky(H_v), float(highest / lowest)
+
+
+def _solve(factor: Array, right: Array) -> Array:
+    return np.linalg.solve(factor.T, np.linalg.solve(factor, right))
+
+
+def _rows(Y: Array, y_0: Array, unit: Array, lb: Array, ub: Array, w: Array) -> Rows:
+    upper = np.maximum(lb, ub)  # bounds that cross by rounding are equal
+    near = np.minimum(*(np.where(np.isfinite(x), np.abs(x), np.inf) for x in (lb, upper)))
+    size = (np.abs(y_0) + near) / unit
+    return Rows(Y / unit[:, None], (lb - y_0) / unit, (upper - y_0) / unit, w * unit, size, unit)
+
+
+def _known(Y: Array, y_0: Array, lb: Array, ub: Array, w: Array) -> Rows:
+    return _rows(Y, y_0, np.ones(len(Y)), lb, ub, w)
+
+
+def _implied(C: Array, T_p: Array, z_b: Array, b: Array) -> Rows:
+    """Return the equations of p that remain of C z = b if its rows are dependent on the plan."""
+    Y, y_0 = C @ T_p, C @ z_b
+    size = np.abs(C) @ np.abs(T_p).sum(-1) + np.abs(C) @ np.abs(z_b) + np.abs(b)
+    remain = np.maximum(np.abs(Y).max(-1, initial=0), np.abs(y_0 - b)) > 1e-9 * size
+    b, hard = b[remain], np.full(remain.sum(), np.inf)
+    return _known(Y[remain], y_0[remain], b, b, hard)
+
+
+def _with(rows: Rows, more: Rows) -> Rows:
+    return Rows(*(np.concatenate(pair) for pair in zip(rows.parts(), more.parts(), strict=True)))
+
+
+def _action_bounds(G: Array, lb: Array, ub: Array, w: Array, u: slice) -> tuple[Array, Array]:
+    """Return the tightest bounds of u_0 by hard rows that contain one of its entries only."""
+    lower, upper = (np.full(u.stop - u.start, side * np.inf) for side in (-1, 1))
+    for i in np.flatnonzero(np.isinf(w) & ((G != 0).sum(-1) == 1)):
+        (j,) = np.flatnonzero(G[i])
+        if u.start <= j < u.stop:
+            ends = sorted((lb[i] / G[i, j], ub[i] / G[i, j]))
+            lower[j - u.start] = max(lower[j - u.start], ends[0])
+            upper[j - u.start] = min(upper[j - u.start], ends[1])
+    return lower, upper
+
+
+def _digest(qp: QuadraticProgram) -> str:
+    digest = hashlib.sha256()
+    for name, x in zip(EVENT_SHAPES, qp.tensors(), strict=True):
+        digest.update(f"{name}{tuple(x.shape)}".encode())
+        digest.update(x.detach().double().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

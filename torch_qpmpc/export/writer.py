@@ -1,0 +1,264 @@
+"""Write the C files of a policy: the template policy.c with the tables of one QP."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from typing import NamedTuple
+
+import numpy as np
+
+from torch_qpmpc.export.tables import Array, Tables
+from torch_qpmpc.mpc.module import QPMPC
+
+
+class Near(NamedTuple):
+    """Tolerances of the self-test."""
+
+    u: float
+    value: float
+
+
+#: Tolerances by dtype, of which `torch_qpmpc/export/policy.c` explains the use.
+CONSTANTS = {
+    "float64": {
+        "BIG": "1e300",
+        "TOLERANCE": "1e-11",
+        "ROUNDING": "4e-15",
+        "DEPENDENT": "1e-12",
+        "NOISE": "1e-10",
+        "FEASIBLE": "1e-8",
+        "KNOWN_FEASIBLE": "1e-6",
+        "GAP": "1e-9",
+    },
+    "float32": {
+        "BIG": "1e30f",
+        "TOLERANCE": "4e-6f",
+        "ROUNDING": "1e-6f",
+        "DEPENDENT": "1e-5f",
+        "NOISE": "1e-3f",
+        "FEASIBLE": "1e-4f",
+        "KNOWN_FEASIBLE": "1e-5f",
+        "GAP": "1e-4f",
+    },
+}
+#: Largest differences in the self-test, relative to the largest expected action and value.
+NEAR = {"float64": Near(1e-6, 1e-8), "float32": Near(1e-3, 1e-4)}
+REAL = {"float64": "double", "float32": "float"}
+WIDTH = 100
+
+#: Names of the entries of x, u and d.
+Labels = Mapping[str, Sequence[str]]
+
+
+class Example(NamedTuple):
+    """A state of the self-test: p, and the expected code, u and value."""
+
+    kind: str
+    p: Array
+    code: int
+    u: Array
+    value: float
+
+
+class Examples(NamedTuple):
+    """The states of the self-test, and the sizes of actions ``(n_u,)`` and of values there."""
+
+    states: Sequence[Example]
+    u: Array
+    value: float
+
+
+class Settings(NamedTuple):
+    """Choices of `export_c`."""
+
+    name: str
+    dtype: str
+    storage: str
+    max_iterations: int
+
+
+def sources(tables: Tables, settings: Settings, header: str, examples: Examples) -> dict[str, str]:
+    """Return the texts of ``name.h`` and ``name.c``."""
+    parts = {
+        "/* @HEADER@ */": header,
+        "@REAL@": REAL[settings.dtype],
+        "/* @SIZES@ */": "\n".join(
+            f"#define {settings.name.upper()}_{key} {size}"
+            for key, size in sizes_of(tables, settings).items()
+        ),
+        "/* @TABLES@ */": _tables(tables, settings),
+        "/* @EXAMPLES@ */": _examples(tables, settings, examples),
+    }
+    return {f"{settings.name}.{end}": filled(f"policy.{end}", settings.name, parts) for end in "hc"}
+
+
+def filled(template: str, name: str, parts: Mapping[str, str] | None = None) -> str:
+    """Return a template of this folder with its names and parts replaced."""
+    text = resources.files("torch_qpmpc.export").joinpath(template).read_text(encoding="utf-8")
+    text = text.replace("policy", name).replace("POLICY", name.upper())
+    for mark, part in (parts or {}).items():
+        text = text.replace(mark, part)
+    return text
+
+
+def header(mpc: QPMPC, tables: Tables, settings: Settings, labels: Labels) -> str:
+    """Return the comment at the head of both files."""
+    lines = [
+        f"{settings.name}: the policy and value of a quadratic program, by torch_qpmpc "
+        f"{sys.modules['torch_qpmpc'].__version__} on {datetime.date.today().isoformat()}.",
+        f"SHA-256 of H, q, c, C, b, G, lb, ub, w: {tables.digest}",
+        "",
+        *_layout(mpc, labels),
+    ]
+    return "/* " + "\n   ".join(line.replace("*/", "* /") for line in lines).rstrip() + " */"
+
+
+def _layout(mpc: QPMPC, labels: Labels) -> list[str]:
+    """Describe the entries of p and u."""
+    blocks = [("d", f"d_{k}", mpc.n_d) for k in range(mpc.horizon + 1) if mpc.n_d]
+    for k in range(1 - mpc.past, 0):
+        blocks += [("x", f"x_{k}", mpc.n_x), ("u", f"u_{k}", mpc.n_u)]
+    blocks.append(("x", "x_0", mpc.n_x))
+    lines, start = [], 0
+    for kind, name, size in blocks:
+        lines.append(_entries("p", start, size, name, labels.get(kind, ())))
+        start += size
+    return [*lines, _entries("u", 0, mpc.n_u, "u_0", labels.get("u", ()))]
+
+
+def _entries(vector: str, start: int, size: int, name: str, labels: Sequence[str]) -> str:
+    span = f"{start}" if size == 1 else f"{start} .. {start + size - 1}"
+    return f"{vector}[{span}]: {name}" + (f" ({', '.join(labels)})" if labels else "")
+
+
+def held(tables: Tables) -> int:
+    """Return the most rows that can be held at once."""
+    return min(tables.R.shape)
+
+
+def factored(tables: Tables, settings: Settings) -> bool:
+    """Return True if R is stored in place of Q."""
+    return settings.storage == "small" and tables.R.shape[1] < tables.R.shape[0]
+
+
+def sizes_of(tables: Tables, settings: Settings) -> dict[str, int]:
+    """Return the sizes in the header, by the macro's name without the prefix."""
+    r, d, most = len(tables.rows), tables.R.shape[1], held(tables)
+    return {
+        "N_P": tables.n_p,
+        "N_U": tables.n_u,
+        "ROWS": r,
+        "ROWS_": max(r, 1),
+        "KNOWN": len(tables.known),
+        "D": d,
+        "HELD": most,
+        "HELD_": max(most, 1),
+        "TRIANGLE": max(most * (most + 1) // 2, 1),
+        "FACTORED": int(factored(tables, settings)),
+        "WORK": d if factored(tables, settings) else 0,
+    }
+
+
+def arrays_of(tables: Tables, settings: Settings) -> dict[str, Array]:
+    """Return the constant arrays by their names in C."""
+    P = np.tril(tables.P, -1) + np.diag(np.diag(tables.P)) / 2
+    rows, known = tables.rows, tables.known
+    return {
+        "Y_P": rows.Y,
+        "Y_LOWER": rows.lower,
+        "Y_UPPER": rows.upper,
+        "W": rows.w,
+        "SIZE": rows.size,
+        "UNIT": rows.unit,
+        **({"R": tables.R} if factored(tables, settings) else {"Q": tables.Q}),
+        "KNOWN_P": known.Y,
+        "KNOWN_LOWER": known.lower,
+        "KNOWN_UPPER": known.upper,
+        "KNOWN_W": known.w,
+        "U_P": tables.K,
+        "U_OFFSET": tables.k,
+        "U_LAMBDA": tables.F,
+        "U_LOWER": tables.u_lower,
+        "U_UPPER": tables.u_upper,
+        "V_PP": P[np.tril_indices(len(P))],
+        "V_P": tables.g,
+    }
+
+
+def _tables(tables: Tables, settings: Settings) -> str:
+    dtype = settings.dtype
+    constants = {**CONSTANTS[dtype], "MAX_ITERATIONS": settings.max_iterations, "REFINEMENTS": 3}
+    lines = [f"#define {name} {value}" for name, value in constants.items()]
+    lines += [array(name, x, dtype) for name, x in arrays_of(tables, settings).items()]
+    lines.append(f"static const real V_OFFSET = {number(tables.c, dtype)};")
+    return "\n".join(lines)
+
+
+def array(name: str, x: Array, dtype: str) -> str:
+    """Return the definition of a constant array; an empty one gets a zero, as C demands."""
+    if not x.size:
+        x = np.zeros([max(n, 1) for n in x.shape])
+    shape = "".join(f"[{n}]" for n in x.shape)
+    rows = x if x.ndim == 2 else x[None]
+    body = ",\n".join(_braced([number(v, dtype) for v in row]) for row in rows)
+    body = f"{{\n{body}}}" if x.ndim == 2 else body
+    return f"static const real {name}{shape} =\n{body};"
+
+
+def _braced(words: list[str]) -> str:
+    lines, line = [], "{"
+    for word in words:
+        if len(line) + len(word) + 2 > WIDTH:
+            lines.append(line.rstrip())
+            line = " "
+        line += f"{word}, "
+    return "\n".join([*lines, line.rstrip(", ") + "}"])
+
+
+def number(x: float, dtype: str) -> str:
+    """Return a C literal that reads back as the same number."""
+    if math.isinf(x) or abs(x) >= float(CONSTANTS[dtype]["BIG"].rstrip("f")):
+        return "BIG" if x > 0 else "-BIG"
+    if dtype == "float64":
+        return repr(float(x))
+    text = f"{np.float32(x):.9g}"
+    return f"{text if {'.', 'e'} & {*text} else f'{text}.0'}f"
+
+
+def _examples(tables: Tables, settings: Settings, examples: Examples) -> str:
+    """Return the tables of the self-test, with tolerances relative to the sizes."""
+    dtype, near, states = settings.dtype, NEAR[settings.dtype], examples.states
+    arrays = {
+        "EXAMPLE_P": np.array([e.p for e in states]).reshape(-1, tables.n_p),
+        "EXAMPLE_U": np.array([np.nan_to_num(e.u) for e in states]).reshape(-1, tables.n_u),
+        "EXAMPLE_VALUE": np.array([np.nan_to_num(e.value) for e in states]),
+        "NEAR_U": near.u * examples.u,
+    }
+    return "\n".join(
+        [
+            f"/* States of the self-test: {', '.join(e.kind for e in states)}. */",
+            f"#define EXAMPLES {len(states)}",
+            f"static const int EXAMPLE_CODE[] = {{{', '.join(str(e.code) for e in states)}}};",
+            *(array(name, x, dtype) for name, x in arrays.items()),
+            f"static const real NEAR_VALUE = {number(near.value * examples.value, dtype)};",
+        ]
+    )
+
+
+def table_bytes(tables: Tables, settings: Settings) -> int:
+    """Return the size of all tables but those of the self-test."""
+    numbers = sum(x.size for x in arrays_of(tables, settings).values()) + 1
+    return numbers * np.dtype(settings.dtype).itemsize
+
+
+def state_bytes(tables: Tables, settings: Settings) -> int:
+    """Return the size of the state, with C's padding."""
+    size = {k: int(v) for k, v in sizes_of(tables, settings).items()}
+    reals = 5 * size["ROWS_"] + size["TRIANGLE"] + 3 * size["HELD_"] + size["WORK"] + size["N_U"]
+    real = np.dtype(settings.dtype).itemsize
+    total = reals * real + 4 * (size["HELD_"] + 1) + size["ROWS_"]
+    return -(-total // real) * real
