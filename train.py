@@ -5,6 +5,7 @@
     python train.py constraint=mpc                      a linear MPC scheme with learned model
     python train.py task=gros_zanon solver=daqp         another plant, in one long episode
     python train.py -m constraint=fixed,free seed=1,2   a sweep
+    python train.py task=gymnasium task.id=Pendulum-v1 start=data   from a log, without a model
     python train.py resume=runs/point_mass/..           resume a stopped run
     python train.py -m +study=paper                     start or resume the paper's study
     tensorboard --logdir runs                           watch the runs
@@ -39,9 +40,10 @@ from torch_qpmpc.experiment.metrics import report, run_summary, table, update_me
 from torch_qpmpc.experiment.plots import summary_figure
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
+from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tally import Tally
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics, make_true_mpc, true_model
-from torch_qpmpc.learning.operators import in_closed_loop, warm_policy
+from torch_qpmpc.learning.operators import in_closed_loop, preview_key, warm_policy
 from torch_qpmpc.learning.replay import ACTIVE_SET
 
 # Absolute, so that a user's script can call main.
@@ -73,18 +75,23 @@ def _train(
 
     # The QP, and its J before learning and with the true model.
     physics = make_physics(cfg)
-    mpc = make_mpc(cfg, physics)
+    identified = make_start(cfg, physics, folder, written=state is not None)
+    if identified is not None and not quiet:
+        print(identified.identified)
+    mpc = make_mpc(cfg, physics, identified)
     start = evaluate(cfg, warm_policy(mpc), physics)
     loops = {"start": start, "learned": start}
     if (true_mpc := make_true_mpc(cfg, physics)) is not None:
         loops["true model"] = evaluate(cfg, warm_policy(true_mpc), physics)
 
     # The learner: Q-learning of first or second order, or actor-critic.
-    operator = QPActorValueOperator(mpc, active_set_key=ACTIVE_SET if cfg.warm_start else None)
+    active_set = ACTIVE_SET if cfg.warm_start else None
+    operator = QPActorValueOperator(mpc, preview_key=preview_key(mpc), active_set_key=active_set)
     released = state is not None and state["structure"] != mpc.structure
     if released:
         mpc.release()
     learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
+    n_preview = (mpc.horizon + 1) * mpc.n_d
     learned_mpc = mpc if cfg.algo.name == "qlearning" or cfg.algo.actor == "qp" else None
 
     # The data: vectorised episodes under the current policy, and their replay.
@@ -110,7 +117,7 @@ def _train(
             tally = restore(state, mpc, learner, collector, replay)
             if state["collector"] is None and tally.update < cfg.updates and not quiet:
                 print("Starting new episodes: the state of the environments is not saved.")
-            loops["learned"] = evaluate(cfg, in_closed_loop(learner.actor), physics)
+            loops["learned"] = evaluate(cfg, in_closed_loop(learner.actor, n_preview), physics)
         interrupt.exit_if_signalled(f"Stopped after update {tally.update}: {command}")
 
         label = f"{cfg.constraint.name}, {cfg.noise.name}"
@@ -129,7 +136,7 @@ def _train(
                 if cfg.replay:
                     replay.remember(sample)
                 learner.advance()
-            tally.add(batch, physics.violation(batch["observation"]))
+            tally.add(batch, physics.violations(batch))
             progress.update()
 
             if update % cfg.log_interval == 0:
@@ -140,7 +147,7 @@ def _train(
             last = update == cfg.updates
             evaluated = last or update % cfg.eval_interval == 0
             if evaluated:
-                loops["learned"] = evaluate(cfg, in_closed_loop(learner.actor), physics)
+                loops["learned"] = evaluate(cfg, in_closed_loop(learner.actor, n_preview), physics)
                 gap = report(run, learned_mpc, loops, update)
                 progress.set_postfix(J=gap["J_final"], closed_gap=gap["closed_gap"])
             if evaluated or interrupt.signum is not None:

@@ -46,20 +46,24 @@ BOUNDS: Any = (-BOUND, BOUND)
 GRID = torch.linspace(-BOUND, BOUND, 5).unsqueeze(-1)
 
 
-def make_mpc(seed: int) -> QPMPC:
+#: Keys of a QP that knows one signal ahead of time.
+PREVIEW: dict[str, Any] = {"preview_key": "preview"}
+
+
+def make_mpc(seed: int, n_d: int = 0) -> QPMPC:
     """Make a QP initialised by ``seed``; its bounds are buffers."""
     learn = ("H", "q", "c", "C", "b")
     bounds = ([-BOUND], [BOUND])
-    return random_mpc(seed, learn=learn, state_slack=5.0, action_bounds=bounds)
+    return random_mpc(seed, learn=learn, state_slack=5.0, action_bounds=bounds, n_d=n_d)
 
 
 def critic(seed: int = 1, **keys: Any) -> Any:
-    return QPActorValueOperator(make_mpc(seed), **keys)
+    return QPActorValueOperator(make_mpc(seed, n_d=len(keys.keys() & PREVIEW)), **keys)
 
 
-def critics(count: int = 2) -> Any:
+def critics(count: int = 2, **keys: Any) -> Any:
     """Make an ensemble as a list: TorchRL fills copies of a single module with random numbers."""
-    return [critic(seed) for seed in range(1, count + 1)]
+    return [critic(seed, **keys) for seed in range(1, count + 1)]
 
 
 def value(seed: int = 9, **keys: Any) -> Any:
@@ -119,10 +123,10 @@ def network_gaussian() -> Any:
     return stochastic(TensorDictModule(net, ["observation"], ["loc", "scale"]))
 
 
-def qp_gaussian() -> Any:
+def qp_gaussian(**keys: Any) -> Any:
     """Make a stochastic policy with the QP as its mean and a learned scale."""
     scale: Any = TensorDictModule(AddStateIndependentNormalScale(1), ["loc"], ["loc", "scale"])
-    return stochastic(TensorDictSequential(policy(action_key="loc"), scale))
+    return stochastic(TensorDictSequential(policy(action_key="loc", **keys), scale))
 
 
 def grid_critic() -> Any:
@@ -151,6 +155,17 @@ LOSSES: dict[str, Callable[[], LossModule]] = {
     "value of PPO": lambda: ClipPPOLoss(network_gaussian(), value()),
     "value of REINFORCE": lambda: ReinforceLoss(network_gaussian(), value()),
     "mean and value of PPO": lambda: ClipPPOLoss(qp_gaussian(), value()),
+    "V and Q of Q-learning, with a preview": lambda: QPQLearningLoss(
+        critic(**PREVIEW), delay_value=True
+    ),
+    "actor and critics of TD3, with a preview": lambda: TD3Loss(
+        policy(**PREVIEW), critics(**PREVIEW), bounds=BOUNDS
+    ),
+    # TorchRL's losses pass the critics no entry that the actor does not read.
+    "mean, critics and value of IQL, with a preview": lambda: IQLLoss(
+        qp_gaussian(**PREVIEW), critics(**PREVIEW), value(**PREVIEW)
+    ),
+    "value of PPO, with a preview": lambda: ClipPPOLoss(network_gaussian(), value(**PREVIEW)),
 }
 #: On-policy losses, whose default estimator is GAE.
 ON_POLICY = [name for name in LOSSES if any(x in name for x in ("A2C", "PPO", "REINFORCE"))]
@@ -171,11 +186,13 @@ def make_batch(loss: LossModule | None = None, *shape: int) -> TensorDict:
     *batch, steps = shape or (2, 4)
     s = random_states(20 * (steps + 1), seed=3)[: torch.Size((*batch, steps + 1)).numel()]
     s = s.float().view(*batch, steps + 1, 2)
+    preview = torch.cat((s.flip(-1), s.square()), -1)
     ended = random_states(1000, 1, size=1.0, seed=4)[: torch.Size((*batch, steps)).numel()]
     ended = ended.view(*batch, steps, 1)
     action = random_states(1000, 1, size=BOUND, seed=5)[: ended.numel()]
     after = TensorDict(
         observation=s[..., 1:, :].clone(),
+        preview=preview[..., 1:, :].clone(),
         reward=-s[..., 1:, :].square().sum(-1, keepdim=True),
         done=ended > 0.5,
         terminated=ended > 0.8,
@@ -183,6 +200,7 @@ def make_batch(loss: LossModule | None = None, *shape: int) -> TensorDict:
     )
     td = TensorDict(
         observation=s[..., :-1, :].clone(),
+        preview=preview[..., :-1, :].clone(),
         action=action.float().view(*batch, steps, 1),
         next=after,
         batch_size=(*batch, steps),

@@ -8,6 +8,7 @@ import gymnasium
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
+from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 from torch_qpmpc.qp.program import QuadraticProgram, Status
@@ -23,6 +24,7 @@ __all__ = [
     "QPMPC",
     "DeviationPenalty",
     "GaussNewton",
+    "Identified",
     "QPActorValueOperator",
     "QPError",
     "QPQLearningLoss",
@@ -32,6 +34,7 @@ __all__ = [
     "SolverError",
     "Status",
     "SystemIdentificationPenalty",
+    "identify",
     "solve_qp",
 ]
 

@@ -19,6 +19,7 @@ def model(*stages: int) -> Model:
     return Model(
         A + 0.1 * normal(*stages, 3, 3, seed=6),
         B + 0.1 * normal(*stages, 3, 2, seed=7),
+        torch.zeros(*stages, 3, 0),
         OFFSET + 0.1 * normal(*stages, 3, seed=8),
         residual,
     )
@@ -38,7 +39,7 @@ def test_error_over_unit_variance_is_the_frobenius_norm():
     parts = (wrong.A - A, wrong.B - B, wrong.offset)
     expected = sum(part.square().sum().item() for part in parts) ** 0.5
     assert one_step_error(wrong, A, B).item() == pytest.approx(expected)
-    right = Model(A, B, OFFSET, torch.zeros(()))
+    right = Model(A, B, torch.zeros(3, 0), OFFSET, torch.zeros(()))
     assert one_step_error(right, A, B, OFFSET) == 0
     assert one_step_error(right, A, B).item() == pytest.approx(OFFSET.norm().item())
 

@@ -81,7 +81,7 @@ def solvable(known: KnownQP, accuracy: float = ACCURACY) -> Case:
 
 def changed(known: KnownQP, **tensors: Tensor) -> KnownQP:
     """Replace tensors of a QP without checks."""
-    parts = dict(vars(known.qp)) | tensors
+    parts: dict[str, Any] = vars(known.qp) | tensors
     return replace(known, qp=QuadraticProgram(**parts, check_values=False))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, dataclass, field, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -109,7 +110,7 @@ def solve(qp: QuadraticProgram, fixed: Tensor, solver: str) -> QPSolution:
 def alone(case: Case, i: int) -> tuple[QuadraticProgram, Tensor]:
     """Return the QP at ``i`` and its fixed entries."""
     qp = case.known.qp
-    parts = {
+    parts: dict[str, Any] = {
         name: tensor[i] if tensor.ndim > len(event) else tensor
         for (name, event), tensor in zip(EVENT_SHAPES.items(), qp.tensors(), strict=True)
     }

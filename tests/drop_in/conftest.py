@@ -8,6 +8,15 @@ from typing import Any
 import pytest
 import torchrl
 
+from tests.drop_in import networks
+
+
+@pytest.fixture(autouse=True, params=["state", "preview"])
+def known(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run every test with QPs that fix a state, and with QPs that fix a preview, too."""
+    monkeypatch.setattr(networks, "PREVIEW", request.param == "preview")
+
+
 #: Reasons by the end of a test's name.
 LEFT_OUT = {
     "prioritized_weights": (

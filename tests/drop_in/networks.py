@@ -27,18 +27,26 @@ class Theta(QPMPC):
             setattr(self, name, constant)
 
 
-def make_theta(n_x: int, n_u: int, unused: str | None = None) -> Theta:
+#: True for QPs whose observation contains a preview [d_0, d_1], where it has the entries for one.
+PREVIEW = False
+
+
+def make_theta(n_p: int, n_u: int, unused: str | None = None) -> Theta:
     """Make a small QP that learns all parts, each with a gradient in any batch.
 
-    Its linear cost pushes some actions to a bound and some beyond it. All entries of a part lie
-    between its smallest and its largest in any order: TorchRL fills the copies of an ensemble's
-    module with such numbers. (In a script, pass a list of modules.)
+    Its observation is p ``(*batch, n_p)``. Its linear cost pushes some actions to a bound and some
+    beyond it. All entries of a part lie between its smallest and its largest in any order: TorchRL
+    fills the copies of an ensemble's module with such numbers. (In a script, pass a list of
+    modules.)
     """
+    n_d = int(PREVIEW and n_p > 2)
+    n_x, horizon = n_p - 2 * n_d, 2 - n_d
     # Each call draws from the generator that the tests seed.
     theta = Theta(
         n_x,
         n_u,
-        2,
+        horizon,
+        n_d=n_d,
         state_bounds=([-0.5] * n_x, [0.5] * n_x),
         action_bounds=([-0.5] * n_u, [0.5] * n_u),
         stage_weight=0.5 + torch.rand(n_x + n_u),
@@ -49,28 +57,29 @@ def make_theta(n_x: int, n_u: int, unused: str | None = None) -> Theta:
         seed=int(torch.randint(2**31, ())),
     )
     stage = torch.cat((torch.linspace(-1, 1, n_x), torch.linspace(-4, 4, n_u)))
-    theta.q.data += torch.cat((stage, stage, torch.linspace(-1, 1, n_x)))
+    plan = torch.cat((*[stage] * horizon, torch.linspace(-1, 1, n_x)))
+    theta.q.data[-len(plan) :] += plan
     return theta
 
 
-def make_policy(n_x: int, n_u: int, observation: Any = "observation") -> Any:
+def make_policy(n_p: int, n_u: int, observation: Any = "observation") -> Any:
     """Make a deterministic actor, without learning c, which no action depends on."""
-    mpc = make_theta(n_x, n_u, unused="c")
+    mpc = make_theta(n_p, n_u, unused="c")
     return QPActorValueOperator(mpc, observation_key=observation).get_policy_operator()
 
 
-def make_gaussian(n_x: int, n_u: int) -> nn.Module:
+def make_gaussian(n_p: int, n_u: int) -> nn.Module:
     """Make a stochastic actor: the QP's action as location, and a learned scale."""
-    return nn.Sequential(make_policy(n_x, n_u), AddStateIndependentNormalScale(n_u))
+    return nn.Sequential(make_policy(n_p, n_u), AddStateIndependentNormalScale(n_u))
 
 
-def make_critic(n_x: int, n_u: int, **keys: Any) -> Any:
+def make_critic(n_p: int, n_u: int, **keys: Any) -> Any:
     """Make a critic, -Q, with keys that a test may rename."""
-    return QPActorValueOperator(make_theta(n_x, n_u), **keys)
+    return QPActorValueOperator(make_theta(n_p, n_u), **keys)
 
 
-def make_value(n_x: int, n_u: int, **keys: Any) -> Any:
+def make_value(n_p: int, n_u: int, **keys: Any) -> Any:
     """Make a value, -V, initially below -Q: above it, IQL with expectile one learns nothing."""
-    operator = make_critic(n_x, n_u, **keys)
-    operator.module.c.data += 100
+    operator = make_critic(n_p, n_u, **keys)
+    operator.module.c.data += 1000
     return operator.get_value_operator()

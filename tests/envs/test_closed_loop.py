@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.envs import TransformedEnv
 
-from torch_qpmpc.envs import GrosZanonLTI, GymnasiumPlant, PointMass
-from torch_qpmpc.envs.closed_loop import closed_gap, closed_loop, gymnasium_loop
+from tests.store import Store
+from torch_qpmpc.envs import GrosZanonLTI, GymnasiumPlant, PastWindow, PlantEnv, PointMass
+from torch_qpmpc.envs.closed_loop import closed_gap, closed_loop, gymnasium_loop, plant_loop
 from torch_qpmpc.errors import QPError
 
 K = torch.tensor([[1.5, 0.0, 1.0, 0.0], [0.0, 1.5, 0.0, 1.0]], dtype=torch.float64)
@@ -60,6 +65,76 @@ def test_closed_loop_takes_any_linear_system():
         s = s @ np.array([[0.9, 0], [0.35, 1.1]]) + a @ [[0.0813, 0.2]]
         s[:, 0] += rng.uniform(-0.1, 0.0, size=3)
     assert run.actions.shape == (20, 3, 1)
+
+
+class Recorded(Store):
+    """A store with given signals and starts."""
+
+    given: tuple[Tensor, Tensor]
+
+    def __init__(self, w: Tensor, x: Tensor, **options: Any) -> None:
+        super().__init__(**options)
+        object.__setattr__(self, "given", (w, x))
+
+    def signals(self, rng, count, length):
+        w, _ = self.given
+        assert w.shape == (count, length, 4)
+        return w
+
+    def starts(self, rng, count):
+        return self.given[1]
+
+
+def test_plant_loop_is_an_episode_of_the_environment():
+    """Both show a policy the same p, and have the same costs."""
+
+    def policy(p: Tensor) -> Tensor:
+        return (0.5 + p[:, :1] - p[:, 2:3] + p[:, -1:] - p[:, -2:-1] - p[:, -3:-2]).sigmoid()
+
+    plant, steps = Store(horizon=2, past=3), 6
+    env: Any = TransformedEnv(PlantEnv(plant, 4, steps, torch.float64, seed=0), PastWindow(3))
+    actor: Any = TensorDictModule(
+        lambda *known: policy(torch.cat(known, -1)), ["preview", "observation"], ["action"]
+    )
+    data = env.rollout(steps, actor)
+    w = env.base_env._signals[data["episode"][:, 0, 0]]
+    recorded = Recorded(w, data["state"][:, 0], horizon=2, past=3)
+    run = plant_loop(policy, recorded, steps=steps, starts=4, gamma=0.9)
+    seen = torch.cat((data["preview"], data["observation"]), -1)
+    assert torch.equal(run.known[:-1], seen.transpose(0, 1))
+    last = data["next"][:, -1]
+    assert torch.equal(run.known[-1], torch.cat((last["preview"], last["observation"]), -1))
+    assert torch.equal(run.states, run.known[..., -1:])
+    assert torch.equal(run.actions, data["action"].transpose(0, 1))
+    assert torch.equal(run.costs, -data["next", "reward"].squeeze(-1).T)
+
+
+def test_the_seed_determines_signals_and_starts_of_plant_loop():
+    class Rival:
+        begun: Any = None
+
+        def begin(self, plant: Store, x: Tensor, w: Tensor) -> None:
+            self.begun = (plant, x, w)
+
+        def __call__(self, p: Tensor) -> Tensor:
+            assert p.shape == (3, 8 + 3)
+            return torch.full((3, 1), 2.0).double()
+
+    plant, rival = Store(), Rival()
+    run = plant_loop(rival, plant, steps=5, starts=3, seed=7)
+    rng = np.random.default_rng(7)
+    w = plant.signals(rng, 3, 5 + 3 + 1)
+    x = plant.starts(rng, 3)
+    assert rival.begun[0] is plant
+    assert torch.equal(rival.begun[1], x)
+    assert torch.equal(rival.begun[2], w)
+    one = torch.ones(3, 1).double()
+    assert torch.equal(run.actions, one.expand(5, 3, 1)), "as applied: clipped"
+    for k in range(5):
+        assert torch.equal(run.states[k], plant.output(x, w[:, k]))
+        assert torch.equal(run.costs[k], plant.cost(x, one, w[:, k]))
+        assert torch.equal(run.known[k][:, 9], one[:, 0] if k else 0 * one[:, 0]), "u_{k-1}"
+        x = plant.step(x, one, w[:, k])
 
 
 def test_arguments_change_the_experiment():

@@ -28,7 +28,7 @@ from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.learning.actor_critic import BoundedPolicy, Clip, ClippedPolicy
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
 
-TASKS = ("point_mass", "pendulum")
+TASKS = ("point_mass", "pendulum", "store")
 NETWORKS = ("qp", "mlp")
 ALGOS = ("ddpg", "td3")
 COMBINATIONS = list(itertools.product(ALGOS, NETWORKS, NETWORKS))
@@ -232,7 +232,7 @@ def test_td3_whose_schedule_is_restored_has_the_same_delay():
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize(("algo", "actor", "critic"), COMBINATIONS)
-def test_updates_move_the_actor_the_critics_and_nothing_else(algo, actor, critic, task):
+def test_updates_move_the_actor_the_critics_and_nothing_else(algo, actor, critic, task, store_task):
     learner, mpc, batch = make(*settings(algo, actor, critic, task))
     assert learner.target is not None
     loss_module = learner.loss_module

@@ -33,7 +33,7 @@ GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
-NOT_NEEDED = ("eval_seed", "logger", "task.file")
+NOT_NEEDED = ("eval_seed", "logger", "start.name", "task.file")
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
@@ -91,6 +91,9 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "first": ("optimizer=adam", "constraint=combined", "constraint.si.windows=4"),
         "second": ("optimizer=gauss_newton", "constraint=combined", "batch_size=8"),
         "actor": ("algo=td3", "task=pendulum", "constraint=free", "batch_size=8"),
+        "house": ("task=house", "warmup_steps=1"),
+        "house_wall": ("task=house_wall", "warmup_steps=1"),
+        "data": ("start=data", "task=pendulum", "constraint=free", "start.transitions=40"),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
     }.items():
         cfg = make_config(*SMALL, "delay_value=true", *overrides)
@@ -118,6 +121,8 @@ NOISES = {
     "point_mass": {"gaussian", "brownian"},
     "gros_zanon": {"uniform"},
     "gymnasium": {"none"},
+    "house": {"none"},
+    "house_wall": {"none"},
     "pendulum": {"none"},
 }
 WINDOWS = ("si", "combined", "identified")
@@ -133,7 +138,7 @@ def faults(constraint: str, noise: str, optimizer: str, task: str) -> list[str]:
 def chosen(constraint: str, noise: str, optimizer: str, task: str) -> DictConfig:
     groups = dict(zip(GROUPS, (constraint, noise, optimizer, task), strict=True))
     more = ["task.id=Pendulum-v1"] if task == "gymnasium" else []
-    return make_config(*(f"{key}={x}" for key, x in groups.items()), *more, "warmup_steps=10")
+    return make_config(*(f"{key}={x}" for key, x in groups.items()), *more, "warmup_steps=32")
 
 
 PRODUCT = list(itertools.product(*map(choices, GROUPS)))
@@ -167,11 +172,22 @@ def test_an_actor_has_the_first_order_by_itself():
     assert make_config("algo=td3", "optimizer=sgd").optimizer.name == "sgd"
 
 
+#: The tasks of keys that pendulum lacks.
+TASK_KEYS = {
+    "task.margin": "task=house",
+    "task.one_weather": "task=house",
+    "task.past": "task=house_wall",
+}
+
+
 def choices_with(key: str) -> list[str]:
     """Return the choices of groups that have the key."""
+    if key in TASK_KEYS:
+        return ["optimizer=adam", TASK_KEYS[key]]
     if key in settings(make_config("optimizer=gauss_newton")):
         return ["optimizer=gauss_newton"]
     having = {"algo": "algo=td3", "collector": "collector=ray", "task": "task=pendulum"}
+    having["start"] = "start=data"
     return ["optimizer=adam", *(c for group, c in having.items() if key.startswith(f"{group}."))]
 
 
@@ -207,6 +223,13 @@ BAD: dict[str, list[Any]] = {
     "algo.policy_delay": WHOLE,
     "algo.policy_noise": REAL,
     "algo.noise_clip": REAL,
+    "start.name": ["policy", *NAME],
+    "start.file": [3, True],
+    "start.transitions": WHOLE,
+    "start.levels": ["normal", *NAME],
+    "start.hold": [0.5, *REAL],
+    "start.causal": FLAG,
+    "start.ridge": REAL[:-1],
     "collector.name": ["many", *NAME],
     "collector.workers": WHOLE,
     "collector.sync": FLAG,
@@ -245,7 +268,8 @@ for _name in ("task.horizon", "task.episode_steps", "task.eval_steps"):
     BAD[_name] = WHOLE
 for _name in ("scale_cost", "scale_constraints", "damping"):
     BAD[f"optimizer.{_name}"] = [0, *REAL]
-BAD["optimizer.trust_region"] = FLAG
+BAD["optimizer.trust_region"] = BAD["task.one_weather"] = FLAG
+BAD["task.past"], BAD["task.margin"] = WHOLE, REAL
 for _name in ("lr_cost", "lr_constraints"):
     BAD[f"optimizer.{_name}"] = REAL
 for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.growth", "si.beta"):
@@ -374,7 +398,7 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     cfg, file = make_config(), tmp_path / "config.yaml"
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
-    del cfg["logger"], cfg["eval_seed"]
+    del cfg["logger"], cfg["eval_seed"], cfg["start"]
     OmegaConf.save(cfg, file)
     assert differences(settings(cfg), now) is None
     assert settings(load_config(file)) == now

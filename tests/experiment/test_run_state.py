@@ -44,10 +44,15 @@ ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
         ("algo=ddpg", *ACTOR_CRITIC),
         ("algo=td3", *ACTOR_CRITIC),
         ("algo=td3", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
+        ("task=store", "optimizer=adam", "constraint=combined"),
+        ("task=store", "optimizer=gauss_newton", "constraint=si", "task.episode_steps=5"),
+        ("task=store", "optimizer=recursive", "optimizer.memory=8", "task.episode_steps=6"),
+        ("task=store", "algo=td3", *ACTOR_CRITIC),
+        ("task=store", "algo=ddpg", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
     ],
     ids=" ".join,
 )
-def test_a_resumed_run_equals_an_undisturbed_one(tmp_path, monkeypatch, overrides):
+def test_a_resumed_run_equals_an_undisturbed_one(tmp_path, monkeypatch, overrides, store_task):
     cfg = make_config(*RUN, *overrides)
     train.train(cfg, str(tmp_path / "whole"))
     for update in STOPS:

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import runpy
 import signal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -159,7 +160,7 @@ def test_a_model_of_other_dimensions_is_an_error_of_the_environment():
         r"^task\.id: got 'MountainCarContinuous-v0', whose observation has 2 entries and whose "
         r"action has 1, with task\.A of shape \(3, 3\), task\.B of shape \(3, 1\), "
         r"task\.stage_weight of shape \(4, 4\), expected task\.A of shape \(2, 2\), task\.B of "
-        r"shape \(2, 1\), task\.stage_weight of shape \(3, 3\)\. Find a model .* finite differences"
+        r"shape \(2, 1\), task\.stage_weight of shape \(3, 3\)\. .* find a model .* differences"
     )
     with pytest.raises(QPError, match=message):
         make_mpc(cfg, make_physics(cfg))
@@ -179,6 +180,44 @@ def test_a_model_on_the_command_line_is_that_of_the_qp():
     assert torch.equal(mpc.C_0, banded_matrix(A, B, 4))
     W = mpc.quadratic_program().H[:3, :3]
     torch.testing.assert_close(W, torch.diag(torch.tensor([2.0, 1, 1])).double())
+
+
+# Plants with previews and windows
+
+
+def test_a_scheme_passes_what_is_known_and_more(store_task):
+    cfg = make_config("task=store", "task.horizon=4", "constraint=free")
+    plant: Any = make_physics(cfg)
+    mpc = make_mpc(cfg, plant)
+    assert (mpc.n_p, mpc.past, mpc.n_d, mpc.horizon) == (10 + 3, 2, 2, 4)
+    assert mpc.quadratic_program().w[0] == 2, "an option replaces task.state_slack"
+    assert len(mpc.G) == 4 * 2 + 1 + 4, "rates, too"
+    assert (mpc.C[0, :2].tolist(), mpc.C[0, 10:12].tolist()) == ([0, -1], [-0.5, 0.5])
+    with_c = dataclasses.replace(find_task(cfg.task).wrong_scheme(cfg, plant), c=7.0)
+    register(dataclasses.replace(TASKS["store"], wrong_scheme=lambda cfg, plant: with_c))
+    assert make_mpc(cfg, plant).c == 7
+
+
+@pytest.mark.parametrize("algo", ["qlearning", "td3"])
+def test_train_learns_a_plants_qp(store_task, tmp_path, algo):
+    """With both penalties, a step of second order, and figures; every step is in the replay."""
+    options = ("optimizer=gauss_newton", "constraint=combined")
+    if algo != "qlearning":
+        options = ("constraint=free", f"algo={algo}", "warm_start=false")
+    cfg = make_config("task=store", *SMALL, *options, "figures=true")
+    summary = train.train(cfg, str(tmp_path), quiet=True)
+    assert summary["unsolved"] == 0
+    assert summary["train_violation"] > 0
+    assert math.isfinite(summary["J_final"])
+    assert summary["J_final"] != summary["J_start"]
+    assert summary["J_start"] == summary["J_true_model"]
+    assert (tmp_path / "summary.png").exists()
+
+
+@pytest.mark.slow
+def test_a_plant_in_worker_processes(store_task, tmp_path):
+    cfg = make_config("task=store", *SMALL, "collector=multi", "collector.workers=2")
+    assert train.train(cfg, str(tmp_path), quiet=True)["unsolved"] == 0
 
 
 # A user's task

@@ -21,10 +21,12 @@ from torchrl.modules import (
 )
 from torchrl.objectives import DDPGLoss, IQLLoss
 
-from torch_qpmpc import QPMPC, QPActorValueOperator, SolveLog, SolverError
+from tests.store import Store, collect
+from tests.store import make_mpc as make_store_mpc
+from torch_qpmpc import QPMPC, QPActorValueOperator, QPError, SolveLog, SolverError
 from torch_qpmpc.envs import PointMass, PointMassEnv
-from torch_qpmpc.envs.closed_loop import closed_loop
-from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, warm_policy
+from torch_qpmpc.envs.closed_loop import closed_loop, plant_loop
+from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, in_closed_loop, warm_policy
 from torch_qpmpc.qp.program import UNKNOWN
 from torch_qpmpc.qp.solvers import BACKENDS
 
@@ -107,6 +109,41 @@ def test_keys():
     )
     assert (policy.in_keys, policy.out_keys) == (["observation"], ["action"])
     assert (value.in_keys, value.out_keys) == (["observation"], ["state_value"])
+
+
+def test_a_preview_is_an_input_of_its_own():
+    mpc, td = make_store_mpc(), collect(3, 4)
+    operator = QPActorValueOperator(mpc, preview_key="preview")
+    value, policy = operator.get_value_operator(), operator.get_policy_operator()
+    assert operator.in_keys == ["observation", "action", "preview"]
+    assert value.in_keys == policy.in_keys == ["observation", "preview"]
+    p = torch.cat((td["preview"], td["observation"]), -1)
+    assert torch.equal(operator.known(td), p)
+    assert p.shape == (3, 4, mpc.n_p)
+    y, a, d = td["observation"], td["action"], td["preview"]
+    assert torch.equal(operator(y, a, d), -mpc.action_value(p, a).unsqueeze(-1))
+    assert torch.equal(value(td)["state_value"], -mpc.value(p).unsqueeze(-1))
+    assert torch.equal(policy(td)["action"], mpc.policy(p))
+
+    whole = QPActorValueOperator(mpc)  # whose observation is p
+    assert torch.equal(whole(p, a), operator(y, a, d))
+    with pytest.raises(QPError, match=r"^preview: got .*, expected one with preview\."):
+        operator(td.exclude("preview", ("next", "preview")))
+    with pytest.raises(QPError, match=r"s: got shape \(3, 4, 3\), expected shape \(\*batch, 11\)"):
+        whole(td)
+
+
+def test_a_policy_of_p_for_closed_loops():
+    plant, mpc = Store(), make_store_mpc()
+    cold = plant_loop(mpc.policy, plant, steps=8, starts=4)
+    warm = plant_loop(warm_policy(mpc), plant, steps=8, starts=4)
+    operator = QPActorValueOperator(mpc, preview_key="preview")
+    actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
+    split = plant_loop(in_closed_loop(actor, plant.n_preview), plant, steps=8, starts=4)
+    for loop in (warm, split):
+        torch.testing.assert_close(loop.actions, cold.actions, rtol=0, atol=1e-7)
+    idle = plant_loop(lambda p: 0 * p[:, :1], plant, steps=8, starts=4)
+    assert cold.J < idle.J
 
 
 def test_nested_keys():

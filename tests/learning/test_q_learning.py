@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
+from tests import store
 from tests.transitions import (
     GAMMA,
     LEARN,
@@ -62,6 +63,35 @@ def test_loss_and_its_gradients(estimator, delay_value):
         if isinstance(online, torch.nn.Parameter):
             assert torch.equal(frozen, online) != delay_value
             assert (frozen.data_ptr() == online.data_ptr()) != delay_value
+
+
+@pytest.mark.parametrize("delay_value", [False, True])
+def test_loss_and_its_gradients_with_a_window_and_a_preview(delay_value):
+    operator = store.make_operator()
+    twin = copy.deepcopy(operator.module)
+    loss = make_loss(operator=operator, delay_value=delay_value)
+    if delay_value:
+        SoftUpdate(loss, tau=0.1)
+    td = store.collect(3, 8).reshape(-1)
+    assert {"preview", ("next", "preview")} <= set(loss.in_keys)
+    loss(td)["loss_value"].backward()
+
+    def known(data: TensorDictBase) -> Tensor:
+        return torch.cat((data["preview"], data["observation"]), -1)
+
+    with torch.no_grad():
+        V = twin.value(known(td["next"]))
+    target = -td["next", "reward"].squeeze(-1) + GAMMA * V
+    Q = twin.action_value(known(td), td["action"])
+    (0.5 * (target - Q).square().mean()).backward()
+    for (name, part), expected in zip(
+        operator.module.named_parameters(), twin.parameters(), strict=True
+    ):
+        assert expected.grad is not None
+        assert expected.grad.norm() > 0, name
+        torch.testing.assert_close(part.grad, expected.grad, msg=name)
+    with pytest.raises(QPError, match=r"\('next', 'preview'\): got .*, expected one with preview"):
+        loss(td.exclude(("next", "preview")))
 
 
 def test_input_is_left_alone_by_an_estimator_that_rewrites_rewards():

@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 
+from tests import store
 from torch_qpmpc.envs import PointMass, PointMassEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.replay import Replay, make_replay, windows_to_tau
@@ -130,6 +131,26 @@ def test_tau_has_the_order_of_z():
         batch_size=[2, N],
     )
     assert torch.equal(windows_to_tau(td), z)
+
+
+def test_tau_begins_with_all_that_is_known():
+    """Each window is p_j, as seen at step j, then the actions and measured outputs after it."""
+    data = store.collect(4, 30, dtype=torch.float32)
+    done = data["next", "done"].squeeze(-1)
+    data["collector", "traj_ids"] = done.cumsum(1) - done.long() + 100 * torch.arange(4)[:, None]
+    replay = make_replay(4 * 30, 4, 8, 3, 50, n_x=1, preview_key="preview")
+    replay.extend(data)
+    tau = replay.sample_tau()
+    assert tau.shape == (50, store.make_mpc().n_z)
+
+    def windows(i: int, k: int) -> torch.Tensor:
+        p = [data["preview"][i, k], data["observation"][i, k]]
+        a, y = data["action"][i, k : k + 3], data["next", "observation"][i, k : k + 3, -1:]
+        return torch.cat([*p, torch.cat((a, y), -1).flatten()])
+
+    inside = [(i, k) for i in range(4) for k in range(28) if not done[i, k : k + 2].any()]
+    possible = torch.stack([windows(i, k) for i, k in inside])
+    assert (tau[:, None] == possible).all(-1).any(1).all()
 
 
 def test_sampling_depends_on_the_seed_alone():

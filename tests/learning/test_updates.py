@@ -8,6 +8,7 @@ import torch
 from torch.optim.lr_scheduler import LambdaLR
 from torch.testing import assert_close
 
+from tests import store
 from tests.learning.test_warm_start import transitions
 from tests.problems import normal, random_mpc
 from torch_qpmpc import (
@@ -18,7 +19,7 @@ from torch_qpmpc import (
     QPQLearningLoss,
     SystemIdentificationPenalty,
 )
-from torch_qpmpc.learning.replay import ACTIVE_SET
+from torch_qpmpc.learning.replay import ACTIVE_SET, windows_to_tau
 from torch_qpmpc.learning.updates import first_order, second_order, share_of_rate
 
 
@@ -68,6 +69,32 @@ def test_the_second_order_steps_towards_the_loss_modules_targets(with_si, clip):
         penalty = si.curvature(windows) if with_si else None
         GaussNewton(twin, td_error_clip=clip).step(s, a, -target, penalty=penalty)
     assert_close(mpc.state_dict(), twin.state_dict(), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("second", [False, True])
+def test_a_window_and_a_preview_move_theta_as_one_observation_does(second):
+    """Also with windows of the SI penalty, in the order of z."""
+    batch = store.collect(4, 8)
+    tau = windows_to_tau(batch[:, :3], 1, "preview")
+    moved = []
+    for key in ("preview", None):
+        mpc = store.make_mpc()
+        loss = QPQLearningLoss(QPActorValueOperator(mpc, preview_key=key))
+        loss.make_value_estimator(gamma=0.9)
+        si = SystemIdentificationPenalty(1e-2)
+        if second:
+            update = second_order(mpc, loss, GaussNewton(mpc), None, si)
+        else:
+            update = first_order(mpc, loss, torch.optim.SGD(mpc.parameters(), 1e-3), None, si)
+        before = copy.deepcopy(mpc.state_dict())
+        terms, scalars = update(batch.reshape(-1).copy(), tau)
+        assert scalars["unsolved"] == 0
+        assert terms["loss/si"] > 0
+        assert not torch.equal(before["C"], mpc.C)
+        moved.append(mpc.state_dict())
+        for part in (batch, batch["next"]):
+            part["observation"] = torch.cat((part["preview"], part["observation"]), -1)
+    assert_close(*moved)
 
 
 def test_the_second_order_keeps_active_sets():

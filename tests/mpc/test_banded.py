@@ -42,7 +42,7 @@ def test_one_matrix_may_vary_with_the_stage():
 @pytest.mark.parametrize(
     ("A", "B", "message"),
     [
-        ((2, 3), (3, 2), r"A: got shape \(2, 3\), expected shape \(3, 3\) or \(4, 3, 3\)"),
+        ((2, 3), (3, 2), r"A: got shape \(2, 3\), expected shape \(2, 2\) or \(4, 2, 2\)"),
         ((5, 3, 3), (3, 2), r"A: got shape \(5, 3, 3\), expected shape \(3, 3\) or \(4, 3, 3\)"),
         ((3, 3), (2, 2), r"B: got shape \(2, 2\), expected shape \(3, 2\) or \(4, 3, 2\)"),
         ((3, 3), (5, 3, 2), r"B: got shape \(5, 3, 2\), expected shape \(3, 2\) or \(4, 3, 2\)"),

@@ -460,11 +460,11 @@ def test_repr():
         ({"constraints": 1.0}, r"constraints: got 1.0, expected the triple \(D, lower, upper\)"),
         (
             {"constraints": (torch.ones(2, 2), [0.0], [1.0])},
-            r"constraints: got D of shape \(2, 2\), expected shape \(n_d, 3\)",
+            r"constraints: got D of shape \(2, 2\), expected shape \(m, 3\)",
         ),
         (
             {"terminal_constraints": (torch.ones(1, 3), [0.0], [1.0])},
-            r"terminal_constraints: got D of shape \(1, 3\), expected shape \(n_d, 2\)",
+            r"terminal_constraints: got D of shape \(1, 3\), expected shape \(m, 2\)",
         ),
         (
             {"constraints": (torch.ones(1, 3), [0.0, 0.0], [1.0, 1.0])},

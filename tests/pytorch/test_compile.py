@@ -49,9 +49,11 @@ def outcome(mpc: QPMPC, function: Function, s: Tensor, a: Tensor) -> tuple[Tenso
     return out.detach(), [part.grad for part in mpc.parameters()]
 
 
+@pytest.mark.parametrize("known", [{}, {"past": 2, "n_d": 1}], ids=["state", "window"])
 @pytest.mark.parametrize("name", NAMES[:-1])
-def test_compiled_in_one_graph_equals_eager(name):
-    mpc, s, a = random_mpc(3), random_states(4), random_states(4, 1, size=0.4)
+def test_compiled_in_one_graph_equals_eager(name, known):
+    mpc, a = random_mpc(3, **known), random_states(4, 1, size=0.4)
+    s = random_states(4, mpc.n_p)
     function = functions(mpc)[name]
     compiled = torch.compile(function, fullgraph=True, backend="aot_eager")
     assert_close(outcome(mpc, compiled, s, a), outcome(mpc, function, s, a))
@@ -72,7 +74,7 @@ def test_a_gradient_in_an_argument_passed_unchanged(output, of):
     given["fixed"] = s
 
     def total(x: Tensor) -> Tensor:
-        theta = given | {of: x}
+        theta: dict[str, Any] = given | {of: x}
         fixed = theta.pop("fixed")
         return getattr(solve_qp(QuadraticProgram(**theta, check_values=False), fixed), output).sum()
 

@@ -24,9 +24,23 @@ KINDS = {
     "full": {"hessian": "full"},
     "tied": {"structure": "tied", "learn": ("H", "C", "q", "b", "w")},
     "varying": {"structure": "varying", "learn": ("C", "G"), "discount_slack": True, **MIXED},
+    "preview": {"n_d": 2, "hessian": "block"},
+    "window": {
+        "past": 3,
+        "n_d": 1,
+        "structure": "tied",
+        "learn": ("H", "C", "q", "b", "w"),
+        "rate_bounds": ([-0.3], [0.3]),
+        "rate_slack": 2.0,
+    },
 }
 kinds = pytest.mark.parametrize("kind", KINDS)
 S, A = random_states(4), random_states(4, 1, size=0.4)
+
+
+def known(mpc: QPMPC) -> Tensor:
+    """Draw p ``(4, n_p)``: the states S, if no more is known."""
+    return random_states(4, mpc.n_p)
 
 
 def outcome(mpc: QPMPC, s: Tensor, a: Tensor) -> list[Tensor]:
@@ -44,8 +58,9 @@ def outcome(mpc: QPMPC, s: Tensor, a: Tensor) -> list[Tensor]:
 @kinds
 def test_meta_tensors_have_the_shapes_and_dtypes(kind):
     mpc = random_mpc(0, **KINDS[kind])
-    real = outcome(mpc, S, A)
-    meta = outcome(mpc.to("meta"), S.to("meta"), A.to("meta"))
+    s = known(mpc)
+    real = outcome(mpc, s, A)
+    meta = outcome(mpc.to("meta"), s.to("meta"), A.to("meta"))
     assert all(x.is_meta for x in meta)
     assert [(x.shape, x.dtype) for x in meta] == [(x.shape, x.dtype) for x in real]
 
@@ -62,14 +77,15 @@ def test_fake_tensors_have_the_shapes():
 @pytest.mark.parametrize("how", ["to_empty", "assign", "reset"])
 def test_a_module_comes_back_from_meta(kind, how):
     mpc = random_mpc(0, free=0.0, **KINDS[kind])
-    state, expected = copy.deepcopy(mpc.state_dict()), mpc.value(S).detach()
+    s = known(mpc)
+    state, expected = copy.deepcopy(mpc.state_dict()), mpc.value(s).detach()
     if how == "assign":
         mpc.to("meta").load_state_dict(state, assign=True)
     elif how == "to_empty":
         mpc.to("meta").to_empty(device="cpu").load_state_dict(state)
     else:
         mpc.to("meta").to_empty(device="cpu").reset_parameters()
-    assert_close(mpc.value(S), expected, rtol=0, atol=0)
+    assert_close(mpc.value(s), expected, rtol=0, atol=0)
 
 
 def test_a_module_is_made_on_the_default_device():
@@ -92,7 +108,8 @@ def test_the_default_device_is_not_the_solvers(solver):
 @kinds
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_autocast_changes_no_number(kind, dtype):
-    mpc, s, a = random_mpc(0, **KINDS[kind]).to(dtype), S.to(dtype), A.to(dtype)
+    mpc = random_mpc(0, **KINDS[kind]).to(dtype)
+    s, a = known(mpc).to(dtype), A.to(dtype)
     expected = outcome(mpc, s, a)
     mpc.zero_grad()
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -163,7 +180,8 @@ def test_a_whole_module_is_saved_and_loaded(kind):
     mpc, file = random_mpc(0, **KINDS[kind]), io.BytesIO()
     torch.save(mpc, file)
     file.seek(0)
-    assert_close(torch.load(file, weights_only=False).value(S), mpc.value(S), rtol=0, atol=0)
+    s = known(mpc)
+    assert_close(torch.load(file, weights_only=False).value(s), mpc.value(s), rtol=0, atol=0)
 
 
 def test_a_shallow_copy_shares_the_parameters():
@@ -174,19 +192,20 @@ def test_a_shallow_copy_shares_the_parameters():
     assert_close(twin.value(S), mpc.value(S), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("kind", ["tied", "varying"])
+@pytest.mark.parametrize("kind", ["tied", "varying", "window"])
 def test_a_release_leaves_the_copies_as_they_are(kind):
     mpc = random_mpc(0, **KINDS[kind])
-    twin, before = copy.deepcopy(mpc), mpc.value(S).detach()
+    s = known(mpc)
+    twin, before = copy.deepcopy(mpc), mpc.value(s).detach()
     mpc.release()
-    assert_close(twin.value(S), before, rtol=0, atol=0)
-    assert twin.structure == kind
+    assert_close(twin.value(s), before, rtol=0, atol=0)
+    assert twin.structure == KINDS[kind]["structure"]
     again = random_mpc(1, **KINDS[kind])
     with pytest.raises(QPError, match="a state_dict with structure = 'free'"):
         again.load_state_dict(mpc.state_dict())
     again.release()
     again.load_state_dict(mpc.state_dict())
-    assert_close(again.value(S), before)
+    assert_close(again.value(s), before)
 
 
 class Doubled(nn.Module):

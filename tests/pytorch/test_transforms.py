@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -68,18 +69,19 @@ FEATURES: Features = {
 }
 
 
-def ensemble() -> tuple[list[QPMPC], dict[str, Tensor]]:
-    mpcs = [random_mpc(seed) for seed in range(3)]
+def ensemble(**options: Any) -> tuple[list[QPMPC], dict[str, Tensor]]:
+    mpcs = [random_mpc(seed, **options) for seed in range(3)]
     states = [{name: part.detach() for name, part in mpc.named_parameters()} for mpc in mpcs]
     return mpcs, {name: torch.stack([state[name] for state in states]) for name in states[0]}
 
 
+@pytest.mark.parametrize("known", [{}, {"past": 2, "n_d": 1}], ids=["state", "window"])
 @pytest.mark.parametrize("name", FEATURES)
-def test_vmap_over_theta_and_samples_equals_loops(name):
+def test_vmap_over_theta_and_samples_equals_loops(name, known):
     """Both nestings are batched over theta, over samples, and over both."""
-    feature, (mpcs, stacked) = FEATURES[name], ensemble()
-    s, a = random_states(4), random_states(4, 1, size=0.4)
+    feature, (mpcs, stacked) = FEATURES[name], ensemble(**known)
     mpc = mpcs[0]
+    s, a = random_states(4, mpc.n_p), random_states(4, 1, size=0.4)
 
     def of_one(theta: dict[str, Tensor], s: Tensor, a: Tensor) -> Tensor:
         return feature(mpc, theta, s, a)

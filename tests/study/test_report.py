@@ -7,6 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import train
+from tests.experiment.conftest import store_task  # noqa: F401 - a fixture
+from tests.runs import SMALL, make_config
 from torch_qpmpc.study import report
 from torch_qpmpc.study.plots import GAP_LEFT
 from torch_qpmpc.study.runs import collect
@@ -82,6 +85,19 @@ def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
     assert 5_000 < (tmp_path / f"{study.name}.png").stat().st_size < 200_000
     # The report's folder is not a run.
     assert len(collect(study)) == len(frame)
+
+
+@pytest.mark.usefixtures("store_task")
+def test_a_report_of_runs_with_a_window_and_previews(tmp_path):
+    settings = ("task=store", "constraint=free", "task.eval_steps=5")
+    train.train(make_config(*SMALL, *settings), str(tmp_path / "free"), quiet=True)
+    frame = collect(tmp_path)
+    start = frame["run"].iloc[0].start
+    assert (start.past, start.n_d) == (2, 2)
+    assert frame["zeros_above"].item() < 1
+    assert "nan to nan (0 of 1)" in report.write(frame, tmp_path / "report")
+    drawn = {path.name for path in (tmp_path / "report" / tmp_path.name).iterdir()}
+    assert drawn == {"learning-none.png", "constraints-none.png", "trajectories-none.png"}
 
 
 def test_many_settings_are_a_frontier_and_ablations_have_their_figure():

@@ -92,11 +92,11 @@ def test_the_models_error_is_that_of_one_step(study):
     physics = FinishedRun(study / "small" / "gaussian-free-seed1").physics
     assert isinstance(physics, LinearSystem)
     none = torch.zeros(4, dtype=torch.float64)
-    A, B = physics.A, physics.B
-    assert prediction_error(Model(A, B, none, none[0]), physics) == 0
+    A, B, E = physics.A, physics.B, torch.zeros(4, 0)
+    assert prediction_error(Model(A, B, E, none, none[0]), physics) == 0
     offset = none.index_fill(0, torch.tensor([2]), 0.3)
-    assert prediction_error(Model(A, B, offset, none[0]), physics) == pytest.approx(0.3)
-    spread = prediction_error(Model(A - torch.eye(4), B, none, none[0]), physics)
+    assert prediction_error(Model(A, B, E, offset, none[0]), physics) == pytest.approx(0.3)
+    spread = prediction_error(Model(A - torch.eye(4), B, E, none, none[0]), physics)
     assert spread == pytest.approx(math.sqrt(2 * (1.5**2 + 0.5**2) / 3), rel=0.05)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Any
 
@@ -23,31 +24,65 @@ from torch_qpmpc.analysis.structure import (
     nearest_model,
     stage_models,
 )
+from torch_qpmpc.checks import check_tensor
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.module import QPMPC
 
 COLOURS = {"start": "tab:red", "learned": "tab:blue", "true model": "tab:green"}
 
 
 def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
-    """Draw a constraint matrix as a heatmap, logarithmic beyond 0.01, with lines between stages."""
+    """Draw a constraint matrix as a heatmap, logarithmic beyond 0.01, with lines between stages.
+
+    Dashed lines end the preview and the window before x_0, where they exist.
+    """
     image = axes.imshow(
         C.detach().cpu().numpy(),
         cmap="RdBu_r",
         norm=SymLogNorm(linthresh=1e-2, vmin=-1, vmax=1),
         interpolation="nearest",
+        aspect="equal" if mpc.n_p == mpc.n_x else "auto",
     )
-    n = mpc.n_x + mpc.n_u
+    layout = Layout(mpc.n_x, mpc.n_u, mpc.horizon, mpc.past, mpc.n_d)
     for k in range(1, mpc.horizon):
         axes.axhline(k * mpc.n_x - 0.5, color="0.85", linewidth=0.4)
-    for k in range(1, mpc.horizon + 1):
-        axes.axvline(k * n - 0.5, color="0.85", linewidth=0.4)
+    previews = range(mpc.n_d, layout.n_preview, mpc.n_d) if mpc.n_d else ()
+    stages = range(layout.n_preview or layout.n, layout.n_z, layout.n)
+    for column in (*previews, *stages):
+        axes.axvline(column - 0.5, color="0.85", linewidth=0.4)
+    _draw_ends(axes, layout)
     axes.set_title(title)
-    stages = range(0, mpc.horizon + 1, max(1, mpc.horizon // 5))
-    axes.set_xticks([k * n for k in stages], [f"$x_{{{k}}}$" for k in stages])
-    rows = [k for k in stages if k < mpc.horizon]
+    plan = (layout.n_before, layout.n, range(mpc.horizon + 1), "x")
+    columns = _columns(layout, layout.n_z, plan)
+    axes.set_xticks(list(columns), list(columns.values()))
+    rows = range(0, mpc.horizon, max(1, mpc.horizon // 5))
     axes.set_yticks([k * mpc.n_x for k in rows], [f"$k={k}$" for k in rows])
     axes.figure.colorbar(image, ax=axes, shrink=0.7, ticks=[-1, -0.1, -0.01, 0, 0.01, 0.1, 1])
+
+
+def _draw_ends(axes: Axes, layout: Layout) -> None:
+    """Draw the ends of the preview and of the window before x_0, where they exist."""
+    for end in {layout.n_preview, layout.n_before} - {0}:
+        axes.axvline(end - 0.5, color="black", linewidth=0.8, linestyle="--")
+
+
+def _columns(layout: Layout, width: int, *plan: tuple[int, int, range, str]) -> dict[int, str]:
+    """Return the columns that get a tick, with its label, in a figure of ``width`` columns.
+
+    Each section, such as the preview, has its first column, the width of a stage, the stages and
+    their letter. Beside a preview or a window, ticks that would overlap are left out.
+    """
+    preview = (0, layout.n_d, range(layout.horizon + 1 if layout.n_d else 0), "d")
+    window = (layout.n_preview, layout.n, range(1 - layout.past, 0), "x")
+    gap = width / 16 if layout.n_before else 0
+    ticks = {}
+    for first, size, stages, letter in (preview, window, *plan):
+        step = max(1, layout.horizon // 5, math.ceil(gap / max(size, 1)))
+        for stage in stages[::step]:
+            ticks[first + (stage - stages[0]) * size] = f"${letter}_{{{stage}}}$"
+    following = [*list(ticks)[1:], math.inf]
+    return {i: x for (i, x), end in zip(ticks.items(), following, strict=True) if end - i >= gap}
 
 
 def constraint_figure(mpc: QPMPC) -> Figure:
@@ -75,15 +110,16 @@ def forms(mpc: QPMPC) -> dict[str, PredictionForm]:
     Raises:
         QPError: if C has no prediction form.
     """
-    return {
-        "start": prediction_form(mpc.C_0, mpc.n_x, mpc.n_u),
-        "learned": predictions(mpc),
-    }
+    start = prediction_form(mpc.C_0, mpc.n_x, mpc.n_u, past=mpc.past, n_d=mpc.n_d)
+    return {"start": start, "learned": predictions(mpc)}
 
 
 def draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
-    """Draw ``[Phi, Gamma]``, the effect of x_0 and each u_j on each x_k, as a heatmap."""
-    N, n_x, n_u = form.horizon, form.n_x, form.n_u
+    """Draw ``[Phi, Gamma]``, the effect of p and each u_j on each x_k, as a heatmap.
+
+    Dashed lines end the preview and the window before x_0, where they exist.
+    """
+    N, n_x, n_u, n_p, layout = form.horizon, form.n_x, form.n_u, form.n_p, form.layout
     entries = torch.cat((form.Phi, form.Gamma), dim=-1)
     image = axes.imshow(
         entries.numpy(),
@@ -92,19 +128,22 @@ def draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
         interpolation="nearest",
         aspect="auto",
     )
-    axes.axvline(n_x - 0.5, color="black", linewidth=0.8)
+    axes.axvline(n_p - 0.5, color="black", linewidth=0.8)
+    _draw_ends(axes, layout)
     for k in range(1, N):
         axes.axhline(k * n_x - 0.5, color="0.85", linewidth=0.4)
-        axes.axvline(n_x + k * n_u - 0.5, color="0.85", linewidth=0.4)
-        # Above this staircase an action would affect earlier states.
-        edge, row = n_x + k * n_u - 0.5, k * n_x - 0.5
-        axes.plot([edge, edge], [row - n_x, row], color="black", linewidth=0.8)
-        axes.plot([edge, edge + n_u], [row, row], color="black", linewidth=0.8)
+        axes.axvline(n_p + k * n_u - 0.5, color="0.85", linewidth=0.4)
+        # Above these staircases an action or a preview would affect earlier states.
+        for first, width in ((n_p, n_u), (0, form.layout.n_d)):
+            if width:
+                edge, row = first + k * width - 0.5, k * n_x - 0.5
+                axes.plot([edge, edge], [row - n_x, row], color="black", linewidth=0.8)
+                axes.plot([edge, edge + width], [row, row], color="black", linewidth=0.8)
     axes.set(xlim=(-0.5, entries.shape[1] - 0.5), ylim=(len(entries) - 0.5, -0.5), title=title)
     shown = range(0, N, max(1, N // 5))
-    axes.set_xticks(
-        [0, *(n_x + k * n_u for k in shown)], ["$x_0$", *(f"$u_{{{k}}}$" for k in shown)]
-    )
+    x_0, actions = (layout.n_before, n_x, range(1), "x"), (n_p, n_u, range(N), "u")
+    columns = _columns(layout, entries.shape[1], x_0, actions)
+    axes.set_xticks(list(columns), list(columns.values()))
     axes.set_yticks([k * n_x for k in shown], [f"$x_{{{k + 1}}}$" for k in shown])
     axes.figure.colorbar(image, ax=axes, shrink=0.7, ticks=[-1, -0.1, 0, 0.1, 1])
 
@@ -154,33 +193,43 @@ def energies_figure(mpc: QPMPC) -> Figure:
         xlim=(-N + 0.4, N - 0.4),
     )
     left.xaxis.set_major_locator(MaxNLocator(integer=True))
-    right.set(xlabel="stages before the latest pair $(x_k, u_k)$", title="What explains $x_{k+1}$")
+    latest = "pair $(x_k, u_k)$" if mpc.n_p == mpc.n_x else "window"
+    right.set(xlabel=f"stages before the latest {latest}", title="What explains $x_{k+1}$")
     step = max(1, N // 5)
     ticks = [back for back in range(0, N, step) if N - back >= step or back == 0]
-    right.set_xticks([*ticks, N], [*map(str, ticks), "later\nactions"])
+    later = "later\nactions" + (",\npreviews" if mpc.n_d else "")
+    right.set_xticks([*ticks, N], [*map(str, ticks), later])
     return figure
 
 
 def slice_between(mpc: QPMPC, starts: Tensor, points: int = 21) -> PolicyMap:
-    """Evaluate the policy on a grid that spans ``starts`` ``(n, n_x)`` in two states; others are 0.
+    """Evaluate the policy on a grid that spans ``starts`` ``(n, n_p)`` in two states of x_0.
 
     The two are the first state and the one half-way: a position and its speed, if all positions
-    come first. A state in which all starts agree is gridded from one below to one above.
+    come first. A state in which all starts agree is gridded from one below to one above. Others are
+    0, and the preview is the starts' mean.
+
+    Raises:
+        QPError: if there is only one state, or the shape of ``starts`` does not fit.
     """
-    axes = (0, mpc.n_x // 2)
+    check_tensor("starts", starts, "n", mpc.n_p, batched=False)
+    first = mpc.n_p - mpc.n_x
+    axes = (first, first + mpc.n_x // 2)
     low, high = (ends.double() for ends in starts.aminmax(dim=0))
     wide = (high == low).double()
     low, high = low - wide, high + wide
     x, y = (torch.linspace(low[i].item(), high[i].item(), points) for i in axes)
-    return policy_map(mpc, x, y, axes=axes)
+    at = starts.double().mean(0)
+    at[(mpc.horizon + 1) * mpc.n_d :] = 0
+    return policy_map(mpc, x, y, axes=axes, at=at)
 
 
 def draw_slice(axes: Axes, found: PolicyMap, field: Tensor, title: str, **style: Any) -> QuadMesh:
     """Draw a field on the grid, ``(n, m)``, blank where it is nan."""
     grid = (part.numpy() for part in (found.x, found.y, field.mT))
     image = axes.pcolormesh(*grid, shading="nearest", rasterized=True, **style)
-    first, second = (axis + 1 for axis in found.axes)
-    axes.set(xlabel=f"$s_{{{first}}}$", ylabel=f"$s_{{{second}}}$", title=title)
+    first, second = found.names
+    axes.set(xlabel=f"${first}$", ylabel=f"${second}$", title=title)
     return image
 
 

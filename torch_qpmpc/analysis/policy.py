@@ -1,7 +1,8 @@
 """The policy in terms of control engineering: its gain, and its regions of one active set each.
 
 On each of these regions of the state space the policy is affine in the state. Its slope is the
-gradient of the QP's solution (see `torch_qpmpc.qp.derivatives`).
+gradient of the QP's solution (see `torch_qpmpc.qp.derivatives`). With a window or a preview, the
+state s is all that V fixes, p ``(n_p,)``.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.initial import riccati_weight
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
@@ -27,17 +29,17 @@ def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
 
     Args:
         mpc: the QP.
-        s: ``(*batch, n_x)``.
+        s: ``(*batch, n_p)``.
 
     Returns:
-        ``(*batch, n_u, n_x)``; zero where the QP is not solved.
+        ``(*batch, n_u, n_p)``; zero where the QP is not solved.
 
     Raises:
         QPError: if the shape of s does not fit.
         SolverError: if a QP has no solution, and ``mpc.on_failure`` is ``"raise"``.
     """
     check_kind("mpc", mpc, QPMPC)
-    return _solve_with_gain(mpc, check_tensor("s", s, mpc.n_x))[1]
+    return _solve_with_gain(mpc, check_tensor("s", s, mpc.n_p))[1]
 
 
 def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
@@ -62,7 +64,7 @@ def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
     )
     check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
     B, W = B.to(A), W.to(A)
-    check_weight("W", W, diagonal=False)
+    check_weight("W", W, diagonal=False, n_d=0)
     P = riccati_weight(A, B, W, gamma)
     left = W[n_x:, n_x:] + gamma * B.mT @ P @ B
     return torch.linalg.solve(left, gamma * B.mT @ P @ A + W[n_x:, :n_x])
@@ -71,8 +73,32 @@ def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
 def stage_weight(mpc: QPMPC) -> Tensor:
     """Return the weight of (x_0, u_0), ``(n_x + n_u, n_x + n_u)``: H's first block (eq:qpH)."""
     check_kind("mpc", mpc, QPMPC)
-    n = mpc.n_x + mpc.n_u
-    return mpc.quadratic_program().H.detach()[:n, :n]
+    stage = slice(mpc.n_p - mpc.n_x, mpc.n_p + mpc.n_u)
+    return mpc.quadratic_program().H.detach()[stage, stage]
+
+
+def window_model(A: Tensor, B: Tensor) -> tuple[Tensor, Tensor]:
+    """Return F and G of the next window w+ = F w + G u for a model with lags; A and B for one lag.
+
+    The window is that of p, w = [x_{1-L}, u_{1-L}, .., x_{-1}, u_{-1}, x_0], ``(n_w,)``.
+
+    Args:
+        A, B: the model, ``(n_x, L n_x)`` and ``(n_x, L n_u)``, as in `banded_matrix`.
+
+    Returns:
+        F ``(n_w, n_w)`` and G ``(n_w, n_u)``.
+
+    Raises:
+        QPError: if the shapes do not fit each other.
+    """
+    check_tensor("A", A, "n_x", "L n_x", batched=False)
+    check_tensor("B", B, "n_x", "L n_u", batched=False)
+    n_x = len(A)
+    following = banded_matrix(A, B.to(A), 1)[:, :-n_x]
+    size, n_u = following.shape[-1], B.shape[-1] // (A.shape[-1] // n_x)
+    shifted = torch.eye(size).to(A)[n_x + n_u :]
+    F, G = torch.cat((shifted, following)).tensor_split((size - n_u,), dim=-1)
+    return F, G
 
 
 def spectral_radius(A: Tensor, B: Tensor, K: Tensor) -> Tensor:
@@ -92,18 +118,20 @@ class PolicyMap:
     """V and the policy on a grid over two states; index ``[i, j]`` is at ``x[i]``, ``y[j]``.
 
     Attributes:
-        axes: the indices of the two states.
+        axes: the indices of the two states, in p.
+        names: their symbols, such as ``s_{1}``, or ``x_{0,1}`` for the first entry of x_0.
         x, y: their values, ``(n,)`` and ``(m,)``.
-        states: the grid points, ``(n, m, n_x)``.
+        states: the grid points, ``(n, m, n_p)``.
         values: V, ``(n, m)``; nan where the QP is not solved.
         actions: pi(s), ``(n, m, n_u)``; likewise.
-        gains: ``-d u_0 / d s``, ``(n, m, n_u, n_x)``; likewise.
+        gains: ``-d u_0 / d s``, ``(n, m, n_u, n_p)``; likewise.
         regions: the index in ``active_sets``, ``(n, m)``; -1 where the QP is not solved.
         active_sets: the distinct active sets, the most frequent first, ``(count, n_g)``, coded as
             in `QPSolution.active`.
     """
 
     axes: tuple[int, int]
+    names: tuple[str, str]
     x: Tensor
     y: Tensor
     states: Tensor
@@ -119,7 +147,7 @@ def policy_map(
     x: Any,
     y: Any,
     *,
-    axes: tuple[int, int] = (0, 1),
+    axes: tuple[int, int] | None = None,
     at: Any = None,
 ) -> PolicyMap:
     """Evaluate the policy, its gain and its active sets on a slice of the states, in one batch.
@@ -127,8 +155,8 @@ def policy_map(
     Args:
         mpc: the QP.
         x, y: the values of two states, ``(n,)`` and ``(m,)``.
-        axes: the indices of these states.
-        at: a state with the values of the others, ``(n_x,)``; zero by default.
+        axes: the indices of these states, in p; by default, those of the first two of x_0.
+        at: a state with the values of the others, ``(n_p,)``; zero by default.
 
     Raises:
         QPError: if ``axes`` are not two different states, or ``x`` or ``y`` is not a vector.
@@ -144,20 +172,22 @@ def policy_map(
         (torch.Size([9, 5, 1]), torch.Size([9, 5, 1, 2]), True)
     """
     check_kind("mpc", mpc, QPMPC)
+    if axes is None:
+        axes = (mpc.n_p - mpc.n_x, mpc.n_p - mpc.n_x + 1)
     if not isinstance(axes, tuple | list) or len(axes) != 2:
         raise QPError.expected("axes", repr(axes), "a pair of indices, such as (0, 1)")
     for axis in axes:
         check_whole("axes", axis, 0)
     first, second = axes
-    if first == second or not all(0 <= axis < mpc.n_x for axis in axes):
-        raise QPError.expected("axes", axes, f"two different states among 0 to {mpc.n_x - 1}")
+    if first == second or not all(0 <= axis < mpc.n_p for axis in axes):
+        raise QPError.expected("axes", axes, f"two different states among 0 to {mpc.n_p - 1}")
     x, y = as_tensor("x", x), as_tensor("y", y)
     if x.ndim != 1 or y.ndim != 1 or not len(x) or not len(y):
         got = f"shapes {tuple(x.shape)} and {tuple(y.shape)}"
         raise QPError.expected("x, y", got, "non-empty vectors", GRID_REMEDY)
-    states = torch.zeros(mpc.n_x) if at is None else as_tensor("at", at)
-    if tuple(states.shape) != (mpc.n_x,):
-        raise QPError.expected("at", f"shape {tuple(states.shape)}", f"shape ({mpc.n_x},)")
+    states = torch.zeros(mpc.n_p) if at is None else as_tensor("at", at)
+    if tuple(states.shape) != (mpc.n_p,):
+        raise QPError.expected("at", f"shape {tuple(states.shape)}", f"shape ({mpc.n_p},)")
     states = states.double().repeat(len(x), len(y), 1)
     states[..., first], states[..., second] = x.unsqueeze(-1), y
     solution, gains = _solve_with_gain(mpc, states)
@@ -170,9 +200,10 @@ def policy_map(
     failed[regions[~solved.flatten()]] = True
     order = counts.masked_fill(failed, 0).argsort(descending=True, stable=True)
     regions = order.argsort()[regions].view(solved.shape).masked_fill(~solved, -1)
-    u = solution.z.detach()[..., mpc.n_x : mpc.n_x + mpc.n_u]
+    u = solution.z.detach()[..., mpc.n_p : mpc.n_p + mpc.n_u]
     return PolicyMap(
         axes,
+        (_symbol(mpc, first), _symbol(mpc, second)),
         x,
         y,
         states,
@@ -184,12 +215,25 @@ def policy_map(
     )
 
 
+def _symbol(mpc: QPMPC, i: int) -> str:
+    """Return the symbol of entry i of p: s_1, or one of d_k, x_k and u_k with its stage."""
+    if mpc.n_p == mpc.n_x:
+        return f"s_{{{i + 1}}}"
+    n, n_preview = mpc.n_x + mpc.n_u, (mpc.horizon + 1) * mpc.n_d
+    if i < n_preview:
+        stage, entry = divmod(i, mpc.n_d)
+        return f"d_{{{stage},{entry + 1}}}"
+    stage, entry = divmod(i - n_preview, n)
+    letter, entry = ("x", entry) if entry < mpc.n_x else ("u", entry - mpc.n_x)
+    return f"{letter}_{{{stage + 1 - mpc.past},{entry + 1}}}"
+
+
 def _solve_with_gain(mpc: QPMPC, s: Tensor) -> tuple[QPSolution, Tensor]:
-    """Return V's solution at s, and -du_0/ds ``(*batch, n_u, n_x)``."""
+    """Return V's solution at s, and -du_0/ds ``(*batch, n_u, n_p)``."""
     with torch.enable_grad():
         s = s.detach().clone().requires_grad_()
         solution = mpc.solve(s)
-        u = solution.z[..., mpc.n_x : mpc.n_x + mpc.n_u]
+        u = solution.z[..., mpc.n_p : mpc.n_p + mpc.n_u]
         # Each action depends on its own state alone, so the sum's gradient is each one's.
         slopes = [
             torch.autograd.grad(u[..., i].sum(), s, retain_graph=True)[0] for i in range(mpc.n_u)

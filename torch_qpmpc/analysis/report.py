@@ -6,10 +6,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
+import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.analysis.model_error import one_step_error
-from torch_qpmpc.analysis.policy import local_gain, lqr_gain, spectral_radius, stage_weight
+from torch_qpmpc.analysis.policy import (
+    local_gain,
+    lqr_gain,
+    spectral_radius,
+    stage_weight,
+    window_model,
+)
 from torch_qpmpc.analysis.prediction_form import PredictionForm, canonical_matrix, prediction_form
 from torch_qpmpc.analysis.structure import (
     Model,
@@ -24,6 +32,9 @@ from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 
+#: A, B, offset and E.
+TrueModel = tuple[Tensor, Tensor, Tensor, Tensor]
+
 
 @dataclass(frozen=True, eq=False)
 class StructureReport:
@@ -31,25 +42,26 @@ class StructureReport:
 
     Attributes:
         form: the prediction form.
-        nearest: the nearest time-invariant scheme (A, B, offset).
-        stages: the model of each stage (A_k, B_k, offset_k).
+        nearest: the nearest time-invariant scheme (A, B, E, offset).
+        stages: the model of each stage (A_k, B_k, E_k, offset_k).
         memory: `memory_energies`.
-        K: the policy's gain at the state, ``(n_u, n_x)``, u_0 = pi(s) - K ds.
-        K_lqr: the LQR gain of the nearest model and the stage weight, or None if the Riccati
-            equation has no solution.
+        K: the policy's gain at the state, ``(n_u, n_p)``, u_0 = pi(s) - K ds.
+        K_lqr: the LQR gain of the nearest model and the stage weight, for the window
+            (`window_model`), or None if the Riccati equation has no solution.
         condition: condition number of C's state columns.
         causality: `causality_defect`.
         toeplitz: `toeplitz_defect`.
-        non_markov: share of the predictions' norm that the latest pair (x_k, u_k) does not explain.
+        non_markov: share of the predictions' norm that the latest pair (x_k, u_k), or the latest
+            window, does not explain.
         order: `markov_order`.
         distance_to_mpc: relative distance of the predictions to those of ``nearest``.
-        gain_to_lqr: ``||K - K_lqr|| / ||K_lqr||``, or nan.
-        radius_predicted: spectral radius of the nearest model's A - B K.
+        gain_to_lqr: ``||K - K_lqr|| / ||K_lqr||`` with K's part for the window, or nan.
+        radius_predicted: spectral radius of the nearest model's A - B K, or of its window's.
         radius: spectral radius of the true A - B K; nan without a true model, as are the next.
         model_error: `one_step_error` of ``nearest`` against the true model, with (s, a) of unit
             variance.
-        model_error_max: largest difference of an entry of A or B.
-        first_stage_error: ``model_error`` of A_0, B_0.
+        model_error_max: largest difference of an entry of A, B or E.
+        first_stage_error: ``model_error`` of A_0, B_0, E_0.
     """
 
     form: PredictionForm = field(repr=False)
@@ -79,20 +91,23 @@ class StructureReport:
 
     def __str__(self) -> str:
         lines = [f"{name:18}{value:12.4g}" for name, value in self.scalars().items()]
-        matrices = {"A": self.nearest.A, "B": self.nearest.B, "K": self.K}
+        K = self.K[:, self.form.layout.n_preview :]
+        matrices = {"A": self.nearest.A, "B": self.nearest.B, "E": self.nearest.E, "K": K}
         for name, matrix in matrices.items():
+            if not matrix.numel():
+                continue
             rows = ["  ".join(f"{entry:8.4f}" for entry in row) for row in matrix.tolist()]
             lines += [f"{name if i == 0 else '':4}{row}" for i, row in enumerate(rows)]
         return "\n".join(lines)
 
 
 def predictions(mpc: QPMPC) -> PredictionForm:
-    """Return the prediction form of the constraints, X = Phi x_0 + Gamma U + phi.
+    """Return the prediction form of the constraints, X = Phi p + Gamma U + phi.
 
     Raises:
         QPError: if C has no prediction form.
     """
-    return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
+    return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b, mpc.past, mpc.n_d)
 
 
 def canonical(mpc: QPMPC) -> Tensor:
@@ -112,8 +127,9 @@ def read(
 
     Args:
         mpc: the QP.
-        true_model: the plant's A, B and, if it has one, offset; None if they are unknown.
-        at: the state of the policy's gain, ``(n_x,)``; the origin by default.
+        true_model: the plant's A and B, ``(n_x, L n_x)`` and ``(n_x, L n_u)``, and, if it has them,
+            offset and E ``(n_x, n_d)``; None if they are unknown.
+        at: the state of the policy's gain, ``(n_p,)``; the origin by default.
 
     Raises:
         QPError: if C has no prediction form, or an argument does not fit.
@@ -128,24 +144,29 @@ def read(
         (1.0, True, 0.97)
     """
     check_kind("mpc", mpc, QPMPC)
-    if true_model is not None:
-        true_model = _checked_model(mpc, true_model)
+    true = None if true_model is None else _checked_model(mpc, true_model)
     if at is not None:
-        check_tensor("at", at, mpc.n_x, batched=False)
+        check_tensor("at", at, mpc.n_p, batched=False)
     form = predictions(mpc)
     nearest, stages, memory = nearest_model(form), stage_models(form), memory_energies(form)
-    K = local_gain(mpc, form.Phi.new_zeros(mpc.n_x) if at is None else at.to(form.Phi))
+    K = local_gain(mpc, form.Phi.new_zeros(mpc.n_p) if at is None else at.to(form.Phi))
+    K_window = K[:, form.layout.n_preview :]
+    window = window_model(nearest.A, nearest.B)
+    before = K_window.shape[-1] - mpc.n_x
     try:
-        K_lqr = lqr_gain(nearest.A, nearest.B, stage_weight(mpc), mpc.gamma)
+        K_lqr = lqr_gain(*window, F.pad(stage_weight(mpc), (before, 0, before, 0)), mpc.gamma)
     except QPError:
         K_lqr = None
-    radius = error = largest = first = math.nan
-    if true_model is not None:
-        A, B, *offset = (part.to(form.Phi) for part in true_model)
-        radius = spectral_radius(A, B, K).item()
-        error = one_step_error(nearest, A, B, *offset).item()
-        largest = max((nearest.A - A).abs().max().item(), (nearest.B - B).abs().max().item())
-        first = one_step_error(stages, A, B, *offset)[0].item()
+    radius = error = largest = first = gain_error = math.nan
+    if K_lqr is not None:
+        gain_error = ((K_window - K_lqr).norm() / K_lqr.norm()).item()
+    if true is not None:
+        A, B, offset, E = true
+        radius = spectral_radius(*window_model(A, B), K_window).item()
+        error = one_step_error(nearest, A, B, offset, E=E).item()
+        pairs = ((nearest.A, A), (nearest.B, B), (nearest.E, E))
+        largest = max((own - part).abs().max().item() for own, part in pairs if part.numel())
+        first = one_step_error(stages, A, B, offset, E=E)[0].item()
     return StructureReport(
         form=form,
         nearest=nearest,
@@ -159,8 +180,8 @@ def read(
         non_markov=memory[1:].sum().sqrt().item(),
         order=markov_order(memory),
         distance_to_mpc=nearest.residual.item(),
-        gain_to_lqr=math.nan if K_lqr is None else ((K - K_lqr).norm() / K_lqr.norm()).item(),
-        radius_predicted=spectral_radius(nearest.A, nearest.B, K).item(),
+        gain_to_lqr=gain_error,
+        radius_predicted=spectral_radius(*window, K_window).item(),
         radius=radius,
         model_error=error,
         model_error_max=largest,
@@ -179,28 +200,33 @@ def structure_metrics(mpc: QPMPC, true_model: Sequence[Tensor] | None = None) ->
         QPError: if an argument does not fit.
     """
     check_kind("mpc", mpc, QPMPC)
-    if true_model is not None:
-        true_model = _checked_model(mpc, true_model)
+    true = None if true_model is None else _checked_model(mpc, true_model)
     names = ("causality_defect", "toeplitz_defect", "distance_to_mpc")
-    names += () if true_model is None else ("model_error",)
+    names += () if true is None else ("model_error",)
     try:
         form = predictions(mpc)
     except QPError:
         return dict.fromkeys(names, math.nan)
     nearest = nearest_model(form)
     values = [causality_defect(form), toeplitz_defect(form), nearest.residual]
-    if true_model is not None:
-        values.append(one_step_error(nearest, *(part.to(form.Phi) for part in true_model)))
+    if true is not None:
+        A, B, offset, E = true
+        values.append(one_step_error(nearest, A, B, offset, E=E))
     return dict(zip(names, map(float, values), strict=True))
 
 
-def _checked_model(mpc: QPMPC, true_model: Sequence[Tensor]) -> Sequence[Tensor]:
-    """Return ``true_model``; raise `QPError` if it does not fit."""
-    if not isinstance(true_model, tuple | list) or len(true_model) not in (2, 3):
+def _checked_model(mpc: QPMPC, true_model: Sequence[Tensor]) -> TrueModel:
+    """Return the true A, B, offset and E; raise `QPError` if one does not fit."""
+    names = ("A", "B", "offset", "E")
+    if not isinstance(true_model, tuple | list) or len(true_model) not in (2, 3, 4):
         got = type(true_model).__name__
         got += f" of {len(true_model)}" if isinstance(true_model, tuple | list) else ""
-        raise QPError.expected("true_model", got, "the pair (A, B), or (A, B, offset)")
-    shapes = ((mpc.n_x, mpc.n_x), (mpc.n_x, mpc.n_u), (mpc.n_x,))
-    for name, part, shape in zip(("A", "B", "offset"), true_model, shapes, strict=False):
+        want = "the pair (A, B), (A, B, offset) or (A, B, offset, E)"
+        raise QPError.expected("true_model", got, want)
+    n_x, n_u, L = mpc.n_x, mpc.n_u, mpc.past
+    shapes = ((n_x, L * n_x), (n_x, L * n_u), (n_x,), (n_x, mpc.n_d))
+    for name, part, shape in zip(names, true_model, shapes, strict=False):
         check_tensor(f"true_model's {name}", part, *shape, batched=False)
-    return true_model
+    zeros = [torch.zeros(shape) for shape in shapes[len(true_model) :]]
+    A, B, offset, E = (part.to("cpu", torch.float64) for part in (*true_model, *zeros))
+    return A, B, offset, E

@@ -1,8 +1,10 @@
 """Measures of how far the constraints are from an MPC scheme, from their prediction form alone.
 
 All but `distance_by_band` are free of C's gauge (see `prediction_form`): T C is the same QP for any
-invertible T, and has the same numbers. Norms are Frobenius norms of the maps from (x_0, U) to the
-states: all entries of x_0 and U weigh the same, in the QP's units.
+invertible T, and has the same numbers. Norms are Frobenius norms of the maps from (p, U) to the
+states: all entries of p and U weigh the same, in the QP's units. p is x_0 or, with a window and a
+preview, all that V fixes; the *window at k* is then (x_{k+1-L}, u_{k+1-L}, .., x_k, u_k) and d_k,
+and without them (x_k, u_k).
 """
 
 from __future__ import annotations
@@ -21,22 +23,28 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
 
 
-def distance_by_band(C: Tensor, C_0: Tensor, n_x: int, n_u: int) -> dict[str, float]:
+def distance_by_band(
+    C: Tensor, C_0: Tensor, n_x: int, n_u: int, past: int = 1, n_d: int = 0
+) -> dict[str, float]:
     """Return ``sum |C - C_0|`` on, above and below the band, for C, C_0 ``(N n_x, n_z)``.
 
-    This distance, the paper's, depends on the gauge of C, unless C is a canonical matrix.
+    This distance, the paper's, depends on the gauge of C, unless C is a canonical matrix. ``past``
+    and ``n_d`` are those of the `QPMPC`.
 
     Raises:
         QPError: if a shape does not fit.
     """
     check_whole("n_x", n_x, 1)
     check_whole("n_u", n_u, 1)
+    check_whole("past", past, 1)
+    check_whole("n_d", n_d, 0)
     check_tensor("C_0", C_0, "N n_x", "n_z", batched=False, remedy="Pass mpc.C_0.")
     check_tensor("C", C, *C_0.shape, batched=False, remedy="Pass mpc.C.")
-    distance = band_distance(n_x, n_u, C_0.shape[0] // n_x).to(C.device)
+    distance = band_distance(n_x, n_u, C_0.shape[0] // n_x, past, n_d).to(C.device)
     if distance.shape != C_0.shape:
         got, want = f"shape {tuple(C_0.shape)}", f"shape {tuple(distance.shape)}"
-        raise QPError.expected("C_0", got, f"{want} for n_x = {n_x}, n_u = {n_u}")
+        sizes = f"n_x = {n_x}, n_u = {n_u}, past = {past}, n_d = {n_d}"
+        raise QPError.expected("C_0", got, f"{want} for {sizes}")
     deviation = (C.detach() - C_0).abs()
     return {
         "on": deviation[distance == 0].sum().item(),
@@ -85,14 +93,20 @@ def toeplitz_defect(form: PredictionForm) -> Tensor:
 class Model:
     """A model x+ = A x + B u + offset that is read from the constraints.
 
+    With a window of L and a preview it is ``x+ = A [x_k; ..; x_{k+1-L}] + B [u_k; ..; u_{k+1-L}] +
+    E d_k + offset``.
+
     Attributes:
-        A, B, offset: ``(n_x, n_x)``, ``(n_x, n_u)``, ``(n_x,)``; with a leading N, one per stage.
+        A, B, E: ``(n_x, L n_x)``, ``(n_x, L n_u)`` and ``(n_x, n_d)``; with a leading N, one per
+            stage.
+        offset: ``(n_x,)``, likewise.
         residual: share of the predictions' norm that the model does not explain, ``()`` or
             ``(N,)``.
     """
 
     A: Tensor
     B: Tensor
+    E: Tensor
     offset: Tensor
     residual: Tensor
 
@@ -100,57 +114,59 @@ class Model:
 def stage_models(form: PredictionForm) -> Model:
     """Fit the model A_k, B_k of each step of the predictions, from stage k to k + 1.
 
-    Predictions are maps of (x_0, U). A_k, B_k and the offset are the least-squares fit of the map
-    of x_{k+1} by those of x_k, u_k and a constant. If u_k does not enter x_k, as in causal
-    constraints, B_k is block (k, k) of Gamma. The residual is the part of x_{k+1} from earlier
-    pairs or later actions: zero in all stages means Markovian. A_k is zero in directions of the
-    state that no prediction of x_k reaches (the minimum-norm solution).
+    Predictions are maps of (p, U). A_k, B_k, E_k and the offset are the least-squares fit of the
+    map of x_{k+1} by those of the window at k and a constant. If u_k does not enter x_k, as in
+    causal constraints, B_k is block (k, k) of Gamma. The residual is the part of x_{k+1} from
+    earlier pairs or later actions: zero in all stages means Markovian. A_k is zero in directions of
+    the state that no prediction of x_k reaches (the minimum-norm solution).
     """
     check_form(form)
-    maps, regressors = form.maps, _regressors(form)
-    fit = _fit(regressors, maps[1:])
-    left = maps[1:] - fit @ regressors
+    maps, windows = form.maps, _windows(form)
+    fit = _fit(windows, maps[1:])
+    left = maps[1:] - fit @ windows
     residual = (left.square().sum((-1, -2)) / _without_offset(maps[1:])).sqrt()
-    A, B, offset = _split(fit, form)
-    return Model(A, B, offset, residual)
+    return Model(*_split(fit, form), residual)
 
 
 def nearest_model(form: PredictionForm) -> Model:
     """Fit the time-invariant scheme with the nearest predictions; its residual is the distance.
 
-    Minimises ``||[Phi, Gamma, phi] - [Phi, Gamma, phi](A, B, offset)||`` by Levenberg-Marquardt
+    Minimises ``||[Phi, Gamma, phi] - [Phi, Gamma, phi](A, B, E, offset)||`` by Levenberg-Marquardt
     from the one-step fit of all stages; the residual is the minimum over ``||[Phi, Gamma]||``. For
     a scheme with tied stages the start is exact, and the residual zero up to rounding. Otherwise it
     is a local minimum, and an upper bound on the distance to the MPC schemes.
     """
     check_form(form)
-    maps, N = form.maps, form.horizon
+    maps, past = form.maps, form.layout.past
     n_x, n_v = maps.shape[-2:]
-    inputs = _regressors(form)[:, n_x:]
-    pooled = _regressors(form).movedim(0, 1).flatten(1)
+    windows = _windows(form)
+    states, inputs = windows.tensor_split((past * n_x,), dim=1)
+    pooled = windows.movedim(0, 1).flatten(1)
     start = _fit(pooled, maps[1:].movedim(0, 1).flatten(1))
     shape = start.shape
 
-    def rollout(theta: Tensor) -> Tensor:
-        stages = [maps[0]]
-        for k in range(N):
-            stages.append(theta @ torch.cat((stages[-1], inputs[k])))
-        return torch.stack(stages)
+    def rollout(theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the maps of the windows and of x_1, .., x_N that theta predicts."""
+        x, found = [*states[0].split(n_x)[::-1]], []
+        for rest in inputs:
+            found.append(torch.cat((*x[: -past - 1 : -1], rest)))
+            x.append(theta @ found[-1])
+        return torch.stack(found), torch.stack(x[past:])
 
     def residuals(flat):
-        return (rollout(torch.as_tensor(flat).view(shape)) - maps)[1:].flatten().numpy()
+        return (rollout(torch.as_tensor(flat).view(shape))[1] - maps[1:]).flatten().numpy()
 
     def jacobian(flat):
         theta = torch.as_tensor(flat).view(shape)
-        stages = rollout(theta)
+        lags = theta[:, : past * n_x].split(n_x, dim=1)
         unit = torch.eye(n_x).to(maps)
-        slope = maps.new_zeros(*shape, n_x, n_v)
-        slopes = []
-        for k in range(N):
-            direct = torch.einsum("pi,qv->pqiv", unit, torch.cat((stages[k], inputs[k])))
-            slope = direct + theta[:, :n_x] @ slope
+        slopes = [maps.new_zeros(*shape, n_x, n_v)] * past
+        for window in rollout(theta)[0]:
+            slope = torch.einsum("pi,qv->pqiv", unit, window)
+            for lag, A in enumerate(lags, start=1):
+                slope = slope + A @ slopes[-lag]
             slopes.append(slope)
-        return torch.stack(slopes, dim=2).flatten(2).flatten(0, 1).mT.numpy()
+        return torch.stack(slopes[past:], dim=2).flatten(2).flatten(0, 1).mT.numpy()
 
     # The predictions of an unstable fit may be far off or overflow: then zero is a better start.
     candidates = [np.zeros(start.numel()), start.flatten().numpy()]
@@ -159,18 +175,20 @@ def nearest_model(form: PredictionForm) -> Model:
     found = least_squares(residuals, begin, jac=jacobian, method="lm", **tight)  # pyright: ignore[reportArgumentType] - jac may be a function
     theta = torch.as_tensor(found.x).view(shape)
     scale = _without_offset(maps[1:]).sum().sqrt()
-    A, B, offset = _split(theta, form)
-    return Model(A, B, offset, math.sqrt(2 * found.cost) / scale)
+    return Model(*_split(theta, form), math.sqrt(2 * found.cost) / scale)
 
 
 def memory_energies(form: PredictionForm, rtol: float = 1e-9) -> Tensor:
     """Return the shares of the predictions' energy by past pair, ``(N + 1,)``, which sum to 1.
 
     The dependence of x_{k+1} on x_k, u_k, x_{k-1}, .. is not unique, as x_k follows from earlier
-    pairs. Therefore (x_k, u_k) first explains as much as it can, in least squares over (x_0, U);
+    pairs. Therefore (x_k, u_k) first explains as much as it can, in least squares over (p, U);
     then (x_{k-1}, u_{k-1}) explains part of the rest, and so on. Entry m is the share of the energy
     of x_1, .., x_N that the pair m stages before the latest explains. The last entry is the share
-    that the whole past does not explain: dependence on later actions.
+    that the whole past does not explain: dependence on later actions or previews.
+
+    With a window or a preview, the windows at k, k - 1, .. take the place of these pairs: entry 0
+    is the share that a model of L lags can explain.
 
     Args:
         form: the prediction form of the constraints.
@@ -181,15 +199,19 @@ def memory_energies(form: PredictionForm, rtol: float = 1e-9) -> Tensor:
     """
     check_form(form)
     check_number("rtol", rtol, lambda x: 0 <= x < 1, "a number in [0, 1)")
-    maps, pairs, N = form.maps, _regressors(form), form.horizon
+    maps, windows, N = form.maps, _windows(form), form.horizon
+    n_x, n_u, past = form.n_x, form.n_u, form.layout.past
+    states, actions, others = windows.tensor_split((past * n_x, past * (n_x + n_u)), dim=1)
+    # The part of the window at k that the one at k + 1 does not contain.
+    oldest = torch.cat((states[:, -n_x:], actions[:, -n_u:], others), dim=1)
     energies = maps.new_zeros(N + 1)
     for k in range(N):
         left = maps[k + 1].clone()
         left[:, -1] = 0.0
         before = left.square().sum()
         for lag in range(k + 1):
-            past = pairs[k - lag : k + 1].flatten(0, 1)
-            explained = _row_space(past, rtol)
+            known = torch.cat((oldest[k - lag : k].flatten(0, 1), windows[k]))
+            explained = _row_space(known, rtol)
             rest = maps[k + 1] - maps[k + 1] @ explained.mT @ explained
             after = rest.square().sum()
             energies[lag] += (before - after).clamp(min=0)
@@ -199,10 +221,10 @@ def memory_energies(form: PredictionForm, rtol: float = 1e-9) -> Tensor:
 
 
 def markov_order(energies: Tensor, tolerance: float = 1e-6) -> float:
-    """Return the number of latest pairs (x_k, u_k), .. that determine the next state.
+    """Return the number of latest pairs (x_k, u_k), .., or windows, that determine the next state.
 
-    1 is a Markovian scheme, such as MPC; inf means that later actions matter. An order above 1 may
-    be less than the reach of C's rows, because pairs may determine all earlier ones.
+    1 is a Markovian scheme, such as MPC; inf means that later actions or previews matter. An order
+    above 1 may be less than the reach of C's rows, because pairs may determine all earlier ones.
 
     Args:
         energies: `memory_energies`, ``(N + 1,)``.
@@ -219,12 +241,21 @@ def markov_order(energies: Tensor, tolerance: float = 1e-6) -> float:
     return float(enough[0, 0] + 1) if len(enough) else math.inf
 
 
-def _regressors(form: PredictionForm) -> Tensor:
-    """Return x_k, u_k and 1 as maps of (x_0, U, 1), k < N, ``(N, n_x + n_u + 1, n_v)``."""
-    maps, n_x, n_u, N = form.maps, form.n_x, form.n_u, form.horizon
+def _windows(form: PredictionForm) -> Tensor:
+    """Return [x_k, .., x_{k+1-L}, u_k, .., u_{k+1-L}, d_k, 1] as maps of (p, U, 1), k < N.
+
+    Returns:
+        ``(N, L (n_x + n_u) + n_d + 1, n_v)``.
+    """
+    maps, layout, N = form.maps, form.layout, form.horizon
     unit = torch.eye(maps.shape[-1]).to(maps)
-    actions = unit[n_x:-1].unflatten(0, (N, n_u))
-    return torch.cat((maps[:-1], actions, unit[-1:].expand(N, 1, -1)), dim=-2)
+    d = unit[: layout.n_preview].unflatten(0, (N + 1, layout.n_d))[:N]
+    past = unit[layout.n_preview : layout.n_before].unflatten(0, (layout.past - 1, layout.n))
+    x = torch.cat((past[:, : layout.n_x], maps[:-1]))
+    u = torch.cat((past[:, layout.n_x :], unit[layout.n_p : -1].unflatten(0, (N, layout.n_u))))
+    first = range(layout.past - 1, -1, -1)  # that of x_k, .., x_{k+1-L} for k = 0
+    lags = [part[i : i + N] for part in (x, u) for i in first]
+    return torch.cat((*lags, d, unit[-1:].expand(N, 1, -1)), dim=-2)
 
 
 def _fit(regressors: Tensor, target: Tensor) -> Tensor:
@@ -233,14 +264,16 @@ def _fit(regressors: Tensor, target: Tensor) -> Tensor:
     return torch.linalg.lstsq(regressors.mT, target.mT, driver="gelsd").solution.mT
 
 
-def _split(fit: Tensor, form: PredictionForm) -> tuple[Tensor, Tensor, Tensor]:
-    """Return A, B and the offset of a fit."""
-    A, B, offset = fit.split((form.n_x, form.n_u, 1), dim=-1)
-    return A, B, offset.squeeze(-1)
+def _split(fit: Tensor, form: PredictionForm) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return A, B, E and the offset of a fit."""
+    past = form.layout.past
+    sizes = (past * form.n_x, past * form.n_u, form.layout.n_d, 1)
+    A, B, E, offset = fit.split(sizes, dim=-1)
+    return A, B, E, offset.squeeze(-1)
 
 
 def _without_offset(maps: Tensor) -> Tensor:
-    """Return the squared norms of the maps of (x_0, U), without the constant."""
+    """Return the squared norms of the maps of (p, U), without the constant."""
     return maps[..., :-1].square().sum((-1, -2))
 
 

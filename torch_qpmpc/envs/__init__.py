@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+from torch_qpmpc.envs.four_tanks import FourTanks
 from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIEnv, GrosZanonLTIGymEnv
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
+from torch_qpmpc.envs.house import House
+from torch_qpmpc.envs.house_wall import HouseWall
 from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
+from torch_qpmpc.envs.past_window import PastWindow
+from torch_qpmpc.envs.plant import Plant
+from torch_qpmpc.envs.plant_env import PlantEnv
 from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
+from torch_qpmpc.envs.tank_references import TankReferences
 
 __all__ = [
+    "FourTanks",
     "GrosZanonLTI",
     "GrosZanonLTIEnv",
     "GrosZanonLTIGymEnv",
     "GymnasiumPlant",
+    "House",
+    "HouseWall",
     "LinearSystem",
     "LinearSystemEnv",
     "LinearSystemGymEnv",
+    "PastWindow",
+    "Plant",
+    "PlantEnv",
     "PointMass",
     "PointMassEnv",
     "PointMassGymEnv",
+    "TankReferences",
 ]

@@ -14,6 +14,8 @@ from torch import Tensor
 from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.linear_system import LinearSystem
+from torch_qpmpc.envs.past_window import first_window, next_window
+from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.errors import QPError
 
 POLICY_REMEDY = "Map a batch of states to a batch of actions."
@@ -24,16 +26,23 @@ class ClosedLoop:
     """Trajectories of one policy in float64, and its cumulative costs.
 
     Attributes:
-        states: ``(steps + 1, starts, n_x)``.
+        known: p, what the policy saw, ``(steps + 1, starts, n_p)``.
         actions: ``(steps, starts, n_u)``, as applied: clipped to their bounds.
         costs: ``(steps, starts)``, L(s_k, a_k).
         gamma: the discount factor of ``J_discounted``.
+        n_y: the last n_y entries of p are the state or, of a `Plant`, the output; None for all.
     """
 
-    states: Tensor
+    known: Tensor
     actions: Tensor
     costs: Tensor
     gamma: float
+    n_y: int | None = None
+
+    @property
+    def states(self) -> Tensor:
+        """The states ``(steps + 1, starts, n_x)``, or the outputs of a `Plant`."""
+        return self.known[..., -(self.n_y or 0) :]
 
     @property
     def J(self) -> float:
@@ -83,18 +92,67 @@ def closed_loop(
     rng = np.random.default_rng(seed)
     s = physics.starts(rng, starts)
     nu = torch.zeros_like(s)
-    expected = starts, physics.B.shape[1]
-    states, actions, costs = [s], [], []
-    for _ in range(steps):
-        # A result of shape (starts,) or (n_u,) would broadcast silently.
-        a = check_tensor("policy(s)", policy(s), *expected, batched=False, remedy=POLICY_REMEDY)
+
+    def step(a: Tensor) -> Step:
+        nonlocal s, nu
         a = physics.applied(a)
-        costs.append(physics.cost(s, a))
+        cost = physics.cost(s, a)
         nu = physics.noise(nu, physics.draw(rng, starts))
         s = physics.step(s, a, nu)
-        states.append(s)
-        actions.append(a)
-    return ClosedLoop(torch.stack(states), torch.stack(actions), torch.stack(costs), gamma)
+        return s, a, cost
+
+    return _run(policy, s, step, steps, (starts, *physics.lb_a.shape), gamma)
+
+
+@torch.no_grad()
+def plant_loop(
+    policy: Callable[[Tensor], Tensor],
+    plant: Plant,
+    *,
+    steps: int = 96,
+    starts: int = 32,
+    seed: int = 123,
+    gamma: float = 0.99,
+) -> ClosedLoop:
+    """Run ``policy`` as `closed_loop` does, on a `Plant`.
+
+    The seed determines the experiment: ``numpy.random.default_rng(seed)`` draws the signals
+    ``(starts, steps + N + 1, n_w)``, then the starts.
+
+    Args:
+        policy: maps p ``(starts, n_p)`` in float64, the known signals d_k, .., d_{k+N} and the
+            window of past outputs and applied actions, to actions ``(starts, n_u)``. If it has a
+            method ``begin(plant, x, w)``, that is called first, with the true start states x and
+            all signals w, for rivals that see them and filters that need a reset.
+        plant: the plant.
+        steps, starts, seed, gamma: as in `closed_loop`.
+
+    Raises:
+        QPError: as in `closed_loop`.
+    """
+    _check(policy, steps, starts, seed, gamma)
+    check_kind("plant", plant, Plant, "Use closed_loop for a LinearSystem.")
+    rng = np.random.default_rng(seed)
+    w = plant.signals(rng, starts, steps + plant.horizon + 1)
+    x = plant.starts(rng, starts)
+    if (begin := getattr(policy, "begin", None)) is not None:
+        begin(plant, x, w)
+    k, window = 0, first_window(plant.output(x, w[:, 0]), plant.past, 0 * plant.lb_a)
+
+    def known() -> Tensor:
+        ahead = w[:, k : k + plant.horizon + 1, : plant.n_d]
+        return torch.cat((ahead.flatten(1), window), -1)
+
+    def step(a: Tensor) -> Step:
+        nonlocal k, x, window
+        u = plant.applied(a)
+        cost = plant.cost(x, u, w[:, k])
+        x = plant.step(x, u, w[:, k])
+        k += 1
+        window = next_window(window, u, plant.output(x, w[:, k]))
+        return known(), u, cost
+
+    return _run(policy, known(), step, steps, (starts, plant.n_u), gamma, plant.n_y)
 
 
 @torch.no_grad()
@@ -116,27 +174,54 @@ def gymnasium_loop(
     """
     _check(policy, steps, starts, seed, gamma)
     check_kind("plant", plant, GymnasiumPlant, "Use closed_loop for a LinearSystem.")
-    expected = starts, len(plant.lb_a)
     envs = [gymnasium.make(plant.id, max_episode_steps=steps) for _ in range(starts)]
     s = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(envs)])
-    states, actions, costs = [s], [], []
     over = np.zeros(starts, dtype=bool)
     low, high = plant.lb_a.numpy(), plant.ub_a.numpy()
-    for _ in range(steps):
-        a = policy(torch.as_tensor(s, dtype=torch.float64))
-        check_tensor("policy(s)", a, *expected, batched=False, remedy=POLICY_REMEDY)
-        a = a.numpy().clip(low, high)
+
+    def step(a: Tensor) -> Step:
+        nonlocal s
+        applied = a.numpy().clip(low, high)
         s, cost = s.copy(), np.zeros(starts)
         for i in np.flatnonzero(~over):
-            s[i], reward, terminated, truncated, _ = envs[i].step(a[i].astype(low.dtype))
+            s[i], reward, terminated, truncated, _ = envs[i].step(applied[i].astype(low.dtype))
             cost[i], over[i] = -float(reward), terminated or truncated
-        states.append(s)
-        actions.append(a)
-        costs.append(cost)
+        return _float64(s), _float64(applied), _float64(cost)
+
+    shape = starts, len(plant.lb_a)
+    loop = _run(policy, _float64(s), step, steps, shape, gamma)
     for env in envs:
         env.close()
-    s, a, L = (torch.as_tensor(np.stack(x), dtype=torch.float64) for x in (states, actions, costs))
-    return ClosedLoop(s, a, L, gamma)
+    return loop
+
+
+#: What a policy sees after a step, the applied action, and the cost of the step.
+Step = tuple[Tensor, Tensor, Tensor]
+
+
+def _run(
+    policy: Callable[[Tensor], Tensor],
+    p: Tensor,
+    step: Callable[[Tensor], Step],
+    steps: int,
+    shape: tuple[int, ...],
+    gamma: float,
+    n_y: int | None = None,
+) -> ClosedLoop:
+    """Run ``policy``, which sees p ``(starts, n_p)`` first and returns actions of this shape."""
+    known, actions, costs = [p], [], []
+    for _ in range(steps):
+        # A result of shape (starts,) or (n_u,) would broadcast silently.
+        a = check_tensor("policy(s)", policy(p), *shape, batched=False, remedy=POLICY_REMEDY)
+        p, a, cost = step(a)
+        known.append(p)
+        actions.append(a)
+        costs.append(cost)
+    return ClosedLoop(torch.stack(known), torch.stack(actions), torch.stack(costs), gamma, n_y)
+
+
+def _float64(x: np.ndarray) -> Tensor:
+    return torch.as_tensor(x, dtype=torch.float64)
 
 
 def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:
@@ -184,7 +269,7 @@ def gap_text(
 
 
 def _check(policy: object, steps: int, starts: int, seed: int, gamma: float) -> None:
-    """Raise `QPError` unless these arguments of both loops fit."""
+    """Raise `QPError` unless these arguments of the loops fit."""
     if not callable(policy):
         remedy = "Pass a function of states, such as mpc.policy."
         raise QPError.expected("policy", type(policy).__name__, "a function", remedy)

@@ -11,6 +11,7 @@ import gymnasium
 import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
 
@@ -82,3 +83,7 @@ class GymnasiumPlant:
         """Return how far s ``(*batch, n_x)`` is outside its space, summed, ``(*batch,)``."""
         s = check_tensor("s", s, len(self.lb_s)).to(self.lb_s)
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
+
+    def violations(self, batch: TensorDictBase) -> Tensor:
+        """Return the `violation` of each transition of a collected ``batch``."""
+        return self.violation(batch["observation"])

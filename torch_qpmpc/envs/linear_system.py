@@ -18,10 +18,9 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
-from torch_qpmpc.checks import check_kind, check_tensor, check_whole
+from torch_qpmpc.checks import check_kind, check_tensor
+from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.errors import QPError
 
 #: A random generator: torch's in the TorchRL environments, numpy's in the Gymnasium environments
@@ -55,6 +54,13 @@ def check_rng(rng: Rng) -> None:
     if not isinstance(rng, Rng):
         remedy = "From a seed: numpy.random.default_rng(seed)."
         raise QPError.expected("rng", repr(rng), "a NumPy or torch generator", remedy)
+
+
+def moved(plant: Any, device: torch.device | str | None) -> Any:
+    """Return a plant, a dataclass, with its tensors on ``device``."""
+    values = {f.name: getattr(plant, f.name) for f in fields(plant)}
+    tensors = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
+    return replace(plant, **tensors)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,9 +129,7 @@ class LinearSystem(ABC):
 
     def to(self, device: torch.device | str | None) -> Self:
         """Return the same physics with its tensors on ``device``."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        tensors = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
-        return replace(self, **tensors)
+        return moved(self, device)
 
     @abstractmethod
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
@@ -160,6 +164,10 @@ class LinearSystem(ABC):
         """Return how far s ``(*batch, n_x)`` is outside its bounds, summed, ``(*batch,)``."""
         s = check_tensor("s", s, len(self.A)).to(self.A)
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
+
+    def violations(self, batch: TensorDictBase) -> Tensor:
+        """Return the `violation` of each transition of a collected ``batch``."""
+        return self.violation(batch["observation"])
 
     def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
         """Return s+ = A s + B a + nu, with a clipped and, if `clips_states`, s+ too.
@@ -231,7 +239,7 @@ class LinearSystemGymEnv(gymnasium.Env):
         return self._s.numpy().astype(np.float32), reward, False, False, {}
 
 
-class LinearSystemEnv(EnvBase):
+class LinearSystemEnv(VectorisedEnv):
     """A TorchRL environment of ``num_envs`` vectorised episodes, without a Python loop.
 
     Its only state is the generator. Beside the observation, the TensorDict carries the inputs of a
@@ -264,74 +272,23 @@ class LinearSystemEnv(EnvBase):
         seed: int | None = None,
     ) -> None:
         check_kind("physics", physics, LinearSystem)
-        check_whole("num_envs", num_envs, 1)
-        check_whole("max_steps", max_steps, 1)
-        if seed is not None:
-            check_whole("seed", seed, 0)
-        if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
-            raise QPError.expected("dtype", dtype, "a floating-point torch.dtype")
-        super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        super().__init__(num_envs, max_steps, dtype, device, seed)
         self.physics = p = physics.to(self.device)
-        self.max_steps = max_steps
-        self.rng = torch.Generator(device=p.A.device)
-        one, kind = torch.Size([num_envs, 1]), {"dtype": dtype, "device": self.device}
-
-        def box(low: Tensor, high: Tensor) -> Bounded:
-            low, high = (b.to(dtype).expand(num_envs, -1).clone() for b in (low, high))
-            return Bounded(low, high, dtype=dtype, device=self.device)
-
-        def composite(**specs: Any) -> Composite:
-            return Composite(specs, shape=self.batch_size, device=self.device)
-
-        nu = Unbounded(torch.Size([num_envs, p.A.shape[0]]), **kind)
-        s = box(p.lb_s, p.ub_s) if p.clips_states else nu.clone()
-        count = Unbounded(one, dtype=torch.int64, device=self.device)
-        flag = Categorical(2, shape=one, dtype=torch.bool, device=self.device)
-        # The hidden entries are inputs (state) and outputs (observation) of a step.
-        self.state_spec = composite(noise=nu, step_count=count)
-        self.observation_spec = composite(observation=s, noise=nu.clone(), step_count=count.clone())
-        self.action_spec = box(p.lb_a, p.ub_a)
-        self.reward_spec = Unbounded(one, **kind)
-        self.done_spec = composite(done=flag, terminated=flag.clone(), truncated=flag.clone())
-        self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
-
-    def get_rng_state(self) -> Tensor:
-        """Return the generator's state, a uint8 tensor for a checkpoint."""
-        return self.rng.get_state()
-
-    def set_rng_state(self, state: Tensor) -> None:
-        """Restore the generator's ``state``, a result of :meth:`get_rng_state`."""
-        self.rng.set_state(state.cpu())
-
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            self.rng.manual_seed(seed)
+        nu = self._reals(len(p.A))
+        s = self._box(p.lb_s, p.ub_s) if p.clips_states else nu
+        self._start({"observation": s}, {"noise": nu}, self._box(p.lb_a, p.ub_a), seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         # Reset every environment: at a partial reset, TorchRL keeps the old values of the others.
         s = self.physics.starts(self.rng, self.batch_size[0])
-        count = torch.zeros((*self.batch_size, 1), dtype=torch.int64, device=s.device)
-        return self._pack(s, torch.zeros_like(s), count)
+        return self._observed(s, torch.zeros_like(s), self._zero_count())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         s, a = tensordict["observation"], tensordict["action"]
         draw = self.physics.draw(self.rng, self.batch_size[0])
         nu = self.physics.noise(tensordict["noise"], draw)
-        out = self._pack(self.physics.step(s, a, nu), nu, tensordict["step_count"] + 1)
-        return out.set("reward", -self.physics.cost(s, a).unsqueeze(-1).to(out["observation"]))
+        out = self._observed(self.physics.step(s, a, nu), nu, tensordict["step_count"] + 1)
+        return out.set("reward", -self.physics.cost(s, a).unsqueeze(-1).to(self.dtype))
 
-    def _pack(self, s: Tensor, nu: Tensor, step_count: Tensor) -> TensorDict:
-        dtype = self.observation_spec["observation"].dtype
-        truncated = step_count >= self.max_steps
-        return TensorDict(
-            {
-                "observation": s.to(dtype),
-                "noise": nu.to(dtype),
-                "step_count": step_count,
-                "done": truncated,
-                "terminated": torch.zeros_like(truncated),
-                "truncated": truncated.clone(),
-            },
-            batch_size=self.batch_size,
-            device=self.device,
-        )
+    def _observed(self, s: Tensor, nu: Tensor, step_count: Tensor) -> TensorDict:
+        return self._pack(step_count, observation=s.to(self.dtype), noise=nu.to(self.dtype))

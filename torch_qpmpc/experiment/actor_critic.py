@@ -13,7 +13,12 @@ from torch import Tensor
 from torchrl.objectives import DDPGLoss, LossModule, TD3Loss
 
 from torch_qpmpc.learning.actor_critic import ActionValue, BoundedPolicy, ClippedPolicy, clipped
-from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, QPActorValueOperator
+from torch_qpmpc.learning.operators import (
+    POLICY_ACTIVE_SET,
+    QPActorValueOperator,
+    known_keys,
+    preview_key,
+)
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import COST
 
@@ -22,11 +27,12 @@ SPREAD = 0.01
 
 
 def make_actor(cfg: DictConfig, mpc: QPMPC, low: Tensor, high: Tensor) -> TensorDictModule:
-    """Make the module from observation to action, for bounds ``low`` and ``high`` ``(n_u,)``."""
-    if cfg.algo.actor == "qp":
-        return TensorDictModule(ClippedPolicy(mpc, low, high), ["observation"], ["action"])
-    network = BoundedPolicy(mpc.n_x, low, high, cfg.algo.width)
-    return TensorDictModule(network, ["observation"], ["action"])
+    """Make the actor, for bounds ``low`` and ``high`` ``(n_u,)`` of the action."""
+    qp = cfg.algo.actor == "qp"
+    policy = (
+        ClippedPolicy(mpc, low, high) if qp else BoundedPolicy(mpc.n_p, low, high, cfg.algo.width)
+    )
+    return TensorDictModule(policy, known_keys(mpc), ["action"])
 
 
 def make_closed_loop_actor(
@@ -35,23 +41,24 @@ def make_closed_loop_actor(
     """Make the actor for the closed loop; a QP is warm-started from the previous step."""
     if cfg.algo.actor == "mlp":
         return cast("TensorDictModuleBase", loss_module.actor_network)
-    policy: Any = QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
+    operator = QPActorValueOperator(mpc, preview_key=preview_key(mpc))
+    policy: Any = operator.get_policy_operator(POLICY_ACTIVE_SET)
     clip: Any = TensorDictModule(partial(clipped, low=low, high=high), ["action"], ["action"])
     return TensorDictSequential(policy, clip)
 
 
 def make_critic(cfg: DictConfig, mpc: QPMPC) -> Any:
-    """Make the module from (observation, action) to state_action_value for TorchRL's losses."""
+    """Make the critic for TorchRL's losses, which writes state_action_value."""
     if cfg.algo.critic == "qp":
         critic = copy.deepcopy(mpc)
         with torch.no_grad():
             for parameter in critic.parameters():
                 parameter.mul_(1 + SPREAD * torch.randn_like(parameter))
-        return QPActorValueOperator(critic)
+        return QPActorValueOperator(critic, preview_key=preview_key(mpc))
     # The network's output scale is the return of unit rewards; a wrong scale slows learning.
     scale = sum(cfg.task.gamma**k for k in range(cfg.task.episode_steps))
-    network = ActionValue(mpc.n_x, mpc.n_u, cfg.algo.width, scale)
-    return TensorDictModule(network, ["observation", "action"], ["state_action_value"])
+    network = ActionValue(mpc.n_p, mpc.n_u, cfg.algo.width, scale)
+    return TensorDictModule(network, [*known_keys(mpc), "action"], ["state_action_value"])
 
 
 def make_actor_critic_loss(

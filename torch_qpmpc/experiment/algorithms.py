@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torchrl.objectives import LossModule, SoftUpdate
 
-from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.actor_critic import (
     actor_groups,
@@ -20,7 +19,7 @@ from torch_qpmpc.experiment.actor_critic import (
     make_actor_critic_loss,
     make_closed_loop_actor,
 )
-from torch_qpmpc.experiment.tasks import find_task
+from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, QPActorValueOperator
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
@@ -60,7 +59,7 @@ class Learner:
 def make_learner(
     cfg: DictConfig,
     operator: QPActorValueOperator,
-    physics: LinearSystem | GymnasiumPlant,
+    physics: AnyPlant,
     done: int = 0,
 ) -> Learner:
     """Make the learner of ``cfg.algo``; its rates continue after ``done`` updates."""
@@ -97,7 +96,7 @@ def make_penalties(
     """Make the deviation and the SI penalty; None for each that is off."""
     deviation, si = cfg.constraint.deviation, cfg.constraint.si
     return (
-        None if deviation is None else DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, **deviation),
+        None if deviation is None else DeviationPenalty.of(mpc, **deviation),
         None if si is None else SystemIdentificationPenalty(si.beta, normalised=si.normalised),
     )
 
@@ -168,9 +167,7 @@ def decay(update: int, updates: int, last: float) -> float:
     return 1 - (1 - last) * min(update / updates, 1)
 
 
-def evaluate(
-    cfg: DictConfig, policy: Callable[[Tensor], Tensor], physics: LinearSystem | GymnasiumPlant
-) -> ClosedLoop:
+def evaluate(cfg: DictConfig, policy: Callable[[Tensor], Tensor], physics: AnyPlant) -> ClosedLoop:
     """Run ``policy`` in closed loop, with the starts and the noise of ``cfg.eval_seed``."""
     options = {} if cfg.eval_seed is None else {"seed": cfg.eval_seed}
     return find_task(cfg.task).closed_loop(

@@ -13,9 +13,9 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.modules import AdditiveGaussianModule
 
-from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
+from torch_qpmpc.experiment.tasks import AnyPlant
+from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, preview_key
 from torch_qpmpc.learning.replay import Replay, make_replay
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -30,7 +30,7 @@ def num_columns(cfg: DictConfig) -> int:
 
 
 def make_collector(
-    cfg: DictConfig, physics: LinearSystem | GymnasiumPlant, actor: TensorDictModuleBase
+    cfg: DictConfig, physics: AnyPlant, actor: TensorDictModuleBase
 ) -> BaseCollector:
     """Make the collector of ``actor``'s vectorised episodes with Gaussian exploration.
 
@@ -86,6 +86,8 @@ def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
         1 if si is None else si.windows,
         seed=cfg.seed,
         active_rows=len(mpc.G) if cfg.warm_start else None,
+        n_x=mpc.n_x,
+        preview_key=preview_key(mpc),
     )
 
 

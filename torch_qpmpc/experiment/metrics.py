@@ -80,18 +80,18 @@ def report(
     run.log({f"eval/{name}": summary[key] for name, key in EVALUATION_SCALARS.items()}, update)
     if mpc is None or update == 0:
         return summary
-    distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u)
+    distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u, mpc.past, mpc.n_d)
     distances |= structure_metrics(mpc)
     run.log({f"structure/{name}": distance for name, distance in distances.items()}, update)
     if run.cfg.figures:
         run.figure("structure/C", constraint_figure(mpc), update)
         run.figure("eval/closed_loop", closed_loop_figure(loops, mpc), update)
     if run.cfg.figures and update == run.cfg.updates:
-        states = loops["learned"].states
-        if states.isfinite().all():
+        known = loops["learned"].known
+        if known.isfinite().all():
             run.figure("eval/predictions", predictions_figure(mpc, loops["learned"]), update)
         if mpc.n_x > 1:
-            run.figure("eval/policy", policy_figure(slice_between(mpc, states[0])), update)
+            run.figure("eval/policy", policy_figure(slice_between(mpc, known[0])), update)
     return summary
 
 
@@ -114,11 +114,13 @@ def structure_summary(mpc: QPMPC, true_model: Sequence[Tensor] | None) -> dict[s
     if true_model is None:
         return {"canonical_distance": structure_metrics(mpc)["distance_to_mpc"]}
     metrics = structure_metrics(mpc, true_model)
-    start = nearest_model(prediction_form(mpc.C_0, mpc.n_x, mpc.n_u))
+    sizes = mpc.n_x, mpc.n_u, None, mpc.past, mpc.n_d
+    start = nearest_model(prediction_form(mpc.C_0, *sizes))
+    A, B, offset, *E = true_model
     return {
         "canonical_distance": metrics["distance_to_mpc"],
         "model_error": metrics["model_error"],
-        "model_error_start": one_step_error(start, *true_model).item(),
+        "model_error_start": one_step_error(start, A, B, offset, E=E[0] if E else None).item(),
     }
 
 

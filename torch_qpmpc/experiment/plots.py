@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
+from torch import Tensor
 
 from torch_qpmpc.analysis.plots import COLOURS, draw_matrix
 from torch_qpmpc.envs.closed_loop import ClosedLoop
@@ -15,20 +17,31 @@ from torch_qpmpc.mpc.module import QPMPC
 
 
 def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, shown: int = 6) -> None:
-    """Draw closed-loop paths in the plane from a few starts, and the learned QP's predictions."""
+    """Draw closed-loop paths from a few starts, and the learned QP's predictions.
+
+    They are in the plane of the first two states or outputs, or over time if there is only one.
+    """
+    plane = mpc.n_x > 1
+
+    def draw(paths: Tensor, *style: Any, **options: Any) -> None:
+        """Draw paths ``(steps, starts, n_x)``."""
+        x = paths[..., 0] if plane else torch.arange(len(paths))
+        axes.plot(x, paths[..., int(plane)], *style, **options)
+
     for name, loop in loops.items():
-        paths = loop.states[:, :shown]
         colour = COLOURS.get(name)
-        axes.plot(paths[..., 0], paths[..., 1], color=colour, linewidth=1)
+        draw(loop.states[:, :shown], color=colour, linewidth=1)
         axes.plot([], [], color=colour, label=f"{name}, J = {loop.J:.0f}")
-    starts = next(iter(loops.values())).states[0, :shown]
+    first = next(iter(loops.values()))
     with torch.no_grad():
-        predicted, _ = mpc.predicted(mpc.solve(starts).z)
-    axes.plot(predicted[..., 0].mT, predicted[..., 1].mT, "k:", linewidth=1)
+        predicted, _ = mpc.predicted(mpc.solve(first.known[0, :shown]).z)
+    draw(predicted.transpose(0, 1), "k:", linewidth=1)
     axes.plot([], [], "k:", label="predicted at the start")
-    axes.plot(starts[:, 0], starts[:, 1], "ko", markersize=3)
-    axes.plot(0, 0, "k+", markersize=9)
-    axes.set(xlabel="$s_1$", ylabel="$s_2$", title="Closed loop")
+    draw(first.states[:1, :shown], "ko", markersize=3)
+    if plane:
+        axes.plot(0, 0, "k+", markersize=9)
+    labels = ("$s_1$", "$s_2$") if plane else ("step", "$s_1$")
+    axes.set(xlabel=labels[0], ylabel=labels[1], title="Closed loop")
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
 
 
@@ -47,7 +60,7 @@ def predictions_figure(mpc: QPMPC, loop: ClosedLoop, every: int = 8, start: int 
     rows = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     times = range(0, len(loop.actions), every)
     with torch.no_grad():
-        x, u = mpc.predicted(mpc.solve(loop.states[list(times), start]).z)
+        x, u = mpc.predicted(mpc.solve(loop.known[list(times), start]).z)
     realised = [*loop.states[:, start].unbind(-1), *loop.actions[:, start].unbind(-1)]
     predicted = [*x.unbind(-1), *u.unbind(-1)]
     for axes, name, real, expected in zip(rows, names, realised, predicted, strict=True):

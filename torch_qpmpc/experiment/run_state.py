@@ -1,7 +1,7 @@
 """The state of a run, as tensors and plain numbers, from which it resumes.
 
-With one collector in this process over a `LinearSystem` the resumed run is exact, down to every
-random number. Other environments cannot be saved and start new episodes.
+With one collector in this process over a `LinearSystem` or a `Plant` the resumed run is exact, down
+to every random number. Other environments cannot be saved and start new episodes.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl.collectors import BaseCollector, Collector
+from torchrl.envs import TransformedEnv
 
-from torch_qpmpc.envs import LinearSystemEnv
+from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
@@ -184,24 +185,32 @@ def _part(name: str) -> Iterator[None]:
 
 
 def _collector_state(collector: BaseCollector) -> dict[str, Any] | None:
-    if not isinstance(collector, Collector) or not isinstance(collector.env, LinearSystemEnv):
+    if not isinstance(collector, Collector) or (env := _saved_env(collector)) is None:
         return None
     # TorchRL's collector state lacks the current steps and the ids of the episodes.
     return {
         "episodes": collector._carrier.to_dict(),
         "trajectories": collector._traj_pool.state_dict(),
-        "rng": collector.env.get_rng_state(),
+        "rng": env.get_rng_state(),
     }
+
+
+def _saved_env(collector: Collector) -> VectorisedEnv | None:
+    """Return the collector's environment, without its transforms, if its state can be saved."""
+    env = collector.env
+    env = env.base_env if isinstance(env, TransformedEnv) else env
+    return env if isinstance(env, VectorisedEnv) else None
 
 
 def _restore_collector(collector: BaseCollector, state: dict[str, Any] | None) -> None:
     if state is None:
         return
     assert isinstance(collector, Collector)
-    assert isinstance(collector.env, LinearSystemEnv)
+    env = _saved_env(collector)
+    assert env is not None
     episodes = TensorDict(state["episodes"], batch_size=collector._carrier.batch_size)
     if missing := set(collector._carrier.keys(True, True)) - set(episodes.keys(True, True)):
         raise KeyError(f"no {missing}")
     collector._carrier.update(episodes)
     collector._traj_pool.load_state_dict(state["trajectories"])
-    collector.env.set_rng_state(state["rng"])
+    env.set_rng_state(state["rng"])

@@ -18,22 +18,23 @@ from torch_qpmpc.mpc.module import QPMPC
 class BoundedPolicy(nn.Module):
     """A network policy, with ``width`` units in each layer and actions bounded by tanh.
 
-    Its parameters are float32; it accepts states of any float dtype, and returns actions of it.
+    Its parameters are float32; it accepts inputs of any float dtype, and returns actions of it.
     """
 
     low: Tensor
     high: Tensor
 
-    def __init__(self, n_x: int, low: Tensor, high: Tensor, width: int) -> None:
+    def __init__(self, n_p: int, low: Tensor, high: Tensor, width: int) -> None:
         super().__init__()
-        self.net = MLP(n_x, len(low), num_cells=[width, width], activation_class=nn.ReLU)
+        self.net = MLP(n_p, len(low), num_cells=[width, width], activation_class=nn.ReLU)
         self.register_buffer("low", low.float())
         self.register_buffer("high", high.float())
 
-    def forward(self, s: Tensor) -> Tensor:
-        """Map states ``(*batch, n_x)`` to actions ``(*batch, n_u)``."""
-        share = (self.net(s.to(self.low)).tanh() + 1) / 2
-        return (self.low + share * (self.high - self.low)).to(s.dtype)
+    def forward(self, *known: Tensor) -> Tensor:
+        """Map the parts of p, n_p entries in all, to actions ``(*batch, n_u)``."""
+        p = torch.cat(known, -1)
+        share = (self.net(p.to(self.low)).tanh() + 1) / 2
+        return (self.low + share * (self.high - self.low)).to(p.dtype)
 
 
 class Clip(torch.autograd.Function):
@@ -62,7 +63,7 @@ def clipped(a: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 class ClippedPolicy(nn.Module):
-    """A QP's policy pi(s), clipped to the action bounds, which soft rows let it exceed."""
+    """A QP's policy pi(p), clipped to the action bounds, which soft rows let it exceed."""
 
     low: Tensor
     high: Tensor
@@ -73,19 +74,19 @@ class ClippedPolicy(nn.Module):
         self.register_buffer("low", low)
         self.register_buffer("high", high)
 
-    def forward(self, s: Tensor) -> Tensor:
-        """Map states ``(*batch, n_x)`` to actions ``(*batch, n_u)``."""
-        return clipped(self.module.policy(s), self.low, self.high)
+    def forward(self, *known: Tensor) -> Tensor:
+        """Map the parts of p, n_p entries in all, to actions ``(*batch, n_u)``."""
+        return clipped(self.module.policy(torch.cat(known, -1)), self.low, self.high)
 
 
 class ActionValue(nn.Module):
-    """A network for -Q(s, a), with ``width`` units in each layer and an output in ``scale``s."""
+    """A network for -Q(p, a), with ``width`` units in each layer and an output in ``scale``s."""
 
-    def __init__(self, n_x: int, n_u: int, width: int, scale: float) -> None:
+    def __init__(self, n_p: int, n_u: int, width: int, scale: float) -> None:
         super().__init__()
         self.scale = scale
-        self.net = MLP(n_x + n_u, 1, num_cells=[width, width], activation_class=nn.ReLU)
+        self.net = MLP(n_p + n_u, 1, num_cells=[width, width], activation_class=nn.ReLU)
 
-    def forward(self, s: Tensor, a: Tensor) -> Tensor:
-        """Map states ``(*batch, n_x)`` and actions ``(*batch, n_u)`` to ``(*batch, 1)``."""
-        return self.scale * self.net(torch.cat((s, a), -1))
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Map the parts of p and the action, n_p + n_u entries in all, to ``(*batch, 1)``."""
+        return self.scale * self.net(torch.cat(inputs, -1))

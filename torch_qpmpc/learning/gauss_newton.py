@@ -164,7 +164,7 @@ class GaussNewton(torch.optim.Optimizer):
         """Move theta so that Q(s, a) approaches ``target``, within the limits of the damping.
 
         Args:
-            s, a: visited pairs, ``(B, n_x)`` and ``(B, n_u)``.
+            s, a: visited pairs, ``(B, n_p)`` and ``(B, n_u)``.
             target: costs to go, L + gamma V(s+), ``(B,)``. Pairs with a target that is not finite
                 are left out and counted; if none is left, theta stays, with a `RuntimeWarning`.
                 The sign is not checked: negate rewards and TorchRL's values.
@@ -181,7 +181,7 @@ class GaussNewton(torch.optim.Optimizer):
         """
         mpc = self._mpc
         self._check_parameters()
-        check_tensor("s", s, "B", mpc.n_x, batched=False)
+        check_tensor("s", s, "B", mpc.n_p, batched=False)
         check_tensor("a", a, len(s), mpc.n_u, batched=False)
         check_tensor("target", target, len(s), batched=False, remedy="Squeeze its last dimension.")
         if not len(s):

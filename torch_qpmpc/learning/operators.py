@@ -1,5 +1,8 @@
 """TensorDict modules that make a QPMPC the critic, value or actor of a TorchRL script.
 
+What V fixes, p, is the entry ``observation``; with a ``preview_key``, it is the preview of known
+signals followed by the observation. Without either previews or past outputs it is the state s.
+
 Only here do costs become rewards: TorchRL maximises, so state_value = -V(s) and
 state_action_value = -Q(s, a), both with TorchRL's trailing dimension of one.
 """
@@ -18,6 +21,8 @@ from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 
+#: The key of the known signals, as environments emit them.
+PREVIEW = "preview"
 #: The key of the active sets that a policy in closed loop passes from step to step.
 POLICY_ACTIVE_SET = "policy_active_set"
 
@@ -37,18 +42,31 @@ class _QPOperator(TensorDictModuleBase):
         in_keys: Sequence[NestedKey],
         out_key: NestedKey,
         active_set_key: NestedKey | None = None,
+        preview_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
         check_kind("mpc", mpc, QPMPC)
         self.module = mpc
-        self.active_set_key = active_set_key
-        out_keys = [out_key] if active_set_key is None else [out_key, active_set_key]
-        self.in_keys = list(in_keys)  # pyright: ignore[reportAttributeAccessIssue]
+        self.active_set_key, self.preview_key = active_set_key, preview_key
+        in_keys = [*in_keys, *_if_any(preview_key)]
+        out_keys = [out_key, *_if_any(active_set_key)]
+        self.in_keys = in_keys  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = out_keys  # pyright: ignore[reportAttributeAccessIssue]
 
-    def _set_value(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write -V, or -Q if the in-keys include an action, to the first out-key."""
-        inputs = [_read(tensordict, key) for key in self.in_keys]
+    def known(self, tensordict: TensorDictBase) -> Tensor:
+        """Return p ``(*batch, n_p)``: the preview, if there is a key of it, and the observation.
+
+        Raises:
+            QPError: if an entry is missing.
+        """
+        observation = _read(tensordict, self.in_keys[0])
+        if self.preview_key is None:
+            return observation
+        return torch.cat((_read(tensordict, self.preview_key).to(observation), observation), -1)
+
+    def _set_value(self, tensordict: TensorDictBase, *action_key: NestedKey) -> TensorDictBase:
+        """Write -V, or -Q with the key of an action, to the first out-key."""
+        inputs = [self.known(tensordict), *(_read(tensordict, key) for key in action_key)]
         if self.active_set_key is None:
             cost = self.module(*inputs)
         else:
@@ -56,6 +74,10 @@ class _QPOperator(TensorDictModuleBase):
             cost, active = self.module.value_and_active_set(*inputs, warm_start=start)
             tensordict.set(self.active_set_key, active)
         return tensordict.set(self.out_keys[0], -cost.unsqueeze(-1))
+
+
+def _if_any(key: NestedKey | None) -> list[NestedKey]:
+    return [] if key is None else [key]
 
 
 def _read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
@@ -69,7 +91,7 @@ def _read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 class QPPolicyOperator(_QPOperator):
-    """The policy pi(s): observation ``(*batch, n_x)`` to action ``(*batch, n_u)``.
+    """The policy pi(p): observation, and preview if any, to action ``(*batch, n_u)``.
 
     With an ``active_set_key`` each call starts from the active sets under that key, or from empty
     ones if there are none, and writes its own there. Rollouts and collectors carry them to the next
@@ -78,37 +100,40 @@ class QPPolicyOperator(_QPOperator):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write pi(s) to the action key."""
-        s = _read(tensordict, self.in_keys[0])
+        """Write pi(p) to the action key."""
+        p = self.known(tensordict)
         if self.active_set_key is None:
-            return tensordict.set(self.out_keys[0], self.module.policy(s))
+            return tensordict.set(self.out_keys[0], self.module.policy(p))
         start = tensordict.get(self.active_set_key, None)
         if start is None:
             rows = len(self.module.G)
-            start = torch.zeros((*s.shape[:-1], rows), dtype=torch.int8, device=s.device)
-        action, active = self.module.policy_and_active_set(s, start)
+            start = torch.zeros((*p.shape[:-1], rows), dtype=torch.int8, device=p.device)
+        action, active = self.module.policy_and_active_set(p, start)
         tensordict.set(self.active_set_key, active)
         return tensordict.set(self.out_keys[0], action)
 
 
 class QPValueOperator(_QPOperator):
-    """The state value -V(s): observation ``(*batch, n_x)`` to state_value ``(*batch, 1)``."""
+    """The state value -V(p): observation, and preview if any, to state_value ``(*batch, 1)``."""
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write -V(s) to the value key."""
+        """Write -V(p) to the value key."""
         return self._set_value(tensordict)
 
 
 class QPActorValueOperator(_QPOperator):
-    """The critic -Q(s, a): (observation, action) to state_action_value ``(*batch, 1)``.
+    """The critic -Q(p, a): (observation, action) to state_action_value ``(*batch, 1)``.
 
-    The observation is ``(*batch, n_x)``, the action ``(*batch, n_u)``. The views of the value and
-    of the policy share its parameters.
+    The observation is p ``(*batch, n_p)``, such as a state s ``(*batch, n_x)``, and the action
+    ``(*batch, n_u)``. The views of the value and of the policy share its parameters.
 
     Args:
         mpc: the QPMPC.
         observation_key, action_key: the keys of its inputs.
+        preview_key: the key of the known signals [d_k, .., d_{k+N}], ``(*batch, (N + 1) n_d)``; a
+            third input, after the action. The observation is then the rest of p. None, the
+            default, if there are none, or if the observation contains them.
         state_value_key, state_action_value_key: the output keys of the value and the critic.
         active_set_key: the key where the value and the critic write the QP's active set, int8
             ``(*batch, n_g)``, after starting from the one they find there, such as one stored in a
@@ -132,39 +157,51 @@ class QPActorValueOperator(_QPOperator):
         *,
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
+        preview_key: NestedKey | None = None,
         state_value_key: NestedKey = "state_value",
         state_action_value_key: NestedKey = "state_action_value",
         active_set_key: NestedKey | None = None,
     ) -> None:
         in_keys = [observation_key, action_key]
-        super().__init__(mpc, in_keys, state_action_value_key, active_set_key)
+        super().__init__(mpc, in_keys, state_action_value_key, active_set_key, preview_key)
         self.state_value_key = state_value_key
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write -Q(s, a) to the action value's key of ``tensordict``, and return it.
+        """Write -Q(p, a) to the action value's key of ``tensordict``, and return it.
 
         Raises:
             QPError: if an entry is missing or does not fit.
         """
-        return self._set_value(tensordict)
+        return self._set_value(tensordict, self.in_keys[1])
 
     def get_policy_operator(self, active_set_key: NestedKey | None = None) -> QPPolicyOperator:
-        """Return the actor: observation to action.
+        """Return the actor: observation, and preview if any, to action.
 
         ``active_set_key`` is the key of the active set that each step of an episode passes to the
         next; it must not be the critic's. None starts each step cold.
         """
-        return QPPolicyOperator(self.module, self.in_keys[:1], self.in_keys[1], active_set_key)
+        keys = self.in_keys[1], active_set_key, self.preview_key
+        return QPPolicyOperator(self.module, self.in_keys[:1], *keys)
 
     def get_value_operator(self) -> QPValueOperator:
-        """Return the state value: observation to state_value."""
-        keys = self.state_value_key, self.active_set_key
+        """Return the state value: observation, and preview if any, to state_value."""
+        keys = self.state_value_key, self.active_set_key, self.preview_key
         return QPValueOperator(self.module, self.in_keys[:1], *keys)
 
     def get_critic_operator(self) -> QPActorValueOperator:
-        """Return the critic, this operator: (observation, action) to state_action_value."""
+        """Return the critic, this operator."""
         return self
+
+
+def preview_key(mpc: QPMPC) -> str | None:
+    """Return `PREVIEW` if the QP has known signals, else None."""
+    return PREVIEW if mpc.n_d else None
+
+
+def known_keys(mpc: QPMPC) -> list[NestedKey]:
+    """Return the keys of p's parts, as environments emit them, in the order of p."""
+    return [PREVIEW, "observation"] if mpc.n_d else ["observation"]
 
 
 def warm_policy(mpc: QPMPC) -> Callable[[Tensor], Tensor]:
@@ -181,14 +218,18 @@ def warm_policy(mpc: QPMPC) -> Callable[[Tensor], Tensor]:
     return in_closed_loop(QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET))
 
 
-def in_closed_loop(actor: TensorDictModuleBase) -> Callable[[Tensor], Tensor]:
-    """Return an actor as a function from s to a, for one closed loop.
+def in_closed_loop(actor: TensorDictModuleBase, n_preview: int = 0) -> Callable[[Tensor], Tensor]:
+    """Return an actor as a function from p to a, for one closed loop.
 
-    Other entries that the actor writes, such as active sets, are inputs of its next call.
+    The first ``n_preview`` entries of p are the actor's ``preview``, the others its
+    ``observation``. Other entries that the actor writes, such as active sets, are inputs of its
+    next call.
     """
     carried = TensorDict()
 
-    def policy(s: Tensor) -> Tensor:
-        return actor(carried.set("observation", s))["action"]
+    def policy(p: Tensor) -> Tensor:
+        if n_preview:
+            carried.set(PREVIEW, p[..., :n_preview])
+        return actor(carried.set("observation", p[..., n_preview:]))["action"]
 
     return policy

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch_qpmpc.checks import check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
+from torch_qpmpc.mpc.module import QPMPC
 
 WINDOWS_REMEDY = "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}."
 
@@ -36,7 +37,8 @@ def system_identification_penalty(
 
     Args:
         C: ``(n_c, n_z)``.
-        windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}], ``(M, n_z)``.
+        windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}], ``(M, n_z)``. With a past or a preview,
+            s_j is p at step j, and the later s are the measured outputs.
         normalised: scale the rows of C to unit norm first.
 
     Raises:
@@ -56,9 +58,10 @@ class DeviationPenalty(nn.Module):
     everything below the band is free: the prediction stays causal, but need not be Markovian.
 
     Args:
-        C_0: the banded matrix, ``(N n_x, N (n_x + n_u) + n_x)``.
+        C_0: the banded matrix, ``(N n_x, n_z)``.
         n_x: number of states.
         n_u: number of actions.
+        past, n_d: L and the entries of d_k, as in `QPMPC`.
         c_1: weight above the band, where the future would act on the past.
         c_2: weight on the band.
         c_3: weight below the band.
@@ -71,7 +74,7 @@ class DeviationPenalty(nn.Module):
     Example:
         >>> import torch, torch_qpmpc as qm
         >>> mpc = qm.QPMPC.from_model(torch.eye(1), torch.eye(1), 3)
-        >>> penalty = qm.DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u)
+        >>> penalty = qm.DeviationPenalty.of(mpc)
         >>> penalty(mpc.C).item()
         0.0
     """
@@ -84,6 +87,8 @@ class DeviationPenalty(nn.Module):
         C_0: Tensor,
         n_x: int,
         n_u: int,
+        past: int = 1,
+        n_d: int = 0,
         *,
         c_1: float = 1.0,
         c_2: float = 1e-4,
@@ -96,12 +101,14 @@ class DeviationPenalty(nn.Module):
             check_number(name, weight, _finite, "a finite weight >= 0")
         check_whole("n_x", n_x, 1)
         check_whole("n_u", n_u, 1)
+        check_whole("past", past, 1)
+        check_whole("n_d", n_d, 0)
         remedy = "Pass the C_0 of a QPMPC."
         check_tensor("C_0", C_0, "N n_x", "n_z", batched=False, remedy=remedy)
         if not C_0.isfinite().all():
             raise QPError.expected("C_0", "NaN or inf", "finite entries", remedy)
         horizon = C_0.shape[0] // n_x
-        distance = band_distance(n_x, n_u, horizon)
+        distance = band_distance(n_x, n_u, horizon, past, n_d)
         if distance.shape != C_0.shape:
             raise QPError.expected(
                 "C_0",
@@ -114,6 +121,15 @@ class DeviationPenalty(nn.Module):
         mask *= 1 + growth * (distance.abs() - 1).clamp(min=0)
         self.register_buffer("C_0", C_0.detach().clone())
         self.register_buffer("C_mask", mask)
+
+    @classmethod
+    def of(cls, mpc: QPMPC, **weights: float) -> DeviationPenalty:
+        """Return the penalty for the C of ``mpc``; ``weights`` are c_1, c_2, c_3 and growth.
+
+        Raises:
+            QPError: as in `DeviationPenalty`.
+        """
+        return cls(mpc.C_0, mpc.n_x, mpc.n_u, mpc.past, mpc.n_d, **weights)
 
     def forward(self, C: Tensor) -> Tensor:
         """Return the penalty of C ``(N n_x, n_z)``, a scalar."""

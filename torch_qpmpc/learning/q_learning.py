@@ -339,7 +339,7 @@ class QPQLearningLoss(LossModule):
         for key in self.state_value_network.in_keys:
             if following.get(key, None) is None:
                 present = ", ".join(sorted(str(name) for name in following.keys(True, True)))
-                remedy = "Collect the next observations, or set the operator's observation_key."
+                remedy = "Collect the next observations, or set the operator's keys."
                 name, got = str(unravel_key(("next", key))), f"a TensorDict with {present}"
                 raise QPError.expected(name, got, f"one with {key}", remedy)
         if 0 in tensordict.batch_size:

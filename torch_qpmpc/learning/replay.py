@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import (
     ImmutableDatasetWriter,
@@ -31,29 +32,39 @@ ACTIVE_SET = "active_set"
 ACTIVE_SETS = (ACTIVE_SET, ("next", ACTIVE_SET))
 
 
-def windows_to_tau(windows: TensorDictBase) -> Tensor:
-    """Return tau = [s_j, a_j, s_{j+1}, ..., s_{j+N}] of eq:sdp3, in the order of z.
+def windows_to_tau(
+    windows: TensorDictBase, n_x: int | None = None, preview_key: NestedKey | None = None
+) -> Tensor:
+    """Return tau = [p_j, a_j, y_{j+1}, a_{j+1}, ..., y_{j+N}] of eq:sdp3, in the order of z.
+
+    p_j is what V fixes at step j: the state s_j or, in general, the preview and the observation.
 
     Args:
         windows: ``(M, N)`` consecutive transitions along the last dimension, with
-            ``observation`` ``(M, N, n_x)``, ``action`` and ``("next", "observation")``.
+            ``observation`` ``(M, N, n)``, ``action`` and ``("next", "observation")``.
+        n_x: the last n_x entries of the observation are the outputs y; by default, all of them.
+        preview_key: the key of the preview; None, the default, if p is the observation.
 
     Returns:
-        ``(M, N (n_x + n_u) + n_x)``.
+        ``(M, n_p + N (n_x + n_u))``.
 
     Raises:
         QPError: if an entry is missing.
     """
     check_kind("windows", windows, TensorDictBase)
-    for key in ("observation", "action", ("next", "observation")):
+    known = ["observation"] if preview_key is None else [preview_key, "observation"]
+    for key in (*known, "action", ("next", "observation")):
         if windows.get(key, None) is None or windows.batch_dims < 1:
             got = (
                 f"shape {tuple(windows.shape)} with {', '.join(map(str, windows.keys(True, True)))}"
             )
-            want = "consecutive transitions (M, N) with observation, action, (next, observation)"
+            names = ", ".join(map(str, known))
+            want = f"consecutive transitions (M, N) with {names}, action, (next, observation)"
             raise QPError.expected("windows", got, want)
-    pairs = torch.cat([windows["observation"], windows["action"]], dim=-1)
-    return torch.cat([pairs.flatten(-2), windows["next", "observation"][..., -1, :]], dim=-1)
+    p = [windows[key][..., 0, :] for key in known]
+    y = windows["next", "observation"][..., -(n_x or 0) :]
+    pairs = torch.cat([windows["action"], y], dim=-1)
+    return torch.cat([*p, pairs.flatten(-2)], dim=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +79,7 @@ class Replay:
         window: N, the number of transitions in a window.
         num_envs: number of columns of the storage.
         active_rows: n_g if active sets are stored with the transitions, else None.
+        n_x, preview_key: see :func:`windows_to_tau`.
     """
 
     transitions: ReplayBuffer
@@ -76,6 +88,8 @@ class Replay:
     window: int
     num_envs: int
     active_rows: int | None = None
+    n_x: int | None = None
+    preview_key: NestedKey | None = None
 
     def __len__(self) -> int:
         return len(self.transitions)
@@ -138,7 +152,7 @@ class Replay:
         return self.windows.can_sample()
 
     def sample_tau(self) -> Tensor:
-        """Sample windows ``(num_windows, N (n_x + n_u) + n_x)``; see :func:`windows_to_tau`.
+        """Sample windows ``(num_windows, n_p + N (n_x + n_u))``; see :func:`windows_to_tau`.
 
         Raises:
             QPError: if no stored trajectory has N steps yet.
@@ -153,7 +167,7 @@ class Replay:
             remedy = "Collect more, until has_windows() is True."
             expected = f"{self.window} consecutive transitions"
             raise QPError.expected("replay", got, expected, remedy) from error
-        return windows_to_tau(sample.reshape(-1, self.window))
+        return windows_to_tau(sample.reshape(-1, self.window), self.n_x, self.preview_key)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the stored data (not copied: save them at once), write position and generator."""
@@ -194,6 +208,8 @@ def make_replay(
     seed: int = 0,
     device: torch.device | str = "cpu",
     active_rows: int | None = None,
+    n_x: int | None = None,
+    preview_key: NestedKey | None = None,
 ) -> Replay:
     """Make the empty replay of a training run, to be filled by :meth:`Replay.extend`.
 
@@ -207,6 +223,7 @@ def make_replay(
         device: device of the stored data and of the generator.
         active_rows: n_g, to store the active sets of Q(s, a) and V(s+) with each transition, n_g
             bytes each, under `ACTIVE_SETS`; see :meth:`Replay.remember`.
+        n_x, preview_key: see :func:`windows_to_tau`.
 
     Raises:
         QPError: if a number is out of range, ``capacity`` is not a multiple of ``num_envs``, or it
@@ -242,4 +259,4 @@ def make_replay(
         batch_size=num_windows * window,
         generator=generator,
     )
-    return Replay(transitions, windows, generator, window, num_envs, active_rows)
+    return Replay(transitions, windows, generator, window, num_envs, active_rows, n_x, preview_key)

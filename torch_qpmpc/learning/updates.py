@@ -112,7 +112,7 @@ def second_order(
         deviation, si: the penalties on C; None for none.
     """
     network = loss_module.value_network
-    observation, action = network.in_keys
+    action = network.in_keys[1]
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
         target, terms, penalty = loss_module.target(batch), {}, None
@@ -120,8 +120,8 @@ def second_order(
             penalty = si.curvature(windows)
             terms["loss/si"] = si(mpc.C, windows)
         start = None if network.active_set_key is None else batch.get(network.active_set_key, None)
-        s, a = batch.get(observation), batch.get(action)
-        report = optimizer.step(s, a, -target, penalty=penalty, warm_start=start)
+        p, a = network.known(batch), batch.get(action)
+        report = optimizer.step(p, a, -target, penalty=penalty, warm_start=start)
         if network.active_set_key is not None:
             batch.set(network.active_set_key, report.solution.active)
         prediction = -report.solution.value.to(target)

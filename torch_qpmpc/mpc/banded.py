@@ -1,7 +1,8 @@
 """The banded constraint matrix of a linear MPC scheme (eq:cband), and distances from its band.
 
-Rows are grouped in N blocks of n_x, columns in the order of z = [x_0, u_0, x_1, .., x_N]. In row
-block k the band is (x_k, u_k, x_{k+1}); columns to its right are above it, those to its left below.
+Rows are grouped in N blocks of n_x, columns in the order of z (see `torch_qpmpc.mpc.layout`). In
+row block k the band is (x_k, u_k, x_{k+1}) or, with a past of L pairs and a preview,
+(d_k, y_{k+1-L}, u_{k+1-L}, .., y_k, u_k, y_{k+1}). Later columns are above it, earlier ones below.
 """
 
 from __future__ import annotations
@@ -11,41 +12,71 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.layout import Layout
 
 
-def banded_matrix(A: Tensor, B: Tensor, horizon: int) -> Tensor:
-    """Return C_0 for the model x+ = A x + B u: ``C_0 z = 0`` is the model over the horizon.
+def banded_matrix(A: Tensor, B: Tensor, horizon: int, E: Tensor | None = None) -> Tensor:
+    """Return C_0 for a linear model: ``C_0 z = 0`` is the model over the horizon.
+
+    The model is ``x_{k+1} = A x_k + B u_k`` or, with a past of L pairs and a preview d,
+    ``y_{k+1} = A_1 y_k + .. + A_L y_{k+1-L} + B_1 u_k + .. + B_L u_{k+1-L} + E d_k``.
 
     Args:
-        A: ``(n_x, n_x)``, or ``(N, n_x, n_x)`` for one per stage.
-        B: ``(n_x, n_u)``, or ``(N, n_x, n_u)``.
+        A: ``(n_x, n_x)``, or [A_1, .., A_L] ``(n_x, L n_x)``; a leading N has one per stage.
+        B: ``(n_x, n_u)``, or [B_1, .., B_L] ``(n_x, L n_u)``; likewise.
         horizon: N.
+        E: ``(n_x, n_d)``, likewise; None without a preview.
 
     Returns:
-        ``(N n_x, N (n_x + n_u) + n_x)``.
+        ``(N n_x, n_z)``.
 
     Raises:
-        QPError: the shapes of A and B do not match each other or the horizon.
+        QPError: the shapes of A, B and E do not match each other or the horizon.
     """
-    n_x, n_u = A.shape[-1], B.shape[-1]
-    for name, matrix, shape in (("A", A, (n_x, n_x)), ("B", B, (n_x, n_u))):
+    E = A.new_zeros(*A.shape[:-1], 0) if E is None else E
+    n_x = A.shape[-2] if A.ndim > 1 else len(A)
+    past = max(A.shape[-1] // n_x, 1)
+    n_u, n_d = max(B.shape[-1] // past, 1), E.shape[-1]
+    shapes = {"A": (A, (n_x, past * n_x)), "B": (B, (n_x, past * n_u)), "E": (E, (n_x, n_d))}
+    for name, (matrix, shape) in shapes.items():
         if tuple(matrix.shape) not in (shape, (horizon, *shape)):
             got = f"shape {tuple(matrix.shape)}"
             raise QPError.expected(name, got, f"shape {shape} or {(horizon, *shape)}")
-    blocks = torch.cat((A.expand(horizon, n_x, n_x), B.expand(horizon, n_x, n_u)), dim=-1)
-    following = torch.eye(horizon * n_x).to(A).unflatten(-1, (horizon, n_x))
-    following = F.pad(F.pad(following, (0, n_u)).flatten(1), (n_x + n_u, -n_u))
-    return F.pad(torch.block_diag(*blocks), (0, n_x)) - following
+    lags = (x.unflatten(-1, (past, -1)).expand(horizon, n_x, past, -1) for x in (A, B))
+    window = torch.cat(tuple(lags), dim=-1).flip(-2).flatten(2)  # z has the oldest first
+    following = torch.diag_embed(-A.new_ones(horizon, n_x))
+    C = _staircase(torch.cat((window, following), dim=-1), n_x + n_u)
+    preview = F.pad(torch.block_diag(*E.expand(horizon, n_x, n_d)), (0, n_d))
+    return torch.cat((preview, C), dim=-1)
 
 
-def band_distance(n_x: int, n_u: int, horizon: int) -> Tensor:
+def model_of(C: Tensor, layout: Layout) -> tuple[Tensor, ...]:
+    """Return A and B and, with a preview, E from the band of C, each with a leading N."""
+    window, E = layout.model_blocks(C)
+    pairs = window.unflatten(-1, (layout.past, layout.n)).flip(-2)
+    A, B = (x.flatten(-2) for x in pairs.split((layout.n_x, layout.n_u), dim=-1))
+    return (A, B, E) if layout.n_d else (A, B)
+
+
+def _staircase(blocks: Tensor, step: int) -> Tensor:
+    """Return rows with ``blocks`` ``(N, i, width)``, each ``step`` columns after the one above."""
+    N, width = len(blocks), blocks.shape[-1]
+    total = (N - 1) * step + width
+    # Padded to total + step columns and read with a stride of total, each block moves by step.
+    padded = F.pad(blocks.movedim(1, 0), (0, total + step - width)).flatten(1)
+    rows = padded[:, : N * total].unflatten(-1, (N, total))
+    return rows.movedim(0, 1).flatten(0, 1)
+
+
+def band_distance(n_x: int, n_u: int, horizon: int, past: int = 1, n_d: int = 0) -> Tensor:
     """Return the signed distance from the band in stages, ``(N n_x, n_z)``, > 0 above it."""
+    n = n_x + n_u
     row = torch.arange(horizon).repeat_interleave(n_x).unsqueeze(1)
-    n_z = horizon * (n_x + n_u) + n_x
-    column = torch.arange(n_z)
-    stage = column // (n_x + n_u)
-    is_state = column % (n_x + n_u) < n_x
+    column = torch.arange((horizon + past - 1) * n + n_x)
+    stage = column // n - (past - 1)
+    is_state = column % n < n_x
     # x_{k+1} is on the band of row block k, u_{k+1} the first block above it.
     above = (stage - row - is_state.long()).clamp(min=0)
-    below = (row - stage).clamp(min=0)
-    return above - below
+    below = (row + 1 - past - stage).clamp(min=0)
+    preview = torch.arange(horizon + 1).repeat_interleave(n_d) - row
+    return torch.cat((preview, above - below), dim=-1)

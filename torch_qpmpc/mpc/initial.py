@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import scipy
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
@@ -22,21 +23,27 @@ from torch_qpmpc.mpc.validation import (
 )
 
 RICCATI = "riccati"
+#: The parts of theta that may start at any finite values.
+STARTED = ("q", "c", "C", "b")
 
 
 def theta(
     n_x: int,
     n_u: int,
     horizon: int,
+    past: int,
+    n_d: int,
     *,
     gamma: float,
     A: Any,
     B: Any,
+    E: Any,
     offset: Any,
     state_bounds: tuple[Any, Any] | None,
     action_bounds: tuple[Any, Any] | None,
     constraints: tuple[Any, Any, Any] | None,
     terminal_constraints: tuple[Any, Any, Any] | None,
+    rate_bounds: tuple[Any, Any] | None,
     structure: str,
     hessian: str,
     learn: Collection[str],
@@ -45,19 +52,21 @@ def theta(
     state_slack: Any,
     action_slack: Any,
     constraint_slack: float,
+    rate_slack: Any,
     seed: int,
     **_: Any,
 ) -> tuple[Layout, dict[str, Tensor]]:
     """Return the layout and theta by part, from the arguments of `QPMPC`; w is inf on hard rows."""
-    D = _linear_rows("constraints", constraints, n_x + n_u)
-    D_f = _linear_rows("terminal_constraints", terminal_constraints, n_x)
-    layout = Layout(n_x, n_u, horizon, len(D[0]), len(D_f[0]))
+    D = _linear_rows("constraints", constraints, n_d + n_x + n_u)
+    D_f = _linear_rows("terminal_constraints", terminal_constraints, n_d + n_x)
+    rates = _rates(rate_bounds, n_u, past)
+    layout = Layout(n_x, n_u, horizon, past, n_d, len(D[0]), len(D_f[0]), len(rates[0]))
     if "G" in learn and structure != "free" and not layout.n_linear:
         remedy = "Pass constraints, or structure='free'."
         raise QPError.expected("learn", "'G' without constraints", "other parts", remedy)
     random = torch.Generator().manual_seed(seed)
-    A, B = _model(A, B, n_x, n_u, random)
-    C = banded_matrix(A, B, horizon)
+    A, B, E = _model(A, B, E, layout, random)
+    C = banded_matrix(A, B, horizon, E)
     offset = torch.zeros(n_x) if offset is None else as_tensor("offset", offset)
     if tuple(offset.shape) != (n_x,):
         raise QPError.expected("offset", f"shape {tuple(offset.shape)}", f"shape ({n_x},)")
@@ -73,21 +82,37 @@ def theta(
             raise QPError.expected("terminal_weight", got, want)
         terminal_weight = _riccati_weight(A, B, stage_weight, gamma, layout)
     return layout, {
-        **cost_weights(stage_weight, terminal_weight, hessian, n_x, n_u, horizon),
+        **cost_weights(stage_weight, terminal_weight, hessian, layout),
         "q": torch.zeros(layout.n_z),
         "c": torch.zeros(()),
         "C": C,
         "b": -offset.repeat(horizon),
         "G": LinearRows(layout, tied=True)(D[0], D_f[0]),
-        **_bounds(layout, state_bounds, action_bounds, D, D_f),
-        "w": _slack_weights(layout, state_slack, action_slack, constraint_slack),
+        **_bounds(layout, state_bounds, action_bounds, D, D_f, rates),
+        "w": _slack_weights(layout, state_slack, action_slack, constraint_slack, rate_slack),
     }
+
+
+def started(theta: Mapping[str, Tensor], start: Any, **_: Any) -> dict[str, Tensor]:
+    """Return the initial values in the argument ``start`` of `QPMPC`, by part of ``theta``."""
+    if start is None:
+        return {}
+    wanted = f"a mapping of values by name, of {', '.join(STARTED)}"
+    if not isinstance(start, Mapping) or not all(name in STARTED for name in start):
+        got = list(start) if isinstance(start, Mapping) else repr(start)
+        raise QPError.expected("start", got, wanted)
+    values = {name: as_tensor(f"start[{name!r}]", value) for name, value in start.items()}
+    for name, value in values.items():
+        if value.shape != theta[name].shape:
+            got, want = tuple(value.shape), tuple(theta[name].shape)
+            raise QPError.expected(f"start[{name!r}]", f"shape {got}", f"shape {want}")
+    return values
 
 
 def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dict[str, Any]:
     """Return the defaults of `QPMPC.linear_mpc` for ``options``."""
-    A, B = check_model(A, B)
-    n_x, n_u = A.shape[-1], B.shape[-1]
+    n_x, n_u, past = model_sizes(*check_model(A, B))
+    riccati = hessian != "diagonal" and past == 1
     learn = ["H", "H_f", "q", "c", "C", "b", "lb", "ub", "w"]
     if hessian == "full":
         learn.remove("H_f")
@@ -97,32 +122,55 @@ def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dic
         "structure": "tied",
         "hessian": hessian,
         "stage_weight": [1.0] * (n_x + n_u),
-        "terminal_weight": [1.0] * n_x if hessian == "diagonal" else RICCATI,
+        "terminal_weight": RICCATI if riccati else [1.0] * n_x,
         "discount_slack": True,
         "learn": learn,
     }
 
 
-def _model(A: Any, B: Any, n_x: int, n_u: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return A and B as tensors, or random ones for None."""
+def model_sizes(A: Tensor, B: Tensor) -> tuple[int, int, int]:
+    """Return n_x, n_u and past of a model [A_1, .., A_L], [B_1, .., B_L]."""
+    n_x = A.shape[-2]
+    past = max(A.shape[-1] // max(n_x, 1), 1)
+    return n_x, max(B.shape[-1] // past, 1), past
+
+
+def _model(
+    A: Any, B: Any, E: Any, layout: Layout, random: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return A, B and E as tensors; for None, random A_1 and B_1 and zeros."""
+    n_x, n_u, past, n_d = layout.n_x, layout.n_u, layout.past, layout.n_d
     if A is None:
         A = torch.eye(n_x, dtype=torch.float32) + 0.1 * torch.randn(
             n_x, n_x, generator=random, dtype=torch.float32
         )
+        A = F.pad(A, (0, (past - 1) * n_x))
     if B is None:
         B = 0.1 * torch.randn(n_x, n_u, generator=random, dtype=torch.float32)
+        B = F.pad(B, (0, (past - 1) * n_u))
     A, B = as_tensor("A", A), as_tensor("B", B)
-    if A.shape[-1:] != (n_x,) or B.shape[-1:] != (n_u,):
+    E = A.new_zeros(n_x, n_d) if E is None else as_tensor("E", E)
+    if A.shape[-1:] != (past * n_x,) or B.shape[-1:] != (past * n_u,):
         got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
-        raise QPError.expected("A, B", got, f"({n_x}, {n_x}) and ({n_x}, {n_u})")
-    return A, B
+        want = f"({n_x}, {past * n_x}) and ({n_x}, {past * n_u})"
+        remedy = None if past == 1 else f"[A_1, .., A_L] and [B_1, .., B_L] for past={past}."
+        raise QPError.expected("A, B", got, want, *([remedy] if remedy else []))
+    if E.shape[-2:] != (n_x, n_d):
+        remedy = "It multiplies the preview d_k, of n_d entries."
+        raise QPError.expected("E", f"shape {tuple(E.shape)}", f"({n_x}, {n_d})", remedy)
+    return A, B, E
 
 
 def _riccati_weight(
     A: Tensor, B: Tensor, stage_weight: Any, gamma: float, layout: Layout
 ) -> Tensor:
+    if layout.past > 1:
+        remedy = "Pass a matrix: its cost to go is one of the whole window."
+        raise QPError.expected("terminal_weight", f"{RICCATI!r} with past > 1", "past=1", remedy)
     W = as_tensor("stage_weight", stage_weight)
     W = torch.diag(W) if W.shape == (layout.n,) else W
+    if W.shape == (layout.n_d + layout.n,) * 2:
+        W = W[layout.n_d :, layout.n_d :]
     sizes = {"A": (A, layout.n_x, layout.n_x), "B": (B, layout.n_x, layout.n_u)}
     for name, (matrix, *shape) in (sizes | {"stage_weight": (W, layout.n, layout.n)}).items():
         if list(matrix.shape) != shape:
@@ -169,8 +217,18 @@ def _linear_rows(name: str, rows: tuple[Any, Any, Any] | None, width: int) -> tu
         raise QPError.expected(name, repr(rows), "the triple (D, lower, upper)") from error
     matrix = as_tensor(name, matrix)
     if matrix.ndim != 2 or matrix.shape[1] != width:
-        raise QPError.expected(name, f"D of shape {tuple(matrix.shape)}", f"shape (n_d, {width})")
+        raise QPError.expected(name, f"D of shape {tuple(matrix.shape)}", f"shape (m, {width})")
     return matrix, *bound_pair(f"{name}, bounds", (lower, upper), len(matrix))
+
+
+def _rates(bounds: tuple[Any, Any] | None, n_u: int, past: int) -> tuple[Tensor, Tensor]:
+    """Return the bounds of u_k - u_{k-1}; empty for None."""
+    if bounds is None:
+        return torch.zeros(0), torch.zeros(0)
+    if past == 1:
+        remedy = "The window then holds u_{-1}; torch_qpmpc.envs.PastWindow makes it."
+        raise QPError.expected("rate_bounds", "bounds with past=1", "past >= 2", remedy)
+    return bound_pair("rate_bounds", bounds, n_u)
 
 
 def _bounds(
@@ -179,19 +237,21 @@ def _bounds(
     action_bounds: tuple[Any, Any] | None,
     D: tuple[Tensor, ...],
     D_f: tuple[Tensor, ...],
+    rates: tuple[Tensor, Tensor],
 ) -> dict[str, Tensor]:
     """Return lb and ub ``(n_g,)`` by name."""
     x = bound_pair("state_bounds", state_bounds, layout.n_x)
     u = bound_pair("action_bounds", action_bounds, layout.n_u)
-    lower, upper = (layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], strict=True))
+    lower, upper = (layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], rates, strict=True))
     return {"lb": lower, "ub": upper}
 
 
-def _slack_weights(layout: Layout, state: Any, action: Any, constraint: Any) -> Tensor:
+def _slack_weights(layout: Layout, state: Any, action: Any, constraint: Any, rate: Any) -> Tensor:
     """Return w ``(n_g,)``, inf on hard rows."""
     return layout.rows(
         slack_weight("state_slack", state, layout.n_x),
         slack_weight("action_slack", action, layout.n_u),
-        slack_weight("constraint_slack", constraint).expand(layout.n_d),
-        slack_weight("constraint_slack", constraint).expand(layout.n_d_f),
+        slack_weight("constraint_slack", constraint).expand(layout.n_mixed),
+        slack_weight("constraint_slack", constraint).expand(layout.n_terminal),
+        slack_weight("rate_slack", rate, layout.n_u)[: layout.n_rates],
     )

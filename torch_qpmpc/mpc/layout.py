@@ -1,7 +1,13 @@
-"""The order of the stages in z and in the rows of G, their ties, and the discounted cost (eq:qpH).
+"""The order of z and of the rows of G, their ties, and the discounted cost (eq:qpH).
 
-The rows of G are one for each entry of z, then those of D on (x_k, u_k) for each stage, then those
-of D^f on x_N (eq:v1c4).
+What is known comes first in z, then the plan:
+
+    z = [d_0, .., d_N,  y_{1-L}, u_{1-L}, .., y_{-1}, u_{-1}, y_0,  u_0, y_1, u_1, .., y_N]
+         preview        past window, up to the current output       plan
+
+With L = 1 and no preview it is the paper's z, whose states y_k are x_k. The rows of G are one for
+each entry of [x_0, u_0, .., x_N], then those of D on (d_k, x_k, u_k) for each stage, then those of
+D^f on (d_N, x_N) (eq:v1c4), then one for each entry of the changes u_k - u_{k-1}.
 """
 
 from __future__ import annotations
@@ -10,89 +16,200 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The sizes N, n_x and n_u, and the numbers of rows of D and D^f."""
+    """The sizes of z and of G.
+
+    Attributes:
+        n_x, n_u, horizon: the numbers of states (or measured outputs) and actions, and N.
+        past: L, the length of the window of the past.
+        n_d: entries of a stage's preview d_k.
+        n_mixed, n_terminal: rows of D and of D^f.
+        n_rates: entries of u_k - u_{k-1} that have bounds, n_u or 0.
+    """
 
     n_x: int
     n_u: int
     horizon: int
+    past: int = 1
     n_d: int = 0
-    n_d_f: int = 0
+    n_mixed: int = 0
+    n_terminal: int = 0
+    n_rates: int = 0
 
     @property
     def n(self) -> int:
-        """Entries of a stage, n_x + n_u."""
+        """Entries of a stage of the plan, n_x + n_u."""
         return self.n_x + self.n_u
 
     @property
+    def n_preview(self) -> int:
+        """Entries of all previews, (N + 1) n_d."""
+        return (self.horizon + 1) * self.n_d
+
+    @property
+    def n_before(self) -> int:
+        """Entries of z before x_0."""
+        return self.n_preview + (self.past - 1) * self.n
+
+    @property
+    def n_p(self) -> int:
+        """Entries of z that V fixes: all up to x_0."""
+        return self.n_before + self.n_x
+
+    @property
     def n_z(self) -> int:
-        """Entries of z, N (n_x + n_u) + n_x."""
-        return self.horizon * self.n + self.n_x
+        """Entries of z."""
+        return self.n_before + self.horizon * self.n + self.n_x
 
     @property
     def n_linear(self) -> int:
-        """Rows of G other than bounds."""
-        return self.horizon * self.n_d + self.n_d_f
+        """Rows of D and D^f in G."""
+        return self.horizon * self.n_mixed + self.n_terminal
 
-    def entries(self, x: Tensor, u: Tensor) -> Tensor:
-        """Arrange x ``(N + 1, n_x)`` and u ``(N + 1, n_u)`` as z ``(n_z,)``, without u_N."""
+    @property
+    def reach(self) -> int:
+        """Entries of the window (y_{k+1-L}, u_{k+1-L}, .., y_k, u_k) that y_{k+1} depends on."""
+        return self.past * self.n
+
+    def stages(self, x: Tensor, u: Tensor) -> Tensor:
+        """Arrange x ``(N + 1, n_x)`` and u ``(N + 1, n_u)`` as [x_0, u_0, .., x_N], without u_N."""
         x, u = (part.expand(self.horizon + 1, -1) for part in (x, u))
-        return torch.cat((x, u), dim=-1).flatten()[: self.n_z]
+        return torch.cat((x, u), dim=-1).flatten()[: self.n_z - self.n_before]
 
-    def rows(self, x: Tensor, u: Tensor, d: Tensor, d_f: Tensor) -> Tensor:
-        """Arrange values of x, u, D ``(N, n_d)`` and D^f ``(n_d_f,)`` as rows of G ``(n_g,)``."""
-        return torch.cat((self.entries(x, u), d.expand(self.horizon, -1).flatten(), d_f))
+    def rows(self, x: Tensor, u: Tensor, D: Tensor, D_f: Tensor, rates: Tensor) -> Tensor:
+        """Arrange values of the rows of G ``(n_g,)``.
+
+        They are those of x, u, D ``(N, n_mixed)``, D^f ``(n_terminal,)`` and u_k - u_{k-1}
+        ``(N, n_rates)``; a leading N + 1 or N may be 1, for the same values in all stages.
+        """
+        D, rates = (part.expand(self.horizon, -1).flatten() for part in (D, rates))
+        return torch.cat((self.stages(x, u), D, D_f, rates))
 
     def discounts(self, gamma: float) -> tuple[Tensor, Tensor]:
-        """Return gamma^k for the entries of z ``(n_z,)`` and for the rows of G ``(n_g,)``."""
+        """Return gamma^k for the entries of z ``(n_z,)`` and for the rows of G ``(n_g,)``.
+
+        It is one for the past.
+        """
         powers = gamma ** torch.arange(self.horizon + 1, dtype=torch.float64).unsqueeze(-1)
-        x, u = powers.expand(-1, self.n_x), powers.expand(-1, self.n_u)
-        d, d_f = powers[:-1].expand(-1, self.n_d), powers[-1].expand(self.n_d_f)
-        return self.entries(x, u), self.rows(x, u, d, d_f)
+        sizes = (self.n_d, self.n_x, self.n_u, self.n_mixed, self.n_terminal, self.n_rates)
+        d, x, u, D, D_f, rates = (powers.expand(-1, size) for size in sizes)
+        past = powers.new_ones(self.n_before - self.n_preview)
+        z = torch.cat((d.flatten(), past, self.stages(x, u)))
+        return z, self.rows(x, u, D[:-1], D_f[-1], rates[:-1])
 
     def ties(self, part: str) -> Tensor:
         """Return the index of the value of each entry of a tied q, b, lb, ub or w.
 
-        x_N has values of its own in q and w, as w^f in eq:v1c0, but not in lb and ub.
+        x_N has values of its own in q and w, as w^f in eq:v1c0, but not in lb and ub; d_N has them
+        in q.
         """
         n_x, n = self.n_x, self.n
         x, u = torch.arange(n_x), torch.arange(n_x, n)
         if part == "b":
             return x.repeat(self.horizon)
-        if part in ("q", "w"):
-            x, n = torch.stack((*[x] * self.horizon, n + x)), n + n_x
         if part == "q":
-            return self.entries(x, u)
-        d, d_f = torch.arange(self.n_d), torch.arange(self.n_d_f)
-        return self.rows(x, u, n + d, n + self.n_d + d_f)
+            d, first = torch.arange(self.n_d), n + n_x
+            past = torch.arange(self.n_before - self.n_preview) + first + 2 * self.n_d
+            d = torch.cat(((first + d).repeat(self.horizon), first + self.n_d + d))
+            return torch.cat((d, past, self.tied_stages()))
+        if part == "w":
+            x, n = torch.stack((*[x] * self.horizon, n + x)), n + n_x
+        D, D_f, rates = (torch.arange(i) for i in (self.n_mixed, self.n_terminal, self.n_rates))
+        D_f, rates = self.n_mixed + D_f, self.n_mixed + self.n_terminal + rates
+        return self.rows(x, u, n + D, n + D_f, n + rates)
+
+    def tied_stages(self) -> Tensor:
+        """Return the index of the value of each entry of [x_0, .., x_N] if x_N has its own."""
+        x, u = torch.arange(self.n_x), torch.arange(self.n_x, self.n)
+        return self.stages(torch.stack((*[x] * self.horizon, self.n + x)), u)
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
-        stages = z[..., : self.horizon * self.n].unflatten(-1, (self.horizon, self.n))
-        terminal = z[..., None, self.horizon * self.n :]
+        plan, terminal = z[..., self.n_before : -self.n_x], z[..., None, -self.n_x :]
+        stages = plan.unflatten(-1, (self.horizon, self.n))
         return torch.cat((stages[..., : self.n_x], terminal), -2), stages[..., self.n_x :]
+
+    def from_stage(self, blocks: Tensor) -> Tensor:
+        """Return rows ``(N i, n_z)`` with ``(N, i, n_d + n)`` at the columns of d_k, x_k, u_k."""
+        d, plan = (torch.block_diag(*x) for x in blocks.split((self.n_d, self.n), dim=-1))
+        d = F.pad(d, (0, self.n_before - d.shape[-1]))
+        return torch.cat((d, F.pad(plan, (0, self.n_x))), dim=-1)
+
+    def from_terminal(self, block: Tensor) -> Tensor:
+        """Return rows ``(i, n_z)`` with ``(i, n_d + n_x)`` at the columns of d_N and x_N."""
+        d, x = block.split((self.n_d, self.n_x), dim=-1)
+        d = F.pad(d, (self.n_preview - self.n_d, self.n_z - self.n_preview - self.n_x))
+        return torch.cat((d, x), dim=-1)
+
+    def stage_blocks(self, rows: Tensor) -> Tensor:
+        """Return the entries of rows ``(N i, n_z)`` at d_k, x_k, u_k, ``(N, i, n_d + n)``."""
+        d = _diagonal_blocks(rows, self.horizon, 0, self.n_d, self.n_d)
+        plan = _diagonal_blocks(rows, self.horizon, self.n_before, self.n, self.n)
+        return torch.cat((d, plan), dim=-1)
+
+    def terminal_block(self, rows: Tensor) -> Tensor:
+        """Return the entries of rows ``(i, n_z)`` at d_N and x_N, ``(i, n_d + n_x)``."""
+        d = rows[:, self.n_preview - self.n_d : self.n_preview]
+        return torch.cat((d, rows[:, self.n_z - self.n_x :]), dim=-1)
+
+    def model_blocks(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what row block k of C has at its window and at d_k, with a leading N."""
+        window = _diagonal_blocks(rows, self.horizon, self.n_preview, self.reach, self.n)
+        return window, _diagonal_blocks(rows, self.horizon, 0, self.n_d, self.n_d)
+
+    def rate_rows(self) -> Tensor:
+        """Return the rows of G for u_k - u_{k-1}, ``(N n_rates, n_z)``."""
+        unit = torch.eye(self.n_z, dtype=torch.float64)
+        actions = unit[self.n_before - self.n : self.n_z - self.n_x].unflatten(0, (-1, self.n))
+        actions = actions[:, self.n_x :]
+        return (actions[1:] - actions[:-1]).flatten(0, 1)
 
     def hessian(
         self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor, stages: Tensor
     ) -> Tensor:
         """Return H ``(n_z, n_z)`` (eq:qpH) from those of the stages and of x_N, or from a full H.
 
-        ``stages`` is ``ties("q")``, for a diagonal H that all stages share.
+        The blocks of a block-diagonal H are those of (d_k, x_k, u_k) and (d_N, x_N); a diagonal H
+        has entries for the plan only. ``stages`` is `tied_stages`, for a diagonal H that all
+        stages share.
         """
         H = blocks[0]
         if kind == "diagonal":
             entries = torch.cat((H.flatten(), blocks[1]))
             if H.ndim == 1:  # faster than expand
                 entries = entries.index_select(0, stages)
-            return torch.diag_embed(discount * entries)
+            return torch.diag_embed(discount * F.pad(entries, (self.n_before, 0)))
         if kind == "block":
-            H = torch.block_diag(*H.expand(self.horizon, self.n, self.n), blocks[1])
+            H = self.block_hessian(H, blocks[1])
         root = discount.sqrt()
         return root.unsqueeze(-1) * H * root
+
+    def block_hessian(self, stage: Tensor, terminal: Tensor) -> Tensor:
+        """Return H ``(n_z, n_z)`` without discounts from blocks of (d_k, x_k, u_k), (d_N, x_N)."""
+        n_d, size = self.n_d, self.n_d + self.n
+        blocks = (*stage.expand(self.horizon, size, size), terminal)
+        plan = torch.block_diag(*(block[n_d:, n_d:] for block in blocks))
+        if not n_d:
+            return F.pad(plan, (self.n_before, 0, self.n_before, 0))
+        preview = torch.block_diag(*(block[:n_d, :n_d] for block in blocks))
+        cross = torch.block_diag(*(block[:n_d, n_d:] for block in blocks))
+        past = self.n_before - self.n_preview
+        upper = torch.cat((F.pad(preview, (0, past)), cross), dim=-1)
+        lower = F.pad(torch.cat((cross.mT, F.pad(plan, (past, 0))), dim=-1), (0, 0, past, 0))
+        return torch.cat((upper, lower))
+
+
+def _diagonal_blocks(rows: Tensor, count: int, first: int, width: int, step: int) -> Tensor:
+    """Return of each of ``count`` blocks of rows the columns ``first + k step + [0, width)``."""
+    start = first + step * torch.arange(count, device=rows.device)
+    columns = (start.unsqueeze(-1) + torch.arange(width, device=rows.device)).unsqueeze(1)
+    blocks = rows.unflatten(0, (count, len(rows) // count))
+    return blocks.gather(-1, columns.expand(-1, blocks.shape[1], -1))
 
 
 class Discounts(NamedTuple):
@@ -100,7 +217,7 @@ class Discounts(NamedTuple):
 
     ``z`` ``(n_z,)`` and ``rows`` ``(n_g,)`` are gamma^k, or one. ``hardness`` ``(n_g,)`` is added
     to w: inf for a hard row, whose w is a placeholder, and zero otherwise. ``stages`` is
-    ``ties("q")`` of `Layout`.
+    `Layout.tied_stages`.
     """
 
     z: Tensor

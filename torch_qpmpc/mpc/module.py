@@ -17,6 +17,7 @@ from torch.nn.utils import parametrize
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc import initial, parameters, pickling
+from torch_qpmpc.mpc.identification import identify
 from torch_qpmpc.mpc.identity import check_identity, digest, encoded
 from torch_qpmpc.mpc.layout import Discounts, discounted
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
@@ -38,7 +39,8 @@ from torch_qpmpc.qp.solve import solve
 from torch_qpmpc.qp.solvers import backend
 
 #: Attributes that only the constructor and `QPMPC.release` set.
-FIXED = ("n_x", "n_u", "n_z", "horizon", "gamma", "hessian", "structure", "step", "learned")
+FIXED = ("n_x", "n_u", "horizon", "past", "n_d", "n_p", "n_z", "gamma")
+FIXED = (*FIXED, "hessian", "structure", "step", "learned")
 
 
 class QPMPC(nn.Module):
@@ -48,21 +50,36 @@ class QPMPC(nn.Module):
     terminal block H_f, q_f for x_N, discounted by gamma^N. Parameters and buffers are float64,
     inputs of any float dtype; outputs have the dtype of the input.
 
+    More than x_0 may be known: the past and, ahead of time, signals such as prices, forecasts and
+    references. With the *window* of the last L outputs and L - 1 actions between them (``past=L``)
+    and the *preview* d_0, .., d_N (``n_d`` entries each), z has two more parts,
+
+        z = [d_0, .., d_N,  x_{1-L}, u_{1-L}, .., x_{-1}, u_{-1}, x_0,  u_0, x_1, .., x_N],
+
+    V fixes its first n_p entries p, up to x_0, and Q fixes p and u_0. All s below are p; the x_k
+    are the measured outputs, which need not be a state.
+
     Args:
-        n_x: number of states.
+        n_x: number of states, or of measured outputs.
         n_u: number of actions.
         horizon: N, at least 1.
+        past: L, at least 1.
+        n_d: entries of d_k.
         gamma: discount of the stage costs, 0 < gamma <= 1.
         A, B: the initial model in C, ``(n_x, n_x)`` and ``(n_x, n_u)``, or one per stage,
             ``(N, n_x, n_x)`` and ``(N, n_x, n_u)``. By default, A is the identity plus, and B is,
-            random normal entries with standard deviation 0.1.
+            random normal entries with standard deviation 0.1. With a window they are
+            ``[A_1, .., A_L]`` and ``[B_1, .., B_L]``, side by side, the newest first.
+        E: the factor of d_k in x_{k+1}, ``(n_x, n_d)`` or one per stage; zero by default.
         offset: the offset of the model x+ = A x + B u + offset, ``(n_x,)``, which gives the initial
             b; zero by default.
         state_bounds, action_bounds: pairs (lower, upper) of ``(n_x,)`` and of ``(n_u,)``; unbounded
             by default.
         constraints: mixed constraints of each stage, ``lower <= D [x_k; u_k] <= upper`` (eq:v1c4),
-            as the triple (D, lower, upper) of ``(n_d, n_x + n_u)`` and ``(n_d,)`` twice.
-        terminal_constraints: the same for x_N, with D^f ``(n_d_f, n_x)``.
+            as the triple (D, lower, upper) of ``(m, n_x + n_u)`` and ``(m,)`` twice. With a preview
+            D multiplies [d_k; x_k; u_k]: bounds that change with time are entries of d_k.
+        terminal_constraints: the same for x_N, with D^f ``(m_f, n_x)``, or for [d_N; x_N].
+        rate_bounds: a pair (lower, upper) of ``(n_u,)`` for u_k - u_{k-1}; needs past >= 2.
         structure: the ties between learned parts of theta. ``"free"``: none, C is any matrix
             (eq:qp5). ``"tied"``: those of a linear MPC scheme (eq:q1), with one A, B, D and one
             entry of b, q, lb, ub and w for all stages; ``"varying"``: with one for each stage.
@@ -72,14 +89,16 @@ class QPMPC(nn.Module):
             ``(n_x + n_u, n_x + n_u)``, with an optional leading N for one weight per stage; by
             default diagonal, random uniform in (0.5, 5) for states and zero for actions. The cost
             of a stage is *half* of ``[x_k; u_k]' H_k [x_k; u_k]`` (eq:qpH): for a plant's cost
-            ``s'Ws``, pass 2 W.
+            ``s'Ws``, pass 2 W. With a preview and a dense H it may be one of [d_k; x_k; u_k], of
+            which only the block of (x_k, u_k) must be positive semidefinite: a price p times u_k
+            is an entry 1 in both of their cross blocks.
         terminal_weight: the initial H_f, ``(n_x,)`` or ``(n_x, n_x)``; the identity by default.
             ``"riccati"``: the cost to go of the linear quadratic regulator of A, B and the stage
             weight; not for a diagonal hessian.
-        state_slack, action_slack, constraint_slack: the slack weights w of the rows of states, of
-            actions, and of mixed and terminal constraints; ``inf`` makes them hard. By default,
-            actions are hard and the others soft. Pass one weight, or for states and actions one
-            per entry.
+        state_slack, action_slack, constraint_slack, rate_slack: the slack weights w of the rows of
+            states, of actions, of mixed and terminal constraints, and of rates; ``inf`` makes them
+            hard. By default, actions and rates are hard and the others soft. Pass one weight or,
+            except for constraints, one per entry.
         discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
         learn: the parameters among H, H_f, q, c, C, b, G, lb, ub, w; the others are buffers. In a
             mapping, ``{"H": True, "C": mask}``, a mask of the part's shape is True at the entries
@@ -89,10 +108,13 @@ class QPMPC(nn.Module):
             itself, which `project_` corrects after each step, by eigenvalues or by a semidefinite
             program; see `torch_qpmpc.mpc.projections`.
         solver, on_failure: see `solve_qp`.
+        start: initial values of some of q, c, C and b by name, without discounts, in place of those
+            that follow from the other arguments.
         seed: the seed of random initial values.
 
     Attributes:
-        C_0: the initial banded C, ``(N n_x, n_z)``.
+        C_0: the banded C of the initial model, ``(N n_x, n_z)``.
+        n_p: the number of entries of p, (N + 1) n_d + (L - 1) (n_x + n_u) + n_x.
 
     Raises:
         QPError: an argument is invalid.
@@ -134,15 +156,19 @@ class QPMPC(nn.Module):
         n_x: int,
         n_u: int,
         horizon: int,
+        past: int = 1,
+        n_d: int = 0,
         *,
         gamma: float = 0.9,
         A: Any = None,
         B: Any = None,
+        E: Any = None,
         offset: Any = None,
         state_bounds: tuple[Any, Any] | None = None,
         action_bounds: tuple[Any, Any] | None = None,
         constraints: tuple[Any, Any, Any] | None = None,
         terminal_constraints: tuple[Any, Any, Any] | None = None,
+        rate_bounds: tuple[Any, Any] | None = None,
         structure: str = "free",
         hessian: str = "diagonal",
         stage_weight: Any = None,
@@ -150,11 +176,13 @@ class QPMPC(nn.Module):
         state_slack: Any = 100.0,
         action_slack: Any = torch.inf,
         constraint_slack: float = 100.0,
+        rate_slack: Any = torch.inf,
         discount_slack: bool = False,
         learn: Collection[str] = ("H", "c", "C"),
         step: str = CHOLESKY,
         solver: str = "proxqp",
         on_failure: str = "raise",
+        start: Mapping[str, Any] | None = None,
         seed: int = 0,
     ) -> None:
         passed = {name: x for name, x in locals().items() if name not in ("self", "__class__")}
@@ -162,7 +190,8 @@ class QPMPC(nn.Module):
         arguments = {name: own(value) for name, value in passed.items()}
         super().__init__()
         check_structure(**arguments)
-        arguments |= {name: int(arguments[name]) for name in ("n_x", "n_u", "horizon", "seed")}
+        whole = ("n_x", "n_u", "horizon", "past", "n_d", "seed")
+        arguments |= {name: int(arguments[name]) for name in whole}
         self._arguments = arguments
         backend(solver)
         with torch.device("cpu"):
@@ -174,7 +203,8 @@ class QPMPC(nn.Module):
         arguments = self._arguments
         self._layout, theta = initial.theta(**arguments)
         self.n_x, self.n_u, self.horizon = (arguments[name] for name in ("n_x", "n_u", "horizon"))
-        self.n_z, self.gamma = self._layout.n_z, arguments["gamma"]
+        self.past, self.n_d, self.gamma = (arguments[name] for name in ("past", "n_d", "gamma"))
+        self.n_p, self.n_z = self._layout.n_p, self._layout.n_z
         self.hessian, self.structure = arguments["hessian"], arguments["structure"]
         self.step = arguments["step"]
         self.solver, self.on_failure = arguments["solver"], arguments["on_failure"]
@@ -184,6 +214,7 @@ class QPMPC(nn.Module):
         self.register_buffer("soft", theta["w"].isfinite())
         self._hard_rows = digest(theta["w"].isinf())
         self._derive()
+        theta |= initial.started(theta, **arguments)
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
         for name, start in theta.items():
@@ -196,15 +227,67 @@ class QPMPC(nn.Module):
         """Return a QPMPC whose C starts as the banded C_0 of the model x+ = A x + B u (eq:cband).
 
         Args:
-            A, B: see `QPMPC`; their shapes give n_x and n_u.
+            A, B: see `QPMPC`; their shapes give n_x, n_u and past.
             horizon: N.
-            options: the keyword arguments of `QPMPC`.
+            options: the keyword arguments of `QPMPC`; the shape of E gives n_d.
 
         Raises:
             QPError: an argument is invalid.
         """
         A, B = check_model(A, B)
-        return cls(A.shape[-1], B.shape[-1], horizon, A=A, B=B, **options)
+        n_x, n_u, past = initial.model_sizes(A, B)
+        if (E := options.get("E")) is not None:
+            options.setdefault("n_d", torch.as_tensor(E).shape[-1])
+        return cls(n_x, n_u, horizon, **{"past": past, "A": A, "B": B} | options)
+
+    @classmethod
+    def from_data(
+        cls,
+        trajectories: Any,
+        horizon: int,
+        *,
+        past: int = 1,
+        n_d: int = 0,
+        n_x: int | None = None,
+        structure: str = "free",
+        causal: bool = True,
+        ridge: float | None = None,
+        **options: Any,
+    ) -> QPMPC:
+        """Return a QPMPC whose C and b start from least squares on logged trajectories.
+
+        C_0 is the banded matrix of an ARX model; `identify` returns it with its prediction errors.
+
+        Args:
+            trajectories, horizon, past, n_d, n_x, structure, causal, ridge: see `identify`.
+            options: the keyword arguments of `QPMPC`, such as cost and bounds.
+
+        Raises:
+            QPError: as in `identify` and `QPMPC`.
+
+        Example:
+            >>> import torch, torch_qpmpc as qm
+            >>> env = qm.envs.PointMassEnv(num_envs=4, max_steps=50, seed=0)
+            >>> log = env.rollout(50)  # random actions
+            >>> mpc = qm.QPMPC.from_data(
+            ...     log, 10, structure="tied", action_bounds=([-1] * 2, [1] * 2)
+            ... )
+            >>> tuple(mpc.model()[0].shape)
+            (4, 4)
+        """
+        found = identify(
+            trajectories,
+            horizon,
+            past=past,
+            n_d=n_d,
+            n_x=n_x,
+            structure=structure,
+            causal=causal,
+            ridge=ridge,
+        )
+        arguments: dict[str, Any] = {**found.arguments, **options}
+        start = {**found.arguments.get("start", {}), **(options.get("start") or {})}
+        return cls(**{**arguments, "start": start})
 
     @classmethod
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
@@ -230,7 +313,7 @@ class QPMPC(nn.Module):
         return cls.from_model(A, B, horizon, **(initial.linear_mpc(A, B, **options) | options))
 
     def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
-        """Return V(s) (eq:qp4), a cost to go: s ``(*batch, n_x)`` to ``(*batch,)``.
+        """Return V(s) (eq:qp4), a cost to go: s ``(*batch, n_p)`` to ``(*batch,)``.
 
         ``qp`` is the `quadratic_program` of the current theta, if it is available. Errors are as in
         `solve`.
@@ -238,14 +321,14 @@ class QPMPC(nn.Module):
         return self._value(self._checked(s), qp)
 
     def action_value(self, s: Tensor, a: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
-        """Return Q(s, a) (eq:qp5), a cost to go, from ``(*batch, n_x)`` and ``(*batch, n_u)``.
+        """Return Q(s, a) (eq:qp5), a cost to go, from ``(*batch, n_p)`` and ``(*batch, n_u)``.
 
         ``qp`` and errors are as in `value`.
         """
         return self._value(self._checked(s, a), qp)
 
     def policy(self, s: Tensor, warm_start: QPSolution | Tensor | None = None) -> Tensor:
-        """Return pi(s), the u_0 of V's solution: s ``(*batch, n_x)`` to ``(*batch, n_u)``.
+        """Return pi(s), the u_0 of V's solution: s ``(*batch, n_p)`` to ``(*batch, n_u)``.
 
         ``warm_start`` and errors are as in `solve`.
         """
@@ -265,7 +348,7 @@ class QPMPC(nn.Module):
         """Return the solution of V's QP, or of Q's for an action, in theta's dtype.
 
         Args:
-            s: states ``(*batch, n_x)``.
+            s: states ``(*batch, n_x)`` or, with more known, p ``(*batch, n_p)``.
             a: actions ``(*batch, n_u)``.
             warm_start: see `solve_qp`.
             qp: the `quadratic_program` of the current theta, if it is available.
@@ -302,8 +385,10 @@ class QPMPC(nn.Module):
         """
         return self._layout.predicted(check_tensor("z", z, self.n_z))
 
-    def model(self) -> tuple[Tensor, Tensor]:
-        """Return A and B, ``(n_x, n_x)`` and ``(n_x, n_u)``, with a leading N if they vary.
+    def model(self) -> tuple[Tensor, ...]:
+        """Return A and B, ``(n_x, L n_x)`` and ``(n_x, L n_u)``, with a leading N if they vary.
+
+        With a preview, E ``(n_x, n_d)`` is the third.
 
         Raises:
             QPError: C is free, and need not contain a model.
@@ -313,7 +398,7 @@ class QPMPC(nn.Module):
         return Banded(self._layout, self.structure == "tied").right_inverse(self.C)
 
     def readable(self) -> dict[str, Tensor]:
-        """Return the learned parts, detached: A, B and D for C and G, and shared values once."""
+        """Return the learned parts, detached: A, B, E and D for C and G, shared values once."""
         return parameters.readable(self, self.learned)
 
     def release(self, structure: str = "free") -> None:
@@ -357,8 +442,9 @@ class QPMPC(nn.Module):
         """
         for name, leaf in self._projected().items():
             dense = self.hessian != "diagonal" and name != "w"
-            matrices = leaf if dense else leaf[..., None, None]
-            leaf.copy_(NEAREST[self.step](matrices).view_as(leaf))
+            n_free = self._layout.n_before if self.hessian == "full" else self.n_d
+            of_plan = leaf[..., n_free:, n_free:] if dense else leaf[..., None, None]
+            of_plan.copy_(NEAREST[self.step](of_plan))
 
     def quadratic_program(self) -> QuadraticProgram:
         """Return the current theta as a QuadraticProgram, with discounts (eq:qpH)."""
@@ -410,9 +496,11 @@ class QPMPC(nn.Module):
             getattr(self.get_submodule(owner), leaf).data.copy_(start.detach())
 
     def extra_repr(self) -> str:
+        prefix = f"past={self.past}, n_d={self.n_d}, " if self.n_p > self.n_x else ""
         return (
-            f"n_x={self.n_x}, n_u={self.n_u}, horizon={self.horizon}, hessian={self.hessian!r}, "
-            f"structure={self.structure!r}, learned={self.learned}, solver={self.solver!r}"
+            f"n_x={self.n_x}, n_u={self.n_u}, horizon={self.horizon}, "
+            f"{prefix}hessian={self.hessian!r}, structure={self.structure!r}, "
+            f"learned={self.learned}, solver={self.solver!r}"
         )
 
     def __reduce_ex__(self, protocol: Any) -> tuple:
@@ -438,12 +526,14 @@ class QPMPC(nn.Module):
 
     def _identity(self) -> dict[str, Any]:
         """Return all that values depend on besides parameters and buffers, by argument."""
-        names = ("n_x", "n_u", "horizon", "gamma", "structure", "hessian", "step", "discount_slack")
+        names = ("n_x", "n_u", "horizon", "past", "n_d", "gamma", "structure", "hessian", "step")
+        names = (*names, "discount_slack")
         masks = {name: digest(mask) for name, mask in self._masks.items()}
         return {
             **{name: self._arguments[name] for name in names} | {"gamma": float(self.gamma)},
-            "constraints": self._layout.n_d,
-            "terminal_constraints": self._layout.n_d_f,
+            "constraints": self._layout.n_mixed,
+            "terminal_constraints": self._layout.n_terminal,
+            "rate_bounds": self._layout.n_rates,
             "learn": {name: masks.get(name, True) for name in self.learned},
             "hard rows": self._hard_rows,
         }
@@ -471,7 +561,7 @@ class QPMPC(nn.Module):
         derived = {"discount": discount, "slack_discount": weights, "hardness": hardness}
         for name, buffer in derived.items():
             self.register_buffer(name, buffer.to(self.C_0), persistent=False)
-        stages = self._layout.ties("q").to(self.C_0.device)
+        stages = self._layout.tied_stages().to(self.C_0.device)
         self.register_buffer("stages", stages, persistent=False)
         for part in self.modules():
             if isinstance(part, Masked | Tied):
@@ -480,8 +570,8 @@ class QPMPC(nn.Module):
     def _checked(self, s: Tensor, a: Tensor | None = None) -> Tensor:
         """Return the fixed entries of z: s, or s and a side by side."""
         if a is None:
-            return check_tensor("s", s, self.n_x, device=self.C_0.device)
-        return check_pair(s, a, self.n_x, self.n_u, self.C_0.device)
+            return check_tensor("s", s, self.n_p, device=self.C_0.device)
+        return check_pair(s, a, self.n_p, self.n_u, self.C_0.device)
 
     def _current_qp(self, qp: QuadraticProgram | None) -> QuadraticProgram:
         if qp is None:
@@ -499,13 +589,13 @@ class QPMPC(nn.Module):
         warm_start: QPSolution | Tensor | None = None,
     ) -> QPSolution:
         qp = self._current_qp(qp)
-        n_kept = self.n_x + self.n_u  # V, Q and the policy share one elimination
+        n_kept = self.n_p + self.n_u  # V, Q and the policy share one elimination
         fixed = to_dtype(fixed, qp.C.dtype)
         return solve(qp, fixed, n_kept, self.solver, self.on_failure, warm_start)
 
     def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:
         """Return u_0 of a solution of V's QP."""
-        return to_dtype(solution.z[..., self.n_x : self.n_x + self.n_u], dtype)
+        return to_dtype(solution.z[..., self.n_p : self.n_p + self.n_u], dtype)
 
     def _cost(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return H, q and w of the QP."""

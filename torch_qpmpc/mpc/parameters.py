@@ -73,7 +73,7 @@ def matrix(module: nn.Module, name: str) -> tuple[nn.Parameter | None, Tensor | 
 
 
 def readable(module: nn.Module, learned: Collection[str]) -> dict[str, Tensor]:
-    """Return the learned parts, detached: A, B and D for C and G, and shared values once."""
+    """Return the learned parts, detached: A, B, E and D for C and G, and shared values once."""
     values = {}
     for part in learned:
         value = getattr(module, part).detach()
@@ -81,8 +81,8 @@ def readable(module: nn.Module, learned: Collection[str]) -> dict[str, Tensor]:
         if parametrize.is_parametrized(module, part):
             first = next(iter(module.get_submodule(f"parametrizations.{part}").children()))
         if isinstance(first, Banded | LinearRows):
-            names = ("A", "B") if part == "C" else ("D", "D_f")
-            values |= zip(names, first.right_inverse(value), strict=True)
+            names = ("A", "B", "E") if part == "C" else ("D", "D_f")
+            values |= dict(zip(names, first.right_inverse(value), strict=False))
         else:
             values[part] = value[first.first] if isinstance(first, Tied) else value
     return values

@@ -9,11 +9,10 @@ share their values.
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.banded import banded_matrix, model_of
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.projections import CHOLESKY
 
@@ -40,10 +39,11 @@ def parametrizations_for(
     if tied and name in ("q", "b", "lb", "ub", "w"):
         chain.append(Tied(name, layout.ties(name)))
     dense = hessian != "diagonal" and name != "w"
+    n_free = layout.n_before if hessian == "full" else layout.n_d
     if name in SIGNED and step == CHOLESKY:
-        chain.append(Cholesky() if dense else SquareRoot())
+        chain.append(Cholesky(n_free) if dense else SquareRoot())
     elif name in ("H", "H_f"):
-        chain.append(Symmetric() if dense else Support(value))
+        chain.append(Symmetric(n_free) if dense else Support(value))
     if mask is not None and not mask.all():
         _check_mask(name, mask, layout, chain)
         chain.append(Masked(mask, value))
@@ -88,38 +88,64 @@ class Support(nn.Module):
 
 
 class Symmetric(nn.Module):
-    """The symmetric part of matrices ``(*batch, n, n)``, whose gradient is symmetric, too."""
+    """The symmetric part of matrices ``(*batch, n, n)``, whose gradient is symmetric, too.
+
+    Its entries in the first ``n_free`` rows and columns are known variables' and have any sign.
+    """
+
+    def __init__(self, n_free: int = 0) -> None:
+        super().__init__()
+        self.n_free = n_free
 
     def forward(self, matrix: Tensor) -> Tensor:
         return (matrix + matrix.mT) / 2
 
     def right_inverse(self, value: Tensor) -> Tensor:
-        """Return ``value``; raise `QPError` if it is not positive semidefinite."""
-        _spectrum(value)
+        """Return ``value``; raise `QPError` if its other block is not positive semidefinite."""
+        _spectrum(value[..., self.n_free :, self.n_free :])
         return value
 
 
 class Cholesky(nn.Module):
-    """Positive semidefinite matrices ``H = L L'`` from lower triangular L, ``(*batch, n, n)``."""
+    """Positive semidefinite matrices ``H = L L'`` from lower triangular L, ``(*batch, n, n)``.
+
+    With ``n_free``, H is ``[[P, S'], [S, L L']]`` with a symmetric P ``(n_free, n_free)`` and an S
+    of any sign, those of known variables, from ``[[P, 0], [S, L]]``.
+    """
+
+    def __init__(self, n_free: int = 0) -> None:
+        super().__init__()
+        self.n_free = n_free
 
     def forward(self, factor: Tensor) -> Tensor:
-        lower = factor.tril()
-        return lower @ lower.mT
+        if not self.n_free:
+            lower = factor.tril()
+            return lower @ lower.mT
+        n = self.n_free
+        P, S, lower = factor[..., :n, :n], factor[..., n:, :n], factor[..., n:, n:].tril()
+        upper = torch.cat(((P + P.mT) / 2, S.mT), dim=-1)
+        return torch.cat((upper, torch.cat((S, lower @ lower.mT), dim=-1)), dim=-2)
 
     def right_inverse(self, value: Tensor) -> Tensor:
-        """Return a lower triangular factor of a possibly singular ``value``.
+        """Return a factor of a possibly singular ``value``.
 
-        It comes from a QR factorisation of the symmetric square root, since the usual Cholesky
+        L comes from a QR factorisation of the symmetric square root, since the usual Cholesky
         algorithm needs a positive definite matrix.
 
         Raises:
-            QPError: ``value`` is not positive semidefinite.
+            QPError: the block outside of the first ``n_free`` entries is not positive semidefinite.
         """
-        eigenvalues, vectors = _spectrum(value)
+        n = self.n_free
+        eigenvalues, vectors = _spectrum(value[..., n:, n:])
         root = vectors * eigenvalues.clamp(min=0).sqrt().unsqueeze(-2)
         upper = torch.linalg.qr(root.mT).R
         sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0)
-        return upper.mT * sign.unsqueeze(-2)
+        lower = upper.mT * sign.unsqueeze(-2)
+        if not n:
+            return lower
+        factor = value.clone()
+        factor[..., :n, n:], factor[..., n:, n:] = 0, lower
+        return factor
 
 
 class Masked(nn.Module):
@@ -148,21 +174,24 @@ class Masked(nn.Module):
 
 
 class Banded(nn.Module):
-    """C of a model (eq:cband) from A and B, with a leading N if they vary by stage."""
+    """C of a model (eq:cband) from A, B and, with a preview, E; see `banded_matrix`.
+
+    They have a leading N if they vary by stage.
+    """
 
     def __init__(self, layout: Layout, tied: bool) -> None:
         super().__init__()
         self.layout, self.tied = layout, tied
 
-    def forward(self, A: Tensor, B: Tensor) -> Tensor:
-        return banded_matrix(A, B, self.layout.horizon)
+    def forward(self, A: Tensor, B: Tensor, E: Tensor | None = None) -> Tensor:
+        return banded_matrix(A, B, self.layout.horizon, E)
 
-    def right_inverse(self, C: Tensor) -> tuple[Tensor, Tensor]:
+    def right_inverse(self, C: Tensor) -> tuple[Tensor, ...]:
         """Return the model in the band of C; raise `QPError` if C has other entries."""
-        n_x, blocks = self.layout.n_x, _stage_blocks(C, self.layout, self.tied)
-        A, B = blocks[..., :n_x].contiguous(), blocks[..., n_x:].contiguous()
-        _check_tied("C", C, self(A, B))
-        return A, B
+        parts = model_of(C, self.layout)
+        model = tuple((part[0] if self.tied else part).contiguous() for part in parts)
+        _check_tied("C", C, self(*model))
+        return model
 
 
 class Tied(nn.Module):
@@ -193,9 +222,10 @@ class Tied(nn.Module):
 
 
 class LinearRows(nn.Module):
-    """G of mixed constraints (eq:v1c4): the identity, D for each stage, and D^f for x_N.
+    """G of mixed constraints (eq:v1c4): the plan, D for each stage, D^f for x_N, and rates.
 
-    D is ``(n_d, n_x + n_u)``, or ``(N, n_d, n_x + n_u)`` if it varies by stage.
+    D is ``(n_mixed, n_d + n_x + n_u)``, with a leading N if it varies by stage, and D^f
+    ``(n_terminal, n_d + n_x)``.
     """
 
     def __init__(self, layout: Layout, tied: bool) -> None:
@@ -203,17 +233,19 @@ class LinearRows(nn.Module):
         self.layout, self.tied = layout, tied
 
     def forward(self, D: Tensor, D_f: Tensor) -> Tensor:
-        n_x, n_z = self.layout.n_x, self.layout.n_z
-        stages = torch.block_diag(*D.expand(self.layout.horizon, -1, self.layout.n))
-        unit = torch.eye(n_z).to(D)
-        return torch.cat((unit, F.pad(stages, (0, n_x)), F.pad(D_f, (n_z - n_x, 0))))
+        layout = self.layout
+        stages = layout.from_stage(D.expand(layout.horizon, *D.shape[-2:]))
+        plan = torch.eye(layout.n_z)[layout.n_before :].to(D)
+        parts = [plan, stages, layout.from_terminal(D_f)]
+        if layout.n_rates:
+            parts.append(layout.rate_rows().to(D))
+        return torch.cat(parts)
 
     def right_inverse(self, G: Tensor) -> tuple[Tensor, Tensor]:
         """Return D and D^f; raise `QPError` if G has other entries."""
-        n_x, n_z = self.layout.n_x, self.layout.n_z
-        last = n_z + self.layout.horizon * self.layout.n_d
-        D = _stage_blocks(G[n_z:last], self.layout, self.tied).contiguous()
-        D_f = G[last:, n_z - n_x :].contiguous()
+        D, D_f = _linear_rows(G, self.layout)
+        D = self.layout.stage_blocks(D)
+        D, D_f = (D[0] if self.tied else D).contiguous(), self.layout.terminal_block(D_f)
         _check_tied("G", G, self(D, D_f))
         return D, D_f
 
@@ -229,24 +261,21 @@ def _check_mask(name: str, mask: Tensor, layout: Layout, chain: list[nn.Module])
         if isinstance(part, Tied):
             tied = torch.equal(mask, mask[part.first][part.index])
         elif isinstance(part, Banded | LinearRows) and part.tied:
-            n_z, N = layout.n_z, layout.horizon
-            rows = mask if name == "C" else mask[n_z : n_z + N * layout.n_d]
-            blocks = _stage_blocks(rows, layout, tied=False)
-            tied = bool((blocks == blocks[:1]).all())
+            kinds = layout.model_blocks(mask)
+            if name == "G":
+                kinds = (layout.stage_blocks(_linear_rows(mask, layout)[0]),)
+            tied = all(bool((blocks == blocks[:1]).all()) for blocks in kinds)
     if not tied:
         want = "one that is the same for all stages, which structure='tied' ties"
         raise QPError.expected(what, "a mask that differs between stages", want)
 
 
-def _stage_blocks(rows: Tensor, layout: Layout, tied: bool) -> Tensor:
-    """Return the blocks of rows that belong to each stage's (x_k, u_k), ``(N, n, n_x + n_u)``.
-
-    All stages have n rows. If they are tied, return the first block.
-    """
-    horizon, n = layout.horizon, layout.n
-    stages = rows[:, : horizon * n].unflatten(0, (horizon, len(rows) // horizon))
-    blocks = stages.unflatten(-1, (horizon, n)).diagonal(dim1=0, dim2=2).movedim(-1, 0)
-    return blocks[0] if tied else blocks
+def _linear_rows(G: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
+    """Return the rows of G that belong to D and to D^f."""
+    mixed = layout.horizon * layout.n_mixed
+    sizes = (layout.n_z - layout.n_before, mixed, layout.n_terminal)
+    _, D, D_f, _ = G.split((*sizes, len(G) - sum(sizes)))
+    return D, D_f
 
 
 def _check_diagonal(value: Tensor) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.checks import (
@@ -18,6 +19,7 @@ from torch_qpmpc.checks import (
     check_whole,
 )
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.projections import check_step
 from torch_qpmpc.qp.autograd import ON_FAILURE
 from torch_qpmpc.qp.batching import broadcast, to_dtype
@@ -34,6 +36,8 @@ def check_structure(
     n_x: int,
     n_u: int,
     horizon: int,
+    past: int,
+    n_d: int,
     gamma: float,
     hessian: str,
     structure: str,
@@ -45,9 +49,10 @@ def check_structure(
     **_: Any,
 ) -> None:
     """Raise `QPError` unless the sizes and choices among the arguments of `QPMPC` are valid."""
-    for name, size in (("n_x", n_x), ("n_u", n_u), ("horizon", horizon)):
+    for name, size in (("n_x", n_x), ("n_u", n_u), ("horizon", horizon), ("past", past)):
         if not isinstance(size, Integral) or isinstance(size, bool) or int(size) < 1:
             raise QPError.expected(name, repr(size), "a positive integer")
+    check_whole("n_d", n_d, 0)
     check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
     check_choice("hessian", hessian, HESSIANS)
     check_choice("structure", structure, STRUCTURES)
@@ -108,7 +113,7 @@ def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict
 
 
 def check_model(A: Any, B: Any) -> tuple[Tensor, Tensor]:
-    """Return A and B as tensors with at least two dimensions, which give n_x and n_u."""
+    """Return A and B as tensors with at least two dimensions, which give n_x, n_u and past."""
     A, B = as_tensor("A", A), as_tensor("B", B)
     if A.ndim < 2 or B.ndim < 2:
         got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
@@ -177,20 +182,28 @@ def bound_pair(name: str, bounds: tuple[Any, Any] | None, size: int) -> tuple[Te
 
 
 def cost_weights(
-    stage_weight: Any, terminal_weight: Any, hessian: str, n_x: int, n_u: int, horizon: int
+    stage_weight: Any, terminal_weight: Any, hessian: str, layout: Layout
 ) -> dict[str, Tensor]:
-    """Return the initial H and H_f in the shapes for ``hessian``; only H if it is full."""
+    """Return the initial H and H_f in the shapes for ``hessian``; only H if it is full.
+
+    A dense weight of (x_k, u_k) alone has zeros for the preview.
+    """
     stage = as_tensor("stage_weight", stage_weight)
     terminal = as_tensor("terminal_weight", terminal_weight)
-    n, diagonal = n_x + n_u, hessian == "diagonal"
-    event = (n,) if diagonal else (n, n)
-    terminal_event = (n_x,) * len(event)
+    n_x, n, n_d, horizon = layout.n_x, layout.n, layout.n_d, layout.horizon
+    diagonal = hessian == "diagonal"
     # A square matrix is one dense block, even where the horizon happens to be its size.
     diagonals = ((n,), (horizon, n)) if horizon != n else ((n,),)
     if not diagonal and tuple(stage.shape) in diagonals:
         stage = torch.diag_embed(stage)
     if not diagonal and tuple(terminal.shape) == (n_x,):
         terminal = torch.diag(terminal)
+    if not diagonal and n_d:
+        widened = (n_d, 0, n_d, 0)
+        stage = F.pad(stage, widened) if stage.shape[-2:] == (n, n) else stage
+        terminal = F.pad(terminal, widened) if terminal.shape == (n_x, n_x) else terminal
+    event = (n,) if diagonal else (n_d + n,) * 2
+    terminal_event = (n_x,) if diagonal else (n_d + n_x,) * 2
     per_stage = (horizon, *event)
     if tuple(stage.shape) not in (event, per_stage):
         got = f"shape {tuple(stage.shape)}"
@@ -198,21 +211,24 @@ def cost_weights(
     if tuple(terminal.shape) != terminal_event:
         got = f"shape {tuple(terminal.shape)}"
         raise QPError.expected("terminal_weight", got, f"shape {terminal_event}")
-    check_weight("stage_weight", stage, diagonal)
-    check_weight("terminal_weight", terminal, diagonal)
+    check_weight("stage_weight", stage, diagonal, n_d)
+    check_weight("terminal_weight", terminal, diagonal, n_d)
     if hessian == "full":
-        return {"H": torch.block_diag(*stage.expand(horizon, n, n), terminal)}
+        return {"H": layout.block_hessian(stage, terminal)}
     return {"H": stage, "H_f": terminal}
 
 
-def check_weight(name: str, weight: Tensor, diagonal: bool) -> None:
-    """Raise `QPError` unless a weight, or its diagonal, is symmetric positive semidefinite."""
+def check_weight(name: str, weight: Tensor, diagonal: bool, n_d: int) -> None:
+    """Raise `QPError` unless a weight, or its diagonal, is symmetric positive semidefinite.
+
+    The block of the first n_d entries and its cross block may be any.
+    """
     if not diagonal and not torch.allclose(weight, weight.mT):
         asymmetry = (weight - weight.mT).abs().max()
         raise QPError.expected(
             name, f"asymmetry {asymmetry:.3g}", "a symmetric matrix", "Pass (W + W.mT) / 2."
         )
-    eigenvalues = weight if diagonal else torch.linalg.eigvalsh(weight)
+    eigenvalues = weight if diagonal else torch.linalg.eigvalsh(weight[..., n_d:, n_d:])
     if (eigenvalues < (0.0 if diagonal else -1e-9 * eigenvalues.abs().max())).any():
         got = f"smallest eigenvalue {eigenvalues.min():.3g}"
         remedy = "It weights a cost: negate a reward's weight."
@@ -233,9 +249,9 @@ def slack_weight(name: str, weight: Any, size: int | None = None) -> Tensor:
     raise QPError.expected(name, repr(weight), expected)
 
 
-def check_pair(s: Tensor, a: Tensor, n_x: int, n_u: int, device: torch.device) -> Tensor:
-    """Return s and a side by side, ``(*batch, n_x + n_u)``, in the dtype of s."""
-    check_tensor("s", s, n_x, device=device)
+def check_pair(s: Tensor, a: Tensor, n_p: int, n_u: int, device: torch.device) -> Tensor:
+    """Return s and a side by side, ``(*batch, n_p + n_u)``, in the dtype of s."""
+    check_tensor("s", s, n_p, device=device)
     check_tensor("a", a, n_u, device=device)
     try:
         batch = broadcast(s.shape[:-1], a.shape[:-1])

@@ -14,6 +14,7 @@ A row with w_i = inf is hard: its sigma_i is zero.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, fields
 from enum import IntEnum
@@ -21,6 +22,7 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
+from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import broadcast
 
@@ -105,6 +107,8 @@ class QuadraticProgram:
         check_values: check the values, too (finite, H symmetric and positive semidefinite,
             lb <= ub, w >= 0). `QPMPC` passes ``False``: its parametrisations guarantee them, and
             the solve detects values that training has made invalid.
+        n_known: the number of leading entries of z that each solve fixes: only the block of H
+            after them need be positive semidefinite.
 
     Raises:
         QPError: a tensor's type, shape, dtype, device or values are invalid.
@@ -137,11 +141,13 @@ class QuadraticProgram:
     ub: Tensor
     w: Tensor
     check_values: InitVar[bool] = True
+    n_known: InitVar[int] = dataclasses.field(default=0, kw_only=True)
 
-    def __post_init__(self, check_values: bool) -> None:
+    def __post_init__(self, check_values: bool, n_known: int) -> None:
         self._check_shapes()
+        check_whole("n_known", n_known, 0)
         if check_values:
-            self._check_values()
+            self._check_values(n_known)
 
     @property
     def n_z(self) -> int:
@@ -229,7 +235,7 @@ class QuadraticProgram:
                         f"shape {want} with {symbol} = {known} as in {source}",
                     )
 
-    def _check_values(self) -> None:
+    def _check_values(self, n_known: int) -> None:
         for name in ("H", "q", "c", "C", "b", "G"):
             if not getattr(self, name).isfinite().all():
                 raise QPError.expected(name, "NaN or inf", "finite entries")
@@ -259,16 +265,16 @@ class QuadraticProgram:
                 "a symmetric matrix",
                 "Pass (H + H.mT) / 2.",
             )
-        if (
-            self.n_z
-            and (torch.linalg.eigvalsh(self.H)[..., 0] < -tolerance * (scale + 1e-300)).any()
-        ):
-            lowest = torch.linalg.eigvalsh(self.H)[..., 0].min().item()
+        if n_known >= self.n_z:
+            return
+        lowest = torch.linalg.eigvalsh(self.H[..., n_known:, n_known:])[..., 0]
+        if (lowest < -tolerance * (scale + 1e-300)).any():
             raise QPError.expected(
                 "H",
-                f"smallest eigenvalue {lowest:.3g}",
+                f"smallest eigenvalue {lowest.min().item():.3g}",
                 "a positive semidefinite matrix",
-                "Parameterise H by its Cholesky factor (torch_qpmpc.mpc.parametrizations).",
+                "Parameterise H by its Cholesky factor (torch_qpmpc.mpc.parametrizations), or pass "
+                "n_known if the first entries of z are known.",
             )
 
 

@@ -135,7 +135,7 @@ def policies_figure(frame: pd.DataFrame) -> Figure:
     shown |= {label: run.learned for label, run in zip(runs["label"], runs["run"], strict=True)}
     if first.true is not None:
         shown["true model"] = first.true
-    starts = evaluate(first.cfg, warm_policy(first.start), first.physics).states[0]
+    starts = evaluate(first.cfg, warm_policy(first.start), first.physics).known[0]
     slices = {label: slice_between(mpc, starts) for label, mpc in shown.items()}
     figure = Figure(figsize=(3.2 * len(slices), 6), layout="constrained")
     values, actions = figure.subplots(2, len(slices), squeeze=False)

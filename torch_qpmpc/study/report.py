@@ -131,7 +131,8 @@ def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
             yield f"trajectories-{noise}", trajectories_figure(runs)
             if runs["run"].iloc[0].start.n_x > 1:
                 yield f"policies-{noise}", policies_figure(runs)
-        yield "meaning", meaning_figure(sweep)
+        if any(sweep["prediction_error"].notna()):  # the true model is known
+            yield "meaning", meaning_figure(sweep)
     elif has_real(sweep):
         yield "frontier", frontier_figure(sweep)
     if has_ablations(sweep):

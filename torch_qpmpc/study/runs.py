@@ -6,12 +6,13 @@ All readings of a learned C are independent of its gauge.
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,12 +22,18 @@ from omegaconf import DictConfig
 from torch_qpmpc.analysis.model_error import one_step_error, second_moment
 from torch_qpmpc.analysis.report import predictions
 from torch_qpmpc.analysis.structure import Model, nearest_model
-from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
+from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import read_metrics
-from torch_qpmpc.experiment.tasks import make_mpc, make_physics, make_true_mpc, true_model
+from torch_qpmpc.experiment.start import make_start
+from torch_qpmpc.experiment.tasks import (
+    AnyPlant,
+    make_mpc,
+    make_physics,
+    make_true_mpc,
+)
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -68,13 +75,14 @@ class FinishedRun:
         return cfg
 
     @cached_property
-    def physics(self) -> LinearSystem | GymnasiumPlant:
+    def physics(self) -> AnyPlant:
         return make_physics(self.cfg)
 
     @cached_property
     def start(self) -> QPMPC:
         """The QP that learning started from."""
-        return make_mpc(self.cfg, self.physics)
+        start = make_start(self.cfg, self.physics, self.folder, written=True)
+        return make_mpc(self.cfg, self.physics, start)
 
     @cached_property
     def true(self) -> QPMPC | None:
@@ -85,7 +93,7 @@ class FinishedRun:
     def learned(self) -> QPMPC:
         """The learned QP."""
         state = load_checkpoint(self.folder / CHECKPOINT)
-        mpc = make_mpc(self.cfg, self.physics)
+        mpc = copy.deepcopy(self.start)
         if state["structure"] != mpc.structure:
             mpc.release(state["structure"])
         mpc.load_state_dict(state["mpc"])
@@ -109,14 +117,13 @@ class FinishedRun:
             model, nan if the constraints do not determine the states or the true model is unknown.
         """
         mpc = self.learned
-        above = band_distance(mpc.n_x, mpc.n_u, mpc.horizon) > 0
+        above = band_distance(mpc.n_x, mpc.n_u, mpc.horizon, mpc.past, mpc.n_d) > 0
         readings = {
             "zeros_above": (mpc.C[above] == 0).double().mean().item(),
             "prediction_error": math.nan,
             "prediction_error_start": math.nan,
         }
-        if true_model(self.physics) is not None:
-            physics = cast(LinearSystem, self.physics)  # the only plants with a true model
+        if isinstance(physics := self.physics, LinearSystem):
             with contextlib.suppress(QPError):
                 learned, start = (nearest_model(predictions(m)) for m in (mpc, self.start))
                 readings["prediction_error"] = prediction_error(learned, physics)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -208,7 +209,8 @@ def test_the_whole_pipeline_in_tensors_is_that_in_arrays(matrices, spoilt, start
     if spoilt:
         q[1] = torch.nan
         lb[2] = known.qp.ub[2].where(known.qp.ub[2].isfinite(), lb[2])
-    qp = QuadraticProgram(**(vars(known.qp) | {"q": q, "lb": lb}), check_values=False)
+    tensors: dict[str, Any] = vars(known.qp) | {"q": q, "lb": lb}
+    qp = QuadraticProgram(**tensors, check_values=False)
     compiled, in_torch = both(replace(known, qp=qp))
     active = torch.zeros_like(known.lam, dtype=torch.int8) if start else None
     ours = solve_programs(compiled, "torch", None if active is None else active.numpy())

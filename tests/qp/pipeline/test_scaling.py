@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -99,7 +100,8 @@ def test_non_finite_qps_get_their_own_status(matrices, spoilt):
     known = in_size(known_qp(2, batch=(BATCH,), matrices=matrices), cost=1e-7)
     q = known.qp.q.clone()
     q[1] = spoilt
-    qp = QuadraticProgram(**(vars(known.qp) | {"q": q}), check_values=False)
+    tensors: dict[str, Any] = vars(known.qp) | {"q": q}
+    qp = QuadraticProgram(**tensors, check_values=False)
     solution = solve_qp(qp, known.fixed, on_failure="mask")
     assert solution.status.tolist() == [0, Status.INVALID_DATA, 0, 0]
     assert_close(solution.value[[0, 2, 3]], known.value[[0, 2, 3]], rtol=1e-5, atol=1e-12)

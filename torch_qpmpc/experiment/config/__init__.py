@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from torch_qpmpc.experiment.config.messages import first_error, flatten
 from torch_qpmpc.experiment.config.model import Config
@@ -18,7 +18,13 @@ from torch_qpmpc.experiment.config.model import Config
 __all__ = ["check_config", "differences", "flatten", "load_config", "settings"]
 
 #: Keys that older configurations lack, each with the value that keeps their behaviour.
-LATER = {key: info.default for key, info in Config.model_fields.items() if not info.is_required()}
+LATER = flatten(
+    {
+        key: info.default.model_dump() if isinstance(info.default, BaseModel) else info.default
+        for key, info in Config.model_fields.items()
+        if not info.is_required()
+    }
+)
 
 
 def check_config(cfg: DictConfig) -> None:
@@ -34,8 +40,8 @@ def load_config(file: Path) -> DictConfig:
     cfg = OmegaConf.load(file)
     assert isinstance(cfg, DictConfig)
     for key, value in LATER.items():
-        if key not in cfg:
-            cfg[key] = value
+        if key.partition(".")[0] not in cfg:
+            OmegaConf.update(cfg, key, value)
     return cfg
 
 

@@ -10,6 +10,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.fields import (
     Count,
     Expected,
+    Finite,
     Flag,
     Fraction,
     Group,
@@ -117,6 +118,24 @@ class TD3(DDPG):
     noise_clip: NonNegative
 
 
+class FromModel(Group):
+    """Learning starts from the model of the task."""
+
+    name: Literal["model"]
+
+
+class FromData(Group):
+    """Learning starts from a model that is identified from a log."""
+
+    name: Literal["data"]
+    file: Annotated[str | None, Expected("a path, or null")]
+    transitions: Count
+    levels: Annotated[str, one_of(("uniform", "binary"))]
+    hold: Annotated[Finite, Field(ge=1), Expected("a finite number >= 1")]
+    causal: Flag
+    ridge: Annotated[NonNegative | None, Expected("a finite number >= 0, or null")]
+
+
 class SingleProcess(Group):
     name: Literal["single"]
 
@@ -134,4 +153,5 @@ class RayWorkers(Workers):
 
 Optimizer = Annotated[Adam | SGD | GaussNewton, Field(discriminator="name")]
 Algorithm = Annotated[QLearning | DDPG | TD3, Field(discriminator="name")]
+Start = Annotated[FromModel | FromData, Field(discriminator="name")]
 Collector = Annotated[SingleProcess | Workers | RayWorkers, Field(discriminator="name")]

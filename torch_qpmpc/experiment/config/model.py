@@ -13,8 +13,10 @@ from torch_qpmpc.experiment.config.groups import (
     Algorithm,
     Collector,
     Constraint,
+    FromModel,
     Noise,
     Optimizer,
+    Start,
 )
 from torch_qpmpc.experiment.fields import (
     Count,
@@ -81,6 +83,7 @@ class Config(Group):
     log_interval: Count
     algo: Algorithm
     collector: Collector
+    start: Start = FromModel(name="model")
     task: Annotated[TaskSettings, PlainValidator(_settings_of_the_task)]
     noise: Noise
     constraint: Constraint

@@ -10,10 +10,19 @@ from collections.abc import Collection
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
-from torch_qpmpc.experiment.tasks import gros_zanon, gymnasium, point_mass  # noqa: F401 (register)
+from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
+    four_tanks,
+    gros_zanon,
+    gymnasium,
+    house,
+    house_wall,
+    point_mass,
+    tank_references,
+)
+from torch_qpmpc.experiment.tasks.identified import Start, identified_scheme
 from torch_qpmpc.experiment.tasks.registry import (
     TASKS,
+    AnyPlant,
     Scheme,
     Task,
     TaskSettings,
@@ -24,6 +33,7 @@ from torch_qpmpc.mpc.module import QPMPC
 
 __all__ = [
     "TASKS",
+    "AnyPlant",
     "Scheme",
     "Task",
     "TaskSettings",
@@ -36,25 +46,28 @@ __all__ = [
 ]
 
 
-def make_physics(cfg: DictConfig) -> LinearSystem | GymnasiumPlant:
+def make_physics(cfg: DictConfig) -> AnyPlant:
     """Make the plant of the run's task."""
     return find_task(cfg.task).make_plant(cfg)
 
 
-def make_mpc(cfg: DictConfig, physics: LinearSystem | GymnasiumPlant) -> QPMPC:
-    """Make the QP that learns, from the task's wrong scheme."""
+def make_mpc(cfg: DictConfig, physics: AnyPlant, start: Start | None = None) -> QPMPC:
+    """Make the QP that learns, from the task's wrong scheme or, if there is one, from ``start``."""
     learn = (*cfg.task.learn_cost, *cfg.constraint.learn)
-    return _make(cfg, physics, find_task(cfg.task).wrong_scheme(cfg, physics), learn)
+    scheme = find_task(cfg.task).wrong_scheme(cfg, physics)
+    if start is not None:
+        scheme = identified_scheme(cfg, scheme, start)
+    return _make(cfg, physics, scheme, learn)
 
 
-def make_true_mpc(cfg: DictConfig, physics: LinearSystem | GymnasiumPlant) -> QPMPC | None:
+def make_true_mpc(cfg: DictConfig, physics: AnyPlant) -> QPMPC | None:
     """Make the same QP with the true model, cost and bounds; None if they are unknown."""
     true_scheme = find_task(cfg.task).true_scheme
     return None if true_scheme is None else _make(cfg, physics, true_scheme(physics), ())
 
 
 def true_model(
-    physics: LinearSystem | GymnasiumPlant,
+    physics: AnyPlant,
 ) -> tuple[Tensor, Tensor, Tensor] | None:
     """Return the plant's A, B and offset (the noise's mean); None if they are unknown."""
     return physics.true_model()
@@ -62,28 +75,28 @@ def true_model(
 
 def _make(
     cfg: DictConfig,
-    physics: LinearSystem | GymnasiumPlant,
+    physics: AnyPlant,
     scheme: Scheme,
     learn: Collection[str],
 ) -> QPMPC:
     task = cfg.task
-    return QPMPC.from_model(
-        scheme.A,
-        scheme.B,
-        task.horizon,
-        offset=scheme.offset,
-        gamma=task.gamma,
-        state_bounds=(scheme.lb_s, scheme.ub_s),
-        action_bounds=(physics.lb_a, physics.ub_a),
-        structure=cfg.constraint.structure,
-        hessian=task.hessian,
-        stage_weight=scheme.stage_weight,
-        terminal_weight="riccati" if task.terminal_weight == "riccati" else None,
-        state_slack=task.state_slack,
-        action_slack=task.action_slack,
-        discount_slack=task.discount_slack,
-        learn=learn,
-        step=cfg.step,
-        solver=cfg.solver,
-        on_failure="mask",
-    )
+    options = {
+        "offset": scheme.offset,
+        "gamma": task.gamma,
+        "state_bounds": (scheme.lb_s, scheme.ub_s),
+        "action_bounds": (physics.lb_a, physics.ub_a),
+        "structure": cfg.constraint.structure,
+        "hessian": task.hessian,
+        "stage_weight": scheme.stage_weight,
+        "terminal_weight": "riccati" if task.terminal_weight == "riccati" else None,
+        "state_slack": task.state_slack,
+        "action_slack": task.action_slack,
+        "discount_slack": task.discount_slack,
+        "learn": learn,
+        "step": cfg.step,
+        "solver": cfg.solver,
+        "on_failure": "mask",
+    }
+    options |= scheme.options
+    options["start"] = {"c": scheme.c, **options.get("start", {})}
+    return QPMPC.from_model(scheme.A, scheme.B, task.horizon, **options)

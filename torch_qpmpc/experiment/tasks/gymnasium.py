@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from omegaconf import DictConfig
@@ -21,7 +21,7 @@ def _is_chosen(id: str) -> str:
     return id
 
 
-#: A matrix of the model; null by default, which `given_scheme` refuses with a remedy.
+#: A matrix of the model; null by default, which `given_scheme` accepts with ``start=data`` only.
 Model = Annotated[Matrix | None, MATRIX]
 
 
@@ -40,9 +40,9 @@ class GymnasiumSettings(TaskSettings):
 
 #: Instructions for finding a model and passing it on the command line.
 REMEDY = (
-    "Find a model x+ = A x + B u around the target, by finite differences of the dynamics or by "
-    "least squares on logged transitions (x, u, x+), and the weight W of the cost "
-    "1/2 [x; u]' W [x; u]; then pass them, as here for two states and one action: "
+    "Start from data instead, with start=data; or find a model x+ = A x + B u around the target, by"
+    " finite differences of the dynamics, and the weight W of the cost 1/2 [x; u]' W [x; u]; then "
+    "pass them, as here for two states and one action: "
     "'task.A=[[1,.1],[0,1]]' 'task.B=[[0],[.1]]' 'task.stage_weight=[[1,0,0],[0,1,0],[0,0,.1]]'."
 )
 
@@ -50,18 +50,23 @@ REMEDY = (
 def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
     """Read the model and the weight from the task's configuration, the bounds from the spaces.
 
+    With ``start=data``, those that are null are None.
+
     Raises:
         QPError: a matrix is missing, or does not have the shape of the environment's spaces.
     """
     n_x, n_u = len(plant.lb_s), len(plant.lb_a)
     needed = {"A": (n_x, n_x), "B": (n_x, n_u), "stage_weight": (n_x + n_u, n_x + n_u)}
     spaces = f"{plant.id!r}, whose observation has {n_x} entries and whose action has {n_u}"
+    matrices: dict[str, Any] = dict.fromkeys(needed)
     for name, shape in needed.items():
-        if cfg.task[name] is None:
+        rows = cfg.task[name]
+        if rows is not None:
+            matrices[name] = torch.tensor(rows, dtype=torch.float64)
+        elif cfg.start.name != "data":
             expected = f"the rows of a matrix {shape} for {spaces}"
             raise QPError.expected(f"task.{name}", "null", expected, REMEDY)
-    matrices = {name: torch.tensor(cfg.task[name], dtype=torch.float64) for name in needed}
-    shapes = {name: tuple(matrix.shape) for name, matrix in matrices.items()}
+    shapes = {name: needed[name] if x is None else tuple(x.shape) for name, x in matrices.items()}
     if shapes != needed:
         got, expected = (
             ", ".join(f"task.{name} of shape {shape}" for name, shape in sizes.items())

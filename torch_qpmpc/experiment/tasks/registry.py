@@ -15,7 +15,7 @@ from pydantic import model_validator
 from torch import Tensor
 
 from torch_qpmpc.checks import check_kind
-from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.envs import GymnasiumPlant, LinearSystem, Plant
 from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_loop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.fields import (
@@ -31,6 +31,8 @@ from torch_qpmpc.experiment.fields import (
 )
 from torch_qpmpc.mpc.validation import COST, HESSIANS
 
+#: A plant of any kind.
+AnyPlant = LinearSystem | GymnasiumPlant | Plant
 #: All registered tasks by name.
 TASKS: dict[str, Task] = {}
 
@@ -62,21 +64,28 @@ class TaskSettings(Group):
 
 @dataclass(frozen=True)
 class Scheme:
-    """A model x+ = A x + B u + offset, a stage cost and state bounds.
+    """A model x+ = A x + B u + offset, a stage cost and state bounds, as arguments of `QPMPC`.
 
     Attributes:
-        A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
-        stage_weight: W of the cost 1/2 [x; u]' W [x; u], or its diagonal.
+        A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``, or with a window of the past,
+            [A_1, .., A_L] and [B_1, .., B_L].
+        stage_weight: W of the cost 1/2 [x; u]' W [x; u], or its diagonal; W of [d; x; u] with a
+            preview d. With ``start=data`` these three may be None.
         lb_s, ub_s: the bounds of the state, ``(n_x,)``.
         offset: the model's offset, ``(n_x,)``; None for zero.
+        c: the initial constant of the cost.
+        options: other arguments, such as E, constraints or rate_bounds; they replace those from
+            the configuration.
     """
 
-    A: Tensor
-    B: Tensor
-    stage_weight: Tensor
+    A: Tensor | None
+    B: Tensor | None
+    stage_weight: Tensor | None
     lb_s: Tensor
     ub_s: Tensor
     offset: Tensor | None = None
+    c: float = 0.0
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def true(cls, plant: LinearSystem, stage_weight: Tensor) -> Scheme:
@@ -91,10 +100,10 @@ class Task:
 
     Attributes:
         name: the choice in ``task=NAME``.
-        make_plant: makes the plant of a configuration, a `LinearSystem` or a `GymnasiumPlant`.
+        make_plant: makes the plant of a configuration, of any kind.
         wrong_scheme: makes the scheme that learning starts from, of a configuration and a plant.
         true_scheme: makes the true scheme of a plant; None if its model is unknown.
-        closed_loop: runs a policy on the plant, as `torch_qpmpc.envs.closed_loop.closed_loop`.
+        closed_loop: the function of `torch_qpmpc.envs.closed_loop` for the plant's kind.
         noises: choices of ``noise.name``; the first is the default.
         takes_noise_std: True if ``make_plant`` reads ``noise.std``.
         settings: the model of the keys under ``task``.

@@ -1,0 +1,354 @@
+"""A model with lags and previews is read as it is, from the QP and in any gauge."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.experiment.test_plots import image_of, rendered
+from tests.problems import normal
+from torch_qpmpc import QPMPC, DeviationPenalty, QPError
+from torch_qpmpc.analysis.model_error import first_state_error, one_step_error, second_moment
+from torch_qpmpc.analysis.plots import (
+    canonical_figure,
+    constraint_figure,
+    energies_figure,
+    policy_figure,
+    slice_between,
+)
+from torch_qpmpc.analysis.policy import local_gain, policy_map, stage_weight, window_model
+from torch_qpmpc.analysis.prediction_form import (
+    PredictionForm,
+    canonical_matrix,
+    model_form,
+    prediction_form,
+)
+from torch_qpmpc.analysis.report import canonical, predictions, read, structure_metrics
+from torch_qpmpc.analysis.structure import (
+    causality_defect,
+    distance_by_band,
+    markov_order,
+    memory_energies,
+    nearest_model,
+    stage_models,
+    toeplitz_defect,
+)
+from torch_qpmpc.mpc.banded import band_distance, banded_matrix
+from torch_qpmpc.mpc.layout import Layout
+
+N_X, N_U, N_D, L, N = 2, 1, 2, 3, 5
+LAYOUT = Layout(N_X, N_U, N, L, N_D)
+A = 0.2 * normal(N_X, L * N_X, seed=1) + 0.4 * torch.eye(N_X, L * N_X)
+B, E, OFFSET = normal(N_X, L * N_U, seed=2), normal(N_X, N_D, seed=3), normal(N_X, seed=4)
+
+
+def scheme(**options: Any) -> QPMPC:
+    settings = {"E": E, "offset": OFFSET, "solver": "daqp", "learn": ("H", "c", "C", "b")}
+    settings["stage_weight"] = [1.0, 0.5, 0.2]
+    return QPMPC.from_model(A, B, N, **(settings | options))
+
+
+def step(p: Tensor, U: Tensor, A: Tensor = A, B: Tensor = B, E: Tensor = E) -> Tensor:
+    """Step the model over the horizon, ``(N, N_X)``; A, B and E may have a leading N."""
+    A, B, E = (x.expand(N, *x.shape[-2:]) for x in (A, B, E))
+    d, window = p[: LAYOUT.n_preview].view(N + 1, N_D), p[LAYOUT.n_preview :]
+    pairs = window[: (L - 1) * (N_X + N_U)].view(L - 1, N_X + N_U)
+    x, u = [*pairs[:, :N_X], window[-N_X:]], [*pairs[:, N_X:]]
+    for k in range(N):
+        u.append(U[k])
+        lags = (torch.cat(part[: -L - 1 : -1]) for part in (x, u))
+        x.append(A[k] @ next(lags) + B[k] @ next(lags) + E[k] @ d[k] + OFFSET)
+    return torch.stack(x[-N:])
+
+
+def model() -> PredictionForm:
+    return model_form(A, B, N, OFFSET, E)
+
+
+def free_form(seed: int = 0) -> PredictionForm:
+    C = banded_matrix(A, B, N, E)
+    C = C + 0.1 * normal(*C.shape, seed=seed)
+    return prediction_form(C, N_X, N_U, -OFFSET.repeat(N), L, N_D)
+
+
+# The prediction form
+
+
+@pytest.mark.parametrize("stages", [(), (N,)], ids=["tied", "varying"])
+def test_predictions_are_those_of_stepping_the_model(stages):
+    parts = [x + 0.1 * normal(*stages, *x.shape, seed=5) for x in (A, B, E)]
+    form = model_form(parts[0], parts[1], N, OFFSET, parts[2])
+    assert (form.n_x, form.n_u, form.n_p, form.horizon) == (N_X, N_U, LAYOUT.n_p, N)
+    p, U = normal(4, form.n_p), normal(4, N, N_U, seed=1)
+    predicted = form.predict(p, U)
+    for i in range(4):
+        assert_close(predicted[i], step(p[i], U[i], *parts), rtol=1e-12, atol=1e-12)
+    maps = form.maps @ torch.cat((p[0], U[0].flatten(), torch.ones(1).double()))
+    assert_close(maps, torch.cat((p[0, -N_X:].unsqueeze(0), predicted[0])))
+
+
+def test_solutions_of_the_qp_are_predicted():
+    mpc, p = scheme(), normal(6, LAYOUT.n_p)
+    states, actions = mpc.predicted(mpc.solve(p).z.detach())
+    assert_close(predictions(mpc).predict(p, actions), states[:, 1:], rtol=1e-6, atol=1e-6)
+
+
+def test_a_scheme_in_any_gauge_is_a_scheme():
+    C_0, T = banded_matrix(A, B, N, E), normal(N * N_X, N * N_X, seed=6)
+    form = prediction_form(T @ C_0, N_X, N_U, -T @ OFFSET.repeat(N), L, N_D)
+    for part in ("Phi", "Gamma", "phi"):
+        assert_close(getattr(form, part), getattr(model(), part), rtol=0, atol=1e-10)
+    found, stages = nearest_model(form), stage_models(form)
+    for name, expected in (("A", A), ("B", B), ("E", E), ("offset", OFFSET)):
+        assert_close(getattr(found, name), expected, rtol=0, atol=1e-9)
+        each = getattr(stages, name)
+        assert_close(each, expected.expand_as(each), rtol=0, atol=1e-9)
+    assert max(found.residual, stages.residual.max()) < 1e-9
+    assert max(causality_defect(form), toeplitz_defect(form)) < 1e-10
+    C, b = canonical_matrix(form, stages.A)
+    assert_close(C, C_0, rtol=0, atol=1e-9)
+    assert_close(b, -OFFSET.repeat(N), rtol=0, atol=1e-9)
+
+
+def test_the_canonical_matrix_is_the_same_constraints():
+    form = free_form()
+    C, b = canonical_matrix(form, stage_models(form).A)
+    again = prediction_form(C, N_X, N_U, b, L, N_D)
+    for part in ("Phi", "Gamma", "phi"):
+        assert_close(getattr(again, part), getattr(form, part))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_neighbour_of_the_nearest_model_is_nearer(seed):
+    form = free_form(seed)
+    found = nearest_model(form)
+    scale = form.maps[1:, :, :-1].norm()
+
+    def distance(*shifts: Tensor) -> float:
+        own = (found.A, found.B, found.offset, found.E)
+        A, B, offset, E = (x + y for x, y in zip(own, shifts, strict=True))
+        return ((model_form(A, B, N, offset, E).maps - form.maps).norm() / scale).item()
+
+    nothing = [torch.zeros_like(x) for x in (found.A, found.B, found.offset, found.E)]
+    assert distance(*nothing) == pytest.approx(found.residual.item(), rel=1e-9)
+    for i, part in enumerate(nothing):
+        shift = 1e-3 * normal(*part.shape, seed=seed)
+        for sign in (1, -1):
+            assert distance(*nothing[:i], sign * shift, *nothing[i + 1 :]) > found.residual
+    assert 0.01 < found.residual < 1
+
+
+def test_the_order_counts_windows():
+    assert markov_order(memory_energies(model())) == 1
+    C, n = banded_matrix(A, B, N, E), N_X + N_U
+    older, early = C.clone(), C.clone()
+    for k in range(1, N):  # x_{k-L} enters x_{k+1}
+        first = LAYOUT.n_preview + (k - 1) * n
+        older[k * N_X : (k + 1) * N_X, first : first + N_X] = 0.3 * normal(N_X, N_X, seed=7)
+    energies = memory_energies(prediction_form(older, N_X, N_U, None, L, N_D))
+    assert energies.shape == (N + 1,)
+    assert energies.sum().item() == pytest.approx(1, abs=1e-12)
+    assert markov_order(energies) == 2
+    early[0, N_D] = 1.0  # d_1 enters x_1
+    assert markov_order(memory_energies(prediction_form(early, N_X, N_U, None, L, N_D))) == math.inf
+
+
+def test_the_latest_window_explains_what_the_stage_models_do():
+    form = free_form()
+    size = form.maps[1:, :, :-1].square().sum((-1, -2))
+    left = (stage_models(form).residual.square() * size).sum() / size.sum()
+    assert memory_energies(form)[1:].sum().item() == pytest.approx(left.item(), rel=1e-9)
+
+
+# Errors, gains and the report
+
+
+def test_errors_of_the_model_and_of_the_policys_next_state():
+    mpc, p = scheme(), normal(20, LAYOUT.n_p)
+    found = nearest_model(predictions(mpc))
+    wrong = (A + 0.1 * normal(*A.shape), B + 0.1 * normal(*B.shape, seed=8), E + 0.1)
+    differences = [(x - y).flatten() for x, y in zip(wrong, (A, B, E), strict=True)]
+    expected = torch.cat(differences).norm()
+    assert_close(one_step_error(found, *wrong[:2], OFFSET, E=wrong[2]), expected)
+    s, a, d = normal(50, L * N_X), normal(50, L * N_U, seed=1), normal(50, N_D, seed=2)
+    error = s @ (wrong[0] - A).mT + a @ (wrong[1] - B).mT + d @ (wrong[2] - E).mT
+    moment = second_moment(s, a, d)
+    expected = error.square().sum(-1).mean().sqrt()
+    assert_close(one_step_error(found, *wrong[:2], OFFSET, moment, wrong[2]), expected)
+    assert first_state_error(mpc, p, A, B, OFFSET, E) < 1e-6
+    error = p[:, :N_D] @ (wrong[2] - E).mT
+    found = first_state_error(mpc, p, A, B, OFFSET, wrong[2])
+    assert_close(found, error.square().sum(-1).mean().sqrt(), rtol=1e-5, atol=1e-6)
+
+
+def test_the_gain_is_the_slope_of_the_policy_in_all_that_is_known():
+    mpc, p = scheme(action_bounds=([-0.4], [0.4])), normal(6, LAYOUT.n_p)
+    K, h = local_gain(mpc, p), 1e-5
+    assert K.shape == (6, N_U, LAYOUT.n_p)
+    for i, unit in enumerate(torch.eye(LAYOUT.n_p).double()):
+        with torch.no_grad():
+            slope = (mpc.policy(p + h * unit) - mpc.policy(p - h * unit)) / (2 * h)
+        assert_close(-K[..., i], slope, rtol=1e-5, atol=1e-5)
+    assert (K != 0).any(-1).any()
+
+
+def test_the_next_window_is_that_of_the_model():
+    F, G = window_model(A, B)
+    p, U = normal(LAYOUT.n_p), normal(N, N_U, seed=1)
+    p[: LAYOUT.n_preview] = 0
+    w = p[LAYOUT.n_preview :]
+    x_1 = step(p, U)[0] - OFFSET
+    assert_close(F @ w + G @ U[0], torch.cat((w[N_X + N_U :], U[0], x_1)))
+    for one, own in zip(
+        (A[:, :N_X], B[:, :N_U]), window_model(A[:, :N_X], B[:, :N_U]), strict=True
+    ):
+        assert torch.equal(one, own)
+
+
+def test_the_report_of_a_scheme_with_lags_compares_it_with_the_regulator_of_the_window():
+    mpc = QPMPC.from_model(
+        A, B, 16, E=E, gamma=0.95, hessian="block", stage_weight=[1.0, 0.5, 0.2], solver="daqp"
+    )
+    found = read(mpc, (A, B, torch.zeros(N_X), E))
+    expected = dict.fromkeys(("causality", "distance_to_mpc", "model_error"), 0.0)
+    assert {name: found.scalars()[name] for name in expected} == pytest.approx(expected, abs=1e-6)
+    assert found.order == 1
+    assert found.gain_to_lqr < 1e-3  # the horizon is finite
+    assert stage_weight(mpc).diagonal().tolist() == pytest.approx([1.0, 0.5, 0.2])
+    x, radius = normal(mpc.n_p)[17 * N_D :], found.radius
+    F, G = window_model(A, B)
+    closed = F - G @ found.K[:, 17 * N_D :]
+    assert (torch.linalg.matrix_power(closed, 50) @ x).norm() < 100 * radius**50
+    assert radius == pytest.approx(found.radius_predicted)
+    lines = str(found).splitlines()
+    assert [line.split()[0] for line in lines if line[0] in "ABEK"] == ["A", "B", "E", "K"]
+    wrong = read(mpc, (A, B, torch.zeros(N_X), E + 0.1))
+    assert wrong.model_error_max == pytest.approx(0.1)
+    assert wrong.model_error == pytest.approx(0.1 * (N_X * N_D) ** 0.5)
+    metrics = structure_metrics(mpc, (A, B, torch.zeros(N_X), E + 0.1))
+    assert metrics["model_error"] == pytest.approx(wrong.model_error)
+
+
+# The band
+
+
+def test_the_band_of_a_window_and_a_preview():
+    a, o, b, g = 3.0, 5.0, 7.0, 0.5
+    aa, bb = a * (1 + g), b * (1 + g)
+    aaa, bbb = a * (1 + 2 * g), b * (1 + 2 * g)
+    expected = torch.tensor(
+        [  # d_0, d_1, d_2, d_3, x_-1, u_-1, x_0, u_0, x_1, u_1, x_2, u_2, x_3
+            [o, a, aa, aaa, o, o, o, o, o, a, a, aa, aa],
+            [b, o, a, aa, b, b, o, o, o, o, o, a, a],
+            [bb, b, o, a, bb, bb, b, b, o, o, o, o, o],
+        ]
+    )
+    weights = {"c_1": a, "c_2": o, "c_3": b, "growth": g}
+    penalty = DeviationPenalty(torch.zeros(3, 13), 1, 1, past=2, n_d=1, **weights)
+    assert torch.equal(penalty.C_mask, expected)
+    mpc = QPMPC(1, 1, 3, past=2, n_d=1)
+    assert torch.equal(DeviationPenalty.of(mpc, **weights).C_mask, expected.double())
+    C = mpc.C_0 + torch.arange(39).view(3, 13)
+    found = distance_by_band(C, mpc.C_0, 1, 1, past=2, n_d=1)
+    for name, weight in (("on", [o]), ("above", [a, aa, aaa]), ("below", [b, bb, bbb])):
+        where = torch.isin(expected, torch.tensor(weight))
+        assert found[name] == torch.arange(39).view(3, 13)[where].sum()
+    distance = band_distance(N_X, N_U, N, L, N_D)
+    C = banded_matrix(A, B, N, E)
+    assert (C[distance != 0] == 0).all()
+    assert int((C[distance == 0] == 0).sum()) == N * N_X * (N_X - 1)
+
+
+# Figures
+
+
+def test_figures_show_the_matrices_and_mark_what_is_known():
+    mpc = scheme()
+    with torch.no_grad():
+        mpc.C += 0.05 * normal(*mpc.C.shape)
+    figure, form = canonical_figure(mpc), predictions(mpc)
+    panels = [axes for axes in figure.axes if axes.images]
+    shown = (mpc.C.detach(), canonical(mpc))
+    shown += tuple(torch.cat((x.Phi, x.Gamma), -1) for x in (model(), form))
+    for axes, matrix in zip(panels, shown, strict=True):
+        assert_close(torch.as_tensor(image_of(axes)), matrix)
+        ends = [np.asarray(x.get_xdata()) for x in axes.lines if x.get_linestyle() == "--"]
+        expected = sorted((LAYOUT.n_preview - 0.5, LAYOUT.n_before - 0.5))
+        assert sorted(end[0] for end in ends) == expected
+        labels = [x.get_text() for x in axes.get_xticklabels()]
+        assert {"$d_{0}$", "$x_{-2}$"} <= {*labels}
+    figures = (figure, constraint_figure(mpc), energies_figure(mpc))
+    for each in figures:
+        rendered(each)
+    assert "window" in figures[2].axes[1].get_xlabel()
+
+
+def test_a_slice_is_one_of_x_0_at_the_mean_preview():
+    mpc, p = scheme(), normal(7, LAYOUT.n_p)
+    found = slice_between(mpc, p, points=4)
+    first = LAYOUT.n_before
+    assert (found.axes, found.names) == ((first, first + 1), ("x_{0,1}", "x_{0,2}"))
+    assert_close(found.states[0, 0, : LAYOUT.n_preview], p[:, : LAYOUT.n_preview].mean(0))
+    assert (found.states[..., LAYOUT.n_preview : first] == 0).all()
+    assert_close(found.actions[1, 2], mpc.policy(found.states[1, 2]).detach())
+    assert policy_figure(found).axes[0].get_xlabel() == "$x_{0,1}$"
+    grid = torch.linspace(-1, 1, 3)
+    assert policy_map(mpc, grid, grid).axes == found.axes
+    other = policy_map(mpc, grid, grid, axes=(1, LAYOUT.n_preview + N_X))
+    assert other.names == ("d_{0,2}", "u_{-2,1}")
+    with pytest.raises(QPError, match=r"axes: got \(12, 13\), expected two different states"):
+        policy_map(QPMPC(1, 1, 3, past=5, n_d=1), grid, grid)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: prediction_form(torch.zeros(10, 32), N_X, N_U, None, L, N_D),
+            r"C: got shape \(10, 32\), expected .* with n_x = 2, n_u = 1, n_p = 20",
+        ),
+        (lambda: model().predict(torch.zeros(2), torch.zeros(N, N_U)), r"p: got shape \(2,\)"),
+        (
+            lambda: read(scheme(), (A[:, :N_X], B)),
+            r"true_model's A: got shape \(2, 2\), expected shape \(2, 6\)",
+        ),
+        (lambda: read(scheme(), (A, B, OFFSET, E[:, :1])), r"true_model's E: got shape \(2, 1\)"),
+        (
+            lambda: read(scheme(), at=torch.zeros(2)),
+            r"at: got shape \(2,\), expected shape \(20,\)",
+        ),
+        (
+            lambda: one_step_error(nearest_model(model()), A, B, E=E[:, :1]),
+            r"E: got shape \(2, 1\), expected shape \(2, 2\)",
+        ),
+        (
+            lambda: canonical_matrix(model(), torch.zeros(N, N_X, N_X)),
+            r"A: got shape \(5, 2, 2\), expected shape \(5, 2, 6\)",
+        ),
+        (
+            lambda: distance_by_band(torch.zeros(10, 31), torch.zeros(10, 31), N_X, N_U),
+            r"C_0: got shape \(10, 31\), .* n_u = 1, past = 1, n_d = 0",
+        ),
+        (
+            lambda: DeviationPenalty(torch.zeros(3, 13), 1, 1, past=0),
+            "past: got 0, expected a whole number >= 1",
+        ),
+        (
+            lambda: slice_between(scheme(), torch.zeros(3, N_X)),
+            r"starts: got shape \(3, 2\), expected shape \(n, 20\)",
+        ),
+        (
+            lambda: second_moment(normal(4, 2), normal(4, 1), normal(3, 1)),
+            r"s, a, d: got shapes \(4, 2\), \(4, 1\) and \(3, 1\)",
+        ),
+    ],
+)
+def test_bad_input(call, message):
+    with pytest.raises(QPError, match=message):
+        call()

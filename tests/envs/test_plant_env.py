@@ -1,0 +1,167 @@
+"""Plants with previews and hidden states in TorchRL."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
+from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
+
+from tests.store import Store
+from torch_qpmpc.envs import PastWindow, PlantEnv
+from torch_qpmpc.errors import QPError
+
+PLANT = Store(horizon=3, past=3)
+
+
+def make_policy(seed: int = 0) -> Any:
+    torch.manual_seed(seed)
+    net = torch.nn.Sequential(torch.nn.Linear(5, 1, dtype=torch.float64), torch.nn.Sigmoid())
+    return TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
+
+
+def make_env(num_envs: int = 4, max_steps: int = 6, seed: int = 0, **options: Any) -> Any:
+    env = PlantEnv(PLANT, num_envs, max_steps, torch.float64, seed=seed, **options)
+    return TransformedEnv(env, PastWindow(PLANT.past))
+
+
+class StaggeredEnv(PlantEnv):
+    """A plant whose episodes start at different steps, so that every later reset is partial."""
+
+    def _reset(self, tensordict=None, **kwargs):
+        out = super()._reset(tensordict, **kwargs)
+        if tensordict is None or "_reset" not in tensordict:
+            out["step_count"] = torch.arange(self.batch_size[0]).unsqueeze(-1) % self.max_steps
+        return out
+
+
+def collect(env: Any, batches: int, steps: int) -> Any:
+    """Collect a TensorDict of ``(num_envs, batches * steps)`` transitions."""
+    collector = Collector(
+        env,
+        make_policy(),
+        frames_per_batch=steps * env.batch_size[0],
+        total_frames=batches * steps * env.batch_size[0],
+        auto_register_policy_transforms=False,
+    )
+    data: list[Any] = [batch.clone() for batch in collector]
+    collector.shutdown()
+    return torch.cat(data, dim=1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("plant", [PLANT, Store(n_d=0, past=1)], ids=["preview", "none"])
+def test_torchrl_accepts_the_specs(plant, dtype):
+    check_env_specs(PlantEnv(plant, 3, 5, dtype, seed=0), seed=0)
+    check_env_specs(plant.vectorised(3, 5, seed=0), seed=0)
+    check_env_specs(SerialEnv(2, lambda: plant.vectorised(3, 5, seed=0)), seed=0)
+
+
+def test_sizes_are_those_of_what_a_controller_sees():
+    env = PLANT.vectorised(4, 6, seed=0)
+    assert env.observation_spec["observation"].shape == (4, 5)
+    assert env.observation_spec["preview"].shape == (4, 8)
+    assert (PLANT.n_preview, PLANT.n_p) == (8, 13)
+    assert isinstance(Store(past=1).vectorised(4, 6, seed=0), PlantEnv)
+
+
+def test_transitions_follow_the_plant():
+    env = make_env(seed=11, episodes=5)
+    data = env.rollout(6, make_policy())
+    rng = torch.Generator().manual_seed(11)
+    signals = PLANT.signals(rng, 5, 6 + PLANT.horizon + 1)
+    x = PLANT.starts(rng, 4)
+    w = signals[torch.randint(5, (4,), generator=rng)]
+    for k in range(6):
+        now, u = data[:, k], data[:, k]["action"]
+        assert torch.equal(now["state"], x)
+        assert torch.equal(now["observation"][:, -1:], PLANT.output(x, w[:, k]))
+        assert torch.equal(now["preview"], w[:, k : k + 4, :2].flatten(1))
+        assert torch.equal(now["violation"], PLANT.violation(x, w[:, k]).unsqueeze(-1))
+        assert torch.equal(now["next", "reward"], -PLANT.cost(x, u, w[:, k]).unsqueeze(-1))
+        x = PLANT.step(x, u, w[:, k])
+        assert torch.equal(now["next", "state"], x)
+        assert torch.equal(now["next", "preview"], w[:, k + 1 : k + 5, :2].flatten(1))
+    assert torch.equal(PLANT.violations(data), data["violation"])
+    assert data["violation"].max() > 0
+    assert not data["next", "terminated"].any()
+    assert data["next", "truncated"].squeeze(-1).nonzero()[:, 1].tolist() == [5] * 4
+
+
+def test_actions_are_clipped():
+    env = make_env(num_envs=2)
+    td = env.reset().set("action", torch.tensor([[2.0], [1.0]]).double())
+    for name in ("state", "episode", "step_count"):
+        td[name] = td[name][:1].expand(2, -1)
+    following = env.step(td)["next"]
+    assert torch.equal(*following["state"])
+    assert torch.equal(*following["reward"])
+
+
+def test_partial_resets_restart_exactly_the_finished_episodes():
+    env = StaggeredEnv(PLANT, 6, 5, torch.float64, seed=2)
+    data = collect(TransformedEnv(env, PastWindow(PLANT.past)), batches=15, steps=2)
+    done = data["next", "done"].squeeze(-1)
+    assert done.any(0).all(), "every step ends some episode"
+    assert not done.all(0).any(), "no step ends all"
+    now, then, ended = data[:, 1:], data[:, :-1], done[:, :-1]
+    for key in ("observation", "preview", "state", "episode", "step_count", "violation"):
+        assert torch.equal(now[key][~ended], then["next", key][~ended]), key
+        assert not torch.equal(now[key][ended], then["next", key][ended]), key
+    fresh = now["observation"][ended]
+    assert torch.equal(fresh, fresh[:, -1:] * torch.tensor([1, 0, 1, 0, 1]))
+    assert (now["step_count"][ended] == 0).all()
+    assert (now["state"][ended][:, 1] == 0).all()
+    assert ((now["collector", "traj_ids"] != then["collector", "traj_ids"]) == ended).all()
+
+
+def test_rollouts_depend_on_the_seed_only():
+    def rollout(seed, reseed=None):
+        env = make_env(seed=seed)
+        if reseed is not None:
+            env.set_seed(reseed)
+        torch.manual_seed(torch.seed() % 1000)
+        return env.rollout(5, make_policy())
+
+    assert (rollout(5) == rollout(5)).all()
+    assert (rollout(6, reseed=5) == rollout(5)).all(), "signals, too"
+    assert not torch.equal(rollout(5)["preview"], rollout(6)["preview"])
+
+
+def test_without_a_seed_the_global_generator_decides():
+    def first():
+        torch.manual_seed(9)
+        return PlantEnv(PLANT, 4, 5).reset()["preview"]
+
+    assert torch.equal(first(), first())
+
+
+def test_saved_generator_continues_the_stream():
+    env = make_env(max_steps=3, seed=1)
+    td, state = env.reset(), env.get_rng_state()
+
+    def rollout(env):
+        options = {"auto_reset": False, "break_when_any_done": False, "tensordict": td.clone()}
+        return env.rollout(9, make_policy(), **options)["observation"]
+
+    expected, other = rollout(env), make_env(max_steps=3, seed=1)
+    assert not torch.equal(rollout(other), expected)
+    other.set_rng_state(state)
+    assert torch.equal(rollout(other), expected)
+    env.set_rng_state(state)
+    assert torch.equal(rollout(copy.deepcopy(env)), expected)
+
+
+def test_bad_arguments_are_an_error():
+    with pytest.raises(QPError, match="num_envs: got 0, expected a whole number >= 1"):
+        PlantEnv(PLANT, 0, 5)
+    with pytest.raises(QPError, match="episodes: got 0, expected a whole number >= 1"):
+        PlantEnv(PLANT, 1, 5, episodes=0)
+    with pytest.raises(QPError, match="plant: got int, expected a Plant"):
+        PlantEnv(3, 1, 5)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(QPError, match="past: got 0, expected a whole number >= 1"):
+        Store(past=0)

@@ -1,0 +1,19 @@
+"""Tasks of the tests."""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from torch_qpmpc.experiment.tasks import TASKS
+
+
+@pytest.fixture
+def store_task() -> Iterator[None]:
+    """Register ``task=store`` for a test."""
+    runpy.run_path(str(Path(__file__).parents[1] / "store_task.py"))
+    yield
+    del TASKS["store"]

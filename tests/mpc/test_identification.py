@@ -1,0 +1,218 @@
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+
+import torch_qpmpc as qm
+from tests.logs import A, B, E, arx_log
+from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.predictor import outputs_in, predict, windows
+from torch_qpmpc.mpc.trajectories import read_trajectories
+
+N = 6
+PAST: Any = {"past": 2, "n_d": 1}
+COST: Any = {"stage_weight": [1.0, 1.0, 0.1], "action_bounds": ([-1.0], [1.0]), "solver": "daqp"}
+
+
+# QPMPC.from_data
+
+
+@pytest.mark.parametrize("structure", ["free", "varying", "tied"])
+def test_without_noise_all_starts_predict_the_plant(structure):
+    mpc = QPMPC.from_data(arx_log(), N, structure=structure, **PAST, **COST)
+    assert (mpc.n_x, mpc.n_u, mpc.horizon, mpc.past, mpc.n_d) == (2, 1, N, 2, 1)
+    assert mpc.structure == structure
+    z = windows(read_trajectories(arx_log(seed=1), n_d=1)[0], mpc._layout)[:5]
+    plan = mpc.solve(z[:, : mpc.n_p], z[:, mpc.n_p : mpc.n_p + 1]).z
+    true = banded_matrix(A, B, N, E)
+    offset = -torch.tensor([0.1, -0.3]).double().repeat(N)
+    assert_close(plan @ true.mT, offset.expand(5, -1), rtol=1e-8, atol=1e-8)
+
+
+def test_C_0_is_the_band_of_the_model():
+    log = arx_log(noise=0.2)
+    free, tied = (
+        QPMPC.from_data(log, N, structure=structure, **PAST) for structure in ("free", "tied")
+    )
+    assert torch.equal(free.C_0, tied.C_0)
+    assert torch.equal(tied.C, tied.C_0)
+    assert not torch.equal(free.C, free.C_0)
+    assert torch.equal(tied.model()[0], qm.identify(log, N, **PAST).model.A)
+
+
+def test_options_go_to_the_qp():
+    mpc = QPMPC.from_data(arx_log(), N, **PAST, **COST, gamma=0.8, learn=("C", "b"))
+    assert (mpc.gamma, mpc.learned) == (0.8, ("C", "b"))
+    assert mpc.H.tolist() == [1.0, 1.0, 0.1]
+    other = QPMPC.from_data(arx_log(), N, **PAST, **COST, start={"c": 3.0})
+    assert other.c.item() == 3.0
+    assert torch.equal(other.C, mpc.C)
+
+
+def test_the_start_survives_copies_and_resets():
+    mpc = QPMPC.from_data(arx_log(noise=0.2), N, **PAST, learn=("C", "b"))
+    C, b = mpc.C.detach().clone(), mpc.b.detach().clone()
+    for twin in (copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))):
+        assert torch.equal(twin.C, C)
+        assert torch.equal(twin.C_0, mpc.C_0)
+    with torch.no_grad():
+        mpc.C.add_(1.0)
+        mpc.b.add_(1.0)
+    mpc.reset_parameters()
+    assert torch.equal(mpc.C, C)
+    assert torch.equal(mpc.b, b)
+    file = io.BytesIO()
+    torch.save(mpc.state_dict(), file)
+    file.seek(0)
+    other = QPMPC.from_data(arx_log(seed=3, noise=0.2), N, **PAST, learn=("C", "b"))
+    other.load_state_dict(torch.load(file, weights_only=True))
+    assert torch.equal(other.C, C)
+
+
+def test_a_released_varying_start_keeps_its_values():
+    mpc = QPMPC.from_data(arx_log(noise=0.2), N, structure="varying", **PAST, **COST)
+    assert mpc.model()[0].shape == (N, 2, 4)
+    p = windows(read_trajectories(arx_log(), n_d=1)[0], mpc._layout)[:3, : mpc.n_p]
+    before = mpc.value(p)
+    mpc.release()
+    assert_close(mpc.value(p), before)
+
+
+def test_a_ridge_of_a_users_own():
+    weak, strong = (
+        qm.identify(arx_log(noise=0.2), N, ridge=ridge, **PAST).model.A for ridge in (1e-9, 10.0)
+    )
+    assert strong.norm() < 0.3 * weak.norm()
+
+
+def test_collected_steps_of_torchrl_are_a_log():
+    torch.manual_seed(0)
+    env = qm.envs.PointMassEnv(num_envs=4, max_steps=20, seed=0)
+    log = env.rollout(50, break_when_any_done=False)
+    found = qm.identify(log, 5)
+    assert len(found.data) == 12
+    true = env.physics.true_model()
+    for part, expected in zip((found.model.A, found.model.B), true, strict=False):
+        assert_close(part, expected.double(), atol=0.02, rtol=0)
+
+
+# The report
+
+
+def test_errors_are_those_of_data_that_the_fit_has_not_seen():
+    log = arx_log(noise=0.2, episodes=2, steps=300)
+    found = qm.identify(log, N, **PAST)
+    assert found.errors.shape[1:] == (N, 2)
+    fresh = read_trajectories(arx_log(seed=5, noise=0.2, episodes=4, steps=400), n_d=1)
+    Z = torch.cat([windows(log, found.options.layout)[: -N + 1] for log in fresh])
+    error = Z[:, outputs_in(found.options.layout)] - predict(
+        found.constraints, Z, found.options.layout
+    )
+    assert_close(found.rmse, error.square().mean(0).sqrt(), rtol=0.15, atol=0)
+    assert_close(found.covariance, 0.04 * torch.eye(2).double(), rtol=0, atol=0.02)
+    assert (found.rmse.diff(dim=0) > 0).all()
+    assert ((found.R2 > 0.5) & (found.R2 < 1)).all()
+
+
+def test_the_report_is_printed():
+    text = str(qm.identify(arx_log(noise=0.2), N, **PAST))
+    first, head, *rows = text.splitlines()
+    assert first.startswith("free C from 120 transitions in 3 trajectories, n_x=2, n_u=1, horizo")
+    assert "RMSE" in head
+    assert "R2" in head
+    assert [int(row.split()[0]) for row in rows] == [1, 2, 5, 6]
+    assert all(len(row.split()) == 5 for row in rows)
+
+
+def test_errors_are_nan_where_no_part_of_the_data_is_long_enough():
+    found = qm.identify(arx_log(noise=0.2, episodes=1, steps=30), 20, past=2)
+    assert found.rmse.isfinite().all(1).nonzero().flatten().tolist() == list(range(14))
+    assert str(found).endswith("nan nan")
+    assert qm.identify(arx_log(episodes=1, steps=9), 3, **PAST).rmse.isnan().all()
+
+
+# Bad data
+
+
+def frozen_action(log: TensorDict) -> TensorDict:
+    log["action"] = torch.full_like(log["action"], 0.3)
+    return log
+
+
+def feedback(log: TensorDict) -> TensorDict:
+    log["action"] = log["observation"][..., :1] - 0.5 * log["observation"][..., 1:] + 1
+    return log
+
+
+def two_equal_actions(log: TensorDict) -> TensorDict:
+    log["action"] = log.get("action").repeat(1, 1, 2)
+    return log
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: qm.identify(arx_log(episodes=2, steps=4), N, **PAST),
+            "trajectories: got 8 transitions in 2 trajectories, 6 of them with 1 before them, "
+            "expected at least 8 such for past=2, n_x=2, n_u=1 and n_d=1. Log trajectories of more",
+        ),
+        (
+            lambda: qm.identify(arx_log(episodes=1, steps=3), N),
+            "trajectories: got 3 transitions in 1 trajectories, expected at least 4 such for past",
+        ),
+        (
+            lambda: qm.identify(frozen_action(arx_log()), N),
+            "action: got entry 0 constant at 0.3, expected one that moves. Add a random signal",
+        ),
+        (
+            lambda: qm.identify(feedback(arx_log()), N),
+            "action: got entry 0 a linear function of the outputs and other actions, as in feed",
+        ),
+        (
+            lambda: qm.identify(two_equal_actions(arx_log()), N),
+            "action: got entry 0 a linear function of the outputs and other actions, as in feed",
+        ),
+        (lambda: qm.identify(arx_log(), 0), "horizon: got 0, expected a whole number >= 1"),
+        (lambda: qm.identify(arx_log(), N, past=0), "past: got 0, expected a whole number >= 1"),
+        (lambda: qm.identify(arx_log(), N, n_d=-1), "n_d: got -1, expected a whole number >= 0"),
+        (
+            lambda: qm.identify(arx_log(), N, n_x=3),
+            r"observation: got shape \(3, 40, 2\), expected",
+        ),
+        (
+            lambda: qm.identify(arx_log(), N, structure="arx"),
+            "structure: got 'arx', expected one of free, varying, tied",
+        ),
+        (lambda: qm.identify(arx_log(), N, ridge=-1.0), "ridge: got -1.0, expected a finite numbe"),
+        (lambda: qm.identify(arx_log(), N, causal=1), "causal: got 1, expected True or False"),  # pyright: ignore[reportArgumentType] (the mistake)
+        (
+            lambda: QPMPC.from_data(arx_log(), N, stage_weight=[1.0]),
+            r"stage_weight: got shape \(1,\), expected shape",
+        ),
+        (
+            lambda: QPMPC(2, 1, 3, start={"H": torch.eye(3)}),
+            r"start: got \['H'\], expected a mapping of values by name, of q, c, C, b",
+        ),
+        (lambda: QPMPC(2, 1, 3, start=[1.0]), r"start: got \[1.0\], expected a mapping"),  # pyright: ignore[reportArgumentType] (the mistake)
+        (
+            lambda: QPMPC(2, 1, 3, start={"b": [0.0]}),
+            r"start\['b'\]: got shape \(1,\), expected shape \(6,\)",
+        ),
+        (
+            lambda: QPMPC(2, 1, 3, start={"c": torch.nan}),
+            r"start\['c'\]: got NaN or inf, expected finite entries",
+        ),
+    ],
+)
+def test_a_mistake_is_named(call, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        call()

@@ -1,0 +1,18 @@
+"""``task=store``: a `Store` as a task, registered as by a user's script."""
+
+from __future__ import annotations
+
+from tests.store import Store, scheme
+from torch_qpmpc.envs.closed_loop import plant_loop
+from torch_qpmpc.experiment.tasks import Task, register
+
+register(
+    Task(
+        "store",
+        lambda cfg: Store(horizon=cfg.task.horizon),
+        lambda cfg, plant: scheme(plant),
+        scheme,
+        closed_loop=plant_loop,
+        defaults={"task": {"horizon": 3, "hessian": "block", "learn_cost": ["H", "q", "c"]}},
+    )
+)

@@ -1,0 +1,96 @@
+"""TorchRL environments of vectorised episodes, whose only state is a random generator."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torch_qpmpc.checks import check_whole
+from torch_qpmpc.errors import QPError
+
+
+class VectorisedEnv(EnvBase):
+    """``num_envs`` episodes side by side, without a Python loop, of which none terminates.
+
+    Its only state is the generator. Whatever else a step needs travels in the TensorDict as hidden
+    entries beside the observation, ``step_count`` ``(num_envs, 1)`` among them. At a partial reset,
+    TorchRL's merging by mask therefore restarts exactly the episodes that are reset. A policy must
+    not read the hidden entries.
+
+    Episodes are truncated at ``max_steps`` (no ``StepCounter`` needed), so that a collector resets
+    them and changes their trajectory ids.
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        max_steps: int,
+        dtype: torch.dtype,
+        device: torch.device | str | None,
+        seed: int | None,
+    ) -> None:
+        check_whole("num_envs", num_envs, 1)
+        check_whole("max_steps", max_steps, 1)
+        if seed is not None:
+            check_whole("seed", seed, 0)
+        if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
+            raise QPError.expected("dtype", dtype, "a floating-point torch.dtype")
+        super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        self.max_steps, self.dtype = max_steps, dtype
+        self.rng = torch.Generator(device=self.device or "cpu")
+
+    def _start(
+        self, observed: dict[str, Any], hidden: dict[str, Any], action: Bounded, seed: int | None
+    ) -> None:
+        """Set the specs and the seed; hidden entries are inputs and outputs of a step."""
+        count = self._reals(1, dtype=torch.int64)
+        hidden = {**hidden, "step_count": count}
+        shape = self.batch_size
+        flags = ("done", "terminated", "truncated")
+        flag = Categorical(2, shape=count.shape, dtype=torch.bool, device=self.device)
+
+        def composite(specs: dict[str, Any]) -> Composite:
+            copies = {name: spec.clone() for name, spec in specs.items()}
+            return Composite(copies, shape=shape, device=self.device)
+
+        self.state_spec = composite(hidden)
+        self.observation_spec = composite({**observed, **hidden})
+        self.action_spec = action
+        self.reward_spec = self._reals(1)
+        self.done_spec = composite(dict.fromkeys(flags, flag))
+        self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
+
+    def _reals(self, size: int, dtype: torch.dtype | None = None) -> Unbounded:
+        shape = torch.Size([*self.batch_size, size])
+        return Unbounded(shape, dtype=dtype or self.dtype, device=self.device)
+
+    def _box(self, low: Tensor, high: Tensor) -> Bounded:
+        low, high = (b.to(self.dtype).expand(*self.batch_size, -1).clone() for b in (low, high))
+        return Bounded(low, high, dtype=self.dtype, device=self.device)
+
+    def get_rng_state(self) -> Tensor:
+        """Return the generator's state, a uint8 tensor for a checkpoint."""
+        return self.rng.get_state()
+
+    def set_rng_state(self, state: Tensor) -> None:
+        """Restore the generator's ``state``, a result of :meth:`get_rng_state`."""
+        self.rng.set_state(state.cpu())
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.rng.manual_seed(seed)
+
+    def _zero_count(self) -> Tensor:
+        return torch.zeros((*self.batch_size, 1), dtype=torch.int64, device=self.rng.device)
+
+    def _pack(self, step_count: Tensor, **entries: Tensor) -> TensorDict:
+        """Make a step's TensorDict of the entries, the step count and the flags."""
+        truncated = step_count >= self.max_steps
+        entries |= {"step_count": step_count, "done": truncated, "truncated": truncated.clone()}
+        entries["terminated"] = torch.zeros_like(truncated)
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)

@@ -1,0 +1,124 @@
+"""``start=data``: the log that C and b are identified from, collected by exploration or loaded."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.checkpoint import load_checkpoint, write_whole
+from torch_qpmpc.experiment.tasks import AnyPlant
+from torch_qpmpc.experiment.tasks.identified import Start, identified_start
+
+#: The log in a run's folder.
+LOG = "log.pt"
+#: The entries of a log, of which the preview is optional.
+NEXT = ("observation", "reward", "done", "terminated", "truncated")
+ENTRIES = ("observation", "preview", "action", *(("next", name) for name in NEXT))
+WANTED = "a log.pt that train.py start=data wrote"
+
+
+class Exploration(nn.Module):
+    """Random actions that stay constant for a random number of steps.
+
+    At each step, each entry of each episode's action keeps its level or, with probability
+    1 / ``hold``, gets a new one: a uniform level within the bounds or, if ``binary``, one of the
+    bounds (a pseudo-random binary signal).
+
+    Args:
+        low, high: the bounds ``(n_u,)``, which must be finite.
+        hold: the mean number of steps between changes.
+        binary: choose among the bounds.
+        seed: seed of the levels.
+
+    Raises:
+        QPError: a bound is infinite.
+    """
+
+    def __init__(self, low: Tensor, high: Tensor, hold: float, binary: bool, seed: int) -> None:
+        super().__init__()
+        if not (low.isfinite() & high.isfinite()).all():
+            got = f"actions from {low.tolist()} to {high.tolist()}"
+            remedy = "Collect a log with actions of your own, and pass it as start.file."
+            raise QPError.expected("start", got, "finite bounds to explore between", remedy)
+        self.low, self.high, self.hold, self.binary = low, high, hold, binary
+        self.generator = torch.Generator().manual_seed(seed)
+        self.action: Tensor | None = None
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the next action ``(*batch, n_u)`` for any observation ``(*batch, n)``."""
+        shape = (*observation.shape[:-1], len(self.low))
+        level, change = torch.rand((2, *shape), generator=self.generator, dtype=torch.float64)
+        if self.binary:
+            level = level.round()
+        level = self.low + level * (self.high - self.low)
+        if self.action is not None:
+            level = torch.where(change < 1 / self.hold, level, self.action)
+        self.action = level
+        return level.to(observation.dtype)
+
+
+def make_start(
+    cfg: DictConfig, physics: AnyPlant, folder: str | Path, written: bool
+) -> Start | None:
+    """Identify the start of a run from a log, and keep the log in the run's folder.
+
+    Args:
+        cfg: the run's configuration.
+        physics: the plant.
+        folder: the run's folder.
+        written: read the log that the run has written there before.
+
+    Returns:
+        The start; None with ``start=model``.
+
+    Raises:
+        QPError: the log cannot be read or identified, or the plant cannot be explored.
+    """
+    if cfg.start.name != "data":
+        return None
+    path = Path(folder) / LOG
+    if written:
+        return identified_start(cfg, physics, read_log(path))
+    log = collect_log(cfg, physics) if cfg.start.file is None else read_log(Path(cfg.start.file))
+    start = identified_start(cfg, physics, log)
+    buffer = io.BytesIO()
+    torch.save(log.to_dict(), buffer)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, buffer.getbuffer())
+    return start
+
+
+def collect_log(cfg: DictConfig, physics: AnyPlant) -> TensorDict:
+    """Collect ``cfg.start.transitions`` of `Exploration` in the run's environments."""
+    start = cfg.start
+    env = physics.vectorised(cfg.num_envs, cfg.task.episode_steps, seed=cfg.seed)
+    binary = start.levels == "binary"
+    explore: Any = Exploration(physics.lb_a, physics.ub_a, start.hold, binary, cfg.seed)
+    policy = TensorDictModule(explore, ["observation"], ["action"])
+    steps = -(-start.transitions // cfg.num_envs)
+    log = env.rollout(steps, policy, break_when_any_done=False).contiguous()
+    env.close()
+    return log.select(*ENTRIES, strict=False)
+
+
+def read_log(path: Path) -> TensorDict:
+    """Read a log.
+
+    Raises:
+        QPError: the file is missing, damaged, or not a log.
+    """
+    if not path.exists():
+        raise QPError.expected("start.file", f"{path}, which does not exist", WANTED)
+    stored = load_checkpoint(path)
+    actions = stored.get("action") if isinstance(stored, dict) else None
+    if not isinstance(actions, Tensor):
+        raise QPError.expected("start.file", f"{path}, without actions", WANTED)
+    return TensorDict(stored, batch_size=actions.shape[:-1])

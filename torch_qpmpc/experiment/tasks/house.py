@@ -1,0 +1,89 @@
+"""``task=house``: leap-c's room, heated by price, learned from its planner's wrong model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from torch_qpmpc.envs import House
+from torch_qpmpc.envs.closed_loop import plant_loop
+from torch_qpmpc.envs.heated_house import DAY, HeatedHouse
+from torch_qpmpc.experiment.fields import Flag, NonNegative
+from torch_qpmpc.experiment.heating import Model, heating_options, known_model
+from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
+
+#: The resistance that the tutorial's planner assumes, in K/kW.
+WRONG_R = 2.0
+#: Typical cost of a day in EUR, for the initial c.
+COST = 21.0
+
+
+class HeatingSettings(TaskSettings):
+    """The keys of the heated houses."""
+
+    #: Distance to the lower comfort bound, in K, at which the planned violation begins.
+    margin: NonNegative
+
+
+class HouseSettings(HeatingSettings):
+    """The keys of `House`."""
+
+    one_weather: Flag
+
+
+def make_plant(cfg: DictConfig) -> House:
+    return House(horizon=cfg.task.horizon, one_weather=cfg.task.one_weather)
+
+
+def wrong_scheme(cfg: DictConfig, plant: House) -> Scheme:
+    return learned_scheme(cfg, plant, known_model(replace(plant, R=WRONG_R)), COST)
+
+
+def true_scheme(plant: House) -> Scheme:
+    """Return the scheme with the true model, without discount; it does not see the gain."""
+    return heating_scheme(plant, known_model(plant), gamma=1.0)
+
+
+def learned_scheme(cfg: DictConfig, plant: HeatedHouse, model: Model, cost: float) -> Scheme:
+    """Make the scheme that learns, whose c is the part of a typical cost that lies beyond N.
+
+    The learned entries of q are those of the forecasts, in which V and Q become linear: others
+    would be prices of the plan, of which that of y_N is not bounded.
+    """
+    gamma, learn = cfg.task.gamma, (*cfg.task.learn_cost, *cfg.constraint.learn)
+    n_z = plant.n_p + plant.horizon * (plant.n_y + plant.n_u)
+    masks = {"q": torch.arange(n_z) < plant.n_preview}
+    beyond = gamma**plant.horizon / (1 - gamma) if gamma < 1 else 0.0
+    return heating_scheme(
+        plant,
+        model,
+        margin=cfg.task.margin,
+        c=beyond * cost / DAY,
+        learn={part: masks.get(part, True) for part in learn},
+    )
+
+
+def heating_scheme(
+    plant: HeatedHouse, model: Model, *, c: float = 0.0, margin: float = 0.0, **options: Any
+) -> Scheme:
+    """Make the scheme of the plant's cost and a model; ``options`` are those of `QPMPC`."""
+    A, B, _ = model
+    cost = heating_options(plant, model, margin=margin)
+    free = plant.lb_a.new_full((len(A),), torch.inf)
+    return Scheme(A, B, cost["stage_weight"], -free, free, c=c, options=cost | options)
+
+
+register(
+    Task(
+        "house",
+        make_plant,
+        wrong_scheme,
+        true_scheme,
+        closed_loop=plant_loop,
+        settings=HouseSettings,
+        defaults=None,
+    )
+)

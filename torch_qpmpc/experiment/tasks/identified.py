@@ -1,0 +1,97 @@
+"""Schemes that are identified from a log: the model, and the stage cost if the task has none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.tasks.registry import AnyPlant, Scheme
+from torch_qpmpc.mpc.identification import Identified, identify
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.stage_cost import fit_stage_cost
+
+
+class Start(NamedTuple):
+    """A log of the task's plant, and what has been identified from it."""
+
+    log: TensorDictBase
+    identified: Identified
+
+
+def identified_start(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase) -> Start:
+    """Identify C and b from a log of the task's plant; `identify` names the errors."""
+    found = identify(
+        log,
+        cfg.task.horizon,
+        past=getattr(physics, "past", 1),
+        n_d=getattr(physics, "n_d", 0),
+        n_x=getattr(physics, "n_y", None),
+        structure=cfg.constraint.structure,
+        causal=cfg.start.causal,
+        ridge=cfg.start.ridge,
+    )
+    return Start(log, found)
+
+
+def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
+    """Return ``scheme`` with the identified model and, if it has no weight, the log's cost."""
+    arguments = start.identified.arguments
+    model = {name: arguments[name] for name in ("A", "B")}
+    options = {name: arguments[name] for name in ("past", "n_d", "E", "offset")}
+    values = {**scheme.options.get("start", {}), **arguments.get("start", {})}
+    cost = {}
+    if scheme.stage_weight is None:
+        cost, weights, q = observed_cost(cfg, start.log, start.identified.options.layout)
+        options, values = options | weights, {**values, "q": q}
+    options = {**scheme.options, **options, "start": values}
+    return replace(scheme, **model, **cost, options=options)
+
+
+def observed_cost(
+    cfg: DictConfig, log: TensorDictBase, layout: Layout
+) -> tuple[dict[str, Any], dict[str, Tensor], Tensor]:
+    """Fit a convex stage cost to the rewards of a log.
+
+    It is the cost of x_N, too, without an action, unless ``cfg`` has a terminal weight from the
+    Riccati equation. The constant adds the mean cost of the log beyond the horizon.
+
+    Returns:
+        The stage weight and the constant c as fields of `Scheme`, the terminal weight as an
+        argument of `QPMPC`, and q ``(n_z,)``.
+
+    Raises:
+        QPError: the log has no rewards, or not all are finite.
+    """
+    n_d, n_x, n_u, N = layout.n_d, layout.n_x, layout.n_u, layout.horizon
+    reward = log.get(("next", "reward"), None)
+    if reward is None or not reward.isfinite().all():
+        got = "a log without rewards" if reward is None else "a log with rewards of NaN or inf"
+        remedy = "Pass task.stage_weight, the weight W of the cost 1/2 [x; u]' W [x; u]."
+        raise QPError.expected("start", got, "finite rewards to fit a cost to", remedy)
+    parts = [log["observation"][..., -n_x:], log["action"]]
+    if n_d:
+        parts.insert(0, log["preview"][..., :n_d])
+    v = torch.cat(tuple(part.double() for part in parts), dim=-1).flatten(0, -2)
+    cost, diagonal = -reward.double().flatten(), cfg.task.hessian == "diagonal"
+    W, q, c = fit_stage_cost(v, cost, n_d, diagonal)
+    weight, terminal = (W[n_d:, n_d:].diagonal() if diagonal else W), n_d + n_x
+    weights = {"terminal_weight": weight[:n_x] if diagonal else W[:terminal, :terminal]}
+    d, x, u = q.split((n_d, n_x, n_u))
+    past = q.new_zeros(layout.n_before - layout.n_preview)
+    ahead = cfg.task.gamma ** torch.arange(N + 1, dtype=torch.float64)
+    constant = c * ahead.sum()
+    if cfg.task.gamma < 1:
+        constant += cfg.task.gamma ** (N + 1) / (1 - cfg.task.gamma) * cost.mean()
+    fields = {"stage_weight": weight, "c": constant.item()}
+    if cfg.task.terminal_weight == "riccati":
+        weights, x_N = {}, torch.zeros_like(x)
+    else:
+        x_N = x
+    stages = layout.stages(torch.stack((*[x] * N, x_N)), u)
+    return fields, weights, torch.cat((d.repeat(N + 1), past, stages))

@@ -1,0 +1,72 @@
+"""``task=tank_references``: tanks that track known references, learned from a wrong model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from omegaconf import DictConfig
+from torch import Tensor
+
+from torch_qpmpc.envs import TankReferences
+from torch_qpmpc.envs.closed_loop import plant_loop
+from torch_qpmpc.experiment.fields import Flag, NonNegative, Whole
+from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
+from torch_qpmpc.experiment.tracking import offset_free, reference_options
+
+#: Standard deviation of the disturbed variant's noise.
+NOISE_STD = 0.1
+
+
+class TankReferencesSettings(TaskSettings):
+    """The keys of `TankReferences`."""
+
+    #: Noise, and other leaks and pump gains in each episode, as in the original's second table.
+    disturbed: Flag
+    #: Scale of the wrong model's error, in units of the disturbed variant's largest one.
+    model_error: NonNegative
+    #: Number of model errors whose mean corrects the predictions (`offset_free`); 0 for none.
+    memory: Whole
+
+
+def make_plant(cfg: DictConfig) -> TankReferences:
+    task = cfg.task
+    return TankReferences(
+        horizon=task.horizon,
+        past=1 + task.memory,
+        noise_std=NOISE_STD * task.disturbed,
+        mismatch=float(task.disturbed),
+    )
+
+
+def wrong_scheme(cfg: DictConfig, plant: TankReferences) -> Scheme:
+    """Draw the wrong model by ``cfg.seed``."""
+    rng = np.random.default_rng(cfg.seed)
+    w = replace(plant, mismatch=cfg.task.model_error).signals(rng, 1, 1)[0, 0]
+    A, B, _ = plant.model(w)
+    return _scheme(plant, A, B, cfg.task.gamma)
+
+
+def true_scheme(plant: TankReferences) -> Scheme:
+    """Return the scheme with the nominal model, without discount."""
+    return _scheme(plant, plant.A, plant.B, gamma=1.0)
+
+
+def _scheme(plant: TankReferences, A: Tensor, B: Tensor, gamma: float) -> Scheme:
+    options = reference_options(plant, gamma)
+    if plant.past > 1:
+        A, B = offset_free(A, B, plant.past - 1)
+    return Scheme(A, B, options["stage_weight"], plant.lb_x, plant.ub_x, options=options)
+
+
+register(
+    Task(
+        "tank_references",
+        make_plant,
+        wrong_scheme,
+        true_scheme,
+        closed_loop=plant_loop,
+        settings=TankReferencesSettings,
+        defaults=None,
+    )
+)

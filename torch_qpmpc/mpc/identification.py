@@ -1,0 +1,213 @@
+"""Identification of C and b from logged trajectories, and a report of its prediction errors.
+
+`torch_qpmpc.mpc.predictor` has the mathematics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.checks import check_choice, check_flag, check_number, check_whole
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.predictor import (
+    Constraints,
+    Model,
+    Options,
+    fit,
+    prediction_errors,
+    transitions,
+)
+from torch_qpmpc.mpc.trajectories import Trajectory, folds, read_trajectories
+from torch_qpmpc.mpc.validation import STRUCTURES
+
+#: The largest number of parts of the data in cross-validation.
+PARTS = 5
+#: An action that the other regressors explain up to this share of its size does not excite.
+STILL = 1e-6
+EXCITE = "Add a random signal to the action, independent of the outputs."
+SIZES = ("n_x", "n_u", "horizon", "past", "n_d")
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """An ARX model, the constraints ``C z = b`` that start from it, and their prediction errors.
+
+    ``print`` shows the errors, which are those of cross-validation: each is of a fit without the
+    part of the data that it is in. They are NaN for steps that no part is long enough for, and if
+    the other parts determine no model. Their root mean square is the standard deviation that a
+    back-off from bounds needs.
+
+    Attributes:
+        model: the ARX model.
+        constraints: C and b.
+        options: how they were fitted.
+        data: the trajectories.
+    """
+
+    model: Model
+    constraints: Constraints
+    options: Options
+    data: Sequence[Trajectory]
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of `QPMPC` that start it here: ``QPMPC(**identified.arguments, ..)``."""
+        structure, start = self.options.structure, self.constraints._asdict()
+        sizes = {name: getattr(self.options.layout, name) for name in SIZES}
+        more = {} if structure == "tied" else {"start": start}
+        return {**sizes, "structure": structure, **self.model._asdict(), **more}
+
+    @cached_property
+    def errors(self) -> Tensor:
+        """y_{k+1} minus its prediction, ``(starts, N, n_x)``; NaN after a trajectory's end."""
+        layout, causal = self.options.layout, self.options.causal
+        total = sum(log.steps for log in self.data)
+        count = max(min(PARTS, total // (2 * (layout.past + layout.horizon))), 2)
+        parts = folds(self.data, count)
+        errors = [torch.full((1, layout.horizon, layout.n_x), torch.nan, dtype=torch.float64)]
+        for i, part in enumerate(parts):
+            others = [log for j, other in enumerate(parts) if j != i for log in other]
+            if _usable(others, layout) >= _needed(layout):
+                found = fit(others, self.options)[1]
+                errors.append(prediction_errors(part, found, layout, causal))
+        return torch.cat(errors)
+
+    @property
+    def rmse(self) -> Tensor:
+        """The root mean square of the errors after 1, .., N steps, ``(N, n_x)``."""
+        return self.errors.square().nanmean(0).sqrt()
+
+    @property
+    def R2(self) -> Tensor:
+        """The share of each output's variance that is predicted 1, .., N steps ahead."""
+        outputs = torch.cat([log.y for log in self.data])
+        return 1 - (self.rmse / outputs.std(0, correction=0)).square()
+
+    @property
+    def covariance(self) -> Tensor:
+        """The covariance of the one-step errors, ``(n_x, n_x)``."""
+        e = self.errors[:, 0]
+        e = e[e.isfinite().all(-1)]
+        return e.mT @ e / len(e)
+
+    def __str__(self) -> str:
+        layout, N = self.options.layout, self.options.layout.horizon
+        total = sum(log.steps for log in self.data)
+        lines = [
+            f"{self.options.structure} C from {total} transitions in {len(self.data)} trajectories,"
+            f" {', '.join(f'{name}={getattr(layout, name)}' for name in SIZES)}",
+            f"{'steps':>6}  {'RMSE of each output, cross-validated':38}R2",
+        ]
+        for k in sorted({k for k in (1, 2, 5, 10, 20, 50, 100) if k < N} | {N}):
+            errors = " ".join(f"{x:.3g}" for x in self.rmse[k - 1].tolist())
+            lines.append(f"{k:6}  {errors:38}{' '.join(f'{x:.3f}' for x in self.R2[k - 1])}")
+        return "\n".join(lines)
+
+
+def identify(
+    trajectories: Any,
+    horizon: int,
+    *,
+    past: int = 1,
+    n_d: int = 0,
+    n_x: int | None = None,
+    structure: str = "free",
+    causal: bool = True,
+    ridge: float | None = None,
+) -> Identified:
+    """Fit C and b to logged trajectories; see `torch_qpmpc.mpc.predictor`.
+
+    Args:
+        trajectories: logged steps, ``(T,)`` or ``(episodes, T)``, with ``observation``, ``action``
+            (as applied) and ``("next", "observation")``. Done flags and the ids of trajectories are
+            respected.
+        horizon: N.
+        past: L, the number of lags.
+        n_d: entries of d_k, the first of the entry ``preview``.
+        n_x: the number of outputs, the last entries of ``observation``, which may be a window; all
+            of them by default.
+        structure: ``"tied"``: an ARX model. ``"varying"``: one for each stage, fitted to the
+            predictions before it. ``"free"``: a multi-step predictor.
+        causal: let row block k of a free C read d_0, .., d_k and u_0, .., u_k only.
+        ridge: the weight of the squared coefficients, in units of the root mean squares of the
+            regressors, relative to the mean squared error; by default each regression has the one
+            of the largest evidence.
+
+    Raises:
+        QPError: an argument or an entry is invalid, the data are too short for ``past``, or the
+            actions do not move enough to show their effect.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> from tensordict import TensorDict
+        >>> u = 2 * torch.rand(50, 1, generator=torch.Generator().manual_seed(0)) - 1
+        >>> y = torch.zeros(51, 1)
+        >>> for t in range(50):
+        ...     y[t + 1] = 0.9 * y[t] + 0.5 * u[t]
+        >>> log = {"observation": y[:-1], "action": u, "next": {"observation": y[1:]}}
+        >>> found = qm.identify(TensorDict(log, [50]), horizon=4)
+        >>> [round(part.item(), 4) for part in found.model[:2]]
+        [0.9, 0.5]
+    """
+    for name, size in (("horizon", horizon), ("past", past)):
+        check_whole(name, size, 1)
+    check_choice("structure", structure, STRUCTURES)
+    check_flag("causal", causal)
+    if ridge is not None:
+        check_number("ridge", ridge, lambda x: 0 <= x < torch.inf, "a finite number >= 0, or None")
+    data = read_trajectories(trajectories, n_x, n_d)
+    layout = Layout(data[0].y.shape[-1], data[0].u.shape[-1], int(horizon), int(past), int(n_d))
+    check_excitation(data, layout)
+    options = Options(layout, structure, causal, ridge)
+    return Identified(*fit(data, options), options, data)
+
+
+def check_excitation(trajectories: Sequence[Trajectory], layout: Layout) -> None:
+    """Raise `QPError` unless the data determine an ARX model.
+
+    There must be more transitions than coefficients, and each action must move in a way that the
+    other regressors do not explain.
+    """
+    past, needed = layout.past, _needed(layout)
+    usable = _usable(trajectories, layout)
+    if usable < needed:
+        total = sum(log.steps for log in trajectories)
+        got = f"{total} transitions in {len(trajectories)} trajectories"
+        if past > 1:
+            got += f", {usable} of them with {past - 1} before them"
+        n_x, n_u, n_d = layout.n_x, layout.n_u, layout.n_d
+        expected = f"at least {needed} such for past={past}, n_x={n_x}, n_u={n_u} and n_d={n_d}"
+        remedy = f"Log trajectories of more than {past} steps, or lower past."
+        raise QPError.expected("trajectories", got, expected, remedy)
+    X, _ = transitions(trajectories, past)
+    middle = X.mean(0)
+    X, first = X - middle, past * layout.n_x
+    size = X.square().mean(0).sqrt()
+    X = X / torch.where(size > 0, size, 1.0)
+    for i, column in enumerate(range(first, first + layout.n_u)):
+        if size[column] <= STILL * middle[column].abs():
+            got = f"entry {i} constant at {middle[column].item():.6g}"
+            raise QPError.expected("action", got, "one that moves", EXCITE)
+        target = X[:, column : column + 1]
+        others = X.index_fill(1, torch.tensor(column), 0.0)
+        rest = target - others @ torch.linalg.lstsq(others, target, driver="gelsd").solution
+        if rest.square().mean().sqrt() <= STILL:
+            got = f"entry {i} a linear function of the outputs and other actions, as in feedback"
+            raise QPError.expected("action", got, "one that moves by itself, too", EXCITE)
+
+
+def _needed(layout: Layout) -> int:
+    """Return the number of an ARX model's coefficients for an output, with the offset."""
+    return layout.past * layout.n + layout.n_d + 1
+
+
+def _usable(trajectories: Sequence[Trajectory], layout: Layout) -> int:
+    """Return the number of transitions that have a window before them."""
+    return sum(max(log.steps - layout.past + 1, 0) for log in trajectories)

@@ -1,0 +1,185 @@
+"""Linear predictors by least squares: C and b from trajectories.
+
+The start is an ARX model with L lags, by ridge regression on one-step transitions,
+
+    y_{k+1} = A_1 y_k + .. + A_L y_{k+1-L} + B_1 u_k + .. + B_L u_{k+1-L} + E d_k + offset,
+
+which gives the banded C_0 (``structure="tied"``). The other structures correct its row blocks in
+turn. From each start in the data, row block k predicts y_{k+1} from the *predicted* y_1, .., y_k;
+its error is regressed on what the row block may read, again with a ridge:
+
+* ``"free"``: on all that is known and u_0, .., u_k, which gives a multi-step predictor;
+* ``"varying"``: on the band, which gives one ARX model for each stage.
+
+So C keeps the gauge of the band, with -1 at y_{k+1}, and differs from C_0 only by the corrections.
+Its predictions are as general as those of a regression of each y_{k+1} on (p, u_0, .., u_k), since
+these determine the predicted y_1, .., y_k. But the ridge shrinks them to the ARX model's next step
+from the corrected prediction, instead of to zero, and an exact ARX model is not corrected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.ridge import ridge
+from torch_qpmpc.mpc.trajectories import Trajectory
+
+#: The correction of a prediction k steps ahead needs more than this many times k starts, because
+#: the errors of fewer than k starts overlap.
+SPANS = 3
+
+
+class Model(NamedTuple):
+    """An ARX model: A ``(n_x, L n_x)``, B ``(n_x, L n_u)``, E ``(n_x, n_d)``, offset ``(n_x,)``.
+
+    A and B have the newest lag first.
+    """
+
+    A: Tensor
+    B: Tensor
+    E: Tensor
+    offset: Tensor
+
+
+class Constraints(NamedTuple):
+    """``C z = b``: C ``(N n_x, n_z)`` and b ``(N n_x,)``."""
+
+    C: Tensor
+    b: Tensor
+
+
+class Options(NamedTuple):
+    """How to fit: the sizes of z, and the arguments of `identify`; None chooses each ridge."""
+
+    layout: Layout
+    structure: str = "free"
+    causal: bool = True
+    ridge: float | None = None
+
+
+def arx(trajectories: Sequence[Trajectory], past: int, strength: float | None = None) -> Model:
+    """Fit an ARX model with L = ``past`` lags by `ridge` regression of that ``strength``."""
+    X, Y = transitions(trajectories, past)
+    middle, mean = X.mean(0), Y.mean(0)
+    W = ridge(X - middle, Y - mean, strength).mT
+    n_x, n_u, n_d = (part.shape[-1] for part in trajectories[0])
+    A, B, E = W.split((past * n_x, past * n_u, n_d), dim=-1)
+    return Model(A, B, E, mean - W @ middle)
+
+
+def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[Model, Constraints]:
+    """Fit an ARX model, and correct its banded C and b as the structure allows.
+
+    A row block is not corrected if the data have too few starts.
+    """
+    layout, structure, causal, strength = options
+    N, n_x = layout.horizon, layout.n_x
+    model = arx(trajectories, layout.past, strength)
+    C = banded_matrix(model.A, model.B, N, model.E)
+    b = -model.offset.repeat(N)
+    if structure == "tied":
+        return model, Constraints(C, b)
+    measured = [windows(log, layout) for log in trajectories]
+    outputs = outputs_in(layout)
+    Z = [z.index_fill(1, outputs.flatten(), 0.0) for z in measured]  # the predictions, one by one
+    for k in range(N):
+        rows = slice(k * n_x, (k + 1) * n_x)
+        last = k if causal or structure == "varying" else N - 1
+        read = _band(layout, k) if structure == "varying" else _known(layout, last)
+        # Starts whose windows end after the log are left out.
+        inside = [slice(max(len(z) - last, 0)) for z in Z]
+        pairs = list(zip(Z, measured, inside, strict=True))
+        X = torch.cat([z[i] for z, _, i in pairs])
+        if (k or last) and len(X) > SPANS * last:
+            Y = torch.cat([y[i, outputs[k]] for _, y, i in pairs]) - X @ C[rows].mT + b[rows]
+            X = X[:, read]
+            middle, mean = X.mean(0), Y.mean(0)
+            change = ridge(X - middle, Y - mean, strength).mT
+            C[rows, read] += change
+            b[rows] += change @ middle - mean
+        for z in Z:
+            z[:, outputs[k]] = z @ C[rows].mT - b[rows]
+    return model, Constraints(C, b)
+
+
+def predict(found: Constraints, Z: Tensor, layout: Layout) -> Tensor:
+    """Predict y_1, .., y_N ``(*batch, N, n_x)`` from p and the actions in z ``(*batch, n_z)``."""
+    outputs = outputs_in(layout).flatten()
+    Z = Z.index_fill(-1, outputs, 0.0)
+    Y = torch.linalg.solve(found.C[:, outputs], (found.b - Z @ found.C.mT).mT).mT
+    return Y.unflatten(-1, (layout.horizon, layout.n_x))
+
+
+def prediction_errors(
+    trajectories: Sequence[Trajectory], found: Constraints, layout: Layout, causal: bool = True
+) -> Tensor:
+    """Return y_{k+1} minus its prediction from each start, ``(starts, N, n_x)``.
+
+    It is NaN for steps after the end of the trajectory. If the predictions are not ``causal``,
+    those from a start are all NaN if one of their actions is after the end.
+    """
+    N = layout.horizon
+    needed = torch.arange(N) if causal else torch.full((N,), N - 1)
+    errors = [torch.zeros(0, N, layout.n_x, dtype=torch.float64)]
+    for log in trajectories:
+        Z = windows(log, layout)
+        over = torch.arange(len(Z)).unsqueeze(-1) + needed >= len(Z)
+        error = Z[:, outputs_in(layout)] - predict(found, Z, layout)
+        errors.append(error.masked_fill(over.unsqueeze(-1), torch.nan))
+    return torch.cat(errors)
+
+
+def windows(log: Trajectory, layout: Layout) -> Tensor:
+    """Return z from each possible start, ``(T - L + 1, n_z)``, with zeros after the end."""
+    past, horizon, starts = layout.past, layout.horizon, log.steps - layout.past + 1
+    if starts < 1:
+        return log.y.new_zeros(0, layout.n_z)
+    pairs = torch.cat((log.y, F.pad(log.u, (0, 0, 0, 1))), dim=-1)
+    pairs = F.pad(pairs, (0, 0, 0, horizon)).unfold(0, past + horizon, 1)
+    preview = F.pad(log.d[past - 1 :], (0, 0, 0, horizon)).unfold(0, horizon + 1, 1)
+    preview, stages = (x[:starts].mT.flatten(1) for x in (preview, pairs))
+    return torch.cat((preview, stages[:, : stages.shape[1] - layout.n_u]), dim=-1)
+
+
+def outputs_in(layout: Layout) -> Tensor:
+    """Return the columns of y_1, .., y_N in z, ``(N, n_x)``."""
+    first = layout.n_before + layout.n * torch.arange(1, layout.horizon + 1)
+    return first.unsqueeze(-1) + torch.arange(layout.n_x)
+
+
+def transitions(trajectories: Sequence[Trajectory], past: int) -> tuple[Tensor, Tensor]:
+    """Return the regressors and targets of an ARX model: [y lags, u lags, d] and the next y."""
+    X, Y = [], []
+    for log in trajectories:
+        if log.steps >= past:
+            X.append(
+                torch.cat((_lags(log.y[:-1], past), _lags(log.u, past), log.d[past - 1 :]), -1)
+            )
+            Y.append(log.y[past:])
+    return torch.cat(X), torch.cat(Y)
+
+
+def _lags(x: Tensor, count: int) -> Tensor:
+    """Return the ``count`` rows up to each row, the newest first, ``(T - count + 1, count n)``."""
+    return x.unfold(0, count, 1).flip(-1).mT.flatten(1)
+
+
+def _band(layout: Layout, k: int) -> Tensor:
+    """Return the columns of z in the band of row block k, without those of y_{k+1}."""
+    window = layout.n_preview + k * layout.n + torch.arange(layout.reach)
+    return torch.cat((k * layout.n_d + torch.arange(layout.n_d), window))
+
+
+def _known(layout: Layout, last: int) -> Tensor:
+    """Return the columns of z of d_0, .., d_last, the window and u_0, .., u_last."""
+    actions = torch.arange(last + 1).unsqueeze(-1) * layout.n + torch.arange(layout.n_u)
+    preview = torch.arange((last + 1) * layout.n_d)
+    window = torch.arange(layout.n_preview, layout.n_p)
+    return torch.cat((preview, window, layout.n_p + actions.flatten()))

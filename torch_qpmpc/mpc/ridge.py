@@ -1,0 +1,59 @@
+"""Ridge regression in the units of the columns, with a strength that the data choose."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+#: The strengths among which the evidence decides, relative to the mean square of a column.
+STRENGTHS = 10.0 ** torch.arange(-16, 4.1, 0.25, dtype=torch.float64)
+
+
+def ridge(X: Tensor, Y: Tensor, strength: float | None = None) -> Tensor:
+    """Return the W that minimises ``|Y - X W|^2 / n + strength |D W|^2``, ``(m, n_y)``.
+
+    D holds the root mean squares of X's columns, so that W does not depend on their units. A
+    strength follows from the evidence: the likelihood of Y ``(n, n_y)`` under a Gaussian prior of
+    W, with the variance of the noise at its maximum, for each column of Y by itself.
+
+    Args:
+        X: regressors, ``(n, m)``.
+        Y: targets, ``(n, n_y)``.
+        strength: the strength; None for that of the largest evidence.
+    """
+    n, m = X.shape
+    size = X.square().mean(0).sqrt()
+    scale = torch.where(size > 0, 1 / size, 0.0)
+    basis, target = X * scale, Y
+    outside = Y.new_zeros(Y.shape[1])
+    if n > m:  # the triangular factor has the same singular values, and fewer rows
+        Q, basis = torch.linalg.qr(basis)
+        target = Q.mT @ Y
+        outside = (Y - Q @ target).square().sum(0)
+    U, s, Vh = torch.linalg.svd(basis, full_matrices=False)
+    a = U.mT @ target
+    outside = outside + (target - U @ a).square().sum(0)
+    if strength is None:
+        shrinkage = _best_strength(s, a, outside, n)
+    else:
+        shrinkage = torch.full_like(outside, strength)
+    seen = (s > s.amax() * max(n, m) * torch.finfo(s.dtype).eps).unsqueeze(-1)
+    s = s.unsqueeze(-1)
+    inverse = torch.where(seen, s / (s.square() + n * shrinkage), 0.0)
+    return scale.unsqueeze(-1) * (Vh.mT @ (inverse * a))
+
+
+def _best_strength(s: Tensor, a: Tensor, outside: Tensor, n: int) -> Tensor:
+    """Return the strength of the largest evidence for each target, ``(n_y,)``.
+
+    Args:
+        s: singular values of the regressors, ``(r,)``.
+        a: targets in the basis of the left singular vectors, ``(r, n_y)``.
+        outside: squared norms of the targets outside of that basis, ``(n_y,)``.
+        n: the number of samples.
+    """
+    gain = 1 + s.square() / (n * STRENGTHS.unsqueeze(-1))
+    noise = outside + (a.square() / gain.unsqueeze(-1)).sum(1)
+    tiny = torch.finfo(s.dtype).tiny
+    log_evidence = -n * noise.clamp(min=tiny).log() - gain.log().sum(1).unsqueeze(-1)
+    return STRENGTHS[log_evidence.argmax(0)]
