@@ -13,10 +13,7 @@ COST = ("H", "H_f", "q", "c", "w")
 
 
 class Reference:
-    """The step of a `GaussNewton` without a trust region, after those of this reference before.
-
-    The QPMPC has two states and one action.
-    """
+    """The steps of a `GaussNewton` without a trust region."""
 
     def __init__(self, mpc: QPMPC, optimizer: GaussNewton) -> None:
         groups = optimizer.param_groups
@@ -25,7 +22,7 @@ class Reference:
         self.parts = [group["name"] for group in groups for _ in group["params"]]
         self.scales = [group["scale"] for group in groups for _ in group["params"]]
         self.damping = groups[0]["damping"]
-        self.m = torch.zeros(3, dtype=torch.float64)
+        self.m = torch.zeros(mpc.n_x + mpc.n_u + mpc.n_d, dtype=torch.float64)
         self.sizes = dict.fromkeys(self.parts, 0.0)
 
     def theta(self) -> Tensor:
@@ -44,17 +41,23 @@ class Reference:
 
     def units(self, z: Tensor) -> list[Tensor]:
         """Compute U of each leaf, flattened."""
-        states, actions = self.mpc._layout.predicted(z)
-        squares = [x.square().mean((0, 1)) for x in (states, actions)]
-        self.m = self.m.maximum(torch.cat(squares))
-        x, u = self.m[:2], self.m[2:]
-        row = x.repeat(self.mpc.horizon)
-        column = torch.cat([*[x, u] * self.mpc.horizon, x])
+        mpc, n = self.mpc, self.mpc.n_x + self.mpc.n_u
+        preview = (mpc.horizon + 1) * mpc.n_d
+        d, stages = z[:, :preview], z[:, preview:]
+        stages = torch.cat((stages, stages.new_full((len(z), mpc.n_u), torch.nan)), dim=-1)
+        values = [stages.reshape(-1, n), d.reshape(len(z) * (mpc.horizon + 1), mpc.n_d)]
+        self.m = self.m.maximum(torch.cat([x.square().nanmean(0) for x in values]))
+        stage, d = self.m.split((n, mpc.n_d))
+        row = stage[: mpc.n_x].repeat(mpc.horizon)
+        column = torch.cat((d.repeat(mpc.horizon + 1), stage.repeat(mpc.past + mpc.horizon)))
+        column = column[: mpc.n_z]
         found = [torch.ones_like(leaf).flatten() for leaf in self.leaves]
         if self.mpc.structure == "free":
             for k, part in enumerate(self.parts):
                 if part == "b":
                     found[k] = row
+                elif part == "q":
+                    found[k] = 1 / column
                 elif part == "C":
                     found[k] = (row.unsqueeze(-1) / column).flatten()
         return found

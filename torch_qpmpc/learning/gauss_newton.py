@@ -15,12 +15,12 @@ so that mu damps each part in relation to its own gradients. A part of the cost 
 own; C, b, G, lb and ub share the sum of theirs, as they describe one model. Sizes never fall, as
 those of MINPACK's scaling: otherwise a part would move the more freely, the less Q depends on it.
 
-U is the identity except for a free C and its b. With m_j the largest mean square of signal j, a
-state or an action, over a batch and the horizon, U is m_i / m_j for the entry of C in a row that
-predicts state i and a column of signal j, and m_i for that row's entry of b: entries are measured
-by the prediction's relative change. The step is then the same in any unit of the cost and, for c, C
-and b, in any units of states and actions. A signal has one m for the horizon, because a single
-entry of z may be nearly zero in a batch without being small.
+U is the identity except where C is free. With m_j the largest mean square of signal j, an entry of
+x, u or d, over a batch and z's stages, U is m_i / m_j for the entry of C in a row that predicts x's
+entry i and a column of signal j, and m_i for that row's entry of b: entries are measured by the
+prediction's relative change. For q it is 1 / m_j. The step is then the same in any unit of the cost
+and, for c, q, C and b, in any units of the signals. A signal has one m for all stages, because a
+single entry of z may be nearly zero in a batch without being small.
 
 The gradients in a free C are the outer products chi_i z_i', so that ``K = (chi chi') * (z P z')``
 is computed without forming them. P is the metric of C's rows: U's or, with the SI penalty
@@ -326,7 +326,7 @@ class GaussNewton(torch.optim.Optimizer):
                 )
             )
         rows, columns = self._units(z[use])
-        free = mpc.structure == "free"
+        units = {"b": rows, "q": 1 / columns} if mpc.structure == "free" else {}
         return [
             _OuterProducts(leaf, group, weight.unsqueeze(-1) * chi, z, rows, columns, penalty, mask)
             if leaf is factored
@@ -334,7 +334,7 @@ class GaussNewton(torch.optim.Optimizer):
                 leaf,
                 group,
                 next(in_leaves).reshape(len(z), -1),
-                rows if free and group["name"] == "b" else None,
+                units.get(group["name"]),
             )
             for leaf, group in pairs
         ]
@@ -345,7 +345,7 @@ class GaussNewton(torch.optim.Optimizer):
         A signal that was always zero counts as one.
         """
         mpc, group = self._mpc, self.param_groups[0]
-        signals = torch.arange(mpc.n_x + mpc.n_u).to(z.device).repeat(mpc.horizon + 1)[: mpc.n_z]
+        signals = mpc._layout.signals().to(z.device)
         count = signals.bincount()
         squares = torch.zeros_like(z[0, : len(count)]).index_add(0, signals, z.square().mean(0))
         m = squares / count
