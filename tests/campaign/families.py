@@ -5,7 +5,6 @@ A family is a function of a `Draw` and a count. It returns a `Case`, a batch of 
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,76 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tests.campaign import prefix
+from tests.campaign.draws import FLOAT32, Case, Draw, changed, solvable
 from tests.campaign.trained import trained
-from tests.problems import BRINK, HARD_ROWS, SOFT_ROWS, WEAK, KnownQP, known_qp, times
+from tests.problems import BRINK, HARD_ROWS, SOFT_ROWS, WEAK, KnownQP, times
 from torch_qpmpc import QuadraticProgram, Status
 from torch_qpmpc.mpc.banded import banded_matrix
-
-#: Tolerance of a value, relative to the terms of the Lagrangian (see `tests.campaign.outcomes`).
-ACCURACY, FLOAT32 = 1e-5, 1e-3
-
-
-@dataclass(frozen=True)
-class Case:
-    """QPs with their true status ``(B,)``; ``known`` has the solutions of solvable ones."""
-
-    known: KnownQP
-    expected: Tensor
-    accuracy: float = ACCURACY
-
-
-class Draw(random.Random):
-    """The random numbers of a family, all from one seed."""
-
-    def __init__(self, seed: int) -> None:
-        super().__init__(seed)
-        self.generator = torch.Generator().manual_seed(seed)
-
-    def normal(self, *shape: int) -> Tensor:
-        return torch.randn(shape, generator=self.generator, dtype=torch.float64)
-
-    def powers(self, low: float, high: float, *shape: int) -> Tensor:
-        """Draw powers of ten with uniform exponents between ``low`` and ``high``."""
-        exponent = torch.rand(shape, generator=self.generator, dtype=torch.float64)
-        return 10 ** (low + (high - low) * exponent)
-
-    def known(self, count: int, **options: Any) -> KnownQP:
-        """Draw a batch of QPs of any size, with shared or separate matrices and few hard rows."""
-        n_z = self.randint(3, 14)
-        n_f = self.randint(0, min(4, n_z - 2))
-        n_c = self.randint(0, (n_z - n_f) // 2)
-        settings: dict[str, Any] = {
-            "batch": (count,),
-            "matrices": self.choice([(), (), (), (count,)]),
-            "n_z": n_z,
-            "n_f": n_f,
-            "n_c": n_c,
-            "soft": self.rows(SOFT_ROWS, 0, 8),
-            "hard": self.rows(HARD_ROWS, 0, (n_z - n_f - n_c) // 2),
-            "weight": 10 ** self.uniform(-1, 2),
-        }
-        return known_qp(self.getrandbits(32), **(settings | options))
-
-    def rows(self, kinds: tuple[str, ...], least: int, most: int) -> tuple[str, ...]:
-        return tuple(self.choices(kinds, k=self.randint(least, most)))
-
-    def combinations(self, rows: Tensor, count: int) -> Tensor:
-        """Draw ``count`` rows, each a multiple of one of ``rows`` or a sum of them."""
-        mix = self.normal(count, len(rows))
-        single = torch.rand(count, generator=self.generator) < 0.5
-        one = torch.eye(len(rows)).double()[torch.arange(count) % len(rows)]
-        factor = torch.tensor([self.choice([1.0, -1.0, 0.5, 3.0]) for _ in range(count)]).double()
-        return torch.where(single[:, None], factor[:, None] * one, mix) @ rows
-
-
-def solvable(known: KnownQP, accuracy: float = ACCURACY) -> Case:
-    return Case(known, torch.full(known.value.shape, int(Status.SOLVED)), accuracy)
-
-
-def changed(known: KnownQP, **tensors: Tensor) -> KnownQP:
-    """Replace tensors of a QP without checks."""
-    parts: dict[str, Any] = vars(known.qp) | tensors
-    return replace(known, qp=QuadraticProgram(**parts, check_values=False))
 
 
 def well_posed(draw: Draw, count: int) -> Case:
@@ -505,5 +440,6 @@ FAMILIES: dict[str, Callable[[Draw, int], Case]] = {
         unstable_model,
         runaway_prediction,
         hopeless_plant,
+        *prefix.FAMILIES,
     )
 }

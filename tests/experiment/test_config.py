@@ -93,6 +93,8 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "actor": ("algo=td3", "task=pendulum", "constraint=free", "batch_size=8"),
         "house": ("task=house", "warmup_steps=1"),
         "house_wall": ("task=house_wall", "warmup_steps=1"),
+        "four_tanks": ("task=four_tanks", "start=model", "warmup_steps=1"),
+        "tank_references": ("task=tank_references", "warmup_steps=1"),
         "data": ("start=data", "task=pendulum", "constraint=free", "start.transitions=40"),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
     }.items():
@@ -118,12 +120,14 @@ def test_each_key_is_read(tmp_path, monkeypatch):
 
 #: The noises of each task, and the constraints whose penalty needs windows of the replay.
 NOISES = {
+    "four_tanks": {"none"},
     "point_mass": {"gaussian", "brownian"},
     "gros_zanon": {"uniform"},
     "gymnasium": {"none"},
     "house": {"none"},
     "house_wall": {"none"},
     "pendulum": {"none"},
+    "tank_references": {"none"},
 }
 WINDOWS = ("si", "combined", "identified")
 
@@ -174,7 +178,10 @@ def test_an_actor_has_the_first_order_by_itself():
 
 #: The tasks of keys that pendulum lacks.
 TASK_KEYS = {
+    "task.disturbed": "task=tank_references",
     "task.margin": "task=house",
+    "task.memory": "task=tank_references",
+    "task.model_error": "task=tank_references",
     "task.one_weather": "task=house",
     "task.past": "task=house_wall",
 }
@@ -268,8 +275,9 @@ for _name in ("task.horizon", "task.episode_steps", "task.eval_steps"):
     BAD[_name] = WHOLE
 for _name in ("scale_cost", "scale_constraints", "damping"):
     BAD[f"optimizer.{_name}"] = [0, *REAL]
-BAD["optimizer.trust_region"] = BAD["task.one_weather"] = FLAG
-BAD["task.past"], BAD["task.margin"] = WHOLE, REAL
+BAD["optimizer.trust_region"] = BAD["task.one_weather"] = BAD["task.disturbed"] = FLAG
+BAD["task.past"], BAD["task.memory"] = WHOLE, WHOLE[1:]
+BAD["task.margin"] = BAD["task.model_error"] = REAL
 for _name in ("lr_cost", "lr_constraints"):
     BAD[f"optimizer.{_name}"] = REAL
 for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.growth", "si.beta"):

@@ -172,7 +172,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPMPC: A 3x2": (
         M(A=torch.ones(3, 2)),
-        "A: got shape (3, 2), expected shape (2, 2) or (3, 2, 2).",
+        "A: got shape (3, 2), expected shape (3, 3) or (3, 3, 3).",
     ),
     "QPMPC: seed float": (
         M(seed=1.5),
@@ -273,7 +273,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPMPC.from_model: swapped": (
         lambda: qm.QPMPC.from_model(torch.ones(2, 1), torch.eye(2), 3),
-        "A: got shape (2, 1), expected shape (1, 1) or (3, 1, 1).",
+        "A, B: got shapes (2, 1) and (2, 2), expected (2, 2) and (2, 2).",
     ),
     "QPMPC.from_model: none": (
         lambda: qm.QPMPC.from_model(None, None, 3),
@@ -293,7 +293,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPMPC.linear_mpc: swapped": (
         lambda: qm.QPMPC.linear_mpc(torch.ones(2, 1), torch.eye(2), 3),
-        "A: got shape (2, 1), expected shape (1, 1) or (3, 1, 1).",
+        "A, B: got shapes (2, 1) and (2, 2), expected (2, 2) and (2, 2).",
     ),
     "QPMPC.value: numpy": (
         lambda: mpc.value(np.zeros((4, 2))),

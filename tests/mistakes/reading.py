@@ -44,7 +44,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "prediction_form: 1d": (
         lambda: prediction_form(torch.zeros(11), 2, 1),
-        "C: got shape (11,), expected shape (*batch, N n_x, N (n_x + n_u) + n_x). Pa",
+        "C: got shape (11,), expected shape (*batch, N n_x, n_z). Pass mpc.C.",
     ),
     "prediction_form: n_x 0": (
         lambda: prediction_form(mpc.C, 0, 1),
@@ -66,7 +66,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "prediction_form: swapped": (
         lambda: prediction_form(mpc.C, 1, 2),
-        "C: got shape (6, 11), expected (*batch, N n_x, N (n_x + n_u) + n_x) with n_",
+        "C: got shape (6, 11), expected (*batch, N n_x, n_p + N (n_x + n_u)) with n_x = 1, n_u = ",
     ),
     "prediction_form: b list": (
         lambda: prediction_form(mpc.C, 2, 1, [0.0]),
@@ -94,7 +94,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "PredictionForm.predict: x0": (
         lambda: form.predict(torch.zeros(3), torch.zeros(4, 1)),
-        "x_0: got shape (3,), expected shape (*batch, 2).",
+        "p: got shape (3,), expected shape (*batch, 2).",
     ),
     "PredictionForm.predict: U": (
         lambda: form.predict(torch.zeros(2).double(), torch.zeros(5, 1).double()),
@@ -106,11 +106,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "PredictionForm.predict: list": (
         lambda: form.predict([0.0, 0.0], [0.0]),
-        "x_0: got list, expected a floating-point torch.Tensor. Convert it: torch.as",
+        "p: got list, expected a floating-point torch.Tensor. Convert it: torch.as_tensor(p).floa",
     ),
     "PredictionForm.predict: batch": (
         lambda: form.predict(torch.zeros(3, 2).double(), torch.zeros(5, 4, 1).double()),
-        "U: got shape (5, 4, 1), expected leading dimensions that broadcast with x_0",
+        "U: got shape (5, 4, 1), expected leading dimensions that broadcast with those of p, (3,).",
     ),
     "PredictionForm.predict: transposed U": (
         lambda: form.predict(torch.zeros(2).double(), torch.zeros(1, 4).double()).shape,
@@ -146,7 +146,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "model_form: 1d": (
         lambda: model_form(torch.ones(2), torch.ones(2), 3),
-        "A: got shape (2,), expected shape (*batch, n_x, n_x).",
+        "A: got shape (2,), expected shape (*batch, n_x, L n_x).",
     ),
     "model_form: nan": (
         lambda: model_form(A2 * math.nan, B1, 3),
@@ -154,7 +154,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "canonical_matrix: form": (
         lambda: canonical_matrix(mpc.C, A2),
-        "form: got Parameter, expected a PredictionForm. Pass prediction_form(mpc.C,",
+        "form: got Parameter, expected a PredictionForm.",
     ),
     "canonical_matrix: A": (
         lambda: canonical_matrix(form, A2),
@@ -172,7 +172,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: canonical_matrix(
             prediction_form(torch.stack([mpc.C] * 2), 2, 1), torch.zeros(3, 2, 2).double()
         ),
-        "form.Phi: got shape (2, 6, 2), expected shape (N n_x, n_x). Pass the form",
+        "form.Phi: got shape (2, 6, 2), expected shape (N n_x, n_p). Pass the form of a single C.",
     ),
     "distance_by_band: shape": (
         lambda: distance_by_band(mpc.C, mpc.C_0[:4], 2, 1),
@@ -184,7 +184,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "distance_by_band: swapped": (
         lambda: distance_by_band(mpc.C, mpc.C_0, 1, 2),
-        "C_0: got shape (6, 11), expected shape (6, 19) for n_x = 1, n_u = 2.",
+        "C_0: got shape (6, 11), expected shape (6, 19) for n_x = 1, n_u = 2, past = 1, n_d = 0.",
     ),
     "distance_by_band: row": (
         lambda: distance_by_band(mpc.C[0], mpc.C_0, 2, 1),
@@ -216,7 +216,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "read: true one": (
         lambda: read(mpc, A2),
-        "true_model: got Tensor, expected the pair (A, B), or (A, B, offset).",
+        "true_model: got Tensor, expected the pair (A, B), (A, B, offset) or (A, B, offset, E).",
     ),
     "read: true shape": (
         lambda: read(mpc, (B1, A2)),
@@ -240,15 +240,15 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "read: true 4": (
         lambda: read(mpc, (A2, B1, torch.zeros(2), torch.zeros(2))),
-        "true_model: got tuple of 4, expected the pair (A, B), or (A, B, offset).",
+        "true_model's E: got shape (2,), expected shape (2, 0).",
     ),
     "read: model": (
         lambda: read(mpc, nearest_model(form)),
-        "true_model: got Model, expected the pair (A, B), or (A, B, offset).",
+        "true_model: got Model, expected the pair (A, B), (A, B, offset) or (A, B, offset, E).",
     ),
     "read: true 1": (
         lambda: read(mpc, (A2,)),
-        "true_model: got tuple of 1, expected the pair (A, B), or (A, B, offset).",
+        "true_model: got tuple of 1, expected the pair (A, B), (A, B, offset) or (A, B, offset, E",
     ),
     "read: A 3x3": (
         lambda: read(mpc, (torch.eye(3), torch.ones(3, 1))),
@@ -264,7 +264,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "structure_metrics: true": (
         lambda: structure_metrics(mpc, A2),
-        "true_model: got Tensor, expected the pair (A, B), or (A, B, offset).",
+        "true_model: got Tensor, expected the pair (A, B), (A, B, offset) or (A, B, offset, E).",
     ),
     "local_gain: operator": (
         lambda: local_gain(op, S),
@@ -368,11 +368,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "second_moment: batch": (
         lambda: second_moment(torch.zeros(3, 2), torch.zeros(4, 1)),
-        "s, a: got shapes (3, 2) and (4, 1), expected the same number of samples, at",
+        "s, a, d: got shapes (3, 2), (4, 1) and (4, 0), expected the same number of samples, at l",
     ),
     "second_moment: empty": (
         lambda: second_moment(torch.zeros(0, 2), torch.zeros(0, 1)),
-        "s, a: got shapes (0, 2) and (0, 1), expected the same number of samples, at",
+        "s, a, d: got shapes (0, 2), (0, 1) and (0, 0), expected the same number of samples, at l",
     ),
     "one_step_error: model": (
         lambda: one_step_error((A2, B1), A2, B1),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch.testing import assert_close
 
 from tests.logs import OFFSET, A, B, E, arx_log
@@ -17,8 +18,10 @@ from torch_qpmpc.mpc.predictor import (
     outputs_in,
     predict,
     prediction_errors,
+    transitions,
     windows,
 )
+from torch_qpmpc.mpc.ridge import ridge
 from torch_qpmpc.mpc.trajectories import Trajectory, read_trajectories
 
 N = 8
@@ -66,7 +69,7 @@ def test_a_short_trajectory_has_few_starts(steps):
 
 
 def test_the_model_is_exact():
-    found = arx(trajectories(), past=2)
+    found = arx(trajectories(), layout(2))
     for part, true in zip(found, (A, B, E, OFFSET), strict=True):
         assert_close(part, true, rtol=1e-10, atol=1e-10)
 
@@ -132,6 +135,23 @@ def test_a_strong_ridge_leaves_the_means():
     mean = torch.cat([log.y[2:] for log in data]).mean(0)
     Y = predict(found, torch.cat([windows(log, sizes) for log in data]), sizes)
     assert_close(Y[:, 0], mean.expand(len(Y), 2))
+
+
+def test_a_smooth_response_is_found_from_few_noisy_data():
+    """A ridge on the changes of coefficients finds it better than one on the coefficients."""
+    sizes, lags = Layout(1, 1, 1, 8), torch.linspace(0.1, 0.8, 8).double()
+
+    def errors(seed: int) -> tuple[float, float]:
+        u, noise = torch.randn(2, 60, 1, generator=torch.Generator().manual_seed(seed)).double()
+        y = torch.cat((torch.zeros(8, 1).double(), u.unfold(0, 8, 1) @ lags))
+        log = Trajectory(y + F.pad(noise, (0, 0, 1, 0)), u, u[:, :0])
+        X, Y = transitions([log], sizes)
+        plain = ridge(X - X.mean(0), Y - Y.mean(0))[1::2, 0]
+        smooth = arx([log], sizes).B.flatten().flip(0)
+        return (smooth - lags).norm().item(), (plain - lags).norm().item()
+
+    smooth, plain = torch.tensor([errors(seed) for seed in range(20)]).mean(0)
+    assert smooth < 0.8 * plain
 
 
 def test_rows_without_enough_starts_keep_the_model():

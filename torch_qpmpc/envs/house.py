@@ -39,6 +39,9 @@ class House(HeatedHouse):
         C: thermal capacity in kWh/K.
         one_weather: give every day the noise of the tutorial's single day.
 
+    Raises:
+        QPError: if an argument does not fit, such as an R that is not positive.
+
     Example:
         >>> import numpy as np, torch_qpmpc as qm
         >>> house, rng = qm.envs.House(), np.random.default_rng(0)

@@ -136,9 +136,9 @@ def identify(
         structure: ``"tied"``: an ARX model. ``"varying"``: one for each stage, fitted to the
             predictions before it. ``"free"``: a multi-step predictor.
         causal: let row block k of a free C read d_0, .., d_k and u_0, .., u_k only.
-        ridge: the weight of the squared coefficients, in units of the root mean squares of the
-            regressors, relative to the mean squared error; by default each regression has the one
-            of the largest evidence.
+        ridge: the weight of the squared changes of coefficients from step to step, in units of the
+            regressors, relative to the mean squared error; by default the evidence chooses it for
+            each regression (`torch_qpmpc.mpc.ridge.ridge`).
 
     Raises:
         QPError: an argument or an entry is invalid, the data are too short for ``past``, or the
@@ -175,23 +175,24 @@ def check_excitation(trajectories: Sequence[Trajectory], layout: Layout) -> None
     There must be more transitions than coefficients, and each action must move in a way that the
     other regressors do not explain.
     """
-    past, needed = layout.past, _needed(layout)
+    past, n_x, n_u, n_d = layout.past, layout.n_x, layout.n_u, layout.n_d
+    needed = _needed(layout)
     usable = _usable(trajectories, layout)
     if usable < needed:
         total = sum(log.steps for log in trajectories)
         got = f"{total} transitions in {len(trajectories)} trajectories"
         if past > 1:
             got += f", {usable} of them with {past - 1} before them"
-        n_x, n_u, n_d = layout.n_x, layout.n_u, layout.n_d
         expected = f"at least {needed} such for past={past}, n_x={n_x}, n_u={n_u} and n_d={n_d}"
         remedy = f"Log trajectories of more than {past} steps, or lower past."
         raise QPError.expected("trajectories", got, expected, remedy)
-    X, _ = transitions(trajectories, past)
+    X, _ = transitions(trajectories, layout)
     middle = X.mean(0)
-    X, first = X - middle, past * layout.n_x
+    X = X - middle
     size = X.square().mean(0).sqrt()
     X = X / torch.where(size > 0, size, 1.0)
-    for i, column in enumerate(range(first, first + layout.n_u)):
+    for i in range(n_u):
+        column = X.shape[1] - n_u + i
         if size[column] <= STILL * middle[column].abs():
             got = f"entry {i} constant at {middle[column].item():.6g}"
             raise QPError.expected("action", got, "one that moves", EXCITE)

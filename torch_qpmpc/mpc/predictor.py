@@ -15,11 +15,16 @@ So C keeps the gauge of the band, with -1 at y_{k+1}, and differs from C_0 only 
 Its predictions are as general as those of a regression of each y_{k+1} on (p, u_0, .., u_k), since
 these determine the predicted y_1, .., y_k. But the ridge shrinks them to the ARX model's next step
 from the corrected prediction, instead of to zero, and an exact ARX model is not corrected.
+
+The ridge penalises changes of a signal's coefficients from each step to the next, as responses are
+smooth. So it averages over noise where a ridge on the coefficients themselves lowers all of them,
+and with them the predicted steady state.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -64,14 +69,14 @@ class Options(NamedTuple):
     ridge: float | None = None
 
 
-def arx(trajectories: Sequence[Trajectory], past: int, strength: float | None = None) -> Model:
-    """Fit an ARX model with L = ``past`` lags by `ridge` regression of that ``strength``."""
-    X, Y = transitions(trajectories, past)
-    middle, mean = X.mean(0), Y.mean(0)
-    W = ridge(X - middle, Y - mean, strength).mT
-    n_x, n_u, n_d = (part.shape[-1] for part in trajectories[0])
-    A, B, E = W.split((past * n_x, past * n_u, n_d), dim=-1)
-    return Model(A, B, E, mean - W @ middle)
+def arx(trajectories: Sequence[Trajectory], layout: Layout, strength: float | None = None) -> Model:
+    """Fit an ARX model with as many lags as the window of ``layout``; see `ridge`."""
+    X, Y = transitions(trajectories, layout)
+    W, offset = _regression(X, Y, _differences(layout, known(layout, 0)), strength)
+    E, window = W[:, : layout.n_d], W[:, layout.n_d :]
+    pairs = window.unflatten(-1, (layout.past, layout.n)).flip(-2)
+    A, B = (x.flatten(1) for x in pairs.split((layout.n_x, layout.n_u), dim=-1))
+    return Model(A, B, E, offset)
 
 
 def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[Model, Constraints]:
@@ -81,7 +86,7 @@ def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[Model, Co
     """
     layout, structure, causal, strength = options
     N, n_x = layout.horizon, layout.n_x
-    model = arx(trajectories, layout.past, strength)
+    model = arx(trajectories, layout, strength)
     C = banded_matrix(model.A, model.B, N, model.E)
     b = -model.offset.repeat(N)
     if structure == "tied":
@@ -92,18 +97,16 @@ def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[Model, Co
     for k in range(N):
         rows = slice(k * n_x, (k + 1) * n_x)
         last = k if causal or structure == "varying" else N - 1
-        read = _band(layout, k) if structure == "varying" else _known(layout, last)
+        read = _band(layout, k) if structure == "varying" else known(layout, last)
         # Starts whose windows end after the log are left out.
         inside = [slice(max(len(z) - last, 0)) for z in Z]
         pairs = list(zip(Z, measured, inside, strict=True))
         X = torch.cat([z[i] for z, _, i in pairs])
         if (k or last) and len(X) > SPANS * last:
             Y = torch.cat([y[i, outputs[k]] for _, y, i in pairs]) - X @ C[rows].mT + b[rows]
-            X = X[:, read]
-            middle, mean = X.mean(0), Y.mean(0)
-            change = ridge(X - middle, Y - mean, strength).mT
+            change, shift = _regression(X[:, read], Y, _differences(layout, read), strength)
             C[rows, read] += change
-            b[rows] += change @ middle - mean
+            b[rows] -= shift
         for z in Z:
             z[:, outputs[k]] = z @ C[rows].mT - b[rows]
     return model, Constraints(C, b)
@@ -154,21 +157,19 @@ def outputs_in(layout: Layout) -> Tensor:
     return first.unsqueeze(-1) + torch.arange(layout.n_x)
 
 
-def transitions(trajectories: Sequence[Trajectory], past: int) -> tuple[Tensor, Tensor]:
-    """Return the regressors and targets of an ARX model: [y lags, u lags, d] and the next y."""
-    X, Y = [], []
-    for log in trajectories:
-        if log.steps >= past:
-            X.append(
-                torch.cat((_lags(log.y[:-1], past), _lags(log.u, past), log.d[past - 1 :]), -1)
-            )
-            Y.append(log.y[past:])
-    return torch.cat(X), torch.cat(Y)
+def transitions(trajectories: Sequence[Trajectory], layout: Layout) -> tuple[Tensor, Tensor]:
+    """Return the regressors and targets of an ARX model: the columns `known` of z, and y_1."""
+    layout = replace(layout, horizon=1)
+    Z = torch.cat([windows(log, layout) for log in trajectories])
+    return Z[:, known(layout, 0)], Z[:, outputs_in(layout)[0]]
 
 
-def _lags(x: Tensor, count: int) -> Tensor:
-    """Return the ``count`` rows up to each row, the newest first, ``(T - count + 1, count n)``."""
-    return x.unfold(0, count, 1).flip(-1).mT.flatten(1)
+def known(layout: Layout, last: int) -> Tensor:
+    """Return the columns of z of d_0, .., d_last, the window and u_0, .., u_last."""
+    actions = torch.arange(last + 1).unsqueeze(-1) * layout.n + torch.arange(layout.n_u)
+    preview = torch.arange((last + 1) * layout.n_d)
+    window = torch.arange(layout.n_preview, layout.n_p)
+    return torch.cat((preview, window, layout.n_p + actions.flatten()))
 
 
 def _band(layout: Layout, k: int) -> Tensor:
@@ -177,9 +178,33 @@ def _band(layout: Layout, k: int) -> Tensor:
     return torch.cat((k * layout.n_d + torch.arange(layout.n_d), window))
 
 
-def _known(layout: Layout, last: int) -> Tensor:
-    """Return the columns of z of d_0, .., d_last, the window and u_0, .., u_last."""
-    actions = torch.arange(last + 1).unsqueeze(-1) * layout.n + torch.arange(layout.n_u)
-    preview = torch.arange((last + 1) * layout.n_d)
-    window = torch.arange(layout.n_preview, layout.n_p)
-    return torch.cat((preview, window, layout.n_p + actions.flatten()))
+def _regression(
+    X: Tensor, Y: Tensor, differences: Tensor, strength: float | None
+) -> tuple[Tensor, Tensor]:
+    """Return W and an offset of Y ~ X W' + offset, with a ridge on the differences in W."""
+    middle, mean = X.mean(0), Y.mean(0)
+    W = (differences @ ridge((X - middle) @ differences, Y - mean, strength)).mT
+    return W, mean - W @ middle
+
+
+def _differences(layout: Layout, read: Tensor) -> Tensor:
+    """Return the matrix from changes of coefficients to the coefficients of columns of z.
+
+    A coefficient is the sum of the changes up to its step, among those of its signal.
+    """
+    n, steps = layout.n, torch.arange(1 - layout.past, layout.horizon + 1)
+    size = layout.n_z - layout.n_preview
+    time = torch.cat(
+        (
+            torch.arange(layout.horizon + 1).repeat_interleave(layout.n_d),
+            steps.repeat_interleave(n)[:size],
+        )
+    )[read]
+    signal = torch.cat(
+        (
+            -1 - torch.arange(layout.n_d).repeat(layout.horizon + 1),
+            torch.arange(n).repeat(len(steps))[:size],
+        )
+    )[read]
+    earlier = time.unsqueeze(-1) >= time
+    return ((signal.unsqueeze(-1) == signal) & earlier).to(torch.float64)

@@ -14,7 +14,7 @@ from torch_qpmpc.experiment.rivals.deepc import DeePC, windows
 from torch_qpmpc.experiment.rivals.kalman_mpc import KalmanMPC
 from torch_qpmpc.experiment.rivals.logs import uniform_log
 from torch_qpmpc.experiment.rivals.tanks import four_tanks_rivals, tank_references_rivals
-from torch_qpmpc.experiment.tracking import set_point_options, window_model
+from torch_qpmpc.experiment.tracking import INPUT_WEIGHT, set_point_options, window_model
 
 
 def test_more_knowledge_costs_less_at_the_set_point():
@@ -137,12 +137,12 @@ def test_a_log_has_uniform_actions_and_seeds_of_its_own():
 def test_identified_from_a_log_the_tanks_cost_little_more_than_with_the_true_model():
     p = FourTanks()
     log = uniform_log(p, 1000, seed=1)
-    options = set_point_options(p, 1.0, input_weight=0.3)
+    options = set_point_options(p, 1.0, INPUT_WEIGHT)
     from_data = qm.QPMPC.from_data(
         log, p.horizon, past=p.past, n_x=2, ridge=0.0, solver="daqp", **options
     )
     A, B = window_model(p.A, p.B, *p.measurement(), p.past)
-    true = qm.QPMPC.from_model(A, B, p.horizon, solver="daqp", **set_point_options(p, 1.0))
+    true = qm.QPMPC.from_model(A, B, p.horizon, solver="daqp", **options)
     J = [plant_loop(mpc.policy, p, steps=100, starts=16, seed=3).J for mpc in (from_data, true)]
     assert J[0] == pytest.approx(218, abs=8)
-    assert J[0] < J[1]  # the plant's small weight of the inputs is not the best for N = 20
+    assert J[0] < 1.03 * J[1]

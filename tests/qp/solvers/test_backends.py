@@ -83,6 +83,18 @@ def test_parts_of_a_program_may_be_missing(solver, options):
     assert_solves(known_qp(1, batch=(4,), **options), solver)
 
 
+def one_sided(seed: int) -> KnownQP:
+    """Make QPs whose soft rows have an upper bound only."""
+    known = known_qp(seed, batch=(6,), soft=("above", "at_upper", "inside") * 2)
+    lb = known.qp.lb.masked_fill(known.qp.w.isfinite(), -torch.inf)
+    return replace(known, qp=replace(known.qp, lb=lb))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_soft_rows_with_one_bound(solver, seed):
+    assert_solves(one_sided(seed), solver)
+
+
 @pytest.mark.parametrize("weight", [1e-2, 1.0, 1e2, 1e4])
 def test_slack_weights_of_any_size(solver, weight):
     assert_solves(known_qp(2, batch=(6,), weight=weight), solver, scale=max(weight, 1.0))

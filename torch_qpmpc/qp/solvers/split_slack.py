@@ -26,8 +26,7 @@ class SplitSlack:
     n_rows: int
     over: np.ndarray  # rows that have a t+
     under: np.ndarray  # rows that have a t-
-    n_x: int  # variables: v and the slacks
-    n_in: int  # rows: those of G and the slacks' signs
+    n_t: int  # slacks
     H: list[sp.csc_matrix]
     rows: list[sp.csc_matrix]
 
@@ -47,11 +46,25 @@ class SplitSlack:
             n_rows,
             over,
             under,
-            n_v + n_t,
-            n_rows + n_t,
+            n_t,
             [sp.csc_matrix(sp.block_diag([H, blank])) for H in qps.H],
             [sp.csc_matrix(sp.vstack([sp.hstack([G, slack]), positive])) for G in qps.G],
         )
+
+    @property
+    def n_x(self) -> int:
+        """Number of variables: v and the slacks."""
+        return self.n_v + self.n_t
+
+    @property
+    def n_in(self) -> int:
+        """Number of rows: those of G and the slacks' signs."""
+        return self.n_rows + self.n_t
+
+    @property
+    def paired(self) -> bool:
+        """True if each soft row has two slacks."""
+        return np.array_equal(self.over, self.under)
 
     def gradient(self, g: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return the linear cost of x for one QP; a hard row's slack is fixed at zero."""

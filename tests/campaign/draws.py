@@ -1,0 +1,79 @@
+"""Random numbers of the campaign, and batches of QPs with their true outcomes."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp
+from torch_qpmpc import QuadraticProgram, Status
+
+#: Tolerance of a value, relative to the terms of the Lagrangian (see `tests.campaign.outcomes`).
+ACCURACY, FLOAT32 = 1e-5, 1e-3
+
+
+@dataclass(frozen=True)
+class Case:
+    """QPs with their true status ``(B,)``; ``known`` has the solutions of solvable ones."""
+
+    known: KnownQP
+    expected: Tensor
+    accuracy: float = ACCURACY
+
+
+class Draw(random.Random):
+    """The random numbers of a family, all from one seed."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(shape, generator=self.generator, dtype=torch.float64)
+
+    def powers(self, low: float, high: float, *shape: int) -> Tensor:
+        """Draw powers of ten with uniform exponents between ``low`` and ``high``."""
+        exponent = torch.rand(shape, generator=self.generator, dtype=torch.float64)
+        return 10 ** (low + (high - low) * exponent)
+
+    def known(self, count: int, **options: Any) -> KnownQP:
+        """Draw a batch of QPs of any size, with shared or separate matrices and few hard rows."""
+        n_z = self.randint(3, 14)
+        n_f = self.randint(0, min(4, n_z - 2))
+        n_c = self.randint(0, (n_z - n_f) // 2)
+        settings: dict[str, Any] = {
+            "batch": (count,),
+            "matrices": self.choice([(), (), (), (count,)]),
+            "n_z": n_z,
+            "n_f": n_f,
+            "n_c": n_c,
+            "soft": self.rows(SOFT_ROWS, 0, 8),
+            "hard": self.rows(HARD_ROWS, 0, (n_z - n_f - n_c) // 2),
+            "weight": 10 ** self.uniform(-1, 2),
+        }
+        return known_qp(self.getrandbits(32), **(settings | options))
+
+    def rows(self, kinds: tuple[str, ...], least: int, most: int) -> tuple[str, ...]:
+        return tuple(self.choices(kinds, k=self.randint(least, most)))
+
+    def combinations(self, rows: Tensor, count: int) -> Tensor:
+        """Draw ``count`` rows, each a multiple of one of ``rows`` or a sum of them."""
+        mix = self.normal(count, len(rows))
+        single = torch.rand(count, generator=self.generator) < 0.5
+        one = torch.eye(len(rows)).double()[torch.arange(count) % len(rows)]
+        factor = torch.tensor([self.choice([1.0, -1.0, 0.5, 3.0]) for _ in range(count)]).double()
+        return torch.where(single[:, None], factor[:, None] * one, mix) @ rows
+
+
+def solvable(known: KnownQP, accuracy: float = ACCURACY) -> Case:
+    return Case(known, torch.full(known.value.shape, int(Status.SOLVED)), accuracy)
+
+
+def changed(known: KnownQP, **tensors: Tensor) -> KnownQP:
+    """Replace tensors of a QP without checks."""
+    parts: dict[str, Any] = vars(known.qp) | tensors
+    return replace(known, qp=QuadraticProgram(**parts, check_values=False))
