@@ -129,13 +129,13 @@ def test_a_qp_learns_alike_in_any_units(name, options):
         one = optimizers[0].step(p, a, target)
         same = optimizers[1].step(column[: plain.n_p] * p, u * a, cost * target)
         assert same.accepted == one.accepted
-        assert same.ratio == pytest.approx(one.ratio, rel=1e-5, nan_ok=True)
-        assert_close(same.solution.value / cost, one.solution.value, rtol=1e-6, atol=1e-7)
+        assert same.ratio == pytest.approx(one.ratio, rel=1e-4, nan_ok=True)
+        assert_close(same.solution.value / cost, one.solution.value, rtol=1e-5, atol=1e-5)
         errors.append((one.solution.value - target).square().mean().item())
-    assert_close(other.C / row.unsqueeze(-1) * column, plain.C, rtol=1e-5, atol=1e-6)
-    assert_close(other.b / row, plain.b, rtol=1e-5, atol=1e-6)
-    assert_close(other.q / cost * column, plain.q, rtol=1e-5, atol=1e-6)
-    assert_close(other.c / cost, plain.c, rtol=1e-5, atol=1e-6)
+    assert_close(other.C / row.unsqueeze(-1) * column, plain.C, rtol=1e-4, atol=1e-5)
+    assert_close(other.b / row, plain.b, rtol=1e-4, atol=1e-5)
+    assert_close(other.q / cost * column, plain.q, rtol=1e-4, atol=1e-5)
+    assert_close(other.c / cost, plain.c, rtol=1e-4, atol=1e-5)
     assert errors[-1] < 0.5 * errors[0]
 
 
