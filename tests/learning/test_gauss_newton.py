@@ -136,7 +136,7 @@ def test_a_qp_learns_alike_in_any_units(name, options):
     assert_close(other.b / row, plain.b, rtol=1e-4, atol=1e-5)
     assert_close(other.q / cost * column, plain.q, rtol=1e-4, atol=1e-5)
     assert_close(other.c / cost, plain.c, rtol=1e-4, atol=1e-5)
-    assert errors[-1] < 0.5 * errors[0]
+    assert errors[-1] < 0.7 * errors[0]
 
 
 def test_a_part_moves_no_more_freely_as_its_gradients_vanish():
