@@ -46,7 +46,7 @@ class Reference:
         d, stages = z[:, :preview], z[:, preview:]
         stages = torch.cat((stages, stages.new_full((len(z), mpc.n_u), torch.nan)), dim=-1)
         values = [stages.reshape(-1, n), d.reshape(len(z) * (mpc.horizon + 1), mpc.n_d)]
-        self.m = self.m.maximum(torch.cat([x.square().nanmean(0) for x in values]))
+        self.m = (0.9 * self.m).maximum(torch.cat([x.square().nanmean(0) for x in values]))
         stage, d = self.m.split((n, mpc.n_d))
         row = stage[: mpc.n_x].repeat(mpc.horizon)
         column = torch.cat((d.repeat(mpc.horizon + 1), stage.repeat(mpc.past + mpc.horizon)))
@@ -68,7 +68,7 @@ class Reference:
         sizes = dict.fromkeys(self.parts, 0.0)
         for part, rows, unit in zip(self.parts, gradients, units, strict=True):
             sizes[part] += (unit * rows.square()).sum(-1).mean().item()
-        self.sizes = {part: max(size, self.sizes[part]) for part, size in sizes.items()}
+        self.sizes = {part: max(size, 0.9 * self.sizes[part]) for part, size in sizes.items()}
         model = sum(size for part, size in self.sizes.items() if part not in COST)
         found = []
         for part, scale, unit in zip(self.parts, self.scales, units, strict=True):

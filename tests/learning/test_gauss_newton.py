@@ -154,6 +154,19 @@ def test_a_part_moves_no_more_freely_as_its_gradients_vanish():
     assert mpc.c > 0.9
 
 
+def test_a_size_is_forgotten_slowly():
+    """A first batch that is far larger than all others damps C less with each step."""
+    (s, a), sizes = pairs(), []
+    mpc = random_mpc(2, free=0.0, learn=("c", "C"))
+    optimizer = GaussNewton(mpc, trust_region=False)
+    group = next(group for group in optimizer.param_groups if group["name"] == "C")
+    for scale in (1.0, *[1e-2] * 10):
+        p, u = scale * s, scale * a
+        optimizer.step(p, u, mpc.action_value(p, u).detach())
+        sizes.append(group["size"])
+    assert sizes == pytest.approx([sizes[0] * 0.9**k for k in range(11)])
+
+
 @pytest.mark.parametrize("memory", [0, 4])
 def test_signals_that_are_always_zero_do_no_harm(memory):
     """From the origin nothing has a gradient but c; then one state is zero, and then none."""

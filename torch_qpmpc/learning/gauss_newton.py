@@ -9,18 +9,19 @@ a system of the batch's size. mu is a fraction of the mean of K's diagonal.
 
 D is diagonal and has no free units. For each part p of theta
 
-    D_p = scale_p U_p / size_p,    size_p = max over batches of mean_i g_ip'U_p g_ip,
+    D_p = scale_p U_p / size_p,    size_p <- max(mean_i g_ip'U_p g_ip, 0.9 size_p),
 
 so that mu damps each part in relation to its own gradients. A part of the cost has a size of its
-own; C, b, G, lb and ub share the sum of theirs, as they describe one model. Sizes never fall, as
+own; C, b, G, lb and ub share the sum of theirs, as they describe one model. Sizes rise at once, as
 those of MINPACK's scaling: otherwise a part would move the more freely, the less Q depends on it.
+They fall slowly, so that the large gradients of a bad start do not damp a part for ever.
 
-U is the identity except where C is free. With m_j the largest mean square of signal j, an entry of
-x, u or d, over a batch and z's stages, U is m_i / m_j for the entry of C in a row that predicts x's
-entry i and a column of signal j, and m_i for that row's entry of b: entries are measured by the
-prediction's relative change. For q it is 1 / m_j. The step is then the same in any unit of the cost
-and, for c, q, C and b, in any units of the signals. A signal has one m for all stages, because a
-single entry of z may be nearly zero in a batch without being small.
+U is the identity except where C is free. With m_j the mean square of signal j, an entry of x, u
+or d, over a batch and z's stages, with the same slow fall, U is m_i / m_j for the entry of C in a
+row that predicts x's entry i and a column of signal j, and m_i for that row's entry of b: entries
+are measured by the prediction's relative change. For q it is 1 / m_j. The step is then the same in
+any unit of the cost and, for c, q, C and b, in any units of the signals. A signal has one m for all
+stages, because a single entry of z may be nearly zero in a batch without being small.
 
 The gradients in a free C are the outer products chi_i z_i', so that ``K = (chi chi') * (z P z')``
 is computed without forming them. P is the metric of C's rows: U's or, with the SI penalty
@@ -52,6 +53,8 @@ from torch_qpmpc.qp.solution import QPSolution
 POOR, GOOD = 0.25, 0.75
 #: Smallest size of a part and smallest mean square of a signal, as a fraction of the largest.
 FLOOR = 1e-12
+#: Factor by which a size or a mean square can fall from one batch to the next.
+FORGET = 0.9
 #: Factors by which the damping rises and falls, and its upper bound.
 RISE, FALL, MAX_DAMPING = 4.0, 0.5, 1e6
 
@@ -350,7 +353,7 @@ class GaussNewton(torch.optim.Optimizer):
         squares = torch.zeros_like(z[0, : len(count)]).index_add(0, signals, z.square().mean(0))
         m = squares / count
         if group["signals"] is not None:
-            m = m.maximum(m.new_tensor(group["signals"]))
+            m = m.maximum(FORGET * m.new_tensor(group["signals"]))
         if m.isfinite().all():
             group["signals"] = m.tolist()
         m = torch.where(m > 0, m.clamp(min=FLOOR * m.max()), 1)
@@ -364,7 +367,7 @@ class GaussNewton(torch.optim.Optimizer):
         for block in blocks:
             group = block.group
             if math.isfinite(size := sizes[group["name"]]):
-                group["size"] = max(group["size"], size)
+                group["size"] = max(FORGET * group["size"], size)
             sizes[group["name"]] = group["size"]
         model = sum(size for name, size in sizes.items() if name not in COST)
         least = FLOOR * max(sizes.values(), default=0.0)
