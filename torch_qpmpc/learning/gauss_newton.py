@@ -252,6 +252,19 @@ class GaussNewton(torch.optim.Optimizer):
         self._adapt(ratio)
         return StepReport(solution, damping, ratio, accepted, *left_out)
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load a `state_dict` of a GaussNewton of the same QPMPC.
+
+        Raises:
+            QPError: it is from a version whose metric had units, and has scales of another meaning.
+        """
+        groups = state_dict.get("param_groups", [])
+        if not all({"size", "signals"} <= group.keys() for group in groups):
+            got, want = "groups without size and signals, of an earlier metric", "both"
+            remedy = "Start with a new GaussNewton: its scales have no unit."
+            raise QPError.expected("state_dict", got, want, remedy)
+        super().load_state_dict(state_dict)
+
     def __reduce__(self) -> tuple:
         # The copy would hold a QPMPC of its own, apart from its owner's copy of it.
         raise QPError.expected(
