@@ -32,8 +32,8 @@ from torch_qpmpc.experiment.checkpoint import CHECKPOINT, drop_previous, save_ch
 from torch_qpmpc.experiment.collection import batches, make_collector, make_run_replay
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.evaluation import Evaluation
-from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.exporting import export_run
+from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.interrupt import Interrupt
 from torch_qpmpc.experiment.launch import launched
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics

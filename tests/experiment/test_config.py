@@ -34,7 +34,7 @@ GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
-NOT_NEEDED = ("eval_seed", "gate", "logger", "start.name", "task.file")
+NOT_NEEDED = ("eval_seed", "gate", "logger", "start.name", "target_horizon", "task.file")
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
@@ -218,6 +218,7 @@ BAD: dict[str, list[Any]] = {
     "td_error_clip": [0, *REAL[:-1]],
     "delay_value": FLAG,
     "target_rate": FRACTION,
+    "target_horizon": ["long", *NAME],
     "step": ["newton", *NAME],
     "penalty_step": ["newton", *NAME],
     "ablation": [3, True],
@@ -415,7 +416,7 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     cfg, file = make_config("gate=false"), tmp_path / "config.yaml"
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
-    for key in ("logger", "eval_seed", "start", "gate", "search"):
+    for key in ("logger", "eval_seed", "start", "gate", "search", "target_horizon"):
         del cfg[key]
     OmegaConf.save(cfg, file)
     assert differences(settings(cfg), now) is None
@@ -520,6 +521,18 @@ def test_solver_must_be_known():
         (
             ["task=gros_zanon", "noise.std=0.1"],
             "noise.std: got 0.1, expected null. The noise of gros_zanon cannot be changed",
+        ),
+        (
+            ["target_horizon=shrinking", "task.horizon=1"],
+            "task.horizon: got 1, expected at least 2. target_horizon=shrinking drops",
+        ),
+        (
+            ["target_horizon=shrinking", "task.hessian=full"],
+            "task.hessian: got 'full', expected diagonal or block. target_horizon=shrinking",
+        ),
+        (
+            ["target_horizon=shrinking", "algo=td3"],
+            "target_horizon: got 'shrinking', expected receding. td3 does not support",
         ),
         (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
     ],

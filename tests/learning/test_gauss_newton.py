@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torch.testing import assert_close
 
+from tests.gauss_newton import Reference
 from tests.problems import MIXED, normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SystemIdentificationPenalty
 from torch_qpmpc.learning.gauss_newton import FALL, RISE
@@ -25,84 +26,44 @@ PARTS = {
     "projected": {"step": "projection", "hessian": "full", "learn": ("H", "w"), "free": 0.01},
     "tied": {"structure": "tied", "learn": ("c", "q", "C", "b", "lb", "ub", "w"), "free": 0.01},
     "varying": {"structure": "varying", "learn": ("C", "G"), **MIXED},
+    "prefix": {"past": 2, "n_d": 1, "learn": ("H", "q", "c", "C", "b")},
 }
 
 
-def pairs(count: int = COUNT) -> tuple[Tensor, Tensor]:
-    return random_states(count, size=0.9), random_states(count, 1, size=0.45, seed=1)
+def pairs(count: int = COUNT, n_p: int = 2) -> tuple[Tensor, Tensor]:
+    return random_states(count, n_p, size=0.9), random_states(count, 1, size=0.45, seed=1)
 
 
 def targets(mpc: QPMPC, size: float = 0.1) -> Tensor:
-    s, a = pairs()
+    s, a = pairs(n_p=mpc.n_p)
     return mpc.action_value(s, a).detach() + size * normal(COUNT, seed=2)
-
-
-def leaves_of(optimizer: GaussNewton) -> list[Tensor]:
-    return [leaf for group in optimizer.param_groups for leaf in group["params"]]
-
-
-def dense_gradients(mpc: QPMPC, leaves: list[Tensor]) -> list[Tensor]:
-    """Compute dQ_i/dleaf as rows ``(B, n)``, one pair at a time."""
-    s, a = pairs()
-    rows = []
-    for i in range(COUNT):
-        value = mpc.action_value(s[i], a[i])
-        found = torch.autograd.grad(value, leaves, allow_unused=True, materialize_grads=True)
-        rows.append([part.flatten() for part in found])
-    return [torch.stack(part) for part in zip(*rows, strict=True)]
-
-
-def expected_steps(mpc: QPMPC, optimizer: GaussNewton, S: Tensor | None) -> list[Tensor]:
-    """Compute the damped least-squares step with a dense system in theta."""
-    leaves = leaves_of(optimizer)
-    scales = [group["scale"] for group in optimizer.param_groups for _ in group["params"]]
-    gradients = dense_gradients(mpc, leaves)
-    sizes = [scale * g.square().sum(-1) for scale, g in zip(scales, gradients, strict=True)]
-    mu = DAMPING * torch.stack(sizes).sum(0).mean()
-    G = torch.cat(gradients, dim=1)
-    scale = torch.cat([torch.full_like(g[0], d) for g, d in zip(gradients, scales, strict=True)])
-    s, a = pairs()
-    delta = targets(mpc) - mpc.action_value(s, a).detach()
-    normal_matrix, right = G.mT @ G + torch.diag(mu / scale), G.mT @ delta
-    if S is not None:
-        at = 0
-        for leaf in leaves:
-            if leaf is mpc.C:
-                of_rows = torch.block_diag(*[COUNT * S] * len(leaf))
-                part = slice(at, at + leaf.numel())
-                normal_matrix[part, part] += of_rows
-                right[part] -= of_rows @ leaf.detach().flatten()
-            at += leaf.numel()
-    step = torch.linalg.solve(normal_matrix, right)
-    parts = step.split([leaf.numel() for leaf in leaves])
-    return [x.reshape(leaf.shape) for x, leaf in zip(parts, leaves, strict=True)]
 
 
 @pytest.mark.parametrize("name", PARTS)
 def test_the_step_is_the_damped_least_squares_step(name):
     mpc = random_mpc(2, **PARTS[name])
     optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
-    leaves = leaves_of(optimizer)
-    before = [leaf.detach().clone() for leaf in leaves]
-    expected = expected_steps(mpc, optimizer, None)
-    report = optimizer.step(*pairs(), targets(mpc))
-    assert report.accepted
-    assert math.isnan(report.ratio)
-    assert max(step.abs().max() for step in expected) > 1e-4
-    for leaf, old, step in zip(leaves, before, expected, strict=True):
-        assert_close(leaf.detach() - old, step, rtol=1e-5, atol=1e-9)
+    reference = Reference(mpc, optimizer)
+    for size in (0.1, 0.02):
+        (s, a), target, before = pairs(n_p=mpc.n_p), targets(mpc, size), reference.theta()
+        expected = reference.step(s, a, target)
+        report = optimizer.step(s, a, target)
+        assert report.accepted
+        assert math.isnan(report.ratio)
+        assert expected.abs().max() > 1e-5
+        assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
 
 
-def test_the_si_penalty_is_part_of_the_step():
-    mpc = random_mpc(3)
+@pytest.mark.parametrize("learn", [("H", "c", "C"), ("C", "b")])
+def test_the_si_penalty_is_part_of_the_step(learn):
+    mpc = random_mpc(3, learn=learn)
     optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
+    reference = Reference(mpc, optimizer)
     S = SystemIdentificationPenalty(1e-2).curvature(normal(5, mpc.n_z))
-    leaves = leaves_of(optimizer)
-    before = [leaf.detach().clone() for leaf in leaves]
-    expected = expected_steps(mpc, optimizer, S)
-    optimizer.step(*pairs(), targets(mpc), penalty=S)
-    for leaf, old, step in zip(leaves, before, expected, strict=True):
-        assert_close(leaf.detach() - old, step, rtol=1e-5, atol=1e-9)
+    before, target = reference.theta(), targets(mpc)
+    expected = reference.step(*pairs(), target, S)
+    optimizer.step(*pairs(), target, penalty=S)
+    assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", PARTS)
@@ -110,22 +71,130 @@ def test_a_memory_preserves_past_pairs(name):
     """A stream of single pairs steps as if past pairs were in the batch with zero error."""
     mpc = random_mpc(2, **PARTS[name])
     optimizer = GaussNewton(mpc, damping=DAMPING, memory=3, trust_region=False)
-    leaves, (s, a), target = leaves_of(optimizer), pairs(), targets(mpc)
-    scales = [group["scale"] for group in optimizer.param_groups for _ in group["params"]]
-    scale = torch.cat([torch.full((x.numel(),), d) for x, d in zip(leaves, scales, strict=True)])
-    rows = torch.zeros(0, len(scale)).double()
+    reference = Reference(mpc, optimizer)
+    (s, a), target = pairs(n_p=mpc.n_p), targets(mpc)
     for i in range(COUNT):
-        value = mpc.action_value(s[i], a[i])
-        found = torch.autograd.grad(value, leaves, allow_unused=True, materialize_grads=True)
-        rows = torch.cat((torch.cat([part.flatten() for part in found]).unsqueeze(0), rows))[:4]
-        mu = DAMPING * (scale * rows.square()).sum(-1).mean()
-        matrix = rows.mT @ rows + torch.diag(mu / scale)
-        expected = torch.linalg.solve(matrix, rows[0] * (target[i] - value).detach())
-        before = torch.cat([leaf.detach().flatten() for leaf in leaves])
-        optimizer.step(s[i : i + 1], a[i : i + 1], target[i : i + 1])
-        after = torch.cat([leaf.detach().flatten() for leaf in leaves])
-        assert_close(after - before, expected, rtol=1e-4, atol=1e-8)
-        rows = rows[:3]
+        pair = s[i : i + 1], a[i : i + 1], target[i : i + 1]
+        before, expected = reference.theta(), reference.step(*pair, past=3)
+        optimizer.step(*pair)
+        assert_close(reference.theta() - before, expected, rtol=1e-4, atol=1e-8)
+
+
+def in_units(x: Tensor, u: float, d: float, cost: float, learn: tuple[str, ...]) -> QPMPC:
+    """Make one QP with a prefix in units x ``(2,)`` of the states, u, d, and of the cost."""
+    A = torch.tensor([[1.0, 0.2, 0.1, 0.0], [-0.1, 0.9, 0.0, -0.2]]).double()
+    B = torch.tensor([[0.1, 0.05], [0.3, -0.1]]).double()
+    of_row, bound = x.unsqueeze(-1), torch.ones(2)
+    return QPMPC(
+        2,
+        1,
+        4,
+        past=2,
+        n_d=1,
+        A=of_row * A / torch.cat((x, x)),
+        B=of_row * B / u,
+        E=of_row * torch.tensor([[0.3], [0.1]]) / d,
+        state_bounds=(-x * bound, x * bound),
+        action_bounds=([-0.5 * u], [0.5 * u]),
+        stage_weight=cost * torch.tensor([1.0, 0.5, 0.1]) / torch.cat((x, torch.tensor([u]))) ** 2,
+        terminal_weight=cost / x**2,
+        state_slack=10 * cost / x,
+        learn=learn,
+        solver="daqp",
+    )
+
+
+#: Units of the states, the action, the preview and the cost, and the parts that learn alike.
+UNITS = {
+    "unlike states": ((1e-2, 1e2), 1.0, 1.0, 1.0, ("q", "c", "C", "b")),
+    "temperatures and prices": ((20.0, 5.0), 3.0, 0.15, 1.0, ("q", "c", "C", "b")),
+    "cost": ((1.0, 1.0), 1.0, 1.0, 1e-3, ("H", "q", "c", "C", "b", "lb", "ub")),
+}
+
+
+@pytest.mark.parametrize("options", [{}, {"memory": 9}, {"trust_region": False, "lr": 0.5}])
+@pytest.mark.parametrize("name", UNITS)
+def test_a_qp_learns_alike_in_any_units(name, options):
+    states, u, d, cost, learn = UNITS[name]
+    x = torch.tensor(states, dtype=torch.float64)
+    plain = in_units(torch.ones(2).double(), 1.0, 1.0, 1.0, learn)
+    other = in_units(x, u, d, cost, learn)
+    column, row = torch.cat((x, torch.tensor([u, d])))[plain._layout.signals()], x.repeat(4)
+    optimizers = [GaussNewton(mpc, **options) for mpc in (plain, other)]
+    errors = []
+    for update in range(8):
+        p = random_states(COUNT, plain.n_p, size=0.9, seed=update)
+        a, s = random_states(COUNT, 1, size=0.45, seed=update + 9), p[:, -2:]
+        target = (s @ torch.tensor([[1.5, 0.4], [0.4, 1.0]]).double() * s).sum(-1) + p[:, 0] + 1.0
+        one = optimizers[0].step(p, a, target)
+        same = optimizers[1].step(column[: plain.n_p] * p, u * a, cost * target)
+        assert same.accepted == one.accepted
+        assert same.ratio == pytest.approx(one.ratio, rel=1e-4, nan_ok=True)
+        assert_close(same.solution.value / cost, one.solution.value, rtol=1e-5, atol=1e-5)
+        errors.append((one.solution.value - target).square().mean().item())
+    assert_close(other.C / row.unsqueeze(-1) * column, plain.C, rtol=1e-4, atol=1e-5)
+    assert_close(other.b / row, plain.b, rtol=1e-4, atol=1e-5)
+    assert_close(other.q / cost * column, plain.q, rtol=1e-4, atol=1e-5)
+    assert_close(other.c / cost, plain.c, rtol=1e-4, atol=1e-5)
+    assert errors[-1] < 0.7 * errors[0]
+
+
+def test_a_part_moves_no_more_freely_as_its_gradients_vanish():
+    """A single pair near the origin has hardly any gradient in C, but one in c."""
+    s, a = pairs()
+    for steps in (0, 3):
+        mpc = random_mpc(2, free=0.0, learn=("c", "C"))
+        optimizer = GaussNewton(mpc, trust_region=False)
+        for _ in range(steps):
+            optimizer.step(s, a, mpc.action_value(s, a).detach())
+        C = mpc.C.detach().clone()
+        optimizer.step(1e-3 * s[:1], 1e-3 * a[:1], torch.ones(1).double())
+        moved = (mpc.C.detach() - C).abs().max()
+        assert (moved < 1e-5) == (steps > 0)
+    assert mpc.c > 0.9
+
+
+def test_a_size_is_forgotten_slowly():
+    """A first batch that is far larger than all others damps C less with each step."""
+    (s, a), sizes = pairs(), []
+    mpc = random_mpc(2, free=0.0, learn=("c", "C"))
+    optimizer = GaussNewton(mpc, trust_region=False)
+    group = next(group for group in optimizer.param_groups if group["name"] == "C")
+    for scale in (1.0, *[1e-2] * 10):
+        p, u = scale * s, scale * a
+        optimizer.step(p, u, mpc.action_value(p, u).detach())
+        sizes.append(group["size"])
+    assert sizes == pytest.approx([sizes[0] * 0.9**k for k in range(11)])
+
+
+@pytest.mark.parametrize("memory", [0, 4])
+def test_signals_that_are_always_zero_do_no_harm(memory):
+    """From the origin nothing has a gradient but c; then one state is zero, and then none."""
+    mpc = QPMPC.from_model(0.9 * torch.eye(2), [[0.0], [1.0]], 3, learn=("c", "C"), solver="daqp")
+    optimizer = GaussNewton(mpc, memory=memory)
+    for s in ([0.0, 0.0], [0.0, 1.0], [1.0, 1.0]):
+        s, a = torch.tensor([s]).double(), torch.zeros(1, 1).double()
+        target = mpc.action_value(s, a).detach() + 0.1
+        C = mpc.C.detach().clone()
+        assert optimizer.step(s, a, target).accepted
+        assert (mpc.action_value(s, a) - target).abs() < 0.05
+        assert (mpc.C - C).abs().max() < 0.1
+
+
+def test_the_sizes_are_part_of_the_state():
+    mpc = random_mpc(2, learn=("c", "C", "b"))
+    optimizer = GaussNewton(mpc)
+    s, a = pairs()
+    optimizer.step(2 * s, a, mpc.action_value(2 * s, a).detach())  # larger than those that follow
+    state = copy.deepcopy(optimizer.state_dict())
+    twins = [copy.deepcopy(mpc) for _ in range(2)]
+    resumed, fresh = (GaussNewton(twin) for twin in twins)
+    resumed.load_state_dict(state)
+    target = targets(mpc)
+    for other in (optimizer, resumed, fresh):
+        other.step(0.5 * s, a, target)
+    assert_close(twins[0].state_dict(), mpc.state_dict(), rtol=0, atol=0)
+    assert not torch.allclose(twins[1].C, mpc.C)
 
 
 def test_a_memory_is_part_of_the_state():
@@ -249,6 +318,15 @@ def test_its_state_can_be_saved():
     fresh = GaussNewton(mpc)
     fresh.load_state_dict(optimizer.state_dict())
     assert fresh.step(*pairs(), targets(mpc)).damping == 0.7
+
+
+def test_a_state_of_the_earlier_metric_is_refused():
+    optimizer = GaussNewton(random_mpc(11))
+    state = optimizer.state_dict()
+    for group in state["param_groups"]:
+        del group["size"], group["signals"]
+    with pytest.raises(QPError, match="state_dict: got groups without size and signals, of an"):
+        optimizer.load_state_dict(state)
 
 
 def test_a_warm_start_saves_time_only():

@@ -123,7 +123,8 @@ def test_invalid_rewards_are_counted_under_their_own_name(second):
     batch["action"][2] = 9.0  # beyond a hard bound
     batch["next", "reward"][4] = torch.nan
     if second:
-        update = second_order(mpc, loss, GaussNewton(mpc), None, None)
+        optimizer = GaussNewton(mpc, trust_region=False)
+        update = second_order(mpc, loss, optimizer, None, None)
     else:
         update = first_order(mpc, loss, torch.optim.SGD(mpc.parameters(), 1e-3), None, None)
     before = mpc.C.detach().clone()

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
+from tests.gauss_newton import Reference
 from tests.problems import random_mpc, random_states
 from tests.transitions import make_batch
 from torch_qpmpc import (
@@ -81,43 +82,20 @@ def test_no_optimiser_moves_frozen_entries(kind, name):
     moves(mpc, C, mask)
 
 
+@pytest.mark.parametrize("penalised", [False, True])
 @pytest.mark.parametrize("memory", [0, 16])
 @pytest.mark.parametrize("kind", MASKS)
-def test_a_gauss_newton_step_is_that_in_the_learned_entries_alone(kind, memory):
-    """The reference is the dense system of all learned entries, from autograd's gradients."""
+def test_a_gauss_newton_step_is_that_in_the_learned_entries_alone(kind, memory, penalised):
     mask = MASKS[kind]()
     mpc = masked(mask)
     s, a, target = targets(mpc)
-    damping, scale = 0.1, 1e-2
-    optimizer = GaussNewton(
-        mpc,
-        scales={"cost": 1.0, "constraints": scale},
-        damping=damping,
-        trust_region=False,
-        memory=memory,
-    )
-    leaves = list(mpc.parameters())
-    names = [name for name, _ in mpc.named_parameters()]
-    rates = torch.cat(
-        [
-            torch.full((p.numel(),), scale if ".C." in n else 1.0).double()
-            for n, p in zip(names, leaves, strict=True)
-        ]
-    )
-    values = mpc.action_value(s, a)
-    J = torch.stack(
-        [
-            torch.cat([g.flatten() for g in torch.autograd.grad(v, leaves, retain_graph=True)])
-            for v in values
-        ]
-    )
-    K = J * rates @ J.mT
-    mu = damping * K.diagonal().mean()
-    alpha = torch.linalg.solve(K + mu * torch.eye(len(K)), target - values.detach())
-    expected = torch.nn.utils.parameters_to_vector(leaves).detach() + rates * (alpha @ J)
+    S = SystemIdentificationPenalty(1e-2).curvature(random_states(20, N_Z)) if penalised else None
+    optimizer = GaussNewton(mpc, damping=0.1, trust_region=False, memory=memory)
+    reference = Reference(mpc, optimizer)
+    before, expected = reference.theta(), reference.step(s, a, target, S)
     C = mpc.C.detach().clone()
-    assert optimizer.step(s, a, target).accepted
-    assert_close(torch.nn.utils.parameters_to_vector(leaves).detach(), expected)
+    assert optimizer.step(s, a, target, penalty=S).accepted
+    assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
     moves(mpc, C, mask)
 
 

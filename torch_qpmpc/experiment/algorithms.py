@@ -85,7 +85,10 @@ def make_learner(
     mpc = operator.module
     if cfg.algo.name == "qlearning":
         loss_module = QPQLearningLoss(
-            operator, delay_value=cfg.delay_value, td_error_clip=cfg.td_error_clip
+            operator,
+            delay_value=cfg.delay_value,
+            horizon=cfg.target_horizon,
+            td_error_clip=cfg.td_error_clip,
         )
         actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
     else:

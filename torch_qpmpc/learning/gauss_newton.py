@@ -5,10 +5,28 @@ With g_i = dQ(s_i, a_i)/dtheta by the envelope theorem and a metric D on theta, 
     min over dtheta:  1/2 sum_i (delta_i - g_i'dtheta)^2 + 1/2 mu dtheta'D^-1 dtheta
 
 by its dual, ``dtheta = D sum_i alpha_i g_i``, ``(K + mu I) alpha = delta``, ``K_ij = g_i'D g_j``,
-a system of the batch's size. The gradients in a free C are the outer products chi_i z_i', so that
-``K = (chi chi') * (z P z')`` is computed without forming them. P is the metric of C's rows: a
-multiple of the identity or, with the SI penalty (eq:sdp3), which is quadratic in each row, the
-inverse of the summed curvatures of damping and penalty. The penalty thus enters the same step.
+a system of the batch's size. mu is a fraction of the mean of K's diagonal.
+
+D is diagonal and has no free units. For each part p of theta
+
+    D_p = scale_p U_p / size_p,    size_p <- max(mean_i g_ip'U_p g_ip, 0.9 size_p),
+
+so that mu damps each part in relation to its own gradients. A part of the cost has a size of its
+own; C, b, G, lb and ub share the sum of theirs, as they describe one model. Sizes rise at once, as
+those of MINPACK's scaling: otherwise a part would move the more freely, the less Q depends on it.
+They fall slowly, so that the large gradients of a bad start do not damp a part for ever.
+
+U is the identity except where C is free. With m_j the mean square of signal j, an entry of x, u
+or d, over a batch and z's stages, with the same slow fall, U is m_i / m_j for the entry of C in a
+row that predicts x's entry i and a column of signal j, and m_i for that row's entry of b: entries
+are measured by the prediction's relative change. For q it is 1 / m_j. The step is then the same in
+any unit of the cost and, for c, q, C and b, in any units of the signals. A signal has one m for all
+stages, because a single entry of z may be nearly zero in a batch without being small.
+
+The gradients in a free C are the outer products chi_i z_i', so that ``K = (chi chi') * (z P z')``
+is computed without forming them. P is the metric of C's rows: U's or, with the SI penalty
+(eq:sdp3), which is quadratic in each row, the inverse of the summed curvatures of damping and
+penalty. The penalty thus enters the same step.
 """
 
 from __future__ import annotations
@@ -26,12 +44,17 @@ from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tenso
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
+from torch_qpmpc.mpc.validation import COST
 from torch_qpmpc.qp.derivatives import envelope_gradients
 from torch_qpmpc.qp.program import EVENT_SHAPES
 from torch_qpmpc.qp.solution import QPSolution
 
 #: A ratio of actual to predicted decrease below POOR raises the damping; one above GOOD lowers it.
 POOR, GOOD = 0.25, 0.75
+#: Smallest size of a part and smallest mean square of a signal, as a fraction of the largest.
+FLOOR = 1e-12
+#: Factor by which a size or a mean square can fall from one batch to the next.
+FORGET = 0.9
 #: Factors by which the damping rises and falls, and its upper bound.
 RISE, FALL, MAX_DAMPING = 4.0, 0.5, 1e6
 
@@ -74,8 +97,9 @@ class GaussNewton(torch.optim.Optimizer):
 
     Args:
         mpc: the QPMPC. With ``on_failure="mask"``, pairs without a solution are left out.
-        scales: the metric D, a factor for each learned part of theta or for the ``"cost"`` and the
-            ``"constraints"``, as in `QPMPC.parameter_groups`. Only their ratios matter.
+        scales: the factor in the metric D of each learned part of theta, or of all parts of the
+            ``"cost"`` and of the ``"constraints"``, as in `QPMPC.parameter_groups`. They have no
+            unit, and only their ratios matter; by default 1 and 3.
         lr: the initial fraction, in (0, 1].
         damping: mu as a fraction of the mean of K's diagonal, and the trust region's lower bound
             on it. A larger one makes a step less sensitive to its batch's noise.
@@ -121,10 +145,11 @@ class GaussNewton(torch.optim.Optimizer):
         if td_error_clip is not None:
             check_number("td_error_clip", td_error_clip, _positive, "a finite number > 0")
         check_flag("trust_region", trust_region)
-        groups = mpc.parameter_groups(scales or {"cost": 1.0, "constraints": 1e-2})
+        groups = mpc.parameter_groups(scales or {"cost": 1.0, "constraints": 3.0})
         for group in groups:
             check_number(f"scales[{group['name']}]", group["lr"], _positive, "a finite number > 0")
             group |= {"scale": group["lr"], "lr": lr, "damping": damping}
+            group |= {"size": 0.0, "signals": None}
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
         self._clip, self._memory, self._trust_region = td_error_clip, memory, trust_region
@@ -188,6 +213,7 @@ class GaussNewton(torch.optim.Optimizer):
             penalty = (len(s) - sum(left_out)) * penalty
         lr, damping = group["lr"], group["damping"]
         blocks = self._blocks(solution, use, penalty)
+        self._scale(blocks, int(use.sum()))
         for block in blocks:
             block.remember(self.state[block.leaf], self._memory)
         # Past pairs have no TD errors: they contribute their curvature alone.
@@ -197,9 +223,11 @@ class GaussNewton(torch.optim.Optimizer):
         steps = [block.step(alpha) for block in blocks]
         before = _objective(delta, blocks)
         if not before.isfinite() or not all(step.isfinite().all() for step in steps):
-            # Overflow: raise the damping and clear the memory.
+            # Overflow: raise the damping, and clear the memory and the sizes.
             self._adapt(math.nan)
             self.state.clear()
+            for group in self.param_groups:
+                group |= {"size": 0.0, "signals": None}
             return StepReport(solution, damping, math.nan, False, *left_out)
         if not self._trust_region:
             _move(blocks, steps, lr)
@@ -223,6 +251,19 @@ class GaussNewton(torch.optim.Optimizer):
                 block.leaf.copy_(value)
         self._adapt(ratio)
         return StepReport(solution, damping, ratio, accepted, *left_out)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load a `state_dict` of a GaussNewton of the same QPMPC.
+
+        Raises:
+            QPError: it is from a version whose metric had units, and has scales of another meaning.
+        """
+        groups = state_dict.get("param_groups", [])
+        if not all({"size", "signals"} <= group.keys() for group in groups):
+            got, want = "groups without size and signals, of an earlier metric", "both"
+            remedy = "Start with a new GaussNewton: its scales have no unit."
+            raise QPError.expected("state_dict", got, want, remedy)
+        super().load_state_dict(state_dict)
 
     def __reduce__(self) -> tuple:
         # The copy would hold a QPMPC of its own, apart from its owner's copy of it.
@@ -274,8 +315,8 @@ class GaussNewton(torch.optim.Optimizer):
         # Only the gradient in a learned w needs the slacks.
         sigma = solution.sigma if solution.qp.w.requires_grad else torch.zeros_like(lam)
         gradients = envelope_gradients(weight, z, sigma, chi, lam, solution.xi)
-        pairs = [(leaf, group["scale"]) for group in self.param_groups for leaf in group["params"]]
-        pairs = [(leaf, scale) for leaf, scale in pairs if leaf.requires_grad]
+        pairs = [(leaf, group) for group in self.param_groups for leaf in group["params"]]
+        pairs = [(leaf, group) for leaf, group in pairs if leaf.requires_grad]
         C, mask = matrix(mpc, "C")
         factored = next((leaf for leaf, _ in pairs if leaf is C), None)
         if factored is not None and mask is not None:
@@ -300,12 +341,53 @@ class GaussNewton(torch.optim.Optimizer):
                     materialize_grads=True,
                 )
             )
+        rows, columns = self._units(z[use])
+        units = {"b": rows, "q": 1 / columns} if mpc.structure == "free" else {}
         return [
-            _OuterProducts(leaf, scale, weight.unsqueeze(-1) * chi, z, penalty, mask)
+            _OuterProducts(leaf, group, weight.unsqueeze(-1) * chi, z, rows, columns, penalty, mask)
             if leaf is factored
-            else _Dense(leaf, scale, next(in_leaves).reshape(len(z), -1))
-            for leaf, scale in pairs
+            else _Dense(
+                leaf,
+                group,
+                next(in_leaves).reshape(len(z), -1),
+                units.get(group["name"]),
+            )
+            for leaf, group in pairs
         ]
+
+    def _units(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return m for the rows ``(n_c,)`` and the columns ``(n_z,)`` of C, updated with z.
+
+        A signal that was always zero counts as one.
+        """
+        mpc, group = self._mpc, self.param_groups[0]
+        signals = mpc._layout.signals().to(z.device)
+        count = signals.bincount()
+        squares = torch.zeros_like(z[0, : len(count)]).index_add(0, signals, z.square().mean(0))
+        m = squares / count
+        if group["signals"] is not None:
+            m = m.maximum(FORGET * m.new_tensor(group["signals"]))
+        if m.isfinite().all():
+            group["signals"] = m.tolist()
+        m = torch.where(m > 0, m.clamp(min=FLOOR * m.max()), 1)
+        return m[: mpc.n_x].repeat(mpc.horizon), m[signals]
+
+    def _scale(self, blocks: list[_Dense | _OuterProducts], count: int) -> None:
+        """Update the parts' sizes with the gradients of ``count`` pairs, and scale the metric."""
+        sizes = {block.group["name"]: 0.0 for block in blocks}
+        for block in blocks:
+            sizes[block.group["name"]] += float(block.diagonal().sum()) / count
+        for block in blocks:
+            group = block.group
+            if math.isfinite(size := sizes[group["name"]]):
+                group["size"] = max(FORGET * group["size"], size)
+            sizes[group["name"]] = group["size"]
+        model = sum(size for name, size in sizes.items() if name not in COST)
+        least = FLOOR * max(sizes.values(), default=0.0)
+        for block in blocks:
+            name = block.group["name"]
+            size = max(sizes[name] if name in COST else model, least)
+            block.scale = block.group["scale"] / (size or 1.0)
 
 
 def _past(state: dict[str, Tensor], name: str, current: Tensor) -> Tensor:
@@ -320,10 +402,16 @@ def _past(state: dict[str, Tensor], name: str, current: Tensor) -> Tensor:
 
 
 class _Dense:
-    """The gradients in one parameter as rows ``(B, n)``, with the metric ``scale``."""
+    """The gradients in one parameter as rows ``(B, n)``, with the metric ``scale * units``.
 
-    def __init__(self, leaf: nn.Parameter, scale: float, rows: Tensor) -> None:
-        self.leaf, self.scale, self.rows = leaf, scale, rows
+    Without ``units`` ``(n,)`` they are ones.
+    """
+
+    def __init__(
+        self, leaf: nn.Parameter, group: dict[str, Any], rows: Tensor, units: Tensor | None
+    ) -> None:
+        self.leaf, self.group, self.rows, self.scale = leaf, group, rows, 1.0
+        self.units = torch.ones_like(leaf).flatten() if units is None else units
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -336,7 +424,7 @@ class _Dense:
 
     def diagonal(self) -> Tensor:
         """Return the kernel's diagonal without a penalty, ``(B,)``."""
-        return self.scale * self.rows.square().sum(-1)
+        return self.scale * self.rows.square() @ self.units
 
     def damp(self, mu: Tensor) -> Tensor:
         """Set the damping; return the change of Q ``(B,)`` by the penalty alone, here zero."""
@@ -344,11 +432,11 @@ class _Dense:
 
     def kernel(self) -> Tensor:
         """Return the kernel ``(B, B)``."""
-        return self.scale * self.rows @ self.rows.mT
+        return self.scale * (self.rows * self.units) @ self.rows.mT
 
     def step(self, alpha: Tensor) -> Tensor:
         """Return the parameter's step for the dual solution ``alpha`` ``(B,)``."""
-        return (self.scale * alpha @ self.rows).reshape(self.leaf.shape)
+        return (self.scale * self.units * (alpha @ self.rows)).reshape(self.leaf.shape)
 
     def penalty(self) -> Tensor | float:
         """Return the penalty of the parameter, here none."""
@@ -356,24 +444,29 @@ class _Dense:
 
 
 class _OuterProducts:
-    """The gradients ``chi_i z_i'`` in C, with the metric P ``(n_z, n_z)`` of its rows.
+    """The gradients ``chi_i z_i'`` in C, with the metric ``scale * rows_i / columns_j``.
 
-    The penalty ``1/2 tr(C S C')`` by itself moves C by ``drift``. With a ``mask`` of the learned
-    entries of C, each pattern of learned entries in a row has its own P. Methods as in `_Dense`.
+    The penalty ``1/2 tr(C S C')`` by itself moves C by ``drift``; with it, the metric of a row is
+    ``rows_i`` times a matrix P ``(n_z, n_z)``, one for each unit of a row. With a ``mask`` of the
+    learned entries of C, each pattern of learned entries in a row has its own P. Methods as in
+    `_Dense`.
     """
 
     def __init__(
         self,
         leaf: nn.Parameter,
-        scale: float,
+        group: dict[str, Any],
         chi: Tensor,
         z: Tensor,
+        rows: Tensor,
+        columns: Tensor,
         S: Tensor | None,
-        mask: Tensor | None = None,
+        mask: Tensor | None,
     ) -> None:
-        self.leaf, self.scale, self.chi, self.z, self.S = leaf, scale, chi, z, S
+        self.leaf, self.group, self.chi, self.z, self.scale = leaf, group, chi, z, 1.0
+        self.rows, self.columns, self.S = rows, columns, S
         self.drift = torch.zeros_like(leaf)
-        self.patterns = _patterns(mask)
+        self.patterns = _patterns(mask, None if S is None else rows.unsqueeze(-1))
 
     def __len__(self) -> int:
         return len(self.z)
@@ -385,49 +478,59 @@ class _OuterProducts:
             state["chi"], state["z"] = self.chi[:count], self.z[:count]
 
     def diagonal(self) -> Tensor:
-        chi, z = self.chi.square(), self.z.square()
+        chi, z = self.rows * self.chi.square(), self.z.square() / self.columns
         diagonals = (chi[:, i].sum(-1) * z[:, j].sum(-1) for i, j, _ in self.patterns)
         return self.scale * sum(diagonals, torch.zeros_like(z[:, 0]))
 
     def damp(self, mu: Tensor) -> Tensor:
         drifted = self.z.new_zeros(len(self.z))
-        self.z_P = [self.scale * self.z[:, j] for _, j, _ in self.patterns]
+        self.z_P = [self.scale * self.z[:, j] / self.columns[j] for _, j, _ in self.patterns]
         if self.S is None:
             return drifted
         force = self.leaf @ self.S
         for k, (i, j, entries) in enumerate(self.patterns):
-            z, S = self.z[:, j], self.S[j][:, j]
-            precision = mu / self.scale * torch.eye(len(S)).to(S) + S
+            z, S, damping = self.z[:, j], self.S[j][:, j], mu / self.rows[i][0]
+            precision = torch.diag(damping / self.scale * self.columns[j]) + S
             inverse = torch.linalg.inv_ex(precision).inverse
             drift = -force[entries] @ inverse
-            self.z_P[k], self.drift[entries] = mu * z @ inverse, drift
+            self.z_P[k], self.drift[entries] = damping * z @ inverse, drift
             drifted = drifted + ((self.chi[:, i] @ drift) * z).sum(-1)
         return drifted
 
     def kernel(self) -> Tensor:
         K = self.z.new_zeros(len(self.z), len(self.z))
+        chi = self.rows * self.chi
         for (i, j, _), z_P in zip(self.patterns, self.z_P, strict=True):
-            chi = self.chi[:, i]
-            K = K + (chi @ chi.mT) * (z_P @ self.z[:, j].mT)
+            K = K + (chi[:, i] @ self.chi[:, i].mT) * (z_P @ self.z[:, j].mT)
         return K
 
     def step(self, alpha: Tensor) -> Tensor:
-        step = self.drift.clone()
+        step, chi = self.drift.clone(), alpha.unsqueeze(-1) * self.rows * self.chi
         for (i, _, entries), z_P in zip(self.patterns, self.z_P, strict=True):
-            step[entries] += (alpha.unsqueeze(-1) * self.chi[:, i]).mT @ z_P
+            step[entries] += chi[:, i].mT @ z_P
         return step
 
     def penalty(self) -> Tensor | float:
         return 0.0 if self.S is None else 0.5 * ((self.leaf @ self.S) * self.leaf).sum()
 
 
-def _patterns(mask: Tensor | None) -> list[tuple[Any, Any, Any]]:
-    """Group the rows of C by learned entries: return their rows, columns, and index in C."""
-    if mask is None:
+def _patterns(mask: Tensor | None, units: Tensor | None) -> list[tuple[Any, Any, Any]]:
+    """Group the rows of C by learned entries and by ``units`` ``(n_c, 1)``, if these are not None.
+
+    Return the rows, the columns, and the index in C of each group.
+    """
+    keys = [key for key in (mask, units) if key is not None]
+    if not keys:
         return [(slice(None), slice(None), (slice(None), slice(None)))]
-    kinds, kind = torch.unique(mask, dim=0, return_inverse=True)
-    pairs = [((kind == k).nonzero()[:, 0], x.nonzero()[:, 0]) for k, x in enumerate(kinds)]
-    return [(i, j, (i.unsqueeze(-1), j)) for i, j in pairs if len(j)]
+    kind = torch.unique(torch.cat(keys, dim=-1), dim=0, return_inverse=True)[1]
+    groups: list[tuple[Any, Any, Any]] = []
+    for k in kind.unique():
+        i = (kind == k).nonzero()[:, 0]
+        if mask is None:
+            groups.append((i, slice(None), (i, slice(None))))
+        elif len(j := mask[i[0]].nonzero()[:, 0]):
+            groups.append((i, j, (i.unsqueeze(-1), j)))
+    return groups
 
 
 def _solve(

@@ -76,12 +76,22 @@ def invalid_rewards(tensordict: TensorDictBase, reward: NestedKey, effect: str) 
     return invalid
 
 
+#: The choices of V(s+)'s horizon: N or N - 1 stages.
+HORIZONS = ("receding", "shrinking")
+
+
 class QPQLearningLoss(LossModule):
     """The loss of semi-gradient Q-learning with a QP (eq:thup).
 
     The TD error is delta = L + gamma (1 - terminated) V(s+) - Q(s, a), with reward = -L in TorchRL.
     V and Q are the same QP without and with u_0 fixed, so V(s+) is exactly min over a of Q(s+, a).
     Truncation bootstraps, termination does not.
+
+    With ``horizon="shrinking"`` the target has V_{N-1}(s+), of the QP with one stage less
+    (`QPMPC.shortened`), so that Q_N is the cost of N steps and a terminal cost, and gamma may be 1.
+    For an exact model and stage cost the TD error is zero whatever the terminal cost is. The target
+    is thus biased: no cost beyond the horizon enters it, and the terminal cost is not learned. The
+    default, ``"receding"``, has V_N(s+): terminal cost and c must then account for all later costs.
 
     Samples whose QP has no certified solution (``on_failure="mask"`` in the QPMPC) add nothing to
     the loss or its gradient and are counted in ``unsolved``. So are, in ``invalid_reward`` and with
@@ -96,6 +106,7 @@ class QPQLearningLoss(LossModule):
             ends with one, whose other modules write its inputs, such as residuals of theta.
         delay_value: evaluate V(s+) with a target network. By default, as in the paper, with the
             current theta.
+        horizon: ``"receding"`` (default) or ``"shrinking"``: V(s+) with N or with N - 1 stages.
         td_error_clip: bound on the absolute TD error in the update; none by default.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
         use_prioritized_weights: weight the samples by ``priority_weight``; by default ``"auto"``,
@@ -169,6 +180,7 @@ class QPQLearningLoss(LossModule):
         value_network: QPActorValueOperator | TensorDictSequential,
         *,
         delay_value: bool = False,
+        horizon: str = "receding",
         td_error_clip: float | None = None,
         gamma: float | None = None,
         reduction: str | None = None,
@@ -190,10 +202,16 @@ class QPQLearningLoss(LossModule):
         if reduction not in (None, "mean", "sum", "none"):
             raise QPError.expected("reduction", repr(reduction), "'mean', 'sum' or 'none'")
         check_flag("delay_value", delay_value)
+        if horizon not in HORIZONS:
+            raise QPError.expected("horizon", repr(horizon), "'receding' or 'shrinking'")
+        if horizon == "shrinking":
+            _last(
+                value_network
+            ).module.shortened()  # raises the error of a QP without stages to drop
         if use_prioritized_weights not in ("auto", True, False):
             got = repr(use_prioritized_weights)
             raise QPError.expected("use_prioritized_weights", got, "'auto', True or False")
-        self.delay_value = delay_value
+        self.delay_value, self.horizon = delay_value, horizon
         self.td_error_clip = td_error_clip
         self.reduction = reduction or "mean"
         self.use_prioritized_weights = use_prioritized_weights
@@ -203,7 +221,8 @@ class QPQLearningLoss(LossModule):
             create_target_params=delay_value,
         )
         # Not registered as a submodule, because its parameters are the value network's.
-        view = _in_place_of_last(self.value_network, self.operator.get_value_operator())
+        value = self.operator.get_value_operator(shortened=horizon == "shrinking")
+        view = _in_place_of_last(self.value_network, value)
         object.__setattr__(self, "state_value_network", view)
 
     @property
@@ -259,8 +278,12 @@ class QPQLearningLoss(LossModule):
         """Choose how V(s+) enters the target: TD0 (default), TD1 or TDLambda.
 
         Raises:
-            QPError: if ``gamma`` or ``lmbda`` is not in [0, 1].
+            QPError: if ``gamma`` or ``lmbda`` is not in [0, 1], or the horizon is shrinking and the
+                estimator is not TD0, since n steps would need V_{N-n}.
         """
+        if self.horizon == "shrinking" and value_type not in (None, "td0", ValueEstimators.TD0):
+            remedy = "Other estimators need horizon='receding'."
+            raise QPError.expected("value_type", repr(value_type), "TD0", remedy)
         for name in {"gamma", "lmbda"} & hyperparams.keys():
             _check_factor(name, hyperparams[name])
         value_type, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)

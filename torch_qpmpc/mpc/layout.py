@@ -127,6 +127,12 @@ class Layout:
         x, u = torch.arange(self.n_x), torch.arange(self.n_x, self.n)
         return self.stages(torch.stack((*[x] * self.horizon, self.n + x)), u)
 
+    def signals(self) -> Tensor:
+        """Return the index in [x; u; d] of the signal in each entry of z, ``(n_z,)``."""
+        stages = torch.arange(self.n).repeat(self.past + self.horizon)
+        d = torch.arange(self.n, self.n + self.n_d).repeat(self.horizon + 1)
+        return torch.cat((d, stages[: self.n_z - self.n_preview]))
+
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
         plan, terminal = z[..., self.n_before : -self.n_x], z[..., None, -self.n_x :]

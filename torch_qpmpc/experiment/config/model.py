@@ -33,6 +33,7 @@ from torch_qpmpc.experiment.fields import (
     one_of,
 )
 from torch_qpmpc.experiment.tasks import TaskSettings, find_task
+from torch_qpmpc.learning.q_learning import HORIZONS
 from torch_qpmpc.mpc.projections import STEPS, check_step
 from torch_qpmpc.qp.solvers import backend
 
@@ -74,6 +75,7 @@ class Config(Group):
     td_error_clip: Annotated[Positive | None, Expected("a finite number > 0, or null")]
     delay_value: Flag
     target_rate: Fraction
+    target_horizon: Annotated[str, one_of(HORIZONS)] = "receding"
     step: Annotated[str, one_of(STEPS), AfterValidator(_installed_step)]
     penalty_step: Annotated[str, one_of(("proximal", "subgradient"))]
     release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
@@ -192,6 +194,21 @@ class Config(Group):
     def export_has_a_qp(self) -> Self:
         if self.export and self.algo.name != "qlearning" and self.algo.actor != "qp":
             self.conflict("export", "null", "The policy of algo.actor=mlp is a network.")
+        return self
+
+    @model_validator(mode="after")
+    def shrinking_horizon_has_stages(self) -> Self:
+        if self.target_horizon == "receding":
+            return self
+        if self.algo.name != "qlearning":
+            remedy = f"{self.algo.name} does not support a shrinking horizon."
+            self.conflict("target_horizon", "receding", remedy)
+        if self.task.horizon == 1:
+            remedy = "target_horizon=shrinking drops a stage."
+            self.conflict("task.horizon", "at least 2", remedy)
+        if self.task.hessian == "full":
+            remedy = "target_horizon=shrinking drops a stage, and a full H couples them."
+            self.conflict("task.hessian", "diagonal or block", remedy)
         return self
 
     @model_validator(mode="after")

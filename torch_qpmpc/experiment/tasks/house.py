@@ -17,6 +17,7 @@ from torch_qpmpc.experiment.fields import Count, Flag, NonNegative
 from torch_qpmpc.experiment.heating import Model, heating_options, known_model
 from torch_qpmpc.experiment.rivals.houses import HOUSE_RIVALS
 from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
+from torch_qpmpc.mpc.banded import band_distance
 
 #: The resistance that the tutorial's planner assumes, in K/kW.
 WRONG_R = 2.0
@@ -68,6 +69,9 @@ def learned_scheme(cfg: DictConfig, plant: HeatedHouse, model: Model, cost: floa
     gamma, learn = cfg.task.gamma, (*cfg.task.learn_cost, *cfg.constraint.learn)
     n_z = plant.n_p + plant.horizon * (plant.n_y + plant.n_u)
     masks = {"q": torch.arange(n_z) < plant.n_preview}
+    if cfg.constraint.structure == "free":
+        distance = band_distance(plant.n_y, plant.n_u, plant.horizon, plant.past, plant.n_d)
+        masks["C"] = distance <= 0
     beyond = gamma**plant.horizon / (1 - gamma) if gamma < 1 else 0.0
     return heating_scheme(
         plant,
