@@ -19,7 +19,7 @@ def test_the_value_and_action_without_rows_are_those_of_the_equalities(name):
     tables = make_tables(mpc)
     qp = mpc.quadratic_program()
     rows = {name: getattr(qp, name).detach()[:0] for name in ("G", "lb", "ub", "w")}
-    without = dataclasses.replace(qp, **rows, check_values=False)
+    without = dataclasses.replace(qp, **rows, check_values=False, n_known=0)
     p = draw_known(mpc, 20)
     solution = solve_qp(without, torch.as_tensor(p))
     value = np.einsum("bi,ij,bj->b", p, tables.P, p) / 2 + p @ tables.g + tables.c
