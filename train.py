@@ -27,6 +27,7 @@ from omegaconf import DictConfig
 from torchrl import torchrl_logger
 from tqdm import tqdm
 
+from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.experiment.algorithms import make_learner, make_operator
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, drop_previous, save_checkpoint
 from torch_qpmpc.experiment.collection import batches, make_collector, make_run_replay
@@ -141,7 +142,7 @@ def _train(
                 run.log(gate.judge(search=last), update)
                 found.evaluate(gate.policy)
                 gap = report(run, gate.mpc, found, update)
-                progress.set_postfix(J=gap["J_best"], closed_gap=gap["closed_gap"])
+                progress.set_postfix(J=cost_text(gap["J_best"]), closed_gap=gap["closed_gap"])
             if evaluated or interrupt.signum is not None:
                 run.flush()
                 state = snapshot(cfg, mpc, learner, gate, collector, replay, tally)

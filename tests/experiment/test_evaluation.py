@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tests.runs import SMALL, make_config
-from torch_qpmpc.envs import Plant
+from torch_qpmpc.envs import House
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.evaluation import Evaluation, rival_costs
@@ -69,7 +69,7 @@ def test_quick_rivals_are_evaluated_or_those_that_are_named(rivals, chosen, name
 def test_rivals_have_the_disturbances_of_the_learned_policy(rivals):
     cfg = make_config(*HOUSE, "rivals=[far,strong]", "eval_seed=4")
     plant = make_physics(cfg)
-    assert isinstance(plant, Plant)
+    assert isinstance(plant, House)
     J = rival_costs(cfg, plant)
     loop = plant_loop(lambda p: 5 * (18 - p[:, -1:]), plant, steps=6, seed=4)
     assert {"strong": loop.J, "far": pytest.approx(loop.J)} == J

@@ -89,10 +89,10 @@ def report(run: RunFolder, mpc: QPMPC | None, found: Evaluation, update: int) ->
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u, mpc.past, mpc.n_d)
     distances |= structure_metrics(mpc)
     run.log({f"structure/{name}": distance for name, distance in distances.items()}, update)
-    if run.cfg.figures:
+    if found.cfg.figures:
         run.figure("structure/C", constraint_figure(mpc), update)
         run.figure("eval/closed_loop", closed_loop_figure(found.loops, mpc), update)
-        if update == run.cfg.updates:
+        if update == found.cfg.updates:
             draw_outcome(run, mpc, found, update)
     return summary
 

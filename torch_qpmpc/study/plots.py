@@ -66,11 +66,12 @@ def draw_J(axes: Axes, frame: pd.DataFrame) -> None:
 def fixed_costs(frame: pd.DataFrame) -> dict[str, float]:
     """Return the means over seeds of J of the start, the true model and the rivals."""
     runs = frame.drop_duplicates("seed")
-    costs = {"start": runs["J_start"], "true model": runs["J_true_model"]}
-    rivals = runs["rivals"].dropna() if "rivals" in runs else pd.Series(dtype=object)
-    costs |= dict(pd.DataFrame(rivals.tolist()).items())
-    known = {str(name): J.dropna().to_numpy() for name, J in costs.items() if len(J.dropna())}
-    return {name: float(interquartile_mean(J)) for name, J in known.items()}
+    costs = runs[["J_start", "J_true_model"]].set_axis(["start", "true model"], axis=1)
+    if "rivals" in runs:
+        rivals = pd.DataFrame(runs["rivals"].dropna().tolist())
+        costs = pd.concat([costs.reset_index(drop=True), rivals], axis=1)
+    known = {str(name): J.dropna().to_numpy() for name, J in costs.items()}
+    return {name: float(interquartile_mean(J)) for name, J in known.items() if len(J)}
 
 
 def draw_gap(axes: Axes, frame: pd.DataFrame) -> None:
