@@ -5,7 +5,6 @@
     python train.py -m constraint=fixed,free seed=1,2   a sweep
     python train.py task=gymnasium task.id=Pendulum-v1 start=data   from a log, without a model
     python train.py resume=runs/point_mass/..           resume a stopped run
-    python train.py -m +study=paper                     start or resume the paper's study
     tensorboard --logdir runs                           watch the runs
 
 configs/ holds every key. The run's folder gets config.yaml, metrics.csv, TensorBoard events,
