@@ -33,7 +33,7 @@ GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
-NOT_NEEDED = ("eval_seed", "logger", "start.name", "task.file")
+NOT_NEEDED = ("export", "eval_seed", "logger", "start.name", "task.file")
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
