@@ -34,7 +34,7 @@ GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
-NOT_NEEDED = ("eval_seed", "gate", "logger", "start.name", "target_horizon", "task.file")
+NOT_NEEDED = ("eval_seed", "export", "gate", "logger", "rivals", "start.name", "target_horizon", "task.file")
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
