@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from torch_qpmpc.analysis.plots import draw_slice, slice_between
 from torch_qpmpc.analysis.report import canonical
 from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.collection import num_columns
 from torch_qpmpc.experiment.plots import draw_matrix, draw_positions
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.study.runs import CASES, FinishedRun, has_real
@@ -36,6 +37,13 @@ def curves(frame: pd.DataFrame, column: str) -> tuple[np.ndarray, np.ndarray]:
     return together.index.to_numpy(), together.to_numpy().T
 
 
+def transitions(run: FinishedRun, updates: np.ndarray) -> np.ndarray:
+    """Return the numbers of transitions collected before the evaluations at ``updates``."""
+    cfg = run.cfg
+    warm_up = -(-cfg.warmup_steps // cfg.steps_per_update)
+    return (updates + warm_up) * cfg.steps_per_update * num_columns(cfg)
+
+
 def draw_band(axes: Axes, x: np.ndarray, runs: np.ndarray, label: str, colour: tuple) -> None:
     """Draw the interquartile mean over ``runs`` ``(runs, len(x))`` with its bootstrap interval."""
     axes.plot(x, interquartile_mean(runs), color=colour, label=label)
@@ -44,15 +52,20 @@ def draw_band(axes: Axes, x: np.ndarray, runs: np.ndarray, label: str, colour: t
 
 
 def draw_J(axes: Axes, frame: pd.DataFrame) -> None:
-    """Draw J over updates, with the means of the start's and the true model's J as lines."""
+    """Draw J over transitions, with the means of the start's and the true model's J as lines."""
     for label, runs in frame.groupby("label", sort=False):
         x, J = curves(runs, "eval/J")
-        draw_band(axes, x, J, str(label), colours(frame)[str(label)])
+        first: FinishedRun = runs["run"].iloc[0]
+        shown = slice(int(first.cfg.algo.get("actor") == "mlp"), None)  # not the QP before learning
+        x = transitions(first, x)[shown]
+        draw_band(axes, x, J[:, shown], str(label), colours(frame)[str(label)])
     for name, style in (("J_start", "k:"), ("J_true_model", "k--")):
         end = interquartile_mean(frame.drop_duplicates("seed")[name].to_numpy())
         axes.plot([], [], style, label={"J_start": "start"}.get(name, "true model"))
         axes.axhline(float(end), color="k", linestyle=style[1:], linewidth=1)
-    axes.set(xlabel="update", ylabel="J", yscale="log")
+    lengths = [run.cfg.updates for run in frame["run"]]
+    scale = "log" if max(lengths) >= 10 * min(lengths) else "linear"
+    axes.set(xlabel="transitions", ylabel="J", xscale=scale, yscale="log")
     axes.legend(fontsize="small")
 
 
