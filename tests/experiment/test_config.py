@@ -34,7 +34,16 @@ GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
-NOT_NEEDED = ("eval_seed", "export", "gate", "logger", "rivals", "start.name", "target_horizon", "task.file")
+NOT_NEEDED = (
+    "eval_seed",
+    "export",
+    "gate",
+    "logger",
+    "rivals",
+    "start.name",
+    "target_horizon",
+    "task.file",
+)
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
@@ -101,6 +110,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "tank_references": ("task=tank_references", "warmup_steps=1"),
         "data": ("start=data", "task=pendulum", "constraint=free", "start.transitions=40"),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
+        "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
     }.items():
         cfg = make_config(*SMALL, "delay_value=true", *overrides)
         monkeypatch.setattr(
@@ -231,12 +241,14 @@ BAD: dict[str, list[Any]] = {
     **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
     "rivals": ["DeePC", 3, None, [1], ["DeePC"], ["omniscient", "nobody"]],
     "resume": [3, True],
-    "algo.name": ["sac", *NAME],
+    "algo.name": ["a2c", *NAME],
     "algo.actor": ["net", *NAME],
     "algo.critic": ["net", *NAME],
     "algo.actor_rate": [0, *REAL],
     "algo.lr_network": [0, *REAL],
     "algo.width": WHOLE,
+    "algo.theta.q": [0, *REAL],
+    "algo.theta.b": [0, *REAL],
     "algo.policy_delay": WHOLE,
     "algo.policy_noise": REAL,
     "algo.noise_clip": REAL,
@@ -495,7 +507,7 @@ def test_solver_must_be_known():
         (["algo=ddpg", "replay=false"], "replay: got False, expected true. ddpg learns from a"),
         (
             ["algo=ddpg", "algo.actor=mlp"],
-            "algo.actor: got 'mlp', expected qp. The penalties are on",
+            "algo.actor: got 'mlp', expected qp or scheduled. The penalties are",
         ),
         (
             ["algo=ddpg", "algo.actor=mlp", "constraint=free", "export=c"],

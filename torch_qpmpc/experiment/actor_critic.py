@@ -54,28 +54,29 @@ def typical_inputs(cfg: DictConfig, mpc: QPMPC, physics: AnyPlant) -> tuple[Tens
 
 def make_actor(cfg: DictConfig, mpc: QPMPC, physics: AnyPlant) -> Any:
     """Make the deterministic actor, which writes an action within the plant's bounds."""
-    low, high, keys = physics.lb_a, physics.ub_a, known_keys(mpc)
+    low, high, keys, out = physics.lb_a, physics.ub_a, known_keys(mpc), cast("Any", ["action"])
     if cfg.algo.actor == "qp":
-        return TensorDictModule(ClippedPolicy(mpc, low, high), keys, ["action"])
+        return TensorDictModule(ClippedPolicy(mpc, low, high), keys, out)
     centre, spread = typical_inputs(cfg, mpc, physics)
     if cfg.algo.actor == "mlp":
         policy = BoundedPolicy(mpc.n_p, low, high, cfg.algo.width)
-        return TensorDictModule(Standardised(centre, spread, policy), keys, ["action"])
+        return TensorDictModule(Standardised(centre, spread, policy), keys, out)
     inputs: Any = TensorDictModule(Standardised(centre, spread), keys, ["standardised"])
+    sizes = {"q": cfg.algo.theta.q, "b": cfg.algo.theta.b}
     options = {"width": cfg.algo.width, "in_keys": ["standardised"]}
-    network: Any = ThetaNetwork(mpc, dict(cfg.algo.theta), **options)
+    network: Any = ThetaNetwork(mpc, sizes, **options)
     operator = QPActorValueOperator(
         mpc, preview_key=preview_key(mpc), theta_keys=network.theta_keys
     )
     policy: Any = operator.get_policy_operator()
-    clip: Any = TensorDictModule(partial(clipped, low=low, high=high), ["action"], ["action"])
-    return TensorDictSequential(inputs, network, policy, clip, selected_out_keys=["action"])
+    clip: Any = TensorDictModule(partial(clipped, low=low, high=high), out, out)
+    return TensorDictSequential(inputs, network, policy, clip, selected_out_keys=out)
 
 
 def make_stochastic_actor(cfg: DictConfig, mpc: QPMPC, physics: AnyPlant) -> Any:
     """Make SAC's actor, which draws actions within the plant's bounds."""
     low, high, keys = physics.lb_a, physics.ub_a, known_keys(mpc)
-    names = ["loc", "scale"]
+    names: Any = ["loc", "scale"]
     if cfg.algo.actor == "mlp":
         policy = GaussianPolicy(mpc.n_p, mpc.n_u, cfg.algo.width)
         standardised = Standardised(*typical_inputs(cfg, mpc, physics), policy)
@@ -118,8 +119,9 @@ def make_critic(cfg: DictConfig, mpc: QPMPC, physics: AnyPlant) -> Any:
     network = ActionValue(mpc.n_p, mpc.n_u, cfg.algo.width, scale)
     bounds = torch.stack((physics.lb_a, physics.ub_a))
     of_action = bounds.mean(0), (bounds[1] - bounds[0]) / 2
-    pairs = zip(typical_inputs(cfg, mpc, physics), of_action, strict=True)
-    standardised = Standardised(*(torch.cat(pair) for pair in pairs), network)
+    of_p = typical_inputs(cfg, mpc, physics)
+    centre, spread = (torch.cat(pair) for pair in zip(of_p, of_action, strict=True))
+    standardised = Standardised(centre, spread, network)
     return TensorDictModule(standardised, [*known_keys(mpc), "action"], ["state_action_value"])
 
 
@@ -127,8 +129,8 @@ def make_actor_critic_loss(cfg: DictConfig, mpc: QPMPC, physics: AnyPlant) -> Lo
     """Make TorchRL's loss for ``cfg.algo``, with target networks; ``mpc`` is the actor's QP."""
     low, high = physics.lb_a, physics.ub_a
     if cfg.algo.name == "ddpg":
-        networks = make_actor(cfg, mpc, physics), make_critic(cfg, mpc, physics)
-        return DDPGLoss(*networks, delay_actor=True, delay_value=True)
+        actor, critic = make_actor(cfg, mpc, physics), make_critic(cfg, mpc, physics)
+        return DDPGLoss(actor, critic, delay_actor=True, delay_value=True)
     if cfg.algo.name == "sac":
         actor = make_stochastic_actor(cfg, mpc, physics)
         critics = [make_critic(cfg, mpc, physics) for _ in range(2)]

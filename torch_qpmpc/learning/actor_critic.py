@@ -127,17 +127,22 @@ class Squashable(nn.Module):
 
 
 class GaussianPolicy(nn.Module):
-    """A network for location and scale, ``width`` units a layer, in inputs of any float dtype."""
+    """A network for location and scale, with ``width`` units in each layer.
+
+    It accepts inputs of any float dtype, and returns outputs of it.
+    """
 
     def __init__(self, n_p: int, n_u: int, width: int) -> None:
         super().__init__()
         self.net = MLP(n_p, 2 * n_u, num_cells=[width, width], activation_class=nn.ReLU)
-        self.split = NormalParamExtractor("biased_softplus_1.0", scale_lb=0.1)
+        floor: Any = 0.1  # TensorDict annotates Number, of which float is none
+        self.split = NormalParamExtractor("biased_softplus_1.0", scale_lb=floor)
 
     def forward(self, *known: Tensor) -> tuple[Tensor, Tensor]:
         """Map the parts of p, n_p entries in all, to a location and a scale ``(*batch, n_u)``."""
         p = torch.cat(known, -1)
-        location, scale = self.split(self.net(p.float()))
+        last: Any = self.net[-1]
+        location, scale = self.split(self.net(p.to(last.bias.dtype)))
         return location.to(p.dtype), scale.to(p.dtype)
 
 
@@ -151,4 +156,5 @@ class ActionValue(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Map the parts of p and the action, n_p + n_u entries in all, to ``(*batch, 1)``."""
-        return self.scale * self.net(torch.cat(inputs, -1).float())
+        last: Any = self.net[-1]
+        return self.scale * self.net(torch.cat(inputs, -1).to(last.bias.dtype))

@@ -93,8 +93,8 @@ class ThetaNetwork(TensorDictModuleBase):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the residuals to ``theta_keys`` of ``tensordict``, and return it."""
-        dtype = self.net[-1].bias.dtype
-        inputs = torch.cat([tensordict.get(key).to(dtype) for key in self.in_keys], -1)
+        last: Any = self.net[-1]
+        inputs = torch.cat([tensordict.get(key).to(last.bias.dtype) for key in self.in_keys], -1)
         counts = [shape.numel() for shape in self.shapes.values()]
         flat = self.net(inputs).tanh().split(counts, -1)
         for (name, shape), entries in zip(self.shapes.items(), flat, strict=True):

@@ -13,7 +13,6 @@ from torch_qpmpc.analysis.plots import draw_slice, slice_between
 from torch_qpmpc.analysis.report import canonical
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.plots import (
-    draw_experience,
     draw_lines,
     draw_matrix,
     draw_positions,
@@ -51,15 +50,20 @@ def draw_band(axes: Axes, x: np.ndarray, runs: np.ndarray, label: str, colour: t
 
 
 def draw_J(axes: Axes, frame: pd.DataFrame) -> None:
-    """Draw J over updates, with means of the start's and the others' J as lines."""
+    """Draw J over experience, with means of the start's and the others' J as lines."""
+    unit = ""
     for label, runs in frame.groupby("label", sort=False):
-        x, J = curves(runs, "eval/J")
-        draw_band(axes, x, J, str(label), colours(frame)[str(label)])
+        updates, J = curves(runs, "eval/J")
+        run: FinishedRun = runs["run"].iloc[0]
+        before, each, unit = experience(run.cfg)
+        shown = slice(int(run.cfg.algo.get("actor") == "mlp"), None)  # not the QP before learning
+        x = (before + each * updates)[shown]
+        draw_band(axes, x, J[:, shown], str(label), colours(frame)[str(label)])
     draw_lines(axes, fixed_costs(frame))
-    axes.set(xlabel="update", ylabel="J")
+    lengths = [run.cfg.updates for run in frame["run"]]
+    scale = "log" if max(lengths) >= 10 * min(lengths) else "linear"
+    axes.set(xlabel=unit, ylabel="J", xscale=scale)
     scale_costs(axes)
-    if len({experience(run.cfg) for run in frame["run"]}) == 1:
-        draw_experience(axes, frame["run"].iloc[0].cfg)
     axes.legend(fontsize="small")
 
 

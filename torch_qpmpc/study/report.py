@@ -128,10 +128,14 @@ def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
     if len({*sweep["label"]}) <= SIDE_BY_SIDE:
         for noise, runs in sweep.groupby("noise"):
             yield f"learning-{noise}", learning_figure(runs)
-            yield f"constraints-{noise}", constraints_figure(runs.query("constraint != 'fixed'"))
-            yield f"trajectories-{noise}", trajectories_figure(runs)
-            if runs["run"].iloc[0].start.n_x > 1:
-                yield f"policies-{noise}", policies_figure(runs)
+            qps = runs.query("actor == 'qp'")
+            learned = qps.query("constraint != 'fixed'")
+            if len(learned):
+                yield f"constraints-{noise}", constraints_figure(learned)
+            if len(qps):
+                yield f"trajectories-{noise}", trajectories_figure(qps)
+            if len(qps) and qps["run"].iloc[0].start.n_x > 1:
+                yield f"policies-{noise}", policies_figure(qps)
         if any(sweep["prediction_error"].notna()):  # the true model is known
             yield "meaning", meaning_figure(sweep)
     elif has_real(sweep):

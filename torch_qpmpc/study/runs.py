@@ -151,8 +151,9 @@ def collect(folder: str | Path) -> pd.DataFrame:
 
     Returns:
         A row for each run: the entries of summary.json, `FinishedRun.readings`, ``run``, a
-        `FinishedRun`, ``sweep``, the folder that contains the run, ``label``, its case with its
-        ablation or the settings that vary in the sweep, and ``real``, True if the gap is real.
+        `FinishedRun`, ``actor``, its kind of policy, ``sweep``, the folder that contains the run,
+        ``label``, its case with its ablation or the settings that vary in the sweep, and ``real``,
+        True if the gap is real.
 
     Raises:
         QPError: there is no finished run.
@@ -178,6 +179,7 @@ def collect(folder: str | Path) -> pd.DataFrame:
         if f"{name}_best" not in frame:
             frame[f"{name}_best"] = frame[f"{name}_final"]
     frame["real"] = frame["J_start"] - frame["J_true_model"] >= REAL_GAP
+    frame["actor"] = [run.cfg.algo.get("actor", "qp") for run in frame["run"]]
     frame["label"] = ""
     for _, sweep in frame.groupby("sweep"):
         frame.loc[sweep.index, "label"] = _labels(sweep)

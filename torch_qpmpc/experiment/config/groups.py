@@ -24,12 +24,6 @@ from torch_qpmpc.experiment.fields import (
 from torch_qpmpc.learning.search import KNOBS
 from torch_qpmpc.mpc.validation import CONSTRAINTS, STRUCTURES
 
-#: The coordinates of theta that an actor's network can move in any task.
-SCHEDULED = ("q", "b", "c", "lb", "ub")
-Sizes = Annotated[
-    dict[Literal[SCHEDULED], Positive],
-    Expected(f"a mapping of some of {', '.join(SCHEDULED)} to numbers > 0"),
-]
 Beta = Annotated[float, Field(ge=0, lt=1)]
 
 
@@ -108,6 +102,13 @@ class QLearning(Group):
     name: Literal["qlearning"]
 
 
+class Residuals(Group):
+    """The bounds of the residuals of a scheduled theta."""
+
+    q: Positive
+    b: Positive
+
+
 class DDPG(Group):
     """The actor is a QP, a QP whose theta a network schedules, or a network."""
 
@@ -117,7 +118,7 @@ class DDPG(Group):
     actor_rate: Positive
     lr_network: Positive
     width: Count
-    theta: Sizes = Field(default={"q": 1.0, "b": 0.1}, min_length=1)
+    theta: Residuals
 
 
 class TD3(DDPG):
