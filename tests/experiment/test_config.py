@@ -239,7 +239,7 @@ BAD: dict[str, list[Any]] = {
     "gate": FLAG,
     "search.loops": WHOLE,
     **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
-    "rivals": ["DeePC", 3, None, [1], ["DeePC"], ["omniscient", "nobody"]],
+    "rivals": ["DeePC", 3, None, [1]],
     "resume": [3, True],
     "algo.name": ["a2c", *NAME],
     "algo.actor": ["net", *NAME],
@@ -316,6 +316,15 @@ def test_impossible_values_are_rejected_by_name(key):
         sentence = f"{key}: got {value!r}, expected {keys()[key]}."
         with pytest.raises(QPError, match=f"^{re.escape(sentence)}"):
             check_config(cfg)
+
+
+def test_rivals_are_those_of_the_task():
+    check_config(make_config("task=four_tanks", 'rivals=[DeePC,"Kalman filter, N = 60"]'))
+    known = "Kalman filter, N = 20; .*; DeePC; omniscient. They are the rivals of task four_tanks"
+    with pytest.raises(QPError, match=rf"rivals: got \['nobody'\], expected .* these: {known}"):
+        check_config(make_config("task=four_tanks", "rivals=[nobody]"))
+    with pytest.raises(QPError, match=r"rivals: got \['DeePC'\], expected true or false\."):
+        check_config(make_config("rivals=[DeePC]"))
 
 
 def test_the_edges_are_accepted():

@@ -12,6 +12,7 @@ import pytest
 import train
 from tests.runs import SMALL, make_config
 from tests.stops import assert_events_are_whole, assert_same_numbers, go_on
+from torch_qpmpc.experiment import evaluation
 from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.interrupt import Interrupt
 from torch_qpmpc.learning.replay import Replay
@@ -60,11 +61,11 @@ def test_a_block_without_a_signal_changes_nothing(capsys):
     ("where", "call", "said"),
     [
         ("train.make_physics", 1, "before the first update"),
-        ("train.evaluate", 1, "before the first update"),
+        ("evaluation.evaluate", 1, "before the first update"),
         ("train.report", 1, "before the first update"),
         ("torch_qpmpc.learning.replay.Replay.extend", 1, "before the first update"),
         ("torch_qpmpc.learning.replay.Replay.extend", 4 + 2, "after update 2"),
-        ("train.evaluate", 3, "after update 3"),
+        ("evaluation.evaluate", 3, "after update 3"),
         ("train.save_checkpoint", 1, "after update 3"),
     ],
 )
@@ -91,7 +92,8 @@ def test_a_run_stops_cleanly_wherever_the_signal_comes(
 def signal_at(patch: pytest.MonkeyPatch, where: str, call: int, signum: int, calls: list) -> None:
     """Send ``signum`` in the given call of the function named ``where``."""
     name = where.rpartition(".")[2]
-    module: Any = train if where.startswith("train.") else Replay
+    modules = {"train": train, "evaluation": evaluation}
+    module: Any = modules.get(where.rpartition(".")[0], Replay)
     function = getattr(module, name)
 
     def signalled(*args: Any, **named: Any) -> Any:
@@ -127,7 +129,7 @@ def test_a_second_ctrl_c_keeps_the_log_and_the_last_checkpoint(tmp_path, monkeyp
 
 
 def test_one_run_of_a_sweep_leaves_signals_to_its_launcher(tmp_path, monkeypatch):
-    signal_at(monkeypatch, "train.evaluate", 1, signal.SIGINT, [])
+    signal_at(monkeypatch, "evaluation.evaluate", 1, signal.SIGINT, [])
     with pytest.raises(KeyboardInterrupt):
         train.train(make_config(*RUN), str(tmp_path / "run"), quiet=True)
     assert not Path(tmp_path / "run").exists()

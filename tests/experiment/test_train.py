@@ -68,7 +68,7 @@ def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 WHOLE = (
     *("optimizer=adam", "solver=daqp", "seed=5", "constraint=combined"),
-    *("updates=150", "eval_interval=75"),
+    *("updates=150", "eval_interval=75", "gate=false"),
 )
 
 
@@ -229,7 +229,14 @@ def test_each_case_runs(tmp_path, constraint, noise, figures):
     assert moved == {-1: constraint != "fixed", 0: constraint != "fixed", 1: free}
 
 
-STREAM = ("task=gros_zanon", "solver=daqp", "task.horizon=4", "task.eval_steps=20", "figures=false")
+STREAM = (
+    "task=gros_zanon",
+    "solver=daqp",
+    "task.horizon=4",
+    "task.eval_steps=20",
+    "figures=false",
+    "gate=false",
+)
 
 
 def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
@@ -432,7 +439,7 @@ def test_training_continues_past_unsolved_qps(tmp_path):
 
 @pytest.mark.parametrize("constraint", ["free", "combined"])
 def test_the_second_order_learns_in_tens_of_updates(tmp_path, constraint):
-    overrides = ("solver=daqp", "seed=5", f"constraint={constraint}", "figures=false")
+    overrides = ("solver=daqp", "seed=5", f"constraint={constraint}", "figures=false", "gate=false")
     summary = train.train(make_config(*overrides, "updates=40", "eval_interval=40"), str(tmp_path))
     assert summary["closed_gap"] > 0.85
     assert summary["unsolved"] == 0

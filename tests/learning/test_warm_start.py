@@ -51,7 +51,7 @@ def test_a_shrinking_horizon_reads_and_writes_the_active_sets_of_v():
     for _ in range(2):  # the second time from the active sets of the first
         assert_close(loss.target(td), expected)
         active = td["next", ACTIVE_SET]
-        assert active.shape == (COUNT, len(loss.value_network.module.lb))
+        assert active.shape == (COUNT, len(loss.operator.module.lb))
     assert active.any()
 
 

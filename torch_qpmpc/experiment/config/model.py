@@ -167,8 +167,9 @@ class Config(Group):
     def task_has_the_rivals(self) -> Self:
         known = find_task(self.task.model_dump()).rivals
         if isinstance(self.rivals, list) and not {*self.rivals} <= {*known}:
-            names = ", ".join(map(repr, known)) or "none"
-            self.conflict("rivals", f"a list of rivals of task {self.task.name}: {names}")
+            names = "; ".join(known)
+            expected = f"true, false or a list of these: {names}" if known else "true or false"
+            self.conflict("rivals", expected, f"They are the rivals of task {self.task.name}.")
         return self
 
     @model_validator(mode="after")
