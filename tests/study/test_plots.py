@@ -5,6 +5,8 @@ import pytest
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
+import train
+from tests.runs import SMALL, make_config
 from tests.study.test_report import made_up
 from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.study.plots import (
@@ -18,7 +20,9 @@ from torch_qpmpc.study.plots import (
     draw_use,
     frontier_figure,
     trajectories_figure,
+    transitions,
 )
+from torch_qpmpc.study.report import figures
 from torch_qpmpc.study.runs import collect
 from torch_qpmpc.study.statistics import interquartile_mean
 
@@ -123,3 +127,23 @@ def test_an_ablation_has_its_runs_median_and_interval():
     drawn = [np.sort(np.asarray(line.get_xdata())).tolist() for line in (runs, interval, median)]
     assert drawn == [pytest.approx(left) for left in ([0.1, 0.8, 0.9], [0.1, 0.9], [0.8])]
     assert to_rgba(median.get_color()) == to_rgba("tab:blue")
+
+
+def test_transitions_include_those_of_the_warm_up(gaussian):
+    run = gaussian["run"].iloc[0]
+    updates = np.array([0, 2, 4])
+    assert transitions(run, updates).tolist() == [16, 24, 32]  # of 4 environments
+
+
+def test_J_of_a_network_is_drawn_over_transitions_without_that_of_the_start(tmp_path, axes):
+    options = (*SMALL, "algo=td3", "algo.critic=mlp", "constraint=free", "updates=2")
+    for actor in ("mlp", "scheduled"):
+        cfg = make_config(*options, f"algo.actor={actor}")
+        train.train(cfg, str(tmp_path / actor), quiet=True)
+    frame = collect(tmp_path)
+    assert sorted(frame["actor"]) == ["mlp", "scheduled"]
+    draw_J(axes, frame)
+    lines = {str(line.get_label()): line.get_xdata() for line in axes.lines}
+    assert list(lines["free, actor=mlp"]) == [24]
+    assert list(lines["free, actor=scheduled"]) == [16, 24]
+    assert [name for name, _ in figures(frame)] == ["learning-gaussian", "meaning"]

@@ -140,6 +140,7 @@ def make_optimizer(
             memory=options.memory,
             td_error_clip=cfg.td_error_clip,
             trust_region=options.trust_region,
+            normalise=options.normalise,
         )
     rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}
     if loss_module is None or cfg.algo.name == "qlearning":

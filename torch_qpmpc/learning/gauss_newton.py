@@ -110,6 +110,8 @@ class GaussNewton(torch.optim.Optimizer):
         trust_region: solve the batch again after each step and its projection (`QPMPC.project_`),
             with the targets fixed; undo a step that raised the squared errors, and adapt the
             damping to the ratio of actual to predicted decrease.
+        normalise: divide by sizes and units, as above. False takes the scales themselves as D, by
+            default 1 and 0.01, for streams of small batches, whose sizes are mostly noise.
 
     Raises:
         QPError: if a number is out of range, or the scales do not fit the learned parts.
@@ -136,6 +138,7 @@ class GaussNewton(torch.optim.Optimizer):
         td_error_clip: float | None = None,
         memory: int = 0,
         trust_region: bool = True,
+        normalise: bool = True,
     ) -> None:
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
         check_kind("mpc", mpc, QPMPC, remedy)
@@ -145,7 +148,9 @@ class GaussNewton(torch.optim.Optimizer):
         if td_error_clip is not None:
             check_number("td_error_clip", td_error_clip, _positive, "a finite number > 0")
         check_flag("trust_region", trust_region)
-        groups = mpc.parameter_groups(scales or {"cost": 1.0, "constraints": 3.0})
+        check_flag("normalise", normalise)
+        default = {"cost": 1.0, "constraints": 3.0 if normalise else 1e-2}
+        groups = mpc.parameter_groups(scales or default)
         for group in groups:
             check_number(f"scales[{group['name']}]", group["lr"], _positive, "a finite number > 0")
             group |= {"scale": group["lr"], "lr": lr, "damping": damping}
@@ -153,6 +158,7 @@ class GaussNewton(torch.optim.Optimizer):
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
         self._clip, self._memory, self._trust_region = td_error_clip, memory, trust_region
+        self._normalise = normalise
 
     @torch.no_grad()
     def step(  # pyright: ignore[reportIncompatibleMethodOverride] - not a closure
@@ -361,6 +367,8 @@ class GaussNewton(torch.optim.Optimizer):
         A signal that was always zero counts as one.
         """
         mpc, group = self._mpc, self.param_groups[0]
+        if not self._normalise:
+            return z.new_ones(mpc.horizon * mpc.n_x), torch.ones_like(z[0])
         signals = mpc._layout.signals().to(z.device)
         count = signals.bincount()
         squares = torch.zeros_like(z[0, : len(count)]).index_add(0, signals, z.square().mean(0))
@@ -374,6 +382,10 @@ class GaussNewton(torch.optim.Optimizer):
 
     def _scale(self, blocks: list[_Dense | _OuterProducts], count: int) -> None:
         """Update the parts' sizes with the gradients of ``count`` pairs, and scale the metric."""
+        if not self._normalise:
+            for block in blocks:
+                block.scale = block.group["scale"]
+            return
         sizes = {block.group["name"]: 0.0 for block in blocks}
         for block in blocks:
             sizes[block.group["name"]] += float(block.diagonal().sum()) / count

@@ -95,6 +95,7 @@ class GaussNewton(Group):
     damping: Positive
     memory: Whole
     trust_region: Flag
+    normalise: Flag
     final_fraction: Fraction
 
 
