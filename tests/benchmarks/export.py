@@ -39,9 +39,9 @@ CHOSEN = (
     "12 states, 4 actions, N = 10",
     "house, N = 32",
 )
-PASSES, COLD = 7, 1000
+PASSES, COLD = 5, 1000
 #: Steps of the contenders in Python, and of OSQP.
-FEW = 200
+FEW, FEWER = 200, 25
 
 
 class Times(NamedTuple):
@@ -186,7 +186,7 @@ def measured(name: str) -> list[list[str]]:
         times: dict[str, list[list[Times]]] = {who: [] for who in contenders}
         for _ in range(PASSES):
             for who, run in contenders.items():
-                few = None if who.startswith("C, ") else FEW
+                few = None if who.startswith("C, ") else FEWER if "OSQP" in who else FEW
                 times[who].append([run(warm[:few], False), run(cold[:few], True)])
     rows = []
     for who, passes in times.items():

@@ -33,7 +33,7 @@ def test_the_report_has_sizes_and_agreement(options, tmp_path):
     assert 20 < agreement.iterations < export.max_iterations == 1300
     assert export.state_bytes == Library(tmp_path / "deep/folder", "mass", "float64").state_bytes
     assert f"state {export.state_bytes:,} bytes" in str(export)
-    assert "at 400 states: actions within" in str(export)
+    assert "at 100 states: actions within" in str(export)
 
 
 @needs_compiler

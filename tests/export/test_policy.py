@@ -40,8 +40,7 @@ def check(mpc, folder, count=200, seed=0, **settings):
     warm = [library.steps(state, p[i : i + 1], tables.n_u) for i in range(count)]
     known = exact(mpc, p, cold.u)
     codes = np.select([known.status == Status.SOLVED, known.status == 1], [SOLVED, INFEASIBLE], -1)
-    for steps in (cold, *warm[:0]):
-        np.testing.assert_array_equal(steps.codes, codes)
+    np.testing.assert_array_equal(cold.codes, codes)
     np.testing.assert_array_equal([step.codes[0] for step in warm], codes)
     solved = codes == SOLVED
     scale = 1 + np.abs(known.value[solved])
@@ -122,7 +121,7 @@ def test_the_limit_of_iterations_is_reported_and_the_next_step_continues(tmp_pat
     assert codes[0] == LIMIT
     assert codes[-1] == SOLVED
     np.testing.assert_allclose(steps.u, exact(mpc, p, steps.u).u, atol=1e-9)
-    assert library.selftest() == 0  # states beyond the limit are left out
+    mpc.export_c(tmp_path, max_iterations=3)  # its self-test leaves out states beyond the limit
 
 
 def test_a_qp_without_rows_has_a_linear_policy(tmp_path):

@@ -1,8 +1,9 @@
 """Solutions of the highest accuracy, with which an exported policy is compared.
 
-A certified solution of another solver gives the active set; for a fixed one, the KKT conditions of
-the whole plan are linear equations. Their solution, with one iterative refinement, is exact up to
-rounding if it confirms the active set, and else corrects it.
+A certified solution gives the active set; for a fixed one, the KKT conditions of the whole plan are
+linear equations. Their solution, with iterative refinement, is exact up to rounding if it confirms
+the active set, and else corrects it. Where this does not settle, the interior point is the most
+accurate solver.
 """
 
 from __future__ import annotations
@@ -65,6 +66,9 @@ def sharpen(mpc: QPMPC, p: Array, coarse: Reference, which: Array) -> Reference:
     for i in which:
         z = _exact(data, np.asarray(p[i], dtype=np.float64), coarse.active[i])
         if z is None:
+            other = reference(mpc, p[i : i + 1], "torch")
+            if other.status[0] == Status.SOLVED:
+                u[i], value[i] = other.u[0], other.value[0]
             continue
         cost = _cost(data, z)
         if abs(cost - value[i]) <= CERTIFIED * (1 + abs(value[i])):
