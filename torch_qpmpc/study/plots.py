@@ -13,7 +13,6 @@ from torch_qpmpc.analysis.plots import draw_slice, slice_between
 from torch_qpmpc.analysis.report import canonical
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.plots import (
-    draw_experience,
     draw_lines,
     draw_matrix,
     draw_positions,
@@ -51,15 +50,15 @@ def draw_band(axes: Axes, x: np.ndarray, runs: np.ndarray, label: str, colour: t
 
 
 def draw_J(axes: Axes, frame: pd.DataFrame) -> None:
-    """Draw J over updates, with means of the start's and the others' J as lines."""
+    """Draw J over experience, with means of the start's and the others' J as lines."""
     for label, runs in frame.groupby("label", sort=False):
         x, J = curves(runs, "eval/J")
-        draw_band(axes, x, J, str(label), colours(frame)[str(label)])
+        first, each, unit = experience(runs["run"].iloc[0].cfg)
+        draw_band(axes, first + each * x, J, str(label), colours(frame)[str(label)])
+        axes.set_xlabel(unit)
     draw_lines(axes, fixed_costs(frame))
-    axes.set(xlabel="update", ylabel="J")
+    axes.set_ylabel("J")
     scale_costs(axes)
-    if len({experience(run.cfg) for run in frame["run"]}) == 1:
-        draw_experience(axes, frame["run"].iloc[0].cfg)
     axes.legend(fontsize="small")
 
 
@@ -90,12 +89,13 @@ def draw_gap(axes: Axes, frame: pd.DataFrame) -> None:
 
 
 def learning_figure(frame: pd.DataFrame) -> Figure:
-    """Draw the paper's figures 1 and 3, J for each case, and beside it the gap left."""
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    """Draw the paper's figures 1 and 3, J for each case, and beside it the gap left, if any."""
+    count = 1 + has_real(frame)
+    figure = Figure(figsize=(5.5 * count, 4), layout="constrained")
+    left, *right = figure.subplots(1, count, squeeze=False)[0]
     draw_J(left, frame)
-    if has_real(frame):
-        draw_gap(right, frame)
+    for axes in right:
+        draw_gap(axes, frame)
     seeds = sorted(frame["seed"].unique().tolist())
     figure.suptitle(f"{frame['noise'].iloc[0]} noise: interquartile mean over seeds {seeds}, 95%")
     return figure
