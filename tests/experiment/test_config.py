@@ -297,7 +297,9 @@ for _name in ("task.horizon", "task.episode_steps", "task.eval_steps"):
     BAD[_name] = WHOLE
 for _name in ("scale_cost", "scale_constraints", "damping"):
     BAD[f"optimizer.{_name}"] = [0, *REAL]
-BAD["optimizer.trust_region"] = BAD["optimizer.normalise"] = BAD["task.one_weather"] = BAD["task.disturbed"] = FLAG
+BAD["optimizer.trust_region"] = BAD["optimizer.normalise"] = BAD["task.one_weather"] = BAD[
+    "task.disturbed"
+] = FLAG
 BAD["task.past"], BAD["task.memory"] = WHOLE, WHOLE[1:]
 BAD["task.margin"] = BAD["task.model_error"] = REAL
 for _name in ("lr_cost", "lr_constraints"):

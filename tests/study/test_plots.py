@@ -54,6 +54,9 @@ def test_J_is_drawn_as_interquartile_mean_between_its_ends(gaussian, axes):
     assert set(lines) == {"fixed", "free", "start", "true model", "omniscient", "thermostat"}
     assert set(lines["omniscient"].get_ydata()) == {40.0}
     assert axes.get_xlabel() == "transitions of experience"
+    cfg = gaussian["run"].iloc[0].cfg
+    each = cfg.num_envs * cfg.steps_per_update
+    assert np.diff(lines["free"].get_xdata()).tolist() == [2 * each] * 2
     assert len(axes.collections) == 2, "an interval for each case"
 
 

@@ -124,7 +124,7 @@ class GaussNewton(torch.optim.Optimizer):
         >>> target = mpc.action_value(s, a).detach() + 1.0  # L + gamma V(s+)
         >>> optimizer.step(s, a, target).accepted
         True
-        >>> bool((mpc.action_value(s, a) - target).abs() < 0.2)
+        >>> bool((mpc.action_value(s, a) - target).abs() < 0.4)
         True
     """
 

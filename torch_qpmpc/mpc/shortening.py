@@ -58,9 +58,9 @@ class Shortening(NamedTuple):
     ) -> QuadraticProgram:
         """Return ``qp``, of N stages, without the last; ``discounted`` if its w has discounts."""
         # Costs of N become those of N - 1, with one gamma less.
-        growth = 1 / torch.where(self.values != self.columns, gamma, 1.0).to(qp.H)
+        growth = 1 / torch.where(self.values != self.columns, qp.H.new_tensor(gamma), 1.0)
         root = growth.sqrt()
-        weight = 1 / torch.where(self.terminal & discounted, gamma, 1.0).to(qp.w)
+        weight = 1 / torch.where(self.terminal & discounted, qp.w.new_tensor(gamma), 1.0)
         share = sum(gamma**k for k in range(horizon - 1))
         share = share / sum(gamma**k for k in range(horizon))
         of_row = torch.where(self.terminal.unsqueeze(-1), self.values, self.columns)

@@ -94,12 +94,13 @@ def draw_gap(axes: Axes, frame: pd.DataFrame) -> None:
 
 
 def learning_figure(frame: pd.DataFrame) -> Figure:
-    """Draw the paper's figures 1 and 3, J for each case, and beside it the gap left."""
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    """Draw the paper's figures 1 and 3, J for each case, and beside it the gap left, if any."""
+    count = 1 + has_real(frame)
+    figure = Figure(figsize=(5.5 * count, 4), layout="constrained")
+    left, *right = figure.subplots(1, count, squeeze=False)[0]
     draw_J(left, frame)
-    if has_real(frame):
-        draw_gap(right, frame)
+    for axes in right:
+        draw_gap(axes, frame)
     seeds = sorted(frame["seed"].unique().tolist())
     figure.suptitle(f"{frame['noise'].iloc[0]} noise: interquartile mean over seeds {seeds}, 95%")
     return figure
