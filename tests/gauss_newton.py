@@ -15,7 +15,8 @@ COST = ("H", "H_f", "q", "c", "w")
 class Reference:
     """The steps of a `GaussNewton` without a trust region."""
 
-    def __init__(self, mpc: QPMPC, optimizer: GaussNewton) -> None:
+    def __init__(self, mpc: QPMPC, optimizer: GaussNewton, normalise: bool = True) -> None:
+        self.normalise = normalise
         groups = optimizer.param_groups
         self.mpc = mpc
         self.leaves: list[Tensor] = [leaf for group in groups for leaf in group["params"]]
@@ -64,6 +65,9 @@ class Reference:
 
     def metric(self, gradients: list[Tensor], z: Tensor) -> Tensor:
         """Compute the diagonal of D from the gradients of a new batch."""
+        if not self.normalise:
+            ones = [torch.ones_like(leaf).flatten() for leaf in self.leaves]
+            return torch.cat([scale * x for scale, x in zip(self.scales, ones, strict=True)])
         units = self.units(z)
         sizes = dict.fromkeys(self.parts, 0.0)
         for part, rows, unit in zip(self.parts, gradients, units, strict=True):

@@ -82,16 +82,20 @@ def test_no_optimiser_moves_frozen_entries(kind, name):
     moves(mpc, C, mask)
 
 
+@pytest.mark.parametrize("normalise", [False, True])
 @pytest.mark.parametrize("penalised", [False, True])
 @pytest.mark.parametrize("memory", [0, 16])
 @pytest.mark.parametrize("kind", MASKS)
-def test_a_gauss_newton_step_is_that_in_the_learned_entries_alone(kind, memory, penalised):
+def test_a_gauss_newton_step_is_that_in_the_learned_entries_alone(
+    kind, memory, penalised, normalise
+):
     mask = MASKS[kind]()
     mpc = masked(mask)
     s, a, target = targets(mpc)
     S = SystemIdentificationPenalty(1e-2).curvature(random_states(20, N_Z)) if penalised else None
-    optimizer = GaussNewton(mpc, damping=0.1, trust_region=False, memory=memory)
-    reference = Reference(mpc, optimizer)
+    options = {"trust_region": False, "memory": memory, "normalise": normalise}
+    optimizer = GaussNewton(mpc, damping=0.1, **options)
+    reference = Reference(mpc, optimizer, normalise)
     before, expected = reference.theta(), reference.step(s, a, target, S)
     C = mpc.C.detach().clone()
     assert optimizer.step(s, a, target, penalty=S).accepted

@@ -20,7 +20,6 @@ from torch_qpmpc.study.plots import (
     draw_use,
     frontier_figure,
     trajectories_figure,
-    transitions,
 )
 from torch_qpmpc.study.report import figures
 from torch_qpmpc.study.runs import collect
@@ -130,12 +129,6 @@ def test_an_ablation_has_its_runs_median_and_interval():
     drawn = [np.sort(np.asarray(line.get_xdata())).tolist() for line in (runs, interval, median)]
     assert drawn == [pytest.approx(left) for left in ([0.1, 0.8, 0.9], [0.1, 0.9], [0.8])]
     assert to_rgba(median.get_color()) == to_rgba("tab:blue")
-
-
-def test_transitions_include_those_of_the_warm_up(gaussian):
-    run = gaussian["run"].iloc[0]
-    updates = np.array([0, 2, 4])
-    assert transitions(run, updates).tolist() == [16, 24, 32]  # of 4 environments
 
 
 def test_J_of_a_network_is_drawn_over_transitions_without_that_of_the_start(tmp_path, axes):
