@@ -70,8 +70,12 @@ def test_the_helps_defaults_are_those_of_the_configuration():
     cfg, text = make_config(), help_text()
     settings = text[text.index("Keys\n") : text.index("All keys")].splitlines()[1:]
     shown = dict(line.split()[0].split("=", 1) for line in settings if line.strip())
-    assert len(shown) == 10
+    assert len(shown) == 13
     del shown["hydra.run.dir"]
-    assert shown == {key: str(OmegaConf.select(cfg, key)) for key in shown}
+    values = {key: OmegaConf.select(cfg, key) for key in shown}
+    words = {True: "true", False: "false", None: "null"}
+    assert shown == {
+        key: words[x] if isinstance(x, bool | None) else str(x) for key, x in values.items()
+    }
     for line in text.splitlines():
         assert len(line) <= 100, line
