@@ -135,10 +135,10 @@ def _train(
                 mpc.release()
                 learner = make_learner(cfg, operator, physics, done=update)
                 gate.release(learner)
+            run.log(gate.judge(update), update)
             last = update == cfg.updates
             evaluated = last or update % cfg.eval_interval == 0
             if evaluated:
-                run.log(gate.judge(search=last), update)
                 found.evaluate(gate.policy)
                 gap = report(run, gate.mpc, found, update)
                 progress.set_postfix(J=cost_text(gap["J_best"]), closed_gap=gap["closed_gap"])

@@ -291,7 +291,13 @@ BAD: dict[str, list[Any]] = {
 for _name in ("threads", "updates", "batch_size", "num_envs", "steps_per_update"):
     BAD[_name] = WHOLE
 BAD["warmup_steps"] = WHOLE[1:]
-for _name in ("replay_capacity", "eval_interval", "log_interval", "constraint.si.windows"):
+for _name in (
+    "replay_capacity",
+    "eval_interval",
+    "gate_interval",
+    "log_interval",
+    "constraint.si.windows",
+):
     BAD[_name] = WHOLE
 for _name in ("task.horizon", "task.episode_steps", "task.eval_steps"):
     BAD[_name] = WHOLE

@@ -16,27 +16,30 @@ from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.study.runs import FinishedRun
 
 GATED = (*SMALL, "gate=true", "optimizer=gauss_newton", "batch_size=32", "steps_per_update=4")
+GATED += ("gate_interval=3",)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("gated")
     summary = train.train(
-        make_config(*GATED, "updates=8", "search.H_u=0.5", "search.loops=4"), str(folder)
+        make_config(*GATED, "updates=8", "search.H_u=0.5", "search.loops=6"), str(folder)
     )
     return folder, summary
 
 
-def test_each_evaluation_and_the_search_are_judged(run):
+def test_candidates_and_the_search_are_judged(run):
     folder, summary = run
-    assert summary["accepted"] + summary["rejected"] == 4 + 1
+    assert summary["accepted"] + summary["rejected"] == 3 + 1
     assert summary["accepted"] > 0
     table = read_metrics(folder)
     judged = table.dropna(subset=["gate/pairs"])
-    assert judged.index.to_list() == [2, 4, 6, 8]
+    assert judged.index.to_list() == [3, 6, 8]
     for row in judged.to_dict("records"):
         assert (float(row["gate/high"]) < 0) == bool(row["gate/accepted"])
     assert len(table["search/H_u"].dropna()) == 1
+    loops = 2 * judged["gate/pairs"].sum() + 2 * table["search/pairs"].sum() + 6 * 32
+    assert summary["simulated"] == 10 * loops
 
 
 def test_the_policy_that_acts_is_the_one_that_is_reported(run):
@@ -59,7 +62,7 @@ def make_gate(*overrides: str) -> tuple[RunGate, Any]:
 def test_without_a_gate_the_learner_acts(tmp_path):
     gate, actor = make_gate("gate=false")
     assert gate.actor is actor
-    assert gate.judge() == gate.summary() == {}
+    assert gate.judge(4) == gate.summary() == {}
     assert gate.state_dict() is None
     gate.save(tmp_path)
     assert not (tmp_path / BEST).exists()
@@ -71,14 +74,19 @@ def test_a_candidate_that_got_worse_does_not_act():
     with torch.no_grad():
         for parameter in actor.parameters():
             parameter.mul_(3.0)
-    assert gate.judge()["gate/accepted"] == 0.0
+    assert gate.judge(4)["gate/accepted"] == 0.0
     assert_close(gate.actor.module.C.detach(), before)
+
+
+def test_without_an_interval_of_its_own_each_evaluation_is_judged():
+    gate, _ = make_gate("gate=true", "gate_interval=null", "updates=8")
+    assert [bool(gate.judge(update)) for update in range(1, 9)] == [False, True] * 4
 
 
 def test_a_search_starts_from_the_policy_that_acts():
     gate, actor = make_gate("gate=true", "search.w=0.1", "search.loops=2")
     with torch.no_grad():
         actor.module.C.mul_(3.0)
-    found = gate.judge(search=True)
+    found = gate.judge(4)
     assert {"search/w", "search/accepted"} <= set(found)
     assert_close(actor.module.C.detach(), gate.actor.module.C.detach())

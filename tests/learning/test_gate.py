@@ -100,7 +100,19 @@ def test_any_other_candidate_does_not(level):
     verdict = gate.judge(Policy(level))
     assert not verdict.accepted
     assert gate.actor.level == 2.0
-    assert verdict.pairs == (96 if level == 2.0 else 32)
+    assert verdict.pairs == 32
+
+
+def test_an_undecided_comparison_ends_in_a_rejection():
+    def unpaired(policy: nn.Module, seed: int) -> Tensor:
+        assert isinstance(policy, Policy)
+        level = policy.level.item()
+        return normal(32, level, seed + int(100 * level))
+
+    verdict = Gate(Policy(2.0), unpaired, seed=1).judge(Policy(1.9))
+    assert not verdict.accepted
+    assert verdict.low < verdict.mean < 0 < verdict.high
+    assert verdict.pairs == 96
 
 
 def test_after_rejections_in_a_row_the_candidate_starts_from_the_acting_policy():

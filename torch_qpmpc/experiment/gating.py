@@ -33,12 +33,14 @@ class RunGate:
 
     Attributes:
         actor: the policy that acts.
+        simulated: the number of transitions in closed loops of comparisons and searches.
     """
 
     def __init__(self, cfg: DictConfig, learner: Learner, physics: AnyPlant) -> None:
         self._cfg, self._learner, self._physics = cfg, learner, physics
         self._gate = Gate(learner.actor, self._costs, seed=cfg.seed) if cfg.gate else None
         self.actor: Any = learner.actor if self._gate is None else self._gate.actor
+        self.simulated = 0
 
     @property
     def policy(self) -> Callable[[Tensor], Tensor]:
@@ -50,14 +52,18 @@ class RunGate:
         """The QP of the policy that acts; None if it is a network."""
         return _qp(self.actor)
 
-    def judge(self, search: bool = False) -> dict[str, float]:
+    def judge(self, update: int) -> dict[str, float]:
         """Let the learner's policy act if it costs less; return the scalars of the comparison.
 
-        With ``search``, a direct search over the scalars that the configuration chooses follows,
-        from the policy that acts, and its result is judged, too.
+        Judges each ``gate_interval`` updates and after the last one. Then a direct search over the
+        scalars that the configuration chooses follows, from the policy that acts, and its result is
+        judged, too.
         """
+        last = update == self._cfg.updates
+        if not last and update % (self._cfg.gate_interval or self._cfg.eval_interval):
+            return {}
         verdict = self._judge("gate")
-        return verdict | self._search() if search else verdict
+        return verdict | self._search() if last else verdict
 
     def _judge(self, tag: str) -> dict[str, float]:
         if self._gate is None:
@@ -79,7 +85,9 @@ class RunGate:
 
     def _costs(self, actor: Any, seed: int) -> Tensor:
         policy = in_closed_loop(actor, self._learner.n_preview)
-        return evaluate(self._cfg, policy, self._physics, seed).costs.sum(0)
+        costs = evaluate(self._cfg, policy, self._physics, seed).costs
+        self.simulated += costs.numel()
+        return costs.sum(0)
 
     def release(self, learner: Learner) -> None:
         """Free the C of the policy that acts, as the new ``learner``'s is."""
@@ -90,10 +98,11 @@ class RunGate:
             self.mpc.release()
 
     def summary(self) -> dict[str, int]:
-        """Return the numbers of candidates that were accepted and rejected."""
+        """Return the numbers of candidates accepted and rejected, and of simulated transitions."""
         if self._gate is None:
             return {}
-        return {"accepted": self._gate.accepted, "rejected": self._gate.rejected}
+        decisions = {"accepted": self._gate.accepted, "rejected": self._gate.rejected}
+        return decisions | {"simulated": self.simulated}
 
     def save(self, folder: Path) -> None:
         """Write the policy that acts to best.pt; without a gate, the checkpoint has it."""
@@ -107,12 +116,15 @@ class RunGate:
 
     def state_dict(self) -> dict[str, Any] | None:
         """Return the state of the gate; None without one."""
-        return None if self._gate is None else self._gate.state_dict()
+        if self._gate is None:
+            return None
+        return self._gate.state_dict() | {"simulated": self.simulated}
 
     def load_state_dict(self, state: dict[str, Any] | None) -> None:
         """Load a `state_dict`."""
         if self._gate is not None and state is not None:
             self._gate.load_state_dict(state)
+            self.simulated = state.get("simulated", 0)
 
 
 def _qp(actor: Any) -> QPMPC | None:

@@ -61,6 +61,8 @@ class RunFolder:
 
     def log(self, metrics: Mapping[str, float], update: int) -> None:
         """Log scalars at an update, to metrics.csv and the logger."""
+        if not metrics:
+            return
         if not self.rows or self.rows[-1]["update"] != update:
             self.rows.append({"update": update})
         self.rows[-1].update(metrics)

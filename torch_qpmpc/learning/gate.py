@@ -159,14 +159,16 @@ class Gate:
     def judge(self, candidate: nn.Module) -> Verdict:
         """Compare ``candidate`` with the acting policy on new starts and disturbances.
 
-        An accepted candidate's parameters are copied to the acting policy; after ``patience``
-        rejections in a row it is the other way round.
+        Pairs are added until the test is decided, the candidate's mean cost is no lower, or there
+        are ``pairs``. An accepted candidate's parameters are copied to the acting policy; after
+        ``patience`` rejections in a row it is the other way round.
 
         Raises:
             QPError: ``costs`` returns another shape than ``(starts,)``.
         """
         test, count = PairedTest(self._alpha), 0
-        while test.decision == "open" and test.pairs < self._pairs:
+        # A candidate that costs as much or more so far is hardly worth more pairs.
+        while test.decision == "open" and test.pairs < self._pairs and not test.mean >= 0:
             entropy = [self._seed, self.accepted + self.rejected, count]
             seed = int(np.random.SeedSequence(entropy).generate_state(1)[0])
             old, new = (self._costs(actor, seed) for actor in (self.actor, candidate))

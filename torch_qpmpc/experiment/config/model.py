@@ -82,6 +82,7 @@ class Config(Group):
     resume: Annotated[str | None, Expected("a path, or null")]
     ablation: Annotated[str | None, Expected("a name, or null")]
     gate: Flag = False
+    gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")] = None
     search: Search = NO_SEARCH
     logger: Annotated[str, one_of(LOGGERS)] = "tensorboard"
     export: Annotated[Literal["c"] | None, Expected("c, or null")] = None

@@ -1,0 +1,196 @@
+"""What learning adds to its start, on all tasks: ``python -m tests.benchmarks.improvement``.
+
+Each case is one of train.py's configurations and a start, corrupted or identified from a log; each
+way is a method of learning, and the last is the default. The evaluation has starts, days and noise
+that no setting was chosen on. Finished runs are kept in runs/improvement.csv and not repeated; the
+tables go into docs/results/improvement.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import tempfile
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import torch
+
+import train
+from tests.benchmarks.table import DOCS, ROOT
+from tests.runs import make_config
+from torch_qpmpc.envs.closed_loop import cost_text
+from torch_qpmpc.experiment.plots import experience
+from torch_qpmpc.experiment.tasks import find_task
+from torch_qpmpc.learning.search import KNOBS
+from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.statistics import bootstrap_interval
+
+PAGE = DOCS / "results" / "improvement.md"
+RESULTS = ROOT / "runs" / "improvement.csv"
+#: Seeds of the runs, and of the evaluation.
+SEEDS, EVAL_SEED = range(501, 511), 9002
+COMMON = ("solver=daqp", "figures=false", "logger=csv", f"eval_seed={EVAL_SEED}")
+NO_SEARCH = tuple(f"search.{name}=null" for name in KNOBS)
+FIELDS = ("case", "way", "seed", "start", "best", "final", "true model", "omniscient")
+FIELDS += ("transitions", "simulated", "accepted", "rejected", "seconds")
+
+
+class Case(NamedTuple):
+    """A task and the start of its learning.
+
+    Attributes:
+        overrides: those of train.py.
+        reference: the rival with the most knowledge, if the task has rivals.
+    """
+
+    overrides: Sequence[str]
+    reference: str | None = None
+
+
+MODEL, DATA = "start=model", "start=data"
+HOUSE, WALL = ("task=house", "task.margin=0.1"), ("task=house_wall",)
+DAYS = ("num_envs=4", "start.transitions=1152")
+CASES = {
+    "Point mass, Gaussian noise, corrupted": Case(("task=point_mass",)),
+    "Point mass, Gaussian noise, identified": Case(("task=point_mass", DATA)),
+    "Point mass, Brownian noise, corrupted": Case(("task=point_mass", "noise=brownian")),
+    "Point mass, Brownian noise, identified": Case(("task=point_mass", "noise=brownian", DATA)),
+    "Gros-Zanon, corrupted": Case(("task=gros_zanon",)),
+    "Gros-Zanon, identified": Case(("task=gros_zanon", DATA)),
+    "House, corrupted": Case(("task=house",), "omniscient"),
+    "House, identified": Case((*HOUSE, DATA, *DAYS), "omniscient"),
+    "House with a wall, corrupted": Case(WALL, "omniscient"),
+    "House with a wall, identified": Case((*WALL, DATA, *DAYS), "omniscient"),
+    "Four tanks, identified": Case(("task=four_tanks",), "omniscient"),
+    "Tank with references, corrupted": Case(("task=tank_references",), "omniscient"),
+    "Tank with references, identified": Case(("task=tank_references", DATA), "omniscient"),
+    "Pendulum, linear model": Case(("task=pendulum",)),
+    "Pendulum, identified": Case(("task=pendulum", DATA)),
+}
+WAYS = {
+    "Q-learning": ("gate=false", *NO_SEARCH),
+    "with the gate": NO_SEARCH,
+    "default": (),
+}
+
+
+def run(case: str, way: str, seed: int) -> dict[str, Any]:
+    """Train once; return the fields of a row."""
+    overrides, reference = CASES[case]
+    cfg = make_config(*COMMON, *overrides, *WAYS[way], f"seed={seed}")
+    cfg.rivals = False if reference is None else [reference]
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        summary = train.train(cfg, folder, quiet=True)
+    seconds = time.perf_counter() - began
+    before, each, _ = experience(cfg)
+    unit, _ = find_task(cfg.task).unit
+    ends = {name: summary[f"J_{name}"] for name in ("start", "best", "final")}
+    return ends | {
+        "case": case,
+        "way": way,
+        "seed": seed,
+        "true model": summary["J_true_model"],
+        "omniscient": summary["rivals"].get(reference),
+        "transitions": round((before + each * cfg.updates) * unit),
+        "simulated": summary.get("simulated", 0),
+        "accepted": summary.get("accepted"),
+        "rejected": summary.get("rejected"),
+        "seconds": round(seconds, 1),
+    }
+
+
+def finished(path: Path) -> pd.DataFrame:
+    """Read the rows of former runs."""
+    return pd.read_csv(path) if path.exists() else pd.DataFrame(columns=list(FIELDS))
+
+
+def add(path: Path, row: dict[str, Any]) -> None:
+    """Append a row."""
+    new = not path.exists()
+    path.parent.mkdir(exist_ok=True)
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, FIELDS)
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def ratios(rows: pd.DataFrame) -> str:
+    """Format J relative to the start's, in percent: median, 95 % interval, worst seed."""
+    percent = (100 * rows["best"] / rows["start"]).to_numpy()
+    low, high = bootstrap_interval([percent])
+    return f"{np.median(percent):.1f} [{low:.1f}, {high:.1f}], {percent.max():.1f}"
+
+
+def outcome_table(rows: pd.DataFrame) -> str:
+    """Format each case's J by way, relative to its start."""
+    lines = []
+    for case, runs in rows.groupby("case", sort=False):
+        by_way = {way: runs[runs["way"] == way] for way in WAYS}
+        cells = [ratios(found) if len(found) else "" for found in by_way.values()]
+        lines.append([str(case), cost_text(runs["start"].median()), *cells])
+    return table(["J / J of the start, %: median [interval], worst", "J start", *WAYS], lines)
+
+
+def reference_table(rows: pd.DataFrame) -> str:
+    """Format the default's J beside the other controllers', with what it took."""
+    lines = []
+    for case, runs in rows[rows["way"] == "default"].groupby("case", sort=False):
+        names = ("start", "best", "true model", "omniscient")
+        costs = ["" if runs[n].isna().all() else cost_text(runs[n].median()) for n in names]
+        gaps = ((runs["start"] - runs["best"]) / (runs["start"] - runs[n]) for n in names[2:])
+        shares = ["" if gap.isna().all() else f"{gap.median():.2f}" for gap in gaps]
+        counts = [f"{runs[n].median():,.0f}" for n in ("transitions", "simulated")]
+        decisions = (
+            f"{runs['accepted'].sum():.0f} of {(runs['accepted'] + runs['rejected']).sum():.0f}"
+        )
+        lines.append([str(case), *costs, *shares, *counts, decisions])
+    head = [
+        "Medians",
+        "start",
+        "default",
+        "true model",
+        "omniscient",
+        "closed gap to the true model",
+    ]
+    head += ["to the omniscient", "transitions", "simulated for comparisons", "accepted"]
+    return table(head, lines)
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.benchmarks.improvement", description="Write the table of learning."
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
+    parser.add_argument("--cases", nargs="+", default=[""], help="parts of the cases' names")
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
+    parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
+    options = parser.parse_args(None if arguments is None else list(arguments))
+    text = options.page.read_text(encoding="utf-8")
+    replaced(text, "", "improvement")  # fail before the runs
+    torch.set_num_threads(1)
+    cases = [case for case in CASES if any(part in case for part in options.cases)]
+    for seed in options.seeds:
+        for case in cases:
+            for way in options.ways:
+                rows = finished(options.results)
+                same = (rows["case"] == case) & (rows["way"] == way) & (rows["seed"] == seed)
+                if not same.any():
+                    add(options.results, row := run(case, way, seed))
+                    print(*row.values(), flush=True)
+    rows = finished(options.results)
+    rows = rows[rows["seed"].isin(options.seeds)]
+    rows = rows.sort_values("case", key=lambda names: names.map(list(CASES).index), kind="stable")
+    tables = f"{outcome_table(rows)}\n\n{reference_table(rows)}"
+    options.page.write_text(replaced(text, tables, "improvement"), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
