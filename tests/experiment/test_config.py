@@ -40,6 +40,7 @@ NOT_NEEDED = (
     "gate",
     "logger",
     "rivals",
+    "search.margin_k",
     "start.name",
     "target_horizon",
     "task.file",
