@@ -40,6 +40,7 @@ NOT_NEEDED = (
     "gate",
     "logger",
     "rivals",
+    "search.margin_k",
     "start.name",
     "target_horizon",
     "task.file",
@@ -332,7 +333,7 @@ def test_rivals_are_those_of_the_task():
     with pytest.raises(QPError, match=rf"rivals: got \['nobody'\], expected .* these: {known}"):
         check_config(make_config("task=four_tanks", "rivals=[nobody]"))
     with pytest.raises(QPError, match=r"rivals: got \['DeePC'\], expected true or false\."):
-        check_config(make_config("rivals=[DeePC]"))
+        check_config(make_config("task=pendulum", "rivals=[DeePC]"))
 
 
 def test_the_edges_are_accepted():
@@ -562,6 +563,10 @@ def test_solver_must_be_known():
         (
             ["target_horizon=shrinking", "algo=td3"],
             "target_horizon: got 'shrinking', expected receding. td3 does not support",
+        ),
+        (
+            ["constraint=mpc", "search.margin_k=0.1"],
+            "search.margin_k: got 0.1, expected null. Learned bounds of constraint.structure=tied",
         ),
         (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
     ],

@@ -18,7 +18,7 @@ from torch_qpmpc.experiment.tasks import TASKS, make_mpc, make_physics
 
 
 def test_the_summary_has_each_J_the_gap_and_the_rivals():
-    cfg = make_config(*SMALL)
+    cfg = make_config(*SMALL, "rivals=false")
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
     found = Evaluation.before(cfg, physics, mpc)

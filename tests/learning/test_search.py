@@ -41,7 +41,8 @@ def test_a_scalar_moves_its_part_alone(name, learn, hessian):
     back = values(mpc)
     for part in PARTS:
         assert_close(back[part], before[part])
-    parts = {"margin": {"lb", "ub"}, "H_u": {"H"}, "H_x": {"H"}, "q_f": {"q"}}
+    bounds = {"lb", "ub"}
+    parts = {"margin": bounds, "margin_k": bounds, "H_u": {"H"}, "H_x": {"H"}, "q_f": {"q"}}
     assert moved >= parts.get(name, {name})
     unchanged = set(PARTS) - parts.get(name, {name})
     for part in unchanged:  # up to the rounding of a factor of H
@@ -56,6 +57,25 @@ def test_a_margin_tightens_soft_rows_alone():
     assert_close(mpc.lb[soft], before["lb"][soft] + 0.1)
     assert_close(mpc.ub[soft], before["ub"][soft] - 0.1)
     assert_close(mpc.lb[~soft], before["lb"][~soft])
+
+
+def test_a_margin_by_stage_grows_like_the_root_of_the_stage():
+    D = torch.ones(1, 3)
+    rows = {"constraints": (D, [-4.0], [4.0]), "terminal_constraints": (D[:, :2], [-5.0], [5.0])}
+    mpc = scheme(structure="varying", learn=("lb", "ub"), **rows)
+    before = values(mpc)
+    _set(mpc, before, {"margin_k": 0.3})
+    at = 0.3 * (torch.arange(4).double() / 3).sqrt()
+    plan = torch.cat([torch.stack((x, x, 0 * x)) for x in at])[:-1]  # the action's row is hard
+    margin = torch.cat((plan, at[:-1], at[-1:]))
+    assert_close(mpc.lb.detach(), before["lb"] + margin)
+    assert_close(mpc.ub.detach(), before["ub"] - margin)
+
+
+def test_tied_learned_bounds_have_no_margin_by_stage():
+    mpc = scheme(structure="tied", learn=("C", "lb"))
+    with pytest.raises(QPError, match="those of all stages"):
+        search(mpc, lambda mpc, seed: torch.ones(1), {"margin_k": 1.0}, loops=1)
 
 
 def test_factors_of_weights():

@@ -73,7 +73,7 @@ class RunGate:
         return {f"{tag}/{name}": float(getattr(verdict, name)) for name in names}
 
     def _search(self) -> dict[str, float]:
-        sizes = {name: x for name in KNOBS if (x := self._cfg.search[name])}
+        sizes = {name: x for name in KNOBS if (x := self._cfg.search.get(name))}
         actor: Any = self._learner.actor
         mpc = _qp(actor)
         if not sizes or mpc is None:

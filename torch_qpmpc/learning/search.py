@@ -24,11 +24,16 @@ Theta = dict[str, Tensor]
 PARTS = ("H", "H_f", "q", "b", "lb", "ub", "w")
 
 
-def _margin(mpc: QPMPC, theta: Theta, x: float) -> Theta:
+def _margin(mpc: QPMPC, theta: Theta, x: float | Tensor) -> Theta:
     return {
         "lb": torch.where(mpc.soft, theta["lb"] + x, theta["lb"]),
         "ub": torch.where(mpc.soft, theta["ub"] - x, theta["ub"]),
     }
+
+
+def _growing_margin(mpc: QPMPC, theta: Theta, x: float) -> Theta:
+    # The standard deviation of a sum of k independent errors grows like the square root of k.
+    return _margin(mpc, theta, x * (mpc._layout.row_stages() / mpc.horizon).sqrt())
 
 
 def _slack_weight(mpc: QPMPC, theta: Theta, x: float) -> Theta:
@@ -72,6 +77,7 @@ def _scaled(mpc: QPMPC, H: Tensor, root: float, action: bool) -> Tensor:
 #: Scalars that a search may move: functions of theta and x, without effect at x = 0.
 KNOBS: dict[str, Callable[[QPMPC, Theta, float], Theta]] = {
     "margin": _margin,
+    "margin_k": _growing_margin,
     "w": _slack_weight,
     "H_u": _action_weight,
     "H_x": _state_weight,
@@ -98,7 +104,8 @@ def search(
         mpc: the QPMPC, which is changed in place.
         costs: maps a QPMPC and a seed to the costs ``(starts,)`` of closed loops.
         knobs: the initial standard deviation of each scalar: ``margin``, by which the bounds of all
-            soft rows are tightened, in their unit; ``b``, added to the model's offset; ``q_f``,
+            soft rows are tightened, in their unit; ``margin_k``, likewise for those of x_N, and
+            times sqrt(k / N) for those of stage k; ``b``, added to the model's offset; ``q_f``,
             added to the terminal slope; and ``w``, ``H_x``, ``H_u`` and ``H_f``, the logarithms of
             factors of the slack weights and of the weights of states, actions and x_N.
         loops: the number of candidates, each one call of ``costs``.
@@ -134,6 +141,9 @@ def search(
         check_number(f"knobs[{name}]", size, lambda x: x > 0, "a finite number > 0")
     if mpc.hessian == "full" and {"H_x", "H_u"} & set(knobs):
         raise QPError.expected("knobs", "H_x or H_u", "others", "A full H has no stage weights.")
+    if "margin_k" in knobs and mpc.structure == "tied" and {"lb", "ub"} & {*mpc.learned}:
+        remedy = "Learned bounds of structure='tied' are those of all stages."
+        raise QPError.expected("knobs", "margin_k", "others", remedy)
     theta = {part: getattr(mpc, part).detach().clone() for part in PARTS if hasattr(mpc, part)}
     # CMA-ES needs two dimensions.
     names, sizes = list(knobs), np.array([*knobs.values(), 1.0][: max(len(knobs), 2)])

@@ -95,11 +95,17 @@ class Layout:
         It is one for the past.
         """
         powers = gamma ** torch.arange(self.horizon + 1, dtype=torch.float64).unsqueeze(-1)
-        sizes = (self.n_d, self.n_x, self.n_u, self.n_mixed, self.n_terminal, self.n_rates)
-        d, x, u, D, D_f, rates = (powers.expand(-1, size) for size in sizes)
+        d, x, u = (powers.expand(-1, size) for size in (self.n_d, self.n_x, self.n_u))
         past = powers.new_ones(self.n_before - self.n_preview)
         z = torch.cat((d.flatten(), past, self.stages(x, u)))
-        return z, self.rows(x, u, D[:-1], D_f[-1], rates[:-1])
+        return z, gamma ** self.row_stages()
+
+    def row_stages(self) -> Tensor:
+        """Return k, the stage of each row of G, ``(n_g,)``."""
+        k = torch.arange(self.horizon + 1, dtype=torch.float64).unsqueeze(-1)
+        sizes = (self.n_x, self.n_u, self.n_mixed, self.n_terminal, self.n_rates)
+        x, u, D, D_f, rates = (k.expand(-1, size) for size in sizes)
+        return self.rows(x, u, D[:-1], D_f[-1], rates[:-1])
 
     def ties(self, part: str) -> Tensor:
         """Return the index of the value of each entry of a tied q, b, lb, ub or w.

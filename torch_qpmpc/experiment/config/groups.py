@@ -159,6 +159,7 @@ class Search(Group):
 
     loops: Count
     margin: Size
+    margin_k: Size = None
     b: Size
     w: Size
     H_x: Size

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torch_qpmpc.envs.four_tanks import FourTanks
 from torch_qpmpc.envs.tank_references import TankReferences
+from torch_qpmpc.experiment.rivals import tightened
 from torch_qpmpc.experiment.rivals.deepc import DeePC
 from torch_qpmpc.experiment.rivals.kalman_mpc import KalmanMPC
 from torch_qpmpc.experiment.rivals.linear_mpc import LinearMPC, OmniscientMPC, Tracking
@@ -73,6 +74,7 @@ TANK_REFERENCES_RIVALS = {
         lambda plant: reference_mpc(plant, *offset_free(plant.A, plant.B, plant.past - 1)),
         sees={"past": 5},
     ),
+    "tightened": Rival(tightened.tank_references, sees={"past": 1}),
     "omniscient": Rival(
         lambda plant: OmniscientMPC(plant, plant.horizon, TERMINAL_FACTOR), slow=True
     ),

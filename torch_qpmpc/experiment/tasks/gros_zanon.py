@@ -6,6 +6,8 @@ import torch
 from omegaconf import DictConfig
 
 from torch_qpmpc.envs import GrosZanonLTI
+from torch_qpmpc.experiment.rivals import tightened
+from torch_qpmpc.experiment.rivals.rival import Rival
 from torch_qpmpc.experiment.tasks.registry import Scheme, Task, register
 
 
@@ -26,6 +28,7 @@ register(
         wrong_scheme,
         true_scheme,
         noises=("uniform",),
+        rivals={"tightened": Rival(tightened.gros_zanon)},
         defaults=None,
     )
 )

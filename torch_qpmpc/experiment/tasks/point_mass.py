@@ -7,6 +7,8 @@ from omegaconf import DictConfig
 
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.envs.point_mass import NOISE_STD
+from torch_qpmpc.experiment.rivals import tightened
+from torch_qpmpc.experiment.rivals.rival import Rival
 from torch_qpmpc.experiment.tasks.registry import Scheme, Task, register
 
 
@@ -34,6 +36,7 @@ register(
         true_scheme,
         noises=tuple(NOISE_STD),
         takes_noise_std=True,
+        rivals={"tightened": Rival(tightened.point_mass)},
         defaults=None,
     )
 )

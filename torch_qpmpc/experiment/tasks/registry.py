@@ -107,7 +107,7 @@ class Task:
         closed_loop: the function of `torch_qpmpc.envs.closed_loop` for the plant's kind.
         noises: choices of ``noise.name``; the first is the default.
         takes_noise_std: True if ``make_plant`` reads ``noise.std``.
-        rivals: controllers of a `Plant` that the learned one is compared with, by name.
+        rivals: controllers that the learned one is compared with, by name.
         episode: returns arguments of `episode_figure` that show an episode of a plant in its own
             names and units, such as ``outputs`` or ``band``, from the known signals d of its steps
             ``(T + 1, n_d)``.

@@ -1,0 +1,115 @@
+"""Chance constraints: soft rows tightened by the covariance of the predictions' errors.
+
+With the model x+ = A x + B u + v, v of covariance W, and the feedback u_k + K e_k on the error e_k
+of the prediction x_k, the error's covariance is
+
+    Sigma_{k+1} = (A + B K) Sigma_k (A + B K)' + W,
+
+and a row g'z <= ub holds with a given probability for a Gaussian error if ub is replaced by ub less
+the quantile times the standard deviation of g'z. K = 0 is the open loop. Colored noise is white
+after its states have been added to x.
+
+References:
+    Farina, Giulioni and Scattolini, "Stochastic linear model predictive control with chance
+    constraints - a review" (Journal of Process Control 44, 2016), section 3.
+"""
+
+from __future__ import annotations
+
+import torch
+from scipy.stats import norm
+from torch import Tensor
+
+from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.module import QPMPC
+
+
+def prediction_covariance(
+    A: Tensor, W: Tensor, horizon: int, initial: Tensor | None = None
+) -> Tensor:
+    """Return the covariances of the errors of x_0, .., x_N, ``(N + 1, n_x, n_x)``.
+
+    Args:
+        A: ``(n_x, n_x)``; A + B K with a feedback.
+        W: covariance of the noise, ``(n_x, n_x)``.
+        horizon: N.
+        initial: covariance of the error of x_0, ``(n_x, n_x)``; zero by default.
+
+    Raises:
+        QPError: a shape does not fit.
+
+    Example:
+        >>> one = torch.ones(1, 1)
+        >>> prediction_covariance(one, 0.5 * one, 4).flatten()
+        tensor([0.0000, 0.5000, 1.0000, 1.5000, 2.0000])
+    """
+    check_whole("horizon", horizon, 0)
+    check_tensor("A", A, "n_x", "n_x", batched=False)
+    n_x = len(A)
+    check_tensor("A", A, n_x, n_x, batched=False)
+    check_tensor("W", W, n_x, n_x, batched=False)
+    covariances = [torch.zeros_like(W) if initial is None else initial]
+    check_tensor("initial", covariances[0], n_x, n_x, batched=False)
+    for _ in range(horizon):
+        covariances.append(A @ covariances[-1] @ A.mT + W)
+    return torch.stack(covariances)
+
+
+@torch.no_grad()
+def tighten(
+    mpc: QPMPC, covariances: Tensor, probability: float = 0.95, K: Tensor | None = None
+) -> None:
+    """Tighten each soft row so that it holds with a probability, and change ``mpc`` in place.
+
+    Each row is a constraint by itself. Correlation between stages, which matters to rows of
+    changes of the action alone, is neglected. Two bounds of a row that would cross meet halfway.
+
+    Args:
+        mpc: the QPMPC, whose bounds must not be learned.
+        covariances: those of the errors of x_0, .., x_N, ``(N + 1, n_x, n_x)``.
+        probability: that of each row, from 0.5 to less than 1.
+        K: the feedback u_k + K e_k, ``(n_u, n_x)``; zero by default.
+
+    Raises:
+        QPError: an argument does not fit, or the bounds are learned.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> one = torch.ones(1, 1)
+        >>> mpc = qm.QPMPC.from_model(one, one, 2, state_bounds=([-5.0], [5.0]))
+        >>> tighten(mpc, prediction_covariance(one, 0.25 * one, 2))
+        >>> mpc.ub[mpc.soft].numpy().round(3)  # of x_0, x_1 and x_2
+        array([5.   , 4.178, 3.837])
+    """
+    check_kind("mpc", mpc, QPMPC)
+    n_x, n_u, N = mpc.n_x, mpc.n_u, mpc.horizon
+    check_tensor("covariances", covariances, N + 1, n_x, n_x, batched=False)
+    valid = "a probability in [0.5, 1)"
+    check_number("probability", probability, lambda x: 0.5 <= x < 1, valid)
+    if learned := {"lb", "ub"} & {*mpc.learned}:
+        got = f"one that learns {' and '.join(sorted(learned))}"
+        raise QPError.expected("mpc", got, "fixed bounds", "Leave lb and ub out of learn.")
+    K = covariances.new_zeros(n_u, n_x) if K is None else K
+    check_tensor("K", K, n_u, n_x, batched=False)
+    variance = _row_variance(mpc, covariances.to(mpc.lb), K.to(mpc.lb))
+    margin = norm.ppf(probability) * variance.sqrt()
+    lb, ub = mpc.lb + margin, mpc.ub - margin
+    halfway = (mpc.lb + mpc.ub) / 2
+    crossed = lb > ub
+    mpc.lb.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, lb), mpc.lb))
+    mpc.ub.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, ub), mpc.ub))
+
+
+def _row_variance(mpc: QPMPC, covariances: Tensor, K: Tensor) -> Tensor:
+    """Return the variance of each row's g'z, ``(n_g,)``."""
+    n_x, n = mpc.n_x, mpc.n_x + mpc.n_u
+    errors = torch.cat((torch.eye(n_x).to(K), K))
+    # The first entry of x_0 in z; what comes before is known.
+    first = mpc.n_p - n_x
+    S = K.new_zeros(mpc.n_z, mpc.n_z)
+    for k, covariance in enumerate(covariances):
+        stage = slice(first + k * n, min(first + (k + 1) * n, mpc.n_z))
+        size = stage.stop - stage.start  # without an action for x_N
+        S[stage, stage] = errors[:size] @ covariance @ errors[:size].mT
+    return ((mpc.G @ S) * mpc.G).sum(-1).clamp(min=0)
