@@ -96,9 +96,8 @@ def test_an_anchor_is_part_of_the_step(mask):
     after = mpc.C.detach().requires_grad_()
     penalty = delta.square().mean() * anchor.value(after) + COUNT / 2 * (after @ S * after).sum()
     (force,) = torch.autograd.grad(penalty, after)
-    parts = dict(
-        zip(reference.parts, left.split([x.numel() for x in reference.leaves]), strict=True)
-    )
+    sizes = [leaf.numel() for leaf in reference.leaves]
+    parts = dict(zip(reference.parts, left.split(sizes), strict=True))
     total = parts["C"].reshape(C.shape) + force
     if mask:
         assert torch.equal(after[~learned], C[~learned])

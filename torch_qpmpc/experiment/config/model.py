@@ -23,6 +23,7 @@ from torch_qpmpc.experiment.config.groups import (
 from torch_qpmpc.experiment.fields import (
     Count,
     Expected,
+    Finite,
     Flag,
     Fraction,
     Group,
@@ -83,7 +84,7 @@ class Config(Group):
     ablation: Annotated[str | None, Expected("a name, or null")]
     gate: Flag = False
     anchor: NonNegative = 0.0
-    average: Annotated[float, Field(ge=0, lt=1), Expected("a number in [0, 1)")] = 0.0
+    average: Annotated[Finite, Field(ge=0, lt=1), Expected("a number in [0, 1)")] = 0.0
     search: Search = NO_SEARCH
     logger: Annotated[str, one_of(LOGGERS)] = "tensorboard"
     export: Annotated[Literal["c"] | None, Expected("c, or null")] = None
