@@ -238,6 +238,8 @@ BAD: dict[str, list[Any]] = {
     "export": ["python", 3, True],
     "figures": FLAG,
     "gate": FLAG,
+    "anchor": REAL,
+    "average": [-0.5, 1, 1.1, math.nan, False, "half", None],
     "search.loops": WHOLE,
     **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
     "rivals": ["DeePC", 3, None, [1]],
@@ -446,7 +448,8 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     cfg, file = make_config("gate=false"), tmp_path / "config.yaml"
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
-    for key in ("logger", "eval_seed", "start", "gate", "search", "target_horizon"):
+    later = ("logger", "eval_seed", "start", "gate", "anchor", "average", "search")
+    for key in (*later, "target_horizon"):
         del cfg[key]
     OmegaConf.save(cfg, file)
     assert differences(settings(cfg), now) is None
@@ -567,6 +570,26 @@ def test_solver_must_be_known():
         (
             ["constraint=mpc", "search.margin_k=0.1"],
             "search.margin_k: got 0.1, expected null. Learned bounds of constraint.structure=tied",
+        ),
+        (
+            ["anchor=1"],
+            "start.name: got 'model', expected data. The anchor is at a C that was identified",
+        ),
+        (
+            ["anchor=1", "start=data", "optimizer=adam"],
+            "optimizer.name: got 'adam', expected gauss_newton. The anchor is part of its steps",
+        ),
+        (
+            ["anchor=1", "start=data", "constraint=fixed"],
+            r"constraint.learn: got \[\], expected a list with C, which is anchored",
+        ),
+        (
+            ["anchor=1", "start=data", "constraint=mpc"],
+            "constraint.structure: got 'tied', expected free. The anchor needs a free C",
+        ),
+        (
+            ["average=0.9", "gate=false"],
+            "gate: got False, expected true. The average is what the gate judges",
         ),
         (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
     ],

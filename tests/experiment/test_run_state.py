@@ -23,6 +23,8 @@ from torch_qpmpc.experiment.run_state import resumed
 RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3")
 STOPS = (2, 7)
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
+GATED = ("gate=true", "optimizer=gauss_newton")
+ANCHORED = ("start=data", "start.transitions=200", "anchor=1")
 ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
 
 
@@ -45,7 +47,8 @@ ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
         ("algo=td3", *ACTOR_CRITIC),
         ("algo=td3", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
         ("task=store", "optimizer=adam", "constraint=combined"),
-        ("gate=true", "optimizer=gauss_newton", "constraint=mpc", "release=5", "search.w=0.5"),
+        (*GATED, "constraint=mpc", "release=5", "search.w=0.5", "average=0.9"),
+        (*GATED, *ANCHORED, "constraint=free", "average=0.5"),
         ("gate=true", "algo=td3", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
         ("task=store", "optimizer=gauss_newton", "constraint=si", "task.episode_steps=5"),
         ("task=store", "optimizer=recursive", "optimizer.memory=8", "task.episode_steps=6"),

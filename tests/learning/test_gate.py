@@ -117,9 +117,9 @@ def test_an_undecided_comparison_ends_in_a_rejection():
 
 def test_after_rejections_in_a_row_the_candidate_starts_from_the_acting_policy():
     gate, candidate = Gate(Policy(2.0), costs, patience=2), Policy(3.0)
-    gate.judge(candidate)
+    assert not gate.judge(candidate).restarted
     assert candidate.level == 3.0
-    gate.judge(candidate)
+    assert gate.judge(candidate).restarted
     assert candidate.level == 2.0
 
 

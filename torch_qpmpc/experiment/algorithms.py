@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.objectives import LossModule, SoftUpdate
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop
@@ -19,7 +21,8 @@ from torch_qpmpc.experiment.actor_critic import (
     make_actor_critic_loss,
     make_closed_loop_actor,
 )
-from torch_qpmpc.experiment.tasks import AnyPlant, find_task
+from torch_qpmpc.experiment.tasks import AnyPlant, Start, find_task
+from torch_qpmpc.learning.anchor import Anchor
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import (
     POLICY_ACTIVE_SET,
@@ -45,6 +48,7 @@ class Learner:
         deviation, si: the penalties; None if off.
         target: the soft update of the target network; None without one.
         n_preview: entries of the preview, with which p begins.
+        average: the exponential average of the actor's parameters; None without one.
     """
 
     learn: Update
@@ -56,17 +60,30 @@ class Learner:
     si: SystemIdentificationPenalty | None
     target: SoftUpdate | None
     n_preview: int = 0
+    average: AveragedModel | None = None
+
+    @property
+    def candidate(self) -> Any:
+        """The policy that a gate judges: the average of the actor or, without one, the actor."""
+        return self.actor if self.average is None else self.average.module
 
     @property
     def policy(self) -> Callable[[Tensor], Tensor]:
-        """The actor as a function from p to a, for one closed loop."""
-        return in_closed_loop(self.actor, self.n_preview)
+        """The candidate as a function from p to a, for one closed loop."""
+        return in_closed_loop(self.candidate, self.n_preview)
 
     def advance(self) -> None:
-        """Advance the learning-rate schedule and the target network by one update."""
+        """Advance the schedule, the target network and the average by one update."""
         self.schedule.step()
         if self.target is not None:
             self.target.step()
+        if self.average is not None:
+            self.average.update_parameters(self.actor)
+
+    def restart(self) -> None:
+        """Go on learning from the candidate."""
+        if self.average is not None:
+            self.actor.load_state_dict(self.candidate.state_dict())
 
 
 def make_operator(cfg: DictConfig, mpc: QPMPC) -> QPActorValueOperator:
@@ -79,9 +96,14 @@ def make_learner(
     cfg: DictConfig,
     operator: QPActorValueOperator,
     physics: AnyPlant,
+    start: Start | None = None,
+    *,
     done: int = 0,
 ) -> Learner:
-    """Make the learner of ``cfg.algo``; its rates continue after ``done`` updates."""
+    """Make the learner of ``cfg.algo``; its rates continue after ``done`` updates.
+
+    An anchor is at the C that was identified at the ``start``.
+    """
     mpc = operator.module
     if cfg.algo.name == "qlearning":
         loss_module = QPQLearningLoss(
@@ -96,7 +118,8 @@ def make_learner(
         actor = make_closed_loop_actor(cfg, mpc, loss_module, physics)
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
     deviation, si = make_penalties(cfg, mpc)
-    optimizer = make_optimizer(cfg, mpc, loss_module)
+    anchor = make_anchor(cfg, start)
+    optimizer = make_optimizer(cfg, mpc, loss_module, anchor)
     schedule = make_schedule(cfg, optimizer, done)
     delayed = cfg.algo.name != "qlearning" or cfg.delay_value
     return Learner(
@@ -109,6 +132,7 @@ def make_learner(
         si,
         SoftUpdate(loss_module, tau=cfg.target_rate) if delayed else None,
         (mpc.horizon + 1) * mpc.n_d,
+        make_average(cfg, actor),
     )
 
 
@@ -123,8 +147,28 @@ def make_penalties(
     )
 
 
+def make_anchor(cfg: DictConfig, start: Start | None) -> Anchor | None:
+    """Make the anchor at the identified C; None if it is off."""
+    if not cfg.anchor or start is None:
+        return None
+    return Anchor.of(start.identified, cfg.anchor, b_learned="b" in cfg.constraint.learn)
+
+
+def make_average(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedModel | None:
+    """Make the exponential average of the actor's parameters, at first a copy; None if off.
+
+    It averages the Cholesky factors of H, so that H stays positive semidefinite.
+    """
+    if not cfg.average:
+        return None
+    return AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(cfg.average))
+
+
 def make_optimizer(
-    cfg: DictConfig, mpc: QPMPC, loss_module: LossModule | None = None
+    cfg: DictConfig,
+    mpc: QPMPC,
+    loss_module: LossModule | None = None,
+    anchor: Anchor | None = None,
 ) -> torch.optim.Optimizer:
     """Make the optimiser, with one rate for the cost and one for the constraints.
 
@@ -141,6 +185,7 @@ def make_optimizer(
             td_error_clip=cfg.td_error_clip,
             trust_region=options.trust_region,
             normalise=options.normalise,
+            anchor=anchor,
         )
     rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}
     if loss_module is None or cfg.algo.name == "qlearning":

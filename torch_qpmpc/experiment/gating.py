@@ -28,7 +28,7 @@ class RunGate:
 
     Args:
         cfg: the run's configuration; ``gate`` switches the comparisons on.
-        learner: the learner, whose actor is the candidate.
+        learner: the learner, whose policy is the candidate.
         physics: the plant.
 
     Attributes:
@@ -68,13 +68,15 @@ class RunGate:
     def _judge(self, tag: str) -> dict[str, float]:
         if self._gate is None:
             return {}
-        verdict = self._gate.judge(self._learner.actor)
+        verdict = self._gate.judge(self._learner.candidate)
+        if verdict.restarted:
+            self._learner.restart()
         names = ("accepted", "mean", "low", "high", "pairs")
         return {f"{tag}/{name}": float(getattr(verdict, name)) for name in names}
 
     def _search(self) -> dict[str, float]:
         sizes = {name: x for name in KNOBS if (x := self._cfg.search.get(name))}
-        actor: Any = self._learner.actor
+        actor = self._learner.candidate
         mpc = _qp(actor)
         if not sizes or mpc is None:
             return {}

@@ -95,13 +95,17 @@ class PairedTest:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of a comparison: the candidate is ``accepted``, at an interval of ``mean``."""
+    """The outcome of a comparison: the candidate is ``accepted``, at an interval of ``mean``.
+
+    ``restarted`` is True if the candidate has become a copy of the acting policy.
+    """
 
     accepted: bool
     mean: float
     low: float
     high: float
     pairs: int
+    restarted: bool = False
 
 
 class Gate:
@@ -179,17 +183,18 @@ class Gate:
             difference = torch.where(old.isfinite(), new - old, -math.inf)
             test.add(difference.where(new.isfinite(), math.inf))
             count += 1
-        accepted = test.decision == "better"
+        accepted, restarted = test.decision == "better", False
         self._in_a_row = 0 if accepted else self._in_a_row + 1
         if accepted:
             self.accepted += 1
             self.actor.load_state_dict(candidate.state_dict())
         else:
             self.rejected += 1
-            if self._in_a_row >= self._patience:
+            restarted = self._in_a_row >= self._patience
+            if restarted:
                 candidate.load_state_dict(self.actor.state_dict())
                 self._in_a_row = 0
-        return Verdict(accepted, test.mean, *test.interval, test.pairs)
+        return Verdict(accepted, test.mean, *test.interval, test.pairs, restarted)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the acting policy's parameters and the numbers of decisions."""

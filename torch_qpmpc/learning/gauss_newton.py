@@ -25,8 +25,8 @@ stages, because a single entry of z may be nearly zero in a batch without being 
 
 The gradients in a free C are the outer products chi_i z_i', so that ``K = (chi chi') * (z P z')``
 is computed without forming them. P is the metric of C's rows: U's or, with the SI penalty
-(eq:sdp3), which is quadratic in each row, the inverse of the summed curvatures of damping and
-penalty. The penalty thus enters the same step.
+(eq:sdp3) or an anchor, which are quadratic in each row, the inverse of the summed curvatures of
+damping and penalties. The penalties thus enter the same step.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ from torch import Tensor, nn
 
 from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.learning.anchor import Anchor
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
 from torch_qpmpc.mpc.validation import COST
@@ -57,6 +58,7 @@ FLOOR = 1e-12
 FORGET = 0.9
 #: Factors by which the damping rises and falls, and its upper bound.
 RISE, FALL, MAX_DAMPING = 4.0, 0.5, 1e6
+NOT_FREE = "a C that is not free"
 
 
 def _positive(x: float) -> bool:
@@ -112,9 +114,12 @@ class GaussNewton(torch.optim.Optimizer):
             damping to the ratio of actual to predicted decrease.
         normalise: divide by sizes and units, as above. False takes the scales themselves as D, by
             default 1 and 0.01, for streams of small batches, whose sizes are mostly noise.
+        anchor: a penalty on C, times the batch's mean squared TD error. With that as the variance
+            of the errors, a step is towards the largest posterior of the anchor's log and a batch.
 
     Raises:
-        QPError: if a number is out of range, or the scales do not fit the learned parts.
+        QPError: if a number is out of range, the scales do not fit the learned parts, or the
+            anchor does not fit a learned, free C.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -139,6 +144,7 @@ class GaussNewton(torch.optim.Optimizer):
         memory: int = 0,
         trust_region: bool = True,
         normalise: bool = True,
+        anchor: Anchor | None = None,
     ) -> None:
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
         check_kind("mpc", mpc, QPMPC, remedy)
@@ -158,7 +164,13 @@ class GaussNewton(torch.optim.Optimizer):
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
         self._clip, self._memory, self._trust_region = td_error_clip, memory, trust_region
-        self._normalise = normalise
+        self._normalise, self._anchor = normalise, anchor
+        if anchor is not None:
+            check_kind("anchor", anchor, Anchor)
+            if self._free_C() is None:
+                raise QPError.expected("anchor", NOT_FREE, "C among the learned parts")
+            remedy = "Pass Anchor.of(identified), with the sizes of the QPMPC."
+            check_tensor("anchor.C_0", anchor.C_0, *mpc.C.shape, batched=False, remedy=remedy)
 
     @torch.no_grad()
     def step(  # pyright: ignore[reportIncompatibleMethodOverride] - not a closure
@@ -215,10 +227,9 @@ class GaussNewton(torch.optim.Optimizer):
         delta = torch.where(use, target.to(solution.value) - solution.value, 0)
         if self._clip is not None:
             delta = delta.clamp(-self._clip, self._clip)
-        if penalty is not None:
-            penalty = (len(s) - sum(left_out)) * penalty
+        pulls = self._pulls(penalty, delta, len(s) - sum(left_out))
         lr, damping = group["lr"], group["damping"]
-        blocks = self._blocks(solution, use, penalty)
+        blocks = self._blocks(solution, use, pulls)
         self._scale(blocks, int(use.sum()))
         for block in blocks:
             block.remember(self.state[block.leaf], self._memory)
@@ -311,8 +322,25 @@ class GaussNewton(torch.optim.Optimizer):
             elif ratio > GOOD:
                 group["damping"] = max(FALL * group["damping"], self._least_damping)
 
+    def _free_C(self) -> Tensor | None:
+        """Return the parameter of C if it is learned, free and not frozen."""
+        C, _ = matrix(self._mpc, "C")
+        leaves = (leaf for group in self.param_groups for leaf in group["params"])
+        return next((leaf for leaf in leaves if leaf is C and leaf.requires_grad), None)
+
+    def _pulls(self, penalty: Tensor | None, delta: Tensor, count: int) -> list[Anchor]:
+        """Return the penalties on C, for the sum over ``count`` pairs with the errors delta."""
+        C, pulls = self._free_C(), []
+        if penalty is not None:
+            if C is None:
+                raise QPError.expected("penalty", NOT_FREE, "C among the learned parts")
+            pulls.append(Anchor(torch.zeros_like(C), count * penalty, C.new_ones(len(C))))
+        if self._anchor is not None and C is not None:
+            pulls.append(self._anchor.times(delta.square().sum() / count))
+        return pulls
+
     def _blocks(
-        self, solution: QPSolution, use: Tensor, penalty: Tensor | None
+        self, solution: QPSolution, use: Tensor, pulls: list[Anchor]
     ) -> list[_Dense | _OuterProducts]:
         """Return Q's gradients in each learned part that is not frozen, zero outside ``use``."""
         mpc = self._mpc
@@ -323,12 +351,9 @@ class GaussNewton(torch.optim.Optimizer):
         gradients = envelope_gradients(weight, z, sigma, chi, lam, solution.xi)
         pairs = [(leaf, group) for group in self.param_groups for leaf in group["params"]]
         pairs = [(leaf, group) for leaf, group in pairs if leaf.requires_grad]
-        C, mask = matrix(mpc, "C")
-        factored = next((leaf for leaf, _ in pairs if leaf is C), None)
+        factored, mask = self._free_C(), matrix(mpc, "C")[1]
         if factored is not None and mask is not None:
             factored.copy_(mpc.C)  # another optimiser may have moved entries that are not learned
-        if penalty is not None and factored is None:
-            raise QPError.expected("penalty", "a C that is not free", "C among the learned parts")
         parts = {name: getattr(solution.qp, name) for name in EVENT_SHAPES}
         if factored is not None:
             parts.pop("C")
@@ -350,7 +375,7 @@ class GaussNewton(torch.optim.Optimizer):
         rows, columns = self._units(z[use])
         units = {"b": rows, "q": 1 / columns} if mpc.structure == "free" else {}
         return [
-            _OuterProducts(leaf, group, weight.unsqueeze(-1) * chi, z, rows, columns, penalty, mask)
+            _OuterProducts(leaf, group, weight.unsqueeze(-1) * chi, z, rows, columns, pulls, mask)
             if leaf is factored
             else _Dense(
                 leaf,
@@ -458,10 +483,10 @@ class _Dense:
 class _OuterProducts:
     """The gradients ``chi_i z_i'`` in C, with the metric ``scale * rows_i / columns_j``.
 
-    The penalty ``1/2 tr(C S C')`` by itself moves C by ``drift``; with it, the metric of a row is
-    ``rows_i`` times a matrix P ``(n_z, n_z)``, one for each unit of a row. With a ``mask`` of the
-    learned entries of C, each pattern of learned entries in a row has its own P. Methods as in
-    `_Dense`.
+    The penalties ``pulls`` by themselves move C by ``drift``; with them, the metric of a row is
+    ``rows_i`` times a matrix P ``(n_z, n_z)``, one for each unit and weight of a row. With a
+    ``mask`` of the learned entries of C, each pattern of learned entries in a row has its own P.
+    Methods as in `_Dense`.
     """
 
     def __init__(
@@ -472,13 +497,14 @@ class _OuterProducts:
         z: Tensor,
         rows: Tensor,
         columns: Tensor,
-        S: Tensor | None,
+        pulls: list[Anchor],
         mask: Tensor | None,
     ) -> None:
         self.leaf, self.group, self.chi, self.z, self.scale = leaf, group, chi, z, 1.0
-        self.rows, self.columns, self.S = rows, columns, S
+        self.rows, self.columns, self.pulls = rows, columns, pulls
         self.drift = torch.zeros_like(leaf)
-        self.patterns = _patterns(mask, None if S is None else rows.unsqueeze(-1))
+        kinds = torch.stack((rows, *(pull.weights for pull in pulls)), dim=-1)
+        self.patterns = _patterns(mask, kinds if pulls else None)
 
     def __len__(self) -> int:
         return len(self.z)
@@ -497,12 +523,13 @@ class _OuterProducts:
     def damp(self, mu: Tensor) -> Tensor:
         drifted = self.z.new_zeros(len(self.z))
         self.z_P = [self.scale * self.z[:, j] / self.columns[j] for _, j, _ in self.patterns]
-        if self.S is None:
+        if not self.pulls:
             return drifted
-        force = self.leaf @ self.S
+        force = torch.stack([pull.gradient(self.leaf) for pull in self.pulls]).sum(0)
         for k, (i, j, entries) in enumerate(self.patterns):
-            z, S, damping = self.z[:, j], self.S[j][:, j], mu / self.rows[i][0]
-            precision = torch.diag(damping / self.scale * self.columns[j]) + S
+            z, damping = self.z[:, j], mu / self.rows[i][0]
+            precision = torch.diag(damping / self.scale * self.columns[j])
+            precision += sum(pull.weights[i][0] * pull.S[j][:, j] for pull in self.pulls)
             inverse = torch.linalg.inv_ex(precision).inverse
             drift = -force[entries] @ inverse
             self.z_P[k], self.drift[entries] = damping * z @ inverse, drift
@@ -523,15 +550,15 @@ class _OuterProducts:
         return step
 
     def penalty(self) -> Tensor | float:
-        return 0.0 if self.S is None else 0.5 * ((self.leaf @ self.S) * self.leaf).sum()
+        return sum((pull.value(self.leaf) for pull in self.pulls), 0.0)
 
 
-def _patterns(mask: Tensor | None, units: Tensor | None) -> list[tuple[Any, Any, Any]]:
-    """Group the rows of C by learned entries and by ``units`` ``(n_c, 1)``, if these are not None.
+def _patterns(mask: Tensor | None, kinds: Tensor | None) -> list[tuple[Any, Any, Any]]:
+    """Group the rows of C by learned entries and by ``kinds`` ``(n_c, k)``, if these are not None.
 
     Return the rows, the columns, and the index in C of each group.
     """
-    keys = [key for key in (mask, units) if key is not None]
+    keys = [key for key in (mask, kinds) if key is not None]
     if not keys:
         return [(slice(None), slice(None), (slice(None), slice(None)))]
     kind = torch.unique(torch.cat(keys, dim=-1), dim=0, return_inverse=True)[1]
