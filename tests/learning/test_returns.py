@@ -116,13 +116,13 @@ def test_the_loss_discounts_v_by_the_steps():
         run = run_of(env, step, 4)
         cost = -sum(GAMMA**i * steps["next", "reward"][env, k].item() for i, k in enumerate(run))
         expected = found.new_tensor(cost + GAMMA ** len(run) * V[env, run[-1]].item())
-        assert_close(found, expected, equal_nan=True)
+        assert_close(found, expected, equal_nan=True, rtol=1e-6, atol=1e-6)
 
 
 def test_slices_have_lambda_returns():
     lmbda, n = 0.7, 5
     loss, steps = make_loss(), history()
-    loss.make_value_estimator("td_lambda", gamma=GAMMA, lmbda=lmbda)
+    loss.make_value_estimator("tdlambda", gamma=GAMMA, lmbda=lmbda)
     V = costs_to_go(loss)
     steps["next", "reward"][2, 20] = 0.5
     replay = make_replay(ROWS * ENVS, ENVS, 200, 2, 5, n_step=n, gamma=None)
@@ -148,7 +148,7 @@ def test_active_sets_are_remembered_where_they_belong(gamma):
     loss = make_loss(ACTIVE_SET)
     mpc = loss.operator.module
     if gamma is None:
-        loss.make_value_estimator("td_lambda", gamma=GAMMA, lmbda=0.7)
+        loss.make_value_estimator("tdlambda", gamma=GAMMA, lmbda=0.7)
     replay = filled(n_step=4, gamma=gamma, active_rows=len(mpc.G))
     replay.transitions.storage[:]["next", "reward"].nan_to_num_()
     sample = replay.sample()
@@ -167,7 +167,7 @@ def test_active_sets_are_remembered_where_they_belong(gamma):
 
 def test_a_second_order_step_on_slices_is_the_one_on_their_pairs():
     loss = make_loss()
-    loss.make_value_estimator("td_lambda", gamma=GAMMA, lmbda=0.7)
+    loss.make_value_estimator("tdlambda", gamma=GAMMA, lmbda=0.7)
     mpc = loss.operator.module
     slices = filled(n_step=4, gamma=None).sample()
     slices["next", "reward"].nan_to_num_()
