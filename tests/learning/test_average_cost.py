@@ -125,5 +125,5 @@ def test_bad_arguments():
         QPQLearningLoss(operator, horizon="shrinking", average_cost=True)
     with pytest.raises(QPError, match="average_cost: got 'no', expected True or False"):
         QPQLearningLoss(operator, average_cost="no")  # pyright: ignore[reportArgumentType] - wrong on purpose
-    with pytest.raises(QPError, match="gamma: got 0.9, expected 1 with average_cost"):
+    with pytest.raises(QPError, match=r"gamma: got 0\.9, expected 1 with average_cost"):
         make_loss().make_value_estimator(gamma=0.9)
