@@ -38,7 +38,10 @@ NOT_NEEDED = (
     "eval_seed",
     "export",
     "gate",
+    "average_cost",
     "logger",
+    "lmbda",
+    "n_step",
     "rivals",
     "search.margin_k",
     "start.name",
@@ -230,6 +233,9 @@ BAD: dict[str, list[Any]] = {
     "delay_value": FLAG,
     "target_rate": FRACTION,
     "target_horizon": ["long", *NAME],
+    "n_step": WHOLE,
+    "lmbda": FRACTION[:-1],
+    "average_cost": FLAG,
     "step": ["newton", *NAME],
     "penalty_step": ["newton", *NAME],
     "ablation": [3, True],
@@ -449,7 +455,7 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
     later = ("logger", "eval_seed", "start", "gate", "anchor", "average", "search")
-    for key in (*later, "target_horizon"):
+    for key in (*later, "target_horizon", "n_step"):
         del cfg[key]
     OmegaConf.save(cfg, file)
     assert differences(settings(cfg), now) is None
@@ -590,6 +596,37 @@ def test_solver_must_be_known():
         (
             ["average=0.9", "gate=false"],
             "gate: got False, expected true. The average is what the gate judges",
+        ),
+        (["lmbda=0.9"], "n_step: got 1, expected at least 2. lmbda mixes the returns of 1"),
+        (
+            ["n_step=3", "target_horizon=shrinking"],
+            "n_step: got 3, expected 1. target_horizon=shrinking has returns of one step",
+        ),
+        (["n_step=3", "algo=sac"], "n_step: got 3, expected 1. sac does not support returns of"),
+        (["n_step=3", "replay=false"], "replay: got False, expected true. n_step above 1 reads"),
+        (
+            ["n_step=3", "collector=multi", "collector.sync=false"],
+            "collector.sync: got False, expected true. n_step above 1 needs the following",
+        ),
+        (
+            ["n_step=3", "lmbda=0.9", "batch_size=256"],
+            "batch_size: got 256, expected a multiple of n_step = 3. lmbda samples slices",
+        ),
+        (
+            ["average_cost=true", "algo=ddpg"],
+            "average_cost: got True, expected false. ddpg does not support an average cost",
+        ),
+        (
+            ["average_cost=true", "target_horizon=shrinking"],
+            "target_horizon: got 'shrinking', expected receding with average_cost. A plant",
+        ),
+        (
+            ["average_cost=true", "task.learn_cost=[H]"],
+            r"task.learn_cost: got \['H'\], expected a list with c. The steps of c move",
+        ),
+        (
+            ["average_cost=true", "constraint=mpc", "release=5"],
+            "release: got 5, expected null. average_cost does not support release",
         ),
         (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
     ],

@@ -41,6 +41,8 @@ ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
         ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
         ("delay_value=true", "noise=brownian", "steps_per_update=3"),
         ("warm_start=false", "replay_capacity=48"),
+        ("optimizer=gauss_newton", "n_step=3", "replay_capacity=48", "average_cost=true"),
+        ("task=store", "optimizer=gauss_newton", "n_step=4", "lmbda=0.8", "average_cost=true"),
         ("solver=proxqp", "optimizer=gauss_newton"),
         ("solver=torch", "step=projection"),
         ("algo=ddpg", *ACTOR_CRITIC),

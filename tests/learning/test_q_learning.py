@@ -26,7 +26,7 @@ from tests.transitions import (
     perturb,
 )
 from torch_qpmpc import QPMPC, QPActorValueOperator, QPError, QPQLearningLoss
-from torch_qpmpc.learning.q_learning import td_loss
+from torch_qpmpc.learning.td_error import td_loss
 
 
 @pytest.mark.parametrize("delay_value", [False, True])

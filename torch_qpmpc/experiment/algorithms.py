@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.actor_critic import (
@@ -21,6 +21,7 @@ from torch_qpmpc.experiment.actor_critic import (
     make_actor_critic_loss,
     make_closed_loop_actor,
 )
+from torch_qpmpc.experiment.collection import target_gamma
 from torch_qpmpc.experiment.tasks import AnyPlant, Start, find_task
 from torch_qpmpc.learning.anchor import Anchor
 from torch_qpmpc.learning.gauss_newton import GaussNewton
@@ -110,13 +111,18 @@ def make_learner(
             operator,
             delay_value=cfg.delay_value,
             horizon=cfg.target_horizon,
+            average_cost=cfg.average_cost,
             td_error_clip=cfg.td_error_clip,
         )
         actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
     else:
         loss_module = make_actor_critic_loss(cfg, mpc, physics)
         actor = make_closed_loop_actor(cfg, mpc, loss_module, physics)
-    loss_module.make_value_estimator(gamma=cfg.task.gamma)
+    gamma = target_gamma(cfg)
+    if cfg.lmbda is None:
+        loss_module.make_value_estimator(gamma=gamma)
+    else:
+        loss_module.make_value_estimator(ValueEstimators.TDLambda, gamma=gamma, lmbda=cfg.lmbda)
     deviation, si = make_penalties(cfg, mpc)
     anchor = make_anchor(cfg, start)
     optimizer = make_optimizer(cfg, mpc, loss_module, anchor)

@@ -97,6 +97,8 @@ def restore(
             replay.load_state_dict(state["replay"])
     with _part("collector"):
         _restore_collector(collector, state["collector"])
+        if state["collector"] is None:
+            replay.end_episodes()
     with _part("rng"):
         torch.set_rng_state(state["rng"])
     with _part("tally"):

@@ -19,8 +19,9 @@ from torchrl.objectives import LossModule
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
-from torch_qpmpc.learning.q_learning import QPQLearningLoss, invalid_rewards, td_loss, td_metadata
+from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.restoring import restored
+from torch_qpmpc.learning.td_error import invalid_rewards, td_loss, td_metadata
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
 
@@ -91,7 +92,9 @@ def first_order(
             mpc.project_()
             if proximal is not None:
                 proximal.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
-        return terms, losses
+        if isinstance(loss_module, QPQLearningLoss):
+            loss_module.move_c_()
+        return terms | average_cost(loss_module), losses
 
     return update
 
@@ -126,15 +129,16 @@ def second_order(
     action = network.in_keys[1]
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
-        target, terms, penalty = loss_module.target(batch), {}, None
+        target, terms, penalty = loss_module.target(batch).reshape(-1), {}, None
         if si is not None and windows is not None:
             penalty = si.curvature(windows)
             terms["loss/si"] = si(mpc.C, windows)
-        start = None if network.active_set_key is None else batch.get(network.active_set_key, None)
-        p, a = network.known(batch), batch.get(action)
+        key, pairs = network.active_set_key, batch.reshape(-1)
+        start = None if key is None else pairs.get(key, None)
+        p, a = network.known(pairs), pairs.get(action)
         report = optimizer.step(p, a, -target, penalty=penalty, warm_start=start)
-        if network.active_set_key is not None:
-            batch.set(network.active_set_key, report.solution.active)
+        if key is not None:
+            batch.set(key, report.solution.active.view(*batch.shape, -1))
         prediction = -report.solution.value.to(target)
         losses = td_metadata(prediction, target)
         solved = prediction.isfinite() & target.isfinite()
@@ -144,9 +148,16 @@ def second_order(
         terms["loss/value"] = elementwise[solved].sum() / solved.sum().clamp(min=1)
         terms["train/damping"] = torch.tensor(report.damping, dtype=torch.float64)
         terms["train/accepted"] = torch.tensor(float(report.accepted))
-        return terms, losses
+        loss_module.move_c_()
+        return terms | average_cost(loss_module), losses
 
     return update
+
+
+def average_cost(loss_module: LossModule) -> dict[str, Tensor]:
+    """Return the average cost of a loss for logging; nothing if it has none."""
+    rho = getattr(loss_module, "average_cost", None)
+    return {} if rho is None else {"train/average_cost": rho.clone()}
 
 
 def entries_of_C(mpc: QPMPC) -> Tensor:

@@ -77,6 +77,9 @@ class Config(Group):
     delay_value: Flag
     target_rate: Fraction
     target_horizon: Annotated[str, one_of(HORIZONS)] = "receding"
+    n_step: Count = 1
+    lmbda: Annotated[Fraction | None, Expected("a number in (0, 1], or null")] = None
+    average_cost: Flag = False
     step: Annotated[str, one_of(STEPS), AfterValidator(_installed_step)]
     penalty_step: Annotated[str, one_of(("proximal", "subgradient"))]
     release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
@@ -235,6 +238,46 @@ class Config(Group):
         if self.task.hessian == "full":
             remedy = "target_horizon=shrinking drops a stage, and a full H couples them."
             self.conflict("task.hessian", "diagonal or block", remedy)
+        return self
+
+    @model_validator(mode="after")
+    def returns_of_several_steps_have_a_replay(self) -> Self:
+        if self.n_step == 1:
+            if self.lmbda is not None:
+                remedy = "lmbda mixes the returns of 1 .. n_step steps."
+                self.conflict("n_step", "at least 2", remedy)
+            return self
+        if self.algo.name != "qlearning":
+            remedy = f"{self.algo.name} does not support returns of several steps."
+            self.conflict("n_step", "1", remedy)
+        if self.target_horizon == "shrinking":
+            remedy = "target_horizon=shrinking has returns of one step."
+            self.conflict("n_step", "1", remedy)
+        if not self.replay:
+            self.conflict("replay", "true", "n_step above 1 reads its steps from the replay.")
+        if self.collector.name != "single" and not self.collector.sync:
+            remedy = "n_step above 1 needs the following steps of each environment."
+            self.conflict("collector.sync", "true", remedy)
+        if self.lmbda is not None and self.batch_size % self.n_step:
+            remedy = "lmbda samples slices of n_step steps."
+            self.conflict("batch_size", f"a multiple of n_step = {self.n_step}", remedy)
+        return self
+
+    @model_validator(mode="after")
+    def average_cost_has_a_constant_that_moves_it(self) -> Self:
+        if not self.average_cost:
+            return self
+        if self.algo.name != "qlearning":
+            remedy = f"{self.algo.name} does not support an average cost."
+            self.conflict("average_cost", "false", remedy)
+        if self.target_horizon == "shrinking":
+            remedy = "A plant that never ends has no last of N steps."
+            self.conflict("target_horizon", "receding with average_cost", remedy)
+        if "c" not in self.task.learn_cost:
+            remedy = "The steps of c move the average cost."
+            self.conflict("task.learn_cost", "a list with c", remedy)
+        if self.release is not None:
+            self.conflict("release", "null", "average_cost does not support release.")
         return self
 
     @model_validator(mode="after")
