@@ -57,6 +57,7 @@ def snapshot(
         "loss_module": learner.loss_module.state_dict(),
         "optimizer": learner.optimizer.state_dict(),
         "schedule": {"last_epoch": learner.schedule.last_epoch},
+        "policy_gradient": improve.state_dict() if (improve := learner.policy_gradient) else None,
         "gate": gate.state_dict(),
         "replay": replay.state_dict() if len(replay) and not finished else None,
         "collector": None if finished else _collector_state(collector),
@@ -86,6 +87,9 @@ def restore(
         learner.optimizer.load_state_dict(state["optimizer"])
     with _part("schedule"):
         learner.schedule.last_epoch = int(state["schedule"]["last_epoch"])
+    with _part("policy_gradient"):
+        if learner.policy_gradient is not None and state.get("policy_gradient") is not None:
+            learner.policy_gradient.load_state_dict(state["policy_gradient"])
     with _part("gate"):
         gate.load_state_dict(state.get("gate"))
     with _part("replay"):

@@ -19,6 +19,7 @@ from torchrl.objectives import LossModule
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
+from torch_qpmpc.learning.policy_gradient import PolicyGradient
 from torch_qpmpc.learning.q_learning import QPQLearningLoss, invalid_rewards, td_loss, td_metadata
 from torch_qpmpc.learning.restoring import restored
 from torch_qpmpc.mpc.module import QPMPC
@@ -147,6 +148,49 @@ def second_order(
         return terms, losses
 
     return update
+
+
+def with_policy_gradient(
+    update: Update,
+    loss_module: QPQLearningLoss,
+    policy_gradient: PolicyGradient,
+    share_of_rate: Callable[[], float] = lambda: 1.0,
+) -> Update:
+    """Return an update by TD errors, followed by a step of the policy gradient on the same batch.
+
+    The targets are the loss module's, with the theta that the TD errors have moved. The signals
+    that are new in p+, the last of its preview, are known not to depend on the action.
+
+    Args:
+        update: the update by TD errors.
+        loss_module: the loss that defines the targets.
+        policy_gradient: the policy gradient of the QP that ``loss_module`` learns.
+        share_of_rate: returns the fraction of the rate of the next step.
+    """
+    operator = loss_module.operator
+    action, n_d = operator.in_keys[1], operator.module.n_d
+
+    def improved(
+        batch: TensorDictBase, windows: Tensor | None
+    ) -> tuple[dict[str, Tensor], Scalars]:
+        terms, losses = update(batch, windows)
+        known = None
+        if operator.preview_key is not None:
+            known = batch.get("next").get(operator.preview_key)[..., -n_d:]
+        key = operator.active_set_key
+        report = policy_gradient.step(
+            operator.known(batch),
+            batch.get(action),
+            -loss_module.target(batch),
+            known=known,
+            warm_start=None if key is None else batch.get(key, None),
+            share_of_rate=share_of_rate(),
+        )
+        terms["policy/share"] = torch.tensor(report.share)
+        terms["policy/change"] = torch.tensor(report.change)
+        return terms, losses
+
+    return improved
 
 
 def entries_of_C(mpc: QPMPC) -> Tensor:
