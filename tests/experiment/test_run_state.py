@@ -23,6 +23,8 @@ from torch_qpmpc.experiment.run_state import resumed
 RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3")
 STOPS = (2, 7)
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
+POLICY = ("constraint.learn=[C]", "policy_gradient.parts=[lb,b]", "policy_gradient.memory=9")
+POLICY += ("exploration_std=0.1",)
 ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
 
 
@@ -36,6 +38,7 @@ ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
         ("optimizer=gauss_newton", "constraint=mpc", "release=5"),
         ("optimizer=adam", "constraint=mpc", "release=9"),
         ("optimizer=recursive", *STREAM),
+        ("optimizer=recursive", *STREAM, *POLICY),
         ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
         ("delay_value=true", "noise=brownian", "steps_per_update=3"),
         ("warm_start=false", "replay_capacity=48"),

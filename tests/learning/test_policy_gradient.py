@@ -28,7 +28,7 @@ PREFIX: dict[str, Any] = {
 @pytest.mark.parametrize("options", [{}, {"structure": "tied"}, PREFIX], ids=["free", "tied", "p"])
 def test_sensitivities_equal_finite_differences(options):
     mpc = random_mpc(1, learn=LEARN, **options)
-    s, h = random_states(24, mpc.n_p), 1e-6
+    s, h = random_states(12, mpc.n_p), 1e-6
     solution, M = policy_sensitivities(mpc, s, PARTS)
     assert solution.active.any(-1).float().mean() > 0.3, "some constraints are active"
     theta, column = mpc.coordinates(), 0
@@ -70,7 +70,7 @@ def test_the_weights_of_a_known_advantage_are_unbiased():
     known = Known()
     improve = PolicyGradient(known.mpc, ["b"], rate=1e-12, ridge=1e-9)
     found = torch.stack(
-        [improve.step(known.s, *known.draw(seed)).w["b"].detach() for seed in range(60)]
+        [improve.step(known.s, *known.draw(seed)).w["b"].detach() for seed in range(40)]
     )
     error = found.std(0) / math.sqrt(len(found))
     assert (error < 0.1).all()
@@ -94,11 +94,11 @@ def test_a_step_goes_down_the_advantage_within_its_bound():
 def test_noise_alone_moves_little():
     known, share = Known(), []
     improve = PolicyGradient(known.mpc, ["b"], rate=1e-12)
-    for seed in range(30):
+    for seed in range(20):
         a, _ = known.draw(seed)
         target = known.V + normal(len(known.s), seed=1000 + seed)
         share.append(improve.step(known.s, a, target).share)
-    assert sum(share) / len(share) < 0.4
+    assert sum(share) / len(share) < 0.4, "the mean"
 
 
 def test_signals_that_are_new_take_their_share_of_the_noise():
@@ -161,7 +161,8 @@ def test_bounds_of_hard_rows_stay():
     before = {part: getattr(known.mpc, part).detach().clone() for part in ("lb", "ub")}
     s = random_states(64)
     a = known.mpc.policy(s).detach() + 0.3 * normal(64, 1)
-    PolicyGradient(known.mpc, ["lb", "ub"], rate=1.0).step(s, a, 9.0 * a[:, 0])
+    target = known.mpc.value(s).detach() + 9.0 * a[:, 0]
+    PolicyGradient(known.mpc, ["lb", "ub"], rate=1.0).step(s, a, target)
     soft = known.mpc.soft
     for part, old in before.items():
         new = getattr(known.mpc, part).detach()
@@ -185,7 +186,7 @@ def test_an_update_is_a_step_by_td_errors_and_one_by_the_policy_gradient():
     mpc = random_mpc(3, learn=("H", "c", "C", "b"), on_failure="mask")
     improve = PolicyGradient(mpc, ["b"], rate=0.5)
     loss = make_loss(mpc, ACTIVE_SET)
-    update = second_order(mpc, loss, GaussNewton(mpc), None, None)
+    update = second_order(mpc, loss, GaussNewton(mpc, trust_region=False), None, None)
     before = {part: getattr(mpc, part).detach().clone() for part in ("H", "b")}
     terms, losses = with_policy_gradient(update, loss, improve, lambda: 0.5)(transitions(), None)
     assert terms["policy/change"] == pytest.approx(0.25 * float(terms["policy/share"]))
@@ -208,7 +209,7 @@ def scheme(**options: Any) -> QPMPC:
     return QPMPC.from_model([[1.0]], [[1.0]], 4, **{**settings, **options})
 
 
-def rollout(mpc: QPMPC, seed: int, explore: float = 0.0, steps: int = 30) -> tuple[Tensor, ...]:
+def rollout(mpc: QPMPC, seed: int, explore: float = 0.0, steps: int = 20) -> tuple[Tensor, ...]:
     """Run x+ = x + u + noise, and return x, u, the costs and x+, ``(steps * 32, ..)``."""
     x, rows = torch.full((32, 1), -1.0).double(), []
     noise = normal(steps, 2, 32, 1, seed=seed)
@@ -233,13 +234,12 @@ def test_closed_loops_cost_less(part, options):
         mpc = scheme(learn=("c", part), **options)
         improve = PolicyGradient(mpc, [part], rate=0.3)
         before = rollout(mpc, 100 + seed)[2].mean()
-        for update in range(12):
-            x, u, cost, following = rollout(mpc, 1000 * seed + update, explore=0.1, steps=12)
+        for update in range(8):
+            x, u, cost, following = rollout(mpc, 1000 * seed + update, explore=0.1, steps=8)
             target = cost + 0.9 * mpc.value(following).detach()
             improve.step(x, u, target)
         ratios.append(float(rollout(mpc, 100 + seed)[2].mean() / before))
     assert max(ratios) < 0.9
-    print(ratios, getattr(mpc, part))
 
 
 @pytest.mark.parametrize(
