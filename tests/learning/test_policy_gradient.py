@@ -101,11 +101,38 @@ def test_noise_alone_moves_little():
     assert sum(share) / len(share) < 0.4, "the mean"
 
 
-def test_signals_that_are_new_take_their_share_of_the_noise():
-    known = Known()
+def test_an_error_of_V_is_no_advantage():
+    """The action moves s+, where V is wrong by R."""
+    known, gamma = Known(), 0.9
     improve = PolicyGradient(known.mpc, ["b"], rate=1e-12, ridge=1e-9)
-    (a, target), price = known.draw(0, noise=0.0), normal(len(known.s), 1, seed=9)
-    report = improve.step(known.s, a, target + 5.0 * price[:, 0], known=price)
+    a = known.pi + 0.1 * normal(len(known.s), 1)
+    target = known.V + ((known.M @ known.w) * (a - known.pi)).sum(-1)
+    following = known.s @ torch.tensor([[1.0, 0.0], [0.2, 0.9]]).double() + a * 0.5 + 0.1
+    following += 0.1 * normal(len(a), 2, seed=5)
+    ended = torch.arange(len(a)) % 4 == 0
+    discount = gamma * (~ended).double()
+    following[ended] = torch.nan
+
+    def error(s: Tensor) -> Tensor:
+        return 7 + 3 * s[:, 0] - s[:, 1] + 2 * s[:, 0].square()
+
+    later = discount * error(following).nan_to_num()
+    target = target + error(known.s) - later
+    plain = improve.step(known.s, a, target)
+    assert not torch.allclose(plain.w["b"], known.w, atol=0.3)
+    report = improve.step(known.s, a, target, following=following, discount=discount)
+    assert_close(report.w["b"], known.w, atol=1e-5, rtol=1e-5)
+
+
+def test_signals_that_are_known_take_their_share_of_the_noise():
+    known = Known(n_d=1)
+    improve = PolicyGradient(known.mpc, ["b"], rate=1e-12, ridge=1e-9)
+    p, price = known.s, normal(len(known.s), 1, seed=9)
+    a = known.pi + 0.1 * normal(len(p), 1)
+    advantage = ((known.M @ known.w) * (a - known.pi)).sum(-1)
+    following = torch.cat((p[:, 1:4], price, p[:, 4:]), -1)
+    target = known.V + advantage + 5.0 * price[:, 0] + p[:, 2]
+    report = improve.step(p, a, target, following=following, discount=0.9)
     assert_close(report.w["b"], known.w, atol=1e-6, rtol=1e-6)
 
 
@@ -237,7 +264,7 @@ def test_closed_loops_cost_less(part, options):
         for update in range(8):
             x, u, cost, following = rollout(mpc, 1000 * seed + update, explore=0.1, steps=8)
             target = cost + 0.9 * mpc.value(following).detach()
-            improve.step(x, u, target)
+            improve.step(x, u, target, following=following, discount=0.9)
         ratios.append(float(rollout(mpc, 100 + seed)[2].mean() / before))
     assert max(ratios) < 0.9
 
@@ -263,7 +290,9 @@ def test_errors(options, message):
 
 
 @pytest.mark.parametrize(
-    ("name", "shape"), [("s", (8, 3)), ("a", (8, 2)), ("target", (8, 1))], ids=str
+    ("name", "shape"),
+    [("s", (8, 3)), ("a", (8, 2)), ("target", (8, 1)), ("following", (8, 3))],
+    ids=str,
 )
 def test_shapes(name, shape):
     batch = {"s": torch.zeros(8, 2), "a": torch.zeros(8, 1), "target": torch.zeros(8)}

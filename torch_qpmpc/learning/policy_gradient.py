@@ -1,18 +1,20 @@
 """Policy improvement: a compatible deterministic policy gradient through the QP's solution.
 
-With the QP's V as baseline, the one-step error of a visited pair
-
-    delta = L + gamma V(s+) - V(s)
-
-has the advantage A(s, a) as its mean, up to the errors of V. Its compatible approximation is linear
-in the policy's sensitivities (Silver et al. 2014; Gros and Zanon 2020),
+The critic of a visited pair is Q(s, a) = V(s) + R(s) + A(s, a). V is the QP's. The advantage is
+linear in the policy's sensitivities, which makes it compatible (Silver et al. 2014; Gros and Zanon
+2020),
 
     A(s, a) = w'psi,   psi = M(s)'(a - pi(s)),   M(s) = dpi(s)/dtheta,
 
-and w is the natural gradient of the closed loop's cost: with it, the gradient in theta is F w, with
-F = E[M'M] the Fisher matrix of Gaussian exploration. Ridge least squares on a batch gives w. The
-known p and the signals that are new in p+ do not depend on a: the regression has them as further
-regressors, which take their share of the noise out of delta.
+and w is then the natural gradient of the closed loop's cost: the gradient in theta is F w, with
+F = E[M'M] the Fisher matrix of Gaussian exploration. R is a correction of V, without which V's
+error at s+, that depends on a, would pass for an advantage: it is linear in the entries of the
+window and their squares. Least-squares TD with a ridge fits both to the one-step errors
+
+    delta = L + gamma V(s+) - V(s) = w'psi + R(s) - gamma R(s+) + noise.
+
+Signals that are known ahead of time do not depend on a: those in p, and the new ones in p+, are
+further regressors, which take their share of the noise out of delta.
 
 A is linear in a, so that w has no length of its own. The step is bounded in the policy instead:
 
@@ -130,7 +132,7 @@ class PolicyGradient:
         mpc: QPMPC,
         parts: Sequence[str],
         *,
-        rate: float = 0.1,
+        rate: float = 0.05,
         ridge: float = 0.01,
         memory: int = 0,
     ) -> None:
@@ -145,7 +147,7 @@ class PolicyGradient:
                 leaf.requires_grad_(False)
         self.parts, self.rate, self.ridge, self.memory = tuple(parts), rate, ridge, memory
         self._mpc = mpc
-        self._past: tuple[Tensor, Tensor, Tensor, Tensor] | None = None
+        self._past: tuple[Tensor, ...] | None = None
 
     @torch.no_grad()
     def step(
@@ -154,7 +156,8 @@ class PolicyGradient:
         a: Tensor,
         target: Tensor,
         *,
-        known: Tensor | None = None,
+        following: Tensor | None = None,
+        discount: Tensor | float = 1.0,
         warm_start: Tensor | None = None,
         share_of_rate: float = 1.0,
     ) -> PolicyStep:
@@ -164,8 +167,9 @@ class PolicyGradient:
             s, a: visited pairs, ``(B, n_p)`` and ``(B, n_u)``, with actions that explore.
             target: costs to go, L + gamma V(s+), ``(B,)``. Pairs with a target that is not finite
                 are left out and counted. Negate rewards and TorchRL's values.
-            known: signals that are new in s+ and do not depend on a, ``(B, k)``, such as the last
-                d of its preview; they only reduce the variance.
+            following: p of s+, ``(B, n_p)``; without it, R is a baseline of delta alone, which
+                suits a V without errors.
+            discount: gamma, or gamma (1 - terminated) ``(B,)``.
             warm_start: active sets of V(s) to start from, ``(B, n_g)``.
             share_of_rate: the fraction of ``rate`` of this step, as from a schedule.
 
@@ -186,9 +190,14 @@ class PolicyGradient:
         left_out = unsolved, len(s) - unsolved - int(use.sum())
         delta = (target.to(solution.value) - solution.value)[use]
         explored = (a.to(solution.z) - solution.z[:, mpc.n_p : mpc.n_p + mpc.n_u])[use]
-        others = [s] if known is None else [s, known.reshape(len(s), -1)]
-        rows = M[use], explored, delta, torch.cat(others, -1)[use].to(delta)
-        rows = self._with_past(rows)
+        gamma = torch.as_tensor(discount).to(delta).expand(len(s))
+        if following is None:
+            following, gamma = torch.zeros_like(s), torch.zeros_like(gamma)
+        check_tensor("following", following, len(s), mpc.n_p, batched=False)
+        # What follows a termination has no value, and may be NaN.
+        following = torch.where(gamma.unsqueeze(-1) > 0, following, 0)
+        known = (x[use].to(delta) for x in (s, following, gamma))
+        rows = self._with_past((M[use], explored, delta, *known))
         if not len(rows[0]):
             message = (
                 f"None of the {len(s)} pairs is usable: {left_out[0]} without a QP solution, "
@@ -222,39 +231,61 @@ class PolicyGradient:
             found.append(soft if bounds else torch.ones_like(theta[part], dtype=torch.bool))
         return torch.cat(found).to(self._mpc.C_0)
 
-    def _with_past(self, rows: tuple[Tensor, Tensor, Tensor, Tensor]) -> Any:
+    def _with_past(self, rows: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """Append the remembered rows to new ones, and remember the newest."""
         if self._past is not None:
-            rows = tuple(map(torch.cat, zip(rows, self._past, strict=True)))  # pyright: ignore[reportAssignmentType]
-        self._past = tuple(x[: self.memory] for x in rows) if self.memory else None  # pyright: ignore[reportAttributeAccessIssue]
+            rows = tuple(map(torch.cat, zip(rows, self._past, strict=True)))
+        self._past = tuple(x[: self.memory] for x in rows) if self.memory else None
         return rows
 
     def _weights(
-        self, M: Tensor, explored: Tensor, delta: Tensor, others: Tensor
+        self,
+        M: Tensor,
+        explored: Tensor,
+        delta: Tensor,
+        s: Tensor,
+        following: Tensor,
+        discount: Tensor,
     ) -> tuple[Tensor, float]:
-        """Return w by ridge least squares, and the share of it that noise does not explain."""
+        """Return w by least-squares TD, and the share of it that noise does not explain."""
         psi = (M * explored.unsqueeze(-1)).sum(1)
         n, size = psi.shape
         scale = psi.square().mean(0).sqrt()
         scale = torch.where(scale > FLOOR * scale.max(), scale, torch.inf)
-        spread, centre = others.std(0, correction=0), others.mean(0)
-        spread = torch.where(spread > FLOOR * (1 + centre.abs()), spread, torch.inf)
-        X = torch.cat((psi / scale, (others - centre) / spread, torch.ones_like(delta[:, None])), 1)
+        before, after = self._features(s, following)
+        # R's constant; without discount and ends, the mean of delta.
+        one, constant = torch.ones_like(delta), 1 - discount
+        constant = constant / constant.mean() if constant.mean() > FLOOR else one
+        X = torch.cat((psi / scale, before, one.unsqueeze(-1)), 1)
+        R = before - discount.unsqueeze(-1) * after
+        Y = torch.cat((psi / scale, R, constant.unsqueeze(-1)), 1)
         penalty = self.ridge * n * torch.eye(X.shape[1]).to(X)
         penalty[-1, -1] = 0
-        gram = X.mT @ X
-        inverse = torch.linalg.inv(gram + penalty)
+        moment = X.mT @ Y
+        inverse = torch.linalg.inv_ex(moment + penalty).inverse
         found = inverse @ (X.mT @ delta)
-        freedom = float((inverse * gram).sum())
-        noise = (delta - X @ found).square().sum() / max(n - freedom, 1.0)
-        covariance = noise * (inverse @ gram @ inverse)[:size, :size]
+        freedom = float((inverse * moment.mT).sum())
+        noise = (delta - Y @ found).square().sum() / max(n - freedom, 1.0)
+        covariance = noise * (inverse @ (X.mT @ X) @ inverse.mT)[:size, :size]
         # w'F w, and its mean if w were noise alone.
-        scaled = M / scale
-        fisher = scaled.flatten(0, 1).mT @ scaled.flatten(0, 1) / n
+        scaled = (M / scale).flatten(0, 1)
+        fisher = scaled.mT @ scaled / n
         size_of_w = found[:size] @ fisher @ found[:size]
         by_noise = (covariance * fisher).sum()
         share = float((1 - by_noise / size_of_w).clamp(min=0)) if size_of_w > 0 else 0.0
         return found[:size] / scale, share
+
+    def _features(self, s: Tensor, following: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the regressors of R and of known signals at s, and those of R alone at s+."""
+        mpc = self._mpc
+        n_preview = (mpc.horizon + 1) * mpc.n_d
+        signals = torch.cat((s[:, :n_preview], following[:, n_preview - mpc.n_d : n_preview]), 1)
+        centre, spread = _units(s[:, n_preview:])
+        y, y_next = ((p[:, n_preview:] - centre) / spread for p in (s, following))
+        centre, spread = _units(signals)
+        signals = (signals - centre) / spread
+        before = torch.cat((y, y.square() - 1, signals), 1)
+        return before, torch.cat((y_next, y_next.square() - 1, torch.zeros_like(signals)), 1)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the remembered pairs."""
@@ -263,3 +294,9 @@ class PolicyGradient:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load a `state_dict`."""
         self._past = state["past"]
+
+
+def _units(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean and the deviation of each column, the latter infinite for a constant."""
+    centre, spread = x.mean(0), (x - x.mean(0)).square().mean(0).sqrt()
+    return centre, torch.where(spread > FLOOR * (1 + centre.abs()), spread, torch.inf)

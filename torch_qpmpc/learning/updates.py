@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
+from torchrl.objectives.value import TD0Estimator
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
@@ -158,8 +159,8 @@ def with_policy_gradient(
 ) -> Update:
     """Return an update by TD errors, followed by a step of the policy gradient on the same batch.
 
-    The targets are the loss module's, with the theta that the TD errors have moved. The signals
-    that are new in p+, the last of its preview, are known not to depend on the action.
+    The targets are the loss module's, with the theta that the TD errors have moved. V's correction
+    R needs targets of one step and of one horizon, those of TD(0) with ``horizon="receding"``.
 
     Args:
         update: the update by TD errors.
@@ -168,21 +169,25 @@ def with_policy_gradient(
         share_of_rate: returns the fraction of the rate of the next step.
     """
     operator = loss_module.operator
-    action, n_d = operator.in_keys[1], operator.module.n_d
+    action, keys = operator.in_keys[1], loss_module.tensor_keys
 
     def improved(
         batch: TensorDictBase, windows: Tensor | None
     ) -> tuple[dict[str, Tensor], Scalars]:
         terms, losses = update(batch, windows)
-        known = None
-        if operator.preview_key is not None:
-            known = batch.get("next").get(operator.preview_key)[..., -n_d:]
-        key = operator.active_set_key
+        key, following, discount = operator.active_set_key, None, 1.0
+        estimator = loss_module.value_estimator
+        if loss_module.horizon == "receding" and isinstance(estimator, TD0Estimator):
+            following = operator.known(batch.get("next"))
+            done = batch.get(("next", keys.done))
+            ended = batch.get(("next", keys.terminated), default=done).squeeze(-1)
+            discount = estimator.gamma * ~ended
         report = policy_gradient.step(
             operator.known(batch),
             batch.get(action),
             -loss_module.target(batch),
-            known=known,
+            following=following,
+            discount=discount,
             warm_start=None if key is None else batch.get(key, None),
             share_of_rate=share_of_rate(),
         )

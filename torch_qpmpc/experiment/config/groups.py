@@ -182,7 +182,7 @@ class PolicyGradient(Group):
 
 
 #: No policy gradient, for configurations of versions without one.
-NO_POLICY_GRADIENT = PolicyGradient(parts=[], rate=0.1, ridge=0.01, memory=0)
+NO_POLICY_GRADIENT = PolicyGradient(parts=[], rate=0.05, ridge=0.01, memory=0)
 
 
 class SingleProcess(Group):
