@@ -25,6 +25,8 @@ STOPS = (2, 7)
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
 GATED = ("gate=true", "optimizer=gauss_newton")
 ANCHORED = ("start=data", "start.transitions=200", "anchor=1")
+POLICY = ("constraint.learn=[C]", "policy_gradient.parts=[lb,b]", "policy_gradient.memory=9")
+POLICY += ("exploration_std=0.1",)
 ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
 
 
@@ -38,6 +40,7 @@ ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
         ("optimizer=gauss_newton", "constraint=mpc", "release=5"),
         ("optimizer=adam", "constraint=mpc", "release=9"),
         ("optimizer=recursive", *STREAM),
+        ("optimizer=recursive", *STREAM, *POLICY),
         ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
         ("delay_value=true", "noise=brownian", "steps_per_update=3"),
         ("warm_start=false", "replay_capacity=48"),

@@ -27,6 +27,7 @@ from torch_qpmpc.experiment.tasks.registry import (
     Task,
     TaskSettings,
     find_task,
+    learned_parts,
     register,
 )
 from torch_qpmpc.mpc.module import QPMPC
@@ -53,11 +54,10 @@ def make_physics(cfg: DictConfig) -> AnyPlant:
 
 def make_mpc(cfg: DictConfig, physics: AnyPlant, start: Start | None = None) -> QPMPC:
     """Make the QP that learns, from the task's wrong scheme or, if there is one, from ``start``."""
-    learn = (*cfg.task.learn_cost, *cfg.constraint.learn)
     scheme = find_task(cfg.task).wrong_scheme(cfg, physics)
     if start is not None:
         scheme = identified_scheme(cfg, scheme, start)
-    return _make(cfg, physics, scheme, learn)
+    return _make(cfg, physics, scheme, learned_parts(cfg))
 
 
 def make_true_mpc(cfg: DictConfig, physics: AnyPlant) -> QPMPC | None:

@@ -16,7 +16,13 @@ from torch_qpmpc.envs.heated_house import DAY, DT, LOWER, OUTDOOR, PRICE, UPPER,
 from torch_qpmpc.experiment.fields import Count, Flag, NonNegative
 from torch_qpmpc.experiment.heating import Model, heating_options, known_model
 from torch_qpmpc.experiment.rivals.houses import HOUSE_RIVALS
-from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
+from torch_qpmpc.experiment.tasks.registry import (
+    Scheme,
+    Task,
+    TaskSettings,
+    learned_parts,
+    register,
+)
 from torch_qpmpc.mpc.banded import band_distance
 
 #: The resistance that the tutorial's planner assumes, in K/kW.
@@ -63,12 +69,14 @@ def lagged_model(plant: House) -> Model:
 def learned_scheme(cfg: DictConfig, plant: HeatedHouse, model: Model, cost: float) -> Scheme:
     """Make the scheme that learns, whose c is the part of a typical cost that lies beyond N.
 
-    The learned entries of q are those of the forecasts, in which V and Q become linear: others
-    would be prices of the plan, of which that of y_N is not bounded.
+    By TD errors, the learned entries of q are those of the forecasts, in which V and Q become
+    linear: others would be prices of the plan, of which that of y_N is not bounded. The policy
+    gradient moves those prices, except y_N's.
     """
-    gamma, learn = cfg.task.gamma, (*cfg.task.learn_cost, *cfg.constraint.learn)
+    gamma = cfg.task.gamma
     n_z = plant.n_p + plant.horizon * (plant.n_y + plant.n_u)
-    masks = {"q": torch.arange(n_z) < plant.n_preview}
+    forecast, last = torch.arange(n_z) < plant.n_preview, torch.arange(n_z) >= n_z - plant.n_y
+    masks = {"q": ~forecast & ~last if "q" in cfg.policy_gradient.parts else forecast}
     if cfg.constraint.structure == "free":
         distance = band_distance(plant.n_y, plant.n_u, plant.horizon, plant.past, plant.n_d)
         masks["C"] = distance <= 0
@@ -78,7 +86,7 @@ def learned_scheme(cfg: DictConfig, plant: HeatedHouse, model: Model, cost: floa
         model,
         margin=cfg.task.margin,
         c=beyond * cost / DAY,
-        learn={part: masks.get(part, True) for part in learn},
+        learn={part: masks.get(part, True) for part in learned_parts(cfg)},
     )
 
 

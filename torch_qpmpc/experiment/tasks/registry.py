@@ -155,6 +155,11 @@ def register(task: Task) -> None:
     ConfigStore.instance().store(task.name, node, group="task", package="_global_")
 
 
+def learned_parts(cfg: DictConfig) -> tuple[str, ...]:
+    """Return the parts of theta that learn, by TD errors or by the policy gradient."""
+    return (*cfg.task.learn_cost, *cfg.constraint.learn, *cfg.policy_gradient.parts)
+
+
 def find_task(settings: Mapping[str, Any]) -> Task:
     """Find a task by the keys under ``task``, running its file if it is not registered.
 
