@@ -304,6 +304,7 @@ BAD: dict[str, list[Any]] = {
 for _name in ("threads", "updates", "batch_size", "num_envs", "steps_per_update"):
     BAD[_name] = WHOLE
 BAD["warmup_steps"] = WHOLE[1:]
+BAD["gate_interval"] = [value for value in WHOLE if value is not None]
 for _name in (
     "replay_capacity",
     "eval_interval",
