@@ -64,7 +64,7 @@ def test_rho_is_the_average_cost_and_q_the_differential_value():
     assert mpc.c == 0
     batch = grid()
     s, a = batch["observation"], batch["action"]
-    ahead = A * s + B * a
+    ahead = s * A + a * B
     expected = (s.square() + R * a.square() + P * ahead.square()).squeeze(-1)
     offset = mpc.action_value(s, a).detach() - expected
     assert_close(offset, offset.mean().expand_as(offset), rtol=0, atol=1e-4)
