@@ -152,7 +152,7 @@ def test_a_finished_run_saves_theta_without_data(tmp_path, stopped):
 @pytest.mark.slow
 def test_worker_processes_start_new_episodes_on_resume(tmp_path, monkeypatch, capsys):
     """One worker suffices: another process's state cannot be saved."""
-    cfg = make_config(*RUN, "collector=multi", "collector.workers=1", "updates=6")
+    cfg = make_config(*RUN, "collector=multi", "collector.workers=1", "updates=6", "n_step=3")
     assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
     go_on(tmp_path)
     expected = "Starting new episodes: the state of the environments is not saved."

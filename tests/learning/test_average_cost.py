@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import pytest
 import torch
@@ -39,7 +40,7 @@ def grid() -> TensorDict:
     return TensorDict(observation=s, action=a, next=following, batch_size=len(s))
 
 
-def learned(average_cost: bool, gamma: float, updates: int) -> tuple[QPMPC, QPQLearningLoss]:
+def learned(average_cost: bool, gamma: float, updates: int) -> tuple[QPMPC, Any]:
     """Learn a QP of two stages from a wrong terminal cost."""
     cost = {"stage_weight": [2.0, 2 * R], "terminal_weight": [0.1], "learn": ("H", "H_f", "c")}
     mpc = QPMPC.from_model([[A]], [[B]], 2, gamma=gamma, solver="daqp", seed=0, **cost)
@@ -63,7 +64,8 @@ def test_rho_is_the_average_cost_and_q_the_differential_value():
     assert mpc.c == 0
     batch = grid()
     s, a = batch["observation"], batch["action"]
-    expected = (s.square() + R * a.square() + P * (A * s + B * a).square()).squeeze(-1)
+    ahead = s * A + a * B
+    expected = (s.square() + R * a.square() + P * ahead.square()).squeeze(-1)
     offset = mpc.action_value(s, a).detach() - expected
     assert_close(offset, offset.mean().expand_as(offset), rtol=0, atol=1e-4)
 
@@ -74,7 +76,7 @@ def test_a_discounted_target_has_the_discounted_gain():
     assert gain(mpc) < 0.97 * riccati(1.0)[1]
 
 
-def make_loss(**options) -> QPQLearningLoss:
+def make_loss(**options: Any) -> Any:
     loss = QPQLearningLoss(QPActorValueOperator(random_mpc(3, **options)), average_cost=True)
     loss.make_value_estimator()
     return loss

@@ -76,7 +76,8 @@ def run_of(env: int, step: int, n: int) -> list[int]:
 def test_n_step_transitions_end_with_the_episode_and_the_data(n_step):
     replay, steps = filled(n_step=n_step, gamma=GAMMA), history()
     seen = set()
-    for sample in torch.cat([replay.sample() for _ in range(10)]).unbind(0):
+    samples: Any = torch.cat([replay.sample() for _ in range(10)])
+    for sample in samples.unbind(0):
         env, step = place(sample["index"])
         run = run_of(env, step, n_step)
         seen.add((env, step))
@@ -99,7 +100,7 @@ def make_loss(key: str | None = None, **options: Any) -> QPQLearningLoss:
 
 def costs_to_go(loss: QPQLearningLoss) -> torch.Tensor:
     """Return gamma (1 - terminated) V(s+) of the whole history."""
-    after = history()["next"]
+    after: Any = history()["next"]
     V = loss.operator.module.value(after["observation"]).detach()
     return V.masked_fill(after["terminated"].squeeze(-1), 0)
 
@@ -157,11 +158,11 @@ def test_active_sets_are_remembered_where_they_belong(gamma):
     replay.remember(sample)
     stored: TensorDictBase = replay.transitions.storage[:]
     rows, columns = sample["index"].reshape(-1, 2).unbind(-1)
-    visited = stored[rows, columns]
+    visited: Any = stored[rows, columns]
     expected = before.solve(visited["observation"], visited["action"]).active
     assert torch.equal(visited[ACTIVE_SET], expected)
     rows, columns = sample["next", "index"].reshape(-1, 2).unbind(-1)
-    after = stored[rows, columns]["next"]
+    after: Any = stored.get("next")[rows, columns]
     assert torch.equal(after[ACTIVE_SET], before.solve(after["observation"]).active)
 
 

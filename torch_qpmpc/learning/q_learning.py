@@ -276,7 +276,7 @@ class QPQLearningLoss(LossModule):
     @torch.no_grad()
     def move_c_(self) -> None:
         """Move the last step of c into the average cost; without one, do nothing."""
-        if self.average_cost is not None:
+        if self.average_cost is not None and self.fixed_c is not None:
             c = self.operator.module.c
             self.average_cost += c - self.fixed_c
             c.copy_(self.fixed_c)

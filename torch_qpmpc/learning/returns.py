@@ -7,6 +7,8 @@ episodes. Its key ``steps_to_next_obs`` is kept, by which TorchRL's estimators d
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -49,7 +51,8 @@ def n_step_transitions(slices: TensorDictBase, gamma: float) -> TensorDictBase:
     if slices.batch_dims != 2:
         raise QPError.expected("slices", f"shape {tuple(slices.shape)}", "(M, n)")
     check_number("gamma", gamma, lambda x: 0 <= x <= 1, "a number in [0, 1]")
-    after: TensorDictBase = slices["next"]
+    first: Any = slices[:, 0]
+    after: Any = slices["next"]
     reward, done = after["reward"], after["done"]
     open_before = torch.ones_like(done)
     open_before[:, 1:] = (~done[:, :-1]).cumprod(1).bool()
@@ -58,7 +61,7 @@ def n_step_transitions(slices: TensorDictBase, gamma: float) -> TensorDictBase:
     # where, not a product: the reward of another episode may be NaN.
     summed = torch.where(open_before, reward, 0).mul(powers.unsqueeze(-1)).sum(1)
     last = after[torch.arange(len(slices), device=steps.device), steps.squeeze(-1) - 1]
-    return slices[:, 0].set("next", last.set("reward", summed)).set(STEPS, steps)
+    return first.set("next", last.set("reward", summed)).set(STEPS, steps)
 
 
 def check_returns(n_step: int, gamma: float | None, batch_size: int) -> None:
