@@ -35,6 +35,8 @@ GROUPS = ("constraint", "noise", "optimizer", "task")
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
 NOT_NEEDED = (
+    "anchor",
+    "average",
     "eval_seed",
     "export",
     "gate",

@@ -425,9 +425,9 @@ def test_a_penalty_needs_a_free_C():
 
 def test_an_anchor_needs_a_free_C_of_its_sizes():
     anchor = anchor_of(random_mpc())
-    for options in ({"learn": ("H", "c")}, {"structure": "tied", "learn": ("C",)}):
+    for mpc in (random_mpc(learn=("H", "c")), random_mpc(structure="tied", learn=("C",))):
         with pytest.raises(QPError, match="anchor: got a C that is not free, expected C among"):
-            GaussNewton(random_mpc(**options), anchor=anchor)
+            GaussNewton(mpc, anchor=anchor)
     with pytest.raises(QPError, match=r"anchor.C_0: got shape .*Pass Anchor.of\(identified\)"):
         GaussNewton(random_mpc(), anchor=anchor._replace(C_0=anchor.C_0[:1]))
     wrong: Any = anchor.S
