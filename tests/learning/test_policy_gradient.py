@@ -295,7 +295,11 @@ def test_errors(options, message):
     ids=str,
 )
 def test_shapes(name, shape):
-    batch = {"s": torch.zeros(8, 2), "a": torch.zeros(8, 1), "target": torch.zeros(8)}
+    batch: dict[str, Any] = {
+        "s": torch.zeros(8, 2),
+        "a": torch.zeros(8, 1),
+        "target": torch.zeros(8),
+    }
     improve = PolicyGradient(random_mpc(0, learn=("c", "b")), ["b"])
     with pytest.raises(QPError, match=f"^{name}: got shape"):
         improve.step(**{**batch, name: torch.zeros(shape)})
