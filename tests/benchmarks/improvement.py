@@ -57,6 +57,9 @@ HOUSE, WALL = ("task=house", "task.margin=0.1"), ("task=house_wall",)
 DAYS = ("num_envs=4", "start.transitions=1152")
 CASES = {
     "Point mass, Gaussian noise, corrupted": Case(("task=point_mass",)),
+    "Point mass, Gaussian noise, corrupted, constraint=identified": Case(
+        ("task=point_mass", "constraint=identified")
+    ),
     "Point mass, Gaussian noise, identified": Case(("task=point_mass", DATA)),
     "Point mass, Brownian noise, corrupted": Case(("task=point_mass", "noise=brownian")),
     "Point mass, Brownian noise, identified": Case(("task=point_mass", "noise=brownian", DATA)),

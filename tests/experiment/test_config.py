@@ -581,10 +581,6 @@ def test_solver_must_be_known():
             "target_horizon: got 'shrinking', expected receding. td3 does not support",
         ),
         (
-            ["constraint=mpc", "search.margin_k=0.1"],
-            "search.margin_k: got 0.1, expected null. Learned bounds of constraint.structure=tied",
-        ),
-        (
             ["anchor=1"],
             "start.name: got 'model', expected data. The anchor is at a C that was identified",
         ),

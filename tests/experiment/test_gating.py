@@ -109,6 +109,19 @@ def test_an_average_of_iterates_is_judged():
         assert_close(module.C.detach(), start)
 
 
+def test_without_a_gate_nothing_is_searched():
+    gate, _ = make_gate("gate=false", "search.w=0.1", "search.loops=2")
+    assert gate.judge(4) == {}
+    assert gate.simulated == 0
+
+
+def test_a_search_leaves_out_what_the_QP_lacks():
+    options = ("task.hessian=full", "search.H_u=0.1", "search.w=0.1", "search.loops=2")
+    found = make_gate("gate=true", *options)[0].judge(4)
+    assert "search/w" in found
+    assert "search/H_u" not in found
+
+
 def test_a_search_starts_from_the_policy_that_acts():
     gate, actor = make_gate("gate=true", "search.w=0.1", "search.loops=2")
     with torch.no_grad():

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from tests.problems import random_mpc
 from torch_qpmpc import QPMPC, QPError
-from torch_qpmpc.learning.search import KNOBS, PARTS, _set, search
+from torch_qpmpc.learning.search import KNOBS, PARTS, _set, available, search
 
 
 def scheme(**options: Any) -> QPMPC:
@@ -72,10 +72,22 @@ def test_a_margin_by_stage_grows_like_the_root_of_the_stage():
     assert_close(mpc.ub.detach(), before["ub"] - margin)
 
 
-def test_tied_learned_bounds_have_no_margin_by_stage():
-    mpc = scheme(structure="tied", learn=("C", "lb"))
-    with pytest.raises(QPError, match="those of all stages"):
-        search(mpc, lambda mpc, seed: torch.ones(1), {"margin_k": 1.0}, loops=1)
+@pytest.mark.parametrize(
+    ("options", "missing"),
+    [
+        ({"structure": "tied", "learn": ("C", "lb")}, {"margin_k"}),
+        ({"structure": "tied", "learn": ("C",)}, set()),
+        ({"hessian": "full"}, {"H_x", "H_u", "H_f"}),
+        ({"state_slack": math.inf}, {"margin", "margin_k", "w"}),
+    ],
+)
+def test_scalars_that_a_QP_lacks_are_refused(options, missing):
+    mpc = scheme(**options)
+    assert {*available(mpc)} == {*KNOBS} - missing
+    for name in missing:
+        message = rf"knobs: got \['{name}'\], expected names among those of this QP"
+        with pytest.raises(QPError, match=message):
+            search(mpc, lambda mpc, seed: torch.ones(1), {name: 1.0})
 
 
 def test_factors_of_weights():
@@ -149,8 +161,3 @@ def test_errors(options, message):
     arguments = {"knobs": {"b": 1.0}} | options
     with pytest.raises(QPError, match=message):
         search(random_mpc(0), lambda mpc, seed: torch.ones(1), **arguments)
-
-
-def test_a_full_H_has_no_stage_weights():
-    with pytest.raises(QPError, match="full H"):
-        search(scheme(hessian="full"), lambda mpc, seed: torch.ones(1), {"H_u": 1.0})

@@ -16,7 +16,7 @@ from torch_qpmpc.experiment.checkpoint import write_whole
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.learning.gate import Gate
 from torch_qpmpc.learning.operators import in_closed_loop
-from torch_qpmpc.learning.search import KNOBS, search
+from torch_qpmpc.learning.search import available, search
 from torch_qpmpc.mpc.module import QPMPC
 
 #: The file of the policy that acts, in a run's folder.
@@ -57,8 +57,10 @@ class RunGate:
 
         Judges each ``gate_interval`` updates and after the last one. Then a direct search over the
         scalars that the configuration chooses follows, from the policy that acts, and its result is
-        judged, too.
+        judged, too. Without a gate nothing is judged or searched.
         """
+        if self._gate is None:
+            return {}
         last = update == self._cfg.updates
         if not last and update % (self._cfg.gate_interval or self._cfg.eval_interval):
             return {}
@@ -66,8 +68,7 @@ class RunGate:
         return verdict | self._search() if last else verdict
 
     def _judge(self, tag: str) -> dict[str, float]:
-        if self._gate is None:
-            return {}
+        assert self._gate is not None
         verdict = self._gate.judge(self._learner.candidate)
         if verdict.restarted:
             self._learner.restart()
@@ -75,10 +76,12 @@ class RunGate:
         return {f"{tag}/{name}": float(getattr(verdict, name)) for name in names}
 
     def _search(self) -> dict[str, float]:
-        sizes = {name: x for name in KNOBS if (x := self._cfg.search.get(name))}
         actor = self._learner.candidate
         mpc = _qp(actor)
-        if not sizes or mpc is None:
+        if mpc is None:
+            return {}
+        sizes = {name: x for name in available(mpc) if (x := self._cfg.search.get(name))}
+        if not sizes:
             return {}
         actor.load_state_dict(self.actor.state_dict())
         loops, seed = self._cfg.search.loops, self._cfg.seed

@@ -87,6 +87,22 @@ KNOBS: dict[str, Callable[[QPMPC, Theta, float], Theta]] = {
 }
 
 
+def available(mpc: QPMPC) -> list[str]:
+    """Return the names of the scalars that change the policy of this QP.
+
+    A full H has no weights of its stages, without soft rows there is nothing to tighten, and
+    learned bounds of structure="tied" are those of all stages.
+    """
+    without: set[str] = set()
+    if mpc.hessian == "full":
+        without |= {"H_x", "H_u", "H_f"}
+    if not mpc.soft.any():
+        without |= {"margin", "margin_k", "w"}
+    if mpc.structure == "tied" and {"lb", "ub"} & {*mpc.learned}:
+        without.add("margin_k")
+    return [name for name in KNOBS if name not in without]
+
+
 def search(
     mpc: QPMPC,
     costs: Callable[[QPMPC, int], Tensor],
@@ -115,7 +131,7 @@ def search(
         The scalars found; all zero stand for the theta that the search started from.
 
     Raises:
-        QPError: an argument is invalid.
+        QPError: an argument is invalid, or a scalar is not `available`.
 
     Example:
         >>> import torch_qpmpc as qm
@@ -134,16 +150,12 @@ def search(
     check_kind("mpc", mpc, QPMPC)
     check_whole("loops", loops, 1)
     check_whole("seed", seed, 0)
-    if not knobs or (unknown := set(knobs) - set(KNOBS)):
+    known = available(mpc)
+    if not knobs or (unknown := set(knobs) - {*known}):
         got = sorted(unknown) if knobs else "none"
-        raise QPError.expected("knobs", got, f"names among {', '.join(KNOBS)}")
+        raise QPError.expected("knobs", got, f"names among those of this QP, {', '.join(known)}")
     for name, size in knobs.items():
         check_number(f"knobs[{name}]", size, lambda x: x > 0, "a finite number > 0")
-    if mpc.hessian == "full" and {"H_x", "H_u"} & set(knobs):
-        raise QPError.expected("knobs", "H_x or H_u", "others", "A full H has no stage weights.")
-    if "margin_k" in knobs and mpc.structure == "tied" and {"lb", "ub"} & {*mpc.learned}:
-        remedy = "Learned bounds of structure='tied' are those of all stages."
-        raise QPError.expected("knobs", "margin_k", "others", remedy)
     theta = {part: getattr(mpc, part).detach().clone() for part in PARTS if hasattr(mpc, part)}
     # CMA-ES needs two dimensions.
     names, sizes = list(knobs), np.array([*knobs.values(), 1.0][: max(len(knobs), 2)])

@@ -317,15 +317,6 @@ class Config(Group):
         return self
 
     @model_validator(mode="after")
-    def growing_margin_has_bounds_by_stage(self) -> Self:
-        constraint = self.constraint
-        tied = constraint.structure == "tied" and {"lb", "ub"} & {*constraint.learn}
-        if self.search.margin_k and tied:
-            remedy = "Learned bounds of constraint.structure=tied are those of all stages."
-            self.conflict("search.margin_k", "null", remedy)
-        return self
-
-    @model_validator(mode="after")
     def environments_divide_evenly(self) -> Self:
         """Check that num_envs divides evenly among workers and divides the replay's capacity."""
         if self.collector.name != "single" and self.num_envs % self.collector.workers:
