@@ -141,10 +141,9 @@ def test_a_finished_run_saves_theta_without_data(tmp_path, stopped):
     ]
 
 
-@pytest.mark.slow
-def test_worker_processes_start_new_episodes_on_resume(tmp_path, monkeypatch, capsys):
-    """One worker suffices: another process's state cannot be saved."""
-    cfg = make_config(*RUN, "collector=multi", "collector.workers=1", "updates=6")
+def test_environments_of_gymnasium_start_new_episodes_on_resume(tmp_path, monkeypatch, capsys):
+    """Their state cannot be saved, nor that of other processes: test_collection.py."""
+    cfg = make_config(*RUN, "task=pendulum", "noise=none", "updates=6")
     assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
     go_on(tmp_path)
     expected = "Starting new episodes: the state of the environments is not saved."
