@@ -24,6 +24,8 @@ RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3")
 STOPS = (2, 7)
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
 ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
+NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
+SGD = ("optimizer=sgd", "penalty_step=subgradient")
 
 
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
@@ -31,26 +33,17 @@ ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
     "overrides",
     [
         ("optimizer=adam", "constraint=combined"),
-        ("optimizer=sgd", "constraint=combined", "penalty_step=subgradient"),
-        ("optimizer=gauss_newton", "constraint=combined"),
-        ("optimizer=gauss_newton", "constraint=mpc", "release=5"),
+        (*SGD, "constraint=combined", "solver=torch", "step=projection"),
+        ("optimizer=gauss_newton", "constraint=combined", "solver=proxqp"),
         ("optimizer=adam", "constraint=mpc", "release=9"),
-        ("optimizer=recursive", *STREAM),
         ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
-        ("delay_value=true", "noise=brownian", "steps_per_update=3"),
-        ("warm_start=false", "replay_capacity=48"),
-        ("solver=proxqp", "optimizer=gauss_newton"),
-        ("solver=torch", "step=projection"),
-        ("algo=ddpg", *ACTOR_CRITIC),
+        ("delay_value=true", "noise=brownian", "steps_per_update=3", "warm_start=false"),
         ("algo=td3", *ACTOR_CRITIC),
-        ("algo=td3", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
-        ("task=store", "optimizer=adam", "constraint=combined"),
         ("gate=true", "optimizer=gauss_newton", "constraint=mpc", "release=5", "search.w=0.5"),
-        ("gate=true", "algo=td3", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
+        ("gate=true", "algo=td3", *ACTOR_CRITIC, *NETWORKS),
         ("task=store", "optimizer=gauss_newton", "constraint=si", "task.episode_steps=5"),
         ("task=store", "optimizer=recursive", "optimizer.memory=8", "task.episode_steps=6"),
-        ("task=store", "algo=td3", *ACTOR_CRITIC),
-        ("task=store", "algo=ddpg", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
+        ("task=store", "algo=ddpg", *ACTOR_CRITIC, *NETWORKS),
     ],
     ids=" ".join,
 )
