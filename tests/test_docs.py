@@ -113,7 +113,7 @@ def test_modules_that_commands_run_exist(module):
 @needs_docs
 @pytest.mark.slow
 def test_the_task_of_the_guide_trains(tmp_path):
-    """As a script, in the runs of a sweep, which are processes of their own."""
+    """As a script, in the runs of a sweep, which are processes of their own, with one line."""
     blocks = [code for _, code in fenced(PAGES["docs/guides/task.md"], "python")]
     (script,) = (code for code in blocks if "register(" in code)
     (tmp_path / "my_task.py").write_text(script, encoding="utf-8")
@@ -129,6 +129,10 @@ def test_the_task_of_the_guide_trains(tmp_path):
         check=False,
     )
     assert ended.returncode == 0, ended.stderr
+    assert "2/2" in ended.stderr
+    assert "done=2" in ended.stderr
+    assert "deviation, none" not in ended.stderr, "a run's own bar"
+    assert "closed gap" not in ended.stdout, "a run's own table"
     summary = json.loads((tmp_path / "sweep/none-deviation-seed2/summary.json").read_text())
     assert (summary["task"], summary["seed"], summary["updates"]) == ("pole", 2, 4)
     assert summary["J_true_model"] < summary["J_start"]

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 #: Environment variables that shorten the notebooks.
-SMALL = {"UPDATES": "2"}
+SMALL = {"UPDATES": "2", "SEEDS": "1", "DAYS": "2"}
 
 pytestmark = pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks, as in a wheel's tests")
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import json
+import signal
 from typing import Any
 
 import pytest
@@ -12,6 +14,7 @@ from omegaconf import DictConfig
 
 import train
 from tests.runs import SMALL, make_config
+from tests.stops import go_on, stop
 from torch_qpmpc import QPActorValueOperator, QPError, SolveLog
 from torch_qpmpc.experiment.collection import batches, make_collector, num_columns
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
@@ -106,20 +109,27 @@ def test_workers_share_the_environments_and_follow_theta(name):
 
 
 @pytest.mark.parametrize("name", ELSEWHERE)
-def test_asynchronous_workers_return_batches_of_their_environments(tmp_path, monkeypatch, name):
-    """Each batch has the environments of one of two workers."""
+@pytest.mark.usefixtures("store_task")
+def test_asynchronous_workers_return_batches_of_their_environments(
+    tmp_path, monkeypatch, capsys, name
+):
+    """Each batch has the environments, here plants, of one of two workers, also on resume."""
     if name == "ray":
         pytest.importorskip("ray", reason="the extra ray is not installed")
-    overrides = (*SMALL, f"collector={name}", "collector.sync=false", "num_envs=4", "constraint=si")
-    cfg = make_config(*overrides, "steps_per_update=5", "warmup_steps=10", "updates=6")
+    overrides = ("task=store", *SMALL, f"collector={name}", "collector.sync=false", "num_envs=4")
+    more = ("constraint=si", "steps_per_update=5", "warmup_steps=10", "updates=6")
+    cfg = make_config(*overrides, *more)
     assert num_columns(cfg) == 2
     seen = []
     monkeypatch.setattr(
         train, "batches", lambda collector: (seen.append(b.shape) or b for b in batches(collector))
     )
-    summary = train.train(cfg, str(tmp_path))
-    assert seen == [(2, 5)] * 8
-    assert summary["updates"] == 6
+    assert stop(monkeypatch, cfg, tmp_path, 4) == 128 + signal.SIGTERM
+    go_on(tmp_path)
+    assert set(seen) == {(2, 5)}
+    assert "Starting new episodes: the state of the env" in capsys.readouterr().out
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["updates"], summary["unsolved"]) == (6, 0)
     assert summary["J_final"] != summary["J_start"]
 
 

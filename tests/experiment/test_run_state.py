@@ -28,6 +28,8 @@ ANCHORED = ("start=data", "start.transitions=200", "anchor=1")
 POLICY = ("constraint.learn=[C]", "policy_gradient.parts=[lb,b]", "policy_gradient.memory=9")
 POLICY += ("exploration_std=0.1",)
 ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
+NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
+SGD = ("optimizer=sgd", "penalty_step=subgradient")
 
 
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
@@ -35,30 +37,21 @@ ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
     "overrides",
     [
         ("optimizer=adam", "constraint=combined"),
-        ("optimizer=sgd", "constraint=combined", "penalty_step=subgradient"),
-        ("optimizer=gauss_newton", "constraint=combined"),
-        ("optimizer=gauss_newton", "constraint=mpc", "release=5"),
+        (*SGD, "constraint=combined", "solver=torch", "step=projection"),
+        ("optimizer=gauss_newton", "constraint=combined", "solver=proxqp"),
         ("optimizer=adam", "constraint=mpc", "release=9"),
-        ("optimizer=recursive", *STREAM),
         ("optimizer=recursive", *STREAM, *POLICY),
         ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
-        ("delay_value=true", "noise=brownian", "steps_per_update=3"),
-        ("warm_start=false", "replay_capacity=48"),
+        ("delay_value=true", "noise=brownian", "steps_per_update=3", "warm_start=false"),
         ("optimizer=gauss_newton", "n_step=3", "replay_capacity=48", "average_cost=true"),
         ("task=store", "optimizer=gauss_newton", "n_step=4", "lmbda=0.8", "average_cost=true"),
-        ("solver=proxqp", "optimizer=gauss_newton"),
-        ("solver=torch", "step=projection"),
-        ("algo=ddpg", *ACTOR_CRITIC),
         ("algo=td3", *ACTOR_CRITIC),
-        ("algo=td3", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
-        ("task=store", "optimizer=adam", "constraint=combined"),
         (*GATED, "constraint=mpc", "release=5", "search.w=0.5", "average=0.9"),
         (*GATED, *ANCHORED, "constraint=free", "average=0.5"),
-        ("gate=true", "algo=td3", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
+        ("gate=true", "algo=td3", *ACTOR_CRITIC, *NETWORKS),
         ("task=store", "optimizer=gauss_newton", "constraint=si", "task.episode_steps=5"),
         ("task=store", "optimizer=recursive", "optimizer.memory=8", "task.episode_steps=6"),
-        ("task=store", "algo=td3", *ACTOR_CRITIC),
-        ("task=store", "algo=ddpg", *ACTOR_CRITIC, "algo.actor=mlp", "algo.critic=mlp"),
+        ("task=store", "algo=ddpg", *ACTOR_CRITIC, *NETWORKS),
     ],
     ids=" ".join,
 )
@@ -149,10 +142,15 @@ def test_a_finished_run_saves_theta_without_data(tmp_path, stopped):
     ]
 
 
-@pytest.mark.slow
-def test_worker_processes_start_new_episodes_on_resume(tmp_path, monkeypatch, capsys):
-    """One worker suffices: another process's state cannot be saved."""
-    cfg = make_config(*RUN, "collector=multi", "collector.workers=1", "updates=6", "n_step=3")
+        ("optimizer=recursive", *STREAM, *POLICY),
+        ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
+        ("delay_value=true", "noise=brownian", "steps_per_update=3", "warm_start=false"),
+        ("optimizer=gauss_newton", "n_step=3", "replay_capacity=48", "average_cost=true"),
+        ("task=store", "optimizer=gauss_newton", "n_step=4", "lmbda=0.8", "average_cost=true"),
+        ("algo=td3", *ACTOR_CRITIC),
+        (*GATED, "constraint=mpc", "release=5", "search.w=0.5", "average=0.9"),
+        (*GATED, *ANCHORED, "constraint=free", "average=0.5"),
+        ("gate=true", "algo=td3", *ACTOR_CRITIC, *NETWORKS),
     assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
     go_on(tmp_path)
     expected = "Starting new episodes: the state of the environments is not saved."

@@ -215,12 +215,6 @@ def test_train_learns_a_plants_qp(store_task, tmp_path, algo):
     assert (tmp_path / "episode.png").exists()
 
 
-@pytest.mark.slow
-def test_a_plant_in_worker_processes(store_task, tmp_path):
-    cfg = make_config("task=store", *SMALL, "collector=multi", "collector.workers=2")
-    assert train.train(cfg, str(tmp_path), quiet=True)["unsolved"] == 0
-
-
 # A user's task
 
 

@@ -110,6 +110,9 @@ def test_meaning_shows_each_run_and_use_those_with_a_real_gap(gaussian, axes):
     real = gaussian[gaussian["real"]]
     points = np.concatenate([dots.get_offsets() for dots in other.collections])
     np.testing.assert_allclose(points[:, 1], 1 - real["closed_gap"])
+    without = Figure().subplots()
+    draw_use(without, gaussian[~gaussian["real"]])
+    assert without.get_legend() is None
 
 
 def test_a_setting_is_a_point_of_the_frontier():

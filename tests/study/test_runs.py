@@ -80,7 +80,7 @@ def test_readings_do_not_depend_on_the_gauge(study):
 
 
 def test_constraints_that_determine_no_states_have_no_readings(study):
-    run = FinishedRun(study / "small" / "gaussian-free-seed1")
+    run = FinishedRun(str(study / "small" / "gaussian-free-seed1"))
     with torch.no_grad():
         run.learned.C.zero_()
     readings = run.readings()

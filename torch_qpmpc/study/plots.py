@@ -201,7 +201,8 @@ def draw_use(axes: Axes, frame: pd.DataFrame) -> None:
     axes.axvline(1, color="k", linestyle="--", linewidth=1)
     axes.set(xlabel="prediction error, learned / corrupted", ylabel="gap left", xscale="log")
     axes.set_yscale("symlog", linthresh=0.01)
-    axes.legend(fontsize="small")
+    if not real.empty:
+        axes.legend(fontsize="small")
 
 
 def meaning_figure(frame: pd.DataFrame) -> Figure:

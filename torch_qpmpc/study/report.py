@@ -35,7 +35,7 @@ from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
 SIDE_BY_SIDE = 8
 CAPTION = f"""\
 Closed gap: median and 95% interval (bootstrapped over seeds) of the runs with a real gap, J_start -
-J_true_model >= {REAL_GAP:.0f}, and their number. All other entries are medians over all runs.
+J_true_model >= {REAL_GAP:g} J_start, and their number. All other entries are medians over all runs.
 J: start to learned, with the true model in brackets. Distance: relative distance of C's predictions
 from those of the nearest time-invariant MPC scheme. Zeros: share of C's entries above the band that
 are exactly zero. Prediction error: root mean square over one step, of the corrupted (A, B) and of

@@ -9,7 +9,6 @@ import contextlib
 import copy
 import json
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -40,21 +39,21 @@ from torch_qpmpc.mpc.module import QPMPC
 
 #: The paper's cases, in its order.
 CASES = ("fixed", "free", "deviation", "si", "combined")
-#: Smallest J_start - J_true_model for which the closed gap is meaningful.
-REAL_GAP = 50.0
+#: Smallest J_start - J_true_model for which the closed gap is meaningful, as a share of J_start.
+REAL_GAP = 0.5
 #: Settings that labels leave out: they vary within a case, or do not affect learning.
 _UNLABELLED = ("seed", "figures", "threads", "log_interval", "eval_interval", "logger", "rivals")
 
 
-@dataclass(frozen=True, eq=False)
 class FinishedRun:
     """A finished run, read from its folder.
 
-    Attributes:
+    Args:
         folder: the run's folder, with config.yaml and checkpoint.pt.
     """
 
-    folder: Path
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
 
     @cached_property
     def cfg(self) -> DictConfig:
@@ -178,7 +177,8 @@ def collect(folder: str | Path) -> pd.DataFrame:
     for name in ("J", "J_discounted"):  # runs before there was a gate
         if f"{name}_best" not in frame:
             frame[f"{name}_best"] = frame[f"{name}_final"]
-    frame["real"] = frame["J_start"] - frame["J_true_model"] >= REAL_GAP
+    gap = frame["J_start"] - frame["J_true_model"]
+    frame["real"] = gap >= REAL_GAP * frame["J_start"].abs()
     frame["actor"] = [run.cfg.algo.get("actor", "qp") for run in frame["run"]]
     frame["label"] = ""
     for _, sweep in frame.groupby("sweep"):
