@@ -86,7 +86,6 @@ CASES = {
 }
 WAYS = {
     "Q-learning": ("gate=false", *NO_SEARCH),
-    "with the gate": NO_SEARCH,
     "default": (),
 }
 
@@ -162,8 +161,10 @@ def outcome_table(rows: pd.DataFrame) -> str:
     for case, runs in rows.groupby("case", sort=False):
         by_way = {way: runs[runs["way"] == way] for way in WAYS}
         cells = [ratios(found) if len(found) else "" for found in by_way.values()]
-        lines.append([str(case), cost_text(runs["start"].median()), *cells])
-    return table(["J / J of the start, %: median [interval], worst", "J start", *WAYS], lines)
+        seeds = str(runs["seed"].nunique())
+        lines.append([str(case), seeds, cost_text(runs["start"].median()), *cells])
+    head = ["J / J of the start, %: median [interval], worst", "seeds", "J start", *WAYS]
+    return table(head, lines)
 
 
 def reference_table(rows: pd.DataFrame) -> str:
