@@ -21,9 +21,10 @@ def pytest_configure(config: pytest.Config) -> None:
     Idle workers steal tests, because by default long ones may run last on one worker.
     """
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
-        command = [sys.executable, "-m", "tests.kernels"]
-        config.stash[COMPILING] = subprocess.Popen(command, cwd=config.rootpath)
         config.option.dist = "worksteal"
+        if config.option.markexpr != "slow":  # these run after the others, which compile them
+            command = [sys.executable, "-m", "tests.kernels"]
+            config.stash[COMPILING] = subprocess.Popen(command, cwd=config.rootpath)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.testing import assert_close
 
+from tests.covering import covering
 from tests.runs import SMALL, choices, make_config
 from torch_qpmpc import QPMPC, QPActorValueOperator
 from torch_qpmpc.experiment.actor_critic import (
@@ -235,8 +236,10 @@ def test_td3_whose_schedule_is_restored_has_the_same_delay():
         assert torch.equal(mpc.C, before) == (update != 6)
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize(("algo", "actor", "critic"), COMBINATIONS)
+@pytest.mark.parametrize(
+    ("algo", "actor", "critic", "task"),
+    covering(itertools.product(ALGOS, ACTORS, NETWORKS, TASKS)),
+)
 def test_updates_move_the_actor_the_critics_and_nothing_else(algo, actor, critic, task, store_task):
     learner, mpc, batch = make(*settings(algo, actor, critic, task))
     assert learner.target is not None

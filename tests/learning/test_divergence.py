@@ -24,8 +24,9 @@ RATES = {
 }
 
 
-@pytest.mark.parametrize("slack", ["100", "inf"])
-@pytest.mark.parametrize("optimizer", RATES)
+@pytest.mark.parametrize(
+    ("optimizer", "slack"), zip(RATES, ["100", "inf", "inf", "100"], strict=True)
+)
 def test_a_run_with_far_too_large_a_rate_ends_with_a_summary(tmp_path, optimizer, slack):
     sizes = ("updates=12", "eval_interval=12", "task.eval_steps=5", f"task.state_slack={slack}")
     rates = (f"optimizer={optimizer}", *RATES[optimizer], "optimizer.final_fraction=1")

@@ -252,9 +252,12 @@ def test_metadata_are_detached_scalars():
 def test_compiled_without_graph_breaks():
     loss = make_loss(reduction="none")
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
-    for seed in (0, 1):
-        first, second = make_batch(6, seed=seed), make_batch(6, seed=seed)
+    for invalid in (0, 1):
+        first, second = make_batch(6, seed=invalid), make_batch(6, seed=invalid)
+        for batch in (first, second):
+            batch["next", "reward"][:invalid] = torch.nan
         expected = loss(first)
+        assert expected["invalid_reward"] == invalid
         expected["loss_value"].mean().backward()
         gradients = [p.grad for p in loss.parameters()]
         loss.zero_grad(set_to_none=True)

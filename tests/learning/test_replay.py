@@ -71,8 +71,7 @@ def check_windows(replay: Replay) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3])
-@pytest.mark.parametrize("max_steps", [N, 7, 50])
-@pytest.mark.parametrize("rows", [15, 40])
+@pytest.mark.parametrize(("max_steps", "rows"), [(N, 15), (7, 40), (50, 15)])
 def test_windows_never_cross_episodes(steps, max_steps, rows):
     replay = make_replay(rows * ENVS, ENVS, 32, N, 200)
     wrapped = False

@@ -97,8 +97,7 @@ def test_the_losses_of_torchrl_after_an_error(name, monkeypatch):
     assert_close(losses.total(loss, batch), expected, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("critic", ["qp", "mlp"])
-@pytest.mark.parametrize("algo", ["ddpg", "td3"])
+@pytest.mark.parametrize(("algo", "critic"), [("ddpg", "mlp"), ("td3", "qp")])
 @pytest.mark.parametrize("where", ["observation", ("next", "observation")])
 def test_an_update_of_actor_and_critic_after_an_error(where, algo, critic):
     learner, mpc, batch = make(*settings(algo, "qp", critic))

@@ -168,10 +168,9 @@ def fresh_dynamo() -> Iterator[None]:
     torch._dynamo.reset()
 
 
-@pytest.mark.parametrize("kind", ["free", "tied window"])
 @pytest.mark.usefixtures("fresh_dynamo")
-def test_compiled_in_one_graph_equals_eager(kind):
-    mpc = make_mpc(kind)
+def test_compiled_in_one_graph_equals_eager():
+    mpc = make_mpc("tied window")
     s, a = inputs(mpc)
     leaves = {name: x.requires_grad_() for name, x in residuals_of(mpc, 0.01, 4).items()}
 
