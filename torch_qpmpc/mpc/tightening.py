@@ -93,7 +93,7 @@ def tighten(
     K = covariances.new_zeros(n_u, n_x) if K is None else K
     check_tensor("K", K, n_u, n_x, batched=False)
     variance = _row_variance(mpc, covariances.to(mpc.lb), K.to(mpc.lb))
-    margin = norm.ppf(probability) * variance.sqrt()
+    margin = float(norm.ppf(probability)) * variance.sqrt()
     lb, ub = mpc.lb + margin, mpc.ub - margin
     halfway = (mpc.lb + mpc.ub) / 2
     crossed = lb > ub
