@@ -11,9 +11,10 @@ from __future__ import annotations
 import argparse
 import csv
 import functools
+import math
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,7 +41,8 @@ SEEDS, EVAL_SEED = range(501, 511), 9002
 COMMON = ("solver=daqp", "figures=false", "logger=csv", f"eval_seed={EVAL_SEED}")
 COMMON += ("eval_interval=1000", "rivals=false")
 NO_SEARCH = tuple(f"search.{name}=null" for name in KNOBS)
-FIELDS = ("case", "way", "seed", "start", "best", "final", "true model", "omniscient")
+ENDS = ("start", "best", "true model", "reference")
+FIELDS = ("case", "way", "seed", *ENDS, "final")
 FIELDS += ("transitions", "simulated", "accepted", "rejected", "seconds")
 
 
@@ -123,7 +125,7 @@ def run(case: str, way: str, seed: int) -> dict[str, Any]:
         "way": way,
         "seed": seed,
         "true model": summary["J_true_model"],
-        "omniscient": reference_cost(case),
+        "reference": reference_cost(case),
         "transitions": round((before + each * cfg.updates) * unit) + logged,
         "simulated": summary.get("simulated", 0),
         "accepted": summary.get("accepted"),
@@ -150,19 +152,26 @@ def add(path: Path, row: dict[str, Any]) -> None:
 
 def ratios(rows: pd.DataFrame) -> str:
     """Format J relative to the start's, in percent: median, 95 % interval, worst seed."""
-    percent = (100 * rows["best"] / rows["start"]).to_numpy()
+    percent = 100 * rows["best"].to_numpy(float) / rows["start"].to_numpy(float)
     low, high = bootstrap_interval([percent])
     return f"{np.median(percent):.1f} [{low:.1f}, {high:.1f}], {percent.max():.1f}"
+
+
+def by_case(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield the rows of each case, in the order of the cases."""
+    for case in CASES:
+        if len(runs := rows[rows["case"] == case]):
+            yield case, runs
 
 
 def outcome_table(rows: pd.DataFrame) -> str:
     """Format each case's J by way, relative to its start."""
     lines = []
-    for case, runs in rows.groupby("case", sort=False):
-        by_way = {way: runs[runs["way"] == way] for way in WAYS}
-        cells = [ratios(found) if len(found) else "" for found in by_way.values()]
+    for case, runs in by_case(rows):
+        ways = [runs[runs["way"] == way] for way in WAYS]
+        cells = [ratios(found) if len(found) else "" for found in ways]
         seeds = str(runs["seed"].nunique())
-        lines.append([str(case), seeds, cost_text(runs["start"].median()), *cells])
+        lines.append([case, seeds, cost_text(float(runs["start"].median())), *cells])
     head = ["J / J of the start, %: median [interval], worst", "seeds", "J start", *WAYS]
     return table(head, lines)
 
@@ -170,25 +179,17 @@ def outcome_table(rows: pd.DataFrame) -> str:
 def reference_table(rows: pd.DataFrame) -> str:
     """Format the default's J beside the other controllers', with what it took."""
     lines = []
-    for case, runs in rows[rows["way"] == "default"].groupby("case", sort=False):
-        names = ("start", "best", "true model", "omniscient")
-        costs = ["" if runs[n].isna().all() else cost_text(runs[n].median()) for n in names]
-        gaps = ((runs["start"] - runs["best"]) / (runs["start"] - runs[n]) for n in names[2:])
-        shares = ["" if gap.isna().all() else f"{gap.median():.2f}" for gap in gaps]
+    for case, runs in by_case(rows[rows["way"] == "default"]):
+        J = {name: runs[name].to_numpy(float) for name in ENDS}
+        gaps = ((J["start"] - J["best"]) / (J["start"] - J[name]) for name in ENDS[2:])
+        medians = [float(np.median(x)) for x in (*J.values(), *gaps)]
+        cells = [cost_text(x) for x in medians[:4]] + [f"{x:.2f}" for x in medians[4:]]
+        cells = ["" if math.isnan(x) else cell for x, cell in zip(medians, cells, strict=True)]
         counts = [f"{runs[n].median():,.0f}" for n in ("transitions", "simulated")]
-        decisions = (
-            f"{runs['accepted'].sum():.0f} of {(runs['accepted'] + runs['rejected']).sum():.0f}"
-        )
-        lines.append([str(case), *costs, *shares, *counts, decisions])
-    head = [
-        "Medians",
-        "start",
-        "default",
-        "true model",
-        "omniscient",
-        "closed gap to the true model",
-    ]
-    head += ["to the omniscient", "transitions", "simulated for comparisons", "accepted"]
+        accepted, rejected = (runs[n].sum() for n in ("accepted", "rejected"))
+        lines.append([case, *cells, *counts, f"{accepted:.0f} of {accepted + rejected:.0f}"])
+    head = ["Medians", "start", "default", "true model", "reference", "gap closed to true model"]
+    head += ["to reference", "transitions", "simulated for comparisons", "accepted"]
     return table(head, lines)
 
 
@@ -216,7 +217,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
                     print(*row.values(), flush=True)
     rows = finished(options.results)
     rows = rows[rows["seed"].isin(options.seeds)]
-    rows = rows.sort_values("case", key=lambda names: names.map(list(CASES).index), kind="stable")
     tables = f"{outcome_table(rows)}\n\n{reference_table(rows)}"
     options.page.write_text(replaced(text, tables, "improvement"), encoding="utf-8")
 

@@ -15,9 +15,9 @@ SOFT = 8
 MANY = 16
 #: The next QP is the nearest of this many.
 NEAR = 256
-#: DAQP's reciprocal quadratic slack weight; 1e4 to 1e8 are accurate to 1e-7, others less. A soft row
-#: is off its bound by its multiplier over this weight: with 1e6, certificates of QPs with large
-#: multipliers are narrowly missed.
+#: DAQP's reciprocal quadratic slack weight; 1e4 to 1e8 are accurate to 1e-7, others less. A soft
+#: row is off its bound by its multiplier over this weight: with 1e6, the certificate rejects QPs
+#: with large multipliers narrowly.
 RECIPROCAL_RHO = 1e7
 #: DAQP's infinity.
 NO_BOUND = 1e30
