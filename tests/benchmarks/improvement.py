@@ -38,8 +38,7 @@ PAGE = DOCS / "results" / "improvement.md"
 RESULTS = ROOT / "runs" / "improvement.csv"
 #: Seeds of the runs, and of the evaluation.
 SEEDS, EVAL_SEED = range(501, 511), 9002
-COMMON = ("solver=daqp", "figures=false", "logger=csv", f"eval_seed={EVAL_SEED}")
-COMMON += ("eval_interval=1000", "rivals=false")
+COMMON = ("solver=daqp", "figures=false", "logger=csv", "rivals=false", f"eval_seed={EVAL_SEED}")
 NO_SEARCH = tuple(f"search.{name}=null" for name in KNOBS)
 ENDS = ("start", "best", "true model", "reference")
 FIELDS = ("case", "way", "seed", *ENDS, "final")
