@@ -56,7 +56,7 @@ CASES: dict[str, dict[str, Sequence[str]]] = {
     "point_mass": {
         "QP": ("task=point_mass",),
         "TD3": ("algo=td3", *NETWORK, *POINT_MASS, SLOW),
-        "SAC": ("algo=sac", *NETWORK, *POINT_MASS, SLOW),
+        "SAC": ("algo=sac", *NETWORK, *POINT_MASS, FAST),
     },
     "house": {
         "QP": ("task=house",),
