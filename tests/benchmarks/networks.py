@@ -8,12 +8,15 @@ the page are drawn from that file.
 from __future__ import annotations
 
 import argparse
+import csv
+import math
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import median
 
-import pandas as pd
+import numpy as np
 from matplotlib.figure import Figure
 
 from tests.benchmarks.table import DOCS, ROOT
@@ -23,6 +26,10 @@ from torch_qpmpc.experiment.plots import experience, scale_costs
 from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.study.markdown import replaced, table
+
+#: J by transitions of each seed; those of each case of each task.
+Seeds = dict[int, dict[int, float]]
+Curves = dict[str, dict[str, Seeds]]
 
 PAGE = DOCS / "results" / "networks.md"
 SEEDS = range(11, 16)
@@ -87,82 +94,87 @@ def costs(folder: Path) -> Iterator[tuple[int, int, float]]:
         before, each, _ = experience(cfg)
         length, _ = find_task(cfg.task).unit
         unused = cfg.start.transitions if network and cfg.start.name == "data" else 0
-        J = read_metrics(file.parent)["eval/J"].dropna()
-        for update, cost in J.items():
+        for update, J in read_metrics(file.parent)["eval/J"].dropna().to_dict().items():
             if update or not network:
-                yield cfg.seed, round((before + each * update) * length) - unused, cost
+                yield cfg.seed, round((before + each * float(update)) * length) - unused, float(J)
 
 
-def collected(runs: Path) -> pd.DataFrame:
-    """Return J of all cases by task, case, seed and transitions."""
-    rows = [
-        (task, case, *row)
-        for task, cases in CASES.items()
-        for case in cases
-        for row in costs(runs / task / case)
-    ]
-    return pd.DataFrame(rows, columns=["task", "case", "seed", "transitions", "J"])
+def write(runs: Path, file: Path) -> None:
+    """Write J of all cases to a CSV file, by task, case, seed and transitions."""
+    with file.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(["task", "case", "seed", "transitions", "J"])
+        for task, cases in CASES.items():
+            for case in cases:
+                for seed, transitions, J in costs(runs / task / case):
+                    writer.writerow([task, case, seed, transitions, f"{J:.6g}"])
 
 
-def at(runs: pd.DataFrame, transitions: int) -> pd.Series:
-    """Return J by seed at the last evaluation of a case with at most so many transitions."""
-    before = runs[runs["transitions"] <= transitions].sort_values("transitions")
-    return before.groupby("seed")["J"].last()
+def read(file: Path) -> Curves:
+    """Read what `write` has written."""
+    found: Curves = {}
+    with file.open(encoding="utf-8", newline="") as rows:
+        for row in csv.DictReader(rows):
+            seeds = found.setdefault(row["task"], {}).setdefault(row["case"], {})
+            seeds.setdefault(int(row["seed"]), {})[int(row["transitions"])] = float(row["J"])
+    return found
 
 
-def reach(runs: pd.DataFrame, level: float) -> pd.Series:
-    """Return, by seed, the transitions after which J of a case is first at most ``level``."""
-    return runs[runs["J"] <= level].groupby("seed")["transitions"].min()
+def at(seeds: Seeds, transitions: float = math.inf) -> list[float]:
+    """Return J of each seed at its last evaluation with at most so many transitions."""
+    latest = [max((x for x in J if x <= transitions), default=None) for J in seeds.values()]
+    return [J[x] for J, x in zip(seeds.values(), latest, strict=True) if x is not None]
 
 
-def cell(J: pd.Series) -> str:
-    """Format the median over seeds, the best and the worst."""
-    if J.empty:
-        return "-"
-    return f"{cost_text(J.median())} [{cost_text(J.min())}, {cost_text(J.max())}]"
+def reach(seeds: Seeds, level: float) -> list[int]:
+    """Return the transitions after which J is first at most ``level``, of the seeds that do so."""
+    found = [min((x for x in J if J[x] <= level), default=None) for J in seeds.values()]
+    return [x for x in found if x is not None]
 
 
-def seeds_table(frame: pd.DataFrame) -> str:
-    """Format the last J of each case of one task, by seed."""
-    seeds = sorted(frame["seed"].unique())
-    lines = []
-    for case, runs in frame.groupby("case", sort=False):
-        J = at(runs, runs["transitions"].max())
-        each = [cost_text(J[seed]) if seed in J else "-" for seed in seeds]
-        lines.append([str(case), cost_text(J.median()), *each])
-    return table(["J", "median", *(f"seed {seed}" for seed in seeds)], lines)
+def seeds_table(cases: Mapping[str, Seeds]) -> str:
+    """Format the last J of a task's cases, by seed."""
+    head = ["J", "median", *(f"seed {seed}" for seed in next(iter(cases.values())))]
+    last = {case: at(seeds) for case, seeds in cases.items()}
+    return table(head, [[case, *map(cost_text, [median(J), *J])] for case, J in last.items()])
 
 
-def budgets_table(frame: pd.DataFrame) -> str:
+def spread(J: list[float]) -> str:
+    """Format the median, the best and the worst."""
+    return f"{cost_text(median(J))} [{cost_text(min(J))}, {cost_text(max(J))}]"
+
+
+def budgets_table(cases: Mapping[str, Seeds]) -> str:
     """Format J of a task's cases at multiples of the QP's transitions, and who reaches its J."""
-    first = frame["case"].iloc[0]
-    qp = frame[frame["case"] == first]
-    budget = int(qp["transitions"].max())
-    level = at(qp, budget).median()
+    qp, *_ = cases.values()
+    budget, level = max(map(max, qp.values())), median(at(qp))
     lines = []
-    for case, runs in frame.groupby("case", sort=False):
-        row, found = [str(case)], reach(runs, level)
+    for case, seeds in cases.items():
+        row = [case]
         for multiple in MULTIPLES:
-            fits = runs["transitions"].max() >= 0.99 * multiple * budget
-            row.append(cell(at(runs, multiple * budget)) if fits else "")
-        count = f"{len(found)} of {runs['seed'].nunique()}"
-        median = f", {found.median():,.0f} transitions" if len(found) else ""
-        lines.append([*row, "" if case == first else count + median])
+            J = at(seeds, multiple * budget)
+            covered = min(map(max, seeds.values())) > 0.99 * multiple * budget
+            spread = (
+                f"{cost_text(median(J))} [{cost_text(min(J))}, {cost_text(max(J))}]" if J else ""
+            )
+            row.append(spread if covered else "")
+        found = reach(seeds, level)
+        after = f", after {median(found):,.0f}" if found else ""
+        lines.append([*row, "" if seeds is qp else f"{len(found)} of {len(seeds)}{after}"])
     head = [f"J at {multiple * budget:,}" for multiple in MULTIPLES]
     return table(["", *head, f"reach {cost_text(level)}"], lines)
 
 
-def figure(frame: pd.DataFrame) -> Figure:
+def figure(curves: Curves) -> Figure:
     """Draw J over transitions for each task: the median over seeds, the best and the worst."""
-    tasks = frame["task"].unique()
-    drawn = Figure(figsize=(5 * len(tasks), 4), layout="constrained")
-    for axes, task in zip(drawn.subplots(1, len(tasks), squeeze=False)[0], tasks, strict=True):
-        for case, runs in frame[frame["task"] == task].groupby("case", sort=False):
-            J = runs[runs["transitions"] > 0].groupby("transitions")["J"]
-            line = axes.plot(J.median().index, J.median(), label=case)[0]
-            axes.fill_between(
-                J.min().index, J.min(), J.max(), color=line.get_color(), alpha=0.2, linewidth=0
-            )
+    drawn = Figure(figsize=(5 * len(curves), 4), layout="constrained")
+    panels = drawn.subplots(1, len(curves), squeeze=False)[0]
+    for axes, (task, cases) in zip(panels, curves.items(), strict=True):
+        for case, seeds in cases.items():
+            x = sorted(set.intersection(*map(set, seeds.values())))
+            J = np.array([[of_seed[k] for k in x] for of_seed in seeds.values()])
+            (line,) = axes.plot(x, np.median(J, 0), label=case)
+            axes.fill_between(x, J.min(0), J.max(0), color=line.get_color(), alpha=0.2, linewidth=0)
         axes.set(title=task, xlabel="transitions", ylabel="J", xscale="log")
         scale_costs(axes)
         axes.legend(fontsize="small")
@@ -186,12 +198,12 @@ def main(arguments: list[str] | None = None) -> None:
         for task, cases in CASES.items():
             for case in cases:
                 train(options.runs, task, case, options.seeds)
-        collected(options.runs).to_csv(file, index=False, float_format="%.6g")
-    frame = pd.read_csv(file)
-    figure(frame).savefig(options.page.with_suffix(".png"), dpi=80)
+        write(options.runs, file)
+    curves = read(file)
+    figure(curves).savefig(options.page.with_suffix(".png"), dpi=80)
     text = options.page.read_text(encoding="utf-8")
-    for task, runs in frame.groupby("task", sort=False):
-        text = replaced(text, TABLES[str(task)](runs), str(task))
+    for task, cases in curves.items():
+        text = replaced(text, TABLES[task](cases), task)
     options.page.write_text(text, encoding="utf-8")
 
 
