@@ -34,7 +34,7 @@ Curves = dict[str, dict[str, Seeds]]
 PAGE = DOCS / "results" / "networks.md"
 SEEDS = range(11, 16)
 #: J is shown at these multiples of the QP's transitions.
-MULTIPLES = (1, 10, 100)
+MULTIPLES = (1, 100)
 #: A gate's closed loops would be further transitions.
 COMMON = ("gate=false", "rivals=false", "figures=false")
 PENDULUM = (

@@ -20,9 +20,8 @@ def test_every_case_is_a_valid_configuration_and_every_task_has_a_table():
 
 def test_budgets_have_medians_extremes_and_the_seeds_that_reach_the_first_case():
     _, _, qp, td3 = budgets_table(COMPARED).splitlines()
-    assert qp == "| QP | 5.000 [4.000, 6.000] |  |  |  |"
-    tenfold, hundredfold = "6.500 [6.000, 7.000]", "7.000 [6.000, 8.000]"
-    assert td3 == f"| TD3 |  | {tenfold} | {hundredfold} | 1 of 2, after 900 |"
+    assert qp == "| QP | 5.000 [4.000, 6.000] |  |  |"
+    assert td3 == "| TD3 |  | 7.000 [6.000, 8.000] | 1 of 2, after 900 |"
 
 
 def test_seeds_have_the_last_cost_of_each():
