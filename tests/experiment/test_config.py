@@ -40,6 +40,7 @@ NOT_NEEDED = (
     "eval_seed",
     "export",
     "gate",
+    "gate_interval",
     "average_cost",
     "logger",
     "lmbda",
@@ -108,7 +109,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(train, "check_config", lambda _: None)
     for name, overrides in {
         "first": ("optimizer=adam", "constraint=combined", "constraint.si.windows=4"),
-        "second": ("optimizer=gauss_newton", "constraint=combined", "batch_size=8", *SEARCH),
+        "second": ("gate=true", "constraint=combined", "optimizer=gauss_newton", "batch_size=8"),
         "actor": ("algo=td3", "task=pendulum", "constraint=free", "batch_size=8"),
         "house": ("task=house", "warmup_steps=1", "policy_gradient.parts=[lb]"),
         "house_wall": ("task=house_wall", "warmup_steps=1"),
@@ -118,7 +119,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
         "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
     }.items():
-        cfg = make_config(*SMALL, "delay_value=true", *overrides)
+        cfg = make_config(*SMALL, *SEARCH, "delay_value=true", *overrides)
         monkeypatch.setattr(
             train, "RunFolder", lambda folder, _, after, cfg=cfg: RunFolder(folder, cfg, after)
         )
@@ -307,13 +308,7 @@ for _name in ("threads", "updates", "batch_size", "num_envs", "steps_per_update"
     BAD[_name] = WHOLE
 BAD["warmup_steps"] = WHOLE[1:]
 BAD["gate_interval"] = [value for value in WHOLE if value is not None]
-for _name in (
-    "replay_capacity",
-    "eval_interval",
-    "gate_interval",
-    "log_interval",
-    "constraint.si.windows",
-):
+for _name in ("replay_capacity", "eval_interval", "log_interval", "constraint.si.windows"):
     BAD[_name] = WHOLE
 for _name in ("task.horizon", "task.episode_steps", "task.eval_steps"):
     BAD[_name] = WHOLE

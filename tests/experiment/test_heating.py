@@ -117,5 +117,5 @@ def test_a_window_changes_neither_the_schemes_of_the_room_nor_its_rivals():
         found = Evaluation.before(cfg, house, make_task_mpc(cfg, house))
         assert found.loops["start"].known.shape[-1] == 9 * 4 + 2 * past - 1
         J.append([loop.J for loop in found.loops.values()] + list(found.rivals.values()))
-    assert len(J[0]) == 8
+    assert len(J[0]) == 9
     assert J[0] == pytest.approx(J[1])
