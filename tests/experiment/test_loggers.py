@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import time
 from pathlib import Path
 
 import pandas as pd
@@ -52,6 +53,16 @@ def test_csv(tmp_path):
     assert not (tmp_path / "tensorboard").exists()
 
 
+def written(file: Path, name: str) -> bool:
+    """Wait until a file has the name: W&B's service writes after the run has ended."""
+    end = time.monotonic() + 60
+    while time.monotonic() < end:
+        if name.encode() in file.read_bytes():
+            return True
+        time.sleep(0.2)
+    return False
+
+
 def test_wandb(tmp_path):
     pytest.importorskip("wandb", reason="the extra wandb is not installed")
     stop_and_go_on(tmp_path, "wandb")
@@ -60,7 +71,7 @@ def test_wandb(tmp_path):
     assert len(records) == 2, "both parts of one run at W&B"
     for record, names in zip(records, ((), ("eval/J", "hparam/J_final")), strict=True):
         for name in ("loss/value", "structure/C", *names):
-            assert name.encode() in record.read_bytes()
+            assert written(record, name)
     assert len(list((tmp_path / "wandb").rglob("*.png"))) == 2
 
 
