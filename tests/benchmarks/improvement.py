@@ -138,7 +138,7 @@ def finished(path: Path) -> pd.DataFrame:
     return pd.read_csv(path) if path.exists() else pd.DataFrame(columns=list(FIELDS))
 
 
-def add(path: Path, row: dict[str, Any]) -> None:
+def add(path: Path, row: Any) -> None:
     """Append a row."""
     new = not path.exists()
     path.parent.mkdir(exist_ok=True)
@@ -149,21 +149,21 @@ def add(path: Path, row: dict[str, Any]) -> None:
         writer.writerow(row)
 
 
-def ratios(rows: pd.DataFrame) -> str:
+def ratios(rows: Any) -> str:
     """Format J relative to the start's, in percent: median, 95 % interval, worst seed."""
     percent = 100 * rows["best"].to_numpy(float) / rows["start"].to_numpy(float)
     low, high = bootstrap_interval([percent])
     return f"{np.median(percent):.1f} [{low:.1f}, {high:.1f}], {percent.max():.1f}"
 
 
-def by_case(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+def by_case(rows: Any) -> Iterator[tuple[str, Any]]:
     """Yield the rows of each case, in the order of the cases."""
     for case in CASES:
         if len(runs := rows[rows["case"] == case]):
             yield case, runs
 
 
-def outcome_table(rows: pd.DataFrame) -> str:
+def outcome_table(rows: Any) -> str:
     """Format each case's J by way, relative to its start."""
     lines = []
     for case, runs in by_case(rows):
@@ -175,7 +175,7 @@ def outcome_table(rows: pd.DataFrame) -> str:
     return table(head, lines)
 
 
-def reference_table(rows: pd.DataFrame) -> str:
+def reference_table(rows: Any) -> str:
     """Format the default's J beside the other controllers', with what it took."""
     lines = []
     for case, runs in by_case(rows[rows["way"] == "default"]):
@@ -215,8 +215,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
                     add(options.results, row := run(case, way, seed))
                     print(*row.values(), flush=True)
     rows = finished(options.results)
-    rows = rows[rows["seed"].isin(options.seeds)]
-    tables = f"{outcome_table(rows)}\n\n{reference_table(rows)}"
+    chosen: Any = rows[rows["seed"].isin(options.seeds)]
+    tables = f"{outcome_table(chosen)}\n\n{reference_table(chosen)}"
     options.page.write_text(replaced(text, tables, "improvement"), encoding="utf-8")
 
 

@@ -154,10 +154,7 @@ def budgets_table(cases: Mapping[str, Seeds]) -> str:
         for multiple in MULTIPLES:
             J = at(seeds, multiple * budget)
             covered = min(map(max, seeds.values())) > 0.99 * multiple * budget
-            spread = (
-                f"{cost_text(median(J))} [{cost_text(min(J))}, {cost_text(max(J))}]" if J else ""
-            )
-            row.append(spread if covered else "")
+            row.append(spread(J) if J and covered else "")
         found = reach(seeds, level)
         after = f", after {median(found):,.0f}" if found else ""
         lines.append([*row, "" if seeds is qp else f"{len(found)} of {len(seeds)}{after}"])
