@@ -75,6 +75,7 @@ CASES = {
     "Gros-Zanon, corrupted": Case(("task=gros_zanon",), "tightened"),
     # Random actions in one long episode would diverge.
     "Gros-Zanon, identified": Case(("task=gros_zanon", DATA), "tightened", SHORT_EPISODES),
+    "House, corrupted, 8 days": Case(("task=house", "updates=24"), "omniscient"),
     "House, corrupted": Case(("task=house",), "omniscient"),
     "House, identified": Case((*HOUSE, DATA, *DAYS), "omniscient"),
     "House with a wall, corrupted": Case(WALL, "omniscient"),
