@@ -1,9 +1,9 @@
 """What learning adds to its start, on all tasks: ``python -m tests.benchmarks.improvement``.
 
 Each case is one of train.py's configurations and a start, corrupted or identified from a log; each
-way is a method of learning, and the last is the default. The evaluation has starts, days and noise
-that no setting was chosen on. Finished runs are kept in runs/improvement.csv and not repeated; the
-tables go into docs/results/improvement.md.
+way is plain Q-learning, the default, or, on some cases and seeds, a single method. The evaluation
+has starts, days and noise that no setting was chosen on. Finished runs are kept in
+docs/results/improvement.csv and not repeated; the tables go into docs/results/improvement.md.
 """
 
 from __future__ import annotations
@@ -21,11 +21,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 import torch
+from omegaconf import DictConfig
 
 import train
-from tests.benchmarks.table import DOCS, ROOT
+from tests.benchmarks.table import DOCS
 from tests.runs import make_config
 from torch_qpmpc.envs.closed_loop import cost_text
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.evaluation import rival_costs
 from torch_qpmpc.experiment.plots import experience
 from torch_qpmpc.experiment.start import collect_log
@@ -35,9 +38,9 @@ from torch_qpmpc.study.markdown import replaced, table
 from torch_qpmpc.study.statistics import bootstrap_interval
 
 PAGE = DOCS / "results" / "improvement.md"
-RESULTS = ROOT / "runs" / "improvement.csv"
-#: Seeds of the runs, and of the evaluation.
-SEEDS, EVAL_SEED = range(501, 511), 9002
+RESULTS = DOCS / "results" / "improvement.csv"
+#: Seeds of the runs, of those of single methods, and of the evaluation.
+SEEDS, METHOD_SEEDS, EVAL_SEED = range(501, 511), range(501, 503), 9002
 COMMON = ("solver=daqp", "figures=false", "logger=csv", "rivals=false", f"eval_seed={EVAL_SEED}")
 NO_SEARCH = tuple(f"search.{name}=null" for name in KNOBS)
 ENDS = ("start", "best", "true model", "reference")
@@ -86,9 +89,34 @@ CASES = {
     "Pendulum, linear model": Case(("task=pendulum",)),
     "Pendulum, identified": Case(("task=pendulum", DATA)),
 }
-WAYS = {
-    "Q-learning": ("gate=false", *NO_SEARCH),
-    "default": (),
+PLAIN = ("gate=false", *NO_SEARCH)
+WAYS = {"Q-learning": PLAIN, "default": ()}
+POLICY, SEARCH = "policy's gradient", "search"
+METHODS = {
+    "N - 1": (*PLAIN, "target_horizon=shrinking", "task.gamma=1"),
+    "n steps": (*PLAIN, "n_step=5"),
+    "lambda": (*PLAIN, "n_step=8", "lmbda=0.8"),
+    "average cost": (*PLAIN, "average_cost=true"),
+    "anchor": (*PLAIN, "anchor=100"),
+    POLICY: PLAIN,
+    "gate": NO_SEARCH,
+    "gate, average": (*NO_SEARCH, "average=0.9"),
+    SEARCH: ("updates=1",),
+}
+#: Cases of the single methods, with further overrides of some. The policy's gradient moves parts
+#: that no TD error moves.
+METHOD_CASES: dict[str, dict[str, Sequence[str]]] = {
+    "Point mass, Gaussian noise, identified": {
+        POLICY: ("policy_gradient.parts=[b,lb,ub]",),
+        SEARCH: ("search.H_f=1",),
+    },
+    "Gros-Zanon, corrupted": {
+        POLICY: ("policy_gradient.parts=[w]", "policy_gradient.memory=250", "exploration_std=0.1"),
+    },
+    "House, identified": {POLICY: ("policy_gradient.parts=[b,lb]",)},
+    "House with a wall, identified": {POLICY: ("policy_gradient.parts=[b,lb]",)},
+    "Four tanks, identified": {POLICY: ("policy_gradient.parts=[b,q]",)},
+    "Tank with references, identified": {POLICY: ("policy_gradient.parts=[w]",)},
 }
 
 
@@ -103,10 +131,25 @@ def reference_cost(case: str) -> float | None:
     return rival_costs(cfg, make_physics(cfg))[reference]
 
 
+def configuration(case: str, way: str, seed: int) -> DictConfig:
+    """Compose the configuration of a run."""
+    overrides = [*COMMON, *CASES[case].overrides, *(WAYS | METHODS)[way], f"seed={seed}"]
+    return make_config(*overrides, *METHOD_CASES.get(case, {}).get(way, ()))
+
+
+def applies(case: str, method: str) -> bool:
+    """Tell whether a method can be used: some need a replay, or a free C and a log."""
+    try:
+        check_config(configuration(case, method, seed=0))
+    except QPError:
+        return False
+    return True
+
+
 def run(case: str, way: str, seed: int) -> dict[str, Any]:
     """Train once; return the fields of a row."""
-    overrides, _, log = CASES[case]
-    cfg = make_config(*COMMON, *overrides, *WAYS[way], f"seed={seed}")
+    log = CASES[case].log
+    cfg = configuration(case, way, seed)
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         logged = 0
@@ -176,6 +219,22 @@ def outcome_table(rows: Any) -> str:
     return table(head, lines)
 
 
+def method_table(rows: Any) -> str:
+    """Format J of single methods, relative to the start's: the median and the worst seed."""
+    lines = []
+    for case, runs in by_case(rows):
+        if case not in METHOD_CASES:
+            continue
+        cells = []
+        for way in (*WAYS, *METHODS):
+            found = runs[runs["way"] == way]
+            percent = 100 * found["best"].to_numpy(float) / found["start"].to_numpy(float)
+            text = f"{np.median(percent):.1f} ({percent.max():.1f})" if len(found) else ""
+            cells.append(text)
+        lines.append([case, *cells])
+    return table(["J / J of the start, %: median (worst)", *WAYS, *METHODS], lines)
+
+
 def reference_table(rows: Any) -> str:
     """Format the default's J beside the other controllers', with what it took."""
     lines = []
@@ -193,32 +252,45 @@ def reference_table(rows: Any) -> str:
     return table(head, lines)
 
 
+def wanted(
+    seeds: Sequence[int], parts: Sequence[str], ways: Sequence[str]
+) -> Iterator[tuple[str, str, int]]:
+    """Yield case, way and seed of each run, for the cases with one of ``parts`` in their names."""
+    cases = [case for case in CASES if any(part in case for part in parts)]
+    for seed in seeds:
+        yield from ((case, way, seed) for case in cases for way in WAYS if way in ways)
+        if seed in METHOD_SEEDS:
+            some = [case for case in cases if case in METHOD_CASES]
+            pairs = ((case, way) for case in some for way in METHODS if way in ways)
+            yield from ((case, way, seed) for case, way in pairs if applies(case, way))
+
+
 def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m tests.benchmarks.improvement", description="Write the table of learning."
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--cases", nargs="+", default=[""], help="parts of the cases' names")
-    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
+    ways = [*WAYS, *METHODS]
+    parser.add_argument("--ways", nargs="+", choices=ways, default=ways)
     parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
     parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
     options = parser.parse_args(None if arguments is None else list(arguments))
     text = options.page.read_text(encoding="utf-8")
-    replaced(text, "", "improvement")  # fail before the runs
+    replaced(replaced(text, "", "improvement"), "", "methods")  # fail before the runs
     torch.set_num_threads(1)
-    cases = [case for case in CASES if any(part in case for part in options.cases)]
-    for seed in options.seeds:
-        for case in cases:
-            for way in options.ways:
-                rows = finished(options.results)
-                same = (rows["case"] == case) & (rows["way"] == way) & (rows["seed"] == seed)
-                if not same.any():
-                    add(options.results, row := run(case, way, seed))
-                    print(*row.values(), flush=True)
+    for case, way, seed in wanted(options.seeds, options.cases, options.ways):
+        rows = finished(options.results)
+        done = {*zip(rows["case"], rows["way"], rows["seed"], strict=True)}
+        if (case, way, seed) not in done:
+            add(options.results, row := run(case, way, seed))
+            print(*row.values(), flush=True)
     rows = finished(options.results)
-    chosen: Any = rows[rows["seed"].isin(options.seeds)]
-    tables = f"{outcome_table(chosen)}\n\n{reference_table(chosen)}"
-    options.page.write_text(replaced(text, tables, "improvement"), encoding="utf-8")
+    all_seeds: Any = rows[rows["seed"].isin(options.seeds) & rows["way"].isin([*WAYS])]
+    few: Any = rows[rows["seed"].isin([*METHOD_SEEDS])]
+    tables = f"{outcome_table(all_seeds)}\n\n{reference_table(all_seeds)}"
+    text = replaced(replaced(text, tables, "improvement"), method_table(few), "methods")
+    options.page.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

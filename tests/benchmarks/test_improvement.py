@@ -1,0 +1,90 @@
+"""The tables of what learning adds, on made-up costs, and one short run."""
+
+from __future__ import annotations
+
+import pandas as pd
+import pytest
+
+from tests.benchmarks import improvement
+from tests.benchmarks.improvement import CASES, FIELDS, METHOD_CASES, METHODS, WAYS, Case
+from tests.runs import SMALL
+from torch_qpmpc.experiment.config import check_config
+
+TANKS = "Four tanks, identified"
+
+
+def row(way: str, seed: int, best: float, case: str = TANKS) -> dict[str, object]:
+    counts = {"transitions": 100, "simulated": 20, "accepted": 1, "rejected": 2, "seconds": 3.0}
+    ends = {"start": 10.0, "best": best, "final": best, "true model": 5.0, "reference": 4.0}
+    return {"case": case, "way": way, "seed": seed, **ends, **counts}
+
+
+ROWS = pd.DataFrame(
+    [row(way, seed, 2 * seed + k) for k, way in enumerate(WAYS) for seed in (1, 2, 3)]
+)
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("way", WAYS)
+def test_every_case_is_a_valid_configuration(case, way):
+    check_config(improvement.configuration(case, way, seed=1))
+
+
+def test_only_methods_that_need_a_replay_a_free_C_or_a_log_do_not_apply():
+    without = {
+        (case, method)
+        for case in METHOD_CASES
+        for method in METHODS
+        if not improvement.applies(case, method)
+    }
+    assert without == {
+        ("Gros-Zanon, corrupted", "n steps"),
+        ("Gros-Zanon, corrupted", "lambda"),
+        ("Gros-Zanon, corrupted", "anchor"),
+        ("Tank with references, identified", "anchor"),
+    }
+
+
+def test_outcomes_are_relative_to_the_start():
+    *_, line = improvement.outcome_table(ROWS).splitlines()
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells[:3] == [TANKS, "3", "10.00"]
+    assert cells[3].startswith("40.0 [")
+    assert cells[3].endswith("], 60.0")
+    assert cells[4].startswith("50.0 [")
+    assert cells[4].endswith("], 70.0")
+
+
+def test_gaps_are_those_of_the_default():
+    *_, line = improvement.reference_table(ROWS).splitlines()
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells == [
+        *(TANKS, "10.00", "5.000", "5.000", "4.000", "1.00", "0.83"),
+        *("100", "20", "3 of 9"),
+    ]
+
+
+def test_methods_have_their_median_and_worst_seed():
+    method = next(iter(METHODS))
+    rows = pd.concat([ROWS, pd.DataFrame([row(method, seed, seed) for seed in (1, 2)])])
+    *_, line = improvement.method_table(rows).splitlines()
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells[:4] == [TANKS, "40.0 (60.0)", "50.0 (70.0)", "15.0 (20.0)"]
+    assert not any(cells[4:])
+
+
+def test_a_finished_run_is_not_repeated_and_fills_the_page(tmp_path, monkeypatch):
+    short = ("task=four_tanks", *SMALL, "start.transitions=200")
+    monkeypatch.setitem(CASES, TANKS, Case(short))
+    page, results = tmp_path / "page.md", tmp_path / "rows.csv"
+    empty = "".join(f"<!-- {x} -->\n\n<!-- /{x} -->\n" for x in ("improvement", "methods"))
+    page.write_text(empty)
+    arguments = ["--cases", TANKS, "--ways", "Q-learning", "--seeds", "7"]
+    arguments += ["--page", str(page), "--results", str(results)]
+    improvement.main(arguments)
+    first = results.read_text()
+    assert first.splitlines()[0] == ",".join(FIELDS)
+    assert len(first.splitlines()) == 2
+    assert f"| {TANKS} | 1 |" in page.read_text()
+    improvement.main(arguments)
+    assert results.read_text() == first
