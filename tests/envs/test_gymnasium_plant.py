@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete
 
 from torch_qpmpc.envs import GymnasiumPlant
+from torch_qpmpc.envs.closed_loop import gymnasium_loop
 from torch_qpmpc.errors import QPError
 
 
@@ -80,6 +82,56 @@ def test_an_unknown_environment_is_an_error(id):
 def test_other_spaces_are_an_error(register, options, match):
     with pytest.raises(QPError, match=match):
         GymnasiumPlant(register(**options))
+
+
+def test_further_arguments_are_those_of_its_environment(register):
+    def angles(g: float) -> torch.Tensor:
+        plant = GymnasiumPlant("Pendulum-v1", g=g)
+        env: Any = plant.make(max_steps=7)
+        assert (env.unwrapped.g, env.spec.max_episode_steps) == (g, 7)
+        envs = plant.vectorised(2, 3, seed=0)
+        batch = envs.rollout(2)
+        envs.close()
+        return batch["next", "observation"]
+
+    assert not torch.equal(angles(0.0), angles(10.0))
+
+
+def test_unknown_arguments_of_an_environment_are_an_error():
+    match = r"task.kwargs: got {'weight': 2}, expected arguments of 'Pendulum-v1'. .* 'weight'"
+    with pytest.raises(QPError, match=match):
+        GymnasiumPlant("Pendulum-v1", weight=2)
+
+
+def test_observations_by_name_become_one_vector(monkeypatch):
+    class Named(Counter):
+        def __init__(self, **_) -> None:
+            super().__init__()
+            self.observation_space = Dict(
+                level=Box(0.0, 9.0, (2,), np.float32), age=Box(-1.0, 1.0, (1,), np.float32)
+            )
+
+        def observe(self) -> dict[str, np.ndarray]:
+            level = np.array([self.k, 2 * self.k], np.float32)
+            return {"age": np.full(1, -0.5, np.float32), "level": level}
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self.observe(), {}
+
+        def step(self, action):
+            _, *rest = super().step(action)
+            return self.observe(), *rest
+
+    monkeypatch.setitem(gymnasium.registry, "Named-v0", EnvSpec("Named-v0", Named))
+    plant = GymnasiumPlant("Named-v0")
+    assert plant.ub_s.tolist() == [9, 9, 1]
+    env = plant.vectorised(2, 3, seed=0)
+    batch = env.rollout(2)
+    env.close()
+    assert batch["next", "observation"][0].tolist() == [[1, 2, -0.5], [2, 4, -0.5]]
+    run = gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=2, starts=2)
+    assert run.states[-1, 0].tolist() == [2, 4, -0.5]
 
 
 def test_a_truncated_episode_keeps_its_last_observation_and_is_not_terminated(register):

@@ -50,6 +50,7 @@ NOT_NEEDED = (
     "start.name",
     "target_horizon",
     "task.file",
+    "task.kwargs",
 )
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
@@ -281,6 +282,7 @@ BAD: dict[str, list[Any]] = {
     "collector.num_cpus": [0, *REAL],
     "task.name": ["pendulum", *NAME],
     "task.id": ["???", *NAME],
+    "task.kwargs": ["g=1", 3, [1.0], {1: 2}],
     "task.file": [3, True],
     "task.A": MATRIX,
     "task.B": MATRIX,

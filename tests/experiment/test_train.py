@@ -640,15 +640,19 @@ PENDULUM = (
 SHORT = ("solver=daqp", "updates=3", "eval_interval=3", "warmup_steps=12", "task.eval_steps=5")
 
 
-@pytest.mark.parametrize("id", ["Pendulum-v1", "torch_qpmpc/PointMass-v0"])
-def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys, id):
+@pytest.mark.parametrize(
+    ("id", "kwargs"),
+    [("Pendulum-v1", ()), ("Pendulum-v1", ("task.kwargs={g: 9.81}",)), ("PointMass-v0", ())],
+)
+def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys, id, kwargs):
     monkeypatch.chdir(tmp_path)
     model = PENDULUM
-    if id != "Pendulum-v1":
+    if id == "PointMass-v0":
+        id = f"torch_qpmpc/{id}"
         A, B = PointMass().A.tolist(), PointMass().B.tolist()
         W = torch.eye(6).tolist()
         model = (f"task.A={A}", f"task.B={B}", f"task.stage_weight={W}")
-    run_command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false")
+    run_command("task=gymnasium", f"task.id={id}", *model, *kwargs, *SHORT, "figures=false")
     folder = Path(capsys.readouterr().out.splitlines()[-1])
     assert folder.parent == tmp_path / "runs" / "gymnasium" / id / "none-deviation"
     assert folder.name.startswith("seed1-")

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import gymnasium
 import numpy as np
 import torch
 from torch import Tensor
@@ -174,7 +173,7 @@ def gymnasium_loop(
     """
     _check(policy, steps, starts, seed, gamma)
     check_kind("plant", plant, GymnasiumPlant, "Use closed_loop for a LinearSystem.")
-    envs = [gymnasium.make(plant.id, max_episode_steps=steps) for _ in range(starts)]
+    envs = [plant.make(steps) for _ in range(starts)]
     s = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(envs)])
     over = np.zeros(starts, dtype=bool)
     low, high = plant.lb_a.numpy(), plant.ub_a.numpy()

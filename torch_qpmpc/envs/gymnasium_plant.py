@@ -5,12 +5,14 @@ Unlike a `LinearSystem` it is a black box: it can only be reset and stepped.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import gymnasium
 import torch
-from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode
+from gymnasium.spaces import Box, Dict
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import FlattenObservation
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
@@ -23,10 +25,12 @@ class GymnasiumPlant:
     """A Gymnasium environment as a plant: its observation is the state s, its reward -L.
 
     Args:
-        id: id of a registered environment with Box spaces of one dimension.
+        id: id of a registered environment with Box spaces of one dimension. Observations by name,
+            a Dict space, become one vector, in the order of the space.
+        kwargs: further arguments of `gymnasium.make`.
 
     Attributes:
-        id: the id.
+        id, kwargs: the arguments.
         lb_s, ub_s, lb_a, ub_a: the bounds of its spaces, ``(n_x,)`` and ``(n_u,)``.
 
     Raises:
@@ -37,17 +41,27 @@ class GymnasiumPlant:
         tensor([2.], dtype=torch.float64)
     """
 
-    def __init__(self, id: str) -> None:
+    def __init__(self, id: str, **kwargs: Any) -> None:
         check_kind("task.id", id, str)
-        self.id = id
+        self.id, self.kwargs = id, kwargs
         try:
-            env = gymnasium.make(id)
+            env = self.make()
         except (gymnasium.error.Error, ImportError) as error:
             expected = "an environment that Gymnasium can make"
             raise QPError.expected("task.id", repr(id), expected, str(error)) from error
+        except TypeError as error:
+            if not kwargs:
+                raise
+            expected = f"arguments of {id!r}"
+            raise QPError.expected("task.kwargs", repr(kwargs), expected, str(error)) from error
         self.lb_s, self.ub_s = self._bounds("observation", env.observation_space)
         self.lb_a, self.ub_a = self._bounds("action", env.action_space)
         env.close()
+
+    def make(self, max_steps: int | None = None) -> gymnasium.Env[Any, Any]:
+        """Make one environment; ``max_steps`` replaces the length of its episodes."""
+        env = gymnasium.make(self.id, max_episode_steps=max_steps, **self.kwargs)
+        return FlattenObservation(env) if isinstance(env.observation_space, Dict) else env
 
     def _bounds(self, name: str, space: Any) -> tuple[Tensor, Tensor]:
         if not isinstance(space, Box) or len(space.shape) != 1:
@@ -64,14 +78,9 @@ class GymnasiumPlant:
         """
         check_whole("num_envs", num_envs, 1)
         check_whole("max_steps", max_steps, 1)
-        envs = gymnasium.make_vec(
-            self.id,
-            num_envs,
-            vectorization_mode="sync",
-            # TorchRL resets by itself; Gymnasium's reset would lose an episode's last observation.
-            vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED},
-            max_episode_steps=max_steps,
-        )
+        # TorchRL resets by itself; Gymnasium's reset would lose an episode's last observation.
+        makers = [partial(self.make, max_steps)] * num_envs
+        envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
         env = TransformedEnv(GymWrapper(envs), DoubleToFloat())
         env.set_seed(seed)
         return env

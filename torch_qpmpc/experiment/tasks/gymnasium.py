@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from pydantic import AfterValidator
 
 from torch_qpmpc.envs import GymnasiumPlant
@@ -33,6 +33,9 @@ class GymnasiumSettings(TaskSettings):
         AfterValidator(_is_chosen),
         Expected("the id of a Gymnasium environment, as in task.id=Pendulum-v1"),
     ]
+    kwargs: Annotated[
+        dict[str, Any] | None, Expected("further arguments of gymnasium.make by name, or null")
+    ] = None
     A: Model
     B: Model
     stage_weight: Model
@@ -45,6 +48,12 @@ REMEDY = (
     "pass them, as here for two states and one action: "
     "'task.A=[[1,.1],[0,1]]' 'task.B=[[0],[.1]]' 'task.stage_weight=[[1,0,0],[0,1,0],[0,0,.1]]'."
 )
+
+
+def make_plant(cfg: DictConfig) -> GymnasiumPlant:
+    """Make the environment with its further arguments."""
+    kwargs: Any = OmegaConf.to_container(OmegaConf.create(cfg.task.get("kwargs") or {}))
+    return GymnasiumPlant(cfg.task.id, **kwargs)
 
 
 def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
@@ -79,7 +88,7 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
 register(
     Task(
         "gymnasium",
-        lambda cfg: GymnasiumPlant(cfg.task.id),
+        make_plant,
         given_scheme,
         closed_loop=gymnasium_loop,
         settings=GymnasiumSettings,
