@@ -435,6 +435,15 @@ def test_an_anchor_needs_a_free_C_of_its_sizes():
         GaussNewton(random_mpc(), anchor=wrong)
 
 
+def test_an_anchor_takes_the_dtype_of_the_qp():
+    mpc = random_mpc(15, on_failure="mask", learn=("c", "C"))
+    (s, a), target = pairs(), targets(mpc)
+    sizes = mpc.C.detach(), torch.eye(mpc.n_z), torch.ones(len(mpc.C))
+    optimizer = GaussNewton(mpc, anchor=Anchor(*(x.float() for x in sizes)))
+    assert optimizer.step(s, a, target).accepted
+    assert mpc.C.dtype == torch.float64
+
+
 @pytest.mark.parametrize("trust_region", [True, False])
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
 def test_a_batch_without_a_usable_pair_moves_nothing(bad, trust_region):

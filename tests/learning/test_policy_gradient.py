@@ -175,6 +175,36 @@ def test_no_usable_pair_warns():
         PolicyGradient(known.mpc, ["b"]).step(known.s, a, target * torch.nan)
 
 
+@pytest.mark.filterwarnings("ignore:None of the")
+def test_a_batch_without_a_usable_pair_moves_nothing_and_is_not_remembered():
+    known = Known()
+    improve = PolicyGradient(known.mpc, ["b"], memory=1000)
+    a, target = known.draw(0)
+    improve.step(known.s, a, target)
+    before, state = known.mpc.b.clone(), improve.state_dict()["past"]
+    report = improve.step(known.s, a, target * torch.nan)
+    assert (report.change, report.without_target) == (0.0, len(a))
+    assert torch.equal(known.mpc.b, before)
+    assert_close(improve.state_dict()["past"], state, rtol=0, atol=0)
+
+
+def test_a_part_in_large_units_counts_as_in_others():
+    """The floor of the features' sizes is relative to the largest of their own part."""
+    mpc = random_mpc(0, structure="tied", learn=("c", "b", "w"))
+    s, explored = random_states(64), 0.1 * normal(64, 1)
+    _, M = policy_sensitivities(mpc, s, ("b", "w"))
+    n_b = mpc.coordinates()["b"].numel()
+    column = n_b + int(M[:, 0, n_b:].square().sum(0).argmax())
+    M[..., n_b:] *= 1e-9
+    delta = 1e9 * M[:, 0, column] * explored[:, 0]
+    nothing = torch.zeros_like(s), torch.zeros_like(s), torch.zeros(64).double()
+    improve = PolicyGradient(mpc, ["b", "w"], ridge=1e-12)
+    w, _ = improve._weights(M, explored, delta, *nothing)
+    found = (M @ w)[:, 0] * explored[:, 0]
+    assert (found - delta).abs().max() < 0.02 * delta.abs().max()
+    assert w[column] != 0
+
+
 def test_actions_without_exploration_move_nothing():
     known = Known()
     before = known.mpc.b.clone()
@@ -275,7 +305,7 @@ def test_closed_loops_cost_less(part, options):
         ({"parts": []}, r"parts: got \[\]"),
         ({"parts": ["C"]}, "parts.*C.*expected different names of q, b, lb, ub, w"),
         ({"parts": ["b", "b"]}, "parts"),
-        ({"parts": ["w"]}, "part: got 'w', expected one of the learned parts"),
+        ({"parts": ["b", "w"]}, "part: got 'w', expected one of the learned parts"),
         ({"rate": 0}, "rate"),
         ({"ridge": 0.0}, "ridge"),
         ({"memory": -1}, "memory"),
@@ -287,11 +317,12 @@ def test_errors(options, message):
     mpc, parts = arguments.pop("mpc"), arguments.pop("parts")
     with pytest.raises(QPError, match=message):
         PolicyGradient(mpc, parts, **arguments)
+    assert mpc is None or mpc.b.requires_grad, "what is refused freezes nothing"
 
 
 @pytest.mark.parametrize(
     ("name", "shape"),
-    [("s", (8, 3)), ("a", (8, 2)), ("target", (8, 1)), ("following", (8, 3))],
+    [("s", (8, 3)), ("a", (8, 2)), ("target", (8, 1)), ("following", (8, 3)), ("discount", (8, 1))],
     ids=str,
 )
 def test_shapes(name, shape):

@@ -68,8 +68,8 @@ def test_a_margin_by_stage_grows_like_the_root_of_the_stage():
     at = 0.3 * (torch.arange(4).double() / 3).sqrt()
     plan = torch.cat([torch.stack((x, x, 0 * x)) for x in at])[:-1]  # the action's row is hard
     margin = torch.cat((plan, at[:-1], at[-1:]))
-    assert_close(mpc.lb.detach(), before["lb"] + margin)
-    assert_close(mpc.ub.detach(), before["ub"] - margin)
+    assert_close(mpc.lb.detach(), before["lb"] + margin, rtol=1e-14, atol=0)
+    assert_close(mpc.ub.detach(), before["ub"] - margin, rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize(

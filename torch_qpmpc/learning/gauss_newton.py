@@ -32,7 +32,6 @@ damping and penalties. The penalties thus enter the same step.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -43,6 +42,7 @@ from torch import Tensor, nn
 from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.anchor import Anchor
+from torch_qpmpc.learning.pairs import usable
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
 from torch_qpmpc.mpc.validation import COST
@@ -171,6 +171,7 @@ class GaussNewton(torch.optim.Optimizer):
                 raise QPError.expected("anchor", NOT_FREE, "C among the learned parts")
             remedy = "Pass Anchor.of(identified), with the sizes of the QPMPC."
             check_tensor("anchor.C_0", anchor.C_0, *mpc.C.shape, batched=False, remedy=remedy)
+            self._anchor = Anchor(*(x.to(mpc.C) for x in anchor))
 
     @torch.no_grad()
     def step(  # pyright: ignore[reportIncompatibleMethodOverride] - not a closure
@@ -214,15 +215,8 @@ class GaussNewton(torch.optim.Optimizer):
         with torch.enable_grad():
             qp = self._mpc.quadratic_program()
         solution = self._mpc.solve(s, a, warm_start, qp)
-        use = solution.solved & target.isfinite()
-        unsolved = int((~solution.solved).sum())
-        left_out = unsolved, len(s) - unsolved - int(use.sum())
+        use, left_out = usable(solution.solved, target)
         if sum(left_out) == len(s):
-            message = (
-                f"None of the {len(s)} pairs is usable: {left_out[0]} without a QP solution, "
-                f"{left_out[1]} without a finite target. Theta stays unchanged."
-            )
-            warnings.warn(message, RuntimeWarning, stacklevel=2)
             return StepReport(solution, group["damping"], math.nan, False, *left_out)
         delta = torch.where(use, target.to(solution.value) - solution.value, 0)
         if self._clip is not None:

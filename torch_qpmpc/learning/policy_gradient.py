@@ -28,7 +28,6 @@ at least 0 (James and Stein): a w within its noise moves nothing.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -38,6 +37,7 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.learning.pairs import usable
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.qp.solution import QPSolution
 
@@ -142,9 +142,8 @@ class PolicyGradient:
         check_whole("memory", memory, 0)
         if not parts or set(parts) - set(PARTS) or len(set(parts)) < len(parts):
             raise QPError.expected("parts", repr(parts), f"different names of {', '.join(PARTS)}")
-        for part in parts:
-            for leaf in mpc.leaves(part):
-                leaf.requires_grad_(False)
+        for leaf in [leaf for part in parts for leaf in mpc.leaves(part)]:
+            leaf.requires_grad_(False)
         self.parts, self.rate, self.ridge, self.memory = tuple(parts), rate, ridge, memory
         self._mpc = mpc
         self._past: tuple[Tensor, ...] | None = None
@@ -169,12 +168,12 @@ class PolicyGradient:
                 are left out and counted. Negate rewards and TorchRL's values.
             following: p of s+, ``(B, n_p)``; without it, R is a baseline of delta alone, which
                 suits a V without errors.
-            discount: gamma, or gamma (1 - terminated) ``(B,)``.
+            discount: gamma, or gamma (1 - terminated) ``(B,)``; not used without ``following``.
             warm_start: active sets of V(s) to start from, ``(B, n_g)``.
             share_of_rate: the fraction of ``rate`` of this step, as from a schedule.
 
         Returns:
-            The outcome; without a usable pair theta stays, with a `RuntimeWarning`.
+            The outcome; without a usable pair theta and the memory stay, with a `RuntimeWarning`.
 
         Raises:
             QPError: a shape does not fit.
@@ -183,28 +182,25 @@ class PolicyGradient:
         check_tensor("s", s, "B", mpc.n_p, batched=False)
         check_tensor("a", a, len(s), mpc.n_u, batched=False)
         check_tensor("target", target, len(s), batched=False, remedy="Squeeze its last dimension.")
-        solution, M = policy_sensitivities(mpc, s, self.parts, warm_start)
-        M = M * self._movable()
-        use = solution.solved & target.isfinite()
-        unsolved = int((~solution.solved).sum())
-        left_out = unsolved, len(s) - unsolved - int(use.sum())
-        delta = (target.to(solution.value) - solution.value)[use]
-        explored = (a.to(solution.z) - solution.z[:, mpc.n_p : mpc.n_p + mpc.n_u])[use]
-        gamma = torch.as_tensor(discount).to(delta).expand(len(s))
+        gamma = torch.as_tensor(discount).to(mpc.C_0)
+        if gamma.ndim:
+            remedy = "Squeeze its last dimension."
+            check_tensor("discount", gamma, len(s), batched=False, remedy=remedy)
+        gamma = gamma.expand(len(s))
         if following is None:
             following, gamma = torch.zeros_like(s), torch.zeros_like(gamma)
         check_tensor("following", following, len(s), mpc.n_p, batched=False)
+        solution, M = policy_sensitivities(mpc, s, self.parts, warm_start)
+        M = M * self._movable()
+        use, left_out = usable(solution.solved, target)
+        if sum(left_out) == len(s):
+            return PolicyStep({}, 0.0, 0.0, *left_out)
+        delta = (target.to(solution.value) - solution.value)[use]
+        explored = (a.to(solution.z) - solution.z[:, mpc.n_p : mpc.n_p + mpc.n_u])[use]
         # What follows a termination has no value, and may be NaN.
         following = torch.where(gamma.unsqueeze(-1) > 0, following, 0)
         known = (x[use].to(delta) for x in (s, following, gamma))
         rows = self._with_past((M[use], explored, delta, *known))
-        if not len(rows[0]):
-            message = (
-                f"None of the {len(s)} pairs is usable: {left_out[0]} without a QP solution, "
-                f"{left_out[1]} without a finite target. Theta stays unchanged."
-            )
-            warnings.warn(message, RuntimeWarning, stacklevel=2)
-            return PolicyStep({}, 0.0, 0.0, *left_out)
         M, explored = rows[:2]
         w, share = self._weights(*rows)
         change = (M @ w).square().sum(-1).mean().sqrt()
@@ -213,14 +209,18 @@ class PolicyGradient:
             length, step = 0.0, torch.zeros_like(w)
         else:
             step = -length * explored.square().sum(-1).mean().sqrt() / change * w
-        theta = mpc.coordinates()
-        sizes = [theta[part].numel() for part in self.parts]
+        theta, sizes = mpc.coordinates(), self._sizes()
         for part, move in zip(self.parts, step.split(sizes), strict=True):
             theta[part].add_(move.view_as(theta[part]))
         mpc.project_()
         pieces = zip(self.parts, w.split(sizes), strict=True)
         found = {part: x.view_as(theta[part]) for part, x in pieces}
         return PolicyStep(found, share, length, *left_out)
+
+    def _sizes(self) -> list[int]:
+        """Return the number of coordinates of each part."""
+        theta = self._mpc.coordinates()
+        return [theta[part].numel() for part in self.parts]
 
     def _movable(self) -> Tensor:
         """Return 0 at the bounds of hard rows, else 1, side by side for all parts."""
@@ -251,7 +251,8 @@ class PolicyGradient:
         psi = (M * explored.unsqueeze(-1)).sum(1)
         n, size = psi.shape
         scale = psi.square().mean(0).sqrt()
-        scale = torch.where(scale > FLOOR * scale.max(), scale, torch.inf)
+        largest = [part.max().expand(len(part)) for part in scale.split(self._sizes())]
+        scale = torch.where(scale > FLOOR * torch.cat(largest), scale, torch.inf)
         before, after = self._features(s, following)
         # R's constant; without discount and ends, the mean of delta.
         one, constant = torch.ones_like(delta), 1 - discount

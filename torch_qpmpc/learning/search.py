@@ -35,7 +35,8 @@ def _margin(mpc: QPMPC, theta: Theta, x: float | Tensor) -> Theta:
 
 def _growing_margin(mpc: QPMPC, theta: Theta, x: float) -> Theta:
     # The standard deviation of a sum of k independent errors grows like the square root of k.
-    return _margin(mpc, theta, x * (mpc._layout.row_stages() / mpc.horizon).sqrt())
+    stages = mpc._layout.row_stages().to(theta["lb"])
+    return _margin(mpc, theta, x * (stages / mpc.horizon).sqrt())
 
 
 def _slack_weight(mpc: QPMPC, theta: Theta, x: float) -> Theta:

@@ -19,6 +19,7 @@ from torchrl.objectives.value import TD0Estimator
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
+from torch_qpmpc.learning.operators import QPActorValueOperator
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.policy_gradient import PolicyGradient
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
@@ -123,11 +124,7 @@ def second_order(
         QPError: the value network has other modules or ``theta_keys``: the step's curvature is that
             of the QP's own theta.
     """
-    network = loss_module.value_network
-    if network is not loss_module.operator or network.theta_keys:
-        remedy = "Learn with first_order and a torch optimiser."
-        got = "a value network with theta_keys or upstream modules"
-        raise QPError.expected("loss_module", got, "a QPActorValueOperator alone", remedy)
+    network = _alone(loss_module)
     action = network.in_keys[1]
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
@@ -156,6 +153,16 @@ def second_order(
     return update
 
 
+def _alone(loss_module: QPQLearningLoss) -> QPActorValueOperator:
+    """Return the value network, if it is the QP's operator with a theta of its own."""
+    network = loss_module.operator
+    if loss_module.value_network is not network or network.theta_keys:
+        remedy = "Learn with first_order and a torch optimiser."
+        got = "a value network with theta_keys or upstream modules"
+        raise QPError.expected("loss_module", got, "a QPActorValueOperator alone", remedy)
+    return network
+
+
 def average_cost(loss_module: LossModule) -> dict[str, Tensor]:
     """Return the average cost of a loss for logging; nothing if it has none."""
     rho = getattr(loss_module, "average_cost", None)
@@ -178,8 +185,11 @@ def with_policy_gradient(
         loss_module: the loss that defines the targets.
         policy_gradient: the policy gradient of the QP that ``loss_module`` learns.
         share_of_rate: returns the fraction of the rate of the next step.
+
+    Raises:
+        QPError: the value network has other modules or ``theta_keys``.
     """
-    operator = loss_module.operator
+    operator = _alone(loss_module)
     action, keys = operator.in_keys[1], loss_module.tensor_keys
 
     def improved(

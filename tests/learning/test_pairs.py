@@ -1,0 +1,26 @@
+"""Which visited pairs an update can learn from."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import torch
+
+from torch_qpmpc.learning.pairs import usable
+
+
+def test_pairs_lack_a_solution_or_a_target():
+    solved = torch.tensor([True, True, False, False])
+    target = torch.tensor([1.0, torch.nan, 2.0, torch.inf])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        use, left_out = usable(solved, target)
+    assert use.tolist() == [True, False, False, False]
+    assert left_out == (2, 1)
+
+
+def test_no_pair_is_left():
+    message = "None of the 2 pairs is usable: 1 without a QP solution, 1 without a finite target"
+    with pytest.warns(RuntimeWarning, match=message):
+        usable(torch.tensor([True, False]), torch.full((2,), torch.nan))
