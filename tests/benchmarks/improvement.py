@@ -40,7 +40,7 @@ from torch_qpmpc.study.statistics import bootstrap_interval
 PAGE = DOCS / "results" / "improvement.md"
 RESULTS = DOCS / "results" / "improvement.csv"
 #: Seeds of the runs, of those of single methods, and of the evaluation.
-SEEDS, METHOD_SEEDS, EVAL_SEED = range(501, 511), range(501, 503), 9002
+SEEDS, METHOD_SEEDS, EVAL_SEED = range(501, 511), range(501, 506), 9002
 COMMON = ("solver=daqp", "figures=false", "logger=csv", "rivals=false", f"eval_seed={EVAL_SEED}")
 NO_SEARCH = tuple(f"search.{name}=null" for name in KNOBS)
 ENDS = ("start", "best", "true model", "reference")
@@ -235,12 +235,19 @@ def method_table(rows: Any) -> str:
     return table(["J / J of the start, %: median (worst)", *WAYS, *METHODS], lines)
 
 
+def closed(start: np.ndarray, best: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the share of the gap to another controller; NaN if a start is as good as it."""
+    if not (start > other).all():
+        return np.full_like(start, np.nan)
+    return (start - best) / (start - other)
+
+
 def reference_table(rows: Any) -> str:
     """Format the default's J beside the other controllers', with what it took."""
     lines = []
     for case, runs in by_case(rows[rows["way"] == "default"]):
         J = {name: runs[name].to_numpy(float) for name in ENDS}
-        gaps = ((J["start"] - J["best"]) / (J["start"] - J[name]) for name in ENDS[2:])
+        gaps = (closed(J["start"], J["best"], J[name]) for name in ENDS[2:])
         medians = [float(np.median(x)) for x in (*J.values(), *gaps)]
         cells = [cost_text(x) for x in medians[:4]] + [f"{x:.2f}" for x in medians[4:]]
         cells = ["" if math.isnan(x) else cell for x, cell in zip(medians, cells, strict=True)]

@@ -64,6 +64,13 @@ def test_gaps_are_those_of_the_default():
     ]
 
 
+def test_a_start_as_good_as_the_other_controller_leaves_no_gap():
+    rows = ROWS.assign(**{"true model": 10.0})
+    *_, line = improvement.reference_table(rows).splitlines()
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells[3:7] == ["10.00", "4.000", "", "0.83"]
+
+
 def test_methods_have_their_median_and_worst_seed():
     method = next(iter(METHODS))
     rows = pd.concat([ROWS, pd.DataFrame([row(method, seed, seed) for seed in (1, 2)])])
