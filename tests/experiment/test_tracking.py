@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 import torch_qpmpc as qm
+from tests.benchmarks.offset import Reachable, controllers, steady_error
 from torch_qpmpc.envs import FourTanks, TankReferences
-from torch_qpmpc.envs.closed_loop import plant_loop
-from torch_qpmpc.envs.linear_system import Rng
 from torch_qpmpc.experiment.rivals.linear_mpc import Tracking
 from torch_qpmpc.experiment.tracking import (
     TERMINAL_FACTOR,
@@ -118,29 +117,28 @@ def test_the_references_make_the_policy_of_an_mpc_that_is_written_by_hand():
     torch.testing.assert_close(solution.value.detach(), by_hand.value + now, rtol=1e-6, atol=0)
 
 
-class Reachable(TankReferences):
-    """Tanks that start near references which the plant of the episode can hold."""
-
-    def signals(self, rng: Rng, count: int, length: int) -> Tensor:
-        w = super().signals(rng, count, length)
-        A, B, _ = self.model(w[:, 0])
-        inputs = 0.03 + 0.005 * w[:, 0, :2, None]  # from 0.03 to 0.13
-        w[..., :4] = torch.linalg.solve(torch.eye(4).to(A) - A, B @ inputs).mT
-        return w
-
-    def starts(self, rng: Rng, count: int) -> Tensor:
-        return self.signals(np.random.default_rng(5), count, 1)[:, 0, :4]
-
-
 @pytest.mark.parametrize(("memory", "largest"), [(0, None), (1, 1e-3), (4, 1e-3)])
 def test_only_an_offset_free_model_tracks_references_without_an_error(memory, largest):
     """The plant's leaks and gains differ three times as much from the model as learning-qp's."""
     p = Reachable(horizon=8, past=1 + memory, mismatch=3.0)
     A, B = offset_free(p.A, p.B, memory) if memory else (p.A, p.B)
     mpc = qm.QPMPC.from_model(A, B, p.horizon, solver="daqp", **reference_options(p, 1.0))
-    loop = plant_loop(mpc.policy, p, steps=400, starts=4, seed=5)
-    error = (loop.states[-1] - loop.states[0]).abs().max()
+    error = steady_error(mpc, p)
     if largest is None:
         assert error > 0.02
     else:
         assert error < largest
+
+
+def test_a_learned_model_tracks_without_an_error_once_it_is_offset_free():
+    short = ("updates=3", "warmup_steps=10", "search.loops=2", "gate=false", "batch_size=64")
+    found = controllers(1, *short)
+    errors = {
+        name: steady_error(mpc, Reachable(horizon=16, past=1 + cfg.task.memory))
+        for name, (mpc, cfg) in found.items()
+    }
+    assert errors["learned"] > 0.02
+    assert errors["wrong model"] > 0.02
+    assert errors["wrong model, offset-free"] < 1e-3
+    assert errors["learned model, offset-free"] < 1e-3
+    assert errors["true model"] < 1e-3
