@@ -40,7 +40,7 @@ from torch_qpmpc.study.statistics import bootstrap_interval
 PAGE = DOCS / "results" / "improvement.md"
 RESULTS = DOCS / "results" / "improvement.csv"
 #: Seeds of the runs, of those of single methods, and of the evaluation.
-SEEDS, METHOD_SEEDS, EVAL_SEED = range(501, 511), range(501, 506), 9002
+SEEDS, METHOD_SEEDS, EVAL_SEED = range(501, 511), range(501, 504), 9002
 COMMON = ("solver=daqp", "figures=false", "logger=csv", "rivals=false", f"eval_seed={EVAL_SEED}")
 NO_SEARCH = tuple(f"search.{name}=null" for name in KNOBS)
 ENDS = ("start", "best", "true model", "reference")

@@ -1,8 +1,8 @@
 """QPs beside plain networks: ``python -m tests.benchmarks.networks``.
 
 Each case is a configuration of train.py. ``--train`` runs its missing seeds, below the folder
-``--runs``, and writes J by transitions to networks.csv. Without it, the tables and the figure of
-the page are drawn from that file.
+``--runs``, and writes J by transitions to networks.csv, where tasks that ``--tasks`` leaves out
+stay. Without it, the tables and the figure of the page are drawn from that file.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import csv
 import math
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 
@@ -50,6 +50,8 @@ NETWORK = (
 )
 POINT_MASS = ("task=point_mass", "num_envs=160", "updates=4090", "eval_interval=200")
 HOUSE = ("task=house", "num_envs=64", "warmup_steps=10", "updates=3090", "eval_interval=150")
+TANKS = ("task=tank_references", "algo=td3", "task.horizon=8", "num_envs=4", "updates=800")
+TANKS += ("solver=daqp", "eval_interval=100", "log_interval=50")
 FAST, SLOW = "algo.lr_network=1e-3", "algo.lr_network=3e-4"
 #: The overrides of each case, by task; the first case of a task is the QP.
 CASES: dict[str, dict[str, Sequence[str]]] = {
@@ -69,6 +71,11 @@ CASES: dict[str, dict[str, Sequence[str]]] = {
         "QP": ("task=house",),
         "TD3": ("algo=td3", *NETWORK, *HOUSE, SLOW),
         "SAC": ("algo=sac", *NETWORK, *HOUSE, FAST),
+    },
+    # One theta is enough here: a network should do no harm.
+    "tank_references": {
+        "QP": TANKS,
+        "scheduled QP": (*TANKS, "algo.actor=scheduled"),
     },
 }
 
@@ -99,15 +106,23 @@ def costs(folder: Path) -> Iterator[tuple[int, int, float]]:
                 yield cfg.seed, round((before + each * float(update)) * length) - unused, float(J)
 
 
-def write(runs: Path, file: Path) -> None:
-    """Write J of all cases to a CSV file, by task, case, seed and transitions."""
+def write(runs: Path, file: Path, tasks: Collection[str]) -> None:
+    """Write J to a CSV file, by task, case, seed and transitions: of ``tasks`` that of the runs."""
+    curves = read(file) if set(CASES) - set(tasks) else {}
+    for task in tasks:
+        curves[task] = {}
+        for case in CASES[task]:
+            seeds = curves[task][case] = {}
+            for seed, transitions, J in costs(runs / task / case):
+                seeds.setdefault(seed, {})[transitions] = J
     with file.open("w", encoding="utf-8", newline="") as out:
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(["task", "case", "seed", "transitions", "J"])
-        for task, cases in CASES.items():
-            for case in cases:
-                for seed, transitions, J in costs(runs / task / case):
-                    writer.writerow([task, case, seed, transitions, f"{J:.6g}"])
+        for task in CASES:
+            for case, seeds in curves.get(task, {}).items():
+                for seed, found in seeds.items():
+                    for transitions, J in found.items():
+                        writer.writerow([task, case, seed, transitions, f"{J:.6g}"])
 
 
 def read(file: Path) -> Curves:
@@ -178,7 +193,12 @@ def figure(curves: Curves) -> Figure:
     return drawn
 
 
-TABLES = {"pendulum": seeds_table, "point_mass": budgets_table, "house": budgets_table}
+TABLES = {
+    "pendulum": seeds_table,
+    "point_mass": budgets_table,
+    "house": budgets_table,
+    "tank_references": seeds_table,
+}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -186,16 +206,17 @@ def main(arguments: list[str] | None = None) -> None:
         prog="python -m tests.benchmarks.networks", description="Compare QPs with plain networks."
     )
     parser.add_argument("--train", action="store_true", help="run what is missing; takes hours")
+    parser.add_argument("--tasks", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "networks")
     parser.add_argument("--page", type=Path, default=PAGE)
     options = parser.parse_args(arguments)
     file = options.page.with_suffix(".csv")
     if options.train:
-        for task, cases in CASES.items():
-            for case in cases:
+        for task in options.tasks:
+            for case in CASES[task]:
                 train(options.runs, task, case, options.seeds)
-        write(options.runs, file)
+        write(options.runs, file, options.tasks)
     curves = read(file)
     figure(curves).savefig(options.page.with_suffix(".png"), dpi=80)
     text = options.page.read_text(encoding="utf-8")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from tests.benchmarks import networks
 from tests.benchmarks.networks import CASES, TABLES, budgets_table, costs, figure, read, seeds_table
 from tests.runs import SMALL, make_config, run_command
 from torch_qpmpc.experiment.config import check_config
@@ -47,3 +50,14 @@ def test_curves_are_read_by_task_case_and_seed(tmp_path):
     file = tmp_path / "networks.csv"
     file.write_text("task,case,seed,transitions,J\nhouse,QP,1,5,9\nhouse,QP,1,10,4\n")
     assert read(file) == {"house": {"QP": {1: {5: 9.0, 10: 4.0}}}}
+
+
+def test_tasks_that_are_left_out_stay_in_the_file(tmp_path, monkeypatch):
+    file = tmp_path / "networks.csv"
+    lines = ["house,QP,1,5,9", "house,QP,1,10,4", "point_mass,QP,1,5,7"]
+    file.write_text("\n".join(["task,case,seed,transitions,J", *lines]) + "\n")
+    monkeypatch.setattr(networks, "costs", lambda folder: [(2, 8, len(folder.parts))])
+    networks.write(Path("runs"), file, ["house"])
+    found = read(file)
+    assert found["point_mass"] == {"QP": {1: {5: 7.0}}}
+    assert found["house"] == {case: {2: {8: 3.0}} for case in CASES["house"]}
