@@ -23,7 +23,7 @@ Theta = dict[str, Tensor]
 #: The parts of theta that the scalars move.
 PARTS = ("H", "H_f", "q", "b", "lb", "ub", "w")
 #: Spawn key of the closed loops' seeds: they are never those of the gate, which judges the result.
-SEEDS = 1
+SPAWN_KEY = 1
 
 
 def _margin(mpc: QPMPC, theta: Theta, x: float | Tensor) -> Theta:
@@ -169,7 +169,7 @@ def search(
     done = 0
     while done < loops:
         points = strategy.ask()
-        entropy = np.random.SeedSequence([seed, done], spawn_key=(SEEDS,))
+        entropy = np.random.SeedSequence([seed, done], spawn_key=(SPAWN_KEY,))
         run = int(entropy.generate_state(1)[0])
         found = []
         for x in points:
