@@ -116,7 +116,9 @@ METHOD_CASES: dict[str, dict[str, Sequence[str]]] = {
     "House, identified": {POLICY: ("policy_gradient.parts=[b,lb]",)},
     "House with a wall, identified": {POLICY: ("policy_gradient.parts=[b,lb]",)},
     "Four tanks, identified": {POLICY: ("policy_gradient.parts=[b,q]",)},
-    "Tank with references, identified": {POLICY: ("policy_gradient.parts=[w]",)},
+    "Tank with references, identified": {
+        POLICY: ("policy_gradient.parts=[b]", "constraint.learn=[C,lb,ub]"),
+    },
 }
 
 

@@ -190,19 +190,41 @@ def test_a_batch_without_a_usable_pair_moves_nothing_and_is_not_remembered():
 
 def test_a_part_in_large_units_counts_as_in_others():
     """The floor of the features' sizes is relative to the largest of their own part."""
-    mpc = random_mpc(0, structure="tied", learn=("c", "b", "w"))
+    mpc = random_mpc(0, structure="tied", learn=("c", "b", "q"))
     s, explored = random_states(64), 0.1 * normal(64, 1)
-    _, M = policy_sensitivities(mpc, s, ("b", "w"))
+    _, M = policy_sensitivities(mpc, s, ("b", "q"))
     n_b = mpc.coordinates()["b"].numel()
     column = n_b + int(M[:, 0, n_b:].square().sum(0).argmax())
     M[..., n_b:] *= 1e-9
     delta = 1e9 * M[:, 0, column] * explored[:, 0]
     nothing = torch.zeros_like(s), torch.zeros_like(s), torch.zeros(64).double()
-    improve = PolicyGradient(mpc, ["b", "w"], ridge=1e-12)
+    improve = PolicyGradient(mpc, ["b", "q"], ridge=1e-12)
     w, _ = improve._weights(M, explored, delta, *nothing)
     found = (M @ w)[:, 0] * explored[:, 0]
     assert (found - delta).abs().max() < 0.02 * delta.abs().max()
     assert w[column] != 0
+
+
+@pytest.mark.parametrize("unit", [0.0, 1e-14, 1e-5])
+def test_what_hardly_shapes_the_policy_does_not_move(monkeypatch, unit):
+    """The bounds and slack weights of rows that no plan touches."""
+    parts = ("b", "lb", "w")
+    mpc = random_mpc(0, structure="tied", learn=("c", *parts))
+
+    def hardly(*arguments: Any) -> tuple[Any, Tensor]:
+        solution, M = policy_sensitivities(*arguments)
+        n_b = mpc.coordinates()["b"].numel()
+        M[..., n_b:] *= unit
+        return solution, M
+
+    monkeypatch.setattr("torch_qpmpc.learning.policy_gradient.policy_sensitivities", hardly)
+    improve = PolicyGradient(mpc, parts)
+    before = {part: getattr(mpc, part).detach().clone() for part in parts}
+    s = random_states(64)
+    a = mpc.policy(s).detach() + 0.1 * normal(64, 1)
+    improve.step(s, a, mpc.value(s).detach() + a[:, 0])
+    moved = [part for part in parts if not torch.equal(getattr(mpc, part), before[part])]
+    assert moved == ["b"]
 
 
 def test_actions_without_exploration_move_nothing():

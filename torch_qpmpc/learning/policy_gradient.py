@@ -23,6 +23,10 @@ A is linear in a, so that w has no length of its own. The step is bounded in the
 changes the actions by at most the fraction ``rate`` of the exploration, in root mean square, a
 trust region in the metric F. ``share`` is 1 minus the part of w'F w that noise alone would explain,
 at least 0 (James and Stein): a w within its noise moves nothing.
+
+Where hardly any row is active, the actions hardly depend on bounds or slack weights, and a step
+that is bounded in the actions would be as good as unbounded in these. They move only where a
+change by their whole size changes the actions by a hundredth of the exploration.
 """
 
 from __future__ import annotations
@@ -45,6 +49,9 @@ from torch_qpmpc.qp.solution import QPSolution
 PARTS = ("q", "b", "lb", "ub", "w")
 #: Smallest size of a feature, relative to the largest of its part, that counts.
 FLOOR = 1e-6
+#: Smallest change of the actions by a change of a bound or slack weight by its whole size, relative
+#: to the exploration, for which it moves.
+WEAK = 1e-2
 
 
 @dataclass(frozen=True)
@@ -222,6 +229,17 @@ class PolicyGradient:
         theta = self._mpc.coordinates()
         return [theta[part].numel() for part in self.parts]
 
+    def _magnitudes(self) -> Tensor:
+        """Return the size of each coordinate: infinite for q and b, which may well be zero."""
+        mpc, theta = self._mpc, self._mpc.coordinates()
+        bounds = torch.cat((mpc.lb[mpc.soft], mpc.ub[mpc.soft]))
+        found = []
+        for part in self.parts:
+            sizes = {"w": theta[part], "lb": bounds, "ub": bounds}.get(part)
+            size = torch.inf if sizes is None else _rms(sizes[sizes.isfinite()])
+            found.append(torch.full_like(theta[part], size).flatten())
+        return torch.cat(found)
+
     def _movable(self) -> Tensor:
         """Return 0 at the bounds of hard rows, else 1, side by side for all parts."""
         theta, soft = self._mpc.coordinates(), self._mpc.soft
@@ -251,6 +269,8 @@ class PolicyGradient:
         psi = (M * explored.unsqueeze(-1)).sum(1)
         n, size = psi.shape
         scale = psi.square().mean(0).sqrt()
+        weak = M.square().mean((0, 1)).sqrt() * self._magnitudes()
+        scale = torch.where(weak > WEAK * explored.square().mean().sqrt(), scale, 0.0)
         largest = [part.max().expand(len(part)) for part in scale.split(self._sizes())]
         scale = torch.where(scale > FLOOR * torch.cat(largest), scale, torch.inf)
         before, after = self._features(s, following)
@@ -301,3 +321,8 @@ def _units(x: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean and the deviation of each column, the latter infinite for a constant."""
     centre, spread = x.mean(0), (x - x.mean(0)).square().mean(0).sqrt()
     return centre, torch.where(spread > FLOOR * (1 + centre.abs()), spread, torch.inf)
+
+
+def _rms(x: Tensor) -> float:
+    """Return the root mean square, 0 of nothing."""
+    return float(x.square().mean().sqrt()) if len(x) else 0.0
