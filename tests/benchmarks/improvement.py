@@ -91,7 +91,7 @@ CASES = {
 }
 PLAIN = ("gate=false", *NO_SEARCH)
 WAYS = {"Q-learning": PLAIN, "default": ()}
-POLICY, SEARCH = "policy's gradient", "search"
+POLICY, GATE, SEARCH = "policy's gradient", "gate", "search"
 METHODS = {
     "N - 1": (*PLAIN, "target_horizon=shrinking", "task.gamma=1"),
     "n steps": (*PLAIN, "n_step=5"),
@@ -99,8 +99,9 @@ METHODS = {
     "average cost": (*PLAIN, "average_cost=true"),
     "anchor": (*PLAIN, "anchor=100"),
     POLICY: PLAIN,
-    "gate": NO_SEARCH,
-    "gate, average": (*NO_SEARCH, "average=0.9"),
+    f"{POLICY}, {GATE}": NO_SEARCH,
+    GATE: NO_SEARCH,
+    f"{GATE}, average": (*NO_SEARCH, "average=0.9"),
     SEARCH: ("updates=1",),
 }
 #: Cases of the single methods, with further overrides of some. The policy's gradient moves parts
@@ -136,7 +137,9 @@ def reference_cost(case: str) -> float | None:
 def configuration(case: str, way: str, seed: int) -> DictConfig:
     """Compose the configuration of a run."""
     overrides = [*COMMON, *CASES[case].overrides, *(WAYS | METHODS)[way], f"seed={seed}"]
-    return make_config(*overrides, *METHOD_CASES.get(case, {}).get(way, ()))
+    return make_config(
+        *overrides, *METHOD_CASES.get(case, {}).get(way.removesuffix(f", {GATE}"), ())
+    )
 
 
 def applies(case: str, method: str) -> bool:
