@@ -64,6 +64,8 @@ class Case(NamedTuple):
 
 MODEL, DATA = "start=model", "start=data"
 HOUSE, WALL = ("task=house", "task.margin=0.1"), ("task=house_wall",)
+#: As many transitions as 24 of the task's updates, with four times as many updates.
+HOUSE_8 = ("steps_per_update=1", "updates=96")
 SHORT_EPISODES = ("task=gros_zanon", DATA, "num_envs=25", "task.episode_steps=20")
 SHORT_EPISODES += ("start.transitions=500",)
 DAYS = ("num_envs=4", "start.transitions=1152")
@@ -78,7 +80,7 @@ CASES = {
     "Gros-Zanon, corrupted": Case(("task=gros_zanon",), "tightened"),
     # Random actions in one long episode would diverge.
     "Gros-Zanon, identified": Case(("task=gros_zanon", DATA), "tightened", SHORT_EPISODES),
-    "House, corrupted, 8 days": Case(("task=house", "updates=24"), "omniscient"),
+    "House, corrupted, 8 days": Case((*HOUSE_8, "task=house"), "omniscient"),
     "House, corrupted": Case(("task=house",), "omniscient"),
     "House, identified": Case((*HOUSE, DATA, *DAYS), "omniscient"),
     "House with a wall, corrupted": Case(WALL, "omniscient"),
