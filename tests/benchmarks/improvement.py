@@ -200,9 +200,14 @@ def add(path: Path, row: Any) -> None:
         writer.writerow(row)
 
 
+def percents(rows: Any) -> np.ndarray:
+    """Return J of each run relative to its start's, in percent."""
+    return 100 * rows["best"].to_numpy(float) / rows["start"].to_numpy(float)
+
+
 def ratios(rows: Any) -> str:
     """Format J relative to the start's, in percent: median, 95 % interval, worst seed."""
-    percent = 100 * rows["best"].to_numpy(float) / rows["start"].to_numpy(float)
+    percent = percents(rows)
     low, high = bootstrap_interval([percent])
     return f"{np.median(percent):.1f} [{low:.1f}, {high:.1f}], {percent.max():.1f}"
 
@@ -235,9 +240,8 @@ def method_table(rows: Any) -> str:
         cells = []
         for way in (*WAYS, *METHODS):
             found = runs[runs["way"] == way]
-            percent = 100 * found["best"].to_numpy(float) / found["start"].to_numpy(float)
-            text = f"{np.median(percent):.1f} ({percent.max():.1f})" if len(found) else ""
-            cells.append(text)
+            percent = percents(found)
+            cells.append(f"{np.median(percent):.1f} ({percent.max():.1f})" if len(found) else "")
         lines.append([case, *cells])
     return table(["J / J of the start, %: median (worst)", *WAYS, *METHODS], lines)
 

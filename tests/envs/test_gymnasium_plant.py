@@ -84,7 +84,7 @@ def test_other_spaces_are_an_error(register, options, match):
         GymnasiumPlant(register(**options))
 
 
-def test_further_arguments_are_those_of_its_environment(register):
+def test_further_arguments_are_those_of_its_environment():
     def angles(g: float) -> torch.Tensor:
         plant = GymnasiumPlant("Pendulum-v1", g=g)
         env: Any = plant.make(max_steps=7)

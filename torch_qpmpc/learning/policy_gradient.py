@@ -24,9 +24,9 @@ changes the actions by at most the fraction ``rate`` of the exploration, in root
 trust region in the metric F. ``share`` is 1 minus the part of w'F w that noise alone would explain,
 at least 0 (James and Stein): a w within its noise moves nothing.
 
-Where hardly any row is active, the actions hardly depend on bounds or slack weights, and a step
-that is bounded in the actions would be as good as unbounded in these. They move only where a
-change by their whole size changes the actions by a hundredth of the exploration.
+The actions hardly depend on the bounds and slack weights of rows that are rarely active, so that a
+step bounded in the actions is not bounded in these. A bound or slack weight moves only if a change
+by its whole size changes the actions by more than a hundredth of the exploration.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ from torch_qpmpc.qp.solution import QPSolution
 PARTS = ("q", "b", "lb", "ub", "w")
 #: Smallest size of a feature, relative to the largest of its part, that counts.
 FLOOR = 1e-6
-#: Smallest change of the actions by a change of a bound or slack weight by its whole size, relative
-#: to the exploration, for which it moves.
+#: A bound or slack weight stays if a change by its whole size changes the actions by less than this
+#: fraction of the exploration.
 WEAK = 1e-2
 
 
@@ -269,8 +269,8 @@ class PolicyGradient:
         psi = (M * explored.unsqueeze(-1)).sum(1)
         n, size = psi.shape
         scale = psi.square().mean(0).sqrt()
-        weak = M.square().mean((0, 1)).sqrt() * self._magnitudes()
-        scale = torch.where(weak > WEAK * explored.square().mean().sqrt(), scale, 0.0)
+        effect = M.square().mean((0, 1)).sqrt() * self._magnitudes()
+        scale = torch.where(effect > WEAK * explored.square().mean().sqrt(), scale, 0.0)
         largest = [part.max().expand(len(part)) for part in scale.split(self._sizes())]
         scale = torch.where(scale > FLOOR * torch.cat(largest), scale, torch.inf)
         before, after = self._features(s, following)
