@@ -43,6 +43,21 @@ PENDULUM = (
     *("solver=daqp", "task.horizon=5", "constraint=free", "constraint.learn=[C,b]"),
     *("num_envs=1", "replay_capacity=10000", "log_interval=50", "eval_interval=1000"),
 )
+#: Episodes of 5 s. The linear model is that at the hanging pole, where they start.
+CART_POLE = (
+    *("task=gymnasium", "task.id=gymnasium_cartpole_swingup:CartPoleSwingUp-v0"),
+    "task.kwargs={obs_mode: trig, cost_mode: pilco, sigma_c: 1, x_threshold: 1000, dt: 0.05}",
+    "task.A=[[1,.05,0,0,0],[0,.992,.2946,0,0],[0,0,1,0,-.05],[0,0,0,1,0],[0,.02,1.964,0,1]]",
+    "task.B=[[0],[.8],[0],[0],[-2]]",
+    "task.stage_weight=[[4,0,2.4,0,0,0],[0,.1,0,0,0,0],[2.4,0,2.4,0,0,0],[0,0,0,0,0,0],"
+    "[0,0,0,0,.05,0],[0,0,0,0,0,1]]",
+    *("task.horizon=5", "task.episode_steps=100", "task.eval_steps=100", "task.gamma=0.97"),
+    *("task.action_slack=0.1", "solver=daqp", "constraint=free", "constraint.learn=[C,b]"),
+    *("algo=td3", "algo.critic=mlp", "algo.lr_network=1e-3", "algo.width=128"),
+    *("target_rate=0.01", "batch_size=128", "exploration_std=0.3", "replay_capacity=10000"),
+    *("num_envs=1", "warmup_steps=1000", "updates=9000", "log_interval=50", "eval_interval=1000"),
+)
+CART_POLE_QP = ("algo.actor_rate=0.3", "optimizer.lr_cost=2e-3", "optimizer.lr_constraints=2e-4")
 NETWORK = (
     *("algo.actor=mlp", "algo.critic=mlp", "algo.width=256", "algo.actor_rate=1"),
     *("constraint=free", "target_rate=0.005", "batch_size=256", "replay_capacity=102400"),
@@ -61,6 +76,11 @@ CASES: dict[str, dict[str, Sequence[str]]] = {
             *("algo.actor=scheduled", "algo.theta.q=5", "algo.theta.b=0.3", "updates=7950"),
         ),
         "network": (*PENDULUM, "algo.actor=mlp", "updates=9950"),
+    },
+    "cart_pole": {
+        "scheduled QP": (*CART_POLE, *CART_POLE_QP, "algo.actor=scheduled"),
+        "network": (*CART_POLE, "algo.actor_rate=1", "algo.actor=mlp"),
+        "QP": (*CART_POLE, *CART_POLE_QP, "algo.actor=qp"),
     },
     "point_mass": {
         "QP": ("task=point_mass",),
@@ -195,6 +215,7 @@ def figure(curves: Curves) -> Figure:
 
 TABLES = {
     "pendulum": seeds_table,
+    "cart_pole": seeds_table,
     "point_mass": budgets_table,
     "house": budgets_table,
     "tank_references": seeds_table,
