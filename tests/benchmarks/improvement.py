@@ -113,6 +113,10 @@ METHOD_CASES: dict[str, dict[str, Sequence[str]]] = {
         POLICY: ("policy_gradient.parts=[b,lb,ub]",),
         SEARCH: ("search.H_f=1",),
     },
+    "Point mass, Brownian noise, identified": {
+        POLICY: ("policy_gradient.parts=[b,lb,ub]",),
+        SEARCH: ("search.H_f=1",),
+    },
     "Gros-Zanon, corrupted": {
         POLICY: ("policy_gradient.parts=[w]", "policy_gradient.memory=250", "exploration_std=0.1"),
     },
@@ -122,6 +126,7 @@ METHOD_CASES: dict[str, dict[str, Sequence[str]]] = {
     "Tank with references, identified": {
         POLICY: ("policy_gradient.parts=[b]", "constraint.learn=[C,lb,ub]"),
     },
+    "Pendulum, identified": {POLICY: ("policy_gradient.parts=[b]",)},
 }
 
 

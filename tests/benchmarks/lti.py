@@ -2,7 +2,8 @@
 
 Both learn all numbers of a linear MPC scheme from one endless episode, on the same noise. The
 schemes are the same but for the terminal cost, an undiscounted regulator's there and the discounted
-one's here. Ours learns as `task=gros_zanon` does: from each transition once, or from the latest.
+one's here. Ours learns as `task=gros_zanon` does, from each transition once, after 25 steps or
+after each as mpcrl, or from the latest.
 The tables go into docs/results/mpcrl.md.
 """
 
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
@@ -32,13 +33,16 @@ PAGE = DOCS / "results" / "mpcrl.md"
 SEEDS, STEPS, LAST = (69, 1, 2, 3), 5000, 500
 #: Untimed steps of each contender at first, during which kernels are compiled.
 WARMUP = 50
-#: Settings of the replay that differ from those of the stream.
+#: Settings of updates after each step, and of the replay, that differ from the task's.
+SINGLE = ("steps_per_update=1",)
 REPLAYED = ("optimizer=sliding", "exploration_std=0.05")
 
 
-def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = True) -> Stream:
+def run(
+    seed: int, steps: int = STEPS, overrides: Sequence[str] = (), *, learn: bool = True
+) -> Stream:
     """Run one episode under the learning QP, or under the initial one."""
-    cfg, physics = make_config("task=gros_zanon", "solver=daqp", *REPLAYED * replay), GrosZanonLTI()
+    cfg, physics = make_config("task=gros_zanon", "solver=daqp", *overrides), GrosZanonLTI()
     every, exploration = cfg.steps_per_update, cfg.exploration_std
     cfg.updates = steps // every
     mpc = make_mpc(cfg, physics)
@@ -62,7 +66,7 @@ def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = Tr
             if not learn or (k + 1) % every:
                 continue
             batch = torch.arange(k + 1 - every, k + 1)
-            if replay:
+            if cfg.replay:
                 stored = min(k + 1, cfg.replay_capacity)
                 batch = k - torch.randperm(stored, generator=draws)[: cfg.batch_size]
             visited = states[batch], actions[batch]
@@ -78,7 +82,8 @@ def run(seed: int, steps: int = STEPS, *, replay: bool = False, learn: bool = Tr
 CONTENDERS: dict[str, Callable[[int, int], Stream]] = {
     "mpcrl": mpcrl_lti.run,
     "ours, each transition once": run,
-    "ours, the latest replayed": lambda seed, steps: run(seed, steps, replay=True),
+    "ours, after each step": lambda seed, steps: run(seed, steps, SINGLE),
+    "ours, the latest replayed": lambda seed, steps: run(seed, steps, REPLAYED),
     "ours, without learning": lambda seed, steps: run(seed, steps, learn=False),
 }
 

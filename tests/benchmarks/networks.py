@@ -1,8 +1,8 @@
 """QPs beside plain networks: ``python -m tests.benchmarks.networks``.
 
 Each case is a configuration of train.py. ``--train`` runs its missing seeds, below the folder
-``--runs``, and writes J by transitions to networks.csv, where tasks that ``--tasks`` leaves out
-stay. Without it, the tables and the figure of the page are drawn from that file.
+``--runs``, and writes J by transitions to networks.csv, where what has no run there stays.
+Without it, the tables and the figure of the page are drawn from that file.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import csv
 import math
 import subprocess
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 
@@ -38,11 +38,14 @@ MULTIPLES = (1, 100)
 #: A gate's closed loops would be further transitions.
 COMMON = ("gate=false", "rivals=false", "figures=false")
 PENDULUM = (
-    *("task=pendulum", "start=data", "algo=td3", "algo.critic=mlp", "algo.actor_rate=1"),
+    *("task=pendulum", "start=data", "algo.critic=mlp", "algo.actor_rate=1"),
     *("algo.lr_network=1e-3", "algo.width=64", "target_rate=0.01", "batch_size=128"),
     *("solver=daqp", "task.horizon=5", "constraint=free", "constraint.learn=[C,b]"),
     *("num_envs=1", "replay_capacity=10000", "log_interval=50", "eval_interval=1000"),
 )
+#: The log's 2,000 transitions, of which a network has no use, count as the QP's.
+SCHEDULED = ("algo.actor=scheduled", "algo.theta.q=5", "algo.theta.b=0.3", "updates=7950")
+ALONE = ("algo.actor=mlp", "updates=9950")
 #: Episodes of 5 s. The linear model is that at the hanging pole, where they start.
 CART_POLE = (
     *("task=gymnasium", "task.id=gymnasium_cartpole_swingup:CartPoleSwingUp-v0"),
@@ -54,7 +57,7 @@ CART_POLE = (
     *("task.horizon=5", "task.episode_steps=100", "task.eval_steps=100", "task.gamma=0.97"),
     *("task.action_slack=0.1", "solver=daqp", "constraint=free", "constraint.learn=[C,b]"),
     *("algo=td3", "algo.critic=mlp", "algo.lr_network=1e-3", "algo.width=128"),
-    *("target_rate=0.01", "batch_size=128", "exploration_std=0.3", "replay_capacity=10000"),
+    *("target_rate=0.01", "batch_size=128", "exploration_std=0.8", "replay_capacity=10000"),
     *("num_envs=1", "warmup_steps=1000", "updates=9000", "log_interval=50", "eval_interval=1000"),
 )
 CART_POLE_QP = ("algo.actor_rate=0.3", "optimizer.lr_cost=2e-3", "optimizer.lr_constraints=2e-4")
@@ -71,16 +74,14 @@ FAST, SLOW = "algo.lr_network=1e-3", "algo.lr_network=3e-4"
 #: The overrides of each case, by task; the first case of a task is the QP.
 CASES: dict[str, dict[str, Sequence[str]]] = {
     "pendulum": {
-        "scheduled QP": (
-            *PENDULUM,
-            *("algo.actor=scheduled", "algo.theta.q=5", "algo.theta.b=0.3", "updates=7950"),
-        ),
-        "network": (*PENDULUM, "algo.actor=mlp", "updates=9950"),
+        "scheduled QP by TD3": ("algo=td3", *PENDULUM, *SCHEDULED),
+        "network by TD3": ("algo=td3", *PENDULUM, *ALONE),
+        "scheduled QP by SAC": ("algo=sac", *PENDULUM, *SCHEDULED),
+        "network by SAC": ("algo=sac", *PENDULUM, *ALONE),
     },
     "cart_pole": {
         "scheduled QP": (*CART_POLE, *CART_POLE_QP, "algo.actor=scheduled"),
         "network": (*CART_POLE, "algo.actor_rate=1", "algo.actor=mlp"),
-        "QP": (*CART_POLE, *CART_POLE_QP, "algo.actor=qp"),
     },
     "point_mass": {
         "QP": ("task=point_mass",),
@@ -126,23 +127,31 @@ def costs(folder: Path) -> Iterator[tuple[int, int, float]]:
                 yield cfg.seed, round((before + each * float(update)) * length) - unused, float(J)
 
 
-def write(runs: Path, file: Path, tasks: Collection[str]) -> None:
-    """Write J to a CSV file, by task, case, seed and transitions: of ``tasks`` that of the runs."""
-    curves = read(file) if set(CASES) - set(tasks) else {}
-    for task in tasks:
-        curves[task] = {}
-        for case in CASES[task]:
-            seeds = curves[task][case] = {}
+def update(curves: Curves, runs: Path) -> Curves:
+    """Return the curves with those of the runs below ``runs`` in the place of the same seeds'."""
+    updated: Curves = {}
+    for task, cases in CASES.items():
+        for case in cases:
+            seeds = updated.setdefault(task, {})[case] = dict(curves.get(task, {}).get(case, {}))
+            found: Seeds = {}
             for seed, transitions, J in costs(runs / task / case):
-                seeds.setdefault(seed, {})[transitions] = J
+                found.setdefault(seed, {})[transitions] = J
+            seeds |= found
+    return updated
+
+
+def write(curves: Curves, file: Path) -> None:
+    """Write J to a CSV file, by task, case, seed and transitions."""
+    rows = [
+        (task, case, seed, transitions, f"{J:.6g}")
+        for task, cases in curves.items()
+        for case, seeds in cases.items()
+        for seed, found in seeds.items()
+        for transitions, J in found.items()
+    ]
     with file.open("w", encoding="utf-8", newline="") as out:
         writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(["task", "case", "seed", "transitions", "J"])
-        for task in CASES:
-            for case, seeds in curves.get(task, {}).items():
-                for seed, found in seeds.items():
-                    for transitions, J in found.items():
-                        writer.writerow([task, case, seed, transitions, f"{J:.6g}"])
+        writer.writerows([("task", "case", "seed", "transitions", "J"), *rows])
 
 
 def read(file: Path) -> Curves:
@@ -237,7 +246,7 @@ def main(arguments: list[str] | None = None) -> None:
         for task in options.tasks:
             for case in CASES[task]:
                 train(options.runs, task, case, options.seeds)
-        write(options.runs, file, options.tasks)
+        write(update(read(file), options.runs), file)
     curves = read(file)
     figure(curves).savefig(options.page.with_suffix(".png"), dpi=80)
     text = options.page.read_text(encoding="utf-8")

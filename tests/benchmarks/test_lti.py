@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from tests.benchmarks.lti import Stream, run, tables
+from tests.benchmarks.lti import REPLAYED, SINGLE, Stream, run, tables
 
 
 def test_streams_depend_on_the_noise_and_the_learner() -> None:
@@ -15,10 +16,11 @@ def test_streams_depend_on_the_noise_and_the_learner() -> None:
     assert run(2, 60).costs[1] != learned.costs[1]
 
 
-def test_replay_learns_within_some_hundred_steps() -> None:
-    fixed, replayed = run(2, 500, learn=False), run(2, 500, replay=True)
-    assert fixed.costs[-100:].sum() > 2 * replayed.costs[-100:].sum() > 0
-    assert fixed.violations.sum() > 2 * replayed.violations.sum() >= 0
+@pytest.mark.parametrize("overrides", [SINGLE, REPLAYED], ids=["each step", "replay"])
+def test_other_updates_learn_within_some_hundred_steps(overrides: tuple[str, ...]) -> None:
+    fixed, learned = run(2, 500, learn=False), run(2, 500, overrides)
+    assert fixed.costs[-100:].sum() > 2 * learned.costs[-100:].sum() > 0
+    assert fixed.violations.sum() > 2 * learned.violations.sum() >= 0
 
 
 def test_the_table_has_each_seed_and_the_median() -> None:

@@ -52,12 +52,15 @@ def test_curves_are_read_by_task_case_and_seed(tmp_path):
     assert read(file) == {"house": {"QP": {1: {5: 9.0, 10: 4.0}}}}
 
 
-def test_tasks_that_are_left_out_stay_in_the_file(tmp_path, monkeypatch):
+def test_runs_replace_their_seeds_and_all_others_stay_in_the_file(tmp_path, monkeypatch):
     file = tmp_path / "networks.csv"
-    lines = ["house,QP,1,5,9", "house,QP,1,10,4", "point_mass,QP,1,5,7"]
-    file.write_text("\n".join(["task,case,seed,transitions,J", *lines]) + "\n")
-    monkeypatch.setattr(networks, "costs", lambda folder: [(2, 8, len(folder.parts))])
-    networks.write(Path("runs"), file, ["house"])
+    before = {"house": {"QP": {1: {5: 9.0}, 2: {5: 8.0}}}, "point_mass": {"QP": {1: {5: 7.0}}}}
+    monkeypatch.setattr(
+        networks,
+        "costs",
+        lambda folder: [(2, 8, 3.0)] if folder.parts[-2:] == ("house", "QP") else [],
+    )
+    networks.write(networks.update(before, Path("runs")), file)
     found = read(file)
-    assert found["point_mass"] == {"QP": {1: {5: 7.0}}}
-    assert found["house"] == {case: {2: {8: 3.0}} for case in CASES["house"]}
+    assert found["point_mass"] == before["point_mass"]
+    assert found["house"] == {"QP": {1: {5: 9.0}, 2: {8: 3.0}}}
