@@ -106,17 +106,15 @@ METHODS = {
     f"{GATE}, average": (*NO_SEARCH, "average=0.9"),
     SEARCH: ("updates=1",),
 }
+POINT_MASS: dict[str, Sequence[str]] = {
+    POLICY: ("policy_gradient.parts=[b,lb,ub]",),
+    SEARCH: ("search.H_f=1",),
+}
 #: Cases of the single methods, with further overrides of some. The policy's gradient moves parts
 #: that no TD error moves.
 METHOD_CASES: dict[str, dict[str, Sequence[str]]] = {
-    "Point mass, Gaussian noise, identified": {
-        POLICY: ("policy_gradient.parts=[b,lb,ub]",),
-        SEARCH: ("search.H_f=1",),
-    },
-    "Point mass, Brownian noise, identified": {
-        POLICY: ("policy_gradient.parts=[b,lb,ub]",),
-        SEARCH: ("search.H_f=1",),
-    },
+    "Point mass, Gaussian noise, identified": POINT_MASS,
+    "Point mass, Brownian noise, identified": POINT_MASS,
     "Gros-Zanon, corrupted": {
         POLICY: ("policy_gradient.parts=[w]", "policy_gradient.memory=250", "exploration_std=0.1"),
     },

@@ -43,7 +43,8 @@ def run(
 ) -> Stream:
     """Run one episode under the learning QP, or under the initial one."""
     cfg, physics = make_config("task=gros_zanon", "solver=daqp", *overrides), GrosZanonLTI()
-    every, exploration = cfg.steps_per_update, cfg.exploration_std
+    # Read once: OmegaConf's lookups would count as time of the loop.
+    every, exploration, replay = cfg.steps_per_update, cfg.exploration_std, cfg.replay
     cfg.updates = steps // every
     mpc = make_mpc(cfg, physics)
     optimizer = make_optimizer(cfg, mpc)
@@ -66,7 +67,7 @@ def run(
             if not learn or (k + 1) % every:
                 continue
             batch = torch.arange(k + 1 - every, k + 1)
-            if cfg.replay:
+            if replay:
                 stored = min(k + 1, cfg.replay_capacity)
                 batch = k - torch.randperm(stored, generator=draws)[: cfg.batch_size]
             visited = states[batch], actions[batch]

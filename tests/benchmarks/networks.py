@@ -243,10 +243,11 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     file = options.page.with_suffix(".csv")
     if options.train:
+        before = read(file) if file.exists() else {}
         for task in options.tasks:
             for case in CASES[task]:
                 train(options.runs, task, case, options.seeds)
-        write(update(read(file), options.runs), file)
+        write(update(before, options.runs), file)
     curves = read(file)
     figure(curves).savefig(options.page.with_suffix(".png"), dpi=80)
     text = options.page.read_text(encoding="utf-8")
