@@ -100,6 +100,7 @@ def _train(
             tally = Tally()
             report(run, gate.mpc, found, 0)
             for batch in itertools.islice(stream, -(-cfg.warmup_steps // cfg.steps_per_update)):
+                learner.observe(batch)
                 if cfg.replay:
                     replay.extend(batch)
                 interrupt.exit_if_signalled(f"Stopped before the first update: {command}")
@@ -116,6 +117,7 @@ def _train(
         for update in range(tally.update + 1, cfg.updates + 1):
             with tally.timed() as watch:
                 batch = next(stream)
+                learner.observe(batch)
                 if cfg.replay:
                     replay.extend(batch)
                 watch.collected()

@@ -3,8 +3,8 @@
 Both learn all numbers of a linear MPC scheme from one endless episode, on the same noise. The
 schemes are the same but for the terminal cost, an undiscounted regulator's there and the discounted
 one's here. Ours learns as `task=gros_zanon` does, from each transition once, after 25 steps or
-after each as mpcrl, or from the latest.
-The tables go into docs/results/mpcrl.md.
+after each as mpcrl, or from the latest; and with `constraint=adaptive`, whole and in part. The
+tables go into docs/results/mpcrl.md.
 """
 
 from __future__ import annotations
@@ -25,17 +25,20 @@ from tests.benchmarks.table import DOCS
 from tests.runs import make_config
 from torch_qpmpc import GaussNewton
 from torch_qpmpc.envs import GrosZanonLTI
-from torch_qpmpc.experiment.algorithms import make_optimizer, make_schedule
+from torch_qpmpc.experiment.algorithms import make_errors, make_optimizer, make_schedule
 from torch_qpmpc.experiment.tasks import make_mpc
+from torch_qpmpc.mpc.tightening import BackOff
 from torch_qpmpc.study.markdown import replaced, table
 
 PAGE = DOCS / "results" / "mpcrl.md"
 SEEDS, STEPS, LAST = (69, 1, 2, 3), 5000, 500
 #: Untimed steps of each contender at first, during which kernels are compiled.
 WARMUP = 50
-#: Settings of updates after each step, and of the replay, that differ from the task's.
+#: Settings that differ from the task's: updates after each step, the replay, a model that follows
+#: the prediction errors with bounds tightened by their covariance.
 SINGLE = ("steps_per_update=1",)
 REPLAYED = ("optimizer=sliding", "exploration_std=0.05")
+ADAPTIVE = ("constraint=adaptive",)
 
 
 def run(
@@ -47,7 +50,9 @@ def run(
     every, exploration, replay = cfg.steps_per_update, cfg.exploration_std, cfg.replay
     cfg.updates = steps // every
     mpc = make_mpc(cfg, physics)
-    optimizer = make_optimizer(cfg, mpc)
+    errors = make_errors(cfg, mpc)
+    back_off = None if cfg.back_off is None else BackOff(mpc, cfg.back_off)
+    optimizer = make_optimizer(cfg, mpc, errors=errors)
     assert isinstance(optimizer, GaussNewton)
     schedule, gamma = make_schedule(cfg, optimizer), cfg.task.gamma
     # mpcrl's agents draw the seed of each episode.
@@ -67,6 +72,8 @@ def run(
             if not learn or (k + 1) % every:
                 continue
             batch = torch.arange(k + 1 - every, k + 1)
+            if errors is not None:
+                errors.add(states[batch], actions[batch], states[batch + 1])
             if replay:
                 stored = min(k + 1, cfg.replay_capacity)
                 batch = k - torch.randperm(stored, generator=draws)[: cfg.batch_size]
@@ -74,6 +81,8 @@ def run(
             following = mpc.solve(states[batch + 1], qp=qp)
             optimizer.step(*visited, physics.cost(*visited) + gamma * following.value)
             schedule.step()
+            if back_off is not None and errors is not None:
+                back_off.tighten(errors.covariance(mpc.quadratic_program()))
             qp = mpc.quadratic_program()
     seconds = time.perf_counter() - began
     costs = physics.cost(states[:-1], actions)
@@ -85,6 +94,10 @@ CONTENDERS: dict[str, Callable[[int, int], Stream]] = {
     "ours, each transition once": run,
     "ours, after each step": lambda seed, steps: run(seed, steps, SINGLE),
     "ours, the latest replayed": lambda seed, steps: run(seed, steps, REPLAYED),
+    "ours, adaptive": lambda seed, steps: run(seed, steps, ADAPTIVE),
+    ".. after each step": lambda seed, steps: run(seed, steps, (*ADAPTIVE, *SINGLE)),
+    ".. without back-offs": lambda seed, steps: run(seed, steps, (*ADAPTIVE, "back_off=null")),
+    ".. by TD errors alone": lambda seed, steps: run(seed, steps, (*ADAPTIVE, "prediction=0")),
     "ours, without learning": lambda seed, steps: run(seed, steps, learn=False),
 }
 

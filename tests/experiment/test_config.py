@@ -37,6 +37,7 @@ OPTIONAL = ("constraint.deviation", "constraint.si")
 NOT_NEEDED = (
     "anchor",
     "average",
+    "back_off",
     "eval_seed",
     "export",
     "gate",
@@ -45,6 +46,7 @@ NOT_NEEDED = (
     "logger",
     "lmbda",
     "n_step",
+    "prediction",
     "rivals",
     "search.margin_k",
     "start.name",
@@ -112,6 +114,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "first": ("optimizer=adam", "constraint=combined", "constraint.si.windows=4"),
         "second": ("gate=true", "constraint=combined", "optimizer=gauss_newton", "batch_size=8"),
         "actor": ("algo=td3", "task=pendulum", "constraint=free", "batch_size=8"),
+        "adaptive": ("constraint=adaptive", "optimizer=gauss_newton"),
         "house": ("task=house", "warmup_steps=1", "policy_gradient.parts=[lb]"),
         "house_wall": ("task=house_wall", "warmup_steps=1"),
         "four_tanks": ("task=four_tanks", "start=model", "warmup_steps=1"),
@@ -158,6 +161,7 @@ def faults(constraint: str, noise: str, optimizer: str, task: str) -> list[str]:
     """List the conflicting keys of a choice of groups; recursive learns without a replay."""
     found = {"noise.name": noise not in NOISES[task]}
     found["replay"] = optimizer == "recursive" and constraint in WINDOWS
+    found["optimizer.name"] = optimizer in ("adam", "sgd") and constraint == "adaptive"
     return [key for key, wrong in found.items() if wrong]
 
 
@@ -249,6 +253,8 @@ BAD: dict[str, list[Any]] = {
     "figures": FLAG,
     "gate": FLAG,
     "anchor": REAL,
+    "prediction": REAL,
+    "back_off": [0.4, 1, math.nan, False, "half"],
     "average": [-0.5, 1, 1.1, math.nan, False, "half", None],
     "policy_gradient.parts": ["b", ["C"], ["H"], None, 3],
     "policy_gradient.rate": [0, *REAL],
@@ -459,7 +465,7 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
     later = ("logger", "eval_seed", "start", "gate", "anchor", "average", "policy_gradient")
-    for key in (*later, "search", "target_horizon", "n_step"):
+    for key in (*later, "prediction", "back_off", "search", "target_horizon", "n_step"):
         del cfg[key]
     OmegaConf.save(cfg, file)
     assert differences(settings(cfg), now) is None
@@ -592,6 +598,31 @@ def test_solver_must_be_known():
         (
             ["anchor=1", "start=data", "constraint=mpc"],
             "constraint.structure: got 'tied', expected free. The anchor needs a free C",
+        ),
+        (
+            ["prediction=1"],
+            "constraint.structure: got 'free', expected tied. prediction and back_off need one",
+        ),
+        (
+            ["constraint=adaptive", "algo=td3", "prediction=0"],
+            "algo.name: got 'td3', expected qlearning. td3 does not support prediction and back",
+        ),
+        (["constraint=adaptive", "release=5"], "release: got 5, expected null. prediction and"),
+        (
+            ["constraint=adaptive", "optimizer=adam"],
+            "optimizer.name: got 'adam', expected gauss_newton. prediction is part of its steps",
+        ),
+        (
+            ["constraint=adaptive", "constraint.learn=[]"],
+            r"constraint.learn: got \[\], expected a list with C or b, which prediction moves",
+        ),
+        (
+            ["constraint=adaptive", "constraint.learn=[C,lb]"],
+            r"constraint.learn: got \['C', 'lb'\], expected a list without lb and ub. back_off",
+        ),
+        (
+            ["constraint=adaptive", "policy_gradient.parts=[ub]"],
+            r"policy_gradient.parts: got \['ub'\], expected a list without lb and ub. back_off",
         ),
         (
             ["average=0.9", "gate=false"],

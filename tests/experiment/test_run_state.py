@@ -48,6 +48,7 @@ SGD = ("optimizer=sgd", "penalty_step=subgradient")
         ("algo=td3", *ACTOR_CRITIC),
         (*GATED, "constraint=mpc", "release=5", "search.w=0.5", "average=0.9"),
         (*GATED, *ANCHORED, "constraint=free", "average=0.5"),
+        ("optimizer=recursive", *STREAM, *GATED[:1], "constraint=adaptive"),
         ("gate=true", "algo=td3", *ACTOR_CRITIC, *NETWORKS),
         ("task=store", "optimizer=gauss_newton", "constraint=si", "task.episode_steps=5"),
         ("task=store", "optimizer=recursive", "optimizer.memory=8", "task.episode_steps=6"),

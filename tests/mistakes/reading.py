@@ -16,10 +16,8 @@ from tests.mistakes.objects import A2, B1, S, form, mpc, op
 from torch_qpmpc.analysis.model_error import first_state_error, one_step_error, second_moment
 from torch_qpmpc.analysis.policy import (
     local_gain,
-    lqr_gain,
     policy_map,
     spectral_radius,
-    stage_weight,
 )
 from torch_qpmpc.analysis.prediction_form import canonical_matrix, model_form, prediction_form
 from torch_qpmpc.analysis.report import read, structure_metrics
@@ -32,6 +30,7 @@ from torch_qpmpc.analysis.structure import (
 )
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.projections import check_step, nearest_psd, nearest_psd_by_sdp
+from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
 
 MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "prediction_form: list": (

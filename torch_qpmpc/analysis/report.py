@@ -13,9 +13,7 @@ from torch import Tensor
 from torch_qpmpc.analysis.model_error import one_step_error
 from torch_qpmpc.analysis.policy import (
     local_gain,
-    lqr_gain,
     spectral_radius,
-    stage_weight,
     window_model,
 )
 from torch_qpmpc.analysis.prediction_form import PredictionForm, canonical_matrix, prediction_form
@@ -31,6 +29,7 @@ from torch_qpmpc.analysis.structure import (
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
 
 #: A, B, offset and E.
 TrueModel = tuple[Tensor, Tensor, Tensor, Tensor]

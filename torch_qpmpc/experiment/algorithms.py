@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
@@ -33,10 +34,12 @@ from torch_qpmpc.learning.operators import (
 )
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.policy_gradient import PolicyGradient
+from torch_qpmpc.learning.prediction_errors import PredictionErrors
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.replay import ACTIVE_SET
 from torch_qpmpc.learning.updates import Update, first_order, second_order, with_policy_gradient
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.tightening import BackOff
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,8 @@ class Learner:
         policy_gradient: moves parts of theta by the policy's gradient; None without such parts.
         n_preview: entries of the preview, with which p begins.
         average: the exponential average of the actor's parameters; None without one.
+        errors: the prediction errors of the transitions; None if nothing uses them.
+        back_off: tightens the bounds by the covariance of these; None if it is off.
     """
 
     learn: Update
@@ -65,6 +70,8 @@ class Learner:
     policy_gradient: PolicyGradient | None = None
     n_preview: int = 0
     average: AveragedModel | None = None
+    errors: PredictionErrors | None = None
+    back_off: BackOff | None = None
 
     @property
     def candidate(self) -> Any:
@@ -76,9 +83,19 @@ class Learner:
         """The candidate as a function from p to a, for one closed loop."""
         return in_closed_loop(self.candidate, self.n_preview)
 
+    def observe(self, batch: TensorDictBase) -> None:
+        """Add new transitions to the prediction errors."""
+        if self.errors is not None:
+            operator: QPActorValueOperator = self.loss_module.operator
+            flat = batch.reshape(-1)
+            following = operator.known(flat.get("next"))[:, -operator.module.n_x :]
+            self.errors.add(operator.known(flat), flat.get(operator.in_keys[1]), following)
+
     def advance(self) -> None:
-        """Advance the schedule, the target network and the average by one update."""
+        """Advance the schedule, the bounds, the target network and the average by one update."""
         self.schedule.step()
+        if self.back_off is not None and self.errors is not None:
+            self.back_off.tighten(self.errors.covariance(self.back_off.mpc.quadratic_program()))
         if self.target is not None:
             self.target.step()
         if self.average is not None:
@@ -128,8 +145,8 @@ def make_learner(
     else:
         loss_module.make_value_estimator(ValueEstimators.TDLambda, gamma=gamma, lmbda=cfg.lmbda)
     deviation, si = make_penalties(cfg, mpc)
-    anchor = make_anchor(cfg, start)
-    optimizer = make_optimizer(cfg, mpc, loss_module, anchor)
+    anchor, errors = make_anchor(cfg, start), make_errors(cfg, mpc)
+    optimizer = make_optimizer(cfg, mpc, loss_module, anchor, errors)
     schedule = make_schedule(cfg, optimizer, done)
     delayed = cfg.algo.name != "qlearning" or cfg.delay_value
     update = make_update(cfg, mpc, loss_module, optimizer, schedule, deviation, si, done)
@@ -153,6 +170,8 @@ def make_learner(
         policy_gradient,
         (mpc.horizon + 1) * mpc.n_d,
         make_average(cfg, actor),
+        errors,
+        None if cfg.back_off is None else BackOff(mpc, cfg.back_off),
     )
 
 
@@ -172,6 +191,13 @@ def make_anchor(cfg: DictConfig, start: Start | None) -> Anchor | None:
     if not cfg.anchor or start is None:
         return None
     return Anchor.of(start.identified, cfg.anchor, b_learned="b" in cfg.constraint.learn)
+
+
+def make_errors(cfg: DictConfig, mpc: QPMPC) -> PredictionErrors | None:
+    """Make the prediction errors; None if neither steps nor bounds use them."""
+    if not cfg.prediction and cfg.back_off is None:
+        return None
+    return PredictionErrors(mpc, weight=cfg.prediction or 1.0)
 
 
 def make_average(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedModel | None:
@@ -196,9 +222,11 @@ def make_optimizer(
     mpc: QPMPC,
     loss_module: LossModule | None = None,
     anchor: Anchor | None = None,
+    errors: PredictionErrors | None = None,
 ) -> torch.optim.Optimizer:
     """Make the optimiser, with one rate for the cost and one for the constraints.
 
+    ``errors`` are a term of Gauss-Newton's steps if ``prediction`` gives them a weight.
     ``loss_module`` is needed for actor-critic algorithms, whose critics are optimised, too.
     """
     options = cfg.optimizer
@@ -213,6 +241,7 @@ def make_optimizer(
             trust_region=options.trust_region,
             normalise=options.normalise,
             anchor=anchor,
+            residuals=errors.residuals if errors is not None and cfg.prediction else None,
         )
     rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}
     if loss_module is None or cfg.algo.name == "qlearning":

@@ -51,6 +51,8 @@ def update_metrics(
     metrics |= tally.metrics() | theta_metrics(mpc)
     if learner.deviation is not None:
         metrics.setdefault("loss/deviation", learner.deviation(mpc.C).item())
+    if learner.back_off is not None:
+        metrics["train/margin"] = learner.back_off.margin
     return metrics | watch.metrics()
 
 

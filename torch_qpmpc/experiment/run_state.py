@@ -58,6 +58,7 @@ def snapshot(
         "optimizer": learner.optimizer.state_dict(),
         "schedule": {"last_epoch": learner.schedule.last_epoch},
         "average": None if learner.average is None else learner.average.state_dict(),
+        "errors": None if learner.errors is None else learner.errors.state_dict(),
         "policy_gradient": improve.state_dict() if (improve := learner.policy_gradient) else None,
         "gate": gate.state_dict(),
         "replay": replay.state_dict() if len(replay) and not finished else None,
@@ -91,6 +92,9 @@ def restore(
     with _part("average"):
         if learner.average is not None:
             learner.average.load_state_dict(state["average"])
+    with _part("errors"):
+        if learner.errors is not None:
+            learner.errors.load_state_dict(state["errors"])
     with _part("policy_gradient"):
         if learner.policy_gradient is not None and state.get("policy_gradient") is not None:
             learner.policy_gradient.load_state_dict(state["policy_gradient"])

@@ -26,13 +26,15 @@ stages, because a single entry of z may be nearly zero in a batch without being 
 The gradients in a free C are the outer products chi_i z_i', so that ``K = (chi chi') * (z P z')``
 is computed without forming them. P is the metric of C's rows: U's or, with the SI penalty
 (eq:sdp3) or an anchor, which are quadratic in each row, the inverse of the summed curvatures of
-damping and penalties. The penalties thus enter the same step.
+damping and penalties. The penalties thus enter the same step. Where C is not free, further
+residuals r, such as the one-step prediction errors of a tied C, add 1/2 v |r + dr/dtheta dtheta|^2,
+with v the mean squared TD error: they are further rows of the least-squares problem.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -47,7 +49,7 @@ from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
 from torch_qpmpc.mpc.validation import COST
 from torch_qpmpc.qp.derivatives import envelope_gradients
-from torch_qpmpc.qp.program import EVENT_SHAPES
+from torch_qpmpc.qp.program import EVENT_SHAPES, QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 
 #: A ratio of actual to predicted decrease below POOR raises the damping; one above GOOD lowers it.
@@ -116,10 +118,14 @@ class GaussNewton(torch.optim.Optimizer):
             default 1 and 0.01, for streams of small batches, whose sizes are mostly noise.
         anchor: a penalty on C, times the batch's mean squared TD error. With that as the variance
             of the errors, a step is towards the largest posterior of the anchor's log and a batch.
+        residuals: maps a QP to residuals r ``(M,)``, differentiable in its tensors, such as
+            `PredictionErrors.residuals`. 1/2 r'r at first order, times the mean squared TD error,
+            is added to the batch's sum of ``1/2 delta^2``. That mean rises at once and falls
+            slowly, like a size.
 
     Raises:
-        QPError: if a number is out of range, the scales do not fit the learned parts, or the
-            anchor does not fit a learned, free C.
+        QPError: if a number is out of range, the scales do not fit the learned parts, the anchor
+            does not fit a learned, free C, or there are residuals and C is free and learned.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -145,6 +151,7 @@ class GaussNewton(torch.optim.Optimizer):
         trust_region: bool = True,
         normalise: bool = True,
         anchor: Anchor | None = None,
+        residuals: Callable[[QuadraticProgram], Tensor] | None = None,
     ) -> None:
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
         check_kind("mpc", mpc, QPMPC, remedy)
@@ -160,11 +167,14 @@ class GaussNewton(torch.optim.Optimizer):
         for group in groups:
             check_number(f"scales[{group['name']}]", group["lr"], _positive, "a finite number > 0")
             group |= {"scale": group["lr"], "lr": lr, "damping": damping}
-            group |= {"size": 0.0, "signals": None}
+            group |= {"size": 0.0, "signals": None, "variance": 0.0}
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
         self._clip, self._memory, self._trust_region = td_error_clip, memory, trust_region
-        self._normalise, self._anchor = normalise, anchor
+        self._normalise, self._anchor, self._residuals = normalise, anchor, residuals
+        if residuals is not None and self._free_C() is not None:
+            remedy = "Pass a penalty of its rows to step, or an anchor."
+            raise QPError.expected("residuals", "them with a free C", "a tied C", remedy)
         if anchor is not None:
             check_kind("anchor", anchor, Anchor)
             if self._free_C() is None:
@@ -227,18 +237,20 @@ class GaussNewton(torch.optim.Optimizer):
         self._scale(blocks, int(use.sum()))
         for block in blocks:
             block.remember(self.state[block.leaf], self._memory)
+        mu = _damping(blocks, damping)
+        errors = torch.cat((delta, self._further(blocks, delta, len(s) - sum(left_out))))
         # Past pairs have no TD errors: they contribute their curvature alone.
-        past = delta.new_zeros(len(blocks[0]) - len(delta) if blocks else 0)
-        alpha, change = _solve(blocks, torch.cat((delta, past)), damping)
-        change = change[: len(delta)]
+        past = delta.new_zeros(len(blocks[0]) - len(errors) if blocks else 0)
+        alpha, change = _solve(blocks, torch.cat((errors, past)), mu)
+        change = change[: len(errors)]
         steps = [block.step(alpha) for block in blocks]
-        before = _objective(delta, blocks)
+        before = _objective(errors, blocks)
         if not before.isfinite() or not all(step.isfinite().all() for step in steps):
             # Overflow: raise the damping, and clear the memory and the sizes.
             self._adapt(math.nan)
             self.state.clear()
             for group in self.param_groups:
-                group |= {"size": 0.0, "signals": None}
+                group |= {"size": 0.0, "signals": None, "variance": 0.0}
             return StepReport(solution, damping, math.nan, False, *left_out)
         if not self._trust_region:
             _move(blocks, steps, lr)
@@ -248,11 +260,11 @@ class GaussNewton(torch.optim.Optimizer):
         _move(blocks, steps, lr)
         proposed = lr * change
         change = self._project(blocks, proposed)
-        predicted = before - _objective(delta - change, blocks)
+        predicted = before - _objective(errors - change, blocks)
         after = self._mpc.solve(s, a, warm_start=solution.active)
-        decrease = before - _objective(
-            delta - torch.where(use, after.value - solution.value, 0), blocks
-        )
+        actual = change.clone()
+        actual[: len(delta)] = torch.where(use, after.value - solution.value, 0)
+        decrease = before - _objective(errors - actual, blocks)
         # Without a predicted decrease, reject the step only if the projection raised the objective.
         lost = not torch.equal(change, proposed) and not decrease >= 0
         ratio = float(decrease / predicted) if predicted > 0 else float(not lost)
@@ -332,6 +344,25 @@ class GaussNewton(torch.optim.Optimizer):
         if self._anchor is not None and C is not None:
             pulls.append(self._anchor.times(delta.square().sum() / count))
         return pulls
+
+    def _further(self, blocks: list[_Dense | _OuterProducts], delta: Tensor, count: int) -> Tensor:
+        """Insert the residuals' gradients after those of the TD errors; return their errors -r."""
+        if self._residuals is None or not blocks:
+            return delta.new_zeros(0)
+        group, variance = self.param_groups[0], float(delta.square().sum() / count)
+        if math.isfinite(variance):
+            group["variance"] = max(FORGET * group.get("variance", 0.0), variance)
+        with torch.enable_grad():
+            r = self._residuals(self._mpc.quadratic_program())
+            r = group["variance"] ** 0.5 * r.to(delta)
+        leaves = [block.leaf for block in blocks]
+        unit = torch.eye(len(r)).to(r)
+        gradients = torch.autograd.grad(r, leaves, unit, is_grads_batched=True, allow_unused=True)
+        for block, rows in zip(blocks, gradients, strict=True):
+            assert isinstance(block, _Dense)
+            rows = block.rows.new_zeros(len(r), 1) if rows is None else rows.flatten(1)
+            block.insert(rows.expand(-1, block.rows.shape[1]), len(delta))
+        return -r.detach()
 
     def _blocks(
         self, solution: QPSolution, use: Tensor, pulls: list[Anchor]
@@ -453,6 +484,10 @@ class _Dense:
             self.rows = torch.cat((self.rows, _past(state, "rows", self.rows)))
             state["rows"] = self.rows[:count]
 
+    def insert(self, rows: Tensor, place: int) -> None:
+        """Insert further rows, which are not remembered."""
+        self.rows = torch.cat((self.rows[:place], rows, self.rows[place:]))
+
     def diagonal(self) -> Tensor:
         """Return the kernel's diagonal without a penalty, ``(B,)``."""
         return self.scale * self.rows.square() @ self.units
@@ -566,12 +601,16 @@ def _patterns(mask: Tensor | None, kinds: Tensor | None) -> list[tuple[Any, Any,
     return groups
 
 
+def _damping(blocks: list[_Dense | _OuterProducts], damping: float) -> Tensor:
+    """Return mu, for a damping relative to the mean of K's diagonal."""
+    mu = damping * sum((block.diagonal() for block in blocks), torch.zeros(())).mean()
+    return mu.clamp(min=torch.finfo(mu.dtype).tiny)
+
+
 def _solve(
-    blocks: list[_Dense | _OuterProducts], delta: Tensor, damping: float
+    blocks: list[_Dense | _OuterProducts], delta: Tensor, mu: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Solve the dual; return alpha ``(B,)`` and the step's predicted change of Q ``(B,)``."""
-    mu = damping * sum((block.diagonal() for block in blocks), torch.zeros_like(delta)).mean()
-    mu = mu.clamp(min=torch.finfo(mu.dtype).tiny)
     drifted = sum((block.damp(mu) for block in blocks), torch.zeros_like(delta))
     K = sum((block.kernel() for block in blocks), delta.new_zeros(len(delta), len(delta)))
     damped = K + mu * torch.eye(len(delta)).to(delta)

@@ -23,6 +23,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
 
 
 def prediction_covariance(
@@ -99,6 +100,72 @@ def tighten(
     crossed = lb > ub
     mpc.lb.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, lb), mpc.lb))
     mpc.ub.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, ub), mpc.ub))
+
+
+class BackOff:
+    """The tightening of a QPMPC whose model is learned, for a noise that is estimated.
+
+    The prediction's errors are fed back by the regulator of the model and the stage cost, or not,
+    if the Riccati equation of these has no solution.
+
+    Args:
+        mpc: the QPMPC with its nominal bounds.
+        probability: that of each soft row, as in `tighten`.
+
+    Raises:
+        QPError: the QPMPC has a free C, a window of more than one step, learned bounds or no soft
+            ones, or the probability is out of range.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> one = torch.ones(1, 1)
+        >>> mpc = qm.QPMPC.from_model(
+        ...     one, one, 2, structure="tied", stage_weight=[1.0, 1.0], state_bounds=([-5], [5])
+        ... )
+        >>> back_off = BackOff(mpc)
+        >>> for variance in (0.25, 0.04):
+        ...     back_off.tighten(variance * one)
+        ...     print(mpc.ub[mpc.soft].numpy().round(3))
+        [5.    4.178 4.12 ]
+        [5.    4.671 4.648]
+    """
+
+    def __init__(self, mpc: QPMPC, probability: float = 0.95) -> None:
+        check_kind("mpc", mpc, QPMPC)
+        if mpc.past > 1:
+            remedy = "A back-off has no regulator for a window: call tighten yourself."
+            raise QPError.expected("mpc", f"past={mpc.past}", "past=1", remedy)
+        if not (mpc.soft & (mpc.lb.isfinite() | mpc.ub.isfinite())).any():
+            got, want = "one without soft bounds", "soft bounds to tighten"
+            raise QPError.expected("mpc", got, want, "Leave the back-off out.")
+        mpc.model()  # raises if C is free
+        self.mpc, self._probability = mpc, probability
+        self._lb, self._ub = mpc.lb.detach().clone(), mpc.ub.detach().clone()
+        self.tighten(mpc.lb.new_zeros(mpc.n_x, mpc.n_x))
+
+    @torch.no_grad()
+    def tighten(self, W: Tensor) -> None:
+        """Tighten the nominal bounds for the current model.
+
+        Args:
+            W: covariance of the noise, ``(n_x, n_x)``.
+        """
+        mpc = self.mpc
+        A, B, *_ = (x.to(W) for x in mpc.model())
+        try:
+            K = -lqr_gain(A, B, stage_weight(mpc).to(W))
+        except QPError:
+            K = W.new_zeros(mpc.n_u, mpc.n_x)
+        mpc.lb.copy_(self._lb)
+        mpc.ub.copy_(self._ub)
+        covariances = prediction_covariance(A + B @ K, W, mpc.horizon)
+        tighten(mpc, covariances, self._probability, K)
+
+    @property
+    def margin(self) -> float:
+        """The largest difference of a bound to the nominal one."""
+        moved = torch.cat((self.mpc.lb - self._lb, self._ub - self.mpc.ub))
+        return float(moved.nan_to_num(0.0).max())
 
 
 def _row_variance(mpc: QPMPC, covariances: Tensor, K: Tensor) -> Tensor:

@@ -90,6 +90,10 @@ class Config(Group):
     gate: Flag = False
     gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")] = None
     anchor: NonNegative = 0.0
+    prediction: NonNegative = 0.0
+    back_off: Annotated[
+        Annotated[Finite, Field(ge=0.5, lt=1)] | None, Expected("a number in [0.5, 1), or null")
+    ] = None
     average: Annotated[Finite, Field(ge=0, lt=1), Expected("a number in [0, 1)")] = 0.0
     policy_gradient: PolicyGradient = NO_POLICY_GRADIENT
     search: Search = NO_SEARCH
@@ -177,6 +181,31 @@ class Config(Group):
             self.conflict("constraint.learn", "a list with C, which is anchored")
         if self.constraint.structure != "free":
             self.conflict("constraint.structure", "free", "The anchor needs a free C.")
+        return self
+
+    @model_validator(mode="after")
+    def prediction_errors_are_those_of_a_tied_C(self) -> Self:
+        if not self.prediction and self.back_off is None:
+            return self
+        if self.constraint.structure != "tied":
+            remedy = "prediction and back_off need one model for all stages: constraint=adaptive."
+            self.conflict("constraint.structure", "tied", remedy)
+        if self.algo.name != "qlearning":
+            remedy = f"{self.algo.name} does not support prediction and back_off."
+            self.conflict("algo.name", "qlearning", remedy)
+        if self.release is not None:
+            self.conflict("release", "null", "prediction and back_off need a tied C.")
+        if self.prediction and not self.second_order:
+            self.conflict("optimizer.name", "gauss_newton", "prediction is part of its steps.")
+        if self.prediction and not {"C", "b"} & {*self.constraint.learn}:
+            self.conflict("constraint.learn", "a list with C or b, which prediction moves")
+        bounds = {"lb", "ub"}
+        if self.back_off is not None and bounds & {*self.constraint.learn}:
+            remedy = "back_off moves the bounds."
+            self.conflict("constraint.learn", "a list without lb and ub", remedy)
+        if self.back_off is not None and bounds & {*self.policy_gradient.parts}:
+            remedy = "back_off moves the bounds."
+            self.conflict("policy_gradient.parts", "a list without lb and ub", remedy)
         return self
 
     @model_validator(mode="after")

@@ -10,7 +10,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_qpmpc.analysis.policy import lqr_gain
 from torch_qpmpc.envs.gros_zanon import GrosZanonLTI
 from torch_qpmpc.envs.heated_house import CORRELATION, GAIN
 from torch_qpmpc.envs.house import House
@@ -22,6 +21,7 @@ from torch_qpmpc.experiment.rivals.heating import make_mpc
 from torch_qpmpc.experiment.rivals.rival import Policy
 from torch_qpmpc.experiment.tracking import reference_options
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.regulator import lqr_gain
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 
 #: The horizon and the price of a violation for linear systems.
