@@ -22,7 +22,7 @@ from torch_qpmpc.analysis.plots import (
     policy_figure,
     slice_between,
 )
-from torch_qpmpc.analysis.policy import local_gain, policy_map, stage_weight, window_model
+from torch_qpmpc.analysis.policy import local_gain, policy_map, window_model
 from torch_qpmpc.analysis.prediction_form import (
     PredictionForm,
     canonical_matrix,
@@ -41,6 +41,7 @@ from torch_qpmpc.analysis.structure import (
 )
 from torch_qpmpc.mpc.banded import band_distance, banded_matrix
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.regulator import stage_weight
 
 N_X, N_U, N_D, L, N = 2, 1, 2, 3, 5
 LAYOUT = Layout(N_X, N_U, N, L, N_D)

@@ -78,6 +78,9 @@ CASES = {
     "Point mass, Brownian noise, corrupted": Case(("task=point_mass", "noise=brownian")),
     "Point mass, Brownian noise, identified": Case(("task=point_mass", "noise=brownian", DATA)),
     "Gros-Zanon, corrupted": Case(("task=gros_zanon",), "tightened"),
+    "Gros-Zanon, corrupted, constraint=adaptive": Case(
+        ("task=gros_zanon", "constraint=adaptive"), "tightened"
+    ),
     # Random actions in one long episode would diverge.
     "Gros-Zanon, identified": Case(("task=gros_zanon", DATA), "tightened", SHORT_EPISODES),
     "House, corrupted, 8 days": Case((*HOUSE_8, "task=house"), "omniscient"),

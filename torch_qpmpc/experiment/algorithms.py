@@ -86,8 +86,8 @@ class Learner:
     def observe(self, batch: TensorDictBase) -> None:
         """Add new transitions to the prediction errors."""
         if self.errors is not None:
-            operator: QPActorValueOperator = self.loss_module.operator
-            flat = batch.reshape(-1)
+            assert isinstance(self.loss_module, QPQLearningLoss)
+            operator, flat = self.loss_module.operator, batch.reshape(-1)
             following = operator.known(flat.get("next"))[:, -operator.module.n_x :]
             self.errors.add(operator.known(flat), flat.get(operator.in_keys[1]), following)
 
