@@ -1,7 +1,7 @@
 """What learning adds to its start, on all tasks: ``python -m tests.benchmarks.improvement``.
 
 Each case is one of train.py's configurations and a start, corrupted or identified from a log; each
-way is plain Q-learning, the default, or, on some cases and seeds, a single method. The evaluation
+way is plain Q-learning, the default, or, on some cases, a single method. The evaluation
 has starts, days and noise that no setting was chosen on. Finished runs are kept in
 docs/results/improvement.csv and not repeated; the tables go into docs/results/improvement.md.
 """
@@ -39,8 +39,8 @@ from torch_qpmpc.study.statistics import bootstrap_interval
 
 PAGE = DOCS / "results" / "improvement.md"
 RESULTS = DOCS / "results" / "improvement.csv"
-#: Seeds of the runs, of those of single methods, and of the evaluation.
-SEEDS, METHOD_SEEDS, EVAL_SEED = range(501, 511), range(501, 504), 9002
+#: Seeds of the runs, and of the evaluation.
+SEEDS, EVAL_SEED = range(501, 511), 9002
 COMMON = ("solver=daqp", "figures=false", "logger=csv", "rivals=false", f"eval_seed={EVAL_SEED}")
 NO_SEARCH = tuple(f"search.{name}=null" for name in KNOBS)
 ENDS = ("start", "best", "true model", "reference")
@@ -238,18 +238,22 @@ def outcome_table(rows: Any) -> str:
 
 
 def method_table(rows: Any) -> str:
-    """Format J of single methods, relative to the start's: the median and the worst seed."""
+    """Format J of single methods, relative to the start's: the median and the worst seed.
+
+    A case's seeds are those with which all its methods have run.
+    """
     lines = []
     for case, runs in by_case(rows):
         if case not in METHOD_CASES:
             continue
-        cells = []
+        common = set.intersection(*({*found["seed"]} for _, found in runs.groupby("way")))
+        runs, cells = runs[runs["seed"].isin([*common])], []
         for way in (*WAYS, *METHODS):
             found = runs[runs["way"] == way]
             percent = percents(found)
             cells.append(f"{np.median(percent):.1f} ({percent.max():.1f})" if len(found) else "")
-        lines.append([case, *cells])
-    return table(["J / J of the start, %: median (worst)", *WAYS, *METHODS], lines)
+        lines.append([case, str(len(common)), *cells])
+    return table(["J / J of the start, %: median (worst)", "seeds", *WAYS, *METHODS], lines)
 
 
 def closed(start: np.ndarray, best: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -283,10 +287,9 @@ def wanted(
     cases = [case for case in CASES if any(part in case for part in parts)]
     for seed in seeds:
         yield from ((case, way, seed) for case in cases for way in WAYS if way in ways)
-        if seed in METHOD_SEEDS:
-            some = [case for case in cases if case in METHOD_CASES]
-            pairs = ((case, way) for case in some for way in METHODS if way in ways)
-            yield from ((case, way, seed) for case, way in pairs if applies(case, way))
+        some = [case for case in cases if case in METHOD_CASES]
+        pairs = ((case, way) for case in some for way in METHODS if way in ways)
+        yield from ((case, way, seed) for case, way in pairs if applies(case, way))
 
 
 def main(arguments: Iterable[str] | None = None) -> None:
@@ -310,10 +313,10 @@ def main(arguments: Iterable[str] | None = None) -> None:
             add(options.results, row := run(case, way, seed))
             print(*row.values(), flush=True)
     rows = finished(options.results)
-    all_seeds: Any = rows[rows["seed"].isin(options.seeds) & rows["way"].isin([*WAYS])]
-    few: Any = rows[rows["seed"].isin([*METHOD_SEEDS])]
-    tables = f"{outcome_table(all_seeds)}\n\n{reference_table(all_seeds)}"
-    text = replaced(replaced(text, tables, "improvement"), method_table(few), "methods")
+    rows = rows[rows["seed"].isin(options.seeds)]
+    both: Any = rows[rows["way"].isin([*WAYS])]
+    tables = f"{outcome_table(both)}\n\n{reference_table(both)}"
+    text = replaced(replaced(text, tables, "improvement"), method_table(rows), "methods")
     options.page.write_text(text, encoding="utf-8")
 
 
