@@ -178,6 +178,17 @@ def test_the_mean_squared_error_falls_slowly_and_is_part_of_the_state():
     assert other.param_groups[0]["variance"] == variance
 
 
+def test_residuals_of_parts_that_do_not_learn_change_nothing():
+    mpcs = [tied(learn=("c", "q")) for _ in range(2)]
+    errors = PredictionErrors(mpcs[0])
+    errors.add(*transitions())
+    s, a = random_states(COUNT), random_states(COUNT, 1, size=0.45, seed=1)
+    for mpc, residuals in zip(mpcs, (errors.residuals, None), strict=True):
+        optimizer = GaussNewton(mpc, residuals=residuals)
+        optimizer.step(s, a, mpc.action_value(s, a).detach() + 0.1)
+    assert_close(mpcs[0].state_dict(), mpcs[1].state_dict(), rtol=0, atol=0)
+
+
 def test_transitions_that_are_not_finite_are_omitted():
     mpc, (s, a, following) = tied(), transitions(10)
     clean, errors = PredictionErrors(mpc), PredictionErrors(mpc)

@@ -355,6 +355,8 @@ class GaussNewton(torch.optim.Optimizer):
         with torch.enable_grad():
             r = self._residuals(self._mpc.quadratic_program())
             r = group["variance"] ** 0.5 * r.to(delta)
+        if not r.requires_grad:  # of parts that are not learned, or frozen
+            return delta.new_zeros(0)
         leaves = [block.leaf for block in blocks]
         unit = torch.eye(len(r)).to(r)
         gradients = torch.autograd.grad(r, leaves, unit, is_grads_batched=True, allow_unused=True)
