@@ -9,11 +9,7 @@ import torch
 
 from tests.problems import normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, QPError
-from torch_qpmpc.analysis.policy import (
-    local_gain,
-    policy_map,
-    spectral_radius,
-)
+from torch_qpmpc.analysis.policy import local_gain, policy_map, spectral_radius
 from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
 
 A = torch.tensor([[1.0, 0.2], [-0.1, 1.1]], dtype=torch.float64)

@@ -14,11 +14,7 @@ import torch
 
 from tests.mistakes.objects import A2, B1, S, form, mpc, op
 from torch_qpmpc.analysis.model_error import first_state_error, one_step_error, second_moment
-from torch_qpmpc.analysis.policy import (
-    local_gain,
-    policy_map,
-    spectral_radius,
-)
+from torch_qpmpc.analysis.policy import local_gain, policy_map, spectral_radius
 from torch_qpmpc.analysis.prediction_form import canonical_matrix, model_form, prediction_form
 from torch_qpmpc.analysis.report import read, structure_metrics
 from torch_qpmpc.analysis.structure import (

@@ -11,11 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.analysis.model_error import one_step_error
-from torch_qpmpc.analysis.policy import (
-    local_gain,
-    spectral_radius,
-    window_model,
-)
+from torch_qpmpc.analysis.policy import local_gain, spectral_radius, window_model
 from torch_qpmpc.analysis.prediction_form import PredictionForm, canonical_matrix, prediction_form
 from torch_qpmpc.analysis.structure import (
     Model,

@@ -105,8 +105,8 @@ def tighten(
 class BackOff:
     """The tightening of a QPMPC whose model is learned, for a noise that is estimated.
 
-    The prediction's errors are fed back by the regulator of the model and the stage cost, or not,
-    if the Riccati equation of these has no solution.
+    The regulator of the model and the stage cost feeds the prediction's errors back; if their
+    Riccati equation has no solution, nothing does.
 
     Args:
         mpc: the QPMPC with its nominal bounds.
@@ -138,7 +138,6 @@ class BackOff:
         if not (mpc.soft & (mpc.lb.isfinite() | mpc.ub.isfinite())).any():
             got, want = "one without soft bounds", "soft bounds to tighten"
             raise QPError.expected("mpc", got, want, "Leave the back-off out.")
-        mpc.model()  # raises if C is free
         self.mpc, self._probability = mpc, probability
         self._lb, self._ub = mpc.lb.detach().clone(), mpc.ub.detach().clone()
         self.tighten(mpc.lb.new_zeros(mpc.n_x, mpc.n_x))

@@ -199,13 +199,11 @@ class Config(Group):
             self.conflict("optimizer.name", "gauss_newton", "prediction is part of its steps.")
         if self.prediction and not {"C", "b"} & {*self.constraint.learn}:
             self.conflict("constraint.learn", "a list with C or b, which prediction moves")
-        bounds = {"lb", "ub"}
-        if self.back_off is not None and bounds & {*self.constraint.learn}:
-            remedy = "back_off moves the bounds."
-            self.conflict("constraint.learn", "a list without lb and ub", remedy)
-        if self.back_off is not None and bounds & {*self.policy_gradient.parts}:
-            remedy = "back_off moves the bounds."
-            self.conflict("policy_gradient.parts", "a list without lb and ub", remedy)
+        moved = {"constraint.learn": self.constraint.learn}
+        moved["policy_gradient.parts"] = self.policy_gradient.parts
+        for key, parts in moved.items():
+            if self.back_off is not None and {"lb", "ub"} & {*parts}:
+                self.conflict(key, "a list without lb and ub", "back_off moves the bounds.")
         return self
 
     @model_validator(mode="after")
