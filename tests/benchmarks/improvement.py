@@ -78,8 +78,8 @@ CASES = {
     "Point mass, Brownian noise, corrupted": Case(("task=point_mass", "noise=brownian")),
     "Point mass, Brownian noise, identified": Case(("task=point_mass", "noise=brownian", DATA)),
     "Gros-Zanon, corrupted": Case(("task=gros_zanon",), "tightened"),
-    "Gros-Zanon, corrupted, constraint=adaptive": Case(
-        ("task=gros_zanon", "constraint=adaptive"), "tightened"
+    "Gros-Zanon, corrupted, TD errors alone": Case(
+        ("task=gros_zanon", "constraint=mpc", "task.learn_cost=[q,c]"), "tightened"
     ),
     # Random actions in one long episode would diverge.
     "Gros-Zanon, identified": Case(("task=gros_zanon", DATA), "tightened", SHORT_EPISODES),
@@ -118,7 +118,7 @@ POINT_MASS: dict[str, Sequence[str]] = {
 METHOD_CASES: dict[str, dict[str, Sequence[str]]] = {
     "Point mass, Gaussian noise, identified": POINT_MASS,
     "Point mass, Brownian noise, identified": POINT_MASS,
-    "Gros-Zanon, corrupted": {
+    "Gros-Zanon, corrupted, TD errors alone": {
         POLICY: ("policy_gradient.parts=[w]", "policy_gradient.memory=250", "exploration_std=0.1"),
     },
     "House, identified": {POLICY: ("policy_gradient.parts=[b,lb]",)},
@@ -200,7 +200,7 @@ def add(path: Path, row: Any) -> None:
     new = not path.exists()
     path.parent.mkdir(exist_ok=True)
     with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, FIELDS)
+        writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
         if new:
             writer.writeheader()
         writer.writerow(row)
@@ -238,22 +238,22 @@ def outcome_table(rows: Any) -> str:
 
 
 def method_table(rows: Any) -> str:
-    """Format J of single methods, relative to the start's: the median and the worst seed.
+    """Format J of single methods, relative to the start's, with a column for each case.
 
     A case's seeds are those with which all its methods have run.
     """
-    lines = []
+    head = ["J / J of the start, %: median [interval], worst"]
+    lines = [["seeds"], *([way] for way in (*WAYS, *METHODS))]
     for case, runs in by_case(rows):
         if case not in METHOD_CASES:
             continue
         common = set.intersection(*({*found["seed"]} for _, found in runs.groupby("way")))
-        runs, cells = runs[runs["seed"].isin([*common])], []
-        for way in (*WAYS, *METHODS):
-            found = runs[runs["way"] == way]
-            percent = percents(found)
-            cells.append(f"{np.median(percent):.1f} ({percent.max():.1f})" if len(found) else "")
-        lines.append([case, str(len(common)), *cells])
-    return table(["J / J of the start, %: median (worst)", "seeds", *WAYS, *METHODS], lines)
+        head.append(case)
+        lines[0].append(str(len(common)))
+        for line in lines[1:]:
+            found: Any = runs[runs["seed"].isin([*common]) & (runs["way"] == line[0])]
+            line.append(ratios(found) if len(found) else "")
+    return table(head, lines)
 
 
 def closed(start: np.ndarray, best: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -117,7 +117,7 @@ def test_the_evaluation_has_a_seed_of_its_own(task):
 
 
 def test_the_learner_sees_each_transition_and_tightens_by_their_errors():
-    cfg = make_config(*SMALL, "optimizer=gauss_newton", "constraint=adaptive", "task=gros_zanon")
+    cfg = make_config(*SMALL, "optimizer=gauss_newton", "task=gros_zanon")
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
     learner = make_learner(cfg, make_operator(cfg, mpc), physics)
@@ -141,7 +141,7 @@ def test_the_learner_sees_each_transition_and_tightens_by_their_errors():
 
 
 def test_prediction_errors_are_made_where_they_are_used():
-    cfg = make_config(*SMALL, "optimizer=gauss_newton", "constraint=adaptive", "task=gros_zanon")
+    cfg = make_config(*SMALL, "optimizer=gauss_newton", "task=gros_zanon")
     mpc = make_mpc(cfg, make_physics(cfg))
     for prediction, back_off in ((0.0, None), (2.0, None), (0.0, 0.9)):
         cfg.prediction, cfg.back_off = prediction, back_off

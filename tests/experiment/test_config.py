@@ -605,12 +605,17 @@ def test_solver_must_be_known():
         ),
         (
             ["constraint=adaptive", "algo=td3", "prediction=0"],
-            "algo.name: got 'td3', expected qlearning. td3 does not support prediction and back",
+            "algo.name: got 'td3', expected qlearning. td3 does not support prediction and "
+            "back_off; constraint=mpc has neither",
         ),
-        (["constraint=adaptive", "release=5"], "release: got 5, expected null. prediction and"),
+        (
+            ["constraint=adaptive", "release=5"],
+            "release: got 5, expected null. prediction and back_off need a tied C; constraint=mpc",
+        ),
         (
             ["constraint=adaptive", "optimizer=adam"],
-            "optimizer.name: got 'adam', expected gauss_newton. prediction is part of its steps",
+            "optimizer.name: got 'adam', expected gauss_newton. prediction is part of its steps; "
+            "constraint=mpc has none",
         ),
         (
             ["constraint=adaptive", "constraint.learn=[]"],
@@ -618,11 +623,13 @@ def test_solver_must_be_known():
         ),
         (
             ["constraint=adaptive", "constraint.learn=[C,lb]"],
-            r"constraint.learn: got \['C', 'lb'\], expected a list without lb and ub. back_off",
+            r"constraint.learn: got \['C', 'lb'\], expected a list without lb and ub. back_off "
+            "moves the bounds; constraint=mpc has none",
         ),
         (
             ["constraint=adaptive", "policy_gradient.parts=[ub]"],
-            r"policy_gradient.parts: got \['ub'\], expected a list without lb and ub. back_off",
+            r"policy_gradient.parts: got \['ub'\], expected a list without lb and ub. back_off "
+            "moves the bounds; constraint=mpc has none",
         ),
         (
             ["average=0.9", "gate=false"],

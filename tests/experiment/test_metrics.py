@@ -70,7 +70,7 @@ def test_table_shows_the_change_of_J_without_a_gap(ends, J, discounted):
 
 
 def test_the_numbers_of_theta_are_logged_where_they_are_few():
-    cfg = make_config("task=gros_zanon", "solver=daqp")
+    cfg = make_config("task=gros_zanon", "constraint=mpc", "task.learn_cost=[q,c]")
     metrics = theta_metrics(make_mpc(cfg, make_physics(cfg)))
     expected = {"theta/c": 0.0, "theta/A_1": 0.25, "theta/B_0": 0.0312, "theta/ub_0": 2.0}
     assert {name: metrics[name] for name in expected} == pytest.approx(expected)

@@ -111,7 +111,7 @@ def test_configuration_reaches_the_qp():
 
 
 def test_the_other_task_starts_from_the_original_wrong_model():
-    cfg = make_config("task=gros_zanon")
+    cfg = make_config("task=gros_zanon", "constraint=mpc", "task.learn_cost=[q,c]")
     physics = linear_system(cfg)
     assert isinstance(physics, GrosZanonLTI)
     mpc = make_mpc(cfg, physics)

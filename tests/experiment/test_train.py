@@ -238,10 +238,12 @@ STREAM = (
 )
 
 
-def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
-    cfg = make_config(*STREAM, "updates=40", "eval_interval=20", "seed=69")
+@pytest.mark.parametrize("overrides", [(), ("constraint=mpc", "task.learn_cost=[q,c]")], ids=str)
+def test_a_stream_whose_transitions_are_used_once_learns(tmp_path, overrides):
+    cfg = make_config(*STREAM, *overrides, "updates=40", "eval_interval=20", "seed=69")
     summary = train.train(cfg, str(tmp_path))
-    names = {"constraint": "mpc", "noise": "uniform", "updates": 40}
+    constraint = "mpc" if overrides else "adaptive"
+    names = {"constraint": constraint, "noise": "uniform", "updates": 40}
     assert {**summary, **names} == summary
     assert summary["unsolved"] == 0
     assert summary["J_final"] < 0.5 * summary["J_start"]
@@ -249,10 +251,14 @@ def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
     assert 0 < summary["train_violation"] < 3
     table = metrics(tmp_path)
     assert sorted(table.index) == list(range(41))
-    theta = table[[f"theta/{name}" for name in ("c", "A_0", "B_1", "b_0", "lb_0", "q_4")]]
-    assert (theta.dropna().std() > 0).all()
-    hard = table[["theta/lb_2", "theta/ub_2"]].dropna()
-    assert (hard == [-1.0, 1.0]).all(axis=None)
+    moved = ["c", "A_0", "B_1", "b_0", *(("lb_0", "q_4") if overrides else ())]
+    assert (table[[f"theta/{name}" for name in moved]].dropna().std() > 0).all()
+    if overrides:
+        hard = table[["theta/lb_2", "theta/ub_2"]].dropna()
+        assert (hard == [-1.0, 1.0]).all(axis=None)
+    else:
+        assert not {"theta/lb_0", "theta/q_4"} & {*table}
+        assert (table["train/margin"].dropna() > 0.05).all()
     violation = table["train/violation"].dropna()
     assert (violation.diff().dropna() >= 0).all()
     assert violation[40] == pytest.approx(summary["train_violation"])
@@ -330,7 +336,7 @@ def test_each_ablation_runs(tmp_path, name):
 @pytest.mark.parametrize(("rule", "optimizer"), [("projection", "recursive"), ("sdp", "adam")])
 def test_a_scheme_with_dense_weights_learns_them_by_each_rule(tmp_path, rule, optimizer):
     """The scheme is released in mid-training."""
-    dense = ("task.learn_cost=[H,H_f,q,c,w]", "updates=12", "eval_interval=12", "release=6")
+    dense = ("constraint=mpc", "task.learn_cost=[H,H_f,q,c,w]", "updates=12", "release=6")
     cfg = make_config(*STREAM, *dense, f"optimizer={optimizer}", f"step={rule}", "batch_size=4")
     assert train.train(cfg, str(tmp_path))["unsolved"] == 0
     state = load_checkpoint(tmp_path / "checkpoint.pt")["mpc"]

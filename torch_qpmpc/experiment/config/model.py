@@ -191,19 +191,23 @@ class Config(Group):
             remedy = "prediction and back_off need one model for all stages: constraint=adaptive."
             self.conflict("constraint.structure", "tied", remedy)
         if self.algo.name != "qlearning":
-            remedy = f"{self.algo.name} does not support prediction and back_off."
+            name = self.algo.name
+            remedy = f"{name} does not support prediction and back_off; constraint=mpc has neither."
             self.conflict("algo.name", "qlearning", remedy)
         if self.release is not None:
-            self.conflict("release", "null", "prediction and back_off need a tied C.")
+            remedy = "prediction and back_off need a tied C; constraint=mpc has neither."
+            self.conflict("release", "null", remedy)
         if self.prediction and not self.second_order:
-            self.conflict("optimizer.name", "gauss_newton", "prediction is part of its steps.")
+            remedy = "prediction is part of its steps; constraint=mpc has none."
+            self.conflict("optimizer.name", "gauss_newton", remedy)
         if self.prediction and not {"C", "b"} & {*self.constraint.learn}:
             self.conflict("constraint.learn", "a list with C or b, which prediction moves")
         moved = {"constraint.learn": self.constraint.learn}
         moved["policy_gradient.parts"] = self.policy_gradient.parts
         for key, parts in moved.items():
             if self.back_off is not None and {"lb", "ub"} & {*parts}:
-                self.conflict(key, "a list without lb and ub", "back_off moves the bounds.")
+                remedy = "back_off moves the bounds; constraint=mpc has none."
+                self.conflict(key, "a list without lb and ub", remedy)
         return self
 
     @model_validator(mode="after")
