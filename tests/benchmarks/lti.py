@@ -1,9 +1,10 @@
 """Gros and Zanon's linear system, compared with mpcrl: ``python -m tests.benchmarks.lti``.
 
-Both learn all numbers of a linear MPC scheme from one endless episode, on the same noise. The
+Both learn a linear MPC scheme with a wrong model in one endless episode, on the same noise. The
 schemes are the same but for the terminal cost, an undiscounted regulator's there and the discounted
-one's here. Ours learns as `task=gros_zanon` does, after 25 steps or after each as mpcrl; and by TD
-errors alone, in q, too, also from the latest transitions. The tables go into docs/results/mpcrl.md.
+one's here. Ours learns as `task=gros_zanon` does, after 25 steps or after each as mpcrl; and all its
+numbers by TD errors alone, as mpcrl does, also from the latest transitions. The tables go into
+docs/results/mpcrl.md.
 """
 
 from __future__ import annotations
