@@ -2,7 +2,7 @@
 
 Both learn a linear MPC scheme with a wrong model in one endless episode, on the same noise. The
 schemes are the same but for the terminal cost, an undiscounted regulator's there and the discounted
-one's here. Ours learns as `task=gros_zanon` does, after 25 steps or after each as mpcrl; and all its
+one's here. Ours learns as `task=gros_zanon` does, after 25 steps or after each as mpcrl; and all
 numbers by TD errors alone, as mpcrl does, also from the latest transitions. The tables go into
 docs/results/mpcrl.md.
 """
