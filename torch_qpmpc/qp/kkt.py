@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, multiply
+from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, largest, multiply, times
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import NDIMS, Status
 from torch_qpmpc.qp.solution import active_rows
@@ -19,6 +19,8 @@ from torch_qpmpc.qp.tracing import has_values, is_differentiating
 
 #: A KKT system whose solution has a larger relative residual counts as singular.
 SINGULAR = 1e-8
+#: Unit normals that differ by at most this are parallel: data in float32 are no more accurate.
+PARALLEL = 1e-6
 #: Event dimensions of the operator's tensors: four gradients; z, lam, status; H, .., fixed.
 KKT_NDIMS = (1, 1, 1, 1, 1, 1, 0, *NDIMS, 1)
 
@@ -126,12 +128,38 @@ def _solve_active(
     H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Solve ``H v + G't = right_v, G v = right_t``; G and right_t are zero in inactive rows."""
-    d = H.shape[-1]
     rows = active.any(dim=0).nonzero().squeeze(-1)
-    G, idle = G[:, rows], (~active[:, rows]).to(H.dtype)
+    G, right, idle = G[:, rows], right_t[:, rows], ~active[:, rows]
+    v, t_rows = _solve_rows(H, G, idle, right_v, right)
+    if (again := _is_strained(H, G, v, t_rows, right_v)).any():
+        # Rows that are dependent but for rounding, which would decide about v: an orthonormal basis
+        # of them, and of all t the one of least norm.
+        size = torch.linalg.vector_norm(G[again], dim=-1) + idle[again]
+        left, singular, basis = torch.linalg.svd(G[again] / size.unsqueeze(-1), full_matrices=False)
+        kept = singular > PARALLEL * singular[:, :1]
+        inverse = (left * (kept / singular.where(kept, 1)).unsqueeze(-2)) / size.unsqueeze(-1)
+        basis, of_basis = basis * kept.unsqueeze(-1), times(inverse.mT, right[again])
+        v[again], of_basis = _solve_rows(H[again], basis, ~kept, right_v[again], of_basis)
+        t_rows[again] = times(inverse, of_basis)
+    t = torch.zeros_like(right_t)
+    t[:, rows] = t_rows
+    return v, t
+
+
+def _is_strained(H: Tensor, G: Tensor, v: Tensor, t: Tensor, right_v: Tensor) -> Tensor:
+    """Return the mask of QPs in which terms of G't cancel to a fraction of their size, ``(B,)``."""
+    others = largest(right_v) + largest(H.flatten(1)) * largest(v)
+    return PARALLEL * largest(largest(G) * t) > others
+
+
+def _solve_rows(
+    H: Tensor, G: Tensor, idle: Tensor, right_v: Tensor, right_t: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Solve ``H v + G't = right_v, G v = right_t``, with t = 0 in the ``idle`` rows."""
+    d = H.shape[-1]
     top = torch.cat((H, G.mT), dim=-1)
-    kkt = torch.cat((top, torch.cat((G, torch.diag_embed(idle)), dim=-1)), dim=-2)
-    right = torch.cat((right_v, right_t[:, rows]), dim=-1).unsqueeze(-1)
+    kkt = torch.cat((top, torch.cat((G, torch.diag_embed(idle.to(H))), dim=-1)), dim=-2)
+    right = torch.cat((right_v, right_t), dim=-1).unsqueeze(-1)
     solution = torch.linalg.solve_ex(kkt, right)[0]
     error = (kkt @ solution - right).abs().amax(dim=(-2, -1)) if kkt.numel() else right.new_zeros(0)
     bound = SINGULAR * (1 + right.abs().amax(dim=(-2, -1))) if kkt.numel() else error
@@ -140,9 +168,7 @@ def _solve_active(
         # Dependent active rows or directions without curvature: take the least-norm solution.
         inverse = torch.linalg.pinv(kkt[singular], hermitian=True)
         solution[singular] = inverse @ right[singular]
-    t = torch.zeros_like(right_t)
-    t[:, rows] = solution[:, d:, 0]
-    return solution[:, :d, 0], t
+    return solution[:, :d, 0], solution[:, d:, 0]
 
 
 kkt_op = torch.library.custom_op("torch_qpmpc::solve_kkt", solve_kkt, mutates_args=())
