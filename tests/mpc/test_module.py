@@ -3,15 +3,17 @@ from __future__ import annotations
 import copy
 import io
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.func import jacfwd, jacrev
 from torch.testing import assert_close
 
 from tests.problems import MIXED, random_mpc, random_states, step
-from torch_qpmpc import QPMPC, QPError, SolverError, Status
+from torch_qpmpc import QPMPC, QPError, QPSolution, SolverError, Status, solve_qp
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
 
 A = torch.tensor([[1.0, 0.2], [0.0, 0.9]]).double()
@@ -104,6 +106,52 @@ def test_without_bounds_it_is_the_discounted_linear_quadratic_regulator():
     s = random_states(5)
     assert_close(mpc.value(s), 0.5 * ((s @ P) * s).sum(-1))
     assert_close(mpc.policy(s), -s @ K.mT)
+
+
+#: Schemes with a state at which rows meet without a multiplier, or many rows have one.
+STRUCTURED: dict[str, tuple[dict[str, Any], list[float]]] = {
+    "set-point": ({"terminal_constraints": ([[1, 0], [0, 1]], [0, 0], [0, 0])}, [0, 0]),
+    "opposite": ({"terminal_constraints": ([[1, 0], [-2, 0]], [-9, -9], [0, 0])}, [0, 0]),
+    "no power": (
+        {"constraints": ([[0, 0, 1, 1], [0, 0, 3, 0], [0, 0, 0, 1]], [-9, 0, 0], [0, 9, 9])},
+        [0, 0],
+    ),
+    "pinned": ({"action_bounds": ([-9, 0], [9, 0])}, [0, 0]),
+    "pinned, away": ({"action_bounds": ([-9, 0], [9, 0])}, [0.5, -0.3]),
+    "saturated": ({"action_bounds": ([-0.2, -0.1], [0.2, 0.1])}, [4, -1]),
+}
+
+
+@pytest.mark.parametrize("solver", ["proxqp", "daqp", "torch"])
+@pytest.mark.parametrize("name", STRUCTURED)
+def test_derivatives_where_a_controller_spends_its_life(name, solver):
+    options, s = STRUCTURED[name]
+    mpc = QPMPC.from_model(
+        A,
+        torch.cat((B, torch.tensor([[0.1], [0.2]]).double()), 1),
+        4,
+        stage_weight=torch.diag(torch.tensor([1.0, 0.2, 0.1, 0.3])) + 0.01,
+        constraint_slack=torch.inf,
+        **options,
+    )
+    program, towards = mpc.quadratic_program(), random_states(*mpc.C.shape)
+
+    def solution(p: Tensor) -> QPSolution:
+        C = program.C.detach() + p[2] * towards
+        return solve_qp(replace(program, C=C, check_values=False), p[:2], solver=solver)
+
+    def policy(p: Tensor) -> Tensor:
+        return solution(p).z[2:4]
+
+    def slope(p: Tensor) -> Tensor:
+        return jacrev(lambda p: solution(p).value)(p)
+
+    at = torch.tensor([*s, 0.0]).double()
+    for f in (policy, slope):
+        steps = 1e-4 * torch.eye(3).double()
+        differences = torch.stack([(f(at + d) - f(at - d)) / 2e-4 for d in steps], -1)
+        for derivative in (jacrev(f)(at), jacfwd(f)(at)):
+            assert_close(derivative, differences, rtol=1e-4, atol=1e-4)
 
 
 def test_the_solution_of_a_banded_scheme_is_a_trajectory_with_its_cost():

@@ -1,15 +1,18 @@
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import pytest
 import torch
 from torch import Tensor
-from torch.func import jacrev, vmap
+from torch.func import hessian, jacfwd, jacrev, vmap
 from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states
 from torch_qpmpc import QPError, QuadraticProgram, solve_qp
+from torch_qpmpc.qp import kkt
 from torch_qpmpc.qp.program import EVENT_SHAPES
-from torch_qpmpc.qp.solution import active_rows
+from torch_qpmpc.qp.solution import saturated_rows
 
 OPERANDS = (*EVENT_SHAPES, "fixed")
 PARTS = ("value", "z", "sigma", "chi", "upsilon", "eta", "xi")
@@ -65,7 +68,7 @@ def test_saturated_rows_pass_on_their_weight():
     operands = operands_of(known)
     leaf = operands[OPERANDS.index("w")].requires_grad_()
     (gradient,) = torch.autograd.grad(part_of(operands, "z").sum(), leaf)
-    saturated = active_rows(known.lam, known.qp.w)[1]
+    saturated = saturated_rows(known.lam, known.qp.w)
     assert saturated.any()
     assert (gradient[saturated] != 0).all()
     assert (gradient[~saturated] == 0).all()
@@ -237,3 +240,238 @@ def test_the_gradient_of_z_does_not_depend_on_the_units(cost, length):
     assert ordinary.abs().max() > 0.1
     found = jacrev(lambda q: in_units(q, cost, length))(q)
     assert_close(found, ordinary, rtol=1e-8, atol=1e-8)
+
+
+# Structured points: bounds that coincide, opposite rows, corners
+
+INF = torch.inf
+#: An optimum without rows, for zero multipliers of rows through it.
+CENTRE = torch.tensor([0.4, -0.3, 0.2, 0.1, -0.5], dtype=torch.float64)
+#: A QP as a function of a few parameters.
+Family = Callable[[Tensor], tuple[QuadraticProgram, Tensor]]
+
+
+def vector(*entries: float) -> Tensor:
+    return torch.tensor(entries, dtype=torch.float64)
+
+
+def family(
+    rows: Tensor,
+    lb: Sequence[float],
+    ub: Sequence[float],
+    w: Sequence[float],
+    shift: Sequence[float] = (0.0,),
+    moves: Tensor | None = None,
+) -> Family:
+    """Return QPs in z of 5, the first entry fixed, with C z = b and ``rows`` (z - CENTRE).
+
+    Parameter 0 moves the bounds by ``moves`` (by default all by 1), parameter 1 the fixed entry, 2
+    to 6 move q, and 7 b. ``shift`` is added to q, to put multipliers on the rows.
+    """
+    M, C, fixed = normal(5, 5), normal(1, 5, seed=1), CENTRE[:1]
+    H = M @ M.mT + torch.eye(5, dtype=torch.float64)
+    moves = torch.ones(len(rows), dtype=torch.float64) if moves is None else moves
+    offset = rows @ CENTRE
+
+    def program(p: Tensor) -> tuple[QuadraticProgram, Tensor]:
+        q = -H @ CENTRE + vector(*shift).expand(5) + p[2:7]
+        b, move = C @ CENTRE + p[7:], offset + moves * p[0]
+        rest = rows, vector(*lb) + move, vector(*ub) + move, vector(*w)
+        return QuadraticProgram(H, q, 0 * q[0], C, b, *rest, check_values=False), fixed + p[1:2]
+
+    return program
+
+
+def assert_derivatives_at_the_origin(program: Family, solver: str) -> None:
+    """Compare all derivatives of z, and the second ones of the value, with differences."""
+
+    def z(p: Tensor) -> Tensor:
+        return solve_qp(*program(p), solver=solver).z
+
+    def value(p: Tensor) -> Tensor:
+        return solve_qp(*program(p), solver=solver).value
+
+    origin, step = torch.zeros(8, dtype=torch.float64), 1e-3
+    axes = step * torch.eye(8, dtype=torch.float64)
+    expected = torch.stack([z(e) - z(-e) for e in axes], -1) / (2 * step)
+    eager = torch.autograd.functional.jacobian(z, origin)
+    for slope in (eager, jacrev(z)(origin), jacfwd(z)(origin)):
+        assert_close(slope, expected, rtol=0, atol=1e-4)
+    first = torch.stack([jacrev(value)(e) - jacrev(value)(-e) for e in axes], -1) / (2 * step)
+    eager = torch.autograd.functional.hessian(value, origin)
+    for second in (eager, jacrev(jacrev(value))(origin), hessian(value)(origin)):
+        assert_close(second, first, rtol=1e-5, atol=1e-4)
+
+
+ROW = normal(1, 5, seed=2)
+SOLVERS = pytest.mark.parametrize("solver", ["proxqp", "daqp", "torch"])
+
+
+@SOLVERS
+@pytest.mark.parametrize("w", [INF, 50.0], ids=["hard", "soft"])
+@pytest.mark.parametrize("shift", [0.0, 1.0], ids=["no_multiplier", "multiplier"])
+def test_a_row_with_equal_bounds_is_an_equality(solver, w, shift):
+    rows = torch.cat((ROW, torch.eye(5, dtype=torch.float64)[2:]))
+    bounds = [0.0, -1.0, -1.0, -1.0], [0.0, 1.0, 1.0, 1.0]
+    weights = [w, INF, 5.0, INF]
+    assert_derivatives_at_the_origin(family(rows, *bounds, weights, [shift]), solver)
+
+
+@SOLVERS
+def test_a_soft_row_with_equal_bounds_beyond_its_price_is_not_held(solver):
+    assert_derivatives_at_the_origin(family(ROW, [0.0], [0.0], [0.1], [3.0]), solver)
+
+
+@SOLVERS
+@pytest.mark.parametrize("w", [INF, 50.0], ids=["hard", "soft"])
+@pytest.mark.parametrize("scale", [1.0, -1.0, 30.0, -1e-3])
+def test_opposite_rows_that_meet_are_an_equality(solver, w, scale):
+    """a'z <= beta and scale a'z >= scale beta, which is an upper bound if the scale is negative."""
+    rows, moves = torch.cat((ROW, scale * ROW)), vector(1.0, scale)
+    lower, upper = ([-INF, 0.0], [0.0, INF]) if scale > 0 else ([-INF, -INF], [0.0, 0.0])
+    assert_derivatives_at_the_origin(family(rows, lower, upper, [w, INF], moves=moves), solver)
+
+
+@SOLVERS
+def test_rows_that_pinch_z_together_are_equalities(solver):
+    """a'z >= 0, d'z >= 0 and (a + 2 d)'z <= 0 leave a'z = d'z = 0."""
+    pair = torch.cat((ROW, normal(1, 5, seed=3)))
+    rows, moves = torch.cat((pair, vector(1.0, 2.0)[None] @ pair)), vector(1.0, 1.0, 3.0)
+    bounds = [0.0, 0.0, -INF], [INF, INF, 0.0]
+    assert_derivatives_at_the_origin(family(rows, *bounds, [INF] * 3, moves=moves), solver)
+
+
+@SOLVERS
+def test_bounds_that_differ_by_rounding_are_equal(solver):
+    bounds = [0.0], [1e-15]
+    assert_derivatives_at_the_origin(family(ROW, *bounds, [INF]), solver)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_opposite_rows_are_recognised_in_all_units(dtype, unit):
+    one = torch.ones(2, dtype=dtype)
+
+    def z(t: Tensor) -> Tensor:
+        rows = torch.tensor([[0.3, 0.7], [-0.1, -0.7 / 3]], dtype=dtype)
+        ub = torch.stack((t, -t / 3))
+        none = one.new_zeros(0)
+        data = torch.eye(2, dtype=dtype), 0 * one, 0 * one[0], none.reshape(0, 2), none
+        qp = QuadraticProgram(*data, rows, -INF * one, ub, INF * one, check_values=False)
+        return solve_qp(qp, solver="daqp").z
+
+    # At t = 0 the multipliers are zero. z is linear in t.
+    slope = torch.autograd.functional.jacobian(z, torch.zeros((), dtype=dtype))
+    assert_close(unit * slope, z(torch.tensor(unit, dtype=dtype)), rtol=1e-5, atol=0)
+
+
+def test_equal_bounds_share_the_gradient_evenly_at_a_zero_multiplier():
+    zero, eye = torch.zeros(1, dtype=torch.float64), torch.eye(1, dtype=torch.float64)
+
+    def part(name: str) -> Callable[[Tensor, Tensor], Tensor]:
+        data = eye, zero, zero[0], eye[:0], zero[:0], eye
+        return lambda lb, ub: getattr(
+            solve_qp(QuadraticProgram(*data, lb, ub, INF + zero, check_values=False)), name
+        )
+
+    for jacobian in (jacrev, jacfwd):
+        assert [x.item() for x in jacobian(part("z"), argnums=(0, 1))(zero, zero)] == [0.5, 0.5]
+    for outer in (jacrev, jacfwd):
+        second = outer(jacrev(part("value"), argnums=(0, 1)), argnums=(0, 1))(zero, zero)
+        assert [x.item() for row in second for x in row] == [0.25] * 4
+
+
+def test_second_derivatives_do_not_reach_the_other_bound_of_a_row():
+    """V with -1 <= z <= t, -z <= -t depends on t alone, and not on the lower bound."""
+    eye, one = torch.eye(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+
+    def value(lower: Tensor, t: Tensor) -> Tensor:
+        lb, ub = torch.cat((lower, -INF * one)), torch.cat((t, -t))
+        data = eye, 0 * one, 0 * one[0], eye[:0], one[:0], torch.cat((eye, -eye))
+        qp = QuadraticProgram(*data, lb, ub, INF * one.expand(2), check_values=False)
+        return solve_qp(qp, solver="daqp").value
+
+    for second in (hessian, lambda f, argnums: jacrev(jacrev(f, argnums), argnums)):
+        (of_lower, mixed), (_, of_t) = second(value, argnums=(0, 1))(-one, 0 * one)
+        assert of_lower.item() == mixed.item() == 0
+        assert of_t.item() == pytest.approx(1.0)
+
+
+def test_structured_points_in_batches_and_under_vmap():
+    """The rows meet in three of four elements."""
+    gaps = vector(0.0, 0.5, 0.0, 1e-15)
+
+    program = family(torch.cat((ROW, -ROW)), [-INF] * 2, [0.0] * 2, [INF] * 2)
+
+    def z(p: Tensor, gap: Tensor) -> Tensor:
+        qp, fixed = program(p)
+        tensors = [*qp.tensors()[:7], qp.ub + torch.stack((0 * gap, gap)), qp.w]
+        return solve_qp(QuadraticProgram(*tensors, check_values=False), fixed, solver="daqp").z
+
+    points = torch.zeros(4, 8, dtype=torch.float64)
+    together = vmap(jacrev(z))(points, gaps)
+    alone = torch.stack([jacrev(z)(p, gap) for p, gap in zip(points, gaps, strict=True)])
+    assert_close(together, alone)
+    assert_close(together[0], together[3])
+    assert (together[0] - together[1]).abs().max() > 0.1
+
+
+def test_a_row_on_fixed_entries_alone_has_no_part_in_the_derivatives(monkeypatch):
+    monkeypatch.setattr(torch.linalg, "pinv", None)  # of a singular KKT system
+    rows, slopes = torch.eye(5, dtype=torch.float64)[[0, 2]], []
+    for width in (0.0, 1.0):
+        bounds = [-width, -1.0], [width, 1.0]
+        program = family(rows, *bounds, [5.0, INF], moves=torch.zeros(2, dtype=torch.float64))
+        origin = torch.zeros(8, dtype=torch.float64)
+        slopes.append(jacrev(lambda p, f=program: solve_qp(*f(p), solver="daqp").z)(origin))
+    assert_close(*slopes)
+
+
+@SOLVERS
+def test_at_a_corner_the_derivative_is_one_sided(solver):
+    """z at two of its bounds, with zero multipliers: as if these were absent."""
+    eye = torch.eye(5, dtype=torch.float64)[1:3]
+    program, origin = family(eye, [-1.0, -1.0], [0.0, 0.0], [INF, 5.0]), torch.zeros(8).double()
+
+    def z(p: Tensor) -> Tensor:
+        return solve_qp(*program(p), solver=solver).z
+
+    slope, inwards = jacrev(z)(origin), torch.zeros_like(origin)
+    inwards[2:7] = eye[0] + eye[1]
+    assert (slope @ inwards)[1:3].max() < -1e-3
+    step = 1e-3 * inwards
+    assert_close(slope @ step, z(step) - z(origin), rtol=0, atol=1e-8)
+
+
+def test_a_slack_has_no_slope_where_its_row_is_about_to_be_held():
+    one = torch.ones(1, dtype=torch.float64)
+
+    def sigma(s: Tensor) -> Tensor:
+        data = one.diag(), -s, 0 * one[0], one.diag()[:0], one[:0], one.diag(), -one, one, 5 * one
+        return solve_qp(QuadraticProgram(*data, check_values=False), solver="daqp").sigma
+
+    assert jacrev(sigma)(one).item() == 0
+    assert sigma(1.01 * one).item() == sigma(0.99 * one).item() == 0
+
+
+@SOLVERS
+def test_more_active_rows_than_variables_give_a_consistent_derivative(solver):
+    """z_1 <= 1, z_2 <= 1 and z_1 + z_2 <= 2, moved together, take z with them."""
+    one = torch.ones(3, dtype=torch.float64)
+    rows = torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
+    none = one.new_zeros(0)
+
+    def z(ub: Tensor) -> Tensor:
+        data = torch.eye(2).double(), -5 * one[:2], 0 * one[0], none.reshape(0, 2), none
+        return solve_qp(QuadraticProgram(*data, rows, -9 * one, ub, INF * one), solver=solver).z
+
+    slope = torch.autograd.functional.jacobian(z, vector(1.0, 1.0, 2.0))
+    assert_close(slope @ vector(1.0, 1.0, 2.0), vector(1.0, 1.0))
+    assert_close(slope @ vector(1.0, -1.0, 0.0), vector(1.0, -1.0))
+
+
+def test_opposite_rows_are_not_sought_without_weakly_active_ones(monkeypatch):
+    monkeypatch.setattr(kkt, "implied_equalities", None)
+    mpc, s = random_mpc(0), random_states(16, size=3.0).requires_grad_()
+    mpc.policy(s).sum().backward()
+    assert s.grad is not None

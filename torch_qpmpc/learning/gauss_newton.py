@@ -375,7 +375,7 @@ class GaussNewton(torch.optim.Optimizer):
         z, chi, lam = solution.z, solution.chi, solution.lam
         # Only the gradient in a learned w needs the slacks.
         sigma = solution.sigma if solution.qp.w.requires_grad else torch.zeros_like(lam)
-        gradients = envelope_gradients(weight, z, sigma, chi, lam, solution.xi)
+        gradients = envelope_gradients(weight, z, sigma, chi, lam, solution.eta, solution.xi)
         pairs = [(leaf, group) for group in self.param_groups for leaf in group["params"]]
         pairs = [(leaf, group) for leaf, group in pairs if leaf.requires_grad]
         factored, mask = self._free_C(), matrix(mpc, "C")[1]

@@ -24,8 +24,14 @@ and the tangents of the solution from those of the data, with dlam_S = sign(lam)
 
     -(dH z + dq + dC'chi + dG'lam + G_S'dlam_S),  db - dC z,  d(lb, ub)_A - dG_A z,  d(fixed)
 
-on the right-hand side. Where a row is weakly active (at its bound with a zero multiplier), the
-solution has a kink, and this is one of its one-sided derivatives.
+on the right-hand side.
+
+A row with lb = ub belongs to A whatever its multiplier. Its lb and ub share t by the sign of lam,
+evenly if lam = 0: only the sum of the two is defined. A also has the rows that opposite ones turn
+into equalities, see `torch_qpmpc.qp.kkt`. Where any other row is weakly active (at its bound with a
+zero multiplier), the solution has a kink, and this is the derivative without that row: the
+one-sided one for changes that move z off its bound. A row at the kink |lam| = w counts as
+saturated.
 """
 
 from __future__ import annotations
@@ -38,7 +44,8 @@ from torch import Tensor
 from torch_qpmpc.qp.batching import outer, sum_to, times, weighted_sum
 from torch_qpmpc.qp.kkt import kkt
 from torch_qpmpc.qp.program import Status
-from torch_qpmpc.qp.solution import active_rows, slacks
+from torch_qpmpc.qp.solution import saturated_rows, slacks, upper_share
+from torch_qpmpc.qp.tracing import is_differentiating
 
 #: Tangents of H, q, c, C, b, G, lb, ub, w, fixed; None for zero.
 Tangents = Sequence[Tensor | None]
@@ -47,7 +54,7 @@ N_THETA = 10
 
 
 def envelope_gradients(
-    weight: Tensor, z: Tensor, sigma: Tensor, chi: Tensor, lam: Tensor, xi: Tensor
+    weight: Tensor, z: Tensor, sigma: Tensor, chi: Tensor, lam: Tensor, eta: Tensor, xi: Tensor
 ) -> dict[str, Callable[[Tensor], Tensor]]:
     """Return the gradients of sum_i weight_i value_i in the QP's tensors and the fixed entries.
 
@@ -61,8 +68,8 @@ def envelope_gradients(
         "C": lambda like: outer(chi, weighted_z, like),
         "b": lambda like: weighted_sum(negative, chi, like),
         "G": lambda like: outer(lam, weighted_z, like),
-        "lb": lambda like: weighted_sum(negative, lam.clamp(max=0), like),
-        "ub": lambda like: weighted_sum(negative, lam.clamp(min=0), like),
+        "lb": lambda like: weighted_sum(weight, eta - lam, like),
+        "ub": lambda like: weighted_sum(negative, eta, like),
         "w": lambda like: weighted_sum(weight, sigma, like),
         "fixed": lambda like: weighted_sum(negative, xi, like),
     }
@@ -103,7 +110,11 @@ def _value_gradients(
     # An unsolved element has zeros here, but zero times what is infinite or NaN is NaN.
     weight = torch.where(solved, incoming, 0)
     sigma = torch.where(solved.unsqueeze(-1), slacks(z, *theta[5:9]), 0) if needed[8] else z
-    formulas = envelope_gradients(weight, z, sigma, chi, lam, xi).values()
+    eta = lam.clamp(min=0)
+    if (needed[6] or needed[7]) and is_differentiating():
+        # A clamp's derivative at zero is 1 on either side, which counts lb = ub twice.
+        eta = lam * upper_share(z, lam, *theta[5:8])
+    formulas = envelope_gradients(weight, z, sigma, chi, lam, eta, xi).values()
     return (f(x) if need else None for f, x, need in zip(formulas, theta, needed, strict=True))
 
 
@@ -120,8 +131,8 @@ def _solution_gradients(
     grads = [torch.zeros_like(x) if grad is None else grad for x, grad in pairs]
     grad_z, grad_chi, grad_lam, grad_xi = grads
     p, r, t, u = kkt(grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, n_kept)
-    _, saturated = active_rows(lam, w)
-    slope = torch.where(saturated, lam.sign() * (grad_lam - times(G, p)), 0)
+    upper = upper_share(z, lam, G, lb, ub) if needed[6] or needed[7] else lam
+    slope = torch.where(saturated_rows(lam, w), lam.sign() * (grad_lam - times(G, p)), 0)
     formulas = (
         lambda: -0.5 * (outer(p, z, H) + outer(z, p, H)),
         lambda: sum_to(-p, q),
@@ -129,8 +140,8 @@ def _solution_gradients(
         lambda: -(outer(chi, p, C) + outer(r, z, C)),
         lambda: sum_to(r, b),
         lambda: -(outer(lam, p, G) + outer(t, z, G)),
-        lambda: sum_to(torch.where(lam < 0, t, 0), lb),
-        lambda: sum_to(torch.where(lam > 0, t, 0), ub),
+        lambda: sum_to((1 - upper) * t, lb),
+        lambda: sum_to(upper * t, ub),
         lambda: sum_to(slope, w),
         lambda: sum_to(u, fixed),
     )
@@ -146,14 +157,22 @@ def tangents(
     """Return the tangents of value, z, chi, lam and xi from ``d_theta``, those of theta."""
     z, chi, lam, xi, status = solution
     sigma = slacks(z, *theta[5:9])
-    value = torch.where(status == 0, _value_tangent(d_theta, z, sigma, chi, lam, xi), 0)
-    *right, saturated = _right_side(d_theta, z, lam, chi, xi, theta[5], theta[8])
+    upper = upper_share(z, lam, *theta[5:8])
+    rise = _value_tangent(d_theta, z, sigma, chi, lam, upper * lam, xi)
+    value = torch.where(status == 0, rise, 0)
+    *right, saturated = _right_side(d_theta, z, lam, chi, xi, upper, theta[5], theta[8])
     dz, dchi, dlam, dxi = kkt(*right, z, lam, status, *theta, n_kept)
     return value, dz, dchi, dlam + saturated, dxi
 
 
 def _value_tangent(
-    d_theta: Tangents, z: Tensor, sigma: Tensor, chi: Tensor, lam: Tensor, xi: Tensor
+    d_theta: Tangents,
+    z: Tensor,
+    sigma: Tensor,
+    chi: Tensor,
+    lam: Tensor,
+    eta: Tensor,
+    xi: Tensor,
 ) -> Tensor:
     dH, dq, dc, dC, db, dG, dlb, dub, dw, dfixed = d_theta
     total = z.new_zeros(z.shape[:-1])
@@ -162,7 +181,7 @@ def _value_tangent(
     for matrix, left in ((dH, 0.5 * z), (dC, chi), (dG, lam)):
         if matrix is not None:
             total = total + (left * times(matrix, z)).sum(-1)
-    weights = (z, -chi, (-lam).clamp(min=0), -lam.clamp(min=0), sigma, -xi)
+    weights = (z, -chi, eta - lam, -eta, sigma, -xi)
     for vector, weight in zip((dq, db, dlb, dub, dw, dfixed), weights, strict=True):
         if vector is not None:
             total = total + (weight * vector).sum(-1)
@@ -170,7 +189,14 @@ def _value_tangent(
 
 
 def _right_side(
-    d_theta: Tangents, z: Tensor, lam: Tensor, chi: Tensor, xi: Tensor, G: Tensor, w: Tensor
+    d_theta: Tangents,
+    z: Tensor,
+    lam: Tensor,
+    chi: Tensor,
+    xi: Tensor,
+    upper: Tensor,
+    G: Tensor,
+    w: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return the right-hand side in the order z, lam, chi, xi, and dlam of saturated rows."""
     dH, dq, _, dC, db, dG, dlb, dub, dw, dfixed = d_theta
@@ -178,15 +204,15 @@ def _right_side(
     right_xi = torch.zeros_like(xi) if dfixed is None else dfixed.expand_as(xi)
     saturated = torch.zeros_like(lam)
     if dw is not None:
-        saturated = torch.where(active_rows(lam, w)[1], lam.sign() * dw, 0)
+        saturated = torch.where(saturated_rows(lam, w), lam.sign() * dw, 0)
         right_z = right_z - times(G.mT, saturated)
     if dH is not None:
         right_z = right_z - times(dH + dH.mT, z) / 2
     if dq is not None:
         right_z = right_z - dq
-    for bound, side in ((dlb, lam < 0), (dub, lam > 0)):
+    for bound, share in ((dlb, 1 - upper), (dub, upper)):
         if bound is not None:
-            right_lam = torch.where(side, bound, right_lam)
+            right_lam = right_lam + torch.where(share > 0, share * bound, 0)
     if db is not None:
         right_chi = right_chi + db
     if dC is not None:

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, multiply
+from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, largest, multiply, times
+from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, to_numpy
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import NDIMS, Status
 from torch_qpmpc.qp.solution import active_rows
@@ -19,6 +22,10 @@ from torch_qpmpc.qp.tracing import has_values, is_differentiating
 
 #: A KKT system whose solution has a larger relative residual counts as singular.
 SINGULAR = 1e-8
+#: A row is at its bound within this fraction of its size, the certificate's tolerance.
+AT_BOUND = TOLERANCE
+#: Unit normals that differ by at most this are parallel: data in float32 are no more accurate.
+PARALLEL = 1e-6
 #: Event dimensions of the operator's tensors: four gradients; z, lam, status; H, .., fixed.
 KKT_NDIMS = (1, 1, 1, 1, 1, 1, 0, *NDIMS, 1)
 
@@ -74,7 +81,7 @@ def solve_kkt(
         return flatten_batch(x.expand(*batch, x.shape[-1]))[solved].double()
 
     right = flat(grad_z), flat(grad_lam), flat(grad_chi), flat(grad_xi)
-    solutions = _solve_kkt(solvable, *right, flat(lam), z.device) if len(solvable) else ()
+    solutions = _solve_kkt(solvable, *right, flat(z), flat(lam)) if len(solvable) else ()
     results = tuple(z.new_zeros(len(solved), x.shape[-1]) for x in (z, b, lb, fixed))
     for x, solution in zip(results, solutions, strict=False):
         x[solved] = solution.to(x)
@@ -87,27 +94,23 @@ def _solve_kkt(
     grad_lam: Tensor,
     grad_chi: Tensor,
     grad_xi: Tensor,
+    z: Tensor,
     lam: Tensor,
-    device: torch.device,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    n_f = p.n_f
+    n_f, theta = p.n_f, p.prepared.theta
 
     def tensor(x: Any) -> Tensor:
-        return torch.as_tensor(x, device=device)
+        return torch.as_tensor(x, device=z.device)
 
-    theta, group, w = p.prepared.theta, tensor(p.group), tensor(p.theta.w)
+    group = tensor(p.group)
     H, C, G = tensor(theta.H), tensor(theta.C), tensor(theta.G)
     T, Y_neg, H_y, G_y, _, _ = map(tensor, p.prepared.condensed(n_f).arrays)
-    multipliers, weight = lam, w
-    if (units := p.prepared.units) is not None:  # a zero multiplier is zero relative to these
-        scale = tensor(units.rows / units.cost)[group]
-        multipliers, weight = lam * scale, w * scale
-    active, _ = active_rows(multipliers, weight)
+    active = _held_rows(p, multiply(G, group, z), lam)
     T_f, T = T[:, :, :n_f], T[:, :, n_f:]
     # A particular solution of C p = dl/dchi and E p = dl/dxi; the condensed system gives the rest.
     particular = multiply(T_f, group, grad_xi) - multiply(Y_neg, group, grad_chi)
     right_v = multiply(T.mT, group, grad_z - multiply(H, group, particular))
-    right_t = (grad_lam - multiply(G, group, particular)) * active
+    right_t = torch.where(active, grad_lam - multiply(G, group, particular), 0)
     v, t = _solve_active(
         H_y[group, n_f:, n_f:],
         G_y[group, :, n_f:] * active.unsqueeze(-1),
@@ -122,16 +125,113 @@ def _solve_kkt(
     return p_z, r, t, u
 
 
+def _held_rows(p: Programs, y: Tensor, lam: Tensor) -> Tensor:
+    """Return the mask of rows y = G z that stay at a bound if the data change, ``(B, n_g)``.
+
+    They are those of `active_rows`, and those that `implied_equalities` adds; rows without a free
+    variable have no part in the KKT system.
+    """
+
+    def tensor(x: Any) -> Tensor:
+        return torch.as_tensor(x, device=y.device)
+
+    lb, ub, w = map(tensor, p.theta[6:9])
+    if (units := p.prepared.units) is not None:  # zero and equal are relative to these
+        rows, cost = tensor(units.rows)[p.group], tensor(units.cost)[p.group]
+        y, lb, ub, lam, w = y / rows, lb / rows, ub / rows, lam * (rows / cost), w * (rows / cost)
+    held, saturated = active_rows(lam, lb, ub, w)
+    condensed = p.prepared.condensed(p.n_f)
+    entering = tensor(condensed.enters[:, p.n_f :].any(-1))
+    near, free = AT_BOUND * (1 + y.abs()), ~(held | saturated) & entering
+    held &= entering
+    lower, upper = free & (y - lb <= near), free & (ub - y <= near)
+    if (weak := (lower | upper).any(-1)).any():
+        index = to_numpy(weak.nonzero().squeeze(-1))
+        G = condensed.arrays.G[:, :, p.n_f :]
+        masks = (to_numpy(x)[index] for x in (lower, upper, held))
+        implied = _all_implied(G, to_numpy(p.group)[index], *masks)
+        held[weak] |= torch.from_numpy(implied).to(held.device)
+    return held
+
+
+def _all_implied(
+    G: np.ndarray, group: np.ndarray, lower: np.ndarray, upper: np.ndarray, held: np.ndarray
+) -> np.ndarray:
+    """Return `implied_equalities` of each QP, computed once for QPs with equal arguments."""
+    keys = np.concatenate((group[:, None], lower, upper, held), axis=1)
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    found = [implied_equalities(G[group[i]], lower[i], upper[i], held[i]) for i in first]
+    return np.stack(found)[inverse.reshape(-1)]
+
+
+def implied_equalities(
+    G: np.ndarray, lower: np.ndarray, upper: np.ndarray, held: np.ndarray
+) -> np.ndarray:
+    """Return a mask of independent weakly active rows that others turn into equalities, ``(n_g,)``.
+
+    A row with outward normal n stays at its bound if -n is a non-negative combination of the
+    others' normals plus any of the held rows': no feasible direction leaves it. Two opposite rows
+    are the simplest case; z_1 >= 0, z_2 >= 0, z_1 + z_2 <= 0 is another.
+
+    Args:
+        G: the rows in the free variables, ``(n_g, d)``.
+        lower, upper: masks of the rows with a zero multiplier at these bounds.
+        held: mask of the rows that are held already.
+    """
+    sizes = np.linalg.norm(G, axis=-1, keepdims=True)
+    G, implied = G / np.where(sizes > 0, sizes, 1), np.zeros_like(held)
+    rows = np.concatenate((upper.nonzero()[0], lower.nonzero()[0]))
+    normals = np.concatenate((G[upper], -G[lower]))
+    if held.any():
+        basis = scipy.linalg.orth(G[held].T, rcond=PARALLEL)
+        normals -= normals @ basis @ basis.T
+    rest = np.linalg.norm(normals, axis=-1)
+    free = rest > PARALLEL  # the others depend on held rows
+    rows, normals = rows[free], normals[free] / rest[free, None]
+    if np.linalg.matrix_rank(normals, tol=PARALLEL) < len(rows):
+        stuck = [scipy.optimize.nnls(normals.T, -n)[1] < PARALLEL for n in normals]
+        rows, normals = rows[stuck], normals[stuck]
+        _, R, order = scipy.linalg.qr(normals.T, mode="economic", pivoting=True)
+        implied[rows[order[: int((np.abs(R.diagonal()) > PARALLEL).sum())]]] = True
+    return implied
+
+
 def _solve_active(
     H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Solve ``H v + G't = right_v, G v = right_t``; G and right_t are zero in inactive rows."""
-    d = H.shape[-1]
     rows = active.any(dim=0).nonzero().squeeze(-1)
-    G, idle = G[:, rows], (~active[:, rows]).to(H.dtype)
+    G, right, idle = G[:, rows], right_t[:, rows], ~active[:, rows]
+    v, t_rows = _solve_rows(H, G, idle, right_v, right)
+    if (again := _is_strained(H, G, v, t_rows, right_v)).any():
+        # Rows that are dependent but for rounding, which would decide about v: an orthonormal basis
+        # of them, and of all t the one of least norm.
+        size = torch.linalg.vector_norm(G[again], dim=-1) + idle[again]
+        left, singular, basis = torch.linalg.svd(G[again] / size.unsqueeze(-1), full_matrices=False)
+        kept = singular > PARALLEL * singular[:, :1]
+        inverse = (left * (kept / singular.where(kept, 1)).unsqueeze(-2)) / size.unsqueeze(-1)
+        basis, of_basis = basis * kept.unsqueeze(-1), times(inverse.mT, right[again])
+        v[again], of_basis = _solve_rows(H[again], basis, ~kept, right_v[again], of_basis)
+        t_rows[again] = times(inverse, of_basis)
+    t = torch.zeros_like(right_t)
+    t[:, rows] = t_rows
+    return v, t
+
+
+def _is_strained(H: Tensor, G: Tensor, v: Tensor, t: Tensor, right_v: Tensor) -> Tensor:
+    """Return the mask of QPs in which terms of G't cancel to a fraction of their size, ``(B,)``."""
+    others = largest(right_v) + largest(H.flatten(1)) * largest(v)
+    return PARALLEL * largest(largest(G) * t) > others
+
+
+def _solve_rows(
+    H: Tensor, G: Tensor, idle: Tensor, right_v: Tensor, right_t: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Solve ``H v + G't = right_v, G v = right_t``, with t = 0 in the ``idle`` rows."""
+    d = H.shape[-1]
     top = torch.cat((H, G.mT), dim=-1)
-    kkt = torch.cat((top, torch.cat((G, torch.diag_embed(idle)), dim=-1)), dim=-2)
-    right = torch.cat((right_v, right_t[:, rows]), dim=-1).unsqueeze(-1)
+    kkt = torch.cat((top, torch.cat((G, torch.diag_embed(idle.to(H))), dim=-1)), dim=-2)
+    right = torch.cat((right_v, right_t), dim=-1).unsqueeze(-1)
     solution = torch.linalg.solve_ex(kkt, right)[0]
     error = (kkt @ solution - right).abs().amax(dim=(-2, -1)) if kkt.numel() else right.new_zeros(0)
     bound = SINGULAR * (1 + right.abs().amax(dim=(-2, -1))) if kkt.numel() else error
@@ -140,9 +240,7 @@ def _solve_active(
         # Dependent active rows or directions without curvature: take the least-norm solution.
         inverse = torch.linalg.pinv(kkt[singular], hermitian=True)
         solution[singular] = inverse @ right[singular]
-    t = torch.zeros_like(right_t)
-    t[:, rows] = solution[:, d:, 0]
-    return solution[:, :d, 0], t
+    return solution[:, :d, 0], solution[:, d:, 0]
 
 
 kkt_op = torch.library.custom_op("torch_qpmpc::solve_kkt", solve_kkt, mutates_args=())

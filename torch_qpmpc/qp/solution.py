@@ -15,12 +15,29 @@ from torch_qpmpc.qp.tracing import has_values
 ACTIVE_FRACTION = 1e-8
 
 
-def active_rows(lam: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the masks of rows held at a bound and saturated at |lam| = w, ``(*batch, n_g)``."""
-    size = lam.abs()
-    saturated = w.isfinite() & (size >= (1 - ACTIVE_FRACTION) * w)
+def active_rows(lam: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the masks of rows held at a bound and saturated at |lam| = w, ``(*batch, n_g)``.
+
+    A row with lb = ub is held whatever its multiplier.
+    """
+    saturated, size = saturated_rows(lam, w), lam.abs()
     largest = size.amax(-1, keepdim=True) if size.shape[-1] else size
-    return (size > ACTIVE_FRACTION * (1 + largest)) & ~saturated, saturated
+    return ((size > ACTIVE_FRACTION * (1 + largest)) | (lb >= ub)) & ~saturated, saturated
+
+
+def saturated_rows(lam: Tensor, w: Tensor) -> Tensor:
+    """Return the mask of rows with |lam| = w, ``(*batch, n_g)``."""
+    return w.isfinite() & (lam.abs() >= (1 - ACTIVE_FRACTION) * w)
+
+
+def upper_share(z: Tensor, lam: Tensor, G: Tensor, lb: Tensor, ub: Tensor) -> Tensor:
+    """Return the derivative of eta in lam, ``(*batch, n_g)``: 1 at ub, 0 at lb.
+
+    The sign of lam decides, for lam = 0 the nearer bound; 1/2 if both are equally near.
+    """
+    y = _rows(z, G)
+    side = torch.where(lam == 0, (y - lb) - (ub - y), lam).detach()
+    return (1 + side.nan_to_num().sign()) / 2  # NaN where both bounds are infinite
 
 
 def row_states(p, lower, upper, w) -> tuple:
@@ -136,7 +153,7 @@ class QPSolution:
 def slacks(z: Tensor, G: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
     """Return sigma, the violation of soft rows by z, ``(*batch, n_g)``; zero on hard rows."""
     y = _rows(z, G)
-    return torch.where(w.isinf(), 0, torch.maximum(lb - y, y - ub).clamp(min=0))
+    return torch.where(w.isinf(), 0, torch.maximum(lb - y, y - ub).relu())
 
 
 def _rows(z: Tensor, G: Tensor) -> Tensor:
