@@ -34,6 +34,7 @@ from torch_qpmpc.mpc.validation import (
     own,
 )
 from torch_qpmpc.qp.batching import full_precision, to_dtype
+from torch_qpmpc.qp.forking import serially_if_forked
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
@@ -203,6 +204,7 @@ class QPMPC(nn.Module):
         if (device := torch.get_default_device()).type != "cpu":
             self.to(device)
 
+    @serially_if_forked
     def _start(self, learn: Collection[str]) -> None:
         arguments = self._arguments
         self._layout, theta = initial.theta(**arguments)
@@ -469,6 +471,7 @@ class QPMPC(nn.Module):
             of_plan = leaf[..., n_free:, n_free:] if dense else leaf[..., None, None]
             of_plan.copy_(NEAREST[self.step](of_plan))
 
+    @serially_if_forked
     def quadratic_program(self, residuals: Mapping[str, Tensor] | None = None) -> QuadraticProgram:
         """Return the current theta as a QuadraticProgram, with discounts (eq:qpH).
 
