@@ -123,7 +123,7 @@ def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = Fa
     R2 = _adjusted_R2(cost, cost - found(v), 1 + n + len(rows))
     if not R2 >= GOOD:
         warnings.warn(_poor(R2), UserWarning, stacklevel=2)
-    return StageCost(*found, R2)
+    return StageCost(found.W, found.q, found.c, R2)
 
 
 def _checked(v: Tensor, cost: Tensor, n_free: int, diagonal: bool) -> tuple[Tensor, Tensor]:
