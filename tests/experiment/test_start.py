@@ -165,11 +165,11 @@ def test_the_fit_of_the_cost_is_shown():
 def test_a_log_without_rewards_needs_a_weight():
     cfg = make_config(*PENDULUM)
     log = collect_log(cfg, make_physics(cfg))
-    message = "start: got a log with rewards of NaN or inf, expected finite rewards to fit a cost"
+    message = "stage_weight: got none, and a log with rewards of NaN or inf, expected a weight, or finite"
     log["next", "reward"][0, 3] = torch.nan
     with pytest.raises(QPError, match=message):
         observed_cost(cfg, log, Layout(3, 1, 3))
-    message = r"start: got a log without rewards, expected finite .* Pass task\.stage_weight"
+    message = r"stage_weight: got none, and a log without rewards, expected .* task\.stage_weight"
     with pytest.raises(QPError, match=message):
         observed_cost(cfg, log.exclude(("next", "reward")), Layout(3, 1, 3))
 

@@ -59,12 +59,10 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
     Raises:
         QPError: an entry is missing, has another shape, or is not finite.
     """
-    from tensordict import LazyStackedTensorDict, TensorDictBase
+    from tensordict import TensorDictBase
 
-    if isinstance(data, LazyStackedTensorDict) and data.batch_dims in (1, 2):
-        data = list(data.unbind(0)) if -1 in data.shape else data
-    if isinstance(data, list | tuple):
-        return _read_each(data, n_x, n_d)
+    if isinstance(data, list | tuple) or (isinstance(data, TensorDictBase) and -1 in data.shape):
+        return _read_each(logs(data), n_x, n_d)
     check_kind("trajectories", data, TensorDictBase, REMEDY)
     if data.batch_dims not in (1, 2):
         got = f"shape {tuple(data.shape)}"
@@ -73,7 +71,7 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
     if n_x is not None:
         check_whole("n_x", n_x, 1)
     steps = data if data.batch_dims == 2 else data.unsqueeze(0)
-    valid = _flags(steps, MASKS, default=True)
+    valid = valid_steps(steps)
     y = _entry(steps, ("observation",), valid, n_x)
     u = _entry(steps, ("action",), valid)
     following = _entry(steps, NEXT, valid, n_x)
@@ -105,6 +103,18 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
     if not found:
         raise QPError.expected("trajectories", "no steps", "logged steps", REMEDY)
     return found
+
+
+def logs(data: Any) -> list[Any]:
+    """Return the logs in a list, or in a lazy stack of logs of different lengths; else one."""
+    if isinstance(data, list | tuple):
+        return list(data)
+    return list(data.unbind(0)) if -1 in data.shape else [data]
+
+
+def valid_steps(steps: Any) -> Tensor:
+    """Return True for the steps that are not padding, in the log's shape."""
+    return _flags(steps, MASKS, default=True)
 
 
 def _read_each(parts: Sequence[Any], n_x: int | None, n_d: int) -> list[Trajectory]:

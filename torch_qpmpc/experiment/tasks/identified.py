@@ -10,11 +10,11 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.tasks.registry import AnyPlant, Scheme, find_task
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.stage_cost import StageCost, fit_stage_cost
+from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
+from torch_qpmpc.mpc.stage_cost import StageCost
 
 
 class Start(NamedTuple):
@@ -45,7 +45,7 @@ def identified_start(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase) ->
     )
     cost = None
     if find_task(cfg.task).wrong_scheme(cfg, physics).stage_weight is None:
-        cost = fitted_cost(cfg, log, found.options.layout)
+        cost = fit_rewards(log, found.options.layout, cfg.task.hessian == "diagonal")
     return Start(log, found, cost)
 
 
@@ -64,29 +64,10 @@ def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
     return replace(scheme, **model, **cost, options=options)
 
 
-def fitted_cost(cfg: DictConfig, log: TensorDictBase, layout: Layout) -> StageCost:
-    """Fit a convex stage cost to the rewards of a log.
-
-    Raises:
-        QPError: the log has no rewards, or not all are finite.
-    """
-    n_d = layout.n_d
-    reward = log.get(("next", "reward"), None)
-    if reward is None or not reward.isfinite().all():
-        got = "a log without rewards" if reward is None else "a log with rewards of NaN or inf"
-        remedy = "Pass task.stage_weight, the weight W of the cost 1/2 [x; u]' W [x; u]."
-        raise QPError.expected("start", got, "finite rewards to fit a cost to", remedy)
-    parts = [log["observation"][..., -layout.n_x :], log["action"]]
-    if n_d:
-        parts.insert(0, log["preview"][..., :n_d])
-    v = torch.cat(tuple(part.double() for part in parts), dim=-1).flatten(0, -2)
-    return fit_stage_cost(v, -reward.double().flatten(), n_d, cfg.task.hessian == "diagonal")
-
-
 def observed_cost(
     cfg: DictConfig, log: TensorDictBase, layout: Layout, found: StageCost | None = None
 ) -> tuple[dict[str, Any], dict[str, Tensor], Tensor]:
-    """Return the cost of a scheme from that of a stage, by default `fitted_cost`.
+    """Return the cost of a scheme from that of a stage, by default fitted to the log's rewards.
 
     It is the cost of x_N, too, without an action, unless ``cfg`` has a terminal weight from the
     Riccati equation. The constant adds the mean cost of the log beyond the horizon.
@@ -96,27 +77,16 @@ def observed_cost(
         argument of `QPMPC`, and q ``(n_z,)``.
 
     Raises:
-        QPError: as in `fitted_cost`.
+        QPError: as in `fit_rewards`.
     """
-    n_d, n_x, n_u, N = layout.n_d, layout.n_x, layout.n_u, layout.horizon
-    W, q, c = fitted_cost(cfg, log, layout) if found is None else found
-    diagonal = cfg.task.hessian == "diagonal"
-    weight, terminal = (W[n_d:, n_d:].diagonal() if diagonal else W), n_d + n_x
-    weights = {"terminal_weight": weight[:n_x] if diagonal else W[:terminal, :terminal]}
-    d, x, u = q.split((n_d, n_x, n_u))
-    past = q.new_zeros(layout.n_before - layout.n_preview)
-    ahead = cfg.task.gamma ** torch.arange(N + 1, dtype=torch.float64)
-    constant = c * ahead.sum()
-    if cfg.task.gamma < 1:
-        constant += (
-            cfg.task.gamma ** (N + 1)
-            / (1 - cfg.task.gamma)
-            * -log["next", "reward"].double().mean()
-        )
-    fields = {"stage_weight": weight, "c": constant.item()}
+    diagonal, gamma = cfg.task.hessian == "diagonal", cfg.task.gamma
+    found = fit_rewards(log, layout, diagonal) if found is None else found
+    cost = scheme_cost(found, layout, gamma, diagonal)
+    q, constant = cost["start"]["q"], cost["start"]["c"]
+    if gamma < 1:
+        mean = -log["next", "reward"].double().mean()
+        constant += gamma ** (layout.horizon + 1) / (1 - gamma) * mean
+    fields = {"stage_weight": cost["stage_weight"], "c": constant.item()}
     if cfg.task.terminal_weight == "riccati":
-        weights, x_N = {}, torch.zeros_like(x)
-    else:
-        x_N = x
-    stages = layout.stages(torch.stack((*[x] * N, x_N)), u)
-    return fields, weights, torch.cat((d.repeat(N + 1), past, stages))
+        return fields, {}, torch.cat((q[: -layout.n_x], 0 * q[-layout.n_x :]))
+    return fields, {"terminal_weight": cost["terminal_weight"]}, q
