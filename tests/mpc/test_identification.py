@@ -40,7 +40,8 @@ def test_without_noise_all_starts_predict_the_plant(structure):
 def test_C_0_is_the_band_of_the_model():
     log = arx_log(noise=0.2)
     free, tied = (
-        QPMPC.from_data(log, N, structure=structure, **PAST) for structure in ("free", "tied")
+        QPMPC.from_data(log, N, structure=structure, **PAST, **COST)
+        for structure in ("free", "tied")
     )
     assert torch.equal(free.C_0, tied.C_0)
     assert torch.equal(tied.C, tied.C_0)
@@ -58,7 +59,7 @@ def test_options_go_to_the_qp():
 
 
 def test_the_start_survives_copies_and_resets():
-    mpc = QPMPC.from_data(arx_log(noise=0.2), N, **PAST, learn=("C", "b"))
+    mpc = QPMPC.from_data(arx_log(noise=0.2), N, **PAST, **COST, learn=("C", "b"))
     C, b = mpc.C.detach().clone(), mpc.b.detach().clone()
     for twin in (copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))):
         assert torch.equal(twin.C, C)
@@ -72,7 +73,7 @@ def test_the_start_survives_copies_and_resets():
     file = io.BytesIO()
     torch.save(mpc.state_dict(), file)
     file.seek(0)
-    other = QPMPC.from_data(arx_log(seed=3, noise=0.2), N, **PAST, learn=("C", "b"))
+    other = QPMPC.from_data(arx_log(seed=3, noise=0.2), N, **PAST, **COST, learn=("C", "b"))
     other.load_state_dict(torch.load(file, weights_only=True))
     assert torch.equal(other.C, C)
 

@@ -17,7 +17,6 @@ from torch_qpmpc.mpc.parametrizations import LinearRows
 from torch_qpmpc.mpc.validation import (
     as_tensor,
     bound_pair,
-    check_model,
     check_weight,
     cost_weights,
     slack_weight,

@@ -58,11 +58,12 @@ RANDOM = (
 
 
 class QPMPC(nn.Module):
-    """A parametric QP (eq:qp5) whose model and cost are random where none are passed.
+    """A parametric QP (eq:qp5), which starts at random where no model or stage cost is passed.
 
-    Its variable is z = [x_0, u_0, x_1, .., x_N], n_z = N (n_x + n_u) + n_x. The cost (eq:qpH) has a stage block H_k, q_k for (x_k, u_k), discounted by gamma^k, and a
-    terminal block H_f, q_f for x_N, discounted by gamma^N. Parameters and buffers are float64,
-    inputs of any float dtype; outputs have the dtype of the input.
+    Its variable is z = [x_0, u_0, x_1, .., x_N], n_z = N (n_x + n_u) + n_x. The cost (eq:qpH) has a
+    stage block H_k, q_k for (x_k, u_k), discounted by gamma^k, and a terminal block H_f, q_f for
+    x_N, discounted by gamma^N. Parameters and buffers are float64, inputs of any float dtype;
+    outputs have the dtype of the input.
 
     More than x_0 may be known: the past and, ahead of time, signals such as prices, forecasts and
     references. With the *window* of the last L outputs and L - 1 actions between them (``past=L``)
@@ -257,10 +258,11 @@ class QPMPC(nn.Module):
         """
         A, B = check_model(A, B)
         n_x, n_u, past = initial.model_sizes(A, B)
-        initial.check_cost(options.get("stage_weight"), n_x, n_u)
         if (E := options.get("E")) is not None:
             options.setdefault("n_d", torch.as_tensor(E).shape[-1])
-        return cls(n_x, n_u, horizon, **{"past": past, "A": A, "B": B} | options)
+        mpc = cls(n_x, n_u, horizon, **{"past": past, "A": A, "B": B} | options)
+        initial.check_cost(options.get("stage_weight"), n_x, n_u)
+        return mpc
 
     @classmethod
     def from_data(
@@ -314,9 +316,7 @@ class QPMPC(nn.Module):
         if arguments.get("stage_weight") is None:
             diagonal = options.get("hessian", "diagonal") == "diagonal"
             fitted = fit_rewards(trajectories, found.options.layout, diagonal)
-            cost = scheme_cost(
-                fitted, found.options.layout, options.get("gamma", GAMMA), diagonal
-            )
+            cost = scheme_cost(fitted, found.options.layout, options.get("gamma", GAMMA), diagonal)
             starts.insert(0, cost.pop("start"))
             arguments = {**arguments, **cost, **{k: x for k, x in options.items() if x is not None}}
         return cls(**{**arguments, "start": {k: x for part in starts for k, x in part.items()}})

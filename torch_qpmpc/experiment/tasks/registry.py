@@ -59,7 +59,9 @@ class TaskSettings(Group):
     def riccati_is_dense(self) -> Self:
         if self.terminal_weight == "riccati" and self.hessian == "diagonal":
             remedy = "The Riccati weight needs task.hessian=block or full."
-            raise QPError.expected("task.terminal_weight", "'riccati'", "default or identity", remedy)
+            raise QPError.expected(
+                "task.terminal_weight", "'riccati'", "default or identity", remedy
+            )
         return self
 
 
