@@ -59,8 +59,7 @@ def tied(horizon: int = 8, **options: Any) -> QPMPC:
         state_bounds=([-2.0, -1.0], [2.0, 1.0]),
         constraints=([[1.0, 0.5, 1.0], [0.0, 1.0, -1.0]], [-0.8, -torch.inf], [0.8, 0.6]),
         terminal_constraints=([[1.0, 1.0]], [-0.4], [0.3]),
-        solver="daqp",
-        **options,
+        **{"stage_weight": [1.0, 1.0, 1.0], "solver": "daqp"} | options,
     )
 
 

@@ -191,6 +191,7 @@ def random_mpc(seed: int = 0, *, free: float = 0.1, horizon: int = 3, **options:
         "state_bounds": ([-1.0, -1.0], [1.0, 1.0]),
         "action_bounds": ([-0.5], [0.5]),
         "stage_weight": [1.0, 0.5, 0.1],
+        "terminal_weight": [1.0, 1.0],
         "solver": "daqp",
     }
     mpc = QPMPC(2, 1, horizon, seed=seed, **(settings | options))

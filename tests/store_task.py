@@ -13,6 +13,13 @@ register(
         lambda cfg, plant: scheme(plant),
         scheme,
         closed_loop=plant_loop,
-        defaults={"task": {"horizon": 3, "hessian": "block", "learn_cost": ["H", "q", "c"]}},
+        defaults={
+            "task": {
+                "horizon": 3,
+                "hessian": "block",
+                "terminal_weight": "identity",
+                "learn_cost": ["H", "q", "c"],
+            }
+        },
     )
 )

@@ -10,7 +10,7 @@ from hydra.errors import HydraException
 
 import torch_qpmpc as qm
 from tests.mistakes import learning, plants, programs, reading
-from tests.mistakes.objects import A2, B1, M, mpc, op
+from tests.mistakes.objects import A2, B1, W3, M, mpc, op
 from tests.runs import make_config
 from torch_qpmpc.envs import PointMass, PointMassEnv
 from torch_qpmpc.learning.replay import make_replay
@@ -31,7 +31,7 @@ MISSPELT: Any = {"misspelt": 1}
     "call",
     [
         M(**MISSPELT),
-        lambda: qm.QPMPC.linear_mpc(A2, B1, 3, **MISSPELT),
+        lambda: qm.QPMPC.linear_mpc(A2, B1, 3, stage_weight=W3, **MISSPELT),
         lambda: qm.QPActorValueOperator(mpc, **MISSPELT),
         lambda: qm.QPQLearningLoss(op, **MISSPELT),
         lambda: qm.GaussNewton(mpc, **MISSPELT),

@@ -47,6 +47,7 @@ def test_error_over_unit_variance_is_the_frobenius_norm():
 def test_the_policys_predicted_next_state():
     A, B = normal(2, 2, seed=1), normal(2, 1, seed=2)
     settings = {"action_bounds": ([-0.5], [0.5]), "solver": "daqp", "offset": [0.1, 0.2]}
+    settings["stage_weight"] = [1.0, 1.0, 0.1]
     mpc, s = QPMPC.from_model(A, B, 3, **settings), random_states(20)
     offset = torch.tensor([0.1, 0.2], dtype=torch.float64)
     assert first_state_error(mpc, s, A, B, offset) < 1e-6

@@ -99,7 +99,7 @@ def test_borders_are_between_regions(mpc):
 def test_states_without_a_solution_are_left_blank():
     mpc = QPMPC.from_model(
         torch.eye(2), torch.eye(2)[:, :1], 2, state_bounds=([-1.0] * 2, [1.0] * 2),
-        state_slack=torch.inf, on_failure="mask", solver="daqp",
+        stage_weight=[1.0, 1.0, 0.0], state_slack=torch.inf, on_failure="mask", solver="daqp",
     )  # fmt: skip
     grid = torch.linspace(-2, 2, 5)
     figure = policy_figure(policy_map(mpc, grid, grid))

@@ -55,6 +55,7 @@ CART_POLE = (
     "task.stage_weight=[[4,0,2.4,0,0,0],[0,.1,0,0,0,0],[2.4,0,2.4,0,0,0],[0,0,0,0,0,0],"
     "[0,0,0,0,.05,0],[0,0,0,0,0,1]]",
     *("task.horizon=5", "task.episode_steps=100", "task.eval_steps=100", "task.gamma=0.97"),
+    "task.terminal_weight=identity",
     *("task.action_slack=0.1", "solver=daqp", "constraint=free", "constraint.learn=[C,b]"),
     *("algo=td3", "algo.critic=mlp", "algo.lr_network=1e-3", "algo.width=128"),
     *("target_rate=0.01", "batch_size=128", "exploration_std=0.8", "replay_capacity=10000"),

@@ -80,6 +80,7 @@ def make_mpc(size: Size, *, dense: bool, solver: str = "daqp") -> QPMPC:
         state_bounds=state_bounds,
         action_bounds=([-1.0] * size.n_u, [1.0] * size.n_u),
         stage_weight=torch.cat((weight, weight.new_zeros(size.n_u))),
+        terminal_weight=torch.ones_like(weight),
         state_slack=SLACK,
         learn=LEARN,
         solver=solver,

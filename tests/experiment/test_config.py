@@ -522,7 +522,7 @@ def test_solver_must_be_known():
         (["release=10"], "release: got 10, expected null. Nothing is tied: choose constraint=mpc"),
         (
             ["task.terminal_weight=riccati"],
-            "task.terminal_weight: got 'riccati', expected identity. The Riccati weight needs",
+            "task.terminal_weight: got 'riccati', expected default or identity. The Riccati weig",
         ),
         (
             ["noise=uniform"],

@@ -151,14 +151,25 @@ def test_the_id_alone_makes_a_qp():
     assert action.isfinite().all()
 
 
+def test_the_fit_of_the_cost_is_shown():
+    cfg = make_config(*PENDULUM, "start.transitions=1000")
+    _, start, _ = start_of(cfg)
+    assert start.cost is not None
+    assert (
+        str(start).splitlines()[-1] == f"stage cost fitted to the rewards: R2 {start.cost.R2:.3f}"
+    )
+    _, start, _ = start_of(make_config(*DATA))
+    assert start.cost is None, "the task has its own"
+
+
 def test_a_log_without_rewards_needs_a_weight():
     cfg = make_config(*PENDULUM)
     log = collect_log(cfg, make_physics(cfg))
-    message = "start: got a log with rewards of NaN or inf, expected finite rewards to fit a cost"
+    message = "stage_weight: got none, and a log with rewards of NaN or inf, expected a weight"
     log["next", "reward"][0, 3] = torch.nan
     with pytest.raises(QPError, match=message):
         observed_cost(cfg, log, Layout(3, 1, 3))
-    message = r"start: got a log without rewards, expected finite .* Pass task\.stage_weight"
+    message = r"stage_weight: got none, and a log without rewards, expected .* task\.stage_weight"
     with pytest.raises(QPError, match=message):
         observed_cost(cfg, log.exclude(("next", "reward")), Layout(3, 1, 3))
 

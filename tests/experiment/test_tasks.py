@@ -247,7 +247,8 @@ def test_a_registered_task_inherits_the_defaults_of_the_point_mass(own_task):
     file = own_task('defaults={"num_envs": 3, "task": {"horizon": 4}}')
     cfg = make_config("task=mine", "replay_capacity=300")
     check_config(cfg)
-    assert cfg.task == {**make_config().task, "name": "mine", "file": file, "horizon": 4}
+    own = {"name": "mine", "file": file, "horizon": 4, "terminal_weight": "default"}
+    assert cfg.task == {**make_config().task, **own}, "all but the paper's terminal cost"
     assert (cfg.num_envs, cfg.noise.name) == (3, "none")
     assert make_config("task=mine", "task.horizon=5", "num_envs=2").task.horizon == 5
     physics = linear_system(cfg)

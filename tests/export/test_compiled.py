@@ -51,7 +51,8 @@ def test_each_row_of_a_batch_is_a_controller():
 def test_the_closed_loop_has_the_same_cost():
     physics = PointMass()
     bounds = {"action_bounds": ([-1, -1], [1, 1]), "state_bounds": (physics.lb_s, physics.ub_s)}
-    mpc = QPMPC.from_model(physics.A, physics.B, 5, solver="daqp", **bounds)
+    cost = {"stage_weight": [2.0, 2.0, 1.0, 1.0, 0.1, 0.1]}
+    mpc = QPMPC.from_model(physics.A, physics.B, 5, solver="daqp", **bounds, **cost)
     J = [closed_loop(f, physics, starts=4).J for f in (CompiledPolicy(mpc), warm_policy(mpc))]
     assert J[0] == pytest.approx(J[1], rel=1e-9)
 

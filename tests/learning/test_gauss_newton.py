@@ -222,7 +222,8 @@ def test_a_size_is_forgotten_slowly():
 @pytest.mark.parametrize("memory", [0, 4])
 def test_signals_that_are_always_zero_do_no_harm(memory):
     """From the origin nothing has a gradient but c; then one state is zero, and then none."""
-    mpc = QPMPC.from_model(0.9 * torch.eye(2), [[0.0], [1.0]], 3, learn=("c", "C"), solver="daqp")
+    options = {"stage_weight": [1.0, 1.0, 0.0], "learn": ("c", "C"), "solver": "daqp"}
+    mpc = QPMPC.from_model(0.9 * torch.eye(2), [[0.0], [1.0]], 3, **options)
     optimizer = GaussNewton(mpc, memory=memory)
     for s in ([0.0, 0.0], [0.0, 1.0], [1.0, 1.0]):
         s, a = torch.tensor([s]).double(), torch.zeros(1, 1).double()

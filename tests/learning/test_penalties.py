@@ -165,7 +165,8 @@ def test_the_subgradient_with_adam_leaves_what_the_proximal_step_removes(generat
 
 
 def test_deviation_penalty_keeps_its_own_C_0(generator):
-    mpc = QPMPC.from_model(normal(generator, N_X, N_X), normal(generator, N_X, N_U), N)
+    A, B = normal(generator, N_X, N_X), normal(generator, N_X, N_U)
+    mpc = QPMPC.from_model(A, B, N, stage_weight=[1.0] * (N_X + N_U))
     penalty = DeviationPenalty(mpc.C_0, N_X, N_U)
     twin = copy.deepcopy(penalty)
     expected = penalty(mpc.C_0 + 1)

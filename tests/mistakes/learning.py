@@ -14,7 +14,20 @@ import torch
 from tensordict import TensorDict
 
 import torch_qpmpc as qm
-from tests.mistakes.objects import A2, B1, Aa, G, S, batch_with, batch_without, free, gn, mpc, op
+from tests.mistakes.objects import (
+    A2,
+    B1,
+    W3,
+    Aa,
+    G,
+    S,
+    batch_with,
+    batch_without,
+    free,
+    gn,
+    mpc,
+    op,
+)
 from tests.problems import random_mpc
 from tests.transitions import make_batch, make_loss
 from torch_qpmpc.learning.replay import make_replay, windows_to_tau
@@ -330,7 +343,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "DeviationPenalty: prox parametrized": (
         lambda: (lambda m: qm.DeviationPenalty(m.C_0, 2, 1).proximal_step_(m.C))(
-            qm.QPMPC.linear_mpc(A2, B1, 3)
+            qm.QPMPC.linear_mpc(A2, B1, 3, stage_weight=W3)
         ),
         "C: got a computed tensor, expected a parameter. If only some entries of C",
     ),

@@ -17,6 +17,7 @@ from torch_qpmpc.mpc.banded import banded_matrix
 
 A2 = torch.tensor([[1.0, 0.1], [0, 0.9]]).double()
 B1 = torch.tensor([[0.0], [1.0]]).double()
+W3 = [1.0, 1.0, 1.0]
 KNOWN = known_qp(14, batch=(3,))
 qp, fixed = KNOWN.qp, KNOWN.fixed
 GOOD = dict(zip(("H", "q", "c", "C", "b", "G", "lb", "ub", "w"), qp.tensors(), strict=True))

@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDict
 
 import torch_qpmpc as qm
-from tests.mistakes.objects import A2, B1, GOOD, Aa, M, Q, S, fixed, mpc, qp
+from tests.mistakes.objects import A2, B1, GOOD, W3, Aa, M, Q, S, fixed, mpc, qp
 
 MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "QuadraticProgram: int": (
@@ -367,16 +367,26 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: mpc.predicted([0.0]),
         "z: got list, expected a floating-point torch.Tensor. Convert it: torch.as_t",
     ),
+    "QPMPC.from_model: no cost": (
+        lambda: qm.QPMPC.from_model(A2, B1, 3),
+        "stage_weight: got none, expected the weight of [x; u] in the stage cost 1/2 [x; u]' W",
+    ),
+    "QPMPC.linear_mpc: no cost": (
+        lambda: qm.QPMPC.linear_mpc(A2, B1, 3),
+        "stage_weight: got none, expected the weight of [x; u] in the stage cost 1/2 [x; u]' W",
+    ),
     "QPMPC.release: twice": (
-        lambda: (lambda m: (m.release(), m.release()))(qm.QPMPC.linear_mpc(A2, B1, 3)),
+        lambda: (lambda m: (m.release(), m.release()))(
+            qm.QPMPC.linear_mpc(A2, B1, 3, stage_weight=W3)
+        ),
         "structure: got 'free', expected one that is freer than 'free'. Those are: n",
     ),
     "QPMPC.release: typo": (
-        lambda: qm.QPMPC.linear_mpc(A2, B1, 3).release("fre"),
+        lambda: qm.QPMPC.linear_mpc(A2, B1, 3, stage_weight=W3).release("fre"),
         "structure: got 'fre', expected one that is freer than 'tied'. Those are: fr",
     ),
     "QPMPC.release: list": (
-        lambda: qm.QPMPC.linear_mpc(A2, B1, 3).release(["free"]),
+        lambda: qm.QPMPC.linear_mpc(A2, B1, 3, stage_weight=W3).release(["free"]),
         "structure: got ['free'], expected one that is freer than 'tied'. Those are:",
     ),
     "QPMPC.parameter_groups: list": (

@@ -174,7 +174,7 @@ def test_a_tied_model_with_a_known_row():
     """x_1 integrates x_2 in every stage, so its row of A and B is known."""
     A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
     learn = {"C": rows().logical_not(), "H": True}
-    mpc = QPMPC.linear_mpc(A, B, HORIZON, learn=learn, solver="daqp")
+    mpc = QPMPC.linear_mpc(A, B, HORIZON, stage_weight=[1.0] * 3, learn=learn, solver="daqp")
     optimizer = torch.optim.AdamW(mpc.parameters(), lr=0.01, weight_decay=0.1)
     for _ in range(3):
         optimizer.zero_grad()
@@ -332,7 +332,7 @@ def test_settings_of_the_constructor_cannot_be_changed(name, value):
 
 def test_arguments_are_kept_by_value():
     A, mask = np.array([[1.0, 0.1], [0.0, 0.9]]), rows()
-    options = {"learn": {"C": mask}, "seed": 1}
+    options = {"learn": {"C": mask}, "stage_weight": [1.0, 1.0, 0.1]}
     mpc = QPMPC.from_model(A, [[0.0], [0.1]], HORIZON, **options)
     start = mpc.C.detach().clone()
     A *= 2

@@ -40,7 +40,8 @@ def test_without_noise_all_starts_predict_the_plant(structure):
 def test_C_0_is_the_band_of_the_model():
     log = arx_log(noise=0.2)
     free, tied = (
-        QPMPC.from_data(log, N, structure=structure, **PAST) for structure in ("free", "tied")
+        QPMPC.from_data(log, N, structure=structure, **PAST, **COST)
+        for structure in ("free", "tied")
     )
     assert torch.equal(free.C_0, tied.C_0)
     assert torch.equal(tied.C, tied.C_0)
@@ -58,7 +59,7 @@ def test_options_go_to_the_qp():
 
 
 def test_the_start_survives_copies_and_resets():
-    mpc = QPMPC.from_data(arx_log(noise=0.2), N, **PAST, learn=("C", "b"))
+    mpc = QPMPC.from_data(arx_log(noise=0.2), N, **PAST, **COST, learn=("C", "b"))
     C, b = mpc.C.detach().clone(), mpc.b.detach().clone()
     for twin in (copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))):
         assert torch.equal(twin.C, C)
@@ -72,7 +73,7 @@ def test_the_start_survives_copies_and_resets():
     file = io.BytesIO()
     torch.save(mpc.state_dict(), file)
     file.seek(0)
-    other = QPMPC.from_data(arx_log(seed=3, noise=0.2), N, **PAST, learn=("C", "b"))
+    other = QPMPC.from_data(arx_log(seed=3, noise=0.2), N, **PAST, **COST, learn=("C", "b"))
     other.load_state_dict(torch.load(file, weights_only=True))
     assert torch.equal(other.C, C)
 
@@ -136,7 +137,7 @@ def test_errors_are_nan_where_no_part_of_the_data_is_long_enough():
     found = qm.identify(arx_log(noise=0.2, episodes=1, steps=30), 20, past=2)
     assert found.rmse.isfinite().all(1).nonzero().flatten().tolist() == list(range(14))
     assert str(found).endswith("nan nan")
-    assert qm.identify(arx_log(episodes=1, steps=9), 3, **PAST).rmse.isnan().all()
+    assert qm.identify(arx_log(episodes=1, steps=10), 3, **PAST).rmse.isnan().all()
 
 
 # Bad data
@@ -163,11 +164,11 @@ def two_equal_actions(log: TensorDict) -> TensorDict:
         (
             lambda: qm.identify(arx_log(episodes=2, steps=4), N, **PAST),
             "trajectories: got 8 transitions in 2 trajectories, 6 of them with 1 before them, "
-            "expected at least 8 such for past=2, n_x=2, n_u=1 and n_d=1. Log trajectories of more",
+            "expected at least 9 such for past=2, n_x=2, n_u=1 and n_d=1. A fit of as many tran",
         ),
         (
-            lambda: qm.identify(arx_log(episodes=1, steps=3), N),
-            "trajectories: got 3 transitions in 1 trajectories, expected at least 4 such for past",
+            lambda: qm.identify(arx_log(episodes=1, steps=4), N),
+            "trajectories: got 4 transitions in 1 trajectories, expected at least 5 such .* Log mo",
         ),
         (
             lambda: qm.identify(frozen_action(arx_log()), N),

@@ -254,15 +254,15 @@ def test_a_release_only_frees(start, structure):
             "terminal_weight: got 'riccati' with hessian='diagonal', .* 'riccati' with hessian=",
         ),
         (
-            {"A": 2 * torch.eye(2), "B": [[1.0], [0.0]]},
+            {"A": 2 * torch.eye(2), "B": [[1.0], [0.0]], "terminal_weight": "riccati"},
             "terminal_weight: got a Riccati equation without a solution .* Give the actions some",
         ),
         (
-            {"stage_weight": torch.eye(3).expand(4, 3, 3)},
+            {"stage_weight": torch.eye(3).expand(4, 3, 3), "terminal_weight": "riccati"},
             r"stage_weight: got shape \(4, 3, 3\), expected shape \(3, 3\). The Riccati equation",
         ),
         (
-            {"A": A.expand(4, 2, 2)},
+            {"A": A.expand(4, 2, 2), "terminal_weight": "riccati"},
             r"A: got shape \(4, 2, 2\), expected shape \(2, 2\). The Riccati equation has one",
         ),
     ],

@@ -285,7 +285,8 @@ def test_stages_may_have_weights_and_models_of_their_own():
 
 
 def test_the_model_may_have_an_offset():
-    mpc = QPMPC.from_model(A, B, 2, offset=[0.1, -0.2], solver="daqp")
+    cost = {"stage_weight": [1.0, 1.0, 0.1]}
+    mpc = QPMPC.from_model(A, B, 2, offset=[0.1, -0.2], solver="daqp", **cost)
     s, a = random_states(3), random_states(3, 1)
     states, _ = mpc.predicted(mpc.solve(s, a).z)
     assert_close(states[:, 1], s @ A.mT + a @ B.mT + torch.tensor([0.1, -0.2]).double())
@@ -295,13 +296,15 @@ def test_the_model_may_have_an_offset():
 @pytest.mark.parametrize("horizon", [2, 3])
 def test_a_dense_stage_weight_is_one_block_whatever_the_horizon(hessian, horizon):
     weight = torch.tensor([[2.0, 0.5, 0.1], [0.5, 1.0, 0.2], [0.1, 0.2, 0.3]]).double()
-    mpc = QPMPC(2, 1, horizon, gamma=1.0, hessian=hessian, stage_weight=weight)
+    options = {"stage_weight": weight, "terminal_weight": [1.0, 1.0]}
+    mpc = QPMPC(2, 1, horizon, gamma=1.0, hessian=hessian, **options)
     H = mpc.quadratic_program().H
     assert_close(H, torch.block_diag(*[weight] * horizon, torch.eye(2).double()))
 
 
 def test_the_same_start_gives_the_same_program_whatever_the_hessian():
     options = {"free": 0.0, "A": A, "B": B, "stage_weight": [2.0, 0.0, 0.1]}
+    options["terminal_weight"] = [1.0, 1.0]
     programs = [
         random_mpc(0, hessian=hessian, **options).quadratic_program()
         for hessian in ("diagonal", "block", "full")

@@ -270,7 +270,7 @@ def test_a_window_and_a_preview_that_do_not_matter_change_no_value():
     settings = {"state_bounds": ([-1.0] * 2, [1.0] * 2), "action_bounds": ([-0.5], [0.5])}
     more = QPMPC.from_model(
         torch.cat((A, 0 * A), -1), torch.cat((B, 0 * B), -1), 3, n_d=2,
-        stage_weight=[1.0, 0.5, 0.1], solver="daqp", **settings,
+        stage_weight=[1.0, 0.5, 0.1], terminal_weight=[1.0, 1.0], solver="daqp", **settings,
     )  # fmt: skip
     s = random_states(8)
     p = torch.cat((normal(8, more.n_p - 2), s), -1)
@@ -280,7 +280,7 @@ def test_a_window_and_a_preview_that_do_not_matter_change_no_value():
 
 def test_with_a_preview_of_zeros_it_is_the_linear_quadratic_regulator():
     A_1, B_1 = A[:, :N_X], B[:, :N_U]
-    mpc = QPMPC.linear_mpc(A_1, B_1, 5, E=E, gamma=GAMMA, solver="daqp")
+    mpc = QPMPC.linear_mpc(A_1, B_1, 5, E=E, stage_weight=[1.0] * n, gamma=GAMMA, solver="daqp")
     P, s = riccati_weight(A_1, B_1, torch.eye(n).double(), GAMMA), random_states(4)
     p = torch.cat((torch.zeros(4, 6 * N_D), s), -1)
     assert_close(mpc.value(p).detach(), 0.5 * ((s @ P) * s).sum(-1))

@@ -20,7 +20,8 @@ QUANTILE = 1.6448536269514722
 
 def scheme(**options) -> QPMPC:
     bounds = {"state_bounds": ([-2.0, -3.0], [2.0, 3.0]), "action_bounds": ([-1.0], [1.0])}
-    return QPMPC.from_model(A, B, N, **{**bounds, "learn": ("H",), **options})
+    settings = {**bounds, "stage_weight": [1.0, 1.0, 0.1], "learn": ("H",)}
+    return QPMPC.from_model(A, B, N, **settings | options)
 
 
 def errors(paths: int, K: Tensor) -> tuple[Tensor, Tensor]:
@@ -72,7 +73,7 @@ def test_hard_rows_and_known_stages_stay():
 
 def test_the_first_covariance_is_that_of_the_current_output_behind_a_window_and_a_preview():
     lags, E = torch.cat((A, 0 * A), -1), torch.ones(2, 1).double()
-    bounds = {"state_bounds": ([-2.0, -3.0], [2.0, 3.0])}
+    bounds = {"state_bounds": ([-2.0, -3.0], [2.0, 3.0]), "stage_weight": [1.0, 1.0, 0.1]}
     mpc = QPMPC.from_model(lags, torch.cat((B, 0 * B), -1), N, E=E, learn=("H",), **bounds)
     covariances = prediction_covariance(A, W, N, W)
     tighten(mpc, covariances)

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, lazy_stack
 from torch.testing import assert_close
 from torchrl.collectors.utils import split_trajectories
 
@@ -49,6 +49,45 @@ def test_trajectories_end_at_flags_ids_and_gaps():
     log["collector", "traj_ids"][1, 25:] = 1
     log["observation"][2, 7] += 1
     assert lengths(log) == [10, 30, 25, 15, 7, 33]
+
+
+def test_a_step_across_a_gap_in_time_is_left_out():
+    """The observations do not show it: the next one is the first after the gap."""
+    log, index = arx_log(), torch.arange(40)
+    time = 60.0 * index
+
+    def of(key: str, times: torch.Tensor) -> list[int]:
+        return lengths(log.clone().set(key, times.unsqueeze(-1).expand(3, 40, 1)))
+
+    assert of("time", time) == [40] * 3
+    assert of("time", time + torch.rand(40)) == [40] * 3, "jitter"
+    assert of("time", 1.7e9 + 0.1 * index.double()) == [40] * 3
+    assert of("time", torch.where(index >= 25, time + 3600, time)) == [24, 15] * 3
+    assert of("time", 1.7e9 + (index + 100 * (index >= 25)).double()) == [24, 15] * 3
+    assert of("time", torch.where(index >= 10, time - 600, time)) == [9, 30] * 3
+    assert of("step_count", index + (index >= 30).long()) == [29, 10] * 3
+    log["next", "done"][:, 24] = True
+    assert of("step_count", index % 25) == [25, 15] * 3, "an end is no gap"
+
+
+def test_logs_of_different_lengths_are_read():
+    log = arx_log()
+    parts = [log[0], log[1, :30]]
+    assert lengths(lazy_stack(parts)) == lengths(parts) == [40, 30]  # pyright: ignore[reportArgumentType] (a list)
+    assert lengths(lazy_stack([log[0], log[1]])) == [40, 40]
+    with pytest.raises(
+        QPError, match=r"^trajectories: got logs of \(n_x, n_u\) = \(1, 1\), \(2, 1\), "
+    ):
+        read_trajectories(
+            [
+                log[0],
+                change("observation", lambda x: x[..., :1])(
+                    change(("next", "observation"), lambda x: x[..., :1])(log[1])
+                ),
+            ]
+        )
+    with pytest.raises(QPError, match=r"^trajectories: got no logs, expected"):
+        read_trajectories([])
 
 
 def test_padded_steps_are_left_out():
@@ -125,6 +164,18 @@ def spoilt(index: tuple[int, ...], number: float):
         (
             change("preview", lambda x: x[..., :0]),
             r"preview: got shape \(3, 40, 0\), expected a real tensor \(3, 40, 'n'\) with n >= 1",
+        ),
+        (
+            lambda log: log.set(("next", "done"), torch.zeros(3, 40, 2, dtype=torch.bool)),
+            r"next\.done: got shape \(3, 40, 2\), expected shape \(3, 40\) or \(3, 40, 1\)",
+        ),
+        (
+            lambda log: log.to("meta"),
+            "observation: got a meta tensor, expected a tensor with values",
+        ),
+        (
+            change("observation", lambda x: 1e155 * x),
+            r"observation: got .*e\+155, expected numbers up to 1e.100. Squares .* larger units",
         ),
         (
             lambda log: log.set("mask", torch.zeros(3, 40, dtype=torch.bool)),

@@ -52,21 +52,29 @@ def compare(expected: dict[str, Tensor], found: dict[str, Tensor]) -> None:
         assert_close(found[name], expected[name], rtol=1e-9, atol=1e-9, msg=name)
 
 
-def check(mpcs: list[QPMPC], expected: list[dict[str, Tensor]]) -> None:
+def check(mpcs: list[QPMPC], expected: list[dict[str, Tensor]], threads: int | None = None) -> None:
+    threads = torch.get_num_threads() if threads is None else threads
+    assert torch.get_num_threads() == threads
     for mpc, known in zip(mpcs, expected, strict=True):
         compare(known, answers(mpc))
+        assert torch.get_num_threads() == threads
+    large = QPMPC(6, 3, 40)  # of a size at which torch takes several threads
+    large.policy(random_states(2, 6))
+    assert torch.get_num_threads() == threads
 
 
 def scenario() -> None:
     """Solve with two threads, in children started in each way, and again, with shared modules."""
     torch.set_num_threads(2)
+    torch.ones(2_000_000).exp().sum()  # OpenMP's threads exist when the child is forked
     mpcs = [random_mpc(0, solver=name).share_memory() for name in BACKENDS]
     expected = [answers(mpc) for mpc in mpcs]
     for method in ("fork", "spawn"):
         if method not in torch.multiprocessing.get_all_start_methods():
             continue  # not on every platform
         context: Any = torch.multiprocessing.get_context(method)
-        child = context.Process(target=check, args=(mpcs, expected), daemon=True)
+        threads = 2 if method == "fork" else None
+        child = context.Process(target=check, args=(mpcs, expected, threads), daemon=True)
         child.start()
         child.join(WATCHDOG)
         hung = child.exitcode is None

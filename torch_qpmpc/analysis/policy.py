@@ -129,7 +129,11 @@ def policy_map(
     Example:
         >>> import torch, torch_qpmpc as qm
         >>> mpc = qm.QPMPC.from_model(
-        ...     [[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], 5, action_bounds=([-1.0], [1.0])
+        ...     [[1.0, 0.1], [0.0, 1.0]],
+        ...     [[0.0], [0.1]],
+        ...     5,
+        ...     stage_weight=[1.0, 1.0, 0.1],
+        ...     action_bounds=([-1.0], [1.0]),
         ... )
         >>> found = policy_map(mpc, torch.linspace(-1, 1, 9), torch.linspace(-1, 1, 5))
         >>> found.actions.shape, found.gains.shape, bool((found.regions >= 0).all())

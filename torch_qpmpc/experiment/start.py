@@ -75,7 +75,7 @@ def make_start(
         physics: the plant.
         folder: the run's folder.
         written: read the log that the run has written there before.
-        quiet: do not print the report of the prediction errors.
+        quiet: do not print the report of the prediction errors and the fitted cost.
 
     Returns:
         The start; None with ``start=model``.
@@ -99,7 +99,7 @@ def make_start(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, buffer.getbuffer())
     if not quiet:
-        print(start.identified)
+        print(start)
     return start
 
 

@@ -135,7 +135,8 @@ class Gate:
         >>> physics = PointMass()
         >>> def costs(mpc, seed):
         ...     return closed_loop(mpc.policy, physics, steps=20, seed=seed).costs.sum(0)
-        >>> mpc = qm.QPMPC.from_model(physics.A, physics.B, 5, action_bounds=([-1, -1], [1, 1]))
+        >>> options = {"stage_weight": [1.0] * 4 + [0.1] * 2, "action_bounds": ([-1] * 2, [1] * 2)}
+        >>> mpc = qm.QPMPC.from_model(physics.A, physics.B, 5, **options)
         >>> gate = Gate(mpc, costs)
         >>> gate.judge(mpc).accepted  # an equal policy is no better
         False

@@ -262,7 +262,8 @@ def warm_policy(mpc: QPMPC) -> Callable[[Tensor], Tensor]:
         >>> from torch_qpmpc.envs import PointMass
         >>> from torch_qpmpc.envs.closed_loop import closed_loop
         >>> physics = PointMass()
-        >>> mpc = qm.QPMPC.from_model(physics.A, physics.B, 5, action_bounds=([-1, -1], [1, 1]))
+        >>> options = {"stage_weight": [1.0] * 4 + [0.1] * 2, "action_bounds": ([-1] * 2, [1] * 2)}
+        >>> mpc = qm.QPMPC.from_model(physics.A, physics.B, 5, **options)
         >>> loop = closed_loop(warm_policy(mpc), physics, steps=10)
     """
     return in_closed_loop(QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET))

@@ -73,7 +73,7 @@ class DeviationPenalty(nn.Module):
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC.from_model(torch.eye(1), torch.eye(1), 3)
+        >>> mpc = qm.QPMPC.from_model(torch.eye(1), torch.eye(1), 3, stage_weight=[1.0, 0.1])
         >>> penalty = qm.DeviationPenalty.of(mpc)
         >>> penalty(mpc.C).item()
         0.0
@@ -176,7 +176,7 @@ class SystemIdentificationPenalty(nn.Module):
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC.from_model(torch.eye(1), torch.eye(1), horizon=1)
+        >>> mpc = qm.QPMPC.from_model(torch.eye(1), torch.eye(1), 1, stage_weight=[1.0, 0.1])
         >>> penalty = qm.SystemIdentificationPenalty(beta=0.5)
         >>> windows = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 5.0]])  # [s_0, a_0, s_1]
         >>> penalty(mpc.C, windows).item()  # the second is 2 off the model s_1 = s_0 + a_0

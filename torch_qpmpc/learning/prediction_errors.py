@@ -40,7 +40,7 @@ class PredictionErrors(nn.Module):
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC.linear_mpc([[1.0]], [[1.0]], horizon=3)
+        >>> mpc = qm.QPMPC.linear_mpc([[1.0]], [[1.0]], horizon=3, stage_weight=[1.0, 1.0])
         >>> errors = PredictionErrors(mpc)
         >>> s, a = torch.rand(2, 100, 1, generator=torch.Generator().manual_seed(0))
         >>> following = 0.5 * s + a + torch.tensor([[0.1], [-0.1]]).repeat(50, 1)

@@ -143,7 +143,8 @@ def search(
         >>> physics = PointMass()
         >>> def costs(mpc, seed):
         ...     return closed_loop(mpc.policy, physics, steps=20, seed=seed).costs.sum(0)
-        >>> mpc = qm.QPMPC.from_model(physics.A, physics.B, 5, action_bounds=([-1, -1], [1, 1]))
+        >>> options = {"stage_weight": [1.0] * 4 + [0.1] * 2, "action_bounds": ([-1] * 2, [1] * 2)}
+        >>> mpc = qm.QPMPC.from_model(physics.A, physics.B, 5, **options)
         >>> found = search(mpc, costs, {"H_u": 0.5, "H_f": 0.5}, loops=12)
         >>> sorted(found)
         ['H_f', 'H_u']

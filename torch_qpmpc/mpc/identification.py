@@ -74,7 +74,7 @@ class Identified:
         errors = [torch.full((1, layout.horizon, layout.n_x), torch.nan, dtype=torch.float64)]
         for i, part in enumerate(parts):
             others = [log for j, other in enumerate(parts) if j != i for log in other]
-            if _usable(others, layout) >= _needed(layout):
+            if _usable(others, layout) > _needed(layout):
                 found = fit(others, self.options)[1]
                 errors.append(prediction_errors(part, found, layout, causal))
         return torch.cat(errors)
@@ -126,8 +126,9 @@ def identify(
 
     Args:
         trajectories: logged steps, ``(T,)`` or ``(episodes, T)``, with ``observation``, ``action``
-            (as applied) and ``("next", "observation")``. Done flags and the ids of trajectories are
-            respected.
+            (as applied) and ``("next", "observation")``. Done flags, the ids of trajectories and
+            gaps in ``time`` or ``step_count`` are respected. A list or lazy stack of logs may have
+            different lengths.
         horizon: N.
         past: L, the number of lags.
         n_d: entries of d_k, the first of the entry ``preview``.
@@ -178,13 +179,16 @@ def check_excitation(trajectories: Sequence[Trajectory], layout: Layout) -> None
     past, n_x, n_u, n_d = layout.past, layout.n_x, layout.n_u, layout.n_d
     needed = _needed(layout)
     usable = _usable(trajectories, layout)
-    if usable < needed:
+    if usable <= needed:
         total = sum(log.steps for log in trajectories)
         got = f"{total} transitions in {len(trajectories)} trajectories"
         if past > 1:
             got += f", {usable} of them with {past - 1} before them"
-        expected = f"at least {needed} such for past={past}, n_x={n_x}, n_u={n_u} and n_d={n_d}"
-        remedy = f"Log trajectories of more than {past} steps, or lower past."
+        expected = f"at least {needed + 1} such for past={past}, n_x={n_x}, n_u={n_u} and n_d={n_d}"
+        remedy = (
+            f"A fit of as many transitions as coefficients, {needed}, has no error to judge it by. "
+            f"Log more, in trajectories of more than {past} steps, or lower past."
+        )
         raise QPError.expected("trajectories", got, expected, remedy)
     X, _ = transitions(trajectories, layout)
     middle = X.mean(0)

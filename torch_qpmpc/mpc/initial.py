@@ -17,7 +17,7 @@ from torch_qpmpc.mpc.parametrizations import LinearRows
 from torch_qpmpc.mpc.validation import (
     as_tensor,
     bound_pair,
-    check_model,
+    check_weight,
     cost_weights,
     slack_weight,
 )
@@ -53,6 +53,7 @@ def theta(
     action_slack: Any,
     constraint_slack: float,
     rate_slack: Any,
+    start: Any,
     seed: int,
     **_: Any,
 ) -> tuple[Layout, dict[str, Tensor]]:
@@ -70,11 +71,14 @@ def theta(
     offset = torch.zeros(n_x) if offset is None else as_tensor("offset", offset)
     if tuple(offset.shape) != (n_x,):
         raise QPError.expected("offset", f"shape {tuple(offset.shape)}", f"shape ({n_x},)")
-    if stage_weight is None:
+    is_random = stage_weight is None
+    if is_random:
         states = 0.5 + 4.5 * torch.rand(n_x, generator=random, dtype=torch.float32)
         stage_weight = torch.cat((states, torch.zeros(n_u)))
-    if terminal_weight is None:
+    if terminal_weight is None and is_random:
         terminal_weight = torch.ones(n_x)
+    elif terminal_weight is None:
+        terminal_weight = _default_weight(A, B, stage_weight, gamma, hessian, start, layout)
     elif isinstance(terminal_weight, str):
         if terminal_weight != RICCATI or hessian == "diagonal":
             got = f"{terminal_weight!r} with hessian={hessian!r}"
@@ -109,10 +113,8 @@ def started(theta: Mapping[str, Tensor], start: Any, **_: Any) -> dict[str, Tens
     return values
 
 
-def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dict[str, Any]:
+def linear_mpc(*, hessian: str = "block", **options: Any) -> dict[str, Any]:
     """Return the defaults of `QPMPC.linear_mpc` for ``options``."""
-    n_x, n_u, past = model_sizes(*check_model(A, B))
-    riccati = hessian != "diagonal" and past == 1
     learn = ["H", "H_f", "q", "c", "C", "b", "lb", "ub", "w"]
     if hessian == "full":
         learn.remove("H_f")
@@ -121,11 +123,24 @@ def linear_mpc(A: Any, B: Any, *, hessian: str = "block", **options: Any) -> dic
     return {
         "structure": "tied",
         "hessian": hessian,
-        "stage_weight": [1.0] * (n_x + n_u),
-        "terminal_weight": RICCATI if riccati else [1.0] * n_x,
         "discount_slack": True,
         "learn": learn,
     }
+
+
+def check_cost(stage_weight: Any, n_x: int, n_u: int) -> None:
+    """Raise `QPError` if nobody has chosen a stage cost.
+
+    A controller of a model must not start from a random one.
+    """
+    if stage_weight is None:
+        example = ", ".join(["1.0"] * min(n_x, 4) + [".."] * (n_x > 4) + ["0.1"] * min(n_u, 4))
+        remedy = (
+            f"Pass the cost that the plant has, such as stage_weight=[{example}] for states "
+            "weighted 1 and actions 0.1, twice the plant's own weights."
+        )
+        expected = "the weight of [x; u] in the stage cost 1/2 [x; u]' W [x; u]"
+        raise QPError.expected("stage_weight", "none", expected, remedy)
 
 
 def model_sizes(A: Tensor, B: Tensor) -> tuple[int, int, int]:
@@ -161,6 +176,36 @@ def _model(
     return A, B, E
 
 
+def _default_weight(
+    A: Tensor,
+    B: Tensor,
+    stage_weight: Any,
+    gamma: float,
+    hessian: str,
+    start: Any,
+    layout: Layout,
+) -> Tensor:
+    """Return the Riccati weight about the target if it exists, else the last stage's weight.
+
+    A linear cost in ``start`` has a target of its own, which only the stage's weight respects.
+    """
+    W, n_x, n_d = as_tensor("stage_weight", stage_weight), layout.n_x, layout.n_d
+    shapes = ((layout.n,), (layout.n,) * 2, (n_d + layout.n,) * 2)
+    if hessian == "diagonal" or tuple(W.shape) not in shapes:
+        W = W[-1] if W.ndim > 1 else W
+    elif not (isinstance(start, Mapping) and "q" in start):
+        try:
+            P = _riccati_weight(A, B, W, gamma, layout)
+            check_weight("terminal_weight", P, diagonal=False, n_d=len(P) - n_x)
+            return P
+        except QPError:
+            pass  # the stage's weight is always one
+    if W.ndim == 2:
+        size = len(W) - layout.n_u
+        return W[:size, :size]
+    return W[:n_x] if W.ndim else W
+
+
 def _riccati_weight(
     A: Tensor, B: Tensor, stage_weight: Any, gamma: float, layout: Layout
 ) -> Tensor:
@@ -168,15 +213,22 @@ def _riccati_weight(
         remedy = "Pass a matrix: its cost to go is one of the whole window."
         raise QPError.expected("terminal_weight", f"{RICCATI!r} with past > 1", "past=1", remedy)
     W = as_tensor("stage_weight", stage_weight)
-    W = torch.diag(W) if W.shape == (layout.n,) else W
-    if W.shape == (layout.n_d + layout.n,) * 2:
-        W = W[layout.n_d :, layout.n_d :]
+    W, n_d = torch.diag(W) if W.shape == (layout.n,) else W, layout.n_d
+    cross = W.new_zeros(layout.n_x, 0)
+    if W.shape == (n_d + layout.n,) * 2:
+        cross, W = W[n_d : n_d + layout.n_x, :n_d], W[n_d:, n_d:]
     sizes = {"A": (A, layout.n_x, layout.n_x), "B": (B, layout.n_x, layout.n_u)}
     for name, (matrix, *shape) in (sizes | {"stage_weight": (W, layout.n, layout.n)}).items():
         if list(matrix.shape) != shape:
             got, remedy = f"shape {tuple(matrix.shape)}", "The Riccati equation has one stage only."
             raise QPError.expected(name, got, f"shape {tuple(shape)}", remedy)
-    return riccati_weight(A, B, W, gamma)
+    P = riccati_weight(A, B, W, gamma)
+    if not cross.any():
+        return P
+    # x - target, where the stage's cost of x is least for d.
+    Q = W[: layout.n_x, : layout.n_x]
+    error = torch.cat((torch.linalg.pinv(Q, hermitian=True) @ cross, torch.eye(len(P)).to(P)), -1)
+    return error.mT @ P @ error
 
 
 def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:

@@ -7,6 +7,7 @@ appear only in `torch_qpmpc.learning`.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from torch_qpmpc.mpc.identification import identify
 from torch_qpmpc.mpc.identity import check_identity, digest, encoded
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST
+from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
 from torch_qpmpc.mpc.shortening import Shortening
 from torch_qpmpc.mpc.validation import (
     CONSTRAINTS,
@@ -34,6 +36,7 @@ from torch_qpmpc.mpc.validation import (
     own,
 )
 from torch_qpmpc.qp.batching import full_precision, to_dtype
+from torch_qpmpc.qp.forking import serially_if_forked
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
@@ -45,14 +48,22 @@ if TYPE_CHECKING:
 #: Attributes that only the constructor and `QPMPC.release` set.
 FIXED = ("n_x", "n_u", "horizon", "past", "n_d", "n_p", "n_z", "gamma")
 FIXED = (*FIXED, "hessian", "structure", "step", "learned")
+#: The default discount, that of the paper.
+GAMMA = 0.9
+#: The warning of a random start.
+RANDOM = (
+    "This QPMPC acts with a random model or stage cost, which is a start to learn from and not a "
+    "controller. Pass A, B and stage_weight, or use QPMPC.from_model or QPMPC.from_data."
+)
 
 
 class QPMPC(nn.Module):
-    """A parametric QP in z = [x_0, u_0, x_1, .., x_N], n_z = N (n_x + n_u) + n_x (eq:qp5).
+    """A parametric QP (eq:qp5), which starts at random where no model or stage cost is passed.
 
-    The cost (eq:qpH) has a stage block H_k, q_k for (x_k, u_k), discounted by gamma^k, and a
-    terminal block H_f, q_f for x_N, discounted by gamma^N. Parameters and buffers are float64,
-    inputs of any float dtype; outputs have the dtype of the input.
+    Its variable is z = [x_0, u_0, x_1, .., x_N], n_z = N (n_x + n_u) + n_x. The cost (eq:qpH) has a
+    stage block H_k, q_k for (x_k, u_k), discounted by gamma^k, and a terminal block H_f, q_f for
+    x_N, discounted by gamma^N. Parameters and buffers are float64, inputs of any float dtype;
+    outputs have the dtype of the input.
 
     More than x_0 may be known: the past and, ahead of time, signals such as prices, forecasts and
     references. With the *window* of the last L outputs and L - 1 actions between them (``past=L``)
@@ -91,14 +102,17 @@ class QPMPC(nn.Module):
         hessian: ``"diagonal"``, ``"block"`` (one dense block a stage) or ``"full"`` (dense in z).
         stage_weight: the initial H_k, ``(n_x + n_u,)`` if diagonal, else
             ``(n_x + n_u, n_x + n_u)``, with an optional leading N for one weight per stage; by
-            default diagonal, random uniform in (0.5, 5) for states and zero for actions. The cost
+            default diagonal, random uniform in (0.5, 5) for states and zero for actions, of which
+            a `UserWarning` tells when the policy first acts before a state_dict is loaded. The cost
             of a stage is *half* of ``[x_k; u_k]' H_k [x_k; u_k]`` (eq:qpH): for a plant's cost
             ``s'Ws``, pass 2 W. With a preview and a dense H it may be one of [d_k; x_k; u_k], of
             which only the block of (x_k, u_k) must be positive semidefinite: a price p times u_k
             is an entry 1 in both of their cross blocks.
-        terminal_weight: the initial H_f, ``(n_x,)`` or ``(n_x, n_x)``; the identity by default.
+        terminal_weight: the initial H_f, ``(n_x,)`` or ``(n_x, n_x)``, or of [d_N; x_N].
             ``"riccati"``: the cost to go of the linear quadratic regulator of A, B and the stage
-            weight; not for a diagonal hessian.
+            weight, about the x of least stage cost for d_N; not for a diagonal hessian. By default
+            it is that if it exists, for one dense stage, past=1 and no q in ``start``; else the
+            stage's own weight. With a random stage weight it is the identity.
         state_slack, action_slack, constraint_slack, rate_slack: the slack weights w of the rows of
             states, of actions, of mixed and terminal constraints, and of rates; ``inf`` makes them
             hard. By default, actions and rates are hard and the others soft. Pass one weight or,
@@ -163,7 +177,7 @@ class QPMPC(nn.Module):
         past: int = 1,
         n_d: int = 0,
         *,
-        gamma: float = 0.9,
+        gamma: float = GAMMA,
         A: Any = None,
         B: Any = None,
         E: Any = None,
@@ -197,12 +211,14 @@ class QPMPC(nn.Module):
         whole = ("n_x", "n_u", "horizon", "past", "n_d", "seed")
         arguments |= {name: int(arguments[name]) for name in whole}
         self._arguments = arguments
+        self._random = stage_weight is None or A is None or B is None
         backend(solver)
         with torch.device("cpu"):
             self._start(arguments["learn"])
         if (device := torch.get_default_device()).type != "cpu":
             self.to(device)
 
+    @serially_if_forked
     def _start(self, learn: Collection[str]) -> None:
         arguments = self._arguments
         self._layout, theta = initial.theta(**arguments)
@@ -234,16 +250,19 @@ class QPMPC(nn.Module):
         Args:
             A, B: see `QPMPC`; their shapes give n_x, n_u and past.
             horizon: N.
-            options: the keyword arguments of `QPMPC`; the shape of E gives n_d.
+            options: the keyword arguments of `QPMPC`, of which ``stage_weight`` is required; the
+                shape of E gives n_d.
 
         Raises:
-            QPError: an argument is invalid.
+            QPError: an argument is invalid, or there is no stage cost.
         """
         A, B = check_model(A, B)
         n_x, n_u, past = initial.model_sizes(A, B)
         if (E := options.get("E")) is not None:
             options.setdefault("n_d", torch.as_tensor(E).shape[-1])
-        return cls(n_x, n_u, horizon, **{"past": past, "A": A, "B": B} | options)
+        mpc = cls(n_x, n_u, horizon, **{"past": past, "A": A, "B": B} | options)
+        initial.check_cost(options.get("stage_weight"), n_x, n_u)
+        return mpc
 
     @classmethod
     def from_data(
@@ -262,13 +281,15 @@ class QPMPC(nn.Module):
         """Return a QPMPC whose C and b start from least squares on logged trajectories.
 
         C_0 is the banded matrix of an ARX model; `identify` returns it with its prediction errors.
+        Without ``stage_weight`` the cost is fitted to the rewards of the log
+        (`torch_qpmpc.mpc.stage_cost`), with a warning if it explains them poorly.
 
         Args:
             trajectories, horizon, past, n_d, n_x, structure, causal, ridge: see `identify`.
             options: the keyword arguments of `QPMPC`, such as cost and bounds.
 
         Raises:
-            QPError: as in `identify` and `QPMPC`.
+            QPError: as in `identify` and `QPMPC`, or there is neither a stage cost nor rewards.
 
         Example:
             >>> import torch, torch_qpmpc as qm
@@ -291,31 +312,37 @@ class QPMPC(nn.Module):
             ridge=ridge,
         )
         arguments: dict[str, Any] = {**found.arguments, **options}
-        start = {**found.arguments.get("start", {}), **(options.get("start") or {})}
-        return cls(**{**arguments, "start": start})
+        starts = [found.arguments.get("start", {}), options.get("start") or {}]
+        if arguments.get("stage_weight") is None:
+            diagonal = options.get("hessian", "diagonal") == "diagonal"
+            fitted = fit_rewards(trajectories, found.options.layout, diagonal)
+            cost = scheme_cost(fitted, found.options.layout, options.get("gamma", GAMMA), diagonal)
+            starts.insert(0, cost.pop("start"))
+            arguments = {**arguments, **cost, **{k: x for k, x in options.items() if x is not None}}
+        return cls(**{**arguments, "start": {k: x for part in starts for k, x in part.items()}})
 
     @classmethod
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
         """Return a linear MPC scheme with all parts learned (eq:v1, eq:q1).
 
-        It is `from_model` with other defaults: ``structure="tied"``, dense weights that start as
-        the identity and, for x_N, from the Riccati equation, discounted slack weights, and all
-        parts of theta in ``learn``. `release` frees C.
+        It is `from_model` with other defaults: ``structure="tied"``, dense weights, discounted
+        slack weights, and all parts of theta in ``learn``. `release` frees C.
 
         Args:
             A, B, horizon, options: see `from_model`.
 
         Raises:
-            QPError: an argument is invalid, or the Riccati equation has no solution.
+            QPError: as in `from_model`.
 
         Example:
             >>> import torch, torch_qpmpc as qm
             >>> A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]), torch.tensor([[0.0], [0.1]])
-            >>> mpc = qm.QPMPC.linear_mpc(A, B, 10, action_bounds=([-1.0], [1.0]))
+            >>> cost, bounds = [1.0, 1.0, 0.1], ([-1.0], [1.0])
+            >>> mpc = qm.QPMPC.linear_mpc(A, B, 10, stage_weight=cost, action_bounds=bounds)
             >>> [tuple(part.shape) for part in mpc.model()]
             [(2, 2), (2, 1)]
         """
-        return cls.from_model(A, B, horizon, **(initial.linear_mpc(A, B, **options) | options))
+        return cls.from_model(A, B, horizon, **(initial.linear_mpc(**options) | options))
 
     def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
         """Return V(s) (eq:qp4), a cost to go: s ``(*batch, n_p)`` to ``(*batch,)``.
@@ -469,6 +496,7 @@ class QPMPC(nn.Module):
             of_plan = leaf[..., n_free:, n_free:] if dense else leaf[..., None, None]
             of_plan.copy_(NEAREST[self.step](of_plan))
 
+    @serially_if_forked
     def quadratic_program(self, residuals: Mapping[str, Tensor] | None = None) -> QuadraticProgram:
         """Return the current theta as a QuadraticProgram, with discounts (eq:qpH).
 
@@ -554,7 +582,7 @@ class QPMPC(nn.Module):
         Example:
             >>> import torch, torch_qpmpc as qm
             >>> A, B = torch.tensor([[0.9]]), torch.tensor([[1.0]])
-            >>> long, short = (qm.QPMPC.from_model(A, B, N, seed=0) for N in (5, 4))
+            >>> long, short = (qm.QPMPC.from_model(A, B, N, stage_weight=[1, 1]) for N in (5, 4))
             >>> torch.allclose(long.shortened().H, short.quadratic_program().H, rtol=1e-12)
             True
         """
@@ -679,6 +707,7 @@ class QPMPC(nn.Module):
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         super()._load_from_state_dict(self.checked_state(state_dict, prefix), prefix, *args)
+        self._random = False
         self._derive()
 
     def _derive(self) -> None:
@@ -734,7 +763,10 @@ class QPMPC(nn.Module):
         return solve(qp, fixed, n_kept, self.solver, self.on_failure, warm_start)
 
     def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:
-        """Return u_0 of a solution of V's QP."""
+        """Return u_0 of a solution of V's QP, and tell of a random start the first time."""
+        if self._random and not torch.compiler.is_compiling():
+            self._random = False
+            warnings.warn(RANDOM, UserWarning, stacklevel=3)
         return to_dtype(solution.z[..., self.n_p : self.n_p + self.n_u], dtype)
 
     def _cost(self, theta: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:

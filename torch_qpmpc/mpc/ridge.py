@@ -12,11 +12,17 @@ STRENGTHS = 10.0 ** torch.arange(-16, 4.1, 0.25, dtype=torch.float64)
 SHARE = 0.3
 
 
-def ridge(X: Tensor, Y: Tensor, strength: float | None = None) -> Tensor:
+def ridge(
+    X: Tensor,
+    Y: Tensor,
+    strength: float | None = None,
+    strengths: Tensor = STRENGTHS,
+    share: float = SHARE,
+) -> Tensor:
     """Return the W that minimises ``|Y - X W|^2 / n + strength |D W|^2``, ``(m, n_y)``.
 
     D holds the root mean squares of X's columns, so that W does not depend on their units. By
-    default the strength is `SHARE` of the one with the largest evidence, the likelihood of Y
+    default the strength is ``share`` of the one with the largest evidence, the likelihood of Y
     ``(n, n_y)`` under a Gaussian prior of W, for each column of Y by itself; the variance of the
     noise has its likeliest value.
 
@@ -24,6 +30,8 @@ def ridge(X: Tensor, Y: Tensor, strength: float | None = None) -> Tensor:
         X: regressors, ``(n, m)``.
         Y: targets, ``(n, n_y)``.
         strength: the strength; None for that of the evidence.
+        strengths: those among which the evidence decides.
+        share: the share of that strength which is used.
     """
     n, m = X.shape
     size = X.square().mean(0).sqrt()
@@ -38,7 +46,7 @@ def ridge(X: Tensor, Y: Tensor, strength: float | None = None) -> Tensor:
     a = U.mT @ target
     outside = outside + (target - U @ a).square().sum(0)
     if strength is None:
-        shrinkage = SHARE * _best_strength(s, a, outside, n)
+        shrinkage = share * _best_strength(s, a, outside, n, strengths)
     else:
         shrinkage = torch.full_like(outside, strength)
     seen = (s > s.amax() * max(n, m) * torch.finfo(s.dtype).eps).unsqueeze(-1)
@@ -47,7 +55,7 @@ def ridge(X: Tensor, Y: Tensor, strength: float | None = None) -> Tensor:
     return scale.unsqueeze(-1) * (Vh.mT @ (inverse * a))
 
 
-def _best_strength(s: Tensor, a: Tensor, outside: Tensor, n: int) -> Tensor:
+def _best_strength(s: Tensor, a: Tensor, outside: Tensor, n: int, strengths: Tensor) -> Tensor:
     """Return the strength of the largest evidence for each target, ``(n_y,)``.
 
     Args:
@@ -55,9 +63,10 @@ def _best_strength(s: Tensor, a: Tensor, outside: Tensor, n: int) -> Tensor:
         a: targets in the basis of the left singular vectors, ``(r, n_y)``.
         outside: squared norms of the targets outside of that basis, ``(n_y,)``.
         n: the number of samples.
+        strengths: the candidates.
     """
-    gain = 1 + s.square() / (n * STRENGTHS.unsqueeze(-1))
+    gain = 1 + s.square() / (n * strengths.unsqueeze(-1))
     noise = outside + (a.square() / gain.unsqueeze(-1)).sum(1)
     tiny = torch.finfo(s.dtype).tiny
     log_evidence = -n * noise.clamp(min=tiny).log() - gain.log().sum(1).unsqueeze(-1)
-    return STRENGTHS[log_evidence.argmax(0)]
+    return strengths[log_evidence.argmax(0)]

@@ -18,6 +18,10 @@ ENDS = (("next", "done"), ("next", "terminated"), ("next", "truncated"))
 #: Keys of collectors and of `torchrl.collectors.utils.split_trajectories`.
 IDS = (("collector", "traj_ids"), ("traj_ids",))
 MASKS = (("collector", "mask"), ("mask",))
+#: Times and step counts, whose increments are constant without a gap.
+TIMES = (("time",), ("step_count",))
+#: The largest magnitude, whose squares are finite.
+LARGEST = 1e100
 
 
 class Trajectory(NamedTuple):
@@ -41,10 +45,12 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
     """Return the trajectories in logged steps, in order.
 
     A trajectory ends at a done flag, where the id of the trajectory changes, and where the next
-    observation is not the one of the following step, as in steps sampled at random.
+    observation is not the one of the following step, as in steps sampled at random. A step within a
+    trajectory during which ``time`` or ``step_count`` jumps is left out.
 
     Args:
-        data: steps ``(T,)`` or ``(episodes, T)`` with ``observation``, ``action``,
+        data: steps ``(T,)`` or ``(episodes, T)``, or a lazy stack or list of ``(T,)`` of different
+            lengths, with ``observation``, ``action``,
             ``("next", "observation")`` and, for ``n_d > 0``, ``preview``, whose first entries are
             d_k. Done flags, trajectory ids and masks of padded steps are respected.
         n_x: the number of outputs, the last entries of ``observation``; None for all of them.
@@ -55,6 +61,8 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
     """
     from tensordict import TensorDictBase
 
+    if isinstance(data, list | tuple) or (isinstance(data, TensorDictBase) and -1 in data.shape):
+        return _read_each(logs(data), n_x, n_d)
     check_kind("trajectories", data, TensorDictBase, REMEDY)
     if data.batch_dims not in (1, 2):
         got = f"shape {tuple(data.shape)}"
@@ -63,7 +71,7 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
     if n_x is not None:
         check_whole("n_x", n_x, 1)
     steps = data if data.batch_dims == 2 else data.unsqueeze(0)
-    valid = _flags(steps, MASKS, default=True)
+    valid = valid_steps(steps)
     y = _entry(steps, ("observation",), valid, n_x)
     u = _entry(steps, ("action",), valid)
     following = _entry(steps, NEXT, valid, n_x)
@@ -73,12 +81,17 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
     d = u.new_zeros(*u.shape[:-1], 0)
     if n_d:
         d = _entry(steps, ("preview",), valid, n_d, first=True)
-    ends = _flags(steps, ENDS, default=False) | ~valid
-    ends[:, :-1] |= (following[:, :-1] != y[:, 1:]).any(-1) | ~valid[:, 1:]
+    ends = _flags(steps, ENDS, default=False)
+    ends[:, :-1] |= (following[:, :-1] != y[:, 1:]).any(-1)
     for key in IDS:
         if (ids := steps.get(key, None)) is not None:
-            ids = ids.reshape(steps.shape)
+            ids = _narrow(key, ids, steps.shape)
             ends[:, :-1] |= ids[:, 1:] != ids[:, :-1]
+    for key in TIMES:
+        if (times := steps.get(key, None)) is not None:
+            valid = valid & ~_gaps(_narrow(key, times, steps.shape), ends)
+    ends |= ~valid
+    ends[:, :-1] |= ~valid[:, 1:]
     found = []
     for row in range(len(y)):
         start = 0
@@ -90,6 +103,41 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
     if not found:
         raise QPError.expected("trajectories", "no steps", "logged steps", REMEDY)
     return found
+
+
+def logs(data: Any) -> list[Any]:
+    """Return the logs in a list, or in a lazy stack of logs of different lengths; else one."""
+    if isinstance(data, list | tuple):
+        return list(data)
+    return list(data.unbind(0)) if -1 in data.shape else [data]
+
+
+def valid_steps(steps: Any) -> Tensor:
+    """Return True for the steps that are not padding, in the log's shape."""
+    return _flags(steps, MASKS, default=True)
+
+
+def _read_each(parts: Sequence[Any], n_x: int | None, n_d: int) -> list[Trajectory]:
+    """Return the trajectories of several logs."""
+    found = [log for part in parts for log in read_trajectories(part, n_x, n_d)]
+    sizes = {(log.y.shape[1], log.u.shape[1]) for log in found}
+    if len(sizes) != 1:
+        got = f"logs of (n_x, n_u) = {', '.join(map(str, sorted(sizes)))}" if sizes else "no logs"
+        raise QPError.expected("trajectories", got, "logs of the same sizes", REMEDY)
+    return found
+
+
+def _gaps(times: Tensor, ends: Tensor) -> Tensor:
+    """Mark the steps ``(episodes, T)`` before an end during which the time jumps."""
+    eps = torch.finfo(times.dtype if times.is_floating_point() else torch.float64).eps
+    times, inside = times.double(), ~ends[:, :-1]
+    change = times.diff(dim=1)
+    gaps = torch.zeros_like(ends)
+    if inside.any():
+        step = change[inside].median()
+        rounding = 4 * eps * times.abs()[:, 1:]
+        gaps[:, :-1] = inside & ~((change - step).abs() <= 0.5 * step.abs() + rounding)
+    return gaps
 
 
 def folds(trajectories: Sequence[Trajectory], count: int) -> list[list[Trajectory]]:
@@ -127,6 +175,7 @@ def _entry(
         raise QPError.expected(name, got, wanted, REMEDY)
     if value.shape[-1] < (width or 1):
         raise QPError.expected(name, f"shape {tuple(value.shape)}", wanted)
+    _check_values(name, value)
     value = value.detach().to("cpu", torch.float64)
     if width is not None:
         value = value[..., :width] if first else value[..., value.shape[-1] - width :]
@@ -136,7 +185,28 @@ def _entry(
         got = f"{value[tuple(bad[0])].item()} at step {tuple(step)}, entry {entry}"
         remedy = "Cut the steps that were not measured, and mark the last ones before as done."
         raise QPError.expected(name, got, "finite numbers", remedy)
+    large = value.masked_fill(~valid.unsqueeze(-1), 0.0).abs().amax() if value.numel() else 0.0
+    if large > LARGEST:
+        remedy = "Squares of larger numbers overflow: choose larger units."
+        raise QPError.expected(name, f"{large:.3g}", f"numbers up to {LARGEST:g}", remedy)
     return value
+
+
+def _check_values(name: str, value: Tensor) -> None:
+    """Raise `QPError` for a meta tensor."""
+    if value.is_meta:
+        remedy = "Pass the log itself, not its shapes."
+        raise QPError.expected(name, "a meta tensor", "a tensor with values", remedy)
+
+
+def _narrow(key: tuple[str, ...], value: Any, batch: torch.Size) -> Tensor:
+    """Return one flag, id or time for each step; several are those of several agents, say."""
+    if not isinstance(value, Tensor) or value.numel() != batch.numel():
+        got = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+        expected = f"shape {tuple(batch)} or {(*batch, 1)}"
+        raise QPError.expected(_name(key), got, expected, "Pass one for each step.")
+    _check_values(_name(key), value)
+    return value.reshape(batch).cpu()
 
 
 def _flags(steps: Any, keys: tuple[tuple[str, ...], ...], default: bool) -> Tensor:
@@ -144,7 +214,7 @@ def _flags(steps: Any, keys: tuple[tuple[str, ...], ...], default: bool) -> Tens
     flags = torch.full(steps.shape, default)
     for key in keys:
         if (value := steps.get(key, None)) is not None:
-            value = value.reshape(steps.shape).bool().cpu()
+            value = _narrow(key, value, steps.shape).bool()
             flags = flags & value if default else flags | value
     return flags
 

@@ -5,7 +5,6 @@ Between the two everything works in float64 without autograd, once per batch.
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -16,6 +15,7 @@ from torch import Tensor
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.qp.batching import broadcast, flatten_batch
 from torch_qpmpc.qp.derivatives import N_THETA, gradients
+from torch_qpmpc.qp.forking import serial_if_forked
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.solve import solve_programs
@@ -25,9 +25,6 @@ from torch_qpmpc.qp.solvers import backend
 ON_FAILURE = ("raise", "warn", "mask")
 #: The tensors of a `QPSolution`: value, z, chi, lam, xi, status, residual, iterations, active.
 Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-
-# OpenMP's threads do not survive a fork; with more than one, torch would hang in the child.
-os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def solve_eager(
@@ -94,11 +91,12 @@ def solve_now(
     device = q.device if solver == "torch" and q.is_cuda else None
     theta = (H, q, c, C, b, G, lb, ub, w)
     try:
-        programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=device)
-        if start is not None:
-            start = flatten_batch(start.detach().to(q.device).expand(*batch, -1)).contiguous()
-        sets = start.numpy(force=True) if start is not None and device is None else start
-        solution = solve_programs(programs, solver, sets)
+        with serial_if_forked():
+            programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=device)
+            if start is not None:
+                start = flatten_batch(start.detach().to(q.device).expand(*batch, -1)).contiguous()
+            sets = start.numpy(force=True) if start is not None and device is None else start
+            solution = solve_programs(programs, solver, sets)
     except (MemoryError, RuntimeError) as error:
         if not _is_out_of_memory(error):
             raise

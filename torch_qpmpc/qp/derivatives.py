@@ -42,6 +42,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.qp.batching import outer, sum_to, times, weighted_sum
+from torch_qpmpc.qp.forking import serially_if_forked
 from torch_qpmpc.qp.kkt import kkt
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solution import saturated_rows, slacks, upper_share
@@ -75,6 +76,7 @@ def envelope_gradients(
     }
 
 
+@serially_if_forked
 def gradients(
     incoming: Sequence[Tensor | None],
     theta: Sequence[Tensor],
@@ -148,6 +150,7 @@ def _solution_gradients(
     return (f() if need else None for f, need in zip(formulas, needed, strict=True))
 
 
+@serially_if_forked
 def tangents(
     d_theta: Tangents,
     theta: Sequence[Tensor],

@@ -203,6 +203,7 @@ def test_hard_rows_that_hold_only_far_away_are_not_infeasible(far):
 #: Settings with soft states and hard action bounds, feasible and bounded for every state.
 BOUNDED: dict[str, Any] = {
     "stage_weight": [1.0, 0.1, 0.01],
+    "terminal_weight": [1.0, 1.0],
     "state_bounds": ([-2, -10], [2, 10]),
     "action_bounds": ([-1.0], [1.0]),
 }
@@ -277,6 +278,7 @@ def test_noise_beside_large_numbers_spoils_no_proof(solver):
         flat.q[2] = 1.0
     assert flat.solve(doubles([0.0])).status == Status.UNBOUNDED
     options = {"state_bounds": ([-2, -2], [2, 2]), "state_slack": torch.inf}
+    options["stage_weight"] = [1.0, 1.0, 0.0]
     A, B = [[1.5, 0.1], [0.0, 1.2]], [[0.0], [1.0]]
     mpc = QPMPC.from_model(A, B, 3, solver=solver, on_failure="mask", **options)
     assert mpc.solve(doubles([1.9, 0.0])).status == Status.INFEASIBLE

@@ -120,6 +120,7 @@ def test_small_and_large_contradictions_are_infeasible(size):
 def test_retries_exclude_the_matrices_of_invalid_qps(solver):
     """One of three QPs with too large units has NaN in its matrices."""
     options = {"stage_weight": [1.0, 0.1, 0.01], "action_bounds": ([-1.0], [1.0])}
+    options["terminal_weight"] = [1.0, 1.0]
     A, B, far = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], ([-1e6] * 2, [1e6] * 2)
     qp = QPMPC.from_model(A, B, 10, state_bounds=far, **options).quadratic_program()
     H = qp.H.detach().expand(3, -1, -1).clone()

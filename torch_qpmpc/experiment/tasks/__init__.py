@@ -6,6 +6,7 @@ Each task is one file that registers it. A user's script can register more.
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import Any
 
 from omegaconf import DictConfig
 from torch import Tensor
@@ -73,6 +74,13 @@ def true_model(
     return physics.true_model()
 
 
+def _terminal_weight(choice: str, scheme: Scheme) -> Any:
+    """Return the argument of `QPMPC`, which is None for ``default``."""
+    if choice == "identity" and scheme.A is not None:
+        return [1.0] * scheme.A.shape[-2]
+    return "riccati" if choice == "riccati" else None
+
+
 def _make(
     cfg: DictConfig,
     physics: AnyPlant,
@@ -88,7 +96,7 @@ def _make(
         "structure": cfg.constraint.structure,
         "hessian": task.hessian,
         "stage_weight": scheme.stage_weight,
-        "terminal_weight": "riccati" if task.terminal_weight == "riccati" else None,
+        "terminal_weight": _terminal_weight(task.terminal_weight, scheme),
         "state_slack": task.state_slack,
         "action_slack": task.action_slack,
         "discount_slack": task.discount_slack,

@@ -10,22 +10,29 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.tasks.registry import AnyPlant, Scheme
+from torch_qpmpc.experiment.tasks.registry import AnyPlant, Scheme, find_task
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.stage_cost import fit_stage_cost
+from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
+from torch_qpmpc.mpc.stage_cost import StageCost
 
 
 class Start(NamedTuple):
-    """A log of the task's plant, and what has been identified from it."""
+    """A log of the task's plant, and the model and, if the task has none, the cost fitted to it.
+
+    ``print`` shows the errors of both.
+    """
 
     log: TensorDictBase
     identified: Identified
+    cost: StageCost | None = None
+
+    def __str__(self) -> str:
+        return "\n".join(str(part) for part in self[1:] if part is not None)
 
 
 def identified_start(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase) -> Start:
-    """Identify C and b from a log of the task's plant; `identify` names the errors."""
+    """Identify C, b and a missing stage cost from a log of the plant; `identify` names errors."""
     found = identify(
         log,
         cfg.task.horizon,
@@ -36,7 +43,10 @@ def identified_start(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase) ->
         causal=cfg.start.causal,
         ridge=cfg.start.ridge,
     )
-    return Start(log, found)
+    cost = None
+    if find_task(cfg.task).wrong_scheme(cfg, physics).stage_weight is None:
+        cost = fit_rewards(log, found.options.layout, cfg.task.hessian == "diagonal")
+    return Start(log, found, cost)
 
 
 def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
@@ -47,16 +57,17 @@ def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
     values = {**scheme.options.get("start", {}), **arguments.get("start", {})}
     cost = {}
     if scheme.stage_weight is None:
-        cost, weights, q = observed_cost(cfg, start.log, start.identified.options.layout)
+        layout = start.identified.options.layout
+        cost, weights, q = observed_cost(cfg, start.log, layout, start.cost)
         options, values = options | weights, {**values, "q": q}
     options = {**scheme.options, **options, "start": values}
     return replace(scheme, **model, **cost, options=options)
 
 
 def observed_cost(
-    cfg: DictConfig, log: TensorDictBase, layout: Layout
+    cfg: DictConfig, log: TensorDictBase, layout: Layout, found: StageCost | None = None
 ) -> tuple[dict[str, Any], dict[str, Tensor], Tensor]:
-    """Fit a convex stage cost to the rewards of a log.
+    """Return the cost of a scheme from that of a stage, by default fitted to the log's rewards.
 
     It is the cost of x_N, too, without an action, unless ``cfg`` has a terminal weight from the
     Riccati equation. The constant adds the mean cost of the log beyond the horizon.
@@ -66,32 +77,16 @@ def observed_cost(
         argument of `QPMPC`, and q ``(n_z,)``.
 
     Raises:
-        QPError: the log has no rewards, or not all are finite.
+        QPError: as in `fit_rewards`.
     """
-    n_d, n_x, n_u, N = layout.n_d, layout.n_x, layout.n_u, layout.horizon
-    reward = log.get(("next", "reward"), None)
-    if reward is None or not reward.isfinite().all():
-        got = "a log without rewards" if reward is None else "a log with rewards of NaN or inf"
-        remedy = "Pass task.stage_weight, the weight W of the cost 1/2 [x; u]' W [x; u]."
-        raise QPError.expected("start", got, "finite rewards to fit a cost to", remedy)
-    parts = [log["observation"][..., -n_x:], log["action"]]
-    if n_d:
-        parts.insert(0, log["preview"][..., :n_d])
-    v = torch.cat(tuple(part.double() for part in parts), dim=-1).flatten(0, -2)
-    cost, diagonal = -reward.double().flatten(), cfg.task.hessian == "diagonal"
-    W, q, c = fit_stage_cost(v, cost, n_d, diagonal)
-    weight, terminal = (W[n_d:, n_d:].diagonal() if diagonal else W), n_d + n_x
-    weights = {"terminal_weight": weight[:n_x] if diagonal else W[:terminal, :terminal]}
-    d, x, u = q.split((n_d, n_x, n_u))
-    past = q.new_zeros(layout.n_before - layout.n_preview)
-    ahead = cfg.task.gamma ** torch.arange(N + 1, dtype=torch.float64)
-    constant = c * ahead.sum()
-    if cfg.task.gamma < 1:
-        constant += cfg.task.gamma ** (N + 1) / (1 - cfg.task.gamma) * cost.mean()
-    fields = {"stage_weight": weight, "c": constant.item()}
+    diagonal, gamma = cfg.task.hessian == "diagonal", cfg.task.gamma
+    found = fit_rewards(log, layout, diagonal) if found is None else found
+    cost = scheme_cost(found, layout, gamma, diagonal)
+    q, constant = cost["start"]["q"], cost["start"]["c"]
+    if gamma < 1:
+        mean = -log["next", "reward"].double().mean()
+        constant += gamma ** (layout.horizon + 1) / (1 - gamma) * mean
+    fields = {"stage_weight": cost["stage_weight"], "c": constant.item()}
     if cfg.task.terminal_weight == "riccati":
-        weights, x_N = {}, torch.zeros_like(x)
-    else:
-        x_N = x
-    stages = layout.stages(torch.stack((*[x] * N, x_N)), u)
-    return fields, weights, torch.cat((d.repeat(N + 1), past, stages))
+        return fields, {}, torch.cat((q[: -layout.n_x], 0 * q[-layout.n_x :]))
+    return fields, {"terminal_weight": cost["terminal_weight"]}, q

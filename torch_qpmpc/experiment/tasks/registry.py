@@ -49,7 +49,7 @@ class TaskSettings(Group):
     episode_steps: Count
     eval_steps: Count
     hessian: Annotated[str, one_of(HESSIANS)]
-    terminal_weight: Annotated[str, one_of(("identity", "riccati"))]
+    terminal_weight: Annotated[str, one_of(("default", "identity", "riccati"))]
     learn_cost: Annotated[list[str], some_of(COST)]
     state_slack: Weight
     action_slack: Weight
@@ -59,7 +59,9 @@ class TaskSettings(Group):
     def riccati_is_dense(self) -> Self:
         if self.terminal_weight == "riccati" and self.hessian == "diagonal":
             remedy = "The Riccati weight needs task.hessian=block or full."
-            raise QPError.expected("task.terminal_weight", "'riccati'", "identity", remedy)
+            raise QPError.expected(
+                "task.terminal_weight", "'riccati'", "default or identity", remedy
+            )
         return self
 
 
@@ -150,7 +152,7 @@ def register(task: Task) -> None:
     node = {
         "defaults": ["/task/point_mass@task", {"override /noise": task.noises[0]}, "_self_"],
         **task.defaults,
-        "task": {**task.defaults.get("task", {}), **own},
+        "task": {"terminal_weight": "default", **task.defaults.get("task", {}), **own},
     }
     ConfigStore.instance().store(task.name, node, group="task", package="_global_")
 

@@ -7,8 +7,6 @@ of earlier solves.
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import torch
 from proxsuite import proxqp
@@ -24,17 +22,6 @@ EPS_INFEASIBLE = 1e-12
 MAX_ITER, MAX_ITER_IN = 30, 100
 #: The default, 10, takes a tenth of the time and saves no iteration.
 REFINEMENTS = 2
-
-_forked = False
-
-
-def _mark_forked() -> None:
-    global _forked
-    _forked = True
-
-
-# OpenMP's threads do not survive a fork: solving in parallel would hang in the child.
-os.register_at_fork(after_in_child=_mark_forked)
 
 
 def solve(qps: SoftQPs) -> BackendSolution:
@@ -57,7 +44,7 @@ def solve(qps: SoftQPs) -> BackendSolution:
             qp.results.z = np.concatenate((np.zeros(form.n_rows), -gradient[form.n_v :]))
         handles.append(qp)
     threads = torch.get_num_threads()
-    if _forked or threads == 1 or n_qps == 1:
+    if threads == 1 or n_qps == 1:
         for qp in handles:
             qp.solve()
     else:

@@ -1,0 +1,149 @@
+"""What nobody chose: the terminal weight, and the stage cost."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.func import vmap
+from torch.testing import assert_close
+
+from tests.logs import arx_log
+from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc.mpc.initial import riccati_weight
+
+A = torch.tensor([[1.0, 0.1], [0.0, 0.9]]).double()
+B = torch.tensor([[0.0], [0.1]]).double()
+W = torch.tensor([[1.0, 0.1, 0.0], [0.1, 0.5, 0.0], [0.0, 0.0, 0.1]]).double()
+UNCHOSEN = r"stage_weight: got none, expected the weight .* such as stage_weight=\[1.0, 1.0, 0.1\]"
+
+
+# The terminal weight
+
+
+def terminal_block(mpc: QPMPC, n_x: int) -> torch.Tensor:
+    H = mpc.quadratic_program().H.detach()
+    return H[-n_x:, -n_x:] / mpc.gamma**mpc.horizon
+
+
+@pytest.mark.parametrize("hessian", ["block", "full"])
+def test_it_is_the_riccati_weight_if_that_exists(hessian):
+    mpc = QPMPC.from_model(A, B, 4, hessian=hessian, stage_weight=W)
+    assert_close(terminal_block(mpc, 2), riccati_weight(A, B, W, 0.9))
+
+
+@pytest.mark.parametrize(
+    ("model", "options"),
+    [
+        ((A, B), {"hessian": "diagonal", "stage_weight": W.diagonal()}),
+        ((2 * torch.eye(2), [[1.0], [0.0]]), {}),  # not stabilisable
+        ((A.expand(4, 2, 2), B), {}),
+        ((A, B), {"stage_weight": torch.stack((9 * W, 9 * W, 9 * W, W))}),
+        ((torch.cat((A, 0 * A), -1), torch.cat((B, 0 * B), -1)), {}),
+        ((A, B), {"start": {"q": torch.ones(14)}}),  # its target is not zero
+    ],
+)
+def test_else_it_is_the_stages(model: Any, options: dict[str, Any]):
+    settings: dict[str, Any] = {"hessian": "block", "stage_weight": W, **options}
+    mpc = QPMPC.from_model(model[0], model[1], 4, **settings)
+    expected = W[:2, :2] if settings["hessian"] == "block" else torch.diag(W.diagonal()[:2])
+    assert_close(terminal_block(mpc, 2), expected)
+
+
+@pytest.mark.parametrize("past", [1, 2])
+@pytest.mark.parametrize("horizon", [1, 5, 20])
+@pytest.mark.parametrize("make", [QPMPC.from_model, QPMPC.linear_mpc])
+def test_a_reference_in_the_preview_is_reached(make, horizon, past):
+    weight = torch.tensor([[2.0, -2.0, 0.0], [-2.0, 2.0, 0.0], [0.0, 0.0, 1e-4]])
+    options = {"hessian": "block", "stage_weight": weight, "gamma": 1.0, "solver": "daqp"}
+    lags = [0.0] * (past - 1)
+    bounds = ([20.0], [80.0])
+    mpc = make(
+        [[0.95, *lags]], [[0.05, *lags]], horizon, E=[[0.0]], action_bounds=bounds, **options
+    )
+    y, u = torch.tensor([50.0]), torch.tensor([50.0])
+    for _ in range(150):
+        window = torch.cat((y, u)) if past > 1 else y[:0]
+        u = mpc.policy(torch.cat((55.0 * torch.ones(horizon + 1), window, y))).detach()
+        y = 0.95 * y + 0.05 * u
+    assert y.item() == pytest.approx(55.0, abs=1e-2 if horizon > 1 else 0.1)  # u costs a little
+
+
+def test_a_random_start_keeps_the_identity():
+    assert QPMPC(2, 1, 3).H_f.tolist() == [1.0, 1.0]
+
+
+# The stage cost
+
+
+@pytest.mark.parametrize("make", [QPMPC.from_model, QPMPC.linear_mpc])
+def test_a_controller_without_a_cost_is_refused(make):
+    with pytest.raises(QPError, match=f"^{UNCHOSEN}"):
+        make(A, B, 3)
+    with pytest.raises(QPError, match=f"^{UNCHOSEN}"):
+        make(A, B, 3, stage_weight=None)
+
+
+def rewarded() -> tuple[TensorDict, torch.Tensor]:
+    """Return a log with its costs, of which the weights of (y, u) are 1/2 diag(2, 1, 0.2)."""
+    log = arx_log(noise=0.1)
+    weight = torch.tensor([2.0, 1.0, 0.2]).double()
+    v = torch.cat((log["observation"], log["action"]), -1)
+    log["next", "reward"] = -(v.square() @ weight / 2 + v[..., :1].squeeze(-1)).unsqueeze(-1)
+    return log, weight
+
+
+@pytest.mark.parametrize("hessian", ["diagonal", "block"])
+def test_from_data_fits_the_cost_to_the_rewards(hessian):
+    log, weight = rewarded()
+    mpc = QPMPC.from_data(log, 3, past=2, hessian=hessian, gamma=0.8, learn=("H", "H_f", "q"))
+    H, H_f = (x if hessian == "diagonal" else x.diagonal() for x in (mpc.H, mpc.H_f))
+    assert_close(H.detach(), weight, rtol=1e-6, atol=1e-6)
+    assert_close(H_f.detach(), weight[:2], rtol=1e-6, atol=1e-6)
+    assert_close(mpc.q[-2:].detach(), torch.tensor([1.0, 0.0]).double(), rtol=1e-6, atol=1e-6)
+    own = QPMPC.from_data(log, 3, past=2, stage_weight=[1.0, 1.0, 0.1])
+    assert own.H.tolist() == [1.0, 1.0, 0.1]
+    assert (own.q == 0).all()
+
+
+def test_from_data_refuses_a_log_without_rewards():
+    message = r"^stage_weight: got none, and a log without rewards, expected a weight, or finite"
+    with pytest.raises(QPError, match=message):
+        QPMPC.from_data(arx_log(), 3, past=2)
+    log, _ = rewarded()
+    log["next", "reward"][0, 3] = torch.nan
+    with pytest.raises(QPError, match=r"^stage_weight: got none, and a log with rewards of NaN"):
+        QPMPC.from_data(log, 3, past=2)
+
+
+def test_a_random_start_warns_once_when_its_policy_acts():
+    assert QPMPC.__doc__ is not None
+    assert "starts at random" in QPMPC.__doc__.splitlines()[0]
+    mpc, s = QPMPC(2, 1, 3), torch.ones(4, 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mpc.value(s)
+        mpc.action_value(s, torch.zeros(4, 1))
+    with pytest.warns(UserWarning, match="random model or stage cost, .* Pass A, B and stage_weig"):
+        mpc.policy(s)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mpc.policy(s)
+        vmap(mpc.policy)(s)
+        for twin in (copy.copy(mpc), copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))):
+            twin.policy(s)
+        loaded = QPMPC(2, 1, 3, seed=1)
+        loaded.load_state_dict(mpc.state_dict())
+        loaded.policy_and_active_set(s)
+        QPMPC.from_model(A, B, 3, stage_weight=[1.0, 1.0, 0.1]).policy(s)
+
+
+def test_a_random_start_compiles():
+    mpc, s = QPMPC(2, 1, 3), torch.ones(4, 2)
+    compiled = torch.compile(mpc.policy, backend="eager", fullgraph=True)
+    assert_close(compiled(s), mpc.policy(s))
