@@ -35,7 +35,7 @@ from torch_qpmpc.experiment.start import collect_log
 from torch_qpmpc.experiment.tasks import find_task, make_physics
 from torch_qpmpc.learning.search import KNOBS
 from torch_qpmpc.study.markdown import replaced, table
-from torch_qpmpc.study.statistics import bootstrap_interval
+from torch_qpmpc.study.statistics import spread
 
 PAGE = DOCS / "results" / "improvement.md"
 RESULTS = DOCS / "results" / "improvement.csv"
@@ -212,10 +212,9 @@ def percents(rows: Any) -> np.ndarray:
 
 
 def ratios(rows: Any) -> str:
-    """Format J relative to the start's, in percent: median, 95 % interval, worst seed."""
+    """Format J relative to the start's, in percent: median, spread, worst seed."""
     percent = percents(rows)
-    low, high = bootstrap_interval([percent])
-    return f"{np.median(percent):.1f} [{low:.1f}, {high:.1f}], {percent.max():.1f}"
+    return f"{np.median(percent):.1f} {spread([percent]).text('.1f')}, {percent.max():.1f}"
 
 
 def by_case(rows: Any) -> Iterator[tuple[str, Any]]:

@@ -49,10 +49,8 @@ def test_outcomes_are_relative_to_the_start():
     *_, line = improvement.outcome_table(ROWS).splitlines()
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     assert cells[:3] == [TANKS, "3", "10.00"]
-    assert cells[3].startswith("40.0 [")
-    assert cells[3].endswith("], 60.0")
-    assert cells[4].startswith("50.0 [")
-    assert cells[4].endswith("], 70.0")
+    assert cells[3] == "40.0 (range of 3: 20.0 to 60.0), 60.0"
+    assert cells[4] == "50.0 (range of 3: 30.0 to 70.0), 70.0"
 
 
 def test_gaps_are_those_of_the_default():
@@ -79,10 +77,9 @@ def test_methods_have_their_median_and_worst_seed():
     cells = dict([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
     # The third seed has no run of the method.
     assert cells["seeds"] == "2"
-    medians = {"Q-learning": ("30.0 [", "], 40.0"), "default": ("40.0 [", "], 50.0")}
-    for way, (median, worst) in (medians | {method: ("15.0 [", "], 20.0")}).items():
-        assert cells[way].startswith(median)
-        assert cells[way].endswith(worst)
+    assert cells["Q-learning"] == "30.0 (range of 2: 20.0 to 40.0), 40.0"
+    assert cells["default"] == "40.0 (range of 2: 30.0 to 50.0), 50.0"
+    assert cells[method] == "15.0 (range of 2: 10.0 to 20.0), 20.0"
     assert not any(cells[way] for way in METHODS if way != method)
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+import shutil
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -89,6 +93,101 @@ def test_bad_arguments_are_refused():
         CompiledPolicy(tied(), speed=1)
     with pytest.raises(QPError, match=r"s: got shape \(3,\), expected shape \(\*batch, 2\)"):
         CompiledPolicy(tied())(torch.ones(3))
+
+
+@needs_compiler
+def test_the_value_of_an_unsolved_step_is_inf_as_that_of_the_module():
+    mpc = rates()
+    mpc.on_failure = "mask"
+    p = torch.tensor([[0.0, 0.0, -3.0, 0.0, 0.0], [torch.nan] * 5, [0.1] * 5])
+    value = CompiledPolicy(mpc).value(p)
+    torch.testing.assert_close(value, mpc.value(p).detach())
+    assert value[:2].tolist() == [torch.inf] * 2
+
+
+@needs_compiler
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_is_a_controller_of_its_own(again):
+    policy, s = CompiledPolicy(tied()), torch.tensor([[1.9, -0.5]])
+    u = policy(s)
+    other = again(policy)
+    policy.reset()
+    assert torch.equal(other(s), u)
+    assert other.last.iterations.max() == 0
+    policy(s)
+    assert policy.last is not None
+    assert policy.last.iterations.max() > 0
+    assert str(other.export) == str(policy.export)
+
+
+@needs_compiler
+def test_states_of_half_precision_are_states():
+    s = torch.tensor([[0.5, 0.25]], dtype=torch.bfloat16)
+    u = CompiledPolicy(tied())(s)
+    assert u.dtype is torch.bfloat16
+    torch.testing.assert_close(u, tied().policy(s.double()).detach().bfloat16())
+    with pytest.raises(QPError, match=r"H: got torch.bfloat16, expected torch.float32"):
+        CompiledPolicy(tied().bfloat16())
+
+
+@needs_compiler
+def test_the_self_test_runs_in_threads_at_once():
+    library = CompiledPolicy(tied())._library
+
+    def run(_: int) -> set[int]:
+        return {library.selftest() for _ in range(400)}
+
+    with ThreadPoolExecutor(4) as pool:
+        assert set().union(*pool.map(run, range(4))) == {0}
+
+
+@needs_compiler
+@pytest.mark.parametrize("command", ["gcc -O0", "g++", "clang++", "ccache gcc", "env gcc"])
+def test_the_compiler_may_have_arguments_and_be_one_of_cpp(command, monkeypatch):
+    if missing := [word for word in command.split() if word[0] != "-" and not shutil.which(word)]:
+        pytest.skip(f"no {missing[0]}")
+    monkeypatch.setenv("CC", command)
+    s = torch.tensor([0.5, 0.2])
+    torch.testing.assert_close(CompiledPolicy(tied())(s), tied().policy(s).detach())
+
+
+@pytest.mark.parametrize(
+    ("command", "match"),
+    [
+        (
+            "no-such-compiler -O2",
+            "compiler: got none on the PATH.* 'no-such-compiler' does not exist",
+        ),
+        (
+            "gcc '",
+            r"\$CC: got \"gcc '\": No closing quotation, expected a command. Correct or unset",
+        ),
+    ],
+)
+def test_a_wrong_command_is_named(command, match, monkeypatch):
+    monkeypatch.setenv("CC", command)
+    with pytest.raises(QPError, match=match):
+        CompiledPolicy(tied())
+
+
+def test_a_compiler_that_does_not_run_is_named(tmp_path, monkeypatch):
+    program = tmp_path / "compiler"
+    program.write_bytes(b"\0")
+    program.chmod(0o755)
+    monkeypatch.setenv("CC", str(program))
+    with pytest.raises(QPError, match=r"compiler: got .*, expected a command that runs"):
+        CompiledPolicy(tied())
+
+
+@needs_compiler
+def test_a_folder_without_programs_is_named(monkeypatch):
+    def refuse(path):
+        raise OSError(f"{path}: failed to map segment from shared object")
+
+    monkeypatch.setattr(library.ctypes, "CDLL", refuse)
+    match = "TMPDIR: got .* failed to map .*, expected a folder of programs. Set TMPDIR .* noexec"
+    with pytest.raises(QPError, match=match):
+        CompiledPolicy(tied())
 
 
 def test_without_a_compiler_there_is_none(monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import shutil
 import subprocess
 
 import pytest
@@ -10,9 +11,11 @@ import torch
 
 import torch_qpmpc as qm
 from tests.exported import SCHEMES, house, rates, tied
-from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc import QPMPC, QPError, Status
 from torch_qpmpc.export import export as module
+from torch_qpmpc.export.examples import draw
 from torch_qpmpc.export.library import Library, compiler
+from torch_qpmpc.export.tables import make_tables
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
@@ -30,6 +33,8 @@ def test_the_report_has_sizes_and_agreement(options, tmp_path):
     assert agreement.u < 1e-8
     assert agreement.value < 1e-8
     assert agreement.unsolved == 0
+    assert (agreement.states, agreement.solved, agreement.infeasible) == (100, 100, 0)
+    assert "where solved (100); 0 infeasible, 0 unsolved" in str(export)
     assert 20 < agreement.iterations < export.max_iterations == 1300
     assert export.state_bytes == Library(tmp_path / "deep/folder", "mass", "float64").state_bytes
     assert f"state {export.state_bytes:,} bytes" in str(export)
@@ -106,6 +111,10 @@ def test_previews_are_in_the_head(tmp_path):
         ({"storage": "tiny"}, "storage: got 'tiny', expected one of fast, small"),
         ({"name": "2nd"}, "name: got '2nd', expected a C identifier. It begins the names"),
         ({"name": 3}, "name: got 3, expected a C identifier"),
+        ({"name": "int"}, "name: got 'int', a keyword of C or C.., expected another C identifier"),
+        ({"name": "template"}, "name: got 'template', a keyword of C or C.., .* Append a _"),
+        ({"name": "Math"}, "name: got 'Math', whose .h is a standard header, expected another"),
+        ({"labels": {"u": [3]}}, r"labels\['u'\]: got \[3\], expected strings"),
         ({"max_iterations": 0}, "max_iterations: got 0, expected a whole number >= 1"),
         ({"labels": ["a"]}, "labels: got list, expected a mapping from x, u and d"),
         ({"labels": {"y": []}}, "labels: got 'y', expected one of x, u, d"),
@@ -131,6 +140,121 @@ def test_a_qp_without_solutions_is_refused(tmp_path, monkeypatch):
     match = "mpc: got no solution of its QP at 5 states, expected a QP that a solver solves"
     with pytest.raises(QPError, match=match):
         mpc.export_c(tmp_path)
+
+
+def shifted(**options) -> QPMPC:
+    """Make a scheme with two actions in percent, far from 0, and hard limits of their changes."""
+    zeros = torch.zeros(2, 2)
+    return QPMPC.from_model(
+        torch.cat((0.9 * torch.eye(2), zeros), 1),
+        torch.cat((0.1 * torch.eye(2), zeros), 1),
+        10,
+        stage_weight=[1.0, 1.0, 0.1, 0.1],
+        action_bounds=([40.0] * 2, [60.0] * 2),
+        rate_bounds=([-1.0] * 2, [1.0] * 2),
+        on_failure="mask",
+        **options,
+    )
+
+
+def test_states_are_drawn_about_a_feasible_one(tmp_path):
+    mpc = shifted(state_bounds=([49.0] * 2, [51.0] * 2))
+    tables = make_tables(mpc)
+    p, exact = module._states(mpc, tables, "float64")
+    assert mpc.solve(torch.tensor(tables.centre)).solved
+    assert mpc.solve(torch.tensor(draw(tables, 100))).solved.sum() > 20
+    last = p[exact.status == Status.SOLVED, 2:4]
+    assert len(last) > 60
+    assert ((last > 39 - 1e-6) & (last < 61 + 1e-6)).all()
+    export = mpc.export_c(tmp_path)
+    kinds = (tmp_path / "policy.c").read_text().split("self-test: ")[1].split(". */")[0]
+    assert {*kinds.split(", ")} == {"at bounds", "saturated", "infeasible"}  # 0 is out of bounds
+    if export.agreement is not None:
+        agreement = export.agreement
+        assert agreement.solved + agreement.infeasible == agreement.states == 100
+        assert agreement.solved > 60
+        assert agreement.infeasible > 0
+        assert 0 < agreement.u < 1e-8
+
+
+def test_states_of_every_kind_are_in_the_self_test(tmp_path):
+    for name, scheme in {"shifted": shifted, "rates": rates}.items():
+        scheme().export_c(tmp_path, name=name)
+        kinds = (tmp_path / f"{name}.c").read_text().split("self-test: ")[1].split(". */")[0]
+        assert {"at bounds", "infeasible"} <= {*kinds.split(", ")}
+        assert "interior" in kinds or name == "shifted"
+
+
+def test_hard_rows_that_contradict_each_other_are_refused(tmp_path):
+    bounds = {"state_bounds": ([-1.0], [1.0]), "state_slack": torch.inf}
+    mpc = QPMPC.from_model([[0.0]], [[0.0]], 2, stage_weight=[1.0, 1.0], offset=[3.0], **bounds)
+    match = "mpc: got no solution of its QP at 100 states, .* hard rows may contradict .* slack"
+    with pytest.raises(QPError, match=match):
+        mpc.export_c(tmp_path)
+
+
+@needs_compiler
+def test_a_limit_that_solves_nothing_is_refused(tmp_path, monkeypatch):
+    steps = Library.steps
+
+    def unsolved(self, *arguments):
+        found = steps(self, *arguments)
+        found.codes[:] = 1
+        return found
+
+    monkeypatch.setattr(Library, "steps", unsolved)
+    match = "max_iterations: got 3, with none of 100 states solved, expected a limit that solves"
+    with pytest.raises(QPError, match=match):
+        tied().export_c(tmp_path, max_iterations=3)
+
+
+NAMES = [
+    "MY_POLICY",
+    "Policy",
+    "POLICY",
+    "y",
+    "u",
+    "near",
+    "known",
+    "EXAMPLE",
+    "is",
+    "real",
+    "int_",
+]
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", NAMES)
+def test_any_identifier_is_a_name(name, tmp_path):
+    tied(3).export_c(tmp_path, name=name)
+    text = (tmp_path / f"{name}.h").read_text()
+    assert f"int {name}_step({name}_state *state" in text
+    assert f"#ifndef {name.upper()}_H" in text
+
+
+@needs_compiler
+@pytest.mark.parametrize("language", ["cc -std=c99", "g++ -x c++"])
+def test_no_label_ends_its_comment_or_the_line(language, tmp_path):
+    command = language.split()
+    if shutil.which(command[0]) is None:
+        pytest.skip(f"no {command[0]}")
+    bad = [
+        "a */ int b;",
+        "/* c",
+        "*\\\n/ d",
+        "*??/\n/ e",
+        "f \\",
+        "g\r*/",
+        "\u202eh",
+        "\ud800",
+        "**//",
+    ]
+    mpc = QPMPC(1, len(bad), 1, stage_weight=[1.0] * (1 + len(bad)))
+    mpc.export_c(tmp_path, labels={"x": ["%\\"], "u": bad})
+    flags = ["-trigraphs", "-Wall", "-Wextra", "-Werror", "-c", "-o", str(tmp_path / "policy.o")]
+    command += [*flags, str(tmp_path / "policy.c")]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
 
 
 def test_without_a_compiler_float64_is_written_and_float32_refused(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -28,18 +29,103 @@ def normal(n: int, mean: float, seed: int) -> Tensor:
     return mean + torch.randn(n, generator=torch.Generator().manual_seed(seed)).double()
 
 
-def test_the_interval_is_that_of_the_formula():
+def test_the_interval_ends_where_the_bets_refute_the_mean():
     d = normal(50, 0.3, 0)
-    test = PairedTest(0.1, narrowest=20)
+    test = PairedTest(0.1, bound=6.0)
     test.add(d[:20])
     test.add(d[20:])
-    n, a = 50, -2 * math.log(0.1)
-    rho = math.sqrt((a + math.log(1 + a)) / 20)
-    root = math.sqrt(2 * (n * rho**2 + 1) / (n * rho) ** 2)
-    half = d.std().item() * root * math.sqrt(math.log(math.sqrt(n * rho**2 + 1) / 0.1))
+
+    def wealth(losses: Tensor, mean: float) -> float:
+        stakes = torch.tensor([0.25, 0.5, 1.0]).double()[:, None]
+        return (1 - stakes * (losses - mean) / (6.0 - mean)).prod(1).mean().item()
+
     low, high = test.interval
-    assert low == pytest.approx(d.mean().item() - half)
-    assert high == pytest.approx(d.mean().item() + half)
+    assert low < 0.3 < high
+    assert wealth(d, high) == pytest.approx(2 / 0.1)
+    assert wealth(-d, -low) == pytest.approx(2 / 0.1)
+
+
+def test_the_bound_comes_from_earlier_pairs_and_grows_with_the_tail_of_losses():
+    test, d = PairedTest(), normal(30, 0.0, 0)
+    test.add(d[:7])
+    assert test.bound == math.inf
+    test.add(d[7:])
+    test.add(torch.tensor([3.0]))
+    d = torch.cat((d, torch.tensor([3.0])))
+    ratio = (d.max() - d.mean()) / (d.mean() - d.min())
+    assert ratio > 1
+    assert test.bound == pytest.approx(5 * d.abs().mean().item() * ratio.item())
+    assert PairedTest(bound=2.0).bound == 2.0
+
+
+#: Candidates that are no better: the mean difference is zero, with losses in the tail.
+NO_BETTER = {
+    "normal": lambda n, g: torch.randn(n, generator=g),
+    "lognormal 1": lambda n, g: torch.randn(n, generator=g).exp() - math.exp(0.5),
+    "lognormal 2": lambda n, g: (2 * torch.randn(n, generator=g)).exp() - math.exp(2.0),
+    "fails 1 in 50": lambda n, g: (torch.rand(n, generator=g) < 0.02).double() - 0.02,
+    "fails 1 in 200": lambda n, g: (torch.rand(n, generator=g) < 0.005).double() - 0.005,
+}
+LOOKS = {"batches": range(32, 97, 32), "pairs": range(16, 201, 4)}
+
+
+@pytest.mark.parametrize("looks", LOOKS)
+@pytest.mark.parametrize("family", NO_BETTER)
+def test_a_candidate_that_is_no_better_is_accepted_with_probability_alpha_at_most(family, looks):
+    assert accepted(NO_BETTER[family], LOOKS[looks], None) <= 0.05 * 300
+
+
+@pytest.mark.parametrize("rate", [0.02, 0.005])
+def test_a_bound_covers_failures_that_are_hidden_by_noise(rate):
+    """Beside noise they leave no trace: with a bound only is the test right."""
+
+    def fails(n: int, g: torch.Generator) -> Tensor:
+        noise = 0.1 * rate * torch.randn(n, generator=g)
+        return (torch.rand(n, generator=g) < rate).double() - rate + noise
+
+    assert accepted(fails, LOOKS["batches"], 1.1) <= 0.05 * 300
+    assert accepted(fails, LOOKS["batches"], None) > 0.2 * 300
+
+
+def accepted(draw: Any, looks: range, bound: float | None, alpha: float = 0.05) -> int:
+    """Count the tests of 300 that accept at some look."""
+    count, generator = 0, torch.Generator().manual_seed(0)
+    for _ in range(300):
+        test, d, seen = PairedTest(alpha, bound), draw(max(looks), generator).double(), 0
+        for look in looks:
+            test.add(d[seen:look])
+            seen = look
+            if test.decision != "open":
+                break
+        count += test.decision == "better"
+    return count
+
+
+@pytest.mark.parametrize(("effect", "share"), [(0.3, 0.27), (0.5, 0.85), (1.0, 0.99)])
+def test_a_better_candidate_is_accepted_within_96_pairs(effect, share):
+    def draw(n: int, g: torch.Generator) -> Tensor:
+        return torch.randn(n, generator=g) - effect
+
+    assert accepted(draw, LOOKS["batches"], None) >= share * 300
+
+
+@pytest.mark.parametrize("bound", [None, 20.0])
+def test_a_pair_that_loses_more_than_the_bound_is_a_veto(bound):
+    test = PairedTest(bound=bound)
+    test.add(normal(64, -1.0, 1))
+    assert test.decision == ("better" if bound is None else "open")
+    assert not test.vetoed
+    test.add(torch.tensor([25.0]))
+    assert test.vetoed
+    test.add(normal(200, -1.0, 2))
+    assert test.decision == "worse"
+
+
+def test_equal_differences_say_nothing_without_a_bound():
+    for bound, decision in ((None, "open"), (1.0, "better")):
+        test = PairedTest(bound=bound)
+        test.add(torch.full((40,), -0.5))
+        assert test.decision == decision
 
 
 def test_the_interval_covers_the_mean_at_all_times():
@@ -63,7 +149,7 @@ def test_decisions(mean, decision):
 
 
 def test_few_pairs_decide_nothing():
-    test = PairedTest()
+    test = PairedTest(bound=5.0)
     test.add(torch.full((15,), -5.0))
     assert test.decision == "open"
     test.add(torch.tensor([-5.0]))
@@ -145,6 +231,23 @@ def test_comparisons_have_seeds_of_their_own():
     assert len(seeds) == 4
 
 
+def test_the_comparisons_of_a_run_share_one_alpha():
+    gate, shares = Gate(Policy(2.0), costs, decisions=3), []
+    for _ in range(4):
+        shares.append(gate._test().alpha)  # of the next comparison
+        gate.judge(Policy(2.5))
+    assert shares == [pytest.approx(0.05 * 3 / (k * (k + 1))) for k in (3, 4, 5, 6)]
+    assert sum(3 / (k * (k + 1)) for k in range(3, 100_000)) == pytest.approx(1, abs=1e-4)
+    resumed = Gate(Policy(2.0), costs, decisions=3)
+    resumed.load_state_dict(gate.state_dict())
+    assert resumed._test().alpha == gate._test().alpha
+
+
+def test_a_gate_has_the_bound_of_its_user():
+    assert Gate(Policy(2.0), costs, bound=50.0)._test().bound == 50.0
+    assert not Gate(Policy(2.0), costs, bound=1e4).judge(Policy(1.0)).accepted
+
+
 def test_the_state_is_restored():
     gate, other = Gate(Policy(2.0), costs), Gate(Policy(2.0), costs)
     gate.judge(Policy(1.0))
@@ -158,7 +261,9 @@ def test_the_state_is_restored():
     ("call", "message"),
     [
         (lambda: PairedTest(0.0), "alpha"),
-        (lambda: PairedTest(narrowest=0), "narrowest"),
+        (lambda: PairedTest(bound=-1.0), r"bound: got -1.0, expected a positive loss of one pair"),
+        (lambda: Gate(Policy(1.0), costs, bound=0.0), "bound"),
+        (lambda: Gate(Policy(1.0), costs, decisions=0), "decisions"),
         (lambda: PairedTest().add(torch.zeros(2, 2)), "differences"),
         (lambda: Gate(Policy(1.0), costs, pairs=8), "pairs"),
         (lambda: Gate(Policy(1.0), costs, alpha=1.0), "alpha"),

@@ -132,6 +132,7 @@ def test_an_ablation_has_its_runs_median_and_interval():
     drawn = [np.sort(np.asarray(line.get_xdata())).tolist() for line in (runs, interval, median)]
     assert drawn == [pytest.approx(left) for left in ([0.1, 0.8, 0.9], [0.1, 0.9], [0.8])]
     assert to_rgba(median.get_color()) == to_rgba("tab:blue")
+    assert axes.get_title() == "gaussian noise: median, range"
 
 
 def test_J_of_a_network_is_drawn_over_transitions_without_that_of_the_start(tmp_path, axes):

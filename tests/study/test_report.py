@@ -31,12 +31,18 @@ def made_up(gaps: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
 
 
 def test_a_case_is_a_row_with_median_interval_and_both_ends():
-    frame = made_up({("gaussian", "free"): [0.9, 0.9, 0.9, 0.1], ("brownian", "si"): [0.5]})
+    frame = made_up({("gaussian", "free"): [0.9] * 6 + [0.1], ("brownian", "si"): [0.5]})
     *_, free, si = report.cases_table(frame).splitlines()
     ends = "285.0 to 50.00 (46.97) | 285.0 to 50.00 (46.97)"
-    errors = "0.250 | 1.00 | 0.050 to 0.050 (2 of 4)"
-    assert free == f"| gaussian | free | 0.900 [0.900, 0.900] (3 of 4) | {ends} | {errors} |"
+    errors = "0.400 | 1.00 | 0.050 to 0.080 (2 of 7)"
+    assert free == f"| gaussian | free | 0.900 [0.900, 0.900] (6 of 7) | {ends} | {errors} |"
     assert si == f"| brownian | si | - (0 of 1) | {ends} | 0.100 | 1.00 | 0.050 to 0.020 (1 of 1) |"
+
+
+def test_fewer_than_six_runs_have_a_range():
+    frame = made_up({("gaussian", case): [0.7, 0.9, 0.8, 0.1] for case in report.CASES})
+    assert "| 0.800 (range of 3: 0.700 to 0.900) (3 of 4) |" in report.cases_table(frame)
+    assert report.overall(frame).endswith("noise 0.800 (range of 12: 0.700 to 0.900).")
 
 
 def test_every_run_is_in_the_long_table():
@@ -54,7 +60,7 @@ def test_a_run_without_a_gap_shows_the_change_of_J():
 
 def test_the_overall_gap_weighs_the_learned_cases_equally():
     gaps = {"free": 0.9, "deviation": 0.8, "si": 1.0, "combined": 0.9, "fixed": -3.0}
-    frame = made_up({("gaussian", case): [gap] * 5 for case, gap in gaps.items()})
+    frame = made_up({("gaussian", case): [gap] * 7 for case, gap in gaps.items()})
     text = report.overall(frame)
     # Each case is a stratum without spread, so the interval has zero width.
     assert text.endswith("four cases that learn C: gaussian noise 0.900 [0.900, 0.900].")

@@ -5,7 +5,12 @@ import pytest
 from scipy.stats import trim_mean
 
 from torch_qpmpc import QPError
-from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
+from torch_qpmpc.study.statistics import (
+    bootstrap_interval,
+    interquartile_mean,
+    spread,
+    spread_name,
+)
 
 
 @pytest.fixture
@@ -83,3 +88,31 @@ def test_a_seed_gives_one_interval(rng):
 def test_an_empty_stratum_is_refused(strata):
     with pytest.raises(QPError, match=r"strata: got sizes \[.*\], expected at least one run"):
         bootstrap_interval(strata)
+
+
+def test_three_values_have_a_range_as_an_interval_of_them_misses(rng):
+    missed = 0
+    for _ in range(200):
+        low, high = bootstrap_interval([rng.normal(size=3)], resamples=200)
+        missed += not low <= 0 <= high
+    assert missed > 0.15 * 200
+    x = rng.normal(size=(3, 4))
+    low, high, count, few = spread([x])
+    np.testing.assert_array_equal((low, high), (x.min(0), x.max(0)))
+    assert (count, few) == (3, True)
+
+
+@pytest.mark.parametrize("sizes", [[6], [9, 6]])
+def test_six_values_in_each_stratum_have_an_interval(rng, sizes):
+    strata = [rng.normal(size=size) for size in sizes]
+    found = spread(strata, np.mean)
+    assert found[:2] == bootstrap_interval(strata, np.mean)
+    assert found[2:] == (sum(sizes), False)
+    assert spread([*strata, strata[0][:5]], np.mean).few
+
+
+def test_a_spread_is_called_what_it_is():
+    assert spread([np.arange(3.0)]).text(".1f") == "(range of 3: 0.0 to 2.0)"
+    assert spread([np.full(6, 0.25)]).text() == "[0.250, 0.250]"
+    names = [spread_name(counts) for counts in ([3, 5], [6, 10], [3, 10])]
+    assert names == ["range", "95% interval", "95% interval (range of fewer than six)"]

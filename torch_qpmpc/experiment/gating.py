@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from torch_qpmpc.mpc.module import QPMPC
 
 #: The file of the policy that acts, in a run's folder.
 BEST = "best.pt"
+#: The most pairs of a comparison, of which a run's later ones need more: they share one alpha.
+PAIRS = 160
 
 
 class RunGate:
@@ -38,7 +41,8 @@ class RunGate:
 
     def __init__(self, cfg: DictConfig, learner: Learner, physics: AnyPlant) -> None:
         self._cfg, self._learner, self._physics = cfg, learner, physics
-        self._gate = Gate(learner.actor, self._costs, seed=cfg.seed) if cfg.gate else None
+        options = {"seed": cfg.seed, "pairs": PAIRS, "decisions": _decisions(cfg)}
+        self._gate = Gate(learner.actor, self._costs, **options) if cfg.gate else None
         self.actor: Any = learner.actor if self._gate is None else self._gate.actor
         self.simulated = 0
 
@@ -62,7 +66,7 @@ class RunGate:
         if self._gate is None:
             return {}
         last = update == self._cfg.updates
-        if not last and update % (self._cfg.gate_interval or self._cfg.eval_interval):
+        if not last and update % _interval(self._cfg):
             return {}
         verdict = self._judge("gate")
         return verdict | self._search() if last else verdict
@@ -130,6 +134,15 @@ class RunGate:
         if self._gate is not None and state is not None:
             self._gate.load_state_dict(state)
             self.simulated = state.get("simulated", 0)
+
+
+def _interval(cfg: DictConfig) -> int:
+    return cfg.gate_interval or cfg.eval_interval
+
+
+def _decisions(cfg: DictConfig) -> int:
+    """Count the comparisons of a run, the one of the search included."""
+    return math.ceil(cfg.updates / _interval(cfg)) + 1
 
 
 def _qp(actor: Any) -> QPMPC | None:

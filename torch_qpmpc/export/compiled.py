@@ -72,7 +72,7 @@ class CompiledPolicy:
             SolverError: with ``on_failure="raise"``, a step is not solved.
         """
         check_tensor("s", s, self._n_p)
-        p = s.detach().cpu().numpy().reshape(-1, self._n_p)
+        p = s.detach().double().cpu().numpy().reshape(-1, self._n_p)
         if len(p) != self._count:
             self._states, self._count = self._library.states(len(p)), len(p)
         self.last = self._library.steps(self._states, p, self._n_u)
@@ -85,10 +85,14 @@ class CompiledPolicy:
         return u.reshape(*s.shape[:-1], self._n_u)
 
     def value(self, s: Tensor) -> Tensor:
-        """Return V(s), a cost to go: s ``(*batch, n_p)`` to ``(*batch,)``; errors as in a call."""
+        """Return V(s), a cost to go: s ``(*batch, n_p)`` to ``(*batch,)``; errors as in a call.
+
+        It is inf where a step is not solved, as that of the module.
+        """
         self(s)
         assert self.last is not None
-        return torch.from_numpy(self.last.value).to(s).reshape(s.shape[:-1])
+        value = np.where(self.last.codes == 0, self.last.value, np.inf)
+        return torch.from_numpy(value).to(s).reshape(s.shape[:-1])
 
     def reset(self) -> None:
         """Forget the last active sets."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from torch_qpmpc.errors import QPError
@@ -13,10 +15,12 @@ from torch_qpmpc.qp.program import Status
 
 #: Examples of each kind.
 EACH = 3
+#: Most times that an infeasible state is moved half way to the centre.
+HALVINGS = 12
 
 
 def draw(tables: Tables, count: int, seed: int = 0) -> Array:
-    """Draw p ``(count, n_p)`` at sizes from a hundredth to ten times that which reaches the bounds.
+    """Draw p ``(count, n_p)`` about the centre, up to ten times as far away as the bounds.
 
     Those nearest to reaching the bounds come first. An entry's size is a quantile, at most the
     median, over the rows that contain it, of that at which the row without multipliers is at its
@@ -25,7 +29,8 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
     rng = np.random.default_rng(seed)
     pairs = zip(tables.rows.parts(), tables.known.parts(), strict=True)
     Y, lower, upper, *_ = (np.concatenate(pair) for pair in pairs)
-    near = np.minimum(*(np.where(np.abs(x) > 0, np.abs(x), np.inf) for x in (lower, upper)))
+    distances = (np.abs(x - Y @ tables.centre) for x in (lower, upper))
+    near = np.minimum(*(np.where(x > 0, x, np.inf) for x in distances))
     quantiles, scale = rng.uniform(0, 0.5, count), np.ones((count, tables.n_p))
     for j, column in enumerate(np.abs(Y).T):
         reaches = np.isfinite(near) & (column > 1e-9 * column.max(initial=0))
@@ -33,14 +38,35 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
             scale[:, j] = np.quantile(near[reaches] / column[reaches], quantiles)
     exponents = rng.uniform(-2, 1, count)
     exponents = exponents[np.abs(exponents).argsort()]
-    return 10 ** exponents[:, None] * scale * rng.standard_normal((count, tables.n_p))
+    away = 10 ** exponents[:, None] * scale * rng.standard_normal((count, tables.n_p))
+    return tables.centre + away
+
+
+def nearer(
+    tables: Tables, p: Array, solve: Callable[[Array], Reference]
+) -> tuple[Array, Reference]:
+    """Draw infeasible p nearer to the centre until they have solutions, and solve for all p.
+
+    The p with a plan are a convex set. One infeasible p in four stays what it is.
+    """
+    p, exact = p.copy(), solve(p)
+    for _ in range(HALVINGS):
+        infeasible = np.flatnonzero(exact.status == Status.INFEASIBLE)
+        moved = infeasible[infeasible % 4 > 0]
+        if not len(moved):
+            break
+        p[moved] = (p[moved] + tables.centre) / 2
+        found = solve(p[moved])
+        for whole, part in zip(exact.parts(), found.parts(), strict=True):
+            whole[moved] = part
+    return p, exact
 
 
 def choose(mpc: QPMPC, tables: Tables, p: Array, coarse: Reference) -> tuple[Examples, Reference]:
     """Choose a few states of each kind, and return exact solutions of them.
 
     Raises:
-        QPError: no state is solved or infeasible.
+        QPError: no state is solved.
     """
     solved, states = coarse.status == Status.SOLVED, np.abs(coarse.active)
     kinds = {
@@ -52,9 +78,12 @@ def choose(mpc: QPMPC, tables: Tables, p: Array, coarse: Reference) -> tuple[Exa
     chosen = {kind: np.flatnonzero(mask)[:EACH] for kind, mask in kinds.items()}
     exact = sharpen(mpc, p, coarse, np.concatenate([chosen[kind] for kind in [*kinds][:3]]))
     codes = {"infeasible": 2}
-    if not any(map(len, chosen.values())):
+    if not solved.any():
         got = f"no solution of its QP at {len(p)} states"
-        raise QPError.expected("mpc", got, "a QP that a solver solves", "See mpc.solve(s).")
+        remedy = (
+            "See mpc.solve(s): hard rows may contradict each other; a finite slack softens them."
+        )
+        raise QPError.expected("mpc", got, "a QP that a solver solves", remedy)
     examples = [
         Example(kind, p[i], codes.get(kind, 0), exact.u[i], float(exact.value[i]))
         for kind, indices in chosen.items()

@@ -13,7 +13,7 @@ import numpy as np
 
 from torch_qpmpc.checks import check_choice, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.export.examples import choose, draw
+from torch_qpmpc.export.examples import choose, draw, nearer
 from torch_qpmpc.export.library import Library, compiler
 from torch_qpmpc.export.reference import Reference, reference, sharpen
 from torch_qpmpc.export.tables import Array, Tables, make_tables
@@ -32,12 +32,28 @@ from torch_qpmpc.qp.program import Status
 STORAGES = ("fast", "small")
 #: Number of random states that the compiled policy is compared at.
 COMPARED = 400
-#: Largest share of these states that may be uncertified.
+#: Largest share of the solvable states that may be uncertified.
 UNSOLVED = 0.1
 #: Differences above this, relative to the largest action or value, are worth an exact solution.
 DOUBTFUL = 1e-9
 #: The default limit of iterations is ``PER_ROW r + AT_LEAST``.
 PER_ROW, AT_LEAST = 20, 100
+#: What a step of an infeasible state returns.
+INFEASIBLE = 2
+#: Names that the files would hide or that readers would take for something else.
+TAKEN = {
+    "a keyword of C or C++": """alignas alignof and and_eq asm auto bitand bitor bool break case
+        catch char class compl concept const const_cast consteval constexpr constinit continue
+        co_await co_return co_yield decltype default delete do double dynamic_cast else enum
+        explicit export extern false float for friend goto if inline int long mutable namespace new
+        noexcept not not_eq nullptr operator or or_eq private protected public register
+        reinterpret_cast requires restrict return short signed sizeof static static_assert
+        static_cast struct switch template this thread_local throw true try typedef typeid typename
+        typeof union unsigned using virtual void volatile wchar_t while xor xor_eq""",
+    "whose .h is a standard header": """assert complex ctype errno fenv inttypes iso646 limits
+        locale math setjmp signal stdalign stdarg stdatomic stdbool stddef stdint stdio stdlib
+        stdnoreturn string tgmath threads time uchar wchar wctype""",
+}
 
 
 @dataclass(frozen=True)
@@ -46,6 +62,8 @@ class Agreement:
 
     Attributes:
         states: the number of states.
+        solved: the number of those that both solve, where actions and values are compared.
+        infeasible: the number of those that both call infeasible.
         u: the largest difference of an action.
         value: the largest difference of a value, relative to the value.
         unsolved: the number of states that the solver solves and the policy does not.
@@ -53,6 +71,8 @@ class Agreement:
     """
 
     states: int
+    solved: int
+    infeasible: int
     u: float
     value: float
     unsolved: int
@@ -110,8 +130,9 @@ class Export:
         else:
             lines.append(
                 f"at {agreement.states} states: actions within {agreement.u:.1e}, values within "
-                f"{agreement.value:.1e}, {agreement.unsolved} unsolved, at most "
-                f"{agreement.iterations} iterations"
+                f"{agreement.value:.1e} where solved ({agreement.solved}); {agreement.infeasible} "
+                f"infeasible, {agreement.unsolved} unsolved, at most {agreement.iterations} "
+                "iterations"
             )
         return "\n".join(lines)
 
@@ -151,8 +172,7 @@ def build(
     tables = make_tables(mpc)
     limit = max_iterations or PER_ROW * len(tables.rows) + AT_LEAST
     settings = Settings(name, dtype, storage, limit)
-    p = draw(tables, COMPARED).astype(dtype).astype(np.float64)
-    exact = reference(mpc, p)
+    p, exact = _states(mpc, tables, dtype)
     examples, exact = choose(mpc, tables, p, exact)
     texts = sources(tables, settings, header(mpc, tables, settings, labels or {}), examples)
     files = []
@@ -166,8 +186,7 @@ def build(
         if failed := library.selftest():
             kinds = [*(example.kind for example in examples.states), "invalid"]
             _refuse(dtype, f"a failed self-test at state {failed} ({kinds[failed - 1]})", tables)
-        if max_iterations is None and agreement.unsolved > UNSOLVED * COMPARED:
-            _refuse(dtype, f"{agreement.unsolved} of {COMPARED} states not certified", tables)
+        _check_solved(agreement, dtype, max_iterations, tables)
     elif dtype == "float32":
         remedy = "Install one, or export float64."
         raise QPError.expected("dtype", "'float32' without a C compiler to test it", "one", remedy)
@@ -189,6 +208,27 @@ def build(
     return export, library
 
 
+def _check_solved(agreement: Agreement, dtype: str, limit: int | None, tables: Tables) -> None:
+    """Refuse a policy that solves too few of the states that have solutions, or none."""
+    solvable = agreement.solved + agreement.unsolved
+    if limit is None and agreement.unsolved > UNSOLVED * solvable:
+        _refuse(dtype, f"{agreement.unsolved} of {solvable} states not certified", tables)
+    if not agreement.solved:
+        got = f"{limit}, with none of {solvable} states solved"
+        remedy = "Raise it, or leave it out."
+        raise QPError.expected("max_iterations", got, "a limit that solves some", remedy)
+
+
+def _states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, Reference]:
+    """Draw states in the policy's numbers, most of which have solutions, and solve for them."""
+
+    def solve(p: Array) -> Reference:
+        return reference(mpc, p.astype(dtype).astype(np.float64))
+
+    p, exact = nearer(tables, draw(tables, COMPARED), solve)
+    return p.astype(dtype).astype(np.float64), exact
+
+
 def _compare(mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Reference) -> Agreement:
     steps = library.steps(library.states(len(p)), p, tables.n_u)
     solvable = exact.status == Status.SOLVED
@@ -205,6 +245,8 @@ def _compare(mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Refe
         u, value = differences(sharpen(mpc, p, exact, np.flatnonzero(doubtful)))
     return Agreement(
         states=len(p),
+        solved=int(both.sum()),
+        infeasible=int(((exact.status == Status.INFEASIBLE) & (steps.codes == INFEASIBLE)).sum()),
         u=float(u[both].max(initial=0)),
         value=float(value[both].max(initial=0)),
         unsolved=int((solvable & ~both).sum()),
@@ -225,9 +267,7 @@ def _refuse(dtype: str, got: str, tables: Tables) -> None:
 def _check(mpc: QPMPC, dtype: str, name: str, storage: str, labels: Labels | None) -> None:
     check_choice("dtype", dtype, tuple(REAL))
     check_choice("storage", storage, STORAGES)
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        remedy = "It begins the names of functions and files."
-        raise QPError.expected("name", repr(name), "a C identifier", remedy)
+    _check_name(name)
     sizes = {"x": mpc.n_x, "u": mpc.n_u, "d": mpc.n_d}
     if labels is not None and not isinstance(labels, Mapping):
         raise QPError.expected("labels", type(labels).__name__, "a mapping from x, u and d")
@@ -235,3 +275,15 @@ def _check(mpc: QPMPC, dtype: str, name: str, storage: str, labels: Labels | Non
         check_choice("labels", key, tuple(sizes))
         if not isinstance(names, Sequence) or isinstance(names, str) or len(names) != sizes[key]:
             raise QPError.expected(f"labels[{key!r}]", repr(names), f"{sizes[key]} names")
+        if not all(isinstance(label, str) for label in names):
+            raise QPError.expected(f"labels[{key!r}]", repr(names), "strings")
+
+
+def _check_name(name: str) -> None:
+    remedy = "It begins the names of functions and files."
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise QPError.expected("name", repr(name), "a C identifier", remedy)
+    for kind, taken in TAKEN.items():
+        if name.lower() in taken.split():
+            got = f"{name!r}, {kind}"
+            raise QPError.expected("name", got, "another C identifier", f"{remedy} Append a _.")

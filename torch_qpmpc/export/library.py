@@ -10,9 +10,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ FLAGS = ("-std=c99", "-O3", "-fPIC", "-shared")
 
 def compiler() -> list[str] | None:
     """Return the command of $CC, cc, gcc, clang or ziglang, the first that exists, else None."""
-    if named := shlex.split(os.environ.get("CC", "")):
+    if named := _named():
         return named if shutil.which(named[0]) else None
     for name in ("cc", "gcc", "clang"):
         if found := shutil.which(name):
@@ -32,6 +32,16 @@ def compiler() -> list[str] | None:
     if importlib.util.find_spec("ziglang"):
         return [sys.executable, "-m", "ziglang", "cc"]
     return None
+
+
+def _named() -> list[str]:
+    """Return the words of $CC, such as ``ccache gcc -m32``."""
+    command = os.environ.get("CC", "")
+    try:
+        return shlex.split(command)
+    except ValueError as error:
+        got = f"{command!r}: {error}"
+        raise QPError.expected("$CC", got, "a command", "Correct or unset it.") from error
 
 
 def required_compiler() -> list[str]:
@@ -42,6 +52,10 @@ def required_compiler() -> list[str]:
     """
     if (command := compiler()) is None:
         got, remedy = "none on the PATH", "Install one, or pip install ziglang, which has clang."
+        if named := _named():
+            remedy += (
+                f" $CC is {' '.join(named)!r}, of which {named[0]!r} does not exist: unset it."
+            )
         raise QPError.expected("compiler", got, "a C compiler: $CC, cc, gcc or clang", remedy)
     return command
 
@@ -66,23 +80,21 @@ class Steps(NamedTuple):
 
 
 class Library:
-    """The functions of an exported policy, compiled into a shared library."""
+    """The functions of an exported policy, compiled into a shared library.
+
+    Its copies share the functions; a pickle has the source, and is compiled when it is loaded.
+    """
 
     def __init__(self, folder: Path, name: str, dtype: str, flags: Sequence[str] = ()) -> None:
-        command = required_compiler()
+        names = (f"{name}.h", f"{name}.c")
+        files = {file: (folder / file).read_text(encoding="utf-8") for file in names}
+        self._made_of = files, name, dtype, tuple(flags or FLAGS)
+        self._load()
+
+    def _load(self) -> None:
+        files, name, dtype, flags = self._made_of
         self.real = np.dtype(dtype)
-        with tempfile.TemporaryDirectory() as temporary:
-            wrapper = Path(temporary) / "wrapper.c"
-            wrapper.write_text(filled("wrapper.c", name), encoding="utf-8")
-            target = Path(temporary) / f"{name}.so"
-            files = [str(folder / f"{name}.c"), str(wrapper), f"-I{folder}", "-o", str(target)]
-            ended = subprocess.run(
-                [*command, *(flags or FLAGS), *files], capture_output=True, text=True, check=False
-            )
-            if ended.returncode:
-                got = f"an error of {' '.join(command)}: {ended.stderr.strip()[-500:]}"
-                raise QPError.expected("compiler", got, "a compiled policy")
-            library = ctypes.CDLL(str(target))
+        library = _compiled(files | {"wrapper_.c": filled("wrapper.c", name)}, flags)
         self._steps = library[f"{name}_steps"]
         self._resets = library[f"{name}_resets"]
         self.selftest = library[f"{name}_selftest"]
@@ -97,6 +109,16 @@ class Library:
             align=True,
         )
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> Library:
+        return self
+
+    def __getstate__(self) -> tuple[Any, ...]:
+        return self._made_of
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self._made_of = state
+        self._load()
+
     def states(self, count: int) -> np.ndarray:
         """Return the reset states of ``count`` controllers, as bytes."""
         states = np.zeros(count * self.state_bytes, dtype=np.uint8)
@@ -110,3 +132,27 @@ class Library:
         info, codes = np.empty(len(p), dtype=self._info), np.empty(len(p), dtype=np.int32)
         self._steps(*(x.ctypes.data for x in (states, p, u, info, codes)), len(p))
         return Steps(u, codes, *(info[name] for name in self._info.names or ()))
+
+
+def _compiled(files: Mapping[str, str], flags: Sequence[str]) -> ctypes.CDLL:
+    """Compile files as C, also with a compiler of C++, and load them."""
+    command = required_compiler()
+    with tempfile.TemporaryDirectory() as folder:
+        for file, text in files.items():
+            (Path(folder) / file).write_text(text, encoding="utf-8")
+        target = Path(folder) / "policy.so"
+        sources = [str(Path(folder) / file) for file in files if file.endswith(".c")]
+        line = [*command, *flags, f"-I{folder}", "-o", str(target), "-x", "c", *sources]
+        try:
+            ended = subprocess.run(line, capture_output=True, text=True, check=False)
+        except OSError as error:
+            raise QPError.expected("compiler", f"{error}", "a command that runs") from error
+        if ended.returncode:
+            got = f"an error of {' '.join(command)}: {ended.stderr.strip()[-500:]}"
+            raise QPError.expected("compiler", got, "a compiled policy")
+        try:
+            return ctypes.CDLL(str(target))
+        except OSError as error:
+            got = f"{folder}, from which a library does not load: {error}"
+            remedy = "Set TMPDIR to another one, as this may be mounted with noexec, or check $CC."
+            raise QPError.expected("TMPDIR", got, "a folder of programs", remedy) from error

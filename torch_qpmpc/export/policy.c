@@ -494,10 +494,19 @@ int policy_step(policy_state *s, const real p[], real u[], policy_info *info)
 
 static int near(real x, real expected, real tolerance) { return absolute(x - expected) <= tolerance; }
 
+/* With an operating system each thread has its own; without one a stack may be too small. */
+#if defined(__GNUC__) && (defined(__unix__) || defined(__APPLE__))
+#define OWN static __thread
+#elif defined(_MSC_VER)
+#define OWN static __declspec(thread)
+#else
+#define OWN static
+#endif
+
 int policy_selftest(void)
 {
-    static policy_state state;
-    static real p[POLICY_N_P], u[POLICY_N_U];
+    OWN policy_state state;
+    OWN real p[POLICY_N_P], u[POLICY_N_U];
     policy_info info;
     volatile real zero = 0;
     int round, i, j;

@@ -49,7 +49,9 @@ void policy_reset(policy_state *state);
    last iterate with the codes 1 and 2, and with code 3 the last action. info may be a null pointer. */
 int policy_step(policy_state *state, const policy_real p[], policy_real u[], policy_info *info);
 
-/* Compare with actions of an exact solver; return 0, or the number of the first state that fails. */
+/* Compare with actions of an exact solver; return 0, or the number of the first state that fails.
+
+   Without an operating system, only one thread at a time may call it. */
 int policy_selftest(void);
 
 #ifdef __cplusplus

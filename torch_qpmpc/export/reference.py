@@ -40,6 +40,10 @@ class Reference:
     value: Array
     active: Array
 
+    def parts(self) -> tuple[Array, ...]:
+        """Return all four arrays."""
+        return self.status, self.u, self.value, self.active
+
 
 @torch.no_grad()
 def reference(mpc: QPMPC, p: Array, solver: str = "daqp") -> Reference:
@@ -51,10 +55,10 @@ def reference(mpc: QPMPC, p: Array, solver: str = "daqp") -> Reference:
     u = solution.z[:, mpc.n_p : mpc.n_p + mpc.n_u].double().cpu().numpy()
     value = solution.value.double().cpu().numpy()
     return Reference(
-        solution.status.cpu().numpy(),
+        solution.status.cpu().numpy().copy(),
         np.where(solved[:, None], u, np.nan),
         np.where(solved, value, np.nan),
-        solution.active.cpu().numpy(),
+        solution.active.cpu().numpy().copy(),
     )
 
 

@@ -14,14 +14,18 @@ import hashlib
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.qp.pipeline.condensing import ENTERS, null_space
-from torch_qpmpc.qp.program import EVENT_SHAPES, QuadraticProgram, crossed
+from torch_qpmpc.qp.program import EVENT_SHAPES, QuadraticProgram, Status, crossed
+from torch_qpmpc.qp.solve import solve_qp
 
 #: H_v is singular if its smallest eigenvalue is below this fraction of the largest.
 SINGULAR = 1e-12
+#: Weight of entries without bounds at the centre, relative to those with.
+CENTRED = 1e-6
 
 Array = np.ndarray
 
@@ -68,6 +72,7 @@ class Tables:
             ``p'Pp / 2 + g'p + c``.
         u_lower, u_upper: ``(n_u,)``, the hard bounds of rows that contain one action only.
         condition: the condition number of H_v in an orthonormal basis of the plan.
+        centre: ``(n_p,)``, a p with a plan near the middle of its bounds, zero if there is none.
         digest: SHA-256 of the nine tensors of the QP.
     """
 
@@ -86,6 +91,7 @@ class Tables:
     u_lower: Array
     u_upper: Array
     condition: float
+    centre: Array
     digest: str
 
 
@@ -142,6 +148,7 @@ def make_tables(mpc: QPMPC) -> Tables:
         u_lower,
         u_upper,
         condition,
+        _centre(qp, n_p),
         _digest(qp),
     )
 
@@ -208,6 +215,23 @@ def _action_bounds(G: Array, lb: Array, ub: Array, w: Array, u: slice) -> tuple[
             lower[j - u.start] = max(lower[j - u.start], ends[0])
             upper[j - u.start] = min(upper[j - u.start], ends[1])
     return lower, upper
+
+
+@torch.no_grad()
+def _centre(qp: QuadraticProgram, n_p: int) -> Array:
+    """Return the p of the plan whose bounded rows are nearest to the middle of their bounds."""
+    names = ("C", "b", "G", "lb", "ub", "w")
+    C, b, G, lb, ub, w = (getattr(qp, name).detach().double().cpu() for name in names)
+    half = (ub - lb) / 2
+    rows = half.isfinite() & (half > 0) & (w > 0)
+    weighted = G[rows] / half[rows, None].square()
+    H = weighted.mT @ G[rows]
+    H = H + CENTRED * max(float(H.diagonal().mean()), 1.0) * torch.eye(len(H)).to(H)
+    q = -weighted.mT @ (lb + half)[rows]
+    middle = QuadraticProgram(H, q, q.new_zeros(()), C, b, G, lb, ub, w, check_values=False)
+    solution = solve_qp(middle, solver="daqp", on_failure="mask")
+    z = solution.z if solution.status == Status.SOLVED else torch.zeros_like(q)
+    return z[:n_p].numpy()
 
 
 def _digest(qp: QuadraticProgram) -> str:

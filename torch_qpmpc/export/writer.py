@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -99,7 +100,8 @@ def sources(tables: Tables, settings: Settings, header: str, examples: Examples)
 def filled(template: str, name: str, parts: Mapping[str, str] | None = None) -> str:
     """Return a template of this folder with its names and parts replaced."""
     text = resources.files("torch_qpmpc.export").joinpath(template).read_text(encoding="utf-8")
-    text = text.replace("policy", name).replace("POLICY", name.upper())
+    named = {"policy": name, "POLICY": name.upper()}
+    text = re.sub("policy|POLICY", lambda found: named[found[0]], text)  # at once: MY_POLICY
     for mark, part in (parts or {}).items():
         text = text.replace(mark, part)
     return text
@@ -114,7 +116,16 @@ def header(mpc: QPMPC, tables: Tables, settings: Settings, labels: Labels) -> st
         "",
         *_layout(mpc, labels),
     ]
-    return "/* " + "\n   ".join(line.replace("*/", "* /") for line in lines).rstrip() + " */"
+    return "/* " + "\n   ".join(map(_harmless, lines)).rstrip() + " */"
+
+
+def _harmless(line: str) -> str:
+    """Return a line that neither ends nor continues a comment, nor splices lines."""
+    line = "".join(x if x.isprintable() else " " for x in line)
+    for ends in ("*/", "/*", "??"):  # ??/ is a backslash
+        while ends in line:
+            line = line.replace(ends, " ".join(ends))
+    return line
 
 
 def _layout(mpc: QPMPC, labels: Labels) -> list[str]:

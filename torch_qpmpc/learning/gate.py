@@ -20,42 +20,59 @@ from torch import Tensor, nn
 from torch_qpmpc.checks import check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 
-#: Fewest pairs of a decision: the test relies on a central limit theorem.
+#: Fewest pairs of a decision.
 FEWEST = 16
+#: Pairs that only set the scale of the differences, if no bound is given.
+FIRST = 8
+#: Largest loss of a pair that is assumed without a bound, in mean absolute differences.
+MULTIPLE = 5.0
+#: Differences within this fraction of their mean size are equal.
+EQUAL = 1e-9
+#: Stakes, as fractions of the largest one that no loss within the bound can turn into a debt.
+STAKES = np.array([0.25, 0.5, 1.0])
 
 
 class PairedTest:
-    """A sequential test of paired differences: cost of the candidate minus cost of the incumbent.
+    """A sequential test of paired differences d: the candidate's cost minus the incumbent's.
 
-    The interval of the mean difference after n pairs, with their mean and standard deviation sd,
+    It bets against E d >= 0. The wealth after n pairs, averaged over the stakes c = 1/4, 1/2 and 1,
 
-        mean -+ sd sqrt(2 (n rho^2 + 1) / (n rho)^2 log(sqrt(n rho^2 + 1) / alpha)),
+        W_n = mean_c prod_t (1 - c d_t / M_t),
 
-    is an asymptotic confidence sequence (Waudby-Smith, Arbour, Sinha, Kennedy and Ramdas, Annals of
-    Statistics 52, 2024): it covers the mean at all n at once with probability 1 - alpha, so that
-    a test may look after each pair and stop as soon as it is decided. Without a simulator a pair is
-    an episode of either policy, one after the other.
+    is a nonnegative supermartingale if no pair loses more than M_t, whatever the gains: it exceeds
+    2 / alpha at any n with probability alpha / 2 at most (Ville), so that a test may look after
+    each pair; bets against E d <= 0 have the other half. No test of a mean does without such a
+    bound (Bahadur and Savage, 1956). Without ``bound`` it comes from the pairs before t,
+
+        M_t = 5 mean |d| max(1, (max d - mean d) / (mean d - min d)),
+
+    which grows where losses have the longer tail, and is infinite for the first 8 pairs and while
+    all differences are equal. The assumption is then that no pair loses more than that. A pair that
+    does is a veto: the candidate is worse. A failure rarer than about 3 / n may leave no trace in n
+    pairs: a plant that cannot afford one needs ``bound``.
 
     Args:
         alpha: the probability of a wrong decision, in (0, 1).
-        narrowest: the number of pairs at which the interval is tightest, which sets rho.
+        bound: the largest loss of one pair, such as the cost of a failed episode.
+
+    Attributes:
+        pairs: the number of pairs.
 
     Raises:
         QPError: an argument is out of range.
 
     Example:
         >>> test = PairedTest()
-        >>> test.add(torch.linspace(-3.0, 1.0, 32))
+        >>> test.add(torch.tensor([-3.0, 1.0]).repeat(32))
         >>> test.decision, [round(end, 2) for end in test.interval]
-        ('better', [-1.65, -0.35])
+        ('better', [-1.94, -0.01])
     """
 
-    def __init__(self, alpha: float = 0.05, narrowest: int = 32) -> None:
+    def __init__(self, alpha: float = 0.05, bound: float | None = None) -> None:
         check_number("alpha", alpha, lambda x: 0 < x < 1, "a probability in (0, 1)")
-        check_whole("narrowest", narrowest, 1)
-        a = -2 * math.log(alpha)
-        self.alpha, self._rho2 = alpha, (a + math.log(1 + a)) / narrowest
-        self.pairs, self._sum, self._squares = 0, 0.0, 0.0
+        if bound is not None:
+            check_number("bound", bound, lambda x: 0 < x < math.inf, "a positive loss of one pair")
+        self.alpha, self._given, self._d = alpha, bound, np.zeros(0)
 
     def add(self, differences: Tensor) -> None:
         """Add the differences ``(n,)`` of new pairs; an infinite one decides, as does a NaN.
@@ -64,33 +81,93 @@ class PairedTest:
             QPError: the shape does not fit.
         """
         check_tensor("differences", differences, len(differences), batched=False)
-        self.pairs += len(differences)
-        self._sum += float(differences.double().sum())
-        self._squares += float(differences.double().square().sum())
+        new = differences.detach().double().cpu().numpy()
+        self._d = np.concatenate((self._d, new))
+
+    @property
+    def pairs(self) -> int:
+        """The number of pairs."""
+        return len(self._d)
 
     @property
     def mean(self) -> float:
         """The mean difference; nan without pairs."""
-        return self._sum / self.pairs if self.pairs else math.nan
+        return float(self._d.mean()) if self.pairs else math.nan
+
+    @property
+    def bound(self) -> float:
+        """The largest loss of the next pair that the test allows for; inf while there are few."""
+        return float(_bounds(self._d, self._given)[-1])
+
+    @property
+    def vetoed(self) -> bool:
+        """True if a pair has lost more than the bound before it."""
+        return bool((self._d > _bounds(self._d, self._given)[:-1]).any())
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The confidence interval of the mean difference, infinite with fewer than 16 pairs."""
-        n, rho2 = self.pairs, self._rho2
-        if n < FEWEST or not math.isfinite(self._sum):
+        """The confidence interval of the mean difference, infinite with fewer than 16 pairs.
+
+        It covers the mean at all n at once with probability 1 - alpha. Its lower end takes the
+        bound for that of gains.
+        """
+        if self.pairs < FEWEST or not math.isfinite(self.mean):
             return -math.inf, math.inf
-        variance = max(self._squares / n - self.mean**2, 0.0) * n / (n - 1)
-        factor = 2 * (n * rho2 + 1) / (n**2 * rho2)
-        half = math.sqrt(variance * factor * math.log(math.sqrt(n * rho2 + 1) / self.alpha))
-        return self.mean - half, self.mean + half
+        losses, gains = (_Bets(d, self._given) for d in (self._d, -self._d))
+        return -gains.end(2 / self.alpha), losses.end(2 / self.alpha)
 
     @property
     def decision(self) -> str:
-        """``"better"`` or ``"worse"`` if the interval says so of the candidate, else ``"open"``."""
-        if not math.isfinite(self._sum):
-            return "better" if self._sum == -math.inf else "worse"
-        low, high = self.interval
-        return "better" if high < 0 else "worse" if low > 0 else "open"
+        """``"better"`` or ``"worse"`` if the bets or a veto say so, else ``"open"``."""
+        if math.isinf(self.mean) or (self.pairs and math.isnan(self.mean)):
+            return "better" if self.mean == -math.inf else "worse"
+        if self.vetoed:
+            return "worse"
+        if self.pairs < FEWEST:
+            return "open"
+        sides = {"better": self._d, "worse": -self._d}
+        won = (side for side, d in sides.items() if _Bets(d, self._given).won(2 / self.alpha))
+        return next(won, "open")
+
+
+def _bounds(d: np.ndarray, given: float | None) -> np.ndarray:
+    """Return the bounds on the losses of all pairs and of the next one, ``(n + 1,)``."""
+    if given is not None:
+        return np.full(len(d) + 1, given)
+    n, bounds = np.arange(1, len(d) + 1), np.full(len(d) + 1, np.inf)
+    with np.errstate(all="ignore"):
+        mean, size = np.cumsum(d) / n, np.cumsum(np.abs(d)) / n
+        losses, gains = np.maximum.accumulate(d) - mean, mean - np.minimum.accumulate(d)
+        bounds[1:] = MULTIPLE * size * np.maximum(losses / gains, 1.0)
+        bounds[1:][~(losses + gains > EQUAL * size)] = np.inf  # no spread, no scale
+    bounds[:FIRST] = np.inf
+    return bounds
+
+
+class _Bets:
+    """Bets against E d >= mean: their wealth increases with the mean."""
+
+    def __init__(self, d: np.ndarray, given: float | None) -> None:
+        bounds = _bounds(d, given)[:-1]
+        self._lost, bet = bool((d > bounds).any()), np.isfinite(bounds)
+        self._d, self._bounds = d[bet], bounds[bet]
+
+    def _wealth(self, mean: float) -> float:
+        lost = (self._d - mean) / (self._bounds - mean)
+        return float(np.prod(1 - STAKES[:, None] * lost, axis=1).mean())
+
+    def won(self, wealth: float) -> bool:
+        """Return True if the bets against E d >= 0 have reached a wealth."""
+        return not self._lost and self._wealth(0.0) >= wealth
+
+    def end(self, wealth: float) -> float:
+        """Return the smallest mean against which the bets have reached a wealth."""
+        if self._lost or not len(self._d):
+            return math.inf
+        low, high = float(self._d.min()), float(self._bounds.min())
+        while low < (middle := (low + high) / 2) < high:
+            low, high = (low, middle) if self._wealth(middle) >= wealth else (middle, high)
+        return high
 
 
 @dataclass(frozen=True)
@@ -116,7 +193,10 @@ class Gate:
         costs: maps a policy and a seed to the costs ``(starts,)`` of closed loops, with starts and
             disturbances from the seed alone.
         pairs: the number of pairs after which an undecided comparison rejects the candidate.
-        alpha: the probability of a wrong decision in one comparison.
+        alpha: the probability that any candidate is accepted that is no better. Comparison k, from
+            1, has the share ``K / ((K + k - 1) (K + k))`` of it; all shares sum to 1.
+        decisions: K, the number of comparisons that are planned.
+        bound: the largest loss of one closed loop, as in `PairedTest`.
         patience: the number of rejections in a row after which the candidate becomes a copy of the
             acting policy.
         seed: seeds the starts and disturbances of all comparisons.
@@ -149,16 +229,25 @@ class Gate:
         *,
         pairs: int = 96,
         alpha: float = 0.05,
+        decisions: int = 10,
+        bound: float | None = None,
         patience: int = 3,
         seed: int = 0,
     ) -> None:
         check_whole("pairs", pairs, FEWEST)
         check_whole("patience", patience, 1)
         check_whole("seed", seed, 0)
-        PairedTest(alpha)
+        check_whole("decisions", decisions, 1)
+        PairedTest(alpha, bound)
         self.actor, self._costs = copy.deepcopy(actor), costs
+        self._decisions, self._bound = decisions, bound
         self._pairs, self._alpha, self._patience, self._seed = pairs, alpha, patience, seed
         self.accepted = self.rejected = self._in_a_row = 0
+
+    def _test(self) -> PairedTest:
+        """Return the test of the next comparison, with its share of alpha."""
+        k = self._decisions + self.accepted + self.rejected
+        return PairedTest(self._alpha * self._decisions / (k * (k + 1)), self._bound)
 
     @torch.no_grad()
     def judge(self, candidate: nn.Module) -> Verdict:
@@ -171,7 +260,7 @@ class Gate:
         Raises:
             QPError: ``costs`` returns another shape than ``(starts,)``.
         """
-        test, count = PairedTest(self._alpha), 0
+        test, count = self._test(), 0
         # A candidate that costs as much or more so far is hardly worth more pairs.
         while test.decision == "open" and test.pairs < self._pairs and not test.mean >= 0:
             entropy = [self._seed, self.accepted + self.rejected, count]

@@ -546,7 +546,8 @@ class QPMPC(nn.Module):
         """Write the policy and value of the current theta as C99 without heap or dependencies.
 
         The files are ``name.c`` and ``name.h``, whose ``name_step`` maps p to u_0 and V(p); they
-        are compared with an exact solver if a C compiler is installed.
+        are compared with an exact solver, at states about feasible ones, if a C compiler is
+        installed.
 
         Args:
             folder: the folder of both files, created if it does not exist.
@@ -562,8 +563,8 @@ class QPMPC(nn.Module):
             Sizes, conditioning, and the measured agreement.
 
         Raises:
-            QPError: an argument is invalid, the cost is singular on the plan, or the self-test
-                fails.
+            QPError: an argument is invalid, the cost is singular on the plan, no state has a
+                solution, or the self-test fails.
         """
         from torch_qpmpc.export.export import export_c
 

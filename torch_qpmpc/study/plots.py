@@ -21,7 +21,7 @@ from torch_qpmpc.experiment.plots import (
 )
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.study.runs import CASES, FinishedRun, has_real
-from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
+from torch_qpmpc.study.statistics import interquartile_mean, spread, spread_name
 
 GAP_LEFT = "gap left, (J - J true) / (J start - J true)"
 TICKS = [0, 0.02, 0.05, 0.1, 0.2, 0.5, 1], ["0", ".02", ".05", ".1", ".2", ".5", "1"]
@@ -43,9 +43,9 @@ def curves(frame: pd.DataFrame, column: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_band(axes: Axes, x: np.ndarray, runs: np.ndarray, label: str, colour: tuple) -> None:
-    """Draw the interquartile mean over ``runs`` ``(runs, len(x))`` with its bootstrap interval."""
+    """Draw the interquartile mean over ``runs`` ``(runs, len(x))`` with their `spread`."""
     axes.plot(x, interquartile_mean(runs), color=colour, label=label)
-    low, high = bootstrap_interval([runs], interquartile_mean)
+    low, high, *_ = spread([runs], interquartile_mean)
     axes.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
 
 
@@ -102,7 +102,9 @@ def learning_figure(frame: pd.DataFrame) -> Figure:
     for axes in right:
         draw_gap(axes, frame)
     seeds = sorted(frame["seed"].unique().tolist())
-    figure.suptitle(f"{frame['noise'].iloc[0]} noise: interquartile mean over seeds {seeds}, 95%")
+    counts = [n for part in (frame, frame.query("real")) for n in part["label"].value_counts()]
+    title = f"{frame['noise'].iloc[0]} noise: interquartile mean over seeds {seeds}"
+    figure.suptitle(f"{title}, {spread_name(counts)}")
     return figure
 
 
@@ -253,7 +255,7 @@ def frontier_figure(frame: pd.DataFrame) -> Figure:
 
 
 def ablation_figure(frame: pd.DataFrame) -> Figure:
-    """Draw the gap left by each ablation: every run, the median and its interval, by noise."""
+    """Draw the gap left by each ablation: every run, the median and its spread, by noise."""
     real = frame.query("real")
     noises = sorted(real["noise"].unique())
     figure = Figure(figsize=(5 * len(noises), 0.4 * len({*real["ablation"]}) + 1.5))
@@ -264,14 +266,14 @@ def ablation_figure(frame: pd.DataFrame) -> Figure:
         groups = real.query(f"noise == {noise!r}").groupby("ablation")["closed_gap"]
         for height, (_, gaps) in enumerate(groups):
             left = 1 - gaps
-            low, high = bootstrap_interval([left.to_numpy()])
+            low, high, *_ = spread([left.to_numpy()])
             axes.plot(left, [height] * len(left), ".", color="0.7")
             axes.plot([low, high], [height, height], color="tab:blue")
             axes.plot(left.median(), height, "o", color="tab:blue")
         axes.set_yticks(range(len(groups)), [str(name) for name in groups.groups])
         axes.set_xscale("symlog", linthresh=0.1)
         axes.set_xticks(*TICKS)
-        axes.set(xlabel=GAP_LEFT, title=f"{noise} noise")
+        axes.set(xlabel=GAP_LEFT, title=f"{noise} noise: median, {spread_name(groups.size())}")
         axes.grid(alpha=0.3)
     return figure
 

@@ -1,9 +1,9 @@
 """Tables and figures of finished runs: ``python -m torch_qpmpc.report RUNS_FOLDER``.
 
 The report is written to RUNS_FOLDER/report, with a folder for each sweep: the paper's figures with
-intervals over seeds (1 and 3: learning-NOISE.png, 2 and 4: constraints-NOISE.png), closed-loop
-paths, slices of value and policy, model errors, and for swept settings the frontier and the
-ablations.
+intervals or ranges over seeds (1 and 3: learning-NOISE.png, 2 and 4: constraints-NOISE.png),
+closed-loop paths, slices of value and policy, model errors, and for swept settings the frontier and
+the ablations.
 """
 
 from __future__ import annotations
@@ -29,13 +29,14 @@ from torch_qpmpc.study.plots import (
     trajectories_figure,
 )
 from torch_qpmpc.study.runs import CASES, REAL_GAP, collect, has_real
-from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
+from torch_qpmpc.study.statistics import interquartile_mean, spread
 
 #: Largest number of settings that fit side by side in a figure.
 SIDE_BY_SIDE = 8
 CAPTION = f"""\
-Closed gap: median and 95% interval (bootstrapped over seeds) of the runs with a real gap, J_start -
-J_true_model >= {REAL_GAP:g} J_start, and their number. All other entries are medians over all runs.
+Closed gap: median and 95% interval (bootstrapped over seeds; the range of fewer than six) of the
+runs with a real gap, J_start - J_true_model >= {REAL_GAP:g} J_start, and their number. All other
+entries are medians over all runs.
 J: start to learned, with the true model in brackets. Distance: relative distance of C's predictions
 from those of the nearest time-invariant MPC scheme. Zeros: share of C's entries above the band that
 are exactly zero. Prediction error: root mean square over one step, of the corrupted (A, B) and of
@@ -78,8 +79,7 @@ def cases_table(sweep: pd.DataFrame) -> str:
         nearer = (runs["prediction_error"] < runs["prediction_error_start"]).sum()
         gap = "-"
         if len(real):
-            low, high = bootstrap_interval([real])
-            gap = f"{pd.Series(real).median():.3f} [{low:.3f}, {high:.3f}]"
+            gap = f"{pd.Series(real).median():.3f} {spread([real]).text()}"
         errors = f"{median['prediction_error_start']:.3f} to {median['prediction_error']:.3f}"
         lines.append(
             [
@@ -110,9 +110,8 @@ def overall(sweep: pd.DataFrame) -> str:
         cases = [runs.query(f"label == {case!r}")["closed_gap"].to_numpy() for case in CASES[1:]]
         if not all(map(len, cases)):
             continue
-        low, high = bootstrap_interval(cases, interquartile_mean)
         mean = interquartile_mean(pd.Series([gap for case in cases for gap in case]).to_numpy())
-        lines.append(f"{noise} noise {mean:.3f} [{low:.3f}, {high:.3f}]")
+        lines.append(f"{noise} noise {mean:.3f} {spread(cases, interquartile_mean).text()}")
     if not lines:
         return ""
     return f"Interquartile mean over the four cases that learn C: {'; '.join(lines)}."

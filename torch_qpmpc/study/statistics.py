@@ -1,14 +1,42 @@
-"""Robust averages over seeds, and their confidence intervals."""
+"""Robust averages over seeds, with their confidence intervals, or the ranges of a few values."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import bootstrap
 
 from torch_qpmpc.checks import check_number, check_whole
 from torch_qpmpc.errors import QPError
+
+#: Fewest values of an interval: of three normal ones, a median's of 95 % covers in 75 % of cases.
+FEWEST = 6
+
+
+class Spread(NamedTuple):
+    """The ends of a 95% interval of ``count`` values, or of their range if they are ``few``."""
+
+    low: np.ndarray
+    high: np.ndarray
+    count: int
+    few: bool
+
+    def text(self, digits: str = ".3f") -> str:
+        """Format the ends: ``[0.1, 0.3]``, or ``(range of 3: 0.1 to 0.3)``."""
+        low, high = (format(float(end), digits) for end in (self.low, self.high))
+        if self.few:
+            return f"(range of {self.count}: {low} to {high})"
+        return f"[{low}, {high}]"
+
+
+def spread_name(counts: Iterable[int]) -> str:
+    """Return the name of spreads of so many values each."""
+    few = {count < FEWEST for count in counts}
+    if few == {True}:
+        return "range"
+    return "95% interval" + (" (range of fewer than six)" if True in few else "")
 
 
 def interquartile_mean(x: np.ndarray, axis: int = 0) -> np.ndarray:
@@ -48,7 +76,7 @@ def bootstrap_interval(
     """Compute the stratified percentile bootstrap interval of a statistic of all runs.
 
     Each stratum, such as the seeds of one case, is resampled separately, so that every case keeps
-    its number of runs.
+    its number of runs. With fewer than about ten runs it is too short: see `spread`.
 
     Args:
         strata: arrays ``(n_i, ...)``.
@@ -101,3 +129,28 @@ def bootstrap_interval(
         rng=seed,
     ).confidence_interval
     return low, high
+
+
+def spread(
+    strata: Sequence[np.ndarray], statistic: Callable[..., np.ndarray] = np.median
+) -> Spread:
+    """Compute the 95% bootstrap interval of a statistic, or the range of few values.
+
+    Args:
+        strata: as in `bootstrap_interval`; the smallest one counts.
+        statistic: a function of an array and ``axis``.
+
+    Raises:
+        QPError: as in `bootstrap_interval`.
+
+    Example:
+        >>> import numpy as np
+        >>> from torch_qpmpc.study.statistics import spread
+        >>> spread([np.array([0.7, 0.9, 0.8])]).text(".1f")
+        '(range of 3: 0.7 to 0.9)'
+    """
+    low, high = bootstrap_interval(strata, statistic)
+    together = np.concatenate([np.asarray(stratum) for stratum in strata])
+    if few := min(map(len, strata)) < FEWEST:
+        low, high = together.min(0), together.max(0)
+    return Spread(low, high, len(together), few)
