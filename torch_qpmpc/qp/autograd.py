@@ -23,8 +23,9 @@ from torch_qpmpc.qp.program import NDIMS, Status
 from torch_qpmpc.qp.solvers import backend
 
 ON_FAILURE = ("raise", "warn", "mask")
-#: The tensors of a `QPSolution`: value, z, chi, lam, xi, status, residual, iterations, active.
-Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+#: The tensors of a `QPSolution`: value, z, chi, lam, xi, status, residual, value_error, iterations,
+#: active.
+Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def solve_eager(
@@ -116,7 +117,7 @@ def solve_now(
         dtype = q.dtype if x.is_floating_point() else x.dtype
         return x.reshape((*batch, *x.shape[1:])).to(q.device, dtype)
 
-    return tuple(map(out, outputs))  # pyright: ignore[reportReturnType] - a tuple of nine
+    return tuple(map(out, outputs))  # pyright: ignore[reportReturnType] - a tuple of ten
 
 
 def _is_out_of_memory(error: Exception) -> bool:

@@ -70,12 +70,13 @@ def _(H, q, c, C, b, G, lb, ub, w, fixed, start, n_kept, solver, on_failure):
     n_z, n_c, n_g, n_f = q.shape[-1], b.shape[-1], lb.shape[-1], fixed.shape[-1]
     vectors = [q.new_empty((*batch, n)) for n in (n_z, n_c, n_g, n_f)]
     active = q.new_empty((*batch, n_g), dtype=torch.int8)
-    return (q.new_empty(batch), *vectors, count(), q.new_empty(batch), count(), active)
+    errors = q.new_empty(batch), q.new_empty(batch)
+    return (q.new_empty(batch), *vectors, count(), *errors, count(), active)
 
 
 @solve_op.register_vmap
 def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
-    return solve_op(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9
+    return solve_op(*align(in_dims, args, EVENT_NDIMS)), (0,) * 10
 
 
 def _setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
@@ -113,7 +114,7 @@ class Traced(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
-        return Traced.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9
+        return Traced.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 10
 
 
 class TracedForward(Traced):
@@ -128,8 +129,8 @@ class TracedForward(Traced):
     def jvp(ctx: Any, *d_inputs: Tensor | None) -> tuple:
         theta, solution = ctx.saved_tensors[:N_THETA], ctx.saved_tensors[N_THETA:]
         d_outputs = tangents(d_inputs[:N_THETA], theta, solution, ctx.n_kept)
-        return *d_outputs, *(None,) * 4
+        return *d_outputs, *(None,) * 5
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
-        return TracedForward.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 9
+        return TracedForward.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 10

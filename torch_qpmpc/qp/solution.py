@@ -76,6 +76,8 @@ class QPSolution:
         xi: multipliers of the fixed entries, ``(*batch, n_f)``: the paper's xi, then zeta.
         status: `Status` as integers, ``(*batch,)``.
         residual: relative KKT residual, from the certificate, ``(*batch,)``.
+        value_error: bound of the error of ``value``, relative to the largest of 1/2 z'Hz, q'z,
+            w'sigma and their sum (but to no more than 1e3 times the sum), ``(*batch,)``.
         iterations: the solver's iterations, ``(*batch,)``.
         active: the active set as int8 ``(*batch, n_g)``, a warm start for a nearly equal QP. Rows
             are 0 without a multiplier, 1 if held at ub, -1 if held at lb, 2 and -2 if saturated
@@ -97,6 +99,7 @@ class QPSolution:
     xi: Tensor
     status: Tensor
     residual: Tensor
+    value_error: Tensor
     iterations: Tensor
     active: Tensor
 

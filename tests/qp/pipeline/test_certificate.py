@@ -21,6 +21,7 @@ N_Z, N_C, N_F = 12, 3, 2
 class Certificate(NamedTuple):
     value: Tensor
     residual: Tensor
+    value_error: Tensor
 
 
 def certify(p: Programs, *claim: Tensor) -> Certificate:
@@ -198,8 +199,8 @@ def test_absurd_multipliers_do_not_hide_errors():
     huge = torch.full((1, 1), 1e12).double()
     for z_2, accepted in ((2.0, True), (1.9, False)):
         z = torch.tensor([[0.0, z_2]]).double()
-        residual = certify(programs, z, huge, -huge, z[:, :0]).residual
-        assert bool(residual <= TOLERANCE) == accepted
+        _, residual, error = certify(programs, z, huge, -huge, z[:, :0])
+        assert bool(residual.maximum(error) <= TOLERANCE) == accepted
 
 
 def test_the_constant_is_part_of_the_value_but_not_of_the_tolerance():
@@ -222,3 +223,55 @@ def test_parts_of_a_program_may_be_missing(missing):
     )
     assert judge(known).residual.max() < 1e-12
     assert judge(known, z=shifted(known.z, 5, 1e-3)).residual[SPOILT] > 10 * TOLERANCE
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+@pytest.mark.parametrize("off", [1e-2, 1e-4, 1e-6, 1e-8])
+@pytest.mark.parametrize("parts", ["z", "lam", "z lam"])
+def test_the_error_of_the_value_is_bounded(parts, off, matrices):
+    for seed in range(20):
+        known = known_qp(seed, batch=(BATCH,), matrices=matrices)
+        noise = torch.Generator().manual_seed(seed)
+        claim = {
+            name: (x := getattr(known, name)) + off * torch.randn(x.shape, generator=noise).double()
+            for name in parts.split()
+        }
+        if "z" in claim:  # on C z = b, as after an elimination
+            C, z = known.qp.C, claim["z"]
+            z[:, :N_F] = known.fixed
+            short = known.qp.b - times(C, z)
+            z[:, N_F:] += times(torch.linalg.pinv(C[..., N_F:]), short)
+        if "lam" in claim:  # within [-w, w] and at bounds that exist, as `recover` makes it
+            lb, ub, w = known.qp.lb, known.qp.ub, known.qp.w
+            least, most = torch.where(lb.isinf(), 0, -w), torch.where(ub.isinf(), 0, w)
+            claim["lam"] = claim["lam"].clamp(least, most)
+        certificate = judge(known, **claim)
+        size = largest_term(known, claim.get("z", known.z))
+        error = (certificate.value - known.value).abs() / size
+        assert (error <= certificate.value_error + 1e-14).all()
+
+
+def largest_term(known: KnownQP, z: Tensor) -> Tensor:
+    """Compute the largest of the cost's terms at z, and of their sum, ``(B,)``."""
+    H, q, _, _, _, G, lb, ub, w = known.qp.tensors()
+    outside = (times(G, z) - times(G, z).clamp(lb, ub)).abs()
+    terms = torch.stack(
+        (
+            (z * times(H, z)).sum(-1) / 2,
+            (q * z).sum(-1),
+            (w.masked_fill(w.isinf(), 0) * outside).sum(-1),
+        )
+    )
+    return torch.cat((terms, terms.sum(0, keepdim=True))).abs().amax(0)
+
+
+def test_a_violation_counts_by_the_step_that_ends_it():
+    # z_1 = 0 and 1e-9 z_2 <= -1e-9: z_2 is -1, and V 1/2. At z = 0 the row is violated by 1e-9.
+    C, none = torch.tensor([[1.0, 0.0]]).double(), torch.zeros(1).double()
+    G, inf = torch.tensor([[-1.0, 1e-9]]).double(), torch.full((1,), torch.inf).double()
+    data = (torch.eye(2).double(), torch.zeros(2).double(), none.sum(), C, none, G, -inf)
+    programs, _ = Programs.of(*data, torch.tensor([-1e-9]).double(), inf, none[:0])
+    z = torch.zeros(1, 2).double()
+    certificate = certify(programs, z, 0 * z[:, :1], 0 * z[:, :1], z[:, :0])
+    assert certificate.residual <= TOLERANCE
+    assert certificate.value_error > 1

@@ -130,3 +130,12 @@ def test_retries_exclude_the_matrices_of_invalid_qps(solver):
     solution = solve_qp(three, s, solver=solver, on_failure="mask")
     assert solution.status.tolist() == [0, Status.INVALID_DATA, 0]
     assert_close(solution.value[[0, 2]], torch.tensor([2.28345503, 0.05404678]).double())
+
+
+def test_a_batch_of_invalid_qps_in_unusual_units_is_invalid():
+    known = known_qp(0, batch=(2,))
+    C = 1e8 * known.qp.C
+    C[..., 0, -1] = torch.nan
+    qp = replace(known.qp, C=C, check_values=False)
+    status = solve_qp(qp, known.fixed, on_failure="mask").status
+    assert (status == Status.INVALID_DATA).all()

@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from tests.problems import KnownQP, known_qp
 from torch_qpmpc import QPMPC, QPSolution, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
 from torch_qpmpc.envs import PointMass
+from torch_qpmpc.qp.pipeline import refinement
 from torch_qpmpc.qp.pipeline import solve as chain
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import UNKNOWN
@@ -192,6 +193,7 @@ def test_the_active_set_of_an_unsolved_qp_is_unknown():
 def nobody_solves(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in list(BACKENDS):
         monkeypatch.setitem(BACKENDS, name, doctored(LIES["zeros"]))
+    monkeypatch.setattr(refinement, "MAX_SETS", 0)
 
 
 @pytest.mark.usefixtures("nobody_solves")

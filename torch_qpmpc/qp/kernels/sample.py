@@ -17,6 +17,7 @@ from torch_qpmpc.qp.kernels.linalg import (
     comparing,
     compiled,
     copy,
+    dot,
     larger,
     products,
     summing,
@@ -31,6 +32,19 @@ MAX_STEPS = 10
 MAX_PASSES = 3
 #: Relative tolerance for bounds and for signs of multipliers in a warm start.
 SLIP = 1e-9
+#: Errors of the value are relative to its largest term, but to no more than this many times the
+#: value (where z is far along a flat direction, huge terms cancel), and to no less than the floor.
+CANCELLED, FLOOR = 1e3, 1e-12
+#: Some optimum is no further from z than this many times its largest entry, where H is singular.
+RANGE = 1e3
+#: A few rounding errors, relative to the terms of a sum.
+ROUNDING = 1e-15
+#: Rounding errors of the value are looked at closely from this size on.
+DOUBTFUL = 1e-8
+#: A hard row is nearly active if its slack is this small, relatively.
+NEARLY_ACTIVE = 1e-6
+#: Rows of G are dependent if the sine of their angle is below this, and agree within this.
+DEPENDENT = 1e-14
 
 
 @compiled
@@ -44,7 +58,7 @@ def offsets(fixed, group, matrix, constant):
     return out
 
 
-def recover(v, lam, group, fixed, theta, reduced, diagonal, passes=0) -> tuple[Any, ...]:
+def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes=0) -> tuple[Any, ...]:
     """Complete and certify solutions of reduced QPs.
 
     The multipliers of C z = b and of the fixed entries follow from the stationarity of the
@@ -52,18 +66,19 @@ def recover(v, lam, group, fixed, theta, reduced, diagonal, passes=0) -> tuple[A
 
     Args:
         v, lam: solutions ``(B, d)`` and signed multipliers ``(B, r)`` of the reduced QPs.
-        group, fixed, theta, reduced: the QPs, see `torch_qpmpc.qp.pipeline.batch`.
+        group, fixed, theta, reduced, sizes: the QPs, see `torch_qpmpc.qp.pipeline.batch`.
         diagonal: two flags, True if the batch shares one diagonal H, and one diagonal G.
         passes: the number of iterative refinements of z and chi after the elimination.
 
     Returns:
-        value, z, chi, lam, xi, the codes of the active set, and the certificate's residual.
+        value, z, chi, lam, xi, the codes of the active set, and the certificate's residual and
+        error of the value.
     """
-    return _recover(v, lam, group, fixed, theta, reduced, diagonal, passes)
+    return _recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes)
 
 
 @compiled
-def _recover(v, lam_v, group, fixed, theta, reduced, diagonal, passes):
+def _recover(v, lam_v, group, fixed, theta, reduced, sizes, diagonal, passes):
     n_qps, n_f = fixed.shape
     H, C, G, q = theta.H, theta.C, theta.G, theta.q
     kept = np.empty((n_qps, n_f + v.shape[1]))
@@ -94,8 +109,9 @@ def _recover(v, lam_v, group, fixed, theta, reduced, diagonal, passes):
     xi = -left[:, :n_f]
     for i in range(n_qps):
         add(left[i, :n_f], 1.0, xi[i])
-    value, residual = _judge(z, lam, chi, fixed, theta, Hz, G_lam, C_chi, left, y, Cz)
-    return value, z, chi, lam, xi, codes, residual
+    terms = (Hz, G_lam, C_chi, left, y, Cz)
+    value, residual, error = _judge(z, lam, chi, group, fixed, theta, reduced.T, sizes, terms)
+    return value, z, chi, lam, xi, codes, residual, error
 
 
 @compiled
@@ -129,13 +145,16 @@ def _all_multipliers(lam_v, y, theta, rows, others):
     return lam, codes
 
 
-def certify(z, lam, chi, xi, group, fixed, theta, diagonal) -> tuple[Any, Any]:
-    """Return value and KKT residual ``(B,)``, see `torch_qpmpc.qp.pipeline.certificate`."""
-    return _certify(z, lam, chi, xi, group, fixed, theta, diagonal)
+def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal) -> tuple[Any, Any, Any]:
+    """Return value, KKT residual and the value's error ``(B,)``.
+
+    `torch_qpmpc.qp.pipeline.certificate` has the formulas.
+    """
+    return _certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal)
 
 
 @compiled
-def _certify(z, lam, chi, xi, group, fixed, theta, diagonal):
+def _certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal):
     H, C, G, q = theta.H, theta.C, theta.G, theta.q
     Hz, y = products(H, group, z, diagonal[0]), products(G, group, z, diagonal[1])
     G_lam = transposed_products(G, group, lam, diagonal[1])
@@ -144,41 +163,189 @@ def _certify(z, lam, chi, xi, group, fixed, theta, diagonal):
     for i in range(len(z)):
         add(left[i, : xi.shape[1]], 1.0, xi[i])
         add(left[i], 1.0, q[i % len(q)])
-    return _judge(z, lam, chi, fixed, theta, Hz, G_lam, C_chi, left, y, Cz)
+    terms = (Hz, G_lam, C_chi, left, y, Cz)
+    return _judge(z, lam, chi, group, fixed, theta, reduced.T, sizes, terms)
 
 
 @compiled
-def _judge(z, lam, chi, fixed, theta, Hz, G_lam, C_chi, left, y, Cz):
-    """Return value and residual from the KKT terms; ``left`` is the residual of stationarity."""
+def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms):
+    """Return value, residual and error of the value from the KKT terms.
+
+    The fourth term, ``left``, is the residual of stationarity.
+    """
+    Hz, G_lam, C_chi, left, y, Cz = terms
+    H, C, G = theta.H, theta.C, theta.G
     q, c, b, lb, ub, w = theta.q, theta.c, theta.b, theta.lb, theta.ub, theta.w
-    value, residual = np.empty(len(z)), np.empty(len(z))
+    n_f = fixed.shape[1]
+    slopes = transposed_products(T, group, left, False)
+    value, residual, error = np.empty(len(z)), np.empty(len(z)), np.empty(len(z))
+    d = T.shape[2] - n_f
+    basis, ends = np.empty((d + 1, d)), np.empty(d + 1)
+    inverse, shift, box, hard = sizes.inverse, sizes.shift, sizes.box, sizes.hard
+    apart = sizes.apart
     for i in range(len(z)):
-        q_i, b_i = q[i % len(q)], b[i % len(b)]
+        q_i, b_i, m = q[i % len(q)], b[i % len(b)], group[i]
         lb_i, ub_i, w_i = lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)]
-        cost, slip = _cost(z[i], Hz[i], left[i], q_i)
+        linear, quadratic = _cost(z[i], Hz[i], q_i)
         charge, gap = _charge(y[i], lam[i], lb_i, ub_i, w_i)
-        cost, slip = cost + charge, slip + gap + _shortage(Cz[i], b_i, chi[i])
-        force, slope, length = _forces(z[i], Hz[i], G_lam[i], C_chi[i], left[i], q_i)
-        short, size = _distance(Cz[i], b_i)
-        error = max(slope / (1.0 + force), short / (1.0 + size + length))
-        error = max(error, _distance(z[i, : fixed.shape[1]], fixed[i])[0])
-        error = max(error, _excess(y[i], lam[i], lb_i, ub_i, w_i))
-        slip /= 1.0 + abs(cost)
-        worst = max(error, slip)
+        gap += _shortage(Cz[i], b_i, chi[i])
+        cost = linear + quadratic + charge
         value[i] = cost + c[i % len(c)]
+        force, push, length = _forces(z[i], Hz[i], G_lam[i], C_chi[i], left[i], q_i)
+        short, size = _distance(Cz[i], b_i)
+        worst = max(push / (1.0 + force), short / (1.0 + size + length))
+        worst = max(worst, _distance(z[i, :n_f], fixed[i])[0])
+        worst = max(worst, _excess(y[i], lam[i], lb_i, ub_i, w_i))
+        worst = max(worst, gap / (1.0 + abs(cost)))
+
+        scale = max(abs(cost), abs(linear), abs(quadratic), charge)
+        scale = max(min(scale, CANCELLED * abs(cost)), FLOOR)
+        noise = _weighted(z[i], sizes.costs[m]) + _weighted(lam[i], sizes.rows[m])
+        noise = length * (noise + _weighted(chi[i], sizes.equalities[m]))
+        if not ROUNDING * noise < DOUBTFUL * scale:  # the same without the largest entry of z
+            noise = _terms(z[i], H[m], z[i]) + _terms(lam[i], G[m], z[i])
+            noise += _terms(chi[i], C[m], z[i])
+        noise += _weighted(z[i], q_i)
+        slope, steps = slopes[i, n_f:], sizes.steps[m]
+        far = RANGE * length if shift[m] > 0 else np.inf
+        of_slope, push = _fall(slope, lb_i, ub_i, w_i, far, inverse[m], shift[m], steps, box)
+        rows = (y[i], lam[i], lb_i, ub_i, w_i, steps)
+        if apart:
+            step = _repair_apart(rows, hard, z[i], G[m])
+        else:
+            step = _repair(rows, hard, z[i], G[m], sizes.units[m], basis, ends)
+        off = gap + of_slope + ROUNDING * noise + (push + 0.5 * sizes.stiffness[m] * step) * step
+        off += _kinks(y[i], lb_i, ub_i, w_i, steps, step)
         # Sums propagate a NaN in any entry; maxima ignore it.
-        residual[i] = worst if slip < np.inf and worst < np.inf else np.inf
-    return value, residual
+        sound = gap + abs(cost) + _weighted(slopes[i], slopes[i])
+        finite = sound < np.inf and worst < np.inf
+        residual[i] = worst if finite else np.inf
+        error[i] = off / scale if finite and off < np.inf else np.inf
+    return value, residual, error
 
 
 @summing
-def _cost(z, Hz, left, q):
-    """Return (q + Hz / 2)'z, and the stationarity residual weighted by |z|."""
-    cost = slip = 0.0
+def _cost(z, Hz, q):
+    """Return q'z and z'Hz / 2."""
+    linear = quadratic = 0.0
     for j in range(len(z)):
-        cost += (q[j] + 0.5 * Hz[j]) * z[j]
-        slip += abs(left[j] * z[j])
-    return cost, slip
+        of_q, of_H = q[j] * z[j], 0.5 * Hz[j] * z[j]
+        linear += of_q
+        quadratic += of_H
+    return linear, quadratic
+
+
+@summing
+def _weighted(x, sizes):
+    """Return |x|'|sizes|."""
+    total = 0.0
+    for j in range(len(x)):
+        total += abs(x[j] * sizes[j])
+    return total
+
+
+@summing
+def _square(matrix, x):
+    """Return |matrix x|^2."""
+    total = 0.0
+    for a in range(len(x)):
+        part = 0.0
+        for b in range(len(x)):
+            part += matrix[a, b] * x[b]
+        total += part * part
+    return total
+
+
+@compiled
+def _terms(x, matrix, z):
+    """Return |x|'|matrix||z|."""
+    total = 0.0
+    for i in range(len(x)):
+        if x[i] != 0:
+            total += abs(x[i]) * _weighted(z, matrix[i])
+    return total
+
+
+@compiled
+def _fall(slope, lb, ub, w, far, inverse, shift, steps, box):
+    """Return the most by which the Lagrangian is above its minimum in v, and the slope's length.
+
+    It is no more than ``(slope'(H + shift)^-1 slope + shift |reach|^2) / 2``, nor than
+    ``|slope|'reach``, where v_k is no further than ``reach_k`` from an optimum: by a hard row that
+    contains only v_k, or, if H is singular, ``far``.
+    """
+    square = linear = length = 0.0
+    for a in range(len(slope)):
+        square += slope[a] * slope[a]
+        reach, row = far, box[a]
+        if row >= 0 and w[row] == np.inf:
+            reach = min(reach, (ub[row] - lb[row]) / steps[row])
+        length += reach * reach
+        linear += abs(slope[a]) * reach if slope[a] != 0 else 0.0
+    fall = 0.5 * (_square(inverse, slope) + (shift * length if shift > 0 else 0.0))
+    # A NaN in fall stays.
+    return (linear if linear < fall else fall), math.sqrt(square)
+
+
+@compiled
+def _repair_apart(rows, hard, z, G):
+    """Return the length of `_repair`'s step if the hard rows' normals are nearly orthogonal."""
+    y, lam, lb, ub, w, steps = rows
+    total = 0.0
+    for j in hard:
+        over = max(y[j] - ub[j], lb[j] - y[j])
+        if (over > 0 or lam[j] != 0) and w[j] == np.inf and steps[j] > 0:
+            total += ((max(over, 0.0) + ROUNDING * _weighted(z, G[j])) / steps[j]) ** 2
+    return math.sqrt(total)
+
+
+@compiled
+def _repair(rows, hard, z, G, units, basis, ends):
+    """Return the length of a step in v that ends all violations of hard rows, with rounding.
+
+    The step holds all nearly active rows. By Gram and Schmidt, they become an orthonormal ``basis``
+    along which it goes to ``ends``; the two are scratch. It is infinite if rows that are dependent
+    up to rounding disagree by more.
+    """
+    y, lam, lb, ub, w, steps = rows
+    total, k = 0.0, 0
+    for a in range(len(hard)):
+        j = hard[a]
+        if w[j] < np.inf or not steps[j] > 0:
+            continue
+        over, size = max(y[j] - ub[j], lb[j] - y[j]), _weighted(z, G[j])
+        if over <= -NEARLY_ACTIVE * size and lam[j] == 0:
+            continue
+        sign = 1.0 if y[j] - ub[j] > lb[j] - y[j] else -1.0
+        part = sign * (max(over, 0.0) + ROUNDING * size) / steps[j]
+        slack = DEPENDENT * size / steps[j]
+        copy(basis[k], units[a])
+        for _ in range(2):  # again, for the rounding errors of the first time
+            for e in range(k):
+                along = dot(basis[e], basis[k])
+                add(basis[k], -along, basis[e])
+                part -= along * ends[e]
+        norm = math.sqrt(dot(basis[k], basis[k]))
+        if norm > DEPENDENT:
+            for e in range(len(basis[k])):
+                basis[k, e] /= norm
+            ends[k] = part / norm
+            total += ends[k] ** 2
+            k += 1
+        elif abs(part) > slack + DEPENDENT * math.sqrt(total):
+            return np.inf
+    return math.sqrt(total)
+
+
+@summing
+def _kinks(y, lb, ub, w, steps, step):
+    """Return the most by which the charges of soft rows exceed their tangents after a step in v."""
+    total = 0.0
+    for j in range(len(y)):
+        move = steps[j] * step
+        away = min(abs(y[j] - lb[j]), abs(y[j] - ub[j]))
+        total += 2.0 * w[j] * move if away < move and w[j] < np.inf else 0.0
+    return total
 
 
 @summing

@@ -11,7 +11,19 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.qp.batching import largest, multiply
-from torch_qpmpc.qp.kernels.sample import MAX_PASSES, MAX_STEPS, SLIP, VIOLATED
+from torch_qpmpc.qp.kernels.sample import (
+    CANCELLED,
+    DEPENDENT,
+    DOUBTFUL,
+    FLOOR,
+    MAX_PASSES,
+    MAX_STEPS,
+    NEARLY_ACTIVE,
+    RANGE,
+    ROUNDING,
+    SLIP,
+    VIOLATED,
+)
 from torch_qpmpc.qp.solution import active_codes
 
 
@@ -19,7 +31,7 @@ def offsets(fixed, group, matrix, constant) -> Tensor:
     return multiply(matrix.mT, group, fixed) + constant
 
 
-def recover(v, lam, group, fixed, theta, reduced, diagonal, passes=0) -> tuple[Tensor, ...]:
+def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes=0) -> tuple[Tensor, ...]:
     Y_neg, C = reduced.Y_neg, theta.C
     z = multiply(reduced.T, group, torch.cat((fixed, v), dim=-1)) + reduced.z_0
     for _ in range(passes):
@@ -39,20 +51,23 @@ def recover(v, lam, group, fixed, theta, reduced, diagonal, passes=0) -> tuple[T
     left = left + C_chi
     xi = -left[:, : fixed.shape[-1]]
     left[:, : fixed.shape[-1]] += xi
-    value, residual = _judge(z, all_lam, chi, group, fixed, theta, Hz, G_lam, C_chi, left, y)
+    terms = (Hz, G_lam, C_chi, left, y)
+    value, *errors = _judge(z, all_lam, chi, group, fixed, theta, reduced.T, sizes, terms)
     codes = active_codes(y, all_lam, theta.lb, theta.ub, theta.w)
-    return value, z, chi, all_lam, xi, codes, residual
+    return value, z, chi, all_lam, xi, codes, *errors
 
 
-def certify(z, lam, chi, xi, group, fixed, theta, diagonal) -> tuple[Tensor, Tensor]:
+def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal) -> tuple[Tensor, ...]:
     Hz, y = multiply(theta.H, group, z), multiply(theta.G, group, z)
     G_lam, C_chi = multiply(theta.G.mT, group, lam), multiply(theta.C.mT, group, chi)
     left = Hz + theta.q + G_lam + C_chi
     left[:, : xi.shape[-1]] += xi
-    return _judge(z, lam, chi, group, fixed, theta, Hz, G_lam, C_chi, left, y)
+    terms = (Hz, G_lam, C_chi, left, y)
+    return _judge(z, lam, chi, group, fixed, theta, reduced.T, sizes, terms)
 
 
-def _judge(z, lam, chi, group, fixed, theta, Hz, G_lam, C_chi, left, y) -> tuple[Tensor, Tensor]:
+def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms) -> tuple[Tensor, Tensor, Tensor]:
+    Hz, G_lam, C_chi, left, y = terms
     lb, ub, w = theta.lb, theta.ub, theta.w
     hard, no_lb, no_ub = w.isinf(), lb.isinf(), ub.isinf()
     up, down = lam.clamp(min=0.0), lam.clamp(max=0.0)
@@ -60,11 +75,11 @@ def _judge(z, lam, chi, group, fixed, theta, Hz, G_lam, C_chi, left, y) -> tuple
     charge = outside * w.masked_fill(hard, 0.0)
     # h(y) + h*(lam) - lam y for each row, see `torch_qpmpc.qp.pipeline.certificate`.
     gap = charge + (ub.masked_fill(no_ub, 0.0) - y) * up + (lb.masked_fill(no_lb, 0.0) - y) * down
-    cost = torch.linalg.vecdot(theta.q + 0.5 * Hz, z) + charge.sum(-1)
+    charge = charge.sum(-1)
+    linear, quadratic = torch.linalg.vecdot(theta.q, z), torch.linalg.vecdot(0.5 * Hz, z)
+    cost = linear + quadratic + charge
     short = multiply(theta.C, group, z) - theta.b
-    # With a huge z or chi, relative errors can be small but matter to the cost.
-    slip = torch.linalg.vecdot(left.abs(), z.abs())
-    slip = slip + torch.linalg.vecdot(short.abs(), chi.abs()) + gap.abs().sum(-1)
+    gap = torch.linalg.vecdot(short.abs(), chi.abs()) + gap.abs().sum(-1)
     forces = torch.cat((Hz, G_lam, C_chi, theta.q.expand_as(z)), dim=-1)
     errors = (
         left / (1.0 + largest(forces, keepdim=True)),
@@ -74,10 +89,77 @@ def _judge(z, lam, chi, group, fixed, theta, Hz, G_lam, C_chi, left, y) -> tuple
         torch.where(hard, outside / (1.0 + y.abs()), (lam.abs() - w) / (1.0 + w)).clamp(min=0),
         up * no_ub,
         down * no_lb,
-        (slip / (1.0 + cost.abs())).unsqueeze(-1),
+        (gap / (1.0 + cost.abs())).unsqueeze(-1),
     )
+    slopes = multiply(T.mT, group, left)
+    sound = gap + cost.abs() + torch.linalg.vecdot(slopes, slopes)
     residual = largest(torch.cat(errors, dim=-1)).nan_to_num_(torch.inf, torch.inf)
-    return cost + theta.c, residual
+    residual = torch.where(sound < torch.inf, residual, torch.inf)
+
+    value, length = cost + theta.c, largest(z)
+    scale = torch.stack((cost, linear, quadratic, charge)).abs().amax(0)
+    scale = scale.minimum(CANCELLED * cost.abs()).clamp(min=FLOOR)
+    parts = (z, theta.H, sizes.costs), (lam, theta.G, sizes.rows), (chi, theta.C, sizes.equalities)
+    of_rows = [multiply(matrix.abs(), group, z.abs()) for _, matrix, _ in parts]
+    size = sum(torch.linalg.vecdot(sums[group], x.abs()) for x, _, sums in parts) * length
+    close = sum(torch.linalg.vecdot(t, x.abs()) for (x, *_), t in zip(parts, of_rows, strict=True))
+    size = torch.where(ROUNDING * size < DOUBTFUL * scale, size, close)
+    size = size + torch.linalg.vecdot(theta.q.abs(), z.abs())
+    step = _repair(y, lam, theta, of_rows[1], sizes, group)
+    fall, push = _fall(slopes[:, fixed.shape[-1] :], theta, RANGE * length, sizes, group)
+    off = gap + fall + ROUNDING * size + (push + 0.5 * sizes.stiffness[group] * step) * step
+    off = off + _kinks(y, theta, sizes.steps[group], step)
+    error = (off / scale).nan_to_num(torch.inf, torch.inf).masked_fill_(residual.isinf(), torch.inf)
+    return value, residual, error
+
+
+def _fall(slope, theta, far, sizes, group) -> tuple[Tensor, Tensor]:
+    part, shift = multiply(sizes.inverse, group, slope), sizes.shift[group]
+    reach = torch.where(shift > 0, far, torch.inf).unsqueeze(-1).expand_as(slope)
+    boxed, rows = sizes.box >= 0, sizes.box.clamp(min=0)
+    if len(theta.lb[0]):
+        width = ((theta.ub - theta.lb)[:, rows]) / sizes.steps[group][:, rows]
+        reach = torch.where(boxed & theta.w[:, rows].isinf(), reach.minimum(width), reach)
+    fall = part.square().sum(-1) + (shift * reach.square().sum(-1)).nan_to_num(nan=0.0)
+    linear = torch.where(slope != 0, slope.abs() * reach, 0).sum(-1)
+    return (0.5 * fall).minimum(linear), torch.linalg.vector_norm(slope, dim=-1)
+
+
+def _repair(y, lam, theta, size, sizes, group) -> Tensor:
+    y, lam, size = y[:, sizes.hard], lam[:, sizes.hard], size[:, sizes.hard]
+    lb, ub, w = (x[:, sizes.hard] for x in (theta.lb, theta.ub, theta.w))
+    norm = sizes.steps[group][:, sizes.hard]
+    over = torch.maximum(y - ub, lb - y)
+    part = (over.clamp(min=0) + ROUNDING * size) / norm
+    present = w.isinf() & (norm > 0)
+    if sizes.apart:
+        counts = present & ((over > 0) | (lam != 0))
+        return torch.linalg.vector_norm(torch.where(counts, part, 0), dim=-1)
+    near = present & ((over > -NEARLY_ACTIVE * size) | (lam != 0))
+    part = torch.where(y - ub > lb - y, part, -part)
+    slack, units = DEPENDENT * size / norm, sizes.units[group]
+    basis, ends = torch.zeros_like(units), torch.zeros_like(part)
+    total, failed = torch.zeros_like(part[:, 0]), torch.zeros_like(near[:, 0])
+    for a in range(near.shape[1]):
+        row, end = units[:, a], part[:, a]
+        for _ in range(2):
+            for e in range(a):
+                along = torch.linalg.vecdot(basis[:, e], row)
+                row, end = row - along.unsqueeze(-1) * basis[:, e], end - along * ends[:, e]
+        length = torch.linalg.vector_norm(row, dim=-1)
+        new = near[:, a] & (length > DEPENDENT)
+        basis[:, a] = torch.where(new.unsqueeze(-1), row / length.unsqueeze(-1), 0)
+        ends[:, a] = torch.where(new, end / length, 0)
+        apart = end.abs() > slack[:, a] + DEPENDENT * total.sqrt()
+        failed |= near[:, a] & ~new & apart
+        total = total + ends[:, a].square()
+    return torch.where(failed, torch.inf, total.sqrt())
+
+
+def _kinks(y, theta, steps, step) -> Tensor:
+    move = steps * step.unsqueeze(-1)
+    away = torch.minimum((y - theta.lb).abs(), (y - theta.ub).abs())
+    return torch.where((away < move) & theta.w.isfinite(), 2 * theta.w * move, 0).sum(-1)
 
 
 def try_active_sets(qps, forces, active) -> tuple[Tensor, ...]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_qpmpc.qp.program import UNKNOWN, Status, crossed
 
-#: The certificate rejects a solution with a larger relative residual.
+#: The certificate rejects a solution with a larger relative residual or error of its value.
 TOLERANCE = 1e-6
 #: ``np.ndarray`` on the CPU, ``torch.Tensor`` elsewhere.
 Array = Any
@@ -58,12 +58,13 @@ class BatchSolution(NamedTuple):
     xi: Array
     status: Array
     residual: Array
+    value_error: Array
     iterations: Array
     active: Array
 
     def accepted(self) -> Array:
         """Return the mask of solutions that the certificate accepts, ``(B,)``."""
-        return self.residual <= TOLERANCE
+        return (self.residual <= TOLERANCE) & (self.value_error <= TOLERANCE)
 
     @property
     def all_accepted(self) -> bool:
@@ -95,6 +96,7 @@ def unsolved(fixed: np.ndarray, n_z: int, n_c: int, n_g: int, status: Status) ->
         xi=np.zeros_like(fixed),
         status=np.full(n, int(status)),
         residual=np.full(n, np.inf),
+        value_error=np.full(n, np.inf),
         iterations=np.zeros(n, np.int64),
         active=np.full((n, n_g), UNKNOWN, np.int8),
     )

@@ -23,6 +23,12 @@ RANK_TOLERANCE = 1e-10
 THRESHOLD = 1e-2
 #: A coefficient up to this fraction of its row's absolute sum counts as rounding.
 ENTERS = 1e-12
+#: A reduced row with a smaller fraction of its terms contains no variable at all.
+ABSENT = 1e-15
+#: A pivot of H below this fraction of the largest diagonal entry means that H is singular, ..
+DEFINITE = 1e-11
+#: .. and that this fraction of it is added for the bound of a value's error.
+SHIFT = 1e-10
 #: H is indefinite if an eigenvalue is below minus this fraction of the largest.
 CONVEX = 1e-9
 
@@ -58,11 +64,14 @@ class Condensed:
     ``surely_convex`` is True if all of H is known to be convex. If ``deficient``, the columns of C
     after ``n_kept`` do not have full row rank, and the arrays are valid only for QPs that fix
     exactly ``n_kept`` entries. ``enters`` ``(n_g, n_y)`` is True where a row of G
-    contains a variable of y, but for rounding.
+    contains a variable of y, but for rounding, relative to its ``terms`` ``(M, n_g)`` before the
+    elimination. ``sums`` are those of the absolute entries in the rows of H, G and C.
     """
 
     arrays: CondensedArrays
     enters: np.ndarray
+    terms: np.ndarray
+    sums: tuple[np.ndarray, np.ndarray, np.ndarray]
     n_kept: int
     deficient: bool
     surely_convex: bool
@@ -96,6 +105,36 @@ class Reduced(NamedTuple):
     Y_neg: Array
 
 
+class Sizes(NamedTuple):
+    """Sizes that bound the error of a value, see `torch_qpmpc.qp.pipeline.certificate`.
+
+    Attributes:
+        inverse: the inverse of the Cholesky factor of H + shift I, ``(M, d, d)``; inf if there is
+            none.
+        shift: zero for a definite H, ``(M,)``.
+        stiffness: a bound of H's eigenvalues, ``(M,)``.
+        costs, rows, equalities: the sums of absolute entries of the rows of H, G and C,
+            ``(M, n_z)``, ``(M, n_g)`` and ``(M, n_c)``.
+        steps: the norms of G's rows in v, ``(M, n_g)``, zero where they contain no variable.
+        hard: the indices of rows that are hard in some QP, ``(h,)``.
+        box: the index of a row that contains only v_k, for each k, ``(d,)``; -1 without one.
+        units: the hard rows in v, of unit length, ``(M, h, d)``.
+        apart: True if each subset of these rows is well conditioned.
+    """
+
+    inverse: Array
+    shift: Array
+    stiffness: Array
+    costs: Array
+    rows: Array
+    equalities: Array
+    steps: Array
+    hard: Array
+    box: Array
+    units: Array
+    apart: bool
+
+
 class Forces(NamedTuple):
     """The response ``-rise'g - push'lam`` of (v, y = G v) to g and multipliers.
 
@@ -119,12 +158,13 @@ def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) 
     G = theta.G @ T
     # Rounding leaves traces of variables that a row does not contain, and all of a row that C
     # implies: sizes are compared with those before the elimination.
-    size = np.abs(theta.G) @ np.abs(T).sum(-1, keepdims=True)
-    enters = (np.abs(G) > ENTERS * size).any(0)
+    size = np.abs(theta.G)
+    terms = size @ np.abs(T).sum(-1, keepdims=True)
+    enters = (np.abs(G) > ENTERS * terms).any(0)
+    sums = np.abs(theta.H).sum(-1), size.sum(-1), np.abs(theta.C).sum(-1)
     arrays = CondensedArrays(T, Y_neg, H, G, H_b, G_b)
-    return Condensed(
-        arrays, enters, n_kept, padding is not None, padding is None and _has_factor(H)
-    )
+    convex = padding is None and _has_factor(H)
+    return Condensed(arrays, enters, terms[:, :, 0], sums, n_kept, padding is not None, convex)
 
 
 def _has_factor(H: np.ndarray) -> bool:
@@ -165,6 +205,46 @@ def _times(matrices: np.ndarray, group: np.ndarray, vectors: np.ndarray) -> np.n
     if len(matrices) == 1:
         return vectors @ matrices[0].T
     return (matrices[group] @ vectors[:, :, None])[:, :, 0]
+
+
+@np.errstate(all="ignore")
+def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
+    """Return the `Sizes` of QPs with the first n_f entries fixed."""
+    H, G = condensed.arrays.H[:, n_f:, n_f:], condensed.arrays.G[:, :, n_f:]
+    steps = np.sqrt(np.einsum("mij,mij->mi", G, G))
+    steps[steps <= ABSENT * condensed.terms] = 0.0
+    enters = condensed.enters[:, n_f:]
+    single = enters & (enters.sum(-1) == 1)[:, None]
+    box = np.where(single.any(0), single.argmax(0) if len(single) else 0, -1)
+    hard = np.flatnonzero(np.isinf(theta.w).any(0) & (steps > 0).any(0))
+    units = G[:, hard] / np.where(steps > 0, steps, 1.0)[:, hard, None]
+    cosines = units @ units.swapaxes(1, 2)
+    apart = bool((np.abs(cosines).sum(-1) < 1.5).all())
+    inverse, shift = _inverse_factor(H)
+    stiffness = np.abs(H).sum(-1).max(-1, initial=0.0)
+    return Sizes(inverse, shift, stiffness, *condensed.sums, steps, hard, box, units, apart)
+
+
+def _inverse_factor(H: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return `Sizes.inverse` and `Sizes.shift`."""
+    unit, shift = np.eye(H.shape[1]), np.zeros(len(H))
+    largest = H.diagonal(axis1=1, axis2=2).max(-1, initial=0.0)
+    try:
+        factor = np.linalg.cholesky(H)
+        pivots = factor.diagonal(axis1=1, axis2=2) ** 2
+        if (pivots > DEFINITE * largest[:, None]).all():
+            return np.linalg.inv(factor), shift
+    except np.linalg.LinAlgError:
+        pass
+    inverse = np.full_like(H, np.inf)
+    for m in range(len(H)):
+        for added in (0.0, max(SHIFT * largest[m], np.finfo(float).tiny)):
+            factor, info = torch.linalg.cholesky_ex(torch.from_numpy(H[m] + added * unit))
+            shift[m], pivots = added, factor.diagonal().square()
+            if info == 0 and (added > 0 or (pivots > DEFINITE * largest[m]).all()):
+                inverse[m] = np.linalg.inv(factor.numpy())
+                break
+    return inverse, shift
 
 
 @np.errstate(all="ignore")

@@ -21,10 +21,12 @@ from torch_qpmpc.qp.pipeline.condensing import (
     Elimination,
     Forces,
     Reduced,
+    Sizes,
     condense,
     convex,
     forces,
     reduce,
+    sizes,
 )
 from torch_qpmpc.qp.pipeline.scaling import Units
 
@@ -124,6 +126,14 @@ class Prepared:
 
         return self._once(("forces", n_f), lambda: self._on_device(forces(self._reduced(n_f))))
 
+    def sizes(self, n_f: int) -> Sizes:
+        """Return the `Sizes` of the reduced QPs, on the device."""
+
+        def make() -> Sizes:
+            return self._on_device(sizes(self.condensed(n_f), self.theta, n_f))
+
+        return self._once(("sizes", n_f), make)
+
     def part(self, group: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, Prepared]:
         """Return the new group and theta of the QPs at ``index``, whose matrices are ``group``."""
         used, group = np.unique(group, return_inverse=True)
@@ -143,7 +153,9 @@ class Prepared:
         return Prepared(self.theta, self.group, self.n_kept, None, self._elimination)
 
     def _on_device(self, arrays: Any) -> Any:
-        return type(arrays)._make(on_device(x, self.device) for x in arrays)
+        return type(arrays)._make(
+            on_device(x, self.device) if isinstance(x, np.ndarray) else x for x in arrays
+        )
 
     def _once(self, name: Any, make: Callable[[], T]) -> T:
         if name not in self._known:

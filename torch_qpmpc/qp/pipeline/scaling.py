@@ -7,7 +7,9 @@ and of the rows rho (of G) and gamma (of C),
     z = l z',  H' = H l^2 / kappa,  q' = q l / kappa,  C' = C l / gamma,  b' = b / gamma,
     G' = G l / rho,  (lb, ub)' = (lb, ub) / rho,  w' = w rho / kappa,
 
-is the same QP. All units are powers of two, so that rounding does not change.
+is the same QP. All units are powers of two, so that rounding does not change. The entries of z
+share one length, unless the columns of H, C and G differ by orders of magnitude, as for states in
+watts beside actions between -1 and 1: then each has its own, from equilibration (Ruiz, 2001).
 """
 
 from __future__ import annotations
@@ -20,12 +22,17 @@ from torch_qpmpc.qp.pipeline.arrays import Array, BatchSolution, Theta, per_qp
 
 #: Sizes between these have the unit one.
 SMALL, LARGE = 2.0**-7, 2.0**10
+#: Columns that differ by more than this factor have units of their own, ..
+APART = 2.0**14
+#: .. after so many passes of equilibration.
+PASSES = 8
 
 
 class Units(NamedTuple):
     """Units of each of the M matrix triples.
 
-    ``cost`` and ``length`` ``(M, 1)``, ``rows`` ``(M, n_g)`` and ``equalities`` ``(M, n_c)``.
+    ``cost`` ``(M, 1)``, ``length`` ``(M, 1)`` or ``(M, n_z)``, ``rows`` ``(M, n_g)`` and
+    ``equalities`` ``(M, n_c)``.
     """
 
     cost: np.ndarray
@@ -39,6 +46,19 @@ class Units(NamedTuple):
         """Return the units of theta; None if all of them are one."""
         if not len(group) or not theta.q.shape[-1]:
             return None
+        columns = _columns(theta)
+        if columns is not None:
+            n_c, n_g = theta.C.shape[1], theta.G.shape[1]
+            one = np.ones((len(columns), 1))
+            own = cls(one, columns, one.repeat(n_g, 1), one.repeat(n_c, 1))
+            units = cls.of_rows_and_cost(own.scaled(theta, group), group)
+            return own if units is None else units._replace(length=units.length * columns)
+        return cls.of_rows_and_cost(theta, group)
+
+    @classmethod
+    @np.errstate(all="ignore")
+    def of_rows_and_cost(cls, theta: Theta, group: np.ndarray) -> Units | None:
+        """Return units with one length for all entries of z; None if all of them are one."""
         M, (rows, equalities) = len(theta.H), (np.abs(x).sum(-1) for x in (theta.G, theta.C))
         q, b, lb, ub = (_sizes(x, group, M) for x in (theta.q, *theta[5:8]))
         H, q = np.abs(theta.H).max(axis=(1, 2))[:, None], q.max(-1, keepdims=True)
@@ -58,10 +78,10 @@ class Units(NamedTuple):
     def scaled(self, theta: Theta, group: np.ndarray) -> Theta:
         """Return theta in these units."""
         cost, length, rows, equalities = (per_qp(unit, group) for unit in self)
-        by_row = (self.length / self.rows)[:, :, None]
-        by_equality = (self.length / self.equalities)[:, :, None]
+        by_row = self.length[:, None] / self.rows[:, :, None]
+        by_equality = self.length[:, None] / self.equalities[:, :, None]
         return Theta(
-            theta.H * (self.length**2 / self.cost)[:, :, None],
+            theta.H * (self.length[:, :, None] * (self.length / self.cost)[:, None]),
             theta.C * by_equality,
             theta.G * by_row,
             theta.q / (cost / length),
@@ -84,8 +104,37 @@ class Units(NamedTuple):
             z=solution.z * length,
             chi=solution.chi * (cost / equalities),
             lam=solution.lam * (cost / rows),
-            xi=solution.xi * (cost / length),
+            xi=solution.xi * (cost / length[:, : solution.xi.shape[-1]]),
         )
+
+
+def _columns(theta: Theta) -> np.ndarray | None:
+    """Return units of the entries of z ``(M, n_z)`` that equilibrate H, C and G; None if alike."""
+    rows = np.abs(np.concatenate((theta.C, theta.G), axis=1))
+    curvature = np.sqrt(np.abs(theta.H.diagonal(axis1=1, axis2=2)))
+    if not (_apart(rows.max(1, initial=0.0)) or _apart(curvature)):
+        return None
+    units, kappa = np.ones(curvature.shape), np.ones((len(rows), 1, 1))
+    H, of_row = np.abs(theta.H), np.ones((*rows.shape[:2], 1))
+    for _ in range(PASSES):
+        of_H, now = H * units[:, None] * units[:, :, None] * kappa, rows * units[:, None] * of_row
+        largest = np.maximum(of_H.max(1), now.max(1, initial=0.0))
+        units = units / np.sqrt(np.where(_positive(largest), largest, 1.0))
+        largest = now.max(-1, keepdims=True, initial=0.0)
+        of_row = of_row / np.where(_positive(largest), largest, 1.0)
+        largest = of_H.max((1, 2), keepdims=True)
+        kappa = kappa / np.where(_positive(largest), largest, 1.0)
+    return np.ldexp(1.0, np.frexp(units)[1])
+
+
+def _apart(sizes: np.ndarray) -> bool:
+    """Return True if positive sizes differ by more than `APART`."""
+    smallest = np.where(sizes > 0, sizes, np.inf).min(-1, initial=np.inf)
+    return bool((sizes.max(-1, initial=0.0) > APART * smallest).any())
+
+
+def _positive(sizes: np.ndarray) -> np.ndarray:
+    return (sizes > 0) & (sizes < np.inf)
 
 
 def _sizes(vectors: np.ndarray, group: np.ndarray, M: int) -> np.ndarray:

@@ -22,7 +22,7 @@ from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.certificate import certify, recover
 from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
-from torch_qpmpc.qp.pipeline.polishing import refine
+from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.pipeline.warm_start import try_active_sets
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
@@ -122,7 +122,9 @@ def _scaled(p: Programs) -> Programs:
     """Return the QPs in their own units."""
     prepared = p.prepared.scaled
     assert p.prepared.units is not None
-    return Programs(prepared, p.group, p.fixed / per_qp(p.prepared.units.length, p.group))
+    return Programs(
+        prepared, p.group, p.fixed / per_qp(p.prepared.units.length, p.group)[:, : p.n_f]
+    )
 
 
 def _settled(p: Programs, solver: str, solution: BatchSolution) -> BatchSolution:
@@ -135,6 +137,7 @@ def _settled(p: Programs, solver: str, solution: BatchSolution) -> BatchSolution
     assert units is not None
     accepted = np.flatnonzero(solution.accepted())
     failed = accepted[_certify_at(p, solution, accepted)]
+    failed = refine(p, solution, failed)
     if len(failed):
         failing = p.take(failed)
         second = _solve(failing, solver, None, SolveLog())
@@ -148,10 +151,13 @@ def _settled(p: Programs, solver: str, solution: BatchSolution) -> BatchSolution
 
 def _certify_at(p: Programs, solution: BatchSolution, at: np.ndarray) -> np.ndarray:
     """Raise the residuals at the indices ``at`` to those of ``p``; return the mask of failures."""
+    if not len(at):
+        return np.zeros(0, bool)
     solved = solution.at(at)
-    _, residual = certify(p.take(at), solved.z, solved.lam, solved.chi, solved.xi)
+    _, residual, error = certify(p.take(at), solved.z, solved.lam, solved.chi, solved.xi)
     solution.residual[at] = np.maximum(solved.residual, residual)
-    return residual > TOLERANCE
+    solution.value_error[at] = np.maximum(solved.value_error, error)
+    return (residual > TOLERANCE) | (error > TOLERANCE)
 
 
 def _solve(p: Programs, solver: str, start: Array | None, log: SolveLog) -> BatchSolution:
@@ -184,9 +190,17 @@ def _solvable(p: Programs) -> np.ndarray | None:
 
 
 def _attempt(
-    p: Programs, solve: Backend, start: Array | None, log: SolveLog, passes: int = 0
+    p: Programs,
+    solve: Backend,
+    start: Array | None,
+    log: SolveLog,
+    passes: int = 0,
+    nearly: float = NEARLY,
 ) -> BatchSolution:
-    """Solve once, from the active sets ``start`` unless None, and certify the result."""
+    """Solve once, from the active sets ``start`` unless None, and certify the result.
+
+    Rejected solutions with a residual up to ``nearly`` are refined.
+    """
     qps = p.reduced_qps()
     settled = None
     if not qps.l.shape[-1]:
@@ -203,7 +217,9 @@ def _attempt(
         if _replace(claim, settled & ~kept, qps, solve):
             solution = recover(p, claim, passes)
     if not solution.all_accepted:
-        solution = _refined(p.on_cpu(), qps.in_numpy(), claim, solution.on_cpu(), passes)
+        solution = solution.on_cpu()
+        rejected = ~solution.accepted() & (solution.residual <= nearly)
+        refine(p.on_cpu(), solution, np.flatnonzero(rejected))
     return solution
 
 
@@ -213,18 +229,6 @@ def _replace(claim: BackendSolution, where: Array, qps: SoftQPs, solve: Backend)
         return False
     claim.put(where, solve(qps.take(where)).like(where))
     return True
-
-
-def _refined(
-    p: Programs, qps: SoftQPs, claim: BackendSolution, solution: BatchSolution, passes: int
-) -> BatchSolution:
-    """Refine solutions that the certificate narrowly rejects."""
-    nearly = ~solution.accepted() & (solution.residual <= NEARLY)
-    if nearly.any():
-        second = recover(p, refine(qps, claim.like(p.fixed), np.flatnonzero(nearly)), passes)
-        better = np.flatnonzero(second.residual < solution.residual)
-        solution.put(better, second.at(better))
-    return solution
 
 
 def _unconstrained(qps: SoftQPs) -> BackendSolution:
@@ -244,11 +248,13 @@ def _solved_otherwise(
     todo = np.flatnonzero(~solution.accepted())
     log.fallback += len(todo)
     rest = p.take(todo)
-    failed = _unsolved(rest, Status.NOT_CONVERGED)._replace(residual=solution.residual[todo])
+    errors = {name: getattr(solution, name)[todo] for name in ("residual", "value_error")}
+    failed = _unsolved(rest, Status.NOT_CONVERGED)._replace(**errors)
     solution.put(todo, failed._replace(status=diagnose(rest)))
     todo = todo[solution.status[todo] == Status.NOT_CONVERGED]
-    first = [(eliminate, BACKENDS["torch"], PASSES) for eliminate in OTHER_ELIMINATIONS]
-    for eliminate, solve, passes in (*first, *((None, other, 0) for other in fallbacks(solver))):
+    ways = [(eliminate, BACKENDS["torch"], PASSES) for eliminate in OTHER_ELIMINATIONS]
+    ways += [(None, other, 0) for other in fallbacks(solver)]
+    for position, (eliminate, solve, passes) in enumerate(ways):
         if not len(todo):
             break
         rest = p.take(todo)
@@ -258,11 +264,13 @@ def _solved_otherwise(
                 continue
             prepared = rest.prepared.eliminated(elimination, rest.n_f)
             rest = Programs(prepared, rest.group, rest.fixed)
-        second = _attempt(rest, solve, None, log, passes)
+        nearly = NEARLY if position < len(ways) - 1 else np.inf
+        second = _attempt(rest, solve, None, log, passes, nearly)
         accepted = second.accepted()
         solution.put(todo[accepted], second.at(accepted))
         todo = todo[~accepted]
         solution.residual[todo] = second.residual[~accepted]
+        solution.value_error[todo] = second.value_error[~accepted]
     return solution
 
 

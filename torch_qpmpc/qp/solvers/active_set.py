@@ -1,6 +1,6 @@
 """Active-set Newton steps for a whole batch, the last phase of the interior-point method.
 
-With fixed states of the rows (see `torch_qpmpc.qp.pipeline.polishing`), the KKT conditions of the
+With fixed states of the rows (see `torch_qpmpc.qp.solution.row_states`), the KKT conditions of the
 condensed QP (eq:qp2, eq:qp3) are linear. The method of multipliers solves them: a large curvature
 holds the active rows at their bounds, and each pass reduces its error by orders of magnitude. One
 d x d Cholesky factor without pivoting suffices, even for dependent active rows.

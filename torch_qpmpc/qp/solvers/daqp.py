@@ -21,7 +21,8 @@ NEAR = 256
 RECIPROCAL_RHO = 1e7
 #: DAQP's infinity.
 NO_BOUND = 1e30
-SETTINGS = {"primal_tol": 1e-9, "dual_tol": 1e-12, "iter_limit": 2000, "time_limit": 0.2}
+#: A limit of iterations, not of time: the result does not depend on the machine's load.
+SETTINGS = {"primal_tol": 1e-9, "dual_tol": 1e-12, "iter_limit": 2000}
 
 
 def solve(qps: SoftQPs) -> BackendSolution:

@@ -1,0 +1,115 @@
+"""Refinement in twice the working precision, and the QPs that only it solves."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.campaign.families import Draw, parallel_rows
+from tests.problems import known_qp, programs_of
+from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
+from torch_qpmpc.qp.pipeline.refinement import Twice, _dot, _product, refine
+from torch_qpmpc.qp.pipeline.solve import solve_programs
+from torch_qpmpc.qp.program import EVENT_SHAPES
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e4, 1e6, 1e8])
+def test_the_value_does_not_depend_on_the_plants_unit(solver, unit):
+    # The terminal weight of one holds x_N at zero in small units: V is the same from 1e4 on.
+    mpc = QPMPC.from_model(
+        [[0.9]],
+        [[0.3 * unit]],
+        20,
+        stage_weight=[unit**-2, 0.1],
+        terminal_weight=[1.0],
+        action_bounds=([-1.0], [1.0]),
+        solver=solver,
+    )
+    solution = mpc.solve(torch.tensor([0.1 * unit], dtype=torch.float64))
+    assert_close(solution.value.item(), 0.007462864406944, rtol=1e-9, atol=0)
+    assert_close(solution.z[1].item(), -0.164190960463, rtol=1e-6, atol=0)
+    assert solution.value_error <= 1e-6
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_nearly_parallel_rows_have_the_value_of_exact_arithmetic(solver, seed):
+    case = parallel_rows(Draw(seed), 16)
+    solution = solve_qp(case.known.qp, solver=solver)
+    assert_close(solution.value, case.known.value, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("case", [0, 1])
+def test_a_flat_direction_has_its_solution_of_least_norm(solver, case):
+    text = (Path(__file__).parent / "flat_directions.json").read_text(encoding="utf-8")
+    data = {k: torch.tensor(v, dtype=torch.float64) for k, v in json.loads(text)[case].items()}
+    n = len(data["q"])
+    data |= {"C": data["C"].reshape(-1, n), "b": data["b"].reshape(-1)}
+    parts: dict[str, Any] = {name: data[name] for name in EVENT_SHAPES}
+    qp = QuadraticProgram(**parts, n_known=len(data["fixed"]))
+    solution = solve_qp(qp, data["fixed"], solver=solver)
+    assert_close(solution.value, data["value"], rtol=1e-9, atol=0)
+    assert solution.z.abs().max() < 2
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-6, 1e-3])
+def test_a_solution_that_is_nearly_right_becomes_exact(off):
+    known = known_qp(3, batch=(6,))
+    p = programs_of(known, None)
+    solution = solve_programs(p, "daqp")
+    generator = np.random.default_rng(0)
+    for part in (solution.z, solution.lam):
+        part += off * generator.standard_normal(part.shape) * (part != 0)
+    assert len(refine(p, solution, np.arange(6))) == 0
+    assert_close(solution.value, known.value.numpy(), rtol=1e-12, atol=1e-12)
+    assert_close(solution.z, known.z.numpy(), rtol=1e-9, atol=1e-9)
+    assert_close(solution.lam, known.lam.numpy(), rtol=1e-9, atol=1e-9)
+    assert solution.residual.max() < 1e-14
+
+
+def test_only_the_chosen_solutions_change():
+    known = known_qp(3, batch=(6,))
+    p = programs_of(known, None)
+    solution = solve_programs(p, "daqp")
+    before = solution.at(np.arange(6))
+    solution.z[2] += 1e-4
+    refine(p, solution, np.array([2]))
+    others = [0, 1, 3, 4, 5]
+    assert_close(solution.z[others], before.z[others], rtol=0, atol=0)
+    assert_close(solution.z[2], before.z[2], rtol=1e-5, atol=1e-6)
+
+
+def test_what_has_no_solution_is_left_as_it_was():
+    known = known_qp(0, batch=(2,))
+    b = known.qp.b.clone()
+    C = torch.cat((known.qp.C, known.qp.C[..., :1, :]), dim=-2)
+    qp = replace(known.qp, C=C, b=torch.cat((b, b[..., :1] + 1), dim=-1))
+    solution = solve_programs(programs_of(known, None), "daqp")
+    chi = np.pad(solution.chi, ((0, 0), (0, 1)))
+    p = programs_of(replace(known, qp=qp), None)
+    claimed = solution._replace(chi=chi)
+    assert refine(p, claimed, np.arange(2)).tolist() == [0, 1]
+    assert_close(claimed.z, solution.z, rtol=0, atol=0)
+
+
+def test_products_have_twice_the_working_precision():
+    generator = np.random.default_rng(1)
+    matrix = generator.standard_normal((5, 37)) * 10.0 ** generator.integers(-8, 8, (5, 37))
+    high = generator.standard_normal(37)
+    x = Twice(high, high * 2.0**-60)
+    exact = [
+        sum(Fraction(m) * (Fraction(a) + Fraction(b)) for m, a, b in zip(row, *x, strict=True))
+        for row in matrix
+    ]
+    size = np.abs(matrix) @ np.abs(high)
+    for row, (value, low) in enumerate(zip(*_product(matrix, x), strict=True)):
+        assert abs(float(Fraction(value) + Fraction(low) - exact[row])) < 1e-29 * size[row]
+    square = sum((Fraction(a) + Fraction(b)) ** 2 for a, b in zip(*x, strict=True))
+    assert_close(_dot(x, x), float(square), rtol=1e-15, atol=0)

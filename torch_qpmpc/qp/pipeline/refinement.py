@@ -1,0 +1,386 @@
+"""Refinement: the solution of an active set in twice the working precision, in all entries of z.
+
+It takes the QPs that the certificate rejects. For fixed states of the rows (free, held at a bound,
+saturated at |lam| = w) the KKT conditions are linear in z, chi and the multipliers of held rows.
+Iterative refinement with residuals in twice the working precision solves them, without elimination
+of C z = b, to far more digits than the condition number leaves in float64 (Higham, "Accuracy and
+stability of numerical algorithms", chapter 12). Rows that contradict their states change them, and
+the new set is solved. The result is judged before it is rounded: where rows are nearly parallel,
+rounding alone violates them by an amount that matters.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # imports scipy.optimize at its first use: a third of a second
+import torch
+
+from torch_qpmpc.qp.kernels.sample import CANCELLED, FLOOR
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.program import Status
+
+#: Largest number of active sets; after `TOGETHER` of them only the worst row changes its state.
+MAX_SETS, TOGETHER = 40, 12
+#: Fewer are tried if their number times the third power of the equations' exceeds this.
+MAX_WORK = 2e8
+#: Largest number of refinements of one set.
+MAX_PASSES = 15
+#: A row contradicts its state by more than this, relatively; ..
+EXACT = 1e-20
+#: .. or by more than this if active rows are equal up to rounding.
+ROUNDING = 1e-14
+#: Rows are dependent if a singular value, relative to the largest, is below this, ..
+SINGULAR = 2e-15
+#: .. and H is flat in a direction whose curvature is, relative to its largest entry.
+FLAT = 1e-14
+#: A z this many times as large as that of least norm is not a start.
+RUNAWAY = 1e6
+#: A row this close to its bound, relatively, may be active at a vertex.
+NEAR = 1e-6
+TINY = np.finfo(float).tiny
+
+
+class Twice(NamedTuple):
+    """Numbers in twice the working precision, ``high + low``."""
+
+    high: np.ndarray
+    low: np.ndarray
+
+    def plus(self, x: np.ndarray) -> Twice:
+        high, low = _two_sum(self.high, x)
+        return Twice(*_two_sum(high, low + self.low))
+
+    def minus(self, x: np.ndarray) -> np.ndarray:
+        """Return the difference, rounded; x may be infinite."""
+        high, low = _two_sum(self.high, -x)
+        return np.where(np.isfinite(x), high + (low + self.low), high)
+
+
+def refine(p: Programs, solution: BatchSolution, which: np.ndarray) -> np.ndarray:
+    """Refine the solutions at the indices ``which`` in place; return the indices of failures."""
+    theta, group, failed = p.theta, p.group, []
+    for i in which:
+        matrices = (x[group[i]] for x in theta[:3])
+        vectors = (x[i % len(x)] for x in theta[3:])
+        qp = _QP._make((*matrices, *vectors, p.fixed[i]))
+        refined = qp.solve(solution.z[i], solution.lam[i])
+        if refined is None:
+            failed.append(i)
+        else:
+            iterations = solution.iterations[i] + refined.iterations
+            solution.put(i, refined._replace(iterations=iterations))
+    return np.array(failed, np.int64)
+
+
+class _QP(NamedTuple):
+    """One QP, see `torch_qpmpc.qp.program`."""
+
+    H: np.ndarray
+    C: np.ndarray
+    G: np.ndarray
+    q: np.ndarray
+    c: np.ndarray
+    b: np.ndarray
+    lb: np.ndarray
+    ub: np.ndarray
+    w: np.ndarray
+    fixed: np.ndarray
+
+    @np.errstate(all="ignore")  # a set without a solution has none that is finite
+    def solve(self, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
+        """Solve from the active set of z and lam; return None if no set does."""
+        solution = self._settled(self._first_codes(z, lam), z, lam)
+        if solution is None:
+            solution = self._settled(self._vertex_codes(z), z, lam)
+        return solution
+
+    def _settled(self, codes: np.ndarray, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
+        slip, seen, x = EXACT, set(), None
+        work = (len(self.q) + len(self.b) + np.count_nonzero(codes)) ** 3
+        for sets in range(1, int(min(MAX_SETS, 2 + MAX_WORK / work)) + 1):
+            system = _System.of(self, codes)
+            x = system.solution(x if x is not None else system.start(z, lam))
+            if x is None:
+                return None
+            if system.solver.dependent:
+                slip = ROUNDING
+            point = _Point.of(self, codes, x)
+            contradiction, states = point.contradictions(slip)
+            if not contradiction.any():
+                solution = point.judged(system.errors(x), sets)
+                return solution if solution.accepted() else None
+            together = sets <= TOGETHER and codes.tobytes() not in seen
+            seen.add(codes.tobytes())
+            changing = contradiction > (0 if together else 0.999 * contradiction.max())
+            codes = np.where(changing, states, codes)
+        return None
+
+    def _first_codes(self, z: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """Return codes as in `QPSolution.active`, by the larger of slack and multiplier.
+
+        A row is held if its multiplier is larger than its distance from the bound, and saturated if
+        it is beyond by more than the multiplier is below w, all relatively.
+        """
+        force = np.abs(lam) * np.abs(self.G).sum(-1)
+        push = force / max(force.max(initial=0.0), TINY)
+        bound, sign = np.where(lam > 0, self.ub, self.lb), np.sign(lam)
+        beyond = sign * (self.G @ z - bound) / np.maximum(self.row_sizes(z), TINY)
+        held = ((lam != 0) & (push > np.abs(beyond))) | ((self.lb == self.ub) & (self.w > 0))
+        below = 1 - np.abs(lam) / np.maximum(self.w, TINY)
+        saturated = (self.w < np.inf) & (lam != 0) & (below <= np.maximum(beyond, 0))
+        code = np.where(saturated, 2 * sign, np.where(held, np.where(sign == 0, 1, sign), 0))
+        return code.astype(np.int8)
+
+    def _vertex_codes(self, z: np.ndarray) -> np.ndarray:
+        """Return the codes of the multipliers that best balance the cost's slope at z.
+
+        Of the rows at a degenerate vertex, they hold independent ones.
+        """
+        n_f, n_c, size = len(self.fixed), len(self.b), np.maximum(self.row_sizes(z), TINY)
+        above, below = (self.G @ z - self.ub) / size, (self.lb - self.G @ z) / size
+        soft, weighty = np.isfinite(self.w), self.w > 0
+        codes = 2 * weighty * soft * ((above > NEAR).astype(np.int8) - (below > NEAR))
+        rows = np.flatnonzero(weighty & (codes == 0) & (np.maximum(above, below) >= -NEAR))
+        slope = self.H @ z + self.q + self.G.T @ np.where(codes != 0, np.sign(codes) * self.w, 0)
+        norm = np.abs(self.G[rows]).sum(-1)
+        matrix = np.vstack((self.C, self.G[rows] / np.maximum(norm, TINY)[:, None]))[:, n_f:].T
+        limit = self.w[rows] * norm
+        least = np.where(below[rows] >= -NEAR, -limit, 0)
+        most = np.where(above[rows] >= -NEAR, limit, 0)
+        free = np.full(n_c, np.inf)
+        bounds = np.concatenate((-free, least)), np.concatenate((free, most))
+        codes = codes.astype(np.int8)
+        if not matrix.size or not np.isfinite(matrix).all() or not np.isfinite(slope).all():
+            return codes
+        best = scipy.optimize.lsq_linear(matrix, -slope[n_f:], bounds, method="bvls", tol=1e-15)
+        lam = best.x[n_c:]
+        at_limit = (lam == least) | (lam == most)
+        codes[rows] = np.sign(lam) * np.where(at_limit, 2, 1)
+        return codes
+
+    def row_sizes(self, z: np.ndarray) -> np.ndarray:
+        """Return the size of the terms that each row compares: |G| |z|, and its bounds."""
+        lb, ub = (np.where(np.isfinite(x), np.abs(x), 0) for x in (self.lb, self.ub))
+        return np.abs(self.G) @ np.abs(z) + np.maximum(lb, ub)
+
+
+class _System(NamedTuple):
+    """The equations ``matrix x = right`` in x = (z, chi, lam), of which ``free`` are unknown."""
+
+    matrix: np.ndarray
+    right: np.ndarray
+    free: np.ndarray
+    known: np.ndarray
+    solver: _Solver
+
+    @classmethod
+    def of(cls, qp: _QP, codes: np.ndarray) -> _System:
+        (n_c, n_z), n_g, n_f = qp.C.shape, len(qp.w), len(qp.fixed)
+        held = np.flatnonzero(np.abs(codes) == 1)
+        top = np.hstack((qp.H, qp.C.T, qp.G.T))[n_f:]
+        rows = np.vstack((qp.C, qp.G[held]))
+        matrix = np.vstack((top, np.pad(rows, ((0, 0), (0, n_c + n_g)))))
+        level = np.where(codes > 0, qp.ub, qp.lb)[held]
+        right = np.concatenate((-qp.q[n_f:], qp.b, level))
+        free = np.concatenate((np.arange(n_f, n_z + n_c), n_z + n_c + held))
+        known = np.zeros(n_z + n_c + n_g)
+        known[:n_f] = qp.fixed
+        known[n_z + n_c :] = np.where(np.abs(codes) == 2, np.sign(codes) * qp.w, 0)
+        solver = _Solver.of(matrix[:, free], n_z - n_f)
+        return cls(matrix, right, free, known, solver)
+
+    def start(self, z: np.ndarray, lam: np.ndarray) -> Twice:
+        """Return z and lam as a start, or zeros if z ran away along a flat direction."""
+        x, nothing = self.known.copy(), np.zeros_like(self.known)
+        least = self.solution(Twice(x, nothing))
+        if least is not None:
+            shortest = np.abs(least.high[: len(z)]).max(initial=0.0)
+            if np.abs(z).max(initial=0.0) <= RUNAWAY * shortest:
+                n_f = len(z) - len(self.solver.H)
+                x[n_f : len(z)] = z[n_f:]
+                x[len(x) - len(lam) :] = lam
+        return Twice(x, nothing)
+
+    def solution(self, start: Twice) -> Twice | None:
+        """Return the solution nearest to ``start``; None if the refinement diverges."""
+        x = Twice(self.known.copy(), np.zeros_like(self.known))
+        for part, given in zip(x, start, strict=True):
+            part[self.free] = given[self.free]
+        last = np.inf
+        for _ in range(MAX_PASSES):
+            step = np.zeros_like(self.known)
+            step[self.free], size = self.solver.solve(-self.errors(x))
+            if not np.isfinite(size):
+                return None
+            if size >= 0.5 * last:
+                break
+            x, last = x.plus(step), size
+        return x
+
+    def errors(self, x: Twice) -> np.ndarray:
+        """Return the errors of the equations."""
+        return _product(self.matrix, x).minus(self.right)
+
+
+class _Solver(NamedTuple):
+    """Factors of a KKT matrix ``[[H, A'], [A, 0]]``, scaled by ``scale`` on both sides.
+
+    The null-space method: with the singular value decomposition of A, whose right vectors are
+    range and null space, errors grow with the condition number of A; that of the KKT matrix is its
+    square. ``A`` and ``H_null`` are the pseudo-inverses of A, and of H on the null space of A.
+    """
+
+    scale: np.ndarray
+    H: np.ndarray
+    A: np.ndarray
+    H_null: np.ndarray
+    dependent: bool
+
+    @classmethod
+    def of(cls, K: np.ndarray, n: int) -> _Solver:
+        scale = _equilibrated(K)
+        K = K * scale * scale[:, None]
+        H, A = K[:n, :n], K[n:, :n]
+        if not np.isfinite(K).all():
+            return cls(scale, H, np.full_like(A.T, np.nan), H, False)
+        # In torch, which uses the caller's number of threads.
+        parts = torch.linalg.svd(torch.from_numpy(A), full_matrices=True)
+        left, singular, right = (x.numpy() for x in parts)
+        rank = int((singular > SINGULAR * singular.max(initial=0.0)).sum())
+        of_range, null = right[:rank].T, right[rank:].T
+        A_inverse = of_range / singular[:rank] @ left[:, :rank].T
+        eigenvalues, vectors = np.linalg.eigh(null.T @ H @ null)
+        flat = eigenvalues <= FLAT * np.abs(H).max(initial=0.0)
+        vectors = null @ vectors[:, ~flat]
+        H_null = vectors / eigenvalues[~flat] @ vectors.T
+        return cls(scale, H, A_inverse, H_null, rank < len(A))
+
+    def solve(self, right: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the solution, and the size of its scaled form."""
+        n = len(self.H)
+        right = right * self.scale
+        z = self.A @ right[n:]
+        z = z + self.H_null @ (right[:n] - self.H @ z)
+        x = np.concatenate((z, self.A.T @ (right[:n] - self.H @ z)))
+        return x * self.scale, float(np.abs(x).max(initial=0.0))
+
+
+class _Point(NamedTuple):
+    """A solution of the equations of an active set."""
+
+    qp: _QP
+    codes: np.ndarray
+    z: Twice
+    chi: Twice
+    lam: Twice
+    y: Twice
+    slope: Twice
+
+    @classmethod
+    def of(cls, qp: _QP, codes: np.ndarray, x: Twice) -> _Point:
+        n_c, n_z = qp.C.shape
+        ends = (n_z, n_z + n_c)
+        z, chi, lam = map(Twice, *(np.split(part, ends) for part in x))
+        return cls(qp, codes, z, chi, lam, _product(qp.G, z), _product(qp.H, z))
+
+    def contradictions(self, slip: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return how much each row contradicts its state, relatively, and the state it takes."""
+        qp, codes = self.qp, self.codes
+        size = np.maximum(qp.row_sizes(self.z.high), TINY)
+        above, below = self.y.minus(qp.ub) / size, -self.y.minus(qp.lb) / size
+        lam, sign = self.lam.high, np.sign(codes)
+        row = np.abs(qp.G).sum(-1)
+        force = max((np.abs(lam) * row).max(initial=0.0), np.abs(self.slope.high + qp.q).max())
+        free, held, saturated = codes == 0, np.abs(codes) == 1, np.abs(codes) == 2
+        over = held * (np.abs(lam) - qp.w) / np.maximum(qp.w, TINY)
+        inwards = held * (qp.lb < qp.ub) * -lam * sign * row / max(force, TINY)
+        outside = free * (qp.w > 0) * np.maximum(above, below)
+        back = saturated * np.where(codes > 0, -above, -below)
+        # Of 0 times inf, the state that a row is not in.
+        by = np.nan_to_num(np.stack((over, inwards, outside, back)), nan=0)
+        states = (2 * np.sign(lam), 0 * sign, np.where(above > below, 1, -1), sign)
+        worst = by.argmax(0)
+        by = by.max(0, initial=0.0)
+        state = np.choose(worst, states).astype(np.int8)
+        return np.where(by > slip, by, 0.0), state
+
+    def judged(self, errors: np.ndarray, sets: int) -> BatchSolution:
+        """Return the solution with its value and errors; ``errors`` are those of the equations."""
+        qp, z, chi, lam = self.qp, self.z.high, self.chi.high, self.lam.high
+        n_f, n_c, hard = len(qp.fixed), len(qp.b), np.isinf(qp.w)
+        beyond = np.maximum(np.maximum(self.y.minus(qp.ub), -self.y.minus(qp.lb)), 0)
+        charge = np.where(hard, 0, qp.w * beyond)
+        half = Twice(self.slope.high / 2, self.slope.low / 2)
+        linear, quadratic = _dot(self.z, Twice(qp.q, 0 * qp.q)), _dot(self.z, half)
+        cost = linear + quadratic + charge.sum()
+        scale = max(map(abs, (cost, linear, quadratic, charge.sum())))
+        scale = max(min(scale, CANCELLED * abs(cost)), FLOOR)
+        bound = np.where(lam > 0, qp.ub, np.where(lam < 0, qp.lb, 0))
+        gap = np.where(lam == 0, charge, charge - lam * self.y.minus(bound))
+        slip = np.abs(errors[: len(z) - n_f]) @ np.abs(z[n_f:]) + np.abs(gap).sum()
+        slip += np.abs(errors[len(z) - n_f :][:n_c]) @ np.abs(chi)
+        force = np.stack((np.abs(qp.H) @ np.abs(z) + np.abs(qp.q), np.abs(qp.G.T) @ np.abs(lam)))
+        force = (force.sum(0) + np.abs(qp.C.T) @ np.abs(chi))[n_f:]
+        short = np.concatenate((np.abs(qp.C) @ np.abs(z) + np.abs(qp.b), qp.row_sizes(z)))
+        off = np.abs(np.concatenate((errors[len(z) - n_f :][:n_c], hard * beyond)))
+        residual = max(_ratio(np.abs(errors[: len(z) - n_f]), force), _ratio(off, short))
+        xi = -(self.slope.high + qp.q + qp.G.T @ lam + qp.C.T @ chi)[:n_f]
+        settled = Status.SOLVED, residual, slip / scale, sets
+        return BatchSolution(cost + qp.c, z, chi, lam, xi, *settled, self.codes)
+
+
+def _ratio(errors: np.ndarray, sizes: np.ndarray) -> float:
+    """Return the largest relative error, without those of terms that all but vanish."""
+    least = max(ROUNDING * sizes.max(initial=0.0), FLOOR)
+    return float((errors / np.maximum(sizes, least)).max(initial=0.0))
+
+
+def _equilibrated(K: np.ndarray) -> np.ndarray:
+    """Return powers of two that scale a symmetric K to rows of about unit size (Ruiz, 2001)."""
+    scale = np.ones(len(K))
+    for _ in range(5):
+        largest = np.abs(K * scale * scale[:, None]).max(-1, initial=0.0)
+        largest[~((largest > 0) & (largest < np.inf))] = 1.0
+        scale *= np.ldexp(1.0, -np.frexp(np.sqrt(largest))[1] + 1)
+    return scale
+
+
+def _product(matrix: np.ndarray, x: Twice) -> Twice:
+    """Return matrix x in twice the working precision."""
+    products, errors = _two_product(matrix, x.high)
+    low = (errors + matrix * x.low).sum(-1)
+    while (n := products.shape[-1]) > 1:
+        pairs = products if n % 2 == 0 else np.pad(products, ((0, 0), (0, 1)))
+        products, errors = _two_sum(pairs[:, ::2], pairs[:, 1::2])
+        low = low + errors.sum(-1)
+    high = products[:, 0] if products.shape[-1] else np.zeros(len(matrix))
+    return Twice(*_two_sum(high, low))
+
+
+def _dot(x: Twice, y: Twice) -> float:
+    products = _product(x.high[None], y)
+    return float(products.high[0] + (products.low[0] + x.low @ y.high))
+
+
+def _two_sum(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return x + y rounded, and its error (Knuth)."""
+    total = x + y
+    part = total - x
+    return total, (x - (total - part)) + (y - part)
+
+
+def _two_product(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return x y rounded, and its error (Dekker)."""
+    product, (x_high, x_low), (y_high, y_low) = x * y, _split(x), _split(y)
+    error = ((x_high * y_high - product) + x_high * y_low + x_low * y_high) + x_low * y_low
+    return product, error
+
+
+def _split(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split x into two halves of 26 bits."""
+    spread = 134217729.0 * x
+    high = spread - (spread - x)
+    return high, x - high
