@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any
 
 import torch
@@ -271,6 +272,21 @@ def scaled_mixed(draw: Draw, count: int) -> Case:
     return replace(case, known=known)
 
 
+def scaled_entries(draw: Draw, count: int) -> Case:
+    """Entries of z in units of their own, from 1e-6 to 1e6, powers of two."""
+    known = draw.known(count)
+    qp, n_f = known.qp, known.fixed.shape[-1]
+    unit = draw.powers(-6, 6, qp.n_z).log2().round().exp2()
+    changes = {
+        "H": qp.H / unit / unit[:, None],
+        "q": qp.q / unit,
+        "C": qp.C / unit,
+        "G": qp.G / unit,
+    }
+    solution = {"fixed": known.fixed * unit[:n_f], "z": known.z * unit, "xi": known.xi / unit[:n_f]}
+    return solvable(replace(changed(known, **changes), **solution))
+
+
 def layouts(draw: Draw, count: int) -> Case:
     """Non-contiguous and expanded tensors."""
     known = draw.known(count, matrices=())
@@ -294,6 +310,59 @@ def after_training(draw: Draw, count: int) -> Case:
     H, C, G, n_f = draw.choice(trained())
     soft = draw.rows(SOFT_ROWS, len(G), len(G))
     return solvable(draw.known(count, n_z=len(H), n_f=n_f, H=H, C=C, G=G, soft=soft, hard=()))
+
+
+def parallel_rows(draw: Draw, count: int) -> Case:
+    """An equality a'z = b, and the same row as an inequality, rounded to 6 to 12 digits.
+
+    The optimum of 1/2 |z|^2 + q'z is that of exact arithmetic.
+    """
+    digits, n = draw.randint(6, 12), draw.randint(3, 6)
+    a, b, q = draw.normal(count, n), draw.normal(count), draw.normal(count, n)
+    factor = draw.powers(-1, 1, count)
+    g, h = _rounded(factor[:, None] * a, digits), _rounded(factor * b, digits)
+    exact = [_exact(*qp) for qp in zip(q, a, b, g, h, strict=True)]
+    z, value, chi, lam = (torch.tensor(x, dtype=torch.float64) for x in zip(*exact, strict=True))
+    qp = QuadraticProgram(
+        H=torch.eye(n).double(),
+        q=q,
+        c=torch.zeros(()).double(),
+        C=a[:, None],
+        b=b[:, None],
+        G=g[:, None],
+        lb=torch.full((1,), -torch.inf).double(),
+        ub=h[:, None],
+        w=torch.full((1,), torch.inf).double(),
+    )
+    none = torch.zeros(count, 0).double()
+    return solvable(KnownQP(qp, none, value, z, 0 * lam, chi, lam, none))
+
+
+def _rounded(x: Tensor, digits: int) -> Tensor:
+    return torch.tensor(
+        [float(f"{v:.{digits}g}") for v in x.flatten().tolist()], dtype=torch.float64
+    ).reshape(x.shape)
+
+
+def _exact(*data: Tensor) -> tuple[list, float, list, list]:
+    """Solve min 1/2 |z|^2 + q'z with a'z = b and g'z <= h, for q, a, b, g, h, by fractions."""
+    (q, a, (b,), g, (h,)) = ([Fraction(v) for v in x.reshape(-1).tolist()] for x in data)
+    lam = Fraction(0)
+
+    def dot(x: list, y: list) -> Fraction:
+        return sum((s * t for s, t in zip(x, y, strict=True)), Fraction(0))
+
+    chi = (-dot(a, q) - b) / dot(a, a)
+    z = [-s - chi * t for s, t in zip(q, a, strict=True)]
+    if dot(g, z) > h:
+        aa, ag, gg = dot(a, a), dot(a, g), dot(g, g)
+        r, s = -dot(a, q) - b, -dot(g, q) - h
+        chi, lam = (
+            (r * gg - s * ag) / (aa * gg - ag * ag),
+            (aa * s - ag * r) / (aa * gg - ag * ag),
+        )
+        z = [-t - chi * u - lam * v for t, u, v in zip(q, a, g, strict=True)]
+    return [float(v) for v in z], float(dot(z, z) / 2 + dot(q, z)), [float(chi)], [float(lam)]
 
 
 @dataclass(frozen=True)
@@ -433,10 +502,12 @@ FAMILIES: dict[str, Callable[[Draw, int], Case]] = {
         scaled_constraints,
         scaled_everything,
         scaled_mixed,
+        scaled_entries,
         layouts,
         float32,
         empty_or_single,
         after_training,
+        parallel_rows,
         unstable_model,
         runaway_prediction,
         hopeless_plant,
