@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -476,3 +477,13 @@ def test_opposite_rows_are_not_sought_without_weakly_active_ones(monkeypatch):
     mpc, s = random_mpc(0), random_states(16, size=3.0).requires_grad_()
     mpc.policy(s).sum().backward()
     assert s.grad is not None
+
+
+def test_a_search_for_implied_equalities_that_does_not_end_finds_none(monkeypatch):
+    def endless(*_: object) -> None:
+        raise RuntimeError("Maximum number of iterations reached.")
+
+    monkeypatch.setattr("scipy.optimize.nnls", endless)
+    opposite = np.array([[1.0, 0.0], [-1.0, 0.0]])
+    masks = np.array([False, False]), np.array([True, True]), np.array([False, False])
+    assert not kkt.implied_equalities(opposite, *masks).any()

@@ -164,6 +164,14 @@ def _all_implied(
     return np.stack(found)[inverse.reshape(-1)]
 
 
+def _in_cone(normals: np.ndarray, x: np.ndarray) -> bool:
+    """Return True if x is a non-negative combination of the rows of ``normals``."""
+    try:
+        return scipy.optimize.nnls(normals.T, x)[1] < PARALLEL
+    except RuntimeError:  # nnls did not converge: the row stays as its multiplier says
+        return False
+
+
 def implied_equalities(
     G: np.ndarray, lower: np.ndarray, upper: np.ndarray, held: np.ndarray
 ) -> np.ndarray:
@@ -189,7 +197,7 @@ def implied_equalities(
     free = rest > PARALLEL  # the others depend on held rows
     rows, normals = rows[free], normals[free] / rest[free, None]
     if np.linalg.matrix_rank(normals, tol=PARALLEL) < len(rows):
-        stuck = [scipy.optimize.nnls(normals.T, -n)[1] < PARALLEL for n in normals]
+        stuck = [_in_cone(normals, -n) for n in normals]
         rows, normals = rows[stuck], normals[stuck]
         _, R, order = scipy.linalg.qr(normals.T, mode="economic", pivoting=True)
         implied[rows[order[: int((np.abs(R.diagonal()) > PARALLEL).sum())]]] = True

@@ -66,7 +66,10 @@ def refine(p: Programs, solution: BatchSolution, which: np.ndarray) -> np.ndarra
         matrices = (x[group[i]] for x in theta[:3])
         vectors = (x[i % len(x)] for x in theta[3:])
         qp = _QP._make((*matrices, *vectors, p.fixed[i]))
-        refined = qp.solve(solution.z[i], solution.lam[i])
+        try:
+            refined = qp.solve(solution.z[i], solution.lam[i])
+        except (np.linalg.LinAlgError, torch.linalg.LinAlgError):  # of numbers that overflowed
+            refined = None
         if refined is None:
             failed.append(i)
         else:
