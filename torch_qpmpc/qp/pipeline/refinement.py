@@ -68,7 +68,7 @@ def refine(p: Programs, solution: BatchSolution, which: np.ndarray) -> np.ndarra
         qp = _QP._make((*matrices, *vectors, p.fixed[i]))
         try:
             refined = qp.solve(solution.z[i], solution.lam[i])
-        except (np.linalg.LinAlgError, torch.linalg.LinAlgError):  # of numbers that overflowed
+        except (np.linalg.LinAlgError, RuntimeError):  # of numbers that overflowed
             refined = None
         if refined is None:
             failed.append(i)
