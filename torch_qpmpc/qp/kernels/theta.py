@@ -1,6 +1,7 @@
-"""The elimination of C z = b (eq:qp2c1), in loops that Numba compiles for the CPU.
+"""Computations for each theta: the elimination of C z = b (eq:qp2c1), and sizes of its entries.
 
-It runs once per theta; LAPACK, called from Python, takes three times as long.
+Loops that Numba compiles for the CPU; LAPACK and NumPy, called from Python, take several times as
+long.
 """
 
 from __future__ import annotations
@@ -9,7 +10,17 @@ import math
 
 import numpy as np
 
-from torch_qpmpc.qp.kernels.linalg import add_product, compiled
+from torch_qpmpc.qp.kernels.linalg import (
+    add,
+    add_product,
+    comparing,
+    compiled,
+    dot,
+    larger,
+    summing,
+)
+
+TINY = np.finfo(float).tiny
 
 
 @compiled
@@ -84,3 +95,118 @@ def _eliminate(C, n_kept, independent, T, Y_neg):
         for j in range(n_c):
             Y_neg[dependent, j] = -right[i, n_y + j]
     return True
+
+
+@compiled
+def inverse_factors(H, definite, shift):
+    """Return the inverses of the Cholesky factors of H, shifted by a multiple of I if singular.
+
+    Args:
+        H: ``(M, d, d)``.
+        definite: smallest squared pivot of a definite H, relative to its largest diagonal entry.
+        shift: the multiple of I, relative to the same.
+
+    Returns:
+        The inverses ``(M, d, d)``, inf where the shifted H has no factor, and the shifts ``(M,)``.
+    """
+    inverses, shifts = np.zeros_like(H), np.zeros(len(H))
+    factor = np.empty(H.shape[1:])
+    for m in range(len(H)):
+        largest = 0.0
+        for j in range(len(factor)):
+            largest = max(largest, H[m, j, j])
+        if not _inverse_factor(H[m], 0.0, definite * largest, factor, inverses[m]):
+            shifts[m] = max(shift * largest, TINY)
+            if not _inverse_factor(H[m], shifts[m], 0.0, factor, inverses[m]):
+                inverses[m] = np.inf
+    return inverses, shifts
+
+
+@compiled
+def _inverse_factor(H, shift, least, factor, inverse):
+    """Fill the lower triangle of ``inverse``; return False if a squared pivot is too small."""
+    for a in range(len(H)):
+        for b in range(a):
+            factor[a, b] = (H[a, b] - dot(factor[a, :b], factor[b, :b])) / factor[b, b]
+        pivot = H[a, a] + shift - dot(factor[a, :a], factor[a, :a])
+        if not least < pivot < np.inf:
+            return False
+        factor[a, a] = math.sqrt(pivot)
+    for a in range(len(H)):
+        row = inverse[a, :a]
+        for b in range(a):
+            row[b] = 0.0
+        for b in range(a):
+            add(inverse[a, : b + 1], -factor[a, b], inverse[b, : b + 1])
+        for b in range(a):
+            row[b] /= factor[a, a]
+        inverse[a, a] = 1.0 / factor[a, a]
+    return True
+
+
+@compiled
+def row_lengths(G, absent):
+    """Return the norms of the rows of G ``(M, r, d)``, zero up to ``absent`` ``(M, r)``."""
+    lengths = np.empty(G.shape[:2])
+    for m in range(len(G)):
+        for j in range(G.shape[1]):
+            length = math.sqrt(dot(G[m, j], G[m, j]))
+            lengths[m, j] = 0.0 if length <= absent[m, j] else length
+    return lengths
+
+
+@compiled
+def nearly_orthogonal(units):
+    """Return True if the unit rows ``(M, h, d)`` of each matrix are orthogonal, but for a half."""
+    for m in range(len(units)):
+        for i in range(units.shape[1]):
+            total = 0.0
+            for j in range(units.shape[1]):
+                total += abs(dot(units[m, i], units[m, j])) if i != j else 0.0
+            if not total < 0.5:
+                return False
+    return True
+
+
+@summing
+def row_sums(matrices):
+    """Return the sums of the absolute entries of the rows of ``(M, i, j)``."""
+    sums = np.empty(matrices.shape[:2])
+    for m in range(len(matrices)):
+        for i in range(matrices.shape[1]):
+            total = 0.0
+            for j in range(matrices.shape[2]):
+                total += abs(matrices[m, i, j])
+            sums[m, i] = total
+    return sums
+
+
+@comparing
+def column_sizes(matrices):
+    """Return the largest absolute entries of the columns of ``(M, i, j)``."""
+    sizes = np.zeros((len(matrices), matrices.shape[2]))
+    for m in range(len(matrices)):
+        for i in range(matrices.shape[1]):
+            for j in range(matrices.shape[2]):
+                sizes[m, j] = larger(sizes[m, j], abs(matrices[m, i, j]))
+    return sizes
+
+
+@compiled
+def finite_sizes(vectors, group, M):
+    """Return the largest finite sizes ``(M, n)`` of the vectors of the QPs of each matrix.
+
+    Args:
+        vectors: ``(B, n)``, or ``(1, n)`` if all QPs share one.
+        group: the index of each QP's matrices, ``(B,)``.
+        M: the number of matrices.
+    """
+    sizes = np.zeros((M, vectors.shape[1]))
+    for i in range(len(vectors)):
+        shared = len(vectors) == 1
+        for m in range(0 if shared else group[i], M if shared else group[i] + 1):
+            for j in range(vectors.shape[1]):
+                size = abs(vectors[i, j])
+                if sizes[m, j] < size < np.inf:
+                    sizes[m, j] = size
+    return sizes

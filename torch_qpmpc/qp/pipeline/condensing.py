@@ -158,10 +158,9 @@ def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) 
     G = theta.G @ T
     # Rounding leaves traces of variables that a row does not contain, and all of a row that C
     # implies: sizes are compared with those before the elimination.
-    size = np.abs(theta.G)
-    terms = size @ np.abs(T).sum(-1, keepdims=True)
+    terms = np.abs(theta.G) @ kernels.row_sums(T)[:, :, None]
     enters = (np.abs(G) > ENTERS * terms).any(0)
-    sums = np.abs(theta.H).sum(-1), size.sum(-1), np.abs(theta.C).sum(-1)
+    sums = kernels.row_sums(theta.H), kernels.row_sums(theta.G), kernels.row_sums(theta.C)
     arrays = CondensedArrays(T, Y_neg, H, G, H_b, G_b)
     convex = padding is None and _has_factor(H)
     return Condensed(arrays, enters, terms[:, :, 0], sums, n_kept, padding is not None, convex)
@@ -210,41 +209,18 @@ def _times(matrices: np.ndarray, group: np.ndarray, vectors: np.ndarray) -> np.n
 @np.errstate(all="ignore")
 def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     """Return the `Sizes` of QPs with the first n_f entries fixed."""
-    H, G = condensed.arrays.H[:, n_f:, n_f:], condensed.arrays.G[:, :, n_f:]
-    steps = np.sqrt(np.einsum("mij,mij->mi", G, G))
-    steps[steps <= ABSENT * condensed.terms] = 0.0
+    H = np.ascontiguousarray(condensed.arrays.H[:, n_f:, n_f:])
+    G = np.ascontiguousarray(condensed.arrays.G[:, :, n_f:])
+    steps = kernels.row_lengths(G, ABSENT * condensed.terms)
     enters = condensed.enters[:, n_f:]
     single = enters & (enters.sum(-1) == 1)[:, None]
     box = np.where(single.any(0), single.argmax(0) if len(single) else 0, -1)
     hard = np.flatnonzero(np.isinf(theta.w).any(0) & (steps > 0).any(0))
     units = G[:, hard] / np.where(steps > 0, steps, 1.0)[:, hard, None]
-    cosines = units @ units.swapaxes(1, 2)
-    apart = bool((np.abs(cosines).sum(-1) < 1.5).all())
-    inverse, shift = _inverse_factor(H)
-    stiffness = np.abs(H).sum(-1).max(-1, initial=0.0)
+    apart = kernels.nearly_orthogonal(units)
+    inverse, shift = kernels.inverse_factors(H, DEFINITE, SHIFT)
+    stiffness = kernels.row_sums(H).max(-1, initial=0.0)
     return Sizes(inverse, shift, stiffness, *condensed.sums, steps, hard, box, units, apart)
-
-
-def _inverse_factor(H: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return `Sizes.inverse` and `Sizes.shift`."""
-    unit, shift = np.eye(H.shape[1]), np.zeros(len(H))
-    largest = H.diagonal(axis1=1, axis2=2).max(-1, initial=0.0)
-    try:
-        factor = np.linalg.cholesky(H)
-        pivots = factor.diagonal(axis1=1, axis2=2) ** 2
-        if (pivots > DEFINITE * largest[:, None]).all():
-            return np.linalg.inv(factor), shift
-    except np.linalg.LinAlgError:
-        pass
-    inverse = np.full_like(H, np.inf)
-    for m in range(len(H)):
-        for added in (0.0, max(SHIFT * largest[m], np.finfo(float).tiny)):
-            factor, info = torch.linalg.cholesky_ex(torch.from_numpy(H[m] + added * unit))
-            shift[m], pivots = added, factor.diagonal().square()
-            if info == 0 and (added > 0 or (pivots > DEFINITE * largest[m]).all()):
-                inverse[m] = np.linalg.inv(factor.numpy())
-                break
-    return inverse, shift
 
 
 @np.errstate(all="ignore")

@@ -22,8 +22,8 @@ from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import Status
 
-#: Largest number of active sets; after `TOGETHER` of them only the worst row changes its state.
-MAX_SETS, TOGETHER = 40, 12
+#: Largest number of active sets from one start: what is solved at all takes one or two.
+MAX_SETS = 6
 #: Fewer are tried if their number times the third power of the equations' exceeds this.
 MAX_WORK = 2e8
 #: Largest number of refinements of one set.
@@ -101,7 +101,7 @@ class _QP(NamedTuple):
         return solution
 
     def _settled(self, codes: np.ndarray, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
-        slip, seen, x = EXACT, set(), None
+        slip, x = EXACT, None
         work = (len(self.q) + len(self.b) + np.count_nonzero(codes)) ** 3
         for sets in range(1, int(min(MAX_SETS, 2 + MAX_WORK / work)) + 1):
             system = _System.of(self, codes)
@@ -115,10 +115,7 @@ class _QP(NamedTuple):
             if not contradiction.any():
                 solution = point.judged(system.errors(x), sets)
                 return solution if solution.accepted() else None
-            together = sets <= TOGETHER and codes.tobytes() not in seen
-            seen.add(codes.tobytes())
-            changing = contradiction > (0 if together else 0.999 * contradiction.max())
-            codes = np.where(changing, states, codes)
+            codes = np.where(contradiction > 0, states, codes)
         return None
 
     def _first_codes(self, z: np.ndarray, lam: np.ndarray) -> np.ndarray:

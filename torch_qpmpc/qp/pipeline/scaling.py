@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torch_qpmpc.qp.kernels.theta import column_sizes, finite_sizes, row_sums
 from torch_qpmpc.qp.pipeline.arrays import Array, BatchSolution, Theta, per_qp
 
 #: Sizes between these have the unit one.
@@ -59,16 +60,18 @@ class Units(NamedTuple):
     @np.errstate(all="ignore")
     def of_rows_and_cost(cls, theta: Theta, group: np.ndarray) -> Units | None:
         """Return units with one length for all entries of z; None if all of them are one."""
-        M, (rows, equalities) = len(theta.H), (np.abs(x).sum(-1) for x in (theta.G, theta.C))
-        q, b, lb, ub = (_sizes(x, group, M) for x in (theta.q, *theta[5:8]))
-        H, q = np.abs(theta.H).max(axis=(1, 2))[:, None], q.max(-1, keepdims=True)
+        M, (rows, equalities) = len(theta.H), (row_sums(x) for x in (theta.G, theta.C))
+        q, b, lb, ub = (finite_sizes(x, group, M) for x in (theta.q, *theta[5:8]))
+        H, q = (x.max(-1, keepdims=True) for x in (column_sizes(theta.H), q))
         reach = np.concatenate((np.maximum(lb, ub) / rows, b / equalities), axis=-1)
         sizes = np.concatenate((np.maximum(H, q), rows, equalities, reach), axis=-1)
         if (sizes[:, 0] > 0).all() and not _unusual(sizes).any():
             return None
         length = _typical(reach)
         cost = np.maximum(H * length**2, q * length)
-        of_rows = (_sizes(theta.w, group, M) * rows * length).max(-1, keepdims=True, initial=0.0)
+        of_rows = (finite_sizes(theta.w, group, M) * rows * length).max(
+            -1, keepdims=True, initial=0.0
+        )
         cost = np.where(cost > 0, cost, np.maximum(cost, of_rows))  # a QP without any other cost
         powers = (_power_above(x) for x in (cost, rows * length, equalities * length))
         cost, rows, equalities = powers
@@ -110,10 +113,11 @@ class Units(NamedTuple):
 
 def _columns(theta: Theta) -> np.ndarray | None:
     """Return units of the entries of z ``(M, n_z)`` that equilibrate H, C and G; None if alike."""
-    rows = np.abs(np.concatenate((theta.C, theta.G), axis=1))
+    of_C, of_G = (column_sizes(x) for x in (theta.C, theta.G))
     curvature = np.sqrt(np.abs(theta.H.diagonal(axis1=1, axis2=2)))
-    if not (_apart(rows.max(1, initial=0.0)) or _apart(curvature)):
+    if not (_apart(np.maximum(of_C, of_G)) or _apart(curvature)):
         return None
+    rows = np.abs(np.concatenate((theta.C, theta.G), axis=1))
     units, kappa = np.ones(curvature.shape), np.ones((len(rows), 1, 1))
     H, of_row = np.abs(theta.H), np.ones((*rows.shape[:2], 1))
     for _ in range(PASSES):
@@ -135,16 +139,6 @@ def _apart(sizes: np.ndarray) -> bool:
 
 def _positive(sizes: np.ndarray) -> np.ndarray:
     return (sizes > 0) & (sizes < np.inf)
-
-
-def _sizes(vectors: np.ndarray, group: np.ndarray, M: int) -> np.ndarray:
-    """Return the largest finite sizes ``(M, n)`` of the QPs that share their matrices."""
-    sizes = np.where(np.isfinite(vectors), np.abs(vectors), 0.0)
-    if M == 1:
-        return sizes.max(0, keepdims=True)
-    largest = np.zeros((M, sizes.shape[1]))
-    np.maximum.at(largest, group, sizes)
-    return largest
 
 
 def _typical(sizes: np.ndarray) -> np.ndarray:
