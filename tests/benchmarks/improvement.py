@@ -96,38 +96,28 @@ CASES = {
 }
 PLAIN = ("gate=false", *NO_SEARCH)
 WAYS = {"Q-learning": PLAIN, "default": ()}
-POLICY, GATE, SEARCH = "policy's gradient", "gate", "search"
+GATE, SEARCH = "gate", "search"
 METHODS = {
     "N - 1": (*PLAIN, "target_horizon=shrinking", "task.gamma=1"),
     "n steps": (*PLAIN, "n_step=5"),
     "lambda": (*PLAIN, "n_step=8", "lmbda=0.8"),
     "average cost": (*PLAIN, "average_cost=true"),
     "anchor": (*PLAIN, "anchor=100"),
-    POLICY: PLAIN,
-    f"{POLICY}, {GATE}": NO_SEARCH,
     GATE: NO_SEARCH,
     f"{GATE}, average": (*NO_SEARCH, "average=0.9"),
     SEARCH: ("updates=1",),
 }
-POINT_MASS: dict[str, Sequence[str]] = {
-    POLICY: ("policy_gradient.parts=[b,lb,ub]",),
-    SEARCH: ("search.H_f=1",),
-}
-#: Cases of the single methods, with further overrides of some. The policy's gradient moves parts
-#: that no TD error moves.
+POINT_MASS: dict[str, Sequence[str]] = {SEARCH: ("search.H_f=1",)}
+#: Cases of the single methods, with further overrides of some.
 METHOD_CASES: dict[str, dict[str, Sequence[str]]] = {
     "Point mass, Gaussian noise, identified": POINT_MASS,
     "Point mass, Brownian noise, identified": POINT_MASS,
-    "Gros-Zanon, corrupted, TD errors alone": {
-        POLICY: ("policy_gradient.parts=[w]", "policy_gradient.memory=250", "exploration_std=0.1"),
-    },
-    "House, identified": {POLICY: ("policy_gradient.parts=[b,lb]",)},
-    "House with a wall, identified": {POLICY: ("policy_gradient.parts=[b,lb]",)},
-    "Four tanks, identified": {POLICY: ("policy_gradient.parts=[b,q]",)},
-    "Tank with references, identified": {
-        POLICY: ("policy_gradient.parts=[b]", "constraint.learn=[C,lb,ub]"),
-    },
-    "Pendulum, identified": {POLICY: ("policy_gradient.parts=[b]",)},
+    "Gros-Zanon, corrupted, TD errors alone": {},
+    "House, identified": {},
+    "House with a wall, identified": {},
+    "Four tanks, identified": {},
+    "Tank with references, identified": {},
+    "Pendulum, identified": {},
 }
 
 
@@ -145,9 +135,7 @@ def reference_cost(case: str) -> float | None:
 def configuration(case: str, way: str, seed: int) -> DictConfig:
     """Compose the configuration of a run."""
     overrides = [*COMMON, *CASES[case].overrides, *(WAYS | METHODS)[way], f"seed={seed}"]
-    return make_config(
-        *overrides, *METHOD_CASES.get(case, {}).get(way.removesuffix(f", {GATE}"), ())
-    )
+    return make_config(*overrides, *METHOD_CASES.get(case, {}).get(way, ()))
 
 
 def applies(case: str, method: str) -> bool:

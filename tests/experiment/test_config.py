@@ -115,7 +115,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "second": ("gate=true", "constraint=combined", "optimizer=gauss_newton", "batch_size=8"),
         "actor": ("algo=td3", "task=pendulum", "constraint=free", "batch_size=8"),
         "adaptive": ("constraint=adaptive", "optimizer=gauss_newton"),
-        "house": ("task=house", "warmup_steps=1", "policy_gradient.parts=[lb]"),
+        "house": ("task=house", "warmup_steps=1"),
         "house_wall": ("task=house_wall", "warmup_steps=1"),
         "four_tanks": ("task=four_tanks", "start=model", "warmup_steps=1"),
         "tank_references": ("task=tank_references", "warmup_steps=1"),
@@ -256,10 +256,6 @@ BAD: dict[str, list[Any]] = {
     "prediction": REAL,
     "back_off": [0.4, 1, math.nan, False, "half"],
     "average": [-0.5, 1, 1.1, math.nan, False, "half", None],
-    "policy_gradient.parts": ["b", ["C"], ["H"], None, 3],
-    "policy_gradient.rate": [0, *REAL],
-    "policy_gradient.ridge": [0, *REAL],
-    "policy_gradient.memory": WHOLE[1:],
     "search.loops": WHOLE,
     **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
     "rivals": ["DeePC", 3, None, [1]],
@@ -464,7 +460,7 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     cfg, file = make_config("gate=false"), tmp_path / "config.yaml"
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
-    later = ("logger", "eval_seed", "start", "gate", "anchor", "average", "policy_gradient")
+    later = ("logger", "eval_seed", "start", "gate", "anchor", "average")
     for key in (*later, "prediction", "back_off", "search", "target_horizon", "n_step"):
         del cfg[key]
     OmegaConf.save(cfg, file)
@@ -627,11 +623,6 @@ def test_solver_must_be_known():
             "moves the bounds; constraint=mpc has none",
         ),
         (
-            ["constraint=adaptive", "policy_gradient.parts=[ub]"],
-            r"policy_gradient.parts: got \['ub'\], expected a list without lb and ub. back_off "
-            "moves the bounds; constraint=mpc has none",
-        ),
-        (
             ["average=0.9", "gate=false"],
             "gate: got False, expected true. The average is what the gate judges",
         ),
@@ -665,26 +656,6 @@ def test_solver_must_be_known():
         (
             ["average_cost=true", "constraint=mpc", "release=5"],
             "release: got 5, expected null. average_cost does not support release",
-        ),
-        (
-            ["task=house", "policy_gradient.parts=[q]"],
-            r"task.learn_cost: got \['q', 'c'\], expected a list without q, which is in policy_g",
-        ),
-        (
-            ["constraint=mpc", "policy_gradient.parts=[lb]"],
-            r"constraint.learn: got \[.*'lb'.*\], expected a list without lb.* either list",
-        ),
-        (
-            ["algo=ddpg", "policy_gradient.parts=[b]"],
-            r"policy_gradient.parts: got \['b'\], expected \[\]. ddpg has a policy gradient of",
-        ),
-        (
-            ["n_step=3", "policy_gradient.parts=[b]"],
-            "n_step: got 3, expected 1. The advantages of policy_gradient.parts are those of",
-        ),
-        (
-            ["exploration_std=0.0", "policy_gradient.parts=[b]"],
-            "exploration_std: got 0.0, expected a positive number. The policy gradient compares",
         ),
         (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
     ],

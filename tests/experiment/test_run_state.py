@@ -25,8 +25,6 @@ STOPS = (2, 7)
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
 GATED = ("gate=true", "optimizer=gauss_newton")
 ANCHORED = ("start=data", "start.transitions=200", "anchor=1")
-POLICY = ("constraint.learn=[C]", "policy_gradient.parts=[lb,b]", "policy_gradient.memory=9")
-POLICY += ("exploration_std=0.1",)
 ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
 NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
 SGD = ("optimizer=sgd", "penalty_step=subgradient")
@@ -40,7 +38,7 @@ SGD = ("optimizer=sgd", "penalty_step=subgradient")
         (*SGD, "constraint=combined", "solver=torch", "step=projection"),
         ("optimizer=gauss_newton", "constraint=combined", "solver=proxqp"),
         ("optimizer=adam", "constraint=mpc", "release=9"),
-        ("optimizer=recursive", *STREAM, "constraint=mpc", *POLICY),
+        ("optimizer=recursive", *STREAM, "constraint=mpc"),
         ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
         ("delay_value=true", "noise=brownian", "steps_per_update=3", "warm_start=false"),
         ("optimizer=gauss_newton", "n_step=3", "replay_capacity=48", "average_cost=true"),

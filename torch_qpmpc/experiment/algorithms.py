@@ -33,11 +33,10 @@ from torch_qpmpc.learning.operators import (
     preview_key,
 )
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
-from torch_qpmpc.learning.policy_gradient import PolicyGradient
 from torch_qpmpc.learning.prediction_errors import PredictionErrors
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.replay import ACTIVE_SET
-from torch_qpmpc.learning.updates import Update, first_order, second_order, with_policy_gradient
+from torch_qpmpc.learning.updates import Update, first_order, second_order
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.tightening import BackOff
 
@@ -52,7 +51,6 @@ class Learner:
         actor: maps observation to action, without exploration.
         deviation, si: the penalties; None if off.
         target: the soft update of the target network; None without one.
-        policy_gradient: moves parts of theta by the policy's gradient; None without such parts.
         n_preview: entries of the preview, with which p begins.
         average: the exponential average of the actor's parameters; None without one.
         errors: the prediction errors of the transitions; None if nothing uses them.
@@ -67,7 +65,6 @@ class Learner:
     deviation: DeviationPenalty | None
     si: SystemIdentificationPenalty | None
     target: SoftUpdate | None
-    policy_gradient: PolicyGradient | None = None
     n_preview: int = 0
     average: AveragedModel | None = None
     errors: PredictionErrors | None = None
@@ -126,7 +123,6 @@ def make_learner(
     An anchor is at the C that was identified at the ``start``.
     """
     mpc = operator.module
-    policy_gradient = make_policy_gradient(cfg, mpc)
     if cfg.algo.name == "qlearning":
         loss_module = QPQLearningLoss(
             operator,
@@ -150,14 +146,6 @@ def make_learner(
     schedule = make_schedule(cfg, optimizer, done)
     delayed = cfg.algo.name != "qlearning" or cfg.delay_value
     update = make_update(cfg, mpc, loss_module, optimizer, schedule, deviation, si, done)
-    if policy_gradient is not None:
-        assert isinstance(loss_module, QPQLearningLoss)
-
-        def share() -> float:
-            rates = cfg.optimizer.final_fraction
-            return decay(done + schedule.last_epoch, cfg.updates, rates)
-
-        update = with_policy_gradient(update, loss_module, policy_gradient, share)
     return Learner(
         update,
         loss_module,
@@ -167,7 +155,6 @@ def make_learner(
         deviation,
         si,
         SoftUpdate(loss_module, tau=cfg.target_rate) if delayed else None,
-        policy_gradient,
         (mpc.horizon + 1) * mpc.n_d,
         make_average(cfg, actor),
         errors,
@@ -208,13 +195,6 @@ def make_average(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedModel 
     if not cfg.average:
         return None
     return AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(cfg.average))
-
-
-def make_policy_gradient(cfg: DictConfig, mpc: QPMPC) -> PolicyGradient | None:
-    """Make the policy gradient and freeze its parts for TD errors; None without parts."""
-    options = dict(cfg.policy_gradient)
-    parts = tuple(options.pop("parts"))
-    return PolicyGradient(mpc, parts, **options) if parts else None
 
 
 def make_optimizer(

@@ -59,7 +59,6 @@ def snapshot(
         "schedule": {"last_epoch": learner.schedule.last_epoch},
         "average": None if learner.average is None else learner.average.state_dict(),
         "errors": None if learner.errors is None else learner.errors.state_dict(),
-        "policy_gradient": improve.state_dict() if (improve := learner.policy_gradient) else None,
         "gate": gate.state_dict(),
         "replay": replay.state_dict() if len(replay) and not finished else None,
         "collector": None if finished else _collector_state(collector),
@@ -95,9 +94,6 @@ def restore(
     with _part("errors"):
         if learner.errors is not None:
             learner.errors.load_state_dict(state["errors"])
-    with _part("policy_gradient"):
-        if learner.policy_gradient is not None and state.get("policy_gradient") is not None:
-            learner.policy_gradient.load_state_dict(state["policy_gradient"])
     with _part("gate"):
         gate.load_state_dict(state.get("gate"))
     with _part("replay"):

@@ -15,13 +15,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
-from torchrl.objectives.value import TD0Estimator
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import QPActorValueOperator
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
-from torch_qpmpc.learning.policy_gradient import PolicyGradient
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.restoring import restored
 from torch_qpmpc.learning.td_error import invalid_rewards, td_loss, td_metadata
@@ -167,56 +165,6 @@ def average_cost(loss_module: LossModule) -> dict[str, Tensor]:
     """Return the average cost of a loss for logging; nothing if it has none."""
     rho = getattr(loss_module, "average_cost", None)
     return {} if rho is None else {"train/average_cost": rho.clone()}
-
-
-def with_policy_gradient(
-    update: Update,
-    loss_module: QPQLearningLoss,
-    policy_gradient: PolicyGradient,
-    share_of_rate: Callable[[], float] = lambda: 1.0,
-) -> Update:
-    """Return an update by TD errors, followed by a step of the policy gradient on the same batch.
-
-    The targets are the loss module's, with the theta that the TD errors have moved. V's correction
-    R needs targets of one step and of one horizon, those of TD(0) with ``horizon="receding"``.
-
-    Args:
-        update: the update by TD errors.
-        loss_module: the loss that defines the targets.
-        policy_gradient: the policy gradient of the QP that ``loss_module`` learns.
-        share_of_rate: returns the fraction of the rate of the next step.
-
-    Raises:
-        QPError: the value network has other modules or ``theta_keys``.
-    """
-    operator = _alone(loss_module)
-    action, keys = operator.in_keys[1], loss_module.tensor_keys
-
-    def improved(
-        batch: TensorDictBase, windows: Tensor | None
-    ) -> tuple[dict[str, Tensor], Scalars]:
-        terms, losses = update(batch, windows)
-        key, following, discount = operator.active_set_key, None, 1.0
-        estimator = loss_module.value_estimator
-        if loss_module.horizon == "receding" and isinstance(estimator, TD0Estimator):
-            following = operator.known(batch.get("next"))
-            done = batch.get(("next", keys.done))
-            ended = batch.get(("next", keys.terminated), default=done).squeeze(-1)
-            discount = estimator.gamma * ~ended
-        report = policy_gradient.step(
-            operator.known(batch),
-            batch.get(action),
-            -loss_module.target(batch),
-            following=following,
-            discount=discount,
-            warm_start=None if key is None else batch.get(key, None),
-            share_of_rate=share_of_rate(),
-        )
-        terms["policy/share"] = torch.tensor(report.share)
-        terms["policy/change"] = torch.tensor(report.change)
-        return terms, losses
-
-    return improved
 
 
 def entries_of_C(mpc: QPMPC) -> Tensor:

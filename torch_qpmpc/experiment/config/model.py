@@ -10,7 +10,6 @@ from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config.groups import (
-    NO_POLICY_GRADIENT,
     NO_SEARCH,
     Algorithm,
     Collector,
@@ -18,7 +17,6 @@ from torch_qpmpc.experiment.config.groups import (
     FromModel,
     Noise,
     Optimizer,
-    PolicyGradient,
     Search,
     Start,
 )
@@ -95,7 +93,6 @@ class Config(Group):
         Annotated[Finite, Field(ge=0.5, lt=1)] | None, Expected("a number in [0.5, 1), or null")
     ] = None
     average: Annotated[Finite, Field(ge=0, lt=1), Expected("a number in [0, 1)")] = 0.0
-    policy_gradient: PolicyGradient = NO_POLICY_GRADIENT
     search: Search = NO_SEARCH
     logger: Annotated[str, one_of(LOGGERS)] = "tensorboard"
     export: Annotated[Literal["c"] | None, Expected("c, or null")] = None
@@ -202,12 +199,9 @@ class Config(Group):
             self.conflict("optimizer.name", "gauss_newton", remedy)
         if self.prediction and not {"C", "b"} & {*self.constraint.learn}:
             self.conflict("constraint.learn", "a list with C or b, which prediction moves")
-        moved = {"constraint.learn": self.constraint.learn}
-        moved["policy_gradient.parts"] = self.policy_gradient.parts
-        for key, parts in moved.items():
-            if self.back_off is not None and {"lb", "ub"} & {*parts}:
-                remedy = "back_off moves the bounds; constraint=mpc has none."
-                self.conflict(key, "a list without lb and ub", remedy)
+        if self.back_off is not None and {"lb", "ub"} & {*self.constraint.learn}:
+            remedy = "back_off moves the bounds; constraint=mpc has none."
+            self.conflict("constraint.learn", "a list without lb and ub", remedy)
         return self
 
     @model_validator(mode="after")
@@ -251,26 +245,6 @@ class Config(Group):
             self.conflict("algo.actor", "qp or scheduled", remedy)
         if self.step != "cholesky":
             self.conflict("step", "cholesky", f"The critics of {name} support no other step.")
-        return self
-
-    @model_validator(mode="after")
-    def policy_gradient_explores_and_has_parts_of_its_own(self) -> Self:
-        parts = self.policy_gradient.parts
-        if not parts:
-            return self
-        if both := [x for x in (*self.task.learn_cost, *self.constraint.learn) if x in parts]:
-            key = "task.learn_cost" if both[0] in self.task.learn_cost else "constraint.learn"
-            expected = f"a list without {both[0]}, which is in policy_gradient.parts"
-            self.conflict(key, expected, "One method moves each part: remove it from either list.")
-        if self.algo.name != "qlearning":
-            remedy = f"{self.algo.name} has a policy gradient of its own."
-            self.conflict("policy_gradient.parts", "[]", remedy)
-        if not self.exploration_std:
-            remedy = "The policy gradient compares actions: choose a deviation > 0."
-            self.conflict("exploration_std", "a positive number", remedy)
-        if self.n_step > 1:
-            remedy = "The advantages of policy_gradient.parts are those of single actions."
-            self.conflict("n_step", "1", remedy)
         return self
 
     @model_validator(mode="after")
