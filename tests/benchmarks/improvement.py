@@ -104,7 +104,6 @@ METHODS = {
     "average cost": (*PLAIN, "average_cost=true"),
     "anchor": (*PLAIN, "anchor=100"),
     GATE: NO_SEARCH,
-    f"{GATE}, average": (*NO_SEARCH, "average=0.9"),
     SEARCH: ("updates=1",),
 }
 POINT_MASS: dict[str, Sequence[str]] = {SEARCH: ("search.H_f=1",)}

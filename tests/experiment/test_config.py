@@ -36,7 +36,6 @@ OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
 NOT_NEEDED = (
     "anchor",
-    "average",
     "back_off",
     "eval_seed",
     "export",
@@ -255,7 +254,6 @@ BAD: dict[str, list[Any]] = {
     "anchor": REAL,
     "prediction": REAL,
     "back_off": [0.4, 1, math.nan, False, "half"],
-    "average": [-0.5, 1, 1.1, math.nan, False, "half", None],
     "search.loops": WHOLE,
     **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
     "rivals": ["DeePC", 3, None, [1]],
@@ -460,7 +458,7 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     cfg, file = make_config("gate=false"), tmp_path / "config.yaml"
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
-    later = ("logger", "eval_seed", "start", "gate", "anchor", "average")
+    later = ("logger", "eval_seed", "start", "gate", "anchor")
     for key in (*later, "prediction", "back_off", "search", "target_horizon", "n_step"):
         del cfg[key]
     OmegaConf.save(cfg, file)
@@ -621,10 +619,6 @@ def test_solver_must_be_known():
             ["constraint=adaptive", "constraint.learn=[C,lb]"],
             r"constraint.learn: got \['C', 'lb'\], expected a list without lb and ub. back_off "
             "moves the bounds; constraint=mpc has none",
-        ),
-        (
-            ["average=0.9", "gate=false"],
-            "gate: got False, expected true. The average is what the gate judges",
         ),
         (["lmbda=0.9"], "n_step: got 1, expected at least 2. lmbda mixes the returns of 1"),
         (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -12,7 +11,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop
@@ -52,7 +50,6 @@ class Learner:
         deviation, si: the penalties; None if off.
         target: the soft update of the target network; None without one.
         n_preview: entries of the preview, with which p begins.
-        average: the exponential average of the actor's parameters; None without one.
         errors: the prediction errors of the transitions; None if nothing uses them.
         back_off: tightens the bounds by the covariance of these; None if it is off.
     """
@@ -66,19 +63,13 @@ class Learner:
     si: SystemIdentificationPenalty | None
     target: SoftUpdate | None
     n_preview: int = 0
-    average: AveragedModel | None = None
     errors: PredictionErrors | None = None
     back_off: BackOff | None = None
 
     @property
-    def candidate(self) -> Any:
-        """The policy that a gate judges: the average of the actor or, without one, the actor."""
-        return self.actor if self.average is None else self.average.module
-
-    @property
     def policy(self) -> Callable[[Tensor], Tensor]:
-        """The candidate as a function from p to a, for one closed loop."""
-        return in_closed_loop(self.candidate, self.n_preview)
+        """The actor as a function from p to a, for one closed loop."""
+        return in_closed_loop(self.actor, self.n_preview)
 
     def observe(self, batch: TensorDictBase) -> None:
         """Add new transitions to the prediction errors."""
@@ -89,19 +80,12 @@ class Learner:
             self.errors.add(operator.known(flat), flat.get(operator.in_keys[1]), following)
 
     def advance(self) -> None:
-        """Advance the schedule, the bounds, the target network and the average by one update."""
+        """Advance the schedule, the bounds and the target network by one update."""
         self.schedule.step()
         if self.back_off is not None and self.errors is not None:
             self.back_off.tighten(self.errors.covariance(self.back_off.mpc.quadratic_program()))
         if self.target is not None:
             self.target.step()
-        if self.average is not None:
-            self.average.update_parameters(self.actor)
-
-    def restart(self) -> None:
-        """Go on learning from the candidate."""
-        if self.average is not None:
-            self.actor.load_state_dict(self.candidate.state_dict())
 
 
 def make_operator(cfg: DictConfig, mpc: QPMPC) -> QPActorValueOperator:
@@ -156,7 +140,6 @@ def make_learner(
         si,
         SoftUpdate(loss_module, tau=cfg.target_rate) if delayed else None,
         (mpc.horizon + 1) * mpc.n_d,
-        make_average(cfg, actor),
         errors,
         None if cfg.back_off is None else BackOff(mpc, cfg.back_off),
     )
@@ -185,16 +168,6 @@ def make_errors(cfg: DictConfig, mpc: QPMPC) -> PredictionErrors | None:
     if not cfg.prediction and cfg.back_off is None:
         return None
     return PredictionErrors(mpc, weight=cfg.prediction or 1.0)
-
-
-def make_average(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedModel | None:
-    """Make the exponential average of the actor's parameters, at first a copy; None if off.
-
-    It averages the Cholesky factors of H, so that H stays positive semidefinite.
-    """
-    if not cfg.average:
-        return None
-    return AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(cfg.average))
 
 
 def make_optimizer(

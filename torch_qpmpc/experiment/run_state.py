@@ -57,7 +57,6 @@ def snapshot(
         "loss_module": learner.loss_module.state_dict(),
         "optimizer": learner.optimizer.state_dict(),
         "schedule": {"last_epoch": learner.schedule.last_epoch},
-        "average": None if learner.average is None else learner.average.state_dict(),
         "errors": None if learner.errors is None else learner.errors.state_dict(),
         "gate": gate.state_dict(),
         "replay": replay.state_dict() if len(replay) and not finished else None,
@@ -88,9 +87,6 @@ def restore(
         learner.optimizer.load_state_dict(state["optimizer"])
     with _part("schedule"):
         learner.schedule.last_epoch = int(state["schedule"]["last_epoch"])
-    with _part("average"):
-        if learner.average is not None:
-            learner.average.load_state_dict(state["average"])
     with _part("errors"):
         if learner.errors is not None:
             learner.errors.load_state_dict(state["errors"])

@@ -92,7 +92,6 @@ class Config(Group):
     back_off: Annotated[
         Annotated[Finite, Field(ge=0.5, lt=1)] | None, Expected("a number in [0.5, 1), or null")
     ] = None
-    average: Annotated[Finite, Field(ge=0, lt=1), Expected("a number in [0, 1)")] = 0.0
     search: Search = NO_SEARCH
     logger: Annotated[str, one_of(LOGGERS)] = "tensorboard"
     export: Annotated[Literal["c"] | None, Expected("c, or null")] = None
@@ -202,12 +201,6 @@ class Config(Group):
         if self.back_off is not None and {"lb", "ub"} & {*self.constraint.learn}:
             remedy = "back_off moves the bounds; constraint=mpc has none."
             self.conflict("constraint.learn", "a list without lb and ub", remedy)
-        return self
-
-    @model_validator(mode="after")
-    def an_average_is_judged(self) -> Self:
-        if self.average and not self.gate:
-            self.conflict("gate", "true", "The average is what the gate judges.")
         return self
 
     @model_validator(mode="after")
