@@ -98,7 +98,6 @@ PLAIN = ("gate=false", *NO_SEARCH)
 WAYS = {"Q-learning": PLAIN, "default": ()}
 GATE, SEARCH = "gate", "search"
 METHODS = {
-    "N - 1": (*PLAIN, "target_horizon=shrinking", "task.gamma=1"),
     "n steps": (*PLAIN, "n_step=5"),
     "lambda": (*PLAIN, "n_step=8", "lmbda=0.8"),
     "average cost": (*PLAIN, "average_cost=true"),

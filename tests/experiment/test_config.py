@@ -49,7 +49,6 @@ NOT_NEEDED = (
     "rivals",
     "search.margin_k",
     "start.name",
-    "target_horizon",
     "task.file",
     "task.kwargs",
 )
@@ -239,7 +238,6 @@ BAD: dict[str, list[Any]] = {
     "td_error_clip": [0, *REAL[:-1]],
     "delay_value": FLAG,
     "target_rate": FRACTION,
-    "target_horizon": ["long", *NAME],
     "n_step": WHOLE,
     "lmbda": FRACTION[:-1],
     "average_cost": FLAG,
@@ -459,7 +457,7 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
     later = ("logger", "eval_seed", "start", "gate", "anchor")
-    for key in (*later, "prediction", "back_off", "search", "target_horizon", "n_step"):
+    for key in (*later, "prediction", "back_off", "search", "n_step"):
         del cfg[key]
     OmegaConf.save(cfg, file)
     assert differences(settings(cfg), now) is None
@@ -566,18 +564,6 @@ def test_solver_must_be_known():
             "noise.std: got 0.1, expected null. The noise of gros_zanon cannot be changed",
         ),
         (
-            ["target_horizon=shrinking", "task.horizon=1"],
-            "task.horizon: got 1, expected at least 2. target_horizon=shrinking drops",
-        ),
-        (
-            ["target_horizon=shrinking", "task.hessian=full"],
-            "task.hessian: got 'full', expected diagonal or block. target_horizon=shrinking",
-        ),
-        (
-            ["target_horizon=shrinking", "algo=td3"],
-            "target_horizon: got 'shrinking', expected receding. td3 does not support",
-        ),
-        (
             ["anchor=1"],
             "start.name: got 'model', expected data. The anchor is at a C that was identified",
         ),
@@ -621,10 +607,6 @@ def test_solver_must_be_known():
             "moves the bounds; constraint=mpc has none",
         ),
         (["lmbda=0.9"], "n_step: got 1, expected at least 2. lmbda mixes the returns of 1"),
-        (
-            ["n_step=3", "target_horizon=shrinking"],
-            "n_step: got 3, expected 1. target_horizon=shrinking has returns of one step",
-        ),
         (["n_step=3", "algo=sac"], "n_step: got 3, expected 1. sac does not support returns of"),
         (["n_step=3", "replay=false"], "replay: got False, expected true. n_step above 1 reads"),
         (
@@ -638,10 +620,6 @@ def test_solver_must_be_known():
         (
             ["average_cost=true", "algo=ddpg"],
             "average_cost: got True, expected false. ddpg does not support an average cost",
-        ),
-        (
-            ["average_cost=true", "target_horizon=shrinking"],
-            "target_horizon: got 'shrinking', expected receding with average_cost. A plant",
         ),
         (
             ["average_cost=true", "task.learn_cost=[H]"],

@@ -123,8 +123,6 @@ def test_bad_arguments():
     with pytest.raises(QPError, match="average_cost: got True, expected a QPMPC that learns c"):
         make_loss(learn=("H",))
     operator = QPActorValueOperator(random_mpc(3))
-    with pytest.raises(QPError, match="average_cost: got True, expected False if shrinking"):
-        QPQLearningLoss(operator, horizon="shrinking", average_cost=True)
     with pytest.raises(QPError, match="average_cost: got 'no', expected True or False"):
         QPQLearningLoss(operator, average_cost="no")  # pyright: ignore[reportArgumentType] - wrong on purpose
     with pytest.raises(QPError, match=r"gamma: got 0\.9, expected 1 with average_cost"):

@@ -111,7 +111,6 @@ def make_learner(
         loss_module = QPQLearningLoss(
             operator,
             delay_value=cfg.delay_value,
-            horizon=cfg.target_horizon,
             average_cost=cfg.average_cost,
             td_error_clip=cfg.td_error_clip,
         )

@@ -22,9 +22,6 @@ from torch_qpmpc.learning.returns import STEPS
 from torch_qpmpc.learning.td_error import invalid_rewards, td_loss, td_metadata
 from torch_qpmpc.qp.tracing import has_values
 
-#: The choices of V(s+)'s horizon: N or N - 1 stages.
-HORIZONS = ("receding", "shrinking")
-
 
 class QPQLearningLoss(LossModule):
     """The loss of semi-gradient Q-learning with a QP (eq:thup).
@@ -32,12 +29,6 @@ class QPQLearningLoss(LossModule):
     The TD error is delta = L + gamma (1 - terminated) V(s+) - Q(s, a), with reward = -L in TorchRL.
     V and Q are the same QP without and with u_0 fixed, so V(s+) is exactly min over a of Q(s+, a).
     Truncation bootstraps, termination does not.
-
-    With ``horizon="shrinking"`` the target has V_{N-1}(s+), of the QP with one stage less
-    (`QPMPC.shortened`), so that Q_N is the cost of N steps and a terminal cost, and gamma may be 1.
-    For an exact model and stage cost the TD error is zero whatever the terminal cost is. The target
-    is thus biased: no cost beyond the horizon enters it, and the terminal cost is not learned. The
-    default, ``"receding"``, has V_N(s+): terminal cost and c must then account for all later costs.
 
     With ``average_cost=True`` it is the differential TD error L - rho + V(s+) - Q(s, a) of a plant
     that never ends (Wan, Naik and Sutton 2021, `arXiv 2006.16318
@@ -63,7 +54,6 @@ class QPQLearningLoss(LossModule):
             ends with one, whose other modules write its inputs, such as residuals of theta.
         delay_value: evaluate V(s+) with a target network. By default, as in the paper, with the
             current theta.
-        horizon: ``"receding"`` (default) or ``"shrinking"``: V(s+) with N or with N - 1 stages.
         average_cost: learn differential values and the average cost, with gamma = 1.
         td_error_clip: bound on the absolute TD error in the update; none by default.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
@@ -140,7 +130,6 @@ class QPQLearningLoss(LossModule):
         value_network: QPActorValueOperator | TensorDictSequential,
         *,
         delay_value: bool = False,
-        horizon: str = "receding",
         average_cost: bool = False,
         td_error_clip: float | None = None,
         gamma: float | None = None,
@@ -165,21 +154,13 @@ class QPQLearningLoss(LossModule):
         check_flag("delay_value", delay_value)
         check_flag("average_cost", average_cost)
         mpc = last.module
-        if horizon not in HORIZONS:
-            raise QPError.expected("horizon", repr(horizon), "'receding' or 'shrinking'")
-        if horizon == "shrinking":
-            mpc.shortened()  # raises the error of a QP without stages to drop
-        if average_cost and horizon == "shrinking":
-            remedy = "A plant that never ends has no last of N steps."
-            raise QPError.expected("average_cost", average_cost, "False if shrinking", remedy)
         if average_cost and "c" not in mpc.learned:
             remedy = "The steps of c move the average cost."
             raise QPError.expected("average_cost", average_cost, "a QPMPC that learns c", remedy)
         if use_prioritized_weights not in ("auto", True, False):
             got = repr(use_prioritized_weights)
             raise QPError.expected("use_prioritized_weights", got, "'auto', True or False")
-        self.delay_value, self.horizon = delay_value, horizon
-        self.td_error_clip = td_error_clip
+        self.delay_value, self.td_error_clip = delay_value, td_error_clip
         self.reduction = reduction or "mean"
         self.use_prioritized_weights = use_prioritized_weights
         self.convert_to_functional(
@@ -191,8 +172,7 @@ class QPQLearningLoss(LossModule):
         self.register_buffer("average_cost", rho)
         self.register_buffer("fixed_c", c)
         # Not registered as a submodule, because its parameters are the value network's.
-        value = self.operator.get_value_operator(shortened=horizon == "shrinking")
-        view = _in_place_of_last(self.value_network, value)
+        view = _in_place_of_last(self.value_network, self.operator.get_value_operator())
         object.__setattr__(self, "state_value_network", view)
 
     @property
@@ -248,13 +228,9 @@ class QPQLearningLoss(LossModule):
         """Choose how V(s+) enters the target: TD0 (default), TD1 or TDLambda.
 
         Raises:
-            QPError: if ``gamma`` or ``lmbda`` is not in [0, 1], ``gamma`` is not 1 with an average
-                cost, or the horizon is shrinking and the estimator is not TD0, since n steps would
-                need V_{N-n}.
+            QPError: if ``gamma`` or ``lmbda`` is not in [0, 1], or ``gamma`` is not 1 with an
+                average cost.
         """
-        if self.horizon == "shrinking" and value_type not in (None, "td0", ValueEstimators.TD0):
-            remedy = "Other estimators need horizon='receding'."
-            raise QPError.expected("value_type", repr(value_type), "TD0", remedy)
         for name in {"gamma", "lmbda"} & hyperparams.keys():
             _check_factor(name, hyperparams[name])
         if self.average_cost is not None and hyperparams.setdefault("gamma", 1.0) != 1:

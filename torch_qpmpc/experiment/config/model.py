@@ -34,7 +34,6 @@ from torch_qpmpc.experiment.fields import (
     one_of,
 )
 from torch_qpmpc.experiment.tasks import TaskSettings, find_task
-from torch_qpmpc.learning.q_learning import HORIZONS
 from torch_qpmpc.mpc.projections import STEPS, check_step
 from torch_qpmpc.qp.solvers import backend
 
@@ -76,7 +75,6 @@ class Config(Group):
     td_error_clip: Annotated[Positive | None, Expected("a finite number > 0, or null")]
     delay_value: Flag
     target_rate: Fraction
-    target_horizon: Annotated[str, one_of(HORIZONS)] = "receding"
     n_step: Count = 1
     lmbda: Annotated[Fraction | None, Expected("a number in (0, 1], or null")] = None
     average_cost: Flag = False
@@ -247,21 +245,6 @@ class Config(Group):
         return self
 
     @model_validator(mode="after")
-    def shrinking_horizon_has_stages(self) -> Self:
-        if self.target_horizon == "receding":
-            return self
-        if self.algo.name != "qlearning":
-            remedy = f"{self.algo.name} does not support a shrinking horizon."
-            self.conflict("target_horizon", "receding", remedy)
-        if self.task.horizon == 1:
-            remedy = "target_horizon=shrinking drops a stage."
-            self.conflict("task.horizon", "at least 2", remedy)
-        if self.task.hessian == "full":
-            remedy = "target_horizon=shrinking drops a stage, and a full H couples them."
-            self.conflict("task.hessian", "diagonal or block", remedy)
-        return self
-
-    @model_validator(mode="after")
     def returns_of_several_steps_have_a_replay(self) -> Self:
         if self.n_step == 1:
             if self.lmbda is not None:
@@ -270,9 +253,6 @@ class Config(Group):
             return self
         if self.algo.name != "qlearning":
             remedy = f"{self.algo.name} does not support returns of several steps."
-            self.conflict("n_step", "1", remedy)
-        if self.target_horizon == "shrinking":
-            remedy = "target_horizon=shrinking has returns of one step."
             self.conflict("n_step", "1", remedy)
         if not self.replay:
             self.conflict("replay", "true", "n_step above 1 reads its steps from the replay.")
@@ -291,9 +271,6 @@ class Config(Group):
         if self.algo.name != "qlearning":
             remedy = f"{self.algo.name} does not support an average cost."
             self.conflict("average_cost", "false", remedy)
-        if self.target_horizon == "shrinking":
-            remedy = "A plant that never ends has no last of N steps."
-            self.conflict("target_horizon", "receding with average_cost", remedy)
         if "c" not in self.task.learn_cost:
             remedy = "The steps of c move the average cost."
             self.conflict("task.learn_cost", "a list with c", remedy)
