@@ -98,8 +98,6 @@ PLAIN = ("gate=false", *NO_SEARCH)
 WAYS = {"Q-learning": PLAIN, "default": ()}
 GATE, SEARCH = "gate", "search"
 METHODS = {
-    "n steps": (*PLAIN, "n_step=5"),
-    "lambda": (*PLAIN, "n_step=8", "lmbda=0.8"),
     "average cost": (*PLAIN, "average_cost=true"),
     "anchor": (*PLAIN, "anchor=100"),
     GATE: NO_SEARCH,
@@ -137,7 +135,7 @@ def configuration(case: str, way: str, seed: int) -> DictConfig:
 
 
 def applies(case: str, method: str) -> bool:
-    """Tell whether a method can be used: some need a replay, or a free C and a log."""
+    """Tell whether a method can be used: some need a free C and a log."""
     try:
         check_config(configuration(case, method, seed=0))
     except QPError:

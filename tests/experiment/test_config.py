@@ -43,8 +43,6 @@ NOT_NEEDED = (
     "gate_interval",
     "average_cost",
     "logger",
-    "lmbda",
-    "n_step",
     "prediction",
     "rivals",
     "search.margin_k",
@@ -238,8 +236,6 @@ BAD: dict[str, list[Any]] = {
     "td_error_clip": [0, *REAL[:-1]],
     "delay_value": FLAG,
     "target_rate": FRACTION,
-    "n_step": WHOLE,
-    "lmbda": FRACTION[:-1],
     "average_cost": FLAG,
     "step": ["newton", *NAME],
     "penalty_step": ["newton", *NAME],
@@ -457,7 +453,7 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
     later = ("logger", "eval_seed", "start", "gate", "anchor")
-    for key in (*later, "prediction", "back_off", "search", "n_step"):
+    for key in (*later, "prediction", "back_off", "search"):
         del cfg[key]
     OmegaConf.save(cfg, file)
     assert differences(settings(cfg), now) is None
@@ -605,17 +601,6 @@ def test_solver_must_be_known():
             ["constraint=adaptive", "constraint.learn=[C,lb]"],
             r"constraint.learn: got \['C', 'lb'\], expected a list without lb and ub. back_off "
             "moves the bounds; constraint=mpc has none",
-        ),
-        (["lmbda=0.9"], "n_step: got 1, expected at least 2. lmbda mixes the returns of 1"),
-        (["n_step=3", "algo=sac"], "n_step: got 3, expected 1. sac does not support returns of"),
-        (["n_step=3", "replay=false"], "replay: got False, expected true. n_step above 1 reads"),
-        (
-            ["n_step=3", "collector=multi", "collector.sync=false"],
-            "collector.sync: got False, expected true. n_step above 1 needs the following",
-        ),
-        (
-            ["n_step=3", "lmbda=0.9", "batch_size=256"],
-            "batch_size: got 256, expected a multiple of n_step = 3. lmbda samples slices",
         ),
         (
             ["average_cost=true", "algo=ddpg"],

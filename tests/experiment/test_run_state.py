@@ -41,8 +41,7 @@ SGD = ("optimizer=sgd", "penalty_step=subgradient")
         ("optimizer=recursive", *STREAM, "constraint=mpc"),
         ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
         ("delay_value=true", "noise=brownian", "steps_per_update=3", "warm_start=false"),
-        ("optimizer=gauss_newton", "n_step=3", "replay_capacity=48", "average_cost=true"),
-        ("task=store", "optimizer=gauss_newton", "n_step=4", "lmbda=0.8", "average_cost=true"),
+        ("task=store", "optimizer=gauss_newton", "replay_capacity=48", "average_cost=true"),
         ("algo=td3", *ACTOR_CRITIC),
         (*GATED, "constraint=mpc", "release=5", "search.w=0.5"),
         (*GATED, *ANCHORED, "constraint=free"),
@@ -143,7 +142,7 @@ def test_a_finished_run_saves_theta_without_data(tmp_path, stopped):
 
 def test_environments_of_gymnasium_start_new_episodes_on_resume(tmp_path, monkeypatch, capsys):
     """Their state cannot be saved, nor that of other processes: test_collection.py."""
-    cfg = make_config(*RUN, "task=pendulum", "noise=none", "updates=6", "n_step=3")
+    cfg = make_config(*RUN, "task=pendulum", "noise=none", "updates=6")
     assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
     go_on(tmp_path)
     expected = "Starting new episodes: the state of the environments is not saved."

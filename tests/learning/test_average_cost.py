@@ -13,7 +13,6 @@ from torch.testing import assert_close
 from tests.learning.test_warm_start import transitions
 from tests.problems import random_mpc
 from torch_qpmpc import QPMPC, GaussNewton, QPActorValueOperator, QPError, QPQLearningLoss
-from torch_qpmpc.learning.returns import STEPS
 from torch_qpmpc.learning.updates import first_order, second_order
 
 A, B, R, STD = 0.9, 0.5, 0.5, 0.3
@@ -98,15 +97,6 @@ def test_a_gradient_step_moves_rho_by_the_mean_td_error():
         assert loss.average_cost.item() == pytest.approx(rho)
         assert terms["train/average_cost"] == loss.average_cost
         assert mpc.c.item() == c
-
-
-def test_a_return_of_several_steps_has_rho_as_often():
-    loss, batch = make_loss(), transitions()
-    before = loss.target(batch)
-    loss.average_cost.fill_(2.0)
-    assert_close(loss.target(batch), before + 2.0)
-    steps = torch.arange(1, len(batch) + 1).unsqueeze(-1)
-    assert_close(loss.target(batch.copy().set(STEPS, steps)), before + 2.0 * steps.squeeze(-1))
 
 
 def test_the_average_cost_is_part_of_the_state():

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
-from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
+from torchrl.objectives import LossModule, SoftUpdate
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.actor_critic import (
@@ -118,11 +118,7 @@ def make_learner(
     else:
         loss_module = make_actor_critic_loss(cfg, mpc, physics)
         actor = make_closed_loop_actor(cfg, mpc, loss_module, physics)
-    gamma = target_gamma(cfg)
-    if cfg.lmbda is None:
-        loss_module.make_value_estimator(gamma=gamma)
-    else:
-        loss_module.make_value_estimator(ValueEstimators.TDLambda, gamma=gamma, lmbda=cfg.lmbda)
+    loss_module.make_value_estimator(gamma=target_gamma(cfg))
     deviation, si = make_penalties(cfg, mpc)
     anchor, errors = make_anchor(cfg, start), make_errors(cfg, mpc)
     optimizer = make_optimizer(cfg, mpc, loss_module, anchor, errors)

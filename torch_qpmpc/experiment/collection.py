@@ -93,8 +93,6 @@ def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
         active_rows=len(mpc.G) if cfg.warm_start else None,
         n_x=mpc.n_x,
         preview_key=preview_key(mpc),
-        n_step=cfg.n_step,
-        gamma=target_gamma(cfg) if cfg.lmbda is None else None,
     )
 
 

@@ -18,7 +18,6 @@ from torch_qpmpc.checks import check_flag, check_number
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.operators import QPActorValueOperator, QPValueOperator
 from torch_qpmpc.learning.restoring import call_with
-from torch_qpmpc.learning.returns import STEPS
 from torch_qpmpc.learning.td_error import invalid_rewards, td_loss, td_metadata
 from torch_qpmpc.qp.tracing import has_values
 
@@ -345,7 +344,7 @@ class QPQLearningLoss(LossModule):
         next_value = self._next_value(tensordict)
         valid = reward.masked_fill(invalid, 0)
         if self.average_cost is not None:
-            valid = valid + self.average_cost.to(reward) * tensordict.get(STEPS, 1)
+            valid = valid + self.average_cost.to(reward) * tensordict.get("steps_to_next_obs", 1)
         target = self._estimate(tensordict, valid, next_value)
         target = torch.where(target.isfinite(), target, -torch.inf)
         if not has_values(invalid) or invalid.any():

@@ -75,8 +75,6 @@ class Config(Group):
     td_error_clip: Annotated[Positive | None, Expected("a finite number > 0, or null")]
     delay_value: Flag
     target_rate: Fraction
-    n_step: Count = 1
-    lmbda: Annotated[Fraction | None, Expected("a number in (0, 1], or null")] = None
     average_cost: Flag = False
     step: Annotated[str, one_of(STEPS), AfterValidator(_installed_step)]
     penalty_step: Annotated[str, one_of(("proximal", "subgradient"))]
@@ -242,26 +240,6 @@ class Config(Group):
     def export_has_a_qp(self) -> Self:
         if self.export and self.algo.name != "qlearning" and self.algo.actor != "qp":
             self.conflict("export", "null", "The policy of algo.actor=mlp is a network.")
-        return self
-
-    @model_validator(mode="after")
-    def returns_of_several_steps_have_a_replay(self) -> Self:
-        if self.n_step == 1:
-            if self.lmbda is not None:
-                remedy = "lmbda mixes the returns of 1 .. n_step steps."
-                self.conflict("n_step", "at least 2", remedy)
-            return self
-        if self.algo.name != "qlearning":
-            remedy = f"{self.algo.name} does not support returns of several steps."
-            self.conflict("n_step", "1", remedy)
-        if not self.replay:
-            self.conflict("replay", "true", "n_step above 1 reads its steps from the replay.")
-        if self.collector.name != "single" and not self.collector.sync:
-            remedy = "n_step above 1 needs the following steps of each environment."
-            self.conflict("collector.sync", "true", remedy)
-        if self.lmbda is not None and self.batch_size % self.n_step:
-            remedy = "lmbda samples slices of n_step steps."
-            self.conflict("batch_size", f"a multiple of n_step = {self.n_step}", remedy)
         return self
 
     @model_validator(mode="after")
