@@ -98,7 +98,6 @@ PLAIN = ("gate=false", *NO_SEARCH)
 WAYS = {"Q-learning": PLAIN, "default": ()}
 GATE, SEARCH = "gate", "search"
 METHODS = {
-    "average cost": (*PLAIN, "average_cost=true"),
     "anchor": (*PLAIN, "anchor=100"),
     GATE: NO_SEARCH,
     SEARCH: ("updates=1",),

@@ -41,7 +41,6 @@ NOT_NEEDED = (
     "export",
     "gate",
     "gate_interval",
-    "average_cost",
     "logger",
     "prediction",
     "rivals",
@@ -236,7 +235,6 @@ BAD: dict[str, list[Any]] = {
     "td_error_clip": [0, *REAL[:-1]],
     "delay_value": FLAG,
     "target_rate": FRACTION,
-    "average_cost": FLAG,
     "step": ["newton", *NAME],
     "penalty_step": ["newton", *NAME],
     "ablation": [3, True],
@@ -601,18 +599,6 @@ def test_solver_must_be_known():
             ["constraint=adaptive", "constraint.learn=[C,lb]"],
             r"constraint.learn: got \['C', 'lb'\], expected a list without lb and ub. back_off "
             "moves the bounds; constraint=mpc has none",
-        ),
-        (
-            ["average_cost=true", "algo=ddpg"],
-            "average_cost: got True, expected false. ddpg does not support an average cost",
-        ),
-        (
-            ["average_cost=true", "task.learn_cost=[H]"],
-            r"task.learn_cost: got \['H'\], expected a list with c. The steps of c move",
-        ),
-        (
-            ["average_cost=true", "constraint=mpc", "release=5"],
-            "release: got 5, expected null. average_cost does not support release",
         ),
         (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
     ],

@@ -41,7 +41,7 @@ SGD = ("optimizer=sgd", "penalty_step=subgradient")
         ("optimizer=recursive", *STREAM, "constraint=mpc"),
         ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
         ("delay_value=true", "noise=brownian", "steps_per_update=3", "warm_start=false"),
-        ("task=store", "optimizer=gauss_newton", "replay_capacity=48", "average_cost=true"),
+        ("task=store", "optimizer=gauss_newton", "replay_capacity=48"),
         ("algo=td3", *ACTOR_CRITIC),
         (*GATED, "constraint=mpc", "release=5", "search.w=0.5"),
         (*GATED, *ANCHORED, "constraint=free"),

@@ -20,7 +20,6 @@ from torch_qpmpc.experiment.actor_critic import (
     make_actor_critic_loss,
     make_closed_loop_actor,
 )
-from torch_qpmpc.experiment.collection import target_gamma
 from torch_qpmpc.experiment.tasks import AnyPlant, Start, find_task
 from torch_qpmpc.learning.anchor import Anchor
 from torch_qpmpc.learning.gauss_newton import GaussNewton
@@ -111,14 +110,13 @@ def make_learner(
         loss_module = QPQLearningLoss(
             operator,
             delay_value=cfg.delay_value,
-            average_cost=cfg.average_cost,
             td_error_clip=cfg.td_error_clip,
         )
         actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
     else:
         loss_module = make_actor_critic_loss(cfg, mpc, physics)
         actor = make_closed_loop_actor(cfg, mpc, loss_module, physics)
-    loss_module.make_value_estimator(gamma=target_gamma(cfg))
+    loss_module.make_value_estimator(gamma=cfg.task.gamma)
     deviation, si = make_penalties(cfg, mpc)
     anchor, errors = make_anchor(cfg, start), make_errors(cfg, mpc)
     optimizer = make_optimizer(cfg, mpc, loss_module, anchor, errors)

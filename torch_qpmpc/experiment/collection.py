@@ -29,11 +29,6 @@ def num_columns(cfg: DictConfig) -> int:
     return cfg.num_envs // cfg.collector.workers if asynchronous else cfg.num_envs
 
 
-def target_gamma(cfg: DictConfig) -> float:
-    """Return the discount factor of the TD target: 1 with an average cost."""
-    return 1.0 if cfg.average_cost else cfg.task.gamma
-
-
 def make_collector(
     cfg: DictConfig, physics: AnyPlant, actor: TensorDictModuleBase
 ) -> BaseCollector:

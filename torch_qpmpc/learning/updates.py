@@ -93,9 +93,7 @@ def first_order(
             mpc.project_()
             if proximal is not None:
                 proximal.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
-        if isinstance(loss_module, QPQLearningLoss):
-            loss_module.move_c_()
-        return terms | average_cost(loss_module), losses
+        return terms, losses
 
     return update
 
@@ -145,8 +143,7 @@ def second_order(
         terms["loss/value"] = elementwise[solved].sum() / solved.sum().clamp(min=1)
         terms["train/damping"] = torch.tensor(report.damping, dtype=torch.float64)
         terms["train/accepted"] = torch.tensor(float(report.accepted))
-        loss_module.move_c_()
-        return terms | average_cost(loss_module), losses
+        return terms, losses
 
     return update
 
@@ -159,12 +156,6 @@ def _alone(loss_module: QPQLearningLoss) -> QPActorValueOperator:
         got = "a value network with theta_keys or upstream modules"
         raise QPError.expected("loss_module", got, "a QPActorValueOperator alone", remedy)
     return network
-
-
-def average_cost(loss_module: LossModule) -> dict[str, Tensor]:
-    """Return the average cost of a loss for logging; nothing if it has none."""
-    rho = getattr(loss_module, "average_cost", None)
-    return {} if rho is None else {"train/average_cost": rho.clone()}
 
 
 def entries_of_C(mpc: QPMPC) -> Tensor:

@@ -75,7 +75,6 @@ class Config(Group):
     td_error_clip: Annotated[Positive | None, Expected("a finite number > 0, or null")]
     delay_value: Flag
     target_rate: Fraction
-    average_cost: Flag = False
     step: Annotated[str, one_of(STEPS), AfterValidator(_installed_step)]
     penalty_step: Annotated[str, one_of(("proximal", "subgradient"))]
     release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
@@ -240,20 +239,6 @@ class Config(Group):
     def export_has_a_qp(self) -> Self:
         if self.export and self.algo.name != "qlearning" and self.algo.actor != "qp":
             self.conflict("export", "null", "The policy of algo.actor=mlp is a network.")
-        return self
-
-    @model_validator(mode="after")
-    def average_cost_has_a_constant_that_moves_it(self) -> Self:
-        if not self.average_cost:
-            return self
-        if self.algo.name != "qlearning":
-            remedy = f"{self.algo.name} does not support an average cost."
-            self.conflict("average_cost", "false", remedy)
-        if "c" not in self.task.learn_cost:
-            remedy = "The steps of c move the average cost."
-            self.conflict("task.learn_cost", "a list with c", remedy)
-        if self.release is not None:
-            self.conflict("release", "null", "average_cost does not support release.")
         return self
 
     @model_validator(mode="after")
