@@ -39,7 +39,7 @@ SGD = ("optimizer=sgd", "penalty_step=subgradient")
         ("optimizer=gauss_newton", "constraint=combined", "solver=proxqp"),
         ("optimizer=adam", "constraint=mpc", "release=9"),
         ("optimizer=recursive", *STREAM, "constraint=mpc"),
-        ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
+        ("optimizer=recursive", *STREAM, "replay=true", "replay_capacity=16", "batch_size=4"),
         ("delay_value=true", "noise=brownian", "steps_per_update=3", "warm_start=false"),
         ("task=store", "optimizer=gauss_newton", "replay_capacity=48"),
         ("algo=td3", *ACTOR_CRITIC),

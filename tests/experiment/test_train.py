@@ -266,7 +266,7 @@ def test_a_stream_whose_transitions_are_used_once_learns(tmp_path, overrides):
 
 def test_the_stream_can_be_replayed(tmp_path):
     """It can be drawn, too: it has two states and one action instead of four and two."""
-    replayed = ("optimizer=sliding", "exploration_std=0.05", "figures=true")
+    replayed = ("replay=true", "replay_capacity=320", "figures=true")
     cfg = make_config(*STREAM, *replayed, "updates=15", "eval_interval=15")
     assert train.train(cfg, str(tmp_path))["unsolved"] == 0
     assert metrics(tmp_path)["qp/recalled"].iloc[-1] > 0
