@@ -236,7 +236,6 @@ BAD: dict[str, list[Any]] = {
     "delay_value": FLAG,
     "target_rate": FRACTION,
     "step": ["newton", *NAME],
-    "penalty_step": ["newton", *NAME],
     "ablation": [3, True],
     "eval_seed": WHOLE[1:-2],
     "logger": ["visdom", *NAME],
@@ -485,10 +484,6 @@ def test_solver_must_be_known():
             r"task.learn_cost: got \[\], expected something to learn, here or in constraint.learn",
         ),
         (
-            ["optimizer=gauss_newton", "penalty_step=subgradient"],
-            r"penalty_step: got 'subgradient', expected proximal. gauss_newton takes no subg",
-        ),
-        (
             ["optimizer=gauss_newton", "constraint=si", "constraint.si.normalised=true"],
             r"constraint.si.normalised: got True, expected False. gauss_newton needs a penal",
         ),
@@ -628,7 +623,6 @@ def test_the_step_rule_needs_its_solver(monkeypatch):
 ABLATIONS: dict[str, tuple[list[str], dict[str, Any]]] = {
     "reference": ([], {}),
     "adam_proximal": (["optimizer=adam"], {}),
-    "adam_subgradient": (["optimizer=adam"], {"penalty_step": "subgradient"}),
     "sgd": (["optimizer=sgd"], {"step": "projection"}),
     "target_network": (["optimizer=adam"], {"delay_value": True}),
     "markov": ([], {"constraint.deviation.c_3": 1.0}),

@@ -27,7 +27,6 @@ GATED = ("gate=true", "optimizer=gauss_newton")
 ANCHORED = ("start=data", "start.transitions=200", "anchor=1")
 ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
 NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
-SGD = ("optimizer=sgd", "penalty_step=subgradient")
 
 
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
@@ -35,7 +34,7 @@ SGD = ("optimizer=sgd", "penalty_step=subgradient")
     "overrides",
     [
         ("optimizer=adam", "constraint=combined"),
-        (*SGD, "constraint=combined", "solver=torch", "step=projection"),
+        ("optimizer=sgd", "constraint=combined", "solver=torch", "step=projection"),
         ("optimizer=gauss_newton", "constraint=combined", "solver=proxqp"),
         ("optimizer=adam", "constraint=mpc", "release=9"),
         ("optimizer=recursive", *STREAM, "constraint=mpc"),

@@ -220,7 +220,6 @@ def make_update(
         optimizer,
         deviation,
         si,
-        cfg.penalty_step,
         lambda: (done + schedule.last_epoch + 1) % every == 0,
     )
 

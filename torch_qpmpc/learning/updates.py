@@ -36,7 +36,6 @@ def first_order(
     optimizer: torch.optim.Optimizer,
     deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
-    penalty_step: str = "proximal",
     actor_due: Callable[[], bool] = lambda: True,
 ) -> Update:
     """Return an update by a torch optimiser on the gradient of the loss and the penalties.
@@ -49,13 +48,9 @@ def first_order(
         loss_module: any TorchRL loss; its ``loss_*`` entries are summed.
         optimizer: any torch optimiser of the parameters in ``loss_module``.
         deviation, si: the penalties on C; None for none.
-        penalty_step: ``"proximal"``, or ``"subgradient"`` to add the deviation penalty to the loss.
         actor_due: returns True for an update of actor and critics, False for the critics alone, as
             TD3 delays its actor.
     """
-    by_gradient, proximal = None, deviation
-    if penalty_step == "subgradient":
-        by_gradient, proximal = deviation, None
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
         with restored(loss_module):
@@ -63,8 +58,6 @@ def first_order(
         terms = {name.replace("_", "/", 1): x for name, x in losses.items() if "loss_" in name}
         if si is not None and windows is not None:
             terms["loss/si"] = si(mpc.C, windows)
-        if by_gradient is not None:
-            terms["loss/deviation"] = by_gradient(mpc.C)
         due = actor_due()
         total = torch.stack([x for name, x in terms.items() if due or "value" in name]).sum()
         optimizer.zero_grad()
@@ -91,8 +84,8 @@ def first_order(
         optimizer.step()
         if due:
             mpc.project_()
-            if proximal is not None:
-                proximal.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
+            if deviation is not None:
+                deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
         return terms, losses
 
     return update

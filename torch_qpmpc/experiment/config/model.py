@@ -76,7 +76,6 @@ class Config(Group):
     delay_value: Flag
     target_rate: Fraction
     step: Annotated[str, one_of(STEPS), AfterValidator(_installed_step)]
-    penalty_step: Annotated[str, one_of(("proximal", "subgradient"))]
     release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
     resume: Annotated[str | None, Expected("a path, or null")]
     ablation: Annotated[str | None, Expected("a name, or null")]
@@ -145,12 +144,10 @@ class Config(Group):
 
     @model_validator(mode="after")
     def second_order_has_quadratic_penalties(self) -> Self:
-        """Check that gauss_newton can apply the penalties: proximal, or quadratic in a free C."""
+        """Check that gauss_newton can apply the SI penalty, which must be quadratic in a free C."""
         penalties = self.constraint
         if not self.second_order:
             return self
-        if penalties.deviation is not None and self.penalty_step != "proximal":
-            self.conflict("penalty_step", "proximal", "gauss_newton takes no subgradient steps.")
         if penalties.si is not None and penalties.si.normalised:
             remedy = "gauss_newton needs a penalty that is quadratic in C."
             self.conflict("constraint.si.normalised", "False", remedy)
