@@ -118,7 +118,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
         "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
     }.items():
-        cfg = make_config(*SMALL, *SEARCH, "delay_value=true", *overrides)
+        cfg = make_config(*SMALL, *SEARCH, *overrides)
         monkeypatch.setattr(
             train, "RunFolder", lambda folder, _, after, cfg=cfg: RunFolder(folder, cfg, after)
         )
@@ -233,7 +233,6 @@ BAD: dict[str, list[Any]] = {
     "release": [*WHOLE[:-2], math.nan],
     "exploration_std": REAL,
     "td_error_clip": [0, *REAL[:-1]],
-    "delay_value": FLAG,
     "target_rate": FRACTION,
     "step": ["newton", *NAME],
     "ablation": [3, True],
@@ -624,7 +623,6 @@ ABLATIONS: dict[str, tuple[list[str], dict[str, Any]]] = {
     "reference": ([], {}),
     "adam_proximal": (["optimizer=adam"], {}),
     "sgd": (["optimizer=sgd"], {"step": "projection"}),
-    "target_network": (["optimizer=adam"], {"delay_value": True}),
     "markov": ([], {"constraint.deviation.c_3": 1.0}),
     "si_raw": (["optimizer=adam", "constraint=si"], {}),
     "si_normalised": (["optimizer=adam", "constraint=si"], {"constraint.si.normalised": True}),

@@ -39,7 +39,7 @@ NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
         ("optimizer=adam", "constraint=mpc", "release=9"),
         ("optimizer=recursive", *STREAM, "constraint=mpc"),
         ("optimizer=recursive", *STREAM, "replay=true", "replay_capacity=16", "batch_size=4"),
-        ("delay_value=true", "noise=brownian", "steps_per_update=3", "warm_start=false"),
+        ("noise=brownian", "steps_per_update=3", "warm_start=false"),
         ("task=store", "optimizer=gauss_newton", "replay_capacity=48"),
         ("algo=td3", *ACTOR_CRITIC),
         (*GATED, "constraint=mpc", "release=5", "search.w=0.5"),

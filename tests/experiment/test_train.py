@@ -344,20 +344,6 @@ def test_a_scheme_with_dense_weights_learns_them_by_each_rule(tmp_path, rule, op
     assert (state["w"] >= 0).all()
 
 
-@pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
-def test_target_network(tmp_path):
-    """A target network changes the targets from the second update on."""
-    for name, rate in (("slow", 0.01), ("fast", 1.0), ("none", None)):
-        more = (
-            ["delay_value=false"] if rate is None else ["delay_value=true", f"target_rate={rate}"]
-        )
-        run_small(tmp_path / name, *more)
-    slow, fast, none = (metrics(tmp_path / n)["loss/value"] for n in ("slow", "fast", "none"))
-    assert slow[1] == fast[1] == none[1]
-    assert slow[2] != fast[2]
-    np.testing.assert_allclose(fast[2:], none[2:], rtol=1e-6)
-
-
 def test_plain_gradient_step(tmp_path):
     run_small(tmp_path / "free", "optimizer=sgd", "constraint=free")
     deviation, _ = learned_C(tmp_path / "free")

@@ -47,7 +47,7 @@ class Learner:
         loss_module: the loss, with its target networks and critics.
         actor: maps observation to action, without exploration.
         deviation, si: the penalties; None if off.
-        target: the soft update of the target network; None without one.
+        target: the soft update of an actor-critic's target networks; None for Q-learning.
         n_preview: entries of the preview, with which p begins.
         errors: the prediction errors of the transitions; None if nothing uses them.
         back_off: tightens the bounds by the covariance of these; None if it is off.
@@ -107,11 +107,7 @@ def make_learner(
     """
     mpc = operator.module
     if cfg.algo.name == "qlearning":
-        loss_module = QPQLearningLoss(
-            operator,
-            delay_value=cfg.delay_value,
-            td_error_clip=cfg.td_error_clip,
-        )
+        loss_module = QPQLearningLoss(operator, td_error_clip=cfg.td_error_clip)
         actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
     else:
         loss_module = make_actor_critic_loss(cfg, mpc, physics)
@@ -121,7 +117,6 @@ def make_learner(
     anchor, errors = make_anchor(cfg, start), make_errors(cfg, mpc)
     optimizer = make_optimizer(cfg, mpc, loss_module, anchor, errors)
     schedule = make_schedule(cfg, optimizer, done)
-    delayed = cfg.algo.name != "qlearning" or cfg.delay_value
     update = make_update(cfg, mpc, loss_module, optimizer, schedule, deviation, si, done)
     return Learner(
         update,
@@ -131,7 +126,7 @@ def make_learner(
         schedule,
         deviation,
         si,
-        SoftUpdate(loss_module, tau=cfg.target_rate) if delayed else None,
+        None if cfg.algo.name == "qlearning" else SoftUpdate(loss_module, tau=cfg.target_rate),
         (mpc.horizon + 1) * mpc.n_d,
         errors,
         None if cfg.back_off is None else BackOff(mpc, cfg.back_off),

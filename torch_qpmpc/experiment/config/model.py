@@ -73,7 +73,6 @@ class Config(Group):
     replay_capacity: Count
     exploration_std: NonNegative
     td_error_clip: Annotated[Positive | None, Expected("a finite number > 0, or null")]
-    delay_value: Flag
     target_rate: Fraction
     step: Annotated[str, one_of(STEPS), AfterValidator(_installed_step)]
     release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
