@@ -44,7 +44,6 @@ NOT_NEEDED = (
     "logger",
     "prediction",
     "rivals",
-    "search.margin_k",
     "start.name",
     "task.file",
     "task.kwargs",

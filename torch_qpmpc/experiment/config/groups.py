@@ -159,10 +159,8 @@ class Search(Group):
 
     loops: Count
     margin: Size
-    margin_k: Size = None
     b: Size
     w: Size
-    H_x: Size
     H_u: Size
     H_f: Size
     q_f: Size
