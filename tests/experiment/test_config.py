@@ -625,11 +625,9 @@ ABLATIONS: dict[str, tuple[list[str], dict[str, Any]]] = {
     "markov": ([], {"constraint.deviation.c_3": 1.0}),
     "si_raw": (["optimizer=adam", "constraint=si"], {}),
     "si_normalised": (["optimizer=adam", "constraint=si"], {"constraint.si.normalised": True}),
-    "soft_actions": ([], {"task.action_slack": 100.0}),
     "horizon_5": ([], {"task.horizon": 5}),
     "horizon_20": ([], {"task.horizon": 20, "warmup_steps": 20}),
     "projection": ([], {"step": "projection"}),
-    "sdp": ([], {"step": "sdp"}),
 }
 
 
