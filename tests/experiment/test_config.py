@@ -35,7 +35,6 @@ GROUPS = ("constraint", "noise", "optimizer", "task")
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
 NOT_NEEDED = (
-    "anchor",
     "back_off",
     "eval_seed",
     "export",
@@ -240,7 +239,6 @@ BAD: dict[str, list[Any]] = {
     "export": ["python", 3, True],
     "figures": FLAG,
     "gate": FLAG,
-    "anchor": REAL,
     "prediction": REAL,
     "back_off": [0.4, 1, math.nan, False, "half"],
     "search.loops": WHOLE,
@@ -447,7 +445,7 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     cfg, file = make_config("gate=false"), tmp_path / "config.yaml"
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
-    later = ("logger", "eval_seed", "start", "gate", "anchor")
+    later = ("logger", "eval_seed", "start", "gate")
     for key in (*later, "prediction", "back_off", "search"):
         del cfg[key]
     OmegaConf.save(cfg, file)
@@ -549,22 +547,6 @@ def test_solver_must_be_known():
         (
             ["task=gros_zanon", "noise.std=0.1"],
             "noise.std: got 0.1, expected null. The noise of gros_zanon cannot be changed",
-        ),
-        (
-            ["anchor=1"],
-            "start.name: got 'model', expected data. The anchor is at a C that was identified",
-        ),
-        (
-            ["anchor=1", "start=data", "optimizer=adam"],
-            "optimizer.name: got 'adam', expected gauss_newton. The anchor is part of its steps",
-        ),
-        (
-            ["anchor=1", "start=data", "constraint=fixed"],
-            r"constraint.learn: got \[\], expected a list with C, which is anchored",
-        ),
-        (
-            ["anchor=1", "start=data", "constraint=mpc"],
-            "constraint.structure: got 'tied', expected free. The anchor needs a free C",
         ),
         (
             ["prediction=1"],

@@ -24,7 +24,7 @@ RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3")
 STOPS = (2, 7)
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
 GATED = ("gate=true", "optimizer=gauss_newton")
-ANCHORED = ("start=data", "start.transitions=200", "anchor=1")
+DATA = ("start=data", "start.transitions=200")
 ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
 NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
 
@@ -43,7 +43,7 @@ NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
         ("task=store", "optimizer=gauss_newton", "replay_capacity=48"),
         ("algo=td3", *ACTOR_CRITIC),
         (*GATED, "constraint=mpc", "release=5", "search.w=0.5"),
-        (*GATED, *ANCHORED, "constraint=free"),
+        (*GATED, *DATA, "constraint=free"),
         ("optimizer=recursive", *STREAM, *GATED[:1]),
         ("gate=true", "algo=td3", *ACTOR_CRITIC, *NETWORKS),
         ("task=store", "optimizer=gauss_newton", "constraint=si", "task.episode_steps=5"),

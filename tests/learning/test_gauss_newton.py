@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -13,7 +12,6 @@ from torch.testing import assert_close
 from tests.gauss_newton import Reference
 from tests.problems import MIXED, normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SystemIdentificationPenalty
-from torch_qpmpc.learning.anchor import Anchor
 from torch_qpmpc.learning.gauss_newton import FALL, RISE
 
 COUNT, DAMPING = 7, 0.2
@@ -66,56 +64,6 @@ def test_the_si_penalty_is_part_of_the_step(learn):
     expected = reference.step(*pairs(), target, S)
     optimizer.step(*pairs(), target, penalty=S)
     assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
-
-
-def anchor_of(mpc: QPMPC) -> Anchor:
-    windows = normal(9, mpc.n_z, seed=3)
-    weights = normal(mpc.n_x, seed=4).square().repeat(mpc.horizon)
-    return Anchor(mpc.C_0 + 0.1 * normal(*mpc.C_0.shape, seed=5), windows.mT @ windows, weights)
-
-
-@pytest.mark.parametrize("mask", [False, True])
-def test_an_anchor_is_part_of_the_step(mask):
-    """Its gradient vanishes at the step's end, together with those of errors and damping."""
-    mpc = random_mpc(3, learn=("H", "C"))
-    learned = torch.rand(mpc.C_0.shape, generator=torch.Generator().manual_seed(0)) < 0.5
-    if mask:
-        mpc = random_mpc(3, learn={"H": True, "C": learned})
-    anchor, S = anchor_of(mpc), SystemIdentificationPenalty(1e-2).curvature(normal(5, mpc.n_z))
-    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False, anchor=anchor)
-    reference, (s, a), target = Reference(mpc, optimizer), pairs(), targets(mpc)
-    gradients, solution = reference.gradients(s, a), mpc.solve(s, a)
-    delta = (target - solution.value).detach()
-    metric = reference.metric(gradients, solution.z.detach())
-    rows = torch.cat(gradients, dim=1)
-    mu = DAMPING * (metric * rows.square()).sum(-1).mean()
-    before, C = reference.theta(), mpc.C.detach().clone()
-    optimizer.step(s, a, target, penalty=S)
-    step = reference.theta() - before
-    left = rows.mT @ (rows @ step - delta) + mu * step / metric
-    after = mpc.C.detach().requires_grad_()
-    penalty = delta.square().mean() * anchor.value(after) + COUNT / 2 * (after @ S * after).sum()
-    (force,) = torch.autograd.grad(penalty, after)
-    sizes = [leaf.numel() for leaf in reference.leaves]
-    parts = dict(zip(reference.parts, left.split(sizes), strict=True))
-    total = parts["C"].reshape(C.shape) + force
-    if mask:
-        assert torch.equal(after[~learned], C[~learned])
-        total = total[learned]
-    assert force.abs().max() > 1e-3
-    assert_close(total, torch.zeros_like(total), rtol=0, atol=1e-7)
-    assert_close(parts["H"], torch.zeros_like(parts["H"]), rtol=0, atol=1e-7)
-
-
-def test_the_trust_region_counts_the_anchor():
-    """A strong anchor takes C to C_0, whatever the targets are."""
-    mpc = random_mpc(7)
-    anchor = anchor_of(mpc)
-    optimizer = GaussNewton(mpc, anchor=anchor.times(1e6))
-    before = anchor.value(mpc.C).item()
-    for _ in range(3):
-        optimizer.step(*pairs(), targets(mpc))
-    assert anchor.value(mpc.C) < 1e-2 * before
 
 
 @pytest.mark.parametrize("name", PARTS)
@@ -422,27 +370,6 @@ def test_a_penalty_needs_a_free_C():
     mpc = random_mpc(learn=("H", "c"))
     with pytest.raises(QPError, match="penalty: got a C that is not free, expected C among the"):
         GaussNewton(mpc).step(*pairs(), targets(mpc), penalty=torch.eye(mpc.n_z).double())
-
-
-def test_an_anchor_needs_a_free_C_of_its_sizes():
-    anchor = anchor_of(random_mpc())
-    for mpc in (random_mpc(learn=("H", "c")), random_mpc(structure="tied", learn=("C",))):
-        with pytest.raises(QPError, match="anchor: got a C that is not free, expected C among"):
-            GaussNewton(mpc, anchor=anchor)
-    with pytest.raises(QPError, match=r"anchor.C_0: got shape .*Pass Anchor.of\(identified\)"):
-        GaussNewton(random_mpc(), anchor=anchor._replace(C_0=anchor.C_0[:1]))
-    wrong: Any = anchor.S
-    with pytest.raises(QPError, match="anchor: got"):
-        GaussNewton(random_mpc(), anchor=wrong)
-
-
-def test_an_anchor_takes_the_dtype_of_the_qp():
-    mpc = random_mpc(15, on_failure="mask", learn=("c", "C"))
-    (s, a), target = pairs(), targets(mpc)
-    sizes = mpc.C.detach(), torch.eye(mpc.n_z), torch.ones(len(mpc.C))
-    optimizer = GaussNewton(mpc, anchor=Anchor(*(x.float() for x in sizes)))
-    assert optimizer.step(s, a, target).accepted
-    assert mpc.C.dtype == torch.float64
 
 
 @pytest.mark.parametrize("trust_region", [True, False])

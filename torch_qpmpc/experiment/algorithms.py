@@ -20,8 +20,7 @@ from torch_qpmpc.experiment.actor_critic import (
     make_actor_critic_loss,
     make_closed_loop_actor,
 )
-from torch_qpmpc.experiment.tasks import AnyPlant, Start, find_task
-from torch_qpmpc.learning.anchor import Anchor
+from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import (
     POLICY_ACTIVE_SET,
@@ -97,14 +96,10 @@ def make_learner(
     cfg: DictConfig,
     operator: QPActorValueOperator,
     physics: AnyPlant,
-    start: Start | None = None,
     *,
     done: int = 0,
 ) -> Learner:
-    """Make the learner of ``cfg.algo``; its rates continue after ``done`` updates.
-
-    An anchor is at the C that was identified at the ``start``.
-    """
+    """Make the learner of ``cfg.algo``; its rates continue after ``done`` updates."""
     mpc = operator.module
     if cfg.algo.name == "qlearning":
         loss_module = QPQLearningLoss(operator, td_error_clip=cfg.td_error_clip)
@@ -114,8 +109,8 @@ def make_learner(
         actor = make_closed_loop_actor(cfg, mpc, loss_module, physics)
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
     deviation, si = make_penalties(cfg, mpc)
-    anchor, errors = make_anchor(cfg, start), make_errors(cfg, mpc)
-    optimizer = make_optimizer(cfg, mpc, loss_module, anchor, errors)
+    errors = make_errors(cfg, mpc)
+    optimizer = make_optimizer(cfg, mpc, loss_module, errors)
     schedule = make_schedule(cfg, optimizer, done)
     update = make_update(cfg, mpc, loss_module, optimizer, schedule, deviation, si, done)
     return Learner(
@@ -144,13 +139,6 @@ def make_penalties(
     )
 
 
-def make_anchor(cfg: DictConfig, start: Start | None) -> Anchor | None:
-    """Make the anchor at the identified C; None if it is off."""
-    if not cfg.anchor or start is None:
-        return None
-    return Anchor.of(start.identified, cfg.anchor, b_learned="b" in cfg.constraint.learn)
-
-
 def make_errors(cfg: DictConfig, mpc: QPMPC) -> PredictionErrors | None:
     """Make the prediction errors; None if neither steps nor bounds use them."""
     if not cfg.prediction and cfg.back_off is None:
@@ -162,7 +150,6 @@ def make_optimizer(
     cfg: DictConfig,
     mpc: QPMPC,
     loss_module: LossModule | None = None,
-    anchor: Anchor | None = None,
     errors: PredictionErrors | None = None,
 ) -> torch.optim.Optimizer:
     """Make the optimiser, with one rate for the cost and one for the constraints.
@@ -181,7 +168,6 @@ def make_optimizer(
             td_error_clip=cfg.td_error_clip,
             trust_region=options.trust_region,
             normalise=options.normalise,
-            anchor=anchor,
             residuals=errors.residuals if errors is not None and cfg.prediction else None,
         )
     rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}

@@ -25,8 +25,8 @@ stages, because a single entry of z may be nearly zero in a batch without being 
 
 The gradients in a free C are the outer products chi_i z_i', so that ``K = (chi chi') * (z P z')``
 is computed without forming them. P is the metric of C's rows: U's or, with the SI penalty
-(eq:sdp3) or an anchor, which are quadratic in each row, the inverse of the summed curvatures of
-damping and penalties. The penalties thus enter the same step. Where C is not free, further
+(eq:sdp3), which is quadratic in each row, the inverse of the summed curvatures of damping and
+penalty. The penalty thus enters the same step. Where C is not free, further
 residuals r, such as the one-step prediction errors of a tied C, add 1/2 v |r + dr/dtheta dtheta|^2,
 with v the mean squared TD error: they are further rows of the least-squares problem.
 """
@@ -43,7 +43,6 @@ from torch import Tensor, nn
 
 from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.learning.anchor import Anchor
 from torch_qpmpc.learning.pairs import usable
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
@@ -60,7 +59,6 @@ FLOOR = 1e-12
 FORGET = 0.9
 #: Factors by which the damping rises and falls, and its upper bound.
 RISE, FALL, MAX_DAMPING = 4.0, 0.5, 1e6
-NOT_FREE = "a C that is not free"
 
 
 def _positive(x: float) -> bool:
@@ -116,16 +114,14 @@ class GaussNewton(torch.optim.Optimizer):
             damping to the ratio of actual to predicted decrease.
         normalise: divide by sizes and units, as above. False takes the scales themselves as D, by
             default 1 and 0.01, for streams of small batches, whose sizes are mostly noise.
-        anchor: a penalty on C, times the batch's mean squared TD error. With that as the variance
-            of the errors, a step is towards the largest posterior of the anchor's log and a batch.
         residuals: maps a QP to residuals r ``(M,)``, differentiable in its tensors, such as
             `PredictionErrors.residuals`. 1/2 r'r at first order, times the mean squared TD error,
             is added to the batch's sum of ``1/2 delta^2``. That mean rises at once and falls
             slowly, like a size.
 
     Raises:
-        QPError: if a number is out of range, the scales do not fit the learned parts, the anchor
-            does not fit a learned, free C, or there are residuals and C is free and learned.
+        QPError: if a number is out of range, the scales do not fit the learned parts, or there are
+            residuals and C is free and learned.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -150,7 +146,6 @@ class GaussNewton(torch.optim.Optimizer):
         memory: int = 0,
         trust_region: bool = True,
         normalise: bool = True,
-        anchor: Anchor | None = None,
         residuals: Callable[[QuadraticProgram], Tensor] | None = None,
     ) -> None:
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
@@ -171,17 +166,10 @@ class GaussNewton(torch.optim.Optimizer):
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
         self._clip, self._memory, self._trust_region = td_error_clip, memory, trust_region
-        self._normalise, self._anchor, self._residuals = normalise, anchor, residuals
+        self._normalise, self._residuals = normalise, residuals
         if residuals is not None and self._free_C() is not None:
-            remedy = "Pass a penalty of its rows to step, or an anchor."
+            remedy = "Pass a penalty of its rows to step."
             raise QPError.expected("residuals", "them with a free C", "a tied C", remedy)
-        if anchor is not None:
-            check_kind("anchor", anchor, Anchor)
-            if self._free_C() is None:
-                raise QPError.expected("anchor", NOT_FREE, "C among the learned parts")
-            remedy = "Pass Anchor.of(identified), with the sizes of the QPMPC."
-            check_tensor("anchor.C_0", anchor.C_0, *mpc.C.shape, batched=False, remedy=remedy)
-            self._anchor = Anchor(*(x.to(mpc.C) for x in anchor))
 
     @torch.no_grad()
     def step(  # pyright: ignore[reportIncompatibleMethodOverride] - not a closure
@@ -221,6 +209,9 @@ class GaussNewton(torch.optim.Optimizer):
         if penalty is not None:
             remedy = "Pass SystemIdentificationPenalty.curvature(windows)."
             check_tensor("penalty", penalty, mpc.n_z, mpc.n_z, batched=False, remedy=remedy)
+            if self._free_C() is None:
+                got = "a C that is not free"
+                raise QPError.expected("penalty", got, "C among the learned parts")
         group = self.param_groups[0]
         with torch.enable_grad():
             qp = self._mpc.quadratic_program()
@@ -231,14 +222,13 @@ class GaussNewton(torch.optim.Optimizer):
         delta = torch.where(use, target.to(solution.value) - solution.value, 0)
         if self._clip is not None:
             delta = delta.clamp(-self._clip, self._clip)
-        pulls = self._pulls(penalty, delta, len(s) - sum(left_out))
-        lr, damping = group["lr"], group["damping"]
-        blocks = self._blocks(solution, use, pulls)
+        lr, damping, count = group["lr"], group["damping"], len(s) - sum(left_out)
+        blocks = self._blocks(solution, use, None if penalty is None else count * penalty)
         self._scale(blocks, int(use.sum()))
         for block in blocks:
             block.remember(self.state[block.leaf], self._memory)
         mu = _damping(blocks, damping)
-        errors = torch.cat((delta, self._further(blocks, delta, len(s) - sum(left_out))))
+        errors = torch.cat((delta, self._further(blocks, delta, count)))
         # Past pairs have no TD errors: they contribute their curvature alone.
         past = delta.new_zeros(len(blocks[0]) - len(errors) if blocks else 0)
         alpha, change = _solve(blocks, torch.cat((errors, past)), mu)
@@ -334,17 +324,6 @@ class GaussNewton(torch.optim.Optimizer):
         leaves = (leaf for group in self.param_groups for leaf in group["params"])
         return next((leaf for leaf in leaves if leaf is C and leaf.requires_grad), None)
 
-    def _pulls(self, penalty: Tensor | None, delta: Tensor, count: int) -> list[Anchor]:
-        """Return the penalties on C, for the sum over ``count`` pairs with the errors delta."""
-        C, pulls = self._free_C(), []
-        if penalty is not None:
-            if C is None:
-                raise QPError.expected("penalty", NOT_FREE, "C among the learned parts")
-            pulls.append(Anchor(torch.zeros_like(C), count * penalty, C.new_ones(len(C))))
-        if self._anchor is not None and C is not None:
-            pulls.append(self._anchor.times(delta.square().sum() / count))
-        return pulls
-
     def _further(self, blocks: list[_Dense | _OuterProducts], delta: Tensor, count: int) -> Tensor:
         """Insert the residuals' gradients after those of the TD errors; return their errors -r."""
         if self._residuals is None or not blocks:
@@ -367,7 +346,7 @@ class GaussNewton(torch.optim.Optimizer):
         return -r.detach()
 
     def _blocks(
-        self, solution: QPSolution, use: Tensor, pulls: list[Anchor]
+        self, solution: QPSolution, use: Tensor, S: Tensor | None
     ) -> list[_Dense | _OuterProducts]:
         """Return Q's gradients in each learned part that is not frozen, zero outside ``use``."""
         mpc = self._mpc
@@ -402,7 +381,7 @@ class GaussNewton(torch.optim.Optimizer):
         rows, columns = self._units(z[use])
         units = {"b": rows, "q": 1 / columns} if mpc.structure == "free" else {}
         return [
-            _OuterProducts(leaf, group, weight.unsqueeze(-1) * chi, z, rows, columns, pulls, mask)
+            _OuterProducts(leaf, group, weight.unsqueeze(-1) * chi, z, rows, columns, S, mask)
             if leaf is factored
             else _Dense(
                 leaf,
@@ -514,9 +493,9 @@ class _Dense:
 class _OuterProducts:
     """The gradients ``chi_i z_i'`` in C, with the metric ``scale * rows_i / columns_j``.
 
-    The penalties ``pulls`` by themselves move C by ``drift``; with them, the metric of a row is
-    ``rows_i`` times a matrix P ``(n_z, n_z)``, one for each unit and weight of a row. With a
-    ``mask`` of the learned entries of C, each pattern of learned entries in a row has its own P.
+    The penalty ``1/2 tr(C S C')`` by itself moves C by ``drift``; with it, the metric of a row is
+    ``rows_i`` times a matrix P ``(n_z, n_z)``, one for each unit of a row. With a ``mask`` of the
+    learned entries of C, each pattern of learned entries in a row has its own P.
     Methods as in `_Dense`.
     """
 
@@ -528,14 +507,13 @@ class _OuterProducts:
         z: Tensor,
         rows: Tensor,
         columns: Tensor,
-        pulls: list[Anchor],
+        S: Tensor | None,
         mask: Tensor | None,
     ) -> None:
         self.leaf, self.group, self.chi, self.z, self.scale = leaf, group, chi, z, 1.0
-        self.rows, self.columns, self.pulls = rows, columns, pulls
+        self.rows, self.columns, self.S = rows, columns, S
         self.drift = torch.zeros_like(leaf)
-        kinds = torch.stack((rows, *(pull.weights for pull in pulls)), dim=-1)
-        self.patterns = _patterns(mask, kinds if pulls else None)
+        self.patterns = _patterns(mask, None if S is None else rows.unsqueeze(-1))
 
     def __len__(self) -> int:
         return len(self.z)
@@ -554,13 +532,12 @@ class _OuterProducts:
     def damp(self, mu: Tensor) -> Tensor:
         drifted = self.z.new_zeros(len(self.z))
         self.z_P = [self.scale * self.z[:, j] / self.columns[j] for _, j, _ in self.patterns]
-        if not self.pulls:
+        if self.S is None:
             return drifted
-        force = torch.stack([pull.gradient(self.leaf) for pull in self.pulls]).sum(0)
+        force = self.leaf @ self.S
         for k, (i, j, entries) in enumerate(self.patterns):
             z, damping = self.z[:, j], mu / self.rows[i][0]
-            precision = torch.diag(damping / self.scale * self.columns[j])
-            precision += sum(pull.weights[i][0] * pull.S[j][:, j] for pull in self.pulls)
+            precision = torch.diag(damping / self.scale * self.columns[j]) + self.S[j][:, j]
             inverse = torch.linalg.inv_ex(precision).inverse
             drift = -force[entries] @ inverse
             self.z_P[k], self.drift[entries] = damping * z @ inverse, drift
@@ -581,11 +558,11 @@ class _OuterProducts:
         return step
 
     def penalty(self) -> Tensor | float:
-        return sum((pull.value(self.leaf) for pull in self.pulls), 0.0)
+        return 0.0 if self.S is None else 0.5 * (self.leaf * (self.leaf @ self.S)).sum()
 
 
 def _patterns(mask: Tensor | None, kinds: Tensor | None) -> list[tuple[Any, Any, Any]]:
-    """Group the rows of C by learned entries and by ``kinds`` ``(n_c, k)``, if these are not None.
+    """Group the rows of C by learned entries and by ``kinds`` ``(n_c, 1)``, if these are not None.
 
     Return the rows, the columns, and the index in C of each group.
     """
@@ -629,5 +606,5 @@ def _move(blocks: list[_Dense | _OuterProducts], steps: list[Tensor], lr: float)
 
 
 def _objective(errors: Tensor, blocks: list[_Dense | _OuterProducts]) -> Tensor:
-    """Return what a step minimises: half the sum of squared errors, plus the penalties."""
+    """Return what a step minimises: half the sum of squared errors, plus the penalty."""
     return 0.5 * errors.square().sum() + sum(block.penalty() for block in blocks)

@@ -80,7 +80,6 @@ class Config(Group):
     ablation: Annotated[str | None, Expected("a name, or null")]
     gate: Flag = False
     gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")] = None
-    anchor: NonNegative = 0.0
     prediction: NonNegative = 0.0
     back_off: Annotated[
         Annotated[Finite, Field(ge=0.5, lt=1)] | None, Expected("a number in [0.5, 1), or null")
@@ -153,21 +152,6 @@ class Config(Group):
         if penalties.si is not None and penalties.structure != "free":
             remedy = "gauss_newton needs a free C for constraint.si."
             self.conflict("constraint.structure", "free", remedy)
-        return self
-
-    @model_validator(mode="after")
-    def an_anchor_has_a_log_and_a_free_C(self) -> Self:
-        if not self.anchor:
-            return self
-        if self.start.name != "data":
-            remedy = "The anchor is at a C that was identified: use constraint=si without a log."
-            self.conflict("start.name", "data", remedy)
-        if not self.second_order:
-            self.conflict("optimizer.name", "gauss_newton", "The anchor is part of its steps.")
-        if "C" not in self.constraint.learn:
-            self.conflict("constraint.learn", "a list with C, which is anchored")
-        if self.constraint.structure != "free":
-            self.conflict("constraint.structure", "free", "The anchor needs a free C.")
         return self
 
     @model_validator(mode="after")
