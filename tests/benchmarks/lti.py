@@ -87,8 +87,6 @@ CONTENDERS: dict[str, Callable[[int, int], Stream]] = {
     "mpcrl": mpcrl_lti.run,
     "ours": run,
     "ours, after each step": lambda seed, steps: run(seed, steps, SINGLE),
-    "ours, without back-offs": lambda seed, steps: run(seed, steps, ("back_off=null",)),
-    "ours, model by TD errors": lambda seed, steps: run(seed, steps, ("prediction=0",)),
     "ours, with q": lambda seed, steps: run(seed, steps, ("task.learn_cost=[q,c]",)),
     "TD errors alone": lambda seed, steps: run(seed, steps, TD),
     "TD errors alone, after each step": lambda seed, steps: run(seed, steps, (*TD, *SINGLE)),

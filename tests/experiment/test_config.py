@@ -41,7 +41,6 @@ NOT_NEEDED = (
     "gate",
     "gate_interval",
     "logger",
-    "prediction",
     "rivals",
     "start.name",
     "task.file",
@@ -239,7 +238,6 @@ BAD: dict[str, list[Any]] = {
     "export": ["python", 3, True],
     "figures": FLAG,
     "gate": FLAG,
-    "prediction": REAL,
     "back_off": [0.4, 1, math.nan, False, "half"],
     "search.loops": WHOLE,
     **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
@@ -446,7 +444,7 @@ def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
     now = settings(cfg)
     OmegaConf.set_struct(cfg, False)
     later = ("logger", "eval_seed", "start", "gate")
-    for key in (*later, "prediction", "back_off", "search"):
+    for key in (*later, "back_off", "search"):
         del cfg[key]
     OmegaConf.save(cfg, file)
     assert differences(settings(cfg), now) is None
@@ -549,26 +547,26 @@ def test_solver_must_be_known():
             "noise.std: got 0.1, expected null. The noise of gros_zanon cannot be changed",
         ),
         (
-            ["prediction=1"],
-            "constraint.structure: got 'free', expected tied. prediction and back_off need one",
+            ["back_off=0.9"],
+            "constraint.structure: got 'free', expected tied. back_off needs one model for all",
         ),
         (
-            ["constraint=adaptive", "algo=td3", "prediction=0"],
-            "algo.name: got 'td3', expected qlearning. td3 does not support prediction and "
-            "back_off; constraint=mpc has neither",
-        ),
-        (
-            ["constraint=adaptive", "release=5"],
-            "release: got 5, expected null. prediction and back_off need a tied C; constraint=mpc",
-        ),
-        (
-            ["constraint=adaptive", "optimizer=adam"],
-            "optimizer.name: got 'adam', expected gauss_newton. prediction is part of its steps; "
+            ["constraint=adaptive", "algo=td3"],
+            "algo.name: got 'td3', expected qlearning. td3 does not support back_off; "
             "constraint=mpc has none",
         ),
         (
+            ["constraint=adaptive", "release=5"],
+            "release: got 5, expected null. back_off needs a tied C; constraint=mpc has none",
+        ),
+        (
+            ["constraint=adaptive", "optimizer=adam"],
+            "optimizer.name: got 'adam', expected gauss_newton. With back_off its steps follow the "
+            "prediction errors; constraint=mpc has none",
+        ),
+        (
             ["constraint=adaptive", "constraint.learn=[]"],
-            r"constraint.learn: got \[\], expected a list with C or b, which prediction moves",
+            r"constraint.learn: got \[\], expected a list with C or b. With back_off the model",
         ),
         (
             ["constraint=adaptive", "constraint.learn=[C,lb]"],

@@ -48,8 +48,8 @@ class Learner:
         deviation, si: the penalties; None if off.
         target: the soft update of an actor-critic's target networks; None for Q-learning.
         n_preview: entries of the preview, with which p begins.
-        errors: the prediction errors of the transitions; None if nothing uses them.
-        back_off: tightens the bounds by the covariance of these; None if it is off.
+        errors: the prediction errors of the transitions, which the model follows; None if off.
+        back_off: tightens the bounds by their covariance; None if off.
     """
 
     learn: Update
@@ -140,10 +140,8 @@ def make_penalties(
 
 
 def make_errors(cfg: DictConfig, mpc: QPMPC) -> PredictionErrors | None:
-    """Make the prediction errors; None if neither steps nor bounds use them."""
-    if not cfg.prediction and cfg.back_off is None:
-        return None
-    return PredictionErrors(mpc, weight=cfg.prediction or 1.0)
+    """Make the prediction errors, which model and bounds follow; None without a back-off."""
+    return None if cfg.back_off is None else PredictionErrors(mpc)
 
 
 def make_optimizer(
@@ -154,7 +152,7 @@ def make_optimizer(
 ) -> torch.optim.Optimizer:
     """Make the optimiser, with one rate for the cost and one for the constraints.
 
-    ``errors`` are a term of Gauss-Newton's steps if ``prediction`` gives them a weight.
+    ``errors`` are a term of Gauss-Newton's steps.
     ``loss_module`` is needed for actor-critic algorithms, whose critics are optimised, too.
     """
     options = cfg.optimizer
@@ -168,7 +166,7 @@ def make_optimizer(
             td_error_clip=cfg.td_error_clip,
             trust_region=options.trust_region,
             normalise=options.normalise,
-            residuals=errors.residuals if errors is not None and cfg.prediction else None,
+            residuals=None if errors is None else errors.residuals,
         )
     rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}
     if loss_module is None or cfg.algo.name == "qlearning":

@@ -80,7 +80,6 @@ class Config(Group):
     ablation: Annotated[str | None, Expected("a name, or null")]
     gate: Flag = False
     gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")] = None
-    prediction: NonNegative = 0.0
     back_off: Annotated[
         Annotated[Finite, Field(ge=0.5, lt=1)] | None, Expected("a number in [0.5, 1), or null")
     ] = None
@@ -155,26 +154,26 @@ class Config(Group):
         return self
 
     @model_validator(mode="after")
-    def prediction_errors_are_those_of_a_tied_C(self) -> Self:
-        if not self.prediction and self.back_off is None:
+    def back_off_has_a_tied_C_that_follows_its_errors(self) -> Self:
+        if self.back_off is None:
             return self
+        without = "constraint=mpc has none."
         if self.constraint.structure != "tied":
-            remedy = "prediction and back_off need one model for all stages: constraint=adaptive."
+            remedy = "back_off needs one model for all stages: constraint=adaptive."
             self.conflict("constraint.structure", "tied", remedy)
         if self.algo.name != "qlearning":
-            name = self.algo.name
-            remedy = f"{name} does not support prediction and back_off; constraint=mpc has neither."
+            remedy = f"{self.algo.name} does not support back_off; {without}"
             self.conflict("algo.name", "qlearning", remedy)
         if self.release is not None:
-            remedy = "prediction and back_off need a tied C; constraint=mpc has neither."
-            self.conflict("release", "null", remedy)
-        if self.prediction and not self.second_order:
-            remedy = "prediction is part of its steps; constraint=mpc has none."
+            self.conflict("release", "null", f"back_off needs a tied C; {without}")
+        if not self.second_order:
+            remedy = f"With back_off its steps follow the prediction errors; {without}"
             self.conflict("optimizer.name", "gauss_newton", remedy)
-        if self.prediction and not {"C", "b"} & {*self.constraint.learn}:
-            self.conflict("constraint.learn", "a list with C or b, which prediction moves")
-        if self.back_off is not None and {"lb", "ub"} & {*self.constraint.learn}:
-            remedy = "back_off moves the bounds; constraint=mpc has none."
+        if not {"C", "b"} & {*self.constraint.learn}:
+            remedy = f"With back_off the model follows its prediction errors; {without}"
+            self.conflict("constraint.learn", "a list with C or b", remedy)
+        if {"lb", "ub"} & {*self.constraint.learn}:
+            remedy = f"back_off moves the bounds; {without}"
             self.conflict("constraint.learn", "a list without lb and ub", remedy)
         return self
 
