@@ -19,9 +19,7 @@ from torch_qpmpc import QPActorValueOperator, QPError
 from torch_qpmpc.experiment.collection import make_collector, num_columns
 from torch_qpmpc.experiment.config import (
     check_config,
-    differences,
     flatten,
-    load_config,
     settings,
 )
 from torch_qpmpc.experiment.config.messages import keys
@@ -33,19 +31,8 @@ from torch_qpmpc.learning.search import KNOBS
 GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
-#: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
-NOT_NEEDED = (
-    "back_off",
-    "eval_seed",
-    "export",
-    "gate",
-    "gate_interval",
-    "logger",
-    "rivals",
-    "start.name",
-    "task.file",
-    "task.kwargs",
-)
+#: Keys that built-in tasks lack.
+NOT_NEEDED = ("task.file", "task.kwargs")
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
@@ -374,7 +361,7 @@ def test_unknown_keys(key, remedy):
 NEEDED = [key for key in KEYS if key not in NOT_NEEDED]
 
 
-@pytest.mark.parametrize("key", [*NEEDED, *OPTIONAL, *GROUPS, "algo", "collector"])
+@pytest.mark.parametrize("key", [*NEEDED, *OPTIONAL, *GROUPS, "algo", "collector", "search", "start"])
 def test_missing_keys(key):
     cfg = make_config("constraint=combined", *choices_with(key))
     owner, _, leaf = key.rpartition(".")
@@ -437,19 +424,6 @@ def test_a_misspelt_key_is_named_before_the_missing_one_and_that_before_a_confli
             del cfg["updates"]
         else:
             cfg["update"] = 3
-
-
-def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
-    cfg, file = make_config("gate=false"), tmp_path / "config.yaml"
-    now = settings(cfg)
-    OmegaConf.set_struct(cfg, False)
-    later = ("logger", "eval_seed", "start", "gate")
-    for key in (*later, "back_off", "search"):
-        del cfg[key]
-    OmegaConf.save(cfg, file)
-    assert differences(settings(cfg), now) is None
-    assert settings(load_config(file)) == now
-    assert differences(settings(cfg), {**now, "eval_seed": 3}) == ("eval_seed=None", "eval_seed=3")
 
 
 def test_solver_must_be_known():

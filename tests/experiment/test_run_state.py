@@ -16,7 +16,6 @@ from tests.runs import SMALL, make_config
 from tests.stops import assert_events_are_whole, assert_same_numbers, go_on, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
-from torch_qpmpc.experiment.config import load_config
 from torch_qpmpc.experiment.run_state import resumed
 
 #: Settings in which neither stop is at an evaluation or a row of metrics.
@@ -86,20 +85,6 @@ def test_a_run_that_has_no_checkpoint_yet_begins_anew(tmp_path, stopped):
     train.train(OmegaConf.load(stopped / "config.yaml"), str(tmp_path / "whole"))  # pyright: ignore[reportArgumentType] -- a DictConfig
     assert_same_numbers(stopped, tmp_path / "whole")
     assert_events_are_whole(stopped)
-
-
-def test_a_run_of_an_earlier_version_resumes(tmp_path, stopped):
-    """Its configuration and its checkpoint lack the keys added since."""
-    file, checkpoint = stopped / "config.yaml", stopped / "checkpoint.pt"
-    cfg, state = load_config(file), load_checkpoint(checkpoint)
-    for key in ("logger", "eval_seed", "gate"):
-        del cfg[key], state["config"][key]
-    del state["gate"]
-    OmegaConf.save(cfg, file)
-    save_checkpoint(checkpoint, state)
-    go_on(stopped)
-    train.train(make_config(*RUN, "eval_interval=2", "figures=false"), str(tmp_path / "whole"))
-    assert_same_numbers(stopped, tmp_path / "whole")
 
 
 @pytest.mark.parametrize("when", ["finish", "drop_previous"])

@@ -131,7 +131,7 @@ class RunGate:
         """Load a `state_dict`."""
         if self._gate is not None and state is not None:
             self._gate.load_state_dict(state)
-            self.simulated = state.get("simulated", 0)
+            self.simulated = state["simulated"]
 
 
 def _interval(cfg: DictConfig) -> int:

@@ -30,7 +30,7 @@ from torch_qpmpc.mpc.module import QPMPC
 
 #: The parts of a snapshot.
 STATE = ("config", "update", "structure", "mpc", "loss_module", "optimizer", "schedule")
-STATE += ("replay", "collector", "tally", "rng")
+STATE += ("errors", "gate", "replay", "collector", "tally", "rng")
 #: Files that a run writes before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
 
@@ -91,7 +91,7 @@ def restore(
         if learner.errors is not None:
             learner.errors.load_state_dict(state["errors"])
     with _part("gate"):
-        gate.load_state_dict(state.get("gate"))
+        gate.load_state_dict(state["gate"])
     with _part("replay"):
         if state["replay"] is not None:
             replay.load_state_dict(state["replay"])

@@ -265,19 +265,6 @@ class GaussNewton(torch.optim.Optimizer):
         self._adapt(ratio)
         return StepReport(solution, damping, ratio, accepted, *left_out)
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Load a `state_dict` of a GaussNewton of the same QPMPC.
-
-        Raises:
-            QPError: it is from a version whose metric had units, and has scales of another meaning.
-        """
-        groups = state_dict.get("param_groups", [])
-        if not all({"size", "signals"} <= group.keys() for group in groups):
-            got, want = "groups without size and signals, of an earlier metric", "both"
-            remedy = "Start with a new GaussNewton: its scales have no unit."
-            raise QPError.expected("state_dict", got, want, remedy)
-        super().load_state_dict(state_dict)
-
     def __reduce__(self) -> tuple:
         # The copy would hold a QPMPC of its own, apart from its owner's copy of it.
         raise QPError.expected(
@@ -330,7 +317,7 @@ class GaussNewton(torch.optim.Optimizer):
             return delta.new_zeros(0)
         group, variance = self.param_groups[0], float(delta.square().sum() / count)
         if math.isfinite(variance):
-            group["variance"] = max(FORGET * group.get("variance", 0.0), variance)
+            group["variance"] = max(FORGET * group["variance"], variance)
         with torch.enable_grad():
             r = self._residuals(self._mpc.quadratic_program())
             r = group["variance"] ** 0.5 * r.to(delta)

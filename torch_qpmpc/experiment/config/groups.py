@@ -21,7 +21,6 @@ from torch_qpmpc.experiment.fields import (
     one_of,
     some_of,
 )
-from torch_qpmpc.learning.search import KNOBS
 from torch_qpmpc.mpc.validation import CONSTRAINTS, STRUCTURES
 
 Beta = Annotated[float, Field(ge=0, lt=1)]
@@ -164,10 +163,6 @@ class Search(Group):
     H_u: Size
     H_f: Size
     q_f: Size
-
-
-#: No search, for configurations of versions without one.
-NO_SEARCH = Search(loops=64, **dict.fromkeys(KNOBS))
 
 
 class SingleProcess(Group):

@@ -10,11 +10,9 @@ from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config.groups import (
-    NO_SEARCH,
     Algorithm,
     Collector,
     Constraint,
-    FromModel,
     Noise,
     Optimizer,
     Search,
@@ -57,10 +55,10 @@ def _settings_of_the_task(value: Any) -> TaskSettings:
 
 
 class Config(Group):
-    """All keys of configs/ but Hydra's; keys added in later versions have defaults."""
+    """All keys of configs/ but Hydra's."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63), Expected("a whole number >= 0 and < 2^63")]
-    eval_seed: Annotated[Whole | None, Expected("a whole number >= 0, or null")] = None
+    eval_seed: Annotated[Whole | None, Expected("a whole number >= 0, or null")]
     solver: Annotated[Name, AfterValidator(_known_solver)]
     warm_start: Flag
     threads: Count
@@ -78,21 +76,21 @@ class Config(Group):
     release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
     resume: Annotated[str | None, Expected("a path, or null")]
     ablation: Annotated[str | None, Expected("a name, or null")]
-    gate: Flag = False
-    gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")] = None
+    gate: Flag
+    gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")]
     back_off: Annotated[
         Annotated[Finite, Field(ge=0.5, lt=1)] | None, Expected("a number in [0.5, 1), or null")
-    ] = None
-    search: Search = NO_SEARCH
-    logger: Annotated[str, one_of(LOGGERS)] = "tensorboard"
-    export: Annotated[Literal["c"] | None, Expected("c, or null")] = None
+    ]
+    search: Search
+    logger: Annotated[str, one_of(LOGGERS)]
+    export: Annotated[Literal["c"] | None, Expected("c, or null")]
     figures: Flag
-    rivals: Annotated[bool | list[str], Expected("true, false or a list of names")] = True
+    rivals: Annotated[bool | list[str], Expected("true, false or a list of names")]
     eval_interval: Count
     log_interval: Count
     algo: Algorithm
     collector: Collector
-    start: Start = FromModel(name="model")
+    start: Start
     task: Annotated[TaskSettings, PlainValidator(_settings_of_the_task)]
     noise: Noise
     constraint: Constraint
