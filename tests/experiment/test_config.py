@@ -361,7 +361,9 @@ def test_unknown_keys(key, remedy):
 NEEDED = [key for key in KEYS if key not in NOT_NEEDED]
 
 
-@pytest.mark.parametrize("key", [*NEEDED, *OPTIONAL, *GROUPS, "algo", "collector", "search", "start"])
+@pytest.mark.parametrize(
+    "key", [*NEEDED, *OPTIONAL, *GROUPS, "algo", "collector", "search", "start"]
+)
 def test_missing_keys(key):
     cfg = make_config("constraint=combined", *choices_with(key))
     owner, _, leaf = key.rpartition(".")

@@ -43,7 +43,7 @@ from torch import Tensor, nn
 
 from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.learning.pairs import usable
+from torch_qpmpc.learning.td_error import usable
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
 from torch_qpmpc.mpc.validation import COST
