@@ -12,7 +12,7 @@ with v the mean squared TD error: they are further rows of the least-squares pro
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -181,50 +181,62 @@ class GaussNewton(torch.optim.Optimizer):
         """
         self._check_parameters()
         self._check_batch(s, a, target, penalty)
-        group = self.param_groups[0]
+        lr, damping = (self.param_groups[0][name] for name in ("lr", "damping"))
         with torch.enable_grad():
             qp = self._mpc.quadratic_program()
         solution = self._mpc.solve(s, a, warm_start, qp)
         use, left_out = usable(solution.solved, target)
-        lr, damping, count = group["lr"], group["damping"], len(s) - sum(left_out)
+
+        def report(ratio: float, accepted: bool) -> StepReport:
+            return StepReport(solution, damping, ratio, accepted, *left_out)
+
+        count = len(s) - sum(left_out)
         if not count:
-            return StepReport(solution, damping, math.nan, False, *left_out)
+            return report(math.nan, False)
         delta = torch.where(use, target.to(solution.value) - solution.value, 0)
         if self._clip is not None:
             delta = delta.clamp(-self._clip, self._clip)
         blocks = self._blocks(solution, use, None if penalty is None else count * penalty)
+        errors, steps, change = self._solve(blocks, delta, count)
+        if not (objective(errors, blocks).isfinite() and all(x.isfinite().all() for x in steps)):
+            self._restart()
+            return report(math.nan, False)
+        if not self._trust_region:
+            _move(blocks, steps, lr)
+            self._mpc.project_()
+            return report(math.nan, True)
+        old = [block.leaf.clone() for block in blocks]
+        ratio = self._try(blocks, steps, errors, change, (s, a, use, solution))
+        accepted = ratio > 0  # False for nan, which an infinite cost causes
+        if not accepted:
+            for block, value in zip(blocks, old, strict=True):
+                block.leaf.copy_(value)
+        self._adapt(ratio)
+        return report(ratio, accepted)
+
+    def _solve(
+        self, blocks: list[Block], delta: Tensor, count: int
+    ) -> tuple[Tensor, list[Tensor], Tensor]:
+        """Return the errors of pairs and residuals, the parts' steps, and their change of both."""
         if self._normalise:
             scale(blocks, count)
         for block in blocks:
             if not self._normalise:
                 block.scale = block.group["scale"]
             block.remember(self.state[block.leaf], self._memory)
-        mu = damping_of(blocks, damping)
+        mu = damping_of(blocks, self.param_groups[0]["damping"])
         errors = torch.cat((delta, self._further(blocks, delta, count)))
         # Past pairs have no TD errors: they contribute their curvature alone.
         past = delta.new_zeros(len(blocks[0]) - len(errors) if blocks else 0)
         alpha, change = solve_dual(blocks, torch.cat((errors, past)), mu)
-        steps = [block.step(alpha) for block in blocks]
-        finite = objective(errors, blocks).isfinite() and all(x.isfinite().all() for x in steps)
-        if not finite:
-            # Overflow: raise the damping, and clear the memory and the sizes.
-            self._adapt(math.nan)
-            self.state.clear()
-            for group in self.param_groups:
-                group |= FRESH
-            return StepReport(solution, damping, math.nan, False, *left_out)
-        if not self._trust_region:
-            _move(blocks, steps, lr)
-            self._mpc.project_()
-            return StepReport(solution, damping, math.nan, True, *left_out)
-        old = [block.leaf.clone() for block in blocks]
-        ratio = self._try(blocks, steps, errors, change[: len(errors)], (s, a, use, solution))
-        accepted = ratio > 0  # False for nan, which an infinite cost causes
-        if not accepted:
-            for block, value in zip(blocks, old, strict=True):
-                block.leaf.copy_(value)
-        self._adapt(ratio)
-        return StepReport(solution, damping, ratio, accepted, *left_out)
+        return errors, [block.step(alpha) for block in blocks], change[: len(errors)]
+
+    def _restart(self) -> None:
+        """Raise the damping, and clear the memory and the sizes, after an overflow."""
+        self._adapt(math.nan)
+        self.state.clear()
+        for group in self.param_groups:
+            group |= FRESH
 
     def _check_batch(self, s: Tensor, a: Tensor, target: Tensor, penalty: Tensor | None) -> None:
         """Raise `QPError` if an argument of `step` does not fit."""
@@ -339,50 +351,43 @@ class GaussNewton(torch.optim.Optimizer):
 
     def _blocks(self, solution: QPSolution, use: Tensor, S: Tensor | None) -> list[Block]:
         """Return Q's gradients in each learned part that is not frozen, zero outside ``use``."""
-        mpc = self._mpc
-        weight = use.to(solution.z)
-        z, chi, lam = solution.z, solution.chi, solution.lam
-        # Only the gradient in a learned w needs the slacks.
-        sigma = solution.sigma if solution.qp.w.requires_grad else torch.zeros_like(lam)
-        gradients = envelope_gradients(weight, z, sigma, chi, lam, solution.eta, solution.xi)
+        mpc, z, chi = self._mpc, solution.z, use.to(solution.z).unsqueeze(-1) * solution.chi
         pairs = [(leaf, group) for group in self.param_groups for leaf in group["params"]]
         pairs = [(leaf, group) for leaf, group in pairs if leaf.requires_grad]
         factored, mask = self._free_C(), matrix(mpc, "C")[1]
         if factored is not None and mask is not None:
             factored.copy_(mpc.C)  # another optimiser may have moved entries that are not learned
-        parts = {name: getattr(solution.qp, name) for name in EVENT_SHAPES}
-        if factored is not None:
-            parts.pop("C")
-        parts = {n: x for n, x in parts.items() if x.requires_grad}
-        # Expanded to one copy per pair, each part has one gradient per pair.
-        in_parts = [gradients[n](x.expand(len(z), *x.shape)) for n, x in parts.items()]
         dense = [leaf for leaf, _ in pairs if leaf is not factored]
-        in_leaves = iter(())
-        if dense:
-            in_leaves = iter(
-                torch.autograd.grad(
-                    list(parts.values()),
-                    dense,
-                    in_parts,
-                    is_grads_batched=True,
-                    materialize_grads=True,
-                )
-            )
+        found = iter(_gradients(solution, use, dense, without_C=factored is not None))
         rows, columns = z.new_ones(mpc.horizon * mpc.n_x), torch.ones_like(z[0])
         if self._normalise:
             rows, columns = signal_sizes(mpc, self.param_groups[0], z[use])
         units = {"b": rows, "q": 1 / columns} if mpc.structure == "free" else {}
         return [
-            OuterProducts(leaf, group, weight.unsqueeze(-1) * chi, z, rows, columns, S, mask)
+            OuterProducts(leaf, group, chi, z, rows, columns, S, mask)
             if leaf is factored
-            else Dense(
-                leaf,
-                group,
-                next(in_leaves).reshape(len(z), -1),
-                units.get(group["name"]),
-            )
+            else Dense(leaf, group, next(found).reshape(len(z), -1), units.get(group["name"]))
             for leaf, group in pairs
         ]
+
+
+def _gradients(
+    solution: QPSolution, use: Tensor, leaves: list[Tensor], without_C: bool
+) -> Sequence[Tensor]:
+    """Return Q's gradients ``(B, *leaf.shape)`` in each leaf, zero outside ``use``."""
+    if not leaves:
+        return ()
+    z, lam, weight = solution.z, solution.lam, use.to(solution.z)
+    # Only the gradient in a learned w needs the slacks.
+    sigma = solution.sigma if solution.qp.w.requires_grad else torch.zeros_like(lam)
+    duals = solution.chi, lam, solution.eta, solution.xi
+    gradients = envelope_gradients(weight, z, sigma, *duals)
+    parts = {n: getattr(solution.qp, n) for n in EVENT_SHAPES if n != "C" or not without_C}
+    parts = {n: x for n, x in parts.items() if x.requires_grad}
+    # Expanded to one copy per pair, each part has one gradient per pair.
+    in_parts = [gradients[n](x.expand(len(z), *x.shape)) for n, x in parts.items()]
+    options = {"is_grads_batched": True, "materialize_grads": True}
+    return torch.autograd.grad(list(parts.values()), leaves, in_parts, **options)
 
 
 def _move(blocks: list[Block], steps: list[Tensor], lr: float) -> None:
