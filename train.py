@@ -81,7 +81,7 @@ def _train(
     released = state is not None and state["structure"] != mpc.structure
     if released:
         mpc.release()
-    learner = make_learner(cfg, operator, physics, identified, done=cfg.release if released else 0)
+    learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
     gate = RunGate(cfg, learner, physics)
 
     # The data: vectorised episodes under the current policy, and their replay.

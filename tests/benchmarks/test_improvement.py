@@ -24,25 +24,13 @@ ROWS = pd.DataFrame(
 )
 
 
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("way", WAYS)
+PAIRS = [(case, way) for case in CASES for way in WAYS]
+PAIRS += [(case, way) for case in METHOD_CASES for way in METHODS]
+
+
+@pytest.mark.parametrize(("case", "way"), PAIRS)
 def test_every_case_is_a_valid_configuration(case, way):
     check_config(improvement.configuration(case, way, seed=1))
-
-
-def test_only_methods_that_need_a_replay_a_free_C_or_a_log_do_not_apply():
-    without = {
-        (case, method)
-        for case in METHOD_CASES
-        for method in METHODS
-        if not improvement.applies(case, method)
-    }
-    assert without == {
-        ("Gros-Zanon, corrupted, TD errors alone", "n steps"),
-        ("Gros-Zanon, corrupted, TD errors alone", "lambda"),
-        ("Gros-Zanon, corrupted, TD errors alone", "anchor"),
-        ("Tank with references, identified", "anchor"),
-    }
 
 
 def test_outcomes_are_relative_to_the_start():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.benchmarks.lti import REPLAYED, SINGLE, TD, Stream, run, tables
+from tests.benchmarks.lti import SINGLE, TD, Stream, run, tables
 
 
 def test_streams_depend_on_the_noise_and_the_learner() -> None:
@@ -16,7 +16,7 @@ def test_streams_depend_on_the_noise_and_the_learner() -> None:
     assert run(2, 60).costs[1] != learned.costs[1]
 
 
-@pytest.mark.parametrize("overrides", [SINGLE, TD, REPLAYED], ids=["each step", "TD", "replay"])
+@pytest.mark.parametrize("overrides", [SINGLE, TD], ids=["each step", "TD"])
 def test_other_updates_learn_within_some_hundred_steps(overrides: tuple[str, ...]) -> None:
     fixed, learned = run(2, 500, learn=False), run(2, 500, overrides)
     assert fixed.costs[-100:].sum() > 2 * learned.costs[-100:].sum() > 0

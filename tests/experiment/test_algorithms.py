@@ -140,16 +140,13 @@ def test_the_learner_sees_each_transition_and_tightens_by_their_errors():
     assert learner.back_off.margin > 0.01
 
 
-def test_prediction_errors_are_made_where_they_are_used():
+def test_a_back_off_follows_prediction_errors():
     cfg = make_config(*SMALL, "optimizer=gauss_newton", "task=gros_zanon")
     mpc = make_mpc(cfg, make_physics(cfg))
-    for prediction, back_off in ((0.0, None), (2.0, None), (0.0, 0.9)):
-        cfg.prediction, cfg.back_off = prediction, back_off
+    for back_off in (None, 0.9):
+        cfg.back_off = back_off
         errors = make_errors(cfg, mpc)
-        assert (errors is None) == (not prediction and back_off is None)
+        assert (errors is None) == (back_off is None)
         optimizer = make_optimizer(cfg, mpc, errors=errors)
         assert isinstance(optimizer, GaussNewton)
-        used = optimizer._residuals is not None
-        assert used == bool(prediction)
-        if errors is not None and used:
-            assert errors.weight == prediction
+        assert (optimizer._residuals is None) == (errors is None)

@@ -19,9 +19,7 @@ from torch_qpmpc import QPActorValueOperator, QPError
 from torch_qpmpc.experiment.collection import make_collector, num_columns
 from torch_qpmpc.experiment.config import (
     check_config,
-    differences,
     flatten,
-    load_config,
     settings,
 )
 from torch_qpmpc.experiment.config.messages import keys
@@ -33,27 +31,8 @@ from torch_qpmpc.learning.search import KNOBS
 GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
-#: Keys that configurations of earlier versions lack, and one that built-in tasks lack.
-NOT_NEEDED = (
-    "anchor",
-    "average",
-    "back_off",
-    "eval_seed",
-    "export",
-    "gate",
-    "gate_interval",
-    "average_cost",
-    "logger",
-    "lmbda",
-    "n_step",
-    "prediction",
-    "rivals",
-    "search.margin_k",
-    "start.name",
-    "target_horizon",
-    "task.file",
-    "task.kwargs",
-)
+#: Keys that built-in tasks lack.
+NOT_NEEDED = ("task.file", "task.kwargs")
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
@@ -115,7 +94,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "second": ("gate=true", "constraint=combined", "optimizer=gauss_newton", "batch_size=8"),
         "actor": ("algo=td3", "task=pendulum", "constraint=free", "batch_size=8"),
         "adaptive": ("constraint=adaptive", "optimizer=gauss_newton"),
-        "house": ("task=house", "warmup_steps=1", "policy_gradient.parts=[lb]"),
+        "house": ("task=house", "warmup_steps=1"),
         "house_wall": ("task=house_wall", "warmup_steps=1"),
         "four_tanks": ("task=four_tanks", "start=model", "warmup_steps=1"),
         "tank_references": ("task=tank_references", "warmup_steps=1"),
@@ -123,7 +102,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
         "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
     }.items():
-        cfg = make_config(*SMALL, *SEARCH, "delay_value=true", *overrides)
+        cfg = make_config(*SMALL, *SEARCH, *overrides)
         monkeypatch.setattr(
             train, "RunFolder", lambda folder, _, after, cfg=cfg: RunFolder(folder, cfg, after)
         )
@@ -238,28 +217,15 @@ BAD: dict[str, list[Any]] = {
     "release": [*WHOLE[:-2], math.nan],
     "exploration_std": REAL,
     "td_error_clip": [0, *REAL[:-1]],
-    "delay_value": FLAG,
     "target_rate": FRACTION,
-    "target_horizon": ["long", *NAME],
-    "n_step": WHOLE,
-    "lmbda": FRACTION[:-1],
-    "average_cost": FLAG,
     "step": ["newton", *NAME],
-    "penalty_step": ["newton", *NAME],
     "ablation": [3, True],
     "eval_seed": WHOLE[1:-2],
     "logger": ["visdom", *NAME],
     "export": ["python", 3, True],
     "figures": FLAG,
     "gate": FLAG,
-    "anchor": REAL,
-    "prediction": REAL,
     "back_off": [0.4, 1, math.nan, False, "half"],
-    "average": [-0.5, 1, 1.1, math.nan, False, "half", None],
-    "policy_gradient.parts": ["b", ["C"], ["H"], None, 3],
-    "policy_gradient.rate": [0, *REAL],
-    "policy_gradient.ridge": [0, *REAL],
-    "policy_gradient.memory": WHOLE[1:],
     "search.loops": WHOLE,
     **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
     "rivals": ["DeePC", 3, None, [1]],
@@ -395,7 +361,9 @@ def test_unknown_keys(key, remedy):
 NEEDED = [key for key in KEYS if key not in NOT_NEEDED]
 
 
-@pytest.mark.parametrize("key", [*NEEDED, *OPTIONAL, *GROUPS, "algo", "collector"])
+@pytest.mark.parametrize(
+    "key", [*NEEDED, *OPTIONAL, *GROUPS, "algo", "collector", "search", "start"]
+)
 def test_missing_keys(key):
     cfg = make_config("constraint=combined", *choices_with(key))
     owner, _, leaf = key.rpartition(".")
@@ -460,19 +428,6 @@ def test_a_misspelt_key_is_named_before_the_missing_one_and_that_before_a_confli
             cfg["update"] = 3
 
 
-def test_a_configuration_of_an_earlier_version_is_completed(tmp_path):
-    cfg, file = make_config("gate=false"), tmp_path / "config.yaml"
-    now = settings(cfg)
-    OmegaConf.set_struct(cfg, False)
-    later = ("logger", "eval_seed", "start", "gate", "anchor", "average", "policy_gradient")
-    for key in (*later, "prediction", "back_off", "search", "target_horizon", "n_step"):
-        del cfg[key]
-    OmegaConf.save(cfg, file)
-    assert differences(settings(cfg), now) is None
-    assert settings(load_config(file)) == now
-    assert differences(settings(cfg), {**now, "eval_seed": 3}) == ("eval_seed=None", "eval_seed=3")
-
-
 def test_solver_must_be_known():
     with pytest.raises(QPError, match="solver: got 'cplex'"):
         check_config(make_config("solver=cplex"))
@@ -497,10 +452,6 @@ def test_solver_must_be_known():
         (
             ["constraint=fixed", "task.learn_cost=[]"],
             r"task.learn_cost: got \[\], expected something to learn, here or in constraint.learn",
-        ),
-        (
-            ["optimizer=gauss_newton", "penalty_step=subgradient"],
-            r"penalty_step: got 'subgradient', expected proximal. gauss_newton takes no subg",
         ),
         (
             ["optimizer=gauss_newton", "constraint=si", "constraint.si.normalised=true"],
@@ -572,119 +523,31 @@ def test_solver_must_be_known():
             "noise.std: got 0.1, expected null. The noise of gros_zanon cannot be changed",
         ),
         (
-            ["target_horizon=shrinking", "task.horizon=1"],
-            "task.horizon: got 1, expected at least 2. target_horizon=shrinking drops",
+            ["back_off=0.9"],
+            "constraint.structure: got 'free', expected tied. back_off needs one model for all",
         ),
         (
-            ["target_horizon=shrinking", "task.hessian=full"],
-            "task.hessian: got 'full', expected diagonal or block. target_horizon=shrinking",
-        ),
-        (
-            ["target_horizon=shrinking", "algo=td3"],
-            "target_horizon: got 'shrinking', expected receding. td3 does not support",
-        ),
-        (
-            ["anchor=1"],
-            "start.name: got 'model', expected data. The anchor is at a C that was identified",
-        ),
-        (
-            ["anchor=1", "start=data", "optimizer=adam"],
-            "optimizer.name: got 'adam', expected gauss_newton. The anchor is part of its steps",
-        ),
-        (
-            ["anchor=1", "start=data", "constraint=fixed"],
-            r"constraint.learn: got \[\], expected a list with C, which is anchored",
-        ),
-        (
-            ["anchor=1", "start=data", "constraint=mpc"],
-            "constraint.structure: got 'tied', expected free. The anchor needs a free C",
-        ),
-        (
-            ["prediction=1"],
-            "constraint.structure: got 'free', expected tied. prediction and back_off need one",
-        ),
-        (
-            ["constraint=adaptive", "algo=td3", "prediction=0"],
-            "algo.name: got 'td3', expected qlearning. td3 does not support prediction and "
-            "back_off; constraint=mpc has neither",
-        ),
-        (
-            ["constraint=adaptive", "release=5"],
-            "release: got 5, expected null. prediction and back_off need a tied C; constraint=mpc",
-        ),
-        (
-            ["constraint=adaptive", "optimizer=adam"],
-            "optimizer.name: got 'adam', expected gauss_newton. prediction is part of its steps; "
+            ["constraint=adaptive", "algo=td3"],
+            "algo.name: got 'td3', expected qlearning. td3 does not support back_off; "
             "constraint=mpc has none",
         ),
         (
+            ["constraint=adaptive", "release=5"],
+            "release: got 5, expected null. back_off needs a tied C; constraint=mpc has none",
+        ),
+        (
+            ["constraint=adaptive", "optimizer=adam"],
+            "optimizer.name: got 'adam', expected gauss_newton. With back_off its steps follow the "
+            "prediction errors; constraint=mpc has none",
+        ),
+        (
             ["constraint=adaptive", "constraint.learn=[]"],
-            r"constraint.learn: got \[\], expected a list with C or b, which prediction moves",
+            r"constraint.learn: got \[\], expected a list with C or b. With back_off the model",
         ),
         (
             ["constraint=adaptive", "constraint.learn=[C,lb]"],
             r"constraint.learn: got \['C', 'lb'\], expected a list without lb and ub. back_off "
             "moves the bounds; constraint=mpc has none",
-        ),
-        (
-            ["constraint=adaptive", "policy_gradient.parts=[ub]"],
-            r"policy_gradient.parts: got \['ub'\], expected a list without lb and ub. back_off "
-            "moves the bounds; constraint=mpc has none",
-        ),
-        (
-            ["average=0.9", "gate=false"],
-            "gate: got False, expected true. The average is what the gate judges",
-        ),
-        (["lmbda=0.9"], "n_step: got 1, expected at least 2. lmbda mixes the returns of 1"),
-        (
-            ["n_step=3", "target_horizon=shrinking"],
-            "n_step: got 3, expected 1. target_horizon=shrinking has returns of one step",
-        ),
-        (["n_step=3", "algo=sac"], "n_step: got 3, expected 1. sac does not support returns of"),
-        (["n_step=3", "replay=false"], "replay: got False, expected true. n_step above 1 reads"),
-        (
-            ["n_step=3", "collector=multi", "collector.sync=false"],
-            "collector.sync: got False, expected true. n_step above 1 needs the following",
-        ),
-        (
-            ["n_step=3", "lmbda=0.9", "batch_size=256"],
-            "batch_size: got 256, expected a multiple of n_step = 3. lmbda samples slices",
-        ),
-        (
-            ["average_cost=true", "algo=ddpg"],
-            "average_cost: got True, expected false. ddpg does not support an average cost",
-        ),
-        (
-            ["average_cost=true", "target_horizon=shrinking"],
-            "target_horizon: got 'shrinking', expected receding with average_cost. A plant",
-        ),
-        (
-            ["average_cost=true", "task.learn_cost=[H]"],
-            r"task.learn_cost: got \['H'\], expected a list with c. The steps of c move",
-        ),
-        (
-            ["average_cost=true", "constraint=mpc", "release=5"],
-            "release: got 5, expected null. average_cost does not support release",
-        ),
-        (
-            ["task=house", "policy_gradient.parts=[q]"],
-            r"task.learn_cost: got \['q', 'c'\], expected a list without q, which is in policy_g",
-        ),
-        (
-            ["constraint=mpc", "policy_gradient.parts=[lb]"],
-            r"constraint.learn: got \[.*'lb'.*\], expected a list without lb.* either list",
-        ),
-        (
-            ["algo=ddpg", "policy_gradient.parts=[b]"],
-            r"policy_gradient.parts: got \['b'\], expected \[\]. ddpg has a policy gradient of",
-        ),
-        (
-            ["n_step=3", "policy_gradient.parts=[b]"],
-            "n_step: got 3, expected 1. The advantages of policy_gradient.parts are those of",
-        ),
-        (
-            ["exploration_std=0.0", "policy_gradient.parts=[b]"],
-            "exploration_std: got 0.0, expected a positive number. The policy gradient compares",
         ),
         (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
     ],
@@ -714,17 +577,13 @@ def test_the_step_rule_needs_its_solver(monkeypatch):
 ABLATIONS: dict[str, tuple[list[str], dict[str, Any]]] = {
     "reference": ([], {}),
     "adam_proximal": (["optimizer=adam"], {}),
-    "adam_subgradient": (["optimizer=adam"], {"penalty_step": "subgradient"}),
     "sgd": (["optimizer=sgd"], {"step": "projection"}),
-    "target_network": (["optimizer=adam"], {"delay_value": True}),
     "markov": ([], {"constraint.deviation.c_3": 1.0}),
     "si_raw": (["optimizer=adam", "constraint=si"], {}),
     "si_normalised": (["optimizer=adam", "constraint=si"], {"constraint.si.normalised": True}),
-    "soft_actions": ([], {"task.action_slack": 100.0}),
     "horizon_5": ([], {"task.horizon": 5}),
     "horizon_20": ([], {"task.horizon": 20, "warmup_steps": 20}),
     "projection": ([], {"step": "projection"}),
-    "sdp": ([], {"step": "sdp"}),
 }
 
 

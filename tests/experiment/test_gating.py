@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 import train
 from tests.runs import SMALL, make_config
-from torch_qpmpc.experiment.algorithms import Learner, evaluate, make_learner, make_operator
+from torch_qpmpc.experiment.algorithms import evaluate, make_learner, make_operator
 from torch_qpmpc.experiment.gating import BEST, RunGate
 from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
@@ -52,16 +52,11 @@ def test_the_policy_that_acts_is_the_one_that_is_reported(run):
     assert (folder / BEST).exists()
 
 
-def make_learned(*overrides: str) -> tuple[RunGate, Learner]:
+def make_gate(*overrides: str) -> tuple[RunGate, Any]:
     cfg = make_config(*SMALL, *overrides)
     physics = make_physics(cfg)
     learner = make_learner(cfg, make_operator(cfg, make_mpc(cfg, physics)), physics)
-    return RunGate(cfg, learner, physics), learner
-
-
-def make_gate(*overrides: str) -> tuple[RunGate, Any]:
-    gate, learner = make_learned(*overrides)
-    return gate, learner.actor
+    return RunGate(cfg, learner, physics), learner.actor
 
 
 def test_without_a_gate_the_learner_acts(tmp_path):
@@ -86,27 +81,6 @@ def test_a_candidate_that_got_worse_does_not_act():
 def test_without_an_interval_of_its_own_each_evaluation_is_judged():
     gate, _ = make_gate("gate=true", "gate_interval=null", "updates=8")
     assert [bool(gate.judge(update)) for update in range(1, 9)] == [False, True] * 4
-
-
-@pytest.mark.filterwarnings("ignore:Detected call of .lr_scheduler.step")
-def test_an_average_of_iterates_is_judged():
-    gate, learner = make_learned("gate=true", "average=0.75")
-    actor: Any = learner.actor
-    learner.advance()
-    start = actor.module.C.detach().clone()
-    with torch.no_grad():
-        actor.module.C.mul_(5.0)
-    learner.advance()
-    assert_close(learner.candidate.module.C.detach(), 2 * start)  # 0.75 + 0.25 * 5
-    p = torch.full((1, 4), 0.1).double()
-    assert_close(learner.policy(p), learner.candidate.module.policy(p))
-    for _ in range(2):
-        assert gate.judge(4)["gate/accepted"] == 0.0
-        assert_close(actor.module.C.detach(), 5 * start)
-    # After the third rejection in a row, average and iterate are the policy that acts.
-    gate.judge(4)
-    for module in (actor.module, learner.candidate.module, gate.actor.module):
-        assert_close(module.C.detach(), start)
 
 
 def test_without_a_gate_nothing_is_searched():

@@ -16,7 +16,6 @@ from tests.runs import SMALL, make_config
 from tests.stops import assert_events_are_whole, assert_same_numbers, go_on, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
-from torch_qpmpc.experiment.config import load_config
 from torch_qpmpc.experiment.run_state import resumed
 
 #: Settings in which neither stop is at an evaluation or a row of metrics.
@@ -24,12 +23,9 @@ RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3")
 STOPS = (2, 7)
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
 GATED = ("gate=true", "optimizer=gauss_newton")
-ANCHORED = ("start=data", "start.transitions=200", "anchor=1")
-POLICY = ("constraint.learn=[C]", "policy_gradient.parts=[lb,b]", "policy_gradient.memory=9")
-POLICY += ("exploration_std=0.1",)
+DATA = ("start=data", "start.transitions=200")
 ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
 NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
-SGD = ("optimizer=sgd", "penalty_step=subgradient")
 
 
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
@@ -37,17 +33,16 @@ SGD = ("optimizer=sgd", "penalty_step=subgradient")
     "overrides",
     [
         ("optimizer=adam", "constraint=combined"),
-        (*SGD, "constraint=combined", "solver=torch", "step=projection"),
+        ("optimizer=sgd", "constraint=combined", "solver=torch", "step=projection"),
         ("optimizer=gauss_newton", "constraint=combined", "solver=proxqp"),
         ("optimizer=adam", "constraint=mpc", "release=9"),
-        ("optimizer=recursive", *STREAM, "constraint=mpc", *POLICY),
-        ("optimizer=sliding", *STREAM, "replay_capacity=16", "batch_size=4"),
-        ("delay_value=true", "noise=brownian", "steps_per_update=3", "warm_start=false"),
-        ("optimizer=gauss_newton", "n_step=3", "replay_capacity=48", "average_cost=true"),
-        ("task=store", "optimizer=gauss_newton", "n_step=4", "lmbda=0.8", "average_cost=true"),
+        ("optimizer=recursive", *STREAM, "constraint=mpc"),
+        ("optimizer=recursive", *STREAM, "replay=true", "replay_capacity=16", "batch_size=4"),
+        ("noise=brownian", "steps_per_update=3", "warm_start=false"),
+        ("task=store", "optimizer=gauss_newton", "replay_capacity=48"),
         ("algo=td3", *ACTOR_CRITIC),
-        (*GATED, "constraint=mpc", "release=5", "search.w=0.5", "average=0.9"),
-        (*GATED, *ANCHORED, "constraint=free", "average=0.5"),
+        (*GATED, "constraint=mpc", "release=5", "search.w=0.5"),
+        (*GATED, *DATA, "constraint=free"),
         ("optimizer=recursive", *STREAM, *GATED[:1]),
         ("gate=true", "algo=td3", *ACTOR_CRITIC, *NETWORKS),
         ("task=store", "optimizer=gauss_newton", "constraint=si", "task.episode_steps=5"),
@@ -92,20 +87,6 @@ def test_a_run_that_has_no_checkpoint_yet_begins_anew(tmp_path, stopped):
     assert_events_are_whole(stopped)
 
 
-def test_a_run_of_an_earlier_version_resumes(tmp_path, stopped):
-    """Its configuration and its checkpoint lack the keys added since."""
-    file, checkpoint = stopped / "config.yaml", stopped / "checkpoint.pt"
-    cfg, state = load_config(file), load_checkpoint(checkpoint)
-    for key in ("logger", "eval_seed", "gate"):
-        del cfg[key], state["config"][key]
-    del state["gate"]
-    OmegaConf.save(cfg, file)
-    save_checkpoint(checkpoint, state)
-    go_on(stopped)
-    train.train(make_config(*RUN, "eval_interval=2", "figures=false"), str(tmp_path / "whole"))
-    assert_same_numbers(stopped, tmp_path / "whole")
-
-
 @pytest.mark.parametrize("when", ["finish", "drop_previous"])
 def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch, when):
     """The run is killed after its last update, before or after writing the summary."""
@@ -145,7 +126,7 @@ def test_a_finished_run_saves_theta_without_data(tmp_path, stopped):
 
 def test_environments_of_gymnasium_start_new_episodes_on_resume(tmp_path, monkeypatch, capsys):
     """Their state cannot be saved, nor that of other processes: test_collection.py."""
-    cfg = make_config(*RUN, "task=pendulum", "noise=none", "updates=6", "n_step=3")
+    cfg = make_config(*RUN, "task=pendulum", "noise=none", "updates=6")
     assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
     go_on(tmp_path)
     expected = "Starting new episodes: the state of the environments is not saved."

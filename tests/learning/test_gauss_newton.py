@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -13,7 +12,6 @@ from torch.testing import assert_close
 from tests.gauss_newton import Reference
 from tests.problems import MIXED, normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SystemIdentificationPenalty
-from torch_qpmpc.learning.anchor import Anchor
 from torch_qpmpc.learning.gauss_newton import FALL, RISE
 
 COUNT, DAMPING = 7, 0.2
@@ -68,56 +66,6 @@ def test_the_si_penalty_is_part_of_the_step(learn):
     assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
 
 
-def anchor_of(mpc: QPMPC) -> Anchor:
-    windows = normal(9, mpc.n_z, seed=3)
-    weights = normal(mpc.n_x, seed=4).square().repeat(mpc.horizon)
-    return Anchor(mpc.C_0 + 0.1 * normal(*mpc.C_0.shape, seed=5), windows.mT @ windows, weights)
-
-
-@pytest.mark.parametrize("mask", [False, True])
-def test_an_anchor_is_part_of_the_step(mask):
-    """Its gradient vanishes at the step's end, together with those of errors and damping."""
-    mpc = random_mpc(3, learn=("H", "C"))
-    learned = torch.rand(mpc.C_0.shape, generator=torch.Generator().manual_seed(0)) < 0.5
-    if mask:
-        mpc = random_mpc(3, learn={"H": True, "C": learned})
-    anchor, S = anchor_of(mpc), SystemIdentificationPenalty(1e-2).curvature(normal(5, mpc.n_z))
-    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False, anchor=anchor)
-    reference, (s, a), target = Reference(mpc, optimizer), pairs(), targets(mpc)
-    gradients, solution = reference.gradients(s, a), mpc.solve(s, a)
-    delta = (target - solution.value).detach()
-    metric = reference.metric(gradients, solution.z.detach())
-    rows = torch.cat(gradients, dim=1)
-    mu = DAMPING * (metric * rows.square()).sum(-1).mean()
-    before, C = reference.theta(), mpc.C.detach().clone()
-    optimizer.step(s, a, target, penalty=S)
-    step = reference.theta() - before
-    left = rows.mT @ (rows @ step - delta) + mu * step / metric
-    after = mpc.C.detach().requires_grad_()
-    penalty = delta.square().mean() * anchor.value(after) + COUNT / 2 * (after @ S * after).sum()
-    (force,) = torch.autograd.grad(penalty, after)
-    sizes = [leaf.numel() for leaf in reference.leaves]
-    parts = dict(zip(reference.parts, left.split(sizes), strict=True))
-    total = parts["C"].reshape(C.shape) + force
-    if mask:
-        assert torch.equal(after[~learned], C[~learned])
-        total = total[learned]
-    assert force.abs().max() > 1e-3
-    assert_close(total, torch.zeros_like(total), rtol=0, atol=1e-7)
-    assert_close(parts["H"], torch.zeros_like(parts["H"]), rtol=0, atol=1e-7)
-
-
-def test_the_trust_region_counts_the_anchor():
-    """A strong anchor takes C to C_0, whatever the targets are."""
-    mpc = random_mpc(7)
-    anchor = anchor_of(mpc)
-    optimizer = GaussNewton(mpc, anchor=anchor.times(1e6))
-    before = anchor.value(mpc.C).item()
-    for _ in range(3):
-        optimizer.step(*pairs(), targets(mpc))
-    assert anchor.value(mpc.C) < 1e-2 * before
-
-
 @pytest.mark.parametrize("name", PARTS)
 def test_a_memory_preserves_past_pairs(name):
     """A stream of single pairs steps as if past pairs were in the batch with zero error."""
@@ -130,108 +78,6 @@ def test_a_memory_preserves_past_pairs(name):
         before, expected = reference.theta(), reference.step(*pair, past=3)
         optimizer.step(*pair)
         assert_close(reference.theta() - before, expected, rtol=1e-4, atol=1e-8)
-
-
-def in_units(x: Tensor, u: float, d: float, cost: float, learn: tuple[str, ...]) -> QPMPC:
-    """Make one QP with a prefix in units x ``(2,)`` of the states, u, d, and of the cost."""
-    A = torch.tensor([[1.0, 0.2, 0.1, 0.0], [-0.1, 0.9, 0.0, -0.2]]).double()
-    B = torch.tensor([[0.1, 0.05], [0.3, -0.1]]).double()
-    of_row, bound = x.unsqueeze(-1), torch.ones(2)
-    return QPMPC(
-        2,
-        1,
-        4,
-        past=2,
-        n_d=1,
-        A=of_row * A / torch.cat((x, x)),
-        B=of_row * B / u,
-        E=of_row * torch.tensor([[0.3], [0.1]]) / d,
-        state_bounds=(-x * bound, x * bound),
-        action_bounds=([-0.5 * u], [0.5 * u]),
-        stage_weight=cost * torch.tensor([1.0, 0.5, 0.1]) / torch.cat((x, torch.tensor([u]))) ** 2,
-        terminal_weight=cost / x**2,
-        state_slack=10 * cost / x,
-        learn=learn,
-        solver="daqp",
-    )
-
-
-#: Units of the states, the action, the preview and the cost, and the parts that learn alike.
-UNITS = {
-    "unlike states": ((1e-2, 1e2), 1.0, 1.0, 1.0, ("q", "c", "C", "b")),
-    "temperatures and prices": ((20.0, 5.0), 3.0, 0.15, 1.0, ("q", "c", "C", "b")),
-    "cost": ((1.0, 1.0), 1.0, 1.0, 1e-3, ("H", "q", "c", "C", "b", "lb", "ub")),
-}
-
-
-@pytest.mark.parametrize("options", [{}, {"memory": 9}, {"trust_region": False, "lr": 0.5}])
-@pytest.mark.parametrize("name", UNITS)
-def test_a_qp_learns_alike_in_any_units(name, options):
-    states, u, d, cost, learn = UNITS[name]
-    x = torch.tensor(states, dtype=torch.float64)
-    plain = in_units(torch.ones(2).double(), 1.0, 1.0, 1.0, learn)
-    other = in_units(x, u, d, cost, learn)
-    column, row = torch.cat((x, torch.tensor([u, d])))[plain._layout.signals()], x.repeat(4)
-    optimizers = [GaussNewton(mpc, **options) for mpc in (plain, other)]
-    errors = []
-    for update in range(8):
-        p = random_states(COUNT, plain.n_p, size=0.9, seed=update)
-        a, s = random_states(COUNT, 1, size=0.45, seed=update + 9), p[:, -2:]
-        target = (s @ torch.tensor([[1.5, 0.4], [0.4, 1.0]]).double() * s).sum(-1) + p[:, 0] + 1.0
-        one = optimizers[0].step(p, a, target)
-        same = optimizers[1].step(column[: plain.n_p] * p, u * a, cost * target)
-        assert same.accepted == one.accepted
-        assert same.ratio == pytest.approx(one.ratio, rel=1e-4, nan_ok=True)
-        assert_close(same.solution.value / cost, one.solution.value, rtol=1e-5, atol=1e-5)
-        errors.append((one.solution.value - target).square().mean().item())
-    assert_close(other.C / row.unsqueeze(-1) * column, plain.C, rtol=1e-4, atol=1e-5)
-    assert_close(other.b / row, plain.b, rtol=1e-4, atol=1e-5)
-    assert_close(other.q / cost * column, plain.q, rtol=1e-4, atol=1e-5)
-    assert_close(other.c / cost, plain.c, rtol=1e-4, atol=1e-5)
-    assert errors[-1] < 0.7 * errors[0]
-
-
-def test_a_part_moves_no_more_freely_as_its_gradients_vanish():
-    """A single pair near the origin has hardly any gradient in C, but one in c."""
-    s, a = pairs()
-    for steps in (0, 3):
-        mpc = random_mpc(2, free=0.0, learn=("c", "C"))
-        optimizer = GaussNewton(mpc, trust_region=False)
-        for _ in range(steps):
-            optimizer.step(s, a, mpc.action_value(s, a).detach())
-        C = mpc.C.detach().clone()
-        optimizer.step(1e-3 * s[:1], 1e-3 * a[:1], torch.ones(1).double())
-        moved = (mpc.C.detach() - C).abs().max()
-        assert (moved < 1e-5) == (steps > 0)
-    assert mpc.c > 0.9
-
-
-def test_a_size_is_forgotten_slowly():
-    """A first batch that is far larger than all others damps C less with each step."""
-    (s, a), sizes = pairs(), []
-    mpc = random_mpc(2, free=0.0, learn=("c", "C"))
-    optimizer = GaussNewton(mpc, trust_region=False)
-    group = next(group for group in optimizer.param_groups if group["name"] == "C")
-    for scale in (1.0, *[1e-2] * 10):
-        p, u = scale * s, scale * a
-        optimizer.step(p, u, mpc.action_value(p, u).detach())
-        sizes.append(group["size"])
-    assert sizes == pytest.approx([sizes[0] * 0.9**k for k in range(11)])
-
-
-@pytest.mark.parametrize("memory", [0, 4])
-def test_signals_that_are_always_zero_do_no_harm(memory):
-    """From the origin nothing has a gradient but c; then one state is zero, and then none."""
-    options = {"stage_weight": [1.0, 1.0, 0.0], "learn": ("c", "C"), "solver": "daqp"}
-    mpc = QPMPC.from_model(0.9 * torch.eye(2), [[0.0], [1.0]], 3, **options)
-    optimizer = GaussNewton(mpc, memory=memory)
-    for s in ([0.0, 0.0], [0.0, 1.0], [1.0, 1.0]):
-        s, a = torch.tensor([s]).double(), torch.zeros(1, 1).double()
-        target = mpc.action_value(s, a).detach() + 0.1
-        C = mpc.C.detach().clone()
-        assert optimizer.step(s, a, target).accepted
-        assert (mpc.action_value(s, a) - target).abs() < 0.05
-        assert (mpc.C - C).abs().max() < 0.1
 
 
 def test_the_sizes_are_part_of_the_state():
@@ -373,15 +219,6 @@ def test_its_state_can_be_saved():
     assert fresh.step(*pairs(), targets(mpc)).damping == 0.7
 
 
-def test_a_state_of_the_earlier_metric_is_refused():
-    optimizer = GaussNewton(random_mpc(11))
-    state = optimizer.state_dict()
-    for group in state["param_groups"]:
-        del group["size"], group["signals"]
-    with pytest.raises(QPError, match="state_dict: got groups without size and signals, of an"):
-        optimizer.load_state_dict(state)
-
-
 def test_a_warm_start_saves_time_only():
     mpc = random_mpc(12, solver="proxqp")
     twin, s_a, target = copy.deepcopy(mpc), pairs(), targets(mpc)
@@ -422,27 +259,6 @@ def test_a_penalty_needs_a_free_C():
     mpc = random_mpc(learn=("H", "c"))
     with pytest.raises(QPError, match="penalty: got a C that is not free, expected C among the"):
         GaussNewton(mpc).step(*pairs(), targets(mpc), penalty=torch.eye(mpc.n_z).double())
-
-
-def test_an_anchor_needs_a_free_C_of_its_sizes():
-    anchor = anchor_of(random_mpc())
-    for mpc in (random_mpc(learn=("H", "c")), random_mpc(structure="tied", learn=("C",))):
-        with pytest.raises(QPError, match="anchor: got a C that is not free, expected C among"):
-            GaussNewton(mpc, anchor=anchor)
-    with pytest.raises(QPError, match=r"anchor.C_0: got shape .*Pass Anchor.of\(identified\)"):
-        GaussNewton(random_mpc(), anchor=anchor._replace(C_0=anchor.C_0[:1]))
-    wrong: Any = anchor.S
-    with pytest.raises(QPError, match="anchor: got"):
-        GaussNewton(random_mpc(), anchor=wrong)
-
-
-def test_an_anchor_takes_the_dtype_of_the_qp():
-    mpc = random_mpc(15, on_failure="mask", learn=("c", "C"))
-    (s, a), target = pairs(), targets(mpc)
-    sizes = mpc.C.detach(), torch.eye(mpc.n_z), torch.ones(len(mpc.C))
-    optimizer = GaussNewton(mpc, anchor=Anchor(*(x.float() for x in sizes)))
-    assert optimizer.step(s, a, target).accepted
-    assert mpc.C.dtype == torch.float64
 
 
 @pytest.mark.parametrize("trust_region", [True, False])

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives import SoftUpdate, ValueEstimators
+from torchrl.objectives import SoftUpdate
 
 from tests import store
 from tests.transitions import (
@@ -25,7 +25,7 @@ from tests.transitions import (
     make_operator,
     perturb,
 )
-from torch_qpmpc import QPMPC, QPActorValueOperator, QPError, QPQLearningLoss
+from torch_qpmpc import QPMPC, QPError, QPQLearningLoss
 from torch_qpmpc.learning.td_error import td_loss
 
 
@@ -92,65 +92,6 @@ def test_loss_and_its_gradients_with_a_window_and_a_preview(delay_value):
         torch.testing.assert_close(part.grad, expected.grad, msg=name)
     with pytest.raises(QPError, match=r"\('next', 'preview'\): got .*, expected one with preview"):
         loss(td.exclude(("next", "preview")))
-
-
-@pytest.mark.parametrize("delay_value", [False, True])
-def test_a_shrinking_horizon_has_the_value_of_one_stage_less(delay_value):
-    operator = store.make_operator()
-    twin = copy.deepcopy(operator.module)
-    loss = make_loss(operator=operator, delay_value=delay_value, horizon="shrinking")
-    if delay_value:
-        SoftUpdate(loss, tau=0.1)
-    td = store.collect(3, 8).reshape(-1)
-    loss(td)["loss_value"].backward()
-
-    def known(data: TensorDictBase) -> Tensor:
-        return torch.cat((data["preview"], data["observation"]), -1)
-
-    with torch.no_grad():
-        V = twin.shortened_value(known(td["next"]))[0]
-    target = -td["next", "reward"].squeeze(-1) + GAMMA * V
-    torch.testing.assert_close(-loss.target(td), target)
-    Q = twin.action_value(known(td), td["action"])
-    (0.5 * (target - Q).square().mean()).backward()
-    for one, other in zip(operator.module.parameters(), twin.parameters(), strict=True):
-        torch.testing.assert_close(one.grad, other.grad)
-
-
-def test_a_shrinking_horizon_learns_the_constant_at_gamma_one():
-    """The TD error of a known QP whose stages cost 0.3 more vanishes; that of V_N never does."""
-    costs = []
-    for horizon in ("shrinking", "receding"):
-        options = {"gamma": 1.0, "learn": ("c",), "solver": "daqp"}
-        mpc = QPMPC.from_model([[0.5]], [[1.0]], 4, stage_weight=[1.0, 0.1], **options)
-        loss = QPQLearningLoss(QPActorValueOperator(mpc), horizon=horizon)
-        loss.make_value_estimator(gamma=1.0)
-        s, a = torch.tensor([[0.4], [-1.0]]).double(), torch.tensor([[0.1], [0.3]]).double()
-        stage = 0.5 * (s.square() + 0.1 * a.square())
-        td = make_batch(2).exclude("next").set("observation", s).set("action", a)
-        ended = torch.zeros(2, 1).bool()
-        following = {"observation": 0.5 * s + a, "reward": -(stage + 0.3)}
-        td.set("next", {**following, "done": ended, "terminated": ended})
-        optimizer = torch.optim.SGD(mpc.parameters(), lr=0.5)
-        for _ in range(100):
-            optimizer.zero_grad()
-            loss(td)["loss_value"].backward()
-            optimizer.step()
-        costs.append(mpc.c.item())
-    assert costs[0] == pytest.approx(4 * 0.3, abs=1e-3)
-    assert costs[1] > 10
-
-
-def test_a_shrinking_horizon_needs_td0_and_a_stage_to_drop():
-    loss = make_loss(horizon="shrinking")
-    for estimator in ("tdlambda", ValueEstimators.TD1):
-        with pytest.raises(QPError, match=r"value_type: got .*, expected TD0\. Other"):
-            loss.make_value_estimator(estimator)
-    with pytest.raises(QPError, match="horizon: got 'long', expected 'receding' or 'shrinking'"):
-        make_loss(horizon="long")
-    full = make_operator(hessian="full", learn=("H", "C"))
-    with pytest.raises(QPError, match="hessian: got 'full', expected 'diagonal' or 'block'"):
-        make_loss(operator=full, horizon="shrinking")
 
 
 def test_input_is_left_alone_by_an_estimator_that_rewrites_rewards():

@@ -42,7 +42,7 @@ def test_a_scalar_moves_its_part_alone(name, learn, hessian):
     for part in PARTS:
         assert_close(back[part], before[part])
     bounds = {"lb", "ub"}
-    parts = {"margin": bounds, "margin_k": bounds, "H_u": {"H"}, "H_x": {"H"}, "q_f": {"q"}}
+    parts = {"margin": bounds, "H_u": {"H"}, "q_f": {"q"}}
     assert moved >= parts.get(name, {name})
     unchanged = set(PARTS) - parts.get(name, {name})
     for part in unchanged:  # up to the rounding of a factor of H
@@ -59,26 +59,13 @@ def test_a_margin_tightens_soft_rows_alone():
     assert_close(mpc.lb[~soft], before["lb"][~soft])
 
 
-def test_a_margin_by_stage_grows_like_the_root_of_the_stage():
-    D = torch.ones(1, 3)
-    rows = {"constraints": (D, [-4.0], [4.0]), "terminal_constraints": (D[:, :2], [-5.0], [5.0])}
-    mpc = scheme(structure="varying", learn=("lb", "ub"), **rows)
-    before = values(mpc)
-    _set(mpc, before, {"margin_k": 0.3})
-    at = 0.3 * (torch.arange(4).double() / 3).sqrt()
-    plan = torch.cat([torch.stack((x, x, 0 * x)) for x in at])[:-1]  # the action's row is hard
-    margin = torch.cat((plan, at[:-1], at[-1:]))
-    assert_close(mpc.lb.detach(), before["lb"] + margin, rtol=1e-14, atol=0)
-    assert_close(mpc.ub.detach(), before["ub"] - margin, rtol=1e-14, atol=0)
-
-
 @pytest.mark.parametrize(
     ("options", "missing"),
     [
-        ({"structure": "tied", "learn": ("C", "lb")}, {"margin_k"}),
+        ({"structure": "tied", "learn": ("C", "lb")}, set()),
         ({"structure": "tied", "learn": ("C",)}, set()),
-        ({"hessian": "full"}, {"H_x", "H_u", "H_f"}),
-        ({"state_slack": math.inf}, {"margin", "margin_k", "w"}),
+        ({"hessian": "full"}, {"H_u", "H_f"}),
+        ({"state_slack": math.inf}, {"margin", "w"}),
     ],
 )
 def test_scalars_that_a_QP_lacks_are_refused(options, missing):
@@ -99,11 +86,7 @@ def test_factors_of_weights():
     expected[2] *= 2
     expected[:, 2] *= 2
     assert_close(mpc.H.detach(), expected)
-    _set(mpc, before, {"H_x": math.log(4.0), "H_f": math.log(3.0), "w": math.log(2.0)})
-    expected = W.clone()
-    expected[:2] *= 2
-    expected[:, :2] *= 2
-    assert_close(mpc.H.detach(), expected)
+    _set(mpc, before, {"H_f": math.log(3.0), "w": math.log(2.0)})
     assert_close(mpc.H_f.detach(), 3 * before["H_f"])
     assert_close(mpc.w.detach(), 2 * before["w"])
 

@@ -35,8 +35,7 @@ from torch_qpmpc import (
     ThetaNetwork,
 )
 from torch_qpmpc.envs import PointMassEnv
-from torch_qpmpc.learning.policy_gradient import PolicyGradient
-from torch_qpmpc.learning.updates import second_order, with_policy_gradient
+from torch_qpmpc.learning.updates import second_order
 
 SIZES = {"q": 0.3, "b": 0.1, "c": 1.0}
 
@@ -276,16 +275,13 @@ def test_a_replay_stores_observations_and_no_theta():
     assert loss(sample)["loss_value"].isfinite()
 
 
-def test_gauss_newton_and_the_policy_gradient_take_no_upstream_modules():
+def test_gauss_newton_takes_no_upstream_modules():
     mpc, theta, operator = scheduled()
-    policy_gradient = PolicyGradient(random_mpc(0, learn=("c", "b")), ["b"])
     message = "loss_module: got a value network with theta_keys"
     for network in (critic_of(theta, operator), operator):
         loss = QPQLearningLoss(network)
         with pytest.raises(QPError, match=message):
             second_order(mpc, loss, GaussNewton(mpc), None, None)
-        with pytest.raises(QPError, match=message):
-            with_policy_gradient(lambda *_: ({}, {}), loss, policy_gradient)
 
 
 def test_the_network_reads_other_keys():

@@ -44,17 +44,6 @@ def make_loss(key: str | None, solver: str = "daqp", **options) -> QPQLearningLo
     return loss
 
 
-def test_a_shrinking_horizon_reads_and_writes_the_active_sets_of_v():
-    loss, cold = (make_loss(key, horizon="shrinking") for key in (ACTIVE_SET, None))
-    td = transitions()
-    expected = cold.target(td.clone())
-    for _ in range(2):  # the second time from the active sets of the first
-        assert_close(loss.target(td), expected)
-        active = td["next", ACTIVE_SET]
-        assert active.shape == (COUNT, len(loss.operator.module.lb))
-    assert active.any()
-
-
 def test_an_operator_reads_and_writes_the_active_set():
     mpc = random_mpc(3, solver="proxqp")
     operator = QPActorValueOperator(mpc, active_set_key="codes")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -12,8 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
+from torchrl.objectives import LossModule, SoftUpdate
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.actor_critic import (
@@ -22,9 +20,7 @@ from torch_qpmpc.experiment.actor_critic import (
     make_actor_critic_loss,
     make_closed_loop_actor,
 )
-from torch_qpmpc.experiment.collection import target_gamma
-from torch_qpmpc.experiment.tasks import AnyPlant, Start, find_task
-from torch_qpmpc.learning.anchor import Anchor
+from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import (
     POLICY_ACTIVE_SET,
@@ -33,11 +29,10 @@ from torch_qpmpc.learning.operators import (
     preview_key,
 )
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
-from torch_qpmpc.learning.policy_gradient import PolicyGradient
 from torch_qpmpc.learning.prediction_errors import PredictionErrors
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.replay import ACTIVE_SET
-from torch_qpmpc.learning.updates import Update, first_order, second_order, with_policy_gradient
+from torch_qpmpc.learning.updates import Update, first_order, second_order
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.tightening import BackOff
 
@@ -51,12 +46,10 @@ class Learner:
         loss_module: the loss, with its target networks and critics.
         actor: maps observation to action, without exploration.
         deviation, si: the penalties; None if off.
-        target: the soft update of the target network; None without one.
-        policy_gradient: moves parts of theta by the policy's gradient; None without such parts.
+        target: the soft update of an actor-critic's target networks; None for Q-learning.
         n_preview: entries of the preview, with which p begins.
-        average: the exponential average of the actor's parameters; None without one.
-        errors: the prediction errors of the transitions; None if nothing uses them.
-        back_off: tightens the bounds by the covariance of these; None if it is off.
+        errors: the prediction errors of the transitions, which the model follows; None if off.
+        back_off: tightens the bounds by their covariance; None if off.
     """
 
     learn: Update
@@ -67,21 +60,14 @@ class Learner:
     deviation: DeviationPenalty | None
     si: SystemIdentificationPenalty | None
     target: SoftUpdate | None
-    policy_gradient: PolicyGradient | None = None
     n_preview: int = 0
-    average: AveragedModel | None = None
     errors: PredictionErrors | None = None
     back_off: BackOff | None = None
 
     @property
-    def candidate(self) -> Any:
-        """The policy that a gate judges: the average of the actor or, without one, the actor."""
-        return self.actor if self.average is None else self.average.module
-
-    @property
     def policy(self) -> Callable[[Tensor], Tensor]:
-        """The candidate as a function from p to a, for one closed loop."""
-        return in_closed_loop(self.candidate, self.n_preview)
+        """The actor as a function from p to a, for one closed loop."""
+        return in_closed_loop(self.actor, self.n_preview)
 
     def observe(self, batch: TensorDictBase) -> None:
         """Add new transitions to the prediction errors."""
@@ -92,19 +78,12 @@ class Learner:
             self.errors.add(operator.known(flat), flat.get(operator.in_keys[1]), following)
 
     def advance(self) -> None:
-        """Advance the schedule, the bounds, the target network and the average by one update."""
+        """Advance the schedule, the bounds and the target network by one update."""
         self.schedule.step()
         if self.back_off is not None and self.errors is not None:
             self.back_off.tighten(self.errors.covariance(self.back_off.mpc.quadratic_program()))
         if self.target is not None:
             self.target.step()
-        if self.average is not None:
-            self.average.update_parameters(self.actor)
-
-    def restart(self) -> None:
-        """Go on learning from the candidate."""
-        if self.average is not None:
-            self.actor.load_state_dict(self.candidate.state_dict())
 
 
 def make_operator(cfg: DictConfig, mpc: QPMPC) -> QPActorValueOperator:
@@ -117,47 +96,23 @@ def make_learner(
     cfg: DictConfig,
     operator: QPActorValueOperator,
     physics: AnyPlant,
-    start: Start | None = None,
     *,
     done: int = 0,
 ) -> Learner:
-    """Make the learner of ``cfg.algo``; its rates continue after ``done`` updates.
-
-    An anchor is at the C that was identified at the ``start``.
-    """
+    """Make the learner of ``cfg.algo``; its rates continue after ``done`` updates."""
     mpc = operator.module
-    policy_gradient = make_policy_gradient(cfg, mpc)
     if cfg.algo.name == "qlearning":
-        loss_module = QPQLearningLoss(
-            operator,
-            delay_value=cfg.delay_value,
-            horizon=cfg.target_horizon,
-            average_cost=cfg.average_cost,
-            td_error_clip=cfg.td_error_clip,
-        )
+        loss_module = QPQLearningLoss(operator, td_error_clip=cfg.td_error_clip)
         actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
     else:
         loss_module = make_actor_critic_loss(cfg, mpc, physics)
         actor = make_closed_loop_actor(cfg, mpc, loss_module, physics)
-    gamma = target_gamma(cfg)
-    if cfg.lmbda is None:
-        loss_module.make_value_estimator(gamma=gamma)
-    else:
-        loss_module.make_value_estimator(ValueEstimators.TDLambda, gamma=gamma, lmbda=cfg.lmbda)
+    loss_module.make_value_estimator(gamma=cfg.task.gamma)
     deviation, si = make_penalties(cfg, mpc)
-    anchor, errors = make_anchor(cfg, start), make_errors(cfg, mpc)
-    optimizer = make_optimizer(cfg, mpc, loss_module, anchor, errors)
+    errors = make_errors(cfg, mpc)
+    optimizer = make_optimizer(cfg, mpc, loss_module, errors)
     schedule = make_schedule(cfg, optimizer, done)
-    delayed = cfg.algo.name != "qlearning" or cfg.delay_value
     update = make_update(cfg, mpc, loss_module, optimizer, schedule, deviation, si, done)
-    if policy_gradient is not None:
-        assert isinstance(loss_module, QPQLearningLoss)
-
-        def share() -> float:
-            rates = cfg.optimizer.final_fraction
-            return decay(done + schedule.last_epoch, cfg.updates, rates)
-
-        update = with_policy_gradient(update, loss_module, policy_gradient, share)
     return Learner(
         update,
         loss_module,
@@ -166,10 +121,8 @@ def make_learner(
         schedule,
         deviation,
         si,
-        SoftUpdate(loss_module, tau=cfg.target_rate) if delayed else None,
-        policy_gradient,
+        None if cfg.algo.name == "qlearning" else SoftUpdate(loss_module, tau=cfg.target_rate),
         (mpc.horizon + 1) * mpc.n_d,
-        make_average(cfg, actor),
         errors,
         None if cfg.back_off is None else BackOff(mpc, cfg.back_off),
     )
@@ -186,47 +139,20 @@ def make_penalties(
     )
 
 
-def make_anchor(cfg: DictConfig, start: Start | None) -> Anchor | None:
-    """Make the anchor at the identified C; None if it is off."""
-    if not cfg.anchor or start is None:
-        return None
-    return Anchor.of(start.identified, cfg.anchor, b_learned="b" in cfg.constraint.learn)
-
-
 def make_errors(cfg: DictConfig, mpc: QPMPC) -> PredictionErrors | None:
-    """Make the prediction errors; None if neither steps nor bounds use them."""
-    if not cfg.prediction and cfg.back_off is None:
-        return None
-    return PredictionErrors(mpc, weight=cfg.prediction or 1.0)
-
-
-def make_average(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedModel | None:
-    """Make the exponential average of the actor's parameters, at first a copy; None if off.
-
-    It averages the Cholesky factors of H, so that H stays positive semidefinite.
-    """
-    if not cfg.average:
-        return None
-    return AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(cfg.average))
-
-
-def make_policy_gradient(cfg: DictConfig, mpc: QPMPC) -> PolicyGradient | None:
-    """Make the policy gradient and freeze its parts for TD errors; None without parts."""
-    options = dict(cfg.policy_gradient)
-    parts = tuple(options.pop("parts"))
-    return PolicyGradient(mpc, parts, **options) if parts else None
+    """Make the prediction errors, which model and bounds follow; None without a back-off."""
+    return None if cfg.back_off is None else PredictionErrors(mpc)
 
 
 def make_optimizer(
     cfg: DictConfig,
     mpc: QPMPC,
     loss_module: LossModule | None = None,
-    anchor: Anchor | None = None,
     errors: PredictionErrors | None = None,
 ) -> torch.optim.Optimizer:
     """Make the optimiser, with one rate for the cost and one for the constraints.
 
-    ``errors`` are a term of Gauss-Newton's steps if ``prediction`` gives them a weight.
+    ``errors`` are a term of Gauss-Newton's steps.
     ``loss_module`` is needed for actor-critic algorithms, whose critics are optimised, too.
     """
     options = cfg.optimizer
@@ -240,8 +166,7 @@ def make_optimizer(
             td_error_clip=cfg.td_error_clip,
             trust_region=options.trust_region,
             normalise=options.normalise,
-            anchor=anchor,
-            residuals=errors.residuals if errors is not None and cfg.prediction else None,
+            residuals=None if errors is None else errors.residuals,
         )
     rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}
     if loss_module is None or cfg.algo.name == "qlearning":
@@ -274,7 +199,6 @@ def make_update(
         optimizer,
         deviation,
         si,
-        cfg.penalty_step,
         lambda: (done + schedule.last_epoch + 1) % every == 0,
     )
 

@@ -29,11 +29,6 @@ def num_columns(cfg: DictConfig) -> int:
     return cfg.num_envs // cfg.collector.workers if asynchronous else cfg.num_envs
 
 
-def target_gamma(cfg: DictConfig) -> float:
-    """Return the discount factor of the TD target: 1 with an average cost."""
-    return 1.0 if cfg.average_cost else cfg.task.gamma
-
-
 def make_collector(
     cfg: DictConfig, physics: AnyPlant, actor: TensorDictModuleBase
 ) -> BaseCollector:
@@ -93,8 +88,6 @@ def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
         active_rows=len(mpc.G) if cfg.warm_start else None,
         n_x=mpc.n_x,
         preview_key=preview_key(mpc),
-        n_step=cfg.n_step,
-        gamma=target_gamma(cfg) if cfg.lmbda is None else None,
     )
 
 

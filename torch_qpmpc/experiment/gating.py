@@ -73,14 +73,12 @@ class RunGate:
 
     def _judge(self, tag: str) -> dict[str, float]:
         assert self._gate is not None
-        verdict = self._gate.judge(self._learner.candidate)
-        if verdict.restarted:
-            self._learner.restart()
+        verdict = self._gate.judge(self._learner.actor)
         names = ("accepted", "mean", "low", "high", "pairs")
         return {f"{tag}/{name}": float(getattr(verdict, name)) for name in names}
 
     def _search(self) -> dict[str, float]:
-        actor = self._learner.candidate
+        actor = self._learner.actor
         mpc = _qp(actor)
         if mpc is None:
             return {}
@@ -133,7 +131,7 @@ class RunGate:
         """Load a `state_dict`."""
         if self._gate is not None and state is not None:
             self._gate.load_state_dict(state)
-            self.simulated = state.get("simulated", 0)
+            self.simulated = state["simulated"]
 
 
 def _interval(cfg: DictConfig) -> int:

@@ -62,7 +62,7 @@ def run_summary(found: Evaluation, tally: Tally, gate: RunGate) -> dict[str, Any
     summary = found.summary() | gate.summary()
     summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
     summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
-    summary |= {"ablation": cfg.ablation, "step": cfg.step, "penalty_step": cfg.penalty_step}
+    summary |= {"ablation": cfg.ablation, "step": cfg.step}
     summary |= {"updates": cfg.updates, **tally.summary()}
     return summary if mpc is None else summary | structure_summary(mpc, true_model(found.physics))
 

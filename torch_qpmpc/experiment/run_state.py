@@ -30,7 +30,7 @@ from torch_qpmpc.mpc.module import QPMPC
 
 #: The parts of a snapshot.
 STATE = ("config", "update", "structure", "mpc", "loss_module", "optimizer", "schedule")
-STATE += ("replay", "collector", "tally", "rng")
+STATE += ("errors", "gate", "replay", "collector", "tally", "rng")
 #: Files that a run writes before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
 
@@ -57,9 +57,7 @@ def snapshot(
         "loss_module": learner.loss_module.state_dict(),
         "optimizer": learner.optimizer.state_dict(),
         "schedule": {"last_epoch": learner.schedule.last_epoch},
-        "average": None if learner.average is None else learner.average.state_dict(),
         "errors": None if learner.errors is None else learner.errors.state_dict(),
-        "policy_gradient": improve.state_dict() if (improve := learner.policy_gradient) else None,
         "gate": gate.state_dict(),
         "replay": replay.state_dict() if len(replay) and not finished else None,
         "collector": None if finished else _collector_state(collector),
@@ -89,17 +87,11 @@ def restore(
         learner.optimizer.load_state_dict(state["optimizer"])
     with _part("schedule"):
         learner.schedule.last_epoch = int(state["schedule"]["last_epoch"])
-    with _part("average"):
-        if learner.average is not None:
-            learner.average.load_state_dict(state["average"])
     with _part("errors"):
         if learner.errors is not None:
             learner.errors.load_state_dict(state["errors"])
-    with _part("policy_gradient"):
-        if learner.policy_gradient is not None and state.get("policy_gradient") is not None:
-            learner.policy_gradient.load_state_dict(state["policy_gradient"])
     with _part("gate"):
-        gate.load_state_dict(state.get("gate"))
+        gate.load_state_dict(state["gate"])
     with _part("replay"):
         if state["replay"] is not None:
             replay.load_state_dict(state["replay"])

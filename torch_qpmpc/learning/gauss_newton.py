@@ -1,32 +1,10 @@
-"""Second-order Q-learning: a Levenberg-Marquardt step on a batch of TD errors, in kernel form.
+"""Second-order Q-learning: a Levenberg-Marquardt step on a batch of TD errors.
 
 With g_i = dQ(s_i, a_i)/dtheta by the envelope theorem and a metric D on theta, the step solves
 
     min over dtheta:  1/2 sum_i (delta_i - g_i'dtheta)^2 + 1/2 mu dtheta'D^-1 dtheta
 
-by its dual, ``dtheta = D sum_i alpha_i g_i``, ``(K + mu I) alpha = delta``, ``K_ij = g_i'D g_j``,
-a system of the batch's size. mu is a fraction of the mean of K's diagonal.
-
-D is diagonal and has no free units. For each part p of theta
-
-    D_p = scale_p U_p / size_p,    size_p <- max(mean_i g_ip'U_p g_ip, 0.9 size_p),
-
-so that mu damps each part in relation to its own gradients. A part of the cost has a size of its
-own; C, b, G, lb and ub share the sum of theirs, as they describe one model. Sizes rise at once, as
-those of MINPACK's scaling: otherwise a part would move the more freely, the less Q depends on it.
-They fall slowly, so that the large gradients of a bad start do not damp a part for ever.
-
-U is the identity except where C is free. With m_j the mean square of signal j, an entry of x, u
-or d, over a batch and z's stages, with the same slow fall, U is m_i / m_j for the entry of C in a
-row that predicts x's entry i and a column of signal j, and m_i for that row's entry of b: entries
-are measured by the prediction's relative change. For q it is 1 / m_j. The step is then the same in
-any unit of the cost and, for c, q, C and b, in any units of the signals. A signal has one m for all
-stages, because a single entry of z may be nearly zero in a batch without being small.
-
-The gradients in a free C are the outer products chi_i z_i', so that ``K = (chi chi') * (z P z')``
-is computed without forming them. P is the metric of C's rows: U's or, with the SI penalty
-(eq:sdp3) or an anchor, which are quadratic in each row, the inverse of the summed curvatures of
-damping and penalties. The penalties thus enter the same step. Where C is not free, further
+by its dual (`learning.kernel`); `learning.metric` defines D. Where C is not free, further
 residuals r, such as the one-step prediction errors of a tied C, add 1/2 v |r + dr/dtheta dtheta|^2,
 with v the mean squared TD error: they are further rows of the least-squares problem.
 """
@@ -34,33 +12,34 @@ with v the mean squared TD error: they are further rows of the least-squares pro
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.learning.anchor import Anchor
-from torch_qpmpc.learning.pairs import usable
+from torch_qpmpc.learning.kernel import (
+    Block,
+    Dense,
+    OuterProducts,
+    damping_of,
+    objective,
+    solve_dual,
+)
+from torch_qpmpc.learning.metric import FORGET, FRESH, scale, signal_sizes
+from torch_qpmpc.learning.td_error import usable
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
-from torch_qpmpc.mpc.validation import COST
 from torch_qpmpc.qp.derivatives import envelope_gradients
 from torch_qpmpc.qp.program import EVENT_SHAPES, QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 
 #: A ratio of actual to predicted decrease below POOR raises the damping; one above GOOD lowers it.
 POOR, GOOD = 0.25, 0.75
-#: Smallest size of a part and smallest mean square of a signal, as a fraction of the largest.
-FLOOR = 1e-12
-#: Factor by which a size or a mean square can fall from one batch to the next.
-FORGET = 0.9
 #: Factors by which the damping rises and falls, and its upper bound.
 RISE, FALL, MAX_DAMPING = 4.0, 0.5, 1e6
-NOT_FREE = "a C that is not free"
 
 
 def _positive(x: float) -> bool:
@@ -116,16 +95,14 @@ class GaussNewton(torch.optim.Optimizer):
             damping to the ratio of actual to predicted decrease.
         normalise: divide by sizes and units, as above. False takes the scales themselves as D, by
             default 1 and 0.01, for streams of small batches, whose sizes are mostly noise.
-        anchor: a penalty on C, times the batch's mean squared TD error. With that as the variance
-            of the errors, a step is towards the largest posterior of the anchor's log and a batch.
         residuals: maps a QP to residuals r ``(M,)``, differentiable in its tensors, such as
             `PredictionErrors.residuals`. 1/2 r'r at first order, times the mean squared TD error,
             is added to the batch's sum of ``1/2 delta^2``. That mean rises at once and falls
             slowly, like a size.
 
     Raises:
-        QPError: if a number is out of range, the scales do not fit the learned parts, the anchor
-            does not fit a learned, free C, or there are residuals and C is free and learned.
+        QPError: if a number is out of range, the scales do not fit the learned parts, or there are
+            residuals and C is free and learned.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -150,7 +127,6 @@ class GaussNewton(torch.optim.Optimizer):
         memory: int = 0,
         trust_region: bool = True,
         normalise: bool = True,
-        anchor: Anchor | None = None,
         residuals: Callable[[QuadraticProgram], Tensor] | None = None,
     ) -> None:
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
@@ -166,22 +142,14 @@ class GaussNewton(torch.optim.Optimizer):
         groups = mpc.parameter_groups(scales or default)
         for group in groups:
             check_number(f"scales[{group['name']}]", group["lr"], _positive, "a finite number > 0")
-            group |= {"scale": group["lr"], "lr": lr, "damping": damping}
-            group |= {"size": 0.0, "signals": None, "variance": 0.0}
+            group |= {"scale": group["lr"], "lr": lr, "damping": damping, **FRESH}
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
         self._clip, self._memory, self._trust_region = td_error_clip, memory, trust_region
-        self._normalise, self._anchor, self._residuals = normalise, anchor, residuals
+        self._normalise, self._residuals = normalise, residuals
         if residuals is not None and self._free_C() is not None:
-            remedy = "Pass a penalty of its rows to step, or an anchor."
+            remedy = "Pass a penalty of its rows to step."
             raise QPError.expected("residuals", "them with a free C", "a tied C", remedy)
-        if anchor is not None:
-            check_kind("anchor", anchor, Anchor)
-            if self._free_C() is None:
-                raise QPError.expected("anchor", NOT_FREE, "C among the learned parts")
-            remedy = "Pass Anchor.of(identified), with the sizes of the QPMPC."
-            check_tensor("anchor.C_0", anchor.C_0, *mpc.C.shape, batched=False, remedy=remedy)
-            self._anchor = Anchor(*(x.to(mpc.C) for x in anchor))
 
     @torch.no_grad()
     def step(  # pyright: ignore[reportIncompatibleMethodOverride] - not a closure
@@ -211,8 +179,68 @@ class GaussNewton(torch.optim.Optimizer):
             QPError: if a shape does not fit, C is not free but penalised, or the QPMPC has new
                 parameters, as after `QPMPC.release`.
         """
-        mpc = self._mpc
         self._check_parameters()
+        self._check_batch(s, a, target, penalty)
+        lr, damping = (self.param_groups[0][name] for name in ("lr", "damping"))
+        with torch.enable_grad():
+            qp = self._mpc.quadratic_program()
+        solution = self._mpc.solve(s, a, warm_start, qp)
+        use, left_out = usable(solution.solved, target)
+
+        def report(ratio: float, accepted: bool) -> StepReport:
+            return StepReport(solution, damping, ratio, accepted, *left_out)
+
+        count = len(s) - sum(left_out)
+        if not count:
+            return report(math.nan, False)
+        delta = torch.where(use, target.to(solution.value) - solution.value, 0)
+        if self._clip is not None:
+            delta = delta.clamp(-self._clip, self._clip)
+        blocks = self._blocks(solution, use, None if penalty is None else count * penalty)
+        errors, steps, change = self._solve(blocks, delta, count)
+        if not (objective(errors, blocks).isfinite() and all(x.isfinite().all() for x in steps)):
+            self._restart()
+            return report(math.nan, False)
+        if not self._trust_region:
+            _move(blocks, steps, lr)
+            self._mpc.project_()
+            return report(math.nan, True)
+        old = [block.leaf.clone() for block in blocks]
+        ratio = self._try(blocks, steps, errors, change, (s, a, use, solution))
+        accepted = ratio > 0  # False for nan, which an infinite cost causes
+        if not accepted:
+            for block, value in zip(blocks, old, strict=True):
+                block.leaf.copy_(value)
+        self._adapt(ratio)
+        return report(ratio, accepted)
+
+    def _solve(
+        self, blocks: list[Block], delta: Tensor, count: int
+    ) -> tuple[Tensor, list[Tensor], Tensor]:
+        """Return the errors of pairs and residuals, the parts' steps, and their change of both."""
+        if self._normalise:
+            scale(blocks, count)
+        for block in blocks:
+            if not self._normalise:
+                block.scale = block.group["scale"]
+            block.remember(self.state[block.leaf], self._memory)
+        mu = damping_of(blocks, self.param_groups[0]["damping"])
+        errors = torch.cat((delta, self._further(blocks, delta, count)))
+        # Past pairs have no TD errors: they contribute their curvature alone.
+        past = delta.new_zeros(len(blocks[0]) - len(errors) if blocks else 0)
+        alpha, change = solve_dual(blocks, torch.cat((errors, past)), mu)
+        return errors, [block.step(alpha) for block in blocks], change[: len(errors)]
+
+    def _restart(self) -> None:
+        """Raise the damping, and clear the memory and the sizes, after an overflow."""
+        self._adapt(math.nan)
+        self.state.clear()
+        for group in self.param_groups:
+            group |= FRESH
+
+    def _check_batch(self, s: Tensor, a: Tensor, target: Tensor, penalty: Tensor | None) -> None:
+        """Raise `QPError` if an argument of `step` does not fit."""
+        mpc = self._mpc
         check_tensor("s", s, "B", mpc.n_p, batched=False)
         check_tensor("a", a, len(s), mpc.n_u, batched=False)
         check_tensor("target", target, len(s), batched=False, remedy="Squeeze its last dimension.")
@@ -221,72 +249,38 @@ class GaussNewton(torch.optim.Optimizer):
         if penalty is not None:
             remedy = "Pass SystemIdentificationPenalty.curvature(windows)."
             check_tensor("penalty", penalty, mpc.n_z, mpc.n_z, batched=False, remedy=remedy)
-        group = self.param_groups[0]
-        with torch.enable_grad():
-            qp = self._mpc.quadratic_program()
-        solution = self._mpc.solve(s, a, warm_start, qp)
-        use, left_out = usable(solution.solved, target)
-        if sum(left_out) == len(s):
-            return StepReport(solution, group["damping"], math.nan, False, *left_out)
-        delta = torch.where(use, target.to(solution.value) - solution.value, 0)
-        if self._clip is not None:
-            delta = delta.clamp(-self._clip, self._clip)
-        pulls = self._pulls(penalty, delta, len(s) - sum(left_out))
-        lr, damping = group["lr"], group["damping"]
-        blocks = self._blocks(solution, use, pulls)
-        self._scale(blocks, int(use.sum()))
-        for block in blocks:
-            block.remember(self.state[block.leaf], self._memory)
-        mu = _damping(blocks, damping)
-        errors = torch.cat((delta, self._further(blocks, delta, len(s) - sum(left_out))))
-        # Past pairs have no TD errors: they contribute their curvature alone.
-        past = delta.new_zeros(len(blocks[0]) - len(errors) if blocks else 0)
-        alpha, change = _solve(blocks, torch.cat((errors, past)), mu)
-        change = change[: len(errors)]
-        steps = [block.step(alpha) for block in blocks]
-        before = _objective(errors, blocks)
-        if not before.isfinite() or not all(step.isfinite().all() for step in steps):
-            # Overflow: raise the damping, and clear the memory and the sizes.
-            self._adapt(math.nan)
-            self.state.clear()
-            for group in self.param_groups:
-                group |= {"size": 0.0, "signals": None, "variance": 0.0}
-            return StepReport(solution, damping, math.nan, False, *left_out)
-        if not self._trust_region:
-            _move(blocks, steps, lr)
-            self._mpc.project_()
-            return StepReport(solution, damping, math.nan, True, *left_out)
-        old = [block.leaf.clone() for block in blocks]
+            if self._free_C() is None:
+                got = "a C that is not free"
+                raise QPError.expected("penalty", got, "C among the learned parts")
+
+    def _try(
+        self,
+        blocks: list[Block],
+        steps: list[Tensor],
+        errors: Tensor,
+        change: Tensor,
+        batch: tuple[Tensor, Tensor, Tensor, QPSolution],
+    ) -> float:
+        """Move and project theta; return the ratio of actual to predicted decrease.
+
+        Args:
+            blocks, steps: the parts and their steps.
+            errors, change: those of the TD errors and residuals, and the step's change of them.
+            batch: s, a, the usable pairs, and the solution before the step.
+        """
+        s, a, use, solution = batch
+        lr, before = self.param_groups[0]["lr"], objective(errors, blocks)
         _move(blocks, steps, lr)
         proposed = lr * change
         change = self._project(blocks, proposed)
-        predicted = before - _objective(errors - change, blocks)
+        predicted = before - objective(errors - change, blocks)
         after = self._mpc.solve(s, a, warm_start=solution.active)
         actual = change.clone()
-        actual[: len(delta)] = torch.where(use, after.value - solution.value, 0)
-        decrease = before - _objective(errors - actual, blocks)
+        actual[: len(use)] = torch.where(use, after.value - solution.value, 0)
+        decrease = before - objective(errors - actual, blocks)
         # Without a predicted decrease, reject the step only if the projection raised the objective.
         lost = not torch.equal(change, proposed) and not decrease >= 0
-        ratio = float(decrease / predicted) if predicted > 0 else float(not lost)
-        accepted = ratio > 0  # False for nan, which an infinite cost causes
-        if not accepted:
-            for block, value in zip(blocks, old, strict=True):
-                block.leaf.copy_(value)
-        self._adapt(ratio)
-        return StepReport(solution, damping, ratio, accepted, *left_out)
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Load a `state_dict` of a GaussNewton of the same QPMPC.
-
-        Raises:
-            QPError: it is from a version whose metric had units, and has scales of another meaning.
-        """
-        groups = state_dict.get("param_groups", [])
-        if not all({"size", "signals"} <= group.keys() for group in groups):
-            got, want = "groups without size and signals, of an earlier metric", "both"
-            remedy = "Start with a new GaussNewton: its scales have no unit."
-            raise QPError.expected("state_dict", got, want, remedy)
-        super().load_state_dict(state_dict)
+        return float(decrease / predicted) if predicted > 0 else float(not lost)
 
     def __reduce__(self) -> tuple:
         # The copy would hold a QPMPC of its own, apart from its owner's copy of it.
@@ -310,10 +304,10 @@ class GaussNewton(torch.optim.Optimizer):
             )
             raise QPError.expected("mpc", got, "the parameters of this optimiser", remedy)
 
-    def _project(self, blocks: list[_Dense | _OuterProducts], change: Tensor) -> Tensor:
+    def _project(self, blocks: list[Block], change: Tensor) -> Tensor:
         """Project theta; return Q's ``change`` ``(B,)`` plus the projection's at first order."""
         leaves = {id(leaf) for leaf in self._mpc._projected().values()}
-        dense = [x for x in blocks if isinstance(x, _Dense) and id(x.leaf) in leaves]
+        dense = [x for x in blocks if isinstance(x, Dense) and id(x.leaf) in leaves]
         proposed = [block.leaf.clone() for block in dense]
         self._mpc.project_()
         for block, leaf in zip(dense, proposed, strict=True):
@@ -334,24 +328,13 @@ class GaussNewton(torch.optim.Optimizer):
         leaves = (leaf for group in self.param_groups for leaf in group["params"])
         return next((leaf for leaf in leaves if leaf is C and leaf.requires_grad), None)
 
-    def _pulls(self, penalty: Tensor | None, delta: Tensor, count: int) -> list[Anchor]:
-        """Return the penalties on C, for the sum over ``count`` pairs with the errors delta."""
-        C, pulls = self._free_C(), []
-        if penalty is not None:
-            if C is None:
-                raise QPError.expected("penalty", NOT_FREE, "C among the learned parts")
-            pulls.append(Anchor(torch.zeros_like(C), count * penalty, C.new_ones(len(C))))
-        if self._anchor is not None and C is not None:
-            pulls.append(self._anchor.times(delta.square().sum() / count))
-        return pulls
-
-    def _further(self, blocks: list[_Dense | _OuterProducts], delta: Tensor, count: int) -> Tensor:
+    def _further(self, blocks: list[Block], delta: Tensor, count: int) -> Tensor:
         """Insert the residuals' gradients after those of the TD errors; return their errors -r."""
         if self._residuals is None or not blocks:
             return delta.new_zeros(0)
         group, variance = self.param_groups[0], float(delta.square().sum() / count)
         if math.isfinite(variance):
-            group["variance"] = max(FORGET * group.get("variance", 0.0), variance)
+            group["variance"] = max(FORGET * group["variance"], variance)
         with torch.enable_grad():
             r = self._residuals(self._mpc.quadratic_program())
             r = group["variance"] ** 0.5 * r.to(delta)
@@ -361,273 +344,53 @@ class GaussNewton(torch.optim.Optimizer):
         unit = torch.eye(len(r)).to(r)
         gradients = torch.autograd.grad(r, leaves, unit, is_grads_batched=True, allow_unused=True)
         for block, rows in zip(blocks, gradients, strict=True):
-            assert isinstance(block, _Dense)
+            assert isinstance(block, Dense)
             rows = block.rows.new_zeros(len(r), 1) if rows is None else rows.flatten(1)
             block.insert(rows.expand(-1, block.rows.shape[1]), len(delta))
         return -r.detach()
 
-    def _blocks(
-        self, solution: QPSolution, use: Tensor, pulls: list[Anchor]
-    ) -> list[_Dense | _OuterProducts]:
+    def _blocks(self, solution: QPSolution, use: Tensor, S: Tensor | None) -> list[Block]:
         """Return Q's gradients in each learned part that is not frozen, zero outside ``use``."""
-        mpc = self._mpc
-        weight = use.to(solution.z)
-        z, chi, lam = solution.z, solution.chi, solution.lam
-        # Only the gradient in a learned w needs the slacks.
-        sigma = solution.sigma if solution.qp.w.requires_grad else torch.zeros_like(lam)
-        gradients = envelope_gradients(weight, z, sigma, chi, lam, solution.eta, solution.xi)
+        mpc, z, chi = self._mpc, solution.z, use.to(solution.z).unsqueeze(-1) * solution.chi
         pairs = [(leaf, group) for group in self.param_groups for leaf in group["params"]]
         pairs = [(leaf, group) for leaf, group in pairs if leaf.requires_grad]
         factored, mask = self._free_C(), matrix(mpc, "C")[1]
         if factored is not None and mask is not None:
             factored.copy_(mpc.C)  # another optimiser may have moved entries that are not learned
-        parts = {name: getattr(solution.qp, name) for name in EVENT_SHAPES}
-        if factored is not None:
-            parts.pop("C")
-        parts = {n: x for n, x in parts.items() if x.requires_grad}
-        # Expanded to one copy per pair, each part has one gradient per pair.
-        in_parts = [gradients[n](x.expand(len(z), *x.shape)) for n, x in parts.items()]
         dense = [leaf for leaf, _ in pairs if leaf is not factored]
-        in_leaves = iter(())
-        if dense:
-            in_leaves = iter(
-                torch.autograd.grad(
-                    list(parts.values()),
-                    dense,
-                    in_parts,
-                    is_grads_batched=True,
-                    materialize_grads=True,
-                )
-            )
-        rows, columns = self._units(z[use])
+        found = iter(_gradients(solution, use, dense, without_C=factored is not None))
+        rows, columns = z.new_ones(mpc.horizon * mpc.n_x), torch.ones_like(z[0])
+        if self._normalise:
+            rows, columns = signal_sizes(mpc, self.param_groups[0], z[use])
         units = {"b": rows, "q": 1 / columns} if mpc.structure == "free" else {}
         return [
-            _OuterProducts(leaf, group, weight.unsqueeze(-1) * chi, z, rows, columns, pulls, mask)
+            OuterProducts(leaf, group, chi, z, rows, columns, S, mask)
             if leaf is factored
-            else _Dense(
-                leaf,
-                group,
-                next(in_leaves).reshape(len(z), -1),
-                units.get(group["name"]),
-            )
+            else Dense(leaf, group, next(found).reshape(len(z), -1), units.get(group["name"]))
             for leaf, group in pairs
         ]
 
-    def _units(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return m for the rows ``(n_c,)`` and the columns ``(n_z,)`` of C, updated with z.
 
-        A signal that was always zero counts as one.
-        """
-        mpc, group = self._mpc, self.param_groups[0]
-        if not self._normalise:
-            return z.new_ones(mpc.horizon * mpc.n_x), torch.ones_like(z[0])
-        signals = mpc._layout.signals().to(z.device)
-        count = signals.bincount()
-        squares = torch.zeros_like(z[0, : len(count)]).index_add(0, signals, z.square().mean(0))
-        m = squares / count
-        if group["signals"] is not None:
-            m = m.maximum(FORGET * m.new_tensor(group["signals"]))
-        if m.isfinite().all():
-            group["signals"] = m.tolist()
-        m = torch.where(m > 0, m.clamp(min=FLOOR * m.max()), 1)
-        return m[: mpc.n_x].repeat(mpc.horizon), m[signals]
-
-    def _scale(self, blocks: list[_Dense | _OuterProducts], count: int) -> None:
-        """Update the parts' sizes with the gradients of ``count`` pairs, and scale the metric."""
-        if not self._normalise:
-            for block in blocks:
-                block.scale = block.group["scale"]
-            return
-        sizes = {block.group["name"]: 0.0 for block in blocks}
-        for block in blocks:
-            sizes[block.group["name"]] += float(block.diagonal().sum()) / count
-        for block in blocks:
-            group = block.group
-            if math.isfinite(size := sizes[group["name"]]):
-                group["size"] = max(FORGET * group["size"], size)
-            sizes[group["name"]] = group["size"]
-        model = sum(size for name, size in sizes.items() if name not in COST)
-        least = FLOOR * max(sizes.values(), default=0.0)
-        for block in blocks:
-            name = block.group["name"]
-            size = max(sizes[name] if name in COST else model, least)
-            block.scale = block.group["scale"] / (size or 1.0)
+def _gradients(
+    solution: QPSolution, use: Tensor, leaves: list[Tensor], without_C: bool
+) -> Sequence[Tensor]:
+    """Return Q's gradients ``(B, *leaf.shape)`` in each leaf, zero outside ``use``."""
+    if not leaves:
+        return ()
+    z, lam, weight = solution.z, solution.lam, use.to(solution.z)
+    # Only the gradient in a learned w needs the slacks.
+    sigma = solution.sigma if solution.qp.w.requires_grad else torch.zeros_like(lam)
+    duals = solution.chi, lam, solution.eta, solution.xi
+    gradients = envelope_gradients(weight, z, sigma, *duals)
+    parts = {n: getattr(solution.qp, n) for n in EVENT_SHAPES if n != "C" or not without_C}
+    parts = {n: x for n, x in parts.items() if x.requires_grad}
+    # Expanded to one copy per pair, each part has one gradient per pair.
+    in_parts = [gradients[n](x.expand(len(z), *x.shape)) for n, x in parts.items()]
+    options = {"is_grads_batched": True, "materialize_grads": True}
+    return torch.autograd.grad(list(parts.values()), leaves, in_parts, **options)
 
 
-def _past(state: dict[str, Tensor], name: str, current: Tensor) -> Tensor:
-    """Return the remembered rows for ``current`` ``(B, n)``, ``(M, n)``; empty at first."""
-    past = state.get(name, current[:0])
-    if past.shape[1:] != current.shape[1:]:
-        got = f"a memory of gradients with {past.shape[1]} entries"
-        want = f"{current.shape[1]}, as in this QPMPC"
-        remedy = "Load the state of a GaussNewton of the same QPMPC."
-        raise QPError.expected("state_dict", got, want, remedy)
-    return past
-
-
-class _Dense:
-    """The gradients in one parameter as rows ``(B, n)``, with the metric ``scale * units``.
-
-    Without ``units`` ``(n,)`` they are ones.
-    """
-
-    def __init__(
-        self, leaf: nn.Parameter, group: dict[str, Any], rows: Tensor, units: Tensor | None
-    ) -> None:
-        self.leaf, self.group, self.rows, self.scale = leaf, group, rows, 1.0
-        self.units = torch.ones_like(leaf).flatten() if units is None else units
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def remember(self, state: dict[str, Tensor], count: int) -> None:
-        """Append the remembered gradients, and remember the newest ``count`` for the next step."""
-        if count:
-            self.rows = torch.cat((self.rows, _past(state, "rows", self.rows)))
-            state["rows"] = self.rows[:count]
-
-    def insert(self, rows: Tensor, place: int) -> None:
-        """Insert further rows, which are not remembered."""
-        self.rows = torch.cat((self.rows[:place], rows, self.rows[place:]))
-
-    def diagonal(self) -> Tensor:
-        """Return the kernel's diagonal without a penalty, ``(B,)``."""
-        return self.scale * self.rows.square() @ self.units
-
-    def damp(self, mu: Tensor) -> Tensor:
-        """Set the damping; return the change of Q ``(B,)`` by the penalty alone, here zero."""
-        return self.rows.new_zeros(len(self.rows))
-
-    def kernel(self) -> Tensor:
-        """Return the kernel ``(B, B)``."""
-        return self.scale * (self.rows * self.units) @ self.rows.mT
-
-    def step(self, alpha: Tensor) -> Tensor:
-        """Return the parameter's step for the dual solution ``alpha`` ``(B,)``."""
-        return (self.scale * self.units * (alpha @ self.rows)).reshape(self.leaf.shape)
-
-    def penalty(self) -> Tensor | float:
-        """Return the penalty of the parameter, here none."""
-        return 0.0
-
-
-class _OuterProducts:
-    """The gradients ``chi_i z_i'`` in C, with the metric ``scale * rows_i / columns_j``.
-
-    The penalties ``pulls`` by themselves move C by ``drift``; with them, the metric of a row is
-    ``rows_i`` times a matrix P ``(n_z, n_z)``, one for each unit and weight of a row. With a
-    ``mask`` of the learned entries of C, each pattern of learned entries in a row has its own P.
-    Methods as in `_Dense`.
-    """
-
-    def __init__(
-        self,
-        leaf: nn.Parameter,
-        group: dict[str, Any],
-        chi: Tensor,
-        z: Tensor,
-        rows: Tensor,
-        columns: Tensor,
-        pulls: list[Anchor],
-        mask: Tensor | None,
-    ) -> None:
-        self.leaf, self.group, self.chi, self.z, self.scale = leaf, group, chi, z, 1.0
-        self.rows, self.columns, self.pulls = rows, columns, pulls
-        self.drift = torch.zeros_like(leaf)
-        kinds = torch.stack((rows, *(pull.weights for pull in pulls)), dim=-1)
-        self.patterns = _patterns(mask, kinds if pulls else None)
-
-    def __len__(self) -> int:
-        return len(self.z)
-
-    def remember(self, state: dict[str, Tensor], count: int) -> None:
-        if count:
-            self.chi = torch.cat((self.chi, _past(state, "chi", self.chi)))
-            self.z = torch.cat((self.z, _past(state, "z", self.z)))
-            state["chi"], state["z"] = self.chi[:count], self.z[:count]
-
-    def diagonal(self) -> Tensor:
-        chi, z = self.rows * self.chi.square(), self.z.square() / self.columns
-        diagonals = (chi[:, i].sum(-1) * z[:, j].sum(-1) for i, j, _ in self.patterns)
-        return self.scale * sum(diagonals, torch.zeros_like(z[:, 0]))
-
-    def damp(self, mu: Tensor) -> Tensor:
-        drifted = self.z.new_zeros(len(self.z))
-        self.z_P = [self.scale * self.z[:, j] / self.columns[j] for _, j, _ in self.patterns]
-        if not self.pulls:
-            return drifted
-        force = torch.stack([pull.gradient(self.leaf) for pull in self.pulls]).sum(0)
-        for k, (i, j, entries) in enumerate(self.patterns):
-            z, damping = self.z[:, j], mu / self.rows[i][0]
-            precision = torch.diag(damping / self.scale * self.columns[j])
-            precision += sum(pull.weights[i][0] * pull.S[j][:, j] for pull in self.pulls)
-            inverse = torch.linalg.inv_ex(precision).inverse
-            drift = -force[entries] @ inverse
-            self.z_P[k], self.drift[entries] = damping * z @ inverse, drift
-            drifted = drifted + ((self.chi[:, i] @ drift) * z).sum(-1)
-        return drifted
-
-    def kernel(self) -> Tensor:
-        K = self.z.new_zeros(len(self.z), len(self.z))
-        chi = self.rows * self.chi
-        for (i, j, _), z_P in zip(self.patterns, self.z_P, strict=True):
-            K = K + (chi[:, i] @ self.chi[:, i].mT) * (z_P @ self.z[:, j].mT)
-        return K
-
-    def step(self, alpha: Tensor) -> Tensor:
-        step, chi = self.drift.clone(), alpha.unsqueeze(-1) * self.rows * self.chi
-        for (i, _, entries), z_P in zip(self.patterns, self.z_P, strict=True):
-            step[entries] += chi[:, i].mT @ z_P
-        return step
-
-    def penalty(self) -> Tensor | float:
-        return sum((pull.value(self.leaf) for pull in self.pulls), 0.0)
-
-
-def _patterns(mask: Tensor | None, kinds: Tensor | None) -> list[tuple[Any, Any, Any]]:
-    """Group the rows of C by learned entries and by ``kinds`` ``(n_c, k)``, if these are not None.
-
-    Return the rows, the columns, and the index in C of each group.
-    """
-    keys = [key for key in (mask, kinds) if key is not None]
-    if not keys:
-        return [(slice(None), slice(None), (slice(None), slice(None)))]
-    kind = torch.unique(torch.cat(keys, dim=-1), dim=0, return_inverse=True)[1]
-    groups: list[tuple[Any, Any, Any]] = []
-    for k in kind.unique():
-        i = (kind == k).nonzero()[:, 0]
-        if mask is None:
-            groups.append((i, slice(None), (i, slice(None))))
-        elif len(j := mask[i[0]].nonzero()[:, 0]):
-            groups.append((i, j, (i.unsqueeze(-1), j)))
-    return groups
-
-
-def _damping(blocks: list[_Dense | _OuterProducts], damping: float) -> Tensor:
-    """Return mu, for a damping relative to the mean of K's diagonal."""
-    mu = damping * sum((block.diagonal() for block in blocks), torch.zeros(())).mean()
-    return mu.clamp(min=torch.finfo(mu.dtype).tiny)
-
-
-def _solve(
-    blocks: list[_Dense | _OuterProducts], delta: Tensor, mu: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Solve the dual; return alpha ``(B,)`` and the step's predicted change of Q ``(B,)``."""
-    drifted = sum((block.damp(mu) for block in blocks), torch.zeros_like(delta))
-    K = sum((block.kernel() for block in blocks), delta.new_zeros(len(delta), len(delta)))
-    damped = K + mu * torch.eye(len(delta)).to(delta)
-    factor, failed = torch.linalg.cholesky_ex(damped)
-    alpha = torch.cholesky_solve((delta - drifted).unsqueeze(-1), factor).squeeze(-1)
-    alpha = torch.where(failed == 0, alpha, math.nan)
-    return alpha, K @ alpha + drifted
-
-
-def _move(blocks: list[_Dense | _OuterProducts], steps: list[Tensor], lr: float) -> None:
+def _move(blocks: list[Block], steps: list[Tensor], lr: float) -> None:
     """Add ``lr`` times its step to each parameter."""
     for block, step in zip(blocks, steps, strict=True):
         block.leaf.add_(step, alpha=lr)
-
-
-def _objective(errors: Tensor, blocks: list[_Dense | _OuterProducts]) -> Tensor:
-    """Return what a step minimises: half the sum of squared errors, plus the penalties."""
-    return 0.5 * errors.square().sum() + sum(block.penalty() for block in blocks)

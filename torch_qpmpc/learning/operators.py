@@ -145,22 +145,6 @@ class QPValueOperator(_QPOperator):
         return self._set_value(tensordict)
 
 
-class QPShortenedValueOperator(QPValueOperator):
-    """The state value -V_{N-1}(p) of the QP with one stage less; see `QPMPC.shortened_value`."""
-
-    @dispatch(auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write -V_{N-1}(p) to the value key."""
-        key = self.active_set_key
-        start = None if key is None else tensordict.get(key, None)
-        cost, active = self.module.shortened_value(
-            self.known(tensordict), start, self._program(tensordict)
-        )
-        if key is not None:
-            tensordict.set(key, active)
-        return tensordict.set(self.out_keys[0], -cost.unsqueeze(-1))
-
-
 class QPActorValueOperator(_QPOperator):
     """The critic -Q(p, a): (observation, action) to state_action_value ``(*batch, 1)``.
 
@@ -230,14 +214,10 @@ class QPActorValueOperator(_QPOperator):
         keys = self.in_keys[1], active_set_key, self.preview_key, self.theta_keys
         return QPPolicyOperator(self.module, self.in_keys[:1], *keys)
 
-    def get_value_operator(self, shortened: bool = False) -> QPValueOperator:
-        """Return the state value: observation, and preview if any, to state_value.
-
-        With ``shortened`` it is that of the QP with one stage less.
-        """
+    def get_value_operator(self) -> QPValueOperator:
+        """Return the state value: observation, and preview if any, to state_value."""
         keys = self.state_value_key, self.active_set_key, self.preview_key, self.theta_keys
-        kind = QPShortenedValueOperator if shortened else QPValueOperator
-        return kind(self.module, self.in_keys[:1], *keys)
+        return QPValueOperator(self.module, self.in_keys[:1], *keys)
 
     def get_critic_operator(self) -> QPActorValueOperator:
         """Return the critic, this operator."""

@@ -60,7 +60,7 @@ class PredictionErrors(nn.Module):
         super().__init__()
         check_kind("mpc", mpc, QPMPC)
         if mpc.structure != "tied":
-            remedy = "A free C has SystemIdentificationPenalty.curvature and Anchor."
+            remedy = "A free C has SystemIdentificationPenalty.curvature."
             raise QPError.expected("mpc", f"structure={mpc.structure!r}", "'tied'", remedy)
         check_number("weight", weight, lambda x: 0 < x < math.inf, "a finite number > 0")
         check_whole("memory", memory, 1)

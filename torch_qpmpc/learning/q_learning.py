@@ -18,12 +18,8 @@ from torch_qpmpc.checks import check_flag, check_number
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.operators import QPActorValueOperator, QPValueOperator
 from torch_qpmpc.learning.restoring import call_with
-from torch_qpmpc.learning.returns import STEPS
 from torch_qpmpc.learning.td_error import invalid_rewards, td_loss, td_metadata
 from torch_qpmpc.qp.tracing import has_values
-
-#: The choices of V(s+)'s horizon: N or N - 1 stages.
-HORIZONS = ("receding", "shrinking")
 
 
 class QPQLearningLoss(LossModule):
@@ -32,19 +28,6 @@ class QPQLearningLoss(LossModule):
     The TD error is delta = L + gamma (1 - terminated) V(s+) - Q(s, a), with reward = -L in TorchRL.
     V and Q are the same QP without and with u_0 fixed, so V(s+) is exactly min over a of Q(s+, a).
     Truncation bootstraps, termination does not.
-
-    With ``horizon="shrinking"`` the target has V_{N-1}(s+), of the QP with one stage less
-    (`QPMPC.shortened`), so that Q_N is the cost of N steps and a terminal cost, and gamma may be 1.
-    For an exact model and stage cost the TD error is zero whatever the terminal cost is. The target
-    is thus biased: no cost beyond the horizon enters it, and the terminal cost is not learned. The
-    default, ``"receding"``, has V_N(s+): terminal cost and c must then account for all later costs.
-
-    With ``average_cost=True`` it is the differential TD error L - rho + V(s+) - Q(s, a) of a plant
-    that never ends (Wan, Naik and Sutton 2021, `arXiv 2006.16318
-    <https://arxiv.org/abs/2006.16318>`_). rho, the average cost per step, is the buffer
-    ``average_cost``. The constant c cancels in that error and is not identified, so c stays fixed
-    and its steps move rho instead: call `move_c_` after each optimiser step (the updates in
-    `learning.updates` do). A gradient step with rate alpha thus is rho += alpha mean delta.
 
     Batches of n-step transitions (TorchRL's ``steps_to_next_obs``) and, with the TD(lambda)
     estimator, of slices ``(*batch, n)`` have returns of several steps. Their rewards are those of
@@ -63,8 +46,6 @@ class QPQLearningLoss(LossModule):
             ends with one, whose other modules write its inputs, such as residuals of theta.
         delay_value: evaluate V(s+) with a target network. By default, as in the paper, with the
             current theta.
-        horizon: ``"receding"`` (default) or ``"shrinking"``: V(s+) with N or with N - 1 stages.
-        average_cost: learn differential values and the average cost, with gamma = 1.
         td_error_clip: bound on the absolute TD error in the update; none by default.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
         use_prioritized_weights: weight the samples by ``priority_weight``; by default ``"auto"``,
@@ -132,16 +113,12 @@ class QPQLearningLoss(LossModule):
     state_value_network: QPValueOperator | TensorDictSequential
     value_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
-    average_cost: Tensor | None
-    fixed_c: Tensor | None
 
     def __init__(
         self,
         value_network: QPActorValueOperator | TensorDictSequential,
         *,
         delay_value: bool = False,
-        horizon: str = "receding",
-        average_cost: bool = False,
         td_error_clip: float | None = None,
         gamma: float | None = None,
         reduction: str | None = None,
@@ -163,23 +140,10 @@ class QPQLearningLoss(LossModule):
         if reduction not in (None, "mean", "sum", "none"):
             raise QPError.expected("reduction", repr(reduction), "'mean', 'sum' or 'none'")
         check_flag("delay_value", delay_value)
-        check_flag("average_cost", average_cost)
-        mpc = last.module
-        if horizon not in HORIZONS:
-            raise QPError.expected("horizon", repr(horizon), "'receding' or 'shrinking'")
-        if horizon == "shrinking":
-            mpc.shortened()  # raises the error of a QP without stages to drop
-        if average_cost and horizon == "shrinking":
-            remedy = "A plant that never ends has no last of N steps."
-            raise QPError.expected("average_cost", average_cost, "False if shrinking", remedy)
-        if average_cost and "c" not in mpc.learned:
-            remedy = "The steps of c move the average cost."
-            raise QPError.expected("average_cost", average_cost, "a QPMPC that learns c", remedy)
         if use_prioritized_weights not in ("auto", True, False):
             got = repr(use_prioritized_weights)
             raise QPError.expected("use_prioritized_weights", got, "'auto', True or False")
-        self.delay_value, self.horizon = delay_value, horizon
-        self.td_error_clip = td_error_clip
+        self.delay_value, self.td_error_clip = delay_value, td_error_clip
         self.reduction = reduction or "mean"
         self.use_prioritized_weights = use_prioritized_weights
         self.convert_to_functional(
@@ -187,12 +151,8 @@ class QPQLearningLoss(LossModule):
             "value_network",
             create_target_params=delay_value,
         )
-        rho, c = (torch.zeros_like(mpc.c), mpc.c.detach().clone()) if average_cost else (None, None)
-        self.register_buffer("average_cost", rho)
-        self.register_buffer("fixed_c", c)
         # Not registered as a submodule, because its parameters are the value network's.
-        value = self.operator.get_value_operator(shortened=horizon == "shrinking")
-        view = _in_place_of_last(self.value_network, value)
+        view = _in_place_of_last(self.value_network, self.operator.get_value_operator())
         object.__setattr__(self, "state_value_network", view)
 
     @property
@@ -248,18 +208,10 @@ class QPQLearningLoss(LossModule):
         """Choose how V(s+) enters the target: TD0 (default), TD1 or TDLambda.
 
         Raises:
-            QPError: if ``gamma`` or ``lmbda`` is not in [0, 1], ``gamma`` is not 1 with an average
-                cost, or the horizon is shrinking and the estimator is not TD0, since n steps would
-                need V_{N-n}.
+            QPError: if ``gamma`` or ``lmbda`` is not in [0, 1].
         """
-        if self.horizon == "shrinking" and value_type not in (None, "td0", ValueEstimators.TD0):
-            remedy = "Other estimators need horizon='receding'."
-            raise QPError.expected("value_type", repr(value_type), "TD0", remedy)
         for name in {"gamma", "lmbda"} & hyperparams.keys():
             _check_factor(name, hyperparams[name])
-        if self.average_cost is not None and hyperparams.setdefault("gamma", 1.0) != 1:
-            remedy = "Differential values are not discounted."
-            raise QPError.expected("gamma", hyperparams["gamma"], "1 with average_cost", remedy)
         value_type, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if options is None:
             return self
@@ -272,14 +224,6 @@ class QPQLearningLoss(LossModule):
             **options,
         )
         return None
-
-    @torch.no_grad()
-    def move_c_(self) -> None:
-        """Move the last step of c into the average cost; without one, do nothing."""
-        if self.average_cost is not None and self.fixed_c is not None:
-            c = self.operator.module.c
-            self.average_cost += c - self.fixed_c
-            c.copy_(self.fixed_c)
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -359,8 +303,7 @@ class QPQLearningLoss(LossModule):
     def target(self, tensordict: TensorDictBase) -> Tensor:
         """Return the value estimator's target of ``tensordict``, ``(*batch,)``, in TorchRL's signs.
 
-        With TD(0) it is -(L + gamma (1 - terminated) V(s+)), with L - rho instead of L if there is
-        an average cost. It is -inf where it contains a V(s+)
+        With TD(0) it is -(L + gamma (1 - terminated) V(s+)). It is -inf where it contains a V(s+)
         without a solution, and NaN where it contains an invalid reward.
         """
         reward = tensordict.get(("next", self.tensor_keys.reward))
@@ -368,8 +311,6 @@ class QPQLearningLoss(LossModule):
         invalid = invalid_rewards(tensordict, self.tensor_keys.reward, effect)
         next_value = self._next_value(tensordict)
         valid = reward.masked_fill(invalid, 0)
-        if self.average_cost is not None:
-            valid = valid + self.average_cost.to(reward) * tensordict.get(STEPS, 1)
         target = self._estimate(tensordict, valid, next_value)
         target = torch.where(target.isfinite(), target, -torch.inf)
         if not has_values(invalid) or invalid.any():

@@ -25,14 +25,11 @@ from torchrl.data import (
 
 from torch_qpmpc.checks import check_kind, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.learning.returns import check_returns, end_where_cut, n_step_transitions
 from torch_qpmpc.qp.program import UNKNOWN
 
 #: The keys of a transition's active sets: of Q(s, a), and of V(s+).
 ACTIVE_SET = "active_set"
 ACTIVE_SETS = (ACTIVE_SET, ("next", ACTIVE_SET))
-#: The keys of a sample's rows and columns in the storage: of (s, a), and of the step to s+.
-INDICES = ("index", ("next", "index"))
 
 
 def windows_to_tau(
@@ -83,8 +80,6 @@ class Replay:
         num_envs: number of columns of the storage.
         active_rows: n_g if active sets are stored with the transitions, else None.
         n_x, preview_key: see :func:`windows_to_tau`.
-        n_step: number of consecutive steps of a sample, fewer where an episode or the data end.
-        gamma: discount factor of n-step returns; None samples the steps themselves, as slices.
     """
 
     transitions: ReplayBuffer
@@ -95,8 +90,6 @@ class Replay:
     active_rows: int | None = None
     n_x: int | None = None
     preview_key: NestedKey | None = None
-    n_step: int = 1
-    gamma: float | None = 1.0
 
     def __len__(self) -> int:
         return len(self.transitions)
@@ -125,12 +118,7 @@ class Replay:
         self.transitions.extend(batch)
 
     def sample(self) -> TensorDictBase:
-        """Sample transitions, each with its row and column as ``"index"`` ``(.., 2)``.
-
-        With ``n_step`` above 1 they are n-step transitions, see `n_step_transitions`, or, with
-        ``gamma=None``, slices ``(batch_size / n_step, n_step)`` of consecutive rows, in which each
-        step that the following one does not continue is done. ``("next", "index")`` is that of the
-        transition that ends in s+.
+        """Sample transitions, each with its row and column as ``"index"`` ``(batch_size, 2)``.
 
         Raises:
             QPError: if nothing is stored.
@@ -140,15 +128,7 @@ class Replay:
                 "replay", "nothing stored", "transitions", "Call extend() first."
             )
         sample, info = self.transitions.sample(return_info=True)
-        row, column = info["index"]
-        if self.n_step == 1:
-            return _indexed(sample, row, column)
-        stored: Any = self.transitions.storage[:]
-        rows = (row.unsqueeze(-1) + torch.arange(self.n_step, device=row.device)) % len(stored)
-        columns = column.unsqueeze(-1).expand_as(rows)
-        slices = _indexed(stored[rows, columns], rows, columns)
-        slices = end_where_cut(slices, rows, self._newest())
-        return slices if self.gamma is None else n_step_transitions(slices, self.gamma)
+        return sample.set("index", torch.stack(info["index"], -1))
 
     def _newest(self) -> int:
         """Return the row that was written last."""
@@ -163,13 +143,14 @@ class Replay:
         """
         if self.active_rows is None:
             return
-        for key in (*INDICES, *ACTIVE_SETS):
+        for key in ("index", *ACTIVE_SETS):
             if sample.get(key, None) is None:
                 remedy = "Pass what sample() returned, after the loss."
                 raise QPError.expected("sample", f"no entry {key}", "one", remedy)
         stored: Any = self.transitions.storage[:]
-        for index, key in zip(INDICES, ACTIVE_SETS, strict=True):
-            stored.get(key)[sample.get(index).unbind(-1)] = sample.get(key)
+        place = sample.get("index").unbind(-1)
+        for key in ACTIVE_SETS:
+            stored.get(key)[place] = sample.get(key)
 
     def end_episodes(self) -> None:
         """Make the stored trajectory ids differ from those of a new collector, which are >= 0."""
@@ -241,8 +222,6 @@ def make_replay(
     active_rows: int | None = None,
     n_x: int | None = None,
     preview_key: NestedKey | None = None,
-    n_step: int = 1,
-    gamma: float | None = 1.0,
 ) -> Replay:
     """Make the empty replay of a training run, to be filled by :meth:`Replay.extend`.
 
@@ -257,18 +236,16 @@ def make_replay(
         active_rows: n_g, to store the active sets of Q(s, a) and V(s+) with each transition, n_g
             bytes each, under `ACTIVE_SETS`; see :meth:`Replay.remember`.
         n_x, preview_key: see :func:`windows_to_tau`.
-        n_step, gamma: the steps of a sample, see :meth:`Replay.sample`.
 
     Raises:
         QPError: if a number is out of range, ``capacity`` is not a multiple of ``num_envs``, or it
-            holds fewer than ``window`` rows, or ``batch_size`` does not divide into slices.
+            holds fewer than ``window`` rows.
     """
     sizes = {"num_envs": num_envs, "batch_size": batch_size, "window": window}
     for name, size in (sizes | {"num_windows": num_windows}).items():
         check_whole(name, size, 1)
     check_whole("capacity", capacity, 0)
     check_whole("seed", seed, 0)
-    check_returns(n_step, gamma, batch_size)
     if active_rows is not None:
         check_whole("active_rows", active_rows, 0)
     if capacity % num_envs or capacity // num_envs < window:
@@ -281,7 +258,7 @@ def make_replay(
     transitions = ReplayBuffer(
         storage=storage,
         sampler=RandomSampler(),
-        batch_size=batch_size if gamma is not None else batch_size // n_step,
+        batch_size=batch_size,
         generator=generator,
     )
     windows = ReplayBuffer(
@@ -306,14 +283,4 @@ def make_replay(
         active_rows,
         n_x,
         preview_key,
-        n_step,
-        gamma,
     )
-
-
-def _indexed(sample: TensorDictBase, row: Tensor, column: Tensor) -> TensorDictBase:
-    """Set `INDICES` of a sample of the storage."""
-    index = torch.stack((row, column), -1)
-    for key in INDICES:
-        sample.set(key, index)
-    return sample

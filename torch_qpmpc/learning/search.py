@@ -26,17 +26,11 @@ PARTS = ("H", "H_f", "q", "b", "lb", "ub", "w")
 SPAWN_KEY = 1
 
 
-def _margin(mpc: QPMPC, theta: Theta, x: float | Tensor) -> Theta:
+def _margin(mpc: QPMPC, theta: Theta, x: float) -> Theta:
     return {
         "lb": torch.where(mpc.soft, theta["lb"] + x, theta["lb"]),
         "ub": torch.where(mpc.soft, theta["ub"] - x, theta["ub"]),
     }
-
-
-def _growing_margin(mpc: QPMPC, theta: Theta, x: float) -> Theta:
-    # The standard deviation of a sum of k independent errors grows like the square root of k.
-    stages = mpc._layout.row_stages().to(theta["lb"])
-    return _margin(mpc, theta, x * (stages / mpc.horizon).sqrt())
 
 
 def _slack_weight(mpc: QPMPC, theta: Theta, x: float) -> Theta:
@@ -45,11 +39,11 @@ def _slack_weight(mpc: QPMPC, theta: Theta, x: float) -> Theta:
 
 def _action_weight(mpc: QPMPC, theta: Theta, x: float) -> Theta:
     # A congruence: the block of the plan stays positive semidefinite.
-    return {"H": _scaled(mpc, theta["H"], np.exp(x / 2), action=True)}
-
-
-def _state_weight(mpc: QPMPC, theta: Theta, x: float) -> Theta:
-    return {"H": _scaled(mpc, theta["H"], np.exp(x / 2), action=False)}
+    H, root = theta["H"], np.exp(x / 2)
+    factor = torch.where(torch.arange(H.shape[-1]) >= H.shape[-1] - mpc.n_u, root, 1.0).to(H)
+    if mpc.hessian == "diagonal":
+        return {"H": H * factor.square()}
+    return {"H": factor.unsqueeze(-1) * H * factor}
 
 
 def _terminal_weight(mpc: QPMPC, theta: Theta, x: float) -> Theta:
@@ -66,24 +60,11 @@ def _offset(mpc: QPMPC, theta: Theta, x: float) -> Theta:
     return {"b": theta["b"] + x}
 
 
-def _scaled(mpc: QPMPC, H: Tensor, root: float, action: bool) -> Tensor:
-    """Scale rows and columns of actions or of states in stage blocks ``(.., n_x + n_u)``."""
-    size = H.shape[-1]
-    kinds = torch.arange(size) >= size - mpc.n_u
-    plan = torch.arange(size) >= size - mpc.n_x - mpc.n_u
-    factor = torch.where(plan & (kinds == action), root, 1.0).to(H)
-    if mpc.hessian == "diagonal":
-        return H * factor.square()
-    return factor.unsqueeze(-1) * H * factor
-
-
 #: Scalars that a search may move: functions of theta and x, without effect at x = 0.
 KNOBS: dict[str, Callable[[QPMPC, Theta, float], Theta]] = {
     "margin": _margin,
-    "margin_k": _growing_margin,
     "w": _slack_weight,
     "H_u": _action_weight,
-    "H_x": _state_weight,
     "H_f": _terminal_weight,
     "q_f": _terminal_slope,
     "b": _offset,
@@ -93,16 +74,13 @@ KNOBS: dict[str, Callable[[QPMPC, Theta, float], Theta]] = {
 def available(mpc: QPMPC) -> list[str]:
     """Return the names of the scalars that change the policy of this QP.
 
-    A full H has no weights of its stages, without soft rows there is nothing to tighten, and
-    learned bounds of structure="tied" are those of all stages.
+    A full H has no weights of its stages, and without soft rows there is nothing to tighten.
     """
     without: set[str] = set()
     if mpc.hessian == "full":
-        without |= {"H_x", "H_u", "H_f"}
+        without |= {"H_u", "H_f"}
     if not mpc.soft.any():
-        without |= {"margin", "margin_k", "w"}
-    if mpc.structure == "tied" and {"lb", "ub"} & {*mpc.learned}:
-        without.add("margin_k")
+        without |= {"margin", "w"}
     return [name for name in KNOBS if name not in without]
 
 
@@ -123,10 +101,9 @@ def search(
         mpc: the QPMPC, which is changed in place.
         costs: maps a QPMPC and a seed to the costs ``(starts,)`` of closed loops.
         knobs: the initial standard deviation of each scalar: ``margin``, by which the bounds of all
-            soft rows are tightened, in their unit; ``margin_k``, likewise for those of x_N, and
-            times sqrt(k / N) for those of stage k; ``b``, added to the model's offset; ``q_f``,
-            added to the terminal slope; and ``w``, ``H_x``, ``H_u`` and ``H_f``, the logarithms of
-            factors of the slack weights and of the weights of states, actions and x_N.
+            soft rows are tightened, in their unit; ``b``, added to the model's offset; ``q_f``,
+            added to the terminal slope; and ``w``, ``H_u`` and ``H_f``, the logarithms of factors
+            of the slack weights and of the weights of actions and x_N.
         loops: the number of candidates, each one call of ``costs``.
         seed: seeds the search, the starts and the disturbances.
 

@@ -1,4 +1,4 @@
-"""TD errors of a batch: their loss, the scalars that describe them, and invalid rewards."""
+"""TD errors of a batch: the usable pairs, their loss, and the scalars that describe them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,27 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from torch_qpmpc.qp.tracing import has_values
+
+
+def usable(solved: Tensor, target: Tensor) -> tuple[Tensor, tuple[int, int]]:
+    """Return True for pairs with a solution and a finite target, and how many lack each.
+
+    A pair that lacks both counts as unsolved. If none is left, a `RuntimeWarning` says so.
+
+    Args:
+        solved: True for a pair with a solution, ``(B,)``.
+        target: ``(B,)``.
+    """
+    use = solved & target.isfinite()
+    unsolved = int((~solved).sum())
+    left_out = unsolved, len(use) - unsolved - int(use.sum())
+    if sum(left_out) == len(use):
+        message = (
+            f"None of the {len(use)} pairs is usable: {unsolved} without a QP solution, "
+            f"{left_out[1]} without a finite target. Theta stays unchanged."
+        )
+        warnings.warn(message, RuntimeWarning, stacklevel=3)
+    return use, left_out
 
 
 def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Tensor:

@@ -15,13 +15,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
-from torchrl.objectives.value import TD0Estimator
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import QPActorValueOperator
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
-from torch_qpmpc.learning.policy_gradient import PolicyGradient
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.restoring import restored
 from torch_qpmpc.learning.td_error import invalid_rewards, td_loss, td_metadata
@@ -38,7 +36,6 @@ def first_order(
     optimizer: torch.optim.Optimizer,
     deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
-    penalty_step: str = "proximal",
     actor_due: Callable[[], bool] = lambda: True,
 ) -> Update:
     """Return an update by a torch optimiser on the gradient of the loss and the penalties.
@@ -51,13 +48,9 @@ def first_order(
         loss_module: any TorchRL loss; its ``loss_*`` entries are summed.
         optimizer: any torch optimiser of the parameters in ``loss_module``.
         deviation, si: the penalties on C; None for none.
-        penalty_step: ``"proximal"``, or ``"subgradient"`` to add the deviation penalty to the loss.
         actor_due: returns True for an update of actor and critics, False for the critics alone, as
             TD3 delays its actor.
     """
-    by_gradient, proximal = None, deviation
-    if penalty_step == "subgradient":
-        by_gradient, proximal = deviation, None
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
         with restored(loss_module):
@@ -65,8 +58,6 @@ def first_order(
         terms = {name.replace("_", "/", 1): x for name, x in losses.items() if "loss_" in name}
         if si is not None and windows is not None:
             terms["loss/si"] = si(mpc.C, windows)
-        if by_gradient is not None:
-            terms["loss/deviation"] = by_gradient(mpc.C)
         due = actor_due()
         total = torch.stack([x for name, x in terms.items() if due or "value" in name]).sum()
         optimizer.zero_grad()
@@ -93,11 +84,9 @@ def first_order(
         optimizer.step()
         if due:
             mpc.project_()
-            if proximal is not None:
-                proximal.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
-        if isinstance(loss_module, QPQLearningLoss):
-            loss_module.move_c_()
-        return terms | average_cost(loss_module), losses
+            if deviation is not None:
+                deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
+        return terms, losses
 
     return update
 
@@ -147,8 +136,7 @@ def second_order(
         terms["loss/value"] = elementwise[solved].sum() / solved.sum().clamp(min=1)
         terms["train/damping"] = torch.tensor(report.damping, dtype=torch.float64)
         terms["train/accepted"] = torch.tensor(float(report.accepted))
-        loss_module.move_c_()
-        return terms | average_cost(loss_module), losses
+        return terms, losses
 
     return update
 
@@ -161,62 +149,6 @@ def _alone(loss_module: QPQLearningLoss) -> QPActorValueOperator:
         got = "a value network with theta_keys or upstream modules"
         raise QPError.expected("loss_module", got, "a QPActorValueOperator alone", remedy)
     return network
-
-
-def average_cost(loss_module: LossModule) -> dict[str, Tensor]:
-    """Return the average cost of a loss for logging; nothing if it has none."""
-    rho = getattr(loss_module, "average_cost", None)
-    return {} if rho is None else {"train/average_cost": rho.clone()}
-
-
-def with_policy_gradient(
-    update: Update,
-    loss_module: QPQLearningLoss,
-    policy_gradient: PolicyGradient,
-    share_of_rate: Callable[[], float] = lambda: 1.0,
-) -> Update:
-    """Return an update by TD errors, followed by a step of the policy gradient on the same batch.
-
-    The targets are the loss module's, with the theta that the TD errors have moved. V's correction
-    R needs targets of one step and of one horizon, those of TD(0) with ``horizon="receding"``.
-
-    Args:
-        update: the update by TD errors.
-        loss_module: the loss that defines the targets.
-        policy_gradient: the policy gradient of the QP that ``loss_module`` learns.
-        share_of_rate: returns the fraction of the rate of the next step.
-
-    Raises:
-        QPError: the value network has other modules or ``theta_keys``.
-    """
-    operator = _alone(loss_module)
-    action, keys = operator.in_keys[1], loss_module.tensor_keys
-
-    def improved(
-        batch: TensorDictBase, windows: Tensor | None
-    ) -> tuple[dict[str, Tensor], Scalars]:
-        terms, losses = update(batch, windows)
-        key, following, discount = operator.active_set_key, None, 1.0
-        estimator = loss_module.value_estimator
-        if loss_module.horizon == "receding" and isinstance(estimator, TD0Estimator):
-            following = operator.known(batch.get("next"))
-            done = batch.get(("next", keys.done))
-            ended = batch.get(("next", keys.terminated), default=done).squeeze(-1)
-            discount = estimator.gamma * ~ended
-        report = policy_gradient.step(
-            operator.known(batch),
-            batch.get(action),
-            -loss_module.target(batch),
-            following=following,
-            discount=discount,
-            warm_start=None if key is None else batch.get(key, None),
-            share_of_rate=share_of_rate(),
-        )
-        terms["policy/share"] = torch.tensor(report.share)
-        terms["policy/change"] = torch.tensor(report.change)
-        return terms, losses
-
-    return improved
 
 
 def entries_of_C(mpc: QPMPC) -> Tensor:

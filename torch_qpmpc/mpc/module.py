@@ -24,7 +24,6 @@ from torch_qpmpc.mpc.identity import check_identity, digest, encoded
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST
 from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
-from torch_qpmpc.mpc.shortening import Shortening
 from torch_qpmpc.mpc.validation import (
     CONSTRAINTS,
     COST,
@@ -571,55 +570,6 @@ class QPMPC(nn.Module):
         options = {"dtype": dtype, "name": name, "storage": storage, "labels": labels}
         return export_c(self, folder, max_iterations=max_iterations, **options)
 
-    def shortened(self, qp: QuadraticProgram | None = None) -> QuadraticProgram:
-        """Return the QP of the same theta with one stage less, whose value is V_{N-1}.
-
-        Its known entries are p without d_N. The terminal cost and rows move to x_{N-1}; see
-        `torch_qpmpc.mpc.shortening`. Differentiable in theta. ``qp`` is as in `value`.
-
-        Raises:
-            QPError: the horizon is 1, or the hessian is full and thus has no stages.
-
-        Example:
-            >>> import torch, torch_qpmpc as qm
-            >>> A, B = torch.tensor([[0.9]]), torch.tensor([[1.0]])
-            >>> long, short = (qm.QPMPC.from_model(A, B, N, stage_weight=[1, 1]) for N in (5, 4))
-            >>> torch.allclose(long.shortened().H, short.quadratic_program().H, rtol=1e-12)
-            True
-        """
-        return self._shortened(qp)[1]
-
-    def shortened_value(
-        self,
-        s: Tensor,
-        warm_start: Tensor | None = None,
-        qp: QuadraticProgram | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """Return V_{N-1}(s), with `shortened`, and the active set ``(*batch, n_g)``.
-
-        Args:
-            s: p ``(*batch, n_p)`` as for V; its d_N is not used.
-            warm_start: an active set of this QP as returned, with the n_g rows of V's QP. Dropped
-                rows count as inactive.
-            qp: see `value`.
-
-        Raises:
-            QPError, SolverError: as in `solve` and `shortened`.
-        """
-        p, n_g = self._checked(s), len(self.lb)
-        shortening, short = self._shortened(qp)
-        if warm_start is not None:
-            if tuple(warm_start.shape) != (*p.shape[:-1], n_g):
-                got, want = tuple(warm_start.shape), (*p.shape[:-1], n_g)
-                raise QPError.expected("warm_start", f"shape {got}", f"shape {want}")
-            warm_start = warm_start[..., shortening.rows]
-        known = to_dtype(p[..., shortening.known], short.C.dtype)
-        n_kept = known.shape[-1] + self.n_u
-        found = solve(short, known, n_kept, self.solver, self.on_failure, warm_start)
-        dropped = found.active.new_zeros(*found.active.shape[:-1], n_g)
-        active = dropped.index_copy(-1, shortening.rows, found.active)
-        return to_dtype(found.value, p.dtype), active
-
     def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
         """Return parameter groups for an optimiser, one for each learned part of theta.
 
@@ -736,18 +686,6 @@ class QPMPC(nn.Module):
             return self.quadratic_program()
         check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or omit it.")
         return qp
-
-    def _shortened(self, qp: QuadraticProgram | None) -> tuple[Shortening, QuadraticProgram]:
-        if self.horizon == 1:
-            raise QPError.expected("horizon", 1, "at least 2, to drop a stage")
-        if self.hessian == "full":
-            remedy = "A full H couples the stages."
-            raise QPError.expected("hessian", "'full'", "'diagonal' or 'block'", remedy)
-        qp = self._current_qp(qp)
-        shortening = Shortening.of(self._layout, qp.H.device)
-        with full_precision(self.C_0):
-            options = self.horizon, self.gamma, self._arguments["discount_slack"]
-            return shortening, shortening.program(qp, *options)
 
     def _value(self, fixed: Tensor, qp: QuadraticProgram | None) -> Tensor:
         return to_dtype(self._solve(fixed, qp).value, fixed.dtype)

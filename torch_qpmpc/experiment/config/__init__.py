@@ -10,21 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from torch_qpmpc.experiment.config.messages import first_error, flatten
 from torch_qpmpc.experiment.config.model import Config
 
 __all__ = ["check_config", "differences", "flatten", "load_config", "settings"]
-
-#: Keys that older configurations lack, each with the value that keeps their behaviour.
-LATER = flatten(
-    {
-        key: info.default.model_dump() if isinstance(info.default, BaseModel) else info.default
-        for key, info in Config.model_fields.items()
-        if not info.is_required()
-    }
-)
 
 
 def check_config(cfg: DictConfig) -> None:
@@ -36,13 +27,9 @@ def check_config(cfg: DictConfig) -> None:
 
 
 def load_config(file: Path) -> DictConfig:
-    """Load a run's saved configuration, and add keys that older versions lacked."""
+    """Load a run's saved configuration."""
     cfg = OmegaConf.load(file)
     assert isinstance(cfg, DictConfig)
-    missing = {key.partition(".")[0] for key in LATER} - {str(key) for key in cfg}
-    for key, value in LATER.items():
-        if key.partition(".")[0] in missing:
-            OmegaConf.update(cfg, key, value)
     return cfg
 
 
@@ -53,7 +40,6 @@ def settings(cfg: DictConfig) -> dict[str, Any]:
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[str, str] | None:
     """Return the differing `settings` of both as ``key=value, ..``; None if all are equal."""
-    then, now = {**LATER, **then}, {**LATER, **now}
     changed = [key for key in {**then, **now} if then.get(key) != now.get(key)]
     if not changed:
         return None

@@ -21,8 +21,6 @@ from torch_qpmpc.experiment.fields import (
     one_of,
     some_of,
 )
-from torch_qpmpc.learning.policy_gradient import PARTS
-from torch_qpmpc.learning.search import KNOBS
 from torch_qpmpc.mpc.validation import CONSTRAINTS, STRUCTURES
 
 Beta = Annotated[float, Field(ge=0, lt=1)]
@@ -160,30 +158,11 @@ class Search(Group):
 
     loops: Count
     margin: Size
-    margin_k: Size = None
     b: Size
     w: Size
-    H_x: Size
     H_u: Size
     H_f: Size
     q_f: Size
-
-
-#: No search, for configurations of versions without one.
-NO_SEARCH = Search(loops=64, **dict.fromkeys(KNOBS))
-
-
-class PolicyGradient(Group):
-    """The parts of theta that the policy gradient moves, and its settings; no parts: off."""
-
-    parts: Annotated[list[str], some_of(PARTS)]
-    rate: Positive
-    ridge: Positive
-    memory: Whole
-
-
-#: No policy gradient, for configurations of versions without one.
-NO_POLICY_GRADIENT = PolicyGradient(parts=[], rate=0.05, ridge=0.01, memory=0)
 
 
 class SingleProcess(Group):

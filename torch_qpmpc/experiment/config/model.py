@@ -10,15 +10,11 @@ from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config.groups import (
-    NO_POLICY_GRADIENT,
-    NO_SEARCH,
     Algorithm,
     Collector,
     Constraint,
-    FromModel,
     Noise,
     Optimizer,
-    PolicyGradient,
     Search,
     Start,
 )
@@ -36,7 +32,6 @@ from torch_qpmpc.experiment.fields import (
     one_of,
 )
 from torch_qpmpc.experiment.tasks import TaskSettings, find_task
-from torch_qpmpc.learning.q_learning import HORIZONS
 from torch_qpmpc.mpc.projections import STEPS, check_step
 from torch_qpmpc.qp.solvers import backend
 
@@ -60,10 +55,10 @@ def _settings_of_the_task(value: Any) -> TaskSettings:
 
 
 class Config(Group):
-    """All keys of configs/ but Hydra's; keys added in later versions have defaults."""
+    """All keys of configs/ but Hydra's."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63), Expected("a whole number >= 0 and < 2^63")]
-    eval_seed: Annotated[Whole | None, Expected("a whole number >= 0, or null")] = None
+    eval_seed: Annotated[Whole | None, Expected("a whole number >= 0, or null")]
     solver: Annotated[Name, AfterValidator(_known_solver)]
     warm_start: Flag
     threads: Count
@@ -76,36 +71,26 @@ class Config(Group):
     replay_capacity: Count
     exploration_std: NonNegative
     td_error_clip: Annotated[Positive | None, Expected("a finite number > 0, or null")]
-    delay_value: Flag
     target_rate: Fraction
-    target_horizon: Annotated[str, one_of(HORIZONS)] = "receding"
-    n_step: Count = 1
-    lmbda: Annotated[Fraction | None, Expected("a number in (0, 1], or null")] = None
-    average_cost: Flag = False
     step: Annotated[str, one_of(STEPS), AfterValidator(_installed_step)]
-    penalty_step: Annotated[str, one_of(("proximal", "subgradient"))]
     release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
     resume: Annotated[str | None, Expected("a path, or null")]
     ablation: Annotated[str | None, Expected("a name, or null")]
-    gate: Flag = False
-    gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")] = None
-    anchor: NonNegative = 0.0
-    prediction: NonNegative = 0.0
+    gate: Flag
+    gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")]
     back_off: Annotated[
         Annotated[Finite, Field(ge=0.5, lt=1)] | None, Expected("a number in [0.5, 1), or null")
-    ] = None
-    average: Annotated[Finite, Field(ge=0, lt=1), Expected("a number in [0, 1)")] = 0.0
-    policy_gradient: PolicyGradient = NO_POLICY_GRADIENT
-    search: Search = NO_SEARCH
-    logger: Annotated[str, one_of(LOGGERS)] = "tensorboard"
-    export: Annotated[Literal["c"] | None, Expected("c, or null")] = None
+    ]
+    search: Search
+    logger: Annotated[str, one_of(LOGGERS)]
+    export: Annotated[Literal["c"] | None, Expected("c, or null")]
     figures: Flag
-    rivals: Annotated[bool | list[str], Expected("true, false or a list of names")] = True
+    rivals: Annotated[bool | list[str], Expected("true, false or a list of names")]
     eval_interval: Count
     log_interval: Count
     algo: Algorithm
     collector: Collector
-    start: Start = FromModel(name="model")
+    start: Start
     task: Annotated[TaskSettings, PlainValidator(_settings_of_the_task)]
     noise: Noise
     constraint: Constraint
@@ -154,12 +139,10 @@ class Config(Group):
 
     @model_validator(mode="after")
     def second_order_has_quadratic_penalties(self) -> Self:
-        """Check that gauss_newton can apply the penalties: proximal, or quadratic in a free C."""
+        """Check that gauss_newton can apply the SI penalty, which must be quadratic in a free C."""
         penalties = self.constraint
         if not self.second_order:
             return self
-        if penalties.deviation is not None and self.penalty_step != "proximal":
-            self.conflict("penalty_step", "proximal", "gauss_newton takes no subgradient steps.")
         if penalties.si is not None and penalties.si.normalised:
             remedy = "gauss_newton needs a penalty that is quadratic in C."
             self.conflict("constraint.si.normalised", "False", remedy)
@@ -169,51 +152,27 @@ class Config(Group):
         return self
 
     @model_validator(mode="after")
-    def an_anchor_has_a_log_and_a_free_C(self) -> Self:
-        if not self.anchor:
+    def back_off_has_a_tied_C_that_follows_its_errors(self) -> Self:
+        if self.back_off is None:
             return self
-        if self.start.name != "data":
-            remedy = "The anchor is at a C that was identified: use constraint=si without a log."
-            self.conflict("start.name", "data", remedy)
-        if not self.second_order:
-            self.conflict("optimizer.name", "gauss_newton", "The anchor is part of its steps.")
-        if "C" not in self.constraint.learn:
-            self.conflict("constraint.learn", "a list with C, which is anchored")
-        if self.constraint.structure != "free":
-            self.conflict("constraint.structure", "free", "The anchor needs a free C.")
-        return self
-
-    @model_validator(mode="after")
-    def prediction_errors_are_those_of_a_tied_C(self) -> Self:
-        if not self.prediction and self.back_off is None:
-            return self
+        without = "constraint=mpc has none."
         if self.constraint.structure != "tied":
-            remedy = "prediction and back_off need one model for all stages: constraint=adaptive."
+            remedy = "back_off needs one model for all stages: constraint=adaptive."
             self.conflict("constraint.structure", "tied", remedy)
         if self.algo.name != "qlearning":
-            name = self.algo.name
-            remedy = f"{name} does not support prediction and back_off; constraint=mpc has neither."
+            remedy = f"{self.algo.name} does not support back_off; {without}"
             self.conflict("algo.name", "qlearning", remedy)
         if self.release is not None:
-            remedy = "prediction and back_off need a tied C; constraint=mpc has neither."
-            self.conflict("release", "null", remedy)
-        if self.prediction and not self.second_order:
-            remedy = "prediction is part of its steps; constraint=mpc has none."
+            self.conflict("release", "null", f"back_off needs a tied C; {without}")
+        if not self.second_order:
+            remedy = f"With back_off its steps follow the prediction errors; {without}"
             self.conflict("optimizer.name", "gauss_newton", remedy)
-        if self.prediction and not {"C", "b"} & {*self.constraint.learn}:
-            self.conflict("constraint.learn", "a list with C or b, which prediction moves")
-        moved = {"constraint.learn": self.constraint.learn}
-        moved["policy_gradient.parts"] = self.policy_gradient.parts
-        for key, parts in moved.items():
-            if self.back_off is not None and {"lb", "ub"} & {*parts}:
-                remedy = "back_off moves the bounds; constraint=mpc has none."
-                self.conflict(key, "a list without lb and ub", remedy)
-        return self
-
-    @model_validator(mode="after")
-    def an_average_is_judged(self) -> Self:
-        if self.average and not self.gate:
-            self.conflict("gate", "true", "The average is what the gate judges.")
+        if not {"C", "b"} & {*self.constraint.learn}:
+            remedy = f"With back_off the model follows its prediction errors; {without}"
+            self.conflict("constraint.learn", "a list with C or b", remedy)
+        if {"lb", "ub"} & {*self.constraint.learn}:
+            remedy = f"back_off moves the bounds; {without}"
+            self.conflict("constraint.learn", "a list without lb and ub", remedy)
         return self
 
     @model_validator(mode="after")
@@ -254,84 +213,9 @@ class Config(Group):
         return self
 
     @model_validator(mode="after")
-    def policy_gradient_explores_and_has_parts_of_its_own(self) -> Self:
-        parts = self.policy_gradient.parts
-        if not parts:
-            return self
-        if both := [x for x in (*self.task.learn_cost, *self.constraint.learn) if x in parts]:
-            key = "task.learn_cost" if both[0] in self.task.learn_cost else "constraint.learn"
-            expected = f"a list without {both[0]}, which is in policy_gradient.parts"
-            self.conflict(key, expected, "One method moves each part: remove it from either list.")
-        if self.algo.name != "qlearning":
-            remedy = f"{self.algo.name} has a policy gradient of its own."
-            self.conflict("policy_gradient.parts", "[]", remedy)
-        if not self.exploration_std:
-            remedy = "The policy gradient compares actions: choose a deviation > 0."
-            self.conflict("exploration_std", "a positive number", remedy)
-        if self.n_step > 1:
-            remedy = "The advantages of policy_gradient.parts are those of single actions."
-            self.conflict("n_step", "1", remedy)
-        return self
-
-    @model_validator(mode="after")
     def export_has_a_qp(self) -> Self:
         if self.export and self.algo.name != "qlearning" and self.algo.actor != "qp":
             self.conflict("export", "null", "The policy of algo.actor=mlp is a network.")
-        return self
-
-    @model_validator(mode="after")
-    def shrinking_horizon_has_stages(self) -> Self:
-        if self.target_horizon == "receding":
-            return self
-        if self.algo.name != "qlearning":
-            remedy = f"{self.algo.name} does not support a shrinking horizon."
-            self.conflict("target_horizon", "receding", remedy)
-        if self.task.horizon == 1:
-            remedy = "target_horizon=shrinking drops a stage."
-            self.conflict("task.horizon", "at least 2", remedy)
-        if self.task.hessian == "full":
-            remedy = "target_horizon=shrinking drops a stage, and a full H couples them."
-            self.conflict("task.hessian", "diagonal or block", remedy)
-        return self
-
-    @model_validator(mode="after")
-    def returns_of_several_steps_have_a_replay(self) -> Self:
-        if self.n_step == 1:
-            if self.lmbda is not None:
-                remedy = "lmbda mixes the returns of 1 .. n_step steps."
-                self.conflict("n_step", "at least 2", remedy)
-            return self
-        if self.algo.name != "qlearning":
-            remedy = f"{self.algo.name} does not support returns of several steps."
-            self.conflict("n_step", "1", remedy)
-        if self.target_horizon == "shrinking":
-            remedy = "target_horizon=shrinking has returns of one step."
-            self.conflict("n_step", "1", remedy)
-        if not self.replay:
-            self.conflict("replay", "true", "n_step above 1 reads its steps from the replay.")
-        if self.collector.name != "single" and not self.collector.sync:
-            remedy = "n_step above 1 needs the following steps of each environment."
-            self.conflict("collector.sync", "true", remedy)
-        if self.lmbda is not None and self.batch_size % self.n_step:
-            remedy = "lmbda samples slices of n_step steps."
-            self.conflict("batch_size", f"a multiple of n_step = {self.n_step}", remedy)
-        return self
-
-    @model_validator(mode="after")
-    def average_cost_has_a_constant_that_moves_it(self) -> Self:
-        if not self.average_cost:
-            return self
-        if self.algo.name != "qlearning":
-            remedy = f"{self.algo.name} does not support an average cost."
-            self.conflict("average_cost", "false", remedy)
-        if self.target_horizon == "shrinking":
-            remedy = "A plant that never ends has no last of N steps."
-            self.conflict("target_horizon", "receding with average_cost", remedy)
-        if "c" not in self.task.learn_cost:
-            remedy = "The steps of c move the average cost."
-            self.conflict("task.learn_cost", "a list with c", remedy)
-        if self.release is not None:
-            self.conflict("release", "null", "average_cost does not support release.")
         return self
 
     @model_validator(mode="after")

@@ -69,14 +69,12 @@ def lagged_model(plant: House) -> Model:
 def learned_scheme(cfg: DictConfig, plant: HeatedHouse, model: Model, cost: float) -> Scheme:
     """Make the scheme that learns, whose c is the part of a typical cost that lies beyond N.
 
-    By TD errors, the learned entries of q are those of the forecasts, in which V and Q become
-    linear: others would be prices of the plan, of which that of y_N is not bounded. The policy
-    gradient moves those prices, except y_N's.
+    The learned entries of q are those of the forecasts, in which V and Q become linear: others
+    would be prices of the plan, of which that of y_N is not bounded.
     """
     gamma = cfg.task.gamma
     n_z = plant.n_p + plant.horizon * (plant.n_y + plant.n_u)
-    forecast, last = torch.arange(n_z) < plant.n_preview, torch.arange(n_z) >= n_z - plant.n_y
-    masks = {"q": ~forecast & ~last if "q" in cfg.policy_gradient.parts else forecast}
+    masks = {"q": torch.arange(n_z) < plant.n_preview}
     if cfg.constraint.structure == "free":
         distance = band_distance(plant.n_y, plant.n_u, plant.horizon, plant.past, plant.n_d)
         masks["C"] = distance <= 0

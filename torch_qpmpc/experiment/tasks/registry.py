@@ -158,8 +158,8 @@ def register(task: Task) -> None:
 
 
 def learned_parts(cfg: DictConfig) -> tuple[str, ...]:
-    """Return the parts of theta that learn, by TD errors or by the policy gradient."""
-    return (*cfg.task.learn_cost, *cfg.constraint.learn, *cfg.policy_gradient.parts)
+    """Return the parts of theta that learn."""
+    return (*cfg.task.learn_cost, *cfg.constraint.learn)
 
 
 def find_task(settings: Mapping[str, Any]) -> Task:

@@ -1,4 +1,4 @@
-"""Which visited pairs an update can learn from."""
+"""TD errors: the visited pairs that an update can learn from."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import warnings
 import pytest
 import torch
 
-from torch_qpmpc.learning.pairs import usable
+from torch_qpmpc.learning.td_error import usable
 
 
 def test_pairs_lack_a_solution_or_a_target():
