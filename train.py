@@ -41,7 +41,7 @@ from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tally import Tally
-from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics, resume_arguments
 
 # Absolute, so that a user's script can call main.
 CONFIGS = str(Path(__file__).with_name("configs"))
@@ -93,7 +93,7 @@ def _train(
         stack.callback(collector.shutdown)
         after = None if state is None else state["update"]
         run = stack.enter_context(RunFolder(folder, cfg, after))
-        command = f"python train.py resume={run.path}"
+        command = f"python train.py {resume_arguments(run.path, cfg.task)}"
 
         # Warm up, or resume.
         if state is None:

@@ -18,7 +18,19 @@ class QPError(ValueError):
     def expected(cls, name: str, got: object, expected: str, remedy: str = "") -> QPError:
         """Return the error ``{name}: got {got}, expected {expected}. {remedy}``."""
         tail = f" {remedy}" if remedy else ""
-        return cls(f"{name}: got {got}, expected {expected}.{tail}")
+        return cls(printable(f"{name}: got {got}, expected {expected}.{tail}"))
+
+
+def printable(text: str) -> str:
+    """Return ``text`` without characters that control a terminal, which a file may have brought.
+
+    Example:
+        >>> printable("a\\x1b[31mb")
+        'a\\\\x1b[31mb'
+    """
+    return "".join(
+        x if x.isprintable() or x in "\n\t" else x.encode("unicode_escape").decode() for x in text
+    )
 
 
 class SolverError(RuntimeError):

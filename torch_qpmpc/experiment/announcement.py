@@ -10,6 +10,8 @@ from numba.core import event
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from torch_qpmpc.errors import printable
+
 COMPILING = "Compiling the QP's kernels for this CPU: up to a minute, the first time only."
 
 
@@ -19,7 +21,7 @@ def announcement(cfg: DictConfig, folder: str, done: int = 0) -> str:
     parts = [f"{group} {cfg[group].name}" for group in ("noise", "constraint", "optimizer")]
     parts = [f"task {task}", *parts, f"solver {cfg.solver}", f"seed {cfg.seed}"]
     updates = f"{cfg.updates} updates" + (f", {done} of them done" if done else "")
-    return f"{cfg.algo.name}, {updates}: {', '.join(parts)}\nFolder: {folder}"
+    return printable(f"{cfg.algo.name}, {updates}: {', '.join(parts)}\nFolder: {folder}")
 
 
 def compilation_named() -> AbstractContextManager[None]:

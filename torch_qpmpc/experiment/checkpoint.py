@@ -28,7 +28,8 @@ def write_whole(path: Path, data: bytes | memoryview) -> None:
     """
     partial = path.with_name(f"{path.name}.partial")
     try:
-        with partial.open("wb") as file:
+        partial.unlink(missing_ok=True)
+        with partial.open("xb") as file:  # a new file: no link is followed
             file.write(data)
             file.flush()
             os.fsync(file.fileno())

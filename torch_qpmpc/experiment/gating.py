@@ -14,14 +14,13 @@ from torch import Tensor
 
 from torch_qpmpc.experiment.algorithms import Learner, evaluate
 from torch_qpmpc.experiment.checkpoint import write_whole
+from torch_qpmpc.experiment.stored_qp import BEST, stored
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.learning.gate import Gate
 from torch_qpmpc.learning.operators import in_closed_loop
 from torch_qpmpc.learning.search import available, search
 from torch_qpmpc.mpc.module import QPMPC
 
-#: The file of the policy that acts, in a run's folder.
-BEST = "best.pt"
 #: The most pairs of a comparison, of which a run's later ones need more: they share one alpha.
 PAIRS = 160
 
@@ -117,7 +116,7 @@ class RunGate:
             return
         state, buffer = {"policy": self.actor.state_dict()}, io.BytesIO()
         if self.mpc is not None:
-            state |= {"structure": self.mpc.structure, "mpc": self.mpc.state_dict()}
+            state |= stored(self.mpc)
         torch.save(state, buffer)
         write_whole(folder / BEST, buffer.getbuffer())
 

@@ -20,6 +20,7 @@ from torch_qpmpc.experiment.lock import ELSEWHERE, ELSEWHERE_IN_SWEEP, locked
 from torch_qpmpc.experiment.run_folder import unwritable
 from torch_qpmpc.experiment.run_state import check_fresh, check_own_folder, folder_of, resumed
 from torch_qpmpc.experiment.sweeps import finished_run, stopped_run
+from torch_qpmpc.experiment.tasks import run_code
 
 # For hydra.run.dir in configs/config.yaml: a resumed run keeps its folder.
 OmegaConf.register_new_resolver("folder_of", folder_of, replace=True)
@@ -52,8 +53,12 @@ class Launch:
             QPError: the configuration is invalid, or the folder holds another run.
         """
         resume, state = cfg.resume, None
-        if resume is not None:
+        if resume is None:
+            run_code(cfg.task)
+        else:
+            own = cfg.task.get("file")
             cfg, state = resumed(resume, self.overrides)
+            run_code({**cfg.task, "file": own})
         check_config(cfg)
         if self.sweep:
             if (summary := finished_run(self.folder, cfg)) is not None:

@@ -52,7 +52,7 @@ def _acquire(path: Path, elsewhere: str) -> int | None:
     """Open and lock ``path``; return its descriptor, or None if the file system has no locks."""
     assert fcntl is not None
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -24,7 +24,9 @@ from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpo
 from torch_qpmpc.experiment.config import differences, load_config, settings
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.lock import ELSEWHERE
+from torch_qpmpc.experiment.stored_qp import stored
 from torch_qpmpc.experiment.tally import Tally
+from torch_qpmpc.experiment.tasks import has_run, named_code, resume_arguments
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -33,6 +35,8 @@ STATE = ("config", "update", "structure", "mpc", "loss_module", "optimizer", "sc
 STATE += ("errors", "gate", "replay", "collector", "tally", "rng")
 #: Files that a run writes before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
+#: Keys that may stand beside ``resume``, because they name the run's code.
+NAMING = ("resume", "task", "task.file", "task.id")
 
 
 def snapshot(
@@ -52,8 +56,7 @@ def snapshot(
     return {
         "config": settings(cfg),
         "update": tally.update,
-        "structure": mpc.structure,
-        "mpc": mpc.state_dict(),
+        **stored(mpc),
         "loss_module": learner.loss_module.state_dict(),
         "optimizer": learner.optimizer.state_dict(),
         "schedule": {"last_epoch": learner.schedule.last_epoch},
@@ -127,16 +130,35 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
 
     Args:
         path: the run's folder, or one of its checkpoints.
-        overrides: the command line's overrides, only ``resume=..`` among them.
+        overrides: the command line's overrides: ``resume=..``, and the code that the run needs, as
+            in ``task.file=FILE`` or ``task=gymnasium task.id=MODULE:ID``.
 
     Raises:
-        QPError: there is no stopped run, its state is damaged or another run's, or there are
-            other overrides.
+        QPError: there is no stopped run, its state is damaged or another run's, its configuration
+            names code that ``overrides`` do not, or there are other overrides.
     """
-    if others := [override for override in overrides if not override.startswith("resume=")]:
+    keys = {override.partition("=")[0].lstrip("+"): override for override in overrides}
+    if others := [override for key, override in keys.items() if key not in NAMING]:
         remedy = "A run resumes with its own configuration."
         got = f"it together with {', '.join(others)}"
         raise QPError.expected("resume", got, "no other override", remedy)
+    cfg, state = _stopped(path)
+    code = {} if has_run(cfg.task) else named_code(cfg.task)
+    given = {key: keys[key].partition("=")[2].strip("'\"") for key in code if key in keys}
+    # Another script may register the task, as on another computer, but not another environment.
+    if code.keys() - given.keys() or given.get("task.id") != code.get("task.id"):
+        got = ", ".join(f"{key}={value!r}" for key, value in code.items())
+        if cfg.task.get("kwargs"):
+            got += f" with task.kwargs={cfg.task.kwargs}"
+        command = f"python train.py {resume_arguments(path, cfg.task)}"
+        remedy = f"Read that code, which may not be yours; to run it: {command}"
+        got = f"{path}, whose config.yaml names code ({got})"
+        raise QPError.expected("resume", got, "code that the command line names, too", remedy)
+    return cfg, state
+
+
+def _stopped(path: str | Path) -> tuple[DictConfig, dict | None]:
+    """Load a stopped run's configuration and last state as data."""
     if not isinstance(path, str | Path):
         raise QPError.expected("resume", repr(path), "a path")
     path = Path(path)
@@ -163,8 +185,8 @@ def check_fresh(folder: str | Path) -> None:
     elif any((folder / name).exists() for name in (*WRITTEN, CHECKPOINT, PREVIOUS)):
         got = "which holds a stopped run"
         with contextlib.suppress(Exception):  # damaged files raise errors of any type
-            resumed(folder, [])
-            remedy = f"Resume it with resume={folder}, or choose another folder with {ELSEWHERE}."
+            arguments = resume_arguments(folder, _stopped(folder)[0].task)
+            remedy = f"Resume it with {arguments}, or choose another folder with {ELSEWHERE}."
     else:
         return
     raise QPError.expected("folder", f"{folder}, {got}", "one without a run", remedy)

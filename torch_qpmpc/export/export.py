@@ -152,6 +152,8 @@ def export_c(
         export, _ = build(mpc, Path(temporary), dtype, name, max_iterations, storage, labels)
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
+        for file in export.files:
+            (folder / file.name).unlink(missing_ok=True)  # may be a link, which copy would follow
         files = tuple(Path(shutil.copy(file, folder)) for file in export.files)
     return Export(**{**vars(export), "files": files})
 

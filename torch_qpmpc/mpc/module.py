@@ -610,6 +610,24 @@ class QPMPC(nn.Module):
             f"learned={self.learned}, solver={self.solver!r}"
         )
 
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The constructor's arguments as tensors and plain values.
+
+        With the state_dict they are all of a QPMPC, in a file that runs no code.
+
+        Example:
+            >>> import io, torch, torch_qpmpc as qm
+            >>> mpc, file = qm.QPMPC(2, 1, 3, stage_weight=[1.0, 1.0, 0.1]), io.BytesIO()
+            >>> torch.save({"arguments": mpc.arguments, "state": mpc.state_dict()}, file)
+            >>> _ = file.seek(0)
+            >>> saved = torch.load(file, weights_only=True)
+            >>> twin = qm.QPMPC(**saved["arguments"])
+            >>> twin.load_state_dict(saved["state"])
+            <All keys matched successfully>
+        """
+        return {name: pickling.plain(value) for name, value in self._arguments.items()}
+
     def __reduce_ex__(self, protocol: Any) -> tuple:
         return pickling.reduce(self, self._arguments, self._parametrizations_for)
 

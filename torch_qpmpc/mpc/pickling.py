@@ -1,14 +1,16 @@
-"""Pickling of a `QPMPC` by its constructor's arguments and its state.
+"""Saving of a `QPMPC` by its constructor's arguments and its state.
 
 torch does not pickle parametrised modules, but spawned collectors need it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from numbers import Integral, Real
 from typing import Any
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from torch_qpmpc.errors import QPError
@@ -41,3 +43,17 @@ def _rebuild(
     for name in frozen:
         module.get_parameter(name).requires_grad_(False)
     return module.train(training)
+
+
+def plain(value: Any) -> Any:
+    """Convert an argument to tensors and plain values, which ``weights_only=True`` reads."""
+    if value is None or isinstance(value, bool | Tensor):
+        return value
+    for kind, convert in ((str, str), (Integral, int), (Real, float)):
+        if isinstance(value, kind):
+            return convert(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return type(value)(map(plain, value)) if type(value) is list else tuple(map(plain, value))
+    return torch.as_tensor(value)

@@ -11,13 +11,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import quote
 
 import pandas as pd
 from matplotlib.figure import Figure
 
 from torch_qpmpc.envs.closed_loop import cost_text, gap_text
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.experiment.checkpoint import write_whole
+from torch_qpmpc.experiment.links import check_links
+from torch_qpmpc.study.markdown import escaped, replaced, table
 from torch_qpmpc.study.plots import (
     ablation_figure,
     constraints_figure,
@@ -61,7 +64,7 @@ def runs_table(frame: pd.DataFrame) -> str:
     rows = frame.assign(case=frame["label"], closed_gap=gaps)[head].itertuples(index=False)
     lines = [
         [
-            cost_text(value) if name in costs else f"{value:{digits.get(name, '')}}"
+            cost_text(value) if name in costs else escaped(f"{value:{digits.get(name, '')}}")
             for name, value in zip(head, row, strict=True)
         ]
         for row in rows
@@ -73,7 +76,7 @@ def cases_table(sweep: pd.DataFrame) -> str:
     """Format a sweep by noise and case as a Markdown table."""
     lines = []
     for noise, label in dict.fromkeys(zip(sweep["noise"], sweep["label"], strict=True)):
-        runs = sweep.query(f"noise == {noise!r} and label == {label!r}")
+        runs = sweep[(sweep["noise"] == noise) & (sweep["label"] == label)]
         real = runs.query("real")["closed_gap"].to_numpy()
         median = runs.median(numeric_only=True)
         nearer = (runs["prediction_error"] < runs["prediction_error_start"]).sum()
@@ -83,8 +86,8 @@ def cases_table(sweep: pd.DataFrame) -> str:
         errors = f"{median['prediction_error_start']:.3f} to {median['prediction_error']:.3f}"
         lines.append(
             [
-                noise,
-                label,
+                escaped(noise),
+                escaped(label),
                 f"{gap} ({len(real)} of {len(runs)})",
                 _ends(median, "J"),
                 _ends(median, "J_discounted"),
@@ -107,11 +110,13 @@ def overall(sweep: pd.DataFrame) -> str:
     """Format the closed gap over the paper's cases that learn C, bootstrapped by case."""
     lines = []
     for noise, runs in sweep.query("real").groupby("noise"):
-        cases = [runs.query(f"label == {case!r}")["closed_gap"].to_numpy() for case in CASES[1:]]
+        cases = [runs["closed_gap"][runs["label"] == case].to_numpy() for case in CASES[1:]]
         if not all(map(len, cases)):
             continue
         mean = interquartile_mean(pd.Series([gap for case in cases for gap in case]).to_numpy())
-        lines.append(f"{noise} noise {mean:.3f} {spread(cases, interquartile_mean).text()}")
+        lines.append(
+            f"{escaped(noise)} noise {mean:.3f} {spread(cases, interquartile_mean).text()}"
+        )
     if not lines:
         return ""
     return f"Interquartile mean over the four cases that learn C: {'; '.join(lines)}."
@@ -131,6 +136,7 @@ def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
             learned = qps.query("constraint != 'fixed'")
             if len(learned):
                 yield f"constraints-{noise}", constraints_figure(learned)
+            qps = qps[[run.physics is not None for run in qps["run"]]]
             if len(qps):
                 yield f"trajectories-{noise}", trajectories_figure(qps)
             if len(qps) and qps["run"].iloc[0].start.n_x > 1:
@@ -152,12 +158,13 @@ def write(frame: pd.DataFrame, folder: Path) -> str:
         links = []
         for title, figure in figures(sweep):
             figure.savefig(own_folder / f"{title}.png", dpi=100)
-            links.append(f"![{title}]({(Path(str(name)) / title).as_posix()}.png)")
-        parts.append(((f"## {name}", section(sweep)), links))
+            link = quote((Path(str(name)) / title).as_posix())
+            links.append(f"![{escaped(title)}]({link}.png)")
+        parts.append(((f"## {escaped(name)}", section(sweep)), links))
     tables = "\n\n".join("\n\n".join(text) for text, _ in parts)
     whole = "\n\n".join("\n\n".join([*text, *links]) for text, links in parts)
-    (folder / "report.md").write_text(f"{CAPTION}\n\n{whole}\n", encoding="utf-8")
-    (folder / "runs.md").write_text(runs_table(frame) + "\n", encoding="utf-8")
+    write_whole(folder / "report.md", f"{CAPTION}\n\n{whole}\n".encode())
+    write_whole(folder / "runs.md", f"{runs_table(frame)}\n".encode())
     return f"{CAPTION}\n\n{tables}"
 
 
@@ -169,9 +176,11 @@ def section(sweep: pd.DataFrame) -> str:
 def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:
     """Write the tables between the markers ``name`` of a Markdown file, and NAME.png beside it."""
     text = page.read_text(encoding="utf-8")
-    tables = [f"**{title}**\n\n{section(sweep)}" for title, sweep in frame.groupby("sweep")]
+    tables = [
+        f"**{escaped(title)}**\n\n{section(sweep)}" for title, sweep in frame.groupby("sweep")
+    ]
     page.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), name), encoding="utf-8")
-    first = max(frame.groupby("sweep"), key=lambda pair: pair[1]["closed_gap"].median())[1]
+    first = max(sweeps, key=lambda pair: pair[1]["closed_gap"].median())[1]
     headline(first).savefig(page.with_name(f"{name}.png"), dpi=90)
 
 
@@ -200,6 +209,7 @@ def main(arguments: list[str] | None = None) -> None:
         frame = collect(options.folder)
         if options.page:
             write_page(frame, options.page, options.folder.resolve().name)
+        check_links(options.folder, "report")
         print(write(frame, options.folder / "report"))
     except QPError as error:
         raise SystemExit(str(error)) from None

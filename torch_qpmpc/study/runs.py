@@ -1,12 +1,12 @@
 """Finished runs: their results as one table, and the QP that each has learned.
 
+A run's folder is data. No code that its configuration names is run.
 All readings of a learned C are independent of its gauge.
 """
 
 from __future__ import annotations
 
 import contextlib
-import copy
 import json
 import math
 from functools import cached_property
@@ -23,17 +23,10 @@ from torch_qpmpc.analysis.report import predictions
 from torch_qpmpc.analysis.structure import Model, nearest_model
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
 from torch_qpmpc.experiment.config import check_config, load_config, settings
-from torch_qpmpc.experiment.gating import BEST
 from torch_qpmpc.experiment.run_folder import read_metrics
-from torch_qpmpc.experiment.start import make_start
-from torch_qpmpc.experiment.tasks import (
-    AnyPlant,
-    make_mpc,
-    make_physics,
-    make_true_mpc,
-)
+from torch_qpmpc.experiment.stored_qp import learned_qp, start_qp
+from torch_qpmpc.experiment.tasks import AnyPlant, has_run, make_physics, make_true_mpc
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -75,29 +68,24 @@ class FinishedRun:
         return cfg
 
     @cached_property
-    def physics(self) -> AnyPlant:
-        return make_physics(self.cfg)
+    def physics(self) -> AnyPlant | None:
+        """The plant; None if that takes code of the configuration, which is not run."""
+        return make_physics(self.cfg) if has_run(self.cfg.task) else None
 
     @cached_property
     def start(self) -> QPMPC:
         """The QP that learning started from."""
-        start = make_start(self.cfg, self.physics, self.folder, written=True)
-        return make_mpc(self.cfg, self.physics, start)
+        return start_qp(self.folder, self.cfg.constraint.structure)
 
     @cached_property
     def true(self) -> QPMPC | None:
         """The QP with the true model; None if that is unknown."""
-        return make_true_mpc(self.cfg, self.physics)
+        return None if self.physics is None else make_true_mpc(self.cfg, self.physics)
 
     @cached_property
     def learned(self) -> QPMPC:
         """The learned QP, which acted at the run's end."""
-        state = load_checkpoint(self.folder / (BEST if self.cfg.gate else CHECKPOINT))
-        mpc = copy.deepcopy(self.start)
-        if state["structure"] != mpc.structure:
-            mpc.release(state["structure"])
-        mpc.load_state_dict(state["mpc"])
-        return mpc
+        return learned_qp(self.folder)
 
     @property
     def metrics(self) -> pd.DataFrame:
@@ -169,7 +157,9 @@ def collect(folder: str | Path) -> pd.DataFrame:
         summary = json.loads(file.read_text(encoding="utf-8"))
         where = "." if file.parent == folder else str(file.parent.parent.relative_to(folder))
         sweep = folder.resolve().name if where == "." else where
-        rows.append({**summary, "run": run, "sweep": sweep, **run.readings()})
+        names = {name: run.cfg[name].name for name in ("constraint", "noise")}
+        names |= {"seed": run.cfg.seed, "ablation": run.cfg.ablation}
+        rows.append({**summary, **names, "run": run, "sweep": sweep, **run.readings()})
     frame = pd.DataFrame(rows)
     for name in ("closed_gap", "J_true_model", "J_discounted_true_model", "canonical_distance"):
         # These are null without a gap, a true model or a QP.
@@ -201,7 +191,8 @@ def _labels(sweep: pd.DataFrame) -> list[str]:
         details = [f"{key.split('.')[-1]}={of_run[key]}" for key in varied]
         if of_run["ablation"] is not None:
             details = [of_run["ablation"]]
-        labels.append(", ".join([case, *details]))
+        # Without $, which would begin mathematics in a figure.
+        labels.append(", ".join(map(str, [case, *details])).replace("$", ""))
     return labels
 
 

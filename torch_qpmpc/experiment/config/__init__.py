@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
+from yaml import YAMLError
 
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config.messages import first_error, flatten
 from torch_qpmpc.experiment.config.model import Config
 
@@ -27,9 +30,29 @@ def check_config(cfg: DictConfig) -> None:
 
 
 def load_config(file: Path) -> DictConfig:
-    """Load a run's saved configuration."""
-    cfg = OmegaConf.load(file)
-    assert isinstance(cfg, DictConfig)
+    """Load a run's saved configuration as plain values.
+
+    Raises:
+        QPError: it cannot be read, or has interpolations such as ``${oc.env:HOME}``, which would
+            read this computer's environment.
+    """
+    try:
+        cfg = OmegaConf.load(file)
+        tree = OmegaConf.to_container(cfg, resolve=False)
+        if not isinstance(cfg, DictConfig) or not isinstance(tree, dict):
+            raise ValueError("not a mapping")
+        if not isinstance(tree.get("task"), dict):
+            raise ValueError("its task is not a mapping")
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
+        reason = " ".join(str(error).split())
+        remedy = "Restore the file, or start a new run."
+        expected = "the configuration that train.py wrote"
+        raise QPError.expected("config.yaml", f"{file} ({reason})", expected, remedy) from error
+    for key, value in flatten(tree).items():
+        if isinstance(value, list | str) and "${" in str(value):
+            remedy = "Interpolations of a saved configuration are not resolved: write the value."
+            got = f"{key}={value!r} in {file}"
+            raise QPError.expected("config.yaml", got, "values, as train.py writes them", remedy)
     return cfg
 
 

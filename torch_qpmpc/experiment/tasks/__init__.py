@@ -20,6 +20,7 @@ from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
     point_mass,
     tank_references,
 )
+from torch_qpmpc.experiment.tasks.code import has_run, named_code, resume_arguments, run_code
 from torch_qpmpc.experiment.tasks.identified import Start, identified_scheme
 from torch_qpmpc.experiment.tasks.registry import (
     TASKS,
@@ -40,10 +41,14 @@ __all__ = [
     "Task",
     "TaskSettings",
     "find_task",
+    "has_run",
     "make_mpc",
     "make_physics",
     "make_true_mpc",
+    "named_code",
     "register",
+    "resume_arguments",
+    "run_code",
     "true_model",
 ]
 

@@ -12,6 +12,7 @@ from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.closed_loop import gymnasium_loop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.fields import MATRIX, Expected, Matrix
+from torch_qpmpc.experiment.tasks.code import has_run
 from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
 
 
@@ -51,7 +52,16 @@ REMEDY = (
 
 
 def make_plant(cfg: DictConfig) -> GymnasiumPlant:
-    """Make the environment with its further arguments."""
+    """Make the environment with its further arguments.
+
+    Raises:
+        QPError: it cannot be made, or needs a module that has not been imported.
+    """
+    if not has_run(cfg.task):
+        got = f"{cfg.task.id!r} with task.kwargs={cfg.task.get('kwargs')}"
+        expected = "an environment whose module has been imported"
+        remedy = "Name it on the command line with task.id=MODULE:ID, or import it before."
+        raise QPError.expected("task.id", got, expected, remedy)
     kwargs: Any = OmegaConf.to_container(OmegaConf.create(cfg.task.get("kwargs") or {}))
     return GymnasiumPlant(cfg.task.id, **kwargs)
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import runpy
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NoReturn, Self
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
-from pydantic import model_validator
+from pydantic import ConfigDict, model_validator
 from torch import Tensor
 
 from torch_qpmpc.checks import check_kind
@@ -163,19 +162,34 @@ def learned_parts(cfg: DictConfig) -> tuple[str, ...]:
 
 
 def find_task(settings: Mapping[str, Any]) -> Task:
-    """Find a task by the keys under ``task``, running its file if it is not registered.
+    """Find a task by the keys under ``task``; no code runs.
+
+    A task whose script has not run in this process has no plant: see `code.run_code`.
 
     Raises:
         QPError: there is no such task.
     """
     name, file = settings.get("name"), settings.get("file")
-    if name not in TASKS and isinstance(file, str):
-        if not Path(file).exists():
-            remedy = "Set task.file to its path."
-            expected = f"the file that registers task={name}"
-            raise QPError.expected("task.file", f"{file!r}, which does not exist", expected, remedy)
-        runpy.run_path(file, run_name="task_file")
-    if name not in TASKS:
-        got = repr(name) if "name" in settings else "nothing"
-        raise QPError.expected("task.name", got, f"one of {', '.join(TASKS)}")
-    return TASKS[name]
+    if name in TASKS:
+        return TASKS[name]
+    if isinstance(name, str) and isinstance(file, str):
+        return _without_code(name, file)
+    got = repr(name) if "name" in settings else "nothing"
+    raise QPError.expected("task.name", got, f"one of {', '.join(TASKS)}")
+
+
+class _AnySettings(TaskSettings):
+    """The keys of a task whose own are unknown."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+
+def _without_code(name: str, file: str) -> Task:
+    """Make a stand-in for a task whose script has not run."""
+
+    def refuse(*_: Any) -> NoReturn:
+        got = f"{file!r}, which has not run"
+        remedy = "Name it on the command line with task.file=FILE, or run it before."
+        raise QPError.expected("task.file", got, f"a script that has registered {name!r}", remedy)
+
+    return Task(name, refuse, refuse, settings=_AnySettings)

@@ -1,0 +1,101 @@
+"""The code that the keys under ``task`` name: a user's script, and an environment's module.
+
+A configuration from a run's folder is data: its code runs only if the command line names it, too.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+import runpy
+import shlex
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.tasks.registry import TASKS
+
+
+def named_code(task: Mapping[str, Any]) -> dict[str, str]:
+    """Return the keys under ``task`` that name code, with their values.
+
+    They are ``task.file``, except with a built-in task, and ``task.id`` if it or a string in
+    ``task.kwargs`` has the form ``module:Id``, whose module Gymnasium imports.
+    """
+    known, file = TASKS.get(str(task.get("name"))), task.get("file")
+    code = {}
+    if isinstance(file, str) and not (known is not None and known.defaults is None):
+        code["task.file"] = file
+    if modules(task):
+        code["task.id"] = str(task["id"])
+    return code
+
+
+def modules(task: Mapping[str, Any]) -> list[str]:
+    """Return the importable modules that a Gymnasium environment's id and arguments name."""
+    if task.get("name") != "gymnasium":
+        return []
+    names = [text.partition(":")[0] for text in _strings([task.get("id"), task.get("kwargs")])]
+    return [name for name in names if _is_module(name)]
+
+
+def has_run(task: Mapping[str, Any]) -> bool:
+    """Return True if all code that ``task`` names has been run in this process."""
+    code = named_code(task)
+    registered = "task.file" not in code or str(task.get("name")) in TASKS
+    return registered and {*modules(task)} <= {*sys.modules}
+
+
+def run_code(task: Mapping[str, Any]) -> None:
+    """Run the script and import the modules that ``task`` names: the command line's own.
+
+    Raises:
+        QPError: the script does not exist, is no Python file, or registers another task.
+    """
+    name, file = task.get("name"), named_code(task).get("task.file")
+    if file is not None and name not in TASKS:
+        expected = f"the Python file that registers task={name}"
+        if not Path(file).exists() or Path(file).suffix != ".py":
+            wrong = "is no .py file" if Path(file).exists() else "does not exist"
+            remedy = "Set task.file to its path."
+            raise QPError.expected("task.file", f"{file!r}, which {wrong}", expected, remedy)
+        runpy.run_path(file, run_name="task_file")
+        if name not in TASKS:
+            raise QPError.expected("task.file", f"{file!r}, which registers no {name!r}", expected)
+    for module in modules(task):
+        importlib.import_module(module)
+
+
+def resume_arguments(folder: str | Path, task: Mapping[str, Any]) -> str:
+    """Return the command line's arguments that resume the run in ``folder``."""
+    code = named_code(task)
+    words = [f"resume={folder}", *(["task=gymnasium"] if "task.id" in code else [])]
+    for key, value in code.items():
+        plain = re.fullmatch(r"[\w./:-]+", value)
+        words.append(f"{key}={value}" if plain else shlex.quote(f'{key}="{value}"'))
+    return " ".join(words)
+
+
+def _strings(value: Any) -> Iterator[str]:
+    if isinstance(value, DictConfig | ListConfig):
+        value = OmegaConf.to_container(value, resolve=True)
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping | list | tuple):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from _strings(item)
+
+
+def _is_module(name: str) -> bool:
+    """Return True if ``name`` could be imported; only its parent's finder is asked."""
+    if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*", name):
+        return False
+    try:
+        return importlib.util.find_spec(name.partition(".")[0]) is not None
+    except ValueError:  # __main__, as under pytest
+        return True
