@@ -180,7 +180,7 @@ def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:
         f"**{escaped(title)}**\n\n{section(sweep)}" for title, sweep in frame.groupby("sweep")
     ]
     page.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), name), encoding="utf-8")
-    first = max(sweeps, key=lambda pair: pair[1]["closed_gap"].median())[1]
+    first = max(frame.groupby("sweep"), key=lambda pair: pair[1]["closed_gap"].median())[1]
     headline(first).savefig(page.with_name(f"{name}.png"), dpi=90)
 
 
