@@ -49,9 +49,10 @@ def plain(value: Any) -> Any:
     """Convert an argument to tensors and plain values, which ``weights_only=True`` reads."""
     if value is None or isinstance(value, bool | Tensor):
         return value
-    for kind, convert in ((str, str), (Integral, int), (Real, float)):
-        if isinstance(value, kind):
-            return convert(value)
+    if isinstance(value, str):
+        return str(value)
+    if isinstance(value, Real):  # numpy's, too
+        return int(value) if isinstance(value, Integral) else float(value)
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | set | frozenset):

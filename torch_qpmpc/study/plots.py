@@ -20,7 +20,7 @@ from torch_qpmpc.experiment.plots import (
     scale_costs,
 )
 from torch_qpmpc.learning.operators import warm_policy
-from torch_qpmpc.study.runs import CASES, FinishedRun, has_real
+from torch_qpmpc.study.runs import CASES, FinishedRun, chosen, has_real
 from torch_qpmpc.study.statistics import interquartile_mean, spread, spread_name
 
 GAP_LEFT = "gap left, (J - J true) / (J start - J true)"
@@ -116,7 +116,7 @@ def shown_seed(frame: pd.DataFrame) -> int:
 
 def constraints_figure(frame: pd.DataFrame) -> Figure:
     """Draw the paper's figures 2 and 4, C_theta of each case beside C_0; below, canonical."""
-    runs = frame[frame["seed"] == shown_seed(frame)]
+    runs = chosen(frame, seed=shown_seed(frame))
     figure = Figure(figsize=(4 * (len(runs) + 1), 6), layout="constrained")
     panels = figure.subplots(2, len(runs) + 1, squeeze=False)
     start: FinishedRun = runs["run"].iloc[0]
@@ -135,7 +135,7 @@ def constraints_figure(frame: pd.DataFrame) -> Figure:
 
 def trajectories_figure(frame: pd.DataFrame) -> Figure:
     """Draw closed-loop paths of the start, each case and the true model, with predictions."""
-    runs = frame[frame["seed"] == shown_seed(frame)]
+    runs = chosen(frame, seed=shown_seed(frame))
     figure = Figure(figsize=(4 * len(runs), 4.5), layout="constrained")
     for axes, label, run in zip(
         figure.subplots(1, len(runs), squeeze=False)[0], runs["label"], runs["run"], strict=True
@@ -154,7 +154,7 @@ def trajectories_figure(frame: pd.DataFrame) -> Figure:
 
 def policies_figure(frame: pd.DataFrame) -> Figure:
     """Draw slices of value and first action of the start, each case and the true model."""
-    runs = frame[frame["seed"] == shown_seed(frame)]
+    runs = chosen(frame, seed=shown_seed(frame))
     first: FinishedRun = runs["run"].iloc[0]
     shown = {"start": first.start}
     shown |= {label: run.learned for label, run in zip(runs["label"], runs["run"], strict=True)}
@@ -263,7 +263,7 @@ def ablation_figure(frame: pd.DataFrame) -> Figure:
     for axes, noise in zip(
         figure.subplots(1, len(noises), squeeze=False, sharey=True)[0], noises, strict=True
     ):
-        groups = real[real["noise"] == noise].groupby("ablation")["closed_gap"]
+        groups = chosen(real, noise=noise).groupby("ablation")["closed_gap"]
         for height, (_, gaps) in enumerate(groups):
             left = 1 - gaps
             low, high, *_ = spread([left.to_numpy()])
@@ -284,7 +284,7 @@ def readme_figure(frame: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(4 * (len(noises) + 1), 3.6), layout="constrained")
     panels = figure.subplots(1, len(noises) + 1)
     for axes, noise in zip(panels, noises, strict=False):
-        draw_gap(axes, frame[frame["noise"] == noise])
+        draw_gap(axes, chosen(frame, noise=noise))
         axes.set_title(f"{noise} noise")
     draw_meaning(panels[-1], frame)
     panels[-1].legend(fontsize="small")

@@ -31,7 +31,7 @@ from torch_qpmpc.study.plots import (
     readme_figure,
     trajectories_figure,
 )
-from torch_qpmpc.study.runs import CASES, REAL_GAP, collect, has_real
+from torch_qpmpc.study.runs import CASES, REAL_GAP, chosen, collect, has_real
 from torch_qpmpc.study.statistics import interquartile_mean, spread
 
 #: Largest number of settings that fit side by side in a figure.
@@ -76,7 +76,7 @@ def cases_table(sweep: pd.DataFrame) -> str:
     """Format a sweep by noise and case as a Markdown table."""
     lines = []
     for noise, label in dict.fromkeys(zip(sweep["noise"], sweep["label"], strict=True)):
-        runs = sweep[(sweep["noise"] == noise) & (sweep["label"] == label)]
+        runs = chosen(sweep, noise=noise, label=label)
         real = runs.query("real")["closed_gap"].to_numpy()
         median = runs.median(numeric_only=True)
         nearer = (runs["prediction_error"] < runs["prediction_error_start"]).sum()
@@ -110,7 +110,7 @@ def overall(sweep: pd.DataFrame) -> str:
     """Format the closed gap over the paper's cases that learn C, bootstrapped by case."""
     lines = []
     for noise, runs in sweep.query("real").groupby("noise"):
-        cases = [runs["closed_gap"][runs["label"] == case].to_numpy() for case in CASES[1:]]
+        cases = [chosen(runs, label=case)["closed_gap"].to_numpy() for case in CASES[1:]]
         if not all(map(len, cases)):
             continue
         mean = interquartile_mean(pd.Series([gap for case in cases for gap in case]).to_numpy())
@@ -136,7 +136,7 @@ def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
             learned = qps.query("constraint != 'fixed'")
             if len(learned):
                 yield f"constraints-{noise}", constraints_figure(learned)
-            qps = qps[[run.physics is not None for run in qps["run"]]]
+            qps = qps.assign(simulated=[run.has_plant for run in qps["run"]]).query("simulated")
             if len(qps):
                 yield f"trajectories-{noise}", trajectories_figure(qps)
             if len(qps) and qps["run"].iloc[0].start.n_x > 1:

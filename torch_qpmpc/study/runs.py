@@ -67,10 +67,15 @@ class FinishedRun:
             ) from None
         return cfg
 
+    @property
+    def has_plant(self) -> bool:
+        """False if the plant takes code that the configuration names, which is not run."""
+        return has_run(self.cfg.task)
+
     @cached_property
-    def physics(self) -> AnyPlant | None:
-        """The plant; None if that takes code of the configuration, which is not run."""
-        return make_physics(self.cfg) if has_run(self.cfg.task) else None
+    def physics(self) -> AnyPlant:
+        """The plant, if `has_plant`."""
+        return make_physics(self.cfg)
 
     @cached_property
     def start(self) -> QPMPC:
@@ -80,7 +85,7 @@ class FinishedRun:
     @cached_property
     def true(self) -> QPMPC | None:
         """The QP with the true model; None if that is unknown."""
-        return None if self.physics is None else make_true_mpc(self.cfg, self.physics)
+        return make_true_mpc(self.cfg, self.physics) if self.has_plant else None
 
     @cached_property
     def learned(self) -> QPMPC:
@@ -111,7 +116,7 @@ class FinishedRun:
             "prediction_error": math.nan,
             "prediction_error_start": math.nan,
         }
-        if isinstance(physics := self.physics, LinearSystem):
+        if self.has_plant and isinstance(physics := self.physics, LinearSystem):
             with contextlib.suppress(QPError):
                 learned, start = (nearest_model(predictions(m)) for m in (mpc, self.start))
                 readings["prediction_error"] = prediction_error(learned, physics)
@@ -122,6 +127,11 @@ class FinishedRun:
 def has_real(frame: pd.DataFrame) -> bool:
     """Return True if any of `collect`'s runs has a real gap."""
     return any(frame["real"])
+
+
+def chosen(frame: pd.DataFrame, **values: Any) -> pd.DataFrame:
+    """Return the rows with these ``values`` by column, which pandas does not evaluate as code."""
+    return frame.query(" and ".join(f"{name} == @{name}" for name in values), local_dict=values)
 
 
 def prediction_error(model: Model, physics: LinearSystem) -> float:
