@@ -6,8 +6,11 @@ Each payload only leaves a mark, a file, which must not appear.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import re
+import runpy
 import shutil
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -24,8 +27,10 @@ from torch_qpmpc.experiment.config import load_config, settings
 from torch_qpmpc.experiment.links import check_links
 from torch_qpmpc.experiment.lock import LOCK, locked
 from torch_qpmpc.experiment.start import read_log
+from torch_qpmpc.experiment.tasks import TASKS, make_mpc
 from torch_qpmpc.export.__main__ import main as export
 from torch_qpmpc.study.report import main as report
+from torch_qpmpc.study.runs import FinishedRun
 
 TASK_OF_GYMNASIUM = "task=pendulum", "start=data", "start.transitions=100"
 
@@ -49,6 +54,15 @@ def mark(tmp_path: Path) -> Path:
 def folder(runs: Path, tmp_path: Path) -> Path:
     """Copy the run of the point mass."""
     return shutil.copytree(runs / "linear", tmp_path / "runs" / "sweep" / "run")
+
+
+OWN_TASK = """
+from torch_qpmpc.envs import GrosZanonLTI
+from torch_qpmpc.experiment.tasks import Task, register
+from torch_qpmpc.experiment.tasks.gros_zanon import true_scheme
+
+register(Task("mine", lambda cfg: GrosZanonLTI(), lambda cfg, plant: true_scheme(plant)))
+"""
 
 
 def change(folder: Path, **changes: object) -> None:
@@ -87,14 +101,17 @@ def script(folder: Path, mark: Path) -> None:
 
 
 def zipped(folder: Path, mark: Path) -> None:
-    """Let the checkpoint be a program, too."""
-    change(folder, task__name="theirs", task__file=str(folder / "checkpoint.pt"))
-    with zipfile.ZipFile(folder / "checkpoint.pt", "a") as file:
+    """Let a checkpoint be a program, too."""
+    program = shutil.copy(folder / "checkpoint.pt", folder / "checkpoint-previous.pt")
+    with zipfile.ZipFile(program, "a") as file:
         file.writestr("__main__.py", f"open({str(mark)!r}, 'w')")
+    change(folder, task__name="theirs", task__file=str(program))
 
 
 def module(folder: Path, mark: Path) -> None:
     (folder / "theirs.py").write_text(f"open({str(mark)!r}, 'w')")
+    importlib.invalidate_caches()
+    sys.modules.pop("theirs", None)
     change(folder, task__id="theirs:Id-v0")
 
 
@@ -136,9 +153,7 @@ def test_a_module_is_imported_if_the_command_line_names_it(runs, tmp_path, mark,
     stop(folder)
     module(folder, mark)
     for wrong in ((), ("task=gymnasium", "task.id=theirs:Other-v0")):
-        message = (
-            f"to run it: python train.py resume={folder} task=gymnasium task.id=theirs:Id-v0.$"
-        )
+        message = f"to run it: python train.py resume={folder} task=gymnasium task.id=theirs:Id-v0$"
         with pytest.raises(SystemExit, match=message):
             run_command(f"resume={folder}", *wrong)
     assert not mark.exists()
@@ -160,12 +175,53 @@ def test_a_module_in_an_environments_arguments_is_not_imported(runs, tmp_path, m
     assert not mark.exists()
 
 
+def test_an_own_task_is_exported_and_reported_without_its_code(tmp_path, monkeypatch):
+    """From the stored QPs; what takes the plant is left out."""
+    monkeypatch.delitem(TASKS, "mine", raising=False)
+    file = tmp_path / "mine.py"
+    file.write_text(OWN_TASK)
+    runpy.run_path(str(file))
+    for case in ("free", "mpc"):
+        cfg = make_config(*SMALL, "task=mine", f"constraint={case}", "rivals=[]")
+        cfg.release = 2 if case == "mpc" else None
+        train.train(cfg, str(tmp_path / "runs" / case), quiet=True)
+    known = FinishedRun(tmp_path / "runs" / "mpc")
+    start = make_mpc(known.cfg, known.physics)
+    assert known.has_plant
+    assert torch.equal(known.start.C, start.C)
+
+    del TASKS["mine"]
+    file.write_text("raise AssertionError")
+    run = FinishedRun(tmp_path / "runs" / "mpc")
+    assert not run.has_plant
+    assert run.true is None
+    assert (run.start.structure, run.learned.structure) == (start.structure, "free")
+    assert torch.equal(run.start.C, start.C)
+    p = torch.ones(1, 2, dtype=torch.float64)
+    torch.testing.assert_close(run.learned.policy(p), known.learned.policy(p))
+    message = "^task.file: got '.*mine.py', which has not run, expected a script that has registere"
+    with pytest.raises(QPError, match=message):
+        _ = run.physics
+    report([str(tmp_path / "runs")])
+    drawn = {path.name for path in (tmp_path / "runs" / "report" / "runs").iterdir()}
+    assert drawn == {"learning-none.png", "constraints-none.png"}
+    export([str(run.folder)])
+    assert (run.folder / "c" / "policy.c").exists()
+
+
+def test_a_policy_that_is_no_qp_is_not_exported(folder):
+    torch.save({"policy": {}}, folder / "best.pt")
+    message = r"^checkpoint: got .*best.pt, from which no QP can be made \(KeyError: 'arg"
+    with pytest.raises(SystemExit, match=message):
+        export([str(folder)])
+
+
 def test_a_number_of_the_summary_is_not_evaluated(folder, mark):
     """A report chooses runs by seed."""
     file = folder / "summary.json"
     code = f"@pd.io.common.os.mkdir('{mark}')"
     file.write_text(file.read_text().replace('"seed": 1', f'"seed": "{code}"'))
-    with contextlib.suppress(SystemExit):
+    with contextlib.suppress(Exception):
         report([str(folder)])
     assert not mark.exists()
 

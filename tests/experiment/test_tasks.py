@@ -5,12 +5,16 @@ from __future__ import annotations
 import dataclasses
 import math
 import runpy
+import shlex
 import signal
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from pydantic import Field
 
 import train
@@ -28,7 +32,10 @@ from torch_qpmpc.experiment.tasks import (
     make_mpc,
     make_physics,
     make_true_mpc,
+    named_code,
     register,
+    resume_arguments,
+    run_code,
 )
 from torch_qpmpc.mpc.banded import banded_matrix
 
@@ -263,20 +270,55 @@ def test_another_process_finds_a_task_by_its_file(own_task):
     del TASKS["mine"]
     with pytest.raises(QPError, match=r"task\.name: got 'mine', expected one of .*point_mass"):
         find_task({"name": "mine"})
+    for wrong, said in (("gone.py", "does not exist"), ("mine.txt", "is no .py file")):
+        other = file.replace("mine.py", wrong)
+        if wrong.endswith("txt"):
+            Path(other).write_text("")
+        message = rf"task\.file: got '.*{wrong}', which {said}, expected the Python file that reg"
+        with pytest.raises(QPError, match=message):
+            run_code({"name": "mine", "file": other})
+    run_code({"name": "mine", "file": file})
     assert find_task({"name": "mine", "file": file}).name == "mine"
+
+
+def test_a_task_without_its_code_has_no_plant(own_task):
+    file = own_task('noises=("windy",)')
+    cfg = make_config("task=mine", "noise.name=windy", "+task.mass=3")
     del TASKS["mine"]
-    message = r"task\.file: got '.*gone\.py', which does not exist, expected the file that"
+    check_config(cfg)
+    message = r"task\.file: got '.*mine\.py', which has not run, expected a script that has regis"
     with pytest.raises(QPError, match=message):
-        find_task({"name": "mine", "file": file.replace("mine.py", "gone.py")})
+        make_physics(cfg)
+    assert named_code(cfg.task) == {"task.file": file}
 
 
-def test_train_resumes_a_run_of_an_own_task(own_task, tmp_path, monkeypatch):
-    own_task('defaults={"task": {"horizon": 3}}')
+def test_an_environment_of_a_module_needs_its_import():
+    cfg = make_config("task=pendulum", "task.id=antigravity:Id-v0")
+    message = r"task\.id: got 'antigravity:Id-v0' with .* expected an environment whose module has "
+    with pytest.raises(QPError, match=message):
+        make_physics(cfg)
+    assert "antigravity" not in sys.modules
+
+
+def test_the_arguments_that_resume_are_quoted():
+    task = {"name": "mine", "file": "/a b/it's.py"}
+    words = shlex.split(resume_arguments("runs/1", task))
+    assert words == ["resume=runs/1", 'task.file="/a b/it\'s.py"']
+    (override,) = OverridesParser.create().parse_overrides(words[1:])
+    assert override.value() == "/a b/it's.py"
+    assert resume_arguments("runs/1", {"name": "point_mass", "file": "x.py"}) == "resume=runs/1"
+
+
+@pytest.mark.parametrize("registered", [True, False])
+def test_train_resumes_a_run_of_an_own_task(own_task, tmp_path, monkeypatch, registered):
+    """The user's script has registered it, or the command line names the script."""
+    file = own_task('defaults={"task": {"horizon": 3}}')
     cfg, whole, cut = make_config("task=mine", *SMALL), tmp_path / "whole", tmp_path / "cut"
     train.train(cfg, str(whole), quiet=True)
     assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
-    del TASKS["mine"]
-    run_command(f"resume={cut}")
+    if not registered:
+        del TASKS["mine"]
+    run_command(f"resume={cut}", *([] if registered else [f"task.file={file}"]))
     assert_same_numbers(cut, whole)
 
 
