@@ -312,6 +312,17 @@ def test_an_export_and_a_report_write_nothing_through_a_link(folder, tmp_path, p
     assert not list(outside.iterdir())
 
 
+def test_a_report_writes_no_figure_elsewhere(folder, tmp_path):
+    """The noise of a task whose code has not run may have any name."""
+    noise = "x/../../../../../../outside"
+    change(folder, task__name="theirs", task__file="theirs.py", noise__name=noise)
+    (folder / "report" / folder.name / "learning-x").mkdir(parents=True)
+    report([str(folder)])
+    assert not (tmp_path / "outside.png").exists()
+    drawn = {path.name for path in (folder / "report" / folder.name).glob("*.png")}
+    assert "learning-x_.._.._.._.._.._.._outside.png" in drawn
+
+
 def test_links_that_stay_inside_are_allowed(tmp_path):
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to("file")

@@ -282,7 +282,7 @@ def test_another_process_finds_a_task_by_its_file(own_task):
 
 
 def test_a_task_without_its_code_has_no_plant(own_task):
-    file = own_task('noises=("windy",)')
+    file = own_task("")
     cfg = make_config("task=mine", "noise.name=windy", "+task.mass=3")
     del TASKS["mine"]
     check_config(cfg)

@@ -9,6 +9,7 @@ the ablations.
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote
@@ -157,9 +158,10 @@ def write(frame: pd.DataFrame, folder: Path) -> str:
         own_folder.mkdir(parents=True, exist_ok=True)
         links = []
         for title, figure in figures(sweep):
-            figure.savefig(own_folder / f"{title}.png", dpi=100)
-            link = quote((Path(str(name)) / title).as_posix())
-            links.append(f"![{escaped(title)}]({link}.png)")
+            # The noise is a name from the folder, which may have slashes.
+            file = re.sub(r"[^\w.,=-]+", "_", f"{title}.png")
+            figure.savefig(own_folder / file, dpi=100)
+            links.append(f"![{escaped(title)}]({quote((Path(str(name)) / file).as_posix())})")
         parts.append(((f"## {escaped(name)}", section(sweep)), links))
     tables = "\n\n".join("\n\n".join(text) for text, _ in parts)
     whole = "\n\n".join("\n\n".join([*text, *links]) for text, links in parts)
