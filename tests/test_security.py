@@ -147,6 +147,13 @@ def test_a_script_runs_if_the_command_line_names_it(folder, mark):
     assert mark.exists()
 
 
+@pytest.mark.parametrize("word", ["task=gros_zanon", "task.file=mine.py", "task=pendulum"])
+def test_a_run_that_names_no_code_resumes_alone(folder, word):
+    stop(folder)
+    with pytest.raises(SystemExit, match=f"^resume: got it together with {word}, expected no oth"):
+        run_command(f"resume={folder}", word)
+
+
 def test_a_module_is_imported_if_the_command_line_names_it(runs, tmp_path, mark, monkeypatch):
     folder = shutil.copytree(runs / "gym", tmp_path / "run")
     monkeypatch.syspath_prepend(folder)

@@ -7,7 +7,7 @@ to every random number. Other environments cannot be saved and start new episode
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -137,24 +137,40 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
         QPError: there is no stopped run, its state is damaged or another run's, its configuration
             names code that ``overrides`` do not, or there are other overrides.
     """
-    keys = {override.partition("=")[0].lstrip("+"): override for override in overrides}
-    if others := [override for key, override in keys.items() if key not in NAMING]:
+    given = {text.partition("=")[0].lstrip("+"): text for text in overrides}
+    _check_alone(given, NAMING)
+    cfg, state = _stopped(path)
+    code = named_code(cfg.task)
+    _check_alone(given, {"resume", *code, *(["task"] if "task.id" in code else [])})
+    if not has_run(cfg.task):
+        _check_named(given, code, path, cfg)
+    return cfg, state
+
+
+def _check_alone(given: Mapping[str, str], allowed: Collection[str]) -> None:
+    if others := [override for key, override in given.items() if key not in allowed]:
         remedy = "A run resumes with its own configuration."
         got = f"it together with {', '.join(others)}"
         raise QPError.expected("resume", got, "no other override", remedy)
-    cfg, state = _stopped(path)
-    code = {} if has_run(cfg.task) else named_code(cfg.task)
-    given = {key: keys[key].partition("=")[2].strip("'\"") for key in code if key in keys}
-    # Another script may register the task, as on another computer, but not another environment.
-    if code.keys() - given.keys() or given.get("task.id") != code.get("task.id"):
-        got = ", ".join(f"{key}={value!r}" for key, value in code.items())
-        if cfg.task.get("kwargs"):
-            got += f" with task.kwargs={cfg.task.kwargs}"
-        command = f"python train.py {resume_arguments(path, cfg.task)}"
-        remedy = f"Read that code, which may not be yours; to run it: {command}"
-        got = f"{path}, whose config.yaml names code ({got})"
-        raise QPError.expected("resume", got, "code that the command line names, too", remedy)
-    return cfg, state
+
+
+def _check_named(
+    given: Mapping[str, str], code: Mapping[str, str], path: str | Path, cfg: DictConfig
+) -> None:
+    """Raise `QPError` unless the overrides name the ``code`` that the configuration names.
+
+    Another script may register the task, as on another computer, but not another environment.
+    """
+    named = {key: text.partition("=")[2].strip("'\"") for key, text in given.items()}
+    if code.keys() <= named.keys() and named.get("task.id") == code.get("task.id"):
+        return
+    words = ", ".join(f"{key}={value!r}" for key, value in code.items())
+    if cfg.task.get("kwargs"):
+        words += f" with task.kwargs={cfg.task.kwargs}"
+    got = f"{path}, whose config.yaml names code ({words})"
+    command = f"python train.py {resume_arguments(path, cfg.task)}"
+    remedy = f"Read that code, which may not be yours; to run it: {command}"
+    raise QPError.expected("resume", got, "code that the command line names, too", remedy)
 
 
 def _stopped(path: str | Path) -> tuple[DictConfig, dict | None]:
