@@ -52,7 +52,7 @@ def keys_of_the_files() -> set[str]:
 
 
 def test_each_key_of_the_files_is_one_of_the_models():
-    assert keys_of_the_files() - set(OPTIONAL) == set(KEYS) - {"task.file"}
+    assert keys_of_the_files() - set(OPTIONAL) == set(KEYS)
     assert all(KEYS.values()), "each says what its value must be"
 
 
@@ -119,7 +119,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     text = (CONFIGS / "config.yaml").read_text(encoding="utf-8").partition("hydra:")[2]
     seen |= set(re.findall(r"\$\{(?!hydra\.)([\w.]+)\}", text))
     seen |= {"logger"}  # RunFolder reads it from the configuration itself
-    assert seen - set(OPTIONAL) == set(KEYS) - {"task.file"}
+    assert seen - set(OPTIONAL) == set(KEYS)
 
 
 #: The noises of each task, and the constraints whose penalty needs windows of the replay.
