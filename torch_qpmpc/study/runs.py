@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import json
 import math
 from functools import cached_property
 from pathlib import Path
@@ -24,9 +23,9 @@ from torch_qpmpc.analysis.structure import Model, nearest_model
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
-from torch_qpmpc.experiment.config import check_config, load_config, settings
+from torch_qpmpc.experiment.config import check_config, damaged, load_config, settings
 from torch_qpmpc.experiment.gating import BEST
-from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.experiment.run_folder import read_metrics, read_summary
 from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import (
     AnyPlant,
@@ -91,12 +90,19 @@ class FinishedRun:
 
     @cached_property
     def learned(self) -> QPMPC:
-        """The learned QP, which acted at the run's end."""
-        state = load_checkpoint(self.folder / (BEST if self.cfg.gate else CHECKPOINT))
-        mpc = copy.deepcopy(self.start)
-        if state["structure"] != mpc.structure:
-            mpc.release(state["structure"])
-        mpc.load_state_dict(state["mpc"])
+        """The learned QP, which acted at the run's end.
+
+        Raises:
+            QPError: its file is missing or damaged.
+        """
+        file = self.folder / (BEST if self.cfg.gate else CHECKPOINT)
+        state, mpc = load_checkpoint(file), copy.deepcopy(self.start)
+        try:
+            if state["structure"] != mpc.structure:
+                mpc.release(state["structure"])
+            mpc.load_state_dict(state["mpc"])
+        except Exception as error:  # damaged files raise errors of any type
+            raise damaged(file, error, "the QP that this run learned") from error
         return mpc
 
     @property
@@ -166,7 +172,7 @@ def collect(folder: str | Path) -> pd.DataFrame:
     rows = []
     for file in files:
         run = FinishedRun(file.parent)
-        summary = json.loads(file.read_text(encoding="utf-8"))
+        summary = read_summary(file.parent)
         where = "." if file.parent == folder else str(file.parent.parent.relative_to(folder))
         sweep = folder.resolve().name if where == "." else where
         rows.append({**summary, "run": run, "sweep": sweep, **run.readings()})

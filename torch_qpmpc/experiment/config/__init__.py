@@ -12,10 +12,11 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from pydantic import ValidationError
 
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config.messages import first_error, flatten
 from torch_qpmpc.experiment.config.model import Config
 
-__all__ = ["check_config", "differences", "flatten", "load_config", "settings"]
+__all__ = ["check_config", "damaged", "differences", "flatten", "load_config", "settings"]
 
 
 def check_config(cfg: DictConfig) -> None:
@@ -27,10 +28,31 @@ def check_config(cfg: DictConfig) -> None:
 
 
 def load_config(file: Path) -> DictConfig:
-    """Load a run's saved configuration."""
-    cfg = OmegaConf.load(file)
-    assert isinstance(cfg, DictConfig)
+    """Load a run's saved configuration.
+
+    Raises:
+        QPError: the file is missing or damaged.
+    """
+    try:
+        cfg = OmegaConf.load(file)
+        if not isinstance(cfg, DictConfig):
+            raise ValueError("it is a list")
+        for key, info in Config.model_fields.items():
+            if info.is_required() and key not in cfg:
+                raise KeyError(key)
+        OmegaConf.to_container(cfg, resolve=True)
+    except Exception as error:  # damaged files raise errors of any type
+        raise damaged(file, error, "the configuration that a run wrote") from error
     return cfg
+
+
+def damaged(file: Path, error: Exception, expected: str) -> QPError:
+    """Make the error of a run's ``file`` that cannot be read."""
+    reason = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, KeyError):
+        reason = f"it has no {error.args[0]}"
+    remedy = "Restore the file, or move the run's folder elsewhere."
+    return QPError.expected(file.name, f"{file} ({reason})", expected, remedy)
 
 
 def settings(cfg: DictConfig) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from torch_qpmpc.experiment.tasks import TaskSettings, find_task
 from torch_qpmpc.mpc.projections import STEPS, check_step
 from torch_qpmpc.qp.solvers import backend
 
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")
 
 
@@ -57,8 +58,8 @@ def _settings_of_the_task(value: Any) -> TaskSettings:
 class Config(Group):
     """All keys of configs/ but Hydra's."""
 
-    seed: Annotated[int, Field(ge=0, lt=2**63), Expected("a whole number >= 0 and < 2^63")]
-    eval_seed: Annotated[Whole | None, Expected("a whole number >= 0, or null")]
+    seed: Annotated[Seed, Expected("a whole number >= 0 and < 2^63")]
+    eval_seed: Annotated[Seed | None, Expected("a whole number >= 0 and < 2^63, or null")]
     solver: Annotated[Name, AfterValidator(_known_solver)]
     warm_start: Flag
     threads: Count
