@@ -508,7 +508,7 @@ def test_impossible_value_on_the_command_line(tmp_path):
             "task.gama: got an unknown key, expected a key of configs/. Did you mean task.gamma?",
         ),
         ("study=paper", "append to your default list use +study=paper"),
-        ("optimizer.lr=1", "Could not override 'optimizer.lr'"),
+        ("optimizer.lr_cost=1", "Could not override 'optimizer.lr_cost'"),
         (
             "+batchsize=3",
             "batchsize: got an unknown key, expected a key of configs/. Did you mean batch_size?",

@@ -110,7 +110,7 @@ def launched() -> Iterator[Launch]:
             raise
         raise SystemExit(str(error)) from None
     except OSError as error:
-        if sweep or isinstance(error, ConnectionError):  # a lost worker is not a file error
+        if sweep:
             raise
         raise SystemExit(str(unwritable(launch.folder, error))) from None
 
