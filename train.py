@@ -35,7 +35,7 @@ from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.exporting import export_run
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.interrupt import Interrupt
-from torch_qpmpc.experiment.launch import launched
+from torch_qpmpc.experiment.launch import check_overrides, launched
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
@@ -74,7 +74,7 @@ def _train(
     physics = make_physics(cfg)
     identified = make_start(cfg, physics, folder, written=state is not None, quiet=quiet)
     mpc = make_mpc(cfg, physics, identified)
-    found = Evaluation.before(cfg, physics, mpc)
+    found = Evaluation.before(cfg, physics, mpc, quiet)
 
     # The learner: Q-learning of first or second order, or actor-critic.
     operator = make_operator(cfg, mpc)
@@ -82,7 +82,7 @@ def _train(
     if released:
         mpc.release()
     learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
-    gate = RunGate(cfg, learner, physics)
+    gate = RunGate(cfg, learner, physics, quiet)
 
     # The data: vectorised episodes under the current policy, and their replay.
     collector = make_collector(cfg, physics, gate.actor)
@@ -165,13 +165,19 @@ def _train(
 
 
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="config")
-def main(cfg: DictConfig) -> float:
+def _run(cfg: DictConfig) -> float:
     """Train, and return the closed gap, which an optimising sweeper can maximise."""
     with launched() as launch:
         cfg, state, summary = launch.settle(cfg)
         if summary is None:
             summary = train(cfg, launch.folder, state, quiet=launch.sweep)
     return summary["closed_gap"]
+
+
+def main() -> None:
+    """Run the command line."""
+    check_overrides(sys.argv[1:], CONFIGS)
+    _run()
 
 
 if __name__ == "__main__":

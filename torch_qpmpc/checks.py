@@ -29,6 +29,12 @@ def check_whole(name: str, value: Any, least: int, remedy: str = "") -> None:
         raise QPError.expected(name, repr(value), f"a whole number >= {least}", remedy)
 
 
+def check_seed(seed: Any) -> None:
+    """Raise `QPError` unless ``seed`` is a whole number that torch's generators take."""
+    if not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= int(seed) < 2**63:
+        raise QPError.expected("seed", repr(seed), "a whole number >= 0 and < 2^63")
+
+
 def check_number(
     name: str, value: Any, accepts: Callable[[Any], bool], expected: str, remedy: str = ""
 ) -> None:

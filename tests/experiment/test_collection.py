@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
-import json
-import signal
 from typing import Any
 
 import pytest
 import torch
 from omegaconf import DictConfig
 
-import train
 from tests.runs import SMALL, make_config
-from tests.stops import go_on, stop
-from torch_qpmpc import QPActorValueOperator, QPError, SolveLog
-from torch_qpmpc.experiment.collection import batches, make_collector, num_columns
+from torch_qpmpc import QPActorValueOperator, SolveLog
+from torch_qpmpc.experiment.collection import batches, make_collector
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
 
@@ -71,72 +66,3 @@ def test_a_collector_carries_active_sets_from_step_to_step(task):
     finally:
         collector.shutdown()
     assert log.recalled > 0.5 * log.solves
-
-
-#: Collectors with environments in other processes.
-ELSEWHERE = [
-    pytest.param("multi", marks=pytest.mark.slow),
-    pytest.param("ray", marks=pytest.mark.cluster),
-]
-WORKERS = ("collector.workers=2", "num_envs=4", "steps_per_update=5", "exploration_std=0")
-
-
-@pytest.mark.parametrize("name", ELSEWHERE)
-def test_workers_share_the_environments_and_follow_theta(name):
-    if name == "ray":
-        pytest.importorskip("ray", reason="the extra ray is not installed")
-    cfg = make_config(*SMALL, f"collector={name}", *WORKERS)
-    physics = make_physics(cfg)
-    mpc = make_mpc(cfg, physics)
-    policy = QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
-    collector = make_collector(cfg, physics, policy)
-    stream = batches(collector)
-    try:
-        first = next(stream).clone()
-        before = mpc.policy(first["observation"])
-        with torch.no_grad():
-            mpc.q.zero_() if "q" in mpc.learned else mpc.C.add_(0.3 * torch.randn_like(mpc.C))
-        second = next(stream).clone()
-    finally:
-        collector.shutdown()
-    assert first.shape == second.shape == (num_columns(cfg), 5) == (4, 5)
-    torch.testing.assert_close(first["action"], before.detach())
-    torch.testing.assert_close(second["action"], mpc.policy(second["observation"]).detach())
-    assert not torch.allclose(mpc.policy(first["observation"]), before, atol=1e-3)
-    # Each environment continues its episode, and no two are equal.
-    torch.testing.assert_close(first["next", "observation"][:, -1], second["observation"][:, 0])
-    assert len(first["observation"][:, 0].unique(dim=0)) == 4
-
-
-@pytest.mark.parametrize("name", ELSEWHERE)
-@pytest.mark.usefixtures("store_task")
-def test_asynchronous_workers_return_batches_of_their_environments(
-    tmp_path, monkeypatch, capsys, name
-):
-    """Each batch has the environments, here plants, of one of two workers, also on resume."""
-    if name == "ray":
-        pytest.importorskip("ray", reason="the extra ray is not installed")
-    overrides = ("task=store", *SMALL, f"collector={name}", "collector.sync=false", "num_envs=4")
-    more = ("constraint=si", "steps_per_update=5", "warmup_steps=10", "updates=6")
-    cfg = make_config(*overrides, *more)
-    assert num_columns(cfg) == 2
-    seen = []
-    monkeypatch.setattr(
-        train, "batches", lambda collector: (seen.append(b.shape) or b for b in batches(collector))
-    )
-    assert stop(monkeypatch, cfg, tmp_path, 4) == 128 + signal.SIGTERM
-    go_on(tmp_path)
-    assert set(seen) == {(2, 5)}
-    assert "Starting new episodes: the state of the env" in capsys.readouterr().out
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert (summary["updates"], summary["unsolved"]) == (6, 0)
-    assert summary["J_final"] != summary["J_start"]
-
-
-def test_ray_must_be_there(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    cfg = make_config(*SMALL, "collector=ray")
-    with pytest.raises(
-        QPError, match=r"collector: got ray, which is not installed, .* '\.\[ray\]'"
-    ):
-        collect(cfg, 1)

@@ -10,13 +10,11 @@ from typing import Any
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
-from torchrl.collectors import distributed
 
 import train
 from tests.covering import covering
 from tests.runs import CONFIGS, SMALL, choices, make_config
-from torch_qpmpc import QPActorValueOperator, QPError
-from torch_qpmpc.experiment.collection import make_collector, num_columns
+from torch_qpmpc import QPError
 from torch_qpmpc.experiment.config import (
     check_config,
     flatten,
@@ -25,7 +23,6 @@ from torch_qpmpc.experiment.config import (
 from torch_qpmpc.experiment.config.messages import keys
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import snapshot
-from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.learning.search import KNOBS
 
 GROUPS = ("constraint", "noise", "optimizer", "task")
@@ -109,13 +106,6 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         monkeypatch.setattr(train, "snapshot", lambda _, *parts, cfg=cfg: snapshot(cfg, *parts))
         recorder: Any = Recorder(cfg, seen)
         train.train(recorder, str(tmp_path / name))
-    monkeypatch.setattr(distributed, "RayCollector", lambda *_, **__: None)
-    monkeypatch.setattr("importlib.util.find_spec", lambda _: True)  # Ray is optional
-    elsewhere: Any = Recorder(make_config("collector=ray"), seen)
-    physics = make_physics(elsewhere)
-    operator = QPActorValueOperator(make_mpc(elsewhere, physics))
-    make_collector(elsewhere, physics, operator.get_policy_operator())
-    assert num_columns(elsewhere) == 16
     text = (CONFIGS / "config.yaml").read_text(encoding="utf-8").partition("hydra:")[2]
     seen |= set(re.findall(r"\$\{(?!hydra\.)([\w.]+)\}", text))
     seen |= {"logger"}  # RunFolder reads it from the configuration itself
@@ -170,10 +160,9 @@ def test_incompatible_choices_are_refused(names):
 
 
 @pytest.mark.parametrize("task", ["point_mass", "pendulum"])
-@pytest.mark.parametrize("collector", choices("collector"))
 @pytest.mark.parametrize("algo", choices("algo"))
-def test_each_algorithm_goes_with_each_collector(algo, collector, task):
-    check_config(make_config(f"algo={algo}", f"collector={collector}", f"task={task}"))
+def test_each_algorithm_goes_with_each_kind_of_task(algo, task):
+    check_config(make_config(f"algo={algo}", f"task={task}"))
 
 
 def test_an_actor_has_the_first_order_by_itself():
@@ -198,7 +187,7 @@ def choices_with(key: str) -> list[str]:
         return ["optimizer=adam", TASK_KEYS[key]]
     if key in settings(make_config("optimizer=gauss_newton")):
         return ["optimizer=gauss_newton"]
-    having = {"algo": "algo=td3", "collector": "collector=ray", "task": "task=pendulum"}
+    having = {"algo": "algo=td3", "task": "task=pendulum"}
     having["start"] = "start=data"
     return ["optimizer=adam", *(c for group, c in having.items() if key.startswith(f"{group}."))]
 
@@ -248,10 +237,6 @@ BAD: dict[str, list[Any]] = {
     "start.hold": [0.5, *REAL],
     "start.causal": FLAG,
     "start.ridge": REAL[:-1],
-    "collector.name": ["many", *NAME],
-    "collector.workers": WHOLE,
-    "collector.sync": FLAG,
-    "collector.num_cpus": [0, *REAL],
     "task.name": ["pendulum", *NAME],
     "task.id": ["???", *NAME],
     "task.kwargs": ["g=1", 3, [1.0], {1: 2}],
@@ -505,18 +490,6 @@ def test_solver_must_be_known():
         (
             ["algo=ddpg", "constraint=mpc", "release=5"],
             "release: got 5, expected null. ddpg does not support release",
-        ),
-        (
-            ["collector=multi", "constraint=mpc", "release=5"],
-            "release: got 5, expected null. Workers of collector=multi would keep",
-        ),
-        (
-            ["collector=ray", "collector.workers=3"],
-            "num_envs: got 16, expected a multiple of collector.workers = 3",
-        ),
-        (
-            ["collector=multi", "collector.sync=false", "constraint=si"],
-            "steps_per_update: got 4, expected at least task.horizon = 10. constraint.si",
         ),
         (
             ["task=gros_zanon", "noise.std=0.1"],

@@ -55,11 +55,6 @@ def test_an_error_of_the_user_is_one_sentence(hydra, error, sentence):
         raise error
 
 
-def test_a_lost_worker_is_no_file_error(hydra):
-    with pytest.raises(BrokenPipeError), launched():
-        raise BrokenPipeError
-
-
 @pytest.mark.parametrize("error", [OSError("disk"), ValueError("bug")])
 def test_a_threads_error_is_printed_unless_the_run_raises_it(capsys, error):
     module._print_unless_os_error(

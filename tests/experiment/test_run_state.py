@@ -12,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 import train
-from tests.runs import SMALL, make_config
+from tests.runs import SMALL, make_config, run_command
 from tests.stops import assert_events_are_whole, assert_same_numbers, go_on, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
@@ -147,6 +147,22 @@ def test_only_a_stopped_run_resumes(tmp_path, stopped):
     (stopped / "summary.json").touch()
     with pytest.raises(QPError, match=r"resume: got .*which is finished, expected a stopped run"):
         resumed(stopped, [])
+
+
+@pytest.mark.parametrize(
+    ("content", "wrong"),
+    [
+        (b"[]", "it is a list"),
+        (b"", "it has no seed"),
+        (b"a: [1\nb: }", "while parsing a flow sequence"),
+        (b"seed: \xff", "'utf-8' codec can't decode"),
+    ],
+)
+def test_a_damaged_configuration_is_named(stopped, content, wrong):
+    (stopped / "config.yaml").write_bytes(content)
+    sentence = rf"^config\.yaml: got .*/config\.yaml \({wrong}.*\), expected the configuration that"
+    with pytest.raises(SystemExit, match=sentence):
+        run_command(f"resume={stopped}")
 
 
 def test_a_damaged_checkpoint_names_the_previous_one_which_resumes(tmp_path, stopped):

@@ -125,15 +125,18 @@ def test_sub_folders_are_named_by_what_the_sweep_varies(tmp_path):
 # --- Runs that have finished ---------------------------------------------------------------------
 
 
+OUTCOME = {"seed": 1, "closed_gap": 0.5, "J_start": 2.0, "J_final": 1.5, "J_true_model": None}
+
+
 @pytest.fixture
 def finished(tmp_path: Path) -> Path:
     OmegaConf.save(make_config(*SMALL), tmp_path / "config.yaml", resolve=True)
-    (tmp_path / "summary.json").write_text('{"closed_gap": 0.5}')
+    (tmp_path / "summary.json").write_text(json.dumps(OUTCOME))
     return tmp_path
 
 
 def test_a_finished_run_is_recognised_by_its_settings(finished):
-    assert finished_run(finished, make_config(*SMALL)) == {"closed_gap": 0.5}
+    assert finished_run(finished, make_config(*SMALL)) == OUTCOME
 
 
 @pytest.mark.parametrize(

@@ -499,7 +499,16 @@ def test_impossible_value_on_the_command_line(tmp_path):
 @pytest.mark.parametrize(
     ("mistake", "sentence"),
     [
-        ("batchsize=3", "Could not override 'batchsize'"),
+        (
+            "batchsize=3",
+            "batchsize: got an unknown key, expected a key of configs/. Did you mean batch_size?",
+        ),
+        (
+            "task.gama=1",
+            "task.gama: got an unknown key, expected a key of configs/. Did you mean task.gamma?",
+        ),
+        ("study=paper", "append to your default list use +study=paper"),
+        ("optimizer.lr_cost=1", "Could not override 'optimizer.lr_cost'"),
         (
             "+batchsize=3",
             "batchsize: got an unknown key, expected a key of configs/. Did you mean batch_size?",
@@ -668,3 +677,15 @@ def test_missing_keys_of_a_gymnasium_task_are_named(tmp_path, monkeypatch, overr
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=message):
         run_command("task=gymnasium", *overrides, *SHORT)
+
+
+# --- Progress -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_bars_name_the_first_evaluation_and_the_search(tmp_path, capsys, quiet):
+    cfg = make_config(*TINY, "gate=true", "search.H_u=0.5", "search.loops=2", "logger=csv")
+    train.train(cfg, str(tmp_path), quiet=quiet)
+    shown = capsys.readouterr().err
+    for line in ("first evaluation:", "start", "true model", "search:"):
+        assert (line in shown) is not quiet, line

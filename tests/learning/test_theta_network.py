@@ -305,6 +305,22 @@ def test_the_network_reads_other_keys():
         (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, width=0), "width: got 0"),
         (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, n_in=0), "n_in: got 0, expected a whole"),
         (
+            lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, in_keys="observation"),
+            r"in_keys: got 'observation', expected a list of keys, such as \['observation'\]",
+        ),
+        (
+            lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, in_keys=[]),
+            r"in_keys: got \[\], expected a l",
+        ),
+        (
+            lambda mpc: ThetaNetwork(mpc, {"q": 1.0})(TensorDict(observation=torch.ones(3, 5))),
+            r"in_keys: got 5 entries of observation, expected n_in = 2. Pass n_in=5, or other",
+        ),
+        (
+            lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, in_keys=["wind"], n_in=2)(transitions(mpc)),
+            "wind: got a TensorDict with .*, expected one with wind. Rename the module's keys",
+        ),
+        (
             lambda mpc: QPActorValueOperator(mpc, theta_keys={"w": "w"}),
             "theta_keys: got 'w', expected names among .* Add w to learn",
         ),

@@ -51,19 +51,19 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPActorValueOperator: missing action": (
         lambda: op(TensorDict(observation=S, batch_size=4)),
-        "action: got a TensorDict with observation, expected one with action. Rename the operator",
+        "action: got a TensorDict with observation, expected one with action. Rename the module",
     ),
     "QPActorValueOperator: missing obs": (
         lambda: op(TensorDict(action=Aa, batch_size=4)),
-        "observation: got a TensorDict with action, expected one with observation. Rename the op",
+        "observation: got a TensorDict with action, expected one with observation. Rename the mod",
     ),
     "QPPolicyOperator: missing obs": (
         lambda: op.get_policy_operator()(TensorDict(state=S, batch_size=4)),
-        "observation: got a TensorDict with state, expected one with observation. Rename the ope",
+        "observation: got a TensorDict with state, expected one with observation. Rename the mod",
     ),
     "QPActorValueOperator: tensor": (
         lambda: op(S),
-        "action: got a TensorDict with observation, expected one with action. Rename the operator",
+        "action: got a TensorDict with observation, expected one with action. Rename the module",
     ),
     "QPActorValueOperator: int action": (
         lambda: op(TensorDict(observation=S, action=Aa.long(), batch_size=4)),
@@ -129,7 +129,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPQLearningLoss: no action": (
         lambda: make_loss()(batch_without("action")),
-        "action: got a TensorDict with observation, expected one with action. Rename the operator",
+        "action: got a TensorDict with observation, expected one with action. Rename the module",
     ),
     "QPQLearningLoss: no done": (
         lambda: make_loss()(batch_without(("next", "done"), ("next", "terminated"))),
@@ -421,7 +421,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "make_replay: seed": (
         lambda: make_replay(64, 2, 4, 3, 2, seed="a"),
-        "seed: got 'a', expected a whole number >= 0.",
+        "seed: got 'a', expected a whole number >= 0 and < 2^63.",
     ),
     "make_replay: active": (
         lambda: make_replay(64, 2, 4, 3, 2, active_rows=-1),

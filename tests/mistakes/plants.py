@@ -58,7 +58,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "closed_loop: seed": (
         lambda: closed_loop(lambda s: s[:, :2], pm, seed=-1),
-        "seed: got -1, expected a whole number >= 0.",
+        "seed: got -1, expected a whole number >= 0 and < 2^63.",
     ),
     "closed_loop: gamma": (
         lambda: closed_loop(lambda s: s[:, :2], pm, gamma=2.0).J_discounted,
@@ -170,7 +170,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "bootstrap_interval: seed": (
         lambda: bootstrap_interval([np.ones(3)], seed=-1),
-        "seed: got -1, expected a whole number >= 0.",
+        "seed: got -1, expected a whole number >= 0 and < 2^63.",
     ),
     "bootstrap_interval: scalar strata": (
         lambda: bootstrap_interval([1.0, 2.0]),
@@ -202,15 +202,23 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "PointMassEnv: seed": (
         lambda: PointMassEnv(2, seed="a"),
-        "seed: got 'a', expected a whole number >= 0.",
+        "seed: got 'a', expected a whole number >= 0 and < 2^63.",
     ),
     "PointMassEnv: physics str": (
         lambda: PointMassEnv(2, physics="gaussian"),
         "physics: got str, expected a LinearSystem.",
     ),
+    "PointMassEnv: set_seed": (
+        lambda: PointMassEnv(2).set_seed(10**30),
+        f"seed: got {10**30}, expected a whole number >= 0 and < 2^63.",
+    ),
+    "GymnasiumPlant: seed": (
+        lambda: GymnasiumPlant("Pendulum-v1").vectorised(2, 5, seed=10**30),
+        f"seed: got {10**30}, expected a whole number >= 0 and < 2^63.",
+    ),
     "PointMassEnv: seed neg": (
         lambda: PointMassEnv(2, seed=-1),
-        "seed: got -1, expected a whole number >= 0.",
+        "seed: got -1, expected a whole number >= 0 and < 2^63.",
     ),
     "PointMassEnv: physics other": (
         lambda: LinearSystemEnv(mpc, 2, 5),
@@ -302,15 +310,15 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "PointMass: corrupted": (
         lambda: pm.corrupted(-1),
-        "seed: got -1, expected a whole number >= 0.",
+        "seed: got -1, expected a whole number >= 0 and < 2^63.",
     ),
     "PointMass: corrupted str": (
         lambda: pm.corrupted("a"),
-        "seed: got 'a', expected a whole number >= 0.",
+        "seed: got 'a', expected a whole number >= 0 and < 2^63.",
     ),
     "PointMass: corrupted None": (
         lambda: pm.corrupted(None),
-        "seed: got None, expected a whole number >= 0.",
+        "seed: got None, expected a whole number >= 0 and < 2^63.",
     ),
     "PointMass: nu 1d": (
         lambda: pm.step(torch.zeros(5, 4), torch.zeros(5, 2), torch.zeros(5, 1)).shape,

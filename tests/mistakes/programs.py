@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 import torch
 from tensordict import TensorDict
 
@@ -174,21 +175,38 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         M(A=torch.ones(3, 2)),
         "A: got shape (3, 2), expected shape (3, 3) or (3, 3, 3).",
     ),
+    "QPMPC: A sparse": (
+        M(A=torch.eye(2).to_sparse()),
+        "A: got a torch.sparse_coo tensor, which is sparse, expected a dense matrix. Convert it: "
+        "A.to_dense().",
+    ),
+    "QPMPC: A sparse by rows": (
+        M(A=torch.eye(2).to_sparse_csr()),
+        "A: got a torch.sparse_csr tensor, which is sparse, expected a dense matrix.",
+    ),
+    "QPMPC: B sparse by scipy": (
+        M(B=scipy.sparse.csr_array(np.ones((2, 1)))),
+        "B: got csr_array, which is sparse, expected a dense matrix. Convert it: B.toarray().",
+    ),
+    "QPMPC: seed huge": (
+        M(seed=2**63),
+        "seed: got 9223372036854775808, expected a whole number >= 0 and < 2^63.",
+    ),
     "QPMPC: seed float": (
         M(seed=1.5),
-        "seed: got 1.5, expected a whole number >= 0.",
+        "seed: got 1.5, expected a whole number >= 0 and < 2^63.",
     ),
     "QPMPC: seed str": (
         M(seed="a"),
-        "seed: got 'a', expected a whole number >= 0.",
+        "seed: got 'a', expected a whole number >= 0 and < 2^63.",
     ),
     "QPMPC: seed neg": (
         M(seed=-1),
-        "seed: got -1, expected a whole number >= 0.",
+        "seed: got -1, expected a whole number >= 0 and < 2^63.",
     ),
     "QPMPC: seed None": (
         M(seed=None),
-        "seed: got None, expected a whole number >= 0.",
+        "seed: got None, expected a whole number >= 0 and < 2^63.",
     ),
     "QPMPC: slack str": (
         M(state_slack="inf"),

@@ -485,6 +485,10 @@ def test_an_indefinite_block_of_the_plan_is_refused():
             "rate_slack: got -1.0, expected a non-negative weight",
         ),
         (
+            {"past": 2, "rate_slack": 2.0},
+            "rate_slack: got 2.0, expected inf without rate_bounds. It is the price of violating",
+        ),
+        (
             {"past": 3, "A": torch.eye(2)},
             r"A, B: got shapes \(2, 2\) and .*, expected \(2, 6\) and \(2, 3\). \[A_1, .., A_L\]",
         ),

@@ -14,7 +14,11 @@ from torch_qpmpc.analysis.report import canonical
 from torch_qpmpc.analysis.structure import Model
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.config import load_config
 from torch_qpmpc.experiment.lock import LOCK
+from torch_qpmpc.experiment.sweeps import finished_run
+from torch_qpmpc.export.__main__ import main as export
+from torch_qpmpc.study.report import main as report
 from torch_qpmpc.study.runs import FinishedRun, collect, prediction_error
 
 
@@ -114,6 +118,98 @@ def test_an_ablation_is_labelled_by_its_name(study, tmp_path):
     assert collect(tmp_path)["label"].tolist() == ["free, one", "free, two"]
 
 
+@pytest.fixture(scope="module")
+def gated(tmp_path_factory):
+    """Train a run whose learned policy is in best.pt."""
+    folder = tmp_path_factory.mktemp("gated")
+    train.train(make_config(*SMALL, "gate=true", "logger=csv"), str(folder), quiet=True)
+    return folder
+
+
+OURS = r"expected the configuration that a run wrote\. Restore the file, or "
+CONFIGS = {
+    "a list": (b"[]\n", "it is a list"),
+    "empty": (b"", "it has no seed"),
+    "a number": (b"5\n", "Invalid loaded object type: int"),
+    "cut": (b"seed: 1\nsolver: daqp\n", "it has no warm_start"),
+    "bad YAML": (b"a: [1\nb: }", "while parsing a flow sequence"),
+    "bad UTF-8": (b"seed: \xff\n", "'utf-8' codec can't decode byte 0xff"),
+    "missing": (None, "No such file or directory"),
+}
+
+
+@pytest.mark.parametrize(("content", "wrong"), CONFIGS.values(), ids=CONFIGS)
+def test_a_damaged_configuration_is_named_by_report_and_export(gated, tmp_path, content, wrong):
+    folder = shutil.copytree(gated, tmp_path / "run")
+    (folder / "config.yaml").unlink()
+    if content is not None:
+        (folder / "config.yaml").write_bytes(content)
+    assert_refused(folder, rf"config\.yaml: got .*/config\.yaml \(.*{wrong}.*\), {OURS}")
+
+
+def assert_refused(folder, sentence):
+    for command in (report, export):
+        with pytest.raises(SystemExit, match=f"^{sentence}"):
+            command([str(folder)])
+
+
+@pytest.mark.parametrize(
+    ("value", "wrong"),
+    [
+        ("${weather}", "Interpolation key 'weather' not found"),
+        ("${weather:1}", "Unsupported interpolation type weather"),
+        ("${", "no viable alternative"),
+    ],
+)
+def test_an_unknown_interpolation_is_named(gated, tmp_path, value, wrong):
+    folder = shutil.copytree(gated, tmp_path / "run")
+    text = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(text.replace("seed: 1", f"seed: {value}", 1))
+    assert_refused(folder, rf"config\.yaml: got .*/config\.yaml \({wrong}.*, {OURS}")
+
+
+@pytest.mark.parametrize(
+    ("content", "wrong"),
+    [
+        (b"junk", "Expecting value"),
+        (b"", "Expecting value"),
+        (b"[]", "list indices must be integers"),
+        (b'{"a": "\xff"}', "'utf-8' codec can't decode byte 0xff"),
+        (b"{}", "it has no seed"),
+        (b'{"seed": "one"}', "seed is 'one'"),
+    ],
+)
+def test_a_damaged_summary_is_named(gated, tmp_path, content, wrong):
+    folder = shutil.copytree(gated, tmp_path / "run")
+    (folder / "summary.json").write_bytes(content)
+    sentence = rf"^summary\.json: got .*/summary\.json \({wrong}.*\), expected the outcome that a"
+    with pytest.raises(SystemExit, match=sentence):
+        report([str(folder)])
+    with pytest.raises(QPError, match=sentence):
+        finished_run(folder, load_config(folder / "config.yaml"))
+
+
+@pytest.mark.parametrize("part", ["structure", "mpc"])
+def test_a_learned_qp_without_its_parts_is_named(gated, tmp_path, part):
+    folder = shutil.copytree(gated, tmp_path / "run")
+    state = torch.load(folder / "best.pt")
+    torch.save({name: x for name, x in state.items() if name != part}, folder / "best.pt")
+    wrong = rf"best\.pt: got .*/best\.pt \(it has no {part}\), expected the QP that this run lea"
+    assert_refused(folder, wrong)
+    torch.save([1.0], folder / "best.pt")
+    assert_refused(folder, r"best\.pt: got .*/best\.pt \(list indices must be integers")
+    (folder / "best.pt").unlink()
+    assert_refused(folder, r"checkpoint: got .*/best\.pt, which does not exist")
+
+
+def test_metrics_that_are_cut_are_named_by_the_report(gated, tmp_path):
+    folder = shutil.copytree(gated, tmp_path / "run")
+    text = (folder / "metrics.csv").read_text()
+    (folder / "metrics.csv").write_text(text[: len(text) // 2])
+    with pytest.raises(SystemExit, match=r"^metrics\.csv: got .*/metrics\.csv \(its last line is"):
+        report([str(folder)])
+
+
 def test_a_scheme_released_in_training_is_read(tmp_path):
     cfg = make_config(*SMALL, "constraint=mpc", "release=2")
     summary = train.train(cfg, str(tmp_path), quiet=True)
@@ -138,6 +234,6 @@ def test_a_checkpoint_that_is_lost_is_named(study, tmp_path):
 def test_a_run_with_other_keys_is_named(study, tmp_path):
     shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
     config = tmp_path / "run" / "config.yaml"
-    config.write_text(config.read_text().replace("step: cholesky\n", "", 1))
-    with pytest.raises(QPError, match=r"run: got .*step: got nothing.* expected a run of this"):
+    config.write_text(config.read_text().replace("step: chol", "weather: fine\nstep: chol", 1))
+    with pytest.raises(QPError, match=r"run: got .*weather: got an unk.* expected a run of this"):
         collect(tmp_path)

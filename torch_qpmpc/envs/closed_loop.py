@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
+from torch_qpmpc.checks import check_kind, check_number, check_seed, check_tensor, check_whole
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.linear_system import LinearSystem
 from torch_qpmpc.envs.past_window import first_window, next_window
@@ -284,5 +284,5 @@ def _check(policy: object, steps: int, starts: int, seed: int, gamma: float) -> 
         raise QPError.expected("policy", type(policy).__name__, "a function", remedy)
     check_whole("steps", steps, 1)
     check_whole("starts", starts, 1)
-    check_whole("seed", seed, 0)
+    check_seed(seed)
     check_number("gamma", gamma, lambda x: 0 <= x <= 1, "a discount factor in [0, 1]")

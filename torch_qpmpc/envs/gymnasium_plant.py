@@ -5,6 +5,7 @@ Unlike a `LinearSystem` it is a black box: it can only be reset and stepped.
 
 from __future__ import annotations
 
+import importlib.util
 from functools import partial
 from typing import Any
 
@@ -17,7 +18,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
 
-from torch_qpmpc.checks import check_kind, check_tensor, check_whole
+from torch_qpmpc.checks import check_kind, check_seed, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 
 
@@ -75,13 +76,24 @@ class GymnasiumPlant:
         """Make a TorchRL environment of ``num_envs`` episodes of at most ``max_steps`` steps.
 
         ``seed`` seeds all of them.
+
+        Raises:
+            QPError: a broken ``gym`` is installed beside Gymnasium.
         """
         check_whole("num_envs", num_envs, 1)
         check_whole("max_steps", max_steps, 1)
+        check_seed(seed)
         # TorchRL resets by itself; Gymnasium's reset would lose an episode's last observation.
         makers = [partial(self.make, max_steps)] * num_envs
         envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
-        env = TransformedEnv(GymWrapper(envs), DoubleToFloat())
+        try:
+            env = TransformedEnv(GymWrapper(envs), DoubleToFloat())
+        except AttributeError as error:  # TorchRL looks at gym first, and this one is broken
+            if (gym := importlib.util.find_spec("gym")) is None:
+                raise
+            remedy = f"Remove it, as by pip uninstall gym: {gym.origin}."
+            got = f"a broken one beside Gymnasium ({error})"
+            raise QPError.expected("the module gym", got, "none", remedy) from error
         env.set_seed(seed)
         return env
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_number, check_tensor, check_whole
+from torch_qpmpc.checks import check_number, check_seed, check_tensor
 from torch_qpmpc.envs.linear_system import (
     LinearSystem,
     LinearSystemEnv,
@@ -133,9 +133,9 @@ class PointMass(LinearSystem):
             [-0.05, 0.05], and theta_1..theta_4 ``(4,)`` uniform in [0.5, 5]; drawn in this order.
 
         Raises:
-            QPError: if ``seed`` is not a whole number >= 0.
+            QPError: if ``seed`` is not a whole number >= 0 and < 2^63.
         """
-        check_whole("seed", seed, 0)
+        check_seed(seed)
         rng = np.random.default_rng(seed)
         dA, dB = (rng.uniform(-0.05, 0.05, size=tuple(M.shape)) for M in (self.A, self.B))
         theta = rng.uniform(0.5, 5, size=4)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torch_qpmpc.checks import check_whole
+from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.errors import QPError
 
 
@@ -37,7 +37,7 @@ class VectorisedEnv(EnvBase):
         check_whole("num_envs", num_envs, 1)
         check_whole("max_steps", max_steps, 1)
         if seed is not None:
-            check_whole("seed", seed, 0)
+            check_seed(seed)
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
             raise QPError.expected("dtype", dtype, "a floating-point torch.dtype")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
@@ -83,6 +83,7 @@ class VectorisedEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
+            check_seed(seed)
             self.rng.manual_seed(seed)
 
     def _zero_count(self) -> Tensor:

@@ -8,16 +8,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from omegaconf import DictConfig
 from torch import Tensor
+from tqdm import tqdm
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_gap
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_true_mpc
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.module import QPMPC
+
+#: Functions that make a policy and its plant, by name.
+Policies = dict[str, Callable[[], tuple[Any, AnyPlant]]]
 
 
 @dataclass(frozen=True)
@@ -37,13 +42,22 @@ class Evaluation:
     rivals: dict[str, float]
 
     @classmethod
-    def before(cls, cfg: DictConfig, physics: AnyPlant, mpc: QPMPC) -> Evaluation:
-        """Evaluate before learning, when ``mpc`` is the start and what has been learned."""
-        start = evaluate(cfg, warm_policy(mpc), physics)
-        loops = {"start": start, "learned": start}
+    def before(
+        cls, cfg: DictConfig, physics: AnyPlant, mpc: QPMPC, quiet: bool = True
+    ) -> Evaluation:
+        """Evaluate before learning, when ``mpc`` is the start and what has been learned.
+
+        Unless ``quiet``, a bar shows which closed loop runs.
+        """
+        policies: Policies = {"start": lambda: (warm_policy(mpc), physics)}
         if (true_mpc := make_true_mpc(cfg, physics)) is not None:
-            loops["true model"] = evaluate(cfg, warm_policy(true_mpc), physics)
-        return cls(cfg, physics, loops, rival_costs(cfg, physics))
+            policies["true model"] = lambda: (warm_policy(true_mpc), physics)
+        rivals = _rivals(cfg, physics)
+        loops = _run(cfg, policies | rivals, quiet)
+        costs = {name: loops.pop(name).J for name in rivals}
+        return cls(
+            cfg, physics, {"start": loops["start"], "learned": loops["start"], **loops}, costs
+        )
 
     def evaluate(self, policy: Callable[[Tensor], Tensor], name: str = "learned") -> None:
         """Evaluate what has been learned so far."""
@@ -74,7 +88,20 @@ class Evaluation:
 
 def rival_costs(cfg: DictConfig, physics: AnyPlant) -> dict[str, float]:
     """Return J of each rival of the task that ``cfg.rivals`` chooses."""
+    return {name: loop.J for name, loop in _run(cfg, _rivals(cfg, physics), quiet=True).items()}
+
+
+def _rivals(cfg: DictConfig, physics: AnyPlant) -> Policies:
     rivals, chosen = find_task(cfg.task).rivals, cfg.rivals
     if isinstance(chosen, bool):
         chosen = [name for name, rival in rivals.items() if chosen and not rival.slow]
-    return {name: evaluate(cfg, *rivals[name].of(physics)).J for name in chosen}
+    return {name: partial(rivals[name].of, physics) for name in chosen}
+
+
+def _run(cfg: DictConfig, policies: Policies, quiet: bool) -> dict[str, ClosedLoop]:
+    loops = {}
+    with tqdm(policies.items(), "first evaluation", leave=False, disable=quiet) as bar:
+        for name, make in bar:
+            bar.set_postfix_str(name)
+            loops[name] = evaluate(cfg, *make())
+    return loops

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
+from tqdm import tqdm
 
 from torch_qpmpc.experiment.algorithms import Learner, evaluate
 from torch_qpmpc.experiment.checkpoint import write_whole
@@ -32,14 +33,17 @@ class RunGate:
         cfg: the run's configuration; ``gate`` switches the comparisons on.
         learner: the learner, whose policy is the candidate.
         physics: the plant.
+        quiet: show no bar during the search.
 
     Attributes:
         actor: the policy that acts.
         simulated: the number of transitions in closed loops of comparisons and searches.
     """
 
-    def __init__(self, cfg: DictConfig, learner: Learner, physics: AnyPlant) -> None:
-        self._cfg, self._learner, self._physics = cfg, learner, physics
+    def __init__(
+        self, cfg: DictConfig, learner: Learner, physics: AnyPlant, quiet: bool = True
+    ) -> None:
+        self._cfg, self._learner, self._physics, self._quiet = cfg, learner, physics, quiet
         options = {"seed": cfg.seed, "pairs": PAIRS, "decisions": _decisions(cfg)}
         self._gate = Gate(learner.actor, self._costs, **options) if cfg.gate else None
         self.actor: Any = learner.actor if self._gate is None else self._gate.actor
@@ -86,7 +90,13 @@ class RunGate:
             return {}
         actor.load_state_dict(self.actor.state_dict())
         loops, seed = self._cfg.search.loops, self._cfg.seed
-        found = search(mpc, lambda _, seed: self._costs(actor, seed), sizes, loops=loops, seed=seed)
+        with tqdm(desc="search", total=loops, leave=False, disable=self._quiet) as bar:
+
+            def costs(_: QPMPC, seed: int) -> Tensor:
+                bar.update()
+                return self._costs(actor, seed)
+
+            found = search(mpc, costs, sizes, loops=loops, seed=seed)
         return {f"search/{name}": x for name, x in found.items()} | self._judge("search")
 
     def _costs(self, actor: Any, seed: int) -> Tensor:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -16,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.announcement import announcement, compilation_named
 from torch_qpmpc.experiment.config import check_config
+from torch_qpmpc.experiment.config.messages import keys, unknown_key
 from torch_qpmpc.experiment.lock import ELSEWHERE, ELSEWHERE_IN_SWEEP, locked
 from torch_qpmpc.experiment.run_folder import unwritable
 from torch_qpmpc.experiment.run_state import check_fresh, check_own_folder, folder_of, resumed
@@ -73,6 +76,26 @@ class Launch:
         return cfg, state, None
 
 
+def check_overrides(arguments: Sequence[str], configs: str | Path) -> None:
+    """Exit with the nearest key if an override has an unknown one, for which Hydra advises a +.
+
+    Args:
+        arguments: the command line.
+        configs: the folder of the configuration groups.
+    """
+    known = keys()
+    groups = {path.name for path in Path(configs).iterdir() if path.is_dir()}
+    for argument in arguments:
+        key = argument.partition("=")[0]
+        is_plain = "=" in argument and re.fullmatch(r"\w+(\.\w+)*", key)
+        if not is_plain or key in groups or key.startswith("hydra."):
+            continue
+        if not any(
+            f"{name}.".startswith(f"{key}.") or key.startswith(f"{name}.") for name in known
+        ):
+            raise SystemExit(str(unknown_key(key, known)))
+
+
 @contextmanager
 def launched() -> Iterator[Launch]:
     """Lock the run's folder, and exit with one sentence on a user's error.
@@ -92,7 +115,7 @@ def launched() -> Iterator[Launch]:
             raise
         raise SystemExit(str(error)) from None
     except OSError as error:
-        if sweep or isinstance(error, ConnectionError):  # a lost worker is not a file error
+        if sweep:
             raise
         raise SystemExit(str(unwritable(launch.folder, error))) from None
 

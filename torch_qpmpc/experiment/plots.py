@@ -15,7 +15,6 @@ from torch import Tensor
 from torch_qpmpc.analysis.episode import episode_figure, plans_along
 from torch_qpmpc.analysis.plots import COLOURS, draw_matrix
 from torch_qpmpc.envs.closed_loop import ClosedLoop, cost_text
-from torch_qpmpc.experiment.collection import num_columns
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.mpc.module import QPMPC
@@ -143,7 +142,7 @@ def experience(cfg: DictConfig) -> tuple[float, float, str]:
     It is all that the plant has been run for: the log, the warm-up and the updates.
     """
     length, unit = find_task(cfg.task).unit
-    each = num_columns(cfg) * cfg.steps_per_update
+    each = cfg.num_envs * cfg.steps_per_update
     first = each * -(-cfg.warmup_steps // cfg.steps_per_update)
     if cfg.start.name == "data" and cfg.start.file is None:
         first += cfg.start.transitions

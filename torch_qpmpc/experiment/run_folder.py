@@ -16,9 +16,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, write_whole
-from torch_qpmpc.experiment.config import settings
+from torch_qpmpc.experiment.config import damaged, settings
 from torch_qpmpc.experiment.links import check_links
 from torch_qpmpc.experiment.loggers import RunLogger
+
+#: Entries of summary.json that are numbers or, if they are not finite, null.
+NUMBERS = ("seed", "closed_gap", "J_start", "J_final", "J_true_model")
 
 
 class RunFolder:
@@ -118,6 +121,23 @@ def read_metrics(folder: str | Path) -> pd.DataFrame:
         return table.astype({"update": int}).set_index("update")
     except (OSError, ValueError, KeyError) as error:
         raise _damaged(file, str(error).strip().partition("\n")[0]) from error
+
+
+def read_summary(folder: str | Path) -> dict[str, Any]:
+    """Read a finished run's summary.json.
+
+    Raises:
+        QPError: the file is missing or damaged.
+    """
+    file = Path(folder) / "summary.json"
+    try:
+        summary = json.loads(file.read_text(encoding="utf-8"))
+        for name in NUMBERS:
+            if not isinstance(summary[name], int | float | None):
+                raise ValueError(f"{name} is {summary[name]!r}")
+        return summary
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise damaged(file, error, "the outcome that a run wrote") from error
 
 
 def _read_until(folder: Path, cfg: DictConfig, update: int) -> pd.DataFrame:

@@ -1,7 +1,7 @@
 """The state of a run, as tensors and plain numbers, from which it resumes.
 
-With one collector in this process over a `LinearSystem` or a `Plant` the resumed run is exact, down
-to every random number. Other environments cannot be saved and start new episodes.
+Over a `LinearSystem` or a `Plant` the resumed run is exact, down to every random number. Other
+environments cannot be saved and start new episodes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
-from torchrl.collectors import BaseCollector, Collector
+from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
 from torch_qpmpc.envs.vectorised import VectorisedEnv
@@ -44,7 +44,7 @@ def snapshot(
     mpc: QPMPC,
     learner: Learner,
     gate: RunGate,
-    collector: BaseCollector,
+    collector: Collector,
     replay: Replay,
     tally: Tally,
 ) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def restore(
     mpc: QPMPC,
     learner: Learner,
     gate: RunGate,
-    collector: BaseCollector,
+    collector: Collector,
     replay: Replay,
 ) -> Tally:
     """Load a `snapshot` into the parts of a new run with the same configuration.
@@ -234,8 +234,8 @@ def _part(name: str) -> Iterator[None]:
         raise QPError.expected("checkpoint", got, "the state of this run", remedy) from error
 
 
-def _collector_state(collector: BaseCollector) -> dict[str, Any] | None:
-    if not isinstance(collector, Collector) or (env := _saved_env(collector)) is None:
+def _collector_state(collector: Collector) -> dict[str, Any] | None:
+    if (env := _saved_env(collector)) is None:
         return None
     # TorchRL's collector state lacks the current steps and the ids of the episodes.
     return {
@@ -252,10 +252,9 @@ def _saved_env(collector: Collector) -> VectorisedEnv | None:
     return env if isinstance(env, VectorisedEnv) else None
 
 
-def _restore_collector(collector: BaseCollector, state: dict[str, Any] | None) -> None:
+def _restore_collector(collector: Collector, state: dict[str, Any] | None) -> None:
     if state is None:
         return
-    assert isinstance(collector, Collector)
     env = _saved_env(collector)
     assert env is not None
     episodes = TensorDict(state["episodes"], batch_size=collector._carrier.batch_size)

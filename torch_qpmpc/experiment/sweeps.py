@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import re
@@ -25,6 +24,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
 from torch_qpmpc.experiment.config import differences, load_config, settings
 from torch_qpmpc.experiment.lock import ELSEWHERE_IN_SWEEP
+from torch_qpmpc.experiment.run_folder import read_summary
 from torch_qpmpc.experiment.run_state import check_state
 
 #: Seconds between two updates of the progress line.
@@ -49,7 +49,7 @@ def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
         then, now = changed
         remedy = f"Remove it, or choose another folder with {ELSEWHERE_IN_SWEEP}."
         raise QPError.expected(f"{folder}", f"a finished run with {then}", now, remedy)
-    return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    return read_summary(folder)
 
 
 def stopped_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torch_qpmpc.checks import check_number, check_tensor, check_whole
+from torch_qpmpc.checks import check_number, check_seed, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 
 #: Fewest pairs of a decision.
@@ -236,7 +236,7 @@ class Gate:
     ) -> None:
         check_whole("pairs", pairs, FEWEST)
         check_whole("patience", patience, 1)
-        check_whole("seed", seed, 0)
+        check_seed(seed)
         check_whole("decisions", decisions, 1)
         PairedTest(alpha, bound)
         self.actor, self._costs = copy.deepcopy(actor), costs

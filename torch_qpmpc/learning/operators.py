@@ -67,21 +67,21 @@ class _QPOperator(TensorDictModuleBase):
         Raises:
             QPError: if an entry is missing.
         """
-        observation = _read(tensordict, self.in_keys[0])
+        observation = entry(tensordict, self.in_keys[0])
         if self.preview_key is None:
             return observation
-        return torch.cat((_read(tensordict, self.preview_key).to(observation), observation), -1)
+        return torch.cat((entry(tensordict, self.preview_key).to(observation), observation), -1)
 
     def _program(self, tensordict: TensorDictBase) -> QuadraticProgram | None:
         """Return the QPs with the residuals in ``tensordict``; None without ``theta_keys``."""
         if not self.theta_keys:
             return None
-        residuals = {name: _read(tensordict, key) for name, key in self.theta_keys.items()}
+        residuals = {name: entry(tensordict, key) for name, key in self.theta_keys.items()}
         return self.module.quadratic_program(residuals)
 
     def _set_value(self, tensordict: TensorDictBase, *action_key: NestedKey) -> TensorDictBase:
         """Write -V, or -Q with the key of an action, to the first out-key."""
-        inputs = [self.known(tensordict), *(_read(tensordict, key) for key in action_key)]
+        inputs = [self.known(tensordict), *(entry(tensordict, key) for key in action_key)]
         qp = self._program(tensordict)
         if self.active_set_key is None:
             cost = self.module(*inputs, qp=qp)
@@ -103,12 +103,12 @@ def _checked_keys(mpc: QPMPC, theta_keys: Any) -> dict[str, NestedKey]:
     return dict(theta_keys)
 
 
-def _read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     """Return the entry ``key``; raise `QPError` if it is missing, where V would pass for Q."""
     value = tensordict.get(key, None)
     if value is None:
         present = ", ".join(map(str, tensordict.keys(True, True))) or "no entry"
-        remedy = "Rename the operator's keys, such as action_key, or the TensorDict's."
+        remedy = "Rename the module's keys, such as action_key, or the TensorDict's."
         raise QPError.expected(str(key), f"a TensorDict with {present}", f"one with {key}", remedy)
     return value
 

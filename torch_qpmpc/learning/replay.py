@@ -23,7 +23,7 @@ from torchrl.data import (
     SliceSampler,
 )
 
-from torch_qpmpc.checks import check_kind, check_whole
+from torch_qpmpc.checks import check_kind, check_seed, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.program import UNKNOWN
 
@@ -245,7 +245,7 @@ def make_replay(
     for name, size in (sizes | {"num_windows": num_windows}).items():
         check_whole(name, size, 1)
     check_whole("capacity", capacity, 0)
-    check_whole("seed", seed, 0)
+    check_seed(seed)
     if active_rows is not None:
         check_whole("active_rows", active_rows, 0)
     if capacity % num_envs or capacity // num_envs < window:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import parametrize
 
-from torch_qpmpc.checks import check_kind, check_number, check_whole
+from torch_qpmpc.checks import check_kind, check_number, check_seed, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -130,7 +130,7 @@ def search(
 
     check_kind("mpc", mpc, QPMPC)
     check_whole("loops", loops, 1)
-    check_whole("seed", seed, 0)
+    check_seed(seed)
     known = available(mpc)
     if not knobs or (unknown := set(knobs) - {*known}):
         got = sorted(unknown) if knobs else "none"

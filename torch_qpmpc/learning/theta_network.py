@@ -14,7 +14,7 @@ from torchrl.modules import MLP
 
 from torch_qpmpc.checks import check_kind, check_number, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.learning.operators import known_keys
+from torch_qpmpc.learning.operators import entry, known_keys
 from torch_qpmpc.mpc.coordinates import check_names
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -80,6 +80,8 @@ class ThetaNetwork(TensorDictModuleBase):
         self.shapes = {name: known[name].shape for name in sizes}
         self.theta_keys: dict[str, NestedKey] = {name: ("theta", name) for name in sizes}
         keys = known_keys(mpc) if in_keys is None else in_keys
+        if not isinstance(keys, Sequence) or isinstance(keys, str) or not keys:
+            raise QPError.expected("in_keys", repr(keys), "a list of keys, such as ['observation']")
         self.in_keys = list(keys)  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = list(self.theta_keys.values())  # pyright: ignore[reportAttributeAccessIssue]
         n_out, device = sum(shape.numel() for shape in self.shapes.values()), mpc.C_0.device
@@ -92,9 +94,18 @@ class ThetaNetwork(TensorDictModuleBase):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the residuals to ``theta_keys`` of ``tensordict``, and return it."""
+        """Write the residuals to ``theta_keys`` of ``tensordict``, and return it.
+
+        Raises:
+            QPError: an input is missing, or their entries are not ``n_in``.
+        """
         last: Any = self.net[-1]
-        inputs = torch.cat([tensordict.get(key).to(last.bias.dtype) for key in self.in_keys], -1)
+        parts = [entry(tensordict, key) for key in self.in_keys]
+        inputs = torch.cat([part.to(last.bias.dtype) for part in parts], -1)
+        if inputs.shape[-1] != self.net.in_features:
+            got = f"{inputs.shape[-1]} entries of {', '.join(map(str, self.in_keys))}"
+            remedy = f"Pass n_in={inputs.shape[-1]}, or other in_keys."
+            raise QPError.expected("in_keys", got, f"n_in = {self.net.in_features}", remedy)
         counts = [shape.numel() for shape in self.shapes.values()]
         flat = self.net(inputs).tanh().split(counts, -1)
         for (name, shape), entries in zip(self.shapes.items(), flat, strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from numbers import Real
 from typing import Any
 
 import scipy
@@ -58,6 +59,9 @@ def theta(
     **_: Any,
 ) -> tuple[Layout, dict[str, Tensor]]:
     """Return the layout and theta by part, from the arguments of `QPMPC`; w is inf on hard rows."""
+    if rate_bounds is None and not (isinstance(rate_slack, Real) and rate_slack == torch.inf):
+        remedy = "It is the price of violating them: pass rate_bounds, too."
+        raise QPError.expected("rate_slack", repr(rate_slack), "inf without rate_bounds", remedy)
     D = _linear_rows("constraints", constraints, n_d + n_x + n_u)
     D_f = _linear_rows("terminal_constraints", terminal_constraints, n_d + n_x)
     rates = _rates(rate_bounds, n_u, past)

@@ -15,6 +15,7 @@ from torch_qpmpc.checks import (
     check_choice,
     check_flag,
     check_number,
+    check_seed,
     check_tensor,
     check_whole,
 )
@@ -59,7 +60,7 @@ def check_structure(
     check_choice("on_failure", on_failure, ON_FAILURE)
     check_step(step)
     check_flag("discount_slack", discount_slack)
-    check_whole("seed", seed, 0)
+    check_seed(seed)
     parts = (*COST, *CONSTRAINTS)
     if (
         not isinstance(learn, Collection)
@@ -130,6 +131,11 @@ def as_tensor(name: str, value: Any) -> Tensor:
 
 
 def _read(name: str, value: Any) -> Tensor:
+    of_scipy = hasattr(value, "toarray")
+    if of_scipy or (isinstance(value, Tensor) and value.layout != torch.strided):
+        remedy = f"Convert it: {name}.{'toarray' if of_scipy else 'to_dense'}()."
+        kind = type(value).__name__ if of_scipy else f"a {value.layout} tensor"
+        raise QPError.expected(name, f"{kind}, which is sparse", "a dense matrix", remedy)
     try:
         of_tensor = isinstance(value, Tensor) and (value.is_complex() or value.is_meta)
         if of_tensor or (isinstance(value, np.ndarray) and np.iscomplexobj(value)):

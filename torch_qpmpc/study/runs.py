@@ -7,7 +7,6 @@ All readings of a learned C are independent of its gauge.
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +23,7 @@ from torch_qpmpc.analysis.structure import Model, nearest_model
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import check_config, load_config, settings
-from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.experiment.run_folder import read_metrics, read_summary
 from torch_qpmpc.experiment.stored_qp import learned_qp, start_qp
 from torch_qpmpc.experiment.tasks import AnyPlant, has_run, make_physics, make_true_mpc
 from torch_qpmpc.mpc.banded import band_distance
@@ -164,7 +163,7 @@ def collect(folder: str | Path) -> pd.DataFrame:
     rows = []
     for file in files:
         run = FinishedRun(file.parent)
-        summary = json.loads(file.read_text(encoding="utf-8"))
+        summary = read_summary(file.parent)
         where = "." if file.parent == folder else str(file.parent.parent.relative_to(folder))
         sweep = folder.resolve().name if where == "." else where
         names = {name: run.cfg[name].name for name in ("constraint", "noise")}

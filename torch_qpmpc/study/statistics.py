@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import bootstrap
 
-from torch_qpmpc.checks import check_number, check_whole
+from torch_qpmpc.checks import check_number, check_seed, check_whole
 from torch_qpmpc.errors import QPError
 
 #: Fewest values of an interval: of three normal ones, a median's of 95 % covers in 75 % of cases.
@@ -109,7 +109,7 @@ def bootstrap_interval(
         raise QPError.expected("statistic", repr(statistic), "a function, such as numpy.median")
     check_number("level", level, lambda x: 0 < x < 1, "a level in (0, 1)", "95% is 0.95.")
     check_whole("resamples", resamples, 1)
-    check_whole("seed", seed, 0)
+    check_seed(seed)
     if not strata or not all(len(stratum) for stratum in strata):
         sizes = [len(stratum) for stratum in strata]
         raise QPError.expected("strata", f"sizes {sizes}", "at least one run in each")

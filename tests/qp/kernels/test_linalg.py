@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numba
 import numpy as np
 import pytest
@@ -24,6 +28,20 @@ def test_without_a_writable_cache_kernels_are_compiled_each_time(monkeypatch):
         return 2 * x
 
     assert twice(3.0) == 6.0
+
+
+def test_without_the_compiler_the_import_ends_in_a_sentence():
+    ended = subprocess.run(
+        [sys.executable, "-c", "import torch_qpmpc"],
+        env=os.environ | {"NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.stderr.splitlines()[-1] == (
+        "torch_qpmpc.errors.QPError: NUMBA_DISABLE_JIT: got 1, expected 0. Unset it before the "
+        "import: the kernels do not run in plain Python."
+    )
 
 
 @pytest.mark.parametrize("n", range(10))

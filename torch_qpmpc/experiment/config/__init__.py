@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
-from yaml import YAMLError
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config.messages import first_error, flatten
 from torch_qpmpc.experiment.config.model import Config
 
-__all__ = ["check_config", "differences", "flatten", "load_config", "settings"]
+__all__ = ["check_config", "damaged", "differences", "flatten", "load_config", "settings"]
 
 
 def check_config(cfg: DictConfig) -> None:
@@ -33,27 +31,36 @@ def load_config(file: Path) -> DictConfig:
     """Load a run's saved configuration as plain values.
 
     Raises:
-        QPError: it cannot be read, or has interpolations such as ``${oc.env:HOME}``, which would
-            read this computer's environment.
+        QPError: the file is missing or damaged, or has interpolations such as ``${oc.env:HOME}``,
+            which would read this computer's environment.
     """
     try:
         cfg = OmegaConf.load(file)
         tree = OmegaConf.to_container(cfg, resolve=False)
         if not isinstance(cfg, DictConfig) or not isinstance(tree, dict):
-            raise ValueError("not a mapping")
-        if not isinstance(tree.get("task"), dict):
+            raise ValueError("it is a list")
+        for key, info in Config.model_fields.items():
+            if info.is_required() and key not in tree:
+                raise KeyError(key)
+        if not isinstance(tree["task"], dict):
             raise ValueError("its task is not a mapping")
-    except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
-        reason = " ".join(str(error).split())
-        remedy = "Restore the file, or start a new run."
-        expected = "the configuration that train.py wrote"
-        raise QPError.expected("config.yaml", f"{file} ({reason})", expected, remedy) from error
+    except Exception as error:  # damaged files raise errors of any type
+        raise damaged(file, error, "the configuration that a run wrote") from error
     for key, value in flatten(tree).items():
         if isinstance(value, list | str) and "${" in str(value):
             remedy = "Interpolations of a saved configuration are not resolved: write the value."
             got = f"{key}={value!r} in {file}"
             raise QPError.expected("config.yaml", got, "values, as train.py writes them", remedy)
     return cfg
+
+
+def damaged(file: Path, error: Exception, expected: str) -> QPError:
+    """Make the error of a run's ``file`` that cannot be read."""
+    reason = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, KeyError):
+        reason = f"it has no {error.args[0]}"
+    remedy = "Restore the file, or move the run's folder elsewhere."
+    return QPError.expected(file.name, f"{file} ({reason})", expected, remedy)
 
 
 def settings(cfg: DictConfig) -> dict[str, Any]:

@@ -165,22 +165,6 @@ class Search(Group):
     q_f: Size
 
 
-class SingleProcess(Group):
-    name: Literal["single"]
-
-
-class Workers(Group):
-    name: Literal["multi"]
-    workers: Count
-    sync: Flag
-
-
-class RayWorkers(Workers):
-    name: Literal["ray"]
-    num_cpus: Positive
-
-
 Optimizer = Annotated[Adam | SGD | GaussNewton, Field(discriminator="name")]
 Algorithm = Annotated[QLearning | DDPG | TD3 | SAC, Field(discriminator="name")]
 Start = Annotated[FromModel | FromData, Field(discriminator="name")]
-Collector = Annotated[SingleProcess | Workers | RayWorkers, Field(discriminator="name")]

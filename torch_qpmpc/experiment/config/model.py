@@ -11,7 +11,6 @@ from pydantic import AfterValidator, Field, PlainValidator, model_validator
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config.groups import (
     Algorithm,
-    Collector,
     Constraint,
     Noise,
     Optimizer,
@@ -35,6 +34,7 @@ from torch_qpmpc.experiment.tasks import TASKS, TaskSettings, find_task
 from torch_qpmpc.mpc.projections import STEPS, check_step
 from torch_qpmpc.qp.solvers import backend
 
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")
 
 
@@ -57,8 +57,8 @@ def _settings_of_the_task(value: Any) -> TaskSettings:
 class Config(Group):
     """All keys of configs/ but Hydra's."""
 
-    seed: Annotated[int, Field(ge=0, lt=2**63), Expected("a whole number >= 0 and < 2^63")]
-    eval_seed: Annotated[Whole | None, Expected("a whole number >= 0, or null")]
+    seed: Annotated[Seed, Expected("a whole number >= 0 and < 2^63")]
+    eval_seed: Annotated[Seed | None, Expected("a whole number >= 0 and < 2^63, or null")]
     solver: Annotated[Name, AfterValidator(_known_solver)]
     warm_start: Flag
     threads: Count
@@ -89,7 +89,6 @@ class Config(Group):
     eval_interval: Count
     log_interval: Count
     algo: Algorithm
-    collector: Collector
     start: Start
     task: Annotated[TaskSettings, PlainValidator(_settings_of_the_task)]
     noise: Noise
@@ -128,13 +127,6 @@ class Config(Group):
             self.conflict("warmup_steps", long_enough, remedy)
         if not self.replay:
             self.conflict("replay", "true", "constraint.si samples its windows from the replay.")
-        if (
-            self.collector.name != "single"
-            and not self.collector.sync
-            and self.steps_per_update < self.task.horizon
-        ):
-            remedy = "constraint.si needs whole windows in each worker's batch."
-            self.conflict("steps_per_update", long_enough, remedy)
         return self
 
     @model_validator(mode="after")
@@ -230,17 +222,11 @@ class Config(Group):
             self.conflict("release", "null", "Nothing is tied: choose constraint=mpc.")
         if self.algo.name != "qlearning":
             self.conflict("release", "null", f"{self.algo.name} does not support release.")
-        if self.collector.name != "single":
-            remedy = f"Workers of collector={self.collector.name} would keep the tied parameters."
-            self.conflict("release", "null", remedy)
         return self
 
     @model_validator(mode="after")
     def environments_divide_evenly(self) -> Self:
-        """Check that num_envs divides evenly among workers and divides the replay's capacity."""
-        if self.collector.name != "single" and self.num_envs % self.collector.workers:
-            workers = self.collector.workers
-            self.conflict("num_envs", f"a multiple of collector.workers = {workers}")
+        """Check that num_envs divides the replay's capacity."""
         if self.replay_capacity % self.num_envs:
             self.conflict("replay_capacity", f"a multiple of num_envs = {self.num_envs}")
         return self

@@ -9,10 +9,17 @@ from typing import Any
 import numba
 import numpy as np
 from llvmlite import ir
+from numba.core import config
 from numba.extending import intrinsic
+
+from torch_qpmpc.errors import QPError
 
 #: Largest matrix size times number of vectors in one call of BLAS, which then uses one thread.
 ONE_THREAD = 2**18
+
+if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue] -- set from the environment
+    remedy = "Unset it before the import: the kernels do not run in plain Python."
+    raise QPError.expected("NUMBA_DISABLE_JIT", "1", "0", remedy)
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
