@@ -29,11 +29,9 @@ from torch_qpmpc.qp.pipeline.arrays import (
     unsolved,
 )
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.certificate import certify, recover
 from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
-from torch_qpmpc.qp.pipeline.warm_start import try_active_sets
 from torch_qpmpc.qp.program import NDIMS, Status
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
 from torch_qpmpc.qp.solvers.base import SoftQPs
@@ -205,7 +203,7 @@ def solve_programs(p: Programs, solver: str, start: Array | None = None) -> Batc
     Args:
         p: the QPs.
         solver: a backend's name, see `torch_qpmpc.qp.solvers`.
-        start: active sets ``(B, n_g)`` of nearly equal QPs, see `warm_start`.
+        start: active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.try_active_sets`.
     """
     began = time.perf_counter()
     log = _active_log.get(unused := SolveLog())
@@ -257,7 +255,7 @@ def _certify_at(p: Programs, solution: BatchSolution, at: np.ndarray) -> np.ndar
     if not len(at):
         return np.zeros(0, bool)
     solved = solution.at(at)
-    _, residual, error = certify(p.take(at), solved.z, solved.lam, solved.chi, solved.xi)
+    _, residual, error = p.take(at).certify(solved.z, solved.lam, solved.chi, solved.xi)
     solution.residual[at] = np.maximum(solved.residual, residual)
     solution.value_error[at] = np.maximum(solved.value_error, error)
     return (residual > TOLERANCE) | (error > TOLERANCE)
@@ -311,14 +309,14 @@ def _attempt(
     elif start is None:
         claim = solve(qps).like(p.fixed)
     else:
-        claim, settled = try_active_sets(p, qps, start)
+        claim, settled = p.try_active_sets(qps, start)
         _replace(claim, ~settled, qps, solve)
-    solution = recover(p, claim, passes)
+    solution = p.recover(claim, passes)
     if settled is not None:
         kept = settled & solution.accepted()
         log.recalled += int(kept.sum())
         if _replace(claim, settled & ~kept, qps, solve):
-            solution = recover(p, claim, passes)
+            solution = p.recover(claim, passes)
     if not solution.all_accepted:
         solution = solution.on_cpu()
         rejected = ~solution.accepted() & (solution.residual <= nearly)
