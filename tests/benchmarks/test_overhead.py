@@ -12,6 +12,7 @@ import torch
 
 from tests.benchmarks.contenders import cold, warm
 from tests.benchmarks.problems import PAPER, make_mpc, nudge, transitions
+from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers import BACKENDS
 
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")

@@ -18,10 +18,17 @@ from torch import Tensor
 
 from torch_qpmpc.qp.batching import broadcast
 from torch_qpmpc.qp.kernels import sample, sample_torch
-from torch_qpmpc.qp.pipeline.arrays import Array, BatchSolution, Theta, on_device, to_numpy
+from torch_qpmpc.qp.pipeline.arrays import (
+    Array,
+    BackendSolution,
+    BatchSolution,
+    SoftQPs,
+    Theta,
+    on_device,
+    to_numpy,
+)
 from torch_qpmpc.qp.pipeline.prepared import Prepared, prepared_for
 from torch_qpmpc.qp.program import NDIMS
-from torch_qpmpc.qp.solvers.base import BackendSolution, SoftQPs
 
 #: The positions of H, C and G.
 MATRICES = (0, 3, 5)

@@ -22,6 +22,7 @@ from torch_qpmpc.qp.pipeline.arrays import (
     TOLERANCE,
     Array,
     BatchSolution,
+    SoftQPs,
     on_device,
     per_qp,
     to_numpy,
@@ -34,7 +35,6 @@ from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import NDIMS, Status
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
-from torch_qpmpc.qp.solvers.base import SoftQPs
 
 ON_FAILURE = ("raise", "warn", "mask")
 #: The tensors of a `QPSolution`: value, z, chi, lam, xi, status, residual, value_error, iterations,
