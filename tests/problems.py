@@ -10,11 +10,10 @@ from torch import Tensor
 
 from torch_qpmpc import QPMPC, QuadraticProgram
 from torch_qpmpc.qp.kernels import sample_torch
-from torch_qpmpc.qp.pipeline.arrays import to_tensor
+from torch_qpmpc.qp.pipeline.arrays import SoftQPs, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import Reduced
 from torch_qpmpc.qp.solvers import BackendSolution
-from torch_qpmpc.qp.solvers.base import SoftQPs
 
 #: Positions of a row at the solution: inside its bounds, at one, or (if soft) beyond one.
 SOFT_ROWS = ("inside", "at_lower", "at_upper", "below", "above", "equality", "no_upper", "free")

@@ -12,7 +12,7 @@ import torch
 
 from tests.benchmarks.contenders import cold, warm
 from tests.benchmarks.problems import PAPER, make_mpc, nudge, transitions
-from torch_qpmpc.qp.pipeline import solve as chain
+from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers import BACKENDS
 
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
@@ -53,7 +53,7 @@ def test_share_outside_the_solver(
 
         return timed_solve
 
-    monkeypatch.setattr(chain, "try_active_sets", timed(chain.try_active_sets))
+    monkeypatch.setattr(Programs, "try_active_sets", timed(Programs.try_active_sets))
     monkeypatch.setitem(BACKENDS, solver, timed(BACKENDS[solver]))
     gradient = STARTS[start](
         make_mpc(PAPER, dense=True, solver=solver),

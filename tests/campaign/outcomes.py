@@ -17,7 +17,7 @@ from tests.campaign.draws import ACCURACY
 from tests.campaign.families import Case
 from tests.problems import times
 from torch_qpmpc import QPSolution, Status
-from torch_qpmpc.qp.operator import EVENT_NDIMS
+from torch_qpmpc.qp.autograd import EVENT_NDIMS
 from torch_qpmpc.qp.solution import slacks
 
 #: Tolerance of a value, relative to the largest of its own terms.

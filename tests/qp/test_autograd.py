@@ -15,8 +15,8 @@ from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states, solution_of
 from torch_qpmpc import QPMPC, QPError, QPSolution, QuadraticProgram, SolverError, Status, solve_qp
+from torch_qpmpc.qp.autograd import solve_op
 from torch_qpmpc.qp.kkt import kkt_op
-from torch_qpmpc.qp.operator import solve_op
 from torch_qpmpc.qp.program import EVENT_SHAPES
 from torch_qpmpc.qp.solve import solve
 
@@ -576,7 +576,7 @@ def test_a_batch_that_is_too_large_for_memory_is_named(error, differentiated, mo
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("torch_qpmpc.qp.autograd.solve_programs", fail)
+    monkeypatch.setattr("torch_qpmpc.qp.pipeline.solve.solve_programs", fail)
     known = known_qp(1, batch=(4, 3))
     fixed = known.fixed.clone().requires_grad_(differentiated)
     message = (
@@ -592,7 +592,7 @@ def test_another_runtime_error_stays_as_it_is(monkeypatch):
     def fail(*_: object) -> None:
         raise RuntimeError("of another kind")
 
-    monkeypatch.setattr("torch_qpmpc.qp.autograd.solve_programs", fail)
+    monkeypatch.setattr("torch_qpmpc.qp.pipeline.solve.solve_programs", fail)
     known = known_qp(1, batch=(3,))
     with pytest.raises(RuntimeError, match="of another kind"):
         solve_qp(known.qp, known.fixed)

@@ -22,8 +22,8 @@ from torch_qpmpc.checks import (
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.projections import check_step
-from torch_qpmpc.qp.autograd import ON_FAILURE
 from torch_qpmpc.qp.batching import broadcast, to_dtype
+from torch_qpmpc.qp.pipeline.solve import ON_FAILURE
 
 HESSIANS = ("diagonal", "block", "full")
 #: In order, from the least tied to the most.

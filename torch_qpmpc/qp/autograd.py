@@ -1,31 +1,30 @@
-"""The eager path: tensors become arrays once, and one autograd Function attaches the derivative.
+"""The derivative of the solve, attached by autograd Functions; `derivatives` has the formulas.
 
-Between the two everything works in float64 without autograd, once per batch.
+*Eager* calls run the pipeline and attach one Function. *Traced* calls (`torch.func`, compile, fake
+tensors, forward mode) are one custom operator over the same pipeline, which stays opaque to
+`torch.compile`, fake tensors and `vmap`. The Function around it makes it differentiable under
+`torch.func` and in forward mode, which a custom operator alone is not.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torch_qpmpc.errors import QPError, SolverError
-from torch_qpmpc.qp.batching import broadcast, flatten_batch
-from torch_qpmpc.qp.derivatives import N_THETA, gradients
-from torch_qpmpc.qp.forking import serial_if_forked
-from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_tensor
-from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.solve import solve_programs
-from torch_qpmpc.qp.program import NDIMS, Status
-from torch_qpmpc.qp.solvers import backend
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.qp.batching import align, broadcast
+from torch_qpmpc.qp.derivatives import N_THETA, gradients, tangents
+from torch_qpmpc.qp.pipeline.solve import Outputs, solve_now
+from torch_qpmpc.qp.program import NDIMS
+from torch_qpmpc.qp.tracing import is_differentiating, is_forward_mode, transforms
 
-ON_FAILURE = ("raise", "warn", "mask")
-#: The tensors of a `QPSolution`: value, z, chi, lam, xi, status, residual, value_error, iterations,
-#: active.
-Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+#: Event dimensions of the operator's tensors: H, q, c, C, b, G, lb, ub, w, fixed, start.
+EVENT_NDIMS = (*NDIMS, 1, 1)
+#: The number of arguments after those: start, n_kept, solver, on_failure.
+N_OTHERS = 4
 
 
 def solve_eager(
@@ -57,90 +56,113 @@ class Solution(torch.autograd.Function):
         return None, None, *gradients(incoming, theta, solution, needed, ctx.n_kept)
 
 
-def solve_now(
-    H: Tensor,
-    q: Tensor,
-    c: Tensor,
-    C: Tensor,
-    b: Tensor,
-    G: Tensor,
-    lb: Tensor,
-    ub: Tensor,
-    w: Tensor,
-    fixed: Tensor,
-    start: Tensor | None,
-    n_kept: int,
-    solver: str,
-    on_failure: str,
-) -> Outputs:
-    """Solve a batch, on the CPU or, with ``solver="torch"``, on the device of q.
+solve_op = torch.library.custom_op("torch_qpmpc::solve", solve_now, mutates_args=())
 
-    Args:
-        H, q, c, C, b, G, lb, ub, w: see `QuadraticProgram`.
-        fixed, solver, on_failure: see `torch_qpmpc.solve_qp`.
-        start: active sets ``(*batch, n_g)`` of a warm start.
-        n_kept: see `Programs.of`.
+
+def solve_traced(*arguments: Any) -> Outputs:
+    """Call `solve_now` in the form that the current trace or transform supports.
+
+    Dynamo traces no Function that has a jvp, no Function under `vmap`, and no custom operator under
+    `grad`. It would silently drop the outer derivative of nested transforms.
 
     Raises:
-        QPError: the solver or ``on_failure`` is unknown, the data are invalid, or the batch
-            exceeds the memory.
-        SolverError: with ``on_failure="raise"``, a QP has no certified solution.
+        QPError: the combination of transforms is not supported.
     """
-    backend(solver)
-    if on_failure not in ON_FAILURE:
-        raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
-    device = q.device if solver == "torch" and q.is_cuda else None
-    theta = (H, q, c, C, b, G, lb, ub, w)
-    try:
-        with serial_if_forked():
-            programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=device)
-            if start is not None:
-                start = flatten_batch(start.detach().to(q.device).expand(*batch, -1)).contiguous()
-            sets = start.numpy(force=True) if start is not None and device is None else start
-            solution = solve_programs(programs, solver, sets)
-    except (MemoryError, RuntimeError) as error:
-        if not _is_out_of_memory(error):
-            raise
-        shapes = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
-        count = broadcast(*shapes, fixed.shape[:-1]).numel()
-        got = f"{count:,} QPs of n_z = {q.shape[-1]}"
-        remedy = f"Solve the batch in chunks, with torch.split. The allocation failed: {error}."
-        raise QPError.expected("batch", got, "as many as fit in memory", remedy) from error
-    if on_failure != "mask" and not solution.all_accepted:
-        _report(solution, batch, on_failure)
-
-    outputs: Any = tuple(map(to_tensor, solution))
-    if len(batch) == 1 and q.dtype == torch.float64 and q.device == outputs[0].device:
-        return outputs
-
-    def out(x: Tensor) -> Tensor:
-        dtype = q.dtype if x.is_floating_point() else x.dtype
-        return x.reshape((*batch, *x.shape[1:])).to(q.device, dtype)
-
-    return tuple(map(out, outputs))  # pyright: ignore[reportReturnType] - a tuple of ten
+    if not is_differentiating():
+        return solve_op(*arguments)
+    stack = transforms()
+    if not torch.compiler.is_compiling():
+        if stack.count("Jvp") > 1:
+            raise QPError.expected(
+                "derivative", "jvp in jvp", "one forward mode", "Use hessian, or jacrev inside."
+            )
+        forward = stack or is_forward_mode()
+        return (TracedForward if forward else Traced).apply(*arguments)
+    if set(stack) <= {"Vmap"}:
+        return solve_op(*arguments) if stack else Traced.apply(*arguments)
+    if stack != ("Grad",):
+        raise QPError.expected(
+            "torch.compile",
+            f"{' in '.join(reversed(stack))} inside a compiled function",
+            "vmap, or one grad, jacrev or vjp of a scalar",
+            "Exclude this function with torch.compiler.disable.",
+        )
+    # Without an operation on an argument of `grad`, Dynamo fails or takes its gradient to be zero.
+    return Traced.apply(*(x.view_as(x) if isinstance(x, Tensor) else x for x in arguments))
 
 
-def _is_out_of_memory(error: Exception) -> bool:
-    """True for a failed allocation, which torch's CPU allocator reports only in the message."""
-    kinds = (MemoryError, torch.OutOfMemoryError)
-    return isinstance(error, kinds) or "DefaultCPUAllocator" in str(error)
+@solve_op.register_fake
+def _(H, q, c, C, b, G, lb, ub, w, fixed, start, n_kept, solver, on_failure):
+    operands = (H, q, c, C, b, G, lb, ub, w, fixed)
+    batch = broadcast(*(t.shape[: t.ndim - n] for t, n in zip(operands, EVENT_NDIMS, strict=False)))
+
+    def count() -> Tensor:
+        return q.new_empty(batch, dtype=torch.int64)
+
+    n_z, n_c, n_g, n_f = q.shape[-1], b.shape[-1], lb.shape[-1], fixed.shape[-1]
+    vectors = [q.new_empty((*batch, n)) for n in (n_z, n_c, n_g, n_f)]
+    active = q.new_empty((*batch, n_g), dtype=torch.int8)
+    errors = q.new_empty(batch), q.new_empty(batch)
+    return (q.new_empty(batch), *vectors, count(), *errors, count(), active)
 
 
-def _report(solution: BatchSolution, batch: torch.Size, on_failure: str) -> None:
-    statuses = torch.as_tensor(solution.status).cpu()
-    failed = statuses.nonzero().squeeze(-1)
-    reasons = []
-    for status in Status:
-        where = (statuses == status).nonzero().squeeze(-1)
-        if status != Status.SOLVED and len(where):
-            first = torch.unravel_index(where[0], batch) if batch else ()
-            at = f", first at batch index {tuple(int(i) for i in first)}" if batch else ""
-            reasons.append(f"{len(where)} {status.name}{at}: {status.explanation}")
-    message = f"{len(failed)} of {len(statuses)} QPs have no certified solution. " + ". ".join(
-        reasons
-    )
-    if on_failure == "raise":
-        if (statuses[failed] == Status.INVALID_DATA).all():
-            raise QPError(message)
-        raise SolverError(message)
-    warnings.warn(message, RuntimeWarning, stacklevel=2)
+@solve_op.register_vmap
+def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
+    return solve_op(*align(in_dims, args, EVENT_NDIMS)), (0,) * 10
+
+
+def _setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
+    _, z, chi, lam, xi, status, *_ = output
+    ctx.set_materialize_grads(False)
+    ctx.n_kept = inputs[N_THETA + 1]
+    # Saving z, chi, lam and xi, which are outputs, makes this backward differentiable.
+    ctx.save_for_backward(*inputs[:N_THETA], z, chi, lam, xi, status)
+
+
+def _backward(ctx: Any, *incoming: Tensor | None) -> tuple:
+    theta, solution = ctx.saved_tensors[:N_THETA], ctx.saved_tensors[N_THETA:]
+    needed = ctx.needs_input_grad[:N_THETA]
+    grads = gradients(incoming[:5], theta, solution, needed, ctx.n_kept)
+    return (*grads, *(None,) * N_OTHERS)
+
+
+solve_op.register_autograd(_backward, setup_context=_setup_context)
+
+
+class Traced(torch.autograd.Function):
+    """`solve_op`, differentiable under `torch.func`."""
+
+    # No *args: Dynamo recognises this style of Function by its number of parameters.
+    @staticmethod
+    def forward(H, q, c, C, b, G, lb, ub, w, fixed, start, n_kept, solver, on_failure) -> Outputs:
+        return solve_op(H, q, c, C, b, G, lb, ub, w, fixed, start, n_kept, solver, on_failure)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
+        ctx.mark_non_differentiable(*output[5:])
+        _setup_context(ctx, inputs, output)
+
+    backward = staticmethod(_backward)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
+        return Traced.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 10
+
+
+class TracedForward(Traced):
+    """`Traced`, differentiable in forward mode as well, which Dynamo does not trace."""
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Outputs) -> None:
+        Traced.setup_context(ctx, inputs, output)
+        ctx.save_for_forward(*ctx.to_save)
+
+    @staticmethod
+    def jvp(ctx: Any, *d_inputs: Tensor | None) -> tuple:
+        theta, solution = ctx.saved_tensors[:N_THETA], ctx.saved_tensors[N_THETA:]
+        d_outputs = tangents(d_inputs[:N_THETA], theta, solution, ctx.n_kept)
+        return *d_outputs, *(None,) * 5
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
+        return TracedForward.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 10

@@ -7,9 +7,8 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.qp.autograd import solve_eager
+from torch_qpmpc.qp.autograd import solve_eager, solve_traced
 from torch_qpmpc.qp.batching import broadcast
-from torch_qpmpc.qp.operator import solve_traced
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.tracing import is_eager

@@ -15,9 +15,7 @@ from tests.problems import CPU, KnownQP, known_qp, programs_of, random_mpc, rand
 from torch_qpmpc import QuadraticProgram, solve_qp
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.certificate import certify, recover
 from torch_qpmpc.qp.pipeline.solve import solve_programs
-from torch_qpmpc.qp.pipeline.warm_start import try_active_sets
 from torch_qpmpc.qp.program import UNKNOWN
 from torch_qpmpc.qp.solvers import BackendSolution, daqp
 
@@ -84,7 +82,7 @@ def test_the_residual_is_the_certificates(name):
         batch = {n: x.unsqueeze(0) for n, x in claim.items()}
         for p in both(replace(known, fixed=known.fixed.unsqueeze(0))):
             given = {n: x.numpy() if p.prepared.device is None else x for n, x in batch.items()}
-            residual = to_tensor(certify(p, **given)[1])
+            residual = to_tensor(p.certify(**given)[1])
             assert_close(residual.item(), float(expected), rtol=1e-9, atol=1e-13)
 
 
@@ -113,9 +111,9 @@ def test_absent_bounds_and_hard_rows_are_judged_as_by_torch(hard):
 
 def assert_certified_alike(known: KnownQP, claim: dict[str, Tensor]) -> Tensor:
     compiled, in_torch = both(known)
-    found = certify(compiled, **{n: x.numpy() for n, x in claim.items()})
+    found = compiled.certify(**{n: x.numpy() for n, x in claim.items()})
     value, residual, error = map(to_tensor, found)
-    of_torch = certify(in_torch, **claim)
+    of_torch = in_torch.certify(**claim)
     assert_close(residual, of_torch[1], rtol=1e-9, atol=1e-13)
     assert_close(error, of_torch[2], rtol=1e-9, atol=1e-13)
     fine = residual.isfinite()
@@ -126,8 +124,8 @@ def assert_certified_alike(known: KnownQP, claim: dict[str, Tensor]) -> Tensor:
 def assert_recovered_alike(
     compiled: Programs, in_torch: Programs, found: BackendSolution, passes: int = 0
 ) -> None:
-    ours = recover(compiled, found.like(np.empty(0)), passes)
-    others = recover(in_torch, found.like(torch.empty(0)), passes)
+    ours = compiled.recover(found.like(np.empty(0)), passes)
+    others = in_torch.recover(found.like(torch.empty(0)), passes)
     for name in BatchSolution._fields:
         one, other = to_tensor(getattr(ours, name)), getattr(others, name)
         if name == "active":
@@ -163,8 +161,8 @@ def test_the_full_solution_of_diagonal_matrices_is_that_of_torch():
 def assert_settled_alike(compiled: Programs, in_torch: Programs, active: Tensor) -> int:
     """Compare the QPs that settle in both; return their number."""
     given = np.ascontiguousarray(active.numpy())
-    ours, settled = try_active_sets(compiled, compiled.reduced_qps(), given)
-    others, done = try_active_sets(in_torch, in_torch.reduced_qps(), active)
+    ours, settled = compiled.try_active_sets(compiled.reduced_qps(), given)
+    others, done = in_torch.try_active_sets(in_torch.reduced_qps(), active)
     # Linearly dependent sets of rows have no solution.
     done &= others.v.isfinite().all(-1)
     assert torch.equal(to_tensor(settled), done)

@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, programs_of, times
-from torch_qpmpc.qp.pipeline import certificate as certificate_module
 from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.pipeline.batch import Programs
 
@@ -26,7 +25,7 @@ class Certificate(NamedTuple):
 
 def certify(p: Programs, *claim: Tensor) -> Certificate:
     """Certify with the compiled loops; `tests.qp.kernels.test_sample` compares the torch forms."""
-    found = certificate_module.certify(p, *(x.numpy() for x in claim))
+    found = p.certify(*(x.numpy() for x in claim))
     return Certificate(*map(torch.from_numpy, found))
 
 

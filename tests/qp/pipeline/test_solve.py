@@ -13,11 +13,10 @@ from tests.problems import KnownQP, known_qp
 from torch_qpmpc import QPMPC, QPSolution, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.qp.pipeline import refinement
-from torch_qpmpc.qp.pipeline import solve as chain
+from torch_qpmpc.qp.pipeline.arrays import SoftQPs
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import UNKNOWN
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, daqp
-from torch_qpmpc.qp.solvers.base import SoftQPs
 
 BATCH = 6
 
@@ -120,7 +119,7 @@ def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, asked)
     def misled(p: Programs, qps: SoftQPs, active: np.ndarray) -> tuple:
         return LIES["v off"](daqp.solve(qps)), np.ones(len(active), dtype=np.bool_)
 
-    monkeypatch.setattr(chain, "try_active_sets", misled)
+    monkeypatch.setattr(Programs, "try_active_sets", misled)
     known = known_qp(2, batch=(BATCH,))
     active = solve(known, solver="daqp").active
     with SolveLog() as log:
@@ -144,7 +143,7 @@ def test_qps_that_the_warm_start_does_not_settle_go_to_the_backend(monkeypatch, 
         answer = daqp.solve(qps)
         return answer._replace(v=np.where(finished[:, None], answer.v, np.nan)), finished
 
-    monkeypatch.setattr(chain, "try_active_sets", half)
+    monkeypatch.setattr(Programs, "try_active_sets", half)
     known = known_qp(3, batch=(BATCH,))
     active = solve(known, solver="daqp").active
     with SolveLog() as log:

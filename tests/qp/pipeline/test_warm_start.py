@@ -8,7 +8,6 @@ from torch.testing import assert_close
 from tests.problems import known_qp, normal, programs_of, random_mpc, random_states, soft_qps
 from torch_qpmpc import SolveLog, solve_qp
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.warm_start import try_active_sets
 from torch_qpmpc.qp.program import UNKNOWN
 from torch_qpmpc.qp.solvers import BackendSolution
 
@@ -23,7 +22,7 @@ def true_set(seed: int, matrices: tuple[int, ...] = ()):
 
 
 def tried(p: Programs, active: Tensor) -> tuple[BackendSolution, Tensor]:
-    return try_active_sets(p, p.reduced_qps(), active)
+    return p.try_active_sets(p.reduced_qps(), active)
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])

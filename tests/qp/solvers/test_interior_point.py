@@ -12,10 +12,10 @@ from torch.testing import assert_close
 
 from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, soft_qps
 from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
+from torch_qpmpc.qp.pipeline.arrays import SoftQPs
 from torch_qpmpc.qp.solution import row_states
 from torch_qpmpc.qp.solvers import BackendSolution, active_set, batched, interior_point
 from torch_qpmpc.qp.solvers.active_set import SETTLED, settle
-from torch_qpmpc.qp.solvers.base import SoftQPs
 from torch_qpmpc.qp.solvers.batched import BatchedQPs
 
 MAX_ITERATIONS = sum(limit + interior_point.LAST_STEPS for _, limit in interior_point.TARGETS)

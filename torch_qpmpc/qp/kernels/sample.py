@@ -2,6 +2,33 @@
 
 `torch_qpmpc.qp.kernels.sample_torch` has the same functions for other devices. Arrays are float64
 and contiguous; a vector that the whole batch shares has one row.
+
+The certificate judges the results of all backends, by a relative KKT residual and a bound of the
+value's error. For multipliers ``lam = eta - upsilon`` of the softened
+rows, optimality of ``h(y) = w dist(y, [lb, ub])`` in y = Gz is ``h(y) + h*(lam) = lam y`` with
+conjugate ``h*(lam) = ub max(lam, 0) - lb max(-lam, 0)`` on ``|lam| <= w`` (Fenchel and Young). Each
+row's gap is non-negative on its own, so errors of opposite sign cannot cancel as they do in a
+summed duality gap.
+
+A residual is relative to terms that one large weight or multiplier can dominate. The optimal value
+lies between two others, in v, the variables that C z = b leaves free:
+
+* Below, the dual function. The Lagrangian at v is the cost less the rows' gaps, and its slope
+  ``r = Hv + g + G'lam`` is at most ``1/2 r'H^-1 r`` above its minimum. For a singular H it is
+  ``1/2 r'(H + shift)^-1 r + shift / 2 |reach|^2``, or ``|r|'reach``, if some optimum is within
+  ``reach``: within the hard bounds of v, or within `RANGE` times the largest entry of z.
+* Above, the cost of a feasible point. The least step that ends all violations of hard rows, and
+  holds those nearly active, is long where rows are nearly parallel. Rounding errors count as
+  violations.
+
+``value_error`` is the distance of the two and the rounding errors of the value, relative to the
+largest of 1/2 z'Hz, q'z, w'sigma and their sum.
+
+A warm start tries the active set of a nearly equal QP: between two visits to a transition theta
+changes little, and most active sets stay the same. With a fixed set, the KKT conditions are linear
+in its multipliers, and need one Cholesky factor per QP, of the active part of K = G H^-1 G'. If the
+signs of the solution contradict the set, the rows concerned change their state, and the new set is
+tried. QPs that do not settle go to the backend.
 """
 
 from __future__ import annotations
@@ -146,10 +173,7 @@ def _all_multipliers(lam_v, y, theta, rows, others):
 
 
 def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal) -> tuple[Any, Any, Any]:
-    """Return value, KKT residual and the value's error ``(B,)``.
-
-    `torch_qpmpc.qp.pipeline.certificate` has the formulas.
-    """
+    """Return value, KKT residual and the value's error ``(B,)``."""
     return _certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal)
 
 
@@ -409,7 +433,7 @@ def _excess(y, lam, lb, ub, w):
 
 
 def try_active_sets(qps, forces, active) -> tuple[Any, ...]:
-    """Try active sets ``(B, r)`` as in `torch_qpmpc.qp.pipeline.warm_start`.
+    """Try active sets ``(B, r)``.
 
     Returns:
         v ``(B, d)``, lam ``(B, r)``, the number of steps, and True where they settled, ``(B,)``.

@@ -73,7 +73,7 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms) -> tuple[Tensor, T
     up, down = lam.clamp(min=0.0), lam.clamp(max=0.0)
     outside = (y - y.clamp(lb, ub)).abs()
     charge = outside * w.masked_fill(hard, 0.0)
-    # h(y) + h*(lam) - lam y for each row, see `torch_qpmpc.qp.pipeline.certificate`.
+    # h(y) + h*(lam) - lam y for each row, see `torch_qpmpc.qp.kernels.sample`.
     gap = charge + (ub.masked_fill(no_ub, 0.0) - y) * up + (lb.masked_fill(no_lb, 0.0) - y) * down
     charge = charge.sum(-1)
     linear, quadratic = torch.linalg.vecdot(theta.q, z), torch.linalg.vecdot(0.5 * Hz, z)

@@ -18,10 +18,17 @@ from torch import Tensor
 
 from torch_qpmpc.qp.batching import broadcast
 from torch_qpmpc.qp.kernels import sample, sample_torch
-from torch_qpmpc.qp.pipeline.arrays import Array, Theta, on_device, to_numpy
+from torch_qpmpc.qp.pipeline.arrays import (
+    Array,
+    BackendSolution,
+    BatchSolution,
+    SoftQPs,
+    Theta,
+    on_device,
+    to_numpy,
+)
 from torch_qpmpc.qp.pipeline.prepared import Prepared, prepared_for
 from torch_qpmpc.qp.program import NDIMS
-from torch_qpmpc.qp.solvers.base import SoftQPs
 
 #: The positions of H, C and G.
 MATRICES = (0, 3, 5)
@@ -128,6 +135,49 @@ class Programs:
                 w = w.expand(len(self), r)
         g, lower, upper = g_l_u[:, :d], g_l_u[:, d : d + r], g_l_u[:, d + r :]
         return SoftQPs(reduced.H, reduced.G, self.group, g, lower, upper, w)
+
+    def try_active_sets(self, qps: SoftQPs, active: Array) -> tuple[BackendSolution, Array]:
+        """Solve the `reduced_qps` from active sets ``(B, n_g)``, corrected where needed.
+
+        The warm start of every solver, for the whole batch at once. Codes are those of
+        `QPSolution.active`; a set with any other code starts as the empty one, and usually settles.
+
+        Returns:
+            The solutions, and True where an active set settled, ``(B,)``.
+        """
+        active = active[:, self.prepared.reduced(self.n_f).rows]
+        forces = self.prepared.forces(self.n_f)
+        *solution, settled = self.kernels.try_active_sets(qps, forces, active)
+        return BackendSolution(*solution), settled
+
+    def recover(self, claim: BackendSolution, passes: int = 0) -> BatchSolution:
+        """Complete a backend's solutions of the `reduced_qps`, and certify them.
+
+        ``passes`` iterative refinements of z and chi reduce errors of an ill-conditioned
+        elimination.
+        """
+        parts = self.kernels.recover(claim.v, claim.lam, *self._data(), passes)
+        value, z, chi, lam, xi, active, residual, error = parts
+        steps = claim.iterations
+        status = 0 * steps  # SOLVED, unless an error is too large
+        return BatchSolution(value, z, chi, lam, xi, status, residual, error, steps, active)
+
+    def certify(self, z: Array, lam: Array, chi: Array, xi: Array) -> tuple[Array, Array, Array]:
+        """Certify z ``(B, n_z)`` and lam ``(B, n_g)``, chi ``(B, n_c)``, xi ``(B, n_f)``.
+
+        Returns:
+            The value, the residual and the error of the value, ``(B,)``. The residual is the
+            largest error in stationarity, C z = b, the fixed entries, hard rows, and multipliers
+            (outside [-w, w] or at absent bounds), each relative to the size of its terms; or, if
+            larger, the sum of the errors in C z = b, weighted by |chi|, and of the rows'
+            complementarity gaps, relative to the cost.
+        """
+        return self.kernels.certify(z, lam, chi, xi, *self._data())
+
+    def _data(self) -> tuple:
+        prepared, n_f = self.prepared, self.n_f
+        sizes = prepared.reduced(n_f), prepared.sizes(n_f)
+        return self.group, self.fixed, self.theta, *sizes, prepared.diagonal
 
 
 def _flattened(x: Tensor, batch: torch.Size, event: Sequence[int]) -> Tensor:

@@ -106,7 +106,7 @@ class Reduced(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """Sizes that bound the error of a value, see `torch_qpmpc.qp.pipeline.certificate`.
+    """Sizes that bound the error of a value, see `torch_qpmpc.qp.kernels.sample`.
 
     Attributes:
         inverse: the inverse of the Cholesky factor of H + shift I, ``(M, d, d)``; inf if there is

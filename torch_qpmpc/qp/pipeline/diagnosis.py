@@ -21,12 +21,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 
-from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
+from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, SoftQPs
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solvers import daqp
-from torch_qpmpc.qp.solvers.base import SoftQPs
 
 #: A sum counts as zero, or as significant, relative to the sum of its absolute terms.
 ROUNDING, SIGNIFICANT = 1e-12, 1e-7

@@ -1,33 +1,45 @@
-"""Solve and certify QPs (eq:qp2, eq:qp3): condense, solve, certify, fall back."""
+"""Solve and certify QPs (eq:qp2, eq:qp3): condense, solve, certify, fall back.
+
+Tensors become arrays once; all else is in float64, without autograd.
+"""
 
 from __future__ import annotations
 
 import contextvars
 import time
+import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.qp.batching import broadcast, flatten_batch
+from torch_qpmpc.qp.forking import serial_if_forked
 from torch_qpmpc.qp.pipeline.arrays import (
     TOLERANCE,
     Array,
     BatchSolution,
+    SoftQPs,
     on_device,
     per_qp,
     to_numpy,
+    to_tensor,
     unsolved,
 )
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.certificate import certify, recover
 from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
-from torch_qpmpc.qp.pipeline.warm_start import try_active_sets
-from torch_qpmpc.qp.program import Status
+from torch_qpmpc.qp.program import NDIMS, Status
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
-from torch_qpmpc.qp.solvers.base import SoftQPs
 
+ON_FAILURE = ("raise", "warn", "mask")
+#: The tensors of a `QPSolution`: value, z, chi, lam, xi, status, residual, value_error, iterations,
+#: active.
+Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 #: Rejected solutions with a relative residual up to this are refined.
 NEARLY = 1e-2
 #: Number of iterative refinements after an alternative elimination.
@@ -96,13 +108,102 @@ class SolveLog:
 _active_log: contextvars.ContextVar[SolveLog] = contextvars.ContextVar("log")
 
 
+def solve_now(
+    H: Tensor,
+    q: Tensor,
+    c: Tensor,
+    C: Tensor,
+    b: Tensor,
+    G: Tensor,
+    lb: Tensor,
+    ub: Tensor,
+    w: Tensor,
+    fixed: Tensor,
+    start: Tensor | None,
+    n_kept: int,
+    solver: str,
+    on_failure: str,
+) -> Outputs:
+    """Solve a batch, on the CPU or, with ``solver="torch"``, on the device of q.
+
+    Args:
+        H, q, c, C, b, G, lb, ub, w: see `QuadraticProgram`.
+        fixed, solver, on_failure: see `torch_qpmpc.solve_qp`.
+        start: active sets ``(*batch, n_g)`` of a warm start.
+        n_kept: see `Programs.of`.
+
+    Raises:
+        QPError: the solver or ``on_failure`` is unknown, the data are invalid, or the batch
+            exceeds the memory.
+        SolverError: with ``on_failure="raise"``, a QP has no certified solution.
+    """
+    backend(solver)
+    if on_failure not in ON_FAILURE:
+        raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
+    device = q.device if solver == "torch" and q.is_cuda else None
+    theta = (H, q, c, C, b, G, lb, ub, w)
+    try:
+        with serial_if_forked():
+            programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=device)
+            if start is not None:
+                start = flatten_batch(start.detach().to(q.device).expand(*batch, -1)).contiguous()
+            sets = start.numpy(force=True) if start is not None and device is None else start
+            solution = solve_programs(programs, solver, sets)
+    except (MemoryError, RuntimeError) as error:
+        if not _is_out_of_memory(error):
+            raise
+        shapes = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
+        count = broadcast(*shapes, fixed.shape[:-1]).numel()
+        got = f"{count:,} QPs of n_z = {q.shape[-1]}"
+        remedy = f"Solve the batch in chunks, with torch.split. The allocation failed: {error}."
+        raise QPError.expected("batch", got, "as many as fit in memory", remedy) from error
+    if on_failure != "mask" and not solution.all_accepted:
+        _report(solution, batch, on_failure)
+
+    outputs: Any = tuple(map(to_tensor, solution))
+    if len(batch) == 1 and q.dtype == torch.float64 and q.device == outputs[0].device:
+        return outputs
+
+    def out(x: Tensor) -> Tensor:
+        dtype = q.dtype if x.is_floating_point() else x.dtype
+        return x.reshape((*batch, *x.shape[1:])).to(q.device, dtype)
+
+    return tuple(map(out, outputs))  # pyright: ignore[reportReturnType] - a tuple of ten
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """True for a failed allocation, which torch's CPU allocator reports only in the message."""
+    kinds = (MemoryError, torch.OutOfMemoryError)
+    return isinstance(error, kinds) or "DefaultCPUAllocator" in str(error)
+
+
+def _report(solution: BatchSolution, batch: torch.Size, on_failure: str) -> None:
+    statuses = torch.as_tensor(solution.status).cpu()
+    failed = statuses.nonzero().squeeze(-1)
+    reasons = []
+    for status in Status:
+        where = (statuses == status).nonzero().squeeze(-1)
+        if status != Status.SOLVED and len(where):
+            first = torch.unravel_index(where[0], batch) if batch else ()
+            at = f", first at batch index {tuple(int(i) for i in first)}" if batch else ""
+            reasons.append(f"{len(where)} {status.name}{at}: {status.explanation}")
+    message = f"{len(failed)} of {len(statuses)} QPs have no certified solution. " + ". ".join(
+        reasons
+    )
+    if on_failure == "raise":
+        if (statuses[failed] == Status.INVALID_DATA).all():
+            raise QPError(message)
+        raise SolverError(message)
+    warnings.warn(message, RuntimeWarning, stacklevel=2)
+
+
 def solve_programs(p: Programs, solver: str, start: Array | None = None) -> BatchSolution:
     """Solve and certify B QPs; the status of an unsolved one is its diagnosis.
 
     Args:
         p: the QPs.
         solver: a backend's name, see `torch_qpmpc.qp.solvers`.
-        start: active sets ``(B, n_g)`` of nearly equal QPs, see `warm_start`.
+        start: active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.try_active_sets`.
     """
     began = time.perf_counter()
     log = _active_log.get(unused := SolveLog())
@@ -154,7 +255,7 @@ def _certify_at(p: Programs, solution: BatchSolution, at: np.ndarray) -> np.ndar
     if not len(at):
         return np.zeros(0, bool)
     solved = solution.at(at)
-    _, residual, error = certify(p.take(at), solved.z, solved.lam, solved.chi, solved.xi)
+    _, residual, error = p.take(at).certify(solved.z, solved.lam, solved.chi, solved.xi)
     solution.residual[at] = np.maximum(solved.residual, residual)
     solution.value_error[at] = np.maximum(solved.value_error, error)
     return (residual > TOLERANCE) | (error > TOLERANCE)
@@ -208,14 +309,14 @@ def _attempt(
     elif start is None:
         claim = solve(qps).like(p.fixed)
     else:
-        claim, settled = try_active_sets(p, qps, start)
+        claim, settled = p.try_active_sets(qps, start)
         _replace(claim, ~settled, qps, solve)
-    solution = recover(p, claim, passes)
+    solution = p.recover(claim, passes)
     if settled is not None:
         kept = settled & solution.accepted()
         log.recalled += int(kept.sum())
         if _replace(claim, settled & ~kept, qps, solve):
-            solution = recover(p, claim, passes)
+            solution = p.recover(claim, passes)
     if not solution.all_accepted:
         solution = solution.on_cpu()
         rejected = ~solution.accepted() & (solution.residual <= nearly)

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from functools import partial
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
 from torch_qpmpc.qp.solvers import daqp, interior_point, proxqp, qpsolvers
-from torch_qpmpc.qp.solvers.base import BackendSolution, SoftQPs
 
 Backend = Callable[[SoftQPs], BackendSolution]
 

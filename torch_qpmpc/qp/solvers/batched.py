@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.qp.batching import largest
-from torch_qpmpc.qp.solvers.base import SoftQPs
+from torch_qpmpc.qp.pipeline.arrays import SoftQPs
 
 #: Replaces infinity: its reciprocal vanishes in sums, and its square does not overflow.
 HUGE = 1e100

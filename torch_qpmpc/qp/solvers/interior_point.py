@@ -20,8 +20,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
 from torch_qpmpc.qp.solvers.active_set import SETTLED, Best, settle
-from torch_qpmpc.qp.solvers.base import BackendSolution, SoftQPs
 from torch_qpmpc.qp.solvers.batched import HUGE, BatchedQPs
 
 #: Gaps, relative to a typical cost, at which active sets are tried, each with its iteration limit.

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from proxsuite import proxqp
 
-from torch_qpmpc.qp.solvers.base import BackendSolution, SoftQPs
+from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
 from torch_qpmpc.qp.solvers.split_slack import SplitSlack
 
 EPS_ABS = 1e-9

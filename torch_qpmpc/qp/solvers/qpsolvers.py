@@ -7,7 +7,7 @@ import qpsolvers
 import scipy.sparse as sp
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.qp.solvers.base import BackendSolution, SoftQPs
+from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
 from torch_qpmpc.qp.solvers.split_slack import SplitSlack
 
 

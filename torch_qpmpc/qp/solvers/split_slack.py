@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from torch_qpmpc.qp.solvers.base import SoftQPs
+from torch_qpmpc.qp.pipeline.arrays import SoftQPs
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,12 @@
+"""DAQP's order of a batch."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
 from tests.problems import random_states
-from torch_qpmpc.qp.kernels.tour import tour
+from torch_qpmpc.qp.solvers.daqp import tour
 
 
 @pytest.mark.parametrize("near", [40, 8])
