@@ -306,9 +306,10 @@ class QPQLearningLoss(LossModule):
         With TD(0) it is -(L + gamma (1 - terminated) V(s+)). It is -inf where it contains a V(s+)
         without a solution, and NaN where it contains an invalid reward.
         """
-        reward = tensordict.get(("next", self.tensor_keys.reward))
+        key = unravel_key(("next", self.tensor_keys.reward))
+        reward = tensordict.get(key)
         effect = "Those transitions are left out of the loss and its gradient."
-        invalid = invalid_rewards(tensordict, self.tensor_keys.reward, effect)
+        invalid = invalid_rewards(reward, key, effect)
         next_value = self._next_value(tensordict)
         valid = reward.masked_fill(invalid, 0)
         target = self._estimate(tensordict, valid, next_value)

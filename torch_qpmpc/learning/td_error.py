@@ -6,8 +6,6 @@ import warnings
 
 import torch
 import torch.nn.functional as F
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from torch_qpmpc.qp.tracing import has_values
@@ -72,16 +70,15 @@ def td_metadata(prediction: Tensor, target: Tensor) -> dict[str, Tensor]:
     }
 
 
-def invalid_rewards(tensordict: TensorDictBase, reward: NestedKey, effect: str) -> Tensor:
-    """Return True where a reward is NaN or infinite, ``(*batch, 1)``, and warn if any is.
+def invalid_rewards(reward: Tensor, key: object, effect: str) -> Tensor:
+    """Return True where a reward ``(*batch, 1)`` is NaN or infinite, and warn if any is.
 
     Args:
-        tensordict: a batch of transitions.
-        reward: the key of the rewards under ``"next"``.
-        effect: the consequence, a sentence for the `RuntimeWarning`.
+        reward: the rewards.
+        key: their name in the `RuntimeWarning`.
+        effect: the consequence, a sentence for it.
     """
-    key = unravel_key(("next", reward))
-    invalid = ~tensordict.get(key).isfinite()
+    invalid = ~reward.isfinite()
     if has_values(invalid) and (count := int(invalid.sum())):
         message = f"{key}: {count} of {invalid.numel()} rewards are NaN or infinite. {effect}"
         warnings.warn(message, RuntimeWarning, stacklevel=3)

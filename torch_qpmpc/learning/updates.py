@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
 
@@ -65,7 +66,8 @@ def first_order(
             if losses.get("unsolved", None) is None:
                 effect = "The batch moves nothing."
                 keys: Any = loss_module.tensor_keys
-                invalid = invalid_rewards(batch, keys.reward, effect).view(-1)
+                key = unravel_key(("next", keys.reward))
+                invalid = invalid_rewards(batch.get(key), key, effect).view(-1)
                 lost = invalid
                 if "pred_value" in losses:  # SAC's output has only sums
                     error = losses["pred_value"] - losses["target_value"]
