@@ -346,9 +346,7 @@ def test_unknown_keys(key, remedy):
 NEEDED = [key for key in KEYS if key not in NOT_NEEDED]
 
 
-@pytest.mark.parametrize(
-    "key", [*NEEDED, *OPTIONAL, *GROUPS, "algo", "collector", "search", "start"]
-)
+@pytest.mark.parametrize("key", [*NEEDED, *OPTIONAL, *GROUPS, "algo", "search", "start"])
 def test_missing_keys(key):
     cfg = make_config("constraint=combined", *choices_with(key))
     owner, _, leaf = key.rpartition(".")
@@ -389,7 +387,7 @@ def test_keys_of_groups(overrides, message):
         check_config(make_config("optimizer=adam", *overrides))
 
 
-@pytest.mark.parametrize("group", [*GROUPS, "algo", "collector"])
+@pytest.mark.parametrize("group", [*GROUPS, "algo"])
 def test_a_group_has_keys(group):
     cfg = make_config()
     OmegaConf.update(cfg, group, 3, merge=False)

@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
+from torch_qpmpc.experiment.config import damaged
 from torch_qpmpc.mpc.module import QPMPC
 
 #: The file of the policy that acts, in a run's folder.
 BEST = "best.pt"
+EXPECTED = "the policy of this run as a QP, not as a network"
 
 
 def stored(mpc: QPMPC) -> dict[str, Any]:
@@ -34,8 +35,8 @@ def learned_qp(folder: str | Path) -> QPMPC:
     mpc = _make(file, state, {})
     try:
         mpc.load_state_dict(state["mpc"])
-    except (KeyError, TypeError, RuntimeError, AttributeError) as error:
-        raise _no_qp(file, error) from error
+    except Exception as error:  # damaged files raise errors of any type
+        raise damaged(file, error, EXPECTED) from error
     return mpc
 
 
@@ -54,11 +55,5 @@ def _file(folder: str | Path) -> Path:
 def _make(file: Path, state: Mapping[str, Any], changed: Mapping[str, Any]) -> QPMPC:
     try:
         return QPMPC(**{**state["arguments"], **changed})
-    except (KeyError, TypeError, RuntimeError, AttributeError, QPError) as error:
-        raise _no_qp(file, error) from error
-
-
-def _no_qp(file: Path, error: Exception) -> QPError:
-    reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-    got = f"{file}, from which no QP can be made ({reason})"
-    return QPError.expected("checkpoint", got, "one of a run whose policy is a QP")
+    except Exception as error:  # damaged files raise errors of any type
+        raise damaged(file, error, EXPECTED) from error
