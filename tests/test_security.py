@@ -218,7 +218,7 @@ def test_an_own_task_is_exported_and_reported_without_its_code(tmp_path, monkeyp
 
 def test_a_policy_that_is_no_qp_is_not_exported(folder):
     torch.save({"policy": {}}, folder / "best.pt")
-    message = r"^best.pt: got .*best.pt \(it has no arguments\), expected the policy of this run as a QP, no"
+    message = r"^best.pt: got .*best.pt \(it has no arguments\), expected the policy of this run as"
     with pytest.raises(SystemExit, match=message):
         export([str(folder)])
 
@@ -256,7 +256,7 @@ def test_pickles_run_no_code(folder, mark, name):
 def test_tags_of_a_configuration_run_no_code(folder, mark):
     with (folder / "config.yaml").open("a") as file:
         file.write(f"more: !!python/object/apply:os.mkdir ['{mark}']\n")
-    for command in (resume, COMMANDS["report"]):
+    for command in (COMMANDS["report"], resume):
         with pytest.raises(SystemExit, match=r"config.yaml: got .* \(could not determine a con"):
             command(folder)
     assert not mark.exists()

@@ -30,8 +30,7 @@ def learned_qp(folder: str | Path) -> QPMPC:
     Raises:
         QPError: there is no checkpoint, it is damaged, or the policy is a network.
     """
-    file = _file(folder)
-    state = load_checkpoint(file)
+    file, state = _read(folder)
     mpc = _make(file, state, {})
     try:
         mpc.load_state_dict(state["mpc"])
@@ -42,14 +41,17 @@ def learned_qp(folder: str | Path) -> QPMPC:
 
 def start_qp(folder: str | Path, structure: str) -> QPMPC:
     """Make the QP that the run in ``folder`` started from, with its ``structure`` at the start."""
-    file = _file(folder)
-    return _make(file, load_checkpoint(file), {"structure": structure})
+    return _make(*_read(folder), {"structure": structure})
 
 
-def _file(folder: str | Path) -> Path:
-    """Return the file of the policy that acts: without a gate, the checkpoint."""
-    best = Path(folder) / BEST
-    return best if best.exists() else Path(folder) / CHECKPOINT
+def _read(folder: str | Path) -> tuple[Path, dict[str, Any]]:
+    """Read the file of the policy that acts: without a gate, the checkpoint."""
+    best, checkpoint = Path(folder) / BEST, Path(folder) / CHECKPOINT
+    if not best.exists():
+        state = load_checkpoint(checkpoint)
+        if not isinstance(state, dict) or state.get("gate") is None:
+            return checkpoint, state
+    return best, load_checkpoint(best)
 
 
 def _make(file: Path, state: Mapping[str, Any], changed: Mapping[str, Any]) -> QPMPC:
