@@ -1,4 +1,4 @@
-"""Run the commands whose numbers the pages quote: ``python -m tests.claims``, hours, or ``--quick``.
+"""Run the commands whose numbers pages quote: ``python -m tests.claims``, hours, or ``--quick``.
 
 claims.yaml lists each command with its numbers: where a number is read, the interval that it must
 lie in, and the pages that quote it, with the quoted text and the number in braces. A number outside
@@ -79,7 +79,7 @@ class Claim:
     quick: bool = False
 
     def run(self, folder: Path) -> list[str]:
-        """Run the command; return a line for each number, or its failure, that makes pages stale."""
+        """Run the command; return a line for each page that is stale."""
         command = self.command.replace("FOLDER", str(folder))
         if re.match(r"python train.py (?!-m )", command):
             command += f" hydra.run.dir={folder}"
