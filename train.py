@@ -85,7 +85,7 @@ def _train(
     gate = RunGate(cfg, learner, physics, quiet)
 
     # The data: vectorised episodes under the current policy, and their replay.
-    collector = make_collector(cfg, physics, gate.actor)
+    collector = make_collector(cfg, physics, gate.acting)
     replay = make_run_replay(cfg, mpc)
     stream = batches(collector)
 

@@ -213,7 +213,8 @@ BAD: dict[str, list[Any]] = {
     "logger": ["visdom", *NAME],
     "export": ["python", 3, True],
     "figures": FLAG,
-    "gate": FLAG,
+    "gate": ["acts", *FLAG],
+    "gate_bound": [0, *REAL[:-1]],
     "back_off": [0.4, 1, math.nan, False, "half"],
     "search.loops": WHOLE,
     **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
@@ -573,3 +574,12 @@ def test_an_ablation_goes_with_both_penalties_and_a_step_rule(name):
     check_config(make_config(f"+ablation={name}", "constraint=combined", "optimizer=adam"))
     cfg = make_config(f"+ablation={name}", "step=projection")
     assert (cfg.step, cfg.ablation) == ("projection", name)
+
+
+def test_what_acts_by_default():
+    """Only accepted policies act where tables were made so, but a critic explores on each task."""
+    assert make_config().gate is True
+    assert {make_config(f"task={name}").gate for name in ("gros_zanon", "house")} == {"act"}
+    for algo in ("ddpg", "td3", "sac"):
+        assert make_config("task=house", f"algo={algo}").gate is True
+    assert make_config("task=house", "algo=ddpg", "gate=act").gate == "act"

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc.experiment.algorithms import evaluate, make_learner, make_operator
-from torch_qpmpc.experiment.gating import BEST, RunGate
+from torch_qpmpc.experiment.gating import BEST, PATIENCE, RunGate
 from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.study.runs import FinishedRun
@@ -42,7 +42,7 @@ def test_candidates_and_the_search_are_judged(run):
     assert summary["simulated"] == 10 * loops
 
 
-def test_the_policy_that_acts_is_the_one_that_is_reported(run):
+def test_the_policy_that_is_kept_is_the_one_that_is_reported(run):
     folder, summary = run
     finished = FinishedRun(folder)
     loop = evaluate(finished.cfg, finished.learned.policy, finished.physics)
@@ -61,21 +61,50 @@ def make_gate(*overrides: str) -> tuple[RunGate, Any]:
 
 def test_without_a_gate_the_learner_acts(tmp_path):
     gate, actor = make_gate("gate=false")
-    assert gate.actor is actor
+    assert gate.kept is gate.acting is actor
     assert gate.judge(4) == gate.summary() == {}
     assert gate.state_dict() is None
     gate.save(tmp_path)
     assert not (tmp_path / BEST).exists()
 
 
-def test_a_candidate_that_got_worse_does_not_act():
+def test_a_candidate_that_got_worse_is_not_kept():
     gate, actor = make_gate("gate=true")
-    before = gate.actor.module.C.detach().clone()
+    before = gate.kept.module.C.detach().clone()
     with torch.no_grad():
         for parameter in actor.parameters():
             parameter.mul_(3.0)
     assert gate.judge(4)["gate/accepted"] == 0.0
-    assert_close(gate.actor.module.C.detach(), before)
+    assert_close(gate.kept.module.C.detach(), before)
+
+
+@pytest.mark.parametrize(("gate", "restarts"), [("true", False), ("act", True)])
+def test_the_learner_acts_and_goes_on_unless_only_what_is_kept_acts(gate, restarts):
+    judged, actor = make_gate(f"gate={gate}")
+    start = judged.kept.module.C.detach().clone()
+    assert judged.acting is (judged.kept if restarts else actor)
+    with torch.no_grad():
+        actor.module.C.mul_(3.0)
+    for _ in range(PATIENCE):
+        assert_close(actor.module.C.detach(), 3 * start)
+        assert judged.judge(4)["gate/accepted"] == 0.0
+    assert_close(actor.module.C.detach(), (1 if restarts else 3) * start)
+
+
+def test_a_gate_that_only_keeps_does_not_change_what_is_learned(tmp_path):
+    ends = {}
+    for gate in ("true", "false", "act"):
+        cfg = make_config(*GATED, "updates=8", "gate_interval=1", f"gate={gate}")
+        ends[gate] = train.train(cfg, str(tmp_path / gate))
+    assert ends["true"]["rejected"] > 0
+    assert ends["true"]["J_final"] == ends["false"]["J_final"]
+    assert ends["act"]["J_final"] != ends["false"]["J_final"]
+
+
+def test_no_candidate_passes_under_a_bound_far_above_its_gain(tmp_path):
+    summary = train.train(make_config(*GATED, "updates=3", "gate_bound=1e9"), str(tmp_path))
+    assert (summary["accepted"], summary["rejected"]) == (0, 1)
+    assert summary["J_best"] == summary["J_start"] != summary["J_final"]
 
 
 def test_without_an_interval_of_its_own_each_evaluation_is_judged():
@@ -96,10 +125,10 @@ def test_a_search_leaves_out_what_the_QP_lacks():
     assert "search/H_u" not in found
 
 
-def test_a_search_starts_from_the_policy_that_acts():
+def test_a_search_starts_from_the_policy_that_is_kept():
     gate, actor = make_gate("gate=true", "search.w=0.1", "search.loops=2")
     with torch.no_grad():
         actor.module.C.mul_(3.0)
     found = gate.judge(4)
     assert {"search/w", "search/accepted"} <= set(found)
-    assert_close(actor.module.C.detach(), gate.actor.module.C.detach())
+    assert_close(actor.module.C.detach(), gate.kept.module.C.detach())

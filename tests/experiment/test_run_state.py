@@ -43,7 +43,7 @@ NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
         ("algo=td3", *ACTOR_CRITIC),
         (*GATED, "constraint=mpc", "release=5", "search.w=0.5"),
         (*GATED, *DATA, "constraint=free"),
-        ("optimizer=recursive", *STREAM, *GATED[:1]),
+        ("gate=act", "optimizer=recursive", *STREAM),
         ("gate=true", "algo=td3", *ACTOR_CRITIC, *NETWORKS),
         ("task=store", "optimizer=gauss_newton", "constraint=si", "task.episode_steps=5"),
         ("task=store", "optimizer=recursive", "optimizer.memory=8", "task.episode_steps=6"),

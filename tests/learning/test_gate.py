@@ -171,7 +171,7 @@ def test_an_empty_test_is_open():
     assert test.decision == "open"
 
 
-def test_a_better_candidate_acts():
+def test_a_better_candidate_is_kept():
     gate, candidate = Gate(Policy(2.0), costs), Policy(1.0)
     verdict = gate.judge(candidate)
     assert verdict.accepted
@@ -181,7 +181,7 @@ def test_a_better_candidate_acts():
 
 
 @pytest.mark.parametrize("level", [2.0, 2.5])
-def test_any_other_candidate_does_not(level):
+def test_any_other_candidate_is_not(level):
     gate = Gate(Policy(2.0), costs)
     verdict = gate.judge(Policy(level))
     assert not verdict.accepted
@@ -201,7 +201,7 @@ def test_an_undecided_comparison_ends_in_a_rejection():
     assert verdict.pairs == 96
 
 
-def test_after_rejections_in_a_row_the_candidate_starts_from_the_acting_policy():
+def test_after_rejections_in_a_row_the_candidate_starts_from_what_is_kept():
     gate, candidate = Gate(Policy(2.0), costs, patience=2), Policy(3.0)
     assert not gate.judge(candidate).restarted
     assert candidate.level == 3.0
@@ -209,7 +209,13 @@ def test_after_rejections_in_a_row_the_candidate_starts_from_the_acting_policy()
     assert candidate.level == 2.0
 
 
-def test_the_acting_policy_is_a_copy():
+def test_without_patience_the_candidate_goes_on():
+    gate, candidate = Gate(Policy(2.0), costs, patience=None), Policy(3.0)
+    assert not any(gate.judge(candidate).restarted for _ in range(10))
+    assert candidate.level == 3.0
+
+
+def test_what_is_kept_is_a_copy():
     candidate = Policy(2.0)
     gate = Gate(candidate, costs)
     with torch.no_grad():

@@ -31,7 +31,7 @@ class Evaluation:
 
     Attributes:
         cfg, physics: the run's configuration and plant.
-        loops: those of ``start``, ``learned``, which acts, and, if they are there, of the last
+        loops: those of ``start``, ``learned``, which is kept, and, if they are there, of the last
             ``candidate`` and the ``true model``.
         rivals: J of the task's rivals by name.
     """
@@ -71,7 +71,7 @@ class Evaluation:
     def summary(self) -> dict[str, Any]:
         """Return J of the start, the learned and the true model, the closed gap and the rivals.
 
-        ``J_best`` is that of the learned policy, which acts, and ``J_final`` that of the last
+        ``J_best`` is that of the learned policy, which is kept, and ``J_final`` that of the last
         candidate. Costs and gap also with discounted costs. Missing values are nan, as for a plant
         without a true model.
         """

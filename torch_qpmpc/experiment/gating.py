@@ -1,4 +1,4 @@
-"""The gate of a run: the policy that acts, and paired comparisons on the run's plant."""
+"""The gate of a run: the policies that act and that are kept, compared on the run's plant."""
 
 from __future__ import annotations
 
@@ -24,10 +24,16 @@ from torch_qpmpc.mpc.module import QPMPC
 
 #: The most pairs of a comparison, of which a run's later ones need more: they share one alpha.
 PAIRS = 160
+#: The rejections in a row after which, with gate=act, the learner restarts from what is kept.
+PATIENCE = 3
 
 
 class RunGate:
-    """The policy that acts in a run: the learner's, or the one that a `Gate` lets act.
+    """The policies of a run: the learner's, and the best one that a `Gate` has accepted.
+
+    With ``gate=true`` the learner's policy acts and learns as without a gate, and the gate decides
+    which one is kept. With ``gate=act`` the policy that is kept acts, too, and the learner restarts
+    from it after three rejections in a row.
 
     Args:
         cfg: the run's configuration; ``gate`` switches the comparisons on.
@@ -36,7 +42,7 @@ class RunGate:
         quiet: show no bar during the search.
 
     Attributes:
-        actor: the policy that acts.
+        kept: the policy that is evaluated and saved; without a gate, the learner's.
         simulated: the number of transitions in closed loops of comparisons and searches.
     """
 
@@ -45,26 +51,32 @@ class RunGate:
     ) -> None:
         self._cfg, self._learner, self._physics, self._quiet = cfg, learner, physics, quiet
         options = {"seed": cfg.seed, "pairs": PAIRS, "decisions": _decisions(cfg)}
+        options |= {"bound": cfg.gate_bound, "patience": PATIENCE if cfg.gate == "act" else None}
         self._gate = Gate(learner.actor, self._costs, **options) if cfg.gate else None
-        self.actor: Any = learner.actor if self._gate is None else self._gate.actor
+        self.kept: Any = learner.actor if self._gate is None else self._gate.actor
         self.simulated = 0
 
     @property
+    def acting(self) -> Any:
+        """The policy that collects transitions."""
+        return self.kept if self._cfg.gate == "act" else self._learner.actor
+
+    @property
     def policy(self) -> Callable[[Tensor], Tensor]:
-        """The policy that acts, as a function from p to a, for one closed loop."""
-        return in_closed_loop(self.actor, self._learner.n_preview)
+        """The policy that is kept, as a function from p to a, for one closed loop."""
+        return in_closed_loop(self.kept, self._learner.n_preview)
 
     @property
     def mpc(self) -> QPMPC | None:
-        """The QP of the policy that acts; None if it is a network."""
-        return _qp(self.actor)
+        """The QP of the policy that is kept; None if it is a network."""
+        return _qp(self.kept)
 
     def judge(self, update: int) -> dict[str, float]:
-        """Let the learner's policy act if it costs less; return the scalars of the comparison.
+        """Keep the learner's policy if it costs less; return the scalars of the comparison.
 
         Judges each ``gate_interval`` updates and after the last one. Then a direct search over the
-        scalars that the configuration chooses follows, from the policy that acts, and its result is
-        judged, too. Without a gate nothing is judged or searched.
+        scalars that the configuration chooses follows, from the policy that is kept, and its result
+        is judged, too. Without a gate nothing is judged or searched.
         """
         if self._gate is None:
             return {}
@@ -88,7 +100,7 @@ class RunGate:
         sizes = {name: x for name in available(mpc) if (x := self._cfg.search.get(name))}
         if not sizes:
             return {}
-        actor.load_state_dict(self.actor.state_dict())
+        actor.load_state_dict(self.kept.state_dict())
         loops, seed = self._cfg.search.loops, self._cfg.seed
         with tqdm(desc="search", total=loops, leave=False, disable=self._quiet) as bar:
 
@@ -106,10 +118,10 @@ class RunGate:
         return costs.sum(0)
 
     def release(self, learner: Learner) -> None:
-        """Free the C of the policy that acts, as the new ``learner``'s is."""
+        """Free the C of the policy that is kept, as the new ``learner``'s is."""
         self._learner = learner
         if self._gate is None:
-            self.actor = learner.actor
+            self.kept = learner.actor
         elif self.mpc is not None:
             self.mpc.release()
 
@@ -121,10 +133,10 @@ class RunGate:
         return decisions | {"simulated": self.simulated}
 
     def save(self, folder: Path) -> None:
-        """Write the policy that acts to best.pt; without a gate, the checkpoint has it."""
+        """Write the policy that is kept to best.pt; without a gate, the checkpoint has it."""
         if self._gate is None:
             return
-        state, buffer = {"policy": self.actor.state_dict()}, io.BytesIO()
+        state, buffer = {"policy": self.kept.state_dict()}, io.BytesIO()
         if self.mpc is not None:
             state |= stored(self.mpc)
         torch.save(state, buffer)

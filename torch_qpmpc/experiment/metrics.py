@@ -57,7 +57,7 @@ def update_metrics(
 
 
 def run_summary(found: Evaluation, tally: Tally, gate: RunGate) -> dict[str, Any]:
-    """Return the content of summary.json, which is about the policy that acts."""
+    """Return the content of summary.json, which is about the policy that is kept."""
     cfg, mpc = found.cfg, gate.mpc
     summary = found.summary() | gate.summary()
     summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}

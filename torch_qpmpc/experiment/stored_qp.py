@@ -10,7 +10,7 @@ from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
 from torch_qpmpc.experiment.config import damaged
 from torch_qpmpc.mpc.module import QPMPC
 
-#: The file of the policy that acts, in a run's folder.
+#: The file of the policy that is kept, in a run's folder.
 BEST = "best.pt"
 EXPECTED = "the policy of this run as a QP, not as a network"
 
@@ -45,7 +45,7 @@ def start_qp(folder: str | Path, structure: str) -> QPMPC:
 
 
 def _read(folder: str | Path) -> tuple[Path, dict[str, Any]]:
-    """Read the file of the policy that acts: without a gate, the checkpoint."""
+    """Read the file of the policy that is kept: without a gate, the checkpoint."""
     best, checkpoint = Path(folder) / BEST, Path(folder) / CHECKPOINT
     if not best.exists():
         state = load_checkpoint(checkpoint)

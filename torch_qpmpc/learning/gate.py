@@ -1,8 +1,8 @@
-"""A gate: a learned policy acts only once closed loops show that it costs less.
+"""A gate: a learned policy is kept only once closed loops show that it costs less.
 
 A falling TD error does not make a better policy. Learning therefore moves a candidate, and a paired
 comparison of closed loops, with the same starts and disturbances for both, lets it replace the
-policy that acts, or not.
+policy that is kept, or not.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ class _Bets:
 class Verdict:
     """The outcome of a comparison: the candidate is ``accepted``, at an interval of ``mean``.
 
-    ``restarted`` is True if the candidate has become a copy of the acting policy.
+    ``restarted`` is True if the candidate has become a copy of the policy that is kept.
     """
 
     accepted: bool
@@ -186,10 +186,10 @@ class Verdict:
 
 
 class Gate:
-    """Holds the policy that acts, and replaces it by a candidate that is shown to cost less.
+    """Keeps the best policy so far, and replaces it by a candidate that is shown to cost less.
 
     Args:
-        actor: the first policy; the gate acts with a copy.
+        actor: the first policy; the gate keeps a copy.
         costs: maps a policy and a seed to the costs ``(starts,)`` of closed loops, with starts and
             disturbances from the seed alone.
         pairs: the number of pairs after which an undecided comparison rejects the candidate.
@@ -198,11 +198,11 @@ class Gate:
         decisions: K, the number of comparisons that are planned.
         bound: the largest loss of one closed loop, as in `PairedTest`.
         patience: the number of rejections in a row after which the candidate becomes a copy of the
-            acting policy.
+            policy that is kept; None: never.
         seed: seeds the starts and disturbances of all comparisons.
 
     Attributes:
-        actor: the policy that acts.
+        actor: the policy that is kept.
         accepted, rejected: the numbers of decisions.
 
     Raises:
@@ -231,11 +231,12 @@ class Gate:
         alpha: float = 0.05,
         decisions: int = 10,
         bound: float | None = None,
-        patience: int = 3,
+        patience: int | None = 3,
         seed: int = 0,
     ) -> None:
         check_whole("pairs", pairs, FEWEST)
-        check_whole("patience", patience, 1)
+        if patience is not None:
+            check_whole("patience", patience, 1)
         check_seed(seed)
         check_whole("decisions", decisions, 1)
         PairedTest(alpha, bound)
@@ -251,11 +252,11 @@ class Gate:
 
     @torch.no_grad()
     def judge(self, candidate: nn.Module) -> Verdict:
-        """Compare ``candidate`` with the acting policy on new starts and disturbances.
+        """Compare ``candidate`` with the policy that is kept, on new starts and disturbances.
 
         Pairs are added until the test is decided, the candidate's mean cost is no lower, or there
-        are ``pairs``. An accepted candidate's parameters are copied to the acting policy; after
-        ``patience`` rejections in a row it is the other way round.
+        are ``pairs``. An accepted candidate's parameters are copied to the policy that is kept;
+        after ``patience`` rejections in a row it is the other way round.
 
         Raises:
             QPError: ``costs`` returns another shape than ``(starts,)``.
@@ -280,14 +281,14 @@ class Gate:
             self.actor.load_state_dict(candidate.state_dict())
         else:
             self.rejected += 1
-            restarted = self._in_a_row >= self._patience
+            restarted = self._patience is not None and self._in_a_row >= self._patience
             if restarted:
                 candidate.load_state_dict(self.actor.state_dict())
                 self._in_a_row = 0
         return Verdict(accepted, test.mean, *test.interval, test.pairs, restarted)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the acting policy's parameters and the numbers of decisions."""
+        """Return the kept policy's parameters and the numbers of decisions."""
         counts = [self.accepted, self.rejected, self._in_a_row]
         return {"actor": self.actor.state_dict(), "counts": counts}
 

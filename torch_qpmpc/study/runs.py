@@ -88,7 +88,7 @@ class FinishedRun:
 
     @cached_property
     def learned(self) -> QPMPC:
-        """The learned QP, which acted at the run's end."""
+        """The learned QP, which the run has kept."""
         return learned_qp(self.folder)
 
     @property

@@ -76,7 +76,8 @@ class Config(Group):
     release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
     resume: Annotated[str | None, Expected("a path, or null")]
     ablation: Annotated[str | None, Expected("a name, or null")]
-    gate: Flag
+    gate: Annotated[Literal["act"] | bool, Expected("true, act or false")]
+    gate_bound: Annotated[Positive | None, Expected("a finite number > 0, or null")]
     gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")]
     back_off: Annotated[
         Annotated[Finite, Field(ge=0.5, lt=1)] | None, Expected("a number in [0.5, 1), or null")

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.campaign.families import FAMILIES
+from tests.claims.__main__ import ROOT, load, main
+from tests.runs import make_config
+from tests.test_docs import PAGES, needs_docs
+from torch_qpmpc.experiment.config import check_config
+
+CLAIMS = load()
+
+
+@needs_docs
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.command)
+def test_pages_quote_what_the_claims_say(claim):
+    for number in claim.numbers:
+        for page, text, quoted in number.quotes():
+            words = " ".join(PAGES[page].split())
+            assert " ".join(text.split()) in words, f"{page} lacks '{text}'"
+            assert number.holds(quoted), f"{page}: {quoted} is not in {number.within}"
+
+
+def test_commands_of_claims_have_possible_settings():
+    for claim in CLAIMS:
+        for words in re.findall(r"python train.py (?!-m )([^&;]*)", claim.command):
+            check_config(make_config(*(word.strip("'") for word in words.split())))
+    assert any(claim.quick for claim in CLAIMS)
+
+
+@needs_docs
+def test_the_campaigns_page_has_every_family():
+    page = (ROOT / "docs/reliability/campaign.md").read_text(encoding="utf-8")
+    rows = page.split("<!-- campaign-families -->")[1].split("<!-- /campaign-families -->")[0]
+    named = [row.split(" | ")[0].removeprefix("| ") for row in rows.splitlines() if row]
+    assert named[2:] == list(FAMILIES)
+
+
+def claims(path: Path, command: str, number: str, *, quick: bool = True) -> list[str]:
+    """Write a file of one claim; return the arguments that name it."""
+    text = f"- command: {command}\n  quick: {quick}\n  numbers:\n    - {number}\n"
+    path.write_text(text, encoding="utf-8")
+    return ["--claims", str(path)]
+
+
+OUTPUT = r"{{output: 'cost (\S+)', within: [1000, 1100], pages: {{page.md: 'costs {{{}}} EUR'}}}}"
+
+
+def test_a_number_in_its_interval_is_not_stale(tmp_path, capsys):
+    arguments = claims(tmp_path / "a.yaml", "echo cost 1,024", OUTPUT.format("1,023"))
+    assert main(arguments) == 0
+    assert "cost (\\S+): 1024, in [1000, 1100]" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("echo cost 1,124", "page.md: 'costs 1,023 EUR' is now 1124"),
+        ("echo nothing", "page.md: 'costs 1,023 EUR' is now nan"),
+        ("ls FOLDER/lost", "page.md: the command failed"),
+    ],
+)
+def test_a_number_outside_makes_its_pages_stale(tmp_path, capsys, command, message):
+    assert main(claims(tmp_path / "a.yaml", command, OUTPUT.format("1,023"))) == 1
+    assert message in capsys.readouterr().out
+
+
+def test_keys_of_the_summary_are_read(tmp_path, capsys):
+    number = "{summary: rivals.best, within: [1, 2], pages: {page.md: 'J is {1.5}'}}"
+    command = """'echo "{\\"rivals\\": {\\"best\\": 1.5}}" > FOLDER/summary.json'"""
+    assert main(claims(tmp_path / "a.yaml", command, number)) == 0
+    assert "rivals.best: 1.5, in [1, 2]" in capsys.readouterr().out
+
+
+def test_only_what_is_asked_for_runs(tmp_path, capsys):
+    arguments = claims(tmp_path / "a.yaml", "ls nowhere", OUTPUT.format("1,023"), quick=False)
+    assert main([*arguments, "--quick"]) == main([*arguments, "--only", "true"]) == 0
+    assert "nowhere" not in capsys.readouterr().out
