@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from torch_qpmpc import QPMPC, QPActorValueOperator
+from torch_qpmpc import QPMPC, Bounds, Cost, Model, QPActorValueOperator, Scheme
 from torch_qpmpc.envs import PastWindow, Plant, PlantEnv
 from torch_qpmpc.envs.linear_system import Rng, float64, normal, uniform
-from torch_qpmpc.experiment.tasks import Scheme
 
 LEARN = ("H", "H_f", "q", "c", "w", "C", "b", "G", "lb", "ub")
 
@@ -58,34 +57,28 @@ class Store(Plant):
         return (1 - x[..., 0]).relu() + (x[..., 0] - 2).relu()
 
 
-def scheme(plant: Store) -> Scheme:
+def scheme(plant: Store, gamma: float = 0.9) -> Scheme:
     """Return an ARX model, prices in the cost, soft bounds and, with a window, rate limits."""
     lags, one = plant.past - 1, torch.ones(1, dtype=torch.float64)
     weight = 0.1 * torch.eye(4, dtype=torch.float64)
     weight[0, 3] = weight[3, 0] = 1.0
     A = torch.tensor([[1.5, *[-0.5][:lags], *[0.0] * (lags - 1)]], dtype=torch.float64)
     B = torch.tensor([[0.0, *[0.5][:lags], *[0.0] * (lags - 1)]], dtype=torch.float64)
-    options: dict[str, Any] = {"E": torch.tensor([[0.0, -1.0]]), "state_slack": 2.0}
-    if lags:
-        options |= {"rate_bounds": (-0.6 * one, 0.6 * one), "rate_slack": 1.0}
-    return Scheme(A, B, weight, one, 2 * one, options=options)
+    bounds = Bounds(
+        state_bounds=(one, 2 * one),
+        action_bounds=(plant.lb_a, plant.ub_a),
+        rate_bounds=(-0.6 * one, 0.6 * one) if lags else None,
+        state_slack=2.0,
+        rate_slack=1.0 if lags else torch.inf,
+    )
+    model, cost = Model(A, B, E=[[0.0, -1.0]]), Cost(weight, hessian="block")
+    return Scheme(model.layout(plant.horizon), model, cost, bounds, gamma)
 
 
-def make_mpc(plant: Store | None = None, **options: Any) -> QPMPC:
+def make_mpc(plant: Store | None = None) -> QPMPC:
     """Make the QP of a store's `scheme`, with all of theta learned."""
     plant = Store() if plant is None else plant
-    start = scheme(plant)
-    settings = {
-        "hessian": "block",
-        "stage_weight": start.stage_weight,
-        "state_bounds": (start.lb_s, start.ub_s),
-        "action_bounds": (plant.lb_a, plant.ub_a),
-        "learn": LEARN,
-        "solver": "daqp",
-        "on_failure": "mask",
-        **start.options,
-    }
-    return QPMPC.from_model(start.A, start.B, plant.horizon, **settings | options)
+    return QPMPC(scheme(plant), learn=LEARN, solver="daqp", on_failure="mask")
 
 
 def make_operator(plant: Store | None = None, **keys: Any) -> QPActorValueOperator:

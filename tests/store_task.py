@@ -10,8 +10,8 @@ register(
     Task(
         "store",
         lambda cfg: Store(horizon=cfg.task.horizon),
-        lambda cfg, plant: scheme(plant),
-        scheme,
+        lambda cfg, plant: scheme(plant, cfg.task.gamma),
+        lambda cfg, plant: scheme(plant, cfg.task.gamma),
         closed_loop=plant_loop,
         defaults={
             "task": {

@@ -8,8 +8,13 @@ import gymnasium
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
+from torch_qpmpc.mpc.bounds import Bounds
+from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 from torch_qpmpc.qp.program import QuadraticProgram, Status
 from torch_qpmpc.qp.solution import QPSolution
@@ -25,16 +30,21 @@ if TYPE_CHECKING:
 
 __all__ = [
     "QPMPC",
+    "Bounds",
     "CompiledPolicy",
+    "Cost",
     "DeviationPenalty",
     "Export",
     "GaussNewton",
     "Identified",
+    "Layout",
+    "Model",
     "QPActorValueOperator",
     "QPError",
     "QPQLearningLoss",
     "QPSolution",
     "QuadraticProgram",
+    "Scheme",
     "SolveLog",
     "SolverError",
     "Status",

@@ -260,7 +260,7 @@ def test_the_band_of_a_window_and_a_preview():
     for name, weight in (("on", [o]), ("above", [a, aa, aaa]), ("below", [b, bb, bbb])):
         where = torch.isin(expected, torch.tensor(weight))
         assert found[name] == torch.arange(39).view(3, 13)[where].sum()
-    distance = band_distance(N_X, N_U, N, L, N_D)
+    distance = band_distance(LAYOUT)
     C = banded_matrix(A, B, N, E)
     assert (C[distance != 0] == 0).all()
     assert int((C[distance == 0] == 0).sum()) == N * N_X * (N_X - 1)

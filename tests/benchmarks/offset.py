@@ -20,13 +20,13 @@ from torch import Tensor
 import train
 from tests.benchmarks.table import DOCS
 from tests.runs import make_config
-from torch_qpmpc import QPMPC
+from torch_qpmpc import QPMPC, Model
 from torch_qpmpc.envs import TankReferences
 from torch_qpmpc.envs.closed_loop import cost_text, plant_loop
 from torch_qpmpc.envs.linear_system import Rng
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.experiment.tracking import offset_free, reference_options
+from torch_qpmpc.experiment.tracking import offset_free, reference_scheme
 from torch_qpmpc.study.markdown import replaced, table
 from torch_qpmpc.study.runs import FinishedRun
 
@@ -61,8 +61,8 @@ def corrected(cfg: DictConfig, mpc: QPMPC) -> QPMPC:
     """Return MPC with the learned model, whose predictions its last error corrects."""
     physics: Any = make_physics(cfg)
     A, B, *_ = mpc.model()
-    options = reference_options(physics, cfg.task.gamma)
-    return QPMPC.from_model(*offset_free(A, B), cfg.task.horizon, solver=cfg.solver, **options)
+    model = Model(*offset_free(A, B))
+    return QPMPC(reference_scheme(physics, model, cfg.task.gamma), solver=cfg.solver)
 
 
 def controllers(seed: int, *overrides: str) -> dict[str, tuple[QPMPC, DictConfig]]:

@@ -113,11 +113,11 @@ def test_a_task_without_a_weight_gets_the_cost_of_the_log(task, hessian):
     log = collect_log(cfg, physics)
     n_d, n_y, past = (2, 1, 2) if task == "store" else (0, 3, 1)
     sizes = Layout(n_y, 1, 3, past, n_d)
-    fields, weights, q = observed_cost(cfg, log, sizes)
+    cost = observed_cost(cfg, log, sizes)
+    W, q = cost.stage_weight, cost.q
     y = log["observation"][..., -n_y:]
     known = [log["preview"][..., :n_d]] if n_d else []
     v = torch.cat((*known, y, log["action"]), dim=-1).double()
-    W = fields["stage_weight"]
     W = torch.diag(torch.nn.functional.pad(W, (n_d, 0))) if W.ndim == 1 else W
     d, u = q[:n_d], q[sizes.n_p : sizes.n_p + 1]
     linear = torch.cat((d, q[sizes.n_before : sizes.n_p], u))
@@ -125,21 +125,21 @@ def test_a_task_without_a_weight_gets_the_cost_of_the_log(task, hessian):
     error = fitted + log["next", "reward"][..., 0]
     assert error.std() < 0.5 * log["next", "reward"].std()
     stage, beyond = -error.mean(), 0.9**4 / 0.1 * -log["next", "reward"].double().mean()
-    assert fields["c"] == pytest.approx((stage * (1 + 0.9 + 0.81 + 0.729) + beyond).item())
+    assert cost.c.item() == pytest.approx((stage * (1 + 0.9 + 0.81 + 0.729) + beyond).item())
     assert torch.equal(q[-n_y:], q[sizes.n_before : sizes.n_p])
     n = n_d + n_y
     if hessian == "diagonal":
-        assert torch.equal(weights["terminal_weight"], fields["stage_weight"][:n_y])
+        assert torch.equal(cost.terminal_weight, cost.stage_weight[:n_y])
     else:
-        assert torch.equal(weights["terminal_weight"], W[:n, :n])
+        assert torch.equal(cost.terminal_weight, W[:n, :n])
 
 
 def test_a_terminal_weight_from_the_riccati_equation_is_kept():
     cfg = make_config(*PENDULUM, "task.terminal_weight=riccati")
     log = collect_log(cfg, make_physics(cfg))
-    _, weights, q = observed_cost(cfg, log, Layout(3, 1, 3))
-    assert not weights
-    assert (q[-3:] == 0).all()
+    cost = observed_cost(cfg, log, Layout(3, 1, 3))
+    assert cost.terminal_weight is None
+    assert (cost.q[-3:] == 0).all()
 
 
 def test_the_id_alone_makes_a_qp():

@@ -20,7 +20,7 @@ from pydantic import Field
 import train
 from tests.runs import SMALL, linear_system, make_config, run_command, true_mpc
 from tests.stops import assert_same_numbers, stop
-from torch_qpmpc import QPError
+from torch_qpmpc import Cost, QPError
 from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.config import check_config
@@ -197,12 +197,24 @@ def test_a_scheme_passes_what_is_known_and_more(store_task):
     plant: Any = make_physics(cfg)
     mpc = make_mpc(cfg, plant)
     assert (mpc.n_p, mpc.past, mpc.n_d, mpc.horizon) == (10 + 3, 2, 2, 4)
-    assert mpc.quadratic_program().w[0] == 2, "an option replaces task.state_slack"
+    assert mpc.quadratic_program().w[0] == 2, "the scheme's own price, not task.state_slack"
     assert len(mpc.G) == 4 * 2 + 1 + 4, "rates, too"
     assert (mpc.C[0, :2].tolist(), mpc.C[0, 10:12].tolist()) == ([0, -1], [-0.5, 0.5])
-    with_c = dataclasses.replace(find_task(cfg.task).wrong_scheme(cfg, plant), c=7.0)
+    scheme = find_task(cfg.task).wrong_scheme(cfg, plant)
+    with_c = dataclasses.replace(scheme, cost=dataclasses.replace(scheme.cost, c=7.0))
     register(dataclasses.replace(TASKS["store"], wrong_scheme=lambda cfg, plant: with_c))
     assert make_mpc(cfg, plant).c == 7
+
+
+def test_a_scheme_without_a_cost_is_refused(store_task):
+    cfg = make_config("task=store", "constraint=free")
+    plant: Any = make_physics(cfg)
+    scheme = find_task(cfg.task).wrong_scheme(cfg, plant)
+    without = dataclasses.replace(scheme, cost=Cost(hessian="block"))
+    register(dataclasses.replace(TASKS["store"], wrong_scheme=lambda cfg, plant: without))
+    message = r"task\.name: got 'store', whose scheme has no model or no stage weight, .* start="
+    with pytest.raises(QPError, match=message):
+        make_mpc(cfg, plant)
 
 
 @pytest.mark.parametrize("algo", ["qlearning", "td3"])
@@ -231,7 +243,7 @@ from torch_qpmpc.experiment.tasks import Task, register
 from torch_qpmpc.experiment.tasks.gros_zanon import true_scheme
 
 register(
-    Task("mine", lambda cfg: GrosZanonLTI(w=7), lambda cfg, plant: true_scheme(plant), {options})
+    Task("mine", lambda cfg: GrosZanonLTI(w=7), true_scheme, {options})
 )
 """
 

@@ -14,8 +14,8 @@ from torch_qpmpc.experiment.rivals.linear_mpc import Tracking
 from torch_qpmpc.experiment.tracking import (
     TERMINAL_FACTOR,
     offset_free,
-    reference_options,
-    set_point_options,
+    reference_scheme,
+    set_point_scheme,
     window_model,
 )
 
@@ -88,7 +88,7 @@ def test_an_offset_free_model_adds_the_mean_of_the_last_errors():
 def test_the_value_at_the_set_point_is_the_discounted_cost_of_the_plan():
     p = FourTanks(horizon=6, past=3)
     A, B = window_model(p.A, p.B, *p.measurement(), p.past)
-    mpc = qm.QPMPC.from_model(A, B, p.horizon, solver="daqp", **set_point_options(p, gamma=0.9))
+    mpc = qm.QPMPC(set_point_scheme(p, qm.Model(A, B), gamma=0.9), solver="daqp")
     window = torch.randn(p.n_p, generator=torch.Generator().manual_seed(1)).double() / 3
     solution = mpc.solve(window)
     y, u = mpc.predicted(solution.z.detach())
@@ -104,7 +104,7 @@ def test_the_references_make_the_policy_of_an_mpc_that_is_written_by_hand():
     rng = np.random.default_rng(0)
     w, x = p.signals(rng, 20, 6), p.starts(rng, 20)
     x[0] = 21.0  # beyond the bounds
-    mpc = qm.QPMPC.from_model(p.A, p.B, p.horizon, solver="daqp", **reference_options(p, 1.0))
+    mpc = qm.QPMPC(reference_scheme(p, qm.Model(p.A, p.B), 1.0), solver="daqp")
     solution = mpc.solve(torch.cat((p.target(w).flatten(1), x), -1))
     cost = Tracking.of(p, TERMINAL_FACTOR)
     by_hand = qm.solve_qp(
@@ -122,7 +122,7 @@ def test_only_an_offset_free_model_tracks_references_without_an_error(memory, la
     """The plant's leaks and gains differ three times as much from the model as learning-qp's."""
     p = Reachable(horizon=8, past=1 + memory, mismatch=3.0)
     A, B = offset_free(p.A, p.B, memory) if memory else (p.A, p.B)
-    mpc = qm.QPMPC.from_model(A, B, p.horizon, solver="daqp", **reference_options(p, 1.0))
+    mpc = qm.QPMPC(reference_scheme(p, qm.Model(A, B), 1.0), solver="daqp")
     error = steady_error(mpc, p)
     if largest is None:
         assert error > 0.02

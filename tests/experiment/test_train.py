@@ -40,6 +40,7 @@ from torch_qpmpc.experiment.lock import LOCK, locked
 from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.mpc.banded import band_distance
+from torch_qpmpc.mpc.layout import Layout
 
 SUMMARY = {"seed", "constraint", "noise", "solver", "unsolved", "updates", "train_seconds"}
 SUMMARY |= {"ablation", "step"}
@@ -61,7 +62,7 @@ def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return the learned C - C_0 and the signed distance of its entries from the band."""
     state = load_checkpoint(folder / "checkpoint.pt")["mpc"]
     horizon = state["C_0"].shape[0] // 4
-    return (state["C"] - state["C_0"]).numpy(), band_distance(4, 2, horizon).numpy()
+    return (state["C"] - state["C_0"]).numpy(), band_distance(Layout(4, 2, horizon)).numpy()
 
 
 # --- One whole run -------------------------------------------------------------------------------

@@ -52,7 +52,7 @@ def test_a_qp_learns_alike_in_any_units(name, options):
     x = torch.tensor(states, dtype=torch.float64)
     plain = in_units(torch.ones(2).double(), 1.0, 1.0, 1.0, learn)
     other = in_units(x, u, d, cost, learn)
-    column, row = torch.cat((x, torch.tensor([u, d])))[plain._layout.signals()], x.repeat(4)
+    column, row = torch.cat((x, torch.tensor([u, d])))[plain.layout.signals()], x.repeat(4)
     optimizers = [GaussNewton(mpc, **options) for mpc in (plain, other)]
     errors = []
     for update in range(8):

@@ -149,7 +149,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPMPC: A 1d": (
         M(A=torch.ones(2)),
-        "A: got shape (2,), expected shape (2, 2) or (3, 2, 2).",
+        "A, B: got shapes (2,) and (2, 1), expected matrices (n_x, n_x) and (n_x, n_u).",
     ),
     "QPMPC: A complex": (
         M(A=torch.eye(2).to(torch.complex64)),
@@ -157,7 +157,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPMPC: A transposed B": (
         M(B=torch.ones(1, 2)),
-        "A, B: got shapes (2, 2) and (1, 2), expected (2, 2) and (2, 1).",
+        "A, B: got shapes (2, 2) and (1, 2), expected (n_x, L n_x) and (n_x, L n_u). L is",
     ),
     "QPMPC: A meta": (
         M(A=torch.eye(2, device="meta")),
@@ -173,7 +173,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPMPC: A 3x2": (
         M(A=torch.ones(3, 2)),
-        "A: got shape (3, 2), expected shape (3, 3) or (3, 3, 3).",
+        "A, B: got shapes (3, 2) and (2, 1), expected (n_x, L n_x) and (n_x, L n_u). L is",
     ),
     "QPMPC: A sparse": (
         M(A=torch.eye(2).to_sparse()),
@@ -291,7 +291,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPMPC.from_model: swapped": (
         lambda: qm.QPMPC.from_model(torch.ones(2, 1), torch.eye(2), 3),
-        "A, B: got shapes (2, 1) and (2, 2), expected (2, 2) and (2, 2).",
+        "A, B: got shapes (2, 1) and (2, 2), expected (n_x, L n_x) and (n_x, L n_u). L is",
     ),
     "QPMPC.from_model: none": (
         lambda: qm.QPMPC.from_model(None, None, 3),
@@ -311,7 +311,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPMPC.linear_mpc: swapped": (
         lambda: qm.QPMPC.linear_mpc(torch.ones(2, 1), torch.eye(2), 3),
-        "A, B: got shapes (2, 1) and (2, 2), expected (2, 2) and (2, 2).",
+        "A, B: got shapes (2, 1) and (2, 2), expected (n_x, L n_x) and (n_x, L n_u). L is",
     ),
     "QPMPC.value: numpy": (
         lambda: mpc.value(np.zeros((4, 2))),

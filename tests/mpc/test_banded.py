@@ -6,6 +6,7 @@ from torch.testing import assert_close
 
 from torch_qpmpc import QPError
 from torch_qpmpc.mpc.banded import band_distance, banded_matrix
+from torch_qpmpc.mpc.layout import Layout
 
 N_X, N_U, N = 3, 2, 4
 
@@ -60,12 +61,12 @@ def test_band_distance_counts_stages():
         [-1, -1, 0, 0, 0, 1, 1],
         [-2, -2, -1, -1, 0, 0, 0],
     ]
-    assert band_distance(1, 1, 3).tolist() == expected
+    assert band_distance(Layout(1, 1, 3)).tolist() == expected
 
 
 def test_the_band_is_where_a_model_has_entries():
     A, B = model()
-    C, distance = banded_matrix(A, B, N), band_distance(N_X, N_U, N)
+    C, distance = banded_matrix(A, B, N), band_distance(Layout(N_X, N_U, N))
     assert distance.shape == C.shape
     assert (C[distance != 0] == 0).all()
     # On the band only the off-diagonal entries of the minus identity are zero.

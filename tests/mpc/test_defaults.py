@@ -15,7 +15,7 @@ from torch.testing import assert_close
 
 from tests.logs import arx_log
 from torch_qpmpc import QPMPC, QPError
-from torch_qpmpc.mpc.initial import riccati_weight
+from torch_qpmpc.mpc.riccati import riccati_weight
 
 A = torch.tensor([[1.0, 0.1], [0.0, 0.9]]).double()
 B = torch.tensor([[0.0], [0.1]]).double()

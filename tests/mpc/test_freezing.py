@@ -262,7 +262,7 @@ def test_a_slack_weight_for_each_state():
     ],
 )
 def test_slack_weights_that_do_not_fit_are_named(slack, got):
-    message = f"state_slack: got .*{got}.*, expected a non-negative weight, .*one for each of the 2"
+    message = f"state_slack: got .*{got}.*, expected a non-negative weight, .*one for each of"
     with pytest.raises(QPError, match=message):
         random_mpc(0, state_slack=slack)
 
@@ -278,8 +278,8 @@ OTHERS = {
     "step": {"step": "projection"},
     "horizon": {"horizon": 4},
     "learn": {"learn": ("H", "C")},
-    "constraints": {"constraints": ([[1.0, 1.0, 0.0]], [-1.0], [1.0])},
-    "terminal_constraints": {"terminal_constraints": ([[1.0, 1.0]], [-1.0], [1.0])},
+    "n_mixed": {"constraints": ([[1.0, 1.0, 0.0]], [-1.0], [1.0])},
+    "n_terminal": {"terminal_constraints": ([[1.0, 1.0]], [-1.0], [1.0])},
     "hard rows": {"state_slack": [torch.inf, 100.0]},
 }
 

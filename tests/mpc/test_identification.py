@@ -30,7 +30,7 @@ def test_without_noise_all_starts_predict_the_plant(structure):
     mpc = QPMPC.from_data(arx_log(), N, structure=structure, **PAST, **COST)
     assert (mpc.n_x, mpc.n_u, mpc.horizon, mpc.past, mpc.n_d) == (2, 1, N, 2, 1)
     assert mpc.structure == structure
-    z = windows(read_trajectories(arx_log(seed=1), n_d=1)[0], mpc._layout)[:5]
+    z = windows(read_trajectories(arx_log(seed=1), n_d=1)[0], mpc.layout)[:5]
     plan = mpc.solve(z[:, : mpc.n_p], z[:, mpc.n_p : mpc.n_p + 1]).z
     true = banded_matrix(A, B, N, E)
     offset = -torch.tensor([0.1, -0.3]).double().repeat(N)
@@ -81,7 +81,7 @@ def test_the_start_survives_copies_and_resets():
 def test_a_released_varying_start_keeps_its_values():
     mpc = QPMPC.from_data(arx_log(noise=0.2), N, structure="varying", **PAST, **COST)
     assert mpc.model()[0].shape == (N, 2, 4)
-    p = windows(read_trajectories(arx_log(), n_d=1)[0], mpc._layout)[:3, : mpc.n_p]
+    p = windows(read_trajectories(arx_log(), n_d=1)[0], mpc.layout)[:3, : mpc.n_p]
     before = mpc.value(p)
     mpc.release()
     assert_close(mpc.value(p), before)
@@ -206,11 +206,11 @@ def two_equal_actions(log: TensorDict) -> TensorDict:
         (lambda: QPMPC(2, 1, 3, start=[1.0]), r"start: got \[1.0\], expected a mapping"),  # pyright: ignore[reportArgumentType] (the mistake)
         (
             lambda: QPMPC(2, 1, 3, start={"b": [0.0]}),
-            r"start\['b'\]: got shape \(1,\), expected shape \(6,\)",
+            r"b: got shape \(1,\), expected shape \(6,\)",
         ),
         (
             lambda: QPMPC(2, 1, 3, start={"c": torch.nan}),
-            r"start\['c'\]: got NaN or inf, expected finite entries",
+            "c: got NaN or inf, expected finite entries",
         ),
     ],
 )

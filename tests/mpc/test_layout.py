@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from torch.func import functional_call
 from torch.testing import assert_close
 
 from tests.problems import MIXED, normal, random_mpc
-from torch_qpmpc import QPMPC
+from torch_qpmpc import QPMPC, Layout, QPError
 
 GAMMA, N = 0.7, 3
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -72,3 +73,29 @@ def test_its_gradients_pass_finite_differences(name):
         )
 
     assert torch.autograd.gradcheck(cost, [x.detach().clone().requires_grad_() for x in start])
+
+
+# Sizes
+
+
+def test_sizes_are_whole_numbers_of_any_kind():
+    sizes: Any = (np.int64(2), 1, np.int32(3))
+    layout = Layout(*sizes)
+    assert layout == Layout(2, 1, 3)
+    assert type(layout.n_x) is int
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ({"n_x": 0}, "n_x: got 0, expected a positive integer"),
+        ({"n_u": 1.5}, "n_u: got 1.5, expected a positive integer"),
+        ({"horizon": "3"}, "horizon: got '3', expected a positive integer"),
+        ({"past": 0}, "past: got 0, expected a positive integer"),
+        ({"n_d": -1}, "n_d: got -1, expected a whole number >= 0"),
+        ({"n_mixed": 1.0}, "n_mixed: got 1.0, expected a whole number >= 0"),
+    ],
+)
+def test_bad_sizes_are_named(sizes, message):
+    with pytest.raises(QPError, match=message):
+        Layout(**({"n_x": 2, "n_u": 1, "horizon": 3} | sizes))

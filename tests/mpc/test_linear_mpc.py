@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from tests.problems import MIXED, normal, random_states, step
 from torch_qpmpc import QPMPC, GaussNewton, QPError
-from torch_qpmpc.mpc.initial import riccati_weight
+from torch_qpmpc.mpc.riccati import riccati_weight
 
 A = torch.tensor([[1.0, 0.2], [0.0, 0.9]]).double()
 B = torch.tensor([[0.0], [0.3]]).double()

@@ -16,7 +16,7 @@ from torch.testing import assert_close
 
 from tests.problems import normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, QPError, QuadraticProgram, solve_qp
-from torch_qpmpc.mpc.initial import riccati_weight
+from torch_qpmpc.mpc.riccati import riccati_weight
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
 
 N, N_X, N_U, N_D, L = 3, 2, 1, 2, 3
@@ -468,16 +468,9 @@ def test_an_indefinite_block_of_the_plan_is_refused():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"past": 0}, "past: got 0, expected a positive integer"),
-        ({"past": 1.0}, "past: got 1.0, expected a positive integer"),
-        ({"n_d": -1}, "n_d: got -1, expected a whole number >= 0"),
         (
             {"past": 1, "rate_bounds": ([-1.0], [1.0])},
             r"rate_bounds: got bounds with past=1, expected past >= 2. The window then holds u_",
-        ),
-        (
-            {"past": 2, "rate_bounds": ([1.0], [-1.0])},
-            "rate_bounds: got lower 1 > upper -1 at entry 0",
         ),
         ({"past": 2, "rate_bounds": ([-1.0] * 2, [1.0] * 2)}, r"rate_bounds: got shape \(2,\)"),
         (

@@ -44,7 +44,7 @@ def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
         interpolation="nearest",
         aspect="equal" if mpc.n_p == mpc.n_x else "auto",
     )
-    layout = Layout(mpc.n_x, mpc.n_u, mpc.horizon, mpc.past, mpc.n_d)
+    layout = mpc.layout
     for k in range(1, mpc.horizon):
         axes.axhline(k * mpc.n_x - 0.5, color="0.85", linewidth=0.4)
     previews = range(mpc.n_d, layout.n_preview, mpc.n_d) if mpc.n_d else ()

@@ -145,7 +145,7 @@ def prediction_form(
     check_tensor("C", C, "N n_x", "n_z", remedy="Pass mpc.C.")
     n_c, n_z = C.shape[-2:]
     N = n_c // n_x
-    layout = Layout(n_x, n_u, N, past, n_d)
+    layout = Layout(n_x, n_u, max(N, 1), past, n_d)
     if N < 1 or n_c != N * n_x or n_z != layout.n_z:
         want = f"(*batch, N n_x, n_p + N (n_x + n_u)) with n_x = {n_x}, n_u = {n_u}"
         raise QPError.expected("C", f"shape {tuple(C.shape)}", f"{want}, n_p = {layout.n_p}")

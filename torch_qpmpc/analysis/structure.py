@@ -21,6 +21,7 @@ from torch_qpmpc.analysis.prediction_form import FORM_REMEDY, PredictionForm, ch
 from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
+from torch_qpmpc.mpc.layout import Layout
 
 
 def distance_by_band(
@@ -40,7 +41,7 @@ def distance_by_band(
     check_whole("n_d", n_d, 0)
     check_tensor("C_0", C_0, "N n_x", "n_z", batched=False, remedy="Pass mpc.C_0.")
     check_tensor("C", C, *C_0.shape, batched=False, remedy="Pass mpc.C.")
-    distance = band_distance(n_x, n_u, C_0.shape[0] // n_x, past, n_d).to(C.device)
+    distance = band_distance(Layout(n_x, n_u, max(C_0.shape[0] // n_x, 1), past, n_d)).to(C.device)
     if distance.shape != C_0.shape:
         got, want = f"shape {tuple(C_0.shape)}", f"shape {tuple(distance.shape)}"
         sizes = f"n_x = {n_x}, n_u = {n_u}, past = {past}, n_d = {n_d}"

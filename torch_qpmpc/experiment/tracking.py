@@ -1,11 +1,11 @@
-"""MPC schemes of the tanks: their costs as arguments of `QPMPC`, and models for windows of outputs.
+"""MPC schemes of the tanks, and models for windows of outputs.
 
-A model is A = [A_1, .., A_L] and B = [B_1, .., B_L], the newest first, as in `QPMPC`.
+A model is A = [A_1, .., A_L] and B = [B_1, .., B_L], the newest first, as in `Model`.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -13,6 +13,10 @@ from torch import Tensor
 
 from torch_qpmpc.envs.four_tanks import FourTanks
 from torch_qpmpc.envs.tank_references import TankReferences
+from torch_qpmpc.mpc.bounds import Bounds
+from torch_qpmpc.mpc.cost import Cost
+from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.scheme import Scheme
 
 #: R of schemes for the set point: it makes up for errors of the model and for a short horizon, to
 #: which plans with the plant's own R of 1e-4 are sensitive.
@@ -21,16 +25,17 @@ INPUT_WEIGHT = 0.3
 TERMINAL_FACTOR = 11.0
 
 
-def set_point_options(
-    plant: FourTanks, gamma: float, input_weight: float | None = None
-) -> dict[str, Any]:
-    """Return the arguments of `QPMPC` for the plant's own cost and bounds.
+def set_point_scheme(
+    plant: FourTanks, model: Model, gamma: float, input_weight: float | None = None
+) -> Scheme:
+    """Make the scheme of a model and the plant's own cost and bounds.
 
     The set point is in q and c, which complete the squares of (y_k - r)'Q(y_k - r) and
     (u_k - u_r)'R(u_k - u_r); the terminal cost is (y_N - r)'Q(y_N - r).
 
     Args:
         plant: the plant.
+        model: the model, for the plant's window.
         gamma: the discount.
         input_weight: replaces the entries of R, such as `INPUT_WEIGHT`.
     """
@@ -40,39 +45,34 @@ def set_point_options(
     N, weight, target = plant.horizon, torch.cat((Q, R)), torch.cat((plant.r, u_r))
     stage, terminal = weight @ target.square(), Q @ plant.r.square()
     linear = (-2 * weight * target).repeat(N + 1)[: -len(R)]
-    start = {
-        "q": F.pad(linear, ((plant.past - 1) * len(weight), 0)),
-        "c": sum(gamma**k for k in range(N)) * stage + gamma**N * terminal,
-    }
-    return {
-        "gamma": gamma,
-        "hessian": "block",
-        "stage_weight": torch.diag(2 * weight),
-        "terminal_weight": torch.diag(2 * Q),
-        "start": start,
-        "action_bounds": (plant.lb_a, plant.ub_a),
-    }
+    cost = Cost(
+        torch.diag(2 * weight),
+        torch.diag(2 * Q),
+        hessian="block",
+        q=F.pad(linear, ((plant.past - 1) * len(weight), 0)),
+        c=sum(gamma**k for k in range(N)) * stage + gamma**N * terminal,
+    )
+    bounds = Bounds(action_bounds=(plant.lb_a, plant.ub_a))
+    return Scheme(model.layout(N), model, cost, bounds, gamma)
 
 
-def reference_options(plant: TankReferences, gamma: float) -> dict[str, Any]:
-    """Return the arguments of `QPMPC` for the plant's own cost and bounds.
+def reference_scheme(plant: TankReferences, model: Model, gamma: float) -> Scheme:
+    """Make the scheme of a model and the plant's own cost and bounds.
 
     The references d_k = r_k are cross terms of H, which make (x_k - r_k)'Q(x_k - r_k) with the
     terms r_k'Q r_k. The terminal cost is `TERMINAL_FACTOR` times that.
     """
     Q, R = (torch.diag(2 * weight) for weight in plant.weights())
     tracking = torch.cat((torch.cat((Q, -Q), -1), torch.cat((-Q, Q), -1)))
-    return {
-        "gamma": gamma,
-        "n_d": plant.n_d,
-        "hessian": "block",
-        "stage_weight": torch.block_diag(tracking, R),
-        "terminal_weight": TERMINAL_FACTOR * tracking,
-        "state_bounds": (plant.lb_x, plant.ub_x),
-        "state_slack": plant.price,
-        "discount_slack": True,
-        "action_bounds": (plant.lb_a, plant.ub_a),
-    }
+    cost = Cost(torch.block_diag(tracking, R), TERMINAL_FACTOR * tracking, hessian="block")
+    bounds = Bounds(
+        state_bounds=(plant.lb_x, plant.ub_x),
+        state_slack=plant.price,
+        discount_slack=True,
+        action_bounds=(plant.lb_a, plant.ub_a),
+    )
+    layout = replace(model.layout(plant.horizon), n_d=plant.n_d)
+    return Scheme(layout, model, cost, bounds, gamma)
 
 
 def offset_free(A: Tensor, B: Tensor, memory: int = 1) -> tuple[Tensor, Tensor]:

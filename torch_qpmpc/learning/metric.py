@@ -45,7 +45,7 @@ def signal_sizes(mpc: QPMPC, group: dict[str, Any], z: Tensor) -> tuple[Tensor, 
 
     A signal that was always zero counts as one.
     """
-    signals = mpc._layout.signals().to(z.device)
+    signals = mpc.layout.signals().to(z.device)
     count = signals.bincount()
     squares = torch.zeros_like(z[0, : len(count)]).index_add(0, signals, z.square().mean(0))
     m = squares / count

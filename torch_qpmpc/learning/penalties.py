@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch_qpmpc.checks import check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
+from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.module import QPMPC
 
 WINDOWS_REMEDY = "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}."
@@ -107,8 +108,8 @@ class DeviationPenalty(nn.Module):
         check_tensor("C_0", C_0, "N n_x", "n_z", batched=False, remedy=remedy)
         if not C_0.isfinite().all():
             raise QPError.expected("C_0", "NaN or inf", "finite entries", remedy)
-        horizon = C_0.shape[0] // n_x
-        distance = band_distance(n_x, n_u, horizon, past, n_d)
+        horizon = max(C_0.shape[0] // n_x, 1)
+        distance = band_distance(Layout(n_x, n_u, horizon, past, n_d))
         if distance.shape != C_0.shape:
             raise QPError.expected(
                 "C_0",

@@ -68,9 +68,9 @@ def _staircase(blocks: Tensor, step: int) -> Tensor:
     return rows.movedim(0, 1).flatten(0, 1)
 
 
-def band_distance(n_x: int, n_u: int, horizon: int, past: int = 1, n_d: int = 0) -> Tensor:
+def band_distance(layout: Layout) -> Tensor:
     """Return the signed distance from the band in stages, ``(N n_x, n_z)``, > 0 above it."""
-    n = n_x + n_u
+    n_x, n, horizon, past = layout.n_x, layout.n, layout.horizon, layout.past
     row = torch.arange(horizon).repeat_interleave(n_x).unsqueeze(1)
     column = torch.arange((horizon + past - 1) * n + n_x)
     stage = column // n - (past - 1)
@@ -78,5 +78,5 @@ def band_distance(n_x: int, n_u: int, horizon: int, past: int = 1, n_d: int = 0)
     # x_{k+1} is on the band of row block k, u_{k+1} the first block above it.
     above = (stage - row - is_state.long()).clamp(min=0)
     below = (row + 1 - past - stage).clamp(min=0)
-    preview = torch.arange(horizon + 1).repeat_interleave(n_d) - row
+    preview = torch.arange(horizon + 1).repeat_interleave(layout.n_d) - row
     return torch.cat((preview, above - below), dim=-1)

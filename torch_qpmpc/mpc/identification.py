@@ -17,8 +17,8 @@ from torch_qpmpc.checks import check_choice, check_flag, check_number, check_who
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.predictor import (
+    ARX,
     Constraints,
-    Model,
     Options,
     fit,
     prediction_errors,
@@ -51,7 +51,7 @@ class Identified:
         data: the trajectories.
     """
 
-    model: Model
+    model: ARX
     constraints: Constraints
     options: Options
     data: Sequence[Trajectory]

@@ -12,11 +12,15 @@ D^f on (d_N, x_N) (eq:v1c4), then one for each entry of the changes u_k - u_{k-1
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from numbers import Integral
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from torch_qpmpc.checks import check_whole
+from torch_qpmpc.errors import QPError
 
 
 @dataclass(frozen=True)
@@ -24,11 +28,22 @@ class Layout:
     """The sizes of z and of G.
 
     Attributes:
-        n_x, n_u, horizon: the numbers of states (or measured outputs) and actions, and N.
-        past: L, the length of the window of the past.
+        n_x: number of states, or of measured outputs.
+        n_u: number of actions.
+        horizon: N, at least 1.
+        past: L, the number of outputs in the window of the past, at least 1.
         n_d: entries of a stage's preview d_k.
-        n_mixed, n_terminal: rows of D and of D^f.
-        n_rates: entries of u_k - u_{k-1} that have bounds, n_u or 0.
+        n_mixed, n_terminal: rows of D and of D^f, which a `Scheme` counts.
+        n_rates: entries of u_k - u_{k-1} that have bounds, n_u or 0; likewise.
+
+    Raises:
+        QPError: a size is not a whole number, or too small.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> layout = qm.Layout(n_x=2, n_u=1, horizon=5, past=3)
+        >>> layout.n_p, layout.n_z
+        (8, 23)
     """
 
     n_x: int
@@ -39,6 +54,16 @@ class Layout:
     n_mixed: int = 0
     n_terminal: int = 0
     n_rates: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("n_x", "n_u", "horizon", "past"):
+            size = getattr(self, name)
+            if not isinstance(size, Integral) or isinstance(size, bool) or int(size) < 1:
+                raise QPError.expected(name, repr(size), "a positive integer")
+        for name in ("n_d", "n_mixed", "n_terminal", "n_rates"):
+            check_whole(name, getattr(self, name), 0)
+        for field in fields(self):
+            object.__setattr__(self, field.name, int(getattr(self, field.name)))
 
     @property
     def n(self) -> int:
@@ -62,7 +87,7 @@ class Layout:
 
     @property
     def n_z(self) -> int:
-        """Entries of z."""
+        """Entries of z, known and planned."""
         return self.n_before + self.horizon * self.n + self.n_x
 
     @property
@@ -83,8 +108,9 @@ class Layout:
     def rows(self, x: Tensor, u: Tensor, D: Tensor, D_f: Tensor, rates: Tensor) -> Tensor:
         """Arrange values of the rows of G ``(n_g,)``.
 
-        They are those of x, u, D ``(N, n_mixed)``, D^f ``(n_terminal,)`` and u_k - u_{k-1}
-        ``(N, n_rates)``; a leading N + 1 or N may be 1, for the same values in all stages.
+        They are those of x ``(N + 1, n_x)``, u ``(N + 1, n_u)``, D ``(N, n_mixed)``, D^f as
+        ``D_f`` ``(n_terminal,)`` and u_k - u_{k-1} as ``rates`` ``(N, n_rates)``; a leading N + 1
+        or N may be 1, for the same values in all stages.
         """
         D, rates = (part.expand(self.horizon, -1).flatten() for part in (D, rates))
         return torch.cat((self.stages(x, u), D, D_f, rates))
@@ -92,7 +118,7 @@ class Layout:
     def discounts(self, gamma: float) -> tuple[Tensor, Tensor]:
         """Return gamma^k for the entries of z ``(n_z,)`` and for the rows of G ``(n_g,)``.
 
-        It is one for the past.
+        It is one for the past. ``gamma`` is the discount.
         """
         powers = gamma ** torch.arange(self.horizon + 1, dtype=torch.float64).unsqueeze(-1)
         d, x, u = (powers.expand(-1, size) for size in (self.n_d, self.n_x, self.n_u))
@@ -108,7 +134,7 @@ class Layout:
         return self.rows(x, u, D[:-1], D_f[-1], rates[:-1])
 
     def ties(self, part: str) -> Tensor:
-        """Return the index of the value of each entry of a tied q, b, lb, ub or w.
+        """Return the index of the value of each entry of a tied ``part``, q, b, lb, ub or w.
 
         x_N has values of its own in q and w, as w^f in eq:v1c0, but not in lb and ub; d_N has them
         in q.
@@ -140,19 +166,19 @@ class Layout:
         return torch.cat((d, stages[: self.n_z - self.n_preview]))
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of z."""
+        """Return the states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of ``z``."""
         plan, terminal = z[..., self.n_before : -self.n_x], z[..., None, -self.n_x :]
         stages = plan.unflatten(-1, (self.horizon, self.n))
         return torch.cat((stages[..., : self.n_x], terminal), -2), stages[..., self.n_x :]
 
     def from_stage(self, blocks: Tensor) -> Tensor:
-        """Return rows ``(N i, n_z)`` with ``(N, i, n_d + n)`` at the columns of d_k, x_k, u_k."""
+        """Return rows ``(N i, n_z)`` with ``blocks`` ``(N, i, n_d + n)`` at d_k, x_k and u_k."""
         d, plan = (torch.block_diag(*x) for x in blocks.split((self.n_d, self.n), dim=-1))
         d = F.pad(d, (0, self.n_before - d.shape[-1]))
         return torch.cat((d, F.pad(plan, (0, self.n_x))), dim=-1)
 
     def from_terminal(self, block: Tensor) -> Tensor:
-        """Return rows ``(i, n_z)`` with ``(i, n_d + n_x)`` at the columns of d_N and x_N."""
+        """Return rows ``(i, n_z)`` with ``block`` ``(i, n_d + n_x)`` at d_N and x_N."""
         d, x = block.split((self.n_d, self.n_x), dim=-1)
         d = F.pad(d, (self.n_preview - self.n_d, self.n_z - self.n_preview - self.n_x))
         return torch.cat((d, x), dim=-1)
@@ -169,7 +195,7 @@ class Layout:
         return torch.cat((d, rows[:, self.n_z - self.n_x :]), dim=-1)
 
     def model_blocks(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what row block k of C has at its window and at d_k, with a leading N."""
+        """Return what row block k of ``rows``, as of C, has at its window and at d_k, with an N."""
         window = _diagonal_blocks(rows, self.horizon, self.n_preview, self.reach, self.n)
         return window, _diagonal_blocks(rows, self.horizon, 0, self.n_d, self.n_d)
 
@@ -185,9 +211,9 @@ class Layout:
     ) -> Tensor:
         """Return H ``(n_z, n_z)`` (eq:qpH) from those of the stages and of x_N, or from a full H.
 
-        The blocks of a block-diagonal H are those of (d_k, x_k, u_k) and (d_N, x_N); a diagonal H
-        has entries for the plan only. ``stages`` is `tied_stages`, for a diagonal H that all
-        stages share.
+        The ``blocks`` of the ``kind`` "block" are those of (d_k, x_k, u_k) and (d_N, x_N); a
+        diagonal H has entries for the plan only. ``discount`` is that of z, and ``stages`` is
+        `tied_stages`, for a diagonal H that all stages share.
         """
         H = blocks[0]
         if kind == "diagonal":
@@ -201,7 +227,10 @@ class Layout:
         return root.unsqueeze(-1) * H * root
 
     def block_hessian(self, stage: Tensor, terminal: Tensor) -> Tensor:
-        """Return H ``(n_z, n_z)`` without discounts from blocks of (d_k, x_k, u_k), (d_N, x_N)."""
+        """Return H ``(n_z, n_z)`` without discounts.
+
+        Its blocks are ``stage`` of (d_k, x_k, u_k), one or N, and ``terminal`` of (d_N, x_N).
+        """
         n_d, size = self.n_d, self.n_d + self.n
         blocks = (*stage.expand(self.horizon, size, size), terminal)
         plan = torch.block_diag(*(block[n_d:, n_d:] for block in blocks))

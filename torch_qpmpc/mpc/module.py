@@ -9,33 +9,37 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torch_qpmpc.checks import check_kind, check_tensor
+from torch_qpmpc.checks import check_choice, check_kind, check_tensor
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc import coordinates, initial, parameters, pickling
+from torch_qpmpc.mpc import coordinates, parameters
+from torch_qpmpc.mpc.cost import check_chosen
 from torch_qpmpc.mpc.identification import identify
-from torch_qpmpc.mpc.identity import check_identity, digest, encoded
+from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
-from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST
+from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST, check_step
 from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
+from torch_qpmpc.mpc.scheme import GAMMA, Scheme
+from torch_qpmpc.mpc.state import check_identity, digest, encoded, reduce
 from torch_qpmpc.mpc.validation import (
     CONSTRAINTS,
     COST,
     STRUCTURES,
-    check_model,
+    as_tensor,
+    check_learn,
     check_pair,
-    check_structure,
     learned_entries,
-    own,
 )
 from torch_qpmpc.qp.batching import full_precision, to_dtype
 from torch_qpmpc.qp.forking import serially_if_forked
+from torch_qpmpc.qp.pipeline.solve import ON_FAILURE
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
@@ -45,10 +49,10 @@ if TYPE_CHECKING:
     from torch_qpmpc.export.export import Export
 
 #: Attributes that only the constructor and `QPMPC.release` set.
-FIXED = ("n_x", "n_u", "horizon", "past", "n_d", "n_p", "n_z", "gamma")
+FIXED = ("scheme", "layout", "n_x", "n_u", "horizon", "past", "n_d", "n_p", "n_z", "gamma")
 FIXED = (*FIXED, "hessian", "structure", "step", "learned")
-#: The default discount, that of the paper.
-GAMMA = 0.9
+#: The parts of theta that are learned by default.
+LEARN = ("H", "c", "C")
 #: The warning of a random start.
 RANDOM = (
     "This QPMPC acts with a random model or stage cost, which is a start to learn from and not a "
@@ -74,62 +78,28 @@ class QPMPC(nn.Module):
     are the measured outputs, which need not be a state.
 
     Args:
-        n_x: number of states, or of measured outputs.
-        n_u: number of actions.
-        horizon: N, at least 1.
-        past: L, at least 1.
-        n_d: entries of d_k.
-        gamma: discount of the stage costs, 0 < gamma <= 1.
-        A, B: the initial model in C, ``(n_x, n_x)`` and ``(n_x, n_u)``, or one per stage,
-            ``(N, n_x, n_x)`` and ``(N, n_x, n_u)``. By default, A is the identity plus, and B is,
-            random normal entries with standard deviation 0.1. With a window they are
-            ``[A_1, .., A_L]`` and ``[B_1, .., B_L]``, side by side, the newest first.
-        E: the factor of d_k in x_{k+1}, ``(n_x, n_d)`` or one per stage; zero by default.
-        offset: the offset of the model x+ = A x + B u + offset, ``(n_x,)``, which gives the initial
-            b; zero by default.
-        state_bounds, action_bounds: pairs (lower, upper) of ``(n_x,)`` and of ``(n_u,)``; unbounded
-            by default.
-        constraints: mixed constraints of each stage, ``lower <= D [x_k; u_k] <= upper`` (eq:v1c4),
-            as the triple (D, lower, upper) of ``(m, n_x + n_u)`` and ``(m,)`` twice. With a preview
-            D multiplies [d_k; x_k; u_k]: bounds that change with time are entries of d_k.
-        terminal_constraints: the same for x_N, with D^f ``(m_f, n_x)``, or for [d_N; x_N].
-        rate_bounds: a pair (lower, upper) of ``(n_u,)`` for u_k - u_{k-1}; needs past >= 2.
+        sizes: a `Scheme`, which has the sizes, the model, the cost, the bounds and the discount;
+            or n_x, n_u, horizon and, optionally, past and n_d, the short way to one.
+        learn: the parameters among H, H_f, q, c, C, b, G, lb, ub, w; the others are buffers. In a
+            mapping, ``{"H": True, "C": mask}``, a mask of the part's shape is True at the entries
+            that are learned, for example at all but the rows of a constant reference.
         structure: the ties between learned parts of theta. ``"free"``: none, C is any matrix
             (eq:qp5). ``"tied"``: those of a linear MPC scheme (eq:q1), with one A, B, D and one
             entry of b, q, lb, ub and w for all stages; ``"varying"``: with one for each stage.
             In both, the bounds of hard rows are known limits (eq:v1c3), and are not learned.
-        hessian: ``"diagonal"``, ``"block"`` (one dense block a stage) or ``"full"`` (dense in z).
-        stage_weight: the initial H_k, ``(n_x + n_u,)`` if diagonal, else
-            ``(n_x + n_u, n_x + n_u)``, with an optional leading N for one weight per stage; by
-            default diagonal, random uniform in (0.5, 5) for states and zero for actions, of which
-            a `UserWarning` tells when the policy first acts before a state_dict is loaded. The cost
-            of a stage is *half* of ``[x_k; u_k]' H_k [x_k; u_k]`` (eq:qpH): for a plant's cost
-            ``s'Ws``, pass 2 W. With a preview and a dense H it may be one of [d_k; x_k; u_k], of
-            which only the block of (x_k, u_k) must be positive semidefinite: a price p times u_k
-            is an entry 1 in both of their cross blocks.
-        terminal_weight: the initial H_f, ``(n_x,)`` or ``(n_x, n_x)``, or of [d_N; x_N].
-            ``"riccati"``: the cost to go of the linear quadratic regulator of A, B and the stage
-            weight, about the x of least stage cost for d_N; not for a diagonal hessian. By default
-            it is that if it exists, for one dense stage, past=1 and no q in ``start``; else the
-            stage's own weight. With a random stage weight it is the identity.
-        state_slack, action_slack, constraint_slack, rate_slack: the slack weights w of the rows of
-            states, of actions, of mixed and terminal constraints, and of rates; ``inf`` makes them
-            hard. By default, actions and rates are hard and the others soft. Pass one weight or,
-            except for constraints, one per entry.
-        discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
-        learn: the parameters among H, H_f, q, c, C, b, G, lb, ub, w; the others are buffers. In a
-            mapping, ``{"H": True, "C": mask}``, a mask of the part's shape is True at the entries
-            that are learned, for example at all but the rows of a constant reference.
         step: the rule that keeps H and H_f positive semidefinite and w non-negative (eq:sdp1).
             ``"cholesky"``: theta is a factor of them. ``"projection"`` and ``"sdp"``: theta is H
             itself, which `project_` corrects after each step, by eigenvalues or by a semidefinite
             program; see `torch_qpmpc.mpc.projections`.
         solver, on_failure: see `solve_qp`.
-        start: initial values of some of q, c, C and b by name, without discounts, in place of those
-            that follow from the other arguments.
-        seed: the seed of random initial values.
+        options: the arguments of `Scheme.of` by name, if no scheme is passed: those of `Model`,
+            `Cost` and `Bounds`, ``gamma``, ``start`` and ``seed``. Where A, B or ``stage_weight``
+            is missing, the start is random, of which a `UserWarning` tells when the policy first
+            acts before a state_dict is loaded.
 
     Attributes:
+        scheme: the `Scheme` that theta starts from.
+        layout: its `Layout`.
         C_0: the banded C of the initial model, ``(N n_x, n_z)``.
         n_p: the number of entries of p, (N + 1) n_d + (L - 1) (n_x + n_u) + n_x.
 
@@ -168,6 +138,19 @@ class QPMPC(nn.Module):
     hardness: Tensor
     stages: Tensor
 
+    @overload
+    def __init__(
+        self,
+        scheme: Scheme,
+        *,
+        learn: Collection[str] = LEARN,
+        structure: str = "free",
+        step: str = CHOLESKY,
+        solver: str = "proxqp",
+        on_failure: str = "raise",
+    ) -> None: ...
+
+    @overload
     def __init__(
         self,
         n_x: int,
@@ -175,70 +158,51 @@ class QPMPC(nn.Module):
         horizon: int,
         past: int = 1,
         n_d: int = 0,
-        *,
-        gamma: float = GAMMA,
-        A: Any = None,
-        B: Any = None,
-        E: Any = None,
-        offset: Any = None,
-        state_bounds: tuple[Any, Any] | None = None,
-        action_bounds: tuple[Any, Any] | None = None,
-        constraints: tuple[Any, Any, Any] | None = None,
-        terminal_constraints: tuple[Any, Any, Any] | None = None,
-        rate_bounds: tuple[Any, Any] | None = None,
+        **options: Any,
+    ) -> None: ...
+
+    def __init__(
+        self,
+        *sizes: Any,
+        learn: Collection[str] = LEARN,
         structure: str = "free",
-        hessian: str = "diagonal",
-        stage_weight: Any = None,
-        terminal_weight: Any = None,
-        state_slack: Any = 100.0,
-        action_slack: Any = torch.inf,
-        constraint_slack: float = 100.0,
-        rate_slack: Any = torch.inf,
-        discount_slack: bool = False,
-        learn: Collection[str] = ("H", "c", "C"),
         step: str = CHOLESKY,
         solver: str = "proxqp",
         on_failure: str = "raise",
-        start: Mapping[str, Any] | None = None,
-        seed: int = 0,
+        **options: Any,
     ) -> None:
-        passed = {name: x for name, x in locals().items() if name not in ("self", "__class__")}
-        # Copies for reset_parameters and pickle, as the caller may change its arrays.
-        arguments = {name: own(value) for name, value in passed.items()}
         super().__init__()
-        check_structure(**arguments)
-        whole = ("n_x", "n_u", "horizon", "past", "n_d", "seed")
-        arguments |= {name: int(arguments[name]) for name in whole}
-        self._arguments = arguments
-        self._random = stage_weight is None or A is None or B is None
+        scheme = _scheme_of(sizes, options)
+        check_choice("structure", structure, STRUCTURES)
+        check_choice("on_failure", on_failure, ON_FAILURE)
+        check_step(step)
+        check_learn(learn, structure, scheme.cost.hessian, scheme.layout.n_linear)
         backend(solver)
+        self.scheme, self.layout, self._random = scheme, scheme.layout, scheme.is_random
+        self.n_x, self.n_u, self.horizon = self.layout.n_x, self.layout.n_u, self.layout.horizon
+        self.past, self.n_d, self.gamma = self.layout.past, self.layout.n_d, scheme.gamma
+        self.n_p, self.n_z = self.layout.n_p, self.layout.n_z
+        self.hessian, self.structure, self.step = scheme.cost.hessian, structure, step
+        self.solver, self.on_failure = solver, on_failure
         with torch.device("cpu"):
-            self._start(arguments["learn"])
+            self._start(learn)
         if (device := torch.get_default_device()).type != "cpu":
             self.to(device)
 
     @serially_if_forked
     def _start(self, learn: Collection[str]) -> None:
-        arguments = self._arguments
-        self._layout, theta = initial.theta(**arguments)
-        self.n_x, self.n_u, self.horizon = (arguments[name] for name in ("n_x", "n_u", "horizon"))
-        self.past, self.n_d, self.gamma = (arguments[name] for name in ("past", "n_d", "gamma"))
-        self.n_p, self.n_z = self._layout.n_p, self._layout.n_z
-        self.hessian, self.structure = arguments["hessian"], arguments["structure"]
-        self.step = arguments["step"]
-        self.solver, self.on_failure = arguments["solver"], arguments["on_failure"]
+        """Register the scheme's theta as parameters and buffers."""
+        theta = dict(self.scheme.theta)
         self.learned = tuple(name for name in (*COST, *CONSTRAINTS) if name in learn)
         self._masks = learned_entries(learn, theta)
-        self.register_buffer("C_0", theta["C"].to(torch.float64))
+        self.register_buffer("C_0", self.scheme.C_0.clone())
         self.register_buffer("soft", theta["w"].isfinite())
-        self._hard_rows = digest(theta["w"].isinf())
         self._derive()
-        theta |= initial.started(theta, **arguments)
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
         self._block_ndims = [theta[name].ndim for name in ("H", "H_f") if name in theta]
         for name, start in theta.items():
-            parameters.register(self, name, start.to(torch.float64).clone(), name in self.learned)
+            parameters.register(self, name, start.clone(), name in self.learned)
             if name in self.learned:
                 parameters.attach(self, name, self._parametrizations_for(name))
 
@@ -247,7 +211,7 @@ class QPMPC(nn.Module):
         """Return a QPMPC whose C starts as the banded C_0 of the model x+ = A x + B u (eq:cband).
 
         Args:
-            A, B: see `QPMPC`; their shapes give n_x, n_u and past.
+            A, B: see `Model`; their shapes give n_x, n_u and past.
             horizon: N.
             options: the keyword arguments of `QPMPC`, of which ``stage_weight`` is required; the
                 shape of E gives n_d.
@@ -255,13 +219,12 @@ class QPMPC(nn.Module):
         Raises:
             QPError: an argument is invalid, or there is no stage cost.
         """
-        A, B = check_model(A, B)
-        n_x, n_u, past = initial.model_sizes(A, B)
-        if (E := options.get("E")) is not None:
-            options.setdefault("n_d", torch.as_tensor(E).shape[-1])
-        mpc = cls(n_x, n_u, horizon, **{"past": past, "A": A, "B": B} | options)
-        initial.check_cost(options.get("stage_weight"), n_x, n_u)
-        return mpc
+        for name, matrix in (("A", A), ("B", B)):
+            as_tensor(name, matrix)  # None would be drawn at random
+        layout = Model(A, B, options.get("E")).layout(horizon)
+        check_chosen(options.get("stage_weight"), layout)
+        arguments = {"past": layout.past, "n_d": layout.n_d, "A": A, "B": B} | options
+        return cls(layout.n_x, layout.n_u, layout.horizon, **arguments)
 
     @classmethod
     def from_data(
@@ -310,14 +273,16 @@ class QPMPC(nn.Module):
             causal=causal,
             ridge=ridge,
         )
-        arguments: dict[str, Any] = {**found.arguments, **options}
+        arguments = {**found.arguments, **options}
         starts = [found.arguments.get("start", {}), options.get("start") or {}]
         if arguments.get("stage_weight") is None:
-            diagonal = options.get("hessian", "diagonal") == "diagonal"
-            fitted = fit_rewards(trajectories, found.options.layout, diagonal)
-            cost = scheme_cost(fitted, found.options.layout, options.get("gamma", GAMMA), diagonal)
-            starts.insert(0, cost.pop("start"))
-            arguments = {**arguments, **cost, **{k: x for k, x in options.items() if x is not None}}
+            hessian, layout = options.get("hessian", "diagonal"), found.options.layout
+            fitted = fit_rewards(trajectories, layout, hessian == "diagonal")
+            cost = scheme_cost(fitted, layout, options.get("gamma", GAMMA), hessian)
+            arguments["stage_weight"] = cost.stage_weight
+            if arguments.get("terminal_weight") is None:
+                arguments["terminal_weight"] = cost.terminal_weight
+            starts.insert(0, {"q": cost.q, "c": cost.c})
         return cls(**{**arguments, "start": {k: x for part in starts for k, x in part.items()}})
 
     @classmethod
@@ -341,7 +306,14 @@ class QPMPC(nn.Module):
             >>> [tuple(part.shape) for part in mpc.model()]
             [(2, 2), (2, 1)]
         """
-        return cls.from_model(A, B, horizon, **(initial.linear_mpc(**options) | options))
+        hessian = options.get("hessian", "block")
+        learn = ["H", "H_f", "q", "c", "C", "b", "lb", "ub", "w"]
+        if hessian == "full":
+            learn.remove("H_f")
+        if {"constraints", "terminal_constraints"} & options.keys():
+            learn.append("G")
+        defaults = {"structure": "tied", "hessian": hessian, "discount_slack": True}
+        return cls.from_model(A, B, horizon, **{**defaults, "learn": learn, **options})
 
     def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
         """Return V(s) (eq:qp4), a cost to go: s ``(*batch, n_p)`` to ``(*batch,)``.
@@ -432,7 +404,7 @@ class QPMPC(nn.Module):
 
         The plan is z ``(*batch, n_z)``, such as that of `solve`.
         """
-        return self._layout.predicted(check_tensor("z", z, self.n_z))
+        return self.layout.predicted(check_tensor("z", z, self.n_z))
 
     def model(self) -> tuple[Tensor, ...]:
         """Return A and B, ``(n_x, L n_x)`` and ``(n_x, L n_u)``, with a leading N if they vary.
@@ -444,7 +416,7 @@ class QPMPC(nn.Module):
         """
         if self.structure == "free":
             raise QPError.expected("structure", "'free'", "'tied' or 'varying', which have a model")
-        return Banded(self._layout, self.structure == "tied").right_inverse(self.C)
+        return Banded(self.layout, self.structure == "tied").right_inverse(self.C)
 
     def readable(self) -> dict[str, Tensor]:
         """Return the learned parts, detached: A, B, E and D for C and G, shared values once."""
@@ -467,7 +439,6 @@ class QPMPC(nn.Module):
             remedy = f"Those are: {', '.join(freer) or 'none'}."
             raise QPError.expected("structure", repr(structure), expected, remedy)
         vars(self)["structure"] = structure
-        self._arguments = {**self._arguments, "structure": structure}
         for part in self.learned:
             if parametrize.is_parametrized(self, part) and part not in ("H", "H_f"):
                 parameters.replace(self, part, self._parametrizations_for(part))
@@ -491,7 +462,7 @@ class QPMPC(nn.Module):
         """
         for name, leaf in self._projected().items():
             dense = self.hessian != "diagonal" and name != "w"
-            n_free = self._layout.n_before if self.hessian == "full" else self.n_d
+            n_free = self.layout.n_before if self.hessian == "full" else self.n_d
             of_plan = leaf[..., n_free:, n_free:] if dense else leaf[..., None, None]
             of_plan.copy_(NEAREST[self.step](of_plan))
 
@@ -596,7 +567,7 @@ class QPMPC(nn.Module):
 
     def reset_parameters(self) -> None:
         """Reset theta to its initial values."""
-        fresh = parametrize.type_before_parametrizations(self)(**self._arguments)
+        fresh = parametrize.type_before_parametrizations(self)(self.scheme, **self._options())
         for name, start in (*fresh.named_parameters(), *fresh.named_buffers()):
             owner, _, leaf = name.rpartition(".")
             # By attribute, as a functional call replaces parameters with plain tensors.
@@ -626,10 +597,10 @@ class QPMPC(nn.Module):
             >>> twin.load_state_dict(saved["state"])
             <All keys matched successfully>
         """
-        return {name: pickling.plain(value) for name, value in self._arguments.items()}
+        return self.scheme.arguments | self._options()
 
     def __reduce_ex__(self, protocol: Any) -> tuple:
-        return pickling.reduce(self, self._arguments, self._parametrizations_for)
+        return reduce(self, self.scheme, self._options(), self._parametrizations_for)
 
     def __copy__(self) -> QPMPC:
         twin = type(self).__new__(type(self))
@@ -649,18 +620,22 @@ class QPMPC(nn.Module):
     def set_extra_state(self, state: Tensor) -> None:
         """Do nothing: `_load_from_state_dict` has compared the identities already."""
 
+    def _options(self) -> dict[str, Any]:
+        """Return the constructor's arguments besides the scheme."""
+        learn = {name: self._masks.get(name, True) for name in self.learned}
+        names = ("structure", "step", "solver", "on_failure")
+        return {"learn": learn, **{name: str(getattr(self, name)) for name in names}}
+
     def _identity(self) -> dict[str, Any]:
-        """Return all that values depend on besides parameters and buffers, by argument."""
-        names = ("n_x", "n_u", "horizon", "past", "n_d", "gamma", "structure", "hessian", "step")
-        names = (*names, "discount_slack")
+        """Return what values depend on besides parameters and buffers."""
         masks = {name: digest(mask) for name, mask in self._masks.items()}
         return {
-            **{name: self._arguments[name] for name in names} | {"gamma": float(self.gamma)},
-            "constraints": self._layout.n_mixed,
-            "terminal_constraints": self._layout.n_terminal,
-            "rate_bounds": self._layout.n_rates,
+            **asdict(self.layout),
+            "gamma": float(self.gamma),
+            **{name: getattr(self, name) for name in ("structure", "hessian", "step")},
+            "discount_slack": self.scheme.bounds.discount_slack,
             "learn": {name: masks.get(name, True) for name in self.learned},
-            "hard rows": self._hard_rows,
+            "hard rows": digest(self.scheme.theta["w"].isinf()),
         }
 
     def checked_state(self, state_dict: dict[str, Any], prefix: str) -> dict[str, Any]:
@@ -681,13 +656,13 @@ class QPMPC(nn.Module):
 
     def _derive(self) -> None:
         """Register the buffers that follow from the arguments and are not in the state_dict."""
-        discount, of_rows = self._layout.discounts(self.gamma)
-        weights = of_rows if self._arguments["discount_slack"] else torch.ones_like(of_rows)
+        discount, of_rows = self.layout.discounts(self.gamma)
+        weights = of_rows if self.scheme.bounds.discount_slack else torch.ones_like(of_rows)
         hardness = torch.where(self.soft, 0.0, torch.inf)
         derived = {"discount": discount, "slack_discount": weights, "hardness": hardness}
         for name, buffer in derived.items():
             self.register_buffer(name, buffer.to(self.C_0), persistent=False)
-        stages = self._layout.tied_stages().to(self.C_0.device)
+        stages = self.layout.tied_stages().to(self.C_0.device)
         self.register_buffer("stages", stages, persistent=False)
         for part in self.modules():
             if isinstance(part, Masked | Tied):
@@ -731,7 +706,7 @@ class QPMPC(nn.Module):
         blocks = [theta[name] for name in ("H", "H_f") if name in theta]
 
         def hessian(*blocks: Tensor) -> Tensor:
-            return self._layout.hessian(self.hessian, blocks, self.discount, self.stages)
+            return self.layout.hessian(self.hessian, blocks, self.discount, self.stages)
 
         H = coordinates.for_each(hessian, blocks, self._block_ndims)
         # A hard row's w is a placeholder, to which its hardness adds inf.
@@ -743,10 +718,23 @@ class QPMPC(nn.Module):
         if self.structure != "free" and name in ("lb", "ub"):
             soft = self.soft.cpu()
             mask = soft if mask is None else mask & soft
-        options = (self._layout, self.structure, self.hessian, self.step, mask)
+        options = (self.layout, self.structure, self.hessian, self.step, mask)
         return parametrizations_for(name, value, *options)
 
     def _projected(self) -> dict[str, nn.Parameter]:
         """Return the parameters that `project_` projects, by part."""
         names = () if self.step == CHOLESKY else SIGNED
         return {name: parameters.leaves(self, name)[0] for name in names if name in self.learned}
+
+
+def _scheme_of(sizes: tuple[Any, ...], options: dict[str, Any]) -> Scheme:
+    """Return the Scheme that is passed, or that of the sizes and options."""
+    scheme = options.get("scheme", sizes[0] if sizes else None)
+    if not isinstance(scheme, Scheme):
+        return Scheme.of(*sizes, **options)
+    others = [*map(repr, sizes[1:]), *(name for name in options if name != "scheme")]
+    if others:
+        remedy = "dataclasses.replace makes another Scheme."
+        got = f"a Scheme and {', '.join(others)}"
+        raise QPError.expected("scheme", got, "a Scheme alone", remedy)
+    return scheme

@@ -41,7 +41,7 @@ from torch_qpmpc.mpc.trajectories import Trajectory
 SPANS = 3
 
 
-class Model(NamedTuple):
+class ARX(NamedTuple):
     """An ARX model: A ``(n_x, L n_x)``, B ``(n_x, L n_u)``, E ``(n_x, n_d)``, offset ``(n_x,)``.
 
     A and B have the newest lag first.
@@ -69,17 +69,17 @@ class Options(NamedTuple):
     ridge: float | None = None
 
 
-def arx(trajectories: Sequence[Trajectory], layout: Layout, strength: float | None = None) -> Model:
+def arx(trajectories: Sequence[Trajectory], layout: Layout, strength: float | None = None) -> ARX:
     """Fit an ARX model with as many lags as the window of ``layout``; see `ridge`."""
     X, Y = transitions(trajectories, layout)
     W, offset = _regression(X, Y, _differences(layout, known(layout, 0)), strength)
     E, window = W[:, : layout.n_d], W[:, layout.n_d :]
     pairs = window.unflatten(-1, (layout.past, layout.n)).flip(-2)
     A, B = (x.flatten(1) for x in pairs.split((layout.n_x, layout.n_u), dim=-1))
-    return Model(A, B, E, offset)
+    return ARX(A, B, E, offset)
 
 
-def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[Model, Constraints]:
+def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[ARX, Constraints]:
     """Fit an ARX model, and correct its banded C and b as the structure allows.
 
     A row block is not corrected if the data have too few starts.

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.checks import check_kind, check_number, check_tensor
-from torch_qpmpc.mpc.initial import riccati_weight
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.riccati import riccati_weight
 from torch_qpmpc.mpc.validation import check_weight
 
 

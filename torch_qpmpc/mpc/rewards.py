@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.stage_cost import StageCost, fit_stage_cost
 from torch_qpmpc.mpc.trajectories import logs, valid_steps
@@ -33,19 +34,18 @@ def fit_rewards(log: Any, layout: Layout, diagonal: bool = False) -> StageCost:
     return fit_stage_cost(torch.cat(v), torch.cat(cost), layout.n_d, diagonal)
 
 
-def scheme_cost(found: StageCost, layout: Layout, gamma: float, diagonal: bool) -> dict[str, Any]:
-    """Return the arguments of `QPMPC` for a stage cost, which is that of x_N, too."""
+def scheme_cost(found: StageCost, layout: Layout, gamma: float, hessian: str) -> Cost:
+    """Return the cost of a scheme for that of a stage, which is that of x_N, too."""
     n_d, n_x, n_u, N = layout.n_d, layout.n_x, layout.n_u, layout.horizon
-    W, terminal = (found.W[n_d:, n_d:].diagonal() if diagonal else found.W), n_d + n_x
+    diagonal = hessian == "diagonal"
+    W = found.W[n_d:, n_d:].diagonal() if diagonal else found.W
+    terminal = W[:n_x] if diagonal else W[: n_d + n_x, : n_d + n_x]
     d, x, u = found.q.split((n_d, n_x, n_u))
     past = found.q.new_zeros(layout.n_before - layout.n_preview)
     stages = layout.stages(x.expand(N + 1, -1), u)
     ahead = gamma ** torch.arange(N + 1, dtype=torch.float64)
-    return {
-        "stage_weight": W,
-        "terminal_weight": W[:n_x] if diagonal else W[:terminal, :terminal],
-        "start": {"q": torch.cat((d.repeat(N + 1), past, stages)), "c": found.c * ahead.sum()},
-    }
+    q = torch.cat((d.repeat(N + 1), past, stages))
+    return Cost(W, terminal, hessian, q=q, c=found.c * ahead.sum())
 
 
 def _observed(steps: Any, layout: Layout) -> tuple[Tensor, Tensor]:

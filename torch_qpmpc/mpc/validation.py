@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from numbers import Integral, Real
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from torch_qpmpc.checks import (
-    check_choice,
-    check_flag,
-    check_number,
-    check_seed,
-    check_tensor,
-    check_whole,
-)
+from torch_qpmpc.checks import check_tensor
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.projections import check_step
 from torch_qpmpc.qp.batching import broadcast, to_dtype
-from torch_qpmpc.qp.pipeline.solve import ON_FAILURE
 
-HESSIANS = ("diagonal", "block", "full")
 #: In order, from the least tied to the most.
 STRUCTURES = ("free", "varying", "tied")
 #: The parts of theta by family; the paper advises a different learning rate for each.
@@ -33,63 +20,28 @@ COST = ("H", "H_f", "q", "c", "w")
 CONSTRAINTS = ("C", "b", "G", "lb", "ub")
 
 
-def check_structure(
-    n_x: int,
-    n_u: int,
-    horizon: int,
-    past: int,
-    n_d: int,
-    gamma: float,
-    hessian: str,
-    structure: str,
-    learn: Collection[str],
-    step: str,
-    on_failure: str,
-    discount_slack: bool,
-    seed: int,
-    **_: Any,
-) -> None:
-    """Raise `QPError` unless the sizes and choices among the arguments of `QPMPC` are valid."""
-    for name, size in (("n_x", n_x), ("n_u", n_u), ("horizon", horizon), ("past", past)):
-        if not isinstance(size, Integral) or isinstance(size, bool) or int(size) < 1:
-            raise QPError.expected(name, repr(size), "a positive integer")
-    check_whole("n_d", n_d, 0)
-    check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
-    check_choice("hessian", hessian, HESSIANS)
-    check_choice("structure", structure, STRUCTURES)
-    check_choice("on_failure", on_failure, ON_FAILURE)
-    check_step(step)
-    check_flag("discount_slack", discount_slack)
-    check_seed(seed)
+def check_learn(learn: Collection[str], structure: str, hessian: str, n_linear: int) -> None:
+    """Raise `QPError` unless ``learn`` has names of parts that a QPMPC can learn.
+
+    Args:
+        learn: the argument of `QPMPC`.
+        structure, hessian: those of the QPMPC and its cost.
+        n_linear: rows of D and D^f.
+    """
     parts = (*COST, *CONSTRAINTS)
     if (
         not isinstance(learn, Collection)
         or isinstance(learn, str)
         or not all(isinstance(part, str) and part in parts for part in learn)
     ):
-        raise QPError.expected(
-            "learn", repr(learn), f"a collection of names among {', '.join(parts)}"
-        )
+        expected = f"a collection of names among {', '.join(parts)}"
+        raise QPError.expected("learn", repr(learn), expected)
     if hessian == "full" and "H_f" in learn:
-        raise QPError.expected(
-            "learn",
-            "'H_f' with hessian='full'",
-            "'H' alone",
-            "A full H contains the terminal block.",
-        )
-
-
-def own(value: Any) -> Any:
-    """Copy an argument that its caller may change: arrays, tensors, and containers of them."""
-    if isinstance(value, Tensor):
-        return value.detach().clone()
-    if isinstance(value, np.ndarray):
-        return value.copy()
-    if isinstance(value, Mapping):
-        return {key: own(item) for key, item in value.items()}
-    if type(value) in (list, tuple):
-        return type(value)(map(own, value))
-    return value
+        remedy = "A full H contains the terminal block."
+        raise QPError.expected("learn", "'H_f' with hessian='full'", "'H' alone", remedy)
+    if "G" in learn and structure != "free" and not n_linear:
+        remedy = "Pass constraints, or structure='free'."
+        raise QPError.expected("learn", "'G' without constraints", "other parts", remedy)
 
 
 def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -113,24 +65,21 @@ def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict
     return masks
 
 
-def check_model(A: Any, B: Any) -> tuple[Tensor, Tensor]:
-    """Return A and B as tensors with at least two dimensions, which give n_x, n_u and past."""
-    A, B = as_tensor("A", A), as_tensor("B", B)
-    if A.ndim < 2 or B.ndim < 2:
-        got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
-        raise QPError.expected("A, B", got, "matrices (n_x, n_x) and (n_x, n_u)")
-    return A, B
-
-
 def as_tensor(name: str, value: Any) -> Tensor:
     """Convert to a float64 tensor on the CPU; raise `QPError` unless it is finite."""
-    tensor = _read(name, value)
+    tensor = read_numbers(name, value)
     if not tensor.isfinite().all():
         raise QPError.expected(name, "NaN or inf", "finite entries")
     return tensor
 
 
-def _read(name: str, value: Any) -> Tensor:
+def owned(name: str, value: Any) -> Tensor | None:
+    """Return a copy by `as_tensor`, which the caller cannot change, or None for None."""
+    return None if value is None else as_tensor(name, value).detach().clone()
+
+
+def read_numbers(name: str, value: Any) -> Tensor:
+    """Convert to a float64 tensor on the CPU, which may have NaN or inf."""
     of_scipy = hasattr(value, "toarray")
     if of_scipy or (isinstance(value, Tensor) and value.layout != torch.strided):
         remedy = f"Convert it: {name}.{'toarray' if of_scipy else 'to_dense'}()."
@@ -154,76 +103,6 @@ def _brief(value: Any) -> str:
     return repr(value)
 
 
-def bound(name: str, bounds: tuple[Any, Any] | None, side: int, size: int) -> Tensor:
-    """Return the lower bounds ``(size,)`` for side 0, or the upper ones for side 1."""
-    if bounds is None:
-        return torch.full((size,), (2 * side - 1) * torch.inf)
-    try:
-        lower, upper = bounds
-    except (TypeError, ValueError) as error:
-        raise QPError.expected(name, repr(bounds), "the pair (lower, upper)") from error
-    values = _read(name, (lower, upper)[side])
-    if values.isnan().any():
-        raise QPError.expected(name, "NaN", "no NaN; inf for no bound")
-    if tuple(values.shape) != (size,):
-        raise QPError.expected(
-            name, f"shape {tuple(values.shape)}", f"shape ({size},) on each side"
-        )
-    if (values == (1 - 2 * side) * torch.inf).any():
-        raise QPError.expected(
-            name, f"{values.tolist()}", ("lower bounds below inf", "upper bounds above -inf")[side]
-        )
-    return values
-
-
-def bound_pair(name: str, bounds: tuple[Any, Any] | None, size: int) -> tuple[Tensor, Tensor]:
-    """Return both sides of `bound`; raise `QPError` if they cross."""
-    lower, upper = bound(name, bounds, 0, size), bound(name, bounds, 1, size)
-    crossing = (lower > upper).nonzero()
-    if len(crossing):
-        i = int(crossing[0])
-        got = f"lower {lower[i]:g} > upper {upper[i]:g} at entry {i}"
-        raise QPError.expected(name, got, "lower <= upper", "The pair is (lower, upper).")
-    return lower, upper
-
-
-def cost_weights(
-    stage_weight: Any, terminal_weight: Any, hessian: str, layout: Layout
-) -> dict[str, Tensor]:
-    """Return the initial H and H_f in the shapes for ``hessian``; only H if it is full.
-
-    A dense weight of (x_k, u_k) alone has zeros for the preview.
-    """
-    stage = as_tensor("stage_weight", stage_weight)
-    terminal = as_tensor("terminal_weight", terminal_weight)
-    n_x, n, n_d, horizon = layout.n_x, layout.n, layout.n_d, layout.horizon
-    diagonal = hessian == "diagonal"
-    # A square matrix is one dense block, even where the horizon happens to be its size.
-    diagonals = ((n,), (horizon, n)) if horizon != n else ((n,),)
-    if not diagonal and tuple(stage.shape) in diagonals:
-        stage = torch.diag_embed(stage)
-    if not diagonal and tuple(terminal.shape) == (n_x,):
-        terminal = torch.diag(terminal)
-    if not diagonal and n_d:
-        widened = (n_d, 0, n_d, 0)
-        stage = F.pad(stage, widened) if stage.shape[-2:] == (n, n) else stage
-        terminal = F.pad(terminal, widened) if terminal.shape == (n_x, n_x) else terminal
-    event = (n,) if diagonal else (n_d + n,) * 2
-    terminal_event = (n_x,) if diagonal else (n_d + n_x,) * 2
-    per_stage = (horizon, *event)
-    if tuple(stage.shape) not in (event, per_stage):
-        got = f"shape {tuple(stage.shape)}"
-        raise QPError.expected("stage_weight", got, f"shape {event} or {per_stage}")
-    if tuple(terminal.shape) != terminal_event:
-        got = f"shape {tuple(terminal.shape)}"
-        raise QPError.expected("terminal_weight", got, f"shape {terminal_event}")
-    check_weight("stage_weight", stage, diagonal, n_d)
-    check_weight("terminal_weight", terminal, diagonal, n_d)
-    if hessian == "full":
-        return {"H": layout.block_hessian(stage, terminal)}
-    return {"H": stage, "H_f": terminal}
-
-
 def check_weight(name: str, weight: Tensor, diagonal: bool, n_d: int) -> None:
     """Raise `QPError` unless a weight, or its diagonal, is symmetric positive semidefinite.
 
@@ -239,20 +118,6 @@ def check_weight(name: str, weight: Tensor, diagonal: bool, n_d: int) -> None:
         got = f"smallest eigenvalue {eigenvalues.min():.3g}"
         remedy = "It weights a cost: negate a reward's weight."
         raise QPError.expected(name, got, "a positive semidefinite weight", remedy)
-
-
-def slack_weight(name: str, weight: Any, size: int | None = None) -> Tensor:
-    """Return slack weights ``(size,)`` from one for all rows, or from one for each."""
-    one, each = "a non-negative weight, or inf for hard rows", f"; or one for each of the {size}"
-    expected = one if size is None else one + each
-    if isinstance(weight, Real) or size is None:
-        check_number(name, weight, lambda x: x >= 0, expected)
-        return torch.full((size or 1,), float(weight), dtype=torch.float64)
-    if isinstance(weight, Sequence | np.ndarray | Tensor) and not isinstance(weight, str):
-        weights = _read(name, weight)
-        if tuple(weights.shape) == (size,) and (weights >= 0).all():
-            return weights
-    raise QPError.expected(name, repr(weight), expected)
 
 
 def check_pair(s: Tensor, a: Tensor, n_p: int, n_u: int, device: torch.device) -> Tensor:

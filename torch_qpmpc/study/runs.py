@@ -109,7 +109,7 @@ class FinishedRun:
             model, nan if the constraints do not determine the states or the true model is unknown.
         """
         mpc = self.learned
-        above = band_distance(mpc.n_x, mpc.n_u, mpc.horizon, mpc.past, mpc.n_d) > 0
+        above = band_distance(mpc.layout) > 0
         readings = {
             "zeros_above": (mpc.C[above] == 0).double().mean().item(),
             "prediction_error": math.nan,

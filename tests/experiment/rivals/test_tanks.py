@@ -14,7 +14,7 @@ from torch_qpmpc.experiment.rivals.deepc import DeePC, windows
 from torch_qpmpc.experiment.rivals.kalman_mpc import KalmanMPC
 from torch_qpmpc.experiment.rivals.logs import uniform_log
 from torch_qpmpc.experiment.rivals.tanks import FOUR_TANKS_RIVALS, TANK_REFERENCES_RIVALS
-from torch_qpmpc.experiment.tracking import INPUT_WEIGHT, set_point_options, window_model
+from torch_qpmpc.experiment.tracking import INPUT_WEIGHT, set_point_scheme, window_model
 
 
 def test_more_knowledge_costs_less_at_the_set_point():
@@ -135,12 +135,11 @@ def test_a_log_has_uniform_actions_and_seeds_of_its_own():
 def test_identified_from_a_log_the_tanks_cost_little_more_than_with_the_true_model():
     p = FourTanks()
     log = uniform_log(p, 1000, seed=1)
-    options = set_point_options(p, 1.0, INPUT_WEIGHT)
-    from_data = qm.QPMPC.from_data(
-        log, p.horizon, past=p.past, n_x=2, ridge=0.0, solver="daqp", **options
-    )
-    A, B = window_model(p.A, p.B, *p.measurement(), p.past)
-    true = qm.QPMPC.from_model(A, B, p.horizon, solver="daqp", **options)
-    J = [plant_loop(mpc.policy, p, steps=100, starts=16, seed=3).J for mpc in (from_data, true)]
+    found = qm.identify(log, p.horizon, past=p.past, n_x=2, ridge=0.0)
+    identified = qm.Model(*found.model, *found.constraints)
+    true = qm.Model(*window_model(p.A, p.B, *p.measurement(), p.past))
+    schemes = (set_point_scheme(p, model, 1.0, INPUT_WEIGHT) for model in (identified, true))
+    policies = (qm.QPMPC(scheme, solver="daqp").policy for scheme in schemes)
+    J = [plant_loop(policy, p, steps=100, starts=16, seed=3).J for policy in policies]
     assert J[0] == pytest.approx(218, abs=8)
     assert J[0] < 1.03 * J[1]

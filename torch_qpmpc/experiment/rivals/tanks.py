@@ -19,7 +19,8 @@ from torch_qpmpc.experiment.rivals.kalman_mpc import KalmanMPC
 from torch_qpmpc.experiment.rivals.linear_mpc import LinearMPC, OmniscientMPC, Tracking
 from torch_qpmpc.experiment.rivals.logs import uniform_log
 from torch_qpmpc.experiment.rivals.rival import Policy, Rival
-from torch_qpmpc.experiment.tracking import TERMINAL_FACTOR, offset_free, reference_options
+from torch_qpmpc.experiment.tracking import TERMINAL_FACTOR, offset_free, reference_scheme
+from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 
 #: The horizons of the Kalman filter's MPC.
@@ -56,8 +57,7 @@ def deepc(plant: FourTanks, log: TensorDictBase, horizon: int = 20) -> DeePC:
 
 def reference_mpc(plant: TankReferences, A: Tensor, B: Tensor) -> Policy:
     """Make MPC of a model and the plant's own cost, without discount."""
-    options = reference_options(plant, gamma=1.0)
-    return QPMPC.from_model(A, B, plant.horizon, solver="daqp", **options).policy
+    return QPMPC(reference_scheme(plant, Model(A, B), gamma=1.0), solver="daqp").policy
 
 
 #: Rivals for the set point; DeePC has a log of its own.

@@ -19,7 +19,8 @@ from torch_qpmpc.envs.tank_references import TankReferences
 from torch_qpmpc.experiment.heating import known_model
 from torch_qpmpc.experiment.rivals.heating import make_mpc
 from torch_qpmpc.experiment.rivals.rival import Policy
-from torch_qpmpc.experiment.tracking import reference_options
+from torch_qpmpc.experiment.tracking import reference_scheme
+from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.regulator import lqr_gain
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
@@ -60,9 +61,8 @@ def tank_references(plant: TankReferences) -> Policy:
     """Make the policy, for the noise of the levels without the mismatch of the model."""
     K = -lqr_gain(plant.A, plant.B, torch.diag(torch.cat(plant.weights())))
     W = plant.noise_std**2 * torch.eye(4).to(plant.A)
-    options = reference_options(plant, gamma=1.0)
-    options |= {"learn": (), "solver": "daqp"}
-    mpc = QPMPC.from_model(plant.A, plant.B, plant.horizon, **options)
+    scheme = reference_scheme(plant, Model(plant.A, plant.B), gamma=1.0)
+    mpc = QPMPC(scheme, learn=(), solver="daqp")
     tighten(mpc, prediction_covariance(plant.A + plant.B @ K, W, plant.horizon), K=K)
     return mpc.policy
 

@@ -6,11 +6,12 @@ Each task is one file that registers it. A user's script can register more.
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
+from dataclasses import replace
 
 from omegaconf import DictConfig
 from torch import Tensor
 
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
     four_tanks,
     gros_zanon,
@@ -25,19 +26,20 @@ from torch_qpmpc.experiment.tasks.identified import Start, identified_scheme
 from torch_qpmpc.experiment.tasks.registry import (
     TASKS,
     AnyPlant,
-    Scheme,
     Task,
     TaskSettings,
     find_task,
     learned_parts,
+    plant_scheme,
+    priced,
     register,
 )
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.scheme import Scheme
 
 __all__ = [
     "TASKS",
     "AnyPlant",
-    "Scheme",
     "Task",
     "TaskSettings",
     "find_task",
@@ -46,6 +48,8 @@ __all__ = [
     "make_physics",
     "make_true_mpc",
     "named_code",
+    "plant_scheme",
+    "priced",
     "register",
     "resume_arguments",
     "run_code",
@@ -60,16 +64,18 @@ def make_physics(cfg: DictConfig) -> AnyPlant:
 
 def make_mpc(cfg: DictConfig, physics: AnyPlant, start: Start | None = None) -> QPMPC:
     """Make the QP that learns, from the task's wrong scheme or, if there is one, from ``start``."""
-    scheme = find_task(cfg.task).wrong_scheme(cfg, physics)
+    task = find_task(cfg.task)
+    scheme = task.wrong_scheme(cfg, physics)
     if start is not None:
         scheme = identified_scheme(cfg, scheme, start)
-    return _make(cfg, physics, scheme, learned_parts(cfg))
+    masks = task.masks(cfg, physics)
+    return _make(cfg, scheme, {part: masks.get(part, True) for part in learned_parts(cfg)})
 
 
 def make_true_mpc(cfg: DictConfig, physics: AnyPlant) -> QPMPC | None:
     """Make the same QP with the true model, cost and bounds; None if they are unknown."""
     true_scheme = find_task(cfg.task).true_scheme
-    return None if true_scheme is None else _make(cfg, physics, true_scheme(physics), ())
+    return None if true_scheme is None else _make(cfg, true_scheme(cfg, physics), ())
 
 
 def true_model(
@@ -79,37 +85,19 @@ def true_model(
     return physics.true_model()
 
 
-def _terminal_weight(choice: str, scheme: Scheme) -> Any:
-    """Return the argument of `QPMPC`, which is None for ``default``."""
-    if choice == "identity" and scheme.A is not None:
-        return [1.0] * scheme.A.shape[-2]
-    return "riccati" if choice == "riccati" else None
-
-
-def _make(
-    cfg: DictConfig,
-    physics: AnyPlant,
-    scheme: Scheme,
-    learn: Collection[str],
-) -> QPMPC:
-    task = cfg.task
-    options = {
-        "offset": scheme.offset,
-        "gamma": task.gamma,
-        "state_bounds": (scheme.lb_s, scheme.ub_s),
-        "action_bounds": (physics.lb_a, physics.ub_a),
-        "structure": cfg.constraint.structure,
-        "hessian": task.hessian,
-        "stage_weight": scheme.stage_weight,
-        "terminal_weight": _terminal_weight(task.terminal_weight, scheme),
-        "state_slack": task.state_slack,
-        "action_slack": task.action_slack,
-        "discount_slack": task.discount_slack,
-        "learn": learn,
-        "step": cfg.step,
-        "solver": cfg.solver,
-        "on_failure": "mask",
-    }
-    options |= scheme.options
-    options["start"] = {"c": scheme.c, **options.get("start", {})}
-    return QPMPC.from_model(scheme.A, scheme.B, task.horizon, **options)
+def _make(cfg: DictConfig, scheme: Scheme, learn: Collection[str]) -> QPMPC:
+    if scheme.is_random:
+        got = f"{cfg.task.name!r}, whose scheme has no model or no stage weight"
+        raise QPError.expected("task.name", got, "a scheme with both", "Or use start=data.")
+    choice = cfg.task.terminal_weight
+    if scheme.cost.terminal_weight is None and choice != "default":
+        weight = choice if choice == "riccati" else [1.0] * scheme.layout.n_x
+        scheme = replace(scheme, cost=replace(scheme.cost, terminal_weight=weight))
+    return QPMPC(
+        scheme,
+        learn=learn,
+        structure=cfg.constraint.structure,
+        step=cfg.step,
+        solver=cfg.solver,
+        on_failure="mask",
+    )

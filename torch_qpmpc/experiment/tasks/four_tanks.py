@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,10 @@ from torch_qpmpc.envs import FourTanks
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.experiment.fields import Count
 from torch_qpmpc.experiment.rivals.tanks import FOUR_TANKS_RIVALS
-from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
-from torch_qpmpc.experiment.tracking import INPUT_WEIGHT, set_point_options, window_model
+from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, priced, register
+from torch_qpmpc.experiment.tracking import INPUT_WEIGHT, set_point_scheme, window_model
+from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.scheme import Scheme
 
 #: Largest errors of the wrong model: of an entry on A's diagonal, and of a pump's relative gain.
 WRONG_LEAK, WRONG_GAIN = 0.04, 0.3
@@ -37,19 +40,18 @@ def wrong_scheme(cfg: DictConfig, plant: FourTanks) -> Scheme:
     leaks = torch.as_tensor(rng.uniform(-WRONG_LEAK, WRONG_LEAK, 4))
     gains = torch.as_tensor(rng.uniform(1 - WRONG_GAIN, 1 + WRONG_GAIN, 2))
     A, B = plant.A + torch.diag(leaks), plant.B * gains
-    return _scheme(plant, A, B, cfg.task.gamma)
+    return _scheme(cfg, plant, A, B, cfg.task.gamma)
 
 
-def true_scheme(plant: FourTanks) -> Scheme:
+def true_scheme(cfg: DictConfig, plant: FourTanks) -> Scheme:
     """Return the scheme with the best prediction from the window, without discount."""
-    return _scheme(plant, plant.A, plant.B, gamma=1.0)
+    return _scheme(cfg, plant, plant.A, plant.B, gamma=1.0)
 
 
-def _scheme(plant: FourTanks, A: Tensor, B: Tensor, gamma: float) -> Scheme:
-    options = set_point_options(plant, gamma, INPUT_WEIGHT)
-    model = window_model(A, B, *plant.measurement(), plant.past)
-    free = plant.r.new_full((plant.n_y,), torch.inf)
-    return Scheme(*model, options["stage_weight"], -free, free, options=options)
+def _scheme(cfg: DictConfig, plant: FourTanks, A: Tensor, B: Tensor, gamma: float) -> Scheme:
+    model = Model(*window_model(A, B, *plant.measurement(), plant.past))
+    scheme = set_point_scheme(plant, model, gamma, INPUT_WEIGHT)
+    return replace(scheme, bounds=priced(cfg, scheme.bounds))
 
 
 def episode(plant: FourTanks, d: Tensor) -> dict[str, Any]:

@@ -8,17 +8,24 @@ from omegaconf import DictConfig
 from torch_qpmpc.envs import GrosZanonLTI
 from torch_qpmpc.experiment.rivals import tightened
 from torch_qpmpc.experiment.rivals.rival import Rival
-from torch_qpmpc.experiment.tasks.registry import Scheme, Task, register
+from torch_qpmpc.experiment.tasks.registry import Task, plant_scheme, register
+from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.scheme import Scheme
+
+#: W of the cost 1/2 [x; u]' W [x; u].
+WEIGHT = torch.tensor([1.0, 1.0, 0.5])
 
 
 def wrong_scheme(cfg: DictConfig, plant: GrosZanonLTI) -> Scheme:
     """Return their wrong model; as in the original, the first upper bound is too wide by one."""
     wide = plant.ub_s + torch.tensor([1.0, 0.0]).to(plant.ub_s)
-    return Scheme(*plant.wrong_model(), true_scheme(plant).stage_weight, plant.lb_s, wide)
+    model = Model(*plant.wrong_model())
+    return plant_scheme(cfg, plant, model, WEIGHT, state_bounds=(plant.lb_s, wide))
 
 
-def true_scheme(plant: GrosZanonLTI) -> Scheme:
-    return Scheme.true(plant, plant.A.new_tensor([1.0, 1.0, 0.5]))
+def true_scheme(cfg: DictConfig, plant: GrosZanonLTI) -> Scheme:
+    A, B, offset = plant.true_model()
+    return plant_scheme(cfg, plant, Model(A, B, offset=offset), WEIGHT)
 
 
 register(

@@ -13,7 +13,9 @@ from torch_qpmpc.envs.closed_loop import gymnasium_loop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.fields import MATRIX, Expected, Matrix
 from torch_qpmpc.experiment.tasks.code import has_run
-from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
+from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, plant_scheme, register
+from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.scheme import Scheme
 
 
 def _is_chosen(id: str) -> str:
@@ -23,7 +25,7 @@ def _is_chosen(id: str) -> str:
 
 
 #: A matrix of the model; null by default, which `given_scheme` accepts with ``start=data`` only.
-Model = Annotated[Matrix | None, MATRIX]
+Given = Annotated[Matrix | None, MATRIX]
 
 
 class GymnasiumSettings(TaskSettings):
@@ -37,9 +39,9 @@ class GymnasiumSettings(TaskSettings):
     kwargs: Annotated[
         dict[str, Any] | None, Expected("further arguments of gymnasium.make by name, or null")
     ] = None
-    A: Model
-    B: Model
-    stage_weight: Model
+    A: Given
+    B: Given
+    stage_weight: Given
 
 
 #: Instructions for finding a model and passing it on the command line.
@@ -92,7 +94,8 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
             for sizes in (shapes, needed)
         )
         raise QPError.expected("task.id", f"{spaces}, with {got}", expected, REMEDY)
-    return Scheme(**matrices, lb_s=plant.lb_s, ub_s=plant.ub_s)
+    model = Model(matrices["A"], matrices["B"])
+    return plant_scheme(cfg, plant, model, matrices["stage_weight"])
 
 
 register(

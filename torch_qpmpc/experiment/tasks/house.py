@@ -14,16 +14,18 @@ from torch_qpmpc.envs import House
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.heated_house import DAY, DT, LOWER, OUTDOOR, PRICE, UPPER, HeatedHouse
 from torch_qpmpc.experiment.fields import Count, Flag, NonNegative
-from torch_qpmpc.experiment.heating import Model, heating_options, known_model
+from torch_qpmpc.experiment.heating import heating_scheme, known_model
 from torch_qpmpc.experiment.rivals.houses import HOUSE_RIVALS
 from torch_qpmpc.experiment.tasks.registry import (
-    Scheme,
     Task,
     TaskSettings,
-    learned_parts,
+    plant_layout,
+    priced,
     register,
 )
 from torch_qpmpc.mpc.banded import band_distance
+from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.scheme import Scheme
 
 #: The resistance that the tutorial's planner assumes, in K/kW.
 WRONG_R = 2.0
@@ -55,47 +57,37 @@ def wrong_scheme(cfg: DictConfig, plant: House) -> Scheme:
     return learned_scheme(cfg, plant, lagged_model(replace(plant, R=WRONG_R)), COST)
 
 
-def true_scheme(plant: House) -> Scheme:
+def true_scheme(cfg: DictConfig, plant: House) -> Scheme:
     """Return the scheme with the true model, without discount; it does not see the gain."""
-    return heating_scheme(plant, lagged_model(plant), gamma=1.0)
+    scheme = heating_scheme(plant, lagged_model(plant))
+    return replace(scheme, bounds=priced(cfg, scheme.bounds))
 
 
 def lagged_model(plant: House) -> Model:
     """Return the known model, with coefficients of zero for the earlier lags of the window."""
-    A, B, E = known_model(plant)
-    return pad(A, (0, plant.past - 1)), pad(B, (0, plant.past - 1)), E
+    model, lags = known_model(plant), (0, plant.past - 1)
+    return replace(model, A=pad(model.A, lags), B=pad(model.B, lags))
 
 
 def learned_scheme(cfg: DictConfig, plant: HeatedHouse, model: Model, cost: float) -> Scheme:
-    """Make the scheme that learns, whose c is the part of a typical cost that lies beyond N.
+    """Make the scheme that learns, whose c is the part of a typical cost that lies beyond N."""
+    gamma = cfg.task.gamma
+    c = gamma**plant.horizon / (1 - gamma) * cost / DAY if gamma < 1 else 0.0
+    scheme = heating_scheme(plant, model, gamma=gamma, margin=cfg.task.margin, c=c)
+    return replace(scheme, bounds=priced(cfg, scheme.bounds))
+
+
+def masks(cfg: DictConfig, plant: HeatedHouse) -> dict[str, Tensor]:
+    """Make the masks of q and of a free C, which keeps the zeros above its band.
 
     The learned entries of q are those of the forecasts, in which V and Q become linear: others
     would be prices of the plan, of which that of y_N is not bounded.
     """
-    gamma = cfg.task.gamma
-    n_z = plant.n_p + plant.horizon * (plant.n_y + plant.n_u)
-    masks = {"q": torch.arange(n_z) < plant.n_preview}
+    layout = plant_layout(plant, plant.horizon)
+    found = {"q": torch.arange(layout.n_z) < layout.n_preview}
     if cfg.constraint.structure == "free":
-        distance = band_distance(plant.n_y, plant.n_u, plant.horizon, plant.past, plant.n_d)
-        masks["C"] = distance <= 0
-    beyond = gamma**plant.horizon / (1 - gamma) if gamma < 1 else 0.0
-    return heating_scheme(
-        plant,
-        model,
-        margin=cfg.task.margin,
-        c=beyond * cost / DAY,
-        learn={part: masks.get(part, True) for part in learned_parts(cfg)},
-    )
-
-
-def heating_scheme(
-    plant: HeatedHouse, model: Model, *, c: float = 0.0, margin: float = 0.0, **options: Any
-) -> Scheme:
-    """Make the scheme of the plant's cost and a model; ``options`` are those of `QPMPC`."""
-    A, B, _ = model
-    cost = heating_options(plant, model, margin=margin)
-    free = plant.lb_a.new_full((len(A),), torch.inf)
-    return Scheme(A, B, cost["stage_weight"], -free, free, c=c, options=cost | options)
+        found["C"] = band_distance(layout) <= 0
+    return found
 
 
 def episode(plant: HeatedHouse, d: Tensor) -> dict[str, Any]:
@@ -116,6 +108,7 @@ register(
         make_plant,
         wrong_scheme,
         true_scheme,
+        masks,
         closed_loop=plant_loop,
         rivals=HOUSE_RIVALS,
         episode=episode,

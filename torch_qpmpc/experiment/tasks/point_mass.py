@@ -9,7 +9,9 @@ from torch_qpmpc.envs import PointMass
 from torch_qpmpc.envs.point_mass import NOISE_STD
 from torch_qpmpc.experiment.rivals import tightened
 from torch_qpmpc.experiment.rivals.rival import Rival
-from torch_qpmpc.experiment.tasks.registry import Scheme, Task, register
+from torch_qpmpc.experiment.tasks.registry import Task, plant_scheme, register
+from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.scheme import Scheme
 
 
 def make_plant(cfg: DictConfig) -> PointMass:
@@ -20,12 +22,13 @@ def wrong_scheme(cfg: DictConfig, plant: PointMass) -> Scheme:
     """Draw the corrupted model and the cost by ``cfg.seed``."""
     A, B, theta = plant.corrupted(cfg.seed)
     weight = torch.cat((theta, torch.zeros_like(plant.lb_a)))
-    return Scheme(A, B, weight, plant.lb_s, plant.ub_s)
+    return plant_scheme(cfg, plant, Model(A, B), weight)
 
 
-def true_scheme(plant: PointMass) -> Scheme:
+def true_scheme(cfg: DictConfig, plant: PointMass) -> Scheme:
+    A, B, offset = plant.true_model()
     weight = torch.cat((2 * plant.W.diagonal(), torch.zeros_like(plant.lb_a)))
-    return Scheme.true(plant, weight)
+    return plant_scheme(cfg, plant, Model(A, B, offset=offset), weight)
 
 
 register(

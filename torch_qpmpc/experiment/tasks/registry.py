@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, Self
 
@@ -29,7 +29,12 @@ from torch_qpmpc.experiment.fields import (
     some_of,
 )
 from torch_qpmpc.experiment.rivals.rival import Rival
-from torch_qpmpc.mpc.validation import COST, HESSIANS
+from torch_qpmpc.mpc.bounds import Bounds
+from torch_qpmpc.mpc.cost import HESSIANS, Cost
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.scheme import Scheme
+from torch_qpmpc.mpc.validation import COST
 
 #: A plant of any kind.
 AnyPlant = LinearSystem | GymnasiumPlant | Plant
@@ -65,46 +70,18 @@ class TaskSettings(Group):
 
 
 @dataclass(frozen=True)
-class Scheme:
-    """A model x+ = A x + B u + offset, a stage cost and state bounds, as arguments of `QPMPC`.
-
-    Attributes:
-        A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``, or with a window of the past,
-            [A_1, .., A_L] and [B_1, .., B_L].
-        stage_weight: W of the cost 1/2 [x; u]' W [x; u], or its diagonal; W of [d; x; u] with a
-            preview d. With ``start=data`` these three may be None.
-        lb_s, ub_s: the bounds of the state, ``(n_x,)``.
-        offset: the model's offset, ``(n_x,)``; None for zero.
-        c: the initial constant of the cost.
-        options: other arguments, such as E, constraints or rate_bounds; they replace those from
-            the configuration.
-    """
-
-    A: Tensor | None
-    B: Tensor | None
-    stage_weight: Tensor | None
-    lb_s: Tensor
-    ub_s: Tensor
-    offset: Tensor | None = None
-    c: float = 0.0
-    options: Mapping[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def true(cls, plant: LinearSystem, stage_weight: Tensor) -> Scheme:
-        """Make the scheme with the model of ``plant``; its offset is the mean of the noise."""
-        A, B, offset = plant.true_model()
-        return cls(A, B, stage_weight, plant.lb_s, plant.ub_s, offset)
-
-
-@dataclass(frozen=True)
 class Task:
-    """A plant, the MPC scheme that learning starts from, and the true scheme.
+    """A plant, the `torch_qpmpc.Scheme` that learning starts from, and the true scheme.
 
     Attributes:
         name: the choice in ``task=NAME``.
         make_plant: makes the plant of a configuration, of any kind.
-        wrong_scheme: makes the scheme that learning starts from, of a configuration and a plant.
-        true_scheme: makes the true scheme of a plant; None if its model is unknown.
+        wrong_scheme: makes the scheme that learning starts from, of a configuration and a plant,
+            as by `plant_scheme`. Where the cost has no terminal weight, it is that of
+            ``task.terminal_weight``. With ``start=data`` the model is that of the log, and so is
+            the cost if its ``stage_weight`` is None.
+        true_scheme: makes the true scheme, likewise; None if the plant's model is unknown.
+        masks: makes the masks of parts of which not all entries are learned, likewise.
         closed_loop: the function of `torch_qpmpc.envs.closed_loop` for the plant's kind.
         noises: choices of ``noise.name``; the first is the default.
         takes_noise_std: True if ``make_plant`` reads ``noise.std``.
@@ -121,7 +98,8 @@ class Task:
     name: str
     make_plant: Callable[[DictConfig], Any]
     wrong_scheme: Callable[[DictConfig, Any], Scheme]
-    true_scheme: Callable[[Any], Scheme] | None = None
+    true_scheme: Callable[[DictConfig, Any], Scheme] | None = None
+    masks: Callable[[DictConfig, Any], Mapping[str, Tensor]] = lambda cfg, plant: {}
     closed_loop: Callable[..., ClosedLoop] = closed_loop
     noises: tuple[str, ...] = ("none",)
     takes_noise_std: bool = False
@@ -130,6 +108,46 @@ class Task:
     unit: tuple[int, str] = (1, "transitions")
     settings: type[TaskSettings] = TaskSettings
     defaults: Mapping[str, Any] | None = field(default_factory=dict)
+
+
+def plant_layout(plant: AnyPlant, horizon: int) -> Layout:
+    """Return the sizes of the QP of a plant."""
+    if isinstance(plant, Plant):
+        return Layout(plant.n_y, plant.n_u, horizon, plant.past, plant.n_d)
+    return Layout(len(plant.lb_s), len(plant.lb_a), horizon)
+
+
+def plant_scheme(
+    cfg: DictConfig,
+    plant: LinearSystem | GymnasiumPlant,
+    model: Model,
+    stage_weight: Tensor | None,
+    state_bounds: tuple[Tensor, Tensor] | None = None,
+) -> Scheme:
+    """Make the scheme of a model and a weight with the settings of ``cfg.task``.
+
+    Args:
+        cfg: the configuration.
+        plant: gives the sizes and the bounds.
+        model: see `torch_qpmpc.Model`.
+        stage_weight: W of the cost 1/2 [x; u]' W [x; u], or its diagonal.
+        state_bounds: those of the plant by default.
+    """
+    states = (plant.lb_s, plant.ub_s) if state_bounds is None else state_bounds
+    bounds = Bounds(state_bounds=states, action_bounds=(plant.lb_a, plant.ub_a))
+    return Scheme(
+        plant_layout(plant, cfg.task.horizon),
+        model,
+        Cost(stage_weight, hessian=cfg.task.hessian),
+        priced(cfg, bounds),
+        cfg.task.gamma,
+    )
+
+
+def priced(cfg: DictConfig, bounds: Bounds) -> Bounds:
+    """Return the bounds with the slack weights of ``cfg.task``."""
+    slacks = {name: cfg.task[name] for name in ("state_slack", "action_slack", "discount_slack")}
+    return replace(bounds, **slacks)
 
 
 def register(task: Task) -> None:

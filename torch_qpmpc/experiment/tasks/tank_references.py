@@ -13,8 +13,10 @@ from torch_qpmpc.envs import TankReferences
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.experiment.fields import Flag, NonNegative, Whole
 from torch_qpmpc.experiment.rivals.tanks import TANK_REFERENCES_RIVALS
-from torch_qpmpc.experiment.tasks.registry import Scheme, Task, TaskSettings, register
-from torch_qpmpc.experiment.tracking import offset_free, reference_options
+from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, register
+from torch_qpmpc.experiment.tracking import offset_free, reference_scheme
+from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.scheme import Scheme
 
 #: Standard deviation of the disturbed variant's noise.
 NOISE_STD = 0.1
@@ -46,19 +48,20 @@ def wrong_scheme(cfg: DictConfig, plant: TankReferences) -> Scheme:
     rng = np.random.default_rng(cfg.seed)
     w = replace(plant, mismatch=cfg.task.model_error).signals(rng, 1, 1)[0, 0]
     A, B, _ = plant.model(w)
-    return _scheme(plant, A, B, cfg.task.gamma)
+    return _scheme(cfg, plant, A, B, cfg.task.gamma)
 
 
-def true_scheme(plant: TankReferences) -> Scheme:
+def true_scheme(cfg: DictConfig, plant: TankReferences) -> Scheme:
     """Return the scheme with the nominal model, without discount."""
-    return _scheme(plant, plant.A, plant.B, gamma=1.0)
+    return _scheme(cfg, plant, plant.A, plant.B, gamma=1.0)
 
 
-def _scheme(plant: TankReferences, A: Tensor, B: Tensor, gamma: float) -> Scheme:
-    options = reference_options(plant, gamma)
+def _scheme(cfg: DictConfig, plant: TankReferences, A: Tensor, B: Tensor, gamma: float) -> Scheme:
     if plant.past > 1:
         A, B = offset_free(A, B, plant.past - 1)
-    return Scheme(A, B, options["stage_weight"], plant.lb_x, plant.ub_x, options=options)
+    scheme = reference_scheme(plant, Model(A, B), gamma)
+    # The plant has the price of its states.
+    return replace(scheme, bounds=replace(scheme.bounds, action_slack=cfg.task.action_slack))
 
 
 def episode(plant: TankReferences, d: Tensor) -> dict[str, Any]:

@@ -1,0 +1,98 @@
+"""The bounds of a scheme: their rows, and messages."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torch_qpmpc import Bounds, Layout, QPError, Scheme
+
+
+def test_rows_are_hard_or_have_a_price():
+    bounds = Bounds(
+        state_bounds=([-1.0, -2.0], [1.0, 2.0]),
+        action_bounds=([-3.0], [3.0]),
+        constraints=([[1.0, 0.0, 1.0]], [0.0], [4.0]),
+        rate_bounds=([-5.0], [5.0]),
+        state_slack=[7.0, torch.inf],
+        rate_slack=8.0,
+    )
+    scheme = Scheme(Layout(2, 1, horizon=1, past=2), bounds=bounds)
+    assert (scheme.layout.n_mixed, scheme.layout.n_terminal, scheme.layout.n_rates) == (1, 0, 1)
+    theta = scheme.theta
+    assert theta["ub"].tolist() == [1, 2, 3, 1, 2, 4, 5]
+    assert theta["lb"].tolist() == [-1, -2, -3, -1, -2, 0, -5]
+    assert theta["w"].tolist() == [7, torch.inf, torch.inf, 7, torch.inf, 100, 8]
+    assert theta["G"][-1].tolist() == [0, 0, -1, 0, 0, 1, 0, 0], "z = [y_-1, u_-1, y_0, u_0, y_1]"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"state_bounds": 5.0}, r"state_bounds: got 5.0, expected the pair \(lower, upper\)"),
+        ({"state_bounds": ([1.0], [1.0], [1.0])}, "state_bounds: .* expected the pair"),
+        (
+            {"state_bounds": ([1.0], [1.0, 2.0])},
+            r"state_bounds: got shapes \(1,\) and \(2,\), expected one length on both sides",
+        ),
+        ({"action_bounds": (-1.0, 1.0)}, r"action_bounds: got shape \(\), expected a vector on ea"),
+        ({"action_bounds": ([torch.nan], [1.0])}, "action_bounds: got NaN, expected no NaN; inf f"),
+        ({"action_bounds": ([torch.inf], [torch.inf])}, "action_bounds: .* lower bounds below inf"),
+        ({"action_bounds": ([-torch.inf], [-torch.inf])}, "action_bounds: .* upper bounds above"),
+        (
+            {"rate_bounds": ([1.0], [-1.0])},
+            r"rate_bounds: got lower 1 > upper -1 at entry 0, .* The pair is \(lower, upper\)",
+        ),
+        (
+            {"state_bounds": ([-1.0, 2.0], [1.0, 1.5])},
+            "state_bounds: got lower 2 > upper 1.5 at entry 1, expected lower <= upper",
+        ),
+        ({"constraints": 1.0}, r"constraints: got 1.0, expected the triple \(D, lower, upper\)"),
+        (
+            {"constraints": ([1.0, 1.0], [0.0], [1.0])},
+            r"constraints: got D of shape \(2,\), expected a matrix",
+        ),
+        (
+            {"constraints": (torch.ones(1, 3), [0.0, 0.0], [1.0, 1.0])},
+            r"constraints, bounds: got shape \(2,\), expected shape \(1,\) on each side",
+        ),
+        (
+            {"terminal_constraints": (torch.ones(1, 3), [1.0], [0.0])},
+            "terminal_constraints, bounds: got lower 1 > upper 0 at entry 0, expected lower <=",
+        ),
+        ({"constraint_slack": -1.0}, "constraint_slack: got -1.0, expected a non-negative weight"),
+        ({"constraint_slack": [1.0]}, r"constraint_slack: got \[1.0\], expected a non-negative we"),
+        ({"state_slack": None}, "state_slack: got None, expected a non-negative weight, or inf"),
+        ({"action_slack": torch.nan}, "action_slack: got nan, expected a non-negative weight"),
+        ({"discount_slack": 1}, "discount_slack: got 1, expected True or False"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        Bounds(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"state_bounds": ([-1.0], [1.0])},
+            r"state_bounds: got shape \(1,\), expected shape \(2,\) on each side",
+        ),
+        (
+            {"constraints": (torch.ones(2, 2), [0.0] * 2, [1.0] * 2)},
+            r"constraints: got D of shape \(2, 2\), expected shape \(m, 3\)",
+        ),
+        (
+            {"terminal_constraints": (torch.ones(1, 3), [0.0], [1.0])},
+            r"terminal_constraints: got D of shape \(1, 3\), expected shape \(m, 2\)",
+        ),
+        (
+            {"state_slack": [1.0]},
+            r"state_slack: got \[1.0\], expected a non-negative .* or one for each of the 2",
+        ),
+    ],
+)
+def test_a_scheme_refuses_bounds_of_other_sizes(arguments, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        Scheme(Layout(2, 1, 3), bounds=Bounds(**arguments))

@@ -1,0 +1,85 @@
+"""The model of a scheme: its shapes, and the sizes that follow from it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.signal
+import torch
+
+from torch_qpmpc import Layout, Model, QPError, Scheme
+
+A, B = torch.eye(2), torch.ones(2, 1)
+
+
+@pytest.mark.parametrize(
+    ("model", "layout"),
+    [
+        (Model(A, B), Layout(2, 1, 5)),
+        (Model(A.expand(5, 2, 2), B), Layout(2, 1, 5)),
+        (Model(torch.ones(2, 6), torch.ones(2, 3)), Layout(2, 1, 5, past=3)),
+        (Model(A, B, E=torch.ones(2, 4)), Layout(2, 1, 5, n_d=4)),
+    ],
+)
+def test_a_model_has_sizes(model, layout):
+    assert model.layout(5) == layout
+
+
+def test_its_tensors_are_copies_in_double_precision():
+    mine = torch.eye(2, requires_grad=True)
+    model = Model(mine, B.numpy())
+    with torch.no_grad():
+        mine.mul_(2)
+    assert torch.equal(model.A, torch.eye(2).double())
+    assert not model.A.requires_grad
+    assert model.B.dtype == torch.float64
+
+
+def test_a_discrete_system_of_scipy_has_a_model():
+    matrices = ([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], np.eye(2), np.zeros((2, 1)))
+    system: Any = scipy.signal.dlti(*matrices, dt=0.1)
+    model = Model(system.A, system.B)
+    assert (model.A.tolist(), model.B.tolist()) == matrices[:2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"A": "model"}, "A: got 'model', expected a tensor, or what torch.as_tensor takes"),
+        ({"A": [[1.0, torch.nan], [0, 1]]}, "A: got NaN or inf, expected finite entries"),
+        ({"b": [torch.inf]}, "b: got NaN or inf, expected finite entries"),
+        ({"A": torch.ones(2)}, r"A, B: got shapes \(2,\) and \(2, 1\), expected matrices \(n_x, n"),
+        (
+            {"A": torch.eye(3)},
+            r"A, B: got shapes \(3, 3\) and \(2, 1\), expected \(n_x, L n_x\) and \(n_x, L n",
+        ),
+        ({"A": torch.ones(2, 3)}, r"A, B: got shapes \(2, 3\) and \(2, 1\), expected \(n_x, L n"),
+        ({"A": torch.ones(2, 4)}, r"A, B: got shapes \(2, 4\) and \(2, 1\), expected \(n_x, L n"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        Model(**({"A": A, "B": B} | arguments))
+
+
+@pytest.mark.parametrize("name", ["A", "B"])
+def test_a_model_without_matrices_has_no_sizes(name):
+    matrices: dict[str, Any] = {"A": A, "B": B} | {name: None}
+    with pytest.raises(QPError, match=f"{name}: got None, expected a matrix. Or pass a Layout"):
+        Model(**matrices).layout(3)
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (Model(torch.eye(3), torch.ones(3, 1)), r"A, B: got .* expected \(2, 2\) and \(2, 1\)"),
+        (Model(A, torch.ones(2, 2, 1)), r"B: got shape \(2, 2, 1\), expected .* or \(3, 2, 1\)"),
+        (Model(offset=[1.0]), r"offset: got shape \(1,\), expected shape \(2,\)"),
+        (Model(C=torch.ones(6, 10)), r"C: got shape \(6, 10\), expected shape \(6, 11\)"),
+    ],
+)
+def test_a_scheme_refuses_a_model_of_other_sizes(model, message):
+    with pytest.raises(QPError, match=message):
+        Scheme(Layout(2, 1, 3), model)

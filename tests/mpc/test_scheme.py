@@ -1,0 +1,128 @@
+"""A scheme describes a QPMPC: the short ways make one, and copies and identities follow from it."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import FrozenInstanceError, asdict, replace
+from typing import Any
+
+import pytest
+import torch
+
+from tests.problems import MIXED
+from torch_qpmpc import QPMPC, Bounds, Cost, Layout, Model, QPError, Scheme
+
+A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]).double(), torch.tensor([[0.0], [0.1]]).double()
+W = torch.diag(torch.tensor([1.0, 0.5, 0.1])).double()
+BOX = {"state_bounds": ([-5.0, -1.0], [5.0, 1.0]), "action_bounds": ([-1.0], [1.0])}
+
+
+def make(**changes: Any) -> Scheme:
+    model = Model(A, B, offset=[0.1, 0.0])
+    cost, bounds = Cost(W, hessian="block"), Bounds(**BOX, **MIXED)
+    return replace(Scheme(model.layout(4), model, cost, bounds), **changes)
+
+
+def same(one: QPMPC, other: QPMPC) -> None:
+    mine, theirs = one.state_dict(), other.state_dict()
+    assert mine.keys() == theirs.keys()
+    assert all(torch.equal(mine[name], theirs[name]) for name in mine), "the identity, too"
+
+
+def test_the_short_way_is_the_same():
+    options = {"stage_weight": W, "hessian": "block", "offset": [0.1, 0.0], **BOX, **MIXED}
+    short = QPMPC.from_model(A, B, 4, structure="tied", learn=["C", "G"], **options)
+    same(QPMPC(make(), structure="tied", learn=["C", "G"]), short)
+    same(QPMPC(scheme=make(), structure="tied", learn=["C", "G"]), short)
+    same(QPMPC(short.scheme, structure="tied", learn=["C", "G"]), short)
+
+
+def test_a_scheme_of_sizes_alone_is_a_random_start():
+    scheme = Scheme(Layout(2, 1, 3), seed=5)
+    assert scheme.is_random
+    assert not make().is_random
+    assert replace(make(), cost=Cost()).is_random
+    same(QPMPC(scheme), QPMPC(2, 1, 3, seed=5))
+    assert not torch.equal(scheme.theta["C"], Scheme(Layout(2, 1, 3), seed=6).theta["C"])
+
+
+def test_a_scheme_counts_the_rows_of_its_bounds():
+    scheme = make()
+    assert (scheme.layout.n_mixed, scheme.layout.n_terminal) == (2, 1)
+    assert scheme.layout == Layout(2, 1, 4, n_mixed=2, n_terminal=1)
+    assert replace(scheme, bounds=Bounds()).layout == Layout(2, 1, 4)
+
+
+def test_a_predictor_takes_the_place_of_the_models_C_and_b():
+    generator = torch.Generator().manual_seed(0)
+    C, b = (torch.randn(*shape, generator=generator).double() for shape in ((8, 14), (8,)))
+    mpc = QPMPC(make(model=Model(A, B, C=C, b=b)))
+    assert torch.equal(mpc.C, C)
+    assert torch.equal(mpc.b, b)
+    assert torch.equal(mpc.C_0, QPMPC(make()).C_0)
+
+
+def test_a_scheme_is_frozen():
+    scheme = make()
+    with pytest.raises(FrozenInstanceError):
+        scheme.gamma = 0.5  # pyright: ignore[reportAttributeAccessIssue] (the mistake)
+    mpc = QPMPC(scheme)
+    with pytest.raises(
+        QPError, match=r"scheme: got Scheme\(Layout.*, as created\. Create another QPMPC"
+    ):
+        mpc.scheme = make()
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_copies_have_the_same_fields_and_theta(copied):
+    for scheme in (make(gamma=0.7, seed=3), Scheme(Layout(2, 1, 3, past=2, n_d=1), seed=4)):
+        twin = copied(scheme)
+        assert (twin.layout, twin.gamma, twin.seed) == (scheme.layout, scheme.gamma, scheme.seed)
+        assert twin.is_random == scheme.is_random
+        assert all(torch.equal(twin.theta[name], x) for name, x in scheme.theta.items())
+
+
+def test_a_step_of_theta_leaves_the_scheme():
+    scheme = make()
+    before = {name: x.clone() for name, x in scheme.theta.items()}
+    mpc = QPMPC(scheme, learn=["H", "C", "b", "w"])
+    with torch.no_grad():
+        for x in (*mpc.parameters(), *mpc.buffers()):
+            x.zero_()
+    assert all(torch.equal(scheme.theta[name], x) for name, x in before.items())
+    mpc.reset_parameters()
+    same(mpc, QPMPC(scheme, learn=["H", "C", "b", "w"]))
+
+
+def test_the_identity_has_the_sizes():
+    message = "state_dict: got a state_dict with past = 2, expected this module's 1"
+    with pytest.raises(QPError, match=message):
+        QPMPC(2, 1, 3).load_state_dict(QPMPC(2, 1, 3, past=2).state_dict())
+    assert set(asdict(make().layout)) <= QPMPC(make())._identity().keys()
+
+
+@pytest.mark.parametrize(
+    ("make_it", "message"),
+    [
+        (lambda: make(gamma=0.0), r"gamma: got 0.0, expected a discount factor in \(0, 1\]"),
+        (lambda: make(gamma=1.1), r"gamma: got 1.1, expected a discount factor in \(0, 1\]"),
+        (lambda: make(gamma=torch.nan), "gamma: got nan, expected a discount factor"),
+        (lambda: make(seed=-1), "seed: got -1, expected a whole number >= 0"),
+        (lambda: make(layout=(2, 1, 4)), "layout: got tuple, expected a Layout"),
+        (lambda: make(model=(A, B)), "model: got tuple, expected a Model"),
+        (lambda: make(cost=W), "cost: got Tensor, expected a Cost"),
+        (lambda: make(bounds=BOX), "bounds: got dict, expected a Bounds"),
+        (
+            lambda: QPMPC(make(), gamma=0.5),  # pyright: ignore[reportCallIssue] (the mistake)
+            "scheme: got a Scheme and gamma, expected a Scheme alone. dataclasses.replace makes",
+        ),
+        (
+            lambda: QPMPC(make(), 1, 4),  # pyright: ignore[reportCallIssue, reportArgumentType] (the mistake)
+            "scheme: got a Scheme and 1, 4, expected a Scheme alone",
+        ),
+    ],
+)
+def test_bad_arguments_are_named(make_it, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        make_it()

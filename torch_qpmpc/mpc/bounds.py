@@ -1,0 +1,203 @@
+"""The bounds of a scheme: the rows of G with lb, ub and the slack weights w (eq:v1c4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from numbers import Real
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_qpmpc.checks import check_flag
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.parametrizations import LinearRows
+from torch_qpmpc.mpc.validation import as_tensor, read_numbers
+
+PAIRS = ("state_bounds", "action_bounds", "rate_bounds")
+ROWS = ("constraints", "terminal_constraints")
+SLACKS = ("state_slack", "action_slack", "constraint_slack", "rate_slack")
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Bounds of states, actions, linear rows and rates, each hard or soft with its price.
+
+    Args:
+        state_bounds, action_bounds: pairs (lower, upper) of ``(n_x,)`` and of ``(n_u,)``; unbounded
+            by default.
+        constraints: mixed constraints of each stage, ``lower <= D [x_k; u_k] <= upper`` (eq:v1c4),
+            as the triple (D, lower, upper) of ``(m, n_x + n_u)`` and ``(m,)`` twice. With a preview
+            D multiplies [d_k; x_k; u_k]: bounds that change with time are entries of d_k.
+        terminal_constraints: the same for x_N, with D^f ``(m_f, n_x)``, or for [d_N; x_N].
+        rate_bounds: a pair (lower, upper) of ``(n_u,)`` for u_k - u_{k-1}; needs past >= 2.
+        state_slack, action_slack, constraint_slack, rate_slack: the slack weights w of the rows of
+            states, of actions, of mixed and terminal constraints, and of rates; ``inf`` makes them
+            hard. By default, actions and rates are hard and the others soft. Pass one weight or,
+            except for constraints, one per entry.
+        discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
+
+    Raises:
+        QPError: bounds cross or are NaN, a weight is negative, or shapes do not match.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> bounds = qm.Bounds(
+        ...     state_bounds=([-5.0, -1.0], [5.0, 1.0]),
+        ...     state_slack=[100.0, 10.0],
+        ...     action_bounds=([-1.0], [1.0]),
+        ... )
+    """
+
+    state_bounds: Any = None
+    action_bounds: Any = None
+    constraints: Any = None
+    terminal_constraints: Any = None
+    rate_bounds: Any = None
+    state_slack: Any = 100.0
+    action_slack: Any = torch.inf
+    constraint_slack: float = 100.0
+    rate_slack: Any = torch.inf
+    discount_slack: bool = False
+
+    def __post_init__(self) -> None:
+        check_flag("discount_slack", self.discount_slack)
+        price = self.rate_slack
+        if self.rate_bounds is None and not (isinstance(price, Real) and price == torch.inf):
+            remedy = "It is the price of violating them: pass rate_bounds, too."
+            raise QPError.expected("rate_slack", repr(price), "inf without rate_bounds", remedy)
+        readers = dict.fromkeys(PAIRS, _pair) | dict.fromkeys(ROWS, _linear_rows)
+        for name, read in (readers | dict.fromkeys(SLACKS, _slack)).items():
+            value = getattr(self, name)
+            if value is not None or name in SLACKS:
+                object.__setattr__(self, name, read(name, value))
+
+    def counted(self, layout: Layout) -> Layout:
+        """Return ``layout`` with the numbers of these rows."""
+        linear = (self.constraints, self.terminal_constraints)
+        n_mixed, n_terminal = (0 if rows is None else len(rows[0]) for rows in linear)
+        n_rates = 0 if self.rate_bounds is None else layout.n_u
+        return replace(layout, n_mixed=n_mixed, n_terminal=n_terminal, n_rates=n_rates)
+
+    def rows(self, layout: Layout) -> dict[str, Tensor]:
+        """Return G, lb, ub and w, inf on hard rows, of the sizes ``layout``, as `counted`.
+
+        Raises:
+            QPError: a shape does not match the sizes, or rates are bounded with past=1.
+        """
+        n_x, n_u, n_d = layout.n_x, layout.n_u, layout.n_d
+        if self.rate_bounds is not None and layout.past == 1:
+            remedy = "The window then holds u_{-1}; torch_qpmpc.envs.PastWindow makes it."
+            raise QPError.expected("rate_bounds", "bounds with past=1", "past >= 2", remedy)
+        D = _matching_rows("constraints", self.constraints, n_d + layout.n)
+        D_f = _matching_rows("terminal_constraints", self.terminal_constraints, n_d + n_x)
+        x = _matching_pair("state_bounds", self.state_bounds, n_x)
+        u = _matching_pair("action_bounds", self.action_bounds, n_u)
+        rates = (x[0][:0], x[1][:0])
+        if self.rate_bounds is not None:
+            rates = _matching_pair("rate_bounds", self.rate_bounds, n_u)
+        lower, upper = (
+            layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], rates, strict=True)
+        )
+        w = layout.rows(
+            _matching_slack("state_slack", self.state_slack, n_x),
+            _matching_slack("action_slack", self.action_slack, n_u),
+            _matching_slack("constraint_slack", self.constraint_slack, layout.n_mixed),
+            _matching_slack("constraint_slack", self.constraint_slack, layout.n_terminal),
+            _matching_slack("rate_slack", self.rate_slack, n_u)[: layout.n_rates],
+        )
+        G = LinearRows(layout, tied=True)(D[0], D_f[0])
+        return {"G": G, "lb": lower, "ub": upper, "w": w}
+
+
+def _pair(name: str, bounds: Any) -> tuple[Tensor, Tensor]:
+    """Return both sides as vectors of one length."""
+    try:
+        lower, upper = bounds
+    except (TypeError, ValueError) as error:
+        raise QPError.expected(name, repr(bounds), "the pair (lower, upper)") from error
+    lower, upper = _side(name, lower, 0), _side(name, upper, 1)
+    if lower.shape != upper.shape:
+        got = f"shapes {tuple(lower.shape)} and {tuple(upper.shape)}"
+        raise QPError.expected(name, got, "one length on both sides")
+    crossing = (lower > upper).nonzero()
+    if len(crossing):
+        i = int(crossing[0])
+        got = f"lower {lower[i]:g} > upper {upper[i]:g} at entry {i}"
+        raise QPError.expected(name, got, "lower <= upper", "The pair is (lower, upper).")
+    return lower, upper
+
+
+def _side(name: str, values: Any, side: int) -> Tensor:
+    values = read_numbers(name, values)
+    if values.isnan().any():
+        raise QPError.expected(name, "NaN", "no NaN; inf for no bound")
+    if values.ndim != 1:
+        raise QPError.expected(name, f"shape {tuple(values.shape)}", "a vector on each side")
+    if (values == (1 - 2 * side) * torch.inf).any():
+        want = ("lower bounds below inf", "upper bounds above -inf")[side]
+        raise QPError.expected(name, f"{values.tolist()}", want)
+    return values.detach().clone()
+
+
+def _linear_rows(name: str, rows: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """Return D and its bounds."""
+    try:
+        matrix, lower, upper = rows
+    except (TypeError, ValueError) as error:
+        raise QPError.expected(name, repr(rows), "the triple (D, lower, upper)") from error
+    matrix = as_tensor(name, matrix).detach().clone()
+    if matrix.ndim != 2:
+        raise QPError.expected(name, f"D of shape {tuple(matrix.shape)}", "a matrix")
+    pair = _pair(f"{name}, bounds", (lower, upper))
+    return matrix, *_matching_pair(f"{name}, bounds", pair, len(matrix))
+
+
+def _slack(name: str, weight: Any) -> float | Tensor:
+    """Return one weight for all rows, or one for each."""
+    want = "a non-negative weight, or inf for hard rows"
+    if isinstance(weight, Real) and not isinstance(weight, bool) and float(weight) >= 0:
+        return float(weight)
+    if name != "constraint_slack":
+        want += "; or one for each of them"
+        if isinstance(weight, Sequence | np.ndarray | Tensor) and not isinstance(weight, str):
+            weights = read_numbers(name, weight)
+            if weights.ndim == 1 and (weights >= 0).all():
+                return weights.detach().clone()
+    raise QPError.expected(name, repr(weight), want)
+
+
+def _matching_pair(
+    name: str, bounds: tuple[Tensor, Tensor] | None, size: int
+) -> tuple[Tensor, Tensor]:
+    if bounds is None:
+        unbounded = torch.full((size,), torch.inf, dtype=torch.float64)
+        return -unbounded, unbounded
+    if len(bounds[0]) != size:
+        got = f"shape {tuple(bounds[0].shape)}"
+        raise QPError.expected(name, got, f"shape ({size},) on each side")
+    return bounds
+
+
+def _matching_rows(
+    name: str, rows: tuple[Tensor, Tensor, Tensor] | None, width: int
+) -> tuple[Tensor, ...]:
+    if rows is None:
+        none = torch.zeros(0, dtype=torch.float64)
+        return torch.zeros(0, width, dtype=torch.float64), none, none
+    if rows[0].shape[1] != width:
+        got = f"D of shape {tuple(rows[0].shape)}"
+        raise QPError.expected(name, got, f"shape (m, {width})")
+    return rows
+
+
+def _matching_slack(name: str, weight: float | Tensor, size: int) -> Tensor:
+    if not isinstance(weight, Tensor):
+        return torch.full((size,), weight, dtype=torch.float64)
+    if len(weight) != size:
+        want = f"a non-negative weight, or inf for hard rows; or one for each of the {size}"
+        raise QPError.expected(name, f"{weight.tolist()}", want)
+    return weight

@@ -1,0 +1,117 @@
+"""The model of a scheme: x_{k+1} = A x_k + B u_k + E d_k + offset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.validation import owned
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The model x+ = A x + B u + E d + offset that the constraints ``C z = b`` start from.
+
+    A and B that are None are drawn at random: A is the identity plus, and B is, normal entries with
+    standard deviation 0.1. A discrete system of scipy or python-control whose states are measured
+    has such matrices: ``Model(system.A, system.B)``.
+
+    Args:
+        A: ``(n_x, n_x)``, or one per stage, ``(N, n_x, n_x)``. With a window of L outputs it is
+            [A_1, .., A_L], side by side, the newest first.
+        B: ``(n_x, n_u)``, or one per stage; with a window [B_1, .., B_L].
+        E: the factor of the preview d_k, ``(n_x, n_d)``, or one per stage; zero by default.
+        offset: ``(n_x,)``; zero by default.
+        C, b: ``(N n_x, n_z)`` and ``(N n_x,)``, as of a multi-step predictor, in place of those of
+            the model.
+
+    Raises:
+        QPError: an entry is not finite, or the shapes do not match each other.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> model = qm.Model(A=[[1.0, 0.1], [0.0, 0.9]], B=[[0.0], [0.1]])
+        >>> model.layout(horizon=5).n_z
+        17
+    """
+
+    A: Any = None
+    B: Any = None
+    E: Any = None
+    offset: Any = None
+    C: Any = None
+    b: Any = None
+
+    def __post_init__(self) -> None:
+        for name in ("A", "B", "E", "offset", "C", "b"):
+            object.__setattr__(self, name, owned(name, getattr(self, name)))
+        if self.A is None or self.B is None:
+            return
+        A, B = tuple(self.A.shape), tuple(self.B.shape)
+        got = f"shapes {A} and {B}"
+        if len(A) < 2 or len(B) < 2:
+            raise QPError.expected("A, B", got, "matrices (n_x, n_x) and (n_x, n_u)")
+        n_x, n_lagged = A[-2:]
+        if B[-2] != n_x or n_lagged % max(n_x, 1) or B[-1] % max(n_lagged // max(n_x, 1), 1):
+            remedy = "L is 1 without a window of the past."
+            raise QPError.expected("A, B", got, "(n_x, L n_x) and (n_x, L n_u)", remedy)
+
+    def layout(self, horizon: int) -> Layout:
+        """Return the sizes that A, B and E have with ``horizon`` stages.
+
+        Raises:
+            QPError: A or B is None, or a size is zero.
+        """
+        if self.A is None or self.B is None:
+            name = "A" if self.A is None else "B"
+            raise QPError.expected(name, "None", "a matrix", "Or pass a Layout.")
+        n_x, n_lagged = self.A.shape[-2:]
+        past = max(n_lagged // max(n_x, 1), 1)
+        n_d = 0 if self.E is None else self.E.shape[-1]
+        return Layout(n_x, self.B.shape[-1] // past, horizon, past, n_d)
+
+    def matrices(self, layout: Layout, random: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Return A, B and E of the sizes ``layout``.
+
+        What is None is drawn by ``random``, or zero for E.
+
+        Raises:
+            QPError: a shape does not match the sizes.
+        """
+        n_x, n_u, past, n_d = layout.n_x, layout.n_u, layout.past, layout.n_d
+        A, B, E = self.A, self.B, self.E
+        if A is None:
+            noise = torch.randn(n_x, n_x, generator=random, dtype=torch.float32)
+            A = torch.eye(n_x, dtype=torch.float32) + 0.1 * noise
+            A = F.pad(A, (0, (past - 1) * n_x)).double()
+        if B is None:
+            B = 0.1 * torch.randn(n_x, n_u, generator=random, dtype=torch.float32)
+            B = F.pad(B, (0, (past - 1) * n_u)).double()
+        E = A.new_zeros(n_x, n_d) if E is None else E
+        if A.shape[-1:] != (past * n_x,) or B.shape[-1:] != (past * n_u,):
+            got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
+            want = f"({n_x}, {past * n_x}) and ({n_x}, {past * n_u})"
+            remedy = "" if past == 1 else f"[A_1, .., A_L] and [B_1, .., B_L] for past={past}."
+            raise QPError.expected("A, B", got, want, remedy)
+        if E.shape[-2:] != (n_x, n_d):
+            remedy = "It multiplies the preview d_k, of n_d entries."
+            raise QPError.expected("E", f"shape {tuple(E.shape)}", f"({n_x}, {n_d})", remedy)
+        return A, B, E
+
+    def offsets(self, layout: Layout) -> Tensor:
+        """Return b ``(N n_x,)`` of the offset for the sizes ``layout``.
+
+        Raises:
+            QPError: the offset's shape does not match the sizes.
+        """
+        n_x = layout.n_x
+        offset = torch.zeros(n_x, dtype=torch.float64) if self.offset is None else self.offset
+        if tuple(offset.shape) != (n_x,):
+            raise QPError.expected("offset", f"shape {tuple(offset.shape)}", f"shape ({n_x},)")
+        return -offset.repeat(layout.horizon)

@@ -1,0 +1,74 @@
+"""The cost to go of the discounted linear quadratic regulator (LQR)."""
+
+from __future__ import annotations
+
+import scipy
+import torch
+from torch import Tensor
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.layout import Layout
+
+RICCATI = "riccati"
+
+
+def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
+    """Return P ``(n_x, n_x)`` of the discounted linear quadratic regulator's cost to go 1/2 x'Px.
+
+    Without active bounds, an MPC scheme with H_f = P is that regulator, for any horizon.
+
+    Args:
+        A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
+        W: weight of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
+        gamma: discount of the stage costs.
+
+    Raises:
+        QPError: the discrete Riccati equation has no stabilising solution.
+    """
+    n_x, root = A.shape[-1], gamma**0.5
+    Q, S, R = W[:n_x, :n_x], W[:n_x, n_x:], W[n_x:, n_x:]
+    try:
+        P = scipy.linalg.solve_discrete_are(
+            *(x.detach().numpy() for x in (root * A, root * B, Q, R)), s=S.detach().numpy()
+        )
+    except (ValueError, scipy.linalg.LinAlgError) as error:
+        raise QPError.expected(
+            "terminal_weight",
+            f"a Riccati equation without a solution ({error})",
+            "a stabilisable model and a positive definite weight of the actions",
+            "Give the actions some weight, or pass a matrix.",
+        ) from error
+    return torch.as_tensor((P + P.T) / 2).to(A)
+
+
+def terminal_riccati(A: Tensor, B: Tensor, W: Tensor, gamma: float, layout: Layout) -> Tensor:
+    """Return P for a scheme's model and stage weight, about the x of least stage cost for d.
+
+    Args:
+        A, B: the model.
+        W: the stage weight, or its diagonal; with a preview, that of [d; x; u] or of [x; u].
+        gamma: the discount.
+        layout: the sizes.
+
+    Raises:
+        QPError: the scheme has a window or several stages, or there is no solution.
+    """
+    if layout.past > 1:
+        remedy = "Pass a matrix: its cost to go is one of the whole window."
+        raise QPError.expected("terminal_weight", f"{RICCATI!r} with past > 1", "past=1", remedy)
+    W, n_d = torch.diag(W) if W.shape == (layout.n,) else W, layout.n_d
+    cross = W.new_zeros(layout.n_x, 0)
+    if W.shape == (n_d + layout.n,) * 2:
+        cross, W = W[n_d : n_d + layout.n_x, :n_d], W[n_d:, n_d:]
+    sizes = {"A": (A, layout.n_x, layout.n_x), "B": (B, layout.n_x, layout.n_u)}
+    for name, (matrix, *shape) in (sizes | {"stage_weight": (W, layout.n, layout.n)}).items():
+        if list(matrix.shape) != shape:
+            got, remedy = f"shape {tuple(matrix.shape)}", "The Riccati equation has one stage only."
+            raise QPError.expected(name, got, f"shape {tuple(shape)}", remedy)
+    P = riccati_weight(A, B, W, gamma)
+    if not cross.any():
+        return P
+    # x - target, where the stage's cost of x is least for d.
+    Q = W[: layout.n_x, : layout.n_x]
+    error = torch.cat((torch.linalg.pinv(Q, hermitian=True) @ cross, torch.eye(len(P)).to(P)), -1)
+    return error.mT @ P @ error

@@ -1,0 +1,185 @@
+"""Schemes: what a QPMPC's QP (eq:qp5) starts from, as data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_qpmpc.checks import check_kind, check_number, check_seed
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.bounds import Bounds
+from torch_qpmpc.mpc.cost import Cost
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.qp.forking import serially_if_forked
+
+#: The default discount, that of the paper.
+GAMMA = 0.9
+SIZES = ("n_x", "n_u", "horizon", "past", "n_d")
+#: The parts of theta that may start at any finite values.
+STARTED = ("q", "c", "C", "b")
+
+
+@dataclass(frozen=True, eq=False)
+class Scheme:
+    """An MPC scheme (eq:v1): the sizes, the model, the cost, the bounds and the discount.
+
+    Its tensors are copies in float64 on the CPU. `dataclasses.replace` makes another with some
+    fields changed.
+
+    Args:
+        layout: the sizes; the scheme counts the rows of its bounds itself.
+        model: A, B, E and the offset; drawn at random by default.
+        cost: the weights; drawn at random by default.
+        bounds: no bounds by default.
+        gamma: discount of the stage costs, 0 < gamma <= 1.
+        seed: the seed of what is drawn.
+
+    Raises:
+        QPError: a part is of another type, or does not match the sizes; or the cost is not convex.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> model = qm.Model(A=[[1.0]], B=[[1.0]])
+        >>> cost = qm.Cost(stage_weight=[1.0, 0.1])
+        >>> bounds = qm.Bounds(action_bounds=([-1.0], [1.0]))
+        >>> scheme = qm.Scheme(model.layout(horizon=3), model, cost, bounds)
+        >>> qm.QPMPC(scheme).policy(torch.tensor([[0.1], [4.0]])).detach()
+        tensor([[-0.0908],
+                [-1.0000]])
+    """
+
+    layout: Layout
+    model: Model = field(default_factory=Model)
+    cost: Cost = field(default_factory=Cost)
+    bounds: Bounds = field(default_factory=Bounds)
+    gamma: float = GAMMA
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        kinds = {"layout": Layout, "model": Model, "cost": Cost, "bounds": Bounds}
+        for name, kind in kinds.items():
+            check_kind(name, getattr(self, name), kind)
+        check_number("gamma", self.gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
+        check_seed(self.seed)
+        object.__setattr__(self, "gamma", float(self.gamma))
+        object.__setattr__(self, "seed", int(self.seed))
+        object.__setattr__(self, "layout", self.bounds.counted(self.layout))
+        _ = self.theta  # which compares shapes and checks the cost
+
+    @classmethod
+    def of(
+        cls,
+        n_x: int,
+        n_u: int,
+        horizon: int,
+        past: int = 1,
+        n_d: int = 0,
+        *,
+        gamma: float = GAMMA,
+        start: Mapping[str, Any] | None = None,
+        seed: int = 0,
+        **options: Any,
+    ) -> Scheme:
+        """Return the scheme of sizes and of the arguments of its parts by name.
+
+        Args:
+            n_x, n_u, horizon, past, n_d: see `Layout`.
+            gamma, seed: see `Scheme`.
+            start: initial values of some of q, c, C and b by name, in place of those that follow
+                from the other arguments.
+            options: the arguments of `Model`, `Cost` and `Bounds`.
+
+        Raises:
+            QPError: an argument is invalid.
+        """
+        layout = Layout(n_x, n_u, horizon, past, n_d)
+        arguments = {**options, **_started(start)}
+        model, cost, bounds = (_taken(kind, arguments) for kind in (Model, Cost, Bounds))
+        if arguments:
+            raise TypeError(f"QPMPC got an unexpected keyword argument {min(arguments)!r}")
+        return cls(layout, Model(**model), Cost(**cost), Bounds(**bounds), gamma, seed)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of `of` as tensors, tuples and plain values."""
+        parts = (self.model, self.cost, self.bounds)
+        return {
+            **{name: getattr(self.layout, name) for name in SIZES},
+            **{x.name: getattr(part, x.name) for part in parts for x in fields(part)},
+            "gamma": self.gamma,
+            "seed": self.seed,
+        }
+
+    @property
+    def is_random(self) -> bool:
+        """True if the model or the stage cost is drawn at random."""
+        return self.model.A is None or self.model.B is None or self.cost.stage_weight is None
+
+    @property
+    def C_0(self) -> Tensor:
+        """The banded C of the model (eq:cband), ``(N n_x, n_z)``."""
+        return self._start[0]
+
+    @property
+    def theta(self) -> dict[str, Tensor]:
+        """The parts of theta by name, without discounts (eq:qpH); w is inf on hard rows."""
+        return self._start[1]
+
+    @cached_property
+    def _start(self) -> tuple[Tensor, dict[str, Tensor]]:
+        with torch.device("cpu"):
+            return _initial_theta(self)
+
+    def __repr__(self) -> str:
+        return f"Scheme({self.layout}, hessian={self.cost.hessian!r}, gamma={self.gamma})"
+
+    def __reduce__(self) -> tuple:
+        # Without the cached theta, which follows from the fields.
+        return type(self), tuple(getattr(self, x.name) for x in fields(self))
+
+
+@serially_if_forked
+def _initial_theta(scheme: Scheme) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return C_0 and theta."""
+    layout, model, cost = scheme.layout, scheme.model, scheme.cost
+    random = torch.Generator().manual_seed(scheme.seed)
+    A, B, E = model.matrices(layout, random)
+    C_0 = banded_matrix(A, B, layout.horizon, E)
+    theta = {
+        **cost.hessians(layout, A, B, scheme.gamma, random),
+        "q": torch.zeros(layout.n_z, dtype=torch.float64),
+        "c": torch.zeros((), dtype=torch.float64),
+        "C": C_0,
+        "b": model.offsets(layout),
+        **scheme.bounds.rows(layout),
+    }
+    for name, value in (("q", cost.q), ("c", cost.c), ("C", model.C), ("b", model.b)):
+        if value is None:
+            continue
+        if value.shape != theta[name].shape:
+            got, want = tuple(value.shape), tuple(theta[name].shape)
+            raise QPError.expected(name, f"shape {got}", f"shape {want}")
+        theta[name] = value
+    return C_0, theta
+
+
+def _taken(kind: type, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Take those of the arguments that are fields of a dataclass."""
+    return {x.name: arguments.pop(x.name) for x in fields(kind) if x.name in arguments}
+
+
+def _started(start: Any) -> Mapping[str, Any]:
+    if start is None:
+        return {}
+    if isinstance(start, Mapping) and all(name in STARTED for name in start):
+        return start
+    got = list(start) if isinstance(start, Mapping) else repr(start)
+    wanted = f"a mapping of values by name, of {', '.join(STARTED)}"
+    raise QPError.expected("start", got, wanted)
