@@ -61,7 +61,7 @@ from torch_qpmpc.envs import GrosZanonLTI
 from torch_qpmpc.experiment.tasks import Task, register
 from torch_qpmpc.experiment.tasks.gros_zanon import true_scheme
 
-register(Task("mine", lambda cfg: GrosZanonLTI(), lambda cfg, plant: true_scheme(plant)))
+register(Task("mine", lambda cfg: GrosZanonLTI(), true_scheme))
 """
 
 

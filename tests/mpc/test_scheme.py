@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import pickle
 from dataclasses import FrozenInstanceError, asdict, replace
 from typing import Any
@@ -81,6 +82,14 @@ def test_copies_have_the_same_fields_and_theta(copied):
         assert (twin.layout, twin.gamma, twin.seed) == (scheme.layout, scheme.gamma, scheme.seed)
         assert twin.is_random == scheme.is_random
         assert all(torch.equal(twin.theta[name], x) for name, x in scheme.theta.items())
+
+
+def test_the_arguments_in_a_file_make_the_same():
+    mask = torch.arange(8 * 14).reshape(8, 14) % 3 == 0
+    mpc, file = QPMPC(make(seed=2), learn={"C": mask, "H": True}, step="projection"), io.BytesIO()
+    torch.save(mpc.arguments, file)
+    file.seek(0)
+    same(QPMPC(**torch.load(file, weights_only=True)), mpc)
 
 
 def test_a_step_of_theta_leaves_the_scheme():
