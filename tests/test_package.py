@@ -55,7 +55,7 @@ def test_the_sdist_trains_and_tests(built):
     assert top == f"torch_qpmpc-{torch_qpmpc.__version__}"
     files = {name.removeprefix(f"{top}/") for name in files}
     alone = {"train.py", "pyproject.toml", "README.md", "LICENSE", "CITATION.cff"}
-    alone |= {"CHANGELOG.md", "CONTRIBUTING.md", "PKG-INFO", ".gitignore"}
+    alone |= {"CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "PKG-INFO", ".gitignore"}
     assert files == alone | sources("torch_qpmpc") | sources("configs") | sources("tests")
     assert built[0].stat().st_size < 1e6
 
