@@ -158,9 +158,7 @@ def _damaged(file: Path, reason: str) -> QPError:
         "Restore the file, resume from a copy of the folder, or start a new run with "
         "hydra.run.dir=FOLDER."
     )
-    return QPError.expected(
-        "metrics.csv", f"{file} ({reason})", "the table that a run wrote", remedy
-    )
+    return damaged(file, ValueError(reason), "the table that a run wrote", remedy)
 
 
 class WritableFolder(Callback):

@@ -54,12 +54,16 @@ def load_config(file: Path) -> DictConfig:
     return cfg
 
 
-def damaged(file: Path, error: Exception, expected: str) -> QPError:
+def damaged(
+    file: Path,
+    error: Exception,
+    expected: str,
+    remedy: str = "Restore the file, or move the run's folder elsewhere.",
+) -> QPError:
     """Make the error of a run's ``file`` that cannot be read."""
     reason = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, KeyError):
         reason = f"it has no {error.args[0]}"
-    remedy = "Restore the file, or move the run's folder elsewhere."
     return QPError.expected(file.name, f"{file} ({reason})", expected, remedy)
 
 

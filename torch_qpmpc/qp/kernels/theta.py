@@ -124,7 +124,7 @@ def inverse_factors(H, definite, shift):
 
 @compiled
 def _inverse_factor(H, shift, least, factor, inverse):
-    """Fill the lower triangle of ``inverse``; return False if a squared pivot is too small."""
+    """Fill zeros with the inverse; return False if a squared pivot is too small."""
     for a in range(len(H)):
         for b in range(a):
             factor[a, b] = (H[a, b] - dot(factor[a, :b], factor[b, :b])) / factor[b, b]
@@ -133,13 +133,10 @@ def _inverse_factor(H, shift, least, factor, inverse):
             return False
         factor[a, a] = math.sqrt(pivot)
     for a in range(len(H)):
-        row = inverse[a, :a]
-        for b in range(a):
-            row[b] = 0.0
         for b in range(a):
             add(inverse[a, : b + 1], -factor[a, b], inverse[b, : b + 1])
         for b in range(a):
-            row[b] /= factor[a, a]
+            inverse[a, b] /= factor[a, a]
         inverse[a, a] = 1.0 / factor[a, a]
     return True
 
