@@ -3,8 +3,8 @@
     x+ = f(x, u, w),    y = h(x, w),    cost L(x, u, w)
 
 x is the state, which may be hidden, y the measured output, and w the signals of a step: the known
-ones d come first, then those that no controller sees, such as noise. `PlantEnv` is a plant's TorchRL
-environment.
+ones d come first, then those that no controller sees, such as noise.
+`PlantEnv` is a plant's TorchRL environment.
 """
 
 from __future__ import annotations
