@@ -1,4 +1,4 @@
-"""What mkdocs.yml cannot say: files from outside docs/, and the examples of docstrings."""
+"""Additions to mkdocs.yml: files from outside docs/, and the examples of docstrings."""
 
 from __future__ import annotations
 

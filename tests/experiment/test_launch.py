@@ -15,7 +15,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment import launch as module
 from torch_qpmpc.experiment.launch import launched
 from torch_qpmpc.experiment.lock import LOCK
 
@@ -29,7 +28,6 @@ def hydra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
         overrides=SimpleNamespace(task=["seed=2"]),
     )
     monkeypatch.setattr(HydraConfig, "get", lambda: hydra)
-    monkeypatch.setattr(threading, "excepthook", threading.__excepthook__)
     return hydra
 
 
@@ -56,8 +54,25 @@ def test_an_error_of_the_user_is_one_sentence(hydra, error, sentence):
 
 
 @pytest.mark.parametrize("error", [OSError("disk"), ValueError("bug")])
-def test_a_threads_error_is_printed_unless_the_run_raises_it(capsys, error):
-    module._print_unless_os_error(
-        threading.ExceptHookArgs((type(error), error, None, threading.current_thread()))
-    )
-    assert ("bug" in capsys.readouterr().err) == isinstance(error, ValueError)
+def test_a_threads_error_is_printed_unless_the_run_raises_it(hydra, monkeypatch, error):
+    """The hook of before sees the other errors, and is back after the run."""
+    seen = []
+
+    def before(args: threading.ExceptHookArgs) -> None:
+        seen.append(args.exc_value)
+
+    def fail() -> None:
+        raise error
+
+    def run_thread() -> None:
+        thread = threading.Thread(target=fail)
+        thread.start()
+        thread.join()
+
+    monkeypatch.setattr(threading, "excepthook", before)
+    with launched():
+        run_thread()
+    assert seen == ([error] if isinstance(error, ValueError) else [])
+    with pytest.raises(SystemExit), launched():
+        raise QPError("seed: got x")
+    assert threading.excepthook is before

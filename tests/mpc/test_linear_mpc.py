@@ -223,6 +223,16 @@ def test_a_released_module_can_be_copied_saved_and_reset():
     assert_close(mpc.value(s), scheme(free=0.0).value(s))
 
 
+def test_a_released_copy_leaves_its_original_tied():
+    mpc, s = scheme(5), random_states(6)
+    value, names = mpc.value(s), [*mpc.state_dict()]
+    twin = copy.deepcopy(mpc)
+    twin.release()
+    assert type(twin) is not type(mpc)
+    assert (mpc.structure, [*mpc.state_dict()]) == ("tied", names)
+    assert_close(mpc.value(s), value, rtol=0, atol=0)
+
+
 def test_frozen_entries_stay_frozen():
     mpc = scheme(7)
     for name, parameter in mpc.named_parameters():

@@ -9,8 +9,7 @@ from torch_qpmpc.envs.house import House
 from torch_qpmpc.envs.house_wall import HouseWall
 from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
 from torch_qpmpc.envs.past_window import PastWindow
-from torch_qpmpc.envs.plant import Plant
-from torch_qpmpc.envs.plant_env import PlantEnv
+from torch_qpmpc.envs.plant import Plant, PlantEnv
 from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.envs.tank_references import TankReferences
 

@@ -1,4 +1,4 @@
-"""What the heated houses share: tariff, comfort band, hidden gain and cost.
+"""Shared parts of the heated houses: tariff, comfort band, hidden gain and cost.
 
 A step is a quarter of an hour; every episode starts at midnight. Units are kW, kWh, K, hours and
 EUR. The signals are w = [price, lower, upper, weather | gain]: all but the gain are known in

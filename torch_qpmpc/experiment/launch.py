@@ -102,13 +102,13 @@ def launched() -> Iterator[Launch]:
 
     In a sweep the error is raised instead, because an exit would end the other runs.
     """
-    threading.excepthook = _print_unless_os_error
     hydra = HydraConfig.get()
     sweep = hydra.mode is RunMode.MULTIRUN
     launch = Launch(hydra.runtime.output_dir, list(hydra.overrides.task), sweep)
     try:
         named = contextlib.nullcontext() if sweep else compilation_named()
-        with locked(launch.folder, ELSEWHERE_IN_SWEEP if sweep else ELSEWHERE), named:
+        lock = locked(launch.folder, ELSEWHERE_IN_SWEEP if sweep else ELSEWHERE)
+        with _threads_os_errors_ignored(), lock, named:
             yield launch
     except QPError as error:
         if sweep:
@@ -120,7 +120,20 @@ def launched() -> Iterator[Launch]:
         raise SystemExit(str(unwritable(launch.folder, error))) from None
 
 
-def _print_unless_os_error(error: threading.ExceptHookArgs) -> None:
-    """Print a thread's error, except TensorBoard's file errors, which the run raises again."""
-    if not isinstance(error.exc_value, OSError):
-        threading.__excepthook__(error)
+@contextmanager
+def _threads_os_errors_ignored() -> Iterator[None]:
+    """Keep silent about file errors of TensorBoard's thread, which the run raises again.
+
+    The thread starts inside TensorBoard, so that only Python's hook sees its errors.
+    """
+    previous = threading.excepthook
+
+    def hook(error: threading.ExceptHookArgs) -> None:
+        if not isinstance(error.exc_value, OSError):
+            previous(error)
+
+    threading.excepthook = hook
+    try:
+        yield
+    finally:
+        threading.excepthook = previous

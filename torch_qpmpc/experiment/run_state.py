@@ -237,7 +237,8 @@ def _part(name: str) -> Iterator[None]:
 def _collector_state(collector: Collector) -> dict[str, Any] | None:
     if (env := _saved_env(collector)) is None:
         return None
-    # TorchRL's collector state lacks the current steps and the ids of the episodes.
+    # The collector's state_dict lacks the current steps, and its load_state_dict begins new
+    # episodes with new ids: only its private attributes continue an episode.
     return {
         "episodes": collector._carrier.to_dict(),
         "trajectories": collector._traj_pool.state_dict(),

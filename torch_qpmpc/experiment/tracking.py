@@ -78,7 +78,7 @@ def reference_scheme(plant: TankReferences, model: Model, gamma: float) -> Schem
 def offset_free(A: Tensor, B: Tensor, memory: int = 1) -> tuple[Tensor, Tensor]:
     """Return the model with the mean of its last ``memory`` errors added to each prediction.
 
-    It has ``memory`` lags more. What stays the same is predicted to stay, so that a wrong model or
+    It has ``memory`` lags more. Constant values are predicted to stay, so that a wrong model or
     a constant disturbance causes no error in a steady state that can be reached. With one error it
     is the velocity form, y_{k+1} = y_k + A_1 (y_k - y_{k-1}) + B_1 (u_k - u_{k-1}) + ..; with more
     it passes on less noise.

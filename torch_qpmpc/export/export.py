@@ -81,7 +81,7 @@ class Agreement:
 
 @dataclass(frozen=True)
 class Export:
-    """What `QPMPC.export_c` has written.
+    """Report of `QPMPC.export_c`.
 
     Attributes:
         files: the paths of ``name.h`` and ``name.c``.

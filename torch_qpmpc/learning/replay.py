@@ -130,11 +130,6 @@ class Replay:
         sample, info = self.transitions.sample(return_info=True)
         return sample.set("index", torch.stack(info["index"], -1))
 
-    def _newest(self) -> int:
-        """Return the row that was written last."""
-        writer: Any = self.transitions.writer
-        return (writer._cursor - 1) % self.transitions.storage.shape[0]
-
     def remember(self, sample: TensorDictBase) -> None:
         """Store the active sets that the loss wrote into a sample, for the next time it is drawn.
 
@@ -206,7 +201,7 @@ class Replay:
         if len(self) == storage.max_size:
             # TorchRL saves the writer's position but not the storage's copy of it, which keeps
             # windows from crossing the ring's seam. Writing the newest row again restores the copy.
-            newest = self._newest()
+            newest = (state["writer"]["_cursor"] - 1) % storage.shape[0]
             storage.set(newest, storage.get(newest))
 
 

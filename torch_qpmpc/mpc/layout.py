@@ -1,6 +1,6 @@
 """The order of z and of the rows of G, their ties, and the discounted cost (eq:qpH).
 
-What is known comes first in z, then the plan:
+Known entries come first in z, then the plan:
 
     z = [d_0, .., d_N,  y_{1-L}, u_{1-L}, .., y_{-1}, u_{-1}, y_0,  u_0, y_1, u_1, .., y_N]
          preview        past window, up to the current output       plan

@@ -79,7 +79,7 @@ class Model:
     def matrices(self, layout: Layout, random: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """Return A, B and E of the sizes ``layout``.
 
-        What is None is drawn by ``random``, or zero for E.
+        Matrices that are None are drawn by ``random``; E is zero.
 
         Raises:
             QPError: a shape does not match the sizes.

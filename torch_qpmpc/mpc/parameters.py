@@ -39,7 +39,8 @@ def attach(module: nn.Module, name: str, parametrizations: list[nn.Module]) -> N
 def replace(module: nn.Module, name: str, parametrizations: list[nn.Module]) -> None:
     """Replace the parametrizations of a part; its value and its ``requires_grad`` stay."""
     value = getattr(module, name).detach()
-    # remove_parametrizations would change the class, which deep copies share.
+    # torch makes a class per module, which its deep copies share; remove_parametrizations deletes
+    # the part's property from it, and would break the copies.
     own = type(type(module).__name__, type(module).__bases__, {**vars(type(module))})
     module.__class__ = own  # pyright: ignore[reportAttributeAccessIssue] - equal but for its identity
     frozen = not any(leaf.requires_grad for leaf in leaves(module, name))

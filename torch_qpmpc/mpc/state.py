@@ -1,4 +1,4 @@
-"""What a QPMPC's state belongs to: its identity in a state_dict, and pickles.
+"""Identity of a QPMPC in its state_dict, and pickles.
 
 The identity prevents loading a state into another module. torch does not pickle parametrised
 modules, but spawned collectors need it: a pickle has the scheme and the state.

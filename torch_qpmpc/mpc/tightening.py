@@ -17,7 +17,7 @@ References:
 from __future__ import annotations
 
 import torch
-from scipy.stats import norm
+from scipy.special import ndtri
 from torch import Tensor
 
 from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
@@ -96,7 +96,7 @@ def tighten(
     K = covariances.new_zeros(n_u, n_x) if K is None else K
     check_tensor("K", K, n_u, n_x, batched=False)
     variance = _row_variance(mpc, covariances.to(mpc.lb), K.to(mpc.lb))
-    margin = float(norm.ppf(probability)) * variance.sqrt()
+    margin = float(ndtri(probability)) * variance.sqrt()
     lb, ub = mpc.lb + margin, mpc.ub - margin
     halfway = (mpc.lb + mpc.ub) / 2
     crossed = lb > ub

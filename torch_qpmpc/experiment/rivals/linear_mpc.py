@@ -153,7 +153,7 @@ class OmniscientMPC:
         self._x, self._w, self._k = x, w, 0
 
     def __call__(self, p: Tensor) -> Tensor:
-        """Return actions ``(starts, n_u)``, without a look at p."""
+        """Return actions ``(starts, n_u)``, ignoring p."""
         w = self._w[:, self._k : self._k + self._horizon + 1]
         _, _, e = self._plant.model(w[:, :-1])
         A, B, _ = self._plant.model(w[:, 0])
