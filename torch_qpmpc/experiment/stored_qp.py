@@ -25,7 +25,7 @@ def stored(mpc: QPMPC) -> dict[str, Any]:
 
 
 def learned_qp(folder: str | Path) -> QPMPC:
-    """Make the learned QP of the run in ``folder``, which acts.
+    """Make the QP that the run in ``folder`` has learned and kept.
 
     Raises:
         QPError: there is no checkpoint, it is damaged, or the policy is a network.

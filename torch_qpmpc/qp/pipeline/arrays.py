@@ -1,6 +1,6 @@
-"""What the pipeline passes on: data, condensed QPs, claims of backends, certified solutions.
+"""Arrays of the pipeline: data, condensed QPs, claims of backends, certified solutions.
 
-Arrays are NumPy's on the CPU, and tensors on other devices.
+They are NumPy's on the CPU, and tensors on other devices.
 """
 
 from __future__ import annotations
