@@ -74,7 +74,7 @@ def _train(
     physics = make_physics(cfg)
     identified = make_start(cfg, physics, folder, written=state is not None, quiet=quiet)
     mpc = make_mpc(cfg, physics, identified)
-    found = Evaluation.before(cfg, physics, mpc, quiet)
+    evaluation = Evaluation.before(cfg, physics, mpc, quiet)
 
     # The learner: Q-learning of first or second order, or actor-critic.
     operator = make_operator(cfg, mpc)
@@ -98,7 +98,7 @@ def _train(
         # Warm up, or resume.
         if state is None:
             tally = Tally()
-            report(run, gate.mpc, found, 0)
+            report(run, gate.mpc, evaluation, 0)
             for batch in itertools.islice(stream, -(-cfg.warmup_steps // cfg.steps_per_update)):
                 learner.observe(batch)
                 if cfg.replay:
@@ -108,7 +108,7 @@ def _train(
             tally = restore(state, mpc, learner, gate, collector, replay)
             if state["collector"] is None and tally.update < cfg.updates and not quiet:
                 print("Starting new episodes: the state of the environments is not saved.")
-            found.evaluate(gate.policy)
+            evaluation.evaluate(gate.policy)
         interrupt.exit_if_signalled(f"Stopped after update {tally.update}: {command}")
 
         label = f"{cfg.constraint.name}, {cfg.noise.name}"
@@ -141,8 +141,8 @@ def _train(
             last = update == cfg.updates
             evaluated = last or update % cfg.eval_interval == 0
             if evaluated:
-                found.evaluate(gate.policy)
-                gap = report(run, gate.mpc, found, update)
+                evaluation.evaluate(gate.policy)
+                gap = report(run, gate.mpc, evaluation, update)
                 progress.set_postfix(J=cost_text(gap["J_best"]), closed_gap=gap["closed_gap"])
             if evaluated or interrupt.signum is not None:
                 run.flush()
@@ -153,8 +153,8 @@ def _train(
                 interrupt.exit_if_signalled(f"Stopped after update {update}: {command}")
 
         gate.save(run.path)
-        found.evaluate(learner.policy, "candidate")
-        summary = run_summary(found, tally, gate)
+        evaluation.evaluate(learner.policy, "candidate")
+        summary = run_summary(evaluation, tally, gate)
         if cfg.export is not None and gate.mpc is not None:
             export_run(gate.mpc, run.path, quiet)
         run.finish(summary)

@@ -224,57 +224,57 @@ def slice_between(mpc: QPMPC, starts: Tensor, points: int = 21) -> PolicyMap:
     return policy_map(mpc, x, y, axes=axes, at=at)
 
 
-def draw_slice(axes: Axes, found: PolicyMap, field: Tensor, title: str, **style: Any) -> QuadMesh:
+def draw_slice(axes: Axes, mapped: PolicyMap, field: Tensor, title: str, **style: Any) -> QuadMesh:
     """Draw a field on the grid, ``(n, m)``, blank where it is nan."""
-    grid = (part.numpy() for part in (found.x, found.y, field.mT))
+    grid = (part.numpy() for part in (mapped.x, mapped.y, field.mT))
     image = axes.pcolormesh(*grid, shading="nearest", rasterized=True, **style)
-    first, second = found.names
+    first, second = mapped.names
     axes.set(xlabel=f"${first}$", ylabel=f"${second}$", title=title)
     return image
 
 
-def draw_regions(axes: Axes, found: PolicyMap) -> None:
+def draw_regions(axes: Axes, mapped: PolicyMap) -> None:
     """Draw the regions of one active set each, with their borders; colours repeat."""
-    title = f"Active sets: {len(found.active_sets)} regions on this grid"
-    colours = (found.regions % 20).double().masked_fill(found.regions < 0, torch.nan)
-    draw_slice(axes, found, colours, title, cmap="tab20", vmin=-0.5, vmax=19.5)
-    for line in _borders(found):
+    title = f"Active sets: {len(mapped.active_sets)} regions on this grid"
+    colours = (mapped.regions % 20).double().masked_fill(mapped.regions < 0, torch.nan)
+    draw_slice(axes, mapped, colours, title, cmap="tab20", vmin=-0.5, vmax=19.5)
+    for line in _borders(mapped):
         axes.plot(*line, color="black", linewidth=0.5, alpha=0.6)
 
 
-def policy_figure(found: PolicyMap, action: int = 0) -> Figure:
+def policy_figure(mapped: PolicyMap, action: int = 0) -> Figure:
     """Plot the value, an action, its local gain and the active sets on a slice of the states.
 
     Args:
-        found: a `policy_map`.
+        mapped: a `PolicyMap`.
         action: index of the action.
     """
     figure = Figure(figsize=(12, 9), layout="constrained")
     (value, policy), (gain, sets) = figure.subplots(2, 2)
-    u, name = found.actions[..., action], f"{{{action + 1}}}"
-    images = [draw_slice(value, found, found.values, "Value $V(s)$", cmap="viridis")]
+    u, name = mapped.actions[..., action], f"{{{action + 1}}}"
+    images = [draw_slice(value, mapped, mapped.values, "Value $V(s)$", cmap="viridis")]
     size = max(1e-12, u.nan_to_num().abs().max().item())
     title = rf"Policy $\pi_{name}(s)$"
-    images.append(draw_slice(policy, found, u, title, cmap="RdBu_r", vmin=-size, vmax=size))
-    slope = found.gains[..., action, :].norm(dim=-1)
+    images.append(draw_slice(policy, mapped, u, title, cmap="RdBu_r", vmin=-size, vmax=size))
+    slope = mapped.gains[..., action, :].norm(dim=-1)
     title = rf"Local gain $\|d\pi_{name} / ds\|$"
-    images.append(draw_slice(gain, found, slope, title, cmap="magma"))
+    images.append(draw_slice(gain, mapped, slope, title, cmap="magma"))
     for axes, image in zip((value, policy, gain), images, strict=True):
         figure.colorbar(image, ax=axes, shrink=0.85)
-    draw_regions(sets, found)
+    draw_regions(sets, mapped)
     return figure
 
 
-def _borders(found: PolicyMap) -> list[tuple[list[float], list[float]]]:
+def _borders(mapped: PolicyMap) -> list[tuple[list[float], list[float]]]:
     """Return the segments between grid points of different active sets, as one line per axis.
 
     A line is a pair of coordinate lists, with nan between the segments.
     """
-    edges = [_edges(axis) for axis in (found.x, found.y)]
+    edges = [_edges(axis) for axis in (mapped.x, mapped.y)]
     lines = []
     for axis in (0, 1):
         across, along = edges[axis], edges[1 - axis]
-        regions = found.regions if axis == 0 else found.regions.mT
+        regions = mapped.regions if axis == 0 else mapped.regions.mT
         at: list[float] = []
         along_at: list[float] = []
         for i, j in (regions[1:] != regions[:-1]).nonzero().tolist():

@@ -134,8 +134,8 @@ def read(
         >>> import torch, torch_qpmpc as qm
         >>> from torch_qpmpc.analysis.report import read
         >>> A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]), torch.tensor([[0.0], [0.1]])
-        >>> found = read(qm.QPMPC.linear_mpc(A, B, 10, stage_weight=[1.0, 1.0, 1.0]))
-        >>> found.order, found.distance_to_mpc < 1e-9, round(found.radius_predicted, 2)
+        >>> reading = read(qm.QPMPC.linear_mpc(A, B, 10, stage_weight=[1.0, 1.0, 1.0]))
+        >>> reading.order, reading.distance_to_mpc < 1e-9, round(reading.radius_predicted, 2)
         (1.0, True, 0.97)
     """
     check_kind("mpc", mpc, QPMPC)

@@ -148,11 +148,11 @@ def nearest_model(form: PredictionForm) -> Model:
 
     def rollout(theta: Tensor) -> tuple[Tensor, Tensor]:
         """Return the maps of the windows and of x_1, .., x_N that theta predicts."""
-        x, found = [*states[0].split(n_x)[::-1]], []
+        x, lagged = [*states[0].split(n_x)[::-1]], []
         for rest in inputs:
-            found.append(torch.cat((*x[: -past - 1 : -1], rest)))
-            x.append(theta @ found[-1])
-        return torch.stack(found), torch.stack(x[past:])
+            lagged.append(torch.cat((*x[: -past - 1 : -1], rest)))
+            x.append(theta @ lagged[-1])
+        return torch.stack(lagged), torch.stack(x[past:])
 
     def residuals(flat):
         return (rollout(torch.as_tensor(flat).view(shape))[1] - maps[1:]).flatten().numpy()
@@ -173,10 +173,10 @@ def nearest_model(form: PredictionForm) -> Model:
     candidates = [np.zeros(start.numel()), start.flatten().numpy()]
     begin = min(candidates, key=lambda flat: np.linalg.norm(residuals(flat)))
     tight = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-12}
-    found = least_squares(residuals, begin, jac=jacobian, method="lm", **tight)  # pyright: ignore[reportArgumentType] - jac may be a function
-    theta = torch.as_tensor(found.x).view(shape)
+    fit = least_squares(residuals, begin, jac=jacobian, method="lm", **tight)  # pyright: ignore[reportArgumentType] - jac may be a function
+    theta = torch.as_tensor(fit.x).view(shape)
     scale = _without_offset(maps[1:]).sum().sqrt()
-    return Model(*_split(theta, form), math.sqrt(2 * found.cost) / scale)
+    return Model(*_split(theta, form), math.sqrt(2 * fit.cost) / scale)
 
 
 def memory_energies(form: PredictionForm, rtol: float = 1e-9) -> Tensor:

@@ -108,8 +108,8 @@ class RunGate:
                 bar.update()
                 return self._costs(actor, seed)
 
-            found = search(mpc, costs, sizes, loops=loops, seed=seed)
-        return {f"search/{name}": x for name, x in found.items()} | self._judge("search")
+            metrics = search(mpc, costs, sizes, loops=loops, seed=seed)
+        return {f"search/{name}": x for name, x in metrics.items()} | self._judge("search")
 
     def _costs(self, actor: Any, seed: int) -> Tensor:
         policy = in_closed_loop(actor, self._learner.n_preview)

@@ -56,18 +56,22 @@ def update_metrics(
     return metrics | watch.metrics()
 
 
-def run_summary(found: Evaluation, tally: Tally, gate: RunGate) -> dict[str, Any]:
+def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str, Any]:
     """Return the content of summary.json, which is about the policy that is kept."""
-    cfg, mpc = found.cfg, gate.mpc
-    summary = found.summary() | gate.summary()
+    cfg, mpc = evaluation.cfg, gate.mpc
+    summary = evaluation.summary() | gate.summary()
     summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
     summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
     summary |= {"ablation": cfg.ablation, "step": cfg.step}
     summary |= {"updates": cfg.updates, **tally.summary()}
-    return summary if mpc is None else summary | structure_summary(mpc, true_model(found.physics))
+    return (
+        summary if mpc is None else summary | structure_summary(mpc, true_model(evaluation.physics))
+    )
 
 
-def report(run: RunFolder, mpc: QPMPC | None, found: Evaluation, update: int) -> dict[str, Any]:
+def report(
+    run: RunFolder, mpc: QPMPC | None, evaluation: Evaluation, update: int
+) -> dict[str, Any]:
     """Log an evaluation: J, the structure of C and, if configured, figures.
 
     Before the first update only J is logged; after the last, the figures of `draw_outcome` are
@@ -76,36 +80,36 @@ def report(run: RunFolder, mpc: QPMPC | None, found: Evaluation, update: int) ->
     Args:
         run: the run's folder.
         mpc: the learned QP; None if the policy is a network.
-        found: the evaluation.
+        evaluation: the evaluation.
         update: the number of updates so far.
 
     Returns:
         `Evaluation.summary`.
     """
-    summary = found.summary()
+    summary = evaluation.summary()
     scalars = {f"eval/{name}": summary[key] for name, key in EVALUATION_SCALARS.items()}
-    scalars |= {f"eval/J_{tag(name)}": J for name, J in found.rivals.items()}
+    scalars |= {f"eval/J_{tag(name)}": J for name, J in evaluation.rivals.items()}
     run.log(scalars, update)
     if mpc is None or update == 0:
         return summary
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u, mpc.past, mpc.n_d)
     distances |= structure_metrics(mpc)
     run.log({f"structure/{name}": distance for name, distance in distances.items()}, update)
-    if found.cfg.figures:
+    if evaluation.cfg.figures:
         run.figure("structure/C", constraint_figure(mpc), update)
-        run.figure("eval/closed_loop", closed_loop_figure(found.loops, mpc), update)
-        if update == found.cfg.updates:
-            draw_outcome(run, mpc, found, update)
+        run.figure("eval/closed_loop", closed_loop_figure(evaluation.loops, mpc), update)
+        if update == evaluation.cfg.updates:
+            draw_outcome(run, mpc, evaluation, update)
     return summary
 
 
-def draw_outcome(run: RunFolder, mpc: QPMPC, found: Evaluation, update: int) -> None:
+def draw_outcome(run: RunFolder, mpc: QPMPC, evaluation: Evaluation, update: int) -> None:
     """Draw summary.png and episode.png; log the episode and the policy."""
-    known = found.loops["learned"].known
-    summary = summary_figure(mpc, found, *run.column("eval/J"))
+    known = evaluation.loops["learned"].known
+    summary = summary_figure(mpc, evaluation, *run.column("eval/J"))
     summary.savefig(run.path / "summary.png", dpi=110)
     if known.isfinite().all():
-        episode = learned_episode_figure(mpc, found)
+        episode = learned_episode_figure(mpc, evaluation)
         episode.savefig(run.path / "episode.png", dpi=110)
         run.figure("eval/episode", episode, update)
     if mpc.n_x > 1:

@@ -60,9 +60,9 @@ def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, show
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
 
 
-def learned_episode_figure(mpc: QPMPC, found: Evaluation) -> Figure:
+def learned_episode_figure(mpc: QPMPC, evaluation: Evaluation) -> Figure:
     """Draw the first episode of the learned policy, and its plans after every half horizon."""
-    loop, task = found.loops["learned"], find_task(found.cfg.task)
+    loop, task = evaluation.loops["learned"], find_task(evaluation.cfg.task)
     p = loop.known[:, 0]
     names = {
         "outputs": [f"$s_{{{i + 1}}}$" for i in range(mpc.n_x)],
@@ -71,7 +71,7 @@ def learned_episode_figure(mpc: QPMPC, found: Evaluation) -> Figure:
     options = {
         "times": torch.arange(len(p), dtype=torch.float64),
         **names,
-        **task.episode(found.physics, p[:, : mpc.n_d]),
+        **task.episode(evaluation.physics, p[:, : mpc.n_d]),
     }
     plans = plans_along(mpc, p[:-1], every=max(mpc.horizon // 2, 1))
     return episode_figure(y=loop.states[:, 0], u=loop.actions[:, 0], plans=plans, **options)
@@ -95,14 +95,14 @@ def closed_loop_figure(loops: Mapping[str, ClosedLoop], mpc: QPMPC) -> Figure:
 
 
 def draw_learning(
-    axes: Axes, updates: Sequence[float], J: Sequence[float], found: Evaluation
+    axes: Axes, updates: Sequence[float], J: Sequence[float], evaluation: Evaluation
 ) -> None:
     """Draw J over updates and experience, with the J of the others as lines."""
     axes.plot(updates, J, color=COLOURS["learned"], marker="o", markersize=3, label="learned")
-    draw_lines(axes, found.lines())
+    draw_lines(axes, evaluation.lines())
     axes.set(xlabel="update", ylabel="J, mean over starts")
     scale_costs(axes)
-    draw_experience(axes, found.cfg)
+    draw_experience(axes, evaluation.cfg)
     axes.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
 
 
@@ -150,12 +150,12 @@ def experience(cfg: DictConfig) -> tuple[float, float, str]:
 
 
 def summary_figure(
-    mpc: QPMPC, found: Evaluation, updates: Sequence[float], J: Sequence[float]
+    mpc: QPMPC, evaluation: Evaluation, updates: Sequence[float], J: Sequence[float]
 ) -> Figure:
     """Draw a run's learning curve, learned matrix and closed loop side by side."""
     figure = Figure(figsize=(15, 4), layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1.5, 1))
-    draw_learning(left, updates, J, found)
+    draw_learning(left, updates, J, evaluation)
     draw_matrix(middle, mpc.C, mpc, r"Learned constraint matrix $C_\theta$")
-    draw_positions(right, found.loops, mpc)
+    draw_positions(right, evaluation.loops, mpc)
     return figure

@@ -78,9 +78,9 @@ class CompiledPolicy:
         self.last = self._library.steps(self._states, p, self._n_u)
         if self._raises and self.last.codes.any():
             codes = np.bincount(self.last.codes, minlength=len(CODES))
-            found = [f"{codes[i]} {CODES[i]}" for i in range(1, len(CODES)) if codes[i]]
+            failures = [f"{codes[i]} {CODES[i]}" for i in range(1, len(CODES)) if codes[i]]
             total = f"{(self.last.codes != 0).sum()} of {len(p)}"
-            raise SolverError(f"{total} steps have no certified solution: {', '.join(found)}.")
+            raise SolverError(f"{total} steps have no certified solution: {', '.join(failures)}.")
         u = torch.from_numpy(self.last.u).to(s)
         return u.reshape(*s.shape[:-1], self._n_u)
 

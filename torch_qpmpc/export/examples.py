@@ -56,8 +56,8 @@ def nearer(
         if not len(moved):
             break
         p[moved] = (p[moved] + tables.centre) / 2
-        found = solve(p[moved])
-        for whole, part in zip(exact.parts(), found.parts(), strict=True):
+        solution = solve(p[moved])
+        for whole, part in zip(exact.parts(), solution.parts(), strict=True):
             whole[moved] = part
     return p, exact
 

@@ -27,8 +27,8 @@ def compiler() -> list[str] | None:
     if named := _named():
         return named if shutil.which(named[0]) else None
     for name in ("cc", "gcc", "clang"):
-        if found := shutil.which(name):
-            return [found]
+        if path := shutil.which(name):
+            return [path]
     if importlib.util.find_spec("ziglang"):
         return [sys.executable, "-m", "ziglang", "cc"]
     return None

@@ -101,7 +101,7 @@ def filled(template: str, name: str, parts: Mapping[str, str] | None = None) -> 
     """Return a template of this folder with its names and parts replaced."""
     text = resources.files("torch_qpmpc.export").joinpath(template).read_text(encoding="utf-8")
     named = {"policy": name, "POLICY": name.upper()}
-    text = re.sub("policy|POLICY", lambda found: named[found[0]], text)  # at once: MY_POLICY
+    text = re.sub("policy|POLICY", lambda match: named[match[0]], text)  # at once: MY_POLICY
     for mark, part in (parts or {}).items():
         text = text.replace(mark, part)
     return text

@@ -29,10 +29,10 @@ def coordinates(module: nn.Module) -> dict[str, Tensor]:
 
     H, H_f and w have coordinates only if they are learned.
     """
-    found: dict[str, Tensor] = {}
+    named: dict[str, Tensor] = {}
     for part in parts(module):
-        found |= _of_part(module, part)
-    return found
+        named |= _of_part(module, part)
+    return named
 
 
 def parts(module: nn.Module) -> list[str]:

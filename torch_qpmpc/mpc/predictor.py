@@ -112,16 +112,19 @@ def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[ARX, Cons
     return model, Constraints(C, b)
 
 
-def predict(found: Constraints, Z: Tensor, layout: Layout) -> Tensor:
+def predict(constraints: Constraints, Z: Tensor, layout: Layout) -> Tensor:
     """Predict y_1, .., y_N ``(*batch, N, n_x)`` from p and the actions in z ``(*batch, n_z)``."""
     outputs = outputs_in(layout).flatten()
     Z = Z.index_fill(-1, outputs, 0.0)
-    Y = torch.linalg.solve(found.C[:, outputs], (found.b - Z @ found.C.mT).mT).mT
+    Y = torch.linalg.solve(constraints.C[:, outputs], (constraints.b - Z @ constraints.C.mT).mT).mT
     return Y.unflatten(-1, (layout.horizon, layout.n_x))
 
 
 def prediction_errors(
-    trajectories: Sequence[Trajectory], found: Constraints, layout: Layout, causal: bool = True
+    trajectories: Sequence[Trajectory],
+    constraints: Constraints,
+    layout: Layout,
+    causal: bool = True,
 ) -> Tensor:
     """Return y_{k+1} minus its prediction from each start, ``(starts, N, n_x)``.
 
@@ -134,7 +137,7 @@ def prediction_errors(
     for log in trajectories:
         Z = windows(log, layout)
         over = torch.arange(len(Z)).unsqueeze(-1) + needed >= len(Z)
-        error = Z[:, outputs_in(layout)] - predict(found, Z, layout)
+        error = Z[:, outputs_in(layout)] - predict(constraints, Z, layout)
         errors.append(error.masked_fill(over.unsqueeze(-1), torch.nan))
     return torch.cat(errors)
 

@@ -34,18 +34,18 @@ def fit_rewards(log: Any, layout: Layout, diagonal: bool = False) -> StageCost:
     return fit_stage_cost(torch.cat(v), torch.cat(cost), layout.n_d, diagonal)
 
 
-def scheme_cost(found: StageCost, layout: Layout, gamma: float, hessian: str) -> Cost:
+def scheme_cost(fitted: StageCost, layout: Layout, gamma: float, hessian: str) -> Cost:
     """Return the cost of a scheme for that of a stage, which is that of x_N, too."""
     n_d, n_x, n_u, N = layout.n_d, layout.n_x, layout.n_u, layout.horizon
     diagonal = hessian == "diagonal"
-    W = found.W[n_d:, n_d:].diagonal() if diagonal else found.W
+    W = fitted.W[n_d:, n_d:].diagonal() if diagonal else fitted.W
     terminal = W[:n_x] if diagonal else W[: n_d + n_x, : n_d + n_x]
-    d, x, u = found.q.split((n_d, n_x, n_u))
-    past = found.q.new_zeros(layout.n_before - layout.n_preview)
+    d, x, u = fitted.q.split((n_d, n_x, n_u))
+    past = fitted.q.new_zeros(layout.n_before - layout.n_preview)
     stages = layout.stages(x.expand(N + 1, -1), u)
     ahead = gamma ** torch.arange(N + 1, dtype=torch.float64)
     q = torch.cat((d.repeat(N + 1), past, stages))
-    return Cost(W, terminal, hessian, q=q, c=found.c * ahead.sum())
+    return Cost(W, terminal, hessian, q=q, c=fitted.c * ahead.sum())
 
 
 def _observed(steps: Any, layout: Layout) -> tuple[Tensor, Tensor]:

@@ -119,11 +119,11 @@ def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = Fa
     seen = _Observed((v - middle) * scale, cost / unit, rows, columns, rows < n_free, n_free)
     W, q, c = _fit(seen)
     W, q, c = unit * W * scale * scale.unsqueeze(-1), unit * q * scale, unit * c
-    found = StageCost(W, q - W @ middle, c - q @ middle + middle @ W @ middle / 2)
-    R2 = _adjusted_R2(cost, cost - found(v), 1 + n + len(rows))
+    fitted = StageCost(W, q - W @ middle, c - q @ middle + middle @ W @ middle / 2)
+    R2 = _adjusted_R2(cost, cost - fitted(v), 1 + n + len(rows))
     if not R2 >= GOOD:
         warnings.warn(_poor(R2), UserWarning, stacklevel=2)
-    return StageCost(found.W, found.q, found.c, R2)
+    return StageCost(fitted.W, fitted.q, fitted.c, R2)
 
 
 def _checked(v: Tensor, cost: Tensor, n_free: int, diagonal: bool) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,7 @@ def escaped(name: object) -> str:
         >>> escaped("<b>![x](http://y)")
         '&lt;b&gt;![x]&#40;http://y)'
     """
-    return re.sub(r"\]\(|[&<>|`\\\n\t]", lambda found: SPECIAL[found[0]], printable(str(name)))
+    return re.sub(r"\]\(|[&<>|`\\\n\t]", lambda match: SPECIAL[match[0]], printable(str(name)))
 
 
 def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:

@@ -165,13 +165,13 @@ def policies_figure(frame: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(3.2 * len(slices), 6), layout="constrained")
     values, actions = figure.subplots(2, len(slices), squeeze=False)
     for name, row, fields, cmap in (
-        ("V", values, [found.values for found in slices.values()], "viridis"),
-        (r"\pi_1", actions, [found.actions[..., 0] for found in slices.values()], "RdBu_r"),
+        ("V", values, [part.values for part in slices.values()], "viridis"),
+        (r"\pi_1", actions, [part.actions[..., 0] for part in slices.values()], "RdBu_r"),
     ):
         every = torch.stack(fields).numpy()
         style = {"cmap": cmap, "vmin": np.nanmin(every), "vmax": np.nanmax(every)}
-        for axes, (label, found), field in zip(row, slices.items(), fields, strict=True):
-            image = draw_slice(axes, found, field, f"${name}$, {label}", **style)
+        for axes, (label, part), field in zip(row, slices.items(), fields, strict=True):
+            image = draw_slice(axes, part, field, f"${name}$, {label}", **style)
         figure.colorbar(image, ax=row.tolist())
     figure.suptitle(f"{runs['noise'].iloc[0]} noise, seed {runs['seed'].iloc[0]}")
     return figure

@@ -84,10 +84,10 @@ def masks(cfg: DictConfig, plant: HeatedHouse) -> dict[str, Tensor]:
     would be prices of the plan, of which that of y_N is not bounded.
     """
     layout = plant_layout(plant, plant.horizon)
-    found = {"q": torch.arange(layout.n_z) < layout.n_preview}
+    masks = {"q": torch.arange(layout.n_z) < layout.n_preview}
     if cfg.constraint.structure == "free":
-        found["C"] = band_distance(layout) <= 0
-    return found
+        masks["C"] = band_distance(layout) <= 0
+    return masks
 
 
 def episode(plant: HeatedHouse, d: Tensor) -> dict[str, Any]:

@@ -36,7 +36,7 @@ class Start(NamedTuple):
 def identified_start(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase) -> Start:
     """Identify C, b and a missing stage cost from a log of the plant; `identify` names errors."""
     layout = plant_layout(physics, cfg.task.horizon)
-    found = identify(
+    identified = identify(
         log,
         layout.horizon,
         past=layout.past,
@@ -48,23 +48,26 @@ def identified_start(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase) ->
     )
     cost = None
     if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is None:
-        cost = fit_rewards(log, found.options.layout, cfg.task.hessian == "diagonal")
-    return Start(log, found, cost)
+        cost = fit_rewards(log, identified.options.layout, cfg.task.hessian == "diagonal")
+    return Start(log, identified, cost)
 
 
 def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
     """Return ``scheme`` with the identified model and, if it has no weight, the log's cost."""
-    found, cost = start.identified, scheme.cost
-    predictor = () if found.options.structure == "tied" else found.constraints
+    identified, cost = start.identified, scheme.cost
+    predictor = () if identified.options.structure == "tied" else identified.constraints
     if cost.stage_weight is None:
-        cost = observed_cost(cfg, start.log, found.options.layout, start.cost)
+        cost = observed_cost(cfg, start.log, identified.options.layout, start.cost)
     return replace(
-        scheme, layout=found.options.layout, model=Model(*found.model, *predictor), cost=cost
+        scheme,
+        layout=identified.options.layout,
+        model=Model(*identified.model, *predictor),
+        cost=cost,
     )
 
 
 def observed_cost(
-    cfg: DictConfig, log: TensorDictBase, layout: Layout, found: StageCost | None = None
+    cfg: DictConfig, log: TensorDictBase, layout: Layout, fitted: StageCost | None = None
 ) -> Cost:
     """Return the cost of a scheme from that of a stage, by default fitted to the log's rewards.
 
@@ -75,8 +78,8 @@ def observed_cost(
         QPError: as in `fit_rewards`.
     """
     diagonal, gamma = cfg.task.hessian == "diagonal", cfg.task.gamma
-    found = fit_rewards(log, layout, diagonal) if found is None else found
-    cost = scheme_cost(found, layout, gamma, cfg.task.hessian)
+    fitted = fit_rewards(log, layout, diagonal) if fitted is None else fitted
+    cost = scheme_cost(fitted, layout, gamma, cfg.task.hessian)
     if gamma < 1:
         mean = -log["next", "reward"].double().mean()
         cost = replace(cost, c=cost.c + gamma ** (layout.horizon + 1) / (1 - gamma) * mean)
