@@ -15,6 +15,7 @@ LAYERS = {
     "qp": {"errors", "checks"},
     "mpc": {"errors", "checks", "qp"},
     "export": {"errors", "checks", "qp", "mpc"},
+    "proofs": {"errors", "checks", "qp", "mpc", "export"},
     "learning": {"errors", "checks", "qp", "mpc"},
     "envs": {"errors", "checks"},
     "analysis": {"errors", "checks", "qp", "mpc"},

@@ -1,0 +1,169 @@
+"""Worst cases of policies beside a million samples: effort, and the size at which it is too much.
+
+    python -m tests.benchmarks.proofs --write
+
+Each row asks for the largest violation of the state's bounds from a box of starts, with noise, and
+attacks the bound by a million starts with noise at its corners, and by gradient ascent from the
+worst of them. Seconds are the process's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from torch_qpmpc import QPMPC
+from torch_qpmpc.envs import PointMass
+from torch_qpmpc.proofs import Answer, Plant, Polytope, largest_violation
+from torch_qpmpc.study.markdown import replaced
+
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "prove.md"
+SAMPLES = 1_000_000
+#: Limit of each mixed-integer program.
+SECONDS = 120.0
+
+
+class Problem(NamedTuple):
+    """A policy, its plant, a box of starts and the bounds of the state."""
+
+    mpc: QPMPC
+    plant: Plant
+    starts: Polytope
+    bound: np.ndarray
+
+
+def double_integrator(horizon: int, structure: str) -> Problem:
+    """Position and velocity, bounded and soft; every start of the whole box of bounds."""
+    A, B = np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]])
+    bound = np.array([1.0, 0.5])
+    bounds = {"state_bounds": (-bound, bound), "action_bounds": ([-1.0], [1.0])}
+    weight = [1.0, 1.0, 0.1]
+    mpc = QPMPC.linear_mpc(A, B, horizon, stage_weight=weight, structure=structure, **bounds)
+    _disturb(mpc)
+    noise = Polytope.box([-0.02, -0.02], [0.02, 0.02])
+    return Problem(mpc, Plant.of(A, B, disturbances=noise), Polytope.box(-bound, bound), bound)
+
+
+def point_mass(horizon: int, structure: str) -> Problem:
+    """The paper's point mass; starts within half of the bounds."""
+    physics = PointMass()
+    A, B = physics.A.numpy(), physics.B.numpy()
+    bound = physics.ub_s.numpy()
+    bounds = {
+        "state_bounds": (physics.lb_s, physics.ub_s),
+        "action_bounds": (physics.lb_a, physics.ub_a),
+    }
+    W = [*(2 * physics.W.diagonal()).tolist(), 0.1, 0.1]
+    mpc = QPMPC.linear_mpc(A, B, horizon, stage_weight=W, structure=structure, **bounds)
+    _disturb(mpc)
+    noise = Polytope.box(-0.02 * np.ones(4), 0.02 * np.ones(4))
+    return Problem(
+        mpc, Plant.of(A, B, disturbances=noise), Polytope.box(-bound / 2, bound / 2), bound
+    )
+
+
+def _disturb(mpc: QPMPC) -> None:
+    """Move a free C off the model, as learning does."""
+    if mpc.structure == "free":
+        with torch.no_grad():
+            noise = torch.randn(mpc.C.shape, generator=torch.Generator().manual_seed(0))
+            mpc.C.add_(0.01 * noise)
+
+
+PROBLEMS = {"double integrator": double_integrator, "point mass": point_mass}
+
+
+def attack(problem: Problem, steps: int) -> float:
+    """Return the largest violation of a million samples, and of ascent from the worst hundred."""
+    mpc, plant, starts, bound = problem
+    generator = torch.Generator().manual_seed(1)
+    A, B = torch.as_tensor(plant.A), torch.as_tensor(plant.B)
+    assert plant.disturbances is not None
+    size = torch.as_tensor(plant.disturbances.upper)
+    low, high = torch.as_tensor(starts.lower), torch.as_tensor(starts.upper)
+
+    def violation(s: torch.Tensor, signs: torch.Tensor) -> torch.Tensor:
+        for k in range(steps):
+            s = s @ A.mT + mpc.policy(s) @ B.mT + signs[k] * size
+        return (s.abs() - torch.as_tensor(bound)).amax(-1)
+
+    chunks, worst = [], -np.inf
+    for _ in range(SAMPLES // 50_000):
+        s = low + (high - low) * torch.rand(50_000, len(low), generator=generator).double()
+        signs = torch.randint(0, 2, (steps, *s.shape), generator=generator).double() * 2 - 1
+        with torch.no_grad():
+            values = violation(s, signs)
+        worst = max(worst, float(values.max()))
+        top = values.topk(5).indices
+        chunks.append((s[top], signs[:, top]))
+    s = torch.cat([x for x, _ in chunks])
+    signs = torch.cat([x for _, x in chunks], dim=1)
+    for k in range(100):
+        s.requires_grad_()
+        values = violation(s, signs)
+        worst = max(worst, values.max().item())
+        (gradient,) = torch.autograd.grad(values.sum(), s)
+        step = 0.1 * (high - low) * 0.95**k
+        s = (s.detach() + step * gradient.sign()).clamp(low, high)
+    return worst
+
+
+def measured(name: str, horizon: int, structure: str, steps: int) -> list[str]:
+    """Measure one row of the table."""
+    problem = PROBLEMS[name](horizon, structure)
+    began = time.process_time()
+    answer: Answer = largest_violation(
+        problem.mpc,
+        problem.plant,
+        problem.starts,
+        -problem.bound,
+        problem.bound,
+        steps=steps,
+        seconds=SECONDS,
+    )
+    seconds = time.process_time() - began
+    sampled = attack(problem, steps)
+    return [
+        f"{name}, N = {horizon}, {structure}",
+        str(steps),
+        f"{answer.value:.4f}",
+        f"{answer.bound:.4f}",
+        f"{sampled:.4f}",
+        f"{answer.binaries} / {answer.nodes:,}",
+        f"{seconds:.1f}",
+    ]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the table, or write it into the docs."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.proofs", description=__doc__)
+    parser.add_argument("--horizons", type=int, nargs="*", default=[3, 5, 10])
+    parser.add_argument("--steps", type=int, nargs="*", default=[1, 2])
+    parser.add_argument("--write", action="store_true", help="write the table into the docs")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    rows = [
+        ["problem", "steps", "worst case", "bound", "attack", "binaries / nodes", "CPU, s"],
+        ["---", *["---:"] * 6],
+    ]
+    for name in PROBLEMS:
+        for horizon in options.horizons:
+            for structure in ("tied", "free"):
+                for steps in options.steps:
+                    rows.append(measured(name, horizon, structure, steps))
+                    print(" | ".join(rows[-1]), flush=True)
+    if options.write:
+        table = "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
+        text = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(replaced(text, table, "proofs"), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

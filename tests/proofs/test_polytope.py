@@ -1,0 +1,49 @@
+"""Polytopes: bounding boxes, vertices, and their errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torch_qpmpc import QPError
+from torch_qpmpc.proofs import Polytope
+
+TRIANGLE = [[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]], [0.0, 0.0, 1.0]
+
+
+def test_a_triangle_has_its_box_and_vertices():
+    triangle = Polytope.of(*TRIANGLE)
+    assert np.allclose((triangle.lower, triangle.upper), ([0, 0], [1, 1]))
+    vertices = triangle.vertices()
+    assert sorted(map(tuple, vertices.round(9) + 0.0)) == [(0, 0), (0, 1), (1, 0)]
+    assert not triangle.is_box()
+
+
+def test_a_box_has_all_corners():
+    box = Polytope.box([-1.0, 0.0, 2.0], [1.0, 0.5, 2.0])
+    assert box.is_box()
+    assert {tuple(x) for x in box.vertices()} == {
+        (a, b, 2.0) for a in (-1.0, 1.0) for b in (0.0, 0.5)
+    }
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: Polytope.of([1.0], [1.0]), "shapes (1,) and (1,)"),
+        (lambda: Polytope.of([[np.nan]], [1.0]), "NaN or inf"),
+        (lambda: Polytope.of([[1.0], [-1.0]], [0.0, -1.0]), "an empty set"),
+        (lambda: Polytope.of([[1.0]], [1.0]), "an unbounded set"),
+        (lambda: Polytope.box([0.0], [1.0, 2.0]), "shapes (1,) and (2,)"),
+        (lambda: Polytope.box([1.0], [0.0]), "finite entries with lower <= upper"),
+        (lambda: Polytope.box(np.zeros(9), np.ones(9)).vertices(), "9 dimensions"),
+        (
+            lambda: Polytope.of([[1.0, 1], [-1, -1], [1, -1], [-1, 1]], [0.0, 0, 1, 1]).vertices(),
+            "a flat polytope",
+        ),
+    ],
+)
+def test_errors(make, sentence):
+    with pytest.raises(QPError) as raised:
+        make()
+    assert sentence in str(raised.value)

@@ -1,0 +1,52 @@
+"""The growing mixed-integer program, on small programs with known optima."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torch_qpmpc import SolverError
+from torch_qpmpc.proofs.program import Affine, Program
+
+
+def knapsack() -> tuple[Program, Affine]:
+    """Weights 3, 4, 5 of at most 8, values 4, 5, 7: the best is 3 and 5, of value 11."""
+    program = Program()
+    x = program.add(np.zeros(3), np.ones(3), binary=True)
+    program.constrain(x.times(np.array([[3.0, 4.0, 5.0]])), upper=8.0)
+    return program, x.times(np.array([[4.0, 5.0, 7.0]]))
+
+
+def test_binaries_are_whole_and_relaxed_ones_are_not():
+    program, objective = knapsack()
+    assert program.binaries == 3
+    best = program.maximise(objective)
+    assert best.value == pytest.approx(11)
+    assert best.bound == pytest.approx(11)
+    assert np.allclose(best.x, [1, 0, 1])
+    assert program.maximise(objective, relaxed=True).bound == pytest.approx(11.0)
+
+
+def test_affine_functions_add_and_have_constants():
+    program = Program()
+    x = program.add(np.array([0.0]), np.array([2.0]))
+    y = program.add(np.array([-1.0]), np.array([1.0]))
+    total = (x + y.times(-np.eye(1))).plus(np.array([10.0]))
+    best = program.maximise(total)
+    assert best.value == pytest.approx(13)
+    assert total.at(best.x) == pytest.approx([13])
+
+
+def test_a_copy_grows_apart():
+    program, objective = knapsack()
+    other = program.copy()
+    other.constrain(objective, upper=5.0)
+    assert other.maximise(objective).value == pytest.approx(5)
+    assert program.maximise(objective).value == pytest.approx(11)
+
+
+def test_an_infeasible_program_is_an_error():
+    program, objective = knapsack()
+    program.constrain(objective, lower=12.0)
+    with pytest.raises(SolverError, match="HiGHS gave no bound of the worst case"):
+        program.maximise(objective)

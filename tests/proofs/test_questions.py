@@ -1,0 +1,135 @@
+"""Worst cases: against closed forms, samples and the plant itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from torch_qpmpc import QPMPC, QPError, SolverError
+from torch_qpmpc.proofs import (
+    Plant,
+    Polytope,
+    invariance,
+    largest_difference,
+    largest_violation,
+    questions,
+)
+
+A, B = np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]])
+BOX = Polytope.box([-1.0, -0.5], [1.0, 0.5])
+NOISE = Polytope.box([-0.02, -0.02], [0.02, 0.02])
+BOUNDS: dict[str, Any] = {"lower": BOX.lower, "upper": BOX.upper}
+
+
+def scheme(**options) -> QPMPC:
+    arguments: dict[str, Any] = {
+        "stage_weight": [1.0, 1.0, 0.1],
+        "state_bounds": (BOX.lower, BOX.upper),
+        "action_bounds": ([-1.0], [1.0]),
+        "solver": "daqp",
+    }
+    return QPMPC.from_model(A, B, 3, **arguments | options)
+
+
+def two_actions() -> QPMPC:
+    return QPMPC.from_model(A, np.eye(2), 3, stage_weight=[1.0, 1.0, 1.0, 1.0])
+
+
+def test_the_corner_is_the_worst_start_of_a_double_integrator():
+    """From x = (1, 0.5), u = -1 leaves 1.08 and 0.3, and the noise adds 0.02."""
+    answer = largest_violation(scheme(), Plant.of(A, B, disturbances=NOISE), BOX, **BOUNDS)
+    assert answer.bound == pytest.approx(0.1, abs=1e-6)
+    assert answer.value == pytest.approx(0.1, abs=1e-6)
+    assert answer.refuted
+    assert not answer.proved
+    assert np.abs(answer.states[0]) == pytest.approx([1.0, 0.5], abs=1e-6)
+    assert np.abs(answer.disturbances[0][0]) == pytest.approx(0.02, abs=1e-6)
+    assert "from p = [" in str(answer)
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_no_sample_exceeds_a_proved_bound(steps):
+    mpc, small = scheme(), Polytope.box([-0.6, -0.3], [0.6, 0.3])
+    answer = largest_violation(
+        mpc, Plant.of(A, B, disturbances=NOISE), small, **BOUNDS, steps=steps
+    )
+    assert answer.proved
+    assert answer.value <= answer.bound + 1e-6
+    generator = np.random.default_rng(0)
+    x = generator.uniform(small.lower, small.upper, (4000, 2))
+    for _ in range(steps):
+        u = mpc.policy(torch.tensor(x)).detach().numpy()
+        x = x @ A.T + u @ B.T + generator.choice([-0.02, 0.02], (4000, 2))
+    assert (np.abs(x) - BOX.upper).max() <= answer.bound + 1e-6
+    assert str(answer).startswith(f"largest violation in {steps} step")
+    assert "proved" in str(answer)
+
+
+def test_invariance_is_proved_of_one_polytope_and_refuted_of_another():
+    mpc, plant = scheme(state_bounds=None), Plant.of(A, B)
+    # A level set of a quadratic Lyapunov function of the unconstrained law, as a polytope.
+    K = -torch.autograd.functional.jacobian(mpc.policy, torch.zeros(2).double()).numpy()
+    closed = A - B @ K
+    P = np.eye(2)
+    for _ in range(500):
+        P = np.eye(2) + closed.T @ P @ closed
+    turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    rows = np.column_stack((np.cos(turns), np.sin(turns))) @ np.linalg.cholesky(P).T
+    inside = Polytope.of(rows, 0.3 * np.ones(16))
+    assert invariance(mpc, plant, inside).proved
+    outside = invariance(mpc, plant, BOX)
+    assert outside.refuted
+    assert (BOX.A @ outside.states[1] - BOX.b).max() == pytest.approx(outside.value)
+
+
+def test_the_worst_of_several_plants_counts():
+    plants = [Plant.of(A, 0.5 * B), Plant.of(A, B)]
+    answers = [largest_violation(scheme(), plant, BOX, **BOUNDS) for plant in (*plants, plants)]
+    assert answers[2].value == pytest.approx(max(x.value for x in answers[:2]), abs=1e-6)
+    assert answers[2].value > answers[1].value + 1e-3
+
+
+def test_two_linear_policies_differ_by_their_gains():
+    first, second = (
+        scheme(state_bounds=None, action_bounds=None, stage_weight=[1.0, 1.0, r])
+        for r in (0.1, 1.0)
+    )
+    zero = torch.zeros(2, dtype=torch.float64)
+    gains = [torch.autograd.functional.jacobian(x.policy, zero) for x in (first, second)]
+    exact = float(((gains[0] - gains[1]).abs() @ torch.tensor(BOX.upper)).max())
+    answer = largest_difference(first, second, BOX)
+    assert answer.value == pytest.approx(exact, abs=1e-6)
+    assert largest_difference(first, first, BOX).bound <= 1e-6
+
+
+def test_an_answer_that_the_policy_contradicts_is_an_error(monkeypatch):
+    monkeypatch.setattr(questions, "_policy", lambda mpc, p: np.array([0.123]))
+    with pytest.raises(SolverError, match="tolerances are too wide for this QP"):
+        largest_violation(scheme(), Plant.of(A, B), BOX, **BOUNDS)
+
+
+@pytest.mark.parametrize(
+    ("ask", "sentence"),
+    [
+        (lambda: Plant.of(A, B, offset=[0.0]), "(n, n), (n, n_u), (n,) and (n, 0)"),
+        (lambda: largest_violation(scheme(), Plant.of(A, B), BOX), "no finite bound"),
+        (lambda: largest_violation(scheme(), Plant.of(A, B), BOX, [0.0]), "(2,) numbers"),
+        (
+            lambda: largest_violation(scheme(), Plant.of([[1.0]], [[1.0]]), BOX, BOX.lower),
+            "plant.B",
+        ),
+        (
+            lambda: largest_violation(scheme(), Plant.of(A, B), BOX, BOX.lower, steps=0),
+            "at least one step",
+        ),
+        (lambda: invariance(scheme(), Plant.of(A, B), Polytope.box([0.0], [1.0])), "n_p = 2"),
+        (lambda: largest_difference(scheme(), two_actions(), BOX), "2 actions"),
+    ],
+)
+def test_errors(ask, sentence):
+    with pytest.raises(QPError) as raised:
+        ask()
+    assert sentence in str(raised.value)

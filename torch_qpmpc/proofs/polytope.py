@@ -1,0 +1,93 @@
+"""Bounded polytopes: sets of states and of disturbances."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linprog
+from scipy.spatial import HalfspaceIntersection, QhullError
+
+from torch_qpmpc.errors import QPError
+
+Array = np.ndarray
+#: Vertices are enumerated up to this dimension.
+MOST = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Polytope:
+    """The points x with ``A x <= b``, a bounded set.
+
+    Attributes:
+        A, b: ``(m, n)`` and ``(m,)``.
+        lower, upper: the bounding box, ``(n,)`` each.
+
+    Raises:
+        QPError: the shapes do not fit, entries are not finite, or the set is empty or unbounded.
+    """
+
+    A: Array
+    b: Array
+    lower: Array
+    upper: Array
+
+    @classmethod
+    def of(cls, A: Any, b: Any) -> Polytope:
+        """Make ``{x: A x <= b}``."""
+        A, b = np.array(A, float), np.array(b, float)
+        if A.ndim != 2 or b.shape != A.shape[:1]:
+            got = f"shapes {A.shape} and {b.shape}"
+            raise QPError.expected("A and b of the polytope", got, "(m, n) and (m,)")
+        if not (np.isfinite(A).all() and np.isfinite(b).all()):
+            raise QPError.expected("A and b of the polytope", "NaN or inf", "finite entries")
+        ends = []
+        for row in np.concatenate((np.eye(A.shape[1]), -np.eye(A.shape[1]))):
+            result = linprog(-row, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
+            if result.status != 0:
+                kind = {2: "an empty", 3: "an unbounded"}.get(result.status, "an undecided")
+                raise QPError.expected("A and b of the polytope", f"{kind} set", "a bounded one")
+            ends.append(-result.fun)
+        upper, lower = np.array(ends[: A.shape[1]]), -np.array(ends[A.shape[1] :])
+        return cls(A, b, lower, upper)
+
+    @classmethod
+    def box(cls, lower: Any, upper: Any) -> Polytope:
+        """Make ``{x: lower <= x <= upper}``."""
+        lower, upper = np.array(lower, float), np.array(upper, float)
+        if lower.ndim != 1 or lower.shape != upper.shape:
+            got = f"shapes {lower.shape} and {upper.shape}"
+            raise QPError.expected("lower and upper", got, "(n,) each")
+        if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower <= upper).all()):
+            raise QPError.expected(
+                "lower and upper", f"{lower} and {upper}", "finite entries with lower <= upper"
+            )
+        eye = np.eye(len(lower))
+        return cls(np.concatenate((eye, -eye)), np.concatenate((upper, -lower)), lower, upper)
+
+    def is_box(self) -> bool:
+        """Return True if the set is its bounding box."""
+        return bool(((self.A != 0).sum(1) <= 1).all())
+
+    def vertices(self) -> Array:
+        """Return the vertices, ``(count, n)``.
+
+        Raises:
+            QPError: the dimension is above 8, or the set has no interior.
+        """
+        n = len(self.lower)
+        if n > MOST:
+            raise QPError.expected("the set", f"{n} dimensions", f"at most {MOST}")
+        if self.is_box():
+            return np.array(list(itertools.product(*zip(self.lower, self.upper, strict=True))))
+        length = np.linalg.norm(self.A, axis=1)
+        with_radius = np.column_stack((self.A, length))
+        bounds = [(None, None)] * n + [(0, None)]
+        inner = linprog([0] * n + [-1], with_radius, self.b, bounds=bounds, method="highs")
+        try:
+            cut = HalfspaceIntersection(np.column_stack((self.A, -self.b)), inner.x[:n])
+        except QhullError as error:
+            raise QPError.expected("the set", "a flat polytope", "one with an interior") from error
+        return cut.intersections[np.isfinite(cut.intersections).all(1)]

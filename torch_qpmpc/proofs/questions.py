@@ -1,0 +1,333 @@
+"""Questions about a policy on a set of states, each answered by a proof or a counterexample."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from torch_qpmpc.checks import check_kind
+from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.export.tables import make_tables
+from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.proofs.encoding import encode
+from torch_qpmpc.proofs.polytope import Polytope
+from torch_qpmpc.proofs.program import Affine, Maximum, Program
+
+Array = np.ndarray
+#: A worst case up to this counts as zero: HiGHS' feasibility tolerance is 1e-6.
+TOLERANCE = 1e-5
+#: A replayed worst case differs from the program's by at most this, relatively.
+AGREEMENT = 1e-4
+#: Combinations of models over the steps.
+MOST_MODELS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """``x+ = A x + B u + offset + E d`` with any d of a polytope.
+
+    Attributes:
+        A, B: ``(n, n)`` and ``(n, n_u)``; x is all that the policy knows, p.
+        offset: ``(n,)``.
+        E: ``(n, n_d)``.
+        disturbances: the set of d.
+    """
+
+    A: Array
+    B: Array
+    offset: Array
+    E: Array
+    disturbances: Polytope | None
+
+    @classmethod
+    def of(
+        cls,
+        A: Any,
+        B: Any,
+        *,
+        offset: Any = None,
+        E: Any = None,
+        disturbances: Polytope | None = None,
+    ) -> Plant:
+        """Make a plant; E is the identity, and there are no disturbances, by default.
+
+        Raises:
+            QPError: the shapes do not fit.
+        """
+        A, B = np.array(A, float), np.array(B, float)
+        n = len(A)
+        offset = np.zeros(n) if offset is None else np.array(offset, float)
+        n_d = 0 if disturbances is None else len(disturbances.lower)
+        E = (np.eye(n) if n_d == n else np.zeros((n, 0))) if E is None else np.array(E, float)
+        shapes = A.shape, B.shape[:1], B.ndim, offset.shape, E.shape
+        if shapes != ((n, n), (n,), 2, (n,), (n, n_d)):
+            got = f"shapes {A.shape}, {B.shape}, {offset.shape} and {E.shape}"
+            want = f"(n, n), (n, n_u), (n,) and (n, {n_d})"
+            raise QPError.expected("A, B, offset and E", got, want)
+        return cls(A, B, offset, E, disturbances)
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The worst case on a set.
+
+    Attributes:
+        question: the function that is maximised.
+        value: its largest value that a point of the set is known to have, by `QPMPC.policy`.
+        bound: no point of the set has a larger one, but for HiGHS' tolerances.
+        states: the worst states p_0, .., p_k, ``(k + 1, n_p)``.
+        disturbances: the worst d of each step, ``(n_d,)``.
+        seconds, nodes, binaries: the effort, and the size of the largest program.
+    """
+
+    question: str
+    value: float
+    bound: float
+    states: Array
+    disturbances: tuple[Array, ...]
+    seconds: float
+    nodes: int
+    binaries: int
+
+    @property
+    def proved(self) -> bool:
+        """True if the function is nowhere positive on the set."""
+        return self.bound <= TOLERANCE
+
+    @property
+    def refuted(self) -> bool:
+        """True if the function is positive at ``states``."""
+        return self.value > TOLERANCE
+
+    def __str__(self) -> str:
+        effort = f"{self.seconds:.1f} s, {self.nodes:,} nodes, {self.binaries} binaries"
+        at = np.array2string(self.states[0], precision=4, separator=", ")
+        if self.proved:
+            return f"{self.question}: proved, at most {self.bound:.3g} ({effort})"
+        if self.refuted:
+            return f"{self.question}: {self.value:.4g} from p = {at} ({effort})"
+        return (
+            f"{self.question}: undecided, between {self.value:.4g} and {self.bound:.4g} ({effort})"
+        )
+
+
+def largest_violation(
+    mpc: QPMPC,
+    plant: Plant | Sequence[Plant],
+    states: Polytope,
+    lower: Any = None,
+    upper: Any = None,
+    *,
+    steps: int = 1,
+    seconds: float = 60.0,
+) -> Answer:
+    """Find the largest violation of bounds of the state, in so many steps.
+
+    Args:
+        mpc: the QP.
+        plant: the plant; of several, each step may be any, which also covers their convex hull
+            for one step.
+        states: the set of p_0.
+        lower, upper: bounds of p_steps, ``(n_p,)``; None or inf for no bound.
+        steps: the number of steps.
+        seconds: time limit of each mixed-integer program.
+
+    Raises:
+        QPError: an argument is invalid, or the QP has no plan with slack in its hard rows
+            somewhere on the way.
+        SolverError: HiGHS gives no bound in time.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> A, B = [[1.0, 0.2], [0.0, 1.0]], [[0.0], [0.2]]
+        >>> mpc = qm.QPMPC.from_model(
+        ...     A, B, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0])
+        ... )
+        >>> box = Polytope.box([-1.0, -0.5], [1.0, 0.5])
+        >>> largest_violation(mpc, Plant.of(A, B), box, upper=[1.2, 0.6]).proved
+        True
+    """
+    n = _check(mpc, states)
+    sides = ((-1.0, lower), (1.0, upper))
+    rows, right = [], []
+    for sign, bound in sides:
+        bound = np.full(n, np.inf) if bound is None else sign * np.array(bound, float)
+        if bound.shape != (n,) or np.isnan(bound).any():
+            raise QPError.expected("lower and upper", f"{bound}", f"({n},) numbers")
+        kept = np.isfinite(bound)
+        rows.append(sign * np.eye(n)[kept])
+        right.append(bound[kept])
+    A, b = np.concatenate(rows), np.concatenate(right)
+    if not len(b):
+        raise QPError.expected("lower and upper", "no finite bound", "at least one")
+    question = f"largest violation in {steps} step{'s' * (steps > 1)}"
+    return _worst(question, mpc, plant, states, A, b, steps, seconds)
+
+
+def invariance(
+    mpc: QPMPC,
+    plant: Plant | Sequence[Plant],
+    states: Polytope,
+    *,
+    steps: int = 1,
+    seconds: float = 60.0,
+) -> Answer:
+    """Prove that p is in the set again after ``steps`` steps, or find a p that leaves it.
+
+    The answer's value is the distance from the set's worst facet. Arguments and errors are those
+    of `largest_violation`.
+    """
+    _check(mpc, states)
+    length = np.linalg.norm(states.A, axis=1)
+    A, b = states.A / length[:, None], states.b / length
+    question = f"outside the set after {steps} step{'s' * (steps > 1)}"
+    return _worst(question, mpc, plant, states, A, b, steps, seconds)
+
+
+def largest_difference(
+    first: QPMPC, second: QPMPC, states: Polytope, *, seconds: float = 60.0
+) -> Answer:
+    """Find the largest difference of two policies' actions, in any entry.
+
+    Raises:
+        QPError: the QPs know or do different things, or as in `largest_violation`.
+        SolverError: HiGHS gives no bound in time.
+    """
+    n = _check(first, states)
+    _check(second, states)
+    if first.n_u != second.n_u:
+        raise QPError.expected("second", f"{second.n_u} actions", f"{first.n_u}")
+    began, program = time.perf_counter(), Program()
+    p, vertices = _known(program, states), states.vertices()
+    u, other = (encode(program, make_tables(mpc), p, vertices) for mpc in (first, second))
+    difference = u + other.times(-np.eye(first.n_u))
+    goals = np.concatenate((np.eye(first.n_u), -np.eye(first.n_u)))
+    value, bound, nodes, at = -np.inf, -np.inf, 0, np.full(n, np.nan)
+    for goal in goals:
+        maximum = program.maximise(difference.times(goal[None]), seconds=seconds)
+        bound, nodes = max(bound, maximum.bound), nodes + maximum.nodes
+        if not np.isfinite(maximum.value):
+            continue
+        state = p.at(maximum.x)
+        reached = float(goal @ (_policy(first, state) - _policy(second, state)))
+        _compare(reached, maximum)
+        if reached > value:
+            value, at = reached, state
+    effort = time.perf_counter() - began, nodes, program.binaries
+    question = "largest difference of the policies"
+    return Answer(question, value, bound, at.reshape(1, n), (), *effort)
+
+
+def _check(mpc: QPMPC, states: Polytope) -> int:
+    check_kind("mpc", mpc, QPMPC)
+    check_kind("states", states, Polytope, "Make one with Polytope.box(lower, upper).")
+    if len(states.lower) != mpc.n_p:
+        got, want = f"{len(states.lower)} dimensions", f"n_p = {mpc.n_p}"
+        raise QPError.expected("states", got, want)
+    return mpc.n_p
+
+
+def _known(program: Program, states: Polytope) -> Affine:
+    """Add p in the set of states."""
+    p = program.add(states.lower, states.upper)
+    if not states.is_box():
+        program.constrain(p.times(states.A), upper=states.b)
+    return p
+
+
+def _policy(mpc: QPMPC, p: Array) -> Array:
+    with torch.no_grad():
+        return mpc.policy(torch.as_tensor(p, dtype=torch.float64)).numpy()
+
+
+def _worst(
+    question: str,
+    mpc: QPMPC,
+    plant: Plant | Sequence[Plant],
+    states: Polytope,
+    A: Array,
+    b: Array,
+    steps: int,
+    seconds: float,
+) -> Answer:
+    """Maximise ``max_i A_i p_steps - b_i`` over the set, the disturbances and the plants."""
+    plants = [plant] if isinstance(plant, Plant) else list(plant)
+    for one in plants:
+        check_kind("plant", one, Plant, "Make one with Plant.of(A, B).")
+        if one.B.shape != (mpc.n_p, mpc.n_u):
+            want = f"({mpc.n_p}, {mpc.n_u}), for p and u"
+            raise QPError.expected("plant.B", f"shape {one.B.shape}", want)
+    if steps < 1 or len(plants) ** steps > MOST_MODELS:
+        got = f"{steps} steps of {len(plants)} plants"
+        raise QPError.expected("steps", got, f"at least one step, and {MOST_MODELS} combinations")
+    began, tables = time.perf_counter(), make_tables(mpc)
+    value, bound, nodes, binaries = -np.inf, -np.inf, 0, 0
+    path, pushes = np.full((steps + 1, mpc.n_p), np.nan), ()
+    for models in itertools.product(plants, repeat=steps):
+        program = Program()
+        p, noise = _known(program, states), []
+        start, vertices = p, states.vertices()
+        for i, model in enumerate(models):
+            u = encode(program, tables, p, vertices)
+            p = (p.times(model.A) + u.times(model.B)).plus(model.offset)
+            if model.disturbances is not None:
+                d = _known(program, model.disturbances)
+                noise.append(d)
+                p = p + d.times(model.E)
+            if i < steps - 1:
+                vertices = _reached(program, p).vertices()
+        binaries = max(binaries, program.binaries)
+        for row, right in zip(A, b, strict=True):
+            maximum = program.maximise(p.times(row[None]).plus(-right[None]), seconds=seconds)
+            bound, nodes = max(bound, maximum.bound), nodes + maximum.nodes
+            if not np.isfinite(maximum.value):
+                continue
+            run, d = _replay(mpc, models, start.at(maximum.x), [x.at(maximum.x) for x in noise])
+            _compare(float(row @ run[-1] - right), maximum)
+            if (reached := float((A @ run[-1] - b).max())) > value:
+                value, path, pushes = reached, run, d
+    effort = time.perf_counter() - began, nodes, binaries
+    return Answer(question, value, bound, path, pushes, *effort)
+
+
+def _compare(value: float, maximum: Maximum) -> None:
+    """Raise if the replayed value is not that of the program, whose tolerances then hide errors."""
+    if abs(value - maximum.value) > AGREEMENT * (1 + abs(value)):
+        raise SolverError(
+            f"The policy gives {value:.6g} where the mixed-integer program says "
+            f"{maximum.value:.6g}: the program's tolerances are too wide for this QP. Scale the "
+            "states to numbers of order one, or lower the prices w of soft rows."
+        )
+
+
+def _reached(program: Program, p: Affine) -> Polytope:
+    """Return a box that contains p, by linear programs."""
+    ends = []
+    for sign in (-1.0, 1.0):
+        rows = p.times(sign * np.eye(len(p.constant)))
+        most = [
+            program.maximise(
+                Affine(rows.columns, rows.matrix[[i]], rows.constant[[i]]), relaxed=True
+            )
+            for i in range(len(p.constant))
+        ]
+        ends.append(sign * np.array([x.bound + TOLERANCE for x in most]))
+    return Polytope.box(*ends)
+
+
+def _replay(
+    mpc: QPMPC, models: Sequence[Plant], p: Array, noise: Sequence[Array]
+) -> tuple[Array, tuple[Array, ...]]:
+    """Run the policy on the plants from p; return the states and the disturbances."""
+    states, drawn, pushes = [p], [], iter(noise)
+    for model in models:
+        drawn.append(np.zeros(0) if model.disturbances is None else next(pushes))
+        p = model.A @ p + model.B @ _policy(mpc, p) + model.offset + model.E @ drawn[-1]
+        states.append(p)
+    return np.array(states), tuple(drawn)
