@@ -8,15 +8,15 @@ import torch
 from tests.problems import normal, random_mpc, random_states
 from torch_qpmpc import QPMPC
 from torch_qpmpc.analysis.model_error import first_state_error, one_step_error, second_moment
-from torch_qpmpc.analysis.structure import Model
+from torch_qpmpc.analysis.structure import NearestModel
 
 A, B, OFFSET = normal(3, 3, seed=1), normal(3, 2, seed=2), normal(3, seed=3)
 S, ACTIONS = 2 * normal(50, 3, seed=4) + 1, normal(50, 2, seed=5)
 
 
-def model(*stages: int) -> Model:
+def model(*stages: int) -> NearestModel:
     residual = torch.zeros(stages)
-    return Model(
+    return NearestModel(
         A + 0.1 * normal(*stages, 3, 3, seed=6),
         B + 0.1 * normal(*stages, 3, 2, seed=7),
         torch.zeros(*stages, 3, 0),
@@ -39,7 +39,7 @@ def test_error_over_unit_variance_is_the_frobenius_norm():
     parts = (wrong.A - A, wrong.B - B, wrong.offset)
     expected = sum(part.square().sum().item() for part in parts) ** 0.5
     assert one_step_error(wrong, A, B).item() == pytest.approx(expected)
-    right = Model(A, B, torch.zeros(3, 0), OFFSET, torch.zeros(()))
+    right = NearestModel(A, B, torch.zeros(3, 0), OFFSET, torch.zeros(()))
     assert one_step_error(right, A, B, OFFSET) == 0
     assert one_step_error(right, A, B).item() == pytest.approx(OFFSET.norm().item())
 

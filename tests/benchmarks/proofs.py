@@ -42,7 +42,7 @@ def double_integrator(horizon: int, structure: str) -> Problem:
     """Position and velocity, bounded and soft; every start of the whole box of bounds."""
     A, B = np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]])
     bound = np.array([1.0, 0.5])
-    bounds = {"state_bounds": (-bound, bound), "action_bounds": ([-1.0], [1.0])}
+    bounds = {"state_bounds": (-bound, bound), "action_bounds": ([-1.0], [1.0]), "solver": "daqp"}
     weight = [1.0, 1.0, 0.1]
     mpc = QPMPC.linear_mpc(A, B, horizon, stage_weight=weight, structure=structure, **bounds)
     _disturb(mpc)
@@ -58,6 +58,7 @@ def point_mass(horizon: int, structure: str) -> Problem:
     bounds = {
         "state_bounds": (physics.lb_s, physics.ub_s),
         "action_bounds": (physics.lb_a, physics.ub_a),
+        "solver": "daqp",
     }
     W = [*(2 * physics.W.diagonal()).tolist(), 0.1, 0.1]
     mpc = QPMPC.linear_mpc(A, B, horizon, stage_weight=W, structure=structure, **bounds)

@@ -12,8 +12,8 @@ from torch_qpmpc.envs.heated_house import DT
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.evaluation import Evaluation, rival_costs
 from torch_qpmpc.experiment.heating import REGULARISATION, known_model
-from torch_qpmpc.experiment.rivals.heating import make_mpc
-from torch_qpmpc.experiment.tasks import make_mpc as make_task_mpc
+from torch_qpmpc.experiment.rivals.heating import house_mpc
+from torch_qpmpc.experiment.tasks import house_mpc as make_task_mpc
 from torch_qpmpc.experiment.tasks import make_physics, make_true_mpc
 from torch_qpmpc.experiment.tasks.house_wall import best_lags
 
@@ -22,7 +22,7 @@ from torch_qpmpc.experiment.tasks.house_wall import best_lags
 def test_the_value_is_the_cost_of_the_plan_in_a_house_without_gain(air):
     house = House(evening_gain=0.0, gain_std=0.0)
     w = house.signals(np.random.default_rng(0), 3, 96)
-    mpc = make_mpc(house, known_model(house))
+    mpc = house_mpc(house, known_model(house))
     # Around 6 h the horizon has the end of the night and a peak.
     w, x = w[:, 24 : 24 + 33], torch.full((3, 1), air, dtype=torch.float64)
     p = torch.cat((w[..., :4].flatten(1), x), -1)
@@ -38,8 +38,8 @@ def test_the_value_is_the_cost_of_the_plan_in_a_house_without_gain(air):
 
 def test_a_margin_moves_the_lower_bound_only():
     house = House()
-    tight = make_mpc(house, known_model(house), margin=0.5).quadratic_program()
-    loose = make_mpc(house, known_model(house)).quadratic_program()
+    tight = house_mpc(house, known_model(house), margin=0.5).quadratic_program()
+    loose = house_mpc(house, known_model(house)).quadratic_program()
     rise = (tight.lb - loose.lb).nan_to_num()
     assert rise.unique().tolist() == [0.0, 0.5]
     assert (rise > 0).sum() == 33

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torch_qpmpc.analysis.structure import Model
+from torch_qpmpc.analysis.structure import NearestModel
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import banded_matrix
@@ -36,7 +36,7 @@ def second_moment(s: Tensor, a: Tensor, d: Tensor | None = None) -> Tensor:
 
 
 def one_step_error(
-    model: Model,
+    model: NearestModel,
     A: Tensor,
     B: Tensor,
     offset: Tensor | None = None,
@@ -47,7 +47,7 @@ def one_step_error(
 
     Args:
         model: the model, with tensors ``(*batch, ..)``, such as one per stage.
-        A, B: the true model, ``(n_x, L n_x)`` and ``(n_x, L n_u)``, as in `Model`.
+        A, B: the true model, ``(n_x, L n_x)`` and ``(n_x, L n_u)``, as in `NearestModel`.
         offset: the true offset, the mean of the noise, ``(n_x,)``; zero by default.
         moment: `second_moment` of the distribution; by default independent entries with mean 0 and
             variance 1, for which the error is the Frobenius norm of the difference.
@@ -57,9 +57,9 @@ def one_step_error(
         ``(*batch,)``.
 
     Raises:
-        QPError: if ``model`` is not a `Model`, or a shape does not fit.
+        QPError: if ``model`` is not a `NearestModel`, or a shape does not fit.
     """
-    check_kind("model", model, Model, "Pass nearest_model(form), or stage_models(form).")
+    check_kind("model", model, NearestModel, "Pass nearest_model(form), or stage_models(form).")
     own = (model.A, model.B, model.E, model.offset.unsqueeze(-1))
     sizes = [part.shape[-1] for part in own[:-1]]
     true = _checked(A, B, E, offset, model.A.shape[-2], sizes, model.A)

@@ -14,7 +14,7 @@ from torch_qpmpc.analysis.model_error import one_step_error
 from torch_qpmpc.analysis.policy import local_gain, spectral_radius, window_model
 from torch_qpmpc.analysis.prediction_form import PredictionForm, canonical_matrix, prediction_form
 from torch_qpmpc.analysis.structure import (
-    Model,
+    NearestModel,
     causality_defect,
     markov_order,
     memory_energies,
@@ -60,8 +60,8 @@ class StructureReport:
     """
 
     form: PredictionForm = field(repr=False)
-    nearest: Model = field(repr=False)
-    stages: Model = field(repr=False)
+    nearest: NearestModel = field(repr=False)
+    stages: NearestModel = field(repr=False)
     memory: Tensor = field(repr=False)
     K: Tensor = field(repr=False)
     K_lqr: Tensor | None = field(repr=False)

@@ -91,7 +91,7 @@ def toeplitz_defect(form: PredictionForm) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class NearestModel:
     """A model x+ = A x + B u + offset that is read from the constraints.
 
     With a window of L and a preview it is ``x+ = A [x_k; ..; x_{k+1-L}] + B [u_k; ..; u_{k+1-L}] +
@@ -112,7 +112,7 @@ class Model:
     residual: Tensor
 
 
-def stage_models(form: PredictionForm) -> Model:
+def stage_models(form: PredictionForm) -> NearestModel:
     """Fit the model A_k, B_k of each step of the predictions, from stage k to k + 1.
 
     Predictions are maps of (p, U). A_k, B_k, E_k and the offset are the least-squares fit of the
@@ -126,10 +126,10 @@ def stage_models(form: PredictionForm) -> Model:
     fit = _fit(windows, maps[1:])
     left = maps[1:] - fit @ windows
     residual = (left.square().sum((-1, -2)) / _without_offset(maps[1:])).sqrt()
-    return Model(*_split(fit, form), residual)
+    return NearestModel(*_split(fit, form), residual)
 
 
-def nearest_model(form: PredictionForm) -> Model:
+def nearest_model(form: PredictionForm) -> NearestModel:
     """Fit the time-invariant scheme with the nearest predictions; its residual is the distance.
 
     Minimises ``||[Phi, Gamma, phi] - [Phi, Gamma, phi](A, B, E, offset)||`` by Levenberg-Marquardt
@@ -176,7 +176,7 @@ def nearest_model(form: PredictionForm) -> Model:
     fit = least_squares(residuals, begin, jac=jacobian, method="lm", **tight)  # pyright: ignore[reportArgumentType] - jac may be a function
     theta = torch.as_tensor(fit.x).view(shape)
     scale = _without_offset(maps[1:]).sum().sqrt()
-    return Model(*_split(theta, form), math.sqrt(2 * fit.cost) / scale)
+    return NearestModel(*_split(theta, form), math.sqrt(2 * fit.cost) / scale)
 
 
 def memory_energies(form: PredictionForm, rtol: float = 1e-9) -> Tensor:

@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 
 from torch_qpmpc.analysis.model_error import one_step_error, second_moment
 from torch_qpmpc.analysis.report import predictions
-from torch_qpmpc.analysis.structure import Model, nearest_model
+from torch_qpmpc.analysis.structure import NearestModel, nearest_model
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import check_config, load_config, settings
@@ -133,7 +133,7 @@ def chosen(frame: pd.DataFrame, **values: Any) -> pd.DataFrame:
     return frame.query(" and ".join(f"{name} == @{name}" for name in values), local_dict=values)
 
 
-def prediction_error(model: Model, physics: LinearSystem) -> float:
+def prediction_error(model: NearestModel, physics: LinearSystem) -> float:
     """Compute `one_step_error` over start states and uniform actions, in units of the state."""
     rng = np.random.default_rng(123)
     s = physics.starts(rng, 1024)

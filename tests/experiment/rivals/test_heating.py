@@ -12,7 +12,7 @@ from torch_qpmpc.envs import House, HouseWall
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.heated_house import GAIN
 from torch_qpmpc.experiment.heating import known_model
-from torch_qpmpc.experiment.rivals.heating import KalmanMPC, Omniscient, Thermostat, make_mpc
+from torch_qpmpc.experiment.rivals.heating import KalmanMPC, Omniscient, Thermostat, house_mpc
 from torch_qpmpc.experiment.rivals.tuned_planner import (
     START,
     Knobs,
@@ -29,8 +29,8 @@ def J(policy, plant, starts=4, steps=96):
 
 def test_more_knowledge_costs_less_in_a_room():
     house = House()
-    true = J(make_mpc(house, known_model(house)).policy, house)
-    wrong = J(make_mpc(house, known_model(replace(house, R=2.0))).policy, house)
+    true = J(house_mpc(house, known_model(house)).policy, house)
+    wrong = J(house_mpc(house, known_model(replace(house, R=2.0))).policy, house)
     assert J(Omniscient(house), house) < true < wrong < J(Thermostat(house, 0.5, 6.0), house)
 
 

@@ -10,7 +10,7 @@ import torch
 import torch_qpmpc as qm
 from torch_qpmpc.envs import FourTanks, TankReferences
 from torch_qpmpc.envs.closed_loop import plant_loop
-from torch_qpmpc.experiment.rivals.deepc import DeePC, windows
+from torch_qpmpc.experiment.rivals.deepc import DeePC, hankel_matrices
 from torch_qpmpc.experiment.rivals.kalman_mpc import KalmanMPC
 from torch_qpmpc.experiment.rivals.logs import uniform_log
 from torch_qpmpc.experiment.rivals.tanks import FOUR_TANKS_RIVALS, TANK_REFERENCES_RIVALS
@@ -80,7 +80,7 @@ def test_deepc_solves_its_definition(projected):
     policy = DeePC(log, p.past, p.horizon, **options, projected=projected)
     window = torch.randn(6, p.n_p, generator=torch.Generator().manual_seed(0)).double() / 2
 
-    P, U, Y = windows(log, p.past, p.horizon, p.n_y)
+    P, U, Y = hankel_matrices(log, p.past, p.horizon, p.n_y)
     count = P.shape[1]
     assert count == 60 - 3 - 4 + 2
     is_output = torch.arange(p.n_p) % 4 < 2

@@ -12,7 +12,7 @@ from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment.evaluation import rival_costs
 from torch_qpmpc.experiment.heating import known_model
 from torch_qpmpc.experiment.rivals import tightened
-from torch_qpmpc.experiment.rivals.heating import make_mpc
+from torch_qpmpc.experiment.rivals.heating import house_mpc
 from torch_qpmpc.experiment.rivals.tanks import reference_mpc
 from torch_qpmpc.experiment.tasks import make_physics
 from torch_qpmpc.mpc.tightening import tighten
@@ -76,4 +76,4 @@ def test_without_noise_nothing_is_tightened():
         ),
         -1,
     )
-    assert_close(tightened.house(house)(p), make_mpc(house, known_model(house)).policy(p))
+    assert_close(tightened.house(house)(p), house_mpc(house, known_model(house)).policy(p))

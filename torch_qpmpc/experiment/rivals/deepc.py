@@ -55,7 +55,7 @@ class DeePC:
         solver: str = "daqp",
     ) -> None:
         n_y, n_u = len(Q), len(R)
-        P, U, Y = windows(log, past, horizon, n_y)
+        P, U, Y = hankel_matrices(log, past, horizon, n_y)
         n_p, n_known = len(P), len(P) + len(U)
         L = torch.linalg.qr(torch.cat((P, U, Y)).mT).R.mT
         n_gamma = L.shape[1]
@@ -92,7 +92,7 @@ class DeePC:
         return solve_qp(self._qp, p, solver=self._solver).z @ self._first.mT
 
 
-def windows(
+def hankel_matrices(
     log: TensorDictBase, past: int, horizon: int, n_y: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return P, U and Y, whose columns are the windows of past + horizon outputs of a log."""

@@ -38,7 +38,7 @@ class Omniscient:
     """MPC with the true model, the true state and all signals, the gain included."""
 
     def __init__(self, plant: HeatedHouse) -> None:
-        self._mpc = make_mpc(plant, Model(*plant.model()))
+        self._mpc = house_mpc(plant, Model(*plant.model()))
 
     def begin(self, plant: HeatedHouse, x: Tensor, w: Tensor) -> None:
         """Start at the true states ``x`` of the signals ``w``."""
@@ -72,7 +72,7 @@ class KalmanMPC:
         self._A[:n_x, -1] = E[:, GAIN]
         self._B, self._E = (torch.cat((M, M[:1] * 0)) for M in (B, E[:, : plant.n_d]))
         self._variance = plant.gain_std**2
-        self._mpc = make_mpc(plant, Model(self._A, self._B, self._E), margin=margin)
+        self._mpc = house_mpc(plant, Model(self._A, self._B, self._E), margin=margin)
 
     def begin(self, plant: HeatedHouse, x: Tensor, w: Tensor) -> None:
         """Start at the true states ``x``, with an unknown gain."""
@@ -98,6 +98,6 @@ def forecasts(plant: HeatedHouse, p: Tensor) -> Tensor:
     return p[:, : plant.n_preview].unflatten(-1, (plant.horizon + 1, plant.n_d))
 
 
-def make_mpc(plant: HeatedHouse, model: Model, **options: float) -> QPMPC:
+def house_mpc(plant: HeatedHouse, model: Model, **options: float) -> QPMPC:
     """Make the MPC of a model, with nothing to learn; ``options`` are those of `heating_scheme`."""
     return QPMPC(heating_scheme(plant, model, **options), learn=(), solver="daqp")

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from torch_qpmpc.experiment.heating import known_model
 from torch_qpmpc.experiment.rivals import tightened
-from torch_qpmpc.experiment.rivals.heating import KalmanMPC, Omniscient, Thermostat, make_mpc
+from torch_qpmpc.experiment.rivals.heating import KalmanMPC, Omniscient, Thermostat, house_mpc
 from torch_qpmpc.experiment.rivals.rival import Rival
 from torch_qpmpc.experiment.rivals.tuned_planner import TUNED, planner
 
@@ -26,7 +26,7 @@ HOUSE_RIVALS = {
         lambda house: Thermostat(house, offset=0.75, gain=10.0, ahead=TIMER)
     ),
     "planner (R = 2)": Rival(
-        lambda house: make_mpc(house, known_model(replace(house, R=2.0))).policy, sees={"past": 1}
+        lambda house: house_mpc(house, known_model(replace(house, R=2.0))).policy, sees={"past": 1}
     ),
     "tuned planner": Rival(lambda house: planner(house, TUNED).policy, sees={"past": 1}),
     "tightened": Rival(tightened.house, sees={"past": 1}),

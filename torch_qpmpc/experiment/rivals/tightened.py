@@ -17,7 +17,7 @@ from torch_qpmpc.envs.linear_system import LinearSystem
 from torch_qpmpc.envs.point_mass import PointMass
 from torch_qpmpc.envs.tank_references import TankReferences
 from torch_qpmpc.experiment.heating import known_model
-from torch_qpmpc.experiment.rivals.heating import make_mpc
+from torch_qpmpc.experiment.rivals.heating import house_mpc
 from torch_qpmpc.experiment.rivals.rival import Policy
 from torch_qpmpc.experiment.tracking import reference_scheme
 from torch_qpmpc.mpc.model import Model
@@ -52,7 +52,7 @@ def house(plant: House) -> Policy:
     A[0, 1] = E[0, GAIN]
     W = torch.diag(A.new_tensor([0.0, (1 - CORRELATION**2) * variance]))
     initial = torch.diag(A.new_tensor([0.0, variance]))
-    mpc = make_mpc(plant, known_model(plant))
+    mpc = house_mpc(plant, known_model(plant))
     tighten(mpc, prediction_covariance(A, W, plant.horizon, initial)[:, :1, :1])
     return mpc.policy
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch_qpmpc.envs.heated_house import DAY, DT
 from torch_qpmpc.envs.house import House
 from torch_qpmpc.experiment.heating import known_model
-from torch_qpmpc.experiment.rivals.heating import make_mpc
+from torch_qpmpc.experiment.rivals.heating import house_mpc
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solve import solve_qp
@@ -47,7 +47,7 @@ TUNED = Knobs(2.0368, 0.2831, 0.3263)
 
 def planner(house: House, knobs: Knobs) -> QPMPC:
     """Make the planner with these knobs."""
-    return make_mpc(
+    return house_mpc(
         house,
         known_model(replace(house, R=float(knobs.R))),
         gamma=GAMMA,
