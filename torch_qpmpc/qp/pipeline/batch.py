@@ -26,6 +26,7 @@ from torch_qpmpc.qp.pipeline.arrays import (
     Theta,
     on_device,
     to_numpy,
+    to_tensor,
 )
 from torch_qpmpc.qp.pipeline.prepared import Prepared, prepared_for
 from torch_qpmpc.qp.program import NDIMS
@@ -149,6 +150,19 @@ class Programs:
         forces = self.prepared.forces(self.n_f)
         *solution, settled = self.kernels.try_active_sets(qps, forces, active)
         return BackendSolution(*solution), settled
+
+    def hold(self, vy: Tensor, held: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
+        """Return v ``(B, d)`` and t ``(B, r)`` with ``G v = level`` in held rows of `reduced_qps`.
+
+        vy are v and G v for t = 0, ``(B, d + r)``. The result is NaN or wrong where the system is
+        singular.
+        """
+        forces = self.prepared.forces(self.n_f)
+        arrays = (x.contiguous() for x in (vy, held, level))
+        if isinstance(self.fixed, np.ndarray):
+            arrays = map(to_numpy, arrays)
+        vy, t = map(to_tensor, self.kernels.hold(forces, self.group, *arrays, 0.0))
+        return vy[:, : vy.shape[-1] - t.shape[-1]], t
 
     def recover(self, claim: BackendSolution, passes: int = 0) -> BatchSolution:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.
