@@ -77,18 +77,19 @@ def solve_kkt(
     device = z.device if z.is_cuda else None
     programs, batch = Programs.of(*theta, n_kept=n_kept, device=device)
     solved = (status == Status.SOLVED).expand(batch).reshape(-1)
-    solvable = programs
+    which, solvable = slice(None), programs
     if not solved.all():
-        solvable = programs.take(solved.nonzero().squeeze(-1).numpy(force=True))
+        which = solved.nonzero().squeeze(-1)
+        solvable = programs.take(which.numpy(force=True))
 
     def flat(x: Tensor) -> Tensor:
-        return flatten_batch(x.expand(*batch, x.shape[-1]))[solved].double()
+        return flatten_batch(x.expand(*batch, x.shape[-1]))[which].double()
 
     right = flat(grad_z), flat(grad_lam), flat(grad_chi), flat(grad_xi)
     solutions = _solve_kkt(solvable, *right, flat(z), flat(lam)) if len(solvable) else ()
     results = tuple(z.new_zeros(len(solved), x.shape[-1]) for x in (z, b, lb, fixed))
     for x, solution in zip(results, solutions, strict=False):
-        x[solved] = solution.to(x)
+        x[which] = solution.to(x)
     return tuple(x.reshape(*batch, x.shape[-1]) for x in results)  # pyright: ignore[reportReturnType] - a tuple of four
 
 
@@ -116,7 +117,7 @@ def _solve_kkt(
     p_z = particular + multiply(T[:, :, n_f:], group, v)
     left = grad_z - multiply(H, group, p_z) - multiply(G.mT, group, t)
     r = -multiply(Y_neg.mT, group, left)
-    u = (left - multiply(C.mT, group, r))[:, :n_f]
+    u = left[:, :n_f] - multiply(C[:, :, :n_f].mT, group, r)
     return p_z, r, t, u
 
 
