@@ -102,19 +102,25 @@ def _solve_kkt(
     z: Tensor,
     lam: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    n_f, group, reduced = p.n_f, to_tensor(p.group), p.prepared.reduced(p.n_f)
-    H, C, G, T, Y_neg = map(to_tensor, (*p.theta[:3], reduced.T, reduced.Y_neg))
+    n_f, theta = p.n_f, p.prepared.theta
+
+    def tensor(x: Any) -> Tensor:
+        return torch.as_tensor(x, device=z.device)
+
+    group = tensor(p.group)
+    H, C, G = tensor(theta.H), tensor(theta.C), tensor(theta.G)
+    T, Y_neg, H_y, G_y, _, _ = map(tensor, p.prepared.condensed(n_f).arrays)
     active = _held_rows(p, multiply(G, group, z), lam)
-    right, right_t = grad_z, grad_lam
-    # A particular solution of C p = dl/dchi and E p = dl/dxi; the condensed system gives the rest.
-    particular = torch.zeros_like(z)
+    T_f, T = T[:, :, :n_f], T[:, :, n_f:]
+    right, right_t, particular = grad_z, grad_lam, torch.zeros_like(z)
     if grad_chi.any() or grad_xi.any():
-        particular = multiply(T[:, :, :n_f], group, grad_xi) - multiply(Y_neg, group, grad_chi)
+        # A solution of C p = dl/dchi and E p = dl/dxi; the condensed system gives the rest.
+        particular = multiply(T_f, group, grad_xi) - multiply(Y_neg, group, grad_chi)
         right = right - multiply(H, group, particular)
         right_t = right_t - multiply(G, group, particular)
-    right_v = multiply(T[:, :, n_f:].mT, group, right)
-    v, t = _solve_active(p, active, right_v, right_t * active)
-    p_z = particular + multiply(T[:, :, n_f:], group, v)
+    system = H_y[:, n_f:, n_f:], G_y[:, :, n_f:], active, multiply(T.mT, group, right)
+    v, t = _solve_active(p, *system, torch.where(active, right_t, 0))
+    p_z = particular + multiply(T, group, v)
     left = grad_z - multiply(H, group, p_z) - multiply(G.mT, group, t)
     r = -multiply(Y_neg.mT, group, left)
     u = left[:, :n_f] - multiply(C[:, :, :n_f].mT, group, r)
@@ -201,45 +207,48 @@ def implied_equalities(
 
 
 def _solve_active(
-    p: Programs, active: Tensor, right_v: Tensor, right_t: Tensor
+    p: Programs, H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Solve ``H v + G't = right_v, G v = right_t``; t and right_t are zero in inactive rows."""
-    reduced, forces, group = p.prepared.reduced(p.n_f), p.prepared.forces(p.n_f), to_tensor(p.group)
-    H, G, rise, rows = map(to_tensor, (reduced.H, reduced.G, forces.rise, reduced.rows))
-    held, right = active[:, rows], right_t[:, rows]
-    v, t, of_v, of_t = torch.zeros_like(right_v), torch.zeros_like(right), right_v, right
-    terms, regular = largest(right_v), held.new_zeros(len(held))
-    size = torch.zeros_like(terms)
+    """Solve ``H v + G't = right_v, G v = right_t``; t and right_t are zero in inactive rows.
+
+    H is factorised once for each theta, and the Schur complement of the active rows for each QP,
+    unless every QP has a theta of its own.
+    """
+    group = torch.as_tensor(p.group, device=H.device)
+    if 1 < len(H) == len(group):
+        return _solve_dense(H[group], G[group], active, right_v, right_t)
+    rise = to_tensor(p.prepared.forces(p.n_f).rise)
+    v, t, of_v, of_t = torch.zeros_like(right_v), torch.zeros_like(right_t), right_v, right_t
+    size = terms = largest(right_v) * 0
+    regular = size < 0
     for _ in range(PASSES):
         free = multiply(rise.mT, group, of_v)
-        dv, dt = p.hold(free, held, of_t)
+        dv, dt = p.hold(free, active, of_t)
         v, t = v + dv, t + dt
         of_v = right_v - multiply(H, group, v) - multiply(G.mT, group, t)
-        of_t = (right - multiply(G, group, v)) * held
-        # The held rows may cancel all of v.
-        size = size + largest(free[:, : v.shape[-1]]) + largest(dv)
+        of_t = torch.where(active, right_t - multiply(G, group, v), 0)
+        size = size + largest(dv) + largest(free[:, : v.shape[-1]])  # the active rows may cancel v
         terms = largest(right_v) + largest(H.flatten(1))[group] * size
-        of_rows = right.abs() + largest(G)[group] * size.unsqueeze(-1)
+        of_rows = right_t.abs() + largest(G)[group] * size.unsqueeze(-1)
         regular = (largest(of_v) <= REGULAR * terms) & (of_t.abs() <= REGULAR * of_rows).all(-1)
         if regular.all():
             break
-    if (again := ~regular | _is_strained(G, group, t, terms)).any():
-        index = group[again]
-        system = H[index], G[index], held[again], right_v[again], right[again]
-        v[again], t[again] = _solve_irregular(*system)
-    return v, torch.zeros_like(right_t).index_copy_(1, rows, t)
+    if (again := ~regular | _is_strained(largest(G)[group], t, terms)).any():
+        index, rest = group[again], (x[again] for x in (active, right_v, right_t))
+        v[again], t[again] = _solve_dense(H[index], G[index], *rest)
+    return v, t
 
 
-def _solve_irregular(
-    H: Tensor, G: Tensor, held: Tensor, right_v: Tensor, right_t: Tensor
+def _solve_dense(
+    H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Do as `_solve_active`, for dependent rows or directions without curvature."""
-    rows = held.any(dim=0).nonzero().squeeze(-1)
-    G, right, idle = G[:, rows] * held[:, rows, None], right_t[:, rows], ~held[:, rows]
+    """Do as `_solve_active`, also for dependent rows and directions without curvature."""
+    rows = active.any(dim=0).nonzero().squeeze(-1)
+    idle, right = ~active[:, rows], right_t[:, rows]
+    G = G[:, rows].masked_fill(idle.unsqueeze(-1), 0)
     v, t_rows = _solve_rows(H, G, idle, right_v, right)
-    each = torch.arange(len(H), device=H.device)
     terms = largest(right_v) + largest(H.flatten(1)) * largest(v)
-    if (again := _is_strained(G, each, t_rows, terms)).any():
+    if (again := _is_strained(largest(G), t_rows, terms)).any():
         # Rows that are dependent but for rounding, which would decide about v: an orthonormal basis
         # of them, and of all t the one of least norm.
         size = torch.linalg.vector_norm(G[again], dim=-1) + idle[again]
@@ -249,15 +258,17 @@ def _solve_irregular(
         basis, of_basis = basis * kept.unsqueeze(-1), times(inverse.mT, right[again])
         v[again], of_basis = _solve_rows(H[again], basis, ~kept, right_v[again], of_basis)
         t_rows[again] = times(inverse, of_basis)
-    return v, torch.zeros_like(right_t).index_copy_(1, rows, t_rows)
+    t = torch.zeros_like(right_t)
+    t[:, rows] = t_rows
+    return v, t
 
 
-def _is_strained(G: Tensor, group: Tensor, t: Tensor, others: Tensor) -> Tensor:
+def _is_strained(G_size: Tensor, t: Tensor, others: Tensor) -> Tensor:
     """Return the mask of QPs in which terms of G't cancel to a fraction of their size, ``(B,)``.
 
     ``others`` are the sizes of the other terms of ``H v + G't = right_v``.
     """
-    return PARALLEL * largest(largest(G)[group] * t) > others
+    return PARALLEL * largest(G_size * t) > others
 
 
 def _solve_rows(
