@@ -106,6 +106,18 @@ def _eliminate(C, n_kept, independent, T, Y_neg):
 
 
 @compiled
+def sparse_products(left, right):
+    """Multiply ``(M, i, j)`` by ``(M, j, k)``, ignoring the left matrices' zeros."""
+    out = np.zeros((len(left), left.shape[1], right.shape[2]))
+    for m in range(len(left)):
+        for i in range(left.shape[1]):
+            for j in range(left.shape[2]):
+                if left[m, i, j] != 0:
+                    add(out[m, i], left[m, i, j], right[m, j])
+    return out
+
+
+@compiled
 def inverse_factors(H, definite, shift):
     """Return the inverses of the Cholesky factors of H, shifted by a multiple of I if singular.
 
