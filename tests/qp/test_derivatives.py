@@ -9,7 +9,15 @@ from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev, vmap
 from torch.testing import assert_close
 
-from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states
+from tests.problems import (
+    CPU,
+    KnownQP,
+    known_qp,
+    normal,
+    programs_of,
+    random_mpc,
+    random_states,
+)
 from torch_qpmpc import QPError, QuadraticProgram, solve_qp
 from torch_qpmpc.qp import kkt
 from torch_qpmpc.qp.program import EVENT_SHAPES
@@ -470,6 +478,56 @@ def test_more_active_rows_than_variables_give_a_consistent_derivative(solver):
     slope = torch.autograd.functional.jacobian(z, vector(1.0, 1.0, 2.0))
     assert_close(slope @ vector(1.0, 1.0, 2.0), vector(1.0, 1.0))
     assert_close(slope @ vector(1.0, -1.0, 0.0), vector(1.0, -1.0))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-9])
+@pytest.mark.parametrize("matrices", [(), (2, 1)])
+def test_the_schur_complement_gives_the_gradients_of_the_whole_system(matrices, unit, monkeypatch):
+    """Compare both ways for QPs that share a theta, also in units of their own."""
+    known = known_qp(4, batch=(2, 3), matrices=matrices, soft=KINDS, hard=("inside", "at_upper"))
+    sizes = [unit if name in ("H", "q", "c", "w") else 1.0 for name in OPERANDS]
+    leaves = [
+        (x * size).requires_grad_() for x, size in zip(operands_of(known), sizes, strict=True)
+    ]
+    qp = QuadraticProgram(*leaves[:-1], check_values=False)
+    solution = solve_qp(qp, leaves[-1], solver="daqp")
+    parts = solution.z, solution.chi / unit, solution.lam / unit, solution.xi / unit
+    loss = torch.stack([(normal(*x.shape, seed=i) * x).sum() for i, x in enumerate(parts)]).sum()
+
+    def gradients() -> tuple[Tensor, ...]:
+        return torch.autograd.grad(loss, leaves, retain_graph=True, materialize_grads=True)
+
+    whole = kkt._solve_dense
+    monkeypatch.setattr(kkt, "_solve_dense", None)
+    ours = gradients()
+    monkeypatch.setattr(kkt, "_solve_dense", whole)
+    monkeypatch.setattr(kkt, "PASSES", 0)
+    for mine, other, size in zip(ours, gradients(), sizes, strict=True):
+        assert_close(size * mine, size * other, rtol=1e-10, atol=1e-11)
+
+
+@pytest.mark.parametrize("matrices", [(), (6,)])
+def test_the_adjoint_in_tensors_is_that_in_arrays(matrices):
+    """Run the other devices' path on the CPU."""
+    known = known_qp(5, batch=(6,), matrices=matrices, soft=KINDS, hard=("inside", "at_upper"))
+    solution = known.z, known.lam, known.chi, known.fixed
+    z, lam, chi, xi = (normal(*x.shape, seed=i) for i, x in enumerate(solution))
+    both = (programs_of(known, device) for device in (None, CPU))
+    ours, others = (kkt._solve_kkt(p, z, lam, chi, xi, known.z, known.lam) for p in both)
+    for one, other in zip(ours, others, strict=True):
+        assert_close(one, other, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("size", [1e-15, 1.0, 1e15])
+def test_gradients_are_linear_in_what_comes_in(size, monkeypatch):
+    """All variables are at a bound, so that only rounding errors are left of p."""
+    monkeypatch.setattr(kkt, "_solve_dense", None)
+    one, none = torch.ones(2, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.float64)
+    H, ub = vector(2.0, 0.3, 0.3, 1.0).reshape(2, 2), vector(1.0, 0.5).requires_grad_()
+    data = H, -5 * one, 0 * one[0], none, none[:, 0], one.diag(), -one, ub, INF * one
+    z = solve_qp(QuadraticProgram(*data), solver="daqp").z
+    (gradient,) = torch.autograd.grad(size * (z * vector(0.7, -0.2)).sum(), ub)
+    assert_close(gradient / size, vector(0.7, -0.2), rtol=1e-12, atol=0)
 
 
 def test_opposite_rows_are_not_sought_without_weakly_active_ones(monkeypatch):

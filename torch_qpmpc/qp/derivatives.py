@@ -134,9 +134,17 @@ def _solution_gradients(
     grad_z, grad_chi, grad_lam, grad_xi = grads
     p, r, t, u = kkt(grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, n_kept)
     upper = upper_share(z, lam, G, lb, ub) if needed[6] or needed[7] else lam
-    slope = torch.where(saturated_rows(lam, w), lam.sign() * (grad_lam - times(G, p)), 0)
+
+    def of_H() -> Tensor:
+        half = -0.5 * outer(p, z, H)
+        return half + half.mT
+
+    def of_w() -> Tensor:
+        slope = lam.sign() * (grad_lam - times(G, p))
+        return sum_to(torch.where(saturated_rows(lam, w), slope, 0), w)
+
     formulas = (
-        lambda: -0.5 * (outer(p, z, H) + outer(z, p, H)),
+        of_H,
         lambda: sum_to(-p, q),
         lambda: torch.zeros_like(c),
         lambda: -(outer(chi, p, C) + outer(r, z, C)),
@@ -144,7 +152,7 @@ def _solution_gradients(
         lambda: -(outer(lam, p, G) + outer(t, z, G)),
         lambda: sum_to((1 - upper) * t, lb),
         lambda: sum_to(upper * t, ub),
-        lambda: sum_to(slope, w),
+        of_w,
         lambda: sum_to(u, fixed),
     )
     return (f() if need else None for f, need in zip(formulas, needed, strict=True))

@@ -14,12 +14,16 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, largest, multiply, times
-from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, to_numpy
+from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, to_numpy, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import NDIMS, Status
 from torch_qpmpc.qp.solution import active_rows
 from torch_qpmpc.qp.tracing import has_values, is_differentiating
 
+#: The Schur complement's solution is accepted with a relative residual up to this, ..
+REGULAR = 1e-12
+#: .. after so many solves of the same system: the first, and a refinement.
+PASSES = 2
 #: A KKT system whose solution has a larger relative residual counts as singular.
 SINGULAR = 1e-8
 #: A row is at its bound within this fraction of its size, the certificate's tolerance.
@@ -73,18 +77,19 @@ def solve_kkt(
     device = z.device if z.is_cuda else None
     programs, batch = Programs.of(*theta, n_kept=n_kept, device=device)
     solved = (status == Status.SOLVED).expand(batch).reshape(-1)
-    solvable = programs
+    which, solvable = slice(None), programs
     if not solved.all():
-        solvable = programs.take(solved.nonzero().squeeze(-1).numpy(force=True))
+        which = solved.nonzero().squeeze(-1)
+        solvable = programs.take(which.numpy(force=True))
 
     def flat(x: Tensor) -> Tensor:
-        return flatten_batch(x.expand(*batch, x.shape[-1]))[solved].double()
+        return flatten_batch(x.expand(*batch, x.shape[-1]))[which].double()
 
     right = flat(grad_z), flat(grad_lam), flat(grad_chi), flat(grad_xi)
     solutions = _solve_kkt(solvable, *right, flat(z), flat(lam)) if len(solvable) else ()
     results = tuple(z.new_zeros(len(solved), x.shape[-1]) for x in (z, b, lb, fixed))
     for x, solution in zip(results, solutions, strict=False):
-        x[solved] = solution.to(x)
+        x[which] = solution.to(x)
     return tuple(x.reshape(*batch, x.shape[-1]) for x in results)  # pyright: ignore[reportReturnType] - a tuple of four
 
 
@@ -107,21 +112,18 @@ def _solve_kkt(
     T, Y_neg, H_y, G_y, _, _ = map(tensor, p.prepared.condensed(n_f).arrays)
     active = _held_rows(p, multiply(G, group, z), lam)
     T_f, T = T[:, :, :n_f], T[:, :, n_f:]
-    # A particular solution of C p = dl/dchi and E p = dl/dxi; the condensed system gives the rest.
-    particular = multiply(T_f, group, grad_xi) - multiply(Y_neg, group, grad_chi)
-    right_v = multiply(T.mT, group, grad_z - multiply(H, group, particular))
-    right_t = torch.where(active, grad_lam - multiply(G, group, particular), 0)
-    v, t = _solve_active(
-        H_y[group, n_f:, n_f:],
-        G_y[group, :, n_f:] * active.unsqueeze(-1),
-        active,
-        right_v,
-        right_t,
-    )
+    right, right_t, particular = grad_z, grad_lam, torch.zeros_like(z)
+    if grad_chi.any() or grad_xi.any():
+        # A solution of C p = dl/dchi and E p = dl/dxi; the condensed system gives the rest.
+        particular = multiply(T_f, group, grad_xi) - multiply(Y_neg, group, grad_chi)
+        right = right - multiply(H, group, particular)
+        right_t = right_t - multiply(G, group, particular)
+    system = H_y[:, n_f:, n_f:], G_y[:, :, n_f:], active, multiply(T.mT, group, right)
+    v, t = _solve_active(p, *system, torch.where(active, right_t, 0))
     p_z = particular + multiply(T, group, v)
     left = grad_z - multiply(H, group, p_z) - multiply(G.mT, group, t)
     r = -multiply(Y_neg.mT, group, left)
-    u = (left - multiply(C.mT, group, r))[:, :n_f]
+    u = left[:, :n_f] - multiply(C[:, :, :n_f].mT, group, r)
     return p_z, r, t, u
 
 
@@ -205,13 +207,48 @@ def implied_equalities(
 
 
 def _solve_active(
+    p: Programs, H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Solve ``H v + G't = right_v, G v = right_t``; t and right_t are zero in inactive rows.
+
+    H is factorised once for each theta, and the Schur complement of the active rows for each QP,
+    unless every QP has a theta of its own.
+    """
+    group = torch.as_tensor(p.group, device=H.device)
+    if 1 < len(H) == len(group):
+        return _solve_dense(H[group], G[group], active, right_v, right_t)
+    rise = to_tensor(p.prepared.forces(p.n_f).rise)
+    v, t, of_v, of_t = torch.zeros_like(right_v), torch.zeros_like(right_t), right_v, right_t
+    size = terms = largest(right_v) * 0
+    regular = size < 0
+    for _ in range(PASSES):
+        free = multiply(rise.mT, group, of_v)
+        dv, dt = p.hold(free, active, of_t)
+        v, t = v + dv, t + dt
+        of_v = right_v - multiply(H, group, v) - multiply(G.mT, group, t)
+        of_t = torch.where(active, right_t - multiply(G, group, v), 0)
+        size = size + largest(dv) + largest(free[:, : v.shape[-1]])  # the active rows may cancel v
+        terms = largest(right_v) + largest(H.flatten(1))[group] * size
+        of_rows = right_t.abs() + largest(G)[group] * size.unsqueeze(-1)
+        regular = (largest(of_v) <= REGULAR * terms) & (of_t.abs() <= REGULAR * of_rows).all(-1)
+        if regular.all():
+            break
+    if (again := ~regular | _is_strained(largest(G)[group], t, terms)).any():
+        index, rest = group[again], (x[again] for x in (active, right_v, right_t))
+        v[again], t[again] = _solve_dense(H[index], G[index], *rest)
+    return v, t
+
+
+def _solve_dense(
     H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Solve ``H v + G't = right_v, G v = right_t``; G and right_t are zero in inactive rows."""
+    """Do as `_solve_active`, also for dependent rows and directions without curvature."""
     rows = active.any(dim=0).nonzero().squeeze(-1)
-    G, right, idle = G[:, rows], right_t[:, rows], ~active[:, rows]
+    idle, right = ~active[:, rows], right_t[:, rows]
+    G = G[:, rows].masked_fill(idle.unsqueeze(-1), 0)
     v, t_rows = _solve_rows(H, G, idle, right_v, right)
-    if (again := _is_strained(H, G, v, t_rows, right_v)).any():
+    terms = largest(right_v) + largest(H.flatten(1)) * largest(v)
+    if (again := _is_strained(largest(G), t_rows, terms)).any():
         # Rows that are dependent but for rounding, which would decide about v: an orthonormal basis
         # of them, and of all t the one of least norm.
         size = torch.linalg.vector_norm(G[again], dim=-1) + idle[again]
@@ -226,10 +263,12 @@ def _solve_active(
     return v, t
 
 
-def _is_strained(H: Tensor, G: Tensor, v: Tensor, t: Tensor, right_v: Tensor) -> Tensor:
-    """Return the mask of QPs in which terms of G't cancel to a fraction of their size, ``(B,)``."""
-    others = largest(right_v) + largest(H.flatten(1)) * largest(v)
-    return PARALLEL * largest(largest(G) * t) > others
+def _is_strained(G_size: Tensor, t: Tensor, others: Tensor) -> Tensor:
+    """Return the mask of QPs in which terms of G't cancel to a fraction of their size, ``(B,)``.
+
+    ``others`` are the sizes of the other terms of ``H v + G't = right_v``.
+    """
+    return PARALLEL * largest(G_size * t) > others
 
 
 def _solve_rows(

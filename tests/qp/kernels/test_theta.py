@@ -16,6 +16,23 @@ def matrix_with(eigenvalues: list[float]) -> np.ndarray:
     return (basis * eigenvalues) @ basis.T
 
 
+def test_zeros_of_a_left_matrix_are_skipped():
+    left = RNG.normal(size=(2, 7, 5)) * (RNG.random((2, 7, 5)) < 0.2)
+    right = RNG.normal(size=(2, 5, 3))
+    np.testing.assert_allclose(kernels.sparse_products(left, right), left @ right, rtol=1e-12)
+
+
+@pytest.mark.parametrize("width", [1, 4, 12])
+def test_a_band_is_eliminated(width):
+    """The band of each row begins at its own variable, which pivoting need not choose."""
+    n_c, n_z = 20, 34
+    C = np.triu(np.tril(RNG.normal(size=(2, n_c, n_z)), 2 + width), 2)
+    T, Y_neg, regular = kernels.eliminate(C, 2, 1e-10)
+    assert regular
+    np.testing.assert_allclose(C @ T, 0, atol=1e-9)
+    np.testing.assert_allclose(-C @ Y_neg, np.eye(n_c)[None].repeat(2, 0), atol=1e-9)
+
+
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
 def test_a_definite_matrix_gets_the_inverse_of_its_cholesky_factor(size):
     H = size * np.stack([matrix_with([1.0, 2.0, 5.0, 1e-3]), matrix_with([3.0] * 4)])

@@ -24,11 +24,12 @@ lies between two others, in v, the variables that C z = b leaves free:
 ``value_error`` is the distance of the two and the rounding errors of the value, relative to the
 largest of 1/2 z'Hz, q'z, w'sigma and their sum.
 
-A warm start tries the active set of a nearly equal QP: between two visits to a transition theta
-changes little, and most active sets stay the same. With a fixed set, the KKT conditions are linear
-in its multipliers, and need one Cholesky factor per QP, of the active part of K = G H^-1 G'. If the
-signs of the solution contradict the set, the rows concerned change their state, and the new set is
-tried. QPs that do not settle go to the backend.
+With a fixed active set, the KKT conditions are linear. `hold` solves them by the Schur complement
+of H, with one Cholesky factor per QP, of the active part of K = G H^-1 G'. The derivatives of the
+solution use it, and so does a warm start, which tries the active set of a nearly equal QP: between
+two visits to a transition theta changes little, and most active sets stay the same. If the signs of
+the solution contradict the set, the rows concerned change their state, and the new set is tried.
+QPs that do not settle go to the backend.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ from torch_qpmpc.qp.kernels.linalg import (
 VIOLATED = 1e-9
 #: Largest number of active sets that a warm start tries for one QP.
 MAX_STEPS = 10
-#: Largest number of solves with one active set: the first, and refinements.
+#: Largest number of solves of one system: the first, and refinements.
 MAX_PASSES = 3
 #: Relative tolerance for bounds and for signs of multipliers in a warm start.
 SLIP = 1e-9
@@ -449,8 +450,8 @@ def _try_active_sets(rise, push, group, g, lower, upper, w, active):
     free = -transposed_products(rise, group, g, False)  # (v, y) without multipliers
     lam, vy, steps = np.zeros((n_qps, r)), free.copy(), np.zeros(n_qps, np.int64)
     done = np.zeros(n_qps, np.bool_)
-    code, held, pull = np.empty(r, np.int8), np.empty(r, np.int64), np.empty(r)
-    factor, nothing = np.empty((r, r)), np.zeros(r, np.int8)
+    code, held, level = np.empty(r, np.int8), np.empty(r, np.int64), np.empty(r)
+    factor, pull, nothing = np.empty((r, r)), np.empty(r), np.zeros(r, np.int8)
     for i in range(n_qps):
         copy(code, active[i])
         push_i = push[group[i]]
@@ -467,25 +468,64 @@ def _try_active_sets(rise, push, group, g, lower, upper, w, active):
                     lam[i, j] = math.copysign(w[i, j], code[j])
                     add(vy[i], -lam[i, j], push_i[j])
                 elif code[j] != 0:
+                    level[j] = upper[i, j] if code[j] > 0 else lower[i, j]
                     held[k] = j
                     k += 1
-            if not _factorise_held(push_i, held, k, d, factor):
+            if not _hold_rows(push_i, held[:k], level, SLIP, vy[i], lam[i], factor, pull):
                 break
-            for _ in range(MAX_PASSES):
-                unmet = False
-                for a in range(k):
-                    j = held[a]
-                    level = upper[i, j] if code[j] > 0 else lower[i, j]
-                    pull[a] = vy[i, d + j] - level
-                    unmet = unmet or not abs(pull[a]) <= SLIP * (1.0 + abs(level))
-                if not unmet:
-                    break
-                _solve_factorised(factor, pull, k)
-                for a in range(k):
-                    lam[i, held[a]] += pull[a]
-                    add(vy[i], -pull[a], push_i[held[a]])
             done[i] = not _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i])
     return vy[:, :d].copy(), lam, steps, done
+
+
+def hold(forces, group, vy, held, level, slip) -> tuple[Any, ...]:
+    """Solve ``H v + G't = right`` with ``G v = level`` and t = 0 in held and other rows.
+
+    Args:
+        forces, group: the `Forces` of the QPs.
+        vy: v and y = G v for t = 0, ``(B, d + r)``.
+        held, level: the mask of held rows, and their levels, ``(B, r)``.
+        slip: the relative error of y that ends the refinement.
+
+    Returns:
+        v and y, and t; t is zero where the held rows have no Cholesky factor.
+    """
+    return _hold(forces.push, group, vy, held, level, slip)
+
+
+@compiled
+def _hold(push, group, vy, held, level, slip):
+    n_qps, r = held.shape
+    vy, t = vy.copy(), np.zeros((n_qps, r))
+    rows, factor, pull = np.empty(r, np.int64), np.empty((r, r)), np.empty(r)
+    for i in range(n_qps):
+        k = 0
+        for j in range(r):
+            if held[i, j]:
+                rows[k] = j
+                k += 1
+        _hold_rows(push[group[i]], rows[:k], level[i], slip, vy[i], t[i], factor, pull)
+    return vy, t
+
+
+@compiled
+def _hold_rows(push, held, level, slip, vy, t, factor, pull):
+    """Add to t and vy the multipliers and their effect; return False if there is no factor."""
+    k, d = len(held), len(vy) - len(t)
+    if not _factorise_held(push, held, k, d, factor):
+        return False
+    for _ in range(MAX_PASSES):
+        unmet = False
+        for a in range(k):
+            at = level[held[a]]
+            pull[a] = vy[d + held[a]] - at
+            unmet = unmet or not abs(pull[a]) <= slip * (1.0 + abs(at))
+        if not unmet:
+            break
+        _solve_factorised(factor, pull, k)
+        for a in range(k):
+            t[held[a]] += pull[a]
+            add(vy, -pull[a], push[held[a]])
+    return True
 
 
 @compiled

@@ -214,19 +214,26 @@ def _solve(qps, forces, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     if saturated.any():
         lam = torch.where(saturated, active.sign() * qps.w, 0)
         vy = vy - multiply(forces.push.mT, qps.group, lam)
-    order, real = _order(size == 1)
-    factor = _factor_held(forces.push[:, :, d:], qps.group, order, real)
+    level = torch.where(active > 0, qps.u, qps.l)
+    vy, pull = hold(forces, qps.group, vy, size == 1, level, SLIP)
+    return vy[:, :d], lam + pull, vy[:, d:]
+
+
+def hold(forces, group, vy, held, level, slip) -> tuple[Tensor, Tensor]:
+    d, t = vy.shape[-1] - held.shape[-1], torch.zeros_like(level)
+    order, real = _order(held)
+    factor = _factor_held(forces.push[:, :, d:], group, order, real)
     order = order * real
-    level = torch.where(active > 0, qps.u, qps.l).gather(1, order)
+    level = level.gather(1, order)
     for _ in range(MAX_PASSES):
         short = (vy[:, d:].gather(1, order) - level).masked_fill_(~real, 0)
-        if not (short.abs() > SLIP * (1 + level.abs())).any():
+        if not (short.abs() > slip * (1 + level.abs())).any():
             break
-        push = torch.cholesky_solve(short.unsqueeze(-1), factor).squeeze(-1)
-        pull = torch.zeros_like(lam).scatter_add_(1, order, push)
-        lam = lam + pull
-        vy = vy - multiply(forces.push.mT, qps.group, pull)
-    return vy[:, :d], lam, vy[:, d:]
+        pull = torch.cholesky_solve(short.unsqueeze(-1), factor).squeeze(-1)
+        pull = torch.zeros_like(t).scatter_add_(1, order, pull)
+        t = t + pull
+        vy = vy - multiply(forces.push.mT, group, pull)
+    return vy, t
 
 
 def _order(held: Tensor) -> tuple[Tensor, Tensor]:

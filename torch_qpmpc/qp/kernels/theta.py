@@ -28,7 +28,8 @@ def eliminate(C, n_kept, independent):
     """Solve C z = b for some entries of z: return T and -Y with ``z = T y + Y b``.
 
     LU with row pivoting on the transpose of C picks columns that are safe to solve for. For a
-    linear MPC scheme they are x_1..x_N, and then T is its prediction form.
+    linear MPC scheme they are x_1..x_N, and then T is its prediction form. For a banded C, the cost
+    grows with the square of N, as T does: the loops skip the zeros outside the band.
 
     Args:
         C: ``(M, n_c, n_z)``.
@@ -70,9 +71,10 @@ def _eliminate(C, n_kept, independent, T, Y_neg):
             order[n_kept + k], order[n_kept + pivot] = order[n_kept + pivot], order[n_kept + k]
         stays[order[n_kept + k]] = False
         for j in range(k + 1, n_rest):
-            factors[j, k] /= factors[k, k]
-            for i in range(k + 1, n_c):
-                factors[j, i] -= factors[j, k] * factors[k, i]
+            if factors[j, k] != 0:  # few are not, in a banded C
+                factors[j, k] /= factors[k, k]
+                for i in range(k + 1, n_c):
+                    factors[j, i] -= factors[j, k] * factors[k, i]
     # The right-hand sides are -C in the remaining columns, and the identity. The system's matrix is
     # C in the dependent columns, the transpose of the first n_c rows of L times U.
     right, k = np.zeros((n_c, n_z)), 0
@@ -84,17 +86,35 @@ def _eliminate(C, n_kept, independent, T, Y_neg):
             k += 1
     for i in range(n_c):
         right[i, n_y + i] = 1.0
-        add_product(right[i], -factors[:i, i], right)
+        first = 0
+        while first < i and factors[first, i] == 0:
+            first += 1
+        add_product(right[i], -factors[first:i, i], right[first:])
         for j in range(n_z):
             right[i, j] /= factors[i, i]
     for i in range(n_c - 1, -1, -1):
-        add_product(right[i], -factors[i + 1 : n_c, i], right[i + 1 :])
+        end = n_c
+        while end > i + 1 and factors[end - 1, i] == 0:
+            end -= 1
+        add_product(right[i], -factors[i + 1 : end, i], right[i + 1 :])
         dependent = order[n_kept + i]
         for j in range(n_y):
             T[dependent, j] = right[i, j]
         for j in range(n_c):
             Y_neg[dependent, j] = -right[i, n_y + j]
     return True
+
+
+@compiled
+def sparse_products(left, right):
+    """Multiply ``(M, i, j)`` by ``(M, j, k)``, ignoring the left matrices' zeros."""
+    out = np.zeros((len(left), left.shape[1], right.shape[2]))
+    for m in range(len(left)):
+        for i in range(left.shape[1]):
+            for j in range(left.shape[2]):
+                if left[m, i, j] != 0:
+                    add(out[m, i], left[m, i, j], right[m, j])
+    return out
 
 
 @compiled

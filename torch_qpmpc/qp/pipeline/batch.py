@@ -26,6 +26,7 @@ from torch_qpmpc.qp.pipeline.arrays import (
     Theta,
     on_device,
     to_numpy,
+    to_tensor,
 )
 from torch_qpmpc.qp.pipeline.prepared import Prepared, prepared_for
 from torch_qpmpc.qp.program import NDIMS
@@ -149,6 +150,20 @@ class Programs:
         forces = self.prepared.forces(self.n_f)
         *solution, settled = self.kernels.try_active_sets(qps, forces, active)
         return BackendSolution(*solution), settled
+
+    def hold(self, vy: Tensor, held: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
+        """Return v ``(B, d)`` and t ``(B, n_g)`` with ``G v = level`` in the ``held`` rows.
+
+        vy are v and the `reduced_qps`' G v for t = 0, ``(B, d + r)``. The result is wrong or NaN
+        where H or the held rows are singular.
+        """
+        forces, rows = self.prepared.forces(self.n_f), self.prepared.reduced(self.n_f).rows
+        t, rows = torch.zeros_like(level), to_tensor(rows)
+        arrays = vy, held[:, rows], level[:, rows]
+        if isinstance(self.fixed, np.ndarray):
+            arrays = map(to_numpy, arrays)
+        vy, t[:, rows] = map(to_tensor, self.kernels.hold(forces, self.group, *arrays, 0.0))
+        return vy[:, : vy.shape[-1] - len(rows)], t
 
     def recover(self, claim: BackendSolution, passes: int = 0) -> BatchSolution:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.

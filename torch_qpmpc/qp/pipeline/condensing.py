@@ -21,6 +21,8 @@ from torch_qpmpc.qp.pipeline.arrays import Array, Theta
 RANK_TOLERANCE = 1e-10
 #: `in_order` accepts a pivot of at least this fraction of the largest.
 THRESHOLD = 1e-2
+#: Largest share of nonzero entries of a matrix that BLAS does not multiply faster.
+SPARSE = 0.1
 #: A coefficient up to this fraction of its row's absolute sum counts as rounding.
 ENTERS = 1e-12
 #: A reduced row with a smaller fraction of its terms contains no variable at all.
@@ -149,13 +151,13 @@ class Forces(NamedTuple):
 def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) -> Condensed:
     """Condense M matrix triples, keeping the first ``n_kept`` entries of z."""
     T, Y_neg, padding = elimination or eliminate(theta.C, n_kept)
-    H_T = theta.H @ T
+    H_T = _products(theta.H, T)
     H = T.swapaxes(1, 2) @ H_T
     H = (H + H.swapaxes(1, 2)) / 2
-    H_b, G_b = -(H_T.swapaxes(1, 2) @ Y_neg), -(theta.G @ Y_neg)
+    H_b, G_b = -(H_T.swapaxes(1, 2) @ Y_neg), -_products(theta.G, Y_neg)
     if padding is not None:  # a unit curvature sets the variables of zero columns to zero
         H = H + padding[:, :, None] * np.eye(H.shape[1])
-    G = theta.G @ T
+    G = _products(theta.G, T)
     # Rounding leaves traces of variables that a row does not contain, and all of a row that C
     # implies: sizes are compared with those before the elimination.
     terms = np.abs(theta.G) @ kernels.row_sums(T)[:, :, None]
@@ -164,6 +166,13 @@ def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) 
     arrays = CondensedArrays(T, Y_neg, H, G, H_b, G_b)
     convex = padding is None and _has_factor(H)
     return Condensed(arrays, enters, terms[:, :, 0], sums, n_kept, padding is not None, convex)
+
+
+def _products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Multiply ``(M, i, j)`` by ``(M, j, k)``; the left matrices of an MPC scheme are sparse."""
+    if np.count_nonzero(left) > SPARSE * left.size:
+        return left @ right
+    return kernels.sparse_products(left, np.ascontiguousarray(right))
 
 
 def _has_factor(H: np.ndarray) -> bool:

@@ -1,0 +1,107 @@
+"""The policy's gradient beside the solution and the value's gradient.
+
+    python -m tests.benchmarks.policy --write
+
+CPU time on one thread with DAQP, the median of rounds in which the three take turns; theta moves
+in its last digits before each round. The bounded LQRs are those of Table 1 in
+https://arxiv.org/abs/2505.01353: 128 initial states, N = 20, n_x = 8, n_u = 4.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
+from torch_qpmpc import QPMPC
+from torch_qpmpc.study.markdown import replaced, table
+
+PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
+ROUNDS, WARM_UP = 30, 2
+TITLES = ["batch", "solution", "value's gradient", "policy's gradient", "/ solution", "/ value's"]
+
+
+def bounded_lqr(u_max: float) -> tuple[QPMPC, Tensor]:
+    n_x, n_u, random = 8, 4, np.random.RandomState(42)
+    A, B = np.eye(n_x) + 0.2 * random.randn(n_x, n_x), random.randn(n_x, n_u)
+    mpc = QPMPC(
+        n_x,
+        n_u,
+        20,
+        A=A,
+        B=B,
+        offset=random.randn(n_x),
+        gamma=1.0,
+        structure="tied",
+        hessian="block",
+        stage_weight=np.eye(n_x + n_u),
+        terminal_weight=np.eye(n_x),
+        action_bounds=([-u_max] * n_u, [u_max] * n_u),
+        learn=("H", "C", "b"),
+        solver="daqp",
+    )
+    return mpc, torch.from_numpy(random.randn(128, n_x))
+
+
+def point_mass(horizon: int) -> tuple[QPMPC, Tensor]:
+    return make_mpc(Size(horizon, 4, 2), dense=False), transitions(4, 2, 256).s
+
+
+PROBLEMS: dict[str, tuple[QPMPC, Tensor]] = {
+    "bounded LQRs, u_max = 1e4": bounded_lqr(1e4),
+    "bounded LQRs, u_max = 1": bounded_lqr(1.0),
+    "banded C, N = 10": point_mass(10),
+    "banded C, N = 40": point_mass(40),
+}
+
+
+def measured(mpc: QPMPC, states: Tensor) -> list[float]:
+    """Return the CPU seconds of a solution, a value's and a policy's gradient in theta."""
+
+    def gradient(function: Callable[[Tensor], Tensor]) -> None:
+        mpc.zero_grad()
+        function(states).sum().backward()
+
+    contenders: tuple[Callable[[], object], ...] = (
+        torch.no_grad()(lambda: mpc.policy(states)),
+        lambda: gradient(mpc.value),
+        lambda: gradient(mpc.policy),
+    )
+    seconds = np.empty((ROUNDS + WARM_UP, len(contenders)))
+    for i in range(len(seconds)):
+        for k, run in enumerate(contenders):
+            nudge(mpc)
+            began = time.process_time()
+            run()
+            seconds[i, k] = time.process_time() - began
+    return np.median(seconds[WARM_UP:], axis=0).tolist()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.policy", description=__doc__)
+    parser.add_argument("--write", action="store_true", help="write the table into the docs")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    rows = []
+    for name, (mpc, states) in PROBLEMS.items():
+        solution, value, policy = measured(mpc, states)
+        times = [f"{1e3 * seconds:.3g}" for seconds in (solution, value, policy)]
+        rows.append(
+            [name, str(len(states)), *times, *(f"{policy / x:.2g}" for x in (solution, value))]
+        )
+        print(" | ".join(rows[-1]), flush=True)
+    if options.write:
+        text = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(replaced(text, table(["", *TITLES], rows), "policy"), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
