@@ -13,7 +13,7 @@ from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.evaluation import Evaluation, rival_costs
 from torch_qpmpc.experiment.heating import REGULARISATION, known_model
 from torch_qpmpc.experiment.rivals.heating import house_mpc
-from torch_qpmpc.experiment.tasks import house_mpc as make_task_mpc
+from torch_qpmpc.experiment.tasks import make_mpc as make_task_mpc
 from torch_qpmpc.experiment.tasks import make_physics, make_true_mpc
 from torch_qpmpc.experiment.tasks.house_wall import best_lags
 

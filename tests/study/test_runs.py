@@ -11,7 +11,7 @@ from tests.problems import normal
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.analysis.report import canonical
-from torch_qpmpc.analysis.structure import Model
+from torch_qpmpc.analysis.structure import NearestModel
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.config import load_config
@@ -97,10 +97,10 @@ def test_the_models_error_is_that_of_one_step(study):
     assert isinstance(physics, LinearSystem)
     none = torch.zeros(4, dtype=torch.float64)
     A, B, E = physics.A, physics.B, torch.zeros(4, 0)
-    assert prediction_error(Model(A, B, E, none, none[0]), physics) == 0
+    assert prediction_error(NearestModel(A, B, E, none, none[0]), physics) == 0
     offset = none.index_fill(0, torch.tensor([2]), 0.3)
-    assert prediction_error(Model(A, B, E, offset, none[0]), physics) == pytest.approx(0.3)
-    spread = prediction_error(Model(A - torch.eye(4), B, E, none, none[0]), physics)
+    assert prediction_error(NearestModel(A, B, E, offset, none[0]), physics) == pytest.approx(0.3)
+    spread = prediction_error(NearestModel(A - torch.eye(4), B, E, none, none[0]), physics)
     assert spread == pytest.approx(math.sqrt(2 * (1.5**2 + 0.5**2) / 3), rel=0.05)
 
 
