@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from torch_qpmpc.learning.operators import QPActorValueOperator
     from torch_qpmpc.learning.q_learning import QPQLearningLoss
     from torch_qpmpc.learning.theta_network import ThetaNetwork
+    from torch_qpmpc.study.runs import load_run
 
 __all__ = [
     "QPMPC",
@@ -51,6 +52,7 @@ __all__ = [
     "SystemIdentificationPenalty",
     "ThetaNetwork",
     "identify",
+    "load_run",
     "solve_qp",
 ]
 
@@ -65,6 +67,7 @@ if not TYPE_CHECKING:
         "QPActorValueOperator": "torch_qpmpc.learning.operators:QPActorValueOperator",
         "QPQLearningLoss": "torch_qpmpc.learning.q_learning:QPQLearningLoss",
         "ThetaNetwork": "torch_qpmpc.learning.theta_network:ThetaNetwork",
+        "load_run": "torch_qpmpc.study.runs:load_run",
     }
 
     def __getattr__(name: str) -> Any:

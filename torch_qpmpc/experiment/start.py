@@ -13,9 +13,10 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.checkpoint import load_checkpoint, write_whole
+from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
+from torch_qpmpc.files import write_whole
 
 #: The log in a run's folder.
 LOG = "log.pt"
