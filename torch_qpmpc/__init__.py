@@ -12,6 +12,7 @@ from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.log import Log, read_log
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import Scheme
@@ -39,6 +40,7 @@ __all__ = [
     "GaussNewton",
     "Identified",
     "Layout",
+    "Log",
     "Model",
     "QPActorValueOperator",
     "QPError",
@@ -53,6 +55,7 @@ __all__ = [
     "ThetaNetwork",
     "identify",
     "load_run",
+    "read_log",
     "solve_qp",
 ]
 

@@ -235,7 +235,7 @@ class QPMPC(nn.Module):
         horizon: int,
         *,
         past: int = 1,
-        n_d: int = 0,
+        n_d: int | None = None,
         n_x: int | None = None,
         structure: str = "free",
         causal: bool = True,
