@@ -83,14 +83,26 @@ if not TYPE_CHECKING:
         return sorted(globals().keys() | _LAZY)
 
 
-for _name, _module, _steps in (
-    ("PointMass", "point_mass", 50),
-    ("GrosZanonLTI", "gros_zanon", 5000),
-):
+#: Entry point, length of an episode and other arguments of each environment.
+_ENVIRONMENTS: dict[str, tuple[str, int, dict[str, Any]]] = {
+    "PointMass": ("point_mass:PointMassGymEnv", 50, {}),
+    "GrosZanonLTI": ("gros_zanon:GrosZanonLTIGymEnv", 5000, {}),
+    **{
+        name: ("plant_gym:PlantGymEnv", steps, {"plant": name, "max_steps": steps})
+        for name, steps in (
+            ("House", 96),
+            ("HouseWall", 192),
+            ("FourTanks", 250),
+            ("TankReferences", 100),
+        )
+    },
+}
+for _name, (_entry, _steps, _kwargs) in _ENVIRONMENTS.items():
     # Registering an id twice warns, and a reload or a spawned worker imports this again.
     if f"torch_qpmpc/{_name}-v0" not in gymnasium.registry:
         gymnasium.register(
             id=f"torch_qpmpc/{_name}-v0",
-            entry_point=f"torch_qpmpc.envs.{_module}:{_name}GymEnv",
+            entry_point=f"torch_qpmpc.envs.{_entry}",
             max_episode_steps=_steps,
+            kwargs=_kwargs,
         )

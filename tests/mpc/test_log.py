@@ -11,19 +11,10 @@ from tensordict import TensorDict
 from torch.testing import assert_close
 
 import torch_qpmpc as qm
-from tests.logs import arx_log
+from tests.logs import arx_log, room
 from torch_qpmpc import QPError
 
 NAMES: Any = {"outputs": ["T"], "inputs": ["q"], "known": ["T_out"]}
-
-
-def room(steps: int = 60, seed: int = 0) -> pd.DataFrame:
-    """Simulate T+ = 0.9 T + 0.5 q + 0.1 T_out, one row every 15 minutes."""
-    rng = np.random.default_rng(seed)
-    T, q, T_out = np.zeros(steps), rng.uniform(0, 1, steps), rng.normal(8, 2, steps)
-    for k in range(steps - 1):
-        T[k + 1] = 0.9 * T[k] + 0.5 * q[k] + 0.1 * T_out[k]
-    return pd.DataFrame({"t": 0.25 * np.arange(steps), "T": T, "q": q, "T_out": T_out})
 
 
 def lengths(log: qm.Log) -> list[int]:
@@ -119,7 +110,9 @@ def test_gaps_marks_and_missing_numbers_end_trajectories():
     log = qm.read_log(frame, **NAMES, time="t", episode="run")
     assert lengths(log) == [9, 9, 18, 10, 6]
     assert log.notes == ("60 rows: 1 gap, 5 trajectories, 5.0% of rows dropped",)
-    assert_close(log.trajectories[1].y[:, 0], torch.as_tensor(frame["T"][10:20].to_numpy(float)))
+    assert_close(
+        log.trajectories[1].y[:, 0], torch.as_tensor(np.array(frame["T"][10:20], dtype=float))
+    )
 
 
 def test_jitter_is_no_gap_and_a_step_back_is_one():
@@ -136,7 +129,7 @@ def test_jitter_is_no_gap_and_a_step_back_is_one():
 def test_constant_and_collinear_columns_are_named():
     frame = room().assign(valve=3.0)
     frame["F"] = 1.8 * frame["T"] + 32 + 0.5 * frame["q"]
-    names = {"outputs": ["T"], "inputs": ["q", "valve"], "known": ["T_out", "F"]}
+    names: Any = {"outputs": ["T"], "inputs": ["q", "valve"], "known": ["T_out", "F"]}
     message = "In this log, valve is constant at 3; F is a linear function of T, q."
     with pytest.warns(UserWarning, match=message):
         log = qm.read_log(frame, **names)
