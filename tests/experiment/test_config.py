@@ -65,7 +65,7 @@ class Recorder:
 
     def __getattr__(self, name: str) -> Any:
         key, value = f"{self._prefix}{name}", self._cfg[name]
-        if isinstance(value, DictConfig):
+        if isinstance(value, DictConfig) and key not in KEYS:
             return Recorder(value, self._seen, f"{key}.")
         self._seen.add(key)
         return value

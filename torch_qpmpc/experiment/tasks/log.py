@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from pydantic import Field
 from torch import Tensor
 
@@ -68,12 +68,13 @@ def read(cfg: DictConfig) -> Log:
     Raises:
         QPError: there is no file, or as in `read_log`.
     """
-    task: Any = OmegaConf.to_container(OmegaConf.create(cfg.task))
-    if task["file"] is None:
+    task = cfg.task
+    if task.get("file") is None:
         remedy = "python train.py task=log task.file=FILE 'task.outputs=[..]' 'task.inputs=[..]' .."
         raise QPError.expected("task.file", "null", "the path of a CSV file, as in", remedy)
-    names = ("outputs", "inputs", "known", "time", "episode")
-    return read_log(Path(task["file"]), **{name: task[name] for name in names})
+    columns = (task[name] for name in ("outputs", "inputs", "known"))
+    names = (None if x is None else list(x) for x in columns)
+    return read_log(Path(task.file), *names, time=task.time, episode=task.episode)
 
 
 def make_plant(cfg: DictConfig) -> ARXPlant:
