@@ -25,7 +25,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import read_metrics, read_summary
 from torch_qpmpc.experiment.stored_qp import learned_qp, start_qp
-from torch_qpmpc.experiment.tasks import AnyPlant, has_run, make_physics, make_true_mpc
+from torch_qpmpc.experiment.tasks import AnyPlant, find_task, has_run, make_physics, make_true_mpc
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -68,8 +68,9 @@ class FinishedRun:
 
     @property
     def has_plant(self) -> bool:
-        """False if the plant takes code that the configuration names, which is not run."""
-        return has_run(self.cfg.task)
+        """False if the plant takes code that the configuration names, or a log that is not here."""
+        task = self.cfg.task
+        return has_run(task) and (find_task(task).log is None or Path(task.file).exists())
 
     @cached_property
     def physics(self) -> AnyPlant:
