@@ -78,7 +78,7 @@ def _train(
 
     # The learner: Q-learning of first or second order, or actor-critic.
     operator = make_operator(cfg, mpc)
-    released = state is not None and state["structure"] != mpc.structure
+    released = state is not None and state["arguments"]["structure"] != mpc.structure
     if released:
         mpc.release()
     learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)

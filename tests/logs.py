@@ -1,7 +1,11 @@
-"""Logged trajectories of an ARX plant with two lags, two outputs, an action and a known signal."""
+"""Logs of an ARX plant with two lags, and of a room as a table."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -39,3 +43,27 @@ def arx_log(
         "next": {"observation": y[:, 1:].clone(), "done": done},
     }
     return TensorDict(entries, [episodes, steps])
+
+
+def room(steps: int = 60, seed: int = 0) -> pd.DataFrame:
+    """Simulate T+ = 0.9 T + 0.5 q + 0.1 T_out, one row every 15 minutes."""
+    rng = np.random.default_rng(seed)
+    T, q, T_out = np.zeros(steps), rng.uniform(0, 1, steps), rng.normal(8, 2, steps)
+    for k in range(steps - 1):
+        T[k + 1] = 0.9 * T[k] + 0.5 * q[k] + 0.1 * T_out[k]
+    return pd.DataFrame({"t": 0.25 * np.arange(steps), "T": T, "q": q, "T_out": T_out})
+
+
+def log_overrides(folder: Path, steps: int = 200) -> tuple[str, ...]:
+    """Write a room's log to ``folder``, and return the overrides of train.py that learn from it."""
+    file = folder / "room.csv"
+    rows = room(steps).assign(
+        price=0.1 * np.sin(np.arange(steps)), target=8.0 + np.arange(steps) // 50 % 2
+    )
+    rows.loc[steps // 2 :, "target"] = 9.0
+    noise = 0.05 * np.random.default_rng(1).normal(size=steps)
+    rows.assign(T=rows["T"] + noise).rename(columns={"T": "T [degC]"}).to_csv(file, index=False)
+    names = ("task.outputs=[T]", "task.inputs=[q]", "task.known=[T_out,price,target]")
+    cost = ("task.Q={T: 1}", "task.r={T: target}", "task.R={q: 0.1}", "task.linear={q: price}")
+    bounds = ("task.y_bounds={T: [5, 12]}", "task.u_bounds={q: [-1, 3]}")
+    return ("task=log", f"task.file={file}", *names, "task.time=t", *cost, *bounds)

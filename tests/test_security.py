@@ -14,6 +14,7 @@ import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -22,13 +23,14 @@ from omegaconf import DictConfig, OmegaConf
 import train
 from tests.runs import SMALL, make_config, run_command
 from torch_qpmpc import QPMPC, QPError
-from torch_qpmpc.experiment.checkpoint import load_checkpoint, write_whole
+from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.config import load_config, settings
 from torch_qpmpc.experiment.links import check_links
 from torch_qpmpc.experiment.lock import LOCK, locked
 from torch_qpmpc.experiment.start import read_log
 from torch_qpmpc.experiment.tasks import TASKS, make_mpc
 from torch_qpmpc.export.__main__ import main as export
+from torch_qpmpc.files import labelled, save_file, write_whole
 from torch_qpmpc.study.report import main as report
 from torch_qpmpc.study.runs import FinishedRun
 
@@ -202,10 +204,10 @@ def test_an_own_task_is_exported_and_reported_without_its_code(tmp_path, monkeyp
     run = FinishedRun(tmp_path / "runs" / "mpc")
     assert not run.has_plant
     assert run.true is None
-    assert (run.start.structure, run.learned.structure) == (start.structure, "free")
+    assert (run.start.structure, run.policy.structure) == (start.structure, "free")
     assert torch.equal(run.start.C, start.C)
     p = torch.ones(1, 2, dtype=torch.float64)
-    torch.testing.assert_close(run.learned.policy(p), known.learned.policy(p))
+    torch.testing.assert_close(run.policy.policy(p), known.policy.policy(p))
     message = "^task.file: got '.*mine.py', which has not run, expected a script that has registere"
     with pytest.raises(QPError, match=message):
         _ = run.physics
@@ -217,8 +219,8 @@ def test_an_own_task_is_exported_and_reported_without_its_code(tmp_path, monkeyp
 
 
 def test_a_policy_that_is_no_qp_is_not_exported(folder):
-    torch.save({"policy": {}}, folder / "best.pt")
-    message = r"^best.pt: got .*best.pt \(it has no arguments\), expected the policy of this run as"
+    save_file(folder / "best.pt", "network", {"policy": {}})
+    message = r"^path: got .*best.pt, a saved network, expected a file that QPMPC.save wrote"
     with pytest.raises(SystemExit, match=message):
         export([str(folder)])
 
@@ -241,13 +243,17 @@ class Payload:
         return open, (str(self.mark), "w")
 
 
-@pytest.mark.parametrize("name", ["checkpoint.pt", "best.pt", "log.pt"])
+@pytest.mark.parametrize("name", ["checkpoint.pt", "best.pt", "log.pt", "mine.qpmpc"])
 def test_pickles_run_no_code(folder, mark, name):
-    torch.save({"action": torch.zeros(3, 1), "mpc": Payload(mark)}, folder / name)
-    read = {"checkpoint.pt": resume, "best.pt": COMMANDS["export"]}.get(
-        name, lambda folder: read_log(folder / name)
-    )
-    match = rf"^checkpoint: got .*{name}, which cannot be read \(UnpicklingError\)"
+    content = {"action": torch.zeros(3, 1), "mpc": Payload(mark)}
+    torch.save(labelled("QPMPC", content), folder / name)
+    read: Callable[[Path], Any] = {
+        "checkpoint.pt": resume,
+        "best.pt": COMMANDS["export"],
+        "log.pt": lambda folder: read_log(folder / name),
+        "mine.qpmpc": lambda folder: QPMPC.load(folder / name),
+    }[name]
+    match = rf"^(path|checkpoint): got .*{name}, which cannot be read \(UnpicklingError\)"
     with pytest.raises((QPError, SystemExit), match=match):
         read(folder)
     assert not mark.exists()
@@ -341,9 +347,10 @@ def test_links_that_stay_inside_are_allowed(tmp_path):
 def test_single_writes_do_not_follow_links(tmp_path):
     outside = tmp_path / "outside"
     outside.write_text("mine")
-    for name in ("file", "file.partial", "policy.c", "policy.h", LOCK):
+    for name in ("file", "file.partial", "policy.c", "policy.h", "mine.qpmpc", LOCK):
         (tmp_path / name).symlink_to(outside)
     write_whole(tmp_path / "file", b"ours")
+    QPMPC(1, 1, 2).save(tmp_path / "mine.qpmpc")
     QPMPC(1, 1, 2, stage_weight=[1.0, 1.0]).export_c(tmp_path)
     with pytest.raises(OSError, match="symbolic links"), locked(tmp_path):
         pass

@@ -12,6 +12,7 @@ from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.log import Log, read_log
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import Scheme
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from torch_qpmpc.learning.operators import QPActorValueOperator
     from torch_qpmpc.learning.q_learning import QPQLearningLoss
     from torch_qpmpc.learning.theta_network import ThetaNetwork
+    from torch_qpmpc.study.runs import load_run
 
 __all__ = [
     "QPMPC",
@@ -38,6 +40,7 @@ __all__ = [
     "GaussNewton",
     "Identified",
     "Layout",
+    "Log",
     "Model",
     "QPActorValueOperator",
     "QPError",
@@ -51,6 +54,8 @@ __all__ = [
     "SystemIdentificationPenalty",
     "ThetaNetwork",
     "identify",
+    "load_run",
+    "read_log",
     "solve_qp",
 ]
 
@@ -65,6 +70,7 @@ if not TYPE_CHECKING:
         "QPActorValueOperator": "torch_qpmpc.learning.operators:QPActorValueOperator",
         "QPQLearningLoss": "torch_qpmpc.learning.q_learning:QPQLearningLoss",
         "ThetaNetwork": "torch_qpmpc.learning.theta_network:ThetaNetwork",
+        "load_run": "torch_qpmpc.study.runs:load_run",
     }
 
     def __getattr__(name: str) -> Any:
@@ -77,14 +83,26 @@ if not TYPE_CHECKING:
         return sorted(globals().keys() | _LAZY)
 
 
-for _name, _module, _steps in (
-    ("PointMass", "point_mass", 50),
-    ("GrosZanonLTI", "gros_zanon", 5000),
-):
+#: Entry point, length of an episode and other arguments of each environment.
+_ENVIRONMENTS: dict[str, tuple[str, int, dict[str, Any]]] = {
+    "PointMass": ("point_mass:PointMassGymEnv", 50, {}),
+    "GrosZanonLTI": ("gros_zanon:GrosZanonLTIGymEnv", 5000, {}),
+    **{
+        name: ("plant_gym:PlantGymEnv", steps, {"plant": name, "max_steps": steps})
+        for name, steps in (
+            ("House", 96),
+            ("HouseWall", 192),
+            ("FourTanks", 250),
+            ("TankReferences", 100),
+        )
+    },
+}
+for _name, (_entry, _steps, _kwargs) in _ENVIRONMENTS.items():
     # Registering an id twice warns, and a reload or a spawned worker imports this again.
     if f"torch_qpmpc/{_name}-v0" not in gymnasium.registry:
         gymnasium.register(
             id=f"torch_qpmpc/{_name}-v0",
-            entry_point=f"torch_qpmpc.envs.{_module}:{_name}GymEnv",
+            entry_point=f"torch_qpmpc.envs.{_entry}",
             max_episode_steps=_steps,
+            kwargs=_kwargs,
         )

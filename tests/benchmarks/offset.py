@@ -71,7 +71,7 @@ def controllers(seed: int, *overrides: str) -> dict[str, tuple[QPMPC, DictConfig
     with tempfile.TemporaryDirectory() as folder:
         train.train(cfg, folder, quiet=True)
         run = FinishedRun(Path(folder))
-        start, learned, true = run.start, run.learned, run.true
+        start, learned, true = run.start, run.policy, run.true
     assert true is not None
     with torch.no_grad():
         return {

@@ -72,7 +72,7 @@ def learned(constraint: str, seed: int) -> Problem:
     with tempfile.TemporaryDirectory() as folder:
         train.train(cfg, folder, quiet=True)
         run = FinishedRun(Path(folder))
-        return linear(run.learned, PointMass(), [2.2, 2.2, 3.0, 3.0])
+        return linear(run.policy, PointMass(), [2.2, 2.2, 3.0, 3.0])
 
 
 def house() -> Problem:

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import train
 from tests.covering import covering
+from tests.logs import log_overrides
 from tests.runs import CONFIGS, SMALL, choices, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.config import (
@@ -64,7 +65,7 @@ class Recorder:
 
     def __getattr__(self, name: str) -> Any:
         key, value = f"{self._prefix}{name}", self._cfg[name]
-        if isinstance(value, DictConfig):
+        if isinstance(value, DictConfig) and key not in KEYS:
             return Recorder(value, self._seen, f"{key}.")
         self._seen.add(key)
         return value
@@ -95,6 +96,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "house_wall": ("task=house_wall", "warmup_steps=1"),
         "four_tanks": ("task=four_tanks", "start=model", "warmup_steps=1"),
         "tank_references": ("task=tank_references", "warmup_steps=1"),
+        "log": log_overrides(tmp_path),
         "data": ("start=data", "task=pendulum", "constraint=free", "start.transitions=40"),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
         "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
@@ -120,6 +122,7 @@ NOISES = {
     "gymnasium": {"none"},
     "house": {"none"},
     "house_wall": {"none"},
+    "log": {"none"},
     "pendulum": {"none"},
     "tank_references": {"none"},
 }
@@ -178,6 +181,9 @@ TASK_KEYS = {
     "task.model_error": "task=tank_references",
     "task.one_weather": "task=house",
     "task.past": "task=house_wall",
+    **dict.fromkeys(("task.outputs", "task.inputs", "task.known"), "task=log"),
+    **dict.fromkeys(("task.time", "task.episode", "task.linear"), "task=log"),
+    **dict.fromkeys(("task.Q", "task.R", "task.r", "task.y_bounds", "task.u_bounds"), "task=log"),
 }
 
 
@@ -245,6 +251,12 @@ BAD: dict[str, list[Any]] = {
     "task.A": MATRIX,
     "task.B": MATRIX,
     "task.stage_weight": MATRIX,
+    **{key: ["T", 3, [1]] for key in ("task.outputs", "task.inputs", "task.known")},
+    **{key: [3, True] for key in ("task.time", "task.episode")},
+    **{key: [1.0, {"T": -1.0}, {"T": "x"}, {"T": math.nan}] for key in ("task.Q", "task.R")},
+    "task.r": [21.0, {"T": None}, {"T": math.inf}],
+    "task.linear": ["price", {"q": 1.0}],
+    **{key: [1.0, {"T": 1.0}, {"T": [1.0]}] for key in ("task.y_bounds", "task.u_bounds")},
     "task.gamma": FRACTION,
     "task.hessian": ["dense", *NAME],
     "task.terminal_weight": ["lqr", *NAME],

@@ -45,7 +45,7 @@ def test_candidates_and_the_search_are_judged(run):
 def test_the_policy_that_is_kept_is_the_one_that_is_reported(run):
     folder, summary = run
     finished = FinishedRun(folder)
-    loop = evaluate(finished.cfg, finished.learned.policy, finished.physics)
+    loop = evaluate(finished.cfg, finished.policy.policy, finished.physics)
     assert summary["J_best"] == pytest.approx(loop.J, rel=1e-9)
     assert summary["J_best"] < summary["J_start"]
     assert read_metrics(folder)["eval/J"].iloc[-1] == summary["J_best"]

@@ -196,7 +196,7 @@ def test_the_log_is_kept_read_and_shown(tmp_path, capsys):
     assert torch.equal(log["action"], collect_log(cfg, make_physics(cfg))["action"])
     run = FinishedRun(tmp_path / "first")
     assert torch.equal(run.start.C, start_of(cfg)[2].C)
-    assert not torch.equal(run.learned.C, run.start.C)
+    assert not torch.equal(run.policy.C, run.start.C)
     cfg = make_config(*DATA, f"start.file={tmp_path / 'first' / LOG}", "seed=9")
     train.train(cfg, str(tmp_path / "second"), quiet=True)
     assert torch.equal(FinishedRun(tmp_path / "second").start.C, run.start.C)

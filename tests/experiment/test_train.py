@@ -300,7 +300,7 @@ def test_a_scheme_is_released_in_mid_training(tmp_path, monkeypatch, optimizer, 
     ((before, after),) = seen
     torch.testing.assert_close(after, before, rtol=0, atol=1e-9)
     state = load_checkpoint(tmp_path / "checkpoint.pt")
-    assert state["structure"] == "free"
+    assert state["arguments"]["structure"] == "free"
     deviation, distance = learned_C(tmp_path)
     assert np.abs(deviation[distance > 0]).max() > 0, "it has learned what an MPC scheme cannot"
 

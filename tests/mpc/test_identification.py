@@ -99,7 +99,7 @@ def test_collected_steps_of_torchrl_are_a_log():
     env = qm.envs.PointMassEnv(num_envs=4, max_steps=20, seed=0)
     log = env.rollout(50, break_when_any_done=False)
     found = qm.identify(log, 5)
-    assert len(found.data) == 12
+    assert len(found.log.trajectories) == 12
     true = env.physics.true_model()
     for part, expected in zip((found.model.A, found.model.B), true, strict=False):
         assert_close(part, expected.double(), atol=0.02, rtol=0)
@@ -125,10 +125,10 @@ def test_errors_are_those_of_data_that_the_fit_has_not_seen():
 
 def test_the_report_is_printed():
     text = str(qm.identify(arx_log(noise=0.2), N, **PAST))
-    first, head, *rows = text.splitlines()
+    signals, first, head, *rows = text.splitlines()
+    assert signals == "120 steps: outputs y1, y2; inputs u1; known d1"
     assert first.startswith("free C from 120 transitions in 3 trajectories, n_x=2, n_u=1, horizo")
-    assert "RMSE" in head
-    assert "R2" in head
+    assert head.split() == ["steps", "RMSE", "of", "y1,", "y2", "R2,", "cross-validated"]
     assert [int(row.split()[0]) for row in rows] == [1, 2, 5, 6]
     assert all(len(row.split()) == 5 for row in rows)
 
@@ -172,15 +172,15 @@ def two_equal_actions(log: TensorDict) -> TensorDict:
         ),
         (
             lambda: qm.identify(frozen_action(arx_log()), N),
-            "action: got entry 0 constant at 0.3, expected one that moves. Add a random signal",
+            "action: got u1 constant at 0.3, expected one that moves. Add a random signal",
         ),
         (
             lambda: qm.identify(feedback(arx_log()), N),
-            "action: got entry 0 a linear function of the outputs and other actions, as in feed",
+            "action: got u1 a linear function of the outputs and other actions, as in feed",
         ),
         (
             lambda: qm.identify(two_equal_actions(arx_log()), N),
-            "action: got entry 0 a linear function of the outputs and other actions, as in feed",
+            "action: got u1 a linear function of the outputs and other actions, as in feed",
         ),
         (lambda: qm.identify(arx_log(), 0), "horizon: got 0, expected a whole number >= 1"),
         (lambda: qm.identify(arx_log(), N, past=0), "past: got 0, expected a whole number >= 1"),

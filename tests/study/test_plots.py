@@ -84,7 +84,7 @@ def test_matrices_are_raw_and_canonical_beside_both_models(gaussian):
         *("canonical, fixed", "canonical, free"),
     ]
     images = [np.asarray(axes.images[0].get_array()) for axes in figure.axes if axes.get_title()]
-    learned = gaussian["run"].iloc[0].learned.C.detach().numpy()
+    learned = gaussian["run"].iloc[0].policy.C.detach().numpy()
     np.testing.assert_array_equal(images[1], learned)
     np.testing.assert_allclose(images[4], learned, atol=1e-9)
     assert np.abs(images[5] - images[2]).max() > 1e-3, "another gauge"

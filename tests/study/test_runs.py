@@ -6,6 +6,7 @@ import shutil
 import pytest
 import torch
 
+import torch_qpmpc as qm
 import train
 from tests.problems import normal
 from tests.runs import SMALL, make_config
@@ -57,7 +58,7 @@ def test_a_lock_file_that_was_left_is_ignored(study):
 def test_the_learned_qp_is_the_one_that_was_evaluated(study):
     for row in collect(study / "small").to_dict("records"):
         run = row["run"]
-        for mpc, then in ((run.start, row["J_start"]), (run.learned, row["J_best"])):
+        for mpc, then in ((run.start, row["J_start"]), (run.policy, row["J_best"])):
             now = evaluate(run.cfg, mpc.policy, run.physics).J
             assert now == pytest.approx(then, rel=1e-6)
 
@@ -75,18 +76,18 @@ def test_where_C_is_fixed_its_model_is_the_corrupted_one(study):
 
 def test_readings_do_not_depend_on_the_gauge(study):
     run = FinishedRun(study / "small" / "gaussian-free-seed1")
-    before, matrix = run.readings(), canonical(run.learned)
-    T = torch.eye(len(run.learned.C)) + 0.1 * normal(*2 * [len(run.learned.C)])
+    before, matrix = run.readings(), canonical(run.policy)
+    T = torch.eye(len(run.policy.C)) + 0.1 * normal(*2 * [len(run.policy.C)])
     with torch.no_grad():
-        run.learned.C.copy_(T @ run.learned.C)
+        run.policy.C.copy_(T @ run.policy.C)
     assert run.readings() == pytest.approx(before, rel=1e-6)
-    torch.testing.assert_close(canonical(run.learned), matrix, rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(canonical(run.policy), matrix, rtol=1e-6, atol=1e-8)
 
 
 def test_constraints_that_determine_no_states_have_no_readings(study):
     run = FinishedRun(str(study / "small" / "gaussian-free-seed1"))
     with torch.no_grad():
-        run.learned.C.zero_()
+        run.policy.C.zero_()
     readings = run.readings()
     assert math.isnan(readings["prediction_error"])
 
@@ -181,12 +182,20 @@ def test_a_learned_qp_without_its_parts_is_named(gated, tmp_path, part):
     folder = shutil.copytree(gated, tmp_path / "run")
     state = torch.load(folder / "best.pt")
     torch.save({name: x for name, x in state.items() if name != part}, folder / "best.pt")
-    wrong = rf"best\.pt: got .*/best\.pt \(it has no {part}\), expected the policy of this run as"
+    wrong = rf"best\.pt: got .*/best\.pt \(it has no {part}\), expected a file that QPMPC.save wrot"
     assert_not_exported(folder, wrong)
-    torch.save([1.0], folder / "best.pt")
-    assert_not_exported(folder, r"best\.pt: got .*/best\.pt \(list indices must be integers")
     (folder / "best.pt").unlink()
-    assert_not_exported(folder, r"checkpoint: got .*/best\.pt, which does not exist")
+    assert_not_exported(folder, r"path: got .*/best\.pt, which does not exist")
+
+
+def test_a_run_is_loaded_with_what_it_wrote(gated, tmp_path):
+    run = qm.load_run(gated)
+    s = torch.ones(3, run.policy.n_p)
+    assert torch.equal(run.policy.policy(s), qm.QPMPC.load(gated / "best.pt").policy(s))
+    assert run.summary["J_best"] == run.metrics["eval/J"].iloc[-1]
+    assert run.cfg.task.name == "point_mass"
+    with pytest.raises(QPError, match=r"^folder: got .*, without config.yaml, expected the folder"):
+        qm.load_run(tmp_path)
 
 
 def test_metrics_that_are_cut_are_named_by_the_report(gated, tmp_path):
@@ -201,8 +210,8 @@ def test_a_scheme_released_in_training_is_read(tmp_path):
     cfg = make_config(*SMALL, "constraint=mpc", "release=2")
     summary = train.train(cfg, str(tmp_path), quiet=True)
     run = FinishedRun(tmp_path)
-    assert run.learned.structure == "free"
-    now = evaluate(cfg, run.learned.policy, run.physics).J
+    assert run.policy.structure == "free"
+    now = evaluate(cfg, run.policy.policy, run.physics).J
     assert now == pytest.approx(summary["J_best"], rel=1e-6)
 
 

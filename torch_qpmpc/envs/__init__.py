@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torch_qpmpc.envs.arx_plant import ARXPlant
 from torch_qpmpc.envs.four_tanks import FourTanks
 from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIEnv, GrosZanonLTIGymEnv
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
@@ -10,10 +11,12 @@ from torch_qpmpc.envs.house_wall import HouseWall
 from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
 from torch_qpmpc.envs.past_window import PastWindow
 from torch_qpmpc.envs.plant import Plant, PlantEnv
+from torch_qpmpc.envs.plant_gym import PlantGymEnv
 from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.envs.tank_references import TankReferences
 
 __all__ = [
+    "ARXPlant",
     "FourTanks",
     "GrosZanonLTI",
     "GrosZanonLTIEnv",
@@ -27,6 +30,7 @@ __all__ = [
     "PastWindow",
     "Plant",
     "PlantEnv",
+    "PlantGymEnv",
     "PointMass",
     "PointMassEnv",
     "PointMassGymEnv",

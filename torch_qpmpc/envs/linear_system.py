@@ -187,6 +187,18 @@ class LinearSystem(ABC):
         return LinearSystemEnv(self, num_envs, max_steps, seed=seed)
 
 
+def checked_action(action: Any, space: gymnasium.Space) -> Tensor:
+    """Return ``action`` in float64; raise `QPError` unless it is finite and fits ``space``."""
+    try:
+        a = torch.as_tensor(np.asarray(action, dtype=np.float64))
+    except (TypeError, ValueError):
+        a = torch.tensor(torch.nan)
+    if a.shape != space.shape or not a.isfinite().all():
+        expected, remedy = f"finite numbers of shape {space.shape}", "Pass one action, not a batch."
+        raise QPError.expected("action", repr(action), expected, remedy)
+    return a
+
+
 class LinearSystemGymEnv(gymnasium.Env):
     """A Gymnasium environment of ``physics``, truncated by its registration, never terminated.
 
@@ -225,14 +237,7 @@ class LinearSystemGymEnv(gymnasium.Env):
             raise QPError.expected(
                 "step", "no episode", "one that has started", "Call reset() first."
             )
-        try:
-            a = torch.as_tensor(np.asarray(action, dtype=np.float64))
-        except (TypeError, ValueError):
-            a = torch.tensor(torch.nan)
-        if a.shape != self.action_space.shape or not a.isfinite().all():
-            expected = f"finite numbers of shape {self.action_space.shape}"
-            remedy = "Pass one action, not a batch."
-            raise QPError.expected("action", repr(action), expected, remedy)
+        a = checked_action(action, self.action_space)
         reward = -self.physics.cost(self._s, a).item()
         self._nu = self.physics.noise(self._nu, self.physics.draw(self.np_random, 1)[0])
         self._s = self.physics.step(self._s, a, self._nu)

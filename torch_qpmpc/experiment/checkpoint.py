@@ -6,37 +6,18 @@ import contextlib
 import io
 import os
 import shutil
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.files import read_tensors, write_whole
 
 #: The newest checkpoint of a run's folder, and the one before.
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint-previous.pt"
 #: Temporary second link to the newest checkpoint, later renamed to `PREVIOUS`.
 SECOND = "checkpoint.second"
-
-
-def write_whole(path: Path, data: bytes | memoryview) -> None:
-    """Write ``data`` to ``path`` atomically.
-
-    Raises:
-        OSError: writing failed, as on a full disk; the old file is unchanged.
-    """
-    partial = path.with_name(f"{path.name}.partial")
-    try:
-        partial.unlink(missing_ok=True)
-        with partial.open("xb") as file:  # a new file: no link is followed
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError:
-        _remove(partial)
-        raise
 
 
 def save_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
@@ -88,10 +69,7 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        with zipfile.ZipFile(path) as file:  # torch.load does not verify checksums
-            if damaged := file.testzip():
-                raise zipfile.BadZipFile(damaged)
-        return torch.load(path, map_location="cpu", weights_only=True)
+        return read_tensors(path)
     except FileNotFoundError as error:
         raise QPError.expected("checkpoint", f"{path}, which does not exist", "a file") from error
     except Exception as error:  # damaged files raise errors of any type

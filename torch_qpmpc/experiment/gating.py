@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
 from torch_qpmpc.experiment.algorithms import Learner, evaluate
-from torch_qpmpc.experiment.checkpoint import write_whole
-from torch_qpmpc.experiment.stored_qp import BEST, stored
+from torch_qpmpc.experiment.stored_qp import BEST
 from torch_qpmpc.experiment.tasks import AnyPlant
+from torch_qpmpc.files import save_file
 from torch_qpmpc.learning.gate import Gate
 from torch_qpmpc.learning.operators import in_closed_loop
 from torch_qpmpc.learning.search import available, search
@@ -136,11 +134,10 @@ class RunGate:
         """Write the policy that is kept to best.pt; without a gate, the checkpoint has it."""
         if self._gate is None:
             return
-        state, buffer = {"policy": self.kept.state_dict()}, io.BytesIO()
         if self.mpc is not None:
-            state |= stored(self.mpc)
-        torch.save(state, buffer)
-        write_whole(folder / BEST, buffer.getbuffer())
+            self.mpc.save(folder / BEST)
+        else:
+            save_file(folder / BEST, "network", {"policy": self.kept.state_dict()})
 
     def state_dict(self) -> dict[str, Any] | None:
         """Return the state of the gate; None without one."""

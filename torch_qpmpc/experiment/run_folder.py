@@ -15,10 +15,11 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.checkpoint import CHECKPOINT, write_whole
-from torch_qpmpc.experiment.config import damaged, settings
+from torch_qpmpc.experiment.checkpoint import CHECKPOINT
+from torch_qpmpc.experiment.config import settings
 from torch_qpmpc.experiment.links import check_links
 from torch_qpmpc.experiment.loggers import RunLogger
+from torch_qpmpc.files import damaged, write_whole
 
 #: Entries of summary.json that are numbers or, if they are not finite, null.
 NUMBERS = ("seed", "closed_gap", "J_start", "J_final", "J_true_model")

@@ -24,14 +24,15 @@ from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpo
 from torch_qpmpc.experiment.config import differences, load_config, settings
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.lock import ELSEWHERE
-from torch_qpmpc.experiment.stored_qp import stored
 from torch_qpmpc.experiment.tally import Tally
 from torch_qpmpc.experiment.tasks import has_run, named_code, resume_arguments
+from torch_qpmpc.files import labelled
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.state import KIND, stored
 
 #: The parts of a snapshot.
-STATE = ("config", "update", "structure", "mpc", "loss_module", "optimizer", "schedule")
+STATE = ("config", "update", "arguments", "mpc", "loss_module", "optimizer", "schedule")
 STATE += ("errors", "gate", "replay", "collector", "tally", "rng")
 #: Files that a run writes before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
@@ -56,7 +57,7 @@ def snapshot(
     return {
         "config": settings(cfg),
         "update": tally.update,
-        **stored(mpc),
+        **labelled(KIND, stored(mpc)),  # so that QPMPC.load reads a checkpoint, too
         "loss_module": learner.loss_module.state_dict(),
         "optimizer": learner.optimizer.state_dict(),
         "schedule": {"last_epoch": learner.schedule.last_epoch},

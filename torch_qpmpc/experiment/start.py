@@ -13,9 +13,10 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.checkpoint import load_checkpoint, write_whole
-from torch_qpmpc.experiment.tasks import AnyPlant
+from torch_qpmpc.experiment.checkpoint import load_checkpoint
+from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
+from torch_qpmpc.files import write_whole
 
 #: The log in a run's folder.
 LOG = "log.pt"
@@ -68,7 +69,7 @@ class Exploration(nn.Module):
 def make_start(
     cfg: DictConfig, physics: AnyPlant, folder: str | Path, written: bool, quiet: bool = True
 ) -> Start | None:
-    """Identify the start of a run from a log, and keep the log in the run's folder.
+    """Identify the start of a run from a log, and keep a log of the plant in the run's folder.
 
     Args:
         cfg: the run's configuration.
@@ -85,15 +86,18 @@ def make_start(
     """
     if cfg.start.name != "data":
         return None
-    path = Path(folder) / LOG
-    if written:
+    path, own = Path(folder) / LOG, find_task(cfg.task).log
+    log: Any
+    if own is not None:
+        log = own(cfg)
+    elif written:
         log = read_log(path)
     elif cfg.start.file is not None:
         log = read_log(Path(cfg.start.file))
     else:
         log = collect_log(cfg, physics)
     start = identified_start(cfg, physics, log)
-    if not written:
+    if own is None and not written:
         buffer = io.BytesIO()
         torch.save(log.to_dict(), buffer)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_choice, check_flag, check_number, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.log import Log, as_log
 from torch_qpmpc.mpc.predictor import (
     ARX,
     Constraints,
@@ -24,8 +25,8 @@ from torch_qpmpc.mpc.predictor import (
     prediction_errors,
     transitions,
 )
-from torch_qpmpc.mpc.trajectories import Trajectory, folds, read_trajectories
-from torch_qpmpc.mpc.validation import STRUCTURES
+from torch_qpmpc.mpc.trajectories import Trajectory, folds
+from torch_qpmpc.mpc.validation import STRUCTURES, as_tensor
 
 #: The largest number of parts of the data in cross-validation.
 PARTS = 5
@@ -48,13 +49,13 @@ class Identified:
         model: the ARX model.
         constraints: C and b.
         options: how they were fitted.
-        data: the trajectories.
+        log: the trajectories, with the names of their signals.
     """
 
     model: ARX
     constraints: Constraints
     options: Options
-    data: Sequence[Trajectory]
+    log: Log
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -68,9 +69,9 @@ class Identified:
     def errors(self) -> Tensor:
         """y_{k+1} minus its prediction, ``(starts, N, n_x)``; NaN after a trajectory's end."""
         layout, causal = self.options.layout, self.options.causal
-        total = sum(log.steps for log in self.data)
+        data, total = self.log.trajectories, self.log.steps
         count = max(min(PARTS, total // (2 * (layout.past + layout.horizon))), 2)
-        parts = folds(self.data, count)
+        parts = folds(data, count)
         errors = [torch.full((1, layout.horizon, layout.n_x), torch.nan, dtype=torch.float64)]
         for i, part in enumerate(parts):
             others = [log for j, other in enumerate(parts) if j != i for log in other]
@@ -87,7 +88,7 @@ class Identified:
     @property
     def R2(self) -> Tensor:
         """The share of each output's variance that is predicted 1, .., N steps ahead."""
-        outputs = torch.cat([log.y for log in self.data])
+        outputs = torch.cat([log.y for log in self.log.trajectories])
         return 1 - (self.rmse / outputs.std(0, correction=0)).square()
 
     @property
@@ -97,13 +98,45 @@ class Identified:
         e = e[e.isfinite().all(-1)]
         return e.mT @ e / len(e)
 
+    def simulate(self, u: Any, y: Any, d: Any = None) -> Tensor:
+        """Return the outputs of the ARX model alone, without corrections by measurements.
+
+        Args:
+            u: actions ``(T, n_u)``, of which the first L - 1 belong to the window.
+            y: the outputs of the window, the first L, ``(L, n_x)``.
+            d: known signals ``(T, n_d)``, if the model has any.
+
+        Returns:
+            y_0, .., y_T, ``(T + 1, n_x)``, of which the first L are ``y``.
+
+        Raises:
+            QPError: a shape does not match the model.
+        """
+        layout = self.options.layout
+        past, n_d = layout.past, layout.n_d
+        u, y = as_tensor("u", u), as_tensor("y", y)
+        steps = len(u) if u.ndim else 0
+        d = u.new_zeros(steps, 0) if d is None else as_tensor("d", d)
+        sizes = {"u": (steps, layout.n_u), "y": (past, layout.n_x), "d": (steps, n_d)}
+        for (name, shape), value in zip(sizes.items(), (u, y, d), strict=True):
+            if tuple(value.shape) != shape:
+                raise QPError.expected(name, f"shape {tuple(value.shape)}", f"{shape}")
+        A, B, E, offset = self.model
+        outputs = list(y)
+        for k in range(past - 1, steps):
+            lags = range(k, k - past, -1)
+            now = A @ torch.cat([outputs[i] for i in lags]) + B @ torch.cat([u[i] for i in lags])
+            outputs.append(now + E @ d[k] + offset)
+        return torch.stack(outputs)
+
     def __str__(self) -> str:
-        layout, N = self.options.layout, self.options.layout.horizon
-        total = sum(log.steps for log in self.data)
+        layout, N, log = self.options.layout, self.options.layout.horizon, self.log
         lines = [
-            f"{self.options.structure} C from {total} transitions in {len(self.data)} trajectories,"
-            f" {', '.join(f'{name}={getattr(layout, name)}' for name in SIZES)}",
-            f"{'steps':>6}  {'RMSE of each output, cross-validated':38}R2",
+            str(log),
+            f"{self.options.structure} C from {log.steps} transitions in {len(log.trajectories)} "
+            f"trajectories, {', '.join(f'{name}={getattr(layout, name)}' for name in SIZES)}",
+            f"{'steps':>6}  {'RMSE of ' + ', '.join(map(log.label, log.outputs)):38}R2,"
+            " cross-validated",
         ]
         for k in sorted({k for k in (1, 2, 5, 10, 20, 50, 100) if k < N} | {N}):
             errors = " ".join(f"{x:.3g}" for x in self.rmse[k - 1].tolist())
@@ -116,7 +149,7 @@ def identify(
     horizon: int,
     *,
     past: int = 1,
-    n_d: int = 0,
+    n_d: int | None = None,
     n_x: int | None = None,
     structure: str = "free",
     causal: bool = True,
@@ -125,13 +158,15 @@ def identify(
     """Fit C and b to logged trajectories; see `torch_qpmpc.mpc.predictor`.
 
     Args:
-        trajectories: logged steps, ``(T,)`` or ``(episodes, T)``, with ``observation``, ``action``
-            (as applied) and ``("next", "observation")``. Done flags, the ids of trajectories and
+        trajectories: a `Log`, or what `read_log` takes; or logged steps, ``(T,)`` or ``(episodes,
+            T)``, in a TensorDict with ``observation``, ``action`` (as applied) and ``("next",
+            "observation")``. Done flags, the ids of trajectories and
             gaps in ``time`` or ``step_count`` are respected. A list or lazy stack of logs may have
             different lengths.
         horizon: N.
         past: L, the number of lags.
-        n_d: entries of d_k, the first of the entry ``preview``.
+        n_d: entries of d_k: by default the known signals of a `Log`, and 0 in a TensorDict, where
+            they are the first of the entry ``preview``.
         n_x: the number of outputs, the last entries of ``observation``, which may be a window; all
             of them by default.
         structure: ``"tied"``: an ARX model. ``"varying"``: one for each stage, fitted to the
@@ -146,14 +181,11 @@ def identify(
             actions do not move enough to show their effect.
 
     Example:
-        >>> import torch, torch_qpmpc as qm
-        >>> from tensordict import TensorDict
-        >>> u = 2 * torch.rand(50, 1, generator=torch.Generator().manual_seed(0)) - 1
-        >>> y = torch.zeros(51, 1)
+        >>> import numpy as np, torch_qpmpc as qm
+        >>> u, y = np.random.default_rng(0).uniform(-1, 1, 50), np.zeros(51)
         >>> for t in range(50):
         ...     y[t + 1] = 0.9 * y[t] + 0.5 * u[t]
-        >>> log = {"observation": y[:-1], "action": u, "next": {"observation": y[1:]}}
-        >>> found = qm.identify(TensorDict(log, [50]), horizon=4)
+        >>> found = qm.identify({"y": y, "u": u}, horizon=4)
         >>> [round(part.item(), 4) for part in found.model[:2]]
         [0.9, 0.5]
     """
@@ -163,25 +195,25 @@ def identify(
     check_flag("causal", causal)
     if ridge is not None:
         check_number("ridge", ridge, lambda x: 0 <= x < torch.inf, "a finite number >= 0, or None")
-    data = read_trajectories(trajectories, n_x, n_d)
-    layout = Layout(data[0].y.shape[-1], data[0].u.shape[-1], int(horizon), int(past), int(n_d))
-    check_excitation(data, layout)
+    log = as_log(trajectories, n_x, n_d)
+    sizes = len(log.outputs), len(log.inputs), int(horizon), int(past), len(log.known)
+    layout = Layout(*sizes)
+    check_excitation(log, layout)
     options = Options(layout, structure, causal, ridge)
-    return Identified(*fit(data, options), options, data)
+    return Identified(*fit(log.trajectories, options), options, log)
 
 
-def check_excitation(trajectories: Sequence[Trajectory], layout: Layout) -> None:
+def check_excitation(log: Log, layout: Layout) -> None:
     """Raise `QPError` unless the data determine an ARX model.
 
     There must be more transitions than coefficients, and each action must move in a way that the
     other regressors do not explain.
     """
     past, n_x, n_u, n_d = layout.past, layout.n_x, layout.n_u, layout.n_d
-    needed = _needed(layout)
+    needed, trajectories = _needed(layout), log.trajectories
     usable = _usable(trajectories, layout)
     if usable <= needed:
-        total = sum(log.steps for log in trajectories)
-        got = f"{total} transitions in {len(trajectories)} trajectories"
+        got = f"{log.steps} transitions in {len(trajectories)} trajectories"
         if past > 1:
             got += f", {usable} of them with {past - 1} before them"
         expected = f"at least {needed + 1} such for past={past}, n_x={n_x}, n_u={n_u} and n_d={n_d}"
@@ -198,14 +230,16 @@ def check_excitation(trajectories: Sequence[Trajectory], layout: Layout) -> None
     for i in range(n_u):
         column = X.shape[1] - n_u + i
         if size[column] <= STILL * middle[column].abs():
-            got = f"entry {i} constant at {middle[column].item():.6g}"
+            got = f"{log.inputs[i]} constant at {middle[column].item():.6g}"
             raise QPError.expected("action", got, "one that moves", EXCITE)
         target = X[:, column : column + 1]
         others = X.index_fill(1, torch.tensor(column), 0.0)
         rest = target - others @ torch.linalg.lstsq(others, target, driver="gelsd").solution
         if rest.square().mean().sqrt() <= STILL:
-            got = f"entry {i} a linear function of the outputs and other actions, as in feedback"
-            raise QPError.expected("action", got, "one that moves by itself, too", EXCITE)
+            of = "a linear function of the outputs and other actions, as in feedback"
+            raise QPError.expected(
+                "action", f"{log.inputs[i]} {of}", "one that moves by itself", EXCITE
+            )
 
 
 def _needed(layout: Layout) -> int:

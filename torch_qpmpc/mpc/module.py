@@ -13,12 +13,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from torch_qpmpc.checks import check_choice, check_kind, check_tensor
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.mpc import coordinates, parameters
 from torch_qpmpc.mpc.cost import check_chosen
 from torch_qpmpc.mpc.identification import identify
@@ -27,7 +29,7 @@ from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, param
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST, check_step
 from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
 from torch_qpmpc.mpc.scheme import GAMMA, Scheme
-from torch_qpmpc.mpc.state import check_identity, digest, encoded, reduce
+from torch_qpmpc.mpc.state import KIND, check_identity, check_own, digest, encoded, reduce, stored
 from torch_qpmpc.mpc.validation import (
     CONSTRAINTS,
     COST,
@@ -233,7 +235,7 @@ class QPMPC(nn.Module):
         horizon: int,
         *,
         past: int = 1,
-        n_d: int = 0,
+        n_d: int | None = None,
         n_x: int | None = None,
         structure: str = "free",
         causal: bool = True,
@@ -341,6 +343,31 @@ class QPMPC(nn.Module):
         ``warm_start``, ``qp`` and errors are as in `solve`.
         """
         return self._action(self.solve(s, warm_start=warm_start, qp=qp), s.dtype)
+
+    @torch.no_grad()
+    def predict(self, observation: Any) -> np.ndarray:
+        """Return pi(observation) as an array, without gradients: the action to apply.
+
+        Args:
+            observation: s or p, an array ``(n_p,)`` or ``(*batch, n_p)``.
+
+        Returns:
+            The actions, ``(n_u,)`` or ``(*batch, n_u)``, in the observation's float dtype.
+
+        Raises:
+            QPError: the observation has another shape.
+            SolverError: a QP has no certified solution, whatever ``on_failure`` is.
+
+        Example:
+            >>> import numpy as np, torch_qpmpc as qm
+            >>> mpc = qm.QPMPC.from_model([[1.0]], [[1.0]], 3, stage_weight=[1.0, 0.1])
+            >>> mpc.predict(np.ones((4, 1))).shape
+            (4, 1)
+        """
+        s = torch.as_tensor(np.asarray(observation))
+        s = (s if s.is_floating_point() else s.double()).to(self.C_0.device)
+        s = check_tensor("observation", s, self.n_p)
+        return self._action(self._solve(s, None, on_failure="raise"), s.dtype).cpu().numpy()
 
     def forward(
         self, s: Tensor, a: Tensor | None = None, qp: QuadraticProgram | None = None
@@ -503,6 +530,46 @@ class QPMPC(nn.Module):
         """
         return coordinates.coordinates(self)
 
+    def save(self, path: str | Path) -> None:
+        """Write this QPMPC to a file of tensors and plain values, which runs no code.
+
+        Its `arguments` and its state_dict are written atomically, to ``path``; a symbolic link
+        there is replaced. Later releases read the file.
+
+        Raises:
+            QPError: a part has a parametrization that is not QPMPC's own.
+            OSError: writing failed; the old file is unchanged.
+        """
+        check_own("save", self, self._parametrizations_for)
+        save_file(path, KIND, stored(self))
+
+    @classmethod
+    def load(cls, path: str | Path) -> QPMPC:
+        """Return the QPMPC that `save` wrote to ``path``, on the CPU, with all of theta.
+
+        ``best.pt`` of a run's folder is such a file, if the policy is a QP.
+
+        Raises:
+            QPError: the file is missing or damaged, of another program or a newer release, or holds
+                more than tensors and plain values.
+
+        Example:
+            >>> import tempfile, torch_qpmpc as qm
+            >>> mpc = qm.QPMPC.from_model([[1.0]], [[1.0]], 3, stage_weight=[1.0, 0.1])
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     mpc.save(f"{folder}/mine.qpmpc")
+            ...     twin = qm.QPMPC.load(f"{folder}/mine.qpmpc")
+            >>> twin.predict([1.0]) == mpc.predict([1.0])
+            array([ True])
+        """
+        content = load_file(path, KIND)
+        try:
+            mpc = cls(**content["arguments"])
+            mpc.load_state_dict(content["mpc"])
+        except Exception as error:  # damaged files raise errors of any type
+            raise damaged(Path(path), error, "a file that QPMPC.save wrote") from error
+        return mpc
+
     def export_c(
         self,
         folder: str | Path,
@@ -585,16 +652,13 @@ class QPMPC(nn.Module):
     def arguments(self) -> dict[str, Any]:
         """The constructor's arguments as tensors and plain values.
 
-        With the state_dict they are all of a QPMPC, in a file that runs no code.
+        With the state_dict they are all of a QPMPC, which `save` writes.
 
         Example:
-            >>> import io, torch, torch_qpmpc as qm
-            >>> mpc, file = qm.QPMPC(2, 1, 3, stage_weight=[1.0, 1.0, 0.1]), io.BytesIO()
-            >>> torch.save({"arguments": mpc.arguments, "state": mpc.state_dict()}, file)
-            >>> _ = file.seek(0)
-            >>> saved = torch.load(file, weights_only=True)
-            >>> twin = qm.QPMPC(**saved["arguments"])
-            >>> twin.load_state_dict(saved["state"])
+            >>> import torch_qpmpc as qm
+            >>> mpc = qm.QPMPC(2, 1, 3, stage_weight=[1.0, 1.0, 0.1])
+            >>> twin = qm.QPMPC(**mpc.arguments)
+            >>> twin.load_state_dict(mpc.state_dict())
             <All keys matched successfully>
         """
         return self.scheme.arguments | self._options()
@@ -688,11 +752,12 @@ class QPMPC(nn.Module):
         fixed: Tensor,
         qp: QuadraticProgram | None,
         warm_start: QPSolution | Tensor | None = None,
+        on_failure: str | None = None,
     ) -> QPSolution:
         qp = self._current_qp(qp)
         n_kept = self.n_p + self.n_u  # V, Q and the policy share one elimination
         fixed = to_dtype(fixed, qp.C.dtype)
-        return solve(qp, fixed, n_kept, self.solver, self.on_failure, warm_start)
+        return solve(qp, fixed, n_kept, self.solver, on_failure or self.on_failure, warm_start)
 
     def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:
         """Return u_0 of a solution of V's QP, and tell of a random start the first time."""

@@ -50,16 +50,20 @@ def scheme_cost(fitted: StageCost, layout: Layout, gamma: float, hessian: str) -
 
 def _observed(steps: Any, layout: Layout) -> tuple[Tensor, Tensor]:
     """Return [d; y; u] and the costs of the steps that are not padding."""
+    reward = steps.get(("next", "reward"), None) if hasattr(steps, "batch_size") else None
+    if reward is None:
+        raise _unfitted("a log without rewards")
     kept = valid_steps(steps)
-    reward = steps.get(("next", "reward"), None)
-    if reward is not None:
-        reward = reward.detach().cpu().reshape(steps.shape)[kept].double()
-    if reward is None or not reward.isfinite().all():
-        got = "a log without rewards" if reward is None else "a log with rewards of NaN or inf"
-        expected = "a weight, or finite rewards to fit a cost to"
-        raise QPError.expected("stage_weight", f"none, and {got}", expected, REMEDY)
+    reward = reward.detach().cpu().reshape(steps.shape)[kept].double()
+    if not reward.isfinite().all():
+        raise _unfitted("a log with rewards of NaN or inf")
     parts = [steps["observation"][..., -layout.n_x :], steps["action"]]
     if layout.n_d:
         parts.insert(0, steps["preview"][..., : layout.n_d])
     v = torch.cat([part.detach().cpu().double() for part in parts], dim=-1)
     return v[kept], -reward
+
+
+def _unfitted(got: str) -> QPError:
+    expected = "a weight, or finite rewards to fit a cost to"
+    return QPError.expected("stage_weight", f"none, and {got}", expected, REMEDY)

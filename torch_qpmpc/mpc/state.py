@@ -1,4 +1,4 @@
-"""Identity of a QPMPC in its state_dict, and pickles.
+"""Identity of a QPMPC in its state_dict, files and pickles.
 
 The identity prevents loading a state into another module. torch does not pickle parametrised
 modules, but spawned collectors need it: a pickle has the scheme and the state.
@@ -17,6 +17,9 @@ from torch.nn.utils import parametrize
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.scheme import Scheme
+
+#: The kind of file that `QPMPC.save` writes.
+KIND = "QPMPC"
 
 
 def encoded(identity: dict[str, Any]) -> Tensor:
@@ -49,6 +52,24 @@ def check_identity(state: Any, own: dict[str, Any]) -> None:
             raise QPError.expected("state_dict", got, f"this module's {value!r}", remedy)
 
 
+def check_own(what: str, module: nn.Module, expected: Callable[[str], list[nn.Module]]) -> None:
+    """Raise `QPError` if a part has other parametrizations than those ``expected``.
+
+    ``what`` is to be written: a pickle or a file.
+    """
+    for name in getattr(module, "parametrizations", ()):
+        attached = module.get_submodule(f"parametrizations.{name}").children()
+        if [type(x) for x in attached] != [type(x) for x in expected(name)]:
+            got = f"a parametrization of {name} that is not QPMPC's own"
+            remedy = "Save the state_dict, or remove_parametrizations first."
+            raise QPError.expected(what, got, "QPMPC's own", remedy)
+
+
+def stored(module: Any) -> dict[str, Any]:
+    """Return the content of a file from which `QPMPC.load` makes the QPMPC ``module``."""
+    return {"arguments": module.arguments, "mpc": module.state_dict()}
+
+
 def reduce(
     module: nn.Module,
     scheme: Scheme,
@@ -57,13 +78,8 @@ def reduce(
 ) -> tuple:
     """Return the value of ``__reduce_ex__``; ``expected`` gives a part's own parametrizations."""
     # TorchRL sends a policy to its workers on the meta device, without values to compare.
-    real = not any(part.is_meta for part in module.buffers())
-    for name in getattr(module, "parametrizations", ()) if real else ():
-        attached = module.get_submodule(f"parametrizations.{name}").children()
-        if [type(x) for x in attached] != [type(x) for x in expected(name)]:
-            got = f"a parametrization of {name} that is not QPMPC's own"
-            remedy = "Save the state_dict, or remove_parametrizations first."
-            raise QPError.expected("pickle", got, "QPMPC's own", remedy)
+    if not any(part.is_meta for part in module.buffers()):
+        check_own("pickle", module, expected)
     plain = parametrize.type_before_parametrizations(module)
     frozen = [name for name, part in module.named_parameters() if not part.requires_grad]
     # The scheme identifies the state; a child process cannot share the tensor of _extra_state.

@@ -109,7 +109,7 @@ def logs(data: Any) -> list[Any]:
     """Return the logs in a list, or in a lazy stack of logs of different lengths; else one."""
     if isinstance(data, list | tuple):
         return list(data)
-    return list(data.unbind(0)) if -1 in data.shape else [data]
+    return list(data.unbind(0)) if -1 in getattr(data, "shape", ()) else [data]
 
 
 def valid_steps(steps: Any) -> Tensor:

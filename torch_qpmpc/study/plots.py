@@ -126,7 +126,7 @@ def constraints_figure(frame: pd.DataFrame) -> Figure:
     else:
         draw_matrix(panels[1, 0], start.true.C_0, start.true, "$C_0$ of the true model")
     for column, label, run in zip(panels.T[1:], runs["label"], runs["run"], strict=True):
-        mpc = run.learned
+        mpc = run.policy
         draw_matrix(column[0], mpc.C, mpc, rf"$C_\theta$, {label}")
         draw_matrix(column[1], canonical(mpc), mpc, f"canonical, {label}")
     figure.suptitle(f"{runs['noise'].iloc[0]} noise, seed {runs['seed'].iloc[0]}")
@@ -140,13 +140,13 @@ def trajectories_figure(frame: pd.DataFrame) -> Figure:
     for axes, label, run in zip(
         figure.subplots(1, len(runs), squeeze=False)[0], runs["label"], runs["run"], strict=True
     ):
-        ends = {"start": run.start, "learned": run.learned, "true model": run.true}
+        ends = {"start": run.start, "learned": run.policy, "true model": run.true}
         loops = {
             name: evaluate(run.cfg, warm_policy(mpc), run.physics)
             for name, mpc in ends.items()
             if mpc is not None
         }
-        draw_positions(axes, loops, run.learned)
+        draw_positions(axes, loops, run.policy)
         axes.set_title(label)
     figure.suptitle(f"{runs['noise'].iloc[0]} noise, seed {runs['seed'].iloc[0]}")
     return figure
@@ -157,7 +157,7 @@ def policies_figure(frame: pd.DataFrame) -> Figure:
     runs = chosen(frame, seed=shown_seed(frame))
     first: FinishedRun = runs["run"].iloc[0]
     shown = {"start": first.start}
-    shown |= {label: run.learned for label, run in zip(runs["label"], runs["run"], strict=True)}
+    shown |= {label: run.policy for label, run in zip(runs["label"], runs["run"], strict=True)}
     if first.true is not None:
         shown["true model"] = first.true
     starts = evaluate(first.cfg, warm_policy(first.start), first.physics).known[0]

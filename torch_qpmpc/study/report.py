@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 
 from torch_qpmpc.envs.closed_loop import cost_text, gap_text
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.checkpoint import write_whole
 from torch_qpmpc.experiment.links import check_links
+from torch_qpmpc.files import write_whole
 from torch_qpmpc.study.markdown import escaped, replaced, table
 from torch_qpmpc.study.plots import (
     ablation_figure,

@@ -25,7 +25,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import read_metrics, read_summary
 from torch_qpmpc.experiment.stored_qp import learned_qp, start_qp
-from torch_qpmpc.experiment.tasks import AnyPlant, has_run, make_physics, make_true_mpc
+from torch_qpmpc.experiment.tasks import AnyPlant, find_task, has_run, make_physics, make_true_mpc
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -38,7 +38,7 @@ _UNLABELLED = ("seed", "figures", "threads", "log_interval", "eval_interval", "l
 
 
 class FinishedRun:
-    """A finished run, read from its folder.
+    """A finished run, read from its folder; `torch_qpmpc.load_run` makes one.
 
     Args:
         folder: the run's folder, with config.yaml and checkpoint.pt.
@@ -68,8 +68,9 @@ class FinishedRun:
 
     @property
     def has_plant(self) -> bool:
-        """False if the plant takes code that the configuration names, which is not run."""
-        return has_run(self.cfg.task)
+        """False if the plant takes code that the configuration names, or a log that is not here."""
+        task = self.cfg.task
+        return has_run(task) and (find_task(task).log is None or Path(task.file).exists())
 
     @cached_property
     def physics(self) -> AnyPlant:
@@ -87,9 +88,18 @@ class FinishedRun:
         return make_true_mpc(self.cfg, self.physics) if self.has_plant else None
 
     @cached_property
-    def learned(self) -> QPMPC:
-        """The learned QP, which the run has kept."""
+    def policy(self) -> QPMPC:
+        """The learned QP, which the run has kept.
+
+        Raises:
+            QPError: the run's policy is a network, or the file is missing or damaged.
+        """
         return learned_qp(self.folder)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The content of summary.json, as ``J_start`` and ``J_best``."""
+        return read_summary(self.folder)
 
     @property
     def metrics(self) -> pd.DataFrame:
@@ -108,7 +118,7 @@ class FinishedRun:
             ``prediction_error`` and ``prediction_error_start`` of the learned and the initial
             model, nan if the constraints do not determine the states or the true model is unknown.
         """
-        mpc = self.learned
+        mpc = self.policy
         above = band_distance(mpc.layout) > 0
         readings = {
             "zeros_above": (mpc.C[above] == 0).double().mean().item(),
@@ -140,6 +150,20 @@ def prediction_error(model: NearestModel, physics: LinearSystem) -> float:
     share = torch.as_tensor(rng.random((1024, physics.B.shape[1])))
     a = physics.lb_a + (physics.ub_a - physics.lb_a) * share
     return one_step_error(model, *physics.true_model(), moment=second_moment(s, a)).item()
+
+
+def load_run(folder: str | Path) -> FinishedRun:
+    """Return the run of train.py in ``folder``: its policy, summary, metrics and configuration.
+
+    No code that the folder names is run.
+
+    Raises:
+        QPError: the folder has no run.
+    """
+    if not (Path(folder) / "config.yaml").exists():
+        got = f"{folder}, without config.yaml"
+        raise QPError.expected("folder", got, "the folder of a run of train.py")
+    return FinishedRun(folder)
 
 
 def collect(folder: str | Path) -> pd.DataFrame:

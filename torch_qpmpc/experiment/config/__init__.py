@@ -15,8 +15,9 @@ from pydantic import ValidationError
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config.messages import first_error, flatten
 from torch_qpmpc.experiment.config.model import Config
+from torch_qpmpc.files import damaged
 
-__all__ = ["check_config", "damaged", "differences", "flatten", "load_config", "settings"]
+__all__ = ["check_config", "differences", "flatten", "load_config", "settings"]
 
 
 def check_config(cfg: DictConfig) -> None:
@@ -52,19 +53,6 @@ def load_config(file: Path) -> DictConfig:
             got = f"{key}={value!r} in {file}"
             raise QPError.expected("config.yaml", got, "values, as train.py writes them", remedy)
     return cfg
-
-
-def damaged(
-    file: Path,
-    error: Exception,
-    expected: str,
-    remedy: str = "Restore the file, or move the run's folder elsewhere.",
-) -> QPError:
-    """Make the error of a run's ``file`` that cannot be read."""
-    reason = " ".join(str(error).split()) or type(error).__name__
-    if isinstance(error, KeyError):
-        reason = f"it has no {error.args[0]}"
-    return QPError.expected(file.name, f"{file} ({reason})", expected, remedy)
 
 
 def settings(cfg: DictConfig) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
     gymnasium,
     house,
     house_wall,
+    log,
     point_mass,
     tank_references,
 )

@@ -55,9 +55,19 @@ def run_code(task: Mapping[str, Any]) -> None:
     """Run the script and import the modules that ``task`` names: the command line's own.
 
     Raises:
-        QPError: the script does not exist, is no Python file, or registers another task.
+        QPError: the script does not exist, is no Python file, or registers another task; or a file
+            is named beside a built-in task, which would not read it.
     """
     name, file = task.get("name"), named_code(task).get("task.file")
+    known = TASKS.get(str(name))
+    if file is None and task.get("file") is not None and known is not None and known.log is None:
+        got = f"{task['file']!r} with task={name}, which reads no file"
+        remedy = (
+            f"To learn from a log: python train.py task=log task.file={task['file']} "
+            "'task.outputs=[..]' 'task.inputs=[..]' 'task.Q={..}'. A script of your own registers "
+            "its task and calls train.main."
+        )
+        raise QPError.expected("task.file", got, "a task with a file", remedy)
     if file is not None and name not in TASKS:
         expected = f"the Python file that registers task={name}"
         if not Path(file).exists() or Path(file).suffix != ".py":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -25,7 +25,7 @@ class Start(NamedTuple):
     ``print`` shows the errors of both.
     """
 
-    log: TensorDictBase
+    log: Any
     identified: Identified
     cost: StageCost | None = None
 
@@ -33,7 +33,7 @@ class Start(NamedTuple):
         return "\n".join(str(part) for part in self[1:] if part is not None)
 
 
-def identified_start(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase) -> Start:
+def identified_start(cfg: DictConfig, physics: AnyPlant, log: Any) -> Start:
     """Identify C, b and a missing stage cost from a log of the plant; `identify` names errors."""
     layout = plant_layout(physics, cfg.task.horizon)
     identified = identify(

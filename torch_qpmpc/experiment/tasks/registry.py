@@ -32,6 +32,7 @@ from torch_qpmpc.experiment.rivals.rival import Rival
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import HESSIANS, Cost
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.log import Log
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.validation import COST
@@ -91,6 +92,8 @@ class Task:
             ``(T + 1, n_d)``.
         unit: the unit of experience in figures: its length in transitions, and its name.
         settings: the model of the keys under ``task``.
+        log: reads the log that ``start=data`` begins with; None to collect one.
+        note: a sentence on what the numbers of a run mean, which is printed at its start.
         defaults: settings of any group that differ from ``task=point_mass``; None if they are in
             configs/task/NAME.yaml.
     """
@@ -107,6 +110,8 @@ class Task:
     episode: Callable[[Any, Tensor], Mapping[str, Any]] = lambda plant, d: {}
     unit: tuple[int, str] = (1, "transitions")
     settings: type[TaskSettings] = TaskSettings
+    log: Callable[[DictConfig], Log] | None = None
+    note: str | None = None
     defaults: Mapping[str, Any] | None = field(default_factory=dict)
 
 

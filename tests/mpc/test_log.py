@@ -1,0 +1,218 @@
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+
+import torch_qpmpc as qm
+from tests.logs import arx_log, room
+from torch_qpmpc import QPError
+
+NAMES: Any = {"outputs": ["T"], "inputs": ["q"], "known": ["T_out"]}
+
+
+def lengths(log: qm.Log) -> list[int]:
+    return [part.steps for part in log.trajectories]
+
+
+def same(one: qm.Log, other: qm.Log) -> bool:
+    pairs = zip(one.trajectories, other.trajectories, strict=True)
+    return all(
+        torch.allclose(x, y, rtol=1e-14) for a, b in pairs for x, y in zip(a, b, strict=True)
+    )
+
+
+# The forms
+
+
+def test_rows_are_steps_and_the_last_one_needs_outputs_alone():
+    frame = room()
+    frame.loc[59, ["q", "T_out"]] = np.nan
+    log = qm.read_log(frame, **NAMES, time="t")
+    (part,) = log.trajectories
+    assert (part.y.shape, part.u.shape, part.d.shape) == ((60, 1), (59, 1), (59, 1))
+    assert part.y.dtype == torch.float64
+    assert part.y[:, 0].tolist() == frame["T"].tolist()
+    assert part.d[:, 0].tolist() == frame["T_out"].tolist()[:-1]
+    assert (log.outputs, log.inputs, log.known, log.dt) == (("T",), ("q",), ("T_out",), 0.25)
+    assert "0.0% of rows dropped" in str(log)
+
+
+def test_all_forms_are_the_same_log(tmp_path):
+    frame = room()
+    expected = qm.read_log(frame, **NAMES)
+    file = tmp_path / "room.csv"
+    frame.to_csv(file, index=False)
+    arrays = {name: frame[name].to_numpy() for name in frame}
+    dated = frame.set_index(pd.date_range("2024-03-01", periods=60, freq="15min"))
+    tensors = {name: torch.tensor(array) for name, array in arrays.items()}
+    for data in (file, str(file), arrays, tensors, dated):
+        assert same(qm.read_log(data, **NAMES), expected)
+    assert qm.read_log(dated, **NAMES).dt == 900
+    dates = frame.assign(t=dated.index.astype(str))
+    assert qm.read_log(dates, **NAMES, time="t").dt == 900
+    shorter = {"T": arrays["T"], "q": arrays["q"][:-1], "T_out": arrays["T_out"][:-1]}
+    assert same(qm.read_log(shorter, **NAMES), expected)
+
+
+def test_a_list_has_an_episode_in_each_part():
+    log = qm.read_log([room(20), dict(room(30, seed=1))], **NAMES, time="t")
+    assert lengths(log) == [19, 29]
+
+
+def test_arrays_and_columns_have_names_by_default():
+    rng = np.random.default_rng(0)
+    y, u = rng.normal(size=(20, 2)), rng.normal(size=(19, 1))
+    log = qm.read_log({"y": y, "u": u})
+    assert (log.outputs, log.inputs, log.known) == (("y1", "y2"), ("u",), ())
+    assert_close(log.trajectories[0].y, torch.as_tensor(y))
+    frame = pd.DataFrame({"y1": y[:, 0], "y2": y[:, 1], "u": y[:, 0], "d": y[:, 1]})
+    with pytest.warns(UserWarning, match="u is a linear function of y1; d is a linear function of"):
+        assert qm.read_log(frame).known == ("d",)
+
+
+def test_steps_of_torchrl_get_names():
+    log = qm.read_log(arx_log(), ["T", "p"], ["q"], ["w"])
+    assert str(log) == "120 steps: outputs T, p; inputs q; known w"
+    assert qm.identify(log, 4, past=2).log is log
+    with pytest.raises(QPError, match=r"^inputs: got \['q', 'v'\], expected 1 names"):
+        qm.read_log(arx_log(), ["T", "p"], ["q", "v"])
+    with pytest.raises(QPError, match=r"^time, episode: got 't' and None, expected None for a"):
+        qm.read_log(arx_log(), time="t")
+
+
+def test_units_in_headers_are_kept():
+    frame = room().rename(columns={"T": "T [degC]", "q": " q[kW]"})
+    log = qm.read_log(frame, **NAMES)
+    assert log.units == {"T": "degC", "q": "kW"}
+    assert str(log).startswith("59 steps: outputs T [degC]; inputs q [kW]; known T_out\n60 rows: ")
+    assert "RMSE of T [degC]" in str(qm.identify(log, 4))
+
+
+# Gaps, marks and missing numbers
+
+
+def test_gaps_marks_and_missing_numbers_end_trajectories():
+    frame = room()
+    frame.loc[10:, "t"] += 5.0  # between rows 9 and 10
+    frame.loc[20, "T"] = np.nan
+    frame["run"] = np.where(frame.index < 40, "a", "b")
+    frame.loc[50, "q"] = np.inf
+    frame.loc[51, "T"] = 1e200
+    frame["T"] = frame["T"].astype(object)
+    frame.loc[59, "T"] = "n/a"
+    log = qm.read_log(frame, **NAMES, time="t", episode="run")
+    assert lengths(log) == [9, 9, 18, 10, 6]
+    assert log.notes == ("60 rows: 1 gap, 5 trajectories, 5.0% of rows dropped",)
+    assert_close(
+        log.trajectories[1].y[:, 0], torch.as_tensor(np.array(frame["T"][10:20], dtype=float))
+    )
+
+
+def test_jitter_is_no_gap_and_a_step_back_is_one():
+    frame = room()
+    frame["t"] += 0.05 * np.random.default_rng(0).random(60)
+    assert lengths(qm.read_log(frame, **NAMES, time="t")) == [59]
+    frame.loc[30:, "t"] -= 10
+    assert lengths(qm.read_log(frame, **NAMES, time="t")) == [29, 29]
+
+
+# What is wrong with columns
+
+
+def test_constant_and_collinear_columns_are_named():
+    frame = room().assign(valve=3.0)
+    frame["F"] = 1.8 * frame["T"] + 32 + 0.5 * frame["q"]
+    names: Any = {"outputs": ["T"], "inputs": ["q", "valve"], "known": ["T_out", "F"]}
+    message = "In this log, valve is constant at 3; F is a linear function of T, q."
+    with pytest.warns(UserWarning, match=message):
+        log = qm.read_log(frame, **names)
+    assert log.notes[1:] == ("valve is constant at 3", "F is a linear function of T, q")
+    del names["known"]
+    with pytest.warns(UserWarning, match="valve"):
+        log = qm.read_log(frame, **names)
+    with pytest.raises(QPError, match="action: got valve constant at 3, expected one that moves"):
+        qm.identify(log, 4)
+
+
+def test_a_short_log_is_not_called_collinear():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        qm.read_log(room(4), **NAMES)
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "message"),
+    [
+        (5, {}, "data: got int, expected a CSV file, a DataFrame, a dict of arrays, a list"),
+        ([], {}, "data: got an empty list, expected a CSV file"),
+        ("none.csv", {}, r"data: got none.csv, which cannot be read \(.*No such file"),
+        ("http://a.b/c.csv", {}, r"data: got http://a.b/c.csv, which cannot be read"),
+        (room(), {"outputs": ["p"]}, "column: got 'p', which is missing, expected one of t, T, q,"),
+        (room(), {"inputs": ["T"]}, "column: got 'T' twice, expected each once"),
+        (room(), {"outputs": None}, "outputs: got none, and columns t, T, q, T_out, expected nam"),
+        (room(), {"inputs": None}, r"inputs: got none, .* Pass read_log\(.., inputs=\[..\]\)"),
+        (room(), {"time": "clock"}, "column: got 'clock', which is missing"),
+        (room(), {"episode": "run"}, "column: got 'run', which is missing"),
+        (room().assign(q="on"), {}, "column: got q, without a number"),
+        (room().assign(t="noon"), {"time": "t"}, r"time: got t \(.*\), expected numbers or dates"),
+        (room()[::-1], {"time": "t"}, "time: got steps of -0.25, expected times that increase"),
+        (room(1), {}, "data: got 1 rows, of which no two in a row are complete, expected consec"),
+        ({"T": np.zeros((2, 3, 4))}, {}, r"T: got shape \(2, 3, 4\), expected shape \(T,\) or"),
+        ({"T": np.ones(9), "q": np.ones(7)}, {}, "q: got 7 rows, expected 9 rows, as others, or 8"),
+        (
+            pd.concat([room(), room()[["T"]]], axis=1),
+            {},
+            "column: got 'T', which is there twice, expected one of",
+        ),
+    ],
+)
+def test_a_mistake_is_named(data, options, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        qm.read_log(data, **{**NAMES, **options})
+
+
+# Where logs are taken
+
+
+def test_plain_data_are_identified_and_start_a_qp():
+    frame = room()
+    plain = frame.rename(columns={"T": "y", "q": "u", "T_out": "d"})
+    found = qm.identify(plain, 4)
+    assert_close(found.model.A, torch.tensor([[0.9]]).double())
+    assert_close(found.model.E, torch.tensor([[0.1]]).double())
+    mpc = qm.QPMPC.from_data([plain, plain], 4, stage_weight=[1.0, 0.1])
+    assert mpc.n_d == 1
+    log = qm.read_log(frame, **NAMES)
+    assert torch.equal(qm.QPMPC.from_data(log, 4, stage_weight=[1.0, 0.1]).C, qm.QPMPC(
+        **qm.identify(log, 4).arguments, stage_weight=[1.0, 0.1]).C)  # fmt: skip
+    for data in (plain, log, [plain]):
+        with pytest.raises(QPError, match=r"^stage_weight: got none, and a log without rewards"):
+            qm.QPMPC.from_data(data, 4)
+    with pytest.raises(QPError, match=r"^n_d: got 2, but 1 of T_out, expected the log's own. Omit"):
+        qm.identify(log, 4, n_d=2)
+    with pytest.raises(QPError, match=r"^n_x: got 2, but 1 of T, expected the log's own"):
+        qm.identify(log, 4, n_x=2)
+
+
+def test_a_simulation_is_the_plant_without_corrections():
+    log = qm.read_log(room(), **NAMES)
+    found, (y, u, d) = qm.identify(log, 4, past=2), log.trajectories[0]
+    assert_close(found.simulate(u, y[:2], d), y)
+    assert_close(found.simulate(u[:1], y[:2], d[:1]), y[:2])
+    off = found.simulate(u, y[:2] + 1, d)
+    assert 0 < (off - y)[-1].abs() < 0.01, "it forgets its start"
+    for name, wrong in {"u": (u[:, :0], y[:2], d), "y": (u, y[:1], d), "d": (u, y[:2])}.items():
+        with pytest.raises(QPError, match=rf"^{name}: got shape \(.*\), expected \("):
+            found.simulate(*wrong)
+
+
+def test_a_tensordict_of_another_kind_is_named():
+    with pytest.raises(QPError, match=r"^trajectories: got only T, expected an entry observation"):
+        qm.read_log(TensorDict({"T": torch.zeros(3, 1)}, [3]))

@@ -1,0 +1,183 @@
+"""Save, load and predict: files that run no code, that later releases read, and arrays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.problems import normal
+from torch_qpmpc import QPMPC, QPError, SolverError, files
+
+FOLDER = Path(__file__).parent
+
+
+def small() -> QPMPC:
+    """Make a QPMPC that has learned, with a window, a preview, masks and soft and hard rows."""
+    torch.manual_seed(0)
+    mpc = QPMPC(
+        1,
+        1,
+        horizon=2,
+        past=2,
+        n_d=1,
+        A=[[0.9, -0.1]],
+        B=[[0.5, 0.1]],
+        E=[[0.2]],
+        stage_weight=[1.0, 0.1],
+        state_bounds=([-1.0], [1.0]),
+        action_bounds=([-0.5], [0.5]),
+        learn={"H": True, "c": True, "C": torch.arange(20).reshape(2, 10) % 2 == 0},
+        solver="daqp",
+        on_failure="mask",
+    )
+    optimizer = torch.optim.Adam(mpc.parameters(), lr=0.1)
+    mpc.value(torch.ones(mpc.n_p)).backward()
+    optimizer.step()
+    return mpc
+
+
+@pytest.mark.parametrize("structure", ["free", "tied", "varying"])
+@pytest.mark.parametrize("step", ["cholesky", "projection"])
+def test_the_twin_is_the_same_and_learns_on(tmp_path, structure, step):
+    mpc = QPMPC.linear_mpc(
+        [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], 3, stage_weight=[1.0, 1.0, 0.1], step=step
+    )  # fmt: skip
+    if structure != "tied":
+        mpc.release(structure)
+    with torch.no_grad():
+        for parameter in mpc.parameters():
+            parameter += 0.01
+    mpc.save(tmp_path / "mine.qpmpc")
+    twin = QPMPC.load(str(tmp_path / "mine.qpmpc"))
+    s, a = normal(5, 2), normal(5, 1)
+    assert torch.equal(twin.value(s), mpc.value(s))
+    for module in (mpc, twin):
+        module.action_value(s, a).sum().backward()
+    theirs = dict(mpc.named_parameters())
+    for name, parameter in twin.named_parameters():
+        assert_close(parameter.grad, theirs[name].grad)
+    assert (twin.structure, twin.step, twin.learned) == (structure, step, mpc.learned)
+
+
+def test_masks_solver_and_on_failure_are_kept(tmp_path):
+    mpc = small()
+    mpc.save(tmp_path / "file")
+    twin = QPMPC.load(tmp_path / "file")
+    assert (twin.solver, twin.on_failure, twin.n_p) == ("daqp", "mask", 6)
+    assert torch.equal(twin.arguments["learn"]["C"], mpc.arguments["learn"]["C"])
+
+
+def test_later_releases_read_the_first_format():
+    """``python -m tests.mpc.test_saving`` has written the file."""
+    mpc = QPMPC.load(FOLDER / "saved-1.qpmpc")
+    p = np.array([[0.0, 0.1, 0.0, -0.5, 0.1, 0.2], [0.1, 0.2, 0.3, 0.4, -0.2, 0.9]])
+    assert_close(mpc.predict(p), np.array([[-0.313663464725], [-0.5]]), rtol=0, atol=1e-9)
+    assert mpc.learned == ("H", "c", "C")
+
+
+def test_a_parametrization_of_the_users_is_refused(tmp_path):
+    mpc = QPMPC(1, 1, 2, stage_weight=[1.0, 1.0])
+    torch.nn.utils.parametrize.register_parametrization(mpc, "C", torch.nn.Identity())
+    with pytest.raises(QPError, match=r"^save: got a parametrization of C that is not QPMPC"):
+        mpc.save(tmp_path / "file")
+    assert not (tmp_path / "file").exists()
+
+
+def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
+    mpc, path = QPMPC(1, 1, 2, stage_weight=[1.0, 1.0]), tmp_path / "file"
+    mpc.save(path)
+    before = path.read_bytes()
+
+    def fail(_: int) -> None:
+        raise OSError("Input/output error")
+
+    monkeypatch.setattr(files.os, "fsync", fail)
+    with pytest.raises(OSError, match="Input/output error"):
+        mpc.save(path)
+    assert path.read_bytes() == before
+    assert [found.name for found in tmp_path.iterdir()] == ["file"]
+
+
+# Files that are not a QPMPC
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": None}, "which another program wrote, expected a file that QPMPC.save wrote"),
+        ({"kind": "network"}, "a saved network, expected a file that QPMPC.save wrote"),
+        ({"version": 2}, r"whose format has version 2, expected version 1 to 1. A newer release w"),
+        ({"version": "x"}, "whose format has version 'x', expected"),
+    ],
+)
+def test_a_file_of_another_kind_or_version_is_named(tmp_path, change, message):
+    QPMPC(1, 1, 2).save(tmp_path / "file")
+    torch.save(torch.load(tmp_path / "file") | change, tmp_path / "file")
+    with pytest.raises(QPError, match=f"^path: got .*/file, {message}"):
+        QPMPC.load(tmp_path / "file")
+
+
+def test_another_file_is_named(tmp_path):
+    torch.save([1.0], tmp_path / "list")
+    with pytest.raises(QPError, match="list, which another program wrote"):
+        QPMPC.load(tmp_path / "list")
+    (tmp_path / "text").write_text("x")
+    with pytest.raises(QPError, match=r"text, which cannot be read \(BadZipFile\), expected a fil"):
+        QPMPC.load(tmp_path / "text")
+    with pytest.raises(QPError, match="none, which does not exist, expected a file that QPMPC"):
+        QPMPC.load(tmp_path / "none")
+
+
+def test_a_file_without_a_part_is_named(tmp_path):
+    QPMPC(1, 1, 2).save(tmp_path / "file")
+    content = torch.load(tmp_path / "file")
+    del content["mpc"]["q"]
+    torch.save(content, tmp_path / "file")
+    with pytest.raises(QPError, match=r"^file: got .*/file \(Error\(s\) in loading .* Missing key"):
+        QPMPC.load(tmp_path / "file")
+
+
+# Predict
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_it_is_the_policy_as_an_array(dtype, batch):
+    mpc = QPMPC.from_model([[1.0]], [[1.0]], 3, stage_weight=[1.0, 0.1])
+    s = np.linspace(-1, 1, int(np.prod(batch))).reshape(*batch, 1).astype(dtype)
+    action = mpc.predict(s)
+    assert (type(action), action.dtype, action.shape) == (np.ndarray, dtype, (*batch, 1))
+    assert_close(action, mpc.policy(torch.as_tensor(s)).detach().numpy())
+
+
+def test_lists_and_integers_are_taken():
+    mpc = QPMPC.from_model([[1.0]], [[1.0]], 3, stage_weight=[1.0, 0.1])
+    assert mpc.predict([1]).dtype == np.float64
+    assert mpc.predict([1]) == mpc.predict(np.ones(1))
+
+
+@pytest.mark.parametrize("observation", [np.ones(3), 1.0, np.ones((2, 1))])
+def test_another_shape_is_an_error(observation):
+    with pytest.raises(QPError, match=r"^observation: got shape \(.*\), expected shape \(\*batch"):
+        QPMPC(2, 1, 3).predict(observation)
+
+
+def test_an_unsolved_qp_raises_even_if_it_is_masked():
+    """A placeholder must not reach a plant."""
+    bounds = {
+        "state_bounds": ([-1.0], [1.0]),
+        "state_slack": torch.inf,
+        "action_bounds": ([-1], [1]),
+    }
+    mpc = QPMPC.from_model([[1.0]], [[0.1]], 3, stage_weight=[1, 1], on_failure="mask", **bounds)
+    assert mpc.policy(torch.tensor([5.0])) == 0.0
+    with pytest.raises(SolverError, match="1 of 1 QPs have no certified solution"):
+        mpc.predict([5.0])
+
+
+if __name__ == "__main__":
+    small().save(FOLDER / f"saved-{files.VERSION}.qpmpc")

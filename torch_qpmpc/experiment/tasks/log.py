@@ -1,0 +1,204 @@
+"""``task=log``: a log of a plant instead of the plant, whose ARX model closed loops run on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from omegaconf import DictConfig
+from pydantic import Field
+from torch import Tensor
+
+from torch_qpmpc.envs import ARXPlant
+from torch_qpmpc.envs.closed_loop import plant_loop
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.fields import Count, Expected, Finite, NonNegative
+from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, plant_layout, priced, register
+from torch_qpmpc.mpc.bounds import Bounds
+from torch_qpmpc.mpc.identification import identify
+from torch_qpmpc.mpc.log import Log, read_log
+from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.rewards import scheme_cost
+from torch_qpmpc.mpc.scheme import Scheme
+from torch_qpmpc.mpc.stage_cost import StageCost
+
+NOTE = (
+    "task=log has no plant: closed loops run on the ARX model of the log, disturbed by its own "
+    "one-step errors, so that every J is a prediction."
+)
+Names = Annotated[list[str] | None, Expected("a list of columns, or null")]
+Column = Annotated[str | None, Expected("a column, or null")]
+Weights = Annotated[
+    dict[str, NonNegative] | None, Expected("weights >= 0 by name, as {T: 1.0}, or null")
+]
+Pairs = Annotated[
+    dict[str, Annotated[list[Finite], Field(min_length=2, max_length=2)]] | None,
+    Expected("pairs of numbers by name, as {T: [18, 24]}, or null"),
+]
+
+
+class LogSettings(TaskSettings):
+    """The keys of the log and of the cost."""
+
+    outputs: Names
+    inputs: Names
+    known: Names
+    time: Column
+    episode: Column
+    #: Number of outputs in the window.
+    past: Count
+    Q: Weights
+    R: Weights
+    r: Annotated[
+        dict[str, Finite | str] | None,
+        Expected("numbers or known signals by output, as {T: 21.0}, or null"),
+    ]
+    linear: Annotated[
+        dict[str, str] | None, Expected("known signals by input, as {q: price}, or null")
+    ]
+    y_bounds: Pairs
+    u_bounds: Pairs
+
+
+def read(cfg: DictConfig) -> Log:
+    """Read the log that ``cfg.task`` names.
+
+    Raises:
+        QPError: there is no file, or as in `read_log`.
+    """
+    task = cfg.task
+    if task.get("file") is None:
+        remedy = "python train.py task=log task.file=FILE 'task.outputs=[..]' 'task.inputs=[..]' .."
+        raise QPError.expected("task.file", "null", "the path of a CSV file, as in", remedy)
+    columns = (task[name] for name in ("outputs", "inputs", "known"))
+    names = (None if x is None else list(x) for x in columns)
+    return read_log(Path(task.file), *names, time=task.time, episode=task.episode)
+
+
+def make_plant(cfg: DictConfig) -> ARXPlant:
+    """Identify the model that stands for the plant, with its cost and bounds."""
+    task, log = cfg.task, read(cfg)
+    found = identify(log, 1, past=task.past, structure="tied")
+    errors = found.errors[:, 0]
+    u = torch.cat([part.u for part in log.trajectories])
+    seen = torch.stack((u.amin(0), u.amax(0)))
+    unbounded = torch.full((2, len(log.outputs)), torch.inf).double()
+    unbounded[0] *= -1
+    lb_a, ub_a = _bounds(task, "u_bounds", log.inputs, seen)
+    lb_y, ub_y = _bounds(task, "y_bounds", log.outputs, unbounded)
+    W, q, c = stage_cost(task, log)
+
+    def labels(names: tuple[str, ...]) -> list[str]:
+        return [log.label(name) for name in names]
+
+    return ARXPlant(
+        **found.model._asdict(),
+        errors=errors[errors.isfinite().all(-1)],
+        outputs=torch.cat([part.y[:-1] for part in log.trajectories]),
+        signals_seen=torch.cat([part.d for part in log.trajectories]),
+        W=W,
+        q=q,
+        c=c,
+        lb_a=lb_a,
+        ub_a=ub_a,
+        lb_y=lb_y,
+        ub_y=ub_y,
+        price=task.state_slack,
+        labels=(labels(log.outputs), labels(log.inputs), labels(log.known)),
+        n_y=len(log.outputs),
+        n_d=len(log.known),
+        horizon=task.horizon,
+        past=task.past,
+    )
+
+
+def stage_cost(task: Mapping[str, Any], log: Log) -> StageCost:
+    """Return (y - r)'Q(y - r) + u'R u + price u as a cost of v = [d; y; u].
+
+    Raises:
+        QPError: a name is not that of a signal of its kind, or no output has a weight.
+    """
+    d, y, u = (
+        {x: i for i, x in enumerate(names)} for names in (log.known, log.outputs, log.inputs)
+    )
+    n_d, n = len(d), len(d) + len(y) + len(u)
+    W, q, c = torch.zeros(n, n).double(), torch.zeros(n).double(), torch.zeros(()).double()
+    if not task["Q"]:
+        example = f"'task.Q={{{log.outputs[0]}: 1.0}}'"
+        raise QPError.expected("task.Q", "none", f"weights of outputs, such as {example}")
+    targets = _named(task, "r", y)
+    for name, weight in _named(task, "Q", y).items():
+        row, target = n_d + y[name], targets.get(name, 0.0)
+        W[row, row] += 2 * weight
+        if isinstance(target, str):
+            column = _index("r", target, d)
+            W[column, column] += 2 * weight
+            W[row, column] = W[column, row] = -2 * weight
+        else:
+            q[row] -= 2 * weight * target
+            c += weight * target**2
+    for name, weight in _named(task, "R", u).items():
+        W[n_d + len(y) + u[name], n_d + len(y) + u[name]] = 2 * weight
+    for name, price in _named(task, "linear", u).items():
+        row, column = n_d + len(y) + u[name], _index("linear", price, d)
+        W[row, column] = W[column, row] = 1.0
+    return StageCost(W, q, c)
+
+
+def scheme(cfg: DictConfig, plant: ARXPlant) -> Scheme:
+    """Make the scheme of the plant's own model; ``start=data`` replaces that by a predictor."""
+    layout = plant_layout(plant, cfg.task.horizon)
+    cost = scheme_cost(
+        StageCost(plant.W, plant.q, plant.c), layout, cfg.task.gamma, cfg.task.hessian
+    )
+    bounds = Bounds(state_bounds=(plant.lb_y, plant.ub_y), action_bounds=(plant.lb_a, plant.ub_a))
+    model = Model(plant.A, plant.B, plant.E, plant.offset)
+    return Scheme(layout, model, cost, priced(cfg, bounds), cfg.task.gamma)
+
+
+def episode(plant: ARXPlant, d: Tensor) -> dict[str, Any]:
+    """Show the signals by their names and units in the log."""
+    outputs, actions, known = plant.labels
+    signals = dict(zip(known, d.unbind(-1), strict=True))
+    return {"outputs": outputs, "actions": actions, "signals": signals}
+
+
+def _named(task: Mapping[str, Any], key: str, known: Mapping[str, int]) -> Mapping[str, Any]:
+    """Return the mapping under ``key``, whose names are ``known``."""
+    chosen = task[key] or {}
+    for name in chosen:
+        _index(key, name, known)
+    return chosen
+
+
+def _index(key: str, name: str, known: Mapping[str, int]) -> int:
+    if name not in known:
+        expected = f"one of {', '.join(known)}" if known else "none: the log has no such signal"
+        raise QPError.expected(f"task.{key}", repr(name), expected)
+    return known[name]
+
+
+def _bounds(task: DictConfig, key: str, names: tuple[str, ...], default: Tensor) -> Tensor:
+    """Return the lower and upper bounds ``(2, n)``, the ``default`` where there is none."""
+    index = {name: i for i, name in enumerate(names)}
+    bounds = default.clone()
+    for name, pair in _named(task, key, index).items():
+        bounds[:, index[name]] = torch.tensor(list(pair)).double()
+    return bounds
+
+
+register(
+    Task(
+        "log",
+        make_plant,
+        scheme,
+        closed_loop=plant_loop,
+        episode=episode,
+        settings=LogSettings,
+        defaults=None,
+        log=read,
+        note=NOTE,
+    )
+)

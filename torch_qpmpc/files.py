@@ -1,0 +1,103 @@
+"""Files of tensors and plain values: written atomically, and read without running code."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torch_qpmpc.errors import QPError
+
+#: The version of the format that `save_file` writes, and the newest that `load_file` reads.
+VERSION = 1
+
+
+def write_whole(path: Path, data: bytes | memoryview) -> None:
+    """Write ``data`` to ``path`` atomically; a symbolic link is replaced, not followed.
+
+    Raises:
+        OSError: writing failed, as on a full disk; the old file is unchanged.
+    """
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        partial.unlink(missing_ok=True)
+        with partial.open("xb") as file:  # a new file: no link is followed
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise
+
+
+def read_tensors(path: Path) -> Any:
+    """Read tensors and plain values; a damaged file raises an error of any type."""
+    with zipfile.ZipFile(path) as file:  # torch.load does not verify checksums
+        if damaged := file.testzip():
+            raise zipfile.BadZipFile(damaged)
+    return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def labelled(kind: str, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``content`` with the entries that `load_file` compares."""
+    return {"kind": kind, "version": VERSION, **content}
+
+
+def save_file(path: str | Path, kind: str, content: Mapping[str, Any]) -> None:
+    """Write ``content``, tensors and plain values by name, as a file of a ``kind``.
+
+    Raises:
+        OSError: writing failed; the old file is unchanged.
+    """
+    buffer = io.BytesIO()
+    torch.save(labelled(kind, content), buffer)
+    write_whole(Path(path), buffer.getbuffer())
+
+
+def load_file(path: str | Path, kind: str) -> dict[str, Any]:
+    """Read the content of a file of a ``kind``.
+
+    Raises:
+        QPError: the file is missing, damaged, of another kind or of a newer version, or holds more
+            than tensors and plain values.
+    """
+    expected = f"a file that {kind}.save wrote"
+    try:
+        content = read_tensors(Path(path))
+    except FileNotFoundError as error:
+        raise QPError.expected("path", f"{path}, which does not exist", expected) from error
+    except Exception as error:  # damaged files raise errors of any type
+        got = f"{path}, which cannot be read ({type(error).__name__})"
+        remedy = "It may be damaged, or hold more than tensors and numbers."
+        raise QPError.expected("path", got, expected, remedy) from error
+    of = content.get("kind") if isinstance(content, dict) else None
+    if of != kind:
+        got = f"{path}, {'which another program wrote' if of is None else f'a saved {of}'}"
+        raise QPError.expected("path", got, expected)
+    version = content.get("version")
+    if not isinstance(version, int) or not 1 <= version <= VERSION:
+        got = f"{path}, whose format has version {version!r}"
+        remedy = "A newer release wrote it: pip install --upgrade torch-qpmpc."
+        raise QPError.expected("path", got, f"version 1 to {VERSION}", remedy)
+    return content
+
+
+def damaged(
+    file: Path,
+    error: Exception,
+    expected: str,
+    remedy: str = "Restore the file, or move the run's folder elsewhere.",
+) -> QPError:
+    """Make the error of a ``file``, as of a run, that cannot be read."""
+    reason = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, KeyError):
+        reason = f"it has no {error.args[0]}"
+    return QPError.expected(file.name, f"{file} ({reason})", expected, remedy)
