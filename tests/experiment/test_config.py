@@ -95,6 +95,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "house_wall": ("task=house_wall", "warmup_steps=1"),
         "four_tanks": ("task=four_tanks", "start=model", "warmup_steps=1"),
         "tank_references": ("task=tank_references", "warmup_steps=1"),
+        "actuator_noise": ("task=actuator_noise", "warmup_steps=1"),
         "data": ("start=data", "task=pendulum", "constraint=free", "start.transitions=40"),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
         "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
@@ -114,6 +115,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
 
 #: The noises of each task, and the constraints whose penalty needs windows of the replay.
 NOISES = {
+    "actuator_noise": {"none"},
     "four_tanks": {"none"},
     "point_mass": {"gaussian", "brownian"},
     "gros_zanon": {"uniform"},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torch_qpmpc.envs.actuator_noise import ActuatorNoise
 from torch_qpmpc.envs.four_tanks import FourTanks
 from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIEnv, GrosZanonLTIGymEnv
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
@@ -14,6 +15,7 @@ from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.envs.tank_references import TankReferences
 
 __all__ = [
+    "ActuatorNoise",
     "FourTanks",
     "GrosZanonLTI",
     "GrosZanonLTIEnv",
