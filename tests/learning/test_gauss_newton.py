@@ -54,6 +54,31 @@ def test_the_step_is_the_damped_least_squares_step(name):
         assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["default", "C alone", "tied"])
+def test_weights_are_those_of_the_squared_errors(name):
+    mpc = random_mpc(2, **PARTS[name])
+    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
+    reference, weight = Reference(mpc, optimizer), torch.arange(1.0, COUNT + 1).double()
+    (s, a), target, before = pairs(n_p=mpc.n_p), targets(mpc), reference.theta()
+    expected = reference.step(s, a, target, weight=weight)
+    optimizer.step(s, a, target, weight=weight)
+    assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
+
+
+def test_a_pair_without_weight_has_no_influence():
+    """Neither its error nor the change of its Q counts in the trust region."""
+    weight = torch.ones(COUNT).double()
+    weight[2], reports = 0, []
+    for far in (0.0, 1e3):
+        mpc = random_mpc(2)
+        target = targets(mpc)
+        target[2] += far
+        report = GaussNewton(mpc).step(*pairs(), target, weight=weight)
+        reports.append((report.ratio, mpc.C.detach().clone()))
+    assert reports[0][0] == reports[1][0] > 0.5
+    assert torch.equal(reports[0][1], reports[1][1])
+
+
 @pytest.mark.parametrize("learn", [("H", "c", "C"), ("C", "b")])
 def test_the_si_penalty_is_part_of_the_step(learn):
     mpc = random_mpc(3, learn=learn)

@@ -158,6 +158,7 @@ class GaussNewton(torch.optim.Optimizer):
         a: Tensor,
         target: Tensor,
         *,
+        weight: Tensor | None = None,
         penalty: Tensor | None = None,
         warm_start: Tensor | None = None,
     ) -> StepReport:
@@ -168,6 +169,8 @@ class GaussNewton(torch.optim.Optimizer):
             target: costs to go, L + gamma V(s+), ``(B,)``. Pairs with a target that is not finite
                 are left out and counted; if none is left, theta stays, with a `RuntimeWarning`.
                 The sign is not checked: negate rewards and TorchRL's values.
+            weight: factors of the pairs' ``1/2 delta^2``, ``(B,)``, such as one over the variance
+                of their targets by `TargetVariance`; their mean should be one. By default ones.
             penalty: S ``(n_z, n_z)`` of a penalty ``1/2 tr(C S C')`` added to the batch's mean of
                 ``1/2 delta^2``, such as `SystemIdentificationPenalty.curvature`; for a free C only.
             warm_start: active sets of Q(s, a) to start from, ``(B, n_g)``.
@@ -176,11 +179,11 @@ class GaussNewton(torch.optim.Optimizer):
             The outcome of the step.
 
         Raises:
-            QPError: if a shape does not fit, C is not free but penalised, or the QPMPC has new
-                parameters, as after `QPMPC.release`.
+            QPError: if a shape does not fit, a weight is negative or not finite, C is not free but
+                penalised, or the QPMPC has new parameters, as after `QPMPC.release`.
         """
         self._check_parameters()
-        self._check_batch(s, a, target, penalty)
+        self._check_batch(s, a, target, weight, penalty)
         lr, damping = (self.param_groups[0][name] for name in ("lr", "damping"))
         with torch.enable_grad():
             qp = self._mpc.quadratic_program()
@@ -196,7 +199,10 @@ class GaussNewton(torch.optim.Optimizer):
         delta = torch.where(use, target.to(solution.value) - solution.value, 0)
         if self._clip is not None:
             delta = delta.clamp(-self._clip, self._clip)
-        blocks = self._blocks(solution, use, None if penalty is None else count * penalty)
+        # The root of a weight scales its pair's row, both its error and its gradient.
+        root = use.to(delta) if weight is None else use * weight.to(delta).sqrt()
+        delta = root * delta
+        blocks = self._blocks(solution, root, None if penalty is None else count * penalty)
         errors, steps, change = self._solve(blocks, delta, count)
         if not (objective(errors, blocks).isfinite() and all(x.isfinite().all() for x in steps)):
             self._restart()
@@ -206,7 +212,7 @@ class GaussNewton(torch.optim.Optimizer):
             self._mpc.project_()
             return report(math.nan, True)
         old = [block.leaf.clone() for block in blocks]
-        ratio = self._try(blocks, steps, errors, change, (s, a, use, solution))
+        ratio = self._try(blocks, steps, errors, change, (s, a, root, solution))
         accepted = ratio > 0  # False for nan, which an infinite cost causes
         if not accepted:
             for block, value in zip(blocks, old, strict=True):
@@ -238,7 +244,9 @@ class GaussNewton(torch.optim.Optimizer):
         for group in self.param_groups:
             group |= FRESH
 
-    def _check_batch(self, s: Tensor, a: Tensor, target: Tensor, penalty: Tensor | None) -> None:
+    def _check_batch(
+        self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None, penalty: Tensor | None
+    ) -> None:
         """Raise `QPError` if an argument of `step` does not fit."""
         mpc = self._mpc
         check_tensor("s", s, "B", mpc.n_p, batched=False)
@@ -246,6 +254,10 @@ class GaussNewton(torch.optim.Optimizer):
         check_tensor("target", target, len(s), batched=False, remedy="Squeeze its last dimension.")
         if not len(s):
             raise QPError.expected("s", "an empty batch", "at least one pair")
+        if weight is not None:
+            check_tensor("weight", weight, len(s), batched=False)
+            if not (weight.isfinite() & (weight >= 0)).all():
+                raise QPError.expected("weight", "negative, NaN or inf", "finite numbers >= 0")
         if penalty is not None:
             remedy = "Pass SystemIdentificationPenalty.curvature(windows)."
             check_tensor("penalty", penalty, mpc.n_z, mpc.n_z, batched=False, remedy=remedy)
@@ -266,9 +278,9 @@ class GaussNewton(torch.optim.Optimizer):
         Args:
             blocks, steps: the parts and their steps.
             errors, change: those of the TD errors and residuals, and the step's change of them.
-            batch: s, a, the usable pairs, and the solution before the step.
+            batch: s, a, the rows' factors, 0 if not usable, and the solution before the step.
         """
-        s, a, use, solution = batch
+        s, a, root, solution = batch
         lr, before = self.param_groups[0]["lr"], objective(errors, blocks)
         _move(blocks, steps, lr)
         proposed = lr * change
@@ -276,7 +288,7 @@ class GaussNewton(torch.optim.Optimizer):
         predicted = before - objective(errors - change, blocks)
         after = self._mpc.solve(s, a, warm_start=solution.active)
         actual = change.clone()
-        actual[: len(use)] = torch.where(use, after.value - solution.value, 0)
+        actual[: len(root)] = root * torch.where(root > 0, after.value - solution.value, 0)
         decrease = before - objective(errors - actual, blocks)
         # Without a predicted decrease, reject the step only if the projection raised the objective.
         lost = not torch.equal(change, proposed) and not decrease >= 0
@@ -349,19 +361,19 @@ class GaussNewton(torch.optim.Optimizer):
             block.insert(rows.expand(-1, block.rows.shape[1]), len(delta))
         return -r.detach()
 
-    def _blocks(self, solution: QPSolution, use: Tensor, S: Tensor | None) -> list[Block]:
-        """Return Q's gradients in each learned part that is not frozen, zero outside ``use``."""
-        mpc, z, chi = self._mpc, solution.z, use.to(solution.z).unsqueeze(-1) * solution.chi
+    def _blocks(self, solution: QPSolution, root: Tensor, S: Tensor | None) -> list[Block]:
+        """Return Q's gradients in each learned part that is not frozen, times ``root``."""
+        mpc, z, chi = self._mpc, solution.z, root.unsqueeze(-1) * solution.chi
         pairs = [(leaf, group) for group in self.param_groups for leaf in group["params"]]
         pairs = [(leaf, group) for leaf, group in pairs if leaf.requires_grad]
         factored, mask = self._free_C(), matrix(mpc, "C")[1]
         if factored is not None and mask is not None:
             factored.copy_(mpc.C)  # another optimiser may have moved entries that are not learned
         dense = [leaf for leaf, _ in pairs if leaf is not factored]
-        found = iter(_gradients(solution, use, dense, without_C=factored is not None))
+        found = iter(_gradients(solution, root, dense, without_C=factored is not None))
         rows, columns = z.new_ones(mpc.horizon * mpc.n_x), torch.ones_like(z[0])
         if self._normalise:
-            rows, columns = signal_sizes(mpc, self.param_groups[0], z[use])
+            rows, columns = signal_sizes(mpc, self.param_groups[0], z[root > 0])
         units = {"b": rows, "q": 1 / columns} if mpc.structure == "free" else {}
         return [
             OuterProducts(leaf, group, chi, z, rows, columns, S, mask)
@@ -372,16 +384,16 @@ class GaussNewton(torch.optim.Optimizer):
 
 
 def _gradients(
-    solution: QPSolution, use: Tensor, leaves: list[Tensor], without_C: bool
+    solution: QPSolution, root: Tensor, leaves: list[Tensor], without_C: bool
 ) -> Sequence[Tensor]:
-    """Return Q's gradients ``(B, *leaf.shape)`` in each leaf, zero outside ``use``."""
+    """Return Q's gradients ``(B, *leaf.shape)`` in each leaf, times ``root`` ``(B,)``."""
     if not leaves:
         return ()
-    z, lam, weight = solution.z, solution.lam, use.to(solution.z)
+    z, lam = solution.z, solution.lam
     # Only the gradient in a learned w needs the slacks.
     sigma = solution.sigma if solution.qp.w.requires_grad else torch.zeros_like(lam)
     duals = solution.chi, lam, solution.eta, solution.xi
-    gradients = envelope_gradients(weight, z, sigma, *duals)
+    gradients = envelope_gradients(root, z, sigma, *duals)
     parts = {n: getattr(solution.qp, n) for n in EVENT_SHAPES if n != "C" or not without_C}
     parts = {n: x for n, x in parts.items() if x.requires_grad}
     # Expanded to one copy per pair, each part has one gradient per pair.
