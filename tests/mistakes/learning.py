@@ -248,13 +248,9 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: gn.step(S[0], Aa[0], torch.tensor(0.0)),
         "s: got shape (2,), expected shape (B, 2).",
     ),
-    "GaussNewton: weight shape": (
-        lambda: gn.step(S, Aa, torch.zeros(4), weight=torch.ones(4, 1)),
-        "weight: got shape (4, 1), expected shape (4,).",
-    ),
-    "GaussNewton: weight negative": (
-        lambda: gn.step(S, Aa, torch.zeros(4), weight=-torch.ones(4)),
-        "weight: got negative, NaN or inf, expected finite numbers >= 0.",
+    "GaussNewton: weighted": (
+        lambda: qm.GaussNewton(mpc, weighted="yes"),
+        "weighted: got 'yes', expected True or False.",
     ),
     "GaussNewton: penalty": (
         lambda: qm.GaussNewton(free).step(S, Aa, torch.zeros(4), penalty=torch.eye(3)),

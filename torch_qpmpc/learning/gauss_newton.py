@@ -30,6 +30,7 @@ from torch_qpmpc.learning.kernel import (
 )
 from torch_qpmpc.learning.metric import FORGET, FRESH, scale, signal_sizes
 from torch_qpmpc.learning.td_error import usable
+from torch_qpmpc.learning.variance import inverse_variance
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
 from torch_qpmpc.qp.derivatives import envelope_gradients
@@ -99,6 +100,7 @@ class GaussNewton(torch.optim.Optimizer):
             `PredictionErrors.residuals`. 1/2 r'r at first order, times the mean squared TD error,
             is added to the batch's sum of ``1/2 delta^2``. That mean rises at once and falls
             slowly, like a size.
+        weighted: multiply each pair's ``1/2 delta^2`` by `inverse_variance`.
 
     Raises:
         QPError: if a number is out of range, the scales do not fit the learned parts, or there are
@@ -128,6 +130,7 @@ class GaussNewton(torch.optim.Optimizer):
         trust_region: bool = True,
         normalise: bool = True,
         residuals: Callable[[QuadraticProgram], Tensor] | None = None,
+        weighted: bool = False,
     ) -> None:
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
         check_kind("mpc", mpc, QPMPC, remedy)
@@ -138,6 +141,7 @@ class GaussNewton(torch.optim.Optimizer):
             check_number("td_error_clip", td_error_clip, _positive, "a finite number > 0")
         check_flag("trust_region", trust_region)
         check_flag("normalise", normalise)
+        check_flag("weighted", weighted)
         default = {"cost": 1.0, "constraints": 3.0 if normalise else 1e-2}
         groups = mpc.parameter_groups(scales or default)
         for group in groups:
@@ -146,7 +150,7 @@ class GaussNewton(torch.optim.Optimizer):
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
         self._clip, self._memory, self._trust_region = td_error_clip, memory, trust_region
-        self._normalise, self._residuals = normalise, residuals
+        self._normalise, self._residuals, self._weighted = normalise, residuals, weighted
         if residuals is not None and self._free_C() is not None:
             remedy = "Pass a penalty of its rows to step."
             raise QPError.expected("residuals", "them with a free C", "a tied C", remedy)
@@ -158,7 +162,6 @@ class GaussNewton(torch.optim.Optimizer):
         a: Tensor,
         target: Tensor,
         *,
-        weight: Tensor | None = None,
         penalty: Tensor | None = None,
         warm_start: Tensor | None = None,
     ) -> StepReport:
@@ -169,8 +172,6 @@ class GaussNewton(torch.optim.Optimizer):
             target: costs to go, L + gamma V(s+), ``(B,)``. Pairs with a target that is not finite
                 are left out and counted; if none is left, theta stays, with a `RuntimeWarning`.
                 The sign is not checked: negate rewards and TorchRL's values.
-            weight: factors of the pairs' ``1/2 delta^2``, ``(B,)``, such as one over the variance
-                of their targets by `TargetVariance`; their mean should be one. By default ones.
             penalty: S ``(n_z, n_z)`` of a penalty ``1/2 tr(C S C')`` added to the batch's mean of
                 ``1/2 delta^2``, such as `SystemIdentificationPenalty.curvature`; for a free C only.
             warm_start: active sets of Q(s, a) to start from, ``(B, n_g)``.
@@ -179,11 +180,11 @@ class GaussNewton(torch.optim.Optimizer):
             The outcome of the step.
 
         Raises:
-            QPError: if a shape does not fit, a weight is negative or not finite, C is not free but
-                penalised, or the QPMPC has new parameters, as after `QPMPC.release`.
+            QPError: if a shape does not fit, C is not free but penalised, or the QPMPC has new
+                parameters, as after `QPMPC.release`.
         """
         self._check_parameters()
-        self._check_batch(s, a, target, weight, penalty)
+        self._check_batch(s, a, target, penalty)
         lr, damping = (self.param_groups[0][name] for name in ("lr", "damping"))
         with torch.enable_grad():
             qp = self._mpc.quadratic_program()
@@ -199,8 +200,10 @@ class GaussNewton(torch.optim.Optimizer):
         delta = torch.where(use, target.to(solution.value) - solution.value, 0)
         if self._clip is not None:
             delta = delta.clamp(-self._clip, self._clip)
+        root = use.to(delta)
+        if self._weighted:
+            root = root * inverse_variance(s, a, solution.value, delta, use).sqrt()
         # The root of a weight scales its pair's row, both its error and its gradient.
-        root = use.to(delta) if weight is None else use * weight.to(delta).sqrt()
         delta = root * delta
         blocks = self._blocks(solution, root, None if penalty is None else count * penalty)
         errors, steps, change = self._solve(blocks, delta, count)
@@ -244,9 +247,7 @@ class GaussNewton(torch.optim.Optimizer):
         for group in self.param_groups:
             group |= FRESH
 
-    def _check_batch(
-        self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None, penalty: Tensor | None
-    ) -> None:
+    def _check_batch(self, s: Tensor, a: Tensor, target: Tensor, penalty: Tensor | None) -> None:
         """Raise `QPError` if an argument of `step` does not fit."""
         mpc = self._mpc
         check_tensor("s", s, "B", mpc.n_p, batched=False)
@@ -254,10 +255,6 @@ class GaussNewton(torch.optim.Optimizer):
         check_tensor("target", target, len(s), batched=False, remedy="Squeeze its last dimension.")
         if not len(s):
             raise QPError.expected("s", "an empty batch", "at least one pair")
-        if weight is not None:
-            check_tensor("weight", weight, len(s), batched=False)
-            if not (weight.isfinite() & (weight >= 0)).all():
-                raise QPError.expected("weight", "negative, NaN or inf", "finite numbers >= 0")
         if penalty is not None:
             remedy = "Pass SystemIdentificationPenalty.curvature(windows)."
             check_tensor("penalty", penalty, mpc.n_z, mpc.n_z, batched=False, remedy=remedy)
