@@ -344,7 +344,7 @@ def test_values_are_clipped_to_the_range_of_the_observed_rewards():
     with torch.no_grad():
         operator.module.c.fill_(-1e3)
     torch.testing.assert_close(loss.target(td), rewards - 0.5 * future)
-    seen["next", "reward"].fill_(-1e9)
+    seen["next", "reward"] = torch.full((6, 1), -1e9).double()
     loss.observe(seen)
     with torch.no_grad():
         operator.module.c.zero_()
