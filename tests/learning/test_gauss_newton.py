@@ -56,6 +56,20 @@ def test_the_step_is_the_damped_least_squares_step(name):
 
 
 @pytest.mark.parametrize("name", ["default", "C alone", "tied"])
+def test_the_step_is_the_same_with_more_pairs_than_entries_of_theta(name):
+    mpc = random_mpc(2, **PARTS[name])
+    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
+    reference, count = Reference(mpc, optimizer), 100
+    before = reference.theta()
+    assert count > len(before)
+    s, a = random_states(count, mpc.n_p, size=0.9), random_states(count, 1, size=0.45, seed=1)
+    target = mpc.action_value(s, a).detach() + 0.1 * normal(count, seed=2)
+    expected = reference.step(s, a, target)
+    optimizer.step(s, a, target)
+    assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["default", "C alone", "tied"])
 def test_weights_are_those_of_the_squared_errors(name):
     mpc = random_mpc(2, **PARTS[name])
     optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False, weighted=True)
