@@ -174,6 +174,8 @@ def test_an_actor_has_the_first_order_by_itself():
 
 #: The tasks of keys that pendulum lacks.
 TASK_KEYS = {
+    "task.a_max": "task=actuator_noise",
+    "task.actuator_std": "task=actuator_noise",
     "task.disturbed": "task=tank_references",
     "task.margin": "task=house",
     "task.memory": "task=tank_references",
@@ -223,6 +225,7 @@ BAD: dict[str, list[Any]] = {
     "rivals": ["DeePC", 3, None, [1]],
     "resume": [3, True],
     "algo.name": ["a2c", *NAME],
+    "algo.weighted": FLAG,
     "algo.actor": ["net", *NAME],
     "algo.critic": ["net", *NAME],
     "algo.actor_rate": [0, *REAL],
@@ -281,6 +284,7 @@ BAD["optimizer.trust_region"] = BAD["optimizer.normalise"] = BAD["task.one_weath
 ] = FLAG
 BAD["task.past"], BAD["task.memory"] = WHOLE, WHOLE[1:]
 BAD["task.margin"] = BAD["task.model_error"] = REAL
+BAD["task.actuator_std"], BAD["task.a_max"] = REAL, [0, *REAL]
 for _name in ("lr_cost", "lr_constraints"):
     BAD[f"optimizer.{_name}"] = REAL
 for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.growth", "si.beta"):

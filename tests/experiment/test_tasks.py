@@ -387,7 +387,7 @@ def test_the_true_scheme_is_optimal_under_actuator_noise(horizon, std):
     torch.testing.assert_close(true.policy(s), -s @ K.mT, atol=1e-6, rtol=0)
     optimal = evaluate(cfg, true.policy, plant).J_discounted
     start = evaluate(cfg, make_mpc(cfg, plant).policy, plant).J_discounted
-    assert optimal < {0.7: 0.95, 1.2: 0.4}[std] * start
+    assert optimal < {0.7: 0.99, 1.2: 0.5}[std] * start
 
 
 def test_the_actuator_is_bounded_by_a_max():
