@@ -81,13 +81,22 @@ class Reference:
         return torch.cat(found)
 
     def step(
-        self, s: Tensor, a: Tensor, target: Tensor, S: Tensor | None = None, past: int = 0
+        self,
+        s: Tensor,
+        a: Tensor,
+        target: Tensor,
+        S: Tensor | None = None,
+        past: int = 0,
+        weight: Tensor | None = None,
     ) -> Tensor:
         """Compute the step of theta; rows of ``past`` pairs before these have no error."""
-        gradients, solution = self.gradients(s, a), self.mpc.solve(s, a)
+        solution, root = self.mpc.solve(s, a), torch.ones(len(s)).double()
+        if weight is not None:
+            root = weight.sqrt()
+        gradients = [root.unsqueeze(-1) * part for part in self.gradients(s, a)]
         metric = self.metric(gradients, solution.z.detach())
         rows = torch.cat(gradients, dim=1)
-        delta = (target - solution.value).detach()
+        delta = root * (target - solution.value).detach()
         if past:
             earlier = getattr(self, "earlier", rows[:0])
             rows = torch.cat((rows, earlier))

@@ -97,6 +97,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "four_tanks": ("task=four_tanks", "start=model", "warmup_steps=1"),
         "tank_references": ("task=tank_references", "warmup_steps=1"),
         "log": log_overrides(tmp_path),
+        "actuator_noise": ("task=actuator_noise", "warmup_steps=1"),
         "data": ("start=data", "task=pendulum", "constraint=free", "start.transitions=40"),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
         "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
@@ -116,6 +117,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
 
 #: The noises of each task, and the constraints whose penalty needs windows of the replay.
 NOISES = {
+    "actuator_noise": {"none"},
     "four_tanks": {"none"},
     "point_mass": {"gaussian", "brownian"},
     "gros_zanon": {"uniform"},
@@ -175,6 +177,8 @@ def test_an_actor_has_the_first_order_by_itself():
 
 #: The tasks of keys that pendulum lacks.
 TASK_KEYS = {
+    "task.a_max": "task=actuator_noise",
+    "task.actuator_std": "task=actuator_noise",
     "task.disturbed": "task=tank_references",
     "task.margin": "task=house",
     "task.memory": "task=tank_references",
@@ -227,6 +231,7 @@ BAD: dict[str, list[Any]] = {
     "rivals": ["DeePC", 3, None, [1]],
     "resume": [3, True],
     "algo.name": ["a2c", *NAME],
+    "algo.weighted": FLAG,
     "algo.actor": ["net", *NAME],
     "algo.critic": ["net", *NAME],
     "algo.actor_rate": [0, *REAL],
@@ -291,6 +296,7 @@ BAD["optimizer.trust_region"] = BAD["optimizer.normalise"] = BAD["task.one_weath
 ] = FLAG
 BAD["task.past"], BAD["task.memory"] = WHOLE, WHOLE[1:]
 BAD["task.margin"] = BAD["task.model_error"] = REAL
+BAD["task.actuator_std"], BAD["task.a_max"] = REAL, [0, *REAL]
 for _name in ("lr_cost", "lr_constraints"):
     BAD[f"optimizer.{_name}"] = REAL
 for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.growth", "si.beta"):

@@ -21,7 +21,7 @@ import train
 from tests.runs import SMALL, linear_system, make_config, run_command, true_mpc
 from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import Cost, QPError
-from torch_qpmpc.envs import GrosZanonLTI, PointMass
+from torch_qpmpc.envs import ActuatorNoise, GrosZanonLTI, PointMass
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.fields import Name
@@ -38,6 +38,8 @@ from torch_qpmpc.experiment.tasks import (
     run_code,
 )
 from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.regulator import lqr_gain
+from torch_qpmpc.mpc.riccati import noisy_stage_weight
 
 
 @pytest.mark.parametrize(("noise", "std"), [("gaussian", 0.01), ("brownian", 0.002)])
@@ -367,3 +369,29 @@ def test_invalid_registrations_are_refused(own_task):
         register(dataclasses.replace(TASKS["mine"], name="point_mass"))
     with pytest.raises(QPError, match="task: got str, expected a Task"):
         register("mine")  # pyright: ignore[reportArgumentType] (the mistake)
+
+
+# The integrator with actuator noise
+
+
+@pytest.mark.parametrize("horizon", [1, 5])
+@pytest.mark.parametrize("std", [0.7, 1.2])
+def test_the_true_scheme_is_optimal_under_actuator_noise(horizon, std):
+    cfg = make_config("task=actuator_noise", f"task.horizon={horizon}", f"task.actuator_std={std}")
+    plant = make_physics(cfg)
+    assert isinstance(plant, ActuatorNoise)
+    weight = noisy_stage_weight(plant.A, plant.B, plant.W, 0.95, torch.tensor([std]).double())
+    K = lqr_gain(plant.A, plant.B, weight, 0.95)
+    true, s = make_true_mpc(cfg, plant), plant.starts(np.random.default_rng(0), 20)
+    assert true is not None
+    torch.testing.assert_close(true.policy(s), -s @ K.mT, atol=1e-6, rtol=0)
+    optimal = evaluate(cfg, true.policy, plant).J_discounted
+    start = evaluate(cfg, make_mpc(cfg, plant).policy, plant).J_discounted
+    assert optimal < {0.7: 0.99, 1.2: 0.5}[std] * start
+
+
+def test_the_actuator_is_bounded_by_a_max():
+    cfg = make_config("task=actuator_noise", "task.a_max=0.5")
+    mpc = make_mpc(cfg, make_physics(cfg))
+    s = torch.tensor([[1.0, 1.0], [-1.0, -1.0]]).double()
+    torch.testing.assert_close(mpc.policy(s), torch.tensor([[-0.5], [0.5]]).double())

@@ -13,6 +13,7 @@ from tests.gauss_newton import Reference
 from tests.problems import MIXED, normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SystemIdentificationPenalty
 from torch_qpmpc.learning.gauss_newton import FALL, RISE
+from torch_qpmpc.learning.variance import inverse_variance
 
 COUNT, DAMPING = 7, 0.2
 ALL = ("H", "H_f", "q", "c", "C", "b", "G", "lb", "ub", "w")
@@ -52,6 +53,45 @@ def test_the_step_is_the_damped_least_squares_step(name):
         assert math.isnan(report.ratio)
         assert expected.abs().max() > 1e-5
         assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["default", "C alone", "tied"])
+def test_the_step_is_the_same_with_more_pairs_than_entries_of_theta(name):
+    mpc = random_mpc(2, **PARTS[name])
+    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
+    reference, count = Reference(mpc, optimizer), 100
+    before = reference.theta()
+    assert count > len(before)
+    s, a = random_states(count, mpc.n_p, size=0.9), random_states(count, 1, size=0.45, seed=1)
+    target = mpc.action_value(s, a).detach() + 0.1 * normal(count, seed=2)
+    expected = reference.step(s, a, target)
+    optimizer.step(s, a, target)
+    assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["default", "C alone", "tied"])
+def test_weights_are_those_of_the_squared_errors(name):
+    mpc = random_mpc(2, **PARTS[name])
+    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False, weighted=True)
+    s, a = random_states(40, mpc.n_p, size=0.9), random_states(40, 1, size=0.45, seed=1)
+    value = mpc.action_value(s, a).detach()
+    error = 0.1 * a[:, 0] * normal(40, seed=2)
+    weight = inverse_variance(s, a, value, error, torch.ones(40).bool())
+    reference = Reference(mpc, optimizer)
+    expected = reference.step(s, a, value + error, weight=weight)
+    assert not torch.allclose(expected, Reference(mpc, optimizer).step(s, a, value + error))
+    before = reference.theta()
+    optimizer.step(s, a, value + error)
+    assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
+
+
+def test_the_trust_region_counts_weighted_errors():
+    """The predicted decrease is that of the weighted objective: a small step meets it."""
+    mpc = random_mpc(2)
+    s, a = random_states(40, 2, size=0.9), random_states(40, 1, size=0.45, seed=1)
+    target = mpc.action_value(s, a).detach() + 1e-4 * a[:, 0] * normal(40, seed=2)
+    report = GaussNewton(mpc, damping=1.0, weighted=True).step(s, a, target)
+    assert report.ratio == pytest.approx(1, abs=0.01)
 
 
 @pytest.mark.parametrize("learn", [("H", "c", "C"), ("C", "b")])

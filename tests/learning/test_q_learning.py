@@ -25,8 +25,9 @@ from tests.transitions import (
     make_operator,
     perturb,
 )
-from torch_qpmpc import QPMPC, QPError, QPQLearningLoss
+from torch_qpmpc import QPMPC, GaussNewton, QPActorValueOperator, QPError, QPQLearningLoss
 from torch_qpmpc.learning.td_error import td_loss
+from torch_qpmpc.learning.variance import inverse_variance
 
 
 @pytest.mark.parametrize("delay_value", [False, True])
@@ -307,3 +308,68 @@ def test_td_loss_is_huber_beyond_the_clip():
         assert torch.equal(gradient, prediction.clamp(-bound, bound))
         assert (loss >= 0).all()
         assert loss[16] == 0
+
+
+# Weights, and the range of V
+
+
+def test_a_weighted_loss_and_its_gradients():
+    operator, td = make_operator(), make_batch(40)
+    loss = make_loss(operator=operator, weighted=True)
+    prediction = hand_prediction(operator.module, td)
+    error = hand_target(operator.module, td.unsqueeze(-1), 0.0).squeeze(-1) - prediction
+    p, use = td["observation"], torch.ones(40).bool()
+    weight = inverse_variance(p, td["action"], prediction.detach(), error.detach(), use)
+    assert weight.max() > 2 * weight.min()
+    expected = (weight * 0.5 * error.square()).mean()
+    value = loss(td)["loss_value"]
+    torch.testing.assert_close(value, expected)
+    leaves = [*learned_leaves(loss).values()]
+    for leaf, by_hand in zip(leaves, torch.autograd.grad(expected, leaves), strict=True):
+        torch.testing.assert_close(torch.autograd.grad(value, leaf, retain_graph=True)[0], by_hand)
+
+
+def test_values_are_clipped_to_the_range_of_the_observed_rewards():
+    operator, td = make_operator(), make_batch(6)
+    loss, rewards = make_loss(operator=operator), td["next", "reward"].squeeze(-1)
+    unclipped = loss.target(td)
+    with torch.no_grad():
+        operator.module.c.fill_(1e3)
+    future = torch.where(td["next", "terminated"].squeeze(-1), 0.0, -GAMMA / (1 - GAMMA))
+    assert (loss.target(td) < -500).any()
+    seen = td.clone()
+    seen["next", "reward"] = torch.tensor([[-1.0], [0.5], [torch.nan]]).double().repeat(2, 1)
+    loss.observe(seen)
+    torch.testing.assert_close(loss.target(td), rewards + future)
+    with torch.no_grad():
+        operator.module.c.fill_(-1e3)
+    torch.testing.assert_close(loss.target(td), rewards - 0.5 * future)
+    seen["next", "reward"] = torch.full((6, 1), -1e9).double()
+    loss.observe(seen)
+    with torch.no_grad():
+        operator.module.c.zero_()
+    assert loss.reward_range.tolist() == [-1e9, 0.5]
+    torch.testing.assert_close(loss.target(td), unclipped)
+
+
+def test_a_transition_out_of_the_data_does_not_raise_its_own_target_for_ever():
+    """Q of s = 1 learns from V of s+ = 2, which is four times as large."""
+    scheme = {"stage_weight": torch.eye(2), "hessian": "block", "gamma": GAMMA, "solver": "daqp"}
+    costs = []
+    for observed in (False, True):
+        mpc = QPMPC.from_model([[0.0]], [[1.0]], 1, learn=("H", "c"), **scheme)
+        operator = QPActorValueOperator(mpc)
+        loss, optimizer = make_loss(operator=operator), GaussNewton(mpc)
+        td = make_batch(1)
+        td["observation"] = torch.ones(1, 1).double()
+        td["action"] = torch.zeros(1, 1).double()
+        td["next", "observation"] = 2 * torch.ones(1, 1).double()
+        td["next", "reward"] = -torch.ones(1, 1).double()
+        td["next", "terminated"] = torch.zeros(1, 1).bool()
+        if observed:
+            loss.observe(td)
+        for _ in range(60):
+            optimizer.step(td["observation"], td["action"], -loss.target(td))
+        costs.append(mpc.action_value(td["observation"], td["action"]).item())
+    assert costs[0] > 1e6
+    assert 0 < costs[1] <= 1 / (1 - GAMMA)

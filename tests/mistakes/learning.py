@@ -248,6 +248,10 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: gn.step(S[0], Aa[0], torch.tensor(0.0)),
         "s: got shape (2,), expected shape (B, 2).",
     ),
+    "GaussNewton: weighted": (
+        lambda: qm.GaussNewton(mpc, weighted="yes"),
+        "weighted: got 'yes', expected True or False.",
+    ),
     "GaussNewton: penalty": (
         lambda: qm.GaussNewton(free).step(S, Aa, torch.zeros(4), penalty=torch.eye(3)),
         "penalty: got shape (3, 3), expected shape (11, 11). Pass SystemIdentificati",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torch_qpmpc.envs.actuator_noise import ActuatorNoise
 from torch_qpmpc.envs.arx_plant import ARXPlant
 from torch_qpmpc.envs.four_tanks import FourTanks
 from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIEnv, GrosZanonLTIGymEnv
@@ -17,6 +18,7 @@ from torch_qpmpc.envs.tank_references import TankReferences
 
 __all__ = [
     "ARXPlant",
+    "ActuatorNoise",
     "FourTanks",
     "GrosZanonLTI",
     "GrosZanonLTIEnv",

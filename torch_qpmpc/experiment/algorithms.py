@@ -70,7 +70,9 @@ class Learner:
         return in_closed_loop(self.actor, self.n_preview)
 
     def observe(self, batch: TensorDictBase) -> None:
-        """Add new transitions to the prediction errors."""
+        """Add new transitions to the loss's range of rewards and to the prediction errors."""
+        if isinstance(self.loss_module, QPQLearningLoss):
+            self.loss_module.observe(batch)
         if self.errors is not None:
             assert isinstance(self.loss_module, QPQLearningLoss)
             operator, flat = self.loss_module.operator, batch.reshape(-1)
@@ -102,7 +104,9 @@ def make_learner(
     """Make the learner of ``cfg.algo``; its rates continue after ``done`` updates."""
     mpc = operator.module
     if cfg.algo.name == "qlearning":
-        loss_module = QPQLearningLoss(operator, td_error_clip=cfg.td_error_clip)
+        loss_module = QPQLearningLoss(
+            operator, td_error_clip=cfg.td_error_clip, weighted=cfg.algo.weighted
+        )
         actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
     else:
         loss_module = make_actor_critic_loss(cfg, mpc, physics)
@@ -167,6 +171,7 @@ def make_optimizer(
             trust_region=options.trust_region,
             normalise=options.normalise,
             residuals=None if errors is None else errors.residuals,
+            weighted=cfg.algo.weighted,
         )
     rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}
     if loss_module is None or cfg.algo.name == "qlearning":

@@ -30,6 +30,7 @@ from torch_qpmpc.learning.kernel import (
 )
 from torch_qpmpc.learning.metric import FORGET, FRESH, scale, signal_sizes
 from torch_qpmpc.learning.td_error import usable
+from torch_qpmpc.learning.variance import inverse_variance
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
 from torch_qpmpc.qp.derivatives import envelope_gradients
@@ -99,6 +100,7 @@ class GaussNewton(torch.optim.Optimizer):
             `PredictionErrors.residuals`. 1/2 r'r at first order, times the mean squared TD error,
             is added to the batch's sum of ``1/2 delta^2``. That mean rises at once and falls
             slowly, like a size.
+        weighted: multiply each pair's ``1/2 delta^2`` by `inverse_variance`.
 
     Raises:
         QPError: if a number is out of range, the scales do not fit the learned parts, or there are
@@ -128,6 +130,7 @@ class GaussNewton(torch.optim.Optimizer):
         trust_region: bool = True,
         normalise: bool = True,
         residuals: Callable[[QuadraticProgram], Tensor] | None = None,
+        weighted: bool = False,
     ) -> None:
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
         check_kind("mpc", mpc, QPMPC, remedy)
@@ -138,6 +141,7 @@ class GaussNewton(torch.optim.Optimizer):
             check_number("td_error_clip", td_error_clip, _positive, "a finite number > 0")
         check_flag("trust_region", trust_region)
         check_flag("normalise", normalise)
+        check_flag("weighted", weighted)
         default = {"cost": 1.0, "constraints": 3.0 if normalise else 1e-2}
         groups = mpc.parameter_groups(scales or default)
         for group in groups:
@@ -146,7 +150,7 @@ class GaussNewton(torch.optim.Optimizer):
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
         self._clip, self._memory, self._trust_region = td_error_clip, memory, trust_region
-        self._normalise, self._residuals = normalise, residuals
+        self._normalise, self._residuals, self._weighted = normalise, residuals, weighted
         if residuals is not None and self._free_C() is not None:
             remedy = "Pass a penalty of its rows to step."
             raise QPError.expected("residuals", "them with a free C", "a tied C", remedy)
@@ -196,7 +200,12 @@ class GaussNewton(torch.optim.Optimizer):
         delta = torch.where(use, target.to(solution.value) - solution.value, 0)
         if self._clip is not None:
             delta = delta.clamp(-self._clip, self._clip)
-        blocks = self._blocks(solution, use, None if penalty is None else count * penalty)
+        root = use.to(delta)
+        if self._weighted:
+            root = root * inverse_variance(s, a, solution.value, delta, use).sqrt()
+        # The root of a weight scales its pair's row, both its error and its gradient.
+        delta = root * delta
+        blocks = self._blocks(solution, root, None if penalty is None else count * penalty)
         errors, steps, change = self._solve(blocks, delta, count)
         if not (objective(errors, blocks).isfinite() and all(x.isfinite().all() for x in steps)):
             self._restart()
@@ -206,7 +215,7 @@ class GaussNewton(torch.optim.Optimizer):
             self._mpc.project_()
             return report(math.nan, True)
         old = [block.leaf.clone() for block in blocks]
-        ratio = self._try(blocks, steps, errors, change, (s, a, use, solution))
+        ratio = self._try(blocks, steps, errors, change, (s, a, root, solution))
         accepted = ratio > 0  # False for nan, which an infinite cost causes
         if not accepted:
             for block, value in zip(blocks, old, strict=True):
@@ -266,9 +275,9 @@ class GaussNewton(torch.optim.Optimizer):
         Args:
             blocks, steps: the parts and their steps.
             errors, change: those of the TD errors and residuals, and the step's change of them.
-            batch: s, a, the usable pairs, and the solution before the step.
+            batch: s, a, the rows' factors, 0 if not usable, and the solution before the step.
         """
-        s, a, use, solution = batch
+        s, a, root, solution = batch
         lr, before = self.param_groups[0]["lr"], objective(errors, blocks)
         _move(blocks, steps, lr)
         proposed = lr * change
@@ -276,7 +285,7 @@ class GaussNewton(torch.optim.Optimizer):
         predicted = before - objective(errors - change, blocks)
         after = self._mpc.solve(s, a, warm_start=solution.active)
         actual = change.clone()
-        actual[: len(use)] = torch.where(use, after.value - solution.value, 0)
+        actual[: len(root)] = root * torch.where(root > 0, after.value - solution.value, 0)
         decrease = before - objective(errors - actual, blocks)
         # Without a predicted decrease, reject the step only if the projection raised the objective.
         lost = not torch.equal(change, proposed) and not decrease >= 0
@@ -349,19 +358,19 @@ class GaussNewton(torch.optim.Optimizer):
             block.insert(rows.expand(-1, block.rows.shape[1]), len(delta))
         return -r.detach()
 
-    def _blocks(self, solution: QPSolution, use: Tensor, S: Tensor | None) -> list[Block]:
-        """Return Q's gradients in each learned part that is not frozen, zero outside ``use``."""
-        mpc, z, chi = self._mpc, solution.z, use.to(solution.z).unsqueeze(-1) * solution.chi
+    def _blocks(self, solution: QPSolution, root: Tensor, S: Tensor | None) -> list[Block]:
+        """Return Q's gradients in each learned part that is not frozen, times ``root``."""
+        mpc, z, chi = self._mpc, solution.z, root.unsqueeze(-1) * solution.chi
         pairs = [(leaf, group) for group in self.param_groups for leaf in group["params"]]
         pairs = [(leaf, group) for leaf, group in pairs if leaf.requires_grad]
         factored, mask = self._free_C(), matrix(mpc, "C")[1]
         if factored is not None and mask is not None:
             factored.copy_(mpc.C)  # another optimiser may have moved entries that are not learned
         dense = [leaf for leaf, _ in pairs if leaf is not factored]
-        found = iter(_gradients(solution, use, dense, without_C=factored is not None))
+        found = iter(_gradients(solution, root, dense, without_C=factored is not None))
         rows, columns = z.new_ones(mpc.horizon * mpc.n_x), torch.ones_like(z[0])
         if self._normalise:
-            rows, columns = signal_sizes(mpc, self.param_groups[0], z[use])
+            rows, columns = signal_sizes(mpc, self.param_groups[0], z[root > 0])
         units = {"b": rows, "q": 1 / columns} if mpc.structure == "free" else {}
         return [
             OuterProducts(leaf, group, chi, z, rows, columns, S, mask)
@@ -372,16 +381,16 @@ class GaussNewton(torch.optim.Optimizer):
 
 
 def _gradients(
-    solution: QPSolution, use: Tensor, leaves: list[Tensor], without_C: bool
+    solution: QPSolution, root: Tensor, leaves: list[Tensor], without_C: bool
 ) -> Sequence[Tensor]:
-    """Return Q's gradients ``(B, *leaf.shape)`` in each leaf, zero outside ``use``."""
+    """Return Q's gradients ``(B, *leaf.shape)`` in each leaf, times ``root`` ``(B,)``."""
     if not leaves:
         return ()
-    z, lam, weight = solution.z, solution.lam, use.to(solution.z)
+    z, lam = solution.z, solution.lam
     # Only the gradient in a learned w needs the slacks.
     sigma = solution.sigma if solution.qp.w.requires_grad else torch.zeros_like(lam)
     duals = solution.chi, lam, solution.eta, solution.xi
-    gradients = envelope_gradients(weight, z, sigma, *duals)
+    gradients = envelope_gradients(root, z, sigma, *duals)
     parts = {n: getattr(solution.qp, n) for n in EVENT_SHAPES if n != "C" or not without_C}
     parts = {n: x for n, x in parts.items() if x.requires_grad}
     # Expanded to one copy per pair, each part has one gradient per pair.

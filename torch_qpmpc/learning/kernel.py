@@ -5,7 +5,8 @@ With g_i = dQ(s_i, a_i)/dtheta and a metric D on theta, the step that minimises
     1/2 sum_i (delta_i - g_i'dtheta)^2 + 1/2 mu dtheta'D^-1 dtheta
 
 is ``dtheta = D sum_i alpha_i g_i``, ``(K + mu I) alpha = delta``, ``K_ij = g_i'D g_j``, a system of
-the batch's size. mu is a fraction of the mean of K's diagonal.
+the batch's size. mu is a fraction of the mean of K's diagonal. In a batch of more pairs than theta
+has entries, alpha follows from the smaller system of theta's size.
 
 The gradients in a free C are the outer products chi_i z_i', so that ``K = (chi chi') * (z P z')``
 is computed without forming them. P is the metric of C's rows: D's or, with the SI penalty
@@ -49,6 +50,14 @@ class Dense:
     def insert(self, rows: Tensor, place: int) -> None:
         """Insert further rows, which are not remembered."""
         self.rows = torch.cat((self.rows[:place], rows, self.rows[place:]))
+
+    def width(self) -> float:
+        """Return n, or infinity with a penalty."""
+        return self.rows.shape[1]
+
+    def features(self) -> Tensor:
+        """Return Phi ``(B, n)`` of the kernel Phi Phi', without a penalty."""
+        return self.rows * (self.scale * self.units).sqrt()
 
     def diagonal(self) -> Tensor:
         """Return the kernel's diagonal without a penalty, ``(B,)``."""
@@ -104,6 +113,14 @@ class OuterProducts:
             self.chi = torch.cat((self.chi, _past(state, "chi", self.chi)))
             self.z = torch.cat((self.z, _past(state, "z", self.z)))
             state["chi"], state["z"] = self.chi[:count], self.z[:count]
+
+    def width(self) -> float:
+        return self.leaf.numel() if self.S is None else math.inf
+
+    def features(self) -> Tensor:
+        chi, z = self.chi * self.rows.sqrt(), self.z * (self.scale / self.columns).sqrt()
+        parts = (torch.einsum("bi,bj->bij", chi[:, i], z[:, j]) for i, j, _ in self.patterns)
+        return torch.cat([chi[:, :0], *(part.flatten(1) for part in parts)], -1)
 
     def diagonal(self) -> Tensor:
         chi, z = self.rows * self.chi.square(), self.z.square() / self.columns
@@ -185,12 +202,20 @@ def damping_of(blocks: Sequence[Block], damping: float) -> Tensor:
 def solve_dual(blocks: Sequence[Block], delta: Tensor, mu: Tensor) -> tuple[Tensor, Tensor]:
     """Solve the dual; return alpha ``(B,)`` and the step's predicted change of Q ``(B,)``."""
     drifted = sum((block.damp(mu) for block in blocks), torch.zeros_like(delta))
+    if 0 < sum(block.width() for block in blocks) < len(delta):
+        features = torch.cat([block.features() for block in blocks], -1)
+        change = features @ _solve(features.mT @ features, features.mT @ delta, mu)
+        return (delta - change) / mu, change
     K = sum((block.kernel() for block in blocks), delta.new_zeros(len(delta), len(delta)))
-    damped = K + mu * torch.eye(len(delta)).to(delta)
-    factor, failed = torch.linalg.cholesky_ex(damped)
-    alpha = torch.cholesky_solve((delta - drifted).unsqueeze(-1), factor).squeeze(-1)
-    alpha = torch.where(failed == 0, alpha, math.nan)
+    alpha = _solve(K, delta - drifted, mu)
     return alpha, K @ alpha + drifted
+
+
+def _solve(matrix: Tensor, right: Tensor, mu: Tensor) -> Tensor:
+    """Return ``(matrix + mu I)^-1 right`` ``(n,)``, or nan if there is no Cholesky factor."""
+    factor, failed = torch.linalg.cholesky_ex(matrix + mu * torch.eye(len(right)).to(right))
+    x = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
+    return torch.where(failed == 0, x, math.nan)
 
 
 def objective(errors: Tensor, blocks: Sequence[Block]) -> Tensor:

@@ -19,6 +19,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.operators import QPActorValueOperator, QPValueOperator
 from torch_qpmpc.learning.restoring import call_with
 from torch_qpmpc.learning.td_error import invalid_rewards, td_loss, td_metadata
+from torch_qpmpc.learning.variance import inverse_variance
 from torch_qpmpc.qp.tracing import has_values
 
 
@@ -32,6 +33,11 @@ class QPQLearningLoss(LossModule):
     Batches of n-step transitions (TorchRL's ``steps_to_next_obs``) and, with the TD(lambda)
     estimator, of slices ``(*batch, n)`` have returns of several steps. Their rewards are those of
     the actions taken, so that Q(s, a) then learns the cost of the exploring policy's next steps.
+
+    If `observe` is given all transitions, V(s+) is clipped to what a constant cost, the least or
+    the largest so far, or none would cost for ever (truncated fitted value iteration: Munos and
+    Szepesvari, "Finite-time bounds for fitted value iteration", JMLR 2008). Without it a transition
+    to a state that no other transition leaves can raise its own target without bound.
 
     Samples whose QP has no certified solution (``on_failure="mask"`` in the QPMPC) add nothing to
     the loss or its gradient and are counted in ``unsolved``. So are, in ``invalid_reward`` and with
@@ -47,6 +53,7 @@ class QPQLearningLoss(LossModule):
         delay_value: evaluate V(s+) with a target network. By default, as in the paper, with the
             current theta.
         td_error_clip: bound on the absolute TD error in the update; none by default.
+        weighted: multiply each sample's loss by `inverse_variance`.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
         use_prioritized_weights: weight the samples by ``priority_weight``; by default ``"auto"``,
             if the batch contains it.
@@ -113,6 +120,7 @@ class QPQLearningLoss(LossModule):
     state_value_network: QPValueOperator | TensorDictSequential
     value_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
+    reward_range: Tensor
 
     def __init__(
         self,
@@ -120,6 +128,7 @@ class QPQLearningLoss(LossModule):
         *,
         delay_value: bool = False,
         td_error_clip: float | None = None,
+        weighted: bool = False,
         gamma: float | None = None,
         reduction: str | None = None,
         use_prioritized_weights: str | bool = "auto",
@@ -140,10 +149,11 @@ class QPQLearningLoss(LossModule):
         if reduction not in (None, "mean", "sum", "none"):
             raise QPError.expected("reduction", repr(reduction), "'mean', 'sum' or 'none'")
         check_flag("delay_value", delay_value)
+        check_flag("weighted", weighted)
         if use_prioritized_weights not in ("auto", True, False):
             got = repr(use_prioritized_weights)
             raise QPError.expected("use_prioritized_weights", got, "'auto', True or False")
-        self.delay_value, self.td_error_clip = delay_value, td_error_clip
+        self.delay_value, self.td_error_clip, self.weighted = delay_value, td_error_clip, weighted
         self.reduction = reduction or "mean"
         self.use_prioritized_weights = use_prioritized_weights
         self.convert_to_functional(
@@ -151,6 +161,7 @@ class QPQLearningLoss(LossModule):
             "value_network",
             create_target_params=delay_value,
         )
+        self.register_buffer("reward_range", torch.tensor([torch.inf, -torch.inf]).double())
         # Not registered as a submodule, because its parameters are the value network's.
         view = _in_place_of_last(self.value_network, self.operator.get_value_operator())
         object.__setattr__(self, "state_value_network", view)
@@ -269,7 +280,18 @@ class QPQLearningLoss(LossModule):
         priority = (target - prediction).detach().square()
         tensordict.set(self.tensor_keys.priority, priority, inplace=True)
         loss = td_loss(prediction, target, self.td_error_clip)
+        if self.weighted:
+            loss = self._inverse_variance(visited, prediction, target - prediction, use) * loss
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
+
+    def _inverse_variance(
+        self, visited: TensorDictBase, prediction: Tensor, error: Tensor, use: Tensor
+    ) -> Tensor:
+        """Return `inverse_variance` of each sample, ``(*batch,)``."""
+        flat, (operator, shape) = visited.reshape(-1), (self.operator, error.shape)
+        a = flat.get(operator.in_keys[1])
+        rest = (x.detach().reshape(-1) for x in (prediction, error, use))
+        return inverse_variance(operator.known(flat), a, *rest).view(shape)
 
     def _check_batch(self, tensordict: TensorDictBase) -> None:
         """Raise `QPError` if an entry is missing or would broadcast against the values."""
@@ -298,6 +320,22 @@ class QPQLearningLoss(LossModule):
                 raise QPError.expected(name, got, f"one with {key}", remedy)
         if 0 in tensordict.batch_size:
             raise QPError.expected("tensordict", "an empty batch", "at least one transition")
+
+    @torch.no_grad()
+    def observe(self, tensordict: TensorDictBase) -> None:
+        """Extend the range of rewards, which bounds V(s+), by those of new transitions."""
+        reward = tensordict.get(("next", self.tensor_keys.reward)).to(self.reward_range)
+        if (reward := reward[reward.isfinite()]).numel():
+            self.reward_range[0] = reward.min().minimum(self.reward_range[0])
+            self.reward_range[1] = reward.max().maximum(self.reward_range[1])
+
+    def _bounded(self, value: Tensor) -> Tensor:
+        """Clip values, in TorchRL's signs, to the sums of rewards within their range or of none."""
+        low, high = self.reward_range
+        rest = (1 - torch.as_tensor(self.value_estimator.gamma)).clamp(min=torch.finfo().tiny)
+        low, high = low.clamp(max=0) / rest, high.clamp(min=0) / rest
+        unknown = self.reward_range[0] > self.reward_range[1]
+        return torch.where(unknown, value, value.clamp(low.to(value), high.to(value)))
 
     @torch.no_grad()
     def target(self, tensordict: TensorDictBase) -> Tensor:
@@ -334,7 +372,10 @@ class QPQLearningLoss(LossModule):
             tensordict.set(unravel_key(("next", active_set)), following.get(active_set))
         done = tensordict.get(("next", self.tensor_keys.done))
         terminated = tensordict.get(("next", self.tensor_keys.terminated), default=done)
-        return following[self.tensor_keys.value].masked_fill(terminated, 0.0)
+        value = following[self.tensor_keys.value]
+        # An infinite cost marks a QP without a solution.
+        value = torch.where(value.isfinite(), self._bounded(value), value)
+        return value.masked_fill(terminated, 0.0)
 
     def _reads(self, network: TensorDictModuleBase) -> list[NestedKey]:
         """Return the in-keys of a view of the QP, and its active-set key if there is one."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import scipy
 import torch
 from torch import Tensor
@@ -10,6 +12,8 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
 
 RICCATI = "riccati"
+#: Riccati equations solved for one generalised equation.
+MAX_ITERATIONS = 1000
 
 
 def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
@@ -39,6 +43,34 @@ def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tenso
             "Give the actions some weight, or pass a matrix.",
         ) from error
     return torch.as_tensor((P + P.T) / 2).to(A)
+
+
+def noisy_stage_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float, std: Tensor) -> Tensor:
+    """Return the stage weight that accounts for noise on the actions, ``(n_x + n_u, n_x + n_u)``.
+
+    Of the plant ``x+ = A x + B diag(1 + xi) u + e``, with xi and e independent in time, the
+    optimal cost to go is 1/2 x'Px plus a constant. P solves the generalised Riccati equation, which
+    is that of the mean model with ``gamma diag(std^2) diag(B'PB)`` added to the weight of u (de
+    Koning, Automatica 1982). With the weight returned, `riccati_weight` is that P, and the
+    regulator is the optimal policy.
+
+    Args:
+        A, B, W, gamma: as in `riccati_weight`.
+        std: standard deviations of xi, ``(n_u,)``.
+
+    Raises:
+        QPError: the equation has no solution: under this noise no policy has a finite cost.
+    """
+    P, weight, zeros = riccati_weight(A, B, W, gamma), W, std.new_zeros(len(A))
+    with contextlib.suppress(QPError):  # the weight has grown too large
+        for _ in range(MAX_ITERATIONS):
+            added = gamma * std.square() * (B.mT @ P @ B).diagonal()
+            last, weight = weight, W + torch.diag(torch.cat((zeros, added)))
+            if torch.allclose(weight, last, rtol=1e-12, atol=0):
+                return weight
+            P = riccati_weight(A, B, weight, gamma)
+    expected = "noise under which some policy has a finite cost"
+    raise QPError.expected("std", str(std.tolist()), expected)
 
 
 def terminal_riccati(A: Tensor, B: Tensor, W: Tensor, gamma: float, layout: Layout) -> Tensor:

@@ -100,6 +100,7 @@ class GaussNewton(Group):
 
 class QLearning(Group):
     name: Literal["qlearning"]
+    weighted: Flag
 
 
 class Residuals(Group):

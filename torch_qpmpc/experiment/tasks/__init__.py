@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
+    actuator_noise,
     four_tanks,
     gros_zanon,
     gymnasium,

@@ -1,0 +1,103 @@
+"""Weights of TD errors: their size, their limits, and what they are good for."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.problems import normal
+from torch_qpmpc import QPMPC, GaussNewton
+from torch_qpmpc.envs import ActuatorNoise
+from torch_qpmpc.learning.variance import FLOOR, inverse_variance
+from torch_qpmpc.mpc.regulator import lqr_gain
+from torch_qpmpc.mpc.riccati import noisy_stage_weight
+
+COUNT = 4000
+
+
+def pairs() -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return p, a, Q and usable pairs; a is spread over two decades."""
+    p, a = normal(COUNT, 2, seed=0), torch.exp(normal(COUNT, 1, seed=1)) * normal(COUNT, 1, seed=2)
+    return p, a, 5 + p[:, 0].abs(), torch.ones(COUNT).bool()
+
+
+def test_the_weights_are_one_over_the_variance():
+    p, a, value, use = pairs()
+    variance = (0.05 + (a - a.mean()).square() / a.var(correction=0))[:, 0]
+    error = variance.sqrt() * normal(COUNT, seed=3)
+    weight = inverse_variance(p, a, value, error, use)
+    expected = 1 / (variance / variance.median()).clamp(min=FLOOR)
+    assert_close(weight.mean(), torch.ones(()).double())
+    assert_close(weight, expected / expected.mean(), rtol=0.4, atol=0)
+    assert weight.max() > 100 * weight.min()
+
+
+def test_errors_of_one_variance_have_equal_weights():
+    p, a, value, use = pairs()
+    weight = inverse_variance(p, a, value, normal(COUNT, seed=3), use)
+    assert_close(weight, torch.ones_like(weight), rtol=0.25, atol=0)
+
+
+def test_the_weights_have_no_units():
+    p, a, value, use = pairs()
+    error = a[:, 0] * normal(COUNT, seed=3)
+    weight = inverse_variance(p, a, value, error, use)
+    scaled = inverse_variance(10 * p + 3, 7 * a, 2 * value, 100 * error, use)
+    assert_close(scaled, weight, rtol=1e-6, atol=0)
+
+
+def test_unusable_pairs_do_not_count():
+    p, a, value, use = pairs()
+    error = a[:, 0] * normal(COUNT, seed=3)
+    use[::3] = False
+    weight = inverse_variance(p, a, value, error, use)
+    assert_close(weight[use], inverse_variance(p[use], a[use], value[use], error[use], use[use]))
+    assert (weight[~use] == 1).all()
+
+
+def test_few_pairs_or_errors_of_zero_have_weight_one():
+    p, a, value, use = pairs()
+    few = slice(0, 15)
+    assert (inverse_variance(p[few], a[few], value[few], a[few, 0], use[few]) == 1).all()
+    assert (inverse_variance(p, a, value, torch.zeros(COUNT).double(), use) == 1).all()
+
+
+def test_equal_inputs_leave_the_weights_finite():
+    p, a, value, use = (x[:50] for x in pairs())
+    weight = inverse_variance(0 * p, a, 0 * value, a[:, 0], use)
+    assert weight.isfinite().all()
+
+
+def learned_gain(weighted: bool) -> Tensor:
+    """Learn H, H_f and c of a QP with N = 1 by fitted Q iteration; return its policy's gain."""
+    plant = ActuatorNoise()
+    mpc = QPMPC.from_model(
+        plant.A,
+        plant.B,
+        1,
+        gamma=0.95,
+        hessian="block",
+        stage_weight=plant.W,
+        terminal_weight="riccati",
+        learn=("H", "H_f", "c"),
+        solver="daqp",
+    )
+    x, w = 2 * normal(600, 2, seed=0), normal(600, 3, seed=1) * torch.tensor([1.2, 0.02, 0.02])
+    u = -x @ torch.tensor([[3.0], [2.5]]).double() + normal(600, 1, seed=2)
+    cost, following = plant.cost(x, u, w), plant.step(x, u, w)
+    optimizer = GaussNewton(mpc, weighted=weighted)
+    for _ in range(20):
+        optimizer.step(x, u, cost + 0.95 * mpc.value(following).detach())
+    unit = torch.eye(2).double()
+    return (mpc.policy(0 * unit) - mpc.policy(unit)).detach().mT
+
+
+def test_weighted_q_learning_finds_the_optimal_gain_under_actuator_noise():
+    """That of the generalised Riccati equation; without weights a few errors dominate."""
+    plant = ActuatorNoise()
+    weight = noisy_stage_weight(plant.A, plant.B, plant.W, 0.95, torch.tensor([1.2]).double())
+    K = lqr_gain(plant.A, plant.B, weight, 0.95)
+    weighted, plain = ((learned_gain(x) - K).norm() / K.norm() for x in (True, False))
+    assert weighted < 0.2
+    assert plain > 2 * weighted

@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from torch_qpmpc import QPError
+from torch_qpmpc.mpc.regulator import lqr_gain
+from torch_qpmpc.mpc.riccati import noisy_stage_weight, riccati_weight
+
+A = torch.tensor([[1.1, 0.2], [0.0, 0.9]]).double()
+B = torch.tensor([[0.0, 0.1], [0.3, 0.2]]).double()
+W = torch.tensor([[2, 0.3, 0.1, 0], [0.3, 1, 0, 0.2], [0.1, 0, 0.5, 0], [0, 0.2, 0, 0.2]]).double()
+STD, GAMMA = torch.tensor([0.8, 0.3]).double(), 0.9
+
+
+def test_the_noisy_weight_solves_the_generalised_equation():
+    """P is that of the policy's expected cost to go, with E[x+ x+'] written out."""
+    weight = noisy_stage_weight(A, B, W, GAMMA, STD)
+    P, K = riccati_weight(A, B, weight, GAMMA), lqr_gain(A, B, weight, GAMMA)
+    closed, gain = A - B @ K, torch.cat((torch.eye(2).double(), -K))
+    noise = sum(
+        STD[i] ** 2 * torch.outer(K[i], K[i]) * (B[:, i] @ P @ B[:, i]) for i in range(len(STD))
+    )
+    assert_close(P, gain.mT @ W @ gain + GAMMA * (closed.mT @ P @ closed + noise))
+
+
+def test_no_other_gain_costs_less():
+    def cost(K: torch.Tensor) -> torch.Tensor:
+        """Return the trace of the cost to go of u = -K x, by value iteration."""
+        gain, P = torch.cat((torch.eye(2).double(), -K)), torch.zeros_like(A)
+        for _ in range(600):
+            spread = torch.diag(STD.square() * (B.mT @ P @ B).diagonal())
+            step = (A - B @ K).mT @ P @ (A - B @ K) + K.mT @ spread @ K
+            P = gain.mT @ W @ gain + GAMMA * step
+        return P.trace()
+
+    K = lqr_gain(A, B, noisy_stage_weight(A, B, W, GAMMA, STD), GAMMA)
+    slope = torch.func.grad(cost)(K)
+    assert_close(slope, torch.zeros_like(K), atol=1e-8, rtol=0)
+    assert cost(K) < cost(lqr_gain(A, B, W, GAMMA)) - 1e-3
+
+
+def test_noise_that_no_policy_withstands_is_refused():
+    one = torch.ones(1, 1).double()
+    with pytest.raises(QPError, match=r"std: got \[3.0\], expected noise under which some"):
+        noisy_stage_weight(2 * one, one, torch.eye(2).double(), 1.0, 3 * one[0])
