@@ -90,6 +90,7 @@ _ENVIRONMENTS: dict[str, tuple[str, int, dict[str, Any]]] = {
     **{
         name: ("plant_gym:PlantGymEnv", steps, {"plant": name, "max_steps": steps})
         for name, steps in (
+            ("ActuatorNoise", 10),
             ("House", 96),
             ("HouseWall", 192),
             ("FourTanks", 250),
