@@ -323,7 +323,12 @@ class QPQLearningLoss(LossModule):
 
     @torch.no_grad()
     def observe(self, tensordict: TensorDictBase) -> None:
-        """Extend the range of rewards, which bounds V(s+), by those of new transitions."""
+        """Extend the range of rewards, which bounds V(s+), by those of new transitions.
+
+        Args:
+            tensordict: the transitions, of any batch shape. Rewards that are not finite do not
+                count.
+        """
         reward = tensordict.get(("next", self.tensor_keys.reward)).to(self.reward_range)
         if (reward := reward[reward.isfinite()]).numel():
             self.reward_range[0] = reward.min().minimum(self.reward_range[0])
