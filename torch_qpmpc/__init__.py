@@ -23,6 +23,8 @@ from torch_qpmpc.qp.solve import solve_qp
 
 if TYPE_CHECKING:
     from torch_qpmpc import envs as envs
+    from torch_qpmpc.control.controller import Controller
+    from torch_qpmpc.control.linear_mpc import LinearMPC
     from torch_qpmpc.export.compiled import CompiledPolicy
     from torch_qpmpc.export.export import Export
     from torch_qpmpc.learning.operators import QPActorValueOperator
@@ -34,12 +36,14 @@ __all__ = [
     "QPMPC",
     "Bounds",
     "CompiledPolicy",
+    "Controller",
     "Cost",
     "DeviationPenalty",
     "Export",
     "GaussNewton",
     "Identified",
     "Layout",
+    "LinearMPC",
     "Log",
     "Model",
     "QPActorValueOperator",
@@ -65,8 +69,10 @@ if not TYPE_CHECKING:
     #: Imported at first use: TensorDict and TorchRL take as long to import as torch does.
     _LAZY = {
         "CompiledPolicy": "torch_qpmpc.export.compiled:CompiledPolicy",
+        "Controller": "torch_qpmpc.control.controller:Controller",
         "Export": "torch_qpmpc.export.export:Export",
         "envs": "torch_qpmpc.envs:",
+        "LinearMPC": "torch_qpmpc.control.linear_mpc:LinearMPC",
         "QPActorValueOperator": "torch_qpmpc.learning.operators:QPActorValueOperator",
         "QPQLearningLoss": "torch_qpmpc.learning.q_learning:QPQLearningLoss",
         "ThetaNetwork": "torch_qpmpc.learning.theta_network:ThetaNetwork",

@@ -26,6 +26,17 @@ def test_rows_are_hard_or_have_a_price():
     assert theta["G"][-1].tolist() == [0, 0, -1, 0, 0, 1, 0, 0], "z = [y_-1, u_-1, y_0, u_0, y_1]"
 
 
+def test_each_row_of_D_and_D_f_may_have_its_own_price():
+    rows = ([[1.0, 0.0], [0.0, 1.0]], [-1.0] * 2, [1.0] * 2)
+    bounds = Bounds(
+        constraints=rows,
+        terminal_constraints=([[1.0]], [-1.0], [1.0]),
+        constraint_slack=[2.0, torch.inf, 3.0],
+    )
+    w = Scheme(Layout(1, 1, horizon=2), bounds=bounds).theta["w"]
+    assert w[5:].tolist() == [2, torch.inf, 2, torch.inf, 3]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -61,7 +72,10 @@ def test_rows_are_hard_or_have_a_price():
             "terminal_constraints, bounds: got lower 1 > upper 0 at entry 0, expected lower <=",
         ),
         ({"constraint_slack": -1.0}, "constraint_slack: got -1.0, expected a non-negative weight"),
-        ({"constraint_slack": [1.0]}, r"constraint_slack: got \[1.0\], expected a non-negative we"),
+        (
+            {"constraint_slack": [-1.0]},
+            r"constraint_slack: got \[-1.0\], expected a non-negati",
+        ),
         ({"state_slack": None}, "state_slack: got None, expected a non-negative weight, or inf"),
         ({"action_slack": torch.nan}, "action_slack: got nan, expected a non-negative weight"),
         ({"discount_slack": 1}, "discount_slack: got 1, expected True or False"),
@@ -90,6 +104,10 @@ def test_bad_arguments_are_named(arguments, message):
         (
             {"state_slack": [1.0]},
             r"state_slack: got \[1.0\], expected a non-negative .* or one for each of the 2",
+        ),
+        (
+            {"constraint_slack": [1.0]},
+            r"constraint_slack: got \[1.0\], expected a non-negative .* one for each of the 0",
         ),
     ],
 )

@@ -36,8 +36,8 @@ class Bounds:
         rate_bounds: a pair (lower, upper) of ``(n_u,)`` for u_k - u_{k-1}; needs past >= 2.
         state_slack, action_slack, constraint_slack, rate_slack: the slack weights w of the rows of
             states, of actions, of mixed and terminal constraints, and of rates; ``inf`` makes them
-            hard. By default, actions and rates are hard and the others soft. Pass one weight or,
-            except for constraints, one per entry.
+            hard. By default, actions and rates are hard and the others soft. Pass one weight or one
+            per entry, for ``constraint_slack`` of the rows of D and then of D^f.
         discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
 
     Raises:
@@ -59,7 +59,7 @@ class Bounds:
     rate_bounds: Any = None
     state_slack: Any = 100.0
     action_slack: Any = torch.inf
-    constraint_slack: float = 100.0
+    constraint_slack: Any = 100.0
     rate_slack: Any = torch.inf
     discount_slack: bool = False
 
@@ -102,11 +102,11 @@ class Bounds:
         lower, upper = (
             layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], rates, strict=True)
         )
+        linear = (layout.n_mixed, layout.n_terminal)
         w = layout.rows(
             _matching_slack("state_slack", self.state_slack, n_x),
             _matching_slack("action_slack", self.action_slack, n_u),
-            _matching_slack("constraint_slack", self.constraint_slack, layout.n_mixed),
-            _matching_slack("constraint_slack", self.constraint_slack, layout.n_terminal),
+            *_matching_slack("constraint_slack", self.constraint_slack, sum(linear)).split(linear),
             _matching_slack("rate_slack", self.rate_slack, n_u)[: layout.n_rates],
         )
         G = LinearRows(layout, tied=True)(D[0], D_f[0])
@@ -158,15 +158,13 @@ def _linear_rows(name: str, rows: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 def _slack(name: str, weight: Any) -> float | Tensor:
     """Return one weight for all rows, or one for each."""
-    want = "a non-negative weight, or inf for hard rows"
     if isinstance(weight, Real) and not isinstance(weight, bool) and float(weight) >= 0:
         return float(weight)
-    if name != "constraint_slack":
-        want += "; or one for each of them"
-        if isinstance(weight, Sequence | np.ndarray | Tensor) and not isinstance(weight, str):
-            weights = read_numbers(name, weight)
-            if weights.ndim == 1 and (weights >= 0).all():
-                return weights.detach().clone()
+    if isinstance(weight, Sequence | np.ndarray | Tensor) and not isinstance(weight, str):
+        weights = read_numbers(name, weight)
+        if weights.ndim == 1 and (weights >= 0).all():
+            return weights.detach().clone()
+    want = "a non-negative weight, or inf for hard rows; or one for each of them"
     raise QPError.expected(name, repr(weight), want)
 
 

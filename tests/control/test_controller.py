@@ -1,0 +1,144 @@
+"""`Controller`: offsets, names, bumpless starts, and messages."""
+
+from __future__ import annotations
+
+from unittest.mock import Mock
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.linalg
+
+import torch_qpmpc as qm
+from torch_qpmpc import QPError
+from torch_qpmpc.control.observer import kalman
+from torch_qpmpc.control.state_space import read_model
+
+A = np.array([[1.0, 0.1], [0.0, 0.8]])
+B, C = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
+BOUNDS = {"u_bounds": (-1.0, 1.0), "du_bounds": (-0.3, 0.3)}
+
+
+def integrator(**options):
+    return qm.LinearMPC((A, B, C), 20, **{"Q": 1.0, "R": 0.1, "dR": 0.1, **BOUNDS, **options})
+
+
+def closed_loop(controller, r, steps, load=0.0, bias=0.0, **options):
+    """Run the plant with constant disturbances of its input and output; return u and y."""
+    x, us, ys = np.zeros(2), [], []
+    for _ in range(steps):
+        ys.append(C @ x + bias)
+        us.append(controller.step(ys[-1], r, **options))
+        x = A @ x + B @ (us[-1] + load)
+    return np.array(us), np.array(ys)
+
+
+def test_constant_disturbances_of_input_and_output_leave_no_offset():
+    us, ys = closed_loop(qm.Controller(integrator()), [2.0], 200, load=0.3, bias=-0.4)
+    assert np.abs(ys[-1] - 2.0) < 1e-8
+    assert np.abs(us[-1] + 0.3) < 1e-8
+    assert np.abs(us).max() <= 1.0
+    assert np.abs(np.diff(us, axis=0)).max() <= 0.3 + 1e-9
+
+
+def test_without_disturbances_in_the_model_there_is_an_offset():
+    controller = qm.Controller(integrator(disturbances=None))
+    _, ys = closed_loop(controller, [2.0], 200, load=0.3)
+    assert np.abs(ys[-1] - 2.0) > 0.01
+
+
+def test_a_previewed_set_point_is_met_on_time():
+    controller = qm.Controller(integrator(references="preview"))
+    x, ys = np.zeros(2), []
+    plan = np.concatenate((np.zeros(15), np.ones(40)))
+    for k in range(40):
+        ys.append((C @ x).item())
+        r = plan[k : k + 21, None]
+        x = A @ x + B @ controller.step([ys[-1]], r)
+    assert ys[14] > 0.1, "moves before the step of the set-point"
+    assert abs(ys[-1] - 1) < 0.01
+
+
+def test_forecasts_are_fed_forward():
+    mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 10, Q=1.0, dR=1.0, E=[[0.5]], known=["d"])
+    controller = qm.Controller(mpc)
+    controller.reset(y=[0.0], u=[-0.2], known=[0.2])
+    assert np.allclose(controller.step([0.0], [0.0], known=[0.2]), [-0.2])
+    ahead = controller.step([0.0], known=pd.DataFrame({"d": [0.2] * 2 + [1.0] * 9}))
+    assert ahead[0] < -0.25
+
+
+def test_signals_go_in_and_out_by_name():
+    mpc = integrator(inputs=["valve"], outputs=["level"])
+    by_name, by_vector = qm.Controller(mpc), qm.Controller(mpc)
+    u = by_name.step({"level": 0.5}, {"level": 1.0})
+    assert u == {"valve": by_vector.step([0.5], [1.0])[0]}
+
+
+def test_a_reset_starts_where_the_plant_rests():
+    controller = qm.Controller(integrator())
+    controller.reset(y=[3.0], u=[0.2])
+    assert np.allclose(controller.w, [-0.2])  # which the input makes up for
+    assert np.allclose(controller.step([3.0], [3.0]), [0.2])
+    assert np.allclose(controller.step([3.0]), [0.2])
+    controller.reset()
+    assert controller.target is None
+    assert np.allclose(controller.step([3.0], [3.0]), [0.0])
+
+
+def test_the_filter_is_stable_and_faster_with_more_drift():
+    design, noise = integrator().design, np.array([0.1])
+
+    def radius(drift):
+        observer = kalman(design, noise, np.array([drift]))
+        return np.abs(np.linalg.eigvals(observer.F - observer.F @ observer.L @ observer.H)).max()
+
+    assert radius(1.0) < radius(0.01) < 1
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda c: c.step([0.0]), "r: got None in the first step, expected set-points of y1"),
+        (lambda c: c.step([0.0, 1.0], [0.0]), r"y: got shape \(1, 2\), expected 1 numbers \(y1\)"),
+        (lambda c: c.step([np.nan], [0.0]), "y: got NaN or inf, expected finite numbers"),
+        (
+            lambda c: c.step({"T": 0.0}, [0.0]),
+            r"y: got signals \['T'\], expected those of \['y1'\]",
+        ),
+        (lambda c: c.reset(u=[1.0, 2.0]), r"u: got shape \(1, 2\), expected 1 numbers"),
+    ],
+)
+def test_bad_signals_are_named(call, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        call(qm.Controller(integrator()))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"noise": 0.0}, r"noise: got \[0.0\], expected standard deviations > 0"),
+        ({"drift": [1.0, 2.0]}, r"drift: got shape \(2,\) or NaN, expected a number, or one for"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        qm.Controller(integrator(), **arguments)
+
+
+def test_other_modules_and_forecasts_that_are_missing_are_named():
+    with pytest.raises(QPError, match=r"^mpc: got Mock, expected a LinearMPC"):
+        qm.Controller(Mock())
+    mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 3, Q=1.0, E=[[0.5, 1.0]], known=["d", "e"])
+    with pytest.raises(QPError, match=r"^known: got None, expected the signals d, e. Pass a forec"):
+        qm.Controller(mpc).step([0.0], [0.0])
+    with pytest.raises(QPError, match=r"^known: got lengths \[2, 3\], expected columns of one le"):
+        qm.Controller(mpc).step([0.0], [0.0], known={"d": [1.0, 2.0], "e": [1.0] * 3})
+
+
+def test_a_mode_that_no_input_moves_has_no_filter():
+    turn = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    A = scipy.linalg.block_diag(turn, 0.5)
+    model = read_model((A, [[0.0], [0.0], [1.0]], [[1.0, 0.0, 1.0]]))
+    with pytest.raises(QPError, match=r"^model: got a model whose Kalman filter does not converge"):
+        qm.Controller(qm.LinearMPC(model, 3, Q=1.0, R=1.0))

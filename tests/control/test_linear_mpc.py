@@ -1,0 +1,194 @@
+"""`LinearMPC` beside the same problem in CVXPY, its set-points, and messages."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from types import SimpleNamespace
+
+import cvxpy
+import numpy as np
+import pytest
+import torch
+
+import torch_qpmpc as qm
+from torch_qpmpc import QPError
+
+A = np.array([[0.9, 0.2, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
+B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.4]])
+C = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+E = np.array([[0.1, 0.0], [0.0, 0.0], [0.2, 0.0]])  # the second signal is a price
+NAMES = {"inputs": ["q", "v"], "outputs": ["T", "c"], "known": ["T_out", "price"]}
+DESIGN = {
+    "Q": {"T": 2.0, "c": 1.0},
+    "R": {"q": 0.3},
+    "dR": {"q": 0.5, "v": 0.2},
+    "y_bounds": {"T": (None, 1.2)},
+    "u_bounds": (-1.0, 1.0),
+    "du_bounds": {"v": (-0.3, 0.3)},
+    "y_slack": 20.0,
+    "linear": {"q": "price", "v": 0.05},
+}
+SCALAR = ([[0.9]], [[0.5]])
+
+
+def reference(x, target, r, known, u_last, N=8):
+    """Solve the problem as its docstring has it, about the steady state for the last set-point."""
+    plan = cvxpy.Variable((N, 2))
+    rows: list[cvxpy.Constraint] = [plan >= -1, plan <= 1]
+    cost, last, load = 0, u_last, target.y - C @ target.x
+    for k in range(N + 1):
+        y = C @ x + load
+        cost += 20 * cvxpy.pos(y[0] - 1.2)
+        if k == N:
+            error = cvxpy.hstack((x - target.x, last - target.u))
+            cost += cvxpy.quad_form(error, terminal_weight())
+            cvxpy.Problem(cvxpy.Minimize(cost), rows).solve(
+                solver="CLARABEL", tol_gap_rel=1e-11, tol_feas=1e-11
+            )
+            assert plan.value is not None
+            return plan.value[0]
+        du = plan[k] - last
+        u_s = target.u + np.linalg.solve(C @ np.linalg.solve(np.eye(3) - A, B), r[k] - r[-1])
+        cost += 2 * cvxpy.square(y[0] - r[k][0]) + cvxpy.square(y[1] - r[k][1])
+        cost += 0.3 * cvxpy.square(plan[k, 0] - u_s[0])
+        cost += 0.5 * cvxpy.square(du[0]) + 0.2 * cvxpy.square(du[1])
+        cost += known[k][1] * plan[k, 0] + 0.05 * plan[k, 1]
+        rows += [cvxpy.abs(du[1]) <= 0.3]
+        x, last = A @ x + B @ plan[k] + E @ known[k], plan[k]
+    raise AssertionError
+
+
+def terminal_weight():
+    """Iterate the Riccati equation of (x, u_last) to its limit."""
+    F = np.block([[A, np.zeros((3, 2))], [np.zeros((2, 5))]])
+    G = np.vstack((B, np.eye(2)))
+    dR, R = np.diag([0.5, 0.2]), np.diag([0.8, 0.2])
+    Q = np.block([[C.T @ np.diag([2.0, 1.0]) @ C, np.zeros((3, 2))], [np.zeros((2, 3)), dR]])
+    S = np.vstack((np.zeros((3, 2)), -dR))
+    P = Q
+    for _ in range(2000):
+        K = np.linalg.solve(R + G.T @ P @ G, G.T @ P @ F + S.T)
+        P = Q + F.T @ P @ F - (F.T @ P @ G + S) @ K
+    return P
+
+
+def steady_state(r, w, d):
+    """The target within wide bounds: y = C x + w is r."""
+    matrix = np.block([[A - np.eye(3), B], [C, np.zeros((2, 2))]])
+    state = np.linalg.solve(matrix, np.concatenate((-E @ d, r - w)))
+    return SimpleNamespace(x=state[:3], u=state[3:], y=r)
+
+
+@pytest.mark.parametrize("references", ["held", "preview"])
+def test_the_plan_is_that_of_the_problem_in_the_docstring(references):
+    wide = {**DESIGN, "u_bounds": (-1.0, 1.0)}
+    mpc = qm.LinearMPC((A, B, C), 8, E=E, references=references, **NAMES, **wide)
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        x, w, u_last = rng.normal(size=3), 0.1 * rng.normal(size=2), rng.uniform(-0.8, 0.8, 2)
+        r = 0.1 * rng.normal(size=(9, 2))
+        r = r if references == "preview" else r[:1].repeat(9, 0)
+        known = 0.1 * rng.normal(size=(9, 2))
+        d = known.mean(0)
+        expected = steady_state(r[-1], w, d)
+        target = mpc.target(r if references == "preview" else r[0], w, d)
+        last = target.u[-1] if references == "preview" else target.u
+        assert np.allclose(last, expected.u, atol=1e-8)
+        u = reference(x, expected, r, known, u_last)
+        p = mpc.arrange(x, target, known=known, level=d, u_last=u_last)
+        assert np.allclose(last + mpc.policy(p).detach(), u, atol=1e-5)
+
+
+def test_an_input_weight_moves_no_output_off_a_set_point_that_can_be_reached():
+    mpc = qm.LinearMPC((A, B, C), 10, Q=1.0, R=50.0)
+    expected = steady_state(np.array([0.3, -0.2]), np.zeros(2), np.zeros(2))
+    target = mpc.target([0.3, -0.2])
+    assert np.allclose(target.u, expected.u)
+    assert mpc.policy(mpc.arrange(expected.x, target)).abs().max() < 1e-8
+
+
+def test_a_set_point_out_of_reach_is_tracked_as_near_as_the_bounds_allow():
+    mpc = qm.LinearMPC(SCALAR, 5, Q=1.0, u_bounds=(-1.0, 1.0))  # y = 5 u at rest
+    target = mpc.target([[7.0], [-3.0]], w=[1.0])
+    assert np.allclose(target.y, [[6.0], [-3.0]])
+    assert np.allclose(target.u, [[1.0], [-0.8]])
+    bounded = qm.LinearMPC(SCALAR, 5, Q=1.0, y_bounds=(-2.0, 2.0))
+    assert np.allclose(bounded.target([7.0]).y, [2.0])
+
+
+def test_with_more_inputs_than_outputs_the_smallest_inputs_hold_the_set_point():
+    mpc = qm.LinearMPC(([[0.5]], [[1.0, 1.0]]), 5, Q=1.0, R=1.0, u_bounds=([-1, -1], [0.2, 1]))
+    assert np.allclose(mpc.target([0.2]).u, [0.05, 0.05], atol=1e-6)
+    assert np.allclose(mpc.target([1.0]).u, [0.2, 0.3], atol=1e-6)
+
+
+def test_without_a_riccati_solution_the_terminal_weight_is_the_stage_s():
+    # The position has no weight and does not decay.
+    mpc = qm.LinearMPC(([[1.0, 0.1], [0.0, 0.9]], [[0.0], [1.0]]), 3, Q=[0.0, 1.0], R=1.0)
+    assert torch.equal(mpc.H_f.detach()[:2, :2], torch.diag(torch.tensor([0.0, 2.0])).double())
+    assert mpc.H_f.detach()[2:].abs().max() == 0
+
+
+def test_copies_keep_the_design():
+    mpc = qm.LinearMPC(SCALAR, 3, Q=1.0, dR=0.1)
+    for twin in (pickle.loads(pickle.dumps(mpc)), copy.deepcopy(mpc)):
+        assert twin.design.places() == mpc.design.places()
+        p = twin.arrange([1.0], twin.target([0.5]))
+        assert torch.equal(twin.policy(p), mpc.policy(p))
+    mpc.reset_parameters()
+
+
+def test_p_takes_batches_and_is_relative_to_the_last_target():
+    mpc = qm.LinearMPC((A, B, C), 8, E=E, references="preview", **NAMES, **DESIGN)
+    r = np.linspace(0, 0.1, 9)[:, None] * np.ones((5, 1, 2))
+    p = mpc.arrange(np.ones((5, 3)), mpc.target(r), known=np.ones((5, 9, 2)))
+    assert tuple(p.shape) == (5, mpc.n_p)
+    assert np.allclose(p[0, :2], -0.1)  # r_0 - r_N
+    assert p[0, 4:6].tolist() == [1, 1]
+    assert p[0, 48 : 48 + 4].abs().max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"Q": None}, "Q: got no cost, expected weights .* Pass one, such as Q={'y1': 1.0}, dR="),
+        ({"Q": {"T": 1.0}}, "Q: got 'T', expected names among y1"),
+        ({"Q": [1.0, 2.0]}, r"Q: got shape \(2,\) or NaN, expected a number, or one for each of"),
+        ({"linear": {"u1": "d1"}, "E": [[1.0]]}, "linear: got 'd1', which acts on the plant"),
+        ({"Q": [[1.0, 2.0]]}, r"Q: got shape \(1, 2\), expected \(1, 1\)"),
+        ({"dR": -1.0}, "dR: got smallest eigenvalue -1, expected a positive semidefinite weight"),
+        ({"horizon": 0}, "horizon: got 0, expected a whole number >= 1"),
+        ({"references": "later"}, "references: got 'later', expected one of held, preview"),
+        ({"gamma": 0}, "gamma: got 0, expected a discount factor"),
+        ({"y_slack": -1.0}, r"y_slack: got \[-1.0\], expected prices >= 0"),
+        ({"linear": 1.0}, "linear: got 1.0, expected a mapping from inputs"),
+        ({"linear": {"u1": "price"}}, "linear: got {'u1': 'price'}, expected a mapping"),
+        ({"u_bounds": {"q": (0, 1)}}, "u_bounds: got 'q', expected names among u1"),
+        ({"u_bounds": {"u1": 1.0}}, "u_bounds: got {'u1': 1.0}, expected pairs .* by name"),
+        ({"u_bounds": 1.0}, "u_bounds: got 1.0, expected the pair"),
+        ({"u_bounds": (1.0, 0.0)}, "u_bounds: got lower 1 > upper 0 for u1, expected lower <="),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        qm.LinearMPC(SCALAR, **{"horizon": 3, "Q": 1.0, **arguments})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"z": 1.0}, "signals: got 'z', expected some of u_last, known, level"),
+        ({"x": [1.0, 2.0]}, r"x: got shape \(2,\), expected 1 entries"),
+        ({"known": np.ones((3, 2))}, "known: .* expected 0 entries"),
+    ],
+)
+def test_signals_that_are_not_those_of_p_are_named(arguments, message):
+    mpc = qm.LinearMPC(SCALAR, 3, Q=1.0)
+    with pytest.raises(QPError, match=f"^{message}"):
+        mpc.arrange(**{"x": [1.0], "target": mpc.target([0.0]), **arguments})
+
+
+def test_set_points_of_another_size_are_named():
+    with pytest.raises(QPError, match=r"^r: got shape \(2,\), expected \(\*batch, 1\)"):
+        qm.LinearMPC(SCALAR, 3, Q=1.0).target([1.0, 2.0])

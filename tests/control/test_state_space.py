@@ -1,0 +1,96 @@
+"""Models from matrices, systems and identifications, and messages."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.signal
+import torch
+
+from torch_qpmpc import Identified, QPError
+from torch_qpmpc.control.state_space import read_model
+from torch_qpmpc.mpc.predictor import ARX
+
+A, B = np.array([[0.0, 1.0], [-1.0, -0.5]]), np.array([[0.0], [1.0]])
+C, D = np.array([[1.0, 0.0]]), np.array([[0.0]])
+
+
+def system(**changes):
+    """A system with the attributes of control.StateSpace."""
+    return SimpleNamespace(**{"A": A, "B": B, "C": C, "D": D, "dt": 0, **changes})
+
+
+def test_a_continuous_system_is_sampled_by_zero_order_hold():
+    plant = read_model(system(input_labels=["F"], output_labels=["position"]), dt=0.2)
+    x = np.array([1.0, -1.0])
+    held = scipy.integrate.solve_ivp(lambda _, x: A @ x + B[:, 0] * 2, (0, 0.2), x, rtol=1e-9)
+    assert np.allclose(plant.A @ x + plant.B[:, 0] * 2, held.y[:, -1], atol=1e-7)
+    assert (plant.dt, plant.inputs, plant.outputs) == (0.2, ("F",), ("position",))
+    twin = read_model(scipy.signal.lti(A, B, C, D), dt=0.2)
+    assert np.array_equal(twin.A, plant.A)
+
+
+def test_a_discrete_system_keeps_its_matrices_and_time():
+    plant = read_model(scipy.signal.dlti(A, B, C, D, dt=0.5))
+    assert np.array_equal(plant.A, A)
+    assert (plant.dt, plant.inputs) == (0.5, ("u1",))
+    assert read_model(system(dt=True), dt=0.3).dt == 0.3
+    transfer = scipy.signal.dlti([0.5], [1.0, -0.9], dt=1.0)
+    assert np.allclose(read_model(transfer).A, [[0.9]])
+
+
+def test_named_inputs_of_a_system_become_known_signals():
+    two = system(B=[[0.0, 3.0], [1.0, 4.0]], D=[[0.0, 0.0]], dt=1.0, input_labels=["q", "T_out"])
+    plant = read_model(two, known=["T_out"])
+    assert plant.inputs == ("q",)
+    assert plant.known == ("T_out",)
+    assert plant.E.tolist() == [[3.0], [4.0]]
+
+
+def test_matrices_without_an_output_measure_the_state():
+    assert np.array_equal(read_model((A, B)).C, np.eye(2))
+    assert read_model((A, B), E=np.ones((2, 2))).known == ("d1", "d2")
+
+
+def test_the_state_space_of_an_identification_has_its_predictions():
+    rng = np.random.default_rng(0)
+    A, B, E, offset = (rng.normal(size=size) for size in ((2, 4), (2, 2), (2, 1), (2,)))
+    arx = ARX(*(torch.from_numpy(x) for x in (A, B, E, offset)))
+    plant = read_model(Identified(arx, Mock(), Mock(), ()))
+    y, u, d = [*rng.normal(size=(2, 2))], rng.normal(size=(6, 1)), rng.normal(size=(6, 1))
+    x = np.concatenate((y[1], A[:, 2:] @ y[0] + B[:, 1:] @ u[0]))
+    for k in range(1, 6):
+        lags = np.concatenate((y[k], y[k - 1])), np.concatenate((u[k], u[k - 1]))
+        y.append(A @ lags[0] + B @ lags[1] + E @ d[k] + offset)
+        x = plant.A @ x + plant.B @ u[k] + plant.E @ d[k] + plant.offset
+        assert np.allclose(plant.C @ x, y[-1])
+
+
+@pytest.mark.parametrize(
+    ("model", "arguments", "message"),
+    [
+        (5.0, {}, r"model: got float, expected \(A, B\), .* Convert a transfer function"),
+        (system(D=[[1.0]]), {"dt": 1.0}, "model: got a direct feedthrough D, expected D = 0"),
+        (system(), {}, "dt: got None for a continuous model, expected a sampling time"),
+        (system(), {"dt": -1.0}, "dt: got -1.0, expected a sampling time > 0"),
+        (system(dt=None), {"dt": 1.0}, "model: got no time base, .* Set model.dt: 0 if it is"),
+        (system(dt=0.1), {"dt": 0.2}, "dt: got 0.2, expected the model's own 0.1"),
+        ((A, [1.0, 2.0]), {}, r"model\[1\]: got shape \(2,\), expected a matrix"),
+        ((A, np.ones((3, 1))), {}, r"B: got shape \(3, 1\), expected \(2, 1\)"),
+        ((A, B, np.ones((1, 3))), {}, r"C_y: got shape \(1, 3\), expected \(1, 2\)"),
+        ((A, B), {"inputs": ["y1"]}, "names: got 'y1' twice, expected different names"),
+        ((A, B), {"E": np.ones((2, 1)), "known": ["a", "b"]}, r"E: got shape \(2, 1\), expected"),
+        (
+            system(dt=1.0, input_labels=["q"]),
+            {"known": ["T"]},
+            "known: got 'T', expected inputs among",
+        ),
+    ],
+)
+def test_models_that_do_not_fit_are_named(model, arguments, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        read_model(model, **arguments)

@@ -1,0 +1,178 @@
+"""`Controller`: a linear MPC with what it needs between two steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from torch_qpmpc.checks import check_kind
+from torch_qpmpc.control.design import half_range, read_vector
+from torch_qpmpc.control.linear_mpc import LinearMPC, Target
+from torch_qpmpc.control.observer import SMALL, kalman
+from torch_qpmpc.control.signals import read_row, read_table
+from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.errors import QPError
+
+
+class Controller:
+    """A `LinearMPC` with an observer, a target within bounds, the last input and names.
+
+    In each step a steady-state Kalman filter estimates the state x and constant disturbances w from
+    the measured outputs; the steady state within the bounds that is nearest to the set-point is the
+    target; and the MPC plans to it. So constant disturbances, and errors of the model's gain, leave
+    no offset, and a set-point out of reach is tracked as near as the bounds allow.
+
+    Args:
+        mpc: the MPC. Call `reset` when its theta has changed.
+        noise: standard deviations of the noise of outputs, as a number, a vector or by name; by
+            default a tenth of half the distance of the outputs' bounds, or of one without bounds.
+        drift: those of the change of each disturbance in a step; by default a tenth of half the
+            distance of the bounds of the output or the input. A larger ratio of drift to noise
+            rejects disturbances faster, and passes on more noise.
+
+    Attributes:
+        mpc: the MPC.
+        x, w, u: the estimates of x and w, and the last input.
+        target: the `Target` of the last step, None before the first; with a preview, of all stages.
+
+    Raises:
+        QPError: an argument is invalid, or the model has no filter.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> model = ([[0.9]], [[0.5]])
+        >>> mpc = qm.LinearMPC(model, 10, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
+        >>> controller, y = qm.Controller(mpc), [0.0]
+        >>> for _ in range(60):  # the plant has another gain, and a load
+        ...     u = controller.step(y, r=[1.0])
+        ...     y = 0.9 * y[0] + 0.4 * u + 0.1
+        >>> print(y.round(6))
+        [1.]
+    """
+
+    def __init__(self, mpc: LinearMPC, *, noise: Any = None, drift: Any = None) -> None:
+        check_kind("mpc", mpc, LinearMPC, "qm.LinearMPC makes one of a plant's model.")
+        self.mpc = mpc
+        design = self._design = mpc.design
+        plant, w = design.plant, design.disturbances
+        y, u = half_range(design.y_bounds), half_range(design.u_bounds)
+        ranges = np.abs(y @ w.C + u @ np.linalg.pinv(plant.B) @ w.B)
+        self._noise = _deviations("noise", noise, SMALL * y, plant.outputs)
+        self._drift = _deviations("drift", drift, SMALL * ranges, w.names)
+        self._observer = kalman(design, self._noise, self._drift)
+        self.r = np.zeros(0)
+        self.reset()
+
+    def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
+        """Forget the past: the plant rests with the outputs y, by default those of the next step.
+
+        Args:
+            y: outputs, by name or as a vector.
+            u: the input that holds the plant there, by default the one nearest to zero within the
+                bounds. It is the last input that moves are counted from.
+            known: known signals, as in `step`.
+
+        Raises:
+            QPError: an argument is invalid.
+        """
+        plant = self._design.plant
+        self._qp = self.mpc.quadratic_program()
+        self.u = np.clip(np.zeros(len(plant.inputs)), *self._design.u_bounds)
+        if u is not None:
+            self.u = read_row("u", u, plant.inputs)
+        self.target: Target | None = None
+        self._e: Array | None = None
+        if y is not None:
+            self._rest(read_row("y", y, plant.outputs), self._known(known)[0])
+
+    @property
+    def x(self) -> Array:
+        """The estimate of the state, zero before the first step."""
+        e = np.zeros(len(self._observer.F)) if self._e is None else self._e
+        return e[: len(self._design.plant.A)]
+
+    @property
+    def w(self) -> Array:
+        """The estimate of the disturbances, zero before the first step."""
+        e = np.zeros(len(self._observer.F)) if self._e is None else self._e
+        return e[len(self._design.plant.A) :]
+
+    def step(self, y: Any, r: Any = None, known: Any = None) -> Any:
+        """Return the input for measured outputs: a vector ``(m,)``, or by name if y is by name.
+
+        Args:
+            y: outputs, by name or as a vector ``(n_y,)``.
+            r: set-points in the same forms, by default the last ones; with a preview also rows for
+                the stages 0, .., N, of which the last is held.
+            known: known signals for the stages 0, .., N, ``(N + 1, n_d)``, as a DataFrame or a
+                mapping of columns; one row is held.
+
+        Raises:
+            QPError: an argument is invalid, or missing.
+            SolverError: no input satisfies the hard bounds.
+        """
+        plant, observer = self._design.plant, self._observer
+        d, y_k = self._known(known), read_row("y", y, plant.outputs)
+        self._read_set_point(r)
+        if self._e is None:
+            self._rest(y_k, d[0])
+        assert self._e is not None
+        self._e = self._e + observer.L @ (y_k - observer.H @ self._e)
+        self.u = self._plan(d)
+        self._e = self._predicted(self._e, d[0])
+        return (
+            dict(zip(plant.inputs, self.u.tolist(), strict=True))
+            if isinstance(y, Mapping)
+            else self.u.copy()
+        )
+
+    def _predicted(self, e: Array, d: Array) -> Array:
+        observer = self._observer
+        return observer.F @ e + observer.G @ self.u + observer.E @ d + observer.offset
+
+    def _rest(self, y: Array, d: Array) -> None:
+        """Set the estimate to where the plant rests with the last input."""
+        still = -self._predicted(np.zeros(len(self._observer.F)), d)
+        self._e = self._observer.rest @ np.concatenate((still, y))
+
+    @torch.no_grad()
+    def _plan(self, d: Array) -> Array:
+        """Return the input for the current estimate and known signals."""
+        previewed, level = self._design.references == "preview", d.mean(0)
+        self.target = self.mpc.target(self.r if previewed else self.r[0], self.w, level)
+        p = self.mpc.arrange(self.x, self.target, u_last=self.u, known=d, level=level)
+        u_s = self.target.u[-1] if previewed else self.target.u
+        u = u_s + self.mpc.policy(p, qp=self._qp)
+        return np.clip(u.numpy(), *self._design.u_bounds)
+
+    def _known(self, known: Any) -> Array:
+        names, stages = self._design.plant.known, self._design.horizon + 1
+        if not names and known is None:
+            return np.zeros((stages, 0))
+        if known is None:
+            remedy = "Pass a forecast of N + 1 rows, or one row that is held."
+            raise QPError.expected("known", "None", f"the signals {', '.join(names)}", remedy)
+        return read_table("known", known, names, stages)
+
+    def _read_set_point(self, r: Any) -> None:
+        outputs, stages = self._design.plant.outputs, self._design.horizon + 1
+        if r is not None:
+            self.r = read_table("r", r, outputs, stages)
+        elif not len(self.r):
+            if self._design.Q.any():
+                want = f"set-points of {', '.join(outputs)}"
+                raise QPError.expected("r", "None in the first step", want)
+            self.r = np.zeros((stages, len(outputs)))
+
+
+def _deviations(name: str, value: Any, default: Array, names: tuple[str, ...]) -> Array:
+    """Read standard deviations, which must be positive."""
+    if value is None:
+        return default
+    vector = read_vector(name, value, names, 0.0)
+    if not ((vector > 0) & np.isfinite(vector)).all():
+        raise QPError.expected(name, f"{vector.tolist()}", "standard deviations > 0 of each")
+    return vector

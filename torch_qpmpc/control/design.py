@@ -1,0 +1,223 @@
+"""A linear MPC's design: the plant, weights, bounds and set-points, and where p has them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from torch_qpmpc.checks import check_choice, check_number, check_whole
+from torch_qpmpc.control.disturbance import Disturbances, choose
+from torch_qpmpc.control.state_space import Array, StateSpace
+from torch_qpmpc.control.steady import Steady
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.validation import as_tensor, check_weight, read_numbers
+
+REFERENCES = ("held", "preview")
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """What `LinearMPC` is made of, as arrays.
+
+    Attributes:
+        plant: the model.
+        horizon: N.
+        Q, R, dR: the weights, ``(n_y, n_y)`` and ``(m, m)`` twice.
+        y_bounds, u_bounds, du_bounds: pairs (lower, upper), infinite where there is none.
+        y_slack: the price of a unit of violation of ``y_bounds``, ``(n_y,)``; inf is hard.
+        linear: known signals, by index, or numbers that multiply inputs, by input.
+        references: "held" or "preview".
+        disturbances: B_w, C_w and names.
+        gamma: the discount.
+    """
+
+    plant: StateSpace
+    horizon: int
+    Q: Array
+    R: Array
+    dR: Array  # noqa: N815 (the weight of du)
+    y_bounds: tuple[Array, Array]
+    u_bounds: tuple[Array, Array]
+    du_bounds: tuple[Array, Array]
+    y_slack: Array
+    linear: dict[str, str | float]
+    references: str
+    disturbances: Disturbances
+    gamma: float
+    steady: Steady
+
+    @property
+    def moves(self) -> bool:
+        """True if moves of the inputs cost or are bounded, so that p has the last input."""
+        return bool(self.dR.any() or np.isfinite(self.du_bounds).any())
+
+    @property
+    def typical(self) -> float:
+        """The cost of a stage that is half of the bounds' distance off the target."""
+        y, u = half_range(self.y_bounds), half_range(self.u_bounds)
+        return float(y @ self.Q @ y + u @ (self.R + self.dR) @ u)
+
+    @property
+    def bounded(self) -> tuple[Array, Array]:
+        """Masks of the outputs and of the inputs with bounds, ``(n_y,)`` and ``(m,)``."""
+        y = np.isfinite(self.y_bounds).any(0) & (self.y_slack > 0)
+        return y, np.asarray(np.isfinite(self.u_bounds).any(0))
+
+    def places(self) -> dict[str, slice]:
+        """Return the places of the signals in a stage [d_k; x_k; u_k], see `LinearMPC`."""
+        n, m, n_y, n_d = self.plant.sizes
+        n_r = n_y if self.references == "preview" else 0
+        parts = {
+            "r": n_r,
+            "u_r": m if n_r and self.R.any() else 0,
+            "known": n_d,
+            "x": n,
+            "u_last": m if self.moves else 0,
+            "y_s": int(self.bounded[0].sum()),
+            "u_s": int(self.bounded[1].sum()),
+            "one": 1,
+            "u": m,
+        }
+        ends = np.cumsum([*parts.values()])
+        return {
+            name: slice(int(end) - size, int(end))
+            for (name, size), end in zip(parts.items(), ends, strict=True)
+        }
+
+    def selectors(self) -> dict[str, Array]:
+        """Return the rows that read each signal from a stage [d_k; x_k; u_k]."""
+        places = self.places()
+        unit = np.eye(places["u"].stop)
+        return {name: unit[place] for name, place in places.items()}
+
+
+def half_range(bounds: tuple[Array, Array]) -> Array:
+    """Return half the distance of the bounds, and one where there is none."""
+    half = (bounds[1] - bounds[0]) / 2
+    return np.where(np.isfinite(half) & (half > 0), half, 1.0)
+
+
+def read_design(
+    plant: StateSpace,
+    horizon: Any,
+    *,
+    Q: Any,
+    R: Any,
+    dR: Any,
+    y_bounds: Any,
+    u_bounds: Any,
+    du_bounds: Any,
+    y_slack: Any,
+    linear: Mapping[str, str | float] | None,
+    references: str,
+    disturbances: Any,
+    gamma: float,
+) -> Design:
+    """Return the design of the arguments of `LinearMPC`.
+
+    Raises:
+        QPError: an argument is invalid, or nothing has a cost.
+    """
+    check_whole("horizon", horizon, 1)
+    check_choice("references", references, REFERENCES)
+    check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
+    y, u = plant.outputs, plant.inputs
+    Q, R, dR = _weight("Q", Q, y), _weight("R", R, u), _weight("dR", dR, u)
+    prices = _prices(linear, plant)
+    if not (Q.any() or prices):
+        example = f"Q={{{y[0]!r}: 1.0}}, dR={{{u[0]!r}: 0.1}}"
+        remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
+        raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
+    slack = read_vector("y_slack", y_slack, y, 0.0)
+    if (slack < 0).any():
+        raise QPError.expected("y_slack", f"{slack.tolist()}", "prices >= 0, or inf for hard rows")
+    found = choose(plant, disturbances)
+    return Design(
+        plant,
+        int(horizon),
+        Q,
+        R,
+        dR,
+        _bounds("y_bounds", y_bounds, y),
+        _bounds("u_bounds", u_bounds, u),
+        _bounds("du_bounds", du_bounds, u),
+        slack,
+        prices,
+        references,
+        found,
+        gamma,
+        Steady.of(plant, found, Q, R),
+    )
+
+
+def _prices(linear: Mapping[str, str | float] | None, plant: StateSpace) -> dict[str, str | float]:
+    want = f"a mapping from inputs {plant.inputs} to numbers or known signals {plant.known}"
+    if linear is not None and not isinstance(linear, Mapping):
+        raise QPError.expected("linear", repr(linear), want)
+    for name, price in (linear or {}).items():
+        numeric = isinstance(price, int | float) and np.isfinite(price)
+        if name not in plant.inputs or not (numeric or price in plant.known):
+            raise QPError.expected("linear", f"{{{name!r}: {price!r}}}", want)
+        if not numeric and plant.E[:, plant.known.index(str(price))].any():
+            got, want = f"{price!r}, which acts on the plant", "a price with a column of zeros in E"
+            raise QPError.expected("linear", got, want, "Pass the signal twice.")
+    return dict(linear or {})
+
+
+def read_vector(name: str, value: Any, names: Sequence[str], missing: float) -> Array:
+    """Read one number for each name, from a number, a vector or a mapping."""
+    if isinstance(value, Mapping):
+        if unknown := sorted({*value} - {*names}):
+            raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
+        value = [value.get(x, missing) for x in names]
+    vector = read_numbers(name, value).numpy()
+    vector = np.full(len(names), float(vector)) if vector.ndim == 0 else vector.copy()
+    if vector.shape != (len(names),) or np.isnan(vector).any():
+        want = f"a number, or one for each of {', '.join(names)}"
+        raise QPError.expected(name, f"shape {vector.shape} or NaN", want)
+    return vector
+
+
+def _weight(name: str, value: Any, names: Sequence[str]) -> Array:
+    """Read a weight by name, as a number, a vector or a matrix, as a matrix."""
+    if value is None:
+        return np.zeros((len(names), len(names)))
+    if not isinstance(value, Mapping) and (matrix := as_tensor(name, value)).ndim == 2:
+        if matrix.shape != (len(names), len(names)):
+            got = f"shape {tuple(matrix.shape)}"
+            raise QPError.expected(name, got, f"({len(names)}, {len(names)})")
+        weight = matrix.detach().numpy().copy()
+    else:
+        weight = np.diag(read_vector(name, value, names, 0.0))
+    check_weight(name, torch.from_numpy(weight), diagonal=False, n_d=0)
+    return weight
+
+
+def _bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Array]:
+    """Read bounds as a mapping from names to pairs, or as one pair of numbers or vectors."""
+    if value is None:
+        value = {}
+    if not isinstance(value, Mapping):
+        pair = value
+    elif unknown := sorted({*value} - {*names}):
+        raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
+    else:
+        pairs = [value.get(x, (None, None)) for x in names]
+        if not all(isinstance(x, Sequence) and len(x) == 2 for x in pairs):
+            raise QPError.expected(name, repr(dict(value)), "pairs (lower, upper) by name")
+        pair = [
+            [limit if x is None else x for x in side]
+            for side, limit in zip(zip(*pairs, strict=True), (-np.inf, np.inf), strict=True)
+        ]
+    if not isinstance(pair, Sequence) or len(pair) != 2:
+        raise QPError.expected(name, repr(value), "the pair (lower, upper), or pairs by name")
+    lower, upper = (read_vector(f"{name}, side {i}", x, names, 0.0) for i, x in enumerate(pair))
+    if (lower > upper).any():
+        i = int(np.flatnonzero(lower > upper)[0])
+        got = f"lower {lower[i]:g} > upper {upper[i]:g} for {names[i]}"
+        raise QPError.expected(name, got, "lower <= upper", "The pair is (lower, upper).")
+    return lower, upper

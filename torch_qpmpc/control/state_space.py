@@ -1,0 +1,177 @@
+"""A plant's linear model, read from matrices, systems of control libraries or identifications."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.signal
+
+from torch_qpmpc.checks import check_number
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.identification import Identified
+from torch_qpmpc.mpc.validation import as_tensor
+
+Array = np.ndarray
+WANTED = "(A, B), (A, B, C_y), a control.StateSpace, scipy's dlti, or an identification"
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpace:
+    """A discrete linear model, x+ = A x + B u + E d + offset with outputs y = C x.
+
+    Attributes:
+        A, B, C, E: ``(n, n)``, ``(n, m)``, ``(n_y, n)`` and ``(n, n_d)``; d are known signals, such
+            as a measured disturbance or a price.
+        offset: ``(n,)``.
+        dt: the sampling time, or None.
+        inputs, outputs, known: names of the entries of u, y and d.
+
+    Raises:
+        QPError: the shapes do not match, or the names do not.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    E: Array
+    offset: Array
+    dt: float | None
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    known: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.A)
+        sizes = {"A": n, "B": len(self.inputs), "E": len(self.known)}
+        for name, columns in sizes.items():
+            if (got := getattr(self, name).shape) != (n, columns):
+                raise QPError.expected(name, f"shape {got}", f"({n}, {columns})")
+        if self.C.shape != (len(self.outputs), n):
+            raise QPError.expected("C_y", f"shape {self.C.shape}", f"({len(self.outputs)}, {n})")
+        names = (*self.inputs, *self.outputs, *self.known)
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            remedy = "Inputs, outputs and known signals are addressed by name."
+            raise QPError.expected("names", f"{twice[0]!r} twice", "different names", remedy)
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """n, m, n_y and n_d."""
+        return len(self.A), self.B.shape[1], len(self.C), self.E.shape[1]
+
+
+def read_model(
+    model: Any,
+    E: Any = None,
+    dt: float | None = None,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    known: Sequence[str] = (),
+) -> StateSpace:
+    """Return a plant's model from the forms that `LinearMPC` takes.
+
+    Args:
+        model: (A, B) or (A, B, C_y) in discrete time, of which (A, B) measures all states; a system
+            with matrices A, B, C and D, such as control.StateSpace; or an `Identified`.
+        E: the factor of known signals, ``(n, n_d)``.
+        dt: the sampling time; a continuous system is sampled with it, by zero-order hold.
+        inputs, outputs, known: names; by default the system's own, or u1, .. and y1, ... Inputs of
+            a system that are named in ``known`` become known signals.
+
+    Raises:
+        QPError: the model is of another kind, has a direct feedthrough, or needs another dt.
+    """
+    if dt is not None:
+        check_number("dt", dt, lambda x: 0 < x < np.inf, "a sampling time > 0")
+    if isinstance(model, StateSpace):
+        return model
+    offset = None
+    if isinstance(model, Identified):
+        A, B, C, E, offset = _of_arx(model)
+    elif isinstance(model, Sequence) and len(model) in (2, 3):
+        A, B, *rest = (_matrix(f"model[{i}]", x) for i, x in enumerate(model))
+        C = rest[0] if rest else np.eye(len(A))
+    else:
+        A, B, C, dt = _of_system(model, dt)
+        inputs = inputs or _labels(model, "input_labels", B.shape[1])
+        outputs = outputs or _labels(model, "output_labels", len(C))
+        if inputs and E is None and known:
+            if missing := sorted({*known} - {*inputs}):
+                raise QPError.expected("known", repr(missing[0]), f"inputs among {inputs}")
+            A, B, E, inputs = A, *_columns(B, inputs, known)
+    E = np.zeros((len(A), len(known))) if E is None else _matrix("E", E)
+    if E.shape[1] > len(known) and not known:
+        known = [f"d{i + 1}" for i in range(E.shape[1])]
+    inputs = inputs or [f"u{i + 1}" for i in range(B.shape[1])]
+    outputs = outputs or [f"y{i + 1}" for i in range(len(C))]
+    offset = np.zeros(len(A)) if offset is None else offset
+    return StateSpace(A, B, C, E, offset, dt, tuple(inputs), tuple(outputs), tuple(known))
+
+
+def _matrix(name: str, value: Any) -> Array:
+    matrix = as_tensor(name, value).detach().numpy().copy()
+    if matrix.ndim != 2:
+        raise QPError.expected(name, f"shape {matrix.shape}", "a matrix")
+    return matrix
+
+
+def _columns(B: Array, inputs: Sequence[str], known: Sequence[str]) -> tuple[Array, Array, list]:
+    """Split the inputs of a system into those that act and those that are known."""
+    acting = [name for name in inputs if name not in known]
+    order = {name: i for i, name in enumerate(inputs)}
+    return B[:, [order[x] for x in acting]], B[:, [order[x] for x in known]], acting
+
+
+def _labels(system: Any, name: str, size: int) -> list[str] | None:
+    labels = getattr(system, name, None)
+    return list(labels) if labels is not None and len(labels) == size else None
+
+
+def _of_system(system: Any, dt: float | None) -> tuple[Array, Array, Array, float | None]:
+    """Return A, B, C and dt of a system, sampled if it is continuous."""
+    if not hasattr(system, "A") and hasattr(system, "to_ss"):
+        system = system.to_ss()
+    if not all(hasattr(system, name) for name in "ABCD"):
+        remedy = "Convert a transfer function to state space first."
+        raise QPError.expected("model", type(system).__name__, WANTED, remedy)
+    A, B, C, D = (_matrix(f"model.{name}", getattr(system, name)) for name in "ABCD")
+    if D.any():
+        remedy = "Sample the output before the input changes, or add the input to the state."
+        raise QPError.expected("model", "a direct feedthrough D", "D = 0", remedy)
+    own = getattr(system, "dt", None)
+    if isinstance(system, scipy.signal.lti) or (own is not None and own is not True and own == 0):
+        if dt is None:
+            remedy = "It is sampled with that, by zero-order hold."
+            raise QPError.expected("dt", "None for a continuous model", "a sampling time", remedy)
+        n, m = B.shape
+        hold = scipy.linalg.expm(dt * np.pad(np.hstack((A, B)), ((0, m), (0, 0))))
+        return hold[:n, :n], hold[:n, n:], C, dt
+    if own is None:
+        remedy = "Set model.dt: 0 if it is continuous, True or a number if it is discrete."
+        raise QPError.expected("model", "no time base", "a continuous or discrete model", remedy)
+    if own is True:
+        return A, B, C, dt
+    if dt is not None and not np.isclose(dt, own):
+        remedy = "Leave dt out, or sample the model again."
+        raise QPError.expected("dt", repr(dt), f"the model's own {own:g}", remedy)
+    return A, B, C, float(own)
+
+
+def _of_arx(found: Identified) -> tuple[Array, Array, Array, Array, Array]:
+    """Return A, B, C, E and the offset of an ARX model in observer form, with states of outputs.
+
+    The first block of the state is y, and block i what the lags i, .., L of the past add to y.
+    """
+    A_lags, B_lags, E, offset = (np.asarray(x.detach()) for x in found.model)
+    n_y = len(A_lags)
+    lags = A_lags.shape[1] // n_y
+    first = np.concatenate(np.split(A_lags, lags, axis=1))
+    A = np.eye(n_y * lags, k=n_y)
+    A[:, :n_y] = first
+    B = np.concatenate(np.split(B_lags, lags, axis=1))
+    below = np.zeros((n_y * (lags - 1), E.shape[1]))
+    C = np.eye(n_y, n_y * lags)
+    return A, B, C, np.vstack((E, below)), np.concatenate((offset, np.zeros(len(below))))
