@@ -73,8 +73,8 @@ def test_the_gain_is_taken_at_the_given_state():
     mpc = QPMPC.from_model(
         A, B, 4, action_bounds=([-0.5], [0.5]), stage_weight=[9.0, 1.0, 0.01], solver="daqp"
     )
-    assert (read(mpc, at=torch.tensor([1.5, 1.0])).K == 0).all()
-    assert (read(mpc).K != 0).any()
+    assert (read(mpc, at=torch.tensor([1.5, 1.0])).K.abs() < 1e-12).all()
+    assert (read(mpc).K.abs() > 0.1).any()
 
 
 def test_printed_as_a_table():

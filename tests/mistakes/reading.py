@@ -161,7 +161,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "canonical_matrix: model": (
         lambda: canonical_matrix(form, stage_models(form)),
-        "A: got Model, expected a floating-point torch.Tensor. Convert it: torch.as_",
+        "A: got NearestModel, expected a floating-point torch.Tensor. Convert it: torch.as_",
     ),
     "canonical_matrix: batched": (
         lambda: canonical_matrix(
@@ -239,7 +239,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "read: model": (
         lambda: read(mpc, nearest_model(form)),
-        "true_model: got Model, expected the pair (A, B), (A, B, offset) or (A, B, offset, E).",
+        "true_model: got NearestModel, expected the pair (A, B), (A, B, offset)",
     ),
     "read: true 1": (
         lambda: read(mpc, (A2,)),
@@ -371,7 +371,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "one_step_error: model": (
         lambda: one_step_error((A2, B1), A2, B1),
-        "model: got tuple, expected a Model. Pass nearest_model(form), or stage_mode",
+        "model: got tuple, expected a NearestModel. Pass nearest_model(form), or stage_mode",
     ),
     "one_step_error: shape": (
         lambda: one_step_error(
