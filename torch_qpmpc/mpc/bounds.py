@@ -102,11 +102,13 @@ class Bounds:
         lower, upper = (
             layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], rates, strict=True)
         )
-        linear = (layout.n_mixed, layout.n_terminal)
+        n_linear = layout.n_mixed + layout.n_terminal
+        price = _matching_slack("constraint_slack", self.constraint_slack, n_linear)
         w = layout.rows(
             _matching_slack("state_slack", self.state_slack, n_x),
             _matching_slack("action_slack", self.action_slack, n_u),
-            *_matching_slack("constraint_slack", self.constraint_slack, sum(linear)).split(linear),
+            price[: layout.n_mixed],
+            price[layout.n_mixed :],
             _matching_slack("rate_slack", self.rate_slack, n_u)[: layout.n_rates],
         )
         G = LinearRows(layout, tied=True)(D[0], D_f[0])
