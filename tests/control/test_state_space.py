@@ -60,7 +60,10 @@ def test_the_state_space_of_an_identification_has_its_predictions():
     rng = np.random.default_rng(0)
     A, B, E, offset = (rng.normal(size=size) for size in ((2, 4), (2, 2), (2, 1), (2,)))
     arx = ARX(*(torch.from_numpy(x) for x in (A, B, E, offset)))
-    plant = read_model(Identified(arx, Mock(), Mock(), ()))
+    log = Log([], ("level", "flow"), ("pump",), ("rain",), dt=0.5)
+    plant = read_model(Identified(arx, Mock(), Mock(), log))
+    assert (plant.outputs, plant.inputs, plant.known) == (log.outputs, log.inputs, log.known)
+    assert plant.dt == 0.5
     y, u, d = [*rng.normal(size=(2, 2))], rng.normal(size=(6, 1)), rng.normal(size=(6, 1))
     x = np.concatenate((y[1], A[:, 2:] @ y[0] + B[:, 1:] @ u[0]))
     for k in range(1, 6):

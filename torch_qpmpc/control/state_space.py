@@ -75,7 +75,8 @@ def read_model(
 
     Args:
         model: (A, B) or (A, B, C_y) in discrete time, of which (A, B) measures all states; a system
-            with matrices A, B, C and D, such as control.StateSpace; or an `Identified`.
+            with matrices A, B, C and D, such as control.StateSpace; or an `Identified`, whose names
+            and dt are its log's.
         E: the factor of known signals, ``(n, n_d)``.
         dt: the sampling time; a continuous system is sampled with it, by zero-order hold.
         inputs, outputs, known: names; by default the system's own, or u1, .. and y1, ... Inputs of
@@ -91,6 +92,8 @@ def read_model(
     offset = None
     if isinstance(model, Identified):
         A, B, C, E, offset = _of_arx(model)
+        log, dt = model.log, model.log.dt if dt is None else dt
+        inputs, outputs, known = inputs or log.inputs, outputs or log.outputs, known or log.known
     elif isinstance(model, Sequence) and len(model) in (2, 3):
         A, B, *rest = (_matrix(f"model[{i}]", x) for i, x in enumerate(model))
         C = rest[0] if rest else np.eye(len(A))
@@ -160,12 +163,12 @@ def _of_system(system: Any, dt: float | None) -> tuple[Array, Array, Array, floa
     return A, B, C, float(own)
 
 
-def _of_arx(found: Identified) -> tuple[Array, Array, Array, Array, Array]:
+def _of_arx(identified: Identified) -> tuple[Array, Array, Array, Array, Array]:
     """Return A, B, C, E and the offset of an ARX model in observer form, with states of outputs.
 
     The first block of the state is y, and block i what the lags i, .., L of the past add to y.
     """
-    A_lags, B_lags, E, offset = (np.asarray(x.detach()) for x in found.model)
+    A_lags, B_lags, E, offset = (np.asarray(x.detach()) for x in identified.model)
     n_y = len(A_lags)
     lags = A_lags.shape[1] // n_y
     first = np.concatenate(np.split(A_lags, lags, axis=1))
