@@ -13,6 +13,7 @@ import torch
 
 from torch_qpmpc import Identified, QPError
 from torch_qpmpc.control.state_space import read_model
+from torch_qpmpc.mpc.log import Log
 from torch_qpmpc.mpc.predictor import ARX
 
 A, B = np.array([[0.0, 1.0], [-1.0, -0.5]]), np.array([[0.0], [1.0]])
@@ -64,6 +65,8 @@ def test_the_state_space_of_an_identification_has_its_predictions():
     plant = read_model(Identified(arx, Mock(), Mock(), log))
     assert (plant.outputs, plant.inputs, plant.known) == (log.outputs, log.inputs, log.known)
     assert plant.dt == 0.5
+    priced = read_model(Identified(arx, Mock(), Mock(), log), prices=["rain"])
+    assert not priced.E.any(), "a price acts on no plant"
     y, u, d = [*rng.normal(size=(2, 2))], rng.normal(size=(6, 1)), rng.normal(size=(6, 1))
     x = np.concatenate((y[1], A[:, 2:] @ y[0] + B[:, 1:] @ u[0]))
     for k in range(1, 6):

@@ -125,8 +125,9 @@ class LinearMPC(QPMPC):
             super().__init__(model, **options)
             self._start_targets()
             return
+        prices = linear.values() if isinstance(linear, Mapping) else ()
         design = read_design(
-            read_model(model, E, dt, inputs, outputs, known),
+            read_model(model, E, dt, inputs, outputs, known, prices),
             horizon,
             Q=Q,
             R=R,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,6 +70,7 @@ def read_model(
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
     known: Sequence[str] = (),
+    prices: Collection[Any] = (),
 ) -> StateSpace:
     """Return a plant's model from the forms that `LinearMPC` takes.
 
@@ -81,6 +82,7 @@ def read_model(
         dt: the sampling time; a continuous system is sampled with it, by zero-order hold.
         inputs, outputs, known: names; by default the system's own, or u1, .. and y1, ... Inputs of
             a system that are named in ``known`` become known signals.
+        prices: known signals that act on no plant: what an identification says of them is noise.
 
     Raises:
         QPError: the model is of another kind, has a direct feedthrough, or needs another dt.
@@ -94,6 +96,7 @@ def read_model(
         A, B, C, E, offset = _of_arx(model)
         log, dt = model.log, model.log.dt if dt is None else dt
         inputs, outputs, known = inputs or log.inputs, outputs or log.outputs, known or log.known
+        E = E * [name not in prices for name in known]
     elif isinstance(model, Sequence) and len(model) in (2, 3):
         A, B, *rest = (_matrix(f"model[{i}]", x) for i, x in enumerate(model))
         C = rest[0] if rest else np.eye(len(A))
