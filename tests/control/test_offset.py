@@ -1,7 +1,11 @@
-"""Steady states of closed loops of random plants, beside an independent search for the nearest."""
+"""Steady states of closed loops of random plants, beside an independent search for the nearest.
+
+The slow tests draw 25 plants; ``PLANTS=200 pytest -m slow tests/control/test_offset.py`` draws 200.
+"""
 
 from __future__ import annotations
 
+import os
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +15,7 @@ import scipy.linalg
 
 import torch_qpmpc as qm
 
+PLANTS = int(os.environ.get("PLANTS", "25"))
 #: The loop has settled when no state moves by more; it is cut off after so many steps.
 STILL, STEPS = 1e-11, 3000
 OFFSET = 1e-6
@@ -132,6 +137,6 @@ def test_the_loop_settles_at_the_set_point_or_the_nearest_outputs(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5, 200))
+@pytest.mark.parametrize("seed", range(5, PLANTS))
 def test_the_loops_of_many_plants_settle_there(seed):
     check(seed)
