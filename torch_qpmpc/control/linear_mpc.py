@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -155,6 +156,12 @@ class LinearMPC(QPMPC):
         """The `Design` of the arguments."""
         assert self.scheme.design is not None
         return self.scheme.design
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> QPMPC:
+        """Raise `QPError`: a saved file has the QP without its design; `QPMPC.load` reads it."""
+        remedy = "Make the LinearMPC again from its model, or load its QP with QPMPC.load."
+        raise QPError.expected("LinearMPC.load", str(path), "a file with a design", remedy)
 
     @torch.no_grad()
     def target(self, r: Any, w: Any = 0.0, known: Any = 0.0) -> Target:
