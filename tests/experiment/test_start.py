@@ -214,7 +214,8 @@ def test_a_stopped_run_resumes_number_for_number(tmp_path, monkeypatch):
 @pytest.mark.parametrize("algo", ["qlearning", "td3"])
 def test_any_environment_trains_from_its_id(tmp_path, algo):
     settings = [x for x in PENDULUM if not x.startswith("optimizer")]
-    run_command(*settings, f"algo={algo}", f"hydra.run.dir={tmp_path}")
+    own = ("task.episode_steps=null", "task.eval_steps=null", "figures=false")
+    run_command(*settings, *own, f"algo={algo}", f"hydra.run.dir={tmp_path}")
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["J_final"] > 0
 

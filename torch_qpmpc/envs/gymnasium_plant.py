@@ -21,6 +21,9 @@ from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
 from torch_qpmpc.checks import check_kind, check_seed, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 
+#: The length of episodes of an environment that has no limit of its own.
+STEPS = 200
+
 
 class GymnasiumPlant:
     """A Gymnasium environment as a plant: its observation is the state s, its reward -L.
@@ -33,6 +36,7 @@ class GymnasiumPlant:
     Attributes:
         id, kwargs: the arguments.
         lb_s, ub_s, lb_a, ub_a: the bounds of its spaces, ``(n_x,)`` and ``(n_u,)``.
+        max_steps: the environment's own ``max_episode_steps``; 200 if it has none.
 
     Raises:
         QPError: if the environment cannot be made, or has other spaces.
@@ -57,6 +61,7 @@ class GymnasiumPlant:
             raise QPError.expected("task.kwargs", repr(kwargs), expected, str(error)) from error
         self.lb_s, self.ub_s = self._bounds("observation", env.observation_space)
         self.lb_a, self.ub_a = self._bounds("action", env.action_space)
+        self.max_steps = (env.spec and env.spec.max_episode_steps) or STEPS
         env.close()
 
     def make(self, max_steps: int | None = None) -> gymnasium.Env[Any, Any]:
@@ -72,15 +77,16 @@ class GymnasiumPlant:
         low, high = (torch.as_tensor(x, dtype=torch.float64) for x in (space.low, space.high))
         return low, high
 
-    def vectorised(self, num_envs: int, max_steps: int, seed: int) -> EnvBase:
+    def vectorised(self, num_envs: int, max_steps: int | None, seed: int) -> EnvBase:
         """Make a TorchRL environment of ``num_envs`` episodes of at most ``max_steps`` steps.
 
-        ``seed`` seeds all of them.
+        None is the environment's own length. ``seed`` seeds all of them.
 
         Raises:
             QPError: a broken ``gym`` is installed beside Gymnasium.
         """
         check_whole("num_envs", num_envs, 1)
+        max_steps = self.max_steps if max_steps is None else max_steps
         check_whole("max_steps", max_steps, 1)
         check_seed(seed)
         # TorchRL resets by itself; Gymnasium's reset would lose an episode's last observation.
