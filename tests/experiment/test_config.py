@@ -321,7 +321,7 @@ def test_rivals_are_those_of_the_task():
     with pytest.raises(QPError, match=rf"rivals: got \['nobody'\], expected .* these: {known}"):
         check_config(make_config("task=four_tanks", "rivals=[nobody]"))
     with pytest.raises(QPError, match=r"rivals: got \['DeePC'\], expected true or false\."):
-        check_config(make_config("task=pendulum", "rivals=[DeePC]"))
+        check_config(make_config("task=actuator_noise", "rivals=[DeePC]"))
 
 
 def test_the_edges_are_accepted():

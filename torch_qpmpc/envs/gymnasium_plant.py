@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import gymnasium
+import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -102,6 +103,23 @@ class GymnasiumPlant:
             raise QPError.expected("the module gym", got, "none", remedy) from error
         env.set_seed(seed)
         return env
+
+    def is_reproducible(self, steps: int = 5, seed: int = 0) -> bool:
+        """Return True if two episodes with one seed and the same actions are equal."""
+
+        def episode() -> np.ndarray:
+            env = self.make()
+            env.action_space.seed(seed)
+            signals = [np.ravel(env.reset(seed=seed)[0])]
+            for _ in range(steps):
+                s, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+                signals += [np.ravel(s), np.array([float(reward)])]
+                if terminated or truncated:
+                    break
+            env.close()
+            return np.concatenate(signals)
+
+        return np.array_equal(episode(), episode(), equal_nan=True)
 
     def true_model(self) -> None:
         """Return None, as the plant can only be stepped."""
