@@ -155,6 +155,7 @@ def _train(
         gate.save(run.path)
         evaluation.evaluate(learner.policy, "candidate")
         summary = run_summary(evaluation, tally, gate)
+        summary |= {} if identified is None else identified.summary
         if cfg.export is not None and gate.mpc is not None:
             export_run(gate.mpc, run.path, quiet)
         run.finish(summary)

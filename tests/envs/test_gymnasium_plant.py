@@ -98,6 +98,20 @@ def test_further_arguments_are_those_of_its_environment():
     assert not torch.equal(angles(0.0), angles(10.0))
 
 
+def test_episodes_have_the_environments_own_length(register, monkeypatch):
+    assert GymnasiumPlant("Pendulum-v1").max_steps == 200
+    assert GymnasiumPlant("MountainCarContinuous-v0").max_steps == 999
+    assert GymnasiumPlant(register()).max_steps == 200, "no limit of its own"
+    limited = EnvSpec("Limited-v0", lambda **_: gymnasium.wrappers.TimeLimit(Counter(), 4))
+    monkeypatch.setitem(gymnasium.registry, "Limited-v0", limited)
+    plant = GymnasiumPlant("Limited-v0")
+    assert plant.max_steps == 4, "that of a wrapper"
+    env = plant.vectorised(1, None, seed=0)
+    assert env.rollout(9)["next", "done"].flatten().tolist() == [False] * 3 + [True]
+    env.close()
+    assert len(gymnasium_loop(lambda s: s[:, :1], plant, starts=2).costs) == 4
+
+
 def test_unknown_arguments_of_an_environment_are_an_error():
     match = r"task.kwargs: got {'weight': 2}, expected arguments of 'Pendulum-v1'. .* 'weight'"
     with pytest.raises(QPError, match=match):

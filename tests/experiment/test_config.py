@@ -291,9 +291,9 @@ for _name in ("task.horizon", "task.episode_steps", "task.eval_steps"):
     BAD[_name] = WHOLE
 for _name in ("scale_cost", "scale_constraints", "damping"):
     BAD[f"optimizer.{_name}"] = [0, *REAL]
-BAD["optimizer.trust_region"] = BAD["optimizer.normalise"] = BAD["task.one_weather"] = BAD[
-    "task.disturbed"
-] = FLAG
+for _name in ("optimizer.trust_region", "optimizer.normalise", "task.one_weather"):
+    BAD[_name] = FLAG
+BAD["task.disturbed"] = BAD["task.observation_bounds"] = FLAG
 BAD["task.past"], BAD["task.memory"] = WHOLE, WHOLE[1:]
 BAD["task.margin"] = BAD["task.model_error"] = REAL
 BAD["task.actuator_std"], BAD["task.a_max"] = REAL, [0, *REAL]
@@ -321,7 +321,7 @@ def test_rivals_are_those_of_the_task():
     with pytest.raises(QPError, match=rf"rivals: got \['nobody'\], expected .* these: {known}"):
         check_config(make_config("task=four_tanks", "rivals=[nobody]"))
     with pytest.raises(QPError, match=r"rivals: got \['DeePC'\], expected true or false\."):
-        check_config(make_config("task=pendulum", "rivals=[DeePC]"))
+        check_config(make_config("task=actuator_noise", "rivals=[DeePC]"))
 
 
 def test_the_edges_are_accepted():
@@ -549,6 +549,13 @@ def test_values_that_do_not_fit_each_other(overrides, message):
 
 def test_short_episodes_do_without_the_si_penalty():
     check_config(make_config("constraint=free", "task.episode_steps=5", "warmup_steps=1"))
+
+
+def test_a_gymnasium_task_has_episodes_of_the_environments_length():
+    check_config(make_config("task=gymnasium", "task.id=Pendulum-v1", "constraint=si"))
+    message = "task.eval_steps: got 0, expected a whole number >= 1"
+    with pytest.raises(QPError, match=message):
+        check_config(make_config("task=gymnasium", "task.id=Pendulum-v1", "task.eval_steps=0"))
 
 
 def test_flatten():

@@ -13,6 +13,7 @@ from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.metrics import report, structure_summary, table, theta_metrics
+from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics, true_model
 from torch_qpmpc.mpc.banded import banded_matrix
@@ -43,6 +44,27 @@ def test_table_has_the_rivals_and_all_digits_of_large_costs():
     assert lines[1].split()[:4] == ["J", "40827", "21.23", "1.000"]
     assert lines[4] == "J of the rivals"
     assert [line.split() for line in lines[5:]] == [["omniscient", "20.50"], ["thermostat", "1234"]]
+
+
+@pytest.mark.parametrize(
+    ("start", "learned", "last"),
+    [
+        (100.0, 60.0, "The start costs more than zero action: 100.0 against 70.00."),
+        (10.0, 80.0, "The learned policy costs more than zero action: 80.00 against 70.00."),
+        (
+            100.0,
+            math.nan,
+            "The start and the learned policy cost more than zero action: 100.0 and nan against "
+            "70.00.",
+        ),
+        (70.0 + 1e-9, 60.0, "  zero action     70.00"),
+    ],
+)
+def test_the_table_says_what_costs_more_than_zero_action(start, learned, last):
+    found = evaluation(start, learned, math.nan, **{ZERO_ACTION: 70.0})
+    assert table(found.summary()).splitlines()[-1] == last
+    found.rivals.clear()
+    assert "zero action" not in table(found.summary())
 
 
 @pytest.mark.parametrize(

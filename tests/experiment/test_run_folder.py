@@ -85,14 +85,14 @@ def test_folder_has_everything_logged(tmp_path):
 
 def test_summary_is_strict_json(tmp_path):
     with RunFolder(tmp_path, make_config()) as run:
-        run.finish({"closed_gap": math.nan, "J_final": math.inf, "J_start": 1.5})
+        run.finish({"closed_gap": math.nan, "J_start": 1.5, "rivals": {"zero action": math.inf}})
 
     def refuse(constant):
         raise AssertionError(constant)
 
     text = (tmp_path / "summary.json").read_text()
     summary = json.loads(text, parse_constant=refuse)
-    assert summary == {"closed_gap": None, "J_final": None, "J_start": 1.5}
+    assert summary == {"closed_gap": None, "J_start": 1.5, "rivals": {"zero action": None}}
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])

@@ -6,8 +6,11 @@ import json
 import signal
 from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
+from gymnasium.envs.registration import EnvSpec
 from omegaconf import DictConfig
 from torch.testing import assert_close
 
@@ -155,11 +158,29 @@ def test_the_fit_of_the_cost_is_shown():
     cfg = make_config(*PENDULUM, "start.transitions=1000")
     _, start, _ = start_of(cfg)
     assert start.cost is not None
-    assert (
-        str(start).splitlines()[-1] == f"stage cost fitted to the rewards: R2 {start.cost.R2:.3f}"
-    )
+    assert start.cost.after is not None
+    assert str(start).splitlines()[-1] == str(start.cost)
+    R2 = {"R2_cost": start.cost.now.R2, "R2_cost_next": start.cost.after.R2}
+    assert start.summary == {"log_episodes_cut": 0, **R2, "cost_of_next": start.cost.shifted}
     _, start, _ = start_of(make_config(*DATA))
     assert start.cost is None, "the task has its own"
+    assert start.summary == {"log_episodes_cut": 0}
+
+
+def test_episodes_that_blow_up_are_cut_and_counted():
+    cfg = make_config(*PENDULUM)
+    physics = make_physics(cfg)
+    log = collect_log(cfg, physics)
+    shorter = identified_start(cfg, physics, log[:, :40])
+    for key in ("observation", ("next", "observation"), ("next", "reward")):
+        log[key][:, 40:] = torch.nan  # of the fourth episode and of all later ones
+    start = identified_start(cfg, physics, log)
+    assert start.cut == 4 * 2
+    assert str(start).startswith("Episodes of the log that blow up, and are cut there: 8\n")
+    assert_close(start.identified.constraints.C, shorter.identified.constraints.C)
+    layout = Layout(3, 1, 3)
+    costs = [observed_cost(cfg, x.log, layout).c for x in (start, shorter)]
+    assert_close(*costs)
 
 
 def test_a_log_without_rewards_needs_a_weight():
@@ -214,9 +235,38 @@ def test_a_stopped_run_resumes_number_for_number(tmp_path, monkeypatch):
 @pytest.mark.parametrize("algo", ["qlearning", "td3"])
 def test_any_environment_trains_from_its_id(tmp_path, algo):
     settings = [x for x in PENDULUM if not x.startswith("optimizer")]
-    run_command(*settings, f"algo={algo}", f"hydra.run.dir={tmp_path}")
+    own = ("task.episode_steps=null", "task.eval_steps=null", "figures=false")
+    run_command(*settings, *own, f"algo={algo}", f"hydra.run.dir={tmp_path}")
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["J_final"] > 0
+
+
+class Walk(gymnasium.Env):
+    """A noisy integrator whose reward is of the next observation."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.y = self.np_random.standard_normal(1)
+        return self.y, {}
+
+    def step(self, action):
+        self.y = self.y + action + 0.3 * self.np_random.standard_normal(1)
+        return self.y, -float(self.y.item() ** 2 + 0.1 * action.item() ** 2), False, False, {}
+
+
+def test_a_reward_of_the_next_observation_gets_a_cost_of_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(gymnasium.registry, "Walk-v0", EnvSpec("Walk-v0", lambda **_: Walk()))
+    settings = ("task.id=Walk-v0", "start.transitions=1000", "constraint=free")
+    summary = train.train(make_config(*PENDULUM, *settings), str(tmp_path), quiet=True)
+    assert summary["cost_of_next"]
+    assert summary["R2_cost_next"] == pytest.approx(1)
+    assert summary["J_start"] < 0.7 * summary["rivals"]["zero action"]
+    start = FinishedRun(tmp_path).start
+    H = start.quadratic_program().H.diagonal()
+    assert_close(H[:3], torch.tensor([0.0, 0.2, 2.0]).double(), atol=1e-6, rtol=1e-6)
 
 
 def test_damaged_logs_are_named(tmp_path):

@@ -189,6 +189,10 @@ def test_a_model_on_the_command_line_is_that_of_the_qp():
     assert torch.equal(mpc.C_0, banded_matrix(A, B, 4))
     W = mpc.quadratic_program().H[:3, :3]
     torch.testing.assert_close(W, torch.diag(torch.tensor([2.0, 1, 1])).double())
+    assert mpc.ub[:3].tolist() == [torch.inf, torch.inf, 1], "of the actions only"
+    cfg.task.observation_bounds = True
+    bounded = make_mpc(cfg, make_physics(cfg))
+    torch.testing.assert_close(bounded.ub[:3], torch.tensor([0.6, 0.07, 1]).double())
 
 
 # Plants with previews and windows

@@ -159,20 +159,22 @@ def gymnasium_loop(
     policy: Callable[[Tensor], Tensor],
     plant: GymnasiumPlant,
     *,
-    steps: int = 200,
+    steps: int | None = None,
     starts: int = 32,
     seed: int = 123,
     gamma: float = 0.99,
 ) -> ClosedLoop:
     """Run ``policy`` as `closed_loop` does, in a Gymnasium environment; start i has seed + i.
 
-    After an episode's end its state stays constant, at no cost.
+    After an episode's end its state stays constant, at no cost. ``steps`` is by default the length
+    of the environment's own episodes.
 
     Raises:
         QPError: as in `closed_loop`.
     """
-    _check(policy, steps, starts, seed, gamma)
     check_kind("plant", plant, GymnasiumPlant, "Use closed_loop for a LinearSystem.")
+    steps = plant.max_steps if steps is None else steps
+    _check(policy, steps, starts, seed, gamma)
     envs = [plant.make(steps) for _ in range(starts)]
     s = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(envs)])
     over = np.zeros(starts, dtype=bool)

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import gymnasium
+import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -20,6 +21,9 @@ from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
 
 from torch_qpmpc.checks import check_kind, check_seed, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
+
+#: The length of episodes of an environment that has no limit of its own.
+STEPS = 200
 
 
 class GymnasiumPlant:
@@ -33,6 +37,7 @@ class GymnasiumPlant:
     Attributes:
         id, kwargs: the arguments.
         lb_s, ub_s, lb_a, ub_a: the bounds of its spaces, ``(n_x,)`` and ``(n_u,)``.
+        max_steps: the environment's own ``max_episode_steps``; 200 if it has none.
 
     Raises:
         QPError: if the environment cannot be made, or has other spaces.
@@ -57,6 +62,7 @@ class GymnasiumPlant:
             raise QPError.expected("task.kwargs", repr(kwargs), expected, str(error)) from error
         self.lb_s, self.ub_s = self._bounds("observation", env.observation_space)
         self.lb_a, self.ub_a = self._bounds("action", env.action_space)
+        self.max_steps = (env.spec and env.spec.max_episode_steps) or STEPS
         env.close()
 
     def make(self, max_steps: int | None = None) -> gymnasium.Env[Any, Any]:
@@ -72,15 +78,16 @@ class GymnasiumPlant:
         low, high = (torch.as_tensor(x, dtype=torch.float64) for x in (space.low, space.high))
         return low, high
 
-    def vectorised(self, num_envs: int, max_steps: int, seed: int) -> EnvBase:
+    def vectorised(self, num_envs: int, max_steps: int | None, seed: int) -> EnvBase:
         """Make a TorchRL environment of ``num_envs`` episodes of at most ``max_steps`` steps.
 
-        ``seed`` seeds all of them.
+        None is the environment's own length. ``seed`` seeds all of them.
 
         Raises:
             QPError: a broken ``gym`` is installed beside Gymnasium.
         """
         check_whole("num_envs", num_envs, 1)
+        max_steps = self.max_steps if max_steps is None else max_steps
         check_whole("max_steps", max_steps, 1)
         check_seed(seed)
         # TorchRL resets by itself; Gymnasium's reset would lose an episode's last observation.
@@ -96,6 +103,23 @@ class GymnasiumPlant:
             raise QPError.expected("the module gym", got, "none", remedy) from error
         env.set_seed(seed)
         return env
+
+    def is_reproducible(self, steps: int = 5, seed: int = 0) -> bool:
+        """Return True if two episodes with one seed and the same actions are equal."""
+
+        def episode() -> np.ndarray:
+            env = self.make()
+            env.action_space.seed(seed)
+            signals = [np.ravel(env.reset(seed=seed)[0])]
+            for _ in range(steps):
+                s, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+                signals += [np.ravel(s), np.array([float(reward)])]
+                if terminated or truncated:
+                    break
+            env.close()
+            return np.concatenate(signals)
+
+        return np.array_equal(episode(), episode(), equal_nan=True)
 
     def true_model(self) -> None:
         """Return None, as the plant can only be stepped."""

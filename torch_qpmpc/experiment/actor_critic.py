@@ -14,6 +14,7 @@ from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import DDPGLoss, LossModule, SACLoss, TD3Loss
 
+from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.learning.actor_critic import (
     ActionValue,
@@ -115,7 +116,8 @@ def make_critic(cfg: DictConfig, mpc: QPMPC, physics: AnyPlant) -> Any:
                 parameter.mul_(1 + SPREAD * torch.randn_like(parameter))
         return QPActorValueOperator(critic, preview_key=preview_key(mpc))
     # The network's output scale is the return of unit rewards; a wrong scale slows learning.
-    scale = sum(cfg.task.gamma**k for k in range(cfg.task.episode_steps))
+    steps = cfg.task.episode_steps or cast("GymnasiumPlant", physics).max_steps
+    scale = sum(cfg.task.gamma**k for k in range(steps))
     network = ActionValue(mpc.n_p, mpc.n_u, cfg.algo.width, scale)
     bounds = torch.stack((physics.lb_a, physics.ub_a))
     of_action = bounds.mean(0), (bounds[1] - bounds[0]) / 2

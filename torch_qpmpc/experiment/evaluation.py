@@ -6,6 +6,7 @@ All have the same starts and disturbances. All but the learned policy are evalua
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -15,6 +16,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
+from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_gap
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_true_mpc
@@ -23,6 +25,11 @@ from torch_qpmpc.mpc.module import QPMPC
 
 #: Functions that make a policy and its plant, by name.
 Policies = dict[str, Callable[[], tuple[Any, AnyPlant]]]
+UNPAIRED = (
+    "Two episodes of {id!r} with one seed and the same actions differ: policies are compared on "
+    "different episodes, and the gate's pairs are not pairs. Draw all of the environment's random "
+    "numbers from the seed of reset."
+)
 
 
 @dataclass(frozen=True)
@@ -48,7 +55,12 @@ class Evaluation:
         """Evaluate before learning, when ``mpc`` is the start and what has been learned.
 
         Unless ``quiet``, a bar shows which closed loop runs.
+
+        Warns:
+            UserWarning: the plant's episodes are not determined by their seeds.
         """
+        if isinstance(physics, GymnasiumPlant) and not physics.is_reproducible():
+            warnings.warn(UNPAIRED.format(id=physics.id), UserWarning, stacklevel=2)
         policies: Policies = {"start": lambda: (warm_policy(mpc), physics)}
         if (true_mpc := make_true_mpc(cfg, physics)) is not None:
             policies["true model"] = lambda: (warm_policy(true_mpc), physics)

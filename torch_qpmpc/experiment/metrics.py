@@ -23,6 +23,7 @@ from torch_qpmpc.experiment.plots import (
     learned_episode_figure,
     summary_figure,
 )
+from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tally import Stopwatch, Tally
 from torch_qpmpc.experiment.tasks import true_model
@@ -174,4 +175,22 @@ def table(summary: Mapping[str, Any]) -> str:
         width = max(map(len, rivals))
         lines += ["", "J of the rivals"]
         lines += [f"  {name:{width}}  {cost_text(J):>8}" for name, J in rivals.items()]
-    return "\n".join(lines)
+    return "\n".join(lines + _worse_than_zero(summary))
+
+
+def _worse_than_zero(summary: Mapping[str, Any]) -> list[str]:
+    """Return a sentence if zero action costs less than the start or the learned policy."""
+    zero = summary["rivals"].get(ZERO_ACTION, math.nan)
+    if math.isnan(zero):
+        return []
+    ends = {"start": summary["J_start"], "learned policy": summary["J_best"]}
+    worse = {
+        name: cost_text(J)
+        for name, J in ends.items()
+        if not (zero >= J or math.isclose(J, zero, rel_tol=1e-6, abs_tol=1e-9))
+    }
+    if not worse:
+        return []
+    names, verb = " and the ".join(worse), "costs" if len(worse) == 1 else "cost"
+    costs = " and ".join(worse.values())
+    return ["", f"The {names} {verb} more than zero action: {costs} against {cost_text(zero)}."]

@@ -90,18 +90,14 @@ class RunFolder:
         write_whole(self.path / "metrics.csv", table.encode())
         self.logger.flush()
 
-    def finish(self, summary: Mapping[str, float | int | str]) -> None:
+    def finish(self, summary: Mapping[str, Any]) -> None:
         """Write the outcome to the logger and to summary.json.
 
         JSON has no nan (no gap to close) and no inf; both are written as null.
         """
         self.logger.finish(summary)
         self.logger.flush()
-        finite = {
-            key: None if isinstance(value, float) and not math.isfinite(value) else value
-            for key, value in summary.items()
-        }
-        text = json.dumps(finite, indent=2, allow_nan=False)
+        text = json.dumps(_finite(summary), indent=2, allow_nan=False)
         # Written last and atomically: its presence marks the run as finished.
         write_whole(self.path / "summary.json", f"{text}\n".encode())
 
@@ -152,6 +148,13 @@ def _read_until(folder: Path, cfg: DictConfig, update: int) -> pd.DataFrame:
     if not table.index.is_monotonic_increasing or table.index.has_duplicates:
         raise _damaged(folder / "metrics.csv", "its updates do not increase")
     return table.loc[:update]
+
+
+def _finite(value: Any) -> Any:
+    """Replace numbers that are not finite by None."""
+    if isinstance(value, Mapping):
+        return {key: _finite(entry) for key, entry in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _damaged(file: Path, reason: str) -> QPError:

@@ -279,7 +279,7 @@ class QPMPC(nn.Module):
         starts = [found.arguments.get("start", {}), options.get("start") or {}]
         if arguments.get("stage_weight") is None:
             hessian, layout = options.get("hessian", "diagonal"), found.options.layout
-            fitted = fit_rewards(trajectories, layout, hessian == "diagonal")
+            fitted = fit_rewards(trajectories, layout, hessian == "diagonal").now
             cost = scheme_cost(fitted, layout, options.get("gamma", GAMMA), hessian)
             arguments["stage_weight"] = cost.stage_weight
             if arguments.get("terminal_weight") is None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import warnings
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,45 +12,115 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.stage_cost import StageCost, fit_stage_cost
-from torch_qpmpc.mpc.trajectories import logs, valid_steps
+from torch_qpmpc.mpc.trajectories import NEXT, logs, valid_steps
 
 REMEDY = (
     "Pass stage_weight (in train.py task.stage_weight), the weight W of the cost "
     "1/2 [x; u]' W [x; u], such as [1.0, 1.0, 0.1] for two states and an action."
 )
+UNUSABLE = (
+    "The rewards depend on the next observation, but a tied C and a Riccati weight need a cost of "
+    "the present one: choose constraint=free and another task.terminal_weight."
+)
+#: The least R2 without a warning, and the gain in R2 that is worth a cost of y_{k+1}.
+GOOD, GAIN = 0.9, 1e-3
 
 
-def fit_rewards(log: Any, layout: Layout, diagonal: bool = False) -> StageCost:
-    """Fit a stage cost of (d_k, y_k, u_k) to the rewards of a log, as `fit_stage_cost`.
+class RewardCost(NamedTuple):
+    """Stage costs fitted to rewards: of (d_k, y_k, u_k) and, unless None, of (y_{k+1}, u_k).
+
+    The second is used only if it is ``usable``. ``print`` shows R2 of both.
+    """
+
+    now: StageCost
+    after: StageCost | None = None
+    usable: bool = True
+
+    @property
+    def shifted(self) -> bool:
+        """True if the cost of (y_{k+1}, u_k) explains more and is usable."""
+        return self.usable and self._later
+
+    @property
+    def _later(self) -> bool:
+        return self.after is not None and self.after.R2 > self.now.R2 + GAIN
+
+    @property
+    def best(self) -> StageCost:
+        """The cost that is used."""
+        return self.after if self.after is not None and self.shifted else self.now
+
+    def __str__(self) -> str:
+        text = f"stage cost fitted to the rewards: R2 {self.now.R2:.3f}"
+        if self.after is not None:
+            used = "(y_(k+1), u_k)" if self.shifted else "(y_k, u_k)"
+            text += f" on (y_k, u_k), {self.after.R2:.3f} on (y_(k+1), u_k); the cost is of {used}"
+        if self._later and not self.usable:
+            text += f"\n{UNUSABLE}"
+        return text if self.best.R2 >= GOOD else f"{text}\n{_poor(self.best.R2)}"
+
+
+def fit_rewards(
+    log: Any, layout: Layout, diagonal: bool = False, after: bool = False, usable: bool = True
+) -> RewardCost:
+    """Fit stage costs to the rewards of a log, as `fit_stage_cost`.
 
     Args:
         log: logged steps, as in `read_trajectories`, with ``("next", "reward")``.
         layout: the sizes.
         diagonal: fit a diagonal W.
+        after: fit one of (y_{k+1}, u_k), too, without cross terms of both; not with known signals.
+        usable: use that one if it explains more.
 
     Raises:
         QPError: rewards are missing or not finite.
+
+    Warns:
+        UserWarning: R2 of the better one is below 0.9.
     """
-    v, cost = zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
-    return fit_stage_cost(torch.cat(v), torch.cat(cost), layout.n_d, diagonal)
+    d, y, u, following, cost = map(
+        torch.cat, zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
+    )
+    now, later = fit_stage_cost(torch.cat((d, y, u), -1), cost, layout.n_d, diagonal), None
+    if after and not layout.n_d:
+        v = torch.cat((following, u), -1)
+        later = fit_stage_cost(v, cost, diagonal=diagonal, n_apart=layout.n_u)
+    fitted = RewardCost(now, later, usable)
+    if not fitted.best.R2 >= GOOD:
+        warnings.warn(_poor(fitted.best.R2), UserWarning, stacklevel=2)
+    return fitted
 
 
-def scheme_cost(fitted: StageCost, layout: Layout, gamma: float, hessian: str) -> Cost:
-    """Return the cost of a scheme for that of a stage, which is that of x_N, too."""
+def scheme_cost(
+    fitted: StageCost, layout: Layout, gamma: float, hessian: str, shifted: bool = False
+) -> Cost:
+    """Return the cost of a scheme for that of a stage, which is that of x_N, too.
+
+    If it is ``shifted``, the stage's cost is of (x_{k+1}, u_k): its part of x is stage k + 1's,
+    divided by the discount, and x_0 has none.
+    """
     n_d, n_x, n_u, N = layout.n_d, layout.n_x, layout.n_u, layout.horizon
     diagonal = hessian == "diagonal"
     W = fitted.W[n_d:, n_d:].diagonal() if diagonal else fitted.W
     terminal = W[:n_x] if diagonal else W[: n_d + n_x, : n_d + n_x]
     d, x, u = fitted.q.split((n_d, n_x, n_u))
+    if shifted:
+        terminal, x = terminal / gamma, x / gamma
+        W = W.repeat(N, *[1] * W.ndim)
+        of_x = (slice(None), *[slice(n_x)] * terminal.ndim)
+        W[of_x] = terminal
+        W[0][of_x[1:]] = 0
     past = fitted.q.new_zeros(layout.n_before - layout.n_preview)
     stages = layout.stages(x.expand(N + 1, -1), u)
-    ahead = gamma ** torch.arange(N + 1, dtype=torch.float64)
+    if shifted:
+        stages[:n_x] = 0
+    ahead = gamma ** torch.arange(N if shifted else N + 1, dtype=torch.float64)
     q = torch.cat((d.repeat(N + 1), past, stages))
     return Cost(W, terminal, hessian, q=q, c=fitted.c * ahead.sum())
 
 
-def _observed(steps: Any, layout: Layout) -> tuple[Tensor, Tensor]:
-    """Return [d; y; u] and the costs of the steps that are not padding."""
+def _observed(steps: Any, layout: Layout) -> tuple[Tensor, ...]:
+    """Return d, y, u, the next y and the costs of the steps that are not padding."""
     reward = steps.get(("next", "reward"), None) if hasattr(steps, "batch_size") else None
     if reward is None:
         raise _unfitted("a log without rewards")
@@ -57,11 +128,19 @@ def _observed(steps: Any, layout: Layout) -> tuple[Tensor, Tensor]:
     reward = reward.detach().cpu().reshape(steps.shape)[kept].double()
     if not reward.isfinite().all():
         raise _unfitted("a log with rewards of NaN or inf")
-    parts = [steps["observation"][..., -layout.n_x :], steps["action"]]
-    if layout.n_d:
-        parts.insert(0, steps["preview"][..., : layout.n_d])
-    v = torch.cat([part.detach().cpu().double() for part in parts], dim=-1)
-    return v[kept], -reward
+    u = steps["action"]
+    d = steps["preview"][..., : layout.n_d] if layout.n_d else u[..., :0]
+    y, following = (steps[key][..., -layout.n_x :] for key in ("observation", NEXT))
+    parts = (part.detach().cpu().double()[kept] for part in (d, y, u, following))
+    return *parts, -reward
+
+
+def _poor(R2: float) -> str:
+    return (
+        f"The fitted stage cost explains {R2:.1%} of the rewards' variance: the controller "
+        "minimises another cost than the plant's. Pass the plant's own cost as stage_weight, in "
+        "train.py task.stage_weight, or a log about the states where the controller is to work."
+    )
 
 
 def _unfitted(got: str) -> QPError:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -25,8 +24,8 @@ ZERO, HARMLESS = 1e-9, 1e-6
 RIDGE = 1e-6
 #: L-BFGS: the smallest eigenvalue that it starts from, its tolerance and its iterations.
 FLOOR, TOLERANCE, ITERATIONS = 1e-2, 1e-9, 500
-#: The largest magnitude of data, whose squares are finite, and the least R2 without a warning.
-LARGEST, GOOD = 1e100, 0.9
+#: The largest magnitude of data, whose squares are finite.
+LARGEST = 1e100
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +49,6 @@ class StageCost:
     def __call__(self, v: Tensor) -> Tensor:
         """Return the costs ``(*batch,)`` of v ``(*batch, n)``."""
         return (v @ self.W * v).sum(-1) / 2 + v @ self.q + self.c
-
-    def __str__(self) -> str:
-        more = "" if self.R2 >= GOOD else f"\n{_poor(self.R2)}"
-        return f"stage cost fitted to the rewards: R2 {self.R2:.3f}{more}"
 
 
 class _Observed(NamedTuple):
@@ -86,7 +81,9 @@ class _Observed(NamedTuple):
         return W[self.n_free :, self.n_free :]
 
 
-def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = False) -> StageCost:
+def fit_stage_cost(
+    v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = False, n_apart: int = 0
+) -> StageCost:
     """Fit a stage cost whose W is positive semidefinite, except in its first rows and columns.
 
     It is ridge regression about a typical v, in units in which columns have unit variance. The
@@ -100,12 +97,11 @@ def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = Fa
         n_free: the number of first entries of v, such as those of d, whose rows and columns of W
             have any sign; they are zero in a diagonal W.
         diagonal: fit a diagonal W.
+        n_apart: the number of last entries of v, such as those of u, without cross terms with the
+            others.
 
     Raises:
         QPError: an argument has another shape, or entries that are not finite or too large.
-
-    Warns:
-        UserWarning: R2 is below 0.9.
     """
     v, cost = _checked(v, cost, n_free, diagonal)
     n = v.shape[1]
@@ -115,14 +111,13 @@ def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = Fa
     rows, columns = torch.triu_indices(n, n)
     # A diagonal W has no entries of d.
     kept = (rows == columns) & (rows >= n_free) if diagonal else rows >= 0
+    kept &= (rows < n - n_apart) == (columns < n - n_apart)
     rows, columns = rows[kept], columns[kept]
     seen = _Observed((v - middle) * scale, cost / unit, rows, columns, rows < n_free, n_free)
     W, q, c = _fit(seen)
     W, q, c = unit * W * scale * scale.unsqueeze(-1), unit * q * scale, unit * c
     fitted = StageCost(W, q - W @ middle, c - q @ middle + middle @ W @ middle / 2)
     R2 = _adjusted_R2(cost, cost - fitted(v), 1 + n + len(rows))
-    if not R2 >= GOOD:
-        warnings.warn(_poor(R2), UserWarning, stacklevel=2)
     return StageCost(fitted.W, fitted.q, fitted.c, R2)
 
 
@@ -155,14 +150,6 @@ def _adjusted_R2(cost: Tensor, error: Tensor, coefficients: int) -> float:
     if spread.sqrt() <= 1e-12 * cost.norm():
         return 1.0  # of a constant cost
     return (1 - error.square().sum() / spread * (m - 1) / (m - coefficients)).item()
-
-
-def _poor(R2: float) -> str:
-    return (
-        f"The fitted stage cost explains {R2:.1%} of the rewards' variance: the controller "
-        "minimises another cost than the plant's. Pass the plant's own cost as stage_weight, in "
-        "train.py task.stage_weight, or a log about the states where the controller is to work."
-    )
 
 
 def _fit(seen: _Observed) -> tuple[Tensor, Tensor, Tensor]:

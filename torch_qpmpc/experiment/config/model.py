@@ -122,7 +122,7 @@ class Config(Group):
             return self
         long_enough = f"at least task.horizon = {self.task.horizon}"
         remedy = "constraint.si needs windows of task.horizon steps."
-        if self.task.episode_steps < self.task.horizon:
+        if (self.task.episode_steps or self.task.horizon) < self.task.horizon:
             self.conflict("task.episode_steps", long_enough, remedy)
         if self.warmup_steps < self.task.horizon:
             self.conflict("warmup_steps", long_enough, remedy)

@@ -6,8 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
+#: The name of `zero_action` among a task's rivals.
+ZERO_ACTION = "zero action"
 #: Maps p ``(starts, n_p)`` to actions ``(starts, n_u)``; see `plant_loop`.
 Policy = Callable[[Tensor], Tensor]
 
@@ -28,5 +31,11 @@ class Rival:
 
     def of(self, plant: Any) -> tuple[Policy, Any]:
         """Return the policy, and the plant that it sees."""
-        seen = replace(plant, **self.sees)
+        seen = replace(plant, **self.sees) if self.sees else plant
         return self.make(seen), seen
+
+
+def zero_action(plant: Any) -> Policy:
+    """Make the policy that applies zero or, if the bounds exclude it, the nearest action."""
+    action = torch.zeros_like(plant.lb_a).clamp(plant.lb_a, plant.ub_a)
+    return lambda s: action.expand(len(s), -1)

@@ -11,7 +11,8 @@ from pydantic import AfterValidator
 from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.closed_loop import gymnasium_loop
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.fields import MATRIX, Expected, Matrix
+from torch_qpmpc.experiment.fields import MATRIX, Count, Expected, Flag, Matrix
+from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION, Rival, zero_action
 from torch_qpmpc.experiment.tasks.code import has_run
 from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, plant_scheme, register
 from torch_qpmpc.mpc.model import Model
@@ -28,8 +29,18 @@ def _is_chosen(id: str) -> str:
 Given = Annotated[Matrix | None, MATRIX]
 
 
+#: The length of episodes; null for the environment's own.
+Steps = Annotated[Count | None, Expected("a whole number >= 1, or null")]
+
+
 class GymnasiumSettings(TaskSettings):
     """The keys of the environment and its linear model."""
+
+    # Narrower in other tasks, whose plants have no length of their own.
+    episode_steps: Steps  # pyright: ignore[reportIncompatibleVariableOverride]
+    eval_steps: Steps  # pyright: ignore[reportIncompatibleVariableOverride]
+    #: Take the bounds of the observation space as constraints.
+    observation_bounds: Flag
 
     id: Annotated[
         str,
@@ -71,7 +82,8 @@ def make_plant(cfg: DictConfig) -> GymnasiumPlant:
 def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
     """Read the model and the weight from the task's configuration, the bounds from the spaces.
 
-    With ``start=data``, those that are null are None.
+    With ``start=data``, those that are null are None. The bounds of the observations count with
+    ``task.observation_bounds`` only.
 
     Raises:
         QPError: a matrix is missing, or does not have the shape of the environment's spaces.
@@ -95,7 +107,9 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
         )
         raise QPError.expected("task.id", f"{spaces}, with {got}", expected, REMEDY)
     model = Model(matrices["A"], matrices["B"])
-    return plant_scheme(cfg, plant, model, matrices["stage_weight"])
+    unbounded = torch.full_like(plant.lb_s, torch.inf)
+    states = None if cfg.task.observation_bounds else (-unbounded, unbounded)
+    return plant_scheme(cfg, plant, model, matrices["stage_weight"], states)
 
 
 register(
@@ -104,6 +118,7 @@ register(
         make_plant,
         given_scheme,
         closed_loop=gymnasium_loop,
+        rivals={ZERO_ACTION: Rival(zero_action)},
         settings=GymnasiumSettings,
         defaults=None,
     )

@@ -9,32 +9,48 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
+from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task, plant_layout
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
-from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
+from torch_qpmpc.mpc.rewards import RewardCost, fit_rewards, scheme_cost
 from torch_qpmpc.mpc.scheme import Scheme
-from torch_qpmpc.mpc.stage_cost import StageCost
+from torch_qpmpc.mpc.trajectories import valid_steps
 
 
 class Start(NamedTuple):
     """A log of the task's plant, and the model and, if the task has none, the cost fitted to it.
 
-    ``print`` shows the errors of both.
+    ``cut`` is the number of the log's episodes that blow up. ``print`` shows it and the errors of
+    the model and the cost.
     """
 
     log: Any
     identified: Identified
-    cost: StageCost | None = None
+    cost: RewardCost | None = None
+    cut: int = 0
 
     def __str__(self) -> str:
-        return "\n".join(str(part) for part in self[1:] if part is not None)
+        cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
+        parts = (cut if self.cut else None, self.identified, self.cost)
+        return "\n".join(str(part) for part in parts if part is not None)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The entries of summary.json: the fits of the cost, and the episodes that are cut."""
+        entries: dict[str, Any] = {"log_episodes_cut": self.cut}
+        if self.cost is None:
+            return entries
+        now, after = self.cost.now, self.cost.after
+        R2 = {"R2_cost": now.R2, "R2_cost_next": torch.nan if after is None else after.R2}
+        return entries | R2 | {"cost_of_next": self.cost.shifted}
 
 
 def identified_start(cfg: DictConfig, physics: AnyPlant, log: Any) -> Start:
     """Identify C, b and a missing stage cost from a log of the plant; `identify` names errors."""
+    log, cut = without_blow_ups(log) if isinstance(log, TensorDictBase) else (log, 0)
     layout = plant_layout(physics, cfg.task.horizon)
     identified = identify(
         log,
@@ -48,8 +64,8 @@ def identified_start(cfg: DictConfig, physics: AnyPlant, log: Any) -> Start:
     )
     cost = None
     if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is None:
-        cost = fit_rewards(log, identified.options.layout, cfg.task.hessian == "diagonal")
-    return Start(log, identified, cost)
+        cost = _fitted(cfg, log, identified.options.layout)
+    return Start(log, identified, cost, cut)
 
 
 def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
@@ -67,7 +83,7 @@ def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
 
 
 def observed_cost(
-    cfg: DictConfig, log: TensorDictBase, layout: Layout, fitted: StageCost | None = None
+    cfg: DictConfig, log: TensorDictBase, layout: Layout, fitted: RewardCost | None = None
 ) -> Cost:
     """Return the cost of a scheme from that of a stage, by default fitted to the log's rewards.
 
@@ -77,13 +93,20 @@ def observed_cost(
     Raises:
         QPError: as in `fit_rewards`.
     """
-    diagonal, gamma = cfg.task.hessian == "diagonal", cfg.task.gamma
-    fitted = fit_rewards(log, layout, diagonal) if fitted is None else fitted
-    cost = scheme_cost(fitted, layout, gamma, cfg.task.hessian)
+    gamma = cfg.task.gamma
+    fitted = _fitted(cfg, log, layout) if fitted is None else fitted
+    cost = scheme_cost(fitted.best, layout, gamma, cfg.task.hessian, fitted.shifted)
     if gamma < 1:
-        mean = -log["next", "reward"].double().mean()
-        cost = replace(cost, c=cost.c + gamma ** (layout.horizon + 1) / (1 - gamma) * mean)
+        mean = -log["next", "reward"].reshape(log.shape)[valid_steps(log)].double().mean()
+        stages = layout.horizon + (not fitted.shifted)
+        cost = replace(cost, c=cost.c + gamma**stages / (1 - gamma) * mean)
     if cfg.task.terminal_weight != "riccati":
         return cost
     q = torch.cat((cost.q[: -layout.n_x], 0 * cost.q[-layout.n_x :]))
     return replace(cost, terminal_weight=None, q=q)
+
+
+def _fitted(cfg: DictConfig, log: TensorDictBase, layout: Layout) -> RewardCost:
+    """Fit the costs of a stage; with a tied C or a Riccati weight all stages have the same."""
+    usable = cfg.constraint.structure == "free" and cfg.task.terminal_weight != "riccati"
+    return fit_rewards(log, layout, cfg.task.hessian == "diagonal", after=True, usable=usable)
