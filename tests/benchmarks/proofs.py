@@ -1,6 +1,6 @@
 """Worst cases of policies beside a million samples: effort, and the size at which it is too much.
 
-    python -m tests.benchmarks.proofs --write
+    python -m tests.benchmarks.proofs --problems 'double integrator' --horizons 3 5 --write
 
 Each row asks for the largest violation of the state's bounds from a box of starts, with noise, and
 attacks the bound by a million starts with noise at its corners, and by gradient ascent from the
@@ -144,6 +144,7 @@ def measured(name: str, horizon: int, structure: str, steps: int) -> list[str]:
 def main(arguments: list[str] | None = None) -> int:
     """Print the table, or write it into the docs."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.proofs", description=__doc__)
+    parser.add_argument("--problems", nargs="*", choices=PROBLEMS, default=list(PROBLEMS))
     parser.add_argument("--horizons", type=int, nargs="*", default=[3, 5, 10])
     parser.add_argument("--steps", type=int, nargs="*", default=[1, 2])
     parser.add_argument("--write", action="store_true", help="write the table into the docs")
@@ -153,7 +154,7 @@ def main(arguments: list[str] | None = None) -> int:
         ["problem", "steps", "worst case", "bound", "attack", "binaries / nodes", "CPU, s"],
         ["---", *["---:"] * 6],
     ]
-    for name in PROBLEMS:
+    for name in options.problems:
         for horizon in options.horizons:
             for structure in ("tied", "free"):
                 for steps in options.steps:

@@ -105,7 +105,12 @@ class GymnasiumPlant:
         return env
 
     def is_reproducible(self, steps: int = 5, seed: int = 0) -> bool:
-        """Return True if two episodes with one seed and the same actions are equal."""
+        """Return True if two episodes with one seed and the same actions are equal.
+
+        Args:
+            steps: the largest number of steps of an episode.
+            seed: the seed of its reset and of its random actions.
+        """
 
         def episode() -> np.ndarray:
             env = self.make()
