@@ -1,6 +1,6 @@
 """Worst cases of policies beside a million samples: effort, and the size at which it is too much.
 
-    python -m tests.benchmarks.proofs --problems 'double integrator' --horizons 3 5 --write
+    python -m tests.benchmarks.proofs --problems 'double integrator' --horizons 3 --write
 
 Each row asks for the largest violation of the state's bounds from a box of starts, with noise, and
 attacks the bound by a million starts with noise at its corners, and by gradient ascent from the
