@@ -155,8 +155,7 @@ def _tighten(program: Program, tables: Tables, p: Affine, reach: Reach) -> None:
     rows = tables.rows
 
     def most(of: Affine, i: int, sign: float) -> float:
-        one = Affine(of.columns, sign * of.matrix[i : i + 1], sign * of.constant[i : i + 1])
-        bound = relaxed.maximise(one, relaxed=True).bound
+        bound = relaxed.maximise(of.part([i]).times(sign * np.eye(1)), relaxed=True).bound
         return bound + MARGIN * (1 + abs(bound))
 
     for i in range(len(rows)):
@@ -196,23 +195,19 @@ def _add_rows(
             continue
         # held = 0: no force. held = 1: y at the bound or beyond it.
         held = program.add(np.zeros(len(at)), np.ones(len(at)), binary=True)
-        program.constrain(_part(force, at) + held.times(np.diag(-most[at])), upper=0.0)
-        signed = _part(y.times(sign * np.eye(r)), at)
+        program.constrain(force.part(at) + held.times(np.diag(-most[at])), upper=0.0)
+        signed = y.part(at).times(sign * np.eye(len(at)))
         gap = np.maximum(bound[at] - least[at], 0.0)
         program.constrain(signed + held.times(np.diag(-gap)), lower=bound[at] - gap)
         # beyond = 0: y within the bound. beyond = 1: the force is the price w.
         soft = np.flatnonzero(~hard[at] & (most[at] >= rows.w[at]))
         within = np.setdiff1d(np.arange(len(at)), soft)
-        program.constrain(_part(signed, within), upper=bound[at][within])
+        program.constrain(signed.part(within), upper=bound[at][within])
         if len(soft):
             beyond = program.add(np.zeros(len(soft)), np.ones(len(soft)), binary=True)
             w, over = rows.w[at][soft], (largest - bound)[at][soft]
-            program.constrain(_part(force, at[soft]) + beyond.times(np.diag(-w)), lower=0.0)
+            program.constrain(force.part(at[soft]) + beyond.times(np.diag(-w)), lower=0.0)
             program.constrain(
-                _part(signed, soft) + beyond.times(np.diag(-over)), upper=bound[at][soft]
+                signed.part(soft) + beyond.times(np.diag(-over)), upper=bound[at][soft]
             )
     return lam, (y, up, low)
-
-
-def _part(rows: Affine, at: Array) -> Affine:
-    return Affine(rows.columns, rows.matrix[at], rows.constant[at])

@@ -37,6 +37,10 @@ class Affine:
         """Multiply by a matrix ``(l, m)`` from the left."""
         return Affine(self.columns, left @ self.matrix, left @ self.constant)
 
+    def part(self, rows: Array | list[int]) -> Affine:
+        """Return some of the rows."""
+        return Affine(self.columns, self.matrix[rows], self.constant[rows])
+
     def plus(self, constant: Array) -> Affine:
         """Add a constant ``(m,)``."""
         return Affine(self.columns, self.matrix, self.constant + constant)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError, SolverError
-from torch_qpmpc.export.tables import make_tables
+from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.proofs.encoding import encode
 from torch_qpmpc.proofs.polytope import Polytope
@@ -207,21 +206,15 @@ def largest_difference(
     p, vertices = _known(program, states), states.vertices()
     u, other = (encode(program, make_tables(mpc), p, vertices) for mpc in (first, second))
     difference = u + other.times(-np.eye(first.n_u))
-    goals = np.concatenate((np.eye(first.n_u), -np.eye(first.n_u)))
-    value, bound, nodes, at = -np.inf, -np.inf, 0, np.full(n, np.nan)
-    for goal in goals:
-        maximum = program.maximise(difference.times(goal[None]), seconds=seconds)
-        bound, nodes = max(bound, maximum.bound), nodes + maximum.nodes
-        if not np.isfinite(maximum.value):
-            continue
-        state = p.at(maximum.x)
-        reached = float(goal @ (_policy(first, state) - _policy(second, state)))
-        _compare(reached, maximum)
-        if reached > value:
-            value, at = reached, state
-    effort = time.perf_counter() - began, nodes, program.binaries
-    question = "largest difference of the policies"
-    return Answer(question, value, bound, at.reshape(1, n), (), *effort)
+    signs = np.concatenate((np.eye(first.n_u), -np.eye(first.n_u)))
+
+    def replay(x: Array) -> tuple[Array, Array, tuple[Array, ...]]:
+        at = p.at(x)
+        return signs @ (_policy(first, at) - _policy(second, at)), at[None], ()
+
+    worst = _Worst(np.full((1, n), np.nan))
+    worst.maximise(program, difference.times(signs), replay, seconds)
+    return worst.answer("largest difference of the policies", time.perf_counter() - began)
 
 
 def _check(mpc: QPMPC, states: Polytope) -> int:
@@ -266,34 +259,82 @@ def _worst(
     if steps < 1 or len(plants) ** steps > MOST_MODELS:
         got = f"{steps} steps of {len(plants)} plants"
         raise QPError.expected("steps", got, f"at least one step, and {MOST_MODELS} combinations")
-    began, tables = time.perf_counter(), make_tables(mpc)
-    value, bound, nodes, binaries = -np.inf, -np.inf, 0, 0
-    path, pushes = np.full((steps + 1, mpc.n_p), np.nan), ()
-    for models in itertools.product(plants, repeat=steps):
-        program = Program()
-        p, noise = _known(program, states), []
-        start, vertices = p, states.vertices()
-        for i, model in enumerate(models):
-            u = encode(program, tables, p, vertices)
-            p = (p.times(model.A) + u.times(model.B)).plus(model.offset)
-            if model.disturbances is not None:
-                d = _known(program, model.disturbances)
-                noise.append(d)
-                p = p + d.times(model.E)
-            if i < steps - 1:
-                vertices = _reached(program, p).vertices()
-        binaries = max(binaries, program.binaries)
-        for row, right in zip(A, b, strict=True):
-            maximum = program.maximise(p.times(row[None]).plus(-right[None]), seconds=seconds)
-            bound, nodes = max(bound, maximum.bound), nodes + maximum.nodes
+    began, tables, program = time.perf_counter(), make_tables(mpc), Program()
+    start = _known(program, states)
+    worst = _Worst(np.full((steps + 1, mpc.n_p), np.nan))
+    for branch in _branches(program, tables, start, states.vertices(), plants, steps):
+
+        def replay(x: Array, branch: _Branch = branch) -> tuple[Array, Array, tuple[Array, ...]]:
+            noise = tuple(np.zeros(0) if d is None else d.at(x) for d in branch.noise)
+            run = _replay(mpc, branch.models, start.at(x), noise)
+            return A @ run[-1] - b, run, noise
+
+        worst.maximise(branch.program, branch.p.times(A).plus(-b), replay, seconds)
+    return worst.answer(question, time.perf_counter() - began)
+
+
+class _Branch(NamedTuple):
+    """A program of one plant for each step, its last p, the plants and their disturbances."""
+
+    program: Program
+    p: Affine
+    models: tuple[Plant, ...]
+    noise: tuple[Affine | None, ...]
+
+
+def _branches(
+    program: Program,
+    tables: Tables,
+    p: Affine,
+    vertices: Array,
+    plants: Sequence[Plant],
+    steps: int,
+) -> Iterator[_Branch]:
+    """Add the policy and each plant for so many steps from p, in the hull of the vertices."""
+    u = encode(program, tables, p, vertices)
+    for model in plants:
+        branch = program.copy()
+        following = (p.times(model.A) + u.times(model.B)).plus(model.offset)
+        d = None if model.disturbances is None else _known(branch, model.disturbances)
+        if d is not None:
+            following = following + d.times(model.E)
+        if steps == 1:
+            yield _Branch(branch, following, (model,), (d,))
+            continue
+        reached = _reached(branch, following).vertices()
+        for rest in _branches(branch, tables, following, reached, plants, steps - 1):
+            yield rest._replace(models=(model, *rest.models), noise=(d, *rest.noise))
+
+
+class _Worst:
+    """The largest of several maxima, each replayed by the policies; ``run`` has no point yet."""
+
+    def __init__(self, run: Array) -> None:
+        self.value, self.bound, self.nodes, self.binaries = -np.inf, -np.inf, 0, 0
+        self.run, self.noise = run, ()
+
+    def maximise(
+        self,
+        program: Program,
+        rows: Affine,
+        replay: Callable[[Array], tuple[Array, Array, tuple[Array, ...]]],
+        seconds: float,
+    ) -> None:
+        """Maximise each row; ``replay`` maps variables to all rows' values, the run and its d."""
+        self.binaries = max(self.binaries, program.binaries)
+        for i in range(len(rows.constant)):
+            maximum = program.maximise(rows.part([i]), seconds=seconds)
+            self.bound, self.nodes = max(self.bound, maximum.bound), self.nodes + maximum.nodes
             if not np.isfinite(maximum.value):
                 continue
-            run, d = _replay(mpc, models, start.at(maximum.x), [x.at(maximum.x) for x in noise])
-            _compare(float(row @ run[-1] - right), maximum)
-            if (reached := float((A @ run[-1] - b).max())) > value:
-                value, path, pushes = reached, run, d
-    effort = time.perf_counter() - began, nodes, binaries
-    return Answer(question, value, bound, path, pushes, *effort)
+            values, run, noise = replay(maximum.x)
+            _compare(float(values[i]), maximum)
+            if values.max() > self.value:
+                self.value, self.run, self.noise = float(values.max()), run, noise
+
+    def answer(self, question: str, seconds: float) -> Answer:
+        effort = seconds, self.nodes, self.binaries
+        return Answer(question, self.value, self.bound, self.run, self.noise, *effort)
 
 
 def _compare(value: float, maximum: Maximum) -> None:
@@ -311,23 +352,15 @@ def _reached(program: Program, p: Affine) -> Polytope:
     ends = []
     for sign in (-1.0, 1.0):
         rows = p.times(sign * np.eye(len(p.constant)))
-        most = [
-            program.maximise(
-                Affine(rows.columns, rows.matrix[[i]], rows.constant[[i]]), relaxed=True
-            )
-            for i in range(len(p.constant))
-        ]
+        most = [program.maximise(rows.part([i]), relaxed=True) for i in range(len(p.constant))]
         ends.append(sign * np.array([x.bound + TOLERANCE for x in most]))
     return Polytope.box(*ends)
 
 
-def _replay(
-    mpc: QPMPC, models: Sequence[Plant], p: Array, noise: Sequence[Array]
-) -> tuple[Array, tuple[Array, ...]]:
-    """Run the policy on the plants from p; return the states and the disturbances."""
-    states, drawn, pushes = [p], [], iter(noise)
-    for model in models:
-        drawn.append(np.zeros(0) if model.disturbances is None else next(pushes))
-        p = model.A @ p + model.B @ _policy(mpc, p) + model.offset + model.E @ drawn[-1]
+def _replay(mpc: QPMPC, models: Sequence[Plant], p: Array, noise: Sequence[Array]) -> Array:
+    """Run the policy on the plants from p; return the states."""
+    states = [p]
+    for model, d in zip(models, noise, strict=True):
+        p = model.A @ p + model.B @ _policy(mpc, p) + model.offset + model.E @ d
         states.append(p)
-    return np.array(states), tuple(drawn)
+    return np.array(states)
