@@ -21,10 +21,11 @@ import torch
 from torch_qpmpc import QPMPC
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.proofs import Answer, Plant, Polytope, largest_violation
-from torch_qpmpc.study.markdown import replaced
+from torch_qpmpc.study.markdown import replaced, table
 
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "prove.md"
 SAMPLES = 1_000_000
+TITLES = ("problem", "steps", "worst case", "bound", "attack", "binaries / nodes", "CPU, s")
 #: Limit of each mixed-integer program.
 SECONDS = 120.0
 
@@ -150,10 +151,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--write", action="store_true", help="write the table into the docs")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    rows = [
-        ["problem", "steps", "worst case", "bound", "attack", "binaries / nodes", "CPU, s"],
-        ["---", *["---:"] * 6],
-    ]
+    rows: list[list[str]] = []
     for name in options.problems:
         for horizon in options.horizons:
             for structure in ("tied", "free"):
@@ -161,9 +159,8 @@ def main(arguments: list[str] | None = None) -> int:
                     rows.append(measured(name, horizon, structure, steps))
                     print(" | ".join(rows[-1]), flush=True)
     if options.write:
-        table = "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
         text = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replaced(text, table, "proofs"), encoding="utf-8")
+        PAGE.write_text(replaced(text, table(TITLES, rows), "proofs"), encoding="utf-8")
     return 0
 
 

@@ -20,7 +20,7 @@ from torch_qpmpc import Status
 from torch_qpmpc.export.library import Library
 from torch_qpmpc.export.reference import reference, sharpen
 from torch_qpmpc.qp.program import Status as Outcome
-from torch_qpmpc.study.markdown import replaced
+from torch_qpmpc.study.markdown import replaced, table
 
 PAGE = Path(__file__).parents[2] / "docs" / "reliability" / "export.md"
 #: The bounds on differences of actions, and of values relative to 1 + |V|.
@@ -120,9 +120,7 @@ def write(row: list[str]) -> None:
     rows = [line.strip("| ").split(" | ") for line in old.strip().splitlines()[2:]]
     found = {cells[0]: cells for cells in rows} | {row[0]: row}
     ordered = [found[name] for name in PROBLEMS if name in found]
-    lines = [TITLES, ["---"] + ["---:"] * (len(TITLES) - 1), *ordered]
-    table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
-    PAGE.write_text(replaced(text, table, "export"), encoding="utf-8")
+    PAGE.write_text(replaced(text, table(TITLES, ordered), "export"), encoding="utf-8")
 
 
 if __name__ == "__main__":
