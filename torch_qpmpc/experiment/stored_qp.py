@@ -23,8 +23,3 @@ def learned_qp(folder: str | Path) -> QPMPC:
         if not isinstance(state, dict) or state.get("gate") is None:
             return QPMPC.load(checkpoint)  # which has the entries of such a file, too
     return QPMPC.load(best)
-
-
-def start_qp(folder: str | Path, structure: str) -> QPMPC:
-    """Make the QP that the run in ``folder`` started from, with its ``structure`` at the start."""
-    return QPMPC(**{**learned_qp(folder).arguments, "structure": structure})

@@ -24,7 +24,7 @@ from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import read_metrics, read_summary
-from torch_qpmpc.experiment.stored_qp import learned_qp, start_qp
+from torch_qpmpc.experiment.stored_qp import learned_qp
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, has_run, make_physics, make_true_mpc
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
@@ -80,7 +80,7 @@ class FinishedRun:
     @cached_property
     def start(self) -> QPMPC:
         """The QP that learning started from."""
-        return start_qp(self.folder, self.cfg.constraint.structure)
+        return QPMPC(**{**self.policy.arguments, "structure": self.cfg.constraint.structure})
 
     @cached_property
     def true(self) -> QPMPC | None:
