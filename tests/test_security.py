@@ -27,7 +27,7 @@ from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.config import load_config, settings
 from torch_qpmpc.experiment.links import check_links
 from torch_qpmpc.experiment.lock import LOCK, locked
-from torch_qpmpc.experiment.start import read_log
+from torch_qpmpc.experiment.start import stored_log
 from torch_qpmpc.experiment.tasks import TASKS, make_mpc
 from torch_qpmpc.export.__main__ import main as export
 from torch_qpmpc.files import labelled, save_file, write_whole
@@ -250,7 +250,7 @@ def test_pickles_run_no_code(folder, mark, name):
     read: Callable[[Path], Any] = {
         "checkpoint.pt": resume,
         "best.pt": COMMANDS["export"],
-        "log.pt": lambda folder: read_log(folder / name),
+        "log.pt": lambda folder: stored_log(folder / name),
         "mine.qpmpc": lambda folder: QPMPC.load(folder / name),
     }[name]
     match = rf"^(path|checkpoint): got .*{name}, which cannot be read \(UnpicklingError\)"

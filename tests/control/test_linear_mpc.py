@@ -133,7 +133,7 @@ def test_without_a_riccati_solution_the_terminal_weight_is_the_stage_s():
 def test_copies_keep_the_design():
     mpc = qm.LinearMPC(SCALAR, 3, Q=1.0, dR=0.1)
     for twin in (pickle.loads(pickle.dumps(mpc)), copy.deepcopy(mpc)):
-        assert twin.design.places() == mpc.design.places()
+        assert twin.design.places == mpc.design.places
         p = twin.arrange([1.0], twin.target([0.5]))
         assert torch.equal(twin.policy(p), mpc.policy(p))
     mpc.reset_parameters()

@@ -19,6 +19,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv, check_env_specs
 
 import torch_qpmpc.envs
+from tests.staggered import Staggered
 from torch_qpmpc.envs import (
     GrosZanonLTI,
     LinearSystem,
@@ -42,14 +43,8 @@ def plant(request: pytest.FixtureRequest) -> LinearSystem:
     return PLANTS[request.param]
 
 
-class StaggeredEnv(LinearSystemEnv):
+class StaggeredEnv(Staggered, LinearSystemEnv):
     """A plant whose episodes start at different steps, so that every later reset is partial."""
-
-    def _reset(self, tensordict=None, **kwargs):
-        out = super()._reset(tensordict, **kwargs)
-        if tensordict is None or "_reset" not in tensordict:
-            out["step_count"] = torch.arange(self.batch_size[0]).unsqueeze(-1) % self.max_steps
-        return out
 
 
 def linear_policy(plant: LinearSystem) -> TensorDictModule:

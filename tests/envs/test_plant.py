@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
 
+from tests.staggered import Staggered
 from tests.store import Store
 from torch_qpmpc.envs import PastWindow, PlantEnv
 from torch_qpmpc.errors import QPError
@@ -29,14 +30,8 @@ def make_env(num_envs: int = 4, max_steps: int = 6, seed: int = 0, **options: An
     return TransformedEnv(env, PastWindow(PLANT.past))
 
 
-class StaggeredEnv(PlantEnv):
+class StaggeredEnv(Staggered, PlantEnv):
     """A plant whose episodes start at different steps, so that every later reset is partial."""
-
-    def _reset(self, tensordict=None, **kwargs):
-        out = super()._reset(tensordict, **kwargs)
-        if tensordict is None or "_reset" not in tensordict:
-            out["step_count"] = torch.arange(self.batch_size[0]).unsqueeze(-1) % self.max_steps
-        return out
 
 
 def collect(env: Any, batches: int, steps: int) -> Any:

@@ -19,7 +19,7 @@ from tests.runs import SMALL, linear_system, make_config, run_command
 from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.config import check_config
-from torch_qpmpc.experiment.start import LOG, Exploration, collect_log, make_start, read_log
+from torch_qpmpc.experiment.start import LOG, Exploration, collect_log, make_start, stored_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start, observed_cost
 from torch_qpmpc.mpc.layout import Layout
@@ -213,7 +213,7 @@ def test_the_log_is_kept_read_and_shown(tmp_path, capsys):
     cfg = make_config(*DATA)
     train.train(cfg, str(tmp_path / "first"))
     assert "free C from 200 transitions in" in capsys.readouterr().out
-    log = read_log(tmp_path / "first" / LOG)
+    log = stored_log(tmp_path / "first" / LOG)
     assert torch.equal(log["action"], collect_log(cfg, make_physics(cfg))["action"])
     run = FinishedRun(tmp_path / "first")
     assert torch.equal(run.start.C, start_of(cfg)[2].C)

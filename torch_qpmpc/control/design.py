@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -61,12 +62,13 @@ class Design:
         y, u = half_range(self.y_bounds), half_range(self.u_bounds)
         return float(y @ self.Q @ y + u @ (self.R + self.dR) @ u)
 
-    @property
+    @cached_property
     def bounded(self) -> tuple[Array, Array]:
         """Masks of the outputs and of the inputs with bounds, ``(n_y,)`` and ``(m,)``."""
         y = np.isfinite(self.y_bounds).any(0) & (self.y_slack > 0)
         return y, np.asarray(np.isfinite(self.u_bounds).any(0))
 
+    @cached_property
     def places(self) -> dict[str, slice]:
         """Return the places of the signals in a stage [d_k; x_k; u_k], see `LinearMPC`."""
         n, m, n_y, n_d = self.plant.sizes
@@ -90,7 +92,7 @@ class Design:
 
     def selectors(self) -> dict[str, Array]:
         """Return the rows that read each signal from a stage [d_k; x_k; u_k]."""
-        places = self.places()
+        places = self.places
         unit = np.eye(places["u"].stop)
         return {name: unit[place] for name, place in places.items()}
 
@@ -135,7 +137,7 @@ def read_design(
     slack = read_vector("y_slack", y_slack, y, 0.0)
     if (slack < 0).any():
         raise QPError.expected("y_slack", f"{slack.tolist()}", "prices >= 0, or inf for hard rows")
-    found = choose(plant, disturbances)
+    estimated = choose(plant, disturbances)
     return Design(
         plant,
         int(horizon),
@@ -148,9 +150,9 @@ def read_design(
         slack,
         prices,
         references,
-        found,
+        estimated,
         gamma,
-        Steady.of(plant, found, Q, R),
+        Steady.of(plant, estimated, Q, R),
     )
 
 

@@ -51,21 +51,21 @@ def choose(plant: StateSpace, wanted: Any = "auto") -> Disturbances:
         return Disturbances(np.zeros((n, 0)), np.zeros((n_y, 0)), ())
     check_observable(plant)
     if isinstance(wanted, str) and wanted == "auto":
-        found = _placed(plant, _automatic(plant, INTEGRATES))
-        if _hidden(plant, found) is None:
-            return found
+        placed = _placed(plant, _automatic(plant, INTEGRATES))
+        if _hidden(plant, placed) is None:
+            return placed
         wanted = _automatic(plant, RANK)
     elif not isinstance(wanted, Mapping):
         raise QPError.expected("disturbances", repr(wanted), "'auto', None or a mapping")
-    found = _placed(plant, wanted)
-    if (hidden := _hidden(plant, found)) is not None:
+    placed = _placed(plant, wanted)
+    if (hidden := _hidden(plant, placed)) is not None:
         got = f"{dict(wanted)}, of which the {hidden} cannot be told from a mode at 1"
         remedy = (
             "At an integrating mode take a disturbance of its input, and at others one of the "
             "output; 'auto' chooses so. There can be no more disturbances than outputs."
         )
         raise QPError.expected("disturbances", got, "detectable disturbances", remedy)
-    return found
+    return placed
 
 
 def _placed(plant: StateSpace, wanted: Mapping[str, str]) -> Disturbances:
@@ -121,14 +121,14 @@ def _independent(matrix: Array) -> list[int]:
     return [int(i) for i, x in zip(order, sizes, strict=False) if x > RANK * sizes[0]]
 
 
-def _hidden(plant: StateSpace, found: Disturbances) -> str | None:
+def _hidden(plant: StateSpace, placed: Disturbances) -> str | None:
     """Return the name of a disturbance that cannot be told from a mode at one, if there is one."""
     n = len(plant.A)
-    matrix = np.block([[plant.A - np.eye(n), found.B], [plant.C, found.C]])
+    matrix = np.block([[plant.A - np.eye(n), placed.B], [plant.C, placed.C]])
     _, sizes, V = np.linalg.svd(matrix)
     if len(sizes) == matrix.shape[1] and sizes[-1] > RANK * sizes[0]:
         return None
-    return found.names[int(np.abs(V[-1, n:]).argmax())]
+    return placed.names[int(np.abs(V[-1, n:]).argmax())]
 
 
 def _number(eigenvalue: complex) -> str:

@@ -209,7 +209,7 @@ class LinearMPC(QPMPC):
         Raises:
             QPError: a name or a shape is wrong.
         """
-        places, n_d = self.design.places(), self.n_d
+        places, n_d = self.design.places, self.n_d
         if unknown := sorted(signals.keys() - {"u_last", "known", "level"}):
             raise QPError.expected("signals", repr(unknown[0]), "some of u_last, known, level")
         values = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in signals.items()}
@@ -248,7 +248,7 @@ def _shifted(place: slice, by: int) -> slice:
 
 def lowered(design: Design) -> LinearScheme:
     """Return the scheme of a design, in deviations from the target."""
-    places = design.places()
+    places = design.places
     n_d = places["known"].stop
     layout = Layout(places["u"].start - n_d, design.plant.sizes[1], design.horizon, 1, n_d)
     parts = _model(design), _cost(design, layout), _bounds(design)
@@ -258,7 +258,7 @@ def lowered(design: Design) -> LinearScheme:
 def _model(design: Design) -> Model:
     """Return the model of [x; u_last; y_s; u_s; 1], where y_s and u_s stay."""
     s, plant = design.selectors(), design.plant
-    n_d = design.places()["known"].stop
+    n_d = design.places["known"].stop
     x = plant.A @ s["x"] + plant.B @ s["u"] + plant.E @ s["known"]
     rows = np.vstack((x, s["u"][: len(s["u_last"])], s["y_s"], s["u_s"], s["one"]))
     n_x = n_d + len(rows)
@@ -267,7 +267,7 @@ def _model(design: Design) -> Model:
 
 def _cost(design: Design, layout: Layout) -> Cost:
     """Return the squares of deviations from the target, and the prices."""
-    s, places, plant = design.selectors(), design.places(), design.plant
+    s, places, plant = design.selectors(), design.places, design.plant
     y, u = plant.C @ s["x"], s["u"].copy()
     y[: len(s["r"])] -= s["r"]
     u[: len(s["u_r"])] -= s["u_r"]
@@ -316,7 +316,7 @@ def _riccati(design: Design) -> Array | None:
 
 def _bounds(design: Design) -> Bounds:
     """Return rows of the outputs at their prices, and hard ones of inputs and moves."""
-    s, size = design.selectors(), design.places()["u"].start
+    s, size = design.selectors(), design.places["u"].start
     moving = np.isfinite(design.du_bounds).any(0)
     of_y, of_u = design.bounded
     y = (design.plant.C @ s["x"])[of_y] + s["y_s"]

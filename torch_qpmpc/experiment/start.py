@@ -91,9 +91,9 @@ def make_start(
     if own is not None:
         log = own(cfg)
     elif written:
-        log = read_log(path)
+        log = stored_log(path)
     elif cfg.start.file is not None:
-        log = read_log(Path(cfg.start.file))
+        log = stored_log(Path(cfg.start.file))
     else:
         log = collect_log(cfg, physics)
     start = identified_start(cfg, physics, log)
@@ -120,7 +120,7 @@ def collect_log(cfg: DictConfig, physics: AnyPlant) -> TensorDict:
     return log.select(*ENTRIES, strict=False)
 
 
-def read_log(path: Path) -> TensorDict:
+def stored_log(path: Path) -> TensorDict:
     """Read a log.
 
     Raises:
