@@ -33,15 +33,15 @@ def rows(folder: Path) -> list[list[str]]:
     for run in sorted(folder.glob("N=*")):
         N, std, weighted = (part.split("=")[1] for part in run.name.split("-")[:3])
         cases.setdefault((std, N, {"True": "yes", "False": "no"}[weighted]), []).append(ratios(run))
-    found = []
+    lines = []
     for case, runs in sorted(cases.items(), reverse=True):
         all_runs = pd.concat(runs, axis=1)
         steady = all_runs[all_runs.index >= STEADY]
         medians = steady.median(axis=1)
         numbers = (all_runs.iloc[0, 0], medians.median(), medians.max(), steady.max().max())
         numbers += (all_runs.iloc[-1].max(),)
-        found.append([*case, str(len(runs)), *(f"{x:.3f}" for x in numbers)])
-    return found
+        lines.append([*case, str(len(runs)), *(f"{x:.3f}" for x in numbers)])
+    return lines
 
 
 def main() -> None:

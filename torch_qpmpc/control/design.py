@@ -22,7 +22,7 @@ REFERENCES = ("held", "preview")
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """What `LinearMPC` is made of, as arrays.
+    """The arguments of `LinearMPC`, read and checked, as arrays.
 
     Attributes:
         plant: the model.

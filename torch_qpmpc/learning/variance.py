@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-#: Added to what the variance depends on before its logarithm is taken, as a fraction of its mean.
+#: Added to each regressor of the variance before its logarithm, as a fraction of its mean.
 OFFSET = 0.05
 #: Added to delta^2, and smallest variance, as a fraction of the batch's median.
 FLOOR = 0.01

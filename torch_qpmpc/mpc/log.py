@@ -1,4 +1,4 @@
-"""Logs as people have them, CSV files, DataFrames and arrays, and what is wrong with them."""
+"""Logs of a plant from CSV files, DataFrames and arrays, with notes on their faults."""
 
 from __future__ import annotations
 

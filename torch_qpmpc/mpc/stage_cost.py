@@ -12,6 +12,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_flag, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.ridge import ridge
+from torch_qpmpc.mpc.trajectories import LARGEST
 
 #: Strengths of the ridge, down to those of costs without noise, and the share of the evidence's
 #: that is used: enough for collinear columns, and too little to bias others.
@@ -24,8 +25,6 @@ ZERO, HARMLESS = 1e-9, 1e-6
 RIDGE = 1e-6
 #: L-BFGS: the smallest eigenvalue that it starts from, its tolerance and its iterations.
 FLOOR, TOLERANCE, ITERATIONS = 1e-2, 1e-9, 500
-#: The largest magnitude of data, whose squares are finite.
-LARGEST = 1e100
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,7 +126,7 @@ def largest_violation(
     steps: int = 1,
     seconds: float = 60.0,
 ) -> Answer:
-    """Find the largest violation of bounds of the state, in so many steps.
+    """Find the largest violation of bounds of the state after ``steps`` steps.
 
     Args:
         mpc: the QP.
@@ -290,7 +290,7 @@ def _branches(
     plants: Sequence[Plant],
     steps: int,
 ) -> Iterator[_Branch]:
-    """Add the policy and each plant for so many steps from p, in the hull of the vertices."""
+    """Add ``steps`` steps of the policy and each plant from p, in the hull of ``vertices``."""
     u = encode(program, tables, p, vertices)
     for model in plants:
         branch = program.copy()

@@ -80,8 +80,8 @@ def read(cfg: DictConfig) -> Log:
 def make_plant(cfg: DictConfig) -> ARXPlant:
     """Identify the model that stands for the plant, with its cost and bounds."""
     task, log = cfg.task, read(cfg)
-    found = identify(log, 1, past=task.past, structure="tied")
-    errors = found.errors[:, 0]
+    identified = identify(log, 1, past=task.past, structure="tied")
+    errors = identified.errors[:, 0]
     u = torch.cat([part.u for part in log.trajectories])
     seen = torch.stack((u.amin(0), u.amax(0)))
     unbounded = torch.full((2, len(log.outputs)), torch.inf).double()
@@ -94,7 +94,7 @@ def make_plant(cfg: DictConfig) -> ARXPlant:
         return [log.label(name) for name in names]
 
     return ARXPlant(
-        **found.model._asdict(),
+        **identified.model._asdict(),
         errors=errors[errors.isfinite().all(-1)],
         outputs=torch.cat([part.y[:-1] for part in log.trajectories]),
         signals_seen=torch.cat([part.d for part in log.trajectories]),
