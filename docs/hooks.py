@@ -1,8 +1,9 @@
-"""Additions to mkdocs.yml: files from outside docs/, and the examples of docstrings."""
+"""Additions to mkdocs.yml: files from outside docs/, made pages, and the examples of docstrings."""
 
 from __future__ import annotations
 
 import re
+import sys
 from importlib.resources import files as package_files
 from pathlib import Path
 from typing import Any
@@ -13,16 +14,19 @@ from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "docs"))
+from keys import page  # noqa: E402, a file beside this one
 
 
 @event_priority(100)  # before mkdocs-jupyter, which turns notebooks into pages
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the notebooks, and MathJax from its Python package."""
+    """Add the notebooks, MathJax from its Python package, and the page of configuration keys."""
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         place = f"notebooks/{path.name}"
         files.append(File(place, str(ROOT), config.site_dir, config.use_directory_urls))
     mathjax = package_files("mathjax") / "static" / "mathjax" / "es5" / "tex-svg.js"
     files.append(File.generated(config, "javascripts/tex-svg.js", abs_src_path=str(mathjax)))
+    files.append(File.generated(config, "guides/keys.md", content=page()))
     return files
 
 

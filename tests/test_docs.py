@@ -180,6 +180,18 @@ def test_the_readme_is_short_and_its_links_lead_somewhere():
 
 
 @needs_docs
+def test_each_configuration_key_has_a_meaning_and_a_value(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS))
+    reference = importlib.import_module("keys")
+    for key, settings in reference.settings().items():
+        assert settings, key
+        assert key.endswith(".name") or reference.meaning(settings), key
+    page = reference.page()
+    assert "| `task.horizon` | N | a whole number >= 1 | `10`; " in page
+    assert "| `search.w` | log of a factor of the slack weights |" in page
+
+
+@needs_docs
 def test_the_reference_has_every_public_name():
     index = PAGES["docs/api/index.md"]
     assert {*re.findall(r"`qm\.(\w+)`", index)} - {"envs"} == {*torch_qpmpc.__all__}
