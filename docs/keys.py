@@ -15,9 +15,10 @@ FIRST = ("config", "algo/qlearning", "algo/td3", "optimizer/gauss_newton", "cons
 FIRST += ("task/point_mass", "task/log")
 TITLE = """# All configuration keys
 
-Each key is set by `python train.py KEY=VALUE`, or for all its keys at once by a choice, as `task=house`; the
-rightmost choice of `defaults` in `configs/config.yaml` that sets a key counts. The usual value comes first, and those of
-single choices follow. Units are the plant's unless the meaning says otherwise.
+Each key is set by `python train.py KEY=VALUE`, or with others by a choice, as `task=house`; the
+rightmost choice of `defaults` in `configs/config.yaml` that sets a key counts. The usual value
+comes first, and those of single choices follow. Units are the plant's unless the meaning says
+otherwise.
 """
 GROUPS = {
     "algo": "Algorithm: `algo=NAME`",
