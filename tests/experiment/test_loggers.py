@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+import re
 import time
 from pathlib import Path
 
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 
 import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.loggers import EXTRAS, RunLogger
 from torch_qpmpc.experiment.run_folder import RunFolder
+
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "loggers.md"
 
 
 @pytest.fixture(autouse=True)
@@ -113,3 +119,39 @@ def test_training_logs_by_the_logger_of_the_configuration(tmp_path):
     assert {"csv", "metrics.csv", "summary.json"} <= {path.name for path in tmp_path.iterdir()}
     J = pd.read_csv(tmp_path / "csv" / "scalars" / "eval" / "J.csv", header=None)[1]
     assert J.iloc[-1] == pytest.approx(summary["J_final"])
+
+
+@pytest.mark.skipif(not PAGE.exists(), reason="no docs, as in a wheel's tests")
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("gate=true", "constraint=adaptive", "optimizer=gauss_newton"),
+        ("constraint=combined", "noise=brownian"),
+        ("algo=sac", "constraint=free", "warm_start=false"),
+    ],
+    ids=lambda overrides: overrides[0],
+)
+def test_the_page_names_each_scalar_file_and_key_of_the_summary(tmp_path, overrides):
+    summary = train.train(make_config(*SMALL, *overrides), str(tmp_path), quiet=True)
+    text = PAGE.read_text(encoding="utf-8")
+    names = {*re.findall(r"`([\w./-]+)`", text)}
+    for scalar in {*pd.read_csv(tmp_path / "metrics.csv").columns} - {"update"}:
+        assert scalar in names or scalar.startswith(("theta/", "eval/J_")), scalar
+    for file in tmp_path.iterdir():
+        assert {file.name, f"{file.name}/"} & names, file.name
+    for key in json.loads((tmp_path / "summary.json").read_text()):
+        assert key in names or key.startswith("J_discounted_"), key
+    assert summary["J_best"] > 0
+
+
+def test_tensorboard_opens_on_scalars_that_a_run_logs(tmp_path):
+    train.train(make_config(*SMALL), str(tmp_path), quiet=True)
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    (event,) = events.Tensors("custom_scalars__config__")
+    layout = Layout.FromString(event.tensor_proto.string_val[0])
+    charts = [chart for category in layout.category for chart in category.chart]
+    assert len(charts) == 2
+    for chart in charts:
+        for pattern in chart.multiline.tag:
+            assert any(re.search(pattern, tag) for tag in events.Tags()["scalars"]), pattern

@@ -23,6 +23,13 @@ from torch_qpmpc.errors import QPError
 LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")
 #: Loggers that need the extra of the same name.
 EXTRAS = ("wandb", "mlflow")
+#: The plots of TensorBoard's tab "Custom Scalars", each of the tags that match.
+LAYOUT = {
+    "run": {
+        "closed-loop cost J": ["Multiline", ["^eval/J(_true_model)?$"]],
+        "mean absolute TD error": ["Multiline", ["^train/td_error$"]],
+    }
+}
 
 
 class RunLogger:
@@ -60,6 +67,7 @@ class RunLogger:
             start = event.SessionLog(status=event.SessionLog.START)
             writer = self.logger.experiment.file_writer.event_writer
             writer.add_event(event.Event(step=0 if after is None else after + 1, session_log=start))
+            self.logger.experiment.add_custom_scalars(LAYOUT)
         else:
             self.logger.log_hparams(self.settings)
         if name in ("csv", "mlflow"):
