@@ -7,12 +7,13 @@ import json
 import re
 import time
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
+from tensorboard.plugins.custom_scalar import layout_pb2
 
 import train
 from tests.runs import SMALL, make_config
@@ -149,7 +150,8 @@ def test_tensorboard_opens_on_scalars_that_a_run_logs(tmp_path):
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     (event,) = events.Tensors("custom_scalars__config__")
-    layout = Layout.FromString(event.tensor_proto.string_val[0])
+    created: Any = layout_pb2  # its classes are created at run time
+    layout = created.Layout.FromString(event.tensor_proto.string_val[0])
     charts = [chart for category in layout.category for chart in category.chart]
     assert len(charts) == 2
     for chart in charts:
