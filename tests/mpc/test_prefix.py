@@ -409,23 +409,6 @@ def test_vmap_equals_the_batch():
     assert vmap(jacrev(mpc.policy))(p).shape == (6, N_U, N_P)
 
 
-def test_compiled_in_one_graph_equals_eager():
-    torch._dynamo.reset()
-    mpc, (p, a) = make(8, structure="tied", learn=("H", "q", "C", "b")), known()
-
-    def total(p: Tensor, a: Tensor) -> Tensor:
-        return mpc.value(p) + mpc.action_value(p, a)
-
-    found = []
-    for function in (total, torch.compile(total, fullgraph=True, backend="aot_eager")):
-        mpc.zero_grad()
-        out = function(p, a)
-        out.sum().backward()
-        found.append((out.detach(), [x.grad for x in mpc.parameters()]))
-    assert_close(found[1], found[0])
-    torch._dynamo.reset()
-
-
 # An H that is indefinite on what is known
 
 

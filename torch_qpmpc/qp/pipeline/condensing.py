@@ -92,6 +92,8 @@ class Reduced(NamedTuple):
             ``constant + matrix' fixed``.
         z_0: ``(B, n_z)``, z if the fixed entries and v are zero.
         w: ``(B, r)``.
+        pins: the index in ``rows`` of a row that is a multiple of v_k, for each k, ``(d,)``; -1
+            without one.
         T, Y_neg: those of `Elimination`.
     """
 
@@ -103,6 +105,7 @@ class Reduced(NamedTuple):
     constant: Array
     z_0: Array
     w: Array
+    pins: Array
     T: Array
     Y_neg: Array
 
@@ -204,7 +207,10 @@ def reduce(condensed: Condensed, theta: Theta, group: np.ndarray, n_f: int) -> R
     constant[:, :d] = _times(T[:, :, n_f:].swapaxes(1, 2), group, q) + _times(H_b, group, b)
     constant[:, d : d + r], constant[:, d + r :] = lb - y_b, ub - y_b
     z_0 = -_times(Y_neg, group, b)
-    arrays = (H[:, :, n_f:], G[:, :, n_f:], matrix, constant, z_0, theta.w[:, rows])
+    alone = (G != 0).any(0).sum(-1) == 1
+    pure = (G[:, :, n_f:] != 0).all(0) & (alone & (G_b == 0).all((0, 2)))[:, None]
+    pins = np.where(pure.any(0), pure.argmax(0) if r else 0, -1)
+    arrays = (H[:, :, n_f:], G[:, :, n_f:], matrix, constant, z_0, theta.w[:, rows], pins)
     return Reduced._make((rows, others, *map(np.ascontiguousarray, arrays), T, Y_neg))
 
 

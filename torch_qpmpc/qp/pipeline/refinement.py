@@ -17,7 +17,7 @@ import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 
-from torch_qpmpc.qp.kernels.sample import CANCELLED, FLOOR
+from torch_qpmpc.qp.kernels.sample import CANCELLED, FLOOR, SHARE
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import Status
@@ -317,7 +317,7 @@ class _Point(NamedTuple):
         linear, quadratic = _dot(self.z, Twice(qp.q, 0 * qp.q)), _dot(self.z, half)
         cost = linear + quadratic + charge.sum()
         scale = max(map(abs, (cost, linear, quadratic, charge.sum())))
-        scale = max(min(scale, CANCELLED * abs(cost)), FLOOR)
+        scale = max(min(scale, CANCELLED * abs(cost)), FLOOR, SHARE * abs(cost + qp.c))
         bound = np.where(lam > 0, qp.ub, np.where(lam < 0, qp.lb, 0))
         gap = np.where(lam == 0, charge, charge - lam * self.y.minus(bound))
         slip = np.abs(errors[: len(z) - n_f]) @ np.abs(z[n_f:]) + np.abs(gap).sum()
@@ -353,9 +353,9 @@ def _product(matrix: np.ndarray, x: Twice) -> Twice:
     products, errors = _two_product(matrix, x.high)
     low = (errors + matrix * x.low).sum(-1)
     while (n := products.shape[-1]) > 1:
-        pairs = products if n % 2 == 0 else np.pad(products, ((0, 0), (0, 1)))
-        products, errors = _two_sum(pairs[:, ::2], pairs[:, 1::2])
-        low = low + errors.sum(-1)
+        half, odd = n // 2, products[:, n // 2 * 2 :]
+        products, errors = _two_sum(products[:, :half], products[:, half : 2 * half])
+        products, low = np.hstack((products, odd)), low + errors.sum(-1)
     high = products[:, 0] if products.shape[-1] else np.zeros(len(matrix))
     return Twice(*_two_sum(high, low))
 
