@@ -202,7 +202,7 @@ def test_forces_solve_the_unconstrained_qp(r):
     root, G = normal(2, 5, 5), normal(2, r, 5, seed=1)
     H = root @ root.mT
     none = np.empty(0)
-    reduced = Reduced._make((none, none, H.numpy(), G.numpy(), *[none] * 7))
+    reduced = Reduced._make((none, none, H.numpy(), G.numpy(), *[none] * 6))
     rise, push = map(torch.from_numpy, forces(reduced))
     g, lam = normal(5, seed=2), normal(r, seed=3)
     for m in range(2):

@@ -75,71 +75,40 @@ def assert_right(solution: QPSolution, known: KnownQP) -> None:
     assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)
 
 
-# Values of zero, and variables at their bounds
+# A cost of zero, at bounds that hold all variables
 
 
-def at_its_bounds(c: float = 0.0) -> tuple[QuadraticProgram, torch.Tensor]:
-    """Make a batch of QPs, in two variables beside x, whose cost is least at u = (0, -2)."""
-    eye, x = torch.eye(3).double(), torch.rand(BATCH, 1).double()
-    qp = QuadraticProgram(
-        H=1e-4 * eye,
-        q=torch.tensor([0.0, 0.03, 0.7]).double(),
-        c=torch.tensor(c, dtype=torch.float64),
-        C=torch.zeros(0, 3).double(),
-        b=torch.zeros(0).double(),
-        G=torch.tensor([[0.0, 3.0, 0.0], [0.0, 0.0, -0.5]]).double(),
-        lb=torch.tensor([0.0, -1.0]).double(),
-        ub=torch.tensor([15.0, 1.0]).double(),
-        w=torch.full((2,), torch.inf).double(),
-    )
-    return qp, x
-
-
-@pytest.mark.parametrize("name", ["daqp", "torch"])
-def test_variables_that_a_bound_holds_are_exactly_there(monkeypatch, name):
-    def nearly(qps: SoftQPs) -> BackendSolution:
-        answer = BACKENDS[name](qps)
-        return answer._replace(v=answer.v + 1e-11)
-
-    monkeypatch.setitem(BACKENDS, "nearly", nearly)
-    qp, x = at_its_bounds()
-    u = solve_qp(qp, x, solver="nearly").z[:, 1:]
-    assert (u == torch.tensor([0.0, -2.0]).double()).all()
-    off = replace(qp, q=torch.tensor([0.0, -3e-4, 0.7]).double())  # no bound holds the first
-    assert_close(solve_qp(off, x, solver="nearly").z[:, 1], torch.full((BATCH,), 3.0).double())
-
-
-@pytest.mark.parametrize("c", [0.0, 0.9])
-def test_a_cost_of_zero_needs_no_refinement(monkeypatch, c):
-    def never(*_: object) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr(refinement._QP, "solve", never)
-    qp, _ = at_its_bounds(c)
-    qp = replace(qp, lb=torch.tensor([0.0, -15.0]).double(), ub=torch.tensor([15.0, 0.0]).double())
-    solution = solve_qp(qp, torch.zeros(BATCH, 1).double(), solver="daqp")
-    assert (solution.value == c).all()
-
-
-@pytest.mark.parametrize(("c", "refined"), [(0.0, True), (0.9, False)])
-def test_an_error_is_relative_to_the_constant_if_the_cost_all_but_vanishes(monkeypatch, c, refined):
+@pytest.mark.parametrize(
+    ("off", "ub", "w", "refined"),
+    [
+        (1e-13, 15.0, torch.inf, False),
+        (1e-13, 15.0, 10.0, True),  # without hard bounds nothing says how large a cost can be
+        (1e-7, 15.0, torch.inf, True),
+        (1e-7, 1e12, torch.inf, True),  # a bound in place of inf says no more
+    ],
+)
+def test_errors_of_a_cost_of_zero_are_relative_to_the_swing(monkeypatch, off, ub, w, refined):
     def above(qps: SoftQPs) -> BackendSolution:
         answer = daqp.solve(qps)
-        return answer._replace(v=answer.v + 1e-13)
+        return answer._replace(v=answer.v + off)
 
     monkeypatch.setitem(BACKENDS, "above", above)
-    monkeypatch.setattr(refinement._QP, "solve", lambda *_: asked.append(1))
-    qp, asked = at_its_bounds(c)[0], []
-    # No row is that of a single variable.
-    rows = torch.tensor([[1e-9, 3.0, 0.0], [1e-9, 0.0, 3.0]]).double()
-    qp = replace(qp, G=rows, lb=torch.zeros(2).double(), ub=torch.full((2,), 15.0).double())
-    with SolveLog() as log:
-        solution = solve_qp(qp, torch.zeros(BATCH, 1).double(), solver="above")
-    assert bool(asked) == refined
-    assert bool(log.fallback) == refined
-    assert_close(
-        solution.value, torch.full((BATCH,), c, dtype=torch.float64), rtol=1e-12, atol=1e-12
+    asked, exact = [], refinement._QP.solve
+    monkeypatch.setattr(refinement._QP, "solve", lambda *x: asked.append(1) or exact(*x))
+    qp = QuadraticProgram(
+        H=torch.diag(torch.tensor([0.0, 1e-4, 1e-4])).double(),
+        q=torch.tensor([0.0, 0.03, 0.7]).double(),
+        c=torch.zeros(()).double(),
+        C=torch.zeros(0, 3).double(),
+        b=torch.zeros(0).double(),
+        G=torch.tensor([[0.0, 3.0, 0.0], [0.0, 0.0, 0.5]]).double(),
+        lb=torch.zeros(2).double(),
+        ub=torch.full((2,), ub).double(),
+        w=torch.full((2,), w).double(),
     )
+    solution = solve_qp(qp, torch.linspace(0.5, 1, BATCH).double()[:, None], solver="above")
+    assert bool(asked) == refined
+    assert_close(solution.value, torch.zeros(BATCH).double(), atol=1e-12, rtol=0)
 
 
 # Solutions rejected by the certificate go to another solver

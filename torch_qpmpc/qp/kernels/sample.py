@@ -22,7 +22,9 @@ lies between two others, in v, the variables that C z = b leaves free:
   violations.
 
 ``value_error`` is the distance of the two and the rounding errors of the value, relative to the
-largest of 1/2 z'Hz, q'z, w'sigma and their sum, or to a millionth of the value if that is larger.
+largest of 1/2 z'Hz, q'z, w'sigma and their sum, or to a millionth of the *swing* if that is larger:
+the sum of ``|Hz + q| (ub - lb)`` over the entries with hard bounds, by which the cost changes, to
+first order, between these bounds. Where the cost is zero, its errors are small beside the swing.
 
 With a fixed active set, the KKT conditions are linear. `hold` solves them by the Schur complement
 of H, with one Cholesky factor per QP, of the active part of K = G H^-1 G'. The derivatives of the
@@ -61,8 +63,8 @@ MAX_PASSES = 3
 #: Relative tolerance for bounds and for signs of multipliers in a warm start.
 SLIP = 1e-9
 #: Errors of the value are relative to its largest term, but to no more than this many times the
-#: cost (where z is far along a flat direction, huge terms cancel), and to no less than the floor
-#: and this share of the value, which is the cost and c: a cost of zero has no digits of its own.
+#: value (where z is far along a flat direction, huge terms cancel), and to no less than the floor
+#: and this share of the swing: a cost of zero has no digits of its own.
 CANCELLED, FLOOR, SHARE = 1e3, 1e-12, 1e-6
 #: Some optimum is no further from z than this many times its largest entry, where H is singular.
 RANGE = 1e3
@@ -114,7 +116,6 @@ def _recover(v, lam_v, group, fixed, theta, reduced, sizes, diagonal, passes):
     for i in range(n_qps):
         copy(kept[i, :n_f], fixed[i])
         copy(kept[i, n_f:], v[i])
-        _pin(kept[i, n_f:], lam_v[i], group[i], i, theta, reduced)
     z = products(reduced.T, group, kept, False)
     for i in range(n_qps):
         add(z[i], 1.0, reduced.z_0[i % len(reduced.z_0)])
@@ -142,18 +143,6 @@ def _recover(v, lam_v, group, fixed, theta, reduced, sizes, diagonal, passes):
     terms = (Hz, G_lam, C_chi, left, y, Cz)
     value, residual, error = _judge(z, lam, chi, group, fixed, theta, reduced.T, sizes, terms)
     return value, z, chi, lam, xi, codes, residual, error
-
-
-@compiled
-def _pin(v, lam, m, i, theta, reduced):
-    """Move variables to the bounds that hold them: a backend is off by its rounding errors."""
-    for k in range(len(v)):
-        row = reduced.pins[k]
-        if row >= 0 and 0 < abs(lam[row]) < reduced.w[i % len(reduced.w), row]:
-            bounds = theta.ub if lam[row] > 0 else theta.lb
-            end = bounds[i % len(bounds), reduced.rows[row]] / reduced.G[m, row, k]
-            if abs(v[k] - end) <= SLIP * (1.0 + abs(end)):
-                v[k] = end
 
 
 @compiled
@@ -238,7 +227,8 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms):
         worst = max(worst, gap / (1.0 + abs(cost)))
 
         scale = max(abs(cost), abs(linear), abs(quadratic), charge)
-        scale = max(min(scale, CANCELLED * abs(cost)), FLOOR, SHARE * abs(value[i]))
+        scale = max(min(scale, CANCELLED * abs(cost)), FLOOR)
+        scale = max(scale, SHARE * _swing(Hz[i], q_i, lb_i, ub_i, w_i, G[m], sizes.bounds, length))
         noise = _weighted(z[i], sizes.costs[m]) + _weighted(lam[i], sizes.rows[m])
         noise = length * (noise + _weighted(chi[i], sizes.equalities[m]))
         if not ROUNDING * noise < DOUBTFUL * scale:  # the same without the largest entry of z
@@ -302,6 +292,18 @@ def _terms(x, matrix, z):
     for i in range(len(x)):
         if x[i] != 0:
             total += abs(x[i]) * _weighted(z, matrix[i])
+    return total
+
+
+@compiled
+def _swing(Hz, q, lb, ub, w, G, bounds, length):
+    total = 0.0
+    for k in range(len(q)):
+        row = bounds[k]
+        if row >= 0 and w[row] == np.inf:
+            width = (ub[row] - lb[row]) / abs(G[row, k])
+            if width < np.inf:
+                total += abs(Hz[k] + q[k]) * min(width, RANGE * length)
     return total
 
 

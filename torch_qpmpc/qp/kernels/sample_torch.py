@@ -34,7 +34,6 @@ def offsets(fixed, group, matrix, constant) -> Tensor:
 
 def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes=0) -> tuple[Tensor, ...]:
     Y_neg, C = reduced.Y_neg, theta.C
-    v = _pinned(v, lam, group, theta, reduced)
     z = multiply(reduced.T, group, torch.cat((fixed, v), dim=-1)) + reduced.z_0
     for _ in range(passes):
         z = z + multiply(Y_neg, group, multiply(C, group, z) - theta.b)
@@ -57,17 +56,6 @@ def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes=0) -> 
     value, *errors = _judge(z, all_lam, chi, group, fixed, theta, reduced.T, sizes, terms)
     codes = active_codes(y, all_lam, theta.lb, theta.ub, theta.w)
     return value, z, chi, all_lam, xi, codes, *errors
-
-
-def _pinned(v, lam, group, theta, reduced) -> Tensor:
-    if not len(reduced.rows):
-        return v
-    row, columns = reduced.pins.clamp(min=0), torch.arange(v.shape[-1], device=v.device)
-    push, at = lam[:, row], reduced.rows[row]
-    end = torch.where(push > 0, theta.ub[:, at], theta.lb[:, at])
-    end = end / reduced.G[:, row, columns][group]
-    held = (reduced.pins >= 0) & (push != 0) & (push.abs() < reduced.w[:, row])
-    return torch.where(held & ((v - end).abs() <= SLIP * (1.0 + end.abs())), end, v)
 
 
 def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal) -> tuple[Tensor, ...]:
@@ -111,7 +99,8 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms) -> tuple[Tensor, T
 
     value, length = cost + theta.c, largest(z)
     scale = torch.stack((cost, linear, quadratic, charge)).abs().amax(0)
-    scale = scale.minimum(CANCELLED * cost.abs()).clamp(min=FLOOR).maximum(SHARE * value.abs())
+    scale = scale.minimum(CANCELLED * cost.abs()).clamp(min=FLOOR)
+    scale = scale.maximum(SHARE * _swing(Hz + theta.q, theta, sizes, group, RANGE * length))
     parts = (z, theta.H, sizes.costs), (lam, theta.G, sizes.rows), (chi, theta.C, sizes.equalities)
     of_rows = [multiply(matrix.abs(), group, z.abs()) for _, matrix, _ in parts]
     size = sum(torch.linalg.vecdot(sums[group], x.abs()) for x, _, sums in parts) * length
@@ -124,6 +113,15 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms) -> tuple[Tensor, T
     off = off + _kinks(y, theta, sizes.steps[group], step)
     error = (off / scale).nan_to_num(torch.inf, torch.inf).masked_fill_(residual.isinf(), torch.inf)
     return value, residual, error
+
+
+def _swing(slope, theta, sizes, group, far) -> Tensor:
+    if not len(theta.lb[0]):
+        return torch.zeros_like(far)
+    rows, entries = sizes.bounds.clamp(min=0), torch.arange(len(sizes.bounds), device=far.device)
+    width = (theta.ub - theta.lb)[:, rows] / theta.G[:, rows, entries].abs()[group]
+    counts = (sizes.bounds >= 0) & theta.w[:, rows].isinf() & width.isfinite()
+    return torch.where(counts, slope.abs() * width.minimum(far.unsqueeze(-1)), 0.0).sum(-1)
 
 
 def _fall(slope, theta, far, sizes, group) -> tuple[Tensor, Tensor]:

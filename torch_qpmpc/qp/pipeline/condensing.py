@@ -92,8 +92,6 @@ class Reduced(NamedTuple):
             ``constant + matrix' fixed``.
         z_0: ``(B, n_z)``, z if the fixed entries and v are zero.
         w: ``(B, r)``.
-        pins: the index in ``rows`` of a row that is a multiple of v_k, for each k, ``(d,)``; -1
-            without one.
         T, Y_neg: those of `Elimination`.
     """
 
@@ -105,7 +103,6 @@ class Reduced(NamedTuple):
     constant: Array
     z_0: Array
     w: Array
-    pins: Array
     T: Array
     Y_neg: Array
 
@@ -123,6 +120,7 @@ class Sizes(NamedTuple):
         steps: the norms of G's rows in v, ``(M, n_g)``, zero where they contain no variable.
         hard: the indices of rows that are hard in some QP, ``(h,)``.
         box: the index of a row that contains only v_k, for each k, ``(d,)``; -1 without one.
+        bounds: the same for the entries of z, ``(n_z,)``, of rows of G itself.
         units: the hard rows in v, of unit length, ``(M, h, d)``.
         apart: True if each subset of these rows is well conditioned.
     """
@@ -136,6 +134,7 @@ class Sizes(NamedTuple):
     steps: Array
     hard: Array
     box: Array
+    bounds: Array
     units: Array
     apart: bool
 
@@ -207,10 +206,7 @@ def reduce(condensed: Condensed, theta: Theta, group: np.ndarray, n_f: int) -> R
     constant[:, :d] = _times(T[:, :, n_f:].swapaxes(1, 2), group, q) + _times(H_b, group, b)
     constant[:, d : d + r], constant[:, d + r :] = lb - y_b, ub - y_b
     z_0 = -_times(Y_neg, group, b)
-    alone = (G != 0).any(0).sum(-1) == 1
-    pure = (G[:, :, n_f:] != 0).all(0) & (alone & (G_b == 0).all((0, 2)))[:, None]
-    pins = np.where(pure.any(0), pure.argmax(0) if r else 0, -1)
-    arrays = (H[:, :, n_f:], G[:, :, n_f:], matrix, constant, z_0, theta.w[:, rows], pins)
+    arrays = (H[:, :, n_f:], G[:, :, n_f:], matrix, constant, z_0, theta.w[:, rows])
     return Reduced._make((rows, others, *map(np.ascontiguousarray, arrays), T, Y_neg))
 
 
@@ -229,13 +225,21 @@ def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     steps = kernels.row_lengths(G, ABSENT * condensed.terms)
     enters = condensed.enters[:, n_f:]
     single = enters & (enters.sum(-1) == 1)[:, None]
-    box = np.where(single.any(0), single.argmax(0) if len(single) else 0, -1)
+    box = _index_of(single)
+    alone = (theta.G != 0).any(0)
+    bounds = _index_of(alone & (alone.sum(-1) == 1)[:, None] & (theta.G != 0).all(0))
+    bounds[:n_f] = -1
     hard = np.flatnonzero(np.isinf(theta.w).any(0) & (steps > 0).any(0))
     units = G[:, hard] / np.where(steps > 0, steps, 1.0)[:, hard, None]
     apart = kernels.nearly_orthogonal(units)
     inverse, shift = kernels.inverse_factors(H, DEFINITE, SHIFT)
     stiffness = kernels.row_sums(H).max(-1, initial=0.0)
-    return Sizes(inverse, shift, stiffness, *condensed.sums, steps, hard, box, units, apart)
+    return Sizes(inverse, shift, stiffness, *condensed.sums, steps, hard, box, bounds, units, apart)
+
+
+def _index_of(rows: np.ndarray) -> np.ndarray:
+    """Return the first row that is True in each column; -1 without one."""
+    return np.where(rows.any(0), rows.argmax(0) if len(rows) else 0, -1)
 
 
 @np.errstate(all="ignore")

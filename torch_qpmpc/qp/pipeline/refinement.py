@@ -17,7 +17,7 @@ import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 
-from torch_qpmpc.qp.kernels.sample import CANCELLED, FLOOR, SHARE
+from torch_qpmpc.qp.kernels.sample import CANCELLED, FLOOR
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import Status
@@ -317,7 +317,7 @@ class _Point(NamedTuple):
         linear, quadratic = _dot(self.z, Twice(qp.q, 0 * qp.q)), _dot(self.z, half)
         cost = linear + quadratic + charge.sum()
         scale = max(map(abs, (cost, linear, quadratic, charge.sum())))
-        scale = max(min(scale, CANCELLED * abs(cost)), FLOOR, SHARE * abs(cost + qp.c))
+        scale = max(min(scale, CANCELLED * abs(cost)), FLOOR)
         bound = np.where(lam > 0, qp.ub, np.where(lam < 0, qp.lb, 0))
         gap = np.where(lam == 0, charge, charge - lam * self.y.minus(bound))
         slip = np.abs(errors[: len(z) - n_f]) @ np.abs(z[n_f:]) + np.abs(gap).sum()
