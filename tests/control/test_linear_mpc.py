@@ -192,13 +192,3 @@ def test_signals_that_are_not_those_of_p_are_named(arguments, message):
 def test_set_points_of_another_size_are_named():
     with pytest.raises(QPError, match=r"^r: got shape \(2,\), expected \(\*batch, 1\)"):
         qm.LinearMPC(SCALAR, 3, Q=1.0).target([1.0, 2.0])
-
-
-def test_a_saved_file_has_the_qp_alone(tmp_path):
-    mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 5, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))
-    mpc.save(tmp_path / "mpc.qpmpc")
-    p = mpc.arrange(x=[0.3], target=mpc.target(r=[1.5]))
-    loaded = qm.QPMPC.load(tmp_path / "mpc.qpmpc")
-    assert torch.equal(loaded.policy(p), mpc.policy(p))
-    with pytest.raises(qm.QPError, match="Make the LinearMPC again from its model"):
-        qm.LinearMPC.load(tmp_path / "mpc.qpmpc")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,7 +15,15 @@ from torch_qpmpc.control.linear_mpc import LinearMPC, Target
 from torch_qpmpc.control.observer import SMALL, kalman
 from torch_qpmpc.control.signals import read_row, read_table
 from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.control.stored import packed, unpacked
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.files import damaged, load_file, save_file
+
+if TYPE_CHECKING:
+    from torch_qpmpc.control.exporting import ControllerExport
+
+#: The kind of file that `Controller.save` writes.
+KIND = "Controller"
 
 
 class Controller:
@@ -35,6 +44,7 @@ class Controller:
 
     Attributes:
         mpc: the MPC.
+        observer: the Kalman `Observer`.
         x, w, u: the estimates of x and w, and the last input.
         target: the `Target` of the last step, None before the first; with a preview, of all stages.
 
@@ -62,7 +72,7 @@ class Controller:
         ranges = np.abs(y @ w.C + u @ np.linalg.pinv(plant.B) @ w.B)
         self._noise = _deviations("noise", noise, SMALL * y, plant.outputs)
         self._drift = _deviations("drift", drift, SMALL * ranges, w.names)
-        self._observer = kalman(design, self._noise, self._drift)
+        self.observer = kalman(design, self._noise, self._drift)
         self.r = np.zeros(0)
         self.reset()
 
@@ -91,13 +101,13 @@ class Controller:
     @property
     def x(self) -> Array:
         """The estimate of the state, zero before the first step."""
-        e = np.zeros(len(self._observer.F)) if self._e is None else self._e
+        e = np.zeros(len(self.observer.F)) if self._e is None else self._e
         return e[: len(self._design.plant.A)]
 
     @property
     def w(self) -> Array:
         """The estimate of the disturbances, zero before the first step."""
-        e = np.zeros(len(self._observer.F)) if self._e is None else self._e
+        e = np.zeros(len(self.observer.F)) if self._e is None else self._e
         return e[len(self._design.plant.A) :]
 
     def step(self, y: Any, r: Any = None, known: Any = None) -> Any:
@@ -114,7 +124,7 @@ class Controller:
             QPError: an argument is invalid, or missing.
             SolverError: no input satisfies the hard bounds.
         """
-        plant, observer = self._design.plant, self._observer
+        plant, observer = self._design.plant, self.observer
         d, y_k = self._known(known), read_row("y", y, plant.outputs)
         self._read_set_point(r)
         if self._e is None:
@@ -129,14 +139,74 @@ class Controller:
             else self.u.copy()
         )
 
+    def save(self, path: str | Path) -> None:
+        """Write this controller, with estimates and the last input, to a file that runs no code.
+
+        Raises:
+            QPError: a part of theta has a parametrization that is not QPMPC's own.
+            OSError: writing failed; the old file is unchanged.
+        """
+        names = ("_noise", "_drift", "_e", "u", "r")
+        state = {name.strip("_"): packed(getattr(self, name)) for name in names}
+        save_file(path, KIND, {**self.mpc.stored(), "controller": state})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Controller:
+        """Return the controller that `save` wrote to ``path``; it goes on from where that was.
+
+        Raises:
+            QPError: the file is missing or damaged, of another kind or a newer release, or holds
+                more than tensors and plain values.
+        """
+        content = load_file(path, KIND)
+        try:
+            state = unpacked(content["controller"])
+            mpc = LinearMPC.of_stored(content)
+            controller = cls(mpc, noise=state["noise"], drift=state["drift"])
+            controller._e, controller.u, controller.r = (state[name] for name in "eur")
+        except Exception as error:  # damaged files raise errors of any type
+            raise damaged(Path(path), error, "a file that Controller.save wrote") from error
+        return controller
+
+    def export_c(
+        self,
+        folder: str | Path,
+        *,
+        dtype: str = "float64",
+        name: str = "policy",
+        max_iterations: int | None = None,
+        storage: str = "fast",
+    ) -> ControllerExport:
+        """Write this controller as C99 without heap or dependencies.
+
+        ``name_step(&state, y, r, known, u)`` of ``name.c`` is `step`, with the estimates, the last
+        input and the active sets of both QPs in the state. A closed loop is compared with this
+        one's if a C compiler is installed. ``main.c`` and a ``Makefile`` run the closed loop with
+        the model as a plant; they are written once, and yours afterwards.
+
+        Args:
+            folder: the folder of the files, created if it does not exist.
+            dtype, name, max_iterations, storage: as in `QPMPC.export_c`.
+
+        Returns:
+            Sizes and the measured agreement.
+
+        Raises:
+            QPError: as in `QPMPC.export_c`, or the self-test fails.
+        """
+        from torch_qpmpc.control.exporting import export_controller
+
+        options = {"dtype": dtype, "name": name, "storage": storage}
+        return export_controller(self, folder, max_iterations=max_iterations, **options)
+
     def _predicted(self, e: Array, d: Array) -> Array:
-        observer = self._observer
+        observer = self.observer
         return observer.F @ e + observer.G @ self.u + observer.E @ d + observer.offset
 
     def _rest(self, y: Array, d: Array) -> None:
         """Set the estimate to where the plant rests with the last input."""
-        still = -self._predicted(np.zeros(len(self._observer.F)), d)
-        self._e = self._observer.rest @ np.concatenate((still, y))
+        still = -self._predicted(np.zeros(len(self.observer.F)), d)
+        self._e = self.observer.rest @ np.concatenate((still, y))
 
     @torch.no_grad()
     def _plan(self, d: Array) -> Array:

@@ -3,41 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from os import PathLike
+from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from scipy.linalg import block_diag
 from torch import Tensor
 
 from torch_qpmpc.control.design import Design, read_design
-from torch_qpmpc.control.state_space import Array, read_model
+from torch_qpmpc.control.lowering import LinearScheme, lowered
+from torch_qpmpc.control.state_space import read_model
+from torch_qpmpc.control.stored import read_stored, stored_design
 from torch_qpmpc.control.target import target_mpc
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.bounds import Bounds
-from torch_qpmpc.mpc.cost import Cost
-from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.regulator import lqr_gain
-from torch_qpmpc.mpc.riccati import riccati_weight
-from torch_qpmpc.mpc.scheme import Scheme
+from torch_qpmpc.mpc.state import KIND, check_own, stored
 from torch_qpmpc.qp.program import QuadraticProgram
 
 #: The price of a unit of violation of an output's bound.
 Y_SLACK = 1e3
-#: Near the target the values are constant, SCALE times those of a typical deviation in each stage:
-#: errors of a value are certified relative to it, and those of zero could not be.
-SCALE = 1e-2
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class LinearScheme(Scheme):
-    """The scheme of a linear MPC, with the design that it is made from."""
-
-    design: Design | None = None
+#: The arguments besides the scheme.
+OPTIONS = ("learn", "structure", "step", "solver", "on_failure")
 
 
 class Target(NamedTuple):
@@ -82,6 +68,10 @@ class LinearMPC(QPMPC):
         options: ``learn``, ``structure``, ``step``, ``solver`` and ``on_failure`` of `QPMPC`; by
             default a tied structure that learns nothing, and DAQP.
 
+    Attributes:
+        targets: the QPMPC whose policy maps [r; w; d] to the target; see
+            `torch_qpmpc.control.target`.
+
     Raises:
         QPError: an argument is invalid, or nothing has a cost.
 
@@ -96,7 +86,7 @@ class LinearMPC(QPMPC):
     """
 
     scheme: LinearScheme
-    _targets: QPMPC
+    targets: QPMPC
     _target_qp: QuadraticProgram
 
     def __init__(
@@ -149,7 +139,7 @@ class LinearMPC(QPMPC):
     def _start_targets(self) -> None:
         """Make the QP of the target, which is not learned and no submodule."""
         targets = target_mpc(self.design)
-        vars(self).update(_targets=targets, _target_qp=targets.quadratic_program())
+        vars(self).update(targets=targets, _target_qp=targets.quadratic_program())
 
     @property
     def design(self) -> Design:
@@ -157,11 +147,54 @@ class LinearMPC(QPMPC):
         assert self.scheme.design is not None
         return self.scheme.design
 
+    @property
+    def constants(self) -> dict[int, float]:
+        """The last entry of p, which is one."""
+        return {self.n_p - 1: 1.0}
+
+    def save(self, path: str | Path) -> None:
+        """Write this MPC with its design to a file that runs no code, as `QPMPC.save` does.
+
+        `LinearMPC.load` reads it, and `QPMPC.load` its QP alone.
+
+        Raises:
+            QPError: a part has a parametrization that is not QPMPC's own.
+            OSError: writing failed; the old file is unchanged.
+        """
+        save_file(path, KIND, self.stored())
+
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> QPMPC:
-        """Raise `QPError`: a saved file has the QP without its design; `QPMPC.load` reads it."""
-        remedy = "Make the LinearMPC again from its model, or load its QP with QPMPC.load."
-        raise QPError.expected("LinearMPC.load", str(path), "a file with a design", remedy)
+    def load(cls, path: str | Path) -> LinearMPC:
+        """Return the LinearMPC that `save` wrote to ``path``, with all of theta.
+
+        Raises:
+            QPError: as in `QPMPC.load`, or the file has no design.
+        """
+        content = load_file(path, KIND)
+        if "design" not in content:
+            remedy = "QPMPC.load reads it."
+            raise QPError.expected("path", f"{path}, a QPMPC", "a saved LinearMPC", remedy)
+        try:
+            return cls.of_stored(content)
+        except Exception as error:  # damaged files raise errors of any type
+            raise damaged(Path(path), error, "a file that LinearMPC.save wrote") from error
+
+    def stored(self) -> dict[str, Any]:
+        """Return the content of a file, tensors and plain values, of which `of_stored` makes one.
+
+        Raises:
+            QPError: a part has a parametrization that is not QPMPC's own.
+        """
+        check_own("save", self, self._parametrizations_for)
+        return {**stored(self), "design": stored_design(self.design)}
+
+    @classmethod
+    def of_stored(cls, content: Mapping[str, Any]) -> LinearMPC:
+        """Return the LinearMPC of the ``content`` of a file."""
+        scheme = lowered(read_stored(content["design"]))
+        mpc = cls(scheme, **{name: content["arguments"][name] for name in OPTIONS})
+        mpc.load_state_dict(content["mpc"])
+        return mpc
 
     @torch.no_grad()
     def target(self, r: Any, w: Any = 0.0, known: Any = 0.0) -> Target:
@@ -178,7 +211,7 @@ class LinearMPC(QPMPC):
         """
         s = self._target_inputs(r, w, known)
         steady = self.design.steady
-        v = self._targets.policy(s, qp=self._target_qp)
+        v = self.targets.policy(s, qp=self._target_qp)
         loads = torch.cat((s[..., len(steady.Q) :], s.new_ones(*s.shape[:-1], 1)), -1)
         pairs = ((steady.X, steady.x), (steady.U, steady.u), (steady.Y, steady.y))
         return Target(*(v @ s.new_tensor(Z.T) + loads @ s.new_tensor(M.T) for Z, M in pairs))
@@ -244,93 +277,3 @@ class LinearMPC(QPMPC):
 
 def _shifted(place: slice, by: int) -> slice:
     return slice(place.start + by, place.stop + by)
-
-
-def lowered(design: Design) -> LinearScheme:
-    """Return the scheme of a design, in deviations from the target."""
-    places = design.places
-    n_d = places["known"].stop
-    layout = Layout(places["u"].start - n_d, design.plant.sizes[1], design.horizon, 1, n_d)
-    parts = _model(design), _cost(design, layout), _bounds(design)
-    return LinearScheme(layout, *parts, design.gamma, design=design)
-
-
-def _model(design: Design) -> Model:
-    """Return the model of [x; u_last; y_s; u_s; 1], where y_s and u_s stay."""
-    s, plant = design.selectors(), design.plant
-    n_d = design.places["known"].stop
-    x = plant.A @ s["x"] + plant.B @ s["u"] + plant.E @ s["known"]
-    rows = np.vstack((x, s["u"][: len(s["u_last"])], s["y_s"], s["u_s"], s["one"]))
-    n_x = n_d + len(rows)
-    return Model(rows[:, n_d:n_x], rows[:, n_x:], rows[:, :n_d])
-
-
-def _cost(design: Design, layout: Layout) -> Cost:
-    """Return the squares of deviations from the target, and the prices."""
-    s, places, plant = design.selectors(), design.places, design.plant
-    y, u = plant.C @ s["x"], s["u"].copy()
-    y[: len(s["r"])] -= s["r"]
-    u[: len(s["u_r"])] -= s["u_r"]
-    du = [s["u"] - s["u_last"]] if design.moves else []
-    T = np.vstack((y, u, *du))
-    stage = 2 * T.T @ block_diag(design.Q, design.R, *[design.dR] * len(du)) @ T
-    linear = np.zeros(len(stage))
-    for name, price in design.linear.items():
-        i = places["u"].start + plant.inputs.index(name)
-        if isinstance(price, str):
-            j = places["known"].start + plant.known.index(price)
-            stage[i, j] += 1
-            stage[j, i] += 1
-        else:
-            linear[i] += price
-    one = places["one"].start
-    stage[one, one] = 2 * SCALE * design.typical
-    size = places["u"].start
-    P = _riccati(design)
-    x = np.vstack((s["x"], s["u_last"]))[:, :size]
-    terminal = 2 * y[:, :size].T @ design.Q @ y[:, :size] if P is None else x.T @ P @ x
-    q = layout.from_stage(torch.as_tensor(linear).expand(layout.horizon, 1, -1)).sum(0)
-    return Cost(stage, terminal, hessian="block", q=q)
-
-
-def _riccati(design: Design) -> Array | None:
-    """Return the cost to go of [x; u_last] about a steady state, None if it does not exist."""
-    plant, m = design.plant, design.plant.sizes[1]
-    A, B = plant.A, plant.B
-    Q, R = 2 * plant.C.T @ design.Q @ plant.C, 2 * (design.R + design.dR)
-    S = np.zeros_like(B)
-    if design.moves:
-        A, B = block_diag(A, np.zeros((m, m))), np.vstack((B, np.eye(m)))
-        Q, S = block_diag(Q, 2 * design.dR), np.vstack((S, -2 * design.dR))
-    A, B, W = (torch.as_tensor(x) for x in (A, B, np.block([[Q, S], [S.T, R]])))
-    try:
-        P = riccati_weight(A, B, W, design.gamma)
-        K = lqr_gain(A, B, W, design.gamma)
-    except (QPError, RuntimeError):  # the latter of a singular matrix
-        return None
-    radius = torch.linalg.eigvals(A - B @ K).abs().max() * design.gamma**0.5
-    eigenvalues = torch.linalg.eigvalsh(P)
-    exists = radius < 1 - 1e-9 and eigenvalues[0] >= -1e-9 * eigenvalues[-1].abs()
-    return P.numpy() if exists else None
-
-
-def _bounds(design: Design) -> Bounds:
-    """Return rows of the outputs at their prices, and hard ones of inputs and moves."""
-    s, size = design.selectors(), design.places["u"].start
-    moving = np.isfinite(design.du_bounds).any(0)
-    of_y, of_u = design.bounded
-    y = (design.plant.C @ s["x"])[of_y] + s["y_s"]
-    du = s["u"][moving] - s["u_last"][moving] if moving.any() else y[:0]
-    D = np.vstack((y, s["u"][of_u] + s["u_s"], du))
-    sides = ((design.y_bounds, of_y), (design.u_bounds, of_u), (design.du_bounds, moving))
-    lower, upper = (
-        np.concatenate([bounds[side][rows] for bounds, rows in sides]) for side in (0, 1)
-    )
-    n_y = len(y)
-    price = design.y_slack[of_y]
-    return Bounds(
-        constraints=(D, lower, upper) if len(D) else None,
-        terminal_constraints=(y[:, :size], lower[:n_y], upper[:n_y]) if n_y else None,
-        constraint_slack=np.concatenate((price, np.full(len(D) - n_y, np.inf), price)),
-        discount_slack=True,
-    )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ class StateSpace:
         offset: ``(n,)``.
         dt: the sampling time, or None.
         inputs, outputs, known: names of the entries of u, y and d.
+        units: units by name, where known.
 
     Raises:
         QPError: the shapes do not match, or the names do not.
@@ -43,6 +44,7 @@ class StateSpace:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     known: tuple[str, ...]
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = len(self.A)
@@ -61,6 +63,10 @@ class StateSpace:
     def sizes(self) -> tuple[int, int, int, int]:
         """n, m, n_y and n_d."""
         return len(self.A), self.B.shape[1], len(self.C), self.E.shape[1]
+
+    def label(self, name: str) -> str:
+        """Return ``name`` with its unit, as ``T [degC]``."""
+        return f"{name} [{self.units[name]}]" if name in self.units else name
 
 
 def read_model(
@@ -91,10 +97,11 @@ def read_model(
         check_number("dt", dt, lambda x: 0 < x < np.inf, "a sampling time > 0")
     if isinstance(model, StateSpace):
         return model
-    offset = None
+    offset, units = None, {}
     if isinstance(model, Identified):
         A, B, C, E, offset = _of_arx(model)
         log, dt = model.log, model.log.dt if dt is None else dt
+        units = dict(log.units)
         inputs, outputs, known = inputs or log.inputs, outputs or log.outputs, known or log.known
         E = E * [name not in prices for name in known]
     elif isinstance(model, Sequence) and len(model) in (2, 3):
@@ -114,7 +121,8 @@ def read_model(
     inputs = inputs or [f"u{i + 1}" for i in range(B.shape[1])]
     outputs = outputs or [f"y{i + 1}" for i in range(len(C))]
     offset = np.zeros(len(A)) if offset is None else offset
-    return StateSpace(A, B, C, E, offset, dt, tuple(inputs), tuple(outputs), tuple(known))
+    names = tuple(inputs), tuple(outputs), tuple(known)
+    return StateSpace(A, B, C, E, offset, dt, *names, units)
 
 
 def _matrix(name: str, value: Any) -> Array:

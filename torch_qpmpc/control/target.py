@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from torch_qpmpc.control.design import Design
+from torch_qpmpc.control.lowering import SCALE
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
@@ -44,7 +45,13 @@ def target_mpc(design: Design) -> QPMPC:
         )
         weight[n_x:, n_x:] += _preference(design) * 1e-3 * np.trace(steady.R) * np.eye(n_v)
     layout = Layout(n_x, n_v, horizon=1)
-    cost = Cost(weight, np.zeros((n_x, n_x)), hessian="block", q=np.pad(linear, (0, n_x)))
+    cost = Cost(
+        weight,
+        np.zeros((n_x, n_x)),
+        hessian="block",
+        q=np.pad(linear, (0, n_x)),
+        c=SCALE * design.typical,
+    )
     model = Model(np.eye(n_x), np.zeros((n_x, n_v)))
     return QPMPC(
         Scheme(layout, model, cost, _bounds(design, error, inputs), gamma=1.0),

@@ -24,7 +24,8 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
 
     Those nearest to reaching the bounds come first. An entry's size is a quantile, at most the
     median, over the rows that contain it, of that at which the row without multipliers is at its
-    nearest bound: rows of late stages reach theirs for absurd p only.
+    nearest bound: rows of late stages reach theirs for absurd p only. Constants stay, and
+    p satisfies hard rows with equal bounds.
     """
     rng = np.random.default_rng(seed)
     pairs = zip(tables.rows.parts(), tables.known.parts(), strict=True)
@@ -39,7 +40,12 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
     exponents = rng.uniform(-2, 1, count)
     exponents = exponents[np.abs(exponents).argsort()]
     away = 10 ** exponents[:, None] * scale * rng.standard_normal((count, tables.n_p))
-    return tables.centre + away
+    p = tables.centre + away
+    p[:, [*tables.constants]] = [*tables.constants.values()]
+    known = tables.known
+    equal = np.isinf(known.w) & (known.lower == known.upper)
+    Y = known.Y[equal]
+    return p - (p @ Y.T - known.lower[equal]) @ np.linalg.pinv(Y).T
 
 
 def nearer(

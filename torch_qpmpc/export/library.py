@@ -94,7 +94,7 @@ class Library:
     def _load(self) -> None:
         files, name, dtype, flags = self._made_of
         self.real = np.dtype(dtype)
-        library = _compiled(files | {"wrapper_.c": filled("wrapper.c", name)}, flags)
+        library = compiled(files | {"wrapper_.c": filled("wrapper.c", name)}, flags)
         self._steps = library[f"{name}_steps"]
         self._resets = library[f"{name}_resets"]
         self.selftest = library[f"{name}_selftest"]
@@ -134,7 +134,7 @@ class Library:
         return Steps(u, codes, *(info[name] for name in self._info.names or ()))
 
 
-def _compiled(files: Mapping[str, str], flags: Sequence[str]) -> ctypes.CDLL:
+def compiled(files: Mapping[str, str], flags: Sequence[str]) -> ctypes.CDLL:
     """Compile files as C, also with a compiler of C++, and load them."""
     command = required_compiler()
     with tempfile.TemporaryDirectory() as folder:

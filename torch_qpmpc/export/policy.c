@@ -522,7 +522,7 @@ int policy_selftest(void)
                 good = good && u[j] >= U_LOWER[j] && u[j] <= U_UPPER[j];
                 if (code == POLICY_SOLVED) good = good && near(u[j], EXAMPLE_U[i][j], NEAR_U[j]);
             }
-            if (code == POLICY_SOLVED) good = good && near(info.value, EXAMPLE_VALUE[i], NEAR_VALUE);
+            if (code == POLICY_SOLVED) good = good && near(info.value, EXAMPLE_VALUE[i], NEAR_VALUE[i]);
             if (!good) return i + 1;
         }
     }

@@ -73,6 +73,7 @@ class Tables:
         u_lower, u_upper: ``(n_u,)``, the hard bounds of rows that contain one action only.
         condition: the condition number of H_v in an orthonormal basis of the plan.
         centre: ``(n_p,)``, a p with a plan near the middle of its bounds, zero if there is none.
+        constants: entries of p with one value only.
         digest: SHA-256 of the nine tensors of the QP.
     """
 
@@ -92,6 +93,7 @@ class Tables:
     u_upper: Array
     condition: float
     centre: Array
+    constants: dict[int, float]
     digest: str
 
 
@@ -148,7 +150,8 @@ def make_tables(mpc: QPMPC) -> Tables:
         u_lower,
         u_upper,
         condition,
-        _centre(qp, n_p),
+        _centre(qp, n_p, mpc.constants),
+        mpc.constants,
         _digest(qp),
     )
 
@@ -218,7 +221,7 @@ def _action_bounds(G: Array, lb: Array, ub: Array, w: Array, u: slice) -> tuple[
 
 
 @torch.no_grad()
-def _centre(qp: QuadraticProgram, n_p: int) -> Array:
+def _centre(qp: QuadraticProgram, n_p: int, constants: dict[int, float]) -> Array:
     """Return the p of the plan whose bounded rows are nearest to the middle of their bounds."""
     names = ("C", "b", "G", "lb", "ub", "w")
     C, b, G, lb, ub, w = (getattr(qp, name).detach().double().cpu() for name in names)
@@ -231,7 +234,9 @@ def _centre(qp: QuadraticProgram, n_p: int) -> Array:
     middle = QuadraticProgram(H, q, q.new_zeros(()), C, b, G, lb, ub, w, check_values=False)
     solution = solve_qp(middle, solver="daqp", on_failure="mask")
     z = solution.z if solution.status == Status.SOLVED else torch.zeros_like(q)
-    return z[:n_p].numpy()
+    p = z[:n_p].numpy()
+    p[[*constants]] = [*constants.values()]
+    return p
 
 
 def _digest(qp: QuadraticProgram) -> str:

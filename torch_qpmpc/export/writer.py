@@ -116,6 +116,11 @@ def header(mpc: QPMPC, tables: Tables, settings: Settings, labels: Labels) -> st
         "",
         *_layout(mpc, labels),
     ]
+    return comment(lines)
+
+
+def comment(lines: Sequence[str]) -> str:
+    """Return lines of any text as a comment in C."""
     return "/* " + "\n   ".join(map(_harmless, lines)).rstrip() + " */"
 
 
@@ -248,6 +253,7 @@ def _examples(tables: Tables, settings: Settings, examples: Examples) -> str:
         "EXAMPLE_U": np.array([np.nan_to_num(e.u) for e in states]).reshape(-1, tables.n_u),
         "EXAMPLE_VALUE": np.array([np.nan_to_num(e.value) for e in states]),
         "NEAR_U": near.u * examples.u,
+        "NEAR_VALUE": near.value * np.fmax([abs(e.value) for e in states], examples.value),
     }
     return "\n".join(
         [
@@ -255,7 +261,6 @@ def _examples(tables: Tables, settings: Settings, examples: Examples) -> str:
             f"#define EXAMPLES {len(states)}",
             f"static const int EXAMPLE_CODE[] = {{{', '.join(str(e.code) for e in states)}}};",
             *(array(name, x, dtype) for name, x in arrays.items()),
-            f"static const real NEAR_VALUE = {number(near.value * examples.value, dtype)};",
         ]
     )
 

@@ -649,6 +649,11 @@ class QPMPC(nn.Module):
         )
 
     @property
+    def constants(self) -> dict[int, float]:
+        """The entries of p that have one value only, such as a 1 in the state."""
+        return {}
+
+    @property
     def arguments(self) -> dict[str, Any]:
         """The constructor's arguments as tensors and plain values.
 

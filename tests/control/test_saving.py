@@ -1,0 +1,142 @@
+"""Saved MPCs and controllers: the same inputs to the last digit, and messages."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import torch_qpmpc as qm
+from torch_qpmpc import QPError, files
+from torch_qpmpc.control.state_space import read_model
+
+FOLDER = Path(__file__).parent
+A = np.array([[1.0, 0.1], [0.0, 0.8]])
+B, C, E = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]]), np.array([[0.0], [0.1]])
+
+
+def learned(references: str = "held") -> qm.LinearMPC:
+    """Make a LinearMPC with bounds, prices and names of which every part has been learned."""
+    names = {"inputs": ["valve"], "outputs": ["level"], "known": ["rain", "price"]}
+    plant = read_model((A, B, C), np.hstack((E, 0 * E)), 0.5, **names)
+    mpc = qm.LinearMPC(
+        replace(plant, units={"level": "m"}),
+        4,
+        Q={"level": 1.0},
+        dR=0.1,
+        y_bounds={"level": (None, 2.0)},
+        u_bounds=(-1.0, 1.0),
+        du_bounds=(-0.3, 0.3),
+        linear={"valve": "price"},
+        references=references,
+        learn=("H", "q", "c", "C", "b", "lb", "ub", "w"),
+    )
+    optimizer = torch.optim.SGD(mpc.parameters(), lr=1e-3)
+    mpc.value(torch.linspace(-0.5, 0.5, mpc.n_p)).backward()
+    optimizer.step()
+    return mpc
+
+
+def inputs(controller: qm.Controller, steps: int = 20) -> np.ndarray:
+    """Return the inputs of a closed loop with noise, a load and a moving set-point."""
+    rng, x, us = np.random.default_rng(1), controller.x, []
+    for k in range(steps):
+        y = C @ x + 0.01 * rng.normal(size=1)
+        us.append(controller.step(y, [np.sin(k / 5)], known=[[0.3, 0.01 * k]]))
+        x = A @ x + B @ (us[-1] + 0.1)
+    return np.array(us)
+
+
+@pytest.mark.parametrize("references", ["held", "preview"])
+def test_a_loaded_controller_goes_on_with_the_same_inputs(tmp_path, references):
+    controller = qm.Controller(learned(references), noise=0.02, drift={"disturbance of valve": 0.5})
+    inputs(controller)
+    controller.save(tmp_path / "mine.qpmpc")
+    twin = qm.Controller.load(tmp_path / "mine.qpmpc")
+    assert twin.mpc.learned == controller.mpc.learned
+    assert np.array_equal(inputs(twin), inputs(controller))
+    assert twin.mpc.design.plant.label("level") == "level [m]"
+    assert twin.mpc.design.plant.dt == 0.5
+
+
+def test_another_process_has_the_same_inputs(tmp_path):
+    controller = qm.Controller(learned())
+    controller.save(tmp_path / "mine.qpmpc")
+    code = """
+import numpy as np, sys, torch_qpmpc as qm
+from tests.control.test_saving import inputs
+np.save("inputs.npy", inputs(qm.Controller.load("mine.qpmpc")))
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
+    assert np.array_equal(np.load(tmp_path / "inputs.npy"), inputs(controller))
+
+
+def test_a_controller_is_saved_before_its_first_step_and_without_disturbances(tmp_path):
+    controller = qm.Controller(qm.LinearMPC((A, B, C), 5, Q=1.0, R=1.0, disturbances=None))
+    controller.save(tmp_path / "mine")
+    twin = qm.Controller.load(tmp_path / "mine")
+    assert twin.step([1.0], [0.0]) == controller.step([1.0], [0.0])
+
+
+def test_a_loaded_mpc_is_the_same_and_qpmpc_reads_its_qp(tmp_path):
+    mpc = learned()
+    mpc.save(tmp_path / "mpc.qpmpc")
+    twin = qm.LinearMPC.load(tmp_path / "mpc.qpmpc")
+    plain = qm.QPMPC.load(tmp_path / "mpc.qpmpc")
+    known = np.ones((5, 2))
+    p = twin.arrange([0.3, 0.1], twin.target([0.5], w=[0.1]), known=known, level=[1.0, 1.0])
+    assert torch.equal(
+        p, mpc.arrange([0.3, 0.1], mpc.target([0.5], w=[0.1]), known=known, level=[1.0, 1.0])
+    )
+    assert torch.equal(twin.value(p), mpc.value(p))
+    assert torch.equal(plain.policy(p), mpc.policy(p))
+    twin.reset_parameters()
+    mpc.reset_parameters()
+    assert torch.equal(twin.value(p), mpc.value(p))
+
+
+def test_later_releases_read_the_first_format():
+    """``python -m tests.control.test_saving`` has written the file."""
+    controller = qm.Controller.load(FOLDER / "saved-1.qpmpc")
+    assert controller.mpc.design.plant.known == ("rain", "price")
+    assert np.allclose(inputs(controller)[[0, 10, 19], 0], FIRST, rtol=0, atol=1e-9)
+
+
+#: Inputs of the file's controller.
+FIRST = [0.058890309342, -0.470079744144, -0.43149202087]
+
+
+# Files of other kinds
+
+
+def test_files_of_other_kinds_are_named(tmp_path):
+    mpc = learned()
+    qm.Controller(mpc).save(tmp_path / "controller")
+    mpc.save(tmp_path / "mpc")
+    qm.QPMPC(1, 1, 2).save(tmp_path / "qp")
+    with pytest.raises(QPError, match=r"controller, a saved Controller, expected a file that QPM"):
+        qm.QPMPC.load(tmp_path / "controller")
+    with pytest.raises(QPError, match=r"mpc, a saved QPMPC, expected a file that Controller.save"):
+        qm.Controller.load(tmp_path / "mpc")
+    with pytest.raises(QPError, match=r"qp, a QPMPC, expected a saved LinearMPC. QPMPC.load reads"):
+        qm.LinearMPC.load(tmp_path / "qp")
+
+
+@pytest.mark.parametrize(("kind", "part"), [("LinearMPC", "plant"), ("Controller", "horizon")])
+def test_a_file_without_a_part_is_named(tmp_path, kind, part):
+    made = learned() if kind == "LinearMPC" else qm.Controller(learned())
+    made.save(tmp_path / "file")
+    content = torch.load(tmp_path / "file")
+    del content["design"][part]
+    torch.save(content, tmp_path / "file")
+    with pytest.raises(QPError, match=rf"^file: got .*/file \(.*{part}.*\), expected a file that"):
+        getattr(qm, kind).load(tmp_path / "file")
+
+
+if __name__ == "__main__":
+    qm.Controller(learned()).save(FOLDER / f"saved-{files.VERSION}.qpmpc")

@@ -1,0 +1,291 @@
+"""`Controller.export_c`: a controller as C, compared with Python in a closed loop."""
+
+from __future__ import annotations
+
+import copy
+import ctypes
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torch_qpmpc.control.controller import Controller
+from torch_qpmpc.control.design import half_range
+from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.export.export import Export, export_c
+from torch_qpmpc.export.library import FLAGS, compiled, compiler
+from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled
+
+#: Steps of the loop that is compared, and of those that the self-test replays.
+COMPARED, REPLAYED = 200, 10
+#: Largest difference of an input in the comparison, relative to half the distance of its bounds.
+NEAR = {"float64": 1e-6, "float32": 1e-2}
+SIZE = """#include "policy.h"
+unsigned long policy_state_size(void) { return sizeof(policy_state); }
+"""
+
+
+@dataclass(frozen=True)
+class ControllerExport:
+    """Report of `Controller.export_c`.
+
+    Attributes:
+        files: the paths of all files.
+        plan, target: the reports of both QPs.
+        table_bytes: the size of all constant tables but those of self-tests.
+        state_bytes: the size of the state, None without a compiler.
+        steps: the number of steps of the closed loop that is compared.
+        difference: the largest difference of an input; None without a compiler.
+    """
+
+    files: tuple[Path, ...]
+    plan: Export
+    target: Export
+    table_bytes: int
+    state_bytes: int | None
+    steps: int
+    difference: float | None
+
+    def __str__(self) -> str:
+        """Return a report of a few lines."""
+        state = "" if self.state_bytes is None else f", state {self.state_bytes:,} bytes"
+        compared = (
+            "not compared: no C compiler was found"
+            if self.difference is None
+            else f"inputs of a closed loop of {self.steps} steps within {self.difference:.1e}"
+        )
+        sizes = f"tables {self.table_bytes:,} bytes{state}"
+        return "\n".join((", ".join(map(str, self.files)), sizes, compared))
+
+
+class Loop(NamedTuple):
+    """Signals of a closed loop: y, r, known and u, each of a step in a row."""
+
+    y: Array
+    r: Array
+    known: Array
+    u: Array
+
+
+class CompiledController:
+    """The functions of an exported controller, compiled.
+
+    Args:
+        files: the texts of the C files by name.
+        name: the beginning of the names in C.
+        dtype: of all numbers.
+        n_u: the number of inputs.
+    """
+
+    def __init__(self, files: Mapping[str, str], name: str, dtype: str, n_u: int) -> None:
+        size = SIZE.replace("policy", name)
+        library = compiled({**files, "size_.c": size}, FLAGS)
+        self._step, self._reset = library[f"{name}_step"], library[f"{name}_reset"]
+        self._step.argtypes, self._reset.argtypes = [ctypes.c_void_p] * 5, [ctypes.c_void_p] * 2
+        self.selftest = library[f"{name}_selftest"]
+        state_size = library[f"{name}_state_size"]
+        state_size.restype = ctypes.c_ulong
+        self.state_bytes, self._dtype = int(state_size()), np.dtype(dtype)
+        self._state, self._u = np.zeros(self.state_bytes, np.uint8), np.zeros(n_u, self._dtype)
+        self.reset()
+
+    def reset(self, y: Any = None) -> None:
+        """Forget the past, as ``policy_reset``."""
+        (y,) = self._numbers(y)
+        self._reset(self._state.ctypes.data, None if y is None else y.ctypes.data)
+
+    def step(self, y: Any, r: Any = None, known: Any = None) -> tuple[Array, int]:
+        """Return the input and the code of a step; r and known have all rows."""
+        signals = self._numbers(y, r, known)
+        pointers = (None if x is None else x.ctypes.data for x in signals)
+        code = self._step(self._state.ctypes.data, *pointers, self._u.ctypes.data)
+        return self._u.astype(np.float64), int(code)
+
+    def _numbers(self, *signals: Any) -> list[Any]:
+        return [None if x is None else np.array(x, self._dtype, order="C") for x in signals]
+
+
+def export_controller(
+    controller: Controller,
+    folder: str | Path,
+    *,
+    dtype: str,
+    name: str,
+    max_iterations: int | None,
+    storage: str,
+) -> ControllerExport:
+    """Write a controller as C; see `Controller.export_c`."""
+    options = {"dtype": dtype, "max_iterations": max_iterations, "storage": storage}
+    mpc, plant = controller.mpc, controller.mpc.design.plant
+    with tempfile.TemporaryDirectory() as temporary:
+        plan = export_c(mpc, temporary, name=f"{name}_plan", **options)
+        target = export_c(mpc.targets, temporary, name=f"{name}_target", **options)
+        texts = {x.name: x.read_text(encoding="utf-8") for x in (*plan.files, *target.files)}
+    loop = _run(controller, COMPARED)
+    texts |= _sources(controller, name, dtype, loop)
+    state_bytes = difference = None
+    if compiler() is not None:
+        library = CompiledController(texts, name, dtype, len(plant.inputs))
+        state_bytes, difference = library.state_bytes, _compare(library, loop)
+        near = NEAR[dtype] * half_range(controller.mpc.design.u_bounds)
+        if (failed := library.selftest()) or (difference > near).any():
+            got = f"{dtype!r}, with a failed self-test ({failed}) or inputs off by {difference}"
+            raise QPError.expected("dtype", got, "a controller that agrees", "Export float64.")
+    example = {"main.c": _main(controller, name, dtype), "Makefile": filled("controller.mk", name)}
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, text in texts.items():
+        (folder / file).unlink(missing_ok=True)  # may be a link, which would be followed
+        (folder / file).write_text(text, encoding="utf-8")
+    for file, text in example.items():
+        if not (folder / file).exists():
+            (folder / file).write_text(text, encoding="utf-8")
+    own = sum(x.size for x in _tables(controller).values()) * np.dtype(dtype).itemsize
+    return ControllerExport(
+        tuple(folder / file for file in (*texts, *example)),
+        plan,
+        target,
+        plan.table_bytes + target.table_bytes + own,
+        state_bytes,
+        len(loop.u),
+        None if difference is None else float(difference.max()),
+    )
+
+
+def _run(controller: Controller, steps: int) -> Loop:
+    """Return signals of a closed loop with noise, a load and moving set-points, from rest.
+
+    It ends early where no input satisfies the hard bounds.
+    """
+    twin, design, rng = copy.copy(controller), controller.mpc.design, np.random.default_rng(0)
+    twin.reset()
+    plant, rows = design.plant, steps + design.horizon + 1
+    size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
+    moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
+    d = 0.1 * rng.normal(size=(rows, len(plant.known)))
+    middle = np.where(np.isfinite(design.y_bounds).all(0), np.mean(design.y_bounds, 0), 0.0)
+    x, loop = np.linalg.pinv(plant.C) @ middle, []
+    for k in range(steps):
+        y = plant.C @ x + 0.01 * size_y * rng.normal(size=len(size_y))
+        r, known = middle + moves[k:] * size_y, d[k:]
+        r, known = (x[: design.horizon + 1] for x in (r, known))
+        r = r if design.references == "preview" else r[:1]
+        try:
+            u = twin.step(y, r, known)
+        except SolverError:
+            if loop:
+                break
+            raise
+        loop.append((y, r.ravel(), known.ravel(), u))
+        x = plant.A @ x + plant.B @ (u + 0.05 * size_u) + plant.E @ known[0] + plant.offset
+    return Loop(*map(np.array, zip(*loop, strict=True)))
+
+
+def _compare(library: CompiledController, loop: Loop) -> Array:
+    """Return the largest difference of each input in a loop, inf where a step is not solved."""
+    differences = []
+    for y, r, known, expected in zip(*loop, strict=True):
+        u, code = library.step(y, r, known)
+        differences.append(np.abs(u - expected) if code == 0 else np.full(len(u), np.inf))
+    return np.max(differences, 0)
+
+
+def _sources(controller: Controller, name: str, dtype: str, loop: Loop) -> dict[str, str]:
+    """Return the texts of ``name.h`` and ``name.c``."""
+    design = controller.mpc.design
+    sizes = {f"{name.upper()}_{key}": size for key, size in _sizes(controller).items()}
+    defined = "\n".join(f"#define {key} {size}" for key, size in sizes.items())
+    tables = [array(key, x, dtype) for key, x in _tables(controller).items()]
+    indices = {
+        f"OF_{key}": np.flatnonzero(mask) for key, mask in zip("YU", design.bounded, strict=True)
+    }
+    tables += [
+        f"static const int {key}[] = {{{', '.join(map(str, x)) or 0}}};"
+        for key, x in indices.items()
+    ]
+    replayed = Loop(*(part[:REPLAYED] for part in loop))
+    examples = {f"EXAMPLE_{key.upper()}": x for key, x in replayed._asdict().items()}
+    examples["NEAR_U"] = NEAR[dtype] * half_range(design.u_bounds)
+    parts = {
+        "/* @HEADER@ */": comment(_signals(controller, name)),
+        "/* @SIZES@ */": defined,
+        "/* @TABLES@ */": "\n".join([f"#define BIG {CONSTANTS[dtype]['BIG']}", *tables]),
+        "/* @EXAMPLES@ */": "\n".join(
+            [
+                f"#define EXAMPLES {len(replayed.u)}",
+                *(array(key, x, dtype) for key, x in examples.items()),
+            ]
+        ),
+    }
+    return {f"{name}.{end}": filled(f"controller.{end}", name, parts) for end in "hc"}
+
+
+def _signals(controller: Controller, name: str) -> list[str]:
+    """Describe the entries of y, r, known and u."""
+    plant = controller.mpc.design.plant
+    every = "" if plant.dt is None else f", a step every {plant.dt:g}"
+    groups = {"y and r": plant.outputs, "known": plant.known, "u": plant.inputs}
+    return [
+        f"{name}: a linear MPC with an observer, by torch_qpmpc{every}.",
+        *(f"{key}: {', '.join(map(plant.label, names))}" for key, names in groups.items() if names),
+    ]
+
+
+def _sizes(controller: Controller) -> dict[str, int]:
+    design, observer = controller.mpc.design, controller.observer
+    n, m, n_y, n_d = design.plant.sizes
+    width = {key: place.stop - place.start for key, place in design.places.items()}
+    stages = design.horizon + 1
+    return {
+        "N_X": n,
+        "N_W": len(observer.F) - n,
+        "N_E": len(observer.F),
+        "N_U": m,
+        "N_Y": n_y,
+        "N_D": n_d,
+        "N_D_": max(n_d, 1),
+        "STAGES": stages,
+        "SET_POINTS": stages if design.references == "preview" else 1,
+        "N_R": width["r"],
+        "N_UR": width["u_r"],
+        "MOVES": width["u_last"],
+        "BOUNDED_Y": width["y_s"],
+        "BOUNDED_U": width["u_s"],
+    }
+
+
+def _tables(controller: Controller) -> dict[str, Array]:
+    """Return the constant arrays by their names in C."""
+    design, observer = controller.mpc.design, controller.observer
+    steady = design.steady
+    return {
+        **{key.upper(): x for key, x in observer._asdict().items()},
+        **{f"{key}_V": getattr(steady, key) for key in "XUY"},
+        **{f"{key.upper()}_L": getattr(steady, key) for key in "xuy"},
+        "ACTS": design.plant.E.any(0).astype(float),
+        "U_LOWER": design.u_bounds[0],
+        "U_UPPER": design.u_bounds[1],
+    }
+
+
+def _main(controller: Controller, name: str, dtype: str) -> str:
+    """Return a program of the closed loop with the model, a load and a set-point in reach."""
+    design = controller.mpc.design
+    plant, sizes = design.plant, _sizes(controller)
+    load = 0.1 * plant.B @ half_range(design.u_bounds) + plant.offset
+    r = design.steady.y[:, -1] + 0.5 * half_range(design.y_bounds)
+    r = controller.mpc.target(r).y.numpy()
+    arrays = {
+        "A": plant.A,
+        "B": plant.B,
+        "C": plant.C,
+        "LOAD": load,
+        "R": np.tile(r, sizes["SET_POINTS"]),
+        "KNOWN": np.zeros(sizes["STAGES"] * sizes["N_D"]),
+    }
+    tables = "\n".join(["enum { STEPS = 200 };", *(array(k, x, dtype) for k, x in arrays.items())])
+    return filled("controller_main.c", name, {"/* @PLANT@ */": tables})

@@ -1,0 +1,182 @@
+/* @HEADER@ */
+#include "policy.h"
+
+/* An observer of e = [x; w], the state and constant disturbances; a QP for the steady state that is
+   nearest to the set-point; and a QP for the plan to it.
+
+       e  is corrected by L (y - H e), and predicted by F e + G u + E d + OFFSET
+       [x_s; u_s; y_s] = [X_V; U_V; Y_V] v + [X_L; U_L; Y_L] [w; level; 1], v by the target's QP
+       u = u_s + the plan's first input, within the bounds */
+
+typedef policy_real real;
+
+enum { N_X = POLICY_N_X, N_W = POLICY_N_W, N_E = POLICY_N_E, N_U = POLICY_N_U };
+enum { N_Y = POLICY_N_Y, N_D = POLICY_N_D, N_V = POLICY_TARGET_N_U, LOADS = N_W + N_D + 1 };
+enum { STAGES = POLICY_STAGES, SET_POINTS = POLICY_SET_POINTS };
+
+/* @TABLES@ */
+
+/* Add M x to y, where M has so many rows and columns. */
+static void add(real *y, const real *M, int rows, int columns, const real *x)
+{
+    int i, j;
+    for (i = 0; i < rows; i++)
+        for (j = 0; j < columns; j++) y[i] += M[i * columns + j] * x[j];
+}
+
+static void copy(real *to, const real *from, int n)
+{
+    int i;
+    for (i = 0; i < n; i++) to[i] = from[i];
+}
+
+static int are_finite(const real *x, int n)
+{
+    int i;
+    for (i = 0; i < n; i++)
+        if (x[i] - x[i] != 0) return 0;
+    return 1;
+}
+
+static real within(real x, int i)
+{
+    return x < U_LOWER[i] ? U_LOWER[i] : x > U_UPPER[i] ? U_UPPER[i] : x;
+}
+
+/* Predict the estimates of the next step. */
+static void predict(policy_state *s)
+{
+    real next[N_E];
+    copy(next, OFFSET, N_E);
+    add(next, &F[0][0], N_E, N_E, s->e);
+    add(next, &G[0][0], N_E, N_U, s->u);
+    add(next, &E[0][0], N_E, N_D, s->known);
+    copy(s->e, next, N_E);
+}
+
+/* Set the estimates to where the plant rests with outputs y and the last input. */
+static void rest(policy_state *s, const real y[])
+{
+    real known[N_E + N_Y];
+    int i;
+    for (i = 0; i < N_E; i++) s->e[i] = 0;
+    predict(s);
+    for (i = 0; i < N_E; i++) known[i] = -s->e[i];
+    copy(known + N_E, y, N_Y);
+    for (i = 0; i < N_E; i++) s->e[i] = 0;
+    add(s->e, &REST[0][0], N_E, N_E + N_Y, known);
+}
+
+/* Correct the estimates by measured outputs. */
+static void correct(policy_state *s, const real y[])
+{
+    real error[N_Y];
+    int i, j;
+    copy(error, y, N_Y);
+    for (i = 0; i < N_Y; i++)
+        for (j = 0; j < N_E; j++) error[i] -= H[i][j] * s->e[j];
+    add(s->e, &L[0][0], N_E, N_Y, error);
+}
+
+/* Set the target for the set-point of a stage; return the code of its QP. */
+static int aim(policy_state *s, const real r[], const real level[])
+{
+    real loads[LOADS], t[POLICY_TARGET_N_P], v[N_V];
+    int i, code;
+    copy(loads, s->e + N_X, N_W);
+    copy(loads + N_W, level, N_D);
+    loads[LOADS - 1] = 1;
+    copy(t, r, N_Y);
+    copy(t + N_Y, loads, N_W + N_D);
+    code = policy_target_step(&s->target, t, v, 0);
+    for (i = 0; i < N_X; i++) s->x_s[i] = 0;
+    for (i = 0; i < N_U; i++) s->u_s[i] = 0;
+    for (i = 0; i < N_Y; i++) s->y_s[i] = 0;
+    add(s->x_s, &X_V[0][0], N_X, N_V, v);
+    add(s->u_s, &U_V[0][0], N_U, N_V, v);
+    add(s->y_s, &Y_V[0][0], N_Y, N_V, v);
+    add(s->x_s, &X_L[0][0], N_X, LOADS, loads);
+    add(s->u_s, &U_L[0][0], N_U, LOADS, loads);
+    add(s->y_s, &Y_L[0][0], N_Y, LOADS, loads);
+    return code;
+}
+
+/* Replace the last input by the plan's; return a code. */
+static int plan(policy_state *s, const real known[])
+{
+    /* a stage of p has set-points and inputs relative to the target if it has any, then known ones */
+    enum { N_R = POLICY_N_R, N_UR = POLICY_N_UR, N_K = N_R + N_UR + N_D };
+    real level[POLICY_N_D_] = {0}, move[N_U], *p = s->p;
+    int i, k, code;
+    for (i = 0; i < N_D; i++) {
+        for (k = 0; k < STAGES; k++) level[i] += known[k * N_D + i];
+        level[i] /= STAGES;
+    }
+    for (k = 0; k < SET_POINTS; k++) {
+        if ((code = aim(s, s->r + k * N_Y, level)) != POLICY_SOLVED) return code;
+        copy(p + k * N_K, s->y_s, N_R);
+        copy(p + k * N_K + N_R, s->u_s, N_UR);
+    }
+    for (k = 0; k < STAGES; k++) {
+        for (i = 0; i < N_R; i++) *p++ -= s->y_s[i];
+        for (i = 0; i < N_UR; i++) *p++ -= s->u_s[i];
+        for (i = 0; i < N_D; i++) *p++ = known[k * N_D + i] - ACTS[i] * level[i];
+    }
+    for (i = 0; i < N_X; i++) *p++ = s->e[i] - s->x_s[i];
+    for (i = 0; i < POLICY_MOVES; i++) *p++ = s->u[i] - s->u_s[i];
+    for (i = 0; i < POLICY_BOUNDED_Y; i++) *p++ = s->y_s[OF_Y[i]];
+    for (i = 0; i < POLICY_BOUNDED_U; i++) *p++ = s->u_s[OF_U[i]];
+    *p = 1;
+    if ((code = policy_plan_step(&s->plan, s->p, move, 0)) != POLICY_SOLVED) return code;
+    for (i = 0; i < N_U; i++) s->u[i] = within(s->u_s[i] + move[i], i);
+    return code;
+}
+
+void policy_reset(policy_state *s, const real y[])
+{
+    int i;
+    policy_plan_reset(&s->plan);
+    policy_target_reset(&s->target);
+    for (i = 0; i < N_E; i++) s->e[i] = 0;
+    for (i = 0; i < N_U; i++) s->u[i] = within(0, i);
+    for (i = 0; i < SET_POINTS * N_Y; i++) s->r[i] = 0;
+    s->starts = y ? 2 : 1;
+    if (y) copy(s->y, y, N_Y);
+}
+
+int policy_step(policy_state *s, const real y[], const real r[], const real known[], real u[])
+{
+    int code = POLICY_INVALID;
+    if (are_finite(y, N_Y) && (!r || are_finite(r, SET_POINTS * N_Y)) &&
+        are_finite(known, STAGES * N_D)) {
+        if (r) copy(s->r, r, SET_POINTS * N_Y);
+        copy(s->known, known, N_D);
+        if (s->starts) rest(s, s->starts == 2 ? s->y : y);
+        s->starts = 0;
+        correct(s, y);
+        code = plan(s, known);
+    }
+    if (!s->starts) predict(s);
+    copy(u, s->u, N_U);
+    return code;
+}
+
+/* @EXAMPLES@ */
+
+int policy_selftest(void)
+{
+    static policy_state state;
+    real u[N_U];
+    int i, j;
+    if (policy_plan_selftest()) return 1;
+    if (policy_target_selftest()) return 2;
+    policy_reset(&state, 0);
+    for (i = 0; i < EXAMPLES; i++) {
+        if (policy_step(&state, EXAMPLE_Y[i], EXAMPLE_R[i], EXAMPLE_KNOWN[i], u)) return 3 + i;
+        for (j = 0; j < N_U; j++) {
+            real off = u[j] - EXAMPLE_U[i][j];
+            if (!(off <= NEAR_U[j] && -off <= NEAR_U[j])) return 3 + i;
+        }
+    }
+    return 0;
+}

@@ -1,0 +1,61 @@
+/* @HEADER@ */
+#ifndef POLICY_H
+#define POLICY_H
+
+#include "policy_plan.h"
+#include "policy_target.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef policy_plan_real policy_real;
+
+/* @SIZES@ */
+
+/* What policy_step returns. */
+#define POLICY_SOLVED 0     /* u is optimal, and certified to be */
+#define POLICY_LIMIT 1      /* not certified within the limit of iterations */
+#define POLICY_INFEASIBLE 2 /* no plan or no steady state satisfies the hard bounds */
+#define POLICY_INVALID 3    /* y, r or known has a NaN or an infinity */
+
+/* The state of a controller: estimates, the last signals, and the active sets of both QPs. */
+typedef struct {
+    policy_real e[POLICY_N_E];                   /* the estimates of the state and disturbances */
+    policy_real u[POLICY_N_U];                   /* the last input */
+    policy_real r[POLICY_SET_POINTS * POLICY_N_Y]; /* the last set-points */
+    policy_real known[POLICY_N_D_];              /* the last known signals */
+    policy_real x_s[POLICY_N_X];                 /* the target: state, input and outputs */
+    policy_real u_s[POLICY_N_U];
+    policy_real y_s[POLICY_N_Y];
+    policy_real y[POLICY_N_Y];                   /* where the plant rests, see policy_reset */
+    policy_real p[POLICY_PLAN_N_P];              /* what the plan's QP knows */
+    policy_plan_state plan;
+    policy_target_state target;
+    int starts;                                  /* 1 before the first step, 2 with a y to rest at */
+} policy_state;
+
+/* Forget the past: the plant rests with the outputs y, those of the first step if y is null.
+
+   The last input, which moves are counted from, is the one nearest to zero within its bounds. Write
+   state->u afterwards if another input holds the plant. */
+void policy_reset(policy_state *state, const policy_real y[]);
+
+/* Write the input u for measured outputs y; return one of the codes above.
+
+   r has POLICY_SET_POINTS rows of POLICY_N_Y set-points, of which a null pointer repeats the last
+   ones; they start as zero. known has POLICY_STAGES rows of POLICY_N_D known signals, of this and
+   later steps. With a code other than 0, u is the last input, which keeps all bounds of inputs; the
+   estimates go on. */
+int policy_step(policy_state *state, const policy_real y[], const policy_real r[],
+                const policy_real known[], policy_real u[]);
+
+/* Test both QPs and replay a closed loop; return 0, or the number of what fails: the plan's QP, the
+   target's, and the steps of the loop. Only one thread at a time may call it. */
+int policy_selftest(void);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,34 @@
+/* The closed loop of the controller with a plant: its model with a load. Put yours in place of it.
+
+   Each line has the step, the outputs, the inputs and the code of policy_step. */
+#include <stdio.h>
+#include "policy.h"
+
+typedef policy_real real;
+
+/* @PLANT@ */
+
+int main(void)
+{
+    static policy_state state;
+    real x[POLICY_N_X] = {0}, next[POLICY_N_X], y[POLICY_N_Y], u[POLICY_N_U];
+    int i, j, k, code = policy_selftest();
+    if (code) fprintf(stderr, "self-test: number %d fails\n", code);
+    policy_reset(&state, 0);
+    for (k = 0; k < STEPS && !code; k++) {
+        for (i = 0; i < POLICY_N_Y; i++)
+            for (y[i] = 0, j = 0; j < POLICY_N_X; j++) y[i] += C[i][j] * x[j];
+        code = policy_step(&state, y, R, KNOWN, u);
+        printf("%d", k);
+        for (i = 0; i < POLICY_N_Y; i++) printf(" %.6g", y[i]);
+        for (i = 0; i < POLICY_N_U; i++) printf(" %.6g", u[i]);
+        printf(" %d\n", code);
+        for (i = 0; i < POLICY_N_X; i++) {
+            next[i] = LOAD[i];
+            for (j = 0; j < POLICY_N_X; j++) next[i] += A[i][j] * x[j];
+            for (j = 0; j < POLICY_N_U; j++) next[i] += B[i][j] * u[j];
+        }
+        for (i = 0; i < POLICY_N_X; i++) x[i] = next[i];
+    }
+    return code;
+}
