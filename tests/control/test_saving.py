@@ -20,7 +20,7 @@ A = np.array([[1.0, 0.1], [0.0, 0.8]])
 B, C, E = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]]), np.array([[0.0], [0.1]])
 
 
-def learned(references: str = "held") -> qm.LinearMPC:
+def learned(references: str = "held", rate: float = 1e-3) -> qm.LinearMPC:
     """Make a LinearMPC with bounds, prices and names of which every part has been learned."""
     names = {"inputs": ["valve"], "outputs": ["level"], "known": ["rain", "price"]}
     plant = read_model((A, B, C), np.hstack((E, 0 * E)), 0.5, **names)
@@ -36,7 +36,7 @@ def learned(references: str = "held") -> qm.LinearMPC:
         references=references,
         learn=("H", "q", "c", "C", "b", "lb", "ub", "w"),
     )
-    optimizer = torch.optim.SGD(mpc.parameters(), lr=1e-3)
+    optimizer = torch.optim.SGD(mpc.parameters(), lr=rate)
     mpc.value(torch.linspace(-0.5, 0.5, mpc.n_p)).backward()
     optimizer.step()
     return mpc

@@ -300,3 +300,26 @@ def test_two_policies_link_into_one_program(tmp_path):
     command = ["cc", "-std=c99", *files, "-o", str(tmp_path / "main")]
     subprocess.run(command, check=True, capture_output=True)
     subprocess.run([str(tmp_path / "main")], check=True)
+
+
+@needs_compiler
+def test_entries_with_one_value_only_keep_it_in_the_examples(tmp_path):
+    model = ([[0.9]], [[0.5]])
+    constant = qm.LinearMPC(model, 4, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0), solver="daqp")
+    fixed = QPMPC.from_model(
+        [[0.9, 0.1], [0.0, 1.0]],
+        [[0.5], [0.0]],
+        4,
+        stage_weight=[1.0, 1.0, 0.1],
+        constraints=([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], [2.0, -1.0], [2.0, 1.0]),
+        constraint_slack=torch.inf,
+        solver="daqp",
+    )
+    for mpc, value in ((constant, 1.0), (fixed, 2.0)):
+        tables = make_tables(mpc)
+        last = draw(tables, 20)[:, -1]
+        assert abs(last - value).max() < 1e-12
+        assert abs(tables.centre[-1] - value) < 1e-12
+        agreement = mpc.export_c(tmp_path).agreement
+        assert agreement is not None
+        assert agreement.solved > 50

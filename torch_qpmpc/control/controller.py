@@ -21,6 +21,7 @@ from torch_qpmpc.files import damaged, load_file, save_file
 
 if TYPE_CHECKING:
     from torch_qpmpc.control.exporting import ControllerExport
+    from torch_qpmpc.control.review import Review
 
 #: The kind of file that `Controller.save` writes.
 KIND = "Controller"
@@ -168,6 +169,32 @@ class Controller:
             raise damaged(Path(path), error, "a file that Controller.save wrote") from error
         return controller
 
+    def review(self, r: Any = None) -> Review:
+        """Return findings about this design: numbers, and a remedy for each fault.
+
+        They are about the cost, the terminal weight, the horizon, the disturbances, the scaling of
+        signals, hard bounds that can leave no plan, the reach of set-points, the QP's condition,
+        the loop without active bounds (its stability, margin and offset), and the C code's size.
+
+        Args:
+            r: set-points that the inputs must reach, by default those of the last step.
+
+        Raises:
+            QPError: r is invalid.
+            SolverError: the bounds of the inputs admit no steady state.
+
+        Example:
+            >>> import torch_qpmpc as qm
+            >>> mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 10, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
+            >>> controller = qm.Controller(mpc)
+            >>> review = controller.review(r=[7.0])
+            >>> review.faults[0].name, review.faults[0].remedy
+            ('set-points', 'Set y1 to 5, not 7, or widen the bounds.')
+        """
+        from torch_qpmpc.control.review import review
+
+        return review(self, None if r is None else read_row("r", r, self._design.plant.outputs))
+
     def export_c(
         self,
         folder: str | Path,
@@ -192,7 +219,8 @@ class Controller:
             Sizes and the measured agreement.
 
         Raises:
-            QPError: as in `QPMPC.export_c`, or the self-test fails.
+            QPError: as in `QPMPC.export_c`; the self-test fails; or several steady inputs hold the
+                same outputs, as their choice is not exact enough in C.
         """
         from torch_qpmpc.control.exporting import export_controller
 

@@ -121,6 +121,10 @@ def export_controller(
     """Write a controller as C; see `Controller.export_c`."""
     options = {"dtype": dtype, "max_iterations": max_iterations, "storage": storage}
     mpc, plant = controller.mpc, controller.mpc.design.plant
+    if mpc.design.steady.is_free:  # 1 / PREFERENCE is the condition of the target's QP
+        got = f"{len(plant.inputs)} inputs, of which several hold the same outputs with a weight"
+        remedy = "Weight another output, or make an input a known signal."
+        raise QPError.expected("controller", got, "one steady input for each set-point", remedy)
     with tempfile.TemporaryDirectory() as temporary:
         plan = export_c(mpc, temporary, name=f"{name}_plan", **options)
         target = export_c(mpc.targets, temporary, name=f"{name}_target", **options)
@@ -167,7 +171,7 @@ def _run(controller: Controller, steps: int) -> Loop:
     size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
     d = 0.1 * rng.normal(size=(rows, len(plant.known)))
-    middle = np.where(np.isfinite(design.y_bounds).all(0), np.mean(design.y_bounds, 0), 0.0)
+    middle = np.where(np.isfinite(design.y_bounds).all(0), design.y_bounds, 0.0).mean(0)
     x, loop = np.linalg.pinv(plant.C) @ middle, []
     for k in range(steps):
         y = plant.C @ x + 0.01 * size_y * rng.normal(size=len(size_y))

@@ -210,8 +210,11 @@ class LinearMPC(QPMPC):
             SolverError: the bounds of the inputs admit no steady state.
         """
         s = self._target_inputs(r, w, known)
+        return self.steady_state(self.targets.policy(s, qp=self._target_qp), s)
+
+    def steady_state(self, v: Tensor, s: Tensor) -> Target:
+        """Return the steady state of v and s = [r; w; d], see `torch_qpmpc.control.steady`."""
         steady = self.design.steady
-        v = self.targets.policy(s, qp=self._target_qp)
         loads = torch.cat((s[..., len(steady.Q) :], s.new_ones(*s.shape[:-1], 1)), -1)
         pairs = ((steady.X, steady.x), (steady.U, steady.u), (steady.Y, steady.y))
         return Target(*(v @ s.new_tensor(Z.T) + loads @ s.new_tensor(M.T) for Z, M in pairs))

@@ -1,0 +1,186 @@
+"""Controllers as C: closed loops beside Python's, faults of signals, and the program of the folder.
+
+``pytest -m slow tests/control/test_exporting.py`` compares loops of 100,000 steps.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+import torch_qpmpc as qm
+from tests.control.test_saving import learned
+from torch_qpmpc import QPError, SolverError
+from torch_qpmpc.control import exporting
+from torch_qpmpc.control.exporting import CompiledController
+from torch_qpmpc.export import export, library
+
+A = np.array([[0.9, 0.2, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
+B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.4]])
+C = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+SIZES = {"R": 0.1, "dR": 0.2, "u_bounds": (-1.0, 1.0)}
+
+
+def integrator(**options):
+    A, B = [[1.0, 0.1], [0.0, 0.8]], [[0.0], [1.0]]
+    design = {"Q": 1.0, "y_bounds": (-2.0, 2.0), "du_bounds": (-0.3, 0.3), **SIZES, **options}
+    return qm.LinearMPC((A, B, [[1.0, 0.0]]), 10, **design)
+
+
+MPCS = {
+    "held": learned,
+    "preview": lambda: learned("preview"),
+    "integrator": integrator,
+    "two by two": lambda: qm.LinearMPC((A, B, C), 8, Q=1.0, y_bounds=(-1.0, 1.0), **SIZES),
+    "more outputs": lambda: qm.LinearMPC((A, B[:, :1], C), 8, Q=[1.0, 0.5], **SIZES),
+    "unbounded": lambda: qm.LinearMPC((A, B, C), 5, Q=1.0, R=0.1, disturbances=None),
+}
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(exporting, "FLAGS", ("-std=c99", "-O1", "-fPIC", "-shared"))
+    monkeypatch.setattr(library, "FLAGS", ("-std=c99", "-O1", "-fPIC", "-shared"))
+    monkeypatch.setattr(export, "COMPARED", 60)
+    monkeypatch.setattr(exporting, "COMPARED", 60)
+
+
+def load(files, controller, name="policy", dtype="float64"):
+    texts = {x.name: x.read_text() for x in files if x.suffix in (".c", ".h")}
+    del texts["main.c"]
+    return CompiledController(texts, name, dtype, len(controller.u))
+
+
+def difference(controller, twin, steps):
+    """Return the largest difference of inputs of a loop that the inputs of Python close."""
+    design, rng, largest = controller.mpc.design, np.random.default_rng(3), 0.0
+    (n, m, n_y, n_d), rows = design.plant.sizes, design.horizon + 1
+    plant, previewed = design.plant, design.references == "preview"
+    x, load, bias = np.zeros(n), np.zeros(m), np.zeros(n_y)
+    r, known = np.zeros((rows, n_y)), np.zeros((rows, n_d))
+    controller.reset()
+    twin.reset()
+    for k in range(steps):
+        if k % 50 == 0:
+            load, bias = rng.uniform(-0.1, 0.1, m), rng.uniform(-0.1, 0.1, n_y)
+            known = 0.1 * rng.normal(size=(rows, n_d))
+            r = rng.uniform(-1, 1, (rows if previewed else 1, n_y))
+        y = plant.C @ x + bias + 0.01 * rng.normal(size=n_y)
+        u = controller.step(y, r, known if n_d else None)
+        got, code = twin.step(y, r, known)
+        assert code == 0
+        largest = max(largest, np.abs(u - got).max())
+        x = plant.A @ x + plant.B @ (u + load) + plant.E @ known[0] + plant.offset
+    return largest
+
+
+@pytest.mark.parametrize("name", MPCS)
+def test_the_loop_is_that_of_python(tmp_path, name):
+    controller = qm.Controller(MPCS[name]())
+    report = controller.export_c(tmp_path)
+    assert report.difference is not None
+    assert report.difference < 1e-9
+    assert difference(controller, load(report.files, controller), 150) < 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["held", "preview", "two by two"])
+def test_the_loop_is_that_of_python_for_100_000_steps(tmp_path, name):
+    controller = qm.Controller(MPCS[name]())
+    report = controller.export_c(tmp_path)
+    assert difference(controller, load(report.files, controller), 100_000) < 1e-9
+
+
+def test_a_reset_starts_where_the_plant_rests(tmp_path):
+    controller = qm.Controller(integrator())
+    twin = load(controller.export_c(tmp_path).files, controller)
+    controller.reset(y=[1.5])
+    twin.reset([1.5])
+    for y in (1.4, 1.45):
+        assert np.allclose(twin.step([y], [1.0])[0], controller.step([y], [1.0]), atol=1e-12)
+    assert np.allclose(twin.step([1.5])[0], controller.step([1.5]), atol=1e-12)  # the last r
+
+
+def test_signals_that_are_not_finite_hold_the_last_input_and_the_loop_goes_on(tmp_path):
+    controller = qm.Controller(integrator())
+    twin = load(controller.export_c(tmp_path).files, controller)
+    assert twin.step([np.nan], [1.0]) == (np.zeros(1), 3)
+    first, code = twin.step([0.0], [1.0])
+    assert code == 0
+    assert twin.step([np.inf]) == (first, 3)
+    assert twin.step([0.0], [np.nan]) == (first, 3)
+    assert twin.step([0.0])[1] == 0
+
+
+def test_an_infeasible_step_holds_the_last_input(tmp_path):
+    controller = qm.Controller(integrator(y_slack=np.inf))
+    twin = load(controller.export_c(tmp_path).files, controller)
+    assert twin.step([3.0], [0.0]) == (np.zeros(1), 2)
+    with pytest.raises(SolverError, match="INFEASIBLE"):
+        controller.step([3.0], [0.0])
+
+
+def test_the_folder_s_program_runs_without_warnings_and_its_loop_has_no_offset(tmp_path):
+    controller = qm.Controller(learned(rate=0.0))
+    report = controller.export_c(tmp_path, name="level")
+    flags = "CFLAGS=-O1 -Wall -Wextra -Werror -pedantic"
+    command = ["make", "run", flags]
+    if shutil.which("make") is None:
+        pytest.skip("make is not installed")
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    step, y, _, code = ended.stdout.splitlines()[-1].split()
+    main = (tmp_path / "main.c").read_text()
+    (r,) = re.findall(r"R\[1\] =\n\{(.*)\}", main)
+    assert (step, code) == ("199", "0")
+    assert abs(float(y) - float(r)) < 1e-4
+    (tmp_path / "main.c").write_text("mine")
+    controller.export_c(tmp_path, name="level")
+    assert (tmp_path / "main.c").read_text() == "mine"
+    header = (tmp_path / "level.h").read_text()
+    assert "y and r: level [m]" in header
+    assert "known: rain, price" in header
+    assert f"state {report.state_bytes} bytes" in str(report)
+    assert report.state_bytes == load(report.files, controller, "level").state_bytes
+
+
+def test_single_precision_agrees_to_its_accuracy(tmp_path):
+    controller = qm.Controller(integrator(y_bounds=None))
+    report = controller.export_c(tmp_path, dtype="float32", storage="small")
+    assert difference(controller, load(report.files, controller, dtype="float32"), 200) < 1e-3
+
+
+def test_without_a_compiler_nothing_is_compared(tmp_path, monkeypatch):
+    for module in (exporting, export):
+        monkeypatch.setattr(module, "compiler", lambda: None)
+    report = qm.Controller(integrator()).export_c(tmp_path)
+    assert (report.difference, report.state_bytes) == (None, None)
+    assert "not compared: no C compiler was found" in str(report)
+
+
+@pytest.mark.parametrize("name", ["plan", "target"])
+def test_the_self_test_finds_a_wrong_table(tmp_path, name):
+    controller = qm.Controller(integrator())
+    files = controller.export_c(tmp_path).files
+    file = tmp_path / f"policy_{name}.c"
+    text = file.read_text()
+    start = text.index("U_P[1]")
+    file.write_text(text[:start] + re.sub(r"\d\.\d+", "7.7", text[start:], count=2))
+    assert load(files, controller).selftest() == 1 + (name == "target")
+
+
+def test_a_controller_that_disagrees_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setitem(exporting.NEAR, "float64", -1.0)
+    with pytest.raises(QPError, match=r"dtype: got 'float64', with a failed self-test \(3\)"):
+        qm.Controller(integrator()).export_c(tmp_path)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_free_input_is_refused(tmp_path):
+    controller = qm.Controller(qm.LinearMPC((A, B, C[:1]), 3, Q=1.0, **SIZES))
+    with pytest.raises(QPError, match=r"^controller: got 2 inputs, .* Weight another output"):
+        controller.export_c(tmp_path)

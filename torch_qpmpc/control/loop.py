@@ -1,0 +1,108 @@
+"""The closed loop of a controller and its model while no bound is active: a linear system.
+
+Its state is [x; e; u_last], the plant's state, the controller's prediction of the state and
+disturbances, and the last input. Its inputs are constant loads of the plant's inputs, biases of the
+outputs, and set-points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.linalg import block_diag
+
+from torch_qpmpc.control.controller import Controller
+from torch_qpmpc.control.linear_mpc import Target
+from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.export.tables import Tables
+
+#: The number of frequencies, from SLOWEST to that of alternating samples.
+FREQUENCIES, SLOWEST = 400, 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class LinearLoop:
+    """The loop's matrices.
+
+    Attributes:
+        A: ``(n + n_e + m, n + n_e + m)``.
+        B: the factors of [load; bias; r], ``(n + n_e + m, m + 2 n_y)``.
+        controller: A_c, B_c, C_c and D_c from y to u, with the state [e; u_last].
+        plant: A, B and C of the model.
+    """
+
+    A: Array
+    B: Array
+    controller: tuple[Array, Array, Array, Array]
+    plant: tuple[Array, Array, Array]
+
+    @classmethod
+    def of(cls, controller: Controller, plan: Tables, target: Tables) -> LinearLoop:
+        """Return the loop of a controller, from the tables of its plan and its target."""
+        K_e, K_u, K_r = _gains(controller, plan, target)
+        observer, plant = controller.observer, controller.mpc.design.plant
+        F, G, L = observer.F, observer.G, observer.L
+        m = plant.B.shape[1]
+        corrected = np.eye(len(F)) - L @ observer.H
+        # u = C_c [e; u_last] + D_c y + K_r r, and e+ = F (corrected e + L y) + G u.
+        C_c, D_c = np.hstack((K_e @ corrected, K_u)), K_e @ L
+        A_c = np.vstack((np.hstack((F @ corrected, np.zeros((len(F), m)))) + G @ C_c, C_c))
+        B_c = np.vstack((F @ L + G @ D_c, D_c))
+        R_c = np.vstack((G @ K_r, K_r))
+        A = np.block([[plant.A + plant.B @ D_c @ plant.C, plant.B @ C_c], [B_c @ plant.C, A_c]])
+        moved = np.hstack((plant.B, plant.B @ D_c, plant.B @ K_r))
+        B = np.vstack((moved, np.hstack((np.zeros((len(A_c), m)), B_c, R_c))))
+        return cls(A, B, (A_c, B_c, C_c, D_c), (plant.A, plant.B, plant.C))
+
+    @property
+    def radius(self) -> float:
+        """The largest modulus of the eigenvalues."""
+        return float(np.abs(np.linalg.eigvals(self.A)).max())
+
+    def offsets(self) -> Array:
+        """Return y - r at rest for a unit of each load, bias and set-point, as columns."""
+        n_y, n = self.plant[2].shape
+        x = np.linalg.solve(np.eye(len(self.A)) - self.A, self.B)[:n]
+        m = self.B.shape[1] - 2 * n_y
+        return self.plant[2] @ x + np.hstack((np.zeros((n_y, m)), np.eye(n_y), -np.eye(n_y)))
+
+    def modulus_margin(self) -> float:
+        """Return the least distance of the loop's return difference at the inputs from singular.
+
+        Each input alone tolerates gains in 1 / (1 + a), .., 1 / (1 - a) and phases of 2 asin(a / 2)
+        for the margin a (Skogestad and Postlethwaite, "Multivariable feedback control", 2005).
+        """
+        A_c, B_c, C_c, D_c = self.controller
+        A, B, C = self.plant
+        states = block_diag(A, A_c).astype(complex)
+        inputs, outputs = block_diag(B, B_c), block_diag(C, C_c)
+        least = np.inf
+        for omega in np.geomspace(SLOWEST, np.pi, FREQUENCIES):
+            z = np.exp(1j * omega) * np.eye(len(states))
+            response = outputs @ np.linalg.solve(z - states, inputs)
+            P = response[: len(C), : B.shape[1]]
+            K = response[len(C) :, B.shape[1] :] + D_c
+            sizes = np.linalg.svd(np.eye(len(K)) - K @ P, compute_uv=False)
+            least = min(least, float(sizes[-1]))
+        return least
+
+
+def _gains(controller: Controller, plan: Tables, target: Tables) -> tuple[Array, Array, Array]:
+    """Return the factors of the estimate e, of u_last and of r in the input without bounds."""
+    mpc, design = controller.mpc, controller.mpc.design
+    n, m, n_y, n_d = design.plant.sizes
+    n_w = len(design.disturbances.names)
+    signals = torch.eye(n + n_w + m + n_y, dtype=torch.float64)
+    signals = torch.cat((torch.zeros_like(signals[:1]), signals))
+    x, w, u_last, r = signals.split((n, n_w, m, n_y), dim=-1)
+    s = torch.cat((r, w, r.new_zeros(len(r), n_d)), -1)
+    aimed = mpc.steady_state(s @ torch.from_numpy(target.K.T) + torch.from_numpy(target.k), s)
+    stages = aimed
+    if design.references == "preview":
+        stages = Target(*(part[:, None].expand(-1, mpc.horizon + 1, -1) for part in aimed))
+    p = mpc.arrange(x, stages, u_last=u_last)
+    u = aimed.u.numpy() + p.numpy() @ plan.K.T + plan.k
+    K_e, K_u, K_r = np.split((u[1:] - u[0]).T, np.cumsum((n + n_w, m)), axis=1)
+    return K_e, K_u, K_r

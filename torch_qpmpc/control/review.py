@@ -1,0 +1,362 @@
+"""`Controller.review`: what is wrong with a design, with numbers and a remedy for each fault."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+import torch
+from torch import Tensor
+
+from torch_qpmpc.control.controller import Controller
+from torch_qpmpc.control.design import half_range
+from torch_qpmpc.control.linear_mpc import Target
+from torch_qpmpc.control.loop import LinearLoop
+from torch_qpmpc.control.lowering import riccati
+from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.export.tables import SINGULAR, make_tables
+from torch_qpmpc.export.writer import Settings, state_bytes, table_bytes
+from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.qp.pipeline.condensing import null_space
+from torch_qpmpc.qp.program import Status
+from torch_qpmpc.qp.solution import QPSolution
+from torch_qpmpc.qp.solve import solve_qp
+
+#: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
+MARGIN, CONDITION, SPREAD, HIDDEN = 0.3, 1e8, 1e4, 1e-3
+#: Offsets relative to half the distance of an output's bounds.
+OFFSET = 1e-6
+#: Largest disturbance that hard bounds are tried against, in half distances of bounds.
+LARGEST = 2.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One question to a design.
+
+    Attributes:
+        name: the subject, such as ``"stability"``.
+        ok: False if it is a fault.
+        numbers: the answer, by name.
+        remedy: what mends the fault; empty if it is none.
+    """
+
+    name: str
+    ok: bool
+    numbers: Mapping[str, Any]
+    remedy: str = ""
+
+    @property
+    def text(self) -> str:
+        """The numbers in words."""
+        return "; ".join(f"{key} {_number(x)}" for key, x in self.numbers.items())
+
+
+@dataclass(frozen=True)
+class Review:
+    """The findings about a controller; ``print`` shows them.
+
+    Attributes:
+        findings: all of them; those that need a definite cost or a stable loop only with one.
+    """
+
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def faults(self) -> list[Finding]:
+        """The findings that are not ok."""
+        return [finding for finding in self.findings if not finding.ok]
+
+    def __getitem__(self, name: str) -> Finding:
+        return {finding.name: finding for finding in self.findings}[name]
+
+    def __str__(self) -> str:
+        lines = [f"{len(self.faults)} faults in {len(self.findings)} findings"]
+        for finding in self.findings:
+            lines.append(f"{'ok   ' if finding.ok else 'FAULT'} {finding.name}: {finding.text}")
+            lines += [f"      {finding.remedy}"] * (not finding.ok)
+        return "\n".join(lines)
+
+    def to_markdown(self) -> str:
+        """Return a page with a table of the findings."""
+        rows = [("Finding", "", "Numbers", "Remedy"), ("---",) * 4]
+        rows += [(x.name, "ok" if x.ok else "**fault**", x.text, x.remedy) for x in self.findings]
+        cells = ("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)
+        return "\n".join(("# Review of a controller", "", *cells, ""))
+
+
+def review(controller: Controller, r: Array | None = None) -> Review:
+    """Return the findings about a controller; see `Controller.review`."""
+    mpc = controller.mpc
+    checks: list[Callable[[Controller], Finding]] = [
+        _terminal,
+        _horizon,
+        _disturbances,
+        _scaling,
+        _hard_rows,
+    ]
+    cost = _cost(controller)
+    findings = [cost, *(check(controller) for check in checks), _set_points(controller, r)]
+    if not cost.ok:
+        return Review(findings)
+    plan, target = make_tables(mpc), make_tables(mpc.targets)
+    loop = LinearLoop.of(controller, plan, target)
+    findings.append(_condition(plan.condition, mpc.horizon))
+    findings.append(_stability(loop, mpc.design.gamma))
+    if loop.radius < 1:
+        findings += [_margin(loop), _offset(loop, controller)]
+    settings = Settings("policy", "float64", "fast", 1)
+    sizes = {
+        "bytes of tables": sum(table_bytes(x, settings) for x in (plan, target)),
+        "bytes of the state": sum(state_bytes(x, settings) for x in (plan, target)),
+        "rows": len(plan.rows) + len(target.rows),
+    }
+    return Review([*findings, Finding("C code", True, sizes)])
+
+
+def _cost(controller: Controller) -> Finding:
+    """H is positive definite on the plans that satisfy C z = b."""
+    mpc = controller.mpc
+    qp = mpc.quadratic_program()
+    H, C = (x.detach().double().numpy() for x in (qp.H, qp.C))
+    T_v = null_space(C[None], mpc.n_p).T[0][:, mpc.n_p :]
+    sizes = np.linalg.eigvalsh(T_v.T @ (H + H.T) @ T_v / 2)
+    numbers = {"smallest eigenvalue on the plan": sizes[0], "largest": sizes[-1]}
+    ok = bool(sizes[0] > SINGULAR * sizes[-1])
+    remedy = f"Add a weight of the moves, such as dR={1e-3 * sizes[-1]:.1g}."
+    if sizes[0] < -SINGULAR * abs(sizes[-1]):
+        remedy = "Learning has made it indefinite: mpc.reset_parameters(), or learn other parts."
+    return Finding("cost", ok, numbers, remedy * (not ok))
+
+
+def _terminal(controller: Controller) -> Finding:
+    """The terminal weight is the cost to go of the loop without bounds."""
+    design = controller.mpc.design
+    plant, exists = design.plant, riccati(design) is not None
+    unseen = _modes(plant.A, design.Q @ plant.C)
+    unmoved = _modes(plant.A.T, plant.B.T)
+    numbers: dict[str, Any] = {"Riccati solution": "exists" if exists else "none"}
+    remedy = "Weight all inputs, by R or dR."
+    if len(unseen):
+        numbers["mode without a weight"] = unseen[0]
+        remedy = "Weight an output that shows this mode, by Q."
+    elif len(unmoved):
+        numbers["mode that no input moves"] = unmoved[0]
+        remedy = "Remove the mode from the model, or pass it as a known signal."
+    return Finding("terminal weight", exists, numbers, remedy * (not exists))
+
+
+def _modes(A: Array, C: Array) -> list[float]:
+    """Return the moduli of modes that do not decay and that C does not show."""
+    modes = []
+    for eigenvalue in np.linalg.eigvals(A):
+        sizes = np.linalg.svd(np.vstack((A - eigenvalue * np.eye(len(A)), C)))[1]
+        if abs(eigenvalue) > 1 - 1e-9 and sizes[-1] < 1e-9 * sizes[0]:
+            modes.append(float(abs(eigenvalue)))
+    return modes
+
+
+def _horizon(controller: Controller) -> Finding:
+    """The plan is longer than dead times and inverse responses."""
+    design, N = controller.mpc.design, controller.mpc.horizon
+    plant, numbers, needed = design.plant, {}, 1
+    stable = np.abs(np.linalg.eigvals(plant.A)).max() < 1 + 1e-9
+    x, steps = plant.B, []
+    for _ in range(max(10 * N, 200)):
+        steps.append(plant.C @ x)
+        x = plant.A @ x
+    size = 1e-9 * np.outer(np.linalg.norm(plant.C, axis=1), np.linalg.norm(plant.B, axis=0))
+    responses = np.cumsum(steps, 0)
+    away = np.abs(responses) <= size
+    if stable:
+        away |= np.sign(responses) != np.sign(responses[-1])
+    late = [
+        [1 + np.flatnonzero([True, *x])[-1] for x in output] for output in away.T.swapaxes(0, 1)
+    ]
+    for i in np.flatnonzero(np.diag(design.Q)):
+        first = int(min(late[i]))
+        numbers[f"steps until {plant.outputs[i]} responds in its direction"] = first
+        needed = max(needed, first)
+    numbers["horizon"] = N
+    ok = needed < N or needed == 1
+    return Finding("horizon", ok, numbers, f"Take a horizon of {2 * needed} or more." * (not ok))
+
+
+def _disturbances(controller: Controller) -> Finding:
+    """The outputs tell the disturbances from the state."""
+    plant, w = controller.mpc.design.plant, controller.mpc.design.disturbances
+    matrix = np.block([[plant.A - np.eye(len(plant.A)), w.B], [plant.C, w.C]])
+    matrix = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+    _, sizes, V = np.linalg.svd(matrix)
+    ok = not w.names or bool(sizes[-1] > HIDDEN)
+    numbers: dict[str, Any] = {"estimated": ", ".join(w.names) or "none"}
+    numbers["smallest singular value"] = sizes[-1]
+    hidden = w.names[int(np.abs(V[-1, len(plant.A) :]).argmax())] if w.names else ""
+    remedy = f"The {hidden} looks like a slow mode: take disturbances='auto', or one at an input."
+    return Finding("disturbances", ok, numbers, remedy * (not ok))
+
+
+def _scaling(controller: Controller) -> Finding:
+    """The distances of the bounds have similar sizes."""
+    design = controller.mpc.design
+    sizes = {}
+    for names, bounds in (
+        (design.plant.outputs, design.y_bounds),
+        (design.plant.inputs, design.u_bounds),
+    ):
+        finite = np.isfinite(bounds).all(0)
+        half = half_range(bounds)
+        sizes |= {name: half[i] for i, name in enumerate(names) if finite[i]}
+    spread = max(sizes.values(), default=1.0) / min(sizes.values(), default=1.0)
+    ok = bool(spread <= SPREAD)
+    units = {name: 10 ** np.round(np.log10(x)) for name, x in sizes.items()}
+    named = ", ".join(f"{name} in units of {x:g}" for name, x in units.items() if x != 1)
+    numbers = {f"half range of {name}": x for name, x in sizes.items()}
+    return Finding("scaling", ok, numbers, f"Measure {named}." * (not ok))
+
+
+def _hard_rows(controller: Controller) -> Finding:
+    """From rest at the set-point, wrong measurements and other last inputs leave a plan."""
+    design = controller.mpc.design
+    half = np.diag(half_range(design.y_bounds))
+    errors = np.linspace(0.05, LARGEST, 40)[:, None, None] * np.vstack((half, -half))
+    errors = errors.reshape(-1, len(half))
+    corrections = np.vstack(
+        (errors @ controller.observer.L.T, np.zeros((2, len(controller.observer.L))))
+    )
+    inputs = np.where(np.isfinite(design.u_bounds), design.u_bounds, np.nan)
+    inputs = np.vstack((np.full((len(errors), inputs.shape[1]), np.nan), inputs))
+    states, failed = _infeasible(controller, corrections, inputs)
+    hard = design.bounded[0] & np.isinf(design.y_slack)
+    names = [name for name, x in zip(design.plant.outputs, hard, strict=True) if x]
+    numbers: dict[str, Any] = {"hard bounds of": ", ".join(names) or "no output"}
+    if not failed.any():
+        return Finding("hard bounds", True, numbers)
+    i = int(np.flatnonzero(failed)[0])
+    if i < len(errors):
+        numbers |= {"errors of outputs that leave no plan": errors[i], "at the state": states[i]}
+        return Finding("hard bounds", False, numbers, f"Give {', '.join(names)} a finite y_slack.")
+    numbers |= {"last inputs that leave no plan": inputs[i]}
+    return Finding("hard bounds", False, numbers, "Let du_bounds contain zero.")
+
+
+@torch.no_grad()
+def _infeasible(controller: Controller, de: Array, u_last: Array) -> tuple[Array, Array]:
+    """Return the states that are de from rest at the set-point, and a mask of those without a plan.
+
+    de has changes of the state and of the disturbances. Without a steady state within the bounds
+    of the inputs a state does not count. A last input of NaN is that of rest.
+    """
+    mpc, design = controller.mpc, controller.mpc.design
+    n, _, n_y, n_d = design.plant.sizes
+    r = controller.r[0] if len(controller.r) else np.zeros(n_y)
+    rest = mpc.target(r)
+    x, u = rest.x.numpy() + de[:, :n], np.where(np.isnan(u_last), rest.u.numpy(), u_last)
+    s = torch.from_numpy(np.hstack((np.tile(r, (len(x), 1)), de[:, n:], np.zeros((len(x), n_d)))))
+    of_target = _solved(mpc.targets, s)
+    aimed = mpc.steady_state(of_target.z[:, len(s[0]) : len(s[0]) + mpc.targets.n_u], s)
+    if design.references == "preview":
+        aimed = Target(*(part[:, None].expand(-1, mpc.horizon + 1, -1) for part in aimed))
+    p = mpc.arrange(x, aimed, u_last=u, known=np.zeros((len(x), mpc.horizon + 1, n_d)))
+    failed = _solved(mpc, p).status == Status.INFEASIBLE
+    return x, (failed & (of_target.status == Status.SOLVED)).numpy()
+
+
+def _solved(mpc: QPMPC, p: Tensor) -> QPSolution:
+    return solve_qp(mpc.quadratic_program(), p, solver="daqp", on_failure="mask")
+
+
+def _set_points(controller: Controller, r: Array | None) -> Finding:
+    """Set-points and bands of outputs are within reach of the inputs' bounds."""
+    design = controller.mpc.design
+    names, weighted = design.plant.outputs, np.diag(design.Q) > 0
+    r = controller.r[-1] if r is None and len(controller.r) else r
+    lower, upper = _reach(controller)
+    numbers: dict[str, Any] = {}
+    faults = []
+    for i, name in enumerate(names):
+        numbers[f"{name} reaches"] = np.array([lower[i], upper[i]])
+        if lower[i] > design.y_bounds[1][i] or upper[i] < design.y_bounds[0][i]:
+            faults.append(f"Let y_bounds of {name} overlap {lower[i]:.4g} .. {upper[i]:.4g}.")
+    if r is not None and weighted.any():
+        y = controller.mpc.target(r, controller.w).y.numpy()
+        for i in np.flatnonzero(weighted & (np.abs(y - r) > OFFSET * half_range(design.y_bounds))):
+            numbers[f"nearest {names[i]}"] = y[i]
+            faults.append(f"Set {names[i]} to {y[i]:.4g}, not {r[i]:.4g}, or widen the bounds.")
+    return Finding("set-points", not faults, numbers, " ".join(faults))
+
+
+def _reach(controller: Controller) -> tuple[Array, Array]:
+    """Return the least and the largest steady value of each output within the inputs' bounds."""
+    steady, w = controller.mpc.design.steady, controller.w
+    loads = np.concatenate((w, np.zeros(steady.y.shape[1] - len(w) - 1), [1.0]))
+    lower, upper = (side - steady.u @ loads for side in controller.mpc.design.u_bounds)
+    rows = np.vstack((steady.U, -steady.U))
+    limits = np.concatenate((upper, -lower))
+    kept = np.isfinite(limits)
+    ends = []
+    for y in steady.Y:
+        both = []
+        for sign in (1, -1):
+            least = scipy.optimize.linprog(
+                sign * y, rows[kept], limits[kept], bounds=(None, None), method="highs"
+            )
+            both.append(sign * least.fun if least.status == 0 else -sign * np.inf)
+        ends.append(both)
+    ends = np.array(ends).T + steady.y @ loads
+    return ends[0], ends[1]
+
+
+def _condition(condition: float, horizon: int) -> Finding:
+    """The QP's numbers are exact enough."""
+    ok = bool(condition < CONDITION)
+    remedy = f"Raise R or dR, or take a horizon of {max(horizon // 3, 2)}."
+    return Finding("condition", ok, {"of the cost on the plan": condition}, remedy * (not ok))
+
+
+def _stability(loop: LinearLoop, gamma: float) -> Finding:
+    """The loop without bounds is stable."""
+    eigenvalues = np.abs(np.linalg.eigvals(loop.A))
+    slow = np.sort(eigenvalues)[::-1][:3]
+    ok = bool(loop.radius < 1 - 1e-9)
+    remedy = "Take gamma=1." if gamma < 1 else "Lengthen the horizon, or weight more outputs."
+    return Finding("stability", ok, {"largest eigenvalues": slow}, remedy * (not ok))
+
+
+def _margin(loop: LinearLoop) -> Finding:
+    """The loop without bounds tolerates errors of the model."""
+    margin = loop.modulus_margin()
+    gains = np.array([1 / (1 + margin), 1 / max(1 - margin, 1e-9)])
+    numbers = {
+        "modulus margin": margin,
+        "gains": gains,
+        "phase in degrees": np.degrees(2 * np.arcsin(min(margin / 2, 1.0))),
+    }
+    ok = margin >= MARGIN
+    remedy = "Raise dR tenfold, or the filter's noise relative to its drift."
+    return Finding("margin", ok, numbers, remedy * (not ok))
+
+
+def _offset(loop: LinearLoop, controller: Controller) -> Finding:
+    """Constant loads, biases and set-points leave no offset that steady inputs could remove."""
+    design = controller.mpc.design
+    Y = design.steady.Y
+    removable = Y @ np.linalg.pinv(Y.T @ design.Q @ Y, rcond=1e-10) @ Y.T @ design.Q
+    m = len(design.plant.inputs)
+    n_y = len(Y)
+    units = np.concatenate((half_range(design.u_bounds), *[half_range(design.y_bounds)] * 2))
+    off = np.abs(removable @ loop.offsets() * units) / half_range(design.y_bounds)[:, None]
+    parts = {"load": off[:, :m], "bias": off[:, m : m + n_y], "set-point": off[:, m + n_y :]}
+    numbers = {f"offset of a full {key}": x.max(initial=0.0) for key, x in parts.items()}
+    ok = bool(off.max(initial=0.0) < OFFSET)
+    remedy = "Take disturbances='auto': one for each output."
+    return Finding("offset", ok, numbers, remedy * (not ok))
+
+
+def _number(x: Any) -> str:
+    if isinstance(x, np.ndarray):
+        return "[" + ", ".join(f"{y:.4g}" for y in x.ravel()) + "]"
+    return x if isinstance(x, str) else f"{x:.4g}"
