@@ -76,8 +76,9 @@ class LinearLoop:
         """
         A_c, B_c, C_c, D_c = self.controller
         A, B, C = self.plant
-        states = block_diag(A, A_c).astype(complex)
-        inputs, outputs = block_diag(B, B_c), block_diag(C, C_c)
+        states, inputs, outputs = (
+            np.asarray(block_diag(*pair)) for pair in ((A, A_c), (B, B_c), (C, C_c))
+        )
         least = np.inf
         for omega in np.geomspace(SLOWEST, np.pi, FREQUENCIES):
             z = np.exp(1j * omega) * np.eye(len(states))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import scipy.optimize
 import torch
-from torch import Tensor
 
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import half_range
@@ -19,17 +18,15 @@ from torch_qpmpc.control.lowering import riccati
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.export.tables import SINGULAR, make_tables
 from torch_qpmpc.export.writer import Settings, state_bytes, table_bytes
-from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
-from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve_qp
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
 MARGIN, CONDITION, SPREAD, HIDDEN = 0.3, 1e8, 1e4, 1e-3
 #: Offsets relative to half the distance of an output's bounds.
 OFFSET = 1e-6
-#: Largest disturbance that hard bounds are tried against, in half distances of bounds.
+#: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
 LARGEST = 2.0
 
 
@@ -173,11 +170,8 @@ def _horizon(controller: Controller) -> Finding:
     away = np.abs(responses) <= size
     if stable:
         away |= np.sign(responses) != np.sign(responses[-1])
-    late = [
-        [1 + np.flatnonzero([True, *x])[-1] for x in output] for output in away.T.swapaxes(0, 1)
-    ]
     for i in np.flatnonzero(np.diag(design.Q)):
-        first = int(min(late[i]))
+        first = 1 + min(int(np.flatnonzero([True, *x])[-1]) for x in away[:, i].T)
         numbers[f"steps until {plant.outputs[i]} responds in its direction"] = first
         needed = max(needed, first)
     numbers["horizon"] = N
@@ -207,7 +201,7 @@ def _scaling(controller: Controller) -> Finding:
         (design.plant.outputs, design.y_bounds),
         (design.plant.inputs, design.u_bounds),
     ):
-        finite = np.isfinite(bounds).all(0)
+        finite = np.isfinite(np.array(bounds)).all(0)
         half = half_range(bounds)
         sizes |= {name: half[i] for i, name in enumerate(names) if finite[i]}
     spread = max(sizes.values(), default=1.0) / min(sizes.values(), default=1.0)
@@ -218,55 +212,34 @@ def _scaling(controller: Controller) -> Finding:
     return Finding("scaling", ok, numbers, f"Measure {named}." * (not ok))
 
 
-def _hard_rows(controller: Controller) -> Finding:
-    """From rest at the set-point, wrong measurements and other last inputs leave a plan."""
-    design = controller.mpc.design
-    half = np.diag(half_range(design.y_bounds))
-    errors = np.linspace(0.05, LARGEST, 40)[:, None, None] * np.vstack((half, -half))
-    errors = errors.reshape(-1, len(half))
-    corrections = np.vstack(
-        (errors @ controller.observer.L.T, np.zeros((2, len(controller.observer.L))))
-    )
-    inputs = np.where(np.isfinite(design.u_bounds), design.u_bounds, np.nan)
-    inputs = np.vstack((np.full((len(errors), inputs.shape[1]), np.nan), inputs))
-    states, failed = _infeasible(controller, corrections, inputs)
-    hard = design.bounded[0] & np.isinf(design.y_slack)
-    names = [name for name, x in zip(design.plant.outputs, hard, strict=True) if x]
-    numbers: dict[str, Any] = {"hard bounds of": ", ".join(names) or "no output"}
-    if not failed.any():
-        return Finding("hard bounds", True, numbers)
-    i = int(np.flatnonzero(failed)[0])
-    if i < len(errors):
-        numbers |= {"errors of outputs that leave no plan": errors[i], "at the state": states[i]}
-        return Finding("hard bounds", False, numbers, f"Give {', '.join(names)} a finite y_slack.")
-    numbers |= {"last inputs that leave no plan": inputs[i]}
-    return Finding("hard bounds", False, numbers, "Let du_bounds contain zero.")
-
-
 @torch.no_grad()
-def _infeasible(controller: Controller, de: Array, u_last: Array) -> tuple[Array, Array]:
-    """Return the states that are de from rest at the set-point, and a mask of those without a plan.
-
-    de has changes of the state and of the disturbances. Without a steady state within the bounds
-    of the inputs a state does not count. A last input of NaN is that of rest.
-    """
+def _hard_rows(controller: Controller) -> Finding:
+    """Outputs off the set-point, and last inputs at their bounds, leave a plan."""
     mpc, design = controller.mpc, controller.mpc.design
-    n, _, n_y, n_d = design.plant.sizes
-    r = controller.r[0] if len(controller.r) else np.zeros(n_y)
-    rest = mpc.target(r)
-    x, u = rest.x.numpy() + de[:, :n], np.where(np.isnan(u_last), rest.u.numpy(), u_last)
-    s = torch.from_numpy(np.hstack((np.tile(r, (len(x), 1)), de[:, n:], np.zeros((len(x), n_d)))))
-    of_target = _solved(mpc.targets, s)
-    aimed = mpc.steady_state(of_target.z[:, len(s[0]) : len(s[0]) + mpc.targets.n_u], s)
-    if design.references == "preview":
-        aimed = Target(*(part[:, None].expand(-1, mpc.horizon + 1, -1) for part in aimed))
-    p = mpc.arrange(x, aimed, u_last=u, known=np.zeros((len(x), mpc.horizon + 1, n_d)))
-    failed = _solved(mpc, p).status == Status.INFEASIBLE
-    return x, (failed & (of_target.status == Status.SOLVED)).numpy()
-
-
-def _solved(mpc: QPMPC, p: Tensor) -> QPSolution:
-    return solve_qp(mpc.quadratic_program(), p, solver="daqp", on_failure="mask")
+    n_y, n_d = design.plant.sizes[2:]
+    half = np.diag(half_range(design.y_bounds))
+    off = np.linspace(0.05, LARGEST, 40)[:, None, None] * np.vstack((half, -half))
+    off = off.reshape(-1, n_y)
+    rest = mpc.target(controller.r[0] if len(controller.r) else np.zeros(n_y))
+    x = np.vstack((off @ np.linalg.pinv(design.plant.C).T, np.zeros((2, len(rest.x)))))
+    x = rest.x.numpy() + x
+    ends = np.where(np.isfinite(design.u_bounds), design.u_bounds, rest.u.numpy())
+    u_last = np.vstack((np.tile(rest.u, (len(off), 1)), ends))
+    stages = (len(x), mpc.horizon + 1) if design.references == "preview" else (len(x),)
+    target = Target(*(part.expand(*stages, -1) for part in rest))
+    p = mpc.arrange(x, target, u_last=u_last, known=np.zeros((len(x), mpc.horizon + 1, n_d)))
+    status = solve_qp(mpc.quadratic_program(), p, solver="daqp", on_failure="mask").status
+    hard = design.bounded[0] & np.isinf(design.y_slack)
+    names = ", ".join(name for name, x in zip(design.plant.outputs, hard, strict=True) if x)
+    numbers: dict[str, Any] = {"hard bounds of": names or "no output"}
+    failed = (status == Status.INFEASIBLE).nonzero().flatten().tolist()
+    if not failed:
+        return Finding("hard bounds", True, numbers)
+    if (i := failed[0]) < len(off):
+        numbers |= {"outputs off the set-point that leave no plan": off[i], "at the state": x[i]}
+        return Finding("hard bounds", False, numbers, f"Give {names} a finite y_slack.")
+    numbers |= {"last inputs that leave no plan": u_last[i]}
+    return Finding("hard bounds", False, numbers, "Let du_bounds contain zero.")
 
 
 def _set_points(controller: Controller, r: Array | None) -> Finding:

@@ -1,0 +1,185 @@
+"""`Controller.review`: designs with planted mistakes, which the remedies mend."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+import torch_qpmpc as qm
+from torch_qpmpc import QPError
+from torch_qpmpc.control.loop import LinearLoop
+from torch_qpmpc.export.tables import make_tables
+
+LAG = ([[0.9]], [[0.5]])
+INTEGRATOR = ([[1.0, 0.1], [0.0, 0.8]], [[0.0], [1.0]], [[1.0, 0.0]])
+INVERSE = ([[0.9, 0.0], [0.0, 0.5]], [[1.0], [1.0]], [[0.3, -1.2]])
+DEAD_TIME = (np.eye(6, k=1), np.eye(6)[:, -1:], np.eye(6)[:1])
+TWO_INPUTS = ([[0.9]], [[0.5, 0.4]])
+
+
+def made(model, horizon=10, filtered=None, r=None, **options):
+    """Return the review of a design."""
+    design = {"Q": 1.0, "dR": 0.1, "u_bounds": (-1.0, 1.0), "y_bounds": (-4.0, 4.0), **options}
+    return qm.Controller(qm.LinearMPC(model, horizon, **design), **(filtered or {})).review(r)
+
+
+def fast(**filtered):
+    return {"horizon": 20, "dR": None, "R": 1e-6, "filtered": filtered}
+
+
+#: A mistake, the finding that names it, a part of its remedy, and what the remedy changes.
+MISTAKES = {
+    "inputs without a weight": (
+        (TWO_INPUTS, {"dR": None}),
+        ("cost", "Add a weight of the moves, such as dR=0.00"),
+        {"dR": 0.002},
+    ),
+    "a set-point out of reach": (
+        (LAG, {"r": [7.0]}),
+        ("set-points", "Set y1 to 4, not 7, or widen"),
+        {"r": [4.0]},
+    ),
+    "a band out of reach": (
+        (LAG, {"y_bounds": (10.0, 20.0)}),
+        ("set-points", "Let y_bounds of y1 overlap -5 .. 5."),
+        {"y_bounds": (-5.0, 20.0)},
+    ),
+    "a hard bound of an output": (
+        (INTEGRATOR, {"y_slack": np.inf}),
+        ("hard bounds", "Give y1 a finite y_slack"),
+        {"y_slack": 100.0},
+    ),
+    "moves that must go on": (
+        (LAG, {"du_bounds": (0.1, 0.3)}),
+        ("hard bounds", "Let du_bounds contain zero"),
+        {"du_bounds": (-0.1, 0.3)},
+    ),
+    "units far apart": (
+        (([[0.9]], [[5e4]]), {"y_bounds": (-4e5, 4e5)}),
+        ("scaling", r"Measure y1 in units of 1e\+06"),
+        {"model": ([[0.9]], [[5e-2]]), "y_bounds": (-0.4, 0.4)},
+    ),
+    "an inverse response and a short horizon": (
+        (INVERSE, {"horizon": 3}),
+        ("horizon", "Take a horizon of 32 or more"),
+        {"horizon": 32},
+    ),
+    "a dead time and a short horizon": (
+        (DEAD_TIME, {"horizon": 4}),
+        ("horizon", "Take a horizon of 12 or more"),
+        {"horizon": 12},
+    ),
+    "a disturbance that looks like the state": (
+        (([[0.99999]], [[0.5]]), {"disturbances": {"y1": "output"}}),
+        ("disturbances", "disturbance of y1 looks like a slow mode: take disturbances='auto'"),
+        {"disturbances": "auto"},
+    ),
+    "no disturbances": (
+        (LAG, {"disturbances": None}),
+        ("offset", "Take disturbances='auto'"),
+        {"disturbances": "auto"},
+    ),
+    "a mode without a weight": (
+        (INTEGRATOR[:2], {"Q": [0.0, 1.0]}),
+        ("terminal weight", "Weight an output that shows this mode, by Q"),
+        {"Q": [1.0, 1.0]},
+    ),
+    "a discount that forgets an unstable plant": (
+        (([[1.1]], [[0.5]]), {"gamma": 0.5, "Q": 1e-4, "dR": 1.0}),
+        ("stability", "Take gamma=1"),
+        {"gamma": 1.0},
+    ),
+    "a filter that trusts all": (
+        (INTEGRATOR, fast(noise=1e-3, drift=1.0)),
+        ("margin", "the filter's noise relative to its drift"),
+        fast(noise=1.0, drift=1e-3),
+    ),
+    "weights far apart": (
+        (TWO_INPUTS, {"dR": 1e-10}),
+        ("condition", "Raise R or dR"),
+        {"dR": 0.1},
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake):
+    (model, options), (name, remedy), change = MISTAKES[mistake]
+    found = made(model, **options)
+    assert name in [x.name for x in found.faults]
+    assert re.search(remedy, found[name].remedy)
+    mended = made(**{"model": model, **options, **change})
+    assert mended.faults == []
+
+
+@pytest.mark.parametrize("model", [LAG, INTEGRATOR, DEAD_TIME])
+def test_a_sound_design_has_no_fault(model):
+    found = made(model, 15, r=[0.5])
+    assert found.faults == []
+    assert len(found.findings) == 12
+    assert str(found).startswith("0 faults in 12 findings\nok    cost: smallest eigenvalue on the")
+
+
+def test_a_learned_cost_that_is_indefinite_is_named():
+    mpc = qm.LinearMPC(LAG, 5, Q=1.0, R=0.1, structure="free", step="projection", learn=("H",))
+    assert qm.Controller(mpc).review().faults == []
+    with torch.no_grad():
+        for leaf in mpc.leaves("H"):
+            leaf -= 1.0
+    found = qm.Controller(mpc).review()
+    assert "Learning has made it indefinite" in found["cost"].remedy
+    with pytest.raises(KeyError):
+        found["stability"]
+
+
+def test_the_page_has_a_row_for_each_finding():
+    found = made(LAG, r=[7.0])
+    page = found.to_markdown()
+    assert page.count("\n| ") == 2 + len(found.findings)
+    row = "| set-points | **fault** | y1 reaches [-5, 5]; nearest y1 4 | Set y1 to 4, not 7, or wi"
+    assert row in page
+    assert "FAULT set-points: y1 reaches [-5, 5]" in str(found)
+
+
+def test_a_set_point_of_another_size_is_named():
+    with pytest.raises(QPError, match=r"^r: got shape \(1, 2\), expected 1 numbers \(y1\)"):
+        made(LAG, r=[1.0, 2.0])
+
+
+# The linear loop
+
+
+@pytest.mark.parametrize("references", ["held", "preview"])
+def test_the_linear_loop_is_that_of_the_controller(references):
+    mpc = qm.LinearMPC(INTEGRATOR, 8, Q=1.0, R=0.1, dR=0.1, references=references)
+    controller = qm.Controller(mpc)
+    loop = LinearLoop.of(controller, make_tables(mpc), make_tables(mpc.targets))
+    A, B, C = loop.plant
+    state, constant = np.zeros(len(loop.A)), np.array([0.1, -0.2, 0.3])  # load, bias and r
+    controller.reset(y=[0.0])
+    x = np.zeros(2)
+    for _ in range(15):
+        u = controller.step(C @ x - 0.2, [0.3])
+        x = A @ x + B @ (u + 0.1)
+        state = loop.A @ state + loop.B @ constant
+        assert np.allclose(state, [*x, *controller.x, *controller.w, *u], atol=1e-9)
+
+
+def test_the_margin_is_that_of_the_loop_s_gain():
+    """The loop is unstable from the gain on that the margin of one input allows at least."""
+    mpc = qm.LinearMPC(INTEGRATOR, 8, Q=1.0, R=0.1, dR=0.1)
+    controller = qm.Controller(mpc)
+    loop = LinearLoop.of(controller, make_tables(mpc), make_tables(mpc.targets))
+    A_c, B_c, C_c, D_c = loop.controller
+    A, B, C = loop.plant
+    margin = loop.modulus_margin()
+
+    def radius(gain):
+        closed = [[A + gain * B @ D_c @ C, gain * B @ C_c], [B_c @ C, A_c]]
+        return np.abs(np.linalg.eigvals(np.block(closed))).max()
+
+    assert max(map(radius, np.linspace(1 / (1 + margin), 1 / (1 - margin), 50))) < 1
+    assert radius(3.0) > 1
