@@ -22,6 +22,7 @@ from torch_qpmpc.files import damaged, load_file, save_file
 if TYPE_CHECKING:
     from torch_qpmpc.control.exporting import ControllerExport
     from torch_qpmpc.control.review import Review
+    from torch_qpmpc.control.simulation import Run
 
 #: The kind of file that `Controller.save` writes.
 KIND = "Controller"
@@ -97,7 +98,7 @@ class Controller:
         self.target: Target | None = None
         self._e: Array | None = None
         if y is not None:
-            self._rest(read_row("y", y, plant.outputs), self._known(known)[0])
+            self._rest(read_row("y", y, plant.outputs), self.read_known(known, 1)[0])
 
     @property
     def x(self) -> Array:
@@ -126,8 +127,9 @@ class Controller:
             SolverError: no input satisfies the hard bounds.
         """
         plant, observer = self._design.plant, self.observer
-        d, y_k = self._known(known), read_row("y", y, plant.outputs)
-        self._read_set_point(r)
+        rows = self._design.horizon + 1
+        d, y_k = self.read_known(known, rows), read_row("y", y, plant.outputs)
+        self.r = self.read_set_points(r, rows)
         if self._e is None:
             self._rest(y_k, d[0])
         assert self._e is not None
@@ -168,6 +170,35 @@ class Controller:
         except Exception as error:  # damaged files raise errors of any type
             raise damaged(Path(path), error, "a file that Controller.save wrote") from error
         return controller
+
+    def simulate(self, plant: Any = None, steps: int = 200, r: Any = None, **options: Any) -> Run:
+        """Return a closed loop of a copy of this controller with a plant, from rest.
+
+        Args:
+            plant: a model as `LinearMPC` takes it, by default its own; or an environment with
+                Gymnasium's ``reset`` and ``step`` whose observations are the outputs.
+            steps: the number of steps.
+            r: a set-point that is held, or rows of them, by default the last one.
+            options: ``known``: a row of known signals that is held, or rows. ``load``: a constant
+                added to the inputs. ``noise``: the standard deviation of that of the outputs.
+                ``x``: the state that a model starts from. ``seed``: that of the noise and of an
+                environment.
+
+        Raises:
+            QPError: an argument is invalid.
+            SolverError: no input satisfies the hard bounds in a step.
+
+        Example:
+            >>> import torch_qpmpc as qm
+            >>> mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 10, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
+            >>> run = qm.Controller(mpc).simulate(([[0.8]], [[0.6]]), 100, r=[1.0], load=0.1)
+            >>> print(run.y[-1].round(3), run.cost[-1].round(3))
+            [1.] 0.0
+            >>> figure = run.plot()
+        """
+        from torch_qpmpc.control.simulation import simulate
+
+        return simulate(self, plant, steps, r, **options)
 
     def review(self, r: Any = None) -> Review:
         """Return findings about this design: numbers, and a remedy for each fault.
@@ -246,24 +277,33 @@ class Controller:
         u = u_s + self.mpc.policy(p, qp=self._qp)
         return np.clip(u.numpy(), *self._design.u_bounds)
 
-    def _known(self, known: Any) -> Array:
-        names, stages = self._design.plant.known, self._design.horizon + 1
+    def read_known(self, known: Any, rows: int) -> Array:
+        """Return known signals, as `step` takes them, as ``(rows, n_d)``.
+
+        Raises:
+            QPError: they are invalid, or missing.
+        """
+        names = self._design.plant.known
         if not names and known is None:
-            return np.zeros((stages, 0))
+            return np.zeros((rows, 0))
         if known is None:
             remedy = "Pass a forecast of N + 1 rows, or one row that is held."
             raise QPError.expected("known", "None", f"the signals {', '.join(names)}", remedy)
-        return read_table("known", known, names, stages)
+        return read_table("known", known, names, rows)
 
-    def _read_set_point(self, r: Any) -> None:
-        outputs, stages = self._design.plant.outputs, self._design.horizon + 1
-        if r is not None:
-            self.r = read_table("r", r, outputs, stages)
-        elif not len(self.r):
-            if self._design.Q.any():
-                want = f"set-points of {', '.join(outputs)}"
-                raise QPError.expected("r", "None in the first step", want)
-            self.r = np.zeros((stages, len(outputs)))
+    def read_set_points(self, r: Any, rows: int) -> Array:
+        """Return set-points, as `step` takes them, as ``(rows, n_y)``.
+
+        Raises:
+            QPError: they are invalid, or None in the first step.
+        """
+        outputs = self._design.plant.outputs
+        if r is None and not len(self.r) and self._design.Q.any():
+            want = f"set-points of {', '.join(outputs)}"
+            raise QPError.expected("r", "None in the first step", want)
+        if r is None:
+            r = self.r if len(self.r) else np.zeros(len(outputs))
+        return read_table("r", r, outputs, rows)
 
 
 def _deviations(name: str, value: Any, default: Array, names: tuple[str, ...]) -> Array:

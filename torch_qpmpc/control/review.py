@@ -201,7 +201,7 @@ def _scaling(controller: Controller) -> Finding:
         (design.plant.outputs, design.y_bounds),
         (design.plant.inputs, design.u_bounds),
     ):
-        finite = np.isfinite(np.array(bounds)).all(0)
+        finite = np.isfinite(bounds[0]) & np.isfinite(bounds[1])
         half = half_range(bounds)
         sizes |= {name: half[i] for i, name in enumerate(names) if finite[i]}
     spread = max(sizes.values(), default=1.0) / min(sizes.values(), default=1.0)

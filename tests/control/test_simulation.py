@@ -1,0 +1,104 @@
+"""`Controller.simulate`: loops with models and environments, their costs, figures and messages."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import torch_qpmpc as qm
+from torch_qpmpc import QPError
+
+LAG = ([[0.9]], [[0.5]])
+
+
+def made(**options):
+    design = {"Q": 1.0, "R": 0.2, "dR": 0.1, "u_bounds": (-1.0, 1.0), **options}
+    return qm.Controller(qm.LinearMPC(LAG, 10, **design))
+
+
+def test_another_plant_with_a_load_settles_and_the_controller_is_untouched():
+    controller = made()
+    controller.step([0.3], [0.2])
+    before = (controller.u.copy(), controller.x, controller.w)
+    run = controller.simulate(([[0.8]], [[0.6]]), 150, r=[1.0], load=0.1)
+    assert [x.shape for x in (run.y, run.r, run.u, run.cost)] == [
+        (151, 1),
+        (151, 1),
+        (150, 1),
+        (150,),
+    ]
+    assert np.abs(run.y[-1] - 1.0) < 1e-5
+    assert np.abs(run.y[0]) < 0.31  # at rest with the load alone
+    assert all(map(np.array_equal, before, (controller.u, controller.x, controller.w)))
+
+
+def test_the_cost_is_that_of_its_formula():
+    controller = made(linear={"u1": "price"}, E=[[0.0]], known=["price"])
+    known = {"price": np.linspace(0, 0.1, 40)}
+    run = controller.simulate(steps=30, r=np.sin(np.arange(40) / 5)[:, None], known=known)
+    du = np.diff(run.u, axis=0, prepend=0.0)
+    u_s = 0.2 * run.r[:-1]
+    cost = (run.y - run.r)[:-1] ** 2 + 0.2 * (run.u - u_s) ** 2 + 0.1 * du**2
+    assert np.allclose(run.cost, (cost + run.known * run.u)[:, 0], atol=1e-6)
+
+
+def test_an_identified_model_with_an_offset_starts_at_rest():
+    plant = qm.Controller(qm.LinearMPC(LAG, 5, Q=1.0)).mpc.design.plant
+    plant.offset[:] = 0.3
+    controller = qm.Controller(qm.LinearMPC(plant, 5, Q=1.0, R=0.1))
+    run = controller.simulate(steps=5, r=[3.0])
+    assert np.allclose(run.y, 3.0)
+    assert np.allclose(controller.simulate(steps=5, r=[3.0], x=[1.0]).y[0], 1.0)
+
+
+def test_noise_is_drawn_from_the_seed():
+    runs = [made().simulate(steps=20, r=[1.0], noise=0.1, seed=seed).y for seed in (0, 0, 1)]
+    assert np.array_equal(runs[0], runs[1])
+    assert not np.array_equal(runs[0], runs[2])
+
+
+def test_an_environment_whose_observations_are_outputs_is_a_plant():
+    class Lag(gymnasium.Env):
+        def reset(self, *, seed=None, options=None):
+            self.x = np.zeros(1)
+            return self.x, {}
+
+        def step(self, action):
+            self.x = 0.85 * self.x + 0.5 * action
+            return self.x, 0.0, False, False, {}
+
+    assert np.abs(made().simulate(Lag(), 120, r=[1.0]).y[-1] - 1.0) < 1e-5
+
+
+def test_the_figure_has_a_panel_for_each_signal_with_its_unit():
+    mpc = qm.LinearMPC(LAG, 5, Q=1.0, E=[[0.1]], known=["rain"], y_bounds=(-1, 1), dt=60.0)
+    figure = qm.Controller(mpc).simulate(steps=5, r=[0.5], known=[0.1]).plot()
+    assert isinstance(figure, Figure)
+    assert [axes.get_ylabel() for axes in figure.axes] == ["y1", "u1", "rain"]
+    assert figure.axes[-1].get_xlabel() == "time"
+    assert figure.axes[0].get_xlim() == (0.0, 300.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"steps": 0}, "steps: got 0, expected a whole number >= 1"),
+        ({"r": None}, "r: got None in the first step, expected set-points of y1"),
+        ({"noise": -1.0}, "noise: got -1.0, expected a standard deviation >= 0"),
+        ({"load": [1.0, 2.0]}, r"load: got shape \(2,\) or NaN, expected a number, or one for"),
+        ({"x": [1.0, 2.0]}, r"x: got shape \(2,\) or NaN, expected a number, or one for"),
+        (
+            {"plant": ([[0.5]], [[1.0, 1.0]])},
+            "plant: got 2 inputs and 1 outputs, expected the controller's 1 inputs and 1 outputs",
+        ),
+        (
+            {"plant": qm.LinearMPC(LAG, 3, Q=1.0, E=[[1.0]]).design.plant},
+            "plant: got 1 known signals, expected none, or 0",
+        ),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        made().simulate(**{"r": [1.0], **arguments})

@@ -1,0 +1,148 @@
+"""`Controller.simulate`: a closed loop of a controller and a plant."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from torch_qpmpc.analysis.episode import episode_figure
+from torch_qpmpc.checks import check_number, check_seed, check_whole
+from torch_qpmpc.control.controller import Controller
+from torch_qpmpc.control.design import Design, read_vector
+from torch_qpmpc.control.state_space import Array, StateSpace, read_model
+from torch_qpmpc.errors import QPError
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Signals of a closed loop of T steps.
+
+    Attributes:
+        design: that of the controller.
+        y, r: measured outputs and set-points, ``(T + 1, n_y)``.
+        u: inputs ``(T, m)``.
+        known: known signals, ``(T, n_d)``.
+        cost: that of each step, ``(y - r)'Q(y - r) + (u - u_s)'R(u - u_s) + du'dR du`` and prices.
+    """
+
+    design: Design
+    y: Array
+    r: Array
+    u: Array
+    known: Array
+    cost: Array
+
+    def plot(self) -> Figure:
+        """Return a figure with a panel for each output, input and known signal."""
+        plant = self.design.plant
+        step = 1.0 if plant.dt is None else plant.dt
+        times, y, u, r = (
+            torch.from_numpy(x) for x in (step * np.arange(len(self.y)), self.y, self.u, self.r)
+        )
+        signals = {
+            plant.label(name): torch.from_numpy(x)
+            for name, x in zip(plant.known, self.known.T.copy(), strict=True)
+        }
+        lower, upper = (torch.from_numpy(x) for x in self.design.y_bounds)
+        return episode_figure(
+            times,
+            y,
+            u,
+            signals=signals,
+            band=(lower, upper),
+            references=r,
+            outputs=[plant.label(name) for name in plant.outputs],
+            actions=[plant.label(name) for name in plant.inputs],
+            xlabel="step" if plant.dt is None else "time",
+        )
+
+
+def simulate(
+    controller: Controller,
+    plant: Any,
+    steps: int,
+    r: Any,
+    *,
+    known: Any = None,
+    load: Any = 0.0,
+    noise: float = 0.0,
+    x: Any = None,
+    seed: int = 0,
+) -> Run:
+    """Return a closed loop; see `Controller.simulate`."""
+    check_whole("steps", steps, 1)
+    check_number("noise", noise, lambda x: 0 <= x < np.inf, "a standard deviation >= 0")
+    check_seed(seed)
+    design, twin = controller.mpc.design, copy.copy(controller)
+    rows = design.horizon + 1
+    d, set_points = (
+        read(signal, steps + rows)
+        for read, signal in ((controller.read_known, known), (controller.read_set_points, r))
+    )
+    load = read_vector("load", load, design.plant.inputs, 0.0)
+    twin.reset()
+    if not hasattr(plant, "reset"):
+        model = design.plant if plant is None else read_model(plant)
+        plant = _Model(model, design, d, twin.u + load, x)
+    rng, last, (observed, _) = np.random.default_rng(seed), twin.u, plant.reset(seed=seed)
+    ys, us, costs = [], [], []
+    for k in range(steps):
+        ys.append(observed + noise * rng.normal(size=len(design.Q)))
+        u = twin.step(ys[-1], set_points[k : k + rows], d[k : k + rows])
+        us.append(u)
+        costs.append(_cost(twin, ys[-1] - set_points[k], u - last, d[k]))
+        observed, last = plant.step(u + load)[0], u
+    ys.append(observed + noise * rng.normal(size=len(design.Q)))
+    return Run(
+        design, np.array(ys), set_points[: steps + 1], np.array(us), d[:steps], np.array(costs)
+    )
+
+
+def _cost(twin: Controller, error: Array, du: Array, d: Array) -> float:
+    """Return the cost of the controller's last step."""
+    design, target = twin.mpc.design, twin.target
+    assert target is not None
+    u_s = target.u.numpy().reshape(-1, len(du))[0]
+    off = twin.u - u_s
+    cost = error @ design.Q @ error + off @ design.R @ off + du @ design.dR @ du
+    for name, price in design.linear.items():
+        level = d[design.plant.known.index(price)] if isinstance(price, str) else price
+        cost += level * twin.u[design.plant.inputs.index(name)]
+    return float(cost)
+
+
+class _Model:
+    """A model with Gymnasium's ``reset`` and ``step``, which rests with the input u at first."""
+
+    def __init__(self, model: StateSpace, design: Design, d: Array, u: Array, x: Any) -> None:
+        got, want = model.sizes[1:3], design.plant.sizes[1:3]
+        if got != want:
+            got, want = (f"{m} inputs and {n_y} outputs" for m, n_y in (got, want))
+            raise QPError.expected("plant", got, f"the controller's {want}")
+        self._model, self._d = model, d if model.known else d[:, :0]
+        if self._d.shape[1] != len(model.known):
+            got, want = f"{len(model.known)} known signals", f"none, or {d.shape[1]}"
+            raise QPError.expected("plant", got, want)
+        still = np.eye(len(model.A)) - model.A
+        rest = np.linalg.lstsq(still, self._driven(u, 0), rcond=None)[0]
+        states = [f"x{i + 1}" for i in range(len(model.A))]
+        self._start = rest if x is None else read_vector("x", x, states, 0.0)
+
+    def _driven(self, u: Array, k: int) -> Array:
+        model = self._model
+        return model.B @ u + model.E @ self._d[k] + model.offset
+
+    def reset(self, *, seed: int) -> tuple[Array, dict]:
+        del seed
+        self._x, self._k = self._start, 0
+        return self._model.C @ self._x, {}
+
+    def step(self, u: Array) -> tuple[Array]:
+        self._x = self._model.A @ self._x + self._driven(u, self._k)
+        self._k += 1
+        return (self._model.C @ self._x,)
