@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torch_qpmpc.control.controller import Controller
-from torch_qpmpc.control.design import half_range
+from torch_qpmpc.control.design import Design, half_range
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, export_c
@@ -171,7 +171,7 @@ def _run(controller: Controller, steps: int) -> Loop:
     size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
     d = 0.1 * rng.normal(size=(rows, len(plant.known)))
-    middle = np.where(np.isfinite(design.y_bounds).all(0), design.y_bounds, 0.0).mean(0)
+    middle = _middle(design)
     x, loop = np.linalg.pinv(plant.C) @ middle, []
     for k in range(steps):
         y = plant.C @ x + 0.01 * size_y * rng.normal(size=len(size_y))
@@ -187,6 +187,11 @@ def _run(controller: Controller, steps: int) -> Loop:
         loop.append((y, r.ravel(), known.ravel(), u))
         x = plant.A @ x + plant.B @ (u + 0.05 * size_u) + plant.E @ known[0] + plant.offset
     return Loop(*map(np.array, zip(*loop, strict=True)))
+
+
+def _middle(design: Design) -> Array:
+    """Return the middle of the outputs' bounds, zero where there is none."""
+    return np.where(np.isfinite(design.y_bounds).all(0), design.y_bounds, 0.0).mean(0)
 
 
 def _compare(library: CompiledController, loop: Loop) -> Array:
@@ -281,7 +286,7 @@ def _main(controller: Controller, name: str, dtype: str) -> str:
     design = controller.mpc.design
     plant, sizes = design.plant, _sizes(controller)
     load = 0.1 * plant.B @ half_range(design.u_bounds) + plant.offset
-    r = design.steady.y[:, -1] + 0.5 * half_range(design.y_bounds)
+    r = _middle(design) + 0.25 * half_range(design.y_bounds)
     r = controller.mpc.target(r).y.numpy()
     arrays = {
         "A": plant.A,

@@ -290,7 +290,7 @@ static int hold(policy_state *s, int row, int side, real excess, int *iterations
 /* Return the row that is furthest from its conditions, its side and its excess; -1 if none is off.
 
    *settled is 0 if a held row is not at its bound. */
-static int worst(const policy_state *s, int *side, real *excess, int *settled)
+static int worst(const policy_state *s, real tolerance, int *side, real *excess, int *settled)
 {
     real sum = 0, gain = 0;
     int i, found = -1;
@@ -304,7 +304,7 @@ static int worst(const policy_state *s, int *side, real *excess, int *settled)
         else if (kind == -SATURATED) off = larger(below, 0);
         else if (kind != IGNORED) off = kind > 0 ? above : below;
         size = absolute(off);
-        if (size <= TOLERANCE * s->size[i] + ROUNDING * sum) continue;
+        if (size <= tolerance * s->size[i] + ROUNDING * sum) continue;
         if (kind == HELD || kind == -HELD) {
             *settled = 0;
             continue;
@@ -320,8 +320,8 @@ static int worst(const policy_state *s, int *side, real *excess, int *settled)
     return found;
 }
 
-/* Solve from the multipliers of the state. */
-static int solve(policy_state *s, int *iterations)
+/* Solve from the multipliers of the state, with rows exact to a tolerance relative to their size. */
+static int solve(policy_state *s, real tolerance, int *iterations)
 {
     int refinements = 0;
     respond_anew(s);
@@ -330,10 +330,10 @@ static int solve(policy_state *s, int *iterations)
         int row, side = 0, settled;
         settle(s, iterations);
         respond(s);
-        row = worst(s, &side, &excess, &settled);
+        row = worst(s, tolerance, &side, &excess, &settled);
         if (row < 0) { /* judge y without the rounding of its updates */
             respond_anew(s);
-            row = worst(s, &side, &excess, &settled);
+            row = worst(s, tolerance, &side, &excess, &settled);
         }
         if (row < 0 && (settled || refinements++ == REFINEMENTS)) return POLICY_SOLVED;
         if (*iterations >= MAX_ITERATIONS) return POLICY_LIMIT;
@@ -469,8 +469,8 @@ int policy_step(policy_state *s, const real p[], real u[], policy_info *info)
     value = info->value;
     violation = info->violation;
     for (i = 0; i < POLICY_ROWS; i++) cold = cold && s->lambda[i] == 0;
-    for (;;) { /* from the last active set, with a new factor, and from none */
-        code = solve(s, &info->iterations);
+    for (;;) { /* from the last active set, with a new factor and tight rows, and from none */
+        code = solve(s, fresh ? TIGHT : TOLERANCE, &info->iterations);
         info->value = value;
         info->violation = violation;
         if (!certify(s, v_free, info) && code == POLICY_SOLVED) {

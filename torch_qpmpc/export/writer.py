@@ -28,6 +28,7 @@ CONSTANTS = {
     "float64": {
         "BIG": "1e300",
         "TOLERANCE": "1e-11",
+        "TIGHT": "1e-14",
         "ROUNDING": "4e-15",
         "DEPENDENT": "1e-12",
         "NOISE": "1e-10",
@@ -38,6 +39,7 @@ CONSTANTS = {
     "float32": {
         "BIG": "1e30f",
         "TOLERANCE": "4e-6f",
+        "TIGHT": "4e-7f",
         "ROUNDING": "1e-6f",
         "DEPENDENT": "1e-5f",
         "NOISE": "1e-3f",
