@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from typing import Any
 
 import numpy as np
 import pytest
@@ -97,11 +98,11 @@ def test_the_loop_is_that_of_python_for_100_000_steps(tmp_path, name):
 
 def test_a_set_point_at_a_soft_bound_with_a_large_price_is_certified(tmp_path):
     """The charge of a row's rounding is large beside the value there."""
-    sides = {"y_bounds": (18.0, 24.0), "u_bounds": (0.0, 12.0), "du_bounds": (-3.0, 3.0)}
+    sides: dict[str, Any] = {"y_bounds": (18.0, 24.0), "u_bounds": (0.0, 12.0)}
     A = np.eye(4, k=1)
     A[:, 0] = [0.905, -0.0085, 0.066, -0.056]
     model = (A, np.array([[0.25], [0.002], [0.0], [-0.02]]), np.eye(1, 4))
-    mpc = qm.LinearMPC(model, 24, Q=1.0, dR=0.1, **sides)
+    mpc = qm.LinearMPC(model, 24, Q=1.0, dR=0.1, du_bounds=(-3.0, 3.0), **sides)
     controller = qm.Controller(mpc)
     twin = load(controller.export_c(tmp_path).files, controller)
     x = np.zeros(4)

@@ -143,7 +143,7 @@ class Controller:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write this controller, with estimates and the last input, to a file that runs no code.
+        """Write this controller, its estimates and last input to ``path``: a file that runs no code.
 
         Raises:
             QPError: a part of theta has a parametrization that is not QPMPC's own.
@@ -278,7 +278,7 @@ class Controller:
         return np.clip(u.numpy(), *self._design.u_bounds)
 
     def read_known(self, known: Any, rows: int) -> Array:
-        """Return known signals, as `step` takes them, as ``(rows, n_d)``.
+        """Return signals ``known``, in the forms of `step`, as ``(rows, n_d)``.
 
         Raises:
             QPError: they are invalid, or missing.
@@ -292,7 +292,7 @@ class Controller:
         return read_table("known", known, names, rows)
 
     def read_set_points(self, r: Any, rows: int) -> Array:
-        """Return set-points, as `step` takes them, as ``(rows, n_y)``.
+        """Return set-points ``r``, in the forms of `step`, as ``(rows, n_y)``.
 
         Raises:
             QPError: they are invalid, or None in the first step.
