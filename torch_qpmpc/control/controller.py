@@ -143,7 +143,7 @@ class Controller:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write this controller, its estimates and last input to ``path``: a file that runs no code.
+        """Write this controller with its estimates and last input to ``path``; no code is in it.
 
         Raises:
             QPError: a part of theta has a parametrization that is not QPMPC's own.

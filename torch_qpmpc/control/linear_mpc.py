@@ -153,7 +153,7 @@ class LinearMPC(QPMPC):
         return {self.n_p - 1: 1.0}
 
     def save(self, path: str | Path) -> None:
-        """Write this MPC with its design to a file that runs no code, as `QPMPC.save` does.
+        """Write this MPC with its design to the file ``path``, as `QPMPC.save` does.
 
         `LinearMPC.load` reads it, and `QPMPC.load` its QP alone.
 
@@ -213,7 +213,7 @@ class LinearMPC(QPMPC):
         return self.steady_state(self.targets.policy(s, qp=self._target_qp), s)
 
     def steady_state(self, v: Tensor, s: Tensor) -> Target:
-        """Return the steady state of v and s = [r; w; d], see `torch_qpmpc.control.steady`."""
+        """Return the steady state of ``v`` and ``s = [r; w; d]``; `Steady` has its maps."""
         steady = self.design.steady
         loads = torch.cat((s[..., len(steady.Q) :], s.new_ones(*s.shape[:-1], 1)), -1)
         pairs = ((steady.X, steady.x), (steady.U, steady.u), (steady.Y, steady.y))
