@@ -17,7 +17,7 @@ from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment.tasks import make_physics, make_true_mpc
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-#: Overrides of a small run, without figures, which would take most of its time.
+#: Overrides of a small run, without figures and rivals, which would take most of its time.
 SMALL = (
     "optimizer=adam",
     "solver=daqp",
@@ -33,6 +33,7 @@ SMALL = (
     "task.eval_steps=10",
     "figures=false",
     "gate=false",
+    "rivals=false",
 )
 
 

@@ -21,7 +21,7 @@ from torch_qpmpc.experiment.tasks import TASKS, make_mpc, make_physics
 
 
 def test_the_summary_has_each_J_the_gap_and_the_rivals():
-    cfg = make_config(*SMALL, "rivals=false")
+    cfg = make_config(*SMALL)
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
     found = Evaluation.before(cfg, physics, mpc)
@@ -70,7 +70,8 @@ def test_quick_rivals_are_evaluated_or_those_that_are_named(rivals, chosen, name
 
 
 def test_zero_action_is_the_action_within_the_bounds_nearest_to_zero():
-    cfg = make_config(*SMALL, "task=gymnasium", "task.id=Pendulum-v1", "noise=none")
+    settings = ("task=gymnasium", "task.id=Pendulum-v1", "noise=none", "rivals=true")
+    cfg = make_config(*SMALL, *settings)
     plant = make_physics(cfg)
     assert isinstance(plant, GymnasiumPlant)
     loop = gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=10)

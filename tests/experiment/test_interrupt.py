@@ -64,7 +64,7 @@ def test_a_block_without_a_signal_changes_nothing(capsys):
         ("train.report", 1, signal.SIGTERM, "before the first update"),
         ("torch_qpmpc.learning.replay.Replay.extend", 1, signal.SIGINT, "before the first update"),
         ("torch_qpmpc.learning.replay.Replay.extend", 4 + 2, signal.SIGTERM, "after update 2"),
-        ("evaluation.evaluate", 4, signal.SIGINT, "after update 3"),
+        ("evaluation.evaluate", 3, signal.SIGINT, "after update 3"),
         ("train.save_checkpoint", 1, signal.SIGTERM, "after update 3"),
     ],
 )

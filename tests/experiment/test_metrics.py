@@ -133,7 +133,7 @@ def test_a_run_continues_if_its_C_cannot_be_read():
 
 
 def test_report_logs_the_evaluation(tmp_path):
-    cfg = make_config(*SMALL, "constraint=free", "rivals=false")
+    cfg = make_config(*SMALL, "constraint=free")
     physics = linear_system(cfg)
     mpc = make_mpc(cfg, physics)
     with torch.no_grad():

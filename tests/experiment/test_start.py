@@ -259,7 +259,7 @@ class Walk(gymnasium.Env):
 
 def test_a_reward_of_the_next_observation_gets_a_cost_of_it(tmp_path, monkeypatch):
     monkeypatch.setitem(gymnasium.registry, "Walk-v0", EnvSpec("Walk-v0", lambda **_: Walk()))
-    settings = ("task.id=Walk-v0", "start.transitions=1000", "constraint=free")
+    settings = ("task.id=Walk-v0", "start.transitions=1000", "constraint=free", "rivals=true")
     summary = train.train(make_config(*PENDULUM, *settings), str(tmp_path), quiet=True)
     assert summary["cost_of_next"]
     assert summary["R2_cost_next"] == pytest.approx(1)
