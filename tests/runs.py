@@ -34,6 +34,7 @@ SMALL = (
     "figures=false",
     "gate=false",
     "rivals=false",
+    "search.loops=2",
 )
 
 

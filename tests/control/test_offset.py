@@ -1,6 +1,6 @@
 """Steady states of closed loops of random plants, beside an independent search for the nearest.
 
-The slow tests draw 25 plants; ``PLANTS=200 pytest -m slow tests/control/test_offset.py`` draws 200.
+The slow tests draw 15 plants; ``PLANTS=200 pytest -m slow tests/control/test_offset.py`` draws 200.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import scipy.linalg
 
 import torch_qpmpc as qm
 
-PLANTS = int(os.environ.get("PLANTS", "25"))
+PLANTS = int(os.environ.get("PLANTS", "15"))
 #: The loop has settled when no state moves by more; it is cut off after so many steps.
 STILL, STEPS = 1e-11, 3000
 OFFSET = 1e-6
