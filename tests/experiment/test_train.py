@@ -69,7 +69,7 @@ def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 WHOLE = (
     *("optimizer=adam", "solver=daqp", "seed=5", "constraint=combined"),
-    *("updates=150", "eval_interval=75", "gate=false"),
+    *("updates=150", "eval_interval=75", "gate=false", "rivals=false"),
 )
 
 
@@ -241,6 +241,7 @@ STREAM = (
     "task.eval_steps=20",
     "figures=false",
     "gate=false",
+    "rivals=false",
 )
 
 
