@@ -135,8 +135,8 @@ def policy_map(
         ...     stage_weight=[1.0, 1.0, 0.1],
         ...     action_bounds=([-1.0], [1.0]),
         ... )
-        >>> found = policy_map(mpc, torch.linspace(-1, 1, 9), torch.linspace(-1, 1, 5))
-        >>> found.actions.shape, found.gains.shape, bool((found.regions >= 0).all())
+        >>> drawn = policy_map(mpc, torch.linspace(-1, 1, 9), torch.linspace(-1, 1, 5))
+        >>> drawn.actions.shape, drawn.gains.shape, bool((drawn.regions >= 0).all())
         (torch.Size([9, 5, 1]), torch.Size([9, 5, 1, 2]), True)
     """
     check_kind("mpc", mpc, QPMPC)

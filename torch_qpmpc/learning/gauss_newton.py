@@ -367,7 +367,7 @@ class GaussNewton(torch.optim.Optimizer):
         if factored is not None and mask is not None:
             factored.copy_(mpc.C)  # another optimiser may have moved entries that are not learned
         dense = [leaf for leaf, _ in pairs if leaf is not factored]
-        found = iter(_gradients(solution, root, dense, without_C=factored is not None))
+        gradients = iter(_gradients(solution, root, dense, without_C=factored is not None))
         rows, columns = z.new_ones(mpc.horizon * mpc.n_x), torch.ones_like(z[0])
         if self._normalise:
             rows, columns = signal_sizes(mpc, self.param_groups[0], z[root > 0])
@@ -375,7 +375,7 @@ class GaussNewton(torch.optim.Optimizer):
         return [
             OuterProducts(leaf, group, chi, z, rows, columns, S, mask)
             if leaf is factored
-            else Dense(leaf, group, next(found).reshape(len(z), -1), units.get(group["name"]))
+            else Dense(leaf, group, next(gradients).reshape(len(z), -1), units.get(group["name"]))
             for leaf, group in pairs
         ]
 

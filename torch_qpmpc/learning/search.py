@@ -108,7 +108,7 @@ def search(
         seed: seeds the search, the starts and the disturbances.
 
     Returns:
-        The scalars found; all zero stand for the theta that the search started from.
+        The best scalars; all zero stand for the theta that the search started from.
 
     Raises:
         QPError: an argument is invalid, or a scalar is not `available`.
@@ -122,8 +122,8 @@ def search(
         ...     return closed_loop(mpc.policy, physics, steps=20, seed=seed).costs.sum(0)
         >>> options = {"stage_weight": [1.0] * 4 + [0.1] * 2, "action_bounds": ([-1] * 2, [1] * 2)}
         >>> mpc = qm.QPMPC.from_model(physics.A, physics.B, 5, **options)
-        >>> found = search(mpc, costs, {"H_u": 0.5, "H_f": 0.5}, loops=12)
-        >>> sorted(found)
+        >>> scalars = search(mpc, costs, {"H_u": 0.5, "H_f": 0.5}, loops=12)
+        >>> sorted(scalars)
         ['H_f', 'H_u']
     """
     from cma import CMAEvolutionStrategy
@@ -149,12 +149,12 @@ def search(
         points = strategy.ask()
         entropy = np.random.SeedSequence([seed, done], spawn_key=(SPAWN_KEY,))
         run = int(entropy.generate_state(1)[0])
-        found = []
+        means = []
         for x in points:
             _set(mpc, theta, dict(zip(names, x * sizes, strict=False)))
             cost = float(costs(mpc, run).mean())
-            found.append(cost if np.isfinite(cost) else np.inf)
-        strategy.tell(points, found)
+            means.append(cost if np.isfinite(cost) else np.inf)
+        strategy.tell(points, means)
         done += len(points)
     best = dict(zip(names, (strategy.result.xfavorite * sizes).tolist(), strict=False))
     _set(mpc, theta, best)

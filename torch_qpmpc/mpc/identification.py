@@ -76,8 +76,8 @@ class Identified:
         for i, part in enumerate(parts):
             others = [log for j, other in enumerate(parts) if j != i for log in other]
             if _usable(others, layout) > _needed(layout):
-                found = fit(others, self.options)[1]
-                errors.append(prediction_errors(part, found, layout, causal))
+                coefficients = fit(others, self.options)[1]
+                errors.append(prediction_errors(part, coefficients, layout, causal))
         return torch.cat(errors)
 
     @property
@@ -185,8 +185,8 @@ def identify(
         >>> u, y = np.random.default_rng(0).uniform(-1, 1, 50), np.zeros(51)
         >>> for t in range(50):
         ...     y[t + 1] = 0.9 * y[t] + 0.5 * u[t]
-        >>> found = qm.identify({"y": y, "u": u}, horizon=4)
-        >>> [round(part.item(), 4) for part in found.model[:2]]
+        >>> identified = qm.identify({"y": y, "u": u}, horizon=4)
+        >>> [round(part.item(), 4) for part in identified.model[:2]]
         [0.9, 0.5]
     """
     for name, size in (("horizon", horizon), ("past", past)):

@@ -265,7 +265,7 @@ class QPMPC(nn.Module):
             >>> tuple(mpc.model()[0].shape)
             (4, 4)
         """
-        found = identify(
+        identified = identify(
             trajectories,
             horizon,
             past=past,
@@ -275,10 +275,10 @@ class QPMPC(nn.Module):
             causal=causal,
             ridge=ridge,
         )
-        arguments = {**found.arguments, **options}
-        starts = [found.arguments.get("start", {}), options.get("start") or {}]
+        arguments = {**identified.arguments, **options}
+        starts = [identified.arguments.get("start", {}), options.get("start") or {}]
         if arguments.get("stage_weight") is None:
-            hessian, layout = options.get("hessian", "diagonal"), found.options.layout
+            hessian, layout = options.get("hessian", "diagonal"), identified.options.layout
             fitted = fit_rewards(trajectories, layout, hessian == "diagonal").now
             cost = scheme_cost(fitted, layout, options.get("gamma", GAMMA), hessian)
             arguments["stage_weight"] = cost.stage_weight

@@ -92,17 +92,17 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
             valid = valid & ~_gaps(_narrow(key, times, steps.shape), ends)
     ends |= ~valid
     ends[:, :-1] |= ~valid[:, 1:]
-    found = []
+    trajectories = []
     for row in range(len(y)):
         start = 0
         for stop in (*(ends[row, :-1].nonzero().flatten() + 1).tolist(), y.shape[1]):
             if valid[row, start:stop].all():
                 outputs = torch.cat((y[row, start:stop], following[row, stop - 1 : stop]))
-                found.append(Trajectory(outputs, u[row, start:stop], d[row, start:stop]))
+                trajectories.append(Trajectory(outputs, u[row, start:stop], d[row, start:stop]))
             start = stop
-    if not found:
+    if not trajectories:
         raise QPError.expected("trajectories", "no steps", "logged steps", REMEDY)
-    return found
+    return trajectories
 
 
 def logs(data: Any) -> list[Any]:
@@ -119,12 +119,12 @@ def valid_steps(steps: Any) -> Tensor:
 
 def _read_each(parts: Sequence[Any], n_x: int | None, n_d: int) -> list[Trajectory]:
     """Return the trajectories of several logs."""
-    found = [log for part in parts for log in read_trajectories(part, n_x, n_d)]
-    sizes = {(log.y.shape[1], log.u.shape[1]) for log in found}
+    trajectories = [log for part in parts for log in read_trajectories(part, n_x, n_d)]
+    sizes = {(log.y.shape[1], log.u.shape[1]) for log in trajectories}
     if len(sizes) != 1:
         got = f"logs of (n_x, n_u) = {', '.join(map(str, sorted(sizes)))}" if sizes else "no logs"
         raise QPError.expected("trajectories", got, "logs of the same sizes", REMEDY)
-    return found
+    return trajectories
 
 
 def _gaps(times: Tensor, ends: Tensor) -> Tensor:

@@ -162,8 +162,8 @@ def _all_implied(
     """Return `implied_equalities` of each QP, computed once for QPs with equal arguments."""
     keys = np.concatenate((group[:, None], lower, upper, held), axis=1)
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    found = [implied_equalities(G[group[i]], lower[i], upper[i], held[i]) for i in first]
-    return np.stack(found)[inverse.reshape(-1)]
+    masks = [implied_equalities(G[group[i]], lower[i], upper[i], held[i]) for i in first]
+    return np.stack(masks)[inverse.reshape(-1)]
 
 
 def _in_cone(normals: np.ndarray, x: np.ndarray) -> bool:

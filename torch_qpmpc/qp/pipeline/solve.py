@@ -96,7 +96,7 @@ class SolveLog:
         }
 
     def add(self, solution: BatchSolution, seconds: float) -> None:
-        """Count the ``solution`` of a batch, solved in so many ``seconds``."""
+        """Count the ``solution`` of a batch, which took ``seconds``."""
         accepted = solution.residual[solution.accepted()]
         self.solves += len(solution.residual)
         self.unsolved += len(solution.residual) - len(accepted)
