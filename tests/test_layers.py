@@ -20,7 +20,7 @@ LAYERS = {
     "learning": {"errors", "checks", "qp", "mpc"},
     "envs": {"errors", "checks"},
     "analysis": {"errors", "checks", "qp", "mpc"},
-    "control": {"errors", "checks", "files", "qp", "mpc", "export", "analysis"},
+    "control": {"errors", "checks", "files", "qp", "mpc", "export", "learning", "analysis"},
     "experiment": {"errors", "checks", "files", "qp", "mpc", "learning", "envs", "analysis"},
     "study": {
         "errors",

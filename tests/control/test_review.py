@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import re
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
 from torch_qpmpc.control.loop import LinearLoop
+from torch_qpmpc.control.review import Finding, Review
 from torch_qpmpc.export.tables import make_tables
 
 LAG = ([[0.9]], [[0.5]])
@@ -142,6 +145,24 @@ def test_the_page_has_a_row_for_each_finding():
     row = "| set-points | **fault** | y1 reaches [-5, 5]; nearest y1 4 | Set y1 to 4, not 7, or wi"
     assert row in page
     assert "FAULT set-points: y1 reaches [-5, 5]" in str(found)
+
+
+def test_the_page_has_all_findings_and_the_figure(tmp_path):
+    figure = Figure()
+    review = made(LAG, r=[7.0])
+    review.to_html(tmp_path / "review.html", figure)
+    page = (tmp_path / "review.html").read_text()
+    assert page.count("<tr>") == 1 + len(review.findings)
+    assert "<td>Set y1 to 4, not 7, or widen the bounds.</td>" in page
+    (data,) = re.findall(r"data:image/png;base64,([^\"]*)", page)
+    assert base64.b64decode(data).startswith(b"\x89PNG")
+
+
+def test_a_page_shows_names_as_text(tmp_path):
+    Review([Finding("<b>", True, {"a & b": 1.0})]).to_html(tmp_path / "page.html")
+    assert (
+        "<td>&lt;b&gt;</td><td>ok</td><td>a &amp; b 1</td>" in (tmp_path / "page.html").read_text()
+    )
 
 
 def test_a_set_point_of_another_size_is_named():

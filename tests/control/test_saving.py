@@ -100,6 +100,14 @@ def test_a_loaded_mpc_is_the_same_and_qpmpc_reads_its_qp(tmp_path):
     assert torch.equal(twin.value(p), mpc.value(p))
 
 
+def test_arguments_are_those_of_its_qp():
+    mpc = learned()
+    plain = qm.QPMPC(**mpc.arguments)
+    plain.load_state_dict(mpc.state_dict())
+    p = torch.linspace(-0.1, 0.1, mpc.n_p, dtype=torch.float64)
+    assert torch.equal(plain.policy(p), mpc.policy(p))
+
+
 def test_later_releases_read_the_first_format():
     """``python -m tests.control.test_saving`` has written the file."""
     controller = qm.Controller.load(FOLDER / "saved-1.qpmpc")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -42,6 +44,16 @@ def test_the_cost_is_that_of_its_formula():
     u_s = 0.2 * run.r[:-1]
     cost = (run.y - run.r)[:-1] ** 2 + 0.2 * (run.u - u_s) ** 2 + 0.1 * du**2
     assert np.allclose(run.cost, (cost + run.known * run.u)[:, 0], atol=1e-6)
+
+
+def test_violations_cost_their_price():
+    run = made(y_bounds=(-0.5, 0.5), y_slack=7.0).simulate(steps=10, r=[0.0], x=[1.0])
+    over = np.maximum(run.y[:-1, 0] - 0.5, 0)
+    assert over[0] == 0.5
+    free = replace(run, design=replace(run.design, y_slack=np.zeros(1)))
+    assert np.allclose(run.cost - free.cost, 7 * over)
+    hard = replace(run, design=replace(run.design, y_slack=np.full(1, np.inf)))
+    assert np.array_equal(hard.cost == np.inf, over > 0)
 
 
 def test_an_identified_model_with_an_offset_starts_at_rest():
@@ -86,7 +98,7 @@ def test_the_figure_has_a_panel_for_each_signal_with_its_unit():
     [
         ({"steps": 0}, "steps: got 0, expected a whole number >= 1"),
         ({"r": None}, "r: got None in the first step, expected set-points of y1"),
-        ({"noise": -1.0}, "noise: got -1.0, expected a standard deviation >= 0"),
+        ({"noise": -1.0}, r"noise: got \[-1.0\], expected standard deviations >= 0"),
         ({"load": [1.0, 2.0]}, r"load: got shape \(2,\) or NaN, expected a number, or one for"),
         ({"x": [1.0, 2.0]}, r"x: got shape \(2,\) or NaN, expected a number, or one for"),
         (

@@ -21,6 +21,7 @@ from torch_qpmpc.files import damaged, load_file, save_file
 
 if TYPE_CHECKING:
     from torch_qpmpc.control.exporting import ControllerExport
+    from torch_qpmpc.control.learning import LearningReport
     from torch_qpmpc.control.review import Review
     from torch_qpmpc.control.simulation import Run
 
@@ -180,7 +181,8 @@ class Controller:
             steps: the number of steps.
             r: a set-point that is held, or rows of them, by default the last one.
             options: ``known``: a row of known signals that is held, or rows. ``load``: a constant
-                added to the inputs. ``noise``: the standard deviation of that of the outputs.
+                added to the inputs. ``noise``: standard deviations of that of the outputs, as a
+                number, a vector or by name.
                 ``x``: the state that a model starts from. ``seed``: that of the noise and of an
                 environment.
 
@@ -199,6 +201,50 @@ class Controller:
         from torch_qpmpc.control.simulation import simulate
 
         return simulate(self, plant, steps, r, **options)
+
+    def learn(self, source: Any, transitions: int = 5000, **options: Any) -> LearningReport:
+        """Identify the model again, and keep the new one if closed loops cost less with it.
+
+        The cost is that of `Run.costs`: the design's, and none other. The controller starts again
+        from rest with the new model if it is accepted, and otherwise stays as it is.
+
+        Args:
+            source: an environment, as in `simulate`: the controller gathers transitions in closed
+                loops whose set-points move, within its bounds, and pairs of further loops decide.
+                Or a log of its signals, as `read_log` reads it: its first two thirds are fitted,
+                and loops with a model of the last third, with its one-step errors as noise, decide.
+            transitions: the number to gather from an environment.
+            options: ``r``, the middle of the set-points, by default the last one, or the mean of
+                the log. ``spread``: their largest distance from it, by default a tenth of half the
+                distance of the outputs' bounds, or the log's standard deviation. ``known``: as in
+                `simulate`, for an environment. ``steps``: the steps of a loop. ``pairs``: the
+                largest number of pairs. ``seed``: that of set-points, noise and environment.
+
+        Raises:
+            QPError: an argument is invalid, or the transitions determine no model with a steady
+                state and a filter.
+            SolverError: no input satisfies the hard bounds in a step of this controller.
+
+        Example:
+            >>> import numpy as np, torch_qpmpc as qm
+            >>> mpc = qm.LinearMPC(([[0.5]], [[0.1]]), 5, Q=1.0, dR=1.0)  # a poor guess
+            >>> rng, y = np.random.default_rng(0), np.zeros(600)
+            >>> u = rng.uniform(-1, 1, 600)
+            >>> for k in range(599):
+            ...     y[k + 1] = 0.9 * y[k] + 0.5 * u[k] + 0.01 * rng.normal()
+            >>> controller = qm.Controller(mpc)
+            >>> log = qm.read_log({"y1": y, "u1": u}, outputs=["y1"], inputs=["u1"])
+            >>> controller.learn(log, steps=8).accepted
+            True
+            >>> controller.mpc.design.plant.A.round(2)
+            array([[0.9]])
+        """
+        from torch_qpmpc.control.learning import learn
+
+        report, candidate = learn(self, source, transitions, **options)
+        if report.accepted:
+            vars(self).update(vars(candidate))
+        return report
 
     def review(self, r: Any = None) -> Review:
         """Return findings about this design: numbers, and a remedy for each fault.

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import base64
+import html
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.optimize
 import torch
+from matplotlib.figure import Figure
 
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import half_range
@@ -28,6 +33,20 @@ MARGIN, CONDITION, SPREAD, HIDDEN = 0.3, 1e8, 1e4, 1e-3
 OFFSET = 1e-6
 #: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
 LARGEST = 2.0
+PAGE = """<!doctype html>
+<meta charset="utf-8">
+<title>Review of a controller</title>
+<style>
+body {{ font-family: sans-serif; max-width: 60em; margin: 2em auto }}
+td, th {{ text-align: left; vertical-align: top; padding: 0.2em 1em 0.2em 0 }}
+img {{ max-width: 100% }}
+</style>
+<h1>Review of a controller</h1>
+<table>
+{table}
+</table>
+{images}
+"""
 
 
 @dataclass(frozen=True)
@@ -83,6 +102,29 @@ class Review:
         rows += [(x.name, "ok" if x.ok else "**fault**", x.text, x.remedy) for x in self.findings]
         cells = ("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)
         return "\n".join(("# Review of a controller", "", *cells, ""))
+
+    def to_html(self, path: str | Path, *figures: Figure) -> None:
+        """Write a page with a table of the findings and ``figures`` below it, such as a `Run`'s.
+
+        It is one file, and loads nothing from elsewhere.
+
+        Raises:
+            OSError: writing failed.
+        """
+        rows = [("th", ("Finding", "", "Numbers", "Remedy"))]
+        rows += [
+            ("td", (x.name, "ok" if x.ok else "fault", x.text, x.remedy)) for x in self.findings
+        ]
+        table = "\n".join(
+            "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row) + "</tr>"
+            for tag, row in rows
+        )
+        images = []
+        for figure in figures:
+            figure.savefig(buffer := BytesIO(), format="png")
+            data = base64.b64encode(buffer.getvalue()).decode()
+            images.append(f'<img alt="" src="data:image/png;base64,{data}">')
+        Path(path).write_text(PAGE.format(table=table, images="\n".join(images)), encoding="utf-8")
 
 
 def review(controller: Controller, r: Array | None = None) -> Review:

@@ -11,7 +11,7 @@ import torch
 from matplotlib.figure import Figure
 
 from torch_qpmpc.analysis.episode import episode_figure
-from torch_qpmpc.checks import check_number, check_seed, check_whole
+from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import Design, read_vector
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model
@@ -27,7 +27,7 @@ class Run:
         y, r: measured outputs and set-points, ``(T + 1, n_y)``.
         u: inputs ``(T, m)``.
         known: known signals, ``(T, n_d)``.
-        cost: that of each step, ``(y - r)'Q(y - r) + (u - u_s)'R(u - u_s) + du'dR du`` and prices.
+        u_s: the inputs that hold the target, ``(T, m)``.
     """
 
     design: Design
@@ -35,7 +35,34 @@ class Run:
     r: Array
     u: Array
     known: Array
-    cost: Array
+    u_s: Array
+
+    @property
+    def cost(self) -> Array:
+        """The `costs` about the run's own targets, ``(T,)``."""
+        return self.costs(self.u_s)
+
+    def costs(self, u_s: Array) -> Array:
+        """Return the cost of each step, ``(T,)``, with weights of inputs about ``u_s`` ``(T, m)``.
+
+        It is ``(y - r)'Q(y - r) + (u - u_s)'R(u - u_s) + du'dR du``, with prices and the price of
+        violations of outputs' bounds.
+        """
+        design, y = self.design, self.y[:-1]
+        start = np.clip(np.zeros((1, u_s.shape[1])), *design.u_bounds)
+        parts = (
+            (y - self.r[:-1], design.Q),
+            (self.u - u_s, design.R),
+            (np.diff(self.u, axis=0, prepend=start), design.dR),
+        )
+        cost = sum(np.einsum("ki,ij,kj->k", x, weight, x) for x, weight in parts)
+        for name, price in design.linear.items():
+            known = isinstance(price, str)
+            level = self.known[:, design.plant.known.index(price)] if known else price
+            cost = cost + level * self.u[:, design.plant.inputs.index(name)]
+        outside = np.maximum(np.maximum(design.y_bounds[0] - y, y - design.y_bounds[1]), 0.0)
+        prices = np.where(outside > 0, design.y_slack, 0.0)  # inf times zero is none
+        return cost + (prices * outside).sum(1)
 
     def plot(self) -> Figure:
         """Return a figure with a panel for each output, input and known signal."""
@@ -70,13 +97,12 @@ def simulate(
     *,
     known: Any = None,
     load: Any = 0.0,
-    noise: float = 0.0,
+    noise: Any = 0.0,
     x: Any = None,
     seed: int = 0,
 ) -> Run:
     """Return a closed loop; see `Controller.simulate`."""
     check_whole("steps", steps, 1)
-    check_number("noise", noise, lambda x: 0 <= x < np.inf, "a standard deviation >= 0")
     check_seed(seed)
     design, twin = controller.mpc.design, copy.copy(controller)
     rows = design.horizon + 1
@@ -85,35 +111,26 @@ def simulate(
         for read, signal in ((controller.read_known, known), (controller.read_set_points, r))
     )
     load = read_vector("load", load, design.plant.inputs, 0.0)
+    noise = read_vector("noise", noise, design.plant.outputs, 0.0)
+    if not ((noise >= 0) & np.isfinite(noise)).all():
+        raise QPError.expected("noise", f"{noise.tolist()}", "standard deviations >= 0")
     twin.reset()
     if not hasattr(plant, "reset"):
         model = design.plant if plant is None else read_model(plant)
         plant = _Model(model, design, d, twin.u + load, x)
-    rng, last, (observed, _) = np.random.default_rng(seed), twin.u, plant.reset(seed=seed)
-    ys, us, costs = [], [], []
+    rng, (observed, _) = np.random.default_rng(seed), plant.reset(seed=seed)
+    ys, us, held = [], [], []
     for k in range(steps):
         ys.append(observed + noise * rng.normal(size=len(design.Q)))
         u = twin.step(ys[-1], set_points[k : k + rows], d[k : k + rows])
         us.append(u)
-        costs.append(_cost(twin, ys[-1] - set_points[k], u - last, d[k]))
-        observed, last = plant.step(u + load)[0], u
+        assert twin.target is not None
+        held.append(twin.target.u.numpy().reshape(-1, len(u))[0])
+        observed = plant.step(u + load)[0]
     ys.append(observed + noise * rng.normal(size=len(design.Q)))
     return Run(
-        design, np.array(ys), set_points[: steps + 1], np.array(us), d[:steps], np.array(costs)
+        design, np.array(ys), set_points[: steps + 1], np.array(us), d[:steps], np.array(held)
     )
-
-
-def _cost(twin: Controller, error: Array, du: Array, d: Array) -> float:
-    """Return the cost of the controller's last step."""
-    design, target = twin.mpc.design, twin.target
-    assert target is not None
-    u_s = target.u.numpy().reshape(-1, len(du))[0]
-    off = twin.u - u_s
-    cost = error @ design.Q @ error + off @ design.R @ off + du @ design.dR @ du
-    for name, price in design.linear.items():
-        level = d[design.plant.known.index(price)] if isinstance(price, str) else price
-        cost += level * twin.u[design.plant.inputs.index(name)]
-    return float(cost)
 
 
 class _Model:

@@ -655,9 +655,9 @@ class QPMPC(nn.Module):
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The constructor's arguments as tensors and plain values.
+        """The arguments of `QPMPC`, and of none of its subclasses, as tensors and plain values.
 
-        With the state_dict they are all of a QPMPC, which `save` writes.
+        With the state_dict they are all of its QP, which `save` writes.
 
         Example:
             >>> import torch_qpmpc as qm

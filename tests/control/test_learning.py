@@ -1,0 +1,129 @@
+"""`Controller.learn`: better models are accepted, others are not, and bad arguments are named."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+
+import torch_qpmpc as qm
+from torch_qpmpc import QPError, SolverError
+from torch_qpmpc.control import learning
+
+WRONG, RIGHT = ([[0.6]], [[0.2]]), ([[0.9]], [[0.5]])
+QUICK = {"r": [0.5], "spread": 0.5, "steps": 12, "transitions": 120}
+
+
+class Lag(gymnasium.Env):
+    """y+ = 0.9 y + 0.5 u + load + noise."""
+
+    def __init__(self, load=0.1, noise=0.01):
+        self.load, self.noise = load, noise
+
+    def reset(self, *, seed=None, options=None):
+        self.rng = np.random.default_rng(seed)
+        self.y = np.zeros(1)
+        return self.y, {}
+
+    def step(self, action):
+        self.y = 0.9 * self.y + 0.5 * action + self.load
+        self.y += self.noise * self.rng.normal()
+        return self.y, 0.0, False, False, {}
+
+
+def made(model, **options):
+    design = {"Q": 1.0, "R": 0.1, "dR": 0.5, "u_bounds": (-1.0, 1.0), **options}
+    return qm.Controller(qm.LinearMPC(model, 5, **design))
+
+
+def logged(steps=600):
+    """Return signals of the plant with random inputs."""
+    env, rng = Lag(), np.random.default_rng(5)
+    u, y = rng.uniform(-1, 1, (steps, 1)).repeat(3, 0)[:steps], [env.reset(seed=1)[0]]
+    y += [env.step(x)[0] for x in u[:-1]]
+    return qm.read_log({"y1": np.array(y), "u1": u}, outputs=["y1"], inputs=["u1"])
+
+
+def test_the_same_object_costs_less_in_the_environment_with_the_same_design():
+    names = {"inputs": ["q"], "outputs": ["T"], "known": ["price", "sun"], "E": [[0.0, 0.01]]}
+    mpc = made(WRONG, linear={"q": "price"}, du_bounds=(-0.5, 0.5), **names).mpc
+    controller, env = qm.Controller(mpc, noise=0.05), Lag()
+    known = {"price": [0.01], "sun": np.sin(np.arange(60))}
+    loop = {"r": {"T": 0.8}, "seed": 11, "steps": 50, "known": known}
+    before = controller.simulate(env, **loop)
+    report = controller.learn(env, known=known, **QUICK)
+    after = controller.simulate(env, **loop)
+    assert report.accepted
+    assert report.after < report.before
+    assert report.interval[1] < 0
+    assert report.transitions == 120
+    assert str(report).startswith(f"accepted: J {report.before:.4g} -> {report.after:.4g} in")
+    assert after.costs(before.u_s).sum() < before.cost.sum()
+    assert abs(after.y[-20:].mean() - 0.8) < 0.02
+    assert np.abs(np.diff(after.u, axis=0)).max() <= 0.5 + 1e-9
+    old, new = mpc.design, controller.mpc.design
+    assert np.allclose([new.plant.A, new.plant.B], [[[0.9]], [[0.5]]], atol=0.05)
+    assert new.plant.known == ("price", "sun")
+    assert np.array_equal(new.plant.E[:, 0], [0.0])
+    for name in ("Q", "R", "dR", "u_bounds", "du_bounds", "linear", "horizon"):
+        assert getattr(new, name) is getattr(old, name)
+
+
+def test_a_controller_with_the_true_model_stays_as_it_is():
+    controller = made(RIGHT)
+    controller.step([0.3], [0.2])
+    mpc, x, w, u = controller.mpc, controller.x, controller.w, controller.u
+    report = controller.learn(Lag(load=0.0, noise=0.0), **QUICK)
+    assert (report.accepted, report.pairs) == (False, 16)
+    assert controller.mpc is mpc
+    assert np.array_equal([controller.x, controller.w, controller.u], [x, w, u])
+    assert str(report).startswith("not accepted, the controller is as before: J")
+
+
+def test_a_log_is_enough_and_its_last_third_decides():
+    controller = made(WRONG)
+    report = controller.learn(logged(), steps=12)
+    assert report.accepted
+    assert report.transitions == 399
+    assert report.plant == "a model of the log's last third"
+    assert np.allclose(controller.mpc.design.plant.A, 0.9, atol=0.05)
+
+
+def test_a_candidate_that_fails_is_not_accepted(monkeypatch):
+    controller, simulate = made(WRONG), learning.simulate
+
+    def failing(used, *args, **options):
+        if used is not controller:
+            raise SolverError("no plan")
+        return simulate(used, *args, **options)
+
+    monkeypatch.setattr(learning, "simulate", failing)
+    report = controller.learn(Lag(), **QUICK)
+    assert (report.accepted, report.after, report.pairs) == (False, math.inf, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 0}, "steps: got 0, expected a whole number >= 1"),
+        ({"transitions": 0}, "transitions: got 0, expected a whole number >= 1"),
+        ({"pairs": 4}, "pairs: got 4, expected a whole number >= 16"),
+        ({"seed": -1}, "seed: got -1, expected a whole number >= 0"),
+        ({"r": None}, "r: got None in the first step, expected set-points of y1"),
+        ({"spread": 0.0}, r"spread: got \[0.0\], expected distances >= 0, not all of them 0"),
+    ],
+)
+def test_bad_arguments_are_named(options, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        made(WRONG).learn(Lag(), **{**QUICK, **options})
+
+
+def test_logs_of_other_signals_and_constant_signals_are_named():
+    controller = made(WRONG, inputs=["q"])
+    with pytest.raises(QPError, match=r"^log: got inputs \('u1',\), expected the controller's \("):
+        controller.learn(logged())
+    controller = made(WRONG, E=[[0.1]], known=["sun"])
+    with pytest.raises(QPError, match=r"^known: got a constant sun, expected one that varies"):
+        controller.learn(Lag(), known=[0.3], **{**QUICK, "transitions": 12})

@@ -1,0 +1,255 @@
+"""`Controller.learn`: a model from a closed loop or a log, kept if closed loops cost less with it.
+
+The candidate is the controller with an ARX model that is identified from the transitions, in its
+observer, its target and its plan. Its weights, bounds and names are the same. Paired closed loops,
+with the same set-points and noise for both, decide (`torch_qpmpc.learning.gate.PairedTest`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from torch_qpmpc.checks import check_seed, check_whole
+from torch_qpmpc.control.controller import Controller
+from torch_qpmpc.control.design import half_range, read_vector
+from torch_qpmpc.control.disturbance import choose
+from torch_qpmpc.control.linear_mpc import OPTIONS, LinearMPC
+from torch_qpmpc.control.lowering import lowered
+from torch_qpmpc.control.observer import SMALL
+from torch_qpmpc.control.simulation import Run, simulate
+from torch_qpmpc.control.state_space import Array, StateSpace, read_model
+from torch_qpmpc.control.steady import Steady
+from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.learning.gate import FEWEST, PairedTest
+from torch_qpmpc.mpc.identification import Identified, identify
+from torch_qpmpc.mpc.log import STILL, Log, as_log
+from torch_qpmpc.mpc.trajectories import Trajectory, folds
+
+#: A log is cut into as many parts, of which the last is held out.
+PARTS = 3
+#: Costs that differ by less, relatively, are equal: a test of pairs would take rounding for gain.
+EQUAL = 1e-9
+
+
+class Plant(NamedTuple):
+    """What closes the loops, in words and as `simulate` takes it, and the options of a loop."""
+
+    name: str
+    plant: Any
+    options: Callable[[np.random.Generator], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class LearningReport:
+    """The outcome of `Controller.learn`; ``print`` shows it.
+
+    Attributes:
+        accepted: True if the controller has changed.
+        before, after: the mean costs of the compared closed loops, with the old and the new model.
+        pairs: their number.
+        interval: the 95 % confidence interval of the mean difference of their costs.
+        steps: the steps of each of them.
+        transitions: the number of transitions that the new model is fitted to.
+        plant: the plant of the closed loops, in words.
+        model: the new model.
+    """
+
+    accepted: bool
+    before: float
+    after: float
+    pairs: int
+    interval: tuple[float, float]
+    steps: int
+    transitions: int
+    plant: str
+    model: Identified
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        verdict = "accepted" if self.accepted else "not accepted, the controller is as before"
+        return (
+            f"{verdict}: J {self.before:.4g} -> {self.after:.4g} in {self.pairs} pairs of closed "
+            f"loops of {self.steps} steps on {self.plant}\n"
+            f"mean difference in [{low:.3g}, {high:.3g}] with 95 %; the model is fitted to "
+            f"{self.transitions} transitions"
+        )
+
+
+def learn(
+    controller: Controller,
+    source: Any,
+    transitions: int,
+    *,
+    r: Any = None,
+    known: Any = None,
+    spread: Any = None,
+    steps: int = 100,
+    pairs: int = 64,
+    seed: int = 0,
+) -> tuple[LearningReport, Controller]:
+    """Return the report and the candidate; see `Controller.learn`."""
+    check_whole("transitions", transitions, 1)
+    check_whole("steps", steps, 1)
+    check_whole("pairs", pairs, FEWEST)
+    check_seed(seed)
+    if hasattr(source, "reset"):
+        plant = _environment(controller, source, r, known, spread, steps)
+        log = _gathered(controller, plant, -(-transitions // steps), steps, seed)
+    else:
+        log, held = _parts(as_log(source), controller)
+        plant = _model(controller, held, r, spread, steps)
+    model = _identified(log, controller)
+    candidate = _with_model(controller, model)
+    test, costs = _compare(controller, candidate, plant, steps, pairs, seed)
+    before, after = np.mean(costs, axis=0)
+    report = LearningReport(
+        test.decision == "better",
+        float(before),
+        float(after),
+        test.pairs,
+        test.interval,
+        steps,
+        log.steps,
+        plant.name,
+        model,
+    )
+    return report, candidate
+
+
+def _environment(
+    controller: Controller, env: Any, r: Any, known: Any, spread: Any, steps: int
+) -> Plant:
+    """Return loops with an environment, with set-points about r."""
+    design = controller.mpc.design
+    middle = controller.read_set_points(r, 1)[0]
+    size = _sizes(controller, spread, SMALL * half_range(design.y_bounds))
+
+    def options(rng: np.random.Generator) -> dict[str, Any]:
+        return {"known": known, "r": _levels(controller, middle, size, steps, rng)}
+
+    return Plant("the environment", env, options)
+
+
+def _model(controller: Controller, held: Log, r: Any, spread: Any, steps: int) -> Plant:
+    """Return loops with a model of a part of a log, at its levels, with its known signals."""
+    found = _identified(held, controller)
+    y, d = (torch.cat(part).numpy() for part in list(zip(*held.trajectories, strict=True))[::2])
+    middle = y.mean(0) if r is None else controller.read_set_points(r, 1)[0]
+    size = _sizes(controller, spread, y.std(0))
+    noise = found.covariance.diagonal().sqrt().nan_to_num().numpy()
+
+    def options(rng: np.random.Generator) -> dict[str, Any]:
+        levels = _levels(controller, middle, size, steps, rng)
+        start = int(rng.integers(max(len(d) - steps, 1)))
+        return {"known": d[start:], "r": levels, "noise": noise}
+
+    return Plant("a model of the log's last third", _state_space(found, controller), options)
+
+
+def _sizes(controller: Controller, spread: Any, default: Array) -> Array:
+    if spread is None:
+        return default
+    size = read_vector("spread", spread, controller.mpc.design.plant.outputs, 0.0)
+    if not ((size > 0).any() and (size >= 0).all() and np.isfinite(size).all()):
+        raise QPError.expected("spread", f"{size.tolist()}", "distances >= 0, not all of them 0")
+    return size
+
+
+def _levels(
+    controller: Controller, middle: Array, size: Array, steps: int, rng: np.random.Generator
+) -> Array:
+    """Return rows of set-points within the bounds, each level held for half a horizon."""
+    design = controller.mpc.design
+    hold = max(design.horizon // 2, 1)
+    levels = middle + size * rng.uniform(-1, 1, (-(-steps // hold), len(middle)))
+    return np.clip(levels, *design.y_bounds).repeat(hold, axis=0)
+
+
+def _gathered(controller: Controller, plant: Plant, loops: int, steps: int, seed: int) -> Log:
+    """Return closed loops of the controller with moving set-points as a log."""
+    runs = [_run(controller, plant, steps, (seed, 0, k)) for k in range(loops)]
+    parts = ([torch.from_numpy(x) for x in (run.y, run.u, run.known)] for run in runs)
+    model = controller.mpc.design.plant
+    names = model.outputs, model.inputs, model.known
+    return Log([Trajectory(*part) for part in parts], *names, model.units, model.dt)
+
+
+def _run(controller: Controller, plant: Plant, steps: int, entropy: tuple[int, ...]) -> Run:
+    rng = np.random.default_rng(entropy)
+    seed = int(rng.integers(2**31))
+    return simulate(controller, plant.plant, steps, seed=seed, **plant.options(rng))
+
+
+def _parts(log: Log, controller: Controller) -> tuple[Log, Log]:
+    """Return the beginning of a log and the part that is held out."""
+    plant = controller.mpc.design.plant
+    for kind in ("outputs", "inputs", "known"):
+        got, want = getattr(log, kind), getattr(plant, kind)
+        if got != want:
+            remedy = f"Pass qm.read_log(.., {kind}={list(want)})."
+            raise QPError.expected("log", f"{kind} {got}", f"the controller's {want}", remedy)
+    *parts, held = folds(log.trajectories, PARTS)
+    first = [trajectory for part in parts for trajectory in part]
+    return replace(log, trajectories=first), replace(log, trajectories=held)
+
+
+def _identified(log: Log, controller: Controller) -> Identified:
+    """Fit an ARX model of as many lags as the state has outputs."""
+    plant = controller.mpc.design.plant
+    d = torch.cat([trajectory.d for trajectory in log.trajectories])
+    for name, column, acts in zip(plant.known, d.mT, plant.E.any(0), strict=True):
+        if acts and column.std() <= STILL * column.abs().max():
+            remedy = "Its effect cannot be learned: pass rows in which it varies."
+            raise QPError.expected("known", f"a constant {name}", "one that varies", remedy)
+    n, _, n_y, _ = plant.sizes
+    return identify(log, 1, past=-(-n // n_y), structure="tied")
+
+
+def _state_space(model: Identified, controller: Controller) -> StateSpace:
+    return read_model(model, prices=controller.mpc.design.linear.values())
+
+
+def _with_model(controller: Controller, model: Identified) -> Controller:
+    """Return the controller with another model."""
+    mpc, old = controller.mpc, controller.mpc.design
+    plant = _state_space(model, controller)
+    w = choose(plant, "auto" if old.disturbances.names else None)
+    steady = Steady.of(plant, w, old.Q, old.R)
+    design = replace(old, plant=plant, disturbances=w, steady=steady)
+    mpc = LinearMPC(lowered(design), **{name: mpc.arguments[name] for name in OPTIONS})
+    drift = controller._drift if w.names == old.disturbances.names else None
+    candidate = Controller(mpc, noise=controller._noise, drift=drift)
+    candidate.r = controller.r
+    return candidate
+
+
+def _compare(
+    old: Controller, new: Controller, plant: Plant, steps: int, pairs: int, seed: int
+) -> tuple[PairedTest, list[tuple[float, float]]]:
+    """Return the test of pairs of closed loops, and the costs of each.
+
+    Weights of inputs are about the old controller's targets in both.
+    """
+    test, costs = PairedTest(), []
+    for k in range(pairs):
+        run = _run(old, plant, steps, (seed, 1, k))
+        before = run.cost.sum()
+        try:
+            after = _run(new, plant, steps, (seed, 1, k)).costs(run.u_s).sum()
+        except (QPError, SolverError):  # no plan, or outputs that overflow
+            after = math.inf
+        costs.append((before, after))
+        difference = after - before if math.isfinite(before + after) else after
+        if abs(difference) <= EQUAL * abs(before):
+            difference = 0.0
+        test.add(torch.tensor([difference], dtype=torch.float64))
+        hopeless = test.pairs >= FEWEST and test.mean >= 0
+        if test.decision != "open" or hopeless:
+            break
+    return test, costs
