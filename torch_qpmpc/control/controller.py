@@ -205,8 +205,9 @@ class Controller:
     def learn(self, source: Any, transitions: int = 5000, **options: Any) -> LearningReport:
         """Identify the model again, and keep the new one if closed loops cost less with it.
 
-        The cost is that of `Run.costs`: the design's, and none other. The controller starts again
-        from rest with the new model if it is accepted, and otherwise stays as it is.
+        The cost is that of `Run.costs`, the design's own, which must be shown to fall by 1 %.
+        The controller starts again from rest with the new model if it is accepted, and otherwise
+        stays as it is.
 
         Args:
             source: an environment, as in `simulate`: the controller gathers transitions in closed
