@@ -16,7 +16,7 @@ from torch_qpmpc.export.library import compiler
 def write_log(path):
     """Write the log of a heated tank with noise, as a CSV file."""
     rng, steps = np.random.default_rng(0), 600
-    q = np.clip(4 + rng.normal(size=steps).cumsum(), 0, 12)
+    q = rng.uniform(0, 12, steps // 10).repeat(10)
     T_out = 5 + 4 * np.sin(np.arange(steps) / 40)
     T = np.full(steps, 18.0)
     for k in range(steps - 1):
@@ -54,6 +54,9 @@ def test_a_log_becomes_a_controller_in_c(tmp_path, monkeypatch):
     twin = qm.Controller.load("reactor.qpmpc")
     inputs = (x.step(y={"T": 20.6}, known=forecast)["q"] for x in (twin, controller))
     assert len({*inputs}) == 1
+    result = controller.learn(log, steps=10, pairs=16)
+    assert not result.accepted, "two thirds of the same log are no better"
+    assert result.transitions == 399
     report = twin.export_c("c/")
     assert report.difference is not None
     assert report.difference < 1e-9

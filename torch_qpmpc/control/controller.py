@@ -214,7 +214,7 @@ class Controller:
                 loops whose set-points move, within its bounds, and pairs of further loops decide.
                 Or a log of its signals, as `read_log` reads it: its first two thirds are fitted,
                 and loops with a model of the last third, with its one-step errors as noise, decide.
-            transitions: the number to gather from an environment.
+            transitions: the number to gather from an environment, rounded up to whole loops.
             options: ``r``, the middle of the set-points, by default the last one, or the mean of
                 the log. ``spread``: their largest distance from it, by default a tenth of half the
                 distance of the outputs' bounds, or the log's standard deviation. ``known``: as in
