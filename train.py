@@ -39,9 +39,9 @@ from torch_qpmpc.experiment.launch import check_overrides, launched
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
-from torch_qpmpc.experiment.start import make_start
+from torch_qpmpc.experiment.start import make_start, transitions
 from torch_qpmpc.experiment.tally import Tally
-from torch_qpmpc.experiment.tasks import make_mpc, make_physics, resume_arguments
+from torch_qpmpc.experiment.tasks import find_task, make_mpc, make_physics, resume_arguments
 
 # Absolute, so that a user's script can call main.
 CONFIGS = str(Path(__file__).with_name("configs"))
@@ -154,6 +154,8 @@ def _train(
 
         gate.save(run.path)
         evaluation.evaluate(learner.policy, "candidate")
+        if cfg.replay and find_task(cfg.task).log is None:
+            evaluation.identify(transitions(identified, replay))
         summary = run_summary(evaluation, tally, gate)
         summary |= {} if identified is None else identified.summary
         if cfg.export is not None and gate.mpc is not None:

@@ -117,6 +117,13 @@ def test_stored_transitions_are_sampled_uniformly():
     assert hits.sum(0).max() < 145
 
 
+def test_all_steps_are_in_the_order_of_each_environment():
+    data = batches(3, 2, max_steps=50)
+    steps = filled(data, rows=10).steps()
+    assert steps.shape == (ENVS, 6)
+    assert torch.equal(steps["observation"], torch.cat([x["observation"] for x in data], 1))
+
+
 def test_tau_has_the_order_of_z():
     z = torch.arange(2 * (N * 6 + 4), dtype=torch.float32).reshape(2, -1)
     pairs = z[:, :-4].unflatten(1, (N, 6))

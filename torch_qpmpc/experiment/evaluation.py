@@ -7,19 +7,23 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
 from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_gap
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_true_mpc
+from torch_qpmpc.experiment.tasks.identified import nominal_mpc
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -75,6 +79,21 @@ class Evaluation:
         """Evaluate what has been learned so far."""
         self.loops[name] = evaluate(self.cfg, policy, self.physics)
 
+    def identify(self, data: Sequence[TensorDictBase]) -> None:
+        """Evaluate the rival `IDENTIFICATION` of logged steps, if ``cfg.rivals`` chooses it.
+
+        J is nan if they identify no model.
+        """
+        chosen = self.cfg.rivals
+        if not (chosen if isinstance(chosen, bool) else IDENTIFICATION in chosen):
+            return
+        try:
+            policy = warm_policy(nominal_mpc(self.cfg, self.physics, data))
+        except QPError:
+            self.rivals[IDENTIFICATION] = math.nan
+        else:
+            self.rivals[IDENTIFICATION] = evaluate(self.cfg, policy, self.physics).J
+
     def lines(self) -> dict[str, float]:
         """Return J of the start, the true model and the rivals by name."""
         ends = {name: self.loops[name].J for name in ("start", "true model") if name in self.loops}
@@ -107,7 +126,7 @@ def _rivals(cfg: DictConfig, physics: AnyPlant) -> Policies:
     rivals, chosen = find_task(cfg.task).rivals, cfg.rivals
     if isinstance(chosen, bool):
         chosen = [name for name, rival in rivals.items() if chosen and not rival.slow]
-    return {name: partial(rivals[name].of, physics) for name in chosen}
+    return {name: partial(rivals[name].of, physics) for name in chosen if name != IDENTIFICATION}
 
 
 def _run(cfg: DictConfig, policies: Policies, quiet: bool) -> dict[str, ClosedLoop]:

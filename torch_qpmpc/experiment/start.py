@@ -8,15 +8,17 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.files import write_whole
+from torch_qpmpc.learning.replay import Replay
 
 #: The log in a run's folder.
 LOG = "log.pt"
@@ -118,6 +120,12 @@ def collect_log(cfg: DictConfig, physics: AnyPlant) -> TensorDict:
     log = env.rollout(steps, policy, break_when_any_done=False).contiguous()
     env.close()
     return log.select(*ENTRIES, strict=False)
+
+
+def transitions(start: Start | None, replay: Replay) -> list[TensorDictBase]:
+    """Return the logged steps of a run: those that it starts from, and those in its replay."""
+    steps, _ = without_blow_ups(replay.steps().select(*ENTRIES, strict=False))
+    return [steps] if start is None else [start.log, steps]
 
 
 def stored_log(path: Path) -> TensorDict:

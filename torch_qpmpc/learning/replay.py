@@ -154,6 +154,11 @@ class Replay:
             ids = stored.get(("collector", "traj_ids"))
             ids -= ids.max() + 1
 
+    def steps(self) -> TensorDictBase:
+        """Return all stored transitions in the order of the storage, ``(num_envs, T)``."""
+        stored: Any = self.transitions.storage[:]
+        return stored.transpose(0, 1)
+
     def has_windows(self) -> bool:
         """Return True if a stored trajectory has the N steps of a window."""
         return self.windows.can_sample()

@@ -30,6 +30,7 @@ from torch_qpmpc.experiment.fields import (
     Whole,
     one_of,
 )
+from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
 from torch_qpmpc.experiment.tasks import TASKS, TaskSettings, find_task
 from torch_qpmpc.mpc.projections import STEPS, check_step
 from torch_qpmpc.qp.solvers import backend
@@ -183,10 +184,9 @@ class Config(Group):
     def task_has_the_rivals(self) -> Self:
         if self.task.name not in TASKS:
             return self
-        known = find_task(self.task.model_dump()).rivals
+        known = (*find_task(self.task.model_dump()).rivals, IDENTIFICATION)
         if isinstance(self.rivals, list) and not {*self.rivals} <= {*known}:
-            names = "; ".join(known)
-            expected = f"true, false or a list of these: {names}" if known else "true or false"
+            expected = f"true, false or a list of these: {'; '.join(known)}"
             self.conflict("rivals", expected, f"They are the rivals of task {self.task.name}.")
         return self
 

@@ -11,6 +11,8 @@ from torch import Tensor
 
 #: The name of `zero_action` among a task's rivals.
 ZERO_ACTION = "zero action"
+#: The name of MPC with the model of all of a run's transitions, a rival of each task.
+IDENTIFICATION = "identification"
 #: Maps p ``(starts, n_p)`` to actions ``(starts, n_u)``; see `plant_loop`.
 Policy = Callable[[Tensor], Tensor]
 

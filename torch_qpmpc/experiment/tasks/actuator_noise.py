@@ -77,6 +77,7 @@ register(
         wrong_scheme,
         true_scheme,
         closed_loop=partial(plant_loop, starts=STARTS),
+        nominal_scheme=wrong_scheme,
         settings=ActuatorNoiseSettings,
         defaults=None,
     )

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
@@ -15,8 +17,10 @@ from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.rewards import RewardCost, fit_rewards, scheme_cost
 from torch_qpmpc.mpc.scheme import Scheme
+from torch_qpmpc.mpc.tightening import BackOff, tighten
 from torch_qpmpc.mpc.trajectories import valid_steps
 
 
@@ -104,6 +108,48 @@ def observed_cost(
         return cost
     q = torch.cat((cost.q[: -layout.n_x], 0 * cost.q[-layout.n_x :]))
     return replace(cost, terminal_weight=None, q=q)
+
+
+def nominal_mpc(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBase]) -> QPMPC:
+    """Make MPC with a model of logged steps and the plant's own cost and bounds, without learning.
+
+    There is no discount. A task without a stage cost has the one fitted to the rewards. Each soft
+    bound is tightened by the covariance of the cross-validated prediction errors, so that it holds
+    with a probability of 95 %: with the feedback of `BackOff` or, for a window, without one.
+
+    Args:
+        cfg: the run's configuration.
+        physics: the plant.
+        data: logs, each as in `identify`.
+
+    Raises:
+        QPError: the steps identify no model.
+    """
+    task = find_task(cfg.task)
+    scheme = (task.nominal_scheme or task.true_scheme or task.wrong_scheme)(cfg, physics)
+    layout, cost = scheme.layout, scheme.cost
+    identified = identify(
+        data,
+        layout.horizon,
+        past=layout.past,
+        n_d=layout.n_d,
+        n_x=layout.n_x,
+        structure="tied",
+    )
+    if cost.stage_weight is None:
+        fitted = fit_rewards(data, layout, cfg.task.hessian == "diagonal").now
+        cost = scheme_cost(fitted, layout, 1.0, cfg.task.hessian)
+    scheme = replace(scheme, model=Model(*identified.model), cost=cost, gamma=1.0)
+    mpc = QPMPC(scheme, learn=(), structure="tied", solver=cfg.solver, on_failure="mask")
+    if not (mpc.soft & (mpc.lb.isfinite() | mpc.ub.isfinite())).any():
+        return mpc
+    if layout.past == 1:
+        BackOff(mpc).tighten(identified.covariance)
+    else:
+        errors = identified.errors
+        errors = errors[errors.isfinite().flatten(1).all(-1)].transpose(0, 1)
+        tighten(mpc, F.pad(errors.mT @ errors / errors.shape[1], (0, 0, 0, 0, 1, 0)))
+    return mpc
 
 
 def _fitted(cfg: DictConfig, log: TensorDictBase, layout: Layout) -> RewardCost:

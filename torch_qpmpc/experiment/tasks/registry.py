@@ -87,6 +87,9 @@ class Task:
         noises: choices of ``noise.name``; the first is the default.
         takes_noise_std: True if ``make_plant`` reads ``noise.std``.
         rivals: controllers that the learned one is compared with, by name.
+        nominal_scheme: makes the scheme of the plant's own cost and bounds, which the rival
+            `IDENTIFICATION` gives a model of its own; None if the true scheme has them or, without
+            one, the wrong scheme.
         episode: returns arguments of `episode_figure` that show an episode of a plant in its own
             names and units, such as ``outputs`` or ``band``, from the known signals d of its steps
             ``(T + 1, n_d)``.
@@ -107,6 +110,7 @@ class Task:
     noises: tuple[str, ...] = ("none",)
     takes_noise_std: bool = False
     rivals: Mapping[str, Rival] = field(default_factory=dict)
+    nominal_scheme: Callable[[DictConfig, Any], Scheme] | None = None
     episode: Callable[[Any, Tensor], Mapping[str, Any]] = lambda plant, d: {}
     unit: tuple[int, str] = (1, "transitions")
     settings: type[TaskSettings] = TaskSettings

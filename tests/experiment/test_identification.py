@@ -1,0 +1,119 @@
+"""MPC with the model of a run's transitions and no learning, the rival of every task."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+import train
+from tests.runs import SMALL, linear_system, make_config
+from torch_qpmpc.experiment.evaluation import Evaluation
+from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
+from torch_qpmpc.experiment.start import collect_log, transitions
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.experiment.tasks.identified import identified_start, nominal_mpc
+from torch_qpmpc.learning.replay import make_replay
+from torch_qpmpc.mpc.identification import identify
+from torch_qpmpc.mpc.rewards import fit_rewards
+
+DATA = ("start=data", "start.transitions=400", "solver=daqp")
+#: Short episodes: without control the plant is unstable.
+GROS_ZANON = ("task=gros_zanon", *DATA, "num_envs=20", "task.episode_steps=20")
+
+
+def test_the_model_is_fitted_and_the_cost_is_the_plants_own():
+    cfg = make_config(*GROS_ZANON)
+    physics = linear_system(cfg)
+    mpc = nominal_mpc(cfg, physics, [collect_log(cfg, physics)])
+    A, B, offset = physics.true_model()
+    for found, true in zip(mpc.model()[:2], (A, B), strict=True):
+        assert_close(found, true, atol=0.02, rtol=0)
+    assert_close(-mpc.b[:2], offset, atol=0.01, rtol=0)
+    assert mpc.scheme.gamma == 1
+    assert_close(mpc.H[0].diagonal(), torch.tensor([1.0, 1.0, 0.5]).double())
+    assert not mpc.learned
+
+
+def test_its_bounds_hold_with_a_probability_of_95_percent():
+    cfg = make_config(*GROS_ZANON)
+    physics = linear_system(cfg)
+    log = collect_log(cfg, physics)
+    mpc = nominal_mpc(cfg, physics, [log])
+    std = identify(log, cfg.task.horizon, structure="tied").covariance[0, 0].sqrt()
+    assert std.item() == pytest.approx(0.1 / math.sqrt(12), rel=0.1)
+    # Of x_0, which is known, and x_1; the rows are those of [x_k, u_k].
+    assert_close(mpc.lb[0], physics.lb_s[0])
+    assert_close(mpc.lb[3], physics.lb_s[0] + 1.645 * std, atol=1e-4, rtol=0)
+
+
+def test_a_window_has_the_spread_of_the_open_loop():
+    cfg = make_config("task=house_wall", *DATA, "start.transitions=800")
+    physics = make_physics(cfg)
+    log = collect_log(cfg, physics)
+    mpc = nominal_mpc(cfg, physics, [log])
+    layout = mpc.scheme.layout
+    assert layout.past > 1
+    found = identify(
+        log, layout.horizon, past=layout.past, n_d=layout.n_d, n_x=layout.n_x, structure="tied"
+    )
+    # The lower rows of x_0, which is known, and of the predictions, with the margin of the scheme.
+    lower = mpc.lb[mpc.soft & mpc.lb.isfinite()] - 0.1
+    e = found.errors[found.errors.isfinite().flatten(1).all(-1)]
+    expected = torch.cat((torch.zeros(1), 1.645 * e.square().mean(0).sqrt().flatten()))
+    assert_close(lower, expected.to(lower), rtol=1e-3, atol=1e-9)
+
+
+def test_a_cost_that_the_task_lacks_is_fitted_to_the_rewards():
+    W = "task.stage_weight=null"
+    cfg = make_config("task=pendulum", W, *DATA, "constraint=free")
+    physics = make_physics(cfg)
+    log = collect_log(cfg, physics)
+    mpc = nominal_mpc(cfg, physics, [log])
+    fitted = fit_rewards(log, mpc.scheme.layout).now
+    assert fitted.R2 > 0.5
+    assert_close(mpc.H[0], fitted.W)
+
+
+def test_all_of_a_runs_transitions_are_used():
+    cfg = make_config(*GROS_ZANON)
+    physics = make_physics(cfg)
+    log = collect_log(cfg, physics)
+    replay = make_replay(400, 20, 8, 5, 1)
+    ids = log["next", "done"][..., 0].int()
+    replay.extend(log.exclude("preview").set(("collector", "traj_ids"), ids))
+    start = identified_start(cfg, physics, log)
+    (stored,) = transitions(None, replay)
+    assert_close(stored["observation"][:, -1], log["observation"][:, -1])
+    first, second = transitions(start, replay)
+    assert first is start.log
+    assert second.shape == (20, 20)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "there"), [("true", True), ("false", False), ("[identification]", True)]
+)
+def test_it_is_evaluated_if_it_is_chosen(chosen, there):
+    cfg = make_config(*GROS_ZANON, f"rivals={chosen}", "task.eval_steps=20")
+    physics = make_physics(cfg)
+    found = Evaluation.before(cfg, physics, make_mpc(cfg, physics))
+    assert IDENTIFICATION not in found.rivals
+    log = collect_log(cfg, physics)
+    found.identify([log])
+    assert (IDENTIFICATION in found.rivals) == there
+    if there:
+        assert found.rivals[IDENTIFICATION] < 0.8 * found.loops["start"].J
+        found.identify([log[:2, :1]])
+        assert math.isnan(found.rivals[IDENTIFICATION])
+
+
+@pytest.mark.parametrize("replay", [True, False])
+def test_a_run_ends_with_it_if_it_has_kept_its_transitions(tmp_path, replay):
+    names = f"rivals=[{IDENTIFICATION}]"
+    cfg = make_config(*SMALL, "constraint=free", f"replay={str(replay).lower()}", names)
+    summary = train.train(cfg, str(tmp_path), quiet=True)
+    assert [*summary["rivals"]] == [IDENTIFICATION] * replay
+    assert json.loads((tmp_path / "summary.json").read_text())["rivals"] == summary["rivals"]
