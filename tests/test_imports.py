@@ -54,5 +54,7 @@ def test_gymnasium_has_the_ids():
         "HouseWall",
         "FourTanks",
         "TankReferences",
+        "Inventory",
+        "TripleIntegrator",
     )
     assert registered == [f"torch_qpmpc/{name}-v0" for name in names]

@@ -101,6 +101,8 @@ _ENVIRONMENTS: dict[str, tuple[str, int, dict[str, Any]]] = {
             ("HouseWall", 192),
             ("FourTanks", 250),
             ("TankReferences", 100),
+            ("Inventory", 100),
+            ("TripleIntegrator", 150),
         )
     },
 }

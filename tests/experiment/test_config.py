@@ -98,6 +98,8 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "tank_references": ("task=tank_references", "warmup_steps=1"),
         "log": log_overrides(tmp_path),
         "actuator_noise": ("task=actuator_noise", "warmup_steps=1"),
+        "inventory": ("task=inventory", "warmup_steps=1"),
+        "short_horizon": ("task=short_horizon", "warmup_steps=1"),
         "data": ("start=data", "task=pendulum", "constraint=free", "start.transitions=40"),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
         "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
@@ -124,8 +126,10 @@ NOISES = {
     "gymnasium": {"none"},
     "house": {"none"},
     "house_wall": {"none"},
+    "inventory": {"none"},
     "log": {"none"},
     "pendulum": {"none"},
+    "short_horizon": {"none"},
     "tank_references": {"none"},
 }
 WINDOWS = ("si", "combined", "identified")
@@ -179,6 +183,7 @@ def test_an_actor_has_the_first_order_by_itself():
 TASK_KEYS = {
     "task.a_max": "task=actuator_noise",
     "task.actuator_std": "task=actuator_noise",
+    "task.capacity": "task=inventory",
     "task.disturbed": "task=tank_references",
     "task.margin": "task=house",
     "task.memory": "task=tank_references",
@@ -296,7 +301,8 @@ for _name in ("optimizer.trust_region", "optimizer.normalise", "task.one_weather
 BAD["task.disturbed"] = BAD["task.observation_bounds"] = FLAG
 BAD["task.past"], BAD["task.memory"] = WHOLE, WHOLE[1:]
 BAD["task.margin"] = BAD["task.model_error"] = REAL
-BAD["task.actuator_std"], BAD["task.a_max"] = REAL, [0, *REAL]
+BAD["task.actuator_std"] = REAL
+BAD["task.a_max"] = BAD["task.capacity"] = [0, *REAL]
 for _name in ("lr_cost", "lr_constraints"):
     BAD[f"optimizer.{_name}"] = REAL
 for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.growth", "si.beta"):
@@ -320,7 +326,9 @@ def test_rivals_are_those_of_the_task():
     known = "Kalman filter, N = 20; .*; DeePC; omniscient. They are the rivals of task four_tanks"
     with pytest.raises(QPError, match=rf"rivals: got \['nobody'\], expected .* these: {known}"):
         check_config(make_config("task=four_tanks", "rivals=[nobody]"))
-    with pytest.raises(QPError, match=r"rivals: got \['DeePC'\], expected true or false\."):
+    with pytest.raises(
+        QPError, match=r"rivals: got \['DeePC'\], expected .* these: identification"
+    ):
         check_config(make_config("task=actuator_noise", "rivals=[DeePC]"))
 
 

@@ -21,7 +21,7 @@ import train
 from tests.runs import SMALL, linear_system, make_config, run_command, true_mpc
 from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import Cost, QPError
-from torch_qpmpc.envs import ActuatorNoise, GrosZanonLTI, PointMass
+from torch_qpmpc.envs import ActuatorNoise, GrosZanonLTI, Inventory, PointMass
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.fields import Name
@@ -399,3 +399,33 @@ def test_the_actuator_is_bounded_by_a_max():
     mpc = make_mpc(cfg, make_physics(cfg))
     s = torch.tensor([[1.0, 1.0], [-1.0, -1.0]]).double()
     torch.testing.assert_close(mpc.policy(s), torch.tensor([[-0.5], [0.5]]).double())
+
+
+# The inventory
+
+
+def test_the_start_orders_up_to_the_mean_and_the_true_scheme_up_to_the_base_stock():
+    cfg = make_config("task=inventory")
+    plant = make_physics(cfg)
+    assert isinstance(plant, Inventory)
+    true, s = (
+        make_true_mpc(cfg, plant),
+        torch.tensor([[4.0, 2.0], [12.0, 6.0], [1.0, 3.0]]).double(),
+    )
+    assert true is not None
+    for mpc, level in ((make_mpc(cfg, plant), 10.0), (true, plant.base_stock())):
+        orders = plant.applied(level - s.sum(-1, keepdim=True))
+        torch.testing.assert_close(mpc.policy(s).detach(), orders, atol=1e-4, rtol=0)
+
+
+# The triple integrator
+
+
+def test_a_long_horizon_settles_what_a_short_one_loses():
+    cfg = make_config("task=short_horizon")
+    plant = make_physics(cfg)
+    true = make_true_mpc(cfg, plant)
+    assert true is not None
+    assert evaluate(cfg, true.policy, plant).J < 10
+    start = evaluate(cfg, make_mpc(cfg, plant).policy, plant).costs.sum(0)
+    assert 0.2 < (start > 1e3).double().mean() < 0.8

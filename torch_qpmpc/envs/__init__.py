@@ -9,12 +9,14 @@ from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIEnv, GrosZanon
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.house import House
 from torch_qpmpc.envs.house_wall import HouseWall
+from torch_qpmpc.envs.inventory import Inventory
 from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
 from torch_qpmpc.envs.past_window import PastWindow
 from torch_qpmpc.envs.plant import Plant, PlantEnv
 from torch_qpmpc.envs.plant_gym import PlantGymEnv
 from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.envs.tank_references import TankReferences
+from torch_qpmpc.envs.triple_integrator import TripleIntegrator
 
 __all__ = [
     "ARXPlant",
@@ -26,6 +28,7 @@ __all__ = [
     "GymnasiumPlant",
     "House",
     "HouseWall",
+    "Inventory",
     "LinearSystem",
     "LinearSystemEnv",
     "LinearSystemGymEnv",
@@ -37,4 +40,5 @@ __all__ = [
     "PointMassEnv",
     "PointMassGymEnv",
     "TankReferences",
+    "TripleIntegrator",
 ]

@@ -19,8 +19,10 @@ from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
     gymnasium,
     house,
     house_wall,
+    inventory,
     log,
     point_mass,
+    short_horizon,
     tank_references,
 )
 from torch_qpmpc.experiment.tasks.code import has_run, named_code, resume_arguments, run_code

@@ -1,0 +1,90 @@
+"""``task=short_horizon``: a horizon too short for a tight input, learned with the exact model."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from omegaconf import DictConfig
+
+from torch_qpmpc.envs import TripleIntegrator
+from torch_qpmpc.envs.closed_loop import plant_loop
+from torch_qpmpc.envs.linear_system import float64
+from torch_qpmpc.experiment.fields import Positive
+from torch_qpmpc.experiment.rivals.rival import Policy, Rival
+from torch_qpmpc.experiment.tasks.registry import (
+    Task,
+    TaskSettings,
+    plant_layout,
+    priced,
+    register,
+)
+from torch_qpmpc.mpc.bounds import Bounds
+from torch_qpmpc.mpc.cost import Cost
+from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.scheme import Scheme
+
+#: Closed loops of an evaluation.
+STARTS = 256
+#: Factor of the weight of the action in MPC that is tuned by hand: the best of 10, 100 and 1000.
+HEAVIER = 100.0
+#: The horizon of the true scheme, beyond which a longer one costs the same.
+LONG = 30
+
+
+class ShortHorizonSettings(TaskSettings):
+    """The keys of `TripleIntegrator`."""
+
+    #: Bound of the absolute action.
+    a_max: Positive
+
+
+def make_plant(cfg: DictConfig) -> TripleIntegrator:
+    bound = cfg.task.a_max
+    return TripleIntegrator(horizon=cfg.task.horizon, lb_a=float64(-bound)(), ub_a=float64(bound)())
+
+
+def wrong_scheme(cfg: DictConfig, plant: TripleIntegrator) -> Scheme:
+    """Return MPC with the true model and cost, which is optimal while no bound is active."""
+    return _scheme(cfg, plant, cfg.task.horizon, cfg.task.gamma)
+
+
+def true_scheme(cfg: DictConfig, plant: TripleIntegrator) -> Scheme:
+    """Return the same scheme without discount, with the horizon `LONG`."""
+    return _scheme(cfg, plant, LONG, gamma=1.0)
+
+
+def tuned(plant: TripleIntegrator) -> Policy:
+    """Make MPC of the task's horizon that is tuned by hand, without discount."""
+    W = plant.W.clone()
+    W[-1, -1] *= HEAVIER
+    bounds = Bounds(action_bounds=(plant.lb_a, plant.ub_a))
+    model, cost = Model(plant.A, plant.B), Cost(W, hessian="block")
+    scheme = Scheme(plant_layout(plant, plant.horizon), model, cost, bounds, gamma=1.0)
+    return QPMPC(scheme, learn=(), solver="daqp").policy
+
+
+def _scheme(cfg: DictConfig, plant: TripleIntegrator, horizon: int, gamma: float) -> Scheme:
+    A, B, _ = plant.true_model()
+    return Scheme(
+        plant_layout(plant, horizon),
+        Model(A, B),
+        Cost(plant.W, hessian=cfg.task.hessian),
+        priced(cfg, Bounds(action_bounds=(plant.lb_a, plant.ub_a))),
+        gamma,
+    )
+
+
+register(
+    Task(
+        "short_horizon",
+        make_plant,
+        wrong_scheme,
+        true_scheme,
+        closed_loop=partial(plant_loop, starts=STARTS),
+        rivals={f"{HEAVIER:g} times the action's weight": Rival(tuned)},
+        nominal_scheme=wrong_scheme,
+        settings=ShortHorizonSettings,
+        defaults=None,
+    )
+)
