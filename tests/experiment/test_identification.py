@@ -34,7 +34,7 @@ def test_the_model_is_fitted_and_the_cost_is_the_plants_own():
         assert_close(found, true, atol=0.02, rtol=0)
     assert_close(-mpc.b[:2], offset, atol=0.01, rtol=0)
     assert mpc.scheme.gamma == 1
-    assert_close(mpc.H[0].diagonal(), torch.tensor([1.0, 1.0, 0.5]).double())
+    assert_close(mpc.scheme.cost.stage_weight, torch.tensor([1.0, 1.0, 0.5]).double())
     assert not mpc.learned
 
 
@@ -75,7 +75,7 @@ def test_a_cost_that_the_task_lacks_is_fitted_to_the_rewards():
     mpc = nominal_mpc(cfg, physics, [log])
     fitted = fit_rewards(log, mpc.scheme.layout).now
     assert fitted.R2 > 0.5
-    assert_close(mpc.H[0], fitted.W)
+    assert_close(mpc.scheme.cost.stage_weight, fitted.W)
 
 
 def test_all_of_a_runs_transitions_are_used():
