@@ -44,7 +44,7 @@ class Evaluation:
         cfg, physics: the run's configuration and plant.
         loops: those of ``start``, ``learned``, which is kept, and, if they are there, of the last
             ``candidate`` and the ``true model``.
-        rivals: J of the task's rivals by name.
+        rivals: J of the task's rivals by name, after `identify` also of `IDENTIFICATION`.
     """
 
     cfg: DictConfig
