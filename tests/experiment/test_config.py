@@ -323,7 +323,8 @@ def test_impossible_values_are_rejected_by_name(key):
 
 def test_rivals_are_those_of_the_task():
     check_config(make_config("task=four_tanks", 'rivals=[DeePC,"Kalman filter, N = 60"]'))
-    known = "Kalman filter, N = 20; .*; DeePC; omniscient. They are the rivals of task four_tanks"
+    known = "Kalman filter, N = 20; .*; DeePC; omniscient; identification"
+    known += ". They are the rivals of task four_tanks"
     with pytest.raises(QPError, match=rf"rivals: got \['nobody'\], expected .* these: {known}"):
         check_config(make_config("task=four_tanks", "rivals=[nobody]"))
     with pytest.raises(
