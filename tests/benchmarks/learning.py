@@ -58,7 +58,7 @@ def row(summaries: list[dict[str, Any]]) -> list[str]:
         np.array([x[f"J_{name}"] for x in summaries]) for name in ("best", "start", "true_model")
     )
     share = np.median((fair - learned) / (fair - optimum))
-    p = wilcoxon(learned, fair, alternative="less").pvalue
+    signed_rank: Any = wilcoxon(learned, fair, alternative="less")
     costs = (start, identified, fair, learned)
     return [
         *(cost_text(float(np.median(x))) for x in costs),
@@ -66,7 +66,7 @@ def row(summaries: list[dict[str, Any]]) -> list[str]:
         cost_text(float(np.median(optimum))),
         f"{share:.2f}",
         f"{(learned < fair).sum()} of {len(fair)}",
-        f"{p:.3f}",
+        f"{signed_rank.pvalue:.3f}",
     ]
 
 
