@@ -154,7 +154,7 @@ def _train(
 
         gate.save(run.path)
         evaluation.evaluate(learner.policy, "candidate")
-        if len(replay) and find_task(cfg.task).log is None:  # none after the last update
+        if len(replay) and find_task(cfg.task).log is None:  # none if resumed after the last update
             evaluation.identify(transitions(identified, replay))
         summary = run_summary(evaluation, tally, gate)
         summary |= {} if identified is None else identified.summary
