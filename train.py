@@ -37,6 +37,7 @@ from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.interrupt import Interrupt
 from torch_qpmpc.experiment.launch import check_overrides, launched
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
+from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import make_start, transitions
@@ -109,6 +110,9 @@ def _train(
             if state["collector"] is None and tally.update < cfg.updates and not quiet:
                 print("Starting new episodes: the state of the environments is not saved.")
             evaluation.evaluate(gate.policy)
+            # The last checkpoint has no transitions to identify a model from.
+            if J := run.column(f"eval/J_{IDENTIFICATION}")[1]:
+                evaluation.rivals[IDENTIFICATION] = J[-1]
         interrupt.exit_if_signalled(f"Stopped after update {tally.update}: {command}")
 
         label = f"{cfg.constraint.name}, {cfg.noise.name}"
@@ -142,6 +146,8 @@ def _train(
             evaluated = last or update % cfg.eval_interval == 0
             if evaluated:
                 evaluation.evaluate(gate.policy)
+                if last and len(replay) and find_task(cfg.task).log is None:
+                    evaluation.identify(transitions(identified, replay))
                 gap = report(run, gate.mpc, evaluation, update)
                 progress.set_postfix(J=cost_text(gap["J_best"]), closed_gap=gap["closed_gap"])
             if evaluated or interrupt.signum is not None:
@@ -154,8 +160,6 @@ def _train(
 
         gate.save(run.path)
         evaluation.evaluate(learner.policy, "candidate")
-        if len(replay) and find_task(cfg.task).log is None:  # none if resumed after the last update
-            evaluation.identify(transitions(identified, replay))
         summary = run_summary(evaluation, tally, gate)
         summary |= {} if identified is None else identified.summary
         if cfg.export is not None and gate.mpc is not None:

@@ -90,7 +90,7 @@ def test_a_run_that_has_no_checkpoint_yet_begins_anew(tmp_path, stopped):
 @pytest.mark.parametrize("when", ["finish", "drop_previous"])
 def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch, when):
     """The run is killed after its last update, before or after writing the summary."""
-    cfg = make_config(*RUN)
+    cfg = make_config(*RUN, "rivals=[identification]")
     train.train(cfg, str(tmp_path / "whole"))
 
     def killed(*_: Any) -> None:
