@@ -17,6 +17,7 @@ import contextlib
 import itertools
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import make_start, transitions
 from torch_qpmpc.experiment.tally import Tally
-from torch_qpmpc.experiment.tasks import find_task, make_mpc, make_physics, resume_arguments
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics, resume_arguments
 
 # Absolute, so that a user's script can call main.
 CONFIGS = str(Path(__file__).with_name("configs"))
@@ -146,8 +147,8 @@ def _train(
             evaluated = last or update % cfg.eval_interval == 0
             if evaluated:
                 evaluation.evaluate(gate.policy)
-                if last and len(replay) and find_task(cfg.task).log is None:
-                    evaluation.identify(transitions(identified, replay))
+                if last and len(replay):
+                    evaluation.identify(partial(transitions, identified, replay))
                 gap = report(run, gate.mpc, evaluation, update)
                 progress.set_postfix(J=cost_text(gap["J_best"]), closed_gap=gap["closed_gap"])
             if evaluated or interrupt.signum is not None:

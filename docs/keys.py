@@ -87,14 +87,13 @@ def values(of: list[Setting]) -> str:
 
 def page() -> str:
     """Return the page as Markdown."""
-    of, text = settings(), [TITLE, "## Of every run\n"]
+    phrases, text = keys(), [TITLE, "## Of every run\n"]
     head = "| key | meaning | expected | values |\n| --- | --- | --- | --- |"
     for group in ("", *GROUPS):
-        own = [key for key in of if (key.partition(".")[0] if "." in key else "") == group]
         text += [f"\n## {GROUPS[group]}\n"] if group else []
         text.append(head)
-        for key, phrase in keys().items():
-            if key in own and not key.endswith(".name"):
-                cells = (f"`{key}`", meaning(of[key]), phrase, values(of[key]))
+        for key, of in settings().items():
+            if key.rpartition(".")[0].partition(".")[0] == group and not key.endswith(".name"):
+                cells = (f"`{key}`", meaning(of), phrases[key], values(of))
                 text.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(text) + "\n"

@@ -102,11 +102,11 @@ def test_it_is_evaluated_if_it_is_chosen(chosen, there):
     found = Evaluation.before(cfg, physics, make_mpc(cfg, physics))
     assert IDENTIFICATION not in found.rivals
     log = collect_log(cfg, physics)
-    found.identify([log])
+    found.identify(lambda: [log])
     assert (IDENTIFICATION in found.rivals) == there
     if there:
         assert found.rivals[IDENTIFICATION] < 0.8 * found.loops["start"].J
-        found.identify([log[:2, :1]])
+        found.identify(lambda: [log[:2, :1]])
         assert math.isnan(found.rivals[IDENTIFICATION])
 
 

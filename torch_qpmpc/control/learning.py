@@ -139,13 +139,13 @@ def _environment(
 
 def _model(controller: Controller, held: Log, r: Any, spread: Any, steps: int) -> Plant:
     """Return loops with a model of a part of a log, at its levels, with its known signals."""
-    found = _identified(held, controller)
+    identified = _identified(held, controller)
     y, d = (torch.cat(part).numpy() for part in list(zip(*held.trajectories, strict=True))[::2])
     middle = y.mean(0) if r is None else controller.read_set_points(r, 1)[0]
     size = _sizes(controller, spread, y.std(0))
-    noise = found.covariance.diagonal().sqrt().nan_to_num().numpy()
+    noise = identified.covariance.diagonal().sqrt().nan_to_num().numpy()
 
-    model = _state_space(found, controller)
+    model = _state_space(identified, controller)
     n, m, n_y, _ = model.sizes
     balance = np.block([[np.eye(n) - model.A, -model.B], [model.C, np.zeros((n_y, m))]])
     loads = np.concatenate((model.E @ d.mean(0) + model.offset, middle))

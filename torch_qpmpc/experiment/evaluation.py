@@ -79,16 +79,18 @@ class Evaluation:
         """Evaluate what has been learned so far."""
         self.loops[name] = evaluate(self.cfg, policy, self.physics)
 
-    def identify(self, data: Sequence[TensorDictBase]) -> None:
-        """Evaluate the rival `IDENTIFICATION` of logged steps, if ``cfg.rivals`` chooses it.
+    def identify(self, data: Callable[[], Sequence[TensorDictBase]]) -> None:
+        """Evaluate the rival `IDENTIFICATION`, if ``cfg.rivals`` chooses it and there is a plant.
 
-        J is nan if they identify no model.
+        ``data`` returns the logged steps. J is nan if they identify no model.
         """
         chosen = self.cfg.rivals
         if not (chosen if isinstance(chosen, bool) else IDENTIFICATION in chosen):
             return
+        if find_task(self.cfg.task).log is not None:
+            return
         try:
-            policy = warm_policy(nominal_mpc(self.cfg, self.physics, data))
+            policy = warm_policy(nominal_mpc(self.cfg, self.physics, data()))
         except QPError:
             self.rivals[IDENTIFICATION] = math.nan
         else:

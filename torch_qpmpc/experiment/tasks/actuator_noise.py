@@ -11,15 +11,7 @@ from torch_qpmpc.envs import ActuatorNoise
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64
 from torch_qpmpc.experiment.fields import NonNegative, Positive
-from torch_qpmpc.experiment.tasks.registry import (
-    Task,
-    TaskSettings,
-    plant_layout,
-    priced,
-    register,
-)
-from torch_qpmpc.mpc.bounds import Bounds
-from torch_qpmpc.mpc.cost import Cost
+from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, plant_scheme, register
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.riccati import noisy_stage_weight
 from torch_qpmpc.mpc.scheme import Scheme
@@ -61,13 +53,7 @@ def true_scheme(cfg: DictConfig, plant: ActuatorNoise) -> Scheme:
 
 def _scheme(cfg: DictConfig, plant: ActuatorNoise, weight: Tensor) -> Scheme:
     A, B, _ = plant.true_model()
-    return Scheme(
-        plant_layout(plant, cfg.task.horizon),
-        Model(A, B),
-        Cost(weight, hessian=cfg.task.hessian),
-        priced(cfg, Bounds(action_bounds=(plant.lb_a, plant.ub_a))),
-        cfg.task.gamma,
-    )
+    return plant_scheme(cfg, plant, Model(A, B), weight)
 
 
 register(

@@ -56,16 +56,8 @@ def identified_start(cfg: DictConfig, physics: AnyPlant, log: Any) -> Start:
     """Identify C, b and a missing stage cost from a log of the plant; `identify` names errors."""
     log, cut = without_blow_ups(log) if isinstance(log, TensorDictBase) else (log, 0)
     layout = plant_layout(physics, cfg.task.horizon)
-    identified = identify(
-        log,
-        layout.horizon,
-        past=layout.past,
-        n_d=layout.n_d,
-        n_x=layout.n_x,
-        structure=cfg.constraint.structure,
-        causal=cfg.start.causal,
-        ridge=cfg.start.ridge,
-    )
+    options = {"causal": cfg.start.causal, "ridge": cfg.start.ridge}
+    identified = _model(log, layout, cfg.constraint.structure, **options)
     cost = None
     if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is None:
         cost = _fitted(cfg, log, identified.options.layout)
@@ -128,14 +120,7 @@ def nominal_mpc(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBas
     task = find_task(cfg.task)
     scheme = (task.nominal_scheme or task.true_scheme or task.wrong_scheme)(cfg, physics)
     layout, cost = scheme.layout, scheme.cost
-    identified = identify(
-        data,
-        layout.horizon,
-        past=layout.past,
-        n_d=layout.n_d,
-        n_x=layout.n_x,
-        structure="tied",
-    )
+    identified = _model(data, layout, "tied")
     if cost.stage_weight is None:
         fitted = fit_rewards(data, layout, cfg.task.hessian == "diagonal").now
         cost = scheme_cost(fitted, layout, 1.0, cfg.task.hessian)
@@ -150,6 +135,12 @@ def nominal_mpc(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBas
         errors = errors[errors.isfinite().flatten(1).all(-1)].transpose(0, 1)
         tighten(mpc, F.pad(errors.mT @ errors / errors.shape[1], (0, 0, 0, 0, 1, 0)))
     return mpc
+
+
+def _model(data: Any, layout: Layout, structure: str, **options: Any) -> Identified:
+    """Identify a model with the sizes of ``layout``."""
+    sizes = {"past": layout.past, "n_d": layout.n_d, "n_x": layout.n_x}
+    return identify(data, layout.horizon, structure=structure, **sizes, **options)
 
 
 def _fitted(cfg: DictConfig, log: TensorDictBase, layout: Layout) -> RewardCost:

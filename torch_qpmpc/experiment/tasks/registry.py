@@ -128,7 +128,7 @@ def plant_layout(plant: AnyPlant, horizon: int) -> Layout:
 
 def plant_scheme(
     cfg: DictConfig,
-    plant: LinearSystem | GymnasiumPlant,
+    plant: AnyPlant,
     model: Model,
     stage_weight: Tensor | None,
     state_bounds: tuple[Tensor, Tensor] | None = None,
@@ -140,10 +140,11 @@ def plant_scheme(
         plant: gives the sizes and the bounds.
         model: see `torch_qpmpc.Model`.
         stage_weight: W of the cost 1/2 [x; u]' W [x; u], or its diagonal.
-        state_bounds: those of the plant by default.
+        state_bounds: those of the plant by default, of which a `Plant` has none.
     """
-    states = (plant.lb_s, plant.ub_s) if state_bounds is None else state_bounds
-    bounds = Bounds(state_bounds=states, action_bounds=(plant.lb_a, plant.ub_a))
+    if state_bounds is None and not isinstance(plant, Plant):
+        state_bounds = plant.lb_s, plant.ub_s
+    bounds = Bounds(state_bounds=state_bounds, action_bounds=(plant.lb_a, plant.ub_a))
     return Scheme(
         plant_layout(plant, cfg.task.horizon),
         model,

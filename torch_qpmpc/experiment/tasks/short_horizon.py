@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 from omegaconf import DictConfig
@@ -15,7 +16,7 @@ from torch_qpmpc.experiment.tasks.registry import (
     Task,
     TaskSettings,
     plant_layout,
-    priced,
+    plant_scheme,
     register,
 )
 from torch_qpmpc.mpc.bounds import Bounds
@@ -46,12 +47,12 @@ def make_plant(cfg: DictConfig) -> TripleIntegrator:
 
 def wrong_scheme(cfg: DictConfig, plant: TripleIntegrator) -> Scheme:
     """Return MPC with the true model and cost, which is optimal while no bound is active."""
-    return _scheme(cfg, plant, cfg.task.horizon, cfg.task.gamma)
+    return plant_scheme(cfg, plant, Model(plant.A, plant.B), plant.W)
 
 
 def true_scheme(cfg: DictConfig, plant: TripleIntegrator) -> Scheme:
     """Return the same scheme without discount, with the horizon `LONG`."""
-    return _scheme(cfg, plant, LONG, gamma=1.0)
+    return replace(wrong_scheme(cfg, plant), layout=plant_layout(plant, LONG), gamma=1.0)
 
 
 def tuned(plant: TripleIntegrator) -> Policy:
@@ -62,17 +63,6 @@ def tuned(plant: TripleIntegrator) -> Policy:
     model, cost = Model(plant.A, plant.B), Cost(W, hessian="block")
     scheme = Scheme(plant_layout(plant, plant.horizon), model, cost, bounds, gamma=1.0)
     return QPMPC(scheme, learn=(), solver="daqp").policy
-
-
-def _scheme(cfg: DictConfig, plant: TripleIntegrator, horizon: int, gamma: float) -> Scheme:
-    A, B, _ = plant.true_model()
-    return Scheme(
-        plant_layout(plant, horizon),
-        Model(A, B),
-        Cost(plant.W, hessian=cfg.task.hessian),
-        priced(cfg, Bounds(action_bounds=(plant.lb_a, plant.ub_a))),
-        gamma,
-    )
 
 
 register(
