@@ -69,7 +69,6 @@ def tables(results: dict[str, Any]) -> str:
         gradients(of("test_gradient")),
         growth(of("test_value"), of("test_condensing")),
         overhead(of("test_share_outside_the_solver"), of("test_decisions")),
-        gpu(of("test_gpu")),
     ]
     return "\n\n".join(part for part in parts if part)
 
@@ -183,23 +182,6 @@ def overhead(shares: list[Row], decisions: list[Row]) -> str:
         "**Overhead**: the share of a gradient's time outside the backend's calls, and the "
         "policy's decisions a second, in batches of 32 with theta at rest."
     )
-    return f"{caption}\n\n{table(head, lines)}"
-
-
-def gpu(rows: list[Row]) -> str:
-    if not rows:
-        return "The torch backend's benchmark on a GPU was skipped: there was none."
-    lines = [
-        [
-            f"{row['row']}, batch {row['batch']:,}",
-            f"{_round(row['batch'] / row['seconds']):,}",
-            f"{_round(row['batch'] / row['daqp_seconds']):,}",
-            _errors(row),
-        ]
-        for row in rows
-    ]
-    head = ["", "torch on the GPU", "daqp on a core", "value"]
-    caption = "**On a GPU**: QPs a second (V, theta moved before each round)."
     return f"{caption}\n\n{table(head, lines)}"
 
 

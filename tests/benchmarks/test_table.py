@@ -34,7 +34,6 @@ def results(tmp_path: Path) -> Path:
         ),
         _result("test_share_outside_the_solver", 1, row="daqp", batch=256, outside=0.25),
         _result("test_decisions", 0.001, row="daqp", batch=32),
-        _result("test_gpu", 0.5, row="a device", batch=4096, daqp_seconds=1.0, **right),
     ]
     machine = {
         "cpu": {"count": 2, "brand_raw": "a processor"},
@@ -59,7 +58,6 @@ def test_the_tables_replace_text_between_the_markers(results: Path, tmp_path: Pa
     assert "| daqp | 2.00 (150x) | 1e-12 | 1e-09 |" in text
     assert "| (4, 2) | daqp, dense C | 0.0250 | 0.100 | 0.400 | 2.0 |" in text
     assert "| daqp | 25% | 32,000 |" in text
-    assert "| a device, batch 4,096 | 8,190 | 4,100 | 1e-12 |" in text
     assert "2 cores (a processor" in text
     assert "torch 2.13" in text
 

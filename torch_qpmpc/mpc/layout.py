@@ -206,21 +206,18 @@ class Layout:
         actions = actions[:, self.n_x :]
         return (actions[1:] - actions[:-1]).flatten(0, 1)
 
-    def hessian(
-        self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor, stages: Tensor
-    ) -> Tensor:
+    def hessian(self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor) -> Tensor:
         """Return H ``(n_z, n_z)`` (eq:qpH) from those of the stages and of x_N, or from a full H.
 
         The ``blocks`` of the ``kind`` "block" are those of (d_k, x_k, u_k) and (d_N, x_N); a
-        diagonal H has entries for the plan only. ``discount`` is that of z, and ``stages`` is
-        `tied_stages`, for a diagonal H that all stages share.
+        diagonal H has entries for the plan only. ``discount`` is that of z.
         """
         H = blocks[0]
         if kind == "diagonal":
-            entries = torch.cat((H.flatten(), blocks[1]))
-            if H.ndim == 1:  # faster than expand
-                entries = entries.index_select(0, stages)
-            return torch.diag_embed(discount * F.pad(entries, (self.n_before, 0)))
+            # Operations whose batched gradients (`GaussNewton`) are not a loop over the batch.
+            before, stages = H.new_zeros(self.n_before), H.expand(self.horizon, self.n)
+            entries = torch.cat((before, stages.flatten(), blocks[1]))
+            return torch.diag_embed(discount * entries)
         if kind == "block":
             H = self.block_hessian(H, blocks[1])
         root = discount.sqrt()
@@ -234,6 +231,8 @@ class Layout:
         n_d, size = self.n_d, self.n_d + self.n
         blocks = (*stage.expand(self.horizon, size, size), terminal)
         plan = torch.block_diag(*(block[n_d:, n_d:] for block in blocks))
+        if not self.n_before:
+            return plan
         if not n_d:
             return F.pad(plan, (self.n_before, 0, self.n_before, 0))
         preview = torch.block_diag(*(block[:n_d, :n_d] for block in blocks))

@@ -138,7 +138,6 @@ class QPMPC(nn.Module):
     slack_discount: Tensor
     soft: Tensor
     hardness: Tensor
-    stages: Tensor
 
     @overload
     def __init__(
@@ -731,8 +730,6 @@ class QPMPC(nn.Module):
         derived = {"discount": discount, "slack_discount": weights, "hardness": hardness}
         for name, buffer in derived.items():
             self.register_buffer(name, buffer.to(self.C_0), persistent=False)
-        stages = self.layout.tied_stages().to(self.C_0.device)
-        self.register_buffer("stages", stages, persistent=False)
         for part in self.modules():
             if isinstance(part, Masked | Tied):
                 part.place(self.C_0.device)
@@ -776,7 +773,7 @@ class QPMPC(nn.Module):
         blocks = [theta[name] for name in ("H", "H_f") if name in theta]
 
         def hessian(*blocks: Tensor) -> Tensor:
-            return self.layout.hessian(self.hessian, blocks, self.discount, self.stages)
+            return self.layout.hessian(self.hessian, blocks, self.discount)
 
         H = coordinates.for_each(hessian, blocks, self._block_ndims)
         # A hard row's w is a placeholder, to which its hardness adds inf.

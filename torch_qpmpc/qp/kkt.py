@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, largest, multiply, times
-from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, to_numpy, to_tensor
+from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, native_device, to_numpy, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import NDIMS, Status
 from torch_qpmpc.qp.solution import active_rows
@@ -74,8 +74,7 @@ def solve_kkt(
     batch = broadcast(*(x.shape[:-1] for x in vectors), status.shape)
     fixed = fixed.expand(*batch, fixed.shape[-1])
     theta = (H, q, c, C, b, G, lb, ub, w, fixed)
-    device = z.device if z.is_cuda else None
-    programs, batch = Programs.of(*theta, n_kept=n_kept, device=device)
+    programs, batch = Programs.of(*theta, n_kept=n_kept, device=native_device(z))
     solved = (status == Status.SOLVED).expand(batch).reshape(-1)
     which, solvable = slice(None), programs
     if not solved.all():

@@ -396,7 +396,9 @@ def test_the_core_stays_on_its_device_in_float64(device):
     assert v.dtype == lam.dtype == torch.float64
     assert {v.device.type, lam.device.type, iterations.device.type} == {device}
     assert_allclose(v.cpu(), expected.v, atol=1e-8)
-    assert_allclose(lam.cpu(), expected.lam, atol=1e-7)
+    # Nearly parallel rows determine only the sum of their forces.
+    forces = (torch.einsum("brd,br->bd", qps.G[qps.group], x) for x in (lam.cpu(), expected.lam))
+    assert_allclose(*forces, rtol=1e-7, atol=1e-6)
 
 
 def test_the_core_never_leaves_the_device_nor_loops_over_the_batch():

@@ -116,7 +116,7 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms) -> tuple[Tensor, T
 
 
 def _swing(slope, theta, sizes, group, far) -> Tensor:
-    if not len(theta.lb[0]):
+    if not theta.lb.shape[-1]:
         return torch.zeros_like(far)
     rows, entries = sizes.bounds.clamp(min=0), torch.arange(len(sizes.bounds), device=far.device)
     width = (theta.ub - theta.lb)[:, rows] / theta.G[:, rows, entries].abs()[group]
@@ -128,7 +128,7 @@ def _fall(slope, theta, far, sizes, group) -> tuple[Tensor, Tensor]:
     part, shift = multiply(sizes.inverse, group, slope), sizes.shift[group]
     reach = torch.where(shift > 0, far, torch.inf).unsqueeze(-1).expand_as(slope)
     boxed, rows = sizes.box >= 0, sizes.box.clamp(min=0)
-    if len(theta.lb[0]):
+    if theta.lb.shape[-1]:
         width = ((theta.ub - theta.lb)[:, rows]) / sizes.steps[group][:, rows]
         reach = torch.where(boxed & theta.w[:, rows].isinf(), reach.minimum(width), reach)
     fall = part.square().sum(-1) + (shift * reach.square().sum(-1)).nan_to_num(nan=0.0)
@@ -254,7 +254,7 @@ def _order(held: Tensor) -> tuple[Tensor, Tensor]:
     """
     n_qps, r = held.shape
     position = held.cumsum(-1)
-    k = int(position[:, -1].max()) if n_qps else 0
+    k = int(position[:, -1].max()) if held.numel() else 0
     order = torch.full((n_qps, k + 1), r, device=held.device)
     # Rows that are not held are written to an extra last column.
     index = torch.arange(r, device=held.device).expand(n_qps, r)

@@ -165,6 +165,11 @@ def to_tensor(x: Array) -> Tensor:
     return torch.from_numpy(x) if isinstance(x, np.ndarray) else x
 
 
+def native_device(x: Tensor) -> torch.device | None:
+    """Return the device of the pipeline's tensors for data like ``x``; None for NumPy arrays."""
+    return x.device if x.is_cuda else None
+
+
 def on_device(x: np.ndarray, device: torch.device | None) -> Array:
     """Return ``x`` as a tensor on ``device``, or unchanged if ``device`` is None."""
     return x if device is None else torch.from_numpy(x).to(device)

@@ -77,8 +77,12 @@ class Programs:
             prepared = prepared_for([x[0] for x in flat], n_kept, device)
         else:
             prepared = Prepared(Theta.of(flat), group, n_kept, device)
-        fixed = fixed.numpy(force=True) if device is None else fixed
-        return cls(prepared, on_device(group, device), fixed), batch
+        if device is None:
+            return cls(prepared, group, fixed.numpy(force=True)), batch
+        own = len(prepared.theta.H) > 1
+        zeros = fixed.new_zeros(len(fixed), dtype=torch.int64)
+        where = on_device(group, device) if own else zeros
+        return cls(prepared, where, fixed), batch
 
     def __len__(self) -> int:
         return len(self.group)

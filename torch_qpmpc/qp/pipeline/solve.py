@@ -23,6 +23,7 @@ from torch_qpmpc.qp.pipeline.arrays import (
     Array,
     BatchSolution,
     SoftQPs,
+    native_device,
     on_device,
     per_qp,
     to_numpy,
@@ -140,7 +141,7 @@ def solve_now(
     backend(solver)
     if on_failure not in ON_FAILURE:
         raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
-    device = q.device if solver == "torch" and q.is_cuda else None
+    device = native_device(q) if solver == "torch" else None
     theta = (H, q, c, C, b, G, lb, ub, w)
     try:
         with serial_if_forked():

@@ -41,9 +41,9 @@ class Best:
     def update(self, index: Tensor, v: Tensor, lam: Tensor, residual: Tensor) -> None:
         """Take the solutions at ``index`` that lower the residual."""
         better = residual < self.residual[index]
-        chosen = index[better]
-        self.v[chosen], self.lam[chosen] = v[better], lam[better]
-        self.residual[chosen] = residual[better]
+        for best, new in ((self.v, v), (self.lam, lam), (self.residual, residual)):
+            mask = better.unsqueeze(-1) if best.ndim > 1 else better
+            best[index] = torch.where(mask, new, best[index])
 
 
 def settle(qps: BatchedQPs, v: Tensor, lam: Tensor, max_steps: int) -> Best:
@@ -55,10 +55,10 @@ def settle(qps: BatchedQPs, v: Tensor, lam: Tensor, max_steps: int) -> Best:
         residual = qps.residual(v, lam)
         best.update(todo, v, lam, residual)
         best.steps[todo] += 1
-        going = ~(residual <= SETTLED)
-        if not going.any():
+        going = (~(residual <= SETTLED)).nonzero().squeeze(-1)
+        if not len(going):
             break
-        if not going.all():
+        if len(going) < len(todo):
             qps, todo, v, lam = qps.take(going), todo[going], v[going], lam[going]
     return best
 

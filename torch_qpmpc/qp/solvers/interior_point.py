@@ -62,7 +62,7 @@ def solve(qps: SoftQPs) -> BackendSolution:
         last = settle(form, point.v, point.lam, LAST_STEPS)
         best.update(todo, last.v, last.lam, last.residual)
         best.steps[todo] += last.steps + point.steps - before
-        going = ~(last.residual <= SETTLED)
+        going = (~(last.residual <= SETTLED)).nonzero().squeeze(-1)
         form, point, todo = form.take(going), point.take(going), todo[going]
     return BackendSolution(best.v, best.lam, best.steps)
 
@@ -155,8 +155,9 @@ def _follow(qps: BatchedQPs, end: Point, target: float, limit: int) -> None:
         if count <= SHRINK * len(todo):
             if point is not end:
                 end.put(todo, point)
-            qps, point, todo = qps.take(going), point.take(going), todo[going]
-            products, gap, going = products[going], gap[going], going[going]
+            index = going.nonzero().squeeze(-1)
+            qps, point, todo = qps.take(index), point.take(index), todo[index]
+            products, gap, going = products[index], gap[index], going[index]
         _step(qps, point, products, gap, going)
     if point is not end:
         end.put(todo, point)

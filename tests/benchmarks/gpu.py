@@ -1,0 +1,309 @@
+"""The torch backend on a GPU beside DAQP on the CPU and qpax on the same GPU.
+
+    python -m tests.benchmarks.gpu --write
+
+Medians of wall-clock time, with the device synchronised. The QPs are the point mass's with a dense
+C and N = 10; all of theta is learned. qpax (with JAX for the GPU) is skipped if not installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
+from torchrl.modules import AdditiveGaussianModule
+
+import torch_qpmpc as qm
+from tests.benchmarks.full_space import FullSpace
+from tests.benchmarks.problems import GAMMA, PAPER, make_mpc, nudge, transitions
+from tests.benchmarks.reference import relative_error
+from torch_qpmpc.envs import PointMass, PointMassEnv
+from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
+from torch_qpmpc.learning.replay import ACTIVE_SET, make_replay
+from torch_qpmpc.learning.updates import second_order
+from torch_qpmpc.study.markdown import replaced, table
+
+PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
+GPU = torch.device("cuda")
+BATCHES = (1, 256, 4_096, 16_384, 65_536, 262_144)
+#: The batch of the comparison, and of the rows of qpax, which needs more memory.
+LARGE, OF_QPAX = 65_536, 16_384
+ROUNDS = 7
+#: The whole loop: environments, steps of an episode, stored steps.
+NUM_ENVS, STEPS, STORED = 16_384, 50, 20
+#: Further updates before these, untimed.
+WARM_UP = 5
+
+
+def synchronise() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def seconds(run: Callable[[], object], before: Callable[[], object] = lambda: None) -> float:
+    """Return the median wall-clock time of ``run``, after two rounds to warm up."""
+    times = []
+    for _ in range(ROUNDS + 2):
+        before()
+        synchronise()
+        began = time.perf_counter()
+        run()
+        synchronise()
+        times.append(time.perf_counter() - began)
+    return sorted(times[2:])[ROUNDS // 2]
+
+
+# The curve over batches
+
+
+def curve(device: torch.device, batches: tuple[int, ...] = BATCHES) -> str:
+    """Return the table of times a QP and of memory, by batch."""
+    mpc = make_mpc(PAPER, dense=True, solver="torch").to(device)
+    exact = make_mpc(PAPER, dense=True, solver="daqp")
+    lines = []
+    for batch in batches:
+        data = transitions(PAPER.n_x, PAPER.n_u, batch)
+        s, a = data.s.to(device), data.a.to(device)
+        with torch.no_grad():
+            first = mpc.solve(s)
+            error = relative_error(first.value.cpu(), exact.value(data.s)).max()
+            if device.type == "cuda":
+                torch.cuda.reset_peak_memory_stats()
+            cold = seconds(lambda s=s: mpc.value(s))
+            memory = torch.cuda.max_memory_allocated() / 2**20 if device.type == "cuda" else 0
+            warm = seconds(lambda s=s, x=first.active: mpc.solve(s, warm_start=x))
+            new = seconds(
+                lambda s=s, x=first.active: mpc.solve(s, warm_start=x), lambda: nudge(mpc)
+            )
+
+        def gradient(value: Callable[[], Tensor]) -> float:
+            def run() -> None:
+                mpc.zero_grad()
+                value().sum().backward()
+
+            return seconds(run)
+
+        of_Q = gradient(lambda s=s, a=a: mpc.action_value(s, a))
+        of_pi = gradient(lambda s=s: mpc.policy(s))
+        times = (f"{1e6 * x / batch:.3g}" for x in (cold, warm, new, of_Q, of_pi))
+        lines.append([f"{batch:,}", *times, f"{memory:,.0f}", f"{error:.0e}"])
+    head = ["batch", "V", "V, warm", "warm, new theta", "Q and gradient", "policy and gradient"]
+    return table([*head, "MiB", "error"], lines)
+
+
+# Beside DAQP and qpax
+
+
+def solved_by_daqp(count: int, first: int, warm: bool) -> float:
+    """Solve ``count`` states after ``first`` with DAQP on one thread; return the seconds."""
+    torch.set_num_threads(1)
+    mpc, s = _by_daqp(first, count)
+    with torch.no_grad():
+        active = _active(first, count) if warm else None
+        began = time.perf_counter()
+        mpc.solve(s, warm_start=active)
+    return time.perf_counter() - began
+
+
+@cache
+def _by_daqp(first: int, count: int) -> tuple[qm.QPMPC, Tensor]:
+    mpc, states = make_mpc(PAPER, dense=True), transitions(PAPER.n_x, PAPER.n_u, LARGE).s
+    mpc.value(states[:64])  # compiles
+    return mpc, states[first : first + count]
+
+
+@cache
+def _active(first: int, count: int) -> Tensor:
+    mpc, s = _by_daqp(first, count)
+    return mpc.solve(s).active
+
+
+def on_cores(cores: int, count: int = LARGE) -> list[float]:
+    """Return the seconds of ``count`` QPs by DAQP, cold and warm, in one process a core."""
+    context = multiprocessing.get_context("spawn")
+    share = count // cores
+    parts = [(share, i * share) for i in range(cores)]
+    with ProcessPoolExecutor(cores, mp_context=context) as pool:
+        results = []
+        for warm in (False, True):
+            rounds = []
+            for _ in range(4):  # the first warms up
+                done = [pool.submit(solved_by_daqp, *part, warm) for part in parts]
+                rounds.append(max(x.result() for x in done))
+            results.append(sorted(rounds[1:])[1])
+    return results
+
+
+def by_qpax(count: int = OF_QPAX) -> tuple[float, float] | None:
+    """Return qpax's seconds, and its largest relative error of a value; None without it."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    if find_spec("jax") is None or find_spec("qpax") is None:
+        return None
+    jax, jnp, qpax = map(import_module, ("jax", "jax.numpy", "qpax"))
+    jax.config.update("jax_enable_x64", True)
+    mpc, s = make_mpc(PAPER, dense=True), transitions(PAPER.n_x, PAPER.n_u, count).s
+    with torch.no_grad():
+        full = FullSpace.of(mpc.quadratic_program(), s)
+        G, h = full.one_sided()
+        expected = mpc.value(s)
+    Q, A, G = (jnp.asarray(x.numpy()) for x in (full.Q, full.A, G))
+
+    def one(p: Any, b: Any, h: Any) -> Any:
+        return qpax.solve_qp(Q, p, A, b, G, h)[0]
+
+    solve, data = jax.jit(jax.vmap(one)), [jnp.asarray(x.numpy()) for x in (full.p, full.b, h)]
+    x = torch.from_numpy(jax.device_get(solve(*data)).copy())
+    with torch.no_grad():
+        error = relative_error(full.value(x), expected).max()
+    return seconds(lambda: solve(*data).block_until_ready()), float(error)
+
+
+def comparison(device: torch.device, count: int = LARGE) -> str:
+    """Return the table of all solvers at one batch, in microseconds a QP."""
+    mpc = make_mpc(PAPER, dense=True, solver="torch").to(device)
+    s = transitions(PAPER.n_x, PAPER.n_u, count).s.to(device)
+    with torch.no_grad():
+        active = mpc.solve(s).active
+        times = seconds(lambda: mpc.solve(s)), seconds(lambda: mpc.solve(s, warm_start=active))
+    rows: list[tuple[str, int, tuple[float, ...] | list[float]]] = []
+    rows.append(("torch, on the GPU", count, times))
+    cores = os.cpu_count() or 1
+    rows.append(("daqp, on one core", count, on_cores(1, count)))
+    rows.append((f"daqp, on {cores} cores", count, on_cores(cores, count)))
+    if (peer := by_qpax(min(count, OF_QPAX))) is not None:
+        rows.append((f"qpax, on the GPU (error {peer[1]:.0e})", min(count, OF_QPAX), [peer[0]]))
+    lines = [
+        [name, f"{batch:,}", *(f"{1e6 * x / batch:.3g}" for x in each), *[""] * (2 - len(each))]
+        for name, batch, each in rows
+    ]
+    return table(["", "batch", "cold", "warm"], lines)
+
+
+# The whole loop
+
+
+def learn(
+    device: torch.device, solver: str, updates: int, pairs: int, num_envs: int
+) -> Iterator[dict[str, Any]]:
+    """Learn the point mass, and yield the scalars of the start, and of the end."""
+    A, B, W = PointMass().corrupted(1)
+    mpc = qm.QPMPC.from_model(
+        A,
+        B,
+        10,
+        gamma=GAMMA,
+        stage_weight=torch.cat((W, torch.zeros(2).double())),
+        terminal_weight=torch.ones(4),
+        state_bounds=([-2.0, -2.0, -10.0, -10.0], [2.0, 2.0, 10.0, 10.0]),
+        action_bounds=([-1.0] * 2, [1.0] * 2),
+        state_slack=100.0,
+        solver=solver,
+        on_failure="mask",
+    ).to(device)
+    operator = qm.QPActorValueOperator(mpc, active_set_key=ACTIVE_SET)
+    actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
+    env = PointMassEnv(num_envs=num_envs, max_steps=STEPS, seed=1, device=device)
+    noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3, device=device)
+    explorer = TensorDictSequential([actor, noise])
+    loss_module = qm.QPQLearningLoss(operator)
+    loss_module.make_value_estimator(gamma=GAMMA)
+    update = second_order(mpc, loss_module, qm.GaussNewton(mpc), None, None)
+    replay = make_replay(
+        num_envs * STORED, num_envs, pairs, 1, 1, device=device, active_rows=len(mpc.G)
+    )
+
+    @torch.no_grad()
+    def cost() -> float:
+        """Return the mean cost of an episode, without exploration, from starts that stay."""
+        episode = PointMassEnv(num_envs=min(num_envs, 2_048), seed=100, device=device)
+        return -float(episode.rollout(STEPS, actor)["next", "reward"].sum(1).mean())
+
+    yield {"J": cost()}
+    current, collecting, began = env.reset(), 0.0, 0.0
+    for i in range(-WARM_UP, updates):
+        if i == 0:
+            synchronise()
+            collecting, began = 0.0, time.perf_counter()
+        before = time.perf_counter()
+        with torch.no_grad():
+            step, current = env.step_and_maybe_reset(explorer(current))
+        synchronise()
+        collecting += time.perf_counter() - before
+        replay.extend(step.exclude(POLICY_ACTIVE_SET).unsqueeze(1))
+        update(batch := replay.sample(), None)
+        replay.remember(batch)
+    synchronise()
+    elapsed = time.perf_counter() - began
+    yield {
+        "J": cost(),
+        "rate": updates * num_envs / elapsed,
+        "step": 1e3 * collecting / updates,
+        "update": 1e3 * (elapsed - collecting) / updates,
+    }
+
+
+def loops(device: torch.device, num_envs: int = NUM_ENVS) -> str:
+    """Return the table of the whole loop, on the device, and with DAQP on the CPU."""
+    lines = []
+    cpu = torch.device("cpu")
+    torch.set_num_threads(1)
+    for name, where, solver, updates, pairs in (
+        ("torch, on the GPU", device, "torch", 100, 4_096),
+        ("torch, on the GPU", device, "torch", 100, 1_024),
+        ("daqp, on one core", cpu, "daqp", 20, 1_024),
+    ):
+        start, end = learn(where, solver, updates, pairs, num_envs)
+        times = [f"{end[x]:,.3g}" for x in ("step", "update")]
+        costs = f"{start['J']:.1f} to {end['J']:.1f}"
+        count = f"{updates + WARM_UP}"
+        lines.append([name, f"{pairs:,}", *times, f"{end['rate']:,.0f}", count, costs])
+    head = ["", "pairs", "ms a step", "ms an update", "transitions a second", "updates", "J"]
+    return table(head, lines)
+
+
+def report(device: torch.device) -> str:
+    card = torch.cuda.get_device_name() if device.type == "cuda" else "the CPU, for a trial"
+    return "\n\n".join(
+        (
+            f"On one {card}, with torch {torch.__version__} and {os.cpu_count()} CPU cores.",
+            "**By batch**, in microseconds a QP; the memory is the peak of the first column, and "
+            "the error the largest of a value, beside DAQP's:",
+            curve(device),
+            "**Beside other solvers**, in microseconds a QP:",
+            comparison(device),
+            f"**The whole loop**: {NUM_ENVS:,} point masses take a step, and `GaussNewton` an "
+            "update on replayed pairs; J is the cost of an episode, before and after so many "
+            "updates:",
+            loops(device),
+        )
+    )
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.gpu", description=__doc__)
+    parser.add_argument("--write", action="store_true", help="write the tables to the page")
+    options = parser.parse_args(arguments)
+    if not torch.cuda.is_available():
+        raise SystemExit("python -m tests.benchmarks.gpu: torch sees no CUDA device")
+    text = report(GPU)
+    print(text)
+    if options.write:
+        page = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(replaced(page, text, "gpu"), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

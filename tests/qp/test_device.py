@@ -1,0 +1,351 @@
+"""The path of other devices, on a GPU or, without one, in tensors on the CPU.
+
+It gives what the compiled path gives, never leaves the device with a batch, and waits for the
+device in a few places only.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+from torch.utils._python_dispatch import TorchDispatchMode
+
+import torch_qpmpc as qm
+from tests.problems import BRINK, HARD_ROWS, MIXED, SOFT_ROWS, WEAK, known_qp, normal, random_mpc
+from tests.problems import random_states as states
+from torch_qpmpc.envs import PointMass, PointMassEnv
+from torch_qpmpc.qp import kkt, tracing
+from torch_qpmpc.qp.pipeline import solve
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+ROOT = Path(qm.__file__).parent
+
+
+@contextmanager
+def in_tensors() -> Iterator[None]:
+    """Let ``solver="torch"`` take the path of other devices on the CPU, too."""
+    patches = (mock.patch.object(x, "native_device", lambda x: x.device) for x in (solve, kkt))
+    with next(patches), next(patches):
+        yield
+
+
+def moved(qp: qm.QuadraticProgram, device: torch.device) -> qm.QuadraticProgram:
+    return qm.QuadraticProgram(*(x.to(device) for x in qp.tensors()), check_values=False)
+
+
+def solution_and_gradients(
+    known: Any, device: torch.device, solver: str
+) -> tuple[qm.QPSolution, list[Tensor]]:
+    """Solve, and differentiate a random function of value, z, chi, lam and xi in all data."""
+    data = [x.to(device).requires_grad_() for x in (*known.qp.tensors(), known.fixed)]
+    qp = qm.QuadraticProgram(*data[:-1], check_values=False)
+    solution = qm.solve_qp(qp, data[-1], solver=solver)
+    parts = (solution.value, solution.z, solution.chi, solution.lam, solution.xi)
+    weights = (normal(*x.shape, seed=i).to(x) for i, x in enumerate(parts))
+    total = torch.stack([(w * x).sum() for w, x in zip(weights, parts, strict=True)]).sum()
+    return solution, list(torch.autograd.grad(total, data))
+
+
+KINDS: dict[str, dict[str, Any]] = {
+    "shared": {"batch": (9,)},
+    "own matrices": {"batch": (5,), "matrices": (5,)},
+    "shared matrices of a larger batch": {"batch": (3, 4), "matrices": (4,)},
+    "one": {},
+    "empty": {"batch": (0,)},
+    "semidefinite": {"batch": (6,), "rank": 10},
+    "without C": {"batch": (4,), "n_c": 0},
+    "without rows": {"batch": (4,), "soft": (), "hard": ()},
+    "nothing fixed": {"batch": (4,), "n_f": 0},
+    "weakly active": {"batch": (6,), "soft": (*SOFT_ROWS[:3], *WEAK), "hard": HARD_ROWS[:3]},
+    "at the kink": {"batch": (6,), "soft": (*SOFT_ROWS[:3], *BRINK), "hard": HARD_ROWS[:3]},
+    "float32": {"batch": (5,), "dtype": torch.float32},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_solutions_and_gradients_are_those_of_the_compiled_path(kind):
+    known = known_qp(3, **KINDS[kind])
+    expected, gradients = solution_and_gradients(known, torch.device("cpu"), "daqp")
+    with in_tensors():
+        solution, others = solution_and_gradients(known, DEVICE, "torch")
+    error = 1e-4 if known.z.dtype == torch.float32 else 1e-5
+
+    def assert_near(actual: Tensor, expected: Tensor) -> None:
+        assert_close(actual.cpu(), expected, rtol=error, atol=error)
+
+    assert solution.solved.all()
+    assert solution.value.device.type == DEVICE.type
+    assert_near(solution.value, known.value)
+    assert_near(solution.z, expected.z)
+    for gradient, other in zip(gradients, others, strict=True):
+        assert other.device.type == DEVICE.type
+        assert_near(other, gradient)
+
+
+def test_units_and_own_thetas():
+    """QPs of tiny and huge units, in one batch."""
+    known = known_qp(5, batch=(4,), matrices=(4,))
+    size = torch.tensor([1e-9, 1.0, 1e6, 1e9], dtype=torch.float64)
+    H, q, c, C, b, G, lb, ub, w = known.qp.tensors()
+    scaled = (H * size[:, None, None], q * size[:, None], c * size, C, b, G, lb, ub)
+    qp = qm.QuadraticProgram(*scaled, w * size[:, None])
+    with in_tensors():
+        fixed = known.fixed.to(DEVICE)
+        solution = qm.solve_qp(moved(qp, DEVICE), fixed, solver="torch")
+    assert solution.solved.all()
+    assert_close(solution.value.cpu() / size, known.value, rtol=1e-5, atol=1e-5)
+
+
+def test_statuses():
+    """One solvable, one infeasible, one unbounded and one invalid QP of one batch."""
+    one, inf = torch.ones(4, 1, dtype=torch.float64), torch.inf
+    H = torch.tensor([1.0, 1.0, 0.0, 1.0]).double().reshape(4, 1, 1)
+    lb = torch.tensor([[-1.0, -inf], [2.0, -inf], [-inf, -inf], [-1.0, -inf]]).double()
+    ub = torch.tensor([[1.0, 5.0], [3.0, 1.0], [inf, 5.0], [1.0, 5.0]]).double()
+    q = torch.tensor([-2.0, 0.0, 1.0, torch.nan]).double().unsqueeze(-1)
+    qp = qm.QuadraticProgram(
+        H,
+        q,
+        torch.zeros(4).double(),
+        torch.zeros(0, 1).double(),
+        torch.zeros(0).double(),
+        torch.ones(2, 1).double(),
+        lb,
+        ub,
+        inf * one.expand(4, 2),
+        check_values=False,
+    )
+    with in_tensors():
+        solution = qm.solve_qp(moved(qp, DEVICE), solver="torch", on_failure="mask")
+    expected = ["SOLVED", "INFEASIBLE", "UNBOUNDED", "INVALID_DATA"]
+    assert [qm.Status(int(x)).name for x in solution.status] == expected
+    assert_close(solution.z[0].cpu(), one[0])
+
+
+@pytest.mark.parametrize("structure", ["free", "tied"])
+def test_a_qpmpc(structure):
+    """V, Q, the policy, and their gradients in theta, cold and warm."""
+    mpc = random_mpc(structure=structure, solver="torch", **MIXED)
+    there = random_mpc(structure=structure, solver="torch", **MIXED).to(DEVICE)
+    s, a = states(40), states(40, 1, size=0.4)
+
+    def results(mpc: qm.QPMPC, s: Tensor, a: Tensor) -> list[Tensor]:
+        V, pi = mpc.value(s), mpc.policy(s)
+        first = mpc.solve(s, a)
+        Q = mpc.solve(s, a, warm_start=first.active).value
+        total = V.sum() + Q.square().sum() + (pi * torch.arange(len(pi)).to(pi)[:, None]).sum()
+        return [V, Q, pi, *torch.autograd.grad(total, list(mpc.parameters()))]
+
+    expected = results(mpc, s, a)
+    with in_tensors(), qm.SolveLog() as log:
+        actual = results(there, s.to(DEVICE), a.to(DEVICE))
+    assert log.recalled == len(s)
+    for x, y in zip(actual, expected, strict=True):
+        assert_close(x.cpu(), y, rtol=1e-6, atol=1e-7)
+
+
+def test_transforms():
+    """The derivative under `torch.func`, over a vmapped batch."""
+    mpc, there = random_mpc(solver="torch"), random_mpc(solver="torch").to(DEVICE)
+    s = states(6)
+    expected = torch.func.vmap(torch.func.grad(mpc.value))(s)
+    with in_tensors():
+        actual = torch.func.vmap(torch.func.grad(there.value))(s.to(DEVICE))
+    assert_close(actual.cpu(), expected, rtol=1e-6, atol=1e-7)
+
+
+def learned(device: torch.device) -> tuple[Tensor, list[Tensor]]:
+    """Return a loss and theta after a `GaussNewton` step on fixed transitions."""
+    mpc = random_mpc(solver="torch").to(device)
+    operator = qm.QPActorValueOperator(mpc, active_set_key="active_set")
+    loss_module = qm.QPQLearningLoss(operator)
+    loss_module.make_value_estimator(gamma=0.9)
+    env = PointMassEnv(num_envs=1)  # its keys, with other numbers
+    batch = env.rollout(30, break_when_any_done=False).reshape(-1)
+    batch.set("observation", states(30, size=0.5, seed=1))
+    batch.set(("next", "observation"), states(30, size=0.5, seed=2))
+    batch.set("action", states(30, 1, size=0.4, seed=3))
+    with torch.no_grad():
+        cost = mpc.action_value(batch["observation"].to(device), batch["action"].to(device)).cpu()
+    batch.set(("next", "reward"), 0.1 * states(30, 1, seed=4) - cost.unsqueeze(-1))
+    batch = batch.to(device)
+    loss = loss_module(batch)["loss_value"]
+    loss.backward()
+    target = -loss_module.target(batch).reshape(-1)
+    report = qm.GaussNewton(mpc, damping=100.0).step(batch["observation"], batch["action"], target)
+    assert report.accepted
+    return loss.detach(), [x.detach() for x in mpc.parameters()]
+
+
+def test_learning():
+    loss, theta = learned(torch.device("cpu"))
+    with in_tensors():
+        there, others = learned(DEVICE)
+    assert_close(there.cpu(), loss, rtol=1e-6, atol=1e-7)
+    for x, y in zip(others, theta, strict=True):
+        assert x.device.type == DEVICE.type
+        assert_close(x.cpu(), y, rtol=1e-5, atol=1e-6)
+
+
+def test_a_rollout():
+    """Plant, policy and active sets are on the device, and actions are those of the policy."""
+    mpc = point_mass(1)[0].to(DEVICE)
+    actor = qm.QPActorValueOperator(mpc).get_policy_operator("policy_active_set")
+    env = PointMassEnv(num_envs=8, seed=0, device=DEVICE)
+    with in_tensors(), torch.no_grad():
+        rollout = env.rollout(4, actor)
+        expected = mpc.policy(rollout["observation"])
+    assert rollout.device is None or rollout.device.type == DEVICE.type
+    assert_close(rollout["action"], expected, rtol=1e-6, atol=1e-7)
+
+
+# Where the host waits
+
+
+#: The functions that wait for the device, and what for. Those of a batch's size copy no batch.
+WAITS = {
+    "envs/linear_system.py:LinearSystem.__post_init__": "once: checks of the plant's arguments",
+    "learning/gauss_newton.py:GaussNewton.step": "branches on its outcome, once a step",
+    "learning/gauss_newton.py:GaussNewton._blocks": "the pairs that are used",
+    "learning/gauss_newton.py:GaussNewton._try": "the ratio of decreases",
+    "learning/metric.py:scale": "sizes of the parts of theta, kept as numbers",
+    "learning/metric.py:signal_sizes": "sizes of the signals, kept as numbers",
+    "learning/q_learning.py:QPQLearningLoss.loss_value": "the bound of the targets",
+    "learning/q_learning.py:QPQLearningLoss.target": "the bound of the targets",
+    "learning/td_error.py:invalid_rewards": "a warning about them",
+    "learning/td_error.py:usable": "their count",
+    "qp/kernels/sample_torch.py:_order": "the largest number of held rows, a shape",
+    "qp/kernels/sample_torch.py:_solve": "skips saturated rows, often none",
+    "qp/kernels/sample_torch.py:hold": "ends its refinements",
+    "qp/kernels/sample_torch.py:try_active_sets": "the QPs whose sets are not settled",
+    "qp/kkt.py:_held_rows": "skips weakly active rows, often none",
+    "qp/kkt.py:_solve_active": "ends its refinements; the QPs that need another way",
+    "qp/kkt.py:_solve_kkt": "skips gradients that are zero",
+    "qp/kkt.py:solve_kkt": "the QPs that are solved",
+    "qp/pipeline/arrays.py:BatchSolution.all_accepted": "ends the solve",
+    "qp/pipeline/arrays.py:BackendSolution.put": "the QPs whose active sets do not settle",
+    "qp/pipeline/arrays.py:SoftQPs.take.<locals>.<genexpr>": "the same",
+    "qp/pipeline/arrays.py:on_device": "what follows from theta, prepared on the CPU",
+    "qp/pipeline/arrays.py:to_numpy": "theta, to be prepared",
+    "qp/pipeline/batch.py:Programs.valid": "finds NaN",
+    "qp/pipeline/solve.py:_attempt": "counts",
+    "qp/pipeline/solve.py:_replace": "the QPs whose active sets do not settle",
+    "qp/solvers/active_set.py:settle": "the QPs that are not settled",
+    "qp/solvers/batched.py:BatchedQPs.factor": "skips failed factors, mostly none",
+    "qp/solvers/interior_point.py:_follow": "ends the iterations; the QPs that go on",
+    "qp/solvers/interior_point.py:_step": "skips failed steps, mostly none",
+    "qp/solvers/interior_point.py:solve": "the QPs that are not solved",
+}
+#: Operations that return a number, or a shape that depends on numbers.
+WAITING = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "unique_dim"}
+INDEXING = {"index", "index_put", "index_put_", "_index_put_impl_"}
+
+
+class Waits(TorchDispatchMode):
+    """Count the operations that would wait for a GPU by the package's function that runs them.
+
+    ``copied`` is the number of entries that go to or from the host.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+        self.copied = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        masked = name in INDEXING and any(i is not None and i.dtype is torch.bool for i in args[1])
+        if name in WAITING or masked:
+            self.note()
+        return func(*args, **(kwargs or {}))
+
+    def note(self) -> None:
+        frame = sys._getframe(1)
+        while frame is not None:
+            path = Path(frame.f_code.co_filename)
+            if path.is_relative_to(ROOT):
+                self.counts[f"{path.relative_to(ROOT)}:{frame.f_code.co_qualname}"] += 1
+                return
+            frame = frame.f_back
+
+    def copying(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def copy(x: Any, **options: Any) -> Any:
+            self.copied += x.size if hasattr(x, "itemsize") and not callable(x.size) else x.numel()
+            self.note()
+            return function(x, **options)
+
+        return copy
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Watch tensors on the CPU, as the path of other devices uses them."""
+        with (
+            in_tensors(),
+            mock.patch.object(tracing, "is_hidden", return_value=False),
+            mock.patch.object(Tensor, "numpy", self.copying(Tensor.numpy)),
+            mock.patch.object(torch, "from_numpy", self.copying(torch.from_numpy)),
+            self,
+        ):
+            yield
+
+
+def point_mass(count: int) -> tuple[qm.QPMPC, Tensor, Tensor]:
+    """Make a bounded QPMPC with states at the origin, within and beyond the bounds."""
+    physics = PointMass()
+    mpc = qm.QPMPC.from_model(
+        physics.A,
+        physics.B,
+        4,
+        stage_weight=[1.0] * 4 + [0.1] * 2,
+        state_bounds=([-1.0] * 4, [1.0] * 4),
+        action_bounds=([-0.5] * 2, [0.5] * 2),
+        solver="torch",
+    )
+    s = states(count, 4)
+    s[0] = 0.0
+    return mpc, s, states(count, 2, size=0.4)
+
+
+def test_the_host_waits_in_listed_places_only():
+    waits = Waits()
+    mpc, s, a = point_mass(64)
+    operator = qm.QPActorValueOperator(mpc, active_set_key="active_set")
+    loss_module = qm.QPQLearningLoss(operator)
+    loss_module.make_value_estimator(gamma=0.9)
+    with waits.watching():
+        solution = mpc.solve(s)
+        mpc.solve(s, warm_start=torch.zeros_like(solution.active))
+        mpc.action_value(s, a).sum().backward()
+        mpc.policy(s).sum().backward()
+        env = PointMassEnv(num_envs=8, seed=0)
+        batch = env.rollout(6, operator.get_policy_operator("policy_active_set")).reshape(-1)
+        loss_module(batch)["loss_value"].backward()
+        target = -loss_module.target(batch).reshape(-1)
+        qm.GaussNewton(mpc).step(batch["observation"], batch["action"], target)
+    assert set(waits.counts) == set(WAITS)
+
+
+def test_no_batch_is_copied_and_the_waits_do_not_grow_with_it():
+    def waits_of(count: int) -> Waits:
+        mpc, s, a = point_mass(16)
+        s, a = (x.repeat(count // 16, 1) for x in (s, a))
+        waits = Waits()
+        with waits.watching():
+            mpc.action_value(s, a).sum().backward()
+            solution = mpc.solve(s)
+            mpc.solve(s, warm_start=solution.active).z.sum().backward()
+        return waits
+
+    few, many = waits_of(16), waits_of(128)
+    assert few.copied == many.copied
+    assert few.counts == many.counts
