@@ -1,26 +1,34 @@
 """The table of `docs/results/learning.md`: ``python -m tests.benchmarks.learning``.
 
-It reads the runs of ``+study=actuator_noise``, ``inventory`` and ``short_horizon`` below runs/.
+It reads the runs of the commands of that page, below runs/learning/.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from omegaconf import DictConfig
 from scipy.stats import wilcoxon
 
+from tests.benchmarks.dynamic_programming import optimal_policy
 from tests.benchmarks.table import DOCS, ROOT
-from torch_qpmpc.envs.closed_loop import cost_text
+from torch_qpmpc.envs import ActuatorNoise
+from torch_qpmpc.envs.closed_loop import cost_text, plant_loop
 from torch_qpmpc.experiment.config import load_config
 from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
 from torch_qpmpc.experiment.run_folder import read_summary
+from torch_qpmpc.experiment.tasks.actuator_noise import STARTS
 from torch_qpmpc.study.markdown import replaced, table
 
 PAGE = DOCS / "results" / "learning.md"
-STUDIES = ("actuator_noise", "inventory", "short_horizon")
+#: The bound of the action of `task=actuator_noise` that is not active.
+FREE = 10.0
 HEADER = (
     "task",
     "N",
@@ -37,17 +45,34 @@ HEADER = (
 
 
 def runs(root: Path) -> dict[tuple[str, int], list[dict[str, Any]]]:
-    """Return the summaries by task and horizon."""
+    """Return the summaries by task and horizon, with the optimum's cost as ``optimum``."""
     cases = defaultdict(list)
-    for study in STUDIES:
-        for path in sorted((root / f"study-{study}").glob("*/summary.json")):
-            cfg, summary = load_config(path.parent / "config.yaml"), read_summary(path.parent)
-            name = cfg.task.name.replace("_", " ")
-            if "actuator_std" in cfg.task:
-                name += f", std {cfg.task.actuator_std}"
-            if cfg.algo.get("weighted") or study == "inventory":
-                cases[name, cfg.task.horizon].append(summary)
+    for path in sorted(root.glob("*/*/summary.json")):
+        cfg, summary = load_config(path.parent / "config.yaml"), read_summary(path.parent)
+        name, summary["optimum"] = cfg.task.name.replace("_", " "), summary["J_true_model"]
+        if "actuator_std" in cfg.task:
+            name += f", std {cfg.task.actuator_std:g}"
+        if cfg.task.get("a_max", FREE) < FREE:
+            name += f", action up to {cfg.task.a_max:g}"
+            summary["optimum"] = bounded_optimum(cfg)
+        cases[name, cfg.task.horizon].append(summary)
     return cases
+
+
+@cache
+def _optimal(a_max: float, std: float, gamma: float) -> tuple[ActuatorNoise, Any]:
+    bound = torch.tensor([a_max]).double()
+    plant = ActuatorNoise(horizon=1, lb_a=-bound, ub_a=bound, actuator_std=std)
+    return plant, optimal_policy(plant, gamma)
+
+
+def bounded_optimum(cfg: DictConfig) -> float:
+    """Return J of the optimal policy of a bounded action, in the run's closed loops."""
+    task = cfg.task
+    plant, policy = _optimal(task.a_max, task.actuator_std, task.gamma)
+    plant = replace(plant, horizon=task.horizon)  # the number of signals that are drawn
+    options = {"steps": task.eval_steps, "starts": STARTS, "seed": cfg.eval_seed}
+    return plant_loop(policy, plant, **options).J
 
 
 def row(summaries: list[dict[str, Any]]) -> list[str]:
@@ -55,7 +80,7 @@ def row(summaries: list[dict[str, Any]]) -> list[str]:
     identified = np.array([x["rivals"][IDENTIFICATION] for x in summaries])
     fair = np.array([min(x["J_start"], *x["rivals"].values()) for x in summaries])
     learned, start, optimum = (
-        np.array([x[f"J_{name}"] for x in summaries]) for name in ("best", "start", "true_model")
+        np.array([x[name] for x in summaries]) for name in ("J_final", "J_start", "optimum")
     )
     share = np.median((fair - learned) / (fair - optimum))
     signed_rank: Any = wilcoxon(learned, fair, alternative="less")
@@ -71,7 +96,8 @@ def row(summaries: list[dict[str, Any]]) -> list[str]:
 
 
 def main() -> None:
-    lines = [[name, str(N), *row(x)] for (name, N), x in sorted(runs(ROOT / "runs").items())]
+    cases = runs(ROOT / "runs" / "learning")
+    lines = [[name, str(N), *row(x)] for (name, N), x in sorted(cases.items())]
     page = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(replaced(page, table(HEADER, lines), "learning"), encoding="utf-8")
 
