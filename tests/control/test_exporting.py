@@ -37,6 +37,7 @@ def integrator(**options):
 MPCS = {
     "held": learned,
     "preview": lambda: learned("preview"),
+    "blocks": lambda: learned(blocks=[1, 3]),
     "integrator": integrator,
     "two by two": lambda: qm.LinearMPC((A, B, C), 8, Q=1.0, y_bounds=(-1.0, 1.0), **SIZES),
     "more outputs": lambda: qm.LinearMPC((A, B[:, :1], C), 8, Q=[1.0, 0.5], **SIZES),
