@@ -19,8 +19,9 @@ from tests.control.test_saving import learned
 from torch_qpmpc import QPError, SolverError
 from torch_qpmpc.control import exporting
 from torch_qpmpc.control.exporting import CompiledController
-from torch_qpmpc.export import export, library
+from torch_qpmpc.export import export
 
+pytestmark = pytest.mark.usefixtures("quick")
 STEPS = int(os.environ.get("STEPS", "150"))
 A = np.array([[0.9, 0.2, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
 B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.4]])
@@ -37,19 +38,12 @@ def integrator(**options):
 MPCS = {
     "held": learned,
     "preview": lambda: learned("preview"),
+    "blocks": lambda: learned(blocks=[1, 3]),
     "integrator": integrator,
     "two by two": lambda: qm.LinearMPC((A, B, C), 8, Q=1.0, y_bounds=(-1.0, 1.0), **SIZES),
     "more outputs": lambda: qm.LinearMPC((A, B[:, :1], C), 8, Q=[1.0, 0.5], **SIZES),
     "unbounded": lambda: qm.LinearMPC((A, B, C), 5, Q=1.0, R=0.1, disturbances=None),
 }
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    monkeypatch.setattr(exporting, "FLAGS", ("-std=c99", "-O1", "-fPIC", "-shared"))
-    monkeypatch.setattr(library, "FLAGS", ("-std=c99", "-O1", "-fPIC", "-shared"))
-    monkeypatch.setattr(export, "COMPARED", 60)
-    monkeypatch.setattr(exporting, "COMPARED", 60)
 
 
 def load(files, controller, name="policy", dtype="float64"):

@@ -32,10 +32,11 @@ DESIGN = {
 SCALAR = ([[0.9]], [[0.5]])
 
 
-def reference(x, target, r, known, u_last, N=8):
+def reference(x, target, r, known, u_last, held=(), N=8):
     """Solve the problem as its docstring has it, about the steady state for the last set-point."""
     plan = cvxpy.Variable((N, 2))
     rows: list[cvxpy.Constraint] = [plan >= -1, plan <= 1]
+    rows += [plan[k] == plan[k - 1] for k in held]
     cost, last, load = 0, u_last, target.y - C @ target.x
     for k in range(N + 1):
         y = C @ x + load
@@ -80,10 +81,12 @@ def steady_state(r, w, d):
     return SimpleNamespace(x=state[:3], u=state[3:], y=r)
 
 
+@pytest.mark.parametrize(("blocks", "held"), [([], []), ([1, 2, 5], [2, 4, 5, 6, 7])])
 @pytest.mark.parametrize("references", ["held", "preview"])
-def test_the_plan_is_that_of_the_problem_in_the_docstring(references):
+def test_the_plan_is_that_of_the_problem_in_the_docstring(references, blocks, held):
     wide = {**DESIGN, "u_bounds": (-1.0, 1.0)}
-    mpc = qm.LinearMPC((A, B, C), 8, E=E, references=references, **NAMES, **wide)
+    options = {**NAMES, **wide, "references": references, "blocks": blocks}
+    mpc = qm.LinearMPC((A, B, C), 8, E=E, **options)
     rng = np.random.default_rng(0)
     for _ in range(4):
         x, w, u_last = rng.normal(size=3), 0.1 * rng.normal(size=2), rng.uniform(-0.8, 0.8, 2)
@@ -95,7 +98,7 @@ def test_the_plan_is_that_of_the_problem_in_the_docstring(references):
         target = mpc.target(r if references == "preview" else r[0], w, d)
         last = target.u[-1] if references == "preview" else target.u
         assert np.allclose(last, expected.u, atol=1e-8)
-        u = reference(x, expected, r, known, u_last)
+        u = reference(x, expected, r, known, u_last, held)
         p = mpc.arrange(x, target, known=known, level=d, u_last=u_last)
         assert np.allclose(last + mpc.policy(p).detach(), u, atol=1e-5)
 
@@ -159,6 +162,8 @@ def test_p_takes_batches_and_is_relative_to_the_last_target():
         ({"Q": [[1.0, 2.0]]}, r"Q: got shape \(1, 2\), expected \(1, 1\)"),
         ({"dR": -1.0}, "dR: got smallest eigenvalue -1, expected a positive semidefinite weight"),
         ({"horizon": 0}, "horizon: got 0, expected a whole number >= 1"),
+        ({"blocks": [1, 1]}, r"blocks: got \[1, 1\], expected whole numbers .* the horizon 3"),
+        ({"blocks": 3}, "blocks: got 3, expected whole numbers"),
         ({"references": "later"}, "references: got 'later', expected one of held, preview"),
         ({"gamma": 0}, "gamma: got 0, expected a discount factor"),
         ({"y_slack": -1.0}, r"y_slack: got \[-1.0\], expected prices >= 0"),

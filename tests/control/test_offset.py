@@ -1,12 +1,15 @@
 """Steady states of closed loops of random plants, beside an independent search for the nearest.
 
-The slow tests draw 15 plants; ``PLANTS=200 pytest -m slow tests/control/test_offset.py`` draws 200.
+The slow tests draw 15 plants, in Python and in C, and 200 with
+``PLANTS=200 pytest -m slow tests/control/test_offset.py``.
 """
 
 from __future__ import annotations
 
 import os
-from typing import NamedTuple
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -14,7 +17,11 @@ import qpsolvers
 import scipy.linalg
 
 import torch_qpmpc as qm
+from tests.control.test_exporting import load
+from torch_qpmpc.export.library import compiler
 
+#: The inputs for outputs and set-points.
+Step = Callable[[np.ndarray, np.ndarray], Any]
 PLANTS = int(os.environ.get("PLANTS", "15"))
 #: The loop has settled when no state moves by more; it is cut off after so many steps.
 STILL, STEPS = 1e-11, 3000
@@ -102,8 +109,8 @@ def matrices(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     return A, np.vstack((np.zeros((n + lags - m, m)), np.eye(m))), np.pad(C, ((0, 0), (0, lags)))
 
 
-def settled(plant: Plant, seed: int) -> np.ndarray:
-    """Return the outputs where the closed loop of the plant settles."""
+def designed(plant: Plant, seed: int) -> qm.Controller:
+    """Return a controller of the plant."""
     rng = np.random.default_rng([seed, 1])
     m = plant.B.shape[1]
     mpc = qm.LinearMPC(
@@ -114,21 +121,41 @@ def settled(plant: Plant, seed: int) -> np.ndarray:
         dR=rng.uniform(0.05, 1, m),
         u_bounds=plant.bounds,
     )
-    controller, x = qm.Controller(mpc), np.zeros(len(plant.A))
+    return qm.Controller(mpc)
+
+
+def compiled(controller: qm.Controller, folder: Path) -> Step:
+    """Return the step of the controller in C."""
+    twin = load(controller.export_c(folder).files, controller)
+
+    def step(y: np.ndarray, r: np.ndarray) -> np.ndarray:
+        u, code = twin.step(y, r)
+        assert code == 0
+        return u
+
+    return step
+
+
+def settled(plant: Plant, step: Step) -> np.ndarray:
+    """Return the outputs where the closed loop of the plant settles."""
+    x = np.zeros(len(plant.A))
     for k in range(STEPS):
-        u = controller.step(plant.C @ x + plant.bias, plant.r)
+        u = step(plant.C @ x + plant.bias, plant.r)
         before, x = x, plant.A @ x + plant.B @ (u + plant.load)
         if k > 50 and np.abs(x - before).max() < STILL:
             break
     return plant.C @ x + plant.bias
 
 
-def check(seed: int) -> None:
+def check(seed: int, folder: Path | None = None) -> None:
+    """Compare the outputs where a loop settles; that of C if there is a folder for it."""
     plant = drawn(seed)
-    nearest = plant.nearest()
+    nearest, controller = plant.nearest(), designed(plant, seed)
     assert nearest is not None, "the loads are smaller than the bounds"
-    offset = np.abs(settled(plant, seed) - nearest).max()
-    assert offset < OFFSET * max(1.0, np.abs(plant.r).max()), seed
+    if folder and controller.mpc.design.steady.is_free:
+        pytest.skip("several inputs hold the same outputs, which is refused in C")
+    outputs = settled(plant, compiled(controller, folder) if folder else controller.step)
+    assert np.abs(outputs - nearest).max() < OFFSET * max(1.0, np.abs(plant.r).max()), seed
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -140,3 +167,10 @@ def test_the_loop_settles_at_the_set_point_or_the_nearest_outputs(seed):
 @pytest.mark.parametrize("seed", range(5, PLANTS))
 def test_the_loops_of_many_plants_settle_there(seed):
     check(seed)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("seed", range(PLANTS))
+def test_the_loops_in_c_settle_there(seed, tmp_path, quick):
+    check(seed, tmp_path)

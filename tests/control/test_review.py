@@ -173,9 +173,9 @@ def test_a_set_point_of_another_size_is_named():
 # The linear loop
 
 
-@pytest.mark.parametrize("references", ["held", "preview"])
-def test_the_linear_loop_is_that_of_the_controller(references):
-    mpc = qm.LinearMPC(INTEGRATOR, 8, Q=1.0, R=0.1, dR=0.1, references=references)
+@pytest.mark.parametrize("options", [{}, {"references": "preview"}, {"blocks": [1, 2, 5]}])
+def test_the_linear_loop_is_that_of_the_controller(options):
+    mpc = qm.LinearMPC(INTEGRATOR, 8, Q=1.0, R=0.1, dR=0.1, **options)
     controller = qm.Controller(mpc)
     loop = LinearLoop.of(controller, make_tables(mpc), make_tables(mpc.targets))
     A, B, C = loop.plant

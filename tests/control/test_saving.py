@@ -20,7 +20,7 @@ A = np.array([[1.0, 0.1], [0.0, 0.8]])
 B, C, E = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]]), np.array([[0.0], [0.1]])
 
 
-def learned(references: str = "held", rate: float = 1e-3) -> qm.LinearMPC:
+def learned(references: str = "held", rate: float = 1e-3, **options) -> qm.LinearMPC:
     """Make a LinearMPC with bounds, prices and names of which every part has been learned."""
     names = {"inputs": ["valve"], "outputs": ["level"], "known": ["rain", "price"]}
     plant = read_model((A, B, C), np.hstack((E, 0 * E)), 0.5, **names)
@@ -35,6 +35,7 @@ def learned(references: str = "held", rate: float = 1e-3) -> qm.LinearMPC:
         linear={"valve": "price"},
         references=references,
         learn=("H", "q", "c", "C", "b", "lb", "ub", "w"),
+        **options,
     )
     optimizer = torch.optim.SGD(mpc.parameters(), lr=rate)
     mpc.value(torch.linspace(-0.5, 0.5, mpc.n_p)).backward()
@@ -52,9 +53,9 @@ def inputs(controller: qm.Controller, steps: int = 20) -> np.ndarray:
     return np.array(us)
 
 
-@pytest.mark.parametrize("references", ["held", "preview"])
-def test_a_loaded_controller_goes_on_with_the_same_inputs(tmp_path, references):
-    controller = qm.Controller(learned(references), noise=0.02, drift={"disturbance of valve": 0.5})
+@pytest.mark.parametrize("options", [{}, {"references": "preview"}, {"blocks": [1, 3]}])
+def test_a_loaded_controller_goes_on_with_the_same_inputs(tmp_path, options):
+    controller = qm.Controller(learned(**options), noise=0.02, drift={"disturbance of valve": 0.5})
     inputs(controller)
     controller.save(tmp_path / "mine.qpmpc")
     twin = qm.Controller.load(tmp_path / "mine.qpmpc")

@@ -1,9 +1,10 @@
-"""The QP's cost of theta (eq:qpH): discounts of the stages, of x_N and of the slack weights."""
+"""The QP's cost of theta (eq:qpH), with its discounts; sizes; and blocks of equal actions."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import cvxpy
 import numpy as np
 import pytest
 import torch
@@ -11,8 +12,9 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.testing import assert_close
 
-from tests.problems import MIXED, normal, random_mpc
+from tests.problems import MIXED, normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, Layout, QPError
+from torch_qpmpc.export.tables import make_tables
 
 GAMMA, N = 0.7, 3
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -94,8 +96,93 @@ def test_sizes_are_whole_numbers_of_any_kind():
         ({"past": 0}, "past: got 0, expected a positive integer"),
         ({"n_d": -1}, "n_d: got -1, expected a whole number >= 0"),
         ({"n_mixed": 1.0}, "n_mixed: got 1.0, expected a whole number >= 0"),
+        ({"blocks": 3}, "blocks: got 3, expected whole numbers >= 1 with the horizon 3 as their"),
+        ({"blocks": [1, 1]}, r"blocks: got \[1, 1\], .* sum\. The last one may hold its actions"),
+        ({"blocks": [3, 0]}, r"blocks: got \[3, 0\], expected whole numbers >= 1"),
+        ({"blocks": [1.5, 1.5]}, r"blocks: got \[1.5, 1.5\], expected whole numbers >= 1"),
     ],
 )
 def test_bad_sizes_are_named(sizes, message):
     with pytest.raises(QPError, match=message):
         Layout(**({"n_x": 2, "n_u": 1, "horizon": 3} | sizes))
+
+
+# Blocks
+
+
+def blocked(blocks: list[int], **options: Any) -> QPMPC:
+    """Make a QPMPC of four stages with hard rows of actions, of their changes and of D."""
+    rows = ([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]], [-0.4, -1.5], [0.3, 1.5])
+    settings: dict[str, Any] = {
+        "past": 2,
+        "rate_bounds": ([-0.3], [0.3]),
+        "constraints": rows,
+        "constraint_slack": [torch.inf, 5.0],
+        "learn": ["H", "q", "C", "b", "lb", "ub", "w"],
+        "structure": "tied",
+    }
+    return random_mpc(3, free=0.02, horizon=4, blocks=blocks, **{**settings, **options})
+
+
+def pasts(count: int) -> Tensor:
+    """Draw windows whose last action is small enough for the bounds of changes."""
+    return random_states(count, 5) * torch.tensor([1.0, 1.0, 0.3, 1.0, 1.0])
+
+
+def dense(mpc: QPMPC, s: Tensor, held: list[int]) -> tuple[float, np.ndarray]:
+    """Solve the QP of a QPMPC without blocks, and with u_k = u_{k-1} for k in ``held``."""
+    H, q, c, C, b, G, lb, ub, w = (x.detach().numpy() for x in mpc.quadratic_program().tensors())
+    z, soft = cvxpy.Variable(len(q)), np.isfinite(w)
+    excess = cvxpy.maximum(G @ z - np.minimum(ub, 1e3), np.maximum(lb, -1e3) - G @ z, 0)
+    cost = cvxpy.quad_form(z, cvxpy.psd_wrap(H)) / 2 + q @ z + c + w[soft] @ excess[soft]
+    u = [mpc.n_p + 3 * k for k in range(4)]
+    rows = [C @ z == b, z[: mpc.n_p] == s.numpy(), excess[~soft] <= 0]
+    rows += [z[u[k]] == z[u[k - 1]] for k in held]
+    problem = cvxpy.Problem(cvxpy.Minimize(cost), rows)
+    problem.solve(solver="CLARABEL", tol_gap_rel=1e-12, tol_gap_abs=1e-12, tol_feas=1e-12)
+    assert z.value is not None
+    return np.asarray(cost.value).item(), z.value[u]
+
+
+@pytest.mark.parametrize(
+    ("blocks", "held"), [([1, 3], [2, 3]), ([2, 1, 1], [1]), ([4], [1, 2, 3]), ([1] * 4, [])]
+)
+def test_the_plan_of_blocks_is_that_of_equal_actions(blocks, held):
+    mpc, free = blocked(blocks), blocked([])
+    for s in pasts(6):
+        value, u = dense(free, s, held)
+        solution = mpc.solve(s)
+        assert abs(solution.value.item() - value) < 1e-6 * (1 + abs(value))
+        assert np.allclose(mpc.predicted(solution.z)[1].detach()[:, 0], u, atol=1e-5)
+
+
+def test_gradients_of_blocks_pass_finite_differences():
+    mpc = blocked([1, 3])
+    names, start = zip(*mpc.named_parameters(), strict=True)
+    s, a = pasts(4), 0.05 * random_states(4, 1)
+    s[:, 2] *= 0.5
+
+    def values(*theta: Tensor) -> Tensor:
+        named = dict(zip(names, theta, strict=True))
+        return torch.cat((functional_call(mpc, named, (s,)), functional_call(mpc, named, (s, a))))
+
+    assert torch.autograd.gradcheck(values, [x.detach().clone().requires_grad_() for x in start])
+
+
+def test_blocks_leave_fewer_variables_and_rows():
+    free, held = (make_tables(blocked(blocks)) for blocks in ([], [1, 3]))
+    assert (free.R.shape[1], held.R.shape[1]) == (4, 2)
+    # Bounds, changes and a row of D for each of two stages.
+    assert len(free.rows) - len(held.rows) == 6
+
+
+def test_residuals_and_copies_keep_blocks(tmp_path):
+    mpc, s = blocked([1, 3]), pasts(3)
+    mpc.save(tmp_path / "mine.qpmpc")
+    twin = QPMPC.load(tmp_path / "mine.qpmpc")
+    assert torch.equal(twin.value(s), mpc.value(s))
+    qp = mpc.quadratic_program({"A": torch.zeros(3, *mpc.coordinates()["A"].shape)})
+    assert_close(mpc.value(s, qp), mpc.value(s))
+    message = r"got a state_dict with blocks = \[1, 3\], expected this module's \[2, 2\]"
+    with pytest.raises(QPError, match=message):
+        blocked([2, 2]).load_state_dict(mpc.state_dict())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -37,6 +39,14 @@ def test_lists_are_read_on_a_default_device_of_meta(name):
     assert {x.device.type for x in (*mpc.parameters(), *mpc.buffers())} == {"meta"}
     mpc.to_empty(device="cpu").reset_parameters()
     assert_close(mpc.state_dict(), expected, rtol=0, atol=0)
+
+
+def test_an_array_that_cannot_be_written_is_read_without_a_warning():
+    column = np.ones(2)
+    column.flags.writeable = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert as_tensor("x", column).tolist() == [1, 1]
 
 
 def test_a_tensor_without_values_is_named():

@@ -15,6 +15,7 @@ from torch_qpmpc.control.disturbance import Disturbances, choose
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.control.steady import Steady
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.layout import read_blocks
 from torch_qpmpc.mpc.validation import as_tensor, check_weight, read_numbers
 
 REFERENCES = ("held", "preview")
@@ -34,6 +35,7 @@ class Design:
         references: "held" or "preview".
         disturbances: B_w, C_w and names.
         gamma: the discount.
+        blocks: numbers of stages that share one input.
     """
 
     plant: StateSpace
@@ -50,6 +52,7 @@ class Design:
     disturbances: Disturbances
     gamma: float
     steady: Steady
+    blocks: tuple[int, ...] = ()
 
     @property
     def moves(self) -> bool:
@@ -118,6 +121,7 @@ def read_design(
     references: str,
     disturbances: Any,
     gamma: float,
+    blocks: Sequence[int],
 ) -> Design:
     """Return the design of the arguments of `LinearMPC`.
 
@@ -153,6 +157,7 @@ def read_design(
         estimated,
         gamma,
         Steady.of(plant, estimated, Q, R),
+        read_blocks(blocks, horizon),
     )
 
 

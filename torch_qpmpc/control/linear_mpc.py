@@ -64,6 +64,8 @@ class LinearMPC(QPMPC):
         references: ``"held"``: one r for the plan. ``"preview"``: one for each stage.
         disturbances: those that an observer estimates, by default one for each output; see
             `torch_qpmpc.control.disturbance.choose`.
+        blocks: numbers of stages that share one input, ``[1, 1, 2, 4]`` for a horizon of 8, or
+            ``[1, 1, 6]`` for a control horizon of 3. Bounds of moves are then those between blocks.
         gamma: the discount.
         options: ``learn``, ``structure``, ``step``, ``solver`` and ``on_failure`` of `QPMPC`; by
             default a tied structure that learns nothing, and DAQP.
@@ -104,6 +106,7 @@ class LinearMPC(QPMPC):
         linear: Mapping[str, str | float] | None = None,
         references: str = "held",
         disturbances: Any = "auto",
+        blocks: Sequence[int] = (),
         gamma: float = 1.0,
         E: Any = None,
         dt: float | None = None,
@@ -131,6 +134,7 @@ class LinearMPC(QPMPC):
             references=references,
             disturbances=disturbances,
             gamma=gamma,
+            blocks=blocks,
         )
         defaults = {"structure": "tied", "learn": (), "solver": "daqp"}
         super().__init__(lowered(design), **{**defaults, **options})

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.linalg import block_diag
+from torch import Tensor
 
 from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.state_space import Array
@@ -30,12 +31,20 @@ class LinearScheme(Scheme):
 
     design: Design | None = None
 
+    @property
+    def of_actions(self) -> Tensor:
+        """True for the rows of inputs and moves, whose other entries are constant in a block."""
+        if self.bounds.constraints is None:
+            return super().of_actions
+        return self.bounds.constraints[0][:, -self.layout.n_u :].any(-1)
+
 
 def lowered(design: Design) -> LinearScheme:
     """Return the scheme of a design, in deviations from the target."""
     places = design.places
     n_d = places["known"].stop
-    layout = Layout(places["u"].start - n_d, design.plant.sizes[1], design.horizon, 1, n_d)
+    n_x, n_u = places["u"].start - n_d, design.plant.sizes[1]
+    layout = Layout(n_x, n_u, design.horizon, 1, n_d, blocks=design.blocks)
     parts = _model(design), _cost(design, layout), _bounds(design)
     return LinearScheme(layout, *parts, design.gamma, design=design)
 

@@ -70,7 +70,10 @@ def _preference(design: Design) -> float:
 
 
 def _bounds(design: Design, error: Array, inputs: Array) -> Bounds:
-    """Return rows of u_s, hard, and of y_s, at their prices."""
+    """Return rows of u_s, hard, and of y_s, at their prices.
+
+    A disturbance alone determines what v does not change, within bounds or not: that has no row.
+    """
     n_y, steady = len(design.Q), design.steady
     outputs = error.copy()
     outputs[:, :n_y] = 0.0
@@ -80,8 +83,9 @@ def _bounds(design: Design, error: Array, inputs: Array) -> Bounds:
         np.concatenate(pair) - constants
         for pair in zip(design.u_bounds, design.y_bounds, strict=True)
     )
-    rows = np.isfinite(lower) | np.isfinite(upper)
+    D = np.vstack((inputs, outputs))
+    rows = (np.isfinite(lower) | np.isfinite(upper)) & D[:, -steady.Y.shape[1] :].any(-1)
     if not rows.any():
         return Bounds()
-    D = np.vstack((inputs, outputs))[rows]
+    D = D[rows]
     return Bounds(constraints=(D, lower[rows], upper[rows]), constraint_slack=slack[rows])

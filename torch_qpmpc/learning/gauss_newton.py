@@ -360,7 +360,8 @@ class GaussNewton(torch.optim.Optimizer):
 
     def _blocks(self, solution: QPSolution, root: Tensor, S: Tensor | None) -> list[Block]:
         """Return Q's gradients in each learned part that is not frozen, times ``root``."""
-        mpc, z, chi = self._mpc, solution.z, root.unsqueeze(-1) * solution.chi
+        mpc, z = self._mpc, solution.z
+        chi = root.unsqueeze(-1) * solution.chi[..., : mpc.horizon * mpc.n_x]
         pairs = [(leaf, group) for group in self.param_groups for leaf in group["params"]]
         pairs = [(leaf, group) for leaf, group in pairs if leaf.requires_grad]
         factored, mask = self._free_C(), matrix(mpc, "C")[1]

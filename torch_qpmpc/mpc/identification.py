@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_choice, check_flag, check_number, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.layout import SIZES, Layout
 from torch_qpmpc.mpc.log import Log, as_log
 from torch_qpmpc.mpc.predictor import (
     ARX,
@@ -33,7 +33,6 @@ PARTS = 5
 #: An action that the other regressors explain up to this share of its size does not excite.
 STILL = 1e-6
 EXCITE = "Add a random signal to the action, independent of the outputs."
-SIZES = ("n_x", "n_u", "horizon", "past", "n_d")
 
 
 @dataclass(frozen=True, eq=False)

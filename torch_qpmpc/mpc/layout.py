@@ -12,7 +12,8 @@ D^f on (d_N, x_N) (eq:v1c4), then one for each entry of the changes u_k - u_{k-1
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from numbers import Integral
 
 import torch
@@ -21,6 +22,9 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
+
+SIZES = ("n_x", "n_u", "horizon", "past", "n_d")
+COUNTS = ("n_mixed", "n_terminal", "n_rates")
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class Layout:
         n_d: entries of a stage's preview d_k.
         n_mixed, n_terminal: rows of D and of D^f, which a `Scheme` counts.
         n_rates: entries of u_k - u_{k-1} that have bounds, n_u or 0; likewise.
+        blocks: numbers of stages that share one action, with the sum N; none if each has its own.
 
     Raises:
         QPError: a size is not a whole number, or too small.
@@ -54,16 +59,18 @@ class Layout:
     n_mixed: int = 0
     n_terminal: int = 0
     n_rates: int = 0
+    blocks: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         for name in ("n_x", "n_u", "horizon", "past"):
             size = getattr(self, name)
             if not isinstance(size, Integral) or isinstance(size, bool) or int(size) < 1:
                 raise QPError.expected(name, repr(size), "a positive integer")
-        for name in ("n_d", "n_mixed", "n_terminal", "n_rates"):
+        for name in ("n_d", *COUNTS):
             check_whole(name, getattr(self, name), 0)
-        for field in fields(self):
-            object.__setattr__(self, field.name, int(getattr(self, field.name)))
+        for name in (*SIZES, *COUNTS):
+            object.__setattr__(self, name, int(getattr(self, name)))
+        object.__setattr__(self, "blocks", read_blocks(self.blocks, self.horizon))
 
     @property
     def n(self) -> int:
@@ -201,10 +208,34 @@ class Layout:
 
     def rate_rows(self) -> Tensor:
         """Return the rows of G for u_k - u_{k-1}, ``(N n_rates, n_z)``."""
+        return self._changes(self.n_before - self.n).flatten(0, 1)
+
+    @property
+    def held(self) -> Tensor:
+        """True for the stages whose action is that of the stage before, ``(N,)``."""
+        held = torch.full((self.horizon,), bool(self.blocks))
+        held[torch.tensor((0, *self.blocks[:-1])).cumsum(0)] = False
+        return held
+
+    def hold_rows(self) -> Tensor:
+        """Return the rows of u_k - u_{k-1} for the held stages, ``(h n_u, n_z)``."""
+        return self._changes(self.n_before)[self.held[1:]].flatten(0, 1)
+
+    def repeated(self, of_actions: Tensor) -> Tensor:
+        """Return True at the rows of G that bound the actions of held stages, ``(n_g,)``.
+
+        ``of_actions`` ``(n_mixed,)`` is True for the rows of D that bound actions alone.
+        """
+        held, none = self.held.unsqueeze(-1), torch.zeros(1, self.n_x, dtype=torch.bool)
+        u = F.pad(held, (0, 0, 0, 1)).expand(-1, self.n_u)
+        D_f = none.new_zeros(self.n_terminal)
+        return self.rows(none, u, held & of_actions, D_f, held.expand(-1, self.n_rates))
+
+    def _changes(self, first: int) -> Tensor:
+        """Return the rows of u_k - u_{k-1}, ``(i, n_u, n_z)``, after the stage at ``first``."""
         unit = torch.eye(self.n_z, dtype=torch.float64)
-        actions = unit[self.n_before - self.n : self.n_z - self.n_x].unflatten(0, (-1, self.n))
-        actions = actions[:, self.n_x :]
-        return (actions[1:] - actions[:-1]).flatten(0, 1)
+        actions = unit[first : self.n_z - self.n_x].unflatten(0, (-1, self.n))[:, self.n_x :]
+        return actions[1:] - actions[:-1]
 
     def hessian(self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor) -> Tensor:
         """Return H ``(n_z, n_z)`` (eq:qpH) from those of the stages and of x_N, or from a full H.
@@ -241,6 +272,19 @@ class Layout:
         upper = torch.cat((F.pad(preview, (0, past)), cross), dim=-1)
         lower = F.pad(torch.cat((cross.mT, F.pad(plan, (past, 0))), dim=-1), (0, 0, past, 0))
         return torch.cat((upper, lower))
+
+
+def read_blocks(blocks: Sequence[int], horizon: int) -> tuple[int, ...]:
+    """Return ``blocks`` as integers; raise `QPError` if they do not add up to the horizon."""
+    want = f"whole numbers >= 1 with the horizon {horizon} as their sum"
+    try:
+        sizes = [int(size) for size in blocks]
+    except (TypeError, ValueError) as error:
+        raise QPError.expected("blocks", repr(blocks), want) from error
+    if sizes and (min(sizes) < 1 or sum(sizes) != horizon or sizes != [*blocks]):
+        remedy = "The last one may hold its actions to the end."
+        raise QPError.expected("blocks", repr(blocks), want, remedy)
+    return (*sizes,)
 
 
 def _diagonal_blocks(rows: Tensor, count: int, first: int, width: int, step: int) -> Tensor:

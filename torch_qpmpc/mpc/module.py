@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
@@ -95,9 +96,9 @@ class QPMPC(nn.Module):
             program; see `torch_qpmpc.mpc.projections`.
         solver, on_failure: see `solve_qp`.
         options: the arguments of `Scheme.of` by name, if no scheme is passed: those of `Model`,
-            `Cost` and `Bounds`, ``gamma``, ``start`` and ``seed``. Where A, B or ``stage_weight``
-            is missing, the start is random, of which a `UserWarning` tells when the policy first
-            acts before a state_dict is loaded.
+            `Cost` and `Bounds`, ``blocks`` of `Layout`, ``gamma``, ``start`` and ``seed``. Where A,
+            B or ``stage_weight`` is missing, the start is random, of which a `UserWarning` tells
+            when the policy first acts before a state_dict is loaded.
 
     Attributes:
         scheme: the `Scheme` that theta starts from.
@@ -138,6 +139,8 @@ class QPMPC(nn.Module):
     slack_discount: Tensor
     soft: Tensor
     hardness: Tensor
+    hold: Tensor
+    repeated: Tensor
 
     @overload
     def __init__(
@@ -518,6 +521,11 @@ class QPMPC(nn.Module):
                 theta = {part: getattr(self, part) for part in coordinates.parts(self)}
             H, q, w = self._cost(theta)
             c, C, b, G, lb, ub = (theta[part] for part in ("c", *CONSTRAINTS))
+            if self.layout.blocks:
+                hold = self.hold.expand(*C.shape[:-2], -1, -1)
+                C, b = torch.cat((C, hold), -2), F.pad(b, (0, hold.shape[-2]))
+                lb = lb.masked_fill(self.repeated, -torch.inf)
+                ub = ub.masked_fill(self.repeated, torch.inf)
             return QuadraticProgram(H, q, c, C, b, G, lb, ub, w, check_values=False)
 
     def coordinates(self) -> dict[str, Tensor]:
@@ -699,6 +707,7 @@ class QPMPC(nn.Module):
         masks = {name: digest(mask) for name, mask in self._masks.items()}
         return {
             **asdict(self.layout),
+            "blocks": [*self.layout.blocks] or None,  # as of a file without
             "gamma": float(self.gamma),
             **{name: getattr(self, name) for name in ("structure", "hessian", "step")},
             "discount_slack": self.scheme.bounds.discount_slack,
@@ -730,6 +739,10 @@ class QPMPC(nn.Module):
         derived = {"discount": discount, "slack_discount": weights, "hardness": hardness}
         for name, buffer in derived.items():
             self.register_buffer(name, buffer.to(self.C_0), persistent=False)
+        if self.layout.blocks:
+            repeated = self.layout.repeated(self.scheme.of_actions).to(self.soft) & ~self.soft
+            self.register_buffer("hold", self.layout.hold_rows().to(self.C_0), persistent=False)
+            self.register_buffer("repeated", repeated, persistent=False)
         for part in self.modules():
             if isinstance(part, Masked | Tied):
                 part.place(self.C_0.device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -15,13 +15,12 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
-from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.layout import SIZES, Layout
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.qp.forking import serially_if_forked
 
 #: The default discount, that of the paper.
 GAMMA = 0.9
-SIZES = ("n_x", "n_u", "horizon", "past", "n_d")
 #: The parts of theta that may start at any finite values.
 STARTED = ("q", "c", "C", "b")
 
@@ -82,6 +81,7 @@ class Scheme:
         past: int = 1,
         n_d: int = 0,
         *,
+        blocks: Sequence[int] = (),
         gamma: float = GAMMA,
         start: Mapping[str, Any] | None = None,
         seed: int = 0,
@@ -90,7 +90,7 @@ class Scheme:
         """Return the scheme of sizes and of the arguments of its parts by name.
 
         Args:
-            n_x, n_u, horizon, past, n_d: see `Layout`.
+            n_x, n_u, horizon, past, n_d, blocks: see `Layout`.
             gamma, seed: see `Scheme`.
             start: initial values of some of q, c, C and b by name, in place of those that follow
                 from the other arguments.
@@ -99,7 +99,7 @@ class Scheme:
         Raises:
             QPError: an argument is invalid.
         """
-        layout = Layout(n_x, n_u, horizon, past, n_d)
+        layout = Layout(n_x, n_u, horizon, past, n_d, blocks=blocks)
         arguments = {**options, **_started(start)}
         model, cost, bounds = (_taken(kind, arguments) for kind in (Model, Cost, Bounds))
         if arguments:
@@ -111,7 +111,7 @@ class Scheme:
         """The arguments of `of` as tensors, tuples and plain values."""
         parts = (self.model, self.cost, self.bounds)
         return {
-            **{name: getattr(self.layout, name) for name in SIZES},
+            **{name: getattr(self.layout, name) for name in (*SIZES, "blocks")},
             **{x.name: getattr(part, x.name) for part in parts for x in fields(part)},
             "gamma": self.gamma,
             "seed": self.seed,
@@ -121,6 +121,13 @@ class Scheme:
     def is_random(self) -> bool:
         """True if the model or the stage cost is drawn at random."""
         return self.model.A is None or self.model.B is None or self.cost.stage_weight is None
+
+    @property
+    def of_actions(self) -> Tensor:
+        """True for the rows of D that bound actions alone, ``(n_mixed,)``."""
+        if self.bounds.constraints is None:
+            return torch.zeros(0, dtype=torch.bool)
+        return ~self.bounds.constraints[0][:, : -self.layout.n_u].any(-1)
 
     @property
     def C_0(self) -> Tensor:
