@@ -13,6 +13,7 @@ import torch_qpmpc as qm
 from tests.exported import SCHEMES, house, rates, tied
 from torch_qpmpc import QPMPC, QPError, Status
 from torch_qpmpc.export import export as module
+from torch_qpmpc.export import reference
 from torch_qpmpc.export.examples import draw
 from torch_qpmpc.export.library import Library, compiler
 from torch_qpmpc.export.tables import make_tables
@@ -140,6 +141,17 @@ def test_a_qp_without_solutions_is_refused(tmp_path, monkeypatch):
     match = "mpc: got no solution of its QP at 5 states, expected a QP that a solver solves"
     with pytest.raises(QPError, match=match):
         mpc.export_c(tmp_path)
+
+
+def test_a_large_qp_is_compared_at_fewer_states_with_the_interior_point(tmp_path, monkeypatch):
+    for part in (module, reference):
+        monkeypatch.setattr(part, "LARGE", 4)
+    monkeypatch.setattr(reference, "_exact", None)  # not called
+    agreement = tied().export_c(tmp_path).agreement
+    assert agreement.states == module.LEAST
+    assert agreement.solved >= module.LEAST // 2
+    assert agreement.u < 1e-8
+    assert agreement.value < 1e-8
 
 
 def shifted(**options) -> QPMPC:

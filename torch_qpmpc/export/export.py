@@ -15,7 +15,7 @@ from torch_qpmpc.checks import check_choice, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.examples import choose, draw, nearer
 from torch_qpmpc.export.library import Library, compiler
-from torch_qpmpc.export.reference import Reference, reference, sharpen
+from torch_qpmpc.export.reference import LARGE, Reference, reference, sharpen
 from torch_qpmpc.export.tables import Array, Tables, make_tables
 from torch_qpmpc.export.writer import (
     REAL,
@@ -30,8 +30,9 @@ from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.qp.program import Status
 
 STORAGES = ("fast", "small")
-#: Number of random states that the compiled policy is compared at.
-COMPARED = 400
+#: Number of random states that the compiled policy is compared at; fewer, but at least so many,
+#: of a `LARGE` QP, whose cold solves take long.
+COMPARED, LEAST = 400, 40
 #: Largest share of the solvable states that may be uncertified.
 UNSOLVED = 0.1
 #: Differences above this, relative to the largest action or value, are worth an exact solution.
@@ -227,7 +228,8 @@ def _states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, Reference]:
     def solve(p: Array) -> Reference:
         return reference(mpc, p.astype(dtype).astype(np.float64))
 
-    p, exact = nearer(tables, draw(tables, COMPARED), solve)
+    count = int(COMPARED * min(1.0, LARGE / max(len(tables.rows), 1)) ** 2)
+    p, exact = nearer(tables, draw(tables, max(count, min(LEAST, COMPARED))), solve)
     return p.astype(dtype).astype(np.float64), exact
 
 

@@ -222,7 +222,7 @@ def array(name: str, x: Array, dtype: str) -> str:
         x = np.zeros([max(n, 1) for n in x.shape])
     shape = "".join(f"[{n}]" for n in x.shape)
     rows = x if x.ndim == 2 else x[None]
-    body = ",\n".join(_braced([number(v, dtype) for v in row]) for row in rows)
+    body = ",\n".join(_braced(numbers(row, dtype)) for row in rows)
     body = f"{{\n{body}}}" if x.ndim == 2 else body
     return f"static const real {name}{shape} =\n{body};"
 
@@ -235,6 +235,13 @@ def _braced(words: list[str]) -> str:
             line = " "
         line += f"{word}, "
     return "\n".join([*lines, line.rstrip(", ") + "}"])
+
+
+def numbers(x: Array, dtype: str) -> list[str]:
+    """Return the `number` of each entry of a row."""
+    if dtype == "float64" and np.abs(x).max() < float(CONSTANTS[dtype]["BIG"]):
+        return list(map(repr, x.tolist()))  # in a fifth of the time
+    return [number(v, dtype) for v in x]
 
 
 def number(x: float, dtype: str) -> str:
