@@ -120,6 +120,15 @@ def test_a_set_point_out_of_reach_is_tracked_as_near_as_the_bounds_allow():
     assert np.allclose(bounded.target([7.0]).y, [2.0])
 
 
+def test_an_integrator_with_a_load_beyond_its_input_s_bounds_has_a_target():
+    """The load alone determines the steady input, so that its bounds leave no choice."""
+    mpc = qm.LinearMPC(([[1.0]], [[1.0]]), 5, Q=1.0, dR=1.0, u_bounds=(-1.0, 1.0))
+    target = mpc.target([0.5], w=[3.0])
+    assert np.allclose([*target.y, *target.u], [0.5, -3.0])
+    p = mpc.arrange([0.5], target, u_last=[-1.0])
+    assert np.allclose(target.u + mpc.policy(p).detach(), -1.0)
+
+
 def test_with_more_inputs_than_outputs_the_smallest_inputs_hold_the_set_point():
     mpc = qm.LinearMPC(([[0.5]], [[1.0, 1.0]]), 5, Q=1.0, R=1.0, u_bounds=([-1, -1], [0.2, 1]))
     assert np.allclose(mpc.target([0.2]).u, [0.05, 0.05], atol=1e-6)
