@@ -186,10 +186,10 @@ def build(
     if compiler() is not None:
         library = Library(folder, name, dtype)
         agreement = _compare(mpc, tables, library, p, exact)
+        _check_solved(agreement, dtype, max_iterations, tables)
         if failed := library.selftest():
             kinds = [*(example.kind for example in examples.states), "invalid"]
             _refuse(dtype, f"a failed self-test at state {failed} ({kinds[failed - 1]})", tables)
-        _check_solved(agreement, dtype, max_iterations, tables)
     elif dtype == "float32":
         remedy = "Install one, or export float64."
         raise QPError.expected("dtype", "'float32' without a C compiler to test it", "one", remedy)
