@@ -48,14 +48,15 @@ def make_config(*overrides: str) -> DictConfig:
     """
     latest = {override.partition("=")[0]: override for override in overrides}
     groups = [x for key, x in latest.items() if (CONFIGS / key.strip("+~")).is_dir()]
-    cfg = copy.deepcopy(_composed(*groups))
+    cfg = copy.deepcopy(composed(*groups))
     values = [_parsed(x) for x in latest.values() if x not in groups]
     ConfigLoaderImpl._apply_overrides_to_config(values, cfg)
     return cfg
 
 
 @functools.cache
-def _composed(*groups: str) -> DictConfig:
+def composed(*groups: str) -> DictConfig:
+    """Compose configs/ with choices of groups; registering another task of a name clears the cache."""
     with initialize_config_dir(version_base="1.3", config_dir=str(CONFIGS)):
         return compose("config", overrides=list(groups))
 
