@@ -56,7 +56,7 @@ def make_config(*overrides: str) -> DictConfig:
 
 @functools.cache
 def composed(*groups: str) -> DictConfig:
-    """Compose configs/ with choices of groups; registering another task of a name clears the cache."""
+    """Compose configs/; whoever registers another task of the same name clears the cache."""
     with initialize_config_dir(version_base="1.3", config_dir=str(CONFIGS)):
         return compose("config", overrides=list(groups))
 

@@ -24,6 +24,7 @@ from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.start import LOG, Exploration, collect_log, make_start, stored_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start, observed_cost
+from torch_qpmpc.mpc import stage_cost
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.study.runs import FinishedRun
 
@@ -40,6 +41,12 @@ def _log(*settings: str) -> TensorDictBase:
 def log_of(*settings: str) -> TensorDictBase:
     """Return a copy of a log that is collected once."""
     return _log(*settings).clone()
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fit costs roughly: tests/mpc/test_stage_cost.py compares the fits."""
+    monkeypatch.setattr(stage_cost, "ITERATIONS", 50)
 
 
 def start_of(cfg: DictConfig):
