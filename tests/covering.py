@@ -7,10 +7,10 @@ from collections.abc import Iterable
 from typing import Any
 
 
-def covering(combinations: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
+def covering(combinations: Iterable[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
     """Choose a few combinations that cover every pair of choices in ``combinations``."""
 
-    def pairs(combination: tuple[str, ...]) -> set[Any]:
+    def pairs(combination: tuple[Any, ...]) -> set[Any]:
         return set(itertools.combinations(enumerate(combination), 2))
 
     given, chosen = list(combinations), []

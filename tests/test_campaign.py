@@ -28,7 +28,7 @@ def _little_training(monkeypatch):
     derandomize=True,
     deadline=None,
     database=None,
-    max_examples=60,
+    max_examples=30,
     # The fixtures do not depend on the example.
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )

@@ -22,6 +22,7 @@ from torch_qpmpc.experiment.run_state import resumed
 RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3")
 STOPS = (2, 7)
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
+STREAM += ("steps_per_update=4",)
 GATED = ("gate=true", "optimizer=gauss_newton")
 DATA = ("start=data", "start.transitions=200")
 ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")

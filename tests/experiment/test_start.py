@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import signal
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
 from torch.testing import assert_close
 
 import train
@@ -22,11 +24,29 @@ from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.start import LOG, Exploration, collect_log, make_start, stored_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start, observed_cost
+from torch_qpmpc.mpc import stage_cost
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.study.runs import FinishedRun
 
 DATA = (*SMALL, "start=data", "start.transitions=200")
 PENDULUM = (*DATA, "task=gymnasium", "task.id=Pendulum-v1", "constraint=free", "noise=none")
+
+
+@functools.cache
+def _log(*settings: str) -> TensorDictBase:
+    cfg = make_config(*settings)
+    return collect_log(cfg, make_physics(cfg))
+
+
+def log_of(*settings: str) -> TensorDictBase:
+    """Return a copy of a log that is collected once."""
+    return _log(*settings).clone()
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fit costs roughly: tests/mpc/test_stage_cost.py compares the fits."""
+    monkeypatch.setattr(stage_cost, "ITERATIONS", 50)
 
 
 def start_of(cfg: DictConfig):
@@ -112,8 +132,7 @@ def test_a_task_without_a_weight_gets_the_cost_of_the_log(task, hessian):
     learn = "[H,q,c]" if hessian == "full" else "[H,H_f,q,c]"
     settings = ("task.gamma=0.9", f"task.hessian={hessian}", f"task.learn_cost={learn}")
     cfg = make_config(*names, *settings)
-    physics = make_physics(cfg)
-    log = collect_log(cfg, physics)
+    log = log_of(*names)
     n_d, n_y, past = (2, 1, 2) if task == "store" else (0, 3, 1)
     sizes = Layout(n_y, 1, 3, past, n_d)
     cost = observed_cost(cfg, log, sizes)
@@ -139,8 +158,7 @@ def test_a_task_without_a_weight_gets_the_cost_of_the_log(task, hessian):
 
 def test_a_terminal_weight_from_the_riccati_equation_is_kept():
     cfg = make_config(*PENDULUM, "task.terminal_weight=riccati")
-    log = collect_log(cfg, make_physics(cfg))
-    cost = observed_cost(cfg, log, Layout(3, 1, 3))
+    cost = observed_cost(cfg, log_of(*PENDULUM), Layout(3, 1, 3))
     assert cost.terminal_weight is None
     assert (cost.q[-3:] == 0).all()
 
@@ -168,9 +186,8 @@ def test_the_fit_of_the_cost_is_shown():
 
 
 def test_episodes_that_blow_up_are_cut_and_counted():
-    cfg = make_config(*PENDULUM)
+    cfg, log = make_config(*PENDULUM), log_of(*PENDULUM)
     physics = make_physics(cfg)
-    log = collect_log(cfg, physics)
     shorter = identified_start(cfg, physics, log[:, :40])
     for key in ("observation", ("next", "observation"), ("next", "reward")):
         log[key][:, 40:] = torch.nan  # of the fourth episode and of all later ones
@@ -184,8 +201,7 @@ def test_episodes_that_blow_up_are_cut_and_counted():
 
 
 def test_a_log_without_rewards_needs_a_weight():
-    cfg = make_config(*PENDULUM)
-    log = collect_log(cfg, make_physics(cfg))
+    cfg, log = make_config(*PENDULUM), log_of(*PENDULUM)
     message = "stage_weight: got none, and a log with rewards of NaN or inf, expected a weight"
     log["next", "reward"][0, 3] = torch.nan
     with pytest.raises(QPError, match=message):
@@ -236,6 +252,7 @@ def test_a_stopped_run_resumes_number_for_number(tmp_path, monkeypatch):
 def test_any_environment_trains_from_its_id(tmp_path, algo):
     settings = [x for x in PENDULUM if not x.startswith("optimizer")]
     own = ("task.episode_steps=null", "task.eval_steps=null", "figures=false")
+    own += ("updates=2", "task.horizon=2")
     run_command(*settings, *own, f"algo={algo}", f"hydra.run.dir={tmp_path}")
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["J_final"] > 0

@@ -18,7 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from pydantic import Field
 
 import train
-from tests.runs import SMALL, linear_system, make_config, run_command, true_mpc
+from tests.runs import SMALL, composed, linear_system, make_config, run_command, true_mpc
 from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import Cost, QPError
 from torch_qpmpc.envs import ActuatorNoise, GrosZanonLTI, Inventory, PointMass
@@ -263,6 +263,7 @@ def own_task(tmp_path, monkeypatch):
         file = tmp_path / "mine.py"
         file.write_text(TASK.replace("{options}", options))
         runpy.run_path(str(file))
+        composed.cache_clear()
         return str(file)
 
     return write
@@ -378,8 +379,7 @@ def test_invalid_registrations_are_refused(own_task):
 # The integrator with actuator noise
 
 
-@pytest.mark.parametrize("horizon", [1, 5])
-@pytest.mark.parametrize("std", [0.7, 1.2])
+@pytest.mark.parametrize(("horizon", "std"), [(1, 0.7), (5, 1.2)])
 def test_the_true_scheme_is_optimal_under_actuator_noise(horizon, std):
     cfg = make_config("task=actuator_noise", f"task.horizon={horizon}", f"task.actuator_std={std}")
     plant = make_physics(cfg)

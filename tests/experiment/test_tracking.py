@@ -131,10 +131,10 @@ def test_only_an_offset_free_model_tracks_references_without_an_error(memory, la
 
 
 def test_a_learned_model_tracks_without_an_error_once_it_is_offset_free():
-    short = ("updates=3", "warmup_steps=10", "search.loops=2", "gate=false", "batch_size=64")
+    short = ("updates=3", "warmup_steps=10", "gate=false", "batch_size=64", "task.eval_steps=5")
     found = controllers(1, *short)
     errors = {
-        name: steady_error(mpc, Reachable(horizon=16, past=1 + cfg.task.memory), steps=200)
+        name: steady_error(mpc, Reachable(horizon=16, past=1 + cfg.task.memory), steps=120)
         for name, (mpc, cfg) in found.items()
     }
     assert errors["learned"] > 0.02

@@ -9,5 +9,5 @@ from torch_qpmpc.export import export, library
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(library, "FLAGS", ("-std=c99", "-O1", "-fPIC", "-shared"))
+    monkeypatch.setattr(library, "FLAGS", ("-std=c99", "-O0", "-fPIC", "-shared"))
     monkeypatch.setattr(export, "COMPARED", 100)

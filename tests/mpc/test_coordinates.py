@@ -175,9 +175,7 @@ def test_compiled_in_one_graph_equals_eager():
     leaves = {name: x.requires_grad_() for name, x in residuals_of(mpc, 0.01, 4).items()}
 
     def run(s: Tensor, a: Tensor, residuals: dict[str, Tensor]) -> Tensor:
-        qp = mpc.quadratic_program(residuals)
-        parts = [f(qp).flatten() for f in functions(mpc, s, a).values()]
-        return torch.cat(parts)
+        return mpc.action_value(s, a, mpc.quadratic_program(residuals))
 
     def outcome(function: Callable[..., Tensor]) -> tuple[Tensor, list[Tensor]]:
         out = function(s, a, leaves)

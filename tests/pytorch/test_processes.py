@@ -43,7 +43,7 @@ FEATURES: dict[str, Callable[[QPMPC, Tensor, Tensor], Tensor]] = {
 
 
 def answers(mpc: QPMPC) -> dict[str, Tensor]:
-    s, a = random_states(24), random_states(24, 1, size=0.4)
+    s, a = random_states(8), random_states(8, 1, size=0.4)
     return {name: feature(mpc, s, a).detach() for name, feature in FEATURES.items()}
 
 

@@ -230,7 +230,8 @@ def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     bounds = _index_of(alone & (alone.sum(-1) == 1)[:, None] & (theta.G != 0).all(0))
     bounds[:n_f] = -1
     hard = np.flatnonzero(np.isinf(theta.w).any(0) & (steps > 0).any(0))
-    units = G[:, hard] / np.where(steps > 0, steps, 1.0)[:, hard, None]
+    # Contiguous whatever the indices, or the kernels would be compiled for each layout.
+    units = np.ascontiguousarray(G[:, hard] / np.where(steps > 0, steps, 1.0)[:, hard, None])
     apart = kernels.nearly_orthogonal(units)
     inverse, shift = kernels.inverse_factors(H, DEFINITE, SHIFT)
     stiffness = kernels.row_sums(H).max(-1, initial=0.0)
