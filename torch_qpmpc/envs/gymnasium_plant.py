@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import FlattenObservation
 from tensordict import TensorDictBase
@@ -30,8 +30,8 @@ class GymnasiumPlant:
     """A Gymnasium environment as a plant: its observation is the state s, its reward -L.
 
     Args:
-        id: id of a registered environment with Box spaces of one dimension. Observations by name,
-            a Dict space, become one vector, in the order of the space.
+        id: id of a registered environment with Box spaces of one dimension. The parts of a Dict or
+            a Tuple of observations become one vector, in the order of the space.
         kwargs: further arguments of `gymnasium.make`.
 
     Attributes:
@@ -68,7 +68,7 @@ class GymnasiumPlant:
     def make(self, max_steps: int | None = None) -> gymnasium.Env[Any, Any]:
         """Make one environment; ``max_steps`` replaces the length of its episodes."""
         env = gymnasium.make(self.id, max_episode_steps=max_steps, **self.kwargs)
-        return FlattenObservation(env) if isinstance(env.observation_space, Dict) else env
+        return FlattenObservation(env) if isinstance(env.observation_space, Dict | Tuple) else env
 
     def _bounds(self, name: str, space: Any) -> tuple[Tensor, Tensor]:
         if not isinstance(space, Box) or len(space.shape) != 1:

@@ -15,7 +15,9 @@ from torch import Tensor, nn
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.checkpoint import load_checkpoint
+from torch_qpmpc.experiment.choosing import choose, chosen_before
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task
+from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.files import write_whole
 from torch_qpmpc.learning.replay import Replay
@@ -73,6 +75,8 @@ def make_start(
 ) -> Start | None:
     """Identify the start of a run from a log, and keep a log of the plant in the run's folder.
 
+    With ``task.start_episodes`` closed loops choose it, and the folder gets their table.
+
     Args:
         cfg: the run's configuration.
         physics: the plant.
@@ -98,12 +102,20 @@ def make_start(
         log = stored_log(Path(cfg.start.file))
     else:
         log = collect_log(cfg, physics)
-    start = identified_start(cfg, physics, log)
+    choice = Choice.read(path.parent) if written else None
+    if choice is not None:
+        start = chosen_before(cfg, physics, log, choice)
+    elif cfg.task.get("start_episodes") and not written:
+        start = choose(cfg, physics, log, quiet)
+    else:
+        start = identified_start(cfg, physics, log)
     if own is None and not written:
         buffer = io.BytesIO()
         torch.save(log.to_dict(), buffer)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, buffer.getbuffer())
+        if start.choice is not None:
+            start.choice.write(path.parent)
     if not quiet:
         print(start)
     return start

@@ -50,11 +50,16 @@ class RewardCost(NamedTuple):
         """The cost that is used."""
         return self.after if self.after is not None and self.shifted else self.now
 
+    @property
+    def variables(self) -> str:
+        """The signals that the cost that is used is of."""
+        return "(y_(k+1), u_k)" if self.shifted else "(y_k, u_k)"
+
     def __str__(self) -> str:
         text = f"stage cost fitted to the rewards: R2 {self.now.R2:.3f}"
         if self.after is not None:
-            used = "(y_(k+1), u_k)" if self.shifted else "(y_k, u_k)"
-            text += f" on (y_k, u_k), {self.after.R2:.3f} on (y_(k+1), u_k); the cost is of {used}"
+            text += f" on (y_k, u_k), {self.after.R2:.3f} on (y_(k+1), u_k); the cost is of "
+            text += self.variables
         if self._later and not self.usable:
             text += f"\n{UNUSABLE}"
         return text if self.best.R2 >= GOOD else f"{text}\n{_poor(self.best.R2)}"

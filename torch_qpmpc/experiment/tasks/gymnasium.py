@@ -11,7 +11,7 @@ from pydantic import AfterValidator
 from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.closed_loop import gymnasium_loop
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.fields import MATRIX, Count, Expected, Flag, Matrix
+from torch_qpmpc.experiment.fields import MATRIX, Count, Expected, Flag, Matrix, Whole
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION, Rival, zero_action
 from torch_qpmpc.experiment.tasks.code import has_run
 from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, plant_scheme, register
@@ -41,6 +41,8 @@ class GymnasiumSettings(TaskSettings):
     eval_steps: Steps  # pyright: ignore[reportIncompatibleVariableOverride]
     #: Take the bounds of the observation space as constraints.
     observation_bounds: Flag
+    #: Episodes by which a start from data is chosen; 0 for the run's own start.
+    start_episodes: Whole = 0
 
     id: Annotated[
         str,

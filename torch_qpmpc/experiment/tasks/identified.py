@@ -10,8 +10,10 @@ import torch
 import torch.nn.functional as F
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
+from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task, plant_layout
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
@@ -23,28 +25,37 @@ from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.tightening import BackOff, tighten
 from torch_qpmpc.mpc.trajectories import valid_steps
 
+#: The largest distance of a policy from an action that it holds, relative to the log's largest; the
+#: number of logged states at which it is checked; and the powers of ten that the weight may have.
+HELD, STATES, POWERS = 1e-4, 64, 20
+
 
 class Start(NamedTuple):
     """A log of the task's plant, and the model and, if the task has none, the cost fitted to it.
 
-    ``cut`` is the number of the log's episodes that blow up. ``print`` shows it and the errors of
-    the model and the cost.
+    ``cut`` is the number of the log's episodes that blow up. ``held`` is an action ``(n_u,)`` that
+    the policy holds, by a weight that outweighs all else; None for the policy of the cost.
+    ``choice`` is the table of starts that it was chosen from, if it was. ``print`` shows ``cut``, the
+    errors of the model and the cost, and that table.
     """
 
     log: Any
     identified: Identified
     cost: RewardCost | None = None
     cut: int = 0
+    held: Tensor | None = None
+    choice: Choice | None = None
 
     def __str__(self) -> str:
         cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
-        parts = (cut if self.cut else None, self.identified, self.cost)
+        parts = (cut if self.cut else None, self.identified, self.cost, self.choice)
         return "\n".join(str(part) for part in parts if part is not None)
 
     @property
     def summary(self) -> dict[str, Any]:
         """The entries of summary.json: the fits of the cost, and the episodes that are cut."""
         entries: dict[str, Any] = {"log_episodes_cut": self.cut}
+        entries |= {} if self.choice is None else self.choice.summary
         if self.cost is None:
             return entries
         now, after = self.cost.now, self.cost.after
@@ -56,12 +67,16 @@ def identified_start(cfg: DictConfig, physics: AnyPlant, log: Any) -> Start:
     """Identify C, b and a missing stage cost from a log of the plant; `identify` names errors."""
     log, cut = without_blow_ups(log) if isinstance(log, TensorDictBase) else (log, 0)
     layout = plant_layout(physics, cfg.task.horizon)
-    options = {"causal": cfg.start.causal, "ridge": cfg.start.ridge}
-    identified = _model(log, layout, cfg.constraint.structure, **options)
+    identified = identified_model(cfg, log, layout, cfg.constraint.structure)
     cost = None
     if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is None:
         cost = _fitted(cfg, log, identified.options.layout)
     return Start(log, identified, cost, cut)
+
+
+def identified_model(cfg: DictConfig, log: Any, layout: Layout, structure: str) -> Identified:
+    """Identify C and b with the sizes of ``layout`` and the run's settings."""
+    return _model(log, layout, structure, causal=cfg.start.causal, ridge=cfg.start.ridge)
 
 
 def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
@@ -70,12 +85,45 @@ def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
     predictor = () if identified.options.structure == "tied" else identified.constraints
     if cost.stage_weight is None:
         cost = observed_cost(cfg, start.log, identified.options.layout, start.cost)
-    return replace(
+    scheme = replace(
         scheme,
         layout=identified.options.layout,
         model=Model(*identified.model, *predictor),
         cost=cost,
     )
+    return scheme if start.held is None else _holding(cfg, scheme, start)
+
+
+def _holding(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
+    """Weight the distance of the actions from ``start.held`` until the policy holds it.
+
+    The value function stays the predicted cost, which is then that of the held action.
+    """
+    assert start.held is not None
+    rows = valid_steps(start.log).flatten()
+    s, u = (start.log[key].flatten(0, -2)[rows].double() for key in ("observation", "action"))
+    s = s[:: max(len(s) // STATES, 1)]
+    size = (u - start.held).abs().amax(0)
+    for power in range(POWERS):
+        R = 10.0**power / size.square()
+        held = replace(scheme, cost=_towards(scheme, start.held, R))
+        mpc = QPMPC(held, learn=(), structure="free", solver=cfg.solver, on_failure="mask")
+        if ((mpc.policy(s) - start.held).abs() <= HELD * size).all():
+            break
+    return held
+
+
+def _towards(scheme: Scheme, action: Tensor, R: Tensor) -> Cost:
+    """Return the cost of ``scheme`` plus 1/2 (u_k - action)'R(u_k - action), for a diagonal R."""
+    layout, cost, n_u = scheme.layout, scheme.cost, scheme.layout.n_u
+    W = cost.stage_weight.clone()
+    diagonal = W[..., -n_u:] if cost.hessian == "diagonal" else W.diagonal(0, -2, -1)[..., -n_u:]
+    diagonal += R
+    q = W.new_zeros(layout.n_z) if cost.q is None else cost.q.clone()
+    q[layout.n_before :] -= layout.stages(W.new_zeros(1, layout.n_x), (R * action).expand(1, -1))
+    ahead = (scheme.gamma ** torch.arange(layout.horizon, dtype=torch.float64)).sum()
+    c = (0.0 if cost.c is None else cost.c) + ahead * (R * action.square()).sum() / 2
+    return replace(cost, stage_weight=W, q=q, c=c)
 
 
 def observed_cost(

@@ -1,0 +1,133 @@
+"""The choice of a start among those that a log allows, by closed loops on the plant."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from scipy.special import stdtrit
+from torch import Tensor
+from tqdm import tqdm
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION, zero_action
+from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
+from torch_qpmpc.experiment.tasks.choice import Choice, Row
+from torch_qpmpc.experiment.tasks.identified import Start, identified_model, identified_start
+from torch_qpmpc.experiment.tasks.registry import plant_layout
+from torch_qpmpc.learning.operators import warm_policy
+from torch_qpmpc.mpc.rewards import RewardCost
+from torch_qpmpc.mpc.trajectories import valid_steps
+
+MEAN_ACTION = "mean action of the log"
+#: Episodes of each start in the first round.
+FIRST = 2
+#: The seeds of the episodes begin this far above the run's seed, away from an evaluation's.
+APART = 10**6
+#: The probability with which the chosen start costs less than zero action.
+CONFIDENCE = 0.95
+
+
+def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
+    """Return the starts of a log by name.
+
+    They are all combinations of the run's structure or a tied one, the run's horizon or twice of
+    it, and a cost of (y_{k+1}, u_k) if that fits better or one of (y_k, u_k); and those that hold
+    zero action and the log's mean action. The first one is the run's own.
+
+    Raises:
+        QPError: as in `identified_start`.
+    """
+    own, N = identified_start(cfg, physics, log), cfg.task.horizon
+    costs = [own.cost]
+    if own.cost is not None and own.cost.shifted:
+        costs.append(RewardCost(own.cost.now))
+    named = {}
+    for horizon in (N, 2 * N):
+        for structure in dict.fromkeys((cfg.constraint.structure, "tied")):
+            model = own.identified
+            if (horizon, structure) != (N, cfg.constraint.structure):
+                layout = plant_layout(physics, horizon)
+                model = identified_model(cfg, own.log, layout, structure)
+            for cost in costs:
+                of = "" if cost is None else f", cost of {cost.variables}"
+                start = own._replace(identified=model, cost=cost)
+                named[f"{structure} C, N={horizon}{of}"] = start
+    u = own.log["action"].flatten(0, -2)[valid_steps(own.log).flatten()].double()
+    held = {ZERO_ACTION: zero_action(physics)(u[:1])[0], MEAN_ACTION: u.mean(0)}
+    return named | {name: own._replace(held=action) for name, action in held.items()}
+
+
+def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> Start:
+    """Choose among the `starts` of a log by successive halving over closed loops on the plant.
+
+    All have the same 2 episodes, the better half 2 more, the better half of these 4 more, and so on
+    up to ``task.start_episodes``, which zero action has, too. The best one of the last round is
+    chosen if it costs less than zero action by a one-sided paired t-test of 95 %; if not, zero
+    action is.
+    """
+    named = starts(cfg, physics, log)
+    policies = {name: _policy(cfg, physics, start) for name, start in named.items()}
+    costs = {name: torch.zeros(0, dtype=torch.float64) for name in named}
+    steps, left, count, last = dict.fromkeys(named, 0), [*named], FIRST, False
+    with tqdm(desc="starts", leave=False, disable=quiet) as bar:
+        while not last:
+            last = count >= cfg.task.start_episodes
+            for name in left:
+                bar.set_postfix_str(name)
+                more = _costs(cfg, physics, policies[name](), len(costs[name]), count)
+                costs[name] = torch.cat((costs[name], more.sum(0).nan_to_num(torch.inf)))
+                steps[name] += more.numel()
+                bar.update()
+            others = sorted({*left} - {ZERO_ACTION}, key=lambda name: costs[name].mean().item())
+            left = [ZERO_ACTION, *others[: -(-len(others) // 2)]]
+            count = min(2 * count, cfg.task.start_episodes)
+    best = left[1]
+    chosen = best if _is_less(costs[best] - costs[ZERO_ACTION]) else ZERO_ACTION
+    rows = {}
+    for name, start in named.items():
+        R2 = math.nan if start.held is not None else start.identified.R2[-1].mean().item()
+        J = costs[name]
+        rows[name] = Row(R2, len(J), J.mean().item(), _error(J), steps[name], name == chosen)
+    return named[chosen]._replace(choice=Choice(rows))
+
+
+def chosen_before(cfg: DictConfig, physics: AnyPlant, log: Any, choice: Choice) -> Start:
+    """Return the start that a run has chosen from its log.
+
+    Raises:
+        QPError: the log has no such start.
+    """
+    named = starts(cfg, physics, log)
+    if choice.name not in named:
+        raise QPError.expected("starts.csv", f"{choice.name!r}", f"one of {', '.join(named)}")
+    return named[choice.name]._replace(choice=choice)
+
+
+def _policy(cfg: DictConfig, physics: AnyPlant, start: Start) -> Callable[[], Any]:
+    """Return a function that makes a start's policy for one closed loop."""
+    if (action := start.held) is not None:
+        return lambda: lambda s: action.expand(len(s), -1)
+    mpc = make_mpc(cfg, physics, start)
+    return lambda: warm_policy(mpc)
+
+
+def _costs(cfg: DictConfig, physics: AnyPlant, policy: Any, done: int, count: int) -> Tensor:
+    """Return the costs ``(steps, count - done)`` of a policy's next episodes."""
+    options = {"steps": cfg.task.eval_steps, "gamma": cfg.task.gamma}
+    options |= {"starts": count - done, "seed": APART + cfg.seed + done}
+    return find_task(cfg.task).closed_loop(policy, physics, **options).costs
+
+
+def _is_less(differences: Tensor) -> bool:
+    """Return True if the mean of ``differences`` is negative, by a one-sided t-test."""
+    t = float(stdtrit(len(differences) - 1, CONFIDENCE))
+    return bool(differences.mean() + t * _error(differences) < 0)
+
+
+def _error(costs: Tensor) -> float:
+    """Return the standard error of the mean."""
+    return (costs.std() / math.sqrt(len(costs))).item()

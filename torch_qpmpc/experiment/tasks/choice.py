@@ -1,0 +1,98 @@
+"""The table of the starts that a log allows, of which closed loops on the plant have chosen one."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import pandas as pd
+
+from torch_qpmpc.envs.closed_loop import cost_text
+from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
+from torch_qpmpc.files import damaged, write_whole
+
+#: The table in a run's folder.
+STARTS = "starts.csv"
+NOTHING = (
+    "No start is shown to cost less than zero action: the run begins with zero action. One linear "
+    "scheme of this log does not control the plant. Pass a log about the states where the "
+    "controller is to work (start.file), the plant's own cost (task.stage_weight), or learn a "
+    "network (algo=td3 algo.actor=mlp)."
+)
+
+
+class Row(NamedTuple):
+    """A start: its prediction, its episodes, and True if it is the ``chosen`` one.
+
+    ``R2`` is the share of the outputs' variance that is predicted N steps ahead, cross-validated,
+    in the mean over the outputs; ``J`` the mean cost of the ``episodes``, ``error`` its standard
+    error, and ``transitions`` the number of their steps.
+    """
+
+    R2: float
+    episodes: int
+    J: float
+    error: float
+    transitions: int
+    chosen: bool
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The rows of the starts by name; ``print`` shows them, best first."""
+
+    rows: Mapping[str, Row]
+
+    @property
+    def name(self) -> str:
+        """The name of the chosen start."""
+        return next(name for name, row in self.rows.items() if row.chosen)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The entries of summary.json."""
+        return {"start": self.name, "start_transitions": self._transitions}
+
+    @property
+    def _transitions(self) -> int:
+        return sum(row.transitions for row in self.rows.values())
+
+    def __str__(self) -> str:
+        rows = sorted(self.rows.items(), key=lambda item: (-item[1].episodes, item[1].J))
+        width = max(map(len, self.rows))
+        lines = [f"{'start':{width}}{'R2':>8}{'episodes':>10}  J"]
+        for name, row in rows:
+            R2 = "" if math.isnan(row.R2) else f"{row.R2:.3f}"
+            J = f"{cost_text(row.J)} +- {cost_text(row.error)}"
+            lines.append(f"{name:{width}}{R2:>8}{row.episodes:10}  {J}")
+        lines.append(f"Chosen by {self._transitions:,} transitions of the plant: {self.name}")
+        return "\n".join(lines + [NOTHING] * (self.name == ZERO_ACTION))
+
+    def write(self, folder: Path) -> None:
+        """Write the table into a run's folder."""
+        buffer = io.BytesIO()
+        table = pd.DataFrame.from_dict(self.rows, orient="index", columns=Row._fields)
+        table.to_csv(buffer, index_label="start")
+        write_whole(folder / STARTS, buffer.getbuffer())
+
+    @classmethod
+    def read(cls, folder: Path) -> Self | None:
+        """Read the table of a run; None if it has none.
+
+        Raises:
+            QPError: the table is damaged.
+        """
+        file = folder / STARTS
+        if not file.exists():
+            return None
+        try:
+            table = pd.read_csv(file, index_col="start", float_precision="round_trip")
+            choice = cls({str(row.Index): Row(*row[1:]) for row in table.itertuples()})
+            _ = choice.name
+        except Exception as error:  # damaged files raise errors of any type
+            raise damaged(file, error, "the table of starts that a run wrote") from error
+        return choice
