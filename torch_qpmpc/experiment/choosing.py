@@ -82,7 +82,8 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
                 costs[name] = torch.cat((costs[name], more.sum(0).nan_to_num(torch.inf)))
                 steps[name] += more.numel()
                 bar.update()
-            others = sorted({*left} - {ZERO_ACTION}, key=lambda name: costs[name].mean().item())
+            others = [name for name in left if name != ZERO_ACTION]
+            others.sort(key=lambda name: costs[name].mean().item())  # the run's own wins a tie
             left = [ZERO_ACTION, *others[: -(-len(others) // 2)]]
             count = min(2 * count, cfg.task.start_episodes)
     best = left[1]

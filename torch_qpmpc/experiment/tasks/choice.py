@@ -75,7 +75,7 @@ class Choice:
     def write(self, folder: Path) -> None:
         """Write the table into a run's folder."""
         buffer = io.BytesIO()
-        table = pd.DataFrame.from_dict(self.rows, orient="index", columns=Row._fields)
+        table = pd.DataFrame([*self.rows.values()], index=[*self.rows], columns=[*Row._fields])
         table.to_csv(buffer, index_label="start")
         write_whole(folder / STARTS, buffer.getbuffer())
 
@@ -90,8 +90,8 @@ class Choice:
         if not file.exists():
             return None
         try:
-            table = pd.read_csv(file, index_col="start", float_precision="round_trip")
-            choice = cls({str(row.Index): Row(*row[1:]) for row in table.itertuples()})
+            table = pd.read_csv(file, index_col="start")
+            choice = cls({str(name): Row(*row) for name, *row in table.itertuples()})
             _ = choice.name
         except Exception as error:  # damaged files raise errors of any type
             raise damaged(file, error, "the table of starts that a run wrote") from error

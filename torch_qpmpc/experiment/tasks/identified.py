@@ -35,8 +35,8 @@ class Start(NamedTuple):
 
     ``cut`` is the number of the log's episodes that blow up. ``held`` is an action ``(n_u,)`` that
     the policy holds, by a weight that outweighs all else; None for the policy of the cost.
-    ``choice`` is the table of starts that it was chosen from, if it was. ``print`` shows ``cut``, the
-    errors of the model and the cost, and that table.
+    ``choice`` is the table of starts that it was chosen from, if it was. ``print`` shows ``cut``,
+    the errors of the model and the cost, and that table.
     """
 
     log: Any

@@ -1,0 +1,335 @@
+"""Plants of other packages, from their id and data: ``python -m tests.benchmarks.outside``.
+
+Each plant is a Gymnasium id, with a shim where its package has none, and its start is that of
+
+    python train.py task=gymnasium task.id=ID start=data
+
+Beside it are zero action, random actions, the start without a choice (``task.start_episodes=0``)
+and the plant's own reference, in the same episodes, which chose nothing. The packages are optional:
+
+    pip install 'gymnasium[mujoco,box2d]' pcgym gym-electric-motor
+    pip install --no-deps controlgym
+
+Finished rows are kept in docs/results/outside.csv and not repeated; the tables go into
+docs/results/outside.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import importlib.util
+import math
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import pandas as pd
+import torch
+from omegaconf import DictConfig
+
+import train
+from tests.benchmarks.table import DOCS
+from tests.runs import make_config
+from torch_qpmpc.envs.closed_loop import cost_text
+from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.rivals.rival import zero_action
+from torch_qpmpc.experiment.start import make_start
+from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc, make_physics, run_code
+from torch_qpmpc.experiment.tasks.identified import identified_start
+from torch_qpmpc.learning.operators import warm_policy
+from torch_qpmpc.study.markdown import replaced, table
+
+PAGE = DOCS / "results" / "outside.md"
+RESULTS = DOCS / "results" / "outside.csv"
+SEEDS, EVAL_SEED = (1, 2, 3), 9002
+#: Rows of the table: a cost that is above zero action's by more than this many standard errors.
+ERRORS = 2.0
+FIELDS = ("plant", "seed", "zero", "random", "own", "start", "excess", "error", "chosen", "R2_cost")
+FIELDS += ("reference", "learned", "transitions", "choosing", "simulated", "seconds")
+#: The module that `gymnasium.make` imports for an id of a shim.
+HERE = "tests.benchmarks.outside"
+
+
+class Outside(NamedTuple):
+    """A plant of another package.
+
+    Attributes:
+        id: as in ``task.id``.
+        package: the one that it needs, as Python imports it.
+        tuned: True if settings were chosen with it.
+        reference: returns J of its own controller; None for the reward that its package calls
+            solved, if it has one.
+        overrides: further ones of train.py.
+    """
+
+    id: str
+    package: str
+    tuned: bool
+    reference: Callable[[], float] | None = None
+    overrides: Sequence[str] = ()
+
+
+# pcgym: the package's examples, with set points that change, and its NMPC with the true model.
+LEVELS = np.repeat
+PCGYM: dict[str, dict[str, Any]] = {
+    "cstr": {
+        "N": 100,
+        "tsim": 26,
+        "SP": {"Ca": [*LEVELS([0.85, 0.9], 50)]},
+        "o_space": {"low": np.array([0.7, 300, 0.8]), "high": np.array([1, 350, 0.9])},
+        "a_space": {"low": np.array([295]), "high": np.array([302])},
+        "x0": np.array([0.8, 330, 0.8]),
+    },
+    "four_tank": {
+        "N": 60,
+        "tsim": 1000,
+        "SP": {"h3": [*LEVELS([0.5, 0.1, 0.2], 20)], "h4": [*LEVELS([0.2, 0.3, 0.4], 20)]},
+        "o_space": {"low": np.zeros(6), "high": np.full(6, 0.6)},
+        "a_space": {"low": np.full(2, 0.1), "high": np.full(2, 10.0)},
+        "x0": np.array([0.141, 0.112, 0.072, 0.42, 0.5, 0.2]),
+    },
+    "multistage_extraction": {
+        "N": 60,
+        "tsim": 60,
+        "SP": {"X5": [*LEVELS([0.3, 0.4, 0.3], 20)]},
+        "o_space": {"low": np.array([0.0] * 10 + [0.3]), "high": np.array([1.0] * 10 + [0.4])},
+        "a_space": {"low": np.array([5.0, 10.0]), "high": np.array([500.0, 1000.0])},
+        "x0": np.array([0.55, 0.3, 0.45, 0.25, 0.4, 0.20, 0.35, 0.15, 0.25, 0.1, 0.3]),
+    },
+}
+
+
+def pcgym_parameters(model: str) -> dict[str, Any]:
+    """Return the arguments of a pcgym environment."""
+    common = {"normalise_a": True, "normalise_o": True, "noise": True, "noise_percentage": 0.001}
+    own = PCGYM[model]
+    scale = dict.fromkeys(own["SP"], 1e3)
+    return {**own, **common, "r_scale": scale, "model": model, "integration_method": "casadi"}
+
+
+class PcGym(gymnasium.Wrapper):
+    """A pcgym environment, whose noise is of NumPy's global generator."""
+
+    def __init__(self, model: str) -> None:
+        super().__init__(import_module("pcgym").make_env(pcgym_parameters(model)))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        if seed is not None:
+            np.random.seed(seed)  # noqa: NPY002 (pcgym's)
+        return self.env.reset()
+
+
+def pcgym_oracle(model: str) -> float:
+    """Return J of the inputs of pcgym's NMPC, which has the true model."""
+    oracle, make_env = import_module("pcgym.oracle").oracle, import_module("pcgym").make_env
+    parameters = pcgym_parameters(model)
+    _, inputs = oracle(make_env, pcgym_parameters(model)).mpc()
+    low, high = (parameters["a_space"][name][:, None] for name in ("low", "high"))
+    env = PcGym(model)
+    env.reset(seed=EVAL_SEED)
+    return -sum(float(env.step(u)[1]) for u in (2 * (inputs - low) / (high - low) - 1).T)
+
+
+class ControlGym(gymnasium.Wrapper):
+    """A controlgym environment; its actions are limited, so that a log can be collected."""
+
+    def __init__(self, plant: str) -> None:
+        super().__init__(controlgym(plant))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        return self.env.reset(seed=seed)
+
+
+def controlgym(plant: str) -> Any:
+    """Make a controlgym environment."""
+    with warnings.catch_warnings():  # the package turns all warnings into errors
+        package = import_module("controlgym")
+    return package.make(plant, n_steps=100, action_limit=1.0)
+
+
+def controlgym_lqg(plant: str) -> float:
+    """Return J of controlgym's LQG, which has the true model."""
+    LQG = import_module("controlgym.controllers").LQG
+    costs = [-LQG(controlgym(plant)).run(seed=EVAL_SEED + i) for i in range(32)]
+    return float(np.mean(costs))
+
+
+def _registered(name: str, make: Callable[..., gymnasium.Env], steps: int) -> str:
+    if name not in gymnasium.registry:  # this module is __main__, too
+        gymnasium.register(name, entry_point=make, max_episode_steps=steps)
+    return f"{HERE}:{name}"
+
+
+def _pcgym(model: str, tuned: bool) -> Outside:
+    name = f"Pcgym-{model}-v0"
+    id = _registered(name, partial(PcGym, model), PCGYM[model]["N"])
+    return Outside(id, "pcgym", tuned, partial(pcgym_oracle, model))
+
+
+def _controlgym(plant: str) -> Outside:
+    id = _registered(f"Controlgym-{plant}-v0", partial(ControlGym, plant), 100)
+    return Outside(id, "controlgym", False, partial(controlgym_lqg, plant))
+
+
+LUNAR = ("task.kwargs={continuous: true}",)
+PLANTS = {
+    "Pendulum": Outside("Pendulum-v1", "gymnasium", True),
+    "Inverted pendulum": Outside("InvertedPendulum-v5", "mujoco", True),
+    "Inverted double pendulum": Outside("InvertedDoublePendulum-v5", "mujoco", True),
+    "Reacher": Outside("Reacher-v5", "mujoco", True),
+    "pcgym cstr": _pcgym("cstr", True),
+    "pcgym four_tank": _pcgym("four_tank", True),
+    "pcgym multistage_extraction": _pcgym("multistage_extraction", False),
+    "Mountain car": Outside("MountainCarContinuous-v0", "gymnasium", False),
+    "Lunar lander": Outside("LunarLander-v3", "Box2D", False, None, LUNAR),
+    "Swimmer": Outside("Swimmer-v5", "mujoco", False),
+    "controlgym psm": _controlgym("psm"),
+    "controlgym dis1": _controlgym("dis1"),
+    "controlgym he1": _controlgym("he1"),
+    "PMSM, currents": Outside("gym_electric_motor:Cont-CC-PMSM-v0", "gym_electric_motor", False),
+}
+
+
+def configuration(name: str, seed: int, *overrides: str) -> DictConfig:
+    """Compose the configuration of a plant's documented command."""
+    plant = PLANTS[name]
+    own = ("task=gymnasium", f"task.id={plant.id}", "start=data", f"seed={seed}")
+    cfg = make_config(*own, "figures=false", "logger=csv", *plant.overrides, *overrides)
+    run_code(cfg.task)
+    return cfg
+
+
+def reference(name: str) -> float:
+    """Return J of the plant's reference; nan if it has none."""
+    plant = PLANTS[name]
+    if plant.reference is not None:
+        return plant.reference()
+    if (threshold := gymnasium.spec(plant.id).reward_threshold) is None:
+        return math.nan
+    return -threshold
+
+
+def run(name: str, seed: int, learn: bool) -> dict[str, Any]:
+    """Start once, and learn if wanted; return the fields of a row."""
+    cfg = configuration(name, seed)
+    physics: Any = make_physics(cfg)
+    began = time.process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        torch.manual_seed(seed)
+        start = make_start(cfg, physics, folder, written=False)
+        assert start is not None
+    seconds = time.process_time() - began
+    own = identified_start(cfg, physics, start.log)
+    policies = {
+        "zero": zero_action(physics),
+        "random": _random(physics, seed),
+        "own": warm_policy(make_mpc(cfg, physics, own)),
+        "start": warm_policy(make_mpc(cfg, physics, start)),
+    }
+    costs = {key: _costs(cfg, physics, policy) for key, policy in policies.items()}
+    excess = costs["start"] - costs["zero"]
+    row = {"plant": name, "seed": seed, **{key: x.mean().item() for key, x in costs.items()}}
+    row |= {"excess": excess.mean().item(), "error": (excess.std() / len(excess) ** 0.5).item()}
+    summary = start.summary
+    row |= {"chosen": summary["start"], "choosing": summary["start_transitions"]}
+    row |= {"R2_cost": start.cost.best.R2 if start.cost else math.nan}
+    row |= {"reference": reference(name), "transitions": cfg.start.transitions}
+    row |= {"learned": math.nan, "simulated": 0, "seconds": round(seconds, 1)}
+    return row | (_learned(name, seed) if learn else {})
+
+
+def _learned(name: str, seed: int) -> dict[str, Any]:
+    """Learn by the documented command; return J of the policy that is kept, and its transitions."""
+    cfg = configuration(name, seed, f"eval_seed={EVAL_SEED}", "rivals=false")
+    with tempfile.TemporaryDirectory() as folder:
+        summary = train.train(cfg, folder, quiet=True)
+    steps = cfg.num_envs * (cfg.warmup_steps + cfg.updates * cfg.steps_per_update)
+    entries = {"learned": summary["J_best"], "simulated": summary["simulated"]}
+    return entries | {"transitions": cfg.start.transitions + steps}
+
+
+def _costs(cfg: DictConfig, physics: AnyPlant, policy: Any) -> torch.Tensor:
+    """Return the costs of the episodes of an evaluation."""
+    return evaluate(cfg, policy, physics, EVAL_SEED).costs.sum(0)
+
+
+def _random(physics: Any, seed: int) -> Callable[[torch.Tensor], torch.Tensor]:
+    rng = torch.Generator().manual_seed(seed)
+    low, high = physics.lb_a, physics.ub_a
+
+    def policy(s: torch.Tensor) -> torch.Tensor:
+        unit = torch.rand((len(s), len(low)), generator=rng, dtype=torch.float64)
+        return low + unit * (high - low)
+
+    return policy
+
+
+def outcomes(rows: Any, tuned: bool) -> str:
+    """Format the rows of the plants that chose settings or, if not ``tuned``, of the others."""
+    lines = []
+    for name, plant in PLANTS.items():
+        runs = rows[rows["plant"] == name]
+        if plant.tuned != tuned or not len(runs):
+            continue
+        J = [runs[key].mean() for key in ("zero", "random", "own", "start", "learned", "reference")]
+        cells = ["" if math.isnan(x) else cost_text(x) for x in J]
+        worse = (runs["excess"] > ERRORS * runs["error"]).sum()
+        counts = f"{runs['choosing'].mean():,.0f}"
+        chosen = "; ".join(dict.fromkeys(runs["chosen"]))
+        tail = [f"{worse} of {len(runs)}", f"{runs['R2_cost'].mean():.2f}", counts, chosen]
+        lines.append([name, *cells, *tail])
+    head = ["J", "zero action", "random", "start without a choice", "start", "learned", "reference"]
+    head += ["worse than zero action", "R2 of the cost", "transitions of the choice", "chosen"]
+    return table(head, lines)
+
+
+def add(path: Path, row: Any) -> None:
+    """Append a row."""
+    new = not path.exists()
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.benchmarks.outside", description="Write the table of other plants."
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
+    parser.add_argument("--plants", nargs="+", default=[""], help="parts of the plants' names")
+    parser.add_argument("--learn", action="store_true", help="learn, too, which takes hours")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
+    parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
+    options = parser.parse_args(None if arguments is None else list(arguments))
+    torch.set_num_threads(1)
+    warnings.filterwarnings("ignore", category=UserWarning)  # rows have what they say
+    for seed in options.seeds:
+        for name, plant in PLANTS.items():
+            if not any(part in name for part in options.plants):
+                continue
+            if importlib.util.find_spec(plant.package) is None:
+                print(f"skipped: {name}, which needs {plant.package}")
+                continue
+            rows: Any = pd.read_csv(options.results) if options.results.exists() else pd.DataFrame()
+            if len(rows) and ((rows["plant"] == name) & (rows["seed"] == seed)).any():
+                continue
+            add(options.results, row := run(name, seed, options.learn))
+            print(*row.values(), flush=True)
+    rows, text = pd.read_csv(options.results), options.page.read_text(encoding="utf-8")
+    for marker, tuned in (("tuned", True), ("others", False)):
+        text = replaced(text, outcomes(rows, tuned), marker)
+    options.page.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

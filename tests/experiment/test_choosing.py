@@ -1,0 +1,161 @@
+"""The choice of a start by closed loops, zero action if nothing is better, and its resumption."""
+
+from __future__ import annotations
+
+import math
+import signal
+
+import gymnasium
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from gymnasium.envs.registration import EnvSpec
+from torch.testing import assert_close
+
+import train
+from tests.runs import SMALL, make_config, run_command
+from tests.stops import stop
+from torch_qpmpc import QPError
+from torch_qpmpc.experiment.choosing import MEAN_ACTION, choose, starts
+from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
+from torch_qpmpc.experiment.start import collect_log
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.experiment.tasks.choice import STARTS, Choice, Row
+from torch_qpmpc.study.runs import FinishedRun
+
+OWN = "free C, N=3, cost of (y_(k+1), u_k)"
+
+
+class Lag(gymnasium.Env):
+    """A lag with noise, to be kept at zero by inputs that cost ``price`` times their size."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+    def __init__(self, gain=1.0, price=0.1):
+        self.gain, self.price = gain, price
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.y = 3 * self.np_random.choice([-1.0, 1.0], 1)
+        return self.y, {}
+
+    def step(self, action):
+        self.y = 0.9 * self.y + self.gain * action + 0.1 * self.np_random.standard_normal(1)
+        cost = self.y.item() ** 2 + self.price * np.abs(action).item()
+        return self.y, -cost, False, False, {}
+
+
+DATA = (*SMALL, "start=data", "start.transitions=400", "task=gymnasium", "task.id=Lag-v0")
+DATA += ("noise=none", "task.start_episodes=4")
+#: Zero action is best: the input does next to nothing and is expensive.
+HOPELESS = (*DATA, "task.kwargs={gain: 0.001, price: 100}")
+
+
+@pytest.fixture(autouse=True)
+def _plant(monkeypatch):
+    make = lambda **kwargs: Lag(**kwargs)  # noqa: E731 (an entry point)
+    monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
+
+
+def chosen(*overrides):
+    cfg = make_config(*overrides)
+    physics = make_physics(cfg)
+    return cfg, physics, choose(cfg, physics, collect_log(cfg, physics))
+
+
+def test_the_starts_are_all_combinations_and_constant_actions():
+    cfg = make_config(*DATA)
+    physics = make_physics(cfg)
+    log = collect_log(cfg, physics)
+    named = starts(cfg, physics, log)
+    kinds = [f"{s} C, N={N}" for N in (3, 6) for s in ("free", "tied")]
+    costs = ("(y_(k+1), u_k)", "(y_k, u_k)")
+    made = [f"{kind}, cost of {cost}" for kind in kinds for cost in costs]
+    assert [*named] == [*made, ZERO_ACTION, MEAN_ACTION]
+    tied = named["tied C, N=6, cost of (y_k, u_k)"]
+    assert (tied.identified.options.structure, tied.identified.options.layout.horizon) == (
+        "tied",
+        6,
+    )
+    assert make_mpc(cfg, physics, tied).horizon == 6
+    held = named[MEAN_ACTION].held
+    assert_close(held, log["action"].double().mean((0, 1)))
+    cfg = make_config(*DATA, "constraint=mpc")
+    assert [*starts(cfg, physics, log)][:2] == [
+        f"tied C, N={N}, cost of (y_k, u_k)" for N in (3, 6)
+    ]
+
+
+def test_a_start_that_costs_less_than_zero_action_is_chosen():
+    _, _, start = chosen(*DATA)
+    rows = start.choice.rows
+    assert start.held is None
+    assert rows[start.choice.name].episodes == rows[ZERO_ACTION].episodes == 4
+    assert rows[start.choice.name].J < rows[ZERO_ACTION].J
+    assert sorted(row.episodes for row in rows.values()) == [2] * 4 + [4] * 6
+    assert start.summary["start_transitions"] == sum(r.episodes for r in rows.values()) * 10
+    lines = str(start.choice).splitlines()
+    assert lines[-1] == f"Chosen by 320 transitions of the plant: {start.choice.name}"
+    assert lines[0].split() == ["start", "R2", "episodes", "J"]
+    assert len(lines) == 2 + len(rows)
+
+
+def test_zero_action_is_held_if_nothing_costs_less():
+    cfg, physics, start = chosen(*HOPELESS)
+    assert start.choice.name == start.summary["start"] == ZERO_ACTION
+    assert "No start is shown to cost less than zero action" in str(start)
+    s = 3 * torch.randn(16, 1, dtype=torch.float64)
+    mpc = make_mpc(cfg, physics, start)
+    assert mpc.policy(s).abs().max() < 1e-3
+    own = make_mpc(cfg, physics, start._replace(held=None))
+    assert own.policy(s).abs().max() > 1e-3 or own.value(s).isfinite().all()
+
+
+def test_a_held_action_adds_its_weight_and_nothing_else():
+    """Q grows by 1/2 (u - action)'R(u - action), and V is the predicted cost of the action."""
+    cfg, physics, start = chosen(*HOPELESS)
+    action = torch.tensor([0.25], dtype=torch.float64)
+    held = make_mpc(cfg, physics, start._replace(held=action))
+    own = make_mpc(cfg, physics, start._replace(held=None))
+    s = torch.randn(8, 1, dtype=torch.float64)
+    assert_close(held.policy(s), action.expand(8, 1), atol=1e-4, rtol=0)
+    R = held.quadratic_program().H.diagonal()[1] - own.quadratic_program().H.diagonal()[1]
+    assert R > 0
+    difference = held.action_value(s, action.expand(8, 1) + 0.5) - held.value(s)
+    assert_close(difference, (R / 8).expand(8), rtol=0.05, atol=0)
+    # Far from the own minimiser V is above the own V, at the action itself by the later stages' R.
+    assert (held.value(s) >= own.value(s) - 1e-6).all()
+
+
+@pytest.mark.parametrize("settings", [DATA, HOPELESS])
+def test_a_run_resumes_with_the_start_that_it_has_chosen(tmp_path, monkeypatch, settings):
+    cfg, whole, cut = make_config(*settings), tmp_path / "whole", tmp_path / "cut"
+    train.train(cfg, str(whole), quiet=True)
+    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
+    assert (cut / STARTS).read_bytes() == (whole / STARTS).read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr("torch_qpmpc.experiment.start.choose", None)
+        run_command(f"resume={cut}")
+    runs = FinishedRun(whole), FinishedRun(cut)
+    entries = ("J_start", "start", "start_transitions")
+    first, second = ({key: run.summary[key] for key in entries} for run in runs)
+    assert first == second
+    assert torch.equal(runs[0].start.C, runs[1].start.C)
+
+
+def test_the_table_is_kept_and_damage_is_named(tmp_path):
+    zero = Row(math.nan, 4, 2.0, 0.0, 40, False)
+    rows = {"a, b": Row(0.1 + 0.2, 4, 1 / 3, 0.1, 40, True), ZERO_ACTION: zero}
+    Choice(rows).write(tmp_path)
+    again = Choice.read(tmp_path)
+    assert again is not None
+    assert again.summary == {"start": "a, b", "start_transitions": 80}
+    assert again.rows["a, b"] == rows["a, b"]
+    assert Choice.read(tmp_path / "other") is None
+    table = pd.read_csv(tmp_path / STARTS)
+    table["chosen"] = False
+    table.to_csv(tmp_path / STARTS, index=False)
+    with pytest.raises(QPError, match=r"starts\.csv: got .*expected the table of starts"):
+        Choice.read(tmp_path)
