@@ -127,15 +127,35 @@ class PcGym(gymnasium.Wrapper):
         return self.env.reset()
 
 
+class _Seconds(float):
+    """A sample time by which do-mpc's times, arrays of one entry, divide to numbers."""
+
+    __array_ufunc__ = None
+
+    def __rtruediv__(self, time: Any) -> float:
+        return float(np.ravel(time)[0]) / float(self)
+
+    def __radd__(self, time: Any) -> Any:
+        return time + float(self)
+
+
 def pcgym_oracle(model: str) -> float:
     """Return J of the inputs of pcgym's NMPC, which has the true model."""
-    oracle, make_env = import_module("pcgym.oracle").oracle, import_module("pcgym").make_env
     parameters = pcgym_parameters(model)
-    _, inputs = oracle(make_env, pcgym_parameters(model)).mpc()
+    make_env = import_module("pcgym").make_env
+    oracle = import_module("pcgym.oracle").oracle(make_env, pcgym_parameters(model))
+    oracle.env.dt = _Seconds(oracle.env.dt)
+    _, inputs = oracle.mpc()
     low, high = (parameters["a_space"][name][:, None] for name in ("low", "high"))
     env = PcGym(model)
     env.reset(seed=EVAL_SEED)
-    return -sum(float(env.step(u)[1]) for u in (2 * (inputs - low) / (high - low) - 1).T)
+    J = 0.0
+    for u in (2 * (inputs - low) / (high - low) - 1).T:
+        _, reward, terminated, truncated, _ = env.step(u)
+        J -= float(reward)
+        if terminated or truncated:
+            break
+    return J
 
 
 class ControlGym(gymnasium.Wrapper):
@@ -151,14 +171,15 @@ class ControlGym(gymnasium.Wrapper):
 def controlgym(plant: str) -> Any:
     """Make a controlgym environment."""
     with warnings.catch_warnings():  # the package turns all warnings into errors
-        package = import_module("controlgym")
+        package, _ = import_module("controlgym"), import_module("controlgym.controllers")
     return package.make(plant, n_steps=100, action_limit=1.0)
 
 
 def controlgym_lqg(plant: str) -> float:
     """Return J of controlgym's LQG, which has the true model."""
-    LQG = import_module("controlgym.controllers").LQG
-    costs = [-LQG(controlgym(plant)).run(seed=EVAL_SEED + i) for i in range(32)]
+    env = controlgym(plant)
+    lqg = import_module("controlgym.controllers").LQG(env)
+    costs = [-lqg.run(seed=EVAL_SEED + i) for i in range(32)]
     return float(np.mean(costs))
 
 

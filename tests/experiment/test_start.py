@@ -30,6 +30,7 @@ from torch_qpmpc.study.runs import FinishedRun
 
 DATA = (*SMALL, "start=data", "start.transitions=200")
 PENDULUM = (*DATA, "task=gymnasium", "task.id=Pendulum-v1", "constraint=free", "noise=none")
+PENDULUM += ("task.start_episodes=0",)
 
 
 @functools.cache
