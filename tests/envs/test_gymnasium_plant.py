@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.closed_loop import gymnasium_loop
@@ -118,17 +118,20 @@ def test_unknown_arguments_of_an_environment_are_an_error():
         GymnasiumPlant("Pendulum-v1", weight=2)
 
 
-def test_observations_by_name_become_one_vector(monkeypatch):
-    class Named(Counter):
+@pytest.mark.parametrize("kind", [Dict, Tuple])
+def test_parts_of_an_observation_become_one_vector(monkeypatch, kind):
+    class Parts(Counter):
         def __init__(self, **_) -> None:
             super().__init__()
-            self.observation_space = Dict(
-                level=Box(0.0, 9.0, (2,), np.float32), age=Box(-1.0, 1.0, (1,), np.float32)
+            level, age = Box(0.0, 9.0, (2,), np.float32), Box(-1.0, 1.0, (1,), np.float32)
+            self.observation_space: Any = (
+                Dict(level=level, age=age) if kind is Dict else Tuple((level, age))
             )
 
-        def observe(self) -> dict[str, np.ndarray]:
+        def observe(self) -> Any:
             level = np.array([self.k, 2 * self.k], np.float32)
-            return {"age": np.full(1, -0.5, np.float32), "level": level}
+            age = np.full(1, -0.5, np.float32)
+            return {"age": age, "level": level} if kind is Dict else (level, age)
 
         def reset(self, *, seed=None, options=None):
             super().reset(seed=seed)
@@ -138,8 +141,8 @@ def test_observations_by_name_become_one_vector(monkeypatch):
             _, *rest = super().step(action)
             return self.observe(), *rest
 
-    monkeypatch.setitem(gymnasium.registry, "Named-v0", EnvSpec("Named-v0", Named))
-    plant = GymnasiumPlant("Named-v0")
+    monkeypatch.setitem(gymnasium.registry, "Parts-v0", EnvSpec("Parts-v0", Parts))
+    plant = GymnasiumPlant("Parts-v0")
     assert plant.ub_s.tolist() == [9, 9, 1]
     env = plant.vectorised(2, 3, seed=0)
     batch = env.rollout(2)

@@ -62,7 +62,9 @@ def _plant(monkeypatch):
 def chosen(*overrides):
     cfg = make_config(*overrides)
     physics = make_physics(cfg)
-    return cfg, physics, choose(cfg, physics, collect_log(cfg, physics))
+    start = choose(cfg, physics, collect_log(cfg, physics))
+    assert start.choice is not None
+    return cfg, physics, start, start.choice
 
 
 def test_the_starts_are_all_combinations_and_constant_actions():
@@ -89,44 +91,42 @@ def test_the_starts_are_all_combinations_and_constant_actions():
 
 
 def test_a_start_that_costs_less_than_zero_action_is_chosen():
-    _, _, start = chosen(*DATA)
-    rows = start.choice.rows
+    _, _, start, choice = chosen(*DATA)
+    rows = choice.rows
     assert start.held is None
-    assert rows[start.choice.name].episodes == rows[ZERO_ACTION].episodes == 4
-    assert rows[start.choice.name].J < rows[ZERO_ACTION].J
+    assert rows[choice.name].episodes == rows[ZERO_ACTION].episodes == 4
+    assert rows[choice.name].J < rows[ZERO_ACTION].J
     assert sorted(row.episodes for row in rows.values()) == [2] * 4 + [4] * 6
     assert start.summary["start_transitions"] == sum(r.episodes for r in rows.values()) * 10
-    lines = str(start.choice).splitlines()
-    assert lines[-1] == f"Chosen by 320 transitions of the plant: {start.choice.name}"
+    lines = str(choice).splitlines()
+    assert lines[-1] == f"Chosen by 320 transitions of the plant: {choice.name}"
     assert lines[0].split() == ["start", "R2", "episodes", "J"]
     assert len(lines) == 2 + len(rows)
 
 
 def test_zero_action_is_held_if_nothing_costs_less():
-    cfg, physics, start = chosen(*HOPELESS)
-    assert start.choice.name == start.summary["start"] == ZERO_ACTION
+    cfg, physics, start, choice = chosen(*HOPELESS)
+    assert choice.name == start.summary["start"] == ZERO_ACTION
     assert "No start is shown to cost less than zero action" in str(start)
     s = 3 * torch.randn(16, 1, dtype=torch.float64)
     mpc = make_mpc(cfg, physics, start)
     assert mpc.policy(s).abs().max() < 1e-3
-    own = make_mpc(cfg, physics, start._replace(held=None))
-    assert own.policy(s).abs().max() > 1e-3 or own.value(s).isfinite().all()
 
 
 def test_a_held_action_adds_its_weight_and_nothing_else():
     """Q grows by 1/2 (u - action)'R(u - action), and V is the predicted cost of the action."""
-    cfg, physics, start = chosen(*HOPELESS)
+    cfg, physics, start, _ = chosen(*DATA)
     action = torch.tensor([0.25], dtype=torch.float64)
     held = make_mpc(cfg, physics, start._replace(held=action))
     own = make_mpc(cfg, physics, start._replace(held=None))
     s = torch.randn(8, 1, dtype=torch.float64)
-    assert_close(held.policy(s), action.expand(8, 1), atol=1e-4, rtol=0)
+    assert (own.policy(s) - action).abs().max() > 0.5
+    assert_close(held.policy(s), action.expand(8, 1), atol=2e-4, rtol=0)
     R = held.quadratic_program().H.diagonal()[1] - own.quadratic_program().H.diagonal()[1]
     assert R > 0
     difference = held.action_value(s, action.expand(8, 1) + 0.5) - held.value(s)
     assert_close(difference, (R / 8).expand(8), rtol=0.05, atol=0)
-    # Far from the own minimiser V is above the own V, at the action itself by the later stages' R.
-    assert (held.value(s) >= own.value(s) - 1e-6).all()
+    assert (held.value(s) > own.value(s)).all()
 
 
 @pytest.mark.parametrize("settings", [DATA, HOPELESS])
