@@ -32,7 +32,7 @@ class Counter(gymnasium.Env):
         return np.zeros(1, np.float32), {}
 
     def step(self, action):
-        self.k += 1
+        self.k, self.action = self.k + 1, action
         return np.full(1, self.k, np.float32), -float(self.k), self.k >= self.last, False, {}
 
 
@@ -116,6 +116,16 @@ def test_unknown_arguments_of_an_environment_are_an_error():
     match = r"task.kwargs: got {'weight': 2}, expected arguments of 'Pendulum-v1'. .* 'weight'"
     with pytest.raises(QPError, match=match):
         GymnasiumPlant("Pendulum-v1", weight=2)
+
+
+def test_a_solvers_rounding_reaches_the_plant_as_zero(register):
+    env = GymnasiumPlant(register()).make()
+    own: Any = env.unwrapped
+    env.reset(seed=0)
+    for action, applied in ((1e-10, 0.0), (-0.5, -0.5)):
+        env.step(np.array([action], np.float32))
+        assert own.action.tolist() == [applied]
+        assert own.action.dtype == np.float32
 
 
 @pytest.mark.parametrize("kind", [Dict, Tuple])

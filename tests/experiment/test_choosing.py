@@ -110,23 +110,28 @@ def test_zero_action_is_held_if_nothing_costs_less():
     assert "No start is shown to cost less than zero action" in str(start)
     s = 3 * torch.randn(16, 1, dtype=torch.float64)
     mpc = make_mpc(cfg, physics, start)
-    assert mpc.policy(s).abs().max() < 1e-3
+    assert mpc.policy(s).abs().max() < 1e-12
 
 
-def test_a_held_action_adds_its_weight_and_nothing_else():
-    """Q grows by 1/2 (u - action)'R(u - action), and V is the predicted cost of the action."""
-    cfg, physics, start, _ = chosen(*DATA)
-    action = torch.tensor([0.25], dtype=torch.float64)
-    held = make_mpc(cfg, physics, start._replace(held=action))
-    own = make_mpc(cfg, physics, start._replace(held=None))
+@pytest.mark.parametrize("hessian", ["block", "diagonal", "full"])
+def test_a_held_action_has_a_cost_of_its_own(hessian):
+    """V is the log's mean cost ahead, and Q is above it by 1/2 (u - action)'R(u - action)."""
+    learn = "[H,q,c]" if hessian == "full" else "[H,H_f,q,c]"
+    bounds = ("task.observation_bounds=true", "task.gamma=0.9")
+    cfg = make_config(*DATA, *bounds, f"task.hessian={hessian}", f"task.learn_cost={learn}")
+    physics = make_physics(cfg)
+    log = collect_log(cfg, physics)
+    start = starts(cfg, physics, log)[ZERO_ACTION]
     s = torch.randn(8, 1, dtype=torch.float64)
-    assert (own.policy(s) - action).abs().max() > 0.5
-    assert_close(held.policy(s), action.expand(8, 1), atol=2e-4, rtol=0)
-    R = held.quadratic_program().H.diagonal()[1] - own.quadratic_program().H.diagonal()[1]
-    assert R > 0
-    difference = held.action_value(s, action.expand(8, 1) + 0.5) - held.value(s)
-    assert_close(difference, (R / 8).expand(8), rtol=0.05, atol=0)
-    assert (held.value(s) > own.value(s)).all()
+    assert make_mpc(cfg, physics, start).policy(s).abs().max() < 1e-12, "rounding alone"
+    action = torch.tensor([0.25], dtype=torch.float64)
+    mpc = make_mpc(cfg, physics, start._replace(held=action))
+    assert_close(mpc.policy(s), action.expand(8, 1), atol=1e-7, rtol=0)
+    costs = -log["next", "reward"].double()
+    assert_close(mpc.value(s), (10 * costs.mean()).expand(8), atol=1e-5, rtol=0)
+    R = costs.abs().mean() / (log["action"] - 0.25).abs().max().double().square()
+    difference = mpc.action_value(s, action.expand(8, 1) + 0.5) - mpc.value(s)
+    assert_close(difference, (R / 8).expand(8), rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("settings", [DATA, HOPELESS])

@@ -57,6 +57,7 @@ def test_each_key_of_the_files_is_one_of_the_models():
 SEARCH = ("search.margin=0.1", "search.loops=1")
 #: The shortest run, in which each part is called once.
 SHORT = (*SMALL, *SEARCH, "updates=2", "task.eval_steps=2", "task.episode_steps=4")
+DATA = ("start=data", "task=pendulum", "start.transitions=40")
 
 
 class Recorder:
@@ -102,7 +103,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "actuator_noise": ("task=actuator_noise", "warmup_steps=1"),
         "inventory": ("task=inventory", "warmup_steps=1"),
         "short_horizon": ("task=short_horizon", "warmup_steps=1"),
-        "data": ("start=data", "task=pendulum", "constraint=free", "start.transitions=40"),
+        "data": (*DATA, "constraint=free", "+task.start_episodes=2"),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
         "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
     }.items():
@@ -310,7 +311,8 @@ for _name in ("scale_cost", "scale_constraints", "damping"):
 for _name in ("optimizer.trust_region", "optimizer.normalise", "task.one_weather"):
     BAD[_name] = FLAG
 BAD["task.disturbed"] = BAD["task.observation_bounds"] = FLAG
-BAD["task.past"], BAD["task.memory"] = WHOLE, WHOLE[1:]
+BAD["task.past"] = WHOLE
+BAD["task.memory"] = BAD["task.start_episodes"] = WHOLE[1:]
 BAD["task.margin"] = BAD["task.model_error"] = REAL
 BAD["task.actuator_std"] = REAL
 BAD["task.a_max"] = BAD["task.capacity"] = [0, *REAL]

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import FlattenObservation
+from gymnasium.wrappers import FlattenObservation, TransformAction
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
@@ -24,6 +24,8 @@ from torch_qpmpc.errors import QPError
 
 #: The length of episodes of an environment that has no limit of its own.
 STEPS = 200
+#: The size of an action that is a solver's rounding.
+ROUNDING = 1e-9
 
 
 class GymnasiumPlant:
@@ -66,8 +68,12 @@ class GymnasiumPlant:
         env.close()
 
     def make(self, max_steps: int | None = None) -> gymnasium.Env[Any, Any]:
-        """Make one environment; ``max_steps`` replaces the length of its episodes."""
+        """Make one environment; ``max_steps`` replaces the length of its episodes.
+
+        Actions within 1e-9 of zero are zero, because some plants react to any other.
+        """
         env = gymnasium.make(self.id, max_episode_steps=max_steps, **self.kwargs)
+        env = TransformAction(env, _without_rounding, None)
         return FlattenObservation(env) if isinstance(env.observation_space, Dict | Tuple) else env
 
     def _bounds(self, name: str, space: Any) -> tuple[Tensor, Tensor]:
@@ -137,3 +143,8 @@ class GymnasiumPlant:
     def violations(self, batch: TensorDictBase) -> Tensor:
         """Return the `violation` of each transition of a collected ``batch``."""
         return self.violation(batch["observation"])
+
+
+def _without_rounding(action: np.ndarray) -> np.ndarray:
+    """Return zero for entries of the action that are a solver's rounding."""
+    return np.where(np.abs(action) <= ROUNDING, 0, action).astype(action.dtype)

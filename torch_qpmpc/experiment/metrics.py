@@ -32,8 +32,6 @@ from torch_qpmpc.mpc.module import QPMPC
 
 #: Entries of the loss's output that are logged in addition to its terms.
 LOGGED = ("td_error", "pred_value", "target_value", "unsolved", "invalid_reward")
-#: Two J within this fraction are equal, as of zero action and a QP that holds it.
-EQUAL = 1e-3
 #: Largest number of entries in a part of theta that is logged entry by entry.
 FEW = 16
 
@@ -189,7 +187,7 @@ def _worse_than_zero(summary: Mapping[str, Any]) -> list[str]:
     worse = {
         name: cost_text(J)
         for name, J in ends.items()
-        if not (zero >= J or math.isclose(J, zero, rel_tol=EQUAL, abs_tol=1e-9))
+        if not (zero >= J or math.isclose(J, zero, rel_tol=1e-6, abs_tol=1e-9))
     }
     if not worse:
         return []

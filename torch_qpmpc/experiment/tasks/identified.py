@@ -25,16 +25,15 @@ from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.tightening import BackOff, tighten
 from torch_qpmpc.mpc.trajectories import valid_steps
 
-#: The largest distance of a policy from an action that it holds, relative to the log's largest; the
-#: number of logged states at which it is checked; and the powers of ten that the weight may have.
-HELD, STATES, POWERS = 1e-4, 64, 20
+#: The least size of the costs of a start that holds an action.
+TINY = 1e-6
 
 
 class Start(NamedTuple):
     """A log of the task's plant, and the model and, if the task has none, the cost fitted to it.
 
     ``cut`` is the number of the log's episodes that blow up. ``held`` is an action ``(n_u,)`` that
-    the policy holds, by a weight that outweighs all else; None for the policy of the cost.
+    the policy holds, by a cost of its own; None for the policy of the fitted cost.
     ``choice`` is the table of starts that it was chosen from, if it was. ``print`` shows ``cut``,
     the errors of the model and the cost, and that table.
     """
@@ -91,39 +90,30 @@ def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
         model=Model(*identified.model, *predictor),
         cost=cost,
     )
-    return scheme if start.held is None else _holding(cfg, scheme, start)
+    return scheme if start.held is None else _holding(scheme, start)
 
 
-def _holding(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
-    """Weight the distance of the actions from ``start.held`` until the policy holds it.
+def _holding(scheme: Scheme, start: Start) -> Scheme:
+    """Return the scheme of the same model whose policy holds ``start.held``.
 
-    The value function stays the predicted cost, which is then that of the held action.
+    Its cost is 1/2 (u_k - held)'R(u_k - held) in each stage, of the size of the log's costs, and a
+    constant, their mean: a weight of x would move the actions, and some plants react to any.
     """
-    assert start.held is not None
-    rows = valid_steps(start.log).flatten()
-    s, u = (start.log[key].flatten(0, -2)[rows].double() for key in ("observation", "action"))
-    s = s[:: max(len(s) // STATES, 1)]
-    size = (u - start.held).abs().amax(0)
-    for power in range(POWERS):
-        R = 10.0**power / size.square()
-        held = replace(scheme, cost=_towards(scheme, start.held, R))
-        mpc = QPMPC(held, learn=(), structure="free", solver=cfg.solver, on_failure="mask")
-        if ((mpc.policy(s) - start.held).abs() <= HELD * size).all():
-            break
-    return held
-
-
-def _towards(scheme: Scheme, action: Tensor, R: Tensor) -> Cost:
-    """Return the cost of ``scheme`` plus 1/2 (u_k - action)'R(u_k - action), for a diagonal R."""
-    layout, cost, n_u = scheme.layout, scheme.cost, scheme.layout.n_u
-    W = cost.stage_weight.clone()
-    diagonal = W[..., -n_u:] if cost.hessian == "diagonal" else W.diagonal(0, -2, -1)[..., -n_u:]
-    diagonal += R
-    q = W.new_zeros(layout.n_z) if cost.q is None else cost.q.clone()
-    q[layout.n_before :] -= layout.stages(W.new_zeros(1, layout.n_x), (R * action).expand(1, -1))
-    ahead = (scheme.gamma ** torch.arange(layout.horizon, dtype=torch.float64)).sum()
-    c = (0.0 if cost.c is None else cost.c) + ahead * (R * action.square()).sum() / 2
-    return replace(cost, stage_weight=W, q=q, c=c)
+    held, log, layout = start.held, start.log, scheme.layout
+    assert held is not None
+    valid = valid_steps(log)
+    costs = -log["next", "reward"].reshape(log.shape)[valid].double()
+    size = (log["action"][valid].double() - held).abs().amax(0)
+    R = costs.abs().mean().clamp(min=TINY) / size.square()
+    gamma, N, zero = scheme.gamma, layout.horizon, R.new_zeros(layout.n_x)
+    q = torch.cat((R.new_zeros(layout.n_before), layout.stages(zero, -R * held)))
+    ahead = (gamma ** torch.arange(N, dtype=torch.float64)).sum()
+    c = (
+        costs.mean() * (N if gamma == 1 else 1 / (1 - gamma))
+        + ahead * (R * held.square()).sum() / 2
+    )
+    cost = Cost(torch.cat((zero, R)), zero, scheme.cost.hessian, q=q, c=c)
+    return replace(scheme, cost=cost, bounds=replace(scheme.bounds, state_bounds=None))
 
 
 def observed_cost(
