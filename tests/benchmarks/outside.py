@@ -228,12 +228,12 @@ def configuration(name: str, seed: int, *overrides: str) -> DictConfig:
     return cfg
 
 
-def reference(name: str) -> float:
+def reference(plant: Outside) -> float:
     """Return J of the plant's reference; nan if it has none."""
-    plant = PLANTS[name]
     if plant.reference is not None:
         return plant.reference()
-    if (threshold := gymnasium.spec(plant.id).reward_threshold) is None:
+    name = plant.id.rpartition(":")[2]
+    if (threshold := gymnasium.spec(name).reward_threshold) is None:
         return math.nan
     return -threshold
 
@@ -262,7 +262,7 @@ def run(name: str, seed: int, learn: bool) -> dict[str, Any]:
     summary = start.summary
     row |= {"chosen": summary["start"], "choosing": summary["start_transitions"]}
     row |= {"R2_cost": start.cost.best.R2 if start.cost else math.nan}
-    row |= {"reference": reference(name), "transitions": cfg.start.transitions}
+    row |= {"reference": reference(PLANTS[name]), "transitions": cfg.start.transitions}
     row |= {"learned": math.nan, "simulated": 0, "seconds": round(seconds, 1)}
     return row | (_learned(name, seed) if learn else {})
 

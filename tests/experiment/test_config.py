@@ -30,7 +30,7 @@ GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that built-in tasks lack.
-NOT_NEEDED = ("task.file", "task.kwargs")
+NOT_NEEDED = ("task.file", "task.kwargs", "task.start_episodes")
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
