@@ -18,14 +18,12 @@ import train
 from tests.runs import SMALL, make_config, run_command
 from tests.stops import stop
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.choosing import MEAN_ACTION, choose, starts
+from torch_qpmpc.experiment.choosing import MEAN_ACTION, choose, chosen_before, starts
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.choice import STARTS, Choice, Row
 from torch_qpmpc.study.runs import FinishedRun
-
-OWN = "free C, N=3, cost of (y_(k+1), u_k)"
 
 
 class Lag(gymnasium.Env):
@@ -128,6 +126,9 @@ def test_a_held_action_has_a_cost_of_its_own(hessian):
     costs = -log.get(("next", "reward")).double()
     assert_close(mpc.value(s), (10 * costs.mean()).expand(8), atol=1e-5, rtol=0)
     R = costs.abs().mean() / (log["action"] - 0.25).abs().max().double().square()
+    blind = start._replace(log=log.exclude(("next", "reward")), cost=None)
+    weighted = make_config(*DATA, "task.stage_weight=[[1,0],[0,1]]")
+    assert make_mpc(weighted, physics, blind).policy(s).abs().max() < 1e-12
     difference = mpc.action_value(s, action.expand(8, 1) + 0.5) - mpc.value(s)
     assert_close(difference, (R / 8).expand(8), rtol=1e-4, atol=0)
 
@@ -162,3 +163,13 @@ def test_the_table_is_kept_and_damage_is_named(tmp_path):
     table.to_csv(tmp_path / STARTS, index=False)
     with pytest.raises(QPError, match=r"starts\.csv: got .*expected the table of starts"):
         Choice.read(tmp_path)
+
+
+def test_a_table_of_another_log_is_named():
+    cfg = make_config(*DATA)
+    physics = make_physics(cfg)
+    choice = Choice({"free C, N=7": Row(0.9, 4, 1.0, 0.1, 40, True)})
+    with pytest.raises(
+        QPError, match=r"starts\.csv: got 'free C, N=7', expected one of free C, N=3"
+    ):
+        chosen_before(cfg, physics, collect_log(cfg, physics), choice)

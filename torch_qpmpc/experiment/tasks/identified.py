@@ -102,16 +102,15 @@ def _holding(scheme: Scheme, start: Start) -> Scheme:
     held, log, layout = start.held, start.log, scheme.layout
     assert held is not None
     valid = valid_steps(log)
-    costs = -log["next", "reward"].reshape(log.shape)[valid].double()
+    reward = log.get(("next", "reward"), torch.zeros(()))  # a task with a weight needs none
+    costs = -reward.double().reshape(log.shape)[valid] if reward.ndim else reward.double()
     size = (log["action"][valid].double() - held).abs().amax(0)
     R = costs.abs().mean().clamp(min=TINY) / size.square()
     gamma, N, zero = scheme.gamma, layout.horizon, R.new_zeros(layout.n_x)
     q = torch.cat((R.new_zeros(layout.n_before), layout.stages(zero, -R * held)))
     ahead = (gamma ** torch.arange(N, dtype=torch.float64)).sum()
-    c = (
-        costs.mean() * (N if gamma == 1 else 1 / (1 - gamma))
-        + ahead * (R * held.square()).sum() / 2
-    )
+    c = costs.mean() * (N if gamma == 1 else 1 / (1 - gamma))
+    c += ahead * (R * held.square()).sum() / 2
     cost = Cost(torch.cat((zero, R)), zero, scheme.cost.hessian, q=q, c=c)
     return replace(scheme, cost=cost, bounds=replace(scheme.bounds, state_bounds=None))
 
