@@ -54,6 +54,15 @@ SEEDS, EVAL_SEED = (1, 2, 3), 9002
 ERRORS = 2.0
 FIELDS = ("plant", "seed", "zero", "random", "own", "start", "excess", "error", "chosen", "R2_cost")
 FIELDS += ("reference", "learned", "transitions", "choosing", "simulated", "seconds")
+#: Columns of J in the table, by field.
+COLUMNS = {
+    "zero": "zero action",
+    "random": "random",
+    "own": "start without a choice",
+    "start": "start",
+    "learned": "learned",
+    "reference": "reference",
+}
 #: The module that `gymnasium.make` imports for an id of a shim.
 HERE = "tests.benchmarks.outside"
 
@@ -210,7 +219,7 @@ PLANTS = {
     "pcgym four_tank": _pcgym("four_tank", True),
     "pcgym multistage_extraction": _pcgym("multistage_extraction", False),
     "Mountain car": Outside("MountainCarContinuous-v0", "gymnasium", False),
-    "Lunar lander": Outside("LunarLander-v3", "Box2D", False, None, LUNAR),
+    "Lunar lander": Outside("LunarLander-v3", "Box2D", True, None, LUNAR),
     "Swimmer": Outside("Swimmer-v5", "mujoco", False),
     "controlgym psm": _controlgym("psm"),
     "controlgym dis1": _controlgym("dis1"),
@@ -295,21 +304,22 @@ def _random(physics: Any, seed: int) -> Callable[[torch.Tensor], torch.Tensor]:
 
 def outcomes(rows: Any, tuned: bool) -> str:
     """Format the rows of the plants that chose settings or, if not ``tuned``, of the others."""
+    shown = COLUMNS if rows["learned"].notna().any() else {**COLUMNS, "learned": ""}
+    shown = {key: head for key, head in shown.items() if head}
     lines = []
     for name, plant in PLANTS.items():
         runs = rows[rows["plant"] == name]
         if plant.tuned != tuned or not len(runs):
             continue
-        J = [runs[key].mean() for key in ("zero", "random", "own", "start", "learned", "reference")]
+        J = [float(runs[key].mean()) for key in shown]
         cells = ["" if math.isnan(x) else cost_text(x) for x in J]
         worse = (runs["excess"] > ERRORS * runs["error"]).sum()
         counts = f"{runs['choosing'].mean():,.0f}"
         chosen = "; ".join(dict.fromkeys(runs["chosen"]))
         tail = [f"{worse} of {len(runs)}", f"{runs['R2_cost'].mean():.2f}", counts, chosen]
         lines.append([name, *cells, *tail])
-    head = ["J", "zero action", "random", "start without a choice", "start", "learned", "reference"]
-    head += ["worse than zero action", "R2 of the cost", "transitions of the choice", "chosen"]
-    return table(head, lines)
+    head = ["J", *shown.values(), "worse than zero action", "R2 of the cost"]
+    return table([*head, "transitions of the choice", "chosen"], lines)
 
 
 def add(path: Path, row: Any) -> None:
