@@ -41,7 +41,7 @@ from torch_qpmpc.experiment.metrics import report, run_summary, table, update_me
 from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
-from torch_qpmpc.experiment.start import make_start, transitions
+from torch_qpmpc.experiment.start import begin_learning, make_start, transitions
 from torch_qpmpc.experiment.tally import Tally
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics, resume_arguments
 
@@ -85,6 +85,7 @@ def _train(
         mpc.release()
     learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
     gate = RunGate(cfg, learner, physics, quiet)
+    begin_learning(cfg, physics, identified, mpc)
 
     # The data: vectorised episodes under the current policy, and their replay.
     collector = make_collector(cfg, physics, gate.acting)

@@ -18,11 +18,11 @@ import train
 from tests.runs import SMALL, make_config, run_command
 from tests.stops import stop
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.choosing import MEAN_ACTION, choose, chosen_before, starts
+from torch_qpmpc.experiment.choosing import choose, chosen_before, starts
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
-from torch_qpmpc.experiment.start import collect_log
+from torch_qpmpc.experiment.start import begin_learning, collect_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.experiment.tasks.choice import STARTS, Choice, Row
+from torch_qpmpc.experiment.tasks.choice import HELD, MEAN_ACTION, STARTS, Choice, Row
 from torch_qpmpc.study.runs import FinishedRun
 
 
@@ -107,6 +107,21 @@ def test_zero_action_is_held_if_nothing_costs_less():
     s = 3 * torch.randn(16, 1, dtype=torch.float64)
     mpc = make_mpc(cfg, physics, start)
     assert mpc.policy(s).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("bounds", ["task.observation_bounds=true", "constraint=mpc"])
+def test_learning_begins_with_the_best_scheme_where_a_gate_keeps_the_held_action(bounds):
+    cfg, physics, start, choice = chosen(*HOPELESS, bounds)
+    assert choice.scheme not in HELD
+    scheme = make_mpc(cfg, physics, start._replace(held=None))
+    cfg.gate = False
+    mpc, s = make_mpc(cfg, physics, start), torch.randn(16, 1, dtype=torch.float64)
+    begin_learning(cfg, physics, start, mpc)
+    assert mpc.policy(s).abs().max() < 1e-12
+    cfg.gate = True
+    begin_learning(cfg, physics, start, mpc)
+    assert_close(mpc.policy(s), scheme.policy(s), rtol=0, atol=0)
+    assert mpc.policy(s).abs().max() > 1e-3
 
 
 @pytest.mark.parametrize("hessian", ["block", "diagonal", "full"])

@@ -15,14 +15,13 @@ from tqdm import tqdm
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
-from torch_qpmpc.experiment.tasks.choice import Choice, Row
+from torch_qpmpc.experiment.tasks.choice import MEAN_ACTION, Choice, Row
 from torch_qpmpc.experiment.tasks.identified import Start, identified_model, identified_start
 from torch_qpmpc.experiment.tasks.registry import plant_layout
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.rewards import RewardCost
 from torch_qpmpc.mpc.trajectories import valid_steps
 
-MEAN_ACTION = "mean action of the log"
 #: Episodes of each start in the first round.
 FIRST = 2
 #: The seeds of the episodes begin this far above the run's seed, away from an evaluation's.
@@ -93,7 +92,7 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
         R2 = math.nan if start.held is not None else start.identified.R2[-1].mean().item()
         J = costs[name]
         rows[name] = Row(R2, len(J), J.mean().item(), _error(J), steps[name], name == chosen)
-    return named[chosen]._replace(choice=Choice(rows))
+    return _start(named, Choice(rows))
 
 
 def chosen_before(cfg: DictConfig, physics: AnyPlant, log: Any, choice: Choice) -> Start:
@@ -103,9 +102,15 @@ def chosen_before(cfg: DictConfig, physics: AnyPlant, log: Any, choice: Choice) 
         QPError: the log has no such start.
     """
     named = starts(cfg, physics, log)
-    if choice.name not in named:
-        raise QPError.expected("starts.csv", f"{choice.name!r}", f"one of {', '.join(named)}")
-    return named[choice.name]._replace(choice=choice)
+    for name in (choice.name, choice.scheme):
+        if name not in named:
+            raise QPError.expected("starts.csv", f"{name!r}", f"one of {', '.join(named)}")
+    return _start(named, choice)
+
+
+def _start(named: dict[str, Start], choice: Choice) -> Start:
+    """Return the chosen start: that of the best scheme, which holds an action if one is chosen."""
+    return named[choice.scheme]._replace(held=named[choice.name].held, choice=choice)
 
 
 def _policy(cfg: DictConfig, physics: AnyPlant, start: Start) -> Callable[[], Any]:

@@ -16,11 +16,12 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.choosing import choose, chosen_before
-from torch_qpmpc.experiment.tasks import AnyPlant, find_task
+from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
 from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.files import write_whole
 from torch_qpmpc.learning.replay import Replay
+from torch_qpmpc.mpc.module import QPMPC
 
 #: The log in a run's folder.
 LOG = "log.pt"
@@ -119,6 +120,15 @@ def make_start(
     if not quiet:
         print(start)
     return start
+
+
+def begin_learning(cfg: DictConfig, physics: AnyPlant, start: Start | None, mpc: QPMPC) -> None:
+    """Load the theta of the scheme where ``start`` holds an action, which the gate has kept.
+
+    Without a gate learning begins with the held action, since what is learned is kept.
+    """
+    if start is not None and start.held is not None and cfg.gate:
+        mpc.load_state_dict(make_mpc(cfg, physics, start._replace(held=None)).state_dict())
 
 
 def collect_log(cfg: DictConfig, physics: AnyPlant) -> TensorDict:

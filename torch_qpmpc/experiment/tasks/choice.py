@@ -17,9 +17,12 @@ from torch_qpmpc.files import damaged, write_whole
 
 #: The table in a run's folder.
 STARTS = "starts.csv"
+MEAN_ACTION = "mean action of the log"
+#: The starts that hold an action.
+HELD = {ZERO_ACTION, MEAN_ACTION}
 NOTHING = (
-    "No start is shown to cost less than zero action: the run begins with zero action. One linear "
-    "scheme of this log does not control the plant. Pass a log about the states where the "
+    "No start is shown to cost less than zero action: that is kept until learning costs less. One "
+    "linear scheme of this log does not control the plant. Pass a log about the states where the "
     "controller is to work (start.file), the plant's own cost (task.stage_weight), or learn a "
     "network (algo=td3 algo.actor=mlp)."
 )
@@ -53,6 +56,14 @@ class Choice:
         return next(name for name, row in self.rows.items() if row.chosen)
 
     @property
+    def scheme(self) -> str:
+        """The name of the best start that holds no action, with which learning begins."""
+        return min(self.rows.keys() - HELD, key=lambda name: self._rank(self.rows[name]))
+
+    def _rank(self, row: Row) -> tuple[bool, int, float]:
+        return not row.chosen, -row.episodes, row.J
+
+    @property
     def summary(self) -> dict[str, Any]:
         """The entries of summary.json."""
         return {"start": self.name, "start_transitions": self._transitions}
@@ -62,7 +73,7 @@ class Choice:
         return sum(row.transitions for row in self.rows.values())
 
     def __str__(self) -> str:
-        rows = sorted(self.rows.items(), key=lambda item: (-item[1].episodes, item[1].J))
+        rows = sorted(self.rows.items(), key=lambda item: self._rank(item[1])[1:])
         width = max(map(len, self.rows))
         lines = [f"{'start':{width}}{'R2':>8}{'episodes':>10}  J"]
         for name, row in rows:
