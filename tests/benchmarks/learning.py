@@ -50,11 +50,11 @@ def runs(root: Path) -> dict[tuple[str, int], list[dict[str, Any]]]:
     for path in sorted(root.glob("*/*/summary.json")):
         cfg, summary = load_config(path.parent / "config.yaml"), read_summary(path.parent)
         name, summary["optimum"] = cfg.task.name.replace("_", " "), summary["J_true_model"]
-        if "actuator_std" in cfg.task:
+        if cfg.task.name == "actuator_noise":
             name += f", std {cfg.task.actuator_std:g}"
-        if cfg.task.get("a_max", FREE) < FREE:
-            name += f", action up to {cfg.task.a_max:g}"
-            summary["optimum"] = bounded_optimum(cfg)
+            if cfg.task.a_max < FREE:
+                name += f", action up to {cfg.task.a_max:g}"
+                summary["optimum"] = bounded_optimum(cfg)
         cases[name, cfg.task.horizon].append(summary)
     return cases
 
