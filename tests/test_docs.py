@@ -91,7 +91,7 @@ def test_python_of_a_page_runs(page, tmp_path, monkeypatch):
 def test_train_commands_have_possible_settings(page, command):
     overrides = [word for word in command[2:] if word != "-m" and not word.startswith("resume=")]
     # Of a sweep, the first of each choice.
-    first = [re.sub(r"=([\w.]+),[^\[\]]*$", r"=\1", word) for word in overrides]
+    first = [re.sub(r"=(?:range\()?([\w.]+),[^\[\]]*$", r"=\1", word) for word in overrides]
     check_config(make_config(*first))
 
 
