@@ -44,10 +44,15 @@ SMALL = (
 def make_config(*overrides: str) -> DictConfig:
     """Compose configs/ with overrides; the last override of a key counts.
 
-    Composing takes long: Hydra composes each choice of groups once, and then sets values in copies.
+    Composing takes long: Hydra composes each choice of groups, and keys of its own, once, and then
+    sets values in copies.
     """
     latest = {override.partition("=")[0]: override for override in overrides}
-    groups = [x for key, x in latest.items() if (CONFIGS / key.strip("+~")).is_dir()]
+    groups = [
+        override
+        for key, override in latest.items()
+        if key.startswith("hydra.") or (CONFIGS / key.strip("+~")).is_dir()
+    ]
     cfg = copy.deepcopy(composed(*groups))
     values = [_parsed(x) for x in latest.values() if x not in groups]
     ConfigLoaderImpl._apply_overrides_to_config(values, cfg)
