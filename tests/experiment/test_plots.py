@@ -125,9 +125,10 @@ def test_constraint_figure_of_a_fixed_C():
     rendered(constraint_figure(QPMPC(2, 1, 3, learn=())))
 
 
-def test_closed_loop_figure_shows_paths_costs_and_J(mpc, loops):
-    figure = closed_loop_figure(loops, mpc)
+def test_closed_loop_figure_shows_paths_costs_and_J(mpc, found):
+    figure, loops = closed_loop_figure(mpc, found), found.loops
     left, right = figure.axes
+    assert (left.get_xlabel(), left.get_ylabel()) == ("x", "y")
     assert legend_of(left) == [
         *(f"{name}, J = {cost_text(loop.J)}" for name, loop in loops.items()),
         "predicted at the start",
@@ -199,10 +200,9 @@ def test_costs_that_hardly_differ_have_a_linear_scale(costs, scale):
 def test_the_episode_has_the_loop_and_the_plans_of_every_half_horizon(mpc, found):
     figure = learned_episode_figure(mpc, found)
     loop = found.loops["learned"]
-    assert [axes.get_ylabel() for axes in figure.axes] == [
-        *(f"$s_{{{i}}}$" for i in range(1, 5)),
-        *("$a_{1}$", "$a_{2}$"),
-    ]
+    states = ["x", "y", "velocity in x", "velocity in y"]
+    actions = ["force in x", "force in y"]
+    assert [axes.get_ylabel() for axes in figure.axes] == [*states, *actions]
     with torch.no_grad():
         x, _ = mpc.predicted(mpc.solve(loop.known[:-1:2, 0]).z)
     for axes, real, planned in zip(figure.axes, loop.states[:, 0].mT, x.unbind(-1), strict=False):
@@ -219,6 +219,8 @@ def test_the_episode_has_the_loop_and_the_plans_of_every_half_horizon(mpc, found
         ("house", ["air, °C", "heating, kW", "price, EUR/kWh", "outdoors, °C"]),
         ("house_wall", ["air, °C", "heating, kW", "price, EUR/kWh", "outdoors, °C"]),
         ("four_tanks", ["level 1", "level 2", "pump 1", "pump 2"]),
+        ("gros_zanon", ["$s_{1}$", "$s_{2}$", "$a_{1}$"]),
+        ("inventory", ["stock", "on order", "new order"]),
         ("tank_references", [*(f"level {i}" for i in range(1, 5)), "pump 1", "pump 2"]),
     ],
 )

@@ -98,7 +98,7 @@ def report(
     run.log({f"structure/{name}": distance for name, distance in distances.items()}, update)
     if evaluation.cfg.figures:
         run.figure("structure/C", constraint_figure(mpc), update)
-        run.figure("eval/closed_loop", closed_loop_figure(evaluation.loops, mpc), update)
+        run.figure("eval/closed_loop", closed_loop_figure(mpc, evaluation), update)
         if update == evaluation.cfg.updates:
             draw_outcome(run, mpc, evaluation, update)
     return summary

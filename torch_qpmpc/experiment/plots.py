@@ -19,6 +19,8 @@ from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.mpc.module import QPMPC
 
+#: Symbols of the first two states.
+SYMBOLS = ("$s_1$", "$s_2$")
 #: Colours of the rivals' lines, in their order.
 RIVAL_COLOURS = (
     "0.2",
@@ -31,10 +33,17 @@ RIVAL_COLOURS = (
 )
 
 
-def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, shown: int = 6) -> None:
+def draw_positions(
+    axes: Axes,
+    loops: Mapping[str, ClosedLoop],
+    mpc: QPMPC,
+    outputs: Sequence[str] = SYMBOLS,
+    shown: int = 6,
+) -> None:
     """Draw closed-loop paths from a few starts, and the learned QP's predictions.
 
-    They are in the plane of the first two states or outputs, or over time if there is only one.
+    They are in the plane of the first two states or outputs, of which ``outputs`` are the names, or
+    over time if there is only one.
     """
     plane = mpc.n_x > 1
 
@@ -55,26 +64,28 @@ def draw_positions(axes: Axes, loops: Mapping[str, ClosedLoop], mpc: QPMPC, show
     draw(first.states[:1, :shown], "ko", markersize=3)
     if plane:
         axes.plot(0, 0, "k+", markersize=9)
-    labels = ("$s_1$", "$s_2$") if plane else ("step", "$s_1$")
+    labels = outputs[:2] if plane else ("step", outputs[0])
     axes.set(xlabel=labels[0], ylabel=labels[1], title="Closed loop")
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
 
 
 def learned_episode_figure(mpc: QPMPC, evaluation: Evaluation) -> Figure:
     """Draw the first episode of the learned policy, and its plans after every half horizon."""
-    loop, task = evaluation.loops["learned"], find_task(evaluation.cfg.task)
-    p = loop.known[:, 0]
-    names = {
+    loop = evaluation.loops["learned"]
+    p, times = loop.known[:, 0], torch.arange(len(loop.known), dtype=torch.float64)
+    options = {"times": times, **_episode(mpc, evaluation)}
+    plans = plans_along(mpc, p[:-1], every=max(mpc.horizon // 2, 1))
+    return episode_figure(y=loop.states[:, 0], u=loop.actions[:, 0], plans=plans, **options)
+
+
+def _episode(mpc: QPMPC, evaluation: Evaluation) -> dict[str, Any]:
+    """Return what the task shows of its first episode, with the names of outputs and actions."""
+    symbols = {
         "outputs": [f"$s_{{{i + 1}}}$" for i in range(mpc.n_x)],
         "actions": [f"$a_{{{i + 1}}}$" for i in range(mpc.n_u)],
     }
-    options = {
-        "times": torch.arange(len(p), dtype=torch.float64),
-        **names,
-        **task.episode(evaluation.physics, p[:, : mpc.n_d]),
-    }
-    plans = plans_along(mpc, p[:-1], every=max(mpc.horizon // 2, 1))
-    return episode_figure(y=loop.states[:, 0], u=loop.actions[:, 0], plans=plans, **options)
+    d = evaluation.loops["learned"].known[:, 0, : mpc.n_d]
+    return symbols | dict(find_task(evaluation.cfg.task).episode(evaluation.physics, d))
 
 
 def draw_stage_costs(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
@@ -85,12 +96,12 @@ def draw_stage_costs(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
     axes.legend(fontsize="small")
 
 
-def closed_loop_figure(loops: Mapping[str, ClosedLoop], mpc: QPMPC) -> Figure:
+def closed_loop_figure(mpc: QPMPC, evaluation: Evaluation) -> Figure:
     """Draw paths in the plane with predictions, and the stage cost over time."""
     figure = Figure(figsize=(6, 9), layout="constrained")
     top, bottom = figure.subplots(2, 1, height_ratios=(3, 2))
-    draw_positions(top, loops, mpc)
-    draw_stage_costs(bottom, loops)
+    draw_positions(top, evaluation.loops, mpc, _episode(mpc, evaluation)["outputs"])
+    draw_stage_costs(bottom, evaluation.loops)
     return figure
 
 
@@ -157,5 +168,5 @@ def summary_figure(
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1.5, 1))
     draw_learning(left, updates, J, evaluation)
     draw_matrix(middle, mpc.C, mpc, r"Learned constraint matrix $C_\theta$")
-    draw_positions(right, evaluation.loops, mpc)
+    draw_positions(right, evaluation.loops, mpc, _episode(mpc, evaluation)["outputs"])
     return figure

@@ -11,7 +11,7 @@ from torch_qpmpc.envs import ActuatorNoise
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64
 from torch_qpmpc.experiment.fields import NonNegative, Positive
-from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, plant_scheme, register
+from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, named, plant_scheme, register
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.riccati import noisy_stage_weight
 from torch_qpmpc.mpc.scheme import Scheme
@@ -64,6 +64,7 @@ register(
         true_scheme,
         closed_loop=partial(plant_loop, starts=STARTS),
         nominal_scheme=wrong_scheme,
+        episode=named(("position", "velocity"), ("acceleration",)),
         settings=ActuatorNoiseSettings,
         defaults=None,
     )

@@ -15,6 +15,7 @@ from torch_qpmpc.experiment.fields import Positive
 from torch_qpmpc.experiment.tasks.registry import (
     Task,
     TaskSettings,
+    named,
     plant_layout,
     priced,
     register,
@@ -88,6 +89,7 @@ register(
         true_scheme,
         closed_loop=partial(plant_loop, starts=STARTS),
         nominal_scheme=wrong_scheme,
+        episode=named(("stock", "on order"), ("new order",)),
         settings=InventorySettings,
         defaults=None,
     )

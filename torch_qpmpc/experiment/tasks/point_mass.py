@@ -9,7 +9,7 @@ from torch_qpmpc.envs import PointMass
 from torch_qpmpc.envs.point_mass import NOISE_STD
 from torch_qpmpc.experiment.rivals import tightened
 from torch_qpmpc.experiment.rivals.rival import Rival
-from torch_qpmpc.experiment.tasks.registry import Task, plant_scheme, register
+from torch_qpmpc.experiment.tasks.registry import Task, named, plant_scheme, register
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
 
@@ -38,6 +38,7 @@ register(
         wrong_scheme,
         true_scheme,
         noises=tuple(NOISE_STD),
+        episode=named(("x", "y", "velocity in x", "velocity in y"), ("force in x", "force in y")),
         takes_noise_std=True,
         rivals={"tightened": Rival(tightened.point_mass)},
         defaults=None,

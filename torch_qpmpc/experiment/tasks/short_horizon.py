@@ -15,6 +15,7 @@ from torch_qpmpc.experiment.rivals.rival import Policy, Rival
 from torch_qpmpc.experiment.tasks.registry import (
     Task,
     TaskSettings,
+    named,
     plant_layout,
     plant_scheme,
     register,
@@ -74,6 +75,7 @@ register(
         closed_loop=partial(plant_loop, starts=STARTS),
         rivals={f"{HEAVIER:g} times the action's weight": Rival(tuned)},
         nominal_scheme=wrong_scheme,
+        episode=named(("position", "velocity", "acceleration"), ("jerk",)),
         settings=ShortHorizonSettings,
         defaults=None,
     )
