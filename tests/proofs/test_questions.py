@@ -106,7 +106,7 @@ def test_two_linear_policies_differ_by_their_gains():
 
 
 def test_an_answer_that_the_policy_contradicts_is_an_error(monkeypatch):
-    monkeypatch.setattr(questions, "_policy", lambda mpc, p: np.array([0.123]))
+    monkeypatch.setattr(questions, "action", lambda mpc, p: np.array([0.123]))
     with pytest.raises(SolverError, match="tolerances are too wide for this QP"):
         largest_violation(scheme(), Plant.of(A, B), BOX, **BOUNDS)
 

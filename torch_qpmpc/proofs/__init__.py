@@ -1,5 +1,6 @@
-"""Proofs about a policy on a set of states, as mixed-integer programs: worst cases, invariance."""
+"""Proofs about a policy on a set of states, by mixed-integer programs: worst cases, invariance."""
 
+from torch_qpmpc.proofs.invariant import InvariantSet, invariant_set
 from torch_qpmpc.proofs.polytope import Polytope
 from torch_qpmpc.proofs.questions import (
     Answer,
@@ -11,9 +12,11 @@ from torch_qpmpc.proofs.questions import (
 
 __all__ = [
     "Answer",
+    "InvariantSet",
     "Plant",
     "Polytope",
     "invariance",
+    "invariant_set",
     "largest_difference",
     "largest_violation",
 ]

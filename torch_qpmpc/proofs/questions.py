@@ -152,7 +152,7 @@ def largest_violation(
         >>> largest_violation(mpc, Plant.of(A, B), box, upper=[1.2, 0.6]).proved
         True
     """
-    n = _check(mpc, states)
+    n = check_states(mpc, states)
     sides = ((-1.0, lower), (1.0, upper))
     rows, right = [], []
     for sign, bound in sides:
@@ -182,7 +182,7 @@ def invariance(
     The answer's value is the distance from the set's worst facet. Arguments and errors are those
     of `largest_violation`.
     """
-    _check(mpc, states)
+    check_states(mpc, states)
     length = np.linalg.norm(states.A, axis=1)
     A, b = states.A / length[:, None], states.b / length
     question = f"outside the set after {steps} step{'s' * (steps > 1)}"
@@ -198,8 +198,8 @@ def largest_difference(
         QPError: the QPs know or do different things, or as in `largest_violation`.
         SolverError: HiGHS gives no bound in time.
     """
-    n = _check(first, states)
-    _check(second, states)
+    n = check_states(first, states)
+    check_states(second, states)
     if first.n_u != second.n_u:
         raise QPError.expected("second", f"{second.n_u} actions", f"{first.n_u}")
     began, program = time.perf_counter(), Program()
@@ -210,20 +210,32 @@ def largest_difference(
 
     def replay(x: Array) -> tuple[Array, Array, tuple[Array, ...]]:
         at = p.at(x)
-        return signs @ (_policy(first, at) - _policy(second, at)), at[None], ()
+        return signs @ (action(first, at) - action(second, at)), at[None], ()
 
     worst = _Worst(np.full((1, n), np.nan))
     worst.maximise(program, difference.times(signs), replay, seconds)
     return worst.answer("largest difference of the policies", time.perf_counter() - began)
 
 
-def _check(mpc: QPMPC, states: Polytope) -> int:
+def check_states(mpc: QPMPC, states: Polytope) -> int:
+    """Return n_p; raise unless the states have that many entries."""
     check_kind("mpc", mpc, QPMPC)
     check_kind("states", states, Polytope, "Make one with Polytope.box(lower, upper).")
     if len(states.lower) != mpc.n_p:
         got, want = f"{len(states.lower)} dimensions", f"n_p = {mpc.n_p}"
         raise QPError.expected("states", got, want)
     return mpc.n_p
+
+
+def check_plants(mpc: QPMPC, plant: Plant | Sequence[Plant]) -> list[Plant]:
+    """Return the plants; raise unless each fits the policy."""
+    plants = [plant] if isinstance(plant, Plant) else list(plant)
+    for one in plants:
+        check_kind("plant", one, Plant, "Make one with Plant.of(A, B).")
+        if one.B.shape != (mpc.n_p, mpc.n_u):
+            want = f"({mpc.n_p}, {mpc.n_u}), for p and u"
+            raise QPError.expected("plant.B", f"shape {one.B.shape}", want)
+    return plants
 
 
 def _known(program: Program, states: Polytope) -> Affine:
@@ -234,7 +246,8 @@ def _known(program: Program, states: Polytope) -> Affine:
     return p
 
 
-def _policy(mpc: QPMPC, p: Array) -> Array:
+def action(mpc: QPMPC, p: Array) -> Array:
+    """Return the policy's u_0 ``(*batch, n_u)`` at p ``(*batch, n_p)``."""
     with torch.no_grad():
         return mpc.policy(torch.as_tensor(p, dtype=torch.float64)).numpy()
 
@@ -250,12 +263,7 @@ def _worst(
     seconds: float,
 ) -> Answer:
     """Maximise ``max_i A_i p_steps - b_i`` over the set, the disturbances and the plants."""
-    plants = [plant] if isinstance(plant, Plant) else list(plant)
-    for one in plants:
-        check_kind("plant", one, Plant, "Make one with Plant.of(A, B).")
-        if one.B.shape != (mpc.n_p, mpc.n_u):
-            want = f"({mpc.n_p}, {mpc.n_u}), for p and u"
-            raise QPError.expected("plant.B", f"shape {one.B.shape}", want)
+    plants = check_plants(mpc, plant)
     if steps < 1 or len(plants) ** steps > MOST_MODELS:
         got = f"{steps} steps of {len(plants)} plants"
         raise QPError.expected("steps", got, f"at least one step, and {MOST_MODELS} combinations")
@@ -361,6 +369,6 @@ def _replay(mpc: QPMPC, models: Sequence[Plant], p: Array, noise: Sequence[Array
     """Run the policy on the plants from p; return the states."""
     states = [p]
     for model, d in zip(models, noise, strict=True):
-        p = model.A @ p + model.B @ _policy(mpc, p) + model.offset + model.E @ d
+        p = model.A @ p + model.B @ action(mpc, p) + model.offset + model.E @ d
         states.append(p)
     return np.array(states)
