@@ -50,7 +50,7 @@ def test_it_is_the_linear_laws_largest_invariant_set():
     """Without noise: all p from which 60 steps of the law keep both bounds, row by row."""
     mpc = scheme()
     answer = invariant_set(mpc, Plant.of(A, B), BOX)
-    assert answer.scale == 1.0
+    assert (answer.scale, answer.gain) == (1.0, 1.0)
     assert answer.proof.proved
     K = torch.autograd.functional.jacobian(mpc.policy, torch.zeros(2).double()).numpy()
     rows = np.concatenate((BOX.A, K, -K))
@@ -84,11 +84,21 @@ def test_a_set_that_the_policy_leaves_shrinks(slack):
     whole = invariant_set(scheme(), PLANT, BOX).set
     mpc = bounded(-0.5, slack)
     answer = invariant_set(mpc, PLANT, BOX)
-    assert answer.scale == 0.5
+    assert answer.scale < 1
     assert (answer.set.lower > whole.lower).all()
     assert stays(mpc, [PLANT], answer.set)
     if np.isfinite(slack):
         assert not stays(mpc, [PLANT], whole)
+
+
+def test_a_policy_that_saturates_has_a_larger_set_than_its_linear_law():
+    """A nearly free u has gains at which the law itself violates u's bounds almost everywhere."""
+    mpc = scheme(stage_weight=[1.0, 1.0, 1e-3], action_bounds=([-0.3], [0.3]))
+    answer = invariant_set(mpc, PLANT, BOX)
+    assert answer.gain < 1
+    assert stays(mpc, [PLANT], answer.set)
+    K = torch.autograd.functional.jacobian(mpc.policy, torch.zeros(2).double()).numpy()
+    assert np.abs(answer.set.vertices() @ K.T).max() > 0.6
 
 
 def test_the_set_lies_about_the_equilibrium():
@@ -101,7 +111,7 @@ def test_the_set_lies_about_the_equilibrium():
     around = Polytope.box(BOX.lower + shift, BOX.upper + shift)
     mpc = bounded(-0.1, 100.0)
     answer = invariant_set(mpc, plant, around)
-    assert answer.scale == 0.5
+    assert answer.scale < 1
     assert (answer.set.lower + answer.set.upper) / 2 == pytest.approx(shift, abs=1e-4)
 
 

@@ -1,24 +1,31 @@
 """A robustly positively invariant polytope of a policy: where the state stays for ever.
 
-Without multipliers the policy is affine, u_0 = K p + k, and p+ = A_K p + c + E d. Of the states
-within X the largest set that this law never leaves, for any d, is
+Without multipliers the policy is affine, and bounds of u saturate it. Let u(p) = K p + k be the
+affine law, u_c its action at its equilibrium, and theta in (0, 1]. Where ``u_c + theta (u - u_c)``
+is within the bounds, each saturated u_i lies between ``u_i`` and ``u_ci + theta (u_i - u_ci)`` (Hu,
+Lin and Chen). So a convex set that none of these laws leaves is one that the saturated law does not
+leave. Of the states within X and those bounds, the largest one is
 
-    O = {p: p_t in X for all t >= 0 and all d},
+    O = {p: p_t in X for all t >= 0, all d and any such law at each t},
 
-a polytope of the rows ``a'p <= b`` of X and of their predecessors ``(A_K'a)'p <= b - a'c - h(a)``,
-h(a) = max_d a'E d, until all new ones are redundant. In O the QP's other rows may bend the policy
-away from the law, so that O is a candidate, and `invariance` of the policy itself decides.
+a polytope of the rows ``a'p <= b`` of X and of their predecessors ``(A_j'a)'p <= b - a'c_j - h(a)``
+by each law ``p+ = A_j p + c_j + E d``, h(a) = max_d a'E d, until all new ones are redundant. The QP
+does not just saturate its affine law, so that O is a candidate, and `invariance` of the policy
+itself decides.
 
 References: Gilbert and Tan (1991), "Linear systems with state and control constraints: the theory
 and application of maximal output admissible sets", IEEE TAC 36; with disturbances, Kolmanovsky and
 Gilbert (1998), "Theory and computation of disturbance invariant sets for discrete-time linear
-systems", Mathematical Problems in Engineering 4.
+systems", Mathematical Problems in Engineering 4; saturated, Hu, Lin and Chen (2002), "Analysis and
+design for discrete-time linear systems subject to actuator saturation", Systems & Control Letters
+45.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linprog
@@ -39,9 +46,11 @@ from torch_qpmpc.proofs.questions import (
 
 Array = np.ndarray
 #: Fractions of the bounds that are tried, the largest first.
-SCALES = np.arange(10, 0, -1) / 10
+SCALES = (1.0, 0.8, 0.6, 0.4, 0.2)
+#: Fractions theta of the gain of a saturated law, all of them at each scale.
+GAINS = (1.0, 1 / 4, 1 / 16)
 #: Rows of a candidate, which a law near the limit of stability would exceed.
-MOST_ROWS = 500
+MOST_ROWS = 200
 #: Distance from its facets that the linear law keeps in a candidate: above HiGHS' tolerances.
 MARGIN = 2 * TOLERANCE
 
@@ -52,12 +61,14 @@ class InvariantSet:
 
     Attributes:
         set: the polytope.
-        scale: the fraction of the bounds within which it is the linear law's largest.
+        scale: the fraction of the bounds within which it is the saturated law's largest.
+        gain: theta, the fraction of the law's gain that keeps these bounds of u.
         proof: the answer of `invariance`.
     """
 
     set: Polytope
     scale: float
+    gain: float
     proof: Answer
 
 
@@ -66,9 +77,9 @@ def invariant_set(
 ) -> InvariantSet:
     """Find a set within ``states`` that the policy never leaves, for any disturbance.
 
-    The candidates are the largest such sets of the law without multipliers, within ``states`` and
-    the bounds of u, both scaled about the law's equilibrium: by 1, 0.9, .., 0.1. The first that
-    `invariance` proves is returned.
+    The candidates are the largest such sets of the law without multipliers, saturated, within
+    ``states`` and the bounds of u, both scaled about the law's equilibrium: by 1, 0.8, .., 0.2. The
+    first that `invariance` proves is returned.
 
     Args:
         mpc: the QP.
@@ -94,20 +105,21 @@ def invariant_set(
     """
     check_states(mpc, states)
     plants, tables = check_plants(mpc, plant), make_tables(mpc)
-    closed = [one.A + one.B @ tables.K for one in plants]
-    radius = max(float(np.abs(np.linalg.eigvals(A)).max()) for A in closed)
-    if radius >= 1:
+    laws = _laws(tables, plants, np.zeros(mpc.n_u), 1.0)
+    if (radius := _radius(laws)) >= 1:
         want = "a linear law with a spectral radius below 1"
         raise QPError.expected("mpc", f"{radius:.4g} without its inequalities", want)
-    A, b = _bounds(tables, states)
-    centre = _equilibrium(tables, plants[0], closed[0])
-    for scale in SCALES:
-        candidate = _largest(tables, plants, A, scale * b + (1 - scale) * A @ centre)
-        if candidate is None:
-            break
-        proof = _proof(mpc, plants, candidate, seconds)
-        if proof is not None and proof.proved:
-            return InvariantSet(candidate, float(scale), proof)
+    centre = _equilibrium(laws[0])
+    u = tables.K @ centre + tables.k
+    for scale, gain in itertools.product(SCALES, GAINS):
+        laws = _laws(tables, plants, u, gain)
+        if _radius(laws) >= 1:
+            continue
+        A, b = _bounds(tables, states, u, gain)
+        candidate = _largest(laws, A, scale * b + (1 - scale) * A @ centre)
+        proof = None if candidate is None else _proof(mpc, plants, candidate, seconds)
+        if candidate is not None and proof is not None and proof.proved:
+            return InvariantSet(candidate, scale, gain, proof)
     raise QPError.expected(
         "states",
         "a set without a part that is proved invariant",
@@ -116,37 +128,52 @@ def invariant_set(
     )
 
 
-def _bounds(tables: Tables, states: Polytope) -> tuple[Array, Array]:
-    """Return the rows of the states and of the bounds of u without multipliers, of length 1."""
-    A = np.concatenate((states.A, tables.K, -tables.K))
-    b = np.concatenate((states.b, tables.u_upper - tables.k, tables.k - tables.u_lower))
+def _laws(tables: Tables, plants: list[Plant], u: Array, gain: float) -> list[Plant]:
+    """Return the plants in a loop with the affine law, each bounded u_i by itself or ``gain``."""
+    bounded = np.isfinite(tables.u_lower) | np.isfinite(tables.u_upper)
+    laws = []
+    for gains in itertools.product(*[{1.0, gain} if one else {1.0} for one in bounded]):
+        K, k = np.diag(gains) @ tables.K, u + gains * (tables.k - u)
+        laws += [replace(x, A=x.A + x.B @ K, offset=x.B @ k + x.offset) for x in plants]
+    return laws
+
+
+def _radius(laws: list[Plant]) -> float:
+    return max(float(np.abs(np.linalg.eigvals(law.A)).max()) for law in laws)
+
+
+def _equilibrium(law: Plant) -> Array:
+    """Return the state at which a law rests, at the disturbances' middle."""
+    shift = law.offset
+    if law.disturbances is not None:
+        shift = shift + law.E @ (law.disturbances.lower + law.disturbances.upper) / 2
+    return np.linalg.solve(np.eye(len(shift)) - law.A, shift)
+
+
+def _bounds(tables: Tables, states: Polytope, u: Array, gain: float) -> tuple[Array, Array]:
+    """Return rows of length 1: the states, and the bounds of ``u + gain (K p + k - u)``."""
+    K, k = gain * tables.K, u + gain * (tables.k - u)
+    A = np.concatenate((states.A, K, -K))
+    b = np.concatenate((states.b, tables.u_upper - k, k - tables.u_lower))
     length = np.linalg.norm(A, axis=1)
     kept = np.isfinite(b) & (length > 0)
     return A[kept] / length[kept, None], b[kept] / length[kept]
 
 
-def _equilibrium(tables: Tables, plant: Plant, closed: Array) -> Array:
-    """Return the state at which the law without multipliers rests, at the disturbances' middle."""
-    shift = plant.B @ tables.k + plant.offset
-    if plant.disturbances is not None:
-        shift = shift + plant.E @ (plant.disturbances.lower + plant.disturbances.upper) / 2
-    return np.linalg.solve(np.eye(len(closed)) - closed, shift)
-
-
-def _largest(tables: Tables, plants: list[Plant], A: Array, b: Array) -> Polytope | None:
-    """Return the linear law's largest invariant set in A p <= b; None without one of few rows."""
+def _largest(laws: list[Plant], A: Array, b: Array) -> Polytope | None:
+    """Return the largest set in A p <= b that no law leaves; None without one of few rows."""
     i = 0
     while i < len(b):
-        for plant in plants:
-            row = A[i] @ (plant.A + plant.B @ tables.K)
-            shift = A[i] @ (plant.B @ tables.k + plant.offset) + _push(plant, A[i])
-            right, most = b[i] - shift - MARGIN, _most(A, b, row)
+        for law in laws:
+            row = A[i] @ law.A
+            right = b[i] - A[i] @ law.offset - _push(law, A[i]) - MARGIN
+            most = _most(A, b, row)
+            if most == -np.inf or len(b) > MOST_ROWS:
+                return None
             if most > right:
                 length = float(np.linalg.norm(row)) or 1.0
                 A, b = np.vstack((A, row / length)), np.append(b, right / length)
         i += 1
-        if len(b) > MOST_ROWS or _most(A, b, A[0]) == -np.inf:
-            return None
     kept = np.ones(len(b), bool)
     for i in range(len(b)):
         kept[i] = False
