@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import OptimizeResult
 
 from torch_qpmpc import SolverError
+from torch_qpmpc.proofs import program as module
 from torch_qpmpc.proofs.program import Affine, Program
 
 
@@ -35,6 +37,23 @@ def test_affine_functions_add_and_have_constants():
     best = program.maximise(total)
     assert best.value == pytest.approx(13)
     assert total.at(best.x) == pytest.approx([13])
+
+
+def test_a_program_that_presolve_spoils_is_solved_without_it(monkeypatch):
+    unknown = OptimizeResult(status=4, fun=0.0, message="model_status is Unknown")
+    solve, presolved = module.milp, []
+
+    def milp(*arguments, options, **others):
+        presolved.append(options["presolve"])
+        return unknown if options["presolve"] else solve(*arguments, options=options, **others)
+
+    monkeypatch.setattr(module, "milp", milp)
+    program, objective = knapsack()
+    assert program.maximise(objective).bound == pytest.approx(11)
+    assert presolved == [True, False]
+    monkeypatch.setattr(module, "milp", lambda *arguments, **others: unknown)
+    with pytest.raises(SolverError, match="model_status is Unknown"):
+        program.maximise(objective)
 
 
 def test_a_copy_grows_apart():

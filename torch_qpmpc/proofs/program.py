@@ -12,6 +12,8 @@ from scipy.sparse import csr_array, vstack
 from torch_qpmpc.errors import SolverError
 
 Array = np.ndarray
+#: The status that scipy gives to an outcome of HiGHS without a name.
+UNKNOWN = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,13 +113,16 @@ class Program:
         cost, relaxed = np.zeros(len(self.lower)), relaxed or not self.binaries
         np.add.at(cost, objective.columns, -objective.matrix[0])
         options = {"mip_rel_gap": 0.0} | ({"time_limit": seconds} if np.isfinite(seconds) else {})
-        result = milp(
-            cost,
-            integrality=np.zeros(len(cost)) if relaxed else self.binary,
-            bounds=(self.lower, self.upper),
-            constraints=self._constraints(),
-            options=options,
-        )
+        for presolve in (True, False):  # by presolve's round-off HiGHS can miss an optimum
+            result = milp(
+                cost,
+                integrality=np.zeros(len(cost)) if relaxed else self.binary,
+                bounds=(self.lower, self.upper),
+                constraints=self._constraints(),
+                options=options | {"presolve": presolve},
+            )
+            if result.status != UNKNOWN:
+                break
         bound = result.fun if relaxed else result.get("mip_dual_bound")
         if bound is None or result.status not in (0, 1):
             raise SolverError(f"HiGHS gave no bound of the worst case: {result.message}")
