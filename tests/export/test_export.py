@@ -148,6 +148,7 @@ def test_a_large_qp_is_compared_at_fewer_states_with_the_interior_point(tmp_path
         monkeypatch.setattr(part, "LARGE", 4)
     monkeypatch.setattr(reference, "_exact", None)  # not called
     agreement = tied().export_c(tmp_path).agreement
+    assert agreement is not None
     assert agreement.states == module.LEAST
     assert agreement.solved >= module.LEAST // 2
     assert agreement.u < 1e-8
