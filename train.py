@@ -41,7 +41,7 @@ from torch_qpmpc.experiment.metrics import report, run_summary, table, update_me
 from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
-from torch_qpmpc.experiment.start import begin_learning, make_start, transitions
+from torch_qpmpc.experiment.start import learning_start, make_start, transitions
 from torch_qpmpc.experiment.tally import Tally
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics, resume_arguments
 
@@ -75,8 +75,10 @@ def _train(
     # The QP, and J of all that it is compared with.
     physics = make_physics(cfg)
     identified = make_start(cfg, physics, folder, written=state is not None, quiet=quiet)
-    mpc = make_mpc(cfg, physics, identified)
-    evaluation = Evaluation.before(cfg, physics, mpc, quiet)
+    start = make_mpc(cfg, physics, identified)
+    evaluation = Evaluation.before(cfg, physics, start, quiet)
+    scheme = learning_start(cfg, identified)
+    mpc = start if scheme is identified else make_mpc(cfg, physics, scheme)
 
     # The learner: Q-learning of first or second order, or actor-critic.
     operator = make_operator(cfg, mpc)
@@ -85,7 +87,8 @@ def _train(
         mpc.release()
     learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
     gate = RunGate(cfg, learner, physics, quiet)
-    begin_learning(cfg, physics, identified, mpc)
+    if state is None and mpc is not start:
+        gate.keep(start)
 
     # The data: vectorised episodes under the current policy, and their replay.
     collector = make_collector(cfg, physics, gate.acting)

@@ -18,9 +18,9 @@ import train
 from tests.runs import SMALL, make_config, run_command
 from tests.stops import stop
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.choosing import choose, chosen_before, starts
+from torch_qpmpc.experiment.choosing import _is_less, choose, chosen_before, starts
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
-from torch_qpmpc.experiment.start import begin_learning, collect_log
+from torch_qpmpc.experiment.start import collect_log, learning_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.choice import HELD, MEAN_ACTION, STARTS, Choice, Row
 from torch_qpmpc.study.runs import FinishedRun
@@ -95,7 +95,7 @@ def test_a_start_that_costs_less_than_zero_action_is_chosen():
     assert sorted(row.episodes for row in rows.values()) == [2] * 4 + [4] * 6
     assert start.summary["start_transitions"] == sum(r.episodes for r in rows.values()) * 10
     lines = str(choice).splitlines()
-    assert lines[-1] == f"Chosen by 320 transitions of the plant: {choice.name}"
+    assert lines[-1] == f"Chosen by at most 320 transitions of the plant: {choice.name}"
     assert lines[0].split() == ["start", "R2", "episodes", "J"]
     assert len(lines) == 2 + len(rows)
 
@@ -109,19 +109,46 @@ def test_zero_action_is_held_if_nothing_costs_less():
     assert mpc.policy(s).abs().max() < 1e-12
 
 
-@pytest.mark.parametrize("bounds", ["task.observation_bounds=true", "constraint=mpc"])
-def test_learning_begins_with_the_best_scheme_where_a_gate_keeps_the_held_action(bounds):
-    cfg, physics, start, choice = chosen(*HOPELESS, bounds)
+def test_learning_begins_with_the_best_scheme_where_a_gate_keeps_the_held_action():
+    cfg, physics, start, choice = chosen(*HOPELESS)
     assert choice.scheme not in HELD
-    scheme = make_mpc(cfg, physics, start._replace(held=None))
     cfg.gate = False
-    mpc, s = make_mpc(cfg, physics, start), torch.randn(16, 1, dtype=torch.float64)
-    begin_learning(cfg, physics, start, mpc)
-    assert mpc.policy(s).abs().max() < 1e-12
+    assert learning_start(cfg, start) is start
     cfg.gate = True
-    begin_learning(cfg, physics, start, mpc)
-    assert_close(mpc.policy(s), scheme.policy(s), rtol=0, atol=0)
-    assert mpc.policy(s).abs().max() > 1e-3
+    s = torch.randn(16, 1, dtype=torch.float64)
+    assert make_mpc(cfg, physics, learning_start(cfg, start)).policy(s).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("gate=true", "task.observation_bounds=true", "optimizer=gauss_newton"),
+        ("gate=true", "constraint=mpc", "optimizer=gauss_newton", "release=2"),
+        ("gate=act", "algo=td3", "constraint=free", "warm_start=false"),
+    ],
+    ids=" ".join,
+)
+def test_the_gate_keeps_the_held_action_and_the_run_resumes(tmp_path, monkeypatch, settings):
+    cfg, whole, cut = make_config(*HOPELESS, *settings), tmp_path / "whole", tmp_path / "cut"
+    summary = train.train(cfg, str(whole), quiet=True)
+    assert summary["start"] == ZERO_ACTION
+    assert summary["J_best"] == summary["J_start"] < summary["J_final"]
+    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
+    run_command(f"resume={cut}")
+    assert FinishedRun(cut).summary["J_final"] == summary["J_final"]
+
+
+def test_the_runs_own_scheme_wins_a_tie():
+    row = Row(0.5, 4, 0.0, 0.0, 40, False)
+    rows = {"own": row, "other": row, ZERO_ACTION: row._replace(chosen=True)}
+    assert Choice(rows).scheme == "own"
+
+
+def test_a_finite_cost_is_less_than_an_infinite_one():
+    inf = torch.inf
+    assert _is_less(torch.tensor([-inf, -inf, -1.0]))
+    assert not _is_less(torch.tensor([-inf, inf, -1.0]))
+    assert not _is_less(torch.tensor([1.0, inf, 2.0]))
 
 
 @pytest.mark.parametrize("hessian", ["block", "diagonal", "full"])
@@ -178,6 +205,13 @@ def test_the_table_is_kept_and_damage_is_named(tmp_path):
     table.to_csv(tmp_path / STARTS, index=False)
     with pytest.raises(QPError, match=r"starts\.csv: got .*expected the table of starts"):
         Choice.read(tmp_path)
+
+
+def test_a_run_without_its_table_is_named(tmp_path, monkeypatch):
+    assert stop(monkeypatch, make_config(*HOPELESS), tmp_path / "cut", 3) == 128 + signal.SIGTERM
+    (tmp_path / "cut" / STARTS).unlink()
+    with pytest.raises(SystemExit, match=r"starts\.csv: got no file, .* Start a new run"):
+        run_command(f"resume={tmp_path / 'cut'}")
 
 
 def test_a_table_of_another_log_is_named():

@@ -98,6 +98,7 @@ def test_sizes_are_whole_numbers_of_any_kind():
         ({"n_mixed": 1.0}, "n_mixed: got 1.0, expected a whole number >= 0"),
         ({"blocks": 3}, "blocks: got 3, expected whole numbers >= 1 with the horizon 3 as their"),
         ({"blocks": [1, 1]}, r"blocks: got \[1, 1\], .* sum\. The last one may hold its actions"),
+        ({"blocks": [float("inf")]}, r"blocks: got \[inf\], expected whole numbers >= 1"),
         ({"blocks": [3, 0]}, r"blocks: got \[3, 0\], expected whole numbers >= 1"),
         ({"blocks": [1.5, 1.5]}, r"blocks: got \[1.5, 1.5\], expected whole numbers >= 1"),
     ],

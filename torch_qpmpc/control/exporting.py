@@ -172,10 +172,10 @@ def _run(design: Design, step: Callable[..., Array], steps: int) -> Loop:
     """Return signals of a closed loop of ``step``, with noise, a load and moving set-points.
 
     It ends early where no input satisfies the hard bounds. Each controller closes a loop of its
-    own: replayed outputs would tell of rounding alone if a controller is unstable by itself.
+    own: replaying outputs through an unstable controller would measure rounding alone.
     """
     rng = np.random.default_rng(0)
-    plant, rows = design.plant, steps + design.horizon + 1
+    plant, rows = design.plant, COMPARED + design.horizon + 1
     size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
     d = 0.1 * rng.normal(size=(rows, len(plant.known)))

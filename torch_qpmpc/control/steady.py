@@ -53,7 +53,7 @@ class Steady:
             got = "a mode at 1 that no input moves"
             raise QPError.expected("model", got, "a model with a steady state", remedy)
         Z = scipy.linalg.null_space(balance, rcond=RANK)
-        Z = np.where(np.abs(Z) < RANK, 0.0, Z)  # a bound could hold by a huge v times rounding
+        Z = np.where(np.abs(Z) < RANK, 0.0, Z)  # rounding would let a bound hold by a huge v
         loads = np.hstack((w.B, plant.E, plant.offset[:, None]))
         M = -np.linalg.pinv(balance) @ loads
         y = plant.C @ M[:n] + np.hstack((w.C, np.zeros((len(plant.C), n_d + 1))))

@@ -72,7 +72,7 @@ def _preference(design: Design) -> float:
 def _bounds(design: Design, error: Array, inputs: Array) -> Bounds:
     """Return rows of u_s, hard, and of y_s, at their prices.
 
-    A disturbance alone determines what v does not change, within bounds or not: that has no row.
+    Rows that v does not change are left out: a disturbance alone determines them.
     """
     n_y, steady = len(design.Q), design.steady
     outputs = error.copy()

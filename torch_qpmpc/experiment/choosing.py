@@ -78,7 +78,7 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
             for name in left:
                 bar.set_postfix_str(name)
                 more = _costs(cfg, physics, policies[name](), len(costs[name]), count)
-                costs[name] = torch.cat((costs[name], more.sum(0).nan_to_num(torch.inf)))
+                costs[name] = torch.cat((costs[name], more.sum(0).nan_to_num(torch.inf, torch.inf)))
                 steps[name] += more.numel()
                 bar.update()
             others = [name for name in left if name != ZERO_ACTION]
@@ -130,8 +130,8 @@ def _costs(cfg: DictConfig, physics: AnyPlant, policy: Any, done: int, count: in
 
 def _is_less(differences: Tensor) -> bool:
     """Return True if the mean of ``differences`` is negative, by a one-sided t-test."""
-    t = float(stdtrit(len(differences) - 1, CONFIDENCE))
-    return bool(differences.mean() + t * _error(differences) < 0)
+    mean, t = differences.mean().item(), float(stdtrit(len(differences) - 1, CONFIDENCE))
+    return mean == -math.inf or mean + t * _error(differences) < 0
 
 
 def _error(costs: Tensor) -> float:

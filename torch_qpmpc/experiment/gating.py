@@ -115,6 +115,11 @@ class RunGate:
         self.simulated += costs.numel()
         return costs.sum(0)
 
+    def keep(self, mpc: QPMPC) -> None:
+        """Keep the policy of a QP, until a candidate costs less; a network stays what it is."""
+        if self.mpc is not None:
+            self.mpc.load_state_dict(mpc.state_dict())
+
     def release(self, learner: Learner) -> None:
         """Free the C of the policy that is kept, as the new ``learner``'s is."""
         self._learner = learner

@@ -16,12 +16,11 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.choosing import choose, chosen_before
-from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
+from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.files import write_whole
 from torch_qpmpc.learning.replay import Replay
-from torch_qpmpc.mpc.module import QPMPC
 
 #: The log in a run's folder.
 LOG = "log.pt"
@@ -103,10 +102,14 @@ def make_start(
         log = stored_log(Path(cfg.start.file))
     else:
         log = collect_log(cfg, physics)
+    chosen = bool(cfg.task.get("start_episodes"))
     choice = Choice.read(path.parent) if written else None
+    if written and chosen and choice is None:
+        want = "the table that the run wrote"
+        raise QPError.expected("starts.csv", "no file", want, "Start a new run.")
     if choice is not None:
         start = chosen_before(cfg, physics, log, choice)
-    elif cfg.task.get("start_episodes") and not written:
+    elif chosen:
         start = choose(cfg, physics, log, quiet)
     else:
         start = identified_start(cfg, physics, log)
@@ -122,13 +125,14 @@ def make_start(
     return start
 
 
-def begin_learning(cfg: DictConfig, physics: AnyPlant, start: Start | None, mpc: QPMPC) -> None:
-    """Load the theta of the scheme where ``start`` holds an action, which the gate has kept.
+def learning_start(cfg: DictConfig, start: Start | None) -> Start | None:
+    """Return the start that learning begins with: where one holds an action, that of the scheme.
 
-    Without a gate learning begins with the held action, since what is learned is kept.
+    The gate keeps the action. Without a gate what is learned is kept, from the action on.
     """
-    if start is not None and start.held is not None and cfg.gate:
-        mpc.load_state_dict(make_mpc(cfg, physics, start._replace(held=None)).state_dict())
+    if start is None or start.held is None or not cfg.gate:
+        return start
+    return start._replace(held=None)
 
 
 def collect_log(cfg: DictConfig, physics: AnyPlant) -> TensorDict:

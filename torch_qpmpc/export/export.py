@@ -30,8 +30,8 @@ from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.qp.program import Status
 
 STORAGES = ("fast", "small")
-#: Number of random states that the compiled policy is compared at; fewer, but at least so many,
-#: of a `LARGE` QP, whose cold solves take long.
+#: Number of random states that the compiled policy is compared at; at least `LEAST` for a `LARGE`
+#: QP, whose cold solves take long.
 COMPARED, LEAST = 400, 40
 #: Largest share of the solvable states that may be uncertified.
 UNSOLVED = 0.1

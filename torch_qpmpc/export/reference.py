@@ -16,7 +16,7 @@ import scipy
 import torch
 
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.qp.program import Status
+from torch_qpmpc.qp.program import QuadraticProgram, Status
 from torch_qpmpc.qp.solution import row_states
 from torch_qpmpc.qp.solve import solve_qp
 
@@ -53,7 +53,7 @@ class Reference:
 def reference(mpc: QPMPC, p: Array, solver: str | None = None) -> Reference:
     """Return the certified solutions of V at p ``(B, n_p)`` by a solver of the package."""
     qp = mpc.quadratic_program()
-    solver = solver or ("daqp" if len(qp.G) <= LARGE else "torch")
+    solver = solver or ("torch" if _is_large(qp) else "daqp")
     fixed = torch.as_tensor(p, dtype=qp.q.dtype, device=qp.q.device)
     solution = solve_qp(qp, fixed, solver=solver, on_failure="mask")
     solved = (solution.status == Status.SOLVED).cpu().numpy()
@@ -67,10 +67,15 @@ def reference(mpc: QPMPC, p: Array, solver: str | None = None) -> Reference:
     )
 
 
+def _is_large(qp: QuadraticProgram) -> bool:
+    """Return True for more than `LARGE` rows with a bound."""
+    return int((qp.lb.isfinite() | qp.ub.isfinite()).sum()) > LARGE
+
+
 def sharpen(mpc: QPMPC, p: Array, coarse: Reference, which: Array) -> Reference:
     """Replace solutions of ``coarse`` at the indices ``which`` by exact ones."""
     qp = mpc.quadratic_program()
-    if len(qp.G) > LARGE:
+    if _is_large(qp):
         return coarse
     data = [x.detach().double().cpu().numpy() for x in qp.tensors()]
     u, value = coarse.u.copy(), coarse.value.copy()

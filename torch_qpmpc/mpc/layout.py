@@ -279,7 +279,7 @@ def read_blocks(blocks: Sequence[int], horizon: int) -> tuple[int, ...]:
     want = f"whole numbers >= 1 with the horizon {horizon} as their sum"
     try:
         sizes = [int(size) for size in blocks]
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise QPError.expected("blocks", repr(blocks), want) from error
     if sizes and (min(sizes) < 1 or sum(sizes) != horizon or sizes != [*blocks]):
         remedy = "The last one may hold its actions to the end."

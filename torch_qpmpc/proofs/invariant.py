@@ -182,9 +182,9 @@ def _largest(laws: list[Plant], A: Array, b: Array) -> Polytope | None:
 
 
 def _most(A: Array, b: Array, row: Array) -> float:
-    """Return the largest ``row'x`` with A x <= b: inf if unbounded, -inf if the set is empty."""
+    """Return the largest ``row'x`` with A x <= b: -inf if the set is empty, inf if not decided."""
     result = linprog(-row, A, b, bounds=(None, None), method="highs")
-    return -result.fun if result.status == 0 else np.inf if result.status == 3 else -np.inf
+    return -result.fun if result.status == 0 else -np.inf if result.status == 2 else np.inf
 
 
 def _push(plant: Plant, row: Array) -> float:
@@ -194,9 +194,9 @@ def _push(plant: Plant, row: Array) -> float:
 
 
 def _proof(mpc: QPMPC, plants: list[Plant], candidate: Polytope, seconds: float) -> Answer | None:
-    """Prove that the policy stays in the candidate; None if a vertex already refutes it."""
-    p = candidate.vertices()
+    """Prove that the policy stays in the candidate; None if a vertex refutes it or if undecided."""
     try:
+        p = candidate.vertices()
         u = action(mpc, p)
         for one in plants:
             push = np.array([_push(one, row) for row in candidate.A])
@@ -204,5 +204,5 @@ def _proof(mpc: QPMPC, plants: list[Plant], candidate: Polytope, seconds: float)
             if (after @ candidate.A.T + push > candidate.b + TOLERANCE).any():
                 return None
         return invariance(mpc, plants, candidate, seconds=seconds)
-    except (QPError, SolverError):  # no plan with slack somewhere in the candidate
+    except (QPError, SolverError):  # flat, without a plan with slack somewhere, or out of time
         return None

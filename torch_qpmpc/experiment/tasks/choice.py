@@ -21,8 +21,8 @@ MEAN_ACTION = "mean action of the log"
 #: The starts that hold an action.
 HELD = {ZERO_ACTION, MEAN_ACTION}
 NOTHING = (
-    "No start is shown to cost less than zero action: that is kept until learning costs less. One "
-    "linear scheme of this log does not control the plant. Pass a log about the states where the "
+    "No start is shown to cost less than zero action, which is the start. Perhaps no linear scheme "
+    "of this log controls the plant: pass a log about the states where the "
     "controller is to work (start.file), the plant's own cost (task.stage_weight), or learn a "
     "network (algo=td3 algo.actor=mlp)."
 )
@@ -33,7 +33,7 @@ class Row(NamedTuple):
 
     ``R2`` is the share of the outputs' variance that is predicted N steps ahead, cross-validated,
     in the mean over the outputs; ``J`` the mean cost of the ``episodes``, ``error`` its standard
-    error, and ``transitions`` the number of their steps.
+    error, and ``transitions`` at most the number of their steps: those that end early have fewer.
     """
 
     R2: float
@@ -58,7 +58,8 @@ class Choice:
     @property
     def scheme(self) -> str:
         """The name of the best start that holds no action, with which learning begins."""
-        return min(self.rows.keys() - HELD, key=lambda name: self._rank(self.rows[name]))
+        schemes = [name for name in self.rows if name not in HELD]  # the run's own wins a tie
+        return min(schemes, key=lambda name: self._rank(self.rows[name]))
 
     def _rank(self, row: Row) -> tuple[bool, int, float]:
         return not row.chosen, -row.episodes, row.J
@@ -80,7 +81,9 @@ class Choice:
             R2 = "" if math.isnan(row.R2) else f"{row.R2:.3f}"
             J = f"{cost_text(row.J)} +- {cost_text(row.error)}"
             lines.append(f"{name:{width}}{R2:>8}{row.episodes:10}  {J}")
-        lines.append(f"Chosen by {self._transitions:,} transitions of the plant: {self.name}")
+        lines.append(
+            f"Chosen by at most {self._transitions:,} transitions of the plant: {self.name}"
+        )
         return "\n".join(lines + [NOTHING] * (self.name == ZERO_ACTION))
 
     def write(self, folder: Path) -> None:
@@ -101,9 +104,15 @@ class Choice:
         if not file.exists():
             return None
         try:
-            table = pd.read_csv(file, index_col="start")
+            exact = dict.fromkeys(("R2", "J", "error"), _number)  # pandas before 3.1 rounds
+            table = pd.read_csv(file, index_col="start", converters=exact)
             choice = cls({str(name): Row(*row) for name, *row in table.itertuples()})
             _ = choice.name
         except Exception as error:  # damaged files raise errors of any type
             raise damaged(file, error, "the table of starts that a run wrote") from error
         return choice
+
+
+def _number(text: str) -> float:
+    """Return the number in a cell; nan if it is empty."""
+    return float(text or "nan")
