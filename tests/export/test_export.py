@@ -155,6 +155,14 @@ def test_a_large_qp_is_compared_at_fewer_states_with_the_interior_point(tmp_path
     assert agreement.value < 1e-8
 
 
+def test_rows_without_a_bound_do_not_make_a_qp_large():
+    A, B = torch.eye(4), torch.ones(4, 2)
+    options = {"stage_weight": [1.0] * 6, "action_bounds": ([-1.0] * 2, [1.0] * 2)}
+    qp = QPMPC.from_model(A, B, 40, **options).quadratic_program()
+    assert len(qp.G) > reference.LARGE
+    assert not reference._is_large(qp)
+
+
 def shifted(**options) -> QPMPC:
     """Make a scheme with two actions in percent, far from 0, and hard limits of their changes."""
     zeros = torch.zeros(2, 2)
