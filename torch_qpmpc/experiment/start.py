@@ -88,7 +88,8 @@ def make_start(
         The start; None with ``start=model``.
 
     Raises:
-        QPError: the log cannot be read or identified, or the plant cannot be explored.
+        QPError: the log or the table of starts cannot be read, the log is not identified, or the
+            plant cannot be explored.
     """
     if cfg.start.name != "data":
         return None

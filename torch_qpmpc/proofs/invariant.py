@@ -28,12 +28,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linprog
 
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.proofs.polytope import Polytope
+from torch_qpmpc.proofs.polytope import Polytope, support
 from torch_qpmpc.proofs.questions import (
     TOLERANCE,
     Answer,
@@ -167,30 +166,24 @@ def _largest(laws: list[Plant], A: Array, b: Array) -> Polytope | None:
         for law in laws:
             row = A[i] @ law.A
             right = b[i] - A[i] @ law.offset - _push(law, A[i]) - MARGIN
-            most = _most(A, b, row)
-            if most == -np.inf or len(b) > MOST_ROWS:
+            reached = support(A, b, row)
+            if reached == -np.inf or not np.isfinite(right) or len(b) > MOST_ROWS:
                 return None
-            if most > right:
+            if not reached <= right:  # undecided ones are kept
                 length = float(np.linalg.norm(row)) or 1.0
                 A, b = np.vstack((A, row / length)), np.append(b, right / length)
         i += 1
     kept = np.ones(len(b), bool)
     for i in range(len(b)):
         kept[i] = False
-        kept[i] = _most(A[kept], b[kept], A[i]) > b[i]
+        kept[i] = not support(A[kept], b[kept], A[i]) <= b[i]
     return Polytope.of(A[kept], b[kept])
-
-
-def _most(A: Array, b: Array, row: Array) -> float:
-    """Return the largest ``row'x`` with A x <= b: -inf if the set is empty, inf if not decided."""
-    result = linprog(-row, A, b, bounds=(None, None), method="highs")
-    return -result.fun if result.status == 0 else -np.inf if result.status == 2 else np.inf
 
 
 def _push(plant: Plant, row: Array) -> float:
     """Return h(row), the most that a disturbance adds to it."""
     d = plant.disturbances
-    return 0.0 if d is None else _most(d.A, d.b, row @ plant.E)
+    return 0.0 if d is None else support(d.A, d.b, row @ plant.E)
 
 
 def _proof(mpc: QPMPC, plants: list[Plant], candidate: Polytope, seconds: float) -> Answer | None:

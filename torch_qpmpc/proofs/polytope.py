@@ -17,6 +17,12 @@ Array = np.ndarray
 MOST = 8
 
 
+def support(A: Array, b: Array, row: Array) -> float:
+    """Return the support function, max row'x with A x <= b; -inf if empty, nan if undecided."""
+    result = linprog(-row, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
+    return -result.fun if result.status == 0 else {2: -np.inf, 3: np.inf}.get(result.status, np.nan)
+
+
 @dataclass(frozen=True, eq=False)
 class Polytope:
     """The points x with ``A x <= b``, a bounded set.
@@ -43,13 +49,13 @@ class Polytope:
             raise QPError.expected("A and b of the polytope", got, "(m, n) and (m,)")
         if not (np.isfinite(A).all() and np.isfinite(b).all()):
             raise QPError.expected("A and b of the polytope", "NaN or inf", "finite entries")
-        ends = []
-        for row in np.concatenate((np.eye(A.shape[1]), -np.eye(A.shape[1]))):
-            result = linprog(-row, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
-            if result.status != 0:
-                kind = {2: "an empty", 3: "an unbounded"}.get(result.status, "an undecided")
+        ends = [
+            support(A, b, row) for row in np.concatenate((np.eye(A.shape[1]), -np.eye(A.shape[1])))
+        ]
+        for end in ends:
+            if not np.isfinite(end):
+                kind = {-np.inf: "an empty", np.inf: "an unbounded"}.get(end, "an undecided")
                 raise QPError.expected("A and b of the polytope", f"{kind} set", "a bounded one")
-            ends.append(-result.fun)
         upper, lower = np.array(ends[: A.shape[1]]), -np.array(ends[A.shape[1] :])
         return cls(A, b, lower, upper)
 

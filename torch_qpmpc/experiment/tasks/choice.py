@@ -58,11 +58,13 @@ class Choice:
     @property
     def scheme(self) -> str:
         """The name of the best start that holds no action, with which learning begins."""
-        schemes = [name for name in self.rows if name not in HELD]  # the run's own wins a tie
-        return min(schemes, key=lambda name: self._rank(self.rows[name]))
+        best_first = (name for name, _ in self._ranked if name not in HELD)
+        return next(best_first) if self.name in HELD else self.name
 
-    def _rank(self, row: Row) -> tuple[bool, int, float]:
-        return not row.chosen, -row.episodes, row.J
+    @property
+    def _ranked(self) -> list[tuple[str, Row]]:
+        """The rows, best first; the run's own wins a tie."""
+        return sorted(self.rows.items(), key=lambda item: (-item[1].episodes, item[1].J))
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -74,10 +76,9 @@ class Choice:
         return sum(row.transitions for row in self.rows.values())
 
     def __str__(self) -> str:
-        rows = sorted(self.rows.items(), key=lambda item: self._rank(item[1])[1:])
         width = max(map(len, self.rows))
         lines = [f"{'start':{width}}{'R2':>8}{'episodes':>10}  J"]
-        for name, row in rows:
+        for name, row in self._ranked:
             R2 = "" if math.isnan(row.R2) else f"{row.R2:.3f}"
             J = f"{cost_text(row.J)} +- {cost_text(row.error)}"
             lines.append(f"{name:{width}}{R2:>8}{row.episodes:10}  {J}")
