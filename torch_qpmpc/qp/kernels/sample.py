@@ -361,12 +361,15 @@ def _repair(rows, hard, z, G, units, basis, ends):
         part = sign * (max(over, 0.0) + ROUNDING * size) / steps[j]
         slack = DEPENDENT * size / steps[j]
         copy(basis[k], units[a])
-        for _ in range(2):  # again, for the rounding errors of the first time
+        norm = 0.0
+        for _ in range(2):
             for e in range(k):
                 along = dot(basis[e], basis[k])
                 add(basis[k], -along, basis[e])
                 part -= along * ends[e]
-        norm = math.sqrt(dot(basis[k], basis[k]))
+            norm = math.sqrt(dot(basis[k], basis[k]))
+            if norm > 0.5:  # else again, for the rounding errors of the first time
+                break
         if norm > DEPENDENT:
             for e in range(len(basis[k])):
                 basis[k, e] /= norm

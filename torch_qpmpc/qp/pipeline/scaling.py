@@ -117,17 +117,25 @@ def _columns(theta: Theta) -> np.ndarray | None:
     curvature = np.sqrt(np.abs(theta.H.diagonal(axis1=1, axis2=2)))
     if not (_apart(np.maximum(of_C, of_G)) or _apart(curvature)):
         return None
-    rows = np.abs(np.concatenate((theta.C, theta.G), axis=1))
-    units, kappa = np.ones(curvature.shape), np.ones((len(rows), 1, 1))
-    H, of_row = np.abs(theta.H), np.ones((*rows.shape[:2], 1))
+    rows = np.concatenate((theta.C, theta.G), axis=1)
+    M, n = curvature.shape
+    # The matrices of an MPC scheme are sparse.
+    (m, i, j), (k, row, column) = theta.H.nonzero(), rows.nonzero()
+    H, entries = np.abs(theta.H[m, i, j]), np.abs(rows[k, row, column])
+    units, of_row, kappa = np.ones((M, n)), np.ones(rows.shape[:2]), np.ones(M)
     for _ in range(PASSES):
-        of_H, now = H * units[:, None] * units[:, :, None] * kappa, rows * units[:, None] * of_row
-        largest = np.maximum(of_H.max(1), now.max(1, initial=0.0))
-        units = units / np.sqrt(np.where(_positive(largest), largest, 1.0))
-        largest = now.max(-1, keepdims=True, initial=0.0)
-        of_row = of_row / np.where(_positive(largest), largest, 1.0)
-        largest = of_H.max((1, 2), keepdims=True)
-        kappa = kappa / np.where(_positive(largest), largest, 1.0)
+        of_H = H * units[m, j] * units[m, i] * kappa[m]
+        now = entries * units[k, column] * of_row[k, row]
+        largest = np.zeros(M * n)
+        np.maximum.at(largest, m * n + j, of_H)
+        np.maximum.at(largest, k * n + column, now)
+        units = units / np.sqrt(_positive_or_one(largest)).reshape(M, n)
+        largest = np.zeros(of_row.size)
+        np.maximum.at(largest, k * rows.shape[1] + row, now)
+        of_row = of_row / _positive_or_one(largest).reshape(of_row.shape)
+        largest = np.zeros(M)
+        np.maximum.at(largest, m, of_H)
+        kappa = kappa / _positive_or_one(largest)
     return np.ldexp(1.0, np.frexp(units)[1])
 
 
@@ -137,8 +145,8 @@ def _apart(sizes: np.ndarray) -> bool:
     return bool((sizes.max(-1, initial=0.0) > APART * smallest).any())
 
 
-def _positive(sizes: np.ndarray) -> np.ndarray:
-    return (sizes > 0) & (sizes < np.inf)
+def _positive_or_one(sizes: np.ndarray) -> np.ndarray:
+    return np.where((sizes > 0) & (sizes < np.inf), sizes, 1.0)
 
 
 def _typical(sizes: np.ndarray) -> np.ndarray:
