@@ -132,7 +132,7 @@ def piqp_solver(full: FullSpace) -> Callable[[], Tensor]:
     piqp = needs("piqp")
     Q, A, G = (sp.csc_matrix(matrix.detach().numpy()) for matrix in (full.Q, full.A, full.G))
     p, b, lower, upper = (v.detach().numpy() for v in (full.p, full.b, full.l, full.u))
-    lower, upper = (np.where(abs(v) < INFINITE, v, np.sign(v) * np.inf) for v in (lower, upper))
+    lower, upper = (np.where(abs(v) < INFINITE, v, np.copysign(np.inf, v)) for v in (lower, upper))
     single = np.diff(G.tocsr().indptr) == 1
     rows, columns = G[single].nonzero()
     columns = columns[np.argsort(rows)]

@@ -12,8 +12,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from torch_qpmpc.study.markdown import replaced, table
 
 ROOT = Path(__file__).parents[2]
@@ -21,8 +19,6 @@ DOCS = ROOT / "docs"
 PAGE = DOCS / "benchmarks.md"
 RESULTS = ROOT / "runs" / "benchmark.json"
 REFERENCE = "ProxSuite's QPFunction"
-#: Horizons between which the growth exponent is fitted.
-FITTED = (10, 40)
 
 Row = dict[str, Any]
 
@@ -67,7 +63,6 @@ def tables(results: dict[str, Any]) -> str:
     parts = [
         conditions(results["machine_info"]),
         gradients(of("test_gradient")),
-        growth(of("test_value"), of("test_condensing")),
         overhead(of("test_share_outside_the_solver"), of("test_decisions")),
     ]
     return "\n\n".join(part for part in parts if part)
@@ -124,46 +119,6 @@ def _errors(row: Row) -> str:
 
 def _kind(row: Row) -> str:
     return "dense" if row["dense"] else "banded"
-
-
-def growth(values: list[Row], condensing: list[Row]) -> str:
-    if not values:
-        return ""
-    # By dimensions, then dense before banded; the stable sort keeps the order of solvers.
-    rows = sorted(values, key=lambda row: (row["dimensions"], not row["dense"])) + condensing
-    horizons = sorted(_unique(row["horizon"] for row in rows))
-    lines = []
-    for key in _unique(_growth_label(row) for row in rows):
-        mine = {
-            row["horizon"]: 1e3 * row["seconds"] / row["batch"]
-            for row in rows
-            if _growth_label(row) == key
-        }
-        cells = [_digits(mine[N]) if N in mine else "" for N in horizons]
-        lines.append([*key, *cells, _exponent(mine)])
-    wrong = sum(row["wrong"] for row in values)
-    verdict = "No value" if not wrong else f"{wrong} values"
-    head = ["(n_x, n_u)", "", *(f"N = {N}" for N in horizons), "exponent"]
-    caption = (
-        f"**Growth with the horizon**: ms a QP (V, theta at rest), or a theta for condensing; the "
-        f"exponent of N is fitted from {FITTED[0]} to {FITTED[1]}. {verdict} compared with the "
-        "reference was wrong by more than 1e-6."
-    )
-    return f"{caption}\n\n{table(head, lines)}"
-
-
-def _growth_label(row: Row) -> tuple[str, str]:
-    n_x, n_u = row["dimensions"]
-    name = row["row"] if row["row"] == "condensing" else f"{row['row']}, {_kind(row)} C"
-    return f"({n_x}, {n_u})", name
-
-
-def _exponent(milliseconds: dict[int, float]) -> str:
-    points = [(N, t) for N, t in milliseconds.items() if FITTED[0] <= N <= FITTED[1]]
-    if len(points) < 2:
-        return ""
-    N, t = np.log(points).T
-    return f"{np.polyfit(N, t, 1)[0]:.1f}"
 
 
 def overhead(shares: list[Row], decisions: list[Row]) -> str:

@@ -22,15 +22,10 @@ def _result(test: str, seconds: float, **extra: Any) -> dict[str, Any]:
 def results(tmp_path: Path) -> Path:
     right = {"value_error": 1e-12, "wrong": 0, "solved": 64, "gradient_error": 1e-9}
     wrong = right | {"value_error": 2e-5, "wrong": 17}
-    sizes = {"dense": True, "batch": 4, "dimensions": [4, 2]}
     benchmarks = [
         _result("test_gradient", 0.4, row=REFERENCE, dense=True, batch=32, **wrong),
         _result(
             "test_gradient", 0.002, row="daqp", dense=True, batch=32, reference_seconds=0.3, **right
-        ),
-        *(
-            _result("test_value", 1e-6 * N**2, row="daqp", horizon=N, **sizes, **right)
-            for N in (10, 20, 40)
         ),
         _result("test_share_outside_the_solver", 1, row="daqp", batch=256, outside=0.25),
         _result("test_decisions", 0.001, row="daqp", batch=32),
@@ -56,7 +51,6 @@ def test_the_tables_replace_text_between_the_markers(results: Path, tmp_path: Pa
     assert "old" not in text
     assert f"| {REFERENCE} | 400 | 2e-05, 17 of 64 wrong | 1e-09 |" in text
     assert "| daqp | 2.00 (150x) | 1e-12 | 1e-09 |" in text
-    assert "| (4, 2) | daqp, dense C | 0.0250 | 0.100 | 0.400 | 2.0 |" in text
     assert "| daqp | 25% | 32,000 |" in text
     assert "2 cores (a processor" in text
     assert "torch 2.13" in text

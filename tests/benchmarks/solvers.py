@@ -1,0 +1,228 @@
+"""Solvers side by side as the horizon and the state grow.
+
+    pip install clarabel piqp osqp qpax cvxpylayers
+    python -m tests.benchmarks.solvers --write
+
+V of the benchmarks' QP with theta at rest: our solvers in a batch, with the certificate, and
+others on the QP in full space, whose matrices each sets up once if it can. CPU time a QP on one
+thread, the median of rounds in which the solvers take turns. A solver whose QP takes longer than
+`PATIENCE` gets one round, and no larger size. A package that is not installed is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from importlib.metadata import version
+from importlib.util import find_spec
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from torch import Tensor
+
+from tests.benchmarks.full_space import FullSpace
+from tests.benchmarks.peers import cvxpylayers, piqp_solver
+from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
+from tests.benchmarks.reference import reference_values, relative_error
+from torch_qpmpc import QPMPC
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.solvers import BACKENDS
+from torch_qpmpc.study.markdown import replaced, table
+
+PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
+#: QPs in our batches, in the others' loops, and compared with the reference.
+BATCH, LOOP, CHECKED = 32, 4, 2
+ROUNDS, PATIENCE = 5, 1.0
+HORIZONS = (5, 10, 20, 50, 100, 200)
+STATES = ((4, 2), (8, 2), (16, 4), (32, 8))
+#: Sizes of each series, by its caption.
+SERIES = {
+    "n_x = 4, n_u = 2, by N": [Size(N, 4, 2) for N in HORIZONS],
+    "N = 20, by (n_x, n_u)": [Size(20, *dimensions) for dimensions in STATES],
+}
+
+Solve = Callable[[], Tensor]
+
+
+def osqp_solver(full: FullSpace) -> Solve:
+    """Make OSQP, without warm starts, at tolerances of 1e-6."""
+    import osqp
+
+    solver = osqp.OSQP()
+    p, b, lower, upper = (v.detach().numpy() for v in (full.p, full.b, full.l, full.u))
+    lower, upper = np.hstack((b, lower)), np.hstack((b, upper))
+    rows = sp.csc_matrix(torch.cat((full.A, full.G)).detach().numpy())
+    Q = sp.triu(sp.csc_matrix(full.Q.detach().numpy()), format="csc")
+    options = {"eps_abs": 1e-6, "eps_rel": 1e-6, "max_iter": 100_000, "warm_starting": False}
+    solver.setup(Q, p[0], rows, lower[0], upper[0], verbose=False, **options)
+
+    def values() -> Tensor:
+        x = np.empty_like(p)
+        for i in range(len(p)):
+            solver.update(q=p[i], l=lower[i], u=upper[i])
+            x[i] = solver.solve().x
+        return full.value(torch.from_numpy(x))
+
+    return values
+
+
+def clarabel_solver(full: FullSpace) -> Solve:
+    """Make Clarabel at its default tolerances, 1e-8, set up for each QP."""
+    import clarabel
+
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    G, h = full.one_sided()
+    rows, right = sp.csc_matrix(torch.cat((full.A, G))), torch.cat((full.b, h), dim=1).numpy()
+    Q, p = sp.csc_matrix(full.Q.triu()), full.p.numpy()
+    cones = [clarabel.ZeroConeT(len(full.A)), clarabel.NonnegativeConeT(len(G))]
+
+    def values() -> Tensor:
+        x = [
+            clarabel.DefaultSolver(Q, p[i], rows, right[i], cones, settings).solve().x
+            for i in range(len(p))
+        ]
+        return full.value(torch.tensor(x, dtype=torch.float64))
+
+    return values
+
+
+def qpax_solver(full: FullSpace) -> Solve:
+    """Make qpax, dense, compiled for the batch, in float64."""
+    import jax
+    import qpax
+
+    jax.config.update("jax_enable_x64", True)
+    G, h = full.one_sided()
+    Q, A, G = (matrix.numpy() for matrix in (full.Q, full.A, G))
+    vectors = full.p.numpy(), full.b.numpy(), h.numpy()
+    batched = jax.jit(jax.vmap(lambda p, b, h: qpax.solve_qp(Q, p, A, b, G, h)[0]))
+    return lambda: full.value(torch.from_numpy(np.array(batched(*vectors))))
+
+
+#: Other packages' solvers in full space, by the package that they need.
+PEERS: dict[str, tuple[str, Callable[[FullSpace], Solve]]] = {
+    "PIQP, sparse": ("piqp", piqp_solver),
+    "Clarabel": ("clarabel", clarabel_solver),
+    "OSQP, 1e-6": ("osqp", osqp_solver),
+    "qpax": ("qpax", qpax_solver),
+}
+#: Its compilation for parametric matrices takes tens of GiB for z with more entries than this.
+LAYERS, LARGEST = "cvxpylayers", 500
+CONDENSING = "condensing, a new theta"
+
+
+def contenders(size: Size, dense: bool) -> Iterable[tuple[str, int, Callable[[], Solve]]]:
+    """Yield each solver's name, the number of its QPs, and a function that sets it up."""
+    states = transitions(size.n_x, size.n_u, BATCH).s
+    for name in BACKENDS:
+        mpc = make_mpc(size, dense=dense, solver=name)
+        count = LOOP if name == "proxqp" else BATCH
+        yield name, count, partial(partial, mpc.value, states[:count])
+    qp = make_mpc(size, dense=dense).quadratic_program()
+    for name, (package, make) in PEERS.items():
+        if find_spec(package):
+            yield name, LOOP, lambda make=make: make(FullSpace.of(qp, states[:LOOP]))
+    if find_spec(LAYERS) and qp.n_z <= LARGEST:
+        yield LAYERS, LOOP, lambda: partial(cvxpylayers(), qp, states[:LOOP])
+    yield CONDENSING, 1, lambda: condensing(make_mpc(size, dense=dense), size)
+
+
+def condensing(mpc: QPMPC, size: Size) -> Solve:
+    """Make the elimination of C z = b, of a theta that has changed since the last round."""
+    s = torch.zeros(1, size.n_x).double()
+
+    def once() -> Tensor:
+        nudge(mpc)
+        n = size.n_x + size.n_u
+        programs, _ = Programs.of(*mpc.quadratic_program().tensors(), s, n_kept=n)
+        return torch.from_numpy(programs.prepared.condensed(n).arrays.T[0])
+
+    return once
+
+
+@torch.no_grad()
+def measured(size: Size, dense: bool, left_out: set[str]) -> dict[str, tuple[float, float | None]]:
+    """Return the CPU seconds a QP of each solver, and its largest relative error of a value.
+
+    Adds to ``left_out`` whatever is too slow for a larger size.
+    """
+    mpc = make_mpc(size, dense=dense)
+    states = transitions(size.n_x, size.n_u, BATCH).s[:CHECKED]
+    truth = reference_values(mpc.quadratic_program(), states)
+    solves: dict[str, tuple[int, Solve]] = {}
+    seconds: dict[str, list[float]] = {}
+    errors: dict[str, float | None] = {}
+    for name, count, make in contenders(size, dense):
+        if name in left_out:
+            continue
+        solve = make()
+        taken, result = timed(solve)  # compiles what is compiled at first use
+        error = None if name == CONDENSING else relative_error(result[:CHECKED], truth)
+        errors[name] = None if error is None else float(error.max())
+        if taken > PATIENCE * count:
+            taken, _ = timed(solve)
+        seconds[name] = [taken / count]
+        if taken > PATIENCE * count:
+            left_out.add(name)
+        else:
+            solves[name] = count, solve
+            seconds[name] = []
+    for _ in range(ROUNDS):
+        for name, (count, solve) in solves.items():
+            seconds[name].append(timed(solve)[0] / count)
+    return {name: (float(np.median(times)), errors[name]) for name, times in seconds.items()}
+
+
+def timed(solve: Solve) -> tuple[float, Tensor]:
+    began = time.process_time()
+    result = solve()
+    return time.process_time() - began, result
+
+
+def series(caption: str, sizes: list[Size], dense: bool) -> str:
+    left_out: set[str] = set()
+    columns = []
+    for size in sizes:
+        columns.append(measured(size, dense, left_out))
+        for name, (taken, error) in columns[-1].items():
+            said = "" if error is None else f", error {error:.0e}"
+            print(f"{size}, {name}: {1e3 * taken:.3g} ms{said}", flush=True)
+    by_horizon = len({size.horizon for size in sizes}) > 1
+    heads = [str(s.horizon) if by_horizon else f"({s.n_x}, {s.n_u})" for s in sizes]
+    lines = []
+    for name in dict.fromkeys(name for column in columns for name in column):
+        cells = [f"{1e3 * column[name][0]:.3g}" if name in column else "" for column in columns]
+        largest = [e for c in columns if name in c and (e := c[name][1]) is not None]
+        lines.append([name, *cells, f"{max(largest):.0e}" if largest else ""])
+    kind = "dense C" if dense else "banded C"
+    return f"**{kind}, {caption}**\n\n{table(['', *heads, 'error'], lines)}"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.solvers", description=__doc__)
+    parser.add_argument("--write", action="store_true", help="write the tables into the docs")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+    cases = product(SERIES.items(), (False, True))
+    tables = [series(caption, sizes, dense) for (caption, sizes), dense in cases]
+    packages = ["daqp", "proxsuite", "torch", *(p for p, _ in PEERS.values()), LAYERS]
+    versions = ", ".join(f"{name} {version(name)}" for name in packages if find_spec(name))
+    text = "\n\n".join([f"Milliseconds a QP, with {versions}.", *tables])
+    print(text)
+    if options.write:
+        page = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(replaced(page, text, "solvers"), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
