@@ -1,4 +1,4 @@
-"""Logs of an ARX plant with two lags, and of a room as a table."""
+"""Logs of an ARX plant with two lags, of a room as a table, and overrides of train.py."""
 
 from __future__ import annotations
 
@@ -14,6 +14,22 @@ A = torch.tensor([[1.5, 0.1, -0.56, 0.0], [0.0, 1.2, 0.05, -0.35]]).double()
 B = torch.tensor([[0.5, 0.2], [0.1, 0.4]]).double()
 E = torch.tensor([[0.3], [-0.2]]).double()
 OFFSET = torch.tensor([0.1, -0.3]).double()
+#: Overrides of train.py: a double integrator whose position is measured.
+LINEAR = (
+    "task=linear",
+    "task.A=[[1, 0.2], [0, 0.9]]",
+    "task.B=[[0], [0.2]]",
+    "task.C_y=[[1, 0]]",
+    "task.outputs=[s]",
+    "task.inputs=[F]",
+    "task.Q={s: 1}",
+    "task.R={F: 0.1}",
+    "task.dR={F: 0.2}",
+    "task.r={s: 1}",
+    "task.noise={s: 0.01, F: 0.02}",
+    "task.y_bounds={s: [-2, 2]}",
+    "task.u_bounds={F: [-1, 1]}",
+)
 
 
 def arx_log(

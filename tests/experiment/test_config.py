@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import train
 from tests.covering import covering
-from tests.logs import log_overrides
+from tests.logs import LINEAR, log_overrides
 from tests.runs import CONFIGS, SMALL, choices, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.config import (
@@ -99,6 +99,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "house_wall": ("task=house_wall", "warmup_steps=1"),
         "four_tanks": ("task=four_tanks", "start=model", "warmup_steps=1"),
         "tank_references": ("task=tank_references", "warmup_steps=1"),
+        "linear": (*LINEAR, "warmup_steps=1"),
         "log": log_overrides(tmp_path),
         "actuator_noise": ("task=actuator_noise", "warmup_steps=1"),
         "inventory": ("task=inventory", "warmup_steps=1"),
@@ -130,6 +131,7 @@ NOISES = {
     "house": {"none"},
     "house_wall": {"none"},
     "inventory": {"none"},
+    "linear": {"none"},
     "log": {"none"},
     "pendulum": {"none"},
     "short_horizon": {"none"},
@@ -202,6 +204,7 @@ TASK_KEYS = {
     "task.model_error": "task=tank_references",
     "task.one_weather": "task=house",
     "task.past": "task=house_wall",
+    **dict.fromkeys(("task.C_y", "task.dR", "task.noise", "task.starts"), "task=linear"),
     **dict.fromkeys(("task.outputs", "task.inputs", "task.known"), "task=log"),
     **dict.fromkeys(("task.time", "task.episode", "task.linear"), "task=log"),
     **dict.fromkeys(("task.Q", "task.R", "task.r", "task.y_bounds", "task.u_bounds"), "task=log"),
@@ -225,6 +228,7 @@ FRACTION = [0, -0.5, 1.1, math.nan, False, "half", None]
 FLAG = [0, 1, "yes", None]
 NAME = [3, True, None]
 MATRIX = [1.0, [1.0], [[1.0], [1.0, 2.0]], [["a"]], [[math.nan]], [[True]], "???"]
+WEIGHTS = ("Q", "R", "dR", "noise")
 BAD: dict[str, list[Any]] = {
     "seed": [*WHOLE[1:], 2**63],
     "solver": NAME,
@@ -273,12 +277,13 @@ BAD: dict[str, list[Any]] = {
     "task.A": MATRIX,
     "task.B": MATRIX,
     "task.stage_weight": MATRIX,
+    "task.C_y": MATRIX[:-1],
     **{key: ["T", 3, [1]] for key in ("task.outputs", "task.inputs", "task.known")},
     **{key: [3, True] for key in ("task.time", "task.episode")},
-    **{key: [1.0, {"T": -1.0}, {"T": "x"}, {"T": math.nan}] for key in ("task.Q", "task.R")},
+    **{f"task.{x}": [1.0, {"T": -1.0}, {"T": "x"}, {"T": math.nan}] for x in WEIGHTS},
     "task.r": [21.0, {"T": None}, {"T": math.inf}],
     "task.linear": ["price", {"q": 1.0}],
-    **{key: [1.0, {"T": 1.0}, {"T": [1.0]}] for key in ("task.y_bounds", "task.u_bounds")},
+    **{f"task.{x}": [1.0, {"T": 1.0}, {"T": [1.0]}] for x in ("y_bounds", "u_bounds", "starts")},
     "task.gamma": FRACTION,
     "task.hessian": ["dense", *NAME],
     "task.terminal_weight": ["lqr", *NAME],

@@ -10,6 +10,7 @@ from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.house import House
 from torch_qpmpc.envs.house_wall import HouseWall
 from torch_qpmpc.envs.inventory import Inventory
+from torch_qpmpc.envs.linear_plant import LinearPlant
 from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
 from torch_qpmpc.envs.past_window import PastWindow
 from torch_qpmpc.envs.plant import Plant, PlantEnv
@@ -29,6 +30,7 @@ __all__ = [
     "House",
     "HouseWall",
     "Inventory",
+    "LinearPlant",
     "LinearSystem",
     "LinearSystemEnv",
     "LinearSystemGymEnv",

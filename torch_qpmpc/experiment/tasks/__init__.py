@@ -20,6 +20,7 @@ from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
     house,
     house_wall,
     inventory,
+    linear,
     log,
     point_mass,
     short_horizon,

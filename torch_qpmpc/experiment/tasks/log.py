@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from pydantic import Field
 from torch import Tensor
 
-from torch_qpmpc.envs import ARXPlant
+from torch_qpmpc.envs import ARXPlant, LinearPlant
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.fields import Count, Expected, Finite, NonNegative
@@ -86,9 +86,9 @@ def make_plant(cfg: DictConfig) -> ARXPlant:
     seen = torch.stack((u.amin(0), u.amax(0)))
     unbounded = torch.full((2, len(log.outputs)), torch.inf).double()
     unbounded[0] *= -1
-    lb_a, ub_a = _bounds(task, "u_bounds", log.inputs, seen)
-    lb_y, ub_y = _bounds(task, "y_bounds", log.outputs, unbounded)
-    W, q, c = stage_cost(task, log)
+    lb_a, ub_a = read_pairs(task, "u_bounds", log.inputs, seen)
+    lb_y, ub_y = read_pairs(task, "y_bounds", log.outputs, unbounded)
+    W, q, c = stage_cost(task, log.outputs, log.inputs, log.known)
 
     def labels(names: tuple[str, ...]) -> list[str]:
         return [log.label(name) for name in names]
@@ -114,22 +114,25 @@ def make_plant(cfg: DictConfig) -> ARXPlant:
     )
 
 
-def stage_cost(task: Mapping[str, Any], log: Log) -> StageCost:
-    """Return (y - r)'Q(y - r) + u'R u + price u as a cost of v = [d; y; u].
+def stage_cost(
+    task: Mapping[str, Any],
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+    known: Sequence[str] = (),
+) -> StageCost:
+    """Return (y - r)'Q(y - r) + u'R u + price u as a cost of v = [d; y; u], by their names.
 
     Raises:
         QPError: a name is not that of a signal of its kind, or no output has a weight.
     """
-    d, y, u = (
-        {x: i for i, x in enumerate(names)} for names in (log.known, log.outputs, log.inputs)
-    )
+    d, y, u = ({x: i for i, x in enumerate(names)} for names in (known, outputs, inputs))
     n_d, n = len(d), len(d) + len(y) + len(u)
     W, q, c = torch.zeros(n, n).double(), torch.zeros(n).double(), torch.zeros(()).double()
     if not task["Q"]:
-        example = f"'task.Q={{{log.outputs[0]}: 1.0}}'"
+        example = f"'task.Q={{{outputs[0]}: 1.0}}'"
         raise QPError.expected("task.Q", "none", f"weights of outputs, such as {example}")
-    targets = _named(task, "r", y)
-    for name, weight in _named(task, "Q", y).items():
+    targets = named(task, "r", y)
+    for name, weight in named(task, "Q", y).items():
         row, target = n_d + y[name], targets.get(name, 0.0)
         W[row, row] += 2 * weight
         if isinstance(target, str):
@@ -139,9 +142,9 @@ def stage_cost(task: Mapping[str, Any], log: Log) -> StageCost:
         else:
             q[row] -= 2 * weight * target
             c += weight * target**2
-    for name, weight in _named(task, "R", u).items():
+    for name, weight in named(task, "R", u).items():
         W[n_d + len(y) + u[name], n_d + len(y) + u[name]] = 2 * weight
-    for name, price in _named(task, "linear", u).items():
+    for name, price in named(task, "linear", u).items():
         row, column = n_d + len(y) + u[name], _index("linear", price, d)
         W[row, column] = W[column, row] = 1.0
     return StageCost(W, q, c)
@@ -149,25 +152,29 @@ def stage_cost(task: Mapping[str, Any], log: Log) -> StageCost:
 
 def scheme(cfg: DictConfig, plant: ARXPlant) -> Scheme:
     """Make the scheme of the plant's own model; ``start=data`` replaces that by a predictor."""
+    return plant_cost_scheme(cfg, plant, Model(plant.A, plant.B, plant.E, plant.offset))
+
+
+def plant_cost_scheme(cfg: DictConfig, plant: ARXPlant | LinearPlant, model: Model) -> Scheme:
+    """Make the scheme of a model with the plant's own cost and bounds."""
     layout = plant_layout(plant, cfg.task.horizon)
     cost = scheme_cost(
         StageCost(plant.W, plant.q, plant.c), layout, cfg.task.gamma, cfg.task.hessian
     )
     bounds = Bounds(state_bounds=(plant.lb_y, plant.ub_y), action_bounds=(plant.lb_a, plant.ub_a))
-    model = Model(plant.A, plant.B, plant.E, plant.offset)
     return Scheme(layout, model, cost, priced(cfg, bounds), cfg.task.gamma)
 
 
-def episode(plant: ARXPlant, d: Tensor) -> dict[str, Any]:
+def episode(plant: ARXPlant | LinearPlant, d: Tensor) -> dict[str, Any]:
     """Show the signals by their names and units in the log."""
     outputs, actions, known = plant.labels
     signals = dict(zip(known, d.unbind(-1), strict=True))
     return {"outputs": outputs, "actions": actions, "signals": signals}
 
 
-def _named(task: Mapping[str, Any], key: str, known: Mapping[str, int]) -> Mapping[str, Any]:
+def named(task: Mapping[str, Any], key: str, known: Mapping[str, int]) -> Mapping[str, Any]:
     """Return the mapping under ``key``, whose names are ``known``."""
-    chosen = task[key] or {}
+    chosen = task.get(key) or {}
     for name in chosen:
         _index(key, name, known)
     return chosen
@@ -175,16 +182,23 @@ def _named(task: Mapping[str, Any], key: str, known: Mapping[str, int]) -> Mappi
 
 def _index(key: str, name: str, known: Mapping[str, int]) -> int:
     if name not in known:
-        expected = f"one of {', '.join(known)}" if known else "none: the log has no such signal"
+        expected = f"one of {', '.join(known)}" if known else "none: there is no such signal"
         raise QPError.expected(f"task.{key}", repr(name), expected)
     return known[name]
 
 
-def _bounds(task: DictConfig, key: str, names: tuple[str, ...], default: Tensor) -> Tensor:
-    """Return the lower and upper bounds ``(2, n)``, the ``default`` where there is none."""
+def read_pairs(task: DictConfig, key: str, names: Sequence[str], default: Tensor) -> Tensor:
+    """Return the pairs by name under ``key`` as ``(2, n)``, the ``default`` where there is none.
+
+    Raises:
+        QPError: a name is none of ``names``, or the first number of a pair is above the second.
+    """
     index = {name: i for i, name in enumerate(names)}
     bounds = default.clone()
-    for name, pair in _named(task, key, index).items():
+    for name, pair in named(task, key, index).items():
+        if pair[0] > pair[1]:
+            got = f"{{{name}: {list(pair)}}}"
+            raise QPError.expected(f"task.{key}", got, "the lower number first")
         bounds[:, index[name]] = torch.tensor(list(pair)).double()
     return bounds
 
