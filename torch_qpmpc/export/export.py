@@ -271,7 +271,7 @@ def _refuse(dtype: str, got: str, tables: Tables) -> None:
 def _check(mpc: QPMPC, dtype: str, name: str, storage: str, labels: Labels | None) -> None:
     check_choice("dtype", dtype, tuple(REAL))
     check_choice("storage", storage, STORAGES)
-    _check_name(name)
+    check_name(name)
     sizes = {"x": mpc.n_x, "u": mpc.n_u, "d": mpc.n_d}
     if labels is not None and not isinstance(labels, Mapping):
         raise QPError.expected("labels", type(labels).__name__, "a mapping from x, u and d")
@@ -283,7 +283,8 @@ def _check(mpc: QPMPC, dtype: str, name: str, storage: str, labels: Labels | Non
             raise QPError.expected(f"labels[{key!r}]", repr(names), "strings")
 
 
-def _check_name(name: str) -> None:
+def check_name(name: str) -> None:
+    """Raise unless a name can begin those of C files and functions."""
     remedy = "It begins the names of functions and files."
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise QPError.expected("name", repr(name), "a C identifier", remedy)

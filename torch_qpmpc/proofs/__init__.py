@@ -1,5 +1,6 @@
-"""Proofs about a policy on a set of states, by mixed-integer programs: worst cases, invariance."""
+"""Proofs about a policy on a set of states: worst cases, invariance, its explicit law."""
 
+from torch_qpmpc.proofs.explicit import ExplicitLaw, Region, explicit_law
 from torch_qpmpc.proofs.invariant import InvariantSet, invariant_set
 from torch_qpmpc.proofs.polytope import Polytope
 from torch_qpmpc.proofs.questions import (
@@ -9,12 +10,17 @@ from torch_qpmpc.proofs.questions import (
     largest_difference,
     largest_violation,
 )
+from torch_qpmpc.proofs.tree import SearchTree
 
 __all__ = [
     "Answer",
+    "ExplicitLaw",
     "InvariantSet",
     "Plant",
     "Polytope",
+    "Region",
+    "SearchTree",
+    "explicit_law",
     "invariance",
     "invariant_set",
     "largest_difference",

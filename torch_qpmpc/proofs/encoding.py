@@ -29,6 +29,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.tables import Tables
 from torch_qpmpc.proofs.program import Affine, Program
 from torch_qpmpc.qp.program import QuadraticProgram, Status
+from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve_qp
 
 Array = np.ndarray
@@ -78,12 +79,10 @@ def _derived(tables: Tables, vertices: Array) -> Reach:
     slack = np.zeros(len(vertices))
     if hard.any():
         slack = SHARE * _slack(tables.R[hard], lower[:, hard], upper[:, hard], vertices)
-    cost = _least_costs(
-        tables.R,
-        lower + hard * slack[:, None],
-        upper - hard * slack[:, None],
-        rows.w,
-    ).max(initial=0.0)
+    slack_of = hard * slack[:, None]
+    solution = solve_rows(tables.R, lower + slack_of, upper - slack_of, rows.w)
+    assert (solution.status == Status.SOLVED).all(), "the plan with slack solves these QPs"
+    cost = solution.value.numpy().max(initial=0.0)
     radius = np.sqrt(2 * cost) * (1 + MARGIN)
     most = np.where(hard, cost * (1 + MARGIN) / slack.min() if hard.any() else np.inf, rows.w)
     return Reach(
@@ -136,16 +135,14 @@ def _slack(R: Array, lower: Array, upper: Array, vertices: Array) -> Array:
     return slack
 
 
-def _least_costs(R: Array, lower: Array, upper: Array, w: Array) -> Array:
-    """Return ``min |nu|^2 / 2 + sum_i w_i dist(R_i nu, [lower_i, upper_i])`` at each vertex."""
+def solve_rows(R: Array, lower: Array, upper: Array, w: Array) -> QPSolution:
+    """Solve ``min |nu|^2 / 2 + sum_i w_i dist(R_i nu, [lower_i, upper_i])`` for many bounds."""
     n, zeros = R.shape[1], torch.zeros(1, dtype=torch.float64)
     rows = [torch.as_tensor(x) for x in (R, lower, upper, w)]
     # H, q, c, C and b: C has no rows.
     cost = (torch.eye(n).double(), zeros.expand(n), zeros[0], zeros.expand(0, n), zeros[:0])
     qp = QuadraticProgram(*cost, *rows)  # pyright: ignore[reportArgumentType] - nine tensors
-    solution = solve_qp(qp, solver="daqp", on_failure="mask")
-    assert (solution.status == Status.SOLVED).all(), "the plan with slack solves these QPs"
-    return solution.value.numpy()
+    return solve_qp(qp, solver="daqp", on_failure="mask")
 
 
 def _tighten(program: Program, tables: Tables, p: Affine, reach: Reach) -> None:

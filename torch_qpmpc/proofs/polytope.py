@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linprog
@@ -13,6 +13,8 @@ from scipy.spatial import HalfspaceIntersection, QhullError
 from torch_qpmpc.errors import QPError
 
 Array = np.ndarray
+#: Radius of the largest ball in a set that counts as flat, relative to the ball's place.
+FLAT = 1e-9
 #: Vertices are enumerated up to this dimension.
 MOST = 8
 
@@ -21,6 +23,39 @@ def support(A: Array, b: Array, row: Array) -> float:
     """Return the support function, max row'x with A x <= b; -inf if empty, nan if undecided."""
     result = linprog(-row, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
     return -result.fun if result.status == 0 else {2: -np.inf, 3: np.inf}.get(result.status, np.nan)
+
+
+class Body(NamedTuple):
+    """Facets ``A x <= b`` with rows of length 1, and vertices ``(count, n)``."""
+
+    A: Array
+    b: Array
+    vertices: Array
+
+
+def facets(A: Array, b: Array) -> Body | None:
+    """Return the facets and vertices of the bounded set ``A x <= b``; None if it is flat or empty.
+
+    Rows are not zero.
+    """
+    length, n = np.linalg.norm(A, axis=1), A.shape[1]
+    A, b = A / length[:, None], b / length
+    # Of rows with the same normal the tightest is kept.
+    order = np.lexsort((b, *A.round(9).T))
+    A, b = A[order], b[order]
+    first = np.append(True, (np.diff(A.round(9), axis=0) != 0).any(1))
+    A, b = A[first], b[first]
+    bounds, with_radius = [(None, None)] * n + [(0, None)], np.column_stack((A, np.ones(len(b))))
+    inner = linprog([0] * n + [-1], with_radius, b, bounds=bounds, method="highs")
+    if inner.status != 0 or inner.x[-1] <= FLAT * (1 + np.abs(inner.x[:n]).max()):
+        return None
+    if n == 1:
+        ends = [np.flatnonzero(A[:, 0] > 0), np.flatnonzero(A[:, 0] < 0)]
+        kept = np.array([i[b[i].argmin()] for i in ends])
+        return Body(A[kept], b[kept], (b[kept] * A[kept, 0])[:, None])
+    cut = HalfspaceIntersection(np.column_stack((A, -b)), inner.x[:n])
+    kept = np.unique(np.concatenate(cut.dual_facets))
+    return Body(A[kept], b[kept], np.unique(cut.intersections.round(14), axis=0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,395 @@
+"""The explicit law: the regions of states on which the policy is affine and V is quadratic.
+
+With the tables of `torch_qpmpc.export.tables` each row is free (lam = 0), held at a bound, or
+saturated (|lam| = w). A choice for all rows makes lam, y and u_0 affine in p, and its conditions,
+
+    free: lower <= y <= upper;   held: 0 <= |lam| <= w;   saturated: y at the bound or beyond it,
+
+are a polytope, the choice's region. The walk begins with the choice of one state, which a solver
+makes, and steps over the facets of each region; a point beyond, in no region yet, is solved. Facets
+need not be shared by two regions only, so that random states without a region are solved, too. The
+regions' volumes then say which share of the set is covered.
+
+Where held rows are dependent the multipliers are not unique. They are moved along the dependence
+until one row is free or saturated. The regions of two such choices can overlap, with the same law.
+
+References: Bemporad, Morari, Dua and Pistikopoulos (2002), "The explicit linear quadratic regulator
+for constrained systems", Automatica 38; Tøndel, Johansen and Bemporad (2003), "An algorithm for
+multi-parametric quadratic programming and explicit MPC solutions", Automatica 39; on facets of
+several regions, Spjøtvold, Kerrigan, Jones, Tøndel and Johansen (2006), "On the facet-to-facet
+property of solutions to convex parametric quadratic programs", Automatica 42.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.export.tables import Tables, make_tables
+from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.proofs.encoding import solve_rows
+from torch_qpmpc.proofs.polytope import Polytope, facets
+from torch_qpmpc.qp.program import Status
+
+Array = np.ndarray
+#: Entries of s.
+MOST = 3
+#: Steps over a facet, relative to the set's size: a longer one is taken where a shorter one is too
+#: near to the facet for the solver, or in a region without an interior.
+STEPS = (1e-6, 1e-5, 1e-4, 1e-3)
+#: Largest violation of a region's conditions by a point of it, relative to the set's size.
+INSIDE = 1e-8
+#: Held rows are dependent if a singular value of their unit rows is below this.
+DEPENDENT = 1e-9
+#: Rows that change by less than this fraction of their terms do not bound a region.
+CONSTANT = 1e-10
+#: Random states that are solved if no region contains them.
+SAMPLES = 1000
+#: Outcomes of a point.
+WITHIN, INFEASIBLE, NEITHER = range(3)
+#: States that are evaluated at once.
+CHUNK = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A polytope of s with one affine law and one quadratic value.
+
+    Attributes:
+        set: the polytope; its rows are facets of length 1.
+        vertices: ``(count, d)``.
+        K, k: ``(n_u, d)`` and ``(n_u,)``, u_0 is ``K s + k``.
+        P, g, c: ``(d, d)``, ``(d,)`` and a number; V is ``s'Ps / 2 + g's + c``, without the prices
+            of rows that p alone determines.
+        active: the rows' choices, codes as in `QPSolution.active`, ``(r,)``.
+    """
+
+    set: Polytope
+    vertices: Array
+    K: Array
+    k: Array
+    P: Array
+    g: Array
+    c: float
+    active: Array
+
+    @property
+    def volume(self) -> float:
+        """The length, area or volume."""
+        return _volume(self.vertices)
+
+
+@dataclass(frozen=True, eq=False)
+class ExplicitLaw:
+    """The policy and the value as functions of s, where p = origin + basis s.
+
+    Attributes:
+        set: the s of the set of states at which the QP is feasible.
+        regions: its parts.
+        covered: the regions' volume relative to the set's, 1 if nothing is missing.
+        origin, basis: ``(n_p,)`` and ``(n_p, d)``.
+        tables: the QP's tables.
+    """
+
+    set: Polytope
+    regions: tuple[Region, ...]
+    covered: float
+    origin: Array
+    basis: Array
+    tables: Tables
+
+    def index(self, s: Any) -> Array:
+        """Return the region of each s ``(*batch, d)``, -1 outside all, ``(*batch,)``."""
+        s = np.asarray(s, float)
+        flat = s.reshape(-1, s.shape[-1])
+        parts = [_nearest(self.regions, flat[i : i + CHUNK]) for i in range(0, len(flat), CHUNK)]
+        at, off = (np.concatenate(x) if parts else np.zeros(0) for x in zip(*parts, strict=True))
+        return np.where(off <= INSIDE * _size(self.set), at, -1).reshape(s.shape[:-1])
+
+    def policy(self, s: Any) -> Array:
+        """Return u_0 ``(*batch, n_u)``, NaN outside all regions."""
+        s, at = np.asarray(s, float), self.index(s)
+        K, k = (np.stack([getattr(x, name) for x in self.regions]) for name in ("K", "k"))
+        u = (K[at] @ s[..., None])[..., 0] + k[at]
+        return np.where(at[..., None] < 0, np.nan, u)
+
+    def value(self, s: Any) -> Array:
+        """Return V ``(*batch,)``, NaN outside all regions."""
+        s, at = np.asarray(s, float), self.index(s)
+        P, g, c = (np.stack([getattr(x, name) for x in self.regions]) for name in ("P", "g", "c"))
+        half = (P[at] @ s[..., None])[..., 0] / 2
+        known = self.tables.known
+        y = (self.origin + s @ self.basis.T) @ known.Y.T
+        off = np.maximum(np.maximum(y - known.upper, known.lower - y), 0)
+        prices = (np.where(np.isinf(known.w), 0, known.w) * off).sum(-1)
+        return np.where(at < 0, np.nan, ((half + g[at]) * s).sum(-1) + c[at] + prices)
+
+    def __str__(self) -> str:
+        laws = len({(*x.K.ravel().round(9), *x.k.round(9)) for x in self.regions})
+        return f"{len(self.regions)} regions, {laws} laws, {self.covered:.4%} of the set covered"
+
+
+def explicit_law(
+    mpc: QPMPC, states: Polytope, *, origin: Any = None, basis: Any = None
+) -> ExplicitLaw:
+    """Compute the policy's affine laws on a set of states, region by region.
+
+    Args:
+        mpc: the QP.
+        states: the set of s, of at most three dimensions.
+        origin, basis: a slice of the known entries, p = origin + basis s; ``(n_p,)`` and
+            ``(n_p, d)``. By default s is p.
+
+    Raises:
+        QPError: an argument is invalid, the set is flat, or the QP is infeasible at all samples.
+
+    Example:
+        >>> import torch_qpmpc as qm
+        >>> A, B = [[1.0, 0.2], [0.0, 1.0]], [[0.02], [0.2]]
+        >>> mpc = qm.QPMPC.from_model(
+        ...     A, B, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-0.5], [0.5])
+        ... )
+        >>> law = explicit_law(mpc, Polytope.box([-1.0, -1.0], [1.0, 1.0]))
+        >>> print(law)
+        7 regions, 3 laws, 100.0000% of the set covered
+    """
+    d = len(states.lower)
+    origin = np.zeros(mpc.n_p) if origin is None else np.array(origin, float)
+    basis = np.eye(mpc.n_p)[:, : max(d, mpc.n_p)] if basis is None else np.array(basis, float)
+    if d > MOST:
+        remedy = "Take a slice: basis=(n_p, 2) and an origin."
+        raise QPError.expected("states", f"{d} dimensions", f"at most {MOST}", remedy)
+    if origin.shape != (mpc.n_p,) or basis.shape != (mpc.n_p, d):
+        got, want = f"shapes {origin.shape} and {basis.shape}", f"({mpc.n_p},) and ({mpc.n_p}, {d})"
+        raise QPError.expected("origin and basis", got, want)
+    tables = make_tables(mpc)
+    walk = _Walk(_Sliced.of(tables, origin, basis), _possible(tables, states, origin, basis))
+    walk.run()
+    whole = facets(walk.A, walk.b)
+    if whole is None or not walk.regions:
+        _raise_infeasible()
+    covered = sum(x.volume for x in walk.regions) / _volume(whole.vertices)
+    feasible = Polytope.of(whole.A, whole.b)
+    return ExplicitLaw(feasible, tuple(walk.regions), covered, origin, basis, tables)
+
+
+def _raise_infeasible() -> NoReturn:
+    want = "one with an interior, in which the QP is feasible"
+    raise QPError.expected("states", "a set without a region", want)
+
+
+def _size(states: Polytope) -> float:
+    return float((states.upper - states.lower).max())
+
+
+def _volume(vertices: Array) -> float:
+    return float(np.ptp(vertices) if vertices.shape[1] == 1 else ConvexHull(vertices).volume)
+
+
+def _possible(tables: Tables, states: Polytope, origin: Array, basis: Array) -> Polytope:
+    """Return the states that satisfy the hard rows of p alone."""
+    known = tables.known
+    hard = np.isinf(known.w)
+    Y, y_0 = known.Y[hard] @ basis, known.Y[hard] @ origin
+    b = np.concatenate((known.upper[hard] - y_0, y_0 - known.lower[hard]))
+    kept = np.isfinite(b)
+    A, b = np.concatenate((states.A, np.concatenate((Y, -Y))[kept])), np.append(states.b, b[kept])
+    moves = np.abs(A).sum(1) > 0
+    body = None if (b[~moves] < 0).any() else facets(A[moves], b[moves])
+    if body is None:
+        _raise_infeasible()
+    return Polytope.of(body.A, body.b)
+
+
+def _nearest(regions: tuple[Region, ...] | list[Region], s: Array) -> tuple[Array, Array]:
+    """Return the region that contains each s or is nearest to it, and the largest violation."""
+    A = np.concatenate([x.set.A for x in regions])
+    b = np.concatenate([x.set.b for x in regions])
+    ends = np.cumsum([0, *(len(x.set.b) for x in regions)])[:-1]
+    off = np.maximum.reduceat(s @ A.T - b, ends, axis=1)
+    at = off.argmin(1)
+    return at, off[np.arange(len(s)), at]
+
+
+@dataclass(frozen=True, eq=False)
+class _Sliced:
+    """Tables of s: the rows are ``Y s - Q lam`` within ``lower, upper``, and so on."""
+
+    Y: Array
+    lower: Array
+    upper: Array
+    w: Array
+    Q: Array
+    R: Array
+    K: Array
+    k: Array
+    F: Array
+    P: Array
+    g: Array
+    c: float
+
+    @classmethod
+    def of(cls, tables: Tables, origin: Array, basis: Array) -> _Sliced:
+        rows, P = tables.rows, (tables.P + tables.P.T) / 2
+        y_0 = rows.Y @ origin
+        return cls(
+            rows.Y @ basis,
+            rows.lower - y_0,
+            rows.upper - y_0,
+            rows.w,
+            tables.Q,
+            tables.R,
+            tables.K @ basis,
+            tables.K @ origin + tables.k,
+            tables.F,
+            basis.T @ P @ basis,
+            basis.T @ (P @ origin + tables.g),
+            float(origin @ P @ origin / 2 + tables.g @ origin + tables.c),
+        )
+
+    def solve(self, s: Array) -> tuple[Array, Array, Array]:
+        """Return the rows' choices and multipliers at points s, and the solver's status."""
+        y = s @ self.Y.T
+        solution = solve_rows(self.R, self.lower - y, self.upper - y, self.w)
+        return solution.active.numpy(), solution.lam.numpy(), solution.status.numpy()
+
+    def independent(self, active: Array, lam: Array) -> Array:
+        """Return a choice without dependent held rows, by moves that change neither y nor u.
+
+        A row with equal bounds is held at the upper one.
+        """
+        active, lam = active.copy(), lam.copy()
+        active[(active == -1) & (self.lower == self.upper)] = 1
+        while len(held := np.flatnonzero(abs(active) == 1)):
+            left, sizes, _ = np.linalg.svd(self.R[held])
+            if len(held) <= len(sizes) and sizes[-1] > DEPENDENT:
+                break
+            move, equal = left[:, -1], self.lower[held] == self.upper[held]
+            move = move * np.sign(move[abs(move).argmax()])
+            low = np.where(equal | (active[held] < 0), -self.w[held], 0)
+            high = np.where(equal | (active[held] > 0), self.w[held], 0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                room = np.where(move > 0, high - lam[held], low - lam[held]) / move
+            room[abs(move) < DEPENDENT] = np.inf
+            at = room.argmin() if np.isfinite(room.min()) else abs(move).argmax()
+            if np.isfinite(room[at]):
+                lam[held] += room[at] * move
+                end = (high if move[at] > 0 else low)[at]
+            else:  # equal hard rows on both sides
+                lam[held] -= lam[held[at]] / move[at] * move
+                end = 0
+            active[held[at]] = 2 * np.sign(end)
+        return active
+
+    def region(self, active: Array, states: Polytope) -> Region | None:
+        """Return the part of ``states`` on which the choice is optimal; None if it is flat."""
+        side, held, saturated = np.sign(active), abs(active) == 1, abs(active) == 2
+        bound = np.where(side > 0, self.upper, self.lower)
+        w = np.where(saturated, self.w, 0)
+        L, l_0 = np.zeros_like(self.Y), side * w
+        right = np.column_stack((self.Y, -self.Q @ l_0 - np.where(held, bound, 0)))[held]
+        solved = np.linalg.solve(self.Q[np.ix_(held, held)], right)
+        L[held], l_0[held] = solved[:, :-1], solved[:, -1]
+        Y, y_0 = self.Y - self.Q @ L, -self.Q @ l_0
+        size = np.abs(self.Y).sum(1) + np.abs(self.Q) @ np.abs(L).sum(1)
+        up, low, equal = side > 0, side < 0, held & (self.lower == self.upper)
+        y_low = np.where(active == 0, self.lower, np.where(saturated & up, self.upper, -np.inf))
+        y_high = np.where(active == 0, self.upper, np.where(saturated & low, self.lower, np.inf))
+        lam_low = np.where(held, np.where(equal | low, -self.w, 0), -np.inf)
+        lam_high = np.where(held, np.where(equal | up, self.w, 0), np.inf)
+        A = np.concatenate((states.A, Y, -Y, L, -L))
+        b = np.concatenate((states.b, y_high - y_0, y_0 - y_low, lam_high - l_0, l_0 - lam_low))
+        terms = np.concatenate((np.abs(states.A).sum(1), size, size, 1 + 0 * size, 1 + 0 * size))
+        kept = np.isfinite(b) & (np.abs(A).sum(1) > CONSTANT * terms)
+        body = facets(A[kept], b[kept])
+        if body is None:
+            return None
+        polytope = Polytope(body.A, body.b, body.vertices.min(0), body.vertices.max(0))
+        # V = v_free + lam'Q lam / 2 + sum over saturated rows of lam (y - bound)
+        S = saturated
+        P = self.P + L.T @ self.Q @ L
+        g = self.g + L.T @ self.Q @ l_0 + Y[S].T @ l_0[S]
+        c = self.c + l_0 @ self.Q @ l_0 / 2 + l_0[S] @ (y_0 - bound)[S]
+        K, k = self.K - self.F @ L, self.k - self.F @ l_0
+        return Region(polytope, body.vertices, K, k, P, g, float(c), active)
+
+
+class _Walk:
+    """The regions so far; ``A s <= b`` are the states and the limits of feasibility so far."""
+
+    def __init__(self, tables: _Sliced, states: Polytope) -> None:
+        self.tables, self.states, self.size = tables, states, _size(states)
+        self.A, self.b = states.A, states.b
+        self.regions: list[Region] = []
+        self._choices: set[bytes] = set()
+
+    def run(self) -> None:
+        """Walk from random states, until none of them is outside all regions."""
+        generator, n = np.random.default_rng(0), len(self.states.lower)
+        while True:
+            s = generator.uniform(self.states.lower, self.states.upper, (SAMPLES, n))
+            s = self._outside(s[(s @ self.A.T <= self.b).all(1)])
+            before = len(self.regions)
+            fresh, _ = self._add(s if self.regions else s[: SAMPLES // 10])
+            while fresh:
+                fresh = self._cross(fresh)
+            if len(self.regions) == before:
+                return
+
+    def _outside(self, s: Array) -> Array:
+        """Return the points in no region."""
+        if not self.regions or not len(s):
+            return s
+        return s[_nearest(self.regions, s)[1] > INSIDE * self.size]
+
+    def _add(self, s: Array) -> tuple[list[Region], Array]:
+        """Solve at points, and return their new regions.
+
+        Beside them is the outcome for each point: WITHIN a region, INFEASIBLE, or NEITHER.
+        """
+        outcome = np.full(len(s), NEITHER)
+        fresh: list[Region] = []
+        if not len(s):
+            return fresh, outcome
+        choices, multipliers, status = self.tables.solve(s)
+        outcome[status == Status.INFEASIBLE] = INFEASIBLE
+        for i in np.flatnonzero(status == Status.SOLVED):
+            active = self.tables.independent(choices[i], multipliers[i])
+            known = active.tobytes() in self._choices
+            region = None if known else self.tables.region(active, self.states)
+            if region is not None:
+                self._choices.add(active.tobytes())
+                fresh.append(region)
+            inside = [*self.regions, *fresh]
+            if inside and _nearest(inside, s[i : i + 1])[1][0] <= INSIDE * self.size:
+                outcome[i] = WITHIN
+        self.regions += fresh
+        return fresh, outcome
+
+    def _cross(self, regions: list[Region]) -> list[Region]:
+        """Step over all facets of regions, and return the new ones there."""
+        starts, normals, limits, fresh = [], [], [], []
+        for region in regions:
+            A, b, V = region.set.A, region.set.b, region.vertices
+            for a, limit in zip(A, b, strict=True):
+                on = V[abs(V @ a - limit) < INSIDE * self.size]
+                if len(on):
+                    starts.append(on.mean(0))
+                    normals.append(a)
+                    limits.append(limit)
+        s, a, b = np.array(starts), np.array(normals), np.array(limits)
+        for step in STEPS:
+            beyond = s + step * self.size * a
+            kept = np.flatnonzero((beyond @ self.A.T <= self.b).all(1))
+            kept = kept[_nearest(self.regions, beyond[kept])[1] > INSIDE * self.size]
+            more, outcome = self._add(beyond[kept])
+            fresh += more
+            limits = kept[outcome == INFEASIBLE]
+            self.A, self.b = np.concatenate((self.A, a[limits])), np.append(self.b, b[limits])
+            kept = kept[outcome == NEITHER]
+            s, a, b = s[kept], a[kept], b[kept]
+        return fresh
