@@ -8,7 +8,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,12 @@ def tables(results: dict[str, Any]) -> str:
         overhead(of("test_share_outside_the_solver"), of("test_decisions")),
     ]
     return "\n\n".join(part for part in parts if part)
+
+
+def two_tables(head: Sequence[str], lines: Sequence[Sequence[str]], at: int) -> str:
+    """Format a table as two that fit a page: the second has column 0, and those from ``at`` on."""
+    first = table(head[:at], [line[:at] for line in lines])
+    return f"{first}\n\n{table([head[0], *head[at:]], [[line[0], *line[at:]] for line in lines])}"
 
 
 def conditions(machine: dict[str, Any]) -> str:
@@ -140,22 +146,22 @@ def growth(values: list[Row], condensing: list[Row]) -> str:
             if _growth_label(row) == key
         }
         cells = [_digits(mine[N]) if N in mine else "" for N in horizons]
-        lines.append([*key, *cells, _exponent(mine)])
+        lines.append([key, *cells, _exponent(mine)])
     wrong = sum(row["wrong"] for row in values)
     verdict = "No value" if not wrong else f"{wrong} values"
-    head = ["(n_x, n_u)", "", *(f"N = {N}" for N in horizons), "exponent"]
+    head = ["", *(f"N = {N}" for N in horizons), "exponent"]
     caption = (
-        f"**Growth with the horizon**: ms a QP (V, theta at rest), or a theta for condensing; the "
-        f"exponent of N is fitted from {FITTED[0]} to {FITTED[1]}. {verdict} compared with the "
-        "reference was wrong by more than 1e-6."
+        "**Growth with the horizon**, by (n_x, n_u): ms a QP (V, theta at rest), or a theta for "
+        f"condensing; the exponent of N is fitted from {FITTED[0]} to {FITTED[1]}. {verdict} "
+        "compared with the reference was wrong by more than 1e-6."
     )
     return f"{caption}\n\n{table(head, lines)}"
 
 
-def _growth_label(row: Row) -> tuple[str, str]:
+def _growth_label(row: Row) -> str:
     n_x, n_u = row["dimensions"]
     name = row["row"] if row["row"] == "condensing" else f"{row['row']}, {_kind(row)} C"
-    return f"({n_x}, {n_u})", name
+    return f"{name}, ({n_x}, {n_u})"
 
 
 def _exponent(milliseconds: dict[int, float]) -> str:

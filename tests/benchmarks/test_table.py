@@ -56,7 +56,7 @@ def test_the_tables_replace_text_between_the_markers(results: Path, tmp_path: Pa
     assert "old" not in text
     assert f"| {REFERENCE} | 400 | 2e-05, 17 of 64 wrong | 1e-09 |" in text
     assert "| daqp | 2.00 (150x) | 1e-12 | 1e-09 |" in text
-    assert "| (4, 2) | daqp, dense C | 0.0250 | 0.100 | 0.400 | 2.0 |" in text
+    assert "| daqp, dense C, (4, 2) | 0.0250 | 0.100 | 0.400 | 2.0 |" in text
     assert "| daqp | 25% | 32,000 |" in text
     assert "2 cores (a processor" in text
     assert "torch 2.13" in text
