@@ -48,7 +48,7 @@ def test_fewer_than_six_runs_have_a_range():
 def test_every_run_is_in_the_long_table():
     frame = made_up({("gaussian", "free"): [0.91, 0.92]})
     assert report.runs_table(frame).splitlines()[-1] == (
-        "| a | free, gaussian | 2 | 285.0 | 50.00 | 46.97 | 0.920 | 0.200 | 0.0400 | 0.0500 | 0 "
+        "| a | gaussian | free | 2 | 285.0 | 50.00 | 46.97 | 0.920 | 0.200 | 0.0400 | 0.0500 | 0 "
         "| 3.2 |"
     )
 
