@@ -99,9 +99,9 @@ def curve(device: torch.device, batches: tuple[int, ...] = BATCHES) -> str:
         of_Q = gradient(lambda s=s, a=a: mpc.action_value(s, a))
         of_pi = gradient(lambda s=s: mpc.policy(s))
         times = (f"{1e6 * x / batch:.3g}" for x in (cold, warm, new, of_Q, of_pi))
-        lines.append([f"{batch:,}", *times, f"{memory:,.0f}", f"{error:.0e}"])
+        lines.append([f"{batch:,}", *times, f"{memory:,.0f}; {error:.0e}"])
     head = ["batch", "V", "V, warm", "warm, new theta", "Q and gradient", "policy and gradient"]
-    return table([*head, "MiB", "error"], lines)
+    return table([*head, "MiB; error"], lines)
 
 
 # Beside DAQP and qpax

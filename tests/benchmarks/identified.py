@@ -123,7 +123,7 @@ def evaluated(case: Case, seeds: Sequence[int], folder: Path) -> dict[str, list[
                 found.setdefault("DeePC", []).append(J)
             if case.picture and seed == seeds[0]:
                 shown = Evaluation(cfg, physics, {"learned": loop}, {})
-                learned_episode_figure(mpc, shown).savefig(folder / f"{case.picture}.png", dpi=80)
+                learned_episode_figure(mpc, shown).savefig(folder / f"{case.picture}.png", dpi=110)
     return {
         name: [(J - scale.fixed) / scale.per for J in costs]
         for name, costs in sorted(found.items(), key=lambda item: median(item[1]))

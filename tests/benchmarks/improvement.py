@@ -24,7 +24,7 @@ import torch
 from omegaconf import DictConfig
 
 import train
-from tests.benchmarks.table import DOCS
+from tests.benchmarks.table import DOCS, two_tables
 from tests.runs import make_config
 from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.experiment.evaluation import rival_costs
@@ -208,21 +208,21 @@ def outcome_table(rows: Any) -> str:
 
 
 def method_table(rows: Any) -> str:
-    """Format J of single methods, relative to the start's, with a column for each case.
+    """Format J of single methods, relative to the start's.
 
     A case's seeds are those with which all its methods have run.
     """
-    head = ["J / J of the start, %: median [interval], worst"]
-    lines = [["seeds"], *([way] for way in (*WAYS, *METHODS))]
+    ways = (*WAYS, *METHODS)
+    head = ["J / J of the start, %: median [interval], worst", "seeds", *ways]
+    lines = []
     for case, runs in by_case(rows):
         if case not in METHOD_CASES:
             continue
         common = set.intersection(*({*found["seed"]} for _, found in runs.groupby("way")))
-        head.append(case)
-        lines[0].append(str(len(common)))
-        for line in lines[1:]:
-            found: Any = runs[runs["seed"].isin([*common]) & (runs["way"] == line[0])]
-            line.append(ratios(found) if len(found) else "")
+        lines.append([case, str(len(common))])
+        for way in ways:
+            of_way: Any = runs[runs["seed"].isin([*common]) & (runs["way"] == way)]
+            lines[-1].append(ratios(of_way) if len(of_way) else "")
     return table(head, lines)
 
 
@@ -247,7 +247,7 @@ def reference_table(rows: Any) -> str:
         lines.append([case, *cells, *counts, f"{accepted:.0f} of {accepted + rejected:.0f}"])
     head = ["Medians", "start", "default", "true model", "reference", "gap closed to true model"]
     head += ["to reference", "transitions", "simulated for comparisons", "accepted"]
-    return table(head, lines)
+    return two_tables(head, lines, 7)
 
 
 def wanted(

@@ -17,21 +17,20 @@ from omegaconf import DictConfig
 from scipy.stats import wilcoxon
 
 from tests.benchmarks.dynamic_programming import optimal_policy
-from tests.benchmarks.table import DOCS, ROOT
+from tests.benchmarks.table import DOCS, ROOT, two_tables
 from torch_qpmpc.envs import ActuatorNoise
 from torch_qpmpc.envs.closed_loop import cost_text, plant_loop
 from torch_qpmpc.experiment.config import load_config
 from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
 from torch_qpmpc.experiment.run_folder import read_summary
 from torch_qpmpc.experiment.tasks.actuator_noise import STARTS
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import replaced
 
 PAGE = DOCS / "results" / "learning.md"
 #: The bound of the action of `task=actuator_noise` that is not active.
 FREE = 10.0
 HEADER = (
     "task",
-    "N",
     "start",
     "identification",
     "best without learning",
@@ -97,9 +96,9 @@ def row(summaries: list[dict[str, Any]]) -> list[str]:
 
 def main() -> None:
     cases = runs(ROOT / "runs" / "learning")
-    lines = [[name, str(N), *row(x)] for (name, N), x in sorted(cases.items())]
+    lines = [[f"{name}, N = {N}", *row(x)] for (name, N), x in sorted(cases.items())]
     page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(replaced(page, table(HEADER, lines), "learning"), encoding="utf-8")
+    PAGE.write_text(replaced(page, two_tables(HEADER, lines, 7), "learning"), encoding="utf-8")
 
 
 if __name__ == "__main__":

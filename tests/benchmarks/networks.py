@@ -207,17 +207,27 @@ def budgets_table(cases: Mapping[str, Seeds]) -> str:
     return table(["", *head, f"reach {cost_text(level)}"], lines)
 
 
+TITLES = {
+    "pendulum": "Pendulum",
+    "cart_pole": "Cart-pole, swing-up",
+    "point_mass": "Point mass",
+    "house": "House, EUR a day",
+    "tank_references": "Tank with references",
+}
+
+
 def figure(curves: Curves) -> Figure:
     """Draw J over transitions for each task: the median over seeds, the best and the worst."""
     drawn = Figure(figsize=(5 * len(curves), 4), layout="constrained")
-    panels = drawn.subplots(1, len(curves), squeeze=False)[0]
-    for axes, (task, cases) in zip(panels, curves.items(), strict=True):
+    panels = drawn.subfigures(1, len(curves), squeeze=False)[0]
+    for panel, (task, cases) in zip(panels, curves.items(), strict=True):
+        axes = panel.subplots()
         for case, seeds in cases.items():
             x = sorted(set.intersection(*map(set, seeds.values())))
             J = np.array([[of_seed[k] for k in x] for of_seed in seeds.values()])
             (line,) = axes.plot(x, np.median(J, 0), label=case)
             axes.fill_between(x, J.min(0), J.max(0), color=line.get_color(), alpha=0.2, linewidth=0)
-        axes.set(title=task, xlabel="transitions", ylabel="J", xscale="log")
+        axes.set(title=TITLES[task], xlabel="transitions", ylabel="J", xscale="log")
         scale_costs(axes)
         axes.legend(fontsize="small")
     return drawn

@@ -36,7 +36,7 @@ import torch
 from omegaconf import DictConfig
 
 import train
-from tests.benchmarks.table import DOCS
+from tests.benchmarks.table import DOCS, two_tables
 from tests.runs import make_config
 from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.experiment.algorithms import evaluate
@@ -45,7 +45,7 @@ from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc, make_physics, run_code
 from torch_qpmpc.experiment.tasks.identified import identified_start
 from torch_qpmpc.learning.operators import warm_policy
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import replaced
 
 PAGE = DOCS / "results" / "outside.md"
 RESULTS = DOCS / "results" / "outside.csv"
@@ -318,8 +318,8 @@ def outcomes(rows: Any, tuned: bool) -> str:
         chosen = "; ".join(dict.fromkeys(runs["chosen"]))
         tail = [f"{worse} of {len(runs)}", f"{runs['R2_cost'].mean():.2f}", counts, chosen]
         lines.append([name, *cells, *tail])
-    head = ["J", *shown.values(), "worse than zero action", "R2 of the cost"]
-    return table([*head, "transitions of the choice", "chosen"], lines)
+    head = ["plant", *shown.values(), "worse than zero action", "R2 of the cost"]
+    return two_tables([*head, "transitions of the choice", "chosen"], lines, len(head) - 1)
 
 
 def add(path: Path, row: Any) -> None:

@@ -8,7 +8,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +66,12 @@ def tables(results: dict[str, Any]) -> str:
         overhead(of("test_share_outside_the_solver"), of("test_decisions")),
     ]
     return "\n\n".join(part for part in parts if part)
+
+
+def two_tables(head: Sequence[str], lines: Sequence[Sequence[str]], at: int) -> str:
+    """Format a table as two that fit a page: the second has column 0, and those from ``at`` on."""
+    first = table(head[:at], [line[:at] for line in lines])
+    return f"{first}\n\n{table([head[0], *head[at:]], [[line[0], *line[at:]] for line in lines])}"
 
 
 def conditions(machine: dict[str, Any]) -> str:

@@ -17,7 +17,7 @@ from torch_qpmpc.study.markdown import replaced, table
 PAGE = DOCS / "results" / "weighted.md"
 #: Transitions before the first update and in each, and those from which a run counts as steady.
 WARM_UP, UPDATE, STEADY = 640, 160, 3000
-HEADER = ("std", "N", "weighted", "seeds", "start", "median", "worst median", "worst", "end: worst")
+HEADER = ("case", "seeds", "start", "median", "worst median", "worst", "end: worst")
 
 
 def ratios(folder: Path) -> pd.Series:
@@ -32,7 +32,9 @@ def rows(folder: Path) -> list[list[str]]:
     cases: dict[tuple[str, str, str], list[pd.Series]] = {}
     for run in sorted(folder.glob("N=*")):
         N, std, weighted = (part.split("=")[1] for part in run.name.split("-")[:3])
-        cases.setdefault((std, N, {"True": "yes", "False": "no"}[weighted]), []).append(ratios(run))
+        cases.setdefault((std, N, {"True": "weighted", "False": "plain"}[weighted]), []).append(
+            ratios(run)
+        )
     lines = []
     for case, runs in sorted(cases.items(), reverse=True):
         all_runs = pd.concat(runs, axis=1)
@@ -40,7 +42,9 @@ def rows(folder: Path) -> list[list[str]]:
         medians = steady.median(axis=1)
         numbers = (all_runs.iloc[0, 0], medians.median(), medians.max(), steady.max().max())
         numbers += (all_runs.iloc[-1].max(),)
-        lines.append([*case, str(len(runs)), *(f"{x:.3f}" for x in numbers)])
+        std, N, weighted = case
+        name = f"std {std}, N = {N}, {weighted}"
+        lines.append([name, str(len(runs)), *(f"{x:.3f}" for x in numbers)])
     return lines
 
 

@@ -31,9 +31,7 @@ TITLES = (
     "rows",
     "largest difference of u",
     "of the value",
-    "solved",
-    "infeasible",
-    "not certified",
+    "solved, infeasible, not certified",
     "most iterations",
     "object, state",
 )
@@ -86,7 +84,7 @@ def judged(name: str, count: int, storage: str) -> tuple[list[str], bool]:
             counts += [x.sum() for x in (solved, infeasible, limit)]
             most = max(most, int(steps.iterations.max()))
     row = [name, f"{export.rows}", f"{worst[0]:.0e}", f"{worst[1]:.0e}"]
-    row += [f"{n:,}" for n in counts]
+    row += [", ".join(f"{n}" for n in counts)]
     row += [f"{most}", f"{size / 1e3:.0f}, {export.state_bytes / 1e3:.1f} kB"]
     return row, not wrong and bool((worst <= LARGEST).all())
 

@@ -229,7 +229,13 @@ def test_a_task_shows_its_episode_in_its_own_terms(task, labels):
     cfg = make_config(f"task={task}", *more)
     physics = make_physics(cfg)
     mpc = make_task_mpc(cfg, physics)
-    figure = learned_episode_figure(mpc, Evaluation.before(cfg, physics, mpc))
+    before = Evaluation.before(cfg, physics, mpc)
+    figure = learned_episode_figure(mpc, before)
     assert [axes.get_ylabel() for axes in figure.axes] == labels
+    paths = closed_loop_figure(mpc, before).axes[0]
+    over_time = task.startswith("house")
+    assert [paths.get_xlabel(), paths.get_ylabel()] == (
+        ["hour", labels[0]] if over_time else labels[:2]
+    )
     assert {"realised", "planned"} <= {*legend_of(figure.axes[0])}
     rendered(figure)

@@ -106,7 +106,7 @@ def episode_figure(
         if len(signal) < length - 1:
             got, want = f"shape {tuple(signal.shape)}", f"at least {length - 1} entries"
             raise QPError.expected(f"signals[{name!r}]", got, want)
-    figure = Figure(figsize=(9, 1.7 * (len(names) + len(signals))), layout="constrained")
+    figure = Figure(figsize=(6.5, 1.7 * (len(names) + len(signals))), layout="constrained")
     panels = figure.subplots(len(names) + len(signals), 1, sharex=True, squeeze=False)[:, 0]
     for axes, name in zip(panels, [*names, *signals], strict=True):
         axes.set_ylabel(name)

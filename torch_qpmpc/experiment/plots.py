@@ -19,8 +19,6 @@ from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.mpc.module import QPMPC
 
-#: Symbols of the first two states.
-SYMBOLS = ("$s_1$", "$s_2$")
 #: Colours of the rivals' lines, in their order.
 RIVAL_COLOURS = (
     "0.2",
@@ -37,19 +35,20 @@ def draw_positions(
     axes: Axes,
     loops: Mapping[str, ClosedLoop],
     mpc: QPMPC,
-    outputs: Sequence[str] = SYMBOLS,
+    names: Mapping[str, Any],
     shown: int = 6,
 ) -> None:
     """Draw closed-loop paths from a few starts, and the learned QP's predictions.
 
-    They are in the plane of the first two states or outputs, of which ``outputs`` are the names, or
-    over time if there is only one.
+    They are in the plane of the first two states or outputs, or over time if there is only one.
+    ``names`` are those of `episode_names`.
     """
     plane = mpc.n_x > 1
+    times = names.get("times", torch.arange(2.0))
 
     def draw(paths: Tensor, *style: Any, **options: Any) -> None:
         """Draw paths ``(steps, starts, n_x)``."""
-        x = paths[..., 0] if plane else torch.arange(len(paths))
+        x = paths[..., 0] if plane else (times[1] - times[0]) * torch.arange(len(paths))
         axes.plot(x, paths[..., int(plane)], *style, **options)
 
     for name, loop in loops.items():
@@ -64,7 +63,8 @@ def draw_positions(
     draw(first.states[:1, :shown], "ko", markersize=3)
     if plane:
         axes.plot(0, 0, "k+", markersize=9)
-    labels = outputs[:2] if plane else ("step", outputs[0])
+    outputs = names["outputs"]
+    labels = outputs[:2] if plane else (names.get("xlabel", "step"), outputs[0])
     axes.set(xlabel=labels[0], ylabel=labels[1], title="Closed loop")
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
 
@@ -73,19 +73,30 @@ def learned_episode_figure(mpc: QPMPC, evaluation: Evaluation) -> Figure:
     """Draw the first episode of the learned policy, and its plans after every half horizon."""
     loop = evaluation.loops["learned"]
     p, times = loop.known[:, 0], torch.arange(len(loop.known), dtype=torch.float64)
-    options = {"times": times, **_episode(mpc, evaluation)}
+    options = {"times": times, **_names(mpc, evaluation)}
     plans = plans_along(mpc, p[:-1], every=max(mpc.horizon // 2, 1))
     return episode_figure(y=loop.states[:, 0], u=loop.actions[:, 0], plans=plans, **options)
 
 
-def _episode(mpc: QPMPC, evaluation: Evaluation) -> dict[str, Any]:
-    """Return what the task shows of its first episode, with the names of outputs and actions."""
+def episode_names(cfg: DictConfig, physics: Any, mpc: QPMPC, d: Tensor) -> dict[str, Any]:
+    """Return the names of outputs and actions, and what else the task shows of an episode.
+
+    Args:
+        cfg: the configuration of the run.
+        physics: the plant.
+        mpc: a QPMPC of its sizes.
+        d: the episode's known signals, ``(steps, n_d)``.
+    """
     symbols = {
         "outputs": [f"$s_{{{i + 1}}}$" for i in range(mpc.n_x)],
         "actions": [f"$a_{{{i + 1}}}$" for i in range(mpc.n_u)],
     }
+    return symbols | dict(find_task(cfg.task).episode(physics, d))
+
+
+def _names(mpc: QPMPC, evaluation: Evaluation) -> dict[str, Any]:
     d = evaluation.loops["learned"].known[:, 0, : mpc.n_d]
-    return symbols | dict(find_task(evaluation.cfg.task).episode(evaluation.physics, d))
+    return episode_names(evaluation.cfg, evaluation.physics, mpc, d)
 
 
 def draw_stage_costs(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
@@ -100,7 +111,7 @@ def closed_loop_figure(mpc: QPMPC, evaluation: Evaluation) -> Figure:
     """Draw paths in the plane with predictions, and the stage cost over time."""
     figure = Figure(figsize=(6, 9), layout="constrained")
     top, bottom = figure.subplots(2, 1, height_ratios=(3, 2))
-    draw_positions(top, evaluation.loops, mpc, _episode(mpc, evaluation)["outputs"])
+    draw_positions(top, evaluation.loops, mpc, _names(mpc, evaluation))
     draw_stage_costs(bottom, evaluation.loops)
     return figure
 
@@ -163,10 +174,10 @@ def experience(cfg: DictConfig) -> tuple[float, float, str]:
 def summary_figure(
     mpc: QPMPC, evaluation: Evaluation, updates: Sequence[float], J: Sequence[float]
 ) -> Figure:
-    """Draw a run's learning curve, learned matrix and closed loop side by side."""
+    """Draw a run's learning curve, learned matrix and closed loop, each in a third of the width."""
     figure = Figure(figsize=(15, 4), layout="constrained")
-    left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1.5, 1))
+    left, middle, right = (panel.subplots() for panel in figure.subfigures(1, 3))
     draw_learning(left, updates, J, evaluation)
     draw_matrix(middle, mpc.C, mpc, r"Learned constraint matrix $C_\theta$")
-    draw_positions(right, evaluation.loops, mpc, _episode(mpc, evaluation)["outputs"])
+    draw_positions(right, evaluation.loops, mpc, _names(mpc, evaluation))
     return figure

@@ -16,6 +16,7 @@ from torch_qpmpc.experiment.plots import (
     draw_lines,
     draw_matrix,
     draw_positions,
+    episode_names,
     experience,
     scale_costs,
 )
@@ -146,7 +147,8 @@ def trajectories_figure(frame: pd.DataFrame) -> Figure:
             for name, mpc in ends.items()
             if mpc is not None
         }
-        draw_positions(axes, loops, run.policy)
+        d = next(iter(loops.values())).known[:, 0, : run.policy.n_d]
+        draw_positions(axes, loops, run.policy, episode_names(run.cfg, run.physics, run.policy, d))
         axes.set_title(label)
     figure.suptitle(f"{runs['noise'].iloc[0]} noise, seed {runs['seed'].iloc[0]}")
     return figure

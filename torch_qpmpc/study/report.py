@@ -87,18 +87,15 @@ def cases_table(sweep: pd.DataFrame) -> str:
         errors = f"{median['prediction_error_start']:.3f} to {median['prediction_error']:.3f}"
         lines.append(
             [
-                escaped(noise),
-                escaped(label),
+                escaped(f"{label}, {noise}"),
                 f"{gap} ({len(real)} of {len(runs)})",
                 _ends(median, "J"),
-                _ends(median, "J_discounted"),
                 f"{median['canonical_distance']:.3f}",
                 f"{median['zeros_above']:.2f}",
                 f"{errors} ({nearer} of {len(runs)})",
             ]
         )
-    head = ["noise", "case", "closed gap", "J", "J discounted", "distance", "zeros"]
-    head += ["prediction error"]
+    head = ["case, noise", "closed gap", "J", "distance", "zeros", "prediction error"]
     return table(head, lines)
 
 
