@@ -159,3 +159,27 @@ def piqp_solver(full: FullSpace) -> Callable[[], Tensor]:
         return full.value(torch.from_numpy(x)).detach()
 
     return values
+
+
+def clarabel_solver(full: FullSpace, tolerance: float) -> Callable[[], Tensor]:
+    """Make Clarabel in full space, set up for each QP: a function that returns values ``(B,)``."""
+    clarabel = needs("clarabel")
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+    G, h = full.one_sided()
+    rows = sp.csc_matrix(torch.cat((full.A, G)).detach().numpy())
+    Q, p = sp.csc_matrix(full.Q.detach().triu().numpy()), full.p.detach().numpy()
+    right = torch.cat((full.b, h), dim=1).detach().numpy()
+    cones = [clarabel.ZeroConeT(len(full.A)), clarabel.NonnegativeConeT(len(G))]
+
+    def values() -> Tensor:
+        x = []
+        for i in range(len(p)):
+            solution = clarabel.DefaultSolver(Q, p[i], rows, right[i], cones, settings).solve()
+            if "Solved" not in str(solution.status):
+                raise RuntimeError(f"Clarabel: {solution.status}")
+            x.append(solution.x)
+        return full.value(torch.tensor(x, dtype=torch.float64)).detach()
+
+    return values

@@ -89,8 +89,7 @@ def cvxpylayers(u_max: float) -> Peer:
 
 def cvxpygen(u_max: float) -> Peer:
     """Generate CVXPYgen's C with OSQP at its default tolerance; its gradient, state by state."""
-    import cvxpygen.cpg
-
+    generator = import_module("cvxpygen.cpg")
     of, parameters, x, u = problem(u_max)
     A, B, offset, states = lqr()
     values = dict(zip(parameters, (states[0], A, B, offset), strict=True))
@@ -100,7 +99,7 @@ def cvxpygen(u_max: float) -> Peer:
     sys.path.insert(0, folder)
     with chdir(folder):
         options = {"prefix": code, "solver": "OSQP", "gradient": True}  # the prefix names its types
-        cvxpygen.cpg.generate_code(of, code_dir=code, **options)
+        generator.generate_code(of, code_dir=code, **options)
     generated = import_module(f"{code}.cpg_solver")
 
     def solved() -> list[Any]:

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from tests.benchmarks.full_space import FullSpace
-from tests.benchmarks.peers import cvxpylayers, piqp_solver
+from tests.benchmarks.peers import clarabel_solver, cvxpylayers, needs, piqp_solver
 from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
 from tests.benchmarks.reference import reference_values, relative_error
 from torch_qpmpc import QPMPC
@@ -53,9 +53,7 @@ Solve = Callable[[], Tensor]
 
 def osqp_solver(full: FullSpace) -> Solve:
     """Make OSQP, without warm starts, at tolerances of 1e-6."""
-    import osqp
-
-    solver = osqp.OSQP()
+    solver = needs("osqp").OSQP()
     p, b, lower, upper = (v.detach().numpy() for v in (full.p, full.b, full.l, full.u))
     lower, upper = np.hstack((b, lower)), np.hstack((b, upper))
     rows = sp.csc_matrix(torch.cat((full.A, full.G)).detach().numpy())
@@ -73,32 +71,9 @@ def osqp_solver(full: FullSpace) -> Solve:
     return values
 
 
-def clarabel_solver(full: FullSpace) -> Solve:
-    """Make Clarabel at its default tolerances, 1e-8, set up for each QP."""
-    import clarabel
-
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    G, h = full.one_sided()
-    rows, right = sp.csc_matrix(torch.cat((full.A, G))), torch.cat((full.b, h), dim=1).numpy()
-    Q, p = sp.csc_matrix(full.Q.triu()), full.p.numpy()
-    cones = [clarabel.ZeroConeT(len(full.A)), clarabel.NonnegativeConeT(len(G))]
-
-    def values() -> Tensor:
-        x = [
-            clarabel.DefaultSolver(Q, p[i], rows, right[i], cones, settings).solve().x
-            for i in range(len(p))
-        ]
-        return full.value(torch.tensor(x, dtype=torch.float64))
-
-    return values
-
-
 def qpax_solver(full: FullSpace) -> Solve:
     """Make qpax, dense, compiled for the batch, in float64."""
-    import jax
-    import qpax
-
+    jax, qpax = needs("jax"), needs("qpax")
     jax.config.update("jax_enable_x64", True)
     G, h = full.one_sided()
     Q, A, G = (matrix.numpy() for matrix in (full.Q, full.A, G))
@@ -110,7 +85,7 @@ def qpax_solver(full: FullSpace) -> Solve:
 #: Other packages' solvers in full space, by the package that they need.
 PEERS: dict[str, tuple[str, Callable[[FullSpace], Solve]]] = {
     "PIQP, sparse": ("piqp", piqp_solver),
-    "Clarabel": ("clarabel", clarabel_solver),
+    "Clarabel": ("clarabel", partial(clarabel_solver, tolerance=1e-8)),
     "OSQP": ("osqp", osqp_solver),
     "qpax": ("qpax", qpax_solver),
 }

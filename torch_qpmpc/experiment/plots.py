@@ -176,7 +176,8 @@ def summary_figure(
 ) -> Figure:
     """Draw a run's learning curve, learned matrix and closed loop, each in a third of the width."""
     figure = Figure(figsize=(15, 4), layout="constrained")
-    left, middle, right = (panel.subplots() for panel in figure.subfigures(1, 3))
+    panels: Any = figure.subfigures(1, 3)
+    left, middle, right = (panel.subplots() for panel in panels)
     draw_learning(left, updates, J, evaluation)
     draw_matrix(middle, mpc.C, mpc, r"Learned constraint matrix $C_\theta$")
     draw_positions(right, evaluation.loops, mpc, _names(mpc, evaluation))
