@@ -281,7 +281,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
         if (case, way, seed) not in done:
             add(options.results, row := run(case, way, seed))
             print(*row.values(), flush=True)
-    rows = finished(options.results)
+    rows: Any = finished(options.results)
     rows = rows[rows["seed"].isin(options.seeds)]
     both: Any = rows[rows["way"].isin([*WAYS])]
     tables = f"{outcome_table(both)}\n\n{reference_table(both)}"
