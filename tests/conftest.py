@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import torch
 
 import train
 from tests.runs import SMALL, make_config
+from torch_qpmpc.control import exporting
+from torch_qpmpc.export import export, library
 from torch_qpmpc.qp.solvers import BACKENDS
 
 COMPILING = pytest.StashKey[subprocess.Popen[bytes]]()
@@ -47,6 +50,17 @@ def one_thread() -> None:
 def solver(request: pytest.FixtureRequest) -> str:
     """Return the name of each backend in turn."""
     return request.param
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_exports() -> Iterator[None]:
+    """Compile exports without optimisation, and compare them at few states."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (exporting, library):
+            patch.setattr(module, "FLAGS", ("-std=c99", "-O0", "-fPIC", "-shared"))
+        for module in (exporting, export):
+            patch.setattr(module, "COMPARED", 60)
+        yield
 
 
 @pytest.fixture

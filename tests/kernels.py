@@ -5,14 +5,18 @@ from __future__ import annotations
 import tempfile
 
 import train
+from tests.campaign.families import FAMILIES, Draw
 from tests.runs import SMALL, make_config
+from torch_qpmpc import solve_qp
 
 
 def compile_kernels() -> None:
-    """Train briefly with either order of optimiser, which calls nearly every kernel."""
-    for optimizer in ("gauss_newton", "adam"):
+    """Train briefly and solve a QP of large numbers, which calls nearly every kernel."""
+    for override in ("optimizer=gauss_newton", "optimizer=adam", "task=inventory"):
         with tempfile.TemporaryDirectory() as folder:
-            train.train(make_config(*SMALL, f"optimizer={optimizer}"), folder, quiet=True)
+            train.train(make_config(*SMALL, override), folder, quiet=True)
+    case = FAMILIES["scaled cost"](Draw(7), 3)
+    solve_qp(case.known.qp, case.known.fixed, solver="daqp")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import subprocess
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from torch_qpmpc.control import exporting
 from torch_qpmpc.control.exporting import CompiledController
 from torch_qpmpc.export import export
 
-pytestmark = pytest.mark.usefixtures("quick")
 STEPS = int(os.environ.get("STEPS", "100"))
 A = np.array([[0.9, 0.2, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
 B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.4]])
@@ -102,9 +102,16 @@ def test_a_set_point_at_a_soft_bound_with_a_large_price_is_certified(tmp_path):
         x = A @ x + model[1] @ (u + 0.6)
 
 
-def test_a_reset_starts_where_the_plant_rests(tmp_path):
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Export a controller of the integrator: the controller, its files, and C to be reset."""
     controller = qm.Controller(integrator())
-    twin = load(controller.export_c(tmp_path).files, controller)
+    files = controller.export_c(tmp_path_factory.mktemp("c")).files
+    return controller, files, load(files, controller)
+
+
+def test_a_reset_starts_where_the_plant_rests(exported):
+    controller, _, twin = exported
     controller.reset(y=[1.5])
     twin.reset([1.5])
     for y in (1.4, 1.45):
@@ -112,9 +119,9 @@ def test_a_reset_starts_where_the_plant_rests(tmp_path):
     assert np.allclose(twin.step([1.5])[0], controller.step([1.5]), atol=1e-12)  # the last r
 
 
-def test_signals_that_are_not_finite_hold_the_last_input_and_the_loop_goes_on(tmp_path):
-    controller = qm.Controller(integrator())
-    twin = load(controller.export_c(tmp_path).files, controller)
+def test_signals_that_are_not_finite_hold_the_last_input_and_the_loop_goes_on(exported):
+    _, _, twin = exported
+    twin.reset()
     assert twin.step([np.nan], [1.0]) == (np.zeros(1), 3)
     first, code = twin.step([0.0], [1.0])
     assert code == 0
@@ -158,7 +165,7 @@ def test_the_folder_s_program_runs_without_warnings_and_its_loop_has_no_offset(t
 def test_single_precision_agrees_to_its_accuracy(tmp_path):
     controller = qm.Controller(integrator(y_bounds=None))
     report = controller.export_c(tmp_path, dtype="float32", storage="small")
-    assert difference(controller, load(report.files, controller, dtype="float32"), 200) < 1e-3
+    assert difference(controller, load(report.files, controller, dtype="float32"), 60) < 1e-3
 
 
 def test_without_a_compiler_nothing_is_compared(tmp_path, monkeypatch):
@@ -170,9 +177,9 @@ def test_without_a_compiler_nothing_is_compared(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["plan", "target"])
-def test_the_self_test_finds_a_wrong_table(tmp_path, name):
-    controller = qm.Controller(integrator())
-    files = controller.export_c(tmp_path).files
+def test_the_self_test_finds_a_wrong_table(tmp_path, name, exported):
+    controller, files, _ = exported
+    files = [Path(shutil.copy(file, tmp_path)) for file in files]
     file = tmp_path / f"policy_{name}.c"
     text = file.read_text()
     start = text.index("U_P[1]")

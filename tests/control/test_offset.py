@@ -1,6 +1,6 @@
 """Steady states of closed loops of random plants, beside an independent search for the nearest.
 
-The slow tests draw 15 plants, in Python and in C, and 200 with
+The slow tests draw 8 plants, in Python and in C, and 200 with
 ``PLANTS=200 pytest -m slow tests/control/test_offset.py``.
 """
 
@@ -22,7 +22,7 @@ from torch_qpmpc.export.library import compiler
 
 #: The inputs for outputs and set-points.
 Step = Callable[[np.ndarray, np.ndarray], Any]
-PLANTS = int(os.environ.get("PLANTS", "15"))
+PLANTS = int(os.environ.get("PLANTS", "8"))
 #: The loop has settled when no state moves by more; it is cut off after so many steps.
 STILL, STEPS = 1e-11, 3000
 OFFSET = 1e-6
@@ -172,5 +172,5 @@ def test_the_loops_of_many_plants_settle_there(seed):
 @pytest.mark.slow
 @pytest.mark.skipif(compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("seed", range(PLANTS))
-def test_the_loops_in_c_settle_there(seed, tmp_path, quick):
+def test_the_loops_in_c_settle_there(seed, tmp_path):
     check(seed, tmp_path)

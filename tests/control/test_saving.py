@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,18 +61,6 @@ def test_a_loaded_controller_goes_on_with_the_same_inputs(tmp_path, options):
     assert np.array_equal(inputs(twin), inputs(controller))
     assert twin.mpc.design.plant.label("level") == "level [m]"
     assert twin.mpc.design.plant.dt == 0.5
-
-
-def test_another_process_has_the_same_inputs(tmp_path):
-    controller = qm.Controller(learned())
-    controller.save(tmp_path / "mine.qpmpc")
-    code = """
-import numpy as np, sys, torch_qpmpc as qm
-from tests.control.test_saving import inputs
-np.save("inputs.npy", inputs(qm.Controller.load("mine.qpmpc")))
-"""
-    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
-    assert np.array_equal(np.load(tmp_path / "inputs.npy"), inputs(controller))
 
 
 def test_a_controller_is_saved_before_its_first_step_and_without_disturbances(tmp_path):

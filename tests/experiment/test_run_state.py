@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from pathlib import Path
 from typing import Any
@@ -33,20 +34,16 @@ NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
 @pytest.mark.parametrize(
     "overrides",
     [
-        ("optimizer=adam", "constraint=combined"),
         ("optimizer=sgd", "constraint=combined", "solver=torch", "step=projection"),
         ("optimizer=gauss_newton", "constraint=combined", "solver=proxqp"),
         ("optimizer=adam", "constraint=mpc", "release=9"),
-        ("optimizer=recursive", *STREAM, "constraint=mpc"),
+        ("gate=act", "optimizer=recursive", *STREAM, "constraint=mpc"),
         ("optimizer=recursive", *STREAM, "replay=true", "replay_capacity=16", "batch_size=4"),
         ("noise=brownian", "steps_per_update=3", "warm_start=false"),
-        ("task=store", "optimizer=gauss_newton", "replay_capacity=48"),
-        ("algo=td3", *ACTOR_CRITIC),
         (*GATED, "constraint=mpc", "release=5", "search.w=0.5"),
         (*GATED, *DATA, "constraint=free"),
-        ("gate=act", "optimizer=recursive", *STREAM),
-        ("gate=true", "algo=td3", *ACTOR_CRITIC, *NETWORKS),
-        ("task=store", "optimizer=gauss_newton", "constraint=si", "task.episode_steps=5"),
+        ("gate=true", "algo=td3", *ACTOR_CRITIC),
+        ("task=store", "optimizer=gauss_newton", "constraint=si", "replay_capacity=48"),
         ("task=store", "optimizer=recursive", "optimizer.memory=8", "task.episode_steps=6"),
         ("task=store", "algo=ddpg", *ACTOR_CRITIC, *NETWORKS),
     ],
@@ -63,12 +60,19 @@ def test_a_resumed_run_equals_an_undisturbed_one(tmp_path, monkeypatch, override
     assert_events_are_whole(tmp_path / "stopped")
 
 
-@pytest.fixture
-def stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Stop a run in its third update, after the checkpoint of the second."""
-    folder, cfg = tmp_path / "run", make_config(*RUN, "eval_interval=2")
-    stop(monkeypatch, cfg, folder, 3)
+    folder = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        stop(patch, make_config(*RUN, "eval_interval=2"), folder, 3)
     return folder
+
+
+@pytest.fixture
+def stopped(run: Path, tmp_path: Path) -> Path:
+    """Copy the stopped run."""
+    return shutil.copytree(run, tmp_path / "run")
 
 
 def test_figures_are_not_drawn_twice(tmp_path, monkeypatch):

@@ -236,11 +236,13 @@ def test_an_unstable_plant_that_the_actions_hold_is_solved(solver, horizon):
 
 
 @pytest.mark.parametrize(
-    ("A", "horizon"),
+    ("solver", "A", "horizon"),
     [
-        ([[2.0, 0.1], [0.0, 2.0]], 40),  # at the edge of what |u| <= 1 holds
-        ([[800.0, 600.0], [-600.0, 800.0]], 30),  # a norm of 1,000, and states of 1e90
-        ([[1.0, 1e3], [1e3, 1.0]], 20),
+        # At the edge of what |u| <= 1 holds.
+        *((solver, [[2.0, 0.1], [0.0, 2.0]], 40) for solver in ("daqp", "proxqp")),
+        # A norm of 1,000, and states of 1e90.
+        *((solver, [[800.0, 600.0], [-600.0, 800.0]], 30) for solver in ("daqp", "torch")),
+        ("qpsolvers:clarabel", [[1.0, 1e3], [1e3, 1.0]], 20),
     ],
 )
 def test_qps_beyond_float64_are_not_infeasible(solver, A, horizon):

@@ -458,7 +458,7 @@ def try_active_sets(qps, forces, active) -> tuple[Any, ...]:
     Returns:
         v ``(B, d)``, lam ``(B, r)``, the number of steps, and True where they settled, ``(B,)``.
     """
-    g, lower, upper, w = map(np.ascontiguousarray, (qps.g, qps.l, qps.u, qps.w))
+    g, lower, upper, w, active = map(np.ascontiguousarray, (qps.g, qps.l, qps.u, qps.w, active))
     return _try_active_sets(forces.rise, forces.push, qps.group, g, lower, upper, w, active)
 
 

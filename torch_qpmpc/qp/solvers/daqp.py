@@ -105,7 +105,7 @@ def tour(vectors: np.ndarray, near: int) -> np.ndarray:
     """
     few = len(vectors) <= near or not vectors.shape[1]
     order = np.arange(len(vectors)) if few else vectors[:, 0].argsort()
-    _walk(vectors, order, near)
+    _walk(np.ascontiguousarray(vectors), order, near)
     return order
 
 
