@@ -53,7 +53,7 @@ def target_mpc(design: Design) -> QPMPC:
     # y_s - r and u_s as maps of [r; w; d; v], and constants.
     error = np.hstack((-np.eye(n_y), steady.y[:, :-1], steady.Y))
     inputs = np.hstack((np.zeros((len(steady.U), n_y)), steady.u[:, :-1], steady.U))
-    weight = 2 * error.T @ design.Q @ error
+    weight = np.asarray(2 * error.T @ design.Q @ error)
     linear = 2 * error.T @ design.Q @ steady.y[:, -1]
     if len(steady.W) and not split:
         weight[n_x + steady.n_a :, n_x + steady.n_a :] += 2 * _preference(design) * steady.W
