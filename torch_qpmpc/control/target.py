@@ -15,6 +15,7 @@ that numbers in C lose their digits; it remains where f moves an output with sof
 from __future__ import annotations
 
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -53,7 +54,7 @@ def target_mpc(design: Design) -> QPMPC:
     # y_s - r and u_s as maps of [r; w; d; v], and constants.
     error = np.hstack((-np.eye(n_y), steady.y[:, :-1], steady.Y))
     inputs = np.hstack((np.zeros((len(steady.U), n_y)), steady.u[:, :-1], steady.U))
-    weight = np.asarray(2 * error.T @ design.Q @ error)
+    weight = 2 * error.T @ design.Q @ error
     linear = 2 * error.T @ design.Q @ steady.y[:, -1]
     if len(steady.W) and not split:
         weight[n_x + steady.n_a :, n_x + steady.n_a :] += 2 * _preference(design) * steady.W
@@ -90,7 +91,7 @@ def free_mpc(design: Design) -> QPMPC | None:
 
 
 def _of_one_stage(
-    n_x: int, weight: Array, linear: Array, constant: float, rows: tuple[Array, ...], slack: Array
+    n_x: int, weight: Any, linear: Array, constant: float, rows: tuple[Array, ...], slack: Array
 ) -> QPMPC:
     """Return the QPMPC with the rows (D, lower, upper), whose state has no cost at its end."""
     n_v = len(weight) - n_x
