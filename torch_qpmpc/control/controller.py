@@ -297,8 +297,8 @@ class Controller:
             Sizes and the measured agreement.
 
         Raises:
-            QPError: as in `QPMPC.export_c`; the self-test fails; or inputs that r leaves free move a
-                bounded output without a weight, as their choice is not exact in C.
+            QPError: as in `QPMPC.export_c`; the self-test fails; or inputs that r leaves free move
+                a bounded output without a weight, as their choice is not exact in C.
         """
         from torch_qpmpc.control.exporting import export_controller
 
