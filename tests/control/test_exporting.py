@@ -42,6 +42,7 @@ MPCS = {
     "integrator": integrator,
     "two by two": lambda: qm.LinearMPC((A, B, C), 8, Q=1.0, y_bounds=(-1.0, 1.0), **SIZES),
     "more outputs": lambda: qm.LinearMPC((A, B[:, :1], C), 8, Q=[1.0, 0.5], **SIZES),
+    "more inputs": lambda: qm.LinearMPC((A, B, C), 8, Q=[1.0, 0.0], **SIZES),
     "unbounded": lambda: qm.LinearMPC((A, B, C), 5, Q=1.0, R=0.1, disturbances=None),
 }
 
@@ -194,7 +195,9 @@ def test_a_controller_that_disagrees_is_refused(tmp_path, monkeypatch):
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_free_input_is_refused(tmp_path):
-    controller = qm.Controller(qm.LinearMPC((A, B, C[:1]), 3, Q=1.0, **SIZES))
-    with pytest.raises(QPError, match=r"^controller: got 2 inputs, .* Weight another output"):
-        controller.export_c(tmp_path)
+def test_a_bound_that_free_inputs_move_is_refused(tmp_path):
+    """Its price is beside the weight of the other output, and that of free inputs far below."""
+    mpc = qm.LinearMPC((A, B, C), 3, Q=[1.0, 0.0], **SIZES, y_bounds={"y2": (-1.0, 1.0)})
+    message = r"^controller: got bounds of y2, which inputs move .* Give y2 a small weight, or no"
+    with pytest.raises(QPError, match=message):
+        qm.Controller(mpc).export_c(tmp_path)

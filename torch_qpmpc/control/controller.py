@@ -285,7 +285,7 @@ class Controller:
         """Write this controller as C99 without heap or dependencies.
 
         ``name_step(&state, y, r, known, u)`` of ``name.c`` is `step`, with the estimates, the last
-        input and the active sets of both QPs in the state. A closed loop is compared with this
+        input and the active sets of all QPs in the state. A closed loop is compared with this
         one's if a C compiler is installed. ``main.c`` and a ``Makefile`` run the closed loop with
         the model as a plant; they are written once, and yours afterwards.
 
@@ -297,8 +297,8 @@ class Controller:
             Sizes and the measured agreement.
 
         Raises:
-            QPError: as in `QPMPC.export_c`; the self-test fails; or several steady inputs hold the
-                same outputs, as their choice is not exact enough in C.
+            QPError: as in `QPMPC.export_c`; the self-test fails; or inputs that r leaves free move
+                a bounded output without a weight, as their choice is not exact in C.
         """
         from torch_qpmpc.control.exporting import export_controller
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import Design, half_range
+from torch_qpmpc.control.disturbance import RANK
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, export_c
@@ -35,7 +36,8 @@ class ControllerExport:
 
     Attributes:
         files: the paths of all files.
-        plan, target: the reports of both QPs.
+        plan, target: the reports of the plan's and the target's QPs.
+        free: that of the QP of inputs that the target leaves free, None without one.
         table_bytes: the size of all constant tables but those of self-tests.
         state_bytes: the size of the state, None without a compiler.
         steps: the number of steps of the closed loop that is compared.
@@ -45,6 +47,7 @@ class ControllerExport:
     files: tuple[Path, ...]
     plan: Export
     target: Export
+    free: Export | None
     table_bytes: int
     state_bytes: int | None
     steps: int
@@ -126,14 +129,21 @@ def export_controller(
     """Write a controller as C; see `Controller.export_c`."""
     options = {"dtype": dtype, "max_iterations": max_iterations, "storage": storage}
     mpc, plant = controller.mpc, controller.mpc.design.plant
-    if mpc.design.steady.is_free:  # 1 / PREFERENCE is the condition of the target's QP
-        got = f"{len(plant.inputs)} inputs, of which several hold the same outputs with a weight"
-        remedy = "Weight another output, or make an input a known signal."
-        raise QPError.expected("controller", got, "one steady input for each set-point", remedy)
+    steady = mpc.design.steady
+    if len(steady.W) and steady.n_a and mpc.free is None:  # 1 / PREFERENCE is the QP's condition
+        moved = np.abs(steady.Y[:, steady.n_a :]).max(-1) > RANK
+        names = ", ".join(np.array(plant.outputs)[moved & mpc.design.bounded[0]])
+        got = f"bounds of {names}, which inputs move that no output with a weight tells apart"
+        remedy = f"Give {names} a small weight, or no bounds."
+        raise QPError.expected("controller", got, "bounds that the set-point determines", remedy)
     with tempfile.TemporaryDirectory() as temporary:
         plan = export_c(mpc, temporary, name=f"{name}_plan", **options)
         target = export_c(mpc.targets, temporary, name=f"{name}_target", **options)
-        texts = {x.name: x.read_text(encoding="utf-8") for x in (*plan.files, *target.files)}
+        free = None
+        if mpc.free is not None:
+            free = export_c(mpc.free, temporary, name=f"{name}_free", **options)
+        reports = [plan, target, *([free] if free else [])]
+        texts = {x.name: x.read_text(encoding="utf-8") for part in reports for x in part.files}
     twin = copy.copy(controller)
     twin.reset()
     loop = _run(mpc.design, twin.step, COMPARED)
@@ -161,7 +171,8 @@ def export_controller(
         tuple(folder / file for file in (*texts, *example)),
         plan,
         target,
-        plan.table_bytes + target.table_bytes + own,
+        free,
+        sum(part.table_bytes for part in reports) + own,
         state_bytes,
         len(loop.u),
         None if difference is None else float(difference.max()),
@@ -251,6 +262,7 @@ def _sizes(controller: Controller) -> dict[str, int]:
     return {
         "N_X": n,
         "N_W": len(observer.F) - n,
+        "N_F": 0 if controller.mpc.free is None else controller.mpc.free.n_u,
         "N_E": len(observer.F),
         "N_U": m,
         "N_Y": n_y,

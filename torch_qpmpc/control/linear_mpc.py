@@ -13,7 +13,7 @@ from torch_qpmpc.control.design import Design, read_design
 from torch_qpmpc.control.lowering import LinearScheme, lowered
 from torch_qpmpc.control.state_space import read_model
 from torch_qpmpc.control.stored import read_stored, stored_design
-from torch_qpmpc.control.target import target_mpc
+from torch_qpmpc.control.target import free_mpc, target_mpc
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.mpc.module import QPMPC
@@ -73,6 +73,7 @@ class LinearMPC(QPMPC):
     Attributes:
         targets: the QPMPC whose policy maps [r; w; d] to the target; see
             `torch_qpmpc.control.target`.
+        free: the one of the inputs that the target leaves free, None if there are none.
 
     Raises:
         QPError: an argument is invalid, or nothing has a cost.
@@ -89,7 +90,8 @@ class LinearMPC(QPMPC):
 
     scheme: LinearScheme
     targets: QPMPC
-    _target_qp: QuadraticProgram
+    free: QPMPC | None
+    _target_qps: list[QuadraticProgram]
 
     def __init__(
         self,
@@ -141,9 +143,10 @@ class LinearMPC(QPMPC):
         self._start_targets()
 
     def _start_targets(self) -> None:
-        """Make the QP of the target, which is not learned and no submodule."""
-        targets = target_mpc(self.design)
-        vars(self).update(targets=targets, _target_qp=targets.quadratic_program())
+        """Make the QPs of the target, which are not learned and no submodules."""
+        targets, free = target_mpc(self.design), free_mpc(self.design)
+        qps = [mpc.quadratic_program() for mpc in (targets, free) if mpc is not None]
+        vars(self).update(targets=targets, free=free, _target_qps=qps)
 
     @property
     def design(self) -> Design:
@@ -214,7 +217,11 @@ class LinearMPC(QPMPC):
             SolverError: the bounds of the inputs admit no steady state.
         """
         s = self._target_inputs(r, w, known)
-        return self.steady_state(self.targets.policy(s, qp=self._target_qp), s)
+        v = self.targets.policy(s, qp=self._target_qps[0])
+        if self.free is not None:
+            state = torch.cat((v, s[..., len(self.design.Q) :]), -1)
+            v = torch.cat((v, self.free.policy(state, qp=self._target_qps[1])), -1)
+        return self.steady_state(v, s)
 
     def steady_state(self, v: Tensor, s: Tensor) -> Target:
         """Return the steady state of ``v`` and ``s = [r; w; d]``; `Steady` has its maps."""

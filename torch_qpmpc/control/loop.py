@@ -99,7 +99,11 @@ def _gains(controller: Controller, plan: Tables, target: Tables) -> tuple[Array,
     signals = torch.cat((torch.zeros_like(signals[:1]), signals))
     x, w, u_last, r = signals.split((n, n_w, m, n_y), dim=-1)
     s = torch.cat((r, w, r.new_zeros(len(r), n_d)), -1)
-    aimed = mpc.steady_state(s @ torch.from_numpy(target.K.T) + torch.from_numpy(target.k), s)
+    a = s @ torch.from_numpy(target.K.T) + torch.from_numpy(target.k)
+    f = a.new_zeros(
+        len(a), design.steady.Y.shape[1] - a.shape[1]
+    )  # inputs without bounds are least
+    aimed = mpc.steady_state(torch.cat((a, f), -1), s)
     stages = aimed
     if design.references == "preview":
         stages = Target(*(part[:, None].expand(-1, mpc.horizon + 1, -1) for part in aimed))

@@ -15,6 +15,8 @@ from torch_qpmpc.errors import QPError
 
 #: Default standard deviations, relative to half of the bounds' distance.
 SMALL = 0.1
+#: A filter's mode this near to the unit circle is on it but for rounding.
+ON_CIRCLE = 1e-9
 
 
 class Observer(NamedTuple):
@@ -61,7 +63,7 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
     try:
         P = scipy.linalg.solve_discrete_are(F.T, H.T, process, np.diag(noise**2))
         L = np.linalg.solve(H @ P @ H.T + np.diag(noise**2), H @ P).T
-        stable = np.abs(np.linalg.eigvals(F - F @ L @ H)).max() < 1
+        stable = np.abs(np.linalg.eigvals(F - F @ L @ H)).max() < 1 - ON_CIRCLE
     except (ValueError, np.linalg.LinAlgError):
         L, stable = np.zeros((n + n_w, n_y)), False
     if not stable:

@@ -4,7 +4,9 @@ The steady states for a disturbance w and known signals d are the affine set
 
     [x_s; u_s] = Z v + M [w; d; 1],   Z a basis of the null space of [A - I, B].
 
-Among those that are as near to a set-point, the one with the least u_s'R u_s is the target.
+Among those that are as near to a set-point, the one with the least u_s'R u_s is the target. Where
+several have the same outputs with a weight, v = [a; f]: a determines these outputs, and f is the
+distance from the one with the least u_s'R u_s, small multiples of x_s and u_s added.
 """
 
 from __future__ import annotations
@@ -18,6 +20,9 @@ from torch_qpmpc.control.disturbance import RANK, Disturbances
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError
 
+#: The weight of v among steady states with the same outputs, relative to that of the inputs.
+SMALL = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class Steady:
@@ -27,6 +32,7 @@ class Steady:
         X, U, Y: those of v to x_s, u_s and y_s, ``(n, n_v)``, ``(m, n_v)`` and ``(n_y, n_v)``.
         x, u, y: those of [w; d; 1], with n_w + n_d + 1 columns.
         Q, R: the weights of the target's outputs and inputs; R is the identity in place of zero.
+        W: the weight of f, ``(n_f, n_f)``.
     """
 
     X: Array
@@ -37,6 +43,7 @@ class Steady:
     y: Array
     Q: Array
     R: Array
+    W: Array
 
     @classmethod
     def of(cls, plant: StateSpace, w: Disturbances, Q: Array, R: Array) -> Steady:
@@ -58,10 +65,20 @@ class Steady:
         M = -np.linalg.pinv(balance) @ loads
         y = plant.C @ M[:n] + np.hstack((w.C, np.zeros((len(plant.C), n_d + 1))))
         R = R if R.any() else np.eye(m)
-        return cls(Z[:n], Z[n:], plant.C @ Z[:n], M[:n], M[n:], y, Q, R)
+        X, U, Y, x, u = Z[:n], Z[n:], plant.C @ Z[:n], M[:n], M[n:]
+        sizes, V = np.linalg.eigh(Y.T @ Q @ Y)
+        free = sizes <= RANK * max(sizes[-1], RANK)
+        W = np.zeros((0, 0))
+        if free.any():
+            F = V[:, free]
+            W = F.T @ U.T @ R @ U @ F + SMALL * np.trace(R) * np.eye(F.shape[1])
+            least = -np.linalg.solve(W, F.T @ U.T @ R)  # f of the least u'R u, for u without it
+            T = np.hstack((V[:, ~free] + F @ least @ U @ V[:, ~free], F))
+            x, y, u = (of + basis @ F @ least @ u for of, basis in ((x, X), (y, Y), (u, U)))
+            X, U, Y = X @ T, U @ T, Y @ T
+        return cls(X, U, Y, x, u, y, Q, R, W)
 
     @property
-    def is_free(self) -> bool:
-        """True if several steady states have the same outputs with a weight."""
-        sizes = np.linalg.eigvalsh(self.Y.T @ self.Q @ self.Y)
-        return bool(sizes[0] <= RANK * max(sizes[-1], RANK))
+    def n_a(self) -> int:
+        """The number of entries of a, which determine the outputs with a weight."""
+        return self.Y.shape[1] - len(self.W)

@@ -5,13 +5,23 @@
 where (x_s, u_s, y_s) is the steady state for v, the disturbance w and known signals d (see
 `torch_qpmpc.control.steady`). It is the policy of a `QPMPC` of one stage whose state, and p, is
 [r; w; d] and whose action is v.
+
+Where several steady states have the same outputs with a weight, v = [a; f], the action is a, and
+the bounds are those of a for which there is an f. The policy of a second QPMPC with the state
+[a; w; d] is f: least inputs within their bounds. One QP for both would need a weight of f so small
+that numbers in C lose their digits; it remains where f moves an output with soft bounds.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from itertools import combinations
+from typing import Any
 
-from torch_qpmpc.control.design import Design
+import numpy as np
+import scipy.linalg
+
+from torch_qpmpc.control.design import Design, half_range
+from torch_qpmpc.control.disturbance import RANK
 from torch_qpmpc.control.lowering import SCALE
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.mpc.bounds import Bounds
@@ -25,67 +35,102 @@ from torch_qpmpc.mpc.scheme import Scheme
 PREFERENCE = 1e-8
 #: The price of a hard bound of an output, which a disturbance may make impossible to keep.
 HARD = 1e6
+#: The price of a bound of u_s where a has left an f but for rounding, in units of R u.
+NEARLY_HARD = 1e4
+
+
+def is_split(design: Design) -> bool:
+    """Return True if f has a QP of its own."""
+    steady = design.steady
+    moved = np.abs(steady.Y[:, steady.n_a :]).max(-1, initial=0.0) > RANK
+    return 0 < steady.n_a < steady.Y.shape[1] and not (moved & design.bounded[0]).any()
 
 
 def target_mpc(design: Design) -> QPMPC:
-    """Return the QPMPC whose policy maps [r; w; d] to v."""
-    steady, n_y = design.steady, len(design.Q)
-    n_v = steady.Y.shape[1]
+    """Return the QPMPC whose policy maps [r; w; d] to v, or to a if f has a QP of its own."""
+    steady, n_y, split = design.steady, len(design.Q), is_split(design)
+    n_v = steady.n_a if split else steady.Y.shape[1]
     n_x = n_y + steady.y.shape[1] - 1
     # y_s - r and u_s as maps of [r; w; d; v], and constants.
     error = np.hstack((-np.eye(n_y), steady.y[:, :-1], steady.Y))
     inputs = np.hstack((np.zeros((len(steady.U), n_y)), steady.u[:, :-1], steady.U))
     weight = 2 * error.T @ design.Q @ error
     linear = 2 * error.T @ design.Q @ steady.y[:, -1]
-    if steady.is_free:
-        small = _preference(design) * steady.R
-        weight, linear = (
-            weight + 2 * inputs.T @ small @ inputs,
-            linear + 2 * inputs.T @ small @ steady.u[:, -1],
-        )
-        weight[n_x:, n_x:] += _preference(design) * 1e-3 * np.trace(steady.R) * np.eye(n_v)
-    layout = Layout(n_x, n_v, horizon=1)
-    cost = Cost(
-        weight,
-        np.zeros((n_x, n_x)),
-        hessian="block",
-        q=np.pad(linear, (0, n_x)),
-        c=SCALE * design.typical,
-    )
+    if len(steady.W) and not split:
+        weight[n_x + steady.n_a :, n_x + steady.n_a :] += 2 * _preference(design) * steady.W
+    lower, upper = (side - steady.u[:, -1] for side in design.u_bounds)
+    rows = (np.isfinite(lower) | np.isfinite(upper)) & inputs[:, n_x:].any(-1)
+    rows = inputs[rows], lower[rows], upper[rows]
+    if split:
+        rows = _without_last(*rows, len(steady.W))
+    D, lower, upper = rows
+    lower_y, upper_y = (side - steady.y[:, -1] for side in design.y_bounds)
+    error[:, :n_y] = 0.0
+    soft = (np.isfinite(lower_y) | np.isfinite(upper_y)) & error[:, n_x : n_x + n_v].any(-1)
+    D = np.vstack((D[:, : n_x + n_v], error[soft, : n_x + n_v]))
+    lower, upper = np.append(lower, lower_y[soft]), np.append(upper, upper_y[soft])
+    slack = np.append(np.full(len(rows[0]), np.inf), np.minimum(design.y_slack, HARD)[soft])
+    weight, linear = weight[: n_x + n_v, : n_x + n_v], linear[: n_x + n_v]
+    return _of_one_stage(n_x, weight, linear, SCALE * design.typical, (D, lower, upper), slack)
+
+
+def free_mpc(design: Design) -> QPMPC | None:
+    """Return the QPMPC whose policy maps [a; w; d] to f, None if f has no QP of its own."""
+    if not is_split(design):
+        return None
+    steady, n_a, n_f = design.steady, design.steady.n_a, len(design.steady.W)
+    n_x = n_a + steady.u.shape[1] - 1
+    bounded = design.bounded[1]
+    D = np.hstack((steady.U[:, :n_a], steady.u[:, :-1], steady.U[:, n_a:]))[bounded]
+    rows = (D, *((side - steady.u[:, -1])[bounded] for side in design.u_bounds))
+    size = np.linalg.norm(steady.R, 2) * half_range(design.u_bounds).max()
+    slack = np.full(len(D), NEARLY_HARD * size)
+    weight = scipy.linalg.block_diag(np.zeros((n_x, n_x)), 2 * steady.W)
+    constant = SCALE * size * half_range(design.u_bounds).max()
+    return _of_one_stage(n_x, weight, np.zeros(n_x + n_f), constant, rows, slack)
+
+
+def _of_one_stage(
+    n_x: int, weight: Any, linear: Array, constant: float, rows: tuple[Array, ...], slack: Array
+) -> QPMPC:
+    """Return the QPMPC with the rows (D, lower, upper), whose state has no cost at its end."""
+    n_v = len(weight) - n_x
+    terminal = np.zeros((n_x, n_x))
+    cost = Cost(weight, terminal, hessian="block", q=np.pad(linear, (0, n_x)), c=constant)
     model = Model(np.eye(n_x), np.zeros((n_x, n_v)))
-    return QPMPC(
-        Scheme(layout, model, cost, _bounds(design, error, inputs), gamma=1.0),
-        learn=(),
-        solver="daqp",
+    bounds = Bounds(constraints=rows, constraint_slack=slack) if len(rows[0]) else Bounds()
+    scheme = Scheme(Layout(n_x, n_v, horizon=1), model, cost, bounds, gamma=1.0)
+    return QPMPC(scheme, learn=(), solver="daqp")
+
+
+def _without_last(D: Array, lower: Array, upper: Array, count: int) -> tuple[Array, Array, Array]:
+    """Return the rows that are left of lower <= D [x; f] <= upper if some f may be chosen.
+
+    They are the sums of rows without f that no other sums imply, those of the fewest rows
+    (Fourier-Motzkin elimination); ``count`` is the number of entries of f.
+    """
+    left = []
+    for size in range(1, count + 2):
+        for chosen in map(list, combinations(range(len(D)), size)):
+            factors = scipy.linalg.null_space(D[chosen, -count:].T, rcond=RANK)
+            if factors.shape[1] == 1 and (np.abs(factors) > RANK).all():
+                factor = factors[:, 0]
+                ends = np.sort(factor * np.stack((lower[chosen], upper[chosen])), axis=0).sum(-1)
+                if np.isfinite(ends).any():
+                    left.append((factor @ D[chosen], *ends))
+    rows, lower, upper = (
+        (np.array(part) for part in zip(*left, strict=True))
+        if left
+        else (D[:0], lower[:0], upper[:0])
     )
+    rows[np.abs(rows) < RANK] = 0.0
+    return rows, lower, upper
 
 
 def _preference(design: Design) -> float:
-    """Return the weight of small inputs."""
-    Y = design.steady.Y
-    sizes = np.linalg.eigvalsh(Y.T @ design.Q @ Y)
-    seen = sizes[sizes > 1e-9 * max(sizes[-1], 1e-300)]
-    size = np.linalg.norm(design.steady.U.T @ design.steady.R @ design.steady.U, 2)
-    return float(PREFERENCE * (seen[0] if len(seen) else 1.0) / (size or 1.0))
-
-
-def _bounds(design: Design, error: Array, inputs: Array) -> Bounds:
-    """Return rows of u_s, hard, and of y_s, at their prices.
-
-    Rows that v does not change are left out: a disturbance alone determines them.
-    """
-    n_y, steady = len(design.Q), design.steady
-    outputs = error.copy()
-    outputs[:, :n_y] = 0.0
-    constants = np.concatenate((steady.u[:, -1], steady.y[:, -1]))
-    slack = np.concatenate((np.full(len(inputs), np.inf), np.minimum(design.y_slack, HARD)))
-    lower, upper = (
-        np.concatenate(pair) - constants
-        for pair in zip(design.u_bounds, design.y_bounds, strict=True)
-    )
-    D = np.vstack((inputs, outputs))
-    rows = (np.isfinite(lower) | np.isfinite(upper)) & D[:, -steady.Y.shape[1] :].any(-1)
-    if not rows.any():
-        return Bounds()
-    D = D[rows]
-    return Bounds(constraints=(D, lower[rows], upper[rows]), constraint_slack=slack[rows])
+    """Return the factor of f's weight, one if no output has a weight."""
+    Y = design.steady.Y[:, : design.steady.n_a]
+    if not Y.size:
+        return 1.0
+    seen = np.linalg.eigvalsh(Y.T @ design.Q @ Y)
+    return float(PREFERENCE * seen[0] / np.linalg.norm(design.steady.W, 2))

@@ -2,17 +2,17 @@
 #include "policy.h"
 
 /* An observer of e = [x; w], the state and constant disturbances; a QP for the steady state that is
-   nearest to the set-point; and a QP for the plan to it.
+   nearest to the set-point, or two if that leaves inputs free; and a QP for the plan to it.
 
        e  is corrected by L (y - H e), and predicted by F e + G u + E d + OFFSET
-       [x_s; u_s; y_s] = [X_V; U_V; Y_V] v + [X_L; U_L; Y_L] [w; level; 1], v by the target's QP
+       [x_s; u_s; y_s] = [X_V; U_V; Y_V] v + [X_L; U_L; Y_L] [w; level; 1], v by the target's QPs
        u = u_s + the plan's first input, within the bounds */
 
 typedef policy_real real;
 
 enum { N_X = POLICY_N_X, N_W = POLICY_N_W, N_E = POLICY_N_E, N_U = POLICY_N_U };
-enum { N_Y = POLICY_N_Y, N_D = POLICY_N_D, N_V = POLICY_TARGET_N_U, LOADS = N_W + N_D + 1 };
-enum { STAGES = POLICY_STAGES, SET_POINTS = POLICY_SET_POINTS };
+enum { N_Y = POLICY_N_Y, N_D = POLICY_N_D, N_A = POLICY_TARGET_N_U, LOADS = N_W + N_D + 1 };
+enum { N_V = N_A + POLICY_N_F, STAGES = POLICY_STAGES, SET_POINTS = POLICY_SET_POINTS };
 
 /* @TABLES@ */
 
@@ -78,10 +78,10 @@ static void correct(policy_state *s, const real y[])
     add(s->e, &L[0][0], N_E, N_Y, error);
 }
 
-/* Set the target for the set-point of a stage; return the code of its QP. */
+/* Set the target for the set-point of a stage; return the code of its QPs. */
 static int aim(policy_state *s, const real r[], const real level[])
 {
-    real loads[LOADS], t[POLICY_TARGET_N_P], v[N_V];
+    real loads[LOADS], t[N_A + POLICY_TARGET_N_P], v[N_V];
     int i, code;
     copy(loads, s->e + N_X, N_W);
     copy(loads + N_W, level, N_D);
@@ -89,6 +89,13 @@ static int aim(policy_state *s, const real r[], const real level[])
     copy(t, r, N_Y);
     copy(t + N_Y, loads, N_W + N_D);
     code = policy_target_step(&s->target, t, v, 0);
+#if POLICY_N_F
+    if (code == POLICY_SOLVED) {
+        copy(t, v, N_A);
+        copy(t + N_A, loads, N_W + N_D);
+        code = policy_free_step(&s->free, t, v + N_A, 0);
+    }
+#endif
     for (i = 0; i < N_X; i++) s->x_s[i] = 0;
     for (i = 0; i < N_U; i++) s->u_s[i] = 0;
     for (i = 0; i < N_Y; i++) s->y_s[i] = 0;
@@ -137,6 +144,9 @@ void policy_reset(policy_state *s, const real y[])
     int i;
     policy_plan_reset(&s->plan);
     policy_target_reset(&s->target);
+#if POLICY_N_F
+    policy_free_reset(&s->free);
+#endif
     for (i = 0; i < N_E; i++) s->e[i] = 0;
     for (i = 0; i < N_U; i++) s->u[i] = within(0, i);
     for (i = 0; i < SET_POINTS * N_Y; i++) s->r[i] = 0;
@@ -170,6 +180,9 @@ int policy_selftest(void)
     int i, j;
     if (policy_plan_selftest()) return 1;
     if (policy_target_selftest()) return 2;
+#if POLICY_N_F
+    if (policy_free_selftest()) return 2;
+#endif
     policy_reset(&state, 0);
     for (i = 0; i < EXAMPLES; i++) {
         if (policy_step(&state, EXAMPLE_Y[i], EXAMPLE_R[i], EXAMPLE_KNOWN[i], u)) return 3 + i;

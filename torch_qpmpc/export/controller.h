@@ -2,8 +2,13 @@
 #ifndef POLICY_H
 #define POLICY_H
 
+/* @SIZES@ */
+
 #include "policy_plan.h"
 #include "policy_target.h"
+#if POLICY_N_F
+#include "policy_free.h"
+#endif
 
 #ifdef __cplusplus
 extern "C" {
@@ -11,15 +16,13 @@ extern "C" {
 
 typedef policy_plan_real policy_real;
 
-/* @SIZES@ */
-
 /* What policy_step returns. */
 #define POLICY_SOLVED 0     /* u is optimal, and certified to be */
 #define POLICY_LIMIT 1      /* not certified within the limit of iterations */
 #define POLICY_INFEASIBLE 2 /* no plan or no steady state satisfies the hard bounds */
 #define POLICY_INVALID 3    /* y, r or known has a NaN or an infinity */
 
-/* The state of a controller: estimates, the last signals, and the active sets of both QPs. */
+/* The state of a controller: estimates, the last signals, and the active sets of all QPs. */
 typedef struct {
     policy_real e[POLICY_N_E];                   /* the estimates of the state and disturbances */
     policy_real u[POLICY_N_U];                   /* the last input */
@@ -32,6 +35,9 @@ typedef struct {
     policy_real p[POLICY_PLAN_N_P];              /* what the plan's QP knows */
     policy_plan_state plan;
     policy_target_state target;
+#if POLICY_N_F
+    policy_free_state free;
+#endif
     int starts;                                  /* 1 before the first step, 2 with a y to rest at */
 } policy_state;
 
@@ -50,8 +56,8 @@ void policy_reset(policy_state *state, const policy_real y[]);
 int policy_step(policy_state *state, const policy_real y[], const policy_real r[],
                 const policy_real known[], policy_real u[]);
 
-/* Test both QPs and replay a closed loop; return 0, or the number of what fails: the plan's QP, the
-   target's, and the steps of the loop. Only one thread at a time may call it. */
+/* Test all QPs and replay a closed loop; return 0, or the number of what fails: the plan's QP, one
+   of the target's, and the steps of the loop. Only one thread at a time may call it. */
 int policy_selftest(void);
 
 #ifdef __cplusplus

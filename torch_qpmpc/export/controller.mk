@@ -1,7 +1,7 @@
 CFLAGS = -O3
-SOURCES = main.c policy.c policy_plan.c policy_target.c
+SOURCES = main.c policy.c $(wildcard policy_*.c)
 
-policy: $(SOURCES) policy.h policy_plan.h policy_target.h
+policy: $(SOURCES) $(wildcard policy*.h)
 	$(CC) -std=c99 $(CFLAGS) -o $@ $(SOURCES)
 
 run: policy

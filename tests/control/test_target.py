@@ -1,0 +1,54 @@
+"""Targets with more inputs than outputs with a weight, beside independent solves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import qpsolvers
+import scipy.linalg
+
+import torch_qpmpc as qm
+
+
+def drawn(seed: int) -> qm.LinearMPC:
+    """Return the MPC of a stable plant with more inputs than outputs."""
+    rng = np.random.default_rng(seed)
+    n, n_y = 4, int(rng.integers(1, 3))
+    basis = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    A = basis * rng.uniform(-0.5, 0.9, n) @ basis.T
+    B, C = rng.normal(size=(n, 4)), rng.normal(size=(n_y, n))
+    bounds = -rng.uniform(0.2, 1, 4), rng.uniform(0.2, 1, 4)
+    R = rng.uniform(0.1, 2, 4)
+    return qm.LinearMPC((A, B, C), 2, Q=rng.uniform(0.5, 2, n_y), R=R, u_bounds=bounds)
+
+
+def nearest(mpc: qm.LinearMPC, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steady outputs nearest to r, and the least inputs of those that have them."""
+    plant, (lower, upper) = mpc.design.plant, mpc.design.u_bounds
+    gain = plant.C @ np.linalg.solve(np.eye(len(plant.A)) - plant.A, plant.B)
+    Q = gain.T @ mpc.design.Q @ gain
+    limits = {"lb": lower, "ub": upper, "solver": "quadprog"}
+    u = qpsolvers.solve_qp(2 * Q + 1e-12 * np.eye(4), -2 * gain.T @ mpc.design.Q @ r, **limits)
+    assert u is not None
+    y = gain @ u
+    # Of all u with these outputs: u = u_0 + F f.
+    F, R = scipy.linalg.null_space(gain), mpc.design.R
+    rows = {"G": np.vstack((F, -F)), "h": np.append(upper - u, u - lower) + 1e-9}
+    small = 1e-3 * np.trace(R)  # of v = [x; u], which the target adds
+    Z = scipy.linalg.null_space(np.hstack((plant.A - np.eye(4), plant.B)))
+    M, to_v = Z[4:].T @ R @ Z[4:] + small * np.eye(4), np.linalg.inv(Z[4:])
+    W = to_v.T @ M @ to_v
+    f = qpsolvers.solve_qp(F.T @ W @ F, F.T @ W @ u, **rows, solver="quadprog")
+    assert f is not None
+    return y, u + F @ f
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_inputs_that_the_set_point_leaves_free_are_least(seed):
+    mpc, rng = drawn(seed), np.random.default_rng([seed, 1])
+    assert mpc.free is not None
+    for size in (0.3, 1.0, 4.0):
+        r = size * rng.normal(size=len(mpc.design.Q))
+        target, (y, u) = mpc.target(r), nearest(mpc, r)
+        assert np.abs(target.y.numpy() - y).max() < 1e-8
+        assert np.abs(target.u.numpy() - u).max() < 1e-5
