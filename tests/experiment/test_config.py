@@ -389,6 +389,7 @@ def test_the_edges_are_accepted():
     ("key", "remedy"),
     [
         ("batchsize", "Did you mean batch_size?"),
+        ("taks", "Did you mean task?"),
         ("task.horizn", "Did you mean task.horizon?"),
         ("constraint.deviaton.c_1", "Did you mean constraint.deviation.c_1?"),
         ("zzz", "See configs/config.yaml."),

@@ -43,7 +43,8 @@ def _make_error(error: Any) -> QPError:
 
 def unknown_key(key: str, known: Mapping[str, str]) -> QPError:
     """Make the error of an unknown key, with the nearest known one."""
-    close = difflib.get_close_matches(key, known, n=1)
+    groups = {name.partition(".")[0] for name in known} if "." not in key else ()
+    close = difflib.get_close_matches(key, [*groups, *known], n=1)
     hint = f"Did you mean {close[0]}?" if close else "See configs/config.yaml."
     return QPError.expected(key, "an unknown key", "a key of configs/", hint)
 
