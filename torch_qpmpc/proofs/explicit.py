@@ -159,7 +159,7 @@ def explicit_law(
     """
     d = len(states.lower)
     origin = np.zeros(mpc.n_p) if origin is None else np.array(origin, float)
-    basis = np.eye(mpc.n_p)[:, : max(d, mpc.n_p)] if basis is None else np.array(basis, float)
+    basis = np.eye(mpc.n_p) if basis is None else np.array(basis, float)
     if d > MOST:
         remedy = "Take a slice: basis=(n_p, 2) and an origin."
         raise QPError.expected("states", f"{d} dimensions", f"at most {MOST}", remedy)
