@@ -61,7 +61,7 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
     try:
         P = scipy.linalg.solve_discrete_are(F.T, H.T, process, np.diag(noise**2))
         L = np.linalg.solve(H @ P @ H.T + np.diag(noise**2), H @ P).T
-        stable = np.abs(np.linalg.eigvals(F - F @ L @ H)).max() < 1
+        stable = np.abs(np.linalg.eigvals(F - F @ L @ H)).max() < 1 - 1e-9
     except (ValueError, np.linalg.LinAlgError):
         L, stable = np.zeros((n + n_w, n_y)), False
     if not stable:
