@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -529,10 +530,10 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.fixture
-def stopped(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def stopped_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Stop a run after the checkpoint of its second update."""
-    folder = tmp_path / "run"
+    folder = tmp_path_factory.mktemp("stopped") / "run"
 
     def killed(*given: Any) -> None:
         save_checkpoint(*given)
@@ -543,6 +544,12 @@ def stopped(tmp_path: Path) -> Path:
         with pytest.raises(KeyboardInterrupt):
             train.train(make_config(*TINY), str(folder))
     return folder
+
+
+@pytest.fixture
+def stopped(stopped_run: Path, tmp_path: Path) -> Path:
+    """Copy the stopped run."""
+    return shutil.copytree(stopped_run, tmp_path / "run")
 
 
 def test_a_finished_run_is_not_overwritten(tmp_path):
