@@ -103,7 +103,7 @@ MISTAKES = {
     "weights far apart": (
         (TWO_INPUTS, {"dR": 1e-10}),
         ("condition", "Raise R or dR"),
-        {"dR": 0.1},
+        {"R": 0.1},
     ),
 }
 

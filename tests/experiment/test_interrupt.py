@@ -30,6 +30,14 @@ def listening() -> Iterator[None]:
     signal.signal(signal.SIGINT, usual)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finish a run without a signal."""
+    folder = tmp_path_factory.mktemp("whole")
+    train.train(make_config(*RUN), str(folder), quiet=True)
+    return folder
+
+
 @pytest.mark.parametrize("signum", SIGNALS)
 def test_the_first_signal_is_noted_and_the_second_acts(signum):
     before = signal.getsignal(signum)
@@ -69,7 +77,7 @@ def test_a_block_without_a_signal_changes_nothing(capsys):
     ],
 )
 def test_a_run_stops_cleanly_wherever_the_signal_comes(
-    tmp_path, monkeypatch, capsys, where, call, signum, said
+    tmp_path, monkeypatch, capsys, whole, where, call, signum, said
 ):
     """The signal arrives at start, or while warming up, learning, evaluating or saving."""
     cfg, folder, calls = make_config(*RUN), tmp_path / "run", []
@@ -82,8 +90,7 @@ def test_a_run_stops_cleanly_wherever_the_signal_comes(
     assert capsys.readouterr().out.splitlines()[-1] == sentence
     assert (folder / "checkpoint.pt").exists() == ("after" in said)
     go_on(folder)
-    train.train(cfg, str(tmp_path / "whole"))
-    assert_same_numbers(folder, tmp_path / "whole")
+    assert_same_numbers(folder, whole)
     assert_events_are_whole(folder)
 
 

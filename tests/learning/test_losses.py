@@ -125,7 +125,7 @@ def test_targets_are_frozen_until_they_are_updated(name, updater):
 
 
 @pytest.mark.parametrize(
-    ("name", "estimator"), zip(LOSSES, itertools.cycle(["td1", "tdlambda"]), strict=False)
+    ("name", "estimator"), [*zip(LOSSES, itertools.cycle(["td1", "tdlambda"]), strict=False)]
 )
 def test_estimators(name, estimator):
     """The other tests have TD(0)."""

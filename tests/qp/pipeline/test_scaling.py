@@ -22,7 +22,7 @@ def in_size(known: KnownQP, **sizes: float) -> KnownQP:
     return in_units(known, **{name: torch.tensor(x).double() for name, x in parts.items()})
 
 
-@pytest.mark.parametrize("size", [1e-8, 1e-4, 1e4, 1e8])
+@pytest.mark.parametrize("size", [1e-8, 1e8])
 @pytest.mark.parametrize("unit", ["cost", "variables", "rows", "equalities"])
 def test_a_qp_of_any_size_is_solved_without_help(solver, unit, size):
     known = in_size(known_qp(0, batch=(BATCH,)), **{unit: size})
@@ -52,7 +52,7 @@ def test_units_are_powers_of_two_and_make_sizes_ordinary(matrices):
     assert prepared.scaled.units is None
 
 
-@pytest.mark.parametrize("bound", [1e3, 1e5, 1e6, 1e8, 1e10])
+@pytest.mark.parametrize("bound", [1e3, 1e6, 1e10])
 def test_bounds_that_are_far_away_change_no_answer(solver, bound):
     """Large numbers in place of infinite bounds once led to units that hid every error."""
     A, B, s = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], torch.tensor([[1.0, -0.5], [0.1, 0.2]])
