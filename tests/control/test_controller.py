@@ -16,6 +16,11 @@ from torch_qpmpc.control.state_space import read_model
 
 A = np.array([[1.0, 0.1], [0.0, 0.8]])
 B, C = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
+PAIR = (
+    scipy.linalg.block_diag([[0.9, 0.3], [-0.2, 0.8]], [[0.7, 0.1], [0.0, 0.6]]),
+    np.array([[0.2, 0.0], [0.5, 0.1], [0.1, 0.0], [0.0, 0.4]]),
+    np.array([[1.0, 0.0, 0.2, 0.0], [0.0, 0.0, 1.0, 0.0]]),
+)
 BOUNDS = {"u_bounds": (-1.0, 1.0), "du_bounds": (-0.3, 0.3)}
 
 
@@ -84,6 +89,45 @@ def test_a_reset_starts_where_the_plant_rests():
     controller.reset()
     assert controller.target is None
     assert np.allclose(controller.step([3.0], [3.0]), [0.0])
+
+
+def identified(seed=0):
+    """Identify a plant with two lags, two outputs and two inputs from a log without noise."""
+    rng = np.random.default_rng(seed)
+    u, x, ys = rng.uniform(-1, 1, (200, 2)), np.zeros(4), []
+    for k in range(200):
+        ys.append(PAIR[2] @ x)
+        x = PAIR[0] @ x + PAIR[1] @ u[k]
+    log = qm.read_log({"y": np.array(ys), "u": u}, outputs=["y1", "y2"], inputs=["u1", "u2"])
+    return qm.identify(log, 1, past=2, structure="tied")
+
+
+def test_a_window_determines_the_estimates_and_leaves_no_offset(tmp_path):
+    mpc = qm.LinearMPC(identified(), 10, Q=1.0, dR=0.1, u_bounds=(-2.0, 2.0))
+    controller = qm.Controller(mpc, window=True)
+    controller.reset(y=[5.0, -5.0])  # another past, forgotten after three steps
+    x, errors, load, bias = np.zeros(4), [], np.array([0.2, -0.1]), np.array([0.3, 0.1])
+    for _ in range(100):
+        y = PAIR[2] @ x + bias
+        u = controller.step(y, [0.5, -0.2])
+        predicted = mpc.design.plant.C @ controller.x + mpc.design.disturbances.C @ controller.w
+        x = PAIR[0] @ x + PAIR[1] @ (u + load)
+        errors.append(np.abs(predicted - PAIR[2] @ x - bias).max())
+    assert min(errors[:2]) > 1
+    assert max(errors[2:]) < 1e-9
+    assert np.abs(y - [0.5, -0.2]).max() < 1e-8
+    controller.save(tmp_path / "c.qpmpc")
+    again = qm.Controller.load(tmp_path / "c.qpmpc")
+    assert np.array_equal(again.observer.L, controller.observer.L)
+    assert np.array_equal(again.step(y), controller.step(y))
+
+
+def test_a_window_that_does_not_determine_the_estimates_is_refused():
+    with pytest.raises(QPError, match=r"^window: got 5 states and disturbances, which no whole nu"):
+        qm.Controller(
+            qm.LinearMPC((np.diag([0.5, 0.6, 0.7]), np.eye(3), np.eye(2, 3) + 0.1), 3, Q=1.0),
+            window=True,
+        )
 
 
 def test_the_filter_is_stable_and_faster_with_more_drift():

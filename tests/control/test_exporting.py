@@ -76,6 +76,12 @@ def difference(controller, twin, steps):
     return largest
 
 
+def test_the_loop_with_a_window_is_that_of_python(tmp_path):
+    controller = qm.Controller(MPCS["integrator"](), window=True)
+    report = controller.export_c(tmp_path)
+    assert difference(controller, load(report.files, controller), STEPS) < 1e-9
+
+
 @pytest.mark.parametrize("name", MPCS)
 def test_the_loop_is_that_of_python(tmp_path, name):
     controller = qm.Controller(MPCS[name]())

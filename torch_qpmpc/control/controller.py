@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torch_qpmpc.checks import check_kind
+from torch_qpmpc.checks import check_flag, check_kind
 from torch_qpmpc.control.design import half_range, read_vector
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
-from torch_qpmpc.control.observer import SMALL, kalman
+from torch_qpmpc.control.observer import SMALL, kalman, windowed
 from torch_qpmpc.control.signals import read_row, read_table
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.control.stored import packed, unpacked
@@ -44,10 +44,12 @@ class Controller:
         drift: those of the change of each disturbance in a step; by default a tenth of half the
             distance of the bounds of the output or the input. A larger ratio of drift to noise
             rejects disturbances faster, and passes on more noise.
+        window: True takes the estimates that the last few outputs and inputs determine, as an
+            identification's window does, instead of the filter: the fastest, and the noisiest.
 
     Attributes:
         mpc: the MPC.
-        observer: the Kalman `Observer`.
+        observer: the `Observer`.
         x, w, u: the estimates of x and w, and the last input.
         target: the `Target` of the last step, None before the first; with a preview, of all stages.
 
@@ -66,7 +68,10 @@ class Controller:
         [1.]
     """
 
-    def __init__(self, mpc: LinearMPC, *, noise: Any = None, drift: Any = None) -> None:
+    def __init__(
+        self, mpc: LinearMPC, *, noise: Any = None, drift: Any = None, window: bool = False
+    ) -> None:
+        check_flag("window", window)
         check_kind("mpc", mpc, LinearMPC, "qm.LinearMPC makes one of a plant's model.")
         self.mpc = mpc
         design = self._design = mpc.design
@@ -75,7 +80,9 @@ class Controller:
         ranges = np.abs(y @ w.C + u @ np.linalg.pinv(plant.B) @ w.B)
         self._noise = _deviations("noise", noise, SMALL * y, plant.outputs)
         self._drift = _deviations("drift", drift, SMALL * ranges, w.names)
-        self.observer = kalman(design, self._noise, self._drift)
+        self.observer, self._window = kalman(design, self._noise, self._drift), window
+        if window:
+            self.observer = windowed(self.observer)
         self.r = np.zeros(0)
         self.reset()
 
@@ -150,7 +157,7 @@ class Controller:
             QPError: a part of theta has a parametrization that is not QPMPC's own.
             OSError: writing failed; the old file is unchanged.
         """
-        names = ("_noise", "_drift", "_e", "u", "r")
+        names = ("_noise", "_drift", "_window", "_e", "u", "r")
         state = {name.strip("_"): packed(getattr(self, name)) for name in names}
         save_file(path, KIND, {**self.mpc.stored(), "controller": state})
 
@@ -166,7 +173,8 @@ class Controller:
         try:
             state = unpacked(content["controller"])
             mpc = LinearMPC.of_stored(content)
-            controller = cls(mpc, noise=state["noise"], drift=state["drift"])
+            options = {name: state[name] for name in ("noise", "drift", "window") if name in state}
+            controller = cls(mpc, **options)
             controller._e, controller.u, controller.r = (state[name] for name in "eur")
         except Exception as error:  # damaged files raise errors of any type
             raise damaged(Path(path), error, "a file that Controller.save wrote") from error

@@ -231,7 +231,8 @@ def _with_model(controller: Controller, model: Identified) -> Controller:
     design = replace(old, plant=plant, disturbances=w, steady=steady)
     mpc = LinearMPC(lowered(design), **{name: mpc.arguments[name] for name in OPTIONS})
     drift = controller._drift if w.names == old.disturbances.names else None
-    candidate = Controller(mpc, noise=controller._noise, drift=drift)
+    options = {"noise": controller._noise, "drift": drift, "window": controller._window}
+    candidate = Controller(mpc, **options)
     candidate.r = controller.r
     return candidate
 
