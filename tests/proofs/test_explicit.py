@@ -114,7 +114,8 @@ def test_the_published_example_of_bemporad_and_others():
     whole = np.block([[200 * np.eye(2), F], [F.T, H]])  # z = (x_0, u_0, u_1)
     arrays = whole, np.zeros(4), 0.0, np.zeros((0, 4)), np.zeros(0), np.eye(4)[2:]
     bounds = [-2.0, -2.0], [2.0, 2.0], [np.inf, np.inf]
-    qp = QuadraticProgram(*(torch.tensor(x, dtype=torch.float64) for x in (*arrays, *bounds)))
+    tensors = [torch.tensor(x, dtype=torch.float64) for x in (*arrays, *bounds)]
+    qp = QuadraticProgram(*tensors)  # pyright: ignore[reportArgumentType] - nine tensors
     mpc: Any = SimpleNamespace(quadratic_program=lambda: qp, n_p=2, n_u=1, constants={})
     law = explicit_law(mpc, Polytope.box([-1.5] * 2, [1.5] * 2))
     assert len(law.regions) == 9
