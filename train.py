@@ -38,6 +38,7 @@ from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.interrupt import Interrupt
 from torch_qpmpc.experiment.launch import check_overrides, launched
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
+from torch_qpmpc.experiment.proving import prove_run
 from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
@@ -169,6 +170,8 @@ def _train(
         summary |= {} if identified is None else identified.summary
         if cfg.export is not None and gate.mpc is not None:
             export_run(gate.mpc, run.path, quiet)
+        if cfg.prove is not None and gate.mpc is not None:
+            summary |= prove_run(gate.mpc, physics, cfg.prove, quiet)
         run.finish(summary)
         drop_previous(run.path / CHECKPOINT)
     if not quiet:

@@ -19,7 +19,17 @@ LAYERS = {
     "envs": {"errors", "checks"},
     "analysis": {"errors", "checks", "qp", "mpc"},
     "control": {"errors", "checks", "files", "qp", "mpc", "export", "learning", "analysis"},
-    "experiment": {"errors", "checks", "files", "qp", "mpc", "learning", "envs", "analysis"},
+    "experiment": {
+        "errors",
+        "checks",
+        "files",
+        "qp",
+        "mpc",
+        "learning",
+        "envs",
+        "analysis",
+        "proofs",
+    },
     "study": {
         "errors",
         "checks",

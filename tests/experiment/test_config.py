@@ -256,6 +256,7 @@ BAD: dict[str, list[Any]] = {
     "eval_seed": WHOLE[1:-2],
     "logger": ["visdom", *NAME],
     "export": ["python", 3, True],
+    "prove": [-0.1, "box", math.nan],
     "figures": FLAG,
     "gate": ["acts", *FLAG],
     "gate_bound": [0, *REAL[:-1]],

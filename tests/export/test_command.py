@@ -15,9 +15,11 @@ pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
 
 def test_a_run_is_exported_at_its_end_and_afterwards(tmp_path, capsys):
-    cfg = make_config(*SMALL, "export=c")
-    train.train(cfg, str(tmp_path))
-    assert "actions within" in capsys.readouterr().out
+    cfg = make_config(*SMALL, "export=c", "prove=0.02")
+    summary = train.train(cfg, str(tmp_path))
+    printed = capsys.readouterr().out
+    assert "actions within" in printed
+    assert f"From every start, |nu| <= 0.02: {summary['proof']}" in printed
     first = (tmp_path / "c" / "policy.h").read_text()
     assert Library(tmp_path / "c", "policy", "float64").selftest() == 0
     main([str(tmp_path), "--folder", str(tmp_path / "again"), "--storage", "small"])

@@ -10,6 +10,7 @@ from torch_qpmpc.proofs.questions import (
     largest_difference,
     largest_violation,
 )
+from torch_qpmpc.proofs.regions import grown_set, largest_increase
 from torch_qpmpc.proofs.tree import SearchTree
 
 __all__ = [
@@ -21,8 +22,10 @@ __all__ = [
     "Region",
     "SearchTree",
     "explicit_law",
+    "grown_set",
     "invariance",
     "invariant_set",
     "largest_difference",
+    "largest_increase",
     "largest_violation",
 ]

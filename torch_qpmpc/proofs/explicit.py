@@ -63,9 +63,9 @@ class Region:
         set: the polytope; its rows are facets of length 1.
         vertices: ``(count, d)``.
         K, k: ``(n_u, d)`` and ``(n_u,)``, u_0 is ``K s + k``.
-        P, g, c: ``(d, d)``, ``(d,)`` and a number; V is ``s'Ps / 2 + g's + c``, without the prices
-            of rows that p alone determines.
-        active: the rows' choices, codes as in `QPSolution.active`, ``(r,)``.
+        P, g, c: ``(d, d)``, ``(d,)`` and a number; V is ``s'Ps / 2 + g's + c``.
+        active: the rows' choices, codes as in `QPSolution.active`, ``(r,)``; the last ones are of
+            soft rows that p alone determines.
     """
 
     set: Polytope
@@ -122,11 +122,7 @@ class ExplicitLaw:
         s, at = np.asarray(s, float), self.index(s)
         P, g, c = (np.stack([getattr(x, name) for x in self.regions]) for name in ("P", "g", "c"))
         half = (P[at] @ s[..., None])[..., 0] / 2
-        known = self.tables.known
-        y = (self.origin + s @ self.basis.T) @ known.Y.T
-        off = np.maximum(np.maximum(y - known.upper, known.lower - y), 0)
-        prices = (np.where(np.isinf(known.w), 0, known.w) * off).sum(-1)
-        return np.where(at < 0, np.nan, ((half + g[at]) * s).sum(-1) + c[at] + prices)
+        return np.where(at < 0, np.nan, ((half + g[at]) * s).sum(-1) + c[at])
 
     def __str__(self) -> str:
         laws = len({(*x.K.ravel().round(9), *x.k.round(9)) for x in self.regions})
@@ -217,7 +213,10 @@ def _nearest(regions: tuple[Region, ...] | list[Region], s: Array) -> tuple[Arra
 
 @dataclass(frozen=True, eq=False)
 class _Sliced:
-    """Tables of s: the rows are ``Y s - Q lam`` within ``lower, upper``, and so on."""
+    """Tables of s: the rows are ``Y s - Q lam`` within ``lower, upper``, and so on.
+
+    Soft rows that p alone determines follow, with zeros in Q; R does not have them.
+    """
 
     Y: Array
     lower: Array
@@ -234,18 +233,21 @@ class _Sliced:
 
     @classmethod
     def of(cls, tables: Tables, origin: Array, basis: Array) -> _Sliced:
-        rows, P = tables.rows, (tables.P + tables.P.T) / 2
-        y_0 = rows.Y @ origin
+        rows, known, P = tables.rows, tables.known, (tables.P + tables.P.T) / 2
+        soft = np.isfinite(known.w)
+        pairs = ((getattr(rows, x), getattr(known, x)[soft]) for x in ("Y", "lower", "upper", "w"))
+        Y, lower, upper, w = (np.concatenate(pair) for pair in pairs)
+        more, y_0 = int(soft.sum()), Y @ origin
         return cls(
-            rows.Y @ basis,
-            rows.lower - y_0,
-            rows.upper - y_0,
-            rows.w,
-            tables.Q,
+            Y @ basis,
+            lower - y_0,
+            upper - y_0,
+            w,
+            np.pad(tables.Q, (0, more)),
             tables.R,
             tables.K @ basis,
             tables.K @ origin + tables.k,
-            tables.F,
+            np.pad(tables.F, ((0, 0), (0, more))),
             basis.T @ P @ basis,
             basis.T @ (P @ origin + tables.g),
             float(origin @ P @ origin / 2 + tables.g @ origin + tables.c),
@@ -253,9 +255,13 @@ class _Sliced:
 
     def solve(self, s: Array) -> tuple[Array, Array, Array]:
         """Return the rows' choices and multipliers at points s, and the solver's status."""
-        y = s @ self.Y.T
-        solution = solve_rows(self.R, self.lower - y, self.upper - y, self.w)
-        return solution.active.numpy(), solution.lam.numpy(), solution.status.numpy()
+        y, r = s @ self.Y.T, len(self.R)
+        lower, upper = self.lower - y, self.upper - y
+        solution = solve_rows(self.R, lower[:, :r], upper[:, :r], self.w[:r])
+        known = (2 * ((upper < 0) * 1 - (lower > 0)))[:, r:]
+        active = np.concatenate((solution.active.numpy(), known.astype(np.int8)), axis=1)
+        lam = np.concatenate((solution.lam.numpy(), known / 2 * self.w[r:]), axis=1)
+        return active, lam, solution.status.numpy()
 
     def independent(self, active: Array, lam: Array) -> Array:
         """Return a choice without dependent held rows, by moves that change neither y nor u.

@@ -16,7 +16,7 @@ from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.proofs.encoding import encode
 from torch_qpmpc.proofs.polytope import Polytope
-from torch_qpmpc.proofs.program import Affine, Maximum, Program
+from torch_qpmpc.proofs.program import Affine, Program
 
 Array = np.ndarray
 #: A worst case up to this counts as zero: HiGHS' feasibility tolerance is 1e-6.
@@ -174,17 +174,21 @@ def invariance(
     plant: Plant | Sequence[Plant],
     states: Polytope,
     *,
+    into: Polytope | None = None,
     steps: int = 1,
     seconds: float = 60.0,
 ) -> Answer:
     """Prove that p is in the set again after ``steps`` steps, or find a p that leaves it.
 
-    The answer's value is the distance from the set's worst facet. Arguments and errors are those
-    of `largest_violation`.
+    ``into`` is another set to be in then, such as a smaller one, for contraction. The answer's
+    value is the distance from the worst facet. The other arguments and errors are those of
+    `largest_violation`.
     """
     check_states(mpc, states)
-    length = np.linalg.norm(states.A, axis=1)
-    A, b = states.A / length[:, None], states.b / length
+    into = states if into is None else into
+    check_states(mpc, into)
+    length = np.linalg.norm(into.A, axis=1)
+    A, b = into.A / length[:, None], into.b / length
     question = f"outside the set after {steps} step{'s' * (steps > 1)}"
     return _worst(question, mpc, plant, states, A, b, steps, seconds)
 
@@ -336,7 +340,7 @@ class _Worst:
             if not np.isfinite(maximum.value):
                 continue
             values, run, noise = replay(maximum.x)
-            _compare(float(values[i]), maximum)
+            compare_replay(float(values[i]), maximum.value)
             if values.max() > self.value:
                 self.value, self.run, self.noise = float(values.max()), run, noise
 
@@ -345,12 +349,12 @@ class _Worst:
         return Answer(question, self.value, self.bound, self.run, self.noise, *effort)
 
 
-def _compare(value: float, maximum: Maximum) -> None:
-    """Raise if the replayed value is not that of the program, whose tolerances then hide errors."""
-    if abs(value - maximum.value) > AGREEMENT * (1 + abs(value)):
+def compare_replay(value: float, computed: float) -> None:
+    """Raise if the replayed value is not the computed one, whose tolerances then hide errors."""
+    if abs(value - computed) > AGREEMENT * (1 + abs(value)):
         raise SolverError(
-            f"The policy gives {value:.6g} where the mixed-integer program says "
-            f"{maximum.value:.6g}: the program's tolerances are too wide for this QP. Scale the "
+            f"The policy gives {value:.6g} where the program says "
+            f"{computed:.6g}: the program's tolerances are too wide for this QP. Scale the "
             "states to numbers of order one, or lower the prices w of soft rows."
         )
 

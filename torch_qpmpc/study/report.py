@@ -168,8 +168,22 @@ def write(frame: pd.DataFrame, folder: Path) -> str:
 
 
 def section(sweep: pd.DataFrame) -> str:
-    """Format a sweep's table and, below it, its overall closed gap."""
-    return "\n\n".join(text for text in (cases_table(sweep), overall(sweep)) if text)
+    """Format a sweep's table and, below it, its overall closed gap and what was proved."""
+    texts = cases_table(sweep), overall(sweep), proofs(sweep)
+    return "\n\n".join(text for text in texts if text)
+
+
+def proofs(sweep: pd.DataFrame) -> str:
+    """Format the answers of ``prove=BOUND``, a line for each run that has one."""
+    if "proof" not in sweep:
+        return ""
+    runs = zip(sweep["run"], sweep["label"], sweep["seed"], sweep["proof"], strict=True)
+    lines = [
+        f"- {escaped(label)}, seed {seed}, |nu| <= {run.cfg.prove:g}: {escaped(proof)}"
+        for run, label, seed, proof in runs
+        if isinstance(proof, str)
+    ]
+    return "\n".join(["From every start:", "", *lines])
 
 
 def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:

@@ -86,6 +86,7 @@ class Config(Group):
     search: Search
     logger: Annotated[str, one_of(LOGGERS)]
     export: Annotated[Literal["c"] | None, Expected("c, or null")]
+    prove: Annotated[NonNegative | None, Expected("a finite number >= 0, or null")]
     figures: Flag
     rivals: Annotated[bool | list[str], Expected("true, false or a list of names")]
     eval_interval: Count
