@@ -89,7 +89,9 @@ class FinishedRun:
 
     @cached_property
     def policy(self) -> QPMPC:
-        """The learned QP, which the run has kept; with ``algo.actor=scheduled`` without its network.
+        """The learned QP, which the run has kept.
+
+        With ``algo.actor=scheduled`` it is without its network.
 
         Raises:
             QPError: the run's policy is a network, or the file is missing or damaged.
