@@ -126,7 +126,7 @@ class Controller:
         Args:
             y: outputs, by name or as a vector ``(n_y,)``.
             r: set-points in the same forms, by default the last ones; with a preview also rows for
-                the stages 0, .., N, of which the last is held.
+                the stages 0, .., N; the last one is held.
             known: known signals for the stages 0, .., N, ``(N + 1, n_d)``, as a DataFrame or a
                 mapping of columns; one row is held.
 

@@ -40,7 +40,7 @@ def choose(plant: StateSpace, wanted: Any = "auto") -> Disturbances:
     Args:
         plant: the model.
         wanted: ``"auto"``: one at an input for each integrating mode, and at the outputs for the
-            others. A mapping from outputs to ``"output"`` or the name of an input, of which
+            others. A mapping from outputs to ``"output"`` or the name of an input;
             outputs that are left out have none. None: no disturbances.
 
     Raises:

@@ -31,7 +31,7 @@ from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.log import STILL, Log, as_log
 from torch_qpmpc.mpc.trajectories import Trajectory, folds
 
-#: A log is cut into as many parts, of which the last is held out.
+#: Number of parts that a log is cut into; the last one is held out.
 PARTS = 3
 #: The least gain, as a share of the old cost, that pairs must show.
 GAIN = 0.01

@@ -46,7 +46,7 @@ class LinearMPC(QPMPC):
     Riccati equation's about (x_s, u_s) if it has a stabilising solution, else that of y_N.
 
     All signals are deviations from the target, which keeps the values near it exact. p has d_0, ..,
-    d_N, each of known signals, of which those that act on the plant are less their mean; then the
+    d_N, the known signals, less their mean if they act on the plant; then the
     state [x - x_s; u_last - u_s; y_s; u_s; 1].
     In it u_last is there if moves cost or are bounded, and y_s and u_s are those with bounds.
     The last entry adds a small constant to the values, which their errors are relative to. With
@@ -187,7 +187,7 @@ class LinearMPC(QPMPC):
             raise damaged(Path(path), error, "a file that LinearMPC.save wrote") from error
 
     def stored(self) -> dict[str, Any]:
-        """Return the content of a file, tensors and plain values, of which `of_stored` makes one.
+        """Return the content of a file, tensors and plain values, that `of_stored` reads.
 
         Raises:
             QPError: a part has a parametrization that is not QPMPC's own.
@@ -249,7 +249,7 @@ class LinearMPC(QPMPC):
         Args:
             x: the state, ``(*batch, n)``.
             target: the `target`; with a preview of references those of the stages,
-                ``(*batch, N + 1, ..)``, of which the last is the one that p is relative to.
+                ``(*batch, N + 1, ..)``; p is relative to the last one.
             signals: ``u_last`` ``(*batch, m)``, u_s if left out; ``known`` ``(*batch, N + 1, n_d)``
                 and the ``level`` ``(*batch, n_d)`` that the target is for; zero if left out.
 

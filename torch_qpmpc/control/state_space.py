@@ -81,7 +81,7 @@ def read_model(
     """Return a plant's model from the forms that `LinearMPC` takes.
 
     Args:
-        model: (A, B) or (A, B, C_y) in discrete time, of which (A, B) measures all states; a system
+        model: (A, B) or (A, B, C_y) in discrete time, all states measured without C_y; a system
             with matrices A, B, C and D, such as control.StateSpace; or an `Identified`, whose names
             and dt are its log's.
         E: the factor of known signals, ``(n, n_d)``.

@@ -20,7 +20,7 @@ from torch_qpmpc.learning.operators import in_closed_loop
 from torch_qpmpc.learning.search import available, search
 from torch_qpmpc.mpc.module import QPMPC
 
-#: The most pairs of a comparison, of which a run's later ones need more: they share one alpha.
+#: The most pairs of a comparison. A run's later ones need more, as they share one alpha.
 PAIRS = 160
 #: The rejections in a row after which, with gate=act, the learner restarts from what is kept.
 PATIENCE = 3

@@ -118,8 +118,13 @@ def draw_outcome(run: RunFolder, mpc: QPMPC, evaluation: Evaluation, update: int
 
 
 def tag(name: str) -> str:
-    """Return a name with a single underscore for other characters than letters and digits."""
-    return re.sub(r"\W+", "_", name)
+    """Return the words of a name with an underscore between them.
+
+    Example:
+        >>> tag("planner (R = 2)")
+        'planner_R_2'
+    """
+    return re.sub(r"\W+", "_", name).strip("_")
 
 
 #: Names of an evaluation's scalars, and their keys in `Evaluation.summary`.

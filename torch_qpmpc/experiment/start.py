@@ -24,7 +24,7 @@ from torch_qpmpc.learning.replay import Replay
 
 #: The log in a run's folder.
 LOG = "log.pt"
-#: The entries of a log, of which the preview is optional.
+#: The entries of a log; the preview is optional.
 NEXT = ("observation", "reward", "done", "terminated", "truncated")
 ENTRIES = ("observation", "preview", "action", *(("next", name) for name in NEXT))
 WANTED = "a log.pt that train.py start=data wrote"

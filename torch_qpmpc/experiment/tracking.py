@@ -97,7 +97,7 @@ def window_model(
 ) -> tuple[Tensor, Tensor]:
     """Return the best prediction of y_{k+1} from the window and u_k, as a model with L lags.
 
-    It is C (A x + B u_k), where x is the state's mean given the window, of which the first state is
+    It is C (A x + B u_k), where x is the state's mean given the window, whose first state is
     unknown: y = C x + e and x+ = A x + B u + v have white noise of covariances E and V.
 
     Args:

@@ -91,6 +91,8 @@ class FinishedRun:
     def policy(self) -> QPMPC:
         """The learned QP, which the run has kept.
 
+        With ``algo.actor=scheduled`` it is without its network.
+
         Raises:
             QPError: the run's policy is a network, or the file is missing or damaged.
         """

@@ -61,7 +61,7 @@ class Tracking:
     def program(
         self, A: Tensor, B: Tensor, horizon: int, x_r: Tensor, e: Tensor
     ) -> QuadraticProgram:
-        """Return the QP in z = [x_0, u_0, x_1, .., x_N], of which x_0 is to be fixed.
+        """Return the QP in z = [x_0, u_0, x_1, .., x_N]; x_0 is to be fixed.
 
         Args:
             A, B: the model, ``(*batch, n_x, n_x)`` and ``(*batch, n_x, n_u)``.

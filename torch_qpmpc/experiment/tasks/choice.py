@@ -1,4 +1,4 @@
-"""The table of the starts that a log allows, of which closed loops on the plant have chosen one."""
+"""The table of the starts that a log allows; closed loops on the plant have chosen one."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def masks(cfg: DictConfig, plant: HeatedHouse) -> dict[str, Tensor]:
     """Make the masks of q and of a free C, which keeps the zeros above its band.
 
     The learned entries of q are those of the forecasts, in which V and Q become linear: others
-    would be prices of the plan, of which that of y_N is not bounded.
+    would be prices of the plan, and that of y_N is not bounded.
     """
     layout = plant_layout(plant, plant.horizon)
     masks = {"q": torch.arange(layout.n_z) < layout.n_preview}

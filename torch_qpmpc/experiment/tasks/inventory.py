@@ -29,7 +29,7 @@ from torch_qpmpc.mpc.scheme import Scheme
 STARTS = 64
 #: Stocks, in mean demands, below which a row has a price. Of the start only 0 has the plant's.
 KINKS = (-1.2, -0.6, 0.0, 0.6, 1.2, 1.8, 2.4, 3.0, 3.6)
-#: The price of the other rows, of which all together cost less than holding a unit.
+#: The price of the other rows: all of them together cost less than holding a unit.
 PRICE = 0.1
 #: The curvature that makes the plan unique.
 CURVATURE = 1e-3

@@ -82,7 +82,7 @@ class Task:
             ``task.terminal_weight``. With ``start=data`` the model is that of the log, and so is
             the cost if its ``stage_weight`` is None.
         true_scheme: makes the true scheme, likewise; None if the plant's model is unknown.
-        masks: makes the masks of parts of which not all entries are learned, likewise.
+        masks: makes, likewise, the masks of parts that are learned only in some entries.
         closed_loop: the function of `torch_qpmpc.envs.closed_loop` for the plant's kind.
         noises: choices of ``noise.name``; the first is the default.
         takes_noise_std: True if ``make_plant`` reads ``noise.std``.
@@ -140,7 +140,7 @@ def plant_scheme(
         plant: gives the sizes and the bounds.
         model: see `torch_qpmpc.Model`.
         stage_weight: W of the cost 1/2 [x; u]' W [x; u], or its diagonal.
-        state_bounds: those of the plant by default, of which a `Plant` has none.
+        state_bounds: by default those of the plant; a `Plant` has none.
     """
     if state_bounds is None and not isinstance(plant, Plant):
         state_bounds = plant.lb_s, plant.ub_s
