@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -94,7 +95,8 @@ def test_a_reset_starts_where_the_plant_rests():
 def identified(seed=0):
     """Identify a plant with two lags, two outputs and two inputs from a log without noise."""
     rng = np.random.default_rng(seed)
-    u, x, ys = rng.uniform(-1, 1, (200, 2)), np.zeros(4), []
+    u, ys = rng.uniform(-1, 1, (200, 2)), []
+    x: Any = np.zeros(4)
     for k in range(200):
         ys.append(PAIR[2] @ x)
         x = PAIR[0] @ x + PAIR[1] @ u[k]
@@ -106,7 +108,9 @@ def test_a_window_determines_the_estimates_and_leaves_no_offset(tmp_path):
     mpc = qm.LinearMPC(identified(), 10, Q=1.0, dR=0.1, u_bounds=(-2.0, 2.0))
     controller = qm.Controller(mpc, window=True)
     controller.reset(y=[5.0, -5.0])  # another past, forgotten after three steps
-    x, errors, load, bias = np.zeros(4), [], np.array([0.2, -0.1]), np.array([0.3, 0.1])
+    errors, load, bias = [], np.array([0.2, -0.1]), np.array([0.3, 0.1])
+    x: Any = np.zeros(4)
+    y: Any = None
     for _ in range(100):
         y = PAIR[2] @ x + bias
         u = controller.step(y, [0.5, -0.2])
