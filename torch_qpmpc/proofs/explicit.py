@@ -194,8 +194,8 @@ def _possible(tables: Tables, states: Polytope, origin: Array, basis: Array) -> 
     b = np.concatenate((known.upper[hard] - y_0, y_0 - known.lower[hard]))
     kept = np.isfinite(b)
     A, b = np.concatenate((states.A, np.concatenate((Y, -Y))[kept])), np.append(states.b, b[kept])
-    moves = np.abs(A).sum(1) > 0
-    body = None if (b[~moves] < 0).any() else facets(A[moves], b[moves])
+    moves = np.abs(A).sum(1) > CONSTANT * np.abs(known.Y).max(initial=1.0)
+    body = None if (b[~moves] < -INSIDE).any() else facets(A[moves], b[moves])
     if body is None:
         _raise_infeasible()
     return Polytope.of(body.A, body.b)
@@ -215,7 +215,8 @@ def _nearest(regions: tuple[Region, ...] | list[Region], s: Array) -> tuple[Arra
 class _Sliced:
     """Tables of s: the rows are ``Y s - Q lam`` within ``lower, upper``, and so on.
 
-    Soft rows that p alone determines follow, with zeros in Q; R does not have them.
+    Soft rows that p alone determines follow, with zeros in Q; R does not have them. ``size`` is
+    that of Y before the slice, whose round-off is no slope.
     """
 
     Y: Array
@@ -230,6 +231,7 @@ class _Sliced:
     P: Array
     g: Array
     c: float
+    size: Array
 
     @classmethod
     def of(cls, tables: Tables, origin: Array, basis: Array) -> _Sliced:
@@ -251,6 +253,7 @@ class _Sliced:
             basis.T @ P @ basis,
             basis.T @ (P @ origin + tables.g),
             float(origin @ P @ origin / 2 + tables.g @ origin + tables.c),
+            np.abs(Y).sum(1) * np.abs(basis).max(),
         )
 
     def solve(self, s: Array) -> tuple[Array, Array, Array]:
@@ -301,7 +304,7 @@ class _Sliced:
         solved = np.linalg.solve(self.Q[np.ix_(held, held)], right)
         L[held], l_0[held] = solved[:, :-1], solved[:, -1]
         Y, y_0 = self.Y - self.Q @ L, -self.Q @ l_0
-        size = np.abs(self.Y).sum(1) + np.abs(self.Q) @ np.abs(L).sum(1)
+        size = self.size + np.abs(self.Q) @ np.abs(L).sum(1)
         up, low, equal = side > 0, side < 0, held & (self.lower == self.upper)
         y_low = np.where(active == 0, self.lower, np.where(saturated & up, self.upper, -np.inf))
         y_high = np.where(active == 0, self.upper, np.where(saturated & low, self.lower, np.inf))
