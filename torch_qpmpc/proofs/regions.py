@@ -70,7 +70,7 @@ def grown_set(
         >>> plant = Plant.of(A, B, disturbances=Polytope.box([-0.01] * 2, [0.01] * 2))
         >>> grown = grown_set(law, plant, Polytope.box([-0.3] * 2, [0.3] * 2))
         >>> grown.upper.round(2)
-        array([0.36, 0.32])
+        array([0.46, 0.3 ])
     """
     plants = _check(law, plant)
     n = len(law.set.lower)
