@@ -20,6 +20,7 @@ LAG = ([[0.9]], [[0.5]])
 INTEGRATOR = ([[1.0, 0.1], [0.0, 0.8]], [[0.0], [1.0]], [[1.0, 0.0]])
 INVERSE = ([[0.9, 0.0], [0.0, 0.5]], [[1.0], [1.0]], [[0.3, -1.2]])
 DEAD_TIME = (np.eye(6, k=1), np.eye(6)[:, -1:], np.eye(6)[:1])
+TWO_OUTPUTS = (np.diag([0.9, 0.5]), np.eye(2))
 TWO_INPUTS = ([[0.9]], [[0.5, 0.4]])
 
 
@@ -105,6 +106,16 @@ MISTAKES = {
         ("condition", "Raise R or dR"),
         {"R": 0.1},
     ),
+    "inputs that set-points leave free, without a weight": (
+        (TWO_INPUTS, {}),
+        ("terminal weight", "Weight all inputs by R"),
+        {"R": 0.01},
+    ),
+    "a weight that does not matter": (
+        (TWO_OUTPUTS, {"Q": [1.0, 1e-9]}),
+        ("weights", "Raise Q of y2, or leave it out"),
+        {"Q": [1.0, 0.1]},
+    ),
 }
 
 
@@ -122,8 +133,8 @@ def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake):
 def test_a_sound_design_has_no_fault(model):
     found = made(model, 15, r=[0.5])
     assert found.faults == []
-    assert len(found.findings) == 12
-    assert str(found).startswith("0 faults in 12 findings\nok    cost: smallest eigenvalue on the")
+    assert len(found.findings) == 13
+    assert str(found).startswith("0 faults in 13 findings\nok    cost: smallest eigenvalue on the")
 
 
 def test_a_learned_cost_that_is_indefinite_is_named():
@@ -204,3 +215,27 @@ def test_the_margin_is_that_of_the_loop_s_gain():
 
     assert max(map(radius, np.linspace(1 / (1 + margin), 1 / (1 - margin), 50))) < 1
     assert radius(3.0) > 1
+
+
+def test_shares_are_the_gradient_of_the_loop_s_cost():
+    """Those of central differences, as the inputs are nearly optimal for each weight."""
+
+    def cost(dR):
+        mpc = qm.LinearMPC(TWO_OUTPUTS, 20, Q=[1.0, 0.5], R=0.1, dR=dR, u_bounds=(-3.0, 3.0))
+        run = qm.Controller(mpc).simulate(steps=60, r=[1.0, -1.0])
+        return run.cost.sum(), (np.diff(run.u[:, 0], prepend=0.0) ** 2).sum()
+
+    h, dR = 1e-3, np.array([0.5, 0.3])
+    (up, _), (down, _) = cost(dR * [1 + h, 1]), cost(dR * [1 - h, 1])
+    whole, moves = cost(dR)
+    assert abs((up - down) / (2 * h) / whole - dR[0] * moves / whole) < 0.01
+    assert (up - down) / (2 * h) / whole > 0.05
+
+
+def test_tight_bounds_take_more_iterations():
+    mpc = qm.LinearMPC(INTEGRATOR, 10, Q=1.0, dR=0.1, u_bounds=(-0.2, 0.2))
+    controller = qm.Controller(mpc)
+    numbers = controller.review()["C code"].numbers
+    assert 1 < numbers["iterations of the plan, on average"] < numbers["at most"] <= 21
+    free = qm.Controller(qm.LinearMPC(INTEGRATOR, 10, Q=1.0, dR=0.1)).review()["C code"].numbers
+    assert free["at most"] == 1

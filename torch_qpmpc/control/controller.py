@@ -51,6 +51,7 @@ class Controller:
         mpc: the MPC.
         observer: the `Observer`.
         x, w, u: the estimates of x and w, and the last input.
+        p: what the plan of the last step knew, ``(n_p,)``.
         target: the `Target` of the last step, None before the first; with a preview, of all stages.
 
     Raises:
@@ -104,6 +105,7 @@ class Controller:
         if u is not None:
             self.u = read_row("u", u, plant.inputs)
         self.target: Target | None = None
+        self.p = torch.zeros(self.mpc.n_p)
         self._e: Array | None = None
         if y is not None:
             self._rest(read_row("y", y, plant.outputs), self.read_known(known, 1)[0])
@@ -260,7 +262,8 @@ class Controller:
 
         They are about the cost, the terminal weight, the horizon, the disturbances, the scaling of
         signals, hard bounds that can leave no plan, the reach of set-points, the QP's condition,
-        the loop without active bounds (its stability, margin and offset), and the C code's size.
+        the loop without active bounds (its stability, margin and offset), the shares of weights in
+        the cost of a closed loop, and the C code's size and iterations.
 
         Args:
             r: set-points that the inputs must reach, by default those of the last step.
@@ -327,7 +330,7 @@ class Controller:
         """Return the input for the current estimate and known signals."""
         previewed, level = self._design.references == "preview", d.mean(0)
         self.target = self.mpc.target(self.r if previewed else self.r[0], self.w, level)
-        p = self.mpc.arrange(self.x, self.target, u_last=self.u, known=d, level=level)
+        self.p = p = self.mpc.arrange(self.x, self.target, u_last=self.u, known=d, level=level)
         u_s = self.target.u[-1] if previewed else self.target.u
         u = u_s + self.mpc.policy(p, qp=self._qp)
         return np.clip(u.numpy(), *self._design.u_bounds)

@@ -20,6 +20,7 @@ from torch_qpmpc.control.design import half_range
 from torch_qpmpc.control.linear_mpc import Target
 from torch_qpmpc.control.loop import LinearLoop
 from torch_qpmpc.control.lowering import riccati
+from torch_qpmpc.control.probe import probe
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.export.tables import SINGULAR, make_tables
 from torch_qpmpc.export.writer import Settings, state_bytes, table_bytes
@@ -29,6 +30,8 @@ from torch_qpmpc.qp.solve import solve_qp
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
 MARGIN, CONDITION, SPREAD, HIDDEN = 0.3, 1e8, 1e4, 1e-3
+#: An output's weight with a smaller share of the cost does not matter.
+IDLE = 1e-6
 #: Offsets relative to half the distance of an output's bounds.
 OFFSET = 1e-6
 #: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
@@ -142,6 +145,7 @@ def review(controller: Controller, r: Array | None = None) -> Review:
     if not cost.ok:
         return Review(findings)
     plan, target = make_tables(mpc), make_tables(mpc.targets)
+    qps = [plan, target, *([] if mpc.free is None else [make_tables(mpc.free)])]
     loop = LinearLoop.of(controller, plan, target)
     findings.append(_condition(plan.condition, mpc.horizon))
     findings.append(_stability(loop, mpc.design.gamma))
@@ -149,10 +153,15 @@ def review(controller: Controller, r: Array | None = None) -> Review:
         findings += [_margin(loop), _offset(loop, controller)]
     settings = Settings("policy", "float64", "fast", 1)
     sizes = {
-        "bytes of tables": sum(table_bytes(x, settings) for x in (plan, target)),
-        "bytes of the state": sum(state_bytes(x, settings) for x in (plan, target)),
-        "rows": len(plan.rows) + len(target.rows),
+        "bytes of tables": sum(table_bytes(x, settings) for x in qps),
+        "bytes of the state": sum(state_bytes(x, settings) for x in qps),
+        "rows": sum(len(x.rows) for x in qps),
     }
+    seen = probe(controller)
+    findings.append(_weights(controller, seen.shares))
+    if len(seen.iterations):
+        sizes |= {"iterations of the plan, on average": seen.iterations.mean()}
+        sizes |= {"at most": seen.iterations.max()}
     return Review([*findings, Finding("C code", True, sizes)])
 
 
@@ -182,6 +191,8 @@ def _terminal(controller: Controller) -> Finding:
     if len(unseen):
         numbers["mode without a weight"] = unseen[0]
         remedy = "Weight an output that shows this mode, by Q."
+    elif len(design.steady.W) and not design.R.any():
+        remedy = "Weight all inputs by R: several of them hold the same outputs."
     elif len(unmoved):
         numbers["mode that no input moves"] = unmoved[0]
         remedy = "Remove the mode from the model, or pass it as a known signal."
@@ -369,6 +380,15 @@ def _offset(loop: LinearLoop, controller: Controller) -> Finding:
     ok = bool(off.max(initial=0.0) < OFFSET)
     remedy = "Take disturbances='auto': one for each output."
     return Finding("offset", ok, numbers, remedy * (not ok))
+
+
+def _weights(controller: Controller, shares: Mapping[str, float]) -> Finding:
+    """Each output's weight matters for the cost of a closed loop."""
+    names, Q = controller.mpc.design.plant.outputs, controller.mpc.design.Q
+    small = [names[i] for i in np.flatnonzero(Q.any(0)) if shares.get(f"Q of {names[i]}", 1) < IDLE]
+    numbers = {f"share of {name} in the cost": share for name, share in shares.items()}
+    remedy = f"Raise Q of {', '.join(small)}, or leave it out: it does not matter."
+    return Finding("weights", not small, numbers, remedy * bool(small))
 
 
 def _number(x: Any) -> str:

@@ -1,0 +1,74 @@
+"""What a closed loop of a controller and its model tells of the design's weights and of its QP."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from torch_qpmpc.control.controller import Controller
+from torch_qpmpc.control.design import half_range
+from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.errors import SolverError
+
+#: Steps of the loop, and of a set-point. Set-points and loads are these shares of half the bounds.
+STEPS, HELD = 100, 25
+MOVE, LOAD = 0.5, 0.1
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A closed loop with moving set-points and a load, which ends where no input is feasible.
+
+    Attributes:
+        shares: the share of each weight in the loop's cost J, the largest first. By the envelope
+            theorem it is d log J / d log weight, as the inputs are nearly optimal for the weights.
+        iterations: the changes of the plan's active set in a step, and one; at least so many
+            iterations take a step in C, from the last active set.
+    """
+
+    shares: dict[str, float]
+    iterations: Array
+
+
+@torch.no_grad()
+def probe(controller: Controller) -> Probe:
+    """Run the loop; known signals are zero."""
+    design, twin, rng = controller.mpc.design, copy.copy(controller), np.random.default_rng(0)
+    plant = design.plant
+    twin.reset()
+    size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
+    middle = np.where(np.isfinite(design.y_bounds).all(0), design.y_bounds, 0.0).mean(0)
+    known, x, last, load = np.zeros(len(plant.known)), None, twin.u, LOAD * size_u
+    costs: dict[str, float] = {}
+    states = []
+    for k in range(STEPS):
+        if k % HELD == 0:
+            r = middle + MOVE * size_y * rng.uniform(-1, 1, len(size_y))
+        x = np.linalg.pinv(plant.C) @ middle if x is None else x
+        y = plant.C @ x
+        try:
+            u = twin.step(y, r, known)
+        except SolverError:
+            break
+        assert twin.target is not None
+        u_s = twin.target.u.numpy().reshape(-1, len(u))[0]
+        states.append(twin.p)
+        for name, weight, signal, names in (
+            ("Q", design.Q, y - twin.target.y.numpy().reshape(-1, len(y))[0], plant.outputs),
+            ("R", design.R, u - u_s, plant.inputs),
+            ("dR", design.dR, u - last, plant.inputs),
+        ):
+            for i in np.flatnonzero(weight.any(0)):
+                key = f"{name} of {names[i]}"
+                costs[key] = costs.get(key, 0.0) + float(signal[i] * (weight[i] @ signal))
+        x, last = plant.A @ x + plant.B @ (u + load) + plant.offset, u
+    whole = sum(costs.values()) or 1.0
+    shares = {name: cost / whole for name, cost in sorted(costs.items(), key=lambda x: -x[1])}
+    changes = np.zeros(0)
+    if states:
+        active = controller.mpc.solve(torch.stack(states)).active.numpy()
+        changes = (np.diff(active, axis=0, prepend=0 * active[:1]) != 0).sum(-1)
+    return Probe(shares, 1 + changes)
