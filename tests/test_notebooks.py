@@ -2,40 +2,71 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
-import os
+import logging
+import subprocess
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import matplotlib
+import matplotlib.pyplot as plt
 import pytest
+
+from tests.runs import run_command
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 #: Environment variables that shorten the notebooks.
 SMALL = {"UPDATES": "2", "SEEDS": "1", "DAYS": "2"}
+#: Settings that shorten the runs of train.py.
+SHORT = ("rivals=false", "gate=false")
 
+in_a_process = subprocess.run
 pytestmark = pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks, as in a wheel's tests")
+
+
+def cells(path: Path) -> list[dict[str, Any]]:
+    """Return the cells of code."""
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+
+
+def run(command: list[str], **options: Any) -> Any:
+    """Run ``python train.py ..`` in this process and shortly, other commands as they are."""
+    if command[1] != "train.py":
+        return in_a_process(command, **options)
+    with contextlib.redirect_stdout(io.StringIO()) as stdout:
+        run_command(*command[2:], *SHORT)
+    return SimpleNamespace(stdout=stdout.getvalue())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path, monkeypatch):
-    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
-    search = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    for name, value in (SMALL | {"PYTHONPATH": search}).items():
+    """Cell by cell in this process, which has imported everything."""
+    for name, value in SMALL.items():
         monkeypatch.setenv(name, value)
-    notebook = nbformat.read(path, as_version=4)
-    client = nbclient.NotebookClient(
-        notebook, timeout=600, resources={"metadata": {"path": str(path.parent)}}
-    )
-    client.execute()
+    monkeypatch.chdir(path.parent)
+    monkeypatch.setattr(subprocess, "run", run)
+    namespace: dict[str, Any] = {"__name__": path.stem}
+    try:
+        with matplotlib.rc_context():
+            for number, cell in enumerate(cells(path), 1):
+                source = "".join(line for line in cell["source"] if not line.startswith("%"))
+                exec(compile(source, f"{path.name}, cell {number}", "exec"), namespace)
+    finally:
+        plt.close("all")
+        logging.disable(logging.NOTSET)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_keeps_its_outputs_and_they_are_small(path):
-    text = path.read_text(encoding="utf-8")
-    cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
-    counts = [cell["execution_count"] for cell in cells]
-    assert counts == list(range(1, len(cells) + 1)), "run from the first cell to the last"
-    assert any(cell["outputs"] for cell in cells)
+    text, code = path.read_text(encoding="utf-8"), cells(path)
+    counts = [cell["execution_count"] for cell in code]
+    assert counts == list(range(1, len(code) + 1)), "run from the first cell to the last"
+    assert any(cell["outputs"] for cell in code)
     assert len(text) < 400_000
     assert str(ROOT) not in text
