@@ -18,7 +18,6 @@ import scipy.linalg
 
 import torch_qpmpc as qm
 from tests.control.test_exporting import load
-from torch_qpmpc.export.library import compiler
 
 #: The inputs for outputs and set-points.
 Step = Callable[[np.ndarray, np.ndarray], Any]
