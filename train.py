@@ -37,6 +37,7 @@ from torch_qpmpc.experiment.exporting import export_run
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.interrupt import Interrupt
 from torch_qpmpc.experiment.launch import check_overrides, launched
+from torch_qpmpc.experiment.loggers import check_logger
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
 from torch_qpmpc.experiment.proving import prove_run
 from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
@@ -61,6 +62,7 @@ def train(
         The content of summary.json.
     """
     check_config(cfg)
+    check_logger(cfg.logger)  # before the first evaluations, which may take minutes
     interrupt = Interrupt()
     with contextlib.nullcontext() if quiet else interrupt:
         return _train(cfg, folder, state, quiet, interrupt)

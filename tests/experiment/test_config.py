@@ -543,7 +543,7 @@ def test_solver_must_be_known():
         ),
         (
             ["algo=ddpg", "algo.actor=mlp", "constraint=free", "export=c"],
-            "export: got 'c', expected null. The policy of algo.actor=mlp is a network",
+            "export: got 'c', expected null. The policy of this algo.actor has a network",
         ),
         (["algo=ddpg", "step=projection"], "step: got 'projection', expected cholesky. The crit"),
         (

@@ -111,6 +111,8 @@ def test_a_logger_that_is_not_installed_is_named_before_anything_is_written(
     )
     with pytest.raises(QPError, match=message):
         RunLogger(name, tmp_path, {})
+    with pytest.raises(QPError, match=message):
+        train.train(make_config(f"logger={name}"), str(tmp_path))
     assert not list(tmp_path.iterdir())
 
 

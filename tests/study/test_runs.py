@@ -198,6 +198,19 @@ def test_a_run_is_loaded_with_what_it_wrote(gated, tmp_path):
         qm.load_run(tmp_path)
 
 
+def test_a_policy_with_a_network_is_not_its_qp_alone(gated, tmp_path):
+    folder = shutil.copytree(gated, tmp_path / "run")
+    config = folder / "config.yaml"
+    config.write_text(config.read_text().replace("\nalgo:\n", "\nalgo:\n  actor: scheduled\n"))
+    message = "policy: got .* whose theta comes from a network, expected a run whose policy is a QP"
+    run = qm.load_run(folder)
+    assert run.qp.horizon == 3
+    with pytest.raises(QPError, match=message):
+        run.policy  # noqa: B018
+    with pytest.raises(SystemExit, match=message):
+        export([str(folder)])
+
+
 def test_metrics_that_are_cut_are_named_by_the_report(gated, tmp_path):
     folder = shutil.copytree(gated, tmp_path / "run")
     text = (folder / "metrics.csv").read_text()

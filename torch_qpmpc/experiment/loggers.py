@@ -32,6 +32,17 @@ LAYOUT = {
 }
 
 
+def check_logger(name: str) -> None:
+    """Check that the package of a logger is installed.
+
+    Raises:
+        QPError: it is not.
+    """
+    if name in EXTRAS and importlib.util.find_spec(name) is None:
+        got, remedy = f"{name}, which is not installed", f"Install it: pip install {name}."
+        raise QPError.expected("logger", got, "an installed logger", remedy)
+
+
 class RunLogger:
     """One of TorchRL's loggers, for a new or a resumed run.
 
@@ -56,9 +67,7 @@ class RunLogger:
         rows: Sequence[Mapping[str, float]] = (),
         after: int | None = None,
     ) -> None:
-        if name in EXTRAS and importlib.util.find_spec(name) is None:
-            got, remedy = f"{name}, which is not installed", f"Install it: pip install {name}."
-            raise QPError.expected("logger", got, "an installed logger", remedy)
+        check_logger(name)
         self.name, self.folder, self.settings = name, folder, plain(settings)
         self.logger: Logger = self._make()
         if isinstance(self.logger, TensorboardLogger):

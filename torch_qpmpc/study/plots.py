@@ -127,7 +127,7 @@ def constraints_figure(frame: pd.DataFrame) -> Figure:
     else:
         draw_matrix(panels[1, 0], start.true.C_0, start.true, "$C_0$ of the true model")
     for column, label, run in zip(panels.T[1:], runs["label"], runs["run"], strict=True):
-        mpc = run.policy
+        mpc = run.qp
         draw_matrix(column[0], mpc.C, mpc, rf"$C_\theta$, {label}")
         draw_matrix(column[1], canonical(mpc), mpc, f"canonical, {label}")
     figure.suptitle(f"{runs['noise'].iloc[0]} noise, seed {runs['seed'].iloc[0]}")
@@ -141,14 +141,14 @@ def trajectories_figure(frame: pd.DataFrame) -> Figure:
     for axes, label, run in zip(
         figure.subplots(1, len(runs), squeeze=False)[0], runs["label"], runs["run"], strict=True
     ):
-        ends = {"start": run.start, "learned": run.policy, "true model": run.true}
+        ends = {"start": run.start, "learned": run.qp, "true model": run.true}
         loops = {
             name: evaluate(run.cfg, warm_policy(mpc), run.physics)
             for name, mpc in ends.items()
             if mpc is not None
         }
-        d = next(iter(loops.values())).known[:, 0, : run.policy.n_d]
-        draw_positions(axes, loops, run.policy, episode_names(run.cfg, run.physics, run.policy, d))
+        d = next(iter(loops.values())).known[:, 0, : run.qp.n_d]
+        draw_positions(axes, loops, run.qp, episode_names(run.cfg, run.physics, run.qp, d))
         axes.set_title(label)
     figure.suptitle(f"{runs['noise'].iloc[0]} noise, seed {runs['seed'].iloc[0]}")
     return figure
@@ -159,7 +159,7 @@ def policies_figure(frame: pd.DataFrame) -> Figure:
     runs = chosen(frame, seed=shown_seed(frame))
     first: FinishedRun = runs["run"].iloc[0]
     shown = {"start": first.start}
-    shown |= {label: run.policy for label, run in zip(runs["label"], runs["run"], strict=True)}
+    shown |= {label: run.qp for label, run in zip(runs["label"], runs["run"], strict=True)}
     if first.true is not None:
         shown["true model"] = first.true
     starts = evaluate(first.cfg, warm_policy(first.start), first.physics).known[0]

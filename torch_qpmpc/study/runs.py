@@ -24,7 +24,7 @@ from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import read_metrics, read_summary
-from torch_qpmpc.experiment.stored_qp import learned_qp
+from torch_qpmpc.experiment.stored_qp import check_alone, learned_qp
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, has_run, make_physics, make_true_mpc
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
@@ -80,21 +80,30 @@ class FinishedRun:
     @cached_property
     def start(self) -> QPMPC:
         """The QP that learning started from."""
-        return QPMPC(**{**self.policy.arguments, "structure": self.cfg.constraint.structure})
+        return QPMPC(**{**self.qp.arguments, "structure": self.cfg.constraint.structure})
 
     @cached_property
     def true(self) -> QPMPC | None:
         """The QP with the true model; None if that is unknown."""
         return make_true_mpc(self.cfg, self.physics) if self.has_plant else None
 
-    @cached_property
+    @property
     def policy(self) -> QPMPC:
-        """The learned QP, which the run has kept.
-
-        With ``algo.actor=scheduled`` it is without its network.
+        """The learned policy, which the run has kept.
 
         Raises:
-            QPError: the run's policy is a network, or the file is missing or damaged.
+            QPError: the policy is a network or takes its theta from one, or the file is missing or
+                damaged.
+        """
+        check_alone(self.folder)
+        return self.qp
+
+    @cached_property
+    def qp(self) -> QPMPC:
+        """The learned QP, for readings: `policy`, but without the network of theta, if any.
+
+        Raises:
+            QPError: the policy is a network without a QP, or the file is missing or damaged.
         """
         return learned_qp(self.folder)
 
@@ -120,7 +129,7 @@ class FinishedRun:
             ``prediction_error`` and ``prediction_error_start`` of the learned and the initial
             model, nan if the constraints do not determine the states or the true model is unknown.
         """
-        mpc = self.policy
+        mpc = self.qp
         above = band_distance(mpc.layout) > 0
         readings = {
             "zeros_above": (mpc.C[above] == 0).double().mean().item(),

@@ -213,7 +213,7 @@ class Config(Group):
     @model_validator(mode="after")
     def export_has_a_qp(self) -> Self:
         if self.export and self.algo.name != "qlearning" and self.algo.actor != "qp":
-            self.conflict("export", "null", "The policy of algo.actor=mlp is a network.")
+            self.conflict("export", "null", "The policy of this algo.actor has a network.")
         return self
 
     @model_validator(mode="after")
