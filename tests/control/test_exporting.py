@@ -22,7 +22,7 @@ from torch_qpmpc.control import exporting
 from torch_qpmpc.control.exporting import CompiledController
 from torch_qpmpc.export import export
 
-STEPS = int(os.environ.get("STEPS", "100"))
+STEPS = int(os.environ.get("STEPS", "50"))
 A = np.array([[0.9, 0.2, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
 B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.4]])
 C = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
