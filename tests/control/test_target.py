@@ -52,3 +52,12 @@ def test_inputs_that_the_set_point_leaves_free_are_least(seed):
         target, (y, u) = mpc.target(r), nearest(mpc, r)
         assert np.abs(target.y.numpy() - y).max() < 1e-8
         assert np.abs(target.u.numpy() - u).max() < 1e-5
+
+
+def test_many_inputs_of_one_output_have_bounds_of_its_own():
+    """The gains of 24 inputs within 1 add up to the output that they can hold."""
+    B = np.random.default_rng(0).uniform(0.1, 1, (1, 24))
+    mpc = qm.LinearMPC(([[0.5]], B, [[1.0]]), 2, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))
+    target = mpc.target([1e3])
+    assert abs(target.y.item() - B.sum() / 0.5) < 1e-6
+    assert np.abs(target.u.numpy() - 1).max() < 1e-6

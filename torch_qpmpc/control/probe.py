@@ -25,6 +25,7 @@ class Probe:
     Attributes:
         shares: the share of each weight in the loop's cost J, the largest first. By the envelope
             theorem it is d log J / d log weight, as the inputs are nearly optimal for the weights.
+            Of a weight with entries off the diagonal, that of a row, which may be negative.
         iterations: the changes of the plan's active set in a step, and one; at least so many
             iterations take a step in C, from the last active set.
     """

@@ -160,8 +160,8 @@ def review(controller: Controller, r: Array | None = None) -> Review:
     seen = probe(controller)
     findings.append(_weights(controller, seen.shares))
     if len(seen.iterations):
-        sizes |= {"iterations of the plan, on average": seen.iterations.mean()}
-        sizes |= {"at most": seen.iterations.max()}
+        sizes |= {"least iterations of a step in the loop, on average": seen.iterations.mean()}
+        sizes |= {"and in its worst step": seen.iterations.max()}
     return Review([*findings, Finding("C code", True, sizes)])
 
 
@@ -385,7 +385,9 @@ def _offset(loop: LinearLoop, controller: Controller) -> Finding:
 def _weights(controller: Controller, shares: Mapping[str, float]) -> Finding:
     """Each output's weight matters for the cost of a closed loop."""
     names, Q = controller.mpc.design.plant.outputs, controller.mpc.design.Q
-    small = [names[i] for i in np.flatnonzero(Q.any(0)) if shares.get(f"Q of {names[i]}", 1) < IDLE]
+    small = [
+        names[i] for i in np.flatnonzero(Q.any(0)) if abs(shares.get(f"Q of {names[i]}", 1)) < IDLE
+    ]
     numbers = {f"share of {name} in the cost": share for name, share in shares.items()}
     remedy = f"Raise Q of {', '.join(small)}, or leave it out: it does not matter."
     return Finding("weights", not small, numbers, remedy * bool(small))

@@ -21,7 +21,7 @@ from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError
 
 #: The weight of v among steady states with the same outputs, relative to that of the inputs.
-SMALL = 1e-3
+REGULARISATION = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Steady:
         W = np.zeros((0, 0))
         if free.any():
             F = V[:, free]
-            W = F.T @ U.T @ R @ U @ F + SMALL * np.trace(R) * np.eye(F.shape[1])
+            W = F.T @ U.T @ R @ U @ F + REGULARISATION * np.trace(R) * np.eye(F.shape[1])
             least = -np.linalg.solve(W, F.T @ U.T @ R)  # f of the least u'R u, for u without it
             T = np.hstack((V[:, ~free] + F @ least @ U @ V[:, ~free], F))
             x, y, u = (of + basis @ F @ least @ u for of, basis in ((x, X), (y, Y), (u, U)))

@@ -69,7 +69,11 @@ def target_mpc(design: Design) -> QPMPC:
     soft = (np.isfinite(lower_y) | np.isfinite(upper_y)) & error[:, n_x : n_x + n_v].any(-1)
     D = np.vstack((D[:, : n_x + n_v], error[soft, : n_x + n_v]))
     lower, upper = np.append(lower, lower_y[soft]), np.append(upper, upper_y[soft])
-    slack = np.append(np.full(len(rows[0]), np.inf), np.minimum(design.y_slack, HARD)[soft])
+    # Where the plant integrates, a load may have no steady inputs within bounds.
+    integrates = np.linalg.matrix_rank(steady.U, RANK) < len(steady.U)
+    most = NEARLY_HARD * np.linalg.norm(weight[n_x:, n_x:], 2) * half_range(design.u_bounds).max()
+    price = np.full(len(rows[0]), most if integrates else np.inf)
+    slack = np.append(price, np.minimum(design.y_slack, HARD)[soft])
     weight, linear = weight[: n_x + n_v, : n_x + n_v], linear[: n_x + n_v]
     return _of_one_stage(n_x, weight, linear, SCALE * design.typical, (D, lower, upper), slack)
 
@@ -106,18 +110,26 @@ def _of_one_stage(
 def _without_last(D: Array, lower: Array, upper: Array, count: int) -> tuple[Array, Array, Array]:
     """Return the rows that are left of lower <= D [x; f] <= upper if some f may be chosen.
 
-    They are the sums of rows without f that no other sums imply, those of the fewest rows
-    (Fourier-Motzkin elimination); ``count`` is the number of entries of f.
+    They are the sums of rows without f that no other sums imply: those in which as many rows as
+    possible have no part (the result of Fourier-Motzkin elimination without redundant rows).
+    ``count`` is the number of entries of f.
     """
-    left = []
-    for size in range(1, count + 2):
-        for chosen in map(list, combinations(range(len(D)), size)):
-            factors = scipy.linalg.null_space(D[chosen, -count:].T, rcond=RANK)
-            if factors.shape[1] == 1 and (np.abs(factors) > RANK).all():
-                factor = factors[:, 0]
-                ends = np.sort(factor * np.stack((lower[chosen], upper[chosen])), axis=0).sum(-1)
-                if np.isfinite(ends).any():
-                    left.append((factor @ D[chosen], *ends))
+    left, supports = [], set()
+    sums = scipy.linalg.null_space(D[:, -count:].T, rcond=RANK)
+    n = sums.shape[1]
+    for apart in map(list, combinations(range(len(D)), n - 1) if n else ()):
+        mix = scipy.linalg.null_space(sums[apart], rcond=RANK) if apart else np.eye(n)
+        if mix.shape[1] > 1:
+            continue
+        factor = sums @ mix[:, 0]
+        chosen = np.flatnonzero(np.abs(factor) > RANK * np.abs(factor).max())
+        if chosen.tobytes() in supports:
+            continue
+        supports.add(chosen.tobytes())
+        factor = factor[chosen]
+        ends = np.sort(factor * np.stack((lower[chosen], upper[chosen])), axis=0).sum(-1)
+        if np.isfinite(ends).any():
+            left.append((factor @ D[chosen], *ends))
     rows, lower, upper = (
         (np.array(part) for part in zip(*left, strict=True))
         if left
