@@ -15,6 +15,7 @@ from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.envs import LinearPlant
 from torch_qpmpc.envs.past_window import first_window, next_window
+from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 
 MEASURED = ("task.C_y=null", "task.outputs=[s, v]", "task.dR=null")
@@ -77,11 +78,12 @@ def test_a_run_ends_with_a_policy_and_its_c(tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("task.A=null", "task.A: got null, expected a matrix by its rows, as in. python train.py"),
+        ("task.A=null", "task.A: got null, expected a matrix by its rows. As in: python train.py"),
         ("task.B=[[1]]", "task.B: got shape (1, 1), expected shape (2, 1), for 2 states."),
         ("task.A=[[1]]", "task.B: got shape (2, 1), expected shape (1, 1), for 1 states."),
         ("task.C_y=[[1]]", "task.C_y: got shape (1, 1), expected shape (1, 2), for 2 states."),
         ("task.outputs=[a, b]", "task.outputs: got ['a', 'b'], expected 1 different names."),
+        ("task.inputs=[s]", "task.inputs: got 's', an output, expected names of their own."),
         ("task.Q=null", "task.Q: got none, expected weights of outputs, such as 'task.Q={s: 1.0}'"),
         ("task.noise={v: 1}", "task.noise: got 'v', expected one of s, F."),
         ("task.starts={s: [1, 0]}", "task.starts: got {s: [1, 0]}, expected the lower number"),
@@ -90,3 +92,10 @@ def test_a_run_ends_with_a_policy_and_its_c(tmp_path):
 def test_a_mistake_is_named(override, message):
     with pytest.raises(QPError, match=f"^{re.escape(message)}"):
         made(override)
+
+
+@pytest.mark.parametrize("A", ["[]", "[[1, 2], [3]]"])
+def test_a_matrix_has_rows_of_one_length(A):
+    message = r"^task\.A: got .*, expected a list of equally long rows of finite numbers"
+    with pytest.raises(QPError, match=message):
+        check_config(make_config(*LINEAR, f"task.A={A}"))

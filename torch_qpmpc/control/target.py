@@ -35,7 +35,8 @@ from torch_qpmpc.mpc.scheme import Scheme
 PREFERENCE = 1e-8
 #: The price of a hard bound of an output, which a disturbance may make impossible to keep.
 HARD = 1e6
-#: The price of a bound of u_s where a has left an f but for rounding, in units of R u.
+#: The price of a bound of u_s that a load or rounding may make impossible to keep, in units of the
+#: cost's slope.
 NEARLY_HARD = 1e4
 
 
@@ -69,11 +70,12 @@ def target_mpc(design: Design) -> QPMPC:
     soft = (np.isfinite(lower_y) | np.isfinite(upper_y)) & error[:, n_x : n_x + n_v].any(-1)
     D = np.vstack((D[:, : n_x + n_v], error[soft, : n_x + n_v]))
     lower, upper = np.append(lower, lower_y[soft]), np.append(upper, upper_y[soft])
-    # Where the plant integrates, a load may have no steady inputs within bounds.
-    integrates = np.linalg.matrix_rank(steady.U, RANK) < len(steady.U)
-    most = NEARLY_HARD * np.linalg.norm(weight[n_x:, n_x:], 2) * half_range(design.u_bounds).max()
-    price = np.full(len(rows[0]), most if integrates else np.inf)
-    slack = np.append(price, np.minimum(design.y_slack, HARD)[soft])
+    price = np.inf
+    if np.linalg.matrix_rank(steady.U, RANK) < len(steady.U):
+        # The plant integrates, and a load may have no steady inputs within bounds.
+        slope = np.linalg.norm(weight[n_x:, n_x:], 2) * half_range(design.u_bounds).max()
+        price = NEARLY_HARD * slope
+    slack = np.append(np.full(len(rows[0]), price), np.minimum(design.y_slack, HARD)[soft])
     weight, linear = weight[: n_x + n_v, : n_x + n_v], linear[: n_x + n_v]
     return _of_one_stage(n_x, weight, linear, SCALE * design.typical, (D, lower, upper), slack)
 

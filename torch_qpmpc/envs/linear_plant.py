@@ -21,7 +21,7 @@ class LinearPlant(Plant):
 
         L(x, u) = 1/2 z'W z + q'z + c + price violation(x),    z = [C x; u]
 
-    Starts are the smallest states whose outputs are drawn from a box.
+    Starts are the smallest states whose outputs are drawn from a box, or are nearest to that draw.
 
     Args:
         A, B, C: ``(n, n)``, ``(n, n_u)`` and ``(n_y, n)``.

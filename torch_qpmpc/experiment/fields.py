@@ -52,7 +52,7 @@ def some_of(names: tuple[str, ...]) -> Expected:
 
 
 def _equally_long(rows: list[list[float]]) -> list[list[float]]:
-    if any(len(row) != len(rows[0]) for row in rows):
+    if not rows or any(len(row) != len(rows[0]) for row in rows):
         raise ValueError
     return rows
 

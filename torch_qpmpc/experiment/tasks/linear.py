@@ -45,15 +45,15 @@ NOTE = (
     "task=linear has no plant but its model: closed loops run on that, so that every J is a "
     "prediction."
 )
-Given = Annotated[Matrix | None, MATRIX]
+OptionalMatrix = Annotated[Matrix | None, MATRIX]
 
 
 class LinearSettings(TaskSettings):
     """The keys of the model and of the cost."""
 
-    A: Given
-    B: Given
-    C_y: Given
+    A: OptionalMatrix
+    B: OptionalMatrix
+    C_y: OptionalMatrix
     outputs: Names
     inputs: Names
     #: Number of outputs in the window.
@@ -82,6 +82,8 @@ def make_plant(cfg: DictConfig) -> LinearPlant:
     A, B, C = _matrices(task)
     (n, m), n_y = B.shape, len(C)
     outputs, inputs = _labels(task, "outputs", "y", n_y), _labels(task, "inputs", "u", m)
+    if both := {*outputs} & {*inputs}:
+        raise QPError.expected("task.inputs", f"{min(both)!r}, an output", "names of their own")
     std = _vector(task, "noise", (*outputs, *inputs))
     past = task.past or (1 if torch.linalg.matrix_rank(C) == n else 2 * n)
     V, std_y = B * std[n_y:], std[:n_y]
@@ -138,7 +140,8 @@ def _matrices(task: DictConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Return A, B and C_y."""
     for name in ("A", "B"):
         if task[name] is None:
-            raise QPError.expected(f"task.{name}", "null", "a matrix by its rows, as in", EXAMPLE)
+            remedy = f"As in: {EXAMPLE}"
+            raise QPError.expected(f"task.{name}", "null", "a matrix by its rows", remedy)
     A, B = (torch.tensor([list(row) for row in task[name]]).double() for name in ("A", "B"))
     n = len(A)
     C = torch.eye(n).double()

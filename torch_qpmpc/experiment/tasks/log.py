@@ -28,7 +28,7 @@ NOTE = (
     "task=log has no plant: closed loops run on the ARX model of the log, disturbed by its own "
     "one-step errors, so that every J is a prediction."
 )
-Names = Annotated[list[str] | None, Expected("a list of columns, or null")]
+Names = Annotated[list[str] | None, Expected("a list of names, or null")]
 Column = Annotated[str | None, Expected("a column, or null")]
 Weights = Annotated[
     dict[str, NonNegative] | None, Expected("weights >= 0 by name, as {T: 1.0}, or null")
