@@ -61,3 +61,13 @@ def test_many_inputs_of_one_output_have_bounds_of_its_own():
     target = mpc.target([1e3])
     assert abs(target.y.item() - B.sum() / 0.5) < 1e-6
     assert np.abs(target.u.numpy() - 1).max() < 1e-6
+
+
+def test_a_load_beyond_the_inputs_of_an_integrator_has_a_target():
+    """Two inputs within 1 cannot hold a disturbance of 5: they exceed their bounds in the target."""
+    mpc = qm.LinearMPC(([[1.0]], [[1.0, 0.5]], [[1.0]]), 5, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))
+    target = mpc.target([0.0], 5.0)
+    assert np.isfinite(target.u.numpy()).all()
+    u = target.u.numpy().ravel()
+    assert u.min() < -1
+    assert abs(u @ [1.0, 0.5] + mpc.design.disturbances.B[0] @ np.full(1, 5.0)) < 1e-6

@@ -207,6 +207,9 @@ class LinearMPC(QPMPC):
     def target(self, r: Any, w: Any = 0.0, known: Any = 0.0) -> Target:
         """Return the steady states within the bounds that are nearest to set-points.
 
+        The inputs exceed their bounds as little as possible if no steady state of a plant that
+        integrates is within them.
+
         Args:
             r: ``(*batch, n_y)``.
             w: the disturbances ``(*batch, n_w)``, or a number for all.
@@ -214,7 +217,6 @@ class LinearMPC(QPMPC):
 
         Raises:
             QPError: a shape is wrong.
-            SolverError: the bounds of the inputs admit no steady state.
         """
         s = self._target_inputs(r, w, known)
         v = self.targets.policy(s, qp=self._target_qps[0])
