@@ -45,9 +45,8 @@ class Controller:
             distance of the bounds of the output or the input. A larger ratio of drift to noise
             rejects disturbances faster, and passes on more noise.
         window: True takes the estimates that the last few outputs and inputs determine, as an
-            identification's window does, instead of the filter: the fastest, and the noisiest. Of a
-            plant that integrates, those of its first steps can be loads beyond the inputs' bounds,
-            which raises `SolverError`: call `reset` with y and u that hold the plant.
+            identification's window does, instead of the filter: the fastest, and the noisiest.
+            Call `reset` with y and u of the plant at rest, or the first steps' estimates are wild.
 
     Attributes:
         mpc: the MPC.
