@@ -37,7 +37,7 @@ PREFERENCE = 1e-8
 HARD = 1e6
 #: The price of a bound of u_s that a load or rounding may make impossible to keep, in units of the
 #: cost's slope.
-NEARLY_HARD = 1e4
+NEARLY_HARD = 1e3
 
 
 def is_split(design: Design) -> bool:
