@@ -154,6 +154,9 @@ def test_no_points_have_no_actions(shape):
 
 
 LAW = explicit_law(scheme(state_bounds=None), BOX)
+THREE: Any = 3
+LIST: Any = [BOX]
+LETTER: Any = "a"
 HARD = scheme(state_slack=np.inf)
 
 
@@ -164,15 +167,15 @@ HARD = scheme(state_slack=np.inf)
         (lambda: explicit_law(scheme(), Polytope.box([0.0], [1.0])), "(2,) and (2, 1)"),
         (lambda: explicit_law(HARD, Polytope.box([3.0, 0.0], [4.0, 0.1])), "without a region"),
         (lambda: explicit_law(HARD, Polytope.box([0.95, 0.4], [0.99, 0.5])), "without a region"),
-        (lambda: explicit_law(scheme(), [BOX]), "states: got list, expected a Polytope"),
-        (lambda: explicit_law(3, BOX), "mpc: got int, expected a QPMPC"),
+        (lambda: explicit_law(scheme(), LIST), "states: got list, expected a Polytope"),
+        (lambda: explicit_law(THREE, BOX), "mpc: got int, expected a QPMPC"),
         (lambda: LAW.index([0.0]), "s: got shape (1,), expected (*batch, 2)"),
         (lambda: LAW.policy(0.0), "s: got shape (), expected (*batch, 2)"),
         (lambda: LAW.value(np.zeros((2, 3))), "s: got shape (2, 3), expected (*batch, 2)"),
         (lambda: SearchTree.of(LAW).policy([0.0]), "s: got shape (1,), expected (*batch, 2)"),
-        (lambda: SearchTree.of(3), "law: got int, expected an ExplicitLaw"),
-        (lambda: law_figure(3), "law: got int, expected an ExplicitLaw"),
-        (lambda: law_figure(LAW, action="a"), "action: got 'a', expected a whole number >= 0"),
+        (lambda: SearchTree.of(THREE), "law: got int, expected an ExplicitLaw"),
+        (lambda: law_figure(THREE), "law: got int, expected an ExplicitLaw"),
+        (lambda: law_figure(LAW, action=LETTER), "action: got 'a', expected a whole number >= 0"),
         (lambda: law_figure(LAW, action=1), "an index below 1"),
         (
             lambda: law_figure(

@@ -116,6 +116,8 @@ def test_another_set_is_reached_in_a_step(mpc):
         assert (answer.proved, answer.refuted) == (proved, not proved)
 
 
+THREE: Any = 3
+LIST: Any = [1.0]
 FAR = Polytope.box([2.0, 2.0], [3.0, 3.0])
 OVER = Polytope.box([0.0, 0.0], [1.6, 0.1])
 FLAT = Polytope.box([0.1, 0.0], [0.1, 0.2])
@@ -137,9 +139,9 @@ SLICE = explicit_law(scheme(), Polytope.box([-0.1], [0.1]), basis=[[1.0], [0.0]]
         (lambda mpc, law: grown_set(SLICE, plant(), BOX), "a slice of the known entries"),
         (lambda mpc, law: grown_set(law, Plant.of([[1.0]], [[1.0]]), BOX), "plant.B"),
         (lambda mpc, law: grown_set(law, [], BOX), "plant: got an empty list, expected at least"),
-        (lambda mpc, law: grown_set(law, 3, BOX), "plant: got int, expected a Plant"),
-        (lambda mpc, law: grown_set(3, plant(), BOX), "law: got int, expected an ExplicitLaw"),
-        (lambda mpc, law: grown_set(law, plant(), [1.0]), "starts: got list, expected a Polytope"),
+        (lambda mpc, law: grown_set(law, THREE, BOX), "plant: got int, expected a Plant"),
+        (lambda mpc, law: grown_set(THREE, plant(), BOX), "law: got int, expected an ExplicitLaw"),
+        (lambda mpc, law: grown_set(law, plant(), LIST), "starts: got list, expected a"),
         (lambda mpc, law: grown_set(law, plant(), CUBE), "starts: got 3 dimensions, expected n_p"),
         (lambda mpc, law: grown_set(law, plant(), FAR), "states outside the law's set by 1.5"),
         (lambda mpc, law: grown_set(law, plant(), FLAT), "starts: got a flat set, expected a set"),
@@ -157,10 +159,10 @@ SLICE = explicit_law(scheme(), Polytope.box([-0.1], [0.1]), basis=[[1.0], [0.0]]
         ),
         (lambda mpc, law: grown_set(law, plant(0.4), BOX), "grows out of the law's set"),
         (
-            lambda mpc, law: largest_increase(3, law, plant(), HALF),
+            lambda mpc, law: largest_increase(THREE, law, plant(), HALF),
             "mpc: got int, expected a QPMPC",
         ),
-        (lambda mpc, law: largest_increase(mpc, law, [plant()], HALF), "plant: got list"),
+        (lambda mpc, law: largest_increase(mpc, law, LIST, HALF), "plant: got list"),
         (lambda mpc, law: largest_increase(mpc, law, plant(), FAR), "states outside the law's set"),
         (
             lambda mpc, law: largest_increase(mpc, law, plant(), OVER),

@@ -24,7 +24,7 @@ def law_figure(law: ExplicitLaw, *, action: int = 0) -> Figure:
         action: the index of the action, which colours each region by its value at the middle.
 
     Raises:
-        QPError: ``law`` is no explicit law, s does not have two entries, or there is no such action.
+        QPError: ``law`` is no explicit law of two entries, or there is no such action.
     """
     check_kind("law", law, ExplicitLaw)
     if law.basis.shape[1] != 2:
