@@ -39,7 +39,7 @@ from torch_qpmpc.experiment.interrupt import Interrupt
 from torch_qpmpc.experiment.launch import check_overrides, launched
 from torch_qpmpc.experiment.loggers import check_logger
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
-from torch_qpmpc.experiment.proving import prove_run
+from torch_qpmpc.experiment.proving import check_provable, prove_run
 from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
@@ -77,6 +77,8 @@ def _train(
 
     # The QP, and J of all that it is compared with.
     physics = make_physics(cfg)
+    if cfg.prove is not None:
+        check_provable(physics)
     identified = make_start(cfg, physics, folder, written=state is not None, quiet=quiet)
     start = make_mpc(cfg, physics, identified)
     evaluation = Evaluation.before(cfg, physics, start, quiet)

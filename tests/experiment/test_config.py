@@ -545,6 +545,13 @@ def test_solver_must_be_known():
             ["algo=ddpg", "algo.actor=mlp", "constraint=free", "export=c"],
             "export: got 'c', expected null. The policy of this algo.actor has a network",
         ),
+        *(
+            (
+                ["algo=ddpg", f"algo.actor={actor}", "constraint=free", "prove=0.0"],
+                "prove: got 0.0, expected null. The policy of this algo.actor has a network",
+            )
+            for actor in ("scheduled", "mlp")
+        ),
         (["algo=ddpg", "step=projection"], "step: got 'projection', expected cholesky. The crit"),
         (
             ["algo=ddpg", "constraint=mpc", "release=5"],

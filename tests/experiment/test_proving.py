@@ -9,9 +9,11 @@ import pandas as pd
 import pytest
 import torch
 
+import train
 from tests.runs import SMALL, make_config
-from torch_qpmpc.envs import PointMass
-from torch_qpmpc.experiment.proving import prove_run
+from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc.envs import GrosZanonLTI, PointMass
+from torch_qpmpc.experiment.proving import check_provable, prove_run
 from torch_qpmpc.experiment.tasks import make_mpc
 from torch_qpmpc.study import report
 
@@ -21,7 +23,9 @@ def test_the_report_has_a_line_for_each_proof():
     rows = [(run, "free", 1, "at most 0.1"), (run, "free", 2, None)]
     frame = pd.DataFrame(rows, columns=["run", "label", "seed", "proof"])
     assert report.proofs(frame).splitlines()[2:] == ["- free, seed 1, |nu| <= 0.02: at most 0.1"]
-    assert not report.proofs(frame.drop(columns="proof"))
+    assert report.proofs(frame.drop(columns="proof")) == ""
+    assert report.proofs(frame.assign(proof=None)) == ""
+    assert report.proofs(frame.assign(proof=np.nan)) == ""
 
 
 def test_no_sampled_start_exceeds_the_bound():
@@ -36,7 +40,28 @@ def test_no_sampled_start_exceeds_the_bound():
     assert sampled > entries["proof_bound"] - 0.1
 
 
-def test_a_plant_without_a_linear_model_is_a_warning():
-    mpc = make_mpc(make_config(*SMALL), PointMass())
-    with pytest.warns(UserWarning, match="Nothing is proved. prove: got object, expected a linear"):
-        assert prove_run(mpc, object(), 0.02, quiet=True) == {}
+def test_a_plant_without_a_box_of_starts_is_refused_before_the_first_update(tmp_path, monkeypatch):
+    cfg = make_config("task=short_horizon", "prove=0.1")
+    match = "prove: got a TripleIntegrator, expected a LinearSystem with a start_box. Use task=poin"
+    with pytest.raises(QPError, match=match):
+        train.train(cfg, str(tmp_path), quiet=True)
+    assert not list(tmp_path.iterdir())
+    monkeypatch.setattr(PointMass, "start_box", lambda self: None)
+    with pytest.raises(QPError, match="got a PointMass, expected a LinearSystem with a start_box"):
+        check_provable(PointMass())
+
+
+def test_a_qp_of_other_states_is_a_warning():
+    mpc = QPMPC(2, 1, 2, stage_weight=[1.0] * 3)
+    with pytest.warns(UserWarning, match="Nothing is proved. states: got 4 dimensions, expected n"):
+        assert prove_run(mpc, PointMass(), 0.02, quiet=True) == {}
+
+
+@pytest.mark.parametrize("physics", [PointMass(start_velocity=0.2), GrosZanonLTI()])
+def test_all_starts_are_in_their_box_and_near_its_faces(physics):
+    lower, upper = physics.start_box()
+    for rng in (np.random.default_rng(0), torch.Generator().manual_seed(0)):
+        s = physics.starts(rng, 1000)
+        assert ((lower <= s) & (s <= upper)).all()
+        assert torch.allclose(s.amin(0), lower, atol=0.02)
+        assert torch.allclose(s.amax(0), upper, atol=0.02)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import torch
 
 from tests.enumeration import double_integrator, enumerated
 from torch_qpmpc import QPMPC, QPError, solve_qp
-from torch_qpmpc.proofs import Polytope, explicit_law
+from torch_qpmpc.proofs import Polytope, SearchTree, explicit_law
 from torch_qpmpc.proofs.plots import law_figure
 from torch_qpmpc.qp.program import QuadraticProgram, Status
 
@@ -32,7 +32,8 @@ def scheme(**options: Any) -> QPMPC:
 def compare(mpc: QPMPC, states: Polytope, **options: Any) -> None:
     """Compare u and V with the on-line solver at random states, and the volumes with the set's."""
     law = explicit_law(mpc, states, **options)
-    assert law.covered == pytest.approx(1, abs=1e-6)
+    assert law.covered == 1
+    assert law.volume == pytest.approx(1, abs=1e-6)
     generator = np.random.default_rng(0)
     s = generator.uniform(states.lower, states.upper, (2000, len(states.lower)))
     p = torch.as_tensor(law.origin + s @ law.basis.T)
@@ -97,7 +98,8 @@ def test_three_entries():
 @pytest.mark.parametrize("horizon", [1, 2])
 def test_the_regions_are_those_of_all_active_sets(horizon):
     law = explicit_law(double_integrator(horizon), Polytope.box([-5.0] * 2, [5.0] * 2))
-    assert law.covered == pytest.approx(1, abs=1e-6)
+    assert law.covered == 1
+    assert law.volume == pytest.approx(1, abs=1e-6)
 
     def listed(laws):
         return sorted((*K.ravel().round(6) + 0.0, *k.round(6) + 0.0) for K, k in laws)
@@ -107,7 +109,7 @@ def test_the_regions_are_those_of_all_active_sets(horizon):
     assert np.array(walked) == pytest.approx(np.array(listed(enumerated(horizon))), abs=1e-6)
 
 
-def test_the_published_example_of_bemporad_and_others():
+def test_the_published_example_of_bemporad_and_others(monkeypatch):
     """Section 7.1 of their paper of 2002: H and F to four digits, nine regions and these gains."""
     H = np.array([[1.5064, 0.4838], [0.4838, 1.5258]])
     F = np.array([[9.6652, 5.2115], [7.0732, -7.0879]])
@@ -116,7 +118,8 @@ def test_the_published_example_of_bemporad_and_others():
     bounds = [-2.0, -2.0], [2.0, 2.0], [np.inf, np.inf]
     tensors: Any = (torch.tensor(x, dtype=torch.float64) for x in (*arrays, *bounds))
     qp = QuadraticProgram(*tensors)
-    mpc: Any = SimpleNamespace(quadratic_program=lambda: qp, n_p=2, n_u=1, constants={})
+    mpc = scheme()
+    monkeypatch.setattr(mpc, "quadratic_program", lambda: qp)
     law = explicit_law(mpc, Polytope.box([-1.5] * 2, [1.5] * 2))
     assert len(law.regions) == 9
     at = law.index([[0.0, 0.0], [0.5, -0.8], [1.5, 1.5]])
@@ -132,7 +135,28 @@ def test_a_figure_has_all_regions():
     assert f"{len(law.regions)} regions, " in str(law)
 
 
+def test_a_hole_is_counted_though_overlaps_hide_it_in_the_volumes():
+    law = explicit_law(scheme(state_bounds=None), BOX)
+    large, *others = sorted(law.regions, key=lambda x: -x.volume)
+    share = large.volume / np.prod(BOX.upper - BOX.lower)
+    holed = replace(law, regions=tuple(others))
+    assert holed.covered == pytest.approx(1 - share, abs=0.02)
+    assert holed.volume == pytest.approx(1 - share, abs=1e-6)
+    twice = replace(law, regions=(large, large, large, *others[1:]))
+    assert twice.volume > 1 > twice.covered
+
+
+@pytest.mark.parametrize("shape", [(0, 2), (3, 0, 2)])
+def test_no_points_have_no_actions(shape):
+    s = np.zeros(shape)
+    assert LAW.policy(s).shape == SearchTree.of(LAW).policy(s).shape == (*shape[:-1], 1)
+    assert LAW.index(s).shape == LAW.value(s).shape == shape[:-1]
+
+
 LAW = explicit_law(scheme(state_bounds=None), BOX)
+THREE: Any = 3
+LIST: Any = [BOX]
+LETTER: Any = "a"
 HARD = scheme(state_slack=np.inf)
 
 
@@ -143,6 +167,15 @@ HARD = scheme(state_slack=np.inf)
         (lambda: explicit_law(scheme(), Polytope.box([0.0], [1.0])), "(2,) and (2, 1)"),
         (lambda: explicit_law(HARD, Polytope.box([3.0, 0.0], [4.0, 0.1])), "without a region"),
         (lambda: explicit_law(HARD, Polytope.box([0.95, 0.4], [0.99, 0.5])), "without a region"),
+        (lambda: explicit_law(scheme(), LIST), "states: got list, expected a Polytope"),
+        (lambda: explicit_law(THREE, BOX), "mpc: got int, expected a QPMPC"),
+        (lambda: LAW.index([0.0]), "s: got shape (1,), expected (*batch, 2)"),
+        (lambda: LAW.policy(0.0), "s: got shape (), expected (*batch, 2)"),
+        (lambda: LAW.value(np.zeros((2, 3))), "s: got shape (2, 3), expected (*batch, 2)"),
+        (lambda: SearchTree.of(LAW).policy([0.0]), "s: got shape (1,), expected (*batch, 2)"),
+        (lambda: SearchTree.of(THREE), "law: got int, expected an ExplicitLaw"),
+        (lambda: law_figure(THREE), "law: got int, expected an ExplicitLaw"),
+        (lambda: law_figure(LAW, action=LETTER), "action: got 'a', expected a whole number >= 0"),
         (lambda: law_figure(LAW, action=1), "an index below 1"),
         (
             lambda: law_figure(

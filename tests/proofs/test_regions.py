@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -115,6 +116,20 @@ def test_another_set_is_reached_in_a_step(mpc):
         assert (answer.proved, answer.refuted) == (proved, not proved)
 
 
+THREE: Any = 3
+LIST: Any = [1.0]
+FAR = Polytope.box([2.0, 2.0], [3.0, 3.0])
+OVER = Polytope.box([0.0, 0.0], [1.6, 0.1])
+FLAT = Polytope.box([0.1, 0.0], [0.1, 0.2])
+CUBE = Polytope.box([0.0] * 3, [0.1] * 3)
+
+
+def holed(law):
+    """The law without its smallest region."""
+    regions = sorted(law.regions, key=lambda x: x.volume)[1:]
+    return replace(law, regions=tuple(regions))
+
+
 SLICE = explicit_law(scheme(), Polytope.box([-0.1], [0.1]), basis=[[1.0], [0.0]])
 
 
@@ -123,7 +138,42 @@ SLICE = explicit_law(scheme(), Polytope.box([-0.1], [0.1]), basis=[[1.0], [0.0]]
     [
         (lambda mpc, law: grown_set(SLICE, plant(), BOX), "a slice of the known entries"),
         (lambda mpc, law: grown_set(law, Plant.of([[1.0]], [[1.0]]), BOX), "plant.B"),
+        (lambda mpc, law: grown_set(law, [], BOX), "plant: got an empty list, expected at least"),
+        (lambda mpc, law: grown_set(law, THREE, BOX), "plant: got int, expected a Plant"),
+        (lambda mpc, law: grown_set(THREE, plant(), BOX), "law: got int, expected an ExplicitLaw"),
+        (lambda mpc, law: grown_set(law, plant(), LIST), "starts: got list, expected a"),
+        (lambda mpc, law: grown_set(law, plant(), CUBE), "starts: got 3 dimensions, expected n_p"),
+        (lambda mpc, law: grown_set(law, plant(), FAR), "states outside the law's set by 1.5"),
+        (lambda mpc, law: grown_set(law, plant(), FLAT), "starts: got a flat set, expected a set"),
+        (lambda mpc, law: grown_set(holed(law), plant(), BOX), "expected regions of all of them"),
+        *(
+            (
+                lambda mpc, law, rows=rows: grown_set(law, plant(), HALF, directions=rows),
+                "expected finite rows (m, 2) that are not zero",
+            )
+            for rows in ([[0.0, 0.0]], [1.0, 0.0, 1.0], [[np.nan, 1.0]], [[1.0, 0.0, 0.0]])
+        ),
+        (
+            lambda mpc, law: grown_set(law, plant(), HALF, directions=[[1.0, 0.0]]),
+            "directions: got an unbounded set, expected rows that bound one",
+        ),
         (lambda mpc, law: grown_set(law, plant(0.4), BOX), "grows out of the law's set"),
+        (
+            lambda mpc, law: largest_increase(THREE, law, plant(), HALF),
+            "mpc: got int, expected a QPMPC",
+        ),
+        (lambda mpc, law: largest_increase(mpc, law, LIST, HALF), "plant: got list"),
+        (lambda mpc, law: largest_increase(mpc, law, plant(), FAR), "states outside the law's set"),
+        (
+            lambda mpc, law: largest_increase(mpc, law, plant(), OVER),
+            "outside the law's set by 0.1",
+        ),
+        (lambda mpc, law: largest_increase(mpc, law, plant(), FLAT), "states: got a flat set"),
+        (lambda mpc, law: largest_increase(mpc, holed(law), plant(), HALF), "regions of all of"),
+        (
+            lambda mpc, law: largest_increase(scheme(gamma=0.9), law, plant(), HALF),
+            "law: got that of another QP, expected that of mpc",
+        ),
         (lambda mpc, law: largest_increase(mpc, law, plant(), BOX, weight=[1.0]), "(2, 2)"),
         (lambda mpc, law: largest_increase(mpc, law, plant(0.9), BOX), "a law of all next states"),
     ],

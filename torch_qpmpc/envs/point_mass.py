@@ -116,6 +116,10 @@ class PointMass(LinearSystem):
         draws = [rng.uniform(-r, r, size=(count, 2)) for r in ranges]
         return torch.as_tensor(np.hstack(draws)).to(self.A)
 
+    def start_box(self) -> tuple[Tensor, Tensor]:
+        """Return the box of all starts."""
+        return -self.start_range, self.start_range
+
     def draw(self, rng: Rng, count: int) -> Tensor:
         """Draw standard normal numbers ``(count, 4)`` from ``rng``."""
         return normal(rng, count, 4)

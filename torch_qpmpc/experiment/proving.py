@@ -12,27 +12,31 @@ from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.proofs import Plant, Polytope, largest_violation
 
-#: Starts whose bounding box is the set.
-STARTS = 1000
+
+def check_provable(physics: Any) -> None:
+    """Raise `QPError` unless the plant is a `LinearSystem` that knows its starts."""
+    if not isinstance(physics, LinearSystem) or physics.start_box() is None:
+        got, want = f"a {type(physics).__name__}", "a LinearSystem with a start_box"
+        remedy = "Use task=point_mass or task=gros_zanon."
+        raise QPError.expected("prove", got, want, remedy)
 
 
 def prove_run(mpc: QPMPC, physics: Any, bound: float, quiet: bool) -> dict[str, Any]:
     """Return the entries of summary.json: ``proof``, a sentence, its ``value`` and its ``bound``.
 
-    The states are the bounding box of a thousand starts, and each entry of the noise is within
-    ``bound``. A question without an answer is a warning, and has no entries.
+    The states are the box of all starts, and each entry of the noise is within ``bound``. A
+    question without an answer is a warning, and has no entries.
+
+    Raises:
+        QPError: the plant is not a linear one with a box of starts.
     """
+    check_provable(physics)
+    lower, upper = (x.numpy() for x in physics.start_box() or ())
+    noise = Polytope.box(*(sign * bound * np.ones(len(lower)) for sign in (-1, 1)))
+    plant = Plant.of(physics.A.numpy(), physics.B.numpy(), disturbances=noise)
+    bounds = physics.lb_s.numpy(), physics.ub_s.numpy()
     try:
-        if not isinstance(physics, LinearSystem):
-            got = type(physics).__name__
-            raise QPError.expected("prove", got, "a linear plant of a bounded state")
-        starts = physics.starts(np.random.default_rng(0), STARTS).numpy()
-        n = starts.shape[1]
-        noise = Polytope.box(-bound * np.ones(n), bound * np.ones(n))
-        plant = Plant.of(physics.A.numpy(), physics.B.numpy(), disturbances=noise)
-        box = Polytope.box(starts.min(0), starts.max(0))
-        bounds = physics.lb_s.numpy(), physics.ub_s.numpy()
-        answer = largest_violation(mpc, plant, box, *bounds)
+        answer = largest_violation(mpc, plant, Polytope.box(lower, upper), *bounds)
     except (QPError, SolverError) as error:
         warnings.warn(f"Nothing is proved. {error}", stacklevel=2)
         return {}

@@ -103,7 +103,7 @@ def invariant_set(
         (1.0, True)
     """
     check_states(mpc, states)
-    plants, tables = check_plants(mpc, plant), make_tables(mpc)
+    plants, tables = check_plants(plant, mpc.n_p, mpc.n_u), make_tables(mpc)
     laws = _laws(tables, plants, np.zeros(mpc.n_u), 1.0)
     if (radius := _radius(laws)) >= 1:
         want = "a linear law with a spectral radius below 1"

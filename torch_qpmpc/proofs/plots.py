@@ -8,6 +8,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
 
+from torch_qpmpc.checks import check_kind, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.proofs.explicit import ExplicitLaw
 
@@ -23,12 +24,14 @@ def law_figure(law: ExplicitLaw, *, action: int = 0) -> Figure:
         action: the index of the action, which colours each region by its value at the middle.
 
     Raises:
-        QPError: s does not have two entries, or there is no such action.
+        QPError: ``law`` is no explicit law of two entries, or there is no such action.
     """
+    check_kind("law", law, ExplicitLaw)
     if law.basis.shape[1] != 2:
         remedy = "Pass a basis of two directions to explicit_law."
         raise QPError.expected("law", f"{law.basis.shape[1]} entries of s", "two", remedy)
-    if not 0 <= action < law.tables.n_u:
+    check_whole("action", action, 0)
+    if action >= law.tables.n_u:
         raise QPError.expected("action", f"{action}", f"an index below {law.tables.n_u}")
     corners = [x.vertices[ConvexHull(x.vertices).vertices] for x in law.regions]
     u = [(x.K @ x.vertices.mean(0) + x.k)[action] for x in law.regions]

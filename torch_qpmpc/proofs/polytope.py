@@ -16,7 +16,7 @@ Array = np.ndarray
 #: Radius of the largest ball in a set that counts as flat, relative to the ball's place.
 FLAT = 1e-9
 #: Vertices are enumerated up to this dimension.
-MOST = 8
+MOST_DIMENSIONS = 8
 
 
 def support(A: Array, b: Array, row: Array) -> float:
@@ -119,8 +119,8 @@ class Polytope:
             QPError: the dimension is above 8, or the set has no interior.
         """
         n = len(self.lower)
-        if n > MOST:
-            raise QPError.expected("the set", f"{n} dimensions", f"at most {MOST}")
+        if n > MOST_DIMENSIONS:
+            raise QPError.expected("the set", f"{n} dimensions", f"at most {MOST_DIMENSIONS}")
         if self.is_box():
             return np.array(list(itertools.product(*zip(self.lower, self.upper, strict=True))))
         length = np.linalg.norm(self.A, axis=1)

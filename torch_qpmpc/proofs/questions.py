@@ -231,13 +231,15 @@ def check_states(mpc: QPMPC, states: Polytope) -> int:
     return mpc.n_p
 
 
-def check_plants(mpc: QPMPC, plant: Plant | Sequence[Plant]) -> list[Plant]:
-    """Return the plants; raise unless each fits the policy."""
-    plants = [plant] if isinstance(plant, Plant) else list(plant)
+def check_plants(plant: Plant | Sequence[Plant], n_p: int, n_u: int) -> list[Plant]:
+    """Return the plants; raise unless there is one, and each fits the policy."""
+    plants = list(plant) if isinstance(plant, Sequence) else [plant]
+    if not plants:
+        raise QPError.expected("plant", "an empty list", "at least one Plant")
     for one in plants:
         check_kind("plant", one, Plant, "Make one with Plant.of(A, B).")
-        if one.B.shape != (mpc.n_p, mpc.n_u):
-            want = f"({mpc.n_p}, {mpc.n_u}), for p and u"
+        if one.B.shape != (n_p, n_u):
+            want = f"({n_p}, {n_u}), for p and u"
             raise QPError.expected("plant.B", f"shape {one.B.shape}", want)
     return plants
 
@@ -267,7 +269,7 @@ def _worst(
     seconds: float,
 ) -> Answer:
     """Maximise ``max_i A_i p_steps - b_i`` over the set, the disturbances and the plants."""
-    plants = check_plants(mpc, plant)
+    plants = check_plants(plant, mpc.n_p, mpc.n_u)
     if steps < 1 or len(plants) ** steps > MOST_MODELS:
         got = f"{steps} steps of {len(plants)} plants"
         raise QPError.expected("steps", got, f"at least one step, and {MOST_MODELS} combinations")

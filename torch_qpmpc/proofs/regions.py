@@ -27,18 +27,28 @@ from scipy.linalg import null_space
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.export.tables import make_tables
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.proofs.explicit import ExplicitLaw, Region
+from torch_qpmpc.proofs.explicit import INSIDE, ExplicitLaw, Region, size_of
 from torch_qpmpc.proofs.polytope import Body, Polytope, facets, support
-from torch_qpmpc.proofs.questions import TOLERANCE, Answer, Plant, action, compare_replay
+from torch_qpmpc.proofs.questions import (
+    TOLERANCE,
+    Answer,
+    Plant,
+    action,
+    check_plants,
+    compare_replay,
+)
 
 Array = np.ndarray
 #: Steps after which a growing set is given up.
 MOST_STEPS = 500
 #: Entries of the directions of a set, before they are scaled.
 DIRECTIONS = (-1.0, -0.5, 0.0, 0.5, 1.0)
-#: Points are in a polytope within this, relative to its size.
-INSIDE = 1e-9
+#: Rows of p+ that change by less than this with p do not bound it.
+CONSTANT = 1e-9
+#: Regions with a smaller share of the set's volume can be missing.
+MISSING = 1e-6
 
 
 def grown_set(
@@ -53,11 +63,12 @@ def grown_set(
     Args:
         law: the explicit law of all known entries.
         plant: the plant, or several, of which each step may be any.
-        starts: a subset of the law's set.
+        starts: a subset of the law's set, with an interior.
         directions: rows of the set, ``(m, n_p)``; by default 16 of two entries and 98 of three.
 
     Raises:
-        QPError: an argument is invalid, or the set grows out of the law's set.
+        QPError: an argument is invalid, the law's regions leave a hole, or the set grows out of the
+            law's set.
 
     Example:
         >>> import torch_qpmpc as qm
@@ -72,17 +83,21 @@ def grown_set(
         >>> grown.upper.round(2)
         array([0.46, 0.3 ])
     """
-    plants = _check(law, plant)
-    n = len(law.set.lower)
+    plants, n = _check(law, plant, "starts", starts), len(law.origin)
     if directions is None:
         grid = np.array([x for x in itertools.product(DIRECTIONS, repeat=n) if 1 in map(abs, x)])
         directions = grid / (law.set.upper - law.set.lower)
     A = np.array(directions, float)
+    if A.shape[1:] != (n,) or not np.isfinite(A).all() or not A.any(1).all():
+        got = f"{directions}"
+        raise QPError.expected("directions", got, f"finite rows (m, {n}) that are not zero")
     A = A / np.linalg.norm(A, axis=1, keepdims=True)
     b = np.array([support(starts.A, starts.b, row) for row in A])
     pushes = [_pushes(one, A) for one in plants]
     for step in range(MOST_STEPS):
-        if (worst := _outside(law, A, b)) > INSIDE:
+        if (worst := _outside(law, A, b)) == np.inf:
+            raise QPError.expected("directions", "an unbounded set", "rows that bound one")
+        if worst > INSIDE * size_of(law.set):
             got = f"a set that grows out of the law's set by {worst:.3g} in {step} steps"
             want = "a law on a larger set, smaller disturbances or more directions"
             raise QPError.expected("starts", got, want)
@@ -96,17 +111,26 @@ def grown_set(
     raise QPError.expected("starts", got, "a policy that contracts it")
 
 
-def _check(law: ExplicitLaw, plant: Plant | Sequence[Plant]) -> list[Plant]:
+def _check(
+    law: ExplicitLaw, plant: Plant | Sequence[Plant], name: str, states: Polytope
+) -> list[Plant]:
+    """Return the plants; raise unless the regions know the law at all of the states."""
     check_kind("law", law, ExplicitLaw)
     n = len(law.origin)
     if law.basis.shape != (n, n) or (law.basis != np.eye(n)).any() or law.origin.any():
         raise QPError.expected("law", "a slice of the known entries", "all of them")
-    plants = [plant] if isinstance(plant, Plant) else list(plant)
-    for one in plants:
-        check_kind("plant", one, Plant, "Make one with Plant.of(A, B).")
-        if one.B.shape != (n, law.tables.n_u):
-            want = f"({n}, {law.tables.n_u}), for p and u"
-            raise QPError.expected("plant.B", f"shape {one.B.shape}", want)
+    plants = check_plants(plant, n, law.tables.n_u)
+    check_kind(name, states, Polytope, "Make one with Polytope.box(lower, upper).")
+    if len(states.lower) != n:
+        raise QPError.expected(name, f"{len(states.lower)} dimensions", f"n_p = {n}")
+    if (worst := _outside(law, states.A, states.b)) > INSIDE * size_of(law.set):
+        got, remedy = f"states outside the law's set by {worst:.3g}", "Compute it on a larger set."
+        raise QPError.expected(name, got, "a subset of it", remedy)
+    if facets(states.A, states.b) is None:
+        raise QPError.expected(name, "a flat set", "a set with an interior")
+    if law.covered < 1 or law.volume < 1 - MISSING:
+        got = f"regions of {law.covered:.2%} of its random states, and {law.volume:.6f} of its set"
+        raise QPError.expected("law", got, "regions of all of them")
     return plants
 
 
@@ -161,13 +185,14 @@ def largest_increase(
 
     Args:
         mpc: the QP.
-        law: its explicit law, on a set that p+ does not leave.
+        law: its explicit law, as it is now, on a set that p+ does not leave.
         plant: the plant.
-        states: a subset of the law's set.
+        states: a subset of the law's set, with an interior.
         weight: W, ``(n_p, n_p)``; zero by default.
 
     Raises:
-        QPError: an argument is invalid, or p+ can leave the law's set.
+        QPError: an argument is invalid, the law is that of another QP or its regions leave a hole,
+            or p+ can leave the law's set.
 
     Example:
         >>> import torch_qpmpc as qm
@@ -181,14 +206,20 @@ def largest_increase(
         >>> largest_increase(mpc, law, Plant.of(A, B), box).proved
         True
     """
-    began, (plant,) = time.perf_counter(), _check(law, plant)
+    began = time.perf_counter()
+    check_kind("mpc", mpc, QPMPC)
+    check_kind("plant", plant, Plant, "Make one with Plant.of(A, B).")
+    _check(law, plant, "states", states)
+    if make_tables(mpc).digest != law.tables.digest:
+        remedy = "Compute the law of this QP, after it has learned."
+        raise QPError.expected("law", "that of another QP", "that of mpc", remedy)
     n = len(law.origin)
     W = np.zeros((n, n)) if weight is None else np.array(weight, float)
     if W.shape != (n, n):
         raise QPError.expected("weight", f"shape {W.shape}", f"({n}, {n})")
     left = _reached(law, plant, states.A, states.b, law.set.A) + _pushes(plant, law.set.A)
     left -= law.set.b
-    if left.max() > INSIDE:
+    if left.max() > INSIDE * size_of(law.set):
         got, remedy = f"p+ outside it by {left.max():.3g}", "Compute the law on a larger set."
         raise QPError.expected("law", got, "a law of all next states", remedy)
     d = plant.disturbances
@@ -240,7 +271,7 @@ def _transitions(
                     continue
                 rows = np.concatenate((own.A, other.set.A @ A))
                 right = np.append(own.b, other.set.b - other.set.A @ c)
-                varies = np.abs(rows).max(1) > INSIDE
+                varies = np.abs(rows).max(1) > CONSTANT
                 pair = None if (right[~varies] < 0).any() else facets(rows[varies], right[varies])
                 if pair is not None:
                     yield _Transition(pair, region, other, A, c, i)
@@ -251,8 +282,8 @@ def _largest(P: Array, g: Array, body: Body) -> tuple[float, Array]:
 
     Along a face without a unique maximum it is as large at the face's boundary.
     """
-    points = [body.vertices]
-    n = len(g)
+    points, n = [body.vertices], len(g)
+    slack = INSIDE * np.ptp(body.vertices, axis=0).max()
     for size in range(n):
         for on in itertools.combinations(range(len(body.b)), size):
             A, b = body.A[list(on)], body.b[list(on)]
@@ -262,7 +293,7 @@ def _largest(P: Array, g: Array, body: Body) -> tuple[float, Array]:
                 continue
             p = np.linalg.lstsq(A, b, rcond=None)[0] if size else np.zeros(n)
             p = p - along @ np.linalg.solve(curvature, along.T @ (P @ p + g))
-            if (body.A @ p <= body.b + INSIDE).all():
+            if (body.A @ p <= body.b + slack).all():
                 points.append(p[None])
     p = np.concatenate(points)
     values = ((p @ P) * p).sum(1) / 2 + p @ g

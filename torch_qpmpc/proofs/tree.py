@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torch_qpmpc.checks import check_choice
+from torch_qpmpc.checks import check_choice, check_kind
 from torch_qpmpc.export.export import check_name
 from torch_qpmpc.export.writer import REAL, array, comment, filled
-from torch_qpmpc.proofs.explicit import ExplicitLaw
+from torch_qpmpc.proofs.explicit import ExplicitLaw, check_points
 from torch_qpmpc.proofs.polytope import Body, facets
 
 Array = np.ndarray
@@ -58,6 +58,9 @@ class SearchTree:
     def of(cls, law: ExplicitLaw) -> SearchTree:
         """Build the tree.
 
+        Raises:
+            QPError: ``law`` is no explicit law.
+
         Example:
             >>> import torch_qpmpc as qm
             >>> from torch_qpmpc.proofs import Polytope, explicit_law
@@ -70,6 +73,7 @@ class SearchTree:
             >>> tree.policy([1.0, 0.5])
             array([-0.5])
         """
+        check_kind("law", law, ExplicitLaw)
         laws, at = _laws(law)
         pieces = [
             _Piece(Body(x.set.A, x.set.b, x.vertices), i)
@@ -95,8 +99,12 @@ class SearchTree:
         return cls(law, nodes, np.array(children, int).reshape(-1, 2), laws, depth)
 
     def policy(self, s: Any) -> Array:
-        """Return u_0 ``(*batch, n_u)`` at s ``(*batch, d)``; outside the set, of some law."""
-        s = np.asarray(s, float)
+        """Return u_0 ``(*batch, n_u)`` at s ``(*batch, d)``; outside the set, of some law.
+
+        Raises:
+            QPError: s has another shape.
+        """
+        s = check_points(s, self.laws.shape[2] - 1)
         flat = s.reshape(-1, s.shape[-1])
         at = np.full(len(flat), 0 if len(self.planes) else -1)
         while len(inner := np.flatnonzero(at >= 0)):
@@ -105,7 +113,7 @@ class SearchTree:
             at[inner] = self.children[at[inner], side.astype(int)]
         laws = self.laws[-1 - at]
         u = (laws[..., :-1] @ flat[..., None])[..., 0] + laws[..., -1]
-        return u.reshape(*s.shape[:-1], -1)
+        return u.reshape(*s.shape[:-1], u.shape[-1])
 
     @property
     def numbers(self) -> int:

@@ -183,7 +183,7 @@ def proofs(sweep: pd.DataFrame) -> str:
         for run, label, seed, proof in runs
         if isinstance(proof, str)
     ]
-    return "\n".join(["From every start:", "", *lines])
+    return "\n".join(["From every start:", "", *lines]) if lines else ""
 
 
 def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:

@@ -211,9 +211,11 @@ class Config(Group):
         return self
 
     @model_validator(mode="after")
-    def export_has_a_qp(self) -> Self:
-        if self.export and self.algo.name != "qlearning" and self.algo.actor != "qp":
-            self.conflict("export", "null", "The policy of this algo.actor has a network.")
+    def export_and_proof_have_a_qp(self) -> Self:
+        for key in ("export", "prove"):
+            asked = getattr(self, key) is not None
+            if asked and self.algo.name != "qlearning" and self.algo.actor != "qp":
+                self.conflict(key, "null", "The policy of this algo.actor has a network.")
         return self
 
     @model_validator(mode="after")
