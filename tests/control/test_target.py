@@ -64,7 +64,7 @@ def test_many_inputs_of_one_output_have_bounds_of_its_own():
 
 
 def test_a_load_beyond_the_inputs_of_an_integrator_has_a_target():
-    """Two inputs within 1 cannot hold a disturbance of 5: they exceed their bounds in the target."""
+    """Two inputs within 1 cannot hold a disturbance of 5: the target exceeds their bounds."""
     mpc = qm.LinearMPC(([[1.0]], [[1.0, 0.5]], [[1.0]]), 5, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))
     target = mpc.target([0.0], 5.0)
     assert np.isfinite(target.u.numpy()).all()
