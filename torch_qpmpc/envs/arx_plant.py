@@ -7,7 +7,6 @@ Errors e_k and known signals d_k are those of the log.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,11 +14,11 @@ from torch import Tensor
 
 from torch_qpmpc.envs.linear_system import Rng, uniform
 from torch_qpmpc.envs.past_window import first_window, next_window
-from torch_qpmpc.envs.plant import Plant
+from torch_qpmpc.envs.quadratic_plant import QuadraticPlant
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ARXPlant(Plant):
+class ARXPlant(QuadraticPlant):
     """The physics in float64, with a quadratic cost. Its state is the window.
 
         L(y, u, d) = 1/2 v' W v + q'v + c + price violation(y),    v = [d; y; u]
@@ -45,13 +44,6 @@ class ARXPlant(Plant):
     errors: Tensor
     outputs: Tensor
     signals_seen: Tensor
-    W: Tensor
-    q: Tensor
-    c: Tensor
-    lb_y: Tensor
-    ub_y: Tensor
-    price: float = 0.0
-    labels: tuple[Sequence[str], Sequence[str], Sequence[str]] = ((), (), ())
 
     def signals(self, rng: Rng, count: int, length: int) -> Tensor:
         """Draw w = [d, e], ``(count, length, n_d + n_y)``."""
@@ -69,9 +61,7 @@ class ARXPlant(Plant):
 
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         v = torch.cat((w[..., : self.n_d], self.output(x, w), u), -1)
-        return (
-            (v @ self.W * v).sum(-1) / 2 + v @ self.q + self.c + self.price * self.violation(x, w)
-        )
+        return self._cost_of(v, self.violation(x, w))
 
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         d, e = w.split((self.n_d, self.n_y), -1)
@@ -81,8 +71,7 @@ class ARXPlant(Plant):
         return next_window(x, u, following)
 
     def violation(self, x: Tensor, w: Tensor) -> Tensor:
-        y = self.output(x, w)
-        return ((self.lb_y - y).relu() + (y - self.ub_y).relu()).sum(-1)
+        return self._violation_of(self.output(x, w))
 
 
 def _rows(rng: Rng, rows: int, *shape: int) -> Tensor:

@@ -5,18 +5,17 @@ x+ = A x + B u + v,    y = C x + e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torch_qpmpc.envs.linear_system import Rng, normal, uniform
-from torch_qpmpc.envs.plant import Plant
+from torch_qpmpc.envs.quadratic_plant import QuadraticPlant
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LinearPlant(Plant):
+class LinearPlant(QuadraticPlant):
     """The physics in float64. The signals w are v ``(n,)`` and e ``(n_y,)``; both are hidden.
 
         L(x, u) = 1/2 z'W z + q'z + c + price violation(x),    z = [C x; u]
@@ -48,14 +47,7 @@ class LinearPlant(Plant):
     C: Tensor
     V: Tensor
     std: Tensor
-    W: Tensor
-    q: Tensor
-    c: Tensor
-    lb_y: Tensor
-    ub_y: Tensor
     first: Tensor
-    price: float = 0.0
-    labels: tuple[Sequence[str], Sequence[str], Sequence[str]] = ((), (), ())
 
     def signals(self, rng: Rng, count: int, length: int) -> Tensor:
         """Draw w = [v, e], ``(count, length, n + n_y)``."""
@@ -72,13 +64,10 @@ class LinearPlant(Plant):
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """Return L(x, u) ``(*batch,)``, which does not depend on w."""
         z = torch.cat((x @ self.C.mT, u.to(x)), -1)
-        return (
-            (z @ self.W * z).sum(-1) / 2 + z @ self.q + self.c + self.price * self.violation(x, w)
-        )
+        return self._cost_of(z, self.violation(x, w))
 
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         return x @ self.A.mT + u.to(x) @ self.B.mT + w[..., : -self.n_y]
 
     def violation(self, x: Tensor, w: Tensor) -> Tensor:
-        y = x @ self.C.mT
-        return ((self.lb_y - y).relu() + (y - self.ub_y).relu()).sum(-1)
+        return self._violation_of(x @ self.C.mT)

@@ -87,7 +87,7 @@ class FinishedRun:
         """The QP with the true model; None if that is unknown."""
         return make_true_mpc(self.cfg, self.physics) if self.has_plant else None
 
-    @property
+    @cached_property
     def policy(self) -> QPMPC:
         """The learned policy, which the run has kept.
 
