@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 
 import torch_qpmpc as qm
-from tests.control.test_saving import learned
+from tests.control.controllers import designed, drawn, learned, load
 from torch_qpmpc import QPError, SolverError
 from torch_qpmpc.control import exporting
-from torch_qpmpc.control.exporting import CompiledController
 from torch_qpmpc.export import export
 
 STEPS = int(os.environ.get("STEPS", "50"))
@@ -45,12 +44,6 @@ MPCS = {
     "more inputs": lambda: qm.LinearMPC((A, B, C), 8, Q=[1.0, 0.0], **SIZES),
     "unbounded": lambda: qm.LinearMPC((A, B, C), 5, Q=1.0, R=0.1, disturbances=None),
 }
-
-
-def load(files, controller, name="policy", dtype="float64"):
-    texts = {x.name: x.read_text() for x in files if x.suffix in (".c", ".h")}
-    del texts["main.c"]
-    return CompiledController(texts, name, dtype, len(controller.u))
 
 
 def difference(controller, twin, steps):
@@ -192,6 +185,14 @@ def test_the_self_test_finds_a_wrong_table(tmp_path, name, exported):
     start = text.index("U_P[1]")
     file.write_text(text[:start] + re.sub(r"\d\.\d+", "7.7", text[start:], count=2))
     assert load(files, controller).selftest() == 1 + (name == "target")
+
+
+def test_a_self_test_replays_the_steps_whose_inputs_rounding_hardly_changes(tmp_path):
+    """The window's gains are above a hundred, so that replayed outputs enlarge rounding."""
+    files = designed(drawn(54), 54, window=True).export_c(tmp_path).files
+    replayed = int(re.search(r"#define EXAMPLES (\d+)", (tmp_path / "policy.c").read_text())[1])
+    assert 2 < replayed < exporting.REPLAYED
+    assert load(files, designed(drawn(54), 54, window=True)).selftest() == 0
 
 
 def test_a_controller_that_disagrees_is_refused(tmp_path, monkeypatch):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,35 +9,10 @@ import pytest
 import torch
 
 import torch_qpmpc as qm
+from tests.control.controllers import A, B, C, learned
 from torch_qpmpc import QPError, files
-from torch_qpmpc.control.state_space import read_model
 
 FOLDER = Path(__file__).parent
-A = np.array([[1.0, 0.1], [0.0, 0.8]])
-B, C, E = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]]), np.array([[0.0], [0.1]])
-
-
-def learned(references: str = "held", rate: float = 1e-3, **options) -> qm.LinearMPC:
-    """Make a LinearMPC with bounds, prices and names of which every part has been learned."""
-    names = {"inputs": ["valve"], "outputs": ["level"], "known": ["rain", "price"]}
-    plant = read_model((A, B, C), np.hstack((E, 0 * E)), 0.5, **names)
-    mpc = qm.LinearMPC(
-        replace(plant, units={"level": "m"}),
-        4,
-        Q={"level": 1.0},
-        dR=0.1,
-        y_bounds={"level": (None, 2.0)},
-        u_bounds=(-1.0, 1.0),
-        du_bounds=(-0.3, 0.3),
-        linear={"valve": "price"},
-        references=references,
-        learn=("H", "q", "c", "C", "b", "lb", "ub", "w"),
-        **options,
-    )
-    optimizer = torch.optim.SGD(mpc.parameters(), lr=rate)
-    mpc.value(torch.linspace(-0.5, 0.5, mpc.n_p)).backward()
-    optimizer.step()
-    return mpc
 
 
 def inputs(controller: qm.Controller, steps: int = 20) -> np.ndarray:
