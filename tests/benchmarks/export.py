@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from tests.benchmarks.table import significant
 from tests.campaign.exports import PROBLEMS
 from torch_qpmpc import QPMPC, CompiledPolicy
 from torch_qpmpc.export.library import required_compiler
@@ -52,7 +53,7 @@ class Times(NamedTuple):
 
     def __str__(self) -> str:
         p50, p99 = np.percentile(self.steps, [50, 99])
-        return " / ".join(f"{x:.3g}" for x in (p50, p99, self.steps.max()))
+        return " / ".join(map(significant, (p50, p99, self.steps.max())))
 
 
 def library(folder: Path, source: Path, *more: str) -> ctypes.CDLL:
@@ -196,7 +197,7 @@ def measured(name: str) -> list[list[str]]:
         error = ""
         if (u := passes[-1][1].u) is not None:
             error = f"{np.abs(u - reference(mpc, cold[: len(u)]).u).max():.0e}"
-        rows.append([name, who, *map(str, both), f"{ratio:.3g}x", error])
+        rows.append([name, who, *map(str, both), f"{significant(ratio)}x", error])
     return rows
 
 
@@ -206,7 +207,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--write", action="store_true", help="write the table into the docs")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    titles = ["problem", "step of", "warm: p50 / p99 / max, us", "cold", "warm p50", "error of u"]
+    kinds = (f"{kind}: p50 / p99 / max" for kind in ("warm", "cold"))
+    titles = ["problem", "step of", *kinds, "speed-up, warm p50", "error of u"]
     rows = []
     for name in [options.problem] if options.problem else CHOSEN:
         rows += measured(name)

@@ -30,6 +30,7 @@ import torch_qpmpc as qm
 from tests.benchmarks.full_space import FullSpace
 from tests.benchmarks.problems import GAMMA, PAPER, make_mpc, nudge, transitions
 from tests.benchmarks.reference import relative_error
+from tests.benchmarks.table import significant
 from torch_qpmpc.envs import PointMass, PointMassEnv
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
 from torch_qpmpc.learning.replay import ACTIVE_SET, make_replay
@@ -98,7 +99,7 @@ def curve(device: torch.device, batches: tuple[int, ...] = BATCHES) -> str:
 
         of_Q = gradient(lambda s=s, a=a: mpc.action_value(s, a))
         of_pi = gradient(lambda s=s: mpc.policy(s))
-        times = (f"{1e6 * x / batch:.3g}" for x in (cold, warm, new, of_Q, of_pi))
+        times = (significant(1e6 * x / batch) for x in (cold, warm, new, of_Q, of_pi))
         lines.append([f"{batch:,}", *times, f"{memory:,.0f}; {error:.0e}"])
     head = ["batch", "V", "V, warm", "warm, new theta", "Q and gradient", "policy and gradient"]
     return table([*head, "MiB; error"], lines)
@@ -186,7 +187,7 @@ def comparison(device: torch.device, count: int = LARGE) -> str:
     if (peer := by_qpax(min(count, OF_QPAX))) is not None:
         rows.append((f"qpax, on the GPU (error {peer[1]:.0e})", min(count, OF_QPAX), [peer[0]]))
     lines = [
-        [name, f"{batch:,}", *(f"{1e6 * x / batch:.3g}" for x in each), *[""] * (2 - len(each))]
+        [name, f"{batch:,}", *(significant(1e6 * x / batch) for x in each), *[""] * (2 - len(each))]
         for name, batch, each in rows
     ]
     return table(["", "batch", "cold", "warm"], lines)
@@ -266,7 +267,7 @@ def loops(device: torch.device, num_envs: int = NUM_ENVS) -> str:
         ("daqp, on one core", cpu, "daqp", 20, 1_024),
     ):
         start, end = learn(where, solver, updates, pairs, num_envs)
-        times = [f"{end[x]:,.3g}" for x in ("step", "update")]
+        times = [significant(end[x]) for x in ("step", "update")]
         costs = f"{start['J']:.1f} to {end['J']:.1f}"
         count = f"{updates + WARM_UP}"
         lines.append([name, f"{pairs:,}", *times, f"{end['rate']:,.0f}", count, costs])
@@ -279,14 +280,13 @@ def report(device: torch.device) -> str:
     return "\n\n".join(
         (
             f"On one {card}, with torch {torch.__version__} and {os.cpu_count()} CPU cores.",
-            "**By batch**, in microseconds a QP; the memory is the peak of the first column, and "
-            "the error the largest of a value, beside DAQP's:",
+            "**By batch**, in microseconds per QP. The memory is the peak of the first column; the "
+            "error is the largest of a value, compared with DAQP:",
             curve(device),
-            "**Beside other solvers**, in microseconds a QP:",
+            "**Beside other solvers**, in microseconds per QP:",
             comparison(device),
-            f"**The whole loop**: {NUM_ENVS:,} point masses take a step, and `GaussNewton` an "
-            "update on replayed pairs; J is the cost of an episode, before and after so many "
-            "updates:",
+            f"**The whole loop**: {NUM_ENVS:,} point masses take a step, then `GaussNewton` an "
+            "update on replayed pairs. J is the cost of an episode before and after the updates:",
             loops(device),
         )
     )

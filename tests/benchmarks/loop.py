@@ -16,6 +16,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from tests.benchmarks.table import significant
 from torch_qpmpc.study.markdown import replaced, table
 
 ROOT = Path(__file__).parents[2]
@@ -43,7 +44,7 @@ def measured(solver: str, threads: int, count: int) -> list[str]:
     )
     rate = UPDATES * STEPS * count / seconds
     shares = [f"{collecting / seconds:.0%}", f"{solving / seconds:.0%}"]
-    times = [f"{float(f'{rate:.3g}'):,.0f}", f"{1e3 * seconds / UPDATES:.3g}"]
+    times = [significant(rate), significant(1e3 * seconds / UPDATES)]
     return [solver, str(threads), f"{count:,}", *times, *shares]
 
 

@@ -21,7 +21,7 @@ from scipy import sparse
 
 import torch_qpmpc as qm
 from tests.benchmarks.export import compiled
-from tests.benchmarks.table import DOCS
+from tests.benchmarks.table import DOCS, significant
 from torch_qpmpc.export.tables import make_tables
 from torch_qpmpc.export.writer import Settings, state_bytes, table_bytes
 from torch_qpmpc.study.markdown import replaced, table
@@ -145,7 +145,7 @@ def row(horizon: int, blocks: list[int]) -> list[str]:
     name = f"N = {horizon}" + (f", {len(blocks)} blocks" if blocks else "")
     sizes = [str(tables.R.shape[1]), str(len(tables.rows))]
     difference = np.abs(u[some, 0] - expected).max()
-    return [name, *sizes, f"{p50:.3g}", f"{p99:.3g}", f"{memory:,.0f}", f"{difference:.0e}"]
+    return [name, *sizes, significant(p50), significant(p99), f"{memory:,.0f}", f"{difference:.0e}"]
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from tests.benchmarks.policy_peers import AVAILABLE, HORIZON, MODULES, PEERS, Peer, lqr
 from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
+from tests.benchmarks.table import significant
 from torch_qpmpc import QPMPC
 from torch_qpmpc.study.markdown import replaced, table
 
@@ -106,7 +107,7 @@ def beside(u_max: float) -> list[list[str]]:
     truth, rows = solved(), []
     for name, peer in peers.items():
         error = np.abs(peer.solution() - truth).max()
-        cells = [f"{1e3 * next(times):.3g}" for _ in range(2)]
+        cells = [significant(1e3 * next(times)) for _ in range(2)]
         rows.append([name, f"{u_max:g}", *cells, "" if peer is ours else f"{error:.0e}"])
         print(" | ".join(rows[-1]), flush=True)
     return rows
@@ -120,7 +121,7 @@ def main(arguments: list[str] | None = None) -> int:
     rows = []
     for name, (mpc, states) in PROBLEMS.items():
         solution, value, policy = measured(mpc, states)
-        times = [f"{1e3 * seconds:.3g}" for seconds in (solution, value, policy)]
+        times = [significant(1e3 * seconds) for seconds in (solution, value, policy)]
         rows.append(
             [name, str(len(states)), *times, *(f"{policy / x:.2g}" for x in (solution, value))]
         )

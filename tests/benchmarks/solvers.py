@@ -31,6 +31,7 @@ from tests.benchmarks.full_space import FullSpace
 from tests.benchmarks.peers import clarabel_solver, cvxpylayers, needs, piqp_solver
 from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
 from tests.benchmarks.reference import reference_values, relative_error
+from tests.benchmarks.table import significant
 from torch_qpmpc import QPMPC
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers import BACKENDS
@@ -174,7 +175,7 @@ def series(caption: str, sizes: list[Size], dense: bool) -> str:
     heads = [str(s.horizon) if by_horizon else f"({s.n_x}, {s.n_u})" for s in sizes]
     lines = []
     for name in dict.fromkeys(name for column in columns for name in column):
-        cells = [f"{1e3 * column[name][0]:.3g}" if name in column else "" for column in columns]
+        cells = [significant(1e3 * column[name][0]) if name in column else "" for column in columns]
         largest = [e for c in columns if name in c and (e := c[name][1]) is not None]
         lines.append([name + (f" ({max(largest):.0e})" if largest else ""), *cells])
     kind = "dense C" if dense else "banded C"

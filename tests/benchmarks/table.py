@@ -115,7 +115,7 @@ def _gradients(rows: list[Row]) -> str:
 def _timing(row: Row, own: float | None) -> str:
     reference = row.get("reference_seconds", own)
     ratio = "" if reference is None or row["row"] == REFERENCE else reference / row["seconds"]
-    return _digits(1e3 * row["seconds"]) + (f" ({_digits(ratio)}x)" if ratio else "")
+    return significant(1e3 * row["seconds"]) + (f" ({significant(ratio)}x)" if ratio else "")
 
 
 def _errors(row: Row) -> str:
@@ -150,7 +150,7 @@ def _unique(items: Iterable[Any]) -> list[Any]:
     return list(dict.fromkeys(items))
 
 
-def _digits(x: float) -> str:
+def significant(x: float) -> str:
     """Format three significant digits below a hundred, whole numbers above."""
     if x >= 100:
         return f"{_round(x):,}"
