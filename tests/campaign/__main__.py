@@ -1,7 +1,7 @@
 """Solve QPs whose outcome is known: ``python -m tests.campaign --count 100000 --solver daqp``.
 
-It ends with two tables in Markdown of the latest counts of each solver: all families together, and
-each by itself. ``--write`` writes them to docs/reliability/campaign.md. ``--solver`` without a name
+It ends with two tables in Markdown of the latest counts: all families together by solver, and each
+by itself. ``--write`` writes them to docs/reliability/campaign.md. ``--solver`` without a name
 solves nothing.
 """
 
@@ -32,6 +32,13 @@ LONG = (
     "runaway prediction",
     "hopeless plant",
 )
+#: Counts of a family, with their names in the tables.
+OUTCOMES = {
+    "certified": "certified, and right",
+    "named": "failed, and named for what they are",
+    "missed": "not solved to tolerance",
+    "wrong": "wrong",
+}
 PAGE = DOCS / "reliability" / "campaign.md"
 RESULTS = ROOT / "runs" / "campaign"
 
@@ -95,13 +102,19 @@ def load(folder: Path) -> dict[str, dict[str, Tally]]:
 
 
 def by_family(tallies: dict[str, dict[str, Tally]]) -> str:
-    """Format the table of families by solvers."""
-    families = [name for name in FAMILIES if any(name in of_one for of_one in tallies.values())]
+    """Format the table of families; a count that depends on the solver is a range."""
     lines = []
-    for family in families:
-        of_all = [of_one.get(family) for of_one in tallies.values()]
-        lines.append([family, *(tally.cell() if tally else "" for tally in of_all)])
-    return table(["certified / named / not converged / wrong", *tallies], lines)
+    for family in FAMILIES:
+        of_all = [of_one[family] for of_one in tallies.values() if family in of_one]
+        if of_all:
+            lines.append([family, *(spread(of_all, name) for name in OUTCOMES)])
+    return table(["", *OUTCOMES.values()], lines)
+
+
+def spread(tallies: list[Tally], name: str) -> str:
+    """Format a count of several solvers."""
+    least, most = (f(getattr(tally, name) for tally in tallies) for f in (min, max))
+    return f"{least:,}" if least == most else f"{least:,} to {most:,}"
 
 
 def totals(tallies: dict[str, dict[str, Tally]]) -> str:
@@ -109,10 +122,7 @@ def totals(tallies: dict[str, dict[str, Tally]]) -> str:
     sums = [functools.reduce(Tally.plus, of_one.values()) for of_one in tallies.values()]
     lines = [
         ["QPs", *(f"{total.count:,}" for total in sums)],
-        ["certified, and right", *(f"{total.certified:,}" for total in sums)],
-        ["failed, and named for what they are", *(f"{total.named:,}" for total in sums)],
-        ["not solved to tolerance", *(f"{total.missed:,}" for total in sums)],
-        ["wrong", *(f"{total.wrong:,}" for total in sums)],
+        *([title, *(f"{getattr(x, name):,}" for x in sums)] for name, title in OUTCOMES.items()),
         ["with NaN or inf in a gradient", *(f"{total.not_finite:,}" for total in sums)],
         [f"slower than {SLOW} s", *(f"{total.slow:,}" for total in sums)],
         ["slowest, in seconds of one core", *(f"{total.slowest:.2f}" for total in sums)],
