@@ -84,6 +84,37 @@ def test_an_environment_whose_observations_are_outputs_is_a_plant():
     assert np.abs(made().simulate(Lag(), 120, r=[1.0]).y[-1] - 1.0) < 1e-5
 
 
+def test_an_environment_forecasts_the_known_signals():
+    class Rain(gymnasium.Env):
+        """y+ = 0.9 y + 0.5 u + 0.3 rain, with a forecast of 11 rows or of none."""
+
+        def __init__(self, rows=11):
+            self.rain, self.rows = np.sin(np.arange(200) / 3), rows
+
+        def ahead(self):
+            return {"known": {"rain": self.rain[self.k : self.k + self.rows]}} if self.rows else {}
+
+        def reset(self, *, seed=None, options=None):
+            self.k, self.y = 0, np.zeros(1)
+            return self.y, self.ahead()
+
+        def step(self, action):
+            self.y = 0.9 * self.y + 0.5 * action + 0.3 * self.rain[self.k]
+            self.k += 1
+            return self.y, 0.0, False, False, self.ahead()
+
+    controller = made(E=[[0.3]], known=["rain"], R=0.0)
+    run, held = (controller.simulate(Rain(rows), 100, r=[0.0]) for rows in (11, 1))
+    assert np.array_equal(run.known[:, 0], Rain().rain[:100])
+    assert run.cost.sum() < 0.9 * held.cost.sum()
+    same = controller.simulate(None, 100, r=[0.0], known={"rain": Rain().rain})
+    assert np.allclose(run.u, same.u, atol=1e-6)
+    with pytest.raises(
+        QPError, match=r"known: got None, .* has it in info\['known'\]"
+    ):
+        controller.simulate(Rain(0), 5, r=[0.0])
+
+
 def test_the_figure_has_a_panel_for_each_signal_with_its_unit():
     mpc = qm.LinearMPC(LAG, 5, Q=1.0, E=[[0.1]], known=["rain"], y_bounds=(-1, 1), dt=60.0)
     figure = qm.Controller(mpc).simulate(steps=5, r=[0.5], known=[0.1]).plot()

@@ -191,11 +191,11 @@ class Controller:
                 Gymnasium's ``reset`` and ``step`` whose observations are the outputs.
             steps: the number of steps.
             r: a set-point that is held, or rows of them, by default the last one.
-            options: ``known``: a row of known signals that is held, or rows. ``load``: a constant
-                added to the inputs. ``noise``: standard deviations of that of the outputs, as a
-                number, a vector or by name.
-                ``x``: the state that a model starts from. ``seed``: that of the noise and of an
-                environment.
+            options: ``known``: a row of known signals that is held, or rows; by default the
+                forecast in an environment's ``info["known"]``, in the forms of `step`. ``load``: a
+                constant added to the inputs. ``noise``: standard deviations of that of the outputs,
+                as a number, a vector or by name. ``x``: the state that a model starts from.
+                ``seed``: that of the noise and of an environment.
 
         Raises:
             QPError: an argument is invalid.
@@ -346,7 +346,8 @@ class Controller:
         if not names and known is None:
             return np.zeros((rows, 0))
         if known is None:
-            remedy = "Pass a forecast of N + 1 rows, or one row that is held."
+            remedy = "Pass a forecast of N + 1 rows, or one row that is held; an environment has "
+            remedy += "it in info['known']."
             raise QPError.expected("known", "None", f"the signals {', '.join(names)}", remedy)
         return read_table("known", known, names, rows)
 

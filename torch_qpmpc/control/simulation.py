@@ -106,10 +106,9 @@ def simulate(
     check_seed(seed)
     design, twin = controller.mpc.design, copy.copy(controller)
     rows = design.horizon + 1
-    d, set_points = (
-        read(signal, steps + rows)
-        for read, signal in ((controller.read_known, known), (controller.read_set_points, r))
-    )
+    announced = known is None and hasattr(plant, "reset")  # by the environment, step by step
+    d = np.empty((0, 0)) if announced else controller.read_known(known, steps + rows)
+    set_points = controller.read_set_points(r, steps + rows)
     load = read_vector("load", load, design.plant.inputs, 0.0)
     noise = read_vector("noise", noise, design.plant.outputs, 0.0)
     if not ((noise >= 0) & np.isfinite(noise)).all():
@@ -118,19 +117,20 @@ def simulate(
     if not hasattr(plant, "reset"):
         model = design.plant if plant is None else read_model(plant)
         plant = _Model(model, design, d, twin.u + load, x)
-    rng, (observed, _) = np.random.default_rng(seed), plant.reset(seed=seed)
-    ys, us, held = [], [], []
+    rng, (observed, info) = np.random.default_rng(seed), plant.reset(seed=seed)
+    ys, us, ds, held = [], [], [], []
     for k in range(steps):
         ys.append(observed + noise * rng.normal(size=len(design.Q)))
-        u = twin.step(ys[-1], set_points[k : k + rows], d[k : k + rows])
+        ahead = twin.read_known(info.get("known"), rows) if announced else d[k : k + rows]
+        u = twin.step(ys[-1], set_points[k : k + rows], ahead)
         us.append(u)
+        ds.append(ahead[0])
         assert twin.target is not None
         held.append(twin.target.u.numpy().reshape(-1, len(u))[0])
-        observed = plant.step(u + load)[0]
+        observed, *_, info = plant.step(u + load)
     ys.append(observed + noise * rng.normal(size=len(design.Q)))
-    return Run(
-        design, np.array(ys), set_points[: steps + 1], np.array(us), d[:steps], np.array(held)
-    )
+    y, u, d, u_s = map(np.array, (ys, us, ds, held))
+    return Run(design, y, set_points[: steps + 1], u, d, u_s)
 
 
 class _Model:
@@ -159,7 +159,7 @@ class _Model:
         self._x, self._k = self._start, 0
         return self._model.C @ self._x, {}
 
-    def step(self, u: Array) -> tuple[Array]:
+    def step(self, u: Array) -> tuple[Array, dict]:
         self._x = self._model.A @ self._x + self._driven(u, self._k)
         self._k += 1
-        return (self._model.C @ self._x,)
+        return self._model.C @ self._x, {}
