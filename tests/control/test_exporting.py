@@ -190,8 +190,8 @@ def test_the_self_test_finds_a_wrong_table(tmp_path, name, exported):
 def test_a_self_test_replays_the_steps_whose_inputs_rounding_hardly_changes(tmp_path):
     """The window's gains are above a hundred, so that replayed outputs enlarge rounding."""
     files = designed(drawn(54), 54, window=True).export_c(tmp_path).files
-    replayed = int(re.search(r"#define EXAMPLES (\d+)", (tmp_path / "policy.c").read_text())[1])
-    assert 2 < replayed < exporting.REPLAYED
+    (replayed,) = re.findall(r"#define EXAMPLES (\d+)", (tmp_path / "policy.c").read_text())
+    assert 2 < int(replayed) < exporting.REPLAYED
     assert load(files, designed(drawn(54), 54, window=True)).selftest() == 0
 
 

@@ -109,9 +109,7 @@ def test_an_environment_forecasts_the_known_signals():
     assert run.cost.sum() < 0.9 * held.cost.sum()
     same = controller.simulate(None, 100, r=[0.0], known={"rain": Rain().rain})
     assert np.allclose(run.u, same.u, atol=1e-6)
-    with pytest.raises(
-        QPError, match=r"known: got None, .* has it in info\['known'\]"
-    ):
+    with pytest.raises(QPError, match=r"known: got None, .* has it in info\['known'\]"):
         controller.simulate(Rain(0), 5, r=[0.0])
 
 
