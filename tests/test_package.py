@@ -60,12 +60,22 @@ def test_the_sdist_trains_and_tests(built):
     assert built[0].stat().st_size < 1e6
 
 
-def test_the_wheel_is_the_package_alone(built):
+def test_the_module_is_train_py(tmp_path):
+    """In a clone; the wheel's is the same file, with its own copy of configs/."""
+    command = [sys.executable, "-m", "torch_qpmpc.train", "task.gama=1"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.endswith("Did you mean task.gamma?\n")
+    assert not [*tmp_path.iterdir()]
+
+
+def test_the_wheel_is_the_package_with_the_command(built):
     with zipfile.ZipFile(built[1]) as archive:
         files = set(archive.namelist())
         (metadata,) = (name for name in files if name.endswith("/METADATA"))
         text = archive.read(metadata).decode()
-    assert {name for name in files if ".dist-info/" not in name} == sources("torch_qpmpc")
+    command = {f"torch_qpmpc/command/{name}" for name in {"train.py"} | sources("configs")}
+    assert {name for name in files if ".dist-info/" not in name} == sources("torch_qpmpc") | command
     assert built[1].stat().st_size < 6e5
     assert re.findall(r"^Version: (.*)$", text, re.M) == [torch_qpmpc.__version__]
     assert "torch_qpmpc/py.typed" in files
