@@ -48,6 +48,14 @@ def test_a_misspelt_keyword_is_named(call):
 
 
 @pytest.mark.parametrize(
+    "make", [qm.QPMPC.from_model, lambda A, B, N, **x: qm.QPMPC.from_data({}, N, **x)]
+)
+def test_the_nearest_keyword_is_suggested(make):
+    with pytest.raises(TypeError, match=r"'stage_weigth'; did you mean 'stage_weight'\?"):
+        make([[1.0]], [[1.0]], 3, stage_weigth=[1.0, 0.1])
+
+
+@pytest.mark.parametrize(
     ("override", "message"),
     [
         ("optimizer=adm", "Could not find 'optimizer/adm'"),

@@ -81,7 +81,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "QPQLearningLoss: mpc": (
         lambda: qm.QPQLearningLoss(mpc),
-        "value_network: got ParametrizedQPMPC, expected a QPActorValueOperator. Wrap",
+        "value_network: got QPMPC, expected a QPActorValueOperator. Wrap",
     ),
     "QPQLearningLoss: value op": (
         lambda: qm.QPQLearningLoss(op.get_value_operator()),
@@ -287,7 +287,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "DeviationPenalty: C0 mpc": (
         lambda: qm.DeviationPenalty(mpc, 2, 1),
-        "C_0: got ParametrizedQPMPC, expected a floating-point torch.Tensor. Convert",
+        "C_0: got QPMPC, expected a floating-point torch.Tensor. Convert",
     ),
     "DeviationPenalty: n_x 0": (
         lambda: qm.DeviationPenalty(mpc.C_0, 0, 1),
@@ -319,7 +319,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "DeviationPenalty: C mpc": (
         lambda: qm.DeviationPenalty(mpc.C_0, 2, 1)(mpc),
-        "C: got ParametrizedQPMPC, expected a floating-point torch.Tensor. Convert i",
+        "C: got QPMPC, expected a floating-point torch.Tensor. Convert i",
     ),
     "DeviationPenalty: swapped": (
         lambda: qm.DeviationPenalty(mpc.C_0, 1, 2),
@@ -377,7 +377,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "SystemIdentificationPenalty: mpc": (
         lambda: qm.SystemIdentificationPenalty()(mpc, torch.zeros(1, 11)),
-        "C: got ParametrizedQPMPC, expected a floating-point torch.Tensor. Convert i",
+        "C: got QPMPC, expected a floating-point torch.Tensor. Convert i",
     ),
     "SystemIdentificationPenalty: curv shape": (
         lambda: qm.SystemIdentificationPenalty().curvature(torch.zeros(11)),

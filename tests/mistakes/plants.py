@@ -30,7 +30,7 @@ from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
 MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "closed_loop: plant": (
         lambda: closed_loop(mpc.policy, mpc),
-        "physics: got ParametrizedQPMPC, expected a LinearSystem. Use gymnasium_loop",
+        "physics: got QPMPC, expected a LinearSystem. Use gymnasium_loop",
     ),
     "closed_loop: policy mpc": (
         lambda: closed_loop(mpc, pm),
@@ -222,7 +222,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "PointMassEnv: physics other": (
         lambda: LinearSystemEnv(mpc, 2, 5),
-        "physics: got ParametrizedQPMPC, expected a LinearSystem.",
+        "physics: got QPMPC, expected a LinearSystem.",
     ),
     "PointMass: noise list": (
         lambda: PointMass(["gaussian"]),

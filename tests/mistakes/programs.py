@@ -73,7 +73,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "solve_qp: mpc": (
         lambda: qm.solve_qp(mpc),
-        "qp: got ParametrizedQPMPC, expected a QuadraticProgram. Pass mpc.quadratic_",
+        "qp: got QPMPC, expected a QuadraticProgram. Pass mpc.quadratic_",
     ),
     "solve_qp: dict": (
         lambda: qm.solve_qp(GOOD),
@@ -388,6 +388,10 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "QPMPC.from_model: no cost": (
         lambda: qm.QPMPC.from_model(A2, B1, 3),
         "stage_weight: got none, expected the weight of [x; u] in the stage cost 1/2 [x; u]' W",
+    ),
+    "QPMPC.from_model: a matrix": (
+        lambda: qm.QPMPC.from_model(A2, B1, 4, stage_weight=torch.eye(3)),
+        "stage_weight: got shape (3, 3), expected shape (3,) or (4, 3). A matrix needs hessian='b",
     ),
     "QPMPC.linear_mpc: no cost": (
         lambda: qm.QPMPC.linear_mpc(A2, B1, 3),

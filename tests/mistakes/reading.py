@@ -35,7 +35,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "prediction_form: mpc": (
         lambda: prediction_form(mpc, 2, 1),
-        "C: got ParametrizedQPMPC, expected a floating-point torch.Tensor. Convert i",
+        "C: got QPMPC, expected a floating-point torch.Tensor. Convert i",
     ),
     "prediction_form: 1d": (
         lambda: prediction_form(torch.zeros(11), 2, 1),
@@ -307,7 +307,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "lqr_gain: mpc": (
         lambda: lqr_gain(mpc, 1, 1),
-        "A: got ParametrizedQPMPC, expected a floating-point torch.Tensor. Convert i",
+        "A: got QPMPC, expected a floating-point torch.Tensor. Convert i",
     ),
     "stage_weight: operator": (
         lambda: stage_weight(op),
@@ -457,7 +457,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "nearest_psd: mpc": (
         lambda: nearest_psd(mpc),
-        "H: got ParametrizedQPMPC, expected a floating-point torch.Tensor. Convert i",
+        "H: got QPMPC, expected a floating-point torch.Tensor. Convert i",
     ),
     "check_step: wrong": (
         lambda: check_step(None),

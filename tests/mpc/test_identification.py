@@ -153,6 +153,11 @@ def feedback(log: TensorDict) -> TensorDict:
     return log
 
 
+def discrete_actions(log: TensorDict) -> TensorDict:
+    log["action"] = torch.nn.functional.one_hot((log["action"] > 0).long().squeeze(-1), 2).double()
+    return log
+
+
 def two_equal_actions(log: TensorDict) -> TensorDict:
     log["action"] = log.get("action").repeat(1, 1, 2)
     return log
@@ -181,6 +186,10 @@ def two_equal_actions(log: TensorDict) -> TensorDict:
         (
             lambda: qm.identify(two_equal_actions(arx_log()), N),
             "action: got u1 a linear function of the outputs and other actions, as in feed",
+        ),
+        (
+            lambda: qm.identify(discrete_actions(arx_log()), N),
+            "action: got one-hot vectors of discrete ones, expected continuous actions",
         ),
         (lambda: qm.identify(arx_log(), 0), "horizon: got 0, expected a whole number >= 1"),
         (lambda: qm.identify(arx_log(), N, past=0), "past: got 0, expected a whole number >= 1"),

@@ -11,6 +11,7 @@ from torch.testing import assert_close
 
 from tests.problems import normal
 from torch_qpmpc import QPMPC, QPError, SolverError, files
+from torch_qpmpc.qp.solvers import BACKENDS
 
 FOLDER = Path(__file__).parent
 
@@ -141,6 +142,14 @@ def test_a_file_without_a_part_is_named(tmp_path):
         QPMPC.load(tmp_path / "file")
 
 
+def test_a_file_with_a_backend_that_is_not_registered_says_so(tmp_path, monkeypatch):
+    monkeypatch.setitem(BACKENDS, "mine", BACKENDS["daqp"])
+    QPMPC(1, 1, 2, solver="mine").save(tmp_path / "file")
+    monkeypatch.delitem(BACKENDS, "mine")
+    with pytest.raises(QPError, match=r"solver: got 'mine'.* Register the backend of that name"):
+        QPMPC.load(tmp_path / "file")
+
+
 # Predict
 
 
@@ -164,6 +173,20 @@ def test_lists_and_integers_are_taken():
 def test_another_shape_is_an_error(observation):
     with pytest.raises(QPError, match=r"^observation: got shape \(.*\), expected shape \(\*batch"):
         QPMPC(2, 1, 3).predict(observation)
+
+
+@pytest.mark.parametrize("observation", [(np.ones(2), {}), {"observation": np.ones(2)}])
+def test_more_than_an_observation_is_an_error(observation):
+    message = (
+        rf"^observation: got {type(observation).__name__}, .* \(\.\., 2\)\. Pass the observation"
+    )
+    with pytest.raises(QPError, match=message):
+        QPMPC(2, 1, 3).predict(observation)
+
+
+def test_nan_is_an_error():
+    with pytest.raises(QPError, match=r"^observation: got NaN or inf, expected finite numbers"):
+        QPMPC(2, 1, 3).predict([0.0, np.nan])
 
 
 def test_an_unsolved_qp_raises_even_if_it_is_masked():

@@ -218,11 +218,14 @@ class QPQLearningLoss(LossModule):
     ) -> Any:
         """Choose how V(s+) enters the target: TD0 (default), TD1 or TDLambda.
 
+        ``gamma`` is by default the discount of the QP.
+
         Raises:
             QPError: if ``gamma`` or ``lmbda`` is not in [0, 1].
         """
         for name in {"gamma", "lmbda"} & hyperparams.keys():
             _check_factor(name, hyperparams[name])
+        hyperparams.setdefault("gamma", self.operator.module.gamma)
         value_type, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if options is None:
             return self

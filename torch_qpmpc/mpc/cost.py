@@ -131,7 +131,9 @@ def _blocks(stage: Tensor, terminal: Tensor, hessian: str, layout: Layout) -> di
     per_stage = (horizon, *event)
     if tuple(stage.shape) not in (event, per_stage):
         got = f"shape {tuple(stage.shape)}"
-        raise QPError.expected("stage_weight", got, f"shape {event} or {per_stage}")
+        dense = diagonal and stage.shape[-2:] in ((n, n), (n_d + n,) * 2)
+        remedy = "A matrix needs hessian='block'." if dense else ""
+        raise QPError.expected("stage_weight", got, f"shape {event} or {per_stage}", remedy)
     if tuple(terminal.shape) != terminal_event:
         got = f"shape {tuple(terminal.shape)}"
         raise QPError.expected("terminal_weight", got, f"shape {terminal_event}")

@@ -221,6 +221,9 @@ def check_excitation(log: Log, layout: Layout) -> None:
             f"Log more, in trajectories of more than {past} steps, or lower past."
         )
         raise QPError.expected("trajectories", got, expected, remedy)
+    u = torch.cat([log.u for log in trajectories])
+    if n_u > 1 and ((u == 0) | (u == 1)).all() and (u.sum(-1) == 1).all():
+        raise QPError.expected("action", "one-hot vectors of discrete ones", "continuous actions")
     X, _ = transitions(trajectories, layout)
     middle = X.mean(0)
     X = X - middle

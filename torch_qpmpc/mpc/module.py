@@ -29,7 +29,7 @@ from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST, check_step
 from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
-from torch_qpmpc.mpc.scheme import GAMMA, Scheme
+from torch_qpmpc.mpc.scheme import GAMMA, Scheme, check_names
 from torch_qpmpc.mpc.state import KIND, check_identity, check_own, digest, encoded, reduce, stored
 from torch_qpmpc.mpc.validation import (
     CONSTRAINTS,
@@ -226,6 +226,7 @@ class QPMPC(nn.Module):
         for name, matrix in (("A", A), ("B", B)):
             as_tensor(name, matrix)  # None would be drawn at random
         layout = Model(A, B, options.get("E")).layout(horizon)
+        check_names(options)
         check_chosen(options.get("stage_weight"), layout)
         arguments = {"past": layout.past, "n_d": layout.n_d, "A": A, "B": B} | options
         return cls(layout.n_x, layout.n_u, layout.horizon, **arguments)
@@ -248,7 +249,8 @@ class QPMPC(nn.Module):
 
         C_0 is the banded matrix of an ARX model; `identify` returns it with its prediction errors.
         Without ``stage_weight`` the cost is fitted to the rewards of the log
-        (`torch_qpmpc.mpc.stage_cost`), with a warning if it explains them poorly.
+        (`torch_qpmpc.mpc.stage_cost`), with a warning if it explains them poorly. It is dense, as
+        set-points among the observations need it, unless ``hessian="diagonal"`` is passed.
 
         Args:
             trajectories, horizon, past, n_d, n_x, structure, causal, ridge: see `identify`.
@@ -267,6 +269,7 @@ class QPMPC(nn.Module):
             >>> tuple(mpc.model()[0].shape)
             (4, 4)
         """
+        check_names(options)
         identified = identify(
             trajectories,
             horizon,
@@ -280,7 +283,7 @@ class QPMPC(nn.Module):
         arguments = {**identified.arguments, **options}
         starts = [identified.arguments.get("start", {}), options.get("start") or {}]
         if arguments.get("stage_weight") is None:
-            hessian, layout = options.get("hessian", "diagonal"), identified.options.layout
+            hessian, layout = arguments.setdefault("hessian", "block"), identified.options.layout
             fitted = fit_rewards(trajectories, layout, hessian == "diagonal").now
             cost = scheme_cost(fitted, layout, options.get("gamma", GAMMA), hessian)
             arguments["stage_weight"] = cost.stage_weight
@@ -348,7 +351,7 @@ class QPMPC(nn.Module):
 
     @torch.no_grad()
     def predict(self, observation: Any) -> np.ndarray:
-        """Return pi(observation) as an array, without gradients: the action to apply.
+        """Return pi(observation) as an array, without gradients: the action to apply, and no more.
 
         Args:
             observation: s or p, an array ``(n_p,)`` or ``(*batch, n_p)``.
@@ -357,7 +360,7 @@ class QPMPC(nn.Module):
             The actions, ``(n_u,)`` or ``(*batch, n_u)``, in the observation's float dtype.
 
         Raises:
-            QPError: the observation has another shape.
+            QPError: the observation has another shape, or is not finite.
             SolverError: a QP has no certified solution, whatever ``on_failure`` is.
 
         Example:
@@ -366,7 +369,14 @@ class QPMPC(nn.Module):
             >>> mpc.predict(np.ones((4, 1))).shape
             (4, 1)
         """
-        s = torch.as_tensor(np.asarray(observation))
+        try:
+            s = torch.as_tensor(np.asarray(observation))
+        except (TypeError, ValueError) as error:
+            got, want = type(observation).__name__, f"an array of shape (.., {self.n_p})"
+            remedy = "Pass the observation alone; env.reset and env.step return more."
+            raise QPError.expected("observation", got, want, remedy) from error
+        if not s.isfinite().all():
+            raise QPError.expected("observation", "NaN or inf", "finite numbers")
         s = (s if s.is_floating_point() else s.double()).to(self.C_0.device)
         s = check_tensor("observation", s, self.n_p)
         return self._action(self._solve(s, None, on_failure="raise"), s.dtype).cpu().numpy()
@@ -574,7 +584,10 @@ class QPMPC(nn.Module):
             mpc = cls(**content["arguments"])
             mpc.load_state_dict(content["mpc"])
         except Exception as error:  # damaged files raise errors of any type
-            raise damaged(Path(path), error, "a file that QPMPC.save wrote") from error
+            remedy = {}
+            if str(error).startswith("solver: "):  # the file is right, this process is not
+                remedy = {"remedy": "Register the backend of that name first."}
+            raise damaged(Path(path), error, "a file that QPMPC.save wrote", **remedy) from error
         return mpc
 
     def export_c(

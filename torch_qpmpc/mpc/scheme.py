@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -21,6 +22,8 @@ from torch_qpmpc.qp.forking import serially_if_forked
 
 #: The default discount, that of the paper.
 GAMMA = 0.9
+#: Keyword arguments of `QPMPC` that no scheme has.
+KEYWORDS = ("learn", "structure", "step", "solver", "on_failure")
 #: The parts of theta that may start at any finite values.
 STARTED = ("q", "c", "C", "b")
 
@@ -103,7 +106,7 @@ class Scheme:
         arguments = {**options, **_started(start)}
         model, cost, bounds = (_taken(kind, arguments) for kind in (Model, Cost, Bounds))
         if arguments:
-            raise TypeError(f"QPMPC got an unexpected keyword argument {min(arguments)!r}")
+            check_names(arguments, ())
         return cls(layout, Model(**model), Cost(**cost), Bounds(**bounds), gamma, seed)
 
     @property
@@ -175,6 +178,16 @@ def _initial_theta(scheme: Scheme) -> tuple[Tensor, dict[str, Tensor]]:
             raise QPError.expected(name, f"shape {got}", f"shape {want}")
         theta[name] = value
     return C_0, theta
+
+
+def check_names(options: Iterable[str], also: Iterable[str] = KEYWORDS) -> None:
+    """Raise `TypeError` unless these are names of arguments of `Scheme.of`, or ``also`` known."""
+    own = {x.name for part in (Model, Cost, Bounds) for x in fields(part)}
+    known = own | {"blocks", "gamma", "start", "seed", *SIZES, *also}
+    for name in sorted(set(options) - known):
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise TypeError(f"QPMPC got an unexpected keyword argument {name!r}{hint}")
 
 
 def _taken(kind: type, arguments: dict[str, Any]) -> dict[str, Any]:
