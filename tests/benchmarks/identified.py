@@ -14,6 +14,7 @@ from statistics import median
 from typing import Any, NamedTuple
 
 import torch
+from omegaconf import DictConfig
 
 from tests.benchmarks.table import DOCS
 from tests.runs import make_config
@@ -48,6 +49,11 @@ class Case(NamedTuple):
     title: str
     overrides: Sequence[str]
     picture: str | None = None
+
+    def configured(self, *more: str) -> DictConfig:
+        """Compose the configuration of its runs, with ``more`` overrides."""
+        shared = ("start=data", UNDISCOUNTED, f"eval_seed={EVAL_SEED}")
+        return make_config(*self.overrides, *shared, *more)
 
 
 class Scale(NamedTuple):
@@ -100,8 +106,7 @@ def evaluated(case: Case, seeds: Sequence[int], folder: Path) -> dict[str, list[
 
     Draws the case's picture into ``folder``.
     """
-    common = (*case.overrides, "start=data", UNDISCOUNTED, f"eval_seed={EVAL_SEED}")
-    cfg = make_config(*common)
+    cfg = case.configured()
     physics: Any = make_physics(cfg)
     rivals, scale = TASKS[cfg.task.name].rivals, SCALES[cfg.task.name]
     true_mpc = make_true_mpc(cfg, physics)
@@ -111,7 +116,7 @@ def evaluated(case: Case, seeds: Sequence[int], folder: Path) -> dict[str, list[
     found |= {name: [J] for name, J in rival_costs(cfg, physics).items()}
     for seed in seeds:
         for name, constraint in STRUCTURES.items():
-            cfg = make_config(*common, constraint, f"seed={seed}")
+            cfg = case.configured(constraint, f"seed={seed}")
             log = collect_log(cfg, physics)
             mpc = make_mpc(cfg, physics, identified_start(cfg, physics, log))
             loop = evaluate(cfg, warm_policy(mpc), physics)
@@ -156,7 +161,7 @@ def main(arguments: list[str] | None = None) -> None:
         blocks = []
         for case in CASES[name]:
             found = evaluated(case, options.seeds, options.folder)
-            task = make_config(*case.overrides).task.name
+            task = case.configured().task.name
             blocks.append(case_table(case.title, found, SCALES[task].reference))
             print(blocks[-1], flush=True)
         text = page.read_text(encoding="utf-8")

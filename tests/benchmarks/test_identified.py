@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.benchmarks.identified import Case, case_table, evaluated, logs
+from tests.benchmarks.identified import CASES, SCALES, Case, case_table, evaluated, logs
 
 
 def test_each_log_has_a_cost_of_each_structure_and_a_picture(tmp_path):
@@ -13,6 +13,12 @@ def test_each_log_has_a_cost_of_each_structure_and_a_picture(tmp_path):
     }
     assert len(found["true model"]) == len(found["omniscient"]) == 1
     assert (tmp_path / "tanks.png").exists()
+
+
+def test_each_case_has_the_scale_of_its_task():
+    for page, cases in CASES.items():
+        assert page in ("house", "tanks")
+        assert all(case.configured().task.name in SCALES for case in cases)
 
 
 def test_the_table_has_medians_extremes_and_ratios():
