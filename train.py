@@ -112,8 +112,7 @@ def _train(
             report(run, gate.mpc, evaluation, 0)
             for batch in itertools.islice(stream, -(-cfg.warmup_steps // cfg.steps_per_update)):
                 learner.observe(batch)
-                if cfg.replay:
-                    replay.extend(batch)
+                replay.extend(batch)
                 interrupt.exit_if_signalled(f"Stopped before the first update: {command}")
         else:
             tally = restore(state, mpc, learner, gate, collector, replay)
@@ -132,8 +131,7 @@ def _train(
             with tally.timed() as watch:
                 batch = next(stream)
                 learner.observe(batch)
-                if cfg.replay:
-                    replay.extend(batch)
+                replay.extend(batch)
                 watch.collected()
 
                 sample = replay.sample() if cfg.replay else batch.reshape(-1)
@@ -156,7 +154,7 @@ def _train(
             evaluated = last or update % cfg.eval_interval == 0
             if evaluated:
                 evaluation.evaluate(gate.policy)
-                if last and len(replay):
+                if last:
                     evaluation.identify(partial(transitions, identified, replay))
                 gap = report(run, gate.mpc, evaluation, update)
                 progress.set_postfix(J=cost_text(gap["J_best"]), closed_gap=gap["closed_gap"])
