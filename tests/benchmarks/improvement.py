@@ -1,4 +1,4 @@
-"""Q-learning beside what needs no learning, on all tasks: ``python -m tests.benchmarks.improvement``.
+"""Q-learning beside rivals that do not learn: ``python -m tests.benchmarks.improvement``.
 
 Each case is one of train.py's configurations, which starts from a model identified from a log. What
 is learned is the last theta, without a gate or a search. The evaluation has starts, days and noise
@@ -171,7 +171,7 @@ def further(rows: Any) -> str:
 
 
 def order(pair: tuple[int, str]) -> tuple[bool, bool, int]:
-    """Sort Q-learning on the first seeds before the other ways, and these before its other seeds."""
+    """Sort Q-learning on the few seeds before the other ways, and its other seeds after them."""
     seed, way = pair
     return seed not in FEW, way != "Q-learning", seed
 

@@ -85,9 +85,9 @@ def run(
 
 CONTENDERS: dict[str, Callable[[int, int], Stream]] = {
     "mpcrl": mpcrl_lti.run,
-    "ours": run,
-    "ours, after each step": lambda seed, steps: run(seed, steps, SINGLE),
-    "ours, with q": lambda seed, steps: run(seed, steps, ("task.learn_cost=[q,c]",)),
+    "adaptive MPC": run,
+    "adaptive MPC, after each step": lambda seed, steps: run(seed, steps, SINGLE),
+    "adaptive MPC, with q": lambda seed, steps: run(seed, steps, ("task.learn_cost=[q,c]",)),
     "TD errors alone": lambda seed, steps: run(seed, steps, TD),
     "TD errors alone, after each step": lambda seed, steps: run(seed, steps, (*TD, *SINGLE)),
     "without learning": lambda seed, steps: run(seed, steps, learn=False),

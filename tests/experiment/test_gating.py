@@ -78,7 +78,7 @@ def test_a_candidate_that_got_worse_is_not_kept():
     assert_close(gate.kept.module.C.detach(), before)
 
 
-@pytest.mark.parametrize(("gate", "restarts"), [("true", False), ("act", True)])
+@pytest.mark.parametrize(("gate", "restarts"), [("true", False), ("act", True), ("plant", True)])
 def test_the_learner_acts_and_goes_on_unless_only_what_is_kept_acts(gate, restarts):
     judged, actor = make_gate(f"gate={gate}")
     start = judged.kept.module.C.detach().clone()
@@ -89,6 +89,14 @@ def test_the_learner_acts_and_goes_on_unless_only_what_is_kept_acts(gate, restar
         assert_close(actor.module.C.detach(), 3 * start)
         assert judged.judge(4)["gate/accepted"] == 0.0
     assert_close(actor.module.C.detach(), (1 if restarts else 3) * start)
+
+
+@pytest.mark.parametrize(("gate", "name"), [("act", "simulated"), ("plant", "alternated")])
+def test_on_the_plant_no_two_episodes_are_the_same_and_all_count(gate, name):
+    judged, _ = make_gate(f"gate={gate}")
+    verdict = judged.judge(4)  # the candidate is what is kept
+    assert (verdict["gate/mean"] != 0) == (gate == "plant")
+    assert judged.summary()[name] == 10 * 2 * verdict["gate/pairs"]
 
 
 def test_a_gate_that_only_keeps_does_not_change_what_is_learned(tmp_path):
@@ -115,7 +123,7 @@ def test_without_an_interval_of_its_own_each_evaluation_is_judged():
 def test_without_a_gate_nothing_is_searched():
     gate, _ = make_gate("gate=false", "search.w=0.1", "search.loops=2")
     assert gate.judge(4) == {}
-    assert gate.simulated == 0
+    assert gate.compared == 0
 
 
 def test_a_search_leaves_out_what_the_QP_lacks():

@@ -37,7 +37,7 @@ NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
         ("optimizer=sgd", "constraint=combined", "solver=torch", "step=projection"),
         ("optimizer=gauss_newton", "constraint=combined", "solver=proxqp"),
         ("optimizer=adam", "constraint=mpc", "release=9"),
-        ("gate=act", "optimizer=recursive", *STREAM, "constraint=mpc"),
+        ("gate=plant", "optimizer=recursive", *STREAM, "constraint=mpc"),
         ("optimizer=recursive", *STREAM, "replay=true", "replay_capacity=16", "batch_size=4"),
         ("noise=brownian", "steps_per_update=3", "warm_start=false"),
         (*GATED, "constraint=mpc", "release=5", "search.w=0.5"),

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
@@ -22,7 +23,9 @@ from torch_qpmpc.mpc.module import QPMPC
 
 #: The most pairs of a comparison. A run's later ones need more, as they share one alpha.
 PAIRS = 160
-#: The rejections in a row after which, with gate=act, the learner restarts from what is kept.
+#: The values of gate with which only what is kept acts.
+ACTING = ("act", "plant")
+#: The rejections in a row after which the learner then restarts from what is kept.
 PATIENCE = 3
 
 
@@ -31,7 +34,8 @@ class RunGate:
 
     With ``gate=true`` the learner's policy acts and learns as without a gate, and the gate decides
     which one is kept. With ``gate=act`` the policy that is kept acts, too, and the learner restarts
-    from it after three rejections in a row.
+    from it after three rejections in a row. ``gate=plant`` does the same with closed loops that a
+    plant can run, as no two of them have the same starts and disturbances.
 
     Args:
         cfg: the run's configuration; ``gate`` switches the comparisons on.
@@ -41,7 +45,7 @@ class RunGate:
 
     Attributes:
         kept: the policy that is evaluated and saved; without a gate, the learner's.
-        simulated: the number of transitions in closed loops of comparisons and searches.
+        compared: the number of transitions in closed loops of comparisons and searches.
     """
 
     def __init__(
@@ -49,15 +53,15 @@ class RunGate:
     ) -> None:
         self._cfg, self._learner, self._physics, self._quiet = cfg, learner, physics, quiet
         options = {"seed": cfg.seed, "pairs": PAIRS, "decisions": _decisions(cfg)}
-        options |= {"bound": cfg.gate_bound, "patience": PATIENCE if cfg.gate == "act" else None}
+        options |= {"bound": cfg.gate_bound, "patience": PATIENCE if cfg.gate in ACTING else None}
         self._gate = Gate(learner.actor, self._costs, **options) if cfg.gate else None
         self.kept: Any = learner.actor if self._gate is None else self._gate.actor
-        self.simulated = 0
+        self.compared = 0
 
     @property
     def acting(self) -> Any:
         """The policy that collects transitions."""
-        return self.kept if self._cfg.gate == "act" else self._learner.actor
+        return self.kept if self._cfg.gate in ACTING else self._learner.actor
 
     @property
     def policy(self) -> Callable[[Tensor], Tensor]:
@@ -110,9 +114,11 @@ class RunGate:
         return {f"search/{name}": x for name, x in metrics.items()} | self._judge("search")
 
     def _costs(self, actor: Any, seed: int) -> Tensor:
+        if self._cfg.gate == "plant":
+            seed = int(np.random.SeedSequence([seed, self.compared]).generate_state(1)[0])
         policy = in_closed_loop(actor, self._learner.n_preview)
         costs = evaluate(self._cfg, policy, self._physics, seed).costs
-        self.simulated += costs.numel()
+        self.compared += costs.numel()
         return costs.sum(0)
 
     def keep(self, mpc: QPMPC) -> None:
@@ -129,11 +135,15 @@ class RunGate:
             self.mpc.release()
 
     def summary(self) -> dict[str, int]:
-        """Return the numbers of candidates accepted and rejected, and of simulated transitions."""
+        """Return the numbers of candidates accepted and rejected, and of transitions for them.
+
+        These are ``simulated``, or ``alternated`` on the plant.
+        """
         if self._gate is None:
             return {}
         decisions = {"accepted": self._gate.accepted, "rejected": self._gate.rejected}
-        return decisions | {"simulated": self.simulated}
+        name = "alternated" if self._cfg.gate == "plant" else "simulated"
+        return decisions | {name: self.compared}
 
     def save(self, folder: Path) -> None:
         """Write the policy that is kept to best.pt; without a gate, the checkpoint has it."""
@@ -148,13 +158,13 @@ class RunGate:
         """Return the state of the gate; None without one."""
         if self._gate is None:
             return None
-        return self._gate.state_dict() | {"simulated": self.simulated}
+        return self._gate.state_dict() | {"compared": self.compared}
 
     def load_state_dict(self, state: dict[str, Any] | None) -> None:
         """Load a `state_dict`."""
         if self._gate is not None and state is not None:
             self._gate.load_state_dict(state)
-            self.simulated = state["simulated"]
+            self.compared = state["compared"]
 
 
 def _interval(cfg: DictConfig) -> int:
