@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from tests.benchmarks import improvement
-from tests.benchmarks.improvement import CASES, COSTS, WAYS, Case
+from tests.benchmarks.improvement import CASES, COSTS, Case
 from tests.benchmarks.learning import compared
 from tests.runs import SMALL
 from torch_qpmpc.experiment.config import check_config
@@ -15,18 +15,17 @@ from torch_qpmpc.experiment.config import check_config
 TANKS = "Four tanks"
 
 
-def row(way: str, seed: int, learned: float) -> dict[str, object]:
+def row(seed: int, learned: float) -> dict[str, object]:
     costs = dict(zip(COSTS, (20.0, 10.0 + seed, 12.5, learned, 6.0, 5.0), strict=True))
-    return {"case": TANKS, "way": way, "seed": seed, **costs, "transitions": 3000, "simulated": 0}
+    return {"case": TANKS, "seed": seed, **costs, "transitions": 3000}
 
 
-ROWS = pd.DataFrame([row("Q-learning", seed, 7.0 + 2 * seed) for seed in (1, 2, 3)])
+ROWS = pd.DataFrame([row(seed, 7.0 + 2 * seed) for seed in (1, 2, 3)])
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_every_case_is_a_valid_configuration(case):
-    for way in WAYS:
-        check_config(improvement.configuration(case, way, seed=1))
+    check_config(improvement.configuration(CASES[case], seed=1))
 
 
 def test_learning_is_compared_with_the_best_without_it():
@@ -45,20 +44,12 @@ def test_a_small_gap_has_no_share():
     assert compared(learned, fair, np.full(2, np.nan))[0] == ""
 
 
-def test_all_ways_have_the_same_seeds():
-    others = [row(way, seed, 5.0 + seed) for way in [*WAYS][1:] for seed in (1, 2)]
-    *_, line = improvement.further(pd.concat([ROWS, pd.DataFrame(others)])).splitlines()
-    # The third seed has one way alone.
-    assert line == f"| {TANKS} | 2 | 10.00 | 6.500 | 6.500 | 0 |"
-
-
 def test_a_finished_run_is_not_repeated_and_fills_the_page(tmp_path, monkeypatch):
-    short = (*SMALL, "start.transitions=200", "task=four_tanks")
+    short = (*SMALL, "start.transitions=200", "task=four_tanks", "rivals=[identification]")
     monkeypatch.setitem(CASES, TANKS, Case(short))
     page, results = tmp_path / "page.md", tmp_path / "rows.csv"
-    empty = "".join(f"<!-- {x} -->\n\n<!-- /{x} -->\n" for x in ("improvement", "further"))
-    page.write_text(empty)
-    arguments = ["--cases", TANKS, "--ways", "Q-learning", "--seeds", "7"]
+    page.write_text("<!-- improvement -->\n\n<!-- /improvement -->\n")
+    arguments = ["--cases", TANKS, "--seeds", "7"]
     arguments += ["--page", str(page), "--results", str(results)]
     improvement.main(arguments)
     first = results.read_text()
