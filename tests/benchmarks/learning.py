@@ -102,7 +102,7 @@ def compared(learned: np.ndarray, fair: np.ndarray, optimum: np.ndarray) -> list
     share = np.median((fair - learned) / gap) if np.median(gap / fair) > SMALL else None
     signed_rank: Any = wilcoxon(learned, fair, alternative="less")
     return [
-        "" if share is None else f"{share:.2f}",
+        "" if share is None else f"{round(share, 2) + 0:.2f}",
         f"{(learned < fair).sum()} of {len(fair)}",
         f"{signed_rank.pvalue:.3f}",
     ]
