@@ -83,6 +83,7 @@ class Answer:
         states: the worst states p_0, .., p_k, ``(k + 1, n_p)``.
         disturbances: the worst d of each step, ``(n_d,)``.
         seconds, nodes, binaries: the effort, and the size of the largest program.
+        digest: SHA-256 of the QP that it is about, as in its tables.
     """
 
     question: str
@@ -93,6 +94,7 @@ class Answer:
     seconds: float
     nodes: int
     binaries: int
+    digest: str
 
     @property
     def proved(self) -> bool:
@@ -208,7 +210,8 @@ def largest_difference(
         raise QPError.expected("second", f"{second.n_u} actions", f"{first.n_u}")
     began, program = time.perf_counter(), Program()
     p, vertices = _known(program, states), states.vertices()
-    u, other = (encode(program, make_tables(mpc), p, vertices) for mpc in (first, second))
+    tables = make_tables(first)
+    u, other = (encode(program, x, p, vertices) for x in (tables, make_tables(second)))
     difference = u + other.times(-np.eye(first.n_u))
     signs = np.concatenate((np.eye(first.n_u), -np.eye(first.n_u)))
 
@@ -218,7 +221,8 @@ def largest_difference(
 
     worst = _Worst(np.full((1, n), np.nan))
     worst.maximise(program, difference.times(signs), replay, seconds)
-    return worst.answer("largest difference of the policies", time.perf_counter() - began)
+    question = "largest difference of the policies"
+    return worst.answer(question, time.perf_counter() - began, tables.digest)
 
 
 def check_states(mpc: QPMPC, states: Polytope) -> int:
@@ -284,7 +288,7 @@ def _worst(
             return A @ run[-1] - b, run, noise
 
         worst.maximise(branch.program, branch.p.times(A).plus(-b), replay, seconds)
-    return worst.answer(question, time.perf_counter() - began)
+    return worst.answer(question, time.perf_counter() - began, tables.digest)
 
 
 class _Branch(NamedTuple):
@@ -346,9 +350,9 @@ class _Worst:
             if values.max() > self.value:
                 self.value, self.run, self.noise = float(values.max()), run, noise
 
-    def answer(self, question: str, seconds: float) -> Answer:
+    def answer(self, question: str, seconds: float, digest: str) -> Answer:
         effort = seconds, self.nodes, self.binaries
-        return Answer(question, self.value, self.bound, self.run, self.noise, *effort)
+        return Answer(question, self.value, self.bound, self.run, self.noise, *effort, digest)
 
 
 def compare_replay(value: float, computed: float) -> None:

@@ -241,7 +241,8 @@ def largest_increase(
     compare_replay(replayed, worst)
     noise = () if d is None else (d.vertices()[push],)
     effort = time.perf_counter() - began, 0, 0
-    return Answer("largest increase of V", replayed, worst, run, noise, *effort)
+    question = "largest increase of V"
+    return Answer(question, replayed, worst, run, noise, *effort, law.tables.digest)
 
 
 class _Transition(NamedTuple):
