@@ -28,7 +28,7 @@ from torch_qpmpc.proofs.questions import action
 
 Array = np.ndarray
 TITLES = (
-    *("policy", "n_p", "too cold, K (attack)", "too warm, K (attack)", "regions", "CPU, s"),
+    *("policy", "n_p", "too cold, K (attack), at", "too warm, K (attack)", "regions", "CPU, s"),
     "first step as MILP: nodes, CPU, s",
 )
 SPREAD, EVENING, DAYS = 0.6, 1.5, 1000
@@ -136,10 +136,11 @@ def measured(name: str) -> list[str]:
         [float((sign * (x - day.bands[1:])[:, i]).max()) for x in (ends, seen)]
         for i, sign in enumerate((-1, 1))
     )
+    coldest = 1 + (day.bands[1:, 0] - ends[:, 0]).argmax()
     return [
         name,
         str(day.mpc.n_p),
-        f"{cold[0]:.3f} ({cold[1]:.3f})",
+        f"{cold[0]:.3f} ({cold[1]:.3f}), {coldest / 4:g} h",
         f"{warm[0]:.3f} ({warm[1]:.3f})",
         str(regions),
         f"{seconds:.1f}",

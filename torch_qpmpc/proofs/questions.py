@@ -15,6 +15,7 @@ from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.proofs.encoding import encode
+from torch_qpmpc.proofs.plant import Plant, check_plants
 from torch_qpmpc.proofs.polytope import Polytope
 from torch_qpmpc.proofs.program import Affine, Program
 
@@ -25,51 +26,6 @@ TOLERANCE = 1e-5
 AGREEMENT = 1e-4
 #: Combinations of models over the steps.
 MOST_MODELS = 64
-
-
-@dataclass(frozen=True, eq=False)
-class Plant:
-    """``x+ = A x + B u + offset + E d`` with any d of a polytope.
-
-    Attributes:
-        A, B: ``(n, n)`` and ``(n, n_u)``; x is all that the policy knows, p.
-        offset: ``(n,)``.
-        E: ``(n, n_d)``.
-        disturbances: the set of d.
-    """
-
-    A: Array
-    B: Array
-    offset: Array
-    E: Array
-    disturbances: Polytope | None
-
-    @classmethod
-    def of(
-        cls,
-        A: Any,
-        B: Any,
-        *,
-        offset: Any = None,
-        E: Any = None,
-        disturbances: Polytope | None = None,
-    ) -> Plant:
-        """Make a plant; E is the identity, and there are no disturbances, by default.
-
-        Raises:
-            QPError: the shapes do not fit.
-        """
-        A, B = np.array(A, float), np.array(B, float)
-        n = len(A)
-        offset = np.zeros(n) if offset is None else np.array(offset, float)
-        n_d = 0 if disturbances is None else len(disturbances.lower)
-        E = (np.eye(n) if n_d == n else np.zeros((n, 0))) if E is None else np.array(E, float)
-        shapes = A.shape, B.shape[:1], B.ndim, offset.shape, E.shape
-        if shapes != ((n, n), (n,), 2, (n,), (n, n_d)):
-            got = f"shapes {A.shape}, {B.shape}, {offset.shape} and {E.shape}"
-            want = f"(n, n), (n, n_u), (n,) and (n, {n_d})"
-            raise QPError.expected("A, B, offset and E", got, want)
-        return cls(A, B, offset, E, disturbances)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,19 +189,6 @@ def check_states(mpc: QPMPC, states: Polytope) -> int:
         got, want = f"{len(states.lower)} dimensions", f"n_p = {mpc.n_p}"
         raise QPError.expected("states", got, want)
     return mpc.n_p
-
-
-def check_plants(plant: Plant | Sequence[Plant], n_p: int, n_u: int) -> list[Plant]:
-    """Return the plants; raise unless there is one, and each fits the policy."""
-    plants = list(plant) if isinstance(plant, Sequence) else [plant]
-    if not plants:
-        raise QPError.expected("plant", "an empty list", "at least one Plant")
-    for one in plants:
-        check_kind("plant", one, Plant, "Make one with Plant.of(A, B).")
-        if one.B.shape != (n_p, n_u):
-            want = f"({n_p}, {n_u}), for p and u"
-            raise QPError.expected("plant.B", f"shape {one.B.shape}", want)
-    return plants
 
 
 def _known(program: Program, states: Polytope) -> Affine:
