@@ -21,6 +21,7 @@ import numpy as np
 from tests.benchmarks.rows import main
 from tests.runs import make_config
 from torch_qpmpc import QPMPC
+from torch_qpmpc.envs import House
 from torch_qpmpc.envs.heated_house import DAY, GAIN, LOWER, OUTDOOR, UPPER, hours
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics, make_true_mpc
 from torch_qpmpc.proofs import Plant, Polytope, explicit_law, largest_violation
@@ -58,6 +59,7 @@ class Day(NamedTuple):
     def of(cls, horizon: int, margin: float, *, true: bool) -> Day:
         cfg = make_config("task=house", f"task.horizon={horizon}", f"task.margin={margin}")
         house = make_physics(cfg)
+        assert isinstance(house, House)
         mpc = make_true_mpc(cfg, house) if true else make_mpc(cfg, house)
         assert mpc is not None
         length = DAY + horizon + 1
@@ -71,7 +73,7 @@ class Day(NamedTuple):
             w[: DAY + 1, [LOWER, UPPER]], np.array(known),
         )  # fmt: skip
 
-    def following(self, k: int, T: Array, q: Array, gain: Array) -> Array:
+    def following(self, k: int, T: Array, q: Array, gain: Array | float) -> Array:
         """Return the next temperatures."""
         return self.a * T + self.b * q + self.rest[k] + self.e * gain
 

@@ -60,11 +60,12 @@ class Example(NamedTuple):
         eye = np.eye(len(A))
         F = np.concatenate((eye, -eye, K, -K))
         f = np.concatenate((self.x[1], -self.x[0], self.u[1], -self.u[0]))
-        body, before = facets(F, f), None
-        while before is None or len(body.b) != len(before.b) or (body.b != before.b).any():
-            before = body
-            body = facets(np.concatenate((body.A, body.A @ A)), np.tile(body.b, 2))
-        return body.A, body.b
+        while True:
+            body = facets(np.concatenate((F, F @ A)), np.tile(f, 2))
+            assert body is not None
+            if len(f) == len(body.b) and (f == body.b).all():
+                return F, f
+            F, f = body.A, body.b
 
 
 INTEGRATOR = Example(

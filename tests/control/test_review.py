@@ -212,7 +212,7 @@ def test_proofs_are_findings_of_the_review_and_its_page(tmp_path):
     with pytest.raises(QPError, match=r"^the proof of 'y1 < 0.9': got another QP's"):
         another.review(proofs={"y1 < 0.9": proved})
     with pytest.raises(QPError, match=r"^proofs: got str, expected an Answer.*Pass what a quest"):
-        another.review(proofs={"y1 < 0.9": "proved"})
+        another.review(proofs={"y1 < 0.9": "proved"})  # pyright: ignore[reportArgumentType]
 
 
 # The linear loop
