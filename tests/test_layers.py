@@ -18,7 +18,17 @@ LAYERS = {
     "learning": {"errors", "checks", "qp", "mpc"},
     "envs": {"errors", "checks"},
     "analysis": {"errors", "checks", "qp", "mpc"},
-    "control": {"errors", "checks", "files", "qp", "mpc", "export", "learning", "analysis"},
+    "control": {
+        "errors",
+        "checks",
+        "files",
+        "qp",
+        "mpc",
+        "export",
+        "proofs",
+        "learning",
+        "analysis",
+    },
     "experiment": {
         "errors",
         "checks",

@@ -10,16 +10,14 @@ enumerated: all active sets of at most N rows. Seconds are the process's.
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from tests.benchmarks.proofs import double_integrator, point_mass
+from tests.benchmarks.rows import PAGE, main
 from tests.enumeration import double_integrator as textbook
 from tests.enumeration import enumerated
 from tests.law_code import actions
@@ -29,9 +27,7 @@ from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.export.tables import make_tables
 from torch_qpmpc.proofs import Polytope, SearchTree, explicit_law
 from torch_qpmpc.proofs.plots import law_figure
-from torch_qpmpc.study.markdown import replaced, table
 
-PAGE = Path(__file__).parents[2] / "docs" / "guides" / "prove.md"
 SAMPLES = 1_000_000
 CHUNK = 50_000
 TITLES = (
@@ -152,24 +148,7 @@ def _figure() -> None:
     law_figure(law).savefig(PAGE.with_name("prove-regions.png"), dpi=80)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Print the table, or write it into the docs."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.explicit")
-    parser.add_argument("--problems", nargs="*", default=list(PROBLEMS))
-    parser.add_argument("--write", action="store_true", help="write the table into the docs")
-    options = parser.parse_args(arguments)
-    torch.set_num_threads(1)
-    explicit_law(textbook(1), Polytope.box([-1.0] * 2, [1.0] * 2))  # compiles the loops
-    rows: list[list[str]] = []
-    for name in options.problems:
-        rows.append(measured(name))
-        print(" | ".join(rows[-1]), flush=True)
-    if options.write:
-        _figure()
-        text = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replaced(text, table(TITLES, rows), "explicit laws"), encoding="utf-8")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    explicit_law(textbook(1), Polytope.box([-1.0] * 2, [1.0] * 2))  # compiles the loops
+    if main("explicit", "explicit laws", TITLES, PROBLEMS, measured):
+        _figure()

@@ -13,18 +13,16 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from tests.benchmarks.rows import write
 from torch_qpmpc import QPMPC, SolverError
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.proofs import Plant, Polytope, largest_violation
-from torch_qpmpc.study.markdown import replaced, table
 
-PAGE = Path(__file__).parents[2] / "docs" / "guides" / "prove.md"
 SAMPLES = 1_000_000
 TITLES = ("problem", "steps", "worst case", "bound", "attack", "binaries / nodes", "CPU, s")
 #: Limit of each mixed-integer program.
@@ -162,8 +160,7 @@ def main(arguments: list[str] | None = None) -> int:
                     rows.append(measured(name, horizon, structure, steps))
                     print(" | ".join(rows[-1]), flush=True)
         if options.write:
-            text, mark = PAGE.read_text(encoding="utf-8"), f"proofs: {name}"
-            PAGE.write_text(replaced(text, table(TITLES, rows), mark), encoding="utf-8")
+            write(f"proofs: {name}", TITLES, rows)
     return 0
 
 

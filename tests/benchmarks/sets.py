@@ -12,17 +12,15 @@ Seconds are the process's, without the attack. Dashes are a policy without a set
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from tests.benchmarks.proofs import double_integrator, point_mass
+from tests.benchmarks.rows import main
 from torch_qpmpc import QPMPC, CompiledPolicy, QPError
 from torch_qpmpc.envs import GrosZanonLTI
 from torch_qpmpc.mpc.tightening import BackOff
@@ -35,9 +33,7 @@ from torch_qpmpc.proofs import (
     invariant_set,
     largest_violation,
 )
-from torch_qpmpc.study.markdown import replaced, table
 
-PAGE = Path(__file__).parents[2] / "docs" / "guides" / "prove.md"
 SAMPLES = 1_000_000
 CHUNK = 50_000
 SECONDS = 30.0
@@ -180,22 +176,5 @@ def measured(name: str) -> list[str]:
     ]
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Print the table, or write it into the docs."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.sets")
-    parser.add_argument("--subjects", nargs="*", default=list(SUBJECTS))
-    parser.add_argument("--write", action="store_true", help="write the table into the docs")
-    options = parser.parse_args(arguments)
-    torch.set_num_threads(1)
-    rows: list[list[str]] = []
-    for name in options.subjects:
-        rows.append(measured(name))
-        print(" | ".join(rows[-1]), flush=True)
-    if options.write:
-        text = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replaced(text, table(TITLES, rows), "sets"), encoding="utf-8")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    main("sets", "sets", TITLES, SUBJECTS, measured)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from torch_qpmpc import QPError
 from torch_qpmpc.control.loop import LinearLoop
 from torch_qpmpc.control.review import Finding, Review
 from torch_qpmpc.export.tables import make_tables
+from torch_qpmpc.proofs import Answer, Plant, Polytope, largest_violation
 
 LAG = ([[0.9]], [[0.5]])
 INTEGRATOR = ([[1.0, 0.1], [0.0, 0.8]], [[0.0], [1.0]], [[1.0, 0.0]])
@@ -179,6 +181,38 @@ def test_a_page_shows_names_as_text(tmp_path):
 def test_a_set_point_of_another_size_is_named():
     with pytest.raises(QPError, match=r"^r: got shape \(1, 2\), expected 1 numbers \(y1\)"):
         made(LAG, r=[1.0, 2.0])
+
+
+def y1_within(mpc: qm.LinearMPC, bound: float) -> Answer:
+    """Ask whether y1 - r stays below a bound from at most 1, with a noise of 0.1."""
+    model = mpc.scheme.model  # of p = [y1 - r, u_last - u_s, u_s, 1]
+    noise, E = Polytope.box([-0.1], [0.1]), np.eye(mpc.n_p)[:, :1]
+    plant = Plant.of(model.A.numpy(), model.B.numpy(), E=E, disturbances=noise)
+    starts = Polytope.box([-1.0, -0.2, 0.0, 1.0], [1.0, 0.2, 0.0, 1.0])
+    upper = np.where(np.arange(mpc.n_p) == 0, bound, np.inf)
+    return largest_violation(mpc, plant, starts, upper=upper)
+
+
+def test_proofs_are_findings_of_the_review_and_its_page(tmp_path):
+    controller = qm.Controller(qm.LinearMPC(LAG, 3, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0)))
+    proved, refuted = (y1_within(controller.mpc, bound) for bound in (0.9, 0.2))
+    undecided = replace(proved, bound=0.5)
+    proofs = {"y1 < 0.9": proved, "y1 < 0.2": refuted, "y1 < 0.9 in no time": undecided}
+    review = controller.review(proofs=proofs)
+    assert [x.name for x in review.faults] == ["y1 < 0.2", "y1 < 0.9 in no time"]
+    first, second, third = (review[name] for name in proofs)
+    assert first.text.startswith(f"largest violation in 1 step {proved.value:.4g}; proved bound -0")
+    assert "; from p [1, -0.2, 0, 1]; d_0 [0.1]" in second.text
+    assert second.remedy.startswith("Claim it of a smaller set, or of smaller disturbances")
+    assert third.remedy == "It is undecided: give it more seconds."
+    assert "\nok    y1 < 0.9: largest violation" in str(review)
+    review.to_html(tmp_path / "review.html")
+    assert "<td>y1 &lt; 0.2</td><td>fault</td>" in (tmp_path / "review.html").read_text()
+    another = qm.Controller(qm.LinearMPC(LAG, 3, Q=1.0, dR=0.2, u_bounds=(-1.0, 1.0)))
+    with pytest.raises(QPError, match=r"^the proof of 'y1 < 0.9': got another QP's"):
+        another.review(proofs={"y1 < 0.9": proved})
+    with pytest.raises(QPError, match=r"^proofs: got str, expected an Answer.*Pass what a quest"):
+        another.review(proofs={"y1 < 0.9": "proved"})  # pyright: ignore[reportArgumentType]
 
 
 # The linear loop

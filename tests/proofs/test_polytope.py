@@ -25,6 +25,8 @@ def test_a_box_has_all_corners():
     assert {tuple(x) for x in box.vertices()} == {
         (a, b, 2.0) for a in (-1.0, 1.0) for b in (0.0, 0.5)
     }
+    fixed = Polytope.box([0.0] * 40 + [-1.0], [0.0] * 40 + [1.0])  # one entry varies
+    assert fixed.vertices()[:, -1].tolist() == [-1.0, 1.0]
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from torch_qpmpc.control.learning import LearningReport
     from torch_qpmpc.control.review import Review
     from torch_qpmpc.control.simulation import Run
+    from torch_qpmpc.proofs import Answer
 
 #: The kind of file that `Controller.save` writes.
 KIND = "Controller"
@@ -258,7 +259,7 @@ class Controller:
             vars(self).update(vars(candidate))
         return report
 
-    def review(self, r: Any = None) -> Review:
+    def review(self, r: Any = None, *, proofs: Mapping[str, Answer] | None = None) -> Review:
         """Return findings about this design: numbers, and a remedy for each fault.
 
         They are about the cost, the terminal weight, the horizon, the disturbances, the scaling of
@@ -268,9 +269,11 @@ class Controller:
 
         Args:
             r: set-points that the inputs must reach, by default those of the last step.
+            proofs: claims about the policy, by name: what a question of `torch_qpmpc.proofs` about
+                ``mpc`` returned. A claim that is not proved is a fault.
 
         Raises:
-            QPError: r is invalid.
+            QPError: r is invalid, or a proof is about another QP, such as this one before learning.
             SolverError: the bounds of the inputs admit no steady state.
 
         Example:
@@ -283,7 +286,8 @@ class Controller:
         """
         from torch_qpmpc.control.review import review
 
-        return review(self, None if r is None else read_row("r", r, self._design.plant.outputs))
+        r = None if r is None else read_row("r", r, self._design.plant.outputs)
+        return review(self, r, proofs)
 
     def export_c(
         self,

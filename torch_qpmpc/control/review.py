@@ -15,6 +15,7 @@ import scipy.optimize
 import torch
 from matplotlib.figure import Figure
 
+from torch_qpmpc.checks import check_kind
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import half_range
 from torch_qpmpc.control.linear_mpc import Target
@@ -22,8 +23,10 @@ from torch_qpmpc.control.loop import LinearLoop
 from torch_qpmpc.control.lowering import riccati
 from torch_qpmpc.control.probe import probe
 from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.tables import SINGULAR, make_tables
 from torch_qpmpc.export.writer import Settings, state_bytes, table_bytes
+from torch_qpmpc.proofs import Answer
 from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solve import solve_qp
@@ -79,7 +82,8 @@ class Review:
     """The findings about a controller; ``print`` shows them.
 
     Attributes:
-        findings: all of them; those that need a definite cost or a stable loop only with one.
+        findings: all of them; those that need a definite cost, as proofs do, or a stable loop only
+            with one.
     """
 
     findings: list[Finding] = field(default_factory=list)
@@ -130,7 +134,9 @@ class Review:
         Path(path).write_text(PAGE.format(table=table, images="\n".join(images)), encoding="utf-8")
 
 
-def review(controller: Controller, r: Array | None = None) -> Review:
+def review(
+    controller: Controller, r: Array | None = None, proofs: Mapping[str, Answer] | None = None
+) -> Review:
     """Return the findings about a controller; see `Controller.review`."""
     mpc = controller.mpc
     checks: list[Callable[[Controller], Finding]] = [
@@ -162,7 +168,10 @@ def review(controller: Controller, r: Array | None = None) -> Review:
     if len(seen.iterations):
         sizes |= {"least iterations of a step in the loop, on average": seen.iterations.mean()}
         sizes |= {"and in its worst step": seen.iterations.max()}
-    return Review([*findings, Finding("C code", True, sizes)])
+    findings.append(Finding("C code", True, sizes))
+    for name, answer in (proofs or {}).items():
+        findings.append(_proof(name, answer, plan.digest))
+    return Review(findings)
 
 
 def _cost(controller: Controller) -> Finding:
@@ -391,6 +400,24 @@ def _weights(controller: Controller, shares: Mapping[str, float]) -> Finding:
     numbers = {f"share of {name} in the cost": share for name, share in shares.items()}
     remedy = f"Raise Q of {', '.join(small)}, or leave it out: it does not matter."
     return Finding("weights", not small, numbers, remedy * bool(small))
+
+
+def _proof(name: str, answer: Answer, digest: str) -> Finding:
+    """A claim about the policy is proved; of a refuted one, the worst run is shown."""
+    check_kind("proofs", answer, Answer, "Pass what a question of torch_qpmpc.proofs returns.")
+    if answer.digest != digest:
+        remedy = "Ask again, after the controller has changed."
+        raise QPError.expected(f"the proof of {name!r}", "another QP's", "this QP's", remedy)
+    numbers = {answer.question: answer.value, "proved bound": answer.bound}
+    numbers |= {"nodes": answer.nodes, "binaries": answer.binaries}
+    if answer.proved:
+        return Finding(name, True, numbers)
+    if not answer.refuted:
+        return Finding(name, False, numbers, "It is undecided: give it more seconds.")
+    numbers |= {"from p": answer.states[0]}
+    numbers |= {f"d_{k}": d for k, d in enumerate(answer.disturbances) if len(d)}
+    remedy = "Claim it of a smaller set, or of smaller disturbances, or tighten the bounds."
+    return Finding(name, False, numbers, remedy)
 
 
 def _number(x: Any) -> str:

@@ -1,11 +1,12 @@
 """Proofs about a policy on a set of states: worst cases, invariance, its explicit law."""
 
-from torch_qpmpc.proofs.explicit import ExplicitLaw, Region, explicit_law
+from torch_qpmpc.proofs.choices import Region
+from torch_qpmpc.proofs.explicit import ExplicitLaw, explicit_law
 from torch_qpmpc.proofs.invariant import InvariantSet, invariant_set
+from torch_qpmpc.proofs.plant import Plant
 from torch_qpmpc.proofs.polytope import Polytope
 from torch_qpmpc.proofs.questions import (
     Answer,
-    Plant,
     invariance,
     largest_difference,
     largest_violation,

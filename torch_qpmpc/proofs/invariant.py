@@ -32,13 +32,12 @@ import numpy as np
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.proofs.plant import Plant, check_plants
 from torch_qpmpc.proofs.polytope import Polytope, support
 from torch_qpmpc.proofs.questions import (
     TOLERANCE,
     Answer,
-    Plant,
     action,
-    check_plants,
     check_states,
     invariance,
 )

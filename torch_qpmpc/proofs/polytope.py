@@ -15,7 +15,7 @@ from torch_qpmpc.errors import QPError
 Array = np.ndarray
 #: Radius of the largest ball in a set that counts as flat, relative to the ball's place.
 FLAT = 1e-9
-#: Vertices are enumerated up to this dimension.
+#: Vertices are enumerated up to this dimension, not counting entries that a box fixes.
 MOST_DIMENSIONS = 8
 
 
@@ -116,13 +116,14 @@ class Polytope:
         """Return the vertices, ``(count, n)``.
 
         Raises:
-            QPError: the dimension is above 8, or the set has no interior.
+            QPError: more than 8 entries vary, or the set has no interior and is no box.
         """
-        n = len(self.lower)
-        if n > MOST_DIMENSIONS:
-            raise QPError.expected("the set", f"{n} dimensions", f"at most {MOST_DIMENSIONS}")
+        n, ends = len(self.lower), [sorted({*x}) for x in zip(self.lower, self.upper, strict=True)]
+        if (varying := sum(len(x) - 1 for x in ends)) > MOST_DIMENSIONS:
+            got, want = f"{varying} dimensions", f"at most {MOST_DIMENSIONS}"
+            raise QPError.expected("the set", got, want)
         if self.is_box():
-            return np.array(list(itertools.product(*zip(self.lower, self.upper, strict=True))))
+            return np.array(list(itertools.product(*ends)))
         length = np.linalg.norm(self.A, axis=1)
         with_radius = np.column_stack((self.A, length))
         bounds = [(None, None)] * n + [(0, None)]

@@ -15,6 +15,7 @@ from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.proofs.encoding import encode
+from torch_qpmpc.proofs.plant import Plant, check_plants
 from torch_qpmpc.proofs.polytope import Polytope
 from torch_qpmpc.proofs.program import Affine, Program
 
@@ -28,51 +29,6 @@ MOST_MODELS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Plant:
-    """``x+ = A x + B u + offset + E d`` with any d of a polytope.
-
-    Attributes:
-        A, B: ``(n, n)`` and ``(n, n_u)``; x is all that the policy knows, p.
-        offset: ``(n,)``.
-        E: ``(n, n_d)``.
-        disturbances: the set of d.
-    """
-
-    A: Array
-    B: Array
-    offset: Array
-    E: Array
-    disturbances: Polytope | None
-
-    @classmethod
-    def of(
-        cls,
-        A: Any,
-        B: Any,
-        *,
-        offset: Any = None,
-        E: Any = None,
-        disturbances: Polytope | None = None,
-    ) -> Plant:
-        """Make a plant; E is the identity, and there are no disturbances, by default.
-
-        Raises:
-            QPError: the shapes do not fit.
-        """
-        A, B = np.array(A, float), np.array(B, float)
-        n = len(A)
-        offset = np.zeros(n) if offset is None else np.array(offset, float)
-        n_d = 0 if disturbances is None else len(disturbances.lower)
-        E = (np.eye(n) if n_d == n else np.zeros((n, 0))) if E is None else np.array(E, float)
-        shapes = A.shape, B.shape[:1], B.ndim, offset.shape, E.shape
-        if shapes != ((n, n), (n,), 2, (n,), (n, n_d)):
-            got = f"shapes {A.shape}, {B.shape}, {offset.shape} and {E.shape}"
-            want = f"(n, n), (n, n_u), (n,) and (n, {n_d})"
-            raise QPError.expected("A, B, offset and E", got, want)
-        return cls(A, B, offset, E, disturbances)
-
-
-@dataclass(frozen=True, eq=False)
 class Answer:
     """The worst case on a set.
 
@@ -83,6 +39,7 @@ class Answer:
         states: the worst states p_0, .., p_k, ``(k + 1, n_p)``.
         disturbances: the worst d of each step, ``(n_d,)``.
         seconds, nodes, binaries: the effort, and the size of the largest program.
+        digest: SHA-256 of the QP that it is about, as in its tables.
     """
 
     question: str
@@ -93,6 +50,7 @@ class Answer:
     seconds: float
     nodes: int
     binaries: int
+    digest: str
 
     @property
     def proved(self) -> bool:
@@ -208,7 +166,8 @@ def largest_difference(
         raise QPError.expected("second", f"{second.n_u} actions", f"{first.n_u}")
     began, program = time.perf_counter(), Program()
     p, vertices = _known(program, states), states.vertices()
-    u, other = (encode(program, make_tables(mpc), p, vertices) for mpc in (first, second))
+    tables = make_tables(first)
+    u, other = (encode(program, x, p, vertices) for x in (tables, make_tables(second)))
     difference = u + other.times(-np.eye(first.n_u))
     signs = np.concatenate((np.eye(first.n_u), -np.eye(first.n_u)))
 
@@ -218,7 +177,8 @@ def largest_difference(
 
     worst = _Worst(np.full((1, n), np.nan))
     worst.maximise(program, difference.times(signs), replay, seconds)
-    return worst.answer("largest difference of the policies", time.perf_counter() - began)
+    question = "largest difference of the policies"
+    return worst.answer(question, time.perf_counter() - began, tables.digest)
 
 
 def check_states(mpc: QPMPC, states: Polytope) -> int:
@@ -229,19 +189,6 @@ def check_states(mpc: QPMPC, states: Polytope) -> int:
         got, want = f"{len(states.lower)} dimensions", f"n_p = {mpc.n_p}"
         raise QPError.expected("states", got, want)
     return mpc.n_p
-
-
-def check_plants(plant: Plant | Sequence[Plant], n_p: int, n_u: int) -> list[Plant]:
-    """Return the plants; raise unless there is one, and each fits the policy."""
-    plants = list(plant) if isinstance(plant, Sequence) else [plant]
-    if not plants:
-        raise QPError.expected("plant", "an empty list", "at least one Plant")
-    for one in plants:
-        check_kind("plant", one, Plant, "Make one with Plant.of(A, B).")
-        if one.B.shape != (n_p, n_u):
-            want = f"({n_p}, {n_u}), for p and u"
-            raise QPError.expected("plant.B", f"shape {one.B.shape}", want)
-    return plants
 
 
 def _known(program: Program, states: Polytope) -> Affine:
@@ -284,7 +231,7 @@ def _worst(
             return A @ run[-1] - b, run, noise
 
         worst.maximise(branch.program, branch.p.times(A).plus(-b), replay, seconds)
-    return worst.answer(question, time.perf_counter() - began)
+    return worst.answer(question, time.perf_counter() - began, tables.digest)
 
 
 class _Branch(NamedTuple):
@@ -346,9 +293,9 @@ class _Worst:
             if values.max() > self.value:
                 self.value, self.run, self.noise = float(values.max()), run, noise
 
-    def answer(self, question: str, seconds: float) -> Answer:
+    def answer(self, question: str, seconds: float, digest: str) -> Answer:
         effort = seconds, self.nodes, self.binaries
-        return Answer(question, self.value, self.bound, self.run, self.noise, *effort)
+        return Answer(question, self.value, self.bound, self.run, self.noise, *effort, digest)
 
 
 def compare_replay(value: float, computed: float) -> None:

@@ -29,14 +29,14 @@ from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.tables import make_tables
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.proofs.explicit import INSIDE, ExplicitLaw, Region, size_of
+from torch_qpmpc.proofs.choices import Region
+from torch_qpmpc.proofs.explicit import INSIDE, ExplicitLaw, size_of
+from torch_qpmpc.proofs.plant import Plant, check_plants
 from torch_qpmpc.proofs.polytope import Body, Polytope, facets, support
 from torch_qpmpc.proofs.questions import (
     TOLERANCE,
     Answer,
-    Plant,
     action,
-    check_plants,
     compare_replay,
 )
 
@@ -241,7 +241,8 @@ def largest_increase(
     compare_replay(replayed, worst)
     noise = () if d is None else (d.vertices()[push],)
     effort = time.perf_counter() - began, 0, 0
-    return Answer("largest increase of V", replayed, worst, run, noise, *effort)
+    question = "largest increase of V"
+    return Answer(question, replayed, worst, run, noise, *effort, law.tables.digest)
 
 
 class _Transition(NamedTuple):
