@@ -62,14 +62,14 @@ def save_file(path: str | Path, kind: str, content: Mapping[str, Any]) -> None:
     write_whole(Path(path), buffer.getbuffer())
 
 
-def load_file(path: str | Path, kind: str) -> dict[str, Any]:
-    """Read the content of a file of a ``kind``.
+def load_file(path: str | Path, kind: str, writer: str = "") -> dict[str, Any]:
+    """Read the content of a file of a ``kind``, which the class ``writer`` wrote, or that kind's.
 
     Raises:
         QPError: the file is missing, damaged, of another kind or of a newer version, or holds more
             than tensors and plain values.
     """
-    expected = f"a file that {kind}.save wrote"
+    expected = f"a file that {writer or kind}.save wrote"
     try:
         content = read_tensors(Path(path))
     except FileNotFoundError as error:
@@ -81,7 +81,8 @@ def load_file(path: str | Path, kind: str) -> dict[str, Any]:
     of = content.get("kind") if isinstance(content, dict) else None
     if of != kind:
         got = f"{path}, {'which another program wrote' if of is None else f'a saved {of}'}"
-        raise QPError.expected("path", got, expected)
+        remedy = f"{of}.load reads it." if of in ("Controller", "QPMPC") else ""
+        raise QPError.expected("path", got, expected, remedy)
     version = content.get("version")
     if not isinstance(version, int) or not 1 <= version <= VERSION:
         got = f"{path}, whose format has version {version!r}"

@@ -81,6 +81,13 @@ def test_signals_go_in_and_out_by_name():
     assert u == {"valve": by_vector.step([0.5], [1.0])[0]}
 
 
+def test_a_controller_shows_its_design_and_last_input():
+    controller = qm.Controller(integrator(inputs=["valve"], outputs=["level"]))
+    text = "level by valve; horizon 20; Q [1.0]; R [0.1]; dR [0.1]"
+    assert repr(controller) == f"Controller({text}; filter; u = [0.0])"
+    assert text in repr(controller.mpc)
+
+
 def test_a_reset_starts_where_the_plant_rests():
     controller = qm.Controller(integrator())
     controller.reset(y=[3.0], u=[0.2])

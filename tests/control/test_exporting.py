@@ -112,8 +112,8 @@ def exported(tmp_path_factory):
 
 def test_a_reset_starts_where_the_plant_rests(exported):
     controller, _, twin = exported
-    controller.reset(y=[1.5])
-    twin.reset([1.5])
+    controller.reset(y=[1.5], u=[0.4])
+    twin.reset([1.5], [0.4])
     for y in (1.4, 1.45):
         assert np.allclose(twin.step([y], [1.0])[0], controller.step([y], [1.0]), atol=1e-12)
     assert np.allclose(twin.step([1.5])[0], controller.step([1.5]), atol=1e-12)  # the last r

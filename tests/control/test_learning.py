@@ -91,6 +91,15 @@ def test_a_log_is_enough_and_its_last_third_decides():
     assert np.allclose(controller.mpc.design.plant.A, 0.9, atol=0.05)
 
 
+def test_loops_of_a_log_start_at_rest_at_its_levels():
+    log = logged()
+    signals = {"y1": log.trajectories[0].y.numpy() + 50, "u1": log.trajectories[0].u.numpy() + 5}
+    log = qm.read_log(signals, outputs=["y1"], inputs=["u1"])
+    controller = made(WRONG, u_bounds=(3.0, 7.0), du_bounds=(-0.2, 0.2))
+    report = controller.learn(log, steps=12, spread=0.1)
+    assert report.before < 1, "a start at another input would cost thousands"
+
+
 def test_a_candidate_that_fails_is_not_accepted(monkeypatch):
     controller, simulate = made(WRONG), learning.simulate
 

@@ -177,10 +177,14 @@ def test_p_takes_batches_and_is_relative_to_the_last_target():
         ({"gamma": 0}, "gamma: got 0, expected a discount factor"),
         ({"y_slack": -1.0}, r"y_slack: got \[-1.0\], expected prices >= 0"),
         ({"linear": 1.0}, "linear: got 1.0, expected a mapping from inputs"),
-        ({"linear": {"u1": "price"}}, "linear: got {'u1': 'price'}, expected a mapping"),
+        ({"linear": {"u1": "price"}}, "linear: got {'u1': 'price'}, .* Pass known=.'price'"),
         ({"u_bounds": {"q": (0, 1)}}, "u_bounds: got 'q', expected names among u1"),
         ({"u_bounds": {"u1": 1.0}}, "u_bounds: got {'u1': 1.0}, expected pairs .* by name"),
         ({"u_bounds": 1.0}, "u_bounds: got 1.0, expected the pair"),
+        (
+            {"du_bounds": (0.1, 0.3)},
+            r"du_bounds: got \(0.1, 0.3\) for u1, expected bounds with zero",
+        ),
         ({"u_bounds": (1.0, 0.0)}, "u_bounds: got lower 1 > upper 0 for u1, expected lower <="),
     ],
 )

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
+from torch_qpmpc.control.findings import Finding, Review
 from torch_qpmpc.control.loop import LinearLoop
-from torch_qpmpc.control.review import Finding, Review
 from torch_qpmpc.export.tables import make_tables
 from torch_qpmpc.proofs import Answer, Plant, Polytope, largest_violation
 
@@ -57,11 +57,6 @@ MISTAKES = {
         (INTEGRATOR, {"y_slack": np.inf}),
         ("hard bounds", "Give y1 a finite y_slack"),
         {"y_slack": 100.0},
-    ),
-    "moves that must go on": (
-        (LAG, {"du_bounds": (0.1, 0.3)}),
-        ("hard bounds", "Let du_bounds contain zero"),
-        {"du_bounds": (-0.1, 0.3)},
     ),
     "units far apart": (
         (([[0.9]], [[5e4]]), {"y_bounds": (-4e5, 4e5)}),
@@ -135,8 +130,39 @@ def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake):
 def test_a_sound_design_has_no_fault(model):
     found = made(model, 15, r=[0.5])
     assert found.faults == []
-    assert len(found.findings) == 13
-    assert str(found).startswith("0 faults in 13 findings\nok    cost: smallest eigenvalue on the")
+    assert len(found.findings) == 14
+    assert str(found).startswith("0 faults in 14 findings\nok    cost: smallest eigenvalue on the")
+
+
+def test_findings_are_about_the_last_known_signals_or_those_passed():
+    options = {"E": [[0.1]], "known": ["rain"], "u_bounds": (0.0, 5.0), "y_bounds": (0.0, 50.0)}
+    controller = qm.Controller(qm.LinearMPC(LAG, 12, Q=1.0, dR=0.1, **options))
+    controller.reset(y=[20.0], u=[2.0], known=[10.0])
+    found = controller.review(r=[35.0])
+    assert found["set-points"].text == "at rain 10; y1 reaches [10, 35]"
+    assert found.faults == []
+    (fault,) = controller.review(r=[35.0], known=[5.0]).faults
+    assert fault.remedy == "Set y1 to 30, not 35, or widen the bounds."
+    controller.reset()
+    assert controller.review()["set-points"].text.startswith("at rain (not known, assumed) 0;")
+
+
+def test_gains_are_those_of_steps():
+    options = {"E": [[0.1, 0.0]], "known": ["rain", "price"]}
+    gains = made(LAG, **options)["gains"].numbers
+    assert np.allclose(gains["y1 per unit of u1, rain in steady state"], [5.0, 1.0])
+    (after,) = made(INTEGRATOR)["gains"].numbers.items()
+    assert after[0] == "y1 per unit of u1 after 10 steps"
+    step = np.cumsum([0.8**k for k in range(10)])
+    assert np.allclose(after[1], 0.1 * step[:-1].sum())
+
+
+def test_the_noise_of_a_fit_is_no_response():
+    """A dead time of six steps, with 1 % of the gain at once and an input that does nothing."""
+    B = np.hstack((DEAD_TIME[1], 1e-3 * np.ones((6, 1))))
+    B[0, 0] = 0.01
+    text = made((DEAD_TIME[0], B, DEAD_TIME[2]), R=0.01)["horizon"].text
+    assert text == "steps until y1 responds in its direction 6; horizon 10"
 
 
 def test_a_learned_cost_that_is_indefinite_is_named():

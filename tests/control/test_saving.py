@@ -33,6 +33,10 @@ def test_a_loaded_controller_goes_on_with_the_same_inputs(tmp_path, options):
     twin = qm.Controller.load(tmp_path / "mine.qpmpc")
     assert twin.mpc.learned == controller.mpc.learned
     assert np.array_equal(inputs(twin), inputs(controller))
+    assert twin.known is not None
+    assert twin.known.tolist() == [0.3, 0.19]
+    assert twin.rest[0] is None
+    assert np.array_equal(twin.rest[1], controller.rest[1])
     assert twin.mpc.design.plant.label("level") == "level [m]"
     assert twin.mpc.design.plant.dt == 0.5
 
@@ -90,6 +94,8 @@ def test_files_of_other_kinds_are_named(tmp_path):
     qm.QPMPC(1, 1, 2).save(tmp_path / "qp")
     with pytest.raises(QPError, match=r"controller, a saved Controller, expected a file that QPM"):
         qm.QPMPC.load(tmp_path / "controller")
+    with pytest.raises(QPError, match=r"that LinearMPC.save wrote. Controller.load reads it"):
+        qm.LinearMPC.load(tmp_path / "controller")
     with pytest.raises(QPError, match=r"mpc, a saved QPMPC, expected a file that Controller.save"):
         qm.Controller.load(tmp_path / "mpc")
     with pytest.raises(QPError, match=r"qp, a QPMPC, expected a saved LinearMPC. QPMPC.load reads"):

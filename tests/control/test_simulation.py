@@ -32,8 +32,32 @@ def test_another_plant_with_a_load_settles_and_the_controller_is_untouched():
         (150,),
     ]
     assert np.abs(run.y[-1] - 1.0) < 1e-5
-    assert np.abs(run.y[0]) < 0.31  # at rest with the load alone
+    assert run.y[0] == 0  # at rest before the load
     assert all(map(np.array_equal, before, (controller.u, controller.x, controller.w)))
+
+
+def test_a_loop_starts_where_the_last_reset_rests():
+    """At its input, which moves and their bounds and prices count from."""
+    options = {"E": [[0.3]], "known": ["rain"], "u_bounds": (0.0, 4.0), "du_bounds": (-0.1, 0.1)}
+    controller = made(**options)
+    controller.reset(y=[13.0], u=[2.0], known=[1.0])
+    controller.step([13.0], [13.0], known=[1.0])
+    run = controller.simulate(steps=20, r=[13.0], known=[1.0])
+    assert np.allclose(run.y, 13.0)
+    assert np.allclose(run.u, 2.0)
+    assert np.abs(run.cost.sum()) < 1e-6
+    moved = controller.simulate(steps=20, r=[20.0], known=[1.0], u=[1.0])
+    assert np.allclose(moved.y[0], 8.0)
+    assert np.allclose(moved.u[:2, 0], [1.1, 1.2])
+    assert np.allclose(moved.costs(moved.u)[0], 144 + 0.1 * 0.1**2)
+    assert repr(moved).startswith("Run(20 steps, cost ")
+
+
+def test_an_integrator_starts_at_the_outputs_of_the_last_reset():
+    mpc = qm.LinearMPC(([[1.0]], [[0.1]]), 10, Q=1.0, dR=1.0)
+    controller = qm.Controller(mpc)
+    controller.reset(y=[50.0], u=[0.0])
+    assert np.allclose(controller.simulate(steps=3, r=[50.0]).y, 50.0)
 
 
 def test_the_cost_is_that_of_its_formula():
@@ -129,6 +153,7 @@ def test_the_figure_has_a_panel_for_each_signal_with_its_unit():
         ({"r": None}, "r: got None in the first step, expected set-points of y1"),
         ({"noise": -1.0}, r"noise: got \[-1.0\], expected standard deviations >= 0"),
         ({"load": [1.0, 2.0]}, r"load: got shape \(2,\) or NaN, expected a number, or one for"),
+        ({"u": [1.0, 2.0]}, r"u: got shape \(1, 2\), expected 1 numbers"),
         ({"x": [1.0, 2.0]}, r"x: got shape \(2,\) or NaN, expected a number, or one for"),
         (
             {"plant": ([[0.5]], [[1.0, 1.0]])},
@@ -143,3 +168,13 @@ def test_the_figure_has_a_panel_for_each_signal_with_its_unit():
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(QPError, match=f"^{message}"):
         made().simulate(**{"r": [1.0], **arguments})
+
+
+def test_rows_of_known_signals_are_one_or_all():
+    controller = made(E=[[0.3]], known=["rain"])
+    with pytest.raises(QPError, match=r"^known: got 9 rows, expected one row, or at least 10"):
+        controller.simulate(steps=10, r=[1.0], known=np.ones((9, 1)))
+    with pytest.raises(QPError, match=r"^known: got 5 rows, expected one row, or at least 11"):
+        controller.step([0.0], [1.0], known=np.ones((5, 1)))
+    held, rows = (controller.simulate(steps=10, r=[1.0], known=np.ones((n, 1))) for n in (1, 10))
+    assert np.array_equal(held.u, rows.u)

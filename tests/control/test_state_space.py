@@ -67,6 +67,11 @@ def test_the_state_space_of_an_identification_has_its_predictions():
     assert plant.dt == 0.5
     priced = read_model(Identified(arx, Mock(), Mock(), log), prices=["rain"])
     assert not priced.E.any(), "a price acts on no plant"
+    more = read_model(Identified(arx, Mock(), Mock(), log), known=["price", "rain", "sun"])
+    assert np.array_equal(more.E, np.pad(plant.E, ((0, 0), (1, 1))))
+    message = r"known: got \['price'\], expected all known .* rain. Pass known=\['rain', 'price'\]"
+    with pytest.raises(QPError, match=message):
+        read_model(Identified(arx, Mock(), Mock(), log), known=["price"], prices=["price"])
     y, u, d = [*rng.normal(size=(2, 2))], rng.normal(size=(6, 1)), rng.normal(size=(6, 1))
     x = np.concatenate((y[1], A[:, 2:] @ y[0] + B[:, 1:] @ u[0]))
     for k in range(1, 6):

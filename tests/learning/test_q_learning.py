@@ -216,7 +216,8 @@ def test_compiled_without_graph_breaks():
 def test_the_discount_of_the_target_is_by_default_that_of_the_qp():
     loss = QPQLearningLoss(make_operator())
     loss.make_value_estimator()
-    assert float(loss._value_estimator.gamma) == loss.operator.module.gamma != 0.99
+    estimator: Any = loss.value_estimator
+    assert float(estimator.gamma) == loss.operator.module.gamma != 0.99
 
 
 def test_bad_arguments():

@@ -5,6 +5,7 @@ import io
 import pickle
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -131,6 +132,15 @@ def test_the_report_is_printed():
     assert head.split() == ["steps", "RMSE", "of", "y1,", "y2", "R2,", "cross-validated"]
     assert [int(row.split()[0]) for row in rows] == [1, 2, 5, 6]
     assert all(len(row.split()) == 5 for row in rows)
+
+
+def test_columns_of_many_outputs_are_apart():
+    names = [f"y{i}" for i in range(1, 11)]
+    y = np.random.default_rng(0).normal(size=(60, 10))
+    log = qm.read_log({"y": y, "u": y[:, :1] ** 2}, outputs=names, inputs=["u"])
+    head, row = str(qm.identify(log, 1, structure="tied")).splitlines()[-2:]
+    assert "y9, y10  " in head
+    assert len(row.split()) == 21
 
 
 def test_errors_are_nan_where_no_part_of_the_data_is_long_enough():

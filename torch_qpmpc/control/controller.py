@@ -53,6 +53,8 @@ class Controller:
         mpc: the MPC.
         observer: the `Observer`.
         x, w, u: the estimates of x and w, and the last input.
+        known: the known signals of the last step or reset, ``(n_d,)``, None before.
+        rest: the outputs y, or None, and the input u that the last reset said the plant rests with.
         p: what the plan of the last step knew, ``(n_p,)``.
         target: the `Target` of the last step, None before the first; with a preview, of all stages.
 
@@ -92,6 +94,9 @@ class Controller:
     def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
         """Forget the past: the plant rests with the outputs y, by default those of the next step.
 
+        It is where `simulate` and `learn` start, too. Of a plant that does not rest, pass its last
+        input; the estimates take as many steps to settle as the filter does.
+
         Args:
             y: outputs, by name or as a vector.
             u: the input that holds the plant there, by default the one nearest to zero within the
@@ -106,11 +111,21 @@ class Controller:
         self.u = np.clip(np.zeros(len(plant.inputs)), *self._design.u_bounds)
         if u is not None:
             self.u = read_row("u", u, plant.inputs)
+        y = None if y is None else read_row("y", y, plant.outputs)
+        self.rest: tuple[Array | None, Array] = (y, self.u)
+        self.known: Array | None = None
         self.target: Target | None = None
         self.p = torch.zeros(self.mpc.n_p)
         self._e: Array | None = None
-        if y is not None:
-            self._rest(read_row("y", y, plant.outputs), self.read_known(known, 1)[0])
+        if known is not None or y is not None:
+            self.known = d = self.read_known(known, 1)[0]
+            if y is not None:
+                self._rest(y, d)
+
+    def __repr__(self) -> str:
+        """Return its design, its estimator and the last input."""
+        estimator = "window" if self._window else "filter"
+        return f"Controller({self._design}; {estimator}; u = {self.u.round(4).tolist()})"
 
     @property
     def x(self) -> Array:
@@ -131,8 +146,8 @@ class Controller:
             y: outputs, by name or as a vector ``(n_y,)``.
             r: set-points in the same forms, by default the last ones; with a preview also rows for
                 the stages 0, .., N; the last one is held.
-            known: known signals for the stages 0, .., N, ``(N + 1, n_d)``, as a DataFrame or a
-                mapping of columns; one row is held.
+            known: known signals for the stages 0, .., N, as a DataFrame or a mapping of columns
+                with at least N + 1 rows; or one row, which is held.
 
         Raises:
             QPError: an argument is invalid, or missing.
@@ -141,7 +156,7 @@ class Controller:
         plant, observer = self._design.plant, self.observer
         rows = self._design.horizon + 1
         d, y_k = self.read_known(known, rows), read_row("y", y, plant.outputs)
-        self.r = self.read_set_points(r, rows)
+        self.r, self.known = self.read_set_points(r, rows), d[0]
         if self._e is None:
             self._rest(y_k, d[0])
         assert self._e is not None
@@ -161,7 +176,7 @@ class Controller:
             QPError: a part of theta has a parametrization that is not QPMPC's own.
             OSError: writing failed; the old file is unchanged.
         """
-        names = ("_noise", "_drift", "_window", "_e", "u", "r")
+        names = ("_noise", "_drift", "_window", "_e", "u", "r", "known", "rest")
         state = {name.strip("_"): packed(getattr(self, name)) for name in names}
         save_file(path, KIND, {**self.mpc.stored(), "controller": state})
 
@@ -180,6 +195,8 @@ class Controller:
             options = {name: state[name] for name in ("noise", "drift", "window") if name in state}
             controller = cls(mpc, **options)
             controller._e, controller.u, controller.r = (state[name] for name in "eur")
+            controller.known = state.get("known")
+            controller.rest = state.get("rest", controller.rest)
         except Exception as error:  # damaged files raise errors of any type
             raise damaged(Path(path), error, "a file that Controller.save wrote") from error
         return controller
@@ -187,16 +204,22 @@ class Controller:
     def simulate(self, plant: Any = None, steps: int = 200, r: Any = None, **options: Any) -> Run:
         """Return a closed loop of a copy of this controller with a plant, from rest.
 
+        The last `reset` says where: a model rests with its input (and outputs, if it integrates)
+        and the first known signals; an environment starts where its own reset says, and its first
+        outputs are taken to rest with that input.
+
         Args:
             plant: a model as `LinearMPC` takes it, by default its own; or an environment with
                 Gymnasium's ``reset`` and ``step`` whose observations are the outputs.
             steps: the number of steps.
             r: a set-point that is held, or rows of them, by default the last one.
-            options: ``known``: a row of known signals that is held, or rows; by default the
-                forecast in an environment's ``info["known"]``, in the forms of `step`. ``load``: a
-                constant added to the inputs. ``noise``: standard deviations of that of the outputs,
-                as a number, a vector or by name. ``x``: the state that a model starts from.
-                ``seed``: that of the noise and of an environment.
+            options: ``known``: a row of known signals that is held, or at least ``steps`` rows, of
+                which the last is held at the end; by default the forecast in an environment's
+                ``info["known"]``, in the forms of `step`. An environment must run the same signals.
+                ``u``: the input to start from, by default that of the last reset. ``load``: a
+                constant that is added to the inputs from the first step on. ``noise``: standard
+                deviations of that of the outputs, as a number, a vector or by name. ``x``: the
+                state that a model starts from. ``seed``: that of the noise and of an environment.
 
         Raises:
             QPError: an argument is invalid.
@@ -218,8 +241,9 @@ class Controller:
         """Identify the model again, and keep the new one if closed loops cost less with it.
 
         The cost is that of `Run.costs`, the design's own, which must be shown to fall by 1 %.
-        The controller starts again from rest with the new model if it is accepted, and otherwise
-        stays as it is.
+        An accepted controller starts again with the new model, from rest with its last input;
+        otherwise it stays as it is. Loops start where the last `reset` rests, those with a log's
+        model at rest in the middle of the set-points.
 
         Args:
             source: an environment, as in `simulate`: the controller gathers transitions in closed
@@ -227,11 +251,12 @@ class Controller:
                 Or a log of its signals, as `read_log` reads it: its first two thirds are fitted,
                 and loops with a model of the last third, with its one-step errors as noise, decide.
             transitions: the number to gather from an environment, rounded up to whole loops.
-            options: ``r``, the middle of the set-points, by default the last one, or the mean of
-                the log. ``spread``: their largest distance from it, by default a tenth of half the
-                distance of the outputs' bounds, or the log's standard deviation. ``known``: as in
-                `simulate`, for an environment. ``steps``: the steps of a loop. ``pairs``: the
-                largest number of pairs. ``seed``: that of set-points, noise and environment.
+            options: ``r``, the middle of the set-points, by default the last one, or the log's mean
+                within the outputs' bounds. ``spread``: their largest distance from it, by default a
+                tenth of half the distance of the outputs' bounds, or the log's standard deviation.
+                ``known``: as in `simulate`, for an environment. ``steps``: the steps of a loop.
+                ``pairs``: the largest number of pairs, at least 16. ``seed``: that of set-points,
+                noise and environment.
 
         Raises:
             QPError: an argument is invalid, or the transitions determine no model with a steady
@@ -259,21 +284,26 @@ class Controller:
             vars(self).update(vars(candidate))
         return report
 
-    def review(self, r: Any = None, *, proofs: Mapping[str, Answer] | None = None) -> Review:
+    def review(
+        self, r: Any = None, known: Any = None, *, proofs: Mapping[str, Answer] | None = None
+    ) -> Review:
         """Return findings about this design: numbers, and a remedy for each fault.
 
-        They are about the cost, the terminal weight, the horizon, the disturbances, the scaling of
-        signals, hard bounds that can leave no plan, the reach of set-points, the QP's condition,
-        the loop without active bounds (its stability, margin and offset), the shares of weights in
-        the cost of a closed loop, and the C code's size and iterations.
+        They are about the cost, the terminal weight, the gains, the horizon, the disturbances, the
+        scaling of signals, hard bounds that can leave no plan, the reach of set-points, the QP's
+        condition, the loop without active bounds (its stability, margin and offset), the shares of
+        weights in the cost of a closed loop, and the C code's size and iterations.
 
         Args:
             r: set-points that the inputs must reach, by default those of the last step.
+            known: a row of known signals that are held, by default those of the last step or reset,
+                else zero. The finding about set-points says which they are.
             proofs: claims about the policy, by name: what a question of `torch_qpmpc.proofs` about
                 ``mpc`` returned. A claim that is not proved is a fault.
 
         Raises:
-            QPError: r is invalid, or a proof is about another QP, such as this one before learning.
+            QPError: r or known is invalid, or a proof is about another QP, such as this one before
+                learning.
             SolverError: the bounds of the inputs admit no steady state.
 
         Example:
@@ -286,8 +316,7 @@ class Controller:
         """
         from torch_qpmpc.control.review import review
 
-        r = None if r is None else read_row("r", r, self._design.plant.outputs)
-        return review(self, r, proofs)
+        return review(self, r, known, proofs)
 
     def export_c(
         self,
@@ -340,8 +369,12 @@ class Controller:
         u = u_s + self.mpc.policy(p, qp=self._qp)
         return np.clip(u.numpy(), *self._design.u_bounds)
 
-    def read_known(self, known: Any, rows: int) -> Array:
+    def read_known(self, known: Any, rows: int, least: int | None = None) -> Array:
         """Return signals ``known``, in the forms of `step`, as ``(rows, n_d)``.
+
+        Args:
+            known: one row, or at least ``least`` rows, by default all.
+            rows, least: numbers of rows.
 
         Raises:
             QPError: they are invalid, or missing.
@@ -353,7 +386,7 @@ class Controller:
             remedy = "Pass a forecast of N + 1 rows, or one row that is held; an environment has "
             remedy += "it in info['known']."
             raise QPError.expected("known", "None", f"the signals {', '.join(names)}", remedy)
-        return read_table("known", known, names, rows)
+        return read_table("known", known, names, rows, rows if least is None else least)
 
     def read_set_points(self, r: Any, rows: int) -> Array:
         """Return set-points ``r``, in the forms of `step`, as ``(rows, n_y)``.

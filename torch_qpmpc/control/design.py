@@ -54,6 +54,15 @@ class Design:
     steady: Steady
     blocks: tuple[int, ...] = ()
 
+    def __str__(self) -> str:
+        plant, weights = self.plant, {"Q": self.Q, "R": self.R, "dR": self.dR}
+        y, u, d = (
+            ", ".join(map(plant.label, x)) for x in (plant.outputs, plant.inputs, plant.known)
+        )
+        parts = [f"{y} by {u}", *([f"known {d}"] if d else []), f"horizon {self.horizon}"]
+        parts += [f"{name} {np.diag(x).tolist()}" for name, x in weights.items() if x.any()]
+        return "; ".join(parts)
+
     @property
     def moves(self) -> bool:
         """True if moves of the inputs cost or are bounded, so that p has the last input."""
@@ -106,6 +115,11 @@ def half_range(bounds: tuple[Array, Array]) -> Array:
     return np.where(np.isfinite(half) & (half > 0), half, 1.0)
 
 
+def middle(bounds: tuple[Array, Array]) -> Array:
+    """Return the middle of the bounds, and zero where there is none."""
+    return np.where(np.isfinite(bounds).all(0), bounds, 0.0).mean(0)
+
+
 def read_design(
     plant: StateSpace,
     horizon: Any,
@@ -150,7 +164,7 @@ def read_design(
         dR,
         _bounds("y_bounds", y_bounds, y),
         _bounds("u_bounds", u_bounds, u),
-        _bounds("du_bounds", du_bounds, u),
+        _moves(du_bounds, u),
         slack,
         prices,
         references,
@@ -168,7 +182,8 @@ def _prices(linear: Mapping[str, str | float] | None, plant: StateSpace) -> dict
     for name, price in (linear or {}).items():
         numeric = isinstance(price, int | float) and np.isfinite(price)
         if name not in plant.inputs or not (numeric or price in plant.known):
-            raise QPError.expected("linear", f"{{{name!r}: {price!r}}}", want)
+            remedy = f"Pass known={[*plant.known, price]}." * isinstance(price, str)
+            raise QPError.expected("linear", f"{{{name!r}: {price!r}}}", want, remedy)
         if not numeric and plant.E[:, plant.known.index(str(price))].any():
             got, want = f"{price!r}, which acts on the plant", "a price with a column of zeros in E"
             raise QPError.expected("linear", got, want, "Pass the signal twice.")
@@ -202,6 +217,16 @@ def _weight(name: str, value: Any, names: Sequence[str]) -> Array:
         weight = np.diag(read_vector(name, value, names, 0.0))
     check_weight(name, torch.from_numpy(weight), diagonal=False, n_d=0)
     return weight
+
+
+def _moves(du_bounds: Any, names: Sequence[str]) -> tuple[Array, Array]:
+    """Read bounds of moves, which must allow to hold an input."""
+    lower, upper = _bounds("du_bounds", du_bounds, names)
+    for name, *pair in zip(names, lower, upper, strict=True):
+        if not pair[0] <= 0 <= pair[1]:
+            got, want = f"({pair[0]:g}, {pair[1]:g}) for {name}", "bounds with zero between them"
+            raise QPError.expected("du_bounds", got, want, "An input must be able to stay.")
+    return lower, upper
 
 
 def _bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ import copy
 import ctypes
 import math
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torch_qpmpc.control.controller import Controller
-from torch_qpmpc.control.design import Design, half_range
+from torch_qpmpc.control.design import half_range, middle
 from torch_qpmpc.control.disturbance import RANK
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError, SolverError
@@ -67,12 +67,16 @@ class ControllerExport:
 
 
 class Loop(NamedTuple):
-    """Signals of a closed loop by step: y, r and known with their stages, and u."""
+    """Signals of a closed loop by step: y, r and known with their stages, and u.
+
+    It starts at rest with the input ``start``, which is one row.
+    """
 
     y: Array
     r: Array
     known: Array
     u: Array
+    start: Array
 
 
 class CompiledController:
@@ -89,7 +93,7 @@ class CompiledController:
         size = SIZE.replace("policy", name)
         library = compiled({**files, "size_.c": size}, FLAGS)
         self._step, self._reset = library[f"{name}_step"], library[f"{name}_reset"]
-        self._step.argtypes, self._reset.argtypes = [ctypes.c_void_p] * 5, [ctypes.c_void_p] * 2
+        self._step.argtypes, self._reset.argtypes = [ctypes.c_void_p] * 5, [ctypes.c_void_p] * 3
         self.selftest = library[f"{name}_selftest"]
         state_size = library[f"{name}_state_size"]
         state_size.restype = ctypes.c_ulong
@@ -97,10 +101,11 @@ class CompiledController:
         self._state, self._u = np.zeros(self.state_bytes, np.uint8), np.zeros(n_u, self._dtype)
         self.reset()
 
-    def reset(self, y: Any = None) -> None:
+    def reset(self, y: Any = None, u: Any = None) -> None:
         """Forget the past, as ``policy_reset``."""
-        (y,) = self._numbers(y)
-        self._reset(self._state.ctypes.data, None if y is None else y.ctypes.data)
+        signals = self._numbers(y, u)
+        pointers = (None if x is None else x.ctypes.data for x in signals)
+        self._reset(self._state.ctypes.data, *pointers)
 
     def step(self, y: Any, r: Any = None, known: Any = None) -> tuple[Array, int]:
         """Return the input and the code of a step; r and known have all rows."""
@@ -145,14 +150,12 @@ def export_controller(
             free = export_c(mpc.free, temporary, name=f"{name}_free", **options)
         reports = [plan, target, *([free] if free else [])]
         texts = {x.name: x.read_text(encoding="utf-8") for part in reports for x in part.files}
-    twin = copy.copy(controller)
-    twin.reset()
-    loop = _run(mpc.design, twin.step, COMPARED)
+    loop = _run(controller, copy.copy(controller), COMPARED)
     texts |= _sources(controller, name, dtype, loop)
     state_bytes = difference = None
     if compiler() is not None:
         library = CompiledController(texts, name, dtype, len(plant.inputs))
-        state_bytes, own = library.state_bytes, _run(mpc.design, library.solved, len(loop.u))
+        state_bytes, own = library.state_bytes, _run(controller, library, len(loop.u))
         difference = np.abs(own.u - loop.u).max(0)
         near = NEAR[dtype] * half_range(mpc.design.u_bounds)
         if (failed := library.selftest()) or not (difference <= near).all():
@@ -180,22 +183,25 @@ def export_controller(
     )
 
 
-def _run(design: Design, step: Callable[..., Array], steps: int) -> Loop:
-    """Return signals of a closed loop of ``step``, with noise, a load and moving set-points.
+def _run(controller: Controller, twin: Controller | CompiledController, steps: int) -> Loop:
+    """Return signals of a closed loop of ``twin``, with noise, a load and moving set-points.
 
-    It ends early where no input satisfies the hard bounds. Each controller closes a loop of its
-    own: replaying outputs through an unstable controller would measure rounding alone.
+    It starts at rest in the middle of the outputs' bounds, and ends early where no input satisfies
+    the hard bounds. Each controller closes a loop of its own: replaying outputs through an unstable
+    controller would measure rounding alone.
     """
-    rng = np.random.default_rng(0)
+    rng, design = np.random.default_rng(0), controller.mpc.design
     plant, rows = design.plant, COMPARED + design.horizon + 1
     size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
-    d = 0.1 * rng.normal(size=(rows, len(plant.known)))
-    middle = _middle(design)
-    x, loop = np.linalg.pinv(plant.C) @ middle, []
+    x, start, level = _at_rest(controller)
+    d = level + 0.1 * rng.normal(size=(rows, len(plant.known)))
+    centre, loop = middle(design.y_bounds), []
+    twin.reset(u=start)
+    step = twin.step if isinstance(twin, Controller) else twin.solved
     for k in range(steps):
         y = plant.C @ x + 0.01 * size_y * rng.normal(size=len(size_y))
-        r, known = middle + moves[k:] * size_y, d[k:]
+        r, known = centre + moves[k:] * size_y, d[k:]
         r, known = (x[: design.horizon + 1] for x in (r, known))
         r = r if design.references == "preview" else r[:1]
         try:
@@ -206,7 +212,19 @@ def _run(design: Design, step: Callable[..., Array], steps: int) -> Loop:
             raise
         loop.append((y, r, known, u))
         x = plant.A @ x + plant.B @ (u + 0.05 * size_u) + plant.E @ known[0] + plant.offset
-    return Loop(*map(np.array, zip(*loop, strict=True)))
+    y, r, known, u = map(np.array, zip(*loop, strict=True))
+    return Loop(y, r, known, u, start[None])
+
+
+def _at_rest(controller: Controller) -> tuple[Array, Array, Array]:
+    """Return x, u and known of the model at rest in the middle of its outputs' bounds.
+
+    The known signals are those of the last step or reset, else zero.
+    """
+    design = controller.mpc.design
+    known = np.zeros(len(design.plant.known)) if controller.known is None else controller.known
+    rest = controller.mpc.target(middle(design.y_bounds), known=known)
+    return rest.x.numpy(), rest.u.numpy(), known
 
 
 def _replayed(controller: Controller, loop: Loop, dtype: str) -> Loop:
@@ -218,17 +236,13 @@ def _replayed(controller: Controller, loop: Loop, dtype: str) -> Loop:
     rounding = 8 * np.finfo(dtype).eps * np.random.default_rng(0).choice([-1, 1], loop.y.shape)
     near = 0.01 * NEAR[dtype] * half_range(design.u_bounds)
     twin = copy.copy(controller)
-    twin.reset()
-    for k, (y, r, known, u) in enumerate(zip(*loop, strict=True)):
+    twin.reset(u=loop.start[0])
+    for k, (y, r, known, u) in enumerate(zip(*loop[:4], strict=True)):
         off = np.abs(twin.step(y * (1 + rounding[k]), r, known) - u)
         if k == REPLAYED or (k and (off > near).any()):
-            return Loop(*(part[:k] for part in loop))
+            y, r, known, u = (part[:k] for part in loop[:4])
+            return Loop(y, r, known, u, loop.start)
     return loop
-
-
-def _middle(design: Design) -> Array:
-    """Return the middle of the outputs' bounds, zero where there is none."""
-    return np.where(np.isfinite(design.y_bounds).all(0), design.y_bounds, 0.0).mean(0)
 
 
 def _sources(controller: Controller, name: str, dtype: str, loop: Loop) -> dict[str, str]:
@@ -317,16 +331,19 @@ def _main(controller: Controller, name: str, dtype: str) -> str:
     """Return a program of the closed loop with the model, a load and a set-point in reach."""
     design = controller.mpc.design
     plant, sizes = design.plant, _sizes(controller)
-    load = 0.1 * plant.B @ half_range(design.u_bounds) + plant.offset
-    r = _middle(design) + 0.25 * half_range(design.y_bounds)
-    r = controller.mpc.target(r).y.numpy()
+    x, u, known = _at_rest(controller)
+    load = 0.1 * plant.B @ half_range(design.u_bounds) + plant.E @ known + plant.offset
+    r = middle(design.y_bounds) + 0.25 * half_range(design.y_bounds)
+    r = controller.mpc.target(r, known=known).y.numpy()
     arrays = {
         "A": plant.A,
         "B": plant.B,
         "C": plant.C,
         "LOAD": load,
         "R": np.tile(r, sizes["SET_POINTS"]),
-        "KNOWN": np.zeros(sizes["STAGES"] * sizes["N_D"]),
+        "KNOWN": np.tile(known, sizes["STAGES"]),
+        "START_X": x,
+        "START_U": u,
     }
     tables = "\n".join(["enum { STEPS = 200 };", *(array(k, x, dtype) for k, x in arrays.items())])
     return filled("controller_main.c", name, {"/* @PLANT@ */": tables})

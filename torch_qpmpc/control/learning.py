@@ -142,6 +142,7 @@ def _model(controller: Controller, held: Log, r: Any, spread: Any, steps: int) -
     identified = _identified(held, controller)
     y, d = (torch.cat(part).numpy() for part in list(zip(*held.trajectories, strict=True))[::2])
     middle = y.mean(0) if r is None else controller.read_set_points(r, 1)[0]
+    middle = np.clip(middle, *controller.mpc.design.y_bounds)
     size = _sizes(controller, spread, y.std(0))
     noise = identified.covariance.diagonal().sqrt().nan_to_num().numpy()
 
@@ -149,12 +150,15 @@ def _model(controller: Controller, held: Log, r: Any, spread: Any, steps: int) -
     n, m, n_y, _ = model.sizes
     balance = np.block([[np.eye(n) - model.A, -model.B], [model.C, np.zeros((n_y, m))]])
     loads = np.concatenate((model.E @ d.mean(0) + model.offset, middle))
-    x = np.linalg.lstsq(balance, loads, rcond=None)[0][:n]  # at rest in the middle
+    u = np.linalg.lstsq(balance, loads, rcond=None)[0][n:]  # at rest in the middle
+    rest = {"u": np.clip(u, *controller.mpc.design.u_bounds)}
+    ends = len(d) - 1
 
     def options(rng: np.random.Generator) -> dict[str, Any]:
         levels = _levels(controller, middle, size, steps, rng)
         start = int(rng.integers(max(len(d) - steps, 1)))
-        return {"known": d[start:], "r": levels, "noise": noise, "x": x}
+        known = d[np.minimum(start + np.arange(steps), ends)]
+        return {"known": known, "r": levels, "noise": noise, **rest}
 
     return Plant("a model of the log's last third", model, options)
 
@@ -233,7 +237,8 @@ def _with_model(controller: Controller, model: Identified) -> Controller:
     drift = controller._drift if w.names == old.disturbances.names else None
     options = {"noise": controller._noise, "drift": drift, "window": controller._window}
     candidate = Controller(mpc, **options)
-    candidate.r = controller.r
+    candidate.reset(u=controller.u)
+    candidate.r, candidate.rest = controller.r, controller.rest
     return candidate
 
 

@@ -159,6 +159,9 @@ class LinearMPC(QPMPC):
         """The last entry of p, which is one."""
         return {self.n_p - 1: 1.0}
 
+    def extra_repr(self) -> str:
+        return f"{self.design}, {super().extra_repr()}"
+
     def save(self, path: str | Path) -> None:
         """Write this MPC with its design to the file ``path``, as `QPMPC.save` does.
 
@@ -177,7 +180,7 @@ class LinearMPC(QPMPC):
         Raises:
             QPError: as in `QPMPC.load`, or the file has no design.
         """
-        content = load_file(path, KIND)
+        content = load_file(path, KIND, "LinearMPC")
         if "design" not in content:
             remedy = "QPMPC.load reads it."
             raise QPError.expected("path", f"{path}, a QPMPC", "a saved LinearMPC", remedy)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from torch_qpmpc.control.controller import Controller
-from torch_qpmpc.control.design import half_range
+from torch_qpmpc.control.design import half_range, middle
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import SolverError
 
@@ -36,19 +36,19 @@ class Probe:
 
 @torch.no_grad()
 def probe(controller: Controller) -> Probe:
-    """Run the loop; known signals are zero."""
+    """Run the loop, from rest in the middle of the outputs' bounds; known signals are held."""
     design, twin, rng = controller.mpc.design, copy.copy(controller), np.random.default_rng(0)
     plant = design.plant
-    twin.reset()
     size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
-    middle = np.where(np.isfinite(design.y_bounds).all(0), design.y_bounds, 0.0).mean(0)
-    known, x, last, load = np.zeros(len(plant.known)), None, twin.u, LOAD * size_u
+    centre, load = middle(design.y_bounds), LOAD * size_u
+    known = np.zeros(len(plant.known)) if controller.known is None else controller.known
+    x, last, _ = (part.numpy() for part in controller.mpc.target(centre, known=known))
+    twin.reset(u=last)
     costs: dict[str, float] = {}
     states = []
     for k in range(STEPS):
         if k % HELD == 0:
-            r = middle + MOVE * size_y * rng.uniform(-1, 1, len(size_y))
-        x = np.linalg.pinv(plant.C) @ middle if x is None else x
+            r = centre + MOVE * size_y * rng.uniform(-1, 1, len(size_y))
         y = plant.C @ x
         try:
             u = twin.step(y, r, known)
@@ -65,7 +65,7 @@ def probe(controller: Controller) -> Probe:
             for i in np.flatnonzero(weight.any(0)):
                 key = f"{name} of {names[i]}"
                 costs[key] = costs.get(key, 0.0) + float(signal[i] * (weight[i] @ signal))
-        x, last = plant.A @ x + plant.B @ (u + load) + plant.offset, u
+        x, last = plant.A @ x + plant.B @ (u + load) + plant.E @ known + plant.offset, u
     whole = sum(costs.values()) or 1.0
     shares = {name: cost / whole for name, cost in sorted(costs.items(), key=lambda x: -x[1])}
     changes = np.zeros(0)

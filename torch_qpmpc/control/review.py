@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import base64
-import html
+import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from io import BytesIO
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.optimize
 import torch
-from matplotlib.figure import Figure
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.control.controller import Controller
-from torch_qpmpc.control.design import half_range
+from torch_qpmpc.control.design import half_range, middle
+from torch_qpmpc.control.findings import Finding, Review
 from torch_qpmpc.control.linear_mpc import Target
 from torch_qpmpc.control.loop import LinearLoop
 from torch_qpmpc.control.lowering import riccati
@@ -37,117 +33,35 @@ MARGIN, CONDITION, SPREAD, HIDDEN = 0.3, 1e8, 1e4, 1e-3
 IDLE = 1e-6
 #: Offsets relative to half the distance of an output's bounds.
 OFFSET = 1e-6
+#: A response below this share of the largest, for inputs of half their range, is noise of a fit.
+SHOWS = 0.03
 #: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
 LARGEST = 2.0
-PAGE = """<!doctype html>
-<meta charset="utf-8">
-<title>Review of a controller</title>
-<style>
-body {{ font-family: sans-serif; max-width: 60em; margin: 2em auto }}
-td, th {{ text-align: left; vertical-align: top; padding: 0.2em 1em 0.2em 0 }}
-img {{ max-width: 100% }}
-</style>
-<h1>Review of a controller</h1>
-<table>
-{table}
-</table>
-{images}
-"""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One question to a design.
-
-    Attributes:
-        name: the subject, such as ``"stability"``.
-        ok: False if it is a fault.
-        numbers: the answer, by name.
-        remedy: what mends the fault; empty if it is none.
-    """
-
-    name: str
-    ok: bool
-    numbers: Mapping[str, Any]
-    remedy: str = ""
-
-    @property
-    def text(self) -> str:
-        """The numbers in words."""
-        return "; ".join(f"{key} {_number(x)}" for key, x in self.numbers.items())
-
-
-@dataclass(frozen=True)
-class Review:
-    """The findings about a controller; ``print`` shows them.
-
-    Attributes:
-        findings: all of them; those that need a definite cost, as proofs do, or a stable loop only
-            with one.
-    """
-
-    findings: list[Finding] = field(default_factory=list)
-
-    @property
-    def faults(self) -> list[Finding]:
-        """The findings that are not ok."""
-        return [finding for finding in self.findings if not finding.ok]
-
-    def __getitem__(self, name: str) -> Finding:
-        return {finding.name: finding for finding in self.findings}[name]
-
-    def __str__(self) -> str:
-        lines = [f"{len(self.faults)} faults in {len(self.findings)} findings"]
-        for finding in self.findings:
-            lines.append(f"{'ok   ' if finding.ok else 'FAULT'} {finding.name}: {finding.text}")
-            lines += [f"      {finding.remedy}"] * (not finding.ok)
-        return "\n".join(lines)
-
-    def to_markdown(self) -> str:
-        """Return a page with a table of the findings."""
-        rows = [("Finding", "", "Numbers", "Remedy"), ("---",) * 4]
-        rows += [(x.name, "ok" if x.ok else "**fault**", x.text, x.remedy) for x in self.findings]
-        cells = ("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)
-        return "\n".join(("# Review of a controller", "", *cells, ""))
-
-    def to_html(self, path: str | Path, *figures: Figure) -> None:
-        """Write a page with a table of the findings and ``figures`` below it, such as a `Run`'s.
-
-        It is one file, and loads nothing from elsewhere.
-
-        Raises:
-            OSError: writing failed.
-        """
-        rows = [("th", ("Finding", "", "Numbers", "Remedy"))]
-        rows += [
-            ("td", (x.name, "ok" if x.ok else "fault", x.text, x.remedy)) for x in self.findings
-        ]
-        table = "\n".join(
-            "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row) + "</tr>"
-            for tag, row in rows
-        )
-        images = []
-        for figure in figures:
-            figure.savefig(buffer := BytesIO(), format="png")
-            data = base64.b64encode(buffer.getvalue()).decode()
-            images.append(f'<img alt="" src="data:image/png;base64,{data}">')
-        Path(path).write_text(PAGE.format(table=table, images="\n".join(images)), encoding="utf-8")
 
 
 def review(
-    controller: Controller, r: Array | None = None, proofs: Mapping[str, Answer] | None = None
+    controller: Controller,
+    r: Any = None,
+    known: Any = None,
+    proofs: Mapping[str, Answer] | None = None,
 ) -> Review:
     """Return the findings about a controller; see `Controller.review`."""
-    mpc = controller.mpc
+    mpc, controller = controller.mpc, copy.copy(controller)
+    if r is not None:
+        controller.r = controller.read_set_points(r, 1)
+    if known is not None:
+        controller.known = controller.read_known(known, 1)[0]
     checks: list[Callable[[Controller], Finding]] = [
         _terminal,
+        _gains,
         _horizon,
         _disturbances,
         _scaling,
         _hard_rows,
+        _set_points,
     ]
     cost = _cost(controller)
-    findings = [cost, *(check(controller) for check in checks), _set_points(controller, r)]
+    findings = [cost, *(check(controller) for check in checks)]
     if not cost.ok:
         return Review(findings)
     plan, target = make_tables(mpc), make_tables(mpc.targets)
@@ -218,18 +132,35 @@ def _modes(A: Array, C: Array) -> list[float]:
     return modes
 
 
+def _gains(controller: Controller) -> Finding:
+    """Each output's gains by inputs and known signals, for a look at signs and sizes."""
+    plant, N = controller.mpc.design.plant, controller.mpc.horizon
+    acting = plant.E.any(0)
+    names = (*plant.inputs, *np.array(plant.known)[acting])
+    A, B = plant.A, np.hstack((plant.B, plant.E[:, acting]))
+    steady = np.abs(np.linalg.eigvals(A)).max() < 1 - 1e-9
+    powers = (np.linalg.matrix_power(A, k) for k in range(N))
+    x = np.linalg.solve(np.eye(len(A)) - A, B) if steady else sum(powers) @ B
+    when = "in steady state" if steady else f"after {N} steps"
+    numbers = {
+        f"{y} per unit of {', '.join(names)} {when}": row
+        for y, row in zip(plant.outputs, plant.C @ x, strict=True)
+    }
+    return Finding("gains", True, numbers)
+
+
 def _horizon(controller: Controller) -> Finding:
     """The plan is longer than dead times and inverse responses."""
     design, N = controller.mpc.design, controller.mpc.horizon
     plant, numbers, needed = design.plant, {}, 1
     stable = np.abs(np.linalg.eigvals(plant.A)).max() < 1 + 1e-9
-    x, steps = plant.B, []
+    x, steps = plant.B * half_range(design.u_bounds), []
     for _ in range(max(10 * N, 200)):
         steps.append(plant.C @ x)
         x = plant.A @ x
-    size = 1e-9 * np.outer(np.linalg.norm(plant.C, axis=1), np.linalg.norm(plant.B, axis=0))
     responses = np.cumsum(steps, 0)
-    away = np.abs(responses) <= size
+    sizes = np.abs(responses)
+    away = sizes <= SHOWS * sizes[: 2 * N].max((0, 2), keepdims=True)
     if stable:
         away |= np.sign(responses) != np.sign(responses[-1])
     for i in np.flatnonzero(np.diag(design.Q)):
@@ -278,18 +209,21 @@ def _scaling(controller: Controller) -> Finding:
 def _hard_rows(controller: Controller) -> Finding:
     """Outputs off the set-point, and last inputs at their bounds, leave a plan."""
     mpc, design = controller.mpc, controller.mpc.design
-    n_y, n_d = design.plant.sizes[2:]
+    n_y = len(design.Q)
     half = np.diag(half_range(design.y_bounds))
     off = np.linspace(0.05, LARGEST, 40)[:, None, None] * np.vstack((half, -half))
     off = off.reshape(-1, n_y)
-    rest = mpc.target(controller.r[0] if len(controller.r) else np.zeros(n_y))
+    known = _known(controller)
+    r = controller.r[0] if len(controller.r) else middle(design.y_bounds)
+    rest = mpc.target(r, known=known)
     x = np.vstack((off @ np.linalg.pinv(design.plant.C).T, np.zeros((2, len(rest.x)))))
     x = rest.x.numpy() + x
     ends = np.where(np.isfinite(design.u_bounds), design.u_bounds, rest.u.numpy())
     u_last = np.vstack((np.tile(rest.u, (len(off), 1)), ends))
     stages = (len(x), mpc.horizon + 1) if design.references == "preview" else (len(x),)
     target = Target(*(part.expand(*stages, -1) for part in rest))
-    p = mpc.arrange(x, target, u_last=u_last, known=np.zeros((len(x), mpc.horizon + 1, n_d)))
+    ahead = np.tile(known, (len(x), mpc.horizon + 1, 1))
+    p = mpc.arrange(x, target, u_last=u_last, known=ahead, level=known)
     status = solve_qp(mpc.quadratic_program(), p, solver="daqp", on_failure="mask").status
     hard = design.bounded[0] & np.isinf(design.y_slack)
     names = ", ".join(name for name, x in zip(design.plant.outputs, hard, strict=True) if x)
@@ -299,25 +233,32 @@ def _hard_rows(controller: Controller) -> Finding:
         return Finding("hard bounds", True, numbers)
     if (i := failed[0]) < len(off):
         numbers |= {"outputs off the set-point that leave no plan": off[i], "at the state": x[i]}
-        return Finding("hard bounds", False, numbers, f"Give {names} a finite y_slack.")
-    numbers |= {"last inputs that leave no plan": u_last[i]}
-    return Finding("hard bounds", False, numbers, "Let du_bounds contain zero.")
+    else:
+        numbers |= {"last inputs that leave no plan": u_last[i]}
+    return Finding("hard bounds", False, numbers, f"Give {names} a finite y_slack.")
 
 
-def _set_points(controller: Controller, r: Array | None) -> Finding:
+def _known(controller: Controller) -> Array:
+    n_d = controller.mpc.design.plant.sizes[3]
+    return np.zeros(n_d) if controller.known is None else controller.known
+
+
+def _set_points(controller: Controller) -> Finding:
     """Set-points and bands of outputs are within reach of the inputs' bounds."""
-    design = controller.mpc.design
+    design, known = controller.mpc.design, _known(controller)
     names, weighted = design.plant.outputs, np.diag(design.Q) > 0
-    r = controller.r[-1] if r is None and len(controller.r) else r
     lower, upper = _reach(controller)
-    numbers: dict[str, Any] = {}
+    assumed = " (not known, assumed)" if controller.known is None else ""
+    acting = np.flatnonzero(design.plant.E.any(0))
+    numbers: dict[str, Any] = {f"at {design.plant.known[i]}{assumed}": known[i] for i in acting}
     faults = []
     for i, name in enumerate(names):
         numbers[f"{name} reaches"] = np.array([lower[i], upper[i]])
         if lower[i] > design.y_bounds[1][i] or upper[i] < design.y_bounds[0][i]:
             faults.append(f"Let y_bounds of {name} overlap {lower[i]:.4g} .. {upper[i]:.4g}.")
-    if r is not None and weighted.any():
-        y = controller.mpc.target(r, controller.w).y.numpy()
+    if len(controller.r) and weighted.any():
+        r = controller.r[-1]
+        y = controller.mpc.target(r, controller.w, known).y.numpy()
         for i in np.flatnonzero(weighted & (np.abs(y - r) > OFFSET * half_range(design.y_bounds))):
             numbers[f"nearest {names[i]}"] = y[i]
             faults.append(f"Set {names[i]} to {y[i]:.4g}, not {r[i]:.4g}, or widen the bounds.")
@@ -327,7 +268,7 @@ def _set_points(controller: Controller, r: Array | None) -> Finding:
 def _reach(controller: Controller) -> tuple[Array, Array]:
     """Return the least and the largest steady value of each output within the inputs' bounds."""
     steady, w = controller.mpc.design.steady, controller.w
-    loads = np.concatenate((w, np.zeros(steady.y.shape[1] - len(w) - 1), [1.0]))
+    loads = np.concatenate((w, _known(controller), [1.0]))
     lower, upper = (side - steady.u @ loads for side in controller.mpc.design.u_bounds)
     rows = np.vstack((steady.U, -steady.U))
     limits = np.concatenate((upper, -lower))
@@ -418,9 +359,3 @@ def _proof(name: str, answer: Answer, digest: str) -> Finding:
     numbers |= {f"d_{k}": d for k, d in enumerate(answer.disturbances) if len(d)}
     remedy = "Claim it of a smaller set, or of smaller disturbances, or tighten the bounds."
     return Finding(name, False, numbers, remedy)
-
-
-def _number(x: Any) -> str:
-    if isinstance(x, np.ndarray):
-        return "[" + ", ".join(f"{y:.4g}" for y in x.ravel()) + "]"
-    return x if isinstance(x, str) else f"{x:.4g}"

@@ -21,13 +21,14 @@ def read_row(name: str, value: Any, names: Sequence[str]) -> Array:
     return read_table(name, value, names, 1)[0]
 
 
-def read_table(name: str, value: Any, names: Sequence[str], rows: int) -> Array:
+def read_table(name: str, value: Any, names: Sequence[str], rows: int, least: int = 1) -> Array:
     """Return ``(rows, len(names))`` from a mapping or DataFrame of columns, or an array.
 
     One row stands for all; a table that ends early holds its last row, and a longer one is cut.
 
     Raises:
-        QPError: a name is missing or unknown, a number is not finite, or the shape is wrong.
+        QPError: a name is missing or unknown, a number is not finite, the shape is wrong, or more
+            than one row and fewer than ``least``.
     """
     if hasattr(value, "columns"):  # a DataFrame
         value = {column: value[column].to_numpy() for column in value.columns if column in names}
@@ -48,5 +49,7 @@ def read_table(name: str, value: Any, names: Sequence[str], rows: int) -> Array:
         raise QPError.expected(name, f"shape {table.shape}", want)
     if not np.isfinite(table).all():
         raise QPError.expected(name, "NaN or inf", "finite numbers")
+    if 1 < len(table) < least:
+        raise QPError.expected(name, f"{len(table)} rows", f"one row, or at least {least}")
     held = np.minimum(np.arange(rows), len(table) - 1)
     return table[held]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 import torch
 from matplotlib.figure import Figure
 
@@ -14,6 +15,7 @@ from torch_qpmpc.analysis.episode import episode_figure
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import Design, read_vector
+from torch_qpmpc.control.disturbance import RANK
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model
 from torch_qpmpc.errors import QPError
 
@@ -28,6 +30,7 @@ class Run:
         u: inputs ``(T, m)``.
         known: known signals, ``(T, n_d)``.
         u_s: the inputs that hold the target, ``(T, m)``.
+        u_last: the input before the first step, ``(m,)``.
     """
 
     design: Design
@@ -36,6 +39,12 @@ class Run:
     u: Array
     known: Array
     u_s: Array
+    u_last: Array
+
+    def __repr__(self) -> str:
+        """Return its size, cost and end."""
+        last = dict(zip(self.design.plant.outputs, self.y[-1].round(4).tolist(), strict=True))
+        return f"Run({len(self.u)} steps, cost {self.cost.sum():.4g}, at the end {last})"
 
     @property
     def cost(self) -> Array:
@@ -49,11 +58,10 @@ class Run:
         violations of outputs' bounds.
         """
         design, y = self.design, self.y[:-1]
-        start = np.clip(np.zeros((1, u_s.shape[1])), *design.u_bounds)
         parts = (
             (y - self.r[:-1], design.Q),
             (self.u - u_s, design.R),
-            (np.diff(self.u, axis=0, prepend=start), design.dR),
+            (np.diff(self.u, axis=0, prepend=self.u_last[None]), design.dR),
         )
         cost = sum(np.einsum("ki,ij,kj->k", x, weight, x) for x, weight in parts)
         for name, price in design.linear.items():
@@ -96,6 +104,7 @@ def simulate(
     r: Any,
     *,
     known: Any = None,
+    u: Any = None,
     load: Any = 0.0,
     noise: Any = 0.0,
     x: Any = None,
@@ -107,36 +116,42 @@ def simulate(
     design, twin = controller.mpc.design, copy.copy(controller)
     rows = design.horizon + 1
     announced = known is None and hasattr(plant, "reset")  # by the environment, step by step
-    d = np.empty((0, 0)) if announced else controller.read_known(known, steps + rows)
+    d = np.empty((0, 0)) if announced else controller.read_known(known, steps + rows, steps)
     set_points = controller.read_set_points(r, steps + rows)
     load = read_vector("load", load, design.plant.inputs, 0.0)
     noise = read_vector("noise", noise, design.plant.outputs, 0.0)
     if not ((noise >= 0) & np.isfinite(noise)).all():
         raise QPError.expected("noise", f"{noise.tolist()}", "standard deviations >= 0")
-    twin.reset()
+    y, last = controller.rest
+    twin.reset(u=last if u is None else u)
+    start = twin.u
     if not hasattr(plant, "reset"):
         model = design.plant if plant is None else read_model(plant)
-        plant = _Model(model, design, d, twin.u + load, x)
+        plant = _Model(model, design, d, start, y, x)
     rng, (observed, info) = np.random.default_rng(seed), plant.reset(seed=seed)
     ys, us, ds, held = [], [], [], []
     for k in range(steps):
         ys.append(observed + noise * rng.normal(size=len(design.Q)))
         ahead = twin.read_known(info.get("known"), rows) if announced else d[k : k + rows]
-        u = twin.step(ys[-1], set_points[k : k + rows], ahead)
-        us.append(u)
+        us.append(twin.step(ys[-1], set_points[k : k + rows], ahead))
         ds.append(ahead[0])
         assert twin.target is not None
-        held.append(twin.target.u.numpy().reshape(-1, len(u))[0])
-        observed, *_, info = plant.step(u + load)
+        held.append(twin.target.u.numpy().reshape(-1, len(load))[0])
+        observed, *_, info = plant.step(us[-1] + load)
     ys.append(observed + noise * rng.normal(size=len(design.Q)))
-    y, u, d, u_s = map(np.array, (ys, us, ds, held))
-    return Run(design, y, set_points[: steps + 1], u, d, u_s)
+    measured, inputs, d, u_s = map(np.array, (ys, us, ds, held))
+    return Run(design, measured, set_points[: steps + 1], inputs, d, u_s, start)
 
 
 class _Model:
-    """A model with Gymnasium's ``reset`` and ``step``, which rests with the input u at first."""
+    """A model with Gymnasium's ``reset`` and ``step``, which rests with the input u at first.
 
-    def __init__(self, model: StateSpace, design: Design, d: Array, u: Array, x: Any) -> None:
+    Its outputs are near y there, as far as integrators leave them free.
+    """
+
+    def __init__(
+        self, model: StateSpace, design: Design, d: Array, u: Array, y: Array | None, x: Any
+    ) -> None:
         got, want = model.sizes[1:3], design.plant.sizes[1:3]
         if got != want:
             got, want = (f"{m} inputs and {n_y} outputs" for m, n_y in (got, want))
@@ -147,6 +162,9 @@ class _Model:
             raise QPError.expected("plant", got, want)
         still = np.eye(len(model.A)) - model.A
         rest = np.linalg.lstsq(still, self._driven(u, 0), rcond=None)[0]
+        free = scipy.linalg.null_space(still, rcond=RANK)  # an integrator rests anywhere
+        off = (0.0 if y is None else y) - model.C @ rest
+        rest = rest + free @ np.linalg.pinv(model.C @ free) @ off
         states = [f"x{i + 1}" for i in range(len(model.A))]
         self._start = rest if x is None else read_vector("x", x, states, 0.0)
 

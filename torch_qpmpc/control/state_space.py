@@ -87,11 +87,13 @@ def read_model(
         E: the factor of known signals, ``(n, n_d)``.
         dt: the sampling time; a continuous system is sampled with it, by zero-order hold.
         inputs, outputs, known: names; by default the system's own, or u1, .. and y1, ... Inputs of
-            a system that are named in ``known`` become known signals.
+            a system that are named in ``known`` become known signals. Those of an identification
+            are all in ``known``; others there, such as a price, do not act on the plant.
         prices: known signals that act on no plant: what an identification says of them is noise.
 
     Raises:
-        QPError: the model is of another kind, has a direct feedthrough, or needs another dt.
+        QPError: the model is of another kind, has a direct feedthrough, or needs another dt; or a
+            known signal of an identification is missing in ``known``.
     """
     if dt is not None:
         check_number("dt", dt, lambda x: 0 < x < np.inf, "a sampling time > 0")
@@ -103,7 +105,12 @@ def read_model(
         log, dt = model.log, model.log.dt if dt is None else dt
         units = dict(log.units)
         inputs, outputs, known = inputs or log.inputs, outputs or log.outputs, known or log.known
-        E = E * [name not in prices for name in known]
+        if not {*known} >= {*log.known}:
+            want = f"all known signals of the log, {', '.join(log.known)}"
+            remedy = f"Pass known={[*log.known, *(x for x in known if x in prices)]}."
+            raise QPError.expected("known", f"{list(known)}", want, remedy)
+        column = {x: E[:, i] for i, x in enumerate(log.known) if x not in prices}
+        E = np.stack([column.get(x, np.zeros(len(A))) for x in known], -1) if known else E
     elif isinstance(model, Sequence) and len(model) in (2, 3):
         A, B, *rest = (_matrix(f"model[{i}]", x) for i, x in enumerate(model))
         C = rest[0] if rest else np.eye(len(A))

@@ -139,7 +139,7 @@ static int plan(policy_state *s, const real known[])
     return code;
 }
 
-void policy_reset(policy_state *s, const real y[])
+void policy_reset(policy_state *s, const real y[], const real u[])
 {
     int i;
     policy_plan_reset(&s->plan);
@@ -148,7 +148,7 @@ void policy_reset(policy_state *s, const real y[])
     policy_free_reset(&s->free);
 #endif
     for (i = 0; i < N_E; i++) s->e[i] = 0;
-    for (i = 0; i < N_U; i++) s->u[i] = within(0, i);
+    for (i = 0; i < N_U; i++) s->u[i] = u ? u[i] : within(0, i);
     for (i = 0; i < SET_POINTS * N_Y; i++) s->r[i] = 0;
     s->starts = y ? 2 : 1;
     if (y) copy(s->y, y, N_Y);
@@ -183,7 +183,7 @@ int policy_selftest(void)
 #if POLICY_N_F
     if (policy_free_selftest()) return 2;
 #endif
-    policy_reset(&state, 0);
+    policy_reset(&state, 0, EXAMPLE_START[0]);
     for (i = 0; i < EXAMPLES; i++) {
         if (policy_step(&state, EXAMPLE_Y[i], EXAMPLE_R[i], EXAMPLE_KNOWN[i], u)) return 3 + i;
         for (j = 0; j < N_U; j++) {

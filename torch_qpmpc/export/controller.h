@@ -41,11 +41,11 @@ typedef struct {
     int starts;                                  /* 1 before the first step, 2 with a y to rest at */
 } policy_state;
 
-/* Forget the past: the plant rests with the outputs y, those of the first step if y is null.
+/* Forget the past: the plant rests with the outputs y, those of the first step if y is null, and
+   with the input u, the one nearest to zero within its bounds if u is null.
 
-   The last input, which moves are counted from, is the one nearest to zero within its bounds. Write
-   state->u afterwards if another input holds the plant. */
-void policy_reset(policy_state *state, const policy_real y[]);
+   u is the last input, which moves are counted from: another than the plant's is a bump. */
+void policy_reset(policy_state *state, const policy_real y[], const policy_real u[]);
 
 /* Write the input u for measured outputs y; return one of the codes above.
 

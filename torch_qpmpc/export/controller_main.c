@@ -1,4 +1,5 @@
-/* The closed loop of the controller with a plant: its model with a load. Put yours in place of it.
+/* The closed loop of the controller with a plant: its model, at rest until a load comes. Put yours
+   in place of it.
 
    Each line has the step, the outputs, the inputs and the code of policy_step. */
 #include <stdio.h>
@@ -11,10 +12,11 @@ typedef policy_real real;
 int main(void)
 {
     static policy_state state;
-    real x[POLICY_N_X] = {0}, next[POLICY_N_X], y[POLICY_N_Y], u[POLICY_N_U];
+    real x[POLICY_N_X], next[POLICY_N_X], y[POLICY_N_Y], u[POLICY_N_U];
     int i, j, k, code = policy_selftest();
     if (code) fprintf(stderr, "self-test: number %d fails\n", code);
-    policy_reset(&state, 0);
+    policy_reset(&state, 0, START_U);
+    for (i = 0; i < POLICY_N_X; i++) x[i] = START_X[i];
     for (k = 0; k < STEPS && !code; k++) {
         for (i = 0; i < POLICY_N_Y; i++)
             for (y[i] = 0, j = 0; j < POLICY_N_X; j++) y[i] += C[i][j] * x[j];

@@ -134,12 +134,17 @@ class Identified:
             str(log),
             f"{self.options.structure} C from {log.steps} transitions in {len(log.trajectories)} "
             f"trajectories, {', '.join(f'{name}={getattr(layout, name)}' for name in SIZES)}",
-            f"{'steps':>6}  {'RMSE of ' + ', '.join(map(log.label, log.outputs)):38}R2,"
-            " cross-validated",
         ]
-        for k in sorted({k for k in (1, 2, 5, 10, 20, 50, 100) if k < N} | {N}):
+        rows = [("RMSE of " + ", ".join(map(log.label, log.outputs)), "R2, cross-validated")]
+        steps = sorted({k for k in (1, 2, 5, 10, 20, 50, 100) if k < N} | {N})
+        for k in steps:
             errors = " ".join(f"{x:.3g}" for x in self.rmse[k - 1].tolist())
-            lines.append(f"{k:6}  {errors:38}{' '.join(f'{x:.3f}' for x in self.R2[k - 1])}")
+            rows.append((errors, " ".join(f"{x:.3f}" for x in self.R2[k - 1])))
+        width = max(38, *(len(errors) + 2 for errors, _ in rows))
+        lines += [
+            f"{k:>6}  {errors:{width}}{R2}"
+            for k, (errors, R2) in zip(("steps", *steps), rows, strict=True)
+        ]
         return "\n".join(lines)
 
 
