@@ -7,5 +7,11 @@ from pathlib import Path
 PACKAGED = Path(__file__).with_name("command")
 FOLDER = PACKAGED if PACKAGED.exists() else Path(__file__).parents[1]
 
-if __name__ == "__main__":
+
+def main() -> None:
+    """Run the command line; a script calls this after it has registered a task of its own."""
     runpy.run_path(str(FOLDER / "train.py"), run_name="__main__")
+
+
+if __name__ == "__main__":
+    main()
