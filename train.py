@@ -45,7 +45,7 @@ from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import learning_start, make_start, transitions
 from torch_qpmpc.experiment.tally import Tally
-from torch_qpmpc.experiment.tasks import make_mpc, make_physics, resume_arguments
+from torch_qpmpc.experiment.tasks import COMMAND, make_mpc, make_physics, resume_arguments
 
 # Absolute, so that a user's script can call main.
 CONFIGS = str(Path(__file__).with_name("configs"))
@@ -104,7 +104,7 @@ def _train(
         stack.callback(collector.shutdown)
         after = None if state is None else state["update"]
         run = stack.enter_context(RunFolder(folder, cfg, after))
-        command = f"python train.py {resume_arguments(run.path, cfg.task)}"
+        command = f"{COMMAND} {resume_arguments(run.path, cfg.task)}"
 
         # Warm up, or resume.
         if state is None:

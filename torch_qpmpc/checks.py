@@ -15,11 +15,16 @@ from torch import Tensor
 from torch_qpmpc.errors import QPError
 
 
+def class_name(value: Any) -> str:
+    """Return the name of a value's class, without torch's prefix if it has parametrizations."""
+    return type(value).__name__.removeprefix("Parametrized")
+
+
 def check_kind(name: str, value: Any, kind: type, remedy: str = "") -> None:
     """Raise `QPError` unless ``value`` is a ``kind``."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        got = type(value).__name__
+        got = class_name(value)
         raise QPError.expected(name, got, f"{article} {kind.__name__}", remedy)
 
 
@@ -77,7 +82,7 @@ def check_tensor(
         QPError: its type, shape or device is wrong.
     """
     if not isinstance(value, Tensor) or not value.is_floating_point():
-        got = value.dtype if isinstance(value, Tensor) else type(value).__name__
+        got = value.dtype if isinstance(value, Tensor) else class_name(value)
         how = f"Convert it: torch.as_tensor({name}).float()."
         raise QPError.expected(name, got, "a floating-point torch.Tensor", how)
     lead = value.ndim - len(event)

@@ -18,7 +18,6 @@ class QPError(ValueError):
     def expected(cls, name: str, got: object, expected: str, remedy: str = "") -> QPError:
         """Return the error ``{name}: got {got}, expected {expected}. {remedy}``."""
         tail = f" {remedy}" if remedy else ""
-        got = str(got).replace("Parametrized", "")  # torch's prefix of classes
         return cls(printable(f"{name}: got {got}, expected {expected}.{tail}"))
 
 

@@ -100,6 +100,21 @@ def test_loops_of_a_log_start_at_rest_at_its_levels():
     assert report.before < 1, "a start at another input would cost thousands"
 
 
+@pytest.mark.parametrize("pole", [0.999, 1.0])
+def test_so_do_those_of_a_slow_plant_with_a_known_signal_that_varies(pole):
+    rng, T = np.random.default_rng(0), [20.0]
+    u, d = rng.uniform(-0.5, 0.5, 600).repeat(3)[:600], rng.normal(size=600)
+    for k in range(599):
+        u[k] -= 0.1 * (T[k] - 20.0)
+        T.append(20.0 + pole * (T[k] - 20.0) + 0.5 * u[k] + 0.1 * d[k] + 0.01 * rng.normal())
+    signals = {"T": T, "q": u, "d": d}
+    log = qm.read_log(signals, outputs=["T"], inputs=["q"], known=["d"])
+    names = {"inputs": ["q"], "outputs": ["T"], "known": ["d"], "E": [[0.1]]}
+    model = ([[pole]], [[0.5]])
+    mpc = qm.LinearMPC(model, 5, Q=1.0, dR=0.5, u_bounds=(-3.0, 3.0), **names)
+    assert qm.Controller(mpc).learn(log, steps=12, spread=0.1).before < 5
+
+
 def test_a_candidate_that_fails_is_not_accepted(monkeypatch):
     controller, simulate = made(WRONG), learning.simulate
 

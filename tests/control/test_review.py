@@ -147,6 +147,23 @@ def test_findings_are_about_the_last_known_signals_or_those_passed():
     assert controller.review()["set-points"].text.startswith("at rain (not known, assumed) 0;")
 
 
+def test_known_signals_that_no_input_balances_are_a_fault():
+    options = {"E": [[1.0]], "known": ["d"], "u_bounds": (-1.0, 0.0)}
+    controller = qm.Controller(qm.LinearMPC(([[1.0]], [[0.5]]), 10, Q=1.0, dR=0.1, **options))
+    finding = controller.review(known={"d": [5.0]})["set-points"]
+    assert not finding.ok
+    assert finding.remedy.startswith("No input within its bounds holds the plant")
+    assert controller.review(known={"d": [0.2]})["set-points"].ok
+
+
+@pytest.mark.parametrize("horizon", [10, 30])
+def test_an_integrator_responds_as_early_with_any_horizon(horizon):
+    model = ([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]], [[1.0, 0.0]])
+    mpc = qm.LinearMPC(model, horizon, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
+    numbers = qm.Controller(mpc).review()["horizon"].numbers
+    assert numbers["steps until y1 responds in its direction"] == 1
+
+
 def test_gains_are_those_of_steps():
     options = {"E": [[0.1, 0.0]], "known": ["rain", "price"]}
     gains = made(LAG, **options)["gains"].numbers

@@ -60,6 +60,26 @@ def test_an_integrator_starts_at_the_outputs_of_the_last_reset():
     assert np.allclose(controller.simulate(steps=3, r=[50.0]).y, 50.0)
 
 
+@pytest.mark.parametrize("pole", [0.9999, 1 - 1e-10, 1.0003])
+def test_so_does_a_plant_that_nearly_integrates_with_its_known_signals(pole):
+    mpc = qm.LinearMPC(([[pole]], [[1.0]]), 10, Q=1.0, dR=0.1, E=[[1.0]], known=["d"])
+    controller = qm.Controller(mpc)
+    controller.reset(y=[5.0], u=[-0.3], known=[0.25])
+    run = controller.simulate(steps=60, r=[5.0])
+    assert np.allclose(run.y[0], 5.0, atol=1e-3)
+    assert np.allclose(run.y[-1], 5.0, atol=1e-3)
+    assert np.array_equal(run.known, np.full((60, 1), 0.25))
+
+
+def test_an_environment_without_gymnasium_s_reset_is_named():
+    class Bare:
+        def reset(self, *, seed=None):
+            return np.zeros(1)
+
+    with pytest.raises(QPError, match="plant: got Bare, expected Gymnasium's reset and step"):
+        made().simulate(Bare(), 3, r=[0.0])
+
+
 def test_the_cost_is_that_of_its_formula():
     controller = made(linear={"u1": "price"}, E=[[0.0]], known=["price"])
     known = {"price": np.linspace(0, 0.1, 40)}

@@ -99,8 +99,8 @@ class Controller:
 
         Args:
             y: outputs, by name or as a vector.
-            u: the input that holds the plant there, by default the one nearest to zero within the
-                bounds. It is the last input that moves are counted from.
+            u: the input that holds the plant there, by default zero; it is clipped into the bounds.
+                It is the last input that moves are counted from.
             known: known signals, as in `step`.
 
         Raises:
@@ -108,9 +108,8 @@ class Controller:
         """
         plant = self._design.plant
         self._qp = self.mpc.quadratic_program()
-        self.u = np.clip(np.zeros(len(plant.inputs)), *self._design.u_bounds)
-        if u is not None:
-            self.u = read_row("u", u, plant.inputs)
+        last = np.zeros(len(plant.inputs)) if u is None else read_row("u", u, plant.inputs)
+        self.u = np.clip(last, *self._design.u_bounds)
         y = None if y is None else read_row("y", y, plant.outputs)
         self.rest: tuple[Array | None, Array] = (y, self.u)
         self.known: Array | None = None

@@ -238,7 +238,10 @@ def _replayed(controller: Controller, loop: Loop, dtype: str) -> Loop:
     twin = copy.copy(controller)
     twin.reset(u=loop.start[0])
     for k, (y, r, known, u) in enumerate(zip(*loop[:4], strict=True)):
-        off = np.abs(twin.step(y * (1 + rounding[k]), r, known) - u)
+        try:
+            off = np.abs(twin.step(y * (1 + rounding[k]), r, known) - u)
+        except SolverError:  # at the edge of hard bounds
+            off = np.full_like(u, np.inf)
         if k == REPLAYED or (k and (off > near).any()):
             y, r, known, u = (part[:k] for part in loop[:4])
             return Loop(y, r, known, u, loop.start)

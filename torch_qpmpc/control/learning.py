@@ -19,7 +19,7 @@ from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import half_range, read_vector
 from torch_qpmpc.control.disturbance import choose
-from torch_qpmpc.control.linear_mpc import OPTIONS, LinearMPC
+from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import lowered
 from torch_qpmpc.control.observer import SMALL
 from torch_qpmpc.control.simulation import Run, simulate
@@ -29,6 +29,7 @@ from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.log import STILL, Log, as_log
+from torch_qpmpc.mpc.scheme import KEYWORDS
 from torch_qpmpc.mpc.trajectories import Trajectory, folds
 
 #: Number of parts that a log is cut into; the last one is held out.
@@ -150,8 +151,8 @@ def _model(controller: Controller, held: Log, r: Any, spread: Any, steps: int) -
     n, m, n_y, _ = model.sizes
     balance = np.block([[np.eye(n) - model.A, -model.B], [model.C, np.zeros((n_y, m))]])
     loads = np.concatenate((model.E @ d.mean(0) + model.offset, middle))
-    u = np.linalg.lstsq(balance, loads, rcond=None)[0][n:]  # at rest in the middle
-    rest = {"u": np.clip(u, *controller.mpc.design.u_bounds)}
+    x, u = np.split(np.linalg.lstsq(balance, loads, rcond=None)[0], [n])  # at rest in the middle
+    rest = {"x": x, "u": np.clip(u, *controller.mpc.design.u_bounds)}
     ends = len(d) - 1
 
     def options(rng: np.random.Generator) -> dict[str, Any]:
@@ -233,12 +234,13 @@ def _with_model(controller: Controller, model: Identified) -> Controller:
     w = choose(plant, "auto" if old.disturbances.names else None)
     steady = Steady.of(plant, w, old.Q, old.R)
     design = replace(old, plant=plant, disturbances=w, steady=steady)
-    mpc = LinearMPC(lowered(design), **{name: mpc.arguments[name] for name in OPTIONS})
+    mpc = LinearMPC(lowered(design), **{name: mpc.arguments[name] for name in KEYWORDS})
     drift = controller._drift if w.names == old.disturbances.names else None
     options = {"noise": controller._noise, "drift": drift, "window": controller._window}
     candidate = Controller(mpc, **options)
     candidate.reset(u=controller.u)
-    candidate.r, candidate.rest = controller.r, controller.rest
+    for name in ("r", "rest", "known"):
+        setattr(candidate, name, getattr(controller, name))
     return candidate
 
 

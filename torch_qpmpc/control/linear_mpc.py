@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,13 +18,13 @@ from torch_qpmpc.control.target import free_mpc, target_mpc
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.scheme import KEYWORDS, check_keywords
 from torch_qpmpc.mpc.state import KIND, check_own, stored
 from torch_qpmpc.qp.program import QuadraticProgram
 
 #: The price of a unit of violation of an output's bound.
 Y_SLACK = 1e3
 #: The arguments besides the scheme.
-OPTIONS = ("learn", "structure", "step", "solver", "on_failure")
 
 
 class Target(NamedTuple):
@@ -121,6 +122,7 @@ class LinearMPC(QPMPC):
             super().__init__(model, **options)
             self._start_targets()
             return
+        check_keywords("LinearMPC", options, [*KEYWORDS, *signature(LinearMPC).parameters])
         prices = linear.values() if isinstance(linear, Mapping) else ()
         design = read_design(
             read_model(model, E, dt, inputs, outputs, known, prices),
@@ -202,7 +204,7 @@ class LinearMPC(QPMPC):
     def of_stored(cls, content: Mapping[str, Any]) -> LinearMPC:
         """Return the LinearMPC of the ``content`` of a file."""
         scheme = lowered(read_stored(content["design"]))
-        mpc = cls(scheme, **{name: content["arguments"][name] for name in OPTIONS})
+        mpc = cls(scheme, **{name: content["arguments"][name] for name in KEYWORDS})
         mpc.load_state_dict(content["mpc"])
         return mpc
 

@@ -20,7 +20,7 @@ from torch_qpmpc.control.lowering import riccati
 from torch_qpmpc.control.probe import probe
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.export.tables import SINGULAR, make_tables
+from torch_qpmpc.export.tables import SINGULAR, digest, make_tables
 from torch_qpmpc.export.writer import Settings, state_bytes, table_bytes
 from torch_qpmpc.proofs import Answer
 from torch_qpmpc.qp.pipeline.condensing import null_space
@@ -33,7 +33,7 @@ MARGIN, CONDITION, SPREAD, HIDDEN = 0.3, 1e8, 1e4, 1e-3
 IDLE = 1e-6
 #: Offsets relative to half the distance of an output's bounds.
 OFFSET = 1e-6
-#: A response below this share of the largest, for inputs of half their range, is noise of a fit.
+#: A response below this share of those soon after, with inputs of half their range, is noise.
 SHOWS = 0.03
 #: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
 LARGEST = 2.0
@@ -62,8 +62,10 @@ def review(
     ]
     cost = _cost(controller)
     findings = [cost, *(check(controller) for check in checks)]
+    qp = digest(mpc.quadratic_program())
+    claims = [_proof(name, answer, qp) for name, answer in (proofs or {}).items()]
     if not cost.ok:
-        return Review(findings)
+        return Review([*findings, *claims])
     plan, target = make_tables(mpc), make_tables(mpc.targets)
     qps = [plan, target, *([] if mpc.free is None else [make_tables(mpc.free)])]
     loop = LinearLoop.of(controller, plan, target)
@@ -83,9 +85,7 @@ def review(
         sizes |= {"least iterations of a step in the loop, on average": seen.iterations.mean()}
         sizes |= {"and in its worst step": seen.iterations.max()}
     findings.append(Finding("C code", True, sizes))
-    for name, answer in (proofs or {}).items():
-        findings.append(_proof(name, answer, plan.digest))
-    return Review(findings)
+    return Review([*findings, *claims])
 
 
 def _cost(controller: Controller) -> Finding:
@@ -159,8 +159,10 @@ def _horizon(controller: Controller) -> Finding:
         steps.append(plant.C @ x)
         x = plant.A @ x
     responses = np.cumsum(steps, 0)
-    sizes = np.abs(responses)
-    away = sizes <= SHOWS * sizes[: 2 * N].max((0, 2), keepdims=True)
+    moves = np.abs(steps)  # beside those of the next ten steps, as a ramp has no largest one
+    ahead = np.lib.stride_tricks.sliding_window_view(moves.max(2), 10, axis=0).max(-1)
+    responses = responses[: len(ahead)]
+    away = np.logical_and.accumulate(moves[: len(ahead)] <= SHOWS * ahead[..., None])
     if stable:
         away |= np.sign(responses) != np.sign(responses[-1])
     for i in np.flatnonzero(np.diag(design.Q)):
@@ -252,6 +254,11 @@ def _set_points(controller: Controller) -> Finding:
     acting = np.flatnonzero(design.plant.E.any(0))
     numbers: dict[str, Any] = {f"at {design.plant.known[i]}{assumed}": known[i] for i in acting}
     faults = []
+    if np.isnan(lower).any():
+        remedy = (
+            "No input within its bounds holds the plant at these known signals: widen u_bounds."
+        )
+        return Finding("set-points", False, numbers | {"outputs in reach": "none"}, remedy)
     for i, name in enumerate(names):
         numbers[f"{name} reaches"] = np.array([lower[i], upper[i]])
         if lower[i] > design.y_bounds[1][i] or upper[i] < design.y_bounds[0][i]:
@@ -266,7 +273,10 @@ def _set_points(controller: Controller) -> Finding:
 
 
 def _reach(controller: Controller) -> tuple[Array, Array]:
-    """Return the least and the largest steady value of each output within the inputs' bounds."""
+    """Return the least and the largest steady value of each output within the inputs' bounds.
+
+    They are NaN if there is no steady state.
+    """
     steady, w = controller.mpc.design.steady, controller.w
     loads = np.concatenate((w, _known(controller), [1.0]))
     lower, upper = (side - steady.u @ loads for side in controller.mpc.design.u_bounds)
@@ -280,7 +290,8 @@ def _reach(controller: Controller) -> tuple[Array, Array]:
             least = scipy.optimize.linprog(
                 sign * y, rows[kept], limits[kept], bounds=(None, None), method="highs"
             )
-            both.append(sign * least.fun if least.status == 0 else -sign * np.inf)
+            otherwise = np.nan if least.status == 2 else -sign * np.inf  # infeasible, or unbounded
+            both.append(sign * least.fun if least.status == 0 else otherwise)
         ends.append(both)
     ends = np.array(ends).T + steady.y @ loads
     return ends[0], ends[1]

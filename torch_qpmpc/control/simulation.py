@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 import torch
 from matplotlib.figure import Figure
 
@@ -15,9 +14,11 @@ from torch_qpmpc.analysis.episode import episode_figure
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import Design, read_vector
-from torch_qpmpc.control.disturbance import RANK
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model
 from torch_qpmpc.errors import QPError
+
+#: Weight of the last reset's outputs beside an input that is passed: it decides for integrators.
+FAINT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +117,7 @@ def simulate(
     design, twin = controller.mpc.design, copy.copy(controller)
     rows = design.horizon + 1
     announced = known is None and hasattr(plant, "reset")  # by the environment, step by step
+    known = controller.known if known is None else known
     d = np.empty((0, 0)) if announced else controller.read_known(known, steps + rows, steps)
     set_points = controller.read_set_points(r, steps + rows)
     load = read_vector("load", load, design.plant.inputs, 0.0)
@@ -127,8 +129,12 @@ def simulate(
     start = twin.u
     if not hasattr(plant, "reset"):
         model = design.plant if plant is None else read_model(plant)
-        plant = _Model(model, design, d, start, y, x)
-    rng, (observed, info) = np.random.default_rng(seed), plant.reset(seed=seed)
+        plant = _Model(model, design, d, start, y, FAINT if u is not None else 1.0, x)
+    rng, started = np.random.default_rng(seed), plant.reset(seed=seed)
+    if not (isinstance(started, tuple) and len(started) == 2):
+        remedy = "Its reset returns the outputs and a dict."
+        raise QPError.expected("plant", type(plant).__name__, "Gymnasium's reset and step", remedy)
+    observed, info = started
     ys, us, ds, held = [], [], [], []
     for k in range(steps):
         ys.append(observed + noise * rng.normal(size=len(design.Q)))
@@ -137,20 +143,29 @@ def simulate(
         ds.append(ahead[0])
         assert twin.target is not None
         held.append(twin.target.u.numpy().reshape(-1, len(load))[0])
-        observed, *_, info = plant.step(us[-1] + load)
+        stepped = plant.step(us[-1] + load)
+        observed, info = stepped[0], stepped[-1]
     ys.append(observed + noise * rng.normal(size=len(design.Q)))
     measured, inputs, d, u_s = map(np.array, (ys, us, ds, held))
     return Run(design, measured, set_points[: steps + 1], inputs, d, u_s, start)
 
 
 class _Model:
-    """A model with Gymnasium's ``reset`` and ``step``, which rests with the input u at first.
+    """A model with Gymnasium's ``reset`` and ``step``, which starts at rest with the input u.
 
-    Its outputs are near y there, as far as integrators leave them free.
+    With outputs y it starts as near to that, and to y with a weight, as least squares allow: the
+    input alone does not determine the outputs of a plant that integrates, or nearly so.
     """
 
     def __init__(
-        self, model: StateSpace, design: Design, d: Array, u: Array, y: Array | None, x: Any
+        self,
+        model: StateSpace,
+        design: Design,
+        d: Array,
+        u: Array,
+        y: Array | None,
+        weight: float,
+        x: Any,
     ) -> None:
         got, want = model.sizes[1:3], design.plant.sizes[1:3]
         if got != want:
@@ -161,10 +176,11 @@ class _Model:
             got, want = f"{len(model.known)} known signals", f"none, or {d.shape[1]}"
             raise QPError.expected("plant", got, want)
         still = np.eye(len(model.A)) - model.A
-        rest = np.linalg.lstsq(still, self._driven(u, 0), rcond=None)[0]
-        free = scipy.linalg.null_space(still, rcond=RANK)  # an integrator rests anywhere
-        off = (0.0 if y is None else y) - model.C @ rest
-        rest = rest + free @ np.linalg.pinv(model.C @ free) @ off
+        matrix, wanted = still, self._driven(u, 0)
+        if y is not None:
+            matrix = np.vstack((still, weight * model.C))
+            wanted = np.concatenate((wanted, weight * y))
+        rest = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
         states = [f"x{i + 1}" for i in range(len(model.A))]
         self._start = rest if x is None else read_vector("x", x, states, 0.0)
 

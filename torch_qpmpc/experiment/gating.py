@@ -158,13 +158,13 @@ class RunGate:
         """Return the state of the gate; None without one."""
         if self._gate is None:
             return None
-        return self._gate.state_dict() | {"compared": self.compared}
+        return self._gate.state_dict() | {"simulated": self.compared}
 
     def load_state_dict(self, state: dict[str, Any] | None) -> None:
         """Load a `state_dict`."""
         if self._gate is not None and state is not None:
             self._gate.load_state_dict(state)
-            self.compared = state["compared"]
+            self.compared = state["simulated"]
 
 
 def _interval(cfg: DictConfig) -> int:

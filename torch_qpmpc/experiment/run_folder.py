@@ -19,6 +19,7 @@ from torch_qpmpc.experiment.checkpoint import CHECKPOINT
 from torch_qpmpc.experiment.config import settings
 from torch_qpmpc.experiment.links import check_links
 from torch_qpmpc.experiment.loggers import RunLogger
+from torch_qpmpc.experiment.tasks import COMMAND
 from torch_qpmpc.files import damaged, write_whole
 
 #: Entries of summary.json that are numbers or, if they are not finite, null.
@@ -192,6 +193,6 @@ def unwritable(folder: str | Path, error: OSError, key: str = "hydra.run.dir") -
     checkpoint = Path(folder) / CHECKPOINT
     remedy = f"Choose another folder with {key}=FOLDER."
     if checkpoint.exists():
-        remedy = f"{checkpoint} is intact: free space, then python train.py resume={folder}."
+        remedy = f"{checkpoint} is intact: free space, then {COMMAND} resume={folder}."
     got = f"{folder}, where writing failed ({error})"
     return QPError.expected("folder", got, "a writable folder", remedy)

@@ -25,7 +25,7 @@ from torch_qpmpc.experiment.config import differences, load_config, settings
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.lock import ELSEWHERE
 from torch_qpmpc.experiment.tally import Tally
-from torch_qpmpc.experiment.tasks import has_run, named_code, resume_arguments
+from torch_qpmpc.experiment.tasks import COMMAND, has_run, named_code, resume_arguments
 from torch_qpmpc.files import labelled
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.module import QPMPC
@@ -169,7 +169,7 @@ def _check_named(
     if cfg.task.get("kwargs"):
         words += f" with task.kwargs={cfg.task.kwargs}"
     got = f"{path}, whose config.yaml names code ({words})"
-    command = f"python train.py {resume_arguments(path, cfg.task)}"
+    command = f"{COMMAND} {resume_arguments(path, cfg.task)}"
     remedy = f"Read that code, which may not be yours; to run it: {command}"
     raise QPError.expected("resume", got, "code that the command line names, too", remedy)
 

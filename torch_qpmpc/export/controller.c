@@ -148,7 +148,7 @@ void policy_reset(policy_state *s, const real y[], const real u[])
     policy_free_reset(&s->free);
 #endif
     for (i = 0; i < N_E; i++) s->e[i] = 0;
-    for (i = 0; i < N_U; i++) s->u[i] = u ? u[i] : within(0, i);
+    for (i = 0; i < N_U; i++) s->u[i] = within(u ? u[i] : 0, i);
     for (i = 0; i < SET_POINTS * N_Y; i++) s->r[i] = 0;
     s->starts = y ? 2 : 1;
     if (y) copy(s->y, y, N_Y);

@@ -152,7 +152,7 @@ def make_tables(mpc: QPMPC) -> Tables:
         condition,
         _centre(qp, n_p, mpc.constants),
         mpc.constants,
-        _digest(qp),
+        digest(qp),
     )
 
 
@@ -239,9 +239,10 @@ def _centre(qp: QuadraticProgram, n_p: int, constants: dict[int, float]) -> Arra
     return p
 
 
-def _digest(qp: QuadraticProgram) -> str:
-    digest = hashlib.sha256()
+def digest(qp: QuadraticProgram) -> str:
+    """Return the SHA-256 of the nine tensors of a QP."""
+    total = hashlib.sha256()
     for name, x in zip(EVENT_SHAPES, qp.tensors(), strict=True):
-        digest.update(f"{name}{tuple(x.shape)}".encode())
-        digest.update(x.detach().double().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
+        total.update(f"{name}{tuple(x.shape)}".encode())
+        total.update(x.detach().double().cpu().contiguous().numpy().tobytes())
+    return total.hexdigest()

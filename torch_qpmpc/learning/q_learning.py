@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import _GAMMA_LMBDA_DEPREC_ERROR, dispatch_value_estimator
 
-from torch_qpmpc.checks import check_flag, check_number
+from torch_qpmpc.checks import check_flag, check_number, class_name
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.operators import QPActorValueOperator, QPValueOperator
 from torch_qpmpc.learning.restoring import call_with
@@ -138,7 +138,7 @@ class QPQLearningLoss(LossModule):
         if gamma is not None:
             raise TypeError(_GAMMA_LMBDA_DEPREC_ERROR)
         if not isinstance(last := _last(value_network), QPActorValueOperator):
-            got = type(last).__name__
+            got = class_name(last)
             if last is not value_network:
                 got = f"a TensorDictSequential that ends with {got}"
             remedy = "Wrap the QPMPC: QPActorValueOperator(mpc)."

@@ -369,6 +369,8 @@ class QPMPC(nn.Module):
             >>> mpc.predict(np.ones((4, 1))).shape
             (4, 1)
         """
+        if isinstance(observation, Tensor):
+            observation = observation.detach().cpu()
         try:
             s = torch.as_tensor(np.asarray(observation))
         except (TypeError, ValueError) as error:

@@ -106,7 +106,7 @@ class Scheme:
         arguments = {**options, **_started(start)}
         model, cost, bounds = (_taken(kind, arguments) for kind in (Model, Cost, Bounds))
         if arguments:
-            check_names(arguments, ())
+            check_names(arguments, also=())
         return cls(layout, Model(**model), Cost(**cost), Bounds(**bounds), gamma, seed)
 
     @property
@@ -183,11 +183,15 @@ def _initial_theta(scheme: Scheme) -> tuple[Tensor, dict[str, Tensor]]:
 def check_names(options: Iterable[str], also: Iterable[str] = KEYWORDS) -> None:
     """Raise `TypeError` unless these are names of arguments of `Scheme.of`, or ``also`` known."""
     own = {x.name for part in (Model, Cost, Bounds) for x in fields(part)}
-    known = own | {"blocks", "gamma", "start", "seed", *SIZES, *also}
-    for name in sorted(set(options) - known):
+    check_keywords("QPMPC", options, own | {"blocks", "gamma", "start", "seed", *SIZES, *also})
+
+
+def check_keywords(owner: str, options: Iterable[str], known: Iterable[str]) -> None:
+    """Raise `TypeError` for the first of the options that is not known, with the nearest name."""
+    for name in sorted({*options}.difference(known)):
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise TypeError(f"QPMPC got an unexpected keyword argument {name!r}{hint}")
+        raise TypeError(f"{owner} got an unexpected keyword argument {name!r}{hint}")
 
 
 def _taken(kind: type, arguments: dict[str, Any]) -> dict[str, Any]:

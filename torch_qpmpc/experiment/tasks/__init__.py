@@ -26,7 +26,13 @@ from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
     short_horizon,
     tank_references,
 )
-from torch_qpmpc.experiment.tasks.code import has_run, named_code, resume_arguments, run_code
+from torch_qpmpc.experiment.tasks.code import (
+    COMMAND,
+    has_run,
+    named_code,
+    resume_arguments,
+    run_code,
+)
 from torch_qpmpc.experiment.tasks.identified import Start, identified_scheme
 from torch_qpmpc.experiment.tasks.registry import (
     TASKS,
@@ -43,6 +49,7 @@ from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import Scheme
 
 __all__ = [
+    "COMMAND",
     "TASKS",
     "AnyPlant",
     "Task",

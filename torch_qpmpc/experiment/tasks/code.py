@@ -81,6 +81,12 @@ def run_code(task: Mapping[str, Any]) -> None:
         importlib.import_module(module)
 
 
+#: How train.py is started: by its path in a clone, and as a module from a wheel.
+COMMAND = "python train.py"
+if (Path(__file__).parents[2] / "command").exists():
+    COMMAND = "python -m torch_qpmpc.train"
+
+
 def resume_arguments(folder: str | Path, task: Mapping[str, Any]) -> str:
     """Return the command line's arguments that resume the run in ``folder``."""
     code = named_code(task)
