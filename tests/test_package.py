@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -60,10 +61,17 @@ def test_the_sdist_trains_and_tests(built):
     assert built[0].stat().st_size < 1e6
 
 
-def test_the_module_is_train_py(tmp_path):
-    """In a clone; the wheel's is the same file, with its own copy of configs/."""
+@pytest.mark.parametrize("packaged", [False, True])
+def test_the_module_is_train_py(built, tmp_path, packaged):
+    """In a clone, and in a wheel, which has its own copy of train.py and configs/."""
+    environment = dict(os.environ)
+    if packaged:
+        folder = built[1].parent / "unpacked"
+        zipfile.ZipFile(built[1]).extractall(folder)
+        environment["PYTHONPATH"] = str(folder)
     command = [sys.executable, "-m", "torch_qpmpc.train", "task.gama=1"]
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    options = {"cwd": tmp_path, "capture_output": True, "text": True, "env": environment}
+    ended = subprocess.run(command, check=False, **options)
     assert ended.returncode == 1
     assert ended.stderr.endswith("Did you mean task.gamma?\n")
     assert not [*tmp_path.iterdir()]

@@ -63,7 +63,7 @@ def test_estimator_by_string_enum_class_and_instance(name, kind, estimator):
 def test_default_estimator_is_td0():
     loss = QPQLearningLoss(make_operator())
     assert isinstance(loss.value_estimator, TD0Estimator)
-    assert loss.value_estimator.gamma.item() == pytest.approx(0.99)
+    assert loss.value_estimator.gamma.item() == loss.operator.module.gamma
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")
