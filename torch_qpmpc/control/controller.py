@@ -203,9 +203,9 @@ class Controller:
     def simulate(self, plant: Any = None, steps: int = 200, r: Any = None, **options: Any) -> Run:
         """Return a closed loop of a copy of this controller with a plant, from rest.
 
-        The last `reset` says where: a model rests with its input (and outputs, if it integrates)
-        and the first known signals; an environment starts where its own reset says, and its first
-        outputs are taken to rest with that input.
+        The last `reset` says where: a model starts as near to rest with its input, the first known
+        signals and its outputs as it can; an environment starts where its own reset says, and its
+        first outputs are taken to rest with that input.
 
         Args:
             plant: a model as `LinearMPC` takes it, by default its own; or an environment with
@@ -213,8 +213,9 @@ class Controller:
             steps: the number of steps.
             r: a set-point that is held, or rows of them, by default the last one.
             options: ``known``: a row of known signals that is held, or at least ``steps`` rows, of
-                which the last is held at the end; by default the forecast in an environment's
-                ``info["known"]``, in the forms of `step`. An environment must run the same signals.
+                which the last is held at the end; by default those of the last step or reset, and
+                with an environment the forecast in its ``info["known"]``, in the forms of `step`.
+                An environment must run the same signals.
                 ``u``: the input to start from, by default that of the last reset. ``load``: a
                 constant that is added to the inputs from the first step on. ``noise``: standard
                 deviations of that of the outputs, as a number, a vector or by name. ``x``: the

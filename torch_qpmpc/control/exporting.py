@@ -16,6 +16,7 @@ import numpy as np
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import half_range, middle
 from torch_qpmpc.control.disturbance import RANK
+from torch_qpmpc.control.probe import at_rest
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, export_c
@@ -194,7 +195,7 @@ def _run(controller: Controller, twin: Controller | CompiledController, steps: i
     plant, rows = design.plant, COMPARED + design.horizon + 1
     size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
-    x, start, level = _at_rest(controller)
+    x, start, level = at_rest(controller)
     d = level + 0.1 * rng.normal(size=(rows, len(plant.known)))
     centre, loop = middle(design.y_bounds), []
     twin.reset(u=start)
@@ -214,17 +215,6 @@ def _run(controller: Controller, twin: Controller | CompiledController, steps: i
         x = plant.A @ x + plant.B @ (u + 0.05 * size_u) + plant.E @ known[0] + plant.offset
     y, r, known, u = map(np.array, zip(*loop, strict=True))
     return Loop(y, r, known, u, start[None])
-
-
-def _at_rest(controller: Controller) -> tuple[Array, Array, Array]:
-    """Return x, u and known of the model at rest in the middle of its outputs' bounds.
-
-    The known signals are those of the last step or reset, else zero.
-    """
-    design = controller.mpc.design
-    known = np.zeros(len(design.plant.known)) if controller.known is None else controller.known
-    rest = controller.mpc.target(middle(design.y_bounds), known=known)
-    return rest.x.numpy(), rest.u.numpy(), known
 
 
 def _replayed(controller: Controller, loop: Loop, dtype: str) -> Loop:
@@ -334,7 +324,7 @@ def _main(controller: Controller, name: str, dtype: str) -> str:
     """Return a program of the closed loop with the model, a load and a set-point in reach."""
     design = controller.mpc.design
     plant, sizes = design.plant, _sizes(controller)
-    x, u, known = _at_rest(controller)
+    x, u, known = at_rest(controller)
     load = 0.1 * plant.B @ half_range(design.u_bounds) + plant.E @ known + plant.offset
     r = middle(design.y_bounds) + 0.25 * half_range(design.y_bounds)
     r = controller.mpc.target(r, known=known).y.numpy()

@@ -24,7 +24,6 @@ from torch_qpmpc.qp.program import QuadraticProgram
 
 #: The price of a unit of violation of an output's bound.
 Y_SLACK = 1e3
-#: The arguments besides the scheme.
 
 
 class Target(NamedTuple):

@@ -34,6 +34,19 @@ class Probe:
     iterations: Array
 
 
+def held_known(controller: Controller) -> Array:
+    """Return the known signals of the last step or reset, ``(n_d,)``, zero before."""
+    n_d = len(controller.mpc.design.plant.known)
+    return np.zeros(n_d) if controller.known is None else controller.known
+
+
+def at_rest(controller: Controller) -> tuple[Array, Array, Array]:
+    """Return x, u and `held_known` of the model at rest in the middle of its outputs' bounds."""
+    known = held_known(controller)
+    rest = controller.mpc.target(middle(controller.mpc.design.y_bounds), known=known)
+    return rest.x.numpy(), rest.u.numpy(), known
+
+
 @torch.no_grad()
 def probe(controller: Controller) -> Probe:
     """Run the loop, from rest in the middle of the outputs' bounds; known signals are held."""
@@ -41,8 +54,7 @@ def probe(controller: Controller) -> Probe:
     plant = design.plant
     size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
     centre, load = middle(design.y_bounds), LOAD * size_u
-    known = np.zeros(len(plant.known)) if controller.known is None else controller.known
-    x, last, _ = (part.numpy() for part in controller.mpc.target(centre, known=known))
+    x, last, known = at_rest(controller)
     twin.reset(u=last)
     costs: dict[str, float] = {}
     states = []

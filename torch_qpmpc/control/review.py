@@ -17,7 +17,7 @@ from torch_qpmpc.control.findings import Finding, Review
 from torch_qpmpc.control.linear_mpc import Target
 from torch_qpmpc.control.loop import LinearLoop
 from torch_qpmpc.control.lowering import riccati
-from torch_qpmpc.control.probe import probe
+from torch_qpmpc.control.probe import held_known, probe
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.tables import SINGULAR, digest, make_tables
@@ -215,7 +215,7 @@ def _hard_rows(controller: Controller) -> Finding:
     half = np.diag(half_range(design.y_bounds))
     off = np.linspace(0.05, LARGEST, 40)[:, None, None] * np.vstack((half, -half))
     off = off.reshape(-1, n_y)
-    known = _known(controller)
+    known = held_known(controller)
     r = controller.r[0] if len(controller.r) else middle(design.y_bounds)
     rest = mpc.target(r, known=known)
     x = np.vstack((off @ np.linalg.pinv(design.plant.C).T, np.zeros((2, len(rest.x)))))
@@ -240,14 +240,9 @@ def _hard_rows(controller: Controller) -> Finding:
     return Finding("hard bounds", False, numbers, f"Give {names} a finite y_slack.")
 
 
-def _known(controller: Controller) -> Array:
-    n_d = controller.mpc.design.plant.sizes[3]
-    return np.zeros(n_d) if controller.known is None else controller.known
-
-
 def _set_points(controller: Controller) -> Finding:
     """Set-points and bands of outputs are within reach of the inputs' bounds."""
-    design, known = controller.mpc.design, _known(controller)
+    design, known = controller.mpc.design, held_known(controller)
     names, weighted = design.plant.outputs, np.diag(design.Q) > 0
     lower, upper = _reach(controller)
     assumed = " (not known, assumed)" if controller.known is None else ""
@@ -278,7 +273,7 @@ def _reach(controller: Controller) -> tuple[Array, Array]:
     They are NaN if there is no steady state.
     """
     steady, w = controller.mpc.design.steady, controller.w
-    loads = np.concatenate((w, _known(controller), [1.0]))
+    loads = np.concatenate((w, held_known(controller), [1.0]))
     lower, upper = (side - steady.u @ loads for side in controller.mpc.design.u_bounds)
     rows = np.vstack((steady.U, -steady.U))
     limits = np.concatenate((upper, -lower))
