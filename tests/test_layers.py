@@ -52,7 +52,7 @@ LAYERS = {
         "experiment",
     },
     "report": {"study"},  # `python -m torch_qpmpc.report`
-    "train": set(),  # `python -m torch_qpmpc.train`
+    "train": {"files"},  # `python -m torch_qpmpc.train`
     "export/__main__": {
         "errors",
         "export",

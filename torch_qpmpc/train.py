@@ -1,11 +1,10 @@
 """``python -m torch_qpmpc.train``: train.py with its configs/, of the clone or of the wheel."""
 
 import runpy
-from pathlib import Path
 
-#: The wheel's copies of train.py and configs/ are here; in a clone they are beside the package.
-PACKAGED = Path(__file__).with_name("command")
-FOLDER = PACKAGED if PACKAGED.exists() else Path(__file__).parents[1]
+from torch_qpmpc.files import PACKAGED
+
+FOLDER = PACKAGED if PACKAGED.exists() else PACKAGED.parents[1]
 
 
 def main() -> None:

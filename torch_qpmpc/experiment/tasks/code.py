@@ -19,6 +19,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.tasks.registry import TASKS
+from torch_qpmpc.files import PACKAGED
 
 
 def named_code(task: Mapping[str, Any]) -> dict[str, str]:
@@ -82,9 +83,7 @@ def run_code(task: Mapping[str, Any]) -> None:
 
 
 #: How train.py is started: by its path in a clone, and as a module from a wheel.
-COMMAND = "python train.py"
-if (Path(__file__).parents[2] / "command").exists():
-    COMMAND = "python -m torch_qpmpc.train"
+COMMAND = "python -m torch_qpmpc.train" if PACKAGED.exists() else "python train.py"
 
 
 def resume_arguments(folder: str | Path, task: Mapping[str, Any]) -> str:
