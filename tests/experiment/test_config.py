@@ -257,7 +257,7 @@ BAD: dict[str, list[Any]] = {
     "logger": ["visdom", *NAME],
     "export": ["python", 3, True],
     "prove": [-0.1, "box", math.nan],
-    "figures": FLAG,
+    "figures": ["each", *FLAG],
     "gate": ["acts", *FLAG],
     "gate_bound": [0, *REAL[:-1]],
     "back_off": [0.4, 1, math.nan, False, "half"],

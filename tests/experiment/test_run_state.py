@@ -76,7 +76,7 @@ def stopped(run: Path, tmp_path: Path) -> Path:
 
 
 def test_figures_are_not_drawn_twice(tmp_path, monkeypatch):
-    stop(monkeypatch, make_config(*RUN, "figures=true"), tmp_path, 9)
+    stop(monkeypatch, make_config(*RUN, "figures=all"), tmp_path, 9)
     (tmp_path / "checkpoint.pt").unlink()
     (tmp_path / "checkpoint-previous.pt").rename(tmp_path / "checkpoint.pt")
     go_on(tmp_path)

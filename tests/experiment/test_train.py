@@ -278,6 +278,14 @@ def test_the_stream_can_be_replayed(tmp_path):
     assert metrics(tmp_path)["qp/recalled"].iloc[-1] > 0
 
 
+@pytest.mark.parametrize(("figures", "updates"), [("true", {2, 6}), ("all", {2, 4, 6})])
+def test_figures_are_drawn_at_the_first_evaluation_and_at_the_end(tmp_path, figures, updates):
+    every = ("updates=6", "eval_interval=2", "logger=csv")
+    train.train(make_config(*SMALL, *every, f"figures={figures}"), str(tmp_path))
+    drawn = (tmp_path / "csv" / "figures" / "structure").glob("C-*.png")
+    assert {int(file.stem.removeprefix("C-")) for file in drawn} == updates
+
+
 @pytest.mark.parametrize("optimizer", ["adam", "gauss_newton"])
 @pytest.mark.parametrize("structure", ["tied", "varying"])
 def test_a_scheme_is_released_in_mid_training(tmp_path, monkeypatch, optimizer, structure):

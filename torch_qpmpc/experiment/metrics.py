@@ -75,8 +75,8 @@ def report(
 ) -> dict[str, Any]:
     """Log an evaluation: J, the structure of C and, if configured, figures.
 
-    Before the first update only J is logged; after the last, the figures of `draw_outcome` are
-    added.
+    Before the first update only J is logged. Figures are drawn at the first evaluation after it and
+    at the last, to which `draw_outcome` adds its own, or with ``figures=all`` at each.
 
     Args:
         run: the run's folder.
@@ -96,11 +96,13 @@ def report(
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u, mpc.past, mpc.n_d)
     distances |= structure_metrics(mpc)
     run.log({f"structure/{name}": distance for name, distance in distances.items()}, update)
-    if evaluation.cfg.figures:
+    cfg = evaluation.cfg
+    last = update == cfg.updates
+    if cfg.figures == "all" or (cfg.figures and (last or update == cfg.eval_interval)):
         run.figure("structure/C", constraint_figure(mpc), update)
         run.figure("eval/closed_loop", closed_loop_figure(mpc, evaluation), update)
-        if update == evaluation.cfg.updates:
-            draw_outcome(run, mpc, evaluation, update)
+    if cfg.figures and last:
+        draw_outcome(run, mpc, evaluation, update)
     return summary
 
 

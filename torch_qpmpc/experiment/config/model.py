@@ -87,7 +87,7 @@ class Config(Group):
     logger: Annotated[str, one_of(LOGGERS)]
     export: Annotated[Literal["c"] | None, Expected("c, or null")]
     prove: Annotated[NonNegative | None, Expected("a finite number >= 0, or null")]
-    figures: Flag
+    figures: Annotated[Literal["all"] | bool, Expected("true, all or false")]
     rivals: Annotated[bool | list[str], Expected("true, false or a list of names")]
     eval_interval: Count
     log_interval: Count
