@@ -1,6 +1,6 @@
 """Learn a quadratic program as value function by Q-learning.
 
-    python train.py                                     the paper's point mass: deviation, seed 1
+    python train.py                                     the paper's point mass, seed 1
     python train.py task=gros_zanon solver=daqp         another plant, in one long episode
     python train.py -m constraint=fixed,free seed=1,2   a sweep
     python train.py task=gymnasium task.id=Pendulum-v1 start=data   from a log, without a model
@@ -99,6 +99,7 @@ def _train(
     collector = make_collector(cfg, physics, gate.acting)
     replay = make_run_replay(cfg, mpc)
     stream = batches(collector)
+    rounds = -(-cfg.warmup_steps // cfg.steps_per_update)  # of the warm-up
 
     with contextlib.ExitStack() as stack:
         stack.callback(collector.shutdown)
@@ -110,7 +111,7 @@ def _train(
         if state is None:
             tally = Tally()
             report(run, gate.mpc, evaluation, 0)
-            for batch in itertools.islice(stream, -(-cfg.warmup_steps // cfg.steps_per_update)):
+            for batch in itertools.islice(stream, rounds):
                 learner.observe(batch)
                 replay.extend(batch)
                 interrupt.exit_if_signalled(f"Stopped before the first update: {command}")
@@ -135,7 +136,9 @@ def _train(
                 watch.collected()
 
                 sample = replay.sample() if cfg.replay else batch.reshape(-1)
-                windows = None if learner.si is None else replay.sample_tau()
+                long_enough = (rounds + update) * cfg.steps_per_update >= cfg.task.horizon
+                penalised = learner.si is not None and long_enough
+                windows = replay.sample_tau() if penalised else None
                 terms, losses = learner.learn(sample, windows)
                 if cfg.replay:
                     replay.remember(sample)

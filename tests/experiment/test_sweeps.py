@@ -143,7 +143,7 @@ def test_a_finished_run_is_recognised_by_its_settings(finished):
     ("override", "difference"),
     [
         ("seed=2", r"seed=1, expected seed=2"),
-        ("constraint=si", r"constraint.name=deviation, .* expected constraint.name=si,"),
+        ("constraint=si", r"constraint.name=identified, .* expected constraint.name=si,"),
     ],
 )
 def test_other_settings_are_another_run(finished, override, difference):

@@ -233,6 +233,11 @@ def test_each_case_runs(tmp_path, constraint, noise):
     assert moved == {-1: constraint != "fixed", 0: constraint != "fixed", 1: free}
 
 
+def test_the_si_penalty_begins_with_the_first_window_of_n_steps(tmp_path):
+    run_small(tmp_path, "constraint=identified", "warmup_steps=1", "task.horizon=3")
+    assert metrics(tmp_path)["loss/si"].isna().tolist() == [True, True, False, False, False]
+
+
 STREAM = (
     "task=gros_zanon",
     "solver=daqp",
@@ -635,7 +640,7 @@ def test_runs_that_start_in_the_same_second_have_folders_of_their_own():
     assert len({hydra.run.dir for hydra in hydras}) == 3
     assert len({hydra.sweep.dir for hydra in hydras}) == 3
     assert re.fullmatch(
-        r"runs/point_mass/gaussian-deviation/seed1-\d{8}-\d{6}-\d{6}", hydras[0].run.dir
+        r"runs/point_mass/gaussian-identified/seed1-\d{8}-\d{6}-\d{6}", hydras[0].run.dir
     )
 
 

@@ -119,15 +119,13 @@ class Config(Group):
 
     @model_validator(mode="after")
     def si_penalty_has_windows(self) -> Self:
-        """Check that windows of the horizon's length fit the episodes, warm-up and replay."""
+        """Check that windows of the horizon's length fit the episodes, in the replay."""
         if self.constraint.si is None:
             return self
-        long_enough = f"at least task.horizon = {self.task.horizon}"
-        remedy = "constraint.si needs windows of task.horizon steps."
         if (self.task.episode_steps or self.task.horizon) < self.task.horizon:
-            self.conflict("task.episode_steps", long_enough, remedy)
-        if self.warmup_steps < self.task.horizon:
-            self.conflict("warmup_steps", long_enough, remedy)
+            expected = f"at least task.horizon = {self.task.horizon}"
+            remedy = "constraint.si needs windows of task.horizon steps."
+            self.conflict("task.episode_steps", expected, remedy)
         if not self.replay:
             self.conflict("replay", "true", "constraint.si samples its windows from the replay.")
         return self
