@@ -12,6 +12,12 @@ from torch_qpmpc.mpc import parameters
 COST = ("H", "H_f", "q", "c", "w")
 
 
+def penalty(mpc: QPMPC, S: Tensor) -> float:
+    """Return the penalty ``1/2 tr(D S D')`` of D = [C, b]."""
+    D = torch.cat((mpc.C, mpc.b.unsqueeze(-1)), -1)
+    return 0.5 * ((D @ S) * D).sum().item()
+
+
 class Reference:
     """The steps of a `GaussNewton` without a trust region."""
 
@@ -112,9 +118,9 @@ class Reference:
             own = mask if leaf is C and mask is not None else torch.ones(leaf.numel()).bool()
             learned.append(own.flatten())
             if leaf is C and S is not None:
-                curvature = torch.block_diag(*[len(s) * S] * len(leaf))
-                matrix[part, part] += curvature
-                right[part] -= curvature @ leaf.detach().flatten()
+                D = torch.cat((leaf, self.mpc.b.unsqueeze(-1)), -1).detach()
+                matrix[part, part] += torch.block_diag(*[len(s) * S[:-1, :-1]] * len(leaf))
+                right[part] -= len(s) * (D @ S)[:, :-1].flatten()
         index = torch.cat(learned).nonzero()[:, 0]
         step = torch.zeros_like(right)
         step[index] = torch.linalg.solve(matrix[index][:, index], right[index])

@@ -401,9 +401,9 @@ def test_configuration_reaches_the_parts(tmp_path, monkeypatch):
         losses.append((gamma, self.td_error_clip, self.delay_value, tuple(tensordict.shape)))
         return loss_value(self, tensordict)
 
-    def spy_si(self, C, tau):
+    def spy_si(self, C, tau, b):
         windows.append(tuple(tau.shape))
-        return si(self, C, tau)
+        return si(self, C, tau, b)
 
     def spy_proximal(self, C, scale):
         scales.append(scale)

@@ -52,7 +52,7 @@ def test_gauss_newton_takes_no_step_that_is_not_finite(trust_region, memory):
     before = {name: value.clone() for name, value in mpc.state_dict().items()}
     s, a = torch.ones(2, 2).double(), torch.zeros(2, 1).double()
     target = torch.full((2,), 1e308, dtype=torch.float64)
-    S = 1e308 * torch.eye(mpc.n_z, dtype=torch.float64)
+    S = 1e308 * torch.eye(mpc.n_z + 1, dtype=torch.float64)
     report = optimizer.step(s, a, target, penalty=S)
     assert not report.accepted
     assert all(torch.equal(value, before[name]) for name, value in mpc.state_dict().items())

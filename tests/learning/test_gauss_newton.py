@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torch.testing import assert_close
 
-from tests.gauss_newton import Reference
+from tests.gauss_newton import Reference, penalty
 from tests.problems import MIXED, normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SystemIdentificationPenalty
 from torch_qpmpc.learning.gauss_newton import FALL, RISE
@@ -189,14 +189,10 @@ def test_the_trust_region_counts_the_penalty():
     """Where the targets are met, only the penalty moves C, and it decreases."""
     mpc = random_mpc(7)
     S = SystemIdentificationPenalty(1e-3).curvature(normal(5, mpc.n_z))
-
-    def penalty() -> float:
-        return ((mpc.C @ S) * mpc.C).sum().item()
-
-    before = penalty()
+    before = penalty(mpc, S)
     report = GaussNewton(mpc).step(*pairs(), targets(mpc, 0.0), penalty=S)
     assert report.accepted
-    assert penalty() < before
+    assert penalty(mpc, S) < before
 
 
 def test_pairs_without_a_solution_or_a_target_are_left_out():
@@ -299,7 +295,7 @@ def test_unknown_scales_are_named():
 def test_a_penalty_needs_a_free_C():
     mpc = random_mpc(learn=("H", "c"))
     with pytest.raises(QPError, match="penalty: got a C that is not free, expected C among the"):
-        GaussNewton(mpc).step(*pairs(), targets(mpc), penalty=torch.eye(mpc.n_z).double())
+        GaussNewton(mpc).step(*pairs(), targets(mpc), penalty=torch.eye(mpc.n_z + 1).double())
 
 
 @pytest.mark.parametrize("trust_region", [True, False])

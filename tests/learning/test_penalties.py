@@ -197,14 +197,16 @@ def test_C_0_of_no_horizon(shape, horizon):
 @pytest.mark.parametrize("normalised", [False, True])
 def test_system_identification_penalty_window_by_window(generator, normalised):
     C, windows = normal(generator, N * N_X, N_Z), normal(generator, 7, N_Z)
-    rows = C.numpy()
+    b = normal(generator, N * N_X)
+    rows, offset = C.numpy(), b.numpy()
     if normalised:
-        rows = rows / np.sqrt((rows**2).sum(1, keepdims=True))
-    total = sum(np.linalg.norm(rows @ tau) ** 2 for tau in windows.numpy())
-    found = system_identification_penalty(C, windows, normalised=normalised)
-    assert found.item() == pytest.approx(total, rel=1e-12)
+        sizes = np.sqrt((rows**2).sum(1))
+        rows, offset = rows / sizes[:, None], offset / sizes
+    total = sum(np.linalg.norm(rows @ tau - offset) ** 2 for tau in windows.numpy())
+    penalty = system_identification_penalty(C, windows, b, normalised=normalised)
+    assert penalty.item() == pytest.approx(total, rel=1e-12)
     module = SystemIdentificationPenalty(1e-3, normalised=normalised)
-    assert module(C, windows).item() == pytest.approx(1e-3 * total, rel=1e-12)
+    assert module(C, windows, b).item() == pytest.approx(1e-3 * total, rel=1e-12)
     assert SystemIdentificationPenalty()(C, windows).item() == pytest.approx(
         1e-6 * system_identification_penalty(C, windows).item()
     )
@@ -213,9 +215,10 @@ def test_system_identification_penalty_window_by_window(generator, normalised):
 @pytest.mark.parametrize("normalised", [False, True])
 def test_system_identification_penalty_has_the_right_gradient(generator, normalised):
     C = normal(generator, N * N_X, N_Z).requires_grad_()
+    b = normal(generator, N * N_X).requires_grad_()
     windows = normal(generator, 7, N_Z)
     penalty = SystemIdentificationPenalty(0.1, normalised=normalised)
-    assert torch.autograd.gradcheck(lambda x: penalty(x, windows), C)
+    assert torch.autograd.gradcheck(lambda x, y: penalty(x, windows, y), (C, b))
 
 
 def test_normalised_penalty_does_not_reward_shrinking_C(generator):
@@ -289,7 +292,9 @@ def test_the_si_penalty_as_a_quadratic_in_C():
     generator = torch.Generator().manual_seed(0)
     C, windows = normal(generator, 3, 8), normal(generator, 5, 8)
     penalty = SystemIdentificationPenalty(0.3)
-    S = penalty.curvature(windows)
-    assert_close(0.5 * ((C @ S) * C).sum(), penalty(C, windows))
+    S, b = penalty.curvature(windows), normal(generator, 3)
+    for offset in (b, None):
+        D = torch.cat((C, (b if offset is not None else 0 * b).unsqueeze(-1)), -1)
+        assert_close(0.5 * ((D @ S) * D).sum(), penalty(C, windows, offset))
     with pytest.raises(QPError, match=r"normalised: got True, expected False\. Only then"):
         SystemIdentificationPenalty(0.3, normalised=True).curvature(windows)

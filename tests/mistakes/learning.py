@@ -254,7 +254,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "GaussNewton: penalty": (
         lambda: qm.GaussNewton(free).step(S, Aa, torch.zeros(4), penalty=torch.eye(3)),
-        "penalty: got shape (3, 3), expected shape (11, 11). Pass SystemIdentificati",
+        "penalty: got shape (3, 3), expected shape (12, 12). Pass SystemIdentificati",
     ),
     "GaussNewton: penalty type": (
         lambda: qm.GaussNewton(free).step(S, Aa, torch.zeros(4), penalty=1.0),
@@ -262,7 +262,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "GaussNewton: penalty loss": (
         lambda: qm.GaussNewton(free).step(S, Aa, torch.zeros(4), penalty=torch.tensor(1.0)),
-        "penalty: got shape (), expected shape (11, 11). Pass SystemIdentificationPe",
+        "penalty: got shape (), expected shape (12, 12). Pass SystemIdentificationPe",
     ),
     "GaussNewton: warm": (
         lambda: gn.step(S, Aa, torch.zeros(4), warm_start=torch.zeros(2, 3)),

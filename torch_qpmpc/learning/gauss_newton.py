@@ -172,8 +172,9 @@ class GaussNewton(torch.optim.Optimizer):
             target: costs to go, L + gamma V(s+), ``(B,)``. Pairs with a target that is not finite
                 are left out and counted; if none is left, theta stays, with a `RuntimeWarning`.
                 The sign is not checked: negate rewards and TorchRL's values.
-            penalty: S ``(n_z, n_z)`` of a penalty ``1/2 tr(C S C')`` added to the batch's mean of
-                ``1/2 delta^2``, such as `SystemIdentificationPenalty.curvature`; for a free C only.
+            penalty: S ``(n_z + 1, n_z + 1)`` of a penalty ``1/2 tr([C, b] S [C, b]')`` added to the
+                batch's mean of ``1/2 delta^2``, such as `SystemIdentificationPenalty.curvature`;
+                for a free C only, which it moves, and not b.
             warm_start: active sets of Q(s, a) to start from, ``(B, n_g)``.
 
         Returns:
@@ -257,7 +258,8 @@ class GaussNewton(torch.optim.Optimizer):
             raise QPError.expected("s", "an empty batch", "at least one pair")
         if penalty is not None:
             remedy = "Pass SystemIdentificationPenalty.curvature(windows)."
-            check_tensor("penalty", penalty, mpc.n_z, mpc.n_z, batched=False, remedy=remedy)
+            size = mpc.n_z + 1
+            check_tensor("penalty", penalty, size, size, batched=False, remedy=remedy)
             if self._free_C() is None:
                 got = "a C that is not free"
                 raise QPError.expected("penalty", got, "C among the learned parts")
@@ -374,7 +376,7 @@ class GaussNewton(torch.optim.Optimizer):
             rows, columns = signal_sizes(mpc, self.param_groups[0], z[root > 0])
         units = {"b": rows, "q": 1 / columns} if mpc.structure == "free" else {}
         return [
-            OuterProducts(leaf, group, chi, z, rows, columns, S, mask)
+            OuterProducts(leaf, group, chi, z, rows, columns, S, mpc.b.detach(), mask)
             if leaf is factored
             else Dense(leaf, group, next(gradients).reshape(len(z), -1), units.get(group["name"]))
             for leaf, group in pairs

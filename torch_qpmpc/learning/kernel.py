@@ -83,9 +83,9 @@ class Dense:
 class OuterProducts:
     """The gradients ``chi_i z_i'`` in C, with the metric ``scale * rows_i / columns_j``.
 
-    The penalty ``1/2 tr(C S C')`` by itself moves C by ``drift``; with it, the metric of a row is
-    ``rows_i`` times a matrix P ``(n_z, n_z)``, one for each unit of a row. With a ``mask`` of the
-    learned entries of C, each pattern of learned entries in a row has its own P.
+    The penalty ``1/2 tr([C, b] S [C, b]')`` by itself moves C by ``drift``; with it, the metric of
+    a row is ``rows_i`` times a matrix P ``(n_z, n_z)``, one for each unit of a row. With a ``mask``
+    of the learned entries of C, each pattern of learned entries in a row has its own P.
     Methods as in `Dense`.
     """
 
@@ -98,10 +98,11 @@ class OuterProducts:
         rows: Tensor,
         columns: Tensor,
         S: Tensor | None,
+        b: Tensor,
         mask: Tensor | None,
     ) -> None:
         self.leaf, self.group, self.chi, self.z, self.scale = leaf, group, chi, z, 1.0
-        self.rows, self.columns, self.S = rows, columns, S
+        self.rows, self.columns, self.S, self.b = rows, columns, S, b.unsqueeze(-1)
         self.drift = torch.zeros_like(leaf)
         self.patterns = _patterns(mask, None if S is None else rows.unsqueeze(-1))
 
@@ -132,10 +133,10 @@ class OuterProducts:
         self.z_P = [self.scale * self.z[:, j] / self.columns[j] for _, j, _ in self.patterns]
         if self.S is None:
             return drifted
-        force = self.leaf @ self.S
+        force, S = (torch.cat((self.leaf, self.b), -1) @ self.S)[:, :-1], self.S[:-1, :-1]
         for k, (i, j, entries) in enumerate(self.patterns):
             z, damping = self.z[:, j], mu / self.rows[i][0]
-            precision = torch.diag(damping / self.scale * self.columns[j]) + self.S[j][:, j]
+            precision = torch.diag(damping / self.scale * self.columns[j]) + S[j][:, j]
             inverse = torch.linalg.inv_ex(precision).inverse
             drift = -force[entries] @ inverse
             self.z_P[k], self.drift[entries] = damping * z @ inverse, drift
@@ -156,7 +157,10 @@ class OuterProducts:
         return step
 
     def penalty(self) -> Tensor | float:
-        return 0.0 if self.S is None else 0.5 * (self.leaf * (self.leaf @ self.S)).sum()
+        if self.S is None:
+            return 0.0
+        D = torch.cat((self.leaf, self.b), -1)
+        return 0.5 * (D * (D @ self.S)).sum()
 
 
 #: The gradients in one parameter.

@@ -29,27 +29,31 @@ def deviation_penalty(C: Tensor, C_0: Tensor, C_mask: Tensor) -> Tensor:
 
 
 def system_identification_penalty(
-    C: Tensor, windows: Tensor, *, normalised: bool = False
+    C: Tensor, windows: Tensor, b: Tensor | None = None, *, normalised: bool = False
 ) -> Tensor:
-    """Return ``sum_i ||C tau_i||^2`` (eq:sdp3), a scalar.
+    """Return ``sum_i ||C tau_i - b||^2`` (eq:sdp3, where b is zero), a scalar.
 
-    C has a gauge: T C is the same QP for any invertible T, so that shrinking C alone lowers the
-    penalty. ``normalised`` prevents that.
+    C and b have a gauge: T C and T b are the same QP for any invertible T, so that shrinking them
+    lowers the penalty. ``normalised`` prevents that.
 
     Args:
         C: ``(n_c, n_z)``.
         windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}], ``(M, n_z)``. With a past or a preview,
             s_j is p at step j, and the later s are the measured outputs.
-        normalised: scale the rows of C to unit norm first.
+        b: ``(n_c,)``; None for zero.
+        normalised: scale the rows of C to unit norm first, and b with them.
 
     Raises:
         QPError: if a shape does not fit.
     """
     check_tensor("C", C, "n_c", "n_z", batched=False, remedy="Pass mpc.C.")
     check_tensor("windows", windows, "M", C.shape[-1], batched=False, remedy=WINDOWS_REMEDY)
+    b = C.new_zeros(len(C)) if b is None else b
+    check_tensor("b", b, len(C), batched=False, remedy="Pass mpc.b.")
     if normalised:
-        C = F.normalize(C, dim=-1)
-    return (windows.to(C.dtype) @ C.mT).square().sum()
+        sizes = C.norm(dim=-1).clamp(min=1e-12)  # as in F.normalize
+        C, b = C / sizes.unsqueeze(-1), b / sizes
+    return (windows.to(C.dtype) @ C.mT - b).square().sum()
 
 
 class DeviationPenalty(nn.Module):
@@ -166,7 +170,7 @@ class DeviationPenalty(nn.Module):
 
 
 class SystemIdentificationPenalty(nn.Module):
-    """The system-identification (SI) penalty ``beta sum_i ||C tau_i||^2`` (eq:sdp3).
+    """The system-identification (SI) penalty ``beta sum_i ||C tau_i - b||^2`` (eq:sdp3).
 
     Args:
         beta: weight of the penalty.
@@ -190,7 +194,9 @@ class SystemIdentificationPenalty(nn.Module):
         self.beta, self.normalised = beta, normalised
 
     def curvature(self, windows: Tensor) -> Tensor:
-        """Return S ``(n_z, n_z)``: the penalty on windows ``(M, n_z)`` is ``1/2 tr(C S C')``.
+        """Return S ``(n_z + 1, n_z + 1)``: the penalty on windows ``(M, n_z)`` as a quadratic.
+
+        It is ``1/2 tr(D S D')``, with D = [C, b].
 
         Raises:
             QPError: if the penalty is normalised, so not quadratic in C, or a shape does not fit.
@@ -198,9 +204,10 @@ class SystemIdentificationPenalty(nn.Module):
         if self.normalised:
             raise QPError.expected("normalised", True, "False", "Only then is it quadratic in C.")
         check_tensor("windows", windows, "M", "n_z", batched=False, remedy=WINDOWS_REMEDY)
-        windows = windows.to(torch.float64)
-        return 2 * self.beta * windows.mT @ windows
+        tau = F.pad(windows.to(torch.float64), (0, 1), value=-1.0)
+        return 2 * self.beta * tau.mT @ tau
 
-    def forward(self, C: Tensor, windows: Tensor) -> Tensor:
-        """Return the penalty of C ``(n_c, n_z)`` on windows ``(M, n_z)``, a scalar."""
-        return self.beta * system_identification_penalty(C, windows, normalised=self.normalised)
+    def forward(self, C: Tensor, windows: Tensor, b: Tensor | None = None) -> Tensor:
+        """Return the penalty of C ``(n_c, n_z)`` and b ``(n_c,)`` on windows ``(M, n_z)``."""
+        error = system_identification_penalty(C, windows, b, normalised=self.normalised)
+        return self.beta * error

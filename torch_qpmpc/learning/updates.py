@@ -58,7 +58,7 @@ def first_order(
             losses = loss_module(batch)
         terms = {name.replace("_", "/", 1): x for name, x in losses.items() if "loss_" in name}
         if si is not None and windows is not None:
-            terms["loss/si"] = si(mpc.C, windows)
+            terms["loss/si"] = si(mpc.C, windows, mpc.b)
         due = actor_due()
         total = torch.stack([x for name, x in terms.items() if due or "value" in name]).sum()
         optimizer.zero_grad()
@@ -122,7 +122,7 @@ def second_order(
         target, terms, penalty = loss_module.target(batch).reshape(-1), {}, None
         if si is not None and windows is not None:
             penalty = si.curvature(windows)
-            terms["loss/si"] = si(mpc.C, windows)
+            terms["loss/si"] = si(mpc.C, windows, mpc.b)
         key, pairs = network.active_set_key, batch.reshape(-1)
         start = None if key is None else pairs.get(key, None)
         p, a = network.known(pairs), pairs.get(action)
