@@ -32,8 +32,8 @@ def test_every_run_is_a_row_in_the_papers_order(study):
         ("small", "gaussian", "fixed", 4),
         ("small", "gaussian", "free", 1),
         ("small", "gaussian", "free", 4),
-        ("weights", "gaussian", "deviation, c_2=0.0", 1),
-        ("weights", "gaussian", "deviation, c_2=0.5", 1),
+        ("weights", "gaussian", "identified, c_2=0.0", 1),
+        ("weights", "gaussian", "identified, c_2=0.5", 1),
     ]
     assert frame["real"].tolist() == [True, True, False, True, False, True, True]
 

@@ -127,7 +127,8 @@ class Config(Group):
             remedy = "constraint.si needs windows of task.horizon steps."
             self.conflict("task.episode_steps", expected, remedy)
         if not self.replay:
-            self.conflict("replay", "true", "constraint.si samples its windows from the replay.")
+            remedy = "constraint.si samples its windows from the replay; constraint=deviation has none."
+            self.conflict("replay", "true", remedy)
         return self
 
     @model_validator(mode="after")
