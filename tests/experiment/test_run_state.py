@@ -44,7 +44,7 @@ NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
         (*GATED, *DATA, "constraint=free"),
         ("gate=true", "algo=td3", *ACTOR_CRITIC),
         ("task=store", "optimizer=gauss_newton", "constraint=si", "replay_capacity=48"),
-        ("task=store", "constraint=free", *STREAM[2:4], "optimizer=recursive"),
+        ("task=store", "optimizer=recursive", "optimizer.memory=8", "constraint=free"),
         ("task=store", "algo=ddpg", *ACTOR_CRITIC, *NETWORKS),
     ],
     ids=" ".join,
