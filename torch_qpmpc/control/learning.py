@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.controller import Controller
@@ -185,7 +186,8 @@ def _levels(
 
 def _gathered(controller: Controller, plant: Plant, loops: int, steps: int, seed: int) -> Log:
     """Return closed loops of the controller with moving set-points as a log."""
-    runs = [_run(controller, plant, steps, (seed, 0, k)) for k in range(loops)]
+    bar = tqdm(range(loops), "transitions", unit="loop", leave=False, disable=None)
+    runs = [_run(controller, plant, steps, (seed, 0, k)) for k in bar]
     parts = ([torch.from_numpy(x) for x in (run.y, run.u, run.known)] for run in runs)
     model = controller.mpc.design.plant
     names = model.outputs, model.inputs, model.known
@@ -252,7 +254,7 @@ def _compare(
     Weights of inputs are about the old controller's targets in both.
     """
     test, costs = PairedTest(), []
-    for k in range(pairs):
+    for k in tqdm(range(pairs), "comparison", unit="pair", leave=False, disable=None):
         run = _run(old, plant, steps, (seed, 1, k))
         before = run.cost.sum()
         try:
