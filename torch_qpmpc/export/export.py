@@ -18,6 +18,7 @@ from torch_qpmpc.export.library import Library, compiler
 from torch_qpmpc.export.reference import LARGE, Reference, reference, sharpen
 from torch_qpmpc.export.tables import Array, Tables, make_tables
 from torch_qpmpc.export.writer import (
+    NEAR,
     REAL,
     Labels,
     Settings,
@@ -187,6 +188,8 @@ def build(
         library = Library(folder, name, dtype)
         agreement = _compare(mpc, tables, library, p, exact)
         _check_solved(agreement, dtype, max_iterations, tables)
+        if agreement.u > NEAR[dtype].u * np.nanmax(np.abs(exact.u), initial=1e-9):
+            _refuse(dtype, f"actions off by {agreement.u:.1e}", tables)
         if failed := library.selftest():
             kinds = [*(example.kind for example in examples.states), "invalid"]
             _refuse(dtype, f"a failed self-test at state {failed} ({kinds[failed - 1]})", tables)
