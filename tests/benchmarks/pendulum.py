@@ -27,7 +27,7 @@ from torch_qpmpc.export.writer import Settings, state_bytes, table_bytes
 from torch_qpmpc.study.markdown import replaced, table
 
 PAGE = DOCS / "results" / "conventions.md"
-HORIZONS = (50, 100, 125)
+HORIZONS = (50, 75, 100, 125)
 BLOCKS = [1, 1, 2, 4, 8]
 DT, STEPS, PASSES = 0.01, 500, 5
 #: Every this many steps of the loop is compared.

@@ -146,6 +146,9 @@ def test_a_candidate_that_fails_is_not_accepted(monkeypatch):
     monkeypatch.setattr(learning, "simulate", failing)
     report = controller.learn(Lag(), **QUICK)
     assert (report.accepted, report.after, report.pairs) == (False, math.inf, 1)
+    assert "\na loop with the new model failed, or cost far more than its pair: a veto; " in str(
+        report
+    )
 
 
 @pytest.mark.parametrize(

@@ -75,12 +75,14 @@ class LearningReport:
 
     def __str__(self) -> str:
         low, high = self.interval
+        proof = f"mean difference and 1 % of J in [{low:.3g}, {high:.3g}] with 95 %"
+        if self.pairs < FEWEST or math.isinf(self.after):
+            proof = "a loop with the new model failed, or cost far more than its pair: a veto"
         verdict = "accepted" if self.accepted else "not accepted, the controller is as before"
         return (
             f"{verdict}: J {self.before:.4g} -> {self.after:.4g} in {self.pairs} pairs of closed "
             f"loops of {self.steps} steps on {self.plant}\n"
-            f"mean difference and 1 % of J in [{low:.3g}, {high:.3g}] with 95 %; the model is "
-            f"fitted to {self.transitions} transitions"
+            f"{proof}; the model is fitted to {self.transitions} transitions"
         )
 
 
