@@ -352,7 +352,7 @@ def test_states_that_leave_nothing_but_the_open_loop_of_an_unstable_plant_are_ce
     mpc = qm.LinearMPC(([[1.5]], [[1.0]]), 20, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))
     agreement = mpc.export_c(tmp_path).agreement
     assert agreement is not None
-    assert (agreement.solved, agreement.unsolved) == (400, 0)
+    assert (agreement.solved, agreement.unsolved) == (agreement.states, 0)
     assert 1e-9 < agreement.value < 1e-7
 
 
