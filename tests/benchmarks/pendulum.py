@@ -1,4 +1,4 @@
-"""LinearMPC.jl's cart-pendulum, in C, beside a dense QP: ``python -m tests.benchmarks.pendulum``.
+"""LinearMPC.jl's cart-pendulum, in C, beside a sparse QP: ``python -m tests.benchmarks.pendulum``.
 
 The plant, the weights and the closed loop are those of the package's own benchmark
 (https://github.com/darnstrom/lmpc-codegen-benchmark); a violated bound of an output has a linear
@@ -27,7 +27,7 @@ from torch_qpmpc.export.writer import Settings, state_bytes, table_bytes
 from torch_qpmpc.study.markdown import replaced, table
 
 PAGE = DOCS / "results" / "conventions.md"
-HORIZONS = (50,)
+HORIZONS = (50, 75, 100, 125)
 BLOCKS = [1, 1, 2, 4, 8]
 DT, STEPS, PASSES = 0.01, 500, 5
 #: Every this many steps of the loop is compared.
@@ -74,64 +74,68 @@ def closed(mpc: qm.LinearMPC) -> Loop:
     return Loop(*map(np.array, zip(*rows, strict=True)))
 
 
-class Dense:
-    """The same problem as one QP in the inputs and the violations of bounds, written by hand."""
+class Sparse:
+    """The same problem as one QP in states, inputs and violations of bounds, written by hand."""
 
     def __init__(self, mpc: qm.LinearMPC) -> None:
         plant, N = mpc.design.plant, mpc.horizon
         A, B, C = plant.A, plant.B, plant.C
-        powers = [np.linalg.matrix_power(A, k) for k in range(N + 1)]
-        self.free = np.vstack(powers)
-        columns = [
-            np.vstack((np.zeros((4 * j + 4, 1)), *(P @ B for P in powers[: N - j])))
-            for j in range(N)
-        ]
-        self.forced = np.hstack(columns)
-        self.moves = np.eye(N) - np.eye(N, k=-1)
-        W = np.kron(np.eye(N + 1), C.T @ np.diag(Q) @ C)
-        W[-4:, -4:] = 0
-        self.W = W
+        blocks = mpc.design.blocks or (1,) * N
+        hold, stages = np.repeat(np.eye(len(blocks)), blocks, axis=0), np.eye(N + 1)
+        self.moves = (np.eye(N) - np.eye(N, k=-1)) @ hold
+        self.x, self.v, rows = 4 * (N + 1), len(blocks), 2 * (N + 1)
         weight = scipy.linalg.block_diag(C.T @ np.diag(Q) @ C, DR)
         pair = scipy.linalg.block_diag(A, 0.0), np.vstack((B, 1.0))
         cross = np.append(np.zeros(4), -DR)[:, None]
-        self.P = scipy.linalg.solve_discrete_are(*pair, weight, DR, s=cross)  # of x_N and u_{N-1}
-        self.C = np.kron(np.eye(N + 1), C)
-        blocks = mpc.design.blocks or (1,) * N
-        self.hold = np.repeat(np.eye(len(blocks)), blocks, axis=0)
+        P = scipy.linalg.solve_discrete_are(*pair, weight, DR, s=cross)  # of x_N and u_{N-1}
+        self.W = np.kron(np.diag(np.append(np.ones(N), 0)), weight[:4, :4])
+        self.W[-4:, -4:] = P[:4, :4]
+        H = scipy.linalg.block_diag(self.W, DR * self.moves.T @ self.moves, np.zeros((rows, rows)))
+        last = self.x + self.v - 1
+        H[last, last] += P[4, 4]
+        H[self.x - 4 : self.x, last] = H[last, self.x - 4 : self.x] = self.P = P[:4, 4]
+        y, unit = np.kron(stages, C), np.eye(rows)
+        free = np.zeros((rows, self.v))
+        steps = np.kron(stages, np.eye(4)) - np.kron(np.eye(N + 1, k=-1), A)
+        forced = np.vstack((np.zeros((4, self.v)), -np.kron(hold, B)))
+        self.matrices = [
+            sparse.csc_matrix(x)
+            for x in (
+                2 * H,
+                np.block([[y, free, -unit], [-y, free, -unit]]),
+                np.hstack((steps, forced, np.zeros((self.x, rows)))),
+            )
+        ]
 
     def solve(self, x: np.ndarray, u_last: np.ndarray, r: np.ndarray) -> float:
         """Return u_0."""
-        N, M = len(self.moves), self.hold
-        error = self.free @ x - np.tile([r[0], 0, r[1], 0], N + 1)
-        before = np.eye(N)[0] * u_last
-        G, D = self.forced @ M, self.moves @ M
-        end = np.vstack((G[-4:], M[-1:]))
-        e_end = np.append(error[-4:], 0.0)
-        H = 2 * (G.T @ self.W @ G + DR * D.T @ D + end.T @ self.P @ end)
-        q = 2 * (G.T @ self.W @ error - DR * D.T @ before + end.T @ self.P @ e_end)
-        Y, y, n = self.C @ G, self.C @ (self.free @ x), M.shape[1]
-        rows, band = len(Y), np.tile(BAND, N + 1)
-        unit = np.eye(rows)
+        (H, G, A), rows = self.matrices, self.x // 2
+        aim = np.array([r[0], 0, r[1], 0])
+        states, inputs = -2 * self.W @ np.tile(aim, self.x // 4), -2 * DR * self.moves[0] * u_last
+        inputs[-1] -= 2 * self.P @ aim
+        ends = np.full(self.x, np.inf), np.full(self.v, BOUND), np.full(rows, np.inf)
         solution = qpsolvers.solve_qp(
-            sparse.csc_matrix(scipy.linalg.block_diag(H, np.zeros((rows, rows)))),
-            np.append(q, np.full(rows, PRICE)),
-            sparse.csc_matrix(np.block([[Y, -unit], [-Y, -unit]])),
-            np.concatenate((band - y, band + y)),
-            lb=np.append(np.full(n, -BOUND), np.zeros(rows)),
-            ub=np.append(np.full(n, BOUND), np.full(rows, np.inf)),
+            H,
+            np.concatenate((states, inputs, np.full(rows, PRICE))),
+            G,
+            np.tile(BAND, rows),
+            A,
+            np.append(x, np.zeros(self.x - 4)),
+            lb=np.concatenate((-ends[0], -ends[1], np.zeros(rows))),
+            ub=np.concatenate(ends),
             solver="clarabel",
             tol_gap_abs=1e-11,
             tol_gap_rel=1e-11,
             tol_feas=1e-11,
         )
         assert solution is not None
-        return solution[0]
+        return solution[self.x]
 
 
 def row(horizon: int, blocks: list[int]) -> list[str]:
-    """Measure one MPC: sizes, microseconds of a step in C, and its distance from the dense QP."""
+    """Measure one MPC: sizes, microseconds of a step in C, and its distance from the sparse QP."""
     mpc = designed(horizon, blocks)
-    loop, dense, tables = closed(mpc), Dense(mpc), make_tables(mpc)
+    loop, other, tables = closed(mpc), Sparse(mpc), make_tables(mpc)
     with tempfile.TemporaryDirectory() as folder:
         run = compiled(mpc, Path(folder), "fast")
         passes = [run(loop.p, False) for _ in range(PASSES)]
@@ -139,7 +143,7 @@ def row(horizon: int, blocks: list[int]) -> list[str]:
     u = passes[0].u
     assert u is not None  # about the target's input, which is zero
     some = range(0, STEPS, EVERY)
-    expected = [dense.solve(loop.x[k], loop.u_last[k], loop.r[k]) for k in some]
+    expected = [other.solve(loop.x[k], loop.u_last[k], loop.r[k]) for k in some]
     settings = Settings("policy", "float64", "fast", 1)
     memory = (table_bytes(tables, settings) + state_bytes(tables, settings)) / 1024
     name = f"N = {horizon}" + (f", {len(blocks)} blocks" if blocks else "")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import sys
 
 import gymnasium
 import numpy as np
@@ -19,12 +21,12 @@ QUICK = {"r": [0.5], "spread": 0.5, "steps": 12, "transitions": 120}
 class Lag(gymnasium.Env):
     """y+ = 0.9 y + 0.5 u + load + noise."""
 
-    def __init__(self, load=0.1, noise=0.01):
-        self.load, self.noise = load, noise
+    def __init__(self, load=0.1, noise=0.01, start=0.0):
+        self.load, self.noise, self.start = load, noise, start
 
     def reset(self, *, seed=None, options=None):
         self.rng = np.random.default_rng(seed)
-        self.y = np.zeros(1)
+        self.y = self.start * self.rng.uniform(-1, 1, 1)
         return self.y, {}
 
     def step(self, action):
@@ -69,6 +71,24 @@ def test_the_same_object_costs_less_in_the_environment_with_the_same_design():
     assert np.array_equal(new.plant.E[:, 0], [0.0])
     for name in ("Q", "R", "dR", "u_bounds", "du_bounds", "linear", "horizon"):
         assert getattr(new, name) is getattr(old, name)
+
+
+@pytest.mark.parametrize(("model", "accepted"), [(WRONG, True), (RIGHT, False)])
+def test_starts_off_rest_change_no_decision(model, accepted):
+    """The filter takes them for a disturbance at first, with the old model and with the new."""
+    controller = made(model)
+    report = controller.learn(Lag(start=3.0), **QUICK)
+    assert report.accepted == accepted
+    assert np.allclose(controller.mpc.design.plant.A, 0.9, atol=0.05)
+
+
+def test_a_bar_shows_the_progress_on_a_terminal_alone(monkeypatch):
+    for interactive in (True, False):
+        monkeypatch.setattr(sys, "stderr", written := io.StringIO())
+        monkeypatch.setattr(written, "isatty", lambda shown=interactive: shown)
+        made(RIGHT).learn(Lag(), **{**QUICK, "steps": 2, "transitions": 8})
+        text = written.getvalue()
+        assert all((word in text) == interactive for word in ("transitions: ", "comparison: "))
 
 
 def test_a_controller_with_the_true_model_stays_as_it_is():
@@ -126,6 +146,9 @@ def test_a_candidate_that_fails_is_not_accepted(monkeypatch):
     monkeypatch.setattr(learning, "simulate", failing)
     report = controller.learn(Lag(), **QUICK)
     assert (report.accepted, report.after, report.pairs) == (False, math.inf, 1)
+    assert "\na loop with the new model failed, or cost far more than its pair: a veto; " in str(
+        report
+    )
 
 
 @pytest.mark.parametrize(

@@ -26,92 +26,112 @@ TWO_OUTPUTS = (np.diag([0.9, 0.5]), np.eye(2))
 TWO_INPUTS = ([[0.9]], [[0.5, 0.4]])
 
 
-def made(model, horizon=10, filtered=None, r=None, **options):
-    """Return the review of a design."""
+def controller(model, horizon=10, filtered=None, r=None, **options):
+    """Return the controller of a design, and its set-points."""
     design = {"Q": 1.0, "dR": 0.1, "u_bounds": (-1.0, 1.0), "y_bounds": (-4.0, 4.0), **options}
-    return qm.Controller(qm.LinearMPC(model, horizon, **design), **(filtered or {})).review(r)
+    return qm.Controller(qm.LinearMPC(model, horizon, **design), **(filtered or {})), r
+
+
+def made(model, *args, **options):
+    """Return the review of a design."""
+    made, r = controller(model, *args, **options)
+    return made.review(r)
 
 
 def fast(**filtered):
     return {"horizon": 20, "dR": None, "R": 1e-6, "filtered": filtered}
 
 
-#: A mistake, the finding that names it, a part of its remedy, and what the remedy changes.
+def weighted(R):
+    return {"R": float(R)}
+
+
+#: A mistake, the finding that names it, its remedy, and what the remedy changes when it is followed
+#: word by word, from its groups.
 MISTAKES = {
     "inputs without a weight": (
         (TWO_INPUTS, {"dR": None}),
-        ("cost", "Add a weight of the moves, such as dR=0.00"),
-        {"dR": 0.002},
+        ("cost", r"Raise the weights of the inputs to R=(0\.002)\."),
+        weighted,
     ),
     "a set-point out of reach": (
         (LAG, {"r": [7.0]}),
-        ("set-points", "Set y1 to 4, not 7, or widen"),
-        {"r": [4.0]},
+        ("set-points", r"Set y1 to (4), not 7, or widen the bounds\."),
+        lambda y: {"r": [float(y)]},
     ),
     "a band out of reach": (
         (LAG, {"y_bounds": (10.0, 20.0)}),
-        ("set-points", "Let y_bounds of y1 overlap -5 .. 5."),
-        {"y_bounds": (-5.0, 20.0)},
+        ("set-points", r"Let y_bounds of y1 overlap (-5) \.\. 5\."),
+        lambda lower: {"y_bounds": (float(lower), 20.0)},
     ),
     "a hard bound of an output": (
         (INTEGRATOR, {"y_slack": np.inf}),
-        ("hard bounds", "Give y1 a finite y_slack"),
-        {"y_slack": 100.0},
+        ("hard bounds", r"Give y1 a finite y_slack\."),
+        lambda: {"y_slack": 100.0},
     ),
     "units far apart": (
         (([[0.9]], [[5e4]]), {"y_bounds": (-4e5, 4e5)}),
-        ("scaling", r"Measure y1 in units of 1e\+06"),
-        {"model": ([[0.9]], [[5e-2]]), "y_bounds": (-0.4, 0.4)},
+        ("scaling", r"Measure y1 in units of (1e\+06)\."),
+        lambda unit: {
+            "model": ([[0.9]], [[5e4 / float(unit)]]),
+            "y_bounds": (-4e5 / float(unit), 4e5 / float(unit)),
+        },
     ),
     "an inverse response and a short horizon": (
         (INVERSE, {"horizon": 3}),
-        ("horizon", "Take a horizon of 32 or more"),
-        {"horizon": 32},
+        ("horizon", r"Take a horizon of (32) or more\."),
+        lambda N: {"horizon": int(N)},
     ),
     "a dead time and a short horizon": (
         (DEAD_TIME, {"horizon": 4}),
-        ("horizon", "Take a horizon of 12 or more"),
-        {"horizon": 12},
+        ("horizon", r"Take a horizon of (12) or more\."),
+        lambda N: {"horizon": int(N)},
     ),
     "a disturbance that looks like the state": (
         (([[0.99999]], [[0.5]]), {"disturbances": {"y1": "output"}}),
-        ("disturbances", "disturbance of y1 looks like a slow mode: take disturbances='auto'"),
-        {"disturbances": "auto"},
+        (
+            "disturbances",
+            r"Take disturbances='(auto)': the disturbance of y1 looks like a.*",
+        ),
+        lambda auto: {"disturbances": auto},
     ),
     "no disturbances": (
         (LAG, {"disturbances": None}),
-        ("offset", "Take disturbances='auto'"),
-        {"disturbances": "auto"},
+        ("offset", r"Take disturbances='(auto)': one for each output\."),
+        lambda auto: {"disturbances": auto},
     ),
     "a mode without a weight": (
         (INTEGRATOR[:2], {"Q": [0.0, 1.0]}),
-        ("terminal weight", "Weight an output that shows this mode, by Q"),
-        {"Q": [1.0, 1.0]},
+        ("terminal weight", r"Weight an output that shows this mode, by Q\."),
+        lambda: {"Q": [1.0, 1.0]},
     ),
     "a discount that forgets an unstable plant": (
         (([[1.1]], [[0.5]]), {"gamma": 0.5, "Q": 1e-4, "dR": 1.0}),
-        ("stability", "Take gamma=1"),
-        {"gamma": 1.0},
+        ("stability", r"Take gamma=(1)\."),
+        lambda gamma: {"gamma": float(gamma)},
     ),
     "a filter that trusts all": (
         (INTEGRATOR, fast(noise=1e-3, drift=1.0)),
-        ("margin", "the filter's noise relative to its drift"),
-        fast(noise=1.0, drift=1e-3),
+        (
+            "margin",
+            r"Slow the filter down, by qm\.Controller\(\.\., noise={'y1': (1)}\)\.",
+        ),
+        lambda noise: fast(noise={"y1": float(noise)}, drift=1.0),
     ),
     "weights far apart": (
         (TWO_INPUTS, {"dR": 1e-10}),
-        ("condition", "Raise R or dR"),
-        {"R": 0.1},
+        ("condition", r"Raise the weights of the inputs to R=(0\.002)\."),
+        weighted,
     ),
     "inputs that set-points leave free, without a weight": (
         (TWO_INPUTS, {}),
-        ("terminal weight", "Weight all inputs by R"),
-        {"R": 0.01},
+        ("terminal weight", r"Weight all inputs by R: several of them hold the same outputs\."),
+        lambda: {"R": 0.01},
     ),
     "a weight that does not matter": (
         (TWO_OUTPUTS, {"Q": [1.0, 1e-9]}),
-        ("weights", "Raise Q of y2, or leave it out"),
-        {"Q": [1.0, 0.1]},
+        ("weights", r"Raise Q of y2 to (0\.2), or leave it out: y2 does not matter\."),
+        lambda weight: {"Q": [1.0, float(weight)]},
     ),
 }
 
@@ -119,11 +139,27 @@ MISTAKES = {
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake):
     (model, options), (name, remedy), change = MISTAKES[mistake]
-    found = made(model, **options)
-    assert name in [x.name for x in found.faults]
-    assert re.search(remedy, found[name].remedy)
-    mended = made(**{"model": model, **options, **change})
-    assert mended.faults == []
+    design = {"model": model, **options}
+    fault = made(**design)[name]
+    assert not fault.ok
+    words = re.fullmatch(remedy, fault.remedy)
+    assert words, fault.remedy
+    changed = {**design, **change(*words.groups())}
+    assert made(**changed).faults == []
+    assert cost(changed, changed) <= 1.001 * cost(design, changed)
+
+
+def cost(design, wanted):
+    """Return J of a design's loop with noise and a load, in the weights and units of another."""
+    runs = []
+    for options in (design, wanted):
+        looped, r = controller(**options)
+        noise = 0.01 * looped.mpc.design.y_bounds[1]
+        r = 10 * noise if r is None else r
+        runs.append(looped.simulate(steps=60, r=r, load=0.05, noise=noise))
+    run, aim = runs
+    unit = (run.r / aim.r)[0] if design["model"] != wanted["model"] else 1.0
+    return replace(aim, y=run.y / unit, u=run.u).costs(aim.u_s).sum()
 
 
 @pytest.mark.parametrize("model", [LAG, INTEGRATOR, DEAD_TIME])

@@ -344,3 +344,20 @@ def test_entries_with_one_value_only_keep_it_in_the_examples(tmp_path):
         agreement = mpc.export_c(tmp_path).agreement
         assert agreement is not None
         assert agreement.solved > 50
+
+
+@needs_compiler
+def test_states_that_leave_nothing_but_the_open_loop_of_an_unstable_plant_are_certified(tmp_path):
+    """All inputs are at bounds: the gap is then what the rounding of Q makes of the multipliers."""
+    mpc = qm.LinearMPC(([[1.5]], [[1.0]]), 20, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))
+    agreement = mpc.export_c(tmp_path).agreement
+    assert agreement is not None
+    assert (agreement.solved, agreement.unsolved) == (agreement.states, 0)
+    assert 1e-9 < agreement.value < 1e-7
+
+
+@needs_compiler
+def test_actions_that_differ_at_any_state_are_refused(tmp_path):
+    mpc = qm.LinearMPC(([[2.0]], [[1.0]]), 12, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))
+    with pytest.raises(QPError, match=r"^dtype: got 'float64', with actions off by 1\.\de-04"):
+        mpc.export_c(tmp_path)

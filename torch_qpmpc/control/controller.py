@@ -243,7 +243,11 @@ class Controller:
         The cost is that of `Run.costs`, the design's own, which must be shown to fall by 1 %.
         An accepted controller starts again with the new model, from rest with its last input;
         otherwise it stays as it is. Loops start where the last `reset` rests, those with a log's
-        model at rest in the middle of the set-points.
+        model at rest in the middle of the set-points. An environment starts where its own reset
+        says: the filter takes a start that is not at rest for a disturbance, and each loop pays for
+        it until the filter has settled. The old model and the new one pay on the same starts, so
+        that the decision stands; a controller with ``window=True`` settles in a few steps.
+        On a terminal a bar shows the progress.
 
         Args:
             source: an environment, as in `simulate`: the controller gathers transitions in closed

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.controller import Controller
@@ -74,12 +75,14 @@ class LearningReport:
 
     def __str__(self) -> str:
         low, high = self.interval
+        proof = f"mean difference and 1 % of J in [{low:.3g}, {high:.3g}] with 95 %"
+        if self.pairs < FEWEST or math.isinf(self.after):
+            proof = "a loop with the new model failed, or cost far more than its pair: a veto"
         verdict = "accepted" if self.accepted else "not accepted, the controller is as before"
         return (
             f"{verdict}: J {self.before:.4g} -> {self.after:.4g} in {self.pairs} pairs of closed "
             f"loops of {self.steps} steps on {self.plant}\n"
-            f"mean difference and 1 % of J in [{low:.3g}, {high:.3g}] with 95 %; the model is "
-            f"fitted to {self.transitions} transitions"
+            f"{proof}; the model is fitted to {self.transitions} transitions"
         )
 
 
@@ -185,7 +188,8 @@ def _levels(
 
 def _gathered(controller: Controller, plant: Plant, loops: int, steps: int, seed: int) -> Log:
     """Return closed loops of the controller with moving set-points as a log."""
-    runs = [_run(controller, plant, steps, (seed, 0, k)) for k in range(loops)]
+    bar = tqdm(range(loops), "transitions", unit="loop", leave=False, disable=None)
+    runs = [_run(controller, plant, steps, (seed, 0, k)) for k in bar]
     parts = ([torch.from_numpy(x) for x in (run.y, run.u, run.known)] for run in runs)
     model = controller.mpc.design.plant
     names = model.outputs, model.inputs, model.known
@@ -252,7 +256,7 @@ def _compare(
     Weights of inputs are about the old controller's targets in both.
     """
     test, costs = PairedTest(), []
-    for k in range(pairs):
+    for k in tqdm(range(pairs), "comparison", unit="pair", leave=False, disable=None):
         run = _run(old, plant, steps, (seed, 1, k))
         before = run.cost.sum()
         try:

@@ -17,10 +17,11 @@ from torch_qpmpc.control.findings import Finding, Review
 from torch_qpmpc.control.linear_mpc import Target
 from torch_qpmpc.control.loop import LinearLoop
 from torch_qpmpc.control.lowering import riccati
+from torch_qpmpc.control.observer import kalman
 from torch_qpmpc.control.probe import held_known, probe
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.export.tables import SINGULAR, digest, make_tables
+from torch_qpmpc.export.tables import SINGULAR, Tables, digest, make_tables
 from torch_qpmpc.export.writer import Settings, state_bytes, table_bytes
 from torch_qpmpc.proofs import Answer
 from torch_qpmpc.qp.pipeline.condensing import null_space
@@ -29,12 +30,14 @@ from torch_qpmpc.qp.solve import solve_qp
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
 MARGIN, CONDITION, SPREAD, HIDDEN = 0.3, 1e8, 1e4, 1e-3
-#: An output's weight with a smaller share of the cost does not matter.
-IDLE = 1e-6
+#: An output's weight with a smaller share of the cost does not matter; one that does.
+IDLE, NOTED = 1e-6, 1e-2
 #: Offsets relative to half the distance of an output's bounds.
 OFFSET = 1e-6
 #: A response below this share of those soon after, with inputs of half their range, is noise.
 SHOWS = 0.03
+#: The most powers of ten that the filter's noise is raised by, for a margin.
+SLOWEST = 8
 #: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
 LARGEST = 2.0
 
@@ -69,10 +72,10 @@ def review(
     plan, target = make_tables(mpc), make_tables(mpc.targets)
     qps = [plan, target, *([] if mpc.free is None else [make_tables(mpc.free)])]
     loop = LinearLoop.of(controller, plan, target)
-    findings.append(_condition(plan.condition, mpc.horizon))
+    findings.append(_condition(plan.condition, cost.numbers["largest"]))
     findings.append(_stability(loop, mpc.design.gamma))
     if loop.radius < 1:
-        findings += [_margin(loop), _offset(loop, controller)]
+        findings += [_margin(loop, controller, plan, target), _offset(loop, controller)]
     settings = Settings("policy", "float64", "fast", 1)
     sizes = {
         "bytes of tables": sum(table_bytes(x, settings) for x in qps),
@@ -97,10 +100,14 @@ def _cost(controller: Controller) -> Finding:
     sizes = np.linalg.eigvalsh(T_v.T @ (H + H.T) @ T_v / 2)
     numbers = {"smallest eigenvalue on the plan": sizes[0], "largest": sizes[-1]}
     ok = bool(sizes[0] > SINGULAR * sizes[-1])
-    remedy = f"Add a weight of the moves, such as dR={1e-3 * sizes[-1]:.1g}."
+    remedy = _weighted(sizes[-1])
     if sizes[0] < -SINGULAR * abs(sizes[-1]):
         remedy = "Learning has made it indefinite: mpc.reset_parameters(), or learn other parts."
     return Finding("cost", ok, numbers, remedy * (not ok))
+
+
+def _weighted(largest: float) -> str:
+    return f"Raise the weights of the inputs to R={1e-3 * largest:.1g}."
 
 
 def _terminal(controller: Controller) -> Finding:
@@ -184,7 +191,7 @@ def _disturbances(controller: Controller) -> Finding:
     numbers: dict[str, Any] = {"estimated": ", ".join(w.names) or "none"}
     numbers["smallest singular value"] = sizes[-1]
     hidden = w.names[int(np.abs(V[-1, len(plant.A) :]).argmax())] if w.names else ""
-    remedy = f"The {hidden} looks like a slow mode: take disturbances='auto', or one at an input."
+    remedy = f"Take disturbances='auto': the {hidden} looks like a slow mode."
     return Finding("disturbances", ok, numbers, remedy * (not ok))
 
 
@@ -292,10 +299,10 @@ def _reach(controller: Controller) -> tuple[Array, Array]:
     return ends[0], ends[1]
 
 
-def _condition(condition: float, horizon: int) -> Finding:
+def _condition(condition: float, largest: float) -> Finding:
     """The QP's numbers are exact enough."""
     ok = bool(condition < CONDITION)
-    remedy = f"Raise R or dR, or take a horizon of {max(horizon // 3, 2)}."
+    remedy = _weighted(largest)
     return Finding("condition", ok, {"of the cost on the plan": condition}, remedy * (not ok))
 
 
@@ -308,7 +315,7 @@ def _stability(loop: LinearLoop, gamma: float) -> Finding:
     return Finding("stability", ok, {"largest eigenvalues": slow}, remedy * (not ok))
 
 
-def _margin(loop: LinearLoop) -> Finding:
+def _margin(loop: LinearLoop, controller: Controller, plan: Tables, target: Tables) -> Finding:
     """The loop without bounds tolerates errors of the model."""
     margin = loop.modulus_margin()
     gains = np.array([1 / (1 + margin), 1 / max(1 - margin, 1e-9)])
@@ -317,9 +324,19 @@ def _margin(loop: LinearLoop) -> Finding:
         "gains": gains,
         "phase in degrees": np.degrees(2 * np.arcsin(min(margin / 2, 1.0))),
     }
-    ok = margin >= MARGIN
-    remedy = "Raise dR tenfold, or the filter's noise relative to its drift."
-    return Finding("margin", ok, numbers, remedy * (not ok))
+    if margin >= MARGIN:
+        return Finding("margin", True, numbers)
+    remedy = "Raise dR tenfold."
+    for power in range(1, SLOWEST + 1):
+        noise, slower = controller._noise * 10**power, copy.copy(controller)
+        slower.observer = kalman(controller.mpc.design, noise, controller._drift)
+        loop = LinearLoop.of(slower, plan, target)
+        if loop.radius < 1 and loop.modulus_margin() >= MARGIN:
+            named = dict(zip(controller.mpc.design.plant.outputs, noise.tolist(), strict=True))
+            pairs = ", ".join(f"{name!r}: {x:.3g}" for name, x in named.items())
+            remedy = f"Slow the filter down, by qm.Controller(.., noise={{{pairs}}})."
+            break
+    return Finding("margin", False, numbers, remedy)
 
 
 def _offset(loop: LinearLoop, controller: Controller) -> Finding:
@@ -341,12 +358,14 @@ def _offset(loop: LinearLoop, controller: Controller) -> Finding:
 def _weights(controller: Controller, shares: Mapping[str, float]) -> Finding:
     """Each output's weight matters for the cost of a closed loop."""
     names, Q = controller.mpc.design.plant.outputs, controller.mpc.design.Q
-    small = [
-        names[i] for i in np.flatnonzero(Q.any(0)) if abs(shares.get(f"Q of {names[i]}", 1)) < IDLE
-    ]
     numbers = {f"share of {name} in the cost": share for name, share in shares.items()}
-    remedy = f"Raise Q of {', '.join(small)}, or leave it out: it does not matter."
-    return Finding("weights", not small, numbers, remedy * bool(small))
+    remedies = []
+    for i in np.flatnonzero(Q.any(0)):
+        share = abs(shares.get(f"Q of {names[i]}", 1))
+        if share < IDLE:
+            to = f"Raise Q of {names[i]} to {NOTED / share * Q[i, i]:.1g}, or leave" * (share > 0)
+            remedies.append(f"{to or 'Leave'} it out: {names[i]} does not matter.")
+    return Finding("weights", not remedies, numbers, " ".join(remedies))
 
 
 def _proof(name: str, answer: Answer, digest: str) -> Finding:

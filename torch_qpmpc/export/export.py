@@ -18,6 +18,7 @@ from torch_qpmpc.export.library import Library, compiler
 from torch_qpmpc.export.reference import LARGE, Reference, reference, sharpen
 from torch_qpmpc.export.tables import Array, Tables, make_tables
 from torch_qpmpc.export.writer import (
+    NEAR,
     REAL,
     Labels,
     Settings,
@@ -185,7 +186,7 @@ def build(
     library, agreement = None, None
     if compiler() is not None:
         library = Library(folder, name, dtype)
-        agreement = _compare(mpc, tables, library, p, exact)
+        agreement = _compare(mpc, tables, library, p, exact, dtype)
         _check_solved(agreement, dtype, max_iterations, tables)
         if failed := library.selftest():
             kinds = [*(example.kind for example in examples.states), "invalid"]
@@ -233,7 +234,9 @@ def _states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, Reference]:
     return p.astype(dtype).astype(np.float64), exact
 
 
-def _compare(mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Reference) -> Agreement:
+def _compare(
+    mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Reference, dtype: str
+) -> Agreement:
     steps = library.steps(library.states(len(p)), p, tables.n_u)
     solvable = exact.status == Status.SOLVED
     both = solvable & (steps.codes == 0)
@@ -247,6 +250,11 @@ def _compare(mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Refe
     doubtful = both & ((u > DOUBTFUL * size) | (value > DOUBTFUL))
     if library.real == np.float64:
         u, value = differences(sharpen(mpc, p, exact, np.flatnonzero(doubtful)))
+    # Relative to the state's own action, or to a usual one: some drawn states have huge ones.
+    sizes = np.abs(exact.u).max(-1)
+    sizes = np.fmax(sizes, np.median(sizes[both]) if both.any() else 0).clip(1e-9)
+    if (both & (u > NEAR[dtype].u * sizes)).any():
+        _refuse(dtype, f"actions off by {u[both].max():.1e}", tables)
     return Agreement(
         states=len(p),
         solved=int(both.sum()),

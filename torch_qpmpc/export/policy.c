@@ -352,7 +352,7 @@ static real distance(real y, real lower, real upper)
 /* Certify the multipliers: complete the value and the info; return 1 if they are optimal. */
 static int certify(const policy_state *s, real v_free, policy_info *info)
 {
-    real quadratic = 0, charges = 0, sum = 0;
+    real quadratic = 0, charges = 0, sum = 0, terms;
     int i, holds = 1;
     info->gap = 0;
     for (i = 0; i < POLICY_ROWS; i++) sum += absolute(s->lambda[i]);
@@ -373,7 +373,9 @@ static int certify(const policy_state *s, real v_free, policy_info *info)
         charges += charge;
     }
     info->value += v_free + quadratic + charges;
-    return holds && info->gap <= GAP * (absolute(v_free) + absolute(quadratic) + charges);
+    /* rounding of the entries of Q alone moves the value by up to EPSILON sum^2 */
+    terms = absolute(v_free) + absolute(quadratic) + charges;
+    return holds && info->gap <= larger(GAP * terms, smaller(COARSE * terms, EPSILON * sum * sum));
 }
 
 /* Write u for the current multipliers, within the action bounds. */
