@@ -87,6 +87,14 @@ class Plant(ABC):
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """Return L(x, u, w) ``(*batch,)``, of the applied u ``(*batch, n_u)``."""
 
+    def output_cost(self, y: Tensor, u: Tensor, d: Tensor) -> Tensor | None:
+        """Return the cost that the outputs y, the applied u and the known signals d show.
+
+        It may differ from `cost` by a constant in the mean, as with noise in y. None, unless
+        overridden, if it is unknown.
+        """
+        return None
+
     @abstractmethod
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """Return x+ = f(x, u, w) ``(*batch, n_x)``, for the applied u."""
