@@ -10,9 +10,11 @@ from torch.testing import assert_close
 import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc.experiment.algorithms import evaluate, make_learner, make_operator
+from torch_qpmpc.experiment.collection import make_run_replay
 from torch_qpmpc.experiment.gating import BEST, PATIENCE, RunGate
 from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.experiment.tasks.identified import Start
 from torch_qpmpc.study.runs import FinishedRun
 
 GATED = (*SMALL, "gate=true", "optimizer=gauss_newton", "batch_size=32", "steps_per_update=4")
@@ -52,11 +54,12 @@ def test_the_policy_that_is_kept_is_the_one_that_is_reported(run):
     assert (folder / BEST).exists()
 
 
-def make_gate(*overrides: str) -> tuple[RunGate, Any]:
+def make_gate(*overrides: str, start: Start | None = None) -> tuple[RunGate, Any]:
     cfg = make_config(*SMALL, *overrides)
     physics = make_physics(cfg)
-    learner = make_learner(cfg, make_operator(cfg, make_mpc(cfg, physics)), physics)
-    return RunGate(cfg, learner, physics), learner.actor
+    mpc = make_mpc(cfg, physics)
+    learner, replay = make_learner(cfg, make_operator(cfg, mpc), physics), make_run_replay(cfg, mpc)
+    return RunGate(cfg, learner, physics, start, replay), learner.actor
 
 
 def test_without_a_gate_the_learner_acts(tmp_path):
