@@ -34,21 +34,19 @@ LAYOUT = Layout(2, 1, 3, 2, 1)
 def test_J_of_a_policy_is_predicted_from_a_log_of_another():
     lb, ub = (x * torch.tensor([100.0, 100, 100, 100]).double() for x in (-1, 1))
     physics = PointMass(lb_s=lb, ub_s=ub)
-    log = physics.vectorised(40, 25, seed=3).rollout(50, break_when_any_done=False)
+    log = physics.vectorised(200, 25, seed=3).rollout(25)
     options = {"stage_weight": [1.0] * 4 + [0.1] * 2, "action_bounds": ([-1] * 2, [1] * 2)}
     for N in (2, 10):
         mpc = qm.QPMPC.from_model(physics.A, physics.B, N, solver="daqp", **options)
-        J = closed_loop(warm_policy(mpc), physics, steps=40, starts=256, seed=5).J
-        own = predict_cost(mpc, log, lambda y, u, d: physics.cost(y, u), steps=40, starts=256)
-        fitted = predict_cost(mpc, log, steps=40, starts=256)
-        assert own.low < own.J < own.high
-        assert own.J == pytest.approx(J, rel=0.1)
-        assert fitted.J == pytest.approx(own.J, rel=0.02)
-        behaviour = -log["next", "reward"].sum().item() / 40 / 2 * 40 / 25
-        assert abs(J - behaviour) > abs(J - own.J)
+        true = closed_loop(warm_policy(mpc), physics, steps=25, starts=256, seed=5).J
+        own = predict_cost(mpc, log, lambda y, u, d: physics.cost(y, u), steps=25, starts=256)
+        fitted = predict_cost(mpc, log, steps=25, starts=256)
+        assert own.low < true < own.high
+        assert abs(own.J - true) < 0.1 * true
+        assert abs(fitted.J - own.J) < 0.02 * own.J
 
 
-def test_members_differ_in_their_data_and_start_as_the_log_does():
+def test_members_differ_in_their_data_and_start_as_the_logs_trajectories_do():
     log = arx_log(episodes=6, noise=0.1)
     models = ensemble(log, LAYOUT, lambda y, u, d: y[..., 0], *BOUNDS)
     assert len(models) == MEMBERS
@@ -106,8 +104,8 @@ def test_the_run_has_the_plants_cost_or_one_fitted_to_rewards(store_task):
     ("arguments", "message"),
     [
         ({"members": 1}, "members: got 1, expected"),
-        ({"members": 40}, "trajectories: got 3 transitions in "),
-        ({"members": 16}, "of which no half determines a model"),
+        ({"members": 40}, "trajectories: got 0 transitions in 0"),
+        ({"members": 7}, "of which no half determines a model"),
     ],
 )
 def test_a_log_that_is_too_short_for_the_members_is_named(arguments, message):
@@ -128,11 +126,11 @@ def test_a_run_with_too_few_transitions_for_an_ensemble_says_so_at_its_start(tmp
     physics = make_physics(cfg)
     least = MEMBERS * 2 * (7 + BLOCKS)
     message = (
-        f"gate: got 'model' with 24 transitions before the first .*, expected at least {least}"
+        f"gate: got 'model' with 32 transitions before the first .*, expected at least {least}"
     )
     with pytest.raises(QPError, match=message):
         check_ensemble(cfg, physics, None)
-    cfg.warmup_steps = least // cfg.num_envs - 2
+    cfg.warmup_steps = least // cfg.num_envs - 4
     check_ensemble(cfg, physics, None)
     cfg = make_config(*SMALL, *log_overrides(tmp_path), "gate=model")
     with pytest.raises(QPError, match="gate: got 'model' with task=log, whose plant is a model"):

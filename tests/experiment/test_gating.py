@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +9,17 @@ import torch
 from torch.testing import assert_close
 
 import train
+from tests.logs import arx_log
 from tests.runs import SMALL, make_config
+from torch_qpmpc import QPMPC, Model
+from torch_qpmpc.envs import ActuatorNoise
+from torch_qpmpc.envs.arx_plant import ARXMember
 from torch_qpmpc.experiment.algorithms import evaluate, make_learner, make_operator
 from torch_qpmpc.experiment.collection import make_run_replay
+from torch_qpmpc.experiment.ensemble import run_ensemble
 from torch_qpmpc.experiment.gating import BEST, PATIENCE, RunGate
 from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.experiment.start import collect_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import Start
 from torch_qpmpc.study.runs import FinishedRun
@@ -143,3 +150,54 @@ def test_a_search_starts_from_the_policy_that_is_kept():
     found = gate.judge(4)
     assert {"search/w", "search/accepted"} <= set(found)
     assert_close(actor.module.C.detach(), gate.kept.module.C.detach())
+
+
+MODEL = (*SMALL, "gate=model", "replay_capacity=800", "warmup_steps=120", "optimizer=gauss_newton")
+
+
+def test_with_models_the_plant_runs_no_closed_loop_of_a_comparison(tmp_path, monkeypatch):
+    def forbidden(*_: Any) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("torch_qpmpc.experiment.gating.evaluate", forbidden)
+    for name in ("point_mass", "house_wall"):
+        cfg = make_config(*MODEL, f"task={name}", "search.w=0.5", "search.loops=6")
+        summary = train.train(cfg, str(tmp_path / name))
+        assert summary["modelled"] > 0
+        assert "simulated" not in summary
+        table = read_metrics(tmp_path / name)
+        pairs = table["gate/pairs"].sum() + table["search/pairs"].sum()
+        searched = summary["modelled"] / 10 - 2 * pairs
+        assert searched >= 6 * 4 * 32
+        assert searched % (4 * 32) == 0
+
+
+def test_a_candidate_that_exploits_one_member_is_not_kept(monkeypatch):
+    gate, actor = make_gate(*MODEL, "constraint=mpc", "updates=4", "task.eval_steps=20")
+    cfg = make_config("start=data", "start.transitions=1000", "num_envs=20")
+    physics = make_physics(cfg)
+    right = run_ensemble(cfg, physics, collect_log(cfg, physics))
+    wrong = replace(right[0], B=-right[0].B)  # actions act the other way
+
+    def follow(policy: Any, member: ARXMember) -> None:
+        scheme = replace(policy.module.scheme, model=Model(member.A, member.B))
+        module = QPMPC(scheme, learn=policy.module.learned, structure="tied")
+        policy.module.load_state_dict(module.state_dict())
+
+    follow(gate.kept, right[1])
+    follow(actor, wrong)
+    for models, accepted in (([wrong, *right[1:]], 0), ([wrong] * 4, 1)):
+        monkeypatch.setattr("torch_qpmpc.experiment.gating.run_ensemble", lambda *_, m=models: m)
+        monkeypatch.setattr(gate, "_logged", list)
+        verdict = gate.judge(2)
+        assert verdict["gate/accepted"] == accepted
+        assert (verdict["gate/mean"] < 0) == bool(accepted)
+
+
+def test_a_candidate_is_rejected_where_no_ensemble_is_identified(monkeypatch):
+    gate, _ = make_gate(*MODEL)
+    still = arx_log(noise=0.1).apply(lambda x: 0 * x)
+    monkeypatch.setattr(gate, "_logged", lambda: [still])
+    monkeypatch.setattr(gate, "_physics", ActuatorNoise())
+    with pytest.warns(UserWarning, match="gate=model rejects the candidate: action: got"):
+        assert gate.judge(4) == {"gate/accepted": 0.0}

@@ -52,9 +52,9 @@ def predict_cost(
 ) -> PredictedCost:
     """Predict J of a policy from a log alone: off-policy evaluation, with a range.
 
-    The policy runs in closed loop on the models of an `ensemble`. Their range is that of models
-    which the log cannot tell apart. It is no confidence interval, and does not contain what no
-    linear model of the log has.
+    The policy runs in closed loop on the models of an `ensemble`. Their range shows how much J
+    varies between parts of the log, in models and starts. It is no confidence interval, and says
+    nothing of what no linear model has.
 
     Args:
         mpc: the policy.
@@ -62,7 +62,7 @@ def predict_cost(
         stage_cost: the cost ``(*batch,)`` of y ``(*batch, n_x)``, u ``(*batch, n_u)`` and the known
             signals d ``(*batch, n_d)``; by default the quadratic one that is fitted to the log's
             rewards.
-        steps, starts, seed: those of the closed loops, which start where the log's trajectories do.
+        steps, starts, seed: those of the closed loops on each model.
 
     Raises:
         QPError: as in `ensemble`, or there are no rewards to fit a cost to.
@@ -97,8 +97,9 @@ def ensemble(
 ) -> list[ARXMember]:
     """Fit ARX models to disjoint parts of a log, each to four blocks of steps from all over it.
 
-    A member's disturbances are its own cross-validated one-step errors, drawn with replacement. All
-    members start where the log's trajectories do, with the known signals that follow.
+    A member's disturbances are its own cross-validated one-step errors, drawn with replacement. It
+    starts where some of the log's trajectories do, with the known signals that follow; each member
+    has others if there are enough of them.
 
     Args:
         data: a log, as in `identify`.
@@ -113,14 +114,14 @@ def ensemble(
     check_whole("members", members, 2)
     log = as_log(data, layout.n_x, layout.n_d)
     blocks = folds(log.trajectories, members * BLOCKS)
-    first = torch.tensor([0, *(trajectory.steps for trajectory in log.trajectories[:-1])])
-    options = {"first": first.cumsum(0), "stage_cost": stage_cost, "lb_a": lb_a, "ub_a": ub_a}
+    first = torch.tensor([0, *(trajectory.steps for trajectory in log.trajectories[:-1])]).cumsum(0)
+    options = {"stage_cost": stage_cost, "lb_a": lb_a, "ub_a": ub_a, "horizon": layout.horizon}
     models = []
     for i in range(members):
         part = [trajectory for block in blocks[i::members] for trajectory in block]
         model = identify(replace(log, trajectories=part), 1, past=layout.past, structure="tied")
-        arguments = arx_arguments(model, log)
-        models.append(ARXMember(**arguments, **options, horizon=layout.horizon))
+        starts = first[i::members] if len(first) >= members else first
+        models.append(ARXMember(**arx_arguments(model, log), **options, first=starts))
     return models
 
 
