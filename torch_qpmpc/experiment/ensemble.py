@@ -10,7 +10,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torch_qpmpc.checks import check_kind, check_whole
+from torch_qpmpc.checks import check_kind
 from torch_qpmpc.envs import LinearSystem, Plant
 from torch_qpmpc.envs.arx_plant import ARXMember
 from torch_qpmpc.envs.closed_loop import plant_loop
@@ -27,7 +27,7 @@ from torch_qpmpc.mpc.rewards import fit_rewards
 from torch_qpmpc.mpc.trajectories import folds
 
 #: Models of an ensemble, and the blocks of consecutive steps that each is fitted to.
-MEMBERS, BLOCKS = 4, 4
+MEMBERS, BLOCKS = 4, 8
 
 #: A cost of y, u and d.
 StageCost = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -88,41 +88,40 @@ def predict_cost(
 
 
 def ensemble(
-    data: Any,
-    layout: Layout,
-    stage_cost: StageCost,
-    lb_a: Tensor,
-    ub_a: Tensor,
-    members: int = MEMBERS,
+    data: Any, layout: Layout, stage_cost: StageCost, lb_a: Tensor, ub_a: Tensor
 ) -> list[ARXMember]:
-    """Fit ARX models to disjoint parts of a log, each to four blocks of steps from all over it.
+    """Fit four ARX models to halves of a log, each to eight blocks of steps from all over it.
+
+    A model of half the data differs from that of all by as much as that does from the truth: both
+    differences have the same variance (half-samples: McCarthy, "Pseudo-replication: half samples",
+    Review of the International Statistical Institute 1969).
 
     A member's disturbances are its own cross-validated one-step errors, drawn with replacement. It
-    starts where some of the log's trajectories do, with the known signals that follow; each member
-    has others if there are enough of them.
+    starts where a quarter of the log's trajectories do or, if these are fewer than four, where all
+    do, with the known signals that follow.
 
     Args:
         data: a log, as in `identify`.
         layout: the sizes of the policies.
         stage_cost: the cost ``(*batch,)`` of y, u and d.
         lb_a, ub_a: bounds of the action, ``(n_u,)``.
-        members: the number of models.
 
     Raises:
-        QPError: a part identifies no model.
+        QPError: a half identifies no model.
     """
-    check_whole("members", members, 2)
     log = as_log(data, layout.n_x, layout.n_d)
-    blocks = folds(log.trajectories, members * BLOCKS)
+    blocks = folds(log.trajectories, 2 * BLOCKS)
     first = torch.tensor([0, *(trajectory.steps for trajectory in log.trajectories[:-1])]).cumsum(0)
     options = {"stage_cost": stage_cost, "lb_a": lb_a, "ub_a": ub_a, "horizon": layout.horizon}
-    models = []
-    for i in range(members):
-        part = [trajectory for block in blocks[i::members] for trajectory in block]
+    members = []
+    for i in range(MEMBERS):
+        # Blocks i and i + 1 of each four: each block is in two members.
+        half = [*blocks[i::MEMBERS], *blocks[(i + 1) % MEMBERS :: MEMBERS]]
+        part = [trajectory for block in half for trajectory in block]
         model = identify(replace(log, trajectories=part), 1, past=layout.past, structure="tied")
-        starts = first[i::members] if len(first) >= members else first
-        models.append(ARXMember(**arx_arguments(model, log), **options, first=starts))
-    return models
+        starts = first[i::MEMBERS] if len(first) >= MEMBERS else first
+        members.append(ARXMember(**arx_arguments(model, log), **options, first=starts))
+    return members
 
 
 def run_ensemble(cfg: DictConfig, physics: AnyPlant, data: Any) -> list[ARXMember]:
@@ -156,7 +155,7 @@ def check_ensemble(cfg: DictConfig, physics: AnyPlant, start: Start | None) -> N
         raise QPError.expected("gate", got, "a plant", "Choose gate=act.")
     layout = plant_layout(physics, 1)
     coefficients = layout.past * layout.n + layout.n_d + 1
-    needed = MEMBERS * 2 * (coefficients + BLOCKS * layout.past)
+    needed = 2 * 2 * (coefficients + BLOCKS * layout.past)
     first = min(cfg.gate_interval or cfg.eval_interval, cfg.updates)
     steps = -(-cfg.warmup_steps // cfg.steps_per_update) + first
     collected = min(steps * cfg.steps_per_update * cfg.num_envs, cfg.replay_capacity)

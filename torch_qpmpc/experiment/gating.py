@@ -38,6 +38,8 @@ PAIRS = 160
 ACTING = ("act", "plant", "model")
 #: The rejections in a row after which the learner then restarts from what is kept.
 PATIENCE = 3
+#: Starts of the closed loops on a model, or together on all models of a search.
+STARTS = 32
 #: What the transitions of comparisons are called that do not run on a simulator.
 COMPARED = {"plant": "alternated", "model": "modelled"}
 UNFITTED = "The run's transitions identify no ensemble, so that gate=model rejects the candidate: "
@@ -151,7 +153,8 @@ class RunGate:
 
     def _costs(self, actor: Any, seed: int) -> Tensor:
         if self._cfg.gate == "model":
-            return torch.cat([self._member_costs(i, actor, seed) for i in range(MEMBERS)])
+            starts = STARTS // MEMBERS
+            return torch.cat([self._member_costs(i, actor, seed, starts) for i in range(MEMBERS)])
         if self._cfg.gate == "plant":
             seed = int(np.random.SeedSequence([seed, self.compared]).generate_state(1)[0])
         policy = in_closed_loop(actor, self._learner.n_preview)
@@ -159,12 +162,12 @@ class RunGate:
         self.compared += costs.numel()
         return costs.sum(0)
 
-    def _member_costs(self, i: int, actor: Any, seed: int) -> Tensor:
+    def _member_costs(self, i: int, actor: Any, seed: int, starts: int = STARTS) -> Tensor:
         steps = self._cfg.task.eval_steps
         if steps is None and isinstance(self._physics, GymnasiumPlant):
             steps = self._physics.max_steps
         policy = in_closed_loop(actor, self._learner.n_preview)
-        costs = plant_loop(policy, self._members[i], steps=steps, seed=seed).costs
+        costs = plant_loop(policy, self._members[i], steps=steps, starts=starts, seed=seed).costs
         self.compared += costs.numel()
         return costs.sum(0)
 
