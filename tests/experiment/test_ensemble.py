@@ -102,7 +102,7 @@ def test_the_run_has_the_plants_cost_or_one_fitted_to_rewards(store_task):
 
 @pytest.mark.parametrize(
     ("steps", "message"),
-    [(6, "trajectories: got 8 transitions in 8"), (12, "of which no half determines a model")],
+    [(6, "trajectories: got 8 transitions in 8"), (14, "of which no half determines a model")],
 )
 def test_a_log_that_is_too_short_for_the_members_is_named(steps, message):
     with pytest.raises(QPError, match=message):
