@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
@@ -38,8 +37,6 @@ PAIRS = 160
 ACTING = ("act", "plant", "model")
 #: The rejections in a row after which the learner then restarts from what is kept.
 PATIENCE = 3
-#: Starts of the closed loops on a model, or together on all models of a search.
-STARTS = 32
 #: What the transitions of comparisons are called that do not run on a simulator.
 COMPARED = {"plant": "alternated", "model": "modelled"}
 UNFITTED = "The run's transitions identify no ensemble, so that gate=model rejects the candidate: "
@@ -110,7 +107,8 @@ class RunGate:
 
         Judges each ``gate_interval`` updates and after the last one. Then a direct search over the
         scalars that the configuration chooses follows, from the policy that is kept, and its result
-        is judged, too. Without a gate nothing is judged or searched.
+        is judged, too. Without a gate nothing is judged or searched, and on models nothing is
+        searched: a search moves the policy to where their errors agree.
         """
         if self._gate is None:
             return {}
@@ -124,7 +122,7 @@ class RunGate:
                 warnings.warn(f"{UNFITTED}{error}", UserWarning, stacklevel=2)
                 return {"gate/accepted": 0.0}
         verdict = self._judge("gate")
-        return verdict | self._search() if last else verdict
+        return verdict | self._search() if last and self._cfg.gate != "model" else verdict
 
     def _judge(self, tag: str) -> dict[str, float]:
         assert self._gate is not None
@@ -152,9 +150,6 @@ class RunGate:
         return {f"search/{name}": x for name, x in metrics.items()} | self._judge("search")
 
     def _costs(self, actor: Any, seed: int) -> Tensor:
-        if self._cfg.gate == "model":
-            starts = STARTS // MEMBERS
-            return torch.cat([self._member_costs(i, actor, seed, starts) for i in range(MEMBERS)])
         if self._cfg.gate == "plant":
             seed = int(np.random.SeedSequence([seed, self.compared]).generate_state(1)[0])
         policy = in_closed_loop(actor, self._learner.n_preview)
@@ -162,12 +157,12 @@ class RunGate:
         self.compared += costs.numel()
         return costs.sum(0)
 
-    def _member_costs(self, i: int, actor: Any, seed: int, starts: int = STARTS) -> Tensor:
+    def _member_costs(self, i: int, actor: Any, seed: int) -> Tensor:
         steps = self._cfg.task.eval_steps
         if steps is None and isinstance(self._physics, GymnasiumPlant):
             steps = self._physics.max_steps
         policy = in_closed_loop(actor, self._learner.n_preview)
-        costs = plant_loop(policy, self._members[i], steps=steps, starts=starts, seed=seed).costs
+        costs = plant_loop(policy, self._members[i], steps=steps, seed=seed).costs
         self.compared += costs.numel()
         return costs.sum(0)
 

@@ -129,7 +129,9 @@ class Config(Group):
             remedy = "constraint.si needs windows of task.horizon steps."
             self.conflict("task.episode_steps", expected, remedy)
         if not self.replay:
-            remedy = "constraint.si samples its windows from the replay; constraint=deviation has none."
+            remedy = (
+                "constraint.si samples its windows from the replay; constraint=deviation has none."
+            )
             self.conflict("replay", "true", remedy)
         return self
 
