@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from omegaconf import DictConfig
 from torch.testing import assert_close
 
 import torch_qpmpc as qm
 from tests.logs import arx_log, log_overrides
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
-from torch_qpmpc.envs import ARXPlant, PointMass
+from torch_qpmpc.envs import ARXPlant, Plant, PointMass
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment.ensemble import (
     BLOCKS,
@@ -29,6 +30,12 @@ from torch_qpmpc.mpc.layout import Layout
 DATA = ("start=data", "start.transitions=1200", "num_envs=24")
 BOUNDS = torch.tensor([-1.0]).double(), torch.tensor([1.0]).double()
 LAYOUT = Layout(2, 1, 3, 2, 1)
+
+
+def plant_of(cfg: DictConfig) -> Plant:
+    plant = make_physics(cfg)
+    assert isinstance(plant, Plant)
+    return plant
 
 
 def test_J_of_a_policy_is_predicted_from_a_log_of_another():
@@ -68,7 +75,7 @@ def test_members_differ_in_their_data_and_start_as_the_logs_trajectories_do():
     "name", ["actuator_noise", "house", "inventory", "short_horizon", "tank_references"]
 )
 def test_a_plant_shows_its_cost_by_its_outputs(name):
-    plant = make_physics(make_config(f"task={name}"))
+    plant = plant_of(make_config(f"task={name}"))
     rng = np.random.default_rng(0)
     w, x = plant.signals(rng, 5, 1)[:, 0], plant.starts(rng, 5)
     u = torch.as_tensor(rng.uniform(0, 1, (5, plant.n_u)))
@@ -77,23 +84,24 @@ def test_a_plant_shows_its_cost_by_its_outputs(name):
 
 
 def test_noise_of_the_outputs_shows_in_the_mean_only():
-    plant = make_physics(make_config("task=four_tanks"))
+    plant = plant_of(make_config("task=four_tanks"))
     rng = np.random.default_rng(0)
     w = plant.signals(rng, 20_000, 1)[:, 0]
     x, u = torch.rand(1, 4).double(), torch.rand(1, 2).double()
     shown = plant.output_cost(plant.output(x, w), u, w[:, :0])
+    assert shown is not None
     assert (shown - plant.cost(x, u, w)).mean().item() == pytest.approx(2 * 35 * 0.1**2, rel=0.2)
 
 
 def test_the_run_has_the_plants_cost_or_one_fitted_to_rewards(store_task):
     own = make_config("task=house", *DATA)
-    physics = make_physics(own)
+    physics = plant_of(own)
     y, u = torch.tensor([[15.0], [18.0]]).double(), torch.tensor([[1.0], [0.0]]).double()
     (member, *_) = run_ensemble(own, physics, collect_log(own, physics))
     w = member.signals(np.random.default_rng(0), 2, 1)[:, 0]
     assert_close(member.cost(y, u, w), physics.cost(y, u, w[:, : physics.n_d]))
     other = make_config("task=store", *DATA)
-    physics = make_physics(other)
+    physics = plant_of(other)
     with pytest.warns(UserWarning, match="explains"):  # it is piecewise linear
         (member, *_) = run_ensemble(other, physics, collect_log(other, physics))
     assert not isinstance(member, ARXPlant)

@@ -133,7 +133,8 @@ def run_ensemble(cfg: DictConfig, physics: AnyPlant, data: Any) -> list[ARXMembe
     Raises:
         QPError: as in `ensemble`.
     """
-    layout, cost = plant_layout(physics, cfg.task.horizon), None
+    layout = plant_layout(physics, cfg.task.horizon)
+    cost: Any = None
     if isinstance(physics, LinearSystem):
         cost = lambda y, u, d: physics.cost(y, u)  # noqa: E731
     elif isinstance(physics, Plant):

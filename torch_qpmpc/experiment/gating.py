@@ -158,7 +158,7 @@ class RunGate:
         return costs.sum(0)
 
     def _member_costs(self, i: int, actor: Any, seed: int) -> Tensor:
-        steps = self._cfg.task.eval_steps
+        steps: Any = self._cfg.task.eval_steps
         if steps is None and isinstance(self._physics, GymnasiumPlant):
             steps = self._physics.max_steps
         policy = in_closed_loop(actor, self._learner.n_preview)

@@ -270,7 +270,7 @@ class Gate:
         Raises:
             QPError: ``costs`` returns another shape than ``(starts,)``.
         """
-        tests = []
+        tests: list[PairedTest] = []
         for costs in self._costs:
             tests.append(self._compare(candidate, costs))
             if tests[-1].decision != "better":
