@@ -88,9 +88,10 @@ class Plant(ABC):
         """Return L(x, u, w) ``(*batch,)``, of the applied u ``(*batch, n_u)``."""
 
     def output_cost(self, y: Tensor, u: Tensor, d: Tensor) -> Tensor | None:
-        """Return the cost that the outputs y, the applied u and the known signals d show.
+        """Return the cost ``(*batch,)`` as outputs, inputs and known signals show it.
 
-        It may differ from `cost` by a constant in the mean, as with noise in y. None, unless
+        They are y ``(*batch, n_y)``, the applied u ``(*batch, n_u)`` and d ``(*batch, n_d)``. The
+        mean may differ from that of `cost` by a constant, as with noise in y. None, unless
         overridden, if it is unknown.
         """
         return None

@@ -14,7 +14,6 @@ from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
-from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.arx_plant import ARXMember
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.errors import QPError
@@ -158,9 +157,8 @@ class RunGate:
         return costs.sum(0)
 
     def _member_costs(self, i: int, actor: Any, seed: int) -> Tensor:
-        steps: Any = self._cfg.task.eval_steps
-        if steps is None and isinstance(self._physics, GymnasiumPlant):
-            steps = self._physics.max_steps
+        # An environment has a length of its own.
+        steps = self._cfg.task.eval_steps or getattr(self._physics, "max_steps", 0)
         policy = in_closed_loop(actor, self._learner.n_preview)
         costs = plant_loop(policy, self._members[i], steps=steps, seed=seed).costs
         self.compared += costs.numel()
