@@ -91,13 +91,13 @@ def _train(
     if released:
         mpc.release()
     learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
-    gate = RunGate(cfg, learner, physics, quiet)
+    replay = make_run_replay(cfg, mpc)
+    gate = RunGate(cfg, learner, physics, identified, replay, quiet)
     if state is None and mpc is not start:
         gate.keep(start)
 
-    # The data: vectorised episodes under the current policy, and their replay.
+    # The data: vectorised episodes under the current policy, which the replay stores.
     collector = make_collector(cfg, physics, gate.acting)
-    replay = make_run_replay(cfg, mpc)
     stream = batches(collector)
     rounds = -(-cfg.warmup_steps // cfg.steps_per_update)  # of the warm-up
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +9,19 @@ import torch
 from torch.testing import assert_close
 
 import train
+from tests.logs import arx_log
 from tests.runs import SMALL, make_config
+from torch_qpmpc import QPMPC, Model
+from torch_qpmpc.envs import ActuatorNoise
+from torch_qpmpc.envs.arx_plant import ARXMember
 from torch_qpmpc.experiment.algorithms import evaluate, make_learner, make_operator
+from torch_qpmpc.experiment.collection import make_run_replay
+from torch_qpmpc.experiment.ensemble import run_ensemble
 from torch_qpmpc.experiment.gating import BEST, PATIENCE, RunGate
 from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.experiment.start import collect_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.experiment.tasks.identified import Start
 from torch_qpmpc.study.runs import FinishedRun
 
 GATED = (*SMALL, "gate=true", "optimizer=gauss_newton", "batch_size=32", "steps_per_update=4")
@@ -52,11 +61,12 @@ def test_the_policy_that_is_kept_is_the_one_that_is_reported(run):
     assert (folder / BEST).exists()
 
 
-def make_gate(*overrides: str) -> tuple[RunGate, Any]:
+def make_gate(*overrides: str, start: Start | None = None) -> tuple[RunGate, Any]:
     cfg = make_config(*SMALL, *overrides)
     physics = make_physics(cfg)
-    learner = make_learner(cfg, make_operator(cfg, make_mpc(cfg, physics)), physics)
-    return RunGate(cfg, learner, physics), learner.actor
+    mpc = make_mpc(cfg, physics)
+    learner, replay = make_learner(cfg, make_operator(cfg, mpc), physics), make_run_replay(cfg, mpc)
+    return RunGate(cfg, learner, physics, start, replay), learner.actor
 
 
 def test_without_a_gate_the_learner_acts(tmp_path):
@@ -140,3 +150,52 @@ def test_a_search_starts_from_the_policy_that_is_kept():
     found = gate.judge(4)
     assert {"search/w", "search/accepted"} <= set(found)
     assert_close(actor.module.C.detach(), gate.kept.module.C.detach())
+
+
+MODEL = (*SMALL, "gate=model", "replay_capacity=800", "warmup_steps=120", "optimizer=gauss_newton")
+
+
+def test_with_models_the_plant_runs_no_closed_loop_of_a_comparison(tmp_path, monkeypatch):
+    def forbidden(*_: Any) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("torch_qpmpc.experiment.gating.evaluate", forbidden)
+    for name in ("point_mass", "house_wall"):
+        cfg = make_config(*MODEL, f"task={name}", "search.w=0.5")
+        summary = train.train(cfg, str(tmp_path / name))
+        assert summary["modelled"] > 0
+        assert "simulated" not in summary
+        table = read_metrics(tmp_path / name)
+        assert summary["modelled"] == 10 * 2 * table["gate/pairs"].sum()
+        assert "search/w" not in table
+
+
+def test_a_candidate_that_exploits_one_member_is_not_kept(monkeypatch):
+    gate, actor = make_gate(*MODEL, "constraint=mpc", "updates=4", "task.eval_steps=20")
+    cfg = make_config("start=data", "start.transitions=1000", "num_envs=20")
+    physics = make_physics(cfg)
+    right = run_ensemble(cfg, physics, collect_log(cfg, physics))
+    wrong = replace(right[0], B=-right[0].B)  # actions act the other way
+
+    def follow(policy: Any, member: ARXMember) -> None:
+        scheme = replace(policy.module.scheme, model=Model(member.A, member.B))
+        module = QPMPC(scheme, learn=policy.module.learned, structure="tied")
+        policy.module.load_state_dict(module.state_dict())
+
+    follow(gate.kept, right[1])
+    follow(actor, wrong)
+    for models, accepted in (([wrong, *right[1:]], 0), ([wrong] * 4, 1)):
+        monkeypatch.setattr("torch_qpmpc.experiment.gating.run_ensemble", lambda *_, m=models: m)
+        monkeypatch.setattr(gate, "_logged", list)
+        verdict = gate.judge(2)
+        assert verdict["gate/accepted"] == accepted
+        assert (verdict["gate/mean"] < 0) == bool(accepted)
+
+
+def test_a_candidate_is_rejected_where_no_ensemble_is_identified(monkeypatch):
+    gate, _ = make_gate(*MODEL)
+    still = arx_log(noise=0.1).apply(lambda x: 0 * x)
+    monkeypatch.setattr(gate, "_logged", lambda: [still])
+    monkeypatch.setattr(gate, "_physics", ActuatorNoise())
+    with pytest.warns(UserWarning, match="gate=model rejects the candidate: action: got"):
+        assert gate.judge(4) == {"gate/accepted": 0.0}

@@ -42,6 +42,7 @@ NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
         ("noise=brownian", "steps_per_update=3", "warm_start=false"),
         (*GATED, "constraint=mpc", "release=5", "search.w=0.5"),
         (*GATED, *DATA, "constraint=free"),
+        ("gate=model", "optimizer=gauss_newton", *DATA, "constraint=free"),
         ("gate=true", "algo=td3", *ACTOR_CRITIC),
         ("task=store", "optimizer=gauss_newton", "constraint=si", "replay_capacity=48"),
         ("task=store", "optimizer=recursive", "optimizer.memory=8", "constraint=free"),

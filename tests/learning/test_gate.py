@@ -201,6 +201,30 @@ def test_an_undecided_comparison_ends_in_a_rejection():
     assert verdict.pairs == 96
 
 
+def test_a_candidate_that_exploits_one_of_several_costs_is_rejected():
+    def others(policy: nn.Module, seed: int) -> Tensor:
+        return -costs(policy, seed)
+
+    assert Gate(Policy(2.0), costs).judge(Policy(1.0)).accepted
+    for order in ([costs, others], [others, costs]):
+        gate = Gate(Policy(2.0), order)
+        verdict = gate.judge(Policy(1.0))
+        assert not verdict.accepted
+        assert verdict.mean > 0
+        assert gate.actor.level == 2.0
+
+
+def test_a_candidate_that_all_costs_agree_on_is_accepted_by_the_least_gain():
+    def half(policy: nn.Module, seed: int) -> Tensor:
+        return costs(policy, seed) / 2
+
+    whole = Gate(Policy(2.0), costs).judge(Policy(1.0))
+    verdict = Gate(Policy(2.0), [costs, half]).judge(Policy(1.0))
+    assert verdict.accepted
+    assert verdict.mean == pytest.approx(whole.mean / 2)
+    assert verdict.pairs == 2 * whole.pairs
+
+
 def test_after_rejections_in_a_row_the_candidate_starts_from_what_is_kept():
     gate, candidate = Gate(Policy(2.0), costs, patience=2), Policy(3.0)
     assert not gate.judge(candidate).restarted

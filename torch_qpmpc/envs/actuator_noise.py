@@ -77,6 +77,9 @@ class ActuatorNoise(Plant):
         v = torch.cat((x, u), -1)
         return 0.5 * ((v @ self.W) * v).sum(-1)
 
+    def output_cost(self, y: Tensor, u: Tensor, d: Tensor) -> Tensor:
+        return self.cost(y, u, d)
+
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         return x @ self.A.mT + (1 + w[..., :1]) * u @ self.B.mT + w[..., 1:]
 

@@ -2,11 +2,13 @@
 
     y_{k+1} = A [y_k; ..; y_{k+1-L}] + B [u_k; ..; u_{k+1-L}] + E d_k + offset + e_k
 
-Errors e_k and known signals d_k are those of the log.
+Errors e_k and known signals d_k are those of the log. `ARXPlant` has a quadratic cost, and
+`ARXMember`, one model of an ensemble, any cost of outputs, inputs and known signals.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -14,27 +16,24 @@ from torch import Tensor
 
 from torch_qpmpc.envs.linear_system import Rng, uniform
 from torch_qpmpc.envs.past_window import first_window, next_window
+from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.envs.quadratic_plant import QuadraticPlant
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ARXPlant(QuadraticPlant):
-    """The physics in float64, with a quadratic cost. Its state is the window.
+class ARXModel(Plant):
+    """The physics in float64 without a cost. The state is the window.
 
-        L(y, u, d) = 1/2 v' W v + q'v + c + price violation(y),    v = [d; y; u]
-
-    Known signals follow each other as in the log, from a random row on and in a circle; errors are
-    drawn with replacement; starts are outputs of the log, held with inputs of zero.
+    Known signals follow each other as in the log, from a random one of the rows ``first`` on and in
+    a circle; errors are drawn with replacement; starts are outputs of the log in rows ``first``,
+    held with inputs of zero.
 
     Args:
         A, B, E, offset: the model, ``(n_y, L n_y)``, ``(n_y, L n_u)``, ``(n_y, n_d)`` and
             ``(n_y,)``, with the newest lag first.
         errors: one-step errors ``(m, n_y)``.
         outputs, signals_seen: the log's rows of y ``(T, n_y)`` and d ``(T, n_d)``.
-        W, q, c: the cost, ``(n, n)``, ``(n,)`` and ``()`` with n = n_d + n_y + n_u.
-        lb_y, ub_y: soft bounds of the output, ``(n_y,)``.
-        price: the price of a unit of violation.
-        labels: names of the entries of y, u and d, for figures.
+        first: rows in which episodes may begin; None for all.
     """
 
     A: Tensor
@@ -44,24 +43,24 @@ class ARXPlant(QuadraticPlant):
     errors: Tensor
     outputs: Tensor
     signals_seen: Tensor
+    first: Tensor | None = None
 
     def signals(self, rng: Rng, count: int, length: int) -> Tensor:
         """Draw w = [d, e], ``(count, length, n_d + n_y)``."""
-        first = _rows(rng, len(self.signals_seen), count, 1)
-        rows = first + torch.arange(length, device=first.device)
+        rows = self._first(rng, count, 1) + torch.arange(length, device=self.outputs.device)
         errors = self.errors[_rows(rng, len(self.errors), count, length)]
         return torch.cat((self.signals_seen[rows % len(self.signals_seen)], errors), -1)
 
     def starts(self, rng: Rng, count: int) -> Tensor:
-        y = self.outputs[_rows(rng, len(self.outputs), count)]
-        return first_window(y, self.past, 0 * self.lb_a)
+        return first_window(self.outputs[self._first(rng, count)], self.past, 0 * self.lb_a)
+
+    def _first(self, rng: Rng, *shape: int) -> Tensor:
+        if self.first is None:
+            return _rows(rng, len(self.outputs), *shape)
+        return self.first[_rows(rng, len(self.first), *shape)]
 
     def output(self, x: Tensor, w: Tensor) -> Tensor:
         return x[..., -self.n_y :]
-
-    def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
-        v = torch.cat((w[..., : self.n_d], self.output(x, w), u), -1)
-        return self._cost_of(v, self.violation(x, w))
 
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         d, e = w.split((self.n_d, self.n_y), -1)
@@ -70,8 +69,35 @@ class ARXPlant(QuadraticPlant):
         following = y @ self.A.mT + u_lags @ self.B.mT + d @ self.E.mT + self.offset + e
         return next_window(x, u, following)
 
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ARXPlant(ARXModel, QuadraticPlant):
+    """A model with a quadratic cost.
+
+        L(y, u, d) = 1/2 v' W v + q'v + c + price violation(y),    v = [d; y; u]
+
+    Args:
+        W, q, c: the cost, ``(n, n)``, ``(n,)`` and ``()`` with n = n_d + n_y + n_u.
+        lb_y, ub_y: soft bounds of the output, ``(n_y,)``.
+        price: the price of a unit of violation.
+        labels: names of the entries of y, u and d, for figures.
+    """
+
+    def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        return self.output_cost(self.output(x, w), u, w[..., : self.n_d])
+
     def violation(self, x: Tensor, w: Tensor) -> Tensor:
         return self._violation_of(self.output(x, w))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ARXMember(ARXModel):
+    """A model with a cost ``stage_cost(y, u, d)`` ``(*batch,)`` of any form."""
+
+    stage_cost: Callable[[Tensor, Tensor, Tensor], Tensor]
+
+    def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
+        return self.stage_cost(self.output(x, w), u, w[..., : self.n_d])
 
 
 def _rows(rng: Rng, rows: int, *shape: int) -> Tensor:

@@ -106,6 +106,9 @@ class FourTanks(Plant):
         _, u_r = self.set_point()
         return (x[..., :2] - self.r).square() @ Q + (u - u_r).square() @ R
 
+    def output_cost(self, y: Tensor, u: Tensor, d: Tensor) -> Tensor:
+        return self.cost(y, u, d)
+
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         A, B, v = self.model(w)
         return x @ A.mT + u @ B.mT + v

@@ -100,6 +100,9 @@ class HeatedHouse(Plant):
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         return DT * (w[..., PRICE] * u[..., 0] + self.violation(x, w))
 
+    def output_cost(self, y: Tensor, u: Tensor, d: Tensor) -> Tensor:
+        return self.cost(y, u, d)
+
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         A, B, E = self.model()
         check_tensor("x", x, len(A))

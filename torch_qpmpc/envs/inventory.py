@@ -80,6 +80,9 @@ class Inventory(Plant):
         stock = x[..., 0]
         return self.holding * stock.relu() + self.backlog * (-stock).relu()
 
+    def output_cost(self, y: Tensor, u: Tensor, d: Tensor) -> Tensor:
+        return self.cost(y, u, d)
+
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         return torch.cat((x.sum(-1, keepdim=True) - w, u), -1)
 

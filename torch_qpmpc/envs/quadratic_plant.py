@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from torch_qpmpc.envs.plant import Plant
@@ -28,6 +29,9 @@ class QuadraticPlant(Plant):
     ub_y: Tensor
     price: float = 0.0
     labels: tuple[Sequence[str], Sequence[str], Sequence[str]] = ((), (), ())
+
+    def output_cost(self, y: Tensor, u: Tensor, d: Tensor) -> Tensor:
+        return self._cost_of(torch.cat((d, y, u.to(y)), -1), self._violation_of(y))
 
     def _cost_of(self, v: Tensor, violation: Tensor) -> Tensor:
         return (v @ self.W * v).sum(-1) / 2 + v @ self.q + self.c + self.price * violation

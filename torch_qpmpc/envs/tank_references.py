@@ -131,6 +131,9 @@ class TankReferences(Plant):
         tracking = (x - self.target(w)).square() @ Q + u.square() @ R
         return tracking + self.price * self.violation(x, w)
 
+    def output_cost(self, y: Tensor, u: Tensor, d: Tensor) -> Tensor:
+        return self.cost(y, u, d)
+
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         A, B, v = self.model(w)
         return (A @ x.unsqueeze(-1) + B @ u.unsqueeze(-1)).squeeze(-1) + v

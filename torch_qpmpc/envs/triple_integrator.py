@@ -63,6 +63,9 @@ class TripleIntegrator(Plant):
         v = torch.cat((x, u), -1)
         return 0.5 * ((v @ self.W) * v).sum(-1)
 
+    def output_cost(self, y: Tensor, u: Tensor, d: Tensor) -> Tensor:
+        return self.cost(y, u, d)
+
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         return x @ self.A.mT + u @ self.B.mT
 

@@ -77,7 +77,9 @@ class Config(Group):
     release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
     resume: Annotated[str | None, Expected("a path, or null")]
     ablation: Annotated[str | None, Expected("a name, or null")]
-    gate: Annotated[Literal["act", "plant"] | bool, Expected("true, act, plant or false")]
+    gate: Annotated[
+        Literal["act", "plant", "model"] | bool, Expected("true, act, plant, model or false")
+    ]
     gate_bound: Annotated[Positive | None, Expected("a finite number > 0, or null")]
     gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")]
     back_off: Annotated[

@@ -12,12 +12,14 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task, plant_layout
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.log import Log
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.rewards import RewardCost, fit_rewards, scheme_cost
@@ -113,6 +115,30 @@ def _holding(scheme: Scheme, start: Start) -> Scheme:
     c += ahead * (R * held.square()).sum() / 2
     cost = Cost(torch.cat((zero, R)), zero, scheme.cost.hessian, q=q, c=c)
     return replace(scheme, cost=cost, bounds=replace(scheme.bounds, state_bounds=None))
+
+
+def arx_arguments(identified: Identified, log: Log) -> dict[str, Any]:
+    """Return the arguments of an `ARXModel` that simulates ``log``, but for bounds and horizon.
+
+    Its disturbances are the model's cross-validated one-step errors.
+
+    Raises:
+        QPError: the data are too short for these.
+    """
+    layout, errors = identified.options.layout, identified.errors[:, 0]
+    errors = errors[errors.isfinite().all(-1)]
+    if not len(errors):
+        got = f"{identified.log.steps} transitions, of which no half determines a model"
+        raise QPError.expected("trajectories", got, "enough for a cross-validation", "Log more.")
+    return {
+        **identified.model._asdict(),
+        "errors": errors,
+        "outputs": torch.cat([part.y[:-1] for part in log.trajectories]),
+        "signals_seen": torch.cat([part.d for part in log.trajectories]),
+        "n_y": layout.n_x,
+        "n_d": layout.n_d,
+        "past": layout.past,
+    }
 
 
 def observed_cost(

@@ -15,6 +15,7 @@ from torch_qpmpc.envs import ARXPlant, LinearPlant
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.fields import Count, Expected, Finite, NonNegative
+from torch_qpmpc.experiment.tasks.identified import arx_arguments
 from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, plant_layout, priced, register
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.identification import identify
@@ -81,7 +82,6 @@ def make_plant(cfg: DictConfig) -> ARXPlant:
     """Identify the model that stands for the plant, with its cost and bounds."""
     task, log = cfg.task, read(cfg)
     identified = identify(log, 1, past=task.past, structure="tied")
-    errors = identified.errors[:, 0]
     u = torch.cat([part.u for part in log.trajectories])
     seen = torch.stack((u.amin(0), u.amax(0)))
     unbounded = torch.full((2, len(log.outputs)), torch.inf).double()
@@ -94,10 +94,7 @@ def make_plant(cfg: DictConfig) -> ARXPlant:
         return [log.label(name) for name in names]
 
     return ARXPlant(
-        **identified.model._asdict(),
-        errors=errors[errors.isfinite().all(-1)],
-        outputs=torch.cat([part.y[:-1] for part in log.trajectories]),
-        signals_seen=torch.cat([part.d for part in log.trajectories]),
+        **arx_arguments(identified, log),
         W=W,
         q=q,
         c=c,
@@ -107,10 +104,7 @@ def make_plant(cfg: DictConfig) -> ARXPlant:
         ub_y=ub_y,
         price=task.state_slack,
         labels=(labels(log.outputs), labels(log.inputs), labels(log.known)),
-        n_y=len(log.outputs),
-        n_d=len(log.known),
         horizon=task.horizon,
-        past=task.past,
     )
 
 
