@@ -208,7 +208,7 @@ def identify(
     check_excitation(log, layout)
     if not all(isinstance(i, int) and 0 <= i < layout.n_x for i in held):
         want = f"indices of the {layout.n_x} outputs, from 0 on"
-        raise QPError.expected("held", f"{[*held]}", want, "In train.py it is task.known.")
+        raise QPError.expected("held", f"{[*held]}", want, "In train.py it is task.held.")
     options = Options(layout, structure, causal, ridge, (*held,))
     return Identified(*fit(log.trajectories, options), options, log)
 

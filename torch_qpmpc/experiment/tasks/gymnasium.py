@@ -44,7 +44,7 @@ class GymnasiumSettings(TaskSettings):
     #: Episodes by which a start from data is chosen; 0 for the run's own start.
     start_episodes: Whole = 0
     #: Entries of the observation that are held over the horizon; null for those found in the log.
-    known: Annotated[list[Whole] | None, Expected("a list of indices, or null")] = None
+    held: Annotated[list[Whole] | None, Expected("a list of indices, or null")] = None
 
     id: Annotated[
         str,

@@ -51,7 +51,7 @@ class Start(NamedTuple):
         cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
         held, names = self.identified.options.held, self.identified.log.outputs
         known = f"Held at their last value over the horizon: {', '.join(names[i] for i in held)}"
-        known += f", as by task.known={[*held]}"
+        known += f", as by task.held={[*held]}"
         parts = (cut if self.cut else None, self.identified, known if held else None)
         parts += self.cost, self.choice
         return "\n".join(str(part) for part in parts if part is not None)
@@ -60,7 +60,7 @@ class Start(NamedTuple):
     def summary(self) -> dict[str, Any]:
         """The entries of summary.json: the fits of the cost, and the episodes that are cut."""
         held = [*self.identified.options.held]
-        entries: dict[str, Any] = {"log_episodes_cut": self.cut, "known": held}
+        entries: dict[str, Any] = {"log_episodes_cut": self.cut, "outputs_held": held}
         entries |= {} if self.choice is None else self.choice.summary
         if self.cost is None:
             return entries
@@ -73,10 +73,10 @@ def identified_start(cfg: DictConfig, physics: AnyPlant, log: Any) -> Start:
     """Identify C, b and a missing stage cost from a log of the plant; `identify` names errors."""
     log, cut = without_blow_ups(log) if isinstance(log, TensorDictBase) else (log, 0)
     layout = plant_layout(physics, cfg.task.horizon)
-    known = cfg.task.get("known", [])
-    if known is None:
-        known = unmoved(as_log(log).trajectories, cfg.task.horizon)
-    identified = identified_model(cfg, log, layout, cfg.constraint.structure, known)
+    held = cfg.task.held if "held" in cfg.task else []
+    if held is None:
+        held = unmoved(as_log(log).trajectories, cfg.task.horizon)
+    identified = identified_model(cfg, log, layout, cfg.constraint.structure, held)
     cost = None
     if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is None:
         cost = _fitted(cfg, log, identified.options.layout)
