@@ -159,6 +159,8 @@ def test_a_held_output_keeps_its_value_and_others_depend_on_it(structure):
     planned = predict(held.constraints, z, sizes)
     assert_close(planned[..., 1], z[:, sizes.n_p - 1 : sizes.n_p].expand(-1, N))
     assert held.model.A[0, 1].abs() > 0.1
+    mpc = QPMPC.from_data(log, N, structure=structure, held=[1], **PAST, **COST)
+    assert_close(mpc.C_0[1], held.constraints.C[1])
     free = qm.identify(log, N, structure=structure, **PAST)
     assert_close(held.model.A[0], free.model.A[0])
     assert held.rmse[-1, 0] < 2 * free.rmse[-1, 0]
