@@ -204,9 +204,9 @@ def _pcgym(model: str, tuned: bool) -> Outside:
     return Outside(id, "pcgym", tuned, partial(pcgym_oracle, model))
 
 
-def _controlgym(plant: str) -> Outside:
+def _controlgym(plant: str, *overrides: str) -> Outside:
     id = _registered(f"Controlgym-{plant}-v0", partial(ControlGym, plant), 100)
-    return Outside(id, "controlgym", False, partial(controlgym_lqg, plant))
+    return Outside(id, "controlgym", bool(overrides), partial(controlgym_lqg, plant), overrides)
 
 
 LUNAR = ("task.kwargs={continuous: true}",)
@@ -224,6 +224,7 @@ PLANTS = {
     "controlgym psm": _controlgym("psm"),
     "controlgym dis1": _controlgym("dis1"),
     "controlgym he1": _controlgym("he1"),
+    "controlgym he1, log of short episodes": _controlgym("he1", "task.episode_steps=20"),
     "PMSM, currents": Outside("gym_electric_motor:Cont-CC-PMSM-v0", "gym_electric_motor", False),
 }
 

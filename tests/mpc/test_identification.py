@@ -166,6 +166,17 @@ def test_a_held_output_keeps_its_value_and_others_depend_on_it(structure):
     assert held.rmse[-1, 0] < 2 * free.rmse[-1, 0]
 
 
+@pytest.mark.parametrize("structure", ["free", "varying", "tied"])
+def test_a_collinear_output_leaves_the_predictions_as_good(structure):
+    log = arx_log(noise=0.2)
+    twice: Any = log.clone()
+    for steps in (twice, twice["next"]):
+        y = steps["observation"]
+        steps["observation"] = torch.cat((y, 3 * y[..., :1] - y[..., 1:]), -1)
+    one, both = (qm.identify(x, N, structure=structure, **PAST) for x in (log, twice))
+    assert_close(both.rmse[:, :2], one.rmse, rtol=0.1, atol=0)
+
+
 # Bad data
 
 
