@@ -323,8 +323,9 @@ def outcomes(rows: Any, tuned: bool) -> str:
     return two_tables([*head, "transitions of the choice", "chosen"], lines, len(head) - 1)
 
 
-def add(path: Path, row: Any) -> None:
-    """Append a row."""
+def add(path: Path, row: dict[str, Any]) -> None:
+    """Append a row, with six digits."""
+    row = {key: f"{x:.6g}" if isinstance(x, float) else x for key, x in row.items()}
     new = not path.exists()
     with path.open("a", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, FIELDS, lineterminator="\n")

@@ -58,9 +58,10 @@ class Start(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The entries of summary.json: the fits of the cost, and the episodes that are cut."""
+        """The entries of summary.json: episodes cut, outputs held, and the fits of the cost."""
         held = [*self.identified.options.held]
-        entries: dict[str, Any] = {"log_episodes_cut": self.cut, "outputs_held": held}
+        entries: dict[str, Any] = {"log_episodes_cut": self.cut}
+        entries |= {"outputs_held": held} if held else {}
         entries |= {} if self.choice is None else self.choice.summary
         if self.cost is None:
             return entries
