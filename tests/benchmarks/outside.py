@@ -323,15 +323,15 @@ def outcomes(rows: Any, tuned: bool) -> str:
     return two_tables([*head, "transitions of the choice", "chosen"], lines, len(head) - 1)
 
 
-def add(path: Path, row: dict[str, Any]) -> None:
+def add(path: Path, row: Any) -> None:
     """Append a row, with six digits."""
-    row = {key: f"{x:.6g}" if isinstance(x, float) else x for key, x in row.items()}
+    short: Any = {key: f"{x:.6g}" if isinstance(x, float) else x for key, x in row.items()}
     new = not path.exists()
     with path.open("a", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
         if new:
             writer.writeheader()
-        writer.writerow(row)
+        writer.writerow(short)
 
 
 def main(arguments: Iterable[str] | None = None) -> None:
