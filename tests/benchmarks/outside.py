@@ -217,7 +217,7 @@ PLANTS = {
     "Reacher": Outside("Reacher-v5", "mujoco", True),
     "pcgym cstr": _pcgym("cstr", True),
     "pcgym four_tank": _pcgym("four_tank", True),
-    "pcgym multistage_extraction": _pcgym("multistage_extraction", False),
+    "pcgym multistage_extraction": _pcgym("multistage_extraction", True),
     "Mountain car": Outside("MountainCarContinuous-v0", "gymnasium", False),
     "Lunar lander": Outside("LunarLander-v3", "Box2D", True, None, LUNAR),
     "Swimmer": Outside("Swimmer-v5", "mujoco", False),
