@@ -204,9 +204,9 @@ def _pcgym(model: str, tuned: bool) -> Outside:
     return Outside(id, "pcgym", tuned, partial(pcgym_oracle, model))
 
 
-def _controlgym(plant: str) -> Outside:
+def _controlgym(plant: str, *overrides: str) -> Outside:
     id = _registered(f"Controlgym-{plant}-v0", partial(ControlGym, plant), 100)
-    return Outside(id, "controlgym", False, partial(controlgym_lqg, plant))
+    return Outside(id, "controlgym", bool(overrides), partial(controlgym_lqg, plant), overrides)
 
 
 LUNAR = ("task.kwargs={continuous: true}",)
@@ -217,13 +217,14 @@ PLANTS = {
     "Reacher": Outside("Reacher-v5", "mujoco", True),
     "pcgym cstr": _pcgym("cstr", True),
     "pcgym four_tank": _pcgym("four_tank", True),
-    "pcgym multistage_extraction": _pcgym("multistage_extraction", False),
+    "pcgym multistage_extraction": _pcgym("multistage_extraction", True),
     "Mountain car": Outside("MountainCarContinuous-v0", "gymnasium", False),
     "Lunar lander": Outside("LunarLander-v3", "Box2D", True, None, LUNAR),
     "Swimmer": Outside("Swimmer-v5", "mujoco", False),
     "controlgym psm": _controlgym("psm"),
     "controlgym dis1": _controlgym("dis1"),
     "controlgym he1": _controlgym("he1"),
+    "controlgym he1, log of short episodes": _controlgym("he1", "task.episode_steps=20"),
     "PMSM, currents": Outside("gym_electric_motor:Cont-CC-PMSM-v0", "gym_electric_motor", False),
 }
 
@@ -323,13 +324,14 @@ def outcomes(rows: Any, tuned: bool) -> str:
 
 
 def add(path: Path, row: Any) -> None:
-    """Append a row."""
+    """Append a row, with six digits."""
+    short: Any = {key: f"{x:.6g}" if isinstance(x, float) else x for key, x in row.items()}
     new = not path.exists()
     with path.open("a", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
         if new:
             writer.writeheader()
-        writer.writerow(row)
+        writer.writerow(short)
 
 
 def main(arguments: Iterable[str] | None = None) -> None:

@@ -67,6 +67,42 @@ def chosen(*overrides):
     return cfg, physics, start, start.choice
 
 
+class Followed(Lag):
+    """The lag beside a set-point, which jumps, and of which the reward knows the next value."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.r = self.following = self.np_random.uniform(-2, 2)
+        return np.append(self.y, self.r), {}
+
+    def step(self, action):
+        self.r = self.following
+        if self.np_random.random() < 0.05:
+            self.following = self.np_random.uniform(-2, 2)
+        self.y = 0.9 * self.y + action
+        cost = (self.y.item() - self.following) ** 2
+        return np.append(self.y, self.r), -cost, False, False, {}
+
+
+@pytest.mark.parametrize(
+    ("given", "held"), [("null", (1,)), ("[]", ()), ("[0]", (0,))], ids=["log", "none", "given"]
+)
+def test_set_points_are_held_in_all_starts_and_said(monkeypatch, given, held):
+    make = lambda **kwargs: Followed(**kwargs)  # noqa: E731 (an entry point)
+    monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
+    cfg = make_config(*DATA, f"task.held={given}")
+    physics = make_physics(cfg)
+    named = starts(cfg, physics, collect_log(cfg, physics))
+    assert {start.identified.options.held for start in named.values()} == {held}
+    start = next(iter(named.values()))
+    assert start.summary.get("outputs_held", []) == [*held]
+    said = f"Held at their last value over the horizon: y2, as by task.held={[*held]}"
+    assert (said in str(start).splitlines()) == (held == (1,))
+    assert "tied C, N=6, cost of (y_(k+1), u_k) in most steps" in named
+
+
 def test_the_starts_are_all_combinations_and_constant_actions():
     cfg = make_config(*DATA)
     physics = make_physics(cfg)

@@ -29,7 +29,7 @@ GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that built-in tasks lack.
-NOT_NEEDED = ("task.file", "task.kwargs", "task.start_episodes")
+NOT_NEEDED = ("task.file", "task.kwargs", "task.start_episodes", "task.held")
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
@@ -103,7 +103,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "actuator_noise": ("task=actuator_noise", "warmup_steps=1"),
         "inventory": ("task=inventory", "warmup_steps=1"),
         "short_horizon": ("task=short_horizon", "warmup_steps=1"),
-        "data": (*DATA, "constraint=free", "+task.start_episodes=2"),
+        "data": (*DATA, "constraint=free", "+task.start_episodes=2", "+task.held=null"),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
         "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
     }.items():
@@ -331,6 +331,7 @@ for _name in ("optimizer.trust_region", "optimizer.normalise", "task.one_weather
     BAD[_name] = FLAG
 BAD["task.disturbed"] = BAD["task.observation_bounds"] = FLAG
 BAD["task.past"] = WHOLE
+BAD["task.held"] = [[-1], [0.5], ["a"], 3]
 BAD["task.memory"] = BAD["task.start_episodes"] = WHOLE[1:]
 BAD["task.margin"] = BAD["task.model_error"] = REAL
 BAD["task.actuator_std"] = REAL

@@ -150,6 +150,33 @@ def test_errors_are_nan_where_no_part_of_the_data_is_long_enough():
     assert qm.identify(arx_log(episodes=1, steps=10), 3, **PAST).rmse.isnan().all()
 
 
+@pytest.mark.parametrize("structure", ["free", "varying", "tied"])
+def test_a_held_output_keeps_its_value_and_others_depend_on_it(structure):
+    log = arx_log(noise=0.2)
+    held = qm.identify(log, N, structure=structure, held=[1], **PAST)
+    sizes = held.options.layout
+    z = windows(read_trajectories(log, n_d=1)[0], sizes)[:5]
+    planned = predict(held.constraints, z, sizes)
+    assert_close(planned[..., 1], z[:, sizes.n_p - 1 : sizes.n_p].expand(-1, N))
+    assert held.model.A[0, 1].abs() > 0.1
+    mpc = QPMPC.from_data(log, N, structure=structure, held=[1], **PAST, **COST)
+    assert_close(mpc.C_0[1], held.constraints.C[1])
+    free = qm.identify(log, N, structure=structure, **PAST)
+    assert_close(held.model.A[0], free.model.A[0])
+    assert held.rmse[-1, 0] < 2 * free.rmse[-1, 0]
+
+
+@pytest.mark.parametrize("structure", ["free", "varying", "tied"])
+def test_a_collinear_output_leaves_the_predictions_as_good(structure):
+    log = arx_log(noise=0.2)
+    twice: Any = log.clone()
+    for steps in (twice, twice["next"]):
+        y = steps["observation"]
+        steps["observation"] = torch.cat((y, 3 * y[..., :1] - y[..., 1:]), -1)
+    one, both = (qm.identify(x, N, structure=structure, **PAST) for x in (log, twice))
+    assert_close(both.rmse[:, :2], one.rmse, rtol=0.1, atol=0)
+
+
 # Bad data
 
 
@@ -213,6 +240,10 @@ def two_equal_actions(log: TensorDict) -> TensorDict:
             "structure: got 'arx', expected one of free, varying, tied",
         ),
         (lambda: qm.identify(arx_log(), N, ridge=-1.0), "ridge: got -1.0, expected a finite numbe"),
+        (
+            lambda: qm.identify(arx_log(), N, held=[2]),
+            r"held: got \[2\], expected indices of the 2 outputs, from 0 on. In train.py it is",
+        ),
         (lambda: qm.identify(arx_log(), N, causal=1), "causal: got 1, expected True or False"),  # pyright: ignore[reportArgumentType] (the mistake)
         (
             lambda: QPMPC.from_data(arx_log(), N, stage_weight=[1.0]),

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from torch_qpmpc import QPMPC, Model, Scheme
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
+from torch_qpmpc.mpc.rewards import fit_most, fit_rewards, scheme_cost
 
 LAYOUT = Layout(2, 1, 3)
 W = torch.tensor([[2.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.3]]).double()
@@ -67,6 +67,33 @@ def test_a_poor_fit_is_said_once():
     assert re.search(poor, str(fitted))
     with pytest.warns(UserWarning, match=poor):
         fit_rewards(log(True), LAYOUT)
+
+
+@pytest.mark.filterwarnings("ignore:The fitted stage cost")
+@pytest.mark.parametrize("after", [False, True])
+def test_the_cost_of_most_steps_is_that_of_all_but_the_jumps(after):
+    data = log(after)
+    data["next", "reward"][:, ::20] -= 100.0
+    fitted = fit_rewards(data, LAYOUT, after=True)
+    most = fit_most(data, LAYOUT, fitted)
+    assert most is not None
+    assert most.shifted is after
+    assert most.kept == pytest.approx(0.95, abs=0.01)
+    assert_close(most.best.W, W)
+    assert not torch.allclose(fitted.best.W, W, atol=0.1)
+    assert most.variables == f"{fitted.variables} in most steps"
+    assert f"{most.kept:.1%} of them" in str(most)
+
+
+def test_no_cost_is_of_most_steps_if_one_is_of_all_or_of_too_few():
+    fitted = fit_rewards(log(True), LAYOUT, after=True)
+    assert fit_most(log(True), LAYOUT, fitted) is None
+    noisy, often = log(True, noise=10.0), log(True)
+    often["next", "reward"][:, ::6] -= 100.0
+    for data in (noisy, often):
+        with pytest.warns(UserWarning, match="explains"):
+            fitted = fit_rewards(data, LAYOUT, after=True)
+        assert fit_most(data, LAYOUT, fitted) is None
 
 
 @pytest.mark.parametrize("hessian", ["diagonal", "block", "full"])

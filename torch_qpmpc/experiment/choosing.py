@@ -19,7 +19,7 @@ from torch_qpmpc.experiment.tasks.choice import MEAN_ACTION, Choice, Row
 from torch_qpmpc.experiment.tasks.identified import Start, identified_model, identified_start
 from torch_qpmpc.experiment.tasks.registry import plant_layout
 from torch_qpmpc.learning.operators import warm_policy
-from torch_qpmpc.mpc.rewards import RewardCost
+from torch_qpmpc.mpc.rewards import RewardCost, fit_most
 from torch_qpmpc.mpc.trajectories import valid_steps
 
 #: Episodes of each start in the first round.
@@ -44,13 +44,18 @@ def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
     costs = [own.cost]
     if own.cost is not None and own.cost.shifted:
         costs.append(RewardCost(own.cost.now))
+    if own.cost is not None:
+        layout, diagonal = own.identified.options.layout, cfg.task.hessian == "diagonal"
+        most = fit_most(own.log, layout, own.cost, diagonal)
+        costs += [] if most is None else [most]
     named = {}
     for horizon in (N, 2 * N):
         for structure in dict.fromkeys((cfg.constraint.structure, "tied")):
             model = own.identified
             if (horizon, structure) != (N, cfg.constraint.structure):
                 layout = plant_layout(physics, horizon)
-                model = identified_model(cfg, own.log, layout, structure)
+                held = own.identified.options.held
+                model = identified_model(cfg, own.log, layout, structure, held)
             for cost in costs:
                 of = "" if cost is None else f", cost of {cost.variables}"
                 start = own._replace(identified=model, cost=cost)

@@ -158,6 +158,7 @@ def identify(
     structure: str = "free",
     causal: bool = True,
     ridge: float | None = None,
+    held: Sequence[int] = (),
 ) -> Identified:
     """Fit C and b to logged trajectories; see `torch_qpmpc.mpc.predictor`.
 
@@ -179,6 +180,8 @@ def identify(
         ridge: the weight of the squared changes of coefficients from step to step, in units of the
             regressors, relative to the mean squared error; by default the evidence chooses it for
             each regression (`torch_qpmpc.mpc.ridge.ridge`).
+        held: indices of outputs that the model holds at their last value, such as set-points. All
+            others may depend on them.
 
     Raises:
         QPError: an argument or an entry is invalid, the data are too short for ``past``, or the
@@ -203,7 +206,10 @@ def identify(
     sizes = len(log.outputs), len(log.inputs), int(horizon), int(past), len(log.known)
     layout = Layout(*sizes)
     check_excitation(log, layout)
-    options = Options(layout, structure, causal, ridge)
+    if not all(isinstance(i, int) and 0 <= i < layout.n_x for i in held):
+        want = f"indices of the {layout.n_x} outputs, from 0 on"
+        raise QPError.expected("held", f"{[*held]}", want, "In train.py it is task.held.")
+    options = Options(layout, structure, causal, ridge, (*held,))
     return Identified(*fit(log.trajectories, options), options, log)
 
 

@@ -243,6 +243,7 @@ class QPMPC(nn.Module):
         structure: str = "free",
         causal: bool = True,
         ridge: float | None = None,
+        held: Sequence[int] = (),
         **options: Any,
     ) -> QPMPC:
         """Return a QPMPC whose C and b start from least squares on logged trajectories.
@@ -253,7 +254,7 @@ class QPMPC(nn.Module):
         set-points among the observations need it, unless ``hessian="diagonal"`` is passed.
 
         Args:
-            trajectories, horizon, past, n_d, n_x, structure, causal, ridge: see `identify`.
+            trajectories, horizon, past, n_d, n_x, structure, causal, ridge, held: see `identify`.
             options: the keyword arguments of `QPMPC`, such as cost and bounds.
 
         Raises:
@@ -279,6 +280,7 @@ class QPMPC(nn.Module):
             structure=structure,
             causal=causal,
             ridge=ridge,
+            held=held,
         )
         arguments = {**identified.arguments, **options}
         starts = [identified.arguments.get("start", {}), options.get("start") or {}]

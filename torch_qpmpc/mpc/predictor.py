@@ -67,15 +67,28 @@ class Options(NamedTuple):
     structure: str = "free"
     causal: bool = True
     ridge: float | None = None
+    held: tuple[int, ...] = ()
 
 
-def arx(trajectories: Sequence[Trajectory], layout: Layout, strength: float | None = None) -> ARX:
-    """Fit an ARX model with as many lags as the window of ``layout``; see `ridge`."""
+def arx(
+    trajectories: Sequence[Trajectory],
+    layout: Layout,
+    strength: float | None = None,
+    held: tuple[int, ...] = (),
+) -> ARX:
+    """Fit an ARX model with as many lags as the window of ``layout``; see `ridge`.
+
+    Outputs that are ``held`` keep their last value.
+    """
     X, Y = transitions(trajectories, layout)
     W, offset = _regression(X, Y, _differences(layout, known(layout, 0)), strength)
     E, window = W[:, : layout.n_d], W[:, layout.n_d :]
     pairs = window.unflatten(-1, (layout.past, layout.n)).flip(-2)
     A, B = (x.flatten(1) for x in pairs.split((layout.n_x, layout.n_u), dim=-1))
+    kept = torch.tensor(held, dtype=torch.long)
+    for part in (A, B, E, offset):
+        part[kept] = 0.0
+    A[kept, kept] = 1.0
     return ARX(A, B, E, offset)
 
 
@@ -84,9 +97,9 @@ def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[ARX, Cons
 
     A row block is not corrected if the data have too few starts.
     """
-    layout, structure, causal, strength = options
+    layout, structure, causal, strength, held = options
     N, n_x = layout.horizon, layout.n_x
-    model = arx(trajectories, layout, strength)
+    model = arx(trajectories, layout, strength, held)
     C = banded_matrix(model.A, model.B, N, model.E)
     b = -model.offset.repeat(N)
     if structure == "tied":
@@ -104,6 +117,7 @@ def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[ARX, Cons
         X = torch.cat([z[i] for z, _, i in pairs])
         if (k or last) and len(X) > SPANS * last:
             Y = torch.cat([y[i, outputs[k]] for _, y, i in pairs]) - X @ C[rows].mT + b[rows]
+            Y[:, torch.tensor(held, dtype=torch.long)] = 0.0
             change, shift = _regression(X[:, read], Y, _differences(layout, read), strength)
             C[rows, read] += change
             b[rows] -= shift

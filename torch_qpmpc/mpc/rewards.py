@@ -24,17 +24,22 @@ UNUSABLE = (
 )
 #: The least R2 without a warning, and the gain in R2 that is worth a cost of y_{k+1}.
 GOOD, GAIN = 0.9, 1e-3
+#: Steps whose error is beyond this many standard deviations, of a median's robust estimate, are
+#: left out by `fit_most`; and the least shares of steps that it keeps and of variance explained.
+OUTSIDE, MOST, QUADRATIC, ROUNDS = 6 * 1.4826, 0.9, 0.99, 10
 
 
 class RewardCost(NamedTuple):
     """Stage costs fitted to rewards: of (d_k, y_k, u_k) and, unless None, of (y_{k+1}, u_k).
 
-    The second is used only if it is ``usable``. ``print`` shows R2 of both.
+    The second is used only if it is ``usable``. ``kept`` is the share of the log's steps that they
+    are fitted to. ``print`` shows R2 of both.
     """
 
     now: StageCost
     after: StageCost | None = None
     usable: bool = True
+    kept: float = 1.0
 
     @property
     def shifted(self) -> bool:
@@ -53,13 +58,16 @@ class RewardCost(NamedTuple):
     @property
     def variables(self) -> str:
         """The signals that the cost that is used is of."""
-        return "(y_(k+1), u_k)" if self.shifted else "(y_k, u_k)"
+        most = "" if self.kept == 1 else " in most steps"
+        return ("(y_(k+1), u_k)" if self.shifted else "(y_k, u_k)") + most
 
     def __str__(self) -> str:
         text = f"stage cost fitted to the rewards: R2 {self.now.R2:.3f}"
         if self.after is not None:
             text += f" on (y_k, u_k), {self.after.R2:.3f} on (y_(k+1), u_k); the cost is of "
             text += self.variables
+        if self.kept < 1:
+            text += f", {self.kept:.1%} of them"
         if self._later and not self.usable:
             text += f"\n{UNUSABLE}"
         return text if self.best.R2 >= GOOD else f"{text}\n{_poor(self.best.R2)}"
@@ -83,9 +91,7 @@ def fit_rewards(
     Warns:
         UserWarning: R2 of the better one is below 0.9.
     """
-    d, y, u, following, cost = map(
-        torch.cat, zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
-    )
+    d, y, u, following, cost = _all_observed(log, layout)
     now, later = fit_stage_cost(torch.cat((d, y, u), -1), cost, layout.n_d, diagonal), None
     if after and not layout.n_d:
         v = torch.cat((following, u), -1)
@@ -94,6 +100,44 @@ def fit_rewards(
     if not fitted.best.R2 >= GOOD:
         warnings.warn(_poor(fitted.best.R2), UserWarning, stacklevel=2)
     return fitted
+
+
+def fit_most(
+    log: Any, layout: Layout, fitted: RewardCost, diagonal: bool = False
+) -> RewardCost | None:
+    """Fit the cost that is used, without the steps that it does not explain.
+
+    These are found by fits in turn. They are jumps of a set-point that the observation shows too
+    late, say.
+
+    Args:
+        log, layout, diagonal: as in `fit_rewards`.
+        fitted: its costs.
+
+    Returns:
+        The cost; None unless it explains 99 % of the variance in 90 % of the steps or more, and
+        ``fitted`` less than that in all.
+    """
+    if not fitted.best.R2 < QUADRATIC:
+        return None
+    d, y, u, following, cost = _all_observed(log, layout)
+    v, n_apart = (following, layout.n_u) if fitted.shifted else (torch.cat((d, y), -1), 0)
+    v, best = torch.cat((v, u), -1), fitted.best
+    for _ in range(ROUNDS):
+        error = (cost - best(v)).abs()
+        kept = error <= OUTSIDE * error.median()
+        share = kept.double().mean().item()
+        if share < MOST:
+            return None
+        n_free = 0 if fitted.shifted else layout.n_d
+        best, before = fit_stage_cost(v[kept], cost[kept], n_free, diagonal, n_apart), best
+        if best.R2 - before.R2 <= GAIN * 1e-3:
+            break
+    if best.R2 < QUADRATIC:
+        return None
+    if fitted.shifted:
+        return RewardCost(fitted.now, best, kept=share)
+    return RewardCost(best, kept=share)
 
 
 def scheme_cost(
@@ -122,6 +166,12 @@ def scheme_cost(
     ahead = gamma ** torch.arange(N if shifted else N + 1, dtype=torch.float64)
     q = torch.cat((d.repeat(N + 1), past, stages))
     return Cost(W, terminal, hessian, q=q, c=fitted.c * ahead.sum())
+
+
+def _all_observed(log: Any, layout: Layout) -> tuple[Tensor, ...]:
+    """Return d, y, u, the next y and the costs of the steps of all logs."""
+    each = (_observed(steps, layout) for steps in logs(log))
+    return tuple(map(torch.cat, zip(*each, strict=True)))
 
 
 def _observed(steps: Any, layout: Layout) -> tuple[Tensor, ...]:

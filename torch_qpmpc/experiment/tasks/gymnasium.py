@@ -43,6 +43,8 @@ class GymnasiumSettings(TaskSettings):
     observation_bounds: Flag
     #: Episodes by which a start from data is chosen; 0 for the run's own start.
     start_episodes: Whole = 0
+    #: Entries of the observation that are held over the horizon; null for those found in the log.
+    held: Annotated[list[Whole] | None, Expected("a list of indices, or null")] = None
 
     id: Annotated[
         str,

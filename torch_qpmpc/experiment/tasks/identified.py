@@ -19,10 +19,11 @@ from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task, plant_lay
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import Log
+from torch_qpmpc.mpc.log import Log, as_log
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.rewards import RewardCost, fit_rewards, scheme_cost
+from torch_qpmpc.mpc.roles import unmoved
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.tightening import BackOff, tighten
 from torch_qpmpc.mpc.trajectories import valid_steps
@@ -49,13 +50,19 @@ class Start(NamedTuple):
 
     def __str__(self) -> str:
         cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
-        parts = (cut if self.cut else None, self.identified, self.cost, self.choice)
+        held, names = self.identified.options.held, self.identified.log.outputs
+        known = f"Held at their last value over the horizon: {', '.join(names[i] for i in held)}"
+        known += f", as by task.held={[*held]}"
+        parts = (cut if self.cut else None, self.identified, known if held else None)
+        parts += self.cost, self.choice
         return "\n".join(str(part) for part in parts if part is not None)
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The entries of summary.json: the fits of the cost, and the episodes that are cut."""
+        """The entries of summary.json: episodes cut, outputs held, and the fits of the cost."""
+        held = [*self.identified.options.held]
         entries: dict[str, Any] = {"log_episodes_cut": self.cut}
+        entries |= {"outputs_held": held} if held else {}
         entries |= {} if self.choice is None else self.choice.summary
         if self.cost is None:
             return entries
@@ -68,16 +75,22 @@ def identified_start(cfg: DictConfig, physics: AnyPlant, log: Any) -> Start:
     """Identify C, b and a missing stage cost from a log of the plant; `identify` names errors."""
     log, cut = without_blow_ups(log) if isinstance(log, TensorDictBase) else (log, 0)
     layout = plant_layout(physics, cfg.task.horizon)
-    identified = identified_model(cfg, log, layout, cfg.constraint.structure)
+    held = cfg.task.held if "held" in cfg.task else []
+    if held is None:
+        held = unmoved(as_log(log).trajectories, cfg.task.horizon)
+    identified = identified_model(cfg, log, layout, cfg.constraint.structure, held)
     cost = None
     if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is None:
         cost = _fitted(cfg, log, identified.options.layout)
     return Start(log, identified, cost, cut)
 
 
-def identified_model(cfg: DictConfig, log: Any, layout: Layout, structure: str) -> Identified:
-    """Identify C and b with the sizes of ``layout`` and the run's settings."""
-    return _model(log, layout, structure, causal=cfg.start.causal, ridge=cfg.start.ridge)
+def identified_model(
+    cfg: DictConfig, log: Any, layout: Layout, structure: str, held: Sequence[int]
+) -> Identified:
+    """Identify C and b with the sizes of ``layout`` and the run's settings; ``held`` outputs."""
+    options = {"causal": cfg.start.causal, "ridge": cfg.start.ridge, "held": held}
+    return _model(log, layout, structure, **options)
 
 
 def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
