@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import math
 import sys
@@ -100,6 +101,9 @@ def test_a_controller_with_the_true_model_stays_as_it_is():
     assert controller.mpc is mpc
     assert np.array_equal([controller.x, controller.w, controller.u], [x, w, u])
     assert str(report).startswith("not accepted, the controller is as before: J")
+    for low, undecided in ((-1.0, True), (1.0, False)):
+        text = str(dataclasses.replace(report, interval=(low, 2.0)))
+        assert ("so that more pairs could decide" in text) == undecided
 
 
 def test_a_log_is_enough_and_its_last_third_decides():

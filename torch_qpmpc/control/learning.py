@@ -76,6 +76,8 @@ class LearningReport:
     def __str__(self) -> str:
         low, high = self.interval
         proof = f"mean difference and 1 % of J in [{low:.3g}, {high:.3g}] with 95 %"
+        if not self.accepted and low < 0:
+            proof += ", so that more pairs could decide"
         if self.pairs < FEWEST or math.isinf(self.after):
             proof = "a loop with the new model failed, or cost far more than its pair: a veto"
         verdict = "accepted" if self.accepted else "not accepted, the controller is as before"

@@ -182,6 +182,9 @@ def table(summary: Mapping[str, Any]) -> str:
         width = max(map(len, rivals))
         lines += ["", "J of the rivals"]
         lines += [f"  {name:{width}}  {cost_text(J):>8}" for name, J in rivals.items()]
+    if summary.get("rejected") and not summary["accepted"]:
+        kept = f"none of {summary['rejected']} candidates was shown to cost less"
+        lines += ["", f"The gate kept the start: {kept}."]
     return "\n".join(lines + _worse_than_zero(summary))
 
 
