@@ -55,7 +55,7 @@ class GymnasiumPlant:
         try:
             env = self.make()
         except (gymnasium.error.Error, ImportError) as error:
-            expected = "an environment that Gymnasium can make"
+            expected = "an environment that Gymnasium can make, as ID or MODULE:ID"
             raise QPError.expected("task.id", repr(id), expected, str(error)) from error
         except TypeError as error:
             if not kwargs:

@@ -77,7 +77,9 @@ class Choice:
 
     def __str__(self) -> str:
         width = max(map(len, self.rows))
-        lines = [f"{'start':{width}}{'R2':>8}{'episodes':>10}  J"]
+        lines = [
+            f"{'start':{width}}{'R2':>8}{'episodes':>10}  J (compare rows with equal episodes)"
+        ]
         for name, row in self._ranked:
             R2 = "" if math.isnan(row.R2) else f"{row.R2:.3f}"
             J = f"{cost_text(row.J)} +- {cost_text(row.error)}"
