@@ -97,13 +97,13 @@ def test_the_run_has_the_plants_cost_or_one_fitted_to_rewards(store_task):
     own = make_config("task=house", *DATA)
     physics = plant_of(own)
     y, u = torch.tensor([[15.0], [18.0]]).double(), torch.tensor([[1.0], [0.0]]).double()
-    (member, *_) = run_ensemble(own, physics, collect_log(own, physics))
+    (member, *_) = run_ensemble(own, physics, None, collect_log(own, physics))
     w = member.signals(np.random.default_rng(0), 2, 1)[:, 0]
     assert_close(member.cost(y, u, w), physics.cost(y, u, w[:, : physics.n_d]))
     other = make_config("task=store", *DATA)
     physics = plant_of(other)
     with pytest.warns(UserWarning, match="explains"):  # it is piecewise linear
-        (member, *_) = run_ensemble(other, physics, collect_log(other, physics))
+        (member, *_) = run_ensemble(other, physics, None, collect_log(other, physics))
     assert not isinstance(member, ARXPlant)
     assert member.past == physics.past == 2
 
@@ -115,6 +115,20 @@ def test_the_run_has_the_plants_cost_or_one_fitted_to_rewards(store_task):
 def test_a_log_that_is_too_short_for_the_members_is_named(steps, message):
     with pytest.raises(QPError, match=message):
         ensemble(arx_log(steps=steps, noise=0.1), LAYOUT, lambda y, u, d: y[..., 0], *BOUNDS)
+
+
+def test_what_the_start_holds_its_members_hold():
+    log = arx_log(noise=0.1)
+    members = ensemble(log, LAYOUT, lambda y, u, d: y[..., 0], *BOUNDS, held=[0])
+    assert all((member.B[0] == 0).all() for member in members)
+
+
+def test_a_policy_with_a_window_and_a_log_without_bounds():
+    log = arx_log(noise=0.1)
+    options = {"stage_weight": [1.0, 1.0, 0.1], "action_bounds": ([-1.0], [1.0])}
+    mpc = qm.QPMPC.from_data(log, 3, past=2, n_d=1, **options)
+    J, low, high = predict_cost(mpc, log, lambda y, u, d: y.square().sum(-1), steps=5, starts=8)
+    assert low <= J <= high
 
 
 def test_a_prediction_needs_a_cost():

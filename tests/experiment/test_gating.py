@@ -174,7 +174,7 @@ def test_a_candidate_that_exploits_one_member_is_not_kept(monkeypatch):
     gate, actor = make_gate(*MODEL, "constraint=mpc", "updates=4", "task.eval_steps=20")
     cfg = make_config("start=data", "start.transitions=1000", "num_envs=20")
     physics = make_physics(cfg)
-    right = run_ensemble(cfg, physics, collect_log(cfg, physics))
+    right = run_ensemble(cfg, physics, None, collect_log(cfg, physics))
     wrong = replace(right[0], B=-right[0].B)  # actions act the other way
 
     def follow(policy: Any, member: ARXMember) -> None:
@@ -199,3 +199,4 @@ def test_a_candidate_is_rejected_where_no_ensemble_is_identified(monkeypatch):
     monkeypatch.setattr(gate, "_physics", ActuatorNoise())
     with pytest.warns(UserWarning, match="gate=model rejects the candidate: action: got"):
         assert gate.judge(4) == {"gate/accepted": 0.0}
+    assert gate.summary()["rejected"] == 1

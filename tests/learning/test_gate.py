@@ -299,6 +299,7 @@ def test_the_state_is_restored():
         (lambda: Gate(Policy(1.0), costs, alpha=1.0), "alpha"),
         (lambda: Gate(Policy(1.0), costs, patience=0), "patience"),
         (lambda: Gate(Policy(1.0), costs, seed=-1), "seed"),
+        (lambda: Gate(Policy(1.0), []), "costs: got none, expected a function, or at least one in"),
         (lambda: Gate(Policy(1.0), lambda *_: torch.zeros(())).judge(Policy(1.0)), "costs"),
     ],
 )

@@ -39,7 +39,7 @@ def test_the_first_order_descends_the_sum_of_its_terms():
     terms, scalars = update(transitions(), windows)
     assert set(terms) == {"loss/value", "loss/si"}
     assert scalars["unsolved"] == 0
-    total = make_loss(twin)(transitions())["loss_value"] + si(twin.C, windows, twin.b)
+    total = make_loss(twin)(transitions())["loss_value"] + si(twin.C, windows, twin.b.detach())
     total.backward()
     assert_close(sum(terms.values()), total)
     for moved, still in zip(mpc.parameters(), twin.parameters(), strict=True):

@@ -242,7 +242,7 @@ def two_equal_actions(log: TensorDict) -> TensorDict:
         (lambda: qm.identify(arx_log(), N, ridge=-1.0), "ridge: got -1.0, expected a finite numbe"),
         (
             lambda: qm.identify(arx_log(), N, held=[2]),
-            r"held: got \[2\], expected indices of the 2 outputs, from 0 on. In train.py it is",
+            r"held: got \[2\], expected a list of indices of the 2 outputs, from 0 on. In train.py",
         ),
         (lambda: qm.identify(arx_log(), N, causal=1), "causal: got 1, expected True or False"),  # pyright: ignore[reportArgumentType] (the mistake)
         (

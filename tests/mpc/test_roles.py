@@ -45,3 +45,26 @@ def test_an_output_that_follows_the_actions_is_moved():
 def test_a_short_log_is_read_as_far_as_it_goes(steps):
     log = [each.between(0, steps) for each in trajectories()]
     assert 5 in unmoved(log, N)
+
+
+def lag(u: torch.Tensor) -> Trajectory:
+    """Return a rounded lag of the first input and a count of its large values."""
+    y = torch.zeros(len(u) + 1, dtype=torch.float64)
+    for k in range(len(u)):
+        y[k + 1] = 0.9 * y[k] + u[k, 0]
+    large = torch.cat((torch.zeros(1), (u[:, 0].abs() > 0.7).double()))
+    return Trajectory(torch.stack((y.round(), large), -1), u, u[:, :0])
+
+
+@pytest.mark.parametrize("kind", ["uniform", "binary", "dead input", "rare", "short"])
+def test_what_an_input_moves_is_not_held_whatever_the_excitation(kind):
+    draw = torch.Generator().manual_seed(0)
+    u = torch.rand(2000, 1, generator=draw).double() * 2 - 1
+    u = {
+        "uniform": u,
+        "binary": 0.8 * u.sign(),
+        "dead input": torch.cat((u, 0 * u), -1),
+        "rare": u[:80].repeat_interleave(25, 0),
+        "short": u[:60],
+    }[kind]
+    assert unmoved([lag(u)], N) == ([1] if kind == "binary" else [])  # where all are large

@@ -52,7 +52,9 @@ class ARXModel(Plant):
         return torch.cat((self.signals_seen[rows % len(self.signals_seen)], errors), -1)
 
     def starts(self, rng: Rng, count: int) -> Tensor:
-        return first_window(self.outputs[self._first(rng, count)], self.past, 0 * self.lb_a)
+        return first_window(
+            self.outputs[self._first(rng, count)], self.past, torch.zeros_like(self.lb_a)
+        )
 
     def _first(self, rng: Rng, *shape: int) -> Tensor:
         if self.first is None:

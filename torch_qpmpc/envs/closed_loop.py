@@ -136,7 +136,8 @@ def plant_loop(
     x = plant.starts(rng, starts)
     if (begin := getattr(policy, "begin", None)) is not None:
         begin(plant, x, w)
-    k, window = 0, first_window(plant.output(x, w[:, 0]), plant.past, 0 * plant.lb_a)
+    zero = torch.zeros_like(plant.lb_a)  # bounds may be infinite
+    k, window = 0, first_window(plant.output(x, w[:, 0]), plant.past, zero)
 
     def known() -> Tensor:
         ahead = w[:, k : k + plant.horizon + 1, : plant.n_d]

@@ -62,7 +62,7 @@ class PlantGymEnv(gymnasium.Env):
         self._w = plant.signals(self.np_random, 1, length)[0]
         self._x, self._k = plant.starts(self.np_random, 1)[0], 0
         y = plant.output(self._x, self._w[0])
-        self._window = first_window(y, plant.past, 0 * plant.lb_a)
+        self._window = first_window(y, plant.past, torch.zeros_like(plant.lb_a))
         return self._observed()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:

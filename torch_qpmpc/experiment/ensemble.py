@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.log import as_log
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.rewards import fit_rewards
+from torch_qpmpc.mpc.stage_cost import StageCost as FittedCost
 from torch_qpmpc.mpc.trajectories import folds
 
 #: Models of an ensemble, and the blocks of consecutive steps that each is fitted to.
@@ -88,7 +89,12 @@ def predict_cost(
 
 
 def ensemble(
-    data: Any, layout: Layout, stage_cost: StageCost, lb_a: Tensor, ub_a: Tensor
+    data: Any,
+    layout: Layout,
+    stage_cost: StageCost,
+    lb_a: Tensor,
+    ub_a: Tensor,
+    held: Sequence[int] = (),
 ) -> list[ARXMember]:
     """Fit four ARX models to halves of a log, each to eight blocks of steps from all over it.
 
@@ -98,13 +104,14 @@ def ensemble(
 
     A member's disturbances are its own cross-validated one-step errors, drawn with replacement. It
     starts where a quarter of the log's trajectories do or, if these are fewer than four, where all
-    do, with the known signals that follow.
+    do, with known signals that begin with another of these steps.
 
     Args:
         data: a log, as in `identify`.
         layout: the sizes of the policies.
         stage_cost: the cost ``(*batch,)`` of y, u and d.
         lb_a, ub_a: bounds of the action, ``(n_u,)``.
+        held: outputs that keep their last value, as in `identify`.
 
     Raises:
         QPError: a half identifies no model.
@@ -118,17 +125,21 @@ def ensemble(
         # Blocks i and i + 1 of each four: each block is in two members.
         half = [*blocks[i::MEMBERS], *blocks[(i + 1) % MEMBERS :: MEMBERS]]
         part = [trajectory for block in half for trajectory in block]
-        model = identify(replace(log, trajectories=part), 1, past=layout.past, structure="tied")
+        model = identify(
+            replace(log, trajectories=part), 1, past=layout.past, structure="tied", held=held
+        )
         starts = first[i::MEMBERS] if len(first) >= MEMBERS else first
         members.append(ARXMember(**arx_arguments(model, log), **options, first=starts))
     return members
 
 
-def run_ensemble(cfg: DictConfig, physics: AnyPlant, data: Any) -> list[ARXMember]:
-    """Fit the `ensemble` of a run's logged steps.
+def run_ensemble(
+    cfg: DictConfig, physics: AnyPlant, start: Start | None, data: Any
+) -> list[ARXMember]:
+    """Fit the `ensemble` of a run's logged steps, with the outputs held that the start holds.
 
-    The cost is the plant's own where it is one of outputs, inputs and known signals, and else the
-    one that is fitted to the rewards.
+    The cost is the plant's own where it is one of outputs, inputs and known signals, else the
+    start's if it is one of (y_k, u_k), and else the one that is fitted to the rewards.
 
     Raises:
         QPError: as in `ensemble`.
@@ -140,9 +151,12 @@ def run_ensemble(cfg: DictConfig, physics: AnyPlant, data: Any) -> list[ARXMembe
     elif isinstance(physics, Plant):
         zeros = (torch.zeros(n).double() for n in (layout.n_x, layout.n_u, layout.n_d))
         cost = None if physics.output_cost(*zeros) is None else physics.output_cost
+    if cost is None and start is not None and start.cost is not None and not start.cost.shifted:
+        cost = _stage_cost(start.cost.best)
     if cost is None:
         cost = _fitted(data, layout, cfg.task.hessian == "diagonal")
-    return ensemble(data, layout, cost, physics.lb_a, physics.ub_a)
+    held = () if start is None else start.identified.options.held
+    return ensemble(data, layout, cost, physics.lb_a, physics.ub_a, held)
 
 
 def check_ensemble(cfg: DictConfig, physics: AnyPlant, start: Start | None) -> None:
@@ -168,5 +182,8 @@ def check_ensemble(cfg: DictConfig, physics: AnyPlant, start: Start | None) -> N
 
 
 def _fitted(data: Any, layout: Layout, diagonal: bool = False) -> StageCost:
-    fitted = fit_rewards(data, layout, diagonal).now
+    return _stage_cost(fit_rewards(data, layout, diagonal).now)
+
+
+def _stage_cost(fitted: FittedCost) -> StageCost:
     return lambda y, u, d: fitted(torch.cat((d, y, u.to(y)), -1))

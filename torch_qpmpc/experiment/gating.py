@@ -76,6 +76,7 @@ class RunGate:
     ) -> None:
         self._cfg, self._learner, self._physics, self._quiet = cfg, learner, physics, quiet
         self._logged, self._members = partial(transitions, start, replay), list[ARXMember]()
+        self._start = start
         options = {"seed": cfg.seed, "pairs": PAIRS, "decisions": _decisions(cfg)}
         options |= {"bound": cfg.gate_bound, "patience": PATIENCE if cfg.gate in ACTING else None}
         costs: Any = self._costs
@@ -116,9 +117,10 @@ class RunGate:
             return {}
         if self._cfg.gate == "model":
             try:
-                self._members = run_ensemble(self._cfg, self._physics, self._logged())
+                self._members = run_ensemble(self._cfg, self._physics, self._start, self._logged())
             except QPError as error:
                 warnings.warn(f"{UNFITTED}{error}", UserWarning, stacklevel=2)
+                self._gate.rejected += 1
                 return {"gate/accepted": 0.0}
         verdict = self._judge("gate")
         return verdict | self._search() if last and self._cfg.gate != "model" else verdict

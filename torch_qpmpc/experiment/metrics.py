@@ -17,7 +17,7 @@ from torch_qpmpc.analysis.structure import distance_by_band, nearest_model
 from torch_qpmpc.envs.closed_loop import cost_text, gap_text
 from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.evaluation import Evaluation
-from torch_qpmpc.experiment.gating import RunGate
+from torch_qpmpc.experiment.gating import COMPARED, RunGate
 from torch_qpmpc.experiment.plots import (
     closed_loop_figure,
     learned_episode_figure,
@@ -184,7 +184,7 @@ def table(summary: Mapping[str, Any]) -> str:
         lines += [f"  {name:{width}}  {cost_text(J):>8}" for name, J in rivals.items()]
     if summary.get("rejected") and not summary["accepted"]:
         kept = f"none of {summary['rejected']} candidates was shown to cost less"
-        names = ("simulated", "alternated", "modelled")
+        names = ("simulated", *COMPARED.values())
         compared = next(f"{summary[x]:,} {x}" for x in names if x in summary)
         lines += ["", f"The gate kept the start: {kept}, by {compared} transitions."]
     return "\n".join(lines + _worse_than_zero(summary))

@@ -186,8 +186,10 @@ def build(
     library, agreement = None, None
     if compiler() is not None:
         library = Library(folder, name, dtype)
-        agreement = _compare(mpc, tables, library, p, exact, dtype)
+        agreement, error = _compare(mpc, tables, library, p, exact)
         _check_solved(agreement, dtype, max_iterations, tables)
+        if not error <= NEAR[dtype].u:
+            _refuse(dtype, f"an action off by {error:.1e} of its size", tables)
         if failed := library.selftest():
             kinds = [*(example.kind for example in examples.states), "invalid"]
             _refuse(dtype, f"a failed self-test at state {failed} ({kinds[failed - 1]})", tables)
@@ -235,8 +237,9 @@ def _states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, Reference]:
 
 
 def _compare(
-    mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Reference, dtype: str
-) -> Agreement:
+    mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Reference
+) -> tuple[Agreement, float]:
+    """Return the agreement, and the largest error of an action relative to its size."""
     steps = library.steps(library.states(len(p)), p, tables.n_u)
     solvable = exact.status == Status.SOLVED
     both = solvable & (steps.codes == 0)
@@ -246,16 +249,13 @@ def _compare(
         return u, np.abs(steps.value - exact.value) / (np.abs(exact.value) + 1e-300)
 
     u, value = differences(exact)
-    size = np.nanmax(np.abs(exact.u), initial=1e-9)
-    doubtful = both & ((u > DOUBTFUL * size) | (value > DOUBTFUL))
-    if library.real == np.float64:
-        u, value = differences(sharpen(mpc, p, exact, np.flatnonzero(doubtful)))
     # Relative to the state's own action, or to a usual one: some drawn states have huge ones.
     sizes = np.abs(exact.u).max(-1)
     sizes = np.fmax(sizes, np.median(sizes[both]) if both.any() else 0).clip(1e-9)
-    if (both & (u > NEAR[dtype].u * sizes)).any():
-        _refuse(dtype, f"actions off by {u[both].max():.1e}", tables)
-    return Agreement(
+    doubtful = both & ((u > DOUBTFUL * sizes) | (value > DOUBTFUL))
+    if library.real == np.float64:
+        u, value = differences(sharpen(mpc, p, exact, np.flatnonzero(doubtful)))
+    agreement = Agreement(
         states=len(p),
         solved=int(both.sum()),
         infeasible=int(((exact.status == Status.INFEASIBLE) & (steps.codes == INFEASIBLE)).sum()),
@@ -264,6 +264,7 @@ def _compare(
         unsolved=int((solvable & ~both).sum()),
         iterations=int(steps.iterations.max(initial=0)),
     )
+    return agreement, float((u / sizes)[both].max(initial=0))
 
 
 def _refuse(dtype: str, got: str, tables: Tables) -> None:

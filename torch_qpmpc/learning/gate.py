@@ -244,6 +244,8 @@ class Gate:
         check_whole("decisions", decisions, 1)
         PairedTest(alpha, bound)
         self.actor, self._costs = copy.deepcopy(actor), [costs] if callable(costs) else [*costs]
+        if not self._costs:
+            raise QPError.expected("costs", "none", "a function, or at least one in a list")
         self._decisions, self._bound = decisions, bound
         self._pairs, self._alpha, self._patience, self._seed = pairs, alpha, patience, seed
         self.accepted = self.rejected = self._in_a_row = 0

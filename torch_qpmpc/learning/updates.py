@@ -58,7 +58,7 @@ def first_order(
             losses = loss_module(batch)
         terms = {name.replace("_", "/", 1): x for name, x in losses.items() if "loss_" in name}
         if si is not None and windows is not None:
-            terms["loss/si"] = si(mpc.C, windows, mpc.b)
+            terms["loss/si"] = si(mpc.C, windows, mpc.b.detach())
         due = actor_due()
         total = torch.stack([x for name, x in terms.items() if due or "value" in name]).sum()
         optimizer.zero_grad()

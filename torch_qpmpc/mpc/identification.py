@@ -206,10 +206,11 @@ def identify(
     sizes = len(log.outputs), len(log.inputs), int(horizon), int(past), len(log.known)
     layout = Layout(*sizes)
     check_excitation(log, layout)
-    if not all(isinstance(i, int) and 0 <= i < layout.n_x for i in held):
-        want = f"indices of the {layout.n_x} outputs, from 0 on"
-        raise QPError.expected("held", f"{[*held]}", want, "In train.py it is task.held.")
-    options = Options(layout, structure, causal, ridge, (*held,))
+    whole = isinstance(held, Sequence) and all(type(i) is int for i in held)
+    if not whole or not {*held} <= {*range(layout.n_x)}:
+        want = f"a list of indices of the {layout.n_x} outputs, from 0 on"
+        raise QPError.expected("held", repr(held), want, "In train.py it is task.held.")
+    options = Options(layout, structure, causal, ridge, (*sorted({*held}),))
     return Identified(*fit(log.trajectories, options), options, log)
 
 
