@@ -152,6 +152,13 @@ def test_the_folder_s_program_runs_without_warnings_and_its_loop_has_no_offset(t
     (r,) = re.findall(r"R\[1\] =\n\{(.*)\}", main)
     assert (step, code) == ("199", "0")
     assert abs(float(y) - float(r)) < 1e-4
+    assert controller.export_c(tmp_path, name="level").kept == ()
+    other = qm.Controller(integrator()).export_c(tmp_path, name="level")
+    assert other.kept == (tmp_path / "main.c",)
+    assert f"kept, not written: {tmp_path / 'main.c'}; delete what is not yours" in str(other)
+    failed = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert failed.returncode
+    assert "main.c was written for another controller: delete it and export again" in failed.stderr
     (tmp_path / "main.c").write_text("mine")
     controller.export_c(tmp_path, name="level")
     assert (tmp_path / "main.c").read_text() == "mine"
@@ -160,6 +167,28 @@ def test_the_folder_s_program_runs_without_warnings_and_its_loop_has_no_offset(t
     assert "known: rain, price" in header
     assert f"state {report.state_bytes} bytes" in str(report)
     assert report.state_bytes == load(report.files, controller, "level").state_bytes
+
+
+def test_the_folder_s_program_starts_where_the_plant_can_rest(tmp_path):
+    def written(controller):
+        (tmp_path / "main.c").unlink(missing_ok=True)
+        controller.export_c(tmp_path)
+        rows = re.findall(r"(\w+)\[\d\] =\n\{(.*)\}", (tmp_path / "main.c").read_text())
+        arrays = {name: float(x) for name, x in rows if "," not in x and "{" not in x}
+        return [round(arrays[name], 6) for name in ("START_X", "START_U", "R")]
+
+    lag = {"outputs": ["T"], "inputs": ["q"], "Q": 1.0, "dR": 0.1}
+    model = ([[0.9]], [[0.5]])
+    controller = qm.Controller(qm.LinearMPC(model, 10, u_bounds=(10.0, 50.0), **lag))
+    assert written(controller) == [150.0, 30.0, 150.25]
+    controller.reset(y=[200.0], u=[40.0])
+    assert written(controller) == [200.0, 40.0, 200.0]
+    controller.step([200.0], [120.0])
+    assert written(controller) == [200.0, 40.0, 120.0]
+    one_sided = qm.Controller(qm.LinearMPC(model, 10, u_bounds=(10.0, np.inf), **lag))
+    assert written(one_sided) == [55.0, 11.0, 55.25]
+    bounded = qm.LinearMPC(model, 10, u_bounds=(10.0, 50.0), y_bounds=(60.0, 100.0), **lag)
+    assert written(qm.Controller(bounded)) == [80.0, 16.0, 85.0]
 
 
 def test_single_precision_agrees_to_its_accuracy(tmp_path):

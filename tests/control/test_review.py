@@ -56,7 +56,7 @@ MISTAKES = {
     ),
     "a set-point out of reach": (
         (LAG, {"r": [7.0]}),
-        ("set-points", r"Set y1 to (4), not 7, or widen the bounds\."),
+        ("set-points", r"Set y1 to (4), not 7, or widen y_bounds of y1\."),
         lambda y: {"r": [float(y)]},
     ),
     "a band out of reach": (
@@ -178,9 +178,41 @@ def test_findings_are_about_the_last_known_signals_or_those_passed():
     assert found["set-points"].text == "at rain 10; y1 reaches [10, 35]"
     assert found.faults == []
     (fault,) = controller.review(r=[35.0], known=[5.0]).faults
-    assert fault.remedy == "Set y1 to 30, not 35, or widen the bounds."
+    assert fault.remedy == "Set y1 to 30, not 35, or widen u_bounds of u1."
     controller.reset()
     assert controller.review()["set-points"].text.startswith("at rain (not known, assumed) 0;")
+
+
+COUPLED = (np.diag([0.9, 0.8]), np.array([[0.5, 0.1], [0.13, 0.47]]))
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "r", "limits"),
+    [
+        (COUPLED, {"u_bounds": (10.0, 50.0)}, [300.0, 50.0], "or widen u_bounds of u1"),
+        (COUPLED, {"u_bounds": (-3.17, 7.77)}, [60.0, 30.0], "or widen u_bounds of u1 and u2"),
+        (
+            COUPLED,
+            {"u_bounds": (-3.17, 7.77), "y_bounds": {"y2": (-5, 5)}, "y_slack": 0.3},
+            [10.0, 7.0],
+            "or widen y_bounds of y2",
+        ),
+        (
+            (COUPLED[0], COUPLED[1][:, :1]),
+            {"u_bounds": (-1.0, 1.0)},
+            [1.0, 0.3],
+            "as no inputs hold these set-points together",
+        ),
+    ],
+)
+def test_set_points_of_a_remedy_pass_as_they_are_printed(model, options, r, limits):
+    controller = qm.Controller(qm.LinearMPC(model, 10, Q=[1.0, 0.05], dR=0.1, **options))
+    fault = controller.review(r=r)["set-points"]
+    assert not fault.ok
+    assert f", {limits}." in fault.remedy
+    typed = dict(zip(("y1", "y2"), r, strict=True))
+    typed |= {y: float(x) for y, x in re.findall(r"Set (y\d) to (\S+), not", fault.remedy)}
+    assert controller.review(r=typed)["set-points"].ok
 
 
 def test_known_signals_that_no_input_balances_are_a_fault():
@@ -245,7 +277,7 @@ def test_the_page_has_all_findings_and_the_figure(tmp_path):
     review.to_html(tmp_path / "review.html", figure)
     page = (tmp_path / "review.html").read_text()
     assert page.count("<tr>") == 1 + len(review.findings)
-    assert "<td>Set y1 to 4, not 7, or widen the bounds.</td>" in page
+    assert "<td>Set y1 to 4, not 7, or widen y_bounds of y1.</td>" in page
     (data,) = re.findall(r"data:image/png;base64,([^\"]*)", page)
     assert base64.b64decode(data).startswith(b"\x89PNG")
 

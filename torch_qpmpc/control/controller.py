@@ -54,7 +54,8 @@ class Controller:
         observer: the `Observer`.
         x, w, u: the estimates of x and w, and the last input.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
-        rest: the outputs y, or None, and the input u that the last reset said the plant rests with.
+        rest: the outputs y, and the input u, that the last reset said the plant rests with, or None
+            where it said nothing.
         p: what the plan of the last step knew, ``(n_p,)``.
         target: the `Target` of the last step, None before the first; with a preview, of all stages.
 
@@ -111,7 +112,7 @@ class Controller:
         last = np.zeros(len(plant.inputs)) if u is None else read_row("u", u, plant.inputs)
         self.u = np.clip(last, *self._design.u_bounds)
         y = None if y is None else read_row("y", y, plant.outputs)
-        self.rest: tuple[Array | None, Array] = (y, self.u)
+        self.rest: tuple[Array | None, Array | None] = (y, None if u is None else self.u)
         self.known: Array | None = None
         self.target: Target | None = None
         self.p = torch.zeros(self.mpc.n_p)
@@ -316,7 +317,7 @@ class Controller:
             >>> controller = qm.Controller(mpc)
             >>> review = controller.review(r=[7.0])
             >>> review.faults[0].name, review.faults[0].remedy
-            ('set-points', 'Set y1 to 5, not 7, or widen the bounds.')
+            ('set-points', 'Set y1 to 5, not 7, or widen u_bounds of u1.')
         """
         from torch_qpmpc.control.review import review
 
@@ -336,7 +337,10 @@ class Controller:
         ``name_step(&state, y, r, known, u)`` of ``name.c`` is `step`, with the estimates, the last
         input and the active sets of all QPs in the state. A closed loop is compared with this
         one's if a C compiler is installed. ``main.c`` and a ``Makefile`` run the closed loop with
-        the model as a plant; they are written once, and yours afterwards.
+        the model as a plant. It starts where the last `reset` rests, with the last set-point, by
+        default that rest; without a reset it starts at rest in the middle of the bounds. Both files
+        are written once, and yours afterwards: the report names those that were kept, and an older
+        ``main.c`` does not compile with a controller of other sizes.
 
         Args:
             folder: the folder of the files, created if it does not exist.

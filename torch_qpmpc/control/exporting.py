@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torch_qpmpc.control.controller import Controller
-from torch_qpmpc.control.design import half_range, middle
+from torch_qpmpc.control.design import half_range
 from torch_qpmpc.control.disturbance import RANK
-from torch_qpmpc.control.probe import at_rest
+from torch_qpmpc.control.probe import at_rest, centre
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, export_c
@@ -38,6 +38,7 @@ class ControllerExport:
 
     Attributes:
         files: the paths of all files.
+        kept: those of an older ``main.c`` or ``Makefile`` that differ from what this export has.
         plan, target: the reports of the plan's and the target's QPs.
         free: that of the QP of inputs that the target leaves free, None without one.
         table_bytes: the size of all constant tables but those of self-tests.
@@ -47,6 +48,7 @@ class ControllerExport:
     """
 
     files: tuple[Path, ...]
+    kept: tuple[Path, ...]
     plan: Export
     target: Export
     free: Export | None
@@ -64,7 +66,11 @@ class ControllerExport:
             else f"inputs of a closed loop of {self.steps} steps within {self.difference:.1e}"
         )
         sizes = f"tables {self.table_bytes:,} bytes{state}"
-        return "\n".join((", ".join(map(str, self.files)), sizes, compared))
+        lines = [", ".join(map(str, self.files)), sizes, compared]
+        if self.kept:
+            kept = ", ".join(map(str, self.kept))
+            lines.append(f"kept, not written: {kept}; delete what is not yours and export again")
+        return "\n".join(lines)
 
 
 class Loop(NamedTuple):
@@ -168,12 +174,16 @@ def export_controller(
     for file, text in texts.items():
         (folder / file).unlink(missing_ok=True)  # may be a link, which would be followed
         (folder / file).write_text(text, encoding="utf-8")
+    kept = []
     for file, text in example.items():
-        if not (folder / file).exists():
-            (folder / file).write_text(text, encoding="utf-8")
+        if not (path := folder / file).exists():
+            path.write_text(text, encoding="utf-8")
+        elif path.read_bytes() != text.encode():
+            kept.append(path)
     own = sum(x.size for x in _tables(controller).values()) * np.dtype(dtype).itemsize
     return ControllerExport(
         tuple(folder / file for file in (*texts, *example)),
+        tuple(kept),
         plan,
         target,
         free,
@@ -187,9 +197,9 @@ def export_controller(
 def _run(controller: Controller, twin: Controller | CompiledController, steps: int) -> Loop:
     """Return signals of a closed loop of ``twin``, with noise, a load and moving set-points.
 
-    It starts at rest in the middle of the outputs' bounds, and ends early where no input satisfies
-    the hard bounds. Each controller closes a loop of its own: replaying outputs through an unstable
-    controller would measure rounding alone.
+    It starts at rest near `centre`, and ends early where no input satisfies the hard bounds. Each
+    controller closes a loop of its own: replaying outputs through an unstable controller would
+    measure rounding alone.
     """
     rng, design = np.random.default_rng(0), controller.mpc.design
     plant, rows = design.plant, COMPARED + design.horizon + 1
@@ -197,12 +207,12 @@ def _run(controller: Controller, twin: Controller | CompiledController, steps: i
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
     x, start, level = at_rest(controller)
     d = level + 0.1 * rng.normal(size=(rows, len(plant.known)))
-    centre, loop = middle(design.y_bounds), []
+    middle_y, loop = centre(controller), []
     twin.reset(u=start)
     step = twin.step if isinstance(twin, Controller) else twin.solved
     for k in range(steps):
         y = plant.C @ x + 0.01 * size_y * rng.normal(size=len(size_y))
-        r, known = centre + moves[k:] * size_y, d[k:]
+        r, known = middle_y + moves[k:] * size_y, d[k:]
         r, known = (x[: design.horizon + 1] for x in (r, known))
         r = r if design.references == "preview" else r[:1]
         try:
@@ -321,22 +331,34 @@ def _tables(controller: Controller) -> dict[str, Array]:
 
 
 def _main(controller: Controller, name: str, dtype: str) -> str:
-    """Return a program of the closed loop with the model, a load and a set-point in reach."""
+    """Return a program of the closed loop with the model and a load, from the last reset's rest.
+
+    Without a reset it starts `at_rest`, and moves to a set-point in reach.
+    """
     design = controller.mpc.design
     plant, sizes = design.plant, _sizes(controller)
     x, u, known = at_rest(controller)
     load = 0.1 * plant.B @ half_range(design.u_bounds) + plant.E @ known + plant.offset
-    r = middle(design.y_bounds) + 0.25 * half_range(design.y_bounds)
-    r = controller.mpc.target(r, known=known).y.numpy()
+    r = centre(controller) + 0.25 * half_range(design.y_bounds)
+    y_rest, u_rest = controller.rest
+    if y_rest is not None or u_rest is not None:
+        u = np.clip(np.zeros(len(u)), *design.u_bounds) if u_rest is None else u_rest
+        x = plant.at_rest(u, known, y_rest)
+        r = plant.C @ x
+    r = np.tile(controller.mpc.target(r, known=known).y.numpy(), (sizes["SET_POINTS"], 1))
+    if len(controller.r):
+        r = controller.read_set_points(None, sizes["SET_POINTS"])
     arrays = {
         "A": plant.A,
         "B": plant.B,
         "C": plant.C,
         "LOAD": load,
-        "R": np.tile(r, sizes["SET_POINTS"]),
+        "R": r.ravel(),
         "KNOWN": np.tile(known, sizes["STAGES"]),
         "START_X": x,
         "START_U": u,
     }
     tables = "\n".join(["enum { STEPS = 200 };", *(array(k, x, dtype) for k, x in arrays.items())])
-    return filled("controller_main.c", name, {"/* @PLANT@ */": tables})
+    fixed = ("N_X", "N_U", "N_Y", "N_D", "STAGES", "SET_POINTS")
+    other = " || ".join(f"{name.upper()}_{key} != {sizes[key]}" for key in fixed)
+    return filled("controller_main.c", name, {"/* @PLANT@ */": tables, "@OTHER@": other})

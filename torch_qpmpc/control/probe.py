@@ -10,7 +10,7 @@ import torch
 
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import half_range, middle
-from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.control.state_space import FAINT, Array
 from torch_qpmpc.errors import SolverError
 
 #: Steps of the loop, and of a set-point. Set-points and loads are these shares of half the bounds.
@@ -40,27 +40,39 @@ def held_known(controller: Controller) -> Array:
     return np.zeros(n_d) if controller.known is None else controller.known
 
 
+def centre(controller: Controller) -> Array:
+    """Return the middle of the outputs' bounds, where there are none what the inputs' middle holds.
+
+    An input with one bound is half its range from it.
+    """
+    design, known = controller.mpc.design, held_known(controller)
+    half, (lower, upper) = half_range(design.u_bounds), design.u_bounds
+    u, y = np.clip(0.0, lower + half, upper - half), middle(design.y_bounds)
+    held = design.plant.C @ design.plant.at_rest(u, known, y, FAINT)
+    return np.where(np.isfinite(design.y_bounds).all(0), y, np.clip(held, *design.y_bounds))
+
+
 def at_rest(controller: Controller) -> tuple[Array, Array, Array]:
-    """Return x, u and `held_known` of the model at rest in the middle of its outputs' bounds."""
+    """Return x, u and `held_known` of the model at rest as near to `centre` as its bounds allow."""
     known = held_known(controller)
-    rest = controller.mpc.target(middle(controller.mpc.design.y_bounds), known=known)
+    rest = controller.mpc.target(centre(controller), known=known)
     return rest.x.numpy(), rest.u.numpy(), known
 
 
 @torch.no_grad()
 def probe(controller: Controller) -> Probe:
-    """Run the loop, from rest in the middle of the outputs' bounds; known signals are held."""
+    """Run the loop, from rest near `centre`; known signals are held."""
     design, twin, rng = controller.mpc.design, copy.copy(controller), np.random.default_rng(0)
     plant = design.plant
     size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
-    centre, load = middle(design.y_bounds), LOAD * size_u
+    middle_y, load = centre(controller), LOAD * size_u
     x, last, known = at_rest(controller)
     twin.reset(u=last)
     costs: dict[str, float] = {}
     states = []
     for k in range(STEPS):
         if k % HELD == 0:
-            r = centre + MOVE * size_y * rng.uniform(-1, 1, len(size_y))
+            r = middle_y + MOVE * size_y * rng.uniform(-1, 1, len(size_y))
         y = plant.C @ x
         try:
             u = twin.step(y, r, known)

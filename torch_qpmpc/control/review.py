@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,9 @@ MARGIN, CONDITION, SPREAD, HIDDEN = 0.3, 1e8, 1e4, 1e-3
 IDLE, NOTED = 1e-6, 1e-2
 #: Offsets relative to half the distance of an output's bounds.
 OFFSET = 1e-6
+#: The most times that a set-point is replaced by its nearest one, which soft bounds may move again,
+#: and the most outputs of which all ways to round are tried.
+SETTLES, ROUNDED = 100, 6
 #: A response below this share of those soon after, with inputs of half their range, is noise.
 SHOWS = 0.03
 #: The most powers of ten that the filter's noise is raised by, for a margin.
@@ -267,11 +271,71 @@ def _set_points(controller: Controller) -> Finding:
             faults.append(f"Let y_bounds of {name} overlap {lower[i]:.4g} .. {upper[i]:.4g}.")
     if len(controller.r) and weighted.any():
         r = controller.r[-1]
-        y = controller.mpc.target(r, controller.w, known).y.numpy()
-        for i in np.flatnonzero(weighted & (np.abs(y - r) > OFFSET * half_range(design.y_bounds))):
-            numbers[f"nearest {names[i]}"] = y[i]
-            faults.append(f"Set {names[i]} to {y[i]:.4g}, not {r[i]:.4g}, or widen the bounds.")
+        target = controller.mpc.target(r, controller.w, known)
+        y = target.y.numpy()
+        off = _off(controller, y, r)
+        numbers |= {f"nearest {names[i]}": y[i] for i in np.flatnonzero(off)}
+        for i, word in _settable(controller, r).items() if off.any() else ():
+            limits = _limits(controller, target)
+            faults.append(f"Set {names[i]} to {word}, not {r[i]:.10g}, {limits}.")
     return Finding("set-points", not faults, numbers, " ".join(faults))
+
+
+def _off(controller: Controller, y: Array, r: Array) -> Array:
+    """Return the mask of outputs with a weight that are off their set-points."""
+    design = controller.mpc.design
+    return (np.diag(design.Q) > 0) & (np.abs(y - r) > OFFSET * half_range(design.y_bounds))
+
+
+def _settable(controller: Controller, r: Array) -> dict[int, str]:
+    """Return those entries of r that change for it to be in reach, as they may be typed.
+
+    They are rounded to either side of the steady outputs, with four digits or as few more as do.
+    """
+    design, known = controller.mpc.design, held_known(controller)
+    y = controller.mpc.target(r, controller.w, known).y.numpy()
+    wanted = np.where(_off(controller, y, r), np.clip(y, *design.y_bounds), r)
+    for _ in range(SETTLES):
+        y = controller.mpc.target(wanted, controller.w, known).y.numpy()
+        if not (off := _off(controller, y, wanted)).any():
+            break
+        wanted = np.where(off, y, wanted)
+    changed = np.flatnonzero(_off(controller, wanted, r))
+    sides = (np.floor, np.ceil) if len(changed) <= ROUNDED else (np.round,)
+    size = np.maximum(np.abs(wanted), OFFSET * half_range(design.y_bounds))
+    for digits in range(4, 13):
+        unit = 10.0 ** (np.floor(np.log10(size)) + 1 - digits)
+        tries = [
+            {
+                int(i): f"{rounded(wanted[i] / unit[i]) * unit[i] + 0.0:.{digits}g}"
+                for i, rounded in zip(changed, side, strict=True)
+            }
+            for side in product(sides, repeat=len(changed))
+        ]
+        values = np.tile(r, (len(tries), 1))
+        values[:, changed] = [[float(word) for word in tried.values()] for tried in tries]
+        distance = (np.abs(values - wanted) / unit).sum(-1)
+        y = controller.mpc.target(values, controller.w, known).y.numpy()
+        distance[_off(controller, y, values).any(-1)] = np.inf
+        if np.isfinite(distance).any():
+            return tries[int(distance.argmin())]
+    return {int(i): f"{wanted[i]:.10g}" for i in changed}
+
+
+def _limits(controller: Controller, target: Target) -> str:
+    """Return what a user can do about the bounds that a target is at."""
+    design, named = controller.mpc.design, []
+    for kind, names, bounds, x in (
+        ("y_bounds", design.plant.outputs, design.y_bounds, target.y.numpy()),
+        ("u_bounds", design.plant.inputs, design.u_bounds, target.u.numpy()),
+    ):
+        near = OFFSET * half_range(bounds)
+        at = np.flatnonzero((x <= bounds[0] + near) | (x >= bounds[1] - near))
+        if len(at):
+            named.append(f"{kind} of {' and '.join(names[i] for i in at)}")
+    if not named:
+        return "as no inputs hold these set-points together"
+    return f"or widen {' or '.join(named)}"
 
 
 def _reach(controller: Controller) -> tuple[Array, Array]:

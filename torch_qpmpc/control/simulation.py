@@ -14,11 +14,8 @@ from torch_qpmpc.analysis.episode import episode_figure
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import Design, read_vector
-from torch_qpmpc.control.state_space import Array, StateSpace, read_model
+from torch_qpmpc.control.state_space import FAINT, Array, StateSpace, read_model
 from torch_qpmpc.errors import QPError
-
-#: Weight of the last reset's outputs beside an input that is passed: it decides for integrators.
-FAINT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +150,7 @@ def simulate(
 class _Model:
     """A model with Gymnasium's ``reset`` and ``step``, which starts at rest with the input u.
 
-    With outputs y it starts as near to that, and to y with a weight, as least squares allow: the
-    input alone does not determine the outputs of a plant that integrates, or nearly so.
+    With outputs y it starts as near to them, with a weight, as `StateSpace.at_rest` says.
     """
 
     def __init__(
@@ -175,18 +171,9 @@ class _Model:
         if self._d.shape[1] != len(model.known):
             got, want = f"{len(model.known)} known signals", f"none, or {d.shape[1]}"
             raise QPError.expected("plant", got, want)
-        still = np.eye(len(model.A)) - model.A
-        matrix, wanted = still, self._driven(u, 0)
-        if y is not None:
-            matrix = np.vstack((still, weight * model.C))
-            wanted = np.concatenate((wanted, weight * y))
-        rest = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
+        rest = model.at_rest(u, self._d[0], y, weight)
         states = [f"x{i + 1}" for i in range(len(model.A))]
         self._start = rest if x is None else read_vector("x", x, states, 0.0)
-
-    def _driven(self, u: Array, k: int) -> Array:
-        model = self._model
-        return model.B @ u + model.E @ self._d[k] + model.offset
 
     def reset(self, *, seed: int) -> tuple[Array, dict]:
         del seed
@@ -194,6 +181,8 @@ class _Model:
         return self._model.C @ self._x, {}
 
     def step(self, u: Array) -> tuple[Array, dict]:
-        self._x = self._model.A @ self._x + self._driven(u, self._k)
+        model = self._model
+        driven = model.B @ u + model.E @ self._d[self._k] + model.offset
+        self._x = model.A @ self._x + driven
         self._k += 1
         return self._model.C @ self._x, {}

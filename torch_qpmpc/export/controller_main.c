@@ -5,6 +5,10 @@
 #include <stdio.h>
 #include "policy.h"
 
+#if @OTHER@
+#error "main.c was written for another controller: delete it and export again"
+#endif
+
 typedef policy_real real;
 
 /* @PLANT@ */
