@@ -92,7 +92,7 @@ class Followed(Lag):
 def test_set_points_are_held_in_all_starts_and_said(monkeypatch, given, held):
     make = lambda **kwargs: Followed(**kwargs)  # noqa: E731 (an entry point)
     monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
-    cfg = make_config(*DATA, f"task.held={given}")
+    cfg = make_config(*DATA, "start.transitions=800", f"task.held={given}")
     physics = make_physics(cfg)
     named = starts(cfg, physics, collect_log(cfg, physics))
     assert {start.identified.options.held for start in named.values()} == {held}
