@@ -182,7 +182,7 @@ def test_the_folder_s_program_starts_where_the_plant_can_rest(tmp_path):
     controller = qm.Controller(qm.LinearMPC(model, 10, u_bounds=(10.0, 50.0), **lag))
     assert written(controller) == [150.0, 30.0, 150.25]
     controller.reset(y=[200.0], u=[40.0])
-    assert written(controller) == [200.0, 40.0, 200.0]
+    assert written(controller) == [200.0, 40.0, 200.25]
     controller.step([200.0], [120.0])
     assert written(controller) == [200.0, 40.0, 120.0]
     one_sided = qm.Controller(qm.LinearMPC(model, 10, u_bounds=(10.0, np.inf), **lag))

@@ -337,8 +337,8 @@ class Controller:
         ``name_step(&state, y, r, known, u)`` of ``name.c`` is `step`, with the estimates, the last
         input and the active sets of all QPs in the state. A closed loop is compared with this
         one's if a C compiler is installed. ``main.c`` and a ``Makefile`` run the closed loop with
-        the model as a plant. It starts where the last `reset` rests, with the last set-point, by
-        default that rest; without a reset it starts at rest in the middle of the bounds. Both files
+        the model as a plant. It starts where the last `reset` rests, or else in the
+        middle of the bounds, and goes to the last set-point, or to one near the start. Both files
         are written once, and yours afterwards: the report names those that were kept, and an older
         ``main.c`` does not compile with a controller of other sizes.
 

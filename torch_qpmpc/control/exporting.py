@@ -331,20 +331,20 @@ def _tables(controller: Controller) -> dict[str, Array]:
 
 
 def _main(controller: Controller, name: str, dtype: str) -> str:
-    """Return a program of the closed loop with the model and a load, from the last reset's rest.
+    """Return a program of the closed loop with the model and a load.
 
-    Without a reset it starts `at_rest`, and moves to a set-point in reach.
+    It starts from the last reset's rest, or `at_rest`, and moves to the last set-point or one near.
     """
     design = controller.mpc.design
     plant, sizes = design.plant, _sizes(controller)
     x, u, known = at_rest(controller)
     load = 0.1 * plant.B @ half_range(design.u_bounds) + plant.E @ known + plant.offset
-    r = centre(controller) + 0.25 * half_range(design.y_bounds)
-    y_rest, u_rest = controller.rest
+    middle_y, (y_rest, u_rest) = centre(controller), controller.rest
     if y_rest is not None or u_rest is not None:
         u = np.clip(np.zeros(len(u)), *design.u_bounds) if u_rest is None else u_rest
         x = plant.at_rest(u, known, y_rest)
-        r = plant.C @ x
+        middle_y = plant.C @ x
+    r = middle_y + 0.25 * half_range(design.y_bounds)
     r = np.tile(controller.mpc.target(r, known=known).y.numpy(), (sizes["SET_POINTS"], 1))
     if len(controller.r):
         r = controller.read_set_points(None, sizes["SET_POINTS"])
