@@ -138,7 +138,7 @@ def test_the_task_of_the_guide_trains(tmp_path):
     assert "done=2" in ended.stderr
     assert "deviation, none" not in ended.stderr, "a run's own bar"
     assert "closed gap" not in ended.stdout, "a run's own table"
-    summary = json.loads((tmp_path / "sweep/none-deviation-seed2/summary.json").read_text())
+    summary = json.loads((tmp_path / "sweep/none-identified-seed2/summary.json").read_text())
     assert (summary["task"], summary["seed"], summary["updates"]) == ("pole", 2, 4)
     assert summary["J_true_model"] < summary["J_start"]
 
