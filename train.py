@@ -30,7 +30,12 @@ from tqdm import tqdm
 from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.experiment.algorithms import make_learner, make_operator
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, drop_previous, save_checkpoint
-from torch_qpmpc.experiment.collection import batches, make_collector, make_run_replay
+from torch_qpmpc.experiment.collection import (
+    batches,
+    make_collector,
+    make_run_replay,
+    warm_up_batches,
+)
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.exporting import export_run
@@ -99,7 +104,7 @@ def _train(
     # The data: vectorised episodes under the current policy, which the replay stores.
     collector = make_collector(cfg, physics, gate.acting)
     stream = batches(collector)
-    rounds = -(-cfg.warmup_steps // cfg.steps_per_update)  # of the warm-up
+    warm_up = warm_up_batches(cfg)
 
     with contextlib.ExitStack() as stack:
         stack.callback(collector.shutdown)
@@ -111,7 +116,7 @@ def _train(
         if state is None:
             tally = Tally()
             report(run, gate.mpc, evaluation, 0)
-            for batch in itertools.islice(stream, rounds):
+            for batch in itertools.islice(stream, warm_up):
                 learner.observe(batch)
                 replay.extend(batch)
                 interrupt.exit_if_signalled(f"Stopped before the first update: {command}")
@@ -136,7 +141,7 @@ def _train(
                 watch.collected()
 
                 sample = replay.sample() if cfg.replay else batch.reshape(-1)
-                long_enough = (rounds + update) * cfg.steps_per_update >= cfg.task.horizon
+                long_enough = (warm_up + update) * cfg.steps_per_update >= cfg.task.horizon
                 penalised = learner.si is not None and long_enough
                 windows = replay.sample_tau() if penalised else None
                 terms, losses = learner.learn(sample, windows)

@@ -45,6 +45,11 @@ def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
     )
 
 
+def warm_up_batches(cfg: DictConfig) -> int:
+    """Return the number of batches, of ``steps_per_update`` steps each, of a run's warm-up."""
+    return -(-cfg.warmup_steps // cfg.steps_per_update)
+
+
 def batches(collector: Collector) -> Iterator[TensorDictBase]:
     """Yield batches of ``(num_envs, steps_per_update)`` transitions under the newest theta.
 

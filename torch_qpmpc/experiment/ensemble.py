@@ -15,6 +15,7 @@ from torch_qpmpc.envs import LinearSystem, Plant
 from torch_qpmpc.envs.arx_plant import ARXMember
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.collection import warm_up_batches
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.experiment.tasks.identified import Start, arx_arguments
 from torch_qpmpc.experiment.tasks.registry import plant_layout
@@ -172,8 +173,8 @@ def check_ensemble(cfg: DictConfig, physics: AnyPlant, start: Start | None) -> N
     coefficients = layout.past * layout.n + layout.n_d + 1
     needed = 2 * 2 * (coefficients + BLOCKS * layout.past)
     first = min(cfg.gate_interval or cfg.eval_interval, cfg.updates)
-    steps = -(-cfg.warmup_steps // cfg.steps_per_update) + first
-    collected = min(steps * cfg.steps_per_update * cfg.num_envs, cfg.replay_capacity)
+    batches = warm_up_batches(cfg) + first
+    collected = min(batches * cfg.steps_per_update * cfg.num_envs, cfg.replay_capacity)
     total = collected + (0 if start is None else start.log["action"].shape[:-1].numel())
     if total < needed:
         got = f"'model' with {total} transitions before the first comparison"

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch_qpmpc.analysis.episode import episode_figure, plans_along
 from torch_qpmpc.analysis.plots import COLOURS, draw_matrix
 from torch_qpmpc.envs.closed_loop import ClosedLoop, cost_text
+from torch_qpmpc.experiment.collection import warm_up_batches
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.mpc.module import QPMPC
@@ -165,7 +166,7 @@ def experience(cfg: DictConfig) -> tuple[float, float, str]:
     """
     length, unit = find_task(cfg.task).unit
     each = cfg.num_envs * cfg.steps_per_update
-    first = each * -(-cfg.warmup_steps // cfg.steps_per_update)
+    first = each * warm_up_batches(cfg)
     if cfg.start.name == "data" and cfg.start.file is None:
         first += cfg.start.transitions
     return first / length, each / length, f"{unit} of experience"
