@@ -8,19 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from tests.benchmarks.tuned_planner import differentiable_program, rollout, tune
 from torch_qpmpc.envs import House, HouseWall
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.heated_house import GAIN
 from torch_qpmpc.experiment.heating import known_model
 from torch_qpmpc.experiment.rivals.heating import KalmanMPC, Omniscient, Thermostat, house_mpc
-from torch_qpmpc.experiment.rivals.tuned_planner import (
-    START,
-    Knobs,
-    differentiable_program,
-    planner,
-    rollout,
-    tune,
-)
+from torch_qpmpc.experiment.rivals.tuned_planner import START, Knobs, planner
 
 
 def J(policy, plant, starts=4, steps=96):
