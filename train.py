@@ -163,7 +163,8 @@ def _train(
             if evaluated:
                 evaluation.evaluate(gate.policy)
                 if last:
-                    evaluation.identify(partial(transitions, identified, replay))
+                    held = () if identified is None else identified.identified.options.held
+                    evaluation.identify(partial(transitions, identified, replay), held)
                 gap = report(run, gate.mpc, evaluation, update)
                 progress.set_postfix(J=cost_text(gap["J_best"]), closed_gap=gap["closed_gap"])
             if evaluated or interrupt.signum is not None:

@@ -18,7 +18,7 @@ import train
 from tests.runs import SMALL, make_config, run_command
 from tests.stops import stop
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.choosing import _is_less, choose, chosen_before, starts
+from torch_qpmpc.experiment.choosing import NONE_HELD, _is_less, choose, chosen_before, starts
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log, learning_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
@@ -101,6 +101,22 @@ def test_set_points_are_held_in_all_starts_and_said(monkeypatch, given, held):
     said = f"Held at their last value over the horizon: y2, as by task.held={[*held]}"
     assert (said in str(start).splitlines()) == (held == (1,))
     assert "tied C, N=6, cost of (y_(k+1), u_k) in most steps" in named
+
+
+def test_the_best_start_is_compared_with_one_that_holds_no_output(monkeypatch):
+    make = lambda **kwargs: Followed(**kwargs)  # noqa: E731 (an entry point)
+    monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
+    cfg, physics, start, choice = chosen(*DATA, "start.transitions=800")
+    (name,) = (name for name in choice.rows if name.endswith(NONE_HELD))
+    pair = {key: choice.rows[key] for key in (name, name.removesuffix(NONE_HELD))}
+    assert {row.episodes for row in pair.values()} == {4}
+    assert choice.scheme == min(pair, key=lambda name: pair[name].J)
+    rows = {key: row._replace(chosen=key == name) for key, row in choice.rows.items()}
+    other = chosen_before(cfg, physics, start.log, Choice(rows))
+    assert other.identified.options.held == ()
+    cfg.task.held = [1]
+    with pytest.raises(QPError, match=f"starts.csv: got '.*{NONE_HELD}', expected one of"):
+        chosen_before(cfg, physics, start.log, Choice(rows))
 
 
 def test_the_starts_are_all_combinations_and_constant_actions():

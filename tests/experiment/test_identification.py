@@ -76,6 +76,9 @@ def test_a_cost_that_the_task_lacks_is_fitted_to_the_rewards():
     fitted = fit_rewards(log, mpc.scheme.layout).now
     assert fitted.R2 > 0.5
     assert_close(mpc.scheme.cost.stage_weight, fitted.W)
+    A, B = nominal_mpc(cfg, physics, [log], held=[2]).model()
+    assert_close(A[2], torch.eye(3).double()[2])
+    assert not B[2].any()
 
 
 def test_all_of_a_runs_transitions_are_used():

@@ -28,6 +28,8 @@ FIRST = 2
 APART = 10**6
 #: The probability with which the chosen start costs less than zero action.
 CONFIDENCE = 0.95
+#: The end of the name of a start whose model holds no output.
+NONE_HELD = ", no output held"
 
 
 def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
@@ -69,28 +71,39 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
     """Choose among the `starts` of a log by successive halving over closed loops on the plant.
 
     All have the same 2 episodes, the better half 2 more, the better half of these 4 more, and so on
-    up to ``task.start_episodes``, which zero action has, too. The best one of the last round is
-    chosen if it costs less than zero action by a one-sided paired t-test of 95 %; if not, zero
-    action is.
+    up to ``task.start_episodes``, which zero action has, too. If the log has outputs to hold, the
+    best one of the last round is compared with one that predicts them, in as many episodes. The
+    better one is chosen if it costs less than zero action by a one-sided paired t-test of 95 %; if
+    not, zero action is.
     """
     named = starts(cfg, physics, log)
     policies = {name: _policy(cfg, physics, start) for name, start in named.items()}
-    costs = {name: torch.zeros(0, dtype=torch.float64) for name in named}
+    costs = dict.fromkeys(named, torch.zeros(0, dtype=torch.float64))
     steps, left, count, last = dict.fromkeys(named, 0), [*named], FIRST, False
     with tqdm(desc="starts", leave=False, disable=quiet) as bar:
+
+        def run(name: str, count: int) -> None:
+            bar.set_postfix_str(name)
+            more = _costs(cfg, physics, policies[name](), len(costs[name]), count)
+            costs[name] = torch.cat((costs[name], more.sum(0).nan_to_num(torch.inf, torch.inf)))
+            steps[name] += more.numel()
+            bar.update()
+
         while not last:
             last = count >= cfg.task.start_episodes
             for name in left:
-                bar.set_postfix_str(name)
-                more = _costs(cfg, physics, policies[name](), len(costs[name]), count)
-                costs[name] = torch.cat((costs[name], more.sum(0).nan_to_num(torch.inf, torch.inf)))
-                steps[name] += more.numel()
-                bar.update()
+                run(name, count)
             others = [name for name in left if name != ZERO_ACTION]
             others.sort(key=lambda name: costs[name].mean().item())  # the run's own wins a tie
             left = [ZERO_ACTION, *others[: -(-len(others) // 2)]]
             count = min(2 * count, cfg.task.start_episodes)
-    best = left[1]
+        best = left[1]
+        if (other := _none_held(cfg, named[best])) is not None:
+            name = best + NONE_HELD
+            named[name], policies[name] = other, _policy(cfg, physics, other)
+            costs[name], steps[name] = torch.zeros_like(costs[best][:0]), 0
+            run(name, len(costs[best]))
+            best = min(best, name, key=lambda name: costs[name].mean().item())
     chosen = best if _is_less(costs[best] - costs[ZERO_ACTION]) else ZERO_ACTION
     rows = {}
     for name, start in named.items():
@@ -108,9 +121,25 @@ def chosen_before(cfg: DictConfig, physics: AnyPlant, log: Any, choice: Choice) 
     """
     named = starts(cfg, physics, log)
     for name in (choice.name, choice.scheme):
+        held = named.get(name.removesuffix(NONE_HELD))
+        if name not in named and held is not None:
+            other = _none_held(cfg, held)
+            named |= {} if other is None else {name: other}
         if name not in named:
             raise QPError.expected("starts.csv", f"{name!r}", f"one of {', '.join(named)}")
     return _start(named, choice)
+
+
+def _none_held(cfg: DictConfig, start: Start) -> Start | None:
+    """Return the start with a model that predicts the outputs that the log has as unmoved.
+
+    None if there are none, the run names them itself, or the start holds an action.
+    """
+    options = start.identified.options
+    if start.held is not None or not options.held or cfg.task.get("held") is not None:
+        return None
+    model = identified_model(cfg, start.log, options.layout, options.structure, [])
+    return start._replace(identified=model)
 
 
 def _start(named: dict[str, Start], choice: Choice) -> Start:

@@ -79,10 +79,13 @@ class Evaluation:
         """Evaluate what has been learned so far."""
         self.loops[name] = evaluate(self.cfg, policy, self.physics)
 
-    def identify(self, data: Callable[[], Sequence[TensorDictBase]]) -> None:
+    def identify(
+        self, data: Callable[[], Sequence[TensorDictBase]], held: Sequence[int] = ()
+    ) -> None:
         """Evaluate the rival `IDENTIFICATION`, if ``cfg.rivals`` chooses it and there is a plant.
 
-        ``data`` returns the logged steps. J is nan if they identify no model.
+        ``data`` returns the logged steps, of which the model holds the outputs ``held``. J is nan
+        if they identify no model.
         """
         chosen = self.cfg.rivals
         if not (chosen if isinstance(chosen, bool) else IDENTIFICATION in chosen):
@@ -90,7 +93,7 @@ class Evaluation:
         if find_task(self.cfg.task).log is not None:
             return
         try:
-            policy = warm_policy(nominal_mpc(self.cfg, self.physics, data()))
+            policy = warm_policy(nominal_mpc(self.cfg, self.physics, data(), held))
         except QPError:
             self.rivals[IDENTIFICATION] = math.nan
         else:

@@ -178,7 +178,9 @@ def observed_cost(
     return replace(cost, terminal_weight=None, q=q)
 
 
-def nominal_mpc(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBase]) -> QPMPC:
+def nominal_mpc(
+    cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBase], held: Sequence[int] = ()
+) -> QPMPC:
     """Make MPC with a model of logged steps and the plant's own cost and bounds, without learning.
 
     There is no discount. A task without a stage cost has the one fitted to the rewards. Each soft
@@ -189,6 +191,7 @@ def nominal_mpc(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBas
         cfg: the run's configuration.
         physics: the plant.
         data: logs, each as in `identify`.
+        held: the outputs that the model holds.
 
     Raises:
         QPError: the steps identify no model.
@@ -196,7 +199,7 @@ def nominal_mpc(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBas
     task = find_task(cfg.task)
     scheme = (task.nominal_scheme or task.true_scheme or task.wrong_scheme)(cfg, physics)
     layout, cost = scheme.layout, scheme.cost
-    identified = _model(data, layout, "tied")
+    identified = _model(data, layout, "tied", held=held)
     if cost.stage_weight is None:
         fitted = fit_rewards(data, layout, cfg.task.hessian == "diagonal").now
         cost = scheme_cost(fitted, layout, 1.0, cfg.task.hessian)
