@@ -45,10 +45,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: qm.QPActorValueOperator(torch.nn.Linear(2, 1)),
         "mpc: got Linear, expected a QPMPC.",
     ),
-    "QPActorValueOperator: operator": (
-        lambda: qm.QPActorValueOperator(op),
-        "mpc: got QPActorValueOperator, expected a QPMPC.",
-    ),
     "QPActorValueOperator: missing action": (
         lambda: op(TensorDict(observation=S, batch_size=4)),
         "action: got a TensorDict with observation, expected one with action. Rename the module",
@@ -60,14 +56,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "QPPolicyOperator: missing obs": (
         lambda: op.get_policy_operator()(TensorDict(state=S, batch_size=4)),
         "observation: got a TensorDict with state, expected one with observation. Rename the mod",
-    ),
-    "QPActorValueOperator: tensor": (
-        lambda: op(S),
-        "action: got a TensorDict with observation, expected one with action. Rename the module",
-    ),
-    "QPActorValueOperator: int action": (
-        lambda: op(TensorDict(observation=S, action=Aa.long(), batch_size=4)),
-        "a: got torch.int64, expected a floating-point torch.Tensor. Convert it: tor",
     ),
     "QPActorValueOperator: squeezed action": (
         lambda: op(TensorDict(observation=S, action=Aa.squeeze(-1), batch_size=4)),
@@ -103,28 +91,12 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: qm.QPQLearningLoss(op, reduction=["mean"]),
         "reduction: got ['mean'], expected 'mean', 'sum' or 'none'.",
     ),
-    "QPQLearningLoss: None": (
-        lambda: qm.QPQLearningLoss(None),
-        "value_network: got NoneType, expected a QPActorValueOperator. Wrap the QPMP",
-    ),
     "QPQLearningLoss: gamma 2": (
         lambda: qm.QPQLearningLoss(op).make_value_estimator(gamma=2.0),
         "gamma: got 2.0, expected a number in [0, 1].",
     ),
-    "QPQLearningLoss: gamma nan": (
-        lambda: qm.QPQLearningLoss(op).make_value_estimator(gamma=math.nan),
-        "gamma: got nan, expected a number in [0, 1].",
-    ),
-    "QPQLearningLoss: gamma str": (
-        lambda: qm.QPQLearningLoss(op).make_value_estimator(gamma="a"),
-        "gamma: got 'a', expected a number in [0, 1].",
-    ),
     "QPQLearningLoss: no reward": (
         lambda: make_loss()(batch_without(("next", "reward"))),
-        "('next', 'reward'): got no such entry, expected one of shape (3, 1). Name a",
-    ),
-    "QPQLearningLoss: no next": (
-        lambda: make_loss()(batch_without("next")),
         "('next', 'reward'): got no such entry, expected one of shape (3, 1). Name a",
     ),
     "QPQLearningLoss: no action": (
@@ -143,10 +115,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "QPQLearningLoss: flat reward": (
         lambda: make_loss()(batch_with(("next", "reward"), torch.zeros(3).double())),
         "('next', 'reward'): got shape (3,), expected shape (3, 1). TorchRL's rewa",
-    ),
-    "QPQLearningLoss: reward 2": (
-        lambda: make_loss()(batch_with(("next", "reward"), torch.zeros(3, 2).double())),
-        "('next', 'reward'): got shape (3, 2), expected shape (3, 1). TorchRL's rew",
     ),
     "QPQLearningLoss: term float": (
         lambda: make_loss()(batch_with(("next", "terminated"), torch.zeros(3, 1))),
@@ -168,14 +136,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: make_loss()(batch_with("action", torch.zeros(3, 1).long())),
         "a: got torch.int64, expected a floating-point torch.Tensor. Convert it: tor",
     ),
-    "QPQLearningLoss: tensor": (
-        lambda: make_loss()(S),
-        "('next', 'reward'): got no such entry, expected one of shape (4, 2, 1). Nam",
-    ),
-    "QPQLearningLoss: dict": (
-        lambda: make_loss()({"observation": S}),
-        "('next', 'reward'): got no such entry, expected one of shape (4, 2, 1). Nam",
-    ),
     "QPQLearningLoss: empty": (
         lambda: make_loss()(make_batch(3)[:0]),
         "tensordict: got an empty batch, expected at least one transition.",
@@ -183,10 +143,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "GaussNewton: operator": (
         lambda: qm.GaussNewton(op),
         "mpc: got QPActorValueOperator, expected a QPMPC. Pass the QPMPC itself: its",
-    ),
-    "GaussNewton: params": (
-        lambda: qm.GaussNewton(mpc.parameters()),
-        "mpc: got generator, expected a QPMPC. Pass the QPMPC itself: its learned pa",
     ),
     "GaussNewton: scales list": (
         G(scales=[1.0]),
@@ -200,10 +156,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         G(scales={"cost": 0.0, "constraints": 0.0}),
         "scales[H]: got 0.0, expected a finite number > 0.",
     ),
-    "GaussNewton: lr str": (
-        G(lr="1"),
-        "lr: got '1', expected a number in (0, 1].",
-    ),
     "GaussNewton: lr 2": (
         G(lr=2),
         "lr: got 2, expected a number in (0, 1].",
@@ -216,37 +168,13 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         G(memory=1.5),
         "memory: got 1.5, expected a whole number >= 0.",
     ),
-    "GaussNewton: memory": (
-        G(memory="a"),
-        "memory: got 'a', expected a whole number >= 0.",
-    ),
     "GaussNewton: trust": (
         G(trust_region="no"),
         "trust_region: got 'no', expected True or False.",
     ),
-    "GaussNewton: target shape": (
-        lambda: gn.step(S, Aa, torch.zeros(4, 1)),
-        "target: got shape (4, 1), expected shape (4,). Squeeze its last dimension.",
-    ),
-    "GaussNewton: target short": (
-        lambda: gn.step(S, Aa, torch.zeros(3)),
-        "target: got shape (3,), expected shape (4,). Squeeze its last dimension.",
-    ),
     "GaussNewton: target scalar": (
         lambda: gn.step(S, Aa, torch.tensor(0.0)),
         "target: got shape (), expected shape (4,). Squeeze its last dimension.",
-    ),
-    "GaussNewton: target list": (
-        lambda: gn.step(S, Aa, [0.0] * 4),
-        "target: got list, expected a floating-point torch.Tensor. Convert it: torch",
-    ),
-    "GaussNewton: target int": (
-        lambda: gn.step(S, Aa, torch.zeros(4).long()).accepted,
-        "target: got torch.int64, expected a floating-point torch.Tensor. Convert it",
-    ),
-    "GaussNewton: unbatched": (
-        lambda: gn.step(S[0], Aa[0], torch.tensor(0.0)),
-        "s: got shape (2,), expected shape (B, 2).",
     ),
     "GaussNewton: weighted": (
         lambda: qm.GaussNewton(mpc, weighted="yes"),
@@ -255,14 +183,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "GaussNewton: penalty": (
         lambda: qm.GaussNewton(free).step(S, Aa, torch.zeros(4), penalty=torch.eye(3)),
         "penalty: got shape (3, 3), expected shape (12, 12). Pass SystemIdentificati",
-    ),
-    "GaussNewton: penalty type": (
-        lambda: qm.GaussNewton(free).step(S, Aa, torch.zeros(4), penalty=1.0),
-        "penalty: got float, expected a floating-point torch.Tensor. Convert it: tor",
-    ),
-    "GaussNewton: penalty loss": (
-        lambda: qm.GaussNewton(free).step(S, Aa, torch.zeros(4), penalty=torch.tensor(1.0)),
-        "penalty: got shape (), expected shape (12, 12). Pass SystemIdentificationPe",
     ),
     "GaussNewton: warm": (
         lambda: gn.step(S, Aa, torch.zeros(4), warm_start=torch.zeros(2, 3)),
@@ -281,45 +201,17 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: gn.step(S[:0], Aa[:0], torch.zeros(0)).accepted,
         "s: got an empty batch, expected at least one pair.",
     ),
-    "DeviationPenalty: C0 list": (
-        lambda: qm.DeviationPenalty([[1.0]], 2, 1),
-        "C_0: got list, expected a floating-point torch.Tensor. Convert it: torch.as",
-    ),
-    "DeviationPenalty: C0 mpc": (
-        lambda: qm.DeviationPenalty(mpc, 2, 1),
-        "C_0: got QPMPC, expected a floating-point torch.Tensor. Convert",
-    ),
     "DeviationPenalty: n_x 0": (
         lambda: qm.DeviationPenalty(mpc.C_0, 0, 1),
         "n_x: got 0, expected a whole number >= 1.",
-    ),
-    "DeviationPenalty: n_x float": (
-        lambda: qm.DeviationPenalty(mpc.C_0, 2.0, 1),
-        "n_x: got 2.0, expected a whole number >= 1.",
     ),
     "DeviationPenalty: c str": (
         lambda: qm.DeviationPenalty(mpc.C_0, 2, 1, c_1="1"),
         "c_1: got '1', expected a finite weight >= 0.",
     ),
-    "DeviationPenalty: c None": (
-        lambda: qm.DeviationPenalty(mpc.C_0, 2, 1, c_1=None),
-        "c_1: got None, expected a finite weight >= 0.",
-    ),
-    "DeviationPenalty: C transposed": (
-        lambda: qm.DeviationPenalty(mpc.C_0, 2, 1)(mpc.C.mT),
-        "C: got shape (11, 6), expected shape (6, 11). Pass mpc.C.",
-    ),
     "DeviationPenalty: C row": (
         lambda: qm.DeviationPenalty(mpc.C_0, 2, 1)(mpc.C[0]),
         "C: got shape (11,), expected shape (6, 11). Pass mpc.C.",
-    ),
-    "DeviationPenalty: C scalar": (
-        lambda: qm.DeviationPenalty(mpc.C_0, 2, 1)(torch.tensor(1.0)),
-        "C: got shape (), expected shape (6, 11). Pass mpc.C.",
-    ),
-    "DeviationPenalty: C mpc": (
-        lambda: qm.DeviationPenalty(mpc.C_0, 2, 1)(mpc),
-        "C: got QPMPC, expected a floating-point torch.Tensor. Convert i",
     ),
     "DeviationPenalty: swapped": (
         lambda: qm.DeviationPenalty(mpc.C_0, 1, 2),
@@ -328,10 +220,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "DeviationPenalty: 1d": (
         lambda: qm.DeviationPenalty(mpc.C_0[0], 2, 1),
         "C_0: got shape (11,), expected shape (N n_x, n_z). Pass the C_0 of a QPMPC.",
-    ),
-    "DeviationPenalty: int": (
-        lambda: qm.DeviationPenalty(mpc.C_0.long(), 2, 1),
-        "C_0: got torch.int64, expected a floating-point torch.Tensor. Convert it: t",
     ),
     "DeviationPenalty: nan": (
         lambda: qm.DeviationPenalty(mpc.C_0 * math.nan, 2, 1),
@@ -351,25 +239,9 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         ),
         "C: got a computed tensor, expected a parameter. If only some entries of C",
     ),
-    "DeviationPenalty: prox list": (
-        lambda: qm.DeviationPenalty(mpc.C_0, 2, 1).proximal_step_([1.0]),
-        "C: got list, expected a floating-point torch.Tensor. Convert it: torch.as_t",
-    ),
     "SystemIdentificationPenalty: beta str": (
         lambda: qm.SystemIdentificationPenalty("1"),
         "beta: got '1', expected a finite weight >= 0.",
-    ),
-    "SystemIdentificationPenalty: beta None": (
-        lambda: qm.SystemIdentificationPenalty(None),
-        "beta: got None, expected a finite weight >= 0.",
-    ),
-    "SystemIdentificationPenalty: windows list": (
-        lambda: qm.SystemIdentificationPenalty()(mpc.C, [[1.0]]),
-        "windows: got list, expected a floating-point torch.Tensor. Convert it: torc",
-    ),
-    "SystemIdentificationPenalty: windows td": (
-        lambda: qm.SystemIdentificationPenalty()(mpc.C, make_batch(3)),
-        "windows: got TensorDict, expected a floating-point torch.Tensor. Convert it",
     ),
     "SystemIdentificationPenalty: swapped": (
         lambda: qm.SystemIdentificationPenalty()(torch.zeros(5, 11), mpc.C.mT),
@@ -379,29 +251,9 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: qm.SystemIdentificationPenalty()(mpc, torch.zeros(1, 11)),
         "C: got QPMPC, expected a floating-point torch.Tensor. Convert i",
     ),
-    "SystemIdentificationPenalty: curv shape": (
-        lambda: qm.SystemIdentificationPenalty().curvature(torch.zeros(11)),
-        "windows: got shape (11,), expected shape (M, n_z). Sample N consecutive tra",
-    ),
     "SystemIdentificationPenalty: curv 3d": (
         lambda: qm.SystemIdentificationPenalty().curvature(torch.zeros(2, 3, 11)).shape,
         "windows: got shape (2, 3, 11), expected shape (M, n_z). Sample N consecutiv",
-    ),
-    "SystemIdentificationPenalty: curv list": (
-        lambda: qm.SystemIdentificationPenalty().curvature([1.0]),
-        "windows: got list, expected a floating-point torch.Tensor. Convert it: torc",
-    ),
-    "SystemIdentificationPenalty: int windows": (
-        lambda: qm.SystemIdentificationPenalty()(mpc.C, torch.zeros(2, 11).long()),
-        "windows: got torch.int64, expected a floating-point torch.Tensor. Convert i",
-    ),
-    "make_replay: capacity f": (
-        lambda: make_replay(64.0, 2, 4, 3, 2),
-        "capacity: got 64.0, expected a whole number >= 0.",
-    ),
-    "make_replay: num_envs 0": (
-        lambda: make_replay(64, 0, 4, 3, 2),
-        "num_envs: got 0, expected a whole number >= 1.",
     ),
     "make_replay: batch 0": (
         lambda: make_replay(64, 2, 0, 3, 2),
@@ -431,14 +283,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: make_replay(64, 2, 4, 3, 2, active_rows=-1),
         "active_rows: got -1, expected a whole number >= 0.",
     ),
-    "make_replay: active f": (
-        lambda: make_replay(64, 2, 4, 3, 2, active_rows=1.5),
-        "active_rows: got 1.5, expected a whole number >= 0.",
-    ),
-    "make_replay: num_windows str": (
-        lambda: make_replay(64, 2, 4, 3, "2"),
-        "num_windows: got '2', expected a whole number >= 1.",
-    ),
     "make_replay: sample empty": (
         lambda: make_replay(64, 2, 4, 3, 2).sample(),
         "replay: got nothing stored, expected transitions. Call extend() first.",
@@ -447,19 +291,9 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: make_replay(64, 2, 4, 3, 2).sample_tau(),
         "replay: got no window in 0 transitions, expected 3 consecutive transitions.",
     ),
-    "make_replay: extend tensor": (
-        lambda: make_replay(64, 2, 4, 3, 2).extend(S),
-        "batch: got Tensor, expected a TensorDictBase. Pass the collector's batch as",
-    ),
     "make_replay: extend list": (
         lambda: make_replay(64, 2, 4, 3, 2).extend([1]),
         "batch: got list, expected a TensorDictBase. Pass the collector's batch as i",
-    ),
-    "make_replay: extend envs": (
-        lambda: (lambda r: (r.extend(make_batch(2, 3)), r.extend(make_batch(3, 2))))(
-            make_replay(64, 2, 4, 3, 2)
-        ),
-        "batch: got shape (3, 2), expected (num_envs, T) with num_envs = 2. Transpose it",
     ),
     "make_replay: extend envs first": (
         lambda: (lambda r: (r.extend(make_batch(3, 2)), r.sample()))(make_replay(64, 2, 4, 3, 2)),
@@ -475,18 +309,8 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         )(make_replay(64, 2, 4, 3, 2, active_rows=3)),
         "sample: got no entry active_set, expected one. Pass what sample() returned,",
     ),
-    "make_replay: remember3": (
-        lambda: (lambda r: (r.extend(make_batch(2, 8)), r.remember(make_batch(3))))(
-            make_replay(64, 2, 4, 3, 2, active_rows=3)
-        ),
-        "sample: got no entry index, expected one. Pass what sample() returned, afte",
-    ),
     "make_replay: load": (
         lambda: make_replay(64, 2, 4, 3, 2).load_state_dict({}),
-        "state: got no generator, storage, writer, expected what state_dict() return",
-    ),
-    "make_replay: load wrong": (
-        lambda: make_replay(64, 2, 4, 3, 2).load_state_dict([1]),
         "state: got no generator, storage, writer, expected what state_dict() return",
     ),
     "windows_to_tau: tensor": (

@@ -28,10 +28,6 @@ from torch_qpmpc.experiment.run_state import resumed
 from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
 
 MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
-    "closed_loop: plant": (
-        lambda: closed_loop(mpc.policy, mpc),
-        "physics: got QPMPC, expected a LinearSystem. Use gymnasium_loop",
-    ),
     "closed_loop: policy mpc": (
         lambda: closed_loop(mpc, pm),
         "s: got shape (32, 4), expected shape (*batch, 2).",
@@ -40,17 +36,9 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: closed_loop(op.get_policy_operator(), pm),
         "s: got shape (32, 4), expected shape (*batch, 2).",
     ),
-    "closed_loop: policy none": (
-        lambda: closed_loop(None, pm),
-        "policy: got NoneType, expected a function. Pass a function of states, such ",
-    ),
     "closed_loop: steps 0": (
         lambda: closed_loop(lambda s: s[:, :2], pm, steps=0),
         "steps: got 0, expected a whole number >= 1.",
-    ),
-    "closed_loop: steps f": (
-        lambda: closed_loop(lambda s: s[:, :2], pm, steps=1.5),
-        "steps: got 1.5, expected a whole number >= 1.",
     ),
     "closed_loop: starts 0": (
         lambda: closed_loop(lambda s: s[:, :2], pm, starts=0).J,
@@ -72,21 +60,9 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: closed_loop(lambda s: s[:, :2].numpy(), pm),
         "policy(s): got ndarray, expected a floating-point torch.Tensor. Convert it:",
     ),
-    "closed_loop: tuple": (
-        lambda: closed_loop(lambda s: (s[:, :2],), pm),
-        "policy(s): got tuple, expected a floating-point torch.Tensor. Convert it: t",
-    ),
     "closed_loop: gymplant": (
         lambda: closed_loop(lambda s: s, GymnasiumPlant("Pendulum-v1")),
         "physics: got GymnasiumPlant, expected a LinearSystem. Use gymnasium_loop",
-    ),
-    "gymnasium_loop: linear": (
-        lambda: gymnasium_loop(lambda s: s[:, :1], pm),
-        "plant: got PointMass, expected a GymnasiumPlant. Use closed_loop for a Line",
-    ),
-    "gymnasium_loop: shape": (
-        lambda: gymnasium_loop(lambda s: s[:, 0], GymnasiumPlant("Pendulum-v1"), steps=2, starts=2),
-        "policy(s): got shape (2,), expected shape (2, 1). Map a batch of states to ",
     ),
     "gymnasium_loop: id": (
         lambda: gymnasium_loop(lambda s: s[:, :1], "Pendulum-v1"),
@@ -95,10 +71,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "gymnasium_loop: steps": (
         lambda: gymnasium_loop(lambda s: s[:, :1], GymnasiumPlant("Pendulum-v1"), steps=0),
         "steps: got 0, expected a whole number >= 1.",
-    ),
-    "gymnasium_loop: shape2": (
-        lambda: gymnasium_loop(lambda s: s, GymnasiumPlant("Pendulum-v1"), steps=2, starts=2),
-        "policy(s): got shape (2, 3), expected shape (2, 1). Map a batch of states t",
     ),
     "gymnasium_loop: grad": (
         lambda: (
@@ -116,10 +88,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: closed_gap("1", 1, 1),
         "J_start: got '1', expected a number, or nan.",
     ),
-    "closed_gap: none": (
-        lambda: closed_gap(None, 1, 1),
-        "J_start: got None, expected a number, or nan.",
-    ),
     "interquartile_mean: empty": (
         lambda: interquartile_mean(np.array([])),
         "x: got no values, expected at least one along axis 0.",
@@ -131,10 +99,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "interquartile_mean: str": (
         lambda: interquartile_mean(["a"]),
         "x: got could not convert string to float: 'a', expected numbers along axis ",
-    ),
-    "interquartile_mean: scalar": (
-        lambda: interquartile_mean(1.0),
-        "x: got source: axis 0 is out of bounds for array of dimension 0, expected n",
     ),
     "bootstrap_interval: array": (
         lambda: bootstrap_interval(np.ones(3)),
@@ -156,17 +120,9 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: bootstrap_interval([np.ones(3)], "median"),
         "statistic: got 'median', expected a function, such as numpy.median.",
     ),
-    "bootstrap_interval: 2d array": (
-        lambda: bootstrap_interval(np.ones((2, 3))),
-        "strata: got ndarray, expected a list of arrays. Pass [x] for a single strat",
-    ),
     "bootstrap_interval: shapes": (
         lambda: bootstrap_interval([np.ones((3, 2)), np.ones((3, 3))]),
         "strata: got shapes [(3, 2), (3, 3)], expected (n_i, ...) with ... the same ",
-    ),
-    "bootstrap_interval: resamples f": (
-        lambda: bootstrap_interval([np.ones(3)], resamples=1.5),
-        "resamples: got 1.5, expected a whole number >= 1.",
     ),
     "bootstrap_interval: seed": (
         lambda: bootstrap_interval([np.ones(3)], seed=-1),
@@ -179,10 +135,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "PointMassEnv: num f": (
         lambda: PointMassEnv(1.5),
         "num_envs: got 1.5, expected a whole number >= 1.",
-    ),
-    "PointMassEnv: num str": (
-        lambda: PointMassEnv("2"),
-        "num_envs: got '2', expected a whole number >= 1.",
     ),
     "PointMassEnv: num bool": (
         lambda: PointMassEnv(True),
@@ -199,10 +151,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "PointMassEnv: dtype": (
         lambda: PointMassEnv(2, dtype=torch.int64),
         "dtype: got torch.int64, expected a floating-point torch.dtype.",
-    ),
-    "PointMassEnv: seed": (
-        lambda: PointMassEnv(2, seed="a"),
-        "seed: got 'a', expected a whole number >= 0 and < 2^63.",
     ),
     "PointMassEnv: physics str": (
         lambda: PointMassEnv(2, physics="gaussian"),
@@ -252,21 +200,9 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: PointMass(lb_a=torch.ones(2) * 2),
         "lb_a: got torch.float32, expected torch.float64. Use torch.tensor(.., dtype",
     ),
-    "PointMass: W": (
-        lambda: PointMass(W=torch.eye(3)),
-        "W: got torch.float32, expected torch.float64. Use torch.tensor(.., dtype=to",
-    ),
-    "PointMass: A float32": (
-        lambda: PointMass(A=torch.eye(4)),
-        "A: got torch.float32, expected torch.float64. Use torch.tensor(.., dtype=to",
-    ),
     "PointMass: A nan": (
         lambda: PointMass(A=torch.eye(4).double() * math.nan),
         "A: got NaN or inf, expected finite entries.",
-    ),
-    "PointMass: start str": (
-        lambda: PointMass(start_position="a"),
-        "start_position: got 'a', expected a finite number >= 0.",
     ),
     "PointMass: lb shape": (
         lambda: PointMass(lb_s=torch.tensor(-2.0).double()),
@@ -276,25 +212,13 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: pm.step(torch.zeros(3), torch.zeros(2), torch.zeros(4)),
         "s: got shape (3,), expected shape (*batch, 4).",
     ),
-    "PointMass: step swapped": (
-        lambda: pm.step(torch.zeros(2), torch.zeros(4), torch.zeros(4)),
-        "s: got shape (2,), expected shape (*batch, 4).",
-    ),
     "PointMass: cost shape": (
         lambda: pm.cost(torch.zeros(5, 3), torch.zeros(5, 2)),
         "s: got shape (5, 3), expected shape (*batch, 4).",
     ),
-    "PointMass: cost list": (
-        lambda: pm.cost([0.0], [0.0]),
-        "s: got list, expected a floating-point torch.Tensor. Convert it: torch.as_t",
-    ),
     "PointMass: applied": (
         lambda: pm.applied(torch.zeros(5, 1)).shape,
         "a: got shape (5, 1), expected shape (*batch, 2).",
-    ),
-    "PointMass: applied scalar": (
-        lambda: pm.applied(torch.tensor(0.0)).shape,
-        "a: got shape (), expected shape (*batch, 2).",
     ),
     "PointMass: starts seed": (
         lambda: pm.starts(1, 3),
@@ -312,33 +236,13 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: pm.corrupted(-1),
         "seed: got -1, expected a whole number >= 0 and < 2^63.",
     ),
-    "PointMass: corrupted str": (
-        lambda: pm.corrupted("a"),
-        "seed: got 'a', expected a whole number >= 0 and < 2^63.",
-    ),
-    "PointMass: corrupted None": (
-        lambda: pm.corrupted(None),
-        "seed: got None, expected a whole number >= 0 and < 2^63.",
-    ),
     "PointMass: nu 1d": (
         lambda: pm.step(torch.zeros(5, 4), torch.zeros(5, 2), torch.zeros(5, 1)).shape,
         "nu: got shape (5, 1), expected shape (*batch, 4).",
     ),
-    "PointMass: a transposed": (
-        lambda: pm.step(torch.zeros(5, 4), torch.zeros(2, 5), torch.zeros(5, 4)),
-        "a: got shape (2, 5), expected shape (*batch, 2).",
-    ),
     "PointMass: a scalar col": (
         lambda: pm.step(torch.zeros(5, 4), torch.zeros(5, 1), torch.zeros(5, 4)).shape,
         "a: got shape (5, 1), expected shape (*batch, 2).",
-    ),
-    "PointMassGymEnv: action shape": (
-        lambda: (lambda e: (e.reset(seed=0), e.step(np.zeros(3))))(PointMassGymEnv()),
-        "action: got array([0., 0., 0.]), expected finite numbers of shape (2,). Pass one",
-    ),
-    "PointMassGymEnv: action scalar": (
-        lambda: (lambda e: (e.reset(seed=0), e.step(0.0)))(PointMassGymEnv()),
-        "action: got 0.0, expected finite numbers of shape (2,). Pass one action, not",
     ),
     "PointMassGymEnv: before reset": (
         lambda: PointMassGymEnv().step(np.zeros(2)),
