@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -60,6 +61,14 @@ def quick_exports() -> Iterator[None]:
             patch.setattr(module, "FLAGS", ("-std=c99", "-O0", "-fPIC", "-shared"))
         for module in (exporting, export):
             patch.setattr(module, "COMPARED", 60)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_waiting_for_disks() -> Iterator[None]:
+    """Let writes return before the disk has them: no test cuts the power."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
         yield
 
 
