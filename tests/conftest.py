@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -16,6 +17,9 @@ from torch_qpmpc.control import exporting
 from torch_qpmpc.export import export, library
 from torch_qpmpc.qp.solvers import BACKENDS
 
+#: What imports and the collection of tests make stays: no garbage is looked for among it.
+gc.disable()
+
 COMPILING = pytest.StashKey[subprocess.Popen[bytes]]()
 
 
@@ -29,6 +33,12 @@ def pytest_configure(config: pytest.Config) -> None:
         if config.option.markexpr != "slow":  # these run after the others, which compile them
             command = [sys.executable, "-m", "tests.kernels"]
             config.stash[COMPILING] = subprocess.Popen(command, cwd=config.rootpath)
+
+
+def pytest_collection_finish() -> None:
+    """Leave all that exists before the first test out of the collections of garbage."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)
