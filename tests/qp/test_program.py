@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import doctest
-import importlib
 from dataclasses import FrozenInstanceError, replace
 from typing import Any
 
@@ -141,16 +139,6 @@ def test_a_program_cannot_be_changed():
 @pytest.mark.parametrize("status", Status)
 def test_every_status_explains_itself(status):
     assert len(status.explanation) > 20
-
-
-DOCUMENTED = "errors qp.pipeline.solve qp.program qp.solution qp.solve mpc.module mpc.projections"
-
-
-@pytest.mark.parametrize("module", DOCUMENTED.split())
-def test_the_examples_in_the_docstrings_run(module):
-    results = doctest.testmod(importlib.import_module(f"torch_qpmpc.{module}"))
-    assert results.attempted > 0
-    assert results.failed == 0
 
 
 def test_a_program_is_shown_by_its_sizes():
