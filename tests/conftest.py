@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 import train
 from tests.runs import SMALL, make_config
@@ -79,6 +80,15 @@ def no_waiting_for_disks() -> Iterator[None]:
     """Let writes return before the disk has them: no test cuts the power."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_figures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Draw the figures of runs without their layout, most of the time; tests of figures keep it."""
+    with pytest.MonkeyPatch.context() as patch:
+        if Path(request.module.__file__).stem not in ("test_plots", "test_episode", "test_window"):
+            patch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
         yield
 
 

@@ -85,15 +85,12 @@ class Recorder:
 
 
 def test_each_key_is_read(tmp_path, monkeypatch):
-    """A run of first or second order reads the key, or the run folder's name has it."""
+    """A run reads the key, or the run folder's name has it."""
     seen: set[str] = set()
     # These two read all keys at once, which proves nothing.
     monkeypatch.setattr(train, "check_config", lambda _: None)
     for name, overrides in {
-        "first": ("optimizer=adam", "constraint=combined", "constraint.si.windows=4"),
-        "second": ("gate=true", "constraint=combined", "optimizer=gauss_newton", "batch_size=8"),
-        "actor": ("algo=td3", "task=pendulum", "constraint=free", "batch_size=8"),
-        "adaptive": ("constraint=adaptive", "optimizer=gauss_newton"),
+        "point_mass": ("gate=true", "constraint=combined", "optimizer=gauss_newton", "batch_size=8"),
         "house": ("task=house", "warmup_steps=1"),
         "house_wall": ("task=house_wall", "warmup_steps=1"),
         "four_tanks": ("task=four_tanks", "start=model", "warmup_steps=1"),
@@ -101,7 +98,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "linear": (*LINEAR, "warmup_steps=1"),
         "log": log_overrides(tmp_path),
         "actuator_noise": ("task=actuator_noise", "warmup_steps=1"),
-        "inventory": ("task=inventory", "warmup_steps=1"),
+        "inventory": ("task=inventory", "warmup_steps=1", "task.horizon=1"),
         "short_horizon": ("task=short_horizon", "warmup_steps=1"),
         "data": (*DATA, "constraint=free", "+task.start_episodes=2", "+task.held=null"),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
