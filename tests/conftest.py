@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import ctypes
+import functools
 import gc
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +68,20 @@ def solver(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="session", autouse=True)
 def quick_exports() -> Iterator[None]:
-    """Compile exports without optimisation, and compare them at few states."""
+    """Compile exports without optimisation and once each, and compare them at few states."""
+    compile_now = library.compiled
+
+    @functools.lru_cache(maxsize=8)
+    def once(command: tuple[str, ...], files: tuple[tuple[str, str], ...], flags: tuple[str, ...]):
+        return compile_now(dict(files), flags)
+
+    def compiled(files: Mapping[str, str], flags: Sequence[str]) -> ctypes.CDLL:
+        return once((*library.required_compiler(),), (*sorted(files.items()),), (*flags,))
+
     with pytest.MonkeyPatch.context() as patch:
         for module in (exporting, library):
             patch.setattr(module, "FLAGS", ("-std=c99", "-O0", "-fPIC", "-shared"))
+            patch.setattr(module, "compiled", compiled)
         for module in (exporting, export):
             patch.setattr(module, "COMPARED", 60)
         yield

@@ -90,7 +90,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     # These two read all keys at once, which proves nothing.
     monkeypatch.setattr(train, "check_config", lambda _: None)
     for name, overrides in {
-        "point_mass": ("gate=true", "constraint=combined", "optimizer=gauss_newton", "batch_size=8"),
+        "second": ("gate=true", "constraint=combined", "optimizer=gauss_newton", "batch_size=8"),
         "house": ("task=house", "warmup_steps=1"),
         "house_wall": ("task=house_wall", "warmup_steps=1"),
         "four_tanks": ("task=four_tanks", "start=model", "warmup_steps=1"),

@@ -133,12 +133,11 @@ def test_only_an_offset_free_model_tracks_references_without_an_error(memory, la
 def test_a_learned_model_tracks_without_an_error_once_it_is_offset_free():
     short = ("updates=3", "warmup_steps=10", "gate=false", "batch_size=64", "task.eval_steps=5")
     found = controllers(1, *short)
-    errors = {
-        name: steady_error(mpc, Reachable(horizon=16, past=1 + cfg.task.memory), steps=120)
-        for name, (mpc, cfg) in found.items()
-    }
-    assert errors["learned"] > 0.02
-    assert errors["wrong model"] > 0.02
-    assert errors["wrong model, offset-free"] < 1e-3
-    assert errors["learned model, offset-free"] < 1e-3
-    assert errors["true model"] < 1e-3
+
+    def error(name: str) -> float:
+        mpc, cfg = found[name]
+        return steady_error(mpc, Reachable(horizon=16, past=1 + cfg.task.memory), steps=120)
+
+    assert error("learned") > 0.02
+    assert error("learned model, offset-free") < 1e-3
+    assert error("true model") < 1e-3
