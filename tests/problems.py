@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -216,3 +216,10 @@ def step(mpc: QPMPC, rate: float = 1e-3) -> None:
     optimizer.step()
     mpc.project_()
     optimizer.zero_grad()
+
+
+def one_sided(seed: int) -> KnownQP:
+    """Make QPs whose soft rows have an upper bound only."""
+    known = known_qp(seed, batch=(6,), soft=("above", "at_upper", "inside") * 2)
+    lb = known.qp.lb.masked_fill(known.qp.w.isfinite(), -torch.inf)
+    return replace(known, qp=replace(known.qp, lb=lb))

@@ -7,8 +7,8 @@ import pytest
 
 from tests.campaign.families import FAMILIES
 from tests.claims.__main__ import ROOT, load, main
+from tests.pages import PAGES, needs_docs
 from tests.runs import make_config
-from tests.test_docs import PAGES, needs_docs
 from torch_qpmpc.experiment.config import check_config
 
 CLAIMS = load()

@@ -11,23 +11,16 @@ import re
 import shlex
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import torch_qpmpc
+from tests.pages import DOCS, PAGES, ROOT, fenced, needs_docs
 from tests.runs import SMALL, make_config
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.tasks import TASKS
 from torch_qpmpc.qp import solvers
 
-ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
-PAGES = {
-    path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
-    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md")))
-    if path.exists()
-}
 #: Pages whose Python takes more than a few seconds.
 SLOW = {"docs/guides/torchrl.md"}
 #: The modules whose docstrings have examples.
@@ -36,14 +29,6 @@ EXAMPLES = sorted(
     for path in (ROOT / "torch_qpmpc").rglob("*.py")
     if ">>> " in path.read_text(encoding="utf-8")
 )
-
-needs_docs = pytest.mark.skipif(not DOCS.exists(), reason="no docs, as in a wheel's tests")
-
-
-def fenced(text: str, language: str) -> list[tuple[int, str]]:
-    """Return the fenced blocks in a language, each with the line that it starts on."""
-    fence = re.compile(rf"^```{language}[^\n]*\n(.*?)^```", re.DOTALL | re.MULTILINE)
-    return [(text.count("\n", 0, m.start(1)), m.group(1)) for m in fence.finditer(text)]
 
 
 def commands(text: str) -> list[list[str]]:

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from tests.problems import normal, random_states
 from torch_qpmpc import QPMPC, QPActorValueOperator, QPQLearningLoss
 
 #: Exactly representable in float32, TorchRL's dtype.
@@ -99,3 +100,19 @@ def perturb(module: torch.nn.Module, size: float = 0.05, seed: int = 1) -> None:
 def learned_leaves(loss: QPQLearningLoss) -> dict[Any, Tensor]:
     leaves = loss.value_network_params.items(True, True)
     return {key: leaf for key, leaf in leaves if isinstance(leaf, torch.nn.Parameter)}
+
+
+def transitions(count: int = 12, seed: int = 0) -> TensorDict:
+    following = TensorDict(
+        observation=random_states(count, seed=seed + 1),
+        reward=normal(count, 1, seed=seed + 2),
+        done=torch.zeros(count, 1, dtype=torch.bool),
+        terminated=torch.zeros(count, 1, dtype=torch.bool),
+        batch_size=count,
+    )
+    return TensorDict(
+        observation=random_states(count, seed=seed + 3),
+        action=random_states(count, 1, size=0.5, seed=seed + 4),
+        next=following,
+        batch_size=count,
+    )

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.experiment.test_plots import legend_of, rendered
+from tests.figures import legend_of, rendered
 from tests.problems import normal
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.analysis.episode import episode_figure, plans_along

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.experiment.test_plots import image_of, legend_of, make_mpc, rendered
+from tests.figures import image_of, legend_of, make_mpc, rendered
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.analysis.plots import (
     canonical_figure,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.experiment.test_plots import image_of, rendered
+from tests.figures import image_of, rendered
 from tests.problems import normal
 from torch_qpmpc import QPMPC, DeviationPenalty, QPError
 from torch_qpmpc.analysis.model_error import first_state_error, one_step_error, second_moment

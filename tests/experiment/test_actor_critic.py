@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 from torch.testing import assert_close
 
 from tests.covering import covering
+from tests.learners import make, settings
 from tests.runs import SMALL, choices, make_config
-from torch_qpmpc import QPMPC, QPActorValueOperator
 from torch_qpmpc.experiment.actor_critic import (
     SPREAD,
     actor_groups,
@@ -24,7 +24,7 @@ from torch_qpmpc.experiment.actor_critic import (
     make_actor_critic_loss,
     make_critic,
 )
-from torch_qpmpc.experiment.algorithms import Learner, make_learner
+from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.learning.actor_critic import BoundedPolicy, Clip, ClippedPolicy
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
@@ -34,23 +34,6 @@ ACTORS = ("qp", "scheduled", "mlp")
 NETWORKS = ("qp", "mlp")
 ALGOS = ("ddpg", "td3", "sac")
 COMBINATIONS = list(itertools.product(ALGOS, ACTORS, NETWORKS))
-
-
-def make(*overrides: str, seed: int = 0, done: int = 0) -> tuple[Learner, QPMPC, TensorDictBase]:
-    """Make a learner, its actor's QP, and a batch of random transitions."""
-    torch.manual_seed(seed)
-    cfg = make_config(*SMALL, "constraint=free", *overrides)
-    physics = make_physics(cfg)
-    mpc = make_mpc(cfg, physics)
-    learner = make_learner(cfg, QPActorValueOperator(mpc), physics, done=done)
-    env = physics.vectorised(4, 12, seed=seed)
-    batch: TensorDictBase = env.rollout(3).reshape(-1)
-    env.close()
-    return learner, mpc, batch
-
-
-def settings(algo: str, actor: str, critic: str, task: str = "point_mass") -> tuple[str, ...]:
-    return f"task={task}", f"algo={algo}", f"algo.actor={actor}", f"algo.critic={critic}"
 
 
 def parameters(learner: Learner, name: str) -> dict[str, Tensor]:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import io
 import math
-from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
 
+from tests.figures import image_of, legend_of, make_mpc, rendered
 from tests.runs import make_config
 from torch_qpmpc import QPMPC
 from torch_qpmpc.analysis.plots import constraint_figure
@@ -29,23 +27,6 @@ from torch_qpmpc.experiment.plots import (
 )
 from torch_qpmpc.experiment.tasks import make_mpc as make_task_mpc
 from torch_qpmpc.experiment.tasks import make_physics
-
-
-def make_mpc(horizon: int = 4) -> QPMPC:
-    physics = PointMass()
-    A, B, theta = physics.corrupted(1)
-    mpc = QPMPC.from_model(
-        A,
-        B,
-        horizon,
-        action_bounds=(physics.lb_a, physics.ub_a),
-        stage_weight=torch.cat((theta, torch.zeros(2))),
-        solver="daqp",
-    )
-    generator = torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        mpc.C += 0.1 * torch.randn(mpc.C.shape, generator=generator, dtype=torch.float64)
-    return mpc
 
 
 def make_loops(mpc: QPMPC) -> dict[str, ClosedLoop]:
@@ -66,25 +47,6 @@ def mpc() -> QPMPC:
 @pytest.fixture(scope="module")
 def loops(mpc: QPMPC) -> dict[str, ClosedLoop]:
     return make_loops(mpc)
-
-
-def rendered(figure: Figure) -> np.ndarray:
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=50)
-    file.seek(0)
-    image = plt.imread(file)
-    assert np.ptp(image[..., :3]) > 0.5, "not blank"
-    assert plt.get_fignums() == [], "nothing for pyplot to keep"
-    return image
-
-
-def image_of(axes: Any) -> np.ndarray:
-    (image,) = axes.images
-    return np.asarray(image.get_array())
-
-
-def legend_of(axes: Any) -> list[str]:
-    return [text.get_text() for text in axes.get_legend().get_texts()]
 
 
 def test_constraint_figure_shows_C_raw_and_canonical_beside_C_0(mpc):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_docs import PAGES, fenced
+from tests.pages import PAGES, fenced
 from torch_qpmpc.export.library import compiler
 
 PAGE = "docs/guides/export.md"

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 from torchrl.objectives import LossModule
 
 from tests import losses
-from tests.experiment.test_actor_critic import make, settings
+from tests.learners import make, settings
 from tests.transitions import TRACE, make_batch, make_loss, make_operator
 from torch_qpmpc import QPMPC, QPError, SolverError
 from torch_qpmpc.learning.restoring import restored

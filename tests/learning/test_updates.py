@@ -10,8 +10,8 @@ from torch.optim.lr_scheduler import LambdaLR
 from torch.testing import assert_close
 
 from tests import store
-from tests.learning.test_warm_start import transitions
 from tests.problems import normal, random_mpc
+from tests.transitions import transitions
 from torch_qpmpc import (
     QPMPC,
     DeviationPenalty,

@@ -8,33 +8,17 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.testing import assert_close
 
 import train
-from tests.problems import normal, random_mpc, random_states
+from tests.problems import random_mpc
 from tests.runs import SMALL, make_config
+from tests.transitions import transitions
 from torch_qpmpc import QPActorValueOperator, QPQLearningLoss, SolveLog
 from torch_qpmpc.learning.replay import ACTIVE_SET, ACTIVE_SETS, make_replay
 from torch_qpmpc.qp.program import UNKNOWN
 
 COUNT = 12
-
-
-def transitions(count: int = COUNT, seed: int = 0) -> TensorDict:
-    following = TensorDict(
-        observation=random_states(count, seed=seed + 1),
-        reward=normal(count, 1, seed=seed + 2),
-        done=torch.zeros(count, 1, dtype=torch.bool),
-        terminated=torch.zeros(count, 1, dtype=torch.bool),
-        batch_size=count,
-    )
-    return TensorDict(
-        observation=random_states(count, seed=seed + 3),
-        action=random_states(count, 1, size=0.5, seed=seed + 4),
-        next=following,
-        batch_size=count,
-    )
 
 
 def make_loss(key: str | None, solver: str = "daqp", **options) -> QPQLearningLoss:

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 import train
 from tests.runs import SMALL, make_config
-from tests.study.test_report import made_up
+from tests.study.tables import made_up
 from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.study.plots import (
     ablation_figure,

@@ -10,6 +10,7 @@ from tests.problems import (
     KnownQP,
     known_qp,
     normal,
+    one_sided,
     random_mpc,
     random_states,
     soft_qps,
@@ -81,13 +82,6 @@ def test_an_empty_batch_is_solved(solver, batch):
 )
 def test_parts_of_a_program_may_be_missing(solver, options):
     assert_solves(known_qp(1, batch=(4,), **options), solver)
-
-
-def one_sided(seed: int) -> KnownQP:
-    """Make QPs whose soft rows have an upper bound only."""
-    known = known_qp(seed, batch=(6,), soft=("above", "at_upper", "inside") * 2)
-    lb = known.qp.lb.masked_fill(known.qp.w.isfinite(), -torch.inf)
-    return replace(known, qp=replace(known.qp, lb=lb))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests.benchmarks.problems import PAPER, make_mpc, transitions
-from tests.problems import soft_qps
-from tests.qp.solvers.test_backends import one_sided
+from tests.problems import one_sided, soft_qps
 from torch_qpmpc import QuadraticProgram, solve_qp
 from torch_qpmpc.qp.solvers import proxqp
 
