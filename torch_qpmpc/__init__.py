@@ -8,6 +8,7 @@ import gymnasium
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
+from torch_qpmpc.mpc.blended import BlendedModel, identify_blended
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "QPMPC",
+    "BlendedModel",
     "Bounds",
     "CompiledPolicy",
     "Controller",
@@ -58,6 +60,7 @@ __all__ = [
     "SystemIdentificationPenalty",
     "ThetaNetwork",
     "identify",
+    "identify_blended",
     "load_run",
     "read_log",
     "solve_qp",

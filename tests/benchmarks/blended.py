@@ -1,0 +1,77 @@
+"""Pendulum-v1 by models of a log alone: ``python -m tests.benchmarks.blended``.
+
+Each log has 2,000 random actions, as in the first command of the page of other plants; nothing is
+learned after it. N = 20, the cost is that fitted to the rewards, and J is the mean of 16 episodes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tests.benchmarks.outside import EVAL_SEED, configuration
+from torch_qpmpc import QPMPC
+from torch_qpmpc.envs.closed_loop import cost_text, gymnasium_loop
+from torch_qpmpc.experiment.start import make_start
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.mpc.blended import Schedule, identify_blended
+from torch_qpmpc.study.markdown import table
+
+HORIZON, STARTS, CENTRES = 20, 16, (None, 32)
+
+
+def at_s(mpc: QPMPC, schedule: Schedule) -> Callable[[Tensor], Tensor]:
+    """Return the policy whose model is linearised at s for all stages."""
+    return lambda s: mpc.policy(s, qp=mpc.quadratic_program(schedule(s)))
+
+
+def along(mpc: QPMPC, schedule: Schedule) -> Callable[[Tensor], Tensor]:
+    """Return the policy whose model is linearised along the plan of the step before."""
+    plan: Tensor | None = None
+
+    def policy(s: Tensor) -> Tensor:
+        nonlocal plan
+        u = mpc.predicted(mpc.solve(s, qp=mpc.quadratic_program(schedule(s, plan))).z)[1]
+        plan = torch.cat((u[:, 1:], u[:, -1:]), 1)
+        return u[:, 0]
+
+    return policy
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.blended")
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(11, 16)))
+    rows = []
+    for seed in parser.parse_args(arguments).seeds:
+        options = (f"task.horizon={HORIZON}", "task.start_episodes=0")
+        cfg = configuration("Pendulum", seed, *options)
+        physics: Any = make_physics(cfg)
+        with tempfile.TemporaryDirectory() as folder:
+            start = make_start(cfg, physics, folder, written=False)
+        assert start is not None
+        mpc = make_mpc(cfg, physics, start)
+        policies: dict[str, Callable[[Tensor], Tensor]] = {
+            "zero": lambda s: s.new_zeros(len(s), 1),
+            "linear": mpc.policy,
+        }
+        for count in CENTRES:
+            chosen = {} if count is None else {"centres": count}
+            schedule = identify_blended(start.log, HORIZON, **chosen).schedule(mpc)
+            m = len(schedule.model.centres) if count is not None else "chosen"
+            policies |= {
+                f"at s, {m}": at_s(mpc, schedule),
+                f"along the plan, {m}": along(mpc, schedule),
+            }
+        options = {"starts": STARTS, "seed": EVAL_SEED}
+        J = [gymnasium_loop(policy, physics, **options).J for policy in policies.values()]
+        rows.append([str(seed), *map(cost_text, J)])
+        print(table(["seed", *policies], rows), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,342 @@
+"""Linear models at a few centres, blended by the observation, from a log.
+
+The model of a nonlinear plant is
+
+    x_{k+1} = sum_i w_i(x_k) (A_i x_k + B_i u_k + c_i),   w(x) = softmax(-|z - z_i|^2 / (2 h^2)),
+
+with the standardised observation z and the centres z_i: local linear models (Johansen and Foss,
+1993, "Constructing NARMAX models using ARMAX models"), whose rules are those of Takagi and Sugeno
+(1985). The centres are those of k-means, from the points that are farthest from each other. Each
+local model is fitted to all transitions, weighted by w_i, with a ridge on its change from the
+linear model of all. h is the mean distance of a centre from its nearest one.
+
+For a controller the model is linearised at s: the derivative of x_{k+1}, with that of the weights,
+which the blend of the A_i alone leaves out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_qpmpc.checks import check_kind, check_tensor, check_whole
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.coordinates import for_each
+from torch_qpmpc.mpc.identification import check_excitation
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.log import as_log
+from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.predictor import transitions
+from torch_qpmpc.mpc.ridge import ridge
+from torch_qpmpc.mpc.trajectories import Trajectory, folds
+
+#: The numbers of centres among which the held-out prediction decides.
+CENTRES = (1, 2, 4, 8, 16, 32, 64)
+#: The share of the log that is held out for it is one of so many parts, the last.
+PARTS = 5
+#: The ridge on the changes of a local model, relative to the mean square of a regressor in the log.
+RIDGE = 1e-3
+#: Iterations of k-means.
+ITERATIONS = 50
+
+
+class Linearised(NamedTuple):
+    """``x_{k+1} = A x_k + B u_k + offset``, each with the batch dimensions of s."""
+
+    A: Tensor
+    B: Tensor
+    offset: Tensor
+
+
+class BlendedModel(nn.Module):
+    """Linear models at centres, blended by the observation; `identify_blended` fits one.
+
+    Args:
+        centres: z_i, ``(m, n_x)``, in standardised units.
+        middle, size: the mean and the deviation that standardise x, ``(n_x,)``.
+        width: h.
+        A, B, offset: the local models, ``(m, n_x, n_x)``, ``(m, n_x, n_u)`` and ``(m, n_x)``.
+
+    Attributes:
+        R2: the share of the outputs' variance that is predicted ``horizon`` steps ahead in the
+            held-out part of the log, by the number of centres.
+    """
+
+    centres: Tensor
+    middle: Tensor
+    size: Tensor
+    width: Tensor
+    A: Tensor
+    B: Tensor
+    offset: Tensor
+
+    def __init__(
+        self,
+        centres: Tensor,
+        middle: Tensor,
+        size: Tensor,
+        width: Tensor,
+        A: Tensor,
+        B: Tensor,
+        offset: Tensor,
+    ) -> None:
+        super().__init__()
+        parts = {"centres": centres, "middle": middle, "size": size, "width": width}
+        for name, part in (parts | {"A": A, "B": B, "offset": offset}).items():
+            self.register_buffer(name, part)
+        self.R2: dict[int, float] = {}
+
+    @property
+    def n_x(self) -> int:
+        """The number of outputs."""
+        return self.B.shape[-2]
+
+    @property
+    def n_u(self) -> int:
+        """The number of actions."""
+        return self.B.shape[-1]
+
+    def weights(self, s: Tensor) -> Tensor:
+        """Return w ``(*batch, m)`` at s ``(*batch, n_x)``."""
+        return (-self._distances(s).square().sum(-1) / 2).softmax(-1)
+
+    def forward(self, s: Tensor, u: Tensor) -> Tensor:
+        """Return the next x ``(*batch, n_x)``, in float64.
+
+        Args:
+            s: ``(*batch, n_x)``.
+            u: ``(*batch, n_u)``.
+        """
+        s, u = check_tensor("s", s, self.n_x), check_tensor("u", u, self.n_u)
+        return (self.weights(s).unsqueeze(-1) * self._local(s, u)).sum(-2)
+
+    def linearised(self, s: Tensor, u: Tensor | None = None) -> Linearised:
+        """Return the linear model that agrees with this one and its derivatives at (s, u).
+
+        Args:
+            s: ``(*batch, n_x)``.
+            u: ``(*batch, n_u)``, zero by default.
+        """
+        s = check_tensor("s", s, self.n_x)
+        u = s.new_zeros(*s.shape[:-1], self.n_u) if u is None else check_tensor("u", u, self.n_u)
+        w, local = self.weights(s), self._local(s, u)
+        ahead = (w.unsqueeze(-1) * local).sum(-2)
+        # The derivative of w_i is w_i times that of its exponent minus the exponents' mean one.
+        slopes = -self._distances(s) / (self.width * self.size)
+        slopes = w.unsqueeze(-1) * (slopes - (w.unsqueeze(-1) * slopes).sum(-2, keepdim=True))
+        A = torch.einsum("...i,ijk->...jk", w, self.A) + local.mT @ slopes
+        B = torch.einsum("...i,ijk->...jk", w, self.B)
+        at = torch.cat((s, u), -1).to(A).unsqueeze(-1)
+        return Linearised(A, B, ahead - (torch.cat((A, B), -1) @ at).squeeze(-1))
+
+    def schedule(self, mpc: QPMPC) -> Schedule:
+        """Return the residuals of theta that put this model in the place of that of ``mpc``.
+
+        Args:
+            mpc: the QPMPC, of the model's sizes and without a window or a preview.
+
+        Raises:
+            QPError: it has others.
+        """
+        return Schedule(self, mpc)
+
+    def extra_repr(self) -> str:
+        return f"centres={len(self.centres)}, n_x={self.n_x}, n_u={self.n_u}"
+
+    def _distances(self, s: Tensor) -> Tensor:
+        """Return s minus the centres in units of h, ``(*batch, m, n_x)``."""
+        z = (s.to(self.middle) - self.middle) / self.size
+        return (z.unsqueeze(-2) - self.centres) / self.width
+
+    def _local(self, s: Tensor, u: Tensor) -> Tensor:
+        """Return the prediction of each local model, ``(*batch, m, n_x)``."""
+        of_s, of_u = (
+            torch.einsum("ijk,...k->...ij", M, v.to(M)) for M, v in ((self.A, s), (self.B, u))
+        )
+        return of_s + of_u + self.offset
+
+
+class Schedule(nn.Module):
+    """The residuals of theta that put a model linearised at s in the place of that of a QPMPC.
+
+    They are those from the theta that the QPMPC has when this is made: what is learned later is
+    added to the model. `BlendedModel.schedule` makes one.
+
+    Args:
+        model: the model.
+        mpc: the QPMPC.
+
+    Raises:
+        QPError: the sizes differ, or ``mpc`` has a window or a preview.
+    """
+
+    def __init__(self, model: BlendedModel, mpc: QPMPC) -> None:
+        super().__init__()
+        check_kind("mpc", mpc, QPMPC)
+        sizes = (mpc.n_x, mpc.n_u, mpc.past, mpc.n_d)
+        if sizes != (want := (model.n_x, model.n_u, 1, 0)):
+            got, expected = (f"n_x, n_u, past, n_d = {x}" for x in (sizes, want))
+            raise QPError.expected("mpc", got, f"{expected}, as the model")
+        self.model, self.horizon = model, mpc.horizon
+        known = mpc.coordinates()
+        self.names = ("A", "B", "b") if "A" in known else ("C", "b")
+        self.tied = "A" in known and known["A"].ndim == 2
+        for name in self.names:
+            self.register_buffer(f"{name}_before", known[name].detach().clone())
+
+    def forward(self, s: Tensor, plan: Tensor | None = None) -> dict[str, Tensor]:
+        """Return residuals by name, an argument of `QPMPC.quadratic_program`.
+
+        Args:
+            s: the states, ``(*batch, n_x)``.
+            plan: actions, ``(*batch, N, n_u)``, along whose prediction the model is linearised in
+                each stage, as in sequential quadratic programming. Without them it is linearised at
+                (s, 0), and the same in all stages.
+
+        Raises:
+            QPError: a shape is wrong, or a tied C, whose stages are equal, gets a plan.
+        """
+        N = self.horizon
+        if plan is None:
+            each = [self.model.linearised(s)] * N
+        else:
+            plan = check_tensor("plan", plan, N, self.model.n_u)
+            if self.tied:
+                remedy = "Its stages are equal: use structure='varying' or 'free'."
+                raise QPError.expected("plan", "a plan for a tied C", "none", remedy)
+            each, x = [], s
+            for u in plan.unbind(-2):
+                each.append(self.model.linearised(x, u))
+                x = self.model(x, u)
+        A, B = (torch.stack([getattr(stage, name) for stage in each], -3) for name in ("A", "B"))
+        b = -torch.stack([stage.offset for stage in each], -2)
+        after = {"A": A, "B": B}
+        if self.tied:
+            after = {name: x[..., 0, :, :] for name, x in after.items()}
+        elif self.names[0] == "C":
+            after = {"C": for_each(partial(banded_matrix, horizon=N), (A, B), (3, 3))}
+        # A tied b has one entry for all stages.
+        after["b"] = b.flatten(-2)[..., : len(self.get_buffer("b_before"))]
+        return {name: after[name] - self.get_buffer(f"{name}_before") for name in self.names}
+
+
+def identify_blended(
+    trajectories: Any, horizon: int, centres: int | Sequence[int] = CENTRES
+) -> BlendedModel:
+    """Fit linear models at a few centres to logged trajectories.
+
+    Args:
+        trajectories: as in `identify`, without known signals.
+        horizon: the number of steps over which predictions decide on the number of centres.
+        centres: the number of centres; or several, of which those count whose coefficients are
+            fewer than the transitions. The last fifth of the log decides among these.
+
+    Raises:
+        QPError: an argument is invalid, the log has known signals, or does not determine a linear
+            model, as in `identify`.
+
+    Example:
+        >>> import numpy as np, torch, torch_qpmpc as qm
+        >>> u, y = np.random.default_rng(0).uniform(-1, 1, 400), np.zeros(401)
+        >>> for t in range(400):
+        ...     y[t + 1] = np.sin(y[t]) + 0.5 * u[t]
+        >>> model = qm.identify_blended({"y": y, "u": u}, horizon=3)
+        >>> A, B, offset = model.linearised(torch.tensor([[0.0], [1.0]]))
+        >>> bool(A[0] > 0.9), bool(A[1] < 0.7)  # the slopes of the sine, 1 and 0.54
+        (True, True)
+    """
+    check_whole("horizon", horizon, 1)
+    counts = [centres] if isinstance(centres, int) else centres
+    if not isinstance(counts, Sequence) or isinstance(counts, str) or not counts:
+        raise QPError.expected("centres", repr(centres), "a whole number, or several")
+    for count in counts:
+        check_whole("centres", count, 1)
+    log = as_log(trajectories)
+    if log.known:
+        got = f"known signals {', '.join(log.known)}"
+        raise QPError.expected("trajectories", got, "outputs and actions only")
+    layout = Layout(len(log.outputs), len(log.inputs), int(horizon))
+    check_excitation(log, layout)
+    data = log.trajectories
+    if isinstance(centres, int):
+        return _fit(data, layout, centres)
+    coefficients = layout.n + 1
+    counts = [count for count in counts if count * coefficients < log.steps] or [min(counts)]
+    parts = folds(data, PARTS)
+    rest, last = [steps for part in parts[:-1] for steps in part], parts[-1]
+    R2 = {count: _R2(_fit(rest, layout, count), last, layout.horizon) for count in counts}
+    model = _fit(data, layout, max(R2, key=lambda count: R2[count]))
+    model.R2 = R2
+    return model
+
+
+def _fit(data: Sequence[Trajectory], layout: Layout, count: int) -> BlendedModel:
+    """Fit ``count`` local models."""
+    X, Y = transitions(data, layout)
+    x, n_x = X[:, : layout.n_x], layout.n_x
+    middle, size = x.mean(0), x.std(0, correction=0)
+    size = torch.where(size > 1e-12 * x.abs().amax(0), size, 1.0)
+    centres = _centres((x - middle) / size, count)
+    apart = _distance(centres, centres).fill_diagonal_(torch.inf)
+    width = apart.amin(1).mean() if len(centres) > 1 else size.new_ones(())
+    X = torch.cat((X, torch.ones_like(X[:, :1])), -1)
+    scale = X.square().mean(0).sqrt()
+    X = X / torch.where(scale > 0, scale, 1.0)
+    shared = ridge(X, Y)
+    empty = (x.new_zeros(len(centres), n_x, k) for k in (n_x, layout.n_u, 1))
+    A, B, offset = empty
+    w = BlendedModel(centres, middle, size, width, A, B, offset[..., 0]).weights(x)
+    gram = torch.einsum("ti,tj,tk->ijk", w, X, X) / len(X)
+    moment = torch.einsum("ti,tj,tk->ijk", w, X, Y - X @ shared) / len(X)
+    strength = RIDGE * torch.eye(X.shape[1], dtype=X.dtype)
+    local = shared + torch.linalg.solve(gram + strength, moment)
+    local = (local / torch.where(scale > 0, scale, 1.0).unsqueeze(-1)).mT
+    A, B, offset = local.split((n_x, layout.n_u, 1), -1)
+    return BlendedModel(centres, middle, size, width, A, B, offset[..., 0])
+
+
+def _centres(z: Tensor, count: int) -> Tensor:
+    """Return the centres of k-means of z ``(T, n_x)``, at most ``count``, which differ."""
+    chosen = z[z.square().sum(1).argmin()].unsqueeze(0)
+    while len(chosen) < count:
+        distance, farthest = _distance(z, chosen).amin(1).max(0)
+        if distance == 0:
+            break
+        chosen = torch.cat((chosen, z[farthest].unsqueeze(0)))
+    for _ in range(ITERATIONS):
+        nearest = _distance(z, chosen).argmin(1)
+        members = nn.functional.one_hot(nearest, len(chosen)).to(z)
+        chosen = torch.where(
+            members.any(0).unsqueeze(-1),
+            members.mT @ z / members.sum(0).clamp(min=1).unsqueeze(-1),
+            chosen,
+        )
+    return chosen
+
+
+def _distance(x: Tensor, y: Tensor) -> Tensor:
+    """Return the distances of the rows of x and y, exactly zero for equal ones."""
+    return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _R2(model: BlendedModel, data: Sequence[Trajectory], horizon: int) -> float:
+    """Return R2 of predictions ``horizon`` steps ahead, or as many as the longest of ``data``."""
+    horizon = min(horizon, max(steps.steps for steps in data))
+    errors = []
+    for steps in data:
+        starts = steps.steps - horizon + 1
+        if starts < 1:
+            continue
+        x = steps.y[:starts]
+        for k in range(horizon):
+            x = model(x, steps.u[k : k + starts])
+        errors.append(steps.y[horizon:] - x)
+    outputs = torch.cat([steps.y for steps in data])
+    variance = outputs.var(0, correction=0)
+    R2 = 1 - torch.cat(errors).square().mean(0) / torch.where(variance > 0, variance, 1.0)
+    return R2.mean().nan_to_num(-torch.inf).item()
