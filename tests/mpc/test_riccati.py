@@ -25,17 +25,23 @@ def test_the_noisy_weight_solves_the_generalised_equation():
     assert_close(P, gain.mT @ W @ gain + GAMMA * (closed.mT @ P @ closed + noise))
 
 
-def test_no_other_gain_costs_less():
-    def cost(K: torch.Tensor) -> torch.Tensor:
-        """Return the trace of the cost to go of u = -K x, by value iteration."""
-        gain, P = torch.cat((torch.eye(2).double(), -K)), torch.zeros_like(A)
-        for _ in range(600):
-            spread = torch.diag(STD.square() * (B.mT @ P @ B).diagonal())
-            step = (A - B @ K).mT @ P @ (A - B @ K) + K.mT @ spread @ K
-            P = gain.mT @ W @ gain + GAMMA * step
-        return P.trace()
+@pytest.mark.parametrize("delay", [0, 1, 2])
+def test_no_other_gain_costs_less(delay):
+    """u = -K z, where z is the state without the errors that are not yet seen."""
 
-    K = lqr_gain(A, B, noisy_stage_weight(A, B, W, GAMMA, STD), GAMMA)
+    def cost(K: torch.Tensor) -> torch.Tensor:
+        """Return the discounted cost from E[x x'] = 1, by the second moments of z and x - z."""
+        zero, gain = torch.zeros_like(A), torch.cat((torch.eye(2).double(), -K))
+        M, errors, total = torch.eye(2).double(), [zero] * delay, zero.sum()
+        for k in range(300):
+            stage = (W * (gain @ M @ gain.mT)).sum() + (W[:2, :2] * sum(errors, zero)).sum()
+            total = total + GAMMA**k * stage
+            spread = torch.diag(STD.square() * (K @ M @ K.mT).diagonal())
+            errors = [B @ spread @ B.mT, *(A @ X @ A.mT for X in errors)]
+            M = (A - B @ K) @ M @ (A - B @ K).mT + errors.pop()
+        return total
+
+    K = lqr_gain(A, B, noisy_stage_weight(A, B, W, GAMMA, STD, delay), GAMMA)
     slope = torch.func.grad(cost)(K)
     assert_close(slope, torch.zeros_like(K), atol=1e-8, rtol=0)
     assert cost(K) < cost(lqr_gain(A, B, W, GAMMA)) - 1e-3

@@ -45,7 +45,9 @@ def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tenso
     return torch.as_tensor((P + P.T) / 2).to(A)
 
 
-def noisy_stage_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float, std: Tensor) -> Tensor:
+def noisy_stage_weight(
+    A: Tensor, B: Tensor, W: Tensor, gamma: float, std: Tensor, delay: int = 0
+) -> Tensor:
     """Return the stage weight that accounts for noise on the actions, ``(n_x + n_u, n_x + n_u)``.
 
     Of the plant ``x+ = A x + B diag(1 + xi) u + e``, with xi and e independent in time, the
@@ -54,18 +56,25 @@ def noisy_stage_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float, std: Tenso
     Koning, Automatica 1982). With the weight returned, `riccati_weight` is that P, and the
     regulator is the optimal policy.
 
+    If what xi_k does to x_{k+1} is seen ``delay`` steps later only, that policy is one of the
+    state's mean. The errors of that mean have the cost of the stages until then, which no action
+    can change: ``gamma A'PA`` plus the weight of x replaces P in B'PB, once for each step.
+
     Args:
         A, B, W, gamma: as in `riccati_weight`.
         std: standard deviations of xi, ``(n_u,)``.
+        delay: steps from x_{k+1} until the effect of xi_k is seen.
 
     Raises:
         QPError: the equation has no solution: under this noise no policy has a finite cost.
     """
-    P, weight, zeros = riccati_weight(A, B, W, gamma), W, std.new_zeros(len(A))
+    P, weight, n_x = riccati_weight(A, B, W, gamma), W, len(A)
     with contextlib.suppress(QPError):  # the weight has grown too large
         for _ in range(MAX_ITERATIONS):
+            for _ in range(delay):
+                P = W[:n_x, :n_x] + gamma * A.mT @ P @ A
             added = gamma * std.square() * (B.mT @ P @ B).diagonal()
-            last, weight = weight, W + torch.diag(torch.cat((zeros, added)))
+            last, weight = weight, W + torch.diag(torch.cat((std.new_zeros(n_x), added)))
             if torch.allclose(weight, last, rtol=1e-12, atol=0):
                 return weight
             P = riccati_weight(A, B, weight, gamma)
