@@ -209,6 +209,7 @@ TASK_KEYS = {
     "task.actuator_std": "task=actuator_noise",
     "task.capacity": "task=inventory",
     "task.disturbed": "task=tank_references",
+    "task.hidden_velocity": "task=actuator_noise",
     "task.margin": "task=house",
     "task.memory": "task=tank_references",
     "task.model_error": "task=tank_references",
@@ -326,7 +327,8 @@ for _name in ("scale_cost", "scale_constraints", "damping"):
     BAD[f"optimizer.{_name}"] = [0, *REAL]
 for _name in ("optimizer.trust_region", "optimizer.normalise", "task.one_weather"):
     BAD[_name] = FLAG
-BAD["task.disturbed"] = BAD["task.observation_bounds"] = FLAG
+for _name in ("task.disturbed", "task.observation_bounds", "task.hidden_velocity"):
+    BAD[_name] = FLAG
 BAD["task.past"] = WHOLE
 BAD["task.held"] = [[-1], [0.5], ["a"], 3]
 BAD["task.memory"] = BAD["task.start_episodes"] = WHOLE[1:]

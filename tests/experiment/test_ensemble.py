@@ -72,10 +72,18 @@ def test_members_differ_in_their_data_and_start_as_the_logs_trajectories_do():
 
 
 @pytest.mark.parametrize(
-    "name", ["actuator_noise", "house", "inventory", "short_horizon", "tank_references"]
+    "overrides",
+    [
+        ("task=actuator_noise",),
+        ("task=actuator_noise", "task.hidden_velocity=true"),
+        ("task=house",),
+        ("task=inventory",),
+        ("task=short_horizon",),
+        ("task=tank_references",),
+    ],
 )
-def test_a_plant_shows_its_cost_by_its_outputs(name):
-    plant = plant_of(make_config(f"task={name}"))
+def test_a_plant_shows_its_cost_by_its_outputs(overrides):
+    plant = plant_of(make_config(*overrides))
     rng = np.random.default_rng(0)
     w, x = plant.signals(rng, 5, 1)[:, 0], plant.starts(rng, 5)
     u = torch.as_tensor(rng.uniform(0, 1, (5, plant.n_u)))

@@ -22,6 +22,7 @@ from tests.runs import SMALL, composed, linear_system, make_config, run_command,
 from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import Cost, QPError
 from torch_qpmpc.envs import ActuatorNoise, GrosZanonLTI, Inventory, PointMass
+from torch_qpmpc.envs.actuator_noise import HiddenVelocity
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.fields import Name
@@ -392,6 +393,21 @@ def test_the_true_scheme_is_optimal_under_actuator_noise(horizon, std):
     optimal = evaluate(cfg, true.policy, plant).J_discounted
     start = evaluate(cfg, make_mpc(cfg, plant).policy, plant).J_discounted
     assert optimal < {0.7: 0.99, 1.2: 0.5}[std] * start
+
+
+def test_the_true_scheme_is_optimal_with_a_hidden_velocity():
+    cfg = make_config("task=actuator_noise", "task.hidden_velocity=true")
+    plant = make_physics(cfg)
+    assert isinstance(plant, HiddenVelocity)
+    std = torch.tensor([1.2]).double()
+    weight = noisy_stage_weight(plant.A, plant.B, plant.W, 0.95, std, delay=1)
+    K = lqr_gain(plant.A, plant.B, weight, 0.95)
+    true, start = make_true_mpc(cfg, plant), make_mpc(cfg, plant)
+    assert true is not None
+    window = torch.tensor([[0.1, 0.0, 0.0], [0.0, 1.0, 0.0], [0.1, 0.0, 0.1]]).double()
+    mean = torch.stack((window[:, 2], (window[:, 2] - window[:, 0]) / 0.2 + 0.2 * window[:, 1]), -1)
+    torch.testing.assert_close(true.policy(window), -mean @ K.mT, atol=1e-4, rtol=0)
+    assert evaluate(cfg, true.policy, plant).J < 0.1 * evaluate(cfg, start.policy, plant).J
 
 
 def test_the_actuator_is_bounded_by_a_max():

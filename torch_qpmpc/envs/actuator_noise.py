@@ -15,6 +15,7 @@ import math
 from dataclasses import dataclass, field
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.checks import check_number
@@ -86,3 +87,44 @@ class ActuatorNoise(Plant):
     def true_model(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return A, B and a zero offset, the model of the mean."""
         return self.A, self.B, self.A.new_zeros(2)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HiddenVelocity(ActuatorNoise):
+    """The integrator of which only the position is measured, by an Euler step of 0.2.
+
+        p+ = p + 0.2 v,    v+ = v + 0.2 u (1 + xi) + e,    y = p
+
+    Two positions show the last step's velocity, but what the noise has done since is seen a step
+    later. No more can be known than the window [p_{k-1}, u_{k-1}, p_k], and its mean is that of a
+    linear model: the optimal policy is linear in it; see `noisy_stage_weight` with a delay of 1.
+    The velocity has no cost, and is zero at a start.
+
+    Args:
+        horizon, past, A, B, W, lb_a, ub_a, actuator_std: as in `ActuatorNoise`, with L = 2.
+        noise_std: standard deviation of e, of the velocity.
+    """
+
+    n_y: int = field(default=1, init=False)
+    past: int = 2
+    B: Tensor = field(default_factory=float64([0], [0.2]))
+    W: Tensor = field(default_factory=float64([1, 0, 0], [0, 0, 0], [0, 0, 0.01]))
+
+    def signals(self, rng: Rng, count: int, length: int) -> Tensor:
+        """Draw xi and e, ``(count, length, 3)``, without noise of the position."""
+        return super().signals(rng, count, length) * self.A.new_tensor([1, 0, 1])
+
+    def starts(self, rng: Rng, count: int) -> Tensor:
+        """Draw start states ``(count, 2)`` at rest, with positions uniform in [-1, 1]."""
+        return super().starts(rng, count) * self.A.new_tensor([1, 0])
+
+    def output(self, x: Tensor, w: Tensor) -> Tensor:
+        return x[..., :1]
+
+    def output_cost(self, y: Tensor, u: Tensor, d: Tensor) -> Tensor:
+        return self.cost(F.pad(y, (0, 1)), u, d)
+
+    def true_model(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return [A_1, A_2], [B_1, B_2] and a zero offset, the model of the position's mean."""
+        push = self.A[:1, 1:] @ self.B[1:]
+        return self.A.new_tensor([[2, -1]]), F.pad(push, (1, 0)), self.A.new_zeros(1)

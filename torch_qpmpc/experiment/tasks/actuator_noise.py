@@ -1,17 +1,28 @@
-"""``task=actuator_noise``: noise that multiplies the action, learned from the model of the mean."""
+"""``task=actuator_noise``: noise that multiplies the action, learned from the model of the mean.
+
+With ``task.hidden_velocity=true`` only the position is measured, and the policy sees a window.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torch_qpmpc.envs import ActuatorNoise
+from torch_qpmpc.envs.actuator_noise import ActuatorNoise, HiddenVelocity
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64
-from torch_qpmpc.experiment.fields import NonNegative, Positive
-from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, named, plant_scheme, register
+from torch_qpmpc.experiment.fields import Flag, NonNegative, Positive
+from torch_qpmpc.experiment.tasks.registry import (
+    Task,
+    TaskSettings,
+    plant_layout,
+    plant_scheme,
+    register,
+)
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.riccati import noisy_stage_weight
 from torch_qpmpc.mpc.scheme import Scheme
@@ -20,18 +31,25 @@ from torch_qpmpc.mpc.scheme import Scheme
 STARTS = 256
 
 
+#: The horizon of the true scheme of a window, whose terminal weight is that of the position alone.
+LONG = 30
+
+
 class ActuatorNoiseSettings(TaskSettings):
-    """The keys of `ActuatorNoise`."""
+    """The keys of `ActuatorNoise` and `HiddenVelocity`."""
 
     #: Standard deviation of the factor of the action.
     actuator_std: NonNegative
     #: Bound of the absolute action.
     a_max: Positive
+    #: Only the position is measured.
+    hidden_velocity: Flag
 
 
 def make_plant(cfg: DictConfig) -> ActuatorNoise:
     task = cfg.task
-    return ActuatorNoise(
+    kind = HiddenVelocity if task.hidden_velocity else ActuatorNoise
+    return kind(
         horizon=task.horizon,
         lb_a=float64(-task.a_max)(),
         ub_a=float64(task.a_max)(),
@@ -45,15 +63,27 @@ def wrong_scheme(cfg: DictConfig, plant: ActuatorNoise) -> Scheme:
 
 
 def true_scheme(cfg: DictConfig, plant: ActuatorNoise) -> Scheme:
-    """Return the same scheme with the weight of the noise, optimal while no bound is active."""
-    A, B, _ = plant.true_model()
-    std = A.new_tensor([plant.actuator_std])
-    return _scheme(cfg, plant, noisy_stage_weight(A, B, plant.W, cfg.task.gamma, std))
+    """Return the same scheme with the weight of the noise, optimal while no bound is active.
+
+    That of a window has the horizon `LONG`.
+    """
+    std, delay = plant.A.new_tensor([plant.actuator_std]), plant.past - 1
+    weight = noisy_stage_weight(plant.A, plant.B, plant.W, cfg.task.gamma, std, delay)
+    scheme = _scheme(cfg, plant, weight)
+    return replace(scheme, layout=plant_layout(plant, LONG)) if delay else scheme
 
 
 def _scheme(cfg: DictConfig, plant: ActuatorNoise, weight: Tensor) -> Scheme:
     A, B, _ = plant.true_model()
-    return plant_scheme(cfg, plant, Model(A, B), weight)
+    seen = [*range(plant.n_y), -1]  # of the position, the velocity and the action
+    scheme = plant_scheme(cfg, plant, Model(A, B), weight[seen][:, seen])
+    if plant.past == 1:
+        return scheme
+    return replace(scheme, cost=replace(scheme.cost, terminal_weight=weight[:1, :1]))
+
+
+def _names(plant: ActuatorNoise, d: Tensor) -> dict[str, Any]:
+    return {"outputs": ("position", "velocity")[: plant.n_y], "actions": ("acceleration",)}
 
 
 register(
@@ -64,7 +94,7 @@ register(
         true_scheme,
         closed_loop=partial(plant_loop, starts=STARTS),
         nominal_scheme=wrong_scheme,
-        episode=named(("position", "velocity"), ("acceleration",)),
+        episode=_names,
         settings=ActuatorNoiseSettings,
         defaults=None,
     )
