@@ -1,6 +1,6 @@
 """The table of `docs/results/learning.md`: ``python -m tests.benchmarks.learning``.
 
-It reads the runs of the commands of that page, below runs/learning/.
+It reads the runs of the commands of that page, below runs/learning/; rows without runs stay.
 """
 
 from __future__ import annotations
@@ -53,6 +53,8 @@ def runs(root: Path) -> dict[tuple[str, int], list[dict[str, Any]]]:
         name, summary["optimum"] = cfg.task.name.replace("_", " "), summary["J_true_model"]
         if cfg.task.name == "actuator_noise":
             name += f", std {cfg.task.actuator_std:g}"
+            if cfg.task.hidden_velocity:
+                name += ", hidden velocity"
             if cfg.task.a_max < FREE:
                 name += f", action up to {cfg.task.a_max:g}"
                 summary["optimum"] = bounded_optimum(cfg)
@@ -108,10 +110,19 @@ def compared(learned: np.ndarray, fair: np.ndarray, optimum: np.ndarray) -> list
     ]
 
 
+def rows(page: str) -> dict[str, list[str]]:
+    """Return the cells of each task's row in the page's two tables."""
+    cells = defaultdict(list)
+    for line in page.split("<!-- learning -->")[1].split("<!-- /learning -->")[0].splitlines():
+        name, *others = (cell.strip() for cell in line.strip("| ").split(" | "))
+        cells[name] += others
+    return {name: line for name, line in cells.items() if name not in ("", "task", "---")}
+
+
 def main() -> None:
-    cases = runs(ROOT / "runs" / "learning")
-    lines = [[f"{name}, N = {N}", *row(x)] for (name, N), x in sorted(cases.items())]
-    page = PAGE.read_text(encoding="utf-8")
+    page, cases = PAGE.read_text(encoding="utf-8"), runs(ROOT / "runs" / "learning")
+    cells = rows(page) | {f"{name}, N = {N}": row(x) for (name, N), x in cases.items()}
+    lines = [[name, *line] for name, line in sorted(cells.items())]
     PAGE.write_text(replaced(page, two_tables(HEADER, lines, 7), "learning"), encoding="utf-8")
 
 
