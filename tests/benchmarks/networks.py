@@ -71,6 +71,9 @@ POINT_MASS = ("task=point_mass", "num_envs=160", "updates=4090", "eval_interval=
 HOUSE = ("task=house", "num_envs=64", "warmup_steps=10", "updates=3090", "eval_interval=150")
 TANKS = ("task=tank_references", "algo=td3", "task.horizon=8", "num_envs=4", "updates=800")
 TANKS += ("solver=daqp", "eval_interval=100", "log_interval=50")
+#: One update of 256 transitions for each new one, as in the published examples, after a warm-up;
+#: as many transitions as the QP's.
+EACH = ("task=point_mass", "num_envs=1", "warmup_steps=592", "updates=6000", "eval_interval=500")
 FAST, SLOW = "algo.lr_network=1e-3", "algo.lr_network=3e-4"
 #: The overrides of each case, by task; the first case of a task is the QP.
 CASES: dict[str, dict[str, Sequence[str]]] = {
@@ -88,6 +91,8 @@ CASES: dict[str, dict[str, Sequence[str]]] = {
         "QP": ("task=point_mass",),
         "TD3": ("algo=td3", *NETWORK, *POINT_MASS, SLOW),
         "SAC": ("algo=sac", *NETWORK, *POINT_MASS, FAST),
+        "TD3 each step": ("algo=td3", *NETWORK, *EACH, FAST),
+        "SAC each step": ("algo=sac", *NETWORK, *EACH, FAST),
     },
     "house": {
         "QP": ("task=house",),
