@@ -29,8 +29,6 @@ from torch_qpmpc.mpc.scheme import Scheme
 
 #: Closed loops of an evaluation; costs under this noise have heavy tails.
 STARTS = 256
-
-
 #: The horizon of the true scheme of a window, whose terminal weight is that of the position alone.
 LONG = 30
 
