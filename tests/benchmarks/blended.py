@@ -19,7 +19,7 @@ from torch_qpmpc import QPMPC
 from torch_qpmpc.envs.closed_loop import cost_text, gymnasium_loop
 from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.mpc.blended import Schedule, identify_blended
+from torch_qpmpc.mpc.blended import CENTRES, Schedule, identify_blended
 from torch_qpmpc.study.markdown import table
 
 HORIZON, STARTS = 20, 16
@@ -46,10 +46,12 @@ def along(mpc: QPMPC, schedule: Schedule) -> Callable[[Tensor], Tensor]:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.blended")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(11, 16)))
+    text = "numbers of centres among which prediction decides"
+    parser.add_argument("--centres", type=int, nargs="+", default=list(CENTRES), help=text)
+    options = parser.parse_args(arguments)
     rows = []
-    for seed in parser.parse_args(arguments).seeds:
-        options = (f"task.horizon={HORIZON}", "task.start_episodes=0")
-        cfg = configuration("Pendulum", seed, *options)
+    for seed in options.seeds:
+        cfg = configuration("Pendulum", seed, f"task.horizon={HORIZON}", "task.start_episodes=0")
         physics: Any = make_physics(cfg)
         with tempfile.TemporaryDirectory() as folder:
             start = make_start(cfg, physics, folder, written=False)
@@ -59,10 +61,10 @@ def main(arguments: list[str] | None = None) -> None:
             "zero action": lambda s: s.new_zeros(len(s), 1),
             "linear": mpc.policy,
         }
-        schedule = identify_blended(start.log, HORIZON).schedule(mpc)
+        schedule = identify_blended(start.log, HORIZON, options.centres).schedule(mpc)
         policies |= {"at s": at_s(mpc, schedule), "along the plan": along(mpc, schedule)}
-        options = {"starts": STARTS, "seed": EVAL_SEED}
-        J = [gymnasium_loop(policy, physics, **options).J for policy in policies.values()]
+        episodes = {"starts": STARTS, "seed": EVAL_SEED}
+        J = [gymnasium_loop(policy, physics, **episodes).J for policy in policies.values()]
         rows.append([str(seed), *map(cost_text, J), str(len(schedule.model.centres))])
         print(table(["seed", *policies, "centres"], rows), flush=True)
 

@@ -74,6 +74,7 @@ TANKS += ("solver=daqp", "eval_interval=100", "log_interval=50")
 #: One update of 256 transitions for each new one, as in the published examples, after a warm-up;
 #: as many transitions as the QP's.
 EACH = ("task=point_mass", "num_envs=1", "warmup_steps=592", "updates=6000", "eval_interval=500")
+HOUSE_EACH = ("task=house", "num_envs=1", "warmup_steps=384", "updates=1600", "eval_interval=400")
 FAST, SLOW = "algo.lr_network=1e-3", "algo.lr_network=3e-4"
 #: The overrides of each case, by task; the first case of a task is the QP.
 CASES: dict[str, dict[str, Sequence[str]]] = {
@@ -98,6 +99,8 @@ CASES: dict[str, dict[str, Sequence[str]]] = {
         "QP": ("task=house",),
         "TD3": ("algo=td3", *NETWORK, *HOUSE, SLOW),
         "SAC": ("algo=sac", *NETWORK, *HOUSE, FAST),
+        "TD3 each step": ("algo=td3", *NETWORK, *HOUSE_EACH, FAST),
+        "SAC each step": ("algo=sac", *NETWORK, *HOUSE_EACH, FAST),
     },
     # One theta is enough here: a network should do no harm.
     "tank_references": {

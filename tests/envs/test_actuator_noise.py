@@ -100,3 +100,8 @@ def test_the_optimal_gain_of_the_window_has_the_cost_of_its_riccati_equation():
             other = K.clone()
             other[0, i] *= factor
             assert cost(other) > 1.005 * cost(K)
+
+
+def test_a_horizon_that_no_action_reaches_is_refused():
+    with pytest.raises(QPError, match="horizon: got 1, expected a whole number >= 2"):
+        HiddenVelocity(horizon=1)

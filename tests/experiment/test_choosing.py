@@ -18,6 +18,7 @@ import train
 from tests.runs import SMALL, make_config, run_command
 from tests.stops import stop
 from torch_qpmpc import QPError
+from torch_qpmpc.experiment import choosing, evaluation
 from torch_qpmpc.experiment.choosing import NONE_HELD, _is_less, choose, chosen_before, starts
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log, learning_start
@@ -103,20 +104,30 @@ def test_set_points_are_held_in_all_starts_and_said(monkeypatch, given, held):
     assert "tied C, N=6, cost of (y_(k+1), u_k) in most steps" in named
 
 
-def test_the_best_start_is_compared_with_one_that_holds_no_output(monkeypatch):
+@pytest.mark.parametrize("less", [True, False])
+def test_a_start_that_holds_no_output_is_chosen_if_it_costs_less(tmp_path, monkeypatch, less):
     make = lambda **kwargs: Followed(**kwargs)  # noqa: E731 (an entry point)
     monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
-    cfg, physics, start, choice = chosen(*DATA, "start.transitions=800")
+    monkeypatch.setattr(choosing, "_is_less", lambda _: less)
+    asked, nominal = [], evaluation.nominal_mpc
+    monkeypatch.setattr(
+        evaluation, "nominal_mpc", lambda *x: asked.append(list(x[-1])) or nominal(*x)
+    )
+    cfg = make_config(*DATA, "start.transitions=800", "rivals=[identification]")
+    assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
+    run_command(f"resume={tmp_path}")
+    choice = Choice.read(tmp_path)
+    assert choice is not None
     (name,) = (name for name in choice.rows if name.endswith(NONE_HELD))
-    pair = {key: choice.rows[key] for key in (name, name.removesuffix(NONE_HELD))}
-    assert {row.episodes for row in pair.values()} == {4}
-    assert choice.scheme == min(pair, key=lambda name: pair[name].J)
+    assert {choice.rows[x].episodes for x in (name, name.removesuffix(NONE_HELD))} == {4}
+    assert choice.name == (name if less else ZERO_ACTION)
+    assert FinishedRun(tmp_path).summary.get("outputs_held", []) == ([] if less else [1])
+    assert asked == [[] if less else [1]]
+    cfg.task.held, physics = [1], make_physics(cfg)
     rows = {key: row._replace(chosen=key == name) for key, row in choice.rows.items()}
-    other = chosen_before(cfg, physics, start.log, Choice(rows))
-    assert other.identified.options.held == ()
-    cfg.task.held = [1]
+    log = collect_log(cfg, physics)
     with pytest.raises(QPError, match=f"starts.csv: got '.*{NONE_HELD}', expected one of"):
-        chosen_before(cfg, physics, start.log, Choice(rows))
+        chosen_before(cfg, physics, log, Choice(rows))
 
 
 def test_the_starts_are_all_combinations_and_constant_actions():

@@ -57,6 +57,23 @@ def test_the_linearisation_is_the_derivative_of_the_model(model):
     assert model.linearised(s.view(2, 3, 2)).offset.shape == (2, 3, 2)
 
 
+def test_states_and_actions_broadcast(model):
+    mpc = QPMPC.from_data(pendulum_log(), N, **COST)
+    schedule, s, plan = model.schedule(mpc), states(3), torch.rand(3, N, 1).double()
+    assert_close(schedule(s[0], plan), schedule(s[:1].expand(3, 2), plan))
+    assert_close(schedule(s, plan[0]), schedule(s, plan[:1].expand(3, N, 1)))
+    assert_close(model(s, plan[0, 0]), model(s, plan[:1, 0].expand(3, 1)))
+
+
+def test_an_output_that_never_changes_stays_where_it_is():
+    log = pendulum_log()
+    log["y"] = np.concatenate((log["y"], np.full((1201, 1), 0.3)), 1)
+    with pytest.warns(UserWarning, match="In this log"):
+        fitted = qm.identify_blended(log, 5, centres=np.int64(4))
+    s = torch.tensor([0.5, -0.2, 0.7]).double()
+    assert fitted(s, torch.ones(1).double())[2].item() == pytest.approx(0.7)
+
+
 def test_one_centre_is_the_linear_model():
     log = pendulum_log()
     one = qm.identify_blended(log, N, centres=1).linearised(states())
@@ -139,6 +156,7 @@ def test_the_state_dict_holds_model_and_schedule(model):
     assert "centres=" in str(model)
 
 
+@pytest.mark.filterwarnings("ignore:In this log:UserWarning")
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -181,6 +199,10 @@ def test_the_state_dict_holds_model_and_schedule(model):
                 torch.ones(2), torch.ones(3, 1)
             ),
             "plan: got shape .3, 1., expected",
+        ),
+        (
+            lambda log: qm.identify_blended(log, 3, centres=2)(torch.ones(3, 2), torch.ones(4, 1)),
+            r"u: got shape \(4, 1\), expected leading dimensions that broadcast with those of s",
         ),
         (
             lambda log: qm.identify_blended(log, 3, centres=2).linearised(torch.ones(3)),

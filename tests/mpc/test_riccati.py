@@ -47,6 +47,11 @@ def test_no_other_gain_costs_less(delay):
     assert cost(K) < cost(lqr_gain(A, B, W, GAMMA)) - 1e-3
 
 
+def test_a_delay_that_is_no_number_of_steps_is_refused():
+    with pytest.raises(QPError, match="delay: got -1, expected a whole number >= 0"):
+        noisy_stage_weight(A, B, W, GAMMA, STD, -1)
+
+
 def test_noise_that_no_policy_withstands_is_refused():
     one = torch.ones(1, 1).double()
     with pytest.raises(QPError, match=r"std: got \[3.0\], expected noise under which some"):

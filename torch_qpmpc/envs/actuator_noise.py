@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torch_qpmpc.checks import check_number
+from torch_qpmpc.checks import check_number, check_whole
 from torch_qpmpc.envs.linear_system import Rng, float64, normal, uniform
 from torch_qpmpc.envs.plant import Plant
 
@@ -101,14 +101,23 @@ class HiddenVelocity(ActuatorNoise):
     The velocity has no cost, and is zero at a start.
 
     Args:
-        horizon, past, A, B, W, lb_a, ub_a, actuator_std: as in `ActuatorNoise`, with L = 2.
+        horizon: N, at least 2, as an action moves the position two steps later.
+        A, B, W, lb_a, ub_a, actuator_std: as in `ActuatorNoise`.
         noise_std: standard deviation of e, of the velocity.
+
+    Raises:
+        QPError: as in `ActuatorNoise`, or the horizon is 1.
     """
 
     n_y: int = field(default=1, init=False)
-    past: int = 2
+    past: int = field(default=2, init=False)
+    horizon: int = 2
     B: Tensor = field(default_factory=float64([0], [0.2]))
     W: Tensor = field(default_factory=float64([1, 0, 0], [0, 0, 0], [0, 0, 0.01]))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_whole("horizon", self.horizon, 2)
 
     def signals(self, rng: Rng, count: int, length: int) -> Tensor:
         """Draw xi and e, ``(count, length, 3)``, without noise of the position."""

@@ -71,10 +71,10 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
     """Choose among the `starts` of a log by successive halving over closed loops on the plant.
 
     All have the same 2 episodes, the better half 2 more, the better half of these 4 more, and so on
-    up to ``task.start_episodes``, which zero action has, too. If the log has outputs to hold, the
-    best one of the last round is compared with one that predicts them, in as many episodes. The
-    better one is chosen if it costs less than zero action by a one-sided paired t-test of 95 %; if
-    not, zero action is.
+    up to ``task.start_episodes``, which zero action has, too. If the log has outputs to hold, a
+    start that predicts them takes the place of the best one of the last round if it costs less in
+    the same episodes. The best one is chosen if it costs less than zero action; if not, zero action
+    is. Both are one-sided paired t-tests of 95 %.
     """
     named = starts(cfg, physics, log)
     policies = {name: _policy(cfg, physics, start) for name, start in named.items()}
@@ -103,7 +103,7 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
             named[name], policies[name] = other, _policy(cfg, physics, other)
             costs[name], steps[name] = torch.zeros_like(costs[best][:0]), 0
             run(name, len(costs[best]))
-            best = min(best, name, key=lambda name: costs[name].mean().item())
+            best = name if _is_less(costs[name] - costs[best]) else best
     chosen = best if _is_less(costs[best] - costs[ZERO_ACTION]) else ZERO_ACTION
     rows = {}
     for name, start in named.items():

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch
@@ -104,7 +105,7 @@ class BlendedModel(nn.Module):
 
     def weights(self, s: Tensor) -> Tensor:
         """Return w ``(*batch, m)`` at s ``(*batch, n_x)``."""
-        return (-self._distances(s).square().sum(-1) / 2).softmax(-1)
+        return _weights(s, self.centres, self.middle, self.size, self.width)
 
     def forward(self, s: Tensor, u: Tensor) -> Tensor:
         """Return the next x ``(*batch, n_x)``, in float64.
@@ -112,8 +113,11 @@ class BlendedModel(nn.Module):
         Args:
             s: ``(*batch, n_x)``.
             u: ``(*batch, n_u)``.
+
+        Raises:
+            QPError: a shape is wrong, as in `linearised`.
         """
-        s, u = check_tensor("s", s, self.n_x), check_tensor("u", u, self.n_u)
+        s, u = self._pairs(s, u)
         return (self.weights(s).unsqueeze(-1) * self._local(s, u)).sum(-2)
 
     def linearised(self, s: Tensor, u: Tensor | None = None) -> Linearised:
@@ -122,13 +126,16 @@ class BlendedModel(nn.Module):
         Args:
             s: ``(*batch, n_x)``.
             u: ``(*batch, n_u)``, zero by default.
+
+        Raises:
+            QPError: a shape is wrong.
         """
-        s = check_tensor("s", s, self.n_x)
-        u = s.new_zeros(*s.shape[:-1], self.n_u) if u is None else check_tensor("u", u, self.n_u)
+        s, u = self._pairs(s, self.B.new_zeros(self.n_u) if u is None else u)
         w, local = self.weights(s), self._local(s, u)
         ahead = (w.unsqueeze(-1) * local).sum(-2)
         # The derivative of w_i is w_i times that of its exponent minus the exponents' mean one.
-        slopes = -self._distances(s) / (self.width * self.size)
+        distances = _distances(s, self.centres, self.middle, self.size, self.width)
+        slopes = -distances / (self.width * self.size)
         slopes = w.unsqueeze(-1) * (slopes - (w.unsqueeze(-1) * slopes).sum(-2, keepdim=True))
         A = torch.einsum("...i,ijk->...jk", w, self.A) + local.mT @ slopes
         B = torch.einsum("...i,ijk->...jk", w, self.B)
@@ -149,10 +156,15 @@ class BlendedModel(nn.Module):
     def extra_repr(self) -> str:
         return f"centres={len(self.centres)}, n_x={self.n_x}, n_u={self.n_u}"
 
-    def _distances(self, s: Tensor) -> Tensor:
-        """Return s minus the centres in units of h, ``(*batch, m, n_x)``."""
-        z = (s.to(self.middle) - self.middle) / self.size
-        return (z.unsqueeze(-2) - self.centres) / self.width
+    def _pairs(self, s: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return s and u with the same batch dimensions."""
+        s, u = check_tensor("s", s, self.n_x), check_tensor("u", u, self.n_u)
+        try:
+            batch = torch.broadcast_shapes(s.shape[:-1], u.shape[:-1])
+        except RuntimeError as error:
+            got, want = f"shape {tuple(u.shape)}", "leading dimensions that broadcast with those of"
+            raise QPError.expected("u", got, f"{want} s, {tuple(s.shape)}") from error
+        return s.expand(*batch, -1), u.expand(*batch, -1)
 
     def _local(self, s: Tensor, u: Tensor) -> Tensor:
         """Return the prediction of each local model, ``(*batch, m, n_x)``."""
@@ -252,9 +264,9 @@ def identify_blended(
         (True, True)
     """
     check_whole("horizon", horizon, 1)
-    counts = [centres] if isinstance(centres, int) else centres
+    counts = [int(centres)] if isinstance(centres, Integral) else centres
     if not isinstance(counts, Sequence) or isinstance(counts, str) or not counts:
-        raise QPError.expected("centres", repr(centres), "a whole number, or several")
+        raise QPError.expected("centres", repr(centres), "a whole number, or a list of them")
     for count in counts:
         check_whole("centres", count, 1)
     log = as_log(trajectories)
@@ -264,13 +276,14 @@ def identify_blended(
     layout = Layout(len(log.outputs), len(log.inputs), int(horizon))
     check_excitation(log, layout)
     data = log.trajectories
-    if isinstance(centres, int):
-        return _fit(data, layout, centres)
+    if isinstance(centres, Integral):
+        return _fit(data, layout, int(centres))
     coefficients = layout.n + 1
     counts = [count for count in counts if count * coefficients < log.steps] or [min(counts)]
     parts = folds(data, PARTS)
     rest, last = [steps for part in parts[:-1] for steps in part], parts[-1]
-    R2 = {count: _R2(_fit(rest, layout, count), last, layout.horizon) for count in counts}
+    variance = torch.cat([steps.y for steps in data]).var(0, correction=0)
+    R2 = {count: _R2(_fit(rest, layout, count), last, horizon, variance) for count in counts}
     model = _fit(data, layout, max(R2, key=lambda count: R2[count]))
     model.R2 = R2
     return model
@@ -280,6 +293,7 @@ def _fit(data: Sequence[Trajectory], layout: Layout, count: int) -> BlendedModel
     """Fit ``count`` local models."""
     X, Y = transitions(data, layout)
     x, n_x = X[:, : layout.n_x], layout.n_x
+    Y = Y - x  # an output that never changes stays where it is
     middle, size = x.mean(0), x.std(0, correction=0)
     size = torch.where(size > 1e-12 * x.abs().amax(0), size, 1.0)
     centres = _centres((x - middle) / size, count)
@@ -289,16 +303,27 @@ def _fit(data: Sequence[Trajectory], layout: Layout, count: int) -> BlendedModel
     scale = X.square().mean(0).sqrt()
     X = X / torch.where(scale > 0, scale, 1.0)
     shared = ridge(X, Y)
-    empty = (x.new_zeros(len(centres), n_x, k) for k in (n_x, layout.n_u, 1))
-    A, B, offset = empty
-    w = BlendedModel(centres, middle, size, width, A, B, offset[..., 0]).weights(x)
+    w = _weights(x, centres, middle, size, width)
     gram = torch.einsum("ti,tj,tk->ijk", w, X, X) / len(X)
     moment = torch.einsum("ti,tj,tk->ijk", w, X, Y - X @ shared) / len(X)
     strength = RIDGE * torch.eye(X.shape[1], dtype=X.dtype)
     local = shared + torch.linalg.solve(gram + strength, moment)
     local = (local / torch.where(scale > 0, scale, 1.0).unsqueeze(-1)).mT
     A, B, offset = local.split((n_x, layout.n_u, 1), -1)
+    A = A + torch.eye(n_x).to(A)
     return BlendedModel(centres, middle, size, width, A, B, offset[..., 0])
+
+
+def _distances(s: Tensor, centres: Tensor, middle: Tensor, size: Tensor, width: Tensor) -> Tensor:
+    """Return s minus the centres in units of h, ``(*batch, m, n_x)``."""
+    z = (s.to(middle) - middle) / size
+    return (z.unsqueeze(-2) - centres) / width
+
+
+def _weights(s: Tensor, centres: Tensor, middle: Tensor, size: Tensor, width: Tensor) -> Tensor:
+    """Return w ``(*batch, m)`` at s ``(*batch, n_x)``."""
+    distances = _distances(s, centres, middle, size, width)
+    return (-distances.square().sum(-1) / 2).softmax(-1)
 
 
 def _centres(z: Tensor, count: int) -> Tensor:
@@ -325,8 +350,11 @@ def _distance(x: Tensor, y: Tensor) -> Tensor:
     return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
 
 
-def _R2(model: BlendedModel, data: Sequence[Trajectory], horizon: int) -> float:
-    """Return R2 of predictions ``horizon`` steps ahead, or as many as the longest of ``data``."""
+def _R2(model: BlendedModel, data: Sequence[Trajectory], horizon: int, variance: Tensor) -> float:
+    """Return R2 of predictions ``horizon`` steps ahead, or as many as the longest of ``data``.
+
+    ``variance`` is that of the outputs, ``(n_x,)``.
+    """
     horizon = min(horizon, max(steps.steps for steps in data))
     errors = []
     for steps in data:
@@ -337,7 +365,5 @@ def _R2(model: BlendedModel, data: Sequence[Trajectory], horizon: int) -> float:
         for k in range(horizon):
             x = model(x, steps.u[k : k + starts])
         errors.append(steps.y[horizon:] - x)
-    outputs = torch.cat([steps.y for steps in data])
-    variance = outputs.var(0, correction=0)
     R2 = 1 - torch.cat(errors).square().mean(0) / torch.where(variance > 0, variance, 1.0)
     return R2.mean().nan_to_num(-torch.inf).item()

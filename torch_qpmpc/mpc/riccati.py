@@ -8,6 +8,7 @@ import scipy
 import torch
 from torch import Tensor
 
+from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
 
@@ -66,8 +67,10 @@ def noisy_stage_weight(
         delay: steps from x_{k+1} until the effect of xi_k is seen.
 
     Raises:
-        QPError: the equation has no solution: under this noise no policy has a finite cost.
+        QPError: ``delay`` is not a whole number, or the equation has no solution: under this noise
+            no policy has a finite cost.
     """
+    check_whole("delay", delay, 0)
     P, weight, n_x = riccati_weight(A, B, W, gamma), W, len(A)
     with contextlib.suppress(QPError):  # the weight has grown too large
         for _ in range(MAX_ITERATIONS):

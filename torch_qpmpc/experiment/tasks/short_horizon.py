@@ -11,7 +11,7 @@ from torch_qpmpc.envs import TripleIntegrator
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64
 from torch_qpmpc.experiment.fields import Positive
-from torch_qpmpc.experiment.rivals.rival import Policy, Rival
+from torch_qpmpc.experiment.rivals.heavier import heavier
 from torch_qpmpc.experiment.tasks.registry import (
     Task,
     TaskSettings,
@@ -20,10 +20,7 @@ from torch_qpmpc.experiment.tasks.registry import (
     plant_scheme,
     register,
 )
-from torch_qpmpc.mpc.bounds import Bounds
-from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.model import Model
-from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import Scheme
 
 #: Closed loops of an evaluation.
@@ -56,16 +53,6 @@ def true_scheme(cfg: DictConfig, plant: TripleIntegrator) -> Scheme:
     return replace(wrong_scheme(cfg, plant), layout=plant_layout(plant, LONG), gamma=1.0)
 
 
-def tuned(plant: TripleIntegrator) -> Policy:
-    """Make MPC of the task's horizon that is tuned by hand, without discount."""
-    W = plant.W.clone()
-    W[-1, -1] *= HEAVIER
-    bounds = Bounds(action_bounds=(plant.lb_a, plant.ub_a))
-    model, cost = Model(plant.A, plant.B), Cost(W, hessian="block")
-    scheme = Scheme(plant_layout(plant, plant.horizon), model, cost, bounds, gamma=1.0)
-    return QPMPC(scheme, learn=(), solver="daqp").policy
-
-
 register(
     Task(
         "short_horizon",
@@ -73,7 +60,7 @@ register(
         wrong_scheme,
         true_scheme,
         closed_loop=partial(plant_loop, starts=STARTS),
-        rivals={f"{HEAVIER:g} times the action's weight": Rival(tuned)},
+        rivals=heavier(HEAVIER),
         nominal_scheme=wrong_scheme,
         episode=named(("position", "velocity", "acceleration"), ("jerk",)),
         settings=ShortHorizonSettings,
