@@ -174,24 +174,6 @@ def test_each_choice_of_groups_is_accepted(names):
     check_config(chosen(*names))
 
 
-def conflicts() -> list[tuple[str, ...]]:
-    """List every conflict of a constraint and an optimiser, and a foreign noise of each task."""
-    plain, foreign = (
-        ("none", "pendulum"),
-        {task: noise for noise, task in PLANTS if noise not in NOISES[task]},
-    )
-    learners = [joined(x, plain) for x in LEARNERS if faults(*joined(x, plain))]
-    return learners + [joined(("free", "sgd"), (noise, task)) for task, noise in foreign.items()]
-
-
-@pytest.mark.parametrize("names", conflicts(), ids="-".join)
-def test_incompatible_choices_are_refused(names):
-    """Another task's noise is refused, as are SI windows without a replay."""
-    (key,) = faults(*names)
-    with pytest.raises(QPError, match=f"^{key}: got"):
-        check_config(chosen(*names))
-
-
 @pytest.mark.parametrize("task", ["point_mass", "pendulum"])
 @pytest.mark.parametrize("algo", choices("algo"))
 def test_each_algorithm_goes_with_each_kind_of_task(algo, task):
