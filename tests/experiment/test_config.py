@@ -23,6 +23,7 @@ from torch_qpmpc.experiment.config import (
 from torch_qpmpc.experiment.config.messages import keys
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import snapshot
+from torch_qpmpc.experiment.tasks import TASKS
 from torch_qpmpc.learning.search import KNOBS
 
 GROUPS = ("constraint", "noise", "optimizer", "task")
@@ -167,6 +168,11 @@ def compatible() -> list[tuple[str, ...]]:
     count = max(len(learners), len(plants))
     pairs = zip(itertools.cycle(learners), itertools.cycle(plants), strict=False)
     return [joined(*pair) for pair in itertools.islice(pairs, count)]
+
+
+def test_each_task_has_its_noises():
+    of_tasks = {name: {*task.noises} for name, task in TASKS.items()}
+    assert of_tasks | {"pendulum": of_tasks["gymnasium"]} == NOISES
 
 
 @pytest.mark.parametrize("names", compatible(), ids="-".join)
@@ -479,7 +485,10 @@ def test_solver_must_be_known():
             ["optimizer=gauss_newton", "constraint=si", "constraint.si.normalised=true"],
             r"constraint.si.normalised: got True, expected False. gauss_newton needs a penal",
         ),
-        (["constraint=si", "replay=false"], "replay: got False, expected true. constraint.si"),
+        (
+            ["constraint=si", "optimizer=recursive"],
+            "replay: got False, expected true. constraint.si",
+        ),
         (
             ["constraint=deviation", "constraint.structure=tied"],
             "constraint.structure: got 'tied', expected free. A tied C has nothing off its band",
