@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 import tarfile
@@ -61,17 +62,23 @@ def test_the_sdist_trains_and_tests(built):
     assert built[0].stat().st_size < 1e6
 
 
-@pytest.mark.parametrize("packaged", [False, True])
-def test_the_module_is_train_py(built, tmp_path, packaged):
-    """In a clone, and in a wheel, which has its own copy of train.py and configs/."""
-    environment = dict(os.environ)
-    if packaged:
-        folder = built[1].parent / "unpacked"
-        zipfile.ZipFile(built[1]).extractall(folder)
-        environment["PYTHONPATH"] = str(folder)
+def test_the_module_is_train_py(tmp_path, monkeypatch):
+    """Here in a clone."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", "task.gama=1"])
+    with pytest.raises(SystemExit, match=r"Did you mean task\.gamma\?$"):
+        runpy.run_module("torch_qpmpc.train", run_name="__main__")
+    assert not [*tmp_path.iterdir()]
+
+
+def test_the_module_of_the_wheel_is_its_own_train_py(built, tmp_path):
+    """It has a copy of train.py and configs/."""
+    folder = built[1].parent / "unpacked"
+    zipfile.ZipFile(built[1]).extractall(folder)
     command = [sys.executable, "-m", "torch_qpmpc.train", "task.gama=1"]
-    options = {"cwd": tmp_path, "capture_output": True, "text": True, "env": environment}
-    ended = subprocess.run(command, check=False, **options)
+    options = {"cwd": tmp_path, "capture_output": True, "text": True}
+    environment = os.environ | {"PYTHONPATH": str(folder)}
+    ended = subprocess.run(command, check=False, env=environment, **options)
     assert ended.returncode == 1
     assert ended.stderr.endswith("Did you mean task.gamma?\n")
     assert not [*tmp_path.iterdir()]

@@ -92,7 +92,6 @@ def resume(folder: Path) -> None:
 COMMANDS: dict[str, Callable[[Path], None]] = {
     "export": lambda folder: export([str(folder)]),
     "report": lambda folder: report([str(folder)]),
-    "report of subfolders": lambda folder: report([str(folder.parents[1])]),
     "resume": resume,
 }
 

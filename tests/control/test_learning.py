@@ -16,7 +16,7 @@ from torch_qpmpc import QPError, SolverError
 from torch_qpmpc.control import learning
 
 WRONG, RIGHT = ([[0.6]], [[0.2]]), ([[0.9]], [[0.5]])
-QUICK = {"r": [0.5], "spread": 0.5, "steps": 12, "transitions": 120}
+QUICK = {"r": [0.5], "spread": 0.5, "steps": 8, "transitions": 120}
 
 
 class Lag(gymnasium.Env):
@@ -108,7 +108,7 @@ def test_a_controller_with_the_true_model_stays_as_it_is():
 
 def test_a_log_is_enough_and_its_last_third_decides():
     controller = made(WRONG)
-    report = controller.learn(logged(), steps=12)
+    report = controller.learn(logged(), steps=8)
     assert report.accepted
     assert report.transitions == 399
     assert report.plant == "a model of the log's last third"
@@ -120,7 +120,7 @@ def test_loops_of_a_log_start_at_rest_at_its_levels():
     signals = {"y1": log.trajectories[0].y.numpy() + 50, "u1": log.trajectories[0].u.numpy() + 5}
     log = qm.read_log(signals, outputs=["y1"], inputs=["u1"])
     controller = made(WRONG, u_bounds=(3.0, 7.0), du_bounds=(-0.2, 0.2))
-    report = controller.learn(log, steps=12, spread=0.1)
+    report = controller.learn(log, steps=8, spread=0.1)
     assert report.before < 1, "a start at another input would cost thousands"
 
 

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
+from torch_qpmpc.control import probe
 from torch_qpmpc.control.findings import Finding, Review
 from torch_qpmpc.control.loop import LinearLoop
 from torch_qpmpc.export.tables import make_tables
@@ -24,6 +25,14 @@ INVERSE = ([[0.9, 0.0], [0.0, 0.5]], [[1.0], [1.0]], [[0.3, -1.2]])
 DEAD_TIME = (np.eye(6, k=1), np.eye(6)[:, -1:], np.eye(6)[:1])
 TWO_OUTPUTS = (np.diag([0.9, 0.5]), np.eye(2))
 TWO_INPUTS = ([[0.9]], [[0.5, 0.4]])
+#: Steps of the loop that probes the weights and the QP.
+PROBED = probe.STEPS
+
+
+@pytest.fixture(autouse=True)
+def quick_probe(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Probe by one set-point, except in the tests of what the probe tells."""
+    monkeypatch.setattr(probe, "STEPS", probe.HELD)
 
 
 def controller(model, horizon=10, filtered=None, r=None, **options):
@@ -137,8 +146,10 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake):
+def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake, monkeypatch):
     (model, options), (name, remedy), change = MISTAKES[mistake]
+    if name == "weights":
+        monkeypatch.setattr(probe, "STEPS", PROBED)
     design = {"model": model, **options}
     fault = made(**design)[name]
     assert not fault.ok
@@ -158,11 +169,12 @@ def loop(model, **options):
     looped, r = controller(model, **options)
     noise = 0.01 * looped.mpc.design.y_bounds[1]
     r = 10 * noise if r is None else r
-    return looped.simulate(steps=60, r=r, load=0.05, noise=noise)
+    return looped.simulate(steps=40, r=r, load=0.05, noise=noise)
 
 
 @pytest.mark.parametrize("model", [LAG, INTEGRATOR, DEAD_TIME])
-def test_a_sound_design_has_no_fault(model):
+def test_a_sound_design_has_no_fault(model, monkeypatch):
+    monkeypatch.setattr(probe, "STEPS", PROBED)
     found = made(model, 15, r=[0.5])
     assert found.faults == []
     assert len(found.findings) == 14
@@ -376,7 +388,8 @@ def test_shares_are_the_gradient_of_the_loop_s_cost():
     assert (up - down) / (2 * h) / whole > 0.05
 
 
-def test_a_negative_share_of_coupled_weights_is_no_fault():
+def test_a_negative_share_of_coupled_weights_is_no_fault(monkeypatch):
+    monkeypatch.setattr(probe, "STEPS", PROBED)
     Q = [[1.0, -0.9], [-0.9, 1.0]]
     mpc = qm.LinearMPC(TWO_OUTPUTS, 20, Q=Q, R=0.1, u_bounds=(-3.0, 3.0), y_bounds=(-1.0, 1.0))
     weights = qm.Controller(mpc).review()["weights"]
@@ -384,7 +397,8 @@ def test_a_negative_share_of_coupled_weights_is_no_fault():
     assert weights.ok
 
 
-def test_tight_bounds_take_more_iterations():
+def test_tight_bounds_take_more_iterations(monkeypatch):
+    monkeypatch.setattr(probe, "STEPS", PROBED)
     mpc = qm.LinearMPC(INTEGRATOR, 10, Q=1.0, dR=0.1, u_bounds=(-0.2, 0.2))
     controller = qm.Controller(mpc)
     numbers = controller.review()["C code"].numbers

@@ -96,8 +96,8 @@ def test_windows_are_those_of_each_episode(env):
 
 
 @pytest.mark.slow
-def test_windows_in_worker_processes():
-    env = ParallelEnv(2, windowed)
+def test_windows_in_a_worker_process():
+    env = ParallelEnv(1, windowed)
     check_env_specs(env, seed=0)
     check_windows(env.rollout(20, make_policy(), break_when_any_done=False))
     env.close()

@@ -19,9 +19,9 @@ from torch_qpmpc import QPError
 from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
 from torch_qpmpc.experiment.run_state import resumed
 
-#: Settings in which neither stop is at an evaluation or a row of metrics.
-RUN = (*SMALL, "updates=11", "eval_interval=4", "log_interval=3")
-STOPS = (2, 7)
+#: The stop is at neither an evaluation nor a row of metrics, and an episode ends after it.
+RUN = (*SMALL, "updates=8", "eval_interval=4", "log_interval=3", "task.episode_steps=10")
+STOP = 5
 STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
 STREAM += ("steps_per_update=4",)
 GATED = ("gate=true", "optimizer=gauss_newton")
@@ -36,15 +36,15 @@ NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
     [
         ("optimizer=sgd", "constraint=combined", "solver=torch", "step=projection"),
         ("optimizer=gauss_newton", "constraint=combined", "solver=proxqp"),
-        ("optimizer=adam", "constraint=mpc", "release=9"),
+        ("optimizer=adam", "constraint=mpc", "release=7"),
         ("gate=plant", "optimizer=recursive", *STREAM, "constraint=mpc"),
         ("optimizer=recursive", *STREAM, "replay=true", "replay_capacity=16", "batch_size=4"),
         ("noise=brownian", "steps_per_update=3", "warm_start=false"),
-        (*GATED, "constraint=mpc", "release=5", "search.w=0.5"),
+        (*GATED, "constraint=mpc", "release=3", "search.w=0.5"),
         (*GATED, *DATA, "constraint=free"),
         ("gate=model", "optimizer=gauss_newton", *DATA, "constraint=free"),
         ("gate=true", "algo=td3", *ACTOR_CRITIC),
-        ("task=store", "optimizer=gauss_newton", "constraint=si", "replay_capacity=48"),
+        ("task=store", "optimizer=gauss_newton", "constraint=si", "replay_capacity=40"),
         ("task=store", "optimizer=recursive", "optimizer.memory=8", "constraint=free"),
         ("task=store", "algo=ddpg", *ACTOR_CRITIC, *NETWORKS),
     ],
@@ -53,9 +53,9 @@ NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
 def test_a_resumed_run_equals_an_undisturbed_one(tmp_path, monkeypatch, overrides, store_task):
     cfg = make_config(*RUN, *overrides)
     train.train(cfg, str(tmp_path / "whole"))
-    for update in STOPS:
-        torch.manual_seed(update)
-        assert stop(monkeypatch, cfg, tmp_path / "stopped", update) == 128 + signal.SIGTERM
+    torch.manual_seed(1)
+    assert stop(monkeypatch, cfg, tmp_path / "stopped", STOP) == 128 + signal.SIGTERM
+    torch.manual_seed(2)
     go_on(tmp_path / "stopped")
     assert_same_numbers(tmp_path / "stopped", tmp_path / "whole")
     assert_events_are_whole(tmp_path / "stopped")
@@ -70,48 +70,62 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Train the same run without a stop."""
+    folder = tmp_path_factory.mktemp("whole")
+    train.train(make_config(*RUN, "eval_interval=2"), str(folder))
+    return folder
+
+
 @pytest.fixture
 def stopped(run: Path, tmp_path: Path) -> Path:
     """Copy the stopped run."""
     return shutil.copytree(run, tmp_path / "run")
 
 
+def test_a_resumed_run_stops_and_resumes_again(monkeypatch, stopped, whole):
+    stop(monkeypatch, make_config(), stopped, STOP)
+    go_on(stopped)
+    assert_same_numbers(stopped, whole)
+    assert_events_are_whole(stopped)
+
+
 def test_figures_are_not_drawn_twice(tmp_path, monkeypatch):
-    stop(monkeypatch, make_config(*RUN, "figures=all"), tmp_path, 9)
+    stop(monkeypatch, make_config(*RUN, "figures=all"), tmp_path, STOP)
     (tmp_path / "checkpoint.pt").unlink()
     (tmp_path / "checkpoint-previous.pt").rename(tmp_path / "checkpoint.pt")
     go_on(tmp_path)
     assert_events_are_whole(tmp_path)
 
 
-def test_a_run_that_has_no_checkpoint_yet_begins_anew(tmp_path, stopped):
+def test_a_run_that_has_no_checkpoint_yet_begins_anew(stopped, whole):
     for checkpoint in stopped.glob("checkpoint*"):
         checkpoint.unlink()
     go_on(stopped)
-    train.train(OmegaConf.load(stopped / "config.yaml"), str(tmp_path / "whole"))  # pyright: ignore[reportArgumentType] -- a DictConfig
-    assert_same_numbers(stopped, tmp_path / "whole")
+    assert_same_numbers(stopped, whole)
     assert_events_are_whole(stopped)
 
 
-@pytest.mark.parametrize("when", ["finish", "drop_previous"])
-def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch, when):
-    """The run is killed after its last update, before or after writing the summary."""
+def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch):
+    """Runs killed after the last update, before and after writing the summary, end the same."""
     cfg = make_config(*RUN, "rivals=[identification]")
-    train.train(cfg, str(tmp_path / "whole"))
 
     def killed(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patch:
-        patch.setattr(f"train.{'RunFolder.' * (when == 'finish')}{when}", killed)
-        with pytest.raises(KeyboardInterrupt):
-            train.train(cfg, str(tmp_path / "run"))
-    if when == "finish":
-        assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["update"] == 11
-        go_on(tmp_path / "run")
-        assert not (tmp_path / "run" / "checkpoint-previous.pt").exists()
-    assert_same_numbers(tmp_path / "run", tmp_path / "whole")
-    assert_events_are_whole(tmp_path / "run")
+    run, whole = tmp_path / "run", tmp_path / "whole"
+    for folder, name in ((run, "RunFolder.finish"), (whole, "drop_previous")):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"train.{name}", killed)
+            with pytest.raises(KeyboardInterrupt):
+                train.train(cfg, str(folder))
+    assert load_checkpoint(run / "checkpoint.pt")["update"] == cfg.updates
+    go_on(run)
+    assert not (run / "checkpoint-previous.pt").exists()
+    assert_same_numbers(run, whole)
+    for folder in (run, whole):
+        assert_events_are_whole(folder)
 
 
 def test_a_finished_run_saves_theta_without_data(tmp_path, stopped):
@@ -119,7 +133,7 @@ def test_a_finished_run_saves_theta_without_data(tmp_path, stopped):
     assert load_checkpoint(stopped / "checkpoint.pt")["replay"] is not None
     go_on(stopped)
     state = load_checkpoint(stopped / "checkpoint.pt")
-    assert (state["replay"], state["collector"], state["update"]) == (None, None, 11)
+    assert (state["replay"], state["collector"], state["update"]) == (None, None, 8)
     assert (stopped / "checkpoint.pt").stat().st_size < big
     assert sorted(path.name for path in stopped.iterdir()) == [
         "checkpoint.pt",
@@ -132,12 +146,12 @@ def test_a_finished_run_saves_theta_without_data(tmp_path, stopped):
 
 def test_environments_of_gymnasium_start_new_episodes_on_resume(tmp_path, monkeypatch, capsys):
     """Their state cannot be saved, nor that of other processes: test_collection.py."""
-    cfg = make_config(*RUN, "task=pendulum", "noise=none", "updates=6")
+    cfg = make_config(*RUN, "task=pendulum", "noise=none", "updates=4")
     assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
     go_on(tmp_path)
     expected = "Starting new episodes: the state of the environments is not saved."
     assert expected in capsys.readouterr().out
-    assert json.loads((tmp_path / "summary.json").read_text())["updates"] == 6
+    assert json.loads((tmp_path / "summary.json").read_text())["updates"] == 4
     assert_events_are_whole(tmp_path)
 
 
@@ -171,7 +185,7 @@ def test_a_damaged_configuration_is_named(stopped, content, wrong):
         run_command(f"resume={stopped}")
 
 
-def test_a_damaged_checkpoint_names_the_previous_one_which_resumes(tmp_path, stopped):
+def test_a_damaged_checkpoint_names_the_previous_one_which_resumes(stopped, whole):
     (stopped / "checkpoint.pt").write_bytes(b"PK" + bytes(1000))
     before = stopped / "checkpoint-previous.pt"
     with pytest.raises(QPError, match=rf"cannot be read .*use the previous one, {before}\.$"):
@@ -180,8 +194,7 @@ def test_a_damaged_checkpoint_names_the_previous_one_which_resumes(tmp_path, sto
     assert state is not None
     assert state["update"] == 2
     train.train(cfg, str(stopped), state)
-    train.train(cfg, str(tmp_path / "whole"))
-    assert_same_numbers(stopped, tmp_path / "whole")
+    assert_same_numbers(stopped, whole)
 
 
 def test_a_checkpoint_of_another_run_is_refused(stopped):

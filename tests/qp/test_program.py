@@ -66,16 +66,14 @@ VALUE_ERRORS = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "message"), SHAPE_ERRORS + VALUE_ERRORS)
-def test_bad_data_is_named(changes, message):
+@pytest.mark.parametrize(
+    ("changes", "message", "check_values"),
+    [*((*x, False) for x in SHAPE_ERRORS), *((*x, True) for x in VALUE_ERRORS)],
+)
+def test_bad_data_is_named(changes, message, check_values):
+    """Shapes are checked even where values are not."""
     with pytest.raises(QPError, match=message):
-        QuadraticProgram(**(GOOD | changes))
-
-
-@pytest.mark.parametrize(("changes", "message"), SHAPE_ERRORS)
-def test_shapes_are_checked_even_where_values_are_not(changes, message):
-    with pytest.raises(QPError, match=message):
-        QuadraticProgram(**(GOOD | changes), check_values=False)
+        QuadraticProgram(**(GOOD | changes), check_values=check_values)
 
 
 @pytest.mark.parametrize(("changes", "message"), VALUE_ERRORS)
