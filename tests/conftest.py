@@ -97,9 +97,9 @@ def no_waiting_for_disks() -> Iterator[None]:
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_figures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Draw the figures of runs without their layout, most of the time; tests of figures keep it."""
+    """Draw figures without their layout; modules that are marked ``layout`` keep it."""
     with pytest.MonkeyPatch.context() as patch:
-        if Path(request.module.__file__).stem not in ("test_plots", "test_episode", "test_window"):
+        if request.node.get_closest_marker("layout") is None:
             patch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
         yield
 

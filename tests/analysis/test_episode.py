@@ -14,6 +14,8 @@ from tests.problems import normal
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.analysis.episode import episode_figure, plans_along
 
+pytestmark = pytest.mark.layout
+
 T, N_Y, N_U = 6, 2, 1
 TIMES, Y, U = 0.25 * torch.arange(T + 1), normal(T + 1, N_Y), normal(T, N_U, seed=1)
 LOWER, UPPER = torch.tensor([-1.0, -torch.inf]), torch.stack((Y[:, 0].double() + 1, Y[:, 1]), -1)

@@ -24,6 +24,8 @@ from torch_qpmpc.analysis.structure import (
     stage_models,
 )
 
+pytestmark = pytest.mark.layout
+
 
 @pytest.fixture(scope="module")
 def mpc() -> QPMPC:

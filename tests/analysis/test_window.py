@@ -43,6 +43,8 @@ from torch_qpmpc.mpc.banded import band_distance, banded_matrix
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.regulator import stage_weight
 
+pytestmark = pytest.mark.layout
+
 N_X, N_U, N_D, L, N = 2, 1, 2, 3, 5
 LAYOUT = Layout(N_X, N_U, N, L, N_D)
 A = 0.2 * normal(N_X, L * N_X, seed=1) + 0.4 * torch.eye(N_X, L * N_X)

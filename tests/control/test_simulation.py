@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
 
+pytestmark = pytest.mark.layout
+
 LAG = ([[0.9]], [[0.5]])
 
 

@@ -28,6 +28,8 @@ from torch_qpmpc.experiment.plots import (
 from torch_qpmpc.experiment.tasks import make_mpc as make_task_mpc
 from torch_qpmpc.experiment.tasks import make_physics
 
+pytestmark = pytest.mark.layout
+
 
 def make_loops(mpc: QPMPC) -> dict[str, ClosedLoop]:
     physics = PointMass()

@@ -15,6 +15,8 @@ from torch_qpmpc.proofs import Polytope, SearchTree, explicit_law
 from torch_qpmpc.proofs.plots import law_figure
 from torch_qpmpc.qp.program import QuadraticProgram, Status
 
+pytestmark = pytest.mark.layout
+
 A, B = np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]])
 BOX = Polytope.box([-1.2, -0.8], [1.2, 0.8])
 

@@ -25,6 +25,8 @@ from torch_qpmpc.study.report import figures
 from torch_qpmpc.study.runs import collect
 from torch_qpmpc.study.statistics import interquartile_mean
 
+pytestmark = pytest.mark.layout
+
 
 @pytest.fixture
 def gaussian(study):
