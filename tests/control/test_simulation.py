@@ -82,6 +82,15 @@ def test_an_environment_without_gymnasium_s_reset_is_named():
         made().simulate(Bare(), 3, r=[0.0])
 
 
+def test_an_environment_that_observes_more_than_the_outputs_is_named():
+    class More:
+        def reset(self, *, seed=None):
+            return np.zeros(2), {}
+
+    with pytest.raises(QPError, match=r"plant: got an observation of shape \(2,\), .* alone, y1"):
+        made().simulate(More(), 3, r=[0.0])
+
+
 def test_the_cost_is_that_of_its_formula():
     controller = made(linear={"u1": "price"}, E=[[0.0]], known=["price"])
     known = {"price": np.linspace(0, 0.1, 40)}

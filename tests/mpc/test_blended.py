@@ -74,6 +74,19 @@ def test_an_output_that_never_changes_stays_where_it_is():
     assert fitted(s, torch.ones(1).double())[2].item() == pytest.approx(0.7)
 
 
+def test_set_points_are_held_and_do_not_choose_the_number_of_centres():
+    log = pendulum_log()
+    plain = qm.identify_blended(log, 5, centres=(1, 8))
+    jumps = np.random.default_rng(1).normal(size=(1201, 1)).round(0)
+    log["y"] = np.concatenate((log["y"], jumps), 1)
+    fitted = qm.identify_blended(log, 5, centres=(1, 8), held=[2])
+    A, B, offset = fitted.linearised(torch.randn(6, 3).double())
+    assert_close(A[:, 2], torch.eye(3).double()[2].expand(6, 3))
+    assert not B[:, 2].any()
+    assert offset[:, 2].abs().max() < 1e-9
+    assert fitted.R2[1] == pytest.approx(plain.R2[1], abs=0.02)
+
+
 def test_one_centre_is_the_linear_model():
     log = pendulum_log()
     one = qm.identify_blended(log, N, centres=1).linearised(states())
@@ -163,6 +176,7 @@ def test_the_state_dict_holds_model_and_schedule(model):
         (lambda log: qm.identify_blended(log, 0), "horizon: got 0"),
         (lambda log: qm.identify_blended(log, 3, centres=0), "centres: got 0"),
         (lambda log: qm.identify_blended(log, 3, centres=(2, 0)), "centres: got 0"),
+        (lambda log: qm.identify_blended(log, 3, held=[2]), r"held: got \[2\], expected a list of"),
         (
             lambda log: qm.identify_blended(log, 3, centres="8"),  # pyright: ignore[reportArgumentType]
             "centres: got '8', expected a wh",

@@ -132,6 +132,11 @@ def simulate(
         remedy = "Its reset returns the outputs and a dict."
         raise QPError.expected("plant", type(plant).__name__, "Gymnasium's reset and step", remedy)
     observed, info = started
+    if np.shape(observed) != noise.shape:
+        got = f"an observation of shape {np.shape(observed)}"
+        want = f"the outputs alone, {', '.join(design.plant.outputs)}"
+        remedy = "Wrap the environment: gymnasium.wrappers.TransformObservation chooses entries."
+        raise QPError.expected("plant", got, want, remedy)
     ys, us, ds, held = [], [], [], []
     for k in range(steps):
         ys.append(observed + noise * rng.normal(size=len(design.Q)))

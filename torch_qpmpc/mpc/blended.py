@@ -28,7 +28,7 @@ from torch_qpmpc.checks import check_kind, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.coordinates import for_each
-from torch_qpmpc.mpc.identification import check_excitation
+from torch_qpmpc.mpc.identification import check_excitation, check_held
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.log import as_log
 from torch_qpmpc.mpc.module import QPMPC
@@ -239,7 +239,10 @@ class Schedule(nn.Module):
 
 
 def identify_blended(
-    trajectories: Any, horizon: int, centres: int | Sequence[int] = CENTRES
+    trajectories: Any,
+    horizon: int,
+    centres: int | Sequence[int] = CENTRES,
+    held: Sequence[int] = (),
 ) -> BlendedModel:
     """Fit linear models at a few centres to logged trajectories.
 
@@ -248,6 +251,7 @@ def identify_blended(
         horizon: the number of steps over which predictions decide on the number of centres.
         centres: the number of centres; or several, of which those count whose coefficients are
             fewer than the transitions. The last fifth of the log decides among these.
+        held: indices of outputs that the model holds, such as set-points, as in `identify`.
 
     Raises:
         QPError: an argument is invalid, the log has known signals, or does not determine a linear
@@ -274,26 +278,31 @@ def identify_blended(
         got = f"known signals {', '.join(log.known)}"
         raise QPError.expected("trajectories", got, "outputs and actions only")
     layout = Layout(len(log.outputs), len(log.inputs), int(horizon))
+    held = check_held(held, layout.n_x)
     check_excitation(log, layout)
     data = log.trajectories
     if isinstance(centres, Integral):
-        return _fit(data, layout, int(centres))
+        return _fit(data, layout, int(centres), held)
     coefficients = layout.n + 1
     counts = [count for count in counts if count * coefficients < log.steps] or [min(counts)]
     parts = folds(data, PARTS)
     rest, last = [steps for part in parts[:-1] for steps in part], parts[-1]
     variance = torch.cat([steps.y for steps in data]).var(0, correction=0)
-    R2 = {count: _R2(_fit(rest, layout, count), last, horizon, variance) for count in counts}
-    model = _fit(data, layout, max(R2, key=lambda count: R2[count]))
+    variance[[*held]] = torch.nan  # left out
+    R2 = {count: _R2(_fit(rest, layout, count, held), last, horizon, variance) for count in counts}
+    model = _fit(data, layout, max(R2, key=lambda count: R2[count]), held)
     model.R2 = R2
     return model
 
 
-def _fit(data: Sequence[Trajectory], layout: Layout, count: int) -> BlendedModel:
-    """Fit ``count`` local models."""
+def _fit(
+    data: Sequence[Trajectory], layout: Layout, count: int, held: Sequence[int]
+) -> BlendedModel:
+    """Fit ``count`` local models, which hold the outputs ``held``."""
     X, Y = transitions(data, layout)
     x, n_x = X[:, : layout.n_x], layout.n_x
-    Y = Y - x  # an output that never changes stays where it is
+    Y = Y - x  # an output that never changes stays where it is, as those that are held
+    Y[:, [*held]] = 0.0
     middle, size = x.mean(0), x.std(0, correction=0)
     size = torch.where(size > 1e-12 * x.abs().amax(0), size, 1.0)
     centres = _centres((x - middle) / size, count)
@@ -353,7 +362,7 @@ def _distance(x: Tensor, y: Tensor) -> Tensor:
 def _R2(model: BlendedModel, data: Sequence[Trajectory], horizon: int, variance: Tensor) -> float:
     """Return R2 of predictions ``horizon`` steps ahead, or as many as the longest of ``data``.
 
-    ``variance`` is that of the outputs, ``(n_x,)``.
+    ``variance`` is that of the outputs, ``(n_x,)``, NaN for those that are left out.
     """
     horizon = min(horizon, max(steps.steps for steps in data))
     errors = []
@@ -365,5 +374,5 @@ def _R2(model: BlendedModel, data: Sequence[Trajectory], horizon: int, variance:
         for k in range(horizon):
             x = model(x, steps.u[k : k + starts])
         errors.append(steps.y[horizon:] - x)
-    R2 = 1 - torch.cat(errors).square().mean(0) / torch.where(variance > 0, variance, 1.0)
-    return R2.mean().nan_to_num(-torch.inf).item()
+    R2 = 1 - torch.cat(errors).square().mean(0) / torch.where(variance == 0, 1.0, variance)
+    return R2[~variance.isnan()].mean().nan_to_num(-torch.inf).item()

@@ -206,12 +206,21 @@ def identify(
     sizes = len(log.outputs), len(log.inputs), int(horizon), int(past), len(log.known)
     layout = Layout(*sizes)
     check_excitation(log, layout)
-    whole = isinstance(held, Sequence) and all(type(i) is int for i in held)
-    if not whole or not {*held} <= {*range(layout.n_x)}:
-        want = f"a list of indices of the {layout.n_x} outputs, from 0 on"
-        raise QPError.expected("held", repr(held), want, "In train.py it is task.held.")
-    options = Options(layout, structure, causal, ridge, (*sorted({*held}),))
+    options = Options(layout, structure, causal, ridge, check_held(held, layout.n_x))
     return Identified(*fit(log.trajectories, options), options, log)
+
+
+def check_held(held: Sequence[int], n_x: int) -> tuple[int, ...]:
+    """Return the indices of the outputs that a model holds, each once and in order.
+
+    Raises:
+        QPError: they are no indices of outputs.
+    """
+    whole = isinstance(held, Sequence) and all(type(i) is int for i in held)
+    if not whole or not {*held} <= {*range(n_x)}:
+        want = f"a list of indices of the {n_x} outputs, from 0 on"
+        raise QPError.expected("held", repr(held), want, "In train.py it is task.held.")
+    return (*sorted({*held}),)
 
 
 def check_excitation(log: Log, layout: Layout) -> None:
