@@ -347,9 +347,7 @@ def test_rivals_are_those_of_the_task():
     known += ". They are the rivals of task four_tanks"
     with pytest.raises(QPError, match=rf"rivals: got \['nobody'\], expected .* these: {known}"):
         check_config(make_config("task=four_tanks", "rivals=[nobody]"))
-    with pytest.raises(
-        QPError, match=r"rivals: got \['DeePC'\], expected .* these: identification"
-    ):
+    with pytest.raises(QPError, match=r"rivals: got \['DeePC'\], expected .* these: 10 times the"):
         check_config(make_config("task=actuator_noise", "rivals=[DeePC]"))
 
 

@@ -69,7 +69,7 @@ def test_an_output_that_never_changes_stays_where_it_is():
     log = pendulum_log()
     log["y"] = np.concatenate((log["y"], np.full((1201, 1), 0.3)), 1)
     with pytest.warns(UserWarning, match="In this log"):
-        fitted = qm.identify_blended(log, 5, centres=np.int64(4))
+        fitted = qm.identify_blended(log, 5, centres=np.int64(4))  # pyright: ignore[reportArgumentType]
     s = torch.tensor([0.5, -0.2, 0.7]).double()
     assert fitted(s, torch.ones(1).double())[2].item() == pytest.approx(0.7)
 
