@@ -425,7 +425,7 @@ def test_betas_are_adams():
             ["optimizer.name=rmsprop"],
             "optimizer.name: got 'rmsprop', expected one of adam, sgd, ",
         ),
-        (["task.name=mine"], "task.name: got 'mine', expected one of .*point_mass"),
+        (["task.name=unknown"], "task.name: got 'unknown', expected one of .*point_mass"),
         (["constraint.si=3"], "constraint.si: got 3, expected its keys, as in configs/."),
     ],
 )
