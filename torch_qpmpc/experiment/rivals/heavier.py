@@ -5,8 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import torch
-
 from torch_qpmpc.experiment.rivals.rival import Policy, Rival
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
@@ -24,9 +22,9 @@ def heavier(*factors: float) -> dict[str, Rival]:
 def _policy(plant: Any, factor: float) -> Policy:
     """Make MPC of the plant's horizon, without discount."""
     seen = [*range(plant.n_y), -1]  # of the states and the action
-    W = plant.W[seen][:, seen]
+    W = plant.W[seen][:, seen]  # a copy
+    W[-1, -1] *= factor
     terminal = None if plant.past == 1 else W[:-1, :-1]
-    W = W * torch.outer(*(W.new_tensor([1.0] * plant.n_y + [factor**0.5]) for _ in range(2)))
     layout = Layout(plant.n_y, 1, plant.horizon, plant.past)
     bounds = Bounds(action_bounds=(plant.lb_a, plant.ub_a))
     cost = Cost(W, terminal, hessian="block")
