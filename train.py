@@ -131,7 +131,9 @@ def _train(
         interrupt.exit_if_signalled(f"Stopped after update {tally.update}: {command}")
 
         label = f"{cfg.constraint.name}, {cfg.noise.name}"
-        bar = tqdm(desc=label, initial=tally.update, total=cfg.updates, disable=quiet)
+        # A log file gets a line in ten seconds.
+        rest = {"mininterval": 0.1 if sys.stderr.isatty() else 10, "disable": quiet}
+        bar = tqdm(desc=label, initial=tally.update, total=cfg.updates, **rest)
         progress = stack.enter_context(bar)
         for update in range(tally.update + 1, cfg.updates + 1):
             with tally.timed() as watch:

@@ -172,7 +172,7 @@ def test_bad_signals_are_named(call, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"noise": 0.0}, r"noise: got \[0.0\], expected standard deviations > 0"),
+        ({"noise": 0.0}, r"noise: got 0 of y1, expected a standard deviation > 0 of each"),
         ({"drift": [1.0, 2.0]}, r"drift: got shape \(2,\) or NaN, expected a number, or one for"),
     ],
 )

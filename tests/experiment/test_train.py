@@ -7,6 +7,7 @@ import json
 import math
 import re
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -690,10 +691,14 @@ def test_missing_keys_of_a_gymnasium_task_are_named(tmp_path, monkeypatch, overr
 # --- Progress -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("quiet", [False, True])
-def test_bars_name_the_first_evaluation_and_the_search(tmp_path, capsys, quiet):
+@pytest.mark.parametrize(("terminal", "quiet"), [(True, False), (True, True), (False, False)])
+def test_bars_name_the_first_evaluation_and_the_search(
+    tmp_path, capsys, monkeypatch, terminal, quiet
+):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     cfg = make_config(*TINY, "gate=true", "search.H_u=0.5", "search.loops=2", "logger=csv")
     train.train(cfg, str(tmp_path), quiet=quiet)
     shown = capsys.readouterr().err
     for line in ("first evaluation:", "start", "true model", "search:"):
-        assert (line in shown) is not quiet, line
+        assert (line in shown) is (terminal and not quiet), line
+    assert (f"{cfg.updates}/{cfg.updates}" in shown) is not quiet

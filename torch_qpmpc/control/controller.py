@@ -417,5 +417,6 @@ def _deviations(name: str, value: Any, default: Array, names: tuple[str, ...]) -
         return default
     vector = read_vector(name, value, names, 0.0)
     if not ((vector > 0) & np.isfinite(vector)).all():
-        raise QPError.expected(name, f"{vector.tolist()}", "standard deviations > 0 of each")
+        got = ", ".join(f"{x:g} of {key}" for key, x in zip(names, vector, strict=True))
+        raise QPError.expected(name, got, "a standard deviation > 0 of each")
     return vector

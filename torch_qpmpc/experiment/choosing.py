@@ -80,7 +80,7 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
     policies = {name: _policy(cfg, physics, start) for name, start in named.items()}
     costs = dict.fromkeys(named, torch.zeros(0, dtype=torch.float64))
     steps, left, count, last = dict.fromkeys(named, 0), [*named], FIRST, False
-    with tqdm(desc="starts", leave=False, disable=quiet) as bar:
+    with tqdm(desc="starts", leave=False, disable=quiet or None) as bar:
 
         def run(name: str, count: int) -> None:
             bar.set_postfix_str(name)

@@ -109,7 +109,7 @@ class Evaluation:
 
         ``J_best`` is that of the learned policy, which is kept, and ``J_final`` that of the last
         candidate. Costs and gap also with discounted costs. Missing values are nan, as for a plant
-        without a true model.
+        without a true model. Each cost is a mean over ``episodes``, of at most ``episode_steps``.
         """
         loops = {"candidate": self.loops["learned"], **self.loops}
         summary: dict[str, Any] = {}
@@ -119,6 +119,7 @@ class Evaluation:
             summary |= {f"{tag}_start": start, f"{tag}_best": best, f"{tag}_final": final}
             summary[f"{tag}_true_model"] = true
             summary[f"closed_gap{suffix}"] = closed_gap(start, best, true)
+        summary["episode_steps"], summary["episodes"] = loops["learned"].costs.shape
         return summary | {"rivals": dict(self.rivals)}
 
 
@@ -136,7 +137,7 @@ def _rivals(cfg: DictConfig, physics: AnyPlant) -> Policies:
 
 def _run(cfg: DictConfig, policies: Policies, quiet: bool) -> dict[str, ClosedLoop]:
     loops = {}
-    with tqdm(policies.items(), "first evaluation", leave=False, disable=quiet) as bar:
+    with tqdm(policies.items(), "first evaluation", leave=False, disable=quiet or None) as bar:
         for name, make in bar:
             bar.set_postfix_str(name)
             loops[name] = evaluate(cfg, *make())

@@ -141,7 +141,7 @@ class RunGate:
             return {}
         actor.load_state_dict(self.kept.state_dict())
         loops, seed = self._cfg.search.loops, self._cfg.seed
-        with tqdm(desc="search", total=loops, leave=False, disable=self._quiet) as bar:
+        with tqdm(desc="search", total=loops, leave=False, disable=self._quiet or None) as bar:
 
             def costs(_: QPMPC, seed: int) -> Tensor:
                 bar.update()

@@ -178,6 +178,8 @@ def table(summary: Mapping[str, Any]) -> str:
         cell = f"  {share}" if math.isnan(gap) else f"{share:>12}"
         start, final, true = map(cost_text, (start, final, true))
         lines.append(f"{name:14}{start:>10}{final:>10}{true:>12}{cell}")
+    episodes, steps = summary["episodes"], summary["episode_steps"]
+    lines.append(f"Mean cost of {episodes:,} episodes of at most {steps:,} steps")
     if rivals := summary["rivals"]:
         width = max(map(len, rivals))
         lines += ["", "J of the rivals"]
