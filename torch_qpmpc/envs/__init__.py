@@ -18,6 +18,7 @@ from torch_qpmpc.envs.plant_gym import PlantGymEnv
 from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.envs.tank_references import TankReferences
 from torch_qpmpc.envs.triple_integrator import TripleIntegrator
+from torch_qpmpc.envs.window_observation import WindowObservation
 
 __all__ = [
     "ARXPlant",
@@ -43,4 +44,5 @@ __all__ = [
     "PointMassGymEnv",
     "TankReferences",
     "TripleIntegrator",
+    "WindowObservation",
 ]

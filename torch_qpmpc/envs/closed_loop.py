@@ -177,21 +177,26 @@ def gymnasium_loop(
     steps = plant.max_steps if steps is None else steps
     _check(policy, steps, starts, seed, gamma)
     envs = [plant.make(steps) for _ in range(starts)]
-    s = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(envs)])
+    resets = [env.reset(seed=seed + i) for i, env in enumerate(envs)]
+    s = np.stack([s for s, _ in resets])
+    # Of a `WindowObservation`; the first step's cost has it, too.
+    waited = np.array([float(info.get("waited", 0.0)) for _, info in resets])
     over = np.zeros(starts, dtype=bool)
     low, high = plant.lb_a.numpy(), plant.ub_a.numpy()
 
     def step(a: Tensor) -> Step:
-        nonlocal s
+        nonlocal s, waited
         applied = a.numpy().clip(low, high)
-        s, cost = s.copy(), np.zeros(starts)
+        s, cost, waited = s.copy(), -waited, np.zeros(starts)
         for i in np.flatnonzero(~over):
             s[i], reward, terminated, truncated, _ = envs[i].step(applied[i].astype(low.dtype))
-            cost[i], over[i] = -float(reward), terminated or truncated
+            cost[i] -= float(reward)
+            over[i] = terminated or truncated
         return _float64(s), _float64(applied), _float64(cost)
 
     shape = starts, len(plant.lb_a)
-    loop = _run(policy, _float64(s), step, steps, shape, gamma)
+    n_y = None if plant.past == 1 else len(plant.lb_s)
+    loop = _run(policy, _float64(s), step, steps, shape, gamma, n_y)
     for env in envs:
         env.close()
     return loop

@@ -5,6 +5,7 @@ Unlike a `LinearSystem` it is a black box: it can only be reset and stepped.
 
 from __future__ import annotations
 
+import copy
 import importlib.util
 from functools import partial
 from typing import Any
@@ -20,6 +21,7 @@ from torch import Tensor
 from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
 
 from torch_qpmpc.checks import check_kind, check_seed, check_tensor, check_whole
+from torch_qpmpc.envs.window_observation import WindowObservation
 from torch_qpmpc.errors import QPError
 
 #: The length of episodes of an environment that has no limit of its own.
@@ -38,7 +40,9 @@ class GymnasiumPlant:
 
     Attributes:
         id, kwargs: the arguments.
-        lb_s, ub_s, lb_a, ub_a: the bounds of its spaces, ``(n_x,)`` and ``(n_u,)``.
+        past: L of the `WindowObservation` in place of the observation, see `windowed`; 1 for none.
+        lb_s, ub_s, lb_a, ub_a: the bounds of its spaces, ``(n_x,)`` and ``(n_u,)``, without a
+            window.
         max_steps: the environment's own ``max_episode_steps``; 200 if it has none.
 
     Raises:
@@ -51,7 +55,7 @@ class GymnasiumPlant:
 
     def __init__(self, id: str, **kwargs: Any) -> None:
         check_kind("task.id", id, str)
-        self.id, self.kwargs = id, kwargs
+        self.id, self.past, self.kwargs = id, 1, kwargs
         try:
             env = self.make()
         except (gymnasium.error.Error, ImportError) as error:
@@ -67,6 +71,13 @@ class GymnasiumPlant:
         self.max_steps = (env.spec and env.spec.max_episode_steps) or STEPS
         env.close()
 
+    def windowed(self, past: int) -> GymnasiumPlant:
+        """Return this plant with a window of ``past`` outputs in place of the observation."""
+        check_whole("past", past, 1)
+        plant = copy.copy(self)
+        plant.past = past
+        return plant
+
     def make(self, max_steps: int | None = None) -> gymnasium.Env[Any, Any]:
         """Make one environment; ``max_steps`` replaces the length of its episodes.
 
@@ -74,7 +85,9 @@ class GymnasiumPlant:
         """
         env = gymnasium.make(self.id, max_episode_steps=max_steps, **self.kwargs)
         env = TransformAction(env, _without_rounding, None)
-        return FlattenObservation(env) if isinstance(env.observation_space, Dict | Tuple) else env
+        if isinstance(env.observation_space, Dict | Tuple):
+            env = FlattenObservation(env)
+        return env if self.past == 1 else WindowObservation(env, self.past)
 
     def _bounds(self, name: str, space: Any) -> tuple[Tensor, Tensor]:
         if not isinstance(space, Box) or len(space.shape) != 1:
@@ -136,8 +149,12 @@ class GymnasiumPlant:
         """Return None, as the plant can only be stepped."""
 
     def violation(self, s: Tensor) -> Tensor:
-        """Return how far s ``(*batch, n_x)`` is outside its space, summed, ``(*batch,)``."""
-        s = check_tensor("s", s, len(self.lb_s)).to(self.lb_s)
+        """Return how far s ``(*batch, n_x)`` is outside its space, summed, ``(*batch,)``.
+
+        Of a window it is the last output.
+        """
+        size = self.past * len(self.lb_s) + (self.past - 1) * len(self.lb_a)
+        s = check_tensor("s", s, size)[..., -len(self.lb_s) :].to(self.lb_s)
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
 
     def violations(self, batch: TensorDictBase) -> Tensor:

@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
+from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.checkpoint import load_checkpoint
@@ -137,8 +138,13 @@ def learning_start(cfg: DictConfig, start: Start | None) -> Start | None:
 
 
 def collect_log(cfg: DictConfig, physics: AnyPlant) -> TensorDict:
-    """Collect ``cfg.start.transitions`` of `Exploration` in the run's environments."""
+    """Collect ``cfg.start.transitions`` of `Exploration` in the run's environments.
+
+    Those of a Gymnasium task have no window: an identification makes its own, from the first steps
+    of an episode on.
+    """
     start = cfg.start
+    physics = physics.windowed(1) if isinstance(physics, GymnasiumPlant) else physics
     env = physics.vectorised(cfg.num_envs, cfg.task.episode_steps, seed=cfg.seed)
     binary = start.levels == "binary"
     explore: Any = Exploration(physics.lb_a, physics.ub_a, start.hold, binary, cfg.seed)

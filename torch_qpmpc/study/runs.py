@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from torch_qpmpc.analysis.model_error import one_step_error, second_moment
 from torch_qpmpc.analysis.report import predictions
 from torch_qpmpc.analysis.structure import NearestModel, nearest_model
-from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import read_metrics, read_summary
@@ -75,7 +75,8 @@ class FinishedRun:
     @cached_property
     def physics(self) -> AnyPlant:
         """The plant, if `has_plant`."""
-        return make_physics(self.cfg)
+        plant = make_physics(self.cfg)
+        return plant.windowed(self.qp.past) if isinstance(plant, GymnasiumPlant) else plant
 
     @cached_property
     def start(self) -> QPMPC:

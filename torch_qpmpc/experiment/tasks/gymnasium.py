@@ -41,6 +41,8 @@ class GymnasiumSettings(TaskSettings):
     eval_steps: Steps  # pyright: ignore[reportIncompatibleVariableOverride]
     #: Take the bounds of the observation space as constraints.
     observation_bounds: Flag
+    #: L of the window of outputs and actions that the QP sees; null for that of the chosen start.
+    past: Annotated[Count | None, Expected("a whole number >= 1, or null")] = 1
     #: Episodes by which a start from data is chosen; 0 for the run's own start.
     start_episodes: Whole = 0
     #: Entries of the observation that are held over the horizon; null for those found in the log.
@@ -80,7 +82,7 @@ def make_plant(cfg: DictConfig) -> GymnasiumPlant:
         remedy = "Name it on the command line with task.id=MODULE:ID, or import it before."
         raise QPError.expected("task.id", got, expected, remedy)
     kwargs: Any = OmegaConf.to_container(OmegaConf.create(cfg.task.get("kwargs") or {}))
-    return GymnasiumPlant(cfg.task.id, **kwargs)
+    return GymnasiumPlant(cfg.task.id, **kwargs).windowed(cfg.task.get("past", 1) or 1)
 
 
 def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
@@ -96,6 +98,9 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
     needed = {"A": (n_x, n_x), "B": (n_x, n_u), "stage_weight": (n_x + n_u, n_x + n_u)}
     spaces = f"{plant.id!r}, whose observation has {n_x} entries and whose action has {n_u}"
     matrices: dict[str, Any] = dict.fromkeys(needed)
+    if plant.past > 1 and cfg.start.name != "data":
+        got, remedy = f"{plant.past} with a model that is given", "Start from data: start=data."
+        raise QPError.expected("task.past", got, "1", remedy)
     for name, shape in needed.items():
         rows = cfg.task[name]
         if rows is not None:

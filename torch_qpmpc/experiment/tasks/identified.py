@@ -77,7 +77,7 @@ def identified_start(cfg: DictConfig, physics: AnyPlant, log: Any) -> Start:
     layout = plant_layout(physics, cfg.task.horizon)
     held = cfg.task.held if "held" in cfg.task else []
     if held is None:
-        held = unmoved(as_log(log).trajectories, cfg.task.horizon)
+        held = unmoved(as_log(log, layout.n_x).trajectories, cfg.task.horizon)
     identified = identified_model(cfg, log, layout, cfg.constraint.structure, held)
     cost = None
     if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is None:

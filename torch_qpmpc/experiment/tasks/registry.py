@@ -123,7 +123,8 @@ def plant_layout(plant: AnyPlant, horizon: int) -> Layout:
     """Return the sizes of the QP of a plant."""
     if isinstance(plant, Plant):
         return Layout(plant.n_y, plant.n_u, horizon, plant.past, plant.n_d)
-    return Layout(len(plant.lb_s), len(plant.lb_a), horizon)
+    past = plant.past if isinstance(plant, GymnasiumPlant) else 1
+    return Layout(len(plant.lb_s), len(plant.lb_a), horizon, past)
 
 
 def plant_scheme(
