@@ -248,8 +248,8 @@ def reference(plant: Outside) -> float:
     return -threshold
 
 
-def run(name: str, seed: int, learn: bool) -> dict[str, Any]:
-    """Start once, and learn if wanted; return the fields of a row."""
+def run(name: str, seed: int) -> dict[str, Any]:
+    """Start once; return the fields of a row."""
     cfg = configuration(name, seed)
     physics: Any = make_physics(cfg)
     began = time.process_time()
@@ -273,15 +273,21 @@ def run(name: str, seed: int, learn: bool) -> dict[str, Any]:
     row |= {"chosen": summary["start"], "choosing": summary["start_transitions"]}
     row |= {"R2_cost": start.cost.best.R2 if start.cost else math.nan}
     row |= {"reference": reference(PLANTS[name]), "transitions": cfg.start.transitions}
-    row |= {"learned": math.nan, "simulated": 0, "seconds": round(seconds, 1)}
-    return row | (_learned(name, seed) if learn else {})
+    return row | {"learned": math.nan, "simulated": 0, "seconds": round(seconds, 1)}
 
 
-def _learned(name: str, seed: int) -> dict[str, Any]:
-    """Learn by the documented command; return J of the policy that is kept, and its transitions."""
+def learned(name: str, seed: int, start: float) -> dict[str, Any]:
+    """Learn by the documented command; return J of the policy that is kept, and its transitions.
+
+    Raises:
+        ValueError: If its start does not cost ``start``, that of the row.
+    """
     cfg = configuration(name, seed, f"eval_seed={EVAL_SEED}", "rivals=false")
     with tempfile.TemporaryDirectory() as folder:
         summary = train.train(cfg, folder, quiet=True)
+    if not math.isclose(summary["J_start"], start, rel_tol=1e-3):
+        message = f"{name}, seed {seed}: the row's start costs {start}, not {summary['J_start']}"
+        raise ValueError(f"{message}; delete the row to repeat it")
     steps = cfg.num_envs * (cfg.warmup_steps + cfg.updates * cfg.steps_per_update)
     entries = {"learned": summary["J_best"], "simulated": summary["simulated"]}
     return entries | {"transitions": cfg.start.transitions + steps}
@@ -323,15 +329,28 @@ def outcomes(rows: Any, tuned: bool) -> str:
     return two_tables([*head, "transitions of the choice", "chosen"], lines, len(head) - 1)
 
 
-def add(path: Path, row: Any) -> None:
-    """Append a row, with six digits."""
-    short: Any = {key: f"{x:.6g}" if isinstance(x, float) else x for key, x in row.items()}
-    new = not path.exists()
-    with path.open("a", newline="", encoding="utf-8") as file:
+def finished(path: Path, name: str, seed: int) -> dict[str, Any] | None:
+    """Return the row of a plant and a seed, if the file has it."""
+    rows: Any = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=FIELDS)
+    mine = rows[(rows["plant"] == name) & (rows["seed"] == seed)]
+    return mine.iloc[0].to_dict() if len(mine) else None
+
+
+def add(path: Path, row: dict[str, Any]) -> None:
+    """Append a row, or put it in the place of the one of its plant and seed."""
+    rows: list[Any] = []
+    if path.exists():
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    # Six digits.
+    short = {key: f"{x:.6g}" if isinstance(x, float) else str(x) for key, x in row.items()}
+    same = [i for i, x in enumerate(rows) if all(x[k] == short[k] for k in ("plant", "seed"))]
+    at = same[0] if same else len(rows)
+    rows[at : at + 1] = [short]
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
-        if new:
-            writer.writeheader()
-        writer.writerow(short)
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def main(arguments: Iterable[str] | None = None) -> None:
@@ -340,7 +359,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--plants", nargs="+", default=[""], help="parts of the plants' names")
-    parser.add_argument("--learn", action="store_true", help="learn, too, which takes hours")
+    parser.add_argument("--learn", action="store_true", help="learn, too, from the same starts")
     parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
     parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
     options = parser.parse_args(None if arguments is None else list(arguments))
@@ -353,11 +372,12 @@ def main(arguments: Iterable[str] | None = None) -> None:
             if importlib.util.find_spec(plant.package) is None:
                 print(f"skipped: {name}, which needs {plant.package}")
                 continue
-            rows: Any = pd.read_csv(options.results) if options.results.exists() else pd.DataFrame()
-            if len(rows) and ((rows["plant"] == name) & (rows["seed"] == seed)).any():
-                continue
-            add(options.results, row := run(name, seed, options.learn))
-            print(*row.values(), flush=True)
+            if (row := finished(options.results, name, seed)) is None:
+                add(options.results, row := run(name, seed))
+                print(*row.values(), flush=True)
+            if options.learn and math.isnan(row["learned"]):
+                add(options.results, row | (new := learned(name, seed, row["start"])))
+                print(name, seed, *new.values(), flush=True)
     rows, text = pd.read_csv(options.results), options.page.read_text(encoding="utf-8")
     for marker, tuned in (("tuned", True), ("others", False)):
         text = replaced(text, outcomes(rows, tuned), marker)
