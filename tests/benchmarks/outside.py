@@ -7,8 +7,8 @@ Each plant is a Gymnasium id, with a shim where its package has none, and its st
 Beside it are zero action, random actions, the start without a choice (``task.start_episodes=0``)
 and the plant's own reference, in the same episodes, which chose nothing. The packages are optional:
 
-    pip install 'gymnasium[mujoco,box2d]' pcgym gym-electric-motor
-    pip install --no-deps controlgym
+    pip install 'gymnasium[mujoco,box2d]' pcgym gym-electric-motor anesthesim
+    pip install --no-deps controlgym building-energy-storage-simulation 'setuptools<81'
 
 Finished rows are kept in docs/results/outside.csv and not repeated; the tables go into
 docs/results/outside.md.
@@ -34,11 +34,13 @@ import numpy as np
 import pandas as pd
 import torch
 from omegaconf import DictConfig
+from scipy.optimize import linprog
 
 import train
 from tests.benchmarks.table import DOCS, two_tables
 from tests.runs import make_config
 from torch_qpmpc.envs.closed_loop import cost_text
+from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.rivals.rival import zero_action
 from torch_qpmpc.experiment.start import make_start
@@ -86,8 +88,10 @@ class Outside(NamedTuple):
     overrides: Sequence[str] = ()
 
 
-# pcgym: the package's examples, with set points that change, and its NMPC with the true model.
+# pcgym: the package's examples and default tasks, and its NMPC with the true model.
 LEVELS = np.repeat
+#: Coefficient of variation and mean length of the first moments of the crystallization.
+CV_LN = (math.sqrt(1800863.2 * 1478.01 / 22995.823**2 - 1), 22995.823 / 1478.01)
 PCGYM: dict[str, dict[str, Any]] = {
     "cstr": {
         "N": 100,
@@ -113,6 +117,33 @@ PCGYM: dict[str, dict[str, Any]] = {
         "a_space": {"low": np.array([5.0, 10.0]), "high": np.array([500.0, 1000.0])},
         "x0": np.array([0.55, 0.3, 0.45, 0.25, 0.4, 0.20, 0.35, 0.15, 0.25, 0.1, 0.3]),
     },
+    "heat_exchanger": {
+        "N": 60,
+        "tsim": 10,
+        "SP": {"Tt8": [320.0] * 60},
+        "r_scale": {"Tt8": 0.01},
+        "o_space": {
+            "low": np.array([*[280.0] * 24, 300.0]),
+            "high": np.array([*[400.0] * 24, 360.0]),
+        },
+        "a_space": {
+            "low": np.array([0.5, 0.5, 340.0, 300.0]),
+            "high": np.array([5.0, 5.0, 360.0, 320.0]),
+        },
+        "x0": np.array([*[350.0, 340.0, 310.0] * 8, 320.0]),
+    },
+    "crystallization": {
+        "N": 60,
+        "tsim": 30,
+        "SP": {"CV": [1.0] * 60, "Ln": [15.0] * 60},
+        "r_scale": {"CV": 100.0, "Ln": 1.0},
+        "o_space": {
+            "low": np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.9, 14.0]),
+            "high": np.array([1e20, 1e20, 1e20, 1e20, 0.5, 2.0, 20.0, 1.1, 16.0]),
+        },
+        "a_space": {"low": np.array([10.0]), "high": np.array([40.0])},
+        "x0": np.array([1478.01, 22995.823, 1800863.2, 248516168.0, 0.15861523, *CV_LN, 1.0, 15.0]),
+    },
 }
 
 
@@ -120,8 +151,24 @@ def pcgym_parameters(model: str) -> dict[str, Any]:
     """Return the arguments of a pcgym environment."""
     common = {"normalise_a": True, "normalise_o": True, "noise": True, "noise_percentage": 0.001}
     own = PCGYM[model]
-    scale = dict.fromkeys(own["SP"], 1e3)
-    return {**own, **common, "r_scale": scale, "model": model, "integration_method": "casadi"}
+    common |= {"r_scale": dict.fromkeys(own["SP"], 1e3), "integration_method": "casadi"}
+    if model == "heat_exchanger":  # make_env cannot make it by its name
+        own = {**own, "custom_model": HeatExchanger()}
+    return {**common, **own, "model": model}
+
+
+class HeatExchanger:
+    """pcgym's heat exchanger, which unpacks what CasADi does not let it unpack."""
+
+    int_method = "casadi"
+
+    def __init__(self) -> None:
+        self.model = import_module("pcgym.model_classes").heat_exchanger()
+        self.info = self.model.info
+
+    def __call__(self, x: Any, u: Any) -> Any:
+        split = import_module("casadi").vertsplit
+        return self.model(split(x), split(u))
 
 
 class PcGym(gymnasium.Wrapper):
@@ -153,6 +200,8 @@ def pcgym_oracle(model: str) -> float:
     parameters = pcgym_parameters(model)
     make_env = import_module("pcgym").make_env
     oracle = import_module("pcgym.oracle").oracle(make_env, pcgym_parameters(model))
+    names, scale = oracle.model_info["states"], parameters["r_scale"]
+    oracle.Q = np.diag([scale.get(name, 0.0) for name in names]) / max(scale.values())
     oracle.env.dt = _Seconds(oracle.env.dt)
     _, inputs = oracle.mpc()
     low, high = (parameters["a_space"][name][:, None] for name in ("low", "high"))
@@ -165,6 +214,10 @@ def pcgym_oracle(model: str) -> float:
         if terminated or truncated:
             break
     return J
+
+
+#: Points of the partial differential equations, so that an episode takes less than a second.
+SIZES = {id: {"n_state": 64} for id in ("convection_diffusion_reaction", "allen_cahn")}
 
 
 class ControlGym(gymnasium.Wrapper):
@@ -181,7 +234,7 @@ def controlgym(plant: str) -> Any:
     """Make a controlgym environment."""
     with warnings.catch_warnings():  # the package turns all warnings into errors
         package, _ = import_module("controlgym"), import_module("controlgym.controllers")
-    return package.make(plant, n_steps=100, action_limit=1.0)
+    return package.make(plant, n_steps=100, action_limit=1.0, **SIZES.get(plant, {}))
 
 
 def controlgym_lqg(plant: str) -> float:
@@ -190,6 +243,61 @@ def controlgym_lqg(plant: str) -> float:
     lqg = import_module("controlgym.controllers").LQG(env)
     costs = [-lqg.run(seed=EVAL_SEED + i) for i in range(32)]
     return float(np.mean(costs))
+
+
+BATTERY, WEEK = "building_energy_storage_simulation", 168  # hours
+
+
+class Battery(gymnasium.Wrapper):
+    """A battery in a building, in a week that NumPy's global generator chooses."""
+
+    def __init__(self) -> None:
+        package = import_module(BATTERY)
+        building = package.BuildingSimulation()
+        super().__init__(package.Environment(building, WEEK, randomize_start_time_step=True))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        if seed is not None:
+            np.random.seed(seed)  # noqa: NPY002 (the package's)
+        return self.env.reset()
+
+
+def battery_plans() -> float:
+    """Return J of linear programs that know each week's loads and prices."""
+    env, costs = Battery(), []
+    low = np.tril(np.ones((WEEK, WEEK)))  # sums of the charge
+    none = np.zeros((WEEK, WEEK))
+    for i in range(32):
+        env.reset(seed=EVAL_SEED + i)
+        building: Any = env.get_wrapper_attr("building_simulation")
+        week = slice(building.start_index, building.start_index + WEEK)
+        net = (building.electricity_load_profile - building.solar_generation_profile)[week]
+        battery, price = building.battery, building.electricity_price[week]
+        most = battery.max_battery_charge_per_timestep
+        # Charge b and energy from the grid, which is at least net + b, and at most net + most.
+        A = np.block([[np.eye(WEEK), -np.eye(WEEK)], [low, none], [-low, none]])
+        b = np.concatenate([-net, np.full(WEEK, battery.capacity), np.zeros(WEEK)])
+        grid = [(0.0, max(0.0, x + most)) for x in net]
+        c = np.concatenate([np.zeros(WEEK), price])
+        costs.append(linprog(c, A, b, bounds=[(-most, most)] * WEEK + grid).fun)
+    return float(np.mean(costs))
+
+
+PROPOFOL = "anesthesim:anesthesim/PropofolControl-v0"
+
+
+def propofol_rule() -> float:
+    """Return J of anesthesim's proportional rule for propofol."""
+    rules = import_module("anesthesim.agents.heuristic").HEURISTIC_MAP
+    rule = rules[PROPOFOL.rpartition(":")[2]]
+    env = gymnasium.make(PROPOFOL, max_episode_steps=GymnasiumPlant(PROPOFOL).max_steps)
+    J, episodes = 0.0, 32
+    for i in range(episodes):
+        s, over = env.reset(seed=EVAL_SEED + i)[0], False
+        while not over:
+            s, reward, terminated, truncated, _ = env.step(rule(s))
+            J, over = J - float(reward), terminated or truncated
+    return J / episodes
 
 
 def _registered(name: str, make: Callable[..., gymnasium.Env], steps: int) -> str:
@@ -226,6 +334,18 @@ PLANTS = {
     "controlgym he1": _controlgym("he1"),
     "controlgym he1, log of short episodes": _controlgym("he1", "task.episode_steps=20"),
     "PMSM, currents": Outside("gym_electric_motor:Cont-CC-PMSM-v0", "gym_electric_motor", False),
+    # Chosen, with their settings, before any of their rows was seen.
+    "controlgym ac5": _controlgym("ac5"),
+    "controlgym he2": _controlgym("he2"),
+    "controlgym umv": _controlgym("umv"),
+    "controlgym convection_diffusion_reaction": _controlgym("convection_diffusion_reaction"),
+    "controlgym allen_cahn": _controlgym("allen_cahn")._replace(reference=None),
+    "pcgym heat_exchanger": _pcgym("heat_exchanger", False),
+    "pcgym crystallization": _pcgym("crystallization", False),
+    "Battery in a building": Outside(
+        _registered("Battery-v0", Battery, WEEK), BATTERY, False, battery_plans
+    ),
+    "Propofol": Outside(PROPOFOL, "anesthesim", False, propofol_rule),
 }
 
 
