@@ -10,8 +10,8 @@ and the plant's own reference, in the same episodes, which chose nothing. The pa
     pip install 'gymnasium[mujoco,box2d]' pcgym gym-electric-motor anesthesim
     pip install --no-deps controlgym building-energy-storage-simulation 'setuptools<81'
 
-Finished rows are kept in docs/results/outside.csv and not repeated; the tables go into
-docs/results/outside.md.
+Finished rows are kept in docs/results/outside.csv and not repeated; ``--learn`` adds to them what
+learning by the default of the command reaches. The tables go into docs/results/outside.md.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc, make_physics, run_code
 from torch_qpmpc.experiment.tasks.identified import identified_start
 from torch_qpmpc.learning.operators import warm_policy
-from torch_qpmpc.study.markdown import replaced
+from torch_qpmpc.study.markdown import replaced, table
 
 PAGE = DOCS / "results" / "outside.md"
 RESULTS = DOCS / "results" / "outside.csv"
@@ -62,7 +62,6 @@ COLUMNS = {
     "random": "random",
     "own": "start without a choice",
     "start": "start",
-    "learned": "learned",
     "reference": "reference",
 }
 #: The module that `gymnasium.make` imports for an id of a shim.
@@ -141,7 +140,11 @@ PCGYM: dict[str, dict[str, Any]] = {
             "low": np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.9, 14.0]),
             "high": np.array([1e20, 1e20, 1e20, 1e20, 0.5, 2.0, 20.0, 1.1, 16.0]),
         },
-        "a_space": {"low": np.array([10.0]), "high": np.array([40.0])},
+        # Changes of the temperature: with random temperatures the simulator itself fails.
+        "a_space": {"low": np.array([-1.0]), "high": np.array([1.0])},
+        "a_delta": True,
+        "a_0": 39.0,
+        "a_space_act": {"low": np.array([10.0]), "high": np.array([40.0])},
         "x0": np.array([1478.01, 22995.823, 1800863.2, 248516168.0, 0.15861523, *CV_LN, 1.0, 15.0]),
     },
 }
@@ -341,7 +344,7 @@ PLANTS = {
     "controlgym convection_diffusion_reaction": _controlgym("convection_diffusion_reaction"),
     "controlgym allen_cahn": _controlgym("allen_cahn")._replace(reference=None),
     "pcgym heat_exchanger": _pcgym("heat_exchanger", False),
-    "pcgym crystallization": _pcgym("crystallization", False),
+    "pcgym crystallization": _pcgym("crystallization", False)._replace(reference=None),
     "Battery in a building": Outside(
         _registered("Battery-v0", Battery, WEEK), BATTERY, False, battery_plans
     ),
@@ -431,22 +434,33 @@ def _random(physics: Any, seed: int) -> Callable[[torch.Tensor], torch.Tensor]:
 
 def outcomes(rows: Any, tuned: bool) -> str:
     """Format the rows of the plants that chose settings or, if not ``tuned``, of the others."""
-    shown = COLUMNS if rows["learned"].notna().any() else {**COLUMNS, "learned": ""}
-    shown = {key: head for key, head in shown.items() if head}
     lines = []
     for name, plant in PLANTS.items():
         runs = rows[rows["plant"] == name]
         if plant.tuned != tuned or not len(runs):
             continue
-        J = [float(runs[key].mean()) for key in shown]
+        J = [float(runs[key].mean()) for key in COLUMNS]
         cells = ["" if math.isnan(x) else cost_text(x) for x in J]
         worse = (runs["excess"] > ERRORS * runs["error"]).sum()
         counts = f"{runs['choosing'].mean():,.0f}"
         chosen = "; ".join(dict.fromkeys(runs["chosen"]))
         tail = [f"{worse} of {len(runs)}", f"{runs['R2_cost'].mean():.2f}", counts, chosen]
         lines.append([name, *cells, *tail])
-    head = ["plant", *shown.values(), "worse than zero action", "R2 of the cost"]
+    head = ["plant", *COLUMNS.values(), "worse than zero action", "R2 of the cost"]
     return two_tables([*head, "transitions of the choice", "chosen"], lines, len(head) - 1)
+
+
+def learning(rows: Any) -> str:
+    """Format the rows that learned: the cost of their starts, and of the policies kept."""
+    lines = []
+    for name in PLANTS:
+        runs = rows[(rows["plant"] == name) & rows["learned"].notna()]
+        if len(runs):
+            J = [cost_text(float(runs[key].mean())) for key in ("start", "learned")]
+            better = (runs["learned"] < runs["start"]).sum()
+            gate = f"{runs['simulated'].mean():,.0f}"
+            lines.append([name, *J, f"{better} of {len(runs)}", gate])
+    return table(["plant", "start", "learned", "better", "transitions of the gate"], lines)
 
 
 def finished(path: Path, name: str, seed: int) -> dict[str, Any] | None:
@@ -499,8 +513,9 @@ def main(arguments: Iterable[str] | None = None) -> None:
                 add(options.results, row | (new := learned(name, seed, row["start"])))
                 print(name, seed, *new.values(), flush=True)
     rows, text = pd.read_csv(options.results), options.page.read_text(encoding="utf-8")
-    for marker, tuned in (("tuned", True), ("others", False)):
-        text = replaced(text, outcomes(rows, tuned), marker)
+    tables = {"tuned": outcomes(rows, True), "others": outcomes(rows, False)}
+    for marker, content in {**tables, "learned": learning(rows)}.items():
+        text = replaced(text, content, marker)
     options.page.write_text(text, encoding="utf-8")
 
 
