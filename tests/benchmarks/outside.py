@@ -89,8 +89,6 @@ class Outside(NamedTuple):
 
 # pcgym: the package's examples and default tasks, and its NMPC with the true model.
 LEVELS = np.repeat
-#: Coefficient of variation and mean length of the first moments of the crystallization.
-CV_LN = (math.sqrt(1800863.2 * 1478.01 / 22995.823**2 - 1), 22995.823 / 1478.01)
 PCGYM: dict[str, dict[str, Any]] = {
     "cstr": {
         "N": 100,
@@ -131,21 +129,13 @@ PCGYM: dict[str, dict[str, Any]] = {
         },
         "x0": np.array([*[350.0, 340.0, 310.0] * 8, 320.0]),
     },
-    "crystallization": {
+    "nonsmooth_control": {
         "N": 60,
-        "tsim": 30,
-        "SP": {"CV": [1.0] * 60, "Ln": [15.0] * 60},
-        "r_scale": {"CV": 100.0, "Ln": 1.0},
-        "o_space": {
-            "low": np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.9, 14.0]),
-            "high": np.array([1e20, 1e20, 1e20, 1e20, 0.5, 2.0, 20.0, 1.1, 16.0]),
-        },
-        # Changes of the temperature: with random temperatures the simulator itself fails.
+        "tsim": 5,
+        "SP": {"X1": [0.0] * 60},
+        "o_space": {"low": np.full(3, -1.0), "high": np.full(3, 1.0)},
         "a_space": {"low": np.array([-1.0]), "high": np.array([1.0])},
-        "a_delta": True,
-        "a_0": 39.0,
-        "a_space_act": {"low": np.array([10.0]), "high": np.array([40.0])},
-        "x0": np.array([1478.01, 22995.823, 1800863.2, 248516168.0, 0.15861523, *CV_LN, 1.0, 15.0]),
+        "x0": np.array([0.8, 0.0, 0.0]),
     },
 }
 
@@ -344,7 +334,7 @@ PLANTS = {
     "controlgym convection_diffusion_reaction": _controlgym("convection_diffusion_reaction"),
     "controlgym allen_cahn": _controlgym("allen_cahn")._replace(reference=None),
     "pcgym heat_exchanger": _pcgym("heat_exchanger", False),
-    "pcgym crystallization": _pcgym("crystallization", False)._replace(reference=None),
+    "pcgym nonsmooth_control": _pcgym("nonsmooth_control", False),
     "Battery in a building": Outside(
         _registered("Battery-v0", Battery, WEEK), BATTERY, False, battery_plans
     ),
