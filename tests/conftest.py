@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import copy
 import ctypes
 import functools
 import gc
+import io
 import os
 import subprocess
 import sys
@@ -10,9 +12,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import pytest
 import torch
+from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from omegaconf import OmegaConf, _utils, base, grammar_parser
 
 import train
 from tests.runs import SMALL, make_config
@@ -23,6 +28,8 @@ from torch_qpmpc.qp.solvers import BACKENDS
 #: What imports and the collection of tests make stays: no garbage is looked for among it.
 gc.disable()
 
+#: Resolution of the tests' figures.
+SMALL_DPI = 40
 COMPILING = pytest.StashKey[subprocess.Popen[bytes]]()
 
 
@@ -88,6 +95,23 @@ def quick_exports() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def quick_configurations() -> Iterator[None]:
+    """Parse each text of a configuration and each interpolation once, not in each composition."""
+    load = OmegaConf.load
+    of_text = functools.cache(lambda text: load(io.StringIO(text)))
+    parse = functools.cache(grammar_parser.parse)
+
+    def load_once(file: Any) -> Any:
+        return copy.deepcopy(of_text(file.read())) if isinstance(file, io.IOBase) else load(file)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OmegaConf, "load", load_once)
+        for module in (base, _utils):
+            patch.setattr(module, "parse", parse)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def no_waiting_for_disks() -> Iterator[None]:
     """Let writes return before the disk has them: no test cuts the power."""
     with pytest.MonkeyPatch.context() as patch:
@@ -97,10 +121,17 @@ def no_waiting_for_disks() -> Iterator[None]:
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_figures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Draw figures without their layout; modules that are marked ``layout`` keep it."""
+    """Draw small figures without their layout; modules that are marked ``layout`` keep both."""
+    save = Figure.savefig
+
+    def save_small(figure: Figure, *arguments: Any, **options: Any) -> None:
+        save(figure, *arguments, **options | {"dpi": SMALL_DPI})
+
     with pytest.MonkeyPatch.context() as patch:
         if request.node.get_closest_marker("layout") is None:
             patch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
+            patch.setattr(Figure, "savefig", save_small)
+            patch.setitem(matplotlib.rcParams, "figure.dpi", SMALL_DPI)
         yield
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.problems import normal, random_mpc, random_states, times
+from tests.problems import normal, times
 from torch_qpmpc import QPError
 from torch_qpmpc.analysis.prediction_form import canonical_matrix, model_form, prediction_form
 from torch_qpmpc.analysis.structure import stage_models
@@ -81,14 +81,6 @@ def test_a_batch_is_its_elements():
             torch.testing.assert_close(getattr(form, part)[i], getattr(alone, part))
 
 
-def test_solutions_of_the_qp_are_predicted():
-    mpc = random_mpc(learn=("H", "c", "C", "b"))
-    states, actions = mpc.predicted(mpc.solve(random_states(8)).z.detach())
-    form = prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b)
-    predicted = form.predict(states[:, 0], actions)
-    torch.testing.assert_close(predicted, states[:, 1:], rtol=1e-6, atol=1e-6)
-
-
 @pytest.mark.parametrize("kind", ["tied", "varying"])
 def test_the_canonical_matrix_of_a_scheme_is_banded_in_any_gauge(kind):
     C_0, b_0 = constraints(kind)
@@ -97,16 +89,6 @@ def test_the_canonical_matrix_of_a_scheme_is_banded_in_any_gauge(kind):
     C, b = canonical_matrix(form, stage_models(form).A)
     torch.testing.assert_close(C, C_0, rtol=0, atol=1e-9)
     torch.testing.assert_close(b, b_0, rtol=0, atol=1e-9)
-
-
-def test_the_canonical_matrix_is_the_same_constraints():
-    C, b = constraints("free")
-    form = prediction_form(C, N_X, N_U, b)
-    canonical = canonical_matrix(form, stage_models(form).A)
-    again = prediction_form(canonical[0], N_X, N_U, canonical[1])
-    for part in ("Phi", "Gamma", "phi"):
-        torch.testing.assert_close(getattr(again, part), getattr(form, part))
-    assert not torch.allclose(canonical[0], C)
 
 
 def _of(kind: str) -> tuple[Tensor, int, int, Tensor]:

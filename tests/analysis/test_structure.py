@@ -119,22 +119,6 @@ def test_defects_of_a_batch():
         torch.testing.assert_close(defect(form_of(C)), torch.stack([defect(f) for f in forms]))
 
 
-def test_a_scheme_in_any_gauge_is_a_scheme():
-    T, offset = normal(N * N_X, N * N_X, seed=1), normal(N_X, seed=2)
-    form = form_of(T @ C_0, -T @ offset.repeat(N))
-    assert causality_defect(form) < 1e-10
-    assert toeplitz_defect(form) < 1e-10
-    found = nearest_model(form)
-    assert found.residual < 1e-9
-    for part, expected in (("A", A), ("B", B), ("offset", offset)):
-        torch.testing.assert_close(getattr(found, part), expected, rtol=0, atol=1e-9)
-    stages = stage_models(form)
-    assert stages.residual.shape == (N,)
-    assert stages.residual.max() < 1e-9
-    torch.testing.assert_close(stages.A, A.expand(N, -1, -1), rtol=0, atol=1e-9)
-    assert markov_order(memory_energies(form)) == 1
-
-
 def test_a_time_varying_scheme_is_markovian_but_no_tied_one():
     A_k, B_k = A + 0.1 * normal(N, N_X, N_X, seed=3), B + 0.1 * normal(N, N_X, N_U, seed=4)
     c_k = normal(N, N_X, seed=5)
@@ -242,10 +226,3 @@ def test_later_actions_are_no_memory():
     assert energies[-1] > 1e-3
     assert markov_order(energies) == math.inf
     assert markov_order(energies, tolerance=1.0) == 1
-
-
-def test_the_first_entry_of_memory_is_explained_by_the_stage_models():
-    form = free_form()
-    size = form.maps[1:, :, :-1].square().sum((-1, -2))
-    left = (stage_models(form).residual.square() * size).sum() / size.sum()
-    assert memory_energies(form)[1:].sum().item() == pytest.approx(left.item(), rel=1e-9)

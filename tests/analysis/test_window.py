@@ -125,6 +125,7 @@ def test_the_canonical_matrix_is_the_same_constraints():
     again = prediction_form(C, N_X, N_U, b, L, N_D)
     for part in ("Phi", "Gamma", "phi"):
         assert_close(getattr(again, part), getattr(form, part))
+    assert not torch.allclose(C, banded_matrix(A, B, N, E), atol=0.01)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import copy
 import importlib
 import warnings
 from dataclasses import fields
-from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.collectors import Collector
-from torchrl.envs import SerialEnv, check_env_specs
 
 import torch_qpmpc.envs
-from tests.staggered import Staggered
+from tests.rollouts import Staggered, collected, network_policy
 from torch_qpmpc.envs import (
     GrosZanonLTI,
     LinearSystem,
@@ -27,7 +22,6 @@ from torch_qpmpc.envs import (
     LinearSystemGymEnv,
     PointMass,
 )
-from torch_qpmpc.errors import QPError
 
 PLANTS = {
     "gaussian": PointMass("gaussian", noise_std=0.1),
@@ -45,27 +39,6 @@ def plant(request: pytest.FixtureRequest) -> LinearSystem:
 
 class StaggeredEnv(Staggered, LinearSystemEnv):
     """A plant whose episodes start at different steps, so that every later reset is partial."""
-
-
-def linear_policy(plant: LinearSystem) -> TensorDictModule:
-    torch.manual_seed(0)
-    n_x, n_u = plant.B.shape
-    net = torch.nn.Sequential(torch.nn.Linear(n_x, n_u), torch.nn.Tanh())
-    return TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
-
-
-def collect(env: LinearSystemEnv, batches: int, steps: int) -> Any:
-    """Collect a TensorDict of ``(num_envs, batches * steps)`` transitions."""
-    collector = Collector(
-        env,
-        linear_policy(env.physics),
-        frames_per_batch=steps * env.batch_size[0],
-        total_frames=batches * steps * env.batch_size[0],
-        auto_register_policy_transforms=False,
-    )
-    data: list[Any] = [batch.clone() for batch in collector]
-    collector.shutdown()
-    return torch.cat(data, dim=1)
 
 
 # --- LinearSystem ------------------------------------------------------------------------------
@@ -155,15 +128,9 @@ def test_gymnasium_environment_follows_the_physics(plant):
 # --- TorchRL -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_torchrl_accepts_the_specs(plant, dtype):
-    check_env_specs(LinearSystemEnv(plant, 3, 50, dtype, seed=0), seed=0)
-    check_env_specs(SerialEnv(2, lambda: LinearSystemEnv(plant, 3, 50, dtype)), seed=0)
-
-
 def test_torchrl_environment_follows_the_physics(plant):
     env = LinearSystemEnv(plant, 5, 50, torch.float64, seed=11)
-    data = env.rollout(50, policy=linear_policy(plant).double())
+    data = env.rollout(50, network_policy(env))
     rng = torch.Generator().manual_seed(11)
     s = plant.starts(rng, 5)
     nu = torch.zeros_like(s)
@@ -181,7 +148,7 @@ def test_torchrl_environment_follows_the_physics(plant):
 
 
 def test_partial_resets_in_a_collector_restart_exactly_the_finished_episodes(plant):
-    data = collect(StaggeredEnv(plant, 8, max_steps=5, seed=2), batches=20, steps=2)
+    data = collected(StaggeredEnv(plant, 8, max_steps=5, seed=2), batches=20, steps=2)
     done = data["next", "done"].squeeze(-1)
     assert done.any(0).all(), "every step ends some episode"
     assert not done.all(0).any(), "no step ends all"
@@ -206,49 +173,3 @@ def test_partial_resets_in_a_collector_restart_exactly_the_finished_episodes(pla
         increments = data["next", "noise"] - data["noise"]
         assert increments.std().item() == pytest.approx(0.1, rel=0.05)
         assert data["next", "noise"].std().item() > 0.13
-
-
-def test_rollouts_depend_on_the_seed_only(plant):
-    def rollout(seed):
-        env = LinearSystemEnv(plant, 4, 50, seed=seed)
-        torch.manual_seed(seed + torch.seed() % 1000)
-        return env.rollout(20, policy=linear_policy(plant))["next", "observation"]
-
-    assert torch.equal(rollout(5), rollout(5))
-    assert not torch.equal(rollout(5), rollout(6))
-
-
-def test_without_a_seed_the_global_generator_decides(plant):
-    def first():
-        torch.manual_seed(9)
-        return LinearSystemEnv(plant, 4, 50).rollout(1)["next", "noise"]
-
-    assert torch.equal(first(), first())
-
-
-def test_saved_generator_continues_the_stream(plant):
-    env = LinearSystemEnv(plant, 4, max_steps=7, seed=1)
-    td, state = env.reset(), env.get_rng_state()
-
-    def rollout(env):
-        return env.rollout(
-            30,
-            linear_policy(plant),
-            auto_reset=False,
-            tensordict=td,
-            break_when_any_done=False,
-        )["observation"]
-
-    expected, other = rollout(env), LinearSystemEnv(plant, 4, max_steps=7, seed=2)
-    assert not torch.equal(rollout(other), expected)
-    other.set_rng_state(state)
-    assert torch.equal(rollout(other), expected)
-    env.set_rng_state(state)
-    assert torch.equal(rollout(copy.deepcopy(env)), expected)
-
-
-def test_bad_sizes_are_an_error(plant):
-    with pytest.raises(QPError, match="num_envs: got 0, expected a whole number >= 1"):
-        LinearSystemEnv(plant, 0, 50)
-    with pytest.raises(QPError, match="max_steps: got -1, expected a whole number >= 1"):
-        LinearSystemEnv(plant, 1, max_steps=-1)

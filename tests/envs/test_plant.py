@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
-from torchrl.collectors import Collector
-from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
+from torchrl.envs import TransformedEnv
 
-from tests.staggered import Staggered
+from tests.rollouts import Staggered, collected, network_policy
 from tests.store import Store
 from torch_qpmpc.envs import PastWindow, PlantEnv
 from torch_qpmpc.errors import QPError
 
 PLANT = Store(horizon=3, past=3)
-
-
-def make_policy(seed: int = 0) -> Any:
-    torch.manual_seed(seed)
-    net = torch.nn.Sequential(torch.nn.Linear(5, 1, dtype=torch.float64), torch.nn.Sigmoid())
-    return TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
 
 
 def make_env(num_envs: int = 4, max_steps: int = 6, seed: int = 0, **options: Any) -> Any:
@@ -32,28 +23,6 @@ def make_env(num_envs: int = 4, max_steps: int = 6, seed: int = 0, **options: An
 
 class StaggeredEnv(Staggered, PlantEnv):
     """A plant whose episodes start at different steps, so that every later reset is partial."""
-
-
-def collect(env: Any, batches: int, steps: int) -> Any:
-    """Collect a TensorDict of ``(num_envs, batches * steps)`` transitions."""
-    collector = Collector(
-        env,
-        make_policy(),
-        frames_per_batch=steps * env.batch_size[0],
-        total_frames=batches * steps * env.batch_size[0],
-        auto_register_policy_transforms=False,
-    )
-    data: list[Any] = [batch.clone() for batch in collector]
-    collector.shutdown()
-    return torch.cat(data, dim=1)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("plant", [PLANT, Store(n_d=0, past=1)], ids=["preview", "none"])
-def test_torchrl_accepts_the_specs(plant, dtype):
-    check_env_specs(PlantEnv(plant, 3, 5, dtype, seed=0), seed=0)
-    check_env_specs(plant.vectorised(3, 5, seed=0), seed=0)
-    check_env_specs(SerialEnv(2, lambda: plant.vectorised(3, 5, seed=0)), seed=0)
 
 
 def test_sizes_are_those_of_what_a_controller_sees():
@@ -66,7 +35,7 @@ def test_sizes_are_those_of_what_a_controller_sees():
 
 def test_transitions_follow_the_plant():
     env = make_env(seed=11, episodes=5)
-    data = env.rollout(6, make_policy())
+    data = env.rollout(6, network_policy(env))
     rng = torch.Generator().manual_seed(11)
     signals = PLANT.signals(rng, 5, 6 + PLANT.horizon + 1)
     x = PLANT.starts(rng, 4)
@@ -99,7 +68,7 @@ def test_actions_are_clipped():
 
 def test_partial_resets_restart_exactly_the_finished_episodes():
     env = StaggeredEnv(PLANT, 6, 5, torch.float64, seed=2)
-    data = collect(TransformedEnv(env, PastWindow(PLANT.past)), batches=15, steps=2)
+    data = collected(TransformedEnv(env, PastWindow(PLANT.past)), batches=15, steps=2)
     done = data["next", "done"].squeeze(-1)
     assert done.any(0).all(), "every step ends some episode"
     assert not done.all(0).any(), "no step ends all"
@@ -114,46 +83,7 @@ def test_partial_resets_restart_exactly_the_finished_episodes():
     assert ((now["collector", "traj_ids"] != then["collector", "traj_ids"]) == ended).all()
 
 
-def test_rollouts_depend_on_the_seed_only():
-    def rollout(seed, reseed=None):
-        env = make_env(seed=seed)
-        if reseed is not None:
-            env.set_seed(reseed)
-        torch.manual_seed(torch.seed() % 1000)
-        return env.rollout(5, make_policy())
-
-    assert (rollout(5) == rollout(5)).all()
-    assert (rollout(6, reseed=5) == rollout(5)).all(), "signals, too"
-    assert not torch.equal(rollout(5)["preview"], rollout(6)["preview"])
-
-
-def test_without_a_seed_the_global_generator_decides():
-    def first():
-        torch.manual_seed(9)
-        return PlantEnv(PLANT, 4, 5).reset()["preview"]
-
-    assert torch.equal(first(), first())
-
-
-def test_saved_generator_continues_the_stream():
-    env = make_env(max_steps=3, seed=1)
-    td, state = env.reset(), env.get_rng_state()
-
-    def rollout(env):
-        options = {"auto_reset": False, "break_when_any_done": False, "tensordict": td.clone()}
-        return env.rollout(9, make_policy(), **options)["observation"]
-
-    expected, other = rollout(env), make_env(max_steps=3, seed=1)
-    assert not torch.equal(rollout(other), expected)
-    other.set_rng_state(state)
-    assert torch.equal(rollout(other), expected)
-    env.set_rng_state(state)
-    assert torch.equal(rollout(copy.deepcopy(env)), expected)
-
-
 def test_bad_arguments_are_an_error():
-    with pytest.raises(QPError, match="num_envs: got 0, expected a whole number >= 1"):
-        PlantEnv(PLANT, 0, 5)
     with pytest.raises(QPError, match="episodes: got 0, expected a whole number >= 1"):
         PlantEnv(PLANT, 1, 5, episodes=0)
     with pytest.raises(QPError, match="plant: got int, expected a Plant"):

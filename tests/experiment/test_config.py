@@ -332,10 +332,9 @@ for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.grow
 @pytest.mark.parametrize("key", KEYS)
 def test_impossible_values_are_rejected_by_name(key):
     assert key in BAD, "a new key: add what it rejects"
-    good = make_config("constraint=combined", *choices_with(key))
+    cfg = make_config("constraint=combined", *choices_with(key))
     for value in BAD[key]:
-        cfg = good.copy()
-        OmegaConf.update(cfg, key, value, force_add=True)
+        OmegaConf.update(cfg, key, value, merge=False, force_add=True)
         sentence = f"{key}: got {value!r}, expected {keys()[key]}."
         with pytest.raises(QPError, match=f"^{re.escape(sentence)}"):
             check_config(cfg)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -26,17 +25,14 @@ from torch_qpmpc.experiment.sweeps import (
 )
 
 ROOT = Path(__file__).parents[2]
-#: The plugin of each launcher but `cores`, which test_docs.py runs, and its settings.
+#: The settings of each launcher but `cores`, which test_docs.py runs.
 LAUNCHERS = {
-    "submitit_local": ("submitit", ["hydra.launcher.cpus_per_task=1"]),
-    "ray": (
-        "ray",
-        [
-            "+hydra.launcher.ray.init.num_cpus=1",
-            "+hydra.launcher.ray.init.include_dashboard=false",
-            "hydra.launcher.ray.init.address=local",
-        ],
-    ),
+    "submitit_local": ["hydra.launcher.cpus_per_task=1"],
+    "ray": [
+        "+hydra.launcher.ray.init.num_cpus=1",
+        "+hydra.launcher.ray.init.include_dashboard=false",
+        "hydra.launcher.ray.init.address=local",
+    ],
 }
 
 
@@ -46,13 +42,16 @@ def arguments(folder: Path, *overrides: str) -> list[str]:
     return [*study, *SMALL, f"hydra.sweep.dir={folder}", *overrides]
 
 
-@pytest.mark.cluster
-@pytest.mark.parametrize("launcher", LAUNCHERS)
-def test_every_launcher_runs_the_study_and_shows_one_line(launcher, tmp_path):
-    package, settings = LAUNCHERS[launcher]
-    if not importlib.util.find_spec(f"hydra_plugins.hydra_{package}_launcher"):
-        pytest.skip(f"hydra-{package}-launcher is not installed, which an extra brings")
-    overrides = arguments(tmp_path, f"hydra/launcher={launcher}", "seed=1,2", *settings)
+@pytest.mark.parametrize(
+    "launcher",
+    [
+        pytest.param("submitit_local", marks=pytest.mark.slow),
+        pytest.param("ray", marks=pytest.mark.ray),
+    ],
+)
+def test_a_launcher_runs_the_study_and_shows_one_line(launcher, tmp_path):
+    launch = (f"hydra/launcher={launcher}", *LAUNCHERS[launcher])
+    overrides = arguments(tmp_path, "seed=1,2", *launch)
     # Ray's workers have a low priority by default and would wait for other tests.
     environment = os.environ | {"PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
     ended = subprocess.run(

@@ -1,1 +1,1 @@
-"""Tables of users' mistakes by kind, each with the beginning of its error message."""
+"""Users' mistakes by kind: the beginnings of error messages, and the calls that end in them."""

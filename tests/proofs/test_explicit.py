@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 from tests.enumeration import double_integrator, enumerated
+from tests.integrator import A, B, integrator
 from torch_qpmpc import QPMPC, QPError, solve_qp
 from torch_qpmpc.proofs import Polytope, SearchTree, explicit_law
 from torch_qpmpc.proofs.plots import law_figure
@@ -17,18 +19,8 @@ from torch_qpmpc.qp.program import QuadraticProgram, Status
 
 pytestmark = pytest.mark.layout
 
-A, B = np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]])
 BOX = Polytope.box([-1.2, -0.8], [1.2, 0.8])
-
-
-def scheme(**options: Any) -> QPMPC:
-    arguments: dict[str, Any] = {
-        "stage_weight": [1.0, 0.5, 0.1],
-        "state_bounds": ([-1.0, -0.5], [1.0, 0.5]),
-        "action_bounds": ([-1.0], [1.0]),
-        "solver": "daqp",
-    }
-    return QPMPC.from_model(A, B, 3, **arguments | options)
+scheme = partial(integrator, stage_weight=[1.0, 0.5, 0.1])
 
 
 def compare(mpc: QPMPC, states: Polytope, **options: Any) -> None:

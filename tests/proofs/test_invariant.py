@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from scipy.optimize import linprog
 
+from tests.integrator import BOX, A, B, integrator
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.proofs import Plant, Polytope, invariant, invariant_set
 
-A, B = np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]])
-BOX = Polytope.box([-1.0, -0.5], [1.0, 0.5])
 NOISE = Polytope.box([-0.01, -0.01], [0.01, 0.01])
 PLANT = Plant.of(A, B, disturbances=NOISE)
+scheme = partial(integrator, state_bounds=None)
 
 
 @pytest.fixture
 def one_gain(monkeypatch):
     """Leave out the candidates of saturated laws, which take longer."""
     monkeypatch.setattr(invariant, "GAINS", (1.0,))
-
-
-def scheme(**options: Any) -> QPMPC:
-    arguments: dict[str, Any] = {
-        "stage_weight": [1.0, 1.0, 0.1],
-        "action_bounds": ([-1.0], [1.0]),
-        "solver": "daqp",
-    }
-    return QPMPC.from_model(A, B, 3, **arguments | options)
 
 
 def bounded(low: float, slack: float) -> QPMPC:

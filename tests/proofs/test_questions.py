@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.integrator import BOX, A, B
+from tests.integrator import integrator as scheme
 from torch_qpmpc import QPMPC, QPError, SolverError
 from torch_qpmpc.proofs import (
     Plant,
@@ -18,20 +20,8 @@ from torch_qpmpc.proofs import (
     questions,
 )
 
-A, B = np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]])
-BOX = Polytope.box([-1.0, -0.5], [1.0, 0.5])
 NOISE = Polytope.box([-0.02, -0.02], [0.02, 0.02])
 BOUNDS: dict[str, Any] = {"lower": BOX.lower, "upper": BOX.upper}
-
-
-def scheme(**options) -> QPMPC:
-    arguments: dict[str, Any] = {
-        "stage_weight": [1.0, 1.0, 0.1],
-        "state_bounds": (BOX.lower, BOX.upper),
-        "action_bounds": ([-1.0], [1.0]),
-        "solver": "daqp",
-    }
-    return QPMPC.from_model(A, B, 3, **arguments | options)
 
 
 def two_actions() -> QPMPC:

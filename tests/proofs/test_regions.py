@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from tests.integrator import BOX, A, B, integrator
 from torch_qpmpc import QPMPC, QPError, SolverError
 from torch_qpmpc.envs import GrosZanonLTI
 from torch_qpmpc.mpc.tightening import BackOff
@@ -23,21 +25,9 @@ from torch_qpmpc.proofs import (
     regions,
 )
 
-A, B = np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]])
-BOX = Polytope.box([-1.0, -0.5], [1.0, 0.5])
 HALF = Polytope.box([-0.5, -0.25], [0.5, 0.25])
 WIDE = Polytope.box([-1.5, -1.5], [1.5, 1.5])
-
-
-def scheme(**options: Any) -> QPMPC:
-    arguments: dict[str, Any] = {
-        "stage_weight": [1.0, 1.0, 0.1],
-        "state_bounds": (BOX.lower, BOX.upper),
-        "action_bounds": ([-1.0], [1.0]),
-        "gamma": 1.0,
-        "solver": "daqp",
-    }
-    return QPMPC.linear_mpc(A, B, 2, **arguments | options)
+scheme = partial(integrator, 2, QPMPC.linear_mpc, gamma=1.0)
 
 
 @pytest.fixture(scope="module")

@@ -6,22 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from tests.integrator import integrator
 from tests.law_code import actions
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.export.library import compiler
 from torch_qpmpc.proofs import Polytope, SearchTree, explicit_law
 
 
-def scheme(state_slack: float) -> QPMPC:
-    return QPMPC.from_model(
-        [[1.0, 0.2], [0.0, 1.0]], [[0.02], [0.2]], 3, stage_weight=[1.0, 0.5, 0.1], solver="daqp",
-        state_bounds=([-1.0, -0.5], [1.0, 0.5]), action_bounds=([-1.0], [1.0]),
-        state_slack=state_slack,
-    )  # fmt: skip
-
-
 def built(state_slack: float = 2.0) -> SearchTree:
-    law = explicit_law(scheme(state_slack), Polytope.box([-1.2, -0.8], [1.2, 0.8]))
+    mpc = integrator(stage_weight=[1.0, 0.5, 0.1], state_slack=state_slack)
+    law = explicit_law(mpc, Polytope.box([-1.2, -0.8], [1.2, 0.8]))
     return SearchTree.of(law)
 
 

@@ -71,9 +71,6 @@ class ActuatorNoise(Plant):
         """Draw start states ``(count, 2)`` uniform in [-1, 1]."""
         return 2 * uniform(rng, count, 2) - 1
 
-    def output(self, x: Tensor, w: Tensor) -> Tensor:
-        return x
-
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         v = torch.cat((x, u), -1)
         return 0.5 * ((v @ self.W) * v).sum(-1)

@@ -73,9 +73,6 @@ class Inventory(Plant):
         """Return the mean demand in stock and on order, ``(count, 2)``; nothing is drawn."""
         return self.lb_a.new_full((count, 2), self.mean)
 
-    def output(self, x: Tensor, w: Tensor) -> Tensor:
-        return x
-
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         stock = x[..., 0]
         return self.holding * stock.relu() + self.backlog * (-stock).relu()

@@ -79,9 +79,9 @@ class Plant(ABC):
     def starts(self, rng: Rng, count: int) -> Tensor:
         """Draw start states ``(count, n_x)`` from ``rng``."""
 
-    @abstractmethod
     def output(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return y ``(*batch, n_y)`` from x ``(*batch, n_x)`` and w ``(*batch, n_w)``."""
+        """Return y ``(*batch, n_y)`` from x ``(*batch, n_x)`` and w ``(*batch, n_w)``; here x."""
+        return x
 
     @abstractmethod
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:

@@ -123,9 +123,6 @@ class TankReferences(Plant):
         """Draw start states ``(count, 4)`` uniform in [0, 16], from where no bound need be hit."""
         return 16 * uniform(rng, count, 4)
 
-    def output(self, x: Tensor, w: Tensor) -> Tensor:
-        return x
-
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         Q, R = self.weights()
         tracking = (x - self.target(w)).square() @ Q + u.square() @ R

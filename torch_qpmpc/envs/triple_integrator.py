@@ -56,9 +56,6 @@ class TripleIntegrator(Plant):
         """Draw start states ``(count, 3)`` uniform within `REACH`."""
         return (2 * uniform(rng, count, 3) - 1) * self.A.new_tensor(REACH)
 
-    def output(self, x: Tensor, w: Tensor) -> Tensor:
-        return x
-
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         v = torch.cat((x, u), -1)
         return 0.5 * ((v @ self.W) * v).sum(-1)

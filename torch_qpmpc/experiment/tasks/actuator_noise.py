@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from omegaconf import DictConfig
 from torch import Tensor
@@ -20,6 +19,7 @@ from torch_qpmpc.experiment.rivals.heavier import heavier
 from torch_qpmpc.experiment.tasks.registry import (
     Task,
     TaskSettings,
+    named,
     plant_layout,
     plant_scheme,
     register,
@@ -85,10 +85,6 @@ def _scheme(cfg: DictConfig, plant: ActuatorNoise, weight: Tensor) -> Scheme:
     return replace(scheme, cost=replace(scheme.cost, terminal_weight=weight[:1, :1]))
 
 
-def _names(plant: ActuatorNoise, d: Tensor) -> dict[str, Any]:
-    return {"outputs": ("position", "velocity")[: plant.n_y], "actions": ("acceleration",)}
-
-
 register(
     Task(
         "actuator_noise",
@@ -98,7 +94,7 @@ register(
         closed_loop=partial(plant_loop, starts=STARTS),
         rivals=heavier(*HEAVIER),
         nominal_scheme=wrong_scheme,
-        episode=_names,
+        episode=named(("position", "velocity"), ("acceleration",)),
         settings=ActuatorNoiseSettings,
         defaults=None,
     )

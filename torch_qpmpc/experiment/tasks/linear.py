@@ -23,8 +23,8 @@ from torch_qpmpc.experiment.tasks.log import (
     Names,
     Pairs,
     Weights,
+    by_name,
     episode,
-    named,
     plant_cost_scheme,
     read_pairs,
     stage_cost,
@@ -165,7 +165,7 @@ def _labels(task: DictConfig, key: str, letter: str, size: int) -> tuple[str, ..
 
 def _vector(task: DictConfig, key: str, names: tuple[str, ...]) -> Tensor:
     """Return the numbers by name under ``key``, zero where there is none."""
-    given = named(task, key, {name: i for i, name in enumerate(names)})
+    given = by_name(task, key, {name: i for i, name in enumerate(names)})
     return torch.tensor([given.get(name, 0.0) for name in names]).double()
 
 

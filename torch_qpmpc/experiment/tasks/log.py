@@ -125,8 +125,8 @@ def stage_cost(
     if not task["Q"]:
         example = f"'task.Q={{{outputs[0]}: 1.0}}'"
         raise QPError.expected("task.Q", "none", f"weights of outputs, such as {example}")
-    targets = named(task, "r", y)
-    for name, weight in named(task, "Q", y).items():
+    targets = by_name(task, "r", y)
+    for name, weight in by_name(task, "Q", y).items():
         row, target = n_d + y[name], targets.get(name, 0.0)
         W[row, row] += 2 * weight
         if isinstance(target, str):
@@ -136,9 +136,9 @@ def stage_cost(
         else:
             q[row] -= 2 * weight * target
             c += weight * target**2
-    for name, weight in named(task, "R", u).items():
+    for name, weight in by_name(task, "R", u).items():
         W[n_d + len(y) + u[name], n_d + len(y) + u[name]] = 2 * weight
-    for name, price in named(task, "linear", u).items():
+    for name, price in by_name(task, "linear", u).items():
         row, column = n_d + len(y) + u[name], _index("linear", price, d)
         W[row, column] = W[column, row] = 1.0
     return StageCost(W, q, c)
@@ -166,7 +166,7 @@ def episode(plant: ARXPlant | LinearPlant, d: Tensor) -> dict[str, Any]:
     return {"outputs": outputs, "actions": actions, "signals": signals}
 
 
-def named(task: Mapping[str, Any], key: str, known: Mapping[str, int]) -> Mapping[str, Any]:
+def by_name(task: Mapping[str, Any], key: str, known: Mapping[str, int]) -> Mapping[str, Any]:
     """Return the mapping under ``key``, whose names are ``known``."""
     chosen = task.get(key) or {}
     for name in chosen:
@@ -189,7 +189,7 @@ def read_pairs(task: DictConfig, key: str, names: Sequence[str], default: Tensor
     """
     index = {name: i for i, name in enumerate(names)}
     bounds = default.clone()
-    for name, pair in named(task, key, index).items():
+    for name, pair in by_name(task, key, index).items():
         if pair[0] > pair[1]:
             got = f"{{{name}: {list(pair)}}}"
             raise QPError.expected(f"task.{key}", got, "the lower number first")

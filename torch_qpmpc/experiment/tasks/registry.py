@@ -162,8 +162,8 @@ def priced(cfg: DictConfig, bounds: Bounds) -> Bounds:
 
 
 def named(outputs: Sequence[str], actions: Sequence[str]) -> Callable[[Any, Tensor], Any]:
-    """Return a `Task.episode` with the names of a plant's signals."""
-    return lambda plant, d: {"outputs": outputs, "actions": actions}
+    """Return a `Task.episode` with the names of a plant's signals; it may hide the last outputs."""
+    return lambda plant, d: {"outputs": outputs[: plant_layout(plant, 1).n_x], "actions": actions}
 
 
 def register(task: Task) -> None:

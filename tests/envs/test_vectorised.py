@@ -1,0 +1,90 @@
+"""What all vectorised environments keep in TorchRL: their specs, and their streams of numbers."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
+
+from tests.rollouts import network_policy
+from tests.store import Store
+from torch_qpmpc.envs import GrosZanonLTI, LinearSystemEnv, PastWindow, PlantEnv, PointMass
+from torch_qpmpc.errors import QPError
+
+
+def windowed(*arguments: Any, **options: Any) -> Any:
+    return TransformedEnv(PlantEnv(Store(past=3), *arguments, **options), PastWindow(3))
+
+
+ENVS = {
+    "gaussian": partial(LinearSystemEnv, PointMass("gaussian")),
+    "brownian": partial(LinearSystemEnv, PointMass("brownian")),
+    "gros_zanon": partial(LinearSystemEnv, GrosZanonLTI()),
+    "preview": partial(PlantEnv, Store()),
+    "no preview": partial(PlantEnv, Store(n_d=0, past=1)),
+    "window": windowed,
+}
+
+
+@pytest.fixture(params=ENVS)
+def make(request: pytest.FixtureRequest) -> Callable[..., Any]:
+    """Return a function that makes each environment in turn."""
+    return ENVS[request.param]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_torchrl_accepts_the_specs(make, dtype):
+    check_env_specs(make(3, 5, dtype=dtype, seed=0), seed=0)
+    check_env_specs(SerialEnv(2, lambda: make(3, 5, dtype=dtype)), seed=0)
+
+
+def test_rollouts_depend_on_the_seed_only(make):
+    def rollout(seed, reseed=None):
+        env = make(4, 6, seed=seed)
+        if reseed is not None:
+            env.set_seed(reseed)
+        policy = network_policy(env)
+        torch.seed()
+        return env.rollout(5, policy)
+
+    assert (rollout(5) == rollout(5)).all()
+    assert (rollout(6, reseed=5) == rollout(5)).all()
+    assert not (rollout(5) == rollout(6)).all()
+
+
+def test_without_a_seed_the_global_generator_decides(make):
+    def rollout():
+        torch.manual_seed(9)
+        return make(4, 5).rollout(1)
+
+    assert (rollout() == rollout()).all()
+
+
+def test_saved_generator_continues_the_stream(make):
+    env, other = make(4, 3, seed=1), make(4, 3, seed=1)
+    td, state, policy = env.reset(), env.get_rng_state(), network_policy(env)
+
+    def rollout(env):
+        options = {"auto_reset": False, "break_when_any_done": False, "tensordict": td.clone()}
+        return env.rollout(9, policy, **options)["observation"]
+
+    expected = rollout(env)
+    other.reset()
+    other.rollout(2)
+    assert not torch.equal(rollout(other), expected)
+    for one in (other, env):
+        one.set_rng_state(state)
+        assert torch.equal(rollout(copy.deepcopy(one)), expected)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "said"), [((0, 5), "num_envs: got 0"), ((1, -1), "max_steps: got -1")]
+)
+def test_bad_sizes_are_an_error(make, sizes, said):
+    with pytest.raises(QPError, match=f"{said}, expected a whole number >= 1"):
+        make(*sizes)
