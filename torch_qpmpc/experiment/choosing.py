@@ -19,6 +19,7 @@ from torch_qpmpc.experiment.tasks.choice import MEAN_ACTION, Choice, Row
 from torch_qpmpc.experiment.tasks.identified import Start, identified_model, identified_start
 from torch_qpmpc.experiment.tasks.registry import plant_layout
 from torch_qpmpc.learning.operators import warm_policy
+from torch_qpmpc.mpc.blended import identify_blended
 from torch_qpmpc.mpc.rewards import RewardCost, fit_most
 from torch_qpmpc.mpc.trajectories import valid_steps
 
@@ -62,6 +63,12 @@ def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
                 of = "" if cost is None else f", cost of {cost.variables}"
                 start = own._replace(identified=model, cost=cost)
                 named[f"{structure} C, N={horizon}{of}"] = start
+            if structure == "tied" and horizon > N and _carries_schedule(cfg, physics):
+                blended = identify_blended(own.log, horizon, held=own.identified.options.held)
+                for cost in costs if len(blended.centres) > 1 else ():
+                    of = "" if cost is None else f", cost of {cost.variables}"
+                    start = own._replace(identified=model, cost=cost, blended=blended)
+                    named[f"blended models, N={horizon}{of}"] = start
     u = own.log["action"].flatten(0, -2)[valid_steps(own.log).flatten()].double()
     held = {ZERO_ACTION: zero_action(physics)(u[:1])[0], MEAN_ACTION: u.mean(0)}
     return named | {name: own._replace(held=action) for name, action in held.items()}
@@ -108,6 +115,8 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
     rows = {}
     for name, start in named.items():
         R2 = math.nan if start.held is not None else start.identified.R2[-1].mean().item()
+        if start.blended is not None:
+            R2 = max(start.blended.R2.values())
         J = costs[name]
         rows[name] = Row(R2, len(J), J.mean().item(), _error(J), steps[name], name == chosen)
     return _start(named, Choice(rows))
@@ -128,6 +137,13 @@ def chosen_before(cfg: DictConfig, physics: AnyPlant, log: Any, choice: Choice) 
         if name not in named:
             raise QPError.expected("starts.csv", f"{name!r}", f"one of {', '.join(named)}")
     return _start(named, choice)
+
+
+def _carries_schedule(cfg: DictConfig, physics: AnyPlant) -> bool:
+    """Return True if the run's QP may have a schedule, and all that the run does with it."""
+    layout = plant_layout(physics, cfg.task.horizon)
+    without = cfg.export is None and cfg.back_off is None and cfg.constraint.si is None
+    return without and layout.past == 1 and layout.n_d == 0
 
 
 def _none_held(cfg: DictConfig, start: Start) -> Start | None:

@@ -16,6 +16,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task, plant_layout
+from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
@@ -37,7 +38,8 @@ class Start(NamedTuple):
 
     ``cut`` is the number of the log's episodes that blow up. ``held`` is an action ``(n_u,)`` that
     the policy holds, by a cost of its own; None for the policy of the fitted cost.
-    ``choice`` is the table of starts that it was chosen from, if it was. ``print`` shows ``cut``,
+    ``blended`` are linear models that take the place of the identified one, as a schedule; None for
+    that one. ``choice`` is the table of starts that it was chosen from, if it was. ``print`` shows ``cut``,
     the errors of the model and the cost, and that table.
     """
 
@@ -47,6 +49,7 @@ class Start(NamedTuple):
     cut: int = 0
     held: Tensor | None = None
     choice: Choice | None = None
+    blended: BlendedModel | None = None
 
     def __str__(self) -> str:
         cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
