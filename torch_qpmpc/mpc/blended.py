@@ -143,12 +143,17 @@ class BlendedModel(nn.Module):
         at = torch.cat((s, u), -1).to(A).unsqueeze(-1)
         return Linearised(A, B, ahead - (torch.cat((A, B), -1) @ at).squeeze(-1))
 
-    def constraints(self, s: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
-        """Return C and b of the model linearised at (s, 0), the same in all stages (eq:cband).
+    def constraints(
+        self, s: Tensor, horizon: int, plan: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return C and b of the linearised model (eq:cband), as in a `QuadraticProgram`.
 
         Args:
             s: ``(*batch, n_x)``.
             horizon: N.
+            plan: actions, ``(*batch, N, n_u)``, along whose prediction the model is linearised in
+                each stage, as in sequential quadratic programming. Without them it is linearised at
+                (s, 0), and the same in all stages.
 
         Returns:
             ``(*batch, N n_x, n_z)`` and ``(*batch, N n_x)``.
@@ -156,9 +161,17 @@ class BlendedModel(nn.Module):
         Raises:
             QPError: a shape is wrong.
         """
-        A, B, offset = self.linearised(s)
-        C = for_each(partial(banded_matrix, horizon=horizon), (A, B), (2, 2))
-        return C, -torch.cat([offset] * horizon, -1)
+        if plan is None:
+            stages = [self.linearised(s)] * horizon
+        else:
+            stages, x = [], s
+            for u in check_tensor("plan", plan, horizon, self.n_u).unbind(-2):
+                stages.append(self.linearised(x, u))
+                x = self(x, u)
+        A = torch.stack([stage.A for stage in stages], -3)
+        B = torch.stack([stage.B for stage in stages], -3)
+        b = -torch.cat([stage.offset for stage in stages], -1)
+        return for_each(partial(banded_matrix, horizon=horizon), (A, B), (3, 3)), b
 
     @property
     def arguments(self) -> dict[str, Tensor]:
@@ -186,7 +199,7 @@ class BlendedModel(nn.Module):
         return of_s + of_u + self.offset
 
 
-def scheduled(model: BlendedModel | Mapping[str, Tensor], layout: Layout) -> BlendedModel:
+def schedule_of(model: BlendedModel | Mapping[str, Tensor], layout: Layout) -> BlendedModel:
     """Return a copy of ``model``, which may be its arguments, for a `QPMPC` of sizes ``layout``.
 
     Raises:

@@ -23,7 +23,7 @@ from torch_qpmpc.checks import check_choice, check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.mpc import coordinates, parameters
-from torch_qpmpc.mpc.blended import BlendedModel, scheduled
+from torch_qpmpc.mpc.blended import BlendedModel, schedule_of
 from torch_qpmpc.mpc.cost import check_chosen
 from torch_qpmpc.mpc.identification import identify
 from torch_qpmpc.mpc.model import Model
@@ -38,6 +38,7 @@ from torch_qpmpc.mpc.validation import (
     STRUCTURES,
     as_tensor,
     check_learn,
+    check_one_model,
     check_pair,
     learned_entries,
 )
@@ -198,7 +199,7 @@ class QPMPC(nn.Module):
         self.n_p, self.n_z = self.layout.n_p, self.layout.n_z
         self.hessian, self.structure, self.step = scheme.cost.hessian, structure, step
         self.solver, self.on_failure = solver, on_failure
-        self.schedule = None if schedule is None else scheduled(schedule, self.layout)
+        self.schedule = None if schedule is None else schedule_of(schedule, self.layout)
         with torch.device("cpu"):
             self._start(learn)
         if (device := torch.get_default_device()).type != "cpu":
@@ -466,8 +467,9 @@ class QPMPC(nn.Module):
         With a preview, E ``(n_x, n_d)`` is the third.
 
         Raises:
-            QPError: C is free, and need not contain a model.
+            QPError: C is free, and need not contain a model; or there is a schedule.
         """
+        check_one_model(self)
         if self.structure == "free":
             raise QPError.expected("structure", "'free'", "'tied' or 'varying', which have a model")
         return Banded(self.layout, self.structure == "tied").right_inverse(self.C)

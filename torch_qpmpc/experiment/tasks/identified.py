@@ -38,9 +38,9 @@ class Start(NamedTuple):
 
     ``cut`` is the number of the log's episodes that blow up. ``held`` is an action ``(n_u,)`` that
     the policy holds, by a cost of its own; None for the policy of the fitted cost.
-    ``blended`` are linear models that take the place of the identified one, as a schedule; None for
-    that one. ``choice`` is the table of starts that it was chosen from, if it was. ``print`` shows ``cut``,
-    the errors of the model and the cost, and that table.
+    ``choice`` is the table of starts that it was chosen from, if it was. ``blended`` is the QP's
+    schedule, in the place of the identified model; None without one. ``print`` shows ``cut``, the
+    errors of the model and the cost, and that table.
     """
 
     log: Any
