@@ -230,8 +230,8 @@ def test_files_copies_and_state_dicts_have_the_schedule(model, tmp_path):
         lambda mpc: explicit_law(mpc, Polytope.box([-1.0, -1.0], [1.0, 1.0])),
         read,
         PredictionErrors,
-        lambda mpc: first_order(mpc, *3 * [None], SystemIdentificationPenalty(1.0)),  # pyright: ignore[reportArgumentType]
-        lambda mpc: second_order(mpc, *3 * [None], SystemIdentificationPenalty(1.0)),  # pyright: ignore[reportArgumentType]
+        lambda mpc: first_order(mpc, None, None, None, SystemIdentificationPenalty(1.0)),  # pyright: ignore[reportArgumentType]
+        lambda mpc: second_order(mpc, None, None, None, SystemIdentificationPenalty(1.0)),  # pyright: ignore[reportArgumentType]
     ],
 )
 def test_what_needs_one_model_for_all_states_says_so(use, model):

@@ -116,10 +116,7 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
     chosen = best if _is_less(costs[best] - costs[ZERO_ACTION]) else ZERO_ACTION
     rows = {}
     for name, start in named.items():
-        R2 = math.nan if start.held is not None else start.identified.R2[-1].mean().item()
-        if start.blended is not None:
-            R2 = max(start.blended.R2.values())
-        J = costs[name]
+        R2, J = _R2(start), costs[name]
         rows[name] = Row(R2, len(J), J.mean().item(), _error(J), steps[name], name == chosen)
     return _start(named, Choice(rows))
 
@@ -174,6 +171,20 @@ def _none_held(cfg: DictConfig, start: Start) -> Start | None:
     if start.blended is not None:
         blended = identify_blended(start.log, options.layout.horizon)
     return start._replace(identified=model, blended=blended)
+
+
+def _R2(start: Start) -> float:
+    """Return the share of the outputs' variance that a start predicts; nan if it holds an action.
+
+    It is that over the horizon, in parts of the log that are held out, without outputs held.
+    """
+    if start.held is not None:
+        return math.nan
+    if start.blended is not None:
+        return max(start.blended.R2.values())
+    R2 = start.identified.R2[-1]
+    held = start.identified.options.held
+    return R2[[i for i in range(len(R2)) if i not in held]].mean().item()
 
 
 def _start(named: dict[str, Start], choice: Choice) -> Start:
