@@ -20,11 +20,19 @@ from tests.stops import stop
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment import choosing, evaluation
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.choosing import NONE_HELD, _is_less, choose, chosen_before, starts
+from torch_qpmpc.experiment.choosing import (
+    NONE_HELD,
+    _blended,
+    _is_less,
+    choose,
+    chosen_before,
+    starts,
+)
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log, learning_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.choice import HELD, MEAN_ACTION, STARTS, Choice, Row
+from torch_qpmpc.experiment.tasks.identified import identified_start
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.study.runs import FinishedRun
 
@@ -257,15 +265,15 @@ def turning(monkeypatch):
 @pytest.mark.parametrize(
     "settings",
     [
-        ("gate=true", "optimizer=gauss_newton", "constraint=deviation"),
-        ("gate=act", "constraint=mpc", "release=2"),
+        ("gate=act", "optimizer=gauss_newton", "constraint=mpc", "release=2"),
         ("gate=false", "algo=td3", "constraint=free", "warm_start=false"),
     ],
     ids=" ".join,
 )
 @pytest.mark.usefixtures("turning")
 def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path, monkeypatch, settings):
-    cfg, whole, cut = make_config(*DATA, *settings), tmp_path / "whole", tmp_path / "cut"
+    cfg = make_config(*DATA, "task.start_episodes=2", *settings)
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
     summary = train.train(cfg, str(whole), quiet=True)
     assert summary["start"].startswith("blended models, N=6, cost of")
     run = FinishedRun(whole)
@@ -282,14 +290,12 @@ def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path, monkey
 
 @pytest.mark.usefixtures("turning")
 def test_blended_models_are_no_start_of_a_run_that_needs_one_C():
-    def blended(*overrides: str) -> int:
-        cfg = make_config(*DATA, *overrides)
-        physics = make_physics(cfg)
-        return sum("blended" in name for name in starts(cfg, physics, collect_log(cfg, physics)))
-
-    assert blended() > 0
+    cfg = make_config(*DATA)
+    physics = make_physics(cfg)
+    start = identified_start(cfg, physics, collect_log(cfg, physics))
+    assert _blended(cfg, start, 6) is not None
     for needs in ("export=c", "constraint=si", "constraint=adaptive"):
-        assert blended(needs) == 0, needs
+        assert _blended(make_config(*DATA, needs), start, 6) is None, needs
 
 
 def test_a_run_resumes_with_the_start_that_it_has_chosen(tmp_path, monkeypatch):
