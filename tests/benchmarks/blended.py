@@ -1,7 +1,7 @@
 """Pendulum-v1 by models of a log alone: ``python -m tests.benchmarks.blended``.
 
 Each log has 2,000 random actions, as in the first command of the page of other plants; nothing is
-learned after it. N = 20, the cost is that fitted to the rewards, and J is the mean of 16 episodes.
+learned after it. The cost is that fitted to the rewards, and J is the mean of 16 episodes.
 """
 
 from __future__ import annotations
@@ -46,10 +46,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(11, 16)))
     text = "numbers of centres among which prediction decides"
     parser.add_argument("--centres", type=int, nargs="+", default=list(CENTRES), help=text)
+    parser.add_argument("--horizon", type=int, default=HORIZON, help="N")
     options = parser.parse_args(arguments)
     rows = []
     for seed in options.seeds:
-        cfg = configuration("Pendulum", seed, f"task.horizon={HORIZON}", "task.start_episodes=0")
+        cfg = configuration(
+            "Pendulum", seed, f"task.horizon={options.horizon}", "task.start_episodes=0"
+        )
         physics: Any = make_physics(cfg)
         with tempfile.TemporaryDirectory() as folder:
             start = make_start(cfg, physics, folder, written=False)
@@ -59,7 +62,7 @@ def main(arguments: list[str] | None = None) -> None:
             "zero action": lambda s: s.new_zeros(len(s), 1),
             "linear": mpc.policy,
         }
-        model = identify_blended(start.log, HORIZON, options.centres)
+        model = identify_blended(start.log, options.horizon, options.centres)
         at_s = make_mpc(cfg, physics, start._replace(blended=model))
         policies |= {"at s": at_s.policy, "along the plan": along(mpc, model)}
         episodes = {"starts": STARTS, "seed": EVAL_SEED}

@@ -293,7 +293,10 @@ def test_blended_models_are_no_start_of_a_run_that_needs_one_C():
     cfg = make_config(*DATA)
     physics = make_physics(cfg)
     start = identified_start(cfg, physics, collect_log(cfg, physics))
-    assert _blended(cfg, start, 6) is not None
+    models = _blended(cfg, start, 6)
+    assert models is not None
+    said = f"Linear models at {len(models.centres)} centres, blended, take the place of this one."
+    assert said in str(start._replace(blended=models)).splitlines()
     for needs in ("export=c", "constraint=si", "constraint=adaptive"):
         assert _blended(make_config(*DATA, needs), start, 6) is None, needs
 
