@@ -98,9 +98,9 @@ class QPMPC(nn.Module):
             program; see `torch_qpmpc.mpc.projections`.
         solver, on_failure: see `solve_qp`.
         schedule: a model, as of `identify_blended`, or its arguments, whose linearisation at s
-            takes the place of the scheme's model in V, Q and the policy. C and b are then those of
-            theta plus its change, C_theta + (C(s) - C_0), which is constant for the gradients in
-            theta: what is learned is added to the schedule.
+            takes the place of the scheme's model in V, Q and the policy. Its C(s) and b(s) less
+            those of the scheme are added to those of theta, so that they change with s, and what is
+            learned is added to the schedule.
         options: the arguments of `Scheme.of` by name, if no scheme is passed: those of `Model`,
             `Cost` and `Bounds`, ``blocks`` of `Layout`, ``gamma``, ``start`` and ``seed``. Where A,
             B or ``stage_weight`` is missing, the start is random, of which a `UserWarning` tells
@@ -525,6 +525,8 @@ class QPMPC(nn.Module):
     @serially_if_forked
     def quadratic_program(self, residuals: Mapping[str, Tensor] | None = None) -> QuadraticProgram:
         """Return the current theta as a QuadraticProgram, with discounts (eq:qpH).
+
+        It is that without a schedule, whose changes at s each solve adds.
 
         Args:
             residuals: tensors ``(*batch, ..)``, such as the outputs of a network, that are added to
