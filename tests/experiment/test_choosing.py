@@ -19,11 +19,21 @@ from tests.runs import SMALL, make_config, run_command
 from tests.stops import stop
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment import choosing, evaluation
-from torch_qpmpc.experiment.choosing import NONE_HELD, _is_less, choose, chosen_before, starts
+from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.choosing import (
+    NONE_HELD,
+    _blended,
+    _is_less,
+    choose,
+    chosen_before,
+    starts,
+)
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log, learning_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.choice import HELD, MEAN_ACTION, STARTS, Choice, Row
+from torch_qpmpc.experiment.tasks.identified import identified_start
+from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.study.runs import FinishedRun
 
 
@@ -236,6 +246,59 @@ def test_a_held_action_has_a_cost_of_its_own(hessian):
     assert make_mpc(weighted, physics, blind).policy(s).abs().max() < 1e-12
     difference = mpc.action_value(s, action.expand(8, 1) + 0.5) - mpc.value(s)
     assert_close(difference, (R / 8).expand(8), rtol=1e-4, atol=0)
+
+
+class Turning(Lag):
+    """A lag whose gain changes its sign between the starts and zero."""
+
+    def step(self, action):
+        self.y = 0.95 * self.y + 0.5 * np.cos(self.y) * action
+        return self.y, -(self.y.item() ** 2), False, False, {}
+
+
+@pytest.fixture
+def turning(monkeypatch):
+    make = lambda **kwargs: Turning(**kwargs)  # noqa: E731 (an entry point)
+    monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("gate=act", "optimizer=gauss_newton", "constraint=mpc", "release=2"),
+        ("gate=false", "algo=td3", "constraint=free", "warm_start=false"),
+    ],
+    ids=" ".join,
+)
+@pytest.mark.usefixtures("turning")
+def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path, monkeypatch, settings):
+    cfg = make_config(*DATA, "task.start_episodes=2", *settings)
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    summary = train.train(cfg, str(whole), quiet=True)
+    assert summary["start"].startswith("blended models, N=6, cost of")
+    run = FinishedRun(whole)
+    assert run.policy.schedule is not None
+    assert run.start.schedule is not None
+    J = evaluate(cfg, warm_policy(run.start), run.physics).J
+    assert summary["J_start"] == pytest.approx(J, rel=1e-9)
+    J = evaluate(cfg, warm_policy(run.policy), run.physics).J
+    assert summary["J_best"] == pytest.approx(J, rel=1e-9)
+    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
+    run_command(f"resume={cut}")
+    assert FinishedRun(cut).summary["J_best"] == summary["J_best"]
+
+
+@pytest.mark.usefixtures("turning")
+def test_blended_models_are_no_start_of_a_run_that_needs_one_C():
+    cfg = make_config(*DATA)
+    physics = make_physics(cfg)
+    start = identified_start(cfg, physics, collect_log(cfg, physics))
+    models = _blended(cfg, start, 6)
+    assert models is not None
+    said = f"Linear models at {len(models.centres)} centres, blended, take the place of this one."
+    assert said in str(start._replace(blended=models)).splitlines()
+    for needs in ("export=c", "constraint=si", "constraint=adaptive"):
+        assert _blended(make_config(*DATA, needs), start, 6) is None, needs
 
 
 def test_a_run_resumes_with_the_start_that_it_has_chosen(tmp_path, monkeypatch):

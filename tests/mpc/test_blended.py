@@ -1,7 +1,10 @@
-"""Linear models blended by the observation: their fit, their linearisation, and theta from it."""
+"""Models blended by the observation: fit, linearisation, and the QPMPC that they schedule."""
 
 from __future__ import annotations
 
+import copy
+import pickle
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,12 @@ from torch.testing import assert_close
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPMPC, BlendedModel, QPError
+from torch_qpmpc.analysis.report import read
+from torch_qpmpc.learning.operators import warm_policy
+from torch_qpmpc.learning.penalties import SystemIdentificationPenalty
+from torch_qpmpc.learning.prediction_errors import PredictionErrors
+from torch_qpmpc.learning.updates import first_order, second_order
+from torch_qpmpc.proofs import Polytope, explicit_law
 
 COST: Any = {"stage_weight": [1.0, 1.0, 0.1], "action_bounds": ([-1.0], [1.0]), "solver": "daqp"}
 N = 4
@@ -58,10 +67,11 @@ def test_the_linearisation_is_the_derivative_of_the_model(model):
 
 
 def test_states_and_actions_broadcast(model):
-    mpc = QPMPC.from_data(pendulum_log(), N, **COST)
-    schedule, s, plan = model.schedule(mpc), states(3), torch.rand(3, N, 1).double()
-    assert_close(schedule(s[0], plan), schedule(s[:1].expand(3, 2), plan))
-    assert_close(schedule(s, plan[0]), schedule(s, plan[:1].expand(3, N, 1)))
+    s, plan = states(3), torch.rand(3, N, 1).double()
+    assert_close(model.constraints(s[0], N, plan), model.constraints(s[:1].expand(3, 2), N, plan))
+    assert_close(
+        model.constraints(s, N, plan[0]), model.constraints(s, N, plan[:1].expand(3, N, 1))
+    )
     assert_close(model(s, plan[0, 0]), model(s, plan[:1, 0].expand(3, 1)))
 
 
@@ -104,69 +114,129 @@ def test_a_constant_output_and_repeated_states_have_a_fit():
     assert all(x.isfinite().all() for x in fitted.linearised(torch.ones(3)))
 
 
-@pytest.mark.parametrize("structure", ["tied", "varying", "free"])
-def test_the_schedule_puts_the_model_into_theta(structure, model):
-    mpc = QPMPC.from_data(pendulum_log(), N, structure=structure, **COST)
-    schedule, s = model.schedule(mpc), states()
-    qp = mpc.quadratic_program(schedule(s))
-    z = mpc.solve(s, qp=qp).z
-    x, u = mpc.predicted(z)
+def scheduled(model: BlendedModel, **options: Any) -> QPMPC:
+    return QPMPC.from_data(pendulum_log(), N, **COST | {"schedule": model} | options)
+
+
+@pytest.mark.parametrize(
+    "options", [{"structure": "tied"}, {"structure": "free"}, {"blocks": [1, 3]}]
+)
+def test_the_plan_is_that_of_the_model_at_s(options, model):
+    mpc, s = scheduled(model, **options), states()
+    x, u = mpc.predicted(mpc.solve(s).z)
     A, B, offset = model.linearised(s)
     now = torch.cat((s.unsqueeze(1), x[:, -N:-1]), 1)
     ahead = now @ A.mT + u @ B.mT + offset.unsqueeze(1)
     assert_close(x[:, -N:], ahead, rtol=1e-7, atol=1e-7)
-    one = mpc.policy(s[0], qp=mpc.quadratic_program(schedule(s[0])))
-    assert_close(one, mpc.policy(s, qp=qp)[0])
-    assert not torch.equal(mpc.policy(s, qp=qp), mpc.policy(s))
+    policy = mpc.policy(s)
+    assert_close(mpc.policy(s[0]), policy[0])
+    assert_close(mpc.policy(s, qp=mpc.quadratic_program()), policy)
+    assert_close(warm_policy(mpc)(s), policy)
+    assert_close(mpc.action_value(s, policy), mpc.value(s))
+    plain = QPMPC.from_data(pendulum_log(), N, **COST | options)
+    assert not torch.allclose(plain.policy(s), policy, atol=1e-3)
 
 
-@pytest.mark.parametrize("structure", ["varying", "free"])
-def test_along_a_plan_the_model_is_that_of_each_stage(structure, model):
-    mpc = QPMPC.from_data(pendulum_log(), N, structure=structure, **COST)
-    schedule, s = model.schedule(mpc), states()
-    plan = mpc.predicted(mpc.solve(s, qp=mpc.quadratic_program(schedule(s))).z)[1]
+def test_along_a_plan_the_model_is_that_of_each_stage(model):
+    mpc, s, plan = QPMPC.from_data(pendulum_log(), N, **COST), states(), None
+    change = torch.inf
     for _ in range(10):  # of sequential quadratic programming
-        x, u = mpc.predicted(mpc.solve(s, qp=mpc.quadratic_program(schedule(s, plan))).z)
-        change, plan = (u - plan).abs().max(), u
+        C, b = model.constraints(s, N, plan)
+        qp = replace(mpc.quadratic_program(), C=C, b=b, check_values=False)
+        x, u = mpc.predicted(mpc.solve(s, qp=qp).z)
+        change, plan = torch.inf if plan is None else (u - plan).abs().max(), u
     assert change < 1e-6
+    assert plan is not None
     now = s
     for k in range(N):  # the plan's prediction is the nonlinear model's, once it has converged
         now = model(now, plan[:, k])
         assert_close(x[:, x.shape[1] - N + k], now, rtol=1e-5, atol=1e-5)
 
 
-def test_what_is_learned_is_added_to_the_schedule(model):
-    mpc, s = QPMPC.from_data(pendulum_log(), N, structure="tied", **COST), states()
-    schedule = model.schedule(mpc)
-    start = mpc.quadratic_program(schedule(s)).C
+@pytest.mark.parametrize("structure", ["tied", "free"])
+def test_what_is_learned_is_added_to_the_schedule(structure, model):
+    mpc, s = scheduled(model, structure=structure), states()
+    start = mpc.solve(s).qp
     with torch.no_grad():
         mpc.leaves("C")[0].add_(0.1)
-    moved = mpc.quadratic_program(schedule(s)).C
-    assert_close(moved - start, (mpc.C - mpc.C_0).expand_as(moved))
+    moved = mpc.solve(s).qp
+    assert_close(moved.C - start.C, (mpc.C - mpc.scheme.theta["C"]).expand_as(moved.C))
+    if structure == "tied":
+        mpc.release()
+        assert_close(mpc.solve(s).qp.C, moved.C)
+    mpc.reset_parameters()
+    assert_close(mpc.solve(s).qp.C, start.C)
 
 
-def test_finite_differences_of_the_policy_through_the_schedule(model):
-    mpc = QPMPC.from_data(pendulum_log(), N, structure="tied", **COST | {"action_bounds": None})
-    schedule = model.schedule(mpc)
+@pytest.mark.parametrize("structure", ["tied", "free"])
+def test_finite_differences_of_Q_in_theta_and_gauss_newton_s_step(structure, model):
+    mpc = scheduled(model, structure=structure, learn=["C", "b", "q", "H"])
+    s, a = states(), 0.3 * torch.ones(6, 1).double()
+    Q = mpc.action_value(s, a)
+    slopes = torch.autograd.grad(Q.sum(), [*mpc.parameters()])
+    directions = [torch.randn_like(x) for x in slopes]
+    slope = sum((x * d).sum() for x, d in zip(slopes, directions, strict=True))
 
-    def total(s: Tensor) -> Tensor:
-        return mpc.policy(s, qp=mpc.quadratic_program(schedule(s))).sum()
+    def moved(eps: float) -> Tensor:
+        twin = copy.deepcopy(mpc)
+        with torch.no_grad():
+            for x, d in zip(twin.parameters(), directions, strict=True):
+                x.add_(eps * d)
+            return twin.action_value(s, a).sum()
 
+    difference = (moved(1e-5) - moved(-1e-5)) / 2e-5
+    assert float(slope) == pytest.approx(difference.item(), rel=1e-5)
+    # The ratio of actual to predicted decrease is 1 to first order only with the right gradients.
+    step = qm.GaussNewton(mpc, lr=1e-4, normalise=False).step(s, a, Q.detach() - 1)
+    assert step.ratio == pytest.approx(1, abs=1e-3)
+
+
+def test_finite_differences_of_the_policy_in_s(model):
+    mpc = scheduled(model, structure="tied", action_bounds=None)
     s = states().requires_grad_()
-    (slope,) = torch.autograd.grad(total(s), s)
+    (slope,) = torch.autograd.grad(mpc.policy(s).sum(), s)
     direction, eps = torch.randn_like(s), 1e-5
     with torch.no_grad():
-        difference = (total(s + eps * direction) - total(s - eps * direction)) / (2 * eps)
-    assert (slope * direction).sum().item() == pytest.approx(difference.item(), rel=1e-5)
+        difference = (mpc.policy(s + eps * direction) - mpc.policy(s - eps * direction)).sum()
+    assert (slope * direction).sum().item() == pytest.approx(difference.item() / 2e-5, rel=1e-5)
 
 
-def test_the_state_dict_holds_model_and_schedule(model):
-    mpc = QPMPC.from_data(pendulum_log(), N, **COST)
-    other = qm.identify_blended(pendulum_log(seed=3), 5, centres=len(model.centres)).schedule(mpc)
-    schedule = model.schedule(mpc)
-    other.load_state_dict(schedule.state_dict())
-    assert_close(other(states()), schedule(states()), rtol=0, atol=0)
-    assert "centres=" in str(model)
+def test_files_copies_and_state_dicts_have_the_schedule(model, tmp_path):
+    mpc, s = scheduled(model), states()
+    with torch.no_grad():
+        mpc.leaves("C")[0].mul_(1.01)
+    policy = mpc.policy(s)
+    mpc.save(tmp_path / "mine.qpmpc")
+    twins = [QPMPC.load(tmp_path / "mine.qpmpc"), copy.deepcopy(mpc)]
+    twins.append(pickle.loads(pickle.dumps(mpc)))
+    twins.append(scheduled(qm.identify_blended(pendulum_log(seed=3), 5, len(model.centres))))
+    twins[-1].load_state_dict(mpc.state_dict())
+    for twin in twins:
+        assert torch.equal(twin.policy(s), policy)
+    assert "centres=" in str(mpc)
+    plain = QPMPC.from_data(pendulum_log(), N, **COST)
+    with pytest.raises(QPError, match=r"a state_dict with centres = [0-9]+, expected this module"):
+        plain.load_state_dict(mpc.state_dict())
+    model.offset.add_(1.0)  # the QPMPC has a copy
+    assert torch.equal(mpc.policy(s), policy)
+    model.offset.sub_(1.0)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda mpc: mpc.model(),
+        lambda mpc: mpc.export_c("nowhere"),
+        lambda mpc: explicit_law(mpc, Polytope.box([-1.0, -1.0], [1.0, 1.0])),
+        read,
+        PredictionErrors,
+        lambda mpc: first_order(mpc, None, None, None, SystemIdentificationPenalty(1.0)),  # pyright: ignore[reportArgumentType]
+        lambda mpc: second_order(mpc, None, None, None, SystemIdentificationPenalty(1.0)),  # pyright: ignore[reportArgumentType]
+    ],
+)
+def test_what_needs_one_model_for_all_states_says_so(use, model):
+    with pytest.raises(QPError, match="mpc: got one with a schedule, expected one with the same C"):
+        use(scheduled(model, structure="tied"))
 
 
 @pytest.mark.filterwarnings("ignore:In this log:UserWarning")
@@ -191,26 +261,17 @@ def test_the_state_dict_holds_model_and_schedule(model):
             "trajectories: got known signals d, expected outputs and actions only",
         ),
         (
-            lambda log: qm.identify_blended(log, 3, centres=2).schedule(QPMPC(3, 1, N)),
-            "mpc: got n_x, n_u, past, n_d = .3, 1, 1, 0., expected .* = .2, 1, 1, 0., as the model",
+            lambda log: QPMPC(3, 1, N, schedule=qm.identify_blended(log, 3, centres=2)),
+            "schedule: got n_x, n_u, past, n_d = .2, 1, 1, 0., exp.* = .3, 1, 1, 0., as the QPMPC",
         ),
         (
-            lambda log: qm.identify_blended(log, 3, centres=2).schedule(QPMPC(2, 1, N, past=2)),
-            "mpc: got n_x, n_u, past, n_d = .2, 1, 2, 0.",
+            lambda log: QPMPC(2, 1, N, past=2, schedule=qm.identify_blended(log, 3, centres=2)),
+            "schedule: got n_x, n_u, past, n_d = .2, 1, 1, 0., exp.* = .2, 1, 2, 0., as the QPMPC",
         ),
+        (lambda _: QPMPC(2, 1, N, schedule=1), "schedule: got int, expected a Mapping"),
         (
-            lambda log: qm.identify_blended(log, 3, centres=2).schedule(log),
-            "mpc: got dict, expected a QPMPC",
-        ),
-        (
-            lambda log: qm.identify_blended(log, 3, centres=2).schedule(
-                QPMPC(2, 1, N, structure="tied")
-            )(torch.ones(2), torch.ones(N, 1)),
-            "plan: got a plan for a tied C, expected none. Its stages are equal: use structure=",
-        ),
-        (
-            lambda log: qm.identify_blended(log, 3, centres=2).schedule(QPMPC(2, 1, N))(
-                torch.ones(2), torch.ones(3, 1)
+            lambda log: qm.identify_blended(log, 3, centres=2).constraints(
+                torch.ones(2), N, torch.ones(3, 1)
             ),
             "plan: got shape .3, 1., expected",
         ),

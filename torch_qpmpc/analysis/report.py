@@ -26,6 +26,7 @@ from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
+from torch_qpmpc.mpc.validation import check_one_model
 
 #: A, B, offset and E.
 TrueModel = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -127,7 +128,7 @@ def read(
         at: the state of the policy's gain, ``(n_p,)``; the origin by default.
 
     Raises:
-        QPError: if C has no prediction form, or an argument does not fit.
+        QPError: if C has no prediction form or a schedule, or an argument does not fit.
         SolverError: if the QP has no solution there, and ``mpc.on_failure`` is ``"raise"``.
 
     Example:
@@ -139,6 +140,7 @@ def read(
         (1.0, True, 0.97)
     """
     check_kind("mpc", mpc, QPMPC)
+    check_one_model(mpc)
     true = None if true_model is None else _checked_model(mpc, true_model)
     if at is not None:
         check_tensor("at", at, mpc.n_p, batched=False)

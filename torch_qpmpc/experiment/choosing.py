@@ -19,6 +19,7 @@ from torch_qpmpc.experiment.tasks.choice import MEAN_ACTION, Choice, Row
 from torch_qpmpc.experiment.tasks.identified import Start, identified_model, identified_start
 from torch_qpmpc.experiment.tasks.registry import plant_layout
 from torch_qpmpc.learning.operators import warm_policy
+from torch_qpmpc.mpc.blended import BlendedModel, identify_blended
 from torch_qpmpc.mpc.rewards import RewardCost, fit_most
 from torch_qpmpc.mpc.trajectories import valid_steps
 
@@ -28,6 +29,9 @@ FIRST = 2
 APART = 10**6
 #: The probability with which the chosen start costs less than zero action.
 CONFIDENCE = 0.95
+#: Blended models are among the starts if they leave less than this share of the held-out variance
+#: that one model leaves unexplained.
+CURVED = 0.8
 #: The end of the name of a start whose model holds no output.
 NONE_HELD = ", no output held"
 
@@ -36,8 +40,9 @@ def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
     """Return the starts of a log by name.
 
     They are all combinations of the run's structure or a tied one, the run's horizon or twice of
-    it, and a cost of (y_{k+1}, u_k) if that fits better or one of (y_k, u_k); and those that hold
-    zero action and the log's mean action. The first one is the run's own.
+    it, and a cost of (y_{k+1}, u_k) if that fits better or one of (y_k, u_k); where the plant is
+    nonlinear, models blended from the log with these costs, as a schedule; and those that hold zero
+    action and the log's mean action. The first one is the run's own.
 
     Raises:
         QPError: as in `identified_start`.
@@ -59,9 +64,13 @@ def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
                 held = own.identified.options.held
                 model = identified_model(cfg, own.log, layout, structure, held)
             for cost in costs:
-                of = "" if cost is None else f", cost of {cost.variables}"
                 start = own._replace(identified=model, cost=cost)
-                named[f"{structure} C, N={horizon}{of}"] = start
+                named[f"{structure} C, N={horizon}{_of(cost)}"] = start
+    if (models := _blended(cfg, own, 2 * N)) is not None:
+        # The last model is the tied one of the same horizon, of which only the sizes count.
+        for cost in costs:
+            start = own._replace(identified=model, cost=cost, blended=models)
+            named[f"blended models, N={2 * N}{_of(cost)}"] = start
     u = own.log["action"].flatten(0, -2)[valid_steps(own.log).flatten()].double()
     held = {ZERO_ACTION: zero_action(physics)(u[:1])[0], MEAN_ACTION: u.mean(0)}
     return named | {name: own._replace(held=action) for name, action in held.items()}
@@ -107,8 +116,7 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
     chosen = best if _is_less(costs[best] - costs[ZERO_ACTION]) else ZERO_ACTION
     rows = {}
     for name, start in named.items():
-        R2 = math.nan if start.held is not None else start.identified.R2[-1].mean().item()
-        J = costs[name]
+        R2, J = _R2(start), costs[name]
         rows[name] = Row(R2, len(J), J.mean().item(), _error(J), steps[name], name == chosen)
     return _start(named, Choice(rows))
 
@@ -130,6 +138,27 @@ def chosen_before(cfg: DictConfig, physics: AnyPlant, log: Any, choice: Choice) 
     return _start(named, choice)
 
 
+def _of(cost: RewardCost | None) -> str:
+    """Return the end of a start's name."""
+    return "" if cost is None else f", cost of {cost.variables}"
+
+
+def _blended(cfg: DictConfig, start: Start, horizon: int) -> BlendedModel | None:
+    """Return the models blended from a start's log; None without a use for them.
+
+    They predict held-out steps little better than one model does, or the QP has known signals or a
+    past, or the run needs one C for all states.
+    """
+    layout = start.identified.options.layout
+    if layout.past > 1 or layout.n_d or cfg.export is not None or cfg.back_off is not None:
+        return None
+    if cfg.constraint.si is not None:
+        return None
+    models = identify_blended(start.log, horizon, held=start.identified.options.held)
+    unexplained = {count: 1 - R2 for count, R2 in models.R2.items()}
+    return models if min(unexplained.values()) < CURVED * unexplained[1] else None
+
+
 def _none_held(cfg: DictConfig, start: Start) -> Start | None:
     """Return the start with a model that predicts the outputs that the log has as unmoved.
 
@@ -138,8 +167,24 @@ def _none_held(cfg: DictConfig, start: Start) -> Start | None:
     options = start.identified.options
     if start.held is not None or not options.held or cfg.task.get("held") is not None:
         return None
-    model = identified_model(cfg, start.log, options.layout, options.structure, [])
-    return start._replace(identified=model)
+    model, blended = identified_model(cfg, start.log, options.layout, options.structure, []), None
+    if start.blended is not None:
+        blended = identify_blended(start.log, options.layout.horizon)
+    return start._replace(identified=model, blended=blended)
+
+
+def _R2(start: Start) -> float:
+    """Return the share of the outputs' variance that a start predicts; nan if it holds an action.
+
+    It is that over the horizon, in parts of the log that are held out, without outputs held.
+    """
+    if start.held is not None:
+        return math.nan
+    if start.blended is not None:
+        return max(start.blended.R2.values())
+    R2 = start.identified.R2[-1]
+    held = start.identified.options.held
+    return R2[[i for i in range(len(R2)) if i not in held]].mean().item()
 
 
 def _start(named: dict[str, Start], choice: Choice) -> Start:

@@ -18,6 +18,7 @@ import torch
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.validation import check_one_model
 from torch_qpmpc.qp.pipeline.condensing import ENTERS, null_space
 from torch_qpmpc.qp.program import EVENT_SHAPES, QuadraticProgram, Status, crossed
 from torch_qpmpc.qp.solve import solve_qp
@@ -101,8 +102,10 @@ def make_tables(mpc: QPMPC) -> Tables:
     """Make the tables of the current theta.
 
     Raises:
-        QPError: theta is not finite, has crossed bounds, or its cost is singular on the plan.
+        QPError: theta is not finite, has crossed bounds or a schedule, or its cost is singular on
+            the plan.
     """
+    check_one_model(mpc)
     qp = mpc.quadratic_program()
     H, q, c, C, b, G, lb, ub, w = (x.detach().double().cpu().numpy() for x in qp.tensors())
     _check(qp)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -206,6 +206,8 @@ class GaussNewton(torch.optim.Optimizer):
             root = root * inverse_variance(s, a, solution.value, delta, use).sqrt()
         # The root of a weight scales its pair's row, both its error and its gradient.
         delta = root * delta
+        # Theta's own parts: the change of a schedule is constant in theta.
+        solution = replace(solution, qp=qp)
         blocks = self._blocks(solution, root, None if penalty is None else count * penalty)
         errors, steps, change = self._solve(blocks, delta, count)
         if not (objective(errors, blocks).isfinite() and all(x.isfinite().all() for x in steps)):

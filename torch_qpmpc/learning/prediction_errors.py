@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.validation import check_one_model
 from torch_qpmpc.qp.program import QuadraticProgram
 
 #: The smallest error variance, as a fraction of the output's mean square.
@@ -36,7 +37,7 @@ class PredictionErrors(nn.Module):
         count: the sum of the transitions' weights, at most ``memory``.
 
     Raises:
-        QPError: C is not tied, or a number is out of range.
+        QPError: C is not tied, there is a schedule, or a number is out of range.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -59,6 +60,7 @@ class PredictionErrors(nn.Module):
     def __init__(self, mpc: QPMPC, weight: float = 1.0, memory: int = 1000) -> None:
         super().__init__()
         check_kind("mpc", mpc, QPMPC)
+        check_one_model(mpc)
         if mpc.structure != "tied":
             remedy = "A free C has SystemIdentificationPenalty.curvature."
             raise QPError.expected("mpc", f"structure={mpc.structure!r}", "'tied'", remedy)

@@ -26,6 +26,7 @@ from torch_qpmpc.learning.restoring import restored
 from torch_qpmpc.learning.td_error import invalid_rewards, td_loss, td_metadata
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
+from torch_qpmpc.mpc.validation import check_one_model
 
 Scalars = Mapping[str, Tensor]
 Update = Callable[[TensorDictBase, Tensor | None], tuple[dict[str, Tensor], Scalars]]
@@ -51,7 +52,12 @@ def first_order(
         deviation, si: the penalties on C; None for none.
         actor_due: returns True for an update of actor and critics, False for the critics alone, as
             TD3 delays its actor.
+
+    Raises:
+        QPError: the SI penalty is of one C for all states, and the QPMPC has a schedule.
     """
+    if si is not None:
+        check_one_model(mpc)
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
         with restored(loss_module):
@@ -113,8 +119,10 @@ def second_order(
 
     Raises:
         QPError: the value network has other modules or ``theta_keys``: the step's curvature is that
-            of the QP's own theta.
+            of the QP's own theta. Or the QPMPC has a schedule and an SI penalty.
     """
+    if si is not None:
+        check_one_model(mpc)
     network = _alone(loss_module)
     action = network.in_keys[1]
 

@@ -16,12 +16,14 @@ which the blend of the A_i alone leaves out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from functools import partial
 from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch
+from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 
 from torch_qpmpc.checks import check_kind, check_tensor, check_whole
@@ -31,7 +33,6 @@ from torch_qpmpc.mpc.coordinates import for_each
 from torch_qpmpc.mpc.identification import check_excitation, check_held
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.log import as_log
-from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.predictor import transitions
 from torch_qpmpc.mpc.ridge import ridge
 from torch_qpmpc.mpc.trajectories import Trajectory, folds
@@ -142,16 +143,40 @@ class BlendedModel(nn.Module):
         at = torch.cat((s, u), -1).to(A).unsqueeze(-1)
         return Linearised(A, B, ahead - (torch.cat((A, B), -1) @ at).squeeze(-1))
 
-    def schedule(self, mpc: QPMPC) -> Schedule:
-        """Return the residuals of theta that put this model in the place of that of ``mpc``.
+    def constraints(
+        self, s: Tensor, horizon: int, plan: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return C and b of the linearised model (eq:cband), as in a `QuadraticProgram`.
 
         Args:
-            mpc: the QPMPC, of the model's sizes and without a window or a preview.
+            s: ``(*batch, n_x)``.
+            horizon: N.
+            plan: actions, ``(*batch, N, n_u)``, along whose prediction the model is linearised in
+                each stage, as in sequential quadratic programming. Without them it is linearised at
+                (s, 0), and the same in all stages.
+
+        Returns:
+            ``(*batch, N n_x, n_z)`` and ``(*batch, N n_x)``.
 
         Raises:
-            QPError: it has others.
+            QPError: a shape is wrong.
         """
-        return Schedule(self, mpc)
+        if plan is None:
+            stages = [self.linearised(s)] * horizon
+        else:
+            stages, x = [], s
+            for u in check_tensor("plan", plan, horizon, self.n_u).unbind(-2):
+                stages.append(self.linearised(x, u))
+                x = self(x, u)
+        A = torch.stack([stage.A for stage in stages], -3)
+        B = torch.stack([stage.B for stage in stages], -3)
+        b = -torch.cat([stage.offset for stage in stages], -1)
+        return for_each(partial(banded_matrix, horizon=horizon), (A, B), (3, 3)), b
+
+    @property
+    def arguments(self) -> dict[str, Tensor]:
+        """The arguments of `BlendedModel` by name."""
+        return dict(self.named_buffers())
 
     def extra_repr(self) -> str:
         return f"centres={len(self.centres)}, n_x={self.n_x}, n_u={self.n_u}"
@@ -174,68 +199,20 @@ class BlendedModel(nn.Module):
         return of_s + of_u + self.offset
 
 
-class Schedule(nn.Module):
-    """The residuals of theta that put a model linearised at s in the place of that of a QPMPC.
-
-    They are those from the theta that the QPMPC has when this is made: what is learned later is
-    added to the model. `BlendedModel.schedule` makes one.
-
-    Args:
-        model: the model.
-        mpc: the QPMPC.
+def schedule_of(model: BlendedModel | Mapping[str, Tensor], layout: Layout) -> BlendedModel:
+    """Return a copy of ``model``, which may be its arguments, for a `QPMPC` of sizes ``layout``.
 
     Raises:
-        QPError: the sizes differ, or ``mpc`` has a window or a preview.
+        QPError: it has other sizes, or the QPMPC has a window or a preview.
     """
-
-    def __init__(self, model: BlendedModel, mpc: QPMPC) -> None:
-        super().__init__()
-        check_kind("mpc", mpc, QPMPC)
-        sizes = (mpc.n_x, mpc.n_u, mpc.past, mpc.n_d)
-        if sizes != (want := (model.n_x, model.n_u, 1, 0)):
-            got, expected = (f"n_x, n_u, past, n_d = {x}" for x in (sizes, want))
-            raise QPError.expected("mpc", got, f"{expected}, as the model")
-        self.model, self.horizon = model, mpc.horizon
-        known = mpc.coordinates()
-        self.names = ("A", "B", "b") if "A" in known else ("C", "b")
-        self.tied = "A" in known and known["A"].ndim == 2
-        for name in self.names:
-            self.register_buffer(f"{name}_before", known[name].detach().clone())
-
-    def forward(self, s: Tensor, plan: Tensor | None = None) -> dict[str, Tensor]:
-        """Return residuals by name, an argument of `QPMPC.quadratic_program`.
-
-        Args:
-            s: the states, ``(*batch, n_x)``.
-            plan: actions, ``(*batch, N, n_u)``, along whose prediction the model is linearised in
-                each stage, as in sequential quadratic programming. Without them it is linearised at
-                (s, 0), and the same in all stages.
-
-        Raises:
-            QPError: a shape is wrong, or a tied C, whose stages are equal, gets a plan.
-        """
-        N = self.horizon
-        if plan is None:
-            each = [self.model.linearised(s)] * N
-        else:
-            plan = check_tensor("plan", plan, N, self.model.n_u)
-            if self.tied:
-                remedy = "Its stages are equal: use structure='varying' or 'free'."
-                raise QPError.expected("plan", "a plan for a tied C", "none", remedy)
-            each, x = [], s
-            for u in plan.unbind(-2):
-                each.append(self.model.linearised(x, u))
-                x = self.model(x, u)
-        A, B = (torch.stack([getattr(stage, name) for stage in each], -3) for name in ("A", "B"))
-        b = -torch.stack([stage.offset for stage in each], -2)
-        after = {"A": A, "B": B}
-        if self.tied:
-            after = {name: x[..., 0, :, :] for name, x in after.items()}
-        elif self.names[0] == "C":
-            after = {"C": for_each(partial(banded_matrix, horizon=N), (A, B), (3, 3))}
-        # A tied b has one entry for all stages.
-        after["b"] = b.flatten(-2)[..., : len(self.get_buffer("b_before"))]
-        return {name: after[name] - self.get_buffer(f"{name}_before") for name in self.names}
+    arguments = model.arguments if isinstance(model, BlendedModel) else model
+    check_kind("schedule", arguments, Mapping, "identify_blended returns a BlendedModel.")
+    copy = BlendedModel(**{name: part.detach().clone() for name, part in arguments.items()})
+    sizes = (layout.n_x, layout.n_u, layout.past, layout.n_d)
+    if sizes != (own := (copy.n_x, copy.n_u, 1, 0)):
+        got, expected = (f"n_x, n_u, past, n_d = {x}" for x in (own, sizes))
+        raise QPError.expected("schedule", got, f"{expected}, as the QPMPC")
+    return copy
 
 
 def identify_blended(
@@ -343,15 +320,10 @@ def _centres(z: Tensor, count: int) -> Tensor:
         if distance == 0:
             break
         chosen = torch.cat((chosen, z[farthest].unsqueeze(0)))
-    for _ in range(ITERATIONS):
-        nearest = _distance(z, chosen).argmin(1)
-        members = nn.functional.one_hot(nearest, len(chosen)).to(z)
-        chosen = torch.where(
-            members.any(0).unsqueeze(-1),
-            members.mT @ z / members.sum(0).clamp(min=1).unsqueeze(-1),
-            chosen,
-        )
-    return chosen
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a centre without members stays
+        chosen = kmeans2(z.numpy(), chosen.numpy(), ITERATIONS, minit="matrix")[0]
+    return torch.as_tensor(chosen)
 
 
 def _distance(x: Tensor, y: Tensor) -> Tensor:

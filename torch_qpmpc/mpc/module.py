@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -23,6 +23,7 @@ from torch_qpmpc.checks import check_choice, check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.mpc import coordinates, parameters
+from torch_qpmpc.mpc.blended import BlendedModel, schedule_of
 from torch_qpmpc.mpc.cost import check_chosen
 from torch_qpmpc.mpc.identification import identify
 from torch_qpmpc.mpc.model import Model
@@ -37,6 +38,7 @@ from torch_qpmpc.mpc.validation import (
     STRUCTURES,
     as_tensor,
     check_learn,
+    check_one_model,
     check_pair,
     learned_entries,
 )
@@ -95,6 +97,10 @@ class QPMPC(nn.Module):
             itself, which `project_` corrects after each step, by eigenvalues or by a semidefinite
             program; see `torch_qpmpc.mpc.projections`.
         solver, on_failure: see `solve_qp`.
+        schedule: a model, as of `identify_blended`, or its arguments, whose linearisation at s
+            takes the place of the scheme's model in V, Q and the policy. Its C(s) and b(s) less
+            those of the scheme are added to those of theta, so that they change with s, and what is
+            learned is added to the schedule.
         options: the arguments of `Scheme.of` by name, if no scheme is passed: those of `Model`,
             `Cost` and `Bounds`, ``blocks`` of `Layout`, ``gamma``, ``start`` and ``seed``. Where A,
             B or ``stage_weight`` is missing, the start is random, of which a `UserWarning` tells
@@ -104,6 +110,7 @@ class QPMPC(nn.Module):
         scheme: the `Scheme` that theta starts from.
         layout: its `Layout`.
         C_0: the banded C of the initial model, ``(N n_x, n_z)``.
+        schedule: the `BlendedModel`, a copy of the one passed; None without one.
         n_p: the number of entries of p, (N + 1) n_d + (L - 1) (n_x + n_u) + n_x.
 
     Raises:
@@ -135,6 +142,8 @@ class QPMPC(nn.Module):
     ub: Tensor
     w: Tensor
     C_0: Tensor
+    C_start: Tensor
+    b_start: Tensor
     discount: Tensor
     slack_discount: Tensor
     soft: Tensor
@@ -152,6 +161,7 @@ class QPMPC(nn.Module):
         step: str = CHOLESKY,
         solver: str = "proxqp",
         on_failure: str = "raise",
+        schedule: BlendedModel | Mapping[str, Tensor] | None = None,
     ) -> None: ...
 
     @overload
@@ -173,6 +183,7 @@ class QPMPC(nn.Module):
         step: str = CHOLESKY,
         solver: str = "proxqp",
         on_failure: str = "raise",
+        schedule: BlendedModel | Mapping[str, Tensor] | None = None,
         **options: Any,
     ) -> None:
         super().__init__()
@@ -188,6 +199,7 @@ class QPMPC(nn.Module):
         self.n_p, self.n_z = self.layout.n_p, self.layout.n_z
         self.hessian, self.structure, self.step = scheme.cost.hessian, structure, step
         self.solver, self.on_failure = solver, on_failure
+        self.schedule = None if schedule is None else schedule_of(schedule, self.layout)
         with torch.device("cpu"):
             self._start(learn)
         if (device := torch.get_default_device()).type != "cpu":
@@ -455,8 +467,9 @@ class QPMPC(nn.Module):
         With a preview, E ``(n_x, n_d)`` is the third.
 
         Raises:
-            QPError: C is free, and need not contain a model.
+            QPError: C is free, and need not contain a model; or there is a schedule.
         """
+        check_one_model(self)
         if self.structure == "free":
             raise QPError.expected("structure", "'free'", "'tied' or 'varying', which have a model")
         return Banded(self.layout, self.structure == "tied").right_inverse(self.C)
@@ -512,6 +525,8 @@ class QPMPC(nn.Module):
     @serially_if_forked
     def quadratic_program(self, residuals: Mapping[str, Tensor] | None = None) -> QuadraticProgram:
         """Return the current theta as a QuadraticProgram, with discounts (eq:qpH).
+
+        It is that without a schedule, whose changes at s each solve adds.
 
         Args:
             residuals: tensors ``(*batch, ..)``, such as the outputs of a network, that are added to
@@ -717,7 +732,8 @@ class QPMPC(nn.Module):
         """Return the constructor's arguments besides the scheme."""
         learn = {name: self._masks.get(name, True) for name in self.learned}
         names = ("structure", "step", "solver", "on_failure")
-        return {"learn": learn, **{name: str(getattr(self, name)) for name in names}}
+        options = {"learn": learn, **{name: str(getattr(self, name)) for name in names}}
+        return options if self.schedule is None else options | {"schedule": self.schedule.arguments}
 
     def _identity(self) -> dict[str, Any]:
         """Return what values depend on besides parameters and buffers."""
@@ -730,6 +746,7 @@ class QPMPC(nn.Module):
             "discount_slack": self.scheme.bounds.discount_slack,
             "learn": {name: masks.get(name, True) for name in self.learned},
             "hard rows": digest(self.scheme.theta["w"].isinf()),
+            "centres": None if self.schedule is None else len(self.schedule.centres),
         }
 
     def checked_state(self, state_dict: dict[str, Any], prefix: str) -> dict[str, Any]:
@@ -754,6 +771,8 @@ class QPMPC(nn.Module):
         weights = of_rows if self.scheme.bounds.discount_slack else torch.ones_like(of_rows)
         hardness = torch.where(self.soft, 0.0, torch.inf)
         derived = {"discount": discount, "slack_discount": weights, "hardness": hardness}
+        if self.schedule is not None:
+            derived |= {f"{name}_start": self.scheme.theta[name] for name in ("C", "b")}
         for name, buffer in derived.items():
             self.register_buffer(name, buffer.to(self.C_0), persistent=False)
         if self.layout.blocks:
@@ -789,7 +808,19 @@ class QPMPC(nn.Module):
         qp = self._current_qp(qp)
         n_kept = self.n_p + self.n_u  # V, Q and the policy share one elimination
         fixed = to_dtype(fixed, qp.C.dtype)
+        if self.schedule is not None:
+            qp = self._scheduled(qp, fixed[..., : self.n_p])
         return solve(qp, fixed, n_kept, self.solver, on_failure or self.on_failure, warm_start)
+
+    def _scheduled(self, qp: QuadraticProgram, s: Tensor) -> QuadraticProgram:
+        """Return ``qp`` with the schedule's changes of C and b at s."""
+        assert self.schedule is not None
+        with full_precision(self.C_0):
+            C, b = self.schedule.constraints(s, self.horizon)
+            C, b = C - self.C_start, b - self.b_start
+        held = qp.b.shape[-1] - b.shape[-1]  # rows of blocks
+        C, b = qp.C + F.pad(C, (0, 0, 0, held)), qp.b + F.pad(b, (0, held))
+        return replace(qp, C=C, b=b, check_values=False)
 
     def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:
         """Return u_0 of a solution of V's QP, and tell of a random start the first time."""

@@ -180,7 +180,7 @@ def _initial_theta(scheme: Scheme) -> tuple[Tensor, dict[str, Tensor]]:
     return C_0, theta
 
 
-def check_names(options: Iterable[str], also: Iterable[str] = KEYWORDS) -> None:
+def check_names(options: Iterable[str], also: Iterable[str] = (*KEYWORDS, "schedule")) -> None:
     """Raise `TypeError` unless these are names of arguments of `Scheme.of`, or ``also`` known."""
     own = {x.name for part in (Model, Cost, Bounds) for x in fields(part)}
     check_keywords("QPMPC", options, own | {"blocks", "gamma", "start", "seed", *SIZES, *also})

@@ -65,6 +65,13 @@ def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict
     return masks
 
 
+def check_one_model(mpc: Any) -> None:
+    """Raise `QPError` if a QPMPC has a schedule, so that its C and b differ between states."""
+    if mpc.schedule is not None:
+        got, want = "one with a schedule", "one with the same C and b for all states"
+        raise QPError.expected("mpc", got, want, "Its model at s is mpc.schedule.linearised(s).")
+
+
 def as_tensor(name: str, value: Any) -> Tensor:
     """Convert to a float64 tensor on the CPU; raise `QPError` unless it is finite."""
     tensor = read_numbers(name, value)

@@ -45,6 +45,7 @@ from torch_qpmpc.experiment.tasks.registry import (
     priced,
     register,
 )
+from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import Scheme
 
@@ -81,7 +82,8 @@ def make_mpc(cfg: DictConfig, physics: AnyPlant, start: Start | None = None) -> 
     if start is not None:
         scheme = identified_scheme(cfg, scheme, start)
     masks = task.masks(cfg, physics)
-    return _make(cfg, scheme, {part: masks.get(part, True) for part in learned_parts(cfg)})
+    learn = {part: masks.get(part, True) for part in learned_parts(cfg)}
+    return _make(cfg, scheme, learn, None if start is None else start.blended)
 
 
 def make_true_mpc(cfg: DictConfig, physics: AnyPlant) -> QPMPC | None:
@@ -97,7 +99,12 @@ def true_model(
     return physics.true_model()
 
 
-def _make(cfg: DictConfig, scheme: Scheme, learn: Collection[str]) -> QPMPC:
+def _make(
+    cfg: DictConfig,
+    scheme: Scheme,
+    learn: Collection[str],
+    schedule: BlendedModel | None = None,
+) -> QPMPC:
     if scheme.is_random:
         got = f"{cfg.task.name!r}, whose scheme has no model or no stage weight"
         raise QPError.expected("task.name", got, "a scheme with both", "Or use start=data.")
@@ -112,4 +119,5 @@ def _make(cfg: DictConfig, scheme: Scheme, learn: Collection[str]) -> QPMPC:
         step=cfg.step,
         solver=cfg.solver,
         on_failure="mask",
+        schedule=schedule,
     )

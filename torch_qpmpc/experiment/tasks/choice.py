@@ -31,9 +31,10 @@ NOTHING = (
 class Row(NamedTuple):
     """A start: its prediction, its episodes, and True if it is the ``chosen`` one.
 
-    ``R2`` is the share of the outputs' variance that is predicted N steps ahead, cross-validated,
-    in the mean over the outputs; ``J`` the mean cost of the ``episodes``, ``error`` its standard
-    error, and ``transitions`` at most the number of their steps: those that end early have fewer.
+    ``R2`` is the share of the outputs' variance that is predicted N steps ahead in parts of the log
+    that are held out, in the mean over the outputs that the model does not hold; ``J`` the mean
+    cost of the ``episodes``, ``error`` its standard error, and ``transitions`` at most the number
+    of their steps: those that end early have fewer.
     """
 
     R2: float

@@ -16,6 +16,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task, plant_layout
+from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
@@ -37,8 +38,9 @@ class Start(NamedTuple):
 
     ``cut`` is the number of the log's episodes that blow up. ``held`` is an action ``(n_u,)`` that
     the policy holds, by a cost of its own; None for the policy of the fitted cost.
-    ``choice`` is the table of starts that it was chosen from, if it was. ``print`` shows ``cut``,
-    the errors of the model and the cost, and that table.
+    ``choice`` is the table of starts that it was chosen from, if it was. ``blended`` is the QP's
+    schedule, in the place of the identified model; None without one. ``print`` shows ``cut``, the
+    errors of the model and the cost, and that table.
     """
 
     log: Any
@@ -47,14 +49,17 @@ class Start(NamedTuple):
     cut: int = 0
     held: Tensor | None = None
     choice: Choice | None = None
+    blended: BlendedModel | None = None
 
     def __str__(self) -> str:
         cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
         held, names = self.identified.options.held, self.identified.log.outputs
         known = f"Held at their last value over the horizon: {', '.join(names[i] for i in held)}"
         known += f", as by task.held={[*held]}"
-        parts = (cut if self.cut else None, self.identified, known if held else None)
-        parts += self.cost, self.choice
+        count = 0 if self.blended is None else len(self.blended.centres)
+        blended = f"Linear models at {count} centres, blended, take the place of this one."
+        parts = (cut if self.cut else None, self.identified, blended if count else None)
+        parts += known if held else None, self.cost, self.choice
         return "\n".join(str(part) for part in parts if part is not None)
 
     @property
