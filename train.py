@@ -85,6 +85,7 @@ def _train(
     if cfg.prove is not None:
         check_provable(physics)
     identified = make_start(cfg, physics, folder, written=state is not None, quiet=quiet)
+    physics = physics if identified is None else identified.plant(physics)
     start = make_mpc(cfg, physics, identified)
     evaluation = Evaluation.before(cfg, physics, start, quiet)
     scheme = learning_start(cfg, identified)

@@ -376,9 +376,10 @@ def run(name: str, seed: int) -> dict[str, Any]:
         "zero": zero_action(physics),
         "random": _random(physics, seed),
         "own": warm_policy(make_mpc(cfg, physics, own)),
-        "start": warm_policy(make_mpc(cfg, physics, start)),
     }
     costs = {key: _costs(cfg, physics, policy) for key, policy in policies.items()}
+    plant = start.plant(physics)
+    costs["start"] = _costs(cfg, plant, warm_policy(make_mpc(cfg, plant, start)))
     excess = costs["start"] - costs["zero"]
     row = {"plant": name, "seed": seed, **{key: x.mean().item() for key, x in costs.items()}}
     row |= {"excess": excess.mean().item(), "error": (excess.std() / len(excess) ** 0.5).item()}

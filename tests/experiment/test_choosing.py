@@ -60,6 +60,9 @@ class Lag(gymnasium.Env):
 DATA = (*SMALL, "start=data", "start.transitions=400", "task=gymnasium", "task.id=Lag-v0")
 DATA += ("noise=none", "task.start_episodes=4")
 BOUNDED = "task.observation_bounds=true"
+#: A model of Pendulum-v1.
+GIVEN = ("task.A=[[1,0,0],[0,1,0],[0,0,1]]", "task.B=[[0],[0],[.15]]")
+GIVEN += ("task.stage_weight=[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]",)
 #: Zero action is best: the input does next to nothing and is expensive.
 HOPELESS = (*DATA, "task.kwargs={gain: 0.001, price: 100}")
 
@@ -299,6 +302,58 @@ def test_blended_models_are_no_start_of_a_run_that_needs_one_C():
     assert said in str(start._replace(blended=models)).splitlines()
     for needs in ("export=c", "constraint=si", "constraint=adaptive"):
         assert _blended(make_config(*DATA, needs), start, 6) is None, needs
+
+
+class Swing(Lag):
+    """A swing, of which only the position is measured."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.rate = 0.0
+        return self.y, {}
+
+    def step(self, action):
+        self.rate = 0.97 * self.rate - 0.3 * self.y + 0.5 * action
+        self.y = self.y + 0.3 * self.rate
+        return self.y, -(self.y.item() ** 2), False, False, {}
+
+
+@pytest.fixture
+def swing(monkeypatch):
+    make = lambda **kwargs: Swing(**kwargs)  # noqa: E731 (an entry point)
+    monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
+
+
+@pytest.mark.usefixtures("swing")
+def test_a_run_starts_with_a_window_if_the_observation_hides_a_state(tmp_path, monkeypatch):
+    settings = ("task.eval_steps=30", "task.gamma=1.0", "gate=act")
+    cfg, whole, cut = make_config(*DATA, *settings), tmp_path / "whole", tmp_path / "cut"
+    summary = train.train(cfg, str(whole), quiet=True)
+    assert ", past=3, cost of (y_" in summary["start"]
+    run = FinishedRun(whole)
+    assert run.physics.past == run.policy.past == run.start.past == 3
+    J = evaluate(cfg, warm_policy(run.start), run.physics).J
+    assert summary["J_start"] == pytest.approx(J, rel=1e-9)
+    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
+    run_command(f"resume={cut}")
+    assert FinishedRun(cut).summary["J_best"] == summary["J_best"]
+
+
+@pytest.mark.usefixtures("swing")
+def test_windows_are_no_start_if_the_run_names_its_own_or_episodes_are_short():
+    cfg = make_config(*DATA)
+    physics = make_physics(cfg)
+    log = collect_log(cfg, physics)
+    windows = [name for name in starts(cfg, physics, log) if "past=3" in name]
+    assert len(windows) == 8
+    own = make_config(*DATA, "task.past=1")
+    assert not [name for name in starts(own, make_physics(own), log) if "past" in name]
+    short = make_config(*DATA, "task.episode_steps=2")
+    log = collect_log(short, physics)
+    assert not [name for name in starts(short, physics, log) if "past" in name]
+    given = make_config("task=gymnasium", "task.id=Pendulum-v1", "task.past=2", *GIVEN)
+    with pytest.raises(QPError, match=r"^task.past: got 2 with a model that is given, expected 1"):
+        make_mpc(given, make_physics(given))
 
 
 def test_a_run_resumes_with_the_start_that_it_has_chosen(tmp_path, monkeypatch):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -17,9 +18,9 @@ from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
 from torch_qpmpc.experiment.tasks.choice import MEAN_ACTION, Choice, Row
 from torch_qpmpc.experiment.tasks.identified import Start, identified_model, identified_start
-from torch_qpmpc.experiment.tasks.registry import plant_layout
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.blended import BlendedModel, identify_blended
+from torch_qpmpc.mpc.identification import Identified
 from torch_qpmpc.mpc.rewards import RewardCost, fit_most
 from torch_qpmpc.mpc.trajectories import valid_steps
 
@@ -32,6 +33,9 @@ CONFIDENCE = 0.95
 #: Blended models are among the starts if they leave less than this share of the held-out variance
 #: that one model leaves unexplained.
 CURVED = 0.8
+#: L of the window that is among the starts if the model with it leaves less than this share of the
+#: held-out variance that the model without it leaves unexplained.
+WINDOW, HIDDEN = 3, 0.5
 #: The end of the name of a start whose model holds no output.
 NONE_HELD = ", no output held"
 
@@ -40,9 +44,10 @@ def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
     """Return the starts of a log by name.
 
     They are all combinations of the run's structure or a tied one, the run's horizon or twice of
-    it, and a cost of (y_{k+1}, u_k) if that fits better or one of (y_k, u_k); where the plant is
-    nonlinear, models blended from the log with these costs, as a schedule; and those that hold zero
-    action and the log's mean action. The first one is the run's own.
+    it, and a cost of (y_{k+1}, u_k) if that fits better or one of (y_k, u_k); the same with a
+    window where the observation hides a part of the state; where the plant is nonlinear, models
+    blended from the log with these costs, as a schedule; and those that hold zero action and the
+    log's mean action. The first one is the run's own.
 
     Raises:
         QPError: as in `identified_start`.
@@ -55,21 +60,17 @@ def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
         layout, diagonal = own.identified.options.layout, cfg.task.hessian == "diagonal"
         most = fit_most(own.log, layout, own.cost, diagonal)
         costs += [] if most is None else [most]
-    named = {}
-    for horizon in (N, 2 * N):
-        for structure in dict.fromkeys((cfg.constraint.structure, "tied")):
-            model = own.identified
-            if (horizon, structure) != (N, cfg.constraint.structure):
-                layout = plant_layout(physics, horizon)
-                held = own.identified.options.held
-                model = identified_model(cfg, own.log, layout, structure, held)
-            for cost in costs:
-                start = own._replace(identified=model, cost=cost)
-                named[f"{structure} C, N={horizon}{_of(cost)}"] = start
-    if (models := _blended(cfg, own, 2 * N)) is not None:
-        # The last model is the tied one of the same horizon, of which only the sizes count.
+    models = _models(cfg, own)
+    named = {
+        f"{name}{_of(cost)}": own._replace(identified=model, cost=cost)
+        for name, model in (models | _windowed(cfg, own, models)).items()
+        for cost in costs
+    }
+    if (blended := _blended(cfg, own, 2 * N)) is not None:
+        # Of the tied model only the sizes count.
+        model = models[f"tied C, N={2 * N}"]
         for cost in costs:
-            start = own._replace(identified=model, cost=cost, blended=models)
+            start = own._replace(identified=model, cost=cost, blended=blended)
             named[f"blended models, N={2 * N}{_of(cost)}"] = start
     u = own.log["action"].flatten(0, -2)[valid_steps(own.log).flatten()].double()
     held = {ZERO_ACTION: zero_action(physics)(u[:1])[0], MEAN_ACTION: u.mean(0)}
@@ -93,7 +94,8 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
 
         def run(name: str, count: int) -> None:
             bar.set_postfix_str(name)
-            more = _costs(cfg, physics, policies[name](), len(costs[name]), count)
+            plant = named[name].plant(physics)
+            more = _costs(cfg, plant, policies[name](), len(costs[name]), count)
             costs[name] = torch.cat((costs[name], more.sum(0).nan_to_num(torch.inf, torch.inf)))
             steps[name] += more.numel()
             bar.update()
@@ -136,6 +138,50 @@ def chosen_before(cfg: DictConfig, physics: AnyPlant, log: Any, choice: Choice) 
         if name not in named:
             raise QPError.expected("starts.csv", f"{name!r}", f"one of {', '.join(named)}")
     return _start(named, choice)
+
+
+def _models(cfg: DictConfig, own: Start) -> dict[str, Identified]:
+    """Identify the models of all structures and horizons by name."""
+    N, past = cfg.task.horizon, own.identified.options.layout.past
+    models = {}
+    for horizon in (N, 2 * N):
+        for structure in dict.fromkeys((cfg.constraint.structure, "tied")):
+            name = f"{structure} C, N={horizon}"
+            models[name] = _model(cfg, own, structure, horizon, past)
+    return models
+
+
+def _windowed(
+    cfg: DictConfig, own: Start, models: Mapping[str, Identified]
+) -> dict[str, Identified]:
+    """Return the ``models`` with a window by name.
+
+    There are none if a window predicts held-out steps little better or the run's is given; those
+    for which the log's episodes are too short are left out.
+    """
+    if cfg.task.get("past") is not None:
+        return {}
+    windowed, unexplained = {}, {name: 1 - _explained(model) for name, model in models.items()}
+    first = f"tied C, N={cfg.task.horizon}"
+    for name in (first, *models):
+        options = models[name].options
+        try:
+            model = _model(cfg, own, options.structure, options.layout.horizon, WINDOW)
+        except QPError:
+            continue
+        windowed[f"{name}, past={WINDOW}"] = model
+        if name == first and not 1 - _explained(model) < HIDDEN * unexplained[first]:
+            return {}
+    return windowed
+
+
+def _model(cfg: DictConfig, own: Start, structure: str, horizon: int, past: int) -> Identified:
+    """Identify a model of a start's log; it is the start's if that has the same sizes."""
+    options = own.identified.options
+    layout = replace(options.layout, horizon=horizon, past=past)
+    if (layout, structure) == (options.layout, options.structure):
+        return own.identified
+    return identified_model(cfg, own.log, layout, structure, options.held)
 
 
 def _of(cost: RewardCost | None) -> str:
@@ -182,8 +228,12 @@ def _R2(start: Start) -> float:
         return math.nan
     if start.blended is not None:
         return max(start.blended.R2.values())
-    R2 = start.identified.R2[-1]
-    held = start.identified.options.held
+    return _explained(start.identified)
+
+
+def _explained(model: Identified) -> float:
+    """Return the mean over the outputs, but for those held, of R2 at the end of the horizon."""
+    R2, held = model.R2[-1], model.options.held
     return R2[[i for i in range(len(R2)) if i not in held]].mean().item()
 
 
@@ -196,7 +246,7 @@ def _policy(cfg: DictConfig, physics: AnyPlant, start: Start) -> Callable[[], An
     """Return a function that makes a start's policy for one closed loop."""
     if (action := start.held) is not None:
         return lambda: lambda s: action.expand(len(s), -1)
-    mpc = make_mpc(cfg, physics, start)
+    mpc = make_mpc(cfg, start.plant(physics), start)
     return lambda: warm_policy(mpc)
 
 

@@ -29,7 +29,7 @@ def _is_chosen(id: str) -> str:
 Given = Annotated[Matrix | None, MATRIX]
 
 
-#: The length of episodes; null for the environment's own.
+#: The length of episodes, null for the environment's own; or of a window, null for the start's.
 Steps = Annotated[Count | None, Expected("a whole number >= 1, or null")]
 
 
@@ -42,7 +42,7 @@ class GymnasiumSettings(TaskSettings):
     #: Take the bounds of the observation space as constraints.
     observation_bounds: Flag
     #: L of the window of outputs and actions that the QP sees; null for that of the chosen start.
-    past: Annotated[Count | None, Expected("a whole number >= 1, or null")] = 1
+    past: Steps = None
     #: Episodes by which a start from data is chosen; 0 for the run's own start.
     start_episodes: Whole = 0
     #: Entries of the observation that are held over the horizon; null for those found in the log.
@@ -82,7 +82,7 @@ def make_plant(cfg: DictConfig) -> GymnasiumPlant:
         remedy = "Name it on the command line with task.id=MODULE:ID, or import it before."
         raise QPError.expected("task.id", got, expected, remedy)
     kwargs: Any = OmegaConf.to_container(OmegaConf.create(cfg.task.get("kwargs") or {}))
-    return GymnasiumPlant(cfg.task.id, **kwargs).windowed(cfg.task.get("past", 1) or 1)
+    return GymnasiumPlant(cfg.task.id, **kwargs).windowed(cfg.task.get("past") or 1)
 
 
 def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:

@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.tasks.choice import Choice
@@ -50,6 +51,12 @@ class Start(NamedTuple):
     held: Tensor | None = None
     choice: Choice | None = None
     blended: BlendedModel | None = None
+
+    def plant(self, physics: AnyPlant) -> AnyPlant:
+        """Return ``physics``, whose observation has the window of this start's model."""
+        if not isinstance(physics, GymnasiumPlant):
+            return physics
+        return physics.windowed(self.identified.options.layout.past)
 
     def __str__(self) -> str:
         cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
