@@ -21,7 +21,7 @@ MEAN_ACTION = "mean action of the log"
 #: The starts that hold an action.
 HELD = {ZERO_ACTION, MEAN_ACTION}
 NOTHING = (
-    "No start is shown to cost less than zero action, which is the start. Perhaps no linear scheme "
+    "No start is shown to cost less than zero action, which is the start. Perhaps no scheme "
     "of this log controls the plant: pass a log about the states where the controller is to work "
     "(start.file), one of short episodes if the plant is unstable (task.episode_steps=20), the "
     "plant's own cost (task.stage_weight), or learn a network (algo=td3 algo.actor=mlp)."
