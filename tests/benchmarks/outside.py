@@ -305,9 +305,9 @@ def _pcgym(model: str, tuned: bool) -> Outside:
     return Outside(id, "pcgym", tuned, partial(pcgym_oracle, model))
 
 
-def _controlgym(plant: str, *overrides: str) -> Outside:
+def _controlgym(plant: str, *overrides: str, tuned: bool = False) -> Outside:
     id = _registered(f"Controlgym-{plant}-v0", partial(ControlGym, plant), 100)
-    return Outside(id, "controlgym", bool(overrides), partial(controlgym_lqg, plant), overrides)
+    return Outside(id, "controlgym", tuned, partial(controlgym_lqg, plant), overrides)
 
 
 LUNAR = ("task.kwargs={continuous: true}",)
@@ -322,10 +322,12 @@ PLANTS = {
     "Mountain car": Outside("MountainCarContinuous-v0", "gymnasium", False),
     "Lunar lander": Outside("LunarLander-v3", "Box2D", True, None, LUNAR),
     "Swimmer": Outside("Swimmer-v5", "mujoco", False),
-    "controlgym psm": _controlgym("psm"),
-    "controlgym dis1": _controlgym("dis1"),
-    "controlgym he1": _controlgym("he1"),
-    "controlgym he1, log of short episodes": _controlgym("he1", "task.episode_steps=20"),
+    "controlgym psm": _controlgym("psm", tuned=True),
+    "controlgym dis1": _controlgym("dis1", tuned=True),
+    "controlgym he1": _controlgym("he1", tuned=True),
+    "controlgym he1, log of short episodes": _controlgym(
+        "he1", "task.episode_steps=20", tuned=True
+    ),
     "PMSM, currents": Outside("gym_electric_motor:Cont-CC-PMSM-v0", "gym_electric_motor", False),
     # Chosen, with their settings, before any of their rows was seen.
     "controlgym ac5": _controlgym("ac5"),

@@ -37,7 +37,7 @@ def test_the_window_has_past_outputs_and_actions():
     env = WindowObservation(Sum(), 3)
     window, info = env.reset(seed=0)
     assert window.tolist() == [10, 0, 11, 0, 12]
-    assert info == {"first": False, "waited": -11.0 - 12.0}
+    assert (info, env.waited) == ({"first": False}, -11.0 - 12.0)
     window, reward, terminated, truncated, _ = env.step(np.full(1, 0.5, np.float32))
     assert window.tolist() == [11, 0, 12, 0.5, 13.5]
     assert (reward, terminated, truncated) == (-13.5, False, False)
@@ -60,13 +60,41 @@ def test_it_waits_with_the_action_nearest_to_zero():
 
 def test_an_episode_that_ends_while_it_waits_ends_in_the_first_step():
     env = WindowObservation(Sum(last=1), 3)
-    window, info = env.reset()
+    window, _ = env.reset()
     assert window.tolist() == [10, 0, 11, 0, 11]
-    assert info["waited"] == -11
+    assert env.waited == -11
     again, reward, terminated, truncated, _ = env.step(np.full(1, 2.0, np.float32))
     assert again.tolist() == window.tolist()
     assert (reward, terminated, truncated) == (0, True, False)
     assert env.unwrapped.k == 1  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_it_keeps_copies_of_outputs_and_actions():
+    class Writes(Sum):
+        def step(self, action):
+            y = self.y
+            self.y, *rest = super().step(action)
+            y[:], self.y = self.y, y
+            return y, *rest
+
+    env, u = WindowObservation(Writes(), 3), np.full(1, 0.5, np.float32)
+    assert env.reset()[0].tolist() == [10, 0, 11, 0, 12]
+    env.step(u)
+    u[:] = 1
+    assert env.step(u)[0].tolist() == [12, 0.5, 13.5, 1, 15.5]
+
+
+def test_a_step_before_the_first_reset_is_gymnasiums_error():
+    env = WindowObservation(gymnasium.make("Pendulum-v1"), 2)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(1, np.float32))
+
+
+def test_other_spaces_are_an_error():
+    with pytest.raises(
+        QPError, match=r"env: got the space Discrete.2., expected Box spaces of one"
+    ):
+        WindowObservation(gymnasium.make("CartPole-v1"), 2)
 
 
 @pytest.mark.parametrize("past", [0, 1.5])

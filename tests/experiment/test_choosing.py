@@ -300,7 +300,7 @@ def test_blended_models_are_no_start_of_a_run_that_needs_one_C():
     assert models is not None
     said = f"Linear models at {len(models.centres)} centres, blended, take the place of this one."
     assert said in str(start._replace(blended=models)).splitlines()
-    for needs in ("export=c", "constraint=si", "constraint=adaptive"):
+    for needs in ("export=c", "constraint=si", "constraint=adaptive", "gate=model"):
         assert _blended(make_config(*DATA, needs), start, 6) is None, needs
 
 
@@ -331,7 +331,7 @@ def test_a_run_starts_with_a_window_if_the_observation_hides_a_state(tmp_path, m
     summary = train.train(cfg, str(whole), quiet=True)
     assert ", past=3, cost of (y_" in summary["start"]
     run = FinishedRun(whole)
-    assert run.physics.past == run.policy.past == run.start.past == 3
+    assert run.physics.past == run.policy.past == run.start.past == summary["past"] == 3
     J = evaluate(cfg, warm_policy(run.start), run.physics).J
     assert summary["J_start"] == pytest.approx(J, rel=1e-9)
     assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM

@@ -209,10 +209,19 @@ def test_files_copies_and_state_dicts_have_the_schedule(model, tmp_path):
     mpc.save(tmp_path / "mine.qpmpc")
     twins = [QPMPC.load(tmp_path / "mine.qpmpc"), copy.deepcopy(mpc)]
     twins.append(pickle.loads(pickle.dumps(mpc)))
-    twins.append(scheduled(qm.identify_blended(pendulum_log(seed=3), 5, len(model.centres))))
+    log = pendulum_log(seed=3)
+    other = qm.identify_blended(log, 5, len(model.centres))
+    twins.append(QPMPC.from_data(log, N, **COST | {"schedule": other}))
     twins[-1].load_state_dict(mpc.state_dict())
     for twin in twins:
         assert torch.equal(twin.policy(s), policy)
+    assert mpc.schedule is not None
+    assert mpc.schedule.R2 == model.R2
+    for instead in (None, other):
+        with pytest.raises(
+            QPError, match=r"^schedule: got another .*, expected the one as created"
+        ):
+            mpc.schedule = instead
     assert "centres=" in str(mpc)
     plain = QPMPC.from_data(pendulum_log(), N, **COST)
     with pytest.raises(QPError, match=r"a state_dict with centres = [0-9]+, expected this module"):
@@ -240,6 +249,16 @@ def test_what_needs_one_model_for_all_states_says_so(use, model):
 
 
 @pytest.mark.filterwarnings("ignore:In this log:UserWarning")
+def fitted(log: Any, **arguments: Any) -> BlendedModel:
+    return BlendedModel(**qm.identify_blended(log, 3, centres=2).arguments | arguments)
+
+
+def test_an_empty_batch_has_no_values(model):
+    mpc, none = scheduled(model), torch.zeros(3, 0, 2)
+    assert mpc.value(none).shape == (3, 0)
+    assert mpc.policy(none).shape == (3, 0, 1)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -268,7 +287,15 @@ def test_what_needs_one_model_for_all_states_says_so(use, model):
             lambda log: QPMPC(2, 1, N, past=2, schedule=qm.identify_blended(log, 3, centres=2)),
             "schedule: got n_x, n_u, past, n_d = .2, 1, 1, 0., exp.* = .2, 1, 2, 0., as the QPMPC",
         ),
-        (lambda _: QPMPC(2, 1, N, schedule=1), "schedule: got int, expected a Mapping"),
+        (lambda _: QPMPC(2, 1, N, schedule=1), "schedule: got 1, expected a BlendedModel, or its"),
+        (lambda _: QPMPC(2, 1, N, schedule={"A": 1}), "schedule: got keys A, expected a Blended"),
+        (
+            lambda log: fitted(log, A=torch.ones(2, 2, 1)),
+            r"A: got shape \(2, 2, 1\), expected shape",
+        ),
+        (lambda log: fitted(log, B=1.0), r"B: got shape \(\), expected shape \(2, 2, 0\)"),
+        (lambda log: fitted(log, width=torch.nan), "width: got NaN or inf, expected finite"),
+        (lambda log: fitted(log, middle=None), "middle: got None, expected a tensor"),
         (
             lambda log: qm.identify_blended(log, 3, centres=2).constraints(
                 torch.ones(2), N, torch.ones(3, 1)

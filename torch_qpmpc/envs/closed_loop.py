@@ -167,7 +167,8 @@ def gymnasium_loop(
 ) -> ClosedLoop:
     """Run ``policy`` as `closed_loop` does, in a Gymnasium environment; start i has seed + i.
 
-    After an episode's end its state stays constant, at no cost. ``steps`` is by default the length
+    After an episode's end its state stays constant, at no cost. With a window the cost of the steps
+    that fill it is in that of the first step, without discounts. ``steps`` is by default the length
     of the environment's own episodes.
 
     Raises:
@@ -177,10 +178,10 @@ def gymnasium_loop(
     steps = plant.max_steps if steps is None else steps
     _check(policy, steps, starts, seed, gamma)
     envs = [plant.make(steps) for _ in range(starts)]
-    resets = [env.reset(seed=seed + i) for i, env in enumerate(envs)]
-    s = np.stack([s for s, _ in resets])
-    # Of a `WindowObservation`; the first step's cost has it, too.
-    waited = np.array([float(info.get("waited", 0.0)) for _, info in resets])
+    s = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(envs)])
+    waited = np.zeros(starts)
+    if plant.past > 1:
+        waited = np.array([env.get_wrapper_attr("waited") for env in envs])
     over = np.zeros(starts, dtype=bool)
     low, high = plant.lb_a.numpy(), plant.ub_a.numpy()
 

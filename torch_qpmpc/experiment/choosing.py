@@ -32,10 +32,10 @@ APART = 10**6
 CONFIDENCE = 0.95
 #: Blended models are among the starts if they leave less than this share of the held-out variance
 #: that one model leaves unexplained.
-CURVED = 0.8
+BLENDED_SHARE = 0.8
 #: L of the window that is among the starts if the model with it leaves less than this share of the
 #: held-out variance that the model without it leaves unexplained.
-WINDOW, HIDDEN = 3, 0.5
+WINDOW, WINDOW_SHARE = 3, 0.5
 #: The end of the name of a start whose model holds no output.
 NONE_HELD = ", no output held"
 
@@ -62,7 +62,7 @@ def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
         costs += [] if most is None else [most]
     models = _models(cfg, own)
     named = {
-        f"{name}{_of(cost)}": own._replace(identified=model, cost=cost)
+        f"{name}{_cost_name(cost)}": own._replace(identified=model, cost=cost)
         for name, model in (models | _windowed(cfg, own, models)).items()
         for cost in costs
     }
@@ -71,7 +71,7 @@ def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
         model = models[f"tied C, N={2 * N}"]
         for cost in costs:
             start = own._replace(identified=model, cost=cost, blended=blended)
-            named[f"blended models, N={2 * N}{_of(cost)}"] = start
+            named[f"blended models, N={2 * N}{_cost_name(cost)}"] = start
     u = own.log["action"].flatten(0, -2)[valid_steps(own.log).flatten()].double()
     held = {ZERO_ACTION: zero_action(physics)(u[:1])[0], MEAN_ACTION: u.mean(0)}
     return named | {name: own._replace(held=action) for name, action in held.items()}
@@ -156,12 +156,12 @@ def _windowed(
 ) -> dict[str, Identified]:
     """Return the ``models`` with a window by name.
 
-    There are none if a window predicts held-out steps little better or the run's is given; those
-    for which the log's episodes are too short are left out.
+    Empty if a window hardly improves the held-out prediction, or ``task.past`` is given. Models for
+    which the log's episodes are too short are left out.
     """
     if cfg.task.get("past") is not None:
         return {}
-    windowed, unexplained = {}, {name: 1 - _explained(model) for name, model in models.items()}
+    windowed, unexplained = {}, {name: 1 - _mean_R2(model) for name, model in models.items()}
     first = f"tied C, N={cfg.task.horizon}"
     for name in (first, *models):
         options = models[name].options
@@ -170,7 +170,7 @@ def _windowed(
         except QPError:
             continue
         windowed[f"{name}, past={WINDOW}"] = model
-        if name == first and not 1 - _explained(model) < HIDDEN * unexplained[first]:
+        if name == first and not 1 - _mean_R2(model) < WINDOW_SHARE * unexplained[first]:
             return {}
     return windowed
 
@@ -184,25 +184,25 @@ def _model(cfg: DictConfig, own: Start, structure: str, horizon: int, past: int)
     return identified_model(cfg, own.log, layout, structure, options.held)
 
 
-def _of(cost: RewardCost | None) -> str:
+def _cost_name(cost: RewardCost | None) -> str:
     """Return the end of a start's name."""
     return "" if cost is None else f", cost of {cost.variables}"
 
 
 def _blended(cfg: DictConfig, start: Start, horizon: int) -> BlendedModel | None:
-    """Return the models blended from a start's log; None without a use for them.
+    """Return the models blended from a start's log; None if they are of no use here.
 
     They predict held-out steps little better than one model does, or the QP has known signals or a
-    past, or the run needs one C for all states.
+    past, or the run needs one C for all states, or judges policies by linear models.
     """
     layout = start.identified.options.layout
     if layout.past > 1 or layout.n_d or cfg.export is not None or cfg.back_off is not None:
         return None
-    if cfg.constraint.si is not None:
+    if cfg.constraint.si is not None or cfg.gate == "model":
         return None
     models = identify_blended(start.log, horizon, held=start.identified.options.held)
     unexplained = {count: 1 - R2 for count, R2 in models.R2.items()}
-    return models if min(unexplained.values()) < CURVED * unexplained[1] else None
+    return models if min(unexplained.values()) < BLENDED_SHARE * unexplained[1] else None
 
 
 def _none_held(cfg: DictConfig, start: Start) -> Start | None:
@@ -228,10 +228,10 @@ def _R2(start: Start) -> float:
         return math.nan
     if start.blended is not None:
         return max(start.blended.R2.values())
-    return _explained(start.identified)
+    return _mean_R2(start.identified)
 
 
-def _explained(model: Identified) -> float:
+def _mean_R2(model: Identified) -> float:
     """Return the mean over the outputs, but for those held, of R2 at the end of the horizon."""
     R2, held = model.R2[-1], model.options.held
     return R2[[i for i in range(len(R2)) if i not in held]].mean().item()

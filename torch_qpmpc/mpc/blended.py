@@ -26,7 +26,7 @@ import torch
 from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 
-from torch_qpmpc.checks import check_kind, check_tensor, check_whole
+from torch_qpmpc.checks import check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.coordinates import for_each
@@ -36,9 +36,10 @@ from torch_qpmpc.mpc.log import as_log
 from torch_qpmpc.mpc.predictor import transitions
 from torch_qpmpc.mpc.ridge import ridge
 from torch_qpmpc.mpc.trajectories import Trajectory, folds
+from torch_qpmpc.mpc.validation import as_tensor
 
-#: The numbers of centres among which the held-out prediction decides. It would choose more, with
-#: which closed loops of the pendulum cost more.
+#: The numbers of centres among which the held-out prediction decides. More of them predict better
+#: still, but cost more in closed loops of the pendulum.
 CENTRES = (1, 2, 4, 8, 16, 32)
 #: The log is cut into this many parts, of which the last is held out.
 PARTS = 5
@@ -67,7 +68,11 @@ class BlendedModel(nn.Module):
 
     Attributes:
         R2: the share of the outputs' variance that is predicted ``horizon`` steps ahead in the
-            held-out part of the log, by the number of centres.
+            held-out part of the log, by the number of centres; empty in one that is made from
+            arguments, as in a file.
+
+    Raises:
+        QPError: an argument has a wrong shape, or an entry is not finite.
     """
 
     centres: Tensor
@@ -80,17 +85,24 @@ class BlendedModel(nn.Module):
 
     def __init__(
         self,
-        centres: Tensor,
-        middle: Tensor,
-        size: Tensor,
-        width: Tensor,
-        A: Tensor,
-        B: Tensor,
-        offset: Tensor,
+        centres: Any,
+        middle: Any,
+        size: Any,
+        width: Any,
+        A: Any,
+        B: Any,
+        offset: Any,
     ) -> None:
         super().__init__()
         parts = {"centres": centres, "middle": middle, "size": size, "width": width}
-        for name, part in (parts | {"A": A, "B": B, "offset": offset}).items():
+        parts |= {"A": A, "B": B, "offset": offset}
+        parts = {name: as_tensor(name, part).detach().clone() for name, part in parts.items()}
+        (m, n_x), n_u = (*parts["centres"].shape, 0, 0)[:2], (0, *parts["B"].shape)[-1]
+        of = {"centres": (m, n_x), "middle": (n_x,), "size": (n_x,), "width": ()}
+        of |= {"A": (m, n_x, n_x), "B": (m, n_x, n_u), "offset": (m, n_x)}
+        for name, part in parts.items():
+            if part.shape != of[name]:
+                raise QPError.expected(name, f"shape {tuple(part.shape)}", f"shape {of[name]}")
             self.register_buffer(name, part)
         self.R2: dict[int, float] = {}
 
@@ -203,11 +215,17 @@ def schedule_of(model: BlendedModel | Mapping[str, Tensor], layout: Layout) -> B
     """Return a copy of ``model``, which may be its arguments, for a `QPMPC` of sizes ``layout``.
 
     Raises:
-        QPError: it has other sizes, or the QPMPC has a window or a preview.
+        QPError: it is none, it has other sizes, or the QPMPC has a window or a preview.
     """
-    arguments = model.arguments if isinstance(model, BlendedModel) else model
-    check_kind("schedule", arguments, Mapping, "identify_blended returns a BlendedModel.")
-    copy = BlendedModel(**{name: part.detach().clone() for name, part in arguments.items()})
+    if isinstance(model, BlendedModel):
+        copy = BlendedModel(**model.arguments)
+        copy.R2 = dict(model.R2)
+    elif isinstance(model, Mapping) and {*model} == {*BlendedModel.__annotations__}:
+        copy = BlendedModel(**model)
+    else:
+        got = f"keys {', '.join(map(str, model))}" if isinstance(model, Mapping) else repr(model)
+        remedy = "identify_blended returns one."
+        raise QPError.expected("schedule", got, "a BlendedModel, or its arguments", remedy)
     sizes = (layout.n_x, layout.n_u, layout.past, layout.n_d)
     if sizes != (own := (copy.n_x, copy.n_u, 1, 0)):
         got, expected = (f"n_x, n_u, past, n_d = {x}" for x in (own, sizes))

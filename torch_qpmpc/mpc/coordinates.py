@@ -83,6 +83,9 @@ def for_each(
     except RuntimeError as error:
         got = f"batch dimensions {', '.join(str(tuple(shape)) for shape in batches)}"
         raise QPError.expected("residuals", got, "ones that broadcast") from error
+    if not batch.numel():
+        zeros = (x.new_zeros(x.shape[lead:]) for x, lead in zip(operands, leads, strict=True))
+        return operands[0].new_zeros(*batch, *function(*zeros).shape)
     flat = [
         x.expand(*batch, *x.shape[lead:]).reshape(batch.numel(), *x.shape[lead:])
         for x, lead in zip(operands, leads, strict=True)

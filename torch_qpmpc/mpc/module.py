@@ -213,6 +213,9 @@ class QPMPC(nn.Module):
         self._masks = learned_entries(learn, theta)
         self.register_buffer("C_0", self.scheme.C_0.clone())
         self.register_buffer("soft", theta["w"].isfinite())
+        if self.schedule is not None:
+            self.register_buffer("C_start", theta["C"].clone())
+            self.register_buffer("b_start", theta["b"].clone())
         self._derive()
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
@@ -526,7 +529,7 @@ class QPMPC(nn.Module):
     def quadratic_program(self, residuals: Mapping[str, Tensor] | None = None) -> QuadraticProgram:
         """Return the current theta as a QuadraticProgram, with discounts (eq:qpH).
 
-        It is that without a schedule, whose changes at s each solve adds.
+        It leaves out the schedule, whose change at s each solve adds.
 
         Args:
             residuals: tensors ``(*batch, ..)``, such as the outputs of a network, that are added to
@@ -719,6 +722,9 @@ class QPMPC(nn.Module):
         if name in FIXED and name in vars(self) and value != vars(self)[name]:
             remedy = "Create another QPMPC; release() frees the structure of this one."
             raise QPError.expected(name, repr(value), f"{vars(self)[name]!r}, as created", remedy)
+        if name == "schedule" and hasattr(self, name):
+            got, remedy = f"another {type(value).__name__}", "Create another QPMPC."
+            raise QPError.expected(name, got, "the one as created", remedy)
         super().__setattr__(name, value)
 
     def get_extra_state(self) -> Tensor:
@@ -771,8 +777,6 @@ class QPMPC(nn.Module):
         weights = of_rows if self.scheme.bounds.discount_slack else torch.ones_like(of_rows)
         hardness = torch.where(self.soft, 0.0, torch.inf)
         derived = {"discount": discount, "slack_discount": weights, "hardness": hardness}
-        if self.schedule is not None:
-            derived |= {f"{name}_start": self.scheme.theta[name] for name in ("C", "b")}
         for name, buffer in derived.items():
             self.register_buffer(name, buffer.to(self.C_0), persistent=False)
         if self.layout.blocks:

@@ -76,7 +76,9 @@ class FinishedRun:
     def physics(self) -> AnyPlant:
         """The plant, if `has_plant`."""
         plant = make_physics(self.cfg)
-        return plant.windowed(self.qp.past) if isinstance(plant, GymnasiumPlant) else plant
+        if not isinstance(plant, GymnasiumPlant):
+            return plant
+        return plant.windowed(self.summary.get("past", plant.past))
 
     @cached_property
     def start(self) -> QPMPC:

@@ -71,10 +71,12 @@ class Start(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The entries of summary.json: episodes cut, outputs held, and the fits of the cost."""
+        """The entries of summary.json: episodes cut, outputs held, window, and fits of the cost."""
         held = [*self.identified.options.held]
         entries: dict[str, Any] = {"log_episodes_cut": self.cut}
         entries |= {"outputs_held": held} if held else {}
+        past = self.identified.options.layout.past
+        entries |= {"past": past} if past > 1 else {}
         entries |= {} if self.choice is None else self.choice.summary
         if self.cost is None:
             return entries
