@@ -39,8 +39,9 @@ class PastWindow(Transform):
     """A TorchRL transform that turns an output y into a window of past outputs and actions.
 
     After it, the observation is [y_{k+1-L}, u_{k+1-L}, .., y_{k-1}, u_{k-1}, y_k]. At a reset the
-    first output is repeated. The transform has no state: each window is made of the last one, the
-    action and the new output. The actions are those that the transformed environment receives.
+    first output is repeated, where `WindowObservation` waits. The transform has no state: each
+    window is made of the last one, the action and the new output. The actions are those that the
+    transformed environment receives.
 
     Args:
         past: L, the number of outputs in the window, at least 1.
