@@ -252,7 +252,9 @@ def test_pickles_run_no_code(folder, mark, name):
         "log.pt": lambda folder: stored_log(folder / name),
         "mine.qpmpc": lambda folder: QPMPC.load(folder / name),
     }[name]
-    match = rf"^(path|checkpoint): got .*{name}, which cannot be read \(UnpicklingError\)"
+    match = (
+        rf"^(path|checkpoint|start\.file): got .*{name}, which cannot be read \(UnpicklingError\)"
+    )
     with pytest.raises((QPError, SystemExit), match=match):
         read(folder)
     assert not mark.exists()

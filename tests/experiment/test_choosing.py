@@ -31,7 +31,7 @@ from torch_qpmpc.experiment.choosing import (
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log, learning_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.experiment.tasks.choice import HELD, MEAN_ACTION, STARTS, Choice, Row
+from torch_qpmpc.experiment.tasks.choice import HELD, MEAN_ACTION, NO_WINDOW, STARTS, Choice, Row
 from torch_qpmpc.experiment.tasks.identified import identified_start
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.study.runs import FinishedRun
@@ -172,9 +172,10 @@ def test_a_start_that_costs_less_than_zero_action_is_chosen():
     assert sorted(row.episodes for row in rows.values()) == [2] * 4 + [4] * 6
     assert start.summary["start_transitions"] == sum(r.episodes for r in rows.values()) * 10
     lines = str(choice).splitlines()
-    assert lines[-1] == f"Chosen by at most 320 transitions of the plant: {choice.name}"
-    assert lines[0].endswith("R2  episodes  J (compare rows with equal episodes)")
-    assert len(lines) == 2 + len(rows)
+    assert lines[-2] == f"Chosen by at most 320 transitions of the plant: {choice.name}"
+    assert lines[-1] == NO_WINDOW
+    assert lines[0].endswith("R2  episodes  J +- standard error (compare rows of equal episodes)")
+    assert len(lines) == 3 + len(rows)
 
 
 def test_zero_action_is_held_if_nothing_costs_less():
@@ -348,6 +349,10 @@ def test_windows_are_no_start_if_the_run_names_its_own_or_episodes_are_short():
     assert len(windows) == 8
     own = make_config(*DATA, "task.past=1")
     assert not [name for name in starts(own, make_physics(own), log) if "past" in name]
+    own = make_config(*DATA, "task.past=2")
+    plant = make_physics(own)
+    assert all("past=2" in name for name in starts(own, plant, log) if name not in HELD)
+    assert NO_WINDOW not in str(choose(own, plant, log))
     short = make_config(*DATA, "task.episode_steps=2")
     log = collect_log(short, physics)
     assert not [name for name in starts(short, physics, log) if "past" in name]

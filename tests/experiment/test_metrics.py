@@ -71,7 +71,8 @@ def test_the_table_says_what_costs_more_than_zero_action(start, learned, last):
 def test_the_table_says_that_the_gate_kept_the_start(accepted, said):
     counts = {"accepted": accepted, "rejected": 5, "simulated": 1600}
     summary = evaluation(50, 50, 40).summary() | counts
-    last = "The gate kept the start: none of 5 candidates was shown to cost less, by 1,600 "
+    last = "The gate kept the start: none of 5 candidates was shown to cost less, the last one of "
+    last += "which costs 50.00, by at most 1,600 "
     last += "simulated transitions."
     assert (table(summary).splitlines()[-1] == last) == said
 

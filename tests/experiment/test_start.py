@@ -293,7 +293,7 @@ def test_damaged_logs_are_named(tmp_path):
     for content, message in (
         (None, r"start\.file: got .*log\.pt, which does not exist, expected a log\.pt that"),
         ({"observation": torch.zeros(3)}, r"start\.file: got .*log\.pt, without actions, expected"),
-        (b"text", r"checkpoint: got .*log\.pt, which cannot be read"),
+        (b"text", r"start.file: got .*log\.pt, which cannot be read"),
     ):
         if isinstance(content, bytes):
             Path(cfg.start.file).write_bytes(content)

@@ -146,7 +146,7 @@ def _models(cfg: DictConfig, own: Start) -> dict[str, Identified]:
     models = {}
     for horizon in (N, 2 * N):
         for structure in dict.fromkeys((cfg.constraint.structure, "tied")):
-            name = f"{structure} C, N={horizon}"
+            name = f"{structure} C, N={horizon}" + f", past={past}" * (past > 1)
             models[name] = _model(cfg, own, structure, horizon, past)
     return models
 

@@ -186,9 +186,10 @@ def table(summary: Mapping[str, Any]) -> str:
         lines += [f"  {name:{width}}  {cost_text(J):>8}" for name, J in rivals.items()]
     if summary.get("rejected") and not summary["accepted"]:
         kept = f"none of {summary['rejected']} candidates was shown to cost less"
+        kept += f", the last one of which costs {cost_text(summary['J_final'])}"
         names = ("simulated", *COMPARED.values())
         compared = next(f"{summary[x]:,} {x}" for x in names if x in summary)
-        lines += ["", f"The gate kept the start: {kept}, by {compared} transitions."]
+        lines += ["", f"The gate kept the start: {kept}, by at most {compared} transitions."]
     return "\n".join(lines + _worse_than_zero(summary))
 
 

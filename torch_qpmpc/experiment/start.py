@@ -15,12 +15,11 @@ from torch import Tensor, nn
 from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
-from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.choosing import choose, chosen_before
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
-from torch_qpmpc.files import write_whole
+from torch_qpmpc.files import read_tensors, write_whole
 from torch_qpmpc.learning.replay import Replay
 
 #: The log in a run's folder.
@@ -29,6 +28,7 @@ LOG = "log.pt"
 NEXT = ("observation", "reward", "done", "terminated", "truncated")
 ENTRIES = ("observation", "preview", "action", *(("next", name) for name in NEXT))
 WANTED = "a log.pt that train.py start=data wrote"
+FORMAT = "For one of your own see 'From logged data' in the guides."
 
 
 class Exploration(nn.Module):
@@ -161,16 +161,21 @@ def transitions(start: Start | None, replay: Replay) -> list[TensorDictBase]:
     return [steps] if start is None else [start.log, steps]
 
 
-def stored_log(path: Path) -> TensorDict:
-    """Read a log.
+def stored_log(path: str | Path) -> TensorDict:
+    """Read a log: a nested dict of tensors, written by ``torch.save``, as `collect_log` makes it.
 
     Raises:
         QPError: the file is missing, damaged, or not a log.
     """
+    path = Path(path)
     if not path.exists():
         raise QPError.expected("start.file", f"{path}, which does not exist", WANTED)
-    stored = load_checkpoint(path)
+    try:
+        stored = read_tensors(path)
+    except Exception as error:  # damaged files raise errors of any type
+        got = f"{path}, which cannot be read ({type(error).__name__})"
+        raise QPError.expected("start.file", got, WANTED, FORMAT) from error
     actions = stored.get("action") if isinstance(stored, dict) else None
     if not isinstance(actions, Tensor):
-        raise QPError.expected("start.file", f"{path}, without actions", WANTED)
+        raise QPError.expected("start.file", f"{path}, without actions", WANTED, FORMAT)
     return TensorDict(stored, batch_size=actions.shape[:-1])

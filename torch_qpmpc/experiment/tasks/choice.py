@@ -20,6 +20,7 @@ STARTS = "starts.csv"
 MEAN_ACTION = "mean action of the log"
 #: The starts that hold an action.
 HELD = {ZERO_ACTION, MEAN_ACTION}
+NO_WINDOW = "If one observation hides a part of the state, such as a velocity, try task.past=2."
 NOTHING = (
     "No start is shown to cost less than zero action, which is the start. Perhaps no scheme "
     "of this log controls the plant: pass a log about the states where the controller is to work "
@@ -79,7 +80,8 @@ class Choice:
     def __str__(self) -> str:
         width = max(map(len, self.rows))
         lines = [
-            f"{'start':{width}}{'R2':>8}{'episodes':>10}  J (compare rows with equal episodes)"
+            f"{'start':{width}}{'R2':>8}{'episodes':>10}  "
+            "J +- standard error (compare rows of equal episodes)"
         ]
         for name, row in self._ranked:
             R2 = "" if math.isnan(row.R2) else f"{row.R2:.3f}"
@@ -88,6 +90,7 @@ class Choice:
         lines.append(
             f"Chosen by at most {self._transitions:,} transitions of the plant: {self.name}"
         )
+        lines += [NO_WINDOW] * (not any("past=" in name for name in self.rows))
         return "\n".join(lines + [NOTHING] * (self.name == ZERO_ACTION))
 
     def write(self, folder: Path) -> None:
