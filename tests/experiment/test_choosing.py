@@ -332,7 +332,8 @@ def test_a_run_starts_with_a_window_if_the_observation_hides_a_state(tmp_path, m
     summary = train.train(cfg, str(whole), quiet=True)
     assert ", past=3, cost of (y_" in summary["start"]
     run = FinishedRun(whole)
-    assert run.physics.past == run.policy.past == run.start.past == summary["past"] == 3
+    plant: Any = run.physics
+    assert plant.past == run.policy.past == run.start.past == summary["past"] == 3
     J = evaluate(cfg, warm_policy(run.start), run.physics).J
     assert summary["J_start"] == pytest.approx(J, rel=1e-9)
     assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
