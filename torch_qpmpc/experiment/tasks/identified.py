@@ -64,7 +64,7 @@ class Start(NamedTuple):
         known = f"Held at their last value over the horizon: {', '.join(names[i] for i in held)}"
         known += f", as by task.held={[*held]}"
         count = 0 if self.blended is None else len(self.blended.centres)
-        blended = f"Linear models at {count} centres, blended, take the place of this one."
+        blended = f"Linear models at {count} centres, blended, take the place of the model above."
         parts = (cut if self.cut else None, self.identified, blended if count else None)
         parts += known if held else None, self.cost, self.choice
         return "\n".join(str(part) for part in parts if part is not None)
