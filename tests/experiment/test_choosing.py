@@ -299,7 +299,8 @@ def test_blended_models_are_no_start_of_a_run_that_needs_one_C():
     start = identified_start(cfg, physics, collect_log(cfg, physics))
     models = _blended(cfg, start, 6)
     assert models is not None
-    said = f"Linear models at {len(models.centres)} centres, blended, take the place of the model above."
+    said = f"Linear models at {len(models.centres)} centres, blended, take the place of the model "
+    said += "above."
     assert said in str(start._replace(blended=models)).splitlines()
     for needs in ("export=c", "constraint=si", "constraint=adaptive", "gate=model"):
         assert _blended(make_config(*DATA, needs), start, 6) is None, needs
