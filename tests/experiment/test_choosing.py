@@ -67,10 +67,14 @@ GIVEN += ("task.stage_weight=[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]",)
 HOPELESS = (*DATA, "task.kwargs={gain: 0.001, price: 100}")
 
 
+def plant_is(monkeypatch, kind):
+    make = lambda **kwargs: kind(**kwargs)  # noqa: E731 (an entry point)
+    monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
+
+
 @pytest.fixture(autouse=True)
 def _plant(monkeypatch):
-    make = lambda **kwargs: Lag(**kwargs)  # noqa: E731 (an entry point)
-    monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
+    plant_is(monkeypatch, Lag)
 
 
 def chosen(*overrides):
@@ -252,6 +256,19 @@ def test_a_held_action_has_a_cost_of_its_own(hessian):
     assert_close(difference, (R / 8).expand(8), rtol=1e-4, atol=0)
 
 
+def trained_and_resumed(cfg, folder, monkeypatch) -> FinishedRun:
+    """Train; the files have the policies evaluated, and a run that was cut ends likewise."""
+    whole, cut = folder / "whole", folder / "cut"
+    summary, run = train.train(cfg, str(whole), quiet=True), FinishedRun(whole)
+    for name, policy in (("J_start", run.start), ("J_best", run.policy)):
+        J = evaluate(cfg, warm_policy(policy), run.physics).J
+        assert summary[name] == pytest.approx(J, rel=1e-9)
+    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
+    run_command(f"resume={cut}")
+    assert FinishedRun(cut).summary["J_best"] == summary["J_best"]
+    return run
+
+
 class Turning(Lag):
     """A lag whose gain changes its sign between the starts and zero."""
 
@@ -262,8 +279,7 @@ class Turning(Lag):
 
 @pytest.fixture
 def turning(monkeypatch):
-    make = lambda **kwargs: Turning(**kwargs)  # noqa: E731 (an entry point)
-    monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
+    plant_is(monkeypatch, Turning)
 
 
 @pytest.mark.parametrize(
@@ -277,19 +293,10 @@ def turning(monkeypatch):
 @pytest.mark.usefixtures("turning")
 def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path, monkeypatch, settings):
     cfg = make_config(*DATA, "task.start_episodes=2", *settings)
-    whole, cut = tmp_path / "whole", tmp_path / "cut"
-    summary = train.train(cfg, str(whole), quiet=True)
-    assert summary["start"].startswith("blended models, N=6, cost of")
-    run = FinishedRun(whole)
+    run = trained_and_resumed(cfg, tmp_path, monkeypatch)
+    assert run.summary["start"].startswith("blended models, N=6, cost of")
     assert run.policy.schedule is not None
     assert run.start.schedule is not None
-    J = evaluate(cfg, warm_policy(run.start), run.physics).J
-    assert summary["J_start"] == pytest.approx(J, rel=1e-9)
-    J = evaluate(cfg, warm_policy(run.policy), run.physics).J
-    assert summary["J_best"] == pytest.approx(J, rel=1e-9)
-    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
-    run_command(f"resume={cut}")
-    assert FinishedRun(cut).summary["J_best"] == summary["J_best"]
 
 
 @pytest.mark.usefixtures("turning")
@@ -322,24 +329,16 @@ class Swing(Lag):
 
 @pytest.fixture
 def swing(monkeypatch):
-    make = lambda **kwargs: Swing(**kwargs)  # noqa: E731 (an entry point)
-    monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
+    plant_is(monkeypatch, Swing)
 
 
 @pytest.mark.usefixtures("swing")
 def test_a_run_starts_with_a_window_if_the_observation_hides_a_state(tmp_path, monkeypatch):
     settings = ("task.eval_steps=30", "task.gamma=1.0", "gate=act")
-    cfg, whole, cut = make_config(*DATA, *settings), tmp_path / "whole", tmp_path / "cut"
-    summary = train.train(cfg, str(whole), quiet=True)
-    assert ", past=3, cost of (y_" in summary["start"]
-    run = FinishedRun(whole)
+    run = trained_and_resumed(make_config(*DATA, *settings), tmp_path, monkeypatch)
+    assert ", past=3, cost of (y_" in run.summary["start"]
     plant: Any = run.physics
-    assert plant.past == run.policy.past == run.start.past == summary["past"] == 3
-    J = evaluate(cfg, warm_policy(run.start), run.physics).J
-    assert summary["J_start"] == pytest.approx(J, rel=1e-9)
-    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
-    run_command(f"resume={cut}")
-    assert FinishedRun(cut).summary["J_best"] == summary["J_best"]
+    assert plant.past == run.policy.past == run.start.past == run.summary["past"] == 3
 
 
 @pytest.mark.usefixtures("swing")

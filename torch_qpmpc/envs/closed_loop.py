@@ -196,8 +196,7 @@ def gymnasium_loop(
         return _float64(s), _float64(applied), _float64(cost)
 
     shape = starts, len(plant.lb_a)
-    n_y = None if plant.past == 1 else len(plant.lb_s)
-    loop = _run(policy, _float64(s), step, steps, shape, gamma, n_y)
+    loop = _run(policy, _float64(s), step, steps, shape, gamma, len(plant.lb_s))
     for env in envs:
         env.close()
     return loop

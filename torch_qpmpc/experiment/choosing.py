@@ -161,17 +161,16 @@ def _windowed(
     """
     if cfg.task.get("past") is not None:
         return {}
-    windowed, unexplained = {}, {name: 1 - _mean_R2(model) for name, model in models.items()}
-    first = f"tied C, N={cfg.task.horizon}"
-    for name in (first, *models):
+    windowed, first = {}, f"tied C, N={cfg.task.horizon}"
+    for name in dict.fromkeys((first, *models)):
         options = models[name].options
         try:
             model = _model(cfg, own, options.structure, options.layout.horizon, WINDOW)
         except QPError:
             continue
-        windowed[f"{name}, past={WINDOW}"] = model
-        if name == first and not 1 - _mean_R2(model) < WINDOW_SHARE * unexplained[first]:
+        if name == first and not 1 - _mean_R2(model) < WINDOW_SHARE * (1 - _mean_R2(models[first])):
             return {}
+        windowed[f"{name}, past={WINDOW}"] = model
     return windowed
 
 

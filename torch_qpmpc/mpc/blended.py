@@ -23,7 +23,6 @@ from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch
-from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 
 from torch_qpmpc.checks import check_tensor, check_whole
@@ -338,6 +337,8 @@ def _centres(z: Tensor, count: int) -> Tensor:
         if distance == 0:
             break
         chosen = torch.cat((chosen, z[farthest].unsqueeze(0)))
+    from scipy.cluster.vq import kmeans2  # a tenth of a second, which few imports need
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a centre without members stays
         chosen = kmeans2(z.numpy(), chosen.numpy(), ITERATIONS, minit="matrix")[0]
