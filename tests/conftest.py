@@ -46,8 +46,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Leave all that exists before the first test out of the collections of garbage."""
+    """Leave all that exists before the first test out of the collections of garbage; have few."""
     gc.freeze()
+    gc.set_threshold(20_000, 20)
     gc.enable()
 
 

@@ -21,7 +21,7 @@ from torch_qpmpc import QPError, SolverError
 from torch_qpmpc.control import exporting
 from torch_qpmpc.export import export
 
-STEPS = int(os.environ.get("STEPS", "50"))
+STEPS = int(os.environ.get("STEPS", "25"))
 A = np.array([[0.9, 0.2, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
 B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.4]])
 C = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -197,7 +197,7 @@ def test_the_folder_s_program_starts_where_the_plant_can_rest(tmp_path, monkeypa
 def test_single_precision_agrees_to_its_accuracy(tmp_path):
     controller = qm.Controller(integrator(y_bounds=None))
     report = controller.export_c(tmp_path, dtype="float32", storage="small")
-    assert difference(controller, load(report.files, controller, dtype="float32"), 60) < 1e-3
+    assert difference(controller, load(report.files, controller, dtype="float32"), STEPS) < 1e-3
 
 
 def test_without_a_compiler_nothing_is_compared(tmp_path, monkeypatch):

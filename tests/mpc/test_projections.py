@@ -223,8 +223,8 @@ def test_the_weights_keep_their_sign_while_learning(rule, name, optimizer):
     mpc = random_mpc(4, step=rule, **options)
     start = mpc.action_value(random_states(6, size=0.9), random_states(6, 1, size=0.4)).detach()
     moved, lowest = make_optimizer(optimizer, mpc), []
-    for update in range(50):
-        learn(mpc, moved, start - 0.05 * update, seed=update)
+    for update in range(25):
+        learn(mpc, moved, start - 0.1 * update, seed=update)
         qp = mpc.quadratic_program()
         eigenvalues = torch.linalg.eigvalsh(qp.H.detach())
         assert_close(qp.H, qp.H.mT, rtol=1e-14, atol=1e-14)
