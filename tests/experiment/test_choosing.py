@@ -36,6 +36,7 @@ from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.choice import HELD, MEAN_ACTION, NO_WINDOW, STARTS, Choice, Row
 from torch_qpmpc.experiment.tasks.identified import identified_start
 from torch_qpmpc.learning.operators import warm_policy
+from torch_qpmpc.mpc import stage_cost
 from torch_qpmpc.study.runs import FinishedRun
 
 
@@ -81,7 +82,7 @@ def known_starts() -> dict[tuple[Any, ...], dict[str, Any]]:
 
 @pytest.fixture(autouse=True)
 def _plant(monkeypatch, known_starts):
-    """Make the plant a lag, and fit the starts of the same settings and log once."""
+    """Make the plant a lag, and fit the starts of the same settings and log once, and roughly."""
 
     def once(cfg, physics, log):
         settings = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "resume"])
@@ -92,6 +93,7 @@ def _plant(monkeypatch, known_starts):
 
     plant_is(monkeypatch, Lag)
     monkeypatch.setattr(choosing, "starts", once)
+    monkeypatch.setattr(stage_cost, "ITERATIONS", 50)
 
 
 def chosen(*overrides):
