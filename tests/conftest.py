@@ -8,15 +8,17 @@ import io
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import pytest
 import torch
+from hydra._internal.core_plugins.importlib_resources_config_source import (
+    ImportlibResourcesConfigSource,
+)
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from omegaconf import OmegaConf, _utils, base, grammar_parser
 
 import train
@@ -97,7 +99,7 @@ def quick_exports() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def quick_configurations() -> Iterator[None]:
-    """Parse each text of a configuration and each interpolation once, not in each composition."""
+    """Read, find and parse each text of a configuration and each interpolation once."""
     load = OmegaConf.load
     of_text = functools.cache(lambda text: load(io.StringIO(text)))
     parse = functools.cache(grammar_parser.parse)
@@ -109,7 +111,22 @@ def quick_configurations() -> Iterator[None]:
         patch.setattr(OmegaConf, "load", load_once)
         for module in (base, _utils):
             patch.setattr(module, "parse", parse)
+        for name in ("is_config", "is_group"):
+            patch.setattr(ImportlibResourcesConfigSource, name, once_a_path(name))
         yield
+
+
+def once_a_path(name: str) -> Callable[[ImportlibResourcesConfigSource, str], bool]:
+    """Return a method of a package's configurations, of which each path is looked up once."""
+    method, known = getattr(ImportlibResourcesConfigSource, name), {}
+
+    def answer(source: ImportlibResourcesConfigSource, config_path: str) -> bool:
+        key = source.path, config_path
+        if key not in known:
+            known[key] = method(source, config_path)
+        return known[key]
+
+    return answer
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -130,7 +147,7 @@ def quick_figures(request: pytest.FixtureRequest) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         if request.node.get_closest_marker("layout") is None:
-            patch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
+            patch.setattr(Figure, "get_layout_engine", lambda _: None)  # nor drawn twice for it
             patch.setattr(Figure, "savefig", save_small)
             patch.setitem(matplotlib.rcParams, "figure.dpi", SMALL_DPI)
         yield

@@ -22,7 +22,7 @@ from torch_qpmpc.experiment.tasks import TASKS
 from torch_qpmpc.qp import solvers
 
 #: Pages whose Python takes more than a few seconds.
-SLOW = {"docs/guides/torchrl.md"}
+SLOW = {f"docs/guides/{name}.md" for name in ("engineer", "environment", "prove", "torchrl")}
 #: The modules whose docstrings have examples.
 EXAMPLES = sorted(
     path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__")

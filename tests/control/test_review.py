@@ -169,7 +169,7 @@ def loop(model, **options):
     looped, r = controller(model, **options)
     noise = 0.01 * looped.mpc.design.y_bounds[1]
     r = 10 * noise if r is None else r
-    return looped.simulate(steps=20, r=r, load=0.05, noise=noise)
+    return looped.simulate(steps=40, r=r, load=0.05, noise=noise)
 
 
 @pytest.mark.parametrize("model", [LAG, INTEGRATOR, DEAD_TIME])
