@@ -15,12 +15,7 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torchrl.data import Bounded
-from torchrl.modules import (
-    ProbabilisticActor,
-    QValueActor,
-    TanhNormal,
-    ValueOperator,
-)
+from torchrl.modules import ProbabilisticActor, QValueActor, TanhNormal, ValueOperator
 from torchrl.objectives import (
     A2CLoss,
     ClipPPOLoss,

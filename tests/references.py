@@ -52,11 +52,7 @@ def by_quadprog(qp: QuadraticProgram, fixed: Tensor) -> tuple[float, Tensor]:
     unit = np.eye(n_z + n_g)
     equalities = np.vstack([np.hstack([C, np.zeros((len(b), n_g))]), unit[:n_f], unit[n_z:][hard]])
     rows = np.vstack(
-        [
-            np.hstack([G, np.eye(n_g)])[lower],
-            np.hstack([-G, np.eye(n_g)])[upper],
-            unit[n_z:][~hard],
-        ]
+        [np.hstack([G, np.eye(n_g)])[lower], np.hstack([-G, np.eye(n_g)])[upper], unit[n_z:][~hard]]
     )
     at_least = np.concatenate([lb[lower], -ub[upper], np.zeros((~hard).sum())])
     solution = quadprog.solve_qp(

@@ -192,8 +192,7 @@ def test_the_reference_has_every_public_name():
 def test_docstrings_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     results = doctest.testmod(
-        importlib.import_module(name),
-        optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS,
+        importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
     )
     assert results.attempted
     assert results.failed == 0, f"{results.failed} of {results.attempted} examples of {name}"

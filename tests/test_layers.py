@@ -61,9 +61,7 @@ LAYERS = {
     },  # `python -m torch_qpmpc.export`
 }
 #: Imports against the layers' order, with the reason.
-EXCEPTIONS = {
-    ("mpc/module.py", "export"): "QPMPC.export_c imports it when it is called",
-}
+EXCEPTIONS = {("mpc/module.py", "export"): "QPMPC.export_c imports it when it is called"}
 #: Libraries that only some layers may import.
 RESERVED = {
     "hydra": {"experiment", "study"},

@@ -293,8 +293,7 @@ def test_a_configuration_without_settings_is_named(folder, text):
 
 
 @pytest.mark.parametrize(
-    "name",
-    [LOCK, "train.log", "metrics.csv.partial", "summary.png", "wandb-id.txt", "tensorboard"],
+    "name", [LOCK, "train.log", "metrics.csv.partial", "summary.png", "wandb-id.txt", "tensorboard"]
 )
 def test_a_resumed_run_writes_nothing_through_a_link(folder, tmp_path, name):
     outside = tmp_path / "outside"

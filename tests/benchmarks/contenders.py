@@ -98,10 +98,7 @@ def peer(values: Callable[[], Values]) -> Callable[[QPMPC, Transitions], Gradien
     def make(mpc: QPMPC, batch: Transitions) -> Gradient:
         of = values()
         return Gradient(
-            mpc,
-            batch,
-            lambda s, qp: of(qp, s),
-            lambda s, a, qp: of(qp, torch.cat((s, a), dim=-1)),
+            mpc, batch, lambda s, qp: of(qp, s), lambda s, a, qp: of(qp, torch.cat((s, a), dim=-1))
         )
 
     return make

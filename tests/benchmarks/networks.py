@@ -103,10 +103,7 @@ CASES: dict[str, dict[str, Sequence[str]]] = {
         "SAC each step": ("algo=sac", *NETWORK, *HOUSE_EACH, FAST),
     },
     # One theta is enough here: a network should do no harm.
-    "tank_references": {
-        "QP": TANKS,
-        "scheduled QP": (*TANKS, "algo.actor=scheduled"),
-    },
+    "tank_references": {"QP": TANKS, "scheduled QP": (*TANKS, "algo.actor=scheduled")},
 }
 
 

@@ -38,11 +38,7 @@ CASES = [
 
 @pytest.mark.parametrize(("contender", "dense", "batch"), CASES)
 def test_gradient(
-    benchmark: Any,
-    interleaved: Callable[..., Any],
-    contender: Contender,
-    dense: bool,
-    batch: int,
+    benchmark: Any, interleaved: Callable[..., Any], contender: Contender, dense: bool, batch: int
 ) -> None:
     gradient = contender.gradient(dense, batch)
     against = batch in INTERLEAVED and contender.label != REFERENCE

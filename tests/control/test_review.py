@@ -98,10 +98,7 @@ MISTAKES = {
     ),
     "a disturbance that looks like the state": (
         (([[0.99999]], [[0.5]]), {"disturbances": {"y1": "output"}}),
-        (
-            "disturbances",
-            r"Take disturbances='(auto)': the disturbance of y1 looks like a.*",
-        ),
+        ("disturbances", r"Take disturbances='(auto)': the disturbance of y1 looks like a.*"),
         lambda auto: {"disturbances": auto},
     ),
     "no disturbances": (
@@ -121,10 +118,7 @@ MISTAKES = {
     ),
     "a filter that trusts all": (
         (INTEGRATOR, fast(noise=1e-3, drift=1.0)),
-        (
-            "margin",
-            r"Slow the filter down, by qm\.Controller\(\.\., noise={'y1': (1)}\)\.",
-        ),
+        ("margin", r"Slow the filter down, by qm\.Controller\(\.\., noise={'y1': (1)}\)\."),
         lambda noise: fast(noise={"y1": float(noise)}, drift=1.0),
     ),
     "weights far apart": (

@@ -23,7 +23,7 @@ LEFT_OUT = {
     "prioritized_weights": (
         "makes its own networks, so that it tests none of ours; and TorchRL's C++ extension, "
         "which its prioritized buffers need, does not load with every torch"
-    ),
+    )
 }
 
 

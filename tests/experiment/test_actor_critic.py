@@ -220,8 +220,7 @@ def test_td3_whose_schedule_is_restored_has_the_same_delay():
 
 
 @pytest.mark.parametrize(
-    ("algo", "actor", "critic", "task"),
-    covering(itertools.product(ALGOS, ACTORS, NETWORKS, TASKS)),
+    ("algo", "actor", "critic", "task"), covering(itertools.product(ALGOS, ACTORS, NETWORKS, TASKS))
 )
 def test_updates_move_the_actor_the_critics_and_nothing_else(algo, actor, critic, task, store_task):
     learner, mpc, batch = make(*settings(algo, actor, critic, task))

@@ -15,11 +15,7 @@ import train
 from tests.logs import LINEAR, log_overrides
 from tests.runs import CONFIGS, SMALL, choices, make_config
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.config import (
-    check_config,
-    flatten,
-    settings,
-)
+from torch_qpmpc.experiment.config import check_config, flatten, settings
 from torch_qpmpc.experiment.config.messages import keys
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import snapshot
@@ -420,10 +416,7 @@ def test_betas_are_adams():
             "task.id: got a key of another choice, expected a key of this t",
         ),
         (["+optimizer.lr_cots=1"], "optimizer.lr_cots: got an unknown key, .* optimizer.lr_cost?"),
-        (
-            ["optimizer.name=rmsprop"],
-            "optimizer.name: got 'rmsprop', expected one of adam, sgd, ",
-        ),
+        (["optimizer.name=rmsprop"], "optimizer.name: got 'rmsprop', expected one of adam, sgd, "),
         (["task.name=unknown"], "task.name: got 'unknown', expected one of .*point_mass"),
         (["constraint.si=3"], "constraint.si: got 3, expected its keys, as in configs/."),
     ],
@@ -507,10 +500,7 @@ def test_solver_must_be_known():
             ["noise=uniform"],
             "noise.name: got 'uniform', expected a noise of task point_mass: gauss",
         ),
-        (
-            ["noise.name=pink"],
-            "noise.name: got 'pink', expected a noise of .* gaussian, brownian",
-        ),
+        (["noise.name=pink"], "noise.name: got 'pink', expected a noise of .* gaussian, brownian"),
         (
             ["task=gros_zanon", "noise=gaussian"],
             "noise.name: got 'gaussian', expected a noise of task gros_zanon: uniform.",

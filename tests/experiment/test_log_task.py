@@ -92,10 +92,7 @@ def test_a_model_start_is_the_arx_model(overrides):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        (
-            "task.file=null",
-            "task.file: got null, expected the path of a CSV file, as in. python",
-        ),
+        ("task.file=null", "task.file: got null, expected the path of a CSV file, as in. python"),
         ("task.file=none.csv", "data: got none.csv, which cannot be read"),
         ("task.Q=null", "task.Q: got none, expected weights of outputs, such as 'task.Q={T: 1.0}'"),
         ("task.Q={q: 1}", "task.Q: got 'q', expected one of T."),

@@ -425,12 +425,7 @@ def test_critics_and_value_in_iql():
         in_keys=["loc", "scale"],
         distribution_class=TanhNormal,
     )
-    loss = IQLLoss(
-        actor,
-        qvalue_network=critics,
-        value_network=value,
-        num_qvalue_nets=2,
-    )
+    loss = IQLLoss(actor, qvalue_network=critics, value_network=value, num_qvalue_nets=2)
     loss.make_value_estimator(gamma=0.9)
     out = loss(td)
     (out["loss_actor"] + out["loss_qvalue"] + out["loss_value"]).backward()

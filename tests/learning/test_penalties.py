@@ -38,13 +38,7 @@ def make_C_0(generator: torch.Generator) -> torch.Tensor:
 def test_mask_is_the_printed_one():
     """eq:sdp2's C_mask for z = [x_0, u_0, .., u_2, x_3]; then with blocks for entries."""
     a, o, b = 3.0, 5.0, 7.0  # c_1 above, c_2 on, c_3 below the band
-    scalar = torch.tensor(
-        [
-            [o, o, o, a, a, a, a],
-            [b, b, o, o, o, a, a],
-            [b, b, b, b, o, o, o],
-        ]
-    )
+    scalar = torch.tensor([[o, o, o, a, a, a, a], [b, b, o, o, o, a, a], [b, b, b, b, o, o, o]])
     penalty = DeviationPenalty(torch.zeros(3, 7), 1, 1, c_1=a, c_2=o, c_3=b)
     assert torch.equal(penalty.C_mask, scalar)
 
@@ -60,11 +54,7 @@ def test_mask_grows_with_the_distance():
     a, o, b, g = 3.0, 5.0, 7.0, 0.5
     a_2, b_2 = a * (1 + g), b * (1 + g)
     expected = torch.tensor(
-        [
-            [o, o, o, a, a, a_2, a_2],
-            [b, b, o, o, o, a, a],
-            [b_2, b_2, b, b, o, o, o],
-        ]
+        [[o, o, o, a, a, a_2, a_2], [b, b, o, o, o, a, a], [b_2, b_2, b, b, o, o, o]]
     )
     penalty = DeviationPenalty(torch.zeros(3, 7), 1, 1, c_1=a, c_2=o, c_3=b, growth=g)
     assert torch.equal(penalty.C_mask, expected)

@@ -91,11 +91,7 @@ def test_the_residuals_are_rows_of_the_least_squares_problem(trust_region):
     errors = PredictionErrors(mpc, weight=0.1)
     errors.add(s, a, following)
     optimizer = GaussNewton(
-        mpc,
-        damping=DAMPING,
-        trust_region=trust_region,
-        normalise=False,
-        residuals=errors.residuals,
+        mpc, damping=DAMPING, trust_region=trust_region, normalise=False, residuals=errors.residuals
     )
     reference = Reference(mpc, optimizer, normalise=False)
     pairs = random_states(COUNT, size=0.9), random_states(COUNT, 1, size=0.45, seed=1)

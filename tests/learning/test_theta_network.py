@@ -13,11 +13,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import (
-    AddStateIndependentNormalScale,
-    TensorDictModule,
-    TensorDictSequential,
-)
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torch.testing import assert_close
 from torchrl.collectors import Collector
@@ -298,20 +294,14 @@ def test_the_network_reads_other_keys():
         (lambda mpc: ThetaNetwork(mpc, ["q"]), "sizes: got list, expected a Mapping. Map names"),
         (lambda mpc: ThetaNetwork(mpc, {}), "sizes: got {}, expected bounds of some of H, q, c"),
         (lambda mpc: ThetaNetwork(mpc, {"A": 1.0}), "sizes: got 'A', expected names among H, q"),
-        (
-            lambda mpc: ThetaNetwork(mpc, {"q": 0.0}),
-            r"sizes\['q'\]: got 0.0, expected a n",
-        ),
+        (lambda mpc: ThetaNetwork(mpc, {"q": 0.0}), r"sizes\['q'\]: got 0.0, expected a n"),
         (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, width=0), "width: got 0"),
         (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, n_in=0), "n_in: got 0, expected a whole"),
         (
             lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, in_keys="observation"),
             r"in_keys: got 'observation', expected a list of keys, such as \['observation'\]",
         ),
-        (
-            lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, in_keys=[]),
-            r"in_keys: got \[\], expected a l",
-        ),
+        (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, in_keys=[]), r"in_keys: got \[\], expected a l"),
         (
             lambda mpc: ThetaNetwork(mpc, {"q": 1.0})(TensorDict(observation=torch.ones(3, 5))),
             r"in_keys: got 5 entries of observation, expected n_in = 2. Pass n_in=5, or other",

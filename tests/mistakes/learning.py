@@ -14,17 +14,7 @@ import torch
 from tensordict import TensorDict
 
 import torch_qpmpc as qm
-from tests.mistakes.objects import (
-    Aa,
-    G,
-    S,
-    batch_with,
-    batch_without,
-    free,
-    gn,
-    mpc,
-    op,
-)
+from tests.mistakes.objects import Aa, G, S, batch_with, batch_without, free, gn, mpc, op
 from tests.problems import random_mpc
 from tests.transitions import make_batch, make_loss
 from torch_qpmpc.learning.replay import make_replay, windows_to_tau

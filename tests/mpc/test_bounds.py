@@ -72,10 +72,7 @@ def test_each_row_of_D_and_D_f_may_have_its_own_price():
             "terminal_constraints, bounds: got lower 1 > upper 0 at entry 0, expected lower <=",
         ),
         ({"constraint_slack": -1.0}, "constraint_slack: got -1.0, expected a non-negative weight"),
-        (
-            {"constraint_slack": [-1.0]},
-            r"constraint_slack: got \[-1.0\], expected a non-negati",
-        ),
+        ({"constraint_slack": [-1.0]}, r"constraint_slack: got \[-1.0\], expected a non-negati"),
         ({"state_slack": None}, "state_slack: got None, expected a non-negative weight, or inf"),
         ({"action_slack": torch.nan}, "action_slack: got nan, expected a non-negative weight"),
         ({"discount_slack": 1}, "discount_slack: got 1, expected True or False"),

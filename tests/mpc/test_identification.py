@@ -254,10 +254,7 @@ def two_equal_actions(log: TensorDict) -> TensorDict:
             r"start: got \['H'\], expected a mapping of values by name, of q, c, C, b",
         ),
         (lambda: QPMPC(2, 1, 3, start=[1.0]), r"start: got \[1.0\], expected a mapping"),  # pyright: ignore[reportArgumentType] (the mistake)
-        (
-            lambda: QPMPC(2, 1, 3, start={"b": [0.0]}),
-            r"b: got shape \(1,\), expected shape \(6,\)",
-        ),
+        (lambda: QPMPC(2, 1, 3, start={"b": [0.0]}), r"b: got shape \(1,\), expected shape \(6,\)"),
         (
             lambda: QPMPC(2, 1, 3, start={"c": torch.nan}),
             "c: got NaN or inf, expected finite entries",

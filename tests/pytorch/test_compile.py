@@ -109,10 +109,7 @@ def test_batch_sizes_and_updates_of_theta_do_not_compile_again(name):
 
 @pytest.mark.parametrize(
     "transformed",
-    [
-        lambda f: vmap(grad(f)),
-        lambda f: lambda s: jvp(f, (s,), (torch.ones_like(s),))[1],
-    ],
+    [lambda f: vmap(grad(f)), lambda f: lambda s: jvp(f, (s,), (torch.ones_like(s),))[1]],
     ids=["vmap of grad", "jvp"],
 )
 def test_transforms_that_cannot_be_compiled_are_refused_or_left_eager(transformed):

@@ -11,16 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.func import (
-    functional_call,
-    grad,
-    hessian,
-    jacfwd,
-    jacrev,
-    jvp,
-    stack_module_state,
-    vmap,
-)
+from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, stack_module_state, vmap
 from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, random_mpc, random_states

@@ -9,15 +9,7 @@ from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev, vmap
 from torch.testing import assert_close
 
-from tests.problems import (
-    CPU,
-    KnownQP,
-    known_qp,
-    normal,
-    programs_of,
-    random_mpc,
-    random_states,
-)
+from tests.problems import CPU, KnownQP, known_qp, normal, programs_of, random_mpc, random_states
 from torch_qpmpc import QPError, QuadraticProgram, solve_qp
 from torch_qpmpc.qp import kkt
 from torch_qpmpc.qp.program import EVENT_SHAPES

@@ -5,12 +5,7 @@ import pytest
 from scipy.stats import trim_mean
 
 from torch_qpmpc import QPError
-from torch_qpmpc.study.statistics import (
-    bootstrap_interval,
-    interquartile_mean,
-    spread,
-    spread_name,
-)
+from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean, spread, spread_name
 
 
 @pytest.fixture

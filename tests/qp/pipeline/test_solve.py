@@ -283,13 +283,7 @@ def test_the_log_adds_up_all_solves_of_its_block():
 
 def test_the_log_reports_the_metrics_of_training():
     log = SolveLog(
-        solves=4,
-        unsolved=1,
-        fallback=2,
-        recalled=3,
-        iterations=10,
-        residual=1e-8,
-        seconds=0.5,
+        solves=4, unsolved=1, fallback=2, recalled=3, iterations=10, residual=1e-8, seconds=0.5
     )
     assert log.metrics() == {
         "qp/solves": 4,

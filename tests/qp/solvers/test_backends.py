@@ -21,14 +21,7 @@ from torch_qpmpc import QPError, SolveLog, solve_qp
 from torch_qpmpc.qp.program import EVENT_SHAPES
 from torch_qpmpc.qp.solvers import BACKENDS, backend, fallbacks
 
-BATCHES = [
-    ((), ()),
-    ((1,), ()),
-    ((6,), ()),
-    ((6,), (6,)),
-    ((3, 4), (3, 1)),
-    ((3, 4), (4,)),
-]
+BATCHES = [((), ()), ((1,), ()), ((6,), ()), ((6,), (6,)), ((3, 4), (3, 1)), ((3, 4), (4,))]
 
 
 def assert_solves(

@@ -315,8 +315,7 @@ def test_without_a_solution_the_answer_is_finite_and_soon(case):
 
 
 @pytest.mark.parametrize(
-    ("case", "status"),
-    [("infeasible", Status.INFEASIBLE), ("unbounded", Status.UNBOUNDED)],
+    ("case", "status"), [("infeasible", Status.INFEASIBLE), ("unbounded", Status.UNBOUNDED)]
 )
 def test_the_pipeline_diagnoses_failures(case, status):
     qps = HOPELESS[case]
