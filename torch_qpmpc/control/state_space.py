@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-import scipy.signal
 
 from torch_qpmpc.checks import check_number
 from torch_qpmpc.errors import QPError
@@ -167,6 +166,8 @@ def _labels(system: Any, name: str, size: int) -> list[str] | None:
 
 def _of_system(system: Any, dt: float | None) -> tuple[Array, Array, Array, float | None]:
     """Return A, B, C and dt of a system, sampled if it is continuous."""
+    from scipy.signal import lti  # takes a second, which most controllers need not wait
+
     if not hasattr(system, "A") and hasattr(system, "to_ss"):
         system = system.to_ss()
     if not all(hasattr(system, name) for name in "ABCD"):
@@ -177,7 +178,7 @@ def _of_system(system: Any, dt: float | None) -> tuple[Array, Array, Array, floa
         remedy = "Sample the output before the input changes, or add the input to the state."
         raise QPError.expected("model", "a direct feedthrough D", "D = 0", remedy)
     own = getattr(system, "dt", None)
-    if isinstance(system, scipy.signal.lti) or (own is not None and own is not True and own == 0):
+    if isinstance(system, lti) or (own is not None and own is not True and own == 0):
         if dt is None:
             remedy = "It is sampled with that, by zero-order hold."
             raise QPError.expected("dt", "None for a continuous model", "a sampling time", remedy)
