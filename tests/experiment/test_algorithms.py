@@ -40,13 +40,13 @@ def test_penalties_by_case(constraint):
 
 
 def test_penalties_have_the_configured_weights():
-    overrides = ("deviation.c_1=2", "deviation.c_2=0.5", "deviation.c_3=0.25", "deviation.growth=1")
+    overrides = ("deviation.c_1=2", "deviation.c_2=0.5", "deviation.c_3=0.25")
     more = ("si.beta=0.125", "si.normalised=true")
     names = [f"constraint.{name}" for name in (*overrides, *more)]
     cfg = make_config("constraint=combined", *SMALL, *names)
     deviation, si = make_penalties(cfg, make_mpc(cfg, make_physics(cfg)))
     assert deviation is not None
-    assert deviation.C_mask.unique().tolist() == [0.25, 0.5, 2, 4]
+    assert deviation.C_mask.unique().tolist() == [0.25, 0.5, 2]
     assert si is not None
     assert (si.beta, si.normalised) == (0.125, True)
 

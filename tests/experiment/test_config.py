@@ -201,7 +201,6 @@ TASK_KEYS = {
     "task.margin": "task=house",
     "task.memory": "task=tank_references",
     "task.model_error": "task=tank_references",
-    "task.one_weather": "task=house",
     "task.past": "task=house_wall",
     **dict.fromkeys(("task.C_y", "task.dR", "task.noise", "task.starts"), "task=linear"),
     **dict.fromkeys(("task.outputs", "task.inputs", "task.known"), "task=log"),
@@ -260,9 +259,6 @@ BAD: dict[str, list[Any]] = {
     "algo.width": WHOLE,
     "algo.theta.q": [0, *REAL],
     "algo.theta.b": [0, *REAL],
-    "algo.policy_delay": WHOLE,
-    "algo.policy_noise": REAL,
-    "algo.noise_clip": REAL,
     "start.name": ["policy", *NAME],
     "start.file": [3, True],
     "start.transitions": WHOLE,
@@ -311,9 +307,9 @@ for _name in ("replay_capacity", "eval_interval", "log_interval", "constraint.si
     BAD[_name] = WHOLE
 for _name in ("task.horizon", "task.episode_steps", "task.eval_steps"):
     BAD[_name] = WHOLE
-for _name in ("scale_cost", "scale_constraints", "damping"):
+for _name in ("scale_constraints", "damping"):
     BAD[f"optimizer.{_name}"] = [0, *REAL]
-for _name in ("optimizer.trust_region", "optimizer.normalise", "task.one_weather"):
+for _name in ("optimizer.trust_region", "optimizer.normalise"):
     BAD[_name] = FLAG
 for _name in ("task.disturbed", "task.observation_bounds", "task.hidden_velocity"):
     BAD[_name] = FLAG
@@ -325,7 +321,7 @@ BAD["task.actuator_std"] = REAL
 BAD["task.a_max"] = BAD["task.capacity"] = [0, *REAL]
 for _name in ("lr_cost", "lr_constraints"):
     BAD[f"optimizer.{_name}"] = REAL
-for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "deviation.growth", "si.beta"):
+for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "si.beta"):
     BAD[f"constraint.{_name}"] = REAL
 
 

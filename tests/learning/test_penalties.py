@@ -55,21 +55,6 @@ def test_mask_is_the_printed_one():
     assert torch.equal(penalty.C_mask, blocks)
 
 
-def test_mask_grows_with_the_distance():
-    """Weights off the band increase by ``growth`` with every stage beyond the first."""
-    a, o, b, g = 3.0, 5.0, 7.0, 0.5
-    a_2, b_2 = a * (1 + g), b * (1 + g)
-    expected = torch.tensor(
-        [
-            [o, o, o, a, a, a_2, a_2],
-            [b, b, o, o, o, a, a],
-            [b_2, b_2, b, b, o, o, o],
-        ]
-    )
-    penalty = DeviationPenalty(torch.zeros(3, 7), 1, 1, c_1=a, c_2=o, c_3=b, growth=g)
-    assert torch.equal(penalty.C_mask, expected)
-
-
 def test_default_weights_are_the_papers():
     penalty = DeviationPenalty(torch.zeros(3, 7, dtype=torch.float64), 1, 1)
     assert penalty.C_mask[0].tolist() == [1e-4] * 3 + [1.0] * 4
@@ -104,7 +89,7 @@ def test_deviation_penalty_has_the_right_gradient(generator):
 def test_proximal_step_is_the_minimiser_entry_by_entry(generator, scale):
     """Against a search over a fine grid, and over the kink, for every entry."""
     C_0 = make_C_0(generator)
-    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=1.0, c_2=0.2, c_3=0.0, growth=0.1)
+    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=1.0, c_2=0.2, c_3=0.0)
     start = C_0 + normal(generator, *C_0.shape)
     C = torch.nn.Parameter(start.clone())
     penalty.proximal_step_(C, scale)
@@ -178,7 +163,7 @@ def test_deviation_penalty_keeps_its_own_C_0(generator):
     assert penalty.to(torch.float32).C_mask.dtype == torch.float32
 
 
-@pytest.mark.parametrize("name", ["c_1", "c_2", "c_3", "growth"])
+@pytest.mark.parametrize("name", ["c_1", "c_2", "c_3"])
 @pytest.mark.parametrize("weight", [-1.0, math.inf, math.nan])
 def test_impossible_deviation_weights(name, weight):
     with pytest.raises(QPError, match=rf"{name}: got {weight}, expected a finite weight >= 0"):

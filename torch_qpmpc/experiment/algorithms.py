@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.actor_critic import (
+    POLICY_DELAY,
     actor_groups,
     critic_groups,
     make_actor_critic_loss,
@@ -163,7 +164,7 @@ def make_optimizer(
     if options.name == "gauss_newton":
         return GaussNewton(
             mpc,
-            scales={"cost": options.scale_cost, "constraints": options.scale_constraints},
+            scales={"cost": 1.0, "constraints": options.scale_constraints},
             lr=options.lr,
             damping=options.damping,
             memory=options.memory,
@@ -197,7 +198,7 @@ def make_update(
     if isinstance(optimizer, GaussNewton):
         assert isinstance(loss_module, QPQLearningLoss)
         return second_order(mpc, loss_module, optimizer, deviation, si)
-    every = cfg.algo.policy_delay if cfg.algo.name == "td3" else 1
+    every = POLICY_DELAY if cfg.algo.name == "td3" else 1
     return first_order(
         mpc,
         loss_module,

@@ -70,8 +70,6 @@ class DeviationPenalty(nn.Module):
         c_1: weight above the band, where the future would act on the past.
         c_2: weight on the band.
         c_3: weight below the band.
-        growth: relative growth of the weights off the band with the distance to it in stages,
-            ``c (1 + growth (distance - 1))``.
 
     Raises:
         QPError: if a weight is negative or not finite, or the shape of C_0 fits no horizon.
@@ -98,11 +96,9 @@ class DeviationPenalty(nn.Module):
         c_1: float = 1.0,
         c_2: float = 1e-4,
         c_3: float = 0.0,
-        growth: float = 0.0,
     ) -> None:
         super().__init__()
-        weights = {"c_1": c_1, "c_2": c_2, "c_3": c_3, "growth": growth}
-        for name, weight in weights.items():
+        for name, weight in {"c_1": c_1, "c_2": c_2, "c_3": c_3}.items():
             check_number(name, weight, _finite, "a finite weight >= 0")
         check_whole("n_x", n_x, 1)
         check_whole("n_u", n_u, 1)
@@ -123,13 +119,12 @@ class DeviationPenalty(nn.Module):
         distance = distance.to(C_0)
         mask = torch.full_like(distance, c_2)
         mask[distance > 0], mask[distance < 0] = c_1, c_3
-        mask *= 1 + growth * (distance.abs() - 1).clamp(min=0)
         self.register_buffer("C_0", C_0.detach().clone())
         self.register_buffer("C_mask", mask)
 
     @classmethod
     def of(cls, mpc: QPMPC, **weights: float) -> DeviationPenalty:
-        """Return the penalty for the C of ``mpc``; ``weights`` are c_1, c_2, c_3 and growth.
+        """Return the penalty for the C of ``mpc``; ``weights`` are c_1, c_2 and c_3.
 
         Raises:
             QPError: as in `DeviationPenalty`.

@@ -35,7 +35,6 @@ class Deviation(Group):
     c_1: NonNegative
     c_2: NonNegative
     c_3: NonNegative
-    growth: NonNegative
 
 
 class SystemIdentification(Group):
@@ -89,7 +88,6 @@ class Adam(SGD):
 class GaussNewton(Group):
     name: Literal["gauss_newton"]
     lr: Fraction
-    scale_cost: Positive
     scale_constraints: Positive
     damping: Positive
     memory: Whole
@@ -110,27 +108,16 @@ class Residuals(Group):
     b: Positive
 
 
-class DDPG(Group):
+class ActorCritic(Group):
     """The actor is a QP, a QP whose theta a network schedules, or a network."""
 
-    name: Literal["ddpg"]
+    name: Literal["ddpg", "td3", "sac"]
     actor: Annotated[str, one_of(("qp", "scheduled", "mlp"))]
     critic: Annotated[str, one_of(("qp", "mlp"))]
     actor_rate: Positive
     lr_network: Positive
     width: Count
     theta: Residuals
-
-
-class TD3(DDPG):
-    name: Literal["td3"]
-    policy_delay: Count
-    policy_noise: NonNegative
-    noise_clip: NonNegative
-
-
-class SAC(DDPG):
-    name: Literal["sac"]
 
 
 class FromModel(Group):
@@ -167,5 +154,5 @@ class Search(Group):
 
 
 Optimizer = Annotated[Adam | SGD | GaussNewton, Field(discriminator="name")]
-Algorithm = Annotated[QLearning | DDPG | TD3 | SAC, Field(discriminator="name")]
+Algorithm = Annotated[QLearning | ActorCritic, Field(discriminator="name")]
 Start = Annotated[FromModel | FromData, Field(discriminator="name")]
