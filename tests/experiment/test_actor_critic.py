@@ -201,7 +201,7 @@ def test_td3_delays_its_actor_also_after_a_resume(done):
         actor = copy.deepcopy(mpc.state_dict())
         critics = parameters(learner, "qvalue_network_params")
         learner.learn(batch.clone(), None)
-        learner.schedule.step()
+        learner.scheduler.step()
         still = all(torch.equal(x, actor[name]) for name, x in mpc.state_dict().items())
         assert still == (update % POLICY_DELAY != 0), update
         assert moved(critics, parameters(learner, "qvalue_network_params"))
@@ -209,11 +209,11 @@ def test_td3_delays_its_actor_also_after_a_resume(done):
 
 def test_td3_whose_schedule_is_restored_has_the_same_delay():
     learner, mpc, batch = make(*settings("td3", "qp", "mlp"))
-    learner.schedule.last_epoch = 4
+    learner.scheduler.last_epoch = 4
     for update in (5, 6, 7):
         before = mpc.C.detach().clone()
         learner.learn(batch.clone(), None)
-        learner.schedule.step()
+        learner.scheduler.step()
         assert torch.equal(mpc.C, before) == (update != 6)
 
 
@@ -229,7 +229,7 @@ def test_updates_move_the_actor_the_critics_and_nothing_else(algo, actor, critic
     before, theta = copy.deepcopy(loss_module.state_dict()), copy.deepcopy(mpc.state_dict())
     for _ in range(4):
         terms, losses = learner.learn(batch.clone(), None)
-        learner.schedule.step()
+        learner.scheduler.step()
         learner.target.step()
         assert all(term.isfinite() for term in terms.values())
         assert algo == "sac" or losses["pred_value"].isfinite().all()

@@ -65,7 +65,7 @@ def test_optimizer_has_two_rates_that_fall_linearly(name):
     )
     mpc = make_mpc(cfg, make_physics(cfg))
     learner = make_learner(cfg, QPActorValueOperator(mpc), make_physics(cfg))
-    optimizer, schedule = learner.optimizer, learner.schedule
+    optimizer, scheduler = learner.optimizer, learner.scheduler
     assert type(optimizer).__name__.lower() == name
     rates = {"H": 0.1, "c": 0.1, "C": 0.01, "ub": 0.01}
     assert {g["name"]: g["lr"] for g in optimizer.param_groups} == rates
@@ -73,7 +73,7 @@ def test_optimizer_has_two_rates_that_fall_linearly(name):
     assert {id(p) for p in grouped} == {id(p) for p in mpc.parameters()}
     for update in range(1, 11):
         optimizer.step()
-        schedule.step()
+        scheduler.step()
         factor = 1 - 0.8 * min(update, 8) / 8
         for group in optimizer.param_groups:
             assert group["lr"] == pytest.approx(rates[group["name"]] * factor)

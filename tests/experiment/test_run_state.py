@@ -230,7 +230,7 @@ def test_an_invalid_state_is_refused(stopped):
         ("loss_module", {"more": torch.zeros(2)}),
         ("mpc", {"C": torch.zeros(2, 2)}),
         ("optimizer", {"param_groups": []}),
-        ("schedule", {"last_epoch": None}),
+        ("scheduler", {"last_epoch": None}),
         ("replay", {"storage": {}}),
         ("replay", {"generator": torch.zeros(3, dtype=torch.uint8)}),
         ("collector", {"rng": torch.zeros(3, dtype=torch.uint8)}),

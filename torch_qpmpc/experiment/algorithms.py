@@ -57,7 +57,7 @@ class Learner:
     loss_module: LossModule
     actor: TensorDictModuleBase
     optimizer: torch.optim.Optimizer
-    schedule: LambdaLR
+    scheduler: LambdaLR
     deviation: DeviationPenalty | None
     si: SystemIdentificationPenalty | None
     target: SoftUpdate | None
@@ -81,8 +81,8 @@ class Learner:
             self.errors.add(operator.known(flat), flat.get(operator.in_keys[1]), following)
 
     def advance(self) -> None:
-        """Advance the schedule, the bounds and the target network by one update."""
-        self.schedule.step()
+        """Advance the learning rates, the bounds and the target network by one update."""
+        self.scheduler.step()
         if self.back_off is not None and self.errors is not None:
             self.back_off.tighten(self.errors.covariance(self.back_off.mpc.quadratic_program()))
         if self.target is not None:
@@ -116,14 +116,14 @@ def make_learner(
     deviation, si = make_penalties(cfg, mpc)
     errors = make_errors(cfg, mpc)
     optimizer = make_optimizer(cfg, mpc, loss_module, errors)
-    schedule = make_schedule(cfg, optimizer, done)
-    update = make_update(cfg, mpc, loss_module, optimizer, schedule, deviation, si, done)
+    scheduler = make_scheduler(cfg, optimizer, done)
+    update = make_update(cfg, mpc, loss_module, optimizer, scheduler, deviation, si, done)
     return Learner(
         update,
         loss_module,
         actor,
         optimizer,
-        schedule,
+        scheduler,
         deviation,
         si,
         None if cfg.algo.name == "qlearning" else SoftUpdate(loss_module, tau=cfg.target_rate),
@@ -189,7 +189,7 @@ def make_update(
     mpc: QPMPC,
     loss_module: LossModule,
     optimizer: torch.optim.Optimizer,
-    schedule: LambdaLR,
+    scheduler: LambdaLR,
     deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
     done: int,
@@ -205,11 +205,11 @@ def make_update(
         optimizer,
         deviation,
         si,
-        lambda: (done + schedule.last_epoch + 1) % every == 0,
+        lambda: (done + scheduler.last_epoch + 1) % every == 0,
     )
 
 
-def make_schedule(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int = 0) -> LambdaLR:
+def make_scheduler(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int = 0) -> LambdaLR:
     """Make the linear decay of the learning rates, continued after ``done`` updates."""
     # Read once: OmegaConf's lookups are slower than the function itself.
     last, updates = cfg.optimizer.final_fraction, cfg.updates
