@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests.figures import image_of, rendered
-from tests.problems import normal
+from tests.problems import model_form, normal
 from torch_qpmpc import QPMPC, DeviationPenalty, QPError
 from torch_qpmpc.analysis.model_error import first_state_error, one_step_error, second_moment
 from torch_qpmpc.analysis.plots import (
@@ -26,7 +26,6 @@ from torch_qpmpc.analysis.policy import local_gain, policy_map, window_model
 from torch_qpmpc.analysis.prediction_form import (
     PredictionForm,
     canonical_matrix,
-    model_form,
     prediction_form,
 )
 from torch_qpmpc.analysis.report import canonical, predictions, read, structure_metrics

@@ -195,12 +195,10 @@ def test_an_actor_has_the_first_order_by_itself():
 TASK_KEYS = {
     "task.a_max": "task=actuator_noise",
     "task.actuator_std": "task=actuator_noise",
-    "task.capacity": "task=inventory",
     "task.disturbed": "task=tank_references",
     "task.hidden_velocity": "task=actuator_noise",
     "task.margin": "task=house",
     "task.memory": "task=tank_references",
-    "task.model_error": "task=tank_references",
     "task.past": "task=house_wall",
     **dict.fromkeys(("task.C_y", "task.dR", "task.noise", "task.starts"), "task=linear"),
     **dict.fromkeys(("task.outputs", "task.inputs", "task.known"), "task=log"),
@@ -264,7 +262,6 @@ BAD: dict[str, list[Any]] = {
     "start.transitions": WHOLE,
     "start.levels": ["normal", *NAME],
     "start.hold": [0.5, *REAL],
-    "start.causal": FLAG,
     "start.ridge": REAL[:-1],
     "task.name": ["pendulum", *NAME],
     "task.id": ["???", *NAME],
@@ -316,9 +313,9 @@ for _name in ("task.disturbed", "task.observation_bounds", "task.hidden_velocity
 BAD["task.past"] = WHOLE
 BAD["task.held"] = [[-1], [0.5], ["a"], 3]
 BAD["task.memory"] = BAD["task.start_episodes"] = WHOLE[1:]
-BAD["task.margin"] = BAD["task.model_error"] = REAL
+BAD["task.margin"] = REAL
 BAD["task.actuator_std"] = REAL
-BAD["task.a_max"] = BAD["task.capacity"] = [0, *REAL]
+BAD["task.a_max"] = [0, *REAL]
 for _name in ("lr_cost", "lr_constraints"):
     BAD[f"optimizer.{_name}"] = REAL
 for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "si.beta"):

@@ -134,7 +134,6 @@ class FromData(Group):
     transitions: Count
     levels: Annotated[str, one_of(("uniform", "binary"))]
     hold: Annotated[Finite, Field(ge=1), Expected("a finite number >= 1")]
-    causal: Flag
     ridge: Annotated[NonNegative | None, Expected("a finite number >= 0, or null")]
 
 

@@ -103,8 +103,7 @@ def identified_model(
     cfg: DictConfig, log: Any, layout: Layout, structure: str, held: Sequence[int]
 ) -> Identified:
     """Identify C and b with the sizes of ``layout`` and the run's settings; ``held`` outputs."""
-    options = {"causal": cfg.start.causal, "ridge": cfg.start.ridge, "held": held}
-    return _model(log, layout, structure, **options)
+    return _model(log, layout, structure, ridge=cfg.start.ridge, held=held)
 
 
 def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
