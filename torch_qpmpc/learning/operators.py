@@ -25,6 +25,7 @@ from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.coordinates import check_names
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.qp.batching import to_dtype
 from torch_qpmpc.qp.program import QuadraticProgram
 
 #: The key of the known signals, as environments emit them.
@@ -82,13 +83,12 @@ class _QPOperator(TensorDictModuleBase):
     def _set_value(self, tensordict: TensorDictBase, *action_key: NestedKey) -> TensorDictBase:
         """Write -V, or -Q with the key of an action, to the first out-key."""
         inputs = [self.known(tensordict), *(entry(tensordict, key) for key in action_key)]
-        qp = self._program(tensordict)
-        if self.active_set_key is None:
-            cost = self.module(*inputs, qp=qp)
-        else:
-            start = tensordict.get(self.active_set_key, None)
-            cost, active = self.module.value_and_active_set(*inputs, warm_start=start, qp=qp)
-            tensordict.set(self.active_set_key, active)
+        key = self.active_set_key
+        start = None if key is None else tensordict.get(key, None)
+        solution = self.module.solve(*inputs, warm_start=start, qp=self._program(tensordict))
+        if key is not None:
+            tensordict.set(key, solution.active)
+        cost = to_dtype(solution.value, inputs[0].dtype)
         return tensordict.set(self.out_keys[0], -cost.unsqueeze(-1))
 
 
