@@ -36,19 +36,18 @@ def test_penalties_by_case(constraint):
         assert deviation.C_mask.unique().tolist() == [0, 1e-4, 1]
         assert torch.equal(deviation.C_0, mpc.C_0)
     if si is not None:
-        assert (si.beta, si.normalised) == (1.0 if constraint == "identified" else 1e-6, False)
+        assert si.beta == (1.0 if constraint == "identified" else 1e-6)
 
 
 def test_penalties_have_the_configured_weights():
     overrides = ("deviation.c_1=2", "deviation.c_2=0.5", "deviation.c_3=0.25")
-    more = ("si.beta=0.125", "si.normalised=true")
-    names = [f"constraint.{name}" for name in (*overrides, *more)]
+    names = [f"constraint.{name}" for name in (*overrides, "si.beta=0.125")]
     cfg = make_config("constraint=combined", *SMALL, *names)
     deviation, si = make_penalties(cfg, make_mpc(cfg, make_physics(cfg)))
     assert deviation is not None
     assert deviation.C_mask.unique().tolist() == [0.25, 0.5, 2]
     assert si is not None
-    assert (si.beta, si.normalised) == (0.125, True)
+    assert si.beta == 0.125
 
 
 @pytest.mark.parametrize("name", ["adam", "sgd"])

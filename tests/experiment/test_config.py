@@ -291,7 +291,6 @@ BAD: dict[str, list[Any]] = {
     "noise.std": REAL[:-1],
     "constraint.name": NAME,
     "constraint.learn": ["C", ["C", "H"], ["c"], [{"C": 1}], None, 3],
-    "constraint.si.normalised": FLAG,
     "optimizer.name": ["rmsprop", *NAME],
     "optimizer.betas": [0.9, [0.9], [0.9, 1.0], [-0.1, 0.9], ["a", "b"], [0.9] * 3, None],
     "optimizer.final_fraction": FRACTION,
@@ -306,8 +305,6 @@ for _name in ("task.horizon", "task.episode_steps", "task.eval_steps"):
     BAD[_name] = WHOLE
 for _name in ("scale_constraints", "damping"):
     BAD[f"optimizer.{_name}"] = [0, *REAL]
-for _name in ("optimizer.trust_region", "optimizer.normalise"):
-    BAD[_name] = FLAG
 for _name in ("task.disturbed", "task.observation_bounds", "task.hidden_velocity"):
     BAD[_name] = FLAG
 BAD["task.past"] = WHOLE
@@ -472,10 +469,6 @@ def test_solver_must_be_known():
             r"task.learn_cost: got \[\], expected something to learn, here or in constraint.learn",
         ),
         (
-            ["optimizer=gauss_newton", "constraint=si", "constraint.si.normalised=true"],
-            r"constraint.si.normalised: got True, expected False. gauss_newton needs a penal",
-        ),
-        (
             ["constraint=si", "optimizer=recursive"],
             "replay: got False, expected true. constraint.si",
         ),
@@ -607,7 +600,6 @@ ABLATIONS: dict[str, tuple[list[str], dict[str, Any]]] = {
     "sgd": ([*CASE_3, "optimizer=sgd"], {"step": "projection"}),
     "markov": (CASE_3, {"constraint.deviation.c_3": 1.0}),
     "si_raw": (["optimizer=adam", "constraint=si"], {}),
-    "si_normalised": (["optimizer=adam", "constraint=si"], {"constraint.si.normalised": True}),
     "horizon_5": (CASE_3, {"task.horizon": 5}),
     "horizon_20": (CASE_3, {"task.horizon": 20, "warmup_steps": 20}),
     "projection": (CASE_3, {"step": "projection"}),

@@ -140,7 +140,7 @@ def make_penalties(
     deviation, si = cfg.constraint.deviation, cfg.constraint.si
     return (
         None if deviation is None else DeviationPenalty.of(mpc, **deviation),
-        None if si is None else SystemIdentificationPenalty(si.beta, normalised=si.normalised),
+        None if si is None else SystemIdentificationPenalty(si.beta),
     )
 
 
@@ -169,8 +169,8 @@ def make_optimizer(
             damping=options.damping,
             memory=options.memory,
             td_error_clip=cfg.td_error_clip,
-            trust_region=options.trust_region,
-            normalise=options.normalise,
+            trust_region=not options.memory,  # a few new pairs do not judge a step on past ones
+            normalise=not options.memory,
             residuals=None if errors is None else errors.residuals,
             weighted=cfg.algo.weighted,
         )

@@ -40,7 +40,6 @@ class Deviation(Group):
 class SystemIdentification(Group):
     beta: NonNegative
     windows: Count
-    normalised: Flag
 
 
 class Constraint(Group):
@@ -91,8 +90,6 @@ class GaussNewton(Group):
     scale_constraints: Positive
     damping: Positive
     memory: Whole
-    trust_region: Flag
-    normalise: Flag
     final_fraction: Fraction
 
 

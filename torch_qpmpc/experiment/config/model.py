@@ -136,13 +136,7 @@ class Config(Group):
     @model_validator(mode="after")
     def second_order_has_quadratic_penalties(self) -> Self:
         """Check that gauss_newton can apply the SI penalty, which must be quadratic in a free C."""
-        penalties = self.constraint
-        if not self.second_order:
-            return self
-        if penalties.si is not None and penalties.si.normalised:
-            remedy = "gauss_newton needs a penalty that is quadratic in C."
-            self.conflict("constraint.si.normalised", "False", remedy)
-        if penalties.si is not None and penalties.structure != "free":
+        if self.second_order and self.constraint.si and self.constraint.structure != "free":
             remedy = "gauss_newton needs a free C for constraint.si."
             self.conflict("constraint.structure", "free", remedy)
         return self
