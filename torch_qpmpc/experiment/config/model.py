@@ -104,10 +104,6 @@ class Config(Group):
     def second_order(self) -> bool:
         return self.optimizer.name == "gauss_newton"
 
-    @property
-    def penalised(self) -> bool:
-        return self.constraint.deviation is not None or self.constraint.si is not None
-
     def conflict(self, key: str, expected: str, remedy: str = "") -> NoReturn:
         """Raise the error of a value that conflicts with others."""
         value = functools.reduce(getattr, key.split("."), self)
@@ -198,7 +194,7 @@ class Config(Group):
             self.conflict("warm_start", "false", f"{name} solves at actions not in the replay.")
         if not self.replay:
             self.conflict("replay", "true", f"{name} learns from a replay.")
-        if self.algo.actor == "mlp" and self.penalised:
+        if self.algo.actor == "mlp" and (self.constraint.deviation or self.constraint.si):
             remedy = "The penalties are on a QP's C: choose constraint=free."
             self.conflict("algo.actor", "qp or scheduled", remedy)
         if self.step != "cholesky":
