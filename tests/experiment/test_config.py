@@ -228,7 +228,6 @@ WEIGHTS = ("Q", "R", "dR", "noise")
 BAD: dict[str, list[Any]] = {
     "seed": [*WHOLE[1:], 2**63],
     "solver": NAME,
-    "warm_start": FLAG,
     "replay": FLAG,
     "release": [*WHOLE[:-2], math.nan],
     "exploration_std": REAL,
@@ -505,7 +504,6 @@ def test_solver_must_be_known():
             ["algo=td3", "optimizer=gauss_newton"],
             "optimizer.name: got 'gauss_newton', expected adam or sgd. td3 needs a first-order",
         ),
-        (["algo=ddpg", "warm_start=true"], "warm_start: got True, expected false. ddpg solves at"),
         (
             ["algo=ddpg", "constraint=free", "replay=false"],
             "replay: got False, expected true. ddpg learns from a",

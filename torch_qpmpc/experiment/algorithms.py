@@ -91,7 +91,7 @@ class Learner:
 
 def make_operator(cfg: DictConfig, mpc: QPMPC) -> QPActorValueOperator:
     """Make the operator of the run's QP, with the keys that the environments and replay have."""
-    active_set = ACTIVE_SET if cfg.warm_start else None
+    active_set = ACTIVE_SET if cfg.algo.name == "qlearning" else None
     return QPActorValueOperator(mpc, preview_key=preview_key(mpc), active_set_key=active_set)
 
 

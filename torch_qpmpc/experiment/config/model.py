@@ -61,7 +61,6 @@ class Config(Group):
     seed: Annotated[Seed, Expected("a whole number >= 0 and < 2^63")]
     eval_seed: Annotated[Seed | None, Expected("a whole number >= 0 and < 2^63, or null")]
     solver: Annotated[Name, AfterValidator(_known_solver)]
-    warm_start: Flag
     threads: Count
     updates: Count
     batch_size: Count
@@ -190,8 +189,6 @@ class Config(Group):
         if self.second_order:
             remedy = f"{name} needs a first-order optimizer: set optimizer=adam."
             self.conflict("optimizer.name", "adam or sgd", remedy)
-        if self.warm_start:
-            self.conflict("warm_start", "false", f"{name} solves at actions not in the replay.")
         if not self.replay:
             self.conflict("replay", "true", f"{name} learns from a replay.")
         if self.algo.actor == "mlp" and (self.constraint.deviation or self.constraint.si):
