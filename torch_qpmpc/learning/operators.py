@@ -83,12 +83,14 @@ class _QPOperator(TensorDictModuleBase):
     def _set_value(self, tensordict: TensorDictBase, *action_key: NestedKey) -> TensorDictBase:
         """Write -V, or -Q with the key of an action, to the first out-key."""
         inputs = [self.known(tensordict), *(entry(tensordict, key) for key in action_key)]
-        key = self.active_set_key
-        start = None if key is None else tensordict.get(key, None)
-        solution = self.module.solve(*inputs, warm_start=start, qp=self._program(tensordict))
-        if key is not None:
-            tensordict.set(key, solution.active)
-        cost = to_dtype(solution.value, inputs[0].dtype)
+        qp = self._program(tensordict)
+        if self.active_set_key is None:
+            cost = self.module(*inputs, qp=qp)
+        else:
+            start = tensordict.get(self.active_set_key, None)
+            solution = self.module.solve(*inputs, warm_start=start, qp=qp)
+            tensordict.set(self.active_set_key, solution.active)
+            cost = to_dtype(solution.value, inputs[0].dtype)
         return tensordict.set(self.out_keys[0], -cost.unsqueeze(-1))
 
 
