@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc import QPMPC, QuadraticProgram
+from torch_qpmpc.analysis.prediction_form import PredictionForm, prediction_form
+from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.qp.kernels import sample_torch
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
@@ -40,6 +42,17 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
 def times(matrix: Tensor, vector: Tensor) -> Tensor:
     """Multiply matrices and vectors over any batch dimensions."""
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def model_form(
+    A: Tensor, B: Tensor, N: int, offset: Tensor | None = None, E: Tensor | None = None
+) -> PredictionForm:
+    """Make the prediction form of a model with lags and d, one or one per stage."""
+    n_x, n_d = A.shape[-2], 0 if E is None else E.shape[-1]
+    past = A.shape[-1] // n_x
+    b = None if offset is None else -offset.expand(N, n_x).flatten()
+    C = banded_matrix(A, B, N, E)
+    return prediction_form(C, n_x, B.shape[-1] // past, b, past, n_d)
 
 
 @dataclass(frozen=True)

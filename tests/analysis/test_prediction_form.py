@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.problems import normal, times
+from tests.problems import model_form, normal, times
 from torch_qpmpc import QPError
-from torch_qpmpc.analysis.prediction_form import canonical_matrix, model_form, prediction_form
+from torch_qpmpc.analysis.prediction_form import canonical_matrix, prediction_form
 from torch_qpmpc.analysis.structure import stage_models
 from torch_qpmpc.mpc.banded import banded_matrix
 

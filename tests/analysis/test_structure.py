@@ -10,11 +10,10 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from tests.problems import normal
+from tests.problems import model_form, normal
 from torch_qpmpc.analysis.prediction_form import (
     PredictionForm,
     canonical_matrix,
-    model_form,
     prediction_form,
 )
 from torch_qpmpc.analysis.structure import (

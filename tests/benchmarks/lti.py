@@ -24,7 +24,7 @@ from tests.benchmarks.table import DOCS
 from tests.runs import make_config
 from torch_qpmpc import GaussNewton
 from torch_qpmpc.envs import GrosZanonLTI
-from torch_qpmpc.experiment.algorithms import make_errors, make_optimizer, make_schedule
+from torch_qpmpc.experiment.algorithms import make_errors, make_optimizer, make_scheduler
 from torch_qpmpc.experiment.tasks import make_mpc
 from torch_qpmpc.mpc.tightening import BackOff
 from torch_qpmpc.study.markdown import replaced, table
@@ -51,7 +51,7 @@ def run(
     back_off = None if cfg.back_off is None else BackOff(mpc, cfg.back_off)
     optimizer = make_optimizer(cfg, mpc, errors=errors)
     assert isinstance(optimizer, GaussNewton)
-    schedule, gamma = make_schedule(cfg, optimizer), cfg.task.gamma
+    scheduler, gamma = make_scheduler(cfg, optimizer), cfg.task.gamma
     # mpcrl's agents draw the seed of each episode.
     rng = np.random.default_rng(int(np.random.default_rng(seed).integers(2**32)))
     draws = torch.Generator().manual_seed(seed)
@@ -74,7 +74,7 @@ def run(
             visited = states[batch], actions[batch]
             following = mpc.solve(states[batch + 1], qp=qp)
             optimizer.step(*visited, physics.cost(*visited) + gamma * following.value)
-            schedule.step()
+            scheduler.step()
             if back_off is not None and errors is not None:
                 back_off.tighten(errors.covariance(mpc.quadratic_program()))
             qp = mpc.quadratic_program()

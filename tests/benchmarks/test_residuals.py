@@ -38,13 +38,13 @@ def test_gradient_with_residuals(
         mpc.zero_grad()
         (q_start, v_start), (at, following) = starts.get(own[0] is None, (None, None)), own
         qp = mpc.quadratic_program(at)
-        Q, of_Q = mpc.value_and_active_set(data.s, data.a, q_start, qp)
+        now = mpc.solve(data.s, data.a, q_start, qp)
         with torch.no_grad():
             qp = mpc.quadratic_program(following)
-            V, of_V = mpc.value_and_active_set(data.following, warm_start=v_start, qp=qp)
-        (data.cost + GAMMA * V - Q).square().mean().backward()
+            after = mpc.solve(data.following, warm_start=v_start, qp=qp)
+        (data.cost + GAMMA * after.value - now.value).square().mean().backward()
         if warm:
-            starts[own[0] is None] = of_Q, of_V
+            starts[own[0] is None] = now.active, after.active
 
     interleaved(
         lambda: gradient(pair),

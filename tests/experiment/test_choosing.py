@@ -222,7 +222,7 @@ def test_learning_begins_with_the_best_scheme_where_a_gate_keeps_the_held_action
     "settings",
     [
         ("gate=true", "constraint=mpc", "optimizer=gauss_newton", "release=2", BOUNDED),
-        ("gate=act", "algo=td3", "constraint=free", "warm_start=false"),
+        ("gate=act", "algo=td3", "constraint=free"),
     ],
     ids=" ".join,
 )
@@ -303,7 +303,7 @@ def turning(monkeypatch):
     "settings",
     [
         ("gate=act", "optimizer=gauss_newton", "constraint=mpc", "release=2"),
-        ("gate=false", "algo=td3", "constraint=free", "warm_start=false"),
+        ("gate=false", "algo=td3", "constraint=free"),
     ],
     ids=" ".join,
 )

@@ -130,7 +130,7 @@ def test_training_logs_by_the_logger_of_the_configuration(tmp_path):
     [
         ("gate=true", "constraint=adaptive", "optimizer=gauss_newton"),
         ("constraint=combined", "noise=brownian"),
-        ("algo=sac", "constraint=free", "warm_start=false"),
+        ("algo=sac", "constraint=free"),
     ],
     ids=lambda overrides: overrides[0],
 )

@@ -15,7 +15,7 @@ from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.metrics import report, structure_summary, table, theta_metrics
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder
-from torch_qpmpc.experiment.tasks import make_mpc, make_physics, true_model
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.mpc.banded import banded_matrix
 
 
@@ -118,7 +118,7 @@ def test_structure_summary_has_the_models_error_before_and_after():
     cfg = make_config(*SMALL, "constraint=free")
     physics = linear_system(cfg)
     mpc = make_mpc(cfg, physics)
-    truth = true_model(physics)
+    truth = physics.true_model()
     assert truth is not None
     A, B, offset = truth
     before = (mpc.C_0[:4, :6] - torch.cat((A, B), dim=1)).norm().item()
@@ -136,7 +136,7 @@ def test_a_run_continues_if_its_C_cannot_be_read():
     mpc = make_mpc(cfg, physics)
     with torch.no_grad():
         mpc.C.zero_()
-    summary = structure_summary(mpc, true_model(physics))
+    summary = structure_summary(mpc, physics.true_model())
     assert math.isnan(summary["canonical_distance"])
     assert math.isnan(summary["model_error"])
     assert summary["model_error_start"] > 0

@@ -26,7 +26,7 @@ STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episo
 STREAM += ("steps_per_update=4",)
 GATED = ("gate=true", "optimizer=gauss_newton")
 DATA = ("start=data", "start.transitions=200")
-ACTOR_CRITIC = ("constraint=free", "warm_start=false", "optimizer=adam")
+ACTOR_CRITIC = ("constraint=free", "optimizer=adam")
 NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
 
 
@@ -39,7 +39,7 @@ NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
         ("optimizer=adam", "constraint=mpc", "release=7"),
         ("gate=plant", "optimizer=recursive", *STREAM, "constraint=mpc"),
         ("optimizer=recursive", *STREAM, "replay=true", "replay_capacity=16", "batch_size=4"),
-        ("noise=brownian", "steps_per_update=3", "warm_start=false"),
+        ("noise=brownian", "steps_per_update=3"),
         (*GATED, "constraint=mpc", "release=3", "search.w=0.5"),
         (*GATED, *DATA, "constraint=free"),
         ("gate=model", "optimizer=gauss_newton", *DATA, "constraint=free"),
@@ -230,7 +230,7 @@ def test_an_invalid_state_is_refused(stopped):
         ("loss_module", {"more": torch.zeros(2)}),
         ("mpc", {"C": torch.zeros(2, 2)}),
         ("optimizer", {"param_groups": []}),
-        ("schedule", {"last_epoch": None}),
+        ("scheduler", {"last_epoch": None}),
         ("replay", {"storage": {}}),
         ("replay", {"generator": torch.zeros(3, dtype=torch.uint8)}),
         ("collector", {"rng": torch.zeros(3, dtype=torch.uint8)}),

@@ -229,7 +229,7 @@ def test_train_learns_a_plants_qp(store_task, tmp_path, algo):
     """With both penalties, a step of second order, and figures; every step is in the replay."""
     options = ("optimizer=gauss_newton", "constraint=combined", "figures=true")
     if algo != "qlearning":
-        options = ("constraint=free", f"algo={algo}", "warm_start=false")
+        options = ("constraint=free", f"algo={algo}")
     cfg = make_config("task=store", *SMALL, *options)
     summary = train.train(cfg, str(tmp_path), quiet=True)
     assert summary["unsolved"] == 0

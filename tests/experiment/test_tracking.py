@@ -12,6 +12,7 @@ from tests.benchmarks.offset import Reachable, controllers, steady_error
 from torch_qpmpc.envs import FourTanks, TankReferences
 from torch_qpmpc.experiment.rivals.linear_mpc import Tracking
 from torch_qpmpc.experiment.tracking import (
+    INPUT_WEIGHT,
     TERMINAL_FACTOR,
     offset_free,
     reference_scheme,
@@ -92,9 +93,8 @@ def test_the_value_at_the_set_point_is_the_discounted_cost_of_the_plan():
     window = torch.randn(p.n_p, generator=torch.Generator().manual_seed(1)).double() / 3
     solution = mpc.solve(window)
     y, u = mpc.predicted(solution.z.detach())
-    Q, R = p.weights()
-    stages = (y - p.r).square() @ Q
-    stages[:-1] += (u - p.set_point()[1]).square() @ R
+    stages = (y - p.r).square() @ p.weights()[0]
+    stages[:-1] += INPUT_WEIGHT * (u - p.set_point()[1]).square().sum(-1)
     by_hand = (0.9 ** torch.arange(7)).double() @ stages
     torch.testing.assert_close(solution.value.detach(), by_hand)
 

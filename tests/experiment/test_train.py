@@ -327,7 +327,7 @@ def test_a_seed_determines_every_number(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
-@pytest.mark.parametrize("name", ["markov", "si_normalised", "projection", "horizon_20"])
+@pytest.mark.parametrize("name", ["markov", "si_raw", "projection", "horizon_20"])
 def test_an_ablation_runs(tmp_path, name):
     """The others differ in numbers alone, and in choices that other tests run."""
     small = [override for override in SMALL if not override.startswith(("optimizer", "task.hor"))]

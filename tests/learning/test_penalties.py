@@ -49,17 +49,6 @@ def test_mask_is_the_printed_one():
     assert torch.equal(penalty.C_mask, blocks)
 
 
-def test_mask_grows_with_the_distance():
-    """Weights off the band increase by ``growth`` with every stage beyond the first."""
-    a, o, b, g = 3.0, 5.0, 7.0, 0.5
-    a_2, b_2 = a * (1 + g), b * (1 + g)
-    expected = torch.tensor(
-        [[o, o, o, a, a, a_2, a_2], [b, b, o, o, o, a, a], [b_2, b_2, b, b, o, o, o]]
-    )
-    penalty = DeviationPenalty(torch.zeros(3, 7), 1, 1, c_1=a, c_2=o, c_3=b, growth=g)
-    assert torch.equal(penalty.C_mask, expected)
-
-
 def test_default_weights_are_the_papers():
     penalty = DeviationPenalty(torch.zeros(3, 7, dtype=torch.float64), 1, 1)
     assert penalty.C_mask[0].tolist() == [1e-4] * 3 + [1.0] * 4
@@ -94,7 +83,7 @@ def test_deviation_penalty_has_the_right_gradient(generator):
 def test_proximal_step_is_the_minimiser_entry_by_entry(generator, scale):
     """Against a search over a fine grid, and over the kink, for every entry."""
     C_0 = make_C_0(generator)
-    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=1.0, c_2=0.2, c_3=0.0, growth=0.1)
+    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=1.0, c_2=0.2, c_3=0.0)
     start = C_0 + normal(generator, *C_0.shape)
     C = torch.nn.Parameter(start.clone())
     penalty.proximal_step_(C, scale)
@@ -168,7 +157,7 @@ def test_deviation_penalty_keeps_its_own_C_0(generator):
     assert penalty.to(torch.float32).C_mask.dtype == torch.float32
 
 
-@pytest.mark.parametrize("name", ["c_1", "c_2", "c_3", "growth"])
+@pytest.mark.parametrize("name", ["c_1", "c_2", "c_3"])
 @pytest.mark.parametrize("weight", [-1.0, math.inf, math.nan])
 def test_impossible_deviation_weights(name, weight):
     with pytest.raises(QPError, match=rf"{name}: got {weight}, expected a finite weight >= 0"):
@@ -184,62 +173,29 @@ def test_C_0_of_no_horizon(shape, horizon):
 # --- System identification -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("normalised", [False, True])
-def test_system_identification_penalty_window_by_window(generator, normalised):
+def test_system_identification_penalty_window_by_window(generator):
     C, windows = normal(generator, N * N_X, N_Z), normal(generator, 7, N_Z)
     b = normal(generator, N * N_X)
     rows, offset = C.numpy(), b.numpy()
-    if normalised:
-        sizes = np.sqrt((rows**2).sum(1))
-        rows, offset = rows / sizes[:, None], offset / sizes
     total = sum(np.linalg.norm(rows @ tau - offset) ** 2 for tau in windows.numpy())
-    penalty = system_identification_penalty(C, windows, b, normalised=normalised)
+    penalty = system_identification_penalty(C, windows, b)
     assert penalty.item() == pytest.approx(total, rel=1e-12)
-    module = SystemIdentificationPenalty(1e-3, normalised=normalised)
+    module = SystemIdentificationPenalty(1e-3)
     assert module(C, windows, b).item() == pytest.approx(1e-3 * total, rel=1e-12)
     assert SystemIdentificationPenalty()(C, windows).item() == pytest.approx(
         1e-6 * system_identification_penalty(C, windows).item()
     )
 
 
-@pytest.mark.parametrize("normalised", [False, True])
-def test_system_identification_penalty_has_the_right_gradient(generator, normalised):
+def test_system_identification_penalty_has_the_right_gradient(generator):
     C = normal(generator, N * N_X, N_Z).requires_grad_()
     b = normal(generator, N * N_X).requires_grad_()
     windows = normal(generator, 7, N_Z)
-    penalty = SystemIdentificationPenalty(0.1, normalised=normalised)
+    penalty = SystemIdentificationPenalty(0.1)
     assert torch.autograd.gradcheck(lambda x, y: penalty(x, windows, y), (C, b))
 
 
-def test_normalised_penalty_does_not_reward_shrinking_C(generator):
-    C, windows = normal(generator, N * N_X, N_Z), normal(generator, 7, N_Z)
-    scaled = torch.linspace(0.1, 3, N * N_X, dtype=torch.float64).unsqueeze(1) * C
-    raw, normalised = (
-        SystemIdentificationPenalty(1.0),
-        SystemIdentificationPenalty(1.0, normalised=True),
-    )
-    torch.testing.assert_close(normalised(scaled, windows), normalised(C, windows))
-    torch.testing.assert_close(raw(0.1 * C, windows), 0.01 * raw(C, windows))
-    C = C.requires_grad_()
-    (gradient,) = torch.autograd.grad(normalised(C, windows), C)
-    torch.testing.assert_close(
-        (gradient * C).sum(-1), torch.zeros(N * N_X, dtype=torch.float64), atol=1e-12, rtol=0
-    )
-
-
-def test_normalised_penalty_of_a_zero_row_is_finite(generator):
-    C = normal(generator, N * N_X, N_Z)
-    C[1] = 0
-    C.requires_grad_()
-    value = system_identification_penalty(C, normal(generator, 7, N_Z), normalised=True)
-    value.backward()
-    assert value.isfinite()
-    assert C.grad is not None
-    assert C.grad.isfinite().all()
-
-
-@pytest.mark.parametrize("normalised", [False, True])
-def test_true_model_explains_noise_free_windows(generator, normalised):
+def test_true_model_explains_noise_free_windows(generator):
     physics, horizon = PointMass(noise_std=0.0), 5
     s, entries = 0.5 * normal(generator, 6, 4), []
     for _ in range(horizon):
@@ -247,7 +203,7 @@ def test_true_model_explains_noise_free_windows(generator, normalised):
         entries += [s, a]
         s = physics.step(s, a, torch.zeros(4))
     windows = torch.cat([*entries, s], dim=-1)
-    penalty = SystemIdentificationPenalty(1.0, normalised=normalised)
+    penalty = SystemIdentificationPenalty(1.0)
     assert penalty(banded_matrix(physics.A, physics.B, horizon), windows).item() < 1e-25
     A, B, _ = physics.corrupted(1)
     assert penalty(banded_matrix(A, B, horizon), windows).item() > 1e-2
@@ -286,5 +242,3 @@ def test_the_si_penalty_as_a_quadratic_in_C():
     for offset in (b, None):
         D = torch.cat((C, (b if offset is not None else 0 * b).unsqueeze(-1)), -1)
         assert_close(0.5 * ((D @ S) * D).sum(), penalty(C, windows, offset))
-    with pytest.raises(QPError, match=r"normalised: got True, expected False\. Only then"):
-        SystemIdentificationPenalty(0.3, normalised=True).curvature(windows)

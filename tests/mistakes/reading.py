@@ -15,7 +15,7 @@ import torch
 from tests.mistakes.objects import A2, B1, S, form, mpc, op
 from torch_qpmpc.analysis.model_error import first_state_error, one_step_error, second_moment
 from torch_qpmpc.analysis.policy import local_gain, policy_map, spectral_radius
-from torch_qpmpc.analysis.prediction_form import canonical_matrix, model_form, prediction_form
+from torch_qpmpc.analysis.prediction_form import canonical_matrix, prediction_form
 from torch_qpmpc.analysis.report import read, structure_metrics
 from torch_qpmpc.analysis.structure import (
     distance_by_band,
@@ -23,6 +23,7 @@ from torch_qpmpc.analysis.structure import (
     memory_energies,
     nearest_model,
 )
+from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.projections import check_step, nearest_psd, nearest_psd_by_sdp
 from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
 
@@ -45,16 +46,11 @@ MISTAKES: dict[str, list[Callable[[], Any]]] = {
         lambda: form.predict(torch.zeros(3, 2).double(), torch.zeros(5, 4, 1).double())
     ],
     "B: got shape (1, 2), expected shape (2, 2) or (3, 2, 2).": [
-        lambda: model_form(torch.eye(2), torch.ones(1, 2), 3)
+        lambda: banded_matrix(torch.eye(2), torch.ones(1, 2), 3)
     ],
-    "horizon: got 0, expected a whole number >= 1.": [lambda: model_form(A2, B1, 0)],
-    "offset: got shape (3,), expected shape (*batch, 2).": [
-        lambda: model_form(A2, B1, 3, torch.zeros(3))
+    "C, b: got NaN or inf, expected finite entries.": [
+        lambda: prediction_form(mpc.C * math.nan, 2, 1)
     ],
-    "A: got shape (2,), expected shape (*batch, n_x, L n_x).": [
-        lambda: model_form(torch.ones(2), torch.ones(2), 3)
-    ],
-    "C, b: got NaN or inf, expected finite entries.": [lambda: model_form(A2 * math.nan, B1, 3)],
     "form: got Parameter, expected a PredictionForm.": [lambda: canonical_matrix(mpc.C, A2)],
     "form.Phi: got shape (2, 6, 2), expected shape (N n_x, n_p). Pass the form of a single C.": [
         lambda: canonical_matrix(

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_kind, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.qp.batching import broadcast
 
@@ -166,38 +165,6 @@ def prediction_form(
     solved = torch.linalg.solve(following, torch.cat((-p, -u, b.expand(*p.shape[:-1], 1)), -1))
     Phi, Gamma, phi = solved.split((layout.n_p, N * n_u, 1), dim=-1)
     return PredictionForm(Phi, Gamma, phi.squeeze(-1), condition, layout)
-
-
-def model_form(
-    A: Tensor,
-    B: Tensor,
-    horizon: int,
-    offset: Tensor | None = None,
-    E: Tensor | None = None,
-) -> PredictionForm:
-    """Return the prediction form of x+ = A x + B u + offset, or of a model with lags and d.
-
-    Args:
-        A, B, E: the model, as in `banded_matrix`: ``(n_x, L n_x)``, ``(n_x, L n_u)`` and
-            ``(n_x, n_d)``, or with a leading N for one per stage. Without a preview, E is None.
-        horizon: N.
-        offset: ``(n_x,)``, or ``(N, n_x)``; zero by default.
-
-    Raises:
-        QPError: if the shapes do not fit each other or the horizon.
-    """
-    check_whole("horizon", horizon, 1)
-    check_tensor("A", A, "n_x", "L n_x")
-    check_tensor("B", B, "n_x", "L n_u")
-    n_x, n_d = B.shape[-2], 0 if E is None else E.shape[-1]
-    offset = A.new_zeros(n_x) if offset is None else check_tensor("offset", offset, n_x)
-    if offset.shape[:-1] not in ((), (horizon,)):
-        got = f"shape {tuple(offset.shape)}"
-        raise QPError.expected("offset", got, f"shape ({n_x},) or ({horizon}, {n_x})")
-    C_0 = banded_matrix(A, B, horizon, E)
-    past = A.shape[-1] // n_x
-    b = -offset.expand(horizon, n_x).flatten()
-    return prediction_form(C_0, n_x, B.shape[-1] // past, b, past, n_d)
 
 
 def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import KW_ONLY, dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -107,7 +107,7 @@ class GrosZanonLTIEnv(LinearSystemEnv):
 
     Args:
         physics: the system; None for ``GrosZanonLTI()``.
-        num_envs, max_steps, dtype, device, seed: as in :class:`LinearSystemEnv`.
+        num_envs, max_steps, options: as in :class:`LinearSystemEnv`.
 
     Raises:
         QPError: if an argument does not fit.
@@ -118,9 +118,8 @@ class GrosZanonLTIEnv(LinearSystemEnv):
         num_envs: int = 8,
         physics: GrosZanonLTI | None = None,
         max_steps: int = 5000,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str | None = None,
-        seed: int | None = None,
+        **options: Any,
     ) -> None:
-        physics = GrosZanonLTI() if physics is None else physics
-        super().__init__(physics, num_envs, max_steps, dtype, device, seed)
+        super().__init__(
+            GrosZanonLTI() if physics is None else physics, num_envs, max_steps, **options
+        )

@@ -21,6 +21,7 @@ from torch import Tensor
 from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
 
 from torch_qpmpc.checks import check_kind, check_seed, check_tensor, check_whole
+from torch_qpmpc.envs.past_window import first_window
 from torch_qpmpc.envs.window_observation import WindowObservation
 from torch_qpmpc.errors import QPError
 
@@ -153,7 +154,7 @@ class GymnasiumPlant:
 
         Of a window it is the last output.
         """
-        size = self.past * len(self.lb_s) + (self.past - 1) * len(self.lb_a)
+        size = len(first_window(self.lb_s, self.past, self.lb_a))
         s = check_tensor("s", s, size)[..., -len(self.lb_s) :].to(self.lb_s)
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
 

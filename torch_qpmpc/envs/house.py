@@ -37,7 +37,6 @@ class House(HeatedHouse):
     Args:
         R: thermal resistance to the outdoors in K/kW; the tutorial's planner assumes 2.
         C: thermal capacity in kWh/K.
-        one_weather: give every day the noise of the tutorial's single day.
 
     Raises:
         QPError: if an argument does not fit, such as an R that is not positive.
@@ -56,7 +55,6 @@ class House(HeatedHouse):
     n_d: int = 4
     R: float = 1.4
     C: float = 1.5
-    one_weather: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,13 +68,9 @@ class House(HeatedHouse):
 
     def weather(self, draws: Tensor) -> Tensor:
         """Return T_out: 8 degrees, swinging by 6 to its maximum at 15 h, and smoothed noise."""
-        length, count = draws.shape[:2]
         noise = draws[..., 0].mT
-        if self.one_weather:
-            noise = torch.as_tensor(np.random.default_rng(0).normal(size=length))
-            noise = noise.to(draws).expand(count, length)
         noise = conv1d(pad(noise.unsqueeze(1), (4, 3)), WINDOW.to(noise).expand(1, 1, -1))
-        swing = 6 * torch.sin(2 * math.pi * (hours(length) - 9) / 24).to(noise)
+        swing = 6 * torch.sin(2 * math.pi * (hours(len(draws)) - 9) / 24).to(noise)
         return (8 + swing + noise.squeeze(1)).unsqueeze(-1)
 
     def starts(self, rng: Rng, count: int) -> Tensor:

@@ -249,15 +249,9 @@ class LinearSystemGymEnv(gymnasium.Env):
 
 
 class LinearSystemEnv(VectorisedEnv):
-    """A TorchRL environment of ``num_envs`` vectorised episodes, without a Python loop.
+    """A TorchRL environment of ``num_envs`` episodes of a `LinearSystem`, as in `VectorisedEnv`.
 
-    Its only state is the generator. Beside the observation, the TensorDict carries the inputs of a
-    step: ``noise``, the last nu ``(num_envs, n_x)``, and ``step_count`` ``(num_envs, 1)``. At a
-    partial reset, TorchRL's merging by mask therefore restarts the noise and step count of exactly
-    the episodes that are reset. A policy must not read ``noise``.
-
-    Episodes are truncated at ``max_steps`` (no ``StepCounter`` needed), so that a collector resets
-    them and changes their trajectory ids; they never terminate.
+    The hidden entries are ``noise``, the last nu ``(num_envs, n_x)``, and ``step_count``.
 
     Args:
         physics: the system.

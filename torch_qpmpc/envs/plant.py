@@ -130,19 +130,15 @@ class Plant(ABC):
 
 
 class PlantEnv(VectorisedEnv):
-    """A TorchRL environment of ``num_envs`` vectorised episodes of a `Plant`.
+    """A TorchRL environment of ``num_envs`` episodes of a `Plant`, as in `VectorisedEnv`.
 
     It emits the output y as ``observation`` ``(num_envs, n_y)``, and the known signals d_k, ..,
     d_{k+N} as ``preview`` ``(num_envs, (N + 1) n_d)`` if there are any. The transform `PastWindow`
     turns the observation into the window of past outputs and actions.
 
     The seed draws the signals of ``episodes`` episodes; each reset chooses one of them at random.
-    Hidden entries, which a policy must not read, are ``state`` ``(num_envs, n_x)`` in float64,
-    ``episode``, the index of the signals, ``step_count`` and ``violation``, each
-    ``(num_envs, 1)``. At a partial reset, TorchRL's merging by mask restarts exactly the episodes
-    that are reset.
-
-    Episodes are truncated at ``max_steps`` (no ``StepCounter`` needed); they never terminate.
+    Hidden entries are ``state`` ``(num_envs, n_x)`` in float64, ``episode``, the index of the
+    signals, ``step_count`` and ``violation``, each ``(num_envs, 1)``.
 
     Args:
         plant: the plant.

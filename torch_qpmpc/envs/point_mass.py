@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import KW_ONLY, dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -159,7 +160,7 @@ class PointMassEnv(LinearSystemEnv):
 
     Args:
         physics: the system; None for ``PointMass()``.
-        num_envs, max_steps, dtype, device, seed: as in :class:`LinearSystemEnv`.
+        num_envs, max_steps, options: as in :class:`LinearSystemEnv`.
 
     Raises:
         QPError: if an argument does not fit.
@@ -174,9 +175,8 @@ class PointMassEnv(LinearSystemEnv):
         num_envs: int = 8,
         physics: PointMass | None = None,
         max_steps: int = 50,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str | None = None,
-        seed: int | None = None,
+        **options: Any,
     ) -> None:
-        physics = PointMass() if physics is None else physics
-        super().__init__(physics, num_envs, max_steps, dtype, device, seed)
+        super().__init__(
+            PointMass() if physics is None else physics, num_envs, max_steps, **options
+        )

@@ -39,6 +39,8 @@ from torch_qpmpc.mpc.validation import COST
 SPREAD = 0.01
 #: Initial standard deviation of SAC's QP actors, relative to half the distance of the bounds.
 INITIAL_STD = 0.3
+#: TD3's updates of the critics for one of the actor.
+POLICY_DELAY = 2
 #: Steps with random actions from which the mean and deviation of a network's inputs are taken.
 TYPICAL_STEPS = 50
 
@@ -142,8 +144,6 @@ def make_actor_critic_loss(cfg: DictConfig, mpc: QPMPC, physics: AnyPlant) -> Lo
         make_actor(cfg, mpc, physics),
         [make_critic(cfg, mpc, physics) for _ in range(2)],
         bounds=bounds,
-        policy_noise=cfg.algo.policy_noise,
-        noise_clip=cfg.algo.noise_clip,
         loss_function="l2",
     )
 

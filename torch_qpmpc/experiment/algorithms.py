@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.actor_critic import (
+    POLICY_DELAY,
     actor_groups,
     critic_groups,
     make_actor_critic_loss,
@@ -56,7 +57,7 @@ class Learner:
     loss_module: LossModule
     actor: TensorDictModuleBase
     optimizer: torch.optim.Optimizer
-    schedule: LambdaLR
+    scheduler: LambdaLR
     deviation: DeviationPenalty | None
     si: SystemIdentificationPenalty | None
     target: SoftUpdate | None
@@ -80,8 +81,8 @@ class Learner:
             self.errors.add(operator.known(flat), flat.get(operator.in_keys[1]), following)
 
     def advance(self) -> None:
-        """Advance the schedule, the bounds and the target network by one update."""
-        self.schedule.step()
+        """Advance the learning rates, the bounds and the target network by one update."""
+        self.scheduler.step()
         if self.back_off is not None and self.errors is not None:
             self.back_off.tighten(self.errors.covariance(self.back_off.mpc.quadratic_program()))
         if self.target is not None:
@@ -90,7 +91,7 @@ class Learner:
 
 def make_operator(cfg: DictConfig, mpc: QPMPC) -> QPActorValueOperator:
     """Make the operator of the run's QP, with the keys that the environments and replay have."""
-    active_set = ACTIVE_SET if cfg.warm_start else None
+    active_set = ACTIVE_SET if cfg.algo.name == "qlearning" else None
     return QPActorValueOperator(mpc, preview_key=preview_key(mpc), active_set_key=active_set)
 
 
@@ -115,14 +116,14 @@ def make_learner(
     deviation, si = make_penalties(cfg, mpc)
     errors = make_errors(cfg, mpc)
     optimizer = make_optimizer(cfg, mpc, loss_module, errors)
-    schedule = make_schedule(cfg, optimizer, done)
-    update = make_update(cfg, mpc, loss_module, optimizer, schedule, deviation, si, done)
+    scheduler = make_scheduler(cfg, optimizer, done)
+    update = make_update(cfg, mpc, loss_module, optimizer, scheduler, deviation, si, done)
     return Learner(
         update,
         loss_module,
         actor,
         optimizer,
-        schedule,
+        scheduler,
         deviation,
         si,
         None if cfg.algo.name == "qlearning" else SoftUpdate(loss_module, tau=cfg.target_rate),
@@ -139,7 +140,7 @@ def make_penalties(
     deviation, si = cfg.constraint.deviation, cfg.constraint.si
     return (
         None if deviation is None else DeviationPenalty.of(mpc, **deviation),
-        None if si is None else SystemIdentificationPenalty(si.beta, normalised=si.normalised),
+        None if si is None else SystemIdentificationPenalty(si.beta),
     )
 
 
@@ -163,13 +164,13 @@ def make_optimizer(
     if options.name == "gauss_newton":
         return GaussNewton(
             mpc,
-            scales={"cost": options.scale_cost, "constraints": options.scale_constraints},
+            scales={"cost": 1.0, "constraints": options.scale_constraints},
             lr=options.lr,
             damping=options.damping,
             memory=options.memory,
             td_error_clip=cfg.td_error_clip,
-            trust_region=options.trust_region,
-            normalise=options.normalise,
+            trust_region=not options.memory,  # a few new pairs do not judge a step on past ones
+            normalise=not options.memory,
             residuals=None if errors is None else errors.residuals,
             weighted=cfg.algo.weighted,
         )
@@ -188,7 +189,7 @@ def make_update(
     mpc: QPMPC,
     loss_module: LossModule,
     optimizer: torch.optim.Optimizer,
-    schedule: LambdaLR,
+    scheduler: LambdaLR,
     deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
     done: int,
@@ -197,18 +198,18 @@ def make_update(
     if isinstance(optimizer, GaussNewton):
         assert isinstance(loss_module, QPQLearningLoss)
         return second_order(mpc, loss_module, optimizer, deviation, si)
-    every = cfg.algo.policy_delay if cfg.algo.name == "td3" else 1
+    every = POLICY_DELAY if cfg.algo.name == "td3" else 1
     return first_order(
         mpc,
         loss_module,
         optimizer,
         deviation,
         si,
-        lambda: (done + schedule.last_epoch + 1) % every == 0,
+        lambda: (done + scheduler.last_epoch + 1) % every == 0,
     )
 
 
-def make_schedule(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int = 0) -> LambdaLR:
+def make_scheduler(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int = 0) -> LambdaLR:
     """Make the linear decay of the learning rates, continued after ``done`` updates."""
     # Read once: OmegaConf's lookups are slower than the function itself.
     last, updates = cfg.optimizer.final_fraction, cfg.updates

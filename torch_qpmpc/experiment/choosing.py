@@ -180,7 +180,7 @@ def _model(cfg: DictConfig, own: Start, structure: str, horizon: int, past: int)
     layout = replace(options.layout, horizon=horizon, past=past)
     if (layout, structure) == (options.layout, options.structure):
         return own.identified
-    return identified_model(cfg, own.log, layout, structure, options.held)
+    return identified_model(own.log, layout, structure, options.held, cfg.start.ridge)
 
 
 def _cost_name(cost: RewardCost | None) -> str:
@@ -212,7 +212,8 @@ def _none_held(cfg: DictConfig, start: Start) -> Start | None:
     options = start.identified.options
     if start.held is not None or not options.held or cfg.task.get("held") is not None:
         return None
-    model, blended = identified_model(cfg, start.log, options.layout, options.structure, []), None
+    structure, ridge = options.structure, cfg.start.ridge
+    model, blended = identified_model(start.log, options.layout, structure, [], ridge), None
     if start.blended is not None:
         blended = identify_blended(start.log, options.layout.horizon)
     return start._replace(identified=model, blended=blended)

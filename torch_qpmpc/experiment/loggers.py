@@ -20,7 +20,6 @@ from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
 from torch_qpmpc.errors import QPError
 
-LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")
 #: Loggers that need the extra of the same name.
 EXTRAS = ("wandb", "mlflow")
 #: The plots of TensorBoard's tab "Custom Scalars", each of the tags that match.
@@ -49,7 +48,7 @@ class RunLogger:
     TensorBoard and W&B continue; CSV and MLflow start again from the rows logged so far.
 
     Args:
-        name: one of `LOGGERS`.
+        name: tensorboard, csv, wandb or mlflow.
         folder: the run's folder.
         settings: the run's settings by dotted key.
         rows: the rows logged up to update ``after``.

@@ -26,7 +26,6 @@ from torch_qpmpc.experiment.plots import (
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tally import Stopwatch, Tally
-from torch_qpmpc.experiment.tasks import true_model
 from torch_qpmpc.learning.updates import Scalars
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -65,9 +64,9 @@ def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str
     summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
     summary |= {"ablation": cfg.ablation, "step": cfg.step}
     summary |= {"updates": cfg.updates, **tally.summary()}
-    return (
-        summary if mpc is None else summary | structure_summary(mpc, true_model(evaluation.physics))
-    )
+    if mpc is None:
+        return summary
+    return summary | structure_summary(mpc, evaluation.physics.true_model())
 
 
 def report(

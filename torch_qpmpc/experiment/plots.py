@@ -20,6 +20,8 @@ from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.mpc.module import QPMPC
 
+#: Starts whose paths are drawn.
+SHOWN = 6
 #: Colours of the rivals' lines, in their order.
 RIVAL_COLOURS = (
     "0.2",
@@ -37,7 +39,6 @@ def draw_positions(
     loops: Mapping[str, ClosedLoop],
     mpc: QPMPC,
     names: Mapping[str, Any],
-    shown: int = 6,
 ) -> None:
     """Draw closed-loop paths from a few starts, and the learned QP's predictions.
 
@@ -54,14 +55,14 @@ def draw_positions(
 
     for name, loop in loops.items():
         colour = COLOURS.get(name)
-        draw(loop.states[:, :shown], color=colour, linewidth=1)
+        draw(loop.states[:, :SHOWN], color=colour, linewidth=1)
         axes.plot([], [], color=colour, label=f"{name}, J = {cost_text(loop.J)}")
     first = next(iter(loops.values()))
     with torch.no_grad():
-        predicted, _ = mpc.predicted(mpc.solve(first.known[0, :shown]).z)
+        predicted, _ = mpc.predicted(mpc.solve(first.known[0, :SHOWN]).z)
     draw(predicted.transpose(0, 1), "k:", linewidth=1)
     axes.plot([], [], "k:", label="predicted at the start")
-    draw(first.states[:1, :shown], "ko", markersize=3)
+    draw(first.states[:1, :SHOWN], "ko", markersize=3)
     if plane:
         axes.plot(0, 0, "k+", markersize=9)
     outputs = names["outputs"]

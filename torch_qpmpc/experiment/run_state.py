@@ -32,7 +32,7 @@ from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.state import KIND, stored
 
 #: The parts of a snapshot.
-STATE = ("config", "update", "arguments", "mpc", "loss_module", "optimizer", "schedule")
+STATE = ("config", "update", "arguments", "mpc", "loss_module", "optimizer", "scheduler")
 STATE += ("errors", "gate", "replay", "collector", "tally", "rng")
 #: Files that a run writes before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
@@ -60,7 +60,7 @@ def snapshot(
         **labelled(KIND, stored(mpc)),  # so that QPMPC.load reads a checkpoint, too
         "loss_module": learner.loss_module.state_dict(),
         "optimizer": learner.optimizer.state_dict(),
-        "schedule": {"last_epoch": learner.schedule.last_epoch},
+        "scheduler": {"last_epoch": learner.scheduler.last_epoch},
         "errors": None if learner.errors is None else learner.errors.state_dict(),
         "gate": gate.state_dict(),
         "replay": replay.state_dict() if len(replay) and not finished else None,
@@ -89,8 +89,8 @@ def restore(
         mpc.load_state_dict(state["mpc"])
     with _part("optimizer"):
         learner.optimizer.load_state_dict(state["optimizer"])
-    with _part("schedule"):
-        learner.schedule.last_epoch = int(state["schedule"]["last_epoch"])
+    with _part("scheduler"):
+        learner.scheduler.last_epoch = int(state["scheduler"]["last_epoch"])
     with _part("errors"):
         if learner.errors is not None:
             learner.errors.load_state_dict(state["errors"])

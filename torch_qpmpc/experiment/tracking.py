@@ -25,22 +25,14 @@ INPUT_WEIGHT = 0.3
 TERMINAL_FACTOR = 11.0
 
 
-def set_point_scheme(
-    plant: FourTanks, model: Model, gamma: float, input_weight: float | None = None
-) -> Scheme:
-    """Make the scheme of a model and the plant's own cost and bounds.
+def set_point_scheme(plant: FourTanks, model: Model, gamma: float) -> Scheme:
+    """Make the scheme of a model, for the plant's window, and the plant's own cost and bounds.
 
     The set point is in q and c, which complete the squares of (y_k - r)'Q(y_k - r) and
-    (u_k - u_r)'R(u_k - u_r); the terminal cost is (y_N - r)'Q(y_N - r).
-
-    Args:
-        plant: the plant.
-        model: the model, for the plant's window.
-        gamma: the discount.
-        input_weight: replaces the entries of R, such as `INPUT_WEIGHT`.
+    (u_k - u_r)'R(u_k - u_r), with `INPUT_WEIGHT` as R; the terminal cost is (y_N - r)'Q(y_N - r).
     """
     Q, R = plant.weights()
-    R = R if input_weight is None else torch.full_like(R, input_weight)
+    R = torch.full_like(R, INPUT_WEIGHT)
     _, u_r = plant.set_point()
     N, weight, target = plant.horizon, torch.cat((Q, R)), torch.cat((plant.r, u_r))
     stage, terminal = weight @ target.square(), Q @ plant.r.square()

@@ -68,7 +68,7 @@ def nearer(
     return p, exact
 
 
-def choose(mpc: QPMPC, tables: Tables, p: Array, coarse: Reference) -> tuple[Examples, Reference]:
+def choose(mpc: QPMPC, p: Array, coarse: Reference) -> tuple[Examples, Reference]:
     """Choose a few states of each kind, and return exact solutions of them.
 
     Raises:

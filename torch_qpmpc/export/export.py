@@ -177,7 +177,7 @@ def build(
     limit = max_iterations or PER_ROW * len(tables.rows) + AT_LEAST
     settings = Settings(name, dtype, storage, limit)
     p, exact = _states(mpc, tables, dtype)
-    examples, exact = choose(mpc, tables, p, exact)
+    examples, exact = choose(mpc, p, exact)
     texts = sources(tables, settings, header(mpc, tables, settings, labels or {}), examples)
     files = []
     for file, text in texts.items():

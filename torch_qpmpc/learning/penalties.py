@@ -28,20 +28,17 @@ def deviation_penalty(C: Tensor, C_0: Tensor, C_mask: Tensor) -> Tensor:
     return (C_mask * (C - C_0)).abs().sum()
 
 
-def system_identification_penalty(
-    C: Tensor, windows: Tensor, b: Tensor | None = None, *, normalised: bool = False
-) -> Tensor:
+def system_identification_penalty(C: Tensor, windows: Tensor, b: Tensor | None = None) -> Tensor:
     """Return ``sum_i ||C tau_i - b||^2`` (eq:sdp3, where b is zero), a scalar.
 
     C and b have a gauge: T C and T b are the same QP for any invertible T, so that shrinking them
-    lowers the penalty. ``normalised`` prevents that.
+    lowers the penalty.
 
     Args:
         C: ``(n_c, n_z)``.
         windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}], ``(M, n_z)``. With a past or a preview,
             s_j is p at step j, and the later s are the measured outputs.
         b: ``(n_c,)``; None for zero.
-        normalised: scale the rows of C to unit norm first, and b with them.
 
     Raises:
         QPError: if a shape does not fit.
@@ -50,9 +47,6 @@ def system_identification_penalty(
     check_tensor("windows", windows, "M", C.shape[-1], batched=False, remedy=WINDOWS_REMEDY)
     b = C.new_zeros(len(C)) if b is None else b
     check_tensor("b", b, len(C), batched=False, remedy="Pass mpc.b.")
-    if normalised:
-        sizes = C.norm(dim=-1).clamp(min=1e-12)  # as in F.normalize
-        C, b = C / sizes.unsqueeze(-1), b / sizes
     return (windows.to(C.dtype) @ C.mT - b).square().sum()
 
 
@@ -70,8 +64,6 @@ class DeviationPenalty(nn.Module):
         c_1: weight above the band, where the future would act on the past.
         c_2: weight on the band.
         c_3: weight below the band.
-        growth: relative growth of the weights off the band with the distance to it in stages,
-            ``c (1 + growth (distance - 1))``.
 
     Raises:
         QPError: if a weight is negative or not finite, or the shape of C_0 fits no horizon.
@@ -98,11 +90,9 @@ class DeviationPenalty(nn.Module):
         c_1: float = 1.0,
         c_2: float = 1e-4,
         c_3: float = 0.0,
-        growth: float = 0.0,
     ) -> None:
         super().__init__()
-        weights = {"c_1": c_1, "c_2": c_2, "c_3": c_3, "growth": growth}
-        for name, weight in weights.items():
+        for name, weight in {"c_1": c_1, "c_2": c_2, "c_3": c_3}.items():
             check_number(name, weight, _finite, "a finite weight >= 0")
         check_whole("n_x", n_x, 1)
         check_whole("n_u", n_u, 1)
@@ -123,13 +113,12 @@ class DeviationPenalty(nn.Module):
         distance = distance.to(C_0)
         mask = torch.full_like(distance, c_2)
         mask[distance > 0], mask[distance < 0] = c_1, c_3
-        mask *= 1 + growth * (distance.abs() - 1).clamp(min=0)
         self.register_buffer("C_0", C_0.detach().clone())
         self.register_buffer("C_mask", mask)
 
     @classmethod
     def of(cls, mpc: QPMPC, **weights: float) -> DeviationPenalty:
-        """Return the penalty for the C of ``mpc``; ``weights`` are c_1, c_2, c_3 and growth.
+        """Return the penalty for the C of ``mpc``; ``weights`` are c_1, c_2 and c_3.
 
         Raises:
             QPError: as in `DeviationPenalty`.
@@ -174,7 +163,6 @@ class SystemIdentificationPenalty(nn.Module):
 
     Args:
         beta: weight of the penalty.
-        normalised: scale the rows of C to unit norm, as shrinking C would lower the penalty.
 
     Raises:
         QPError: if beta is negative or not finite.
@@ -188,10 +176,10 @@ class SystemIdentificationPenalty(nn.Module):
         2.0
     """
 
-    def __init__(self, beta: float = 1e-6, *, normalised: bool = False) -> None:
+    def __init__(self, beta: float = 1e-6) -> None:
         super().__init__()
         check_number("beta", beta, _finite, "a finite weight >= 0")
-        self.beta, self.normalised = beta, normalised
+        self.beta = beta
 
     def curvature(self, windows: Tensor) -> Tensor:
         """Return S ``(n_z + 1, n_z + 1)``: the penalty on windows ``(M, n_z)`` as a quadratic.
@@ -199,15 +187,12 @@ class SystemIdentificationPenalty(nn.Module):
         It is ``1/2 tr(D S D')``, with D = [C, b].
 
         Raises:
-            QPError: if the penalty is normalised, so not quadratic in C, or a shape does not fit.
+            QPError: if a shape does not fit.
         """
-        if self.normalised:
-            raise QPError.expected("normalised", True, "False", "Only then is it quadratic in C.")
         check_tensor("windows", windows, "M", "n_z", batched=False, remedy=WINDOWS_REMEDY)
         tau = F.pad(windows.to(torch.float64), (0, 1), value=-1.0)
         return 2 * self.beta * tau.mT @ tau
 
     def forward(self, C: Tensor, windows: Tensor, b: Tensor | None = None) -> Tensor:
         """Return the penalty of C ``(n_c, n_z)`` and b ``(n_c,)`` on windows ``(M, n_z)``."""
-        error = system_identification_penalty(C, windows, b, normalised=self.normalised)
-        return self.beta * error
+        return self.beta * system_identification_penalty(C, windows, b)

@@ -429,21 +429,6 @@ class QPMPC(nn.Module):
         """
         return self._solve(self._checked(s, a), qp, warm_start)
 
-    def value_and_active_set(
-        self,
-        s: Tensor,
-        a: Tensor | None = None,
-        warm_start: Tensor | None = None,
-        qp: QuadraticProgram | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """Return V(s) or Q(s, a), and the active set ``(*batch, n_g)`` of its solution.
-
-        ``warm_start`` is an active set of nearly equal QPs, as in `solve`; so is ``qp``.
-        """
-        fixed = self._checked(s, a)
-        solution = self._solve(fixed, qp, warm_start)
-        return to_dtype(solution.value, fixed.dtype), solution.active
-
     def policy_and_active_set(
         self,
         s: Tensor,
@@ -746,7 +731,7 @@ class QPMPC(nn.Module):
         masks = {name: digest(mask) for name, mask in self._masks.items()}
         return {
             **asdict(self.layout),
-            "blocks": [*self.layout.blocks] or None,  # None as in files from before blocks
+            "blocks": [*self.layout.blocks],  # as in JSON
             "gamma": float(self.gamma),
             **{name: getattr(self, name) for name in ("structure", "hessian", "step")},
             "discount_slack": self.scheme.bounds.discount_slack,

@@ -211,9 +211,6 @@ def collect(folder: str | Path) -> pd.DataFrame:
     for name in ("closed_gap", "J_true_model", "J_discounted_true_model", "canonical_distance"):
         # These are null without a gap, a true model or a QP.
         frame[name] = frame[name].astype(float) if name in frame else math.nan
-    for name in ("J", "J_discounted"):  # runs before there was a gate
-        if f"{name}_best" not in frame:
-            frame[f"{name}_best"] = frame[f"{name}_final"]
     gap = frame["J_start"] - frame["J_true_model"]
     frame["real"] = gap >= REAL_GAP * frame["J_start"].abs()
     frame["actor"] = [run.cfg.algo.get("actor", "qp") for run in frame["run"]]

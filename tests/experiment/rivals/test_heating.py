@@ -13,7 +13,7 @@ from torch_qpmpc.envs import House, HouseWall
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.heated_house import GAIN
 from torch_qpmpc.experiment.heating import known_model
-from torch_qpmpc.experiment.rivals.heating import KalmanMPC, Omniscient, Thermostat, house_mpc
+from torch_qpmpc.experiment.rivals.heating import KalmanHouseMPC, Omniscient, Thermostat, house_mpc
 from torch_qpmpc.experiment.rivals.tuned_planner import START, Knobs, planner
 
 
@@ -30,14 +30,14 @@ def test_more_knowledge_costs_less_in_a_room():
 
 def test_more_knowledge_costs_less_in_a_house_with_a_wall():
     house = HouseWall()
-    omniscient, kalman = J(Omniscient(house), house), J(KalmanMPC(house), house)
+    omniscient, kalman = J(Omniscient(house), house), J(KalmanHouseMPC(house), house)
     assert omniscient < kalman < J(Thermostat(house, 0.5, 4.0), house)
 
 
 def test_the_filter_finds_state_and_gain_from_the_air():
     """Drives the house by a plan of its own, with another wall than the filter assumes."""
     house = HouseWall()
-    kalman = KalmanMPC(house)
+    kalman = KalmanHouseMPC(house)
     rng = np.random.default_rng(0)
     w, x = house.signals(rng, 2, 96 + 33), house.starts(rng, 2)
     kalman.begin(house, x, w)

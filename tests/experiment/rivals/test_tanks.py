@@ -10,11 +10,10 @@ import torch
 import torch_qpmpc as qm
 from torch_qpmpc.envs import FourTanks, TankReferences
 from torch_qpmpc.envs.closed_loop import plant_loop
-from torch_qpmpc.experiment.rivals.deepc import DeePC, hankel_matrices
-from torch_qpmpc.experiment.rivals.kalman_mpc import KalmanMPC
-from torch_qpmpc.experiment.rivals.logs import uniform_log
+from torch_qpmpc.experiment.rivals.deepc import DeePC, hankel_matrices, uniform_log
+from torch_qpmpc.experiment.rivals.linear_mpc import KalmanMPC
 from torch_qpmpc.experiment.rivals.tanks import FOUR_TANKS_RIVALS, TANK_REFERENCES_RIVALS
-from torch_qpmpc.experiment.tracking import INPUT_WEIGHT, set_point_scheme, window_model
+from torch_qpmpc.experiment.tracking import set_point_scheme, window_model
 
 
 def test_more_knowledge_costs_less_at_the_set_point():
@@ -68,8 +67,7 @@ def test_the_filter_has_the_error_of_its_riccati_equation():
     torch.testing.assert_close(errors.mT @ errors / len(errors), P, atol=5e-5, rtol=0.05)
 
 
-@pytest.mark.parametrize("projected", [True, False])
-def test_deepc_solves_its_definition(projected):
+def test_deepc_solves_its_definition():
     p = FourTanks(horizon=4, past=3)
     log = uniform_log(p, 60, seed=2)
     Q, R = torch.tensor([35.0, 20.0]).double(), torch.tensor([0.1, 0.2]).double()
@@ -77,7 +75,7 @@ def test_deepc_solves_its_definition(projected):
     lambda_g, lambda_y = 0.3, 7.0
     options: dict[str, Any] = {"Q": Q, "R": R, "lambda_g": lambda_g, "lambda_y": lambda_y}
     options |= {"y_r": y_r, "u_r": u_r, "lb_u": p.lb_a, "ub_u": 0.58 * p.ub_a}
-    policy = DeePC(log, p.past, p.horizon, **options, projected=projected)
+    policy = DeePC(log, p.past, p.horizon, **options)
     window = torch.randn(6, p.n_p, generator=torch.Generator().manual_seed(0)).double() / 2
 
     P, U, Y = hankel_matrices(log, p.past, p.horizon, p.n_y)
@@ -85,9 +83,7 @@ def test_deepc_solves_its_definition(projected):
     assert count == 60 - 3 - 4 + 2
     is_output = torch.arange(p.n_p) % 4 < 2
     known = torch.cat((P, U))
-    Pi = torch.eye(count).double()
-    if projected:
-        Pi = Pi - torch.linalg.pinv(known) @ known
+    Pi = torch.eye(count).double() - torch.linalg.pinv(known) @ known
     H = 2 * lambda_g * Pi.mT @ Pi + 1e-9 * torch.eye(count).double()
     q = torch.zeros(1, count).double()
     targets = {"Y": y_r.repeat(4), "U": u_r.repeat(4), "past": window[:, is_output]}
@@ -138,7 +134,7 @@ def test_identified_from_a_log_the_tanks_cost_little_more_than_with_the_true_mod
     found = qm.identify(log, p.horizon, past=p.past, n_x=2, ridge=0.0)
     identified = qm.Model(*found.model, *found.constraints)
     true = qm.Model(*window_model(p.A, p.B, *p.measurement(), p.past))
-    schemes = (set_point_scheme(p, model, 1.0, INPUT_WEIGHT) for model in (identified, true))
+    schemes = (set_point_scheme(p, model, 1.0) for model in (identified, true))
     policies = (qm.QPMPC(scheme, solver="daqp").policy for scheme in schemes)
     J = [plant_loop(policy, p, steps=100, starts=16, seed=3).J for policy in policies]
     assert J[0] == pytest.approx(218, abs=8)

@@ -35,13 +35,11 @@ class Deviation(Group):
     c_1: NonNegative
     c_2: NonNegative
     c_3: NonNegative
-    growth: NonNegative
 
 
 class SystemIdentification(Group):
     beta: NonNegative
     windows: Count
-    normalised: Flag
 
 
 class Constraint(Group):
@@ -89,12 +87,9 @@ class Adam(SGD):
 class GaussNewton(Group):
     name: Literal["gauss_newton"]
     lr: Fraction
-    scale_cost: Positive
     scale_constraints: Positive
     damping: Positive
     memory: Whole
-    trust_region: Flag
-    normalise: Flag
     final_fraction: Fraction
 
 
@@ -110,27 +105,16 @@ class Residuals(Group):
     b: Positive
 
 
-class DDPG(Group):
+class ActorCritic(Group):
     """The actor is a QP, a QP whose theta a network schedules, or a network."""
 
-    name: Literal["ddpg"]
+    name: Literal["ddpg", "td3", "sac"]
     actor: Annotated[str, one_of(("qp", "scheduled", "mlp"))]
     critic: Annotated[str, one_of(("qp", "mlp"))]
     actor_rate: Positive
     lr_network: Positive
     width: Count
     theta: Residuals
-
-
-class TD3(DDPG):
-    name: Literal["td3"]
-    policy_delay: Count
-    policy_noise: NonNegative
-    noise_clip: NonNegative
-
-
-class SAC(DDPG):
-    name: Literal["sac"]
 
 
 class FromModel(Group):
@@ -147,7 +131,6 @@ class FromData(Group):
     transitions: Count
     levels: Annotated[str, one_of(("uniform", "binary"))]
     hold: Annotated[Finite, Field(ge=1), Expected("a finite number >= 1")]
-    causal: Flag
     ridge: Annotated[NonNegative | None, Expected("a finite number >= 0, or null")]
 
 
@@ -167,5 +150,5 @@ class Search(Group):
 
 
 Optimizer = Annotated[Adam | SGD | GaussNewton, Field(discriminator="name")]
-Algorithm = Annotated[QLearning | DDPG | TD3 | SAC, Field(discriminator="name")]
+Algorithm = Annotated[QLearning | ActorCritic, Field(discriminator="name")]
 Start = Annotated[FromModel | FromData, Field(discriminator="name")]

@@ -62,7 +62,9 @@ def _keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, st
         if key == "task":
             groups, names = [task.settings for task in TASKS.values()], list(TASKS)
         elif info.discriminator:
-            names = [get_args(group.model_fields["name"].annotation)[0] for group in groups]
+            names = [
+                name for group in groups for name in get_args(group.model_fields["name"].annotation)
+            ]
         for group in groups:
             yield from _keys_of(group, f"{key}.")
         if names:

@@ -61,7 +61,6 @@ class Config(Group):
     seed: Annotated[Seed, Expected("a whole number >= 0 and < 2^63")]
     eval_seed: Annotated[Seed | None, Expected("a whole number >= 0 and < 2^63, or null")]
     solver: Annotated[Name, AfterValidator(_known_solver)]
-    warm_start: Flag
     threads: Count
     updates: Count
     batch_size: Count
@@ -104,10 +103,6 @@ class Config(Group):
     def second_order(self) -> bool:
         return self.optimizer.name == "gauss_newton"
 
-    @property
-    def penalised(self) -> bool:
-        return self.constraint.deviation is not None or self.constraint.si is not None
-
     def conflict(self, key: str, expected: str, remedy: str = "") -> NoReturn:
         """Raise the error of a value that conflicts with others."""
         value = functools.reduce(getattr, key.split("."), self)
@@ -136,13 +131,7 @@ class Config(Group):
     @model_validator(mode="after")
     def second_order_has_quadratic_penalties(self) -> Self:
         """Check that gauss_newton can apply the SI penalty, which must be quadratic in a free C."""
-        penalties = self.constraint
-        if not self.second_order:
-            return self
-        if penalties.si is not None and penalties.si.normalised:
-            remedy = "gauss_newton needs a penalty that is quadratic in C."
-            self.conflict("constraint.si.normalised", "False", remedy)
-        if penalties.si is not None and penalties.structure != "free":
+        if self.second_order and self.constraint.si and self.constraint.structure != "free":
             remedy = "gauss_newton needs a free C for constraint.si."
             self.conflict("constraint.structure", "free", remedy)
         return self
@@ -200,11 +189,9 @@ class Config(Group):
         if self.second_order:
             remedy = f"{name} needs a first-order optimizer: set optimizer=adam."
             self.conflict("optimizer.name", "adam or sgd", remedy)
-        if self.warm_start:
-            self.conflict("warm_start", "false", f"{name} solves at actions not in the replay.")
         if not self.replay:
             self.conflict("replay", "true", f"{name} learns from a replay.")
-        if self.algo.actor == "mlp" and self.penalised:
+        if self.algo.actor == "mlp" and (self.constraint.deviation or self.constraint.si):
             remedy = "The penalties are on a QP's C: choose constraint=free."
             self.conflict("algo.actor", "qp or scheduled", remedy)
         if self.step != "cholesky":

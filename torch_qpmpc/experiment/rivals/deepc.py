@@ -6,8 +6,7 @@
 The columns of P, U and Y are the past windows, the actions and the outputs of all windows of a log,
 and p = (y_p, u_p) is the last window. Pi projects on what the windows and actions do not explain
 (Dörfler, Coulson and Markovsky, "Bridging direct and indirect data-driven control formulations via
-regularizations and relaxations", IEEE TAC 2023), or is the identity (Coulson, Lygeros and Dörfler,
-ECC 2019).
+regularizations and relaxations", IEEE TAC 2023).
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solve import solve_qp
 
@@ -33,8 +33,6 @@ class DeePC:
         y_r, u_r: the set point.
         lb_u, ub_u: hard bounds of the actions, ``(n_u,)``.
         lambda_g, lambda_y: weights of the regularisation and of the past outputs' misfit.
-        projected: Pi is the projection; otherwise the identity.
-        solver: see `solve_qp`.
     """
 
     def __init__(
@@ -51,8 +49,6 @@ class DeePC:
         ub_u: Tensor,
         lambda_g: float,
         lambda_y: float,
-        projected: bool = True,
-        solver: str = "daqp",
     ) -> None:
         n_y, n_u = len(Q), len(R)
         P, U, Y = hankel_matrices(log, past, horizon, n_y)
@@ -62,8 +58,7 @@ class DeePC:
         P, U, Y = L[:n_p], L[n_p:n_known], L[n_known:]
         is_output = torch.arange(n_p) % (n_y + n_u) < n_y
         penalty = torch.full((n_gamma,), lambda_g).to(L)
-        if projected:
-            penalty[:n_known] = 0
+        penalty[:n_known] = 0
         # z = [p, gamma], and the cost is 1/2 z'Hz + q'z of the rows below with their weights.
         misfit = torch.cat((-torch.eye(n_p).to(L), P), -1)
         U, Y = (torch.nn.functional.pad(M, (n_p, 0)) for M in (U, Y))
@@ -85,11 +80,22 @@ class DeePC:
             w=torch.full((len(U),), torch.inf).to(L),
             check_values=False,
         )
-        self._first, self._solver = U[:n_u], solver
+        self._first = U[:n_u]
 
     def __call__(self, p: Tensor) -> Tensor:
         """Return actions ``(starts, n_u)``."""
-        return solve_qp(self._qp, p, solver=self._solver).z @ self._first.mT
+        return solve_qp(self._qp, p, solver="daqp").z @ self._first.mT
+
+
+def uniform_log(plant: Plant, steps: int, seed: int, episodes: int = 1) -> TensorDictBase:
+    """Return ``episodes`` episodes of ``steps`` steps, ``(episodes, steps)``.
+
+    The actions are uniform within their bounds; ``seed`` seeds them, the signals and the starts.
+    """
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        env = plant.vectorised(episodes, steps, seed, episodes=episodes)
+        return env.rollout(steps)
 
 
 def hankel_matrices(

@@ -52,7 +52,7 @@ class Omniscient:
         return u
 
 
-class KalmanMPC:
+class KalmanHouseMPC:
     """MPC with the true model of states that a Kalman filter estimates from the air alone.
 
     The gain is a state of the filter, an AR(1) process like its random part.

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from torch_qpmpc.experiment.heating import known_model
 from torch_qpmpc.experiment.rivals import tightened
-from torch_qpmpc.experiment.rivals.heating import KalmanMPC, Omniscient, Thermostat, house_mpc
+from torch_qpmpc.experiment.rivals.heating import KalmanHouseMPC, Omniscient, Thermostat, house_mpc
 from torch_qpmpc.experiment.rivals.rival import Rival
 from torch_qpmpc.experiment.rivals.tuned_planner import TUNED, planner
 
@@ -39,9 +39,9 @@ HOUSE_WALL_RIVALS = {
     "thermostat with timer": Rival(
         lambda house: Thermostat(house, offset=0.5, gain=6.0, ahead=TIMER)
     ),
-    "Kalman filter": Rival(lambda house: KalmanMPC(house, margin=0.05)),
+    "Kalman filter": Rival(lambda house: KalmanHouseMPC(house, margin=0.05)),
     f"Kalman filter, N = {LONG}": Rival(
-        lambda house: KalmanMPC(house, margin=0.05), sees={"horizon": LONG}, slow=True
+        lambda house: KalmanHouseMPC(house, margin=0.05), sees={"horizon": LONG}, slow=True
     ),
     "omniscient": Rival(Omniscient),
     f"omniscient, N = {LONG}": Rival(Omniscient, sees={"horizon": LONG}, slow=True),

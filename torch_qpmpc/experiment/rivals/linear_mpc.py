@@ -1,9 +1,11 @@
-"""Tracking MPC from the true state: with one model, or omniscient of each episode's signals."""
+"""Tracking MPC from the state, by a Kalman filter or omniscient of each episode's signals."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import scipy
 import torch
 from torch import Tensor
 
@@ -104,28 +106,47 @@ class Tracking:
         )
 
 
-class LinearMPC:
-    """MPC of one model whose references do not change, as a function of the state.
+class KalmanMPC:
+    """A policy of outputs: MPC of the state that a stationary Kalman filter estimates.
+
+        y = C x + e,    x+ = A x + B u + v,    v of covariance V, e of covariance E
 
     Args:
-        cost: the cost and the bounds.
-        A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
-        horizon: N.
-        x_r: reference of the state, ``(n_x,)``.
-        solver: see `solve_qp`.
+        mpc: maps states ``(starts, n_x)`` to actions ``(starts, n_u)``.
+        A, B, C: the model.
+        V, E: covariances ``(n_x, n_x)`` and ``(n_y, n_y)``.
+        x_0: mean of the start state, ``(n_x,)``.
     """
 
     def __init__(
-        self, cost: Tracking, A: Tensor, B: Tensor, horizon: int, x_r: Tensor, solver: str = "daqp"
+        self,
+        mpc: Callable[[Tensor], Tensor],
+        A: Tensor,
+        B: Tensor,
+        C: Tensor,
+        V: Tensor,
+        E: Tensor,
+        x_0: Tensor,
     ) -> None:
-        n_x, n_u = B.shape
-        references, offsets = x_r.expand(horizon + 1, n_x), x_r.new_zeros(horizon, n_x)
-        self._qp = cost.program(A, B, horizon, references, offsets)
-        self._actions, self._solver = slice(n_x, n_x + n_u), solver
+        P = scipy.linalg.solve_discrete_are(*(m.numpy() for m in (A.mT, C.mT, V, E)))
+        P = torch.as_tensor(P)
+        self._gain = torch.linalg.solve(C @ P @ C.mT + E, C @ P).mT
+        self._mpc, self._model, self._x_0 = mpc, (A, B, C), x_0
+        self._predicted: Tensor | None = None
 
-    def __call__(self, x: Tensor) -> Tensor:
-        """Return u_0 ``(*batch, n_u)`` of states ``(*batch, n_x)``."""
-        return solve_qp(self._qp, x, solver=self._solver).z[..., self._actions]
+    def begin(self, plant: object, x: Tensor, w: Tensor) -> None:
+        """Forget the last episodes."""
+        self._predicted = None
+
+    def __call__(self, p: Tensor) -> Tensor:
+        """Return actions; the last n_y entries of p ``(starts, n_p)`` are the new outputs."""
+        A, B, C = self._model
+        y = p[:, -len(C) :]
+        predicted = self._x_0 if self._predicted is None else self._predicted
+        x = predicted + (y - predicted @ C.mT) @ self._gain.mT
+        u = self._mpc(x)
+        self._predicted = x @ A.mT + u @ B.mT
+        return u
 
 
 class OmniscientMPC:
@@ -135,7 +156,6 @@ class OmniscientMPC:
         plant: the plant.
         horizon: N; it is shorter where the signals end.
         terminal_factor: factor of Q for x_N.
-        solver: see `solve_qp`.
     """
 
     def __init__(
@@ -143,9 +163,8 @@ class OmniscientMPC:
         plant: FourTanks | TankReferences,
         horizon: int,
         terminal_factor: float = 1.0,
-        solver: str = "daqp",
     ) -> None:
-        self._plant, self._horizon, self._solver = plant, horizon, solver
+        self._plant, self._horizon = plant, horizon
         self._cost = Tracking.of(plant, terminal_factor)
 
     def begin(self, plant: object, x: Tensor, w: Tensor) -> None:
@@ -159,7 +178,7 @@ class OmniscientMPC:
         A, B, _ = self._plant.model(w[:, 0])
         qp = self._cost.program(A, B, e.shape[1], self._plant.target(w), e)
         n_x = self._x.shape[-1]
-        solution = solve_qp(qp, self._x, solver=self._solver)
+        solution = solve_qp(qp, self._x, solver="daqp")
         u = self._plant.applied(solution.z[:, n_x : n_x + self._plant.n_u])
         self._x = self._plant.step(self._x, u, w[:, 0])
         self._k += 1

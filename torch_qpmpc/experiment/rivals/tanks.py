@@ -14,14 +14,13 @@ from torch import Tensor
 from torch_qpmpc.envs.four_tanks import FourTanks
 from torch_qpmpc.envs.tank_references import TankReferences
 from torch_qpmpc.experiment.rivals import tightened
-from torch_qpmpc.experiment.rivals.deepc import DeePC
-from torch_qpmpc.experiment.rivals.kalman_mpc import KalmanMPC
-from torch_qpmpc.experiment.rivals.linear_mpc import LinearMPC, OmniscientMPC, Tracking
-from torch_qpmpc.experiment.rivals.logs import uniform_log
+from torch_qpmpc.experiment.rivals.deepc import DeePC, uniform_log
+from torch_qpmpc.experiment.rivals.linear_mpc import KalmanMPC, OmniscientMPC, Tracking
 from torch_qpmpc.experiment.rivals.rival import Policy, Rival
 from torch_qpmpc.experiment.tracking import TERMINAL_FACTOR, offset_free, reference_scheme
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.qp.solve import solve_qp
 
 #: The horizons of the Kalman filter's MPC.
 HORIZONS = (20, 40, 60)
@@ -31,8 +30,13 @@ LOG_STEPS, LOG_SEED = 1000, 0
 
 def kalman_mpc(plant: FourTanks, horizon: int) -> KalmanMPC:
     """Make the Kalman filter of the true model and noise, with MPC of the true model."""
-    x_r, _ = plant.set_point()
-    mpc = LinearMPC(Tracking.of(plant), plant.A, plant.B, horizon, x_r)
+    (x_r, _), (n_x, n_u) = plant.set_point(), plant.B.shape
+    references, offsets = x_r.expand(horizon + 1, n_x), x_r.new_zeros(horizon, n_x)
+    qp = Tracking.of(plant).program(plant.A, plant.B, horizon, references, offsets)
+
+    def mpc(x: Tensor) -> Tensor:
+        return solve_qp(qp, x, solver="daqp").z[:, n_x : n_x + n_u]
+
     return KalmanMPC(mpc, plant.A, plant.B, *plant.measurement(), torch.zeros_like(x_r))
 
 

@@ -9,7 +9,6 @@ from collections.abc import Collection
 from dataclasses import replace
 
 from omegaconf import DictConfig
-from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
@@ -66,7 +65,6 @@ __all__ = [
     "register",
     "resume_arguments",
     "run_code",
-    "true_model",
 ]
 
 
@@ -90,13 +88,6 @@ def make_true_mpc(cfg: DictConfig, physics: AnyPlant) -> QPMPC | None:
     """Make the same QP with the true model, cost and bounds; None if they are unknown."""
     true_scheme = find_task(cfg.task).true_scheme
     return None if true_scheme is None else _make(cfg, true_scheme(cfg, physics), ())
-
-
-def true_model(
-    physics: AnyPlant,
-) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Return the plant's A, B and offset (the noise's mean); None if they are unknown."""
-    return physics.true_model()
 
 
 def _make(

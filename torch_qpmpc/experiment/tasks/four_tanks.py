@@ -15,7 +15,7 @@ from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.experiment.fields import Count
 from torch_qpmpc.experiment.rivals.tanks import FOUR_TANKS_RIVALS
 from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, priced, register
-from torch_qpmpc.experiment.tracking import INPUT_WEIGHT, set_point_scheme, window_model
+from torch_qpmpc.experiment.tracking import set_point_scheme, window_model
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
 
@@ -50,7 +50,7 @@ def true_scheme(cfg: DictConfig, plant: FourTanks) -> Scheme:
 
 def _scheme(cfg: DictConfig, plant: FourTanks, A: Tensor, B: Tensor, gamma: float) -> Scheme:
     model = Model(*window_model(A, B, *plant.measurement(), plant.past))
-    scheme = set_point_scheme(plant, model, gamma, INPUT_WEIGHT)
+    scheme = set_point_scheme(plant, model, gamma)
     return replace(scheme, bounds=priced(cfg, scheme.bounds))
 
 

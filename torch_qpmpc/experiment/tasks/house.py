@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from torch_qpmpc.envs import House
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.heated_house import DAY, DT, LOWER, OUTDOOR, PRICE, UPPER, HeatedHouse
-from torch_qpmpc.experiment.fields import Count, Flag, NonNegative
+from torch_qpmpc.experiment.fields import Count, NonNegative
 from torch_qpmpc.experiment.heating import heating_scheme, known_model
 from torch_qpmpc.experiment.rivals.houses import HOUSE_RIVALS
 from torch_qpmpc.experiment.tasks.registry import (
@@ -42,15 +42,8 @@ class HeatingSettings(TaskSettings):
     margin: NonNegative
 
 
-class HouseSettings(HeatingSettings):
-    """The keys of `House`."""
-
-    one_weather: Flag
-
-
 def make_plant(cfg: DictConfig) -> House:
-    task = cfg.task
-    return House(horizon=task.horizon, past=task.past, one_weather=task.one_weather)
+    return House(horizon=cfg.task.horizon, past=cfg.task.past)
 
 
 def wrong_scheme(cfg: DictConfig, plant: House) -> Scheme:
@@ -113,7 +106,7 @@ register(
         rivals=HOUSE_RIVALS,
         episode=episode,
         unit=(DAY, "days"),
-        settings=HouseSettings,
+        settings=HeatingSettings,
         defaults=None,
     )
 )

@@ -92,19 +92,12 @@ def identified_start(cfg: DictConfig, physics: AnyPlant, log: Any) -> Start:
     held = cfg.task.held if "held" in cfg.task else []
     if held is None:
         held = unmoved(as_log(log, layout.n_x).trajectories, cfg.task.horizon)
-    identified = identified_model(cfg, log, layout, cfg.constraint.structure, held)
+    structure, ridge = cfg.constraint.structure, cfg.start.ridge
+    identified = identified_model(log, layout, structure, held, ridge)
     cost = None
     if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is None:
         cost = _fitted(cfg, log, identified.options.layout)
     return Start(log, identified, cost, cut)
-
-
-def identified_model(
-    cfg: DictConfig, log: Any, layout: Layout, structure: str, held: Sequence[int]
-) -> Identified:
-    """Identify C and b with the sizes of ``layout`` and the run's settings; ``held`` outputs."""
-    options = {"causal": cfg.start.causal, "ridge": cfg.start.ridge, "held": held}
-    return _model(log, layout, structure, **options)
 
 
 def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
@@ -213,7 +206,7 @@ def nominal_mpc(
     task = find_task(cfg.task)
     scheme = (task.nominal_scheme or task.true_scheme or task.wrong_scheme)(cfg, physics)
     layout, cost = scheme.layout, scheme.cost
-    identified = _model(data, layout, "tied", held=held)
+    identified = identified_model(data, layout, "tied", held)
     if cost.stage_weight is None:
         fitted = fit_rewards(data, layout, cfg.task.hessian == "diagonal").now
         cost = scheme_cost(fitted, layout, 1.0, cfg.task.hessian)
@@ -230,10 +223,17 @@ def nominal_mpc(
     return mpc
 
 
-def _model(data: Any, layout: Layout, structure: str, **options: Any) -> Identified:
-    """Identify a model with the sizes of ``layout``."""
+def identified_model(
+    data: Any,
+    layout: Layout,
+    structure: str,
+    held: Sequence[int],
+    ridge: float | None = None,
+) -> Identified:
+    """Identify C and b with the sizes of ``layout``; see `identify`."""
     sizes = {"past": layout.past, "n_d": layout.n_d, "n_x": layout.n_x}
-    return identify(data, layout.horizon, structure=structure, **sizes, **options)
+    options = {"structure": structure, "ridge": ridge, "held": held}
+    return identify(data, layout.horizon, **sizes, **options)
 
 
 def _fitted(cfg: DictConfig, log: TensorDictBase, layout: Layout) -> RewardCost:

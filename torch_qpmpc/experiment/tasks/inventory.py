@@ -11,10 +11,8 @@ from torch import Tensor
 from torch_qpmpc.envs import Inventory
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64
-from torch_qpmpc.experiment.fields import Positive
 from torch_qpmpc.experiment.tasks.registry import (
     Task,
-    TaskSettings,
     named,
     plant_layout,
     priced,
@@ -27,6 +25,8 @@ from torch_qpmpc.mpc.scheme import Scheme
 
 #: Closed loops of an evaluation.
 STARTS = 64
+#: The largest order; the mean demand is 5.
+CAPACITY = 6.5
 #: Stocks, in mean demands, below which a row has a price. Of the start only 0 has the plant's.
 KINKS = (-1.2, -0.6, 0.0, 0.6, 1.2, 1.8, 2.4, 3.0, 3.6)
 #: The price of the other rows: all of them together cost less than holding a unit.
@@ -35,15 +35,8 @@ PRICE = 0.1
 CURVATURE = 1e-3
 
 
-class InventorySettings(TaskSettings):
-    """The keys of `Inventory`."""
-
-    #: The largest order.
-    capacity: Positive
-
-
 def make_plant(cfg: DictConfig) -> Inventory:
-    return Inventory(horizon=cfg.task.horizon, ub_a=float64(cfg.task.capacity)())
+    return Inventory(horizon=cfg.task.horizon, ub_a=float64(CAPACITY)())
 
 
 def wrong_scheme(cfg: DictConfig, plant: Inventory) -> Scheme:
@@ -90,7 +83,6 @@ register(
         closed_loop=partial(plant_loop, starts=STARTS),
         nominal_scheme=wrong_scheme,
         episode=named(("stock", "on order"), ("new order",)),
-        settings=InventorySettings,
         defaults=None,
     )
 )

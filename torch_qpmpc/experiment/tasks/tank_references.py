@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_qpmpc.envs import TankReferences
 from torch_qpmpc.envs.closed_loop import plant_loop
-from torch_qpmpc.experiment.fields import Flag, NonNegative, Whole
+from torch_qpmpc.experiment.fields import Flag, Whole
 from torch_qpmpc.experiment.rivals.tanks import TANK_REFERENCES_RIVALS
 from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, register
 from torch_qpmpc.experiment.tracking import offset_free, reference_scheme
@@ -20,6 +20,8 @@ from torch_qpmpc.mpc.scheme import Scheme
 
 #: Standard deviation of the disturbed variant's noise.
 NOISE_STD = 0.1
+#: Scale of the wrong model's error, in units of the disturbed variant's largest one.
+MODEL_ERROR = 5.0
 
 
 class TankReferencesSettings(TaskSettings):
@@ -27,8 +29,6 @@ class TankReferencesSettings(TaskSettings):
 
     #: Noise, and other leaks and pump gains in each episode, as in the original's second table.
     disturbed: Flag
-    #: Scale of the wrong model's error, in units of the disturbed variant's largest one.
-    model_error: NonNegative
     #: Number of model errors whose mean corrects the predictions (`offset_free`); 0 for none.
     memory: Whole
 
@@ -46,7 +46,7 @@ def make_plant(cfg: DictConfig) -> TankReferences:
 def wrong_scheme(cfg: DictConfig, plant: TankReferences) -> Scheme:
     """Draw the wrong model by ``cfg.seed``."""
     rng = np.random.default_rng(cfg.seed)
-    w = replace(plant, mismatch=cfg.task.model_error).signals(rng, 1, 1)[0, 0]
+    w = replace(plant, mismatch=MODEL_ERROR).signals(rng, 1, 1)[0, 0]
     A, B, _ = plant.model(w)
     return _scheme(cfg, plant, A, B, cfg.task.gamma)
 
