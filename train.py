@@ -121,6 +121,11 @@ def _train(
                 learner.observe(batch)
                 replay.extend(batch)
                 interrupt.exit_if_signalled(f"Stopped before the first update: {command}")
+            if identified is not None and identified.cost is not None and warm_up:
+                # Its constant is from the log: what random actions cost.
+                learner.centre(replay.steps())
+                if mpc is start:
+                    gate.keep(mpc)
         else:
             tally = restore(state, mpc, learner, gate, collector, replay)
             if state["collector"] is None and tally.update < cfg.updates and not quiet:

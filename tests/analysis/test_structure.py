@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from tests.problems import model_form, normal
+from torch_qpmpc.analysis import structure
 from torch_qpmpc.analysis.prediction_form import (
     PredictionForm,
     canonical_matrix,
@@ -158,6 +160,23 @@ def test_no_other_search_finds_a_nearer_model(seed):
         other = least_squares(distance, start.numpy())
         assert np.sqrt(2 * other.cost) > found.residual.item() - 1e-7
     assert 0.01 < found.residual < 1
+
+
+def test_a_search_ends_whose_minimum_is_far(monkeypatch):
+    """Predictions of an unstable model, all different: thousands of steps gain little."""
+    fits = []
+
+    def recorded(*args, **options):
+        fits.append(least_squares(*args, **options))
+        return fits[-1]
+
+    monkeypatch.setattr(structure, "least_squares", recorded)
+    form = model_form(1.5 * A / A.norm(), B, 20)
+    form = replace(
+        form, **{x: 9 * normal(*getattr(form, x).shape, seed=1) for x in ("Phi", "Gamma")}
+    )
+    assert nearest_model(form).residual < 1
+    assert fits[0].nfev == structure.EVALUATIONS
 
 
 def test_the_distance_grows_with_the_perturbation():

@@ -393,6 +393,9 @@ def test_a_run_resumes_with_the_start_that_it_has_chosen(tmp_path, monkeypatch):
         patch.setattr("torch_qpmpc.experiment.start.choose", None)
         run_command(f"resume={cut}")
     runs = FinishedRun(whole), FinishedRun(cut)
+    constants = [run.policy.c.item() for run in runs]
+    assert 0 < constants[0] < 0.5 * runs[0].start.c.item(), "random actions cost more"
+    assert constants[0] == constants[1]
     entries = ("J_start", "start", "start_transitions")
     first, second = ({key: run.summary[key] for key in entries} for run in runs)
     assert first == second

@@ -360,6 +360,39 @@ def test_values_are_clipped_to_the_range_of_the_observed_rewards():
     torch.testing.assert_close(loss.target(td), unclipped)
 
 
+@pytest.mark.parametrize("estimator", TRACE)
+def test_a_centred_batch_has_a_mean_error_of_zero(estimator):
+    operator, td = make_operator(), make_batch(6, 5)
+    loss, policy = make_loss(estimator, operator), operator.module.policy(td["observation"])
+    before = td.clone()
+    td["next", "reward"][0, -1] = torch.nan
+
+    def errors():
+        target = loss.target(td)
+        left = target.isfinite()
+        return (-target - operator.module.action_value(td["observation"], td["action"]))[left]
+
+    with pytest.warns(RuntimeWarning, match="1 of 30 rewards"):
+        start = errors().mean().item()
+    c = operator.module.c.item()
+    loss.observe(td)  # does not clip
+    shift = loss.centre_(td)
+    loss.reward_range.copy_(torch.tensor([torch.inf, -torch.inf]))
+    with pytest.warns(RuntimeWarning, match="1 of 30 rewards"):
+        assert abs(errors().mean().item()) < 1e-9
+    assert abs(start) > 0.1
+    assert operator.module.c.item() == pytest.approx(c + shift)
+    assert torch.equal(operator.module.policy(td["observation"]), policy)
+    td["next", "reward"] = before["next", "reward"]
+    assert (td == before).all(), "the batch is left alone"
+
+
+def test_without_a_usable_transition_c_stays():
+    loss, td = make_loss(operator=make_operator()), make_batch(3)
+    td["next", "reward"].fill_(torch.nan)
+    assert loss.centre_(td) == 0.0
+
+
 def test_a_transition_out_of_the_data_does_not_raise_its_own_target_for_ever():
     """Q of s = 1 learns from V of s+ = 2, which is four times as large."""
     scheme = {"stage_weight": torch.eye(2), "hessian": "block", "gamma": GAMMA, "solver": "daqp"}

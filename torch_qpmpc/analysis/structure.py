@@ -23,6 +23,9 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.layout import Layout
 
+#: The most evaluations of `nearest_model`'s predictions: the last ones of thousands gain nothing.
+EVALUATIONS = 100
+
 
 def distance_by_band(
     C: Tensor, C_0: Tensor, n_x: int, n_u: int, past: int = 1, n_d: int = 0
@@ -132,10 +135,11 @@ def stage_models(form: PredictionForm) -> NearestModel:
 def nearest_model(form: PredictionForm) -> NearestModel:
     """Fit the time-invariant scheme with the nearest predictions; its residual is the distance.
 
-    Minimises ``||[Phi, Gamma, phi] - [Phi, Gamma, phi](A, B, E, offset)||`` by Levenberg-Marquardt
-    from the one-step fit of all stages; the residual is the minimum over ``||[Phi, Gamma]||``. For
-    a scheme with tied stages the start is exact, and the residual zero up to rounding. Otherwise it
-    is a local minimum, and an upper bound on the distance to the MPC schemes.
+    Minimises ``||[Phi, Gamma, phi] - [Phi, Gamma, phi](A, B, E, offset)||`` by at most
+    `EVALUATIONS` trust-region steps from the one-step fit of all stages; the residual is the
+    minimum over ``||[Phi, Gamma]||``. For a scheme with tied stages the start is exact, and the
+    residual zero up to rounding. Otherwise it is a local minimum, or near one, and an upper bound
+    on the distance to the MPC schemes.
     """
     check_form(form)
     maps, past = form.maps, form.layout.past
@@ -172,8 +176,8 @@ def nearest_model(form: PredictionForm) -> NearestModel:
     # The predictions of an unstable fit may be far off or overflow: then zero is a better start.
     candidates = [np.zeros(start.numel()), start.flatten().numpy()]
     begin = min(candidates, key=lambda flat: np.linalg.norm(residuals(flat)))
-    tight = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-12}
-    fit = least_squares(residuals, begin, jac=jacobian, method="lm", **tight)  # pyright: ignore[reportArgumentType] - jac may be a function
+    tight = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-12, "max_nfev": EVALUATIONS}
+    fit = least_squares(residuals, begin, jac=jacobian, **tight)  # pyright: ignore[reportArgumentType] - jac may be a function
     theta = torch.as_tensor(fit.x).view(shape)
     scale = _without_offset(maps[1:]).sum().sqrt()
     return NearestModel(*_split(theta, form), math.sqrt(2 * fit.cost) / scale)

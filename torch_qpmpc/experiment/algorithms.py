@@ -80,6 +80,11 @@ class Learner:
             following = operator.known(flat.get("next"))[:, -operator.module.n_x :]
             self.errors.add(operator.known(flat), flat.get(operator.in_keys[1]), following)
 
+    def centre(self, transitions: TensorDictBase) -> None:
+        """Make the mean TD error of transitions zero by c alone: `QPQLearningLoss.centre_`."""
+        if isinstance(self.loss_module, QPQLearningLoss):
+            self.loss_module.centre_(transitions)
+
     def advance(self) -> None:
         """Advance the learning rates, the bounds and the target network by one update."""
         self.scheduler.step()

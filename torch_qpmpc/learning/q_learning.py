@@ -337,6 +337,41 @@ class QPQLearningLoss(LossModule):
             self.reward_range[0] = reward.min().minimum(self.reward_range[0])
             self.reward_range[1] = reward.max().maximum(self.reward_range[1])
 
+    @torch.no_grad()
+    def centre_(self, tensordict: TensorDictBase) -> float:
+        """Move the QP's constant c to where the mean TD error of a batch is zero.
+
+        This is LSTD in c alone (Bradtke and Barto, "Linear least-squares algorithms for temporal
+        difference learning", Machine Learning 1996). Steps towards fixed targets need
+        1 / (1 - gamma) updates to correct the constant of a start, such as one that is fitted to a
+        log of random actions, and all other parts learn what c lacks in the meantime. The policy
+        does not depend on c, which moves even if it is not learned.
+
+        Args:
+            tensordict: transitions, as for `forward`. Those without a solution or a finite reward
+                are left out, and values are not clipped.
+
+        Returns:
+            The change of c; zero if no transition is left, or gamma is 1 and none terminates.
+
+        Raises:
+            QPError: if an entry of the batch is missing or does not fit.
+        """
+        self._check_batch(tensordict)
+        batch = tensordict.copy()
+        visited = batch.select(*self._reads(self.value_network), strict=False)
+        call_with(self.value_network_params, self.value_network, visited)
+        prediction = visited[self.tensor_keys.state_action_value].squeeze(-1)
+        value, terminated = self._unbounded_value(batch)
+        reward = batch.get(("next", self.tensor_keys.reward))
+        target = self._estimate(batch, reward, value)
+        factor = self._estimate(batch, torch.zeros_like(reward), (~terminated).to(value))
+        use = prediction.isfinite() & target.isfinite()
+        lost = (1 - factor)[use].sum()
+        shift = float((prediction - target)[use].sum() / lost) if lost else 0.0
+        self.operator.module.c += shift
+        return shift
+
     def _bounded(self, value: Tensor) -> Tensor:
         """Clip values, in TorchRL's signs, to the sums of rewards within their range or of none."""
         low, high = self.reward_range
@@ -372,7 +407,13 @@ class QPQLearningLoss(LossModule):
         return self.value_estimator.value_estimate(batch, next_value=next_value).squeeze(-1)
 
     def _next_value(self, tensordict: TensorDictBase) -> Tensor:
-        """Return -V(s+), ``(*batch, 1)``; zero after a termination, where it is not used."""
+        """Return -V(s+), clipped, ``(*batch, 1)``; zero after a termination."""
+        value, _ = self._unbounded_value(tensordict)
+        # An infinite cost marks a QP without a solution.
+        return torch.where(value.isfinite(), self._bounded(value), value)
+
+    def _unbounded_value(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return -V(s+), zero after a termination, and True there, both ``(*batch, 1)``."""
         active_set, network = self.operator.active_set_key, self.state_value_network
         following = tensordict.get("next").select(*self._reads(network), strict=False)
         call_with(self.target_value_network_params, network, following)
@@ -380,10 +421,7 @@ class QPQLearningLoss(LossModule):
             tensordict.set(unravel_key(("next", active_set)), following.get(active_set))
         done = tensordict.get(("next", self.tensor_keys.done))
         terminated = tensordict.get(("next", self.tensor_keys.terminated), default=done)
-        value = following[self.tensor_keys.value]
-        # An infinite cost marks a QP without a solution.
-        value = torch.where(value.isfinite(), self._bounded(value), value)
-        return value.masked_fill(terminated, 0.0)
+        return following[self.tensor_keys.value].masked_fill(terminated, 0.0), terminated
 
     def _reads(self, network: TensorDictModuleBase) -> list[NestedKey]:
         """Return the in-keys of a view of the QP, and its active-set key if there is one."""
