@@ -23,8 +23,9 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.layout import Layout
 
-#: The most evaluations of `nearest_model`'s predictions: the last ones of thousands gain nothing.
-EVALUATIONS = 100
+#: The most evaluations of `nearest_model`'s predictions, of thousands whose last ones gain nothing,
+#: and of their multiplications: with many outputs there are fewer evaluations, down to none.
+EVALUATIONS, MULTIPLICATIONS = 100, 2e10
 
 
 def distance_by_band(
@@ -135,11 +136,11 @@ def stage_models(form: PredictionForm) -> NearestModel:
 def nearest_model(form: PredictionForm) -> NearestModel:
     """Fit the time-invariant scheme with the nearest predictions; its residual is the distance.
 
-    Minimises ``||[Phi, Gamma, phi] - [Phi, Gamma, phi](A, B, E, offset)||`` by at most
-    `EVALUATIONS` trust-region steps from the one-step fit of all stages; the residual is the
-    minimum over ``||[Phi, Gamma]||``. For a scheme with tied stages the start is exact, and the
-    residual zero up to rounding. Otherwise it is a local minimum, or near one, and an upper bound
-    on the distance to the MPC schemes.
+    Minimises ``||[Phi, Gamma, phi] - [Phi, Gamma, phi](A, B, E, offset)||`` by trust-region steps
+    from the one-step fit of all stages, as many as `EVALUATIONS` and `MULTIPLICATIONS` allow; the
+    residual is the minimum over ``||[Phi, Gamma]||``. For a scheme with tied stages the start is
+    exact, and the residual zero up to rounding. Otherwise it is a local minimum, or on the way to
+    one, and an upper bound on the distance to the MPC schemes.
     """
     check_form(form)
     maps, past = form.maps, form.layout.past
@@ -176,11 +177,13 @@ def nearest_model(form: PredictionForm) -> NearestModel:
     # The predictions of an unstable fit may be far off or overflow: then zero is a better start.
     candidates = [np.zeros(start.numel()), start.flatten().numpy()]
     begin = min(candidates, key=lambda flat: np.linalg.norm(residuals(flat)))
-    tight = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-12, "max_nfev": EVALUATIONS}
-    fit = least_squares(residuals, begin, jac=jacobian, **tight)  # pyright: ignore[reportArgumentType] - jac may be a function
-    theta = torch.as_tensor(fit.x).view(shape)
+    each = maps[1:].numel() * start.numel() ** 2
+    if evaluations := min(EVALUATIONS, int(MULTIPLICATIONS / each)):
+        options = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-12, "max_nfev": evaluations}
+        begin = least_squares(residuals, begin, jac=jacobian, **options).x  # pyright: ignore[reportArgumentType] - jac may be a function
+    theta = torch.as_tensor(begin).view(shape)
     scale = _without_offset(maps[1:]).sum().sqrt()
-    return NearestModel(*_split(theta, form), math.sqrt(2 * fit.cost) / scale)
+    return NearestModel(*_split(theta, form), float(np.linalg.norm(residuals(begin))) / scale)
 
 
 def memory_energies(form: PredictionForm, rtol: float = 1e-9) -> Tensor:
