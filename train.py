@@ -123,7 +123,7 @@ def _train(
                 interrupt.exit_if_signalled(f"Stopped before the first update: {command}")
             if identified is not None and identified.cost is not None and warm_up:
                 # Its constant is from the log: what random actions cost.
-                learner.centre(replay.steps())
+                run.log({"train/centred": learner.centre(replay)}, 0)
                 if mpc is start:
                     gate.keep(mpc)
         else:

@@ -360,10 +360,15 @@ def test_values_are_clipped_to_the_range_of_the_observed_rewards():
     torch.testing.assert_close(loss.target(td), unclipped)
 
 
+@pytest.mark.parametrize("delay_value", [False, True])
 @pytest.mark.parametrize("estimator", TRACE)
-def test_a_centred_batch_has_a_mean_error_of_zero(estimator):
+def test_a_centred_batch_has_a_mean_error_of_zero(estimator, delay_value):
     operator, td = make_operator(), make_batch(6, 5)
-    loss, policy = make_loss(estimator, operator), operator.module.policy(td["observation"])
+    loss = make_loss(estimator, operator, delay_value=delay_value)
+    if delay_value:
+        SoftUpdate(loss, tau=0.1)
+        perturb(loss)
+    policy = operator.module.policy(td["observation"])
     before = td.clone()
     td["next", "reward"][0, -1] = torch.nan
 
@@ -387,10 +392,22 @@ def test_a_centred_batch_has_a_mean_error_of_zero(estimator):
     assert (td == before).all(), "the batch is left alone"
 
 
-def test_without_a_usable_transition_c_stays():
-    loss, td = make_loss(operator=make_operator()), make_batch(3)
+def test_c_stays_without_a_usable_transition_or_a_discount():
+    loss, td = make_loss("tdlambda", make_operator()), make_batch(7, 9)
+    td["next", "terminated"].fill_(False)
+    loss.make_value_estimator("tdlambda", gamma=1.0, lmbda=0.7)
+    assert loss.centre_(td) == 0.0
+    loss.make_value_estimator()
     td["next", "reward"].fill_(torch.nan)
     assert loss.centre_(td) == 0.0
+
+
+def test_the_constant_of_a_window_and_a_preview():
+    operator, td = store.make_operator(), store.collect(3, 8).reshape(-1)
+    loss, p = make_loss(operator=operator), torch.cat((td["preview"], td["observation"]), -1)
+    assert abs(loss.centre_(td)) > 1e-3
+    error = -loss.target(td) - operator.module.action_value(p, td["action"])
+    assert abs(error.mean().item()) < 1e-9
 
 
 def test_a_transition_out_of_the_data_does_not_raise_its_own_target_for_ever():

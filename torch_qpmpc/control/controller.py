@@ -192,9 +192,11 @@ class Controller:
         try:
             state = unpacked(content["controller"])
             mpc = LinearMPC.of_stored(content)
-            controller = cls(mpc, **{name: state[name] for name in ("noise", "drift", "window")})
+            options = {name: state[name] for name in ("noise", "drift", "window") if name in state}
+            controller = cls(mpc, **options)
             controller._e, controller.u, controller.r = (state[name] for name in "eur")
-            controller.known, controller.rest = state["known"], state["rest"]
+            controller.known = state.get("known")
+            controller.rest = state.get("rest", controller.rest)
         except Exception as error:  # damaged files raise errors of any type
             raise damaged(Path(path), error, "a file that Controller.save wrote") from error
         return controller

@@ -21,6 +21,7 @@ from torch_qpmpc.experiment.actor_critic import (
     make_actor_critic_loss,
     make_closed_loop_actor,
 )
+from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import (
@@ -32,10 +33,11 @@ from torch_qpmpc.learning.operators import (
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.prediction_errors import PredictionErrors
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
-from torch_qpmpc.learning.replay import ACTIVE_SET
+from torch_qpmpc.learning.replay import ACTIVE_SET, Replay
 from torch_qpmpc.learning.updates import Update, first_order, second_order
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.tightening import BackOff
+from torch_qpmpc.mpc.trajectories import valid_steps
 
 
 @dataclass(frozen=True)
@@ -80,10 +82,15 @@ class Learner:
             following = operator.known(flat.get("next"))[:, -operator.module.n_x :]
             self.errors.add(operator.known(flat), flat.get(operator.in_keys[1]), following)
 
-    def centre(self, transitions: TensorDictBase) -> None:
-        """Make the mean TD error of transitions zero by c alone: `QPQLearningLoss.centre_`."""
-        if isinstance(self.loss_module, QPQLearningLoss):
-            self.loss_module.centre_(transitions)
+    def centre(self, replay: Replay) -> float:
+        """Make the mean TD error of the stored steps zero by c alone; return the change of c.
+
+        Steps that blow up do not count, and an actor-critic's c stays.
+        """
+        if not isinstance(self.loss_module, QPQLearningLoss):
+            return 0.0
+        steps, _ = without_blow_ups(replay.steps())
+        return self.loss_module.centre_(steps[valid_steps(steps)])
 
     def advance(self) -> None:
         """Advance the learning rates, the bounds and the target network by one update."""

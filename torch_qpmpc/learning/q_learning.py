@@ -341,11 +341,11 @@ class QPQLearningLoss(LossModule):
     def centre_(self, tensordict: TensorDictBase) -> float:
         """Move the QP's constant c to where the mean TD error of a batch is zero.
 
-        This is LSTD in c alone (Bradtke and Barto, "Linear least-squares algorithms for temporal
-        difference learning", Machine Learning 1996). Steps towards fixed targets need
-        1 / (1 - gamma) updates to correct the constant of a start, such as one that is fitted to a
-        log of random actions, and all other parts learn what c lacks in the meantime. The policy
-        does not depend on c, which moves even if it is not learned.
+        A target network's c moves as far, and the policy does not depend on c, which moves even if
+        it is not learned. This is LSTD in c alone (Bradtke and Barto, "Linear least-squares
+        algorithms for temporal difference learning", Machine Learning 1996): gradient steps need
+        about 1 / (1 - gamma) updates to correct the constant of a start, and until then all other
+        parts learn the difference.
 
         Args:
             tensordict: transitions, as for `forward`. Those without a solution or a finite reward
@@ -368,8 +368,15 @@ class QPQLearningLoss(LossModule):
         factor = self._estimate(batch, torch.zeros_like(reward), (~terminated).to(value))
         use = prediction.isfinite() & target.isfinite()
         lost = (1 - factor)[use].sum()
-        shift = float((prediction - target)[use].sum() / lost) if lost else 0.0
-        self.operator.module.c += shift
+        # Where gamma is 1, rounding is left.
+        if not lost > 1e-6 * use.sum():
+            return 0.0
+        shift, c = float((prediction - target)[use].sum() / lost), self.operator.module.c
+        if self.delay_value:
+            online, delayed = self.value_network_params, self.target_value_network_params
+            key = next(k for k, x in online.items(True, True) if x.data_ptr() == c.data_ptr())
+            delayed.get(key).add_(shift)
+        c += shift
         return shift
 
     def _bounded(self, value: Tensor) -> Tensor:

@@ -731,7 +731,7 @@ class QPMPC(nn.Module):
         masks = {name: digest(mask) for name, mask in self._masks.items()}
         return {
             **asdict(self.layout),
-            "blocks": [*self.layout.blocks],  # as in JSON
+            "blocks": [*self.layout.blocks] or None,  # None as in files from before blocks
             "gamma": float(self.gamma),
             **{name: getattr(self, name) for name in ("structure", "hessian", "step")},
             "discount_slack": self.scheme.bounds.discount_slack,
