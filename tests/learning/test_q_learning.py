@@ -394,11 +394,11 @@ def test_a_centred_batch_has_a_mean_error_of_zero(estimator, delay_value):
 
 def test_c_stays_without_a_usable_transition_or_a_discount():
     loss, td = make_loss("tdlambda", make_operator()), make_batch(7, 9)
-    td["next", "terminated"].fill_(False)
+    td["next", "terminated"] = torch.zeros(7, 9, 1).bool()
     loss.make_value_estimator("tdlambda", gamma=1.0, lmbda=0.7)
     assert loss.centre_(td) == 0.0
     loss.make_value_estimator()
-    td["next", "reward"].fill_(torch.nan)
+    td["next", "reward"] = torch.full((7, 9, 1), torch.nan)
     assert loss.centre_(td) == 0.0
 
 
