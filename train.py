@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import signal
 import sys
 from functools import partial
@@ -174,7 +175,8 @@ def _train(
                     held = () if identified is None else identified.identified.options.held
                     evaluation.identify(partial(transitions, identified, replay), held)
                 gap = report(run, gate.mpc, evaluation, update)
-                progress.set_postfix(J=cost_text(gap["J_best"]), closed_gap=gap["closed_gap"])
+                known = {key: gap[key] for key in ("closed_gap",) if math.isfinite(gap[key])}
+                progress.set_postfix(J=cost_text(gap["J_best"]), **known)
             if evaluated or interrupt.signum is not None:
                 run.flush()
                 state = snapshot(cfg, mpc, learner, gate, collector, replay, tally)

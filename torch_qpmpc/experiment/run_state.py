@@ -168,7 +168,7 @@ def _check_named(
     words = ", ".join(f"{key}={value!r}" for key, value in code.items())
     if cfg.task.get("kwargs"):
         words += f" with task.kwargs={cfg.task.kwargs}"
-    got = f"{path}, whose config.yaml names code ({words})"
+    got = f"{path}, whose config.yaml names {'other ' if 'task.id' in named else ''}code ({words})"
     command = f"{COMMAND} {resume_arguments(path, cfg.task)}"
     remedy = f"Read that code, which may not be yours; to run it: {command}"
     raise QPError.expected("resume", got, "code that the command line names, too", remedy)

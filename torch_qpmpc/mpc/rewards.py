@@ -193,8 +193,9 @@ def _observed(steps: Any, layout: Layout) -> tuple[Tensor, ...]:
 def _poor(R2: float) -> str:
     return (
         f"The fitted stage cost explains {R2:.1%} of the rewards' variance: the controller "
-        "minimises another cost than the plant's. Pass the plant's own cost as stage_weight, in "
-        "train.py task.stage_weight, or a log about the states where the controller is to work."
+        "minimises another cost than the plant's. Pass the plant's own cost as stage_weight (a "
+        "matrix with hessian='block'), in train.py task.stage_weight, or a log about the states "
+        "where the controller is to work. A reward of what is not observed needs a window: past."
     )
 
 
