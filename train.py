@@ -175,7 +175,8 @@ def _train(
                     held = () if identified is None else identified.identified.options.held
                     evaluation.identify(partial(transitions, identified, replay), held)
                 gap = report(run, gate.mpc, evaluation, update)
-                known = {key: gap[key] for key in ("closed_gap",) if math.isfinite(gap[key])}
+                closed = gap["closed_gap"]
+                known = {"closed_gap": closed} if math.isfinite(closed) else {}
                 progress.set_postfix(J=cost_text(gap["J_best"]), **known)
             if evaluated or interrupt.signum is not None:
                 run.flush()

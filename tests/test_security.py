@@ -160,9 +160,10 @@ def test_a_module_is_imported_if_the_command_line_names_it(runs, tmp_path, mark,
     monkeypatch.syspath_prepend(folder)
     stop(folder)
     module(folder, mark)
-    for wrong in ((), ("task=gymnasium", "task.id=theirs:Other-v0")):
+    other = ("task=gymnasium", "task.id=theirs:Other-v0")
+    for wrong, named in (((), "names code"), (other, "names other code")):
         message = f"to run it: python train.py resume={folder} task=gymnasium task.id=theirs:Id-v0$"
-        with pytest.raises(SystemExit, match=message):
+        with pytest.raises(SystemExit, match=f"{named} .*{message}"):
             run_command(f"resume={folder}", *wrong)
     assert not mark.exists()
     with pytest.raises(SystemExit, match=r"^task\.id: got 'theirs:Id-v0', expected an environment"):

@@ -262,8 +262,7 @@ class QPQLearningLoss(LossModule):
             name = str(self.tensor_keys.priority_weight)
             raise QPError.expected(name, "NaN or inf", "finite weights", "Check the priorities.")
         active_set = self.operator.active_set_key
-        visited = tensordict.select(*self._reads(self.value_network), strict=False).detach()
-        call_with(self.value_network_params, self.value_network, visited)
+        visited = self._visited(tensordict)
         if active_set is not None:
             tensordict.set(active_set, visited.get(active_set))
         prediction = visited[self.tensor_keys.state_action_value].squeeze(-1)
@@ -286,6 +285,12 @@ class QPQLearningLoss(LossModule):
         if self.weighted:
             loss = self._inverse_variance(visited, prediction, target - prediction, use) * loss
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
+
+    def _visited(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the entries that Q reads, with -Q(s, a) and, if it has a key, its active set."""
+        visited = tensordict.select(*self._reads(self.value_network), strict=False).detach()
+        call_with(self.value_network_params, self.value_network, visited)
+        return visited
 
     def _inverse_variance(
         self, visited: TensorDictBase, prediction: Tensor, error: Tensor, use: Tensor
@@ -359,9 +364,7 @@ class QPQLearningLoss(LossModule):
         """
         self._check_batch(tensordict)
         batch = tensordict.copy()
-        visited = batch.select(*self._reads(self.value_network), strict=False)
-        call_with(self.value_network_params, self.value_network, visited)
-        prediction = visited[self.tensor_keys.state_action_value].squeeze(-1)
+        prediction = self._visited(batch)[self.tensor_keys.state_action_value].squeeze(-1)
         value, terminated = self._unbounded_value(batch)
         reward = batch.get(("next", self.tensor_keys.reward))
         target = self._estimate(batch, reward, value)
