@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import signal
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -271,6 +272,23 @@ def test_a_held_action_has_a_cost_of_its_own(hessian):
     assert make_mpc(weighted, physics, blind).policy(s).abs().max() < 1e-12
     difference = mpc.action_value(s, action.expand(8, 1) + 0.5) - mpc.value(s)
     assert_close(difference, (R / 8).expand(8), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("hessian", ["block", "diagonal", "full"])
+def test_a_held_action_has_the_parts_of_the_scheme_that_learning_begins_with(hessian):
+    """The gate copies them; a cost of the next output has a weight for each stage."""
+    cfg = make_config(*DATA, f"task.hessian={hessian}", "task.learn_cost=[q,c]")
+    physics = make_physics(cfg)
+    start = starts(cfg, physics, collect_log(cfg, physics))[ZERO_ACTION]
+    cost = start.cost
+    cost = cost._replace(now=replace(cost.now, R2=-1.0))
+    assert cost.shifted
+    held, scheme = (
+        make_mpc(cfg, physics, start._replace(cost=cost, held=action))
+        for action in (start.held, None)
+    )
+    scheme.load_state_dict(held.state_dict())
+    assert scheme.policy(torch.ones(1, 1, dtype=torch.float64)).abs() < 1e-12
 
 
 def trained_and_resumed(cfg, folder, monkeypatch) -> FinishedRun:

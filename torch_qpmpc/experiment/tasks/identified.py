@@ -133,7 +133,10 @@ def _holding(scheme: Scheme, start: Start) -> Scheme:
     ahead = (gamma ** torch.arange(N, dtype=torch.float64)).sum()
     c = costs.mean() * (N if gamma == 1 else 1 / (1 - gamma))
     c += ahead * (R * held.square()).sum() / 2
-    cost = Cost(torch.cat((zero, R)), zero, scheme.cost.hessian, q=q, c=c)
+    weight = torch.cat((zero, R))
+    weight = weight if scheme.cost.hessian == "diagonal" else torch.diag(weight)
+    weight = weight.expand_as(scheme.cost.stage_weight)  # one per stage where the scheme has that
+    cost = Cost(weight, zero, scheme.cost.hessian, q=q, c=c)
     return replace(scheme, cost=cost, bounds=replace(scheme.bounds, state_bounds=None))
 
 
