@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -17,11 +18,20 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
 from torch_qpmpc.experiment.tasks.choice import MEAN_ACTION, Choice, Row
-from torch_qpmpc.experiment.tasks.identified import Start, identified_model, identified_start
+from torch_qpmpc.experiment.tasks.identified import (
+    Start,
+    identified_model,
+    identified_start,
+    observed_cost,
+    regulator_cost,
+)
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.blended import BlendedModel, identify_blended
 from torch_qpmpc.mpc.identification import Identified
-from torch_qpmpc.mpc.rewards import RewardCost, fit_most
+from torch_qpmpc.mpc.local import local_steps, without
+from torch_qpmpc.mpc.log import as_log
+from torch_qpmpc.mpc.predictor import prediction_errors
+from torch_qpmpc.mpc.rewards import RewardCost, fit_most, fit_rewards
 from torch_qpmpc.mpc.trajectories import valid_steps
 
 #: Episodes of each start in the first round.
@@ -36,8 +46,12 @@ BLENDED_SHARE = 0.8
 #: L of the window that is among the starts if the model with it leaves less than this share of the
 #: held-out variance that the model without it leaves unexplained.
 WINDOW, WINDOW_SHARE = 3, 0.5
-#: The end of the name of a start whose model holds no output.
-NONE_HELD = ", no output held"
+#: A local model is among the starts if it leaves less than this share of what the model of all
+#: steps leaves unexplained of the next outputs near where episodes begin, and that is not tiny.
+LOCAL_SHARE, TINY = 0.5, 1e-8
+#: The ends of the names of a start with the regulator's cost at x_N, and of one whose model holds
+#: no output.
+RICCATI, NONE_HELD = ", Riccati", ", no output held"
 
 
 def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
@@ -45,9 +59,10 @@ def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
 
     They are all combinations of the run's structure or a tied one, the run's horizon or twice of
     it, and a cost of (y_{k+1}, u_k) if that fits better or one of (y_k, u_k); the same with a
-    window where the observation hides a part of the state; where the plant is nonlinear, models
-    blended from the log with these costs, as a schedule; and those that hold zero action and the
-    log's mean action. The first one is the run's own.
+    window where the observation hides a part of the state; both structures with the regulator's
+    cost of x_N; where the plant is nonlinear, a model and a cost of the steps near where episodes
+    begin, with the regulator's, and models blended from the log, as a schedule; and those that hold
+    zero action and the log's mean action. The first one is the run's own.
 
     Raises:
         QPError: as in `identified_start`.
@@ -66,6 +81,7 @@ def starts(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
         for name, model in (models | _windowed(cfg, own, models)).items()
         for cost in costs
     }
+    named |= _regulated(cfg, own, models)
     if (blended := _blended(cfg, own, 2 * N)) is not None:
         # Of the tied model only the sizes count.
         model = models[f"tied C, N={2 * N}"]
@@ -174,6 +190,71 @@ def _windowed(
     return windowed
 
 
+def _regulated(cfg: DictConfig, own: Start, models: Mapping[str, Identified]) -> dict[str, Start]:
+    """Return the starts with the regulator's cost of x_N by name.
+
+    They have the run's horizon, as it hardly matters then.
+    """
+    layout, N = own.identified.options.layout, cfg.task.horizon
+    if cfg.task.hessian == "diagonal" or layout.past > 1 or layout.n_d:
+        return {}
+    regulated, tied, ends = {}, models[f"tied C, N={N}"], ""
+    if own.cost is not None:
+        cost = RewardCost(own.cost.now)
+        ends = f"{_cost_name(cost)}{RICCATI}"
+        for structure in dict.fromkeys((cfg.constraint.structure, "tied")):
+            name = f"{structure} C, N={N}"
+            start = own._replace(identified=models[name], cost=cost, riccati=True)
+            regulated[f"{name}{ends}"] = start
+    if (local := _local(cfg, own, tied)) is not None:
+        regulated[f"local C, N={N}{ends}"] = local
+    return {name: start for name, start in regulated.items() if _solvable(cfg, start)}
+
+
+def _solvable(cfg: DictConfig, start: Start) -> bool:
+    """Return True if the start needs no regulator, or its model and cost have one."""
+    if not start.riccati:
+        return True
+    cost = observed_cost(cfg, start.log, start.identified.options.layout, start.cost)
+    try:
+        regulator_cost(cost, start.identified, cfg.task.gamma)
+    except QPError:
+        return False
+    return True
+
+
+def _local(cfg: DictConfig, own: Start, tied: Identified) -> Start | None:
+    """Return the start of a model and a cost of the steps nearest to where episodes begin.
+
+    None if the ``tied`` model of all steps predicts the next outputs nearly as well there, or the
+    log is too short.
+    """
+    layout, held = tied.options.layout, tied.options.held
+    if (near := local_steps(own.log, layout.n_x)) is None:
+        return None
+    steps, still = near
+    moving = without(steps, still, layout.n_x)
+    try:
+        model = identified_model(moving, layout, "tied", [*held, *still], cfg.start.ridge)
+    except QPError:
+        return None
+    others = prediction_errors(as_log(steps, layout.n_x).trajectories, tied.constraints, layout)
+    size = torch.cat([part.y for part in own.identified.log.trajectories]).std(0)
+    kept = [i for i in range(layout.n_x) if i not in model.options.held]
+    local, all_steps = (
+        (errors[:, 0, kept] / size[kept]).square().nanmean() for errors in (model.errors, others)
+    )
+    if not local + TINY < LOCAL_SHARE * all_steps:
+        return None
+    local = own._replace(identified=model, still=still)
+    if own.cost is None:
+        return local
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a poor fit is one of many
+        cost = fit_rewards(moving, layout)
+    return local._replace(cost=cost, riccati=True)
+
+
 def _model(cfg: DictConfig, own: Start, structure: str, horizon: int, past: int) -> Identified:
     """Identify a model of a start's log; it is the start's if that has the same sizes."""
     options = own.identified.options
@@ -212,11 +293,14 @@ def _none_held(cfg: DictConfig, start: Start) -> Start | None:
     options = start.identified.options
     if start.held is not None or not options.held or cfg.task.get("held") is not None:
         return None
+    if start.still is not None:
+        return None
     structure, ridge = options.structure, cfg.start.ridge
     model, blended = identified_model(start.log, options.layout, structure, [], ridge), None
     if start.blended is not None:
         blended = identify_blended(start.log, options.layout.horizon)
-    return start._replace(identified=model, blended=blended)
+    other = start._replace(identified=model, blended=blended)
+    return other if _solvable(cfg, other) else None
 
 
 def _R2(start: Start) -> float:

@@ -25,6 +25,7 @@ from torch_qpmpc.mpc.log import Log, as_log
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.rewards import RewardCost, fit_rewards, scheme_cost
+from torch_qpmpc.mpc.riccati import linear_cost_to_go, terminal_riccati
 from torch_qpmpc.mpc.roles import unmoved
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.tightening import BackOff, tighten
@@ -40,7 +41,9 @@ class Start(NamedTuple):
     ``cut`` is the number of the log's episodes that blow up. ``held`` is an action ``(n_u,)`` that
     the policy holds, by a cost of its own; None for the policy of the fitted cost.
     ``choice`` is the table of starts that it was chosen from, if it was. ``blended`` is the QP's
-    schedule, in the place of the identified model; None without one. ``print`` shows ``cut``, the
+    schedule, in the place of the identified model; None without one. ``riccati`` is True if the
+    cost of x_N is the regulator's. ``still`` has the outputs that hardly move near where episodes
+    begin, if the model and the cost are fitted there; else None. ``print`` shows ``cut``, the
     errors of the model and the cost, and that table.
     """
 
@@ -51,6 +54,13 @@ class Start(NamedTuple):
     held: Tensor | None = None
     choice: Choice | None = None
     blended: BlendedModel | None = None
+    riccati: bool = False
+    still: tuple[int, ...] | None = None
+
+    @property
+    def outputs_held(self) -> list[int]:
+        """The outputs that a model of the whole log holds."""
+        return [i for i in self.identified.options.held if i not in (self.still or ())]
 
     def plant(self, physics: AnyPlant) -> AnyPlant:
         """Return ``physics``, whose observation has the window of this start's model."""
@@ -65,7 +75,9 @@ class Start(NamedTuple):
         known += f", as by task.held={[*held]}"
         count = 0 if self.blended is None else len(self.blended.centres)
         blended = f"Linear models at {count} centres, blended, take the place of the model above."
+        local = "The model and the cost are those of the steps nearest to where episodes begin."
         parts = (cut if self.cut else None, self.identified, blended if count else None)
+        parts += (None if self.still is None else local,)
         parts += known if held else None, self.cost, self.choice
         return "\n".join(str(part) for part in parts if part is not None)
 
@@ -106,6 +118,8 @@ def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
     predictor = () if identified.options.structure == "tied" else identified.constraints
     if cost.stage_weight is None:
         cost = observed_cost(cfg, start.log, identified.options.layout, start.cost)
+        if start.riccati or cfg.task.terminal_weight == "riccati":
+            cost = regulator_cost(cost, identified, scheme.gamma)
     scheme = replace(
         scheme,
         layout=identified.options.layout,
@@ -113,6 +127,25 @@ def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
         cost=cost,
     )
     return scheme if start.held is None else _holding(scheme, start)
+
+
+def regulator_cost(cost: Cost, identified: Identified, gamma: float) -> Cost:
+    """Return ``cost`` with the regulator's cost to go at x_N, with the linear part it has.
+
+    With known signals, it is that about the x of least stage cost for them.
+
+    Raises:
+        QPError: as in `terminal_riccati`.
+    """
+    layout, W, q, model = identified.options.layout, cost.stage_weight, cost.q, identified.model
+    P = terminal_riccati(model.A, model.B, W, gamma, layout)
+    values, vectors = torch.linalg.eigh(P)
+    P = vectors * values.clamp(min=0) @ vectors.mT  # up to rounding, it is that
+    p = q.new_zeros(layout.n_x)
+    if not layout.n_d:
+        of_stage = q[layout.n_before :][: layout.n]
+        p = linear_cost_to_go(model.A, model.B, model.offset, W, of_stage, P, gamma)
+    return replace(cost, terminal_weight=P, q=torch.cat((q[: -layout.n_x], p)))
 
 
 def _holding(scheme: Scheme, start: Start) -> Scheme:
@@ -169,8 +202,8 @@ def observed_cost(
 ) -> Cost:
     """Return the cost of a scheme from that of a stage, by default fitted to the log's rewards.
 
-    It is the cost of x_N, too, without an action, unless ``cfg`` has a terminal weight from the
-    Riccati equation. The constant adds the mean cost of the log beyond the horizon.
+    It is the cost of x_N, too, without an action. The constant adds the mean cost of the log beyond
+    the horizon.
 
     Raises:
         QPError: as in `fit_rewards`.
@@ -182,10 +215,7 @@ def observed_cost(
         mean = -log["next", "reward"].reshape(log.shape)[valid_steps(log)].double().mean()
         stages = layout.horizon + (not fitted.shifted)
         cost = replace(cost, c=cost.c + gamma**stages / (1 - gamma) * mean)
-    if cfg.task.terminal_weight != "riccati":
-        return cost
-    q = torch.cat((cost.q[: -layout.n_x], 0 * cost.q[-layout.n_x :]))
-    return replace(cost, terminal_weight=None, q=q)
+    return cost
 
 
 def nominal_mpc(

@@ -1,0 +1,59 @@
+"""The steps of a log that are nearest to where its episodes begin, for a model and a cost of there.
+
+A log of random actions soon leaves the region where an unstable plant is to work, and the largest
+outputs decide a fit to all of it. A linear model is the plant's derivative only near a point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from torch_qpmpc.mpc.trajectories import NEXT, read_trajectories, valid_steps
+
+#: Steps for each coefficient of an output's linear model, and of a quadratic cost.
+PER_MODEL, PER_COST = 20, 4
+#: An output is still if it varies by less than this share of what the outputs do in the median, in
+#: units of their deviations in the log: so does the cosine of a small angle.
+STILL = 1 / 3
+
+
+def local_steps(log: Any, n_x: int) -> tuple[Any, tuple[int, ...]] | None:
+    """Return the steps that are nearest to the mean first output, and the outputs still there.
+
+    Distances are in units of the outputs' deviations.
+
+    Args:
+        log: logged steps, as in `read_trajectories`.
+        n_x: the number of outputs, the last entries of the observation.
+
+    Returns:
+        The steps, ``(steps, 1)``, and indices of outputs; None if they are over half of the log.
+
+    Raises:
+        QPError: as in `read_trajectories`.
+    """
+    first = torch.stack([part.y[0] for part in read_trajectories(log, n_x)]).mean(0)
+    steps = log.reshape(-1)[valid_steps(log).flatten()]
+    y = steps["observation"][..., -n_x:].double()
+    n = n_x + steps["action"].shape[-1]
+    count = max(PER_MODEL * (n + 1), PER_COST * (n + 1) * (n + 2) // 2)
+    if 2 * count > len(y):
+        return None
+    size = y.std(0, correction=0)
+    size = torch.where(size > 1e-12 * y.abs().amax(0), size, 1.0)
+    distance = ((y - first) / size).square().sum(-1)
+    near = steps[distance.topk(count, largest=False).indices.sort().values]
+    spread = (near["observation"][..., -n_x:].double() / size).std(0, correction=0)
+    still = spread < STILL * spread.median()
+    return near.unsqueeze(1), tuple(still.nonzero().flatten().tolist())
+
+
+def without(steps: Any, outputs: Sequence[int], n_x: int) -> Any:
+    """Return a copy of logged steps where ``outputs`` are zero, so that fits ignore them."""
+    steps = steps.clone()
+    for key in ("observation", NEXT):
+        steps[key][..., -n_x:][..., [*outputs]] = 0.0
+    return steps
