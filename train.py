@@ -172,7 +172,7 @@ def _train(
             if evaluated:
                 evaluation.evaluate(gate.policy)
                 if last:
-                    held = () if identified is None else identified.identified.options.held
+                    held = () if identified is None else identified.outputs_held
                     evaluation.identify(partial(transitions, identified, replay), held)
                 gap = report(run, gate.mpc, evaluation, update)
                 closed = gap["closed_gap"]

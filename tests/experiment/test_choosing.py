@@ -27,6 +27,7 @@ from torch_qpmpc.experiment.choosing import (
     NONE_HELD,
     _blended,
     _is_less,
+    _none_held,
     choose,
     chosen_before,
     starts,
@@ -173,6 +174,7 @@ def test_the_starts_are_all_combinations_and_constant_actions():
     kinds = [f"{s} C, N={N}" for N in (3, 6) for s in ("free", "tied")]
     costs = ("(y_(k+1), u_k)", "(y_k, u_k)")
     made = [f"{kind}, cost of {cost}" for kind in kinds for cost in costs]
+    made += [f"{s} C, N=3, cost of (y_k, u_k), Riccati" for s in ("free", "tied")]
     assert [*named] == [*made, ZERO_ACTION, MEAN_ACTION]
     tied = named["tied C, N=6, cost of (y_k, u_k)"]
     assert tied.identified.options.structure == "tied"
@@ -191,10 +193,10 @@ def test_a_start_that_costs_less_than_zero_action_is_chosen():
     assert start.held is None
     assert rows[choice.name].episodes == rows[ZERO_ACTION].episodes == 4
     assert rows[choice.name].J < rows[ZERO_ACTION].J
-    assert sorted(row.episodes for row in rows.values()) == [2] * 4 + [4] * 6
+    assert sorted(row.episodes for row in rows.values()) == [2] * 5 + [4] * 7
     assert start.summary["start_transitions"] == sum(r.episodes for r in rows.values()) * 10
     lines = str(choice).splitlines()
-    assert lines[-2] == f"Chosen by at most 320 transitions of the plant: {choice.name}"
+    assert lines[-2] == f"Chosen by at most 380 transitions of the plant: {choice.name}"
     assert lines[-1] == NO_WINDOW
     assert lines[0].endswith("R2  episodes  J +- standard error (compare rows of equal episodes)")
     assert len(lines) == 3 + len(rows)
@@ -346,6 +348,51 @@ def test_blended_models_are_no_start_of_a_run_that_needs_one_C():
     assert said in str(start._replace(blended=models)).splitlines()
     for needs in ("export=c", "constraint=si", "constraint=adaptive", "gate=model"):
         assert _blended(make_config(*DATA, needs), start, 6) is None, needs
+
+
+class Falling(Lag):
+    """A pendulum that falls from the upright, shown by its angle's sine and cosine."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.angle, self.rate = self.np_random.uniform(-0.1, 0.1), 0.0
+        return self.seen(), {}
+
+    def seen(self):
+        return np.array([np.sin(self.angle), np.cos(self.angle), self.rate])
+
+    def step(self, action):
+        self.rate += 0.5 * np.sin(self.angle) + 0.3 * action.item()
+        self.angle += 0.5 * self.rate
+        cost = self.angle**2 + 0.1 * action.item() ** 2 - 1
+        return self.seen(), -cost, abs(self.angle) > 2, False, {}
+
+
+def test_a_run_starts_from_the_steps_near_where_episodes_begin(tmp_path, monkeypatch):
+    plant_is(monkeypatch, Falling)
+    cfg = make_config(*DATA, "start.transitions=800", "gate=act")
+    run = trained_and_resumed(cfg, tmp_path, monkeypatch)
+    name = "local C, N=3, cost of (y_k, u_k), Riccati"
+    assert run.summary["start"] == name
+    assert run.summary["J_start"] < 0
+    physics = make_physics(cfg)
+    log = collect_log(cfg, physics)
+    start = starts(cfg, physics, log)[name]
+    assert start.still == (1,), "the cosine"
+    assert start.outputs_held == []
+    assert _none_held(cfg, start) is None
+    said = "The model and the cost are those of the steps nearest to where episodes begin."
+    assert said in str(start).splitlines()
+    own = ("task.stage_weight=[[1,0,0,0],[0,0,0,0],[0,0,1,0],[0,0,0,.1]]",)
+    own += ("task.A=null", "task.B=null")
+    given = starts(make_config(*DATA, "start.transitions=800", *own), physics, log)
+    assert "local C, N=3" in given
+    assert not any("Riccati" in name for name in given), "it is the default's"
+    for other in ("task.hessian=diagonal", "task.past=2"):
+        cfg = make_config(*DATA, other)
+        assert "local" not in "".join(starts(cfg, make_physics(cfg), log)), other
 
 
 class Swing(Lag):

@@ -26,6 +26,7 @@ from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start, observed_cost
 from torch_qpmpc.mpc import stage_cost
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.riccati import linear_cost_to_go, riccati_weight
 from torch_qpmpc.study.runs import FinishedRun
 
 DATA = (*SMALL, "start=data", "start.transitions=200")
@@ -157,11 +158,16 @@ def test_a_task_without_a_weight_gets_the_cost_of_the_log(task, hessian):
         assert torch.equal(cost.terminal_weight, W[:n, :n])
 
 
-def test_a_terminal_weight_from_the_riccati_equation_is_kept():
-    cfg = make_config(*PENDULUM, "task.terminal_weight=riccati")
-    cost = observed_cost(cfg, log_of(*PENDULUM), Layout(3, 1, 3))
-    assert cost.terminal_weight is None
-    assert (cost.q[-3:] == 0).all()
+def test_a_terminal_weight_from_the_riccati_equation_is_that_of_the_fitted_cost():
+    cfg = make_config(*PENDULUM, "task.terminal_weight=riccati", "task.gamma=0.9")
+    _, start, mpc = start_of(cfg)
+    cost = observed_cost(cfg, start.log, start.identified.options.layout, start.cost)
+    A, B, _, offset = start.identified.model
+    P = riccati_weight(A, B, cost.stage_weight, 0.9)
+    assert_close(mpc.H_f.double(), P)
+    q = cost.q[:4]  # past=1, and no preview
+    p = linear_cost_to_go(A, B, offset, cost.stage_weight, q, P, 0.9)
+    assert_close(mpc.q[-3:].double(), p)
 
 
 def test_the_id_alone_makes_a_qp():

@@ -4,14 +4,38 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torch_qpmpc import QPError
+import torch_qpmpc as qm
+from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.regulator import lqr_gain
-from torch_qpmpc.mpc.riccati import noisy_stage_weight, riccati_weight
+from torch_qpmpc.mpc.riccati import linear_cost_to_go, noisy_stage_weight, riccati_weight
 
 A = torch.tensor([[1.1, 0.2], [0.0, 0.9]]).double()
 B = torch.tensor([[0.0, 0.1], [0.3, 0.2]]).double()
 W = torch.tensor([[2, 0.3, 0.1, 0], [0.3, 1, 0, 0.2], [0.1, 0, 0.5, 0], [0, 0.2, 0, 0.2]]).double()
 STD, GAMMA = torch.tensor([0.8, 0.3]).double(), 0.9
+
+
+@pytest.mark.parametrize("gamma", [GAMMA, 1.0])
+def test_the_linear_cost_to_go_makes_the_horizon_irrelevant(gamma):
+    """With P and p at x_N the policy is that of any other horizon, about set-points of both."""
+    offset, q = torch.tensor([0.3, -0.2]).double(), torch.tensor([0.5, -1.0, 0.1, 0.3]).double()
+    P = riccati_weight(A, B, W, gamma)
+    p = linear_cost_to_go(A, B, offset, W, q, P, gamma)
+    s, policies = torch.randn(5, 2, dtype=torch.float64), []
+    for N in (1, 9):
+        model, weights = qm.Model(A, B, offset=offset), (W, P, "block")
+        linear = torch.cat((q.repeat(N), p))
+        scheme = qm.Scheme(Layout(2, 2, N), model, qm.Cost(*weights, q=linear), gamma=gamma)
+        policies.append(QPMPC(scheme, learn=(), structure="tied").policy(s))
+    assert_close(*policies, atol=1e-7, rtol=0)
+
+
+def test_an_action_without_any_cost_has_no_effect_on_it():
+    one, still = torch.ones(1, 1).double(), torch.zeros(1, 1).double()
+    weight = torch.diag(torch.tensor([1.0, 0.0]).double())
+    p = linear_cost_to_go(0.5 * one, still, one[0], weight, torch.zeros(2).double(), one * 4 / 3)
+    assert_close(p, torch.tensor([4 / 3]).double())
 
 
 def test_the_noisy_weight_solves_the_generalised_equation():

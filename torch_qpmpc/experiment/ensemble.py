@@ -156,7 +156,7 @@ def run_ensemble(
         cost = _stage_cost(start.cost.best)
     if cost is None:
         cost = _fitted(data, layout, cfg.task.hessian == "diagonal")
-    held = () if start is None else start.identified.options.held
+    held = () if start is None else start.outputs_held
     return ensemble(data, layout, cost, physics.lb_a, physics.ub_a, held)
 
 
