@@ -80,13 +80,13 @@ class Choice:
     def __str__(self) -> str:
         width = max(map(len, self.rows))
         lines = [
-            f"{'start':{width}}{'R2':>8}{'episodes':>10}  "
+            f"{'start':{width}}{'R2':>11}{'episodes':>10}  "
             "J +- standard error (compare rows of equal episodes)"
         ]
         for name, row in self._ranked:
             R2 = "" if math.isnan(row.R2) else f"{row.R2:.3f}"
             J = f"{cost_text(row.J)} +- {cost_text(row.error)}"
-            lines.append(f"{name:{width}}{R2:>8}{row.episodes:10}  {J}")
+            lines.append(f"{name:{width}}{R2:>11}{row.episodes:10}  {J}")
         lines.append(
             f"Chosen by at most {self._transitions:,} transitions of the plant: {self.name}"
         )
