@@ -32,6 +32,7 @@ from torch_qpmpc.experiment.choosing import (
     chosen_before,
     starts,
 )
+from torch_qpmpc.experiment.ensemble import run_ensemble
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log, learning_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
@@ -370,29 +371,78 @@ class Falling(Lag):
         return self.seen(), -cost, abs(self.angle) > 2, False, {}
 
 
-def test_a_run_starts_from_the_steps_near_where_episodes_begin(tmp_path, monkeypatch):
+LOCAL = "local C, N=3, cost of (y_k, u_k), Riccati"
+
+
+@pytest.fixture
+def falling(monkeypatch):
+    """Return a function that makes the configuration, the plant and its log."""
     plant_is(monkeypatch, Falling)
-    cfg = make_config(*DATA, "start.transitions=800", "gate=act")
+
+    def make(*overrides):
+        cfg = make_config(*DATA, "start.transitions=800", *overrides)
+        physics = make_physics(cfg)
+        return cfg, physics, collect_log(cfg, physics)
+
+    return make
+
+
+def test_a_run_starts_from_the_steps_near_where_episodes_begin(tmp_path, monkeypatch, falling):
+    cfg, *_ = falling("gate=act")
     run = trained_and_resumed(cfg, tmp_path, monkeypatch)
-    name = "local C, N=3, cost of (y_k, u_k), Riccati"
-    assert run.summary["start"] == name
-    assert run.summary["J_start"] < 0
-    physics = make_physics(cfg)
-    log = collect_log(cfg, physics)
-    start = starts(cfg, physics, log)[name]
-    assert start.still == (1,), "the cosine"
+    assert run.summary["start"] == LOCAL
+    assert run.summary["J_start"] < -9
+
+
+def test_the_local_start_holds_outputs_that_hardly_move_there(falling):
+    cfg, physics, log = falling()
+    start = starts(cfg, physics, log)[LOCAL]
+    assert start.still == [1], "the cosine"
     assert start.outputs_held == []
     assert _none_held(cfg, start) is None
-    said = "The model and the cost are those of the steps nearest to where episodes begin."
-    assert said in str(start).splitlines()
-    own = ("task.stage_weight=[[1,0,0,0],[0,0,0,0],[0,0,1,0],[0,0,0,.1]]",)
-    own += ("task.A=null", "task.B=null")
-    given = starts(make_config(*DATA, "start.transitions=800", *own), physics, log)
-    assert "local C, N=3" in given
-    assert not any("Riccati" in name for name in given), "it is the default's"
-    for other in ("task.hessian=diagonal", "task.past=2"):
-        cfg = make_config(*DATA, other)
-        assert "local" not in "".join(starts(cfg, make_physics(cfg), log)), other
+    lines = str(start).splitlines()
+    assert any(line.endswith("Outputs that hardly move there, and are held: y2") for line in lines)
+    assert not any("task.held" in line for line in lines)
+
+
+def test_the_local_start_needs_no_discount(falling):
+    cfg, physics, log = falling("task.gamma=1")
+    start = starts(cfg, physics, log)[LOCAL]
+    s = torch.tensor([[0.05, 1.0, 0.0], [0.0, 1.0, 0.1]]).double()
+    assert (make_mpc(cfg, physics, start).policy(s) < 0).all()
+
+
+def test_the_local_start_has_the_tasks_own_cost(falling):
+    own = "task.stage_weight=[[1,0,0,0],[0,0,0,0],[0,0,1,0],[0,0,0,.1]]"
+    named = starts(*falling(own, "task.A=null", "task.B=null"))
+    assert "local C, N=3" in named
+    assert not any("Riccati" in name for name in named), "it is the default's"
+
+
+@pytest.mark.parametrize("setting", ["task.hessian=diagonal", "task.past=2"])
+def test_a_diagonal_hessian_and_a_window_have_no_local_start(falling, setting):
+    assert "local" not in "".join(starts(*falling(setting)))
+
+
+def test_the_cost_on_an_ensemble_is_that_of_the_whole_log(falling):
+    cfg, physics, log = falling()
+    start, costs = starts(cfg, physics, log)[LOCAL], []
+    for given in (start, start._replace(still=None, cost=None, riccati=False), None):
+        members = run_ensemble(cfg, physics, given, [log])
+        y, u = torch.ones(2, 3).double(), torch.ones(2, 1).double()
+        costs.append(members[0].cost(y, u, y[:, :0]))
+    assert_close(costs[0], costs[1])
+    assert_close(costs[0], costs[2])
+
+
+def test_the_regulators_cost_for_all_starts_leaves_no_window_and_no_copy(monkeypatch):
+    plant_is(monkeypatch, Swing)
+    cfg = make_config(*DATA, "task.terminal_weight=riccati")
+    physics = make_physics(cfg)
+    named = starts(cfg, physics, collect_log(cfg, physics))
+    assert not any("past=" in name or "Riccati" in name for name in named)
+    for start in named.values():
+        assert make_mpc(cfg, physics, start).H_f.abs().max() < 1e6
 
 
 class Swing(Lag):
@@ -468,8 +518,8 @@ def test_a_run_resumes_with_the_start_that_it_has_chosen(tmp_path, monkeypatch):
 
 
 def test_the_table_is_kept_and_damage_is_named(tmp_path):
-    zero = Row(math.nan, 4, 2.0, 0.0, 40, False)
-    rows = {"a, b": Row(0.1 + 0.2, 4, 1 / 3, 0.1, 40, True), ZERO_ACTION: zero}
+    zero = Row(math.nan, 4, 2.0, 0.0, 40, False, 10.0)
+    rows = {"a, b": Row(0.1 + 0.2, 4, 1 / 3, 0.1, 40, True, 20 / 3), ZERO_ACTION: zero}
     Choice(rows).write(tmp_path)
     again = Choice.read(tmp_path)
     assert again is not None

@@ -26,7 +26,7 @@ from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start, observed_cost
 from torch_qpmpc.mpc import stage_cost
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.riccati import linear_cost_to_go, riccati_weight
+from torch_qpmpc.mpc.riccati import affine_cost_to_go, riccati_weight
 from torch_qpmpc.study.runs import FinishedRun
 
 DATA = (*SMALL, "start=data", "start.transitions=200")
@@ -166,8 +166,9 @@ def test_a_terminal_weight_from_the_riccati_equation_is_that_of_the_fitted_cost(
     P = riccati_weight(A, B, cost.stage_weight, 0.9)
     assert_close(mpc.H_f.double(), P)
     q = cost.q[:4]  # past=1, and no preview
-    p = linear_cost_to_go(A, B, offset, cost.stage_weight, q, P, 0.9)
+    p, c = affine_cost_to_go(A, B, offset, cost.stage_weight, q, P, 0.9)
     assert_close(mpc.q[-3:].double(), p)
+    assert_close(mpc.c.double(), 10 * start.cost.now.c + 0.9**3 * c)
 
 
 def test_the_id_alone_makes_a_qp():

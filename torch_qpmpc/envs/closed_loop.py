@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -30,6 +30,7 @@ class ClosedLoop:
         costs: ``(steps, starts)``, L(s_k, a_k).
         gamma: the discount factor of ``J_discounted``.
         n_y: the last n_y entries of p are the state or, of a `Plant`, the output; None for all.
+        lengths: the numbers of steps of the episodes, ``(starts,)``; None if none ends early.
     """
 
     known: Tensor
@@ -37,6 +38,7 @@ class ClosedLoop:
     costs: Tensor
     gamma: float
     n_y: int | None = None
+    lengths: Tensor | None = None
 
     @property
     def states(self) -> Tensor:
@@ -182,13 +184,14 @@ def gymnasium_loop(
     waited = np.zeros(starts)
     if plant.past > 1:
         waited = np.array([env.get_wrapper_attr("waited") for env in envs])
-    over = np.zeros(starts, dtype=bool)
+    over, lengths = np.zeros(starts, dtype=bool), np.zeros(starts)
     low, high = plant.lb_a.numpy(), plant.ub_a.numpy()
 
     def step(a: Tensor) -> Step:
         nonlocal s, waited
         applied = a.numpy().clip(low, high)
         s, cost, waited = s.copy(), -waited, np.zeros(starts)
+        lengths[~over] += 1
         for i in np.flatnonzero(~over):
             s[i], reward, terminated, truncated, _ = envs[i].step(applied[i].astype(low.dtype))
             cost[i] -= float(reward)
@@ -199,7 +202,7 @@ def gymnasium_loop(
     loop = _run(policy, _float64(s), step, steps, shape, gamma, len(plant.lb_s))
     for env in envs:
         env.close()
-    return loop
+    return replace(loop, lengths=_float64(lengths))
 
 
 #: What a policy sees after a step, the applied action, and the cost of the step.

@@ -14,6 +14,7 @@ from scipy.special import stdtrit
 from torch import Tensor
 from tqdm import tqdm
 
+from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
@@ -22,6 +23,7 @@ from torch_qpmpc.experiment.tasks.identified import (
     Start,
     identified_model,
     identified_start,
+    is_regulated,
     observed_cost,
     regulator_cost,
 )
@@ -44,11 +46,13 @@ CONFIDENCE = 0.95
 #: that one model leaves unexplained.
 BLENDED_SHARE = 0.8
 #: L of the window that is among the starts if the model with it leaves less than this share of the
-#: held-out variance that the model without it leaves unexplained.
+#: held-out variance that the model without it leaves unexplained, in one step or over the horizon.
 WINDOW, WINDOW_SHARE = 3, 0.5
 #: A local model is among the starts if it leaves less than this share of what the model of all
-#: steps leaves unexplained of the next outputs near where episodes begin, and that is not tiny.
-LOCAL_SHARE, TINY = 0.5, 1e-8
+#: steps leaves unexplained of the next outputs near where episodes begin.
+LOCAL_SHARE = 0.5
+#: A share of variance that counts as none.
+TINY = 1e-8
 #: The ends of the names of a start with the regulator's cost at x_N, and of one whose model holds
 #: no output.
 RICCATI, NONE_HELD = ", Riccati", ", no output held"
@@ -105,15 +109,18 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
     named = starts(cfg, physics, log)
     policies = {name: _policy(cfg, physics, start) for name, start in named.items()}
     costs = dict.fromkeys(named, torch.zeros(0, dtype=torch.float64))
-    steps, left, count, last = dict.fromkeys(named, 0), [*named], FIRST, False
+    steps, lasted = dict.fromkeys(named, 0), dict.fromkeys(named, 0.0)
+    left, count, last = [*named], FIRST, False
     with tqdm(desc="starts", leave=False, disable=quiet or None) as bar:
 
         def run(name: str, count: int) -> None:
             bar.set_postfix_str(name)
             plant = named[name].plant(physics)
-            more = _costs(cfg, plant, policies[name](), len(costs[name]), count)
-            costs[name] = torch.cat((costs[name], more.sum(0).nan_to_num(torch.inf, torch.inf)))
-            steps[name] += more.numel()
+            loop = _loop(cfg, plant, policies[name](), len(costs[name]), count)
+            more, whole = loop.costs.sum(0), float(loop.costs.numel())
+            costs[name] = torch.cat((costs[name], more.nan_to_num(torch.inf, torch.inf)))
+            steps[name] += loop.costs.numel()
+            lasted[name] += whole if loop.lengths is None else loop.lengths.sum().item()
             bar.update()
 
         while not last:
@@ -128,14 +135,15 @@ def choose(cfg: DictConfig, physics: AnyPlant, log: Any, quiet: bool = True) -> 
         if (other := _none_held(cfg, named[best])) is not None:
             name = best + NONE_HELD
             named[name], policies[name] = other, _policy(cfg, physics, other)
-            costs[name], steps[name] = torch.zeros_like(costs[best][:0]), 0
+            costs[name], steps[name], lasted[name] = torch.zeros_like(costs[best][:0]), 0, 0.0
             run(name, len(costs[best]))
             best = name if _is_less(costs[name] - costs[best]) else best
     chosen = best if _is_less(costs[best] - costs[ZERO_ACTION]) else ZERO_ACTION
     rows = {}
     for name, start in named.items():
         R2, J = _R2(start), costs[name]
-        rows[name] = Row(R2, len(J), J.mean().item(), _error(J), steps[name], name == chosen)
+        errors, length = _error(J), lasted[name] / max(len(J), 1)
+        rows[name] = Row(R2, len(J), J.mean().item(), errors, steps[name], name == chosen, length)
     return _start(named, Choice(rows))
 
 
@@ -172,10 +180,10 @@ def _windowed(
 ) -> dict[str, Identified]:
     """Return the ``models`` with a window by name.
 
-    Empty if a window hardly improves the held-out prediction, or ``task.past`` is given. Models for
-    which the log's episodes are too short are left out.
+    Empty if a window hardly improves the held-out prediction, ``task.past`` is given, or all starts
+    have the regulator's cost. Models for which the log's episodes are too short are left out.
     """
-    if cfg.task.get("past") is not None:
+    if cfg.task.get("past") is not None or cfg.task.terminal_weight == "riccati":
         return {}
     windowed, first = {}, f"tied C, N={cfg.task.horizon}"
     for name in dict.fromkeys((first, *models)):
@@ -184,10 +192,17 @@ def _windowed(
             model = _model(cfg, own, options.structure, options.layout.horizon, WINDOW)
         except QPError:
             continue
-        if name == first and not 1 - _mean_R2(model) < WINDOW_SHARE * (1 - _mean_R2(models[first])):
+        if name == first and not _hides(models[first], model):
             return {}
         windowed[f"{name}, past={WINDOW}"] = model
     return windowed
+
+
+def _hides(one: Identified, window: Identified) -> bool:
+    """Return True if one observation hides what a window shows: in a step or over the horizon."""
+    return any(
+        1 - _mean_R2(window, k) + TINY < WINDOW_SHARE * (1 - _mean_R2(one, k)) for k in (0, -1)
+    )
 
 
 def _regulated(cfg: DictConfig, own: Start, models: Mapping[str, Identified]) -> dict[str, Start]:
@@ -202,7 +217,8 @@ def _regulated(cfg: DictConfig, own: Start, models: Mapping[str, Identified]) ->
     if own.cost is not None:
         cost = RewardCost(own.cost.now)
         ends = f"{_cost_name(cost)}{RICCATI}"
-        for structure in dict.fromkeys((cfg.constraint.structure, "tied")):
+        structures = dict.fromkeys((cfg.constraint.structure, "tied"))
+        for structure in () if is_regulated(cfg, own) else structures:
             name = f"{structure} C, N={N}"
             start = own._replace(identified=models[name], cost=cost, riccati=True)
             regulated[f"{name}{ends}"] = start
@@ -212,12 +228,12 @@ def _regulated(cfg: DictConfig, own: Start, models: Mapping[str, Identified]) ->
 
 
 def _solvable(cfg: DictConfig, start: Start) -> bool:
-    """Return True if the start needs no regulator, or its model and cost have one."""
-    if not start.riccati:
+    """Return True if the start needs no regulator, or there is one of its model and cost."""
+    if not is_regulated(cfg, start):
         return True
     cost = observed_cost(cfg, start.log, start.identified.options.layout, start.cost)
     try:
-        regulator_cost(cost, start.identified, cfg.task.gamma)
+        regulator_cost(cost, start, cfg.task.gamma)
     except QPError:
         return False
     return True
@@ -230,7 +246,7 @@ def _local(cfg: DictConfig, own: Start, tied: Identified) -> Start | None:
     log is too short.
     """
     layout, held = tied.options.layout, tied.options.held
-    if (near := local_steps(own.log, layout.n_x)) is None:
+    if (near := local_steps(own.log, layout.n_x, held)) is None:
         return None
     steps, still = near
     moving = without(steps, still, layout.n_x)
@@ -315,9 +331,9 @@ def _R2(start: Start) -> float:
     return _mean_R2(start.identified)
 
 
-def _mean_R2(model: Identified) -> float:
-    """Return the mean over the outputs, but for those held, of R2 at the end of the horizon."""
-    R2, held = model.R2[-1], model.options.held
+def _mean_R2(model: Identified, k: int = -1) -> float:
+    """Return the mean over the outputs, but for those held, of R2 after k + 1 steps, or all."""
+    R2, held = model.R2[k], model.options.held
     return R2[[i for i in range(len(R2)) if i not in held]].mean().item()
 
 
@@ -334,11 +350,11 @@ def _policy(cfg: DictConfig, physics: AnyPlant, start: Start) -> Callable[[], An
     return lambda: warm_policy(mpc)
 
 
-def _costs(cfg: DictConfig, physics: AnyPlant, policy: Any, done: int, count: int) -> Tensor:
-    """Return the costs ``(steps, count - done)`` of a policy's next episodes."""
+def _loop(cfg: DictConfig, physics: AnyPlant, policy: Any, done: int, count: int) -> ClosedLoop:
+    """Run a policy's next ``count - done`` episodes."""
     options = {"steps": cfg.task.eval_steps, "gamma": cfg.task.gamma}
     options |= {"starts": count - done, "seed": APART + cfg.seed + done}
-    return find_task(cfg.task).closed_loop(policy, physics, **options).costs
+    return find_task(cfg.task).closed_loop(policy, physics, **options)
 
 
 def _is_less(differences: Tensor) -> bool:

@@ -140,7 +140,8 @@ def run_ensemble(
     """Fit the `ensemble` of a run's logged steps, with the outputs held that the start holds.
 
     The cost is the plant's own where it is one of outputs, inputs and known signals, else the
-    start's if it is one of (y_k, u_k), and else the one that is fitted to the rewards.
+    start's if it is one of (y_k, u_k) and of the whole log, and else the one that is fitted to the
+    rewards.
 
     Raises:
         QPError: as in `ensemble`.
@@ -152,8 +153,9 @@ def run_ensemble(
     elif isinstance(physics, Plant):
         zeros = (torch.zeros(n).double() for n in (layout.n_x, layout.n_u, layout.n_d))
         cost = None if physics.output_cost(*zeros) is None else physics.output_cost
-    if cost is None and start is not None and start.cost is not None and not start.cost.shifted:
-        cost = _stage_cost(start.cost.best)
+    fitted = None if start is None or start.still is not None else start.cost
+    if cost is None and fitted is not None and not fitted.shifted:
+        cost = _stage_cost(fitted.best)
     if cost is None:
         cost = _fitted(data, layout, cfg.task.hessian == "diagonal")
     held = () if start is None else start.outputs_held

@@ -105,7 +105,9 @@ def draw_stage_costs(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
     """Draw the mean stage cost over time."""
     for name, loop in loops.items():
         axes.plot(loop.costs.mean(1), color=COLOURS.get(name), label=name)
-    axes.set(xlabel="step", ylabel="L(s, a), mean over starts", title="Stage cost", yscale="log")
+    axes.set(xlabel="step", ylabel="L(s, a), mean over starts", title="Stage cost")
+    if all((loop.costs.mean(1) > 0).any() for loop in loops.values()):
+        axes.set_yscale("log")
     axes.legend(fontsize="small")
 
 

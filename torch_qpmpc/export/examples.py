@@ -24,8 +24,8 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
 
     Those nearest to reaching the bounds come first. An entry's size is a quantile, at most the
     median, over the rows that contain it, of that at which the row without multipliers is at its
-    nearest bound: rows of late stages reach theirs for absurd p only. Constants stay, and
-    p satisfies hard rows with equal bounds.
+    nearest bound: rows of late stages reach theirs for absurd p only. It is one for an entry
+    without an effect. Constants stay, and p satisfies hard rows with equal bounds.
     """
     rng = np.random.default_rng(seed)
     pairs = zip(tables.rows.parts(), tables.known.parts(), strict=True)
@@ -33,8 +33,9 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
     distances = (np.abs(x - Y @ tables.centre) for x in (lower, upper))
     near = np.minimum(*(np.where(x > 0, x, np.inf) for x in distances))
     quantiles, scale = rng.uniform(0, 0.5, count), np.ones((count, tables.n_p))
+    rounding = 1e-13 * np.abs(Y).max(initial=0)  # of entries without an effect
     for j, column in enumerate(np.abs(Y).T):
-        reaches = np.isfinite(near) & (column > 1e-9 * column.max(initial=0))
+        reaches = np.isfinite(near) & (column > max(1e-9 * column.max(initial=0), rounding))
         if reaches.any():
             scale[:, j] = np.quantile(near[reaches] / column[reaches], quantiles)
     exponents = rng.uniform(-2, 1, count)

@@ -136,7 +136,8 @@ class Identified:
             f"trajectories, {', '.join(f'{name}={getattr(layout, name)}' for name in SIZES)}",
         ]
         rows = [("RMSE of " + ", ".join(map(log.label, log.outputs)), "R2, cross-validated")]
-        steps = sorted({k for k in (1, 2, 5, 10, 20, 50, 100) if k < N} | {N})
+        longest = min(N, max(part.steps for part in log.trajectories))  # single steps have one
+        steps = sorted({k for k in (1, 2, 5, 10, 20, 50, 100) if k < longest} | {longest})
         for k in steps:
             errors = " ".join(f"{x:.3g}" for x in self.rmse[k - 1].tolist())
             rows.append((errors, " ".join(f"{x:.3f}" for x in self.R2[k - 1])))

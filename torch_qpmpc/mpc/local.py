@@ -11,23 +11,24 @@ from typing import Any
 
 import torch
 
-from torch_qpmpc.mpc.trajectories import NEXT, read_trajectories, valid_steps
+from torch_qpmpc.mpc.trajectories import NEXT, kept_steps, read_trajectories
 
 #: Steps for each coefficient of an output's linear model, and of a quadratic cost.
 PER_MODEL, PER_COST = 20, 4
-#: An output is still if it varies by less than this share of what the outputs do in the median, in
-#: units of their deviations in the log: so does the cosine of a small angle.
-STILL = 1 / 3
+#: An output is still if it varies by less than this share of what the moving ones do in the median,
+#: in units of their deviations in the log: so does the cosine of a small angle.
+STILL = 1 / 2
 
 
-def local_steps(log: Any, n_x: int) -> tuple[Any, tuple[int, ...]] | None:
+def local_steps(log: Any, n_x: int, held: Sequence[int] = ()) -> tuple[Any, list[int]] | None:
     """Return the steps that are nearest to the mean first output, and the outputs still there.
 
     Distances are in units of the outputs' deviations.
 
     Args:
-        log: logged steps, as in `read_trajectories`.
+        log: logged steps in one TensorDict, as in `read_trajectories`.
         n_x: the number of outputs, the last entries of the observation.
+        held: indices of outputs that a model holds anyway, which are not among those still.
 
     Returns:
         The steps, ``(steps, 1)``, and indices of outputs; None if they are over half of the log.
@@ -36,19 +37,22 @@ def local_steps(log: Any, n_x: int) -> tuple[Any, tuple[int, ...]] | None:
         QPError: as in `read_trajectories`.
     """
     first = torch.stack([part.y[0] for part in read_trajectories(log, n_x)]).mean(0)
-    steps = log.reshape(-1)[valid_steps(log).flatten()]
+    steps = log.reshape(-1)[kept_steps(log).flatten()]
     y = steps["observation"][..., -n_x:].double()
     n = n_x + steps["action"].shape[-1]
     count = max(PER_MODEL * (n + 1), PER_COST * (n + 1) * (n + 2) // 2)
     if 2 * count > len(y):
         return None
     size = y.std(0, correction=0)
-    size = torch.where(size > 1e-12 * y.abs().amax(0), size, 1.0)
+    moving = size > 1e-12 * y.abs().amax(0)
+    moving[[*held]] = False
+    size = torch.where(size > 0, size, 1.0)
     distance = ((y - first) / size).square().sum(-1)
     near = steps[distance.topk(count, largest=False).indices.sort().values]
     spread = (near["observation"][..., -n_x:].double() / size).std(0, correction=0)
-    still = spread < STILL * spread.median()
-    return near.unsqueeze(1), tuple(still.nonzero().flatten().tolist())
+    median = spread[moving].quantile(0.5) if moving.any() else 0.0
+    still = moving & (spread < STILL * median)
+    return near.unsqueeze(1), still.nonzero().flatten().tolist()
 
 
 def without(steps: Any, outputs: Sequence[int], n_x: int) -> Any:

@@ -46,14 +46,14 @@ def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tenso
     return torch.as_tensor((P + P.T) / 2).to(A)
 
 
-def linear_cost_to_go(
+def affine_cost_to_go(
     A: Tensor, B: Tensor, offset: Tensor, W: Tensor, q: Tensor, P: Tensor, gamma: float = 1.0
-) -> Tensor:
-    """Return p ``(n_x,)`` of the regulator's cost to go ``1/2 x'Px + p'x + c`` for affine parts.
+) -> tuple[Tensor, Tensor]:
+    """Return p ``(n_x,)`` and c of the regulator's cost to go ``1/2 x'Px + p'x + c``.
 
     The model is ``A x + B u + offset``, and the stage cost ``1/2 v'Wv + q'v`` of v = [x; u].
     Without active bounds, an MPC scheme with H_f = P and q_f = p is the optimal policy, for any
-    horizon.
+    horizon. Without a discount c has no finite value.
 
     Args:
         A, B, W, gamma: as in `riccati_weight`.
@@ -62,12 +62,15 @@ def linear_cost_to_go(
         P: the `riccati_weight`.
     """
     n_x = len(A)
-    # The regulator is u = -K x + k; an action without any cost has none.
+    # The regulator is u = -K x - k; an action without any cost has none.
     M = torch.linalg.pinv(W[n_x:, n_x:] + gamma * B.mT @ P @ B, hermitian=True)
     K = M @ (W[n_x:, :n_x] + gamma * B.mT @ P @ A)
     closed = gamma * (A - B @ K).mT
     rest = q[:n_x] - K.mT @ q[n_x:] + closed @ P @ offset
-    return torch.linalg.solve(torch.eye(n_x).to(A) - closed, rest)
+    p = torch.linalg.solve(torch.eye(n_x).to(A) - closed, rest)
+    k = q[n_x:] + gamma * B.mT @ (P @ offset + p)
+    c = gamma * (offset @ P @ offset / 2 + p @ offset) - k @ M @ k / 2
+    return p, c / (1 - gamma)
 
 
 def noisy_stage_weight(

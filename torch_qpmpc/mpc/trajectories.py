@@ -81,17 +81,7 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
     d = u.new_zeros(*u.shape[:-1], 0)
     if n_d:
         d = _entry(steps, ("preview",), valid, n_d, first=True)
-    ends = _flags(steps, ENDS, default=False)
-    ends[:, :-1] |= (following[:, :-1] != y[:, 1:]).any(-1)
-    for key in IDS:
-        if (ids := steps.get(key, None)) is not None:
-            ids = _narrow(key, ids, steps.shape)
-            ends[:, :-1] |= ids[:, 1:] != ids[:, :-1]
-    for key in TIMES:
-        if (times := steps.get(key, None)) is not None:
-            valid = valid & ~_gaps(_narrow(key, times, steps.shape), ends)
-    ends |= ~valid
-    ends[:, :-1] |= ~valid[:, 1:]
+    valid, ends = _cuts(steps, valid, (following[:, :-1] != y[:, 1:]).any(-1))
     trajectories = []
     for row in range(len(y)):
         start = 0
@@ -103,6 +93,36 @@ def read_trajectories(data: Any, n_x: int | None = None, n_d: int = 0) -> list[T
     if not trajectories:
         raise QPError.expected("trajectories", "no steps", "logged steps", REMEDY)
     return trajectories
+
+
+def kept_steps(steps: Any) -> Tensor:
+    """Return True for the steps that `read_trajectories` keeps, in the log's shape."""
+    rows = steps if steps.batch_dims == 2 else steps.unsqueeze(0)
+    jumps = (rows[NEXT][:, :-1] != rows["observation"][:, 1:]).flatten(2).any(-1)
+    return _cuts(rows, valid_steps(rows), jumps)[0].reshape(steps.shape)
+
+
+def _cuts(steps: Any, valid: Tensor, jumps: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the steps that are kept, and those that end a trajectory, ``(episodes, T)``.
+
+    Args:
+        steps: the logged steps.
+        valid: True for those that are not padding.
+        jumps: True where the next observation is not that of the following step,
+            ``(episodes, T - 1)``.
+    """
+    ends = _flags(steps, ENDS, default=False)
+    ends[:, :-1] |= jumps
+    for key in IDS:
+        if (ids := steps.get(key, None)) is not None:
+            ids = _narrow(key, ids, steps.shape)
+            ends[:, :-1] |= ids[:, 1:] != ids[:, :-1]
+    for key in TIMES:
+        if (times := steps.get(key, None)) is not None:
+            valid = valid & ~_gaps(_narrow(key, times, steps.shape), ends)
+    ends |= ~valid
+    ends[:, :-1] |= ~valid[:, 1:]
+    return valid, ends
 
 
 def logs(data: Any) -> list[Any]:

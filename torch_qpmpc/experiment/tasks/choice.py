@@ -35,7 +35,8 @@ class Row(NamedTuple):
     ``R2`` is the share of the outputs' variance that is predicted N steps ahead in parts of the log
     that are held out, in the mean over the outputs that the model does not hold; ``J`` the mean
     cost of the ``episodes``, ``error`` its standard error, and ``transitions`` at most the number
-    of their steps: those that end early have fewer.
+    of their steps: those that end early have fewer, in the mean ``length``. R2 is NaN for starts
+    without such a prediction: those that hold an action, and one of single steps.
     """
 
     R2: float
@@ -44,6 +45,7 @@ class Row(NamedTuple):
     error: float
     transitions: int
     chosen: bool
+    length: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -80,16 +82,21 @@ class Choice:
     def __str__(self) -> str:
         width = max(map(len, self.rows))
         lines = [
-            f"{'start':{width}}{'R2':>11}{'episodes':>10}  "
+            f"{'start':{width}}{'R2':>8}{'episodes':>10}  "
             "J +- standard error (compare rows of equal episodes)"
         ]
         for name, row in self._ranked:
-            R2 = "" if math.isnan(row.R2) else f"{row.R2:.3f}"
+            R2 = "" if math.isnan(row.R2) else f"{row.R2:.3f}" if row.R2 > -100 else "< -100"
             J = f"{cost_text(row.J)} +- {cost_text(row.error)}"
-            lines.append(f"{name:{width}}{R2:>11}{row.episodes:10}  {J}")
+            lines.append(f"{name:{width}}{R2:>8}{row.episodes:10}  {J}")
         lines.append(
             f"Chosen by at most {self._transitions:,} transitions of the plant: {self.name}"
         )
+        chosen = self.rows[self.name]
+        if chosen.length < (steps := chosen.transitions / max(chosen.episodes, 1)):
+            lines.append(
+                f"Its episodes end after {chosen.length:.0f} of {steps:.0f} steps in the mean."
+            )
         lines += [NO_WINDOW] * (not any("past=" in name for name in self.rows))
         return "\n".join(lines + [NOTHING] * (self.name == ZERO_ACTION))
 
@@ -111,7 +118,9 @@ class Choice:
         if not file.exists():
             return None
         try:
-            exact = dict.fromkeys(("R2", "J", "error"), _number)  # pandas before 3.1 rounds
+            exact = dict.fromkeys(
+                ("R2", "J", "error", "length"), _number
+            )  # pandas before 3.1 rounds
             table = pd.read_csv(file, index_col="start", converters=exact)
             choice = cls({str(name): Row(*row) for name, *row in table.itertuples()})
             _ = choice.name

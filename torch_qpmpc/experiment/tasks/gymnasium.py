@@ -111,10 +111,15 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
     shapes = {name: needed[name] if x is None else tuple(x.shape) for name, x in matrices.items()}
     if shapes != needed:
         got, expected = (
-            ", ".join(f"task.{name} of shape {shape}" for name, shape in sizes.items())
+            ", ".join(
+                f"task.{name} of shape {shape}"
+                for name, shape in sizes.items()
+                if matrices[name] is not None
+            )
             for sizes in (shapes, needed)
         )
-        raise QPError.expected("task.id", f"{spaces}, with {got}", expected, REMEDY)
+        remedy = "" if cfg.start.name == "data" else REMEDY
+        raise QPError.expected("task.id", f"{spaces}, with {got}", expected, remedy)
     model = Model(matrices["A"], matrices["B"])
     unbounded = torch.full_like(plant.lb_s, torch.inf)
     states = None if cfg.task.observation_bounds else (-unbounded, unbounded)

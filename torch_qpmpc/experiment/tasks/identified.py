@@ -25,7 +25,7 @@ from torch_qpmpc.mpc.log import Log, as_log
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.rewards import RewardCost, fit_rewards, scheme_cost
-from torch_qpmpc.mpc.riccati import linear_cost_to_go, terminal_riccati
+from torch_qpmpc.mpc.riccati import affine_cost_to_go, terminal_riccati
 from torch_qpmpc.mpc.roles import unmoved
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.tightening import BackOff, tighten
@@ -55,11 +55,11 @@ class Start(NamedTuple):
     choice: Choice | None = None
     blended: BlendedModel | None = None
     riccati: bool = False
-    still: tuple[int, ...] | None = None
+    still: Sequence[int] | None = None
 
     @property
     def outputs_held(self) -> list[int]:
-        """The outputs that a model of the whole log holds."""
+        """The outputs that a model of the whole log holds, too."""
         return [i for i in self.identified.options.held if i not in (self.still or ())]
 
     def plant(self, physics: AnyPlant) -> AnyPlant:
@@ -70,12 +70,14 @@ class Start(NamedTuple):
 
     def __str__(self) -> str:
         cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
-        held, names = self.identified.options.held, self.identified.log.outputs
+        held, names = self.outputs_held, self.identified.log.outputs
         known = f"Held at their last value over the horizon: {', '.join(names[i] for i in held)}"
         known += f", as by task.held={[*held]}"
         count = 0 if self.blended is None else len(self.blended.centres)
         blended = f"Linear models at {count} centres, blended, take the place of the model above."
-        local = "The model and the cost are those of the steps nearest to where episodes begin."
+        still = ", ".join(names[i] for i in self.still or ()) or "none"
+        local = "The model and the cost are those of the steps nearest to where episodes begin, "
+        local += f"one by one. Outputs that hardly move there, and are held: {still}"
         parts = (cut if self.cut else None, self.identified, blended if count else None)
         parts += (None if self.still is None else local,)
         parts += known if held else None, self.cost, self.choice
@@ -84,7 +86,7 @@ class Start(NamedTuple):
     @property
     def summary(self) -> dict[str, Any]:
         """The entries of summary.json: episodes cut, outputs held, window, and fits of the cost."""
-        held = [*self.identified.options.held]
+        held = self.outputs_held
         entries: dict[str, Any] = {"log_episodes_cut": self.cut}
         entries |= {"outputs_held": held} if held else {}
         past = self.identified.options.layout.past
@@ -118,8 +120,8 @@ def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
     predictor = () if identified.options.structure == "tied" else identified.constraints
     if cost.stage_weight is None:
         cost = observed_cost(cfg, start.log, identified.options.layout, start.cost)
-        if start.riccati or cfg.task.terminal_weight == "riccati":
-            cost = regulator_cost(cost, identified, scheme.gamma)
+        if is_regulated(cfg, start):
+            cost = regulator_cost(cost, start, scheme.gamma)
     scheme = replace(
         scheme,
         layout=identified.options.layout,
@@ -129,23 +131,39 @@ def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
     return scheme if start.held is None else _holding(scheme, start)
 
 
-def regulator_cost(cost: Cost, identified: Identified, gamma: float) -> Cost:
-    """Return ``cost`` with the regulator's cost to go at x_N, with the linear part it has.
+def is_regulated(cfg: DictConfig, start: Start) -> bool:
+    """Return True if a fitted cost of x_N is to be the regulator's."""
+    return start.cost is not None and (start.riccati or cfg.task.terminal_weight == "riccati")
 
-    With known signals, it is that about the x of least stage cost for them.
+
+def regulator_cost(cost: Cost, start: Start, gamma: float) -> Cost:
+    """Return ``cost``, fitted to a log, with the regulator's cost to go at x_N.
+
+    With known signals, that is the cost about the x of least stage cost for them.
 
     Raises:
         QPError: as in `terminal_riccati`.
     """
-    layout, W, q, model = identified.options.layout, cost.stage_weight, cost.q, identified.model
-    P = terminal_riccati(model.A, model.B, W, gamma, layout)
+    layout, model, fitted = start.identified.options.layout, start.identified.model, start.cost
+    assert fitted is not None
+    first = cost.q[: -layout.n_x]
+    if layout.n_d:
+        P = terminal_riccati(model.A, model.B, cost.stage_weight, gamma, layout)
+        return replace(cost, terminal_weight=P, q=F.pad(first, (0, layout.n_x)))
+    # Outputs that are still have neither a weight nor an effect, and no action moves them.
+    moving = torch.tensor([i for i in range(layout.n_x) if i not in (start.still or ())])
+    both = torch.cat((moving, torch.arange(layout.n_x, layout.n)))
+    sizes = replace(layout, n_x=len(moving))
+    A, B, offset = model.A[moving][:, moving], model.B[moving], model.offset[moving]
+    W, q, c = fitted.best.W[both][:, both], fitted.best.q[both], cost.c
+    P = terminal_riccati(A, B, W, gamma, sizes)
     values, vectors = torch.linalg.eigh(P)
     P = vectors * values.clamp(min=0) @ vectors.mT  # up to rounding, it is that
-    p = q.new_zeros(layout.n_x)
-    if not layout.n_d:
-        of_stage = q[layout.n_before :][: layout.n]
-        p = linear_cost_to_go(model.A, model.B, model.offset, W, of_stage, P, gamma)
-    return replace(cost, terminal_weight=P, q=torch.cat((q[: -layout.n_x], p)))
+    p, ahead = affine_cost_to_go(A, B, offset, W, q, P, gamma)
+    if gamma < 1:
+        c = fitted.best.c / (1 - gamma) + gamma**layout.horizon * ahead
+    into = torch.eye(layout.n_x, dtype=P.dtype)[:, moving]
+    return replace(cost, terminal_weight=into @ P @ into.mT, q=torch.cat((first, into @ p)), c=c)
 
 
 def _holding(scheme: Scheme, start: Start) -> Scheme:
