@@ -112,6 +112,14 @@ def test_episodes_have_the_environments_own_length(register, monkeypatch):
     assert len(gymnasium_loop(lambda s: s[:, :1], plant, starts=2).costs) == 4
 
 
+@pytest.mark.parametrize(("last", "length"), [(3, 3), (1000, 5)])
+def test_a_loop_knows_how_long_its_episodes_last(register, last, length):
+    plant = GymnasiumPlant(register(last=last))
+    loop = gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=5, starts=2)
+    assert loop.lengths is not None
+    assert loop.lengths.tolist() == [length] * 2
+
+
 def test_unknown_arguments_of_an_environment_are_an_error():
     match = r"task.kwargs: got {'weight': 2}, expected arguments of 'Pendulum-v1'. .* 'weight'"
     with pytest.raises(QPError, match=match):

@@ -392,6 +392,11 @@ def test_a_run_starts_from_the_steps_near_where_episodes_begin(tmp_path, monkeyp
     run = trained_and_resumed(cfg, tmp_path, monkeypatch)
     assert run.summary["start"] == LOCAL
     assert run.summary["J_start"] < -9
+    choice = Choice.read(tmp_path / "whole")
+    assert choice is not None
+    rows = choice.rows
+    assert rows[LOCAL].length == 10
+    assert 1 < min(row.length for row in rows.values()) < 10
 
 
 def test_the_local_start_holds_outputs_that_hardly_move_there(falling):
@@ -443,6 +448,20 @@ def test_the_regulators_cost_for_all_starts_leaves_no_window_and_no_copy(monkeyp
     assert not any("past=" in name or "Riccati" in name for name in named)
     for start in named.values():
         assert make_mpc(cfg, physics, start).H_f.abs().max() < 1e6
+
+
+def test_a_window_is_a_start_if_it_shows_the_next_step_better_alone(monkeypatch, falling):
+    """Of the angle alone the rate is hidden; the plant falls before the horizon shows that."""
+    monkeypatch.setattr(Falling, "seen", lambda self: np.array([self.angle]))
+    space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    monkeypatch.setattr(Falling, "observation_space", space)
+    named = starts(*falling("task.horizon=8"))
+    one, window = (
+        named[f"tied C, N=8{past}, cost of (y_k, u_k)"].identified for past in ("", ", past=3")
+    )
+    unexplained = [1 - model.R2[[0, -1], 0] for model in (one, window)]
+    first, last = (unexplained[1] / unexplained[0]).tolist()
+    assert first < 0.5 < last
 
 
 class Swing(Lag):
@@ -531,6 +550,16 @@ def test_the_table_is_kept_and_damage_is_named(tmp_path):
     table.to_csv(tmp_path / STARTS, index=False)
     with pytest.raises(QPError, match=r"starts\.csv: got .*expected the table of starts"):
         Choice.read(tmp_path)
+
+
+def test_episodes_that_end_early_are_said_and_huge_errors_cut():
+    zero = Row(math.nan, 4, 2.0, 0.0, 40, False, 10.0)
+    rows = {"own": Row(-1e6, 4, 1.0, 0.1, 40, True, 6.6), ZERO_ACTION: zero}
+    lines = str(Choice(rows)).splitlines()
+    assert "Its episodes end after 7 of 10 steps in the mean." in lines
+    assert lines[1].split()[:4] == ["own", "<", "-100", "4"]
+    rows["own"] = rows["own"]._replace(length=10.0)
+    assert not any("end after" in line for line in str(Choice(rows)).splitlines())
 
 
 def test_a_table_of_another_log_is_named():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_loop, cost_text
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.plots import (
     closed_loop_figure,
+    draw_stage_costs,
     experience,
     learned_episode_figure,
     scale_costs,
@@ -112,6 +114,9 @@ def test_closed_loop_figure_shows_paths_costs_and_J(mpc, found):
         assert np.array_equal(line.get_ydata(), loop.costs.mean(1))
     assert right.get_yscale() == "log"
     rendered(figure)
+    axes, loop = Figure().subplots(), loops["start"]
+    draw_stage_costs(axes, {**loops, "start": replace(loop, costs=-loop.costs)})
+    assert axes.get_yscale() == "linear"
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +180,10 @@ def test_the_episode_has_the_loop_and_the_plans_of_every_half_horizon(mpc, found
             assert np.array_equal(line.get_xdata(), range(k, k + len(path)))
             assert np.allclose(line.get_ydata(), path, atol=1e-6)
     rendered(figure)
+    ended = replace(loop, lengths=torch.full((loop.costs.shape[1],), 3.0))
+    early = Evaluation(found.cfg, found.physics, {**found.loops, "learned": ended}, {})
+    axes = learned_episode_figure(mpc, early).axes[0]
+    assert np.array_equal(axes.lines[0].get_ydata(), loop.states[:4, 0, 0])
 
 
 @pytest.mark.parametrize(

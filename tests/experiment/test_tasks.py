@@ -176,6 +176,14 @@ def test_a_model_of_other_dimensions_is_an_error_of_the_environment():
         make_mpc(cfg, make_physics(cfg))
 
 
+def test_a_weight_of_other_dimensions_is_named_alone_where_the_log_has_the_model():
+    cfg = make_config("task=pendulum", "start=data", "task.stage_weight=[[1,0],[0,1]]")
+    cfg.task.A = cfg.task.B = None
+    message = r"with task\.stage_weight of shape \(2, 2\), expected task\.stage_weight of shape "
+    with pytest.raises(QPError, match=rf"{message}\(4, 4\)\.$"):
+        make_mpc(cfg, make_physics(cfg))
+
+
 def test_a_model_on_the_command_line_is_that_of_the_qp():
     model = (
         "task.A=[[1,1],[0,1]]",

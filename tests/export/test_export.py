@@ -347,6 +347,17 @@ def test_entries_with_one_value_only_keep_it_in_the_examples(tmp_path):
 
 
 @needs_compiler
+def test_an_entry_without_an_effect_up_to_rounding_is_exported(tmp_path):
+    A, B = [[1.2, 1e-16], [0.0, 1.0]], [[0.5], [0.0]]
+    weight = [1.0, 1e-16, 0.1]
+    mpc = QPMPC.from_model(A, B, 4, stage_weight=weight, action_bounds=([-1.0], [1.0]))
+    assert abs(draw(make_tables(mpc), 100)[:, 1]).max() < 100
+    agreement = mpc.export_c(tmp_path).agreement
+    assert agreement is not None
+    assert agreement.u < 1e-6
+
+
+@needs_compiler
 def test_states_that_leave_nothing_but_the_open_loop_of_an_unstable_plant_are_certified(tmp_path):
     """All inputs are at bounds: the gap is then what the rounding of Q makes of the multipliers."""
     mpc = qm.LinearMPC(([[1.5]], [[1.0]]), 20, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))

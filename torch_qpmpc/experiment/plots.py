@@ -74,10 +74,11 @@ def draw_positions(
 def learned_episode_figure(mpc: QPMPC, evaluation: Evaluation) -> Figure:
     """Draw the first episode of the learned policy, and its plans after every half horizon."""
     loop = evaluation.loops["learned"]
-    p, times = loop.known[:, 0], torch.arange(len(loop.known), dtype=torch.float64)
-    options = {"times": times, **_names(mpc, evaluation)}
+    steps = len(loop.actions) if loop.lengths is None else int(loop.lengths[0])
+    p, y, u = loop.known[: steps + 1, 0], loop.states[: steps + 1, 0], loop.actions[:steps, 0]
+    options = {"times": torch.arange(len(p), dtype=torch.float64), **_names(mpc, evaluation)}
     plans = plans_along(mpc, p[:-1], every=max(mpc.horizon // 2, 1))
-    return episode_figure(y=loop.states[:, 0], u=loop.actions[:, 0], plans=plans, **options)
+    return episode_figure(y=y, u=u, plans=plans, **options)
 
 
 def episode_names(cfg: DictConfig, physics: Any, mpc: QPMPC, d: Tensor) -> dict[str, Any]:
