@@ -114,10 +114,14 @@ def test_episodes_have_the_environments_own_length(register, monkeypatch):
 
 @pytest.mark.parametrize(("last", "length"), [(3, 3), (1000, 5)])
 def test_a_loop_knows_how_long_its_episodes_last(register, last, length):
-    plant = GymnasiumPlant(register(last=last))
-    loop = gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=5, starts=2)
+    """A policy is asked for actions until the last one ends."""
+    plant, asked = GymnasiumPlant(register(last=last)), []
+    policy = lambda s: asked.append(s) or torch.zeros(len(s), 1)  # noqa: E731
+    loop = gymnasium_loop(policy, plant, steps=5, starts=2)
     assert loop.lengths is not None
     assert loop.lengths.tolist() == [length] * 2
+    assert len(asked) == length
+    assert len(loop.costs) == 5
 
 
 def test_unknown_arguments_of_an_environment_are_an_error():

@@ -171,7 +171,7 @@ def gymnasium_loop(
 
     After an episode's end its state stays constant, at no cost. With a window the cost of the steps
     that fill it is in that of the first step, without discounts. ``steps`` is by default the length
-    of the environment's own episodes.
+    of the environment's own episodes. The policy is not asked once all episodes have ended.
 
     Raises:
         QPError: as in `closed_loop`.
@@ -199,7 +199,14 @@ def gymnasium_loop(
         return _float64(s), _float64(applied), _float64(cost)
 
     shape = starts, len(plant.lb_a)
-    loop = _run(policy, _float64(s), step, steps, shape, gamma, len(plant.lb_s))
+    last = torch.zeros(shape, dtype=torch.float64)
+
+    def act(p: Tensor) -> Tensor:
+        nonlocal last
+        last = last if over.all() else policy(p)
+        return last
+
+    loop = _run(act, _float64(s), step, steps, shape, gamma, len(plant.lb_s))
     for env in envs:
         env.close()
     return replace(loop, lengths=_float64(lengths))

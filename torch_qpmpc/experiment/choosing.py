@@ -211,7 +211,7 @@ def _regulated(cfg: DictConfig, own: Start, models: Mapping[str, Identified]) ->
     They have the run's horizon, as it hardly matters then.
     """
     layout, N = own.identified.options.layout, cfg.task.horizon
-    if cfg.task.hessian == "diagonal" or layout.past > 1 or layout.n_d:
+    if cfg.task.hessian == "diagonal" or layout.past > 1:
         return {}
     regulated, tied, ends = {}, models[f"tied C, N={N}"], ""
     if own.cost is not None:
