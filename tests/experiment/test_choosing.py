@@ -284,6 +284,7 @@ def test_a_held_action_has_the_parts_of_the_scheme_that_learning_begins_with(hes
     physics = make_physics(cfg)
     start = starts(cfg, physics, collect_log(cfg, physics))[ZERO_ACTION]
     cost = start.cost
+    assert cost is not None
     cost = cost._replace(now=replace(cost.now, R2=-1.0))
     assert cost.shifted
     held, scheme = (

@@ -168,6 +168,7 @@ def test_a_terminal_weight_from_the_riccati_equation_is_that_of_the_fitted_cost(
     q = cost.q[:4]  # past=1, and no preview
     p, c = affine_cost_to_go(A, B, offset, cost.stage_weight, q, P, 0.9)
     assert_close(mpc.q[-3:].double(), p)
+    assert start.cost is not None
     assert_close(mpc.c.double(), 10 * start.cost.now.c + 0.9**3 * c)
 
 

@@ -1,11 +1,19 @@
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
 from torch_qpmpc.mpc.identification import identify
 from torch_qpmpc.mpc.local import PER_MODEL, local_steps, without
+
+
+def near_first(log: TensorDict, n_x: int, held=()) -> tuple[Any, list[int]]:
+    near = local_steps(log, n_x, held)
+    assert near is not None
+    return near
 
 
 def falling(episodes: int, steps: int = 8) -> TensorDict:
@@ -28,10 +36,11 @@ def falling(episodes: int, steps: int = 8) -> TensorDict:
 
 def test_the_steps_are_the_nearest_to_the_first_outputs():
     log = falling(60)
-    near, still = local_steps(log, 3)
+    near, still = near_first(log, 3)
     assert near.shape == (PER_MODEL * 5, 1)
-    y, all_y = near["observation"].flatten(0, 1), log["observation"].flatten(0, 1)
-    size, first = all_y.std(0, correction=0), log["observation"][:, 0].mean(0)
+    y: Any = near["observation"].flatten(0, 1)
+    all_y: Any = log["observation"].flatten(0, 1)
+    size, first = all_y.std(0, correction=0), all_y.reshape(60, 8, 3)[:, 0].mean(0)
     distance = ((all_y - first) / size).square().sum(-1)
     limit = distance.sort().values[len(near) - 1]
     assert_close(y, all_y[distance <= limit])
@@ -42,9 +51,9 @@ def test_constant_and_held_outputs_are_not_among_those_still():
     log, fixed = falling(60), torch.full((60, 8, 4), 5.0).double()
     for key in ("observation", ("next", "observation")):
         log[key] = torch.cat((log[key], fixed), -1)
-    assert local_steps(log, 7)[1] == [1]
-    assert local_steps(log, 7, held=[1])[1] == []
-    with_rate_alone = local_steps(log, 7, held=[0, 1, 2])
+    assert near_first(log, 7)[1] == [1]
+    assert near_first(log, 7, held=[1])[1] == []
+    with_rate_alone = near_first(log, 7, held=[0, 1, 2])
     assert with_rate_alone[1] == []
 
 
@@ -54,7 +63,7 @@ def test_steps_across_gaps_and_padding_are_left_out():
     log["time"][:, 1:] += 3.0  # during the first step
     log["mask"] = torch.ones(120, 8, dtype=torch.bool)
     log["mask"][:, 3:] = False
-    near, _ = local_steps(log, 3)
+    near, _ = near_first(log, 3)
     kept = log["observation"][:, 1:3].flatten(0, 1)
     assert (near["observation"] == kept).all(-1).any(-1).all()
     assert (near["time"] > 3).all()
@@ -62,7 +71,7 @@ def test_steps_across_gaps_and_padding_are_left_out():
 
 def test_a_model_of_these_steps_has_the_plants_slopes():
     log = falling(300)
-    near, still = local_steps(log, 3)
+    near, still = near_first(log, 3)
     moving = without(near, still, 3)
     assert (moving["observation"][..., 1] == 0).all()
     assert (near["observation"][..., 1] > 0.9).all(), "a copy"
