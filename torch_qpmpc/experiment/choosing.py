@@ -304,12 +304,13 @@ def _blended(cfg: DictConfig, start: Start, horizon: int) -> BlendedModel | None
 def _none_held(cfg: DictConfig, start: Start) -> Start | None:
     """Return the start with a model that predicts the outputs that the log has as unmoved.
 
-    None if there are none, the run names them itself, or the start holds an action.
+    None if there are none, the run names them itself, or the start is a local one or holds an
+    action.
     """
     options = start.identified.options
-    if start.held is not None or not options.held or cfg.task.get("held") is not None:
+    if start.held is not None or start.still is not None or not options.held:
         return None
-    if start.still is not None:
+    if cfg.task.get("held") is not None:
         return None
     structure, ridge = options.structure, cfg.start.ridge
     model, blended = identified_model(start.log, options.layout, structure, [], ridge), None

@@ -118,9 +118,8 @@ class Choice:
         if not file.exists():
             return None
         try:
-            exact = dict.fromkeys(
-                ("R2", "J", "error", "length"), _number
-            )  # pandas before 3.1 rounds
+            numbers = ("R2", "J", "error", "length")
+            exact = dict.fromkeys(numbers, _number)  # pandas before 3.1 rounds
             table = pd.read_csv(file, index_col="start", converters=exact)
             choice = cls({str(name): Row(*row) for name, *row in table.itertuples()})
             _ = choice.name
