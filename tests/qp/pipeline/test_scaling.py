@@ -52,6 +52,16 @@ def test_units_are_powers_of_two_and_make_sizes_ordinary(matrices):
     assert prepared.scaled.units is None
 
 
+def test_what_rounding_leaves_of_a_zero_sets_no_unit():
+    """b of an identified model had 1e-14 in most rows, and z came in units of that."""
+    offset, weight = [5.0, 1e-14, 1e-14, 1e-14], [0.0, 0.0, 0.0, 0.0, 10.0]
+    options = {"offset": offset, "stage_weight": weight, "action_bounds": ([-1.0], [1.0])}
+    mpc = QPMPC.from_model(0.9 * np.eye(4), [[1.0], [0.0], [0.0], [0.0]], 10, **options)
+    s = torch.tensor([[100.0, 1.0, 1.0, 1.0]]).double()
+    assert Programs.of(*mpc.quadratic_program().tensors(), s)[0].prepared.units is None
+    assert mpc.policy(s).abs() < 1e-8
+
+
 @pytest.mark.parametrize("bound", [1e3, 1e6, 1e10])
 def test_bounds_that_are_far_away_change_no_answer(solver, bound):
     """Large numbers in place of infinite bounds once led to units that hid every error."""

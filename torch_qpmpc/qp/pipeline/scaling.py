@@ -27,6 +27,8 @@ SMALL, LARGE = 2.0**-7, 2.0**10
 APART = 2.0**14
 #: .. after so many passes of equilibration.
 PASSES = 8
+#: Entries of b below this, relative to the largest, are what rounding leaves of zeros.
+ROUNDING = 2.0**-40
 
 
 class Units(NamedTuple):
@@ -63,6 +65,7 @@ class Units(NamedTuple):
         M, (rows, equalities) = len(theta.H), (row_sums(x) for x in (theta.G, theta.C))
         q, b, lb, ub = (finite_sizes(x, group, M) for x in (theta.q, *theta[5:8]))
         H, q = (x.max(-1, keepdims=True) for x in (column_sizes(theta.H), q))
+        b = np.where(b > ROUNDING * b.max(-1, keepdims=True, initial=0.0), b, 0)
         reach = np.concatenate((np.maximum(lb, ub) / rows, b / equalities), axis=-1)
         sizes = np.concatenate((np.maximum(H, q), rows, equalities, reach), axis=-1)
         if (sizes[:, 0] > 0).all() and not _unusual(sizes).any():
