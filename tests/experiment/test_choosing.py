@@ -146,9 +146,9 @@ def test_set_points_are_held_in_all_starts_and_said(monkeypatch, given, held):
 def test_a_start_that_holds_no_output_is_chosen_if_it_costs_less(tmp_path, monkeypatch, less):
     plant_is(monkeypatch, Followed)
     monkeypatch.setattr(choosing, "_is_less", lambda _: less)
-    asked, nominal = [], evaluation.nominal_mpc
+    asked, nominal = [], evaluation.nominal_mpcs
     monkeypatch.setattr(
-        evaluation, "nominal_mpc", lambda *x: asked.append(list(x[-1])) or nominal(*x)
+        evaluation, "nominal_mpcs", lambda *x: asked.append(list(x[-1])) or nominal(*x)
     )
     cfg = make_config(*DATA, "start.transitions=800", "rivals=[identification]")
     assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM

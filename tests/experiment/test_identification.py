@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,14 +12,16 @@ from torch.testing import assert_close
 
 import train
 from tests.runs import SMALL, linear_system, make_config
+from torch_qpmpc.experiment import evaluation
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
 from torch_qpmpc.experiment.start import collect_log, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.experiment.tasks.identified import identified_start, nominal_mpc
+from torch_qpmpc.experiment.tasks.identified import identified_start, nominal_mpcs
 from torch_qpmpc.learning.replay import make_replay
 from torch_qpmpc.mpc.identification import identify
 from torch_qpmpc.mpc.rewards import fit_rewards
+from torch_qpmpc.mpc.riccati import terminal_riccati
 
 DATA = ("start=data", "start.transitions=400", "solver=daqp")
 #: Short episodes: without control the plant is unstable.
@@ -28,7 +31,7 @@ GROS_ZANON = ("task=gros_zanon", *DATA, "num_envs=20", "task.episode_steps=20")
 def test_the_model_is_fitted_and_the_cost_is_the_plants_own():
     cfg = make_config(*GROS_ZANON)
     physics = linear_system(cfg)
-    mpc = nominal_mpc(cfg, physics, [collect_log(cfg, physics)])
+    (mpc,) = nominal_mpcs(cfg, physics, [collect_log(cfg, physics)])
     A, B, offset = physics.true_model()
     for found, true in zip(mpc.model()[:2], (A, B), strict=True):
         assert_close(found, true, atol=0.02, rtol=0)
@@ -42,7 +45,7 @@ def test_its_bounds_hold_with_a_probability_of_95_percent():
     cfg = make_config(*GROS_ZANON)
     physics = linear_system(cfg)
     log = collect_log(cfg, physics)
-    mpc = nominal_mpc(cfg, physics, [log])
+    (mpc,) = nominal_mpcs(cfg, physics, [log])
     std = identify(log, cfg.task.horizon, structure="tied").covariance[0, 0].sqrt()
     assert std.item() == pytest.approx(0.1 / math.sqrt(12), rel=0.1)
     # Of x_0, which is known, and x_1; the rows are those of [x_k, u_k].
@@ -54,7 +57,7 @@ def test_a_window_has_the_spread_of_the_open_loop():
     cfg = make_config("task=house_wall", *DATA, "start.transitions=800")
     physics = make_physics(cfg)
     log = collect_log(cfg, physics)
-    mpc = nominal_mpc(cfg, physics, [log])
+    (mpc,) = nominal_mpcs(cfg, physics, [log])
     layout = mpc.scheme.layout
     assert layout.past > 1
     found = identify(
@@ -72,11 +75,14 @@ def test_a_cost_that_the_task_lacks_is_fitted_to_the_rewards():
     cfg = make_config("task=pendulum", W, *DATA, "constraint=free")
     physics = make_physics(cfg)
     log = collect_log(cfg, physics)
-    mpc = nominal_mpc(cfg, physics, [log])
+    mpc, regulated = nominal_mpcs(cfg, physics, [log])
     fitted = fit_rewards(log, mpc.scheme.layout).now
     assert fitted.R2 > 0.5
     assert_close(mpc.scheme.cost.stage_weight, fitted.W)
-    A, B = nominal_mpc(cfg, physics, [log], held=[2]).model()
+    assert_close(mpc.H_f, fitted.W[:3, :3])
+    A, B = regulated.model()
+    assert_close(regulated.H_f, terminal_riccati(A, B, fitted.W, 1.0, mpc.scheme.layout))
+    A, B = nominal_mpcs(cfg, physics, [log], held=[2])[0].model()
     assert_close(A[2], torch.eye(3).double()[2])
     assert not B[2].any()
 
@@ -111,6 +117,18 @@ def test_it_is_evaluated_if_it_is_chosen(chosen, there):
         assert found.rivals[IDENTIFICATION] < 0.8 * found.loops["start"].J
         found.identify(lambda: [log[:2, :1]])
         assert math.isnan(found.rivals[IDENTIFICATION])
+
+
+@pytest.mark.parametrize("costs", [[2.0, 1.0], [1.0, 2.0], [math.nan, 1.0]])
+def test_the_better_scheme_counts(monkeypatch, costs):
+    cfg = make_config(*GROS_ZANON)
+    physics, left = make_physics(cfg), iter(costs)
+    mpc = make_mpc(cfg, physics)
+    monkeypatch.setattr(evaluation, "nominal_mpcs", lambda *_: [mpc, mpc])
+    monkeypatch.setattr(evaluation, "evaluate", lambda *_: SimpleNamespace(J=next(left)))
+    run = Evaluation(cfg, physics, {}, {})
+    run.identify(list)
+    assert run.rivals == {IDENTIFICATION: 1.0}
 
 
 @pytest.mark.parametrize("replay", [True, False])

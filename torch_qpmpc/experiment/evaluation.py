@@ -23,7 +23,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_true_mpc
-from torch_qpmpc.experiment.tasks.identified import nominal_mpc
+from torch_qpmpc.experiment.tasks.identified import nominal_mpcs
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -84,8 +84,8 @@ class Evaluation:
     ) -> None:
         """Evaluate the rival `IDENTIFICATION`, if ``cfg.rivals`` chooses it and there is a plant.
 
-        ``data`` returns the logged steps, of which the model holds the outputs ``held``. J is nan
-        if they identify no model.
+        ``data`` returns the logged steps, of which the model holds the outputs ``held``. J is that
+        of the better of `nominal_mpcs`, and nan if they identify no model.
         """
         chosen = self.cfg.rivals
         if not (chosen if isinstance(chosen, bool) else IDENTIFICATION in chosen):
@@ -93,11 +93,13 @@ class Evaluation:
         if find_task(self.cfg.task).log is not None:
             return
         try:
-            policy = warm_policy(nominal_mpc(self.cfg, self.physics, data(), held))
+            mpcs = nominal_mpcs(self.cfg, self.physics, data(), held)
         except QPError:
             self.rivals[IDENTIFICATION] = math.nan
         else:
-            self.rivals[IDENTIFICATION] = evaluate(self.cfg, policy, self.physics).J
+            policies = map(warm_policy, mpcs)
+            costs = (evaluate(self.cfg, policy, self.physics).J for policy in policies)
+            self.rivals[IDENTIFICATION] = min(costs, key=lambda J: (math.isnan(J), J))
 
     def lines(self) -> dict[str, float]:
         """Return J of the start, the true model and the rivals by name."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -236,14 +237,15 @@ def observed_cost(
     return cost
 
 
-def nominal_mpc(
+def nominal_mpcs(
     cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBase], held: Sequence[int] = ()
-) -> QPMPC:
+) -> list[QPMPC]:
     """Make MPC with a model of logged steps and the plant's own cost and bounds, without learning.
 
-    There is no discount. A task without a stage cost has the one fitted to the rewards. Each soft
-    bound is tightened by the covariance of the cross-validated prediction errors, so that it holds
-    with a probability of 95 %: with the feedback of `BackOff` or, for a window, without one.
+    There is no discount. A task without a stage cost has the one fitted to the rewards, and a
+    second scheme with the regulator's cost of x_N, if there is one. Each soft bound is tightened by
+    the covariance of the cross-validated prediction errors, so that it holds with a probability of
+    95 %: with the feedback of `BackOff` or, for a window, without one.
 
     Args:
         cfg: the run's configuration.
@@ -256,16 +258,26 @@ def nominal_mpc(
     """
     task = find_task(cfg.task)
     scheme = (task.nominal_scheme or task.true_scheme or task.wrong_scheme)(cfg, physics)
-    layout, cost = scheme.layout, scheme.cost
+    layout, costs = scheme.layout, [scheme.cost]
     identified = identified_model(data, layout, "tied", held)
-    if cost.stage_weight is None:
-        fitted = fit_rewards(data, layout, cfg.task.hessian == "diagonal").now
-        cost = scheme_cost(fitted, layout, 1.0, cfg.task.hessian)
-    scheme = replace(scheme, model=Model(*identified.model), cost=cost, gamma=1.0)
+    if scheme.cost.stage_weight is None:
+        diagonal = cfg.task.hessian == "diagonal"
+        start = Start(data, identified, fit := fit_rewards(data, layout, diagonal))
+        costs = [scheme_cost(fit.now, layout, 1.0, cfg.task.hessian)]
+        if not diagonal and layout.past == 1:
+            with suppress(QPError):
+                costs.append(regulator_cost(costs[0], start, 1.0))
+    model = Model(*identified.model)
+    schemes = [replace(scheme, model=model, cost=cost, gamma=1.0) for cost in costs]
+    return [_tightened(cfg, scheme, identified) for scheme in schemes]
+
+
+def _tightened(cfg: DictConfig, scheme: Scheme, identified: Identified) -> QPMPC:
+    """Return MPC with the bounds of `nominal_mpcs`."""
     mpc = QPMPC(scheme, learn=(), structure="tied", solver=cfg.solver, on_failure="mask")
     if not (mpc.soft & (mpc.lb.isfinite() | mpc.ub.isfinite())).any():
         return mpc
-    if layout.past == 1:
+    if scheme.layout.past == 1:
         BackOff(mpc).tighten(identified.covariance)
     else:
         errors = identified.errors
