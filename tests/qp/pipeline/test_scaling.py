@@ -12,6 +12,7 @@ from tests.campaign.families import in_units
 from tests.problems import KnownQP, known_qp, programs_of, random_mpc
 from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
 from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.prepared import Prepared
 from torch_qpmpc.qp.pipeline.solve import solve_programs
 
 BATCH = 4
@@ -50,6 +51,21 @@ def test_units_are_powers_of_two_and_make_sizes_ordinary(matrices):
     for unit in prepared.units:
         assert (np.frexp(unit)[0] == 0.5).all()
     assert prepared.scaled.units is None
+
+
+@pytest.mark.parametrize("matrices", [(), (BATCH,)])
+def test_condensed_matrices_are_the_same_by_way_of_the_units(matrices):
+    known = in_size(known_qp(0, batch=(BATCH,), matrices=matrices), cost=1e-9, variables=1e5)
+    p = programs_of(known).prepared
+    own, other = (Prepared(p.theta, p.group, p.n_kept, None) for _ in range(2))
+    assert other.scaled.units is None
+    own, other = own.condensed(p.n_kept), other.condensed(p.n_kept)
+    pairs = zip(
+        (*own.arrays, own.terms, *own.sums),
+        (*other.arrays, other.terms, *other.sums),
+        strict=True,
+    )
+    assert all((a == b).all() for a, b in pairs)  # units are powers of two
 
 
 def test_what_rounding_leaves_of_a_zero_sets_no_unit():

@@ -8,7 +8,7 @@ Y, T'HT and GT; fixing the first n_f <= n_kept entries then only changes the lin
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ import torch
 
 from torch_qpmpc.qp.kernels import theta as kernels
 from torch_qpmpc.qp.pipeline.arrays import Array, Theta
+from torch_qpmpc.qp.pipeline.scaling import Units
 
 #: A pivot below this fraction of its row's norm means that rows of C are linearly dependent.
 RANK_TOLERANCE = 1e-10
@@ -77,6 +78,18 @@ class Condensed:
     n_kept: int
     deficient: bool
     surely_convex: bool
+
+    def restored(self, units: Units) -> Condensed:
+        """Return the matrices in the original numbers of QPs that one length per QP scaled."""
+        cost, length, rows, equalities = (unit[:, :, None] for unit in units)
+        of_H, of_G, of_C = cost / length**2, rows / length, equalities / length
+        of_b = 1 / of_C.swapaxes(1, 2)
+        T, Y_neg, H, G, H_b, G_b = self.arrays
+        arrays = T, Y_neg * of_b, H * of_H, G * of_G, H_b * (of_H * of_b), G_b * (of_G * of_b)
+        H_sums, G_sums, C_sums = self.sums
+        sums = H_sums * of_H[:, :, 0], G_sums * of_G[:, :, 0], C_sums * of_C[:, :, 0]
+        terms = self.terms * of_G[:, :, 0]
+        return replace(self, arrays=CondensedArrays(*arrays), terms=terms, sums=sums)
 
 
 class Reduced(NamedTuple):

@@ -56,6 +56,7 @@ class Prepared:
     ) -> None:
         self.theta, self.group, self.n_kept, self.device = theta, group, n_kept, device
         self._elimination = elimination
+        self._scaled: Prepared | None = None
         self._known: dict[Any, Any] = {}
 
     @cached_property
@@ -87,21 +88,27 @@ class Prepared:
         """Units in which the QPs are solved; None if all are one."""
         return Units.of(self.theta, self.group)
 
-    @cached_property
+    @property
     def scaled(self) -> Prepared:
         """The same theta, in its `units`."""
-        assert self.units is not None
-        theta = self.units.scaled(self.theta, self.group)
-        return Prepared(theta, self.group, self.n_kept, self.device)
+        if self._scaled is None:
+            assert self.units is not None
+            theta = self.units.scaled(self.theta, self.group)
+            self._scaled = Prepared(theta, self.group, self.n_kept, self.device)
+        return self._scaled
 
     def condensed(self, n_f: int) -> Condensed:
         """Return the QPs without C z = b, for n_f fixed entries."""
-        condensed = self._once("condensed", lambda: self._condense(self.n_kept))
-        if condensed.deficient and self.n_kept > n_f:
-            return self._once(("condensed", n_f), lambda: self._condense(n_f))
-        return condensed
+        condensed = self._condensed(self.n_kept)
+        deficient = condensed.deficient and self.n_kept > n_f
+        return self._condensed(n_f) if deficient else condensed
+
+    def _condensed(self, n_kept: int) -> Condensed:
+        return self._once(("condensed", n_kept), lambda: self._condense(n_kept))
 
     def _condense(self, n_kept: int) -> Condensed:
+        if self._scaled is not None and self.units is not None and self.units.one_length:
+            return self._scaled._condensed(n_kept).restored(self.units)
         return condense(self.theta, n_kept, self._elimination)
 
     def reduced(self, n_f: int) -> Reduced:

@@ -81,6 +81,11 @@ class Units(NamedTuple):
         units = cls(cost, length, rows, equalities)
         return units if any((unit != 1).any() for unit in units) else None
 
+    @property
+    def one_length(self) -> bool:
+        """True if all entries of z have the same length."""
+        return self.length.shape[-1] == 1
+
     def scaled(self, theta: Theta, group: np.ndarray) -> Theta:
         """Return theta in these units."""
         cost, length, rows, equalities = (per_qp(unit, group) for unit in self)

@@ -256,7 +256,8 @@ def _certify_at(p: Programs, solution: BatchSolution, at: np.ndarray) -> np.ndar
     if not len(at):
         return np.zeros(0, bool)
     solved = solution.at(at)
-    _, residual, error = p.take(at).certify(solved.z, solved.lam, solved.chi, solved.xi)
+    part = p if len(at) == len(p) else p.take(at)
+    _, residual, error = part.certify(solved.z, solved.lam, solved.chi, solved.xi)
     solution.residual[at] = np.maximum(solved.residual, residual)
     solution.value_error[at] = np.maximum(solved.value_error, error)
     return (residual > TOLERANCE) | (error > TOLERANCE)
