@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, programs_of, times
+from torch_qpmpc import QuadraticProgram
 from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.pipeline.batch import Programs
 
@@ -274,3 +275,23 @@ def test_a_violation_counts_by_the_step_that_ends_it():
     certificate = certify(programs, z, 0 * z[:, :1], 0 * z[:, :1], z[:, :0])
     assert certificate.residual <= TOLERANCE
     assert certificate.value_error > 1
+
+
+@pytest.mark.parametrize("noise", [0.0, 3e-14, -3e-14])
+def test_what_rounding_leaves_of_a_multiplier_holds_no_row(noise):
+    """Two rows of one action: of a bound that is far, and of a rate that holds it.
+
+    The first one counted as held by its multiplier and contradicted the second one, so that the
+    value of a controller's QP had no bound of its error by most of the solvers.
+    """
+    rows = {"lb": [20.0, -2.0], "ub": [80.0, 2.0], "w": [torch.inf] * 2}
+    data = {"H": torch.eye(2), "q": [0.0, -3.0], "c": 0.0, "G": [[1.0, 1.0], [0.0, 1.0]], **rows}
+    empty = {"C": torch.zeros(0, 2).double(), "b": torch.zeros(0).double()}
+    parts = {name: torch.as_tensor(x, dtype=torch.float64) for name, x in data.items()}
+    fixed = torch.tensor([[52.5]], dtype=torch.float64)
+    p, _ = Programs.of(*QuadraticProgram(**parts, **empty).tensors(), fixed)
+    z = torch.tensor([[52.5, 2 - 2.5e-11]], dtype=torch.float64)
+    lam, xi = torch.tensor([[noise, 1.0]], dtype=torch.float64), -fixed
+    certificate = certify(p, z, lam, fixed[:, :0], xi)
+    assert certificate.residual.item() < 1e-9
+    assert certificate.value_error.item() < 1e-9

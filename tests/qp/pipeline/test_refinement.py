@@ -16,6 +16,7 @@ from torch.testing import assert_close
 from tests.campaign.families import Draw, parallel_rows
 from tests.problems import known_qp, programs_of
 from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
+from torch_qpmpc.qp.pipeline import refinement
 from torch_qpmpc.qp.pipeline.refinement import Twice, _dot, _product, refine
 from torch_qpmpc.qp.pipeline.solve import solve_programs
 from torch_qpmpc.qp.program import EVENT_SHAPES
@@ -60,13 +61,19 @@ def test_a_flat_direction_has_its_solution_of_least_norm(solver, case):
 
 
 @pytest.mark.parametrize("off", [0.0, 1e-6, 1e-3])
-def test_a_solution_that_is_nearly_right_becomes_exact(off):
+def test_a_solution_that_is_nearly_right_becomes_exact(off, monkeypatch):
     known = known_qp(3, batch=(6,))
     p = programs_of(known, None)
     solution = solve_programs(p, "daqp")
     generator = np.random.default_rng(0)
     for part in (solution.z, solution.lam):
         part += off * generator.standard_normal(part.shape) * (part != 0)
+    claimed = solution.at(np.arange(6))
+    with monkeypatch.context() as patch:  # a large QP waits for the other ways to fail
+        patch.setattr(refinement, "MAX_WORK", 1)
+        assert refine(p, solution, np.arange(6)).tolist() == [*range(6)]
+        assert (solution.z == claimed.z).all()
+        assert len(refine(p, claimed, np.arange(6), last=True)) == 0
     assert len(refine(p, solution, np.arange(6))) == 0
     assert_close(solution.value, known.value.numpy(), rtol=1e-12, atol=1e-12)
     assert_close(solution.z, known.z.numpy(), rtol=1e-9, atol=1e-9)

@@ -348,14 +348,14 @@ def _repair(rows, hard, z, G, units, basis, ends):
     along which it goes to ``ends``; the two are scratch. It is infinite if rows that are dependent
     up to rounding disagree by more.
     """
-    y, lam, lb, ub, w, steps = rows
+    y, _, lb, ub, w, steps = rows
     total, k = 0.0, 0
     for a in range(len(hard)):
         j = hard[a]
         if w[j] < np.inf or not steps[j] > 0:
             continue
         over, size = max(y[j] - ub[j], lb[j] - y[j]), _weighted(z, G[j])
-        if over <= -NEARLY_ACTIVE * size and lam[j] == 0:
+        if over <= -NEARLY_ACTIVE * size:  # also with a multiplier, which the gap charges
             continue
         sign = 1.0 if y[j] - ub[j] > lb[j] - y[j] else -1.0
         part = sign * (max(over, 0.0) + ROUNDING * size) / steps[j]

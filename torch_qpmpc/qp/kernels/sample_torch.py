@@ -146,7 +146,7 @@ def _repair(y, lam, theta, size, sizes, group) -> Tensor:
     if sizes.apart:
         counts = present & ((over > 0) | (lam != 0))
         return torch.linalg.vector_norm(torch.where(counts, part, 0), dim=-1)
-    near = present & ((over > -NEARLY_ACTIVE * size) | (lam != 0))
+    near = present & (over > -NEARLY_ACTIVE * size)
     part = torch.where(y - ub > lb - y, part, -part)
     slack, units = DEPENDENT * size / norm, sizes.units[group]
     basis, ends = torch.zeros_like(units), torch.zeros_like(part)

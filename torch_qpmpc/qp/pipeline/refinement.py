@@ -59,9 +59,16 @@ class Twice(NamedTuple):
         return np.where(np.isfinite(x), high + (low + self.low), high)
 
 
-def refine(p: Programs, solution: BatchSolution, which: np.ndarray) -> np.ndarray:
-    """Refine the solutions at the indices ``which`` in place; return the indices of failures."""
+def refine(
+    p: Programs, solution: BatchSolution, which: np.ndarray, last: bool = False
+) -> np.ndarray:
+    """Refine the solutions at the indices ``which`` in place; return the indices of failures.
+
+    Large QPs, for which all other ways together are quicker, count as failures until the ``last``.
+    """
     theta, group, failed = p.theta, p.group, []
+    if not last and sum(p.theta.C.shape[1:]) ** 3 > MAX_WORK:
+        return which
     for i in which:
         matrices = (x[group[i]] for x in theta[:3])
         vectors = (x[i % len(x)] for x in theta[3:])

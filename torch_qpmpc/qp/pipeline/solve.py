@@ -322,7 +322,7 @@ def _attempt(
     if not solution.all_accepted:
         solution = solution.on_cpu()
         rejected = ~solution.accepted() & (solution.residual <= nearly)
-        refine(p.on_cpu(), solution, np.flatnonzero(rejected))
+        refine(p.on_cpu(), solution, np.flatnonzero(rejected), last=nearly == np.inf)
     return solution
 
 
