@@ -41,12 +41,14 @@ def made(model, **options):
     return qm.Controller(qm.LinearMPC(model, 5, **design))
 
 
-def logged(steps=600):
+def logged(steps=600, dt=None):
     """Return signals of the plant with random inputs."""
     env, rng = Lag(), np.random.default_rng(5)
     u, y = rng.uniform(-1, 1, (steps, 1)).repeat(3, 0)[:steps], [env.reset(seed=1)[0]]
     y += [env.step(x)[0] for x in u[:-1]]
-    return qm.read_log({"y1": np.array(y), "u1": u}, outputs=["y1"], inputs=["u1"])
+    rows = {"y1": np.array(y), "u1": u[:, 0]} | ({} if dt is None else {"t": dt * np.arange(steps)})
+    time = None if dt is None else "t"
+    return qm.read_log(rows, outputs=["y1"], inputs=["u1"], time=time)
 
 
 def test_the_same_object_costs_less_in_the_environment_with_the_same_design():
@@ -101,8 +103,12 @@ def test_a_controller_with_the_true_model_stays_as_it_is():
     assert controller.mpc is mpc
     assert np.array_equal([controller.x, controller.w, controller.u], [x, w, u])
     assert str(report).startswith("not accepted, the controller is as before: J")
-    for low, undecided in ((-1.0, True), (1.0, False)):
-        text = str(dataclasses.replace(report, interval=(low, 2.0)))
+    for interval, after, undecided in (
+        ((-1.0, 2.0), 1.9, True),
+        ((-1.0, 2.0), 1.99, False),  # it stops where the gain is too small
+        ((1.0, 2.0), 1.9, False),
+    ):
+        text = str(dataclasses.replace(report, before=2.0, after=after, interval=interval))
         assert ("so that more pairs could decide" in text) == undecided
 
 
@@ -178,3 +184,11 @@ def test_logs_of_other_signals_and_constant_signals_are_named():
     controller = made(WRONG, E=[[0.1]], known=["sun"])
     with pytest.raises(QPError, match=r"^known: got a constant sun, expected one that varies"):
         controller.learn(Lag(), known=[0.3], **{**QUICK, "transitions": 12})
+
+
+def test_a_log_of_another_sampling_time_is_refused():
+    controller = made(WRONG, dt=30.0)
+    message = "log: got one step every 60, expected the controller's sampling time, 30. Resample"
+    with pytest.raises(QPError, match=f"^{message}"):
+        controller.learn(logged(dt=60.0))
+    assert controller.learn(logged(dt=30.0), steps=8).accepted

@@ -65,6 +65,8 @@ def test_the_state_space_of_an_identification_has_its_predictions():
     plant = read_model(Identified(arx, Mock(), Mock(), log))
     assert (plant.outputs, plant.inputs, plant.known) == (log.outputs, log.inputs, log.known)
     assert plant.dt == 0.5
+    with pytest.raises(QPError, match=r"^dt: got 1.0, expected the model's own 0.5. Leave dt out"):
+        read_model(Identified(arx, Mock(), Mock(), log), dt=1.0)
     priced = read_model(Identified(arx, Mock(), Mock(), log), prices=["rain"])
     assert not priced.E.any(), "a price acts on no plant"
     more = read_model(Identified(arx, Mock(), Mock(), log), known=["price", "rain", "sun"])

@@ -163,6 +163,11 @@ def test_a_short_log_is_not_called_collinear():
         (room().assign(q="on"), {}, "column: got q, without a number"),
         (room().assign(t="noon"), {"time": "t"}, r"time: got t \(.*\), expected numbers or dates"),
         (room()[::-1], {"time": "t"}, "time: got steps of -0.25, expected times that increase"),
+        (
+            [room(), room(30).assign(t=0.5 * np.arange(30))],
+            {"time": "t"},
+            "time: got steps of 0.5 in one part, and of 0.25 in the median, expected one sampling",
+        ),
         (room(1), {}, "data: got 1 rows, of which no two in a row are complete, expected consec"),
         ({"T": np.zeros((2, 3, 4))}, {}, r"T: got shape \(2, 3, 4\), expected shape \(T,\) or"),
         ({"T": np.ones(9), "q": np.ones(7)}, {}, "q: got 7 rows, expected 9 rows, as others, or 8"),

@@ -76,7 +76,8 @@ class LearningReport:
     def __str__(self) -> str:
         low, high = self.interval
         proof = f"mean difference and 1 % of J in [{low:.3g}, {high:.3g}] with 95 %"
-        if not self.accepted and low < 0:
+        gain = self.before - self.after - GAIN * abs(self.before)
+        if not self.accepted and low < 0 < gain:  # without a gain it stops before its last pair
             proof += ", so that more pairs could decide"
         if self.pairs < FEWEST or math.isinf(self.after):
             proof = "a loop with the new model failed, or cost far more than its pair: a veto"
@@ -212,6 +213,9 @@ def _parts(log: Log, controller: Controller) -> tuple[Log, Log]:
         if got != want:
             remedy = f"Pass qm.read_log(.., {kind}={list(want)})."
             raise QPError.expected("log", f"{kind} {got}", f"the controller's {want}", remedy)
+    if log.dt and plant.dt and not np.isclose(log.dt, plant.dt):
+        got, want = f"one step every {log.dt:g}", f"the controller's sampling time, {plant.dt:g}"
+        raise QPError.expected("log", got, want, "Resample the log.")
     *parts, held = folds(log.trajectories, PARTS)
     first = [trajectory for part in parts for trajectory in part]
     return replace(log, trajectories=first), replace(log, trajectories=held)

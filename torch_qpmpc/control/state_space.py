@@ -115,7 +115,7 @@ def read_model(
     offset, units = None, {}
     if isinstance(model, Identified):
         A, B, C, E, offset = _of_arx(model)
-        log, dt = model.log, model.log.dt if dt is None else dt
+        log, dt = model.log, _own_dt(dt, model.log.dt)
         units = dict(log.units)
         inputs, outputs, known = inputs or log.inputs, outputs or log.outputs, known or log.known
         if not {*known} >= {*log.known}:
@@ -190,10 +190,17 @@ def _of_system(system: Any, dt: float | None) -> tuple[Array, Array, Array, floa
         raise QPError.expected("model", "no time base", "a continuous or discrete model", remedy)
     if own is True:
         return A, B, C, dt
-    if dt is not None and not np.isclose(dt, own):
+    return A, B, C, _own_dt(dt, float(own))
+
+
+def _own_dt(dt: float | None, own: float | None) -> float | None:
+    """Return the sampling time of a discrete model, which a given one must equal."""
+    if dt is None or own is None:
+        return own if dt is None else dt
+    if not np.isclose(dt, own):
         remedy = "Leave dt out, or sample the model again."
         raise QPError.expected("dt", repr(dt), f"the model's own {own:g}", remedy)
-    return A, B, C, float(own)
+    return own
 
 
 def _of_arx(identified: Identified) -> tuple[Array, Array, Array, Array, Array]:

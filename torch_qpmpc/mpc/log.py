@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 #: A column is constant, or a linear function of others, up to this share of its size.
 STILL = 1e-6
+#: Parts with at least so many steps whose median step differs from that of the whole log by more
+#: than this share of it have another sampling time.
+FEWEST, ONE_DT = 10, 0.1
 #: The column of a DataFrame's index of dates.
 DATES = "the index"
 KINDS = "a CSV file, a DataFrame, a dict of arrays, a list of these, or a TensorDict of steps"
@@ -143,7 +146,7 @@ def _split(
     fits = np.abs(values) <= LARGEST  # False for NaN
     whole, measured = fits.all(1), fits[:, :n_y].all(1)
     inside = marks[1:] == marks[:-1]
-    gaps, dt = _gaps(times, inside)
+    gaps, dt = _gaps(times, inside, marks[1:])
     steps = whole[:-1] & measured[1:] & inside & ~gaps
     edges = np.flatnonzero(np.diff(np.concatenate(([0], steps, [0])))).reshape(-1, 2)
     if not len(edges):
@@ -308,7 +311,9 @@ def _times(frame: pd.DataFrame, name: str | None) -> np.ndarray | None:
     return (dates - dates.min()).dt.total_seconds().to_numpy()
 
 
-def _gaps(times: np.ndarray | None, inside: np.ndarray) -> tuple[np.ndarray, float | None]:
+def _gaps(
+    times: np.ndarray | None, inside: np.ndarray, marks: np.ndarray
+) -> tuple[np.ndarray, float | None]:
     """Return True for the steps of a trajectory across a gap, and the time of the other steps."""
     if times is None or not inside.any():
         return np.zeros_like(inside), None
@@ -316,6 +321,11 @@ def _gaps(times: np.ndarray | None, inside: np.ndarray) -> tuple[np.ndarray, flo
     dt = float(np.nanmedian(change[inside]))
     if not dt > 0:
         raise QPError.expected("time", f"steps of {dt:g}", "times that increase", "Sort the rows.")
+    for mark in np.unique(marks[inside]):
+        own = change[inside & (marks == mark)]
+        if len(own) >= FEWEST and abs(np.nanmedian(own) - dt) > ONE_DT * dt:
+            got = f"steps of {np.nanmedian(own):g} in one part, and of {dt:g} in the median"
+            raise QPError.expected("time", got, "one sampling time", "Resample the data.")
     return inside & ~(np.abs(change - dt) <= 0.5 * dt), dt
 
 
