@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
-from torch_qpmpc.control import probe
+from torch_qpmpc.control import probe, review
 from torch_qpmpc.control.findings import Finding, Review
 from torch_qpmpc.control.loop import LinearLoop
 from torch_qpmpc.export.tables import make_tables
@@ -365,6 +365,14 @@ def test_the_margin_is_that_of_the_loop_s_gain():
 
     assert max(map(radius, np.linspace(1 / (1 + margin), 1 / (1 - margin), 50))) < 1
     assert radius(3.0) > 1
+
+
+def test_a_filter_that_never_settles_is_no_remedy(monkeypatch):
+    """Its margin is that of a loop that hardly reacts."""
+    design = {"model": INTEGRATOR, **fast(noise=1e-3, drift=1.0)}
+    assert made(**design)["margin"].remedy.startswith("Slow the filter down")
+    monkeypatch.setattr(review, "PATIENCE", 0)
+    assert made(**design)["margin"].remedy == "Raise dR tenfold."
 
 
 def test_shares_are_the_gradient_of_the_loop_s_cost():

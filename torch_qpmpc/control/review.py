@@ -40,8 +40,9 @@ OFFSET = 1e-6
 SETTLES, ROUNDED = 100, 6
 #: A response below this share of those soon after, with inputs of half their range, is noise.
 SHOWS = 0.03
-#: The most powers of ten that the filter's noise is raised by, for a margin.
-SLOWEST = 8
+#: The most powers of ten that the filter's noise is raised by, for a margin, and the most times
+#: that the loop may take as long to settle then as it does now, or as the horizon.
+SLOWEST, PATIENCE = 8, 10
 #: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
 LARGEST = 2.0
 
@@ -391,16 +392,24 @@ def _margin(loop: LinearLoop, controller: Controller, plan: Tables, target: Tabl
     if margin >= MARGIN:
         return Finding("margin", True, numbers)
     remedy = "Raise dR tenfold."
+    longest = PATIENCE * max(_settling(loop), controller.mpc.design.horizon)
     for power in range(1, SLOWEST + 1):
         noise, slower = controller._noise * 10**power, copy.copy(controller)
         slower.observer = kalman(controller.mpc.design, noise, controller._drift)
         loop = LinearLoop.of(slower, plan, target)
-        if loop.radius < 1 and loop.modulus_margin() >= MARGIN:
+        if not _settling(loop) <= longest:
+            break
+        if loop.modulus_margin() >= MARGIN:
             named = dict(zip(controller.mpc.design.plant.outputs, noise.tolist(), strict=True))
             pairs = ", ".join(f"{name!r}: {x:.3g}" for name, x in named.items())
             remedy = f"Slow the filter down, by qm.Controller(.., noise={{{pairs}}})."
             break
     return Finding("margin", False, numbers, remedy)
+
+
+def _settling(loop: LinearLoop) -> float:
+    """Return the steps in which the slowest mode falls by a factor e; inf if it is unstable."""
+    return -1 / np.log(max(loop.radius, 1e-9)) if loop.radius < 1 else np.inf
 
 
 def _offset(loop: LinearLoop, controller: Controller) -> Finding:
