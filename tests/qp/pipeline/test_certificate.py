@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -277,21 +277,29 @@ def test_a_violation_counts_by_the_step_that_ends_it():
     assert certificate.value_error > 1
 
 
-@pytest.mark.parametrize("noise", [0.0, 3e-14, -3e-14])
-def test_what_rounding_leaves_of_a_multiplier_holds_no_row(noise):
-    """Two rows of one action: of a bound that is far, and of a rate that holds it.
+def bounded_by_both(least: float, noise: float = 0.0) -> Certificate:
+    """Judge v = 2 of an input 52.5 + v in [least, 80] whose move v is at most 2."""
+    data: dict[str, Any] = {"H": torch.eye(2), "q": [0.0, -3.0], "c": 0.0}
+    data |= {"C": torch.zeros(0, 2), "b": []}
+    data |= {"G": [[1.0, 1.0], [0.0, 1.0]], "lb": [least, -2.0], "ub": [80.0, 2.0]}
+    data |= {"w": [torch.inf] * 2}
+    parts: Any = {name: torch.as_tensor(x, dtype=torch.float64) for name, x in data.items()}
+    z, lam = torch.tensor([[52.5, 2.0]]).double(), torch.tensor([[noise, 1.0]]).double()
+    p, _ = Programs.of(*QuadraticProgram(**parts).tensors(), z[:, :1])
+    return certify(p, z, lam, z[:, :0], -z[:, :1])
 
-    The first one counted as held by its multiplier and contradicted the second one, so that the
-    value of a controller's QP had no bound of its error by most of the solvers.
+
+@pytest.mark.parametrize("noise", [0.0, 3e-14, -3e-14])
+@pytest.mark.parametrize("least", [20.0, 54.5])
+def test_rows_that_agree_up_to_the_rounding_of_the_larger_bound_the_error(least, noise):
+    """The first row, of terms 25 times as large, counted as contradicting the second.
+
+    At 54.5, the two hold v between them; at 20, rounding alone gives the first a multiplier.
     """
-    rows = {"lb": [20.0, -2.0], "ub": [80.0, 2.0], "w": [torch.inf] * 2}
-    data = {"H": torch.eye(2), "q": [0.0, -3.0], "c": 0.0, "G": [[1.0, 1.0], [0.0, 1.0]], **rows}
-    empty = {"C": torch.zeros(0, 2).double(), "b": torch.zeros(0).double()}
-    parts = {name: torch.as_tensor(x, dtype=torch.float64) for name, x in data.items()}
-    fixed = torch.tensor([[52.5]], dtype=torch.float64)
-    p, _ = Programs.of(*QuadraticProgram(**parts, **empty).tensors(), fixed)
-    z = torch.tensor([[52.5, 2 - 2.5e-11]], dtype=torch.float64)
-    lam, xi = torch.tensor([[noise, 1.0]], dtype=torch.float64), -fixed
-    certificate = certify(p, z, lam, fixed[:, :0], xi)
+    certificate = bounded_by_both(least, noise)
     assert certificate.residual.item() < 1e-9
     assert certificate.value_error.item() < 1e-9
+
+
+def test_rows_that_disagree_leave_the_error_without_a_bound():
+    assert bounded_by_both(54.5 + 1e-11).value_error.item() == torch.inf

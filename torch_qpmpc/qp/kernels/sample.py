@@ -208,7 +208,7 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms):
     slopes = transposed_products(T, group, left, False)
     value, residual, error = np.empty(len(z)), np.empty(len(z)), np.empty(len(z))
     d = T.shape[2] - n_f
-    basis, ends = np.empty((d + 1, d)), np.empty(d + 1)
+    basis, ends, slacks = np.empty((d + 1, d)), np.empty(d + 1), np.empty(d + 1)
     inverse, shift, box, hard = sizes.inverse, sizes.shift, sizes.box, sizes.hard
     apart = sizes.apart
     for i in range(len(z)):
@@ -242,7 +242,7 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms):
         if apart:
             step = _repair_apart(rows, hard, z[i], G[m])
         else:
-            step = _repair(rows, hard, z[i], G[m], sizes.units[m], basis, ends)
+            step = _repair(rows, hard, z[i], G[m], sizes.units[m], basis, ends, slacks)
         off = gap + of_slope + ROUNDING * noise + (push + 0.5 * sizes.stiffness[m] * step) * step
         off += _kinks(y[i], lb_i, ub_i, w_i, steps, step)
         # Sums propagate a NaN in any entry; maxima ignore it.
@@ -341,12 +341,13 @@ def _repair_apart(rows, hard, z, G):
 
 
 @compiled
-def _repair(rows, hard, z, G, units, basis, ends):
+def _repair(rows, hard, z, G, units, basis, ends, slacks):
     """Return the length of a step in v that ends all violations of hard rows, with rounding.
 
     The step holds all nearly active rows. By Gram and Schmidt, they become an orthonormal ``basis``
-    along which it goes to ``ends``; the two are scratch. It is infinite if rows that are dependent
-    up to rounding disagree by more.
+    along which it goes to ``ends``, each up to the rounding ``slacks`` of its row; the three are
+    scratch. It is infinite if rows that are dependent up to rounding disagree by more than that of
+    all of them.
     """
     y, _, lb, ub, w, steps = rows
     total, k = 0.0, 0
@@ -367,13 +368,14 @@ def _repair(rows, hard, z, G, units, basis, ends):
                 along = dot(basis[e], basis[k])
                 add(basis[k], -along, basis[e])
                 part -= along * ends[e]
+                slack += abs(along) * slacks[e]
             norm = math.sqrt(dot(basis[k], basis[k]))
             if norm > 0.5:  # else again, for the rounding errors of the first time
                 break
         if norm > DEPENDENT:
             for e in range(len(basis[k])):
                 basis[k, e] /= norm
-            ends[k] = part / norm
+            ends[k], slacks[k] = part / norm, slack
             total += ends[k] ** 2
             k += 1
         elif abs(part) > slack + DEPENDENT * math.sqrt(total):

@@ -149,19 +149,20 @@ def _repair(y, lam, theta, size, sizes, group) -> Tensor:
     near = present & (over > -NEARLY_ACTIVE * size)
     part = torch.where(y - ub > lb - y, part, -part)
     slack, units = DEPENDENT * size / norm, sizes.units[group]
-    basis, ends = torch.zeros_like(units), torch.zeros_like(part)
+    basis, ends, slacks = torch.zeros_like(units), torch.zeros_like(part), slack.clone()
     total, failed = torch.zeros_like(part[:, 0]), torch.zeros_like(near[:, 0])
     for a in range(near.shape[1]):
-        row, end = units[:, a], part[:, a]
+        row, end, own = units[:, a], part[:, a], slack[:, a]
         for _ in range(2):
             for e in range(a):
                 along = torch.linalg.vecdot(basis[:, e], row)
                 row, end = row - along.unsqueeze(-1) * basis[:, e], end - along * ends[:, e]
+                own = own + along.abs() * slacks[:, e]
         length = torch.linalg.vector_norm(row, dim=-1)
         new = near[:, a] & (length > DEPENDENT)
         basis[:, a] = torch.where(new.unsqueeze(-1), row / length.unsqueeze(-1), 0)
-        ends[:, a] = torch.where(new, end / length, 0)
-        apart = end.abs() > slack[:, a] + DEPENDENT * total.sqrt()
+        ends[:, a], slacks[:, a] = torch.where(new, end / length, 0), own
+        apart = end.abs() > own + DEPENDENT * total.sqrt()
         failed |= near[:, a] & ~new & apart
         total = total + ends[:, a].square()
     return torch.where(failed, torch.inf, total.sqrt())
