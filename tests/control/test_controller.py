@@ -158,6 +158,15 @@ def test_the_filter_is_stable_and_faster_with_more_drift():
         (lambda c: c.step([0.0, 1.0], [0.0]), r"y: got shape \(1, 2\), expected 1 numbers \(y1\)"),
         (lambda c: c.step([np.nan], [0.0]), "y: got NaN or inf, expected finite numbers"),
         (
+            lambda c: c.step([3.4e38], [0.0]),
+            r"y: got 3\.4e\+38 of y1, expected at most 1e\+08 in size\. If it is no error, measure",
+        ),
+        (
+            lambda c: c.step([0.0], [-1e12]),
+            r"r: got -1e\+12 of y1, expected at most 1e\+08 in size",
+        ),
+        (lambda c: c.reset(y=[1e12]), r"y: got 1e\+12 of y1, expected at most 1e\+08 in size"),
+        (
             lambda c: c.step({"T": 0.0}, [0.0]),
             r"y: got signals \['T'\], expected those of \['y1'\]",
         ),
@@ -189,6 +198,26 @@ def test_other_modules_and_forecasts_that_are_missing_are_named():
         qm.Controller(mpc).step([0.0], [0.0])
     with pytest.raises(QPError, match=r"^known: got lengths \[2, 3\], expected columns of one le"):
         qm.Controller(mpc).step([0.0], [0.0], known={"d": [1.0, 2.0], "e": [1.0] * 3})
+
+
+def test_signals_may_be_as_large_as_bounds_noise_and_effects_make_usual():
+    model = ([[0.9]], [[0.5]])
+
+    def largest(noise=None, **options):
+        mpc = qm.LinearMPC(model, 3, Q=1.0, **options)
+        return [*np.concatenate(qm.Controller(mpc, noise=noise).most)]
+
+    assert largest() == [1e8]
+    assert largest(u_bounds=(0.0, 1e6)) == [0.5e14]
+    assert largest(y_bounds=(-300.0, np.inf)) == [3e10]
+    assert largest(noise=1e3) == [1e12]
+    disturbed = {"E": [[5e-4, 50.0, 0.0]], "known": ["d", "e", "f"]}
+    assert np.allclose(largest(**disturbed), [1e8, 1e11, 1e8, np.inf])
+    controller = qm.Controller(qm.LinearMPC(model, 3, Q=1.0, **disturbed))
+    with pytest.raises(QPError, match=r"^known: got 2e\+11 of d, expected at most 1e\+11 in size"):
+        controller.step([0.0], [0.0], known=[2e11, 0.0, 0.0])
+    assert controller.known is None
+    assert np.isfinite(controller.step([1e8], [1e8], known=[1e11, 1e8, 1e30])).all()
 
 
 def test_a_mode_that_no_input_moves_has_no_filter():

@@ -18,7 +18,7 @@ import pytest
 import torch_qpmpc as qm
 from tests.control.controllers import designed, drawn, learned, load
 from torch_qpmpc import QPError, SolverError
-from torch_qpmpc.control import exporting
+from torch_qpmpc.control import exporting, observer
 from torch_qpmpc.export import export
 
 STEPS = int(os.environ.get("STEPS", "25"))
@@ -128,6 +128,84 @@ def test_signals_that_are_not_finite_hold_the_last_input_and_the_loop_goes_on(ex
     assert twin.step([np.inf]) == (first, 3)
     assert twin.step([0.0], [np.nan]) == (first, 3)
     assert twin.step([0.0])[1] == 0
+
+
+def test_a_signal_that_is_absurd_is_as_one_that_is_not_finite(exported):
+    controller, _, twin = exported
+    inputs = []
+    for bad in (np.nan, 1e12, 3.4e38, -1e300):
+        twin.reset([0.0], [0.0])
+        twin.step([0.1], [1.0])
+        held = twin.step([0.1])[0]
+        assert twin.step([bad]) == (held, 3)
+        assert twin.step([0.1], [bad]) == (held, 3)
+        inputs.append([twin.step([0.1])[0].item() for _ in range(3)])
+        twin.reset([bad], [bad])
+        assert twin.step([0.1], [1.0])[1] == 0
+    assert np.ptp(inputs, axis=0).max() == 0
+    assert twin.step(controller.most[0])[1] != 3
+    assert twin.step(controller.most[0] * 1.001)[1] == 3
+
+
+def test_an_absurd_known_signal_leaves_the_estimates_alone(tmp_path):
+    controller = qm.Controller(learned())
+    twin = load(controller.export_c(tmp_path).files, controller)
+    rain, price = np.zeros((2, 5, 2))
+    rain[4, 0], price[4, 1] = 1e36, 1e36
+    assert twin.step([0.0], [1.0], rain)[1] == 3
+    assert twin.step([0.0], [1.0], price)[1] != 3  # it moves no state
+    assert twin.step([0.0], [1.0], 0 * rain)[1] == 0
+
+
+@pytest.mark.parametrize("y", [1e12, 1e16, 1e20])
+def test_a_certified_input_keeps_the_bounds_of_moves_where_rounding_is_large(absurd, y):
+    twin = absurd
+    twin.reset([0.0], [0.0])
+    last, codes = np.zeros(1), []
+    for k in range(60):
+        u, code = twin.step([y if k == 5 else 0.0], [1.0])
+        codes.append(code)
+        assert np.abs(u - last).max() < 0.3 * (1 + 2e-6)
+        assert np.abs(u).max() <= 1.0
+        if code:
+            assert (u == last).all()
+        last = u
+    assert 1 in codes
+
+
+@pytest.fixture(scope="module")
+def absurd(tmp_path_factory):
+    """Return the integrator's controller in C with estimates that any y may move."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(observer, "ABSURD", 1e290)
+        controller = qm.Controller(integrator())
+    return load(controller.export_c(tmp_path_factory.mktemp("c")).files, controller)
+
+
+def test_a_reset_takes_the_input_nearest_to_zero_for_one_that_is_not_finite(exported):
+    controller, _, twin = exported
+    for u in (np.nan, np.inf):
+        controller.reset(y=[1.5])
+        twin.reset([1.5], [u])
+        got, code = twin.step([1.5], [1.0])
+        assert code == 0
+        assert np.allclose(got, controller.step([1.5], [1.0]), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["math", "int", "2nd"])
+def test_a_name_is_refused_as_that_of_a_policy(tmp_path, name, exported):
+    with pytest.raises(QPError, match=f"name: got '{name}'.*It begins the names of functions"):
+        exported[0].export_c(tmp_path, name=name)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_an_unstable_loop_is_compared_until_its_outputs_are_absurd(tmp_path, monkeypatch):
+    monkeypatch.setattr(observer, "ABSURD", 1e3)
+    mpc = qm.LinearMPC(([[2.0]], [[0.05]]), 5, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))
+    controller = qm.Controller(mpc)
+    report = controller.export_c(tmp_path)
+    assert 5 < report.steps < exporting.COMPARED
+    assert len(controller.review().findings) > 10
 
 
 def test_an_infeasible_step_holds_the_last_input(tmp_path):

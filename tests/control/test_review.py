@@ -408,3 +408,22 @@ def test_tight_bounds_take_more_iterations(monkeypatch):
     assert 1 < numbers["least iterations of a step in the loop, on average"] < numbers[worst] <= 21
     free = qm.Controller(qm.LinearMPC(INTEGRATOR, 10, Q=1.0, dR=0.1)).review()["C code"].numbers
     assert free[worst] == 1
+
+
+def test_the_c_code_is_as_large_as_its_export_and_refused_as_by_it(tmp_path):
+    mpc = qm.LinearMPC(TWO_OUTPUTS, 5, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0), references="preview")
+    controller = qm.Controller(mpc)
+    numbers, export = controller.review()["C code"].numbers, controller.export_c(tmp_path)
+    sizes = (numbers["bytes of tables"], numbers["bytes of the state"])
+    assert sizes == (export.table_bytes, export.state_bytes)
+    model = (np.diag([0.9, 0.5]), np.eye(2), np.array([[1.0, 1.0], [0.0, 1.0]]))
+    design = {"R": 0.1, "u_bounds": (-1.0, 1.0), "y_bounds": {"y2": (-1.0, 1.0)}}
+    refused = qm.Controller(qm.LinearMPC(model, 5, Q=[1.0, 0.0], **design))
+    found = refused.review()["C code"]
+    assert not found.ok
+    assert found.numbers["outputs whose bounds export_c refuses"] == "y2"
+    assert found.remedy == "Give y2 a small weight, or no bounds."
+    with pytest.raises(QPError, match=r"^controller: got bounds of y2, .* Give y2 a small"):
+        refused.export_c(tmp_path)
+    mended = qm.Controller(qm.LinearMPC(model, 5, Q=[1.0, 1e-3], **design))
+    assert mended.review()["C code"].ok

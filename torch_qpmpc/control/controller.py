@@ -12,7 +12,7 @@ import torch
 from torch_qpmpc.checks import check_flag, check_kind
 from torch_qpmpc.control.design import half_range, read_vector
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
-from torch_qpmpc.control.observer import SMALL, kalman, windowed
+from torch_qpmpc.control.observer import SMALL, kalman, most, windowed
 from torch_qpmpc.control.signals import read_row, read_table
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.control.stored import packed, unpacked
@@ -52,6 +52,8 @@ class Controller:
     Attributes:
         mpc: the MPC.
         observer: the `Observer`.
+        most: the largest sizes of outputs and set-points, ``(n_y,)``, and of known signals,
+            ``(n_d,)``: larger ones are errors, see `torch_qpmpc.control.observer.most`.
         x, w, u: the estimates of x and w, and the last input.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
         rest: the outputs y, and the input u, that the last reset said the plant rests with, or None
@@ -87,6 +89,7 @@ class Controller:
         self._noise = _deviations("noise", noise, SMALL * y, plant.outputs)
         self._drift = _deviations("drift", drift, SMALL * ranges, w.names)
         self.observer, self._window = kalman(design, self._noise, self._drift), window
+        self.most = most(design, self._noise)
         if window:
             self.observer = windowed(self.observer)
         self.r = np.zeros(0)
@@ -111,7 +114,7 @@ class Controller:
         self._qp = self.mpc.quadratic_program()
         last = np.zeros(len(plant.inputs)) if u is None else read_row("u", u, plant.inputs)
         self.u = np.clip(last, *self._design.u_bounds)
-        y = None if y is None else read_row("y", y, plant.outputs)
+        y = None if y is None else self._read("y", y, 1)[0]
         self.rest: tuple[Array | None, Array | None] = (y, None if u is None else self.u)
         self.known: Array | None = None
         self.target: Target | None = None
@@ -150,12 +153,13 @@ class Controller:
                 with at least N + 1 rows; or one row, which is held.
 
         Raises:
-            QPError: an argument is invalid, or missing.
+            QPError: an argument is invalid or missing, or a signal is above `most`.
             SolverError: no input satisfies the hard bounds.
         """
         plant, observer = self._design.plant, self.observer
         rows = self._design.horizon + 1
-        d, y_k = self.read_known(known, rows), read_row("y", y, plant.outputs)
+        d = self.read_known(known, rows)
+        y_k: Array = self._read("y", y, 1)[0]
         self.r, self.known = self.read_set_points(r, rows), d[0]
         if self._e is None:
             self._rest(y_k, d[0])
@@ -394,7 +398,7 @@ class Controller:
             remedy = "Pass a forecast of N + 1 rows, or one row that is held; an environment has "
             remedy += "it in info['known']."
             raise QPError.expected("known", "None", f"the signals {', '.join(names)}", remedy)
-        return read_table("known", known, names, rows, rows if least is None else least)
+        return self._read("known", known, rows, rows if least is None else least)
 
     def read_set_points(self, r: Any, rows: int) -> Array:
         """Return set-points ``r``, in the forms of `step`, as ``(rows, n_y)``.
@@ -408,7 +412,20 @@ class Controller:
             raise QPError.expected("r", "None in the first step", want)
         if r is None:
             r = self.r if len(self.r) else np.zeros(len(outputs))
-        return read_table("r", r, outputs, rows)
+        return self._read("r", r, rows)
+
+    def _read(self, name: str, value: Any, rows: int, least: int = 1) -> Array:
+        """Return rows of y, r or known signals, none of them above `most`."""
+        plant, known = self._design.plant, name == "known"
+        names = plant.known if known else plant.outputs
+        table = read_table(name, value, names, rows, least)
+        if (above := np.abs(table) > self.most[known]).any():
+            k, i = np.argwhere(above)[0]
+            got = f"{table[k, i]:g} of {names[i]}"
+            want = f"at most {self.most[known][i]:.3g} in size"
+            remedy = f"If it is no error, measure {names[i]} in a larger unit."
+            raise QPError.expected(name, got, want, remedy)
+        return table
 
 
 def _deviations(name: str, value: Any, default: Array, names: tuple[str, ...]) -> Array:

@@ -19,7 +19,7 @@ from torch_qpmpc.control.disturbance import RANK
 from torch_qpmpc.control.probe import at_rest, centre
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError, SolverError
-from torch_qpmpc.export.export import Export, export_c
+from torch_qpmpc.export.export import Export, check_name, export_c
 from torch_qpmpc.export.library import FLAGS, compiled, compiler
 from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled
 
@@ -27,6 +27,8 @@ from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled
 COMPARED, REPLAYED = 200, 10
 #: Largest difference of an input in the comparison, relative to half the distance of its bounds.
 NEAR = {"float64": 1e-6, "float32": 1e-2}
+#: The remedy for outputs that are `undetermined`.
+WEIGHT = "Give {} a small weight, or no bounds."
 SIZE = """#include "policy.h"
 unsigned long policy_state_size(void) { return sizeof(policy_state); }
 """
@@ -140,15 +142,13 @@ def export_controller(
     storage: str,
 ) -> ControllerExport:
     """Write a controller as C; see `Controller.export_c`."""
+    check_name(name)
     options = {"dtype": dtype, "max_iterations": max_iterations, "storage": storage}
     mpc, plant = controller.mpc, controller.mpc.design.plant
-    steady = mpc.design.steady
-    if len(steady.W) and steady.n_a and mpc.free is None:  # 1 / PREFERENCE is the QP's condition
-        moved = np.abs(steady.Y[:, steady.n_a :]).max(-1) > RANK
-        names = ", ".join(np.array(plant.outputs)[moved & mpc.design.bounded[0]])
+    if names := undetermined(controller):
         got = f"bounds of {names}, which inputs move that no output with a weight tells apart"
-        remedy = f"Give {names} a small weight, or no bounds."
-        raise QPError.expected("controller", got, "bounds that the set-point determines", remedy)
+        want = "bounds that the set-point determines"
+        raise QPError.expected("controller", got, want, WEIGHT.format(names))
     with tempfile.TemporaryDirectory() as temporary:
         plan = export_c(mpc, temporary, name=f"{name}_plan", **options)
         target = export_c(mpc.targets, temporary, name=f"{name}_target", **options)
@@ -180,26 +180,46 @@ def export_controller(
             path.write_text(text, encoding="utf-8")
         elif path.read_bytes() != text.encode():
             kept.append(path)
-    own = sum(x.size for x in _tables(controller).values()) * np.dtype(dtype).itemsize
     return ControllerExport(
         tuple(folder / file for file in (*texts, *example)),
         tuple(kept),
         plan,
         target,
         free,
-        sum(part.table_bytes for part in reports) + own,
+        sum(part.table_bytes for part in reports) + own_bytes(controller, dtype)[0],
         state_bytes,
         len(loop.u),
         None if difference is None else float(difference.max()),
     )
 
 
+def undetermined(controller: Controller) -> str:
+    """Return the names of the outputs with bounds that are not exact in C.
+
+    Inputs that the set-points leave free move them.
+    """
+    mpc, steady = controller.mpc, controller.mpc.design.steady
+    if not (len(steady.W) and steady.n_a and mpc.free is None):
+        return ""  # else 1 / PREFERENCE is the QP's condition
+    moved = np.abs(steady.Y[:, steady.n_a :]).max(-1) > RANK
+    return ", ".join(np.array(mpc.design.plant.outputs)[moved & mpc.design.bounded[0]])
+
+
+def own_bytes(controller: Controller, dtype: str) -> tuple[int, int]:
+    """Return the sizes of a controller's tables and state in C without those of its QPs."""
+    real, size = np.dtype(dtype).itemsize, _sizes(controller)
+    reals = size["N_E"] + size["N_X"] + 2 * size["N_U"] + (size["SET_POINTS"] + 2) * size["N_Y"]
+    reals += size["N_D_"] + controller.mpc.n_p
+    tables = sum(x.size for x in _tables(controller, dtype).values())
+    return tables * real, (reals + 1) * real  # the state ends with an int
+
+
 def _run(controller: Controller, twin: Controller | CompiledController, steps: int) -> Loop:
     """Return signals of a closed loop of ``twin``, with noise, a load and moving set-points.
 
-    It starts at rest near `centre`, and ends early where no input satisfies the hard bounds. Each
-    controller closes a loop of its own: replaying outputs through an unstable controller would
-    measure rounding alone.
+    It starts at rest near `centre`, and ends early where no input satisfies the hard bounds or y is
+    above `Controller.most`. Each controller closes a loop of its own: replaying outputs through an
+    unstable controller would measure rounding alone.
     """
     rng, design = np.random.default_rng(0), controller.mpc.design
     plant, rows = design.plant, COMPARED + design.horizon + 1
@@ -217,7 +237,7 @@ def _run(controller: Controller, twin: Controller | CompiledController, steps: i
         r = r if design.references == "preview" else r[:1]
         try:
             u = step(y, r, known)
-        except SolverError:
+        except (QPError, SolverError):  # an unstable loop's y is above controller.most
             if loop:
                 break
             raise
@@ -253,7 +273,7 @@ def _sources(controller: Controller, name: str, dtype: str, loop: Loop) -> dict[
     design = controller.mpc.design
     sizes = {f"{name.upper()}_{key}": size for key, size in _sizes(controller).items()}
     defined = "\n".join(f"#define {key} {size}" for key, size in sizes.items())
-    tables = [array(key, x, dtype) for key, x in _tables(controller).items()]
+    tables = [array(key, x, dtype) for key, x in _tables(controller, dtype).items()]
     indices = {
         f"OF_{key}": np.flatnonzero(mask) for key, mask in zip("YU", design.bounded, strict=True)
     }
@@ -316,7 +336,7 @@ def _sizes(controller: Controller) -> dict[str, int]:
     }
 
 
-def _tables(controller: Controller) -> dict[str, Array]:
+def _tables(controller: Controller, dtype: str) -> dict[str, Array]:
     """Return the constant arrays by their names in C."""
     design, observer = controller.mpc.design, controller.observer
     steady = design.steady
@@ -327,7 +347,31 @@ def _tables(controller: Controller) -> dict[str, Array]:
         "ACTS": design.plant.E.any(0).astype(float),
         "U_LOWER": design.u_bounds[0],
         "U_UPPER": design.u_bounds[1],
+        **dict(zip(("MOVE_LOWER", "MOVE_UPPER"), _moves(controller, dtype), strict=True)),
+        **dict(zip(("MOST_Y", "MOST_KNOWN"), controller.most, strict=True)),
     }
+
+
+def _moves(controller: Controller, dtype: str) -> Array:
+    """Return the plan's bounds of the first move, ``(2, m)``, with room for rounding."""
+    mpc, design = controller.mpc, controller.mpc.design
+    m, last = design.plant.sizes[1], design.places["u_last"].start - design.places["known"].stop
+    bounds = np.outer([-np.inf, np.inf], np.ones(m))
+    qp = mpc.quadratic_program()
+    G, *sides = (x.detach().double().cpu().numpy() for x in (qp.G, qp.lb, qp.ub))
+    for i in range(m if design.moves else 0):
+        row = np.zeros(G.shape[1])
+        row[[mpc.n_p - mpc.n_x + last + i, mpc.n_p + i]] = -1, 1
+        for k in np.flatnonzero((row == G).all(1)):
+            bounds[:, i] = [side[k] for side in sides]
+
+    def largest(pair: Array) -> Array:
+        return np.where(np.isfinite(pair), np.abs(pair), 0.0).max(0)
+
+    size = largest(bounds)
+    size = np.where(size > 0, size, half_range(design.u_bounds))
+    room = NEAR[dtype] * size + 4 * np.finfo(dtype).eps * largest(np.array(design.u_bounds))
+    return bounds + np.array([[-1], [1]]) * room
 
 
 def _main(controller: Controller, name: str, dtype: str) -> str:

@@ -17,6 +17,8 @@ from torch_qpmpc.errors import QPError
 SMALL = 0.1
 #: A filter's mode this near to the unit circle is on it but for rounding.
 ON_CIRCLE = 1e-9
+#: Signals above so many times a usual size are no measurements: estimates would lose their digits.
+ABSURD = 1e8
 
 
 class Observer(NamedTuple):
@@ -80,6 +82,31 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
         L,
         np.linalg.pinv(np.vstack((F - np.eye(n + n_w), H)), rcond=1e-12),
     )
+
+
+def most(design: Design, noise: Array) -> tuple[Array, Array]:
+    """Return the largest sizes of outputs and of known signals that are believed.
+
+    They are `ABSURD` times a usual size. That of an output is the largest of its bounds, of half
+    their distance or one, of ``noise`` over `SMALL`, and of what the inputs of a step move it by
+    within the horizon; that of a known signal is one, or what moves the state as much as the inputs
+    do if that is more. Known signals that move no state are not limited.
+    """
+    plant, x = design.plant, design.plant.B * _largest(design.u_bounds)
+    usual, moved = np.maximum(_largest(design.y_bounds), noise / SMALL), np.linalg.norm(x)
+    for _ in range(design.horizon):
+        usual = np.maximum(usual, np.abs(plant.C @ x).max(1))
+        x = plant.A @ x
+    effects = np.linalg.norm(plant.E, axis=0)
+    with np.errstate(divide="ignore"):
+        known = np.where(effects > 0, np.maximum(1.0, moved / effects), np.inf)
+    return ABSURD * usual, ABSURD * known
+
+
+def _largest(bounds: tuple[Array, Array]) -> Array:
+    """Return the largest size of finite bounds, and their half range if that is more."""
+    sizes = np.where(np.isfinite(bounds), np.abs(bounds), 0.0).max(0)
+    return np.maximum(sizes, half_range(bounds))
 
 
 def windowed(observer: Observer) -> Observer:

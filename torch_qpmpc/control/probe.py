@@ -11,7 +11,7 @@ import torch
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import half_range, middle
 from torch_qpmpc.control.state_space import FAINT, Array
-from torch_qpmpc.errors import SolverError
+from torch_qpmpc.errors import QPError, SolverError
 
 #: Steps of the loop, and of a set-point. Set-points and loads are these shares of half the bounds.
 STEPS, HELD = 100, 25
@@ -76,7 +76,7 @@ def probe(controller: Controller) -> Probe:
         y = plant.C @ x
         try:
             u = twin.step(y, r, known)
-        except SolverError:
+        except (QPError, SolverError):  # an unstable loop's y is above controller.most
             break
         assert twin.target is not None
         u_s = twin.target.u.numpy().reshape(-1, len(u))[0]

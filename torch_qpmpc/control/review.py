@@ -14,6 +14,7 @@ import torch
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import half_range, middle
+from torch_qpmpc.control.exporting import WEIGHT, own_bytes, undetermined
 from torch_qpmpc.control.findings import Finding, Review
 from torch_qpmpc.control.linear_mpc import Target
 from torch_qpmpc.control.loop import LinearLoop
@@ -82,9 +83,10 @@ def review(
     if loop.radius < 1:
         findings += [_margin(loop, controller, plan, target), _offset(loop, controller)]
     settings = Settings("policy", "float64", "fast", 1)
-    sizes = {
-        "bytes of tables": sum(table_bytes(x, settings) for x in qps),
-        "bytes of the state": sum(state_bytes(x, settings) for x in qps),
+    tables, state = own_bytes(controller, settings.dtype)
+    sizes: dict[str, Any] = {
+        "bytes of tables": tables + sum(table_bytes(x, settings) for x in qps),
+        "bytes of the state": state + sum(state_bytes(x, settings) for x in qps),
         "rows": sum(len(x.rows) for x in qps),
     }
     seen = probe(controller)
@@ -92,7 +94,9 @@ def review(
     if len(seen.iterations):
         sizes |= {"least iterations of a step in the loop, on average": seen.iterations.mean()}
         sizes |= {"and in its worst step": seen.iterations.max()}
-    findings.append(Finding("C code", True, sizes))
+    if names := undetermined(controller):
+        sizes["outputs whose bounds export_c refuses"] = names
+    findings.append(Finding("C code", not names, sizes, WEIGHT.format(names) * bool(names)))
     return Review([*findings, *claims])
 
 

@@ -30,11 +30,12 @@ static void copy(real *to, const real *from, int n)
     for (i = 0; i < n; i++) to[i] = from[i];
 }
 
-static int are_finite(const real *x, int n)
+/* Return 1 if no entry of rows of x is above `most` in size; a NaN is. */
+static int are_sane(const real *x, const real most[], int rows, int columns)
 {
     int i;
-    for (i = 0; i < n; i++)
-        if (x[i] - x[i] != 0) return 0;
+    for (i = 0; i < rows * columns; i++)
+        if (!(x[i] <= most[i % columns] && -x[i] <= most[i % columns])) return 0;
     return 1;
 }
 
@@ -135,7 +136,11 @@ static int plan(policy_state *s, const real known[])
     for (i = 0; i < POLICY_BOUNDED_U; i++) *p++ = s->u_s[OF_U[i]];
     *p = 1;
     if ((code = policy_plan_step(&s->plan, s->p, move, 0)) != POLICY_SOLVED) return code;
-    for (i = 0; i < N_U; i++) s->u[i] = within(s->u_s[i] + move[i], i);
+    for (i = 0; i < N_U; i++) {
+        real by = (move[i] = within(s->u_s[i] + move[i], i)) - s->u[i];
+        if (!(by >= MOVE_LOWER[i] && by <= MOVE_UPPER[i])) return POLICY_LIMIT;
+    }
+    copy(s->u, move, N_U);
     return code;
 }
 
@@ -148,17 +153,17 @@ void policy_reset(policy_state *s, const real y[], const real u[])
     policy_free_reset(&s->free);
 #endif
     for (i = 0; i < N_E; i++) s->e[i] = 0;
-    for (i = 0; i < N_U; i++) s->u[i] = within(u ? u[i] : 0, i);
+    for (i = 0; i < N_U; i++) s->u[i] = within(u && u[i] - u[i] == 0 ? u[i] : 0, i);
     for (i = 0; i < SET_POINTS * N_Y; i++) s->r[i] = 0;
-    s->starts = y ? 2 : 1;
-    if (y) copy(s->y, y, N_Y);
+    s->starts = y && are_sane(y, MOST_Y, 1, N_Y) ? 2 : 1;
+    if (s->starts == 2) copy(s->y, y, N_Y);
 }
 
 int policy_step(policy_state *s, const real y[], const real r[], const real known[], real u[])
 {
     int code = POLICY_INVALID;
-    if (are_finite(y, N_Y) && (!r || are_finite(r, SET_POINTS * N_Y)) &&
-        are_finite(known, STAGES * N_D)) {
+    if (are_sane(y, MOST_Y, 1, N_Y) && (!r || are_sane(r, MOST_Y, SET_POINTS, N_Y)) &&
+        are_sane(known, MOST_KNOWN, STAGES, N_D)) {
         if (r) copy(s->r, r, SET_POINTS * N_Y);
         copy(s->known, known, N_D);
         if (s->starts) rest(s, s->starts == 2 ? s->y : y);

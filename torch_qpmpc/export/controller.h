@@ -18,9 +18,9 @@ typedef policy_plan_real policy_real;
 
 /* What policy_step returns. */
 #define POLICY_SOLVED 0     /* u is optimal, and certified to be */
-#define POLICY_LIMIT 1      /* not certified within the limit of iterations */
+#define POLICY_LIMIT 1      /* not certified within the limit of iterations, or to rounding */
 #define POLICY_INFEASIBLE 2 /* no plan or no steady state satisfies the hard bounds */
-#define POLICY_INVALID 3    /* y, r or known has a NaN or an infinity */
+#define POLICY_INVALID 3    /* y, r or known has a NaN, or a number too large to be one of them */
 
 /* The state of a controller: estimates, the last signals, and the active sets of all QPs. */
 typedef struct {
@@ -42,7 +42,8 @@ typedef struct {
 } policy_state;
 
 /* Forget the past: the plant rests with the outputs y, those of the first step if y is null, and
-   with the input u, the one nearest to zero within its bounds if u is null.
+   with the input u, the one nearest to zero within its bounds if u is null. A y with a NaN or
+   a number too large is as none, and so is an entry of u that is not finite.
 
    u is the last input, which moves are counted from: another than the plant's is a bump. */
 void policy_reset(policy_state *state, const policy_real y[], const policy_real u[]);
@@ -51,8 +52,9 @@ void policy_reset(policy_state *state, const policy_real y[], const policy_real 
 
    r has POLICY_SET_POINTS rows of POLICY_N_Y set-points, of which a null pointer repeats the last
    ones; they start as zero. known has POLICY_STAGES rows of POLICY_N_D known signals, of this and
-   later steps. With a code other than 0, u is the last input, which keeps all bounds of inputs; the
-   estimates go on. */
+   later steps. A signal above MOST_Y or MOST_KNOWN of policy.c, 1e8 times a usual size, is an error
+   as a NaN is. With the code 0, u keeps the bounds of inputs and of their moves to rounding; with
+   another it is the last input, which keeps them, too, and the estimates go on. */
 int policy_step(policy_state *state, const policy_real y[], const policy_real r[],
                 const policy_real known[], policy_real u[]);
 
