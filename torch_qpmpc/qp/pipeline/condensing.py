@@ -80,7 +80,7 @@ class Condensed:
     surely_convex: bool
 
     def restored(self, units: Units) -> Condensed:
-        """Return the matrices in the original numbers of QPs that one length per QP scaled."""
+        """Return the matrices before the QPs were scaled by ``units``, with one length for z."""
         cost, length, rows, equalities = (unit[:, :, None] for unit in units)
         of_H, of_G, of_C = cost / length**2, rows / length, equalities / length
         of_b = 1 / of_C.swapaxes(1, 2)
