@@ -78,7 +78,7 @@ def test_the_cost_of_most_steps_is_that_of_all_but_the_jumps(after):
     most = fit_most(data, LAYOUT, fitted)
     assert most is not None
     assert most.shifted is after
-    assert most.kept == pytest.approx(0.95, abs=0.01)
+    assert most.kept == 0.95  # rounding leaves out none of the others
     assert_close(most.best.W, W)
     assert not torch.allclose(fitted.best.W, W, atol=0.1)
     assert most.variables == f"{fitted.variables} in most steps"

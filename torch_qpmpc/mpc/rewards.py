@@ -11,7 +11,7 @@ from torch import Tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.stage_cost import StageCost, fit_stage_cost
+from torch_qpmpc.mpc.stage_cost import EXACT, StageCost, fit_stage_cost
 from torch_qpmpc.mpc.trajectories import NEXT, logs, valid_steps
 
 REMEDY = (
@@ -125,7 +125,9 @@ def fit_most(
     v, best = torch.cat((v, u), -1), fitted.best
     for _ in range(ROUNDS):
         error = (cost - best(v)).abs()
-        kept = error <= OUTSIDE * error.median()
+        # Without noise the median is rounding, which is relative to the terms of each step.
+        terms = StageCost(best.W.abs(), best.q.abs(), best.c.abs())(v.abs())
+        kept = error <= torch.maximum(OUTSIDE * error.median(), EXACT * terms)
         share = kept.double().mean().item()
         if share < MOST:
             return None
