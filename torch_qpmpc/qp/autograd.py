@@ -80,15 +80,15 @@ def solve_traced(*arguments: Any) -> Outputs:
         return (TracedForward if forward else Traced).apply(*arguments)
     if set(stack) <= {"Vmap"}:
         return solve_op(*arguments) if stack else Traced.apply(*arguments)
-    if stack != ("Grad",):
-        raise QPError.expected(
-            "torch.compile",
-            f"{' in '.join(reversed(stack))} inside a compiled function",
-            "vmap, or one grad, jacrev or vjp of a scalar",
-            "Exclude this function with torch.compiler.disable.",
-        )
-    # Without an operation on an argument of `grad`, Dynamo fails or takes its gradient to be zero.
-    return Traced.apply(*(x.view_as(x) if isinstance(x, Tensor) else x for x in arguments))
+    if stack == ("Grad",):
+        # Without an operation on an argument of `grad`, Dynamo fails or takes its gradient as zero.
+        return Traced.apply(*(x.view_as(x) if isinstance(x, Tensor) else x for x in arguments))
+    raise QPError.expected(
+        "torch.compile",
+        f"{' in '.join(reversed(stack))} inside a compiled function",
+        "vmap, or one grad, jacrev or vjp of a scalar",
+        "Exclude this function with torch.compiler.disable.",
+    )
 
 
 @solve_op.register_fake
