@@ -13,6 +13,7 @@ import torch
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
+from torch_qpmpc.control.lowering import riccati
 
 A = np.array([[0.9, 0.2, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
 B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.4]])
@@ -140,6 +141,18 @@ def test_without_a_riccati_solution_the_terminal_weight_is_the_stage_s():
     mpc = qm.LinearMPC(([[1.0, 0.1], [0.0, 0.9]], [[0.0], [1.0]]), 3, Q=[0.0, 1.0], R=1.0)
     assert torch.equal(mpc.H_f.detach()[:2, :2], torch.diag(torch.tensor([0.0, 2.0])).double())
     assert mpc.H_f.detach()[2:].abs().max() == 0
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_rounding_does_not_decide_on_a_riccati_solution_without_a_cost(unit):
+    """Two inputs hold one output, a double integrator has no weight of its position."""
+    basis = np.linalg.qr(np.random.default_rng(0).normal(size=(2, 2)))[0]
+    A = basis @ [[1.0, 1.0], [0.0, 1.0]] @ basis.T
+    B, C, q = basis @ [[0.5], [1.0]], unit * basis.T, unit**-2
+    for model, Q in ((([[0.9]], [[0.5, 0.4]], [[unit]]), q), ((A, B, C), [0.0, q])):
+        assert riccati(qm.LinearMPC(model, 3, Q=Q, dR=0.1).design) is None
+        assert riccati(qm.LinearMPC(model, 3, Q=Q, dR=0.1, gamma=0.9).design) is not None
+    assert riccati(qm.LinearMPC((A, B, C), 3, Q=[q, 0.0], dR=0.1).design) is not None
 
 
 def test_copies_keep_the_design():

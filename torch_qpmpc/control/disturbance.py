@@ -21,6 +21,8 @@ from torch_qpmpc.errors import QPError
 
 #: A singular value below this fraction of the largest is zero.
 RANK = 1e-9
+#: A length that is no divisor.
+TINY = 1e-300
 #: Modes this near to one integrate: an output disturbance is hard to tell from their drift.
 INTEGRATES = 1e-2
 OUTPUT = "output"
@@ -85,16 +87,36 @@ def _placed(plant: StateSpace, wanted: Mapping[str, str]) -> Disturbances:
 
 def check_observable(plant: StateSpace) -> None:
     """Raise `QPError` if a mode of the model that does not decay leaves no trace in the outputs."""
-    for eigenvalue in np.linalg.eigvals(plant.A):
+    for eigenvalue, mode in unseen_modes(plant.A, plant.C):
+        state = int(np.abs(mode).argmax())
+        remedy = "Measure a signal that shows it, or remove it from the model."
+        got = f"a mode at {_number(eigenvalue)}, mostly in state {state}, that no output shows"
+        raise QPError.expected("model", got, "a detectable model", remedy)
+
+
+def unseen_modes(A: Array, C: Array) -> list[tuple[complex, Array]]:
+    """Return eigenvalues of A that do not decay, with their modes, that y = C x does not show."""
+    modes = []
+    for eigenvalue in np.linalg.eigvals(A):
         if abs(eigenvalue) < 1 - 1e-9:
             continue
-        pencil = np.vstack((plant.A - eigenvalue * np.eye(len(plant.A)), plant.C))
-        _, sizes, V = np.linalg.svd(pencil)
-        if sizes[-1] <= RANK * sizes[0]:
-            state = int(np.abs(V[-1]).argmax())
-            remedy = "Measure a signal that shows it, or remove it from the model."
-            got = f"a mode at {_number(eigenvalue)}, mostly in state {state}, that no output shows"
-            raise QPError.expected("model", got, "a detectable model", remedy)
+        mode = null_direction(A - eigenvalue * np.eye(len(A)), C)
+        if mode is not None:
+            modes.append((complex(eigenvalue), mode))
+    return modes
+
+
+def null_direction(balance: Array, *shown: Array) -> Array | None:
+    """Return x with balance x = 0 and S x = 0 for each S of ``shown``, None if only zero has it.
+
+    The rows of each S, then all columns are scaled to length one: no unit decides the rank.
+    """
+    rows = [S / np.maximum(np.linalg.norm(S, axis=1, keepdims=True), TINY) for S in shown]
+    matrix = np.vstack((balance, *rows))
+    columns = np.maximum(np.linalg.norm(matrix, axis=0), TINY)
+    _, sizes, V = np.linalg.svd(matrix / columns)
+    full = len(sizes) == len(V) and sizes[-1] > RANK * sizes[0]
+    return None if full else V[-1].conj() / columns
 
 
 def _automatic(plant: StateSpace, tolerance: float) -> dict[str, str]:
@@ -124,11 +146,9 @@ def _independent(matrix: Array) -> list[int]:
 def _hidden(plant: StateSpace, placed: Disturbances) -> str | None:
     """Return the name of a disturbance that cannot be told from a mode at one, if there is one."""
     n = len(plant.A)
-    matrix = np.block([[plant.A - np.eye(n), placed.B], [plant.C, placed.C]])
-    _, sizes, V = np.linalg.svd(matrix)
-    if len(sizes) == matrix.shape[1] and sizes[-1] > RANK * sizes[0]:
-        return None
-    return placed.names[int(np.abs(V[-1, n:]).argmax())]
+    shown = np.hstack((plant.C, placed.C))
+    direction = null_direction(np.hstack((plant.A - np.eye(n), placed.B)), shown)
+    return None if direction is None else placed.names[int(np.abs(direction[n:]).argmax())]
 
 
 def _number(eigenvalue: complex) -> str:

@@ -10,6 +10,7 @@ from scipy.linalg import block_diag
 from torch import Tensor
 
 from torch_qpmpc.control.design import Design
+from torch_qpmpc.control.disturbance import null_direction, unseen_modes
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.bounds import Bounds
@@ -23,6 +24,8 @@ from torch_qpmpc.mpc.scheme import Scheme
 #: Near the target the values are constant, SCALE times those of a typical deviation in each stage:
 #: errors of a value are certified relative to it, and those of zero could not be.
 SCALE = 1e-2
+#: An eigenvalue this near to the unit circle is on it.
+ON_CIRCLE = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -89,6 +92,8 @@ def _cost(design: Design, layout: Layout) -> Cost:
 
 def riccati(design: Design) -> Array | None:
     """Return the cost to go of [x; u_last] about a steady state, None if it does not exist."""
+    if _costless(design):
+        return None
     plant, m = design.plant, design.plant.sizes[1]
     A, B = plant.A, plant.B
     Q, R = 2 * plant.C.T @ design.Q @ plant.C, 2 * (design.R + design.dR)
@@ -106,6 +111,22 @@ def riccati(design: Design) -> Array | None:
     eigenvalues = torch.linalg.eigvalsh(P)
     exists = radius < 1 - 1e-9 and eigenvalues[0] >= -1e-9 * eigenvalues[-1].abs()
     return P.numpy() if exists else None
+
+
+def _costless(design: Design) -> bool:
+    """Return True if a signal that neither grows nor decays has no cost.
+
+    Then rounding alone decides what a solver of the Riccati equation returns.
+    """
+    plant, root = design.plant, design.gamma**0.5
+    n, m = plant.B.shape
+    weighted = design.Q @ plant.C
+    modes = unseen_modes(root * plant.A, weighted)
+    if any(abs(eigenvalue) < 1 + ON_CIRCLE for eigenvalue, _ in modes):
+        return True
+    balance = np.hstack((plant.A - np.eye(n), plant.B))
+    shown = np.pad(weighted, ((0, 0), (0, m))), np.pad(design.R, ((0, 0), (n, 0)))
+    return design.gamma == 1 and null_direction(balance, *shown) is not None
 
 
 def _bounds(design: Design) -> Bounds:

@@ -14,6 +14,7 @@ import torch
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.control.controller import Controller
 from torch_qpmpc.control.design import half_range, middle
+from torch_qpmpc.control.disturbance import unseen_modes
 from torch_qpmpc.control.exporting import WEIGHT, own_bytes, undetermined
 from torch_qpmpc.control.findings import Finding, Review
 from torch_qpmpc.control.linear_mpc import Target
@@ -123,29 +124,19 @@ def _terminal(controller: Controller) -> Finding:
     """The terminal weight is the cost to go of the loop without bounds."""
     design = controller.mpc.design
     plant, exists = design.plant, riccati(design) is not None
-    unseen = _modes(plant.A, design.Q @ plant.C)
-    unmoved = _modes(plant.A.T, plant.B.T)
+    unseen = unseen_modes(plant.A, design.Q @ plant.C)
+    unmoved = unseen_modes(plant.A.T, plant.B.T)
     numbers: dict[str, Any] = {"Riccati solution": "exists" if exists else "none"}
     remedy = "Weight all inputs, by R or dR."
     if len(unseen):
-        numbers["mode without a weight"] = unseen[0]
+        numbers["mode without a weight"] = abs(unseen[0][0])
         remedy = "Weight an output that shows this mode, by Q."
     elif len(design.steady.W) and not design.R.any():
         remedy = "Weight all inputs by R: several of them hold the same outputs."
     elif len(unmoved):
-        numbers["mode that no input moves"] = unmoved[0]
+        numbers["mode that no input moves"] = abs(unmoved[0][0])
         remedy = "Remove the mode from the model, or pass it as a known signal."
     return Finding("terminal weight", exists, numbers, remedy * (not exists))
-
-
-def _modes(A: Array, C: Array) -> list[float]:
-    """Return the moduli of modes that do not decay and that C does not show."""
-    modes = []
-    for eigenvalue in np.linalg.eigvals(A):
-        sizes = np.linalg.svd(np.vstack((A - eigenvalue * np.eye(len(A)), C)))[1]
-        if abs(eigenvalue) > 1 - 1e-9 and sizes[-1] < 1e-9 * sizes[0]:
-            modes.append(float(abs(eigenvalue)))
-    return modes
 
 
 def _gains(controller: Controller) -> Finding:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from torch_qpmpc.control.disturbance import RANK, Disturbances
+from torch_qpmpc.control.disturbance import RANK, Disturbances, null_direction
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError
 
@@ -54,8 +54,7 @@ class Steady:
         """
         n, m, _, n_d = plant.sizes
         balance = np.hstack((plant.A - np.eye(n), plant.B))
-        sizes = np.linalg.svd(balance, compute_uv=False)
-        if sizes[-1] <= RANK * sizes[0]:
+        if null_direction(plant.A.T - np.eye(n), plant.B.T) is not None:
             remedy = "Pass a constant of the model as a known signal, by E."
             got = "a mode at 1 that no input moves"
             raise QPError.expected("model", got, "a model with a steady state", remedy)
