@@ -1,11 +1,8 @@
-"""The proof at a run's end, and its line in the report."""
+"""The proof at a run's end."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
@@ -15,17 +12,6 @@ from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.experiment.proving import check_provable, prove_run
 from torch_qpmpc.experiment.tasks import make_mpc
-from torch_qpmpc.study import report
-
-
-def test_the_report_has_a_line_for_each_proof():
-    run = SimpleNamespace(cfg=SimpleNamespace(prove=0.02))
-    rows = [(run, "free", 1, "at most 0.1"), (run, "free", 2, None)]
-    frame = pd.DataFrame(rows, columns=["run", "label", "seed", "proof"])
-    assert report.proofs(frame).splitlines()[2:] == ["- free, seed 1, |nu| <= 0.02: at most 0.1"]
-    assert report.proofs(frame.drop(columns="proof")) == ""
-    assert report.proofs(frame.assign(proof=None)) == ""
-    assert report.proofs(frame.assign(proof=np.nan)) == ""
 
 
 def test_no_sampled_start_exceeds_the_bound():

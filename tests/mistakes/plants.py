@@ -25,7 +25,6 @@ from torch_qpmpc.envs import (
 )
 from torch_qpmpc.envs.closed_loop import closed_gap, closed_loop, gymnasium_loop
 from torch_qpmpc.experiment.run_state import resumed
-from torch_qpmpc.study.statistics import bootstrap_interval, interquartile_mean
 
 MISTAKES: dict[str, list[Callable[[], Any]]] = {
     "s: got shape (32, 4), expected shape (*batch, 2).": [
@@ -44,7 +43,6 @@ MISTAKES: dict[str, list[Callable[[], Any]]] = {
     ],
     "seed: got -1, expected a whole number >= 0 and < 2^63.": [
         lambda: closed_loop(lambda s: s[:, :2], pm, seed=-1),
-        lambda: bootstrap_interval([np.ones(3)], seed=-1),
         lambda: PointMassEnv(2, seed=-1),
         lambda: pm.corrupted(-1),
     ],
@@ -61,33 +59,6 @@ MISTAKES: dict[str, list[Callable[[], Any]]] = {
         lambda: gymnasium_loop(lambda s: s[:, :1], "Pendulum-v1")
     ],
     "J_start: got '1', expected a number, or nan.": [lambda: closed_gap("1", 1, 1)],
-    "x: got no values, expected at least one along axis 0.": [
-        lambda: interquartile_mean(np.array([]))
-    ],
-    "x: got source: axis 2 is out of bounds for array of dimension 1, expected n": [
-        lambda: interquartile_mean(np.ones(3), axis=2)
-    ],
-    "x: got could not convert string to float: 'a', expected numbers along axis ": [
-        lambda: interquartile_mean(["a"])
-    ],
-    "strata: got float, expected a list of arrays. Pass [x] for a single stratum": [
-        lambda: bootstrap_interval(1.0)
-    ],
-    "level: got 95, expected a level in (0, 1). 95% is 0.95.": [
-        lambda: bootstrap_interval([np.ones(3)], level=95)
-    ],
-    "resamples: got 0, expected a whole number >= 1.": [
-        lambda: bootstrap_interval([np.ones(3)], resamples=0)
-    ],
-    "statistic: got 'median', expected a function, such as numpy.median.": [
-        lambda: bootstrap_interval([np.ones(3)], "median")
-    ],
-    "strata: got shapes [(3, 2), (3, 3)], expected (n_i, ...) with ... the same ": [
-        lambda: bootstrap_interval([np.ones((3, 2)), np.ones((3, 3))])
-    ],
-    "strata: got shapes [(), ()], expected (n_i, ...) with ... the same for all.": [
-        lambda: bootstrap_interval([1.0, 2.0])
-    ],
     "num_envs: got True, expected a whole number >= 1.": [lambda: PointMassEnv(True)],
     "max_steps: got 1.5, expected a whole number >= 1.": [lambda: PointMassEnv(2, max_steps=1.5)],
     "num_envs: got PointMass(A=tensor([[1.0000, 0.0000, 0.1000, 0.0000],": [

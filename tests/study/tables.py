@@ -12,9 +12,7 @@ def made_up(gaps: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
         for seed, gap in enumerate(values, 1):
             row = {"sweep": "a", "noise": noise, "constraint": case, "label": case, "seed": seed}
             row |= {"closed_gap": gap, "real": seed < len(values), "canonical_distance": 0.1 * seed}
-            row |= {"zeros_above": 1.0}
             row |= {"prediction_error": 0.02 * seed, "prediction_error_start": 0.05}
-            for name in ("J", "J_discounted"):
-                row |= {f"{name}_start": 285.04, f"{name}_best": 50.0, f"{name}_true_model": 46.97}
-            rows.append(row | {"unsolved": 0, "train_seconds": 3.21})
+            row |= {"J_start": 285.04, "J_best": 50.0, "J_true_model": 46.97, "zeros_above": 1.0}
+            rows.append(row)
     return pd.DataFrame(rows)

@@ -1,9 +1,5 @@
 from __future__ import annotations
 
-import math
-from pathlib import Path
-
-import numpy as np
 import pytest
 
 import train
@@ -11,7 +7,6 @@ from tests.experiment.conftest import store_task  # noqa: F401 - a fixture
 from tests.runs import SMALL, make_config
 from tests.study.tables import made_up
 from torch_qpmpc.study import report
-from torch_qpmpc.study.plots import GAP_LEFT
 from torch_qpmpc.study.runs import collect
 
 
@@ -30,19 +25,6 @@ def test_fewer_than_six_runs_have_a_range():
     assert report.overall(frame).endswith("noise 0.800 (range of 12: 0.700 to 0.900).")
 
 
-def test_every_run_is_in_the_long_table():
-    frame = made_up({("gaussian", "free"): [0.91, 0.92]})
-    assert report.runs_table(frame).splitlines()[-1] == (
-        "| a | gaussian | free | 2 | 285.0 | 50.00 | 46.97 | 0.920 | 0.200 | 0.0400 | 0.0500 | 0 "
-        "| 3.2 |"
-    )
-
-
-def test_a_run_without_a_gap_shows_the_change_of_J():
-    frame = made_up({("gaussian", "free"): [math.nan]}).assign(J_start=46.97, J_best=50.0)
-    assert "| 46.97 | 50.00 | 46.97 | no gap; J rose by 3.030 |" in report.runs_table(frame)
-
-
 def test_the_overall_gap_weighs_the_learned_cases_equally():
     gaps = {"free": 0.9, "deviation": 0.8, "si": 1.0, "combined": 0.9, "fixed": -3.0}
     frame = made_up({("gaussian", case): [gap] * 7 for case, gap in gaps.items()})
@@ -57,25 +39,18 @@ def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
     page.write_text(f"# A\n<!-- {study.name} -->\nold\n<!-- /{study.name} -->\nend\n")
     report.main([str(study), "--page", str(page)])
 
-    printed = capsys.readouterr().out
-    frame = collect(study)
+    printed, frame = capsys.readouterr().out, collect(study)  # the report's folder is not a run
+    whole = (study / "report" / "report.md").read_text()
     for name, sweep in frame.groupby("sweep"):
         table = report.cases_table(sweep)
-        for text in (printed, (study / "report" / "report.md").read_text(), page.read_text()):
-            assert table in text
-        kinds = ("learning", "constraints", "trajectories", "policies")
-        figures = {f"{kind}-{noise}.png" for kind in kinds for noise in {*sweep["noise"]}}
+        assert all(table in text for text in (printed, whole, page.read_text()))
+        figures = {f"{x}-{y}.png" for x in ("learning", "constraints") for y in {*sweep["noise"]}}
         figures |= {"meaning.png"}
-        drawn = {path.name for path in (study / "report" / str(name)).iterdir()}
-        assert drawn == figures
-        for figure in drawn:
-            assert f"]({name}/{figure})" in (study / "report" / "report.md").read_text()
-    assert len((study / "report" / "runs.md").read_text().splitlines()) == 2 + len(frame)
+        assert {path.name for path in (study / "report" / str(name)).iterdir()} == figures
+        assert all(f"]({name}/{figure})" in whole for figure in figures)
     assert "old" not in page.read_text()
     assert page.read_text().endswith(f"<!-- /{study.name} -->\nend\n")
-    assert 5_000 < (tmp_path / f"{study.name}.png").stat().st_size < 200_000
-    # The report's folder is not a run.
-    assert len(collect(study)) == len(frame)
+    assert (tmp_path / f"{study.name}.png").exists()
 
 
 @pytest.mark.usefixtures("store_task")
@@ -88,17 +63,12 @@ def test_a_report_of_runs_with_a_window_and_previews(tmp_path):
     assert frame["zeros_above"].item() < 1
     assert "nan to nan (0 of 1)" in report.write(frame, tmp_path / "report")
     drawn = {path.name for path in (tmp_path / "report" / tmp_path.name).iterdir()}
-    assert drawn == {"learning-none.png", "constraints-none.png", "trajectories-none.png"}
+    assert drawn == {"learning-none.png", "constraints-none.png"}
 
 
-def test_many_settings_are_a_frontier_and_ablations_have_their_figure():
-    gaps = {("gaussian", f"combined, c_2={i}"): [0.9, 0.8] for i in range(9)}
-    frame = made_up(gaps)
-    assert [name for name, _ in report.figures(frame)] == ["frontier"]
-    ablations = frame.assign(ablation=np.where(frame["label"] < "combined, c_2=4", "a", "b"))
-    assert [name for name, _ in report.figures(ablations)] == ["frontier", "ablation"]
-    labels = [report.headline(sweep).axes[0].get_xlabel() for sweep in (frame, ablations)]
-    assert labels == ["distance of the predictions to an MPC scheme's", GAP_LEFT]
+def test_many_settings_have_no_figure_side_by_side():
+    frame = made_up({("gaussian", f"combined, c_2={i}"): [0.9, 0.8] for i in range(9)})
+    assert not list(report.figures(frame))
 
 
 def test_errors_are_one_line(study, tmp_path):
@@ -106,4 +76,4 @@ def test_errors_are_one_line(study, tmp_path):
         report.main([str(tmp_path)])
     (tmp_path / "paper.md").touch()
     with pytest.raises(SystemExit, match="expected one line <!-- weights -->"):
-        report.main([str(study / "weights"), "--page", str(Path(tmp_path) / "paper.md")])
+        report.main([str(study / "weights"), "--page", str(tmp_path / "paper.md")])

@@ -15,11 +15,6 @@ from torch_qpmpc.analysis.report import canonical
 from torch_qpmpc.analysis.structure import NearestModel
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.config import load_config
-from torch_qpmpc.experiment.lock import LOCK
-from torch_qpmpc.experiment.sweeps import finished_run
-from torch_qpmpc.export.__main__ import main as export
-from torch_qpmpc.study.report import main as report
 from torch_qpmpc.study.runs import FinishedRun, collect, prediction_error
 
 
@@ -36,23 +31,8 @@ def test_every_run_is_a_row_in_the_papers_order(study):
         ("weights", "gaussian", "identified, c_2=0.5", 1),
     ]
     assert frame["real"].tolist() == [True, True, False, True, False, True, True]
-
-
-def test_a_sweep_is_named_by_its_folder(study):
     assert set(collect(study / "small")["sweep"]) == {"small"}
-
-
-def test_one_run_is_enough(study):
     assert len(collect(study / "small" / "gaussian-free-seed1")) == 1
-
-
-def test_a_lock_file_that_was_left_is_ignored(study):
-    folder = study / "small" / "gaussian-free-seed1"
-    (folder / LOCK).touch()
-    try:
-        assert len(collect(folder)) == 1
-    finally:
-        (folder / LOCK).unlink()
 
 
 def test_the_learned_qp_is_the_one_that_was_evaluated(study):
@@ -67,11 +47,12 @@ def test_where_C_is_fixed_its_model_is_the_corrupted_one(study):
     frame = collect(study / "small")
     fixed, free = (frame.query(f"constraint == {case!r}") for case in ("fixed", "free"))
     assert fixed["canonical_distance"].tolist() == pytest.approx([0, 0], abs=1e-9)
-    assert fixed["prediction_error"].tolist() == pytest.approx(
-        fixed["prediction_error_start"].tolist()
-    )
+    ends = (fixed[name].tolist() for name in ("prediction_error", "prediction_error_start"))
+    assert next(ends) == pytest.approx(next(ends))
     assert min(free["canonical_distance"]) > 1e-4
     assert all(free["prediction_error"] != free["prediction_error_start"])
+    assert set(fixed["zeros_above"]) == {1.0}
+    assert max(free["zeros_above"]) < 0.1
 
 
 def test_readings_do_not_depend_on_the_gauge(study):
@@ -82,14 +63,9 @@ def test_readings_do_not_depend_on_the_gauge(study):
         run.policy.C.copy_(T @ run.policy.C)
     assert run.readings() == pytest.approx(before, rel=1e-6)
     torch.testing.assert_close(canonical(run.policy), matrix, rtol=1e-6, atol=1e-8)
-
-
-def test_constraints_that_determine_no_states_have_no_readings(study):
-    run = FinishedRun(str(study / "small" / "gaussian-free-seed1"))
     with torch.no_grad():
         run.policy.C.zero_()
-    readings = run.readings()
-    assert math.isnan(readings["prediction_error"])
+    assert math.isnan(run.readings()["prediction_error"]), "it determines no states"
 
 
 def test_the_models_error_is_that_of_one_step(study):
@@ -105,12 +81,6 @@ def test_the_models_error_is_that_of_one_step(study):
     assert spread == pytest.approx(math.sqrt(2 * (1.5**2 + 0.5**2) / 3), rel=0.05)
 
 
-def test_exact_zeros_above_the_band_are_counted(study):
-    frame = collect(study / "small")
-    assert set(frame.query("constraint == 'fixed'")["zeros_above"]) == {1.0}
-    assert max(frame.query("constraint == 'free'")["zeros_above"]) < 0.1
-
-
 def test_an_ablation_is_labelled_by_its_name(study, tmp_path):
     for name in ("one", "two"):
         shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / name)
@@ -121,128 +91,56 @@ def test_an_ablation_is_labelled_by_its_name(study, tmp_path):
 
 @pytest.fixture(scope="module")
 def gated(tmp_path_factory):
-    """Train a run whose learned policy is in best.pt."""
+    """Train a run whose learned policy is in best.pt, and a scheme that is released."""
     folder = tmp_path_factory.mktemp("gated")
-    train.train(make_config(*SMALL, "gate=true", "logger=csv"), str(folder), quiet=True)
+    more = ("gate=true", "logger=csv", "constraint=mpc", "release=2")
+    train.train(make_config(*SMALL, *more), str(folder), quiet=True)
     return folder
-
-
-OURS = r"expected the configuration that a run wrote\. Restore the file, or "
-CONFIGS = {
-    "a list": (b"[]\n", "it is a list"),
-    "empty": (b"", "it has no seed"),
-    "a number": (b"5\n", "Invalid loaded object type: int"),
-    "cut": (b"seed: 1\nsolver: daqp\n", "it has no eval_seed"),
-    "bad YAML": (b"a: [1\nb: }", "while parsing a flow sequence"),
-    "bad UTF-8": (b"seed: \xff\n", "'utf-8' codec can't decode byte 0xff"),
-    "missing": (None, "No such file or directory"),
-}
-
-
-@pytest.mark.parametrize(("content", "wrong"), CONFIGS.values(), ids=CONFIGS)
-def test_a_damaged_configuration_is_named_by_the_report(gated, tmp_path, content, wrong):
-    folder = shutil.copytree(gated, tmp_path / "run")
-    (folder / "config.yaml").unlink()
-    if content is not None:
-        (folder / "config.yaml").write_bytes(content)
-    with pytest.raises(
-        SystemExit, match=rf"^config\.yaml: got .*/config\.yaml \(.*{wrong}.*\), {OURS}"
-    ):
-        report([str(folder)])
-
-
-def assert_not_exported(folder, sentence):
-    with pytest.raises(SystemExit, match=f"^{sentence}"):
-        export([str(folder)])
-
-
-@pytest.mark.parametrize(
-    ("content", "wrong"),
-    [
-        (b"junk", "Expecting value"),
-        (b"", "Expecting value"),
-        (b"[]", "list indices must be integers"),
-        (b'{"a": "\xff"}', "'utf-8' codec can't decode byte 0xff"),
-        (b"{}", "it has no seed"),
-        (b'{"seed": "one"}', "seed is 'one'"),
-    ],
-)
-def test_a_damaged_summary_is_named(gated, tmp_path, content, wrong):
-    folder = shutil.copytree(gated, tmp_path / "run")
-    (folder / "summary.json").write_bytes(content)
-    sentence = rf"^summary\.json: got .*/summary\.json \({wrong}.*\), expected the outcome that a"
-    with pytest.raises(SystemExit, match=sentence):
-        report([str(folder)])
-    with pytest.raises(QPError, match=sentence):
-        finished_run(folder, load_config(folder / "config.yaml"))
-
-
-@pytest.mark.parametrize("part", ["arguments", "mpc"])
-def test_a_learned_qp_without_its_parts_is_named(gated, tmp_path, part):
-    folder = shutil.copytree(gated, tmp_path / "run")
-    state = torch.load(folder / "best.pt")
-    torch.save({name: x for name, x in state.items() if name != part}, folder / "best.pt")
-    wrong = rf"best\.pt: got .*/best\.pt \(it has no {part}\), expected a file that QPMPC.save wrot"
-    assert_not_exported(folder, wrong)
-    (folder / "best.pt").unlink()
-    assert_not_exported(folder, r"path: got .*/best\.pt, which does not exist")
 
 
 def test_a_run_is_loaded_with_what_it_wrote(gated, tmp_path):
     run = qm.load_run(gated)
+    assert run.policy.structure == "free"
     s = torch.ones(3, run.policy.n_p)
     assert torch.equal(run.policy.policy(s), qm.QPMPC.load(gated / "best.pt").policy(s))
     assert run.summary["J_best"] == run.metrics["eval/J"].iloc[-1]
+    J = evaluate(run.cfg, run.policy.policy, run.physics).J
+    assert pytest.approx(run.summary["J_best"], rel=1e-6) == J
     assert run.cfg.task.name == "point_mass"
     with pytest.raises(QPError, match=r"^folder: got .*, without config.yaml, expected the folder"):
         qm.load_run(tmp_path)
 
 
-def test_a_policy_with_a_network_is_not_its_qp_alone(gated, tmp_path):
-    folder = shutil.copytree(gated, tmp_path / "run")
-    config = folder / "config.yaml"
-    config.write_text(config.read_text().replace("\nalgo:\n", "\nalgo:\n  actor: scheduled\n"))
-    message = "policy: got .* whose theta comes from a network, expected a run whose policy is a QP"
-    run = qm.load_run(folder)
-    assert run.qp.horizon == 3
-    with pytest.raises(QPError, match=message):
-        run.policy  # noqa: B018
-    with pytest.raises(SystemExit, match=message):
-        export([str(folder)])
+@pytest.mark.parametrize(
+    ("file", "content", "wrong"),
+    [
+        ("config.yaml", b"[]\n", r"config.yaml: got .* \(it is a list\), expected the config"),
+        ("config.yaml", b"seed: 1\nsolver: daqp\n", r"config.yaml: got .* \(it has no eval_seed"),
+        ("config.yaml", b"seed: \xff\n", r"config.yaml: got .* \('utf-8' codec can't decode"),
+        ("config.yaml", None, r"config.yaml: got .* \(.*No such file"),
+        ("summary.json", b"junk", r"summary.json: got .* \(Expecting value"),
+        ("summary.json", b"[]", r"summary.json: got .* \(list indices must be integers"),
+        ("summary.json", b"{}", r"summary.json: got .* \(it has no seed"),
+        ("summary.json", b'{"seed": "one"}', r"summary.json: got .* \(seed is 'one'"),
+        ("metrics.csv", b"update,eval/J\n0,", r"metrics.csv: got .* \(its last line is cut off"),
+        ("best.pt", None, "path: got .*best.pt, which does not exist"),
+        ("best.pt", b"junk", "path: got .*best.pt, which cannot be read"),
+    ],
+)
+def test_a_damaged_file_is_named(gated, tmp_path, file, content, wrong):
+    run = qm.load_run(shutil.copytree(gated, tmp_path / "run"))
+    (run.folder / file).unlink()
+    if content is not None:
+        (run.folder / file).write_bytes(content)
+    of = {"config.yaml": "cfg", "summary.json": "summary", "metrics.csv": "metrics"}
+    with pytest.raises(QPError, match=f"^{wrong}"):
+        getattr(run, of.get(file, "policy"))
 
 
-def test_metrics_that_are_cut_are_named_by_the_report(gated, tmp_path):
-    folder = shutil.copytree(gated, tmp_path / "run")
-    text = (folder / "metrics.csv").read_text()
-    (folder / "metrics.csv").write_text(text[: len(text) // 2])
-    with pytest.raises(SystemExit, match=r"^metrics\.csv: got .*/metrics\.csv \(its last line is"):
-        report([str(folder)])
-
-
-def test_a_scheme_released_in_training_is_read(tmp_path):
-    cfg = make_config(*SMALL, "constraint=mpc", "release=2")
-    summary = train.train(cfg, str(tmp_path), quiet=True)
-    run = FinishedRun(tmp_path)
-    assert run.policy.structure == "free"
-    now = evaluate(cfg, run.policy.policy, run.physics).J
-    assert now == pytest.approx(summary["J_best"], rel=1e-6)
-
-
-def test_a_folder_without_runs_is_named(tmp_path):
+def test_a_folder_without_runs_and_a_run_with_other_keys_are_named(gated, tmp_path):
     with pytest.raises(QPError, match=r"RUNS_FOLDER: got .* without a finished run"):
         collect(tmp_path)
-
-
-def test_a_checkpoint_that_is_lost_is_named(study, tmp_path):
-    shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
-    (tmp_path / "run" / "checkpoint.pt").unlink()
-    with pytest.raises(QPError, match=r"checkpoint: got .*checkpoint.pt, which does not exist"):
-        collect(tmp_path)
-
-
-def test_a_run_with_other_keys_is_named(study, tmp_path):
-    shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / "run")
-    config = tmp_path / "run" / "config.yaml"
+    config = shutil.copytree(gated, tmp_path / "run") / "config.yaml"
     config.write_text(config.read_text().replace("step: chol", "weather: fine\nstep: chol", 1))
-    with pytest.raises(QPError, match=r"run: got .*weather: got an unk.* expected a run of this"):
+    with pytest.raises(QPError, match=r"run: got .*weather: got .* expected a run of this"):
         collect(tmp_path)

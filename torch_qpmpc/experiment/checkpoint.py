@@ -12,10 +12,14 @@ from typing import Any
 import torch
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.config import load_config
 from torch_qpmpc.files import read_tensors, write_whole
+from torch_qpmpc.mpc.module import QPMPC
 
 #: The newest checkpoint of a run's folder, and the one before.
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint-previous.pt"
+#: The policy that the gate keeps, written by `QPMPC.save`.
+BEST = "best.pt"
 #: Temporary second link to the newest checkpoint, later renamed to `PREVIOUS`.
 SECOND = "checkpoint.second"
 
@@ -82,3 +86,13 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
             "a checkpoint that train.py wrote",
             f"{reason}; use {f'the previous one, {previous}' if usable else 'another one'}.",
         ) from error
+
+
+def learned_qp(folder: str | Path) -> QPMPC:
+    """Load the QP that the run in ``folder`` has learned and, with a gate, kept.
+
+    Raises:
+        QPError: its configuration or its file is missing or damaged.
+    """
+    cfg = load_config(Path(folder) / "config.yaml")
+    return QPMPC.load(Path(folder) / (BEST if cfg.gate else CHECKPOINT))

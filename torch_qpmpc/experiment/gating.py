@@ -18,9 +18,9 @@ from torch_qpmpc.envs.arx_plant import ARXMember
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import Learner, evaluate
+from torch_qpmpc.experiment.checkpoint import BEST
 from torch_qpmpc.experiment.ensemble import MEMBERS, check_ensemble, run_ensemble
 from torch_qpmpc.experiment.start import transitions
-from torch_qpmpc.experiment.stored_qp import BEST
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.experiment.tasks.identified import Start
 from torch_qpmpc.files import save_file

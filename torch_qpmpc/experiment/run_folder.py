@@ -17,7 +17,6 @@ from omegaconf import DictConfig, OmegaConf
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT
 from torch_qpmpc.experiment.config import settings
-from torch_qpmpc.experiment.links import check_links
 from torch_qpmpc.experiment.loggers import RunLogger
 from torch_qpmpc.experiment.tasks import COMMAND
 from torch_qpmpc.files import damaged, write_whole
@@ -35,8 +34,7 @@ class RunFolder:
         after: the update to resume after, whose earlier rows are kept; None for a new run.
 
     Raises:
-        QPError: rows of updates up to ``after`` are missing or damaged, or the folder has a link
-            out of it.
+        QPError: rows of updates up to ``after`` are missing or damaged.
         OSError: writing failed, here or in a method; no other file is damaged.
     """
 
@@ -44,7 +42,6 @@ class RunFolder:
         # Absolute, so that changes of the working directory do not affect the event writer.
         self.path = Path(folder).resolve()
         self.path.mkdir(parents=True, exist_ok=True)
-        check_links(self.path)
         # Read before the first event is written: damaged rows stop the run.
         earlier: Any = None if after is None else _read_until(self.path, cfg, after)
         self.cfg = cfg
@@ -180,9 +177,6 @@ class WritableFolder(Callback):
         folder = OmegaConf.select(config, key)
         try:
             Path(folder).mkdir(parents=True, exist_ok=True)
-            check_links(folder)  # before Hydra opens its log there
-        except QPError as error:
-            raise SystemExit(str(error)) from None
         except OSError as error:
             # Hydra turns a callback's errors into warnings, but not SystemExit.
             raise SystemExit(str(unwritable(folder, error, key))) from None

@@ -6,10 +6,8 @@ import argparse
 from pathlib import Path
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.checkpoint import CHECKPOINT
+from torch_qpmpc.experiment.checkpoint import CHECKPOINT, learned_qp
 from torch_qpmpc.experiment.exporting import FOLDER
-from torch_qpmpc.experiment.links import check_links
-from torch_qpmpc.experiment.stored_qp import check_alone, learned_qp
 from torch_qpmpc.export.export import STORAGES
 from torch_qpmpc.export.writer import REAL
 
@@ -31,9 +29,6 @@ def main(arguments: list[str] | None = None) -> None:
         if not (run / CHECKPOINT).exists():
             got = f"{run}, which has no {CHECKPOINT}"
             raise QPError.expected("RUN_FOLDER", got, "the folder of a run of train.py")
-        if folder is None:
-            check_links(run, FOLDER)
-        check_alone(run)
         print(learned_qp(run).export_c(folder or run / FOLDER, **options))
     except QPError as error:
         raise SystemExit(str(error)) from None

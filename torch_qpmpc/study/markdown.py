@@ -7,19 +7,16 @@ from collections.abc import Iterable, Sequence
 
 from torch_qpmpc.errors import QPError, printable
 
-#: Characters of a name that Markdown or HTML would read as more than text.
-SPECIAL = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "|": "&#124;", "`": "&#96;", "\n": " "}
-SPECIAL |= {"\\": "&#92;", "](": "]&#40;", "\t": " "}
-
 
 def escaped(name: object) -> str:
     """Return a name from a run's folder as plain text for a page and a terminal.
 
     Example:
         >>> escaped("<b>![x](http://y)")
-        '&lt;b&gt;![x]&#40;http://y)'
+        '&#60;b&#62;!&#91;x](http://y)'
     """
-    return re.sub(r"\]\(|[&<>|`\\\n\t]", lambda match: SPECIAL[match[0]], printable(str(name)))
+    text = " ".join(printable(str(name)).split())
+    return re.sub(r"[&<>|`\\\[]", lambda match: f"&#{ord(match[0])};", text)
 
 
 def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:

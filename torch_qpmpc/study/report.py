@@ -1,9 +1,8 @@
 """Tables and figures of finished runs: ``python -m torch_qpmpc.report RUNS_FOLDER``.
 
 The report is written to RUNS_FOLDER/report, with a folder for each sweep: the paper's figures with
-intervals or ranges over seeds (1 and 3: learning-NOISE.png, 2 and 4: constraints-NOISE.png),
-closed-loop paths, slices of value and policy, model errors, and for swept settings the frontier and
-the ablations.
+intervals or ranges over seeds (1 and 3: learning-NOISE.png, 2 and 4: constraints-NOISE.png), and
+the errors of the models that are read from C.
 """
 
 from __future__ import annotations
@@ -14,25 +13,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from torch_qpmpc.envs.closed_loop import cost_text, gap_text
+from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.links import check_links
 from torch_qpmpc.files import write_whole
+from torch_qpmpc.study import plots
 from torch_qpmpc.study.markdown import escaped, replaced, table
-from torch_qpmpc.study.plots import (
-    ablation_figure,
-    constraints_figure,
-    frontier_figure,
-    learning_figure,
-    meaning_figure,
-    policies_figure,
-    readme_figure,
-    trajectories_figure,
-)
-from torch_qpmpc.study.runs import CASES, REAL_GAP, chosen, collect, has_real
+from torch_qpmpc.study.runs import CASES, REAL_GAP, collect
 from torch_qpmpc.study.statistics import interquartile_mean, spread
 
 #: Largest number of settings that fit side by side in a figure.
@@ -47,49 +37,21 @@ are exactly zero. Prediction error: root mean square over one step, of the corru
 that scheme's, and the number of runs in which the latter is smaller."""
 
 
-def runs_table(frame: pd.DataFrame) -> str:
-    """Format all runs as a Markdown table."""
-    costs = ("J_start", "J_best", "J_true_model")
-    head = ["sweep", "noise", "case", "seed", *costs, "closed_gap"]
-    head += [
-        "canonical_distance",
-        "prediction_error",
-        "prediction_error_start",
-        "unsolved",
-        "train_seconds",
-    ]
-    digits = {"train_seconds": ".1f", "canonical_distance": ".3f"}
-    digits |= dict.fromkeys(("prediction_error", "prediction_error_start"), ".4f")
-    ends = (frame[name] for name in ("closed_gap", *costs))
-    gaps = [gap_text(*values) for values in zip(*ends, strict=True)]
-    rows = frame.assign(case=frame["label"], closed_gap=gaps)[head].itertuples(index=False)
-    lines = [
-        [
-            cost_text(value) if name in costs else escaped(f"{value:{digits.get(name, '')}}")
-            for name, value in zip(head, row, strict=True)
-        ]
-        for row in rows
-    ]
-    return table(head, lines)
-
-
 def cases_table(sweep: pd.DataFrame) -> str:
     """Format a sweep by noise and case as a Markdown table."""
     lines = []
-    for noise, label in dict.fromkeys(zip(sweep["noise"], sweep["label"], strict=True)):
-        runs = chosen(sweep, noise=noise, label=label)
+    for (noise, label), runs in sweep.groupby(["noise", "label"], sort=False):
         real = runs.query("real")["closed_gap"].to_numpy()
+        gap = f"{np.median(real):.3f} {spread([real]).text()}" if len(real) else "-"
         median = runs.median(numeric_only=True)
-        nearer = (runs["prediction_error"] < runs["prediction_error_start"]).sum()
-        gap = "-"
-        if len(real):
-            gap = f"{pd.Series(real).median():.3f} {spread([real]).text()}"
+        start, best, true = (cost_text(median[f"J_{x}"]) for x in ("start", "best", "true_model"))
         errors = f"{median['prediction_error_start']:.3f} to {median['prediction_error']:.3f}"
+        nearer = (runs["prediction_error"] < runs["prediction_error_start"]).sum()
         lines.append(
             [
                 escaped(f"{label}, {noise}"),
                 f"{gap} ({len(real)} of {len(runs)})",
-                _ends(median, "J"),
+                f"{start} to {best} ({true})",
                 f"{median['canonical_distance']:.3f}",
                 f"{median['zeros_above']:.2f}",
                 f"{errors} ({nearer} of {len(runs)})",
@@ -99,118 +61,67 @@ def cases_table(sweep: pd.DataFrame) -> str:
     return table(head, lines)
 
 
-def _ends(median: pd.Series, name: str) -> str:
-    start, best, true = (median[f"{name}_{end}"] for end in ("start", "best", "true_model"))
-    return f"{cost_text(start)} to {cost_text(best)} ({cost_text(true)})"
-
-
 def overall(sweep: pd.DataFrame) -> str:
     """Format the closed gap over the paper's cases that learn C, bootstrapped by case."""
     lines = []
     for noise, runs in sweep.query("real").groupby("noise"):
-        cases = [chosen(runs, label=case)["closed_gap"].to_numpy() for case in CASES[1:]]
-        if not all(map(len, cases)):
-            continue
-        mean = interquartile_mean(pd.Series([gap for case in cases for gap in case]).to_numpy())
-        lines.append(
-            f"{escaped(noise)} noise {mean:.3f} {spread(cases, interquartile_mean).text()}"
-        )
+        cases = [runs["closed_gap"][runs["label"] == case].to_numpy() for case in CASES[1:]]
+        if all(map(len, cases)):
+            mean = interquartile_mean(np.concatenate(cases))
+            ends = spread(cases, interquartile_mean).text()
+            lines.append(f"{escaped(noise)} noise {mean:.3f} {ends}")
     if not lines:
         return ""
     return f"Interquartile mean over the four cases that learn C: {'; '.join(lines)}."
 
 
-def has_ablations(sweep: pd.DataFrame) -> bool:
-    """Return True if the sweep compares ablations and has a real gap."""
-    return "ablation" in sweep and len({*sweep["ablation"]}) > 1 and has_real(sweep)
+def section(sweep: pd.DataFrame) -> str:
+    """Format a sweep's table and, below it, its overall closed gap."""
+    return "\n\n".join(filter(None, (cases_table(sweep), overall(sweep))))
 
 
 def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
-    """Yield the figures of a sweep, each with its name."""
-    if len({*sweep["label"]}) <= SIDE_BY_SIDE:
-        for noise, runs in sweep.groupby("noise"):
-            yield f"learning-{noise}", learning_figure(runs)
-            qps = runs.query("actor == 'qp'")
-            learned = qps.query("constraint != 'fixed'")
-            if len(learned):
-                yield f"constraints-{noise}", constraints_figure(learned)
-            qps = qps.assign(simulated=[run.has_plant for run in qps["run"]]).query("simulated")
-            if len(qps):
-                yield f"trajectories-{noise}", trajectories_figure(qps)
-            if len(qps) and qps["run"].iloc[0].start.n_x > 1:
-                yield f"policies-{noise}", policies_figure(qps)
-        if any(sweep["prediction_error"].notna()):  # the true model is known
-            yield "meaning", meaning_figure(sweep)
-    elif has_real(sweep):
-        yield "frontier", frontier_figure(sweep)
-    if has_ablations(sweep):
-        yield "ablation", ablation_figure(sweep)
+    """Yield the figures of a sweep of at most `SIDE_BY_SIDE` cases, each with its name."""
+    if sweep["label"].nunique() > SIDE_BY_SIDE:
+        return
+    for noise, runs in sweep.groupby("noise"):
+        yield f"learning-{noise}", plots.learning_figure(runs)
+        learned = runs.query("constraint != 'fixed'")
+        if len(learned):
+            yield f"constraints-{noise}", plots.constraints_figure(learned)
+    if any(sweep["prediction_error"].notna()):  # the true model is known
+        yield "meaning", plots.meaning_figure(sweep)
 
 
 def write(frame: pd.DataFrame, folder: Path) -> str:
     """Write the report into ``folder``; return its tables."""
-    parts = []
+    tables, pages = [], []
     for name, sweep in frame.groupby("sweep"):
-        own_folder = folder / str(name)
-        own_folder.mkdir(parents=True, exist_ok=True)
-        links = []
+        (folder / str(name)).mkdir(parents=True, exist_ok=True)
+        tables.append(f"## {escaped(name)}\n\n{section(sweep)}")
+        pages.append(tables[-1])
         for title, figure in figures(sweep):
             # The noise is a name from the folder, which may have slashes.
-            file = re.sub(r"[^\w.,=-]+", "_", f"{title}.png")
-            figure.savefig(own_folder / file, dpi=100)
-            links.append(f"![{escaped(title)}]({quote((Path(str(name)) / file).as_posix())})")
-        parts.append(((f"## {escaped(name)}", section(sweep)), links))
-    tables = "\n\n".join("\n\n".join(text) for text, _ in parts)
-    whole = "\n\n".join("\n\n".join([*text, *links]) for text, links in parts)
-    write_whole(folder / "report.md", f"{CAPTION}\n\n{whole}\n".encode())
-    write_whole(folder / "runs.md", f"{runs_table(frame)}\n".encode())
-    return f"{CAPTION}\n\n{tables}"
-
-
-def section(sweep: pd.DataFrame) -> str:
-    """Format a sweep's table and, below it, its overall closed gap and what was proved."""
-    texts = cases_table(sweep), overall(sweep), proofs(sweep)
-    return "\n\n".join(text for text in texts if text)
-
-
-def proofs(sweep: pd.DataFrame) -> str:
-    """Format the answers of ``prove=BOUND``, a line for each run that has one."""
-    if "proof" not in sweep:
-        return ""
-    runs = zip(sweep["run"], sweep["label"], sweep["seed"], sweep["proof"], strict=True)
-    lines = [
-        f"- {escaped(label)}, seed {seed}, |nu| <= {run.cfg.prove:g}: {escaped(proof)}"
-        for run, label, seed, proof in runs
-        if isinstance(proof, str)
-    ]
-    return "\n".join(["From every start:", "", *lines]) if lines else ""
+            file = Path(str(name)) / re.sub(r"[^\w.,=-]+", "_", f"{title}.png")
+            figure.savefig(folder / file, dpi=100)
+            pages.append(f"![{escaped(title)}]({quote(file.as_posix())})")
+    write_whole(folder / "report.md", "\n\n".join([CAPTION, *pages, ""]).encode())
+    return "\n\n".join([CAPTION, *tables])
 
 
 def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:
     """Write the tables between the markers ``name`` of a Markdown file, and NAME.png beside it."""
-    text = page.read_text(encoding="utf-8")
-    tables = [
-        f"**{escaped(title)}**\n\n{section(sweep)}" for title, sweep in frame.groupby("sweep")
-    ]
+    text, sweeps = page.read_text(encoding="utf-8"), frame.groupby("sweep")
+    tables = [f"**{escaped(title)}**\n\n{section(sweep)}" for title, sweep in sweeps]
     page.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), name), encoding="utf-8")
-    first = max(frame.groupby("sweep"), key=lambda pair: pair[1]["closed_gap"].median())[1]
-    headline(first).savefig(page.with_name(f"{name}.png"), dpi=90)
-
-
-def headline(sweep: pd.DataFrame) -> Figure:
-    """Draw a sweep in one figure."""
-    if has_ablations(sweep):
-        return ablation_figure(sweep)
-    if len({*sweep["label"]}) > SIDE_BY_SIDE:
-        return frontier_figure(sweep)
-    return readme_figure(sweep)
+    _, first = max(sweeps, key=lambda pair: pair[1]["closed_gap"].median())
+    if first["label"].nunique() <= SIDE_BY_SIDE:
+        plots.readme_figure(first).savefig(page.with_name(f"{name}.png"), dpi=90)
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m torch_qpmpc.report",
-        description="Write tables and figures of finished runs.",
-    )
+    about = "Write tables and figures of finished runs."
+    parser = argparse.ArgumentParser(prog="python -m torch_qpmpc.report", description=about)
     parser.add_argument(
         "folder", type=Path, metavar="RUNS_FOLDER", help="folder of the runs, at any depth"
     )
@@ -222,12 +133,6 @@ def main(arguments: list[str] | None = None) -> None:
         frame = collect(options.folder)
         if options.page:
             write_page(frame, options.page, options.folder.resolve().name)
-        check_links(options.folder, "report")
-        print(write(frame, options.folder / "report"))
+        print(f"{write(frame, options.folder / 'report')}\n\n{options.folder / 'report'}")
     except QPError as error:
         raise SystemExit(str(error)) from None
-    print(f"\n{options.folder / 'report'}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Finished runs: their results as one table, and the QP that each has learned.
 
-A run's folder is data. No code that its configuration names is run.
-All readings of a learned C are independent of its gauge.
+A run's folder is data: no code that its configuration names is run. All readings of a learned C are
+independent of its gauge.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from torch_qpmpc.analysis.report import predictions
 from torch_qpmpc.analysis.structure import NearestModel, nearest_model
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.checkpoint import learned_qp
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import read_metrics, read_summary
-from torch_qpmpc.experiment.stored_qp import check_alone, learned_qp
-from torch_qpmpc.experiment.tasks import AnyPlant, find_task, has_run, make_physics, make_true_mpc
+from torch_qpmpc.experiment.tasks import AnyPlant, has_run, make_physics, make_true_mpc
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -38,11 +38,7 @@ _UNLABELLED = ("seed", "figures", "threads", "log_interval", "eval_interval", "l
 
 
 class FinishedRun:
-    """A finished run, read from its folder; `torch_qpmpc.load_run` makes one.
-
-    Args:
-        folder: the run's folder, with config.yaml and checkpoint.pt.
-    """
+    """A finished run, read from its folder; `torch_qpmpc.load_run` makes one."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
@@ -58,19 +54,14 @@ class FinishedRun:
         try:
             check_config(cfg)
         except QPError as error:
-            raise QPError.expected(
-                str(self.folder),
-                f"a run with other keys ({error})",
-                "a run of this version",
-                "Repeat it, or move it elsewhere.",
-            ) from None
+            got, remedy = f"a run with other keys ({error})", "Repeat it, or move it elsewhere."
+            raise QPError.expected(str(self.folder), got, "a run of this version", remedy) from None
         return cfg
 
     @property
     def has_plant(self) -> bool:
-        """False if the plant takes code that the configuration names, or a log that is not here."""
-        task = self.cfg.task
-        return has_run(task) and (find_task(task).log is None or Path(task.file).exists())
+        """False if the plant takes code that the configuration names and that has not run."""
+        return has_run(self.cfg.task)
 
     @cached_property
     def physics(self) -> AnyPlant:
@@ -83,7 +74,7 @@ class FinishedRun:
     @cached_property
     def start(self) -> QPMPC:
         """The QP that learning started from."""
-        return QPMPC(**{**self.qp.arguments, "structure": self.cfg.constraint.structure})
+        return QPMPC(**{**self.policy.arguments, "structure": self.cfg.constraint.structure})
 
     @cached_property
     def true(self) -> QPMPC | None:
@@ -92,22 +83,7 @@ class FinishedRun:
 
     @cached_property
     def policy(self) -> QPMPC:
-        """The learned policy, which the run has kept.
-
-        Raises:
-            QPError: the policy is a network or takes its theta from one, or the file is missing or
-                damaged.
-        """
-        check_alone(self.folder)
-        return self.qp
-
-    @cached_property
-    def qp(self) -> QPMPC:
-        """The learned QP, for readings: `policy`, but without the network of theta, if any.
-
-        Raises:
-            QPError: the policy is a network without a QP, or the file is missing or damaged.
-        """
+        """The learned policy, which the run has kept."""
         return learned_qp(self.folder)
 
     @property
@@ -123,42 +99,25 @@ class FinishedRun:
     def readings(self) -> dict[str, float]:
         """Read zeros and model errors from the learned constraints.
 
-        Their model is the time-invariant one with the nearest predictions. Its error is the root
-        mean square difference of ``A x + B u`` from the true model's, over start states x and
-        actions u drawn uniformly from their bounds.
-
         Returns:
             ``zeros_above``, the share of C's entries above the band that are exactly zero, and
-            ``prediction_error`` and ``prediction_error_start`` of the learned and the initial
-            model, nan if the constraints do not determine the states or the true model is unknown.
+            ``prediction_error`` and ``prediction_error_start``, the errors of the learned and the
+            initial `nearest_model`, nan if the constraints do not determine the states or the true
+            model is unknown.
         """
-        mpc = self.qp
-        above = band_distance(mpc.layout) > 0
-        readings = {
-            "zeros_above": (mpc.C[above] == 0).double().mean().item(),
-            "prediction_error": math.nan,
-            "prediction_error_start": math.nan,
-        }
+        above = band_distance(self.policy.layout) > 0
+        zeros = (self.policy.C[above] == 0).double().mean().item()
+        errors = math.nan, math.nan
         if self.has_plant and isinstance(physics := self.physics, LinearSystem):
             with contextlib.suppress(QPError):
-                learned, start = (nearest_model(predictions(m)) for m in (mpc, self.start))
-                readings["prediction_error"] = prediction_error(learned, physics)
-                readings["prediction_error_start"] = prediction_error(start, physics)
-        return readings
-
-
-def has_real(frame: pd.DataFrame) -> bool:
-    """Return True if any of `collect`'s runs has a real gap."""
-    return any(frame["real"])
-
-
-def chosen(frame: pd.DataFrame, **values: Any) -> pd.DataFrame:
-    """Return the rows with these ``values`` by column, which pandas does not evaluate as code."""
-    return frame.query(" and ".join(f"{name} == @{name}" for name in values), local_dict=values)
+                forms = predictions(self.policy), predictions(self.start)
+                errors = tuple(prediction_error(nearest_model(form), physics) for form in forms)
+        names = ("zeros_above", "prediction_error", "prediction_error_start")
+        return dict(zip(names, (zeros, *errors), strict=True))
 
 
 def prediction_error(model: NearestModel, physics: LinearSystem) -> float:
-    """Compute `one_step_error` over start states and uniform actions, in units of the state."""
+    """Compute the root mean square of `one_step_error` over start states and uniform actions."""
     rng = np.random.default_rng(123)
     s = physics.starts(rng, 1024)
     share = torch.as_tensor(rng.random((1024, physics.B.shape[1])))
@@ -185,35 +144,27 @@ def collect(folder: str | Path) -> pd.DataFrame:
 
     Returns:
         A row for each run: the entries of summary.json, `FinishedRun.readings`, ``run``, a
-        `FinishedRun`, ``actor``, its kind of policy, ``sweep``, the folder that contains the run,
-        ``label``, its case with its ablation or the settings that vary in the sweep, and ``real``,
-        True if the gap is real.
+        `FinishedRun`, ``sweep``, the folder that contains the run, ``label``, its case with its
+        ablation or the settings that vary in the sweep, and ``real``, True if the gap is real.
 
     Raises:
         QPError: there is no finished run.
     """
-    folder = Path(folder)
-    files = sorted(folder.rglob("summary.json"))
-    if not files:
-        raise QPError.expected(
-            "RUNS_FOLDER", f"{folder}, without a finished run", "a folder that train.py wrote to"
-        )
-    rows = []
-    for file in files:
+    folder, rows = Path(folder), []
+    for file in sorted(folder.rglob("summary.json")):
         run = FinishedRun(file.parent)
-        summary = read_summary(file.parent)
         where = "." if file.parent == folder else str(file.parent.parent.relative_to(folder))
-        sweep = folder.resolve().name if where == "." else where
-        names = {name: run.cfg[name].name for name in ("constraint", "noise")}
-        names |= {"seed": run.cfg.seed, "ablation": run.cfg.ablation}
-        rows.append({**summary, **names, "run": run, "sweep": sweep, **run.readings()})
+        names: dict[str, Any] = {name: run.cfg[name].name for name in ("constraint", "noise")}
+        names |= {"seed": run.cfg.seed, "ablation": run.cfg.ablation, "run": run}
+        names["sweep"] = folder.resolve().name if where == "." else where
+        rows.append({**run.summary, **names, **run.readings()})
+    if not rows:
+        got = f"{folder}, without a finished run"
+        raise QPError.expected("RUNS_FOLDER", got, "a folder that train.py wrote to")
     frame = pd.DataFrame(rows)
-    for name in ("closed_gap", "J_true_model", "J_discounted_true_model", "canonical_distance"):
-        # These are null without a gap, a true model or a QP.
-        frame[name] = frame[name].astype(float) if name in frame else math.nan
-    gap = frame["J_start"] - frame["J_true_model"]
-    frame["real"] = gap >= REAL_GAP * frame["J_start"].abs()
-    frame["actor"] = [run.cfg.algo.get("actor", "qp") for run in frame["run"]]
+    for name in ("closed_gap", "J_true_model"):  # null without a gap or a true model
+        frame[name] = frame[name].astype(float)
+    frame["real"] = frame["J_start"] - frame["J_true_model"] >= REAL_GAP * frame["J_start"].abs()
     frame["label"] = ""
     for _, sweep in frame.groupby("sweep"):
         frame.loc[sweep.index, "label"] = _labels(sweep)
@@ -224,25 +175,17 @@ def collect(folder: str | Path) -> pd.DataFrame:
 
 
 def _labels(sweep: pd.DataFrame) -> list[str]:
-    labelled = [_labelled_settings(run.cfg) for run in sweep["run"]]
-    values: dict[tuple[str, str], set[str]] = {}
-    for case, of_run in zip(sweep["constraint"], labelled, strict=True):
-        for key, value in of_run.items():
-            values.setdefault((case, key), set()).add(str(value))
+    """Name each run by its case, and by its ablation or the settings that vary within its case."""
+    flat = [{key: str(x) for key, x in settings(run.cfg).items()} for run in sweep["run"]]
+    keys = pd.DataFrame(flat, index=sweep.index)
+    keys = keys[[x for x in keys if x not in _UNLABELLED and not x.startswith("noise.")]]
+    varied = keys.groupby(sweep["constraint"]).nunique() > 1
     labels = []
-    for case, of_run in zip(sweep["constraint"], labelled, strict=True):
-        varied = [key for key in of_run if len(values[case, key]) > 1]
-        details = [f"{key.split('.')[-1]}={of_run[key]}" for key in varied]
-        if of_run["ablation"] is not None:
-            details = [of_run["ablation"]]
-        # Without $, which would begin mathematics in a figure.
-        labels.append(", ".join(map(str, [case, *details])).replace("$", ""))
+    for row, case, ablation in zip(
+        sweep.index, sweep["constraint"], sweep["ablation"], strict=True
+    ):
+        own = keys.loc[row][varied.loc[case]].dropna().items()
+        details = [f"{str(key).split('.')[-1]}={x}" for key, x in own]
+        parts = [case, *(details if ablation is None else [ablation])]
+        labels.append(", ".join(parts).replace("$", ""))  # a $ begins mathematics in a figure
     return labels
-
-
-def _labelled_settings(cfg: DictConfig) -> dict[str, Any]:
-    return {
-        key: value
-        for key, value in settings(cfg).items()
-        if key not in _UNLABELLED and not key.startswith("noise.")
-    }
