@@ -88,7 +88,7 @@ def constraints_figure(frame: pd.DataFrame) -> Figure:
     The seed is the first one with a real gap, if there is one.
     """
     seed = min(frame.query("real")["seed"] if any(frame["real"]) else frame["seed"])
-    runs = frame[frame["seed"] == seed]
+    runs = frame.loc[frame["seed"] == seed]
     figure = Figure(figsize=(4 * (len(runs) + 1), 6), layout="constrained")
     panels = figure.subplots(2, len(runs) + 1, squeeze=False)
     first: FinishedRun = runs["run"].iloc[0]
@@ -138,7 +138,7 @@ def readme_figure(frame: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(4 * (len(noises) + 1), 3.6), layout="constrained")
     panels = figure.subplots(1, len(noises) + 1)
     for axes, noise in zip(panels, noises, strict=False):
-        draw_gap(axes, frame[frame["noise"] == noise])
+        draw_gap(axes, frame.loc[frame["noise"] == noise])
         axes.set_title(f"{noise} noise")
     draw_meaning(panels[-1], frame)
     panels[-1].legend(fontsize="small")

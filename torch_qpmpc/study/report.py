@@ -11,6 +11,7 @@ import argparse
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -40,16 +41,16 @@ that scheme's, and the number of runs in which the latter is smaller."""
 def cases_table(sweep: pd.DataFrame) -> str:
     """Format a sweep by noise and case as a Markdown table."""
     lines = []
-    for (noise, label), runs in sweep.groupby(["noise", "label"], sort=False):
+    for _, runs in sweep.groupby(["noise", "label"], sort=False):
         real = runs.query("real")["closed_gap"].to_numpy()
         gap = f"{np.median(real):.3f} {spread([real]).text()}" if len(real) else "-"
-        median = runs.median(numeric_only=True)
+        median: Any = runs.median(numeric_only=True)
         start, best, true = (cost_text(median[f"J_{x}"]) for x in ("start", "best", "true_model"))
         errors = f"{median['prediction_error_start']:.3f} to {median['prediction_error']:.3f}"
         nearer = (runs["prediction_error"] < runs["prediction_error_start"]).sum()
         lines.append(
             [
-                escaped(f"{label}, {noise}"),
+                escaped(f"{runs['label'].iloc[0]}, {runs['noise'].iloc[0]}"),
                 f"{gap} ({len(real)} of {len(runs)})",
                 f"{start} to {best} ({true})",
                 f"{median['canonical_distance']:.3f}",
@@ -65,7 +66,7 @@ def overall(sweep: pd.DataFrame) -> str:
     """Format the closed gap over the paper's cases that learn C, bootstrapped by case."""
     lines = []
     for noise, runs in sweep.query("real").groupby("noise"):
-        cases = [runs["closed_gap"][runs["label"] == case].to_numpy() for case in CASES[1:]]
+        cases = [runs.loc[runs["label"] == case, "closed_gap"].to_numpy() for case in CASES[1:]]
         if all(map(len, cases)):
             mean = interquartile_mean(np.concatenate(cases))
             ends = spread(cases, interquartile_mean).text()
@@ -82,7 +83,7 @@ def section(sweep: pd.DataFrame) -> str:
 
 def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
     """Yield the figures of a sweep of at most `SIDE_BY_SIDE` cases, each with its name."""
-    if sweep["label"].nunique() > SIDE_BY_SIDE:
+    if len({*sweep["label"]}) > SIDE_BY_SIDE:
         return
     for noise, runs in sweep.groupby("noise"):
         yield f"learning-{noise}", plots.learning_figure(runs)
@@ -115,7 +116,7 @@ def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:
     tables = [f"**{escaped(title)}**\n\n{section(sweep)}" for title, sweep in sweeps]
     page.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), name), encoding="utf-8")
     _, first = max(sweeps, key=lambda pair: pair[1]["closed_gap"].median())
-    if first["label"].nunique() <= SIDE_BY_SIDE:
+    if len({*first["label"]}) <= SIDE_BY_SIDE:
         plots.readme_figure(first).savefig(page.with_name(f"{name}.png"), dpi=90)
 
 
