@@ -29,6 +29,7 @@ from torchrl import torchrl_logger
 from tqdm import tqdm
 
 from torch_qpmpc.envs.closed_loop import cost_text
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import make_learner, make_operator
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, drop_previous, save_checkpoint
 from torch_qpmpc.experiment.collection import (
@@ -46,12 +47,18 @@ from torch_qpmpc.experiment.launch import check_overrides, launched
 from torch_qpmpc.experiment.loggers import check_logger
 from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
 from torch_qpmpc.experiment.proving import check_provable, prove_run
-from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
+from torch_qpmpc.experiment.rivals import IDENTIFICATION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import learning_start, make_start, transitions
 from torch_qpmpc.experiment.tally import Tally
-from torch_qpmpc.experiment.tasks import COMMAND, make_mpc, make_physics, resume_arguments
+from torch_qpmpc.experiment.tasks import (
+    COMMAND,
+    make_mpc,
+    make_physics,
+    named_task,
+    resume_arguments,
+)
 
 # Absolute, so that a user's script can call main.
 CONFIGS = str(Path(__file__).with_name("configs"))
@@ -213,6 +220,10 @@ def _run(cfg: DictConfig) -> float:
 
 def main() -> None:
     """Run the command line."""
+    try:
+        sys.argv[1:] = named_task(sys.argv[1:])
+    except QPError as error:
+        raise SystemExit(str(error)) from None
     check_overrides(sys.argv[1:], CONFIGS)
     _run()
 

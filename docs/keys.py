@@ -12,10 +12,10 @@ from torch_qpmpc.experiment.config.messages import keys
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: Files whose comments explain the keys that several files set.
 FIRST = ("config", "algo/qlearning", "algo/td3", "optimizer/gauss_newton", "constraint/combined")
-FIRST += ("task/point_mass", "task/log")
+FIRST += ("task/point_mass",)
 TITLE = """# All configuration keys
 
-Each key is set by `python train.py KEY=VALUE`, or with others by a choice, as `task=house`; the
+Each key is set by `python train.py KEY=VALUE`, or with others by a choice, as `task=pendulum`; the
 rightmost choice of `defaults` in `configs/config.yaml` that sets a key counts. The usual value
 comes first, and those of single choices follow. Units are the plant's unless the meaning says
 otherwise.

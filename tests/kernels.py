@@ -12,7 +12,7 @@ from torch_qpmpc import solve_qp
 
 def compile_kernels() -> None:
     """Train briefly and solve a QP of large numbers, which calls nearly every kernel."""
-    for override in ("optimizer=gauss_newton", "optimizer=adam", "task=inventory"):
+    for override in ("optimizer=gauss_newton", "optimizer=adam", "step=projection"):
         with tempfile.TemporaryDirectory() as folder:
             train.train(make_config(*SMALL, override), folder, quiet=True)
     case = FAMILIES["scaled cost"](Draw(7), 3)

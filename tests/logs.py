@@ -1,8 +1,6 @@
-"""Logs of an ARX plant with two lags, of a room as a table, and overrides of train.py."""
+"""Logs of an ARX plant with two lags, and of a room as a table."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -14,22 +12,6 @@ A = torch.tensor([[1.5, 0.1, -0.56, 0.0], [0.0, 1.2, 0.05, -0.35]]).double()
 B = torch.tensor([[0.5, 0.2], [0.1, 0.4]]).double()
 E = torch.tensor([[0.3], [-0.2]]).double()
 OFFSET = torch.tensor([0.1, -0.3]).double()
-#: Overrides of train.py: a double integrator whose position is measured.
-LINEAR = (
-    "task=linear",
-    "task.A=[[1, 0.2], [0, 0.9]]",
-    "task.B=[[0], [0.2]]",
-    "task.C_y=[[1, 0]]",
-    "task.outputs=[s]",
-    "task.inputs=[F]",
-    "task.Q={s: 1}",
-    "task.R={F: 0.1}",
-    "task.dR={F: 0.2}",
-    "task.r={s: 1}",
-    "task.noise={s: 0.01, F: 0.02}",
-    "task.y_bounds={s: [-2, 2]}",
-    "task.u_bounds={F: [-1, 1]}",
-)
 
 
 def arx_log(
@@ -68,18 +50,3 @@ def room(steps: int = 60, seed: int = 0) -> pd.DataFrame:
     for k in range(steps - 1):
         T[k + 1] = 0.9 * T[k] + 0.5 * q[k] + 0.1 * T_out[k]
     return pd.DataFrame({"t": 0.25 * np.arange(steps), "T": T, "q": q, "T_out": T_out})
-
-
-def log_overrides(folder: Path, steps: int = 200) -> tuple[str, ...]:
-    """Write a room's log to ``folder``, and return the overrides of train.py that learn from it."""
-    file = folder / "room.csv"
-    rows = room(steps).assign(
-        price=0.1 * np.sin(np.arange(steps)), target=8.0 + np.arange(steps) // 50 % 2
-    )
-    rows.loc[steps // 2 :, "target"] = 9.0
-    noise = 0.05 * np.random.default_rng(1).normal(size=steps)
-    rows.assign(T=rows["T"] + noise).rename(columns={"T": "T [degC]"}).to_csv(file, index=False)
-    names = ("task.outputs=[T]", "task.inputs=[q]", "task.known=[T_out,price,target]")
-    cost = ("task.Q={T: 1}", "task.r={T: target}", "task.R={q: 0.1}", "task.linear={q: price}")
-    bounds = ("task.y_bounds={T: [5, 12]}", "task.u_bounds={q: [-1, 3]}")
-    return ("task=log", f"task.file={file}", *names, "task.time=t", *cost, *bounds)

@@ -46,15 +46,4 @@ def test_every_public_name_is_there_and_listed():
 
 def test_gymnasium_has_the_ids():
     registered = [name for name in gymnasium.registry if name.startswith("torch_qpmpc/")]
-    names = (
-        "PointMass",
-        "GrosZanonLTI",
-        "ActuatorNoise",
-        "House",
-        "HouseWall",
-        "FourTanks",
-        "TankReferences",
-        "Inventory",
-        "TripleIntegrator",
-    )
-    assert registered == [f"torch_qpmpc/{name}-v0" for name in names]
+    assert registered == [f"torch_qpmpc/{name}-v0" for name in ("PointMass", "GrosZanonLTI")]

@@ -92,29 +92,13 @@ if not TYPE_CHECKING:
         return sorted(globals().keys() | _LAZY)
 
 
-#: Entry point, length of an episode and other arguments of each environment.
-_ENVIRONMENTS: dict[str, tuple[str, int, dict[str, Any]]] = {
-    "PointMass": ("point_mass:PointMassGymEnv", 50, {}),
-    "GrosZanonLTI": ("gros_zanon:GrosZanonLTIGymEnv", 5000, {}),
-    **{
-        name: ("plant_gym:PlantGymEnv", steps, {"plant": name, "max_steps": steps})
-        for name, steps in (
-            ("ActuatorNoise", 10),
-            ("House", 96),
-            ("HouseWall", 192),
-            ("FourTanks", 250),
-            ("TankReferences", 100),
-            ("Inventory", 100),
-            ("TripleIntegrator", 150),
-        )
-    },
-}
-for _name, (_entry, _steps, _kwargs) in _ENVIRONMENTS.items():
+#: Module and length of an episode of each environment.
+_ENVIRONMENTS = {"PointMass": ("point_mass", 50), "GrosZanonLTI": ("gros_zanon", 5000)}
+for _name, (_module, _steps) in _ENVIRONMENTS.items():
     # Registering an id twice warns, and a reload or a spawned worker imports this again.
     if f"torch_qpmpc/{_name}-v0" not in gymnasium.registry:
         gymnasium.register(
             id=f"torch_qpmpc/{_name}-v0",
-            entry_point=f"torch_qpmpc.envs.{_entry}",
+            entry_point=f"torch_qpmpc.envs.{_module}:{_name}GymEnv",
             max_episode_steps=_steps,
-            kwargs=_kwargs,
         )

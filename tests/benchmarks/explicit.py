@@ -21,10 +21,7 @@ from tests.benchmarks.rows import PAGE, main
 from tests.enumeration import double_integrator as textbook
 from tests.enumeration import enumerated
 from tests.law_code import actions
-from tests.runs import make_config
 from torch_qpmpc import QPMPC, CompiledPolicy
-from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.export.tables import make_tables
 from torch_qpmpc.proofs import Polytope, SearchTree, explicit_law
 from torch_qpmpc.proofs.plots import law_figure
 
@@ -74,16 +71,6 @@ def slice_of_four(horizon: int, structure: str) -> Problem:
     return Problem(problem.mpc, box, options)
 
 
-def house(horizon: int) -> Problem:
-    """The room's temperature, and the outdoor temperature of all stages, in K about a plan."""
-    cfg = make_config("task=house", f"task.horizon={horizon}")
-    mpc = make_mpc(cfg, make_physics(cfg))
-    basis = np.zeros((mpc.n_p, 2))
-    basis[-1, 0] = basis[1 : -1 : mpc.n_d, 1] = 1
-    options = {"origin": make_tables(mpc).centre, "basis": basis}
-    return Problem(mpc, Polytope.box([-5.0, -5.0], [5.0, 5.0]), options)
-
-
 PROBLEMS = {
     **{f"double integrator, hard, N = {N}": (hard, N) for N in (2, 3, 4, 5)},
     **{
@@ -97,7 +84,6 @@ PROBLEMS = {
         for N in (3, 10)
         for structure in ("tied", "free")
     },
-    "house, slice, N = 8": (house, 8),
 }
 
 

@@ -68,13 +68,9 @@ NETWORK = (
     "log_interval=100",
 )
 POINT_MASS = ("task=point_mass", "num_envs=160", "updates=4090", "eval_interval=200")
-HOUSE = ("task=house", "num_envs=64", "warmup_steps=10", "updates=3090", "eval_interval=150")
-TANKS = ("task=tank_references", "algo=td3", "task.horizon=8", "num_envs=4", "updates=800")
-TANKS += ("solver=daqp", "eval_interval=100", "log_interval=50")
 #: One update of 256 transitions for each new one, as in the published examples, after a warm-up;
 #: as many transitions as the QP's.
 EACH = ("task=point_mass", "num_envs=1", "warmup_steps=592", "updates=6000", "eval_interval=500")
-HOUSE_EACH = ("task=house", "num_envs=1", "warmup_steps=384", "updates=1600", "eval_interval=400")
 FAST, SLOW = "algo.lr_network=1e-3", "algo.lr_network=3e-4"
 #: The overrides of each case, by task; the first case of a task is the QP.
 CASES: dict[str, dict[str, Sequence[str]]] = {
@@ -95,15 +91,6 @@ CASES: dict[str, dict[str, Sequence[str]]] = {
         "TD3 each step": ("algo=td3", *NETWORK, *EACH, FAST),
         "SAC each step": ("algo=sac", *NETWORK, *EACH, FAST),
     },
-    "house": {
-        "QP": ("task=house",),
-        "TD3": ("algo=td3", *NETWORK, *HOUSE, SLOW),
-        "SAC": ("algo=sac", *NETWORK, *HOUSE, FAST),
-        "TD3 each step": ("algo=td3", *NETWORK, *HOUSE_EACH, FAST),
-        "SAC each step": ("algo=sac", *NETWORK, *HOUSE_EACH, FAST),
-    },
-    # One theta is enough here: a network should do no harm.
-    "tank_references": {"QP": TANKS, "scheduled QP": (*TANKS, "algo.actor=scheduled")},
 }
 
 
@@ -216,8 +203,6 @@ TITLES = {
     "pendulum": "Pendulum",
     "cart_pole": "Cart-pole, swing-up",
     "point_mass": "Point mass",
-    "house": "House, EUR a day",
-    "tank_references": "Tank with references",
 }
 
 
@@ -242,8 +227,6 @@ TABLES = {
     "pendulum": seeds_table,
     "cart_pole": seeds_table,
     "point_mass": budgets_table,
-    "house": budgets_table,
-    "tank_references": seeds_table,
 }
 
 

@@ -42,7 +42,7 @@ from tests.runs import make_config
 from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.rivals.rival import zero_action
+from torch_qpmpc.experiment.rivals import zero_action
 from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc, make_physics, run_code
 from torch_qpmpc.experiment.tasks.identified import identified_start

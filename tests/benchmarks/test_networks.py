@@ -34,7 +34,7 @@ def test_seeds_have_the_last_cost_of_each():
 
 
 def test_the_figure_has_a_line_for_each_case():
-    (axes,) = figure({"house": COMPARED}).axes
+    (axes,) = figure({"point_mass": COMPARED}).axes
     assert [line.get_label() for line in axes.lines] == ["QP", "TD3"]
 
 
@@ -48,19 +48,22 @@ def test_costs_are_those_of_the_evaluations_of_a_finished_run(tmp_path):
 
 def test_curves_are_read_by_task_case_and_seed(tmp_path):
     file = tmp_path / "networks.csv"
-    file.write_text("task,case,seed,transitions,J\nhouse,QP,1,5,9\nhouse,QP,1,10,4\n")
-    assert read(file) == {"house": {"QP": {1: {5: 9.0, 10: 4.0}}}}
+    file.write_text("task,case,seed,transitions,J\npoint_mass,QP,1,5,9\npoint_mass,QP,1,10,4\n")
+    assert read(file) == {"point_mass": {"QP": {1: {5: 9.0, 10: 4.0}}}}
 
 
 def test_runs_replace_their_seeds_and_all_others_stay_in_the_file(tmp_path, monkeypatch):
     file = tmp_path / "networks.csv"
-    before = {"house": {"QP": {1: {5: 9.0}, 2: {5: 8.0}}}, "point_mass": {"QP": {1: {5: 7.0}}}}
+    before = {
+        "point_mass": {"QP": {1: {5: 9.0}, 2: {5: 8.0}}},
+        "pendulum": {"network by TD3": {1: {5: 7.0}}},
+    }
     monkeypatch.setattr(
         networks,
         "costs",
-        lambda folder: [(2, 8, 3.0)] if folder.parts[-2:] == ("house", "QP") else [],
+        lambda folder: [(2, 8, 3.0)] if folder.parts[-2:] == ("point_mass", "QP") else [],
     )
     networks.write(networks.update(before, Path("runs")), file)
     found = read(file)
-    assert found["point_mass"] == before["point_mass"]
-    assert found["house"] == {"QP": {1: {5: 9.0}, 2: {8: 3.0}}}
+    assert found["pendulum"] == before["pendulum"]
+    assert found["point_mass"] == {"QP": {1: {5: 9.0}, 2: {8: 3.0}}}

@@ -6,7 +6,7 @@ import functools
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,10 +14,11 @@ from torch import Tensor
 
 import train
 from tests.benchmarks.problems import Size, make_mpc, model
+from tests.examples import example
 from tests.exported import rates, tied
 from tests.runs import make_config
 from torch_qpmpc import QPMPC
-from torch_qpmpc.envs import GrosZanonLTI, House, LinearSystem, PointMass
+from torch_qpmpc.envs import GrosZanonLTI, LinearSystem, PointMass
 from torch_qpmpc.envs.closed_loop import closed_loop, plant_loop
 from torch_qpmpc.experiment.tasks import make_mpc as make_task_mpc
 from torch_qpmpc.experiment.tasks import make_physics
@@ -76,9 +77,11 @@ def learned(constraint: str, seed: int) -> Problem:
 
 
 def house() -> Problem:
-    """Return the house of task=house, with the signals of random days and random temperatures."""
+    """Return the example house, with the signals of random days and random temperatures."""
+    example("house")
     cfg = make_config("task=house")
-    mpc, plant = make_task_mpc(cfg, make_physics(cfg)), House(horizon=cfg.task.horizon)
+    plant: Any = make_physics(cfg)
+    mpc = make_task_mpc(cfg, plant)
 
     def known(rng: np.random.Generator, count: int) -> np.ndarray:
         loop = plant_loop(

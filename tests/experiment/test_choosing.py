@@ -33,7 +33,7 @@ from torch_qpmpc.experiment.choosing import (
     starts,
 )
 from torch_qpmpc.experiment.ensemble import run_ensemble
-from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
+from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log, learning_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.choice import HELD, MEAN_ACTION, NO_WINDOW, STARTS, Choice, Row

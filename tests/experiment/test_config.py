@@ -12,7 +12,6 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 import train
-from tests.logs import LINEAR, log_overrides
 from tests.runs import CONFIGS, SMALL, choices, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.config import check_config, flatten, settings
@@ -26,7 +25,7 @@ GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
 OPTIONAL = ("constraint.deviation", "constraint.si")
 #: Keys that built-in tasks lack.
-NOT_NEEDED = ("task.file", "task.kwargs", "task.start_episodes", "task.held")
+NOT_NEEDED = ("task.file", "task.kwargs", "task.start_episodes", "task.held", "task.past")
 #: The allowed values of each key, without keys of users' tasks.
 KEYS = keys()
 
@@ -88,16 +87,13 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(train, "check_config", lambda _: None)
     for name, overrides in {
         "second": ("gate=true", "constraint=combined", "optimizer=gauss_newton", "batch_size=8"),
-        "house": ("task=house", "warmup_steps=1"),
-        "house_wall": ("task=house_wall", "warmup_steps=1"),
-        "four_tanks": ("task=four_tanks", "start=model", "warmup_steps=1"),
-        "tank_references": ("task=tank_references", "warmup_steps=1"),
-        "linear": (*LINEAR, "warmup_steps=1"),
-        "log": log_overrides(tmp_path),
-        "actuator_noise": ("task=actuator_noise", "warmup_steps=1"),
-        "inventory": ("task=inventory", "warmup_steps=1", "task.horizon=1"),
-        "short_horizon": ("task=short_horizon", "warmup_steps=1"),
-        "data": (*DATA, "constraint=free", "+task.start_episodes=2", "+task.held=null"),
+        "data": (
+            *DATA,
+            "constraint=free",
+            "+task.start_episodes=2",
+            "+task.held=null",
+            "+task.past=null",
+        ),
         "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
         "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
     }.items():
@@ -116,19 +112,10 @@ def test_each_key_is_read(tmp_path, monkeypatch):
 
 #: The noises of each task, and the constraints whose penalty needs windows of the replay.
 NOISES = {
-    "actuator_noise": {"none"},
-    "four_tanks": {"none"},
     "point_mass": {"gaussian", "brownian"},
     "gros_zanon": {"uniform"},
     "gymnasium": {"none"},
-    "house": {"none"},
-    "house_wall": {"none"},
-    "inventory": {"none"},
-    "linear": {"none"},
-    "log": {"none"},
     "pendulum": {"none"},
-    "short_horizon": {"none"},
-    "tank_references": {"none"},
 }
 WINDOWS = ("si", "combined", "identified")
 
@@ -188,26 +175,8 @@ def test_an_actor_has_the_first_order_by_itself():
     assert make_config("algo=td3", "optimizer=sgd").optimizer.name == "sgd"
 
 
-#: The tasks of keys that pendulum lacks.
-TASK_KEYS = {
-    "task.a_max": "task=actuator_noise",
-    "task.actuator_std": "task=actuator_noise",
-    "task.disturbed": "task=tank_references",
-    "task.hidden_velocity": "task=actuator_noise",
-    "task.margin": "task=house",
-    "task.memory": "task=tank_references",
-    "task.past": "task=house_wall",
-    **dict.fromkeys(("task.C_y", "task.dR", "task.noise", "task.starts"), "task=linear"),
-    **dict.fromkeys(("task.outputs", "task.inputs", "task.known"), "task=log"),
-    **dict.fromkeys(("task.time", "task.episode", "task.linear"), "task=log"),
-    **dict.fromkeys(("task.Q", "task.R", "task.r", "task.y_bounds", "task.u_bounds"), "task=log"),
-}
-
-
 def choices_with(key: str) -> list[str]:
     """Return the choices of groups that have the key."""
-    if key in TASK_KEYS:
-        return ["optimizer=adam", TASK_KEYS[key]]
     if key in settings(make_config("optimizer=gauss_newton")):
         return ["optimizer=gauss_newton"]
     having = {"algo": "algo=td3", "task": "task=pendulum"}
@@ -221,7 +190,6 @@ FRACTION = [0, -0.5, 1.1, math.nan, False, "half", None]
 FLAG = [0, 1, "yes", None]
 NAME = [3, True, None]
 MATRIX = [1.0, [1.0], [[1.0], [1.0, 2.0]], [["a"]], [[math.nan]], [[True]], "???"]
-WEIGHTS = ("Q", "R", "dR", "noise")
 BAD: dict[str, list[Any]] = {
     "seed": [*WHOLE[1:], 2**63],
     "solver": NAME,
@@ -242,7 +210,7 @@ BAD: dict[str, list[Any]] = {
     "back_off": [0.4, 1, math.nan, False, "half"],
     "search.loops": WHOLE,
     **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
-    "rivals": ["DeePC", 3, None, [1]],
+    "rivals": ["tightened", 3, None, [1]],
     "resume": [3, True],
     "algo.name": ["a2c", *NAME],
     "algo.weighted": FLAG,
@@ -266,13 +234,6 @@ BAD: dict[str, list[Any]] = {
     "task.A": MATRIX,
     "task.B": MATRIX,
     "task.stage_weight": MATRIX,
-    "task.C_y": MATRIX[:-1],
-    **{key: ["T", 3, [1]] for key in ("task.outputs", "task.inputs", "task.known")},
-    **{key: [3, True] for key in ("task.time", "task.episode")},
-    **{f"task.{x}": [1.0, {"T": -1.0}, {"T": "x"}, {"T": math.nan}] for x in WEIGHTS},
-    "task.r": [21.0, {"T": None}, {"T": math.inf}],
-    "task.linear": ["price", {"q": 1.0}],
-    **{f"task.{x}": [1.0, {"T": 1.0}, {"T": [1.0]}] for x in ("y_bounds", "u_bounds", "starts")},
     "task.gamma": FRACTION,
     "task.hessian": ["dense", *NAME],
     "task.terminal_weight": ["lqr", *NAME],
@@ -294,21 +255,16 @@ BAD: dict[str, list[Any]] = {
 for _name in ("threads", "updates", "batch_size", "num_envs", "steps_per_update"):
     BAD[_name] = WHOLE
 BAD["warmup_steps"] = WHOLE[1:]
-BAD["gate_interval"] = [value for value in WHOLE if value is not None]
+BAD["gate_interval"] = BAD["task.past"] = [value for value in WHOLE if value is not None]
 for _name in ("replay_capacity", "eval_interval", "log_interval", "constraint.si.windows"):
     BAD[_name] = WHOLE
 for _name in ("task.horizon", "task.episode_steps", "task.eval_steps"):
     BAD[_name] = WHOLE
 for _name in ("scale_constraints", "damping"):
     BAD[f"optimizer.{_name}"] = [0, *REAL]
-for _name in ("task.disturbed", "task.observation_bounds", "task.hidden_velocity"):
-    BAD[_name] = FLAG
-BAD["task.past"] = WHOLE
+BAD["task.observation_bounds"] = FLAG
 BAD["task.held"] = [[-1], [0.5], ["a"], 3]
-BAD["task.memory"] = BAD["task.start_episodes"] = WHOLE[1:]
-BAD["task.margin"] = REAL
-BAD["task.actuator_std"] = REAL
-BAD["task.a_max"] = [0, *REAL]
+BAD["task.start_episodes"] = WHOLE[1:]
 for _name in ("lr_cost", "lr_constraints"):
     BAD[f"optimizer.{_name}"] = REAL
 for _name in ("deviation.c_1", "deviation.c_2", "deviation.c_3", "si.beta"):
@@ -327,13 +283,12 @@ def test_impossible_values_are_rejected_by_name(key):
 
 
 def test_rivals_are_those_of_the_task():
-    check_config(make_config("task=four_tanks", 'rivals=[DeePC,"Kalman filter, N = 60"]'))
-    known = "Kalman filter, N = 20; .*; DeePC; omniscient; identification"
-    known += ". They are the rivals of task four_tanks"
+    check_config(make_config("rivals=[tightened,identification]"))
+    known = "tightened; identification. They are the rivals of task point_mass"
     with pytest.raises(QPError, match=rf"rivals: got \['nobody'\], expected .* these: {known}"):
-        check_config(make_config("task=four_tanks", "rivals=[nobody]"))
-    with pytest.raises(QPError, match=r"rivals: got \['DeePC'\], expected .* these: 10 times the"):
-        check_config(make_config("task=actuator_noise", "rivals=[DeePC]"))
+        check_config(make_config("rivals=[nobody]"))
+    with pytest.raises(QPError, match=r"rivals: got \['tightened'\], .* these: zero action; ide"):
+        check_config(make_config("task=pendulum", "rivals=[tightened]"))
 
 
 def test_the_edges_are_accepted():
@@ -615,7 +570,7 @@ def test_an_ablation_goes_with_both_penalties_and_a_step_rule(name):
 def test_what_acts_by_default():
     """Only accepted policies act where tables were made so, but a critic explores on each task."""
     assert make_config().gate is True
-    assert {make_config(f"task={name}").gate for name in ("gros_zanon", "house")} == {"act"}
+    assert {make_config(f"task={name}").gate for name in ("gros_zanon", "pendulum")} == {"act"}
     for algo in ("ddpg", "td3", "sac"):
-        assert make_config("task=house", f"algo={algo}").gate is True
-    assert make_config("task=house", "algo=ddpg", "gate=act").gate == "act"
+        assert make_config("task=pendulum", f"algo={algo}").gate is True
+    assert make_config("task=pendulum", "algo=ddpg", "gate=act").gate == "act"

@@ -9,15 +9,14 @@ import pytest
 import torch
 from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.envs.registration import EnvSpec
-from torch import Tensor
 
 from tests.runs import SMALL, make_config
-from torch_qpmpc.envs import GymnasiumPlant, House
+from torch_qpmpc.envs import GymnasiumPlant, Plant
 from torch_qpmpc.envs.closed_loop import gymnasium_loop, plant_loop
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.evaluation import UNPAIRED, Evaluation, rival_costs
-from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION, Rival, zero_action
-from torch_qpmpc.experiment.tasks import TASKS, make_mpc, make_physics
+from torch_qpmpc.experiment.rivals import ZERO_ACTION, Policy, zero_action
+from torch_qpmpc.experiment.tasks import TASKS, make_mpc, make_physics, register
 
 
 def test_the_summary_has_each_J_the_gap_and_the_rivals():
@@ -38,34 +37,25 @@ def test_the_summary_has_each_J_the_gap_and_the_rivals():
     assert found.lines() == {"start": start, "true model": true}
 
 
+def proportional(gain: float) -> Policy:
+    return lambda p: gain * (1.5 - p[:, -1:])
+
+
 @pytest.fixture
-def rivals(monkeypatch) -> None:
-    """Replace the room's rivals by proportional controls, one slow, one of a longer horizon."""
-
-    def make(gain: float):
-        def policy(p: Tensor) -> Tensor:
-            assert p.shape[-1] in (4 * 4 + 1, 7 * 4 + 1)
-            return gain * (18 - p[:, -1:])
-
-        return lambda plant: policy
-
-    named = {
-        "weak": Rival(make(0.5)),
-        "strong": Rival(make(5.0)),
-        "far": Rival(make(5.0), sees={"horizon": 6}, slow=True),
-    }
-    monkeypatch.setitem(TASKS, "house", dataclasses.replace(TASKS["house"], rivals=named))
+def rivals(store_task) -> None:
+    """Give the store proportional controls as rivals."""
+    named = {"weak": lambda _: proportional(0.5), "strong": lambda _: proportional(5.0)}
+    register(dataclasses.replace(TASKS["store"], rivals=named))
 
 
-HOUSE = ("task=house", "task.horizon=3", "task.eval_steps=6")
+STORE = ("task=store", "task.eval_steps=6")
 
 
 @pytest.mark.parametrize(
-    ("chosen", "names"),
-    [("true", ["weak", "strong"]), ("false", []), ("[far,strong]", ["far", "strong"])],
+    ("chosen", "names"), [("true", ["weak", "strong"]), ("false", []), ("[strong]", ["strong"])]
 )
-def test_quick_rivals_are_evaluated_or_those_that_are_named(rivals, chosen, names):
-    cfg = make_config(*HOUSE, f"rivals={chosen}")
+def test_all_rivals_are_evaluated_or_those_that_are_named(rivals, chosen, names):
+    cfg = make_config(*STORE, f"rivals={chosen}")
     assert list(rival_costs(cfg, make_physics(cfg))) == names
 
 
@@ -96,10 +86,9 @@ def test_episodes_that_their_seeds_do_not_determine_are_said(monkeypatch, recwar
 
 
 def test_rivals_have_the_disturbances_of_the_learned_policy(rivals):
-    cfg = make_config(*HOUSE, "rivals=[far,strong]", "eval_seed=4")
+    cfg = make_config(*STORE, "rivals=[strong]", "eval_seed=4")
     plant = make_physics(cfg)
-    assert isinstance(plant, House)
-    J = rival_costs(cfg, plant)
-    loop = plant_loop(lambda p: 5 * (18 - p[:, -1:]), plant, steps=6, seed=4)
-    assert {"strong": loop.J, "far": pytest.approx(loop.J)} == J
-    assert torch.equal(evaluate(cfg, lambda p: 5 * (18 - p[:, -1:]), plant).costs, loop.costs)
+    assert isinstance(plant, Plant)
+    loop = plant_loop(proportional(5.0), plant, steps=6, seed=4)
+    assert rival_costs(cfg, plant) == {"strong": loop.J}
+    assert torch.equal(evaluate(cfg, proportional(5.0), plant).costs, loop.costs)

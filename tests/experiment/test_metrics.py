@@ -13,7 +13,7 @@ from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.metrics import report, structure_summary, table, theta_metrics
-from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
+from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.mpc.banded import banded_matrix

@@ -10,6 +10,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from tests.examples import example
 from tests.figures import image_of, legend_of, make_mpc, rendered
 from tests.runs import make_config
 from torch_qpmpc import QPMPC
@@ -149,6 +150,7 @@ def test_summary_figure_of_a_run_without_finite_costs(mpc, found):
 
 
 def test_experience_counts_the_log_and_the_warm_up():
+    example("house")
     house = ("task=house", "num_envs=4", "warmup_steps=96", "steps_per_update=24")
     assert experience(make_config(*house)) == (4, 1, "days of experience")
     log = ("start=data", "start.transitions=192")
@@ -190,15 +192,12 @@ def test_the_episode_has_the_loop_and_the_plans_of_every_half_horizon(mpc, found
     ("task", "labels"),
     [
         ("house", ["air, °C", "heating, kW", "price, EUR/kWh", "outdoors, °C"]),
-        ("house_wall", ["air, °C", "heating, kW", "price, EUR/kWh", "outdoors, °C"]),
-        ("four_tanks", ["level 1", "level 2", "pump 1", "pump 2"]),
         ("gros_zanon", ["$s_{1}$", "$s_{2}$", "$a_{1}$"]),
-        ("inventory", ["stock", "on order", "new order"]),
-        ("tank_references", [*(f"level {i}" for i in range(1, 5)), "pump 1", "pump 2"]),
     ],
 )
 def test_a_task_shows_its_episode_in_its_own_terms(task, labels):
-    more = ("start=model", "rivals=false", "task.horizon=4", "task.eval_steps=6")
+    example("house")
+    more = ("rivals=false", "task.horizon=4", "task.eval_steps=6")
     cfg = make_config(f"task={task}", *more)
     physics = make_physics(cfg)
     mpc = make_task_mpc(cfg, physics)
@@ -206,7 +205,7 @@ def test_a_task_shows_its_episode_in_its_own_terms(task, labels):
     figure = learned_episode_figure(mpc, before)
     assert [axes.get_ylabel() for axes in figure.axes] == labels
     paths = closed_loop_figure(mpc, before).axes[0]
-    over_time = task.startswith("house")
+    over_time = task == "house"
     assert [paths.get_xlabel(), paths.get_ylabel()] == (
         ["hour", labels[0]] if over_time else labels[:2]
     )

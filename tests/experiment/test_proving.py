@@ -26,9 +26,11 @@ def test_no_sampled_start_exceeds_the_bound():
     assert sampled > entries["proof_bound"] - 0.1
 
 
-def test_a_plant_without_a_box_of_starts_is_refused_before_the_first_update(tmp_path, monkeypatch):
-    cfg = make_config("task=short_horizon", "prove=0.1")
-    match = "prove: got a TripleIntegrator, expected a LinearSystem with a start_box. Use task=poin"
+def test_a_plant_without_a_box_of_starts_is_refused_before_the_first_update(
+    tmp_path, monkeypatch, store_task
+):
+    cfg = make_config("task=store", "prove=0.1")
+    match = "prove: got a Store, expected a LinearSystem with a start_box. Use task=poin"
     with pytest.raises(QPError, match=match):
         train.train(cfg, str(tmp_path), quiet=True)
     assert not list(tmp_path.iterdir())

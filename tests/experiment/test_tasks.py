@@ -21,8 +21,7 @@ import train
 from tests.runs import SMALL, composed, linear_system, make_config, run_command, true_mpc
 from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import Cost, QPError
-from torch_qpmpc.envs import ActuatorNoise, GrosZanonLTI, Inventory, PointMass
-from torch_qpmpc.envs.actuator_noise import HiddenVelocity
+from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.fields import Name
@@ -34,13 +33,12 @@ from torch_qpmpc.experiment.tasks import (
     make_physics,
     make_true_mpc,
     named_code,
+    named_task,
     register,
     resume_arguments,
     run_code,
 )
 from torch_qpmpc.mpc.banded import banded_matrix
-from torch_qpmpc.mpc.regulator import lqr_gain
-from torch_qpmpc.mpc.riccati import noisy_stage_weight
 
 
 @pytest.mark.parametrize(("noise", "std"), [("gaussian", 0.01), ("brownian", 0.002)])
@@ -309,6 +307,24 @@ def test_another_process_finds_a_task_by_its_file(own_task):
     assert find_task({"name": "mine", "file": file}).name == "mine"
 
 
+def test_the_command_line_may_name_a_script_alone(own_task, tmp_path):
+    file = own_task('defaults={"defaults": [{"override /constraint": "mpc"}]}')
+    alone = [f"task.file={file}", "seed=2"]
+    assert named_task(alone) == ["task=mine", *alone]
+    assert make_config("task=mine").constraint.name == "mpc"
+    for unchanged in (["seed=2"], [f"task.file={file}", "task=mine"], ["task.file=x", "resume=x"]):
+        assert named_task(unchanged) == unchanged
+    empty = tmp_path / "empty.py"
+    empty.write_text("")
+    with pytest.raises(QPError, match=r"task\.file: got '.*empty\.py', which registers none, exp"):
+        named_task([f"task.file={empty}"])
+    with pytest.raises(QPError, match=r"task\.file: got 'gone\.py', which does not exist, exp"):
+        named_task(["task.file=gone.py"])
+    message = r"task\.file: got '.*mine\.py' with task=point_mass, which reads no file, exp"
+    with pytest.raises(QPError, match=message):
+        run_code({"name": "point_mass", "file": file})
+
+
 def test_a_task_without_its_code_has_no_plant(own_task):
     file = own_task("")
     cfg = make_config("task=mine", "noise.name=windy", "+task.mass=3")
@@ -383,73 +399,3 @@ def test_invalid_registrations_are_refused(own_task):
         register(dataclasses.replace(TASKS["mine"], name="point_mass"))
     with pytest.raises(QPError, match="task: got str, expected a Task"):
         register("mine")  # pyright: ignore[reportArgumentType] (the mistake)
-
-
-# The integrator with actuator noise
-
-
-@pytest.mark.parametrize(("horizon", "std"), [(1, 0.7), (5, 1.2)])
-def test_the_true_scheme_is_optimal_under_actuator_noise(horizon, std):
-    cfg = make_config("task=actuator_noise", f"task.horizon={horizon}", f"task.actuator_std={std}")
-    plant = make_physics(cfg)
-    assert isinstance(plant, ActuatorNoise)
-    weight = noisy_stage_weight(plant.A, plant.B, plant.W, 0.95, torch.tensor([std]).double())
-    K = lqr_gain(plant.A, plant.B, weight, 0.95)
-    true, s = make_true_mpc(cfg, plant), plant.starts(np.random.default_rng(0), 20)
-    assert true is not None
-    torch.testing.assert_close(true.policy(s), -s @ K.mT, atol=1e-6, rtol=0)
-    optimal = evaluate(cfg, true.policy, plant).J_discounted
-    start = evaluate(cfg, make_mpc(cfg, plant).policy, plant).J_discounted
-    assert optimal < {0.7: 0.99, 1.2: 0.5}[std] * start
-
-
-def test_the_true_scheme_is_optimal_with_a_hidden_velocity():
-    cfg = make_config("task=actuator_noise", "task.hidden_velocity=true")
-    plant = make_physics(cfg)
-    assert isinstance(plant, HiddenVelocity)
-    std = torch.tensor([1.2]).double()
-    weight = noisy_stage_weight(plant.A, plant.B, plant.W, 0.95, std, delay=1)
-    K = lqr_gain(plant.A, plant.B, weight, 0.95)
-    true, start = make_true_mpc(cfg, plant), make_mpc(cfg, plant)
-    assert true is not None
-    window = torch.tensor([[0.1, 0.0, 0.0], [0.0, 1.0, 0.0], [0.1, 0.0, 0.1]]).double()
-    mean = torch.stack((window[:, 2], (window[:, 2] - window[:, 0]) / 0.2 + 0.2 * window[:, 1]), -1)
-    torch.testing.assert_close(true.policy(window), -mean @ K.mT, atol=1e-4, rtol=0)
-    assert evaluate(cfg, true.policy, plant).J < 0.1 * evaluate(cfg, start.policy, plant).J
-
-
-def test_the_actuator_is_bounded_by_a_max():
-    cfg = make_config("task=actuator_noise", "task.a_max=0.5")
-    mpc = make_mpc(cfg, make_physics(cfg))
-    s = torch.tensor([[1.0, 1.0], [-1.0, -1.0]]).double()
-    torch.testing.assert_close(mpc.policy(s), torch.tensor([[-0.5], [0.5]]).double())
-
-
-# The inventory
-
-
-def test_the_start_orders_up_to_the_mean_and_the_true_scheme_up_to_the_base_stock():
-    cfg = make_config("task=inventory")
-    plant = make_physics(cfg)
-    assert isinstance(plant, Inventory)
-    true, s = (
-        make_true_mpc(cfg, plant),
-        torch.tensor([[4.0, 2.0], [12.0, 6.0], [1.0, 3.0]]).double(),
-    )
-    assert true is not None
-    for mpc, level in ((make_mpc(cfg, plant), 10.0), (true, plant.base_stock())):
-        orders = plant.applied(level - s.sum(-1, keepdim=True))
-        torch.testing.assert_close(mpc.policy(s).detach(), orders, atol=1e-4, rtol=0)
-
-
-# The triple integrator
-
-
-def test_a_long_horizon_settles_what_a_short_one_loses():
-    cfg = make_config("task=short_horizon")
-    plant = make_physics(cfg)
-    true = make_true_mpc(cfg, plant)
-    assert true is not None
-    assert evaluate(cfg, true.policy, plant).J < 10
-    start = evaluate(cfg, make_mpc(cfg, plant).policy, plant).costs.sum(0)
-    assert 0.2 < (start > 1e3).double().mean() < 0.8

@@ -6,12 +6,11 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
+from tests.examples import example
 from tests.problems import normal
 from torch_qpmpc import QPMPC, GaussNewton
-from torch_qpmpc.envs import ActuatorNoise
 from torch_qpmpc.learning.variance import FLOOR, inverse_variance
 from torch_qpmpc.mpc.regulator import lqr_gain
-from torch_qpmpc.mpc.riccati import noisy_stage_weight
 
 COUNT = 4000
 
@@ -71,7 +70,7 @@ def test_equal_inputs_leave_the_weights_finite():
 
 def learned_gain(weighted: bool) -> Tensor:
     """Learn H, H_f and c of a QP with N = 1 by fitted Q iteration; return its policy's gain."""
-    plant = ActuatorNoise()
+    plant = example("actuator_noise").ActuatorNoise()
     mpc = QPMPC.from_model(
         plant.A,
         plant.B,
@@ -95,8 +94,9 @@ def learned_gain(weighted: bool) -> Tensor:
 
 def test_weighted_q_learning_finds_the_optimal_gain_under_actuator_noise():
     """That of the generalised Riccati equation; without weights a few errors dominate."""
-    plant = ActuatorNoise()
-    weight = noisy_stage_weight(plant.A, plant.B, plant.W, 0.95, torch.tensor([1.2]).double())
+    plant = example("actuator_noise").ActuatorNoise()
+    noisy_stage_weight = example("actuator_noise").noisy_stage_weight
+    weight = noisy_stage_weight(plant.A, plant.B, plant.W, 0.95, plant.actuator_std)
     K = lqr_gain(plant.A, plant.B, weight, 0.95)
     weighted, plain = ((learned_gain(x) - K).norm() / K.norm() for x in (True, False))
     assert weighted < 0.2

@@ -2,8 +2,8 @@
 
     y_{k+1} = A [y_k; ..; y_{k+1-L}] + B [u_k; ..; u_{k+1-L}] + E d_k + offset + e_k
 
-Errors e_k and known signals d_k are those of the log. `ARXPlant` has a quadratic cost, and
-`ARXMember`, one model of an ensemble, any cost of outputs, inputs and known signals.
+Errors e_k and known signals d_k are those of the log. `ARXMember`, one model of an ensemble, has
+any cost of outputs, inputs and known signals.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from torch import Tensor
 from torch_qpmpc.envs.linear_system import Rng, uniform
 from torch_qpmpc.envs.past_window import first_window, next_window
 from torch_qpmpc.envs.plant import Plant
-from torch_qpmpc.envs.quadratic_plant import QuadraticPlant
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -70,26 +69,6 @@ class ARXModel(Plant):
         y, u_lags = (part.flatten(-2) for part in pairs.split((self.n_y, self.n_u), -1))
         following = y @ self.A.mT + u_lags @ self.B.mT + d @ self.E.mT + self.offset + e
         return next_window(x, u, following)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ARXPlant(ARXModel, QuadraticPlant):
-    """A model with a quadratic cost.
-
-        L(y, u, d) = 1/2 v' W v + q'v + c + price violation(y),    v = [d; y; u]
-
-    Args:
-        W, q, c: the cost, ``(n, n)``, ``(n,)`` and ``()`` with n = n_d + n_y + n_u.
-        lb_y, ub_y: soft bounds of the output, ``(n_y,)``.
-        price: the price of a unit of violation.
-        labels: names of the entries of y, u and d, for figures.
-    """
-
-    def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
-        return self.output_cost(self.output(x, w), u, w[..., : self.n_d])
-
-    def violation(self, x: Tensor, w: Tensor) -> Tensor:
-        return self._violation_of(self.output(x, w))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import gymnasium
@@ -25,28 +24,18 @@ class PlantGymEnv(gymnasium.Env):
     gives the signals and the start that it gives in `torch_qpmpc.envs.closed_loop.plant_loop`.
 
     Args:
-        plant: the plant, or the name of its class in `torch_qpmpc.envs`.
+        plant: the plant.
         max_steps: steps of an episode.
-        options: arguments of the class, such as ``horizon`` or ``past``.
 
     Raises:
         QPError: the plant is of another kind, or ``max_steps`` is below 1.
-
-    Example:
-        >>> import gymnasium, torch_qpmpc
-        >>> env = gymnasium.make("torch_qpmpc/House-v0", horizon=8)
-        >>> env.reset(seed=0)[0].shape  # 4 known signals of 9 steps, and the temperature
-        (37,)
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own convention)
 
-    def __init__(self, plant: Plant | str, max_steps: int, **options: Any) -> None:
-        if isinstance(plant, str):
-            plant = getattr(import_module("torch_qpmpc.envs"), plant)(**options)
+    def __init__(self, plant: Plant, max_steps: int) -> None:
         check_kind("plant", plant, Plant)
         check_whole("max_steps", max_steps, 1)
-        assert isinstance(plant, Plant)
         self.plant, self.max_steps = plant, max_steps
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (plant.n_p,))
         low, high = (bound.float().numpy() for bound in (plant.lb_a, plant.ub_a))

@@ -11,7 +11,6 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from torch_qpmpc.errors import printable
-from torch_qpmpc.experiment.tasks import find_task
 
 COMPILING = "Compiling the QP's kernels for this CPU: up to a minute, the first time only."
 
@@ -23,8 +22,6 @@ def announcement(cfg: DictConfig, folder: str, done: int = 0) -> str:
     parts = [f"task {task}", *parts, f"solver {cfg.solver}", f"seed {cfg.seed}"]
     updates = f"{cfg.updates} updates" + (f", {done} of them done" if done else "")
     lines = [f"{cfg.algo.name}, {updates}: {', '.join(parts)}", f"Folder: {folder}"]
-    if (note := find_task(cfg.task).note) is not None:
-        lines.append(note)
     return printable("\n".join(lines))
 
 

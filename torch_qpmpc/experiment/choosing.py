@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION, zero_action
+from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
 from torch_qpmpc.experiment.tasks.choice import MEAN_ACTION, Choice, Row
 from torch_qpmpc.experiment.tasks.identified import (

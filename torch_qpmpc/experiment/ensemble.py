@@ -16,7 +16,7 @@ from torch_qpmpc.envs.arx_plant import ARXMember
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.collection import warm_up_batches
-from torch_qpmpc.experiment.tasks import AnyPlant, find_task
+from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.experiment.tasks.identified import Start, arx_arguments
 from torch_qpmpc.experiment.tasks.registry import plant_layout
 from torch_qpmpc.learning.operators import warm_policy
@@ -168,9 +168,6 @@ def check_ensemble(cfg: DictConfig, physics: AnyPlant, start: Start | None) -> N
     It needs them at the first comparison of ``gate=model``: twice the coefficients of each member,
     and the steps that its blocks lose.
     """
-    if find_task(cfg.task).log is not None:
-        got = f"'model' with task={cfg.task.name}, whose plant is a model"
-        raise QPError.expected("gate", got, "a plant", "Choose gate=act.")
     layout = plant_layout(physics, 1)
     coefficients = layout.past * layout.n + layout.n_d + 1
     needed = 2 * 2 * (coefficients + BLOCKS * layout.past)

@@ -9,7 +9,6 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from omegaconf import DictConfig
@@ -21,14 +20,14 @@ from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_gap
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
+from torch_qpmpc.experiment.rivals import IDENTIFICATION, Policy
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_true_mpc
 from torch_qpmpc.experiment.tasks.identified import nominal_mpcs
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.module import QPMPC
 
-#: Functions that make a policy and its plant, by name.
-Policies = dict[str, Callable[[], tuple[Any, AnyPlant]]]
+#: Functions that make a policy, by name.
+Policies = dict[str, Callable[[], Policy]]
 UNPAIRED = (
     "Two episodes of {id!r} with one seed and the same actions differ: policies are compared on "
     "different episodes, and the gate's pairs are not pairs. Draw all of the environment's random "
@@ -65,11 +64,11 @@ class Evaluation:
         """
         if isinstance(physics, GymnasiumPlant) and not physics.is_reproducible():
             warnings.warn(UNPAIRED.format(id=physics.id), UserWarning, stacklevel=2)
-        policies: Policies = {"start": lambda: (warm_policy(mpc), physics)}
+        policies: Policies = {"start": lambda: warm_policy(mpc)}
         if (true_mpc := make_true_mpc(cfg, physics)) is not None:
-            policies["true model"] = lambda: (warm_policy(true_mpc), physics)
+            policies["true model"] = lambda: warm_policy(true_mpc)
         rivals = _rivals(cfg, physics)
-        loops = _run(cfg, policies | rivals, quiet)
+        loops = _run(cfg, physics, policies | rivals, quiet)
         costs = {name: loops.pop(name).J for name in rivals}
         return cls(
             cfg, physics, {"start": loops["start"], "learned": loops["start"], **loops}, costs
@@ -82,15 +81,13 @@ class Evaluation:
     def identify(
         self, data: Callable[[], Sequence[TensorDictBase]], held: Sequence[int] = ()
     ) -> None:
-        """Evaluate the rival `IDENTIFICATION`, if ``cfg.rivals`` chooses it and there is a plant.
+        """Evaluate the rival `IDENTIFICATION`, if ``cfg.rivals`` chooses it.
 
         ``data`` returns the logged steps, of which the model holds the outputs ``held``. J is that
         of the better of `nominal_mpcs`, and nan if they identify no model.
         """
         chosen = self.cfg.rivals
         if not (chosen if isinstance(chosen, bool) else IDENTIFICATION in chosen):
-            return
-        if find_task(self.cfg.task).log is not None:
             return
         try:
             mpcs = nominal_mpcs(self.cfg, self.physics, data(), held)
@@ -127,20 +124,24 @@ class Evaluation:
 
 def rival_costs(cfg: DictConfig, physics: AnyPlant) -> dict[str, float]:
     """Return J of each rival of the task that ``cfg.rivals`` chooses."""
-    return {name: loop.J for name, loop in _run(cfg, _rivals(cfg, physics), quiet=True).items()}
+    loops = _run(cfg, physics, _rivals(cfg, physics), quiet=True)
+    return {name: loop.J for name, loop in loops.items()}
 
 
 def _rivals(cfg: DictConfig, physics: AnyPlant) -> Policies:
     rivals, chosen = find_task(cfg.task).rivals, cfg.rivals
     if isinstance(chosen, bool):
-        chosen = [name for name, rival in rivals.items() if chosen and not rival.slow]
-    return {name: partial(rivals[name].of, physics) for name in chosen if name != IDENTIFICATION}
+        chosen = rivals if chosen else ()
+    chosen = [name for name in chosen if name != IDENTIFICATION]
+    return {name: lambda make=rivals[name]: make(physics) for name in chosen}
 
 
-def _run(cfg: DictConfig, policies: Policies, quiet: bool) -> dict[str, ClosedLoop]:
+def _run(
+    cfg: DictConfig, physics: AnyPlant, policies: Policies, quiet: bool
+) -> dict[str, ClosedLoop]:
     loops = {}
     with tqdm(policies.items(), "first evaluation", leave=False, disable=quiet or None) as bar:
         for name, make in bar:
             bar.set_postfix_str(name)
-            loops[name] = evaluate(cfg, *make())
+            loops[name] = evaluate(cfg, make(), physics)
     return loops

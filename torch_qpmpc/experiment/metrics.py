@@ -23,7 +23,7 @@ from torch_qpmpc.experiment.plots import (
     learned_episode_figure,
     summary_figure,
 )
-from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION
+from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tally import Stopwatch, Tally
 from torch_qpmpc.learning.updates import Scalars

@@ -16,7 +16,7 @@ from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.choosing import choose, chosen_before
-from torch_qpmpc.experiment.tasks import AnyPlant, find_task
+from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.files import read_tensors, write_whole
@@ -94,11 +94,8 @@ def make_start(
     """
     if cfg.start.name != "data":
         return None
-    path, own = Path(folder) / LOG, find_task(cfg.task).log
-    log: Any
-    if own is not None:
-        log = own(cfg)
-    elif written:
+    path = Path(folder) / LOG
+    if written:
         log = stored_log(path)
     elif cfg.start.file is not None:
         log = stored_log(Path(cfg.start.file))
@@ -115,7 +112,7 @@ def make_start(
         start = choose(cfg, physics, log, quiet)
     else:
         start = identified_start(cfg, physics, log)
-    if own is None and not written:
+    if not written:
         buffer = io.BytesIO()
         torch.save(log.to_dict(), buffer)
         path.parent.mkdir(parents=True, exist_ok=True)

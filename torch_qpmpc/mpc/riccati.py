@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import scipy
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
 
 RICCATI = "riccati"
-#: Riccati equations solved for one generalised equation.
-MAX_ITERATIONS = 1000
 
 
 def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
@@ -71,45 +66,6 @@ def affine_cost_to_go(
     k = q[n_x:] + gamma * B.mT @ (P @ offset + p)
     c = gamma * (offset @ P @ offset / 2 + p @ offset) - k @ M @ k / 2
     return p, c / (1 - gamma)
-
-
-def noisy_stage_weight(
-    A: Tensor, B: Tensor, W: Tensor, gamma: float, std: Tensor, delay: int = 0
-) -> Tensor:
-    """Return the stage weight that accounts for noise on the actions, ``(n_x + n_u, n_x + n_u)``.
-
-    Of the plant ``x+ = A x + B diag(1 + xi) u + e``, with xi and e independent in time, the
-    optimal cost to go is 1/2 x'Px plus a constant. P solves the generalised Riccati equation, which
-    is that of the mean model with ``gamma diag(std^2) diag(B'PB)`` added to the weight of u (de
-    Koning, Automatica 1982). With the weight returned, `riccati_weight` is that P, and the
-    regulator is the optimal policy.
-
-    If what xi_k does to x_{k+1} is seen ``delay`` steps later only, that policy is one of the
-    state's mean. The errors of that mean have the cost of the stages until then, which no action
-    can change: ``gamma A'PA`` plus the weight of x replaces P in B'PB, once for each step.
-
-    Args:
-        A, B, W, gamma: as in `riccati_weight`.
-        std: standard deviations of xi, ``(n_u,)``.
-        delay: steps from x_{k+1} until the effect of xi_k is seen.
-
-    Raises:
-        QPError: ``delay`` is not a whole number, or the equation has no solution: under this noise
-            no policy has a finite cost.
-    """
-    check_whole("delay", delay, 0)
-    P, weight, n_x = riccati_weight(A, B, W, gamma), W, len(A)
-    with contextlib.suppress(QPError):  # the weight has grown too large
-        for _ in range(MAX_ITERATIONS):
-            for _ in range(delay):
-                P = W[:n_x, :n_x] + gamma * A.mT @ P @ A
-            added = gamma * std.square() * (B.mT @ P @ B).diagonal()
-            last, weight = weight, W + torch.diag(torch.cat((std.new_zeros(n_x), added)))
-            if torch.allclose(weight, last, rtol=1e-12, atol=0):
-                return weight
-            P = riccati_weight(A, B, weight, gamma)
-    expected = "noise under which some policy has a finite cost"
-    raise QPError.expected("std", str(std.tolist()), expected)
 
 
 def terminal_riccati(A: Tensor, B: Tensor, W: Tensor, gamma: float, layout: Layout) -> Tensor:

@@ -30,7 +30,7 @@ from torch_qpmpc.experiment.fields import (
     Whole,
     one_of,
 )
-from torch_qpmpc.experiment.rivals.rival import IDENTIFICATION
+from torch_qpmpc.experiment.rivals import IDENTIFICATION
 from torch_qpmpc.experiment.tasks import TASKS, TaskSettings, find_task
 from torch_qpmpc.mpc.projections import STEPS, check_step
 from torch_qpmpc.qp.solvers import backend

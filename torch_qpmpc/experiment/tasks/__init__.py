@@ -11,24 +11,12 @@ from dataclasses import replace
 from omegaconf import DictConfig
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.tasks import (  # noqa: F401 (register)
-    actuator_noise,
-    four_tanks,
-    gros_zanon,
-    gymnasium,
-    house,
-    house_wall,
-    inventory,
-    linear,
-    log,
-    point_mass,
-    short_horizon,
-    tank_references,
-)
+from torch_qpmpc.experiment.tasks import gros_zanon, gymnasium, point_mass  # noqa: F401 (register)
 from torch_qpmpc.experiment.tasks.code import (
     COMMAND,
     has_run,
     named_code,
+    named_task,
     resume_arguments,
     run_code,
 )
@@ -40,6 +28,7 @@ from torch_qpmpc.experiment.tasks.registry import (
     TaskSettings,
     find_task,
     learned_parts,
+    plant_layout,
     plant_scheme,
     priced,
     register,
@@ -60,6 +49,8 @@ __all__ = [
     "make_physics",
     "make_true_mpc",
     "named_code",
+    "named_task",
+    "plant_layout",
     "plant_scheme",
     "priced",
     "register",

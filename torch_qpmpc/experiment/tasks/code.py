@@ -11,10 +11,11 @@ import re
 import runpy
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from torch_qpmpc.errors import QPError
@@ -60,26 +61,51 @@ def run_code(task: Mapping[str, Any]) -> None:
             is named beside a built-in task, which would not read it.
     """
     name, file = task.get("name"), named_code(task).get("task.file")
-    known = TASKS.get(str(name))
-    if file is None and task.get("file") is not None and known is not None and known.log is None:
+    if file is None and task.get("file") is not None and name in TASKS:
         got = f"{task['file']!r} with task={name}, which reads no file"
-        remedy = (
-            f"To learn from a log: python train.py task=log task.file={task['file']} "
-            "'task.outputs=[..]' 'task.inputs=[..]' 'task.Q={..}'. A script of your own registers "
-            "its task and calls train.main."
-        )
+        remedy = "Leave out task to learn the one that the file registers."
         raise QPError.expected("task.file", got, "a task with a file", remedy)
     if file is not None and name not in TASKS:
         expected = f"the Python file that registers task={name}"
-        if not Path(file).exists() or Path(file).suffix != ".py":
-            wrong = "is no .py file" if Path(file).exists() else "does not exist"
-            remedy = "Set task.file to its path."
-            raise QPError.expected("task.file", f"{file!r}, which {wrong}", expected, remedy)
-        runpy.run_path(file, run_name="task_file")
-        if name not in TASKS:
+        if name not in _registered_by(file, expected):
             raise QPError.expected("task.file", f"{file!r}, which registers no {name!r}", expected)
     for module in modules(task):
         importlib.import_module(module)
+
+
+def named_task(arguments: Sequence[str]) -> list[str]:
+    """Return the command line with ``task=NAME`` of the script in ``task.file=FILE``, which is run.
+
+    A command line that names a task or resumes a run is returned unchanged.
+
+    Raises:
+        QPError: the script does not exist, is no Python file, or does not register one task.
+    """
+    named = {key: value for key, _, value in (x.partition("=") for x in arguments)}
+    file = named.get("task.file")
+    if file is None or "resume" in named:
+        return [*arguments]
+    file = str(OverridesParser.create().parse_override(f"task.file={file}").value())
+    expected = "a Python file that registers one task"
+    names = _registered_by(file, expected)
+    if "task" in named:
+        return [*arguments]
+    if len(names) != 1:
+        got = f"{file!r}, which registers {', '.join(names) or 'none'}"
+        raise QPError.expected("task.file", got, expected, "Or choose one with task=NAME.")
+    place = next(i for i, x in enumerate(arguments) if x.startswith("task.file="))
+    return [*arguments[:place], f"task={names[0]}", *arguments[place:]]
+
+
+def _registered_by(file: str, expected: str) -> list[str]:
+    """Run a script, and return the names of the tasks that it registers."""
+    if not Path(file).exists() or Path(file).suffix != ".py":
+        wrong = "is no .py file" if Path(file).exists() else "does not exist"
+        remedy = "Set task.file to its path."
+        raise QPError.expected("task.file", f"{file!r}, which {wrong}", expected, remedy)
+    before = {**TASKS}
+    runpy.run_path(file, run_name="task_file")
+    return [name for name, task in TASKS.items() if before.get(name) is not task]
 
 
 #: How train.py is started: by its path in a clone, and as a module from a wheel.

@@ -6,8 +6,7 @@ import torch
 from omegaconf import DictConfig
 
 from torch_qpmpc.envs import GrosZanonLTI
-from torch_qpmpc.experiment.rivals import tightened
-from torch_qpmpc.experiment.rivals.rival import Rival
+from torch_qpmpc.experiment.rivals import Policy, tightened
 from torch_qpmpc.experiment.tasks.registry import Task, plant_scheme, register
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
@@ -28,6 +27,12 @@ def true_scheme(cfg: DictConfig, plant: GrosZanonLTI) -> Scheme:
     return plant_scheme(cfg, plant, Model(A, B, offset=offset), WEIGHT)
 
 
+def tightened_mpc(plant: GrosZanonLTI) -> Policy:
+    """Make the rival that knows the model, and the noise by its mean and variance."""
+    variance = torch.diag(plant.A.new_tensor([0.1**2 / 12, 0.0]))
+    return tightened(plant, torch.diag(WEIGHT).to(plant.A), variance)
+
+
 register(
     Task(
         "gros_zanon",
@@ -35,7 +40,7 @@ register(
         wrong_scheme,
         true_scheme,
         noises=("uniform",),
-        rivals={"tightened": Rival(tightened.gros_zanon)},
+        rivals={"tightened": tightened_mpc},
         defaults=None,
     )
 )

@@ -12,7 +12,7 @@ from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.closed_loop import gymnasium_loop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.fields import MATRIX, Count, Expected, Flag, Matrix, Whole
-from torch_qpmpc.experiment.rivals.rival import ZERO_ACTION, Rival, zero_action
+from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks.code import has_run
 from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, plant_scheme, register
 from torch_qpmpc.mpc.model import Model
@@ -132,7 +132,7 @@ register(
         make_plant,
         given_scheme,
         closed_loop=gymnasium_loop,
-        rivals={ZERO_ACTION: Rival(zero_action)},
+        rivals={ZERO_ACTION: zero_action},
         settings=GymnasiumSettings,
         defaults=None,
     )

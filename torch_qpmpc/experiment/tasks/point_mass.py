@@ -7,8 +7,7 @@ from omegaconf import DictConfig
 
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.envs.point_mass import NOISE_STD
-from torch_qpmpc.experiment.rivals import tightened
-from torch_qpmpc.experiment.rivals.rival import Rival
+from torch_qpmpc.experiment.rivals import Policy, tightened
 from torch_qpmpc.experiment.tasks.registry import Task, named, plant_scheme, register
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
@@ -31,6 +30,13 @@ def true_scheme(cfg: DictConfig, plant: PointMass) -> Scheme:
     return plant_scheme(cfg, plant, Model(A, B, offset=offset), weight)
 
 
+def tightened_mpc(plant: PointMass) -> Policy:
+    """Make the rival that knows the model and the noise's covariance."""
+    W = torch.diag(torch.cat((2 * plant.W.diagonal(), 0 * plant.lb_a)))
+    unit = plant.std**2 * torch.eye(4).to(plant.A)
+    return tightened(plant, W, unit, walk=plant.noise_kind == "brownian")
+
+
 register(
     Task(
         "point_mass",
@@ -40,7 +46,7 @@ register(
         noises=tuple(NOISE_STD),
         episode=named(("x", "y", "velocity in x", "velocity in y"), ("force in x", "force in y")),
         takes_noise_std=True,
-        rivals={"tightened": Rival(tightened.point_mass)},
+        rivals={"tightened": tightened_mpc},
         defaults=None,
     )
 )

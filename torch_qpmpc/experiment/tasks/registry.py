@@ -28,11 +28,10 @@ from torch_qpmpc.experiment.fields import (
     one_of,
     some_of,
 )
-from torch_qpmpc.experiment.rivals.rival import Rival
+from torch_qpmpc.experiment.rivals import Policy
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import HESSIANS, Cost
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import Log
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.validation import COST
@@ -86,7 +85,7 @@ class Task:
         closed_loop: the function of `torch_qpmpc.envs.closed_loop` for the plant's kind.
         noises: choices of ``noise.name``; the first is the default.
         takes_noise_std: True if ``make_plant`` reads ``noise.std``.
-        rivals: controllers that the learned one is compared with, by name.
+        rivals: functions of a plant that make controllers to compare the learned one with, by name.
         nominal_scheme: makes the scheme of the plant's own cost and bounds, which the rival
             `IDENTIFICATION` gives a model of its own; None if the true scheme has them or, without
             one, the wrong scheme.
@@ -95,9 +94,8 @@ class Task:
             ``(T + 1, n_d)``.
         unit: the unit of experience in figures: its length in transitions, and its name.
         settings: the model of the keys under ``task``.
-        log: reads the log that ``start=data`` begins with; None to collect one.
-        note: a sentence on what the numbers of a run mean, which is printed at its start.
-        defaults: settings of any group that differ from ``task=point_mass``; None if they are in
+        defaults: settings of any group that differ from ``task=point_mass``, and under ``defaults``
+            other choices of groups, as ``[{"override /constraint": "free"}]``; None if they are in
             configs/task/NAME.yaml.
     """
 
@@ -109,13 +107,11 @@ class Task:
     closed_loop: Callable[..., ClosedLoop] = closed_loop
     noises: tuple[str, ...] = ("none",)
     takes_noise_std: bool = False
-    rivals: Mapping[str, Rival] = field(default_factory=dict)
+    rivals: Mapping[str, Callable[[Any], Policy]] = field(default_factory=dict)
     nominal_scheme: Callable[[DictConfig, Any], Scheme] | None = None
     episode: Callable[[Any, Tensor], Mapping[str, Any]] = lambda plant, d: {}
     unit: tuple[int, str] = (1, "transitions")
     settings: type[TaskSettings] = TaskSettings
-    log: Callable[[DictConfig], Log] | None = None
-    note: str | None = None
     defaults: Mapping[str, Any] | None = field(default_factory=dict)
 
 
@@ -182,9 +178,10 @@ def register(task: Task) -> None:
     # Other processes, such as those of a sweep, run the caller's file to register the task.
     file = Path(sys._getframe(1).f_code.co_filename).resolve()
     own = {"name": task.name, "file": str(file) if file.exists() else None}
+    groups = [{"override /noise": task.noises[0]}, *task.defaults.get("defaults", ())]
     node = {
-        "defaults": ["/task/point_mass@task", {"override /noise": task.noises[0]}, "_self_"],
         **task.defaults,
+        "defaults": ["/task/point_mass@task", *groups, "_self_"],
         "task": {"terminal_weight": "default", **task.defaults.get("task", {}), **own},
     }
     ConfigStore.instance().store(task.name, node, group="task", package="_global_")

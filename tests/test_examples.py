@@ -1,0 +1,31 @@
+"""Each example in docs/examples learns, by the command that its page names."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from tests.examples import FOLDER
+from tests.runs import run_command
+from torch_qpmpc.experiment.run_folder import read_summary
+from torch_qpmpc.experiment.tasks import TASKS
+
+SHORT = (
+    *("updates=2", "eval_interval=2", "log_interval=1", "warmup_steps=10", "batch_size=16"),
+    *("task.eval_steps=3", "rivals=true", "replay_capacity=8000"),
+)
+NAMES = sorted(path.stem for path in FOLDER.glob("*.py"))
+
+
+@pytest.mark.parametrize("name", [*NAMES, "actuator_noise task.hidden_velocity=true"])
+def test_an_example_learns_for_two_updates(name, tmp_path):
+    name, *more = name.split()
+    file = FOLDER / f"{name}.py"
+    run_command(f"task.file={file}", *SHORT, *more, f"hydra.run.dir={tmp_path}")
+    summary = read_summary(tmp_path)
+    assert (summary["task"], summary["updates"], summary["unsolved"]) == (name, 2, 0)
+    assert all(math.isfinite(summary[f"J_{end}"]) for end in ("start", "final", "true_model"))
+    assert {*TASKS[name].rivals} <= {*summary["rivals"]}
+    assert (tmp_path / "episode.png").exists()
+    assert len(file.read_text(encoding="utf-8").splitlines()) <= 200

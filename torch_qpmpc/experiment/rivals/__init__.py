@@ -1,1 +1,0 @@
-"""Controllers that learned ones are compared with, as policies for `plant_loop`."""
