@@ -111,6 +111,51 @@ def test_errors_of_a_cost_of_zero_are_relative_to_the_swing(monkeypatch, off, ub
     assert_close(solution.value, torch.zeros(BATCH).double(), atol=1e-12, rtol=0)
 
 
+def standing(stages: int) -> QuadraticProgram:
+    """Return a body on one of two legs at a time: all forces that carry it cost nothing."""
+    dt, n = 0.02, 4 * stages
+    C, ub = torch.zeros(2 * stages, n).double(), torch.full((stages, 4), torch.inf).double()
+    for k in range(stages):  # f_1, f_2, height and speed of each stage
+        C[2 * k : 2 * k + 2, 4 * k : 4 * k + 4] = torch.tensor([[0, 0, 1, 0], [-dt, -dt, 0, 1]])
+        if k:
+            C[2 * k : 2 * k + 2, 4 * k - 2 : 4 * k] = torch.tensor([[-1, -dt], [0, -1]])
+        ub[k, k // 2 % 2] = 0
+    push = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0.3, 0, 0, 0], [0, 0.3, 0, 0]]).double()
+    return QuadraticProgram(
+        H=torch.diag(torch.tensor([0, 0, 10, 0.3]).double().repeat(stages)),
+        q=torch.zeros(n).double(),
+        c=torch.zeros(()).double(),
+        C=C,
+        b=torch.tensor([0, -9.81 * dt]).double().repeat(stages),
+        G=torch.block_diag(*[push] * stages),
+        lb=torch.zeros(n).double(),
+        ub=ub.flatten(),
+        w=torch.full((n,), torch.inf).double(),
+    )
+
+
+@pytest.mark.parametrize("solver", BACKENDS)
+def test_a_cost_of_zero_without_curvature_is_certified(solver):
+    solution = solve_qp(standing(8), solver=solver)
+    assert_close(solution.value, torch.zeros(()).double(), atol=1e-18, rtol=0)
+
+
+@pytest.mark.parametrize("device", [None, torch.device("cpu")])
+@pytest.mark.parametrize(("speed", "right"), [(1e-12, True), (1e-6, False)])
+def test_rounding_of_multipliers_that_cancel_is_no_error_of_the_value(speed, right, device):
+    qp = standing(2)
+    p, _ = Programs.of(*qp.tensors(), torch.zeros(1, 0).double(), device=device)
+    z, lam, chi = torch.zeros(1, 8).double(), torch.zeros(1, 8).double(), torch.zeros(1, 4).double()
+    z[0, [1, 5]] = 9.81 + torch.tensor([speed, -speed]).double() / 0.02
+    z[0, 3], z[0, 6] = speed, 0.02 * speed
+    lam[0, 0::4], lam[0, 2::4] = 0.7, -0.7 / 0.3
+    assert (lam @ qp.G).abs().max() > 0
+    arrays = (z, lam, chi, chi[:, :0])
+    _, residual, error = p.certify(*(x.numpy() if device is None else x for x in arrays))
+    assert residual[0] <= 1e-6
+    assert (error[0] <= 1e-6) == right
+
+
 # Solutions rejected by the certificate go to another solver
 
 

@@ -15,8 +15,10 @@ lies between two others, in v, the variables that C z = b leaves free:
 
 * Below, the dual function. The Lagrangian at v is the cost less the rows' gaps, and its slope
   ``r = Hv + g + G'lam`` is at most ``1/2 r'H^-1 r`` above its minimum. For a singular H it is
-  ``1/2 r'(H + shift)^-1 r + shift / 2 |reach|^2``, or ``|r|'reach``, if some optimum is within
-  ``reach``: within the hard bounds of v, or within `RANGE` times the largest entry of z.
+  ``1/2 r'(H + shift)^-1 r + shift / 2 |reach|^2``, or ``|r|'reach``, or, for any u,
+  ``1/2 u'Hu + |r - Hu|'reach``, if some optimum is within ``reach``: within the hard bounds of v,
+  or within `RANGE` times the largest entry of z. Where these are large, the bound of zero
+  multipliers counts, too: a cost of zero has multipliers that are rounding errors alone.
 * Above, the cost of a feasible point. The least step that ends all violations of hard rows, and
   holds those nearly active, is long where rows are nearly parallel. Rounding errors count as
   violations.
@@ -68,6 +70,8 @@ SLIP = 1e-9
 CANCELLED, FLOOR, SHARE = 1e3, 1e-12, 1e-6
 #: Some optimum is no further from z than this many times its largest entry, where H is singular.
 RANGE = 1e3
+#: Passes that split a slope into what a singular H explains and the rest.
+SPLITS = 2
 #: A few rounding errors, relative to the terms of a sum.
 ROUNDING = 1e-15
 #: Rounding errors of the value are looked at closely from this size on.
@@ -141,7 +145,7 @@ def _recover(v, lam_v, group, fixed, theta, reduced, sizes, diagonal, passes):
     for i in range(n_qps):
         add(left[i, :n_f], 1.0, xi[i])
     terms = (Hz, G_lam, C_chi, left, y, Cz)
-    value, residual, error = _judge(z, lam, chi, group, fixed, theta, reduced.T, sizes, terms)
+    value, residual, error = _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
     return value, z, chi, lam, xi, codes, residual, error
 
 
@@ -192,11 +196,11 @@ def _certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal):
         add(left[i, : xi.shape[1]], 1.0, xi[i])
         add(left[i], 1.0, q[i % len(q)])
     terms = (Hz, G_lam, C_chi, left, y, Cz)
-    return _judge(z, lam, chi, group, fixed, theta, reduced.T, sizes, terms)
+    return _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
 
 
 @compiled
-def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms):
+def _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
     """Return value, residual and error of the value from the KKT terms.
 
     The fourth term, ``left``, is the residual of stationarity.
@@ -205,9 +209,9 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms):
     H, C, G = theta.H, theta.C, theta.G
     q, c, b, lb, ub, w = theta.q, theta.c, theta.b, theta.lb, theta.ub, theta.w
     n_f = fixed.shape[1]
-    slopes = transposed_products(T, group, left, False)
+    slopes = transposed_products(reduced.T, group, left, False)
     value, residual, error = np.empty(len(z)), np.empty(len(z)), np.empty(len(z))
-    d = T.shape[2] - n_f
+    d = reduced.H.shape[1]
     basis, ends, slacks = np.empty((d + 1, d)), np.empty(d + 1), np.empty(d + 1)
     inverse, shift, box, hard = sizes.inverse, sizes.shift, sizes.box, sizes.hard
     apart = sizes.apart
@@ -238,6 +242,16 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms):
         slope, steps = slopes[i, n_f:], sizes.steps[m]
         far = RANGE * length if shift[m] > 0 else np.inf
         of_slope, push = _fall(slope, lb_i, ub_i, w_i, far, inverse[m], shift[m], steps, box)
+        if shift[m] > 0 and not of_slope < DOUBTFUL * scale:
+            curved = (inverse[m], reduced.H[m])
+            split = _split_fall(slope, lb_i, ub_i, w_i, far, *curved, steps, box)
+            of_slope = split if split < of_slope else of_slope
+            slope = _transposed(reduced.T[m], Hz[i], q_i)[n_f:]
+            split = _split_fall(slope, lb_i, ub_i, w_i, far, *curved, steps, box)
+            free_chi = _transposed(reduced.Y_neg[m], Hz[i], q_i)
+            split += charge + _shortage(Cz[i], b_i, free_chi)
+            if split < gap + of_slope:
+                gap, of_slope = 0.0, split
         rows = (y[i], lam[i], lb_i, ub_i, w_i, steps)
         if apart:
             step = _repair_apart(rows, hard, z[i], G[m])
@@ -326,6 +340,39 @@ def _fall(slope, lb, ub, w, far, inverse, shift, steps, box):
     fall = 0.5 * (_square(inverse, slope) + (shift * length if shift > 0 else 0.0))
     # A NaN in fall stays.
     return (linear if linear < fall else fall), math.sqrt(square)
+
+
+@compiled
+def _transposed(matrix, Hz, q):
+    """Return ``matrix'(Hz + q)``."""
+    product = np.zeros(matrix.shape[1])
+    for j in range(len(q)):
+        add(product, Hz[j] + q[j], matrix[j])
+    return product
+
+
+@compiled
+def _split_fall(slope, lb, ub, w, far, inverse, H, steps, box):
+    """Return the first of `_fall` for a singular H, ``1/2 u'Hu + |slope - Hu|'reach``.
+
+    It holds for each u. This one leaves what has no curvature, and rounding, to the second term.
+    """
+    d = len(slope)
+    u, rest, part = np.zeros(d), slope.copy(), np.empty(d)
+    for _ in range(SPLITS):
+        for a in range(d):
+            part[a] = dot(inverse[a], rest)
+        add_product(u, part, inverse)
+        for a in range(d):
+            rest[a] = slope[a] - dot(H[a], u)
+    total = 0.0
+    for a in range(d):
+        reach, row = far, box[a]
+        if row >= 0 and w[row] == np.inf:
+            reach = min(reach, (ub[row] - lb[row]) / steps[row])
+        total += 0.5 * u[a] * (slope[a] - rest[a])
+        total += (abs(rest[a]) + ROUNDING * _weighted(u, H[a])) * reach
+    return total
 
 
 @compiled

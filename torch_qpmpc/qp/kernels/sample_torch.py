@@ -23,6 +23,7 @@ from torch_qpmpc.qp.kernels.sample import (
     ROUNDING,
     SHARE,
     SLIP,
+    SPLITS,
     VIOLATED,
 )
 from torch_qpmpc.qp.solution import active_codes
@@ -53,7 +54,7 @@ def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes=0) -> 
     xi = -left[:, : fixed.shape[-1]]
     left[:, : fixed.shape[-1]] += xi
     terms = (Hz, G_lam, C_chi, left, y)
-    value, *errors = _judge(z, all_lam, chi, group, fixed, theta, reduced.T, sizes, terms)
+    value, *errors = _judge(z, all_lam, chi, group, fixed, theta, reduced, sizes, terms)
     codes = active_codes(y, all_lam, theta.lb, theta.ub, theta.w)
     return value, z, chi, all_lam, xi, codes, *errors
 
@@ -64,10 +65,12 @@ def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal) -> t
     left = Hz + theta.q + G_lam + C_chi
     left[:, : xi.shape[-1]] += xi
     terms = (Hz, G_lam, C_chi, left, y)
-    return _judge(z, lam, chi, group, fixed, theta, reduced.T, sizes, terms)
+    return _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
 
 
-def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms) -> tuple[Tensor, Tensor, Tensor]:
+def _judge(
+    z, lam, chi, group, fixed, theta, reduced, sizes, terms
+) -> tuple[Tensor, Tensor, Tensor]:
     Hz, G_lam, C_chi, left, y = terms
     lb, ub, w = theta.lb, theta.ub, theta.w
     hard, no_lb, no_ub = w.isinf(), lb.isinf(), ub.isinf()
@@ -80,7 +83,7 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms) -> tuple[Tensor, T
     linear, quadratic = torch.linalg.vecdot(theta.q, z), torch.linalg.vecdot(0.5 * Hz, z)
     cost = linear + quadratic + charge
     short = multiply(theta.C, group, z) - theta.b
-    gap = torch.linalg.vecdot(short.abs(), chi.abs()) + gap.abs().sum(-1)
+    gap = _shortage(short, chi) + gap.abs().sum(-1)
     forces = torch.cat((Hz, G_lam, C_chi, theta.q.expand_as(z)), dim=-1)
     errors = (
         left / (1.0 + largest(forces, keepdim=True)),
@@ -92,7 +95,7 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms) -> tuple[Tensor, T
         down * no_lb,
         (gap / (1.0 + cost.abs())).unsqueeze(-1),
     )
-    slopes = multiply(T.mT, group, left)
+    slopes = multiply(reduced.T.mT, group, left)
     sound = gap + cost.abs() + torch.linalg.vecdot(slopes, slopes)
     residual = largest(torch.cat(errors, dim=-1)).nan_to_num_(torch.inf, torch.inf)
     residual = torch.where(sound < torch.inf, residual, torch.inf)
@@ -108,8 +111,18 @@ def _judge(z, lam, chi, group, fixed, theta, T, sizes, terms) -> tuple[Tensor, T
     size = torch.where(ROUNDING * size < DOUBTFUL * scale, size, close)
     size = size + torch.linalg.vecdot(theta.q.abs(), z.abs())
     step = _repair(y, lam, theta, of_rows[1], sizes, group)
-    fall, push = _fall(slopes[:, fixed.shape[-1] :], theta, RANGE * length, sizes, group)
-    off = gap + fall + ROUNDING * size + (push + 0.5 * sizes.stiffness[group] * step) * step
+    n_f, free = fixed.shape[-1], Hz + theta.q
+    reach = _reach(slopes[:, n_f:], theta, RANGE * length, sizes, group)
+    fall, push = _fall(slopes[:, n_f:], reach, sizes, group)
+    doubtful = (sizes.shift[group] > 0) & ~(fall < DOUBTFUL * scale)
+    other = multiply(reduced.T.mT, group, free)[:, n_f:]
+    split = gap + _split_fall(slopes[:, n_f:], reach, reduced.H, sizes, group)
+    other = charge + _split_fall(other, reach, reduced.H, sizes, group)
+    other = other + _shortage(short, multiply(reduced.Y_neg.mT, group, free))
+    off = gap + fall
+    for bound in (split, other):
+        off = torch.where(doubtful & (bound < off), bound, off)
+    off = off + ROUNDING * size + (push + 0.5 * sizes.stiffness[group] * step) * step
     off = off + _kinks(y, theta, sizes.steps[group], step)
     error = (off / scale).nan_to_num(torch.inf, torch.inf).masked_fill_(residual.isinf(), torch.inf)
     return value, residual, error
@@ -124,16 +137,33 @@ def _swing(slope, theta, sizes, group, far) -> Tensor:
     return torch.where(counts, slope.abs() * width.minimum(far.unsqueeze(-1)), 0.0).sum(-1)
 
 
-def _fall(slope, theta, far, sizes, group) -> tuple[Tensor, Tensor]:
-    part, shift = multiply(sizes.inverse, group, slope), sizes.shift[group]
-    reach = torch.where(shift > 0, far, torch.inf).unsqueeze(-1).expand_as(slope)
-    boxed, rows = sizes.box >= 0, sizes.box.clamp(min=0)
+def _shortage(short, chi) -> Tensor:
+    return torch.linalg.vecdot(short.abs(), chi.abs())
+
+
+def _reach(slope, theta, far, sizes, group) -> Tensor:
+    reach = torch.where(sizes.shift[group] > 0, far, torch.inf).unsqueeze(-1).expand_as(slope)
     if theta.lb.shape[-1]:
+        boxed, rows = sizes.box >= 0, sizes.box.clamp(min=0)
         width = ((theta.ub - theta.lb)[:, rows]) / sizes.steps[group][:, rows]
         reach = torch.where(boxed & theta.w[:, rows].isinf(), reach.minimum(width), reach)
+    return reach
+
+
+def _fall(slope, reach, sizes, group) -> tuple[Tensor, Tensor]:
+    part, shift = multiply(sizes.inverse, group, slope), sizes.shift[group]
     fall = part.square().sum(-1) + (shift * reach.square().sum(-1)).nan_to_num(nan=0.0)
     linear = torch.where(slope != 0, slope.abs() * reach, 0).sum(-1)
     return (0.5 * fall).minimum(linear), torch.linalg.vector_norm(slope, dim=-1)
+
+
+def _split_fall(slope, reach, H, sizes, group) -> Tensor:
+    u, rest = torch.zeros_like(slope), slope
+    for _ in range(SPLITS):
+        u = u + multiply(sizes.inverse.mT, group, multiply(sizes.inverse, group, rest))
+        rest = slope - multiply(H, group, u)
+    size = rest.abs() + ROUNDING * multiply(H.abs(), group, u.abs())
+    return 0.5 * torch.linalg.vecdot(u, slope - rest) + (size * reach).sum(-1)
 
 
 def _repair(y, lam, theta, size, sizes, group) -> Tensor:
