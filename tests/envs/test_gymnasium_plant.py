@@ -231,10 +231,6 @@ def test_violation_is_the_distance_to_the_box():
     assert plant.violation(s).tolist() == [0, 1.75]
 
 
-def test_it_has_no_true_model():
-    assert GymnasiumPlant("Pendulum-v1").true_model() is None
-
-
 def test_a_space_without_bounds_has_none(register):
     plant = GymnasiumPlant(register(observations=Box(-math.inf, math.inf, (1,), np.float32)))
     assert plant.ub_s.isinf().all()

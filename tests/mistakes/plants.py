@@ -16,7 +16,6 @@ import torch
 from tests.mistakes.objects import mpc, op, pm
 from torch_qpmpc.envs import (
     GrosZanonLTI,
-    GrosZanonLTIEnv,
     GymnasiumPlant,
     LinearSystemEnv,
     PointMass,
@@ -130,7 +129,6 @@ MISTAKES: dict[str, list[Callable[[], Any]]] = {
         lambda: (lambda e: (e.reset(seed=0), e.step(np.zeros((1, 2)))))(PointMassGymEnv())
     ],
     "num_envs: got 0, expected a whole number >= 1.": [
-        lambda: GrosZanonLTIEnv(0),
         lambda: GymnasiumPlant("Pendulum-v1").vectorised(0, 5, 1),
     ],
     "B: got shape (2, 1), expected shape (3, n_u). Use torch.tensor(.., dtype=to": [

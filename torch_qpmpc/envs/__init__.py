@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIEnv, GrosZanonLTIGymEnv
+from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIGymEnv
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
 from torch_qpmpc.envs.past_window import PastWindow
 from torch_qpmpc.envs.plant import Plant, PlantEnv
-from torch_qpmpc.envs.plant_gym import PlantGymEnv
 from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.envs.window_observation import WindowObservation
 
 __all__ = [
     "GrosZanonLTI",
-    "GrosZanonLTIEnv",
     "GrosZanonLTIGymEnv",
     "GymnasiumPlant",
     "LinearSystem",
@@ -22,7 +20,6 @@ __all__ = [
     "PastWindow",
     "Plant",
     "PlantEnv",
-    "PlantGymEnv",
     "PointMass",
     "PointMassEnv",
     "PointMassGymEnv",

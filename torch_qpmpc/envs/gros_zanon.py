@@ -1,4 +1,4 @@
-"""Gros and Zanon's linear system, with its Gymnasium and TorchRL environments.
+"""Gros and Zanon's linear system, with its Gymnasium environment.
 
     s+ = A s + B a + [e, 0],    e uniform in (-0.1, 0),    s_0 = [0, 0.15]
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,7 +18,6 @@ from torch import Tensor
 from torch_qpmpc.checks import check_number, check_tensor
 from torch_qpmpc.envs.linear_system import (
     LinearSystem,
-    LinearSystemEnv,
     LinearSystemGymEnv,
     Rng,
     float64,
@@ -100,26 +99,3 @@ class GrosZanonLTIGymEnv(LinearSystemGymEnv):
 
     def __init__(self, physics: GrosZanonLTI | None = None) -> None:
         super().__init__(GrosZanonLTI() if physics is None else physics)
-
-
-class GrosZanonLTIEnv(LinearSystemEnv):
-    """A :class:`LinearSystemEnv` of a `GrosZanonLTI`.
-
-    Args:
-        physics: the system; None for ``GrosZanonLTI()``.
-        num_envs, max_steps, options: as in :class:`LinearSystemEnv`.
-
-    Raises:
-        QPError: if an argument does not fit.
-    """
-
-    def __init__(
-        self,
-        num_envs: int = 8,
-        physics: GrosZanonLTI | None = None,
-        max_steps: int = 5000,
-        **options: Any,
-    ) -> None:
-        super().__init__(
-            GrosZanonLTI() if physics is None else physics, num_envs, max_steps, **options
-        )

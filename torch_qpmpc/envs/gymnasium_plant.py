@@ -146,9 +146,6 @@ class GymnasiumPlant:
 
         return np.array_equal(episode(), episode(), equal_nan=True)
 
-    def true_model(self) -> None:
-        """Return None, as the plant can only be stepped."""
-
     def violation(self, s: Tensor) -> Tensor:
         """Return how far s ``(*batch, n_x)`` is outside its space, summed, ``(*batch,)``.
 

@@ -255,14 +255,10 @@ class LinearSystemEnv(VectorisedEnv):
 
     Args:
         physics: the system.
-        num_envs: number of episodes run side by side, the batch size.
-        max_steps: steps of an episode.
-        dtype: dtype of observation, action and reward; the physics stays in float64.
-        device: device of the TensorDicts and of the generator; None for the CPU.
-        seed: seed of the generator; None draws one from torch's global generator.
+        num_envs, max_steps, dtype, device, seed: as in `VectorisedEnv`.
 
     Raises:
-        QPError: if an argument does not fit, such as ``num_envs`` or ``max_steps`` below 1.
+        QPError: an argument does not fit.
     """
 
     def __init__(

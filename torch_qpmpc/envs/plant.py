@@ -109,10 +109,6 @@ class Plant(ABC):
         check_tensor("a", a, self.n_u)
         return a.to(self.lb_a).clamp(self.lb_a, self.ub_a)
 
-    def true_model(self) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Return A, B and the offset of a linear model of the outputs; here None."""
-        return None
-
     def violations(self, batch: TensorDictBase) -> Tensor:
         """Return the `violation` of each transition of a collected ``batch``."""
         return batch["violation"]
@@ -142,15 +138,11 @@ class PlantEnv(VectorisedEnv):
 
     Args:
         plant: the plant.
-        num_envs: number of episodes run side by side, the batch size.
-        max_steps: steps of an episode.
-        dtype: dtype of observation, preview, action and reward; the plant stays in float64.
-        device: device of the TensorDicts and of the generator; None for the CPU.
-        seed: seed of the generator; None draws one from torch's global generator.
+        num_envs, max_steps, dtype, device, seed: as in `VectorisedEnv`.
         episodes: number of different episodes of signals.
 
     Raises:
-        QPError: if an argument does not fit, such as ``num_envs`` or ``episodes`` below 1.
+        QPError: an argument does not fit.
     """
 
     def __init__(

@@ -24,6 +24,16 @@ class VectorisedEnv(EnvBase):
 
     Episodes are truncated at ``max_steps`` (no ``StepCounter`` needed), so that a collector resets
     them and changes their trajectory ids.
+
+    Args:
+        num_envs: number of episodes run side by side, the batch size.
+        max_steps: steps of an episode.
+        dtype: dtype of what the environment emits and of the action; the plant stays in float64.
+        device: device of the TensorDicts and of the generator; None for the CPU.
+        seed: seed of the generator; None draws one from torch's global generator.
+
+    Raises:
+        QPError: an argument does not fit, such as ``num_envs`` or ``max_steps`` below 1.
     """
 
     def __init__(

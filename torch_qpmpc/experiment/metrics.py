@@ -14,6 +14,7 @@ from torch_qpmpc.analysis.plots import constraint_figure, policy_figure, slice_b
 from torch_qpmpc.analysis.prediction_form import prediction_form
 from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.analysis.structure import distance_by_band, nearest_model
+from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.envs.closed_loop import cost_text, gap_text
 from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.evaluation import Evaluation
@@ -66,7 +67,9 @@ def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str
     summary |= {"updates": cfg.updates, **tally.summary()}
     if mpc is None:
         return summary
-    return summary | structure_summary(mpc, evaluation.physics.true_model())
+    physics = evaluation.physics
+    model = physics.true_model() if isinstance(physics, LinearSystem) else None
+    return summary | structure_summary(mpc, model)
 
 
 def report(

@@ -8,9 +8,15 @@ from omegaconf import DictConfig
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.envs.point_mass import NOISE_STD
 from torch_qpmpc.experiment.rivals import Policy, tightened
-from torch_qpmpc.experiment.tasks.registry import Task, named, plant_scheme, register
+from torch_qpmpc.experiment.tasks.registry import Task, plant_scheme, register
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
+
+#: Names of the signals, for figures.
+NAMES = {
+    "outputs": ("x", "y", "velocity in x", "velocity in y"),
+    "actions": ("force in x", "force in y"),
+}
 
 
 def make_plant(cfg: DictConfig) -> PointMass:
@@ -44,7 +50,7 @@ register(
         wrong_scheme,
         true_scheme,
         noises=tuple(NOISE_STD),
-        episode=named(("x", "y", "velocity in x", "velocity in y"), ("force in x", "force in y")),
+        episode=lambda plant, d: NAMES,
         takes_noise_std=True,
         rivals={"tightened": tightened_mpc},
         defaults=None,

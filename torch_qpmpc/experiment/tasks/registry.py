@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, Self
@@ -155,11 +155,6 @@ def priced(cfg: DictConfig, bounds: Bounds) -> Bounds:
     """Return the bounds with the slack weights of ``cfg.task``."""
     slacks = {name: cfg.task[name] for name in ("state_slack", "action_slack", "discount_slack")}
     return replace(bounds, **slacks)
-
-
-def named(outputs: Sequence[str], actions: Sequence[str]) -> Callable[[Any, Tensor], Any]:
-    """Return a `Task.episode` with the names of a plant's signals; it may hide the last outputs."""
-    return lambda plant, d: {"outputs": outputs[: plant_layout(plant, 1).n_x], "actions": actions}
 
 
 def register(task: Task) -> None:
