@@ -18,6 +18,7 @@ from torch_qpmpc.export.library import Library, compiler
 from torch_qpmpc.export.reference import LARGE, Reference, reference, sharpen
 from torch_qpmpc.export.tables import Array, Tables, make_tables
 from torch_qpmpc.export.writer import (
+    CONSTANTS,
     NEAR,
     REAL,
     Labels,
@@ -239,8 +240,12 @@ def _states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, Reference]:
 def _compare(
     mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Reference
 ) -> tuple[Agreement, float]:
-    """Return the agreement, and the largest error of an action relative to its size."""
-    steps = library.steps(library.states(len(p)), p, tables.n_u)
+    """Return the agreement, and the largest error of an action relative to its size.
+
+    An error within the tolerances of the rows that the action follows from counts as none.
+    """
+    states = library.states(len(p))
+    steps = library.steps(states, p, tables.n_u)
     solvable = exact.status == Status.SOLVED
     both = solvable & (steps.codes == 0)
 
@@ -264,7 +269,28 @@ def _compare(
         unsolved=int((solvable & ~both).sum()),
         iterations=int(steps.iterations.max(initial=0)),
     )
-    return agreement, float((u / sizes)[both].max(initial=0))
+    errors = np.where(both, u / sizes, 0)
+    for i in np.flatnonzero(errors > NEAR[str(library.real)].u):
+        lam = library.multipliers(states, len(tables.rows))[i]
+        if u[i] <= _tolerance(tables, str(library.real), p[i], lam):
+            errors[i] = 0
+    return agreement, float(errors.max(initial=0))
+
+
+def _tolerance(tables: Tables, dtype: str, p: Array, lam: Array) -> float:
+    """Return the largest error of u_0 that the tolerances of the held rows allow.
+
+    A held row of policy.c is at its bound to within ``TOLERANCE size + ROUNDING |lam|``. An error
+    dy of the held rows h is, by the tables, an error ``F_h Q_hh^-1 dy`` of u_0.
+    """
+    tight, rounding = (
+        float(CONSTANTS[dtype][key].rstrip("f")) for key in ("TOLERANCE", "ROUNDING")
+    )
+    held = (lam != 0) & (np.abs(lam) < tables.rows.w)
+    size = tables.rows.size + np.abs(tables.rows.Y) @ np.abs(p)
+    error = tight * size[held] + rounding * np.abs(lam).sum()
+    gain = np.linalg.lstsq(tables.Q[np.ix_(held, held)], tables.F[:, held].T, rcond=None)[0]
+    return float((error @ np.abs(gain)).max(initial=0))
 
 
 def _refuse(dtype: str, got: str, tables: Tables) -> None:

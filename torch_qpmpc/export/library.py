@@ -125,6 +125,11 @@ class Library:
         self._resets(states.ctypes.data, count)
         return states
 
+    def multipliers(self, states: np.ndarray, rows: int) -> np.ndarray:
+        """Return the multipliers of each controller's last step, ``(count, rows)``."""
+        lam = states.reshape(-1, self.state_bytes)[:, : rows * self.real.itemsize]
+        return np.ascontiguousarray(lam).view(self.real)
+
     def steps(self, states: np.ndarray, p: np.ndarray, n_u: int) -> Steps:
         """Step each controller with its p ``(count, n_p)``."""
         p = np.ascontiguousarray(p, dtype=self.real)

@@ -199,9 +199,12 @@ def _known(Y: Array, y_0: Array, lb: Array, ub: Array, w: Array) -> Rows:
 
 
 def _implied(C: Array, T_p: Array, z_b: Array, b: Array) -> Rows:
-    """Return the equations of p that remain of C z = b if its rows are dependent on the plan."""
+    """Return the equations of p that remain of C z = b if its rows are dependent on the plan.
+
+    The rounding of T_p and z_b is a fraction of their largest entries, and not of a row's.
+    """
     Y, y_0 = C @ T_p, C @ z_b
-    size = np.abs(C) @ np.abs(T_p).sum(-1) + np.abs(C) @ np.abs(z_b) + np.abs(b)
+    size = np.abs(C).sum(-1) * (np.abs(T_p).sum(-1) + np.abs(z_b)).max() + np.abs(b)
     remain = np.maximum(np.abs(Y).max(-1, initial=0), np.abs(y_0 - b)) > 1e-9 * size
     b, hard = b[remain], np.full(remain.sum(), np.inf)
     return _known(Y[remain], y_0[remain], b, b, hard)
