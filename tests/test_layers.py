@@ -68,7 +68,7 @@ RESERVED = {
     "omegaconf": {"experiment", "study"},
     "pydantic": {"experiment"},
     "torchrl": {"learning", "envs", "experiment"},
-    "matplotlib": {"analysis", "control", "experiment", "proofs", "study"},
+    "matplotlib": {"analysis", "control", "experiment", "study"},
 }
 FILES = [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "__init__.py"]
 

@@ -13,17 +13,19 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from tests.benchmarks.rows import write
 from torch_qpmpc import QPMPC, SolverError
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.proofs import Plant, Polytope, largest_violation
+from torch_qpmpc.study.markdown import replaced, table
 
 SAMPLES = 1_000_000
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "prove.md"
 TITLES = ("problem", "steps", "worst case", "bound", "attack", "binaries / nodes", "CPU, s")
 #: Limit of each mixed-integer program.
 SECONDS = 30.0
@@ -161,7 +163,9 @@ def main(arguments: list[str] | None = None) -> int:
                     rows.append(measured(name, horizon, structure, steps))
                     print(" | ".join(rows[-1]), flush=True)
         if options.write:
-            write(f"proofs: {name}", TITLES, rows)
+            text = PAGE.read_text(encoding="utf-8")
+            text = replaced(text, table(TITLES, rows), f"proofs: {name}")
+            PAGE.write_text(text, encoding="utf-8")
     return 0
 
 

@@ -20,7 +20,7 @@ from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.learning.penalties import SystemIdentificationPenalty
 from torch_qpmpc.learning.prediction_errors import PredictionErrors
 from torch_qpmpc.learning.updates import first_order, second_order
-from torch_qpmpc.proofs import Polytope, explicit_law
+from torch_qpmpc.proofs import Polytope, largest_difference
 
 COST: Any = {"stage_weight": [1.0, 1.0, 0.1], "action_bounds": ([-1.0], [1.0]), "solver": "daqp"}
 N = 4
@@ -236,7 +236,7 @@ def test_files_copies_and_state_dicts_have_the_schedule(model, tmp_path):
     [
         lambda mpc: mpc.model(),
         lambda mpc: mpc.export_c("nowhere"),
-        lambda mpc: explicit_law(mpc, Polytope.box([-1.0, -1.0], [1.0, 1.0])),
+        lambda mpc: largest_difference(mpc, mpc, Polytope.box([-1.0, -1.0], [1.0, 1.0])),
         read,
         PredictionErrors,
         lambda mpc: first_order(mpc, None, None, None, SystemIdentificationPenalty(1.0)),  # pyright: ignore[reportArgumentType]

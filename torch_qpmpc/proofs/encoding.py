@@ -4,14 +4,9 @@ In the tables of `torch_qpmpc.export.tables` the plan's deviation from its minim
 inequalities is nu, in coordinates in which the cost is ``|nu|^2 / 2``. The rows are
 ``y = Y p + R nu`` with unit rows of R, ``nu = -R'lam``, and u_0 is affine in p and lam. A binary
 for each bound says that the row is at the bound or beyond it, another that its multiplier is at the
-soft row's price w. What the binaries switch needs bounds of y and lam. They are derived:
-
-- The least cost J(p) is convex, so that its largest value on a polytope is at a vertex, and
-  ``|nu|^2 <= 2 J``.
-- A soft row's multiplier is at most w.
-- With a plan whose hard rows have slack, its cost bounds the hard rows' multipliers:
-  ``sum_i |lam_i| slack_i <= J``, by weak duality.
-- Linear programs, the relaxation of the encoding itself, then tighten all of them.
+soft row's price w. What the binaries switch needs bounds of y and lam: by the least cost, which is
+convex in p and so largest at a vertex, by w or, of hard rows, by the cost of a plan with slack, and
+then by linear programs over the relaxation.
 
 Reference: the encoding is that of Schwan, Jones and Kuhn (2023), "Stability verification of neural
 network controllers using mixed-integer programming", IEEE TAC, for multi-parametric QPs.
@@ -27,12 +22,11 @@ from scipy.optimize import linprog
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.tables import Tables
-from torch_qpmpc.proofs.program import Affine, Program
+from torch_qpmpc.proofs.program import Affine, Array, Program
 from torch_qpmpc.qp.program import QuadraticProgram, Status
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve_qp
 
-Array = np.ndarray
 #: Fraction of the largest possible slack that the plan with slack has in its hard rows.
 SHARE = 0.5
 #: Rounds of bound tightening.
@@ -55,10 +49,8 @@ def encode(program: Program, tables: Tables, p: Affine, vertices: Array) -> Affi
     """Add the policy's optimality conditions, and return u_0 as a function of the variables.
 
     Args:
-        program: the program, which contains p and the rows that bound it.
-        tables: the policy.
-        p: the known entries, ``(n_p,)``.
-        vertices: points whose convex hull contains p, ``(count, n_p)``.
+        program, tables: the program, which contains p and the rows that bound it; the policy.
+        p, vertices: the known entries, ``(n_p,)``; points whose hull contains p, ``(count, n_p)``.
 
     Raises:
         QPError: the QP is infeasible at a vertex, or its hard rows leave no interior there.
@@ -80,17 +72,13 @@ def _derived(tables: Tables, vertices: Array) -> Reach:
     if hard.any():
         slack = SHARE * _slack(tables.R[hard], lower[:, hard], upper[:, hard], vertices)
     slack_of = hard * slack[:, None]
-    solution = solve_rows(tables.R, lower + slack_of, upper - slack_of, rows.w)
+    solution = _solve_rows(tables.R, lower + slack_of, upper - slack_of, rows.w)
     assert (solution.status == Status.SOLVED).all(), "the plan with slack solves these QPs"
     cost = solution.value.numpy().max(initial=0.0)
     radius = np.sqrt(2 * cost) * (1 + MARGIN)
     most = np.where(hard, cost * (1 + MARGIN) / slack.min() if hard.any() else np.inf, rows.w)
-    return Reach(
-        y_free.min(0) - radius,
-        y_free.max(0) + radius,
-        np.where(np.isfinite(rows.upper), most, 0.0),
-        np.where(np.isfinite(rows.lower), most, 0.0),
-    )
+    forces = (np.where(np.isfinite(x), most, 0.0) for x in (rows.upper, rows.lower))
+    return Reach(y_free.min(0) - radius, y_free.max(0) + radius, *forces)
 
 
 def _check_known(tables: Tables, vertices: Array) -> None:
@@ -105,37 +93,28 @@ def _check_known(tables: Tables, vertices: Array) -> None:
 
 def _raise_infeasible(p: Array) -> None:
     at = np.array2string(p, precision=4, separator=", ")
-    raise QPError.expected(
-        "the set of states",
-        f"p = {at}, where the hard rows leave no plan with slack",
-        "states with a plan strictly inside all hard bounds",
-        "Make bounds of states soft (finite w), or take a smaller set.",
-    )
+    got = f"p = {at}, where the hard rows leave no plan with slack"
+    want = "states with a plan strictly inside all hard bounds"
+    remedy = "Make bounds of states soft (finite w), or take a smaller set."
+    raise QPError.expected("the set of states", got, want, remedy)
 
 
 def _slack(R: Array, lower: Array, upper: Array, vertices: Array) -> Array:
     """Return the largest slack that all hard rows can have at each vertex, ``(count,)``."""
-    slack = np.zeros(len(vertices))
-    n = R.shape[1]
-    both = np.concatenate((R, -R))
-    matrix = np.column_stack((both, np.ones(len(both))))
+    slack, n = np.zeros(len(vertices)), R.shape[1]
+    matrix = np.column_stack((np.concatenate((R, -R)), np.ones(2 * len(R))))
     for i, p in enumerate(vertices):
         right = np.concatenate((upper[i], -lower[i]))
         kept = np.isfinite(right)
-        result = linprog(
-            np.append(np.zeros(n), -1.0),
-            matrix[kept],
-            right[kept],
-            bounds=[(None, None)] * n + [(0, None)],
-            method="highs",
-        )
+        bounds = [(None, None)] * n + [(0, None)]
+        result = linprog([0] * n + [-1], matrix[kept], right[kept], bounds=bounds, method="highs")
         if result.status != 0 or result.x[-1] <= 0:
             _raise_infeasible(p)
         slack[i] = result.x[-1]
     return slack
 
 
-def solve_rows(R: Array, lower: Array, upper: Array, w: Array) -> QPSolution:
+def _solve_rows(R: Array, lower: Array, upper: Array, w: Array) -> QPSolution:
     """Solve ``min |nu|^2 / 2 + sum_i w_i dist(R_i nu, [lower_i, upper_i])`` for many bounds."""
     n, zeros = R.shape[1], torch.zeros(1, dtype=torch.float64)
     rows = [torch.as_tensor(x) for x in (R, lower, upper, w)]
@@ -202,9 +181,7 @@ def _add_rows(
         program.constrain(signed.part(within), upper=bound[at][within])
         if len(soft):
             beyond = program.add(np.zeros(len(soft)), np.ones(len(soft)), binary=True)
-            w, over = rows.w[at][soft], (largest - bound)[at][soft]
+            w, over, limit = (x[at][soft] for x in (rows.w, largest - bound, bound))
             program.constrain(force.part(at[soft]) + beyond.times(np.diag(-w)), lower=0.0)
-            program.constrain(
-                signed.part(soft) + beyond.times(np.diag(-over)), upper=bound[at][soft]
-            )
+            program.constrain(signed.part(soft) + beyond.times(np.diag(-over)), upper=limit)
     return lam, (y, up, low)

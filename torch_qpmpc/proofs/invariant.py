@@ -1,24 +1,15 @@
 """A robustly positively invariant polytope of a policy: where the state stays for ever.
 
-Without multipliers the policy is affine, and bounds of u saturate it. Let u(p) = K p + k be the
-affine law, u_c its action at its equilibrium, and theta in (0, 1]. Where ``u_c + theta (u - u_c)``
-is within the bounds, each saturated u_i lies between ``u_i`` and ``u_ci + theta (u_i - u_ci)`` (Hu,
-Lin and Chen). So a convex set that none of these laws leaves is one that the saturated law does not
-leave. Of the states within X and those bounds, the largest one is
+The candidates are the largest such sets O of the affine law without multipliers, u(p) = K p + k,
+saturated by the bounds of u: all p from which no law ``u_c + theta (u - u_c)`` of each saturated
+u_i leaves the bounds, u_c the action at the equilibrium. O has the rows ``a'p <= b`` of the bounds
+and of their predecessors ``(A_j'a)'p <= b - a'c_j - h(a)`` by each law ``p+ = A_j p + c_j + E d``,
+h(a) = max_d a'E d, until all new ones are redundant. The QP does not just saturate its affine law:
+`invariance` of the policy itself decides.
 
-    O = {p: p_t in X for all t >= 0, all d and any such law at each t},
-
-a polytope of the rows ``a'p <= b`` of X and of their predecessors ``(A_j'a)'p <= b - a'c_j - h(a)``
-by each law ``p+ = A_j p + c_j + E d``, h(a) = max_d a'E d, until all new ones are redundant. The QP
-does not just saturate its affine law, so that O is a candidate, and `invariance` of the policy
-itself decides.
-
-References: Gilbert and Tan (1991), "Linear systems with state and control constraints: the theory
-and application of maximal output admissible sets", IEEE TAC 36; with disturbances, Kolmanovsky and
-Gilbert (1998), "Theory and computation of disturbance invariant sets for discrete-time linear
-systems", Mathematical Problems in Engineering 4; saturated, Hu, Lin and Chen (2002), "Analysis and
-design for discrete-time linear systems subject to actuator saturation", Systems & Control Letters
-45.
+References: Gilbert and Tan (1991), IEEE TAC 36; with disturbances, Kolmanovsky and Gilbert (1998),
+Mathematical Problems in Engineering 4; saturated, Hu, Lin and Chen (2002), Systems & Control
+Letters 45.
 """
 
 from __future__ import annotations
@@ -32,17 +23,10 @@ import numpy as np
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.proofs.plant import Plant, check_plants
-from torch_qpmpc.proofs.polytope import Polytope, support
-from torch_qpmpc.proofs.questions import (
-    TOLERANCE,
-    Answer,
-    action,
-    check_states,
-    invariance,
-)
+from torch_qpmpc.proofs.plant import Plant, Polytope, check_plants, support
+from torch_qpmpc.proofs.program import Array
+from torch_qpmpc.proofs.questions import TOLERANCE, Answer, action, check_states, invariance
 
-Array = np.ndarray
 #: Fractions of the bounds that are tried, the largest first.
 SCALES = (1.0, 0.8, 0.6, 0.4, 0.2)
 #: Fractions theta of the gain of a saturated law, all of them at each scale.
@@ -115,15 +99,12 @@ def invariant_set(
             continue
         A, b = _bounds(tables, states, u, gain)
         candidate = _largest(laws, A, scale * b + (1 - scale) * A @ centre)
-        proof = None if candidate is None else _proof(mpc, plants, candidate, seconds)
-        if candidate is not None and proof is not None and proof.proved:
+        if candidate and (proof := _proof(mpc, plants, candidate, seconds)) and proof.proved:
             return InvariantSet(candidate, scale, gain, proof)
-    raise QPError.expected(
-        "states",
-        "a set without a part that is proved invariant",
-        "one that the linear law can stay in, with these disturbances, as the policy does",
-        "Allow smaller disturbances, larger states or more seconds.",
-    )
+    got = "a set without a part that is proved invariant"
+    want = "one that the linear law can stay in, with these disturbances, as the policy does"
+    remedy = "Allow smaller disturbances, larger states or more seconds."
+    raise QPError.expected("states", got, want, remedy)
 
 
 def _laws(tables: Tables, plants: list[Plant], u: Array, gain: float) -> list[Plant]:

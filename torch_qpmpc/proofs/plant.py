@@ -1,18 +1,101 @@
-"""Linear plants with disturbances of a polytope."""
+"""Linear plants with bounded disturbances, and the polytopes of their states and disturbances."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.optimize import linprog
+from scipy.spatial import HalfspaceIntersection, QhullError
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.proofs.polytope import Polytope
 
 Array = np.ndarray
+#: Vertices are enumerated up to this dimension, not counting entries that a box fixes.
+MOST_DIMENSIONS = 8
+
+
+def support(A: Array, b: Array, row: Array) -> float:
+    """Return the support function, max row'x with A x <= b; -inf if empty, nan if undecided."""
+    result = linprog(-row, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
+    return -result.fun if result.status == 0 else {2: -np.inf, 3: np.inf}.get(result.status, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Polytope:
+    """The points x with ``A x <= b``, a bounded set.
+
+    Attributes:
+        A, b: ``(m, n)`` and ``(m,)``.
+        lower, upper: the bounding box, ``(n,)`` each.
+
+    Raises:
+        QPError: the shapes do not fit, entries are not finite, or the set is empty or unbounded.
+    """
+
+    A: Array
+    b: Array
+    lower: Array
+    upper: Array
+
+    @classmethod
+    def of(cls, A: Any, b: Any) -> Polytope:
+        """Make ``{x: A x <= b}``."""
+        A, b = np.array(A, float), np.array(b, float)
+        if A.ndim != 2 or b.shape != A.shape[:1]:
+            got = f"shapes {A.shape} and {b.shape}"
+            raise QPError.expected("A and b of the polytope", got, "(m, n) and (m,)")
+        if not (np.isfinite(A).all() and np.isfinite(b).all()):
+            raise QPError.expected("A and b of the polytope", "NaN or inf", "finite entries")
+        eye = np.eye(A.shape[1])
+        upper, lower = (np.array([support(A, b, row) for row in rows]) for rows in (eye, -eye))
+        for end in (*upper, *lower):
+            if not np.isfinite(end):
+                kind = {-np.inf: "an empty", np.inf: "an unbounded"}.get(end, "an undecided")
+                raise QPError.expected("A and b of the polytope", f"{kind} set", "a bounded one")
+        return cls(A, b, -lower, upper)
+
+    @classmethod
+    def box(cls, lower: Any, upper: Any) -> Polytope:
+        """Make ``{x: lower <= x <= upper}``."""
+        lower, upper = np.array(lower, float), np.array(upper, float)
+        if lower.ndim != 1 or lower.shape != upper.shape:
+            got = f"shapes {lower.shape} and {upper.shape}"
+            raise QPError.expected("lower and upper", got, "(n,) each")
+        if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower <= upper).all()):
+            got = f"{lower} and {upper}"
+            raise QPError.expected("lower and upper", got, "finite entries with lower <= upper")
+        eye = np.eye(len(lower))
+        return cls(np.concatenate((eye, -eye)), np.concatenate((upper, -lower)), lower, upper)
+
+    def is_box(self) -> bool:
+        """Return True if the set is its bounding box."""
+        return bool(((self.A != 0).sum(1) <= 1).all())
+
+    def vertices(self) -> Array:
+        """Return the vertices, ``(count, n)``.
+
+        Raises:
+            QPError: more than 8 entries vary, or the set has no interior and is no box.
+        """
+        n, ends = len(self.lower), [sorted({*x}) for x in zip(self.lower, self.upper, strict=True)]
+        if (varying := sum(len(x) - 1 for x in ends)) > MOST_DIMENSIONS:
+            got, want = f"{varying} dimensions", f"at most {MOST_DIMENSIONS}"
+            raise QPError.expected("the set", got, want)
+        if self.is_box():
+            return np.array(list(itertools.product(*ends)))
+        with_radius = np.column_stack((self.A, np.linalg.norm(self.A, axis=1)))
+        bounds = [(None, None)] * n + [(0, None)]
+        inner = linprog([0] * n + [-1], with_radius, self.b, bounds=bounds, method="highs")
+        try:
+            cut = HalfspaceIntersection(np.column_stack((self.A, -self.b)), inner.x[:n])
+        except QhullError as error:
+            raise QPError.expected("the set", "a flat polytope", "one with an interior") from error
+        return cut.intersections[np.isfinite(cut.intersections).all(1)]
 
 
 @dataclass(frozen=True, eq=False)

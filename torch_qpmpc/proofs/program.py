@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,13 +19,7 @@ UNKNOWN = 4
 
 @dataclass(frozen=True, eq=False)
 class Affine:
-    """``matrix x[columns] + constant`` in the variables x of a program.
-
-    Attributes:
-        columns: ``(k,)``.
-        matrix: ``(m, k)``.
-        constant: ``(m,)``.
-    """
+    """``matrix x[columns] + constant`` with ``(m, k)``, ``(k,)``, ``(m,)``; x are variables."""
 
     columns: Array
     matrix: Array
@@ -79,8 +74,7 @@ class Program:
 
     def copy(self) -> Program:
         """Return a program with the same variables and rows."""
-        other = Program()
-        other.lower, other.upper, other.binary = self.lower, self.upper, self.binary
+        other = copy.copy(self)
         other._rows = list(self._rows)
         return other
 

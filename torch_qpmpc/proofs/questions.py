@@ -15,11 +15,9 @@ from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.proofs.encoding import encode
-from torch_qpmpc.proofs.plant import Plant, check_plants
-from torch_qpmpc.proofs.polytope import Polytope
-from torch_qpmpc.proofs.program import Affine, Program
+from torch_qpmpc.proofs.plant import Plant, Polytope, check_plants
+from torch_qpmpc.proofs.program import Affine, Array, Program
 
-Array = np.ndarray
 #: A worst case up to this counts as zero: HiGHS' feasibility tolerance is 1e-6.
 TOLERANCE = 1e-5
 #: A replayed worst case differs from the program's by at most this, relatively.
@@ -63,15 +61,14 @@ class Answer:
         return self.value > TOLERANCE
 
     def __str__(self) -> str:
-        effort = f"{self.seconds:.1f} s, {self.nodes:,} nodes, {self.binaries} binaries"
-        at = np.array2string(self.states[0], precision=4, separator=", ")
+        outcome = f"undecided, between {self.value:.4g} and {self.bound:.4g}"
         if self.proved:
-            return f"{self.question}: proved, at most {self.bound:.3g} ({effort})"
-        if self.refuted:
-            return f"{self.question}: {self.value:.4g} from p = {at} ({effort})"
-        return (
-            f"{self.question}: undecided, between {self.value:.4g} and {self.bound:.4g} ({effort})"
-        )
+            outcome = f"proved, at most {self.bound:.3g}"
+        elif self.refuted:
+            at = np.array2string(self.states[0], precision=4, separator=", ")
+            outcome = f"{self.value:.4g} from p = {at}"
+        effort = f"{self.seconds:.1f} s, {self.nodes:,} nodes, {self.binaries} binaries"
+        return f"{self.question}: {outcome} ({effort})"
 
 
 def largest_violation(
@@ -111,9 +108,8 @@ def largest_violation(
         True
     """
     n = check_states(mpc, states)
-    sides = ((-1.0, lower), (1.0, upper))
     rows, right = [], []
-    for sign, bound in sides:
+    for sign, bound in ((-1.0, lower), (1.0, upper)):
         bound = np.full(n, np.inf) if bound is None else sign * np.array(bound, float)
         if bound.shape != (n,) or np.isnan(bound).any():
             raise QPError.expected("lower and upper", f"{bound}", f"({n},) numbers")
@@ -146,8 +142,8 @@ def invariance(
     into = states if into is None else into
     check_states(mpc, into)
     length = np.linalg.norm(into.A, axis=1)
-    A, b = into.A / length[:, None], into.b / length
     question = f"outside the set after {steps} step{'s' * (steps > 1)}"
+    A, b = into.A / length[:, None], into.b / length
     return _worst(question, mpc, plant, states, A, b, steps, seconds)
 
 
@@ -164,9 +160,8 @@ def largest_difference(
     check_states(second, states)
     if first.n_u != second.n_u:
         raise QPError.expected("second", f"{second.n_u} actions", f"{first.n_u}")
-    began, program = time.perf_counter(), Program()
+    program, tables = Program(), make_tables(first)
     p, vertices = _known(program, states), states.vertices()
-    tables = make_tables(first)
     u, other = (encode(program, x, p, vertices) for x in (tables, make_tables(second)))
     difference = u + other.times(-np.eye(first.n_u))
     signs = np.concatenate((np.eye(first.n_u), -np.eye(first.n_u)))
@@ -175,10 +170,9 @@ def largest_difference(
         at = p.at(x)
         return signs @ (action(first, at) - action(second, at)), at[None], ()
 
-    worst = _Worst(np.full((1, n), np.nan))
+    worst = _Worst("largest difference of the policies", tables.digest, np.full((1, n), np.nan))
     worst.maximise(program, difference.times(signs), replay, seconds)
-    question = "largest difference of the policies"
-    return worst.answer(question, time.perf_counter() - began, tables.digest)
+    return worst.answer()
 
 
 def check_states(mpc: QPMPC, states: Polytope) -> int:
@@ -220,9 +214,9 @@ def _worst(
     if steps < 1 or len(plants) ** steps > MOST_MODELS:
         got = f"{steps} steps of {len(plants)} plants"
         raise QPError.expected("steps", got, f"at least one step, and {MOST_MODELS} combinations")
-    began, tables, program = time.perf_counter(), make_tables(mpc), Program()
+    tables, program = make_tables(mpc), Program()
     start = _known(program, states)
-    worst = _Worst(np.full((steps + 1, mpc.n_p), np.nan))
+    worst = _Worst(question, tables.digest, np.full((steps + 1, mpc.n_p), np.nan))
     for branch in _branches(program, tables, start, states.vertices(), plants, steps):
 
         def replay(x: Array, branch: _Branch = branch) -> tuple[Array, Array, tuple[Array, ...]]:
@@ -231,7 +225,7 @@ def _worst(
             return A @ run[-1] - b, run, noise
 
         worst.maximise(branch.program, branch.p.times(A).plus(-b), replay, seconds)
-    return worst.answer(question, time.perf_counter() - began, tables.digest)
+    return worst.answer()
 
 
 class _Branch(NamedTuple):
@@ -244,12 +238,7 @@ class _Branch(NamedTuple):
 
 
 def _branches(
-    program: Program,
-    tables: Tables,
-    p: Affine,
-    vertices: Array,
-    plants: Sequence[Plant],
-    steps: int,
+    program: Program, tables: Tables, p: Affine, vertices: Array, plants: list[Plant], steps: int
 ) -> Iterator[_Branch]:
     """Add ``steps`` steps of the policy and each plant from p, in the hull of ``vertices``."""
     u = encode(program, tables, p, vertices)
@@ -270,9 +259,10 @@ def _branches(
 class _Worst:
     """The largest of several maxima, each replayed by the policies; ``run`` has no point yet."""
 
-    def __init__(self, run: Array) -> None:
+    def __init__(self, question: str, digest: str, run: Array) -> None:
+        self.question, self.digest, self.run, self.noise = question, digest, run, ()
         self.value, self.bound, self.nodes, self.binaries = -np.inf, -np.inf, 0, 0
-        self.run, self.noise = run, ()
+        self.began = time.perf_counter()
 
     def maximise(
         self,
@@ -289,23 +279,19 @@ class _Worst:
             if not np.isfinite(maximum.value):
                 continue
             values, run, noise = replay(maximum.x)
-            compare_replay(float(values[i]), maximum.value)
+            if abs(values[i] - maximum.value) > AGREEMENT * (1 + abs(values[i])):
+                raise SolverError(
+                    f"The policy gives {values[i]:.6g} where the program says {maximum.value:.6g}: "
+                    "the program's tolerances are too wide for this QP. Scale the states to "
+                    "numbers of order one, or lower the prices w of soft rows."
+                )
             if values.max() > self.value:
                 self.value, self.run, self.noise = float(values.max()), run, noise
 
-    def answer(self, question: str, seconds: float, digest: str) -> Answer:
-        effort = seconds, self.nodes, self.binaries
-        return Answer(question, self.value, self.bound, self.run, self.noise, *effort, digest)
-
-
-def compare_replay(value: float, computed: float) -> None:
-    """Raise if the replayed value is not the computed one, whose tolerances then hide errors."""
-    if abs(value - computed) > AGREEMENT * (1 + abs(value)):
-        raise SolverError(
-            f"The policy gives {value:.6g} where the program says "
-            f"{computed:.6g}: the program's tolerances are too wide for this QP. Scale the "
-            "states to numbers of order one, or lower the prices w of soft rows."
-        )
+    def answer(self) -> Answer:
+        seconds = time.perf_counter() - self.began
+        of = self.value, self.bound, self.run, self.noise, seconds, self.nodes, self.binaries
+        return Answer(self.question, *of, self.digest)
 
 
 def _reached(program: Program, p: Affine) -> Polytope:
