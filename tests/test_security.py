@@ -117,9 +117,7 @@ def test_a_module_is_imported_if_the_command_line_names_it(runs, tmp_path, mark,
     folder = shutil.copytree(runs / "gym", tmp_path / "run")
     monkeypatch.syspath_prepend(folder)
     module(folder, mark)
-    with pytest.raises(
-        SystemExit, match=r"names other code .* task.id=theirs:Id-v0$"
-    ):
+    with pytest.raises(SystemExit, match=r"names other code .* task.id=theirs:Id-v0$"):
         resume(folder, "task=gymnasium", "task.id=theirs:Other-v0")
     assert not mark.exists()
     with pytest.raises(SystemExit, match=r"^task\.id: got 'theirs:Id-v0', expected an environment"):

@@ -2,7 +2,7 @@
 
     x+ = A x + B u (1 + xi) + e,    cost = 1/2 [x; u]' W [x; u],    x = [position, velocity]
 
-The mean of x+ is that of a known linear model, but a large action makes the next state uncertain.
+A known linear model predicts the mean of x+, but a large action makes the next state uncertain.
 Without active bounds the optimal policy is linear (Wonham, SIAM J. Control 1967; de Koning,
 Automatica 1982). With task.hidden_velocity=true only the position is measured: an action moves it
 two steps later, and the optimal policy is linear in the window [p_{k-1}, u_{k-1}, p_k].
@@ -106,7 +106,7 @@ def noisy_stage_weight(A, B, W, gamma, std, delay=0):
 
 
 def measured(plant, W):
-    """Return the weight of the measured states and the action, and that of x_N with a window."""
+    """Return the weight of the measured states and the action and, with a window, of x_N."""
     seen = [*range(plant.n_y), -1]
     return W[seen][:, seen], W[:1, :1] if plant.past > 1 else None
 

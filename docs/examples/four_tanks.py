@@ -2,7 +2,7 @@
 
     x+ = A x + B u + v,    y = [x_1, x_2] + e,    cost = 35 |y - r|^2 + 1e-4 |u - u_r|^2
 
-The cost is that of the noiseless outputs. p is a window of the last 10 outputs and actions. The
+The cost counts outputs without their noise. p is a window of the last 10 outputs and actions. The
 model is the linearised one of Berberich, Köhler, Müller and Allgöwer, "Data-driven model predictive
 control with stability and robustness guarantees" (IEEE TAC 2021, arXiv 1906.04679).
 

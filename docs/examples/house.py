@@ -5,7 +5,7 @@
 
 Units are kW, K, hours and EUR. An episode is a day from midnight, in steps of a quarter of an hour.
 Price, comfort band and weather are known 8 hours ahead. The gain is heat from people: more each
-evening, and a random part, both hidden. Model, tariff and weather are those of leap-c's tutorial
+evening, and a random part, both hidden. Model, tariff and weather are from leap-c's tutorial
 (notebooks 06 to 08), whose planner assumes R = 2 where the room has 1.4.
 
     python train.py task.file=docs/examples/house.py

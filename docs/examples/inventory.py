@@ -3,7 +3,7 @@
     x+ = x + o - d,    o+ = u,    cost = holding max(x, 0) + backlog max(-x, 0)
 
 x is the stock, negative if demand waits, o the order that arrives next, u the new order, of at most
-6.5, and d a log-normal demand with mean 5. The mean of x+ is that of a known linear model, but a
+6.5, and d a log-normal demand with mean 5. A known linear model predicts the mean of x+, but a
 plan for the mean demand keeps no safety stock. The rows of the QP give V kinks at nine stocks, so
 that its prices can follow the expected cost.
 

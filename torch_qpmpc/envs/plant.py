@@ -1,4 +1,4 @@
-"""Plants of which some signals are known in advance, such as prices and forecasts, or are hidden.
+"""Plants with signals that are known in advance, such as prices and forecasts, or hidden.
 
     x+ = f(x, u, w),    y = h(x, w),    cost L(x, u, w)
 

@@ -15,7 +15,7 @@ from torch_qpmpc.errors import QPError
 
 
 class VectorisedEnv(EnvBase):
-    """``num_envs`` episodes side by side, without a Python loop, of which none terminates.
+    """``num_envs`` episodes side by side, without a Python loop; none of them terminates.
 
     Its only state is the generator. Whatever else a step needs travels in the TensorDict as hidden
     entries beside the observation, ``step_count`` ``(num_envs, 1)`` among them. At a partial reset,

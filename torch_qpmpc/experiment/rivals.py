@@ -38,15 +38,14 @@ def zero_action(plant: Any) -> Policy:
 def tightened(plant: LinearSystem, weight: Tensor, W: Tensor, walk: bool = False) -> Policy:
     """Make chance-constrained MPC: the true model, and bounds tightened by its noise.
 
-    A planned bound then holds with a probability of 95 %, as in `torch_qpmpc.mpc.tightening`. The
-    spread of the predictions is that of the linear quadratic regulator. There is no discount.
+    A planned bound then holds with a probability of 95 %, as in `torch_qpmpc.mpc.tightening`, with
+    the linear quadratic regulator as feedback. There is no discount.
 
     Args:
         plant: the plant.
         weight: the stage weight, ``(n_x + n_u, n_x + n_u)``.
-        W: covariance of the noise ``(n_x, n_x)`` or, of a ``walk``, of its steps. A walk is a state
-            whose first variance is the mean of an episode.
-        walk: True if the noise is a random walk.
+        W: covariance of the noise or, with ``walk``, of its steps, ``(n_x, n_x)``.
+        walk: the noise is a random walk, whose first variance is the mean over an episode.
     """
     A, B, offset = plant.true_model()
     K = -lqr_gain(A, B, weight)

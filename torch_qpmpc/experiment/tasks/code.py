@@ -133,7 +133,7 @@ def _strings(value: Any) -> Iterator[str]:
 
 
 def _is_module(name: str) -> bool:
-    """Return True if ``name`` could be imported; only its parent's finder is asked."""
+    """Return True if ``name`` could be imported; its code does not run."""
     if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*", name):
         return False
     try:

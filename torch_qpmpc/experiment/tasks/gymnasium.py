@@ -41,7 +41,7 @@ class GymnasiumSettings(TaskSettings):
     eval_steps: Steps  # pyright: ignore[reportIncompatibleVariableOverride]
     #: Take the bounds of the observation space as constraints.
     observation_bounds: Flag
-    #: L of the window of outputs and actions that the QP sees; null for that of the chosen start.
+    #: L of the window of outputs and actions that the QP sees; null: the chosen start sets it.
     past: Steps = None
     #: Episodes by which a start from data is chosen; 0 for the run's own start.
     start_episodes: Whole = 0

@@ -77,9 +77,8 @@ class Task:
         name: the choice in ``task=NAME``.
         make_plant: makes the plant of a configuration, of any kind.
         wrong_scheme: makes the scheme that learning starts from, of a configuration and a plant,
-            as by `plant_scheme`. Where the cost has no terminal weight, it is that of
-            ``task.terminal_weight``. With ``start=data`` the model is that of the log, and so is
-            the cost if its ``stage_weight`` is None.
+            as by `plant_scheme`. ``task.terminal_weight`` fills in a missing terminal weight.
+            ``start=data`` replaces the model and, if its ``stage_weight`` is None, the cost.
         true_scheme: makes the true scheme, likewise; None if the plant's model is unknown.
         masks: makes, likewise, the masks of parts that are learned only in some entries.
         closed_loop: the function of `torch_qpmpc.envs.closed_loop` for the plant's kind.
@@ -137,7 +136,7 @@ def plant_scheme(
         plant: gives the sizes and the bounds.
         model: see `torch_qpmpc.Model`.
         stage_weight: W of the cost 1/2 [x; u]' W [x; u], or its diagonal.
-        state_bounds: by default those of the plant; a `Plant` has none.
+        state_bounds: by default the bounds of the plant; a `Plant` has none.
     """
     if state_bounds is None and not isinstance(plant, Plant):
         state_bounds = plant.lb_s, plant.ub_s
@@ -161,7 +160,7 @@ def register(task: Task) -> None:
     """Make ``task=NAME`` a choice of train.py; registering it again replaces the task.
 
     Raises:
-        QPError: the name is that of a built-in task.
+        QPError: a built-in task has the name.
     """
     check_kind("task", task, Task)
     known = TASKS.get(task.name)
