@@ -99,14 +99,14 @@ def _train(
     scheme = learning_start(cfg, identified)
     mpc = start if scheme is identified else make_mpc(cfg, physics, scheme)
 
-    # The learner: Q-learning of first or second order, or actor-critic.
-    operator = make_operator(cfg, mpc)
+    # The learner: Q-learning of first or second order.
+    operator = make_operator(mpc)
     released = state is not None and state["arguments"]["structure"] != mpc.structure
     if released:
         mpc.release()
-    learner = make_learner(cfg, operator, physics, done=cfg.release if released else 0)
+    learner = make_learner(cfg, operator, done=cfg.release if released else 0)
     replay = make_run_replay(cfg, mpc)
-    gate = RunGate(cfg, learner, physics, identified, replay, quiet)
+    gate = RunGate(cfg, learner, physics)
     if state is None and mpc is not start:
         gate.keep(start)
 
@@ -126,7 +126,7 @@ def _train(
             tally = Tally()
             report(run, gate.mpc, evaluation, 0)
             for batch in itertools.islice(stream, warm_up):
-                learner.observe(batch)
+                learner.loss_module.observe(batch)
                 replay.extend(batch)
                 interrupt.exit_if_signalled(f"Stopped before the first update: {command}")
             if identified is not None and identified.cost is not None and warm_up:
@@ -152,7 +152,7 @@ def _train(
         for update in range(tally.update + 1, cfg.updates + 1):
             with tally.timed() as watch:
                 batch = next(stream)
-                learner.observe(batch)
+                learner.loss_module.observe(batch)
                 replay.extend(batch)
                 watch.collected()
 
@@ -163,7 +163,7 @@ def _train(
                 terms, losses = learner.learn(sample, windows)
                 if cfg.replay:
                     replay.remember(sample)
-                learner.advance()
+                learner.scheduler.step()
             tally.add(batch, physics.violations(batch))
             progress.update()
 
@@ -171,7 +171,7 @@ def _train(
                 run.log(update_metrics(terms, losses, tally, watch, mpc, learner), update)
             if update == cfg.release:
                 mpc.release()
-                learner = make_learner(cfg, operator, physics, done=update)
+                learner = make_learner(cfg, operator, done=update)
                 gate.release(learner)
             run.log(gate.judge(update), update)
             last = update == cfg.updates
@@ -197,9 +197,9 @@ def _train(
         evaluation.evaluate(learner.policy, "candidate")
         summary = run_summary(evaluation, tally, gate)
         summary |= {} if identified is None else identified.summary
-        if cfg.export is not None and gate.mpc is not None:
+        if cfg.export is not None:
             export_run(gate.mpc, run.path, quiet)
-        if cfg.prove is not None and gate.mpc is not None:
+        if cfg.prove is not None:
             summary |= prove_run(gate.mpc, physics, cfg.prove, quiet)
         run.finish(summary)
         drop_previous(run.path / CHECKPOINT)

@@ -11,8 +11,7 @@ from torch_qpmpc.experiment.config.messages import keys
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: Files whose comments explain the keys that several files set.
-FIRST = ("config", "algo/qlearning", "algo/td3", "optimizer/gauss_newton", "constraint/combined")
-FIRST += ("task/point_mass",)
+FIRST = ("config", "optimizer/gauss_newton", "constraint/combined", "task/point_mass")
 TITLE = """# All configuration keys
 
 Each key is set by `python train.py KEY=VALUE`, or with others by a choice, as `task=pendulum`; the
@@ -21,11 +20,9 @@ comes first, and those of single choices follow. Units are the plant's unless th
 otherwise.
 """
 GROUPS = {
-    "algo": "Algorithm: `algo=NAME`",
     "constraint": "Constraints and their penalties: `constraint=NAME`",
     "noise": "Noise: `noise=NAME`",
     "optimizer": "Optimizer: `optimizer=NAME`",
-    "search": "Direct search",
     "start": "Start: `start=NAME`",
     "task": "Task: `task=NAME`",
 }

@@ -21,8 +21,7 @@ def penalty(mpc: QPMPC, S: Tensor) -> float:
 class Reference:
     """The steps of a `GaussNewton` without a trust region."""
 
-    def __init__(self, mpc: QPMPC, optimizer: GaussNewton, normalise: bool = True) -> None:
-        self.normalise = normalise
+    def __init__(self, mpc: QPMPC, optimizer: GaussNewton) -> None:
         groups = optimizer.param_groups
         self.mpc = mpc
         self.leaves: list[Tensor] = [leaf for group in groups for leaf in group["params"]]
@@ -71,9 +70,6 @@ class Reference:
 
     def metric(self, gradients: list[Tensor], z: Tensor) -> Tensor:
         """Compute the diagonal of D from the gradients of a new batch."""
-        if not self.normalise:
-            ones = [torch.ones_like(leaf).flatten() for leaf in self.leaves]
-            return torch.cat([scale * x for scale, x in zip(self.scales, ones, strict=True)])
         units = self.units(z)
         sizes = dict.fromkeys(self.parts, 0.0)
         for part, rows, unit in zip(self.parts, gradients, units, strict=True):
@@ -92,10 +88,9 @@ class Reference:
         a: Tensor,
         target: Tensor,
         S: Tensor | None = None,
-        past: int = 0,
         weight: Tensor | None = None,
     ) -> Tensor:
-        """Compute the step of theta; rows of ``past`` pairs before these have no error."""
+        """Compute the step of theta."""
         solution, root = self.mpc.solve(s, a), torch.ones(len(s)).double()
         if weight is not None:
             root = weight.sqrt()
@@ -103,11 +98,6 @@ class Reference:
         metric = self.metric(gradients, solution.z.detach())
         rows = torch.cat(gradients, dim=1)
         delta = root * (target - solution.value).detach()
-        if past:
-            earlier = getattr(self, "earlier", rows[:0])
-            rows = torch.cat((rows, earlier))
-            delta = torch.cat((delta, delta.new_zeros(len(earlier))))
-            self.earlier = rows[:past]
         mu = self.damping * (metric * rows.square()).sum(-1).mean()
         matrix, right = rows.mT @ rows, rows.mT @ delta
         matrix += torch.diag(mu / metric)

@@ -17,12 +17,8 @@ def make(*overrides: str, seed: int = 0, done: int = 0) -> tuple[Learner, QPMPC,
     cfg = make_config(*SMALL, "constraint=free", *overrides)
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
-    learner = make_learner(cfg, QPActorValueOperator(mpc), physics, done=done)
+    learner = make_learner(cfg, QPActorValueOperator(mpc), done=done)
     env = physics.vectorised(4, 12, seed=seed)
     batch: TensorDictBase = env.rollout(3).reshape(-1)
     env.close()
     return learner, mpc, batch
-
-
-def settings(algo: str, actor: str, critic: str, task: str = "point_mass") -> tuple[str, ...]:
-    return f"task={task}", f"algo={algo}", f"algo.actor={actor}", f"algo.critic={critic}"

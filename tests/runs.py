@@ -37,7 +37,6 @@ SMALL = (
     "figures=false",
     "gate=false",
     "rivals=false",
-    "search.loops=2",
 )
 
 

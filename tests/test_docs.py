@@ -182,7 +182,6 @@ def test_each_configuration_key_has_a_meaning_and_a_value(monkeypatch):
         assert key.endswith(".name") or reference.meaning(settings), key
     page = reference.page()
     assert "| `task.horizon` | N | a whole number >= 1 | `10`; " in page
-    assert "| `search.w` | log of a factor of the slack weights |" in page
 
 
 @needs_docs

@@ -7,7 +7,7 @@ Without active bounds the optimal policy is linear (Wonham, SIAM J. Control 1967
 Automatica 1982). With task.hidden_velocity=true only the position is measured: an action moves it
 two steps later, and the optimal policy is linear in the window [p_{k-1}, u_{k-1}, p_k].
 
-    python train.py task.file=docs/examples/actuator_noise.py algo.weighted=true
+    python train.py task.file=docs/examples/actuator_noise.py weighted=true
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ x is the position, the velocity and the acceleration; the model is exact. From m
 is at its bound for more steps than the horizon sees, and whoever brakes too late never settles. The
 cost beyond the horizon is what is to be learned.
 
-    python train.py task.file=docs/examples/short_horizon.py algo.weighted=true
+    python train.py task.file=docs/examples/short_horizon.py weighted=true
 """
 
 from __future__ import annotations

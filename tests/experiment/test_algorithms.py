@@ -6,20 +6,16 @@ from typing import Any
 
 import pytest
 import torch
-from torch.testing import assert_close
 
 from tests.runs import SMALL, choices, linear_system, make_config
-from torch_qpmpc import GaussNewton, QPActorValueOperator
+from torch_qpmpc import QPActorValueOperator
 from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
 from torch_qpmpc.experiment.algorithms import (
     evaluate,
-    make_errors,
     make_learner,
-    make_operator,
     make_optimizer,
     make_penalties,
 )
-from torch_qpmpc.experiment.collection import batches, make_collector
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 
 
@@ -63,7 +59,7 @@ def test_optimizer_has_two_rates_that_fall_linearly(name):
         "constraint.learn=[C,ub]",
     )
     mpc = make_mpc(cfg, make_physics(cfg))
-    learner = make_learner(cfg, QPActorValueOperator(mpc), make_physics(cfg))
+    learner = make_learner(cfg, QPActorValueOperator(mpc))
     optimizer, scheduler = learner.optimizer, learner.scheduler
     assert type(optimizer).__name__.lower() == name
     rates = {"H": 0.1, "c": 0.1, "C": 0.01, "ub": 0.01}
@@ -113,39 +109,3 @@ def test_the_evaluation_has_a_seed_of_its_own(task):
     assert torch.equal(costs("eval_seed=123"), costs())
     loop = gymnasium_loop if task == "pendulum" else closed_loop
     assert torch.equal(loop(policy, physics, steps=3).costs, costs("eval_seed=null"))
-
-
-def test_the_learner_sees_each_transition_and_tightens_by_their_errors():
-    cfg = make_config(*SMALL, "optimizer=gauss_newton", "task=gros_zanon")
-    physics = make_physics(cfg)
-    mpc = make_mpc(cfg, physics)
-    learner = make_learner(cfg, make_operator(cfg, mpc), physics)
-    assert learner.errors is not None
-    assert learner.back_off is not None
-    stream = batches(make_collector(cfg, physics, learner.actor))
-    seen = []
-    for _ in range(3):
-        batch = next(stream)
-        learner.observe(batch)
-        learner.learn(batch.reshape(-1), None)
-        following = batch["next", "observation"]
-        seen.append(torch.cat((batch["observation"], batch["action"], following), -1))
-    learner.advance()
-    errors = torch.cat(seen).flatten(0, -2).to(mpc.C) @ mpc.C[:2, :5].mT - mpc.b[:2]
-    expected = errors.detach().mT.cov(correction=0)
-    # The latest transitions count a little more.
-    found = learner.errors.covariance(mpc.quadratic_program())
-    assert_close(found, expected, rtol=0.05, atol=1e-4)
-    assert learner.back_off.margin > 0.01
-
-
-def test_a_back_off_follows_prediction_errors():
-    cfg = make_config(*SMALL, "optimizer=gauss_newton", "task=gros_zanon")
-    mpc = make_mpc(cfg, make_physics(cfg))
-    for back_off in (None, 0.9):
-        cfg.back_off = back_off
-        errors = make_errors(cfg, mpc)
-        assert (errors is None) == (back_off is None)
-        optimizer = make_optimizer(cfg, mpc, errors=errors)
-        assert isinstance(optimizer, GaussNewton)
-        assert (optimizer._residuals is None) == (errors is None)

@@ -17,7 +17,7 @@ from torch_qpmpc.experiment.launch import Launch
 def test_a_run_is_described():
     first, second = announcement(make_config("task=pendulum", "seed=3"), "runs/x").splitlines()
     assert first == (
-        "qlearning, 100 updates: task gymnasium Pendulum-v1, noise none, constraint deviation, "
+        "100 updates: task gymnasium Pendulum-v1, noise none, constraint deviation, "
         "optimizer gauss_newton, solver proxqp, seed 3"
     )
     assert second == "Folder: runs/x"
@@ -58,7 +58,7 @@ def help_text() -> str:
     return cfg.hydra.help.template
 
 
-@pytest.mark.parametrize("group", ["constraint", "task", "noise", "optimizer", "algo"])
+@pytest.mark.parametrize("group", ["constraint", "task", "noise", "optimizer"])
 def test_the_help_lists_every_choice(group):
     words = set(help_text().replace(",", " ").replace(";", " ").split())
     names = {path.stem for path in Path(CONFIGS, group).glob("*.yaml")}

@@ -32,7 +32,6 @@ from torch_qpmpc.experiment.choosing import (
     chosen_before,
     starts,
 )
-from torch_qpmpc.experiment.ensemble import run_ensemble
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log, learning_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
@@ -226,7 +225,7 @@ def test_learning_begins_with_the_best_scheme_where_a_gate_keeps_the_held_action
     "settings",
     [
         ("gate=true", "constraint=mpc", "optimizer=gauss_newton", "release=2", BOUNDED),
-        ("gate=act", "algo=td3", "constraint=free"),
+        ("gate=act", "optimizer=adam", "constraint=free"),
     ],
     ids=" ".join,
 )
@@ -325,7 +324,7 @@ def turning(monkeypatch):
     "settings",
     [
         ("gate=act", "optimizer=gauss_newton", "constraint=mpc", "release=2"),
-        ("gate=false", "algo=td3", "constraint=free"),
+        ("gate=false", "optimizer=adam", "constraint=free"),
     ],
     ids=" ".join,
 )
@@ -348,7 +347,7 @@ def test_blended_models_are_no_start_of_a_run_that_needs_one_C():
     said = f"Linear models at {len(models.centres)} centres, blended, take the place of the model "
     said += "above."
     assert said in str(start._replace(blended=models)).splitlines()
-    for needs in ("export=c", "constraint=si", "constraint=adaptive", "gate=model"):
+    for needs in ("export=c", "constraint=si"):
         assert _blended(make_config(*DATA, needs), start, 6) is None, needs
 
 
@@ -428,17 +427,6 @@ def test_the_local_start_has_the_tasks_own_cost(falling):
 @pytest.mark.parametrize("setting", ["task.hessian=diagonal", "task.past=2"])
 def test_a_diagonal_hessian_and_a_window_have_no_local_start(falling, setting):
     assert "local" not in "".join(starts(*falling(setting)))
-
-
-def test_the_cost_on_an_ensemble_is_that_of_the_whole_log(falling):
-    cfg, physics, log = falling()
-    start, costs = starts(cfg, physics, log)[LOCAL], []
-    for given in (start, start._replace(still=None, cost=None, riccati=False), None):
-        members = run_ensemble(cfg, physics, given, [log])
-        y, u = torch.ones(2, 3).double(), torch.ones(2, 1).double()
-        costs.append(members[0].cost(y, u, y[:, :0]))
-    assert_close(costs[0], costs[1])
-    assert_close(costs[0], costs[2])
 
 
 def test_the_regulators_cost_for_all_starts_leaves_no_window_and_no_copy(monkeypatch):

@@ -19,7 +19,6 @@ from torch_qpmpc.experiment.config.messages import keys
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import snapshot
 from torch_qpmpc.experiment.tasks import TASKS
-from torch_qpmpc.learning.search import KNOBS
 
 GROUPS = ("constraint", "noise", "optimizer", "task")
 #: Penalties may be null.
@@ -49,9 +48,8 @@ def test_each_key_of_the_files_is_one_of_the_models():
     assert all(KEYS.values()), "each says what its value must be"
 
 
-SEARCH = ("search.margin=0.1", "search.loops=1")
 #: The shortest run, in which each part is called once.
-SHORT = (*SMALL, *SEARCH, "updates=2", "task.eval_steps=2", "task.episode_steps=4")
+SHORT = (*SMALL, "updates=2", "task.eval_steps=2", "task.episode_steps=4")
 DATA = ("start=data", "task=pendulum", "start.transitions=40")
 
 
@@ -94,8 +92,6 @@ def test_each_key_is_read(tmp_path, monkeypatch):
             "+task.held=null",
             "+task.past=null",
         ),
-        "networks": ("algo=td3", "algo.actor=mlp", "algo.critic=mlp", "constraint=free"),
-        "scheduled": ("algo=sac", "algo.actor=scheduled", "constraint=free"),
     }.items():
         cfg = make_config(*SHORT, *overrides)
         monkeypatch.setattr(
@@ -110,22 +106,18 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     assert seen - set(OPTIONAL) == set(KEYS)
 
 
-#: The noises of each task, and the constraints whose penalty needs windows of the replay.
+#: The noises of each task.
 NOISES = {
     "point_mass": {"gaussian", "brownian"},
     "gros_zanon": {"uniform"},
     "gymnasium": {"none"},
     "pendulum": {"none"},
 }
-WINDOWS = ("si", "combined", "identified")
 
 
 def faults(constraint: str, noise: str, optimizer: str, task: str) -> list[str]:
-    """List the conflicting keys of a choice of groups; recursive learns without a replay."""
-    found = {"noise.name": noise not in NOISES[task]}
-    found["replay"] = optimizer == "recursive" and constraint in WINDOWS
-    found["optimizer.name"] = optimizer in ("adam", "sgd") and constraint == "adaptive"
-    return [key for key, wrong in found.items() if wrong]
+    """List the conflicting keys of a choice of groups."""
+    return [] if noise in NOISES[task] else ["noise.name"]
 
 
 def chosen(constraint: str, noise: str, optimizer: str, task: str) -> DictConfig:
@@ -164,23 +156,11 @@ def test_each_choice_of_groups_is_accepted(names):
     check_config(chosen(*names))
 
 
-@pytest.mark.parametrize("task", ["point_mass", "pendulum"])
-@pytest.mark.parametrize("algo", choices("algo"))
-def test_each_algorithm_goes_with_each_kind_of_task(algo, task):
-    check_config(make_config(f"algo={algo}", f"task={task}"))
-
-
-def test_an_actor_has_the_first_order_by_itself():
-    assert make_config("algo=ddpg").optimizer.name == "adam"
-    assert make_config("algo=td3", "optimizer=sgd").optimizer.name == "sgd"
-
-
 def choices_with(key: str) -> list[str]:
     """Return the choices of groups that have the key."""
     if key in settings(make_config("optimizer=gauss_newton")):
         return ["optimizer=gauss_newton"]
-    having = {"algo": "algo=td3", "task": "task=pendulum"}
-    having["start"] = "start=data"
+    having = {"task": "task=pendulum", "start": "start=data"}
     return ["optimizer=adam", *(c for group, c in having.items() if key.startswith(f"{group}."))]
 
 
@@ -197,7 +177,7 @@ BAD: dict[str, list[Any]] = {
     "release": [*WHOLE[:-2], math.nan],
     "exploration_std": REAL,
     "td_error_clip": [0, *REAL[:-1]],
-    "target_rate": FRACTION,
+    "weighted": FLAG,
     "step": ["newton", *NAME],
     "ablation": [3, True],
     "eval_seed": WHOLE[1:-2],
@@ -207,20 +187,8 @@ BAD: dict[str, list[Any]] = {
     "figures": ["each", *FLAG],
     "gate": ["acts", *FLAG],
     "gate_bound": [0, *REAL[:-1]],
-    "back_off": [0.4, 1, math.nan, False, "half"],
-    "search.loops": WHOLE,
-    **{f"search.{name}": [0, *REAL[:-1]] for name in KNOBS},
     "rivals": ["tightened", 3, None, [1]],
     "resume": [3, True],
-    "algo.name": ["a2c", *NAME],
-    "algo.weighted": FLAG,
-    "algo.actor": ["net", *NAME],
-    "algo.critic": ["net", *NAME],
-    "algo.actor_rate": [0, *REAL],
-    "algo.lr_network": [0, *REAL],
-    "algo.width": WHOLE,
-    "algo.theta.q": [0, *REAL],
-    "algo.theta.b": [0, *REAL],
     "start.name": ["policy", *NAME],
     "start.file": [3, True],
     "start.transitions": WHOLE,
@@ -239,7 +207,6 @@ BAD: dict[str, list[Any]] = {
     "task.terminal_weight": ["lqr", *NAME],
     "constraint.structure": ["banded", *NAME],
     "optimizer.lr": FRACTION,
-    "optimizer.memory": WHOLE[1:],
     "task.learn_cost": ["H", ["H", "C"], ["h"], [["H"]], None, 3],
     "task.state_slack": [*REAL[:2], *REAL[3:]],
     "task.action_slack": [*REAL[:2], *REAL[3:]],
@@ -299,7 +266,6 @@ def test_the_edges_are_accepted():
         "updates=1",
         "td_error_clip=null",
         "exploration_std=0",
-        "target_rate=1",
         "task.gamma=1",
         "task.state_slack=inf",
         "task.learn_cost=[]",
@@ -333,7 +299,7 @@ def test_unknown_keys(key, remedy):
 NEEDED = [key for key in KEYS if key not in NOT_NEEDED]
 
 
-@pytest.mark.parametrize("key", [*NEEDED, *OPTIONAL, *GROUPS, "algo", "search", "start"])
+@pytest.mark.parametrize("key", [*NEEDED, *OPTIONAL, *GROUPS, "start"])
 def test_missing_keys(key):
     cfg = make_config("constraint=combined", *choices_with(key))
     owner, _, leaf = key.rpartition(".")
@@ -371,7 +337,7 @@ def test_keys_of_groups(overrides, message):
         check_config(make_config("optimizer=adam", *overrides))
 
 
-@pytest.mark.parametrize("group", [*GROUPS, "algo"])
+@pytest.mark.parametrize("group", GROUPS)
 def test_a_group_has_keys(group):
     cfg = make_config()
     OmegaConf.update(cfg, group, 3, merge=False)
@@ -417,7 +383,7 @@ def test_solver_must_be_known():
             r"task.learn_cost: got \[\], expected something to learn, here or in constraint.learn",
         ),
         (
-            ["constraint=si", "optimizer=recursive"],
+            ["constraint=si", "replay=false"],
             "replay: got False, expected true. constraint.si",
         ),
         (
@@ -447,63 +413,8 @@ def test_solver_must_be_known():
             "noise.name: got 'gaussian', expected a noise of task gros_zanon: uniform.",
         ),
         (
-            ["algo=td3", "optimizer=gauss_newton"],
-            "optimizer.name: got 'gauss_newton', expected adam or sgd. td3 needs a first-order",
-        ),
-        (
-            ["algo=ddpg", "constraint=free", "replay=false"],
-            "replay: got False, expected true. ddpg learns from a",
-        ),
-        (
-            ["algo=ddpg", "algo.actor=mlp"],
-            "algo.actor: got 'mlp', expected qp or scheduled. The penalties are",
-        ),
-        (
-            ["algo=ddpg", "algo.actor=mlp", "constraint=free", "export=c"],
-            "export: got 'c', expected null. The policy of this algo.actor has a network",
-        ),
-        *(
-            (
-                ["algo=ddpg", f"algo.actor={actor}", "constraint=free", "prove=0.0"],
-                "prove: got 0.0, expected null. The policy of this algo.actor has a network",
-            )
-            for actor in ("scheduled", "mlp")
-        ),
-        (["algo=ddpg", "step=projection"], "step: got 'projection', expected cholesky. The crit"),
-        (
-            ["algo=ddpg", "constraint=mpc", "release=5"],
-            "release: got 5, expected null. ddpg does not support release",
-        ),
-        (
             ["task=gros_zanon", "noise.std=0.1"],
             "noise.std: got 0.1, expected null. The noise of gros_zanon cannot be changed",
-        ),
-        (
-            ["back_off=0.9"],
-            "constraint.structure: got 'free', expected tied. back_off needs one model for all",
-        ),
-        (
-            ["constraint=adaptive", "algo=td3"],
-            "algo.name: got 'td3', expected qlearning. td3 does not support back_off; "
-            "constraint=mpc has none",
-        ),
-        (
-            ["constraint=adaptive", "release=5"],
-            "release: got 5, expected null. back_off needs a tied C; constraint=mpc has none",
-        ),
-        (
-            ["constraint=adaptive", "optimizer=adam"],
-            "optimizer.name: got 'adam', expected gauss_newton. With back_off its steps follow the "
-            "prediction errors; constraint=mpc has none",
-        ),
-        (
-            ["constraint=adaptive", "constraint.learn=[]"],
-            r"constraint.learn: got \[\], expected a list with C or b. With back_off the model",
-        ),
-        (
-            ["constraint=adaptive", "constraint.learn=[C,lb]"],
-            r"constraint.learn: got \['C', 'lb'\], expected a list without lb and ub. back_off "
-            "moves the bounds; constraint=mpc has none",
         ),
         (["num_envs=7"], r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
     ],
@@ -568,9 +479,6 @@ def test_an_ablation_goes_with_both_penalties_and_a_step_rule(name):
 
 
 def test_what_acts_by_default():
-    """Only accepted policies act where tables were made so, but a critic explores on each task."""
+    """Only accepted policies act where tables were made so."""
     assert make_config().gate is True
     assert {make_config(f"task={name}").gate for name in ("gros_zanon", "pendulum")} == {"act"}
-    for algo in ("ddpg", "td3", "sac"):
-        assert make_config("task=pendulum", f"algo={algo}").gate is True
-    assert make_config("task=pendulum", "algo=ddpg", "gate=act").gate == "act"

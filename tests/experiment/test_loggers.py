@@ -128,9 +128,8 @@ def test_training_logs_by_the_logger_of_the_configuration(tmp_path):
 @pytest.mark.parametrize(
     "overrides",
     [
-        ("gate=true", "constraint=adaptive", "optimizer=gauss_newton"),
+        ("gate=true", "constraint=mpc", "optimizer=gauss_newton"),
         ("constraint=combined", "noise=brownian"),
-        ("algo=sac", "constraint=free"),
     ],
     ids=lambda overrides: overrides[0],
 )

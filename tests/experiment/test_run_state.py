@@ -22,12 +22,10 @@ from torch_qpmpc.experiment.run_state import resumed
 #: The stop is at neither an evaluation nor a row of metrics, and an episode ends after it.
 RUN = (*SMALL, "updates=8", "eval_interval=4", "log_interval=3", "task.episode_steps=10")
 STOP = 5
-STREAM = ("task=gros_zanon", "task.horizon=4", "optimizer.memory=8", "task.episode_steps=6")
+STREAM = ("task=gros_zanon", "task.horizon=4", "replay=false", "task.episode_steps=6")
 STREAM += ("steps_per_update=4",)
 GATED = ("gate=true", "optimizer=gauss_newton")
 DATA = ("start=data", "start.transitions=200")
-ACTOR_CRITIC = ("constraint=free", "optimizer=adam")
-NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
 
 
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
@@ -37,16 +35,13 @@ NETWORKS = ("algo.actor=mlp", "algo.critic=mlp")
         ("optimizer=sgd", "constraint=combined", "solver=torch", "step=projection"),
         ("optimizer=gauss_newton", "constraint=combined", "solver=proxqp"),
         ("optimizer=adam", "constraint=mpc", "release=7"),
-        ("gate=plant", "optimizer=recursive", *STREAM, "constraint=mpc"),
-        ("optimizer=recursive", *STREAM, "replay=true", "replay_capacity=16", "batch_size=4"),
+        ("gate=plant", "optimizer=gauss_newton", *STREAM, "constraint=mpc"),
+        ("optimizer=gauss_newton", *STREAM, "replay=true", "replay_capacity=16", "batch_size=4"),
         ("noise=brownian", "steps_per_update=3"),
-        (*GATED, "constraint=mpc", "release=3", "search.w=0.5"),
+        (*GATED, "constraint=mpc", "release=3"),
         (*GATED, *DATA, "constraint=free"),
-        ("gate=model", "optimizer=gauss_newton", *DATA, "constraint=free"),
-        ("gate=true", "algo=td3", *ACTOR_CRITIC),
         ("task=store", "optimizer=gauss_newton", "constraint=si", "replay_capacity=40"),
-        ("task=store", "optimizer=recursive", "optimizer.memory=8", "constraint=free"),
-        ("task=store", "algo=ddpg", *ACTOR_CRITIC, *NETWORKS),
+        ("task=store", "optimizer=gauss_newton", "replay=false", "constraint=free"),
     ],
     ids=" ".join,
 )

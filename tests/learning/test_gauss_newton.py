@@ -13,7 +13,7 @@ from tests.gauss_newton import Reference, penalty
 from tests.problems import MIXED, normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SystemIdentificationPenalty
 from torch_qpmpc.learning.gauss_newton import FALL, RISE
-from torch_qpmpc.learning.variance import inverse_variance
+from torch_qpmpc.learning.td_error import inverse_variance
 
 COUNT, DAMPING = 7, 0.2
 ALL = ("H", "H_f", "q", "c", "C", "b", "G", "lb", "ub", "w")
@@ -107,20 +107,6 @@ def test_the_si_penalty_is_part_of_the_step(learn):
     assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", PARTS)
-def test_a_memory_preserves_past_pairs(name):
-    """A stream of single pairs steps as if past pairs were in the batch with zero error."""
-    mpc = random_mpc(2, **PARTS[name])
-    optimizer = GaussNewton(mpc, damping=DAMPING, memory=3, trust_region=False)
-    reference = Reference(mpc, optimizer)
-    (s, a), target = pairs(n_p=mpc.n_p), targets(mpc)
-    for i in range(COUNT):
-        pair = s[i : i + 1], a[i : i + 1], target[i : i + 1]
-        before, expected = reference.theta(), reference.step(*pair, past=3)
-        optimizer.step(*pair)
-        assert_close(reference.theta() - before, expected, rtol=1e-4, atol=1e-8)
-
-
 def test_the_sizes_are_part_of_the_state():
     mpc = random_mpc(2, learn=("c", "C", "b"))
     optimizer = GaussNewton(mpc)
@@ -135,32 +121,6 @@ def test_the_sizes_are_part_of_the_state():
         other.step(0.5 * s, a, target)
     assert_close(twins[0].state_dict(), mpc.state_dict(), rtol=0, atol=0)
     assert not torch.allclose(twins[1].C, mpc.C)
-
-
-def test_a_memory_is_part_of_the_state():
-    mpc = random_mpc(2)
-    optimizer = GaussNewton(mpc, memory=4)
-    optimizer.step(*pairs(), targets(mpc))
-    twin = copy.deepcopy(mpc)
-    other = GaussNewton(twin, memory=4)
-    other.load_state_dict(optimizer.state_dict())
-    for m, o in ((mpc, optimizer), (twin, other)):
-        o.step(*pairs(), targets(m, size=-0.2))
-    assert_close(twin.state_dict(), mpc.state_dict(), rtol=0, atol=0)
-    forgetful = GaussNewton(copy.deepcopy(twin), memory=4)
-    assert not forgetful.state
-
-
-def test_errors_fall_step_by_step():
-    mpc, other = random_mpc(4), random_mpc(4, free=0.2)
-    target = other.action_value(*pairs()).detach()
-    optimizer = GaussNewton(mpc)
-    errors = []
-    for _ in range(10):
-        errors.append((mpc.action_value(*pairs()) - target).square().sum().item())
-        optimizer.step(*pairs(), target)
-    assert errors == sorted(errors, reverse=True)
-    assert errors[-1] < 0.05 * errors[0]
 
 
 def test_a_step_that_raises_the_errors_is_taken_back():
@@ -237,25 +197,6 @@ def test_schedulers_change_the_part_of_the_step_that_is_taken():
     assert_close(mpc.C.detach() - before, whole / 2)
 
 
-def test_frozen_parts_stay():
-    mpc = random_mpc(14)
-    mpc.C.requires_grad_(False)
-    before, target = copy.deepcopy(mpc.state_dict()), targets(mpc)
-    GaussNewton(mpc).step(*pairs(), target)
-    assert torch.equal(mpc.C, before["C"])
-    assert not torch.equal(mpc.c, before["c"])
-
-
-def test_its_state_can_be_saved():
-    mpc = random_mpc(11)
-    optimizer = GaussNewton(mpc)
-    for group in optimizer.param_groups:
-        group["damping"] = 0.7
-    fresh = GaussNewton(mpc)
-    fresh.load_state_dict(optimizer.state_dict())
-    assert fresh.step(*pairs(), targets(mpc)).damping == 0.7
-
-
 def test_a_warm_start_saves_time_only():
     mpc = random_mpc(12, solver="proxqp")
     twin, s_a, target = copy.deepcopy(mpc), pairs(), targets(mpc)
@@ -265,17 +206,9 @@ def test_a_warm_start_saves_time_only():
     assert_close(mpc.state_dict(), twin.state_dict(), rtol=1e-5, atol=1e-7)
 
 
-def test_without_any_error_theta_stays():
-    mpc = random_mpc(13)
-    before = copy.deepcopy(mpc.state_dict())
-    assert GaussNewton(mpc).step(*pairs(), targets(mpc, 0.0)).accepted
-    assert_close(mpc.state_dict(), before, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("memory", -1, "a whole number >= 0"),
         ("lr", 0.0, r"a number in \(0, 1\]"),
         ("lr", 1.1, r"a number in \(0, 1\]"),
         ("damping", -1.0, "a finite number > 0"),
@@ -302,7 +235,7 @@ def test_a_penalty_needs_a_free_C():
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
 def test_a_batch_without_a_usable_pair_moves_nothing(bad, trust_region):
     mpc = random_mpc(15, on_failure="mask")
-    optimizer = GaussNewton(mpc, memory=3, trust_region=trust_region)
+    optimizer = GaussNewton(mpc, trust_region=trust_region)
     before, (s, a) = copy.deepcopy(mpc.state_dict()), pairs()
     a[1] = 9.0  # beyond a hard bound
     penalty = SystemIdentificationPenalty(1e-2).curvature(normal(5, mpc.n_z))
@@ -317,16 +250,6 @@ def test_a_batch_without_a_usable_pair_moves_nothing(bad, trust_region):
     assert not optimizer.state
 
 
-@pytest.mark.filterwarnings("error")
-def test_pairs_that_are_left_out_are_counted():
-    mpc = random_mpc(15, on_failure="mask")
-    (s, a), target = pairs(), targets(mpc)
-    a[1], target[1], target[3], target[4] = 9.0, torch.inf, torch.nan, torch.inf
-    report = GaussNewton(mpc).step(s, a, target)
-    assert report.accepted
-    assert (report.unsolved, report.without_target) == (1, 2)
-
-
 def test_a_report_is_shown_without_tensors():
     mpc = random_mpc(15, on_failure="mask")
     (s, a), target = pairs(), targets(mpc)
@@ -338,3 +261,32 @@ def test_a_report_is_shown_without_tensors():
     assert "tensor" not in text
     assert len(text.splitlines()) < 10
     assert len(text) < 800
+
+
+@pytest.mark.parametrize("trust_region", [False, True])
+def test_residuals_are_rows_of_the_least_squares_problem(trust_region):
+    """1/2 v |r + dr/dq dq|^2 joins the batch, with v the mean squared TD error."""
+    mpc = QPMPC.from_model(
+        torch.eye(2), torch.ones(2, 1), 3, structure="tied", learn=("q",), stage_weight=[1.0] * 3
+    )
+    options = {"damping": DAMPING, "trust_region": trust_region}
+    optimizer = GaussNewton(mpc, residuals=lambda qp: 0.3 * (qp.q - 1), **options)
+    s, a = pairs()
+    delta = torch.linspace(-0.2, 0.3, len(s)).double()
+    reference = Reference(mpc, optimizer)
+    (rows,), (leaf,) = reference.gradients(s, a), reference.leaves
+    before, r = leaf.detach().clone(), 0.3 * (mpc.quadratic_program().q - 1)
+    J = [torch.autograd.grad(x, leaf, retain_graph=True)[0].flatten() for x in r]
+    metric = reference.metric([rows], mpc.solve(s, a).z.detach())
+    weight = delta.square().mean().sqrt()
+    rows = torch.cat((rows, weight * torch.stack(J)))
+    errors = torch.cat((delta, -weight * r.detach()))
+    mu = DAMPING * (metric * rows[: len(s)].square()).sum(-1).mean()
+    expected = torch.linalg.solve(rows.mT @ rows + torch.diag(mu / metric), rows.mT @ errors)
+    assert optimizer.step(s, a, mpc.action_value(s, a).detach() + delta).accepted
+    assert_close((leaf.detach() - before).flatten(), expected, rtol=1e-5, atol=1e-9)
+
+
+def test_residuals_need_a_tied_C():
+    with pytest.raises(QPError, match="residuals: got them with a free C, expected a tied C"):
+        GaussNewton(random_mpc(2), residuals=lambda qp: qp.q)

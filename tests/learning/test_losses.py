@@ -10,20 +10,16 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
-from torchrl.data import MultiStep
 from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import AdditiveGaussianModule, OrnsteinUhlenbeckProcessModule
-from torchrl.objectives import CQLLoss, DDPGLoss, HardUpdate, SoftUpdate, TD3Loss
-from torchrl.objectives.value import GAE
+from torchrl.objectives import CQLLoss, HardUpdate, SoftUpdate, TD3Loss
 
 from tests.losses import (
     BOUNDS,
     ENSEMBLES,
-    GAMMA,
     LOSSES,
     ON_POLICY,
     critic,
@@ -32,9 +28,7 @@ from tests.losses import (
     make_loss,
     network_gaussian,
     network_policy,
-    policy,
     total,
-    value,
 )
 from torch_qpmpc import QPMPC, QPActorValueOperator, SolverError
 from torch_qpmpc.envs import PointMassEnv
@@ -133,16 +127,6 @@ def test_targets_are_frozen_until_they_are_updated(name, updater):
     assert moved
 
 
-@pytest.mark.parametrize(
-    ("name", "estimator"), zip(LOSSES, itertools.cycle(["td1", "tdlambda"]), strict=False)
-)
-def test_estimators(name, estimator):
-    """The other tests have TD(0)."""
-    loss = make_loss(name, estimator)
-    total(loss, make_batch(loss)).backward()
-    assert all(p.grad is not None and p.grad.isfinite().all() for p in learned(loss).values())
-
-
 @pytest.mark.parametrize("name", LOSSES)
 def test_copies_are_equal_and_independent(name):
     """TorchRL's ensembles hold a local function, which cannot be pickled; the others can."""
@@ -175,14 +159,6 @@ def test_an_ensemble_of_modules_keeps_their_starts_and_shares_no_bounds():
     assert not params["module", "ub"].requires_grad
 
 
-def test_copies_of_one_module_are_filled_with_random_numbers_by_torchrl():
-    """An ensemble must be a list: filled copies have no model left in C."""
-    loss = TD3Loss(network_policy(), critic(), bounds=BOUNDS, num_qvalue_nets=2)
-    stacked, mpc = loss.qvalue_network_params["module", "C"], critic().module
-    assert ((mpc.C_0 == 0) & (stacked == 0)).sum() == 0
-    assert (mpc.C_0 == 0).any()
-
-
 def test_actions_beyond_a_critics_hard_bounds_are_refused_by_name():
     """CQL draws actions between -1 and 1, regardless of the action's bounds."""
     narrow = [critic(seed) for seed in (1, 2)]
@@ -192,76 +168,6 @@ def test_actions_beyond_a_critics_hard_bounds_are_refused_by_name():
     loss = CQLLoss(network_gaussian(), narrow)
     with pytest.raises(SolverError, match=r"INFEASIBLE.* soften rows with a finite w"):
         total(loss, make_batch())
-
-
-def renamed(td: TensorDict) -> TensorDict:
-    """Rename a batch's observation, action, reward and ends to nested keys."""
-    new = td.select("observation", "action", ("next", "observation")).clone()
-    new.rename_key_("observation", ("agent", "s"))
-    new.rename_key_("action", ("agent", "a"))
-    new.rename_key_(("next", "observation"), ("next", "agent", "s"))
-    new["next", "agent", "r"] = td["next", "reward"]
-    for end in ("done", "terminated"):
-        new["next", "ends", end] = td["next", end]
-    return new
-
-
-def test_renamed_and_nested_keys():
-    plain = DDPGLoss(policy(), critic())
-    names: dict[str, Any] = {"observation_key": ("agent", "s"), "action_key": ("agent", "a")}
-    actor = policy(**names)
-    q = critic(**names, state_action_value_key=("critic", "q"))
-    loss = DDPGLoss(actor, q)
-    loss.set_keys(
-        state_action_value=("critic", "q"),
-        reward=("agent", "r"),
-        done=("ends", "done"),
-        terminated=("ends", "terminated"),
-        priority=("replay", "p"),
-    )
-    for module in (plain, loss):
-        module.make_value_estimator(gamma=GAMMA)
-    td = make_batch()
-    new = renamed(td)
-    expected, out = plain(td), loss(new)
-    for key in ("loss_actor", "loss_value"):
-        assert torch.equal(out[key], expected[key]), key
-    assert torch.equal(new["replay", "p"], td["td_error"])
-
-
-def test_multi_step_returns():
-    """The sum of three discounted rewards, and V beyond them."""
-    actor, q = policy(), critic()
-    loss = DDPGLoss(actor, q, delay_value=False, reduction="none")
-    loss.make_value_estimator(gamma=GAMMA)
-    td = make_batch()
-    td["next", "done"].zero_()
-    td["next", "terminated"].zero_()
-    steps = MultiStep(gamma=GAMMA, n_steps=3)(td.clone())
-    out = loss(steps)
-    reward, following = td["next", "reward"].squeeze(-1), td["next", "observation"]
-    mpc, best = q.module, actor.module
-    Q = mpc.action_value(following[:, 2], best.policy(following[:, 2]))
-    target = sum(GAMMA**k * reward[:, k] for k in range(3)) - GAMMA**3 * Q
-    prediction = -mpc.action_value(td["observation"][:, 0], td["action"][:, 0])
-    torch.testing.assert_close(out["target_value"][:, 0], target, rtol=1e-4, atol=1e-3)
-    torch.testing.assert_close(out["pred_value"][:, 0], prediction, rtol=1e-4, atol=1e-3)
-
-
-def test_generalised_advantages():
-    lmbda, network, td = 0.8, value(), make_batch()
-    with torch.no_grad():
-        GAE(gamma=GAMMA, lmbda=lmbda, value_network=network)(td)
-        V = -network.module.value(td["observation"])
-        V_next = -network.module.value(td["next", "observation"])
-    reward, done, ended = (td["next", k].squeeze(-1) for k in ("reward", "done", "terminated"))
-    delta = reward + GAMMA * V_next * ~ended - V
-    advantage = torch.zeros_like(delta)
-    for t in reversed(range(delta.shape[-1])):
-        later = advantage[:, t + 1] * ~done[:, t] if t + 1 < delta.shape[-1] else 0.0
-        advantage[:, t] = delta[:, t] + GAMMA * lmbda * later
-    torch.testing.assert_close(td["advantage"].squeeze(-1), advantage, rtol=1e-4, atol=1e-3)
-    torch.testing.assert_close(td["value_target"].squeeze(-1), advantage + V, rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.parametrize("kind", [AdditiveGaussianModule, OrnsteinUhlenbeckProcessModule])

@@ -9,22 +9,11 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
-from torch import nn
-from torchrl.collectors import Collector
-from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import (
-    ActorCriticWrapper,
-    AdditiveGaussianModule,
-    ProbabilisticActor,
-    TanhNormal,
-)
-from torchrl.objectives import DDPGLoss, IQLLoss
 
 from tests.store import Store, collect
 from tests.store import make_mpc as make_store_mpc
 from torch_qpmpc import QPMPC, QPActorValueOperator, QPError, SolveLog, SolverError
-from torch_qpmpc.envs import PointMass, PointMassEnv
+from torch_qpmpc.envs import PointMass
 from torch_qpmpc.envs.closed_loop import closed_loop, plant_loop
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, in_closed_loop, warm_policy
 from torch_qpmpc.qp.program import UNKNOWN
@@ -48,24 +37,6 @@ def make_inputs(*batch: int, dtype: torch.dtype = torch.float64) -> TensorDict:
     s = 2 * torch.rand(*batch, 2, generator=generator) - 1
     a = 2 * torch.rand(*batch, 1, generator=generator) - 1
     return TensorDict(observation=s.to(dtype), action=a.to(dtype), batch_size=batch)
-
-
-def make_views(mpc: QPMPC) -> tuple[Any, Any, Any]:
-    """Make critic, value and policy; TorchRL's annotations are too narrow for them."""
-    operator = QPActorValueOperator(mpc)
-    return operator, operator.get_value_operator(), operator.get_policy_operator()
-
-
-def make_transitions(count: int) -> TensorDict:
-    td = make_inputs(count, dtype=torch.float32)
-    td["next"] = TensorDict(
-        observation=td["observation"].flip(0),
-        reward=torch.linspace(-2, -1, count).unsqueeze(-1),
-        done=torch.zeros(count, 1, dtype=torch.bool),
-        terminated=torch.zeros(count, 1, dtype=torch.bool),
-        batch_size=[count],
-    )
-    return td
 
 
 @torch.no_grad()
@@ -97,18 +68,6 @@ def test_values_are_minus_the_costs_to_go(batch, dtype):
     torch.testing.assert_close(
         critic(state)["state_action_value"], td["state_value"], rtol=tolerance, atol=tolerance
     )
-
-
-def test_keys():
-    operator = QPActorValueOperator(make_mpc())
-    policy, value = operator.get_policy_operator(), operator.get_value_operator()
-    assert operator.get_critic_operator() is operator
-    assert (operator.in_keys, operator.out_keys) == (
-        ["observation", "action"],
-        ["state_action_value"],
-    )
-    assert (policy.in_keys, policy.out_keys) == (["observation"], ["action"])
-    assert (value.in_keys, value.out_keys) == (["observation"], ["state_value"])
 
 
 def test_a_preview_is_an_input_of_its_own():
@@ -228,19 +187,6 @@ def test_copies(how):
     assert all(torch.equal(x, y) for x, y in zip(evaluate(twin, td), expected, strict=True))
 
 
-def test_gradients_pass_through_the_critic():
-    td = make_inputs(4)
-    td["observation"].requires_grad_()
-    td["action"].requires_grad_()
-    mpc = make_mpc()
-    QPActorValueOperator(mpc)(td)["state_action_value"].sum().backward()
-    Q = mpc.action_value(td["observation"], td["action"]).sum()
-    ds, da = torch.autograd.grad(-Q, (td["observation"], td["action"]))
-    torch.testing.assert_close(td["observation"].grad, ds)
-    torch.testing.assert_close(td["action"].grad, da)
-    assert da.norm() > 0
-
-
 # --- Policies with warm starts in closed loop ----------------------------------------------------
 
 
@@ -309,127 +255,3 @@ def test_a_gradient_passes_through_a_warm_policy():
 
 
 # --- In TorchRL's collectors and losses ----------------------------------------------------------
-
-
-def make_point_mass() -> tuple[QPMPC, PointMassEnv]:
-    physics = PointMass()
-    mpc = QPMPC.from_model(
-        physics.A,
-        physics.B,
-        3,
-        action_bounds=(physics.lb_a, physics.ub_a),
-        stage_weight=torch.tensor([6, 6, 0.5, 0.5, 0.1, 0.1]),
-        solver="daqp",
-    )
-    return mpc, PointMassEnv(4, physics, max_steps=10, seed=0)
-
-
-@pytest.mark.parametrize("exploration", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
-def test_policy_in_a_collector(exploration):
-    mpc, env = make_point_mass()
-    torch.manual_seed(0)
-    noise: Any = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
-    policy: Any = make_views(mpc)[2]
-    collector = Collector(
-        env,
-        TensorDictSequential([policy, noise]),
-        frames_per_batch=12,
-        total_frames=24,
-        exploration_type=exploration,
-        auto_register_policy_transforms=False,
-    )
-    for batch in collector:
-        assert batch.shape == (4, 3)
-        assert batch["action"].dtype == torch.float32
-        assert not batch["action"].requires_grad
-        assert batch["action"].abs().max() <= 1
-        close = torch.isclose(batch["action"], mpc.policy(batch["observation"]), atol=1e-6)
-        assert close.all() == (exploration == ExplorationType.DETERMINISTIC)
-    collector.shutdown()
-
-
-def test_policy_in_a_rollout_follows_the_parameters():
-    mpc, env = make_point_mass()
-    policy = QPActorValueOperator(mpc).get_policy_operator()
-    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        before = env.rollout(3, policy)
-        change(mpc)
-        env.set_seed(0)
-        after = env.rollout(3, policy)
-    torch.testing.assert_close(after["action"], mpc.policy(after["observation"]))
-    assert not torch.allclose(before["action"][:, -1], after["action"][:, -1])
-
-
-def test_actor_critic_wrapper():
-    (critic, value, policy), s = make_views(make_mpc()), make_inputs(4)["observation"]
-    both = ActorCriticWrapper(policy, critic)
-    out = both(TensorDict(observation=s, batch_size=[4]))
-    torch.testing.assert_close(out["state_action_value"], value(s), rtol=1e-9, atol=1e-9)
-    assert len(list(both.parameters())) == len(list(critic.parameters()))
-
-
-def all_have_gradients(module: nn.Module) -> bool:
-    return all(p.grad is not None and p.grad.isfinite().all() for p in module.parameters())
-
-
-@pytest.mark.filterwarnings("ignore:No target network updater")
-def test_critic_in_ddpg_with_a_network_as_actor():
-    """The actor climbs -Q along dQ/da = -zeta."""
-    torch.manual_seed(0)
-    (operator, _, _), td = make_views(make_mpc()), make_transitions(5)
-    net = nn.Sequential(nn.Linear(2, 1), nn.Tanh())
-    actor = TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
-    loss = DDPGLoss(actor, operator)
-    loss.make_value_estimator(gamma=0.9)
-    out = loss(td)
-    a = net(td["observation"])
-    Q = operator.module.action_value(td["observation"], a)
-    expected = torch.autograd.grad(Q.mean(), list(net.parameters()))
-    torch.testing.assert_close(out["loss_actor"], Q.mean())
-    (out["loss_actor"] + out["loss_value"]).backward()
-    assert all_have_gradients(operator)
-    for parameter, gradient in zip(net.parameters(), expected, strict=True):
-        assert gradient.norm() > 0
-        torch.testing.assert_close(parameter.grad, gradient)
-
-
-@pytest.mark.filterwarnings("ignore:No target network updater")
-def test_policy_as_the_actor_of_ddpg():
-    (operator, _, policy), td = make_views(make_mpc()), make_transitions(5)
-    loss = DDPGLoss(policy, copy.deepcopy(operator))
-    loss.make_value_estimator(gamma=0.9)
-    loss(td)["loss_actor"].backward()
-    mpc = operator.module
-    s = td["observation"]
-    leaves = dict(mpc.named_parameters())
-    # The critic is a detached copy: the gradient flows through the action only.
-    critic = copy.deepcopy(mpc).requires_grad_(False)
-    expected = critic.action_value(s, mpc.policy(s)).mean()
-    for name, gradient in zip(
-        leaves, torch.autograd.grad(expected, list(leaves.values()), allow_unused=True), strict=True
-    ):
-        if gradient is not None:
-            torch.testing.assert_close(leaves[name].grad, gradient)
-
-
-@pytest.mark.filterwarnings("ignore:No target network updater")
-def test_critics_and_value_in_iql():
-    """Two critics under vmap beside the value, all of them QPs, with a network as the policy."""
-    torch.manual_seed(0)
-    (operator, value, _), td = make_views(make_mpc()), make_transitions(5)
-    critics: Any = [copy.deepcopy(operator), copy.deepcopy(operator)]
-    change(critics[1].module)
-    net = nn.Sequential(nn.Linear(2, 2), NormalParamExtractor())
-    actor = ProbabilisticActor(
-        TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal,
-    )
-    loss = IQLLoss(actor, qvalue_network=critics, value_network=value, num_qvalue_nets=2)
-    loss.make_value_estimator(gamma=0.9)
-    out = loss(td)
-    (out["loss_actor"] + out["loss_qvalue"] + out["loss_value"]).backward()
-    assert all_have_gradients(loss)
-    stacked = loss.qvalue_network_params["module", "C"]
-    assert stacked.shape == (2, *operator.module.C.shape)
-    assert (stacked.grad.flatten(1).norm(dim=1) > 0).all()

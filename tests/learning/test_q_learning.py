@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -27,8 +26,7 @@ from tests.transitions import (
     perturb,
 )
 from torch_qpmpc import QPMPC, GaussNewton, QPActorValueOperator, QPError, QPQLearningLoss
-from torch_qpmpc.learning.td_error import td_loss
-from torch_qpmpc.learning.variance import inverse_variance
+from torch_qpmpc.learning.td_error import inverse_variance
 
 
 @pytest.mark.parametrize("delay_value", [False, True])
@@ -96,36 +94,6 @@ def test_loss_and_its_gradients_with_a_window_and_a_preview(delay_value):
         loss(td.exclude(("next", "preview")))
 
 
-def test_input_is_left_alone_by_an_estimator_that_rewrites_rewards():
-    loss, td = make_loss(), make_batch(6)
-    loss.make_value_estimator("td0", average_rewards=True)
-    before = td.clone()
-    loss(td)
-    assert (td.exclude("td_error") == before).all()
-
-
-def test_the_operators_follow_the_loss():
-    """The critic given to the loss, and the policy on it, share the learned parameters."""
-    operator = make_operator()
-    loss, td = make_loss(operator=operator), make_batch(8)
-    policy = operator.get_policy_operator()
-    before = policy(td.clone())["action"]
-    optimizer = torch.optim.SGD(loss.parameters(), lr=1e-2)
-    loss(td)["loss_value"].backward()
-    optimizer.step()
-    assert {id(p) for p in loss.parameters()} == {id(p) for p in operator.parameters()}
-    assert not torch.equal(policy(td.clone())["action"], before)
-
-
-def test_reduction():
-    td = make_batch(6)
-    none = make_loss(reduction="none")(td)["loss_value"]
-    assert none.shape == (6,)
-    torch.testing.assert_close(make_loss(reduction="sum")(td)["loss_value"], none.sum())
-    torch.testing.assert_close(make_loss(reduction="mean")(td)["loss_value"], none.mean())
-    torch.testing.assert_close(make_loss()(td)["loss_value"], none.mean())
-
-
 def test_priority_weights():
     td = make_batch(6)
     none = make_loss(reduction="none")(td)["loss_value"]
@@ -161,12 +129,6 @@ def test_cast_to_float32():
     assert out.item() == pytest.approx(expected, rel=1e-4)
     out.backward()
     assert all(p.grad is not None and p.grad.dtype == p.dtype for p in loss.parameters())
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_output_has_the_dtype_of_the_batch(dtype):
-    out = make_loss()(make_batch(6, dtype=dtype))
-    assert {out[key].dtype for key in ("loss_value", *METADATA)} == {dtype}
 
 
 def test_metadata_are_detached_scalars():
@@ -214,13 +176,6 @@ def test_compiled_without_graph_breaks():
         loss.zero_grad()
 
 
-def test_the_discount_of_the_target_is_by_default_that_of_the_qp():
-    loss = QPQLearningLoss(make_operator())
-    loss.make_value_estimator()
-    estimator: Any = loss.value_estimator
-    assert float(estimator.gamma) == loss.operator.module.gamma != 0.99
-
-
 def test_bad_arguments():
     operator = make_operator()
     with pytest.raises(TypeError, match="gamma"):
@@ -232,20 +187,6 @@ def test_bad_arguments():
             QPQLearningLoss(operator, td_error_clip=clip)
     with pytest.raises(QPError, match="reduction: got 'median', expected 'mean', 'sum' or 'none'"):
         QPQLearningLoss(operator, reduction="median")
-
-
-def test_termination_stops_the_bootstrap_and_truncation_does_not():
-    operator = make_operator()
-    td = make_batch(3)
-    done, terminated = torch.tensor([[0, 0], [1, 0], [1, 1]], dtype=torch.bool).T
-    td["next", "done"], td["next", "terminated"] = done.unsqueeze(-1), terminated.unsqueeze(-1)
-    out = make_loss(operator=operator, reduction="none")(td)
-    L: Tensor = -td["next", "reward"].squeeze(-1)
-    V = operator.module.value(td["next", "observation"])
-    Q = operator.module.action_value(td["observation"], td["action"])
-    bootstraps = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
-    delta = L + GAMMA * bootstraps * V - Q
-    torch.testing.assert_close(out["loss_value"], 0.5 * delta**2, atol=0, rtol=0)
 
 
 def expected_step(mpc: QPMPC, td: TensorDictBase, clip: float = math.inf) -> list[Tensor]:
@@ -304,18 +245,6 @@ def test_gradient_against_finite_differences():
         slope = (values[0] - values[1]) / 2e-6
         assert parameter.grad is not None
         assert (parameter.grad * direction).sum().item() == pytest.approx(slope, 1e-5, 1e-8), name
-
-
-def test_td_loss_is_huber_beyond_the_clip():
-    prediction = torch.linspace(-4, 4, 33, dtype=torch.float64, requires_grad=True)
-    target = torch.zeros(33, dtype=torch.float64)
-    for clip in (None, 1.5):
-        loss = td_loss(prediction, target, clip)
-        (gradient,) = torch.autograd.grad(loss.sum(), prediction)
-        bound = math.inf if clip is None else clip
-        assert torch.equal(gradient, prediction.clamp(-bound, bound))
-        assert (loss >= 0).all()
-        assert loss[16] == 0
 
 
 # Weights, and the range of V

@@ -30,18 +30,6 @@ KEYS = {
 }
 
 
-def test_keys_can_be_set_and_reset():
-    loss = QPQLearningLoss(make_operator())
-    assert vars(loss.tensor_keys) == KEYS
-    for key, default in KEYS.items():
-        loss.set_keys(**{key: ("nested", "new")})
-        assert getattr(loss.tensor_keys, key) == ("nested", "new")
-        loss.set_keys(**{key: None})
-        assert getattr(loss.tensor_keys, key) == default
-    with pytest.raises(ValueError, match="unknown_key is not an accepted tensordict key"):
-        loss.set_keys(unknown_key="x")
-
-
 @pytest.mark.parametrize("estimator", TRACE)
 @pytest.mark.parametrize("when", ["before", "after"])
 def test_keys_reach_the_estimator(estimator, when):

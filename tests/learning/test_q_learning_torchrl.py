@@ -10,12 +10,11 @@ import pytest
 import torch
 from torchrl.data import MultiStep
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
-from torchrl.objectives import HardUpdate, SoftUpdate, ValueEstimators
-from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
+from torchrl.objectives import HardUpdate, SoftUpdate
+from torchrl.objectives.value import TD0Estimator
 
 from tests.transitions import (
     GAMMA,
-    LMBDA,
     hand_prediction,
     learned_leaves,
     make_batch,
@@ -24,40 +23,6 @@ from tests.transitions import (
     perturb,
 )
 from torch_qpmpc import QPActorValueOperator, QPQLearningLoss
-
-
-@pytest.mark.parametrize("estimator", [ValueEstimators.GAE, ValueEstimators.VTrace, "gae"])
-def test_other_estimators_are_not_implemented(estimator):
-    with pytest.raises(NotImplementedError, match="not implemented for loss QPQLearningLoss"):
-        make_loss().make_value_estimator(estimator)
-
-
-@pytest.mark.parametrize(
-    ("name", "kind", "estimator"),
-    [
-        ("td0", ValueEstimators.TD0, TD0Estimator),
-        ("td1", ValueEstimators.TD1, TD1Estimator),
-        ("tdlambda", ValueEstimators.TDLambda, TDLambdaEstimator),
-    ],
-)
-def test_estimator_by_string_enum_class_and_instance(name, kind, estimator):
-    td, losses = make_batch(2, 4), []
-    options: dict[str, Any] = {"gamma": GAMMA} | ({"lmbda": LMBDA} if name == "tdlambda" else {})
-    operator = make_operator()
-    for how in ("string", "enum", "class", "instance"):
-        loss = QPQLearningLoss(operator)
-        value_network = loss.state_value_network
-        if how == "string":
-            assert loss.make_value_estimator(name, **options) is None
-        elif how == "enum":
-            loss.make_value_estimator(kind, **options)
-        elif how == "class":
-            loss.make_value_estimator(estimator, value_network=value_network, **options)
-        else:
-            loss.make_value_estimator(estimator(value_network=value_network, **options))
-        assert isinstance(loss.value_estimator, estimator)
-        losses.append(loss(td)["loss_value"])
-    assert len({value.item() for value in losses}) == 1
 
 
 def test_default_estimator_is_td0():
@@ -127,16 +92,6 @@ def test_target_network_updaters():
     hard.step()
     hard.step()
     assert torch.equal(target[C], online[C])
-
-
-@pytest.mark.parametrize(
-    "updater",
-    [lambda loss: SoftUpdate(loss, tau=0.1), lambda loss: HardUpdate(loss)],
-    ids=["soft", "hard"],
-)
-def test_updaters_need_delayed_parameters(updater):
-    with pytest.raises(RuntimeError, match="Did not find any target parameters"):
-        updater(make_loss(delay_value=False))
 
 
 @pytest.mark.parametrize("how", ["deepcopy", "pickle"])

@@ -88,27 +88,6 @@ def test_an_unsolved_value_after_termination_is_not_needed(estimator):
     assert make_loss(estimator, operator)(td)["unsolved"].item() >= 1
 
 
-@pytest.mark.parametrize("estimator", ["td1", "tdlambda"])
-def test_an_unsolved_value_spoils_only_the_returns_that_contain_it(estimator):
-    operator = hard_operator()
-    td = make_batch(3, 6)
-    parts: list[Any] = [td, td["next"]]
-    for part in parts:
-        part["observation"] *= 0.3
-    td["action"] *= 0.3
-    td["next", "terminated"] = torch.zeros(3, 6, 1, dtype=torch.bool)
-    td["next", "done"] = torch.zeros(3, 6, 1, dtype=torch.bool)
-    td["next", "done"][0, 1] = True
-    expected = make_loss(estimator, operator, reduction="none")(td.clone())["loss_value"]
-    td["next", "observation"][0, 3] = 5.0
-    out = make_loss(estimator, operator, reduction="none")(td)
-    spoilt = torch.zeros(3, 6, dtype=torch.bool)
-    spoilt[0, [2, 3]] = True  # it, and the step before it in its episode
-    kept = out["loss_value"][~spoilt]
-    torch.testing.assert_close(kept, expected[~spoilt])
-    assert out["loss_value"].isfinite().all()
-
-
 def test_without_masking_an_unsolved_qp_raises():
     operator = make_operator(state_slack=torch.inf, on_failure="raise")
     td = feasible_batch(3)
@@ -138,20 +117,6 @@ def test_invalid_rewards_are_left_out_and_counted(bad, reduction):
     for key in METADATA:
         torch.testing.assert_close(out[key], expected[key], msg=key)
     assert td["td_error"][2] == 0
-
-
-def test_a_batch_of_invalid_rewards_alone():
-    operator, td = hard_operator(), feasible_batch(3)
-    td["next", "reward"][:] = torch.nan
-    message = "None of the batch's 3 transitions .*: 0 without a QP .*, 3 with an invalid reward"
-    with (
-        pytest.warns(RuntimeWarning, match=message),
-        pytest.warns(RuntimeWarning, match="3 of 3 rewards"),
-    ):
-        out, total = gradients(make_loss(operator=operator), td)
-    assert (out["invalid_reward"].item(), out["unsolved"].item()) == (3, 0)
-    assert all(out[key].item() == 0 for key in ("loss_value", *METADATA))
-    assert all(torch.equal(g, torch.zeros_like(g)) for g in total)
 
 
 @pytest.mark.parametrize("estimator", ["td1", "tdlambda"])

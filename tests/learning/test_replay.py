@@ -117,13 +117,6 @@ def test_stored_transitions_are_sampled_uniformly():
     assert hits.sum(0).max() < 145
 
 
-def test_all_steps_are_in_the_order_of_each_environment():
-    data = batches(3, 2, max_steps=50)
-    steps = filled(data, rows=10).steps()
-    assert steps.shape == (ENVS, 6)
-    assert torch.equal(steps["observation"], torch.cat([x["observation"] for x in data], 1))
-
-
 def test_tau_has_the_order_of_z():
     z = torch.arange(2 * (N * 6 + 4), dtype=torch.float32).reshape(2, -1)
     pairs = z[:, :-4].unflatten(1, (N, 6))
@@ -194,18 +187,6 @@ def test_a_restored_replay_equals_an_undisturbed_one(count):
         second.extend(batch)
 
 
-def test_sampling_windows_too_early_is_an_error():
-    replay = filled([], rows=40)
-    match = "replay: got no window in {} transitions, expected 4 consecutive transitions"
-    with pytest.raises(QPError, match=match.format(0)):
-        replay.sample_tau()
-    for batch in batches(2, 1, max_steps=50):
-        replay.extend(batch)
-    assert not replay.has_windows()
-    with pytest.raises(QPError, match=match.format(16)):
-        replay.sample_tau()
-
-
 def test_a_flattened_batch_is_an_error():
     batch = batches(1, 2, max_steps=50)[0]
     with pytest.raises(QPError, match=r"batch: got shape \(16,\), expected \(num_envs, T\)"):
@@ -216,3 +197,15 @@ def test_a_flattened_batch_is_an_error():
 def test_bad_capacity_is_an_error(capacity):
     with pytest.raises(QPError, match=rf"capacity: got {capacity}, .* The smallest is 32\."):
         make_replay(capacity, ENVS, 32, N, 5)
+
+
+def test_sampling_windows_too_early_is_an_error():
+    replay = filled([], rows=40)
+    match = "replay: got no window in {} transitions, expected 4 consecutive transitions"
+    with pytest.raises(QPError, match=match.format(0)):
+        replay.sample_tau()
+    for batch in batches(2, 1, max_steps=50):
+        replay.extend(batch)
+    assert not replay.has_windows()
+    with pytest.raises(QPError, match=match.format(16)):
+        replay.sample_tau()

@@ -13,13 +13,10 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torch.testing import assert_close
-from torchrl.collectors import Collector
-from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.modules import AdditiveGaussianModule, ProbabilisticActor, TanhNormal
-from torchrl.objectives import DDPGLoss, SACLoss, SoftUpdate, TD3Loss
+from torchrl.objectives import SoftUpdate, TD3Loss
 
 from tests.problems import random_mpc
 from torch_qpmpc import (
@@ -30,7 +27,6 @@ from torch_qpmpc import (
     QPQLearningLoss,
     ThetaNetwork,
 )
-from torch_qpmpc.envs import PointMassEnv
 from torch_qpmpc.learning.updates import second_order
 
 SIZES = {"q": 0.3, "b": 0.1, "c": 1.0}
@@ -138,19 +134,6 @@ def test_finite_differences_through_theta_keys(output):
     assert (weight.grad * direction).sum().item() == pytest.approx(slope, rel=1e-4)
 
 
-def test_warm_starts_are_carried_with_a_scheduled_theta():
-    mpc, theta, operator = scheduled(active_set_key="active_set")
-    td = critic_of(theta, operator)(transitions(mpc))
-    again = critic_of(theta, operator)(td.clone())
-    assert_close(again["state_action_value"], td["state_action_value"])
-    actor = TensorDictSequential(
-        theta, operator.get_policy_operator("carried"), selected_out_keys=["action", "carried"]
-    )
-    first = actor(td.select("observation"))
-    assert first["carried"].dtype == torch.int8
-    assert_close(actor(first.clone())["action"], first["action"])
-
-
 @pytest.mark.parametrize("known", [{}, {"past": 2, "n_d": 1}], ids=["state", "window"])
 @pytest.mark.parametrize("delay_value", [False, True])
 def test_q_learning_trains_the_network_and_the_qp(delay_value, known):
@@ -218,59 +201,6 @@ def test_the_state_dict_holds_the_network():
         assert twin.theta_keys == theta.theta_keys
 
 
-@pytest.mark.parametrize("kind", ["ddpg", "td3", "sac"])
-def test_losses_of_torchrl(kind):
-    mpc, theta, operator = scheduled(moved=False)
-    _, *of_critic = scheduled()
-    critic, td = critic_of(*of_critic), transitions(mpc)
-    actor: Any = actor_of(theta, operator)
-    if kind == "ddpg":
-        loss: Any = DDPGLoss(actor, critic, delay_actor=True, delay_value=True)
-    elif kind == "td3":
-        twins = [critic, copy.deepcopy(critic)]
-        loss = TD3Loss(actor, twins, bounds=(torch.tensor([-0.5]), torch.tensor([0.5])))
-    else:
-        spread: Any = TensorDictModule(
-            AddStateIndependentNormalScale(1), ["action"], ["loc", "scale"]
-        )
-        net = TensorDictSequential(actor, spread, selected_out_keys=["loc", "scale"])
-        stochastic = ProbabilisticActor(
-            net, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True
-        )
-        twins = [critic, copy.deepcopy(critic)]
-        loss = SACLoss(stochastic, twins, action_spec=Bounded(-0.5, 0.5, (1,)))
-    loss.make_value_estimator(gamma=0.9)
-    out = loss(td)
-    sum(x for name, x in out.items() if name.startswith("loss")).backward()
-    of_actor = loss.actor_network_params.flatten_keys(".").to_dict()
-    grads = {name: x.grad for name, x in of_actor.items() if "net.4" in name}
-    assert len(grads) == 2
-    assert all(grad is not None and grad.abs().max() > 0 for grad in grads.values())
-    name = "value_network_params" if kind == "ddpg" else "qvalue_network_params"
-    of_value = getattr(loss, name).flatten_keys(".").to_dict()
-    assert any(x.grad is not None and x.grad.abs().max() > 0 for x in of_value.values())
-    assert "theta" not in td
-    SoftUpdate(loss, tau=0.1).step()
-
-
-def test_a_replay_stores_observations_and_no_theta():
-    mpc = QPMPC(n_x=4, n_u=2, horizon=3, action_bounds=([-1.0] * 2, [1.0] * 2), solver="daqp")
-    theta = ThetaNetwork(mpc, {"q": 0.1})
-    operator = QPActorValueOperator(mpc, theta_keys=theta.theta_keys)
-    env = PointMassEnv(num_envs=2, seed=0)
-    noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
-    explorer: Any = TensorDictSequential(actor_of(theta, operator), noise)
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(16), batch_size=4)
-    options: Any = {"frames_per_batch": 4, "auto_register_policy_transforms": False}
-    for batch in Collector(env, explorer, total_frames=8, **options):
-        replay.extend(batch.reshape(-1))
-    sample = replay.sample()
-    assert not any("theta" in str(key) for key in sample.keys(True, True))
-    loss = QPQLearningLoss(critic_of(theta, operator))
-    loss.make_value_estimator(gamma=0.9)
-    assert loss(sample)["loss_value"].isfinite()
-
-
 def test_gauss_newton_takes_no_upstream_modules():
     mpc, theta, operator = scheduled()
     message = "loss_module: got a value network with theta_keys"
@@ -333,3 +263,20 @@ def test_the_network_reads_other_keys():
 def test_mistakes(call, message):
     with pytest.raises(QPError, match=message):
         call(random_mpc(3))
+
+
+def test_an_actor_and_critics_of_torchrl():
+    mpc, theta, operator = scheduled(moved=False)
+    _, *of_critic = scheduled()
+    critic, td, actor = critic_of(*of_critic), transitions(mpc), actor_of(theta, operator)
+    twins = [critic, copy.deepcopy(critic)]
+    loss: Any = TD3Loss(actor, twins, bounds=(torch.tensor([-0.5]), torch.tensor([0.5])))
+    loss.make_value_estimator(gamma=0.9)
+    sum(x for name, x in loss(td).items() if name.startswith("loss")).backward()
+    for params, part in ((loss.actor_network_params, "net.4"), (loss.qvalue_network_params, "C")):
+        leaves = params.flatten_keys(".").to_dict()
+        grads = [x.grad for name, x in leaves.items() if part in name and x.requires_grad]
+        assert grads
+        assert all(grad.abs().max() > 0 for grad in grads)
+    assert "theta" not in td
+    SoftUpdate(loss, tau=0.1).step()

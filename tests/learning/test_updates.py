@@ -97,25 +97,6 @@ def test_a_window_and_a_preview_move_theta_as_one_observation_does(second):
     assert_close(*moved)
 
 
-def test_the_second_order_keeps_active_sets():
-    mpc = random_mpc(3)
-    loss = make_loss(mpc, ACTIVE_SET)
-    batch = transitions()
-    expected = mpc.solve(batch["observation"], batch["action"]).active
-    second_order(mpc, loss, GaussNewton(mpc), None, None)(batch, None)
-    assert torch.equal(batch[ACTIVE_SET], expected)
-    assert ACTIVE_SET in batch["next"]
-
-
-def test_unsolved_qps_are_counted():
-    mpc = random_mpc(3, on_failure="mask")
-    batch = transitions()
-    batch["action"][2] = 9.0  # beyond a hard bound
-    terms, scalars = second_order(mpc, make_loss(mpc), GaussNewton(mpc), None, None)(batch, None)
-    assert scalars["unsolved"] == 1
-    assert all(term.isfinite() for term in terms.values())
-
-
 @pytest.mark.parametrize("second", [True, False])
 def test_invalid_rewards_are_counted_under_their_own_name(second):
     mpc = random_mpc(3, on_failure="mask")
@@ -255,3 +236,13 @@ def test_the_second_order_finds_the_gain_of_the_riccati_equation():
     for _ in range(10):
         update(TensorDict(observation=s, action=a, next=following, batch_size=len(s)), None)
     assert -mpc.policy(torch.ones(1, 1).double()).item() == pytest.approx(K, rel=1e-3)
+
+
+def test_the_second_order_keeps_active_sets():
+    mpc = random_mpc(3)
+    loss = make_loss(mpc, ACTIVE_SET)
+    batch = transitions()
+    expected = mpc.solve(batch["observation"], batch["action"]).active
+    second_order(mpc, loss, GaussNewton(mpc), None, None)(batch, None)
+    assert torch.equal(batch[ACTIVE_SET], expected)
+    assert ACTIVE_SET in batch["next"]

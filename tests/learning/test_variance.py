@@ -9,7 +9,7 @@ from torch.testing import assert_close
 from tests.examples import example
 from tests.problems import normal
 from torch_qpmpc import QPMPC, GaussNewton
-from torch_qpmpc.learning.variance import FLOOR, inverse_variance
+from torch_qpmpc.learning.td_error import FLOOR, inverse_variance
 from torch_qpmpc.mpc.regulator import lqr_gain
 
 COUNT = 4000
@@ -38,14 +38,6 @@ def test_errors_of_one_variance_have_equal_weights():
     assert_close(weight, torch.ones_like(weight), rtol=0.25, atol=0)
 
 
-def test_the_weights_have_no_units():
-    p, a, value, use = pairs()
-    error = a[:, 0] * normal(COUNT, seed=3)
-    weight = inverse_variance(p, a, value, error, use)
-    scaled = inverse_variance(10 * p + 3, 7 * a, 2 * value, 100 * error, use)
-    assert_close(scaled, weight, rtol=1e-6, atol=0)
-
-
 def test_unusable_pairs_do_not_count():
     p, a, value, use = pairs()
     error = a[:, 0] * normal(COUNT, seed=3)
@@ -60,12 +52,6 @@ def test_few_pairs_or_errors_of_zero_have_weight_one():
     few = slice(0, 15)
     assert (inverse_variance(p[few], a[few], value[few], a[few, 0], use[few]) == 1).all()
     assert (inverse_variance(p, a, value, torch.zeros(COUNT).double(), use) == 1).all()
-
-
-def test_equal_inputs_leave_the_weights_finite():
-    p, a, value, use = (x[:50] for x in pairs())
-    weight = inverse_variance(0 * p, a, 0 * value, a[:, 0], use)
-    assert weight.isfinite().all()
 
 
 def learned_gain(weighted: bool) -> Tensor:
@@ -101,3 +87,17 @@ def test_weighted_q_learning_finds_the_optimal_gain_under_actuator_noise():
     weighted, plain = ((learned_gain(x) - K).norm() / K.norm() for x in (True, False))
     assert weighted < 0.2
     assert plain > 2 * weighted
+
+
+def test_the_weights_have_no_units():
+    p, a, value, use = pairs()
+    error = a[:, 0] * normal(COUNT, seed=3)
+    weight = inverse_variance(p, a, value, error, use)
+    scaled = inverse_variance(10 * p + 3, 7 * a, 2 * value, 100 * error, use)
+    assert_close(scaled, weight, rtol=1e-6, atol=0)
+
+
+def test_equal_inputs_leave_the_weights_finite():
+    p, a, value, use = (x[:50] for x in pairs())
+    weight = inverse_variance(0 * p, a, 0 * value, a[:, 0], use)
+    assert weight.isfinite().all()

@@ -113,7 +113,7 @@ def test_training_is_the_same_without_the_cache(tmp_path, monkeypatch):
     """Equal up to the certificate's tolerance."""
     cfg = make_config(*SMALL, "updates=15", "batch_size=64", "eval_interval=15")
     runs = [train.train(cfg, str(tmp_path / "true"))]
-    monkeypatch.setattr(train, "make_operator", lambda cfg, mpc: QPActorValueOperator(mpc))
+    monkeypatch.setattr(train, "make_operator", QPActorValueOperator)
     monkeypatch.setattr(Replay, "remember", lambda *_: None)
     runs.append(train.train(cfg, str(tmp_path / "false")))
     for name in ("J_start", "J_final", "J_discounted_final"):

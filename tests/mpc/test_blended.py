@@ -18,7 +18,6 @@ from torch_qpmpc import QPMPC, BlendedModel, QPError
 from torch_qpmpc.analysis.report import read
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.learning.penalties import SystemIdentificationPenalty
-from torch_qpmpc.learning.prediction_errors import PredictionErrors
 from torch_qpmpc.learning.updates import first_order, second_order
 from torch_qpmpc.proofs import Polytope, largest_difference
 
@@ -187,7 +186,7 @@ def test_finite_differences_of_Q_in_theta_and_gauss_newton_s_step(structure, mod
     difference = (moved(1e-5) - moved(-1e-5)) / 2e-5
     assert float(slope) == pytest.approx(difference.item(), rel=1e-5)
     # The ratio of actual to predicted decrease is 1 to first order only with the right gradients.
-    step = qm.GaussNewton(mpc, lr=1e-4, normalise=False).step(s, a, Q.detach() - 1)
+    step = qm.GaussNewton(mpc, lr=1e-4).step(s, a, Q.detach() - 1)
     assert step.ratio == pytest.approx(1, abs=1e-3)
 
 
@@ -238,7 +237,6 @@ def test_files_copies_and_state_dicts_have_the_schedule(model, tmp_path):
         lambda mpc: mpc.export_c("nowhere"),
         lambda mpc: largest_difference(mpc, mpc, Polytope.box([-1.0, -1.0], [1.0, 1.0])),
         read,
-        PredictionErrors,
         lambda mpc: first_order(mpc, None, None, None, SystemIdentificationPenalty(1.0)),  # pyright: ignore[reportArgumentType]
         lambda mpc: second_order(mpc, None, None, None, SystemIdentificationPenalty(1.0)),  # pyright: ignore[reportArgumentType]
     ],

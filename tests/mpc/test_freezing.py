@@ -82,20 +82,15 @@ def test_no_optimiser_moves_frozen_entries(kind, name):
     moves(mpc, C, mask)
 
 
-@pytest.mark.parametrize("normalise", [False, True])
 @pytest.mark.parametrize("penalised", [False, True])
-@pytest.mark.parametrize("memory", [0, 16])
 @pytest.mark.parametrize("kind", MASKS)
-def test_a_gauss_newton_step_is_that_in_the_learned_entries_alone(
-    kind, memory, penalised, normalise
-):
+def test_a_gauss_newton_step_is_that_in_the_learned_entries_alone(kind, penalised):
     mask = MASKS[kind]()
     mpc = masked(mask)
     s, a, target = targets(mpc)
     S = SystemIdentificationPenalty(1e-2).curvature(random_states(20, N_Z)) if penalised else None
-    options = {"trust_region": False, "memory": memory, "normalise": normalise}
-    optimizer = GaussNewton(mpc, damping=0.1, **options)
-    reference = Reference(mpc, optimizer, normalise)
+    optimizer = GaussNewton(mpc, damping=0.1, trust_region=False)
+    reference = Reference(mpc, optimizer)
     before, expected = reference.theta(), reference.step(s, a, target, S)
     C = mpc.C.detach().clone()
     assert optimizer.step(s, a, target, penalty=S).accepted
@@ -418,15 +413,6 @@ def test_errors_that_cannot_be_squared_move_nothing():
     before = mpc.C.detach().clone()
     assert not GaussNewton(mpc).step(s, a, 1e160 * target).accepted
     assert torch.equal(mpc.C, before)
-
-
-def test_a_memory_of_another_horizon_is_named():
-    short, long = (GaussNewton(random_mpc(0, horizon=n), memory=4) for n in (2, 3))
-    for optimizer in (short, long):
-        optimizer.step(*targets(optimizer._mpc))
-    long.load_state_dict(short.state_dict())
-    with pytest.raises(QPError, match=r"got a memory of gradients with .* entries, expected"):
-        long.step(*targets(long._mpc))
 
 
 def test_weights_that_are_not_finite_are_named():

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
-from torch_qpmpc.mpc.tightening import BackOff, prediction_covariance, tighten
+from torch_qpmpc.mpc.tightening import back_off, prediction_covariance, tighten
 
 N = 4
 A = torch.tensor([[1.0, 0.1], [0.0, 0.9]]).double()
@@ -126,23 +126,16 @@ def tied(**options) -> QPMPC:
     return scheme(structure="tied", **{"stage_weight": [1.0, 1.0, 0.1], "learn": ["C"], **options})
 
 
-def test_a_back_off_is_the_tightening_of_the_nominal_bounds_by_the_current_model():
-    mpc = tied()
-    back_off = BackOff(mpc)
-    back_off.tighten(100 * W)
+def test_a_back_off_is_the_tightening_by_the_current_model():
+    mpc, reference = tied(), scheme()
     with torch.no_grad():
-        mpc.leaves("C")[0].mul_(0.9)  # a model that learns
-    back_off.tighten(W)
-    reference, model = scheme(), mpc.model()[0].detach()
+        mpc.leaves("C")[0].mul_(0.9)  # a model that has learned
+    back_off(mpc, W)
+    model = mpc.model()[0].detach()
     K = -lqr_gain(model, B, stage_weight(mpc))
     tighten(reference, prediction_covariance(model + B @ K, W, N), K=K)
     assert_close(mpc.lb, reference.lb)
     assert_close(mpc.ub, reference.ub)
-    moved = (scheme().ub - mpc.ub).max()
-    assert back_off.margin == pytest.approx(moved.item())
-    back_off.tighten(0 * W)
-    assert torch.equal(mpc.ub, scheme().ub)
-    assert back_off.margin == 0
 
 
 def test_a_back_off_without_a_regulator_is_that_of_the_open_loop():
@@ -150,16 +143,9 @@ def test_a_back_off_without_a_regulator_is_that_of_the_open_loop():
     mpc, reference = tied(), scheme()
     with torch.no_grad():
         mpc.leaves("C")[0].copy_(unstable)
-    BackOff(mpc, 0.9).tighten(W)
+    back_off(mpc, W, 0.9)
     tighten(reference, prediction_covariance(unstable, W, N), 0.9)
     assert_close(mpc.ub, reference.ub)
-
-
-def test_infinite_bounds_have_no_margin():
-    mpc = tied(state_bounds=([-1.0, -torch.inf], [3.0, torch.inf]))
-    back_off = BackOff(mpc)
-    back_off.tighten(W)
-    assert 0 < back_off.margin < 1
 
 
 @pytest.mark.parametrize(
@@ -168,19 +154,20 @@ def test_infinite_bounds_have_no_margin():
         (None, "mpc"),
         (scheme(), "structure: got 'free'"),
         (tied(learn=["C", "lb"]), "mpc: got one that learns lb, expected fixed bounds"),
-        (tied(state_bounds=None), "mpc: got one without soft bounds"),
         (
             QPMPC(2, 1, N, past=2, structure="tied", state_bounds=([-1, -1], [1, 1])),
             "mpc: got past=2, expected past=1",
         ),
     ],
-    ids=range(5),
+    ids=range(4),
 )
 def test_errors_of_a_back_off(mpc, message):
     with pytest.raises(QPError, match=message):
-        BackOff(mpc)
+        back_off(mpc, W)
 
 
-def test_the_probability_of_a_back_off_is_checked():
+def test_the_numbers_of_a_back_off_are_checked():
     with pytest.raises(QPError, match="probability"):
-        BackOff(tied(), 0.3)
+        back_off(tied(), W, 0.3)
+    with pytest.raises(QPError, match="W"):
+        back_off(tied(), torch.eye(3).double())

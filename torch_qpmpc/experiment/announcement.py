@@ -21,7 +21,7 @@ def announcement(cfg: DictConfig, folder: str, done: int = 0) -> str:
     parts = [f"{group} {cfg[group].name}" for group in ("noise", "constraint", "optimizer")]
     parts = [f"task {task}", *parts, f"solver {cfg.solver}", f"seed {cfg.seed}"]
     updates = f"{cfg.updates} updates" + (f", {done} of them done" if done else "")
-    lines = [f"{cfg.algo.name}, {updates}: {', '.join(parts)}", f"Folder: {folder}"]
+    lines = [f"{updates}: {', '.join(parts)}", f"Folder: {folder}"]
     return printable("\n".join(lines))
 
 

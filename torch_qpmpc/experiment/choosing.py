@@ -289,12 +289,12 @@ def _blended(cfg: DictConfig, start: Start, horizon: int) -> BlendedModel | None
     """Return the models blended from a start's log; None if they are of no use here.
 
     They predict held-out steps little better than one model does, or the QP has known signals or a
-    past, or the run needs one C for all states, or judges policies by linear models.
+    past, or the run needs one C for all states.
     """
     layout = start.identified.options.layout
-    if layout.past > 1 or layout.n_d or cfg.export is not None or cfg.back_off is not None:
+    if layout.past > 1 or layout.n_d or cfg.export is not None:
         return None
-    if cfg.constraint.si is not None or cfg.gate == "model":
+    if cfg.constraint.si is not None:
         return None
     models = identify_blended(start.log, horizon, held=start.identified.options.held)
     unexplained = {count: 1 - R2 for count, R2 in models.R2.items()}

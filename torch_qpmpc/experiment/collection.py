@@ -39,7 +39,7 @@ def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
         cfg.task.horizon,
         1 if si is None else si.windows,
         seed=cfg.seed,
-        active_rows=len(mpc.G) if cfg.algo.name == "qlearning" else None,
+        active_rows=len(mpc.G),
         n_x=mpc.n_x,
         preview_key=preview_key(mpc),
     )

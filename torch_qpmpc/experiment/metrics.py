@@ -52,8 +52,6 @@ def update_metrics(
     metrics |= tally.metrics() | theta_metrics(mpc)
     if learner.deviation is not None:
         metrics.setdefault("loss/deviation", learner.deviation(mpc.C).item())
-    if learner.back_off is not None:
-        metrics["train/margin"] = learner.back_off.margin
     return metrics | watch.metrics()
 
 
@@ -62,19 +60,15 @@ def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str
     cfg, mpc = evaluation.cfg, gate.mpc
     summary = evaluation.summary() | gate.summary()
     summary |= {"seed": cfg.seed, "constraint": cfg.constraint.name, "noise": cfg.noise.name}
-    summary |= {"task": cfg.task.name, "algo": cfg.algo.name, "solver": cfg.solver}
+    summary |= {"task": cfg.task.name, "solver": cfg.solver}
     summary |= {"ablation": cfg.ablation, "step": cfg.step}
     summary |= {"updates": cfg.updates, **tally.summary()}
-    if mpc is None:
-        return summary
     physics = evaluation.physics
     model = physics.true_model() if isinstance(physics, LinearSystem) else None
     return summary | structure_summary(mpc, model)
 
 
-def report(
-    run: RunFolder, mpc: QPMPC | None, evaluation: Evaluation, update: int
-) -> dict[str, Any]:
+def report(run: RunFolder, mpc: QPMPC, evaluation: Evaluation, update: int) -> dict[str, Any]:
     """Log an evaluation: J, the structure of C and, if configured, figures.
 
     Before the first update only J is logged. Figures are drawn at the first evaluation after it and
@@ -82,7 +76,7 @@ def report(
 
     Args:
         run: the run's folder.
-        mpc: the learned QP; None if the policy is a network.
+        mpc: the learned QP.
         evaluation: the evaluation.
         update: the number of updates so far.
 
@@ -93,7 +87,7 @@ def report(
     scalars = {f"eval/{name}": summary[key] for name, key in EVALUATION_SCALARS.items()}
     scalars |= {f"eval/J_{tag(name)}": J for name, J in evaluation.rivals.items()}
     run.log(scalars, update)
-    if mpc is None or update == 0:
+    if update == 0:
         return summary
     distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u, mpc.past, mpc.n_d)
     distances |= structure_metrics(mpc)
@@ -189,8 +183,7 @@ def table(summary: Mapping[str, Any]) -> str:
     if summary.get("rejected") and not summary["accepted"]:
         kept = f"none of {summary['rejected']} candidates was shown to cost less"
         kept += f", the last one of which costs {cost_text(summary['J_final'])}"
-        names = ("simulated", *COMPARED.values())
-        compared = next(f"{summary[x]:,} {x}" for x in names if x in summary)
+        compared = next(f"{summary[x]:,} {x}" for x in COMPARED if x in summary)
         lines += ["", f"The gate kept the start: {kept}, by at most {compared} transitions."]
     return "\n".join(lines + _worse_than_zero(summary))
 

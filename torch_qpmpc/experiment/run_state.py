@@ -33,7 +33,7 @@ from torch_qpmpc.mpc.state import KIND, stored
 
 #: The parts of a snapshot.
 STATE = ("config", "update", "arguments", "mpc", "loss_module", "optimizer", "scheduler")
-STATE += ("errors", "gate", "replay", "collector", "tally", "rng")
+STATE += ("gate", "replay", "collector", "tally", "rng")
 #: Files that a run writes before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
 #: Keys that may stand beside ``resume``, because they name the run's code.
@@ -61,7 +61,6 @@ def snapshot(
         "loss_module": learner.loss_module.state_dict(),
         "optimizer": learner.optimizer.state_dict(),
         "scheduler": {"last_epoch": learner.scheduler.last_epoch},
-        "errors": None if learner.errors is None else learner.errors.state_dict(),
         "gate": gate.state_dict(),
         "replay": replay.state_dict() if len(replay) and not finished else None,
         "collector": None if finished else _collector_state(collector),
@@ -91,9 +90,6 @@ def restore(
         learner.optimizer.load_state_dict(state["optimizer"])
     with _part("scheduler"):
         learner.scheduler.last_epoch = int(state["scheduler"]["last_epoch"])
-    with _part("errors"):
-        if learner.errors is not None:
-            learner.errors.load_state_dict(state["errors"])
     with _part("gate"):
         gate.load_state_dict(state["gate"])
     with _part("replay"):

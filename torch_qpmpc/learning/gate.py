@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -193,8 +193,7 @@ class Gate:
     Args:
         actor: the first policy; the gate keeps a copy.
         costs: maps a policy and a seed to the costs ``(starts,)`` of closed loops, with starts and
-            disturbances from the seed alone. A candidate must cost less by each of several, such
-            as those of the members of an ensemble.
+            disturbances from the seed alone.
         pairs: the number of pairs after which an undecided comparison rejects the candidate.
         alpha: the probability that any candidate is accepted that is no better. Comparison k, from
             1, has the share ``K / ((K + k - 1) (K + k))`` of it; all shares sum to 1.
@@ -228,7 +227,7 @@ class Gate:
     def __init__(
         self,
         actor: nn.Module,
-        costs: Costs | Sequence[Costs],
+        costs: Costs,
         *,
         pairs: int = 96,
         alpha: float = 0.05,
@@ -243,9 +242,7 @@ class Gate:
         check_seed(seed)
         check_whole("decisions", decisions, 1)
         PairedTest(alpha, bound)
-        self.actor, self._costs = copy.deepcopy(actor), [costs] if callable(costs) else [*costs]
-        if not self._costs:
-            raise QPError.expected("costs", "none", "a function, or at least one in a list")
+        self.actor, self._costs = copy.deepcopy(actor), costs
         self._decisions, self._bound = decisions, bound
         self._pairs, self._alpha, self._patience, self._seed = pairs, alpha, patience, seed
         self.accepted = self.rejected = self._in_a_row = 0
@@ -260,11 +257,7 @@ class Gate:
         """Compare ``candidate`` with the policy that is kept, on new starts and disturbances.
 
         Pairs are added until the test is decided, the candidate's mean cost is no lower, or there
-        are ``pairs``. With several costs each is tested in turn, up to the first that rejects, at
-        the same level: an intersection-union test (Berger, "Multiparameter hypothesis testing and
-        acceptance sampling", Technometrics 1982), which accepts a candidate that is no better by
-        one of them with no larger probability. The verdict is of the costs that reject or, if
-        none does, gain least.
+        are ``pairs``.
 
         An accepted candidate's parameters are copied to the policy that is kept; after ``patience``
         rejections in a row it is the other way round.
@@ -272,14 +265,8 @@ class Gate:
         Raises:
             QPError: ``costs`` returns another shape than ``(starts,)``.
         """
-        tests: list[PairedTest] = []
-        for costs in self._costs:
-            tests.append(self._compare(candidate, costs))
-            if tests[-1].decision != "better":
-                break
-        accepted, restarted = tests[-1].decision == "better", False
-        test = max(tests, key=lambda test: test.mean) if accepted else tests[-1]
-        pairs = sum(test.pairs for test in tests)
+        test = self._compare(candidate)
+        accepted, restarted = test.decision == "better", False
         self._in_a_row = 0 if accepted else self._in_a_row + 1
         if accepted:
             self.accepted += 1
@@ -290,15 +277,15 @@ class Gate:
             if restarted:
                 candidate.load_state_dict(self.actor.state_dict())
                 self._in_a_row = 0
-        return Verdict(accepted, test.mean, *test.interval, pairs, restarted)
+        return Verdict(accepted, test.mean, *test.interval, test.pairs, restarted)
 
-    def _compare(self, candidate: nn.Module, costs: Costs) -> PairedTest:
+    def _compare(self, candidate: nn.Module) -> PairedTest:
         test, count = self._test(), 0
         # A candidate that costs as much or more so far is hardly worth more pairs.
         while test.decision == "open" and test.pairs < self._pairs and not test.mean >= 0:
             entropy = [self._seed, self.accepted + self.rejected, count]
             seed = int(np.random.SeedSequence(entropy).generate_state(1)[0])
-            old, new = (costs(actor, seed) for actor in (self.actor, candidate))
+            old, new = (self._costs(actor, seed) for actor in (self.actor, candidate))
             if old.ndim != 1 or new.shape != old.shape or not len(old):
                 got = f"shapes {tuple(old.shape)} and {tuple(new.shape)}"
                 raise QPError.expected("costs", got, "one cost for each start, (starts,)")

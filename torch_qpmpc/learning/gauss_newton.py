@@ -4,9 +4,8 @@ With g_i = dQ(s_i, a_i)/dtheta by the envelope theorem and a metric D on theta, 
 
     min over dtheta:  1/2 sum_i (delta_i - g_i'dtheta)^2 + 1/2 mu dtheta'D^-1 dtheta
 
-by its dual (`learning.kernel`); `learning.metric` defines D. Where C is not free, further
-residuals r, such as the one-step prediction errors of a tied C, add 1/2 v |r + dr/dtheta dtheta|^2,
-with v the mean squared TD error: they are further rows of the least-squares problem.
+by its dual; `learning.kernel` has that and D. Where C is not free, residuals r of your own add
+1/2 v |r + dr/dtheta dtheta|^2, with v the mean squared TD error.
 """
 
 from __future__ import annotations
@@ -18,19 +17,21 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tensor, check_whole
+from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.kernel import (
+    FORGET,
+    FRESH,
     Block,
     Dense,
     OuterProducts,
     damping_of,
     objective,
+    scale,
+    signal_sizes,
     solve_dual,
 )
-from torch_qpmpc.learning.metric import FORGET, FRESH, scale, signal_sizes
-from torch_qpmpc.learning.td_error import usable
-from torch_qpmpc.learning.variance import inverse_variance
+from torch_qpmpc.learning.td_error import inverse_variance, usable
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
 from torch_qpmpc.qp.derivatives import envelope_gradients
@@ -88,18 +89,13 @@ class GaussNewton(torch.optim.Optimizer):
         damping: mu as a fraction of the mean of K's diagonal, and the trust region's lower bound
             on it. A larger one makes a step less sensitive to its batch's noise.
         td_error_clip: bound on the absolute TD error; none by default.
-        memory: number of past pairs whose gradients each step keeps, to penalise changes of their
-            Q at first order, without solving their QPs again. It serves small batches, down to
-            single transitions, as in recursive least squares.
         trust_region: solve the batch again after each step and its projection (`QPMPC.project_`),
             with the targets fixed; undo a step that raised the squared errors, and adapt the
             damping to the ratio of actual to predicted decrease.
-        normalise: divide by sizes and units, as above. False takes the scales themselves as D, by
-            default 1 and 0.01, for streams of small batches, whose sizes are mostly noise.
         residuals: maps a QP to residuals r ``(M,)``, differentiable in its tensors, such as
-            `PredictionErrors.residuals`. 1/2 r'r at first order, times the mean squared TD error,
-            is added to the batch's sum of ``1/2 delta^2``. That mean rises at once and falls
-            slowly, like a size.
+            ``lambda qp: 0.1 * qp.q``. 1/2 r'r at first order, times the mean squared TD error, is
+            added to the batch's sum of ``1/2 delta^2``. That mean rises at once and falls slowly,
+            like a size.
         weighted: multiply each pair's ``1/2 delta^2`` by `inverse_variance`.
 
     Raises:
@@ -126,31 +122,26 @@ class GaussNewton(torch.optim.Optimizer):
         lr: float = 1.0,
         damping: float = 0.03,
         td_error_clip: float | None = None,
-        memory: int = 0,
         trust_region: bool = True,
-        normalise: bool = True,
         residuals: Callable[[QuadraticProgram], Tensor] | None = None,
         weighted: bool = False,
     ) -> None:
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
         check_kind("mpc", mpc, QPMPC, remedy)
-        check_whole("memory", memory, 0)
         check_number("lr", lr, lambda x: 0 < x <= 1, "a number in (0, 1]")
         check_number("damping", damping, _positive, "a finite number > 0")
         if td_error_clip is not None:
             check_number("td_error_clip", td_error_clip, _positive, "a finite number > 0")
         check_flag("trust_region", trust_region)
-        check_flag("normalise", normalise)
         check_flag("weighted", weighted)
-        default = {"cost": 1.0, "constraints": 3.0 if normalise else 1e-2}
-        groups = mpc.parameter_groups(scales or default)
+        groups = mpc.parameter_groups(scales or {"cost": 1.0, "constraints": 3.0})
         for group in groups:
             check_number(f"scales[{group['name']}]", group["lr"], _positive, "a finite number > 0")
             group |= {"scale": group["lr"], "lr": lr, "damping": damping, **FRESH}
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
-        self._clip, self._memory, self._trust_region = td_error_clip, memory, trust_region
-        self._normalise, self._residuals, self._weighted = normalise, residuals, weighted
+        self._clip, self._trust_region = td_error_clip, trust_region
+        self._residuals, self._weighted = residuals, weighted
         if residuals is not None and self._free_C() is not None:
             remedy = "Pass a penalty of its rows to step."
             raise QPError.expected("residuals", "them with a free C", "a tied C", remedy)
@@ -230,23 +221,15 @@ class GaussNewton(torch.optim.Optimizer):
         self, blocks: list[Block], delta: Tensor, count: int
     ) -> tuple[Tensor, list[Tensor], Tensor]:
         """Return the errors of pairs and residuals, the parts' steps, and their change of both."""
-        if self._normalise:
-            scale(blocks, count)
-        for block in blocks:
-            if not self._normalise:
-                block.scale = block.group["scale"]
-            block.remember(self.state[block.leaf], self._memory)
+        scale(blocks, count)
         mu = damping_of(blocks, self.param_groups[0]["damping"])
         errors = torch.cat((delta, self._further(blocks, delta, count)))
-        # Past pairs have no TD errors: they contribute their curvature alone.
-        past = delta.new_zeros(len(blocks[0]) - len(errors) if blocks else 0)
-        alpha, change = solve_dual(blocks, torch.cat((errors, past)), mu)
-        return errors, [block.step(alpha) for block in blocks], change[: len(errors)]
+        alpha, change = solve_dual(blocks, errors, mu)
+        return errors, [block.step(alpha) for block in blocks], change
 
     def _restart(self) -> None:
-        """Raise the damping, and clear the memory and the sizes, after an overflow."""
+        """Raise the damping and clear the sizes after an overflow."""
         self._adapt(math.nan)
-        self.state.clear()
         for group in self.param_groups:
             group |= FRESH
 
@@ -342,7 +325,7 @@ class GaussNewton(torch.optim.Optimizer):
         return next((leaf for leaf in leaves if leaf is C and leaf.requires_grad), None)
 
     def _further(self, blocks: list[Block], delta: Tensor, count: int) -> Tensor:
-        """Insert the residuals' gradients after those of the TD errors; return their errors -r."""
+        """Append the residuals' gradients to those of the TD errors; return their errors -r."""
         if self._residuals is None or not blocks:
             return delta.new_zeros(0)
         group, variance = self.param_groups[0], float(delta.square().sum() / count)
@@ -359,7 +342,7 @@ class GaussNewton(torch.optim.Optimizer):
         for block, rows in zip(blocks, gradients, strict=True):
             assert isinstance(block, Dense)
             rows = block.rows.new_zeros(len(r), 1) if rows is None else rows.flatten(1)
-            block.insert(rows.expand(-1, block.rows.shape[1]), len(delta))
+            block.rows = torch.cat((block.rows, rows.expand(-1, block.rows.shape[1])))
         return -r.detach()
 
     def _blocks(self, solution: QPSolution, root: Tensor, S: Tensor | None) -> list[Block]:
@@ -373,9 +356,7 @@ class GaussNewton(torch.optim.Optimizer):
             factored.copy_(mpc.C)  # another optimiser may have moved entries that are not learned
         dense = [leaf for leaf, _ in pairs if leaf is not factored]
         gradients = iter(_gradients(solution, root, dense, without_C=factored is not None))
-        rows, columns = z.new_ones(mpc.horizon * mpc.n_x), torch.ones_like(z[0])
-        if self._normalise:
-            rows, columns = signal_sizes(mpc, self.param_groups[0], z[root > 0])
+        rows, columns = signal_sizes(mpc, self.param_groups[0], z[root > 0])
         units = {"b": rows, "q": 1 / columns} if mpc.structure == "free" else {}
         return [
             OuterProducts(leaf, group, chi, z, rows, columns, S, mpc.b.detach(), mask)

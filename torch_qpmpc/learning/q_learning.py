@@ -17,9 +17,12 @@ from torchrl.objectives.utils import _GAMMA_LMBDA_DEPREC_ERROR, dispatch_value_e
 from torch_qpmpc.checks import check_flag, check_number, class_name
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.operators import QPActorValueOperator, QPValueOperator
-from torch_qpmpc.learning.restoring import call_with
-from torch_qpmpc.learning.td_error import invalid_rewards, td_loss, td_metadata
-from torch_qpmpc.learning.variance import inverse_variance
+from torch_qpmpc.learning.td_error import (
+    invalid_rewards,
+    inverse_variance,
+    td_loss,
+    td_metadata,
+)
 from torch_qpmpc.qp.tracing import has_values
 
 
@@ -289,7 +292,7 @@ class QPQLearningLoss(LossModule):
     def _visited(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the entries that Q reads, with -Q(s, a) and, if it has a key, its active set."""
         visited = tensordict.select(*self._reads(self.value_network), strict=False).detach()
-        call_with(self.value_network_params, self.value_network, visited)
+        _call_with(self.value_network_params, self.value_network, visited)
         return visited
 
     def _inverse_variance(
@@ -426,7 +429,7 @@ class QPQLearningLoss(LossModule):
         """Return -V(s+), zero after a termination, and True there, both ``(*batch, 1)``."""
         active_set, network = self.operator.active_set_key, self.state_value_network
         following = tensordict.get("next").select(*self._reads(network), strict=False)
-        call_with(self.target_value_network_params, network, following)
+        _call_with(self.target_value_network_params, network, following)
         if active_set is not None:
             tensordict.set(unravel_key(("next", active_set)), following.get(active_set))
         done = tensordict.get(("next", self.tensor_keys.done))
@@ -437,6 +440,23 @@ class QPQLearningLoss(LossModule):
         """Return the in-keys of a view of the QP, and its active-set key if there is one."""
         key = self.operator.active_set_key
         return [*network.in_keys, *([] if key is None else [key])]
+
+
+def _call_with(
+    params: TensorDictBase, network: TensorDictModuleBase, tensordict: TensorDictBase
+) -> None:
+    """Call ``network`` on ``tensordict``, in place, with ``params`` instead of its own tensors.
+
+    After an exception, tensordict's context would leave ``params`` in the network.
+    """
+    failure = None
+    with params.to_module(network, preserve_module_state=False):
+        try:
+            network(tensordict)
+        except Exception as error:
+            failure = error
+    if failure is not None:
+        raise failure
 
 
 def _check_factor(name: str, value: Any) -> None:

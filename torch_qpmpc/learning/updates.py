@@ -9,21 +9,17 @@ batch without a usable transition leaves theta and the optimiser's state unchang
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import QPActorValueOperator
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
-from torch_qpmpc.learning.restoring import restored
-from torch_qpmpc.learning.td_error import invalid_rewards, td_loss, td_metadata
+from torch_qpmpc.learning.td_error import td_loss, td_metadata
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
 from torch_qpmpc.mpc.validation import check_one_model
@@ -34,24 +30,20 @@ Update = Callable[[TensorDictBase, Tensor | None], tuple[dict[str, Tensor], Scal
 
 def first_order(
     mpc: QPMPC,
-    loss_module: LossModule,
+    loss_module: QPQLearningLoss,
     optimizer: torch.optim.Optimizer,
     deviation: DeviationPenalty | None,
     si: SystemIdentificationPenalty | None,
-    actor_due: Callable[[], bool] = lambda: True,
 ) -> Update:
     """Return an update by a torch optimiser on the gradient of the loss and the penalties.
 
-    A loss or gradient that is not finite changes nothing either. The transitions in such a loss are
-    counted: those with an invalid reward, with a `RuntimeWarning`, and the unsolved ones.
+    A loss or gradient that is not finite changes nothing either.
 
     Args:
         mpc: the QPMPC that is penalised and projected.
-        loss_module: any TorchRL loss; its ``loss_*`` entries are summed.
+        loss_module: the loss.
         optimizer: any torch optimiser of the parameters in ``loss_module``.
         deviation, si: the penalties on C; None for none.
-        actor_due: returns True for an update of actor and critics, False for the critics alone, as
-            TD3 delays its actor.
 
     Raises:
         QPError: the SI penalty is of one C for all states, and the QPMPC has a schedule.
@@ -60,40 +52,22 @@ def first_order(
         check_one_model(mpc)
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
-        with restored(loss_module):
-            losses = loss_module(batch)
-        terms = {name.replace("_", "/", 1): x for name, x in losses.items() if "loss_" in name}
+        losses = loss_module(batch)
+        terms = {"loss/value": losses["loss_value"]}
         if si is not None and windows is not None:
             terms["loss/si"] = si(mpc.C, windows, mpc.b.detach())
-        due = actor_due()
-        total = torch.stack([x for name, x in terms.items() if due or "value" in name]).sum()
+        total = torch.stack([*terms.values()]).sum()
         optimizer.zero_grad()
-        if not total.isfinite():
-            if losses.get("unsolved", None) is None:
-                effect = "The batch moves nothing."
-                keys: Any = loss_module.tensor_keys
-                key = unravel_key(("next", keys.reward))
-                invalid = invalid_rewards(batch.get(key), key, effect).view(-1)
-                lost = invalid
-                if "pred_value" in losses:  # SAC's output has only sums
-                    error = losses["pred_value"] - losses["target_value"]
-                    # An ensemble has one error per critic and transition.
-                    lost = (~error.isfinite()).reshape(-1, len(batch)).any(0)
-                losses["unsolved"] = (lost & ~invalid).sum()
-                losses["invalid_reward"] = invalid.sum()
-            return terms, losses
-        unsolved = losses.get("unsolved", None)
-        if unsolved is not None and unsolved + losses["invalid_reward"] == batch.numel():
+        if losses["unsolved"] + losses["invalid_reward"] == batch.numel() or not total.isfinite():
             return terms, losses
         total.backward()
         gradients = [x.grad for group in optimizer.param_groups for x in group["params"]]
         if not all(gradient is None or gradient.isfinite().all() for gradient in gradients):
             return terms, losses
         optimizer.step()
-        if due:
-            mpc.project_()
-            if deviation is not None:
-                deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
+        mpc.project_()
+        if deviation is not None:
+            deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
         return terms, losses
 
     return update

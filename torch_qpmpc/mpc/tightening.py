@@ -104,19 +104,20 @@ def tighten(
     mpc.ub.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, ub), mpc.ub))
 
 
-class BackOff:
-    """The tightening of a QPMPC whose model is learned, for a noise that is estimated.
+@torch.no_grad()
+def back_off(mpc: QPMPC, W: Tensor, probability: float = 0.95) -> None:
+    """Tighten soft rows for a noise of covariance W, and change ``mpc`` in place.
 
     The regulator of the model and the stage cost feeds the prediction's errors back; if their
     Riccati equation has no solution, nothing does.
 
     Args:
-        mpc: the QPMPC with its nominal bounds.
-        probability: that of each soft row, as in `tighten`.
+        mpc: the QPMPC with its nominal bounds, a tied C and no window.
+        W: ``(n_x, n_x)``.
+        probability: as in `tighten`.
 
     Raises:
-        QPError: the QPMPC has a free C, a window of more than one step, learned bounds or no soft
-            ones, or the probability is out of range.
+        QPError: as in `tighten`, or the QPMPC has a free C or a window of more than one step.
 
     Example:
         >>> import torch_qpmpc as qm
@@ -124,49 +125,21 @@ class BackOff:
         >>> mpc = qm.QPMPC.from_model(
         ...     one, one, 2, structure="tied", stage_weight=[1.0, 1.0], state_bounds=([-5], [5])
         ... )
-        >>> back_off = BackOff(mpc)
-        >>> for variance in (0.25, 0.04):
-        ...     back_off.tighten(variance * one)
-        ...     print(mpc.ub[mpc.soft].numpy().round(3))
-        [5.    4.178 4.12 ]
-        [5.    4.671 4.648]
+        >>> back_off(mpc, 0.25 * one)
+        >>> mpc.ub[mpc.soft].numpy().round(3)
+        array([5.   , 4.178, 4.12 ])
     """
-
-    def __init__(self, mpc: QPMPC, probability: float = 0.95) -> None:
-        check_kind("mpc", mpc, QPMPC)
-        if mpc.past > 1:
-            remedy = "A back-off has no regulator for a window: call tighten yourself."
-            raise QPError.expected("mpc", f"past={mpc.past}", "past=1", remedy)
-        if not (mpc.soft & (mpc.lb.isfinite() | mpc.ub.isfinite())).any():
-            got, want = "one without soft bounds", "soft bounds to tighten"
-            raise QPError.expected("mpc", got, want, "Leave the back-off out.")
-        self.mpc, self._probability = mpc, probability
-        self._lb, self._ub = mpc.lb.detach().clone(), mpc.ub.detach().clone()
-        self.tighten(mpc.lb.new_zeros(mpc.n_x, mpc.n_x))
-
-    @torch.no_grad()
-    def tighten(self, W: Tensor) -> None:
-        """Tighten the nominal bounds for the current model.
-
-        Args:
-            W: covariance of the noise, ``(n_x, n_x)``.
-        """
-        mpc = self.mpc
-        A, B, *_ = (x.to(W) for x in mpc.model())
-        try:
-            K = -lqr_gain(A, B, stage_weight(mpc).to(W))
-        except QPError:
-            K = W.new_zeros(mpc.n_u, mpc.n_x)
-        mpc.lb.copy_(self._lb)
-        mpc.ub.copy_(self._ub)
-        covariances = prediction_covariance(A + B @ K, W, mpc.horizon)
-        tighten(mpc, covariances, self._probability, K)
-
-    @property
-    def margin(self) -> float:
-        """The largest difference of a bound to the nominal one."""
-        moved = torch.cat((self.mpc.lb - self._lb, self._ub - self.mpc.ub))
-        return float(moved.nan_to_num(0.0).max())
+    check_kind("mpc", mpc, QPMPC)
+    if mpc.past > 1:
+        remedy = "A window has no regulator: call tighten with your own covariances."
+        raise QPError.expected("mpc", f"past={mpc.past}", "past=1", remedy)
+    check_tensor("W", W, mpc.n_x, mpc.n_x, batched=False)
+    A, B, *_ = (x.to(W) for x in mpc.model())
+    try:
+        K = -lqr_gain(A, B, stage_weight(mpc).to(W))
+    except QPError:
+        K = W.new_zeros(mpc.n_u, mpc.n_x)
+    tighten(mpc, prediction_covariance(A + B @ K, W, mpc.horizon), probability, K)
 
 
 def _row_variance(mpc: QPMPC, covariances: Tensor, K: Tensor) -> Tensor:

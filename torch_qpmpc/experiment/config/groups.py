@@ -11,13 +11,11 @@ from torch_qpmpc.experiment.fields import (
     Count,
     Expected,
     Finite,
-    Flag,
     Fraction,
     Group,
     Name,
     NonNegative,
     Positive,
-    Whole,
     one_of,
     some_of,
 )
@@ -89,32 +87,7 @@ class GaussNewton(Group):
     lr: Fraction
     scale_constraints: Positive
     damping: Positive
-    memory: Whole
     final_fraction: Fraction
-
-
-class QLearning(Group):
-    name: Literal["qlearning"]
-    weighted: Flag
-
-
-class Residuals(Group):
-    """The bounds of the residuals of a scheduled theta."""
-
-    q: Positive
-    b: Positive
-
-
-class ActorCritic(Group):
-    """The actor is a QP, a QP whose theta a network schedules, or a network."""
-
-    name: Literal["ddpg", "td3", "sac"]
-    actor: Annotated[str, one_of(("qp", "scheduled", "mlp"))]
-    critic: Annotated[str, one_of(("qp", "mlp"))]
-    actor_rate: Positive
-    lr_network: Positive
-    width: Count
-    theta: Residuals
 
 
 class FromModel(Group):
@@ -134,21 +107,5 @@ class FromData(Group):
     ridge: Annotated[NonNegative | None, Expected("a finite number >= 0, or null")]
 
 
-Size = Annotated[Positive | None, Expected("a finite number > 0, or null")]
-
-
-class Search(Group):
-    """The initial standard deviations of a direct search; null leaves a scalar out."""
-
-    loops: Count
-    margin: Size
-    b: Size
-    w: Size
-    H_u: Size
-    H_f: Size
-    q_f: Size
-
-
 Optimizer = Annotated[Adam | SGD | GaussNewton, Field(discriminator="name")]
-Algorithm = Annotated[QLearning | ActorCritic, Field(discriminator="name")]
 Start = Annotated[FromModel | FromData, Field(discriminator="name")]

@@ -10,19 +10,15 @@ from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config.groups import (
-    Algorithm,
     Constraint,
     Noise,
     Optimizer,
-    Search,
     Start,
 )
 from torch_qpmpc.experiment.fields import (
     Count,
     Expected,
-    Finite,
     Flag,
-    Fraction,
     Group,
     Name,
     NonNegative,
@@ -70,21 +66,15 @@ class Config(Group):
     replay: Flag
     replay_capacity: Count
     exploration_std: NonNegative
+    weighted: Flag
     td_error_clip: Annotated[Positive | None, Expected("a finite number > 0, or null")]
-    target_rate: Fraction
     step: Annotated[str, one_of(STEPS), AfterValidator(_installed_step)]
     release: Annotated[Count | None, Expected("a whole number >= 1, or null")]
     resume: Annotated[str | None, Expected("a path, or null")]
     ablation: Annotated[str | None, Expected("a name, or null")]
-    gate: Annotated[
-        Literal["act", "plant", "model"] | bool, Expected("true, act, plant, model or false")
-    ]
+    gate: Annotated[Literal["act", "plant"] | bool, Expected("true, act, plant or false")]
     gate_bound: Annotated[Positive | None, Expected("a finite number > 0, or null")]
     gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")]
-    back_off: Annotated[
-        Annotated[Finite, Field(ge=0.5, lt=1)] | None, Expected("a number in [0.5, 1), or null")
-    ]
-    search: Search
     logger: Annotated[str, one_of(LOGGERS)]
     export: Annotated[Literal["c"] | None, Expected("c, or null")]
     prove: Annotated[NonNegative | None, Expected("a finite number >= 0, or null")]
@@ -92,7 +82,6 @@ class Config(Group):
     rivals: Annotated[bool | list[str], Expected("true, false or a list of names")]
     eval_interval: Count
     log_interval: Count
-    algo: Algorithm
     start: Start
     task: Annotated[TaskSettings, PlainValidator(_settings_of_the_task)]
     noise: Noise
@@ -137,30 +126,6 @@ class Config(Group):
         return self
 
     @model_validator(mode="after")
-    def back_off_has_a_tied_C_that_follows_its_errors(self) -> Self:
-        if self.back_off is None:
-            return self
-        without = "constraint=mpc has none."
-        if self.constraint.structure != "tied":
-            remedy = "back_off needs one model for all stages: constraint=adaptive."
-            self.conflict("constraint.structure", "tied", remedy)
-        if self.algo.name != "qlearning":
-            remedy = f"{self.algo.name} does not support back_off; {without}"
-            self.conflict("algo.name", "qlearning", remedy)
-        if self.release is not None:
-            self.conflict("release", "null", f"back_off needs a tied C; {without}")
-        if not self.second_order:
-            remedy = f"With back_off its steps follow the prediction errors; {without}"
-            self.conflict("optimizer.name", "gauss_newton", remedy)
-        if not {"C", "b"} & {*self.constraint.learn}:
-            remedy = f"With back_off the model follows its prediction errors; {without}"
-            self.conflict("constraint.learn", "a list with C or b", remedy)
-        if {"lb", "ub"} & {*self.constraint.learn}:
-            remedy = f"back_off moves the bounds; {without}"
-            self.conflict("constraint.learn", "a list without lb and ub", remedy)
-        return self
-
-    @model_validator(mode="after")
     def task_has_the_noise(self) -> Self:
         if self.task.name not in TASKS:  # its script has not run
             return self
@@ -182,38 +147,11 @@ class Config(Group):
         return self
 
     @model_validator(mode="after")
-    def actor_critic_is_of_first_order_with_a_replay(self) -> Self:
-        if self.algo.name == "qlearning":
-            return self
-        name = self.algo.name
-        if self.second_order:
-            remedy = f"{name} needs a first-order optimizer: set optimizer=adam."
-            self.conflict("optimizer.name", "adam or sgd", remedy)
-        if not self.replay:
-            self.conflict("replay", "true", f"{name} learns from a replay.")
-        if self.algo.actor == "mlp" and (self.constraint.deviation or self.constraint.si):
-            remedy = "The penalties are on a QP's C: choose constraint=free."
-            self.conflict("algo.actor", "qp or scheduled", remedy)
-        if self.step != "cholesky":
-            self.conflict("step", "cholesky", f"The critics of {name} support no other step.")
-        return self
-
-    @model_validator(mode="after")
-    def export_and_proof_have_a_qp(self) -> Self:
-        for key in ("export", "prove"):
-            asked = getattr(self, key) is not None
-            if asked and self.algo.name != "qlearning" and self.algo.actor != "qp":
-                self.conflict(key, "null", "The policy of this algo.actor has a network.")
-        return self
-
-    @model_validator(mode="after")
-    def release_has_ties_and_reaches_all(self) -> Self:
+    def release_has_ties(self) -> Self:
         if self.release is None:
             return self
         if self.constraint.structure == "free":
             self.conflict("release", "null", "Nothing is tied: choose constraint=mpc.")
-        if self.algo.name != "qlearning":
-            self.conflict("release", "null", f"{self.algo.name} does not support release.")
         return self
 
     @model_validator(mode="after")

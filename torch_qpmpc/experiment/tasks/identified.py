@@ -22,14 +22,14 @@ from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import Log, as_log
+from torch_qpmpc.mpc.log import as_log
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.rewards import RewardCost, fit_rewards, scheme_cost
 from torch_qpmpc.mpc.riccati import affine_cost_to_go, terminal_riccati
 from torch_qpmpc.mpc.roles import unmoved
 from torch_qpmpc.mpc.scheme import Scheme
-from torch_qpmpc.mpc.tightening import BackOff, tighten
+from torch_qpmpc.mpc.tightening import back_off, tighten
 from torch_qpmpc.mpc.trajectories import valid_steps
 
 #: The least size of the costs of a start that holds an action.
@@ -192,30 +192,6 @@ def _holding(scheme: Scheme, start: Start) -> Scheme:
     return replace(scheme, cost=cost, bounds=replace(scheme.bounds, state_bounds=None))
 
 
-def arx_arguments(identified: Identified, log: Log) -> dict[str, Any]:
-    """Return the arguments of an `ARXModel` that simulates ``log``, but for bounds and horizon.
-
-    Its disturbances are the model's cross-validated one-step errors.
-
-    Raises:
-        QPError: the data are too short for these.
-    """
-    layout, errors = identified.options.layout, identified.errors[:, 0]
-    errors = errors[errors.isfinite().all(-1)]
-    if not len(errors):
-        got = f"{identified.log.steps} transitions, of which no half determines a model"
-        raise QPError.expected("trajectories", got, "enough for a cross-validation", "Log more.")
-    return {
-        **identified.model._asdict(),
-        "errors": errors,
-        "outputs": torch.cat([part.y[:-1] for part in log.trajectories]),
-        "signals_seen": torch.cat([part.d for part in log.trajectories]),
-        "n_y": layout.n_x,
-        "n_d": layout.n_d,
-        "past": layout.past,
-    }
-
-
 def observed_cost(
     cfg: DictConfig, log: TensorDictBase, layout: Layout, fitted: RewardCost | None = None
 ) -> Cost:
@@ -245,7 +221,7 @@ def nominal_mpcs(
     There is no discount. A task without a stage cost has the one fitted to the rewards, and a
     second scheme with the regulator's cost of x_N, if there is one. Each soft bound is tightened by
     the covariance of the cross-validated prediction errors, so that it holds with a probability of
-    95 %: with the feedback of `BackOff` or, for a window, without one.
+    95 %: with the feedback of `back_off` or, for a window, without one.
 
     Args:
         cfg: the run's configuration.
@@ -278,7 +254,7 @@ def _tightened(cfg: DictConfig, scheme: Scheme, identified: Identified) -> QPMPC
     if not (mpc.soft & (mpc.lb.isfinite() | mpc.ub.isfinite())).any():
         return mpc
     if scheme.layout.past == 1:
-        BackOff(mpc).tighten(identified.covariance)
+        back_off(mpc, identified.covariance)
     else:
         errors = identified.errors
         errors = errors[errors.isfinite().flatten(1).all(-1)].transpose(0, 1)

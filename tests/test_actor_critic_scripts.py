@@ -1,0 +1,24 @@
+"""The scripts of the actor-critic page: short, and each learns for a few updates."""
+
+from __future__ import annotations
+
+import math
+import runpy
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[1] / "docs" / "examples" / "torchrl"
+pytestmark = [
+    pytest.mark.skipif(not FOLDER.exists(), reason="no docs, as in a wheel's tests"),
+    pytest.mark.filterwarnings("ignore:The env passed to Collector"),
+]
+
+
+@pytest.mark.parametrize(("name", "updates"), [("ddpg", 3), ("td3", 3), ("sac", 3), ("ppo", 1)])
+def test_a_script_of_at_most_60_lines_learns(name, updates):
+    path = FOLDER / f"{name}.py"
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 60
+    before, after = runpy.run_path(str(path))["main"](updates)
+    assert math.isfinite(after)
+    assert after != before
