@@ -206,7 +206,7 @@ def random_mpc(seed: int = 0, *, free: float = 0.1, horizon: int = 3, **options:
         "terminal_weight": [1.0, 1.0],
         "solver": "daqp",
     }
-    mpc = QPMPC(2, 1, horizon, seed=seed, **(settings | options))
+    mpc = QPMPC.of(2, 1, horizon, seed=seed, **(settings | options))
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for parameter in mpc.parameters():

@@ -27,7 +27,7 @@ def test_a_qp_alone_and_the_ids_import_nothing_heavy():
         "import gymnasium, torch, torch_qpmpc\n"
         "from torch_qpmpc import QPMPC, solve_qp\n"
         "gymnasium.spec('torch_qpmpc/PointMass-v0')\n"
-        "QPMPC(2, 1, 3).value(torch.ones(2))"
+        "QPMPC.of(2, 1, 3).value(torch.ones(2))"
     )
     assert loaded_after(code) == set()
     spelt = {name for name in HEAVY if importlib.util.find_spec(name)}

@@ -190,7 +190,7 @@ def test_files_are_written_beside_their_links_targets(tmp_path):
     for name in ("file", "file.partial", "policy.c", "policy.h", "mine.qpmpc"):
         (tmp_path / name).symlink_to(outside)
     write_whole(tmp_path / "file", b"ours")
-    mpc = QPMPC(1, 1, 2, stage_weight=[1.0, 1.0])
+    mpc = QPMPC.of(1, 1, 2, stage_weight=[1.0, 1.0])
     mpc.save(tmp_path / "mine.qpmpc")
     mpc.export_c(tmp_path)
     assert outside.read_text() == "mine"

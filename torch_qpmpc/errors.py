@@ -8,7 +8,7 @@ class QPError(ValueError):
 
     Example:
         >>> import torch_qpmpc as qm
-        >>> qm.QPMPC(2, 1, horizon=0)
+        >>> qm.QPMPC.of(2, 1, horizon=0)
         Traceback (most recent call last):
         ...
         torch_qpmpc.errors.QPError: horizon: got 0, expected a positive integer.
@@ -39,7 +39,7 @@ class SolverError(RuntimeError):
     Example:
         >>> import torch, torch_qpmpc as qm
         >>> bounds = {"state_bounds": ([-1.0], [1.0]), "state_slack": torch.inf}
-        >>> mpc = qm.QPMPC(1, 1, 3, **bounds)
+        >>> mpc = qm.QPMPC.of(1, 1, 3, **bounds)
         >>> mpc.value(torch.tensor([2.0]))  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         ...

@@ -58,7 +58,7 @@ def test_only_outputs_and_actions_are_needed():
 
 
 def test_plans_are_those_of_the_qp():
-    mpc = QPMPC(N_Y, N_U, 3, past=2, n_d=1, solver="daqp")
+    mpc = QPMPC.of(N_Y, N_U, 3, past=2, n_d=1, solver="daqp")
     p = normal(T, mpc.n_p)
     plans = plans_along(mpc, p, every=4)
     assert [*plans] == [0, 4]

@@ -84,7 +84,7 @@ def test_spectral_radius():
 
 
 def test_policy_map_is_the_solutions_of_its_states():
-    mpc = QPMPC(
+    mpc = QPMPC.of(
         3,
         2,
         3,

@@ -253,7 +253,7 @@ def test_the_band_of_a_window_and_a_preview():
     weights = {"c_1": a, "c_2": o, "c_3": b}
     penalty = DeviationPenalty(torch.zeros(3, 13), 1, 1, past=2, n_d=1, **weights)
     assert torch.equal(penalty.C_mask, expected)
-    mpc = QPMPC(1, 1, 3, past=2, n_d=1)
+    mpc = QPMPC.of(1, 1, 3, past=2, n_d=1)
     assert torch.equal(DeviationPenalty.of(mpc, **weights).C_mask, expected.double())
     C = mpc.C_0 + torch.arange(39).view(3, 13)
     found = distance_by_band(C, mpc.C_0, 1, 1, past=2, n_d=1)
@@ -304,7 +304,7 @@ def test_a_slice_is_one_of_x_0_at_the_mean_preview():
     other = policy_map(mpc, grid, grid, axes=(1, LAYOUT.n_preview + N_X))
     assert other.names == ("d_{0,2}", "u_{-2,1}")
     with pytest.raises(QPError, match=r"axes: got \(12, 13\), expected two different states"):
-        policy_map(QPMPC(1, 1, 3, past=5, n_d=1), grid, grid)
+        policy_map(QPMPC.of(1, 1, 3, past=5, n_d=1), grid, grid)
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ TITLES = ["batch", "solution", "value's gradient", "policy's gradient", "/ solut
 def bounded_lqr(u_max: float) -> tuple[QPMPC, Tensor]:
     A, B, offset, states = lqr()
     n_x, n_u = B.shape
-    mpc = QPMPC(
+    mpc = QPMPC.of(
         n_x,
         n_u,
         HORIZON,

@@ -69,7 +69,7 @@ def test_a_loaded_mpc_is_the_same_and_qpmpc_reads_its_qp(tmp_path):
 
 def test_arguments_are_those_of_its_qp():
     mpc = learned()
-    plain = qm.QPMPC(**mpc.arguments)
+    plain = qm.QPMPC.of(**mpc.arguments)
     plain.load_state_dict(mpc.state_dict())
     p = torch.linspace(-0.1, 0.1, mpc.n_p, dtype=torch.float64)
     assert torch.equal(plain.policy(p), mpc.policy(p))
@@ -93,7 +93,7 @@ def test_files_of_other_kinds_are_named(tmp_path):
     mpc = learned()
     qm.Controller(mpc).save(tmp_path / "controller")
     mpc.save(tmp_path / "mpc")
-    qm.QPMPC(1, 1, 2).save(tmp_path / "qp")
+    qm.QPMPC.of(1, 1, 2).save(tmp_path / "qp")
     with pytest.raises(QPError, match=r"controller, a saved Controller, expected a file that QPM"):
         qm.QPMPC.load(tmp_path / "controller")
     with pytest.raises(QPError, match=r"that LinearMPC.save wrote. Controller.load reads it"):

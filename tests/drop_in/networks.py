@@ -45,7 +45,7 @@ def make_theta(n_p: int, n_u: int, unused: str | None = None) -> Theta:
     n_d = int(PREVIEW and n_p > 2)
     n_x, horizon = n_p - 2 * n_d, 2 - n_d
     # Each call draws from the generator that the tests seed.
-    theta = Theta(
+    theta = Theta.of(
         n_x,
         n_u,
         horizon,

@@ -33,7 +33,7 @@ def same(first: object, second: object) -> bool:
 
 def make_state(update: int = 3) -> dict:
     """Make the state of a module and an optimiser after one step."""
-    mpc = QPMPC(2, 1, 3, solver="daqp")
+    mpc = QPMPC.of(2, 1, 3, solver="daqp")
     optimizer = torch.optim.Adam(mpc.parameter_groups({"cost": 2e-2, "constraints": 2e-3}))
     mpc.value(torch.ones(4, 2)).mean().backward()
     optimizer.step()
@@ -47,7 +47,7 @@ def test_round_trip(tmp_path):
     assert loaded.keys() == state.keys()
     assert same(loaded, state)
     assert not same(loaded, make_state(4))
-    twin = QPMPC(2, 1, 3, solver="daqp", seed=5)
+    twin = QPMPC.of(2, 1, 3, solver="daqp", seed=5)
     twin.load_state_dict(loaded["mpc"])
     optimizer = torch.optim.Adam(twin.parameter_groups({"cost": 1.0, "constraints": 1.0}))
     optimizer.load_state_dict(loaded["optimizer"])

@@ -89,7 +89,7 @@ def test_constraint_figure_shows_why_there_is_no_canonical_form():
 
 
 def test_constraint_figure_of_a_fixed_C():
-    rendered(constraint_figure(QPMPC(2, 1, 3, learn=())))
+    rendered(constraint_figure(QPMPC.of(2, 1, 3, learn=())))
 
 
 def test_closed_loop_figure_shows_paths_costs_and_J(mpc, found):

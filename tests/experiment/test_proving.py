@@ -40,7 +40,7 @@ def test_a_plant_without_a_box_of_starts_is_refused_before_the_first_update(
 
 
 def test_a_qp_of_other_states_is_a_warning():
-    mpc = QPMPC(2, 1, 2, stage_weight=[1.0] * 3)
+    mpc = QPMPC.of(2, 1, 2, stage_weight=[1.0] * 3)
     with pytest.warns(UserWarning, match="Nothing is proved. states: got 4 dimensions, expected n"):
         assert prove_run(mpc, PointMass(), 0.02, quiet=True) == {}
 

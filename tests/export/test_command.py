@@ -35,11 +35,11 @@ def test_a_folder_without_a_run_is_refused(tmp_path):
 
 
 def test_a_run_that_cannot_be_exported_is_a_warning(tmp_path):
-    mpc = QPMPC(1, 2, 2, B=[[1.0, 1.0]], stage_weight=[1.0, 0.0, 0.0])
+    mpc = QPMPC.of(1, 2, 2, B=[[1.0, 1.0]], stage_weight=[1.0, 0.0, 0.0])
     with pytest.warns(UserWarning, match="The policy is not exported. H: got eigenvalues"):
         export_run(mpc, tmp_path, quiet=False)
 
 
 def test_a_quiet_export_prints_nothing(tmp_path, capsys):
-    export_run(QPMPC(1, 1, 2, stage_weight=[1.0, 1.0]), tmp_path, quiet=True)
+    export_run(QPMPC.of(1, 1, 2, stage_weight=[1.0, 1.0]), tmp_path, quiet=True)
     assert not capsys.readouterr().out

@@ -130,7 +130,7 @@ def test_bad_arguments_are_refused(options, match, tmp_path):
 
 def test_a_qp_without_solutions_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "COMPARED", 5)
-    mpc = QPMPC(1, 1, 2, A=[[1.0]], B=[[1.0]], stage_weight=[1.0, 1.0])
+    mpc = QPMPC.of(1, 1, 2, A=[[1.0]], B=[[1.0]], stage_weight=[1.0, 1.0])
     solve = module.reference
 
     def unsolved(*arguments):
@@ -271,7 +271,7 @@ def test_no_label_ends_its_comment_or_the_line(language, tmp_path):
         "\ud800",
         "**//",
     ]
-    mpc = QPMPC(1, len(bad), 1, stage_weight=[1.0] * (1 + len(bad)))
+    mpc = QPMPC.of(1, len(bad), 1, stage_weight=[1.0] * (1 + len(bad)))
     mpc.export_c(tmp_path, labels={"x": ["%\\"], "u": bad})
     flags = ["-trigraphs", "-Wall", "-Wextra", "-Werror", "-c", "-o", str(tmp_path / "policy.o")]
     command += [*flags, str(tmp_path / "policy.c")]

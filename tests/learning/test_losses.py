@@ -174,7 +174,7 @@ def test_actions_beyond_a_critics_hard_bounds_are_refused_by_name():
 def test_exploration_around_the_policy_in_a_rollout(kind):
     env = TransformedEnv(PointMassEnv(4, max_steps=10, seed=0), InitTracker())
     bounds = ([-1.0] * 2, [1.0] * 2)
-    mpc = QPMPC(4, 2, 3, action_bounds=bounds, stage_weight=torch.ones(6), solver="daqp")
+    mpc = QPMPC.of(4, 2, 3, action_bounds=bounds, stage_weight=torch.ones(6), solver="daqp")
     actor: Any = QPActorValueOperator(mpc).get_policy_operator()
     torch.manual_seed(0)
     explorer = TensorDictSequential(actor, kind(env.action_spec))

@@ -18,7 +18,7 @@ def in_units(x: Tensor, u: float, d: float, cost: float, learn: tuple[str, ...])
     A = torch.tensor([[1.0, 0.2, 0.1, 0.0], [-0.1, 0.9, 0.0, -0.2]]).double()
     B = torch.tensor([[0.1, 0.05], [0.3, -0.1]]).double()
     of_row, bound = x.unsqueeze(-1), torch.ones(2)
-    return QPMPC(
+    return QPMPC.of(
         2,
         1,
         4,

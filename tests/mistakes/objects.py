@@ -37,7 +37,7 @@ def Q(**changes: Any) -> Callable[[], Any]:
 
 def M(**changes: Any) -> Callable[[], Any]:
     base = {"n_x": 2, "n_u": 1, "horizon": 3, "A": torch.eye(2), "B": torch.ones(2, 1)}
-    return lambda: qm.QPMPC(**(base | changes))
+    return lambda: qm.QPMPC.of(**(base | changes))
 
 
 def G(**changes: Any) -> Callable[[], Any]:

@@ -78,7 +78,7 @@ def test_a_reference_in_the_preview_is_reached(make, horizon, past):
 
 
 def test_a_random_start_keeps_the_identity():
-    assert QPMPC(2, 1, 3).H_f.tolist() == [1.0, 1.0]
+    assert QPMPC.of(2, 1, 3).H_f.tolist() == [1.0, 1.0]
 
 
 # The stage cost
@@ -138,7 +138,7 @@ def test_from_data_refuses_a_log_without_rewards():
 def test_a_random_start_warns_once_when_its_policy_acts():
     assert QPMPC.__doc__ is not None
     assert "starts at random" in QPMPC.__doc__.splitlines()[0]
-    mpc, s = QPMPC(2, 1, 3), torch.ones(4, 2)
+    mpc, s = QPMPC.of(2, 1, 3), torch.ones(4, 2)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         mpc.value(s)
@@ -151,13 +151,13 @@ def test_a_random_start_warns_once_when_its_policy_acts():
         vmap(mpc.policy)(s)
         for twin in (copy.copy(mpc), copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))):
             twin.policy(s)
-        loaded = QPMPC(2, 1, 3, seed=1)
+        loaded = QPMPC.of(2, 1, 3, seed=1)
         loaded.load_state_dict(mpc.state_dict())
         loaded.policy_and_active_set(s)
         QPMPC.from_model(A, B, 3, stage_weight=[1.0, 1.0, 0.1]).policy(s)
 
 
 def test_a_random_start_compiles():
-    mpc, s = QPMPC(2, 1, 3), torch.ones(4, 2)
+    mpc, s = QPMPC.of(2, 1, 3), torch.ones(4, 2)
     compiled = torch.compile(mpc.policy, backend="eager", fullgraph=True)
     assert_close(compiled(s), mpc.policy(s))

@@ -311,20 +311,6 @@ def test_a_state_dict_from_before_is_loaded():
     assert torch.equal(other.C, mpc.C)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("gamma", 0.5), ("horizon", 5), ("n_x", 3), ("structure", "tied"), ("learned", ("H",))],
-)
-def test_settings_of_the_constructor_cannot_be_changed(name, value):
-    mpc = random_mpc(0)
-    own = getattr(mpc, name)
-    with pytest.raises(
-        QPError, match=f"{name}: got .*, expected .*, as created. Create another QPMPC"
-    ):
-        setattr(mpc, name, value)
-    assert getattr(mpc, name) == own
-
-
 def test_arguments_are_kept_by_value():
     A, mask = np.array([[1.0, 0.1], [0.0, 0.9]]), rows()
     options = {"learn": {"C": mask}, "stage_weight": [1.0, 1.0, 0.1]}
@@ -383,12 +369,6 @@ def test_a_masked_C_is_not_tied():
         penalty.proximal_step_(mpc.C)
     with pytest.raises(QPError, match="part: got 'b', expected one of the learned parts: H, c, C"):
         mpc.leaves("b")
-
-
-def test_settings_of_the_constructor_may_be_assigned_unchanged():
-    mpc = random_mpc(0)
-    mpc.gamma = mpc.gamma
-    mpc.structure = "free"
 
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])

@@ -250,13 +250,16 @@ def two_equal_actions(log: TensorDict) -> TensorDict:
             r"stage_weight: got shape \(1,\), expected shape",
         ),
         (
-            lambda: QPMPC(2, 1, 3, start={"H": torch.eye(3)}),
+            lambda: QPMPC.of(2, 1, 3, start={"H": torch.eye(3)}),
             r"start: got \['H'\], expected a mapping of values by name, of q, c, C, b",
         ),
-        (lambda: QPMPC(2, 1, 3, start=[1.0]), r"start: got \[1.0\], expected a mapping"),  # pyright: ignore[reportArgumentType] (the mistake)
-        (lambda: QPMPC(2, 1, 3, start={"b": [0.0]}), r"b: got shape \(1,\), expected shape \(6,\)"),
+        (lambda: QPMPC.of(2, 1, 3, start=[1.0]), r"start: got \[1.0\], expected a mapping"),  # pyright: ignore[reportArgumentType] (the mistake)
         (
-            lambda: QPMPC(2, 1, 3, start={"c": torch.nan}),
+            lambda: QPMPC.of(2, 1, 3, start={"b": [0.0]}),
+            r"b: got shape \(1,\), expected shape \(6,\)",
+        ),
+        (
+            lambda: QPMPC.of(2, 1, 3, start={"c": torch.nan}),
             "c: got NaN or inf, expected finite entries",
         ),
     ],

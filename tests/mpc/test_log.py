@@ -195,7 +195,7 @@ def test_plain_data_are_identified_and_start_a_qp():
     mpc = qm.QPMPC.from_data([plain, plain], 4, stage_weight=[1.0, 0.1])
     assert mpc.n_d == 1
     log = qm.read_log(frame, **NAMES)
-    assert torch.equal(qm.QPMPC.from_data(log, 4, stage_weight=[1.0, 0.1]).C, qm.QPMPC(
+    assert torch.equal(qm.QPMPC.from_data(log, 4, stage_weight=[1.0, 0.1]).C, qm.QPMPC.of(
         **qm.identify(log, 4).arguments, stage_weight=[1.0, 0.1]).C)  # fmt: skip
     for data in (plain, log, [plain]):
         with pytest.raises(QPError, match=r"^stage_weight: got none, and a log without rewards"):

@@ -297,7 +297,7 @@ def test_the_model_may_have_an_offset():
 def test_a_dense_stage_weight_is_one_block_whatever_the_horizon(hessian, horizon):
     weight = torch.tensor([[2.0, 0.5, 0.1], [0.5, 1.0, 0.2], [0.1, 0.2, 0.3]]).double()
     options = {"stage_weight": weight, "terminal_weight": [1.0, 1.0]}
-    mpc = QPMPC(2, 1, horizon, gamma=1.0, hessian=hessian, **options)
+    mpc = QPMPC.of(2, 1, horizon, gamma=1.0, hessian=hessian, **options)
     H = mpc.quadratic_program().H
     assert_close(H, torch.block_diag(*[weight] * horizon, torch.eye(2).double()))
 
@@ -362,7 +362,7 @@ def test_learning_nothing_is_allowed():
 
 
 def test_random_starts_are_those_of_the_seed():
-    first, again, other = (QPMPC(2, 1, 3, seed=seed).state_dict() for seed in (0, 0, 1))
+    first, again, other = (QPMPC.of(2, 1, 3, seed=seed).state_dict() for seed in (0, 0, 1))
     assert_close(first, again, rtol=0, atol=0)
     assert (first["C"] - other["C"]).abs().max() > 1e-3
 
@@ -370,7 +370,7 @@ def test_random_starts_are_those_of_the_seed():
 def test_random_starts_do_not_touch_the_global_generator():
     torch.manual_seed(0)
     before = torch.get_rng_state()
-    QPMPC(2, 1, 3, seed=5)
+    QPMPC.of(2, 1, 3, seed=5)
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -509,7 +509,7 @@ def test_repr():
 def test_bad_arguments_are_named(options, message):
     arguments = {"n_x": 2, "n_u": 1, "horizon": 3, "A": torch.eye(2), "B": torch.ones(2, 1)}
     with pytest.raises(QPError, match=message):
-        QPMPC(**(arguments | options))
+        QPMPC.of(**(arguments | options))
 
 
 @pytest.mark.parametrize(("A", "B"), [([1.0], [[1.0]]), (1.0, 1.0), ([[1.0]], [1.0])])

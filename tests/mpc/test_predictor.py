@@ -196,7 +196,7 @@ def test_the_qp_predicts_with_what_was_found():
     sizes = layout(2, 4)
     model, found = fit(trajectories(noise=0.2), Options(sizes))
     start = found._asdict()
-    mpc = QPMPC(2, 1, 4, 2, 1, **model._asdict(), start=start, solver="daqp")
+    mpc = QPMPC.of(2, 1, 4, 2, 1, **model._asdict(), start=start, solver="daqp")
     z = windows(trajectories()[0], sizes)[:5]
     p, a = z[:, : sizes.n_p], z[:, sizes.n_p : sizes.n_p + 1]
     plan = mpc.solve(p, a).z

@@ -19,7 +19,7 @@ FOLDER = Path(__file__).parent
 def small() -> QPMPC:
     """Make a QPMPC that has learned, with a window, a preview, masks and soft and hard rows."""
     torch.manual_seed(0)
-    mpc = QPMPC(
+    mpc = QPMPC.of(
         1,
         1,
         horizon=2,
@@ -81,7 +81,7 @@ def test_later_releases_read_the_first_format():
 
 
 def test_a_parametrization_of_the_users_is_refused(tmp_path):
-    mpc = QPMPC(1, 1, 2, stage_weight=[1.0, 1.0])
+    mpc = QPMPC.of(1, 1, 2, stage_weight=[1.0, 1.0])
     torch.nn.utils.parametrize.register_parametrization(mpc, "C", torch.nn.Identity())
     with pytest.raises(QPError, match=r"^save: got a parametrization of C that is not QPMPC"):
         mpc.save(tmp_path / "file")
@@ -89,7 +89,7 @@ def test_a_parametrization_of_the_users_is_refused(tmp_path):
 
 
 def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
-    mpc, path = QPMPC(1, 1, 2, stage_weight=[1.0, 1.0]), tmp_path / "file"
+    mpc, path = QPMPC.of(1, 1, 2, stage_weight=[1.0, 1.0]), tmp_path / "file"
     mpc.save(path)
     before = path.read_bytes()
 
@@ -116,7 +116,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     ],
 )
 def test_a_file_of_another_kind_or_version_is_named(tmp_path, change, message):
-    QPMPC(1, 1, 2).save(tmp_path / "file")
+    QPMPC.of(1, 1, 2).save(tmp_path / "file")
     torch.save(torch.load(tmp_path / "file") | change, tmp_path / "file")
     with pytest.raises(QPError, match=f"^path: got .*/file, {message}"):
         QPMPC.load(tmp_path / "file")
@@ -134,7 +134,7 @@ def test_another_file_is_named(tmp_path):
 
 
 def test_a_file_without_a_part_is_named(tmp_path):
-    QPMPC(1, 1, 2).save(tmp_path / "file")
+    QPMPC.of(1, 1, 2).save(tmp_path / "file")
     content = torch.load(tmp_path / "file")
     del content["mpc"]["q"]
     torch.save(content, tmp_path / "file")
@@ -144,7 +144,7 @@ def test_a_file_without_a_part_is_named(tmp_path):
 
 def test_a_file_with_a_backend_that_is_not_registered_says_so(tmp_path, monkeypatch):
     monkeypatch.setitem(BACKENDS, "mine", BACKENDS["daqp"])
-    QPMPC(1, 1, 2, solver="mine").save(tmp_path / "file")
+    QPMPC.of(1, 1, 2, solver="mine").save(tmp_path / "file")
     monkeypatch.delitem(BACKENDS, "mine")
     with pytest.raises(QPError, match=r"solver: got 'mine'.* Register the backend of that name"):
         QPMPC.load(tmp_path / "file")
@@ -172,7 +172,7 @@ def test_lists_and_integers_are_taken():
 @pytest.mark.parametrize("observation", [np.ones(3), 1.0, np.ones((2, 1))])
 def test_another_shape_is_an_error(observation):
     with pytest.raises(QPError, match=r"^observation: got shape \(.*\), expected shape \(\*batch"):
-        QPMPC(2, 1, 3).predict(observation)
+        QPMPC.of(2, 1, 3).predict(observation)
 
 
 @pytest.mark.parametrize("observation", [(np.ones(2), {}), {"observation": np.ones(2)}])
@@ -181,12 +181,12 @@ def test_more_than_an_observation_is_an_error(observation):
         rf"^observation: got {type(observation).__name__}, .* \(\.\., 2\)\. Pass the observation"
     )
     with pytest.raises(QPError, match=message):
-        QPMPC(2, 1, 3).predict(observation)
+        QPMPC.of(2, 1, 3).predict(observation)
 
 
 def test_nan_is_an_error():
     with pytest.raises(QPError, match=r"^observation: got NaN or inf, expected finite numbers"):
-        QPMPC(2, 1, 3).predict([0.0, np.nan])
+        QPMPC.of(2, 1, 3).predict([0.0, np.nan])
 
 
 def test_an_unsolved_qp_raises_even_if_it_is_masked():

@@ -155,7 +155,7 @@ def test_a_back_off_without_a_regulator_is_that_of_the_open_loop():
         (scheme(), "structure: got 'free'"),
         (tied(learn=["C", "lb"]), "mpc: got one that learns lb, expected fixed bounds"),
         (
-            QPMPC(2, 1, N, past=2, structure="tied", state_bounds=([-1, -1], [1, 1])),
+            QPMPC.of(2, 1, N, past=2, structure="tied", state_bounds=([-1, -1], [1, 1])),
             "mpc: got past=2, expected past=1",
         ),
     ],

@@ -90,7 +90,7 @@ def test_a_module_comes_back_from_meta(kind, how):
 
 def test_a_module_is_made_on_the_default_device():
     with torch.device("meta"):
-        mpc = QPMPC(2, 1, 3)
+        mpc = QPMPC.of(2, 1, 3)
     assert {part.device.type for part in (*mpc.parameters(), *mpc.buffers())} == {"meta"}
 
 

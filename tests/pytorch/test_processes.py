@@ -58,7 +58,7 @@ def check(mpcs: list[QPMPC], expected: list[dict[str, Tensor]], threads: int | N
     for mpc, known in zip(mpcs, expected, strict=True):
         compare(known, answers(mpc))
         assert torch.get_num_threads() == threads
-    large = QPMPC(6, 3, 40)  # of a size at which torch takes several threads
+    large = QPMPC.of(6, 3, 40)  # of a size at which torch takes several threads
     large.policy(random_states(2, 6))
     assert torch.get_num_threads() == threads
 

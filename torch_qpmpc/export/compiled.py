@@ -40,7 +40,7 @@ class CompiledPolicy:
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
+        >>> mpc = qm.QPMPC.of(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
         >>> policy = qm.CompiledPolicy(mpc)
         >>> s = torch.tensor([[1.0, 0.0], [-0.5, 0.3]])
         >>> torch.allclose(policy(s), mpc.policy(s))

@@ -99,7 +99,7 @@ class Export:
 
     Example:
         >>> import tempfile, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
+        >>> mpc = qm.QPMPC.of(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
         >>> export = mpc.export_c(tempfile.mkdtemp())
         >>> [file.name for file in export.files], export.rows
         (['policy.h', 'policy.c'], 3)

@@ -104,7 +104,7 @@ class GaussNewton(torch.optim.Optimizer):
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC(2, 1, 3, solver="daqp")
+        >>> mpc = qm.QPMPC.of(2, 1, 3, solver="daqp")
         >>> optimizer = qm.GaussNewton(mpc)
         >>> s, a = torch.ones(1, 2), torch.zeros(1, 1)
         >>> target = mpc.action_value(s, a).detach() + 1.0  # L + gamma V(s+)

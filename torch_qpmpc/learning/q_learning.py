@@ -68,7 +68,7 @@ class QPQLearningLoss(LossModule):
     Example:
         >>> import torch, torch_qpmpc as qm
         >>> from tensordict import TensorDict
-        >>> loss = qm.QPQLearningLoss(qm.QPActorValueOperator(qm.QPMPC(2, 1, 5)))
+        >>> loss = qm.QPQLearningLoss(qm.QPActorValueOperator(qm.QPMPC.of(2, 1, 5)))
         >>> loss.make_value_estimator(gamma=0.9)
         >>> step = dict(
         ...     observation=torch.ones(3, 2),

@@ -45,7 +45,7 @@ class ThetaNetwork(TensorDictModuleBase):
         >>> import torch, torch_qpmpc as qm
         >>> from tensordict import TensorDict
         >>> from tensordict.nn import TensorDictSequential
-        >>> mpc = qm.QPMPC(2, 1, 5)
+        >>> mpc = qm.QPMPC.of(2, 1, 5)
         >>> theta = qm.ThetaNetwork(mpc, {"q": 1.0, "b": 0.1})
         >>> operator = qm.QPActorValueOperator(mpc, theta_keys=theta.theta_keys)
         >>> loss = qm.QPQLearningLoss(TensorDictSequential(theta, operator))

@@ -58,7 +58,7 @@ class Identified:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The arguments of `QPMPC` that start it here: ``QPMPC(**identified.arguments, ..)``."""
+        """The arguments of `QPMPC` that start it here: ``QPMPC.of(**identified.arguments, ..)``."""
         structure, start = self.options.structure, self.constraints._asdict()
         sizes = {name: getattr(self.options.layout, name) for name in SIZES}
         more = {} if structure == "tied" else {"start": start}

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST, check_step
 from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
-from torch_qpmpc.mpc.scheme import GAMMA, Scheme, check_names
+from torch_qpmpc.mpc.scheme import GAMMA, KEYWORDS, Scheme, check_names
 from torch_qpmpc.mpc.state import KIND, check_identity, check_own, digest, encoded, reduce, stored
 from torch_qpmpc.mpc.validation import (
     CONSTRAINTS,
@@ -53,9 +53,6 @@ from torch_qpmpc.qp.solvers import backend
 if TYPE_CHECKING:
     from torch_qpmpc.export.export import Export
 
-#: Attributes that only the constructor and `QPMPC.release` set.
-FIXED = ("scheme", "layout", "n_x", "n_u", "horizon", "past", "n_d", "n_p", "n_z", "gamma")
-FIXED = (*FIXED, "hessian", "structure", "step", "learned")
 #: The parts of theta that are learned by default.
 LEARN = ("H", "c", "C")
 #: The warning of a random start.
@@ -66,7 +63,10 @@ RANDOM = (
 
 
 class QPMPC(nn.Module):
-    """A parametric QP (eq:qp5), which starts at random where no model or stage cost is passed.
+    """A parametric QP (eq:qp5) that starts from a `Scheme`.
+
+    `of` makes one from sizes, `from_model` from a model, `from_data` from a log, and `linear_mpc`
+    one that stays a linear MPC scheme.
 
     Its variable is z = [x_0, u_0, x_1, .., x_N], n_z = N (n_x + n_u) + n_x. The cost (eq:qpH) has a
     stage block H_k, q_k for (x_k, u_k), discounted by gamma^k, and a terminal block H_f, q_f for
@@ -83,8 +83,7 @@ class QPMPC(nn.Module):
     are the measured outputs, which need not be a state.
 
     Args:
-        sizes: a `Scheme`, which has the sizes, the model, the cost, the bounds and the discount;
-            or n_x, n_u, horizon and, optionally, past and n_d, the short way to one.
+        scheme: the sizes, the model, the cost, the bounds and the discount.
         learn: the parameters among H, H_f, q, c, C, b, G, lb, ub, w; the others are buffers. In a
             mapping, ``{"H": True, "C": mask}``, a mask of the part's shape is True at the entries
             that are learned, for example at all but the rows of a constant reference.
@@ -101,10 +100,6 @@ class QPMPC(nn.Module):
             takes the place of the scheme's model in V, Q and the policy. Its C(s) and b(s) less
             those of the scheme are added to those of theta, so that they change with s, and what is
             learned is added to the schedule.
-        options: the arguments of `Scheme.of` by name, if no scheme is passed: those of `Model`,
-            `Cost` and `Bounds`, ``blocks`` of `Layout`, ``gamma``, ``start`` and ``seed``. Where A,
-            B or ``stage_weight`` is missing, the start is random, of which a `UserWarning` tells
-            when the policy first acts before a state_dict is loaded.
 
     Attributes:
         scheme: the `Scheme` that theta starts from.
@@ -151,7 +146,6 @@ class QPMPC(nn.Module):
     hold: Tensor
     repeated: Tensor
 
-    @overload
     def __init__(
         self,
         scheme: Scheme,
@@ -162,32 +156,9 @@ class QPMPC(nn.Module):
         solver: str = "proxqp",
         on_failure: str = "raise",
         schedule: BlendedModel | Mapping[str, Tensor] | None = None,
-    ) -> None: ...
-
-    @overload
-    def __init__(
-        self,
-        n_x: int,
-        n_u: int,
-        horizon: int,
-        past: int = 1,
-        n_d: int = 0,
-        **options: Any,
-    ) -> None: ...
-
-    def __init__(
-        self,
-        *sizes: Any,
-        learn: Collection[str] = LEARN,
-        structure: str = "free",
-        step: str = CHOLESKY,
-        solver: str = "proxqp",
-        on_failure: str = "raise",
-        schedule: BlendedModel | Mapping[str, Tensor] | None = None,
-        **options: Any,
     ) -> None:
         super().__init__()
-        scheme = _scheme_of(sizes, options)
+        check_kind("scheme", scheme, Scheme, "QPMPC.of takes sizes.")
         check_choice("structure", structure, STRUCTURES)
         check_choice("on_failure", on_failure, ON_FAILURE)
         check_step(step)
@@ -226,14 +197,32 @@ class QPMPC(nn.Module):
                 parameters.attach(self, name, self._parametrizations_for(name))
 
     @classmethod
+    def of(
+        cls, n_x: int, n_u: int, horizon: int, past: int = 1, n_d: int = 0, **options: Any
+    ) -> QPMPC:
+        """Return a QPMPC of these sizes, at random where no model or stage cost is passed.
+
+        A random start is one to learn from: a `UserWarning` says so when the policy first acts
+        before a state_dict is loaded.
+
+        Args:
+            n_x, n_u, horizon, past, n_d: see `Layout`.
+            options: the keyword arguments of `QPMPC` and of `Scheme.of`.
+
+        Raises:
+            QPError: an argument is invalid.
+        """
+        own = {x: options.pop(x) for x in (*KEYWORDS, "schedule") if x in options}
+        return cls(Scheme.of(n_x, n_u, horizon, past, n_d, **options), **own)
+
+    @classmethod
     def from_model(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
         """Return a QPMPC whose C starts as the banded C_0 of the model x+ = A x + B u (eq:cband).
 
         Args:
             A, B: see `Model`; their shapes give n_x, n_u and past.
             horizon: N.
-            options: the keyword arguments of `QPMPC`, of which ``stage_weight`` is required; the
-                shape of E gives n_d.
+            options: as in `of`; ``stage_weight`` is required, and the shape of E gives n_d.
 
         Raises:
             QPError: an argument is invalid, or there is no stage cost.
@@ -244,7 +233,7 @@ class QPMPC(nn.Module):
         check_names(options)
         check_chosen(options.get("stage_weight"), layout)
         arguments = {"past": layout.past, "n_d": layout.n_d, "A": A, "B": B} | options
-        return cls(layout.n_x, layout.n_u, layout.horizon, **arguments)
+        return cls.of(layout.n_x, layout.n_u, layout.horizon, **arguments)
 
     @classmethod
     def from_data(
@@ -270,7 +259,7 @@ class QPMPC(nn.Module):
 
         Args:
             trajectories, horizon, past, n_d, n_x, structure, causal, ridge, held: see `identify`.
-            options: the keyword arguments of `QPMPC`, such as cost and bounds.
+            options: as in `of`, such as cost and bounds.
 
         Raises:
             QPError: as in `identify` and `QPMPC`, or there is neither a stage cost nor rewards.
@@ -307,7 +296,8 @@ class QPMPC(nn.Module):
             if arguments.get("terminal_weight") is None:
                 arguments["terminal_weight"] = cost.terminal_weight
             starts.insert(0, {"q": cost.q, "c": cost.c})
-        return cls(**{**arguments, "start": {k: x for part in starts for k, x in part.items()}})
+        arguments["start"] = {name: x for part in starts for name, x in part.items()}
+        return cls.of(**arguments)
 
     @classmethod
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
@@ -482,7 +472,7 @@ class QPMPC(nn.Module):
             expected = f"one that is freer than {self.structure!r}"
             remedy = f"Those are: {', '.join(freer) or 'none'}."
             raise QPError.expected("structure", repr(structure), expected, remedy)
-        vars(self)["structure"] = structure
+        self.structure = structure
         for part in self.learned:
             if parametrize.is_parametrized(self, part) and part not in ("H", "H_f"):
                 parameters.replace(self, part, self._parametrizations_for(part))
@@ -496,7 +486,7 @@ class QPMPC(nn.Module):
 
         Example:
             >>> import torch, torch_qpmpc as qm
-            >>> mpc = qm.QPMPC(2, 1, 3, step="projection", stage_weight=[1.0, 2.0, 0.1])
+            >>> mpc = qm.QPMPC.of(2, 1, 3, step="projection", stage_weight=[1.0, 2.0, 0.1])
             >>> optimizer = torch.optim.SGD(mpc.parameters(), lr=1.0)
             >>> mpc.H.sum().mul(1.5).backward()
             >>> optimizer.step()
@@ -526,7 +516,7 @@ class QPMPC(nn.Module):
 
         Example:
             >>> import torch, torch_qpmpc as qm
-            >>> mpc, s = qm.QPMPC(2, 1, 5), torch.zeros(8, 2)
+            >>> mpc, s = qm.QPMPC.of(2, 1, 5), torch.zeros(8, 2)
             >>> b = torch.zeros(8, 10)  # residuals of the model's offsets, one per state
             >>> mpc.value(s, mpc.quadratic_program({"b": b})).shape
             torch.Size([8])
@@ -588,7 +578,7 @@ class QPMPC(nn.Module):
         """
         content = load_file(path, KIND)
         try:
-            mpc = cls(**content["arguments"])
+            mpc = cls.of(**content["arguments"])
             mpc.load_state_dict(content["mpc"])
         except Exception as error:  # damaged files raise errors of any type
             remedy = {}
@@ -682,14 +672,14 @@ class QPMPC(nn.Module):
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The arguments of `QPMPC`, and of none of its subclasses, as tensors and plain values.
+        """The arguments of `QPMPC.of`, without a subclass's own, as tensors and plain values.
 
         With the state_dict they are all of its QP, which `save` writes.
 
         Example:
             >>> import torch_qpmpc as qm
-            >>> mpc = qm.QPMPC(2, 1, 3, stage_weight=[1.0, 1.0, 0.1])
-            >>> twin = qm.QPMPC(**mpc.arguments)
+            >>> mpc = qm.QPMPC.of(2, 1, 3, stage_weight=[1.0, 1.0, 0.1])
+            >>> twin = qm.QPMPC.of(**mpc.arguments)
             >>> twin.load_state_dict(mpc.state_dict())
             <All keys matched successfully>
         """
@@ -702,15 +692,6 @@ class QPMPC(nn.Module):
         twin = type(self).__new__(type(self))
         twin.__dict__.update(self.__dict__)  # a shallow copy, which shares the parameters
         return twin
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in FIXED and name in vars(self) and value != vars(self)[name]:
-            remedy = "Create another QPMPC; release() frees the structure of this one."
-            raise QPError.expected(name, repr(value), f"{vars(self)[name]!r}, as created", remedy)
-        if name == "schedule" and hasattr(self, name):
-            got, remedy = f"another {type(value).__name__}", "Create another QPMPC."
-            raise QPError.expected(name, got, "the one as created", remedy)
-        super().__setattr__(name, value)
 
     def get_extra_state(self) -> Tensor:
         """Return the identity of this QPMPC for its state_dict, as JSON bytes."""
@@ -842,16 +823,3 @@ class QPMPC(nn.Module):
         """Return the parameters that `project_` projects, by part."""
         names = () if self.step == CHOLESKY else SIGNED
         return {name: parameters.leaves(self, name)[0] for name in names if name in self.learned}
-
-
-def _scheme_of(sizes: tuple[Any, ...], options: dict[str, Any]) -> Scheme:
-    """Return the Scheme that is passed, or that of the sizes and options."""
-    scheme = options.get("scheme", sizes[0] if sizes else None)
-    if not isinstance(scheme, Scheme):
-        return Scheme.of(*sizes, **options)
-    others = [*map(repr, sizes[1:]), *(name for name in options if name != "scheme")]
-    if others:
-        remedy = "dataclasses.replace makes another Scheme."
-        got = f"a Scheme and {', '.join(others)}"
-        raise QPError.expected("scheme", got, "a Scheme alone", remedy)
-    return scheme

@@ -62,7 +62,7 @@ class SolveLog:
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC(2, 1, 5)
+        >>> mpc = qm.QPMPC.of(2, 1, 5)
         >>> with qm.SolveLog() as log:
         ...     values = mpc.value(torch.zeros(8, 2))
         >>> log.solves, log.unsolved
