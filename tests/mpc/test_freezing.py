@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests.gauss_newton import Reference, penalty
+from tests.mpc.settings import rows
 from tests.problems import random_mpc, random_states
 from tests.transitions import make_batch
 from torch_qpmpc import (
@@ -27,11 +28,6 @@ from torch_qpmpc import (
 from torch_qpmpc.learning.updates import first_order
 
 HORIZON, N_Z = 3, 11
-
-
-def rows() -> Tensor:
-    """Make the mask of all rows of C except the second state's, such as a constant reference."""
-    return (torch.arange(2 * HORIZON) % 2 == 0).unsqueeze(-1).expand(-1, N_Z).clone()
 
 
 def entries() -> Tensor:
@@ -61,20 +57,13 @@ def moves(mpc: QPMPC, C: Tensor, mask: Tensor) -> None:
     assert moved[mask].float().mean() > 0.5
 
 
-OPTIMIZERS = {
-    "sgd": lambda mpc: torch.optim.SGD(mpc.parameters(), lr=1e-3, momentum=0.9, weight_decay=0.1),
-    "adamw": lambda mpc: torch.optim.AdamW(mpc.parameters(), lr=1e-2, weight_decay=1.0),
-    "rmsprop": lambda mpc: torch.optim.RMSprop(mpc.parameters(), lr=1e-2, weight_decay=0.1),
-}
-
-
-@pytest.mark.parametrize("name", OPTIMIZERS)
 @pytest.mark.parametrize("kind", MASKS)
-def test_no_optimiser_moves_frozen_entries(kind, name):
+def test_no_optimiser_moves_frozen_entries(kind):
     mask = MASKS[kind]()
     mpc = masked(mask)
     s, a, target = targets(mpc)
-    C, optimizer = mpc.C.detach().clone(), OPTIMIZERS[name](mpc)
+    C = mpc.C.detach().clone()
+    optimizer = torch.optim.AdamW(mpc.parameters(), lr=1e-2, weight_decay=1.0)
     for _ in range(5):
         optimizer.zero_grad()
         (mpc.action_value(s, a) - target).square().mean().backward()
@@ -143,26 +132,6 @@ def test_gradients_are_those_of_an_unmasked_qpmpc_in_the_learned_entries():
     assert kept.grad is not None
     assert free.grad is not None
     assert_close(kept.grad, torch.where(mask, free.grad, 0))
-
-
-@pytest.mark.parametrize(
-    "copied",
-    [copy.deepcopy, lambda mpc: pickle.loads(pickle.dumps(mpc))],
-    ids=["deepcopy", "pickle"],
-)
-def test_copies_and_state_dicts_keep_what_is_frozen(copied):
-    mpc = masked(rows())
-    mpc.C = mpc.C.detach() + 0.01
-    twin = copied(mpc)
-    assert_close(twin.C, mpc.C, rtol=0, atol=0)
-    fresh = masked(rows())
-    fresh.load_state_dict(mpc.state_dict())
-    assert_close(fresh.C, mpc.C, rtol=0, atol=0)
-    moved = mpc.C.detach().clone()
-    torch.optim.AdamW(twin.parameters(), lr=0.1, weight_decay=1.0)
-    mpc.reset_parameters()
-    assert_close(mpc.C, masked(True).C, rtol=0, atol=0)
-    assert not torch.equal(mpc.C, moved)
 
 
 def test_a_tied_model_with_a_known_row():
@@ -237,9 +206,6 @@ def test_a_mask_may_be_an_array():
     assert torch.equal(masked(mask.numpy()).C, masked(np.asarray(mask).tolist()).C)
 
 
-# Slack weights
-
-
 def test_a_slack_weight_for_each_state():
     mpc = random_mpc(0, free=0.0, state_slack=[3.0, torch.inf], action_slack=np.array([2.0]))
     w = mpc.quadratic_program().w
@@ -247,25 +213,12 @@ def test_a_slack_weight_for_each_state():
     assert_close(w[-2:], torch.tensor([3.0, torch.inf]).double())
 
 
-@pytest.mark.parametrize(
-    ("slack", "got"),
-    [
-        ([1.0], r"\[1.0\]"),
-        ([1.0, -1.0], r"\[1.0, -1.0\]"),
-        ([1.0, torch.nan], "nan"),
-        (-1.0, "-1.0"),
-    ],
-)
-def test_slack_weights_that_do_not_fit_are_named(slack, got):
-    message = f"state_slack: got .*{got}.*, expected a non-negative weight, .*one for each of"
-    with pytest.raises(QPError, match=message):
-        random_mpc(0, state_slack=slack)
-
-
 # State dicts of other settings
 
 
 OTHERS = {
+    "past": {"past": 2},
+    "n_d": {"n_d": 1},
     "gamma": {"gamma": 0.5},
     "discount_slack": {"discount_slack": True},
     "structure": {"structure": "tied"},
@@ -293,15 +246,6 @@ def test_a_state_dict_of_another_qpmpc_is_refused_by_name(name):
 def test_a_state_dict_of_other_frozen_entries_is_refused():
     with pytest.raises(QPError, match=r"state_dict with learn = .*'C': '33 of 66"):
         masked(entries()).load_state_dict(masked(rows()).state_dict())
-
-
-def test_a_state_dict_has_the_settings_as_tensors(tmp_path):
-    mpc = random_mpc(0)
-    state = {name: tensor.clone() for name, tensor in mpc.state_dict().items()}
-    torch.save(state, tmp_path / "state.pt")
-    random_mpc(0, solver="torch", free=0.0).load_state_dict(
-        torch.load(tmp_path / "state.pt", weights_only=True)
-    )
 
 
 def test_a_state_dict_from_before_is_loaded():

@@ -1,111 +1,224 @@
+"""QPMPC: what holds for each row of one table of settings, and what it refuses."""
+
 from __future__ import annotations
 
 import copy
 import io
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
-from torch.func import jacfwd, jacrev
+from torch.func import grad, jacfwd, jacrev, vmap
 from torch.testing import assert_close
 
-from tests.problems import MIXED, random_mpc, random_states, step
-from torch_qpmpc import QPMPC, QPError, QPSolution, SolverError, Status, solve_qp
-from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
-
-A = torch.tensor([[1.0, 0.2], [0.0, 0.9]]).double()
-B = torch.tensor([[0.0], [0.3]]).double()
-EVERYTHING = (*COST, *CONSTRAINTS)
-SETTINGS: dict[str, dict[str, Any]] = {
-    "diagonal": {"hessian": "diagonal"},
-    "block": {"hessian": "block"},
-    "full": {"hessian": "full"},
-    "all soft": {"action_slack": 50.0},
-    "weak slack": {"state_slack": 0.5, "action_slack": 0.1},
-    "discounted slack": {"discount_slack": True, "action_slack": 50.0},
-    "hard states": {"state_slack": torch.inf, "state_bounds": ([-9.0, -9.0], [9.0, 9.0])},
-    "no bounds": {"state_bounds": None, "action_bounds": None},
-    "everything learned": {"learn": EVERYTHING, "hessian": "block", "action_slack": 50.0},
-    "of one stage": {"horizon": 1},
-    "tied": {"structure": "tied", "learn": {*EVERYTHING} - {"G"}, "action_slack": 50.0},
-    "varying, mixed": {"structure": "varying", "learn": ("C", "G", "w"), **MIXED},
-    "tied, mixed": {"structure": "tied", "learn": ("C", "G", "b"), "horizon": 4, **MIXED},
-    "free, mixed": {"learn": ("C", "G", "w"), "action_slack": 50.0, **MIXED},
-    "undiscounted": {"gamma": 1.0},
-    "projected": {"step": "projection", "learn": EVERYTHING, "action_slack": 50.0},
-    "projected block": {"step": "projection", "hessian": "block", "learn": ("H", "H_f", "C", "w")},
-}
-
-
-def round_trip(mpc: QPMPC) -> QPMPC:
-    return pickle.loads(pickle.dumps(mpc))
-
+from tests.mpc.settings import (
+    A_L,
+    B_L,
+    EVERYTHING,
+    GAMMA,
+    LAST_ROWS,
+    LAST_U,
+    LINEAR,
+    N_D,
+    N_P,
+    N_U,
+    N_X,
+    ROWS,
+    SETTINGS,
+    W_D,
+    W_F,
+    WINDOWED,
+    A,
+    B,
+    E,
+    L,
+    N,
+    W,
+    inputs,
+    linear,
+    made,
+    n,
+    stepped,
+    windowed,
+)
+from tests.problems import MIXED, normal, random_mpc, random_states, step
+from torch_qpmpc import (
+    QPMPC,
+    GaussNewton,
+    QPError,
+    QPSolution,
+    QuadraticProgram,
+    SolverError,
+    Status,
+    solve_qp,
+)
+from torch_qpmpc.mpc.riccati import riccati_weight
 
 # V, Q and the policy
 
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", SETTINGS)
-def test_the_value_is_the_action_value_of_the_policy(name, seed):
-    mpc, s = random_mpc(seed, **SETTINGS[name]), random_states(12)
-    assert_close(mpc.action_value(s, mpc.policy(s).detach()), mpc.value(s), rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("name", SETTINGS)
-def test_no_action_is_better_than_the_policys(name, seed):
-    mpc, s = random_mpc(seed, **SETTINGS[name]), random_states(12)
-    a = random_states(12, 1, size=0.5, seed=seed)
-    advantage = mpc.action_value(s, a) - mpc.value(s)
-    assert (advantage >= -1e-6).all()
-    assert advantage.max() > 1e-3
-
-
-@pytest.mark.parametrize("hessian", ["diagonal", "block", "full"])
-def test_these_hold_with_the_default_solver_too(hessian):
-    mpc, s = random_mpc(2, hessian=hessian, solver="proxqp"), random_states(6)
-    assert_close(mpc.action_value(s, mpc.policy(s).detach()), mpc.value(s), rtol=1e-6, atol=1e-6)
-    a = random_states(6, 1, size=0.5)
-    assert (mpc.action_value(s, a) >= mpc.value(s) - 1e-6).all()
+def test_the_value_is_the_least_action_value_and_that_of_the_policy(name, seed):
+    mpc = made(name, seed)
+    s, a = inputs(mpc, 12)
+    V, Q = mpc(s), mpc(s, a)
+    assert torch.equal(V, mpc.value(s))
+    assert torch.equal(Q, mpc.action_value(s, a))
+    bound = 1e-7 if name in WINDOWED else 1e-6
+    assert_close(mpc.action_value(s, mpc.policy(s).detach()), V, rtol=bound, atol=bound)
+    assert (Q - V).min() > -bound
+    assert (Q - V).max() > 1e-3
 
 
 @pytest.mark.parametrize("free", [0.0, 0.3])
-def test_the_policy_keeps_within_hard_action_bounds(free):
+def test_the_policy_exceeds_bounds_only_if_they_are_soft_and_that_pays(free):
     a = random_mpc(3, free=free).policy(random_states(40, size=4.0))
     assert a.abs().max() <= 0.5 + 1e-8
     assert a.abs().max() > 0.5 - 1e-6  # reaches them, too
+    soft = random_mpc(3, free=0.0, A=A, B=B, action_slack=1e-3, state_slack=1e3)
+    assert soft.policy(random_states(40, size=4.0)).abs().max() > 0.6
 
 
-def test_the_policy_exceeds_soft_action_bounds_where_that_pays():
-    mpc = random_mpc(3, free=0.0, A=A, B=B, action_slack=1e-3, state_slack=1e3)
-    assert mpc.policy(random_states(40, size=4.0)).abs().max() > 0.6
+@pytest.mark.parametrize("horizon", [1, 3, 8])
+@pytest.mark.parametrize("n_d", [0, N_D])
+def test_without_active_bounds_it_is_the_linear_quadratic_regulator(horizon, n_d):
+    options = {"E": E} if n_d else {}
+    mpc = QPMPC.linear_mpc(A, B, horizon, gamma=0.9, stage_weight=W, solver="daqp", **options)
+    P, s = riccati_weight(A, B, W, 0.9), random_states(5)
+    p = torch.cat((torch.zeros(5, (horizon + 1) * n_d), s), -1)
+    assert_close(mpc.value(p).detach(), 0.5 * ((s @ P) * s).sum(-1), rtol=1e-7, atol=1e-9)
+    R = W[2:, 2:] + 0.9 * B.mT @ P @ B
+    gain = torch.linalg.solve(R, W[2:, :2] + 0.9 * B.mT @ P @ A)
+    assert_close(mpc.policy(p).detach(), -s @ gain.mT, rtol=1e-6, atol=1e-7)
 
 
-def test_without_bounds_it_is_the_discounted_linear_quadratic_regulator():
-    gamma, N = 0.9, 6
-    Q, R = torch.diag(torch.tensor([2.0, 0.5])).double(), torch.tensor([[0.1]]).double()
-    Q_f = torch.tensor([[3.0, 0.5], [0.5, 1.0]]).double()
-    mpc = QPMPC.from_model(
-        A,
-        B,
-        N,
-        gamma=gamma,
-        hessian="block",
-        stage_weight=torch.block_diag(Q, R),
-        terminal_weight=Q_f,
-        solver="daqp",
-    )
-    P = Q_f
-    K = torch.zeros(1, 2).double()
-    for _ in range(N):
-        K = torch.linalg.solve(R + gamma * B.mT @ P @ B, gamma * B.mT @ P @ A)
-        P = Q + K.mT @ R @ K + gamma * (A - B @ K).mT @ P @ (A - B @ K)
-    s = random_states(5)
-    assert_close(mpc.value(s), 0.5 * ((s @ P) * s).sum(-1))
-    assert_close(mpc.policy(s), -s @ K.mT)
+@pytest.mark.parametrize("hessian", ["block", "full"])
+def test_the_plan_follows_the_model_keeps_the_bounds_and_has_its_cost(hessian):
+    mpc = windowed(free=0.0, hessian=hessian)
+    p, _ = inputs(mpc)
+    solution = mpc.solve(p)
+    x, u = mpc.predicted(solution.z.detach())
+    d, window = p[:, : (N + 1) * N_D].unflatten(-1, (N + 1, N_D)), p[:, (N + 1) * N_D :]
+    pairs = window[:, :-N_X].unflatten(-1, (L - 1, n))
+    past_x, past_u = torch.cat((pairs[..., :N_X], x), 1), torch.cat((pairs[..., N_X:], u), 1)
+    cost, slack = torch.zeros(len(p)).double(), torch.zeros(len(p)).double()
+    rows, last_rows = (torch.tensor(part[0]).double() for part in (ROWS, LAST_ROWS))
+    for k in range(N):
+        lags_x, lags_u = (y[:, k : k + L].flip(1).flatten(1) for y in (past_x, past_u))
+        following = lags_x @ A_L.mT + lags_u @ B_L.mT + d[:, k] @ E.mT
+        assert_close(x[:, k + 1], following, rtol=0, atol=1e-9)
+        stage = torch.cat((d[:, k], x[:, k], u[:, k]), -1)
+        cost += 0.5 * GAMMA**k * ((stage @ W_D) * stage).sum(-1)
+        y = stage @ rows.mT
+        slack += 2.0 * ((y - 0.5).relu() + (-0.6 - y).relu()).sum(-1)
+    last = torch.cat((d[:, N], x[:, N]), -1)
+    cost += 0.5 * GAMMA**N * ((last @ W_F) * last).sum(-1)
+    slack += 2.0 * ((last @ last_rows.mT).abs() - 0.4).relu().sum(-1)
+    slack += 3.0 * (x.abs() - 1).relu().sum((-1, -2))
+    assert_close(solution.value.detach(), cost + slack, rtol=1e-7, atol=1e-7)
+    change = past_u[:, L - 1 :] - past_u[:, L - 2 : -1]
+    assert u.abs().max() < 0.6 + 1e-8
+    assert 0.4 - 1e-6 < change.abs().max() < 0.4 + 1e-8
+
+
+def test_an_action_beyond_a_hard_bound_is_infeasible():
+    s, a = random_states(2), torch.tensor([[0.4], [0.6]]).double()
+    with pytest.raises(SolverError, match=r"1 of 2 .* 1 INFEASIBLE, first at batch index \(1,\)"):
+        random_mpc(4).action_value(s, a)
+    mpc = random_mpc(4, on_failure="mask")
+    assert mpc.action_value(s, a).isinf().tolist() == [False, True]
+    assert mpc.solve(s, a).status.tolist() == [Status.SOLVED, Status.INFEASIBLE]
+    mpc = windowed(on_failure="mask")
+    p, _ = inputs(mpc)
+    p[2, LAST_U] = 5.0  # no change of the action reaches its bounds
+    assert mpc.value(p).isinf().tolist() == [i == 2 for i in range(6)]
+
+
+def test_a_warm_start_leads_to_the_same_solution(solver):
+    mpc, s, a = random_mpc(5, solver=solver), random_states(6), random_states(6, 1, size=0.5)
+    start = mpc.solve(s)
+    with torch.no_grad():
+        mpc.C *= 1.001
+        mpc.C[:, 5] += 0.01
+    for action in (None, a):
+        cold, warm = mpc.solve(s, action), mpc.solve(s, action, warm_start=start)
+        assert_close(warm.value, cold.value, rtol=1e-6, atol=1e-6)
+
+
+# Derivatives
+
+FUNCTIONS: dict[str, Callable[[QPMPC, Tensor, Tensor], Tensor]] = {
+    "value": lambda mpc, p, _: mpc.value(p),
+    "action value": lambda mpc, p, a: mpc.action_value(p, a),
+    "solution": lambda mpc, p, _: mpc.solve(p).z @ normal(mpc.n_z, seed=9),
+}
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+@pytest.mark.parametrize("name", [*LINEAR, *WINDOWED])
+def test_gradients_in_theta_and_p_agree_with_differences(name, function):
+    if name in LINEAR and function == "solution":
+        return
+    mpc = made(name, 2)
+    p, a = inputs(mpc, 6 if name in LINEAR else 4)
+    p.requires_grad_()
+    FUNCTIONS[function](mpc, p, a).sum().backward()
+    size = 1e-6 if mpc.solver == "daqp" and name in WINDOWED else 1e-5
+    atol = 1e-5 if name in LINEAR else 1e-4
+    leaves = (*mpc.named_parameters(), ("p", p))
+    assert len(leaves) > len(mpc.learned)
+    for i, (leaf_name, leaf) in enumerate(leaves):
+        direction = normal(*leaf.shape, seed=i)
+        part = leaf_name.removeprefix("parametrizations.")[:2]
+        if part in ("lb", "ub") and mpc.structure != "free":
+            learned = mpc.soft  # those of hard rows are no parameters
+            if mpc.structure == "tied":
+                learned = learned[mpc.get_buffer(f"{leaf_name.removesuffix('original')}0.first")]
+            direction = direction * learned
+        values = []
+        with torch.no_grad():
+            for sign in (1, -2):
+                leaf += sign * size * direction
+                values.append(FUNCTIONS[function](mpc, p, a).sum())
+            leaf += size * direction
+        difference = (values[0] - values[1]) / (2 * size)
+        found = torch.zeros(()) if leaf.grad is None else (leaf.grad * direction).nan_to_num().sum()
+        assert_close(
+            found.double(), difference, rtol=1e-4, atol=atol, msg=lambda m, x=leaf_name: f"{x} {m}"
+        )
+
+
+def test_the_slope_in_prices_and_references_is_that_of_the_plan():
+    mpc = windowed(free=0.0, E=0 * E, constraints=None, terminal_constraints=None)
+    p, _ = inputs(mpc)
+    solution = mpc.solve(p)
+    x, u = mpc.predicted(solution.z.detach())
+    slope = grad(lambda p: mpc.value(p).sum())(p)
+    assert_close(slope, -solution.xi.detach())
+    d = p[:, : (N + 1) * N_D].unflatten(-1, (N + 1, N_D))
+    stages = torch.cat((d[:, :N], x[:, :N], u), -1) @ W_D[:, :N_D]
+    last = torch.cat((d[:, N], x[:, N]), -1) @ W_F[:, :N_D]
+    expected = torch.cat((stages, last.unsqueeze(1)), 1)
+    expected = expected * GAMMA ** torch.arange(N + 1).double().unsqueeze(-1)
+    assert_close(slope[:, : (N + 1) * N_D], expected.flatten(1), rtol=1e-7, atol=1e-7)
+
+
+def test_vmap_equals_the_batch():
+    mpc = windowed(7)
+    p, a = inputs(mpc)
+    assert_close(vmap(mpc.value)(p), mpc.value(p))
+    assert_close(vmap(mpc.action_value)(p, a), mpc.action_value(p, a))
+    assert_close(vmap(mpc.policy)(p), mpc.policy(p))
+    leaf = p.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(mpc.value(leaf).sum(), leaf)
+    assert_close(vmap(grad(mpc.value))(p), slope)
+    assert vmap(jacrev(mpc.policy))(p).shape == (6, N_U, N_P)
 
 
 #: Schemes with a state at which rows meet without a multiplier, or many rows have one.
@@ -154,50 +267,6 @@ def test_derivatives_where_a_controller_spends_its_life(name, solver):
             assert_close(derivative, differences, rtol=1e-4, atol=1e-4)
 
 
-def test_the_solution_of_a_banded_scheme_is_a_trajectory_with_its_cost():
-    weights = torch.tensor([2.0, 0.5, 0.1]).double()
-    mpc = random_mpc(0, free=0.0, A=A, B=B, stage_weight=weights, horizon=5)
-    s = random_states(7)
-    solution = mpc.solve(s)
-    x, u = mpc.predicted(solution.z)
-    assert x.shape == (7, 6, 2)
-    assert u.shape == (7, 5, 1)
-    assert_close(x[:, 0], s)
-    assert_close(u[:, 0], mpc.policy(s))
-    assert_close(x[:, 1:], x[:, :-1] @ A.mT + u @ B.mT)
-    powers = 0.9 ** torch.arange(6).double()
-    stages = torch.cat((x[:, :-1], u), -1).square() @ weights
-    cost = 0.5 * (stages @ powers[:5] + powers[5] * x[:, 5].square().sum(-1))
-    violation = (x.abs() - 1).clamp(min=0).sum((-2, -1))
-    assert_close(solution.value, cost + 100 * violation, rtol=1e-6, atol=1e-6)
-
-
-def test_forward_is_the_value_or_the_action_value():
-    mpc, s, a = random_mpc(4), random_states(3), random_states(3, 1, size=0.5)
-    assert_close(mpc(s), mpc.value(s))
-    assert_close(mpc(s, a), mpc.action_value(s, a))
-
-
-def test_an_action_beyond_a_hard_bound_is_infeasible():
-    s, a = random_states(2), torch.tensor([[0.4], [0.6]]).double()
-    with pytest.raises(SolverError, match=r"1 of 2 .* 1 INFEASIBLE, first at batch index \(1,\)"):
-        random_mpc(4).action_value(s, a)
-    mpc = random_mpc(4, on_failure="mask")
-    assert mpc.action_value(s, a).isinf().tolist() == [False, True]
-    assert mpc.solve(s, a).status.tolist() == [Status.SOLVED, Status.INFEASIBLE]
-
-
-def test_a_warm_start_leads_to_the_same_solution(solver):
-    mpc, s, a = random_mpc(5, solver=solver), random_states(6), random_states(6, 1, size=0.5)
-    start = mpc.solve(s)
-    with torch.no_grad():
-        mpc.C *= 1.001
-        mpc.C[:, 5] += 0.01
-    for action in (None, a):
-        cold, warm = mpc.solve(s, action), mpc.solve(s, action, warm_start=start)
-        assert_close(warm.value, cold.value, rtol=1e-6, atol=1e-6)
-
-
 # Shapes and dtypes
 
 
@@ -227,41 +296,93 @@ def test_outputs_have_the_dtype_of_the_state(dtype):
     assert_close(mpc.value(s), mpc.value(s.double()).to(dtype))
 
 
-def test_a_module_in_single_precision_works_too():
-    mpc, s = random_mpc(6), random_states(3)
+@pytest.mark.parametrize("name", ["diagonal", "window"])
+def test_a_module_in_single_precision_works_too(name):
+    mpc = made(name, 6)
+    s, _ = inputs(mpc)
     expected = mpc.value(s)
     assert_close(mpc.float().value(s.float()), expected.float(), rtol=1e-4, atol=1e-4)
     assert all(part.dtype == torch.float32 for part in mpc.parameters())
 
 
-# theta
+# The program
 
 
 @pytest.mark.parametrize("discounted", [False, True])
-def test_the_program_is_discounted_by_stage(discounted):
-    mpc = random_mpc(
-        7,
-        free=0.0,
-        horizon=2,
-        gamma=0.5,
-        learn=("q",),
-        discount_slack=discounted,
-        stage_weight=[2.0, 3.0, 4.0],
-        terminal_weight=[5.0, 6.0],
-    )
+@pytest.mark.parametrize("hessian", ["diagonal", "block", "full"])
+@pytest.mark.parametrize("explicit", [{}, {"past": 1, "n_d": 0}])
+def test_without_a_past_and_a_preview_it_is_the_papers_qp_to_the_last_bit(
+    hessian, explicit, discounted
+):
+    A, B = normal(N_X, N_X, seed=1), normal(N_X, N_U, seed=2)
+    weights, last = torch.tensor([1.0, 0.5, 0.1]).double(), torch.tensor([2.0, 3.0]).double()
+    D, D_f = normal(2, n, seed=3), normal(1, N_X, seed=4)
+    mpc = QPMPC.from_model(
+        A, B, N, gamma=GAMMA, hessian=hessian, stage_weight=weights, terminal_weight=last,
+        offset=[0.1, 0.2], constraints=(D, [-1.0, -2.0], [1.0, 2.0]), discount_slack=discounted,
+        terminal_constraints=(D_f, [-3.0], [3.0]), state_bounds=([-4.0] * 2, [5.0] * 2),
+        action_bounds=([-6.0], [7.0]), state_slack=8.0, constraint_slack=9.0, learn=("q",),
+        **explicit,
+    )  # fmt: skip
     with torch.no_grad():
         mpc.q.fill_(1.0)
+    n_z = N * n + N_X
+    shapes = (n_z,), (N * N_X, n_z), (n_z + 2 * N + 1, n_z)
+    H, C, G = (torch.zeros(shape, dtype=torch.float64) for shape in shapes)
+    powers = GAMMA ** torch.arange(N + 1).double()
+    G[:n_z] = torch.eye(n_z)
+    H[-N_X:], G[-1:, -N_X:] = last, D_f
+    for k in range(N):
+        rows, columns = slice(N_X * k, N_X * (k + 1)), slice(n * k, n * (k + 1))
+        H[columns] = weights
+        C[rows, columns] = torch.cat((A, B), -1)
+        C[rows, n * (k + 1) : n * (k + 1) + N_X] = -torch.eye(N_X)
+        G[n_z + 2 * k : n_z + 2 * k + 2, columns] = D
+    stage = [*[0] * n, *[1] * n, *[2] * n, *[3] * N_X, 0, 0, 1, 1, 2, 2, 3]
+    slack = torch.tensor([*[8.0, 8.0, torch.inf] * N, 8.0, 8.0, *[9.0] * 7]).double()
+    discount = powers[stage[:n_z]]
     qp = mpc.quadratic_program()
-    power = torch.tensor([1, 1, 1, 0.5, 0.5, 0.5, 0.25, 0.25]).double()
-    assert_close(qp.q.detach(), power)
-    assert_close(qp.H, torch.diag(power * torch.tensor([2, 3, 4, 2, 3, 4, 5, 6])))
-    weight = 100 * (power if discounted else torch.ones(8).double())
-    weight[[2, 5]] = torch.inf
-    assert_close(qp.w, weight)
-    assert_close(qp.lb, torch.tensor([-1, -1, -0.5, -1, -1, -0.5, -1, -1]).double())
-    assert_close(qp.ub, -qp.lb)
-    assert_close(qp.G, torch.eye(8).double())
-    assert_close(qp.b, torch.zeros(4).double())
+    dense = discount.sqrt().unsqueeze(-1) * torch.diag(H) * discount.sqrt()
+    expected = {
+        "H": torch.diag(discount * H) if hessian == "diagonal" else dense,
+        "q": discount,
+        "c": torch.zeros(()).double(),
+        "C": C,
+        "b": -torch.tensor([0.1, 0.2] * N, dtype=torch.float64),
+        "G": G,
+        "lb": torch.tensor([*[-4.0, -4.0, -6.0] * N, -4, -4, *[-1, -2] * N, -3]).double(),
+        "ub": torch.tensor([*[5.0, 5.0, 7.0] * N, 5, 5, *[1, 2] * N, 3]).double(),
+        "w": slack * powers[stage] if discounted else slack,
+    }
+    for name, value in expected.items():
+        assert torch.equal(getattr(qp, name), value), name
+    assert (mpc.n_p, mpc.n_z) == (N_X, n_z)
+    assert "past" not in repr(mpc)
+
+
+def test_a_window_and_a_preview_that_do_not_matter_change_no_value():
+    one = random_mpc(free=0.0, learn=())
+    A, B = one.C[:2, :2], one.C[:2, 2:3]
+    more = QPMPC.from_model(
+        torch.cat((A, 0 * A), -1), torch.cat((B, 0 * B), -1), 3, n_d=2,
+        stage_weight=[1.0, 0.5, 0.1], terminal_weight=[1.0, 1.0], solver="daqp",
+        state_bounds=([-1.0] * 2, [1.0] * 2), action_bounds=([-0.5], [0.5]),
+    )  # fmt: skip
+    s = random_states(8)
+    p = torch.cat((normal(8, more.n_p - 2), s), -1)
+    assert_close(more.value(p), one.value(s), rtol=1e-9, atol=1e-9)
+    assert_close(more.policy(p), one.policy(s), rtol=1e-7, atol=1e-7)
+
+
+def test_sizes_and_the_parts_of_z():
+    mpc = windowed()
+    p, a = inputs(mpc)
+    assert (mpc.past, mpc.n_d, mpc.n_p, mpc.n_z) == (L, N_D, N_P, N_P + N * n)
+    assert "past=3, n_d=2" in repr(mpc)
+    assert "hessian='diagonal', structure='free', learned=('H', 'c', 'C')" in repr(random_mpc())
+    assert_close(mpc.solve(p).z[:, :N_P], p)
+    assert_close(mpc.solve(p, a).z[:, : N_P + N_U], torch.cat((p, a), -1))
+    assert_close(mpc.policy(p), mpc.solve(p).z[:, N_P : N_P + N_U])
 
 
 def test_value_and_action_value_may_share_a_quadratic_program():
@@ -284,50 +405,47 @@ def test_stages_may_have_weights_and_models_of_their_own():
     assert_close(mpc.C, mpc.C_0)
 
 
-def test_the_model_may_have_an_offset():
-    cost = {"stage_weight": [1.0, 1.0, 0.1]}
-    mpc = QPMPC.from_model(A, B, 2, offset=[0.1, -0.2], solver="daqp", **cost)
-    s, a = random_states(3), random_states(3, 1)
-    states, _ = mpc.predicted(mpc.solve(s, a).z)
-    assert_close(states[:, 1], s @ A.mT + a @ B.mT + torch.tensor([0.1, -0.2]).double())
-
-
 @pytest.mark.parametrize("hessian", ["block", "full"])
 @pytest.mark.parametrize("horizon", [2, 3])
 def test_a_dense_stage_weight_is_one_block_whatever_the_horizon(hessian, horizon):
-    weight = torch.tensor([[2.0, 0.5, 0.1], [0.5, 1.0, 0.2], [0.1, 0.2, 0.3]]).double()
-    options = {"stage_weight": weight, "terminal_weight": [1.0, 1.0]}
+    options = {"stage_weight": W, "terminal_weight": [1.0, 1.0]}
     mpc = QPMPC.of(2, 1, horizon, gamma=1.0, hessian=hessian, **options)
     H = mpc.quadratic_program().H
-    assert_close(H, torch.block_diag(*[weight] * horizon, torch.eye(2).double()))
-
-
-def test_the_same_start_gives_the_same_program_whatever_the_hessian():
-    options = {"free": 0.0, "A": A, "B": B, "stage_weight": [2.0, 0.0, 0.1]}
-    options["terminal_weight"] = [1.0, 1.0]
-    programs = [
-        random_mpc(0, hessian=hessian, **options).quadratic_program()
-        for hessian in ("diagonal", "block", "full")
-    ]
-    for other in programs[1:]:
-        assert_close(other.tensors(), programs[0].tensors())
+    assert_close(H, torch.block_diag(*[W] * horizon, torch.eye(2).double()))
 
 
 @pytest.mark.parametrize("hessian", ["diagonal", "block", "full"])
-def test_the_hessian_is_semidefinite_whatever_the_factor(hessian):
-    learn = ("H",) if hessian == "full" else ("H", "H_f")
-    mpc = random_mpc(8, free=5.0, hessian=hessian, learn=learn)
-    H = mpc.quadratic_program().H.detach()
+def test_the_cost_stays_convex_whatever_the_factors(hessian):
+    learn = ("H", "w") if hessian == "full" else ("H", "H_f", "w")
+    qp = random_mpc(8, free=5.0, hessian=hessian, learn=learn).quadratic_program()
+    H = qp.H.detach()
     assert_close(H, H.mT, rtol=1e-12, atol=1e-12)
     assert torch.linalg.eigvalsh(H)[0] > -1e-9
     stages = H[:3, 3:6].abs().sum() + H[:9, 9:].abs().sum()
     assert (stages > 0) == (hessian == "full")
+    assert (qp.w >= 0).all()
+    assert qp.w.isinf().sum() == 3
 
 
-def test_slack_weights_stay_non_negative_whatever_the_factor():
-    w = random_mpc(8, free=20.0, learn=("w",)).quadratic_program().w
-    assert (w >= 0).all()
-    assert w.isinf().sum() == 3
+def test_random_starts_are_those_of_the_seed_alone():
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    first, again, other = (QPMPC.of(2, 1, 3, seed=seed).state_dict() for seed in (0, 0, 1))
+    assert_close(first, again, rtol=0, atol=0)
+    assert (first["C"] - other["C"]).abs().max() > 1e-3
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_readable_parts_are_the_model_and_the_rows():
+    mpc = windowed(free=0.0, structure="tied")
+    parts = mpc.readable()
+    expected = {"A": A_L, "B": B_L, "E": E, "H": W_D, "H_f": W_F, "D": ROWS[0], "D_f": LAST_ROWS[0]}
+    for name, value in expected.items():
+        assert_close(parts[name], torch.as_tensor(value).double())
+    assert_close(mpc.model(), (A_L, B_L, E))
+
+
+# Learning
 
 
 @pytest.mark.parametrize("part", EVERYTHING)
@@ -361,92 +479,197 @@ def test_learning_nothing_is_allowed():
     assert not mpc.value(random_states(3)).requires_grad
 
 
-def test_random_starts_are_those_of_the_seed():
-    first, again, other = (QPMPC.of(2, 1, 3, seed=seed).state_dict() for seed in (0, 0, 1))
-    assert_close(first, again, rtol=0, atol=0)
-    assert (first["C"] - other["C"]).abs().max() > 1e-3
-
-
-def test_random_starts_do_not_touch_the_global_generator():
-    torch.manual_seed(0)
-    before = torch.get_rng_state()
-    QPMPC.of(2, 1, 3, seed=5)
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_parameter_groups_have_a_rate_for_each_part():
     mpc = random_mpc(10, learn=("H", "H_f", "c", "C", "b"))
     groups = mpc.parameter_groups({"cost": 0.1, "constraints": 0.01, "C": 0.02})
-    assert {group["name"]: group["lr"] for group in groups} == {
-        "H": 0.1,
-        "H_f": 0.1,
-        "c": 0.1,
-        "C": 0.02,
-        "b": 0.01,
-    }
+    rates = {group["name"]: group["lr"] for group in groups}
+    assert rates == {"H": 0.1, "H_f": 0.1, "c": 0.1, "C": 0.02, "b": 0.01}
     owned = [parameter for group in groups for parameter in group["params"]]
     assert {id(parameter) for parameter in owned} == {id(part) for part in mpc.parameters()}
-    optimizer = torch.optim.SGD(groups)
-    before = {name: part.detach().clone() for name, part in mpc.named_parameters()}
-    mpc.value(random_states(4)).sum().backward()
-    optimizer.step()
-    rates = {group["name"]: group["lr"] for group in groups}
-    for name, part in mpc.named_parameters():
-        key = name.split(".")[1] if "." in name else name
-        assert part.grad is not None
-        assert_close(before[name] - part.detach(), rates[key] * part.grad)
+    for rates, message in (
+        ({"cost": 0.1}, "rates: got nothing for C, expected a rate for every learned part"),
+        ({"cost": 0.1, "constraint": 1.0}, r"rates: got \['constraint'\], expected names among"),
+    ):
+        with pytest.raises(QPError, match=message):
+            mpc.parameter_groups(rates)
+
+
+@pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.parametrize("second_order", [False, True])
+def test_it_stays_a_linear_mpc_scheme_while_it_is_learned(name, second_order):
+    mpc, s = made(name, 2), random_states(6)
+    before = mpc.value(s).detach()
+    if second_order:
+        a = random_states(6, 1, size=0.2)
+        GaussNewton(mpc).step(s, a, mpc.action_value(s, a).detach() + 0.01)
+    else:
+        step(mpc, rate=0.01)
+    assert (mpc.value(s) - before).abs().max() > 1e-4
+    A, B = mpc.model()
+    assert A.shape == ((4, 2, 2) if mpc.structure == "varying" else (2, 2))
+    for k in range(4):
+        columns = slice(3 * k, 3 * k + 5)
+        A_k, B_k = (A, B) if A.ndim == 2 else (A[k], B[k])
+        row = torch.cat((A_k, B_k, -torch.eye(2).double()), 1)
+        assert_close(mpc.C[2 * k : 2 * k + 2, columns], row)
+        assert mpc.C[2 * k : 2 * k + 2].count_nonzero() == row.count_nonzero()
+
+
+@pytest.mark.parametrize("decay", [0.0, 1.0])
+@pytest.mark.parametrize("structure", ["tied", "varying"])
+def test_no_optimiser_moves_the_bounds_of_hard_rows(structure, decay):
+    mpc = linear(free=0.0, structure=structure)
+    optimizer = torch.optim.AdamW(mpc.parameters(), lr=0.1, weight_decay=decay)
+    hard = torch.arange(mpc.n_z) % 3 == 2
+    before = {name: getattr(mpc, name).detach().clone() for name in ("lb", "ub")}
+    for _ in range(3):
+        optimizer.zero_grad()
+        mpc.value(torch.tensor([[3.0, 3.0], [-3.0, -3.0]]).double()).sum().backward()
+        optimizer.step()
+    for name, bounds in before.items():
+        assert_close(getattr(mpc, name)[hard].detach(), bounds[hard], rtol=0, atol=0)
+        assert not torch.equal(getattr(mpc, name)[~hard].detach(), bounds[~hard])
+
+
+@pytest.mark.parametrize("step", ["projection", "sdp"])
+@pytest.mark.parametrize("hessian", ["block", "full"])
+def test_a_projection_changes_the_block_of_the_plan_alone(step, hessian):
+    mpc = windowed(free=0.0, step=step, hessian=hessian)
+    leaf = mpc.leaves("H")[0]
+    with torch.no_grad():
+        leaf -= 1.5 * torch.eye(leaf.shape[-1])
+        before = leaf.clone()
+        mpc.project_()
+    free = N_P - N_X if hessian == "full" else N_D
+    assert torch.equal(leaf[:free], before[:free])
+    assert torch.equal(leaf[:, :free], before[:, :free])
+    assert torch.linalg.eigvalsh(before[free:, free:])[0] < -0.5
+    assert torch.linalg.eigvalsh(leaf[free:, free:])[0] > -1e-9
+    assert mpc.value(inputs(mpc)[0]).isfinite().all()
+
+
+# Release
 
 
 @pytest.mark.parametrize(
-    ("rates", "message"),
-    [
-        ({"cost": 0.1}, "rates: got nothing for C, expected a rate for every learned part"),
-        ({"cost": 0.1, "constraint": 1.0}, r"rates: got \['constraint'\], expected names among"),
-    ],
+    "name", [x for x, (_, o) in SETTINGS.items() if x in LINEAR or "structure" in o]
 )
-def test_rates_that_do_not_fit_are_named(rates, message):
-    with pytest.raises(QPError, match=message):
-        random_mpc(10).parameter_groups(rates)
+@pytest.mark.parametrize("way", [("free",), ("varying",), ("varying", "free")])
+def test_a_release_changes_neither_values_nor_policy(name, way):
+    mpc = made(name, 3)
+    if mpc.structure == "varying" and "varying" in way:
+        with pytest.raises(QPError, match=r"structure: got 'varying', expected .* freer than"):
+            mpc.release("varying")
+        return
+    stepped(mpc, rate=0.01)
+    s, a = inputs(mpc, 50)
+    before = [x.detach() for x in (mpc.value(s), mpc.action_value(s, a), mpc.policy(s))]
+    program = [x.detach() for x in mpc.quadratic_program().tensors()]
+    count = sum(parameter.numel() for parameter in mpc.parameters())
+    for structure in way:
+        mpc.release(structure)
+        assert mpc.structure == structure
+        after = [x.detach() for x in (mpc.value(s), mpc.action_value(s, a), mpc.policy(s))]
+        assert_close(after, before, rtol=0, atol=1e-9)
+        assert_close([x.detach() for x in mpc.quadratic_program().tensors()], program)
+        more = sum(parameter.numel() for parameter in mpc.parameters())
+        assert more > count
+        count = more
+    assert mpc.C.shape == mpc.C_0.shape
+    for structure in ("free", "loose"):
+        with pytest.raises(QPError, match=rf"structure: got '{structure}', expected .* freer than"):
+            made("diagonal").release(structure)
+
+
+def test_released_entries_can_change():
+    mpc, s = linear(4), random_states(6)
+    mpc.release()
+    assert dict(mpc.named_parameters())["C"].shape == mpc.C_0.shape
+    outside = mpc.C == 0
+    step(mpc, rate=0.01)
+    assert (mpc.C[outside] != 0).any()
+    mpc.value(s).sum().backward()
+    assert mpc.q.grad is not None
+    assert (mpc.q.grad[:3] - mpc.q.grad[3:6]).abs().max() > 1e-3
+    with pytest.raises(QPError, match="structure: got 'free', expected 'tied' or 'varying'"):
+        mpc.model()
+
+
+def test_a_released_module_can_be_copied_saved_and_reset():
+    mpc, s = linear(5), random_states(6)
+    value, names, original = mpc.value(s), [*mpc.state_dict()], mpc
+    mpc = copy.deepcopy(mpc)
+    mpc.release("varying")
+    assert (original.structure, [*original.state_dict()]) == ("tied", names)
+    assert_close(original.value(s), value, rtol=0, atol=0)
+    step(mpc)
+    twin = copy.deepcopy(mpc)
+    assert twin.structure == "varying"
+    assert_close(twin.value(s), mpc.value(s), rtol=0, atol=0)
+    other = linear(6, structure="varying")
+    other.load_state_dict(mpc.state_dict())
+    assert_close(other.value(s), mpc.value(s), rtol=0, atol=0)
+    mpc.reset_parameters()
+    assert_close(mpc.value(s), linear(free=0.0).value(s))
+
+
+def test_frozen_parameters_stay_frozen():
+    mpc = linear(7)
+    for name, parameter in mpc.named_parameters():
+        if name.split(".")[1:2] in (["C"], ["q"]):
+            parameter.requires_grad_(False)
+    mpc.release()
+    frozen = {name for name, p in mpc.named_parameters() if not p.requires_grad}
+    assert frozen == {"C", "q"}
 
 
 # Copies, pickles and checkpoints
 
 
-@pytest.mark.parametrize("name", SETTINGS)
-def test_resetting_returns_to_the_start(name):
-    start = random_mpc(11, free=0.0, **SETTINGS[name])
-    mpc = random_mpc(11, **SETTINGS[name])
-    step(mpc)
-    mpc.reset_parameters()
-    assert_close(mpc.state_dict(), start.state_dict(), rtol=0, atol=0)
+def pickled(mpc: QPMPC) -> QPMPC:
+    return pickle.loads(pickle.dumps(mpc))
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, round_trip], ids=["deepcopy", "pickle"])
-@pytest.mark.parametrize("name", SETTINGS)
-def test_a_copy_gives_the_same_answers_and_is_independent(copied, name):
-    mpc, s = random_mpc(12, **SETTINGS[name]), random_states(4)
-    step(mpc)
-    twin = copied(mpc)
-    before = mpc.value(s)
-    assert_close(twin.value(s), before, rtol=0, atol=0)
-    assert_close(twin.state_dict(), mpc.state_dict(), rtol=0, atol=0)
-    step(twin, rate=0.1)
-    assert (twin.value(s) - before).abs().max() > 1e-6
-    assert_close(mpc.value(s), before, rtol=0, atol=0)
-    twin.reset_parameters()
-
-
-@pytest.mark.parametrize("name", SETTINGS)
-def test_a_qp_without_values_is_pickled(name):
+def without_values(mpc: QPMPC) -> QPMPC:
     """TorchRL sends policies to workers on the meta device, with separate weights."""
-    mpc = random_mpc(12, **SETTINGS[name])
-    step(mpc)
-    twin = round_trip(copy.deepcopy(mpc).to("meta")).to_empty(device="cpu")
+    twin = pickled(copy.deepcopy(mpc).to("meta")).to_empty(device="cpu")
     twin.load_state_dict(mpc.state_dict())
-    assert_close(twin.C, mpc.C, rtol=0, atol=0)
+    return twin
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, round_trip], ids=["deepcopy", "pickle"])
+def from_file(mpc: QPMPC, folder: Path) -> QPMPC:
+    mpc.save(folder / "mine.qpmpc")
+    return QPMPC.load(str(folder / "mine.qpmpc"))
+
+
+def from_checkpoint(mpc: QPMPC, name: str) -> QPMPC:
+    other, file = made(name, 14), io.BytesIO()
+    torch.save(mpc.state_dict(), file)
+    file.seek(0)
+    other.load_state_dict(torch.load(file, weights_only=True))
+    return other
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_twins_give_the_same_answers_and_are_independent(tmp_path, name):
+    mpc = stepped(made(name, 12))
+    s, _ = inputs(mpc)
+    before, state = mpc.value(s), mpc.state_dict()
+    twins = [copy.deepcopy(mpc), pickled(mpc), without_values(mpc), from_file(mpc, tmp_path)]
+    for twin in (*twins, from_checkpoint(mpc, name)):
+        assert_close(twin.value(s), before, rtol=0, atol=0)
+        assert_close(twin.state_dict(), state, rtol=0, atol=0)
+        assert (twin.structure, twin.step, twin.learned) == (mpc.structure, mpc.step, mpc.learned)
+        assert (twin.past, twin.n_d, twin.n_p) == (mpc.past, mpc.n_d, mpc.n_p)
+        stepped(twin, rate=0.01)
+        assert (twin.value(s) - before).abs().max() > 1e-6
+        twin.reset_parameters()
+    assert_close(mpc.value(s), before, rtol=0, atol=0)
+    mpc.reset_parameters()
+    assert_close(mpc.state_dict(), made(name, 12, free=0.0).state_dict(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickled])
 @pytest.mark.parametrize("learn", [("H", "C"), ("C",), ()])
 def test_a_copy_keeps_mode_dtype_and_what_is_frozen(copied, learn):
     mpc = random_mpc(12, learn=learn).float().eval()
@@ -460,27 +683,46 @@ def test_a_copy_keeps_mode_dtype_and_what_is_frozen(copied, learn):
     assert repr(twin) == repr(mpc)
 
 
-@pytest.mark.parametrize("name", SETTINGS)
-def test_a_checkpoint_restores_a_module_from_another_seed(name):
-    mpc, other = random_mpc(13, **SETTINGS[name]), random_mpc(14, **SETTINGS[name])
-    step(mpc)
-    file = io.BytesIO()
-    torch.save(mpc.state_dict(), file)
-    file.seek(0)
-    other.load_state_dict(torch.load(file, weights_only=True))
-    s = random_states(4)
-    assert_close(other.value(s), mpc.value(s), rtol=0, atol=0)
+# An H that is indefinite on what is known
 
 
-def test_repr():
-    text = repr(random_mpc(15))
-    assert (
-        "n_x=2, n_u=1, horizon=3, hessian='diagonal', structure='free', learned=('H', 'c', 'C')"
-        in text
+def program(H: Tensor, n_known: int) -> QuadraticProgram:
+    """Make a QP in two variables without constraints."""
+    none, one = torch.zeros(0).double(), torch.zeros(()).double()
+    zeros = torch.zeros(0, 2).double()
+    return QuadraticProgram(
+        H, torch.zeros(2).double(), one, zeros, none, zeros, none, none, none, n_known=n_known
     )
 
 
+def test_an_indefinite_block_of_what_is_known_is_accepted():
+    assert torch.linalg.eigvalsh(windowed(free=0.0).quadratic_program().H)[0] < -1
+    H = torch.tensor([[-2.0, 1.0], [1.0, 4.0]]).double()
+    fixed = torch.tensor([[3.0]]).double()
+    solution = solve_qp(program(H, 1), fixed, solver="daqp")
+    assert_close(solution.z, torch.tensor([[3.0, -0.75]]).double())
+    assert_close(solution.value, torch.tensor([-9.0 - 9 / 8]).double())
+
+
+def test_an_indefinite_block_of_the_plan_is_refused():
+    H = torch.tensor([[-2.0, 1.0], [1.0, 4.0]]).double()
+    with pytest.raises(QPError, match=r"H: got smallest eigenvalue -2.* pass n_known if the first"):
+        program(H, 0)
+    with pytest.raises(QPError, match="H: got smallest eigenvalue -2, expected a positive semi"):
+        program(H.flip(0, 1), 1)
+    with pytest.raises(QPError, match="n_known: got -1, expected a whole number >= 0"):
+        program(H, -1)
+    mpc = windowed(step="projection")
+    with torch.no_grad():
+        mpc.leaves("H")[0][-1, -1] = -5.0
+    with pytest.raises(QPError, match="6 INVALID_DATA"):
+        mpc.value(inputs(mpc)[0])
+
+
 # Bad input
+
+STAGES = torch.ones(3, 1, 1).cumsum(0)
+MODEL: dict[str, Any] = {"A": A, "B": B, "hessian": "block", "stage_weight": W}
 
 
 @pytest.mark.parametrize(
@@ -498,24 +740,114 @@ def test_repr():
             "learn: got 'G' without constraints, expected other parts. Pass constraints, or ",
         ),
         (
-            {"structure": "tied", "A": torch.eye(2) * torch.ones(3, 1, 1).cumsum(0)},
+            {"structure": "tied", "A": torch.eye(2) * STAGES, "B": torch.ones(2, 1)},
             "C: got entries that break the structure of a linear MPC scheme, expected entries",
         ),
         ({"on_failure": "skip"}, "on_failure: got 'skip', expected one of raise, warn, mask"),
         ({"solver": "proxq"}, r"solver: got 'proxq', expected one of .* Did you mean 'proxqp'\?"),
         ({"solver": None}, "solver: got None, expected one of proxqp, daqp"),
+        (
+            {"A": [1.0], "B": [[1.0]]},
+            r"A, B: got shapes .*, expected matrices \(n_x, n_x\) and \(n_x, n_u\)",
+        ),
+        ({"A": [[1.0]], "B": [1.0]}, "A, B: got shapes .*, expected matrices"),
+        (
+            {**MODEL, "terminal_weight": "dare"},
+            "terminal_weight: got 'dare' with .*, expected a tensor, or",
+        ),
+        (
+            {"terminal_weight": "riccati"},
+            "terminal_weight: got 'riccati' with hessian='diagonal', .* 'riccati' with hessian=",
+        ),
+        (
+            {**MODEL, "A": 2 * torch.eye(2), "B": [[1.0], [0.0]], "terminal_weight": "riccati"},
+            "terminal_weight: got a Riccati equation without a solution .* Give the actions some",
+        ),
+        (
+            {**MODEL, "stage_weight": W.expand(3, 3, 3), "terminal_weight": "riccati"},
+            r"stage_weight: got shape \(3, 3, 3\), expected shape \(3, 3\). The Riccati equation",
+        ),
+        (
+            {**MODEL, "A": A.expand(3, 2, 2), "terminal_weight": "riccati"},
+            r"A: got shape \(3, 2, 2\), expected shape \(2, 2\). The Riccati equation has one",
+        ),
+        (
+            {"past": 1, "rate_bounds": ([-1.0], [1.0])},
+            r"rate_bounds: got bounds with past=1, expected past >= 2. The window then holds u_",
+        ),
+        ({"past": 2, "rate_bounds": ([-1.0] * 2, [1.0] * 2)}, r"rate_bounds: got shape \(2,\)"),
+        (
+            {"past": 2, "rate_bounds": ([-1.0], [1.0]), "rate_slack": -1.0},
+            "rate_slack: got -1.0, expected a non-negative weight",
+        ),
+        (
+            {"past": 2, "rate_slack": 2.0},
+            "rate_slack: got 2.0, expected inf without rate_bounds. It is the price of violating",
+        ),
+        (
+            {"past": 3, "A": torch.eye(2)},
+            r"A, B: got shapes \(2, 2\) and .*, expected \(2, 6\) and \(2, 3\). \[A_1, .., A_L\]",
+        ),
+        ({"past": 2, "B": B}, r"A, B: got .* \(2, 1\), expected \(2, 4\) and \(2, 2\)"),
+        ({"E": B}, r"E: got shape \(2, 1\), expected \(2, 0\). It multiplies the prev"),
+        ({"n_d": 2, "E": torch.ones(1, 2)}, r"E: got shape \(1, 2\), expected \(2, 2\)"),
+        ({"n_d": 1, "E": [[torch.nan], [1.0]]}, "E: got NaN or inf, expected finite entries"),
+        (
+            {"past": 2, "hessian": "block", "terminal_weight": "riccati"},
+            "terminal_weight: got 'riccati' with past > 1, expected past=1. Pass a matrix",
+        ),
+        (
+            {"n_d": 2, "hessian": "block", "stage_weight": -W_D},
+            "stage_weight: got smallest eigenvalue -2.* expected a positive semidefinite weight",
+        ),
+        (
+            {"n_d": 2, "hessian": "block", "stage_weight": W_D.triu()},
+            r"stage_weight: got asymmetry 1, expected a symmetric matrix",
+        ),
+        (
+            {"n_d": 2, "stage_weight": W_D},
+            r"stage_weight: got shape \(5, 5\), expected shape \(3,\) or \(3, 3\)",
+        ),
+        (
+            {"n_d": 2, "hessian": "block", "terminal_weight": -W_F},
+            "terminal_weight: got smallest eigenvalue -1",
+        ),
+        (
+            {"n_d": 1, "constraints": ([[1.0, 1.0, 1.0]], [0.0], [1.0])},
+            r"constraints: got D of shape \(1, 3\), expected shape \(m, 4\)",
+        ),
+        (
+            {"n_d": 1, "terminal_constraints": ([[1.0, 1.0]], [0.0], [1.0])},
+            r"terminal_constraints: got D of shape \(1, 2\), expected shape \(m, 3\)",
+        ),
+        *(
+            (
+                {"state_slack": slack},
+                f"state_slack: got .*{got}.*, expected a non-negative weight, .*one for each of",
+            )
+            for slack, got in (
+                ([1.0], r"\[1.0\]"),
+                ([1.0, -1.0], r"\[1.0, -1.0\]"),
+                ([1.0, torch.nan], "nan"),
+                (-1.0, "-1.0"),
+            )
+        ),
     ],
 )
 def test_bad_arguments_are_named(options, message):
-    arguments = {"n_x": 2, "n_u": 1, "horizon": 3, "A": torch.eye(2), "B": torch.ones(2, 1)}
     with pytest.raises(QPError, match=message):
-        QPMPC.of(**(arguments | options))
+        QPMPC.of(2, 1, 3, **options)
 
 
-@pytest.mark.parametrize(("A", "B"), [([1.0], [[1.0]]), (1.0, 1.0), ([[1.0]], [1.0])])
-def test_a_model_without_matrices_is_named(A, B):
-    with pytest.raises(QPError, match=r"A, B: got shapes .*, expected matrices \(n_x, n_x\) and"):
-        QPMPC.from_model(A, B, 3)
+@pytest.mark.parametrize(
+    ("part", "index"), [("C", (0, 6)), ("b", 0), ("lb", 3), ("G", (-1, 0)), ("G", (0, 1))]
+)
+def test_assigning_what_the_stages_do_not_share_is_refused(part, index):
+    mpc = linear(free=0.0, **MIXED)
+    value: Tensor = getattr(mpc, part).detach().clone()
+    value[index] = 0.5
+    with pytest.raises(QPError, match=rf"{part}: got entries .* Call release\(\) first"):
+        setattr(mpc, part, value)
 
 
 S = torch.zeros(4, 2)
@@ -536,6 +868,17 @@ S = torch.zeros(4, 2)
 def test_bad_inputs_are_named(inputs, message):
     with pytest.raises(QPError, match=message):
         random_mpc(0)(*inputs)
+
+
+def test_inputs_of_another_size_are_named():
+    mpc = windowed()
+    p, _ = inputs(mpc)
+    with pytest.raises(QPError, match=r"s: got shape \(6, 2\), expected shape \(\*batch, 16\)"):
+        mpc.value(p[:, -2:])
+    with pytest.raises(QPError, match=r"a: got shape \(6, 16\), expected shape \(\*batch, 1\)"):
+        mpc.action_value(p, p)
+    with pytest.raises(QPError, match=r"z: got shape \(6, 16\), expected shape \(\*batch, 25\)"):
+        mpc.predicted(p)
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])

@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.problems import normal
 from torch_qpmpc import QPMPC, QPError, SolverError, files
 from torch_qpmpc.qp.solvers import BACKENDS
 
@@ -39,29 +38,6 @@ def small() -> QPMPC:
     mpc.value(torch.ones(mpc.n_p)).backward()
     optimizer.step()
     return mpc
-
-
-@pytest.mark.parametrize("structure", ["free", "tied", "varying"])
-@pytest.mark.parametrize("step", ["cholesky", "projection"])
-def test_the_twin_is_the_same_and_learns_on(tmp_path, structure, step):
-    mpc = QPMPC.linear_mpc(
-        [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], 3, stage_weight=[1.0, 1.0, 0.1], step=step
-    )  # fmt: skip
-    if structure != "tied":
-        mpc.release(structure)
-    with torch.no_grad():
-        for parameter in mpc.parameters():
-            parameter += 0.01
-    mpc.save(tmp_path / "mine.qpmpc")
-    twin = QPMPC.load(str(tmp_path / "mine.qpmpc"))
-    s, a = normal(5, 2), normal(5, 1)
-    assert torch.equal(twin.value(s), mpc.value(s))
-    for module in (mpc, twin):
-        module.action_value(s, a).sum().backward()
-    theirs = dict(mpc.named_parameters())
-    for name, parameter in twin.named_parameters():
-        assert_close(parameter.grad, theirs[name].grad)
-    assert (twin.structure, twin.step, twin.learned) == (structure, step, mpc.learned)
 
 
 def test_masks_solver_and_on_failure_are_kept(tmp_path):
