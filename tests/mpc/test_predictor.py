@@ -10,6 +10,7 @@ from torch.testing import assert_close
 from tests.logs import OFFSET, A, B, E, arx_log
 from torch_qpmpc import QPMPC
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.log import Trajectory, as_log
 from torch_qpmpc.mpc.predictor import (
     Constraints,
     Options,
@@ -22,14 +23,13 @@ from torch_qpmpc.mpc.predictor import (
     windows,
 )
 from torch_qpmpc.mpc.ridge import ridge
-from torch_qpmpc.mpc.trajectories import Trajectory, read_trajectories
 
 N = 8
 STARTS = [("tied", True), ("varying", True), ("free", True), ("free", False)]
 
 
 def trajectories(*args, **options) -> list[Trajectory]:
-    return read_trajectories(arx_log(*args, **options), n_d=1)
+    return [*as_log(arx_log(*args, **options), n_d=1).trajectories]
 
 
 def layout(past: int, horizon: int = N) -> Layout:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from torch_qpmpc.mpc.log import Trajectory
 from torch_qpmpc.mpc.roles import unmoved
-from torch_qpmpc.mpc.trajectories import Trajectory
 
 N = 8
 

@@ -29,9 +29,8 @@ from torch_qpmpc.control.steady import Steady
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
 from torch_qpmpc.mpc.identification import Identified, identify
-from torch_qpmpc.mpc.log import STILL, Log, as_log
+from torch_qpmpc.mpc.log import STILL, Log, Trajectory, as_log, folds
 from torch_qpmpc.mpc.scheme import KEYWORDS
-from torch_qpmpc.mpc.trajectories import Trajectory, folds
 
 #: Number of parts that a log is cut into; the last one is held out.
 PARTS = 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 
-from torch_qpmpc.mpc.trajectories import NEXT, valid_steps
+from torch_qpmpc.mpc.log import NEXT, valid_steps
 
 #: The largest size of an observation, relative to the largest in the first transitions.
 GROWTH = 1e6
@@ -18,7 +18,7 @@ def without_blow_ups(log: TensorDictBase) -> tuple[TensorDictBase, int]:
     than 1e6 times the largest of the log's first transitions.
 
     Args:
-        log: logged steps, ``(T,)`` or ``(episodes, T)``, as in `read_trajectories`.
+        log: logged steps, ``(T,)`` or ``(episodes, T)``, as in `as_log`.
 
     Returns:
         The log, with an entry ``mask`` if steps are masked, and the number of these episodes.

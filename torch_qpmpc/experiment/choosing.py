@@ -31,10 +31,9 @@ from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.blended import BlendedModel, identify_blended
 from torch_qpmpc.mpc.identification import Identified
 from torch_qpmpc.mpc.local import local_steps, without
-from torch_qpmpc.mpc.log import as_log
+from torch_qpmpc.mpc.log import as_log, valid_steps
 from torch_qpmpc.mpc.predictor import prediction_errors
 from torch_qpmpc.mpc.rewards import RewardCost, fit_most, fit_rewards
-from torch_qpmpc.mpc.trajectories import valid_steps
 
 #: Episodes of each start in the first round.
 FIRST = 2

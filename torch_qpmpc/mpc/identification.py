@@ -16,7 +16,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_choice, check_flag, check_number, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import SIZES, Layout
-from torch_qpmpc.mpc.log import Log, as_log
+from torch_qpmpc.mpc.log import Log, Trajectory, as_log, folds
 from torch_qpmpc.mpc.predictor import (
     ARX,
     Constraints,
@@ -25,7 +25,6 @@ from torch_qpmpc.mpc.predictor import (
     prediction_errors,
     transitions,
 )
-from torch_qpmpc.mpc.trajectories import Trajectory, folds
 from torch_qpmpc.mpc.validation import STRUCTURES, as_tensor
 
 #: The largest number of parts of the data in cross-validation.

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from torch_qpmpc.mpc.trajectories import NEXT, kept_steps, read_trajectories
+from torch_qpmpc.mpc.log import NEXT, as_log, kept_steps
 
 #: Steps for each coefficient of an output's linear model, and of a quadratic cost.
 PER_MODEL, PER_COST = 20, 4
@@ -26,7 +26,7 @@ def local_steps(log: Any, n_x: int, held: Sequence[int] = ()) -> tuple[Any, list
     Distances are in units of the outputs' deviations.
 
     Args:
-        log: logged steps in one TensorDict, as in `read_trajectories`.
+        log: logged steps in one TensorDict, as in `as_log`.
         n_x: the number of outputs, the last entries of the observation.
         held: indices of outputs that a model holds anyway, which are not among those still.
 
@@ -34,9 +34,9 @@ def local_steps(log: Any, n_x: int, held: Sequence[int] = ()) -> tuple[Any, list
         The steps, ``(steps, 1)``, and indices of outputs; None if they are over half of the log.
 
     Raises:
-        QPError: as in `read_trajectories`.
+        QPError: as in `as_log`.
     """
-    first = torch.stack([part.y[0] for part in read_trajectories(log, n_x)]).mean(0)
+    first = torch.stack([part.y[0] for part in as_log(log, n_x).trajectories]).mean(0)
     steps = log.reshape(-1)[kept_steps(log).flatten()]
     y = steps["observation"][..., -n_x:].double()
     n = n_x + steps["action"].shape[-1]

@@ -33,8 +33,8 @@ from torch import Tensor
 
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.log import Trajectory
 from torch_qpmpc.mpc.ridge import ridge
-from torch_qpmpc.mpc.trajectories import Trajectory
 
 #: The correction of a prediction k steps ahead needs more than this many times k starts, because
 #: the errors of fewer than k starts overlap.

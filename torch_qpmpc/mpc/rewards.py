@@ -11,8 +11,8 @@ from torch import Tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.log import NEXT, logs, valid_steps
 from torch_qpmpc.mpc.stage_cost import EXACT, StageCost, fit_stage_cost
-from torch_qpmpc.mpc.trajectories import NEXT, logs, valid_steps
 
 REMEDY = (
     "Pass stage_weight (in train.py task.stage_weight), the weight W of the cost "
@@ -79,7 +79,7 @@ def fit_rewards(
     """Fit stage costs to the rewards of a log, as `fit_stage_cost`.
 
     Args:
-        log: logged steps, as in `read_trajectories`, with ``("next", "reward")``.
+        log: logged steps, as in `as_log`, with ``("next", "reward")``.
         layout: the sizes.
         diagonal: fit a diagonal W.
         after: fit one of (y_{k+1}, u_k), too, without cross terms of both; not with known signals.

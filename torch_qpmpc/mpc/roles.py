@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torch_qpmpc.mpc.trajectories import Trajectory
+from torch_qpmpc.mpc.log import Trajectory
 
 #: The other orders of the actions, in which they cannot explain a change.
 ORDERS = 99

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_flag, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.log import LARGEST
 from torch_qpmpc.mpc.ridge import ridge
-from torch_qpmpc.mpc.trajectories import LARGEST
 
 #: Strengths of the ridge, down to those of costs without noise, and the share of the evidence's
 #: that is used: enough for collinear columns, and too little to bias others.
