@@ -4,14 +4,12 @@ The model of a nonlinear plant is
 
     x_{k+1} = sum_i w_i(x_k) (A_i x_k + B_i u_k + c_i),   w(x) = softmax(-|z - z_i|^2 / (2 h^2)),
 
-with the standardised observation z and the centres z_i: local linear models (Johansen and Foss,
-1993, "Constructing NARMAX models using ARMAX models"), whose rules are those of Takagi and Sugeno
-(1985). The centres are those of k-means, from the points that are farthest from each other. Each
-local model is fitted to all transitions, weighted by w_i, with a ridge on its change from the
-linear model of all. h is the mean distance of a centre from its nearest one.
+with the standardised observation z and the centres z_i (Johansen and Foss, 1993, "Constructing
+NARMAX models using ARMAX models"; Takagi and Sugeno, 1985). k-means finds the centres, from points
+far from each other. Each local model is fitted to all transitions, weighted by w_i, with a ridge on
+its change from the linear model of all. h is the mean distance of a centre from its nearest one.
 
-For a controller the model is linearised at s: the derivative of x_{k+1}, with that of the weights,
-which the blend of the A_i alone leaves out.
+For a controller the model is linearised at s, with the derivative of the weights.
 """
 
 from __future__ import annotations
@@ -31,10 +29,9 @@ from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.coordinates import for_each
 from torch_qpmpc.mpc.identification import check_excitation, check_held
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import as_log
+from torch_qpmpc.mpc.log import Trajectory, as_log, folds
 from torch_qpmpc.mpc.predictor import transitions
 from torch_qpmpc.mpc.ridge import ridge
-from torch_qpmpc.mpc.trajectories import Trajectory, folds
 from torch_qpmpc.mpc.validation import as_tensor
 
 #: The numbers of centres among which the held-out prediction decides. More of them predict better
@@ -46,6 +43,8 @@ PARTS = 5
 RIDGE = 1e-3
 #: Iterations of k-means.
 ITERATIONS = 50
+#: The distances of the rows of two matrices, exactly zero for equal ones.
+distance = partial(torch.cdist, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 class Linearised(NamedTuple):
@@ -83,41 +82,25 @@ class BlendedModel(nn.Module):
     offset: Tensor
 
     def __init__(
-        self,
-        centres: Any,
-        middle: Any,
-        size: Any,
-        width: Any,
-        A: Any,
-        B: Any,
-        offset: Any,
+        self, centres: Any, middle: Any, size: Any, width: Any, A: Any, B: Any, offset: Any
     ) -> None:
         super().__init__()
-        parts = {"centres": centres, "middle": middle, "size": size, "width": width}
-        parts |= {"A": A, "B": B, "offset": offset}
-        parts = {name: as_tensor(name, part).detach().clone() for name, part in parts.items()}
+        given = (centres, middle, size, width, A, B, offset)
+        parts = {
+            name: as_tensor(name, part).detach().clone()
+            for name, part in zip(BlendedModel.__annotations__, given, strict=True)
+        }
         (m, n_x), n_u = (*parts["centres"].shape, 0, 0)[:2], (0, *parts["B"].shape)[-1]
-        of = {"centres": (m, n_x), "middle": (n_x,), "size": (n_x,), "width": ()}
-        of |= {"A": (m, n_x, n_x), "B": (m, n_x, n_u), "offset": (m, n_x)}
-        for name, part in parts.items():
-            if part.shape != of[name]:
-                raise QPError.expected(name, f"shape {tuple(part.shape)}", f"shape {of[name]}")
+        shapes = ((m, n_x), (n_x,), (n_x,), (), (m, n_x, n_x), (m, n_x, n_u), (m, n_x))
+        for (name, part), shape in zip(parts.items(), shapes, strict=True):
+            if part.shape != shape:
+                raise QPError.expected(name, f"shape {tuple(part.shape)}", f"shape {shape}")
             self.register_buffer(name, part)
         self.R2: dict[int, float] = {}
 
-    @property
-    def n_x(self) -> int:
-        """The number of outputs."""
-        return self.B.shape[-2]
-
-    @property
-    def n_u(self) -> int:
-        """The number of actions."""
-        return self.B.shape[-1]
-
     def weights(self, s: Tensor) -> Tensor:
         """Return w ``(*batch, m)`` at s ``(*batch, n_x)``."""
-        return _weights(s, self.centres, self.middle, self.size, self.width)
+        return (-self._distances(s).square().sum(-1) / 2).softmax(-1)
 
     def forward(self, s: Tensor, u: Tensor) -> Tensor:
         """Return the next x ``(*batch, n_x)``, in float64.
@@ -127,7 +110,7 @@ class BlendedModel(nn.Module):
             u: ``(*batch, n_u)``.
 
         Raises:
-            QPError: a shape is wrong, as in `linearised`.
+            QPError: a shape is wrong.
         """
         s, u = self._pairs(s, u)
         return (self.weights(s).unsqueeze(-1) * self._local(s, u)).sum(-2)
@@ -142,12 +125,11 @@ class BlendedModel(nn.Module):
         Raises:
             QPError: a shape is wrong.
         """
-        s, u = self._pairs(s, self.B.new_zeros(self.n_u) if u is None else u)
+        s, u = self._pairs(s, self.B.new_zeros(self.B.shape[-1]) if u is None else u)
         w, local = self.weights(s), self._local(s, u)
         ahead = (w.unsqueeze(-1) * local).sum(-2)
         # The derivative of w_i is w_i times that of its exponent minus the exponents' mean one.
-        distances = _distances(s, self.centres, self.middle, self.size, self.width)
-        slopes = -distances / (self.width * self.size)
+        slopes = -self._distances(s) / (self.width * self.size)
         slopes = w.unsqueeze(-1) * (slopes - (w.unsqueeze(-1) * slopes).sum(-2, keepdim=True))
         A = torch.einsum("...i,ijk->...jk", w, self.A) + local.mT @ slopes
         B = torch.einsum("...i,ijk->...jk", w, self.B)
@@ -157,17 +139,14 @@ class BlendedModel(nn.Module):
     def constraints(
         self, s: Tensor, horizon: int, plan: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return C and b of the linearised model (eq:cband), as in a `QuadraticProgram`.
+        """Return C ``(*batch, N n_x, n_z)`` and b ``(*batch, N n_x)`` of the model (eq:cband).
 
         Args:
             s: ``(*batch, n_x)``.
             horizon: N.
             plan: actions, ``(*batch, N, n_u)``, along whose prediction the model is linearised in
-                each stage, as in sequential quadratic programming. Without them it is linearised at
-                (s, 0), and the same in all stages.
-
-        Returns:
-            ``(*batch, N n_x, n_z)`` and ``(*batch, N n_x)``.
+                each stage, as in sequential quadratic programming; by default it is linearised at
+                (s, 0) for all stages.
 
         Raises:
             QPError: a shape is wrong.
@@ -176,7 +155,7 @@ class BlendedModel(nn.Module):
             stages = [self.linearised(s)] * horizon
         else:
             stages, x = [], s
-            for u in check_tensor("plan", plan, horizon, self.n_u).unbind(-2):
+            for u in check_tensor("plan", plan, horizon, self.B.shape[-1]).unbind(-2):
                 stages.append(self.linearised(x, u))
                 x = self(x, u)
         A = torch.stack([stage.A for stage in stages], -3)
@@ -190,17 +169,23 @@ class BlendedModel(nn.Module):
         return dict(self.named_buffers())
 
     def extra_repr(self) -> str:
-        return f"centres={len(self.centres)}, n_x={self.n_x}, n_u={self.n_u}"
+        return f"centres={len(self.centres)}, n_x={self.B.shape[-2]}, n_u={self.B.shape[-1]}"
 
     def _pairs(self, s: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return s and u with the same batch dimensions."""
-        s, u = check_tensor("s", s, self.n_x), check_tensor("u", u, self.n_u)
+        n_x, n_u = self.B.shape[-2:]
+        s, u = check_tensor("s", s, n_x), check_tensor("u", u, n_u)
         try:
             batch = torch.broadcast_shapes(s.shape[:-1], u.shape[:-1])
         except RuntimeError as error:
             got, want = f"shape {tuple(u.shape)}", "leading dimensions that broadcast with those of"
             raise QPError.expected("u", got, f"{want} s, {tuple(s.shape)}") from error
         return s.expand(*batch, -1), u.expand(*batch, -1)
+
+    def _distances(self, s: Tensor) -> Tensor:
+        """Return s minus the centres in units of h, ``(*batch, m, n_x)``."""
+        z = (s.to(self.middle) - self.middle) / self.size
+        return (z.unsqueeze(-2) - self.centres) / self.width
 
     def _local(self, s: Tensor, u: Tensor) -> Tensor:
         """Return the prediction of each local model, ``(*batch, m, n_x)``."""
@@ -226,7 +211,7 @@ def schedule_of(model: BlendedModel | Mapping[str, Tensor], layout: Layout) -> B
         remedy = "identify_blended returns one."
         raise QPError.expected("schedule", got, "a BlendedModel, or its arguments", remedy)
     sizes = (layout.n_x, layout.n_u, layout.past, layout.n_d)
-    if sizes != (own := (copy.n_x, copy.n_u, 1, 0)):
+    if sizes != (own := (*copy.B.shape[-2:], 1, 0)):
         got, expected = (f"n_x, n_u, past, n_d = {x}" for x in (own, sizes))
         raise QPError.expected("schedule", got, f"{expected}, as the QPMPC")
     return copy
@@ -274,13 +259,12 @@ def identify_blended(
     layout = Layout(len(log.outputs), len(log.inputs), int(horizon))
     held = check_held(held, layout.n_x)
     check_excitation(log, layout)
-    data = log.trajectories
+    data, coefficients = log.trajectories, layout.n + 1
     if isinstance(centres, Integral):
         return _fit(data, layout, int(centres), held)
-    coefficients = layout.n + 1
     counts = [count for count in counts if count * coefficients < log.steps] or [min(counts)]
-    parts = folds(data, PARTS)
-    rest, last = [steps for part in parts[:-1] for steps in part], parts[-1]
+    *parts, last = folds(data, PARTS)
+    rest = [steps for part in parts for steps in part]
     variance = torch.cat([steps.y for steps in data]).var(0, correction=0)
     variance[[*held]] = torch.nan  # left out
     R2 = {count: _R2(_fit(rest, layout, count, held), last, horizon, variance) for count in counts}
@@ -300,41 +284,31 @@ def _fit(
     middle, size = x.mean(0), x.std(0, correction=0)
     size = torch.where(size > 1e-12 * x.abs().amax(0), size, 1.0)
     centres = _centres((x - middle) / size, count)
-    apart = _distance(centres, centres).fill_diagonal_(torch.inf)
+    apart = distance(centres, centres).fill_diagonal_(torch.inf)
     width = apart.amin(1).mean() if len(centres) > 1 else size.new_ones(())
     X = torch.cat((X, torch.ones_like(X[:, :1])), -1)
     scale = X.square().mean(0).sqrt()
-    X = X / torch.where(scale > 0, scale, 1.0)
+    scale = torch.where(scale > 0, scale, 1.0)
+    X = X / scale
     shared = ridge(X, Y)
-    w = _weights(x, centres, middle, size, width)
+    m, n_u = len(centres), layout.n_u
+    A, B = x.new_zeros(m, n_x, n_x), x.new_zeros(m, n_x, n_u)
+    w = BlendedModel(centres, middle, size, width, A, B, centres).weights(x)
     gram = torch.einsum("ti,tj,tk->ijk", w, X, X) / len(X)
     moment = torch.einsum("ti,tj,tk->ijk", w, X, Y - X @ shared) / len(X)
     strength = RIDGE * torch.eye(X.shape[1], dtype=X.dtype)
     local = shared + torch.linalg.solve(gram + strength, moment)
-    local = (local / torch.where(scale > 0, scale, 1.0).unsqueeze(-1)).mT
-    A, B, offset = local.split((n_x, layout.n_u, 1), -1)
+    A, B, offset = (local / scale.unsqueeze(-1)).mT.split((n_x, n_u, 1), -1)
     A = A + torch.eye(n_x).to(A)
     return BlendedModel(centres, middle, size, width, A, B, offset[..., 0])
-
-
-def _distances(s: Tensor, centres: Tensor, middle: Tensor, size: Tensor, width: Tensor) -> Tensor:
-    """Return s minus the centres in units of h, ``(*batch, m, n_x)``."""
-    z = (s.to(middle) - middle) / size
-    return (z.unsqueeze(-2) - centres) / width
-
-
-def _weights(s: Tensor, centres: Tensor, middle: Tensor, size: Tensor, width: Tensor) -> Tensor:
-    """Return w ``(*batch, m)`` at s ``(*batch, n_x)``."""
-    distances = _distances(s, centres, middle, size, width)
-    return (-distances.square().sum(-1) / 2).softmax(-1)
 
 
 def _centres(z: Tensor, count: int) -> Tensor:
     """Return the centres of k-means of z ``(T, n_x)``, at most ``count``, which differ."""
     chosen = z[z.square().sum(1).argmin()].unsqueeze(0)
     while len(chosen) < count:
-        distance, farthest = _distance(z, chosen).amin(1).max(0)
-        if distance == 0:
+        apart, farthest = distance(z, chosen).amin(1).max(0)
+        if apart == 0:
             break
         chosen = torch.cat((chosen, z[farthest].unsqueeze(0)))
     from scipy.cluster.vq import kmeans2  # a tenth of a second, which few imports need
@@ -345,25 +319,17 @@ def _centres(z: Tensor, count: int) -> Tensor:
     return torch.as_tensor(chosen)
 
 
-def _distance(x: Tensor, y: Tensor) -> Tensor:
-    """Return the distances of the rows of x and y, exactly zero for equal ones."""
-    return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
-
-
 def _R2(model: BlendedModel, data: Sequence[Trajectory], horizon: int, variance: Tensor) -> float:
     """Return R2 of predictions ``horizon`` steps ahead, or as many as the longest of ``data``.
 
-    ``variance`` is that of the outputs, ``(n_x,)``, NaN for those that are left out.
+    Outputs whose ``variance`` ``(n_x,)`` is NaN are left out.
     """
-    horizon = min(horizon, max(steps.steps for steps in data))
-    errors = []
+    horizon, errors = min(horizon, max(steps.steps for steps in data)), []
     for steps in data:
-        starts = steps.steps - horizon + 1
-        if starts < 1:
-            continue
+        starts = max(steps.steps - horizon + 1, 0)
         x = steps.y[:starts]
-        for k in range(horizon):
+        for k in range(horizon if starts else 0):
             x = model(x, steps.u[k : k + starts])
-        errors.append(steps.y[horizon:] - x)
+        errors.append(steps.y[steps.steps + 1 - starts :] - x)
     R2 = 1 - torch.cat(errors).square().mean(0) / torch.where(variance == 0, 1.0, variance)
     return R2[~variance.isnan()].mean().nan_to_num(-torch.inf).item()
