@@ -45,15 +45,6 @@ def test_the_cost_is_the_discounted_sum_of_the_stages(name):
     assert_close(0.5 * z @ qp.H @ z + qp.q @ z, total)
 
 
-@pytest.mark.parametrize("discounted", [True, False])
-def test_slack_weights_are_discounted_on_request_and_hard_rows_stay_hard(discounted):
-    mpc = random_mpc(4, learn=("w",), gamma=GAMMA, discount_slack=discounted, **MIXED)
-    stage = torch.tensor([0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, *(0, 0, 1, 1, 2, 2), 3])
-    expected = mpc.w * (GAMMA**stage if discounted else 1)
-    assert_close(mpc.quadratic_program().w, expected.masked_fill(~mpc.soft, torch.inf))
-    assert (~mpc.soft).any()
-
-
 @pytest.mark.parametrize("name", OPTIONS)
 def test_its_gradients_pass_finite_differences(name):
     mpc = example(name)

@@ -23,8 +23,8 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.coordinates import check_names
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.parameters import check_names
 from torch_qpmpc.qp.batching import to_dtype
 from torch_qpmpc.qp.program import QuadraticProgram
 

@@ -15,8 +15,8 @@ from torchrl.modules import MLP
 from torch_qpmpc.checks import check_kind, check_number, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.operators import entry, known_keys
-from torch_qpmpc.mpc.coordinates import check_names
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.parameters import check_names
 
 
 class ThetaNetwork(TensorDictModuleBase):

@@ -94,11 +94,11 @@ class Bounds:
             raise QPError.expected("rate_bounds", "bounds with past=1", "past >= 2", remedy)
         D = _matching_rows("constraints", self.constraints, n_d + layout.n)
         D_f = _matching_rows("terminal_constraints", self.terminal_constraints, n_d + n_x)
-        x = _matching_pair("state_bounds", self.state_bounds, n_x)
-        u = _matching_pair("action_bounds", self.action_bounds, n_u)
-        rates = (x[0][:0], x[1][:0])
-        if self.rate_bounds is not None:
-            rates = _matching_pair("rate_bounds", self.rate_bounds, n_u)
+        sizes = (n_x, n_u, layout.n_rates)
+        x, u, rates = (
+            _matching_pair(name, getattr(self, name), size)
+            for name, size in zip(PAIRS, sizes, strict=True)
+        )
         lower, upper = (
             layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], rates, strict=True)
         )

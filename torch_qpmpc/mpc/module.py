@@ -22,7 +22,7 @@ from torch.nn.utils import parametrize
 from torch_qpmpc.checks import check_choice, check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
-from torch_qpmpc.mpc import coordinates, parameters
+from torch_qpmpc.mpc import parameters
 from torch_qpmpc.mpc.blended import BlendedModel, schedule_of
 from torch_qpmpc.mpc.cost import check_chosen
 from torch_qpmpc.mpc.identification import identify
@@ -523,9 +523,9 @@ class QPMPC(nn.Module):
         """
         with full_precision(self.C_0):
             if residuals is not None:
-                theta = coordinates.moved(self, residuals)
+                theta = parameters.moved(self, residuals)
             else:
-                theta = {part: getattr(self, part) for part in coordinates.parts(self)}
+                theta = {part: getattr(self, part) for part in parameters.parts(self)}
             H, q, w = self._cost(theta)
             c, C, b, G, lb, ub = (theta[part] for part in ("c", *CONSTRAINTS))
             if self.layout.blocks:
@@ -542,7 +542,7 @@ class QPMPC(nn.Module):
         H_f and w, which are coordinates only if learned, the shorter vectors of tied parts, and A,
         B, E and D, D_f of a tied C and G. H with ``step="projection"`` is its own coordinate.
         """
-        return coordinates.coordinates(self)
+        return parameters.coordinates(self)
 
     def save(self, path: str | Path) -> None:
         """Write this QPMPC to a file of tensors and plain values, which runs no code.
@@ -806,7 +806,7 @@ class QPMPC(nn.Module):
         def hessian(*blocks: Tensor) -> Tensor:
             return self.layout.hessian(self.hessian, blocks, self.discount)
 
-        H = coordinates.for_each(hessian, blocks, self._block_ndims)
+        H = parameters.for_each(hessian, blocks, self._block_ndims)
         # A hard row's w is a placeholder, to which its hardness adds inf.
         w = torch.addcmul(self.hardness, self.slack_discount, theta["w"])
         return H, self.discount * theta["q"], w

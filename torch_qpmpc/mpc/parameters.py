@@ -1,22 +1,29 @@
-"""The parts of theta as parameters or buffers of a module, with their parametrizations.
+"""The parts of theta as parameters or buffers of a module, and their unconstrained coordinates.
 
-A learned part is a parameter, or is computed from parameters, its leaves: H from a factor, a C
-that is tied from A and B. The other parts are buffers.
+A learned part is a parameter, or is computed from parameters, its leaves: H from a factor L of
+H = L L', a tied C from A and B. These are its coordinates, to which any residual can be added: H
+stays positive semidefinite, w non-negative and a tied C a model. Other parts are buffers, and
+coordinates themselves.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torch_qpmpc.checks import check_number
+from torch_qpmpc.checks import check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.parametrizations import Banded, LinearRows, Masked, Tied
+from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, LinearRows, Masked, Tied
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
+from torch_qpmpc.qp.batching import broadcast, to_dtype
+
+#: The coordinates of a tied C and a tied G.
+MODELS: dict[type, tuple[str, ...]] = {Banded: ("A", "B", "E"), LinearRows: ("D", "D_f")}
 
 
 def register(module: nn.Module, name: str, value: Tensor, learned: bool) -> None:
@@ -82,8 +89,7 @@ def readable(module: nn.Module, learned: Collection[str]) -> dict[str, Tensor]:
         if parametrize.is_parametrized(module, part):
             first = next(iter(module.get_submodule(f"parametrizations.{part}").children()))
         if isinstance(first, Banded | LinearRows):
-            names = ("A", "B", "E") if part == "C" else ("D", "D_f")
-            values |= dict(zip(names, first.right_inverse(value), strict=False))
+            values |= dict(zip(MODELS[type(first)], first.right_inverse(value), strict=False))
         else:
             values[part] = value[first.first] if isinstance(first, Tied) else value
     return values
@@ -112,3 +118,104 @@ def groups(
         check_number(f"rates[{part}]", rate, lambda x: 0 <= x < math.inf, "a finite number >= 0")
         result.append({"params": leaves(module, part), "lr": rate, "name": part})
     return result
+
+
+def coordinates(module: nn.Module) -> dict[str, Tensor]:
+    """Return the coordinates of theta by name: A, B, E and D, D_f of tied matrices, else the part.
+
+    H, H_f and w have coordinates only if they are learned.
+    """
+    named: dict[str, Tensor] = {}
+    for part in parts(module):
+        named |= _of_part(module, part)
+    return named
+
+
+def parts(module: nn.Module) -> list[str]:
+    """Return the names of theta's parts; a full H has no H_f."""
+    return [name for name in (*COST, *CONSTRAINTS) if hasattr(module, name)]
+
+
+def moved(module: nn.Module, residuals: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the parts of theta with ``residuals`` ``(*batch, ..)`` added to its coordinates.
+
+    Raises:
+        QPError: a name, a shape or a device is wrong.
+    """
+    check_kind("residuals", residuals, Mapping, "Map names to tensors: {'q': ..}.")
+    rest = dict(residuals)
+    theta = {}
+    for part in parts(module):
+        before = _of_part(module, part)
+        own = {name: rest.pop(name) for name in before if name in rest}
+        for name, residual in own.items():
+            start = before[name]
+            check_tensor(f"residuals[{name!r}]", residual, *start.shape, device=start.device)
+        theta[part] = _with_residuals(module, part, before, own) if own else getattr(module, part)
+    check_names("residuals", rest, module)
+    return theta
+
+
+def check_names(argument: str, names: Collection[str], module: nn.Module) -> None:
+    """Raise `QPError` if one of the ``names`` in an argument is not a coordinate's."""
+    known = coordinates(module)
+    if unknown := [name for name in names if name not in known]:
+        unlearned = [name for name in unknown if name in SIGNED and hasattr(module, name)]
+        remedy = f"Add {unlearned[0]} to learn." if unlearned else ""
+        expected = f"names among {', '.join(known)}"
+        raise QPError.expected(argument, ", ".join(map(repr, unknown)), expected, remedy)
+
+
+def for_each(
+    function: Callable[..., Tensor], operands: Sequence[Tensor], ndims: Sequence[int]
+) -> Tensor:
+    """Call a function of unbatched tensors, of ``ndims`` dimensions, for each of their batch."""
+    leads = [x.ndim - n for x, n in zip(operands, ndims, strict=True)]
+    if not any(leads):
+        return function(*operands)
+    batches = [x.shape[:lead] for x, lead in zip(operands, leads, strict=True)]
+    try:
+        batch = broadcast(*batches)
+    except RuntimeError as error:
+        got = f"batch dimensions {', '.join(str(tuple(shape)) for shape in batches)}"
+        raise QPError.expected("residuals", got, "ones that broadcast") from error
+    if not batch.numel():
+        zeros = (x.new_zeros(x.shape[lead:]) for x, lead in zip(operands, leads, strict=True))
+        return operands[0].new_zeros(*batch, *function(*zeros).shape)
+    flat = [
+        x.expand(*batch, *x.shape[lead:]).reshape(batch.numel(), *x.shape[lead:])
+        for x, lead in zip(operands, leads, strict=True)
+    ]
+    return torch.vmap(function)(*flat).unflatten(0, batch)
+
+
+def _of_part(module: nn.Module, part: str) -> dict[str, Tensor]:
+    if not parametrize.is_parametrized(module, part):
+        learned = part in module._parameters
+        return {} if part in SIGNED and not learned else {part: getattr(module, part)}
+    chain: Any = module.get_submodule(f"parametrizations.{part}")
+    names = MODELS.get(type(next(iter(chain.children()))), (part,))
+    # By attribute, as a functional call replaces parameters with plain tensors.
+    if hasattr(chain, "original"):
+        return {names[0]: chain.original}
+    originals = (getattr(chain, f"original{i}", None) for i in range(len(names)))
+    return {name: x for name, x in zip(names, originals, strict=True) if x is not None}
+
+
+def _with_residuals(
+    module: nn.Module, part: str, before: dict[str, Tensor], residuals: dict[str, Tensor]
+) -> Tensor:
+    after = [
+        x + to_dtype(residuals[name], x.dtype) if name in residuals else x
+        for name, x in before.items()
+    ]
+    if not parametrize.is_parametrized(module, part):
+        return after[0]
+    first, *others = module.get_submodule(f"parametrizations.{part}").children()
+    if isinstance(first, Banded | LinearRows):
+        value = for_each(first, after, [x.ndim for x in before.values()])
+    else:
+        value = first(after[0])
+    for parametrization in others:
+        value = parametrization(value)
+    return value
