@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-import copy
-import io
-import pickle
 from typing import Any
 
 import numpy as np
@@ -57,35 +54,6 @@ def test_options_go_to_the_qp():
     other = QPMPC.from_data(arx_log(), N, **PAST, **COST, start={"c": 3.0})
     assert other.c.item() == 3.0
     assert torch.equal(other.C, mpc.C)
-
-
-def test_the_start_survives_copies_and_resets():
-    mpc = QPMPC.from_data(arx_log(noise=0.2), N, **PAST, **COST, learn=("C", "b"))
-    C, b = mpc.C.detach().clone(), mpc.b.detach().clone()
-    for twin in (copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))):
-        assert torch.equal(twin.C, C)
-        assert torch.equal(twin.C_0, mpc.C_0)
-    with torch.no_grad():
-        mpc.C.add_(1.0)
-        mpc.b.add_(1.0)
-    mpc.reset_parameters()
-    assert torch.equal(mpc.C, C)
-    assert torch.equal(mpc.b, b)
-    file = io.BytesIO()
-    torch.save(mpc.state_dict(), file)
-    file.seek(0)
-    other = QPMPC.from_data(arx_log(seed=3, noise=0.2), N, **PAST, **COST, learn=("C", "b"))
-    other.load_state_dict(torch.load(file, weights_only=True))
-    assert torch.equal(other.C, C)
-
-
-def test_a_released_varying_start_keeps_its_values():
-    mpc = QPMPC.from_data(arx_log(noise=0.2), N, structure="varying", **PAST, **COST)
-    assert mpc.model()[0].shape == (N, 2, 4)
-    p = windows(as_log(arx_log(), n_d=1).trajectories[0], mpc.layout)[:3, : mpc.n_p]
-    before = mpc.value(p)
-    mpc.release()
-    assert_close(mpc.value(p), before)
 
 
 def test_a_ridge_of_a_users_own():

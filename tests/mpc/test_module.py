@@ -747,17 +747,8 @@ MODEL: dict[str, Any] = {"A": A, "B": B, "hessian": "block", "stage_weight": W}
         ({"solver": "proxq"}, r"solver: got 'proxq', expected one of .* Did you mean 'proxqp'\?"),
         ({"solver": None}, "solver: got None, expected one of proxqp, daqp"),
         (
-            {"A": [1.0], "B": [[1.0]]},
-            r"A, B: got shapes .*, expected matrices \(n_x, n_x\) and \(n_x, n_u\)",
-        ),
-        ({"A": [[1.0]], "B": [1.0]}, "A, B: got shapes .*, expected matrices"),
-        (
             {**MODEL, "terminal_weight": "dare"},
             "terminal_weight: got 'dare' with .*, expected a tensor, or",
-        ),
-        (
-            {"terminal_weight": "riccati"},
-            "terminal_weight: got 'riccati' with hessian='diagonal', .* 'riccati' with hessian=",
         ),
         (
             {**MODEL, "A": 2 * torch.eye(2), "B": [[1.0], [0.0]], "terminal_weight": "riccati"},
@@ -777,10 +768,6 @@ MODEL: dict[str, Any] = {"A": A, "B": B, "hessian": "block", "stage_weight": W}
         ),
         ({"past": 2, "rate_bounds": ([-1.0] * 2, [1.0] * 2)}, r"rate_bounds: got shape \(2,\)"),
         (
-            {"past": 2, "rate_bounds": ([-1.0], [1.0]), "rate_slack": -1.0},
-            "rate_slack: got -1.0, expected a non-negative weight",
-        ),
-        (
             {"past": 2, "rate_slack": 2.0},
             "rate_slack: got 2.0, expected inf without rate_bounds. It is the price of violating",
         ),
@@ -791,7 +778,6 @@ MODEL: dict[str, Any] = {"A": A, "B": B, "hessian": "block", "stage_weight": W}
         ({"past": 2, "B": B}, r"A, B: got .* \(2, 1\), expected \(2, 4\) and \(2, 2\)"),
         ({"E": B}, r"E: got shape \(2, 1\), expected \(2, 0\). It multiplies the prev"),
         ({"n_d": 2, "E": torch.ones(1, 2)}, r"E: got shape \(1, 2\), expected \(2, 2\)"),
-        ({"n_d": 1, "E": [[torch.nan], [1.0]]}, "E: got NaN or inf, expected finite entries"),
         (
             {"past": 2, "hessian": "block", "terminal_weight": "riccati"},
             "terminal_weight: got 'riccati' with past > 1, expected past=1. Pass a matrix",
@@ -801,36 +787,12 @@ MODEL: dict[str, Any] = {"A": A, "B": B, "hessian": "block", "stage_weight": W}
             "stage_weight: got smallest eigenvalue -2.* expected a positive semidefinite weight",
         ),
         (
-            {"n_d": 2, "hessian": "block", "stage_weight": W_D.triu()},
-            r"stage_weight: got asymmetry 1, expected a symmetric matrix",
-        ),
-        (
             {"n_d": 2, "stage_weight": W_D},
             r"stage_weight: got shape \(5, 5\), expected shape \(3,\) or \(3, 3\)",
         ),
         (
-            {"n_d": 2, "hessian": "block", "terminal_weight": -W_F},
-            "terminal_weight: got smallest eigenvalue -1",
-        ),
-        (
             {"n_d": 1, "constraints": ([[1.0, 1.0, 1.0]], [0.0], [1.0])},
             r"constraints: got D of shape \(1, 3\), expected shape \(m, 4\)",
-        ),
-        (
-            {"n_d": 1, "terminal_constraints": ([[1.0, 1.0]], [0.0], [1.0])},
-            r"terminal_constraints: got D of shape \(1, 2\), expected shape \(m, 3\)",
-        ),
-        *(
-            (
-                {"state_slack": slack},
-                f"state_slack: got .*{got}.*, expected a non-negative weight, .*one for each of",
-            )
-            for slack, got in (
-                ([1.0], r"\[1.0\]"),
-                ([1.0, -1.0], r"\[1.0, -1.0\]"),
-                ([1.0, torch.nan], "nan"),
-                (-1.0, "-1.0"),
-            )
         ),
     ],
 )
