@@ -37,7 +37,7 @@ from torch_qpmpc.mpc.validation import as_tensor
 #: The numbers of centres among which the held-out prediction decides. More of them predict better
 #: still, but cost more in closed loops of the pendulum.
 CENTRES = (1, 2, 4, 8, 16, 32)
-#: The log is cut into this many parts, of which the last is held out.
+#: The log is cut into this many parts; the last one is held out.
 PARTS = 5
 #: The ridge on the changes of a local model, relative to the mean square of a regressor in the log.
 RIDGE = 1e-3
@@ -85,10 +85,10 @@ class BlendedModel(nn.Module):
         self, centres: Any, middle: Any, size: Any, width: Any, A: Any, B: Any, offset: Any
     ) -> None:
         super().__init__()
-        given = (centres, middle, size, width, A, B, offset)
+        arguments = (centres, middle, size, width, A, B, offset)
         parts = {
             name: as_tensor(name, part).detach().clone()
-            for name, part in zip(BlendedModel.__annotations__, given, strict=True)
+            for name, part in zip(BlendedModel.__annotations__, arguments, strict=True)
         }
         (m, n_x), n_u = (*parts["centres"].shape, 0, 0)[:2], (0, *parts["B"].shape)[-1]
         shapes = ((m, n_x), (n_x,), (n_x,), (), (m, n_x, n_x), (m, n_x, n_u), (m, n_x))
@@ -128,7 +128,7 @@ class BlendedModel(nn.Module):
         s, u = self._pairs(s, self.B.new_zeros(self.B.shape[-1]) if u is None else u)
         w, local = self.weights(s), self._local(s, u)
         ahead = (w.unsqueeze(-1) * local).sum(-2)
-        # The derivative of w_i is w_i times that of its exponent minus the exponents' mean one.
+        # dw_i = w_i (de_i - sum_j w_j de_j), with the exponents e of the softmax.
         slopes = -self._distances(s) / (self.width * self.size)
         slopes = w.unsqueeze(-1) * (slopes - (w.unsqueeze(-1) * slopes).sum(-2, keepdim=True))
         A = torch.einsum("...i,ijk->...jk", w, self.A) + local.mT @ slopes
@@ -228,8 +228,8 @@ def identify_blended(
     Args:
         trajectories: as in `identify`, without known signals.
         horizon: the number of steps over which predictions decide on the number of centres.
-        centres: the number of centres; or several, of which those count whose coefficients are
-            fewer than the transitions. The last fifth of the log decides among these.
+        centres: the number of centres; or several, among which the last fifth of the log decides.
+            Those with more coefficients than the log has transitions are left out.
         held: indices of outputs that the model holds, such as set-points, as in `identify`.
 
     Raises:

@@ -28,7 +28,7 @@ class Cost:
         stage_weight: H_k, ``(n_x + n_u,)`` if diagonal, else ``(n_x + n_u, n_x + n_u)``, with an
             optional leading N for one weight per stage. None draws a diagonal, uniform in (0.5, 5)
             for states and zero for actions. With a preview and a dense H it may be one of
-            [d_k; x_k; u_k], of which only the block of (x_k, u_k) must be positive semidefinite: a
+            [d_k; x_k; u_k], whose block of (x_k, u_k) alone must be positive semidefinite: a
             price p times u_k is an entry 1 in both of their cross blocks.
         terminal_weight: H_f, ``(n_x,)`` or ``(n_x, n_x)``, or of [d_N; x_N]. ``"riccati"``: the
             cost to go of the linear quadratic regulator of A, B and the stage weight, about the x

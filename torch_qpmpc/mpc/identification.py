@@ -38,8 +38,8 @@ EXCITE = "Add a random signal to the action, independent of the outputs."
 class Identified:
     """An ARX model, the constraints ``C z = b`` that start from it, and their prediction errors.
 
-    ``print`` shows the errors, which are those of cross-validation: each is of a fit without the
-    part of the data that it is in. They are NaN for steps that no part is long enough for, and if
+    ``print`` shows the cross-validated errors: each belongs to a fit that has not seen its part of
+    the data. They are NaN for steps that no part is long enough for, and if
     the other parts determine no model. Their root mean square is the standard deviation that a
     back-off from bounds needs.
 
@@ -100,12 +100,12 @@ class Identified:
         """Return the outputs of the ARX model alone, without corrections by measurements.
 
         Args:
-            u: actions ``(T, n_u)``, of which the first L - 1 belong to the window.
+            u: actions ``(T, n_u)``; the first L - 1 belong to the window.
             y: the outputs of the window, the first L, ``(L, n_x)``.
             d: known signals ``(T, n_d)``, if the model has any.
 
         Returns:
-            y_0, .., y_T, ``(T + 1, n_x)``, of which the first L are ``y``.
+            y_0, .., y_T, ``(T + 1, n_x)``; the first L are ``y``.
 
         Raises:
             QPError: a shape does not match the model.

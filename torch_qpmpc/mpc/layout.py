@@ -5,9 +5,9 @@ Known entries come first in z, then the plan:
     z = [d_0, .., d_N,  y_{1-L}, u_{1-L}, .., y_{-1}, u_{-1}, y_0,  u_0, y_1, u_1, .., y_N]
          preview        past window, up to the current output       plan
 
-With L = 1 and no preview it is the paper's z, whose states y_k are x_k. The rows of G are one for
-each entry of [x_0, u_0, .., x_N], then those of D on (d_k, x_k, u_k) for each stage, then those of
-D^f on (d_N, x_N) (eq:v1c4), then one for each entry of the changes u_k - u_{k-1}.
+With L = 1 and no preview it is the paper's z, whose states y_k are x_k. G has one row for
+each entry of [x_0, u_0, .., x_N], then D on (d_k, x_k, u_k) for each stage, then D^f on (d_N, x_N)
+(eq:v1c4), then one row for each entry of the changes u_k - u_{k-1}.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class Layout:
     def rows(self, x: Tensor, u: Tensor, D: Tensor, D_f: Tensor, rates: Tensor) -> Tensor:
         """Arrange values of the rows of G ``(n_g,)``.
 
-        They are those of x ``(N + 1, n_x)``, u ``(N + 1, n_u)``, D ``(N, n_mixed)``, D^f as
+        The values belong to x ``(N + 1, n_x)``, u ``(N + 1, n_u)``, D ``(N, n_mixed)``, D^f as
         ``D_f`` ``(n_terminal,)`` and u_k - u_{k-1} as ``rates`` ``(N, n_rates)``; a leading N + 1
         or N may be 1, for the same values in all stages.
         """
@@ -211,22 +211,22 @@ class Layout:
         return self._changes(self.n_before - self.n).flatten(0, 1)
 
     @property
-    def held(self) -> Tensor:
-        """True for the stages whose action is that of the stage before, ``(N,)``."""
+    def held_stages(self) -> Tensor:
+        """True for the stages that repeat the action of the stage before, ``(N,)``."""
         held = torch.full((self.horizon,), bool(self.blocks))
         held[torch.tensor((0, *self.blocks[:-1])).cumsum(0)] = False
         return held
 
     def hold_rows(self) -> Tensor:
         """Return the rows of u_k - u_{k-1} for the held stages, ``(h n_u, n_z)``."""
-        return self._changes(self.n_before)[self.held[1:]].flatten(0, 1)
+        return self._changes(self.n_before)[self.held_stages[1:]].flatten(0, 1)
 
     def repeated(self, of_actions: Tensor) -> Tensor:
         """Return True at the rows of G that bound the actions of held stages, ``(n_g,)``.
 
         ``of_actions`` ``(n_mixed,)`` is True for the rows of D that bound actions alone.
         """
-        held, none = self.held.unsqueeze(-1), torch.zeros(1, self.n_x, dtype=torch.bool)
+        held, none = self.held_stages.unsqueeze(-1), torch.zeros(1, self.n_x, dtype=torch.bool)
         u = F.pad(held, (0, 0, 0, 1)).expand(-1, self.n_u)
         D_f = none.new_zeros(self.n_terminal)
         return self.rows(none, u, held & of_actions, D_f, held.expand(-1, self.n_rates))
@@ -238,10 +238,10 @@ class Layout:
         return actions[1:] - actions[:-1]
 
     def hessian(self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor) -> Tensor:
-        """Return H ``(n_z, n_z)`` (eq:qpH) from those of the stages and of x_N, or from a full H.
+        """Return H ``(n_z, n_z)`` (eq:qpH) from blocks of the stages and of x_N, or from a full H.
 
-        The ``blocks`` of the ``kind`` "block" are those of (d_k, x_k, u_k) and (d_N, x_N); a
-        diagonal H has entries for the plan only. ``discount`` is that of z.
+        The ``blocks`` of the ``kind`` "block" weight (d_k, x_k, u_k) and (d_N, x_N); a diagonal H
+        has entries for the plan only. ``discount`` has an entry for each of z.
         """
         H = blocks[0]
         if kind == "diagonal":

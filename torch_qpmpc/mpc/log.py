@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 LARGEST = 1e100
 #: A column is constant, or a linear function of others, up to this share of its size.
 STILL = 1e-6
-#: Parts with at least so many steps whose median step differs from that of the whole log by more
-#: than this share of it have another sampling time.
+#: A part with at least FEWEST steps has another sampling time if its median step differs from the
+#: whole log's by more than the share ONE_DT.
 FEWEST, ONE_DT = 10, 0.1
 #: The column of a DataFrame's index of dates.
 DATES = "the index"
@@ -288,7 +288,7 @@ def _frame(part: Any) -> pd.DataFrame:
 def _columns(
     frame: pd.DataFrame, names: Sequence[str] | None, default: str, kind: str
 ) -> tuple[str, ...]:
-    """Return the columns of ``names``, of which ``y`` may stand for ``y1``, ``y2``, ..."""
+    """Return the columns of ``names``; ``y`` may stand for ``y1``, ``y2``, ..."""
     chosen = [default] if names is None else [names] if isinstance(names, str) else list(names)
     columns = []
     for name in chosen:
@@ -470,7 +470,7 @@ def _cuts(steps: Any, valid: Tensor, jumps: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         steps: the logged steps.
         valid: True for those that are not padding.
-        jumps: True where the next observation is not that of the following step,
+        jumps: True where the next observation differs from the following step's,
             ``(episodes, T - 1)``.
     """
     ends = _flags(steps, ENDS, default=False)
@@ -554,7 +554,7 @@ def _check_values(name: str, value: Tensor) -> None:
 
 
 def _narrow(key: tuple[str, ...], value: Any, batch: torch.Size) -> Tensor:
-    """Return one flag, id or time for each step; several are those of several agents, say."""
+    """Return one flag, id or time for each step; there are several for several agents, say."""
     if not isinstance(value, Tensor) or value.numel() != batch.numel():
         got = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
         expected = f"shape {tuple(batch)} or {(*batch, 1)}"

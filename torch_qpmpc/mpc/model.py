@@ -28,8 +28,8 @@ class Model:
         B: ``(n_x, n_u)``, or one per stage; with a window [B_1, .., B_L].
         E: the factor of the preview d_k, ``(n_x, n_d)``, or one per stage; zero by default.
         offset: ``(n_x,)``; zero by default.
-        C, b: ``(N n_x, n_z)`` and ``(N n_x,)``, as of a multi-step predictor, in place of those of
-            the model.
+        C, b: ``(N n_x, n_z)`` and ``(N n_x,)``, as of a multi-step predictor, in place of the
+            model's.
 
     Raises:
         QPError: an entry is not finite, or the shapes do not match each other.

@@ -1,7 +1,7 @@
 """QPMPC: the module that holds theta and computes V, Q and the policy (eq:qp4, eq:qp5).
 
-It is a generic QP whose constraint matrix C starts as that of a linear MPC scheme (eq:cband) and
-becomes free, or stays one (eq:v1, eq:q1). All values are costs to go, as in the paper; rewards
+It is a generic QP whose constraint matrix C starts from a linear MPC scheme (eq:cband), and becomes
+free or stays a scheme (eq:v1, eq:q1). All values are costs to go, as in the paper; rewards
 appear only in `torch_qpmpc.learning`.
 """
 
@@ -88,8 +88,8 @@ class QPMPC(nn.Module):
             mapping, ``{"H": True, "C": mask}``, a mask of the part's shape is True at the entries
             that are learned, for example at all but the rows of a constant reference.
         structure: the ties between learned parts of theta. ``"free"``: none, C is any matrix
-            (eq:qp5). ``"tied"``: those of a linear MPC scheme (eq:q1), with one A, B, D and one
-            entry of b, q, lb, ub and w for all stages; ``"varying"``: with one for each stage.
+            (eq:qp5). ``"tied"``: a linear MPC scheme (eq:q1), with one A, B, D and one entry
+            of b, q, lb, ub and w for all stages; ``"varying"``: with one for each stage.
             In both, the bounds of hard rows are known limits (eq:v1c3), and are not learned.
         step: the rule that keeps H and H_f positive semidefinite and w non-negative (eq:sdp1).
             ``"cholesky"``: theta is a factor of them. ``"projection"`` and ``"sdp"``: theta is H
@@ -97,9 +97,9 @@ class QPMPC(nn.Module):
             program; see `torch_qpmpc.mpc.projections`.
         solver, on_failure: see `solve_qp`.
         schedule: a model, as of `identify_blended`, or its arguments, whose linearisation at s
-            takes the place of the scheme's model in V, Q and the policy. Its C(s) and b(s) less
-            those of the scheme are added to those of theta, so that they change with s, and what is
-            learned is added to the schedule.
+            takes the place of the scheme's model in V, Q and the policy. The differences of its
+            C(s) and b(s) from the scheme's are added to theta's, so what is learned is added to the
+            schedule.
 
     Attributes:
         scheme: the `Scheme` that theta starts from.
@@ -435,7 +435,7 @@ class QPMPC(nn.Module):
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of a plan.
 
-        The plan is z ``(*batch, n_z)``, such as that of `solve`.
+        The plan is z ``(*batch, n_z)``, as `solve` returns it.
         """
         return self.layout.predicted(check_tensor("z", z, self.n_z))
 

@@ -110,7 +110,7 @@ class Cholesky(nn.Module):
     """Positive semidefinite matrices ``H = L L'`` from lower triangular L, ``(*batch, n, n)``.
 
     With ``n_free``, H is ``[[P, S'], [S, L L']]`` with a symmetric P ``(n_free, n_free)`` and an S
-    of any sign, those of known variables, from ``[[P, 0], [S, L]]``.
+    of any sign for known variables, from ``[[P, 0], [S, L]]``.
     """
 
     def __init__(self, n_free: int = 0) -> None:

@@ -12,7 +12,7 @@ its error is regressed on what the row block may read, again with a ridge:
 * ``"varying"``: on the band, which gives one ARX model for each stage.
 
 So C keeps the gauge of the band, with -1 at y_{k+1}, and differs from C_0 only by the corrections.
-Its predictions are as general as those of a regression of each y_{k+1} on (p, u_0, .., u_k), since
+Its predictions are as general as regressions of each y_{k+1} on (p, u_0, .., u_k), since
 these determine the predicted y_1, .., y_k. But the ridge shrinks them to the ARX model's next step
 from the corrected prediction, instead of to zero, and an exact ARX model is not corrected.
 
@@ -190,7 +190,7 @@ def known(layout: Layout, last: int) -> Tensor:
 
 
 def _band(layout: Layout, k: int) -> Tensor:
-    """Return the columns of z in the band of row block k, without those of y_{k+1}."""
+    """Return the columns of z in the band of row block k, without y_{k+1}."""
     window = layout.n_preview + k * layout.n + torch.arange(layout.reach)
     return torch.cat((k * layout.n_d + torch.arange(layout.n_d), window))
 
@@ -207,7 +207,7 @@ def _regression(
 def _differences(layout: Layout, read: Tensor) -> Tensor:
     """Return the matrix from changes of coefficients to the coefficients of columns of z.
 
-    A coefficient is the sum of the changes up to its step, among those of its signal.
+    A coefficient is the sum of its signal's changes up to its step.
     """
     n, steps = layout.n, torch.arange(1 - layout.past, layout.horizon + 1)
     size = layout.n_z - layout.n_preview

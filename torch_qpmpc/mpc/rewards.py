@@ -107,8 +107,7 @@ def fit_most(
 ) -> RewardCost | None:
     """Fit the cost that is used, without the steps that it does not explain.
 
-    These are found by fits in turn. They are jumps of a set-point that the observation shows too
-    late, say.
+    Fits in turn find these steps: jumps of a set-point that the observation shows too late, say.
 
     Args:
         log, layout, diagonal: as in `fit_rewards`.
@@ -145,7 +144,7 @@ def fit_most(
 def scheme_cost(
     fitted: StageCost, layout: Layout, gamma: float, hessian: str, shifted: bool = False
 ) -> Cost:
-    """Return the cost of a scheme for that of a stage, which is that of x_N, too.
+    """Return the cost of a scheme from a stage's, which x_N has, too.
 
     If it is ``shifted``, the stage's cost is of (x_{k+1}, u_k): its part of x is stage k + 1's,
     divided by the discount, and x_0 has none.

@@ -73,7 +73,7 @@ def terminal_riccati(A: Tensor, B: Tensor, W: Tensor, gamma: float, layout: Layo
 
     Args:
         A, B: the model.
-        W: the stage weight, or its diagonal; with a preview, that of [d; x; u] or of [x; u].
+        W: the stage weight, or its diagonal; with a preview, of [d; x; u] or of [x; u].
         gamma: the discount.
         layout: the sizes.
 

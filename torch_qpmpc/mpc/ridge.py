@@ -29,7 +29,7 @@ def ridge(
     Args:
         X: regressors, ``(n, m)``.
         Y: targets, ``(n, n_y)``.
-        strength: the strength; None for that of the evidence.
+        strength: the strength; None lets the evidence choose it.
         strengths: those among which the evidence decides.
         share: the share of that strength which is used.
     """

@@ -20,7 +20,7 @@ from torch_qpmpc.mpc.layout import SIZES, Layout
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.qp.forking import serially_if_forked
 
-#: The default discount, that of the paper.
+#: The paper's discount, the default.
 GAMMA = 0.9
 #: Keyword arguments of `QPMPC` that no scheme has.
 KEYWORDS = ("learn", "structure", "step", "solver", "on_failure")
@@ -195,7 +195,7 @@ def check_keywords(owner: str, options: Iterable[str], known: Iterable[str]) -> 
 
 
 def _taken(kind: type, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Take those of the arguments that are fields of a dataclass."""
+    """Take the arguments that are fields of a dataclass."""
     return {x.name: arguments.pop(x.name) for x in fields(kind) if x.name in arguments}
 
 

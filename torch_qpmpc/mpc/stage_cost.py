@@ -93,10 +93,10 @@ def fit_stage_cost(
     Args:
         v: the arguments of the cost, ``(m, n)``.
         cost: the observed costs, ``(m,)``.
-        n_free: the number of first entries of v, such as those of d, whose rows and columns of W
+        n_free: the number of first entries of v, such as d, whose rows and columns of W
             have any sign; they are zero in a diagonal W.
         diagonal: fit a diagonal W.
-        n_apart: the number of last entries of v, such as those of u, without cross terms with the
+        n_apart: the number of last entries of v, such as u, without cross terms with the
             others.
 
     Raises:

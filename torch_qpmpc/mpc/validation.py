@@ -25,7 +25,7 @@ def check_learn(learn: Collection[str], structure: str, hessian: str, n_linear: 
 
     Args:
         learn: the argument of `QPMPC`.
-        structure, hessian: those of the QPMPC and its cost.
+        structure, hessian: of the QPMPC and its cost.
         n_linear: rows of D and D^f.
     """
     parts = (*COST, *CONSTRAINTS)
