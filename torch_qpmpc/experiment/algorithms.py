@@ -25,8 +25,8 @@ from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificatio
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.replay import ACTIVE_SET, Replay
 from torch_qpmpc.learning.updates import Update, first_order, second_order
+from torch_qpmpc.mpc.log import valid_steps
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.trajectories import valid_steps
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, identify
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import as_log
+from torch_qpmpc.mpc.log import as_log, valid_steps
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.rewards import RewardCost, fit_rewards, scheme_cost
@@ -30,7 +30,6 @@ from torch_qpmpc.mpc.riccati import affine_cost_to_go, terminal_riccati
 from torch_qpmpc.mpc.roles import unmoved
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.tightening import back_off, tighten
-from torch_qpmpc.mpc.trajectories import valid_steps
 
 #: The least size of the costs of a start that holds an action.
 TINY = 1e-6
