@@ -42,10 +42,14 @@ from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.exporting import export_run
 from torch_qpmpc.experiment.gating import RunGate
-from torch_qpmpc.experiment.interrupt import Interrupt
-from torch_qpmpc.experiment.launch import check_overrides, launched
-from torch_qpmpc.experiment.loggers import check_logger
-from torch_qpmpc.experiment.metrics import report, run_summary, table, update_metrics
+from torch_qpmpc.experiment.launch import Interrupt, check_overrides, launched
+from torch_qpmpc.experiment.metrics import (
+    draw_outcome,
+    report,
+    run_summary,
+    table,
+    update_metrics,
+)
 from torch_qpmpc.experiment.proving import check_provable, prove_run
 from torch_qpmpc.experiment.rivals import IDENTIFICATION
 from torch_qpmpc.experiment.run_folder import RunFolder
@@ -75,7 +79,6 @@ def train(
         The content of summary.json.
     """
     check_config(cfg)
-    check_logger(cfg.logger)  # before the first evaluations, which may take minutes
     interrupt = Interrupt()
     with contextlib.nullcontext() if quiet else interrupt:
         return _train(cfg, folder, state, quiet, interrupt)
@@ -194,6 +197,8 @@ def _train(
                 interrupt.exit_if_signalled(f"Stopped after update {update}: {command}")
 
         gate.save(run.path)
+        if cfg.figures:
+            draw_outcome(run, gate.mpc, evaluation)
         evaluation.evaluate(learner.policy, "candidate")
         summary = run_summary(evaluation, tally, gate)
         summary |= {} if identified is None else identified.summary

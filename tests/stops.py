@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import itertools
 import json
-import math
 import signal
-import time
-from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pandas as pd
 import pytest
 from omegaconf import DictConfig
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.summary.writer import event_file_writer
 
 import train
-from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.experiment.run_state import resumed
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 
@@ -46,7 +36,7 @@ def stop(
         return enter(log)
 
     enter = SolveLog.__enter__
-    with monkeypatch.context() as patch, _a_second_later():
+    with monkeypatch.context() as patch:
         patch.setattr(SolveLog, "__enter__", count)
         with pytest.raises(SystemExit) as ended:
             train.train(cfg, str(folder), state)
@@ -57,21 +47,7 @@ def stop(
 def go_on(folder: Path) -> None:
     """Resume a stopped run and finish it."""
     cfg, state = resumed(folder, [])
-    with _a_second_later():
-        train.train(cfg, str(folder), state)
-
-
-@contextlib.contextmanager
-def _a_second_later() -> Iterator[None]:
-    """Advance TensorBoard's clock by a second: it orders event files by the seconds in names."""
-    ahead = next(_seconds)
-    clock = SimpleNamespace(time=lambda: time.time() + ahead)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(event_file_writer, "time", clock)
-        yield
-
-
-_seconds = itertools.count(1)
+    train.train(cfg, str(folder), state)
 
 
 def assert_same_numbers(folder: Path, whole: Path) -> None:
@@ -85,22 +61,3 @@ def assert_same_numbers(folder: Path, whole: Path) -> None:
     for summary in summaries:
         assert summary.pop("train_seconds") > 0
     assert summaries[0] == summaries[1]
-
-
-def assert_events_are_whole(folder: Path) -> None:
-    """Assert that TensorBoard has every number of metrics.csv exactly once."""
-    found = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0, "images": 0})
-    found.Reload()
-    table: Any = read_metrics(folder)
-    for column in table:
-        logged = table[column].dropna()
-        shown = [event for event in found.Scalars(column) if not math.isnan(event.value)]
-        assert [event.step for event in shown] == list(logged.index), column
-        assert [event.value for event in shown] == pytest.approx(list(logged), rel=1e-6), column
-    evaluations = [step for step in table["eval/J"].dropna().index if step]
-    for image in found.Tags()["images"]:
-        at_the_end = image in ("eval/episode", "eval/policy")
-        steps = [event.step for event in found.Images(image)]
-        assert steps == (evaluations[-1:] if at_the_end else evaluations), image
-    texts = [event.tensor_proto.string_val[0] for event in found.Tensors("config/text_summary")]
-    assert len(set(texts)) == 1

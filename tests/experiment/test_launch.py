@@ -1,41 +1,56 @@
-"""Errors of a launch: one sentence for users' errors, a traceback for others.
-
-test_train.py and test_sweeps.py test the folders and the lock.
-"""
+"""Lock, signals and errors of a launch, and the text of `python train.py --help`."""
 
 from __future__ import annotations
 
-import threading
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from omegaconf import OmegaConf
 
+import train
+from tests.runs import CONFIGS, SMALL, choices, make_config
+from tests.stops import assert_same_numbers, go_on
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.launch import launched
-from torch_qpmpc.experiment.lock import LOCK
+from torch_qpmpc.experiment import evaluation
+from torch_qpmpc.experiment.checkpoint import load_checkpoint
+from torch_qpmpc.experiment.launch import LOCK, Interrupt, launched, locked
+from torch_qpmpc.learning.replay import Replay
+from torch_qpmpc.qp.pipeline.solve import SolveLog
+
+HOLD = """
+import sys
+from filelock import FileLock
+with FileLock(sys.argv[1]):
+    print("held", flush=True)
+    input()
+"""
 
 
-@pytest.fixture
-def hydra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Set Hydra's configuration to a single run in ``tmp_path``."""
-    hydra: Any = SimpleNamespace(
-        mode=RunMode.RUN,
-        runtime=SimpleNamespace(output_dir=str(tmp_path)),
-        overrides=SimpleNamespace(task=["seed=2"]),
-    )
-    monkeypatch.setattr(HydraConfig, "get", lambda: hydra)
-    return hydra
-
-
-def test_a_launch_has_the_folder_and_its_lock(hydra, tmp_path):
-    with launched() as launch:
-        assert (launch.folder, launch.overrides, launch.sweep) == (str(tmp_path), ["seed=2"], False)
-        assert (tmp_path / LOCK).exists()
-    assert not (tmp_path / LOCK).exists()
+def test_a_live_process_holds_the_lock_and_a_killed_one_does_not(tmp_path):
+    command = [sys.executable, "-c", HOLD, str(tmp_path / LOCK)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        message = f"^folder: got {tmp_path}, in use by another process, .* with KEY.$"
+        with pytest.raises(QPError, match=message), locked(tmp_path, "KEY"):
+            pass
+    finally:
+        process.kill()
+        process.communicate()
+    with pytest.raises(KeyboardInterrupt), locked(tmp_path, "KEY"):
+        raise KeyboardInterrupt
+    with locked(tmp_path, "KEY"):
+        pass
 
 
 @pytest.mark.parametrize(
@@ -45,7 +60,17 @@ def test_a_launch_has_the_folder_and_its_lock(hydra, tmp_path):
         (OSError(28, "No space left"), r"^folder: got .*where writing failed \(.*No space left\)"),
     ],
 )
-def test_an_error_of_the_user_is_one_sentence(hydra, error, sentence):
+def test_an_error_of_the_user_is_one_sentence(tmp_path, monkeypatch, error, sentence):
+    hydra: Any = SimpleNamespace(
+        mode=RunMode.RUN,
+        runtime=SimpleNamespace(output_dir=str(tmp_path)),
+        overrides=SimpleNamespace(task=["seed=2"]),
+    )
+    monkeypatch.setattr(HydraConfig, "get", lambda: hydra)
+    with launched() as launch:
+        assert (launch.folder, launch.overrides, launch.sweep) == (str(tmp_path), ["seed=2"], False)
+        with pytest.raises(QPError, match="in use"), locked(tmp_path, ""):
+            pass
     with pytest.raises(SystemExit, match=sentence), launched():
         raise error
     hydra.mode = RunMode.MULTIRUN
@@ -53,26 +78,120 @@ def test_an_error_of_the_user_is_one_sentence(hydra, error, sentence):
         raise error
 
 
-@pytest.mark.parametrize("error", [OSError("disk"), ValueError("bug")])
-def test_a_threads_error_is_printed_unless_the_run_raises_it(hydra, monkeypatch, error):
-    """The hook of before sees the other errors, and is back after the run."""
-    seen = []
+# --- Signals -------------------------------------------------------------------------------------
 
-    def before(args: threading.ExceptHookArgs) -> None:
-        seen.append(args.exc_value)
+RUN = (*SMALL, "updates=5", "eval_interval=3", "task.eval_steps=5")
 
-    def fail() -> None:
-        raise error
 
-    def run_thread() -> None:
-        thread = threading.Thread(target=fail)
-        thread.start()
-        thread.join()
+@pytest.fixture
+def listening() -> Iterator[None]:
+    """Restore Ctrl-C's default handler, which a shell's background jobs and children lack."""
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, usual)
 
-    monkeypatch.setattr(threading, "excepthook", before)
-    with launched():
-        run_thread()
-    assert seen == ([error] if isinstance(error, ValueError) else [])
-    with pytest.raises(SystemExit), launched():
-        raise QPError("seed: got x")
-    assert threading.excepthook is before
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finish a run without a signal."""
+    folder = tmp_path_factory.mktemp("whole")
+    train.train(make_config(*RUN), str(folder), quiet=True)
+    return folder
+
+
+def test_the_first_signal_is_noted_and_the_second_acts(listening):
+    with Interrupt() as interrupt:
+        signal.raise_signal(signal.SIGINT)
+        assert interrupt.signum == signal.SIGINT
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "call", "signum", "said"),
+    [
+        (train, "make_physics", 1, signal.SIGTERM, "before the first update"),
+        (evaluation, "evaluate", 1, signal.SIGINT, "before the first update"),
+        (Replay, "extend", 1, signal.SIGINT, "before the first update"),
+        (Replay, "extend", 4 + 2, signal.SIGTERM, "after update 2"),
+        (train, "save_checkpoint", 1, signal.SIGTERM, "after update 3"),
+    ],
+)
+def test_a_run_stops_cleanly_wherever_the_signal_comes(
+    tmp_path, monkeypatch, capsys, listening, whole, module, name, call, signum, said
+):
+    """The signal arrives at start, or while warming up, learning, evaluating or saving."""
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        signal_at(patch, module, name, call, signum)
+        with pytest.raises(SystemExit) as ended:
+            train.train(make_config(*RUN), str(folder))
+    assert ended.value.code == 128 + signum
+    sentence = f"Stopped {said}: python train.py resume={folder}"
+    assert capsys.readouterr().out.splitlines()[-1] == sentence
+    assert (folder / "checkpoint.pt").exists() == ("after" in said)
+    go_on(folder)
+    assert_same_numbers(folder, whole)
+
+
+def signal_at(patch: Any, module: Any, name: str, call: int, signum: int, times: int = 1) -> None:
+    """Send ``signum`` in the given call of a function."""
+    function, calls = getattr(module, name), []
+
+    def signalled(*args: Any, **named: Any) -> Any:
+        calls.append(name)
+        for _ in range(times if len(calls) == call else 0):
+            signal.raise_signal(signum)
+        return function(*args, **named)
+
+    patch.setattr(module, name, signalled)
+
+
+def test_a_signal_in_the_last_update_lets_the_run_finish(tmp_path, monkeypatch):
+    signal_at(monkeypatch, train, "save_checkpoint", 2, signal.SIGTERM)
+    assert train.train(make_config(*RUN), str(tmp_path))["updates"] == 5
+
+
+def test_a_second_ctrl_c_keeps_the_log_and_the_last_checkpoint(tmp_path, monkeypatch, listening):
+    signal_at(monkeypatch, SolveLog, "__enter__", 5, signal.SIGINT, times=2)
+    with pytest.raises(KeyboardInterrupt):
+        train.train(make_config(*RUN), str(tmp_path))
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["update"] == 3
+
+
+def test_one_run_of_a_sweep_leaves_signals_to_its_launcher(tmp_path, monkeypatch, listening):
+    signal_at(monkeypatch, evaluation, "evaluate", 1, signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        train.train(make_config(*RUN), str(tmp_path / "run"), quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+# --- Help ----------------------------------------------------------------------------------------
+
+
+def help_text() -> str:
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        cfg = compose("config", return_hydra_config=True)
+    OmegaConf.set_readonly(cfg, False)
+    return cfg.hydra.help.template
+
+
+def test_the_help_fits_on_two_screens_and_lists_every_choice():
+    lines = help_text().splitlines()
+    assert len(lines) <= 60
+    assert max(map(len, lines)) <= 100
+    words = {*" ".join(lines).replace(",", " ").replace(";", " ").split()}
+    for group in ("constraint", "task", "noise", "optimizer"):
+        assert {*choices(group)} <= words, group
+
+
+def test_the_helps_defaults_are_those_of_the_configuration():
+    cfg, text = make_config(), help_text()
+    settings = text[text.index("Keys\n") : text.index("All keys")].splitlines()[1:]
+    shown = dict(line.split()[0].split("=", 1) for line in settings if line.strip())
+    del shown["hydra.run.dir"]
+    words = {True: "true", False: "false", None: "null"}
+    for key, value in shown.items():
+        x = OmegaConf.select(cfg, key)
+        assert value == (words[x] if isinstance(x, bool | None) else str(x)), key

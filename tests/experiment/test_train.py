@@ -21,7 +21,6 @@ from hydra import compose, initialize_config_dir
 from matplotlib.image import imread
 from numba.core import event
 from omegaconf import DictConfig, OmegaConf
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train
 from tests.runs import CONFIGS, SMALL, make_config, run_command
@@ -35,19 +34,11 @@ from torch_qpmpc import (
 from torch_qpmpc.envs import LinearSystem, PointMass
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
-from torch_qpmpc.experiment.config import flatten
-from torch_qpmpc.experiment.lock import LOCK, locked
+from torch_qpmpc.experiment.launch import LOCK, locked
 from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.layout import Layout
-
-SUMMARY = {"seed", "constraint", "noise", "solver", "unsolved", "updates", "train_seconds"}
-SUMMARY |= {"ablation", "step"}
-for _tag in ("J", "J_discounted"):
-    SUMMARY |= {f"{_tag}_start", f"{_tag}_final", f"{_tag}_true_model"}
-SUMMARY |= {"closed_gap", "closed_gap_discounted", "rivals"}
-SUMMARY |= {"train_cost", "train_cost_last_tenth", "train_violation"}
 
 
 def run_small(folder: Path, *overrides: str) -> dict[str, Any]:
@@ -99,109 +90,44 @@ def test_a_short_run_learns(whole):
     assert summary["closed_gap"] > 0.5
     assert summary["J_discounted_final"] < summary["J_discounted_start"]
     assert summary["unsolved"] == 0
-    deviation, distance = learned_C(folder)
-    assert np.abs(deviation[distance == 0]).max() > 0, "on the band it has learned"
-
-
-def test_summary_is_complete(whole):
-    folder, returned = whole
-    summary = json.loads((folder / "summary.json").read_text())
-    assert summary == returned
-    assert set(summary) >= SUMMARY
-    assert summary["ablation"] is None
-    assert all(math.isfinite(v) for v in summary.values() if isinstance(v, int | float))
-    names = {
-        "step": "cholesky",
-        "seed": 5,
-        "constraint": "combined",
-        "noise": "gaussian",
-        "solver": "daqp",
-    }
-    assert {**summary, **names, "updates": 90} == summary
-    assert 0 < summary["train_seconds"] < 600
     gap = (summary["J_start"] - summary["J_final"]) / (summary["J_start"] - summary["J_true_model"])
     assert summary["closed_gap"] == pytest.approx(gap)
+    deviation, distance = learned_C(folder)
+    assert np.abs(deviation[distance == 0]).max() > 0, "on the band it has learned"
+    assert np.abs(deviation[distance > 0]).max() == 0, "the proximal step leaves nothing above it"
+    assert np.abs(deviation[distance < 0]).max() > 0, "what is below is free"
+    last = metrics(folder).iloc[-1]
+    assert last["structure/above"] == 0
+    assert last["structure/below"] == pytest.approx(np.abs(deviation[distance < 0]).sum())
 
 
 def test_folder_is_complete(whole):
     folder, summary = whole
-    files = {"config.yaml", "metrics.csv", "checkpoint.pt"}
-    files |= {"summary.png", "episode.png", "summary.json"}
-    assert files <= {path.name for path in folder.iterdir()}
-    assert not list(folder.rglob("*.partial"))
+    assert summary == json.loads((folder / "summary.json").read_text())
+    names = {"step": "cholesky", "seed": 5, "constraint": "combined", "noise": "gaussian"}
+    assert {**summary, **names, "solver": "daqp", "updates": 90, "ablation": None} == summary
+    assert 0 < summary["train_seconds"] < 600
     assert OmegaConf.load(folder / "config.yaml") == make_config(*WHOLE)
     assert np.ptp(imread(folder / "summary.png")[..., :3]) > 0.5
-
+    assert (folder / "episode.png").exists()
     table = metrics(folder)
     assert sorted(table.index) == sorted({*range(0, 91, 10), 35})
     J = table["eval/J"].dropna()
     assert list(J.index) == [0, 35, 70, 90]
     assert (J[0], J[90]) == (summary["J_start"], summary["J_final"])
-    assert (table["eval/J_true_model"].dropna() == summary["J_true_model"]).all()
     logged = table.drop(index=[0, 35])
     columns = ["loss/value", "loss/si", "train/td_error", "train/reward", "train/unsolved"]
-    columns += [
-        "train/invalid_reward",
-        "qp/solves",
-        "qp/unsolved",
-        "qp/residual",
-        "time/collect",
-        "time/update",
-        "time/qp",
-    ]
-    for column in columns:
-        assert np.isfinite(logged[column]).all(), column
+    columns += ["train/invalid_reward", "qp/solves", "qp/unsolved", "qp/residual"]
+    assert np.isfinite(logged[[*columns, "time/collect", "time/update", "time/qp"]]).all(axis=None)
     assert logged["qp/residual"].max() < 1e-6
-    assert (logged["train/reward"] < 0).all()
 
 
 def test_checkpoint_is_the_learned_qp(whole):
     folder, summary = whole
-    cfg = OmegaConf.load(folder / "config.yaml")
-    assert isinstance(cfg, DictConfig)
-    physics = make_physics(cfg)
-    mpc = make_mpc(cfg, physics)
-    state = load_checkpoint(folder / "checkpoint.pt")
-    mpc.load_state_dict(state["mpc"])
-    assert state["update"] == 90
-    loop = evaluate(cfg, mpc.policy, physics)
+    cfg: Any = OmegaConf.load(folder / "config.yaml")
+    mpc = QPMPC.load(folder / "checkpoint.pt")
+    loop = evaluate(cfg, mpc.policy, make_physics(cfg))
     np.testing.assert_allclose(loop.J, summary["J_final"], rtol=1e-9)
-
-
-def test_events_are_complete(whole):
-    folder, summary = whole
-    sizes = {"scalars": 0, "images": 0}
-    events = EventAccumulator(str(folder / "tensorboard"), size_guidance=sizes)
-    events.Reload()
-    table = metrics(folder)
-    for column in table:
-        expected = table[column].dropna()
-        found = {event.step: event.value for event in events.Scalars(column)}
-        assert list(found) == list(expected.index), column
-        np.testing.assert_allclose(list(found.values()), expected, rtol=1e-6)
-    drawn = {tag: [event.step for event in events.Images(tag)] for tag in events.Tags()["images"]}
-    assert drawn == {  # at the first evaluation and at the end
-        "structure/C": [35, 90],
-        "eval/closed_loop": [35, 90],
-        "eval/episode": [90],
-        "eval/policy": [90],
-    }
-    text = events.Tensors("config/text_summary")[0].tensor_proto.string_val[0].decode()
-    assert "constraint:" in text
-    plugin = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
-    for key in flatten(OmegaConf.to_container(make_config(*WHOLE))):
-        assert key.encode() in plugin
-    assert events.Scalars("hparam/J_final")[0].value == pytest.approx(summary["J_final"])
-
-
-def test_proximal_step_leaves_nothing_above_the_band(whole):
-    folder, _ = whole
-    deviation, distance = learned_C(folder)
-    assert np.abs(deviation[distance > 0]).max() == 0
-    assert np.abs(deviation[distance < 0]).max() > 0, "what is below is free"
-    last = metrics(folder).iloc[-1]
-    assert last["structure/above"] == 0
-    assert last["structure/below"] == pytest.approx(np.abs(deviation[distance < 0]).sum())
 
 
 # --- Small runs ----------------------------------------------------------------------------------
@@ -240,46 +166,30 @@ def test_the_si_penalty_begins_with_the_first_window_of_n_steps(tmp_path):
 
 
 STREAM = (
-    "task=gros_zanon",
-    "solver=daqp",
-    "task.horizon=4",
-    "task.eval_steps=20",
-    "figures=false",
-    "gate=false",
-    "rivals=false",
+    *("task=gros_zanon", "solver=daqp", "task.horizon=4", "task.eval_steps=20"),
+    *("figures=false", "gate=false", "rivals=false"),
 )
 
 
 def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
     cfg = make_config(*STREAM, "replay=false", "updates=24", "eval_interval=12", "seed=69")
     summary = train.train(cfg, str(tmp_path))
-    names = {"constraint": "mpc", "noise": "uniform", "updates": 24}
-    assert {**summary, **names} == summary
     assert summary["unsolved"] == 0
     assert summary["J_final"] < 0.5 * summary["J_start"]
     assert summary["train_cost_last_tenth"] < summary["train_cost"] < 0.6
-    assert 0 < summary["train_violation"] < 3
     table = metrics(tmp_path)
-    assert sorted(table.index) == list(range(25))
     moved = ["c", "A_0", "B_1", "b_0", "lb_0", "q_4"]
     assert (table[[f"theta/{name}" for name in moved]].dropna().std() > 0).all()
     hard = table[["theta/lb_2", "theta/ub_2"]].dropna()
     assert (hard == [-1.0, 1.0]).all(axis=None)
     violation = table["train/violation"].dropna()
     assert (violation.diff().dropna() >= 0).all()
-    assert violation[24] == pytest.approx(summary["train_violation"])
+    assert 0 < violation[24] == pytest.approx(summary["train_violation"])
 
 
-def test_the_stream_can_be_replayed(tmp_path):
-    """It can be drawn, too: it has two states and one action instead of four and two."""
-    replayed = ("replay=true", "replay_capacity=320", "figures=true")
-    cfg = make_config(*STREAM, *replayed, "updates=15", "eval_interval=15")
-    assert train.train(cfg, str(tmp_path))["unsolved"] == 0
-    assert metrics(tmp_path)["qp/recalled"].iloc[-1] > 0
-
-
-@pytest.mark.parametrize("optimizer", ["adam", "gauss_newton"])
-@pytest.mark.parametrize("structure", ["tied", "varying"])
+@pytest.mark.parametrize(
+    ("optimizer", "structure"), [("adam", "varying"), ("gauss_newton", "tied")]
+)
 def test_a_scheme_is_released_in_mid_training(tmp_path, monkeypatch, optimizer, structure):
     seen = []
 
@@ -321,7 +231,7 @@ def test_a_seed_determines_every_number(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
-@pytest.mark.parametrize("name", ["markov", "si_raw", "projection", "horizon_20"])
+@pytest.mark.parametrize("name", ["si_raw", "horizon_20"])
 def test_an_ablation_runs(tmp_path, name):
     """The others differ in numbers alone, and in choices that other tests run."""
     small = [override for override in SMALL if not override.startswith(("optimizer", "task.hor"))]
@@ -330,20 +240,6 @@ def test_an_ablation_runs(tmp_path, name):
     summary = train.train(cfg, str(tmp_path))
     assert (summary["ablation"], summary["step"]) == (name, cfg.step)
     assert summary["unsolved"] == 0
-
-
-@pytest.mark.parametrize(("rule", "optimizer"), [("projection", "gauss_newton"), ("sdp", "adam")])
-def test_a_scheme_with_dense_weights_learns_them_by_each_rule(tmp_path, rule, optimizer):
-    """The scheme is released in mid-training."""
-    dense = ("constraint=mpc", "task.learn_cost=[H,H_f,q,c,w]", "updates=12", "release=6")
-    cfg = make_config(*STREAM, *dense, f"optimizer={optimizer}", f"step={rule}", "batch_size=4")
-    assert train.train(cfg, str(tmp_path))["unsolved"] == 0
-    state = load_checkpoint(tmp_path / "checkpoint.pt")["mpc"]
-    for part in ("H", "H_f"):
-        H = state[f"parametrizations.{part}.original"]
-        assert torch.equal(H, H.mT)
-        assert torch.linalg.eigvalsh(H)[0] > -1e-12
-    assert (state["w"] >= 0).all()
 
 
 def test_plain_gradient_step(tmp_path):
@@ -441,30 +337,8 @@ def test_the_second_order_learns_in_tens_of_updates(tmp_path):
     assert np.isfinite(table["loss/si"].dropna()).all()
 
 
-def test_an_interruption_keeps_the_log(tmp_path, monkeypatch):
-    calls, forward = [], QPQLearningLoss.loss_value
-
-    def interrupted(self, tensordict):
-        calls.append(1)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return forward(self, tensordict)
-
-    monkeypatch.setattr(QPQLearningLoss, "loss_value", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run_small(tmp_path)
-    table = metrics(tmp_path)
-    assert list(table.index) == [0, 1, 2, 3]
-    assert np.isfinite(table["loss/value"][1:]).all()
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
-    events.Reload()
-    assert [event.step for event in events.Scalars("loss/value")] == [1, 2, 3]
-    assert load_checkpoint(tmp_path / "checkpoint.pt")["update"] == 2
-    assert not (tmp_path / "summary.json").exists()
-
-
 def test_a_bad_configuration_writes_nothing(tmp_path):
-    with pytest.raises(QPError, match=r"task.horizon: got 0, expected a whole number >= 1"):
+    with pytest.raises(QPError, match=r"task\.horizon: got 0"):
         run_small(tmp_path / "run", "task.horizon=0")
     assert not (tmp_path / "run").exists()
 
@@ -487,29 +361,18 @@ def test_command(tmp_path, monkeypatch, capsys):
 def test_impossible_value_on_the_command_line(tmp_path, monkeypatch, capsys):
     """The message is one sentence: Python prints a SystemExit's text without a traceback."""
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as error:
+    with pytest.raises(SystemExit, match=r"^task\.gamma: got 1\.5"):
         run_command("task.gamma=1.5")
-    assert error.value.code == "task.gamma: got 1.5, expected a number in (0, 1]."
     assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(
     ("mistake", "sentence"),
     [
-        (
-            "batchsize=3",
-            "batchsize: got an unknown key, expected a key of configs/. Did you mean batch_size?",
-        ),
-        (
-            "task.gama=1",
-            "task.gama: got an unknown key, expected a key of configs/. Did you mean task.gamma?",
-        ),
+        ("batchsize=3", "batchsize: got an unknown key"),
         ("study=paper", "append to your default list use +study=paper"),
         ("optimizer.lr_cost=1", "Could not override 'optimizer.lr_cost'"),
-        (
-            "+batchsize=3",
-            "batchsize: got an unknown key, expected a key of configs/. Did you mean batch_size?",
-        ),
+        ("+batchsize=3", "batchsize: got an unknown key"),
         ("constraint=none", "Could not find 'constraint/none'"),
     ],
 )
@@ -527,7 +390,8 @@ TINY = (*SMALL, "task.eval_steps=5")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)
+    return {str(path): path.read_bytes() for path in files}
 
 
 @pytest.fixture(scope="module")
@@ -566,7 +430,6 @@ def test_a_finished_run_is_not_overwritten(tmp_path):
     with pytest.raises(SystemExit, match=message):
         run_command(*TINY, "seed=2", f"hydra.run.dir={folder}")
     assert contents(folder) == before
-    assert not (folder / LOCK).exists()
 
 
 def test_a_stopped_run_is_not_overwritten_but_resumes(stopped):
@@ -590,35 +453,18 @@ def test_the_message_offers_no_resume_of_a_broken_run(stopped, name):
         run_command(*TINY, f"hydra.run.dir={stopped}")
 
 
-def test_a_folder_in_use_is_refused(stopped, tmp_path):
+def test_a_folder_in_use_is_refused(stopped):
     before = contents(stopped)
     for overrides in ((*TINY, f"hydra.run.dir={stopped}"), (f"resume={stopped}",)):
-        with locked(stopped), pytest.raises(SystemExit, match=f"got {stopped}, in use by process "):
+        with locked(stopped, ""), pytest.raises(SystemExit, match=f"got {stopped}, in use by "):
             run_command(*overrides)
     assert contents(stopped) == before
-
-
-def test_a_run_holds_the_lock(tmp_path, monkeypatch):
-    def busy(cfg: DictConfig, folder: str, *_: Any, **__: Any) -> dict[str, Any]:
-        with pytest.raises(QPError, match="in use by process"), locked(folder):
-            pass
-        return {"closed_gap": 0.5}
-
-    monkeypatch.setattr(train, "train", busy)
-    run_command(*TINY, f"hydra.run.dir={tmp_path}")
-    assert not (tmp_path / LOCK).exists()
 
 
 def test_a_run_resumes_only_in_its_own_folder(stopped, tmp_path):
     message = f"got {tmp_path}/other with resume={stopped}, expected {stopped}. A run resumes in i"
     with pytest.raises(SystemExit, match=message):
         run_command(f"resume={stopped}", f"hydra.run.dir={tmp_path}/other")
-
-
-def test_damaged_metrics_end_in_a_sentence(stopped):
-    (stopped / "metrics.csv").write_bytes(b"\xff\x00 garbage")
-    with pytest.raises(SystemExit, match=r"^metrics.csv: got .*metrics.csv \('utf-8' codec"):
-        run_command(f"resume={stopped}")
 
 
 def test_runs_that_start_in_the_same_second_have_folders_of_their_own():
@@ -641,22 +487,14 @@ PENDULUM = (
 SHORT = ("solver=daqp", "updates=3", "eval_interval=3", "warmup_steps=12", "task.eval_steps=5")
 
 
-@pytest.mark.parametrize(
-    ("id", "kwargs"),
-    [("Pendulum-v1", ()), ("Pendulum-v1", ("task.kwargs={g: 9.81}",)), ("PointMass-v0", ())],
-)
-def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys, id, kwargs):
+def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    model = PENDULUM
-    if id == "PointMass-v0":
-        id = f"torch_qpmpc/{id}"
-        A, B = PointMass().A.tolist(), PointMass().B.tolist()
-        W = torch.eye(6).tolist()
-        model = (f"task.A={A}", f"task.B={B}", f"task.stage_weight={W}")
-    run_command("task=gymnasium", f"task.id={id}", *model, *kwargs, *SHORT, "figures=false")
+    A, B, W = PointMass().A.tolist(), PointMass().B.tolist(), torch.eye(6).tolist()
+    model = (f"task.A={A}", f"task.B={B}", f"task.stage_weight={W}")
+    id = "torch_qpmpc/PointMass-v0"
+    run_command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false")
     folder = Path(capsys.readouterr().out.splitlines()[-1])
     assert folder.parent == tmp_path / "runs" / "gymnasium" / id / "none-deviation"
-    assert folder.name.startswith("seed1-")
     summary = json.loads((folder / "summary.json").read_text())
     assert (summary["task"], summary["updates"], summary["unsolved"]) == ("gymnasium", 3, 0)
     assert math.isfinite(summary["J_final"])
@@ -686,11 +524,11 @@ def test_missing_keys_of_a_gymnasium_task_are_named(tmp_path, monkeypatch, overr
 
 
 @pytest.mark.parametrize(("terminal", "quiet"), [(True, False), (True, True), (False, False)])
-def test_bars_name_the_first_evaluation(tmp_path, capsys, monkeypatch, terminal, quiet):
+def test_a_bar_names_the_first_evaluation(tmp_path, capsys, monkeypatch, terminal, quiet):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    cfg = make_config(*TINY, "gate=true", "logger=csv")
+    cfg = make_config(*TINY, "updates=2")
     train.train(cfg, str(tmp_path), quiet=quiet)
     shown = capsys.readouterr().err
     for line in ("first evaluation:", "start", "true model"):
         assert (line in shown) is (terminal and not quiet), line
-    assert (f"{cfg.updates}/{cfg.updates}" in shown) is not quiet
+    assert ("2/2" in shown) is not quiet

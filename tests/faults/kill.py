@@ -22,7 +22,7 @@ from pathlib import Path
 
 import train
 from tests.runs import CONFIGS, SMALL
-from tests.stops import assert_events_are_whole, assert_same_numbers
+from tests.stops import assert_same_numbers
 
 #: Overrides that write a checkpoint every few updates.
 RUN = (*SMALL, "constraint=combined", "updates=200", "eval_interval=4")
@@ -54,9 +54,8 @@ def campaign(folder: Path, count: int, rng: random.Random, settings: tuple[str, 
             process = start(place, settings)
         finish(process)
         assert_same_numbers(place, folder / "whole")
-        assert_events_are_whole(place)
     print(f"{count} kills in {runs} runs {dict(kills)}:")
-    print("every number is that of the run that was left alone, and TensorBoard's events are whole")
+    print("every number is that of the run that was left alone")
 
 
 def start(place: Path, settings: tuple[str, ...]) -> Process:

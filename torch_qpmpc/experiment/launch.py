@@ -1,9 +1,9 @@
-"""Launch of a run: its folder, its lock, and its errors as one-sentence messages."""
+"""Launch of a run: its folder, its lock, its signals, and its errors as one-sentence messages."""
 
 from __future__ import annotations
 
-import contextlib
 import re
+import signal
 import threading
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -11,20 +11,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.announcement import announcement, compilation_named
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.config.messages import keys, unknown_key
-from torch_qpmpc.experiment.lock import ELSEWHERE, ELSEWHERE_IN_SWEEP, locked
 from torch_qpmpc.experiment.run_folder import unwritable
 from torch_qpmpc.experiment.run_state import check_fresh, check_own_folder, folder_of, resumed
 from torch_qpmpc.experiment.sweeps import finished_run, stopped_run
 from torch_qpmpc.experiment.tasks import run_code
 
+#: The locked file of a run's folder.
+LOCK = ".lock"
 # For hydra.run.dir in configs/config.yaml: a resumed run keeps its folder.
 OmegaConf.register_new_resolver("folder_of", folder_of, replace=True)
 
@@ -71,8 +72,6 @@ class Launch:
             check_fresh(self.folder)
         else:
             check_own_folder(resume, self.folder)
-        if not self.sweep:
-            print(announcement(cfg, self.folder, state["update"] if state else 0), flush=True)
         return cfg, state, None
 
 
@@ -106,34 +105,68 @@ def launched() -> Iterator[Launch]:
     sweep = hydra.mode is RunMode.MULTIRUN
     launch = Launch(hydra.runtime.output_dir, list(hydra.overrides.task), sweep)
     try:
-        named = contextlib.nullcontext() if sweep else compilation_named()
-        lock = locked(launch.folder, ELSEWHERE_IN_SWEEP if sweep else ELSEWHERE)
-        with _threads_os_errors_ignored(), lock, named:
+        with locked(launch.folder, f"hydra.{'sweep' if sweep else 'run'}.dir=FOLDER"):
             yield launch
-    except QPError as error:
+    except (QPError, OSError) as error:
         if sweep:
             raise
+        if isinstance(error, OSError):
+            error = unwritable(launch.folder, error)
         raise SystemExit(str(error)) from None
-    except OSError as error:
-        if sweep:
-            raise
-        raise SystemExit(str(unwritable(launch.folder, error))) from None
 
 
 @contextmanager
-def _threads_os_errors_ignored() -> Iterator[None]:
-    """Keep silent about file errors of TensorBoard's thread, which the run raises again.
+def locked(folder: str | Path, elsewhere: str) -> Iterator[None]:
+    """Hold the lock of a run's folder; the operating system releases that of a killed process.
 
-    The thread starts inside TensorBoard, so that only Python's hook sees its errors.
+    Raises:
+        QPError: another run holds the lock; the setting ``elsewhere`` chooses another folder.
     """
-    previous = threading.excepthook
-
-    def hook(error: threading.ExceptHookArgs) -> None:
-        if not isinstance(error.exc_value, OSError):
-            previous(error)
-
-    threading.excepthook = hook
+    lock = FileLock(Path(folder) / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        remedy = f"Wait until that run has ended, or choose another folder with {elsewhere}."
+        got, want = f"{folder}, in use by another process", "one that no run is using"
+        raise QPError.expected("folder", got, want, remedy) from None
     try:
         yield
     finally:
-        threading.excepthook = previous
+        lock.release()
+
+
+class Interrupt:
+    """Records the first SIGINT or SIGTERM inside a ``with`` block; a second one acts as usual.
+
+    It records nothing outside the main thread, where Python delivers signals.
+
+    Example:
+        >>> with Interrupt() as interrupt:
+        ...     signal.raise_signal(signal.SIGTERM)
+        >>> interrupt.signum == signal.SIGTERM
+        True
+    """
+
+    def __init__(self) -> None:
+        self.signum: int | None = None
+        self._usual = {}
+
+    def __enter__(self) -> Interrupt:
+        if threading.current_thread() is threading.main_thread():
+            for signum in (signal.SIGINT, signal.SIGTERM):
+                self._usual[signum] = signal.signal(signum, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        while self._usual:
+            signal.signal(*self._usual.popitem())
+
+    def exit_if_signalled(self, sentence: str) -> None:
+        """Print ``sentence`` and exit with the signal's code if one was recorded."""
+        if self.signum is not None:
+            print(f"\n{sentence}", flush=True)
+            raise SystemExit(128 + self.signum)
+
+    def _note(self, signum: int, frame: object) -> None:
+        self.signum = signum
+        self.__exit__()

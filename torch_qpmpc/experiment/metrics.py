@@ -10,7 +10,6 @@ from typing import Any
 from torch import Tensor
 
 from torch_qpmpc.analysis.model_error import one_step_error
-from torch_qpmpc.analysis.plots import constraint_figure, policy_figure, slice_between
 from torch_qpmpc.analysis.prediction_form import prediction_form
 from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.analysis.structure import distance_by_band, nearest_model
@@ -19,11 +18,7 @@ from torch_qpmpc.envs.closed_loop import cost_text, gap_text
 from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.gating import COMPARED, RunGate
-from torch_qpmpc.experiment.plots import (
-    closed_loop_figure,
-    learned_episode_figure,
-    summary_figure,
-)
+from torch_qpmpc.experiment.plots import learned_episode_figure, summary_figure
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tally import Stopwatch, Tally
@@ -69,10 +64,7 @@ def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str
 
 
 def report(run: RunFolder, mpc: QPMPC, evaluation: Evaluation, update: int) -> dict[str, Any]:
-    """Log an evaluation: J, the structure of C and, if configured, figures.
-
-    Before the first update only J is logged. Figures are drawn at the first evaluation after it and
-    at the last, to which `draw_outcome` adds its own, or with ``figures=all`` at each.
+    """Log an evaluation: J and, after the first update, the structure of C.
 
     Args:
         run: the run's folder.
@@ -86,33 +78,20 @@ def report(run: RunFolder, mpc: QPMPC, evaluation: Evaluation, update: int) -> d
     summary = evaluation.summary()
     scalars = {f"eval/{name}": summary[key] for name, key in EVALUATION_SCALARS.items()}
     scalars |= {f"eval/J_{tag(name)}": J for name, J in evaluation.rivals.items()}
+    if update:
+        distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u, mpc.past, mpc.n_d)
+        distances |= structure_metrics(mpc)
+        scalars |= {f"structure/{name}": distance for name, distance in distances.items()}
     run.log(scalars, update)
-    if update == 0:
-        return summary
-    distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u, mpc.past, mpc.n_d)
-    distances |= structure_metrics(mpc)
-    run.log({f"structure/{name}": distance for name, distance in distances.items()}, update)
-    cfg = evaluation.cfg
-    last = update == cfg.updates
-    if cfg.figures == "all" or (cfg.figures and (last or update == cfg.eval_interval)):
-        run.figure("structure/C", constraint_figure(mpc), update)
-        run.figure("eval/closed_loop", closed_loop_figure(mpc, evaluation), update)
-    if cfg.figures and last:
-        draw_outcome(run, mpc, evaluation, update)
     return summary
 
 
-def draw_outcome(run: RunFolder, mpc: QPMPC, evaluation: Evaluation, update: int) -> None:
-    """Draw summary.png and episode.png; log the episode and the policy."""
-    known = evaluation.loops["learned"].known
+def draw_outcome(run: RunFolder, mpc: QPMPC, evaluation: Evaluation) -> None:
+    """Draw summary.png and episode.png."""
     summary = summary_figure(mpc, evaluation, *run.column("eval/J"))
     summary.savefig(run.path / "summary.png", dpi=110)
-    if known.isfinite().all():
-        episode = learned_episode_figure(mpc, evaluation)
-        episode.savefig(run.path / "episode.png", dpi=110)
-        run.figure("eval/episode", episode, update)
-    if mpc.n_x > 1:
-        run.figure("eval/policy", policy_figure(slice_between(mpc, known[0])), update)
+    if evaluation.loops["learned"].known.isfinite().all():
+        learned_episode_figure(mpc, evaluation).savefig(run.path / "episode.png", dpi=110)
 
 
 def tag(name: str) -> str:

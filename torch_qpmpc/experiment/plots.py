@@ -102,25 +102,6 @@ def _names(mpc: QPMPC, evaluation: Evaluation) -> dict[str, Any]:
     return episode_names(evaluation.cfg, evaluation.physics, mpc, d)
 
 
-def draw_stage_costs(axes: Axes, loops: Mapping[str, ClosedLoop]) -> None:
-    """Draw the mean stage cost over time."""
-    for name, loop in loops.items():
-        axes.plot(loop.costs.mean(1), color=COLOURS.get(name), label=name)
-    axes.set(xlabel="step", ylabel="L(s, a), mean over starts", title="Stage cost")
-    if all((loop.costs.mean(1) > 0).any() for loop in loops.values()):
-        axes.set_yscale("log")
-    axes.legend(fontsize="small")
-
-
-def closed_loop_figure(mpc: QPMPC, evaluation: Evaluation) -> Figure:
-    """Draw paths in the plane with predictions, and the stage cost over time."""
-    figure = Figure(figsize=(6, 9), layout="constrained")
-    top, bottom = figure.subplots(2, 1, height_ratios=(3, 2))
-    draw_positions(top, evaluation.loops, mpc, _names(mpc, evaluation))
-    draw_stage_costs(bottom, evaluation.loops)
-    return figure
-
-
 def draw_learning(
     axes: Axes, updates: Sequence[float], J: Sequence[float], evaluation: Evaluation
 ) -> None:

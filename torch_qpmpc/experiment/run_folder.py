@@ -5,19 +5,19 @@ from __future__ import annotations
 import io
 import json
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from hydra.experimental.callback import Callback
-from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
+from torchrl.record.loggers import Logger, get_logger
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT
 from torch_qpmpc.experiment.config import settings
-from torch_qpmpc.experiment.loggers import RunLogger
 from torch_qpmpc.experiment.tasks import COMMAND
 from torch_qpmpc.files import damaged, write_whole
 
@@ -27,6 +27,8 @@ NUMBERS = ("seed", "closed_gap", "J_start", "J_final", "J_true_model")
 
 class RunFolder:
     """The output of one run; a context manager, which flushes at its end.
+
+    Scalars go to metrics.csv and to one of TorchRL's loggers, which a resumed run goes on in.
 
     Args:
         folder: the folder, created if it does not exist.
@@ -49,11 +51,10 @@ class RunFolder:
         if after is not None:
             for update, row in earlier.iterrows():
                 self.rows.append({"update": update, **row.dropna()})
-        self.logger = RunLogger(cfg.logger, self.path, settings(cfg), self.rows, after)
+        self.logger = make_logger(cfg, self.path)
         if after is None:
             text = OmegaConf.to_yaml(cfg, resolve=True)
             write_whole(self.path / "config.yaml", text.encode())
-            self.logger.text("config", f"```yaml\n{text}```")
 
     def __enter__(self) -> RunFolder:
         return self
@@ -63,6 +64,10 @@ class RunFolder:
             self.flush()
         finally:
             self.logger.close()
+            if self.cfg.logger == "mlflow":
+                import mlflow
+
+                mlflow.end_run()  # which the logger does not
 
     def log(self, metrics: Mapping[str, float], update: int) -> None:
         """Log scalars at an update, to metrics.csv and the logger."""
@@ -71,11 +76,7 @@ class RunFolder:
         if not self.rows or self.rows[-1]["update"] != update:
             self.rows.append({"update": update})
         self.rows[-1].update(metrics)
-        self.logger.log(metrics, update)
-
-    def figure(self, name: str, figure: Figure, update: int) -> None:
-        """Log a figure."""
-        self.logger.figure(name, figure, update)
+        self.logger.log_metrics(dict(metrics), step=update)
 
     def column(self, name: str) -> tuple[list[float], list[float]]:
         """Return the updates at which ``name`` was logged, and its values."""
@@ -89,15 +90,26 @@ class RunFolder:
         self.logger.flush()
 
     def finish(self, summary: Mapping[str, Any]) -> None:
-        """Write the outcome to the logger and to summary.json.
+        """Write the outcome to summary.json.
 
         JSON has no nan (no gap to close) and no inf; both are written as null.
         """
-        self.logger.finish(summary)
-        self.logger.flush()
         text = json.dumps(_finite(summary), indent=2, allow_nan=False)
         # Written last and atomically: its presence marks the run as finished.
         write_whole(self.path / "summary.json", f"{text}\n".encode())
+
+
+def make_logger(cfg: DictConfig, folder: Path) -> Logger:
+    """Make TorchRL's logger of ``cfg.logger`` in a run's folder, with the settings."""
+    name = cfg.logger
+    if name == "mlflow":  # its default, a database, needs more packages
+        os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
+    place = folder / "mlflow" if name == "mlflow" else folder
+    logger = get_logger(name, str(place), folder.name if name == "wandb" else name)
+    assert logger is not None
+    if name != "tensorboard":  # whose hyper-parameters begin a folder of their own
+        logger.log_hparams({key: str(value) for key, value in settings(cfg).items()})
+    return logger
 
 
 def read_metrics(folder: str | Path) -> pd.DataFrame:

@@ -23,7 +23,6 @@ from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
 from torch_qpmpc.experiment.config import differences, load_config, settings
 from torch_qpmpc.experiment.gating import RunGate
-from torch_qpmpc.experiment.lock import ELSEWHERE
 from torch_qpmpc.experiment.tally import Tally
 from torch_qpmpc.experiment.tasks import COMMAND, has_run, named_code, resume_arguments
 from torch_qpmpc.files import labelled
@@ -192,14 +191,16 @@ def _stopped(path: str | Path) -> tuple[DictConfig, dict | None]:
 def check_fresh(folder: str | Path) -> None:
     """Raise `QPError` if ``folder`` already holds a run, finished or stopped."""
     folder = Path(folder)
-    remedy = f"Choose another folder with {ELSEWHERE}."
+    remedy = "Choose another folder with hydra.run.dir=FOLDER."
     if (folder / "summary.json").exists():
         got = "which holds a finished run"
     elif any((folder / name).exists() for name in (*WRITTEN, CHECKPOINT, PREVIOUS)):
         got = "which holds a stopped run"
         with contextlib.suppress(Exception):  # damaged files raise errors of any type
             arguments = resume_arguments(folder, _stopped(folder)[0].task)
-            remedy = f"Resume it with {arguments}, or choose another folder with {ELSEWHERE}."
+            remedy = (
+                f"Resume it with {arguments}, or choose another folder with hydra.run.dir=FOLDER."
+            )
     else:
         return
     raise QPError.expected("folder", f"{folder}, {got}", "one without a run", remedy)

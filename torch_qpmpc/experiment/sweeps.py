@@ -23,7 +23,6 @@ from tqdm import tqdm
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
 from torch_qpmpc.experiment.config import differences, load_config, settings
-from torch_qpmpc.experiment.lock import ELSEWHERE_IN_SWEEP
 from torch_qpmpc.experiment.run_folder import read_summary
 from torch_qpmpc.experiment.run_state import check_state
 
@@ -47,7 +46,7 @@ def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
     saved = settings(load_config(folder / "config.yaml"))
     if changed := differences(saved, settings(cfg)):
         then, now = changed
-        remedy = f"Remove it, or choose another folder with {ELSEWHERE_IN_SWEEP}."
+        remedy = "Remove it, or choose another folder with hydra.sweep.dir=FOLDER."
         raise QPError.expected(f"{folder}", f"a finished run with {then}", now, remedy)
     return read_summary(folder)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, NoReturn, Self
 
@@ -37,6 +38,13 @@ LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")
 
 def _known_solver(name: str) -> str:
     backend(name)
+    return name
+
+
+def _installed_logger(name: str) -> str:
+    if name in ("wandb", "mlflow") and importlib.util.find_spec(name) is None:
+        got, remedy = f"{name}, which is not installed", f"Install it: pip install {name}."
+        raise QPError.expected("logger", got, "an installed logger", remedy)
     return name
 
 
@@ -75,10 +83,10 @@ class Config(Group):
     gate: Annotated[Literal["act", "plant"] | bool, Expected("true, act, plant or false")]
     gate_bound: Annotated[Positive | None, Expected("a finite number > 0, or null")]
     gate_interval: Annotated[Count | None, Expected("a whole number >= 1, or null")]
-    logger: Annotated[str, one_of(LOGGERS)]
+    logger: Annotated[str, one_of(LOGGERS), AfterValidator(_installed_logger)]
     export: Annotated[Literal["c"] | None, Expected("c, or null")]
     prove: Annotated[NonNegative | None, Expected("a finite number >= 0, or null")]
-    figures: Annotated[Literal["all"] | bool, Expected("true, all or false")]
+    figures: Flag
     rivals: Annotated[bool | list[str], Expected("true, false or a list of names")]
     eval_interval: Count
     log_interval: Count
