@@ -57,7 +57,7 @@ def test_the_episode_has_the_loop_and_the_plans_of_every_half_horizon(mpc, found
     loop = found.loops["learned"]
     for axes, real in zip(figure.axes, loop.states[:, 0].mT, strict=False):
         assert np.array_equal(axes.lines[0].get_ydata(), real)
-        assert [line.get_xdata()[0] for line in axes.lines[1:4]] == [0, 2, 4]
+        assert [np.asarray(line.get_xdata())[0] for line in axes.lines[1:4]] == [0, 2, 4]
     rendered(figure)
 
 
