@@ -205,7 +205,7 @@ def test_signals_may_be_as_large_as_bounds_noise_and_effects_make_usual():
 
     def largest(noise=None, **options):
         mpc = qm.LinearMPC(model, 3, Q=1.0, **options)
-        return [*np.concatenate(qm.Controller(mpc, noise=noise).most)]
+        return [*np.concatenate(qm.Controller(mpc, noise=noise).max_plausible)]
 
     assert largest() == [1e8]
     assert largest(u_bounds=(0.0, 1e6)) == [0.5e14]

@@ -143,8 +143,8 @@ def test_a_signal_that_is_absurd_is_as_one_that_is_not_finite(exported):
         twin.reset([bad], [bad])
         assert twin.step([0.1], [1.0])[1] == 0
     assert np.ptp(inputs, axis=0).max() == 0
-    assert twin.step(controller.most[0])[1] != 3
-    assert twin.step(controller.most[0] * 1.001)[1] == 3
+    assert twin.step(controller.max_plausible[0])[1] != 3
+    assert twin.step(controller.max_plausible[0] * 1.001)[1] == 3
 
 
 def test_an_absurd_known_signal_leaves_the_estimates_alone(tmp_path):

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
-from torch_qpmpc.control import probe, review
+from torch_qpmpc.control import review, simulation
 from torch_qpmpc.control.findings import Finding, Review
-from torch_qpmpc.control.loop import LinearLoop
+from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.export.tables import make_tables
 from torch_qpmpc.proofs import Answer, Plant, Polytope, largest_violation
 
@@ -26,13 +26,13 @@ DEAD_TIME = (np.eye(6, k=1), np.eye(6)[:, -1:], np.eye(6)[:1])
 TWO_OUTPUTS = (np.diag([0.9, 0.5]), np.eye(2))
 TWO_INPUTS = ([[0.9]], [[0.5, 0.4]])
 #: Steps of the loop that probes the weights and the QP.
-PROBED = probe.STEPS
+PROBED = simulation.PROBED
 
 
 @pytest.fixture(autouse=True)
 def quick_probe(monkeypatch: pytest.MonkeyPatch) -> None:
     """Probe by one set-point, except in the tests of what the probe tells."""
-    monkeypatch.setattr(probe, "STEPS", probe.HELD)
+    monkeypatch.setattr(simulation, "PROBED", simulation.HELD)
 
 
 def controller(model, horizon=10, filtered=None, r=None, **options):
@@ -143,7 +143,7 @@ MISTAKES = {
 def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake, monkeypatch):
     (model, options), (name, remedy), change = MISTAKES[mistake]
     if name == "weights":
-        monkeypatch.setattr(probe, "STEPS", PROBED)
+        monkeypatch.setattr(simulation, "PROBED", PROBED)
     design = {"model": model, **options}
     fault = made(**design)[name]
     assert not fault.ok
@@ -168,7 +168,7 @@ def loop(model, **options):
 
 @pytest.mark.parametrize("model", [LAG, INTEGRATOR, DEAD_TIME])
 def test_a_sound_design_has_no_fault(model, monkeypatch):
-    monkeypatch.setattr(probe, "STEPS", PROBED)
+    monkeypatch.setattr(simulation, "PROBED", PROBED)
     found = made(model, 15, r=[0.5])
     assert found.faults == []
     assert len(found.findings) == 14
@@ -338,7 +338,7 @@ def test_proofs_are_findings_of_the_review_and_its_page(tmp_path):
 def test_the_linear_loop_is_that_of_the_controller(options):
     mpc = qm.LinearMPC(INTEGRATOR, 8, Q=1.0, R=0.1, dR=0.1, **options)
     controller = qm.Controller(mpc)
-    loop = LinearLoop.of(controller, make_tables(mpc), make_tables(mpc.targets))
+    loop = LinearLoop.of(mpc, controller.observer, *map(make_tables, (mpc, mpc.targets)))
     A, B, C = loop.plant
     state, constant = np.zeros(len(loop.A)), np.array([0.1, -0.2, 0.3])  # load, bias and r
     controller.reset(y=[0.0])
@@ -354,7 +354,7 @@ def test_the_margin_is_that_of_the_loop_s_gain():
     """The loop is unstable from the gain on that the margin of one input allows at least."""
     mpc = qm.LinearMPC(INTEGRATOR, 8, Q=1.0, R=0.1, dR=0.1)
     controller = qm.Controller(mpc)
-    loop = LinearLoop.of(controller, make_tables(mpc), make_tables(mpc.targets))
+    loop = LinearLoop.of(mpc, controller.observer, *map(make_tables, (mpc, mpc.targets)))
     A_c, B_c, C_c, D_c = loop.controller
     A, B, C = loop.plant
     margin = loop.modulus_margin()
@@ -391,7 +391,7 @@ def test_shares_are_the_gradient_of_the_loop_s_cost():
 
 
 def test_a_negative_share_of_coupled_weights_is_no_fault(monkeypatch):
-    monkeypatch.setattr(probe, "STEPS", PROBED)
+    monkeypatch.setattr(simulation, "PROBED", PROBED)
     Q = [[1.0, -0.9], [-0.9, 1.0]]
     mpc = qm.LinearMPC(TWO_OUTPUTS, 20, Q=Q, R=0.1, u_bounds=(-3.0, 3.0), y_bounds=(-1.0, 1.0))
     weights = qm.Controller(mpc).review()["weights"]
@@ -400,7 +400,7 @@ def test_a_negative_share_of_coupled_weights_is_no_fault(monkeypatch):
 
 
 def test_tight_bounds_take_more_iterations(monkeypatch):
-    monkeypatch.setattr(probe, "STEPS", PROBED)
+    monkeypatch.setattr(simulation, "PROBED", PROBED)
     mpc = qm.LinearMPC(INTEGRATOR, 10, Q=1.0, dR=0.1, u_bounds=(-0.2, 0.2))
     controller = qm.Controller(mpc)
     numbers = controller.review()["C code"].numbers

@@ -4,30 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import torch
 
 from torch_qpmpc.checks import check_flag, check_kind
-from torch_qpmpc.control.design import half_range, read_vector
-from torch_qpmpc.control.linear_mpc import LinearMPC, Target
-from torch_qpmpc.control.observer import SMALL, kalman, most, windowed
-from torch_qpmpc.control.signals import read_row, read_table
+from torch_qpmpc.control.exporting import ControllerExport, export_controller
+from torch_qpmpc.control.findings import Review
+from torch_qpmpc.control.law import Law, Memory
+from torch_qpmpc.control.learning import LearningReport, learn
+from torch_qpmpc.control.linear_mpc import LinearMPC, Target, packed, unpacked
+from torch_qpmpc.control.observer import Observer
+from torch_qpmpc.control.review import review
+from torch_qpmpc.control.signals import read_row
+from torch_qpmpc.control.simulation import Run, simulate
 from torch_qpmpc.control.state_space import Array
-from torch_qpmpc.control.stored import packed, unpacked
-from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
-
-if TYPE_CHECKING:
-    from torch_qpmpc.control.exporting import ControllerExport
-    from torch_qpmpc.control.learning import LearningReport
-    from torch_qpmpc.control.review import Review
-    from torch_qpmpc.control.simulation import Run
-    from torch_qpmpc.proofs import Answer
+from torch_qpmpc.proofs import Answer
 
 #: The kind of file that `Controller.save` writes.
 KIND = "Controller"
+#: The options of a controller that a file holds.
+OPTIONS = ("noise", "drift", "window")
 
 
 class Controller:
@@ -42,23 +40,23 @@ class Controller:
         mpc: the MPC. Call `reset` when its theta has changed.
         noise: standard deviations of the noise of outputs, as a number, a vector or by name; by
             default a tenth of half the distance of the outputs' bounds, or of one without bounds.
-        drift: those of the change of each disturbance in a step; by default a tenth of half the
-            distance of the bounds of the output or the input. A larger ratio of drift to noise
-            rejects disturbances faster, and passes on more noise.
-        window: True takes the estimates that the last few outputs and inputs determine, as an
-            identification's window does, instead of the filter: the fastest, and the noisiest.
-            Call `reset` with y and u of the plant at rest, or the first steps' estimates are wild.
+        drift: standard deviations of the change of each disturbance in a step; by default a tenth
+            of half the distance of the bounds of the output or the input. A larger ratio of drift
+            to noise rejects disturbances faster and passes on more noise.
+        window: True replaces the filter by estimates from the last few outputs and inputs alone, as
+            in an identification: the fastest, and the noisiest. Call `reset` with y and u of the
+            plant at rest, or the first steps' estimates are wild.
 
     Attributes:
         mpc: the MPC.
         observer: the `Observer`.
-        most: the largest sizes of outputs and set-points, ``(n_y,)``, and of known signals,
-            ``(n_d,)``: larger ones are errors, see `torch_qpmpc.control.observer.most`.
+        max_plausible: the largest sizes of outputs and set-points, ``(n_y,)``, and of known
+            signals, ``(n_d,)``: larger ones are errors; see `torch_qpmpc.control.observer`.
         x, w, u: the estimates of x and w, and the last input.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
-        rest: the outputs y, and the input u, that the last reset said the plant rests with, or None
-            where it said nothing.
-        p: what the plan of the last step knew, ``(n_p,)``.
+        r: the set-points of the last step, without rows before the first.
+        rest: the outputs and the input at rest that the last reset was passed, or None for each.
+        p: the input of the last step's plan, ``(n_p,)``.
         target: the `Target` of the last step, None before the first; with a preview, of all stages.
 
     Raises:
@@ -81,19 +79,8 @@ class Controller:
     ) -> None:
         check_flag("window", window)
         check_kind("mpc", mpc, LinearMPC, "qm.LinearMPC makes one of a plant's model.")
-        self.mpc = mpc
-        design = self._design = mpc.design
-        plant, w = design.plant, design.disturbances
-        y, u = half_range(design.y_bounds), half_range(design.u_bounds)
-        ranges = np.abs(y @ w.C + u @ np.linalg.pinv(plant.B) @ w.B)
-        self._noise = _deviations("noise", noise, SMALL * y, plant.outputs)
-        self._drift = _deviations("drift", drift, SMALL * ranges, w.names)
-        self.observer, self._window = kalman(design, self._noise, self._drift), window
-        self.most = most(design, self._noise)
-        if window:
-            self.observer = windowed(self.observer)
-        self.r = np.zeros(0)
-        self.reset()
+        self._law = Law.of(mpc, noise, drift, window)
+        self._start(self._law.begun())
 
     def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
         """Forget the past: the plant rests with the outputs y, by default those of the next step.
@@ -110,37 +97,71 @@ class Controller:
         Raises:
             QPError: an argument is invalid.
         """
-        plant = self._design.plant
-        self._qp = self.mpc.quadratic_program()
-        last = np.zeros(len(plant.inputs)) if u is None else read_row("u", u, plant.inputs)
-        self.u = np.clip(last, *self._design.u_bounds)
-        y = None if y is None else self._read("y", y, 1)[0]
-        self.rest: tuple[Array | None, Array | None] = (y, None if u is None else self.u)
-        self.known: Array | None = None
+        self._law = law = self._law.renewed()
+        memory = law.begun(None if u is None else read_row("u", u, law.design.plant.inputs))
+        memory = memory._replace(r=self.r)
+        y = None if y is None else law.read("y", y, 1)[0]
+        if known is not None or y is not None:
+            d = law.read_known(known, 1)[0]
+            e = None if y is None else law.observer.at_rest(memory.u, d, y)
+            memory = memory._replace(known=d, e=e, rest=(y, memory.rest[1]))
+        self._start(memory)
+
+    def _start(self, memory: Memory) -> None:
+        """Take a memory without a step."""
+        self._memory = memory
         self.target: Target | None = None
         self.p = torch.zeros(self.mpc.n_p)
-        self._e: Array | None = None
-        if known is not None or y is not None:
-            self.known = d = self.read_known(known, 1)[0]
-            if y is not None:
-                self._rest(y, d)
 
     def __repr__(self) -> str:
         """Return its design, its estimator and the last input."""
-        estimator = "window" if self._window else "filter"
-        return f"Controller({self._design}; {estimator}; u = {self.u.round(4).tolist()})"
+        estimator = "window" if self._law.window else "filter"
+        return f"Controller({self.mpc.design}; {estimator}; u = {self.u.round(4).tolist()})"
+
+    @property
+    def mpc(self) -> LinearMPC:
+        """The MPC."""
+        return self._law.mpc
+
+    @property
+    def observer(self) -> Observer:
+        """The observer."""
+        return self._law.observer
+
+    @property
+    def max_plausible(self) -> tuple[Array, Array]:
+        """The largest sizes of outputs and of known signals."""
+        return self._law.max_plausible
 
     @property
     def x(self) -> Array:
         """The estimate of the state, zero before the first step."""
-        e = np.zeros(len(self.observer.F)) if self._e is None else self._e
-        return e[: len(self._design.plant.A)]
+        return self._law.estimates(self._memory)[0]
 
     @property
     def w(self) -> Array:
         """The estimate of the disturbances, zero before the first step."""
-        e = np.zeros(len(self.observer.F)) if self._e is None else self._e
-        return e[len(self._design.plant.A) :]
+        return self._law.estimates(self._memory)[1]
+
+    @property
+    def u(self) -> Array:
+        """The last input."""
+        return self._memory.u
+
+    @property
+    def r(self) -> Array:
+        """The set-points of the last step."""
+        return self._memory.r
+
+    @property
+    def known(self) -> Array | None:
+        """The known signals of the last step or reset."""
+        return self._memory.known
+
+    @property
+    def rest(self) -> tuple[Array | None, Array | None]:
+        """The outputs and the input at rest of the last reset."""
+        return self._memory.rest
 
     def step(self, y: Any, r: Any = None, known: Any = None) -> Any:
         """Return the input for measured outputs: a vector ``(m,)``, or by name if y is by name.
@@ -153,25 +174,16 @@ class Controller:
                 with at least N + 1 rows; or one row, which is held.
 
         Raises:
-            QPError: an argument is invalid or missing, or a signal is above `most`.
+            QPError: an argument is invalid or missing, or a signal is above `max_plausible`.
             SolverError: no input satisfies the hard bounds.
         """
-        plant, observer = self._design.plant, self.observer
-        rows = self._design.horizon + 1
-        d = self.read_known(known, rows)
-        y_k: Array = self._read("y", y, 1)[0]
-        self.r, self.known = self.read_set_points(r, rows), d[0]
-        if self._e is None:
-            self._rest(y_k, d[0])
-        assert self._e is not None
-        self._e = self._e + observer.L @ (y_k - observer.H @ self._e)
-        self.u = self._plan(d)
-        self._e = self._predicted(self._e, d[0])
-        return (
-            dict(zip(plant.inputs, self.u.tolist(), strict=True))
-            if isinstance(y, Mapping)
-            else self.u.copy()
-        )
+        law, rows = self._law, self.mpc.horizon + 1
+        ahead, measured = law.read_known(known, rows), law.read("y", y, 1)[0]
+        move = law.step(self._memory, measured, law.read_set_points(r, rows, self.r), ahead)
+        self._memory, self.target, self.p = move.memory, move.target, move.p
+        if isinstance(y, Mapping):
+            return dict(zip(law.design.plant.inputs, move.u.tolist(), strict=True))
+        return move.u.copy()
 
     def save(self, path: str | Path) -> None:
         """Write this controller with its estimates and last input to ``path``; no code is in it.
@@ -180,8 +192,8 @@ class Controller:
             QPError: a part of theta has a parametrization that is not QPMPC's own.
             OSError: writing failed; the old file is unchanged.
         """
-        names = ("_noise", "_drift", "_window", "_e", "u", "r", "known", "rest")
-        state = {name.strip("_"): packed(getattr(self, name)) for name in names}
+        options = {name: getattr(self._law, name) for name in OPTIONS}
+        state = packed(options | self._memory._asdict())
         save_file(path, KIND, {**self.mpc.stored(), "controller": state})
 
     @classmethod
@@ -195,12 +207,9 @@ class Controller:
         content = load_file(path, KIND)
         try:
             state = unpacked(content["controller"])
-            mpc = LinearMPC.of_stored(content)
-            options = {name: state[name] for name in ("noise", "drift", "window") if name in state}
-            controller = cls(mpc, **options)
-            controller._e, controller.u, controller.r = (state[name] for name in "eur")
-            controller.known = state.get("known")
-            controller.rest = state.get("rest", controller.rest)
+            options = {name: state.pop(name) for name in OPTIONS if name in state}
+            controller = cls(LinearMPC.of_stored(content), **options)
+            controller._memory = Memory(**state)
         except Exception as error:  # damaged files raise errors of any type
             raise damaged(Path(path), error, "a file that Controller.save wrote") from error
         return controller
@@ -238,9 +247,7 @@ class Controller:
             [1.] 0.0
             >>> figure = run.plot()
         """
-        from torch_qpmpc.control.simulation import simulate
-
-        return simulate(self, plant, steps, r, **options)
+        return simulate(self._law.renewed(), self._memory, plant, steps, r, **options)
 
     def learn(self, source: Any, transitions: int = 5000, **options: Any) -> LearningReport:
         """Identify the model again, and keep the new one if closed loops cost less with it.
@@ -286,11 +293,11 @@ class Controller:
             >>> controller.mpc.design.plant.A.round(2)
             array([[0.9]])
         """
-        from torch_qpmpc.control.learning import learn
-
-        report, candidate = learn(self, source, transitions, **options)
+        law = self._law.renewed()
+        report, candidate = learn(law, self._memory, source, transitions, **options)
         if report.accepted:
-            vars(self).update(vars(candidate))
+            self._law = candidate
+            self._start(self._memory._replace(e=None))
         return report
 
     def review(
@@ -323,9 +330,7 @@ class Controller:
             >>> review.faults[0].name, review.faults[0].remedy
             ('set-points', 'Set y1 to 5, not 7, or widen u_bounds of u1.')
         """
-        from torch_qpmpc.control.review import review
-
-        return review(self, r, known, proofs)
+        return review(self._law.renewed(), self._memory, r, known, proofs)
 
     def export_c(
         self,
@@ -357,83 +362,7 @@ class Controller:
             QPError: as in `QPMPC.export_c`; the self-test fails; or inputs that r leaves free move
                 a bounded output without a weight, as their choice is not exact in C.
         """
-        from torch_qpmpc.control.exporting import export_controller
-
-        options = {"dtype": dtype, "name": name, "storage": storage}
-        return export_controller(self, folder, max_iterations=max_iterations, **options)
-
-    def _predicted(self, e: Array, d: Array) -> Array:
-        observer = self.observer
-        return observer.F @ e + observer.G @ self.u + observer.E @ d + observer.offset
-
-    def _rest(self, y: Array, d: Array) -> None:
-        """Set the estimate to where the plant rests with the last input."""
-        still = -self._predicted(np.zeros(len(self.observer.F)), d)
-        self._e = self.observer.rest @ np.concatenate((still, y))
-
-    @torch.no_grad()
-    def _plan(self, d: Array) -> Array:
-        """Return the input for the current estimate and known signals."""
-        previewed, level = self._design.references == "preview", d.mean(0)
-        self.target = self.mpc.target(self.r if previewed else self.r[0], self.w, level)
-        self.p = p = self.mpc.arrange(self.x, self.target, u_last=self.u, known=d, level=level)
-        u_s = self.target.u[-1] if previewed else self.target.u
-        u = u_s + self.mpc.policy(p, qp=self._qp)
-        return np.clip(u.numpy(), *self._design.u_bounds)
-
-    def read_known(self, known: Any, rows: int, least: int | None = None) -> Array:
-        """Return signals ``known``, in the forms of `step`, as ``(rows, n_d)``.
-
-        Args:
-            known: one row, or at least ``least`` rows, by default all.
-            rows, least: numbers of rows.
-
-        Raises:
-            QPError: they are invalid, or missing.
-        """
-        names = self._design.plant.known
-        if not names and known is None:
-            return np.zeros((rows, 0))
-        if known is None:
-            remedy = "Pass a forecast of N + 1 rows, or one row that is held; an environment has "
-            remedy += "it in info['known']."
-            raise QPError.expected("known", "None", f"the signals {', '.join(names)}", remedy)
-        return self._read("known", known, rows, rows if least is None else least)
-
-    def read_set_points(self, r: Any, rows: int) -> Array:
-        """Return set-points ``r``, in the forms of `step`, as ``(rows, n_y)``.
-
-        Raises:
-            QPError: they are invalid, or None in the first step.
-        """
-        outputs = self._design.plant.outputs
-        if r is None and not len(self.r) and self._design.Q.any():
-            want = f"set-points of {', '.join(outputs)}"
-            raise QPError.expected("r", "None in the first step", want)
-        if r is None:
-            r = self.r if len(self.r) else np.zeros(len(outputs))
-        return self._read("r", r, rows)
-
-    def _read(self, name: str, value: Any, rows: int, least: int = 1) -> Array:
-        """Return rows of y, r or known signals, none of them above `most`."""
-        plant, known = self._design.plant, name == "known"
-        names = plant.known if known else plant.outputs
-        table = read_table(name, value, names, rows, least)
-        if (above := np.abs(table) > self.most[known]).any():
-            k, i = np.argwhere(above)[0]
-            got = f"{table[k, i]:g} of {names[i]}"
-            want = f"at most {self.most[known][i]:.3g} in size"
-            remedy = f"If it is no error, measure {names[i]} in a larger unit."
-            raise QPError.expected(name, got, want, remedy)
-        return table
-
-
-def _deviations(name: str, value: Any, default: Array, names: tuple[str, ...]) -> Array:
-    """Read standard deviations, which must be positive."""
-    if value is None:
-        return default
-    vector = read_vector(name, value, names, 0.0)
-    if not ((vector > 0) & np.isfinite(vector)).all():
-        got = ", ".join(f"{x:g} of {key}" for key, x in zip(names, vector, strict=True))
-        raise QPError.expected(name, got, "a standard deviation > 0 of each")
-    return vector
+        law, options = self._law.renewed(), {"dtype": dtype, "name": name, "storage": storage}
+        return export_controller(
+            law, self._memory, folder, max_iterations=max_iterations, **options
+        )

@@ -12,11 +12,12 @@ import torch
 
 from torch_qpmpc.checks import check_choice, check_number, check_whole
 from torch_qpmpc.control.disturbance import Disturbances, choose
+from torch_qpmpc.control.signals import read_vector
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.control.steady import Steady
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import read_blocks
-from torch_qpmpc.mpc.validation import as_tensor, check_weight, read_numbers
+from torch_qpmpc.mpc.validation import as_tensor, check_weight
 
 REFERENCES = ("held", "preview")
 
@@ -115,6 +116,11 @@ def half_range(bounds: tuple[Array, Array]) -> Array:
     return np.where(np.isfinite(half) & (half > 0), half, 1.0)
 
 
+def largest(bounds: tuple[Array, Array] | Array) -> Array:
+    """Return the largest size of finite bounds, and zero where there is none."""
+    return np.where(np.isfinite(bounds), np.abs(bounds), 0.0).max(0)
+
+
 def middle(bounds: tuple[Array, Array]) -> Array:
     """Return the middle of the bounds, and zero where there is none."""
     return np.where(np.isfinite(bounds).all(0), bounds, 0.0).mean(0)
@@ -188,20 +194,6 @@ def _prices(linear: Mapping[str, str | float] | None, plant: StateSpace) -> dict
             got, want = f"{price!r}, which acts on the plant", "a price with a column of zeros in E"
             raise QPError.expected("linear", got, want, "Pass the signal twice.")
     return dict(linear or {})
-
-
-def read_vector(name: str, value: Any, names: Sequence[str], missing: float) -> Array:
-    """Read one number for each name, from a number, a vector or a mapping."""
-    if isinstance(value, Mapping):
-        if unknown := sorted({*value} - {*names}):
-            raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
-        value = [value.get(x, missing) for x in names]
-    vector = read_numbers(name, value).numpy()
-    vector = np.full(len(names), float(vector)) if vector.ndim == 0 else vector.copy()
-    if vector.shape != (len(names),) or np.isnan(vector).any():
-        want = f"a number, or one for each of {', '.join(names)}"
-        raise QPError.expected(name, f"shape {vector.shape} or NaN", want)
-    return vector
 
 
 def _weight(name: str, value: Any, names: Sequence[str]) -> Array:

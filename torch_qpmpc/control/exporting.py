@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import copy
 import ctypes
 import math
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from torch_qpmpc.control.controller import Controller
-from torch_qpmpc.control.design import half_range
+from torch_qpmpc.control.design import half_range, largest
 from torch_qpmpc.control.disturbance import RANK
-from torch_qpmpc.control.probe import at_rest, centre
-from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.control.law import Law, Memory, Signals
+from torch_qpmpc.control.linear_mpc import LinearMPC
+from torch_qpmpc.control.simulation import Course, at_rest, centre, held_known, own_loop
+from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, check_name, export_c
 from torch_qpmpc.export.library import FLAGS, compiled, compiler
@@ -123,17 +124,18 @@ class CompiledController:
         code = self._step(self._state.ctypes.data, *pointers, self._u.ctypes.data)
         return self._u.astype(np.float64), int(code)
 
-    def solved(self, y: Any, r: Any, known: Any) -> Array:
-        """Return the input of a step, NaN if its code is not 0."""
-        u, code = self.step(y, r, known)
-        return np.where(code == 0, u, np.nan)
+    def policy(self, signals: Signals) -> Any:
+        """Return the move of a step, with a NaN input if its code is not 0."""
+        u, code = self.step(*signals)
+        return SimpleNamespace(u=np.where(code == 0, u, np.nan))
 
     def _numbers(self, *signals: Any) -> list[Any]:
         return [None if x is None else np.array(x, self._dtype, order="C") for x in signals]
 
 
 def export_controller(
-    controller: Controller,
+    law: Law,
+    memory: Memory,
     folder: str | Path,
     *,
     dtype: str,
@@ -144,8 +146,8 @@ def export_controller(
     """Write a controller as C; see `Controller.export_c`."""
     check_name(name)
     options = {"dtype": dtype, "max_iterations": max_iterations, "storage": storage}
-    mpc, plant = controller.mpc, controller.mpc.design.plant
-    if names := undetermined(controller):
+    mpc, known = law.mpc, held_known(law.design, memory)
+    if names := undetermined(mpc):
         got = f"bounds of {names}, which inputs move that no output with a weight tells apart"
         want = "bounds that the set-point determines"
         raise QPError.expected("controller", got, want, WEIGHT.format(names))
@@ -157,18 +159,21 @@ def export_controller(
             free = export_c(mpc.free, temporary, name=f"{name}_free", **options)
         reports = [plan, target, *([free] if free else [])]
         texts = {x.name: x.read_text(encoding="utf-8") for part in reports for x in part.files}
-    loop = _run(controller, copy.copy(controller), COMPARED)
-    texts |= _sources(controller, name, dtype, loop)
+    course, start = _course(law, known)
+    loop = _run(law, course, start, law.policy(law.begun(start)), COMPARED)
+    texts |= _sources(law, name, dtype, loop)
     state_bytes = difference = None
     if compiler() is not None:
-        library = CompiledController(texts, name, dtype, len(plant.inputs))
-        state_bytes, own = library.state_bytes, _run(controller, library, len(loop.u))
+        library = CompiledController(texts, name, dtype, len(start))
+        library.reset(u=start)
+        state_bytes = library.state_bytes
+        own = _run(law, course, start, library.policy, len(loop.u))
         difference = np.abs(own.u - loop.u).max(0)
         near = NEAR[dtype] * half_range(mpc.design.u_bounds)
         if (failed := library.selftest()) or not (difference <= near).all():
             got = f"{dtype!r}, with a failed self-test ({failed}) or inputs off by {difference}"
             raise QPError.expected("dtype", got, "a controller that agrees", "Export float64.")
-    example = {"main.c": _main(controller, name, dtype), "Makefile": filled("controller.mk", name)}
+    example = {"main.c": _main(law, memory, name, dtype), "Makefile": filled("controller.mk", name)}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for file, text in texts.items():
@@ -186,94 +191,92 @@ def export_controller(
         plan,
         target,
         free,
-        sum(part.table_bytes for part in reports) + own_bytes(controller, dtype)[0],
+        sum(part.table_bytes for part in reports) + own_bytes(law, dtype)[0],
         state_bytes,
         len(loop.u),
         None if difference is None else float(difference.max()),
     )
 
 
-def undetermined(controller: Controller) -> str:
-    """Return the names of the outputs with bounds that are not exact in C.
+def undetermined(mpc: LinearMPC) -> str:
+    """Return the names of outputs with bounds that inputs move which the set-points leave free.
 
-    Inputs that the set-points leave free move them.
+    The choice of these inputs is not exact in C.
     """
-    mpc, steady = controller.mpc, controller.mpc.design.steady
+    steady = mpc.design.steady
     if not (len(steady.W) and steady.n_a and mpc.free is None):
         return ""  # else 1 / PREFERENCE is the QP's condition
     moved = np.abs(steady.Y[:, steady.n_a :]).max(-1) > RANK
     return ", ".join(np.array(mpc.design.plant.outputs)[moved & mpc.design.bounded[0]])
 
 
-def own_bytes(controller: Controller, dtype: str) -> tuple[int, int]:
-    """Return the sizes of a controller's tables and state in C without those of its QPs."""
-    real, size = np.dtype(dtype).itemsize, _sizes(controller)
+def own_bytes(law: Law, dtype: str) -> tuple[int, int]:
+    """Return the bytes of a controller's tables and state in C without its QPs."""
+    real, size = np.dtype(dtype).itemsize, _sizes(law)
     reals = size["N_E"] + size["N_X"] + 2 * size["N_U"] + (size["SET_POINTS"] + 2) * size["N_Y"]
-    reals += size["N_D_"] + controller.mpc.n_p
-    tables = sum(x.size for x in _tables(controller, dtype).values())
+    reals += size["N_D_"] + law.mpc.n_p
+    tables = sum(x.size for x in _tables(law, dtype).values())
     return tables * real, (reals + 1) * real  # the state ends with an int
 
 
-def _run(controller: Controller, twin: Controller | CompiledController, steps: int) -> Loop:
-    """Return signals of a closed loop of ``twin``, with noise, a load and moving set-points.
+def _course(law: Law, known: Array) -> tuple[Course, Array]:
+    """Return a course with noise, a load and moving set-points, and the input that it starts with.
 
-    It starts at rest near `centre`, and ends early where no input satisfies the hard bounds or y is
-    above `Controller.most`. Each controller closes a loop of its own: replaying outputs through an
-    unstable controller would measure rounding alone.
+    It starts at rest near `centre`.
     """
-    rng, design = np.random.default_rng(0), controller.mpc.design
-    plant, rows = design.plant, COMPARED + design.horizon + 1
+    rng, design = np.random.default_rng(0), law.design
+    stages, rows = design.horizon + 1, COMPARED + design.horizon + 1
     size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
-    x, start, level = at_rest(controller)
-    d = level + 0.1 * rng.normal(size=(rows, len(plant.known)))
-    middle_y, loop = centre(controller), []
-    twin.reset(u=start)
-    step = twin.step if isinstance(twin, Controller) else twin.solved
-    for k in range(steps):
-        y = plant.C @ x + 0.01 * size_y * rng.normal(size=len(size_y))
-        r, known = middle_y + moves[k:] * size_y, d[k:]
-        r, known = (x[: design.horizon + 1] for x in (r, known))
-        r = r if design.references == "preview" else r[:1]
-        try:
-            u = step(y, r, known)
-        except (QPError, SolverError):  # an unstable loop's y is above controller.most
-            if loop:
-                break
-            raise
-        loop.append((y, r, known, u))
-        x = plant.A @ x + plant.B @ (u + 0.05 * size_u) + plant.E @ known[0] + plant.offset
-    y, r, known, u = map(np.array, zip(*loop, strict=True))
+    x, start = at_rest(law.mpc, known)
+    d = known + 0.1 * rng.normal(size=(rows, len(known)))
+    noise = 0.01 * size_y * rng.normal(size=(COMPARED + 1, len(size_y)))
+    r = centre(design, known) + moves * size_y
+    ahead = np.arange(COMPARED + 1)[:, None] + np.arange(stages)
+    previewed = ahead if design.references == "preview" else ahead[:, :1]
+    return Course(x, 0.05 * size_u, noise, r[previewed], d[ahead]), start
+
+
+def _run(law: Law, course: Course, start: Array, policy: Any, steps: int) -> Loop:
+    """Return the loop of a policy.
+
+    Each policy closes a loop of its own: replaying outputs through an unstable controller would
+    measure rounding alone.
+
+    Raises:
+        SolverError: no input satisfies the hard bounds in the first step.
+    """
+    rows = [(*signals, move.u) for signals, move in own_loop(law, course, policy, steps)]
+    if not rows:
+        raise SolverError("No input satisfies the hard bounds at rest.")
+    y, r, known, u = map(np.array, zip(*rows, strict=True))
     return Loop(y, r, known, u, start[None])
 
 
-def _replayed(controller: Controller, loop: Loop, dtype: str) -> Loop:
-    """Return the first steps of a loop, as long as rounded outputs give nearly the same inputs.
+def _replayed(law: Law, loop: Loop, dtype: str) -> Loop:
+    """Return the first steps of a loop, while rounded outputs give nearly the same inputs.
 
     A controller that is unstable on its own enlarges rounding as its inputs move no plant here.
     """
-    design = controller.mpc.design
     rounding = 8 * np.finfo(dtype).eps * np.random.default_rng(0).choice([-1, 1], loop.y.shape)
-    near = 0.01 * NEAR[dtype] * half_range(design.u_bounds)
-    twin = copy.copy(controller)
-    twin.reset(u=loop.start[0])
+    near = 0.01 * NEAR[dtype] * half_range(law.design.u_bounds)
+    policy = law.policy(law.begun(loop.start[0]))
     for k, (y, r, known, u) in enumerate(zip(*loop[:4], strict=True)):
         try:
-            off = np.abs(twin.step(y * (1 + rounding[k]), r, known) - u)
+            off = np.abs(policy(Signals(y * (1 + rounding[k]), r, known)).u - u)
         except SolverError:  # at the edge of hard bounds
             off = np.full_like(u, np.inf)
         if k == REPLAYED or (k and (off > near).any()):
-            y, r, known, u = (part[:k] for part in loop[:4])
-            return Loop(y, r, known, u, loop.start)
+            return Loop(loop.y[:k], loop.r[:k], loop.known[:k], loop.u[:k], loop.start)
     return loop
 
 
-def _sources(controller: Controller, name: str, dtype: str, loop: Loop) -> dict[str, str]:
+def _sources(law: Law, name: str, dtype: str, loop: Loop) -> dict[str, str]:
     """Return the texts of ``name.h`` and ``name.c``."""
-    design = controller.mpc.design
-    sizes = {f"{name.upper()}_{key}": size for key, size in _sizes(controller).items()}
+    design = law.design
+    sizes = {f"{name.upper()}_{key}": size for key, size in _sizes(law).items()}
     defined = "\n".join(f"#define {key} {size}" for key, size in sizes.items())
-    tables = [array(key, x, dtype) for key, x in _tables(controller, dtype).items()]
+    tables = [array(key, x, dtype) for key, x in _tables(law, dtype).items()]
     indices = {
         f"OF_{key}": np.flatnonzero(mask) for key, mask in zip("YU", design.bounded, strict=True)
     }
@@ -281,14 +284,14 @@ def _sources(controller: Controller, name: str, dtype: str, loop: Loop) -> dict[
         f"static const int {key}[] = {{{', '.join(map(str, x)) or 0}}};"
         for key, x in indices.items()
     ]
-    replayed = _replayed(controller, loop, dtype)
+    replayed = _replayed(law, loop, dtype)
     examples = {
         f"EXAMPLE_{key.upper()}": x.reshape(len(x), math.prod(x.shape[1:]))
         for key, x in replayed._asdict().items()
     }
     examples["NEAR_U"] = NEAR[dtype] * half_range(design.u_bounds)
     parts = {
-        "/* @HEADER@ */": comment(_signals(controller, name)),
+        "/* @HEADER@ */": comment(_signals(law.design.plant, name)),
         "/* @SIZES@ */": defined,
         "/* @TABLES@ */": "\n".join([f"#define BIG {CONSTANTS[dtype]['BIG']}", *tables]),
         "/* @EXAMPLES@ */": "\n".join(
@@ -301,9 +304,8 @@ def _sources(controller: Controller, name: str, dtype: str, loop: Loop) -> dict[
     return {f"{name}.{end}": filled(f"controller.{end}", name, parts) for end in "hc"}
 
 
-def _signals(controller: Controller, name: str) -> list[str]:
+def _signals(plant: StateSpace, name: str) -> list[str]:
     """Describe the entries of y, r, known and u."""
-    plant = controller.mpc.design.plant
     every = "" if plant.dt is None else f", a step every {plant.dt:g}"
     groups = {"y and r": plant.outputs, "known": plant.known, "u": plant.inputs}
     return [
@@ -312,15 +314,15 @@ def _signals(controller: Controller, name: str) -> list[str]:
     ]
 
 
-def _sizes(controller: Controller) -> dict[str, int]:
-    design, observer = controller.mpc.design, controller.observer
+def _sizes(law: Law) -> dict[str, int]:
+    design, observer, free = law.design, law.observer, law.mpc.free
     n, m, n_y, n_d = design.plant.sizes
     width = {key: place.stop - place.start for key, place in design.places.items()}
     stages = design.horizon + 1
     return {
         "N_X": n,
         "N_W": len(observer.F) - n,
-        "N_F": 0 if controller.mpc.free is None else controller.mpc.free.n_u,
+        "N_F": 0 if free is None else free.n_u,
         "N_E": len(observer.F),
         "N_U": m,
         "N_Y": n_y,
@@ -336,25 +338,24 @@ def _sizes(controller: Controller) -> dict[str, int]:
     }
 
 
-def _tables(controller: Controller, dtype: str) -> dict[str, Array]:
+def _tables(law: Law, dtype: str) -> dict[str, Array]:
     """Return the constant arrays by their names in C."""
-    design, observer = controller.mpc.design, controller.observer
-    steady = design.steady
+    design, steady = law.design, law.design.steady
     return {
-        **{key.upper(): x for key, x in observer._asdict().items()},
+        **{key.upper(): x for key, x in law.observer._asdict().items()},
         **{f"{key}_V": getattr(steady, key) for key in "XUY"},
         **{f"{key.upper()}_L": getattr(steady, key) for key in "xuy"},
         "ACTS": design.plant.E.any(0).astype(float),
         "U_LOWER": design.u_bounds[0],
         "U_UPPER": design.u_bounds[1],
-        **dict(zip(("MOVE_LOWER", "MOVE_UPPER"), _moves(controller, dtype), strict=True)),
-        **dict(zip(("MOST_Y", "MOST_KNOWN"), controller.most, strict=True)),
+        **dict(zip(("MOVE_LOWER", "MOVE_UPPER"), _moves(law.mpc, dtype), strict=True)),
+        **dict(zip(("MOST_Y", "MOST_KNOWN"), law.max_plausible, strict=True)),
     }
 
 
-def _moves(controller: Controller, dtype: str) -> Array:
+def _moves(mpc: LinearMPC, dtype: str) -> Array:
     """Return the plan's bounds of the first move, ``(2, m)``, with room for rounding."""
-    mpc, design = controller.mpc, controller.mpc.design
+    design = mpc.design
     m, last = design.plant.sizes[1], design.places["u_last"].start - design.places["known"].stop
     bounds = np.outer([-np.inf, np.inf], np.ones(m))
     qp = mpc.quadratic_program()
@@ -364,34 +365,30 @@ def _moves(controller: Controller, dtype: str) -> Array:
         row[[mpc.n_p - mpc.n_x + last + i, mpc.n_p + i]] = -1, 1
         for k in np.flatnonzero((row == G).all(1)):
             bounds[:, i] = [side[k] for side in sides]
-
-    def largest(pair: Array) -> Array:
-        return np.where(np.isfinite(pair), np.abs(pair), 0.0).max(0)
-
     size = largest(bounds)
     size = np.where(size > 0, size, half_range(design.u_bounds))
-    room = NEAR[dtype] * size + 4 * np.finfo(dtype).eps * largest(np.array(design.u_bounds))
+    room = NEAR[dtype] * size + 4 * np.finfo(dtype).eps * largest(design.u_bounds)
     return bounds + np.array([[-1], [1]]) * room
 
 
-def _main(controller: Controller, name: str, dtype: str) -> str:
+def _main(law: Law, memory: Memory, name: str, dtype: str) -> str:
     """Return a program of the closed loop with the model and a load.
 
     It starts from the last reset's rest, or `at_rest`, and moves to the last set-point or one near.
     """
-    design = controller.mpc.design
-    plant, sizes = design.plant, _sizes(controller)
-    x, u, known = at_rest(controller)
+    design, known = law.design, held_known(law.design, memory)
+    plant, sizes = design.plant, _sizes(law)
+    x, u = at_rest(law.mpc, known)
     load = 0.1 * plant.B @ half_range(design.u_bounds) + plant.E @ known + plant.offset
-    middle_y, (y_rest, u_rest) = centre(controller), controller.rest
+    middle_y, (y_rest, u_rest) = centre(design, known), memory.rest
     if y_rest is not None or u_rest is not None:
         u = np.clip(np.zeros(len(u)), *design.u_bounds) if u_rest is None else u_rest
         x = plant.at_rest(u, known, y_rest)
         middle_y = plant.C @ x
     r = middle_y + 0.25 * half_range(design.y_bounds)
-    r = np.tile(controller.mpc.target(r, known=known).y.numpy(), (sizes["SET_POINTS"], 1))
-    if len(controller.r):
-        r = controller.read_set_points(None, sizes["SET_POINTS"])
+    r = np.tile(law.mpc.target(r, known=known).y.numpy(), (sizes["SET_POINTS"], 1))
+    if len(memory.r):
+        r = law.read_set_points(None, sizes["SET_POINTS"], memory.r)
     arrays = {
         "A": plant.A,
         "B": plant.B,

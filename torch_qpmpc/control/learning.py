@@ -17,12 +17,13 @@ import torch
 from tqdm import tqdm
 
 from torch_qpmpc.checks import check_seed, check_whole
-from torch_qpmpc.control.controller import Controller
-from torch_qpmpc.control.design import half_range, read_vector
+from torch_qpmpc.control.design import Design, half_range
 from torch_qpmpc.control.disturbance import choose
+from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import lowered
 from torch_qpmpc.control.observer import SMALL
+from torch_qpmpc.control.signals import read_vector
 from torch_qpmpc.control.simulation import Run, simulate
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model
 from torch_qpmpc.control.steady import Steady
@@ -89,7 +90,8 @@ class LearningReport:
 
 
 def learn(
-    controller: Controller,
+    law: Law,
+    memory: Memory,
     source: Any,
     transitions: int,
     *,
@@ -99,21 +101,23 @@ def learn(
     steps: int = 100,
     pairs: int = 64,
     seed: int = 0,
-) -> tuple[LearningReport, Controller]:
-    """Return the report and the candidate; see `Controller.learn`."""
+) -> tuple[LearningReport, Law]:
+    """Return the report and the law with the new model; see `Controller.learn`."""
     check_whole("transitions", transitions, 1)
     check_whole("steps", steps, 1)
     check_whole("pairs", pairs, FEWEST)
     check_seed(seed)
     if hasattr(source, "reset"):
-        plant = _environment(controller, source, r, known, spread, steps)
-        log = _gathered(controller, plant, -(-transitions // steps), steps, seed)
+        middle = law.read_set_points(r, 1, memory.r)[0]
+        plant = _environment(law.design, source, middle, known, spread, steps)
+        log = _gathered(law, memory, plant, -(-transitions // steps), steps, seed)
     else:
-        log, held = _parts(as_log(source), controller)
-        plant = _model(controller, held, r, spread, steps)
-    model = _identified(log, controller)
-    candidate = _with_model(controller, model)
-    test, costs = _compare(controller, candidate, plant, steps, pairs, seed)
+        log, held = _parts(as_log(source), law.design.plant)
+        middle = None if r is None else law.read_set_points(r, 1, memory.r)[0]
+        plant = _model(law.design, held, middle, spread, steps)
+    model = _identified(log, law.design.plant)
+    candidate = _with_model(law, model)
+    test, costs = _compare(law, candidate, memory, plant, steps, pairs, seed)
     before, after = np.mean(costs, axis=0)
     report = LearningReport(
         test.decision == "better",
@@ -130,38 +134,35 @@ def learn(
 
 
 def _environment(
-    controller: Controller, env: Any, r: Any, known: Any, spread: Any, steps: int
+    design: Design, env: Any, middle: Array, known: Any, spread: Any, steps: int
 ) -> Plant:
-    """Return loops with an environment, with set-points about r."""
-    design = controller.mpc.design
-    middle = controller.read_set_points(r, 1)[0]
-    size = _sizes(controller, spread, SMALL * half_range(design.y_bounds))
+    """Return loops with an environment, with set-points about the middle."""
+    size = _sizes(design, spread, SMALL * half_range(design.y_bounds))
 
     def options(rng: np.random.Generator) -> dict[str, Any]:
-        return {"known": known, "r": _levels(controller, middle, size, steps, rng)}
+        return {"known": known, "r": _levels(design, middle, size, steps, rng)}
 
     return Plant("the environment", env, options)
 
 
-def _model(controller: Controller, held: Log, r: Any, spread: Any, steps: int) -> Plant:
+def _model(design: Design, held: Log, middle: Any, spread: Any, steps: int) -> Plant:
     """Return loops with a model of a part of a log, at its levels, with its known signals."""
-    identified = _identified(held, controller)
+    identified = _identified(held, design.plant)
     y, d = (torch.cat(part).numpy() for part in list(zip(*held.trajectories, strict=True))[::2])
-    middle = y.mean(0) if r is None else controller.read_set_points(r, 1)[0]
-    middle = np.clip(middle, *controller.mpc.design.y_bounds)
-    size = _sizes(controller, spread, y.std(0))
+    middle = np.clip(y.mean(0) if middle is None else middle, *design.y_bounds)
+    size = _sizes(design, spread, y.std(0))
     noise = identified.covariance.diagonal().sqrt().nan_to_num().numpy()
 
-    model = _state_space(identified, controller)
+    model = _state_space(identified, design)
     n, m, n_y, _ = model.sizes
     balance = np.block([[np.eye(n) - model.A, -model.B], [model.C, np.zeros((n_y, m))]])
     loads = np.concatenate((model.E @ d.mean(0) + model.offset, middle))
     x, u = np.split(np.linalg.lstsq(balance, loads, rcond=None)[0], [n])  # at rest in the middle
-    rest = {"x": x, "u": np.clip(u, *controller.mpc.design.u_bounds)}
+    rest = {"x": x, "u": np.clip(u, *design.u_bounds)}
     ends = len(d) - 1
 
     def options(rng: np.random.Generator) -> dict[str, Any]:
-        levels = _levels(controller, middle, size, steps, rng)
+        levels = _levels(design, middle, size, steps, rng)
         start = int(rng.integers(max(len(d) - steps, 1)))
         known = d[np.minimum(start + np.arange(steps), ends)]
         return {"known": known, "r": levels, "noise": noise, **rest}
@@ -169,44 +170,42 @@ def _model(controller: Controller, held: Log, r: Any, spread: Any, steps: int) -
     return Plant("a model of the log's last third", model, options)
 
 
-def _sizes(controller: Controller, spread: Any, default: Array) -> Array:
+def _sizes(design: Design, spread: Any, default: Array) -> Array:
     if spread is None:
         return default
-    size = read_vector("spread", spread, controller.mpc.design.plant.outputs, 0.0)
+    size = read_vector("spread", spread, design.plant.outputs, 0.0)
     if not ((size > 0).any() and (size >= 0).all() and np.isfinite(size).all()):
         raise QPError.expected("spread", f"{size.tolist()}", "distances >= 0, not all of them 0")
     return size
 
 
 def _levels(
-    controller: Controller, middle: Array, size: Array, steps: int, rng: np.random.Generator
+    design: Design, middle: Array, size: Array, steps: int, rng: np.random.Generator
 ) -> Array:
     """Return rows of set-points within the bounds, each level held for half a horizon."""
-    design = controller.mpc.design
     hold = max(design.horizon // 2, 1)
     levels = middle + size * rng.uniform(-1, 1, (-(-steps // hold), len(middle)))
     return np.clip(levels, *design.y_bounds).repeat(hold, axis=0)
 
 
-def _gathered(controller: Controller, plant: Plant, loops: int, steps: int, seed: int) -> Log:
-    """Return closed loops of the controller with moving set-points as a log."""
+def _gathered(law: Law, memory: Memory, plant: Plant, loops: int, steps: int, seed: int) -> Log:
+    """Return closed loops with moving set-points as a log."""
     bar = tqdm(range(loops), "transitions", unit="loop", leave=False, disable=None)
-    runs = [_run(controller, plant, steps, (seed, 0, k)) for k in bar]
+    runs = [_run(law, memory, plant, steps, (seed, 0, k)) for k in bar]
     parts = ([torch.from_numpy(x) for x in (run.y, run.u, run.known)] for run in runs)
-    model = controller.mpc.design.plant
+    model = law.design.plant
     names = model.outputs, model.inputs, model.known
     return Log([Trajectory(*part) for part in parts], *names, model.units, model.dt)
 
 
-def _run(controller: Controller, plant: Plant, steps: int, entropy: tuple[int, ...]) -> Run:
+def _run(law: Law, memory: Memory, plant: Plant, steps: int, entropy: tuple[int, ...]) -> Run:
     rng = np.random.default_rng(entropy)
     seed = int(rng.integers(2**31))
-    return simulate(controller, plant.plant, steps, seed=seed, **plant.options(rng))
+    return simulate(law, memory, plant.plant, steps, seed=seed, **plant.options(rng))
 
 
-def _parts(log: Log, controller: Controller) -> tuple[Log, Log]:
+def _parts(log: Log, plant: StateSpace) -> tuple[Log, Log]:
     """Return the beginning of a log and the part that is held out."""
-    plant = controller.mpc.design.plant
     for kind in ("outputs", "inputs", "known"):
         got, want = getattr(log, kind), getattr(plant, kind)
         if got != want:
@@ -220,9 +219,8 @@ def _parts(log: Log, controller: Controller) -> tuple[Log, Log]:
     return replace(log, trajectories=first), replace(log, trajectories=held)
 
 
-def _identified(log: Log, controller: Controller) -> Identified:
+def _identified(log: Log, plant: StateSpace) -> Identified:
     """Fit an ARX model of as many lags as the state has outputs."""
-    plant = controller.mpc.design.plant
     d = torch.cat([trajectory.d for trajectory in log.trajectories])
     for name, column, acts in zip(plant.known, d.mT, np.any(plant.E, axis=0), strict=True):
         if acts and column.std() <= STILL * column.abs().max():
@@ -232,40 +230,35 @@ def _identified(log: Log, controller: Controller) -> Identified:
     return identify(log, 1, past=-(-n // n_y), structure="tied")
 
 
-def _state_space(model: Identified, controller: Controller) -> StateSpace:
-    return read_model(model, prices=controller.mpc.design.linear.values())
+def _state_space(model: Identified, design: Design) -> StateSpace:
+    return read_model(model, prices=design.linear.values())
 
 
-def _with_model(controller: Controller, model: Identified) -> Controller:
-    """Return the controller with another model."""
-    mpc, old = controller.mpc, controller.mpc.design
-    plant = _state_space(model, controller)
+def _with_model(law: Law, model: Identified) -> Law:
+    """Return the law with another model."""
+    old = law.design
+    plant = _state_space(model, old)
     w = choose(plant, "auto" if old.disturbances.names else None)
     steady = Steady.of(plant, w, old.Q, old.R)
     design = replace(old, plant=plant, disturbances=w, steady=steady)
-    mpc = LinearMPC(lowered(design), **{name: mpc.arguments[name] for name in KEYWORDS})
-    drift = controller._drift if w.names == old.disturbances.names else None
-    options = {"noise": controller._noise, "drift": drift, "window": controller._window}
-    candidate = Controller(mpc, **options)
-    candidate.reset(u=controller.u)
-    for name in ("r", "rest", "known"):
-        setattr(candidate, name, getattr(controller, name))
-    return candidate
+    mpc = LinearMPC(lowered(design), **{name: law.mpc.arguments[name] for name in KEYWORDS})
+    drift = law.drift if w.names == old.disturbances.names else None
+    return Law.of(mpc, law.noise, drift, law.window)
 
 
 def _compare(
-    old: Controller, new: Controller, plant: Plant, steps: int, pairs: int, seed: int
+    old: Law, new: Law, memory: Memory, plant: Plant, steps: int, pairs: int, seed: int
 ) -> tuple[PairedTest, list[tuple[float, float]]]:
     """Return the test of pairs of closed loops, and the costs of each.
 
-    Weights of inputs are about the old controller's targets in both.
+    Both pay weights of inputs about the old law's targets.
     """
     test, costs = PairedTest(), []
     for k in tqdm(range(pairs), "comparison", unit="pair", leave=False, disable=None):
-        run = _run(old, plant, steps, (seed, 1, k))
+        run = _run(old, memory, plant, steps, (seed, 1, k))
         before = run.cost.sum()
         try:
-            after = _run(new, plant, steps, (seed, 1, k)).costs(run.u_s).sum()
+            after = _run(new, memory, plant, steps, (seed, 1, k)).costs(run.u_s).sum()
         except (QPError, SolverError):  # no plan, or outputs that overflow
             after = math.inf
         costs.append((before, after))

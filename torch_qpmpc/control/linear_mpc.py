@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torch_qpmpc.control.design import Design, read_design
+from torch_qpmpc.control.disturbance import Disturbances
 from torch_qpmpc.control.lowering import LinearScheme, lowered
-from torch_qpmpc.control.state_space import read_model
-from torch_qpmpc.control.stored import read_stored, stored_design
+from torch_qpmpc.control.state_space import StateSpace, read_model
+from torch_qpmpc.control.steady import Steady
 from torch_qpmpc.control.target import free_mpc, target_mpc
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
@@ -297,3 +300,41 @@ class LinearMPC(QPMPC):
 
 def _shifted(place: slice, by: int) -> slice:
     return slice(place.start + by, place.stop + by)
+
+
+def stored_design(design: Design) -> dict[str, Any]:
+    """Return a design without the steady states, which follow from the rest."""
+    content = packed(design)
+    del content["steady"]
+    return content
+
+
+def read_stored(content: Mapping[str, Any]) -> Design:
+    """Return the design that `stored_design` made ``content`` of."""
+    parts = unpacked(content)
+    parts["plant"] = StateSpace(**parts["plant"])
+    parts["disturbances"] = Disturbances(**parts["disturbances"])
+    of = (parts[name] for name in ("plant", "disturbances", "Q", "R"))
+    return Design(**parts, steady=Steady.of(*of))
+
+
+def packed(value: Any) -> Any:
+    """Return dataclasses and named tuples as dictionaries, and arrays as tensors."""
+    if is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    if isinstance(value, Mapping):
+        return {name: packed(part) for name, part in value.items()}
+    if isinstance(value, tuple):
+        return [packed(part) for part in value]
+    return torch.from_numpy(value.copy()) if isinstance(value, np.ndarray) else value
+
+
+def unpacked(value: Any) -> Any:
+    """Return tensors as arrays, and lists as tuples."""
+    if isinstance(value, Mapping):
+        return {name: unpacked(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return tuple(unpacked(part) for part in value)
+    return value.numpy() if isinstance(value, Tensor) else value

@@ -8,16 +8,16 @@ import numpy as np
 import scipy.linalg
 from scipy.linalg import block_diag
 
-from torch_qpmpc.control.design import Design, half_range
+from torch_qpmpc.control.design import Design, half_range, largest
 from torch_qpmpc.control.disturbance import RANK, check_observable
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
 
 #: Default standard deviations, relative to half of the bounds' distance.
 SMALL = 0.1
-#: A filter's mode this near to the unit circle is on it but for rounding.
+#: A filter's mode this near to the unit circle counts as on it.
 ON_CIRCLE = 1e-9
-#: Signals above so many times a usual size are no measurements: estimates would lose their digits.
+#: Signals above this multiple of a usual size are errors: estimates would lose their digits.
 ABSURD = 1e8
 
 
@@ -39,17 +39,26 @@ class Observer(NamedTuple):
     L: Array
     rest: Array
 
+    def predicted(self, e: Array, u: Array, d: Array) -> Array:
+        """Return the e after e with the input u and the known signals d."""
+        return self.F @ e + self.G @ u + self.E @ d + self.offset
+
+    def at_rest(self, u: Array, d: Array, y: Array) -> Array:
+        """Return the e that rests with u, d and y."""
+        still = -self.predicted(np.zeros(len(self.F)), u, d)
+        return self.rest @ np.concatenate((still, y))
+
 
 def kalman(design: Design, noise: Array, drift: Array) -> Observer:
     """Return the steady-state Kalman filter of a design's model.
 
-    Its noises are white: of each input, with a small part of the input's range as standard
-    deviation; of each output; and of the change of each disturbance in a step.
+    White noise acts on each input, with `SMALL` times its half range as standard deviation, on each
+    output, and on the change of each disturbance in a step.
 
     Args:
         design: the design.
         noise: standard deviations of the outputs' noise, ``(n_y,)``.
-        drift: those of the disturbances' changes, ``(n_w,)``.
+        drift: standard deviations of the disturbances' changes, ``(n_w,)``.
 
     Raises:
         QPError: the model has a mode that the outputs do not show, or that no input moves.
@@ -84,16 +93,20 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
     )
 
 
-def most(design: Design, noise: Array) -> tuple[Array, Array]:
-    """Return the largest sizes of outputs and of known signals that are believed.
+def max_plausible(design: Design, noise: Array) -> tuple[Array, Array]:
+    """Return the largest plausible sizes of outputs, ``(n_y,)``, and known signals, ``(n_d,)``.
 
-    They are `ABSURD` times a usual size. That of an output is the largest of its bounds, of half
-    their distance or one, of ``noise`` over `SMALL`, and of what the inputs of a step move it by
-    within the horizon; that of a known signal is one, or what moves the state as much as the inputs
-    do if that is more. Known signals that move no state are not limited.
+    They are `ABSURD` times a usual size. An output's is the largest of its bounds, their half range
+    or one, ``noise`` over `SMALL`, and its response to a step of the inputs within the horizon. A
+    known signal's is one, or the size that moves the state as the inputs do if that is more. Known
+    signals that move no state are not limited.
     """
-    plant, x = design.plant, design.plant.B * _largest(design.u_bounds)
-    usual, moved = np.maximum(_largest(design.y_bounds), noise / SMALL), np.linalg.norm(x)
+    sizes_y, sizes_u = (
+        np.maximum(largest(bounds), half_range(bounds))
+        for bounds in (design.y_bounds, design.u_bounds)
+    )
+    plant, x = design.plant, design.plant.B * sizes_u
+    usual, moved = np.maximum(sizes_y, noise / SMALL), np.linalg.norm(x)
     for _ in range(design.horizon):
         usual = np.maximum(usual, np.abs(plant.C @ x).max(1))
         x = plant.A @ x
@@ -103,21 +116,15 @@ def most(design: Design, noise: Array) -> tuple[Array, Array]:
     return ABSURD * usual, ABSURD * known
 
 
-def _largest(bounds: tuple[Array, Array]) -> Array:
-    """Return the largest size of finite bounds, and their half range if that is more."""
-    sizes = np.where(np.isfinite(bounds), np.abs(bounds), 0.0).max(0)
-    return np.maximum(sizes, half_range(bounds))
-
-
 def windowed(observer: Observer) -> Observer:
-    """Return the observer whose estimate is the one that the last outputs and inputs determine.
+    """Return the observer whose estimate follows from the last q outputs and inputs alone.
 
-    Of q steps: those that have as many outputs as e has entries, L + 1 with a disturbance for each
-    output of an identification with L lags. Its gain is F^{q-1} O^{-1} [0; ..; I] with O = [H; H F;
-    ..; H F^{q-1}], which makes F - F L H nilpotent.
+    The outputs of q steps have as many entries as e: q = L + 1 with an identification's L lags and
+    a disturbance for each output. The gain is F^{q-1} O^{-1} [0; ..; I] with O = [H; H F; ..; H
+    F^{q-1}], which makes F - F L H nilpotent.
 
     Raises:
-        QPError: outputs of so many steps do not determine e.
+        QPError: the outputs of q steps do not determine e.
     """
     F, H = observer.F, observer.H
     n_y, steps = len(H), len(F) // len(H)

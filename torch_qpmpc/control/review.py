@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.optimize
 import torch
 
 from torch_qpmpc.checks import check_kind
-from torch_qpmpc.control.controller import Controller
-from torch_qpmpc.control.design import half_range, middle
+from torch_qpmpc.control.design import Design, half_range, middle
 from torch_qpmpc.control.disturbance import unseen_modes
 from torch_qpmpc.control.exporting import WEIGHT, own_bytes, undetermined
 from torch_qpmpc.control.findings import Finding, Review
-from torch_qpmpc.control.linear_mpc import Target
-from torch_qpmpc.control.loop import LinearLoop
+from torch_qpmpc.control.law import Law, Memory
+from torch_qpmpc.control.linear_loop import LinearLoop
+from torch_qpmpc.control.linear_mpc import LinearMPC, Target
 from torch_qpmpc.control.lowering import riccati
 from torch_qpmpc.control.observer import kalman
-from torch_qpmpc.control.probe import held_known, probe
+from torch_qpmpc.control.simulation import held_known, probe
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.tables import SINGULAR, Tables, digest, make_tables
@@ -50,60 +49,60 @@ LARGEST = 2.0
 
 
 def review(
-    controller: Controller,
+    law: Law,
+    memory: Memory,
     r: Any = None,
     known: Any = None,
     proofs: Mapping[str, Answer] | None = None,
 ) -> Review:
     """Return the findings about a controller; see `Controller.review`."""
-    mpc, controller = controller.mpc, copy.copy(controller)
+    mpc, design, r_last = law.mpc, law.design, memory.r
     if r is not None:
-        controller.r = controller.read_set_points(r, 1)
-    if known is not None:
-        controller.known = controller.read_known(known, 1)[0]
-    checks: list[Callable[[Controller], Finding]] = [
-        _terminal,
-        _gains,
-        _horizon,
-        _disturbances,
-        _scaling,
-        _hard_rows,
-        _set_points,
+        r_last = law.read_set_points(r, 1, memory.r)
+    assumed = known is None and memory.known is None
+    known = held_known(design, memory) if known is None else law.read_known(known, 1)[0]
+    cost = _cost(mpc)
+    findings = [
+        cost,
+        _terminal(design),
+        _gains(design),
+        _horizon(design),
+        _disturbances(design),
+        _scaling(design),
+        _hard_rows(mpc, r_last, known),
+        _set_points(Setting(mpc, law.estimates(memory)[1], known), r_last, assumed),
     ]
-    cost = _cost(controller)
-    findings = [cost, *(check(controller) for check in checks)]
     qp = digest(mpc.quadratic_program())
     claims = [_proof(name, answer, qp) for name, answer in (proofs or {}).items()]
     if not cost.ok:
         return Review([*findings, *claims])
     plan, target = make_tables(mpc), make_tables(mpc.targets)
     qps = [plan, target, *([] if mpc.free is None else [make_tables(mpc.free)])]
-    loop = LinearLoop.of(controller, plan, target)
+    loop = LinearLoop.of(mpc, law.observer, plan, target)
     findings.append(_condition(plan.condition, cost.numbers["largest"]))
-    findings.append(_stability(loop, mpc.design.gamma))
+    findings.append(_stability(loop, design.gamma))
     if loop.radius < 1:
-        findings += [_margin(loop, controller, plan, target), _offset(loop, controller)]
+        findings += [_margin(loop, law, plan, target), _offset(loop, design)]
     settings = Settings("policy", "float64", "fast", 1)
-    tables, state = own_bytes(controller, settings.dtype)
+    tables, state = own_bytes(law, settings.dtype)
     sizes: dict[str, Any] = {
         "bytes of tables": tables + sum(table_bytes(x, settings) for x in qps),
         "bytes of the state": state + sum(state_bytes(x, settings) for x in qps),
         "rows": sum(len(x.rows) for x in qps),
     }
-    seen = probe(controller)
-    findings.append(_weights(controller, seen.shares))
+    seen = probe(law, known)
+    findings.append(_weights(design, seen.shares))
     if len(seen.iterations):
         sizes |= {"least iterations of a step in the loop, on average": seen.iterations.mean()}
         sizes |= {"and in its worst step": seen.iterations.max()}
-    if names := undetermined(controller):
+    if names := undetermined(mpc):
         sizes["outputs whose bounds export_c refuses"] = names
     findings.append(Finding("C code", not names, sizes, WEIGHT.format(names) * bool(names)))
     return Review([*findings, *claims])
 
 
-def _cost(controller: Controller) -> Finding:
+def _cost(mpc: LinearMPC) -> Finding:
     """H is positive definite on the plans that satisfy C z = b."""
-    mpc = controller.mpc
     qp = mpc.quadratic_program()
     H, C = (x.detach().double().numpy() for x in (qp.H, qp.C))
     T_v = null_space(C[None], mpc.n_p).T[0][:, mpc.n_p :]
@@ -120,9 +119,8 @@ def _weighted(largest: float) -> str:
     return f"Raise the weights of the inputs to R={1e-3 * largest:.1g}."
 
 
-def _terminal(controller: Controller) -> Finding:
+def _terminal(design: Design) -> Finding:
     """The terminal weight is the cost to go of the loop without bounds."""
-    design = controller.mpc.design
     plant, exists = design.plant, riccati(design) is not None
     unseen = unseen_modes(plant.A, design.Q @ plant.C)
     unmoved = unseen_modes(plant.A.T, plant.B.T)
@@ -139,9 +137,9 @@ def _terminal(controller: Controller) -> Finding:
     return Finding("terminal weight", exists, numbers, remedy * (not exists))
 
 
-def _gains(controller: Controller) -> Finding:
+def _gains(design: Design) -> Finding:
     """Each output's gains by inputs and known signals, for a look at signs and sizes."""
-    plant, N = controller.mpc.design.plant, controller.mpc.horizon
+    plant, N = design.plant, design.horizon
     acting = plant.E.any(0)
     names = (*plant.inputs, *np.array(plant.known)[acting])
     A, B = plant.A, np.hstack((plant.B, plant.E[:, acting]))
@@ -156,10 +154,9 @@ def _gains(controller: Controller) -> Finding:
     return Finding("gains", True, numbers)
 
 
-def _horizon(controller: Controller) -> Finding:
+def _horizon(design: Design) -> Finding:
     """The plan is longer than dead times and inverse responses."""
-    design, N = controller.mpc.design, controller.mpc.horizon
-    plant, numbers, needed = design.plant, {}, 1
+    plant, N, numbers, needed = design.plant, design.horizon, {}, 1
     stable = np.abs(np.linalg.eigvals(plant.A)).max() < 1 + 1e-9
     x, steps = plant.B * half_range(design.u_bounds), []
     for _ in range(max(10 * N, 200)):
@@ -181,9 +178,9 @@ def _horizon(controller: Controller) -> Finding:
     return Finding("horizon", ok, numbers, f"Take a horizon of {2 * needed} or more." * (not ok))
 
 
-def _disturbances(controller: Controller) -> Finding:
+def _disturbances(design: Design) -> Finding:
     """The outputs tell the disturbances from the state."""
-    plant, w = controller.mpc.design.plant, controller.mpc.design.disturbances
+    plant, w = design.plant, design.disturbances
     matrix = np.block([[plant.A - np.eye(len(plant.A)), w.B], [plant.C, w.C]])
     matrix = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
     _, sizes, V = np.linalg.svd(matrix)
@@ -195,9 +192,8 @@ def _disturbances(controller: Controller) -> Finding:
     return Finding("disturbances", ok, numbers, remedy * (not ok))
 
 
-def _scaling(controller: Controller) -> Finding:
+def _scaling(design: Design) -> Finding:
     """The distances of the bounds have similar sizes."""
-    design = controller.mpc.design
     sizes = {}
     for names, bounds in (
         (design.plant.outputs, design.y_bounds),
@@ -215,16 +211,13 @@ def _scaling(controller: Controller) -> Finding:
 
 
 @torch.no_grad()
-def _hard_rows(controller: Controller) -> Finding:
+def _hard_rows(mpc: LinearMPC, r: Array, known: Array) -> Finding:
     """Outputs off the set-point, and last inputs at their bounds, leave a plan."""
-    mpc, design = controller.mpc, controller.mpc.design
-    n_y = len(design.Q)
+    design, n_y = mpc.design, len(mpc.design.Q)
     half = np.diag(half_range(design.y_bounds))
     off = np.linspace(0.05, LARGEST, 40)[:, None, None] * np.vstack((half, -half))
     off = off.reshape(-1, n_y)
-    known = held_known(controller)
-    r = controller.r[0] if len(controller.r) else middle(design.y_bounds)
-    rest = mpc.target(r, known=known)
+    rest = mpc.target(r[0] if len(r) else middle(design.y_bounds), known=known)
     x = np.vstack((off @ np.linalg.pinv(design.plant.C).T, np.zeros((2, len(rest.x)))))
     x = rest.x.numpy() + x
     ends = np.where(np.isfinite(design.u_bounds), design.u_bounds, rest.u.numpy())
@@ -247,14 +240,31 @@ def _hard_rows(controller: Controller) -> Finding:
     return Finding("hard bounds", False, numbers, f"Give {names} a finite y_slack.")
 
 
-def _set_points(controller: Controller) -> Finding:
+class Setting(NamedTuple):
+    """An MPC at an estimate of the disturbances and at known signals that are held."""
+
+    mpc: LinearMPC
+    w: Array
+    known: Array
+
+    def target(self, r: Array) -> Target:
+        """Return the target of set-points ``(*batch, n_y)``."""
+        return self.mpc.target(r, self.w, self.known)
+
+    def off(self, y: Array, r: Array) -> Array:
+        """Return the mask of outputs with a weight that are off their set-points."""
+        design = self.mpc.design
+        return (np.diag(design.Q) > 0) & (np.abs(y - r) > OFFSET * half_range(design.y_bounds))
+
+
+def _set_points(setting: Setting, r_last: Array, assumed: bool) -> Finding:
     """Set-points and bands of outputs are within reach of the inputs' bounds."""
-    design, known = controller.mpc.design, held_known(controller)
+    design, known = setting.mpc.design, setting.known
     names, weighted = design.plant.outputs, np.diag(design.Q) > 0
-    lower, upper = _reach(controller)
-    assumed = " (not known, assumed)" if controller.known is None else ""
+    lower, upper = _reach(setting)
+    how = " (not known, assumed)" * assumed
     acting = np.flatnonzero(design.plant.E.any(0))
-    numbers: dict[str, Any] = {f"at {design.plant.known[i]}{assumed}": known[i] for i in acting}
+    numbers: dict[str, Any] = {f"at {design.plant.known[i]}{how}": known[i] for i in acting}
     faults = []
     if np.isnan(lower).any():
         remedy = (
@@ -265,38 +275,30 @@ def _set_points(controller: Controller) -> Finding:
         numbers[f"{name} reaches"] = np.array([lower[i], upper[i]])
         if lower[i] > design.y_bounds[1][i] or upper[i] < design.y_bounds[0][i]:
             faults.append(f"Let y_bounds of {name} overlap {lower[i]:.4g} .. {upper[i]:.4g}.")
-    if len(controller.r) and weighted.any():
-        r = controller.r[-1]
-        target = controller.mpc.target(r, controller.w, known)
+    if len(r_last) and weighted.any():
+        r, target = r_last[-1], setting.target(r_last[-1])
         y = target.y.numpy()
-        off = _off(controller, y, r)
+        off = setting.off(y, r)
         numbers |= {f"nearest {names[i]}": y[i] for i in np.flatnonzero(off)}
-        for i, word in _settable(controller, r).items() if off.any() else ():
-            limits = _limits(controller, target)
+        for i, word in _settable(setting, r).items() if off.any() else ():
+            limits = _limits(design, target)
             faults.append(f"Set {names[i]} to {word}, not {r[i]:.10g}, {limits}.")
     return Finding("set-points", not faults, numbers, " ".join(faults))
 
 
-def _off(controller: Controller, y: Array, r: Array) -> Array:
-    """Return the mask of outputs with a weight that are off their set-points."""
-    design = controller.mpc.design
-    return (np.diag(design.Q) > 0) & (np.abs(y - r) > OFFSET * half_range(design.y_bounds))
+def _settable(setting: Setting, r: Array) -> dict[int, str]:
+    """Return the entries of r that must change for it to be in reach, as they may be typed.
 
-
-def _settable(controller: Controller, r: Array) -> dict[int, str]:
-    """Return those entries of r that change for it to be in reach, as they may be typed.
-
-    They are rounded to either side of the steady outputs, with four digits or as few more as do.
+    They are rounded to either side of the steady outputs, to four digits or as many as it takes.
     """
-    design, known = controller.mpc.design, held_known(controller)
-    y = controller.mpc.target(r, controller.w, known).y.numpy()
-    wanted = np.where(_off(controller, y, r), np.clip(y, *design.y_bounds), r)
+    design, y = setting.mpc.design, setting.target(r).y.numpy()
+    wanted = np.where(setting.off(y, r), np.clip(y, *design.y_bounds), r)
     for _ in range(SETTLES):
-        y = controller.mpc.target(wanted, controller.w, known).y.numpy()
-        if not (off := _off(controller, y, wanted)).any():
+        y = setting.target(wanted).y.numpy()
+        if not (off := setting.off(y, wanted)).any():
             break
         wanted = np.where(off, y, wanted)
-    changed = np.flatnonzero(_off(controller, wanted, r))
+    changed = np.flatnonzero(setting.off(wanted, r))
     sides = (np.floor, np.ceil) if len(changed) <= ROUNDED else (np.round,)
     size = np.maximum(np.abs(wanted), OFFSET * half_range(design.y_bounds))
     for digits in range(4, 13):
@@ -311,16 +313,15 @@ def _settable(controller: Controller, r: Array) -> dict[int, str]:
         values = np.tile(r, (len(tries), 1))
         values[:, changed] = [[float(word) for word in tried.values()] for tried in tries]
         distance = (np.abs(values - wanted) / unit).sum(-1)
-        y = controller.mpc.target(values, controller.w, known).y.numpy()
-        distance[_off(controller, y, values).any(-1)] = np.inf
+        distance[setting.off(setting.target(values).y.numpy(), values).any(-1)] = np.inf
         if np.isfinite(distance).any():
             return tries[int(distance.argmin())]
     return {int(i): f"{wanted[i]:.10g}" for i in changed}
 
 
-def _limits(controller: Controller, target: Target) -> str:
+def _limits(design: Design, target: Target) -> str:
     """Return what a user can do about the bounds that a target is at."""
-    design, named = controller.mpc.design, []
+    named = []
     for kind, names, bounds, x in (
         ("y_bounds", design.plant.outputs, design.y_bounds, target.y.numpy()),
         ("u_bounds", design.plant.inputs, design.u_bounds, target.u.numpy()),
@@ -334,14 +335,14 @@ def _limits(controller: Controller, target: Target) -> str:
     return f"or widen {' or '.join(named)}"
 
 
-def _reach(controller: Controller) -> tuple[Array, Array]:
+def _reach(setting: Setting) -> tuple[Array, Array]:
     """Return the least and the largest steady value of each output within the inputs' bounds.
 
     They are NaN if there is no steady state.
     """
-    steady, w = controller.mpc.design.steady, controller.w
-    loads = np.concatenate((w, held_known(controller), [1.0]))
-    lower, upper = (side - steady.u @ loads for side in controller.mpc.design.u_bounds)
+    design = setting.mpc.design
+    steady, loads = design.steady, np.concatenate((setting.w, setting.known, [1.0]))
+    lower, upper = (side - steady.u @ loads for side in design.u_bounds)
     rows = np.vstack((steady.U, -steady.U))
     limits = np.concatenate((upper, -lower))
     kept = np.isfinite(limits)
@@ -375,7 +376,7 @@ def _stability(loop: LinearLoop, gamma: float) -> Finding:
     return Finding("stability", ok, {"largest eigenvalues": slow}, remedy * (not ok))
 
 
-def _margin(loop: LinearLoop, controller: Controller, plan: Tables, target: Tables) -> Finding:
+def _margin(loop: LinearLoop, law: Law, plan: Tables, target: Tables) -> Finding:
     """The loop without bounds tolerates errors of the model."""
     margin = loop.modulus_margin()
     gains = np.array([1 / (1 + margin), 1 / max(1 - margin, 1e-9)])
@@ -387,15 +388,14 @@ def _margin(loop: LinearLoop, controller: Controller, plan: Tables, target: Tabl
     if margin >= MARGIN:
         return Finding("margin", True, numbers)
     remedy = "Raise dR tenfold."
-    longest = PATIENCE * max(_settling(loop), controller.mpc.design.horizon)
+    longest = PATIENCE * max(_settling(loop), law.design.horizon)
     for power in range(1, SLOWEST + 1):
-        noise, slower = controller._noise * 10**power, copy.copy(controller)
-        slower.observer = kalman(controller.mpc.design, noise, controller._drift)
-        loop = LinearLoop.of(slower, plan, target)
+        noise = law.noise * 10**power
+        loop = LinearLoop.of(law.mpc, kalman(law.design, noise, law.drift), plan, target)
         if not _settling(loop) <= longest:
             break
         if loop.modulus_margin() >= MARGIN:
-            named = dict(zip(controller.mpc.design.plant.outputs, noise.tolist(), strict=True))
+            named = dict(zip(law.design.plant.outputs, noise.tolist(), strict=True))
             pairs = ", ".join(f"{name!r}: {x:.3g}" for name, x in named.items())
             remedy = f"Slow the filter down, by qm.Controller(.., noise={{{pairs}}})."
             break
@@ -407,9 +407,8 @@ def _settling(loop: LinearLoop) -> float:
     return -1 / np.log(max(loop.radius, 1e-9)) if loop.radius < 1 else np.inf
 
 
-def _offset(loop: LinearLoop, controller: Controller) -> Finding:
+def _offset(loop: LinearLoop, design: Design) -> Finding:
     """Constant loads, biases and set-points leave no offset that steady inputs could remove."""
-    design = controller.mpc.design
     Y = design.steady.Y
     removable = Y @ np.linalg.pinv(Y.T @ design.Q @ Y, rcond=1e-10) @ Y.T @ design.Q
     m = len(design.plant.inputs)
@@ -423,9 +422,9 @@ def _offset(loop: LinearLoop, controller: Controller) -> Finding:
     return Finding("offset", ok, numbers, remedy * (not ok))
 
 
-def _weights(controller: Controller, shares: Mapping[str, float]) -> Finding:
+def _weights(design: Design, shares: Mapping[str, float]) -> Finding:
     """Each output's weight matters for the cost of a closed loop."""
-    names, Q = controller.mpc.design.plant.outputs, controller.mpc.design.Q
+    names, Q = design.plant.outputs, design.Q
     numbers = {f"share of {name} in the cost": share for name, share in shares.items()}
     remedies = []
     for i in np.flatnonzero(Q.any(0)):

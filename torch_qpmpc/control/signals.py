@@ -1,4 +1,4 @@
-"""Signals by name: dictionaries, DataFrames and arrays, as arrays."""
+"""Numbers and signals by name: from mappings, DataFrames and arrays to arrays."""
 
 from __future__ import annotations
 
@@ -53,3 +53,17 @@ def read_table(name: str, value: Any, names: Sequence[str], rows: int, least: in
         raise QPError.expected(name, f"{len(table)} rows", f"one row, or at least {least}")
     held = np.minimum(np.arange(rows), len(table) - 1)
     return table[held]
+
+
+def read_vector(name: str, value: Any, names: Sequence[str], missing: float) -> Array:
+    """Read one number for each name, from a number, a vector or a mapping."""
+    if isinstance(value, Mapping):
+        if unknown := sorted({*value} - {*names}):
+            raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
+        value = [value.get(x, missing) for x in names]
+    vector = read_numbers(name, value).numpy()
+    vector = np.full(len(names), float(vector)) if vector.ndim == 0 else vector.copy()
+    if vector.shape != (len(names),) or np.isnan(vector).any():
+        want = f"a number, or one for each of {', '.join(names)}"
+        raise QPError.expected(name, f"shape {vector.shape} or NaN", want)
+    return vector

@@ -1,10 +1,10 @@
-"""`Controller.simulate`: a closed loop of a controller and a plant."""
+"""Closed loops of a controller: `Controller.simulate`, and the loop with its own model."""
 
 from __future__ import annotations
 
-import copy
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,10 +12,18 @@ from matplotlib.figure import Figure
 
 from torch_qpmpc.analysis.episode import episode_figure
 from torch_qpmpc.checks import check_seed, check_whole
-from torch_qpmpc.control.controller import Controller
-from torch_qpmpc.control.design import Design, read_vector
+from torch_qpmpc.control.design import Design, half_range, middle
+from torch_qpmpc.control.law import Law, Memory, Move, Signals
+from torch_qpmpc.control.linear_mpc import LinearMPC
+from torch_qpmpc.control.signals import read_row, read_vector
 from torch_qpmpc.control.state_space import FAINT, Array, StateSpace, read_model
-from torch_qpmpc.errors import QPError
+from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.loops import Step, run_loop
+
+#: Steps of the probe, and of each of its set-points.
+PROBED, HELD = 100, 25
+#: Its set-points and load, relative to half of the bounds' distance.
+MOVE, LOAD = 0.5, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +31,7 @@ class Run:
     """Signals of a closed loop of T steps.
 
     Attributes:
-        design: that of the controller.
+        design: the controller's design.
         y, r: measured outputs and set-points, ``(T + 1, n_y)``.
         u: inputs ``(T, m)``.
         known: known signals, ``(T, n_d)``.
@@ -96,7 +104,8 @@ class Run:
 
 
 def simulate(
-    controller: Controller,
+    law: Law,
+    memory: Memory,
     plant: Any,
     steps: int,
     r: Any,
@@ -111,22 +120,20 @@ def simulate(
     """Return a closed loop; see `Controller.simulate`."""
     check_whole("steps", steps, 1)
     check_seed(seed)
-    design, twin = controller.mpc.design, copy.copy(controller)
-    rows = design.horizon + 1
+    design, rows = law.design, law.design.horizon + 1
     announced = known is None and hasattr(plant, "reset")  # by the environment, step by step
-    known = controller.known if known is None else known
-    d = np.empty((0, 0)) if announced else controller.read_known(known, steps + rows, steps)
-    set_points = controller.read_set_points(r, steps + rows)
+    known = memory.known if known is None else known
+    d = np.empty((0, 0)) if announced else law.read_known(known, steps + rows, steps)
+    set_points = law.read_set_points(r, steps + rows, memory.r)
     load = read_vector("load", load, design.plant.inputs, 0.0)
     noise = read_vector("noise", noise, design.plant.outputs, 0.0)
     if not ((noise >= 0) & np.isfinite(noise)).all():
         raise QPError.expected("noise", f"{noise.tolist()}", "standard deviations >= 0")
-    y, last = controller.rest
-    twin.reset(u=last if u is None else u)
-    start = twin.u
+    y, last = memory.rest
+    begun = law.begun(last if u is None else read_row("u", u, design.plant.inputs))
     if not hasattr(plant, "reset"):
         model = design.plant if plant is None else read_model(plant)
-        plant = _Model(model, design, d, start, y, FAINT if u is not None else 1.0, x)
+        plant = _Model(model, design, d, begun.u, y, FAINT if u is not None else 1.0, x)
     rng, started = np.random.default_rng(seed), plant.reset(seed=seed)
     if not (isinstance(started, tuple) and len(started) == 2):
         remedy = "Its reset returns the outputs and a dict."
@@ -137,19 +144,32 @@ def simulate(
         want = f"the outputs alone, {', '.join(design.plant.outputs)}"
         remedy = "Wrap the environment: gymnasium.wrappers.TransformObservation chooses entries."
         raise QPError.expected("plant", got, want, remedy)
-    ys, us, ds, held = [], [], [], []
-    for k in range(steps):
-        ys.append(observed + noise * rng.normal(size=len(design.Q)))
-        ahead = twin.read_known(info.get("known"), rows) if announced else d[k : k + rows]
-        us.append(twin.step(ys[-1], set_points[k : k + rows], ahead))
-        ds.append(ahead[0])
-        assert twin.target is not None
-        held.append(twin.target.u.numpy().reshape(-1, len(load))[0])
-        stepped = plant.step(us[-1] + load)
-        observed, info = stepped[0], stepped[-1]
-    ys.append(observed + noise * rng.normal(size=len(design.Q)))
-    measured, inputs, d, u_s = map(np.array, (ys, us, ds, held))
-    return Run(design, measured, set_points[: steps + 1], inputs, d, u_s, start)
+    k, act = 0, law.policy(begun)
+
+    def measured() -> Array:
+        return observed + noise * rng.normal(size=len(noise))
+
+    def policy(y: Array) -> Move:
+        ahead = law.read_known(info.get("known"), rows) if announced else d[k : k + rows]
+        return act(Signals(law.read("y", y, 1)[0], set_points[k : k + rows], ahead))
+
+    def step(move: Move) -> Step:
+        nonlocal observed, info, k
+        observed, *_, info = plant.step(move.u + load)
+        k += 1
+        return Step(measured(), move)
+
+    first = measured()
+    ys, moves, _ = zip(*run_loop(policy, first, step, steps), strict=True)
+    signals = ((move.u, move.memory.known, _first(move.target.u)) for move in moves)
+    inputs, passed, u_s = map(np.array, zip(*signals, strict=True))
+    measurements = np.array([first, *ys])
+    return Run(design, measurements, set_points[: steps + 1], inputs, passed, u_s, begun.u)
+
+
+def _first(target: torch.Tensor) -> Array:
+    """Return the part of a target of the first stage."""
+    return target.numpy().reshape(-1, target.shape[-1])[0]
 
 
 class _Model:
@@ -191,3 +211,117 @@ class _Model:
         self._x = model.A @ self._x + driven
         self._k += 1
         return self._model.C @ self._x, {}
+
+
+def held_known(design: Design, memory: Memory) -> Array:
+    """Return the known signals of the last step or reset, ``(n_d,)``, zero before."""
+    return np.zeros(len(design.plant.known)) if memory.known is None else memory.known
+
+
+def centre(design: Design, known: Array) -> Array:
+    """Return the middle of the outputs' bounds, where there are none what the inputs' middle holds.
+
+    An input with one bound is half its range from it.
+    """
+    half, (lower, upper) = half_range(design.u_bounds), design.u_bounds
+    u, y = np.clip(0.0, lower + half, upper - half), middle(design.y_bounds)
+    held = design.plant.C @ design.plant.at_rest(u, known, y, FAINT)
+    return np.where(np.isfinite(design.y_bounds).all(0), y, np.clip(held, *design.y_bounds))
+
+
+def at_rest(mpc: LinearMPC, known: Array) -> tuple[Array, Array]:
+    """Return x and u of the model at rest as near to `centre` as its bounds allow."""
+    rest = mpc.target(centre(mpc.design, known), known=known)
+    return rest.x.numpy(), rest.u.numpy()
+
+
+class Course(NamedTuple):
+    """Signals of a loop with the controller's own model, by step.
+
+    Attributes:
+        x: the state that the model starts from, ``(n,)``.
+        load: a constant that is added to the inputs, ``(m,)``.
+        noise: what is added to the outputs, ``(T + 1, n_y)``.
+        r, known: set-points and known signals of the stages, ``(T + 1, rows, ..)``.
+    """
+
+    x: Array
+    load: Array
+    noise: Array
+    r: Array
+    known: Array
+
+
+def own_loop(
+    law: Law, course: Course, policy: Callable[[Signals], Any], steps: int
+) -> Iterator[tuple[Signals, Any]]:
+    """Yield the signals and the move of each step of a loop with the law's own model.
+
+    It ends where no input satisfies the hard bounds, or an output is above `Law.max_plausible`.
+    """
+    plant, x, k = law.design.plant, course.x, 0
+
+    def seen() -> Signals:
+        return Signals(plant.C @ x + course.noise[k], course.r[k], course.known[k])
+
+    def step(move: Any) -> Step:
+        nonlocal x, k
+        x = plant.A @ x + plant.B @ (move.u + course.load)
+        x = x + plant.E @ course.known[k][0] + plant.offset
+        k += 1
+        return Step(seen(), move)
+
+    signals = seen()
+    for after, move, _ in run_loop(policy, signals, step, steps, SolverError):
+        yield signals, move
+        if (np.abs(after.y) > law.max_plausible[0]).any():
+            return
+        signals = after
+
+
+class Probe(NamedTuple):
+    """A closed loop's verdict on the weights and the QP.
+
+    Attributes:
+        shares: the share of each weight in the loop's cost J, the largest first. By the envelope
+            theorem it is d log J / d log weight, as the inputs are nearly optimal for the weights.
+            With entries off the diagonal it is a row's, which may be negative.
+        iterations: the changes of the plan's active set in a step, and one: a lower bound of the
+            iterations in C from the last active set.
+    """
+
+    shares: dict[str, float]
+    iterations: Array
+
+
+@torch.no_grad()
+def probe(law: Law, known: Array) -> Probe:
+    """Run a loop with moving set-points and a load, from rest near `centre`."""
+    design, rng = law.design, np.random.default_rng(0)
+    plant, size_y, size_u = design.plant, half_range(design.y_bounds), half_range(design.u_bounds)
+    (x, u), rows = at_rest(law.mpc, known), design.horizon + 1
+    moves = rng.uniform(-1, 1, (-(-PROBED // HELD), len(size_y))).repeat(HELD, 0)
+    r = centre(design, known) + MOVE * size_y * np.vstack((moves[:PROBED], moves[-1:]))
+    held = np.tile(known, (PROBED + 1, rows, 1))
+    quiet = np.zeros((PROBED + 1, len(size_y)))
+    course = Course(x, LOAD * size_u, quiet, r[:, None].repeat(rows, 1), held)
+    costs: dict[str, float] = {}
+    states, last = [], u
+    for signals, move in own_loop(law, course, law.policy(law.begun(u)), PROBED):
+        states.append(move.p)
+        for name, weight, signal, names in (
+            ("Q", design.Q, signals.y - _first(move.target.y), plant.outputs),
+            ("R", design.R, move.u - _first(move.target.u), plant.inputs),
+            ("dR", design.dR, move.u - last, plant.inputs),
+        ):
+            for i in np.flatnonzero(weight.any(0)):
+                key = f"{name} of {names[i]}"
+                costs[key] = costs.get(key, 0.0) + float(signal[i] * (weight[i] @ signal))
+        last = move.u
+    whole = sum(costs.values()) or 1.0
+    shares = {name: cost / whole for name, cost in sorted(costs.items(), key=lambda x: -x[1])}
+    changes = np.zeros(0)
+    if states:
+        active = law.mpc.solve(torch.stack(states)).active.numpy()
+        changes = (np.diff(active, axis=0, prepend=0 * active[:1]) != 0).sum(-1)
+    return Probe(shares, 1 + changes)

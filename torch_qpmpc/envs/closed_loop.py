@@ -16,6 +16,7 @@ from torch_qpmpc.envs.linear_system import LinearSystem
 from torch_qpmpc.envs.past_window import first_window, next_window
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.loops import Step, run_loop
 
 POLICY_REMEDY = "Map a batch of states to a batch of actions."
 
@@ -100,7 +101,7 @@ def closed_loop(
         cost = physics.cost(s, a)
         nu = physics.noise(nu, physics.draw(rng, starts))
         s = physics.step(s, a, nu)
-        return s, a, cost
+        return Step(s, a, cost)
 
     return _run(policy, s, step, steps, (starts, *physics.lb_a.shape), gamma)
 
@@ -152,7 +153,7 @@ def plant_loop(
         x = plant.step(x, u, w[:, k])
         k += 1
         window = next_window(window, u, plant.output(x, w[:, k]))
-        return known(), u, cost
+        return Step(known(), u, cost)
 
     return _run(policy, known(), step, steps, (starts, plant.n_u), gamma, plant.n_y)
 
@@ -171,7 +172,7 @@ def gymnasium_loop(
 
     After an episode's end its state stays constant, at no cost. With a window the cost of the steps
     that fill it is in that of the first step, without discounts. ``steps`` is by default the length
-    of the environment's own episodes. The policy is not asked once all episodes have ended.
+    of the environment's own episodes. The policy is not called once all episodes have ended.
 
     Raises:
         QPError: as in `closed_loop`.
@@ -196,7 +197,7 @@ def gymnasium_loop(
             s[i], reward, terminated, truncated, _ = envs[i].step(applied[i].astype(low.dtype))
             cost[i] -= float(reward)
             over[i] = terminated or truncated
-        return _float64(s), _float64(applied), _float64(cost)
+        return Step(_float64(s), _float64(applied), _float64(cost))
 
     shape = starts, len(plant.lb_a)
     last = torch.zeros(shape, dtype=torch.float64)
@@ -212,10 +213,6 @@ def gymnasium_loop(
     return replace(loop, lengths=_float64(lengths))
 
 
-#: What a policy sees after a step, the applied action, and the cost of the step.
-Step = tuple[Tensor, Tensor, Tensor]
-
-
 def _run(
     policy: Callable[[Tensor], Tensor],
     p: Tensor,
@@ -226,15 +223,14 @@ def _run(
     n_y: int | None = None,
 ) -> ClosedLoop:
     """Run ``policy``, which sees p ``(starts, n_p)`` first and returns actions of this shape."""
-    known, actions, costs = [p], [], []
-    for _ in range(steps):
+
+    def act(p: Tensor) -> Tensor:
         # A result of shape (starts,) or (n_u,) would broadcast silently.
-        a = check_tensor("policy(s)", policy(p), *shape, batched=False, remedy=POLICY_REMEDY)
-        p, a, cost = step(a)
-        known.append(p)
-        actions.append(a)
-        costs.append(cost)
-    return ClosedLoop(torch.stack(known), torch.stack(actions), torch.stack(costs), gamma, n_y)
+        return check_tensor("policy(s)", policy(p), *shape, batched=False, remedy=POLICY_REMEDY)
+
+    known, actions, costs = zip(*run_loop(act, p, step, steps), strict=True)
+    known = torch.stack((p, *known))
+    return ClosedLoop(known, torch.stack(actions), torch.stack(costs), gamma, n_y)
 
 
 def _float64(x: np.ndarray) -> Tensor:

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from scipy.linalg import block_diag
 
-from torch_qpmpc.control.controller import Controller
-from torch_qpmpc.control.linear_mpc import Target
+from torch_qpmpc.control.linear_mpc import LinearMPC, Target
+from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.export.tables import Tables
 
@@ -39,11 +39,10 @@ class LinearLoop:
     plant: tuple[Array, Array, Array]
 
     @classmethod
-    def of(cls, controller: Controller, plan: Tables, target: Tables) -> LinearLoop:
-        """Return the loop of a controller, from the tables of its plan and its target."""
-        K_e, K_u, K_r = _gains(controller, plan, target)
-        observer, plant = controller.observer, controller.mpc.design.plant
-        F, G, L = observer.F, observer.G, observer.L
+    def of(cls, mpc: LinearMPC, observer: Observer, plan: Tables, target: Tables) -> LinearLoop:
+        """Return the loop of an MPC and an observer, from the tables of the plan and the target."""
+        K_e, K_u, K_r = _gains(mpc, plan, target)
+        plant, F, G, L = mpc.design.plant, observer.F, observer.G, observer.L
         m = plant.B.shape[1]
         corrected = np.eye(len(F)) - L @ observer.H
         # u = C_c [e; u_last] + D_c y + K_r r, and e+ = F (corrected e + L y) + G u.
@@ -90,9 +89,9 @@ class LinearLoop:
         return least
 
 
-def _gains(controller: Controller, plan: Tables, target: Tables) -> tuple[Array, Array, Array]:
+def _gains(mpc: LinearMPC, plan: Tables, target: Tables) -> tuple[Array, Array, Array]:
     """Return the factors of the estimate e, of u_last and of r in the input without bounds."""
-    mpc, design = controller.mpc, controller.mpc.design
+    design = mpc.design
     n, m, n_y, n_d = design.plant.sizes
     n_w = len(design.disturbances.names)
     signals = torch.eye(n + n_w + m + n_y, dtype=torch.float64)
@@ -100,9 +99,8 @@ def _gains(controller: Controller, plan: Tables, target: Tables) -> tuple[Array,
     x, w, u_last, r = signals.split((n, n_w, m, n_y), dim=-1)
     s = torch.cat((r, w, r.new_zeros(len(r), n_d)), -1)
     a = s @ torch.from_numpy(target.K.T) + torch.from_numpy(target.k)
-    f = a.new_zeros(
-        len(a), design.steady.Y.shape[1] - a.shape[1]
-    )  # inputs without bounds are least
+    # Without bounds the free inputs are least: f = 0.
+    f = a.new_zeros(len(a), design.steady.Y.shape[1] - a.shape[1])
     aimed = mpc.steady_state(torch.cat((a, f), -1), s)
     stages = aimed
     if design.references == "preview":

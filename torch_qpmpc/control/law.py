@@ -1,0 +1,205 @@
+"""The control law of a linear MPC: its observer, target and plan, as functions of a memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_qpmpc.control.design import Design, half_range
+from torch_qpmpc.control.linear_mpc import LinearMPC, Target
+from torch_qpmpc.control.observer import SMALL, Observer, kalman, max_plausible, windowed
+from torch_qpmpc.control.signals import read_table, read_vector
+from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.qp.program import QuadraticProgram
+
+
+class Memory(NamedTuple):
+    """What a controller keeps between two steps.
+
+    Attributes:
+        u: the last input, ``(m,)``.
+        e: the prediction of x and w for the next step, None before the first.
+        r: the set-points of the last step, ``(rows, n_y)``, without rows before the first.
+        known: the known signals of the last step or reset, ``(n_d,)``, None before.
+        rest: the outputs and the input at rest that the last reset was passed, or None for each.
+    """
+
+    u: Array
+    e: Array | None = None
+    r: Array = np.zeros(0)
+    known: Array | None = None
+    rest: tuple[Array | None, Array | None] = (None, None)
+
+
+class Signals(NamedTuple):
+    """The signals of a step: outputs ``(n_y,)``, set-points and known signals of the stages."""
+
+    y: Array
+    r: Array
+    known: Array
+
+
+class Move(NamedTuple):
+    """The result of a step: the input, the memory after it, the target and p of the plan."""
+
+    u: Array
+    memory: Memory
+    target: Target
+    p: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """A linear MPC with an observer; see `torch_qpmpc.control.controller.Controller`.
+
+    Attributes:
+        mpc: the MPC.
+        noise, drift: standard deviations, ``(n_y,)`` and ``(n_w,)``.
+        window: True if the observer is `windowed`.
+        observer: the observer.
+        max_plausible: the largest sizes of outputs and set-points, and of known signals.
+        qp: the plan's QP.
+    """
+
+    mpc: LinearMPC
+    noise: Array
+    drift: Array
+    window: bool
+    observer: Observer
+    max_plausible: tuple[Array, Array]
+    qp: QuadraticProgram
+
+    @classmethod
+    def of(cls, mpc: LinearMPC, noise: Any = None, drift: Any = None, window: bool = False) -> Law:
+        """Return the law of an MPC with today's theta.
+
+        Raises:
+            QPError: a deviation is invalid, or the model has no filter.
+        """
+        design, w = mpc.design, mpc.design.disturbances
+        y, u = half_range(design.y_bounds), half_range(design.u_bounds)
+        ranges = np.abs(y @ w.C + u @ np.linalg.pinv(design.plant.B) @ w.B)
+        noise = _deviations("noise", noise, SMALL * y, design.plant.outputs)
+        drift = _deviations("drift", drift, SMALL * ranges, w.names)
+        observer = kalman(design, noise, drift)
+        largest = max_plausible(design, noise)
+        if window:
+            observer = windowed(observer)
+        return cls(mpc, noise, drift, window, observer, largest, mpc.quadratic_program())
+
+    @property
+    def design(self) -> Design:
+        """The design of the MPC."""
+        return self.mpc.design
+
+    def renewed(self) -> Law:
+        """Return the law with today's theta."""
+        return replace(self, qp=self.mpc.quadratic_program())
+
+    def begun(self, u: Array | None = None) -> Memory:
+        """Return a memory without a past, with the last input u, by default zero, in its bounds."""
+        last = np.zeros(len(self.design.plant.inputs)) if u is None else u
+        last = np.clip(last, *self.design.u_bounds)
+        return Memory(last, rest=(None, None if u is None else last))
+
+    def estimates(self, memory: Memory) -> tuple[Array, Array]:
+        """Return the predictions of x and w, zero before the first step."""
+        e = np.zeros(len(self.observer.F)) if memory.e is None else memory.e
+        return e[: len(self.design.plant.A)], e[len(self.design.plant.A) :]
+
+    @torch.no_grad()
+    def step(self, memory: Memory, y: Array, r: Array, known: Array) -> Move:
+        """Return the input for the `Signals` of a step.
+
+        Raises:
+            SolverError: no input satisfies the hard bounds.
+        """
+        design, observer = self.design, self.observer
+        e = observer.at_rest(memory.u, known[0], y) if memory.e is None else memory.e
+        e = e + observer.L @ (y - observer.H @ e)
+        x, w = np.split(e, [len(design.plant.A)])
+        previewed, level = design.references == "preview", known.mean(0)
+        target = self.mpc.target(r if previewed else r[0], w, level)
+        p = self.mpc.arrange(x, target, u_last=memory.u, known=known, level=level)
+        u = (target.u[-1] if previewed else target.u) + self.mpc.policy(p, qp=self.qp)
+        u = np.clip(u.numpy(), *design.u_bounds)
+        e = observer.predicted(e, u, known[0])
+        return Move(u, memory._replace(u=u, e=e, r=r, known=known[0]), target, p)
+
+    def policy(self, memory: Memory) -> Callable[[Signals], Move]:
+        """Return `step` as a function that keeps its own memory."""
+
+        def policy(signals: Signals) -> Move:
+            nonlocal memory
+            move = self.step(memory, *signals)
+            memory = move.memory
+            return move
+
+        return policy
+
+    def read_known(self, known: Any, rows: int, least: int | None = None) -> Array:
+        """Return known signals, in the forms of `Controller.step`, as ``(rows, n_d)``.
+
+        Args:
+            known: one row, or at least ``least`` rows, by default all.
+            rows, least: numbers of rows.
+
+        Raises:
+            QPError: they are invalid or missing.
+        """
+        names = self.design.plant.known
+        if not names and known is None:
+            return np.zeros((rows, 0))
+        if known is None:
+            remedy = "Pass a forecast of N + 1 rows, or one row that is held; an environment has "
+            remedy += "it in info['known']."
+            raise QPError.expected("known", "None", f"the signals {', '.join(names)}", remedy)
+        return self.read("known", known, rows, rows if least is None else least)
+
+    def read_set_points(self, r: Any, rows: int, last: Array) -> Array:
+        """Return set-points, in the forms of `Controller.step`, as ``(rows, n_y)``.
+
+        Args:
+            r: set-points, by default the ``last`` ones.
+            rows: the number of rows.
+            last: the set-points of the last step, without rows before the first.
+
+        Raises:
+            QPError: they are invalid, or None in the first step.
+        """
+        outputs = self.design.plant.outputs
+        if r is None and not len(last) and self.design.Q.any():
+            want = f"set-points of {', '.join(outputs)}"
+            raise QPError.expected("r", "None in the first step", want)
+        if r is None:
+            r = last if len(last) else np.zeros(len(outputs))
+        return self.read("r", r, rows)
+
+    def read(self, name: str, value: Any, rows: int, least: int = 1) -> Array:
+        """Return rows of y, r or known signals, none of them above `max_plausible`."""
+        plant, known = self.design.plant, name == "known"
+        names = plant.known if known else plant.outputs
+        table, largest = read_table(name, value, names, rows, least), self.max_plausible[known]
+        if (above := np.abs(table) > largest).any():
+            k, i = np.argwhere(above)[0]
+            got, want = f"{table[k, i]:g} of {names[i]}", f"at most {largest[i]:.3g} in size"
+            remedy = f"If it is no error, measure {names[i]} in a larger unit."
+            raise QPError.expected(name, got, want, remedy)
+        return table
+
+
+def _deviations(name: str, value: Any, default: Array, names: tuple[str, ...]) -> Array:
+    """Read standard deviations, which must be positive."""
+    if value is None:
+        return default
+    vector = read_vector(name, value, names, 0.0)
+    if not ((vector > 0) & np.isfinite(vector)).all():
+        got = ", ".join(f"{x:g} of {key}" for key, x in zip(names, vector, strict=True))
+        raise QPError.expected(name, got, "a standard deviation > 0 of each")
+    return vector
