@@ -168,7 +168,7 @@ def test_the_filter_is_stable_and_faster_with_more_drift():
         (lambda c: c.reset(y=[1e12]), r"y: got 1e\+12 of y1, expected at most 1e\+08 in size"),
         (
             lambda c: c.step({"T": 0.0}, [0.0]),
-            r"y: got signals \['T'\], expected those of \['y1'\]",
+            r"y: got signals \['T'\], expected the signals \['y1'\]",
         ),
         (lambda c: c.reset(u=[1.0, 2.0]), r"u: got shape \(1, 2\), expected 1 numbers"),
     ],

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from torch_qpmpc import QPError
-from torch_qpmpc.control.disturbance import choose
+from torch_qpmpc.control.disturbance import Steady, choose
 from torch_qpmpc.control.state_space import read_model
-from torch_qpmpc.control.steady import Steady
 
 INTEGRATOR = ([[1.0, 0.1], [0.0, 0.5]], [[0.0], [1.0]], [[1.0, 0.0]])
 STABLE = ([[0.9, 0.1], [0.0, 0.5]], [[0.0], [1.0]], [[1.0, 0.0]])

@@ -16,9 +16,8 @@ from torch_qpmpc.control.learning import LearningReport, learn
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target, packed, unpacked
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.review import review
-from torch_qpmpc.control.signals import read_row
 from torch_qpmpc.control.simulation import Run, simulate
-from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.control.state_space import Array, read_row
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.proofs import Answer
 
@@ -83,10 +82,10 @@ class Controller:
         self._start(self._law.begun())
 
     def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
-        """Forget the past: the plant rests with the outputs y, by default those of the next step.
+        """Forget the past: the plant rests with the outputs y, by default the next step's.
 
-        It is where `simulate` and `learn` start, too. Of a plant that does not rest, pass its last
-        input; the estimates take as many steps to settle as the filter does.
+        `simulate` and `learn` start there, too. If the plant does not rest, pass its last input;
+        the estimates take as many steps to settle as the filter does.
 
         Args:
             y: outputs, by name or as a vector.
@@ -226,14 +225,13 @@ class Controller:
                 Gymnasium's ``reset`` and ``step`` whose observations are the outputs.
             steps: the number of steps.
             r: a set-point that is held, or rows of them, by default the last one.
-            options: ``known``: a row of known signals that is held, or at least ``steps`` rows, of
-                which the last is held at the end; by default those of the last step or reset, and
-                with an environment the forecast in its ``info["known"]``, in the forms of `step`.
-                An environment must run the same signals.
-                ``u``: the input to start from, by default that of the last reset. ``load``: a
-                constant that is added to the inputs from the first step on. ``noise``: standard
-                deviations of that of the outputs, as a number, a vector or by name. ``x``: the
-                state that a model starts from. ``seed``: that of the noise and of an environment.
+            options: ``known``: a row of known signals that is held, or at least ``steps`` rows, the
+                last of which is held at the end; by default the last step's or reset's, and with an
+                environment the forecast in its ``info["known"]``, in the forms of `step`. An
+                environment must run the same signals. ``u``: the input to start from, by default
+                the last reset's. ``load``: a constant that is added to the inputs. ``noise``:
+                standard deviations of the outputs' noise, as a number, a vector or by name. ``x``:
+                the start state of a model. ``seed``: seeds the noise and the environment.
 
         Raises:
             QPError: an argument is invalid.
@@ -252,14 +250,13 @@ class Controller:
     def learn(self, source: Any, transitions: int = 5000, **options: Any) -> LearningReport:
         """Identify the model again, and keep the new one if closed loops cost less with it.
 
-        The cost is that of `Run.costs`, the design's own, which must be shown to fall by 1 %.
-        An accepted controller starts again with the new model, from rest with its last input;
-        otherwise it stays as it is. Loops start where the last `reset` rests, those with a log's
-        model at rest in the middle of the set-points. An environment starts where its own reset
-        says: the filter takes a start that is not at rest for a disturbance, and each loop pays for
-        it until the filter has settled. The old model and the new one pay on the same starts, so
-        that the decision stands; a controller with ``window=True`` settles in a few steps.
-        On a terminal a bar shows the progress.
+        The design's own cost, `Run.costs`, must be shown to fall by 1 %. Then the controller starts
+        again with the new model, from rest with its last input; otherwise it stays as it is. Loops
+        start where the last `reset` rests; with a log's model, at rest in the middle of the
+        set-points; with an environment, where its own reset says. The filter takes a start that is
+        not at rest for a disturbance, until it has settled: the old model and the new one pay for
+        it on the same starts. With ``window=True`` that takes a few steps. On a terminal a bar
+        shows the progress.
 
         Args:
             source: an environment, as in `simulate`: the controller gathers transitions in closed
@@ -271,7 +268,7 @@ class Controller:
                 within the outputs' bounds. ``spread``: their largest distance from it, by default a
                 tenth of half the distance of the outputs' bounds, or the log's standard deviation.
                 ``known``: as in `simulate`, for an environment. ``steps``: the steps of a loop.
-                ``pairs``: the largest number of pairs, at least 16. ``seed``: that of set-points,
+                ``pairs``: the largest number of pairs, at least 16. ``seed``: seeds set-points,
                 noise and environment.
 
         Raises:
@@ -311,11 +308,11 @@ class Controller:
         weights in the cost of a closed loop, and the C code's size and iterations.
 
         Args:
-            r: set-points that the inputs must reach, by default those of the last step.
-            known: a row of known signals that are held, by default those of the last step or reset,
-                else zero. The finding about set-points says which they are.
-            proofs: claims about the policy, by name: what a question of `torch_qpmpc.proofs` about
-                ``mpc`` returned. A claim that is not proved is a fault.
+            r: set-points that the inputs must reach, by default the last step's.
+            known: a row of known signals that are held, by default the last step's or reset's, else
+                zero. The finding about set-points shows them.
+            proofs: claims about the policy, by name: answers of `torch_qpmpc.proofs` about ``mpc``.
+                A claim that is not proved is a fault.
 
         Raises:
             QPError: r or known is invalid, or a proof is about another QP, such as this one before

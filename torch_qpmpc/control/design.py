@@ -11,10 +11,8 @@ import numpy as np
 import torch
 
 from torch_qpmpc.checks import check_choice, check_number, check_whole
-from torch_qpmpc.control.disturbance import Disturbances, choose
-from torch_qpmpc.control.signals import read_vector
-from torch_qpmpc.control.state_space import Array, StateSpace
-from torch_qpmpc.control.steady import Steady
+from torch_qpmpc.control.disturbance import Disturbances, Steady, choose
+from torch_qpmpc.control.state_space import Array, StateSpace, read_vector
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import read_blocks
 from torch_qpmpc.mpc.validation import as_tensor, check_weight

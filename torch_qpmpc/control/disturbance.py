@@ -1,4 +1,4 @@
-"""Constant disturbances that an observer estimates, so that they leave no offset.
+"""Constant disturbances that an observer estimates, and a plant's steady states with them.
 
     x+ = A x + B u + E d + B_w w + offset,   y = C x + C_w w,   w+ = w
 
@@ -6,11 +6,20 @@ With as many entries of w as outputs, a stable observer and a target that respec
 outputs settle at the target whatever constant disturbance acts (Pannocchia and Rawlings,
 "Disturbance models for offset-free MPC", AIChE J. 49, 2003). The pair is detectable if and only if
 the model is, and the matrix [A - I, B_w; C, C_w] has full column rank.
+
+The steady states (x_s, u_s) for w and known signals d are the affine set
+
+    [x_s; u_s] = Z v + M [w; d; 1],   Z a basis of the null space of [A - I, B].
+
+The target is the nearest to the set-point, and the one with the least u_s'R u_s of several. Where
+several have the same outputs with a weight, v = [a; f]: a determines these outputs, and f is the
+distance from the one with the least u_s'R u_s, small multiples of x_s and u_s added.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +34,8 @@ RANK = 1e-9
 TINY = 1e-300
 #: Modes this near to one integrate: an output disturbance is hard to tell from their drift.
 INTEGRATES = 1e-2
+#: The weight of v among steady states with the same outputs, relative to the weight of the inputs.
+REGULARISATION = 1e-3
 OUTPUT = "output"
 
 
@@ -61,7 +72,7 @@ def choose(plant: StateSpace, wanted: Any = "auto") -> Disturbances:
         raise QPError.expected("disturbances", repr(wanted), "'auto', None or a mapping")
     placed = _placed(plant, wanted)
     if (hidden := _hidden(plant, placed)) is not None:
-        got = f"{dict(wanted)}, of which the {hidden} cannot be told from a mode at 1"
+        got = f"{dict(wanted)}, whose {hidden} cannot be told from a mode at 1"
         remedy = (
             "At an integrating mode take a disturbance of its input, and at others one of the "
             "output; 'auto' chooses so. There can be no more disturbances than outputs."
@@ -153,3 +164,62 @@ def _hidden(plant: StateSpace, placed: Disturbances) -> str | None:
 
 def _number(eigenvalue: complex) -> str:
     return f"{eigenvalue.real:.3g}" + (f"{eigenvalue.imag:+.3g}j" if eigenvalue.imag else "")
+
+
+@dataclass(frozen=True, eq=False)
+class Steady:
+    """The steady states of a plant, as linear maps of [w; d; 1].
+
+    Attributes:
+        X, U, Y: the maps of v to x_s, u_s and y_s: ``(n, n_v)``, ``(m, n_v)``, ``(n_y, n_v)``.
+        x, u, y: the maps of [w; d; 1] to them, with n_w + n_d + 1 columns.
+        Q, R: the weights of the target's outputs and inputs; R is the identity in place of zero.
+        W: the weight of f, ``(n_f, n_f)``.
+    """
+
+    X: Array
+    U: Array
+    Y: Array
+    x: Array
+    u: Array
+    y: Array
+    Q: Array
+    R: Array
+    W: Array
+
+    @classmethod
+    def of(cls, plant: StateSpace, w: Disturbances, Q: Array, R: Array) -> Steady:
+        """Return the steady states of ``plant`` with disturbances ``w`` and the weights Q and R.
+
+        Raises:
+            QPError: no input moves a mode at one.
+        """
+        n, m, _, n_d = plant.sizes
+        balance = np.hstack((plant.A - np.eye(n), plant.B))
+        if null_direction(plant.A.T - np.eye(n), plant.B.T) is not None:
+            remedy = "Pass a constant of the model as a known signal, by E."
+            got = "a mode at 1 that no input moves"
+            raise QPError.expected("model", got, "a model with a steady state", remedy)
+        Z = scipy.linalg.null_space(balance, rcond=RANK)
+        Z = np.where(np.abs(Z) < RANK, 0.0, Z)  # rounding would let a bound hold by a huge v
+        loads = np.hstack((w.B, plant.E, plant.offset[:, None]))
+        M = -np.linalg.pinv(balance) @ loads
+        y = plant.C @ M[:n] + np.hstack((w.C, np.zeros((len(plant.C), n_d + 1))))
+        R = R if R.any() else np.eye(m)
+        X, U, Y, x, u = Z[:n], Z[n:], plant.C @ Z[:n], M[:n], M[n:]
+        sizes, V = np.linalg.eigh(Y.T @ Q @ Y)
+        free = sizes <= RANK * max(sizes[-1], RANK)
+        W = np.zeros((0, 0))
+        if free.any():
+            F = V[:, free]
+            W = F.T @ U.T @ R @ U @ F + REGULARISATION * np.trace(R) * np.eye(F.shape[1])
+            least = -np.linalg.solve(W, F.T @ U.T @ R)  # f of the least u'R u, for u without it
+            T = np.hstack((V[:, ~free] + F @ least @ U @ V[:, ~free], F))
+            x, y, u = (of + basis @ F @ least @ u for of, basis in ((x, X), (y, Y), (u, U)))
+            X, U, Y = X @ T, U @ T, Y @ T
+        return cls(X, U, Y, x, u, y, Q, R, W)
+
+    @property
+    def n_a(self) -> int:
+        """The number of entries of a, which determine the outputs with a weight."""
+        return self.Y.shape[1] - len(self.W)

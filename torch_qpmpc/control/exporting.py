@@ -24,7 +24,7 @@ from torch_qpmpc.export.export import Export, check_name, export_c
 from torch_qpmpc.export.library import FLAGS, compiled, compiler
 from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled
 
-#: Steps of the loop that is compared, and at most of those that the self-test replays.
+#: Steps of the loop that is compared, and the most steps that the self-test replays.
 COMPARED, REPLAYED = 200, 10
 #: Largest difference of an input in the comparison, relative to half the distance of its bounds.
 NEAR = {"float64": 1e-6, "float32": 1e-2}
@@ -41,10 +41,10 @@ class ControllerExport:
 
     Attributes:
         files: the paths of all files.
-        kept: those of an older ``main.c`` or ``Makefile`` that differ from what this export has.
+        kept: an older ``main.c`` or ``Makefile`` that differs from this export's.
         plan, target: the reports of the plan's and the target's QPs.
-        free: that of the QP of inputs that the target leaves free, None without one.
-        table_bytes: the size of all constant tables but those of self-tests.
+        free: the report of the QP of inputs that the target leaves free, None without one.
+        table_bytes: the size of all constant tables, without self-tests.
         state_bytes: the size of the state, None without a compiler.
         steps: the number of steps of the closed loop that is compared.
         difference: the largest difference of an input; None without a compiler.

@@ -13,8 +13,7 @@ from torch import Tensor
 from torch_qpmpc.control.design import Design, half_range
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
 from torch_qpmpc.control.observer import SMALL, Observer, kalman, max_plausible, windowed
-from torch_qpmpc.control.signals import read_table, read_vector
-from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.control.state_space import Array, read_table, read_vector
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.program import QuadraticProgram
 

@@ -18,15 +18,13 @@ from tqdm import tqdm
 
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design, half_range
-from torch_qpmpc.control.disturbance import choose
+from torch_qpmpc.control.disturbance import Steady, choose
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import lowered
 from torch_qpmpc.control.observer import SMALL
-from torch_qpmpc.control.signals import read_vector
 from torch_qpmpc.control.simulation import Run, simulate
-from torch_qpmpc.control.state_space import Array, StateSpace, read_model
-from torch_qpmpc.control.steady import Steady
+from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_vector
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
 from torch_qpmpc.mpc.identification import Identified, identify
@@ -40,7 +38,7 @@ GAIN = 0.01
 
 
 class Plant(NamedTuple):
-    """What closes the loops, in words and as `simulate` takes it, and the options of a loop."""
+    """The plant of the loops, in words and as `simulate` takes it, and the options of a loop."""
 
     name: str
     plant: Any

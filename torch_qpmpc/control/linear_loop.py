@@ -18,7 +18,7 @@ from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.export.tables import Tables
 
-#: The number of frequencies, from SLOWEST to that of alternating samples.
+#: The number of frequencies, from SLOWEST to alternating samples.
 FREQUENCIES, SLOWEST = 400, 1e-4
 
 

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.control.design import Design, read_design
-from torch_qpmpc.control.disturbance import Disturbances
+from torch_qpmpc.control.disturbance import Disturbances, Steady
 from torch_qpmpc.control.lowering import LinearScheme, lowered
 from torch_qpmpc.control.state_space import StateSpace, read_model
-from torch_qpmpc.control.steady import Steady
 from torch_qpmpc.control.target import free_mpc, target_mpc
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
@@ -46,12 +45,12 @@ class LinearMPC(QPMPC):
 
     without a half, about the target: the steady state (x_s, u_s, y_s) of the model that is nearest
     to the set-point r within the bounds, so that R moves no output off r. The terminal cost is the
-    Riccati equation's about (x_s, u_s) if it has a stabilising solution, else that of y_N.
+    Riccati equation's about (x_s, u_s) if it has a stabilising solution, else y_N's.
 
     All signals are deviations from the target, which keeps the values near it exact. p has d_0, ..,
     d_N, the known signals, less their mean if they act on the plant; then the
     state [x - x_s; u_last - u_s; y_s; u_s; 1].
-    In it u_last is there if moves cost or are bounded, and y_s and u_s are those with bounds.
+    u_last is in it if moves cost or are bounded, and y_s and u_s have the entries with bounds.
     The last entry adds a small constant to the values, which their errors are relative to. With
     ``references="preview"`` d_k begins with the set-points and inputs of later stages. `target` and
     `arrange` make p, and the policy is u - u_s; `Controller` does all of it.
@@ -257,7 +256,7 @@ class LinearMPC(QPMPC):
 
         Args:
             x: the state, ``(*batch, n)``.
-            target: the `target`; with a preview of references those of the stages,
+            target: the `target`; with a preview of references one for each stage,
                 ``(*batch, N + 1, ..)``; p is relative to the last one.
             signals: ``u_last`` ``(*batch, m)``, u_s if left out; ``known`` ``(*batch, N + 1, n_d)``
                 and the ``level`` ``(*batch, n_d)`` that the target is for; zero if left out.

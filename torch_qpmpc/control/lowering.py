@@ -21,8 +21,8 @@ from torch_qpmpc.mpc.regulator import lqr_gain
 from torch_qpmpc.mpc.riccati import riccati_weight
 from torch_qpmpc.mpc.scheme import Scheme
 
-#: Near the target the values are constant, SCALE times those of a typical deviation in each stage:
-#: errors of a value are certified relative to it, and those of zero could not be.
+#: The value at the target, relative to a typical deviation's in each stage: errors are certified
+#: relative to the value, which must not be zero.
 SCALE = 1e-2
 #: An eigenvalue this near to the unit circle is on it.
 ON_CIRCLE = 1e-6

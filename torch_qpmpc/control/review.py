@@ -37,7 +37,7 @@ IDLE, NOTED = 1e-6, 1e-2
 #: Offsets relative to half the distance of an output's bounds.
 OFFSET = 1e-6
 #: The most times that a set-point is replaced by its nearest one, which soft bounds may move again,
-#: and the most outputs of which all ways to round are tried.
+#: and the most outputs whose roundings are all tried.
 SETTLES, ROUNDED = 100, 6
 #: A response below this share of those soon after, with inputs of half their range, is noise.
 SHOWS = 0.03
@@ -138,7 +138,7 @@ def _terminal(design: Design) -> Finding:
 
 
 def _gains(design: Design) -> Finding:
-    """Each output's gains by inputs and known signals, for a look at signs and sizes."""
+    """Each output's gains by inputs and known signals, to compare with the plant's."""
     plant, N = design.plant, design.horizon
     acting = plant.E.any(0)
     names = (*plant.inputs, *np.array(plant.known)[acting])
@@ -163,7 +163,7 @@ def _horizon(design: Design) -> Finding:
         steps.append(plant.C @ x)
         x = plant.A @ x
     responses = np.cumsum(steps, 0)
-    moves = np.abs(steps)  # beside those of the next ten steps, as a ramp has no largest one
+    moves = np.abs(steps)  # beside the next ten steps', as a ramp has no largest one
     ahead = np.lib.stride_tricks.sliding_window_view(moves.max(2), 10, axis=0).max(-1)
     responses = responses[: len(ahead)]
     away = np.logical_and.accumulate(moves[: len(ahead)] <= SHOWS * ahead[..., None])

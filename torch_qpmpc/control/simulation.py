@@ -15,8 +15,14 @@ from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design, half_range, middle
 from torch_qpmpc.control.law import Law, Memory, Move, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
-from torch_qpmpc.control.signals import read_row, read_vector
-from torch_qpmpc.control.state_space import FAINT, Array, StateSpace, read_model
+from torch_qpmpc.control.state_space import (
+    FAINT,
+    Array,
+    StateSpace,
+    read_model,
+    read_row,
+    read_vector,
+)
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.loops import Step, run_loop
 

@@ -3,13 +3,13 @@
     min over v of (y_s - r)'Q(y_s - r) + price violation(y_s),   u_s within its bounds,
 
 where (x_s, u_s, y_s) is the steady state for v, the disturbance w and known signals d (see
-`torch_qpmpc.control.steady`). It is the policy of a `QPMPC` of one stage whose state, and p, is
+`torch_qpmpc.control.disturbance`). It is the policy of a one-stage `QPMPC` whose state, and p, is
 [r; w; d] and whose action is v.
 
-Where several steady states have the same outputs with a weight, v = [a; f], the action is a, and
-the bounds are those of a for which there is an f. The policy of a second QPMPC with the state
-[a; w; d] is f: least inputs within their bounds. One QP for both would need a weight of f so small
-that numbers in C lose their digits; it remains where f moves an output with soft bounds.
+Where several steady states have the same outputs with a weight, v = [a; f], the action is a,
+bounded so that an f exists. The policy of a second QPMPC with the state [a; w; d] is f: least
+inputs within their bounds. One QP for both would need a weight of f so small that numbers in C lose
+their digits; it remains where f moves an output with soft bounds.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import Scheme
 
-#: The weight of small inputs among those with the same outputs, relative to that of the outputs.
+#: The weight of small inputs among those with the same outputs, relative to the outputs'.
 PREFERENCE = 1e-8
 #: The price of a hard bound of an output, which a disturbance may make impossible to keep.
 HARD = 1e6
