@@ -87,15 +87,6 @@ class Plant(ABC):
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """Return L(x, u, w) ``(*batch,)``, of the applied u ``(*batch, n_u)``."""
 
-    def output_cost(self, y: Tensor, u: Tensor, d: Tensor) -> Tensor | None:
-        """Return the cost ``(*batch,)`` as outputs, inputs and known signals show it.
-
-        They are y ``(*batch, n_y)``, the applied u ``(*batch, n_u)`` and d ``(*batch, n_d)``. The
-        mean may differ from that of `cost` by a constant, as with noise in y. None, unless
-        overridden, if it is unknown.
-        """
-        return None
-
     @abstractmethod
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """Return x+ = f(x, u, w) ``(*batch, n_x)``, for the applied u."""
