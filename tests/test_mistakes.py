@@ -13,7 +13,7 @@ from tests.mistakes import learning, plants, programs, reading
 from tests.mistakes.objects import A2, B1, W3, M, mpc, op
 from tests.runs import make_config
 from torch_qpmpc.envs import PointMass, PointMassEnv
-from torch_qpmpc.learning.replay import make_replay
+from torch_qpmpc.learning.replay import Replay
 
 TABLES = (programs.MISTAKES, learning.MISTAKES, reading.MISTAKES, plants.MISTAKES)
 
@@ -42,7 +42,7 @@ MISSPELT: Any = {"misspelt": 1}
         lambda: qm.SystemIdentificationPenalty(**MISSPELT),
         lambda: PointMass(**MISSPELT),
         lambda: PointMassEnv(**MISSPELT),
-        lambda: make_replay(64, 2, 4, 3, 2, **MISSPELT),
+        lambda: Replay(64, 2, 4, 3, 2, **MISSPELT),
     ],
 )
 def test_a_misspelt_keyword_is_named(call):

@@ -33,7 +33,7 @@ from tests.benchmarks.reference import relative_error
 from tests.benchmarks.table import significant
 from torch_qpmpc.envs import PointMass, PointMassEnv
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
-from torch_qpmpc.learning.replay import ACTIVE_SET, make_replay
+from torch_qpmpc.learning.replay import ACTIVE_SET, Replay
 from torch_qpmpc.learning.updates import second_order
 from torch_qpmpc.study.markdown import replaced, table
 
@@ -222,9 +222,7 @@ def learn(
     loss_module = qm.QPQLearningLoss(operator)
     loss_module.make_value_estimator(gamma=GAMMA)
     update = second_order(mpc, loss_module, qm.GaussNewton(mpc), None, None)
-    replay = make_replay(
-        num_envs * STORED, num_envs, pairs, 1, 1, device=device, active_rows=len(mpc.G)
-    )
+    replay = Replay(num_envs * STORED, num_envs, pairs, 1, 1, device=device, active_rows=len(mpc.G))
 
     @torch.no_grad()
     def cost() -> float:

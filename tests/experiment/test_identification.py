@@ -19,7 +19,7 @@ from torch_qpmpc.experiment.rivals import IDENTIFICATION
 from torch_qpmpc.experiment.start import collect_log, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start, nominal_mpcs
-from torch_qpmpc.learning.replay import make_replay
+from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.identification import identify
 from torch_qpmpc.mpc.rewards import fit_rewards
 from torch_qpmpc.mpc.riccati import terminal_riccati
@@ -93,7 +93,7 @@ def test_all_of_a_runs_transitions_are_used():
     cfg = make_config(*GROS_ZANON)
     physics = make_physics(cfg)
     log = collect_log(cfg, physics)
-    replay = make_replay(400, 20, 8, 5, 1)
+    replay = Replay(400, 20, 8, 5, 1)
     ids = log["next", "done"][..., 0].int()
     replay.extend(log.exclude("preview").set(("collector", "traj_ids"), ids))
     start = identified_start(cfg, physics, log)

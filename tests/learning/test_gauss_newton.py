@@ -86,15 +86,6 @@ def test_weights_are_those_of_the_squared_errors(name):
     assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
 
 
-def test_the_trust_region_counts_weighted_errors():
-    """The predicted decrease is that of the weighted objective: a small step meets it."""
-    mpc = random_mpc(2)
-    s, a = random_states(40, 2, size=0.9), random_states(40, 1, size=0.45, seed=1)
-    target = mpc.action_value(s, a).detach() + 1e-4 * a[:, 0] * normal(40, seed=2)
-    report = GaussNewton(mpc, damping=1.0, weighted=True).step(s, a, target)
-    assert report.ratio == pytest.approx(1, abs=0.01)
-
-
 @pytest.mark.parametrize("learn", [("H", "c", "C"), ("C", "b")])
 def test_the_si_penalty_is_part_of_the_step(learn):
     mpc = random_mpc(3, learn=learn)
@@ -290,3 +281,12 @@ def test_residuals_are_rows_of_the_least_squares_problem(trust_region):
 def test_residuals_need_a_tied_C():
     with pytest.raises(QPError, match="residuals: got them with a free C, expected a tied C"):
         GaussNewton(random_mpc(2), residuals=lambda qp: qp.q)
+
+
+def test_the_trust_region_counts_weighted_errors():
+    """The predicted decrease is that of the weighted objective: a small step meets it."""
+    mpc = random_mpc(2)
+    s, a = random_states(40, 2, size=0.9), random_states(40, 1, size=0.45, seed=1)
+    target = mpc.action_value(s, a).detach() + 1e-4 * a[:, 0] * normal(40, seed=2)
+    report = GaussNewton(mpc, damping=1.0, weighted=True).step(s, a, target)
+    assert report.ratio == pytest.approx(1, abs=0.01)

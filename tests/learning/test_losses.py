@@ -10,28 +10,20 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict.nn import TensorDictSequential
 from torch import Tensor
-from torchrl.envs import InitTracker, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import AdditiveGaussianModule, OrnsteinUhlenbeckProcessModule
-from torchrl.objectives import CQLLoss, HardUpdate, SoftUpdate, TD3Loss
+from torchrl.objectives import CQLLoss, HardUpdate, SoftUpdate
 
 from tests.losses import (
-    BOUNDS,
     ENSEMBLES,
     LOSSES,
     ON_POLICY,
     critic,
-    critics,
     make_batch,
     make_loss,
     network_gaussian,
-    network_policy,
     total,
 )
-from torch_qpmpc import QPMPC, QPActorValueOperator, SolverError
-from torch_qpmpc.envs import PointMassEnv
+from torch_qpmpc import SolverError
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 OFF_POLICY = [name for name in LOSSES if name not in ON_POLICY]
@@ -149,16 +141,6 @@ def test_copies_are_equal_and_independent(name):
 # --- Single losses and modules around them -------------------------------------------------------
 
 
-def test_an_ensemble_of_modules_keeps_their_starts_and_shares_no_bounds():
-    modules = critics(3)
-    loss = TD3Loss(network_policy(), modules, bounds=BOUNDS, num_qvalue_nets=3)
-    params = loss.qvalue_network_params
-    for i, module in enumerate(modules):
-        assert torch.equal(params["module", "C"][i], module.module.C)
-        assert torch.equal(params["module", "ub"][i], module.module.ub)
-    assert not params["module", "ub"].requires_grad
-
-
 def test_actions_beyond_a_critics_hard_bounds_are_refused_by_name():
     """CQL draws actions between -1 and 1, regardless of the action's bounds."""
     narrow = [critic(seed) for seed in (1, 2)]
@@ -168,19 +150,3 @@ def test_actions_beyond_a_critics_hard_bounds_are_refused_by_name():
     loss = CQLLoss(network_gaussian(), narrow)
     with pytest.raises(SolverError, match=r"INFEASIBLE.* soften rows with a finite w"):
         total(loss, make_batch())
-
-
-@pytest.mark.parametrize("kind", [AdditiveGaussianModule, OrnsteinUhlenbeckProcessModule])
-def test_exploration_around_the_policy_in_a_rollout(kind):
-    env = TransformedEnv(PointMassEnv(4, max_steps=10, seed=0), InitTracker())
-    bounds = ([-1.0] * 2, [1.0] * 2)
-    mpc = QPMPC.of(4, 2, 3, action_bounds=bounds, stage_weight=torch.ones(6), solver="daqp")
-    actor: Any = QPActorValueOperator(mpc).get_policy_operator()
-    torch.manual_seed(0)
-    explorer = TensorDictSequential(actor, kind(env.action_spec))
-    for exploration in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
-        with set_exploration_type(exploration), torch.no_grad():
-            rollout = env.rollout(6, explorer)
-        assert rollout["action"].abs().max() <= 1
-        close = torch.isclose(rollout["action"], mpc.policy(rollout["observation"]), atol=1e-6)
-        assert close.all() == (exploration == ExplorationType.DETERMINISTIC)

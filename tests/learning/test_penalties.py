@@ -173,19 +173,6 @@ def test_true_model_explains_noise_free_windows(generator):
     assert (gradient * towards).sum() < 0
 
 
-@pytest.mark.parametrize("shape", [(N_Z,), (3, N_Z - 1), (2, 3, N_Z)])
-def test_windows_of_another_shape(generator, shape):
-    match = rf"windows: got shape \({shape[0]},.*, expected shape \(M, {N_Z}\)"
-    with pytest.raises(QPError, match=match):
-        system_identification_penalty(normal(generator, N * N_X, N_Z), normal(generator, *shape))
-
-
-@pytest.mark.parametrize("beta", [-1e-6, math.inf, math.nan])
-def test_impossible_beta(beta):
-    with pytest.raises(QPError, match=rf"beta: got {beta}, expected a finite weight >= 0"):
-        SystemIdentificationPenalty(beta)
-
-
 def test_the_si_penalty_as_a_quadratic_in_C():
     generator = torch.Generator().manual_seed(0)
     C, windows = normal(generator, 3, 8), normal(generator, 5, 8)

@@ -25,7 +25,7 @@ from tests.transitions import (
     make_operator,
     perturb,
 )
-from torch_qpmpc import QPMPC, GaussNewton, QPActorValueOperator, QPError, QPQLearningLoss
+from torch_qpmpc import QPMPC, GaussNewton, QPActorValueOperator, QPError
 from torch_qpmpc.learning.td_error import inverse_variance
 
 
@@ -108,17 +108,6 @@ def test_priority_weights():
     torch.testing.assert_close(unweighted, none.mean())
 
 
-def test_padding_mask_of_the_collector():
-    td = make_batch(4, 3)
-    none = make_loss(reduction="none")(td)["loss_value"]
-    mask = torch.ones(4, 3, dtype=torch.bool)
-    mask[1, 2] = mask[3, 0] = False
-    td["collector", "mask"] = mask
-    td["observation"][~mask] = torch.nan
-    torch.testing.assert_close(make_loss()(td)["loss_value"], none[mask].mean())
-    torch.testing.assert_close(make_loss(reduction="sum")(td)["loss_value"], none[mask].sum())
-
-
 def test_cast_to_float32():
     loss, td = make_loss(), make_batch(6)
     expected = loss(td.clone())["loss_value"].item()
@@ -174,19 +163,6 @@ def test_compiled_without_graph_breaks():
         for parameter, gradient in zip(loss.parameters(), gradients, strict=True):
             torch.testing.assert_close(parameter.grad, gradient)
         loss.zero_grad()
-
-
-def test_bad_arguments():
-    operator = make_operator()
-    with pytest.raises(TypeError, match="gamma"):
-        QPQLearningLoss(operator, gamma=0.9)
-    with pytest.raises(QPError, match=r"value_network: got \w*QPMPC, .* Wrap the QPMPC"):
-        QPQLearningLoss(operator.module)  # pyright: ignore[reportArgumentType] - what is tested
-    for clip in (0.0, -1.0, math.nan):
-        with pytest.raises(QPError, match=rf"td_error_clip: got {clip}, expected a positive"):
-            QPQLearningLoss(operator, td_error_clip=clip)
-    with pytest.raises(QPError, match="reduction: got 'median', expected 'mean', 'sum' or 'none'"):
-        QPQLearningLoss(operator, reduction="median")
 
 
 def expected_step(mpc: QPMPC, td: TensorDictBase, clip: float = math.inf) -> list[Tensor]:
@@ -329,14 +305,6 @@ def test_c_stays_without_a_usable_transition_or_a_discount():
     loss.make_value_estimator()
     td["next", "reward"] = torch.full((7, 9, 1), torch.nan)
     assert loss.centre_(td) == 0.0
-
-
-def test_the_constant_of_a_window_and_a_preview():
-    operator, td = store.make_operator(), store.collect(3, 8).reshape(-1)
-    loss, p = make_loss(operator=operator), torch.cat((td["preview"], td["observation"]), -1)
-    assert abs(loss.centre_(td)) > 1e-3
-    error = -loss.target(td) - operator.module.action_value(p, td["action"])
-    assert abs(error.mean().item()) < 1e-9
 
 
 def test_a_transition_out_of_the_data_does_not_raise_its_own_target_for_ever():

@@ -11,7 +11,6 @@ import torch
 from torchrl.data import MultiStep
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.objectives import HardUpdate, SoftUpdate
-from torchrl.objectives.value import TD0Estimator
 
 from tests.transitions import (
     GAMMA,
@@ -22,13 +21,7 @@ from tests.transitions import (
     make_operator,
     perturb,
 )
-from torch_qpmpc import QPActorValueOperator, QPQLearningLoss
-
-
-def test_default_estimator_is_td0():
-    loss = QPQLearningLoss(make_operator())
-    assert isinstance(loss.value_estimator, TD0Estimator)
-    assert loss.value_estimator.gamma.item() == loss.operator.module.gamma
+from torch_qpmpc import QPActorValueOperator
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")

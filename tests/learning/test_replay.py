@@ -13,7 +13,7 @@ from torchrl.collectors import Collector
 from tests import store
 from torch_qpmpc.envs import PointMass, PointMassEnv
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.learning.replay import Replay, make_replay, windows_to_tau
+from torch_qpmpc.learning.replay import Replay, windows_to_tau
 
 ENVS, N = 8, 4
 
@@ -46,7 +46,7 @@ def batches(count: int, steps: int, max_steps: int) -> list[TensorDictBase]:
 
 
 def filled(data: list[TensorDictBase], rows: int, num_windows: int = 400, seed: int = 0) -> Replay:
-    replay = make_replay(rows * ENVS, ENVS, 32, N, num_windows, seed=seed)
+    replay = Replay(rows * ENVS, ENVS, 32, N, num_windows, seed=seed)
     for batch in data:
         replay.extend(batch)
     return replay
@@ -73,7 +73,7 @@ def check_windows(replay: Replay) -> torch.Tensor:
 @pytest.mark.parametrize("steps", [1, 2, 3])
 @pytest.mark.parametrize(("max_steps", "rows"), [(N, 15), (7, 40), (50, 15)])
 def test_windows_never_cross_episodes(steps, max_steps, rows):
-    replay = make_replay(rows * ENVS, ENVS, 32, N, 200)
+    replay = Replay(rows * ENVS, ENVS, 32, N, 200)
     wrapped = False
     for batch in batches(60 // steps, steps, max_steps):
         replay.extend(batch)
@@ -137,7 +137,7 @@ def test_tau_begins_with_all_that_is_known():
     data = store.collect(4, 30, dtype=torch.float32)
     done = data["next", "done"].squeeze(-1)
     data["collector", "traj_ids"] = done.cumsum(1) - done.long() + 100 * torch.arange(4)[:, None]
-    replay = make_replay(4 * 30, 4, 8, 3, 50, n_x=1, preview_key="preview")
+    replay = Replay(4 * 30, 4, 8, 3, 50, n_x=1, preview_key="preview")
     replay.extend(data)
     tau = replay.sample_tau()
     assert tau.shape == (50, store.make_mpc().n_z)
@@ -196,7 +196,7 @@ def test_a_flattened_batch_is_an_error():
 @pytest.mark.parametrize("capacity", [33, 24, 0])
 def test_bad_capacity_is_an_error(capacity):
     with pytest.raises(QPError, match=rf"capacity: got {capacity}, .* The smallest is 32\."):
-        make_replay(capacity, ENVS, 32, N, 5)
+        Replay(capacity, ENVS, 32, N, 5)
 
 
 def test_sampling_windows_too_early_is_an_error():

@@ -15,7 +15,7 @@ from tests.problems import random_mpc
 from tests.runs import SMALL, make_config
 from tests.transitions import transitions
 from torch_qpmpc import QPActorValueOperator, QPQLearningLoss, SolveLog
-from torch_qpmpc.learning.replay import ACTIVE_SET, ACTIVE_SETS, Replay, make_replay
+from torch_qpmpc.learning.replay import ACTIVE_SET, ACTIVE_SETS, Replay
 from torch_qpmpc.qp.program import UNKNOWN
 
 COUNT = 12
@@ -79,7 +79,7 @@ def test_without_a_key_nothing_is_written():
 
 
 def test_a_replay_returns_remembered_active_sets():
-    replay = make_replay(8 * 4, 4, 6, 2, 5, active_rows=3)
+    replay = Replay(8 * 4, 4, 6, 2, 5, active_rows=3)
     batch = transitions(20).reshape(4, 5)
     batch["collector", "traj_ids"] = torch.arange(4).unsqueeze(-1).expand(4, 5).clone()
     replay.extend(batch)
@@ -102,7 +102,7 @@ def test_a_replay_returns_remembered_active_sets():
 
 
 def test_a_replay_without_active_sets_has_nothing_to_remember():
-    replay = make_replay(32, 4, 6, 2, 5)
+    replay = Replay(32, 4, 6, 2, 5)
     replay.extend(transitions(20).reshape(4, 5))
     sample = replay.sample()
     assert ACTIVE_SET not in sample

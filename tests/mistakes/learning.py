@@ -17,7 +17,7 @@ import torch_qpmpc as qm
 from tests.mistakes.objects import Aa, G, S, batch_with, batch_without, free, gn, mpc, op
 from tests.problems import random_mpc
 from tests.transitions import make_batch, make_loss
-from torch_qpmpc.learning.replay import make_replay, windows_to_tau
+from torch_qpmpc.learning.replay import Replay, windows_to_tau
 
 
 def released_step() -> None:
@@ -145,33 +145,33 @@ MISTAKES: dict[str, list[Callable[[], Any]]] = {
     "windows: got shape (2, 3, 11), expected shape (M, n_z). Sample N consecutiv": [
         lambda: qm.SystemIdentificationPenalty().curvature(torch.zeros(2, 3, 11)).shape
     ],
-    "batch_size: got 0, expected a whole number >= 1.": [lambda: make_replay(64, 2, 0, 3, 2)],
-    "window: got 0, expected a whole number >= 1.": [lambda: make_replay(64, 2, 4, 0, 2)],
-    "num_windows: got 0, expected a whole number >= 1.": [lambda: make_replay(64, 2, 4, 3, 0)],
-    "capacity: got -64, expected a whole number >= 0.": [lambda: make_replay(-64, 2, 4, 3, 2)],
-    "num_envs: got -2, expected a whole number >= 1.": [lambda: make_replay(64, -2, 4, 3, 2)],
+    "batch_size: got 0, expected a whole number >= 1.": [lambda: Replay(64, 2, 0, 3, 2)],
+    "window: got 0, expected a whole number >= 1.": [lambda: Replay(64, 2, 4, 0, 2)],
+    "num_windows: got 0, expected a whole number >= 1.": [lambda: Replay(64, 2, 4, 3, 0)],
+    "capacity: got -64, expected a whole number >= 0.": [lambda: Replay(-64, 2, 4, 3, 2)],
+    "num_envs: got -2, expected a whole number >= 1.": [lambda: Replay(64, -2, 4, 3, 2)],
     "seed: got 'a', expected a whole number >= 0 and < 2^63.": [
-        lambda: make_replay(64, 2, 4, 3, 2, seed="a")
+        lambda: Replay(64, 2, 4, 3, 2, seed="a")
     ],
     "active_rows: got -1, expected a whole number >= 0.": [
-        lambda: make_replay(64, 2, 4, 3, 2, active_rows=-1)
+        lambda: Replay(64, 2, 4, 3, 2, active_rows=-1)
     ],
     "replay: got nothing stored, expected transitions. Call extend() first.": [
-        lambda: make_replay(64, 2, 4, 3, 2).sample()
+        lambda: Replay(64, 2, 4, 3, 2).sample()
     ],
     "batch: got list, expected a TensorDictBase. Pass the collector's batch as i": [
-        lambda: make_replay(64, 2, 4, 3, 2).extend([1])
+        lambda: Replay(64, 2, 4, 3, 2).extend([1])
     ],
     "batch: got shape (3, 2), expected (num_envs, T) with num_envs = 2. Transpose it": [
-        lambda: (lambda r: (r.extend(make_batch(3, 2)), r.sample()))(make_replay(64, 2, 4, 3, 2))
+        lambda: (lambda r: (r.extend(make_batch(3, 2)), r.sample()))(Replay(64, 2, 4, 3, 2))
     ],
     "sample: got no entry active_set, expected one. Pass what sample() returned,": [
         lambda: (
             lambda r: (r.extend(make_batch(2, 8)), r.remember(r.sample().exclude("active_set")))
-        )(make_replay(64, 2, 4, 3, 2, active_rows=3))
+        )(Replay(64, 2, 4, 3, 2, active_rows=3))
     ],
     "state: got no generator, storage, writer, expected what state_dict() return": [
-        lambda: make_replay(64, 2, 4, 3, 2).load_state_dict({})
+        lambda: Replay(64, 2, 4, 3, 2).load_state_dict({})
     ],
     "windows: got Tensor, expected a TensorDictBase.": [lambda: windows_to_tau(S)],
     "windows: got shape (4,) with observation, expected consecutive transitions ": [

@@ -13,7 +13,7 @@ from torchrl.modules import AdditiveGaussianModule
 
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET, preview_key
-from torch_qpmpc.learning.replay import Replay, make_replay
+from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.module import QPMPC
 
 
@@ -32,7 +32,7 @@ def make_collector(cfg: DictConfig, physics: AnyPlant, actor: TensorDictModuleBa
 def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
     """Make a run's replay of transitions and, for the SI penalty, of windows."""
     si = cfg.constraint.si
-    return make_replay(
+    return Replay(
         cfg.replay_capacity,
         cfg.num_envs,
         cfg.batch_size,

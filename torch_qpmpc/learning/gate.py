@@ -24,7 +24,7 @@ from torch_qpmpc.errors import QPError
 Costs = Callable[[nn.Module, int], Tensor]
 #: Fewest pairs of a decision.
 FEWEST = 16
-#: Pairs that only set the scale of the differences, if no bound is given.
+#: Pairs that only set the scale of the differences without a bound.
 FIRST = 8
 #: Largest loss of a pair that is assumed without a bound, in mean absolute differences.
 MULTIPLE = 5.0
@@ -110,8 +110,8 @@ class PairedTest:
     def interval(self) -> tuple[float, float]:
         """The confidence interval of the mean difference, infinite with fewer than 16 pairs.
 
-        It covers the mean at all n at once with probability 1 - alpha. Its lower end takes the
-        bound for that of gains.
+        It covers the mean at all n at once with probability 1 - alpha. Its lower end applies the
+        bound to gains.
         """
         if self.pairs < FEWEST or not math.isfinite(self.mean):
             return -math.inf, math.inf
@@ -132,10 +132,10 @@ class PairedTest:
         return next(won, "open")
 
 
-def _bounds(d: np.ndarray, given: float | None) -> np.ndarray:
+def _bounds(d: np.ndarray, bound: float | None) -> np.ndarray:
     """Return the bounds on the losses of all pairs and of the next one, ``(n + 1,)``."""
-    if given is not None:
-        return np.full(len(d) + 1, given)
+    if bound is not None:
+        return np.full(len(d) + 1, bound)
     n, bounds = np.arange(1, len(d) + 1), np.full(len(d) + 1, np.inf)
     with np.errstate(all="ignore"):
         mean, size = np.cumsum(d) / n, np.cumsum(np.abs(d)) / n
@@ -149,8 +149,8 @@ def _bounds(d: np.ndarray, given: float | None) -> np.ndarray:
 class _Bets:
     """Bets against E d >= mean: their wealth increases with the mean."""
 
-    def __init__(self, d: np.ndarray, given: float | None) -> None:
-        bounds = _bounds(d, given)[:-1]
+    def __init__(self, d: np.ndarray, bound: float | None) -> None:
+        bounds = _bounds(d, bound)[:-1]
         self._lost, bet = bool((d > bounds).any()), np.isfinite(bounds)
         self._d, self._bounds = d[bet], bounds[bet]
 

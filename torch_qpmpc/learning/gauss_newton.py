@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -48,31 +48,25 @@ def _positive(x: float) -> bool:
     return 0 < x < math.inf
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class StepReport:
     """The outcome of a `GaussNewton.step`.
 
     Attributes:
-        solution: the solution of Q(s, a) before the step.
         damping: mu as a fraction of the mean of K's diagonal, as used by the step.
         ratio: actual over predicted decrease of the objective; nan without a trust region.
         accepted: True if theta has moved.
         unsolved: number of pairs left out because their QP has no solution.
         without_target: number of other pairs left out because their target is not finite.
+        solution: the solution of Q(s, a) before the step.
     """
 
-    solution: QPSolution
     damping: float
     ratio: float
     accepted: bool
-    unsolved: int = 0
-    without_target: int = 0
-
-    def __repr__(self) -> str:
-        """Return the numbers on one line, followed by the solution's summary."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        numbers = (f"{name}={x!r}" for name, x in values.items() if name != "solution")
-        return f"StepReport({', '.join(numbers)}, solution={self.solution!r})"
+    unsolved: int
+    without_target: int
+    solution: QPSolution
 
 
 class GaussNewton(torch.optim.Optimizer):
@@ -184,7 +178,7 @@ class GaussNewton(torch.optim.Optimizer):
         use, left_out = usable(solution.solved, target)
 
         def report(ratio: float, accepted: bool) -> StepReport:
-            return StepReport(solution, damping, ratio, accepted, *left_out)
+            return StepReport(damping, ratio, accepted, *left_out, solution)
 
         count = len(s) - sum(left_out)
         if not count:
@@ -200,9 +194,15 @@ class GaussNewton(torch.optim.Optimizer):
         # Theta's own parts: the change of a schedule is constant in theta.
         solution = replace(solution, qp=qp)
         blocks = self._blocks(solution, root, None if penalty is None else count * penalty)
-        errors, steps, change = self._solve(blocks, delta, count)
+        scale(blocks, count)
+        mu = damping_of(blocks, damping)
+        errors = torch.cat((delta, self._further(blocks, delta, count)))
+        alpha, change = solve_dual(blocks, errors, mu)
+        steps = [block.step(alpha) for block in blocks]
         if not (objective(errors, blocks).isfinite() and all(x.isfinite().all() for x in steps)):
-            self._restart()
+            self._adapt(math.nan)
+            for group in self.param_groups:
+                group |= FRESH
             return report(math.nan, False)
         if not self._trust_region:
             _move(blocks, steps, lr)
@@ -216,22 +216,6 @@ class GaussNewton(torch.optim.Optimizer):
                 block.leaf.copy_(value)
         self._adapt(ratio)
         return report(ratio, accepted)
-
-    def _solve(
-        self, blocks: list[Block], delta: Tensor, count: int
-    ) -> tuple[Tensor, list[Tensor], Tensor]:
-        """Return the errors of pairs and residuals, the parts' steps, and their change of both."""
-        scale(blocks, count)
-        mu = damping_of(blocks, self.param_groups[0]["damping"])
-        errors = torch.cat((delta, self._further(blocks, delta, count)))
-        alpha, change = solve_dual(blocks, errors, mu)
-        return errors, [block.step(alpha) for block in blocks], change
-
-    def _restart(self) -> None:
-        """Raise the damping and clear the sizes after an overflow."""
-        self._adapt(math.nan)
-        for group in self.param_groups:
-            group |= FRESH
 
     def _check_batch(self, s: Tensor, a: Tensor, target: Tensor, penalty: Tensor | None) -> None:
         """Raise `QPError` if an argument of `step` does not fit."""
@@ -261,7 +245,7 @@ class GaussNewton(torch.optim.Optimizer):
 
         Args:
             blocks, steps: the parts and their steps.
-            errors, change: those of the TD errors and residuals, and the step's change of them.
+            errors, change: TD errors and residuals, and the step's predicted change of both.
             batch: s, a, the rows' factors, 0 if not usable, and the solution before the step.
         """
         s, a, root, solution = batch
@@ -288,7 +272,7 @@ class GaussNewton(torch.optim.Optimizer):
         )
 
     def _check_parameters(self) -> None:
-        """Raise `QPError` if the QPMPC's parameters are no longer those of this optimiser."""
+        """Raise `QPError` if the QPMPC has other parameters than this optimiser."""
         own = {id(parameter) for parameter in self._mpc.parameters()}
         groups = self.param_groups
         replaced = [x["name"] for x in groups if not own.issuperset(map(id, x["params"]))]
@@ -325,7 +309,7 @@ class GaussNewton(torch.optim.Optimizer):
         return next((leaf for leaf in leaves if leaf is C and leaf.requires_grad), None)
 
     def _further(self, blocks: list[Block], delta: Tensor, count: int) -> Tensor:
-        """Append the residuals' gradients to those of the TD errors; return their errors -r."""
+        """Append the gradients of the residuals to the TD errors'; return -r."""
         if self._residuals is None or not blocks:
             return delta.new_zeros(0)
         group, variance = self.param_groups[0], float(delta.square().sum() / count)

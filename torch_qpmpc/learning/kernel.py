@@ -19,7 +19,7 @@ The metric has no free units. For each part p of theta
 
 so that mu damps each part in relation to its own gradients. A part of the cost has a size of its
 own; C, b, G, lb and ub share the sum of theirs, as they describe one model. Sizes rise at once, as
-those of MINPACK's scaling: otherwise a part would move the more freely, the less Q depends on it.
+in MINPACK's scaling: otherwise a part would move the more freely, the less Q depends on it.
 They fall slowly, so that the large gradients of a bad start do not damp a part for ever.
 
 U is the identity except where C is free. With m_j the mean square of signal j, an entry of x, u

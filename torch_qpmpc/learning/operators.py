@@ -13,7 +13,6 @@ state_action_value = -Q(s, a), both with TorchRL's trailing dimension of one.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -37,8 +36,7 @@ POLICY_ACTIVE_SET = "policy_active_set"
 class _QPOperator(TensorDictModuleBase):
     """A view of a QPMPC.
 
-    Every view holds the QPMPC as ``module``, so that the parameters of one view, such as those of
-    a target network, fit any other.
+    Every view holds the QPMPC as ``module``, so that the parameters of a target network fit any.
     """
 
     module: QPMPC
@@ -56,9 +54,13 @@ class _QPOperator(TensorDictModuleBase):
         check_kind("mpc", mpc, QPMPC)
         self.module = mpc
         self.active_set_key, self.preview_key = active_set_key, preview_key
-        self.theta_keys = {} if theta_keys is None else _checked_keys(mpc, theta_keys)
-        in_keys = [*in_keys, *_if_any(preview_key), *self.theta_keys.values()]
-        out_keys = [out_key, *_if_any(active_set_key)]
+        theta_keys = {} if theta_keys is None else theta_keys
+        check_kind("theta_keys", theta_keys, Mapping, "Map names to keys: {'q': ('theta', 'q')}.")
+        if theta_keys:
+            check_names("theta_keys", theta_keys, mpc)
+        self.theta_keys = dict(theta_keys)
+        preview, active = ([] if key is None else [key] for key in (preview_key, active_set_key))
+        in_keys, out_keys = [*in_keys, *preview, *theta_keys.values()], [out_key, *active]
         self.in_keys = in_keys  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = out_keys  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -92,17 +94,6 @@ class _QPOperator(TensorDictModuleBase):
             tensordict.set(self.active_set_key, solution.active)
             cost = to_dtype(solution.value, inputs[0].dtype)
         return tensordict.set(self.out_keys[0], -cost.unsqueeze(-1))
-
-
-def _if_any(key: NestedKey | None) -> list[NestedKey]:
-    return [] if key is None else [key]
-
-
-def _checked_keys(mpc: QPMPC, theta_keys: Any) -> dict[str, NestedKey]:
-    """Return ``theta_keys`` as a dict; raise `QPError` if a name is not a coordinate's."""
-    check_kind("theta_keys", theta_keys, Mapping, "Map names to keys: {'q': ('theta', 'q')}.")
-    check_names("theta_keys", theta_keys, mpc)
-    return dict(theta_keys)
 
 
 def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:

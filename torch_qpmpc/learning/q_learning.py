@@ -18,6 +18,7 @@ from torch_qpmpc.checks import check_flag, check_number, class_name
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.operators import QPActorValueOperator, QPValueOperator
 from torch_qpmpc.learning.td_error import (
+    TD_SCALARS,
     invalid_rewards,
     inverse_variance,
     td_loss,
@@ -34,10 +35,10 @@ class QPQLearningLoss(LossModule):
     Truncation bootstraps, termination does not.
 
     Batches of n-step transitions (TorchRL's ``steps_to_next_obs``) and, with the TD(lambda)
-    estimator, of slices ``(*batch, n)`` have returns of several steps. Their rewards are those of
+    estimator, of slices ``(*batch, n)`` have returns of several steps. Their rewards come from
     the actions taken, so that Q(s, a) then learns the cost of the exploring policy's next steps.
 
-    If `observe` is given all transitions, V(s+) is clipped to what a constant cost, the least or
+    If `observe` sees all transitions, V(s+) is clipped to what a constant cost, the least or
     the largest so far, or none would cost for ever (truncated fitted value iteration: Munos and
     Szepesvari, "Finite-time bounds for fitted value iteration", JMLR 2008). Without it a transition
     to a state that no other transition leaves can raise its own target without bound.
@@ -87,7 +88,7 @@ class QPQLearningLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """The keys that ``set_keys`` can rename; the defaults are those of TorchRL's losses."""
+        """The keys that ``set_keys`` can rename; the defaults are TorchRL's."""
 
         advantage: NestedKey = "advantage"
         value_target: NestedKey = "value_target"
@@ -103,21 +104,8 @@ class QPQLearningLoss(LossModule):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     default_value_estimator = ValueEstimators.TD0
-    SUPPORTED_VALUE_ESTIMATORS = (
-        ValueEstimators.TD0,
-        ValueEstimators.TD1,
-        ValueEstimators.TDLambda,
-    )
-    out_keys = [  # noqa: RUF012  # pyright: ignore[reportAssignmentType] - TorchRL's convention
-        "loss_value",
-        "td_error",
-        "pred_value",
-        "target_value",
-        "pred_value_max",
-        "target_value_max",
-        "unsolved",
-        "invalid_reward",
-    ]
+    SUPPORTED_VALUE_ESTIMATORS = tuple(ValueEstimators[x] for x in ("TD0", "TD1", "TDLambda"))
+    out_keys = ["loss_value", *TD_SCALARS]  # noqa: RUF012  # pyright: ignore[reportAssignmentType] - TorchRL's convention
 
     value_network: QPActorValueOperator | TensorDictSequential
     state_value_network: QPValueOperator | TensorDictSequential
@@ -189,28 +177,23 @@ class QPQLearningLoss(LossModule):
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         if self._value_estimator is not None:
             self._value_estimator.set_keys(**self._estimator_keys())
-        self._set_in_keys()
+        self._in_keys = None
 
     def _estimator_keys(self) -> dict[str, NestedKey]:
         names = ("advantage", "value_target", "value", "reward", "done", "terminated")
         return {name: getattr(self.tensor_keys, name) for name in names}
 
-    def _set_in_keys(self) -> None:
-        observation = self.state_value_network.in_keys
-        steps = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
-        keys = {
-            *self.value_network.in_keys,
-            *(unravel_key(("next", key)) for key in (*steps, *observation)),
-        }
-        if self.use_prioritized_weights is True:
-            keys.add(unravel_key(self.tensor_keys.priority_weight))
-        self._in_keys = sorted(keys, key=str)
-
     @property
     def in_keys(self) -> list[NestedKey]:
-        if self._in_keys is None:
-            self._set_in_keys()
-        return self._in_keys  # pyright: ignore[reportReturnType]
+        if self._in_keys is not None:
+            return self._in_keys
+        names, observation = self.tensor_keys, self.state_value_network.in_keys
+        following = (names.reward, names.done, names.terminated, *observation)
+        keys = {*self.value_network.in_keys, *(unravel_key(("next", key)) for key in following)}
+        if self.use_prioritized_weights is True:
+            keys.add(unravel_key(names.priority_weight))
+        self._in_keys = sorted(keys, key=str)
+        return self._in_keys
 
     @in_keys.setter
     def in_keys(self, values: list[NestedKey]) -> None:
@@ -227,18 +210,18 @@ class QPQLearningLoss(LossModule):
             QPError: if ``gamma`` or ``lmbda`` is not in [0, 1].
         """
         for name in {"gamma", "lmbda"} & hyperparams.keys():
-            _check_factor(name, hyperparams[name])
+            value = hyperparams[name]
+            if isinstance(value, Tensor):
+                value = value.item() if value.numel() == 1 else value.tolist()
+            check_number(name, value, lambda x: 0 <= x <= 1, "a number in [0, 1]")
         hyperparams.setdefault("gamma", self.operator.module.gamma)
         value_type, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if options is None:
             return self
+        options |= {"tensor_keys": self._estimator_keys()}
+        options |= {"supported": self.SUPPORTED_VALUE_ESTIMATORS}
         dispatch_value_estimator(
-            self,
-            value_type,
-            supported=self.SUPPORTED_VALUE_ESTIMATORS,
-            tensor_keys=self._estimator_keys(),
-            value_network=self.state_value_network,
-            **options,
+            self, value_type, value_network=self.state_value_network, **options
         )
         return None
 
@@ -264,9 +247,8 @@ class QPQLearningLoss(LossModule):
         if weights is not None and has_values(weights) and not weights.isfinite().all():
             name = str(self.tensor_keys.priority_weight)
             raise QPError.expected(name, "NaN or inf", "finite weights", "Check the priorities.")
-        active_set = self.operator.active_set_key
         visited = self._visited(tensordict)
-        if active_set is not None:
+        if (active_set := self.operator.active_set_key) is not None:
             tensordict.set(active_set, visited.get(active_set))
         prediction = visited[self.tensor_keys.state_action_value].squeeze(-1)
         target = self.target(tensordict)
@@ -286,7 +268,10 @@ class QPQLearningLoss(LossModule):
         tensordict.set(self.tensor_keys.priority, priority, inplace=True)
         loss = td_loss(prediction, target, self.td_error_clip)
         if self.weighted:
-            loss = self._inverse_variance(visited, prediction, target - prediction, use) * loss
+            flat, error = visited.reshape(-1), (target - prediction).detach()
+            pairs = self.operator.known(flat), flat.get(self.operator.in_keys[1])
+            rest = (x.reshape(-1) for x in (prediction.detach(), error, use))
+            loss = inverse_variance(*pairs, *rest).view_as(loss) * loss
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
 
     def _visited(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -295,19 +280,11 @@ class QPQLearningLoss(LossModule):
         _call_with(self.value_network_params, self.value_network, visited)
         return visited
 
-    def _inverse_variance(
-        self, visited: TensorDictBase, prediction: Tensor, error: Tensor, use: Tensor
-    ) -> Tensor:
-        """Return `inverse_variance` of each sample, ``(*batch,)``."""
-        flat, (operator, shape) = visited.reshape(-1), (self.operator, error.shape)
-        a = flat.get(operator.in_keys[1])
-        rest = (x.detach().reshape(-1) for x in (prediction, error, use))
-        return inverse_variance(operator.known(flat), a, *rest).view(shape)
-
     def _check_batch(self, tensordict: TensorDictBase) -> None:
         """Raise `QPError` if an entry is missing or would broadcast against the values."""
         keys, shape = self.tensor_keys, (*tensordict.batch_size, 1)
-        for key in (keys.reward, keys.done, keys.terminated):
+        ends = {keys.reward: None, keys.done: torch.bool, keys.terminated: torch.bool}
+        for key, dtype in ends.items():
             path = unravel_key(("next", key))
             value = tensordict.get(path, None)
             if value is None:
@@ -317,11 +294,10 @@ class QPQLearningLoss(LossModule):
                 raise QPError.expected(str(path), "no such entry", f"one of shape {shape}", remedy)
             if value.shape != shape:
                 remedy = "TorchRL's rewards and flags have a last dimension of one."
-                raise QPError.expected(
-                    str(path), f"shape {tuple(value.shape)}", f"shape {shape}", remedy
-                )
-            if key != keys.reward and value.dtype != torch.bool:
-                raise QPError.expected(str(path), value.dtype, "torch.bool", "Convert it: .bool().")
+                got, want = f"shape {tuple(value.shape)}", f"shape {shape}"
+                raise QPError.expected(str(path), got, want, remedy)
+            if dtype is not None and value.dtype != dtype:
+                raise QPError.expected(str(path), value.dtype, dtype, "Convert it: .bool().")
         following: TensorDictBase = tensordict.get("next")
         for key in self.state_value_network.in_keys:
             if following.get(key, None) is None:
@@ -334,7 +310,7 @@ class QPQLearningLoss(LossModule):
 
     @torch.no_grad()
     def observe(self, tensordict: TensorDictBase) -> None:
-        """Extend the range of rewards, which bounds V(s+), by those of new transitions.
+        """Extend the range of rewards, which bounds V(s+), by new transitions.
 
         Args:
             tensordict: the transitions, of any batch shape. Rewards that are not finite do not
@@ -402,8 +378,7 @@ class QPQLearningLoss(LossModule):
         """
         key = unravel_key(("next", self.tensor_keys.reward))
         reward = tensordict.get(key)
-        effect = "Those transitions are left out of the loss and its gradient."
-        invalid = invalid_rewards(reward, key, effect)
+        invalid = invalid_rewards(reward, key)
         next_value = self._next_value(tensordict)
         valid = reward.masked_fill(invalid, 0)
         target = self._estimate(tensordict, valid, next_value)
@@ -459,19 +434,13 @@ def _call_with(
         raise failure
 
 
-def _check_factor(name: str, value: Any) -> None:
-    if isinstance(value, Tensor):
-        value = value.item() if value.numel() == 1 else value.tolist()
-    check_number(name, value, lambda x: 0 <= x <= 1, "a number in [0, 1]")
-
-
 def _last(network: Any) -> Any:
     """Return the last module of a sequence, or the module itself."""
     return network.module[-1] if isinstance(network, TensorDictSequential) else network
 
 
 def _in_place_of_last(network: Any, last: Any) -> Any:
-    """Return ``last``, or the sequence of which it replaces the last module."""
+    """Return ``last``, or the sequence with ``last`` in place of its last module."""
     if not isinstance(network, TensorDictSequential):
         return last
     upstream: Any = network.module[:-1]

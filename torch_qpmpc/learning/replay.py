@@ -8,7 +8,6 @@ window crosses a change of its column's trajectory id, or the ring buffer's seam
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -53,43 +52,84 @@ def windows_to_tau(
     """
     check_kind("windows", windows, TensorDictBase)
     known = ["observation"] if preview_key is None else [preview_key, "observation"]
-    for key in (*known, "action", ("next", "observation")):
-        if windows.get(key, None) is None or windows.batch_dims < 1:
-            got = (
-                f"shape {tuple(windows.shape)} with {', '.join(map(str, windows.keys(True, True)))}"
-            )
-            names = ", ".join(map(str, known))
-            want = f"consecutive transitions (M, N) with {names}, action, (next, observation)"
-            raise QPError.expected("windows", got, want)
+    needed = (*known, "action", ("next", "observation"))
+    if windows.batch_dims < 1 or any(windows.get(key, None) is None for key in needed):
+        present = ", ".join(map(str, windows.keys(True, True)))
+        names = ", ".join(map(str, known))
+        want = f"consecutive transitions (M, N) with {names}, action, (next, observation)"
+        raise QPError.expected("windows", f"shape {tuple(windows.shape)} with {present}", want)
     p = [windows[key][..., 0, :] for key in known]
     y = windows["next", "observation"][..., -(n_x or 0) :]
     pairs = torch.cat([windows["action"], y], dim=-1)
     return torch.cat([*p, pairs.flatten(-2)], dim=-1)
 
 
-@dataclass(frozen=True, eq=False)
 class Replay:
     """Two TorchRL buffers with one storage and one random generator.
 
+    Args:
+        capacity: number of stored transitions over all environments; a multiple of ``num_envs``.
+        num_envs: number of columns, the batch size of the collector's environment.
+        batch_size: transitions per sample.
+        window: N, transitions per window.
+        num_windows: M, windows per sample.
+        seed: seed of the replay's generator, which all sampling uses instead of torch's global one.
+        device: device of the stored data and of the generator.
+        active_rows: n_g, to store the active sets of Q(s, a) and V(s+) with each transition, n_g
+            bytes each, under `ACTIVE_SETS`; see `remember`.
+        n_x, preview_key: see `windows_to_tau`.
+
     Attributes:
-        transitions: the buffer that :meth:`extend` writes; samples single rows uniformly.
+        transitions: the buffer that `extend` writes; samples single rows uniformly.
         windows: the read-only buffer that samples a trajectory of at least N steps, then a start in
             it, both uniformly, without changing the stored done flags.
-        generator: the generator of all sampling.
-        window: N, the number of transitions in a window.
-        num_envs: number of columns of the storage.
-        active_rows: n_g if active sets are stored with the transitions, else None.
-        n_x, preview_key: see :func:`windows_to_tau`.
+
+    Raises:
+        QPError: if a number is out of range, ``capacity`` is not a multiple of ``num_envs``, or it
+            holds fewer than ``window`` rows.
     """
 
-    transitions: ReplayBuffer
-    windows: ReplayBuffer
-    generator: torch.Generator
-    window: int
-    num_envs: int
-    active_rows: int | None = None
-    n_x: int | None = None
-    preview_key: NestedKey | None = None
+    def __init__(
+        self,
+        capacity: int,
+        num_envs: int,
+        batch_size: int,
+        window: int,
+        num_windows: int,
+        *,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        active_rows: int | None = None,
+        n_x: int | None = None,
+        preview_key: NestedKey | None = None,
+    ) -> None:
+        sizes = {"num_envs": num_envs, "batch_size": batch_size, "window": window}
+        for name, size in (sizes | {"num_windows": num_windows}).items():
+            check_whole(name, size, 1)
+        check_whole("capacity", capacity, 0)
+        check_seed(seed)
+        if active_rows is not None:
+            check_whole("active_rows", active_rows, 0)
+        if capacity % num_envs or capacity // num_envs < window:
+            expected = f"a multiple of num_envs = {num_envs}, at least window * num_envs"
+            remedy = f"The smallest is {window * num_envs}."
+            raise QPError.expected("capacity", capacity, expected, remedy)
+        self.window, self.num_envs, self.active_rows = window, num_envs, active_rows
+        self.n_x, self.preview_key = n_x, preview_key
+        self.generator = torch.Generator(device=device).manual_seed(seed)
+        storage = LazyTensorStorage(capacity, ndim=2, device=device)
+        options: dict[str, Any] = {"storage": storage, "generator": self.generator}
+        # ReplayBuffer, not TensorDictReplayBuffer: that one fails on batches with T = 1.
+        self.transitions = ReplayBuffer(sampler=RandomSampler(), batch_size=batch_size, **options)
+        sampler = SliceSampler(
+            slice_len=window,
+            traj_key=("collector", "traj_ids"),
+            truncated_key=None,  # a key would mark each window's last step as truncated
+            init_key=None,
+            strict_length=True,
+        )
+        options |= {"sampler": sampler, "writer": ImmutableDatasetWriter()}
+        self.windows = ReplayBuffer(batch_size=num_windows * window, **options)
 
     def __len__(self) -> int:
         return len(self.transitions)
@@ -100,16 +140,12 @@ class Replay:
         Raises:
             QPError: if ``batch`` is not a TensorDict or has another shape.
         """
-        check_kind("batch", batch, TensorDictBase, "Pass the collector's batch as it comes.")
-        if batch.batch_dims != 2:
-            got, remedy = f"shape {tuple(batch.shape)}", "Pass the collector's batch as it comes."
-            raise QPError.expected("batch", got, "(num_envs, T)", remedy)
-        if batch.shape[0] != self.num_envs:
-            got, want = (
-                f"shape {tuple(batch.shape)}",
-                f"(num_envs, T) with num_envs = {self.num_envs}",
-            )
-            raise QPError.expected("batch", got, want, "Transpose it if it is (T, num_envs).")
+        remedy = "Pass the collector's batch as it comes."
+        check_kind("batch", batch, TensorDictBase, remedy)
+        if batch.batch_dims != 2 or batch.shape[0] != self.num_envs:
+            want = f"(num_envs, T) with num_envs = {self.num_envs}"
+            remedy = "Transpose it if it is (T, num_envs)." if batch.batch_dims == 2 else remedy
+            raise QPError.expected("batch", f"shape {tuple(batch.shape)}", want, remedy)
         if self.active_rows is not None:
             batch = batch.copy()
             for key in ACTIVE_SETS:
@@ -124,9 +160,8 @@ class Replay:
             QPError: if nothing is stored.
         """
         if not len(self):
-            raise QPError.expected(
-                "replay", "nothing stored", "transitions", "Call extend() first."
-            )
+            remedy = "Call extend() first."
+            raise QPError.expected("replay", "nothing stored", "transitions", remedy)
         sample, info = self.transitions.sample(return_info=True)
         return sample.set("index", torch.stack(info["index"], -1))
 
@@ -148,7 +183,7 @@ class Replay:
             stored.get(key)[place] = sample.get(key)
 
     def end_episodes(self) -> None:
-        """Make the stored trajectory ids differ from those of a new collector, which are >= 0."""
+        """Make the stored trajectory ids differ from a new collector's, which are >= 0."""
         if len(self):
             stored: Any = self.transitions.storage[:]
             ids = stored.get(("collector", "traj_ids"))
@@ -164,7 +199,7 @@ class Replay:
         return self.windows.can_sample()
 
     def sample_tau(self) -> Tensor:
-        """Sample windows ``(num_windows, n_p + N (n_x + n_u))``; see :func:`windows_to_tau`.
+        """Sample windows ``(num_windows, n_p + N (n_x + n_u))``; see `windows_to_tau`.
 
         Raises:
             QPError: if no stored trajectory has N steps yet.
@@ -190,13 +225,12 @@ class Replay:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a :meth:`state_dict` into a replay made with the same arguments.
+        """Restore a `state_dict` into a replay made with the same arguments.
 
         Raises:
             QPError: if ``state`` lacks an entry.
         """
-        missing = {"storage", "writer", "generator"} - set(state)
-        if missing:
+        if missing := {"storage", "writer", "generator"} - set(state):
             got = f"no {', '.join(sorted(missing))}"
             raise QPError.expected("state", got, "what state_dict() returned")
         storage, writer = self.transitions.storage, self.transitions.writer
@@ -208,79 +242,3 @@ class Replay:
             # windows from crossing the ring's seam. Writing the newest row again restores the copy.
             newest = (state["writer"]["_cursor"] - 1) % storage.shape[0]
             storage.set(newest, storage.get(newest))
-
-
-def make_replay(
-    capacity: int,
-    num_envs: int,
-    batch_size: int,
-    window: int,
-    num_windows: int,
-    *,
-    seed: int = 0,
-    device: torch.device | str = "cpu",
-    active_rows: int | None = None,
-    n_x: int | None = None,
-    preview_key: NestedKey | None = None,
-) -> Replay:
-    """Make the empty replay of a training run, to be filled by :meth:`Replay.extend`.
-
-    Args:
-        capacity: number of stored transitions over all environments; a multiple of ``num_envs``.
-        num_envs: batch size of the collector's environment.
-        batch_size: transitions per sample.
-        window: N, transitions per window.
-        num_windows: M, windows per sample.
-        seed: seed of the replay's generator, which all sampling uses instead of torch's global one.
-        device: device of the stored data and of the generator.
-        active_rows: n_g, to store the active sets of Q(s, a) and V(s+) with each transition, n_g
-            bytes each, under `ACTIVE_SETS`; see :meth:`Replay.remember`.
-        n_x, preview_key: see :func:`windows_to_tau`.
-
-    Raises:
-        QPError: if a number is out of range, ``capacity`` is not a multiple of ``num_envs``, or it
-            holds fewer than ``window`` rows.
-    """
-    sizes = {"num_envs": num_envs, "batch_size": batch_size, "window": window}
-    for name, size in (sizes | {"num_windows": num_windows}).items():
-        check_whole(name, size, 1)
-    check_whole("capacity", capacity, 0)
-    check_seed(seed)
-    if active_rows is not None:
-        check_whole("active_rows", active_rows, 0)
-    if capacity % num_envs or capacity // num_envs < window:
-        expected = f"a multiple of num_envs = {num_envs}, at least window * num_envs"
-        remedy = f"The smallest is {window * num_envs}."
-        raise QPError.expected("capacity", capacity, expected, remedy)
-    generator = torch.Generator(device=device).manual_seed(seed)
-    storage = LazyTensorStorage(capacity, ndim=2, device=device)
-    # ReplayBuffer, not TensorDictReplayBuffer: that one fails on batches with T = 1.
-    transitions = ReplayBuffer(
-        storage=storage,
-        sampler=RandomSampler(),
-        batch_size=batch_size,
-        generator=generator,
-    )
-    windows = ReplayBuffer(
-        storage=storage,
-        sampler=SliceSampler(
-            slice_len=window,
-            traj_key=("collector", "traj_ids"),
-            truncated_key=None,  # a key would mark each window's last step as truncated
-            init_key=None,
-            strict_length=True,
-        ),
-        writer=ImmutableDatasetWriter(),
-        batch_size=num_windows * window,
-        generator=generator,
-    )
-    return Replay(
-        transitions,
-        windows,
-        generator,
-        window,
-        num_envs,
-        active_rows,
-        n_x,
-        preview_key,
-    )

@@ -10,6 +10,9 @@ from torch import Tensor
 
 from torch_qpmpc.qp.tracing import has_values
 
+#: The scalars that describe a batch.
+TD_SCALARS = ("td_error", "pred_value", "target_value", "pred_value_max", "target_value_max")
+TD_SCALARS += ("unsolved", "invalid_reward")
 #: Added to each regressor of the variance before its logarithm, as a fraction of its mean.
 OFFSET = 0.05
 #: Added to delta^2, and smallest variance, as a fraction of the batch's median.
@@ -68,28 +71,18 @@ def td_metadata(prediction: Tensor, target: Tensor) -> dict[str, Tensor]:
     def largest(x: Tensor) -> Tensor:
         return x.masked_fill(~use, -torch.inf).max().nan_to_num(neginf=0.0)
 
-    return {
-        "td_error": mean((target - prediction).abs()),
-        "pred_value": mean(prediction),
-        "target_value": mean(target),
-        "pred_value_max": largest(prediction),
-        "target_value_max": largest(target),
-        "unsolved": (~use & ~invalid).sum(),
-        "invalid_reward": invalid.sum(),
-    }
+    means = mean((target - prediction).abs()), mean(prediction), mean(target)
+    counts = (~use & ~invalid).sum(), invalid.sum()
+    scalars = *means, largest(prediction), largest(target), *counts
+    return dict(zip(TD_SCALARS, scalars, strict=True))
 
 
-def invalid_rewards(reward: Tensor, key: object, effect: str) -> Tensor:
-    """Return True where a reward ``(*batch, 1)`` is NaN or infinite, and warn if any is.
-
-    Args:
-        reward: the rewards.
-        key: their name in the `RuntimeWarning`.
-        effect: the consequence, a sentence for it.
-    """
+def invalid_rewards(reward: Tensor, key: object) -> Tensor:
+    """Return True where a reward ``(*batch, 1)`` is NaN or infinite; warn, with their ``key``."""
     invalid = ~reward.isfinite()
     if has_values(invalid) and (count := int(invalid.sum())):
-        message = f"{key}: {count} of {invalid.numel()} rewards are NaN or infinite. {effect}"
+        message = f"{key}: {count} of {invalid.numel()} rewards are NaN or infinite. Those "
+        message += "transitions are left out of the loss and its gradient."
         warnings.warn(message, RuntimeWarning, stacklevel=3)
     return invalid
 

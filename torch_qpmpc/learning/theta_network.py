@@ -27,12 +27,12 @@ class ThetaNetwork(TensorDictModuleBase):
     dtype.
 
     Args:
-        mpc: the QPMPC, of which only the shapes of its coordinates are used.
+        mpc: the QPMPC; only the shapes of its coordinates are used.
         sizes: the bounds of the residuals by their names in `QPMPC.coordinates`, such as
             ``{"q": 1.0, "b": 0.1}``. Residuals of vectors (q, c, b, lb, ub) are cheap. Those of
             matrices (H, H_f, C, G) need one factorisation per QP, ten and more times the time.
         width: units in each of the two hidden layers.
-        in_keys: the keys of the inputs, which are concatenated; by default those of p.
+        in_keys: the keys of the inputs, which are concatenated; by default the keys of p.
         n_in: the number of their entries; by default n_p.
 
     Attributes:

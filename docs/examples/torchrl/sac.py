@@ -24,7 +24,6 @@ def main(updates: int = 1500, seed: int = 1) -> tuple[float, float]:
     options = {"action_bounds": (PLANT.lb_a, PLANT.ub_a), "gamma": 0.9, "learn": ("H", "c", "C")}
     mpc = qm.QPMPC.from_model(A, B, 10, stage_weight=weight, solver="daqp", **options)
     before = closed_loop(mpc.policy, PLANT).J
-
     mean = qm.QPActorValueOperator(mpc, action_key="mean").get_policy_operator()
     inverse = TensorDictModule(lambda mean: (0.99 * mean).atanh(), ["mean"], ["loc"])
     scale = TensorDictModule(Scale(2, scale_mapping="exp"), ["loc"], ["loc", "scale"])
