@@ -24,7 +24,7 @@ from omegaconf import OmegaConf, _utils, base, grammar_parser
 import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc.control import exporting
-from torch_qpmpc.export import export, library
+from torch_qpmpc.export import comparison, library
 from torch_qpmpc.qp.solvers import BACKENDS
 
 #: What imports and the collection of tests make stays: no garbage is looked for among it.
@@ -92,7 +92,7 @@ def quick_exports() -> Iterator[None]:
         for module in (exporting, library):
             patch.setattr(module, "FLAGS", ("-std=c99", "-O0", "-fPIC", "-shared"))
             patch.setattr(module, "compiled", compiled)
-        for module in (exporting, export):
+        for module in (exporting, comparison):
             patch.setattr(module, "COMPARED", 60)
         yield
 

@@ -14,9 +14,9 @@ import torch
 
 from tests.benchmarks.problems import PAPER, Size, make_mpc
 from torch_qpmpc import QPMPC, QuadraticProgram
+from torch_qpmpc.export.comparison import Reference, reference, sharpen
 from torch_qpmpc.export.export import AT_LEAST, PER_ROW
 from torch_qpmpc.export.library import Library
-from torch_qpmpc.export.reference import Reference, reference, sharpen
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.export.writer import Example, Examples, Settings, sources
 

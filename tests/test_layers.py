@@ -37,6 +37,7 @@ LAYERS = {
         "files",
         "qp",
         "mpc",
+        "export",
         "learning",
         "envs",
         "analysis",
@@ -62,8 +63,6 @@ LAYERS = {
         "study",
     },  # `python -m torch_qpmpc.export`
 }
-#: Imports against the layers' order, with the reason.
-EXCEPTIONS = {("mpc/module.py", "export"): "QPMPC.export_c imports it when it is called"}
 #: Libraries that only some layers may import.
 RESERVED = {
     "hydra": {"experiment", "study"},
@@ -100,7 +99,7 @@ def test_a_module_imports_only_what_its_layer_may():
         for name in imported(path):
             first, *rest = name.split(".")
             if first == "torch_qpmpc":
-                allowed = rest[0] in LAYERS[own] | {own} or (file, rest[0]) in EXCEPTIONS
+                allowed = rest[0] in LAYERS[own] | {own}
             else:
                 allowed = own in RESERVED.get(first, {own})
             if not allowed:

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import train
 from tests.runs import SMALL, make_config, run_command
-from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc import QPMPC, QPError, export_c
 from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.config import settings
 from torch_qpmpc.experiment.start import stored_log
@@ -192,7 +192,7 @@ def test_files_are_written_beside_their_links_targets(tmp_path):
     write_whole(tmp_path / "file", b"ours")
     mpc = QPMPC.of(1, 1, 2, stage_weight=[1.0, 1.0])
     mpc.save(tmp_path / "mine.qpmpc")
-    mpc.export_c(tmp_path)
+    export_c(mpc, tmp_path)
     assert outside.read_text() == "mine"
     assert (tmp_path / "file").read_bytes() == b"ours"
 

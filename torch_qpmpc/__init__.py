@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from torch_qpmpc import envs as envs
     from torch_qpmpc.control.controller import Controller
     from torch_qpmpc.control.linear_mpc import LinearMPC
-    from torch_qpmpc.export.compiled import CompiledPolicy
-    from torch_qpmpc.export.export import Export
+    from torch_qpmpc.export.export import CompiledPolicy, export_c
     from torch_qpmpc.learning.operators import QPActorValueOperator
     from torch_qpmpc.learning.q_learning import QPQLearningLoss
     from torch_qpmpc.learning.theta_network import ThetaNetwork
@@ -41,7 +40,6 @@ __all__ = [
     "Controller",
     "Cost",
     "DeviationPenalty",
-    "Export",
     "GaussNewton",
     "Identified",
     "Layout",
@@ -59,6 +57,7 @@ __all__ = [
     "Status",
     "SystemIdentificationPenalty",
     "ThetaNetwork",
+    "export_c",
     "identify",
     "identify_blended",
     "load_run",
@@ -71,14 +70,14 @@ __version__ = "0.1.0"
 if not TYPE_CHECKING:
     #: Imported at first use: TensorDict and TorchRL take as long to import as torch does.
     _LAZY = {
-        "CompiledPolicy": "torch_qpmpc.export.compiled:CompiledPolicy",
+        "CompiledPolicy": "torch_qpmpc.export.export:CompiledPolicy",
         "Controller": "torch_qpmpc.control.controller:Controller",
-        "Export": "torch_qpmpc.export.export:Export",
         "envs": "torch_qpmpc.envs:",
         "LinearMPC": "torch_qpmpc.control.linear_mpc:LinearMPC",
         "QPActorValueOperator": "torch_qpmpc.learning.operators:QPActorValueOperator",
         "QPQLearningLoss": "torch_qpmpc.learning.q_learning:QPQLearningLoss",
         "ThetaNetwork": "torch_qpmpc.learning.theta_network:ThetaNetwork",
+        "export_c": "torch_qpmpc.export.export:export_c",
         "load_run": "torch_qpmpc.study.runs:load_run",
     }
 

@@ -26,9 +26,9 @@ import torch
 
 from tests.benchmarks.table import significant
 from tests.campaign.exports import PROBLEMS
-from torch_qpmpc import QPMPC, CompiledPolicy
+from torch_qpmpc import QPMPC, CompiledPolicy, export_c
+from torch_qpmpc.export.comparison import reference
 from torch_qpmpc.export.library import required_compiler
-from torch_qpmpc.export.reference import reference
 from torch_qpmpc.study.markdown import replaced
 
 HERE = Path(__file__).parent
@@ -70,7 +70,7 @@ def pointer(x: np.ndarray) -> ctypes.c_void_p:
 
 def compiled(mpc: QPMPC, folder: Path, storage: str) -> Callable[[np.ndarray, bool], Times]:
     """Return a function that times the exported C at p ``(steps, n_p)``, warm or cold."""
-    export = mpc.export_c(folder, storage=storage)
+    export = export_c(mpc, folder, storage=storage)
     timed = library(folder, HERE / "timing.c", str(folder / "policy.c"))
     state = np.zeros(export.state_bytes // 8 + 8)
 

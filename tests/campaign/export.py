@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from tests.campaign.exports import PROBLEMS
-from torch_qpmpc import Status
+from torch_qpmpc import Status, export_c
+from torch_qpmpc.export.comparison import reference, sharpen
 from torch_qpmpc.export.library import Library
-from torch_qpmpc.export.reference import reference, sharpen
 from torch_qpmpc.qp.program import Status as Outcome
 from torch_qpmpc.study.markdown import replaced, table
 
@@ -62,7 +62,7 @@ def judged(name: str, count: int, storage: str) -> tuple[list[str], bool]:
     p[: count // 10] *= 10
     p = rng.permutation(p)
     with tempfile.TemporaryDirectory() as folder:
-        export = mpc.export_c(folder, storage=storage)
+        export = export_c(mpc, folder, storage=storage)
         library = Library(Path(folder), "policy", "float64")
         size = object_size(Path(folder))
     counts, most, wrong, worst = np.zeros(3, dtype=int), 0, 0, np.zeros(2)

@@ -89,8 +89,6 @@ def test_unsolved_steps_raise_or_return_an_action_within_bounds():
 def test_bad_arguments_are_refused():
     with pytest.raises(QPError, match="mpc: got int, expected a QPMPC"):
         CompiledPolicy(3)  # pyright: ignore[reportArgumentType] - wrong on purpose
-    with pytest.raises(QPError, match="options: got speed, expected some of dtype, max_iterations"):
-        CompiledPolicy(tied(), speed=1)
     with pytest.raises(QPError, match=r"s: got shape \(3,\), expected shape \(\*batch, 2\)"):
         CompiledPolicy(tied())(torch.ones(3))
 

@@ -1,4 +1,4 @@
-"""`QPMPC.export_c`: its files, its report, and its errors."""
+"""`export_c`: its files, its report, and its errors."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import torch
 
 import torch_qpmpc as qm
 from tests.exported import SCHEMES, house, rates, tied
-from torch_qpmpc import QPMPC, QPError, Status
+from torch_qpmpc import QPMPC, QPError, Status, export_c
+from torch_qpmpc.export import comparison
 from torch_qpmpc.export import export as module
-from torch_qpmpc.export import reference
-from torch_qpmpc.export.examples import draw
+from torch_qpmpc.export.comparison import draw
 from torch_qpmpc.export.library import Library, compiler
 from torch_qpmpc.export.tables import make_tables
 
@@ -26,7 +26,7 @@ needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("options", [{}, {"storage": "small"}], ids=["fast", "small"])
 def test_the_report_has_sizes_and_agreement(options, tmp_path):
     mpc = SCHEMES["point mass"]()
-    export = mpc.export_c(tmp_path / "deep" / "folder", name="mass", **options)
+    export = export_c(mpc, tmp_path / "deep" / "folder", name="mass", **options)
     assert [file.name for file in export.files] == ["mass.h", "mass.c"]
     assert all(file.exists() for file in export.files)
     assert (export.n_p, export.n_u, export.rows, export.variables) == (4, 2, 60, 20)
@@ -46,13 +46,13 @@ def test_the_report_has_sizes_and_agreement(options, tmp_path):
 @needs_compiler
 def test_small_is_smaller_where_rows_outnumber_variables(tmp_path):
     mpc = SCHEMES["12 states"]()
-    sizes = [mpc.export_c(tmp_path, storage=x).table_bytes for x in ("fast", "small")]
+    sizes = [export_c(mpc, tmp_path, storage=x).table_bytes for x in ("fast", "small")]
     assert sizes[1] < 0.8 * sizes[0]
 
 
 @needs_compiler
 def test_float32_is_measured(tmp_path):
-    export = tied().export_c(tmp_path, dtype="float32", name="single")
+    export = export_c(tied(), tmp_path, dtype="float32", name="single")
     assert export.agreement is not None
     assert 1e-8 < export.agreement.u < 1e-3
     assert "typedef float single_real;" in export.files[0].read_text()
@@ -64,9 +64,9 @@ def test_float32_is_measured(tmp_path):
 def test_float32_is_refused_where_the_self_test_fails(tmp_path):
     match = r"dtype: got 'float32', with (a failed self-test|.* not certified).*Export float64"
     with pytest.raises(QPError, match=match):
-        ill_conditioned().export_c(tmp_path, dtype="float32")
+        export_c(ill_conditioned(), tmp_path, dtype="float32")
     assert not [*tmp_path.iterdir()]
-    ill_conditioned().export_c(tmp_path)
+    export_c(ill_conditioned(), tmp_path)
 
 
 def ill_conditioned() -> QPMPC:
@@ -86,23 +86,23 @@ def ill_conditioned() -> QPMPC:
 def test_the_head_names_version_date_layout_and_hash(tmp_path):
     mpc = rates()
     labels = {"x": ["level [m]", "flow [m3/s] */"], "u": ["valve"]}
-    head = mpc.export_c(tmp_path, labels=labels).files[1].read_text().partition("*/\n")[0]
+    head = export_c(mpc, tmp_path, labels=labels).files[1].read_text().partition("*/\n")[0]
     today = datetime.date.today().isoformat()
     assert f"torch_qpmpc {qm.__version__} on {today}" in head
     assert "p[0 .. 1]: x_-1 (level [m], flow [m3/s] * /)" in head
     assert "p[2]: u_-1 (valve)" in head
     assert "p[3 .. 4]: x_0" in head
     assert "u[0]: u_0 (valve)" in head
-    same = mpc.export_c(tmp_path / "again", labels=labels)
+    same = export_c(mpc, tmp_path / "again", labels=labels)
     assert same.digest in head
     with torch.no_grad():
         mpc.c += 1e-12
-    assert mpc.export_c(tmp_path / "other").digest != same.digest
+    assert export_c(mpc, tmp_path / "other").digest != same.digest
 
 
 @needs_compiler
 def test_previews_are_in_the_head(tmp_path):
-    head = house(2).export_c(tmp_path).files[0].read_text()
+    head = export_c(house(2), tmp_path).files[0].read_text()
     assert "p[6 .. 8]: d_2\n   p[9]: x_0" in head
 
 
@@ -125,33 +125,32 @@ def test_previews_are_in_the_head(tmp_path):
 )
 def test_bad_arguments_are_refused(options, match, tmp_path):
     with pytest.raises(QPError, match=match):
-        rates().export_c(tmp_path, **options)
+        export_c(rates(), tmp_path, **options)
 
 
 def test_a_qp_without_solutions_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "COMPARED", 5)
+    monkeypatch.setattr(comparison, "COMPARED", 5)
     mpc = QPMPC.of(1, 1, 2, A=[[1.0]], B=[[1.0]], stage_weight=[1.0, 1.0])
-    solve = module.reference
+    solve = comparison.reference
 
     def unsolved(*arguments):
         found = solve(*arguments)
         found.status[:] = 3
         return found
 
-    monkeypatch.setattr(module, "reference", unsolved)
+    monkeypatch.setattr(comparison, "reference", unsolved)
     match = "mpc: got no solution of its QP at 5 states, expected a QP that a solver solves"
     with pytest.raises(QPError, match=match):
-        mpc.export_c(tmp_path)
+        export_c(mpc, tmp_path)
 
 
 def test_a_large_qp_is_compared_at_fewer_states_with_the_interior_point(tmp_path, monkeypatch):
-    for part in (module, reference):
-        monkeypatch.setattr(part, "LARGE", 4)
-    monkeypatch.setattr(reference, "_exact", None)  # not called
-    agreement = tied().export_c(tmp_path).agreement
+    monkeypatch.setattr(comparison, "LARGE", 4)
+    monkeypatch.setattr(comparison, "_exact", None)  # not called
+    agreement = export_c(tied(), tmp_path).agreement
     assert agreement is not None
-    assert agreement.states == module.LEAST
-    assert agreement.solved >= module.LEAST // 2
+    assert agreement.states == comparison.LEAST
+    assert agreement.solved >= comparison.LEAST // 2
     assert agreement.u < 1e-8
     assert agreement.value < 1e-8
 
@@ -160,8 +159,8 @@ def test_rows_without_a_bound_do_not_make_a_qp_large():
     A, B = torch.eye(4), torch.ones(4, 2)
     options = {"stage_weight": [1.0] * 6, "action_bounds": ([-1.0] * 2, [1.0] * 2)}
     qp = QPMPC.from_model(A, B, 40, **options).quadratic_program()
-    assert len(qp.G) > reference.LARGE
-    assert not reference._is_large(qp)
+    assert len(qp.G) > comparison.LARGE
+    assert not comparison._is_large(qp)
 
 
 def shifted(**options) -> QPMPC:
@@ -182,13 +181,13 @@ def shifted(**options) -> QPMPC:
 def test_states_are_drawn_about_a_feasible_one(tmp_path):
     mpc = shifted(state_bounds=([49.0] * 2, [51.0] * 2))
     tables = make_tables(mpc)
-    p, exact = module._states(mpc, tables, "float64")
+    p, exact = comparison.states(mpc, tables, "float64")
     assert mpc.solve(torch.tensor(tables.centre)).solved
     assert mpc.solve(torch.tensor(draw(tables, 100))).solved.sum() > 20
     last = p[exact.status == Status.SOLVED, 2:4]
     assert len(last) > 30
     assert ((last > 39 - 1e-6) & (last < 61 + 1e-6)).all()
-    export = mpc.export_c(tmp_path)
+    export = export_c(mpc, tmp_path)
     kinds = (tmp_path / "policy.c").read_text().split("self-test: ")[1].split(". */")[0]
     assert {*kinds.split(", ")} == {"at bounds", "saturated", "infeasible"}  # 0 is out of bounds
     if export.agreement is not None:
@@ -201,7 +200,7 @@ def test_states_are_drawn_about_a_feasible_one(tmp_path):
 
 def test_states_of_every_kind_are_in_the_self_test(tmp_path):
     for name, scheme in {"shifted": shifted, "rates": rates}.items():
-        scheme().export_c(tmp_path, name=name)
+        export_c(scheme(), tmp_path, name=name)
         kinds = (tmp_path / f"{name}.c").read_text().split("self-test: ")[1].split(". */")[0]
         assert {"at bounds", "infeasible"} <= {*kinds.split(", ")}
         assert "interior" in kinds or name == "shifted"
@@ -212,7 +211,7 @@ def test_hard_rows_that_contradict_each_other_are_refused(tmp_path):
     mpc = QPMPC.from_model([[0.0]], [[0.0]], 2, stage_weight=[1.0, 1.0], offset=[3.0], **bounds)
     match = "mpc: got no solution of its QP at 60 states, .* hard rows may contradict .* slack"
     with pytest.raises(QPError, match=match):
-        mpc.export_c(tmp_path)
+        export_c(mpc, tmp_path)
 
 
 @needs_compiler
@@ -227,7 +226,7 @@ def test_a_limit_that_solves_nothing_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(Library, "steps", unsolved)
     match = "max_iterations: got 3, with none of 60 states solved, expected a limit that solves"
     with pytest.raises(QPError, match=match):
-        tied().export_c(tmp_path, max_iterations=3)
+        export_c(tied(), tmp_path, max_iterations=3)
 
 
 NAMES = [
@@ -248,7 +247,7 @@ NAMES = [
 @needs_compiler
 @pytest.mark.parametrize("name", NAMES)
 def test_any_identifier_is_a_name(name, tmp_path):
-    tied(3).export_c(tmp_path, name=name)
+    export_c(tied(3), tmp_path, name=name)
     text = (tmp_path / f"{name}.h").read_text()
     assert f"int {name}_step({name}_state *state" in text
     assert f"#ifndef {name.upper()}_H" in text
@@ -272,7 +271,7 @@ def test_no_label_ends_its_comment_or_the_line(language, tmp_path):
         "**//",
     ]
     mpc = QPMPC.of(1, len(bad), 1, stage_weight=[1.0] * (1 + len(bad)))
-    mpc.export_c(tmp_path, labels={"x": ["%\\"], "u": bad})
+    export_c(mpc, tmp_path, labels={"x": ["%\\"], "u": bad})
     flags = ["-trigraphs", "-Wall", "-Wextra", "-Werror", "-c", "-o", str(tmp_path / "policy.o")]
     command += [*flags, str(tmp_path / "policy.c")]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -281,11 +280,11 @@ def test_no_label_ends_its_comment_or_the_line(language, tmp_path):
 
 def test_without_a_compiler_float64_is_written_and_float32_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "compiler", lambda: None)
-    export = tied().export_c(tmp_path)
+    export = export_c(tied(), tmp_path)
     assert export.agreement is None
     assert "not compared with a solver: no C compiler was found" in str(export)
     with pytest.raises(QPError, match="dtype: got 'float32' without a C compiler to test it"):
-        tied().export_c(tmp_path, dtype="float32")
+        export_c(tied(), tmp_path, dtype="float32")
 
 
 @needs_compiler
@@ -293,7 +292,7 @@ def test_a_failed_self_test_of_float64_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "Library", lambda *_: Failing(*_))
     match = r"dtype: got 'float64', with a failed self-test at state 1 \(interior.*condition"
     with pytest.raises(QPError, match=match):
-        tied().export_c(tmp_path)
+        export_c(tied(), tmp_path)
 
 
 class Failing(Library):
@@ -304,7 +303,7 @@ class Failing(Library):
 
 @needs_compiler
 def test_the_self_test_fails_for_other_tables(tmp_path):
-    (header, source) = tied().export_c(tmp_path).files
+    (header, source) = export_c(tied(), tmp_path).files
     text = source.read_text()
     start = text.index("U_OFFSET[1] =") + len("U_OFFSET[1] =\n")
     source.write_text(f"{text[:start]}{{0.5}};{text[text.index(';', start) + 1 :]}")
@@ -313,8 +312,8 @@ def test_the_self_test_fails_for_other_tables(tmp_path):
 
 @needs_compiler
 def test_two_policies_link_into_one_program(tmp_path):
-    tied().export_c(tmp_path, name="one")
-    rates().export_c(tmp_path, name="two", storage="small")
+    export_c(tied(), tmp_path, name="one")
+    export_c(rates(), tmp_path, name="two", storage="small")
     main = '#include "one.h"\n#include "two.h"\nint main(void)\n'
     main += "{ return one_selftest() + two_selftest(); }\n"
     (tmp_path / "main.c").write_text(main)
@@ -342,7 +341,7 @@ def test_entries_with_one_value_only_keep_it_in_the_examples(tmp_path):
         last = draw(tables, 20)[:, -1]
         assert abs(last - value).max() < 1e-12
         assert abs(tables.centre[-1] - value) < 1e-12
-        agreement = mpc.export_c(tmp_path).agreement
+        agreement = export_c(mpc, tmp_path).agreement
         assert agreement is not None
         assert agreement.solved > 50
 
@@ -353,7 +352,7 @@ def test_an_entry_without_an_effect_up_to_rounding_is_exported(tmp_path):
     weight = [1.0, 1e-16, 0.1]
     mpc = QPMPC.from_model(A, B, 4, stage_weight=weight, action_bounds=([-1.0], [1.0]))
     assert abs(draw(make_tables(mpc), 100)[:, 1]).max() < 100
-    agreement = mpc.export_c(tmp_path).agreement
+    agreement = export_c(mpc, tmp_path).agreement
     assert agreement is not None
     assert agreement.u < 1e-6
 
@@ -366,7 +365,7 @@ def test_states_that_leave_nothing_but_the_open_loop_of_an_unstable_plant_are_ce
     """All inputs are at bounds: gap and action are what the rounding of Q makes of lambda."""
     horizon = 20 if pole < 2 else 12
     mpc = qm.LinearMPC(([[pole]], [[1.0]]), horizon, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))
-    agreement = mpc.export_c(tmp_path).agreement
+    agreement = export_c(mpc, tmp_path).agreement
     assert agreement is not None
     assert (agreement.solved, agreement.unsolved) == (agreement.states, 0)
     assert 1e-9 < agreement.value < 1e-7
@@ -385,4 +384,4 @@ def test_actions_that_differ_at_any_state_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(Library, "steps", off)
     match = r"^dtype: got 'float64', with an action off by \d\.\de-0\d of its size"
     with pytest.raises(QPError, match=match):
-        tied().export_c(tmp_path)
+        export_c(tied(), tmp_path)

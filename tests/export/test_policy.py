@@ -20,7 +20,7 @@ from tests.exported import (
     rates,
     tied,
 )
-from torch_qpmpc import QPMPC, Status
+from torch_qpmpc import QPMPC, Status, export_c
 from torch_qpmpc.export.library import compiler
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -121,7 +121,7 @@ def test_the_limit_of_iterations_is_reported_and_the_next_step_continues(tmp_pat
     assert codes[0] == LIMIT
     assert codes[-1] == SOLVED
     np.testing.assert_allclose(steps.u, exact(mpc, p, steps.u).u, atol=1e-9)
-    mpc.export_c(tmp_path, max_iterations=3)  # its self-test leaves out states beyond the limit
+    export_c(mpc, tmp_path, max_iterations=3)  # its self-test leaves out states beyond the limit
 
 
 def test_a_qp_without_rows_has_a_linear_policy(tmp_path):
@@ -152,7 +152,7 @@ def built(command, folder, *flags):
 def exported(tmp_path_factory):
     """A scheme with infeasible states, exported with its self-test, and 40 states of it."""
     folder, mpc = tmp_path_factory.mktemp("c"), tied(4, state_slack=torch.inf)
-    mpc.export_c(folder)
+    export_c(mpc, folder)
     p = draw_known(mpc, 40)
     p[3, 0] = np.nan
     (folder / "p.bin").write_bytes(p.tobytes())
@@ -175,7 +175,7 @@ def test_compilers_agree_without_a_warning(name, level, exported):
 @pytest.mark.parametrize("storage", ["fast", "small"])
 def test_sanitizers_find_nothing(storage, exported, tmp_path):
     mpc = tied(4, state_slack=torch.inf)
-    mpc.export_c(tmp_path, storage=storage)
+    export_c(mpc, tmp_path, storage=storage)
     (tmp_path / "p.bin").write_bytes(draw_known(mpc, 40).tobytes())
     flags = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     try:

@@ -16,6 +16,7 @@ from torch.testing import assert_close
 import torch_qpmpc as qm
 from torch_qpmpc import QPMPC, BlendedModel, QPError
 from torch_qpmpc.analysis.report import read
+from torch_qpmpc.export.export import export_c
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.learning.penalties import SystemIdentificationPenalty
 from torch_qpmpc.learning.updates import first_order, second_order
@@ -229,7 +230,7 @@ def test_files_copies_and_state_dicts_have_the_schedule(model, tmp_path):
     "use",
     [
         lambda mpc: mpc.model(),
-        lambda mpc: mpc.export_c("nowhere"),
+        lambda mpc: export_c(mpc, "nowhere"),
         lambda mpc: largest_difference(mpc, mpc, Polytope.box([-1.0, -1.0], [1.0, 1.0])),
         read,
         lambda mpc: first_order(mpc, None, None, None, SystemIdentificationPenalty(1.0)),  # pyright: ignore[reportArgumentType]

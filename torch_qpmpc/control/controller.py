@@ -350,13 +350,13 @@ class Controller:
 
         Args:
             folder: the folder of the files, created if it does not exist.
-            dtype, name, max_iterations, storage: as in `QPMPC.export_c`.
+            dtype, name, max_iterations, storage: as in `export_c`.
 
         Returns:
             Sizes and the measured agreement.
 
         Raises:
-            QPError: as in `QPMPC.export_c`; the self-test fails; or inputs that r leaves free move
+            QPError: as in `export_c`; the self-test fails; or inputs that r leaves free move
                 a bounded output without a weight, as their choice is not exact in C.
         """
         law, options = self._law.renewed(), {"dtype": dtype, "name": name, "storage": storage}

@@ -8,7 +8,7 @@ from pathlib import Path
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, learned_qp
 from torch_qpmpc.experiment.exporting import FOLDER
-from torch_qpmpc.export.export import STORAGES
+from torch_qpmpc.export.export import STORAGES, export_c
 from torch_qpmpc.export.writer import REAL
 
 
@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> None:
         if not (run / CHECKPOINT).exists():
             got = f"{run}, which has no {CHECKPOINT}"
             raise QPError.expected("RUN_FOLDER", got, "the folder of a run of train.py")
-        print(learned_qp(run).export_c(folder or run / FOLDER, **options))
+        print(export_c(learned_qp(run), folder or run / FOLDER, **options))
     except QPError as error:
         raise SystemExit(str(error)) from None
 

@@ -1,4 +1,4 @@
-"""`export_c`: a policy as two files of C, checked against an exact solver."""
+"""`export_c`: a policy as two files of C, checked against an exact solver; `CompiledPolicy`."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import re
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from torch_qpmpc.checks import check_choice, check_whole
-from torch_qpmpc.errors import QPError
-from torch_qpmpc.export.examples import choose, draw, nearer
-from torch_qpmpc.export.library import Library, compiler
-from torch_qpmpc.export.reference import LARGE, Reference, reference, sharpen
-from torch_qpmpc.export.tables import Array, Tables, make_tables
+from torch_qpmpc.checks import check_choice, check_kind, check_tensor, check_whole
+from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.export.comparison import Agreement, choose, compare, states
+from torch_qpmpc.export.library import Library, Steps, compiler, required_compiler
+from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.export.writer import (
-    CONSTANTS,
     NEAR,
     REAL,
     Labels,
@@ -29,20 +29,14 @@ from torch_qpmpc.export.writer import (
     table_bytes,
 )
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.qp.program import Status
 
 STORAGES = ("fast", "small")
-#: Number of random states that the compiled policy is compared at; at least `LEAST` for a `LARGE`
-#: QP, whose cold solves take long.
-COMPARED, LEAST = 400, 40
 #: Largest share of the solvable states that may be uncertified.
 UNSOLVED = 0.1
-#: Differences above this, relative to the largest action or value, are worth an exact solution.
-DOUBTFUL = 1e-9
 #: The default limit of iterations is ``PER_ROW r + AT_LEAST``.
 PER_ROW, AT_LEAST = 20, 100
-#: What a step of an infeasible state returns.
-INFEASIBLE = 2
+#: The causes of the codes.
+CODES = ("solved", "not certified within max_iterations", "infeasible", "invalid p")
 #: Names that the files would hide or that readers would take for something else.
 TAKEN = {
     "a keyword of C or C++": """alignas alignof and and_eq asm auto bitand bitor bool break case
@@ -60,35 +54,12 @@ TAKEN = {
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """A compiled policy compared with an exact solver at random states, some far out of bounds.
-
-    Attributes:
-        states: the number of states.
-        solved: the number of those that both solve, where actions and values are compared.
-        infeasible: the number of those that both call infeasible.
-        u: the largest difference of an action.
-        value: the largest difference of a value, relative to the value.
-        unsolved: the number of states that the solver solves and the policy does not.
-        iterations: the most iterations from an empty active set.
-    """
-
-    states: int
-    solved: int
-    infeasible: int
-    u: float
-    value: float
-    unsolved: int
-    iterations: int
-
-
-@dataclass(frozen=True)
 class Export:
-    """Report of `QPMPC.export_c`.
+    """Report of `export_c`.
 
     Attributes:
         files: the paths of ``name.h`` and ``name.c``.
-        dtype, storage, max_iterations: as in `QPMPC.export_c`.
+        dtype, storage, max_iterations: as in `export_c`.
         n_p, n_u: the numbers of entries of p and u.
         rows: the number of rows with multipliers.
         variables: the number of free variables of a plan.
@@ -100,7 +71,7 @@ class Export:
     Example:
         >>> import tempfile, torch_qpmpc as qm
         >>> mpc = qm.QPMPC.of(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
-        >>> export = mpc.export_c(tempfile.mkdtemp())
+        >>> export = qm.export_c(mpc, tempfile.mkdtemp())
         >>> [file.name for file in export.files], export.rows
         (['policy.h', 'policy.c'], 3)
     """
@@ -127,15 +98,13 @@ class Export:
             f"{self.variables} variables; {self.dtype}, {self.storage}",
             f"tables {self.table_bytes:,} bytes, state {self.state_bytes:,} bytes; condition "
             f"{self.condition:.1e}",
+            "not compared with a solver: no C compiler was found",
         ]
-        if (agreement := self.agreement) is None:
-            lines.append("not compared with a solver: no C compiler was found")
-        else:
-            lines.append(
-                f"at {agreement.states} states: actions within {agreement.u:.1e}, values within "
-                f"{agreement.value:.1e} where solved ({agreement.solved}); {agreement.infeasible} "
-                f"infeasible, {agreement.unsolved} unsolved, at most {agreement.iterations} "
-                "iterations"
+        if one := self.agreement:
+            lines[-1] = (
+                f"at {one.states} states: actions within {one.u:.1e}, values within "
+                f"{one.value:.1e} where solved ({one.solved}); {one.infeasible} infeasible, "
+                f"{one.unsolved} unsolved, at most {one.iterations} iterations"
             )
         return "\n".join(lines)
 
@@ -150,45 +119,67 @@ def export_c(
     storage: str = "fast",
     labels: Labels | None = None,
 ) -> Export:
-    """Write a policy as C; see `QPMPC.export_c`."""
+    """Write the policy and value of the current theta as C99 without heap or dependencies.
+
+    The files are ``name.c`` and ``name.h``, whose ``name_step`` maps p to u_0 and V(p); they are
+    compared with an exact solver, at states about feasible ones, if a C compiler is installed.
+
+    Args:
+        mpc: the QP.
+        folder: the folder of both files, created if it does not exist.
+        dtype: ``"float64"`` or ``"float32"``, the type of all numbers in C.
+        name: the beginning of the names of files and functions.
+        max_iterations: the limit of a step; by default 20 per row of G on the plan, plus 100.
+        storage: ``"fast"`` stores a table of rows by rows; ``"small"`` one of rows by free
+            variables if that is smaller.
+        labels: names of the entries of ``"x"``, ``"u"`` and ``"d"``, with units, for the comment at
+            the head.
+
+    Returns:
+        Sizes, conditioning, and the measured agreement.
+
+    Raises:
+        QPError: an argument is invalid, the cost is singular on the plan, no state has a solution,
+            or the self-test fails.
+    """
+    settings = Settings(name, dtype, storage, max_iterations)
     with tempfile.TemporaryDirectory() as temporary:
-        export, _ = build(mpc, Path(temporary), dtype, name, max_iterations, storage, labels)
+        export, _ = _build(mpc, Path(temporary), settings, labels)
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         for file in export.files:
             (folder / file.name).unlink(missing_ok=True)  # may be a link, which copy would follow
-        files = tuple(Path(shutil.copy(file, folder)) for file in export.files)
-    return Export(**{**vars(export), "files": files})
+        return replace(
+            export, files=tuple(Path(shutil.copy(file, folder)) for file in export.files)
+        )
 
 
-def build(
-    mpc: QPMPC,
-    folder: Path,
-    dtype: str,
-    name: str,
-    max_iterations: int | None,
-    storage: str,
-    labels: Labels | None = None,
+def _build(
+    mpc: QPMPC, folder: Path, settings: Settings, labels: Labels | None = None
 ) -> tuple[Export, Library | None]:
     """Write, compile and check a policy in an existing folder."""
-    _check(mpc, dtype, name, storage, labels)
-    if max_iterations is not None:
-        check_whole("max_iterations", max_iterations, 1)
+    name, dtype, storage, limit = settings
+    _check(mpc, settings, labels)
     tables = make_tables(mpc)
-    limit = max_iterations or PER_ROW * len(tables.rows) + AT_LEAST
-    settings = Settings(name, dtype, storage, limit)
-    p, exact = _states(mpc, tables, dtype)
+    settings = settings._replace(
+        max_iterations=limit or PER_ROW * len(tables.rows) + AT_LEAST,
+    )
+    p, exact = states(mpc, tables, dtype)
     examples, exact = choose(mpc, p, exact)
     texts = sources(tables, settings, header(mpc, tables, settings, labels or {}), examples)
-    files = []
     for file, text in texts.items():
-        files.append(folder / file)
-        files[-1].write_text(text, encoding="utf-8")
+        (folder / file).write_text(text, encoding="utf-8")
     library, agreement = None, None
     if compiler() is not None:
         library = Library(folder, name, dtype)
-        agreement, error = _compare(mpc, tables, library, p, exact)
-        _check_solved(agreement, dtype, max_iterations, tables)
+        agreement, error = compare(mpc, tables, library, p, exact)
+        solvable, unsolved = agreement.solved + agreement.unsolved, agreement.unsolved
+        if limit is None and unsolved > UNSOLVED * solvable:
+            _refuse(dtype, f"{unsolved} of {solvable} states not certified", tables)
+        if not agreement.solved:
+            got = f"{limit}, with none of {solvable} states solved"
+            remedy = "Raise it, or leave it out."
+            raise QPError.expected("max_iterations", got, "a limit that solves some", remedy)
         if not error <= NEAR[dtype].u:
             _refuse(dtype, f"an action off by {error:.1e} of its size", tables)
         if failed := library.selftest():
@@ -198,115 +189,38 @@ def build(
         remedy = "Install one, or export float64."
         raise QPError.expected("dtype", "'float32' without a C compiler to test it", "one", remedy)
     export = Export(
-        tuple(files),
-        dtype,
-        storage,
-        limit,
-        tables.n_p,
-        tables.n_u,
-        len(tables.rows),
-        tables.R.shape[1],
-        table_bytes(tables, settings),
-        state_bytes(tables, settings),
-        tables.condition,
-        agreement,
-        tables.digest,
+        files=tuple(folder / file for file in texts),
+        dtype=dtype,
+        storage=storage,
+        max_iterations=settings.max_iterations or 0,
+        n_p=tables.n_p,
+        n_u=tables.n_u,
+        rows=len(tables.rows),
+        variables=tables.R.shape[1],
+        table_bytes=table_bytes(tables, settings),
+        state_bytes=state_bytes(tables, settings),
+        condition=tables.condition,
+        agreement=agreement,
+        digest=tables.digest,
     )
     return export, library
 
 
-def _check_solved(agreement: Agreement, dtype: str, limit: int | None, tables: Tables) -> None:
-    """Refuse a policy that solves too few of the states that have solutions, or none."""
-    solvable = agreement.solved + agreement.unsolved
-    if limit is None and agreement.unsolved > UNSOLVED * solvable:
-        _refuse(dtype, f"{agreement.unsolved} of {solvable} states not certified", tables)
-    if not agreement.solved:
-        got = f"{limit}, with none of {solvable} states solved"
-        remedy = "Raise it, or leave it out."
-        raise QPError.expected("max_iterations", got, "a limit that solves some", remedy)
-
-
-def _states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, Reference]:
-    """Draw states in the policy's numbers, most of which have solutions, and solve for them."""
-
-    def solve(p: Array) -> Reference:
-        return reference(mpc, p.astype(dtype).astype(np.float64))
-
-    count = int(COMPARED * min(1.0, LARGE / max(len(tables.rows), 1)) ** 2)
-    p, exact = nearer(tables, draw(tables, max(count, min(LEAST, COMPARED))), solve)
-    return p.astype(dtype).astype(np.float64), exact
-
-
-def _compare(
-    mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Reference
-) -> tuple[Agreement, float]:
-    """Return the agreement, and the largest error of an action relative to its size.
-
-    An error within the tolerances of the rows that the action follows from counts as none.
-    """
-    states = library.states(len(p))
-    steps = library.steps(states, p, tables.n_u)
-    solvable = exact.status == Status.SOLVED
-    both = solvable & (steps.codes == 0)
-
-    def differences(exact: Reference) -> tuple[Array, Array]:
-        u = np.abs(steps.u - exact.u).max(-1)
-        return u, np.abs(steps.value - exact.value) / (np.abs(exact.value) + 1e-300)
-
-    u, value = differences(exact)
-    # Relative to the state's own action, or to a usual one: some drawn states have huge ones.
-    sizes = np.abs(exact.u).max(-1)
-    sizes = np.fmax(sizes, np.median(sizes[both]) if both.any() else 0).clip(1e-9)
-    doubtful = both & ((u > DOUBTFUL * sizes) | (value > DOUBTFUL))
-    if library.real == np.float64:
-        u, value = differences(sharpen(mpc, p, exact, np.flatnonzero(doubtful)))
-    agreement = Agreement(
-        states=len(p),
-        solved=int(both.sum()),
-        infeasible=int(((exact.status == Status.INFEASIBLE) & (steps.codes == INFEASIBLE)).sum()),
-        u=float(u[both].max(initial=0)),
-        value=float(value[both].max(initial=0)),
-        unsolved=int((solvable & ~both).sum()),
-        iterations=int(steps.iterations.max(initial=0)),
-    )
-    errors = np.where(both, u / sizes, 0)
-    for i in np.flatnonzero(errors > NEAR[str(library.real)].u):
-        lam = library.multipliers(states, len(tables.rows))[i]
-        if u[i] <= _tolerance(tables, str(library.real), p[i], lam):
-            errors[i] = 0
-    return agreement, float(errors.max(initial=0))
-
-
-def _tolerance(tables: Tables, dtype: str, p: Array, lam: Array) -> float:
-    """Return the largest error of u_0 that the tolerances of the held rows allow.
-
-    A held row of policy.c is at its bound to within ``TOLERANCE size + ROUNDING |lam|``. An error
-    dy of the held rows h is, by the tables, an error ``F_h Q_hh^-1 dy`` of u_0.
-    """
-    tight, rounding = (
-        float(CONSTANTS[dtype][key].rstrip("f")) for key in ("TOLERANCE", "ROUNDING")
-    )
-    held = (lam != 0) & (np.abs(lam) < tables.rows.w)
-    size = tables.rows.size + np.abs(tables.rows.Y) @ np.abs(p)
-    error = tight * size[held] + rounding * np.abs(lam).sum()
-    gain = np.linalg.lstsq(tables.Q[np.ix_(held, held)], tables.F[:, held].T, rcond=None)[0]
-    return float((error @ np.abs(gain)).max(initial=0))
-
-
 def _refuse(dtype: str, got: str, tables: Tables) -> None:
-    remedy = (
-        "Export float64."
-        if dtype == "float32"
-        else f"The cost on the plan has condition {tables.condition:.1e}: shorten the horizon, or "
-        "rescale the states."
-    )
+    remedy = "Export float64."
+    if dtype == "float64":
+        cost = f"The cost on the plan has condition {tables.condition:.1e}"
+        remedy = f"{cost}: shorten the horizon, or rescale the states."
     raise QPError.expected("dtype", f"{dtype!r}, with {got}", "a policy that agrees", remedy)
 
 
-def _check(mpc: QPMPC, dtype: str, name: str, storage: str, labels: Labels | None) -> None:
-    check_choice("dtype", dtype, tuple(REAL))
-    check_choice("storage", storage, STORAGES)
-    check_name(name)
+def _check(mpc: QPMPC, settings: Settings, labels: Labels | None) -> None:
+    check_kind("mpc", mpc, QPMPC)
+    check_choice("dtype", settings.dtype, tuple(REAL))
+    check_choice("storage", settings.storage, STORAGES)
+    check_name(settings.name)
+    if settings.max_iterations is not None:
+        check_whole("max_iterations", settings.max_iterations, 1)
     sizes = {"x": mpc.n_x, "u": mpc.n_u, "d": mpc.n_d}
     if labels is not None and not isinstance(labels, Mapping):
         raise QPError.expected("labels", type(labels).__name__, "a mapping from x, u and d")
@@ -327,3 +241,83 @@ def check_name(name: str) -> None:
         if name.lower() in taken.split():
             got = f"{name!r}, {kind}"
             raise QPError.expected("name", got, "another C identifier", f"{remedy} Append a _.")
+
+
+class CompiledPolicy:
+    """The policy and value of a QPMPC in compiled C, for fast closed loops.
+
+    It holds the theta of its creation. Each row of a batch is a controller that starts from its own
+    last active set, so that a closed loop of B plants passes ``(B, n_p)`` at each step.
+
+    Args:
+        mpc: the QPMPC; its ``on_failure`` is that of the policy: ``"raise"`` raises on a step that
+            is not solved, and others return the action that C writes.
+        dtype, storage, max_iterations: as in `export_c`.
+
+    Attributes:
+        export: sizes and measured agreement, an `Export`.
+        last: the results of the last step: actions, codes, values and their error bounds.
+
+    Raises:
+        QPError: no C compiler is installed, or as in `export_c`.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> mpc = qm.QPMPC.of(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
+        >>> policy = qm.CompiledPolicy(mpc)
+        >>> s = torch.tensor([[1.0, 0.0], [-0.5, 0.3]])
+        >>> torch.allclose(policy(s), mpc.policy(s))
+        True
+    """
+
+    def __init__(
+        self,
+        mpc: QPMPC,
+        *,
+        dtype: str = "float64",
+        storage: str = "fast",
+        max_iterations: int | None = None,
+    ) -> None:
+        required_compiler()
+        settings = Settings("policy", dtype, storage, max_iterations)
+        with tempfile.TemporaryDirectory() as folder:
+            self.export, library = _build(mpc, Path(folder), settings)
+        assert library is not None
+        self._library = library
+        self._n_p, self._n_u, self._raises = mpc.n_p, mpc.n_u, mpc.on_failure == "raise"
+        self._states, self._count = library.states(1), 1
+        self.last: Steps | None = None
+
+    def __call__(self, s: Tensor) -> Tensor:
+        """Return pi(s): s ``(*batch, n_p)`` to ``(*batch, n_u)``.
+
+        Raises:
+            QPError: the shape or type of s is wrong.
+            SolverError: with ``on_failure="raise"``, a step is not solved.
+        """
+        check_tensor("s", s, self._n_p)
+        p = s.detach().double().cpu().numpy().reshape(-1, self._n_p)
+        if len(p) != self._count:
+            self._states, self._count = self._library.states(len(p)), len(p)
+        self.last = self._library.steps(self._states, p, self._n_u)
+        if self._raises and self.last.codes.any():
+            codes = np.bincount(self.last.codes, minlength=len(CODES))
+            failures = [f"{codes[i]} {CODES[i]}" for i in range(1, len(CODES)) if codes[i]]
+            total = f"{(self.last.codes != 0).sum()} of {len(p)}"
+            raise SolverError(f"{total} steps have no certified solution: {', '.join(failures)}.")
+        u = torch.from_numpy(self.last.u).to(s)
+        return u.reshape(*s.shape[:-1], self._n_u)
+
+    def value(self, s: Tensor) -> Tensor:
+        """Return V(s), a cost to go: s ``(*batch, n_p)`` to ``(*batch,)``; errors as in a call.
+
+        It is inf where a step is not solved, as that of the module.
+        """
+        self(s)
+        assert self.last is not None
+        value = np.where(self.last.codes == 0, self.last.value, np.inf)
+        return torch.from_numpy(value).to(s).reshape(s.shape[:-1])
+
+    def reset(self) -> None:
+        """Forget the last active sets."""
+        self._states = self._library.states(self._count)

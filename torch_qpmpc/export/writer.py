@@ -85,7 +85,7 @@ class Settings(NamedTuple):
     name: str
     dtype: str
     storage: str
-    max_iterations: int
+    max_iterations: int | None
 
 
 def sources(tables: Tables, settings: Settings, header: str, examples: Examples) -> dict[str, str]:

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,9 +49,6 @@ from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
 from torch_qpmpc.qp.solvers import backend
-
-if TYPE_CHECKING:
-    from torch_qpmpc.export.export import Export
 
 #: The parts of theta that are learned by default.
 LEARN = ("H", "c", "C")
@@ -586,44 +583,6 @@ class QPMPC(nn.Module):
                 remedy = {"remedy": "Register the backend of that name first."}
             raise damaged(Path(path), error, "a file that QPMPC.save wrote", **remedy) from error
         return mpc
-
-    def export_c(
-        self,
-        folder: str | Path,
-        *,
-        dtype: str = "float64",
-        name: str = "policy",
-        max_iterations: int | None = None,
-        storage: str = "fast",
-        labels: Mapping[str, Sequence[str]] | None = None,
-    ) -> Export:
-        """Write the policy and value of the current theta as C99 without heap or dependencies.
-
-        The files are ``name.c`` and ``name.h``, whose ``name_step`` maps p to u_0 and V(p); they
-        are compared with an exact solver, at states about feasible ones, if a C compiler is
-        installed.
-
-        Args:
-            folder: the folder of both files, created if it does not exist.
-            dtype: ``"float64"`` or ``"float32"``, the type of all numbers in C.
-            name: the beginning of the names of files and functions.
-            max_iterations: the limit of a step; by default 20 per row of G on the plan, plus 100.
-            storage: ``"fast"`` stores a table of rows by rows; ``"small"`` one of rows by free
-                variables if that is smaller.
-            labels: names of the entries of ``"x"``, ``"u"`` and ``"d"``, with units, for the
-                comment at the head.
-
-        Returns:
-            Sizes, conditioning, and the measured agreement.
-
-        Raises:
-            QPError: an argument is invalid, the cost is singular on the plan, no state has a
-                solution, or the self-test fails.
-        """
-        from torch_qpmpc.export.export import export_c
-
-        options = {"dtype": dtype, "name": name, "storage": storage, "labels": labels}
-        return export_c(self, folder, max_iterations=max_iterations, **options)
 
     def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
         """Return parameter groups for an optimiser, one for each learned part of theta.
