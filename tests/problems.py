@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc import QPMPC, QuadraticProgram
-from torch_qpmpc.analysis.prediction_form import PredictionForm, prediction_form
+from torch_qpmpc.analysis.structure import PredictionForm, prediction_form
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.qp.kernels import sample_torch
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs, to_tensor
@@ -53,6 +53,12 @@ def model_form(
     b = None if offset is None else -offset.expand(N, n_x).flatten()
     C = banded_matrix(A, B, N, E)
     return prediction_form(C, n_x, B.shape[-1] // past, b, past, n_d)
+
+
+def predict(form: PredictionForm, p: Tensor, U: Tensor) -> Tensor:
+    """Return x_1, .., x_N ``(*batch, N, n_x)`` from p and U ``(*batch, N, n_u)``."""
+    X = times(form.Phi, p) + times(form.Gamma, U.flatten(-2)) + form.phi
+    return X.unflatten(-1, (form.layout.horizon, form.layout.n_x))
 
 
 @dataclass(frozen=True)

@@ -1,101 +1,67 @@
-"""Figures of a QP show the numbers of its analysis."""
+"""Figures of a QP are drawn, with finite numbers and labels."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from tests.figures import image_of, legend_of, make_mpc, rendered
+from tests.problems import normal
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.analysis.plots import (
     canonical_figure,
-    energies_figure,
-    forms,
+    episode_figure,
+    plans_along,
     policy_figure,
     slice_between,
 )
 from torch_qpmpc.analysis.policy import policy_map
-from torch_qpmpc.analysis.prediction_form import canonical_matrix
-from torch_qpmpc.analysis.structure import (
-    gamma_energies,
-    memory_energies,
-    nearest_model,
-    stage_models,
-)
+from torch_qpmpc.analysis.structure import nearest_model, predictions
 
 pytestmark = pytest.mark.layout
 
-
-@pytest.fixture(scope="module")
-def mpc() -> QPMPC:
-    return make_mpc()
-
-
-def test_canonical_figure_shows_both_forms_of_C_and_both_predictions(mpc):
-    figure = canonical_figure(mpc)
-    start, learned = forms(mpc).values()
-    canonical, _ = canonical_matrix(learned, stage_models(learned).A)
-    expected = [mpc.C.detach(), canonical]
-    expected += [torch.cat((form.Phi, form.Gamma), -1) for form in (start, learned)]
-    axes = [a for a in figure.axes if a.images]
-    for ax, matrix in zip(axes, expected, strict=True):
-        assert np.array_equal(image_of(ax), matrix.numpy())
-    assert f"distance to MPC {nearest_model(learned).residual:.2g}" in axes[3].get_title()
-    rendered(figure)
+T, N_Y, N_U = 6, 2, 1
+TIMES, Y, U = 0.25 * torch.arange(T + 1), normal(T + 1, N_Y), normal(T, N_U, seed=1)
+LOWER, UPPER = torch.tensor([-1.0, -torch.inf]), torch.stack((Y[:, 0].double() + 1, Y[:, 1]), -1)
 
 
 @pytest.mark.parametrize("horizon", [1, 2, 12])
-def test_figures_of_any_horizon(horizon):
+def test_the_canonical_figure_of_any_horizon(horizon):
     mpc = make_mpc(horizon)
-    rendered(canonical_figure(mpc))
-    rendered(energies_figure(mpc))
-
-
-def test_energies_figure_shows_shares(mpc):
-    figure = energies_figure(mpc)
-    left, right = figure.axes
-    for i, form in enumerate(forms(mpc).values()):
-        energies = gamma_energies(form)
-        for axes, shares in ((left, energies / energies.sum()), (right, memory_energies(form))):
-            heights = [bar.get_height() for bar in axes.containers[i]]
-            assert heights == pytest.approx(shares.clamp(min=1e-12).tolist())
-    assert legend_of(left) == legend_of(right) == ["start", "learned"]
-    assert right.get_xticklabels()[-1].get_text() == "later\nactions"
+    figure = canonical_figure(mpc)
+    axes = [a for a in figure.axes if a.images]
+    assert len(axes) == 4
+    assert all(np.isfinite(image_of(ax)).all() for ax in axes)
+    distance = nearest_model(predictions(mpc)).residual
+    assert f"distance to MPC {distance:.2g}" in axes[3].get_title()
     rendered(figure)
 
 
-def test_a_C_without_canonical_form_shows_the_reason():
+def test_a_C_without_canonical_form_is_an_error():
     mpc = make_mpc()
     with torch.no_grad():
         mpc.C.zero_()
-    for draw in (canonical_figure, energies_figure):
-        with pytest.raises(QPError, match="of rank 0 of 16"):
-            draw(mpc)
+    with pytest.raises(QPError, match="of rank 0 of 16"):
+        canonical_figure(mpc)
 
 
-def test_policy_figure_shows_the_map(mpc):
+def test_the_policy_figure_has_four_panels_and_the_regions_borders():
     grid = torch.linspace(-1, 1, 9)
-    found = policy_map(mpc, grid, grid[:7], axes=(0, 2))
+    found = policy_map(make_mpc(), grid, grid[:7], axes=(0, 2))
     figure = policy_figure(found, action=1)
-    fields = [found.values, found.actions[..., 1], found.gains[..., 1, :].norm(dim=-1)]
-    panels = figure.axes[:4]
-    for axes, field in zip(panels, [*fields, found.regions % 20], strict=True):
+    for axes in figure.axes[:4]:
         (mesh,) = axes.collections
-        assert np.array_equal(np.asarray(mesh.get_array()), field.mT.numpy())
+        assert np.isfinite(np.asarray(mesh.get_array())).all()
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("$s_{1}$", "$s_{3}$")
-    assert f"{len(found.active_sets)} regions" in panels[3].get_title()
-    rendered(figure)
-
-
-def test_borders_are_between_regions(mpc):
-    grid = torch.linspace(-1, 1, 9)
-    found = policy_map(mpc, grid, grid[:7], axes=(0, 2))
+    assert f"{len(found.active_sets)} regions" in figure.axes[3].get_title()
     crossings = sum(int((found.regions.diff(dim=axis) != 0).sum()) for axis in (0, 1))
-    lines = policy_figure(found).axes[3].lines
+    lines = figure.axes[3].lines
     assert sum(int(np.isnan(line.get_xdata()).sum()) for line in lines) == crossings > 0
-    vertical = np.asarray(lines[0].get_xdata())[::3]
-    assert np.isin(vertical.round(9), ((grid[1:] + grid[:-1]) / 2).numpy().round(9)).all()
+    rendered(figure)
 
 
 def test_states_without_a_solution_are_left_blank():
@@ -109,13 +75,65 @@ def test_states_without_a_solution_are_left_blank():
         (mesh,) = axes.collections
         shown = np.ma.masked_invalid(np.asarray(mesh.get_array()))
         assert 0 < shown.count() < shown.size
-    rendered(figure)
 
 
-def test_a_slice_is_as_wide_as_the_starts(mpc):
+def test_a_slice_is_as_wide_as_the_starts():
+    mpc = make_mpc()
     starts = torch.zeros(3, mpc.n_x)
     starts[:, 0] = torch.tensor([-2.0, 0.5, 1.0])
     found = slice_between(mpc, starts, points=5)
     assert found.axes == (0, mpc.n_x // 2)
-    torch.testing.assert_close(found.x, torch.linspace(-2, 1, 5).double())
-    torch.testing.assert_close(found.y, torch.linspace(-1, 1, 5).double())  # that all share
+    assert_close(found.x, torch.linspace(-2, 1, 5).double())
+    assert_close(found.y, torch.linspace(-1, 1, 5).double())  # that all share
+
+
+def test_an_episode_has_a_panel_for_each_signal():
+    known = {"price": normal(T, seed=2), "outdoor": normal(T + 4, seed=3)}
+    references = normal(T + 1, N_Y, seed=4)
+    x, u = normal(4, N_Y, seed=5), normal(3, N_U, seed=6)
+    figure = episode_figure(
+        TIMES, Y, U, signals=known, band=(LOWER, UPPER), references=references, plans={2: (x, u)},
+        outputs=["room", "wall"], actions=["heating"], xlabel="hour",
+    )  # fmt: skip
+    assert [axes.get_ylabel() for axes in figure.axes] == ["room", "wall", "heating", *known]
+    assert figure.axes[-1].get_xlabel() == "hour"
+    assert legend_of(figure.axes[0]) == ["band", "reference", "realised", "planned"]
+    assert np.allclose(figure.axes[0].lines[4].get_xdata(), [0.5, 0.75, 1.0, 1.25])
+    rendered(figure)
+    plain = episode_figure(TIMES, Y, U)
+    assert [axes.get_ylabel() for axes in plain.axes] == ["$y_{1}$", "$y_{2}$", "$u_{1}$"]
+    rendered(plain)
+
+
+def test_plans_are_those_of_the_qp():
+    mpc = QPMPC.of(N_Y, N_U, 3, past=2, n_d=1, solver="daqp")
+    p = normal(T, mpc.n_p)
+    plans = plans_along(mpc, p, every=4)
+    assert [*plans] == [0, 4]
+    for k, plan in plans.items():
+        assert_close(plan, mpc.predicted(mpc.solve(p[k]).z.detach()))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"y": Y[1:]}, r"y: got shape \(6, 2\), expected shape \(7, n_y\)"),
+        ({"u": Y}, r"u: got shape \(7, 2\), expected shape \(6, n_u\)"),
+        ({"references": Y[:, :1]}, r"references: got shape \(7, 1\), expected shape \(7, 2\)"),
+        ({"signals": {"price": Y[:3, 0]}}, r"signals\['price'\]: got .*, expected at least 6"),
+        ({"band": (LOWER, UPPER[1:])}, r"band, upper: got .*, expected shape \(2,\) or \(7, 2\)"),
+        ({"outputs": ["room"]}, r"outputs: got \['room'\], expected 2 names"),
+        ({"actions": "u"}, "actions: got 'u', expected 1 names"),
+    ],
+)
+def test_what_does_not_fit_is_named(options, message):
+    arguments: dict[str, Any] = {"times": TIMES, "y": Y, "u": U}
+    with pytest.raises(QPError, match=message):
+        episode_figure(**(arguments | options))
+
+
+def test_rounding_errors_do_not_fill_a_panel():
+    y, u = torch.linspace(0, 1, 5).unsqueeze(-1), 1e-13 * torch.randn(4, 1)
+    _, panel = episode_figure(torch.arange(5.0), y, u).axes
+    low, high = panel.get_ylim()
+    assert 1 < high - low < 1.1

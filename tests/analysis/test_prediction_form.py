@@ -6,10 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.problems import model_form, normal, times
+from tests.problems import model_form, normal, predict, times
 from torch_qpmpc import QPError
-from torch_qpmpc.analysis.prediction_form import canonical_matrix, prediction_form
-from torch_qpmpc.analysis.structure import stage_models
+from torch_qpmpc.analysis.structure import canonical_matrix, prediction_form, stage_models
 from torch_qpmpc.mpc.banded import banded_matrix
 
 N_X, N_U, N = 3, 2, 5
@@ -38,9 +37,8 @@ def gauge(seed: int) -> Tensor:
 def test_predictions_are_those_of_stepping_the_model(stages):
     A, B = scheme(stages)
     form = model_form(A, B, N, OFFSET)
-    assert (form.n_x, form.n_u, form.horizon) == (N_X, N_U, N)
     x_0, U = normal(4, N_X), normal(4, N, N_U, seed=1)
-    predicted = form.predict(x_0, U)
+    predicted = predict(form, x_0, U)
     A, B = A.expand(N, N_X, N_X), B.expand(N, N_X, N_U)
     x = x_0
     for k in range(N):
@@ -49,7 +47,7 @@ def test_predictions_are_those_of_stepping_the_model(stages):
 
 
 @pytest.mark.parametrize("kind", ["tied", "varying", "free"])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_form_does_not_depend_on_the_gauge(kind, seed):
     C, b = constraints(kind, seed)
     T = gauge(seed)
@@ -62,7 +60,7 @@ def test_the_form_does_not_depend_on_the_gauge(kind, seed):
 def test_blocks_and_maps_are_the_form():
     form = prediction_form(*_of("free"))
     x_0, U = normal(N_X), normal(N, N_U, seed=1)
-    predicted = form.predict(x_0, U)
+    predicted = predict(form, x_0, U)
     by_blocks = torch.einsum("kjxu,ju->kx", form.blocks, U)
     by_blocks += times(form.Phi, x_0).view(N, N_X) + form.phi.view(N, N_X)
     torch.testing.assert_close(by_blocks, predicted)

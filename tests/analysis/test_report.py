@@ -35,7 +35,6 @@ def test_a_scheme_is_read_in_any_gauge():
         "causality": 0.0,
         "toeplitz": 0.0,
         "non_markov": 0.0,
-        "order": 1.0,
         "distance_to_mpc": 0.0,
         "gain_to_lqr": 0.0,
         "model_error": 0.005**0.5,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,19 +11,18 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from tests.problems import model_form, normal
+from torch_qpmpc import QPMPC
 from torch_qpmpc.analysis import structure
-from torch_qpmpc.analysis.prediction_form import (
+from torch_qpmpc.analysis.structure import (
+    NearestModel,
     PredictionForm,
     canonical_matrix,
-    prediction_form,
-)
-from torch_qpmpc.analysis.structure import (
     causality_defect,
     distance_by_band,
-    gamma_energies,
-    markov_order,
-    memory_energies,
     nearest_model,
+    one_step_error,
+    prediction_form,
+    second_moment,
     stage_models,
     toeplitz_defect,
 )
@@ -39,6 +37,9 @@ C = C_0 + torch.randn(C_0.shape, generator=generator, dtype=torch.float64)
 
 
 def test_distances_are_the_blocks_sums():
+    mpc = QPMPC.of(N_X, N_U, N, A=A, B=B, structure="free")
+    with torch.no_grad():
+        mpc.C += C - C_0
     expected = {"on": 0.0, "above": 0.0, "below": 0.0}
     for k in range(N):
         rows = slice(k * N_X, (k + 1) * N_X)
@@ -47,31 +48,7 @@ def test_distances_are_the_blocks_sums():
         expected["below"] += deviation[:, :first].sum().item()
         expected["on"] += deviation[:, first:last].sum().item()
         expected["above"] += deviation[:, last:].sum().item()
-    found = distance_by_band(C, C_0, N_X, N_U)
-    assert found.keys() == expected.keys()
-    for band, value in expected.items():
-        assert isinstance(found[band], float)
-        assert abs(found[band] - value) < 1e-12 * value
-    assert abs(sum(found.values()) - (C - C_0).abs().sum().item()) < 1e-9
-
-
-def test_the_start_has_no_distance():
-    parameter = torch.nn.Parameter(C_0.clone())
-    assert distance_by_band(parameter, C_0, N_X, N_U) == {"on": 0, "above": 0, "below": 0}
-
-
-def test_one_entry_is_in_one_band():
-    for row, column, band in ((0, 0, "on"), (0, N_X + N_U + N_X, "above"), (N_X, 0, "below")):
-        other = C_0.clone()
-        other[row, column] += 2.0
-        nothing = dict.fromkeys(("on", "above", "below"), 0.0)
-        assert distance_by_band(other, C_0, N_X, N_U) == nothing | {band: 2.0}
-
-
-def test_distances_depend_on_the_gauge():
-    """T C is the same QP at a large distance, as the docstring warns."""
-    T = torch.linalg.qr(torch.randn(N * N_X, N * N_X, generator=generator).double()).Q
-    assert distance_by_band(T @ C_0, C_0, N_X, N_U)["above"] > 1
+    assert distance_by_band(mpc) == pytest.approx(expected)
 
 
 def form_of(C: Tensor, b: Tensor | None = None) -> PredictionForm:
@@ -108,15 +85,13 @@ def test_defects_are_sums_over_blocks():
         departure += sum((block - mean).square().sum().item() for block in blocks)
     assert causality_defect(form).item() == pytest.approx((above / total) ** 0.5, rel=1e-12)
     assert toeplitz_defect(form).item() == pytest.approx((departure / total) ** 0.5, rel=1e-12)
-    energies = [sum(b.square().sum().item() for b in blocks) for blocks in by_lag.values()]
-    assert gamma_energies(form).tolist() == pytest.approx(energies, rel=1e-12)
     assert above > 0.01 * total
 
 
 def test_defects_of_a_batch():
     forms = [free_form(seed) for seed in (0, 1)]
     C = torch.stack([canonical_matrix(form, stage_models(form).A)[0] for form in forms])
-    for defect in (causality_defect, toeplitz_defect, gamma_energies):
+    for defect in (causality_defect, toeplitz_defect):
         torch.testing.assert_close(defect(form_of(C)), torch.stack([defect(f) for f in forms]))
 
 
@@ -128,7 +103,6 @@ def test_a_time_varying_scheme_is_markovian_but_no_tied_one():
     for part, expected in (("A", A_k), ("B", B_k), ("offset", c_k)):
         torch.testing.assert_close(getattr(found, part), expected, rtol=0, atol=1e-9)
     assert found.residual.max() < 1e-9
-    assert markov_order(memory_energies(form)) == 1
     assert causality_defect(form) < 1e-12
     assert toeplitz_defect(form) > 0.01
     assert nearest_model(form).residual > 0.01
@@ -212,38 +186,44 @@ def test_directions_that_no_prediction_reaches_are_not_made_up():
     torch.testing.assert_close(nearest_model(form).A, nilpotent)
 
 
-PAIR = 0.3 * torch.randn(N_X, N_X + N_U, generator=generator, dtype=torch.float64)
-ACTION = PAIR * (torch.arange(N_X + N_U) >= N_X)
-
-
-@pytest.mark.parametrize(
-    ("past", "order"),
-    [
-        ((), 1),
-        ((PAIR,), 2),
-        ((ACTION,), 2),
-        ((0 * PAIR, ACTION), 3),
-        ((0 * PAIR, 0 * PAIR, ACTION), 4),
-    ],
-    ids=["none", "pair", "action", "two back", "three back"],
-)
-def test_the_order_is_the_number_of_past_pairs(past, order):
-    """With two actions and three states, older pairs add information."""
+def test_an_older_pair_is_in_the_residual_of_the_stages():
+    """In any gauge, and causally."""
     T = normal(N * N_X, N * N_X, seed=8)
-    form = form_of(T @ scheme_with(*past))
-    energies = memory_energies(form)
-    assert energies.shape == (N + 1,)
-    assert energies.sum().item() == pytest.approx(1, abs=1e-12)
-    assert markov_order(energies) == order
-    assert (energies[order:] < 1e-12).all()
-    assert (stage_models(form).residual.max() > 1e-3) == (order > 1)
+    form = form_of(T @ scheme_with(0.3 * normal(N_X, N_X + N_U, seed=9)))
+    assert stage_models(form).residual[1:].min() > 1e-3
     assert causality_defect(form) < 1e-10
+    assert stage_models(form_of(T @ scheme_with())).residual.max() < 1e-9
 
 
-def test_later_actions_are_no_memory():
-    C = C_0.clone()
-    C[0, 2 * N_X + N_U : 2 * (N_X + N_U)] += 1.0  # u_1 enters x_1
-    energies = memory_energies(form_of(C))
-    assert energies[-1] > 1e-3
-    assert markov_order(energies) == math.inf
-    assert markov_order(energies, tolerance=1.0) == 1
+TRUE_A, TRUE_B, OFFSET = normal(3, 3, seed=1), normal(3, 2, seed=2), normal(3, seed=3)
+S, ACTIONS = 2 * normal(50, 3, seed=4) + 1, normal(50, 2, seed=5)
+
+
+def model(*stages: int) -> NearestModel:
+    residual = torch.zeros(stages)
+    return NearestModel(
+        TRUE_A + 0.1 * normal(*stages, 3, 3, seed=6),
+        TRUE_B + 0.1 * normal(*stages, 3, 2, seed=7),
+        torch.zeros(*stages, 3, 0),
+        OFFSET + 0.1 * normal(*stages, 3, seed=8),
+        residual,
+    )
+
+
+def test_error_over_samples_is_their_root_mean_square():
+    wrong = model(4)
+    found = one_step_error(wrong, TRUE_A, TRUE_B, OFFSET, second_moment(S, ACTIONS))
+    truth = S @ TRUE_A.mT + ACTIONS @ TRUE_B.mT + OFFSET
+    for k in range(4):
+        error = S @ wrong.A[k].mT + ACTIONS @ wrong.B[k].mT + wrong.offset[k] - truth
+        assert found[k].item() == pytest.approx(error.square().sum(-1).mean().sqrt().item())
+
+
+def test_error_over_unit_variance_is_the_frobenius_norm():
+    wrong = model()
+    parts = (wrong.A - TRUE_A, wrong.B - TRUE_B, wrong.offset)
+    expected = sum(part.square().sum().item() for part in parts) ** 0.5
+    assert one_step_error(wrong, TRUE_A, TRUE_B).item() == pytest.approx(expected)
+    right = NearestModel(TRUE_A, TRUE_B, torch.zeros(3, 0), OFFSET, torch.zeros(()))
+    assert one_step_error(right, TRUE_A, TRUE_B, OFFSET) == 0
+    assert one_step_error(right, TRUE_A, TRUE_B).item() == pytest.approx(OFFSET.norm().item())

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 import torch_qpmpc as qm
 from tests.problems import known_qp, random_mpc
 from tests.transitions import make_batch, make_operator
-from torch_qpmpc.analysis.prediction_form import prediction_form
+from torch_qpmpc.analysis.structure import prediction_form
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.mpc.banded import banded_matrix
 

@@ -13,15 +13,14 @@ from typing import Any
 import torch
 
 from tests.mistakes.objects import A2, B1, S, form, mpc, op
-from torch_qpmpc.analysis.model_error import first_state_error, one_step_error, second_moment
 from torch_qpmpc.analysis.policy import local_gain, policy_map, spectral_radius
-from torch_qpmpc.analysis.prediction_form import canonical_matrix, prediction_form
 from torch_qpmpc.analysis.report import read, structure_metrics
 from torch_qpmpc.analysis.structure import (
-    distance_by_band,
-    markov_order,
-    memory_energies,
+    canonical_matrix,
     nearest_model,
+    one_step_error,
+    prediction_form,
+    second_moment,
 )
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.projections import check_step, nearest_psd, nearest_psd_by_sdp
@@ -33,18 +32,8 @@ MISTAKES: dict[str, list[Callable[[], Any]]] = {
     ],
     "n_x: got 0, expected a whole number >= 1.": [
         lambda: prediction_form(mpc.C, 0, 1),
-        lambda: distance_by_band(mpc.C, mpc.C_0, 0, 1),
-    ],
-    "b: got shape (3, 6), expected leading dimensions that broadcast with those ": [
-        lambda: prediction_form(torch.stack([mpc.C] * 2), 2, 1, torch.zeros(3, 6))
     ],
     "n_u: got -1, expected a whole number >= 1.": [lambda: prediction_form(mpc.C, 2, -1)],
-    "U: got shape (5, 1), expected shape (*batch, 4, 1).": [
-        lambda: form.predict(torch.zeros(2).double(), torch.zeros(5, 1).double())
-    ],
-    "U: got shape (5, 4, 1), expected leading dimensions that broadcast with those of p, (3,).": [
-        lambda: form.predict(torch.zeros(3, 2).double(), torch.zeros(5, 4, 1).double())
-    ],
     "B: got shape (1, 2), expected shape (2, 2) or (3, 2, 2).": [
         lambda: banded_matrix(torch.eye(2), torch.ones(1, 2), 3)
     ],
@@ -56,16 +45,6 @@ MISTAKES: dict[str, list[Callable[[], Any]]] = {
         lambda: canonical_matrix(
             prediction_form(torch.stack([mpc.C] * 2), 2, 1), torch.zeros(3, 2, 2).double()
         )
-    ],
-    "C: got shape (11,), expected shape (6, 11). Pass mpc.C.": [
-        lambda: distance_by_band(mpc.C[0], mpc.C_0, 2, 1)
-    ],
-    "rtol: got -1, expected a number in [0, 1).": [lambda: memory_energies(form, rtol=-1)],
-    "energies: got list, expected a floating-point torch.Tensor. Convert it: tor": [
-        lambda: markov_order([1.0, 0.0])
-    ],
-    "tolerance: got -1.0, expected a number in [0, 1].": [
-        lambda: markov_order(memory_energies(form), tolerance=-1.0)
     ],
     "mpc: got Parameter, expected a QPMPC.": [lambda: read(mpc.C)],
     "true_model: got Tensor, expected the pair (A, B), (A, B, offset) or (A, B, offset, E).": [
@@ -80,7 +59,6 @@ MISTAKES: dict[str, list[Callable[[], Any]]] = {
         lambda: local_gain(op, S),
         lambda: stage_weight(op),
         lambda: policy_map(op, torch.ones(2), torch.ones(2)),
-        lambda: first_state_error(op, S, A2, B1),
     ],
     "s: got shape (3,), expected shape (*batch, 2).": [lambda: local_gain(mpc, torch.zeros(3))],
     "A: got list, expected a floating-point torch.Tensor. Convert it: torch.as_t": [
@@ -111,16 +89,7 @@ MISTAKES: dict[str, list[Callable[[], Any]]] = {
     "A, B, K: got NaN or inf, expected finite entries.": [
         lambda: spectral_radius(A2 * math.nan, B1, torch.zeros(1, 2).double())
     ],
-    "axes: got (0, 1, 2), expected a pair of indices, such as (0, 1).": [
-        lambda: policy_map(mpc, torch.ones(2), torch.ones(2), axes=(0, 1, 2))
-    ],
-    "axes: got 0.0, expected a whole number >= 0.": [
-        lambda: policy_map(mpc, torch.ones(2), torch.ones(2), axes=(0.0, 1.0))
-    ],
     "x: got NaN or inf, expected finite entries.": [lambda: policy_map(mpc, [math.nan], [0.0])],
-    "axes: got 'xy', expected a pair of indices, such as (0, 1).": [
-        lambda: policy_map(mpc, [1.0], [0.0], axes="xy")
-    ],
     "s: got list, expected a floating-point torch.Tensor. Convert it: torch.as_t": [
         lambda: second_moment([0.0], [0.0])
     ],
@@ -129,16 +98,12 @@ MISTAKES: dict[str, list[Callable[[], Any]]] = {
     ],
     "offset: got shape (3,), expected shape (2,).": [
         lambda: one_step_error(nearest_model(form), A2, B1, torch.zeros(3).double()),
-        lambda: first_state_error(mpc, S, A2, B1, torch.zeros(3)),
     ],
     "moment: got shape (3, 3), expected shape (4, 4). Pass second_moment(s, a).": [
         lambda: one_step_error(nearest_model(form), A2, B1, moment=torch.eye(3))
     ],
     "A: got shape (1, 1), expected shape (2, 2).": [
         lambda: one_step_error(nearest_model(form), torch.eye(1).double(), torch.eye(1).double())
-    ],
-    "A: got shape (3, 3), expected shape (2, 2).": [
-        lambda: first_state_error(mpc, S, torch.eye(3), B1)
     ],
     "H: got shape (2,), expected shape (*batch, n, n).": [lambda: nearest_psd(torch.ones(2))],
     "H: got shape (2, 3), expected shape (*batch, n, 2).": [

@@ -11,8 +11,7 @@ import train
 from tests.problems import normal
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
-from torch_qpmpc.analysis.report import canonical
-from torch_qpmpc.analysis.structure import NearestModel
+from torch_qpmpc.analysis.structure import NearestModel, canonical
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.study.runs import FinishedRun, collect, prediction_error

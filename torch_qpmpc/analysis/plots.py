@@ -1,8 +1,9 @@
-"""Figures of a learned QP: its canonical form, its predictions and its policy's regions."""
+"""Figures of a learned QP: its canonical form, its policy's regions, and an episode with plans."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -11,24 +12,29 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from torch_qpmpc.analysis.policy import PolicyMap, policy_map
-from torch_qpmpc.analysis.prediction_form import PredictionForm, canonical_matrix, prediction_form
-from torch_qpmpc.analysis.report import canonical, predictions
 from torch_qpmpc.analysis.structure import (
+    PredictionForm,
+    canonical,
     causality_defect,
-    gamma_energies,
-    memory_energies,
     nearest_model,
-    stage_models,
+    prediction_form,
+    predictions,
 )
-from torch_qpmpc.checks import check_tensor
+from torch_qpmpc.checks import check_kind, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.module import QPMPC
 
+#: By step, the planned states ``(N + 1, n_y)`` and actions ``(N, n_u)``, as of `QPMPC.predicted`.
+Plans = Mapping[int, tuple[Tensor, Tensor]]
+#: Lower and upper bounds of the outputs, ``(n_y,)`` or ``(T + 1, n_y)``; infinite for none.
+Band = tuple[Tensor, Tensor]
+
+#: Smallest range of a panel that is not widened.
+FLAT = 1e-6
 COLOURS = {"start": "tab:red", "learned": "tab:blue", "true model": "tab:green"}
 
 
@@ -104,22 +110,13 @@ def constraint_figure(mpc: QPMPC) -> Figure:
     return figure
 
 
-def forms(mpc: QPMPC) -> dict[str, PredictionForm]:
-    """Return the prediction forms of C at the start and of the learned C.
-
-    Raises:
-        QPError: if C has no prediction form.
-    """
-    start = prediction_form(mpc.C_0, mpc.n_x, mpc.n_u, past=mpc.past, n_d=mpc.n_d)
-    return {"start": start, "learned": predictions(mpc)}
-
-
 def draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
     """Draw ``[Phi, Gamma]``, the effect of p and each u_j on each x_k, as a heatmap.
 
     Dashed lines end the preview and the window before x_0, where they exist.
     """
-    N, n_x, n_u, n_p, layout = form.horizon, form.n_x, form.n_u, form.n_p, form.layout
+    layout = form.layout
+    N, n_x, n_u, n_p = layout.horizon, layout.n_x, layout.n_u, layout.n_p
     entries = torch.cat((form.Phi, form.Gamma), dim=-1)
     image = axes.imshow(
         entries.numpy(),
@@ -134,7 +131,7 @@ def draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
         axes.axhline(k * n_x - 0.5, color="0.85", linewidth=0.4)
         axes.axvline(n_p + k * n_u - 0.5, color="0.85", linewidth=0.4)
         # Above these staircases an action or a preview would affect earlier states.
-        for first, width in ((n_p, n_u), (0, form.layout.n_d)):
+        for first, width in ((n_p, n_u), (0, layout.n_d)):
             if width:
                 edge, row = first + k * width - 0.5, k * n_x - 0.5
                 axes.plot([edge, edge], [row - n_x, row], color="black", linewidth=0.8)
@@ -154,51 +151,16 @@ def canonical_figure(mpc: QPMPC) -> Figure:
     Raises:
         QPError: if C has no prediction form.
     """
-    start, learned = forms(mpc).values()
+    start = prediction_form(mpc.C_0, mpc.n_x, mpc.n_u, past=mpc.past, n_d=mpc.n_d)
+    learned = predictions(mpc)
     figure = Figure(figsize=(14, 9), layout="constrained")
-    (raw, canonical), (before, after) = figure.subplots(2, 2)
+    (raw, below), (before, after) = figure.subplots(2, 2)
     draw_matrix(raw, mpc.C, mpc, r"$C_\theta$ as learned")
-    C, _ = canonical_matrix(learned, stage_models(learned).A)
-    draw_matrix(canonical, C, mpc, r"the same constraints in canonical form, $T C_\theta$")
+    draw_matrix(below, canonical(mpc), mpc, r"the same constraints in canonical form, $T C_\theta$")
     draw_prediction_form(before, start, r"$[\Phi, \Gamma]$ at the start")
     defect, distance = causality_defect(learned).item(), nearest_model(learned).residual.item()
     numbers = f"causality defect {defect:.2g}, distance to MPC {distance:.2g}"
     draw_prediction_form(after, learned, rf"$[\Phi, \Gamma]$, learned: {numbers}")
-    return figure
-
-
-def energies_figure(mpc: QPMPC) -> Figure:
-    """Plot the predictions' energy by block diagonal, and by the pair that explains it.
-
-    Raises:
-        QPError: if C has no prediction form.
-    """
-    figure = Figure(figsize=(12, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    N, floor = mpc.horizon, 1e-12
-    for i, (name, form) in enumerate(forms(mpc).items()):
-        style = {"width": 0.4, "color": COLOURS[name], "label": name}
-        share = gamma_energies(form)
-        lags = torch.arange(1 - N, N) + 0.4 * i - 0.2
-        left.bar(lags.numpy(), (share / share.sum()).clamp(min=floor).numpy(), **style)
-        back = torch.arange(N + 1) + 0.4 * i - 0.2
-        right.bar(back.numpy(), memory_energies(form).clamp(min=floor).numpy(), **style)
-    for axes in (left, right):
-        axes.set(yscale="log", ylim=(floor, 2), ylabel="share of the energy")
-        axes.legend(fontsize="small")
-    left.axvspan(-N + 0.4, -0.5, color="0.93", zorder=0)
-    left.set(
-        xlabel="$k - j$ of block $(k, j)$, grey: not causal",
-        title=r"$\Gamma$ by block diagonals: $u_j$ in $x_{k+1}$",
-        xlim=(-N + 0.4, N - 0.4),
-    )
-    left.xaxis.set_major_locator(MaxNLocator(integer=True))
-    latest = "pair $(x_k, u_k)$" if mpc.n_p == mpc.n_x else "window"
-    right.set(xlabel=f"stages before the latest {latest}", title="What explains $x_{k+1}$")
-    step = max(1, N // 5)
-    ticks = [back for back in range(0, N, step) if N - back >= step or back == 0]
-    later = "later\nactions" + (",\npreviews" if mpc.n_d else "")
-    right.set_xticks([*ticks, N], [*map(str, ticks), later])
     return figure
 
 
@@ -291,3 +253,156 @@ def _edges(points: Tensor) -> list[float]:
         return [values[0] - 0.5, values[0] + 0.5]
     middle = [(a + b) / 2 for a, b in pairwise(values)]
     return [2 * values[0] - middle[0], *middle, 2 * values[-1] - middle[-1]]
+
+
+@torch.no_grad()
+def plans_along(mpc: QPMPC, p: Tensor, every: int = 8) -> Plans:
+    """Return the QP's plans at every ``every``-th step of an episode.
+
+    Args:
+        mpc: the QP.
+        p: its argument at each step, ``(T, n_p)``.
+        every: number of steps between two plans.
+
+    Raises:
+        QPError: if an argument does not fit.
+        SolverError: if a QP has no solution, and ``mpc.on_failure`` is ``"raise"``.
+    """
+    check_kind("mpc", mpc, QPMPC)
+    check_tensor("p", p, "T", mpc.n_p, batched=False)
+    check_whole("every", every, 1)
+    steps = range(0, len(p), every)
+    x, u = mpc.predicted(mpc.solve(p[::every]).z)
+    return dict(zip(steps, zip(x, u, strict=True), strict=True))
+
+
+def episode_figure(
+    times: Tensor,
+    y: Tensor,
+    u: Tensor,
+    *,
+    signals: Mapping[str, Tensor] | None = None,
+    band: Band | None = None,
+    references: Tensor | None = None,
+    plans: Plans | None = None,
+    outputs: Sequence[str] | None = None,
+    actions: Sequence[str] | None = None,
+    xlabel: str = "step",
+) -> Figure:
+    """Plot an episode, with a panel for each output, action and known signal.
+
+    Args:
+        times: evenly spaced, ``(T + 1,)``.
+        y: the outputs, ``(T + 1, n_y)``.
+        u: the applied actions, ``(T, n_u)``, constant over a step.
+        signals: the known signals d by name, ``(T,)`` or longer, constant over a step.
+        band: the bounds of the outputs.
+        references: those of the outputs, ``(T + 1, n_y)``; nan for an output without one.
+        plans: see `plans_along`; drawn beside what was realised.
+        outputs, actions: names of the entries of y and u, in their panels.
+        xlabel: the label of the time axis.
+
+    Raises:
+        QPError: if a shape or a number of names does not fit.
+
+    Example:
+        >>> import torch
+        >>> times = torch.arange(25.0)
+        >>> y, u = 19 + torch.sin(times / 4).unsqueeze(-1), torch.ones(24, 1)
+        >>> bounds = torch.tensor([18.0]), torch.tensor([21.0])
+        >>> figure = episode_figure(
+        ...     times, y, u, band=bounds, signals={"price": times}, outputs=["room, degrees"]
+        ... )
+        >>> [axes.get_ylabel() for axes in figure.axes]
+        ['room, degrees', '$u_{1}$', 'price']
+    """
+    check_tensor("times", times, "T + 1", batched=False)
+    length = len(times)
+    check_tensor("y", y, length, "n_y", batched=False)
+    check_tensor("u", u, length - 1, "n_u", batched=False)
+    n_y, n_u = y.shape[-1], u.shape[-1]
+    names = [*_names("outputs", outputs, "y", n_y), *_names("actions", actions, "u", n_u)]
+    if references is not None:
+        check_tensor("references", references, length, n_y, batched=False)
+    bounds = (
+        []
+        if band is None
+        else [
+            _bound(name, side, length, n_y)
+            for name, side in zip(("lower", "upper"), band, strict=True)
+        ]
+    )
+    signals = signals or {}
+    for name, signal in signals.items():
+        check_tensor(f"signals[{name!r}]", signal, "T", batched=False)
+        if len(signal) < length - 1:
+            got, want = f"shape {tuple(signal.shape)}", f"at least {length - 1} entries"
+            raise QPError.expected(f"signals[{name!r}]", got, want)
+    figure = Figure(figsize=(6.5, 1.7 * (len(names) + len(signals))), layout="constrained")
+    panels = figure.subplots(len(names) + len(signals), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, name in zip(panels, [*names, *signals], strict=True):
+        axes.set_ylabel(name)
+        axes.grid(alpha=0.3)
+    for i, axes in enumerate(panels[:n_y]):
+        if bounds:
+            _draw_band(axes, times, *(side[:, i] for side in bounds))
+        if references is not None:
+            style = {"color": "tab:red", "linestyle": "--", "linewidth": 1}
+            axes.plot(times, references[:, i], **style, label="reference")
+        axes.plot(times, y[:, i], color=COLOURS["learned"], label="realised")
+    for i, axes in enumerate(panels[n_y : n_y + n_u]):
+        axes.step(times, _held(u[:, i]), where="post", color=COLOURS["learned"])
+    for axes, signal in zip(panels[n_y + n_u :], signals.values(), strict=True):
+        values = signal[:length] if len(signal) >= length else _held(signal)
+        axes.step(times, values, where="post", color="0.3")
+    for k, (x, planned) in (plans or {}).items():
+        _draw_plan(list(panels), times, k, x, planned)
+    if plans:
+        panels[0].plot([], [], "k:", linewidth=1, label="planned")
+    panels[0].legend(fontsize="small", loc="lower right", bbox_to_anchor=(1, 1), ncols=4)
+    for axes in panels:  # otherwise rounding errors fill a panel
+        low, high = axes.get_ylim()
+        if high - low < FLAT:
+            axes.set_ylim(low - 0.5, high + 0.5)
+    panels[-1].set(xlabel=xlabel, xlim=(times[0].item(), times[-1].item()))
+    return figure
+
+
+def _names(what: str, names: Sequence[str] | None, letter: str, count: int) -> Sequence[str]:
+    if names is None:
+        return [f"${letter}_{{{i + 1}}}$" for i in range(count)]
+    if isinstance(names, str) or len(names) != count:
+        raise QPError.expected(what, repr(names), f"{count} names")
+    return names
+
+
+def _bound(name: str, bound: Tensor, length: int, n_y: int) -> Tensor:
+    """Return one side of the band, ``(T + 1, n_y)``, nan for none."""
+    check_tensor(f"band, {name}", bound, n_y)
+    if bound.shape[:-1] not in ((), (length,)):
+        got, want = f"shape {tuple(bound.shape)}", f"shape ({n_y},) or ({length}, {n_y})"
+        raise QPError.expected(f"band, {name}", got, want)
+    return bound.masked_fill(bound.isinf(), torch.nan).expand(length, n_y)
+
+
+def _held(values: Tensor) -> Tensor:
+    """Return values with the last one repeated, the end of its step."""
+    return torch.cat((values, values[-1:]))
+
+
+def _draw_band(axes: Axes, times: Tensor, lower: Tensor, upper: Tensor) -> None:
+    """Draw both bounds, which hold at the steps, and shade the band where there are both."""
+    band = axes.fill_between(times, lower, upper, step="post", color="tab:green", alpha=0.12)
+    band.set_label("band")
+    for side in (lower, upper):
+        axes.step(times, side, where="post", color="tab:green", linewidth=0.8)
+
+
+def _draw_plan(axes: Sequence[Axes], times: Tensor, k: int, x: Tensor, u: Tensor) -> None:
+    """Draw the states ``(N + 1, n_y)`` and actions ``(N, n_u)`` that are planned at step k."""
+    at = times[k] + (times[1] - times[0]) * torch.arange(len(x))
+    style = {"color": "black", "linestyle": ":", "linewidth": 1, "marker": ".", "markevery": [0]}
+    for panel, path in zip(axes, x.mT, strict=False):
+        panel.plot(at, path, **style)
+    for panel, path in zip(axes[x.shape[-1] :], u.mT, strict=False):
+        panel.step(at, _held(path), where="post", **style)

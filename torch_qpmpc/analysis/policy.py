@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_kind, check_tensor, check_whole
+from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.module import QPMPC
@@ -26,12 +26,7 @@ GRID_REMEDY = "Pass torch.linspace(lower, upper, n)."
 def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
     """Return K = ``-d pi / d s`` for the active set at s: near s, u_0 = pi(s) - K ds.
 
-    Args:
-        mpc: the QP.
-        s: ``(*batch, n_p)``.
-
-    Returns:
-        ``(*batch, n_u, n_p)``; zero where the QP is not solved.
+    It is ``(*batch, n_u, n_p)`` for s ``(*batch, n_p)``, and zero where the QP is not solved.
 
     Raises:
         QPError: if the shape of s does not fit.
@@ -44,13 +39,9 @@ def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
 def window_model(A: Tensor, B: Tensor) -> tuple[Tensor, Tensor]:
     """Return F and G of the next window w+ = F w + G u for a model with lags; A and B for one lag.
 
-    The window is that of p, w = [x_{1-L}, u_{1-L}, .., x_{-1}, u_{-1}, x_0], ``(n_w,)``.
-
-    Args:
-        A, B: the model, ``(n_x, L n_x)`` and ``(n_x, L n_u)``, as in `banded_matrix`.
-
-    Returns:
-        F ``(n_w, n_w)`` and G ``(n_w, n_u)``.
+    The window is that of p, w = [x_{1-L}, u_{1-L}, .., x_{-1}, u_{-1}, x_0], ``(n_w,)``; A
+    ``(n_x, L n_x)`` and B ``(n_x, L n_u)`` are as in `banded_matrix`, F ``(n_w, n_w)`` and G
+    ``(n_w, n_u)``.
 
     Raises:
         QPError: if the shapes do not fit each other.
@@ -142,13 +133,9 @@ def policy_map(
     check_kind("mpc", mpc, QPMPC)
     if axes is None:
         axes = (mpc.n_p - mpc.n_x, mpc.n_p - mpc.n_x + 1)
-    if not isinstance(axes, tuple | list) or len(axes) != 2:
-        raise QPError.expected("axes", repr(axes), "a pair of indices, such as (0, 1)")
-    for axis in axes:
-        check_whole("axes", axis, 0)
-    first, second = axes
-    if first == second or not all(0 <= axis < mpc.n_p for axis in axes):
+    if len({*axes} & {*range(mpc.n_p)}) != 2 or len(axes) != 2:
         raise QPError.expected("axes", axes, f"two different states among 0 to {mpc.n_p - 1}")
+    first, second = axes
     x, y = as_tensor("x", x), as_tensor("y", y)
     if x.ndim != 1 or y.ndim != 1 or not len(x) or not len(y):
         got = f"shapes {tuple(x.shape)} and {tuple(y.shape)}"

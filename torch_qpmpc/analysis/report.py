@@ -10,15 +10,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torch_qpmpc.analysis.model_error import one_step_error
 from torch_qpmpc.analysis.policy import local_gain, spectral_radius, window_model
-from torch_qpmpc.analysis.prediction_form import PredictionForm, canonical_matrix, prediction_form
 from torch_qpmpc.analysis.structure import (
     NearestModel,
+    PredictionForm,
     causality_defect,
-    markov_order,
-    memory_energies,
     nearest_model,
+    one_step_error,
+    predictions,
     stage_models,
     toeplitz_defect,
 )
@@ -40,7 +39,6 @@ class StructureReport:
         form: the prediction form.
         nearest: the nearest time-invariant scheme (A, B, E, offset).
         stages: the model of each stage (A_k, B_k, E_k, offset_k).
-        memory: `memory_energies`.
         K: the policy's gain at the state, ``(n_u, n_p)``, u_0 = pi(s) - K ds.
         K_lqr: the LQR gain of the nearest model and the stage weight, for the window
             (`window_model`), or None if the Riccati equation has no solution.
@@ -49,7 +47,6 @@ class StructureReport:
         toeplitz: `toeplitz_defect`.
         non_markov: share of the predictions' norm that the latest pair (x_k, u_k), or the latest
             window, does not explain.
-        order: `markov_order`.
         distance_to_mpc: relative distance of the predictions to those of ``nearest``.
         gain_to_lqr: ``||K - K_lqr|| / ||K_lqr||`` with K's part for the window, or nan.
         radius_predicted: spectral radius of the nearest model's A - B K, or of its window's.
@@ -63,14 +60,12 @@ class StructureReport:
     form: PredictionForm = field(repr=False)
     nearest: NearestModel = field(repr=False)
     stages: NearestModel = field(repr=False)
-    memory: Tensor = field(repr=False)
     K: Tensor = field(repr=False)
     K_lqr: Tensor | None = field(repr=False)
     condition: float
     causality: float
     toeplitz: float
     non_markov: float
-    order: float
     distance_to_mpc: float
     gain_to_lqr: float
     radius_predicted: float
@@ -97,25 +92,6 @@ class StructureReport:
         return "\n".join(lines)
 
 
-def predictions(mpc: QPMPC) -> PredictionForm:
-    """Return the prediction form of the constraints, X = Phi p + Gamma U + phi.
-
-    Raises:
-        QPError: if C has no prediction form.
-    """
-    return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b, mpc.past, mpc.n_d)
-
-
-def canonical(mpc: QPMPC) -> Tensor:
-    """Return C ``(n_c, n_z)`` in the gauge in which an MPC scheme's is banded.
-
-    Raises:
-        QPError: if C has no prediction form.
-    """
-    form = predictions(mpc)
-    return canonical_matrix(form, stage_models(form).A)[0]
-
-
 def read(
     mpc: QPMPC, true_model: Sequence[Tensor] | None = None, at: Tensor | None = None
 ) -> StructureReport:
@@ -136,8 +112,8 @@ def read(
         >>> from torch_qpmpc.analysis.report import read
         >>> A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]), torch.tensor([[0.0], [0.1]])
         >>> reading = read(qm.QPMPC.linear_mpc(A, B, 10, stage_weight=[1.0, 1.0, 1.0]))
-        >>> reading.order, reading.distance_to_mpc < 1e-9, round(reading.radius_predicted, 2)
-        (1.0, True, 0.97)
+        >>> reading.distance_to_mpc < 1e-9, round(reading.radius_predicted, 2)
+        (True, 0.97)
     """
     check_kind("mpc", mpc, QPMPC)
     check_one_model(mpc)
@@ -145,7 +121,9 @@ def read(
     if at is not None:
         check_tensor("at", at, mpc.n_p, batched=False)
     form = predictions(mpc)
-    nearest, stages, memory = nearest_model(form), stage_models(form), memory_energies(form)
+    nearest, stages = nearest_model(form), stage_models(form)
+    energies = form.maps[1:, :, :-1].square().sum((-1, -2))
+    left = (stages.residual.square() * energies).sum() / energies.sum()
     K = local_gain(mpc, form.Phi.new_zeros(mpc.n_p) if at is None else at.to(form.Phi))
     K_window = K[:, form.layout.n_preview :]
     window = window_model(nearest.A, nearest.B)
@@ -168,14 +146,12 @@ def read(
         form=form,
         nearest=nearest,
         stages=stages,
-        memory=memory,
         K=K,
         K_lqr=K_lqr,
         condition=form.condition.item(),
         causality=causality_defect(form).item(),
         toeplitz=toeplitz_defect(form).item(),
-        non_markov=memory[1:].sum().sqrt().item(),
-        order=markov_order(memory),
+        non_markov=left.sqrt().item(),
         distance_to_mpc=nearest.residual.item(),
         gain_to_lqr=gain_error,
         radius_predicted=spectral_radius(*window, K_window).item(),

@@ -1,15 +1,19 @@
-"""Measures of how far the constraints are from an MPC scheme, from their prediction form alone.
+"""The constraints as a prediction model that does not depend on their gauge.
 
-All but `distance_by_band` are free of C's gauge (see `prediction_form`): T C is the same QP for any
-invertible T, and has the same numbers. Norms are Frobenius norms of the maps from (p, U) to the
-states: all entries of p and U weigh the same, in the QP's units. p is x_0 or, with a window and a
-preview, all that V fixes; the *window at k* is then (x_{k+1-L}, u_{k+1-L}, .., x_k, u_k) and d_k,
-and without them (x_k, u_k).
+``C z = b`` and ``T C z = T b`` are the same constraints for any invertible T, so single entries of
+C mean little. Independent of T is the *prediction form*,
+
+    X = Phi p + Gamma U + phi,    X = [x_1, .., x_N],    U = [u_0, .., u_{N-1}],
+
+and all that follows from it. p is what V fixes: x_0 or, with a window and a preview, all of z up to
+x_0 (see `torch_qpmpc.mpc.layout`); the *window at k* is then (x_{k+1-L}, u_{k+1-L}, .., x_k, u_k)
+and d_k, and without them (x_k, u_k). The *canonical matrix* is the T C whose row block k reads
+``x_{k+1} = A_k x_k + ..``, as in an MPC scheme: for such a scheme it is C_0 (eq:cband). Norms are
+Frobenius norms of the maps from (p, U) to the states, in the QP's units.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,45 +21,194 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from torch_qpmpc.analysis.prediction_form import FORM_REMEDY, PredictionForm, check_form
-from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
+from torch_qpmpc.checks import check_kind, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.module import QPMPC
 
+FORM_REMEDY = "Pass torch_qpmpc.analysis.structure.predictions(mpc)."
+#: The largest accepted condition number of C's state columns, after scaling its rows. The relative
+#: error of a prediction form is about 1e-16 times that number.
+LARGEST_CONDITION = 1e12
 #: The most evaluations of `nearest_model`'s predictions, of thousands whose last ones gain nothing,
 #: and of their multiplications: with many outputs there are fewer evaluations, down to none.
 EVALUATIONS, MULTIPLICATIONS = 100, 2e10
 
 
-def distance_by_band(
-    C: Tensor, C_0: Tensor, n_x: int, n_u: int, past: int = 1, n_d: int = 0
-) -> dict[str, float]:
-    """Return ``sum |C - C_0|`` on, above and below the band, for C, C_0 ``(N n_x, n_z)``.
+@dataclass(frozen=True, eq=False)
+class PredictionForm:
+    """X = Phi p + Gamma U + phi, in float64.
 
-    This distance, the paper's, depends on the gauge of C, unless C is a canonical matrix. ``past``
-    and ``n_d`` are those of the `QPMPC`.
+    Attributes:
+        Phi: ``(*batch, N n_x, n_p)``.
+        Gamma: ``(*batch, N n_x, N n_u)``; block (k, j) is the effect of u_j on x_{k+1}.
+        phi: the offset, ``(*batch, N n_x)``; zero if b is.
+        condition: condition number of C's state columns, ``(*batch,)``; depends on the gauge.
+        layout: the sizes of z.
+    """
+
+    Phi: Tensor
+    Gamma: Tensor
+    phi: Tensor
+    condition: Tensor
+    layout: Layout
+
+    @property
+    def blocks(self) -> Tensor:
+        """Gamma by blocks, ``(*batch, N, N, n_x, n_u)``: [k, j] is the effect of u_j on x_{k+1}."""
+        N = self.layout.horizon
+        rows = self.Gamma.unflatten(-1, (N, self.layout.n_u))
+        rows = rows.unflatten(-3, (N, self.layout.n_x))
+        return rows.movedim(-2, -3)
+
+    @property
+    def maps(self) -> Tensor:
+        """The states x_0, .., x_N as linear maps of (p, U, 1), ``(*batch, N + 1, n_x, n_v)``.
+
+        n_v is n_p + N n_u + 1.
+        """
+        following = torch.cat((self.Phi, self.Gamma, self.phi.unsqueeze(-1)), dim=-1)
+        n_x, n_p = self.layout.n_x, self.layout.n_p
+        first = torch.eye(n_p, following.shape[-1])[-n_x:].to(following)
+        stages = following.unflatten(-2, (self.layout.horizon, n_x))
+        return torch.cat((first.expand(*stages.shape[:-3], 1, -1, -1), stages), dim=-3)
+
+
+def _check_form(form: PredictionForm) -> None:
+    """Raise `QPError` unless ``form`` is a prediction form without batch dimensions."""
+    check_kind("form", form, PredictionForm, FORM_REMEDY)
+    remedy = "Pass the form of a single C."
+    check_tensor("form.Phi", form.Phi, "N n_x", "n_p", batched=False, remedy=remedy)
+
+
+def prediction_form(
+    C: Tensor, n_x: int, n_u: int, b: Tensor | None = None, past: int = 1, n_d: int = 0
+) -> PredictionForm:
+    """Solve ``C z = b`` for x_1, .., x_N.
+
+    Args:
+        C: ``(*batch, N n_x, n_z)``; n_z is N (n_x + n_u) + n_x without a window and a preview.
+        n_x, n_u, past, n_d: numbers of states, actions, lags L and entries of d_k, as in `QPMPC`.
+        b: ``(*batch, N n_x)``; zero by default.
 
     Raises:
-        QPError: if a shape does not fit.
+        QPError: if the shapes do not fit, or C's state columns are singular, so that p and the
+            actions do not determine the states.
+
+    Example:
+        >>> import torch
+        >>> from torch_qpmpc.mpc.banded import banded_matrix
+        >>> C_0 = banded_matrix(torch.tensor([[0.5]]), torch.tensor([[1.0]]), 3)
+        >>> T = torch.tensor([[1.0, 2.0, 0.0], [0.0, 1.0, 3.0], [1.0, 0.0, 1.0]])
+        >>> form = prediction_form(T @ C_0, 1, 1)
+        >>> (form.Gamma + 0.0).round(decimals=6)
+        tensor([[1.0000, 0.0000, 0.0000],
+                [0.5000, 1.0000, 0.0000],
+                [0.2500, 0.5000, 1.0000]], dtype=torch.float64)
     """
     check_whole("n_x", n_x, 1)
     check_whole("n_u", n_u, 1)
     check_whole("past", past, 1)
     check_whole("n_d", n_d, 0)
-    check_tensor("C_0", C_0, "N n_x", "n_z", batched=False, remedy="Pass mpc.C_0.")
-    check_tensor("C", C, *C_0.shape, batched=False, remedy="Pass mpc.C.")
-    distance = band_distance(Layout(n_x, n_u, max(C_0.shape[0] // n_x, 1), past, n_d)).to(C.device)
-    if distance.shape != C_0.shape:
-        got, want = f"shape {tuple(C_0.shape)}", f"shape {tuple(distance.shape)}"
-        sizes = f"n_x = {n_x}, n_u = {n_u}, past = {past}, n_d = {n_d}"
-        raise QPError.expected("C_0", got, f"{want} for {sizes}")
-    deviation = (C.detach() - C_0).abs()
-    return {
-        "on": deviation[distance == 0].sum().item(),
-        "above": deviation[distance > 0].sum().item(),
-        "below": deviation[distance < 0].sum().item(),
-    }
+    check_tensor("C", C, "N n_x", "n_z", remedy="Pass mpc.C.")
+    n_c, n_z = C.shape[-2:]
+    N = n_c // n_x
+    layout = Layout(n_x, n_u, max(N, 1), past, n_d)
+    if N < 1 or n_c != N * n_x or n_z != layout.n_z:
+        want = f"(*batch, N n_x, n_p + N (n_x + n_u)) with n_x = {n_x}, n_u = {n_u}"
+        raise QPError.expected("C", f"shape {tuple(C.shape)}", f"{want}, n_p = {layout.n_p}")
+    b = C.new_zeros(n_c) if b is None else check_tensor("b", b, n_c)
+    C, b = (x.detach().to("cpu", torch.float64) for x in (C, b))
+    if not (C.isfinite().all() and b.isfinite().all()):
+        raise QPError.expected("C, b", "NaN or inf", "finite entries")
+    # Rows of unit norm, so that their scale does not affect the condition number.
+    size = C.norm(dim=-1, keepdim=True).clamp(min=torch.finfo(C.dtype).tiny)
+    C, b = C / size, b.unsqueeze(-1) / size
+    following, p, u = (C[..., columns] for columns in _columns(layout))
+    condition = _condition(following)
+    solved = torch.linalg.solve(following, torch.cat((-p, -u, b.expand(*p.shape[:-1], 1)), -1))
+    Phi, Gamma, phi = solved.split((layout.n_p, N * n_u, 1), dim=-1)
+    return PredictionForm(Phi, Gamma, phi.squeeze(-1), condition, layout)
+
+
+def predictions(mpc: QPMPC) -> PredictionForm:
+    """Return the prediction form of the constraints, X = Phi p + Gamma U + phi.
+
+    Raises:
+        QPError: if C has no prediction form.
+    """
+    return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b, mpc.past, mpc.n_d)
+
+
+def canonical(mpc: QPMPC) -> Tensor:
+    """Return C ``(n_c, n_z)`` in the gauge in which an MPC scheme's is banded.
+
+    Raises:
+        QPError: if C has no prediction form.
+    """
+    form = predictions(mpc)
+    return canonical_matrix(form, stage_models(form).A)[0]
+
+
+def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the same constraints with row blocks ``A_k x_k + .. - x_{k+1}``.
+
+    From each row block of ``[Phi, Gamma, -I]``, A_k times the block before it is subtracted; with a
+    window, each lag of A_k times its block. For an MPC scheme only the band remains, C_0. In
+    general, a row's other entries are what the window at k does not explain.
+
+    Args:
+        form: the prediction form of the constraints.
+        A: ``(N, n_x, L n_x)``, such as ``stage_models(form).A``.
+
+    Returns:
+        C ``(N n_x, n_z)`` and b ``(N n_x,)``.
+
+    Raises:
+        QPError: if ``form`` has batch dimensions, or the shape of A does not fit.
+    """
+    _check_form(form)
+    n_x, N, past = form.layout.n_x, form.layout.horizon, form.layout.past
+    check_tensor("A", A, N, n_x, past * n_x, batched=False, remedy="Pass stage_models(form).A.")
+    A = A.to(form.Phi)
+    F = form.Phi.new_zeros(N * n_x, form.layout.n_z)
+    following, p, u = _columns(form.layout)
+    F[:, p], F[:, u] = form.Phi, form.Gamma
+    F[:, following] = -torch.eye(N * n_x).to(F)
+    rows = torch.cat((F, -form.phi.unsqueeze(-1)), dim=-1).unflatten(0, (N, n_x))
+    canonical = rows.clone()
+    for lag, A_lag in enumerate(A.split(n_x, dim=-1), start=1):
+        canonical[lag:] -= A_lag[lag:] @ rows[:-lag]
+    canonical = canonical.flatten(0, 1)
+    return canonical[:, :-1], canonical[:, -1]
+
+
+def _columns(layout: Layout) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the columns of x_1, .., x_N, of p and of U in z."""
+    z = torch.arange(layout.n_z)
+    plan = z[layout.n_p :].unflatten(0, (layout.horizon, layout.n))
+    return plan[:, layout.n_u :].flatten(), z[: layout.n_p], plan[:, : layout.n_u].flatten()
+
+
+def _condition(following: Tensor) -> Tensor:
+    """Return the condition number of ``(*batch, n_c, n_c)``; raise `QPError` if it is too large."""
+    values = torch.linalg.svdvals(following)
+    condition = values[..., 0] / values[..., -1]
+    # Written so that nan, from 0 / 0, is rejected, too.
+    if not (condition <= LARGEST_CONDITION).all():
+        worst = values.reshape(-1, values.shape[-1])[values[..., -1].argmin()]
+        rank = int((worst > worst[0] / LARGEST_CONDITION).sum())
+        got = f"state columns of rank {rank} of {len(worst)}"
+        got += f" (condition number {worst[0] / worst[-1]:.2g})"
+        remedy = (
+            "The constraints do not determine x_1, .., x_N from what is known and the actions, so "
+            "they have no prediction form. Penalise the deviation from C_0, or learn C at a "
+            "smaller rate."
+        )
+        want = f"a condition number of at most {LARGEST_CONDITION:.0e}"
+        raise QPError.expected("C", got, want, remedy)
+    return condition
 
 
 def causality_defect(form: PredictionForm) -> Tensor:
@@ -63,20 +216,9 @@ def causality_defect(form: PredictionForm) -> Tensor:
 
     It is zero if no u_j enters an x_k with k <= j, and at most 1.
     """
-    energy = gamma_energies(form)
-    return (energy[..., : form.horizon - 1].sum(-1) / energy.sum(-1)).sqrt()
-
-
-def gamma_energies(form: PredictionForm) -> Tensor:
-    """Return the squared norm of each block diagonal of Gamma, ``(*batch, 2 N - 1)``, by lag k - j.
-
-    Lags run from -(N - 1), u_{N-1} in x_1, to N - 1, u_0 in x_N. Negative ones are not causal.
-    """
     check_kind("form", form, PredictionForm, FORM_REMEDY)
-    N = form.horizon
     squares = form.blocks.square().sum((-1, -2))
-    diagonals = [squares.diagonal(offset=-lag, dim1=-2, dim2=-1).sum(-1) for lag in range(1 - N, N)]
-    return torch.stack(diagonals, dim=-1)
+    return (squares.triu(1).sum((-1, -2)) / squares.sum((-1, -2))).sqrt()
 
 
 def toeplitz_defect(form: PredictionForm) -> Tensor:
@@ -85,7 +227,7 @@ def toeplitz_defect(form: PredictionForm) -> Tensor:
     It is zero if an action's effect depends on its lag alone, as in a time-invariant scheme.
     """
     check_kind("form", form, PredictionForm, FORM_REMEDY)
-    N, blocks = form.horizon, form.blocks
+    N, blocks = form.layout.horizon, form.blocks
     means = torch.zeros_like(blocks)
     for lag in range(1 - N, N):
         diagonal = means.diagonal(offset=-lag, dim1=-4, dim2=-3)
@@ -119,13 +261,11 @@ class NearestModel:
 def stage_models(form: PredictionForm) -> NearestModel:
     """Fit the model A_k, B_k of each step of the predictions, from stage k to k + 1.
 
-    Predictions are maps of (p, U). A_k, B_k, E_k and the offset are the least-squares fit of the
-    map of x_{k+1} by those of the window at k and a constant. If u_k does not enter x_k, as in
-    causal constraints, B_k is block (k, k) of Gamma. The residual is the part of x_{k+1} from
-    earlier pairs or later actions: zero in all stages means Markovian. A_k is zero in directions of
-    the state that no prediction of x_k reaches (the minimum-norm solution).
+    A_k, B_k, E_k and the offset are the least-squares fit of the map of x_{k+1} by those of the
+    window at k and a constant, zero in directions that no prediction of x_k reaches. The residual
+    is the part of x_{k+1} from earlier pairs or later actions: zero in all stages means Markovian.
     """
-    check_form(form)
+    _check_form(form)
     maps, windows = form.maps, _windows(form)
     fit = _fit(windows, maps[1:])
     left = maps[1:] - fit @ windows
@@ -137,12 +277,11 @@ def nearest_model(form: PredictionForm) -> NearestModel:
     """Fit the time-invariant scheme with the nearest predictions; its residual is the distance.
 
     Minimises ``||[Phi, Gamma, phi] - [Phi, Gamma, phi](A, B, E, offset)||`` by trust-region steps
-    from the one-step fit of all stages, as many as `EVALUATIONS` and `MULTIPLICATIONS` allow; the
-    residual is the minimum over ``||[Phi, Gamma]||``. For a scheme with tied stages the start is
-    exact, and the residual zero up to rounding. Otherwise it is a local minimum, or on the way to
-    one, and an upper bound on the distance to the MPC schemes.
+    from the one-step fit of all stages; the residual is the minimum over ``||[Phi, Gamma]||``, zero
+    for a scheme with tied stages. In general it is that of a local minimum, an upper bound on the
+    distance to the MPC schemes.
     """
-    check_form(form)
+    _check_form(form)
     maps, past = form.maps, form.layout.past
     n_x, n_v = maps.shape[-2:]
     windows = _windows(form)
@@ -186,76 +325,13 @@ def nearest_model(form: PredictionForm) -> NearestModel:
     return NearestModel(*_split(theta, form), float(np.linalg.norm(residuals(begin))) / scale)
 
 
-def memory_energies(form: PredictionForm, rtol: float = 1e-9) -> Tensor:
-    """Return the shares of the predictions' energy by past pair, ``(N + 1,)``, which sum to 1.
-
-    The dependence of x_{k+1} on x_k, u_k, x_{k-1}, .. is not unique, as x_k follows from earlier
-    pairs. Therefore (x_k, u_k) first explains as much as it can, in least squares over (p, U);
-    then (x_{k-1}, u_{k-1}) explains part of the rest, and so on. Entry m is the share of the energy
-    of x_1, .., x_N that the pair m stages before the latest explains. The last entry is the share
-    that the whole past does not explain: dependence on later actions or previews.
-
-    With a window or a preview, the windows at k, k - 1, .. take the place of these pairs: entry 0
-    is the share that a model of L lags can explain.
-
-    Args:
-        form: the prediction form of the constraints.
-        rtol: singular values of the regressors below this share of the largest count as zero.
-
-    Raises:
-        QPError: if ``form`` has batch dimensions, or ``rtol`` is not in [0, 1).
-    """
-    check_form(form)
-    check_number("rtol", rtol, lambda x: 0 <= x < 1, "a number in [0, 1)")
-    maps, windows, N = form.maps, _windows(form), form.horizon
-    n_x, n_u, past = form.n_x, form.n_u, form.layout.past
-    states, actions, others = windows.tensor_split((past * n_x, past * (n_x + n_u)), dim=1)
-    # The part of the window at k that the one at k + 1 does not contain.
-    oldest = torch.cat((states[:, -n_x:], actions[:, -n_u:], others), dim=1)
-    energies = maps.new_zeros(N + 1)
-    for k in range(N):
-        left = maps[k + 1].clone()
-        left[:, -1] = 0.0
-        before = left.square().sum()
-        for lag in range(k + 1):
-            known = torch.cat((oldest[k - lag : k].flatten(0, 1), windows[k]))
-            explained = _row_space(known, rtol)
-            rest = maps[k + 1] - maps[k + 1] @ explained.mT @ explained
-            after = rest.square().sum()
-            energies[lag] += (before - after).clamp(min=0)
-            before = after
-        energies[-1] += before
-    return energies / energies.sum()
-
-
-def markov_order(energies: Tensor, tolerance: float = 1e-6) -> float:
-    """Return the number of latest pairs (x_k, u_k), .., or windows, that determine the next state.
-
-    1 is a Markovian scheme, such as MPC; inf means that later actions or previews matter. An order
-    above 1 may be less than the reach of C's rows, because pairs may determine all earlier ones.
-
-    Args:
-        energies: `memory_energies`, ``(N + 1,)``.
-        tolerance: share of the norm that the pairs need not explain.
-
-    Raises:
-        QPError: if an argument does not fit.
-    """
-    check_tensor("energies", energies, "N + 1", batched=False, remedy="Pass memory_energies(form).")
-    check_number("tolerance", tolerance, lambda x: 0 <= x <= 1, "a number in [0, 1]")
-    # Summing the unexplained shares avoids the cancellation in 1 minus the explained ones.
-    left = energies.flip(0).cumsum(0).flip(0)[1:].sqrt()
-    enough = (left <= tolerance).nonzero()
-    return float(enough[0, 0] + 1) if len(enough) else math.inf
-
-
 def _windows(form: PredictionForm) -> Tensor:
     """Return [x_k, .., x_{k+1-L}, u_k, .., u_{k+1-L}, d_k, 1] as maps of (p, U, 1), k < N.
 
     Returns:
         ``(N, L (n_x + n_u) + n_d + 1, n_v)``.
     """
-    maps, layout, N = form.maps, form.layout, form.horizon
+    maps, layout, N = form.maps, form.layout, form.layout.horizon
     unit = torch.eye(maps.shape[-1]).to(maps)
     d = unit[: layout.n_preview].unflatten(0, (N + 1, layout.n_d))[:N]
     past = unit[layout.n_preview : layout.n_before].unflatten(0, (layout.past - 1, layout.n))
@@ -275,7 +351,7 @@ def _fit(regressors: Tensor, target: Tensor) -> Tensor:
 def _split(fit: Tensor, form: PredictionForm) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return A, B, E and the offset of a fit."""
     past = form.layout.past
-    sizes = (past * form.n_x, past * form.n_u, form.layout.n_d, 1)
+    sizes = (past * form.layout.n_x, past * form.layout.n_u, form.layout.n_d, 1)
     A, B, E, offset = fit.split(sizes, dim=-1)
     return A, B, E, offset.squeeze(-1)
 
@@ -285,7 +361,74 @@ def _without_offset(maps: Tensor) -> Tensor:
     return maps[..., :-1].square().sum((-1, -2))
 
 
-def _row_space(rows: Tensor, rtol: float) -> Tensor:
-    """Return an orthonormal basis of the row space, as rows."""
-    _, values, basis = torch.linalg.svd(rows, full_matrices=False)
-    return basis[values > rtol * values[0]]
+def second_moment(s: Tensor, a: Tensor, d: Tensor | None = None) -> Tensor:
+    """Return E[v v'] ``(n_v, n_v)`` of v = (s, a, d, 1) over samples ``(*batch, n)``.
+
+    Args:
+        s, a: states and actions; with a window [x_k, .., x_{k+1-L}] and [u_k, .., u_{k+1-L}].
+        d: the known signals d_k; None without a preview.
+
+    Raises:
+        QPError: if s, a and d differ in their numbers of samples, or have none.
+    """
+    check_tensor("s", s, "L n_x")
+    check_tensor("a", a, "L n_u")
+    d = a[..., :0] if d is None else check_tensor("d", d, "n_d")
+    if not (s.shape[:-1] == a.shape[:-1] == d.shape[:-1] and s.shape[:-1].numel()):
+        got = f"shapes {tuple(s.shape)}, {tuple(a.shape)} and {tuple(d.shape)}"
+        raise QPError.expected("s, a, d", got, "the same number of samples, at least one")
+    v = torch.cat((s, a, d, torch.ones_like(a[..., :1])), dim=-1)
+    v = v.reshape(-1, v.shape[-1])
+    return v.mT @ v / len(v)
+
+
+def one_step_error(
+    model: NearestModel,
+    A: Tensor,
+    B: Tensor,
+    offset: Tensor | None = None,
+    moment: Tensor | None = None,
+    E: Tensor | None = None,
+) -> Tensor:
+    """Return the root mean square of the model's error in s+ over a distribution of (s, a).
+
+    Args:
+        model: the model, with tensors ``(*batch, ..)``, such as one per stage.
+        A, B: the true model, ``(n_x, L n_x)`` and ``(n_x, L n_u)``, as in `NearestModel`.
+        offset: the true offset, the mean of the noise, ``(n_x,)``; zero by default.
+        moment: `second_moment` of the distribution; by default independent entries with mean 0 and
+            variance 1, for which the error is the Frobenius norm of the difference.
+        E: the true ``(n_x, n_d)``; zero by default.
+
+    Returns:
+        ``(*batch,)``.
+
+    Raises:
+        QPError: if ``model`` is not a `NearestModel`, or a shape does not fit.
+    """
+    check_kind("model", model, NearestModel, "Pass nearest_model(form), or stage_models(form).")
+    own = (model.A, model.B, model.E, model.offset.unsqueeze(-1))
+    n_x = model.A.shape[-2]
+    offset = model.A.new_zeros(n_x) if offset is None else offset
+    E = model.A.new_zeros(n_x, own[2].shape[-1]) if E is None else E
+    for name, part, like in zip("ABE", (A, B, E), own, strict=False):
+        check_tensor(name, part, n_x, like.shape[-1], batched=False)
+    check_tensor("offset", offset, n_x, batched=False)
+    true = [part.to(model.A) for part in (A, B, E, offset.unsqueeze(-1))]
+    error = torch.cat(own, dim=-1) - torch.cat(true, dim=-1)
+    n = error.shape[-1]
+    if moment is not None:
+        check_tensor("moment", moment, n, n, batched=False, remedy="Pass second_moment(s, a).")
+    moment = torch.eye(n).to(error) if moment is None else moment.to(error)
+    return ((error @ moment) * error).sum((-1, -2)).clamp(min=0).sqrt()
+
+
+def distance_by_band(mpc: QPMPC) -> dict[str, float]:
+    """Return the paper's ``sum |C - C_0|`` on, above and below the band.
+
+    It depends on the gauge of C, unless C is a canonical matrix.
+    """
+    check_kind("mpc", mpc, QPMPC)
+    distance, deviation = band_distance(mpc.layout).to(mpc.C.device), (mpc.C - mpc.C_0).detach()
+    sides = {"on": distance == 0, "above": distance > 0, "below": distance < 0}
+    return {name: deviation.abs()[side].sum().item() for name, side in sides.items()}

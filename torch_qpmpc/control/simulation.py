@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from torch_qpmpc.analysis.episode import episode_figure
+from torch_qpmpc.analysis.plots import episode_figure
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design, half_range, middle
 from torch_qpmpc.control.law import Law, Memory, Move, Signals

@@ -9,10 +9,13 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_qpmpc.analysis.model_error import one_step_error
-from torch_qpmpc.analysis.prediction_form import prediction_form
 from torch_qpmpc.analysis.report import structure_metrics
-from torch_qpmpc.analysis.structure import distance_by_band, nearest_model
+from torch_qpmpc.analysis.structure import (
+    distance_by_band,
+    nearest_model,
+    one_step_error,
+    prediction_form,
+)
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.envs.closed_loop import cost_text, gap_text
 from torch_qpmpc.experiment.algorithms import Learner
@@ -79,7 +82,7 @@ def report(run: RunFolder, mpc: QPMPC, evaluation: Evaluation, update: int) -> d
     scalars = {f"eval/{name}": summary[key] for name, key in EVALUATION_SCALARS.items()}
     scalars |= {f"eval/J_{tag(name)}": J for name, J in evaluation.rivals.items()}
     if update:
-        distances = distance_by_band(mpc.C, mpc.C_0, mpc.n_x, mpc.n_u, mpc.past, mpc.n_d)
+        distances = distance_by_band(mpc)
         distances |= structure_metrics(mpc)
         scalars |= {f"structure/{name}": distance for name, distance in distances.items()}
     run.log(scalars, update)

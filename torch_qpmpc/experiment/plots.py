@@ -12,8 +12,7 @@ from matplotlib.ticker import NullLocator
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torch_qpmpc.analysis.episode import episode_figure, plans_along
-from torch_qpmpc.analysis.plots import COLOURS, draw_matrix
+from torch_qpmpc.analysis.plots import COLOURS, draw_matrix, episode_figure, plans_along
 from torch_qpmpc.envs.closed_loop import ClosedLoop, cost_text
 from torch_qpmpc.experiment.collection import warm_up_batches
 from torch_qpmpc.experiment.evaluation import Evaluation

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torch_qpmpc.analysis.plots import draw_matrix
-from torch_qpmpc.analysis.report import canonical
+from torch_qpmpc.analysis.structure import canonical
 from torch_qpmpc.experiment.plots import draw_lines, experience, scale_costs
 from torch_qpmpc.study.runs import CASES, FinishedRun
 from torch_qpmpc.study.statistics import interquartile_mean, spread, spread_name

@@ -17,9 +17,13 @@ import pandas as pd
 import torch
 from omegaconf import DictConfig
 
-from torch_qpmpc.analysis.model_error import one_step_error, second_moment
-from torch_qpmpc.analysis.report import predictions
-from torch_qpmpc.analysis.structure import NearestModel, nearest_model
+from torch_qpmpc.analysis.structure import (
+    NearestModel,
+    nearest_model,
+    one_step_error,
+    predictions,
+    second_moment,
+)
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import learned_qp
