@@ -13,6 +13,7 @@ import torch
 
 from tests.problems import MIXED
 from torch_qpmpc import QPMPC, Bounds, Cost, Layout, Model, QPError, Scheme
+from torch_qpmpc.mpc.state import identity
 
 A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]).double(), torch.tensor([[0.0], [0.1]]).double()
 W = torch.diag(torch.tensor([1.0, 0.5, 0.1])).double()
@@ -102,7 +103,7 @@ def test_the_identity_has_the_sizes():
     message = "state_dict: got a state_dict with past = 2, expected this module's 1"
     with pytest.raises(QPError, match=message):
         QPMPC.of(2, 1, 3).load_state_dict(QPMPC.of(2, 1, 3, past=2).state_dict())
-    assert set(asdict(make().layout)) <= QPMPC(make())._identity().keys()
+    assert set(asdict(make().layout)) <= identity(QPMPC(make())).keys()
 
 
 @pytest.mark.parametrize(

@@ -198,7 +198,7 @@ class LinearMPC(QPMPC):
         Raises:
             QPError: a part has a parametrization that is not QPMPC's own.
         """
-        check_own("save", self, self._parametrizations_for)
+        check_own("save", self)
         return {**stored(self), "design": stored_design(self.design)}
 
     @classmethod

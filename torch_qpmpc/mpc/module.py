@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, param
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST, check_step
 from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
 from torch_qpmpc.mpc.scheme import GAMMA, KEYWORDS, Scheme, check_names
-from torch_qpmpc.mpc.state import KIND, check_identity, check_own, digest, encoded, reduce, stored
+from torch_qpmpc.mpc.state import KIND, check_identity, check_own, encoded, identity, reduce, stored
 from torch_qpmpc.mpc.validation import (
     CONSTRAINTS,
     COST,
@@ -551,7 +551,7 @@ class QPMPC(nn.Module):
             QPError: a part has a parametrization that is not QPMPC's own.
             OSError: writing failed; the old file is unchanged.
         """
-        check_own("save", self, self._parametrizations_for)
+        check_own("save", self)
         save_file(path, KIND, stored(self))
 
     @classmethod
@@ -645,7 +645,7 @@ class QPMPC(nn.Module):
         return self.scheme.arguments | self._options()
 
     def __reduce_ex__(self, protocol: Any) -> tuple:
-        return reduce(self, self.scheme, self._options(), self._parametrizations_for)
+        return reduce(self)
 
     def __copy__(self) -> QPMPC:
         twin = type(self).__new__(type(self))
@@ -654,7 +654,7 @@ class QPMPC(nn.Module):
 
     def get_extra_state(self) -> Tensor:
         """Return the identity of this QPMPC for its state_dict, as JSON bytes."""
-        return encoded(self._identity())
+        return encoded(identity(self))
 
     def set_extra_state(self, state: Tensor) -> None:
         """Do nothing: `_load_from_state_dict` has compared the identities already."""
@@ -666,29 +666,15 @@ class QPMPC(nn.Module):
         options = {"learn": learn, **{name: str(getattr(self, name)) for name in names}}
         return options if self.schedule is None else options | {"schedule": self.schedule.arguments}
 
-    def _identity(self) -> dict[str, Any]:
-        """Return what values depend on besides parameters and buffers."""
-        masks = {name: digest(mask) for name, mask in self._masks.items()}
-        return {
-            **asdict(self.layout),
-            "blocks": [*self.layout.blocks] or None,  # None as in files from before blocks
-            "gamma": float(self.gamma),
-            **{name: getattr(self, name) for name in ("structure", "hessian", "step")},
-            "discount_slack": self.scheme.bounds.discount_slack,
-            "learn": {name: masks.get(name, True) for name in self.learned},
-            "hard rows": digest(self.scheme.theta["w"].isinf()),
-            "centres": None if self.schedule is None else len(self.schedule.centres),
-        }
-
     def checked_state(self, state_dict: dict[str, Any], prefix: str) -> dict[str, Any]:
         """Return ``state_dict``, whose keys begin with ``prefix``, with an identity if it has none.
 
         Raises:
             QPError: it belongs to another QPMPC.
         """
-        key, identity = f"{prefix}_extra_state", self._identity()
-        state_dict = {key: encoded(identity)} | state_dict
-        check_identity(state_dict[key], identity)
+        key, own = f"{prefix}_extra_state", identity(self)
+        state_dict = {key: encoded(own)} | state_dict
+        check_identity(state_dict[key], own)
         return state_dict
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:

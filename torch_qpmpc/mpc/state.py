@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -33,6 +33,20 @@ def digest(mask: Tensor) -> str:
     return f"{int(entries.sum())} of {len(entries)} ({zlib.crc32(bytes(entries.tolist())):08x})"
 
 
+def identity(mpc: Any) -> dict[str, Any]:
+    """Return what values depend on besides parameters and buffers."""
+    return {
+        **asdict(mpc.layout),
+        "blocks": [*mpc.layout.blocks] or None,  # None as in files from before blocks
+        "gamma": float(mpc.gamma),
+        **{name: getattr(mpc, name) for name in ("structure", "hessian", "step")},
+        "discount_slack": mpc.scheme.bounds.discount_slack,
+        "learn": {x: digest(mpc._masks[x]) if x in mpc._masks else True for x in mpc.learned},
+        "hard rows": digest(mpc.scheme.theta["w"].isinf()),
+        "centres": None if mpc.schedule is None else len(mpc.schedule.centres),
+    }
+
+
 def check_identity(state: Any, own: dict[str, Any]) -> None:
     """Raise `QPError` if the identity of a state_dict differs from the module's own."""
     if isinstance(state, Tensor) and state.is_meta:
@@ -52,39 +66,34 @@ def check_identity(state: Any, own: dict[str, Any]) -> None:
             raise QPError.expected("state_dict", got, f"this module's {value!r}", remedy)
 
 
-def check_own(what: str, module: nn.Module, expected: Callable[[str], list[nn.Module]]) -> None:
-    """Raise `QPError` if a part has other parametrizations than those ``expected``.
+def check_own(what: str, mpc: Any) -> None:
+    """Raise `QPError` if a part of a QPMPC has other parametrizations than its own.
 
     ``what`` is to be written: a pickle or a file.
     """
-    for name in getattr(module, "parametrizations", ()):
-        attached = module.get_submodule(f"parametrizations.{name}").children()
-        if [type(x) for x in attached] != [type(x) for x in expected(name)]:
+    for name in getattr(mpc, "parametrizations", ()):
+        attached = mpc.get_submodule(f"parametrizations.{name}").children()
+        if [type(x) for x in attached] != [type(x) for x in mpc._parametrizations_for(name)]:
             got = f"a parametrization of {name} that is not QPMPC's own"
             remedy = "Save the state_dict, or remove_parametrizations first."
             raise QPError.expected(what, got, "QPMPC's own", remedy)
 
 
-def stored(module: Any) -> dict[str, Any]:
-    """Return the content of a file from which `QPMPC.load` makes the QPMPC ``module``."""
-    return {"arguments": module.arguments, "mpc": module.state_dict()}
+def stored(mpc: Any) -> dict[str, Any]:
+    """Return the content of a file that `QPMPC.load` reads."""
+    return {"arguments": mpc.arguments, "mpc": mpc.state_dict()}
 
 
-def reduce(
-    module: nn.Module,
-    scheme: Scheme,
-    options: dict[str, Any],
-    expected: Callable[[str], list[nn.Module]],
-) -> tuple:
-    """Return the value of ``__reduce_ex__``; ``expected`` gives a part's own parametrizations."""
+def reduce(mpc: Any) -> tuple:
+    """Return the value of ``__reduce_ex__``."""
     # TorchRL sends a policy to its workers on the meta device, without values to compare.
-    if not any(part.is_meta for part in module.buffers()):
-        check_own("pickle", module, expected)
-    plain = parametrize.type_before_parametrizations(module)
-    frozen = [name for name, part in module.named_parameters() if not part.requires_grad]
+    if not any(part.is_meta for part in mpc.buffers()):
+        check_own("pickle", mpc)
+    plain = parametrize.type_before_parametrizations(mpc)
+    frozen = [name for name, part in mpc.named_parameters() if not part.requires_grad]
     # The scheme identifies the state; a child process cannot share the tensor of _extra_state.
-    state = {name: x for name, x in module.state_dict().items() if name != "_extra_state"}
-    return _rebuild, (plain, scheme, options, state, frozen, module.training)
+    state = {name: x for name, x in mpc.state_dict().items() if name != "_extra_state"}
+    return _rebuild, (plain, mpc.scheme, mpc._options(), state, frozen, mpc.training)
 
 
 def _rebuild(

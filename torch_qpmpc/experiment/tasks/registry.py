@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -75,7 +74,8 @@ class Task:
 
     Attributes:
         name: the choice in ``task=NAME``.
-        make_plant: makes the plant of a configuration, of any kind.
+        make_plant: makes the plant of a configuration, of any kind; a function in the file that
+            registers the task, which other processes run.
         wrong_scheme: makes the scheme that learning starts from, of a configuration and a plant,
             as by `plant_scheme`. ``task.terminal_weight`` fills in a missing terminal weight.
             ``start=data`` replaces the model and, if its ``stage_weight`` is None, the cost.
@@ -169,9 +169,10 @@ def register(task: Task) -> None:
     TASKS[task.name] = task
     if task.defaults is None:
         return
-    # Other processes, such as those of a sweep, run the caller's file to register the task.
-    file = Path(sys._getframe(1).f_code.co_filename).resolve()
-    own = {"name": task.name, "file": str(file) if file.exists() else None}
+    # Other processes, such as those of a sweep, run the plant's file to register the task.
+    code = getattr(task.make_plant, "__code__", None)
+    file = None if code is None else Path(code.co_filename).resolve()
+    own = {"name": task.name, "file": str(file) if file is not None and file.exists() else None}
     groups = [{"override /noise": task.noises[0]}, *task.defaults.get("defaults", ())]
     node = {
         **task.defaults,
