@@ -17,7 +17,6 @@ from torch_qpmpc.analysis.plots import (
     episode_figure,
     plans_along,
     policy_figure,
-    slice_between,
 )
 from torch_qpmpc.analysis.policy import policy_map
 from torch_qpmpc.analysis.structure import nearest_model, predictions
@@ -75,16 +74,6 @@ def test_states_without_a_solution_are_left_blank():
         (mesh,) = axes.collections
         shown = np.ma.masked_invalid(np.asarray(mesh.get_array()))
         assert 0 < shown.count() < shown.size
-
-
-def test_a_slice_is_as_wide_as_the_starts():
-    mpc = make_mpc()
-    starts = torch.zeros(3, mpc.n_x)
-    starts[:, 0] = torch.tensor([-2.0, 0.5, 1.0])
-    found = slice_between(mpc, starts, points=5)
-    assert found.axes == (0, mpc.n_x // 2)
-    assert_close(found.x, torch.linspace(-2, 1, 5).double())
-    assert_close(found.y, torch.linspace(-1, 1, 5).double())  # that all share
 
 
 def test_an_episode_has_a_panel_for_each_signal():

@@ -15,9 +15,7 @@ from tests.problems import model_form, normal, predict
 from torch_qpmpc import QPMPC, DeviationPenalty, QPError
 from torch_qpmpc.analysis.plots import (
     canonical_figure,
-    constraint_figure,
     policy_figure,
-    slice_between,
 )
 from torch_qpmpc.analysis.policy import local_gain, policy_map, window_model
 from torch_qpmpc.analysis.report import read, structure_metrics
@@ -211,26 +209,22 @@ def test_the_band_of_a_window_and_a_preview():
 
 def test_figures_are_drawn_and_labelled():
     mpc = scheme()
-    for figure in (canonical_figure(mpc), constraint_figure(mpc)):
-        for axes in figure.axes[:-1]:
-            if axes.images:
-                labels = {x.get_text() for x in axes.get_xticklabels()}
-                assert {"$d_{0}$", "$x_{-2}$"} <= labels
-                assert np.isfinite(image_of(axes)).all()
-        rendered(figure)
+    figure = canonical_figure(mpc)
+    for axes in figure.axes:
+        if axes.images:
+            labels = {x.get_text() for x in axes.get_xticklabels()}
+            assert {"$d_{0}$", "$x_{-2}$"} <= labels
+            assert np.isfinite(image_of(axes)).all()
+    rendered(figure)
 
 
-def test_a_slice_is_one_of_x_0_at_the_mean_preview():
-    mpc, p = scheme(), normal(7, LAYOUT.n_p)
-    found = slice_between(mpc, p, points=4)
-    first = LAYOUT.n_before
+def test_a_map_is_one_of_x_0():
+    mpc, grid, first = scheme(), torch.linspace(-1, 1, 3), LAYOUT.n_before
+    found = policy_map(mpc, grid, grid)
     assert (found.axes, found.names) == ((first, first + 1), ("x_{0,1}", "x_{0,2}"))
-    assert_close(found.states[0, 0, : LAYOUT.n_preview], p[:, : LAYOUT.n_preview].mean(0))
-    assert (found.states[..., LAYOUT.n_preview : first] == 0).all()
+    assert (found.states[..., :first] == 0).all()
     assert_close(found.actions[1, 2], mpc.policy(found.states[1, 2]).detach())
     assert policy_figure(found).axes[0].get_xlabel() == "$x_{0,1}$"
-    grid = torch.linspace(-1, 1, 3)
-    assert policy_map(mpc, grid, grid).axes == found.axes
     other = policy_map(mpc, grid, grid, axes=(1, LAYOUT.n_preview + N_X))
     assert other.names == ("d_{0,2}", "u_{-2,1}")
     with pytest.raises(QPError, match=r"axes: got \(12, 13\), expected two different states"):
@@ -264,10 +258,6 @@ def test_a_slice_is_one_of_x_0_at_the_mean_preview():
         (
             lambda: DeviationPenalty(torch.zeros(3, 13), 1, 1, past=0),
             "past: got 0, expected a whole number >= 1",
-        ),
-        (
-            lambda: slice_between(scheme(), torch.zeros(3, N_X)),
-            r"starts: got shape \(3, 2\), expected shape \(n, 20\)",
         ),
         (
             lambda: second_moment(normal(4, 2), normal(4, 1), normal(3, 1)),

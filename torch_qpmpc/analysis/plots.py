@@ -14,7 +14,7 @@ from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torch_qpmpc.analysis.policy import PolicyMap, policy_map
+from torch_qpmpc.analysis.policy import PolicyMap
 from torch_qpmpc.analysis.structure import (
     PredictionForm,
     canonical,
@@ -91,26 +91,7 @@ def _columns(layout: Layout, width: int, *plan: tuple[int, int, range, str]) -> 
     return {i: x for (i, x), end in zip(ticks.items(), following, strict=True) if end - i >= gap}
 
 
-def constraint_figure(mpc: QPMPC) -> Figure:
-    """Plot C_0, C as in the paper's figures, and C's canonical form, which has no gauge.
-
-    The panels are stacked because TensorBoard's cards are narrow.
-    """
-    figure = Figure(figsize=(6, 10.5), layout="constrained")
-    top, middle, bottom = figure.subplots(3, 1)
-    draw_matrix(top, mpc.C_0, mpc, "$C_0$, the start")
-    draw_matrix(middle, mpc.C, mpc, r"$C_\theta$, learned")
-    try:
-        C = canonical(mpc)
-    except QPError as error:
-        bottom.text(0.5, 0.5, f"No canonical form:\n{error}", ha="center", va="center", wrap=True)
-        bottom.set_axis_off()
-        return figure
-    draw_matrix(bottom, C, mpc, r"$C_\theta$ in canonical form")
-    return figure
-
-
-def draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
+def _draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
     """Draw ``[Phi, Gamma]``, the effect of p and each u_j on each x_k, as a heatmap.
 
     Dashed lines end the preview and the window before x_0, where they exist.
@@ -157,36 +138,14 @@ def canonical_figure(mpc: QPMPC) -> Figure:
     (raw, below), (before, after) = figure.subplots(2, 2)
     draw_matrix(raw, mpc.C, mpc, r"$C_\theta$ as learned")
     draw_matrix(below, canonical(mpc), mpc, r"the same constraints in canonical form, $T C_\theta$")
-    draw_prediction_form(before, start, r"$[\Phi, \Gamma]$ at the start")
+    _draw_prediction_form(before, start, r"$[\Phi, \Gamma]$ at the start")
     defect, distance = causality_defect(learned).item(), nearest_model(learned).residual.item()
     numbers = f"causality defect {defect:.2g}, distance to MPC {distance:.2g}"
-    draw_prediction_form(after, learned, rf"$[\Phi, \Gamma]$, learned: {numbers}")
+    _draw_prediction_form(after, learned, rf"$[\Phi, \Gamma]$, learned: {numbers}")
     return figure
 
 
-def slice_between(mpc: QPMPC, starts: Tensor, points: int = 21) -> PolicyMap:
-    """Evaluate the policy on a grid that spans ``starts`` ``(n, n_p)`` in two states of x_0.
-
-    The two are the first state and the one half-way: a position and its speed, if all positions
-    come first. A state in which all starts agree is gridded from one below to one above. Others are
-    0, and the preview is the starts' mean.
-
-    Raises:
-        QPError: if there is only one state, or the shape of ``starts`` does not fit.
-    """
-    check_tensor("starts", starts, "n", mpc.n_p, batched=False)
-    first = mpc.n_p - mpc.n_x
-    axes = (first, first + mpc.n_x // 2)
-    low, high = (ends.double() for ends in starts.aminmax(dim=0))
-    wide = (high == low).double()
-    low, high = low - wide, high + wide
-    x, y = (torch.linspace(low[i].item(), high[i].item(), points) for i in axes)
-    at = starts.double().mean(0)
-    at[(mpc.horizon + 1) * mpc.n_d :] = 0
-    return policy_map(mpc, x, y, axes=axes, at=at)
-
-
-def draw_slice(axes: Axes, mapped: PolicyMap, field: Tensor, title: str, **style: Any) -> QuadMesh:
+def _draw_slice(axes: Axes, mapped: PolicyMap, field: Tensor, title: str, **style: Any) -> QuadMesh:
     """Draw a field on the grid, ``(n, m)``, blank where it is nan."""
     grid = (part.numpy() for part in (mapped.x, mapped.y, field.mT))
     image = axes.pcolormesh(*grid, shading="nearest", rasterized=True, **style)
@@ -195,11 +154,11 @@ def draw_slice(axes: Axes, mapped: PolicyMap, field: Tensor, title: str, **style
     return image
 
 
-def draw_regions(axes: Axes, mapped: PolicyMap) -> None:
+def _draw_regions(axes: Axes, mapped: PolicyMap) -> None:
     """Draw the regions of one active set each, with their borders; colours repeat."""
     title = f"Active sets: {len(mapped.active_sets)} regions on this grid"
     colours = (mapped.regions % 20).double().masked_fill(mapped.regions < 0, torch.nan)
-    draw_slice(axes, mapped, colours, title, cmap="tab20", vmin=-0.5, vmax=19.5)
+    _draw_slice(axes, mapped, colours, title, cmap="tab20", vmin=-0.5, vmax=19.5)
     for line in _borders(mapped):
         axes.plot(*line, color="black", linewidth=0.5, alpha=0.6)
 
@@ -214,16 +173,16 @@ def policy_figure(mapped: PolicyMap, action: int = 0) -> Figure:
     figure = Figure(figsize=(12, 9), layout="constrained")
     (value, policy), (gain, sets) = figure.subplots(2, 2)
     u, name = mapped.actions[..., action], f"{{{action + 1}}}"
-    images = [draw_slice(value, mapped, mapped.values, "Value $V(s)$", cmap="viridis")]
+    images = [_draw_slice(value, mapped, mapped.values, "Value $V(s)$", cmap="viridis")]
     size = max(1e-12, u.nan_to_num().abs().max().item())
     title = rf"Policy $\pi_{name}(s)$"
-    images.append(draw_slice(policy, mapped, u, title, cmap="RdBu_r", vmin=-size, vmax=size))
+    images.append(_draw_slice(policy, mapped, u, title, cmap="RdBu_r", vmin=-size, vmax=size))
     slope = mapped.gains[..., action, :].norm(dim=-1)
     title = rf"Local gain $\|d\pi_{name} / ds\|$"
-    images.append(draw_slice(gain, mapped, slope, title, cmap="magma"))
+    images.append(_draw_slice(gain, mapped, slope, title, cmap="magma"))
     for axes, image in zip((value, policy, gain), images, strict=True):
         figure.colorbar(image, ax=axes, shrink=0.85)
-    draw_regions(sets, mapped)
+    _draw_regions(sets, mapped)
     return figure
 
 
