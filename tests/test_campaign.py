@@ -13,7 +13,8 @@ from tests.campaign.families import FAMILIES, Draw, solvable, well_posed
 from tests.campaign.outcomes import judge
 from tests.campaign.tally import Tally
 from tests.campaign.trained import trained
-from torch_qpmpc import QPSolution, Status, solve_qp
+from torch_qpmpc import Status, solve_qp
+from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solvers import BACKENDS
 
 CLARABEL = "qpsolvers:clarabel"

@@ -8,18 +8,17 @@ import gymnasium
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
-from torch_qpmpc.mpc.blended import BlendedModel, identify_blended
+from torch_qpmpc.mpc.blended import identify_blended
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
-from torch_qpmpc.mpc.identification import Identified, identify
+from torch_qpmpc.mpc.identification import identify
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import Log, read_log
+from torch_qpmpc.mpc.log import read_log
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 from torch_qpmpc.qp.program import QuadraticProgram, Status
-from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve_qp
 
 if TYPE_CHECKING:
@@ -34,22 +33,18 @@ if TYPE_CHECKING:
 
 __all__ = [
     "QPMPC",
-    "BlendedModel",
     "Bounds",
     "CompiledPolicy",
     "Controller",
     "Cost",
     "DeviationPenalty",
     "GaussNewton",
-    "Identified",
     "Layout",
     "LinearMPC",
-    "Log",
     "Model",
     "QPActorValueOperator",
     "QPError",
     "QPQLearningLoss",
-    "QPSolution",
     "QuadraticProgram",
     "Scheme",
     "SolveLog",

@@ -11,8 +11,9 @@ import scipy.integrate
 import scipy.signal
 import torch
 
-from torch_qpmpc import Identified, QPError
+from torch_qpmpc import QPError
 from torch_qpmpc.control.state_space import read_model
+from torch_qpmpc.mpc.identification import Identified
 from torch_qpmpc.mpc.log import Log
 from torch_qpmpc.mpc.predictor import ARX
 

@@ -14,12 +14,13 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import torch_qpmpc as qm
-from torch_qpmpc import QPMPC, BlendedModel, QPError
+from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.analysis.report import read
 from torch_qpmpc.export.export import export_c
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.learning.penalties import SystemIdentificationPenalty
 from torch_qpmpc.learning.updates import first_order, second_order
+from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.proofs import Polytope, largest_difference
 
 COST: Any = {"stage_weight": [1.0, 1.0, 0.1], "action_bounds": ([-1.0], [1.0]), "solver": "daqp"}

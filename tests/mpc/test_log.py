@@ -14,7 +14,7 @@ from torchrl.collectors.utils import split_trajectories
 import torch_qpmpc as qm
 from tests.logs import arx_log, room
 from torch_qpmpc import QPError
-from torch_qpmpc.mpc.log import as_log, folds
+from torch_qpmpc.mpc.log import Log, as_log, folds
 
 NAMES: Any = {"outputs": ["T"], "inputs": ["q"], "known": ["T_out"]}
 
@@ -23,11 +23,11 @@ def steps_of(log: Any) -> list[int]:
     return [part.steps for part in as_log(log).trajectories]
 
 
-def lengths(log: qm.Log) -> list[int]:
+def lengths(log: Log) -> list[int]:
     return [part.steps for part in log.trajectories]
 
 
-def same(one: qm.Log, other: qm.Log) -> bool:
+def same(one: Log, other: Log) -> bool:
     pairs = zip(one.trajectories, other.trajectories, strict=True)
     return all(
         torch.allclose(x, y, rtol=1e-14) for a, b in pairs for x, y in zip(a, b, strict=True)

@@ -51,13 +51,13 @@ from torch_qpmpc import (
     QPMPC,
     GaussNewton,
     QPError,
-    QPSolution,
     QuadraticProgram,
     SolverError,
     Status,
     solve_qp,
 )
 from torch_qpmpc.mpc.riccati import riccati_weight
+from torch_qpmpc.qp.solution import QPSolution
 
 # V, Q and the policy
 

@@ -26,6 +26,7 @@ from tests.problems import random_states as states
 from torch_qpmpc.envs import PointMass, PointMassEnv
 from torch_qpmpc.qp import kkt, tracing
 from torch_qpmpc.qp.pipeline import solve
+from torch_qpmpc.qp.solution import QPSolution
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 ROOT = Path(qm.__file__).parent
@@ -45,7 +46,7 @@ def moved(qp: qm.QuadraticProgram, device: torch.device) -> qm.QuadraticProgram:
 
 def solution_and_gradients(
     known: Any, device: torch.device, solver: str
-) -> tuple[qm.QPSolution, list[Tensor]]:
+) -> tuple[QPSolution, list[Tensor]]:
     """Solve, and differentiate a random function of value, z, chi, lam and xi in all data."""
     data = [x.to(device).requires_grad_() for x in (*known.qp.tensors(), known.fixed)]
     qp = qm.QuadraticProgram(*data[:-1], check_values=False)

@@ -10,12 +10,13 @@ import torch
 from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp
-from torch_qpmpc import QPMPC, QPSolution, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
+from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.qp.pipeline import refinement
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import UNKNOWN
+from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, daqp
 
 BATCH = 6

@@ -102,7 +102,7 @@ class BackendSolution(NamedTuple):
 
 
 class BatchSolution(NamedTuple):
-    """Primal-dual solutions of B QPs, see `torch_qpmpc.QPSolution`; lam = eta - upsilon."""
+    """Primal-dual solutions of B QPs, see `QPSolution`; lam = eta - upsilon."""
 
     value: Array
     z: Array
