@@ -47,12 +47,6 @@ def test_constant_disturbances_of_input_and_output_leave_no_offset():
     assert np.abs(np.diff(us, axis=0)).max() <= 0.3 + 1e-9
 
 
-def test_without_disturbances_in_the_model_there_is_an_offset():
-    controller = qm.Controller(integrator(disturbances=None))
-    _, ys = closed_loop(controller, [2.0], 200, load=0.3)
-    assert np.abs(ys[-1] - 2.0) > 0.01
-
-
 def test_a_previewed_set_point_is_met_on_time():
     controller = qm.Controller(integrator(references="preview"))
     x, ys = np.zeros(2), []

@@ -312,9 +312,8 @@ def test_a_controller_that_disagrees_is_refused(tmp_path, monkeypatch):
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_bound_that_free_inputs_move_is_refused(tmp_path):
-    """Its price is beside the weight of the other output, and that of free inputs far below."""
-    mpc = qm.LinearMPC((A, B, C), 3, Q=[1.0, 0.0], **SIZES, y_bounds={"y2": (-1.0, 1.0)})
-    message = r"^controller: got bounds of y2, which inputs move .* Give y2 a small weight, or no"
-    with pytest.raises(QPError, match=message):
+def test_a_loop_without_a_first_plan_is_refused(tmp_path):
+    band = {"y_bounds": (10.0, 20.0), "y_slack": np.inf, "u_bounds": (-1.0, 1.0)}
+    mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 5, Q=1.0, R=0.1, **band)
+    with pytest.raises(SolverError, match=r"^No input satisfies the hard bounds at rest: widen"):
         qm.Controller(mpc).export_c(tmp_path)

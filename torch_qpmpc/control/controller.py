@@ -119,12 +119,12 @@ class Controller:
 
     @property
     def mpc(self) -> LinearMPC:
-        """The MPC."""
+        """The MPC that makes the plans."""
         return self._law.mpc
 
     @property
     def observer(self) -> Observer:
-        """The observer."""
+        """The observer that estimates x and w."""
         return self._law.observer
 
     @property
@@ -144,7 +144,7 @@ class Controller:
 
     @property
     def u(self) -> Array:
-        """The last input."""
+        """The last input, ``(m,)``."""
         return self._memory.u
 
     @property

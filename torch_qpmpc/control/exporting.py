@@ -17,7 +17,7 @@ from torch_qpmpc.control.design import half_range, largest
 from torch_qpmpc.control.disturbance import RANK
 from torch_qpmpc.control.law import Law, Memory, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
-from torch_qpmpc.control.simulation import Course, at_rest, centre, held_known, own_loop
+from torch_qpmpc.control.simulation import Course, at_rest, centre, last_known, own_loop
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, check_name, export_c
@@ -146,7 +146,7 @@ def export_controller(
     """Write a controller as C; see `Controller.export_c`."""
     check_name(name)
     options = {"dtype": dtype, "max_iterations": max_iterations, "storage": storage}
-    mpc, known = law.mpc, held_known(law.design, memory)
+    mpc, known = law.mpc, last_known(law.design, memory)
     if names := undetermined(mpc):
         got = f"bounds of {names}, which inputs move that no output with a weight tells apart"
         want = "bounds that the set-point determines"
@@ -248,7 +248,9 @@ def _run(law: Law, course: Course, start: Array, policy: Any, steps: int) -> Loo
     """
     rows = [(*signals, move.u) for signals, move in own_loop(law, course, policy, steps)]
     if not rows:
-        raise SolverError("No input satisfies the hard bounds at rest.")
+        raise SolverError(
+            "No input satisfies the hard bounds at rest: widen them, or give the outputs a y_slack."
+        )
     y, r, known, u = map(np.array, zip(*rows, strict=True))
     return Loop(y, r, known, u, start[None])
 
@@ -376,7 +378,7 @@ def _main(law: Law, memory: Memory, name: str, dtype: str) -> str:
 
     It starts from the last reset's rest, or `at_rest`, and moves to the last set-point or one near.
     """
-    design, known = law.design, held_known(law.design, memory)
+    design, known = law.design, last_known(law.design, memory)
     plant, sizes = design.plant, _sizes(law)
     x, u = at_rest(law.mpc, known)
     load = 0.1 * plant.B @ half_range(design.u_bounds) + plant.E @ known + plant.offset

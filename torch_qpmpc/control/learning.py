@@ -110,9 +110,9 @@ def learn(
         plant = _environment(law.design, source, middle, known, spread, steps)
         log = _gathered(law, memory, plant, -(-transitions // steps), steps, seed)
     else:
-        log, held = _parts(as_log(source), law.design.plant)
+        log, held_out = _parts(as_log(source), law.design.plant)
         middle = None if r is None else law.read_set_points(r, 1, memory.r)[0]
-        plant = _model(law.design, held, middle, spread, steps)
+        plant = _model(law.design, held_out, middle, spread, steps)
     model = _identified(log, law.design.plant)
     candidate = _with_model(law, model)
     test, costs = _compare(law, candidate, memory, plant, steps, pairs, seed)
@@ -143,10 +143,10 @@ def _environment(
     return Plant("the environment", env, options)
 
 
-def _model(design: Design, held: Log, middle: Any, spread: Any, steps: int) -> Plant:
+def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) -> Plant:
     """Return loops with a model of a part of a log, at its levels, with its known signals."""
-    identified = _identified(held, design.plant)
-    y, d = (torch.cat(part).numpy() for part in list(zip(*held.trajectories, strict=True))[::2])
+    identified = _identified(held_out, design.plant)
+    y, d = (torch.cat(part).numpy() for part in list(zip(*held_out.trajectories, strict=True))[::2])
     middle = np.clip(y.mean(0) if middle is None else middle, *design.y_bounds)
     size = _sizes(design, spread, y.std(0))
     noise = identified.covariance.diagonal().sqrt().nan_to_num().numpy()
@@ -212,9 +212,9 @@ def _parts(log: Log, plant: StateSpace) -> tuple[Log, Log]:
     if log.dt and plant.dt and not np.isclose(log.dt, plant.dt):
         got, want = f"one step every {log.dt:g}", f"the controller's sampling time, {plant.dt:g}"
         raise QPError.expected("log", got, want, "Resample the log.")
-    *parts, held = folds(log.trajectories, PARTS)
+    *parts, held_out = folds(log.trajectories, PARTS)
     first = [trajectory for part in parts for trajectory in part]
-    return replace(log, trajectories=first), replace(log, trajectories=held)
+    return replace(log, trajectories=first), replace(log, trajectories=held_out)
 
 
 def _identified(log: Log, plant: StateSpace) -> Identified:

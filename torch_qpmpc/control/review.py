@@ -20,7 +20,7 @@ from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
 from torch_qpmpc.control.lowering import riccati
 from torch_qpmpc.control.observer import kalman
-from torch_qpmpc.control.simulation import held_known, probe
+from torch_qpmpc.control.simulation import last_known, probe
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.tables import SINGULAR, Tables, digest, make_tables
@@ -60,7 +60,7 @@ def review(
     if r is not None:
         r_last = law.read_set_points(r, 1, memory.r)
     assumed = known is None and memory.known is None
-    known = held_known(design, memory) if known is None else law.read_known(known, 1)[0]
+    known = last_known(design, memory) if known is None else law.read_known(known, 1)[0]
     cost = _cost(mpc)
     findings = [
         cost,

@@ -219,7 +219,7 @@ class _Model:
         return self._model.C @ self._x, {}
 
 
-def held_known(design: Design, memory: Memory) -> Array:
+def last_known(design: Design, memory: Memory) -> Array:
     """Return the known signals of the last step or reset, ``(n_d,)``, zero before."""
     return np.zeros(len(design.plant.known)) if memory.known is None else memory.known
 
@@ -308,9 +308,9 @@ def probe(law: Law, known: Array) -> Probe:
     (x, u), rows = at_rest(law.mpc, known), design.horizon + 1
     moves = rng.uniform(-1, 1, (-(-PROBED // HELD), len(size_y))).repeat(HELD, 0)
     r = centre(design, known) + MOVE * size_y * np.vstack((moves[:PROBED], moves[-1:]))
-    held = np.tile(known, (PROBED + 1, rows, 1))
+    constant = np.tile(known, (PROBED + 1, rows, 1))
     quiet = np.zeros((PROBED + 1, len(size_y)))
-    course = Course(x, LOAD * size_u, quiet, r[:, None].repeat(rows, 1), held)
+    course = Course(x, LOAD * size_u, quiet, r[:, None].repeat(rows, 1), constant)
     costs: dict[str, float] = {}
     states, last = [], u
     for signals, move in own_loop(law, course, law.policy(law.begun(u)), PROBED):

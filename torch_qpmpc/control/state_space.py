@@ -184,8 +184,7 @@ def read_table(name: str, value: Any, names: Sequence[str], rows: int, least: in
         raise QPError.expected(name, "NaN or inf", "finite numbers")
     if 1 < len(table) < least:
         raise QPError.expected(name, f"{len(table)} rows", f"one row, or at least {least}")
-    held = np.minimum(np.arange(rows), len(table) - 1)
-    return table[held]
+    return table[np.minimum(np.arange(rows), len(table) - 1)]
 
 
 def read_vector(name: str, value: Any, names: Sequence[str], missing: float) -> Array:
