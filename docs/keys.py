@@ -1,4 +1,4 @@
-"""The page of all configuration keys: allowed values from the models, the rest from configs/."""
+"""The page of all configuration keys, from configs/ and its comments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from torch_qpmpc.experiment.config.messages import keys
+from torch_qpmpc.experiment.config import keys
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: Files whose comments explain the keys that several files set.
@@ -84,13 +84,13 @@ def values(of: list[Setting]) -> str:
 
 def page() -> str:
     """Return the page as Markdown."""
-    phrases, text = keys(), [TITLE, "## Of every run\n"]
-    head = "| key | meaning | expected | values |\n| --- | --- | --- | --- |"
+    text = [TITLE, "## Of every run\n"]
+    head = "| key | meaning | values |\n| --- | --- | --- |"
     for group in ("", *GROUPS):
         text += [f"\n## {GROUPS[group]}\n"] if group else []
         text.append(head)
         for key, of in settings().items():
             if key.rpartition(".")[0].partition(".")[0] == group and not key.endswith(".name"):
-                cells = (f"`{key}`", meaning(of), phrases[key], values(of))
+                cells = (f"`{key}`", meaning(of), values(of))
                 text.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(text) + "\n"

@@ -22,7 +22,7 @@ from torch_qpmpc import QPMPC, Bounds, Cost, Layout, Model, Scheme
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64, normal, uniform
 from torch_qpmpc.envs.plant import Plant
-from torch_qpmpc.experiment.fields import Flag, NonNegative, Positive
+from torch_qpmpc.experiment.fields import NonNegative, Positive
 from torch_qpmpc.experiment.tasks import Task, TaskSettings, plant_layout, plant_scheme, register
 from torch_qpmpc.mpc.riccati import riccati_weight
 
@@ -157,7 +157,7 @@ def episode(plant, d):
 class Settings(TaskSettings):
     actuator_std: NonNegative  # of the factor of the action
     a_max: Positive  # bound of the absolute action
-    hidden_velocity: Flag  # only the position is measured
+    hidden_velocity: bool  # only the position is measured
 
 
 OPTIONS = {"solver": "daqp", "steps_per_update": 10, "warmup_steps": 40, "updates": 60}

@@ -17,8 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.config import check_config
-from torch_qpmpc.experiment.config.messages import keys, unknown_key
+from torch_qpmpc.experiment.config import check_config, keys, unknown_key
 from torch_qpmpc.experiment.run_folder import unwritable
 from torch_qpmpc.experiment.run_state import check_fresh, check_own_folder, folder_of, resumed
 from torch_qpmpc.experiment.sweeps import finished_run, stopped_run
@@ -82,17 +81,14 @@ def check_overrides(arguments: Sequence[str], configs: str | Path) -> None:
         arguments: the command line.
         configs: the folder of the configuration groups.
     """
-    known = keys()
-    groups = {path.name for path in Path(configs).iterdir() if path.is_dir()}
+    known, groups = [*keys()], {path.name for path in Path(configs).iterdir() if path.is_dir()}
     for argument in arguments:
         key = argument.partition("=")[0]
-        is_plain = "=" in argument and re.fullmatch(r"\w+(\.\w+)*", key)
-        if not is_plain or key in groups or key.startswith("hydra."):
+        plain = "=" in argument and re.fullmatch(r"\w+(\.\w+)*", key)
+        if not plain or key in groups or key.startswith("hydra."):
             continue
-        if not any(
-            f"{name}.".startswith(f"{key}.") or key.startswith(f"{name}.") for name in known
-        ):
-            raise SystemExit(str(unknown_key(key, known)))
+        if not any(f"{x}.".startswith(f"{key}.") or key.startswith(f"{x}.") for x in known):
+            raise SystemExit(str(unknown_key(key)))
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from pydantic import AfterValidator
 from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.closed_loop import gymnasium_loop
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.fields import MATRIX, Count, Expected, Flag, Matrix, Whole
+from torch_qpmpc.experiment.fields import Count, Matrix, Whole
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks.code import has_run
 from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, plant_scheme, register
@@ -21,16 +21,17 @@ from torch_qpmpc.mpc.scheme import Scheme
 
 def _is_chosen(id: str) -> str:
     if id == "???":
-        raise ValueError
+        want = "the id of a Gymnasium environment, as in task.id=Pendulum-v1"
+        raise QPError.expected("task.id", repr(id), want)
     return id
 
 
 #: A matrix of the model; null by default, which `given_scheme` accepts with ``start=data`` only.
-Given = Annotated[Matrix | None, MATRIX]
+Given = Matrix | None
 
 
 #: The length of episodes, null for the environment's own; or of a window, null for the start's.
-Steps = Annotated[Count | None, Expected("a whole number >= 1, or null")]
+Steps = Count | None
 
 
 class GymnasiumSettings(TaskSettings):
@@ -40,22 +41,16 @@ class GymnasiumSettings(TaskSettings):
     episode_steps: Steps  # pyright: ignore[reportIncompatibleVariableOverride]
     eval_steps: Steps  # pyright: ignore[reportIncompatibleVariableOverride]
     #: Take the bounds of the observation space as constraints.
-    observation_bounds: Flag
+    observation_bounds: bool
     #: L of the window of outputs and actions that the QP sees; null: the chosen start sets it.
     past: Steps = None
     #: Episodes by which a start from data is chosen; 0 for the run's own start.
     start_episodes: Whole = 0
     #: Entries of the observation that are held over the horizon; null for those found in the log.
-    held: Annotated[list[Whole] | None, Expected("a list of indices, or null")] = None
+    held: list[Whole] | None = None
 
-    id: Annotated[
-        str,
-        AfterValidator(_is_chosen),
-        Expected("the id of a Gymnasium environment, as in task.id=Pendulum-v1"),
-    ]
-    kwargs: Annotated[
-        dict[str, Any] | None, Expected("further arguments of gymnasium.make by name, or null")
-    ] = None
+    id: Annotated[str, AfterValidator(_is_chosen)]
+    kwargs: dict[str, Any] | None = None
     A: Given
     B: Given
     stage_weight: Given

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, Self
+from typing import Any, Literal, NoReturn, Self
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
@@ -16,24 +16,13 @@ from torch_qpmpc.checks import check_kind
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem, Plant
 from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_loop
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.fields import (
-    Count,
-    Expected,
-    Flag,
-    Fraction,
-    Group,
-    Name,
-    Weight,
-    one_of,
-    some_of,
-)
+from torch_qpmpc.experiment.fields import Count, Fraction, Group, Weight
 from torch_qpmpc.experiment.rivals import Policy
 from torch_qpmpc.mpc.bounds import Bounds
-from torch_qpmpc.mpc.cost import HESSIANS, Cost
+from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
-from torch_qpmpc.mpc.validation import COST
 
 #: A plant of any kind.
 AnyPlant = LinearSystem | GymnasiumPlant | Plant
@@ -44,19 +33,19 @@ TASKS: dict[str, Task] = {}
 class TaskSettings(Group):
     """The keys under ``task`` that all tasks share."""
 
-    name: Name
+    name: str
     #: The script that registers a user's task.
-    file: Annotated[str | None, Expected("a path, or null")] = None
+    file: str | None = None
     horizon: Count
     gamma: Fraction
     episode_steps: Count
     eval_steps: Count
-    hessian: Annotated[str, one_of(HESSIANS)]
-    terminal_weight: Annotated[str, one_of(("default", "identity", "riccati"))]
-    learn_cost: Annotated[list[str], some_of(COST)]
+    hessian: Literal["diagonal", "block", "full"]
+    terminal_weight: Literal["default", "identity", "riccati"]
+    learn_cost: list[Literal["H", "H_f", "q", "c", "w"]]
     state_slack: Weight
     action_slack: Weight
-    discount_slack: Flag
+    discount_slack: bool
 
     @model_validator(mode="after")
     def riccati_is_dense(self) -> Self:
