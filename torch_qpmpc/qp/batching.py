@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -64,14 +63,6 @@ def outer(left: Tensor, right: Tensor, like: Tensor) -> Tensor:
     return sum_to(left.unsqueeze(-1) * right.unsqueeze(-2), like)
 
 
-def multiply(matrices: Tensor, group: Tensor, vectors: Tensor) -> Tensor:
-    """Multiply each of ``(B or 1, j)`` by its group's matrix of ``(M, i, j)``, to ``(B, i)``."""
-    if matrices.shape[0] == 1:
-        return F.linear(vectors, matrices[0])
-    vectors = vectors.expand(len(group), -1)
-    return torch.bmm(matrices[group], vectors.unsqueeze(-1)).squeeze(-1)
-
-
 def times(matrix: Tensor, vector: Tensor) -> Tensor:
     """Multiply ``(*batch, i, j)`` by ``(*batch, j)`` to ``(*batch, i)``, broadcasting."""
     return (vector.unsqueeze(-2) @ matrix.mT).squeeze(-2)
@@ -80,14 +71,6 @@ def times(matrix: Tensor, vector: Tensor) -> Tensor:
 def flatten_batch(vectors: Tensor) -> Tensor:
     """Flatten ``(*batch, n)`` to ``(B, n)``, also for n = 0, where -1 would be ambiguous."""
     return vectors.reshape(math.prod(vectors.shape[:-1]), vectors.shape[-1])
-
-
-def largest(x: Tensor, *, keepdim: bool = False) -> Tensor:
-    """Return the largest absolute entry along the last dimension; zero if that is empty."""
-    if x.shape[-1]:
-        # vector_norm is one operation, but several times slower for a large batch.
-        return x.abs().amax(-1, keepdim=keepdim)
-    return x.new_zeros((*x.shape[:-1], 1) if keepdim else x.shape[:-1])
 
 
 def to_dtype(tensor: Tensor, dtype: torch.dtype) -> Tensor:

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, largest, multiply, times
+from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, times
+from torch_qpmpc.qp.kernels.sample_torch import largest, multiply
 from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, native_device, to_numpy, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import NDIMS, Status

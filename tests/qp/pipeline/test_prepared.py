@@ -11,8 +11,7 @@ from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
 from torch_qpmpc.qp.pipeline import condensing
-from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.prepared import _Latest
+from torch_qpmpc.qp.pipeline.batch import Programs, _Latest
 
 
 @pytest.fixture

@@ -11,8 +11,7 @@ from torch.testing import assert_close
 from tests.campaign.families import in_units
 from tests.problems import KnownQP, known_qp, programs_of, random_mpc
 from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
-from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.prepared import Prepared
+from torch_qpmpc.qp.pipeline.batch import Prepared, Programs
 from torch_qpmpc.qp.pipeline.solve import solve_programs
 
 BATCH = 4

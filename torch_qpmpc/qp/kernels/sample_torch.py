@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torch_qpmpc.qp.batching import largest, multiply
 from torch_qpmpc.qp.kernels.sample import (
     CANCELLED,
     DEPENDENT,
@@ -27,6 +26,22 @@ from torch_qpmpc.qp.kernels.sample import (
     VIOLATED,
 )
 from torch_qpmpc.qp.solution import active_codes
+
+
+def multiply(matrices: Tensor, group: Tensor, vectors: Tensor) -> Tensor:
+    """Multiply each of ``(B or 1, j)`` by its group's matrix of ``(M, i, j)``, to ``(B, i)``."""
+    if matrices.shape[0] == 1:
+        return F.linear(vectors, matrices[0])
+    vectors = vectors.expand(len(group), -1)
+    return torch.bmm(matrices[group], vectors.unsqueeze(-1)).squeeze(-1)
+
+
+def largest(x: Tensor, *, keepdim: bool = False) -> Tensor:
+    """Return the largest absolute entry along the last dimension; zero if that is empty."""
+    if x.shape[-1]:
+        # vector_norm is one operation, but several times slower for a large batch.
+        return x.abs().amax(-1, keepdim=keepdim)
+    return x.new_zeros((*x.shape[:-1], 1) if keepdim else x.shape[:-1])
 
 
 def offsets(fixed, group, matrix, constant) -> Tensor:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.program import UNKNOWN, Status, crossed
+from torch_qpmpc.qp.program import crossed
 
 #: The certificate rejects a solution with a larger relative residual or error of its value.
 TOLERANCE = 1e-6
@@ -127,32 +127,18 @@ class BatchSolution(NamedTuple):
         """Return copies of the solutions at ``index``."""
         return BatchSolution._make(x[index] for x in self)
 
-    def put(self, index: np.ndarray, others: BatchSolution) -> None:
+    def put(self, index: Array, others: BatchSolution) -> None:
         """Replace the solutions at ``index``."""
         for own, new in zip(self, others, strict=True):
             own[index] = new
 
+    def clear(self, index: np.ndarray, placeholders: BatchSolution) -> None:
+        """Replace all but the errors of the solutions at ``index``."""
+        errors = {"residual": self.residual, "value_error": self.value_error}
+        self.put(index, placeholders._replace(**errors).at(index))
+
     def on_cpu(self) -> BatchSolution:
         return BatchSolution._make(map(to_numpy, self))
-
-
-def unsolved(fixed: np.ndarray, n_z: int, n_c: int, n_g: int, status: Status) -> BatchSolution:
-    """Return placeholders for unsolved QPs: infinite costs, the fixed entries, and zeros."""
-    n = len(fixed)
-    z = np.zeros((n, n_z))
-    z[:, : fixed.shape[1]] = np.nan_to_num(fixed, posinf=0.0, neginf=0.0)
-    return BatchSolution(
-        value=np.full(n, np.inf),
-        z=z,
-        chi=np.zeros((n, n_c)),
-        lam=np.zeros((n, n_g)),
-        xi=np.zeros_like(fixed),
-        status=np.full(n, int(status)),
-        residual=np.full(n, np.inf),
-        value_error=np.full(n, np.inf),
-        iterations=np.zeros(n, np.int64),
-        active=np.full((n, n_g), UNKNOWN, np.int8),
-    )
 
 
 def to_numpy(x: Array) -> np.ndarray:
@@ -173,6 +159,11 @@ def native_device(x: Tensor) -> torch.device | None:
 def on_device(x: np.ndarray, device: torch.device | None) -> Array:
     """Return ``x`` as a tensor on ``device``, or unchanged if ``device`` is None."""
     return x if device is None else torch.from_numpy(x).to(device)
+
+
+def indices(mask: Array) -> Array:
+    """Return the indices where ``mask`` is True."""
+    return np.flatnonzero(mask) if isinstance(mask, np.ndarray) else mask.nonzero().squeeze(-1)
 
 
 def per_qp(unit: np.ndarray, group: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Solve and certify QPs (eq:qp2, eq:qp3): condense, solve, certify, fall back.
+"""Solve and certify QPs (eq:qp2, eq:qp3): one strategy after the other, until all are certified.
 
 Tensors become arrays once; all else is in float64, without autograd.
 """
@@ -8,8 +8,9 @@ from __future__ import annotations
 import contextvars
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,15 +24,14 @@ from torch_qpmpc.qp.pipeline.arrays import (
     Array,
     BatchSolution,
     SoftQPs,
+    indices,
     native_device,
     on_device,
-    per_qp,
     to_numpy,
     to_tensor,
-    unsolved,
 )
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS
+from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS, Elimination
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import NDIMS, Status
@@ -41,6 +41,7 @@ ON_FAILURE = ("raise", "warn", "mask")
 #: The tensors of a `QPSolution`: value, z, chi, lam, xi, status, residual, value_error, iterations,
 #: active.
 Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+Eliminate = Callable[[np.ndarray, int], Elimination | None]
 #: Rejected solutions with a relative residual up to this are refined.
 NEARLY = 1e-2
 #: Number of iterative refinements after an alternative elimination.
@@ -198,6 +199,50 @@ def _report(solution: BatchSolution, batch: torch.Size, on_failure: str) -> None
     warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
+class Strategy(NamedTuple):
+    """One way to solve QPs: from their last active sets, or by a backend."""
+
+    solve: Backend
+    start: Array | None = None
+    eliminate: Eliminate | None = None
+
+    def prepared(self, p: Programs) -> Programs | None:
+        """Return the QPs with this elimination; None if it does not apply."""
+        if self.eliminate is None:
+            return p
+        elimination = self.eliminate(p.theta.C, p.n_f) if p.theta.C.size else None
+        return None if elimination is None else p.eliminated(elimination)
+
+    def certified(self, p: Programs) -> BatchSolution:
+        """Return candidates, completed and certified; active sets that do not settle are none."""
+        qps = p.reduced_qps()
+        if self.start is not None:
+            candidate, settled = p.try_active_sets(qps, self.start)
+            solution = p.recover(candidate)
+            solution.residual[~settled] = np.inf
+            return solution
+        solve = self.solve if qps.l.shape[-1] else _unconstrained
+        return p.recover(solve(qps).like(p.fixed), PASSES if self.eliminate else 0)
+
+
+def strategies(solver: str, start: Array | None) -> list[Strategy]:
+    """Return the ways to solve QPs, each for those that the ones before do not solve.
+
+    Other eliminations follow the solver, for ill-conditioned QPs, and then other solvers.
+    """
+    own = backend(solver)
+    last_sets = [] if start is None else [Strategy(own, start)]
+    eliminations = [Strategy(BACKENDS["torch"], eliminate=way) for way in OTHER_ELIMINATIONS]
+    return [*last_sets, Strategy(own), *eliminations, *map(Strategy, fallbacks(solver))]
+
+
+def _unconstrained(qps: SoftQPs) -> BackendSolution:
+    """Solve QPs without rows in closed form; the certificate rejects unbounded ones."""
+    H, _, group, g, lam, _, _ = qps.in_torch()
+    v = torch.einsum("bij,bj->bi", torch.linalg.pinv(H, hermitian=True)[group], -g)
+    return BackendSolution(v, lam, torch.zeros_like(group))
+
+
 def solve_programs(p: Programs, solver: str, start: Array | None = None) -> BatchSolution:
     """Solve and certify B QPs; the status of an unsolved one is its diagnosis.
 
@@ -210,173 +255,91 @@ def solve_programs(p: Programs, solver: str, start: Array | None = None) -> Batc
     log = _active_log.get(unused := SolveLog())
     units = p.prepared.units
     if units is None:
-        solution = _solve(p, solver, start, log)
+        solution = _solved(p, solver, start, log)
     else:
-        scaled = _scaled(p)
-        solution = units.restored(_solve(scaled, solver, start, log), scaled.group)
-        solution = _settled(p.on_cpu(), solver, solution.on_cpu())
+        scaled = p.scaled()
+        solution = units.restored(_solved(scaled, solver, start, log), scaled.group)
+        solution = _confirmed(p.on_cpu(), solver, solution.on_cpu())
     if log is not unused:
         log.add(solution, time.perf_counter() - began)
     return solution
 
 
-def _scaled(p: Programs) -> Programs:
-    """Return the QPs in their own units."""
-    prepared = p.prepared.scaled
-    assert p.prepared.units is not None
-    return Programs(
-        prepared, p.group, p.fixed / per_qp(p.prepared.units.length, p.group)[:, : p.n_f]
-    )
+def _solved(p: Programs, solver: str, start: Array | None, log: SolveLog) -> BatchSolution:
+    """Try one strategy after the other on the QPs without a certified solution.
+
+    The first runs on the device of ``p``. What it leaves is diagnosed: a QP that is proved to have
+    no solution is tried no further.
+    """
+    todo, solution, status = p.solvable(), None, np.full(len(p), int(Status.NOT_CONVERGED))
+    if todo is not None:
+        status[:] = Status.INVALID_DATA
+        solution, status[todo] = p.unsolved(status), Status.NOT_CONVERGED
+        todo = on_device(todo, p.prepared.device)
+        start = None if start is None else start[todo]
+    ways = strategies(solver, start)
+    own = ways[start is not None]  # what the solver itself leaves is diagnosed
+    for way in ways:
+        if todo is not None and not len(todo):
+            break
+        rest = way.prepared(p if todo is None else p.take(todo))
+        if rest is None:
+            continue
+        answer = way.certified(rest)
+        if way.start is not None:
+            log.recalled += int(answer.accepted().sum())
+        if todo is None and answer.all_accepted:
+            return answer
+        if way.start is None and not answer.all_accepted:  # what follows needs the CPU
+            p, rest, answer, last = p.on_cpu(), rest.on_cpu(), answer.on_cpu(), way is ways[-1]
+            solution, todo = (
+                solution and solution.on_cpu(),
+                None if todo is None else to_numpy(todo),
+            )
+            rejected = ~answer.accepted() & (last | (answer.residual <= NEARLY))
+            refine(rest, answer, np.flatnonzero(rejected), last)
+        left = indices(~answer.accepted())
+        if solution is None or todo is None:
+            solution, todo = answer, left
+        else:
+            solution.put(todo, answer)
+            todo = todo[left]
+        if way is own and len(todo):
+            log.fallback += len(todo)
+            status[todo] = diagnose(p.take(todo))
+            todo = todo[status[todo] == Status.NOT_CONVERGED]
+    assert solution is not None
+    if not solution.all_accepted:
+        p, solution = p.on_cpu(), solution.on_cpu()
+        solution.clear(np.flatnonzero(~solution.accepted()), p.unsolved(status))
+    return solution
 
 
-def _settled(p: Programs, solver: str, solution: BatchSolution) -> BatchSolution:
+def _confirmed(p: Programs, solver: str, solution: BatchSolution) -> BatchSolution:
     """Certify scaled solutions in the original numbers, too; solve second those that fail.
 
     The units depend on the bounds. A bound that is far from every solution, such as a large number
     in place of inf, makes them so large that a certificate in these units misses errors.
     """
-    units = p.prepared.units
+    units, accepted = p.prepared.units, np.flatnonzero(solution.accepted())
     assert units is not None
-    accepted = np.flatnonzero(solution.accepted())
-    failed = accepted[_certify_at(p, solution, accepted)]
-    failed = refine(p, solution, failed)
+    failed = refine(p, solution, _refuted(p, solution, accepted))
     if len(failed):
-        failing = p.take(failed)
-        second = _solve(failing, solver, None, SolveLog())
-        solution.put(failed, second)
+        solution.put(failed, _solved(p.take(failed), solver, None, SolveLog()))
         in_units = units.inverse().restored(solution, p.group)
         failed = failed[solution.accepted()[failed]]
-        failed = failed[_certify_at(_scaled(p), in_units, failed)]
-        solution.put(failed, _unsolved(p.take(failed), Status.NOT_CONVERGED))
+        failed = _refuted(p.scaled(), in_units, failed)
+        solution.put(failed, p.unsolved(np.full(len(p), int(Status.NOT_CONVERGED))).at(failed))
     return solution
 
 
-def _certify_at(p: Programs, solution: BatchSolution, at: np.ndarray) -> np.ndarray:
-    """Raise the residuals at the indices ``at`` to those of ``p``; return the mask of failures."""
-    if not len(at):
-        return np.zeros(0, bool)
-    solved = solution.at(at)
-    part = p if len(at) == len(p) else p.take(at)
+def _refuted(p: Programs, solution: BatchSolution, which: np.ndarray) -> np.ndarray:
+    """Raise the residuals at the indices ``which`` to those of ``p``; return those rejected."""
+    if not len(which):
+        return which
+    solved = solution.at(which)
+    part = p if len(which) == len(p) else p.take(which)
     _, residual, error = part.certify(solved.z, solved.lam, solved.chi, solved.xi)
-    solution.residual[at] = np.maximum(solved.residual, residual)
-    solution.value_error[at] = np.maximum(solved.value_error, error)
-    return (residual > TOLERANCE) | (error > TOLERANCE)
-
-
-def _solve(p: Programs, solver: str, start: Array | None, log: SolveLog) -> BatchSolution:
-    """Solve with the chosen solver, and by fallbacks if the certificate rejects the result."""
-    index = _solvable(p)
-    if index is None:
-        solution = _attempt(p, backend(solver), start, log)
-        if not solution.all_accepted:
-            solution = _solved_otherwise(p.on_cpu(), solution.on_cpu(), solver, log)
-        return solution
-    solution = _unsolved(p.on_cpu(), Status.INVALID_DATA)
-    if len(index):
-        start = None if start is None else start[on_device(index, p.prepared.device)]
-        solution.put(index, _solve(p.take(index), solver, start, log).on_cpu())
-    return solution
-
-
-def _solvable(p: Programs) -> np.ndarray | None:
-    """Return the indices of QPs with valid data and a convex cost; None for all.
-
-    First-order conditions certify an optimum only where the QP is convex.
-    """
-    valid = p.valid()
-    if valid is None:
-        convex = p.prepared.convex(p.n_f)
-        return None if convex is None else np.flatnonzero(convex[to_numpy(p.group)])
-    index = np.flatnonzero(valid)
-    rest = _solvable(p.take(index)) if len(index) else None
-    return index if rest is None else index[rest]
-
-
-def _attempt(
-    p: Programs,
-    solve: Backend,
-    start: Array | None,
-    log: SolveLog,
-    passes: int = 0,
-    nearly: float = NEARLY,
-) -> BatchSolution:
-    """Solve once, from the active sets ``start`` unless None, and certify the result.
-
-    Rejected solutions with a residual up to ``nearly`` are refined.
-    """
-    qps = p.reduced_qps()
-    settled = None
-    if not qps.l.shape[-1]:
-        claim = _unconstrained(qps).like(p.fixed)
-    elif start is None:
-        claim = solve(qps).like(p.fixed)
-    else:
-        claim, settled = p.try_active_sets(qps, start)
-        _replace(claim, ~settled, qps, solve)
-    solution = p.recover(claim, passes)
-    if settled is not None:
-        kept = settled & solution.accepted()
-        log.recalled += int(kept.sum())
-        if _replace(claim, settled & ~kept, qps, solve):
-            solution = p.recover(claim, passes)
-    if not solution.all_accepted:
-        solution = solution.on_cpu()
-        rejected = ~solution.accepted() & (solution.residual <= nearly)
-        refine(p.on_cpu(), solution, np.flatnonzero(rejected), last=nearly == np.inf)
-    return solution
-
-
-def _replace(claim: BackendSolution, where: Array, qps: SoftQPs, solve: Backend) -> bool:
-    """Solve the QPs in the mask ``where`` again, in place; return False if there are none."""
-    if not where.any():
-        return False
-    claim.put(where, solve(qps.take(where)).like(where))
-    return True
-
-
-def _unconstrained(qps: SoftQPs) -> BackendSolution:
-    """Solve QPs without rows in closed form; the certificate rejects unbounded ones."""
-    H, _, group, g, lam, _, _ = qps.in_torch()
-    v = torch.einsum("bij,bj->bi", torch.linalg.pinv(H, hermitian=True)[group], -g)
-    return BackendSolution(v, lam, torch.zeros_like(group))
-
-
-def _solved_otherwise(
-    p: Programs, solution: BatchSolution, solver: str, log: SolveLog
-) -> BatchSolution:
-    """Diagnose rejected QPs, and solve those that may have a solution by fallbacks.
-
-    Other eliminations of C z = b come first, for ill-conditioned QPs, then the other solvers.
-    """
-    todo = np.flatnonzero(~solution.accepted())
-    log.fallback += len(todo)
-    rest = p.take(todo)
-    errors = {name: getattr(solution, name)[todo] for name in ("residual", "value_error")}
-    failed = _unsolved(rest, Status.NOT_CONVERGED)._replace(**errors)
-    solution.put(todo, failed._replace(status=diagnose(rest)))
-    todo = todo[solution.status[todo] == Status.NOT_CONVERGED]
-    ways = [(eliminate, BACKENDS["torch"], PASSES) for eliminate in OTHER_ELIMINATIONS]
-    ways += [(None, other, 0) for other in fallbacks(solver)]
-    for position, (eliminate, solve, passes) in enumerate(ways):
-        if not len(todo):
-            break
-        rest = p.take(todo)
-        if eliminate is not None:
-            elimination = eliminate(rest.theta.C, rest.n_f) if rest.theta.C.size else None
-            if elimination is None:
-                continue
-            prepared = rest.prepared.eliminated(elimination, rest.n_f)
-            rest = Programs(prepared, rest.group, rest.fixed)
-        nearly = NEARLY if position < len(ways) - 1 else np.inf
-        second = _attempt(rest, solve, None, log, passes, nearly)
-        accepted = second.accepted()
-        solution.put(todo[accepted], second.at(accepted))
-        todo = todo[~accepted]
-        solution.residual[todo] = second.residual[~accepted]
-        solution.value_error[todo] = second.value_error[~accepted]
-    return solution
-
-
-def _unsolved(p: Programs, status: Status) -> BatchSolution:
-    _, C, G, q, *_ = p.theta
-    return unsolved(p.fixed, q.shape[-1], C.shape[1], G.shape[1], status)
+    solution.residual[which] = np.maximum(solved.residual, residual)
+    solution.value_error[which] = np.maximum(solved.value_error, error)
+    return which[(residual > TOLERANCE) | (error > TOLERANCE)]

@@ -9,8 +9,12 @@ Mehrotra's method (1992, doi:10.1137/0802028) reduces both products together. El
 by side leaves ``(H + G'DG) dv = right`` with the diagonal ``1 / D = s / lam + t / mu``: an
 iteration costs one batched product and one d x d Cholesky factor, used twice. Infinite weights and
 bounds are huge numbers, whose pairs are inert; a hard equality, which has no interior, has a
-penalty and a multiplier of its own. At the end, `active_set` identifies the active set and solves
-for it.
+penalty and a multiplier of its own. Nothing loops over the batch.
+
+At the end, `settle` identifies the active set and solves for it. With fixed states of the rows (see
+`torch_qpmpc.qp.solution.row_states`), the KKT conditions are linear, and the method of multipliers
+solves them: a large curvature holds the active rows, and each pass reduces its error by orders of
+magnitude. One d x d Cholesky factor without pivoting suffices, even for dependent rows.
 """
 
 from __future__ import annotations
@@ -20,10 +24,26 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from torch_qpmpc.qp.kernels.sample_torch import largest
 from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
-from torch_qpmpc.qp.solvers.active_set import SETTLED, Best, settle
-from torch_qpmpc.qp.solvers.batched import HUGE, BatchedQPs
+from torch_qpmpc.qp.solution import row_states
 
+#: Replaces infinity: its reciprocal vanishes in sums, and its square does not overflow.
+HUGE = 1e100
+#: A row up to this narrow, relative to its larger bound, counts as an equality.
+NARROW = 1e-6
+#: A typical multiplier, relative to the largest force.
+TYPICAL = 0.05
+#: Least typical curvature, relative to the largest force over a length.
+FLAT = 1e-2
+#: Curvatures that hold a row at its bound and damp every step, relative to the typical one.
+PENALTY, DAMPING = 1e10, 1e-10
+#: Added to a matrix that is indefinite by rounding, relative to its largest diagonal entry.
+ROUNDING = 1e-12
+#: A solution with this relative residual needs no further step.
+SETTLED = 1e-9
+#: Passes of the method of multipliers per Newton step.
+MULTIPLIER_PASSES = 3
 #: Gaps, relative to a typical cost, at which active sets are tried, each with its iteration limit.
 TARGETS = ((1e-4, 40), (1e-8, 15), (1e-12, 10))
 #: Largest number of active-set steps at each gap.
@@ -38,6 +58,178 @@ MILD = 0.3
 LATE, CAUTION = 20, 0.3
 #: Solved QPs are removed from the computation if at most this fraction is unsolved.
 SHRINK = 0.75
+
+
+@dataclass(frozen=True)
+class BatchedQPs:
+    """`SoftQPs` with `HUGE` for infinity, and typical sizes.
+
+    H and G are ``(1, ..)`` if the batch shares them, and ``products`` then holds the outer products
+    of G's rows, ``(r, d d)``; else they are ``(B, ..)``. Typical sizes make all decisions
+    independent of units: the ``width`` between a row's bounds, the ``force`` of its multiplier, the
+    ``penalty`` that holds it, ``(B, r)``; the ``cost``, or least width times force, and the
+    ``curvature``, ``(B,)``.
+    """
+
+    H: Tensor
+    G: Tensor
+    products: Tensor | None
+    g: Tensor
+    lower: Tensor
+    upper: Tensor
+    w: Tensor
+    width: Tensor
+    force: Tensor
+    penalty: Tensor
+    cost: Tensor
+    curvature: Tensor
+
+    @classmethod
+    def of(cls, qps: SoftQPs) -> BatchedQPs:
+        H, G, g, products = qps.H, qps.G, qps.g, None
+        if len(H) == 1:
+            products = (G[0].unsqueeze(-1) * G[0].unsqueeze(-2)).flatten(1)
+        else:
+            H, G = H[qps.group], G[qps.group]
+        lower, upper, w = qps.l.clamp(min=-HUGE), qps.u.clamp(max=HUGE), qps.w.clamp(max=HUGE)
+        size = _largest(G).squeeze(-1)
+        size = torch.where(size > 1 / HUGE, size, 1.0)
+        width = (upper - lower) / size
+        narrow = upper - lower <= NARROW * lower.abs().maximum(upper.abs())
+        known = ~narrow & (width < 1e-10 * HUGE)
+        median = width.masked_fill(~known, torch.nan).nanmedian(-1, keepdim=True).values
+        median = median.nan_to_num(1.0)
+        width = torch.where(known, width, median).maximum(1e-3 * median)
+        length, stiffest = width.amin(-1, keepdim=True), _largest(H.flatten(1))
+        push = _largest(g) + stiffest * length
+        push = torch.where(push > 0, push, 1.0)
+        curvature = stiffest.maximum(FLAT * push / length)
+        width, force = width * size, TYPICAL * push / size
+        penalty, cost = PENALTY * curvature / size.square(), (force * width).amin(-1)
+        curvature = curvature.squeeze(-1)
+        typical = (width, force, penalty, cost, curvature)
+        return cls(H, G, products, g, lower, upper, w, *typical)
+
+    def __len__(self) -> int:
+        return len(self.g)
+
+    def take(self, index: Tensor) -> BatchedQPs:
+        """Return the QPs at ``index``."""
+        same = ("H", "G", "products") if self.products is not None else ("products",)
+        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
+        return BatchedQPs(**{n: t if n in same else t[index] for n, t in tensors.items()})
+
+    def apply_H(self, v: Tensor) -> Tensor:
+        """Return H v, ``(B, d)``."""
+        return self._multiply(self.H, v)
+
+    def rows(self, v: Tensor) -> Tensor:
+        """Return y = G v, ``(B, r)``."""
+        return self._multiply(self.G, v)
+
+    def apply_Gt(self, lam: Tensor) -> Tensor:
+        """Return G' lam, ``(B, d)``."""
+        return self._multiply(self.G.mT, lam)
+
+    def factor(self, weight: Tensor) -> Tensor:
+        """Return Cholesky factors of ``H + G' diag(weight) G``, slightly damped, ``(B, d, d)``."""
+        if self.products is not None:
+            normal = torch.addmm(self.H.flatten(1), weight, self.products)
+            normal = normal.unflatten(1, self.H.shape[1:])
+        else:
+            normal = torch.baddbmm(self.H, (self.G * weight.unsqueeze(-1)).mT, self.G)
+        diagonal = normal.diagonal(dim1=-2, dim2=-1)
+        diagonal += DAMPING * self.curvature.unsqueeze(-1)
+        factor, info = torch.linalg.cholesky_ex(normal)
+        if (failed := info > 0).any():
+            diagonal += ROUNDING * diagonal.amax(-1, keepdim=True)
+            factor[failed] = torch.linalg.cholesky_ex(normal[failed])[0]
+        return factor
+
+    def residual(self, v: Tensor, lam: Tensor) -> Tensor:
+        """Return the certificate's relative KKT residual for the condensed QPs, ``(B,)``."""
+        Hv, y, pull = self.apply_H(v), self.rows(v), self.apply_Gt(lam)
+        stationarity = _largest(Hv + self.g + pull)
+        stationarity /= 1 + _largest(torch.cat((Hv, self.g, pull), dim=-1))
+        hard = self.w == HUGE
+        weight, outside = self.w.masked_fill(hard, 0), (y - y.clip(self.lower, self.upper)).abs()
+        violation = _largest(outside * hard / (1 + y.abs()))
+        excess = _largest((lam.abs() - self.w).clamp(min=0) / (1 + weight))
+        charge = weight * outside
+        gap = charge + lam.clamp(min=0) * (self.upper - y) + lam.clamp(max=0) * (self.lower - y)
+        cost = (v * (Hv / 2 + self.g)).sum(-1, keepdim=True) + charge.sum(-1, keepdim=True)
+        gap = gap.abs().sum(-1, keepdim=True) / (1 + cost.abs())
+        errors = (stationarity, violation, excess, gap)
+        return torch.cat(errors, dim=-1).amax(-1).nan_to_num(torch.inf, torch.inf)
+
+    def _multiply(self, matrices: Tensor, vectors: Tensor) -> Tensor:
+        if self.products is not None:
+            return vectors @ matrices[0].mT
+        return torch.bmm(matrices, vectors.unsqueeze(-1)).squeeze(-1)
+
+
+def _largest(x: Tensor) -> Tensor:
+    """Return the largest absolute entry along the last dimension, which is kept."""
+    return largest(x).unsqueeze(-1)
+
+
+@dataclass
+class Best:
+    """The best v ``(B, d)`` and lam ``(B, r)`` so far, their residuals and steps, ``(B,)``."""
+
+    v: Tensor
+    lam: Tensor
+    residual: Tensor
+    steps: Tensor
+
+    @classmethod
+    def initial(cls, qps: BatchedQPs) -> Best:
+        """Return zeros with infinite residuals."""
+        residual = torch.full_like(qps.cost, torch.inf)
+        steps = torch.zeros_like(qps.cost, dtype=torch.int64)
+        return cls(torch.zeros_like(qps.g), torch.zeros_like(qps.w), residual, steps)
+
+    def update(self, index: Tensor, v: Tensor, lam: Tensor, residual: Tensor) -> None:
+        """Take the solutions at ``index`` that lower the residual."""
+        better = residual < self.residual[index]
+        for best, new in ((self.v, v), (self.lam, lam), (self.residual, residual)):
+            mask = better.unsqueeze(-1) if best.ndim > 1 else better
+            best[index] = torch.where(mask, new, best[index])
+
+
+def settle(qps: BatchedQPs, v: Tensor, lam: Tensor, max_steps: int) -> Best:
+    """Take one or more Newton steps from v and lam, until the residual of each QP is `SETTLED`."""
+    todo = torch.arange(len(qps), device=v.device)
+    best = Best(v.clone(), lam.clone(), qps.residual(v, lam), torch.zeros_like(todo))
+    for _ in range(max_steps):
+        v, lam = _newton_step(qps, v, lam)
+        residual = qps.residual(v, lam)
+        best.update(todo, v, lam, residual)
+        best.steps[todo] += 1
+        going = (~(residual <= SETTLED)).nonzero().squeeze(-1)
+        if not len(going):
+            break
+        if len(going) < len(todo):
+            qps, todo, v, lam = qps.take(going), todo[going], v[going], lam[going]
+    return best
+
+
+def _newton_step(qps: BatchedQPs, v: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
+    """Return v and lam with active rows at their bounds, and fixed lam in the others."""
+    y, stiffness = qps.rows(v), qps.force / qps.width
+    nearest, active, multiplier = row_states(
+        y + lam / stiffness, qps.lower, qps.upper, qps.w / stiffness
+    )
+    lam = torch.where(active, lam, multiplier * stiffness)
+    weight = active * qps.penalty
+    factor = qps.factor(weight)
+    for _ in range(MULTIPLIER_PASSES):
+        short = nearest - y
+        right = qps.apply_Gt(weight * short - lam) - qps.apply_H(v) - qps.g
+        dv = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
+        dy = qps.rows(dv)
+        v, y, lam = v + dv, y + dy, lam + weight * (dy - short)
+    return v, lam
 
 
 @torch.no_grad()
@@ -171,12 +363,12 @@ def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: T
     D = ratio.sum(1).reciprocal_().minimum(qps.penalty.unsqueeze(1))
     factor = qps.factor(D.sum(1) + hold)
     short = point.level - y
-    right = qps.pull(hold * short - point.lam) - qps.bend(v) - qps.g
+    right = qps.apply_Gt(hold * short - point.lam) - qps.apply_H(v) - qps.g
     room = point.bound - y.unsqueeze(1)
 
     def direction(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return dv, dy = G dv and dlam = D (dy - offset), which solve the Newton equations."""
-        total = right + qps.pull((D * offset).sum(1))
+        total = right + qps.apply_Gt((D * offset).sum(1))
         dv = torch.cholesky_solve(total.unsqueeze(-1), factor).squeeze(-1)
         dy = qps.rows(dv)
         return dv, dy, (dy.unsqueeze(1) - offset).mul_(D).unsqueeze(1)
