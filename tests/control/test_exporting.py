@@ -208,12 +208,24 @@ def test_an_unstable_loop_is_compared_until_its_outputs_are_absurd(tmp_path, mon
     assert len(controller.review().findings) > 10
 
 
-def test_an_infeasible_step_holds_the_last_input(tmp_path):
-    controller = qm.Controller(integrator(y_slack=np.inf))
+def test_steps_without_a_plan_hold_the_last_input_and_the_estimates_go_on(tmp_path):
+    controller = qm.Controller(integrator(y_bounds=(-1.0, 1.0), y_slack=np.inf))
     twin = load(controller.export_c(tmp_path).files, controller)
-    assert twin.step([3.0], [0.0]) == (np.zeros(1), 2)
-    with pytest.raises(SolverError, match="INFEASIBLE"):
-        controller.step([3.0], [0.0])
+    for first in (0.0, 3.0):
+        controller.reset()
+        twin.reset()
+        codes = []
+        for k, y in enumerate([first, 0.0, 0.1, 0.2, 3.0, 3.0, 2.5, 0.3, 0.2, 0.1, *[0.0] * 5]):
+            r = [0.1 * k] if k % 2 == 0 else None  # the set-point of a step without a plan, too
+            u, code = twin.step([y], r)
+            codes.append(code)
+            if code == 0:
+                assert np.allclose(u, controller.step([y], r), atol=1e-9)
+                continue
+            with pytest.raises(SolverError, match="INFEASIBLE"):
+                controller.step([y], r)
+            assert np.allclose(u, controller.u, atol=1e-9)
+        assert [codes[0], codes[4], codes[-1]] == [2 * (first > 0), 2, 0]
 
 
 def test_the_folder_s_program_runs_without_warnings_and_its_loop_has_no_offset(tmp_path):

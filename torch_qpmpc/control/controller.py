@@ -11,13 +11,14 @@ import torch
 from torch_qpmpc.checks import check_flag, check_kind
 from torch_qpmpc.control.exporting import ControllerExport, export_controller
 from torch_qpmpc.control.findings import Review
-from torch_qpmpc.control.law import Law, Memory
+from torch_qpmpc.control.law import Law, Memory, Signals
 from torch_qpmpc.control.learning import LearningReport, learn
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target, packed, unpacked
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.review import review
 from torch_qpmpc.control.simulation import Run, simulate
 from torch_qpmpc.control.state_space import Array, read_row
+from torch_qpmpc.errors import SolverError
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.proofs import Answer
 
@@ -174,11 +175,17 @@ class Controller:
 
         Raises:
             QPError: an argument is invalid or missing, or a signal is above `max_plausible`.
-            SolverError: no input satisfies the hard bounds.
+            SolverError: no input satisfies the hard bounds. The last input `u` stays in force, and
+                the estimates go on with it.
         """
         law, rows = self._law, self.mpc.horizon + 1
         ahead, measured = law.read_known(known, rows), law.read("y", y, 1)[0]
-        move = law.step(self._memory, measured, law.read_set_points(r, rows, self.r), ahead)
+        signals = Signals(measured, law.read_set_points(r, rows, self.r), ahead)
+        try:
+            move = law.step(self._memory, *signals)
+        except SolverError:
+            self._memory = law.held(self._memory, *signals)
+            raise
         self._memory, self.target, self.p = move.memory, move.target, move.p
         if isinstance(y, Mapping):
             return dict(zip(law.design.plant.inputs, move.u.tolist(), strict=True))

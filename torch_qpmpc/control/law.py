@@ -119,17 +119,28 @@ class Law:
         Raises:
             SolverError: no input satisfies the hard bounds.
         """
-        design, observer = self.design, self.observer
-        e = observer.at_rest(memory.u, known[0], y) if memory.e is None else memory.e
-        e = e + observer.L @ (y - observer.H @ e)
+        design, e = self.design, self._corrected(memory, y, known)
         x, w = np.split(e, [len(design.plant.A)])
         previewed, level = design.references == "preview", known.mean(0)
         target = self.mpc.target(r if previewed else r[0], w, level)
         p = self.mpc.arrange(x, target, u_last=memory.u, known=known, level=level)
         u = (target.u[-1] if previewed else target.u) + self.mpc.policy(p, qp=self.qp)
         u = np.clip(u.numpy(), *design.u_bounds)
-        e = observer.predicted(e, u, known[0])
-        return Move(u, memory._replace(u=u, e=e, r=r, known=known[0]), target, p)
+        return Move(u, self._after(memory, e, u, r, known), target, p)
+
+    def held(self, memory: Memory, y: Array, r: Array, known: Array) -> Memory:
+        """Return the memory after a step without a plan, in which the last input stays."""
+        return self._after(memory, self._corrected(memory, y, known), memory.u, r, known)
+
+    def _corrected(self, memory: Memory, y: Array, known: Array) -> Array:
+        """Return the estimate of x and w from the prediction and the outputs."""
+        observer, e = self.observer, memory.e
+        e = observer.at_rest(memory.u, known[0], y) if e is None else e
+        return e + observer.L @ (y - observer.H @ e)
+
+    def _after(self, memory: Memory, e: Array, u: Array, r: Array, known: Array) -> Memory:
+        e = self.observer.predicted(e, u, known[0])
+        return memory._replace(u=u, e=e, r=r, known=known[0])
 
     def policy(self, memory: Memory) -> Callable[[Signals], Move]:
         """Return `step` as a function that keeps its own memory."""
