@@ -181,7 +181,7 @@ def test_each_configuration_key_has_a_meaning_and_a_value(monkeypatch):
         assert settings, key
         assert key.endswith(".name") or reference.meaning(settings), key
     page = reference.page()
-    assert "| `task.horizon` | N | a whole number >= 1 | `10`; " in page
+    assert "| `task.horizon` | N | `10`; " in page
 
 
 @needs_docs
