@@ -22,12 +22,14 @@ def loaded_after(code: str) -> set[str]:
     return set(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
 
 
-def test_a_qp_alone_and_the_ids_import_nothing_heavy():
+def test_a_qp_a_controller_and_the_ids_import_nothing_heavy():
     code = (
         "import gymnasium, torch, torch_qpmpc\n"
         "from torch_qpmpc import QPMPC, solve_qp\n"
         "gymnasium.spec('torch_qpmpc/PointMass-v0')\n"
-        "QPMPC.of(2, 1, 3).value(torch.ones(2))"
+        "QPMPC.of(2, 1, 3).value(torch.ones(2))\n"
+        "mpc = torch_qpmpc.LinearMPC(([[0.9]], [[0.5]]), 3, Q=1.0)\n"
+        "torch_qpmpc.Controller(mpc).step([0.0], [1.0])"
     )
     assert loaded_after(code) == set()
     spelt = {name for name in HEAVY if importlib.util.find_spec(name)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -20,7 +20,9 @@ from torch_qpmpc.control.simulation import Run, simulate
 from torch_qpmpc.control.state_space import Array, read_row
 from torch_qpmpc.errors import SolverError
 from torch_qpmpc.files import damaged, load_file, save_file
-from torch_qpmpc.proofs import Answer
+
+if TYPE_CHECKING:
+    from torch_qpmpc.proofs import Answer
 
 #: The kind of file that `Controller.save` writes.
 KIND = "Controller"

@@ -8,10 +8,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PAGE = """<!doctype html>
 <meta charset="utf-8">
@@ -23,6 +25,7 @@ img {{ max-width: 100% }}
 </style>
 <h1>Review of a controller</h1>
 <table>
+<tr><th>Finding</th><th></th><th>Numbers</th><th>Remedy</th></tr>
 {table}
 </table>
 {images}
@@ -76,13 +79,6 @@ class Review:
             lines += [f"      {finding.remedy}"] * (not finding.ok)
         return "\n".join(lines)
 
-    def to_markdown(self) -> str:
-        """Return a page with a table of the findings."""
-        rows = [("Finding", "", "Numbers", "Remedy"), ("---",) * 4]
-        rows += [(x.name, "ok" if x.ok else "**fault**", x.text, x.remedy) for x in self.findings]
-        cells = ("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)
-        return "\n".join(("# Review of a controller", "", *cells, ""))
-
     def to_html(self, path: str | Path, *figures: Figure) -> None:
         """Write a page with a table of the findings and ``figures`` below it, such as a `Run`'s.
 
@@ -91,13 +87,10 @@ class Review:
         Raises:
             OSError: writing failed.
         """
-        rows = [("th", ("Finding", "", "Numbers", "Remedy"))]
-        rows += [
-            ("td", (x.name, "ok" if x.ok else "fault", x.text, x.remedy)) for x in self.findings
-        ]
+        rows = [(x.name, "ok" if x.ok else "fault", x.text, x.remedy) for x in self.findings]
         table = "\n".join(
-            "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row) + "</tr>"
-            for tag, row in rows
+            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
+            for row in rows
         )
         images = []
         for figure in figures:

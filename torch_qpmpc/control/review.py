@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import product
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import scipy.optimize
+import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 
 from torch_qpmpc.checks import check_kind
@@ -25,10 +25,12 @@ from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.tables import SINGULAR, Tables, digest, make_tables
 from torch_qpmpc.export.writer import Settings, state_bytes, table_bytes
-from torch_qpmpc.proofs import Answer
 from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solve import solve_qp
+
+if TYPE_CHECKING:
+    from torch_qpmpc.proofs import Answer
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
 MARGIN, CONDITION, SPREAD, HIDDEN = 0.3, 1e8, 1e4, 1e-3
@@ -437,6 +439,8 @@ def _weights(design: Design, shares: Mapping[str, float]) -> Finding:
 
 def _proof(name: str, answer: Answer, digest: str) -> Finding:
     """A claim about the policy is proved; of a refuted one, the worst run is shown."""
+    from torch_qpmpc.proofs import Answer  # imports scipy.optimize
+
     check_kind("proofs", answer, Answer, "Pass what a question of torch_qpmpc.proofs returns.")
     if answer.digest != digest:
         remedy = "Ask again, after the controller has changed."

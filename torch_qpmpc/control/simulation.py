@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
-from torch_qpmpc.analysis.plots import episode_figure
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design, half_range, middle
 from torch_qpmpc.control.law import Law, Memory, Move, Signals
@@ -25,6 +23,9 @@ from torch_qpmpc.control.state_space import (
 )
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.loops import Step, run_loop
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Steps of the probe, and of each of its set-points.
 PROBED, HELD = 100, 25
@@ -86,6 +87,8 @@ class Run:
 
     def plot(self) -> Figure:
         """Return a figure with a panel for each output, input and known signal."""
+        from torch_qpmpc.analysis.plots import episode_figure  # imports matplotlib
+
         plant = self.design.plant
         step = 1.0 if plant.dt is None else plant.dt
         times, y, u, r = (
