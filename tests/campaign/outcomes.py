@@ -17,8 +17,8 @@ from tests.campaign.draws import ACCURACY
 from tests.campaign.families import Case
 from tests.problems import times
 from torch_qpmpc import Status
-from torch_qpmpc.qp.autograd import EVENT_NDIMS
 from torch_qpmpc.qp.solution import QPSolution, slacks
+from torch_qpmpc.qp.solve import EVENT_NDIMS
 
 #: Tolerance of a value, relative to the largest of its own terms.
 VALUE = 1e-6

@@ -15,11 +15,10 @@ from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states, solution_of
 from torch_qpmpc import QPMPC, QPError, QuadraticProgram, SolverError, Status, solve_qp
-from torch_qpmpc.qp.autograd import solve_op
 from torch_qpmpc.qp.kkt import kkt_op
 from torch_qpmpc.qp.program import EVENT_SHAPES
 from torch_qpmpc.qp.solution import QPSolution
-from torch_qpmpc.qp.solve import solve
+from torch_qpmpc.qp.solve import solve, solve_op
 
 SOLUTION = (
     *("value", "z", "sigma", "chi", "upsilon", "eta", "mu", "xi"),

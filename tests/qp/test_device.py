@@ -229,7 +229,7 @@ WAITS = {
     "qp/kernels/sample_torch.py:_solve": "skips saturated rows, often none",
     "qp/kernels/sample_torch.py:hold": "ends its refinements",
     "qp/kernels/sample_torch.py:try_active_sets": "the QPs whose sets are not settled",
-    "qp/kkt.py:_held_rows": "skips weakly active rows, often none",
+    "qp/kkt.py:_rows_at_bounds": "skips weakly active rows, often none",
     "qp/kkt.py:_solve_active": "ends its refinements; the QPs that need another way",
     "qp/kkt.py:_solve_kkt": "skips gradients that are zero",
     "qp/kkt.py:solve_kkt": "the QPs that are solved",

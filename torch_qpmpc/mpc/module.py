@@ -43,7 +43,7 @@ from torch_qpmpc.mpc.validation import (
     learned_entries,
 )
 from torch_qpmpc.qp.batching import full_precision, to_dtype
-from torch_qpmpc.qp.forking import serially_if_forked
+from torch_qpmpc.qp.tracing import serially_if_forked
 from torch_qpmpc.qp.pipeline.solve import ON_FAILURE
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution

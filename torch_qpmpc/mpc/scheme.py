@@ -18,7 +18,7 @@ from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import SIZES, Layout
 from torch_qpmpc.mpc.model import Model
-from torch_qpmpc.qp.forking import serially_if_forked
+from torch_qpmpc.qp.tracing import serially_if_forked
 
 #: The paper's discount, the default.
 GAMMA = 0.9

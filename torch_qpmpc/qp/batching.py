@@ -84,3 +84,9 @@ def full_precision(like: Tensor) -> AbstractContextManager[object]:
     if device == "meta" or not torch.is_autocast_enabled(device):
         return nullcontext()
     return torch.autocast(device, enabled=False)
+
+
+def schema(tensors: Sequence[str], others: str, n_outputs: int) -> str:
+    """Return the schema of a custom operator with arguments of these names, and tensors back."""
+    inputs = ", ".join(f"Tensor {name}" for name in tensors)
+    return f"({inputs}, {others}) -> ({', '.join(['Tensor'] * n_outputs)})"

@@ -42,11 +42,10 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.qp.batching import outer, sum_to, times, weighted_sum
-from torch_qpmpc.qp.forking import serially_if_forked
 from torch_qpmpc.qp.kkt import kkt
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solution import saturated_rows, slacks, upper_share
-from torch_qpmpc.qp.tracing import is_differentiating
+from torch_qpmpc.qp.tracing import is_differentiating, serially_if_forked
 
 #: Tangents of H, q, c, C, b, G, lb, ub, w, fixed; None for zero.
 Tangents = Sequence[Tensor | None]
@@ -160,30 +159,21 @@ def _solution_gradients(
 
 @serially_if_forked
 def tangents(
-    d_theta: Tangents,
-    theta: Sequence[Tensor],
-    solution: Sequence[Tensor],
-    n_kept: int,
+    d_theta: Tangents, theta: Sequence[Tensor], solution: Sequence[Tensor], n_kept: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return the tangents of value, z, chi, lam and xi from ``d_theta``, those of theta."""
     z, chi, lam, xi, status = solution
     sigma = slacks(z, *theta[5:9])
     upper = upper_share(z, lam, *theta[5:8])
-    rise = _value_tangent(d_theta, z, sigma, chi, lam, upper * lam, xi)
-    value = torch.where(status == 0, rise, 0)
+    value = _value_tangent(d_theta, z, sigma, chi, lam, upper * lam, xi)
+    value = torch.where(status == 0, value, 0)
     *right, saturated = _right_side(d_theta, z, lam, chi, xi, upper, theta[5], theta[8])
     dz, dchi, dlam, dxi = kkt(*right, z, lam, status, *theta, n_kept)
     return value, dz, dchi, dlam + saturated, dxi
 
 
 def _value_tangent(
-    d_theta: Tangents,
-    z: Tensor,
-    sigma: Tensor,
-    chi: Tensor,
-    lam: Tensor,
-    eta: Tensor,
-    xi: Tensor,
+    d_theta: Tangents, z: Tensor, sigma: Tensor, chi: Tensor, lam: Tensor, eta: Tensor, xi: Tensor
 ) -> Tensor:
     dH, dq, dc, dC, db, dG, dlb, dub, dw, dfixed = d_theta
     total = z.new_zeros(z.shape[:-1])

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, times
+from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, schema, times
 from torch_qpmpc.qp.kernels.sample_torch import largest, multiply
 from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, native_device, to_numpy, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.program import NDIMS, Status
+from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, Status
 from torch_qpmpc.qp.solution import active_rows
 from torch_qpmpc.qp.tracing import has_values, is_differentiating
 
@@ -35,47 +35,37 @@ PARALLEL = 1e-6
 KKT_NDIMS = (1, 1, 1, 1, 1, 1, 0, *NDIMS, 1)
 
 
+class KKTSolution(NamedTuple):
+    """p ``(*batch, n_z)``, r ``(*batch, n_c)``, t ``(*batch, n_g)`` and u ``(*batch, n_f)``."""
+
+    p: Tensor
+    r: Tensor
+    t: Tensor
+    u: Tensor
+
+
 def kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Call `solve_kkt` in the form that the current trace supports; its derivative raises."""
     if torch.compiler.is_compiling():
         return kkt_op(*arguments)
     if not is_differentiating() and has_values(*arguments[:-1]):
         return solve_kkt(*arguments)
-    return KKTSolution.apply(*arguments)
+    return Opaque.apply(*arguments)
 
 
-def solve_kkt(
-    grad_z: Tensor,
-    grad_lam: Tensor,
-    grad_chi: Tensor,
-    grad_xi: Tensor,
-    z: Tensor,
-    lam: Tensor,
-    status: Tensor,
-    H: Tensor,
-    q: Tensor,
-    c: Tensor,
-    C: Tensor,
-    b: Tensor,
-    G: Tensor,
-    lb: Tensor,
-    ub: Tensor,
-    w: Tensor,
-    fixed: Tensor,
-    n_kept: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def solve_kkt(*arguments: Any) -> KKTSolution:
     """Solve the KKT system for p, r, t and u, in condensed form for the whole batch at once.
 
-    Returns:
-        p ``(*batch, n_z)``, r ``(*batch, n_c)``, t ``(*batch, n_g)``, u ``(*batch, n_f)``; zero
-        for unsolved elements.
+    Args:
+        arguments: the gradients in z, lam, chi and xi; z, lam and status; H, q, c, C, b, G, lb, ub,
+            w and fixed; and n_kept, see `Programs.of`. The gradients of unsolved elements are zero.
     """
+    grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, fixed, n_kept = arguments
     # Under vmap the gradients may have batch dimensions that the QP lacks.
     vectors = (grad_z, grad_lam, grad_chi, grad_xi, z, lam, fixed)
     batch = broadcast(*(x.shape[:-1] for x in vectors), status.shape)
     fixed = fixed.expand(*batch, fixed.shape[-1])
-    theta = (H, q, c, C, b, G, lb, ub, w, fixed)
-    programs, batch = Programs.of(*theta, n_kept=n_kept, device=native_device(z))
+    programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=native_device(z))
     solved = (status == Status.SOLVED).expand(batch).reshape(-1)
     which, solvable = slice(None), programs
     if not solved.all():
@@ -87,30 +77,23 @@ def solve_kkt(
 
     right = flat(grad_z), flat(grad_lam), flat(grad_chi), flat(grad_xi)
     solutions = _solve_kkt(solvable, *right, flat(z), flat(lam)) if len(solvable) else ()
-    results = tuple(z.new_zeros(len(solved), x.shape[-1]) for x in (z, b, lb, fixed))
+    like = z, theta[4], lam, fixed
+    results = tuple(z.new_zeros(len(solved), x.shape[-1]) for x in like)
     for x, solution in zip(results, solutions, strict=False):
         x[which] = solution.to(x)
-    return tuple(x.reshape(*batch, x.shape[-1]) for x in results)  # pyright: ignore[reportReturnType] - a tuple of four
+    return KKTSolution._make(x.reshape(*batch, x.shape[-1]) for x in results)
 
 
-def _solve_kkt(
-    p: Programs,
-    grad_z: Tensor,
-    grad_lam: Tensor,
-    grad_chi: Tensor,
-    grad_xi: Tensor,
-    z: Tensor,
-    lam: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    n_f, theta = p.n_f, p.prepared.theta
+def _solve_kkt(programs: Programs, grad_z, grad_lam, grad_chi, grad_xi, z, lam) -> KKTSolution:
+    n_f, theta = programs.n_f, programs.prepared.theta
 
     def tensor(x: Any) -> Tensor:
         return torch.as_tensor(x, device=z.device)
 
-    group = tensor(p.group)
+    group = tensor(programs.group)
     H, C, G = tensor(theta.H), tensor(theta.C), tensor(theta.G)
-    T, Y_neg, H_y, G_y, _, _ = map(tensor, p.prepared.condensed(n_f).arrays)
-    active = _held_rows(p, multiply(G, group, z), lam)
+    T, Y_neg, H_y, G_y, _, _ = map(tensor, programs.prepared.condensed(n_f).arrays)
+    active = _rows_at_bounds(programs, multiply(G, group, z), lam)
     T_f, T = T[:, :, :n_f], T[:, :, n_f:]
     right, right_t, particular = grad_z, grad_lam, torch.zeros_like(z)
     if grad_chi.any() or grad_xi.any():
@@ -119,15 +102,15 @@ def _solve_kkt(
         right = right - multiply(H, group, particular)
         right_t = right_t - multiply(G, group, particular)
     system = H_y[:, n_f:, n_f:], G_y[:, :, n_f:], active, multiply(T.mT, group, right)
-    v, t = _solve_active(p, *system, torch.where(active, right_t, 0))
+    v, t = _solve_active(programs, *system, torch.where(active, right_t, 0))
     p_z = particular + multiply(T, group, v)
     left = grad_z - multiply(H, group, p_z) - multiply(G.mT, group, t)
     r = -multiply(Y_neg.mT, group, left)
     u = left[:, :n_f] - multiply(C[:, :, :n_f].mT, group, r)
-    return p_z, r, t, u
+    return KKTSolution(p_z, r, t, u)
 
 
-def _held_rows(p: Programs, y: Tensor, lam: Tensor) -> Tensor:
+def _rows_at_bounds(programs: Programs, y: Tensor, lam: Tensor) -> Tensor:
     """Return the mask of rows y = G z that stay at a bound if the data change, ``(B, n_g)``.
 
     They are those of `active_rows`, and those that `implied_equalities` adds; rows without a free
@@ -137,21 +120,21 @@ def _held_rows(p: Programs, y: Tensor, lam: Tensor) -> Tensor:
     def tensor(x: Any) -> Tensor:
         return torch.as_tensor(x, device=y.device)
 
-    lb, ub, w = map(tensor, p.theta[6:9])
-    if (units := p.prepared.units) is not None:  # zero and equal are relative to these
-        rows, cost = tensor(units.rows)[p.group], tensor(units.cost)[p.group]
+    lb, ub, w = map(tensor, programs.theta[6:9])
+    if (units := programs.prepared.units) is not None:  # zero and equal are relative to these
+        rows, cost = tensor(units.rows)[programs.group], tensor(units.cost)[programs.group]
         y, lb, ub, lam, w = y / rows, lb / rows, ub / rows, lam * (rows / cost), w * (rows / cost)
     held, saturated = active_rows(lam, lb, ub, w)
-    condensed = p.prepared.condensed(p.n_f)
-    entering = tensor(condensed.enters[:, p.n_f :].any(-1))
+    condensed = programs.prepared.condensed(programs.n_f)
+    entering = tensor(condensed.enters[:, programs.n_f :].any(-1))
     near, free = AT_BOUND * (1 + y.abs()), ~(held | saturated) & entering
     held &= entering
     lower, upper = free & (y - lb <= near), free & (ub - y <= near)
     if (weak := (lower | upper).any(-1)).any():
         index = to_numpy(weak.nonzero().squeeze(-1))
-        G = condensed.arrays.G[:, :, p.n_f :]
+        G = condensed.arrays.G[:, :, programs.n_f :]
         masks = (to_numpy(x)[index] for x in (lower, upper, held))
-        implied = _all_implied(G, to_numpy(p.group)[index], *masks)
+        implied = _all_implied(G, to_numpy(programs.group)[index], *masks)
         held[weak] |= torch.from_numpy(implied).to(held.device)
     return held
 
@@ -207,23 +190,23 @@ def implied_equalities(
 
 
 def _solve_active(
-    p: Programs, H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
+    programs: Programs, H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Solve ``H v + G't = right_v, G v = right_t``; t and right_t are zero in inactive rows.
 
     H is factorised once for each theta, and the Schur complement of the active rows for each QP,
     unless every QP has a theta of its own.
     """
-    group = torch.as_tensor(p.group, device=H.device)
+    group = torch.as_tensor(programs.group, device=H.device)
     if 1 < len(H) == len(group):
         return _solve_dense(H[group], G[group], active, right_v, right_t)
-    rise = to_tensor(p.prepared.forces(p.n_f).rise)
+    to_g = to_tensor(programs.prepared.sensitivities(programs.n_f).to_g)
     v, t, of_v, of_t = torch.zeros_like(right_v), torch.zeros_like(right_t), right_v, right_t
     size = terms = largest(right_v) * 0
     regular = size < 0
     for _ in range(PASSES):
-        free = multiply(rise.mT, group, of_v)
-        dv, dt = p.hold(free, active, of_t)
+        free = multiply(to_g.mT, group, of_v)
+        dv, dt = programs.hold(free, active, of_t)
         v, t = v + dv, t + dt
         of_v = right_v - multiply(H, group, v) - multiply(G.mT, group, t)
         of_t = torch.where(active, right_t - multiply(G, group, v), 0)
@@ -290,7 +273,10 @@ def _solve_rows(
     return solution[:, :d, 0], solution[:, d:, 0]
 
 
-kkt_op = torch.library.custom_op("torch_qpmpc::solve_kkt", solve_kkt, mutates_args=())
+NAMES = ("grad_z", "grad_lam", "grad_chi", "grad_xi", "z", "lam", "status", *EVENT_SHAPES, "fixed")
+kkt_op = torch.library.custom_op(
+    "torch_qpmpc::solve_kkt", solve_kkt, mutates_args=(), schema=schema(NAMES, "int n_kept", 4)
+)
 
 
 @kkt_op.register_fake
@@ -303,7 +289,7 @@ def _(info: Any, in_dims: tuple, *args: Any) -> tuple:
     return kkt_op(*align(in_dims, args, KKT_NDIMS)), (0,) * 4
 
 
-class KKTSolution(torch.autograd.Function):
+class Opaque(torch.autograd.Function):
     """`kkt_op`, not differentiable: its derivative is the second of the solution."""
 
     @staticmethod
@@ -325,8 +311,8 @@ class KKTSolution(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *_: Tensor) -> tuple:
-        return KKTSolution.backward(ctx)
+        return Opaque.backward(ctx)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
-        return KKTSolution.apply(*align(in_dims, args, KKT_NDIMS)), (0,) * 4
+        return Opaque.apply(*align(in_dims, args, KKT_NDIMS)), (0,) * 4

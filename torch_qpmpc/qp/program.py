@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import InitVar, dataclass, fields
+from dataclasses import InitVar, dataclass
 from enum import IntEnum
 
 import torch
@@ -195,79 +195,59 @@ class QuadraticProgram:
         )
 
     def _raise_mismatch(self) -> None:
-        for field in fields(self):
-            tensor = getattr(self, field.name)
-            if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
-                got = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
-                raise QPError.expected(
-                    field.name,
-                    got,
-                    "a floating-point torch.Tensor",
-                    "Convert it with torch.as_tensor(..., dtype=torch.float64).",
-                )
-            if tensor.dtype not in DTYPES:
+        for name, x in zip(EVENT_SHAPES, self.tensors(), strict=True):
+            if not isinstance(x, Tensor) or not x.is_floating_point():
+                got = x.dtype if isinstance(x, Tensor) else type(x).__name__
+                expected = "a floating-point torch.Tensor"
+                remedy = "Convert it with torch.as_tensor(..., dtype=torch.float64)."
+            elif x.dtype not in DTYPES:
+                got, expected = x.dtype, "torch.float32 or torch.float64"
                 remedy = "Half precision has no matrix factorisations: use torch.float64."
-                got = tensor.dtype
-                raise QPError.expected(field.name, got, "torch.float32 or torch.float64", remedy)
-            if tensor.device != self.H.device:
-                got, remedy = f"a tensor on {tensor.device}", "Move all nine to one device."
-                expected = f"one on H's device, {self.H.device}"
-                raise QPError.expected(field.name, got, expected, remedy)
-            if tensor.dtype != self.H.dtype:
-                raise QPError.expected(
-                    field.name,
-                    tensor.dtype,
-                    f"H's dtype {self.H.dtype}",
-                    "Give all nine tensors one dtype.",
-                )
+            elif x.device != self.H.device:
+                got, expected = f"a tensor on {x.device}", f"one on H's device, {self.H.device}"
+                remedy = "Move all nine to one device."
+            elif x.dtype != self.H.dtype:
+                got, expected = x.dtype, f"H's dtype {self.H.dtype}"
+                remedy = "Give all nine tensors one dtype."
+            else:
+                continue
+            raise QPError.expected(name, got, expected, remedy)
         sizes: dict[str, tuple[str, int]] = {}
-        for name, event in EVENT_SHAPES.items():
-            tensor = getattr(self, name)
-            want = f"(*batch, {', '.join(event)})" if event else "(*batch,)"
-            if tensor.ndim < len(event):
-                raise QPError.expected(name, f"shape {tuple(tensor.shape)}", f"shape {want}")
-            for symbol, size in zip(event, tensor.shape[tensor.ndim - len(event) :], strict=True):
+        for (name, event), x in zip(EVENT_SHAPES.items(), self.tensors(), strict=True):
+            got, want = f"shape {tuple(x.shape)}", f"shape (*batch, {', '.join(event)})"
+            if x.ndim < len(event):
+                raise QPError.expected(name, got, want)
+            for symbol, size in zip(event, x.shape[x.ndim - len(event) :], strict=True):
                 source, known = sizes.setdefault(symbol, (name, size))
                 if size != known:
-                    raise QPError.expected(
-                        name,
-                        f"shape {tuple(tensor.shape)}",
-                        f"shape {want} with {symbol} = {known} as in {source}",
-                    )
+                    want = f"{want} with {symbol} = {known} as in {source}"
+                    raise QPError.expected(name, got, want)
 
     def _check_values(self, n_known: int) -> None:
+        H, lb, ub, w = self.H, self.lb, self.ub, self.w
         for name in ("H", "q", "c", "C", "b", "G"):
             if not getattr(self, name).isfinite().all():
                 raise QPError.expected(name, "NaN or inf", "finite entries")
-        for name, forbidden in (("lb", torch.inf), ("ub", -torch.inf), ("w", -torch.inf)):
-            tensor = getattr(self, name)
-            if (tensor.isnan() | (tensor == forbidden)).any():
+        infinities = {"lb": torch.inf, "ub": -torch.inf, "w": -torch.inf}
+        for (name, forbidden), x in zip(infinities.items(), (lb, ub, w), strict=True):
+            if (x.isnan() | (x == forbidden)).any():
                 raise QPError.expected(name, f"NaN or {forbidden}", f"numbers or {-forbidden}")
-        if crossed(self.lb, self.ub).any():
-            excess = (self.lb - self.ub).max().item()
-            raise QPError.expected("lb", f"lb > ub by up to {excess:.3g}", "lb <= ub in every row")
-        if (self.w < 0).any():
-            raise QPError.expected(
-                "w",
-                f"{self.w.min().item():.3g}",
-                "non-negative slack weights",
-                "Use inf for a hard row.",
-            )
-        asymmetry = (
-            (self.H - self.H.mT).abs().amax(dim=(-2, -1)) if self.n_z else self.H.new_zeros(1)
-        )
-        scale = self.H.abs().amax(dim=(-2, -1)) if self.n_z else asymmetry
-        tolerance = 1e-5 if self.H.dtype == torch.float32 else 1e-9
+        if crossed(lb, ub).any():
+            got = f"lb > ub by up to {(lb - ub).max().item():.3g}"
+            raise QPError.expected("lb", got, "lb <= ub in every row")
+        if (w < 0).any():
+            got, expected = f"{w.min().item():.3g}", "non-negative slack weights"
+            raise QPError.expected("w", got, expected, "Use inf for a hard row.")
+        if not self.n_z:
+            return
+        asymmetry, scale = (x.abs().amax(dim=(-2, -1)) for x in (H - H.mT, H))
+        tolerance = 1e-5 if H.dtype == torch.float32 else 1e-9
         if (asymmetry > tolerance * scale).any():
-            raise QPError.expected(
-                "H",
-                f"asymmetry {asymmetry.max():.3g}",
-                "a symmetric matrix",
-                "Pass (H + H.mT) / 2.",
-            )
+            got, remedy = f"asymmetry {asymmetry.max():.3g}", "Pass (H + H.mT) / 2."
+            raise QPError.expected("H", got, "a symmetric matrix", remedy)
         if n_known >= self.n_z:
             return
-        lowest = torch.linalg.eigvalsh(self.H[..., n_known:, n_known:])[..., 0]
+        lowest = torch.linalg.eigvalsh(H[..., n_known:, n_known:])[..., 0]
         if (lowest < -tolerance * (scale + 1e-300)).any():
             raise QPError.expected(
                 "H",

@@ -1,4 +1,4 @@
-"""All reads of torch's internals: traces, transforms, forward mode, tensor classes.
+"""What surrounds a call: traces, transforms, forward mode, tensor classes, and forked processes.
 
 The solver must be hidden from traces and transforms, which torch has no public way to detect. A
 test of each function fails if torch changes the internals that it reads.
@@ -6,13 +6,19 @@ test of each function fails if torch changes the internals that it reads.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import functools
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
+P = ParamSpec("P")
+R = TypeVar("R")
+_forked = False
 _functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue] - has no stub
 
 #: The tensor classes without a dispatch of their own.
@@ -66,3 +72,38 @@ def transforms() -> tuple[str, ...]:
 
 # As `torch.compiler.assume_constant_result` does, which imports the compiler: that takes a second.
 vars(transforms)["_dynamo_marked_constant"] = True
+
+
+def _mark() -> None:
+    global _forked
+    _forked = True
+
+
+os.register_at_fork(after_in_child=_mark)
+
+
+@contextmanager
+def serial_if_forked() -> Iterator[None]:
+    """Use one thread of torch in a forked child, and restore the child's own number."""
+    if not _forked:
+        yield
+        return
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def serially_if_forked(function: Callable[P, R]) -> Callable[P, R]:
+    """Run a function that the compiler may trace within `serial_if_forked`."""
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not _forked:
+            return function(*args, **kwargs)
+        with serial_if_forked():
+            return function(*args, **kwargs)
+
+    return wrapped

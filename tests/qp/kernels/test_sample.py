@@ -183,7 +183,7 @@ def test_active_sets_are_tried_as_by_torch(matrices):
 def test_held_rows_get_their_levels(matrices):
     for p in both(known_qp(2, batch=(BATCH,), matrices=matrices)):
         reduced = p.prepared.reduced(p.n_f)
-        H, G, rise = map(to_tensor, (reduced.H, reduced.G, p.prepared.forces(p.n_f).rise))
+        H, G, rise = map(to_tensor, (reduced.H, reduced.G, p.prepared.sensitivities(p.n_f).to_g))
         (r, d), rows = G.shape[1:], to_tensor(reduced.rows)
         held = torch.zeros(BATCH, p.theta.G.shape[1], dtype=torch.bool)
         held[torch.arange(1, BATCH), rows[torch.arange(1, BATCH) % r]] = True  # none in the first

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torch_qpmpc.qp.kernels import theta as kernels
+from torch_qpmpc.qp.kernels import linalg as kernels
 from torch_qpmpc.qp.pipeline.condensing import DEFINITE, SHIFT
 
 RNG = np.random.default_rng(0)

@@ -17,9 +17,9 @@ from torch_qpmpc.qp.pipeline.condensing import (
     Reduced,
     condense,
     eliminate,
-    forces,
     in_order,
     null_space,
+    sensitivities,
 )
 from torch_qpmpc.qp.solve import solve
 
@@ -198,18 +198,18 @@ def test_a_prediction_beyond_float64_has_no_recursion():
 
 
 @pytest.mark.parametrize("r", [0, 3, 9])
-def test_forces_solve_the_unconstrained_qp(r):
+def test_sensitivities_solve_the_unconstrained_qp(r):
     root, G = normal(2, 5, 5), normal(2, r, 5, seed=1)
     H = root @ root.mT
     none = np.empty(0)
     reduced = Reduced._make((none, none, H.numpy(), G.numpy(), *[none] * 6))
-    rise, push = map(torch.from_numpy, forces(reduced))
+    to_g, to_lam = map(torch.from_numpy, sensitivities(reduced))
     g, lam = normal(5, seed=2), normal(r, seed=3)
     for m in range(2):
         v = torch.linalg.solve(H[m], -g - G[m].mT @ lam)
-        assert_close(-g @ rise[m] - lam @ push[m], torch.cat((v, G[m] @ v)))
+        assert_close(-g @ to_g[m] - lam @ to_lam[m], torch.cat((v, G[m] @ v)))
     singular = reduced._replace(H=np.zeros((2, 5, 5)))
-    assert np.isnan(forces(singular).rise).all()
+    assert np.isnan(sensitivities(singular).to_g).all()
 
 
 @pytest.mark.parametrize("n_g", [0, 4, 8])

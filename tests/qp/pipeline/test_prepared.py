@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
 from torch_qpmpc.qp.pipeline import condensing
-from torch_qpmpc.qp.pipeline.batch import Programs, _Latest
+from torch_qpmpc.qp.pipeline.batch import LATEST, Programs
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_the_dtype_is_part_of_a_theta():
 
 def test_only_the_latest_are_remembered():
     fixed = normal(5, 2)
-    known = [known_qp(100 + i).qp.tensors() for i in range(_Latest.SIZE + 1)]
+    known = [known_qp(100 + i).qp.tensors() for i in range(LATEST + 1)]
     prepared = [Programs.of(*theta, fixed)[0].prepared for theta in known]
     assert Programs.of(*known[-1], fixed)[0].prepared is prepared[-1]
     assert Programs.of(*known[0], fixed)[0].prepared is not prepared[0]

@@ -60,9 +60,7 @@ def test_condensed_matrices_are_the_same_by_way_of_the_units(matrices):
     assert other.scaled.units is None
     own, other = own.condensed(p.n_kept), other.condensed(p.n_kept)
     pairs = zip(
-        (*own.arrays, own.terms, *own.sums),
-        (*other.arrays, other.terms, *other.sums),
-        strict=True,
+        (*own.arrays, own.terms, *own.sums), (*other.arrays, other.terms, *other.sums), strict=True
     )
     assert all((a == b).all() for a, b in pairs)  # units are powers of two
 

@@ -1,7 +1,12 @@
-"""Linear algebra as loops that Numba compiles for the CPU. Arrays are float64 and contiguous."""
+"""Linear algebra as loops that Numba compiles for the CPU. Arrays are float64 and contiguous.
+
+The second half runs once for each theta: the elimination of C z = b (eq:qp2c1), and sizes of its
+entries. LAPACK and NumPy, called from Python, take several times as long.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -16,6 +21,7 @@ from torch_qpmpc.errors import QPError
 
 #: Largest matrix size times number of vectors in one call of BLAS, which then uses one thread.
 ONE_THREAD = 2**18
+TINY = np.finfo(float).tiny
 
 if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue] -- set from the environment
     remedy = "Unset it before the import: the kernels do not run in plain Python."
@@ -133,3 +139,209 @@ def _scale(matrix, vectors, out):
     for i in range(len(vectors)):
         for j in range(len(matrix)):
             out[i, j] = vectors[i, j] * matrix[j, j]
+
+
+@compiled
+def eliminate(C, n_kept, independent):
+    """Solve C z = b for some entries of z: return T and -Y with ``z = T y + Y b``.
+
+    LU with row pivoting on the transpose of C picks columns that are safe to solve for. For a
+    linear MPC scheme they are x_1..x_N, and then T is its prediction form. For a banded C, the cost
+    grows with the square of N, as T does: the loops skip the zeros outside the band.
+
+    Args:
+        C: ``(M, n_c, n_z)``.
+        n_kept: the number of leading columns that are not solved for.
+        independent: smallest pivot, relative to its row's norm, of linearly independent rows.
+
+    Returns:
+        T ``(M, n_z, n_y)``, -Y ``(M, n_z, n_c)``, and False if the rows of C are linearly
+        dependent in the columns after ``n_kept``.
+    """
+    M, n_c, n_z = C.shape
+    regular = n_c <= n_z - n_kept
+    T, Y_neg = np.zeros((M, n_z, max(0, n_z - n_c))), np.zeros((M, n_z, n_c))
+    for m in range(M):
+        regular = regular and _eliminate(C[m], n_kept, independent, T[m], Y_neg[m])
+    return T, Y_neg, regular
+
+
+@compiled
+def _eliminate(C, n_kept, independent, T, Y_neg):
+    n_c, n_z = C.shape
+    n_y, n_rest = n_z - n_c, n_z - n_kept
+    factors, order, stays = np.empty((n_rest, n_c)), np.arange(n_z), np.ones(n_z, np.bool_)
+    for i in range(n_c):
+        for j in range(n_rest):
+            factors[j, i] = C[i, n_kept + j]
+    for k in range(n_c):
+        pivot, size = k, 0.0
+        for j in range(n_rest):
+            size += C[k, n_kept + j] ** 2
+        for j in range(k + 1, n_rest):
+            if abs(factors[j, k]) > abs(factors[pivot, k]):
+                pivot = j
+        if not abs(factors[pivot, k]) > independent * math.sqrt(size):
+            return False
+        if pivot != k:
+            for i in range(n_c):
+                factors[k, i], factors[pivot, i] = factors[pivot, i], factors[k, i]
+            order[n_kept + k], order[n_kept + pivot] = order[n_kept + pivot], order[n_kept + k]
+        stays[order[n_kept + k]] = False
+        for j in range(k + 1, n_rest):
+            if factors[j, k] != 0:  # few are not, in a banded C
+                factors[j, k] /= factors[k, k]
+                for i in range(k + 1, n_c):
+                    factors[j, i] -= factors[j, k] * factors[k, i]
+    # The right-hand sides are -C in the remaining columns, and the identity. The system's matrix is
+    # C in the dependent columns, the transpose of the first n_c rows of L times U.
+    right, k = np.zeros((n_c, n_z)), 0
+    for j in range(n_z):
+        if stays[j]:
+            T[j, k] = 1.0
+            for i in range(n_c):
+                right[i, k] = -C[i, j]
+            k += 1
+    for i in range(n_c):
+        right[i, n_y + i] = 1.0
+        first = 0
+        while first < i and factors[first, i] == 0:
+            first += 1
+        add_product(right[i], -factors[first:i, i], right[first:])
+        for j in range(n_z):
+            right[i, j] /= factors[i, i]
+    for i in range(n_c - 1, -1, -1):
+        end = n_c
+        while end > i + 1 and factors[end - 1, i] == 0:
+            end -= 1
+        add_product(right[i], -factors[i + 1 : end, i], right[i + 1 :])
+        dependent = order[n_kept + i]
+        for j in range(n_y):
+            T[dependent, j] = right[i, j]
+        for j in range(n_c):
+            Y_neg[dependent, j] = -right[i, n_y + j]
+    return True
+
+
+@compiled
+def sparse_products(left, right):
+    """Multiply ``(M, i, j)`` by ``(M, j, k)``, ignoring the left matrices' zeros."""
+    out = np.zeros((len(left), left.shape[1], right.shape[2]))
+    for m in range(len(left)):
+        for i in range(left.shape[1]):
+            for j in range(left.shape[2]):
+                if left[m, i, j] != 0:
+                    add(out[m, i], left[m, i, j], right[m, j])
+    return out
+
+
+@compiled
+def inverse_factors(H, definite, shift):
+    """Return the inverses of the Cholesky factors of H, shifted by a multiple of I if singular.
+
+    Args:
+        H: ``(M, d, d)``.
+        definite: smallest squared pivot of a definite H, relative to its largest diagonal entry.
+        shift: the multiple of I, relative to the same.
+
+    Returns:
+        The inverses ``(M, d, d)``, inf where the shifted H has no factor, and the shifts ``(M,)``.
+    """
+    inverses, shifts = np.zeros_like(H), np.zeros(len(H))
+    factor = np.empty(H.shape[1:])
+    for m in range(len(H)):
+        largest = 0.0
+        for j in range(len(factor)):
+            largest = max(largest, H[m, j, j])
+        if not _inverse_factor(H[m], 0.0, definite * largest, factor, inverses[m]):
+            shifts[m] = max(shift * largest, TINY)
+            if not _inverse_factor(H[m], shifts[m], 0.0, factor, inverses[m]):
+                inverses[m] = np.inf
+    return inverses, shifts
+
+
+@compiled
+def _inverse_factor(H, shift, least, factor, inverse):
+    """Fill zeros with the inverse; return False if a squared pivot is too small."""
+    for a in range(len(H)):
+        for b in range(a):
+            factor[a, b] = (H[a, b] - dot(factor[a, :b], factor[b, :b])) / factor[b, b]
+        pivot = H[a, a] + shift - dot(factor[a, :a], factor[a, :a])
+        if not least < pivot < np.inf:
+            return False
+        factor[a, a] = math.sqrt(pivot)
+    for a in range(len(H)):
+        for b in range(a):
+            add(inverse[a, : b + 1], -factor[a, b], inverse[b, : b + 1])
+        for b in range(a):
+            inverse[a, b] /= factor[a, a]
+        inverse[a, a] = 1.0 / factor[a, a]
+    return True
+
+
+@compiled
+def row_lengths(G, absent):
+    """Return the norms of the rows of G ``(M, r, d)``, zero up to ``absent`` ``(M, r)``."""
+    lengths = np.empty(G.shape[:2])
+    for m in range(len(G)):
+        for j in range(G.shape[1]):
+            length = math.sqrt(dot(G[m, j], G[m, j]))
+            lengths[m, j] = 0.0 if length <= absent[m, j] else length
+    return lengths
+
+
+@compiled
+def nearly_orthogonal(units):
+    """Return True if the unit rows ``(M, h, d)`` of each matrix are orthogonal, but for a half."""
+    for m in range(len(units)):
+        for i in range(units.shape[1]):
+            total = 0.0
+            for j in range(units.shape[1]):
+                total += abs(dot(units[m, i], units[m, j])) if i != j else 0.0
+            if not total < 0.5:
+                return False
+    return True
+
+
+@summing
+def row_sums(matrices):
+    """Return the sums of the absolute entries of the rows of ``(M, i, j)``."""
+    sums = np.empty(matrices.shape[:2])
+    for m in range(len(matrices)):
+        for i in range(matrices.shape[1]):
+            total = 0.0
+            for j in range(matrices.shape[2]):
+                total += abs(matrices[m, i, j])
+            sums[m, i] = total
+    return sums
+
+
+@comparing
+def column_sizes(matrices):
+    """Return the largest absolute entries of the columns of ``(M, i, j)``."""
+    sizes = np.zeros((len(matrices), matrices.shape[2]))
+    for m in range(len(matrices)):
+        for i in range(matrices.shape[1]):
+            for j in range(matrices.shape[2]):
+                sizes[m, j] = larger(sizes[m, j], abs(matrices[m, i, j]))
+    return sizes
+
+
+@compiled
+def finite_sizes(vectors, group, M):
+    """Return the largest finite sizes ``(M, n)`` of the vectors of the QPs of each matrix.
+
+    Args:
+        vectors: ``(B, n)``, or ``(1, n)`` if all QPs share one.
+        group: the index of each QP's matrices, ``(B,)``.
+        M: the number of matrices.
+    """
+    sizes = np.zeros((M, vectors.shape[1]))
+    for i in range(len(vectors)):
+        shared = len(vectors) == 1
+        for m in range(0 if shared else group[i], M if shared else group[i] + 1):
+            for j in range(vectors.shape[1]):
+                size = abs(vectors[i, j])
+                if sizes[m, j] < size < np.inf:
+                    sizes[m, j] = size
+    return sizes

@@ -39,7 +39,7 @@ QPs that do not settle go to the backend.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -82,6 +82,17 @@ NEARLY_ACTIVE = 1e-6
 DEPENDENT = 1e-14
 
 
+class Terms(NamedTuple):
+    """Terms of the KKT conditions of B QPs; ``left`` is the residual of stationarity."""
+
+    Hz: Any
+    G_lam: Any
+    C_chi: Any
+    left: Any
+    y: Any
+    Cz: Any
+
+
 @compiled
 def offsets(fixed, group, matrix, constant):
     """Return the linear costs and bounds of the reduced QPs, ``constant + matrix' fixed``."""
@@ -93,14 +104,15 @@ def offsets(fixed, group, matrix, constant):
     return out
 
 
-def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes=0) -> tuple[Any, ...]:
+@compiled
+def recover(v, lam_v, group, fixed, theta, reduced, sizes, diagonal, passes):
     """Complete and certify solutions of reduced QPs.
 
     The multipliers of C z = b and of the fixed entries follow from the stationarity of the
     Lagrangian: chi by the transposed elimination, xi from the residual in the fixed entries.
 
     Args:
-        v, lam: solutions ``(B, d)`` and signed multipliers ``(B, r)`` of the reduced QPs.
+        v, lam_v: solutions ``(B, d)`` and signed multipliers ``(B, r)`` of the reduced QPs.
         group, fixed, theta, reduced, sizes: the QPs, see `torch_qpmpc.qp.pipeline.batch`.
         diagonal: two flags, True if the batch shares one diagonal H, and one diagonal G.
         passes: the number of iterative refinements of z and chi after the elimination.
@@ -109,11 +121,6 @@ def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes=0) -> 
         value, z, chi, lam, xi, the codes of the active set, and the certificate's residual and
         error of the value.
     """
-    return _recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes)
-
-
-@compiled
-def _recover(v, lam_v, group, fixed, theta, reduced, sizes, diagonal, passes):
     n_qps, n_f = fixed.shape
     H, C, G, q = theta.H, theta.C, theta.G, theta.q
     kept = np.empty((n_qps, n_f + v.shape[1]))
@@ -144,7 +151,7 @@ def _recover(v, lam_v, group, fixed, theta, reduced, sizes, diagonal, passes):
     xi = -left[:, :n_f]
     for i in range(n_qps):
         add(left[i, :n_f], 1.0, xi[i])
-    terms = (Hz, G_lam, C_chi, left, y, Cz)
+    terms = Terms(Hz, G_lam, C_chi, left, y, Cz)
     value, residual, error = _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
     return value, z, chi, lam, xi, codes, residual, error
 
@@ -160,8 +167,8 @@ def _all_multipliers(lam_v, y, theta, rows, others):
             lam[i, rows[k]] = lam_v[i, k]
         # A separate loop, which LLVM vectorises.
         for j in range(lam.shape[1]):
-            push, weight = lam[i, j], w[i_w, j]
-            lam[i, j] = weight if push > weight else -weight if push < -weight else push
+            force, weight = lam[i, j], w[i_w, j]
+            lam[i, j] = weight if force > weight else -weight if force < -weight else force
         for j in others:
             if w[i_w, j] < np.inf:  # a violated hard row stays violated: the residual shows it
                 if y[i, j] - ub[i_ub, j] > VIOLATED:
@@ -180,13 +187,9 @@ def _all_multipliers(lam_v, y, theta, rows, others):
     return lam, codes
 
 
-def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal) -> tuple[Any, Any, Any]:
-    """Return value, KKT residual and the value's error ``(B,)``."""
-    return _certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal)
-
-
 @compiled
-def _certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal):
+def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal):
+    """Return value, KKT residual and the value's error ``(B,)``."""
     H, C, G, q = theta.H, theta.C, theta.G, theta.q
     Hz, y = products(H, group, z, diagonal[0]), products(G, group, z, diagonal[1])
     G_lam = transposed_products(G, group, lam, diagonal[1])
@@ -195,16 +198,13 @@ def _certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal):
     for i in range(len(z)):
         add(left[i, : xi.shape[1]], 1.0, xi[i])
         add(left[i], 1.0, q[i % len(q)])
-    terms = (Hz, G_lam, C_chi, left, y, Cz)
+    terms = Terms(Hz, G_lam, C_chi, left, y, Cz)
     return _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
 
 
 @compiled
 def _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
-    """Return value, residual and error of the value from the KKT terms.
-
-    The fourth term, ``left``, is the residual of stationarity.
-    """
+    """Return value, residual and error of the value from the KKT `Terms`."""
     Hz, G_lam, C_chi, left, y, Cz = terms
     H, C, G = theta.H, theta.C, theta.G
     q, c, b, lb, ub, w = theta.q, theta.c, theta.b, theta.lb, theta.ub, theta.w
@@ -223,9 +223,9 @@ def _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
         gap += _shortage(Cz[i], b_i, chi[i])
         cost = linear + quadratic + charge
         value[i] = cost + c[i % len(c)]
-        force, push, length = _forces(z[i], Hz[i], G_lam[i], C_chi[i], left[i], q_i)
+        force, steep, length = _forces(z[i], Hz[i], G_lam[i], C_chi[i], left[i], q_i)
         short, size = _distance(Cz[i], b_i)
-        worst = max(push / (1.0 + force), short / (1.0 + size + length))
+        worst = max(steep / (1.0 + force), short / (1.0 + size + length))
         worst = max(worst, _distance(z[i, :n_f], fixed[i])[0])
         worst = max(worst, _excess(y[i], lam[i], lb_i, ub_i, w_i))
         worst = max(worst, gap / (1.0 + abs(cost)))
@@ -241,7 +241,7 @@ def _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
         noise += _weighted(z[i], q_i)
         slope, steps = slopes[i, n_f:], sizes.steps[m]
         far = RANGE * length if shift[m] > 0 else np.inf
-        of_slope, push = _fall(slope, lb_i, ub_i, w_i, far, inverse[m], shift[m], steps, box)
+        of_slope, steep = _fall(slope, lb_i, ub_i, w_i, far, inverse[m], shift[m], steps, box)
         if shift[m] > 0 and not of_slope < DOUBTFUL * scale:
             curved = (inverse[m], reduced.H[m])
             split = _split_fall(slope, lb_i, ub_i, w_i, far, *curved, steps, box)
@@ -257,7 +257,7 @@ def _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
             step = _repair_apart(rows, hard, z[i], G[m])
         else:
             step = _repair(rows, hard, z[i], G[m], sizes.units[m], basis, ends, slacks)
-        off = gap + of_slope + ROUNDING * noise + (push + 0.5 * sizes.stiffness[m] * step) * step
+        off = gap + of_slope + ROUNDING * noise + (steep + 0.5 * sizes.stiffness[m] * step) * step
         off += _kinks(y[i], lb_i, ub_i, w_i, steps, step)
         # Sums propagate a NaN in any entry; maxima ignore it.
         sound = gap + abs(cost) + _weighted(slopes[i], slopes[i])
@@ -446,11 +446,11 @@ def _charge(y, lam, lb, ub, w):
     """Return w'sigma and the sum of the rows' complementarity gaps."""
     total = slip = 0.0
     for j in range(len(y)):
-        at, push, weight, above, below = y[j], lam[j], w[j], ub[j], lb[j]
+        at, force, weight, above, below = y[j], lam[j], w[j], ub[j], lb[j]
         outside = at - above if at > above else below - at if at < below else 0.0
         charge = outside * (0.0 if weight == np.inf else weight)
         # NaN fails both comparisons, and stays.
-        up, down = 0.0 if push < 0 else push, 0.0 if push > 0 else push
+        up, down = 0.0 if force < 0 else force, 0.0 if force > 0 else force
         above, below = 0.0 if above == np.inf else above, 0.0 if below == -np.inf else below
         total += charge
         slip += abs(charge + (above - at) * up + (below - at) * down)
@@ -491,38 +491,38 @@ def _excess(y, lam, lb, ub, w):
     """Return the largest violation of a hard row, of |lam| <= w, or of lam at an absent bound."""
     error = 0.0
     for j in range(len(y)):
-        at, push, weight = y[j], lam[j], w[j]
+        at, force, weight = y[j], lam[j], w[j]
         above, below = ub[j], lb[j]
         hard = weight == np.inf
-        excess = larger(at - above, below - at) if hard else abs(push) - weight
+        excess = larger(at - above, below - at) if hard else abs(force) - weight
         excess /= 1.0 + (abs(at) if hard else weight)
-        astray = larger(push if above == np.inf else 0.0, -push if below == -np.inf else 0.0)
+        astray = larger(force if above == np.inf else 0.0, -force if below == -np.inf else 0.0)
         error = larger(error, larger(excess, astray))
     return error
 
 
-def try_active_sets(qps, forces, active) -> tuple[Any, ...]:
+def try_active_sets(qps, sensitivities, active) -> tuple[Any, ...]:
     """Try active sets ``(B, r)``.
 
     Returns:
         v ``(B, d)``, lam ``(B, r)``, the number of steps, and True where they settled, ``(B,)``.
     """
     g, lower, upper, w, active = map(np.ascontiguousarray, (qps.g, qps.l, qps.u, qps.w, active))
-    return _try_active_sets(forces.rise, forces.push, qps.group, g, lower, upper, w, active)
+    return _try_active_sets(*sensitivities, qps.group, g, lower, upper, w, active)
 
 
 @compiled
-def _try_active_sets(rise, push, group, g, lower, upper, w, active):
+def _try_active_sets(to_g, to_lam, group, g, lower, upper, w, active):
     n_qps, r = lower.shape
     d = g.shape[1]
-    free = -transposed_products(rise, group, g, False)  # (v, y) without multipliers
+    free = -transposed_products(to_g, group, g, False)  # (v, y) without multipliers
     lam, vy, steps = np.zeros((n_qps, r)), free.copy(), np.zeros(n_qps, np.int64)
     done = np.zeros(n_qps, np.bool_)
     code, held, level = np.empty(r, np.int8), np.empty(r, np.int64), np.empty(r)
-    factor, pull, nothing = np.empty((r, r)), np.empty(r), np.zeros(r, np.int8)
+    factor, change, nothing = np.empty((r, r)), np.empty(r), np.zeros(r, np.int8)
     for i in range(n_qps):
         copy(code, active[i])
-        push_i = push[group[i]]
+        to_lam_i = to_lam[group[i]]
         for j in range(r):
             if not -2 <= code[j] <= 2:
                 copy(code, nothing)
@@ -534,22 +534,23 @@ def _try_active_sets(rise, push, group, g, lower, upper, w, active):
                 lam[i, j] = 0.0
                 if abs(code[j]) == 2:
                     lam[i, j] = math.copysign(w[i, j], code[j])
-                    add(vy[i], -lam[i, j], push_i[j])
+                    add(vy[i], -lam[i, j], to_lam_i[j])
                 elif code[j] != 0:
                     level[j] = upper[i, j] if code[j] > 0 else lower[i, j]
                     held[k] = j
                     k += 1
-            if not _hold_rows(push_i, held[:k], level, SLIP, vy[i], lam[i], factor, pull):
+            if not _hold_rows(to_lam_i, held[:k], level, SLIP, vy[i], lam[i], factor, change):
                 break
             done[i] = not _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i])
     return vy[:, :d].copy(), lam, steps, done
 
 
-def hold(forces, group, vy, held, level, slip) -> tuple[Any, ...]:
+@compiled
+def hold(to_lam, group, vy, held, level, slip):
     """Solve ``H v + G't = right`` with ``G v = level`` and t = 0 in held and other rows.
 
     Args:
-        forces, group: the `Forces` of the QPs.
+        to_lam, group: the `Sensitivities` to lam, and the matrices' index of each QP.
         vy: v and y = G v for t = 0, ``(B, d + r)``.
         held, level: the mask of held rows, and their levels, ``(B, r)``.
         slip: the relative error of y that ends the refinement.
@@ -557,51 +558,46 @@ def hold(forces, group, vy, held, level, slip) -> tuple[Any, ...]:
     Returns:
         v and y, and t; t is zero where the held rows have no Cholesky factor.
     """
-    return _hold(forces.push, group, vy, held, level, slip)
-
-
-@compiled
-def _hold(push, group, vy, held, level, slip):
     n_qps, r = held.shape
     vy, t = vy.copy(), np.zeros((n_qps, r))
-    rows, factor, pull = np.empty(r, np.int64), np.empty((r, r)), np.empty(r)
+    rows, factor, change = np.empty(r, np.int64), np.empty((r, r)), np.empty(r)
     for i in range(n_qps):
         k = 0
         for j in range(r):
             if held[i, j]:
                 rows[k] = j
                 k += 1
-        _hold_rows(push[group[i]], rows[:k], level[i], slip, vy[i], t[i], factor, pull)
+        _hold_rows(to_lam[group[i]], rows[:k], level[i], slip, vy[i], t[i], factor, change)
     return vy, t
 
 
 @compiled
-def _hold_rows(push, held, level, slip, vy, t, factor, pull):
+def _hold_rows(to_lam, held, level, slip, vy, t, factor, change):
     """Add to t and vy the multipliers and their effect; return False if there is no factor."""
     k, d = len(held), len(vy) - len(t)
-    if not _factorise_held(push, held, k, d, factor):
+    if not _factorise_held(to_lam, held, k, d, factor):
         return False
     for _ in range(MAX_PASSES):
         unmet = False
         for a in range(k):
             at = level[held[a]]
-            pull[a] = vy[d + held[a]] - at
-            unmet = unmet or not abs(pull[a]) <= slip * (1.0 + abs(at))
+            change[a] = vy[d + held[a]] - at
+            unmet = unmet or not abs(change[a]) <= slip * (1.0 + abs(at))
         if not unmet:
             break
-        _solve_factorised(factor, pull, k)
+        _solve_factorised(factor, change, k)
         for a in range(k):
-            t[held[a]] += pull[a]
-            add(vy, -pull[a], push[held[a]])
+            t[held[a]] += change[a]
+            add(vy, -change[a], to_lam[held[a]])
     return True
 
 
 @compiled
-def _factorise_held(push, held, k, d, factor):
+def _factorise_held(to_lam, held, k, d, factor):
     """Factorise the held rows and columns of K in place; return False if there is no factor."""
     for a in range(k):
         for b in range(a, k):
-            factor[a, b] = push[held[a], d + held[b]]
+            factor[a, b] = to_lam[held[a], d + held[b]]
     for a in range(k):
         if not factor[a, a] > 0:
             return False

@@ -24,6 +24,7 @@ from torch_qpmpc.qp.kernels.sample import (
     SLIP,
     SPLITS,
     VIOLATED,
+    Terms,
 )
 from torch_qpmpc.qp.solution import active_codes
 
@@ -48,7 +49,7 @@ def offsets(fixed, group, matrix, constant) -> Tensor:
     return multiply(matrix.mT, group, fixed) + constant
 
 
-def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes=0) -> tuple[Tensor, ...]:
+def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes) -> tuple[Tensor, ...]:
     Y_neg, C = reduced.Y_neg, theta.C
     z = multiply(reduced.T, group, torch.cat((fixed, v), dim=-1)) + reduced.z_0
     for _ in range(passes):
@@ -68,7 +69,7 @@ def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes=0) -> 
     left = left + C_chi
     xi = -left[:, : fixed.shape[-1]]
     left[:, : fixed.shape[-1]] += xi
-    terms = (Hz, G_lam, C_chi, left, y)
+    terms = Terms(Hz, G_lam, C_chi, left, y, multiply(C, group, z))
     value, *errors = _judge(z, all_lam, chi, group, fixed, theta, reduced, sizes, terms)
     codes = active_codes(y, all_lam, theta.lb, theta.ub, theta.w)
     return value, z, chi, all_lam, xi, codes, *errors
@@ -79,14 +80,14 @@ def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal) -> t
     G_lam, C_chi = multiply(theta.G.mT, group, lam), multiply(theta.C.mT, group, chi)
     left = Hz + theta.q + G_lam + C_chi
     left[:, : xi.shape[-1]] += xi
-    terms = (Hz, G_lam, C_chi, left, y)
+    terms = Terms(Hz, G_lam, C_chi, left, y, multiply(theta.C, group, z))
     return _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
 
 
 def _judge(
     z, lam, chi, group, fixed, theta, reduced, sizes, terms
 ) -> tuple[Tensor, Tensor, Tensor]:
-    Hz, G_lam, C_chi, left, y = terms
+    Hz, G_lam, C_chi, left, y, Cz = terms
     lb, ub, w = theta.lb, theta.ub, theta.w
     hard, no_lb, no_ub = w.isinf(), lb.isinf(), ub.isinf()
     up, down = lam.clamp(min=0.0), lam.clamp(max=0.0)
@@ -97,7 +98,7 @@ def _judge(
     charge = charge.sum(-1)
     linear, quadratic = torch.linalg.vecdot(theta.q, z), torch.linalg.vecdot(0.5 * Hz, z)
     cost = linear + quadratic + charge
-    short = multiply(theta.C, group, z) - theta.b
+    short = Cz - theta.b
     gap = _shortage(short, chi) + gap.abs().sum(-1)
     forces = torch.cat((Hz, G_lam, C_chi, theta.q.expand_as(z)), dim=-1)
     errors = (
@@ -128,7 +129,7 @@ def _judge(
     step = _repair(y, lam, theta, of_rows[1], sizes, group)
     n_f, free = fixed.shape[-1], Hz + theta.q
     reach = _reach(slopes[:, n_f:], theta, RANGE * length, sizes, group)
-    fall, push = _fall(slopes[:, n_f:], reach, sizes, group)
+    fall, steep = _fall(slopes[:, n_f:], reach, sizes, group)
     doubtful = (sizes.shift[group] > 0) & ~(fall < DOUBTFUL * scale)
     other = multiply(reduced.T.mT, group, free)[:, n_f:]
     split = gap + _split_fall(slopes[:, n_f:], reach, reduced.H, sizes, group)
@@ -137,7 +138,7 @@ def _judge(
     off = gap + fall
     for bound in (split, other):
         off = torch.where(doubtful & (bound < off), bound, off)
-    off = off + ROUNDING * size + (push + 0.5 * sizes.stiffness[group] * step) * step
+    off = off + ROUNDING * size + (steep + 0.5 * sizes.stiffness[group] * step) * step
     off = off + _kinks(y, theta, sizes.steps[group], step)
     error = (off / scale).nan_to_num(torch.inf, torch.inf).masked_fill_(residual.isinf(), torch.inf)
     return value, residual, error
@@ -219,10 +220,10 @@ def _kinks(y, theta, steps, step) -> Tensor:
     return torch.where((away < move) & theta.w.isfinite(), 2 * theta.w * move, 0).sum(-1)
 
 
-def try_active_sets(qps, forces, active) -> tuple[Tensor, ...]:
+def try_active_sets(qps, sensitivities, active) -> tuple[Tensor, ...]:
     known = ((active >= -2) & (active <= 2)).all(-1)
     active = torch.where(known.unsqueeze(-1), active, 0)
-    v, lam, y = _solve(qps, forces, active)
+    v, lam, y = _solve(qps, sensitivities, active)
     steps, done = torch.ones_like(qps.group), torch.ones_like(known)
     todo = _contradicted(qps, active, lam, y).nonzero().squeeze(-1)
     for _ in range(MAX_STEPS - 1):
@@ -230,7 +231,7 @@ def try_active_sets(qps, forces, active) -> tuple[Tensor, ...]:
             break
         rest = qps.take(todo)
         active[todo] = _corrected(rest, active[todo], lam[todo], y[todo])
-        v[todo], lam[todo], y[todo] = new = _solve(rest, forces, active[todo])
+        v[todo], lam[todo], y[todo] = new = _solve(rest, sensitivities, active[todo])
         steps[todo] += 1
         todo = todo[_contradicted(rest, active[todo], *new[1:])]
     done[todo] = False
@@ -263,33 +264,33 @@ def _corrected(qps, active: Tensor, lam: Tensor, y: Tensor) -> Tensor:
     return torch.where(active == 0, above.to(torch.int8) - below.to(torch.int8), corrected)
 
 
-def _solve(qps, forces, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _solve(qps, sensitivities, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return v, lam and y with held rows at their bounds, and saturated ones at lam = w or -w."""
     d, size = qps.g.shape[-1], active.abs()
-    vy = -multiply(forces.rise.mT, qps.group, qps.g)
+    vy = -multiply(sensitivities.to_g.mT, qps.group, qps.g)
     lam, saturated = torch.zeros_like(qps.l), size == 2
     if saturated.any():
         lam = torch.where(saturated, active.sign() * qps.w, 0)
-        vy = vy - multiply(forces.push.mT, qps.group, lam)
+        vy = vy - multiply(sensitivities.to_lam.mT, qps.group, lam)
     level = torch.where(active > 0, qps.u, qps.l)
-    vy, pull = hold(forces, qps.group, vy, size == 1, level, SLIP)
-    return vy[:, :d], lam + pull, vy[:, d:]
+    vy, change = hold(sensitivities.to_lam, qps.group, vy, size == 1, level, SLIP)
+    return vy[:, :d], lam + change, vy[:, d:]
 
 
-def hold(forces, group, vy, held, level, slip) -> tuple[Tensor, Tensor]:
+def hold(to_lam, group, vy, held, level, slip) -> tuple[Tensor, Tensor]:
     d, t = vy.shape[-1] - held.shape[-1], torch.zeros_like(level)
     order, real = _order(held)
-    factor = _factor_held(forces.push[:, :, d:], group, order, real)
+    factor = _factor_held(to_lam[:, :, d:], group, order, real)
     order = order * real
     level = level.gather(1, order)
     for _ in range(MAX_PASSES):
         short = (vy[:, d:].gather(1, order) - level).masked_fill_(~real, 0)
         if not (short.abs() > slip * (1 + level.abs())).any():
             break
-        pull = torch.cholesky_solve(short.unsqueeze(-1), factor).squeeze(-1)
-        pull = torch.zeros_like(t).scatter_add_(1, order, pull)
-        t = t + pull
-        vy = vy - multiply(forces.push.mT, group, pull)
+        change = torch.cholesky_solve(short.unsqueeze(-1), factor).squeeze(-1)
+        change = torch.zeros_like(t).scatter_add_(1, order, change)
+        t = t + change
+        vy = vy - multiply(to_lam.mT, group, change)
     return vy, t
 
 

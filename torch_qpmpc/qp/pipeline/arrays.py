@@ -1,4 +1,4 @@
-"""Arrays of the pipeline: data, condensed QPs, claims of backends, certified solutions.
+"""Arrays of the pipeline: data, condensed QPs, candidates of backends, certified solutions.
 
 They are NumPy's on the CPU, and tensors on other devices.
 """

@@ -38,13 +38,13 @@ from torch_qpmpc.qp.pipeline.arrays import (
 from torch_qpmpc.qp.pipeline.condensing import (
     Condensed,
     Elimination,
-    Forces,
     Reduced,
+    Sensitivities,
     Sizes,
     condense,
     convex,
-    forces,
     reduce,
+    sensitivities,
     sizes,
 )
 from torch_qpmpc.qp.pipeline.scaling import Units
@@ -150,18 +150,18 @@ class Prepared:
         mask = self._once(("convex", n_f), lambda: convex(self._reduced(n_f).H))
         return None if mask.all() else mask
 
-    def forces(self, n_f: int) -> Forces:
-        """Return the `Forces` of the reduced QPs, on the device."""
-
-        return self._once(("forces", n_f), lambda: self._on_device(forces(self._reduced(n_f))))
+    def sensitivities(self, n_f: int) -> Sensitivities:
+        """Return the `Sensitivities` of the reduced QPs, on the device."""
+        return self._once(
+            ("sensitivities", n_f), lambda: self._on_device(sensitivities(self._reduced(n_f)))
+        )
 
     def sizes(self, n_f: int) -> Sizes:
         """Return the `Sizes` of the reduced QPs, on the device."""
-
-        def make() -> Sizes:
-            return self._on_device(sizes(self.condensed(n_f), self.theta, n_f))
-
-        return self._once(("sizes", n_f), make)
+        return self._once(
+            ("sizes", n_f),
+            lambda: self._on_device(sizes(self.condensed(n_f), self.theta, n_f)),
+        )
 
     def part(self, group: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, Prepared]:
         """Return the new group and theta of the QPs at ``index``, whose matrices are ``group``."""
@@ -211,24 +211,16 @@ def _is_diagonal(matrices: np.ndarray) -> bool:
     return square and np.count_nonzero(matrix) == np.count_nonzero(matrix.diagonal())
 
 
-class _Latest(threading.local):
-    """The latest `Prepared` of this thread, each with the content of its tensors."""
-
-    #: V and Q of an online and a target network.
-    SIZE = 4
-
-    def __init__(self) -> None:
-        self.entries: list[tuple[tuple, Prepared]] = []
-
-
-_latest = _Latest()
+#: The latest thetas that are kept: V and Q of an online and a target network.
+LATEST = 4
+_thread = threading.local()
 
 
 def prepared_for(data: Sequence[np.ndarray], n_kept: int, device: torch.device | None) -> Prepared:
     """Return the cached preparation of H, q, .., w, which the whole batch shares."""
     kind = (n_kept, device, data[0].dtype, *(x.shape for x in data))
     content = tuple(x.tobytes() for x in data)
-    entries = _latest.entries
+    entries: list[tuple[tuple, Prepared]] = vars(_thread).setdefault("latest", [])
     for position, ((other_kind, other), prepared) in enumerate(entries):
         if other_kind == kind and other == content:
             entries.insert(0, entries.pop(position))
@@ -236,7 +228,7 @@ def prepared_for(data: Sequence[np.ndarray], n_kept: int, device: torch.device |
     theta = Theta.of([x[np.newaxis].copy() for x in data])  # the caller may change its own
     prepared = Prepared(theta, np.zeros(1, np.int64), n_kept, device)
     entries.insert(0, ((kind, content), prepared))
-    del entries[_Latest.SIZE :]
+    del entries[LATEST:]
     return prepared
 
 
@@ -339,17 +331,17 @@ class Programs:
 
         First-order conditions certify an optimum only where the QP is convex.
         """
-        p, valid, index = self, self.valid(), None
+        programs, valid, index = self, self.valid(), None
         if valid is not None:
             index = np.flatnonzero(valid)
-            p = self.take(index)
-        convex = p.prepared.convex(p.n_f) if len(p) else None
+            programs = self.take(index)
+        convex = programs.prepared.convex(programs.n_f) if len(programs) else None
         if convex is None:
             return index
-        rest = np.flatnonzero(convex[to_numpy(p.group)])
+        rest = np.flatnonzero(convex[to_numpy(programs.group)])
         return rest if index is None else index[rest]
 
-    def unsolved(self, status: np.ndarray) -> BatchSolution:
+    def unsolved(self, status: np.ndarray | int) -> BatchSolution:
         """Return placeholders of ``status`` ``(B,)``: infinite costs, fixed entries, and zeros."""
         _, C, G, q, *_ = self.prepared.theta
         n, fixed = len(self), to_numpy(self.fixed)
@@ -361,7 +353,7 @@ class Programs:
             chi=np.zeros((n, C.shape[1])),
             lam=np.zeros((n, G.shape[1])),
             xi=np.zeros_like(fixed),
-            status=status.copy(),
+            status=np.full(n, status),
             residual=np.full(n, np.inf),
             value_error=np.full(n, np.inf),
             iterations=np.zeros(n, np.int64),
@@ -402,8 +394,8 @@ class Programs:
             The solutions, and True where an active set settled, ``(B,)``.
         """
         active = active[:, self.prepared.reduced(self.n_f).rows]
-        forces = self.prepared.forces(self.n_f)
-        *solution, settled = self.kernels.try_active_sets(qps, forces, active)
+        sensitivities = self.prepared.sensitivities(self.n_f)
+        *solution, settled = self.kernels.try_active_sets(qps, sensitivities, active)
         return BackendSolution(*solution), settled
 
     def hold(self, vy: Tensor, held: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
@@ -412,12 +404,13 @@ class Programs:
         vy are v and the `reduced_qps`' G v for t = 0, ``(B, d + r)``. The result is wrong or NaN
         where H or the held rows are singular.
         """
-        forces, rows = self.prepared.forces(self.n_f), self.prepared.reduced(self.n_f).rows
+        to_lam = self.prepared.sensitivities(self.n_f).to_lam
+        rows = self.prepared.reduced(self.n_f).rows
         t, rows = torch.zeros_like(level), to_tensor(rows)
         arrays = vy, held[:, rows], level[:, rows]
         if isinstance(self.fixed, np.ndarray):
             arrays = map(to_numpy, arrays)
-        vy, t[:, rows] = map(to_tensor, self.kernels.hold(forces, self.group, *arrays, 0.0))
+        vy, t[:, rows] = map(to_tensor, self.kernels.hold(to_lam, self.group, *arrays, 0.0))
         return vy[:, : vy.shape[-1] - len(rows)], t
 
     def recover(self, candidate: BackendSolution, passes: int = 0) -> BatchSolution:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from torch_qpmpc.qp.kernels import theta as kernels
+from torch_qpmpc.qp.kernels import linalg as kernels
 from torch_qpmpc.qp.pipeline.arrays import Array, Theta
 from torch_qpmpc.qp.pipeline.scaling import Units
 
@@ -152,14 +152,14 @@ class Sizes(NamedTuple):
     apart: bool
 
 
-class Forces(NamedTuple):
-    """The response ``-rise'g - push'lam`` of (v, y = G v) to g and multipliers.
+class Sensitivities(NamedTuple):
+    """The response ``-to_g'g - to_lam'lam`` of (v, y = G v) to g and multipliers.
 
-    ``rise = H^-1 [I, G']`` is ``(M, d, d + r)``, and ``push = G rise`` is ``(M, r, d + r)``.
+    ``to_g = H^-1 [I, G']`` is ``(M, d, d + r)``, and ``to_lam = G to_g`` is ``(M, r, d + r)``.
     """
 
-    rise: Array
-    push: Array
+    to_g: Array
+    to_lam: Array
 
 
 @np.errstate(all="ignore")  # predictions of unstable models may overflow
@@ -257,15 +257,15 @@ def _index_of(rows: np.ndarray) -> np.ndarray:
 
 
 @np.errstate(all="ignore")
-def forces(reduced: Reduced) -> Forces:
-    """Return the `Forces` of reduced QPs, NaN if an H is singular."""
+def sensitivities(reduced: Reduced) -> Sensitivities:
+    """Return the `Sensitivities` of reduced QPs, NaN if an H is singular."""
     try:
         inverse = np.linalg.inv(reduced.H)
     except np.linalg.LinAlgError:
         inverse = np.full_like(reduced.H, np.nan)
     y = reduced.G @ inverse
-    rise = np.concatenate((inverse, y.swapaxes(1, 2)), axis=-1)
-    return Forces(rise, np.concatenate((y, y @ reduced.G.swapaxes(1, 2)), axis=-1))
+    to_g = np.concatenate((inverse, y.swapaxes(1, 2)), axis=-1)
+    return Sensitivities(to_g, np.concatenate((y, y @ reduced.G.swapaxes(1, 2)), axis=-1))
 
 
 def convex(H: np.ndarray) -> np.ndarray:

@@ -31,15 +31,15 @@ from torch_qpmpc.qp.solvers import daqp
 ROUNDING, SIGNIFICANT = 1e-12, 1e-7
 
 
-def diagnose(p: Programs) -> np.ndarray:
+def diagnose(programs: Programs) -> np.ndarray:
     """Return the `Status` of each QP, ``(B,)``: INFEASIBLE, UNBOUNDED or NOT_CONVERGED."""
-    H, C, G, q, _, b, lb, ub, w = p.theta
-    ranges = {m: _Range.of(C[m][:, p.n_f :]) for m in set(p.group.tolist())}
+    H, C, G, q, _, b, lb, ub, w = programs.theta
+    ranges = {m: _Range.of(C[m][:, programs.n_f :]) for m in set(programs.group.tolist())}
     statuses = []
-    for i, m in enumerate(p.group.tolist()):
+    for i, m in enumerate(programs.group.tolist()):
         vectors = (x[i % len(x)] for x in (b, lb, ub, w))
         b_i, lb_i, ub_i, w_i = vectors
-        qp = _FreeQP.of(H[m], q[i % len(q)], C[m], b_i, G[m], lb_i, ub_i, w_i, p.fixed[i])
+        qp = _FreeQP.of(H[m], q[i % len(q)], C[m], b_i, G[m], lb_i, ub_i, w_i, programs.fixed[i])
         statuses.append(int(_status(qp, ranges[m])))
     return np.array(statuses, np.int64)
 

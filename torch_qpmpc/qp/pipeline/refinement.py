@@ -60,19 +60,19 @@ class Twice(NamedTuple):
 
 
 def refine(
-    p: Programs, solution: BatchSolution, which: np.ndarray, last: bool = False
+    programs: Programs, solution: BatchSolution, which: np.ndarray, last: bool = False
 ) -> np.ndarray:
     """Refine the solutions at the indices ``which`` in place; return the indices of failures.
 
     Large QPs, for which all other ways together are quicker, count as failures until the ``last``.
     """
-    theta, group, failed = p.theta, p.group, []
-    if not last and sum(p.theta.C.shape[1:]) ** 3 > MAX_WORK:
+    theta, group, failed = programs.theta, programs.group, []
+    if not last and sum(programs.theta.C.shape[1:]) ** 3 > MAX_WORK:
         return which
     for i in which:
         matrices = (x[group[i]] for x in theta[:3])
         vectors = (x[i % len(x)] for x in theta[3:])
-        qp = _QP._make((*matrices, *vectors, p.fixed[i]))
+        qp = _QP._make((*matrices, *vectors, programs.fixed[i]))
         try:
             refined = qp.solve(solution.z[i], solution.lam[i])
         except (np.linalg.LinAlgError, RuntimeError):  # of numbers that overflowed
@@ -132,10 +132,10 @@ class _QP(NamedTuple):
         it is beyond by more than the multiplier is below w, all relatively.
         """
         force = np.abs(lam) * np.abs(self.G).sum(-1)
-        push = force / max(force.max(initial=0.0), TINY)
+        share = force / max(force.max(initial=0.0), TINY)
         bound, sign = np.where(lam > 0, self.ub, self.lb), np.sign(lam)
         beyond = sign * (self.G @ z - bound) / np.maximum(self.row_sizes(z), TINY)
-        held = ((lam != 0) & (push > np.abs(beyond))) | ((self.lb == self.ub) & (self.w > 0))
+        held = ((lam != 0) & (share > np.abs(beyond))) | ((self.lb == self.ub) & (self.w > 0))
         below = 1 - np.abs(lam) / np.maximum(self.w, TINY)
         saturated = (self.w < np.inf) & (lam != 0) & (below <= np.maximum(beyond, 0))
         code = np.where(saturated, 2 * sign, np.where(held, np.where(sign == 0, 1, sign), 0))

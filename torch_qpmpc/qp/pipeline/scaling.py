@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torch_qpmpc.qp.kernels.theta import column_sizes, finite_sizes, row_sums
+from torch_qpmpc.qp.kernels.linalg import column_sizes, finite_sizes, row_sums
 from torch_qpmpc.qp.pipeline.arrays import Array, BatchSolution, Theta, per_qp
 
 #: Sizes between these have the unit one.

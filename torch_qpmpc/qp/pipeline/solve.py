@@ -18,7 +18,6 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.qp.batching import broadcast, flatten_batch
-from torch_qpmpc.qp.forking import serial_if_forked
 from torch_qpmpc.qp.pipeline.arrays import (
     TOLERANCE,
     Array,
@@ -36,11 +35,9 @@ from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import NDIMS, Status
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
+from torch_qpmpc.qp.tracing import serial_if_forked
 
 ON_FAILURE = ("raise", "warn", "mask")
-#: The tensors of a `QPSolution`: value, z, chi, lam, xi, status, residual, value_error, iterations,
-#: active.
-Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 Eliminate = Callable[[np.ndarray, int], Elimination | None]
 #: Rejected solutions with a relative residual up to this are refined.
 NEARLY = 1e-2
@@ -110,40 +107,25 @@ class SolveLog:
 _active_log: contextvars.ContextVar[SolveLog] = contextvars.ContextVar("log")
 
 
-def solve_now(
-    H: Tensor,
-    q: Tensor,
-    c: Tensor,
-    C: Tensor,
-    b: Tensor,
-    G: Tensor,
-    lb: Tensor,
-    ub: Tensor,
-    w: Tensor,
-    fixed: Tensor,
-    start: Tensor | None,
-    n_kept: int,
-    solver: str,
-    on_failure: str,
-) -> Outputs:
+def solve_now(*arguments: Any) -> BatchSolution:
     """Solve a batch, on the CPU or, with ``solver="torch"``, on the device of q.
 
     Args:
-        H, q, c, C, b, G, lb, ub, w: see `QuadraticProgram`.
-        fixed, solver, on_failure: see `torch_qpmpc.solve_qp`.
-        start: active sets ``(*batch, n_g)`` of a warm start.
-        n_kept: see `Programs.of`.
+        arguments: H, q, c, C, b, G, lb, ub and w of the `QuadraticProgram`; ``fixed``; the active
+            sets ``(*batch, n_g)`` of a warm start, or None; ``n_kept`` of `Programs.of`; ``solver``
+            and ``on_failure`` of `torch_qpmpc.solve_qp`.
 
     Raises:
         QPError: the solver or ``on_failure`` is unknown, the data are invalid, or the batch
             exceeds the memory.
         SolverError: with ``on_failure="raise"``, a QP has no certified solution.
     """
+    *theta, fixed, start, n_kept, solver, on_failure = arguments
+    q = theta[1]
     backend(solver)
     if on_failure not in ON_FAILURE:
         raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
     device = native_device(q) if solver == "torch" else None
-    theta = (H, q, c, C, b, G, lb, ub, w)
     try:
         with serial_if_forked():
             programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=device)
@@ -162,15 +144,15 @@ def solve_now(
     if on_failure != "mask" and not solution.all_accepted:
         _report(solution, batch, on_failure)
 
-    outputs: Any = tuple(map(to_tensor, solution))
-    if len(batch) == 1 and q.dtype == torch.float64 and q.device == outputs[0].device:
+    outputs = BatchSolution._make(map(to_tensor, solution))
+    if len(batch) == 1 and q.dtype == torch.float64 and q.device == outputs.value.device:
         return outputs
 
     def out(x: Tensor) -> Tensor:
         dtype = q.dtype if x.is_floating_point() else x.dtype
         return x.reshape((*batch, *x.shape[1:])).to(q.device, dtype)
 
-    return tuple(map(out, outputs))  # pyright: ignore[reportReturnType] - a tuple of ten
+    return BatchSolution._make(map(out, outputs))
 
 
 def _is_out_of_memory(error: Exception) -> bool:
@@ -206,23 +188,24 @@ class Strategy(NamedTuple):
     start: Array | None = None
     eliminate: Eliminate | None = None
 
-    def prepared(self, p: Programs) -> Programs | None:
+    def prepared(self, programs: Programs) -> Programs | None:
         """Return the QPs with this elimination; None if it does not apply."""
         if self.eliminate is None:
-            return p
-        elimination = self.eliminate(p.theta.C, p.n_f) if p.theta.C.size else None
-        return None if elimination is None else p.eliminated(elimination)
+            return programs
+        C = programs.theta.C
+        elimination = self.eliminate(C, programs.n_f) if C.size else None
+        return None if elimination is None else programs.eliminated(elimination)
 
-    def certified(self, p: Programs) -> BatchSolution:
+    def certified(self, programs: Programs) -> BatchSolution:
         """Return candidates, completed and certified; active sets that do not settle are none."""
-        qps = p.reduced_qps()
+        qps = programs.reduced_qps()
         if self.start is not None:
-            candidate, settled = p.try_active_sets(qps, self.start)
-            solution = p.recover(candidate)
+            candidate, settled = programs.try_active_sets(qps, self.start)
+            solution = programs.recover(candidate)
             solution.residual[~settled] = np.inf
             return solution
         solve = self.solve if qps.l.shape[-1] else _unconstrained
-        return p.recover(solve(qps).like(p.fixed), PASSES if self.eliminate else 0)
+        return programs.recover(solve(qps).like(programs.fixed), PASSES if self.eliminate else 0)
 
 
 def strategies(solver: str, start: Array | None) -> list[Strategy]:
@@ -243,46 +226,47 @@ def _unconstrained(qps: SoftQPs) -> BackendSolution:
     return BackendSolution(v, lam, torch.zeros_like(group))
 
 
-def solve_programs(p: Programs, solver: str, start: Array | None = None) -> BatchSolution:
+def solve_programs(programs: Programs, solver: str, start: Array | None = None) -> BatchSolution:
     """Solve and certify B QPs; the status of an unsolved one is its diagnosis.
 
     Args:
-        p: the QPs.
+        programs: the QPs.
         solver: a backend's name, see `torch_qpmpc.qp.solvers`.
         start: active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.try_active_sets`.
     """
     began = time.perf_counter()
     log = _active_log.get(unused := SolveLog())
-    units = p.prepared.units
+    units = programs.prepared.units
     if units is None:
-        solution = _solved(p, solver, start, log)
+        solution = _solved(programs, solver, start, log)
     else:
-        scaled = p.scaled()
+        scaled = programs.scaled()
         solution = units.restored(_solved(scaled, solver, start, log), scaled.group)
-        solution = _confirmed(p.on_cpu(), solver, solution.on_cpu())
+        solution = _confirmed(programs.on_cpu(), solver, solution.on_cpu())
     if log is not unused:
         log.add(solution, time.perf_counter() - began)
     return solution
 
 
-def _solved(p: Programs, solver: str, start: Array | None, log: SolveLog) -> BatchSolution:
+def _solved(programs: Programs, solver: str, start: Array | None, log: SolveLog) -> BatchSolution:
     """Try one strategy after the other on the QPs without a certified solution.
 
-    The first runs on the device of ``p``. What it leaves is diagnosed: a QP that is proved to have
-    no solution is tried no further.
+    The first runs on their device. What it leaves is diagnosed: a QP that is proved to have no
+    solution is tried no further.
     """
-    todo, solution, status = p.solvable(), None, np.full(len(p), int(Status.NOT_CONVERGED))
+    status = np.full(len(programs), int(Status.NOT_CONVERGED))
+    todo, solution = programs.solvable(), None
     if todo is not None:
         status[:] = Status.INVALID_DATA
-        solution, status[todo] = p.unsolved(status), Status.NOT_CONVERGED
-        todo = on_device(todo, p.prepared.device)
+        solution, status[todo] = programs.unsolved(status), Status.NOT_CONVERGED
+        todo = on_device(todo, programs.prepared.device)
         start = None if start is None else start[todo]
     ways = strategies(solver, start)
     own = ways[start is not None]  # what the solver itself leaves is diagnosed
     for way in ways:
         if todo is not None and not len(todo):
             break
-        rest = way.prepared(p if todo is None else p.take(todo))
+        rest = way.prepared(programs if todo is None else programs.take(todo))
         if rest is None:
             continue
         answer = way.certified(rest)
@@ -291,11 +275,9 @@ def _solved(p: Programs, solver: str, start: Array | None, log: SolveLog) -> Bat
         if todo is None and answer.all_accepted:
             return answer
         if way.start is None and not answer.all_accepted:  # what follows needs the CPU
-            p, rest, answer, last = p.on_cpu(), rest.on_cpu(), answer.on_cpu(), way is ways[-1]
-            solution, todo = (
-                solution and solution.on_cpu(),
-                None if todo is None else to_numpy(todo),
-            )
+            programs, rest, answer = programs.on_cpu(), rest.on_cpu(), answer.on_cpu()
+            solution, last = solution and solution.on_cpu(), way is ways[-1]
+            todo = None if todo is None else to_numpy(todo)
             rejected = ~answer.accepted() & (last | (answer.residual <= NEARLY))
             refine(rest, answer, np.flatnonzero(rejected), last)
         left = indices(~answer.accepted())
@@ -306,39 +288,39 @@ def _solved(p: Programs, solver: str, start: Array | None, log: SolveLog) -> Bat
             todo = todo[left]
         if way is own and len(todo):
             log.fallback += len(todo)
-            status[todo] = diagnose(p.take(todo))
+            status[todo] = diagnose(programs.take(todo))
             todo = todo[status[todo] == Status.NOT_CONVERGED]
     assert solution is not None
     if not solution.all_accepted:
-        p, solution = p.on_cpu(), solution.on_cpu()
-        solution.clear(np.flatnonzero(~solution.accepted()), p.unsolved(status))
+        programs, solution = programs.on_cpu(), solution.on_cpu()
+        solution.clear(np.flatnonzero(~solution.accepted()), programs.unsolved(status))
     return solution
 
 
-def _confirmed(p: Programs, solver: str, solution: BatchSolution) -> BatchSolution:
+def _confirmed(programs: Programs, solver: str, solution: BatchSolution) -> BatchSolution:
     """Certify scaled solutions in the original numbers, too; solve second those that fail.
 
     The units depend on the bounds. A bound that is far from every solution, such as a large number
     in place of inf, makes them so large that a certificate in these units misses errors.
     """
-    units, accepted = p.prepared.units, np.flatnonzero(solution.accepted())
+    units, accepted = programs.prepared.units, np.flatnonzero(solution.accepted())
     assert units is not None
-    failed = refine(p, solution, _refuted(p, solution, accepted))
+    failed = refine(programs, solution, _refuted(programs, solution, accepted))
     if len(failed):
-        solution.put(failed, _solved(p.take(failed), solver, None, SolveLog()))
-        in_units = units.inverse().restored(solution, p.group)
+        solution.put(failed, _solved(programs.take(failed), solver, None, SolveLog()))
+        in_units = units.inverse().restored(solution, programs.group)
         failed = failed[solution.accepted()[failed]]
-        failed = _refuted(p.scaled(), in_units, failed)
-        solution.put(failed, p.unsolved(np.full(len(p), int(Status.NOT_CONVERGED))).at(failed))
+        failed = _refuted(programs.scaled(), in_units, failed)
+        solution.put(failed, programs.unsolved(Status.NOT_CONVERGED).at(failed))
     return solution
 
 
-def _refuted(p: Programs, solution: BatchSolution, which: np.ndarray) -> np.ndarray:
-    """Raise the residuals at the indices ``which`` to those of ``p``; return those rejected."""
+def _refuted(programs: Programs, solution: BatchSolution, which: np.ndarray) -> np.ndarray:
+    """Raise the residuals at the indices ``which`` to the QPs' own; return those rejected."""
     if not len(which):
         return which
     solved = solution.at(which)
-    part = p if len(which) == len(p) else p.take(which)
+    part = programs if len(which) == len(programs) else programs.take(which)
     _, residual, error = part.certify(solved.z, solved.lam, solved.chi, solved.xi)
     solution.residual[which] = np.maximum(solved.residual, residual)
     solution.value_error[which] = np.maximum(solved.value_error, error)

@@ -101,10 +101,10 @@ class BatchedQPs:
         median = median.nan_to_num(1.0)
         width = torch.where(known, width, median).maximum(1e-3 * median)
         length, stiffest = width.amin(-1, keepdim=True), _largest(H.flatten(1))
-        push = _largest(g) + stiffest * length
-        push = torch.where(push > 0, push, 1.0)
-        curvature = stiffest.maximum(FLAT * push / length)
-        width, force = width * size, TYPICAL * push / size
+        force = _largest(g) + stiffest * length
+        force = torch.where(force > 0, force, 1.0)
+        curvature = stiffest.maximum(FLAT * force / length)
+        width, force = width * size, TYPICAL * force / size
         penalty, cost = PENALTY * curvature / size.square(), (force * width).amin(-1)
         curvature = curvature.squeeze(-1)
         typical = (width, force, penalty, cost, curvature)
@@ -148,9 +148,9 @@ class BatchedQPs:
 
     def residual(self, v: Tensor, lam: Tensor) -> Tensor:
         """Return the certificate's relative KKT residual for the condensed QPs, ``(B,)``."""
-        Hv, y, pull = self.apply_H(v), self.rows(v), self.apply_Gt(lam)
-        stationarity = _largest(Hv + self.g + pull)
-        stationarity /= 1 + _largest(torch.cat((Hv, self.g, pull), dim=-1))
+        Hv, y, G_lam = self.apply_H(v), self.rows(v), self.apply_Gt(lam)
+        stationarity = _largest(Hv + self.g + G_lam)
+        stationarity /= 1 + _largest(torch.cat((Hv, self.g, G_lam), dim=-1))
         hard = self.w == HUGE
         weight, outside = self.w.masked_fill(hard, 0), (y - y.clip(self.lower, self.upper)).abs()
         violation = _largest(outside * hard / (1 + y.abs()))

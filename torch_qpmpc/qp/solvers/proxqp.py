@@ -12,7 +12,7 @@ import torch
 from proxsuite import proxqp
 
 from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
-from torch_qpmpc.qp.solvers.split_slack import SplitSlack
+from torch_qpmpc.qp.solvers.qpsolvers import SplitSlack
 
 EPS_ABS = 1e-9
 #: ProxQP's default, 1e-4, calls one soft (always feasible) QP in fifty infeasible.

@@ -1,6 +1,18 @@
-"""Any solver of the `qpsolvers` package, as a second opinion: ``solver="qpsolvers:NAME"``."""
+"""Any solver of the `qpsolvers` package: ``solver="qpsolvers:NAME"``; and its form of the QPs.
+
+The split-slack form has soft rows as linear ones, for solvers with hard constraints only:
+
+    min over v, t+, t-:   1/2 v'Hv + g'v + w'(t+ + t-)
+    subject to            l <= G v - t+ + t- <= u,   0 <= t+, t-
+
+There is one slack per side instead of the paper's one sigma per row: the optimum is the same, and
+ProxQP needs half the iterations and reports no false infeasibility. Sides without a finite bound,
+and hard rows, have no slack.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import qpsolvers
@@ -8,7 +20,71 @@ import scipy.sparse as sp
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
-from torch_qpmpc.qp.solvers.split_slack import SplitSlack
+
+
+@dataclass(frozen=True)
+class SplitSlack:
+    """Matrices shared by a batch: x = (v, t+, t-), rows (G v - t+ + t-, t+, t-)."""
+
+    n_v: int
+    n_rows: int
+    over: np.ndarray  # rows that have a t+
+    under: np.ndarray  # rows that have a t-
+    n_t: int  # slacks
+    H: list[sp.csc_matrix]
+    rows: list[sp.csc_matrix]
+
+    @classmethod
+    def of(cls, qps: SoftQPs) -> SplitSlack:
+        n_rows, n_v = qps.G.shape[1:]
+        soft = np.isfinite(qps.w).any(axis=0)
+        over = np.flatnonzero(soft & np.isfinite(qps.u).any(axis=0))
+        under = np.flatnonzero(soft & np.isfinite(qps.l).any(axis=0))
+        n_t = len(over) + len(under)
+        unit = sp.csc_matrix(np.eye(n_rows))
+        slack = sp.hstack([-unit[:, over], unit[:, under]])
+        positive = sp.hstack([sp.csc_matrix((n_t, n_v)), sp.identity(n_t)])
+        blank = sp.csc_matrix((n_t, n_t))
+        return cls(
+            n_v,
+            n_rows,
+            over,
+            under,
+            n_t,
+            [sp.csc_matrix(sp.block_diag([H, blank])) for H in qps.H],
+            [sp.csc_matrix(sp.vstack([sp.hstack([G, slack]), positive])) for G in qps.G],
+        )
+
+    @property
+    def n_x(self) -> int:
+        """Number of variables: v and the slacks."""
+        return self.n_v + self.n_t
+
+    @property
+    def n_in(self) -> int:
+        """Number of rows: those of G and the slacks' signs."""
+        return self.n_rows + self.n_t
+
+    @property
+    def paired(self) -> bool:
+        """True if each soft row has two slacks."""
+        return np.array_equal(self.over, self.under)
+
+    def gradient(self, g: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return the linear cost of x for one QP; a hard row's slack is fixed at zero."""
+        weight = np.where(np.isfinite(w), w, 0.0)
+        return np.concatenate([g, weight[self.over], weight[self.under]])
+
+    def bounds(
+        self, lower: np.ndarray, upper: np.ndarray, w: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return lower and upper bounds of the rows for one QP."""
+        limit = np.where(np.isfinite(w), np.inf, 0.0)
+        slack_upper = np.concatenate([limit[self.over], limit[self.under]])
+        return (
+            np.concatenate([lower, np.zeros_like(slack_upper)]),
+            np.concatenate([upper, slack_upper]),
+        )
 
 
 def check_available(name: str) -> None:
