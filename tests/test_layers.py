@@ -72,7 +72,7 @@ BUDGET = {
     "experiment": 4030,
     "export": 1412,
     "learning": 2473,
-    "mpc": 5153,
+    "mpc": 5109,
     "proofs": 998,
     "qp": 5869,
     "study": 606,

@@ -37,7 +37,7 @@ from torch_qpmpc.experiment.run_state import resumed
 from torch_qpmpc.learning.replay import Replay, windows_to_tau
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.projections import check_step, nearest_psd, nearest_psd_by_sdp
-from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
+from torch_qpmpc.mpc.riccati import lqr_gain
 
 A2, B1 = tensor([[1.0, 0.1], [0, 0.9]]).double(), tensor([[0.0], [1.0]]).double()
 I3 = eye(3).double()
@@ -124,7 +124,7 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("fixed: got a tensor on meta, expected one on the", lambda: qm.solve_qp(qp, fixed.to("meta"))),
     ("warm_start: got list, expected a", lambda: qm.solve_qp(qp, fixed, warm_start=[0])),
     ("3 of 3 QPs have no certified solution. 3 INVALID_DATA", lambda: qm.solve_qp(qp, fixed * nan)),
-    ("n_x: got True, expected a positive integer.", M(n_x=True)),
+    ("n_x: got True, expected a whole number >= 1.", M(n_x=True)),
     ("gamma: got nan, expected a discount factor in (0, 1].", M(gamma=nan)),
     ("A, B: got shapes (2,) and (2, 1), expected matrices (n_x, n_x) and (n_x,", M(A=ones(2))),
     ("A: got a tensor of torch.complex64 on cpu, expected a", M(A=eye(2).to(torch.complex64))),
@@ -223,7 +223,6 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("true_model: got tuple of 1, expected the pair (A, B), (A, B,", lambda: read(mpc, (A2,))),
     ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: structure_metrics(op)),
     ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: local_gain(op, S)),
-    ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: stage_weight(op)),
     ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: policy_map(op, ones(2), ones(2))),
     ("s: got shape (3,), expected shape (*batch, 2).", lambda: local_gain(mpc, zeros(3))),
     ("A: got list, expected a floating-point", lambda: lqr_gain([[1.0]], [[1.0]], [[1.0]])),

@@ -11,7 +11,7 @@ class QPError(ValueError):
         >>> qm.QPMPC.of(2, 1, horizon=0)
         Traceback (most recent call last):
         ...
-        torch_qpmpc.errors.QPError: horizon: got 0, expected a positive integer.
+        torch_qpmpc.errors.QPError: horizon: got 0, expected a whole number >= 1.
     """
 
     @classmethod

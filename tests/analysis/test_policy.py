@@ -10,7 +10,7 @@ import torch
 from tests.problems import normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.analysis.policy import local_gain, policy_map, spectral_radius
-from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
+from torch_qpmpc.mpc.riccati import lqr_gain, stage_weight
 
 A = torch.tensor([[1.0, 0.2], [-0.1, 1.1]], dtype=torch.float64)
 B = torch.tensor([[0.0, 0.1], [0.3, 0.1]], dtype=torch.float64)

@@ -34,7 +34,7 @@ from torch_qpmpc.analysis.structure import (
 )
 from torch_qpmpc.mpc.banded import band_distance, banded_matrix
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.regulator import stage_weight
+from torch_qpmpc.mpc.riccati import stage_weight
 
 pytestmark = pytest.mark.layout
 

@@ -10,7 +10,7 @@ from tests.examples import example
 from tests.problems import normal
 from torch_qpmpc import QPMPC, GaussNewton
 from torch_qpmpc.learning.td_error import FLOOR, inverse_variance
-from torch_qpmpc.mpc.regulator import lqr_gain
+from torch_qpmpc.mpc.riccati import lqr_gain
 
 COUNT = 4000
 

@@ -34,12 +34,6 @@ def test_trajectories_of_the_model_are_its_null_space(stages):
     assert_close(C @ torch.cat(z), torch.zeros(N * N_X).double())
 
 
-def test_one_matrix_may_vary_with_the_stage():
-    A, B = model()
-    C = banded_matrix(A.expand(N, N_X, N_X), B, N)
-    assert_close(C, banded_matrix(A, B, N))
-
-
 @pytest.mark.parametrize(
     ("A", "B", "message"),
     [
@@ -62,12 +56,3 @@ def test_band_distance_counts_stages():
         [-2, -2, -1, -1, 0, 0, 0],
     ]
     assert band_distance(Layout(1, 1, 3)).tolist() == expected
-
-
-def test_the_band_is_where_a_model_has_entries():
-    A, B = model()
-    C, distance = banded_matrix(A, B, N), band_distance(Layout(N_X, N_U, N))
-    assert distance.shape == C.shape
-    assert (C[distance != 0] == 0).all()
-    # On the band only the off-diagonal entries of the minus identity are zero.
-    assert int((C[distance == 0] == 0).sum()) == N * N_X * (N_X - 1)

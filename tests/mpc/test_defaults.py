@@ -114,17 +114,6 @@ def test_from_data_fits_the_cost_to_the_rewards(hessian):
     assert (own.q == 0).all()
 
 
-def test_a_set_point_among_the_observations_needs_the_dense_cost_of_the_default():
-    """The cost is (y_1 - y_2)^2 + 0.1 u^2 / 2, whose weight has a cross-term."""
-    log, _ = rewarded()
-    y, u = log["observation"], log["action"]
-    cost = (y[..., :1] - y[..., 1:]).square() + 0.05 * u.square()
-    log["next", "reward"] = -cost
-    mpc = QPMPC.from_data(log, 3, past=2)
-    expected = torch.tensor([[2.0, -2.0, 0.0], [-2.0, 2.0, 0.0], [0.0, 0.0, 0.1]]).double()
-    assert_close(mpc.H.detach(), expected, rtol=1e-6, atol=1e-6)
-
-
 def test_from_data_refuses_a_log_without_rewards():
     message = r"^stage_weight: got none, and a log without rewards, expected a weight, or finite"
     with pytest.raises(QPError, match=message):

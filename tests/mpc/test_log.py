@@ -67,11 +67,6 @@ def test_all_forms_are_the_same_log(tmp_path):
     assert same(qm.read_log(shorter, **NAMES), expected)
 
 
-def test_a_list_has_an_episode_in_each_part():
-    log = qm.read_log([room(20), dict(room(30, seed=1))], **NAMES, time="t")
-    assert lengths(log) == [19, 29]
-
-
 def test_arrays_and_columns_have_names_by_default():
     rng = np.random.default_rng(0)
     y, u = rng.normal(size=(20, 2)), rng.normal(size=(19, 1))
@@ -238,17 +233,6 @@ def test_a_log_is_read_in_order():
         assert torch.equal(d, log["preview"][i, :, :1])
 
 
-def test_the_last_entries_of_a_window_are_the_output():
-    log = arx_log()
-    wide = log.clone()
-    for key in ("observation", ("next", "observation")):
-        wide[key] = torch.cat((torch.randn(3, 40, 5), log[key]), dim=-1)
-    for plain, windowed in zip(
-        as_log(log).trajectories, as_log(wide, n_x=2).trajectories, strict=True
-    ):
-        assert torch.equal(plain.y, windowed.y)
-
-
 def test_trajectories_end_at_flags_ids_and_gaps():
     log = arx_log()
     log["next", "truncated"] = torch.zeros(3, 40, 1, dtype=torch.bool)
@@ -373,10 +357,6 @@ def spoilt(index: tuple[int, ...], number: float):
         (
             lambda log: log.set(("next", "done"), torch.zeros(3, 40, 2, dtype=torch.bool)),
             r"next\.done: got shape \(3, 40, 2\), expected shape \(3, 40\) or \(3, 40, 1\)",
-        ),
-        (
-            lambda log: log.to("meta"),
-            "observation: got a meta tensor, expected a tensor with values",
         ),
         (
             change("observation", lambda x: 1e155 * x),

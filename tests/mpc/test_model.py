@@ -47,15 +47,11 @@ def test_a_discrete_system_of_scipy_has_a_model():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"A": "model"}, "A: got 'model', expected a tensor, or what torch.as_tensor takes"),
         ({"A": [[1.0, torch.nan], [0, 1]]}, "A: got NaN or inf, expected finite entries"),
-        ({"b": [torch.inf]}, "b: got NaN or inf, expected finite entries"),
-        ({"A": torch.ones(2)}, r"A, B: got shapes \(2,\) and \(2, 1\), expected matrices \(n_x, n"),
         (
             {"A": torch.eye(3)},
             r"A, B: got shapes \(3, 3\) and \(2, 1\), expected \(n_x, L n_x\) and \(n_x, L n",
         ),
-        ({"A": torch.ones(2, 3)}, r"A, B: got shapes \(2, 3\) and \(2, 1\), expected \(n_x, L n"),
         ({"A": torch.ones(2, 4)}, r"A, B: got shapes \(2, 4\) and \(2, 1\), expected \(n_x, L n"),
     ],
 )

@@ -13,13 +13,12 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torch.func import grad, jacfwd, jacrev, vmap
+from torch.func import jacfwd, jacrev
 from torch.testing import assert_close
 
 from tests.mpc.settings import (
     A_L,
     B_L,
-    EVERYTHING,
     GAMMA,
     LAST_ROWS,
     LAST_U,
@@ -140,17 +139,6 @@ def test_an_action_beyond_a_hard_bound_is_infeasible():
     assert mpc.value(p).isinf().tolist() == [i == 2 for i in range(6)]
 
 
-def test_a_warm_start_leads_to_the_same_solution(solver):
-    mpc, s, a = random_mpc(5, solver=solver), random_states(6), random_states(6, 1, size=0.5)
-    start = mpc.solve(s)
-    with torch.no_grad():
-        mpc.C *= 1.001
-        mpc.C[:, 5] += 0.01
-    for action in (None, a):
-        cold, warm = mpc.solve(s, action), mpc.solve(s, action, warm_start=start)
-        assert_close(warm.value, cold.value, rtol=1e-6, atol=1e-6)
-
-
 # Derivatives
 
 FUNCTIONS: dict[str, Callable[[QPMPC, Tensor, Tensor], Tensor]] = {
@@ -192,33 +180,6 @@ def test_gradients_in_theta_and_p_agree_with_differences(name, function):
         assert_close(
             found.double(), difference, rtol=1e-4, atol=atol, msg=lambda m, x=leaf_name: f"{x} {m}"
         )
-
-
-def test_the_slope_in_prices_and_references_is_that_of_the_plan():
-    mpc = windowed(free=0.0, E=0 * E, constraints=None, terminal_constraints=None)
-    p, _ = inputs(mpc)
-    solution = mpc.solve(p)
-    x, u = mpc.predicted(solution.z.detach())
-    slope = grad(lambda p: mpc.value(p).sum())(p)
-    assert_close(slope, -solution.xi.detach())
-    d = p[:, : (N + 1) * N_D].unflatten(-1, (N + 1, N_D))
-    stages = torch.cat((d[:, :N], x[:, :N], u), -1) @ W_D[:, :N_D]
-    last = torch.cat((d[:, N], x[:, N]), -1) @ W_F[:, :N_D]
-    expected = torch.cat((stages, last.unsqueeze(1)), 1)
-    expected = expected * GAMMA ** torch.arange(N + 1).double().unsqueeze(-1)
-    assert_close(slope[:, : (N + 1) * N_D], expected.flatten(1), rtol=1e-7, atol=1e-7)
-
-
-def test_vmap_equals_the_batch():
-    mpc = windowed(7)
-    p, a = inputs(mpc)
-    assert_close(vmap(mpc.value)(p), mpc.value(p))
-    assert_close(vmap(mpc.action_value)(p, a), mpc.action_value(p, a))
-    assert_close(vmap(mpc.policy)(p), mpc.policy(p))
-    leaf = p.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(mpc.value(leaf).sum(), leaf)
-    assert_close(vmap(grad(mpc.value))(p), slope)
-    assert vmap(jacrev(mpc.policy))(p).shape == (6, N_U, N_P)
 
 
 #: Schemes with a state at which rows meet without a multiplier, or many rows have one.
@@ -270,13 +231,14 @@ def test_derivatives_where_a_controller_spends_its_life(name, solver):
 # Shapes and dtypes
 
 
-@pytest.mark.parametrize("batch", [(), (0,), (1,), (5,), (2, 3)])
-def test_outputs_have_the_batch_of_the_inputs(batch):
-    mpc = random_mpc(6)
-    s, a = torch.zeros(*batch, 2), torch.zeros(*batch, 1)
-    assert mpc.value(s).shape == batch
-    assert mpc.action_value(s, a).shape == batch
-    assert mpc.policy(s).shape == (*batch, 1)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+@pytest.mark.parametrize("batch", [(), (0,), (2, 3)])
+def test_outputs_have_the_batch_and_the_dtype_of_the_states(batch, dtype):
+    mpc, s, a = random_mpc(6), 0.1 * torch.ones(*batch, 2, dtype=dtype), torch.zeros(1).double()
+    outputs = mpc.value(s), mpc.action_value(s, a), mpc.policy(s)
+    assert [out.shape for out in outputs] == [batch, batch, (*batch, 1)]
+    assert {out.dtype for out in outputs} == {dtype}
+    assert_close(outputs[0], mpc.value(s.double()).to(dtype))
 
 
 def test_states_and_actions_broadcast():
@@ -286,34 +248,12 @@ def test_states_and_actions_broadcast():
     assert_close(grid[2, 1], mpc.action_value(s[2], a[1]))
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
-def test_outputs_have_the_dtype_of_the_state(dtype):
-    mpc = random_mpc(6)
-    s, a = random_states(3).to(dtype), random_states(3, 1, size=0.5)
-    for out in (mpc.value(s), mpc.action_value(s, a), mpc.policy(s)):
-        assert out.dtype == dtype
-    assert mpc.C.dtype == torch.float64
-    assert_close(mpc.value(s), mpc.value(s.double()).to(dtype))
-
-
-@pytest.mark.parametrize("name", ["diagonal", "window"])
-def test_a_module_in_single_precision_works_too(name):
-    mpc = made(name, 6)
-    s, _ = inputs(mpc)
-    expected = mpc.value(s)
-    assert_close(mpc.float().value(s.float()), expected.float(), rtol=1e-4, atol=1e-4)
-    assert all(part.dtype == torch.float32 for part in mpc.parameters())
-
-
 # The program
 
 
 @pytest.mark.parametrize("discounted", [False, True])
 @pytest.mark.parametrize("hessian", ["diagonal", "block", "full"])
-@pytest.mark.parametrize("explicit", [{}, {"past": 1, "n_d": 0}])
-def test_without_a_past_and_a_preview_it_is_the_papers_qp_to_the_last_bit(
-    hessian, explicit, discounted
-):
+def test_without_a_past_and_a_preview_it_is_the_papers_qp_to_the_last_bit(hessian, discounted):
     A, B = normal(N_X, N_X, seed=1), normal(N_X, N_U, seed=2)
     weights, last = torch.tensor([1.0, 0.5, 0.1]).double(), torch.tensor([2.0, 3.0]).double()
     D, D_f = normal(2, n, seed=3), normal(1, N_X, seed=4)
@@ -322,7 +262,6 @@ def test_without_a_past_and_a_preview_it_is_the_papers_qp_to_the_last_bit(
         offset=[0.1, 0.2], constraints=(D, [-1.0, -2.0], [1.0, 2.0]), discount_slack=discounted,
         terminal_constraints=(D_f, [-3.0], [3.0]), state_bounds=([-4.0] * 2, [5.0] * 2),
         action_bounds=([-6.0], [7.0]), state_slack=8.0, constraint_slack=9.0, learn=("q",),
-        **explicit,
     )  # fmt: skip
     with torch.no_grad():
         mpc.q.fill_(1.0)
@@ -357,42 +296,15 @@ def test_without_a_past_and_a_preview_it_is_the_papers_qp_to_the_last_bit(
     for name, value in expected.items():
         assert torch.equal(getattr(qp, name), value), name
     assert (mpc.n_p, mpc.n_z) == (N_X, n_z)
-    assert "past" not in repr(mpc)
-
-
-def test_a_window_and_a_preview_that_do_not_matter_change_no_value():
-    one = random_mpc(free=0.0, learn=())
-    A, B = one.C[:2, :2], one.C[:2, 2:3]
-    more = QPMPC.from_model(
-        torch.cat((A, 0 * A), -1), torch.cat((B, 0 * B), -1), 3, n_d=2,
-        stage_weight=[1.0, 0.5, 0.1], terminal_weight=[1.0, 1.0], solver="daqp",
-        state_bounds=([-1.0] * 2, [1.0] * 2), action_bounds=([-0.5], [0.5]),
-    )  # fmt: skip
-    s = random_states(8)
-    p = torch.cat((normal(8, more.n_p - 2), s), -1)
-    assert_close(more.value(p), one.value(s), rtol=1e-9, atol=1e-9)
-    assert_close(more.policy(p), one.policy(s), rtol=1e-7, atol=1e-7)
 
 
 def test_sizes_and_the_parts_of_z():
     mpc = windowed()
     p, a = inputs(mpc)
     assert (mpc.past, mpc.n_d, mpc.n_p, mpc.n_z) == (L, N_D, N_P, N_P + N * n)
-    assert "past=3, n_d=2" in repr(mpc)
-    assert "hessian='diagonal', structure='free', learned=('H', 'c', 'C')" in repr(random_mpc())
     assert_close(mpc.solve(p).z[:, :N_P], p)
     assert_close(mpc.solve(p, a).z[:, : N_P + N_U], torch.cat((p, a), -1))
     assert_close(mpc.policy(p), mpc.solve(p).z[:, N_P : N_P + N_U])
-
-
-def test_value_and_action_value_may_share_a_quadratic_program():
-    mpc, s, a = random_mpc(8), random_states(5).double(), random_states(5, 1, size=0.5).double()
-    alone = mpc.value(s).sum() + mpc.action_value(s, a).sum()
-    qp = mpc.quadratic_program()
-    shared = mpc.value(s, qp).sum() + mpc.action_value(s, a, qp).sum()
-    assert shared == alone
-    gradients = [torch.autograd.grad(total, [*mpc.parameters()]) for total in (alone, shared)]
-    assert_close(*gradients)
 
 
 def test_stages_may_have_weights_and_models_of_their_own():
@@ -412,19 +324,6 @@ def test_a_dense_stage_weight_is_one_block_whatever_the_horizon(hessian, horizon
     mpc = QPMPC.of(2, 1, horizon, gamma=1.0, hessian=hessian, **options)
     H = mpc.quadratic_program().H
     assert_close(H, torch.block_diag(*[W] * horizon, torch.eye(2).double()))
-
-
-@pytest.mark.parametrize("hessian", ["diagonal", "block", "full"])
-def test_the_cost_stays_convex_whatever_the_factors(hessian):
-    learn = ("H", "w") if hessian == "full" else ("H", "H_f", "w")
-    qp = random_mpc(8, free=5.0, hessian=hessian, learn=learn).quadratic_program()
-    H = qp.H.detach()
-    assert_close(H, H.mT, rtol=1e-12, atol=1e-12)
-    assert torch.linalg.eigvalsh(H)[0] > -1e-9
-    stages = H[:3, 3:6].abs().sum() + H[:9, 9:].abs().sum()
-    assert (stages > 0) == (hessian == "full")
-    assert (qp.w >= 0).all()
-    assert qp.w.isinf().sum() == 3
 
 
 def test_random_starts_are_those_of_the_seed_alone():
@@ -448,21 +347,6 @@ def test_readable_parts_are_the_model_and_the_rows():
 # Learning
 
 
-@pytest.mark.parametrize("part", EVERYTHING)
-def test_every_part_can_be_learned_alone(part):
-    mpc = random_mpc(9, learn=(part,), action_slack=50.0)
-    assert mpc.learned == (part,)
-    assert len(list(mpc.parameters())) == 1
-    before, s = mpc.value(random_states(6)), random_states(6)
-    mpc.value(s).sum().backward()
-    (parameter,) = mpc.parameters()
-    assert parameter.grad is not None
-    assert parameter.grad.isfinite().all()
-    assert (parameter.grad != 0).any()
-    step(mpc)
-    assert (mpc.value(s) - before).abs().max() > 1e-6
-
-
 def test_hard_rows_and_missing_bounds_leave_the_gradient_finite():
     mpc = random_mpc(
         9, free=0.0, learn=("w", "lb", "ub"), state_bounds=([-1.0, -torch.inf], [1, 1])
@@ -471,12 +355,6 @@ def test_hard_rows_and_missing_bounds_leave_the_gradient_finite():
     for name, parameter in mpc.named_parameters():
         assert parameter.grad is not None
         assert parameter.grad.isfinite().all(), name
-
-
-def test_learning_nothing_is_allowed():
-    mpc = random_mpc(9, learn=())
-    assert list(mpc.parameters()) == []
-    assert not mpc.value(random_states(3)).requires_grad
 
 
 def test_parameter_groups_have_a_rate_for_each_part():
@@ -515,11 +393,10 @@ def test_it_stays_a_linear_mpc_scheme_while_it_is_learned(name, second_order):
         assert mpc.C[2 * k : 2 * k + 2].count_nonzero() == row.count_nonzero()
 
 
-@pytest.mark.parametrize("decay", [0.0, 1.0])
 @pytest.mark.parametrize("structure", ["tied", "varying"])
-def test_no_optimiser_moves_the_bounds_of_hard_rows(structure, decay):
+def test_no_optimiser_moves_the_bounds_of_hard_rows(structure):
     mpc = linear(free=0.0, structure=structure)
-    optimizer = torch.optim.AdamW(mpc.parameters(), lr=0.1, weight_decay=decay)
+    optimizer = torch.optim.AdamW(mpc.parameters(), lr=0.1, weight_decay=1.0)
     hard = torch.arange(mpc.n_z) % 3 == 2
     before = {name: getattr(mpc, name).detach().clone() for name in ("lb", "ub")}
     for _ in range(3):
@@ -672,14 +549,15 @@ def test_twins_give_the_same_answers_and_are_independent(tmp_path, name):
 @pytest.mark.parametrize("copied", [copy.deepcopy, pickled])
 @pytest.mark.parametrize("learn", [("H", "C"), ("C",), ()])
 def test_a_copy_keeps_mode_dtype_and_what_is_frozen(copied, learn):
-    mpc = random_mpc(12, learn=learn).float().eval()
-    mpc.requires_grad_(False)
+    mpc, s = random_mpc(12, learn=learn), random_states(4).float()
+    expected = mpc.value(s)
+    mpc.float().eval().requires_grad_(False)
     twin = copied(mpc)
     assert not twin.training
     assert not any(part.requires_grad for part in twin.parameters())
     assert all(part.dtype == torch.float32 for part in twin.parameters())
-    s = random_states(4).float()
     assert_close(twin.value(s), mpc.value(s), rtol=0, atol=0)
+    assert_close(mpc.value(s), expected, rtol=1e-4, atol=1e-4)
     assert repr(twin) == repr(mpc)
 
 
@@ -729,7 +607,6 @@ MODEL: dict[str, Any] = {"A": A, "B": B, "hessian": "block", "stage_weight": W}
     ("options", "message"),
     [
         ({"learn": "HC"}, "learn: got 'HC', expected a collection of names among H, H_f, q"),
-        ({"learn": ["H", "D"]}, r"learn: got \['H', 'D'\], expected a collection of names"),
         (
             {"learn": ["H", "H_f"], "hessian": "full"},
             "learn: got 'H_f' with hessian='full', expected 'H' alone. A full H contains",
@@ -745,28 +622,14 @@ MODEL: dict[str, Any] = {"A": A, "B": B, "hessian": "block", "stage_weight": W}
         ),
         ({"on_failure": "skip"}, "on_failure: got 'skip', expected one of raise, warn, mask"),
         ({"solver": "proxq"}, r"solver: got 'proxq', expected one of .* Did you mean 'proxqp'\?"),
-        ({"solver": None}, "solver: got None, expected one of proxqp, daqp"),
-        (
-            {**MODEL, "terminal_weight": "dare"},
-            "terminal_weight: got 'dare' with .*, expected a tensor, or",
-        ),
-        (
-            {**MODEL, "A": 2 * torch.eye(2), "B": [[1.0], [0.0]], "terminal_weight": "riccati"},
-            "terminal_weight: got a Riccati equation without a solution .* Give the actions some",
-        ),
         (
             {**MODEL, "stage_weight": W.expand(3, 3, 3), "terminal_weight": "riccati"},
             r"stage_weight: got shape \(3, 3, 3\), expected shape \(3, 3\). The Riccati equation",
         ),
         (
-            {**MODEL, "A": A.expand(3, 2, 2), "terminal_weight": "riccati"},
-            r"A: got shape \(3, 2, 2\), expected shape \(2, 2\). The Riccati equation has one",
-        ),
-        (
             {"past": 1, "rate_bounds": ([-1.0], [1.0])},
             r"rate_bounds: got bounds with past=1, expected past >= 2. The window then holds u_",
         ),
-        ({"past": 2, "rate_bounds": ([-1.0] * 2, [1.0] * 2)}, r"rate_bounds: got shape \(2,\)"),
         (
             {"past": 2, "rate_slack": 2.0},
             "rate_slack: got 2.0, expected inf without rate_bounds. It is the price of violating",
@@ -775,9 +638,7 @@ MODEL: dict[str, Any] = {"A": A, "B": B, "hessian": "block", "stage_weight": W}
             {"past": 3, "A": torch.eye(2)},
             r"A, B: got shapes \(2, 2\) and .*, expected \(2, 6\) and \(2, 3\). \[A_1, .., A_L\]",
         ),
-        ({"past": 2, "B": B}, r"A, B: got .* \(2, 1\), expected \(2, 4\) and \(2, 2\)"),
         ({"E": B}, r"E: got shape \(2, 1\), expected \(2, 0\). It multiplies the prev"),
-        ({"n_d": 2, "E": torch.ones(1, 2)}, r"E: got shape \(1, 2\), expected \(2, 2\)"),
         (
             {"past": 2, "hessian": "block", "terminal_weight": "riccati"},
             "terminal_weight: got 'riccati' with past > 1, expected past=1. Pass a matrix",
@@ -785,14 +646,6 @@ MODEL: dict[str, Any] = {"A": A, "B": B, "hessian": "block", "stage_weight": W}
         (
             {"n_d": 2, "hessian": "block", "stage_weight": -W_D},
             "stage_weight: got smallest eigenvalue -2.* expected a positive semidefinite weight",
-        ),
-        (
-            {"n_d": 2, "stage_weight": W_D},
-            r"stage_weight: got shape \(5, 5\), expected shape \(3,\) or \(3, 3\)",
-        ),
-        (
-            {"n_d": 1, "constraints": ([[1.0, 1.0, 1.0]], [0.0], [1.0])},
-            r"constraints: got D of shape \(1, 3\), expected shape \(m, 4\)",
         ),
     ],
 )
@@ -812,49 +665,14 @@ def test_assigning_what_the_stages_do_not_share_is_refused(part, index):
         setattr(mpc, part, value)
 
 
-S = torch.zeros(4, 2)
-
-
-@pytest.mark.parametrize(
-    ("inputs", "message"),
-    [
-        (([0.0, 0.0],), r"s: got list, expected .* Convert it: torch.as_tensor\(s\).float\(\)"),
-        ((S.long(),), "s: got torch.int64, expected a floating-point torch.Tensor"),
-        ((torch.tensor(1.0),), r"s: got shape \(\), expected shape \(\*batch, 2\)"),
-        ((torch.ones(2, 3),), r"s: got shape \(2, 3\), expected shape \(\*batch, 2\)"),
-        ((S, S), r"a: got shape \(4, 2\), expected shape \(\*batch, 1\)"),
-        ((S, [0.0]), r"a: got list, expected .* Convert it: torch.as_tensor\(a\)"),
-        ((S, torch.ones(3, 1)), r"a: got shape \(3, 1\), .* broadcast with those of s, \(4,\)"),
-    ],
-)
-def test_bad_inputs_are_named(inputs, message):
-    with pytest.raises(QPError, match=message):
-        random_mpc(0)(*inputs)
-
-
-def test_inputs_of_another_size_are_named():
-    mpc = windowed()
-    p, _ = inputs(mpc)
-    with pytest.raises(QPError, match=r"s: got shape \(6, 2\), expected shape \(\*batch, 16\)"):
-        mpc.value(p[:, -2:])
-    with pytest.raises(QPError, match=r"a: got shape \(6, 16\), expected shape \(\*batch, 1\)"):
-        mpc.action_value(p, p)
+def test_the_plan_that_is_predicted_has_the_size_of_z():
     with pytest.raises(QPError, match=r"z: got shape \(6, 16\), expected shape \(\*batch, 25\)"):
-        mpc.predicted(p)
+        windowed().predicted(torch.ones(6, N_P))
 
 
-@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
-def test_invalid_states_are_named(bad):
-    s: Tensor = torch.zeros(3, 2)
-    s[1, 0] = bad
-    with pytest.raises(QPError, match=r"1 INVALID_DATA, first at batch index \(1,\).*the state"):
-        random_mpc(0).value(s)
-
-
-@pytest.mark.parametrize("part", ["c", "C", "parametrizations.H.original"])
-def test_invalid_parameters_are_named(part):
+def test_invalid_parameters_are_named():
     mpc = random_mpc(0)
     with torch.no_grad():
-        mpc.get_parameter(part).view(-1)[0] = torch.nan
+        mpc.C[0, 0] = torch.nan
     with pytest.raises(QPError, match=r"3 of 3 .* 3 INVALID_DATA, .*: NaN or inf in the data"):
         mpc.value(torch.zeros(3, 2))

@@ -8,7 +8,6 @@ import torch.nn.functional as F
 from torch.testing import assert_close
 
 from tests.logs import OFFSET, A, B, E, arx_log
-from torch_qpmpc import QPMPC
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.log import Trajectory, as_log
 from torch_qpmpc.mpc.predictor import (
@@ -57,12 +56,6 @@ def test_what_is_after_the_end_is_zero():
     assert torch.equal(z[outputs_in(sizes)[0]], log.y[-1])
     assert (z[outputs_in(sizes)[1:]] == 0).all()
     assert (z[1 : sizes.n_preview] == 0).all()
-
-
-@pytest.mark.parametrize("steps", [1, 2, 3])
-def test_a_short_trajectory_has_few_starts(steps):
-    log = trajectories()[0].between(4, 4 + steps)
-    assert windows(log, layout(3)).shape == (max(steps - 2, 0), layout(3).n_z)
 
 
 # Without noise
@@ -128,15 +121,6 @@ def test_a_free_predictor_without_a_ridge_is_the_plain_regression():
     assert_close(predict(found, Z, sizes)[:, k], expected)
 
 
-def test_a_strong_ridge_leaves_the_means():
-    sizes, data = layout(2, 3), trajectories(noise=0.3)
-    model, found = fit(data, Options(sizes, ridge=1e12))
-    assert model.A.abs().max() < 1e-9
-    mean = torch.cat([log.y[2:] for log in data]).mean(0)
-    Y = predict(found, torch.cat([windows(log, sizes) for log in data]), sizes)
-    assert_close(Y[:, 0], mean.expand(len(Y), 2))
-
-
 def test_a_smooth_response_is_found_from_few_noisy_data():
     """A ridge on the changes of coefficients finds it better than one on the coefficients."""
     sizes, lags = Layout(1, 1, 1, 8), torch.linspace(0.1, 0.8, 8).double()
@@ -190,14 +174,3 @@ def test_the_free_predictor_is_about_as_good_as_the_true_structure(seed):
     assert error("varying") < 1.2 * tied
     assert error("free") < 1.2 * tied
     assert error("free") < error("free", ridge=0.0)
-
-
-def test_the_qp_predicts_with_what_was_found():
-    sizes = layout(2, 4)
-    model, found = fit(trajectories(noise=0.2), Options(sizes))
-    start = found._asdict()
-    mpc = QPMPC.of(2, 1, 4, 2, 1, **model._asdict(), start=start, solver="daqp")
-    z = windows(trajectories()[0], sizes)[:5]
-    p, a = z[:, : sizes.n_p], z[:, sizes.n_p : sizes.n_p + 1]
-    plan = mpc.solve(p, a).z
-    assert_close(plan[:, outputs_in(sizes)], predict(found, plan, sizes), rtol=1e-6, atol=1e-6)

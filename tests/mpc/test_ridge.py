@@ -13,18 +13,13 @@ def problem(n: int, m: int = 5, noise: float = 0.1, seed: int = 0):
     return X * torch.tensor([1.0, 10, 1, 0.1, 1][:m]), W, e * noise
 
 
-@pytest.mark.parametrize("n", [4, 40])
-def test_a_strength_penalises_coefficients_in_the_units_of_their_columns(n):
+@pytest.mark.parametrize(("n", "strength"), [(4, 0.3), (40, 0.3), (40, 0.0)])
+def test_a_strength_penalises_coefficients_in_the_units_of_their_columns(n, strength):
     X, W, e = problem(n)
     Y = X @ W + e
     D = X.square().mean(0)
-    expected = torch.linalg.solve(X.mT @ X / n + 0.3 * torch.diag(D), X.mT @ Y / n)
-    assert_close(ridge(X, Y, 0.3), expected)
-
-
-def test_no_strength_is_least_squares():
-    X, W, e = problem(30)
-    assert_close(ridge(X, X @ W + e, 0.0), torch.linalg.lstsq(X, X @ W + e).solution)
+    expected = torch.linalg.solve(X.mT @ X / n + strength * torch.diag(D), X.mT @ Y / n)
+    assert_close(ridge(X, Y, strength), expected)
 
 
 def test_units_do_not_matter():
@@ -50,11 +45,6 @@ def test_the_evidence_chooses_well_where_data_are_few():
     best = min(error(10.0**i) for i in range(-3, 3))
     assert error(None) < 2.2 * best
     assert error(None) < 0.8 * error(0.0)
-
-
-def test_targets_without_a_pattern_have_small_coefficients():
-    X, _, e = problem(200)
-    assert ridge(X, e).norm() < 0.75 * ridge(X, e, 0.0).norm()
 
 
 def test_a_column_of_zeros_has_the_coefficient_zero():

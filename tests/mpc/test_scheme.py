@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import io
 import pickle
-from dataclasses import FrozenInstanceError, asdict, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
@@ -39,22 +39,6 @@ def test_the_short_way_is_the_same():
     same(QPMPC(short.scheme, structure="tied", learn=["C", "G"]), short)
 
 
-def test_a_scheme_of_sizes_alone_is_a_random_start():
-    scheme = Scheme(Layout(2, 1, 3), seed=5)
-    assert scheme.is_random
-    assert not make().is_random
-    assert replace(make(), cost=Cost()).is_random
-    same(QPMPC(scheme), QPMPC.of(2, 1, 3, seed=5))
-    assert not torch.equal(scheme.theta["C"], Scheme(Layout(2, 1, 3), seed=6).theta["C"])
-
-
-def test_a_scheme_counts_the_rows_of_its_bounds():
-    scheme = make()
-    assert (scheme.layout.n_mixed, scheme.layout.n_terminal) == (2, 1)
-    assert scheme.layout == Layout(2, 1, 4, n_mixed=2, n_terminal=1)
-    assert replace(scheme, bounds=Bounds()).layout == Layout(2, 1, 4)
-
-
 def test_a_predictor_takes_the_place_of_the_models_C_and_b():
     generator = torch.Generator().manual_seed(0)
     C, b = (torch.randn(*shape, generator=generator).double() for shape in ((8, 14), (8,)))
@@ -62,12 +46,6 @@ def test_a_predictor_takes_the_place_of_the_models_C_and_b():
     assert torch.equal(mpc.C, C)
     assert torch.equal(mpc.b, b)
     assert torch.equal(mpc.C_0, QPMPC(make()).C_0)
-
-
-def test_a_scheme_is_frozen():
-    scheme = make()
-    with pytest.raises(FrozenInstanceError):
-        scheme.gamma = 0.5  # pyright: ignore[reportAttributeAccessIssue] (the mistake)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
@@ -110,13 +88,8 @@ def test_the_identity_has_the_sizes():
     ("make_it", "message"),
     [
         (lambda: make(gamma=0.0), r"gamma: got 0.0, expected a discount factor in \(0, 1\]"),
-        (lambda: make(gamma=1.1), r"gamma: got 1.1, expected a discount factor in \(0, 1\]"),
-        (lambda: make(gamma=torch.nan), "gamma: got nan, expected a discount factor"),
         (lambda: make(seed=-1), "seed: got -1, expected a whole number >= 0"),
         (lambda: make(layout=(2, 1, 4)), "layout: got tuple, expected a Layout"),
-        (lambda: make(model=(A, B)), "model: got tuple, expected a Model"),
-        (lambda: make(cost=W), "cost: got Tensor, expected a Cost"),
-        (lambda: make(bounds=BOX), "bounds: got dict, expected a Bounds"),
         (lambda: QPMPC((2, 1, 3)), "scheme: got tuple, expected a Scheme. QPMPC.of takes sizes."),  # pyright: ignore[reportArgumentType] (the mistake)
     ],
 )

@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torch_qpmpc import QPMPC, QPError
-from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
+from torch_qpmpc.mpc.riccati import lqr_gain, stage_weight
 from torch_qpmpc.mpc.tightening import back_off, prediction_covariance, tighten
 
 N = 4
@@ -14,6 +14,7 @@ A = torch.tensor([[1.0, 0.1], [0.0, 0.9]]).double()
 B = torch.tensor([[0.0], [0.1]]).double()
 K = torch.tensor([[-2.0, -1.0]]).double()
 W = torch.tensor([[0.02, 0.01], [0.01, 0.03]]).double()
+SIGMA = prediction_covariance(A, W, N)
 #: The 95 % quantile of the standard normal distribution.
 QUANTILE = 1.6448536269514722
 
@@ -91,37 +92,6 @@ def test_bounds_that_would_cross_meet_halfway_and_infinite_ones_stay():
     assert x[..., 1].isinf().all()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"probability": 0.4}, "probability"),
-        ({"probability": 1.0}, "probability"),
-        ({"covariances": torch.zeros(N, 2, 2).double()}, "covariances"),
-        ({"K": torch.zeros(2, 2).double()}, "K"),
-        ({"mpc": None}, "mpc"),
-        ({"mpc": scheme(learn=("C", "ub"))}, "mpc: got one that learns ub, expected fixed bounds"),
-    ],
-)
-def test_errors_of_tighten(options, message):
-    arguments = {"mpc": scheme(), "covariances": prediction_covariance(A, W, N)} | options
-    with pytest.raises(QPError, match=message):
-        tighten(**arguments)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"A": B}, "A"),
-        ({"W": torch.eye(3).double()}, "W"),
-        ({"horizon": -1}, "horizon"),
-        ({"initial": torch.eye(3).double()}, "initial"),
-    ],
-)
-def test_errors_of_the_covariance(options, message):
-    with pytest.raises(QPError, match=message):
-        prediction_covariance(**{"A": A, "W": W, "horizon": N} | options)
-
-
 def tied(**options) -> QPMPC:
     return scheme(structure="tied", **{"stage_weight": [1.0, 1.0, 0.1], "learn": ["C"], **options})
 
@@ -149,25 +119,26 @@ def test_a_back_off_without_a_regulator_is_that_of_the_open_loop():
 
 
 @pytest.mark.parametrize(
-    ("mpc", "message"),
+    ("call", "message"),
     [
-        (None, "mpc"),
-        (scheme(), "structure: got 'free'"),
-        (tied(learn=["C", "lb"]), "mpc: got one that learns lb, expected fixed bounds"),
+        (lambda: tighten(scheme(), SIGMA, 0.4), "probability: got 0.4, expected a probability in"),
+        (lambda: tighten(scheme(), SIGMA[1:]), "covariances: got shape .* expected shape"),
+        (lambda: tighten(scheme(), SIGMA, K=SIGMA[0]), "K: got shape .* expected shape"),
+        (lambda: tighten(None, SIGMA), "mpc: got NoneType, expected a QPMPC"),  # pyright: ignore[reportArgumentType]
         (
-            QPMPC.of(2, 1, N, past=2, structure="tied", state_bounds=([-1, -1], [1, 1])),
-            "mpc: got past=2, expected past=1",
+            lambda: tighten(scheme(learn=("C", "ub")), SIGMA),
+            "mpc: got one that learns ub, expected",
         ),
+        (lambda: prediction_covariance(B, W, N), "A: got shape .* expected shape"),
+        (lambda: prediction_covariance(A, B, N), "W: got shape .* expected shape"),
+        (lambda: prediction_covariance(A, W, -1), "horizon: got -1, expected a whole number"),
+        (lambda: prediction_covariance(A, W, N, B), "initial: got shape .* expected shape"),
+        (lambda: back_off(None, W), "mpc: got NoneType, expected a QPMPC"),  # pyright: ignore[reportArgumentType]
+        (lambda: back_off(scheme(), W), "structure: got 'free'"),
+        (lambda: back_off(QPMPC.of(2, 1, N, past=2), W), "mpc: got past=2, expected past=1"),
+        (lambda: back_off(tied(), B), "W: got shape .* expected shape"),
     ],
-    ids=range(4),
 )
-def test_errors_of_a_back_off(mpc, message):
-    with pytest.raises(QPError, match=message):
-        back_off(mpc, W)
-
-
-def test_the_numbers_of_a_back_off_are_checked():
-    with pytest.raises(QPError, match="probability"):
-        back_off(tied(), W, 0.3)
-    with pytest.raises(QPError, match="W"):
-        back_off(tied(), torch.eye(3).double())
+def test_a_mistake_is_named(call, message):
+    with pytest.raises(QPError, match=f"^{message}"):
+        call()

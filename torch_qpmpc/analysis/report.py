@@ -24,7 +24,7 @@ from torch_qpmpc.analysis.structure import (
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
+from torch_qpmpc.mpc.riccati import lqr_gain, stage_weight
 from torch_qpmpc.mpc.validation import check_one_model
 
 #: A, B, offset and E.

@@ -17,8 +17,7 @@ from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
-from torch_qpmpc.mpc.regulator import lqr_gain
-from torch_qpmpc.mpc.riccati import riccati_weight
+from torch_qpmpc.mpc.riccati import lqr_gain, riccati_weight
 from torch_qpmpc.mpc.scheme import Scheme
 
 #: The value at the target, relative to a typical deviation's in each stage: errors are certified

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_qpmpc.envs.linear_system import LinearSystem
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.regulator import lqr_gain
+from torch_qpmpc.mpc.riccati import lqr_gain
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 
 #: The name of `zero_action` among a task's rivals.

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Integral
 
 import torch
 import torch.nn.functional as F
@@ -62,14 +61,9 @@ class Layout:
     blocks: Sequence[int] = ()
 
     def __post_init__(self) -> None:
-        for name in ("n_x", "n_u", "horizon", "past"):
-            size = getattr(self, name)
-            if not isinstance(size, Integral) or isinstance(size, bool) or int(size) < 1:
-                raise QPError.expected(name, repr(size), "a positive integer")
-        for name in ("n_d", *COUNTS):
-            check_whole(name, getattr(self, name), 0)
         for name in (*SIZES, *COUNTS):
-            object.__setattr__(self, name, int(getattr(self, name)))
+            check_whole(name, size := getattr(self, name), 0 if name in ("n_d", *COUNTS) else 1)
+            object.__setattr__(self, name, int(size))
         object.__setattr__(self, "blocks", read_blocks(self.blocks, self.horizon))
 
     @property
@@ -131,14 +125,9 @@ class Layout:
         d, x, u = (powers.expand(-1, size) for size in (self.n_d, self.n_x, self.n_u))
         past = powers.new_ones(self.n_before - self.n_preview)
         z = torch.cat((d.flatten(), past, self.stages(x, u)))
-        return z, gamma ** self.row_stages()
-
-    def row_stages(self) -> Tensor:
-        """Return k, the stage of each row of G, ``(n_g,)``."""
-        k = torch.arange(self.horizon + 1, dtype=torch.float64).unsqueeze(-1)
-        sizes = (self.n_x, self.n_u, self.n_mixed, self.n_terminal, self.n_rates)
-        x, u, D, D_f, rates = (k.expand(-1, size) for size in sizes)
-        return self.rows(x, u, D[:-1], D_f[-1], rates[:-1])
+        sizes = (self.n_mixed, self.n_terminal, self.n_rates)
+        D, D_f, rates = (powers.expand(-1, size) for size in sizes)
+        return z, self.rows(x, u, D[:-1], D_f[-1], rates[:-1])
 
     def ties(self, part: str) -> Tensor:
         """Return the index of the value of each entry of a tied ``part``, q, b, lb, ub or w.
@@ -148,23 +137,19 @@ class Layout:
         """
         n_x, n = self.n_x, self.n
         x, u = torch.arange(n_x), torch.arange(n_x, n)
+        own = torch.stack((*[x] * self.horizon, n + x))
         if part == "b":
             return x.repeat(self.horizon)
         if part == "q":
             d, first = torch.arange(self.n_d), n + n_x
             past = torch.arange(self.n_before - self.n_preview) + first + 2 * self.n_d
             d = torch.cat(((first + d).repeat(self.horizon), first + self.n_d + d))
-            return torch.cat((d, past, self.tied_stages()))
+            return torch.cat((d, past, self.stages(own, u)))
         if part == "w":
-            x, n = torch.stack((*[x] * self.horizon, n + x)), n + n_x
+            x, n = own, n + n_x
         D, D_f, rates = (torch.arange(i) for i in (self.n_mixed, self.n_terminal, self.n_rates))
         D_f, rates = self.n_mixed + D_f, self.n_mixed + self.n_terminal + rates
         return self.rows(x, u, n + D, n + D_f, n + rates)
-
-    def tied_stages(self) -> Tensor:
-        """Return the index of the value of each entry of [x_0, .., x_N] if x_N has its own."""
-        x, u = torch.arange(self.n_x), torch.arange(self.n_x, self.n)
-        return self.stages(torch.stack((*[x] * self.horizon, self.n + x)), u)
 
     def signals(self) -> Tensor:
         """Return the index in [x; u; d] of the signal in each entry of z, ``(n_z,)``."""

@@ -529,7 +529,6 @@ def _entry(
         raise QPError.expected(name, got, wanted, REMEDY)
     if value.shape[-1] < (width or 1):
         raise QPError.expected(name, f"shape {tuple(value.shape)}", wanted)
-    _check_values(name, value)
     value = value.detach().to("cpu", torch.float64)
     if width is not None:
         value = value[..., :width] if first else value[..., value.shape[-1] - width :]
@@ -546,20 +545,12 @@ def _entry(
     return value
 
 
-def _check_values(name: str, value: Tensor) -> None:
-    """Raise `QPError` for a meta tensor."""
-    if value.is_meta:
-        remedy = "Pass the log itself, not its shapes."
-        raise QPError.expected(name, "a meta tensor", "a tensor with values", remedy)
-
-
 def _narrow(key: tuple[str, ...], value: Any, batch: torch.Size) -> Tensor:
     """Return one flag, id or time for each step; there are several for several agents, say."""
     if not isinstance(value, Tensor) or value.numel() != batch.numel():
         got = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
         expected = f"shape {tuple(batch)} or {(*batch, 1)}"
         raise QPError.expected(_name(key), got, expected, "Pass one for each step.")
-    _check_values(_name(key), value)
     return value.reshape(batch).cpu()
 
 

@@ -704,12 +704,6 @@ class QPMPC(nn.Module):
             return check_tensor("s", s, self.n_p, device=self.C_0.device)
         return check_pair(s, a, self.n_p, self.n_u, self.C_0.device)
 
-    def _current_qp(self, qp: QuadraticProgram | None) -> QuadraticProgram:
-        if qp is None:
-            return self.quadratic_program()
-        check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or omit it.")
-        return qp
-
     def _value(self, fixed: Tensor, qp: QuadraticProgram | None) -> Tensor:
         return to_dtype(self._solve(fixed, qp).value, fixed.dtype)
 
@@ -720,7 +714,8 @@ class QPMPC(nn.Module):
         warm_start: QPSolution | Tensor | None = None,
         on_failure: str | None = None,
     ) -> QPSolution:
-        qp = self._current_qp(qp)
+        qp = self.quadratic_program() if qp is None else qp
+        check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or omit it.")
         n_kept = self.n_p + self.n_u  # V, Q and the policy share one elimination
         fixed = to_dtype(fixed, qp.C.dtype)
         if self.schedule is not None:

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_flag, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.log import LARGEST
 from torch_qpmpc.mpc.ridge import ridge
@@ -100,9 +99,15 @@ def fit_stage_cost(
             others.
 
     Raises:
-        QPError: an argument has another shape, or entries that are not finite or too large.
+        QPError: there are no rows, or entries that are not finite or too large.
     """
-    v, cost = _checked(v, cost, n_free, diagonal)
+    for name, value in (("v", v), ("cost", cost)):
+        if not len(v) or not value.isfinite().all() or value.abs().amax() > LARGEST:
+            got = f"{value.abs().amax().item():.3g}" if len(v) else "no rows"
+            remedy = "Squares of larger numbers overflow: choose larger units."
+            expected = f"finite numbers up to {LARGEST:g}"
+            raise QPError.expected(name, got, expected, remedy)
+    v, cost = v.detach().double(), cost.detach().double()
     n = v.shape[1]
     middle, size = _middle(v), v.std(0, correction=0)
     scale = torch.where(size > 1e-12 * v.abs().amax(0), 1 / size, 0.0)
@@ -118,21 +123,6 @@ def fit_stage_cost(
     fitted = StageCost(W, q - W @ middle, c - q @ middle + middle @ W @ middle / 2)
     R2 = _adjusted_R2(cost, cost - fitted(v), 1 + n + len(rows))
     return StageCost(fitted.W, fitted.q, fitted.c, R2)
-
-
-def _checked(v: Tensor, cost: Tensor, n_free: int, diagonal: bool) -> tuple[Tensor, Tensor]:
-    """Return v and the costs in float64."""
-    check_tensor("v", v, "m", "n", batched=False)
-    check_tensor("cost", cost, len(v), batched=False)
-    check_whole("n_free", n_free, 0)
-    check_flag("diagonal", diagonal)
-    for name, value in (("v", v), ("cost", cost)):
-        if not len(v) or not value.isfinite().all() or value.abs().amax() > LARGEST:
-            got = f"{value.abs().amax().item():.3g}" if len(v) else "no rows"
-            remedy = "Squares of larger numbers overflow: choose larger units."
-            expected = f"finite numbers up to {LARGEST:g}"
-            raise QPError.expected(name, got, expected, remedy)
-    return v.detach().double(), cost.detach().double()
 
 
 def _middle(v: Tensor) -> Tensor:

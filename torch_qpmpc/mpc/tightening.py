@@ -23,7 +23,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.regulator import lqr_gain, stage_weight
+from torch_qpmpc.mpc.riccati import lqr_gain, stage_weight
 
 
 def prediction_covariance(
