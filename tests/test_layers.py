@@ -74,7 +74,7 @@ BUDGET = {
     "learning": 2473,
     "mpc": 5109,
     "proofs": 998,
-    "qp": 5869,
+    "qp": 5766,
     "study": 606,
 }
 #: Libraries that only some layers may import.

@@ -42,15 +42,13 @@ def test_plain_tensors_are_not_hidden():
     assert tracing.transforms() == ()
 
 
-def test_a_dispatch_mode_hides():
-    with FakeTensorMode():
+def test_a_dispatch_mode_and_a_tensor_class_hide():
+    with FakeTensorMode() as mode:
         assert tracing.is_hidden(())
     assert not tracing.is_hidden(())
-
-
-def test_a_tensor_class_hides():
     assert tracing.is_hidden((X, X.as_subclass(Subclass)))
-    assert tracing.is_hidden((FakeTensorMode().from_tensor(X),))
+    assert tracing.is_hidden((mode.from_tensor(X),))
+    assert not tracing.has_values(X, X.to("meta"))
 
 
 def test_a_jit_trace_hides():
@@ -98,18 +96,17 @@ def test_a_batch_of_gradients_hides(batched):
     assert Doubled.seen.values == [batched]
 
 
-def test_meta_tensors_have_no_values():
-    assert not tracing.has_values(X, X.to("meta"))
-
-
 def test_a_function_mode_is_not_eager():
     with torch.device("cpu"):
         assert not tracing.is_eager((X,))
     assert tracing.is_eager((X,))
 
 
-def test_forward_mode():
+def test_forward_and_reverse_mode():
     assert not tracing.is_forward_mode()
+    assert tracing.is_differentiating()
+    with torch.no_grad():
+        assert not tracing.is_differentiating()
     with forward_ad.dual_level():
         assert tracing.is_forward_mode()
         assert not tracing.is_eager((X,))
@@ -118,12 +115,6 @@ def test_forward_mode():
     seen = Seen(lambda x: tracing.is_forward_mode())
     jvp(seen, (X,), (X,))
     assert seen.values == [True]
-
-
-def test_reverse_mode_is_differentiating_unless_it_is_off():
-    assert tracing.is_differentiating()
-    with torch.no_grad():
-        assert not tracing.is_differentiating()
 
 
 def test_transforms_from_the_outermost():

@@ -1,4 +1,4 @@
-"""What surrounds a call: traces, transforms, forward mode, tensor classes, and forked processes.
+"""The state around a call: traces, transforms, forward mode, tensor classes, forked processes.
 
 The solver must be hidden from traces and transforms, which torch has no public way to detect. A
 test of each function fails if torch changes the internals that it reads.
@@ -84,7 +84,10 @@ os.register_at_fork(after_in_child=_mark)
 
 @contextmanager
 def serial_if_forked() -> Iterator[None]:
-    """Use one thread of torch in a forked child, and restore the child's own number."""
+    """Use one thread of torch in a forked child, and restore the child's own number.
+
+    OpenMP's threads do not exist there, and torch would wait for them.
+    """
     if not _forked:
         yield
         return

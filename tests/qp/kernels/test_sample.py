@@ -41,10 +41,10 @@ def both(known: KnownQP) -> tuple[Programs, Programs]:
     return programs_of(known, None), programs_of(known)
 
 
-def reference(known: KnownQP, **claim: Tensor) -> float:
+def reference(known: KnownQP, **candidate: Tensor) -> float:
     """Compute the certificate's residual of one QP by the formulas of its docstring."""
     H, q, _, C, b, G, lb, ub, w = (x.numpy() for x in known.qp.tensors())
-    z, lam, chi, xi = (claim[n].numpy() for n in ("z", "lam", "chi", "xi"))
+    z, lam, chi, xi = (candidate[n].numpy() for n in ("z", "lam", "chi", "xi"))
     n_f = len(xi)
 
     def largest(*vectors: np.ndarray) -> float:
@@ -76,10 +76,10 @@ def reference(known: KnownQP, **claim: Tensor) -> float:
 def test_the_residual_is_the_certificates(name):
     for seed in range(4):
         known = known_qp(seed)
-        claim = {n: getattr(known, n).clone() for n in ("z", "lam", "chi", "xi")}
-        SPOILERS[name](claim)
-        expected = reference(known, **claim)
-        batch = {n: x.unsqueeze(0) for n, x in claim.items()}
+        candidate = {n: getattr(known, n).clone() for n in ("z", "lam", "chi", "xi")}
+        SPOILERS[name](candidate)
+        expected = reference(known, **candidate)
+        batch = {n: x.unsqueeze(0) for n, x in candidate.items()}
         for p in both(replace(known, fixed=known.fixed.unsqueeze(0))):
             given = {n: x.numpy() if p.prepared.device is None else x for n, x in batch.items()}
             residual = to_tensor(p.certify(**given)[1])
@@ -91,9 +91,9 @@ def test_the_residual_is_the_certificates(name):
 def test_the_certificate_is_that_of_torch(name, matrices):
     for seed in range(3):
         known = known_qp(seed, batch=(BATCH,), matrices=matrices)
-        claim = {n: getattr(known, n).clone() for n in ("z", "lam", "chi", "xi")}
-        SPOILERS[name](claim)
-        assert_certified_alike(known, claim)
+        candidate = {n: getattr(known, n).clone() for n in ("z", "lam", "chi", "xi")}
+        SPOILERS[name](candidate)
+        assert_certified_alike(known, candidate)
 
 
 @pytest.mark.parametrize("hard", [False, True])
@@ -105,15 +105,15 @@ def test_absent_bounds_and_hard_rows_are_judged_as_by_torch(hard):
     if hard:
         w[...] = torch.inf
     changed = QuadraticProgram(qp.H, qp.q, qp.c, qp.C, qp.b, qp.G, lb, ub, w)
-    claim = {n: getattr(known, n) for n in ("z", "lam", "chi", "xi")}
-    assert assert_certified_alike(replace(known, qp=changed), claim).max() > 1e-3
+    candidate = {n: getattr(known, n) for n in ("z", "lam", "chi", "xi")}
+    assert assert_certified_alike(replace(known, qp=changed), candidate).max() > 1e-3
 
 
-def assert_certified_alike(known: KnownQP, claim: dict[str, Tensor]) -> Tensor:
+def assert_certified_alike(known: KnownQP, candidate: dict[str, Tensor]) -> Tensor:
     compiled, in_torch = both(known)
-    found = compiled.certify(**{n: x.numpy() for n, x in claim.items()})
+    found = compiled.certify(**{n: x.numpy() for n, x in candidate.items()})
     value, residual, error = map(to_tensor, found)
-    of_torch = in_torch.certify(**claim)
+    of_torch = in_torch.certify(**candidate)
     assert_close(residual, of_torch[1], rtol=1e-9, atol=1e-13)
     assert_close(error, of_torch[2], rtol=1e-9, atol=1e-13)
     fine = residual.isfinite()

@@ -40,6 +40,7 @@ DEFICIENT = {
     "zero": ZERO,
 }
 REGULAR = {"independent": INDEPENDENT, "none": NONE}
+MIXED = torch.stack((torch.cat((INDEPENDENT, normal(3, 8, seed=5))), REPEATED))
 
 
 def theta_of(H: Tensor, C: Tensor, G: Tensor) -> Theta:
@@ -68,8 +69,7 @@ def test_elimination_spans_the_solutions_of_the_equalities(name):
 
 
 def test_ranks_may_differ_within_a_batch():
-    C = torch.stack((torch.cat((INDEPENDENT, normal(3, 8, seed=5))), REPEATED))
-    unit = torch.eye(8).double().repeat(2, 1, 1)
+    C, unit = MIXED, torch.eye(8).double().repeat(2, 1, 1)
     arrays = condense(theta_of(unit, C, normal(2, 4, 8)), 1).arrays
     T, H = torch.from_numpy(arrays.T), torch.from_numpy(arrays.H)
     assert T.shape[-1] == 1 + (7 - 3)
@@ -108,19 +108,12 @@ def test_expanded_variables_satisfy_the_equalities(name):
     assert_close(z[:, :3], known.fixed)
 
 
-@pytest.mark.parametrize("name", [*REGULAR, *DEFICIENT])
-@pytest.mark.parametrize("n_f", [0, 3])
+@pytest.mark.parametrize("name", [*REGULAR, *DEFICIENT, "mixed"])
+@pytest.mark.parametrize("n_f", [0, 1, 3])
 def test_equalities_of_any_rank_are_solved(name, n_f):
-    C = (REGULAR | DEFICIENT)[name]
-    known = known_qp(4, n_z=8, n_f=n_f, C=C, batch=(5,), hard=("inside",))
-    solution = solve_qp(known.qp, known.fixed, solver="daqp")
-    assert_close(solution.value, known.value)
-    assert_close(solution.z, known.z, rtol=1e-5, atol=1e-6)
-
-
-def test_a_batch_of_mixed_rank_is_solved():
-    C = torch.stack((torch.cat((INDEPENDENT, normal(3, 8, seed=5))), REPEATED))
-    known = known_qp(4, n_z=8, n_f=1, C=C, batch=(4, 2), matrices=(2,), hard=("inside",))
+    C = (REGULAR | DEFICIENT | {"mixed": MIXED})[name]
+    batch = (4, 2) if name == "mixed" else (5,)
+    known = known_qp(4, n_z=8, n_f=n_f, C=C, batch=batch, hard=("inside",))
     solution = solve_qp(known.qp, known.fixed, solver="daqp")
     assert_close(solution.value, known.value)
     assert_close(solution.z, known.z, rtol=1e-5, atol=1e-6)
@@ -234,14 +227,6 @@ def test_a_theta_is_condensed(M, n_c, n_g):
         np.testing.assert_allclose(H_b, -T_T @ matrix @ Y_neg, atol=1e-9)
         np.testing.assert_allclose(G_y, G @ T, atol=1e-9)
         np.testing.assert_allclose(G_b, -G @ Y_neg, atol=1e-9)
-
-
-@pytest.mark.parametrize("M", [1, 2])
-def test_dependent_rows_are_found(M):
-    C = normal(M, 3, 8)
-    C[-1, 2] = C[-1, 0] - C[-1, 1]
-    assert eliminate(C.numpy(), 2).padding is not None
-    assert eliminate(normal(M, 7, 8).numpy(), 2).padding is not None
 
 
 def test_no_theta_at_all_is_condensed():

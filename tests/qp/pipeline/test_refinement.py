@@ -68,12 +68,12 @@ def test_a_solution_that_is_nearly_right_becomes_exact(off, monkeypatch):
     generator = np.random.default_rng(0)
     for part in (solution.z, solution.lam):
         part += off * generator.standard_normal(part.shape) * (part != 0)
-    claimed = solution.at(np.arange(6))
+    candidate = solution.at(np.arange(6))
     with monkeypatch.context() as patch:  # a large QP waits for the other ways to fail
         patch.setattr(refinement, "MAX_WORK", 1)
         assert refine(p, solution, np.arange(6)).tolist() == [*range(6)]
-        assert (solution.z == claimed.z).all()
-        assert len(refine(p, claimed, np.arange(6), last=True)) == 0
+        assert (solution.z == candidate.z).all()
+        assert len(refine(p, candidate, np.arange(6), last=True)) == 0
     assert len(refine(p, solution, np.arange(6))) == 0
     assert_close(solution.value, known.value.numpy(), rtol=1e-12, atol=1e-12)
     assert_close(solution.z, known.z.numpy(), rtol=1e-9, atol=1e-9)
@@ -101,9 +101,9 @@ def test_what_has_no_solution_is_left_as_it_was():
     solution = solve_programs(programs_of(known, None), "daqp")
     chi = np.pad(solution.chi, ((0, 0), (0, 1)))
     p = programs_of(replace(known, qp=qp), None)
-    claimed = solution._replace(chi=chi)
-    assert refine(p, claimed, np.arange(2)).tolist() == [0, 1]
-    assert_close(claimed.z, solution.z, rtol=0, atol=0)
+    candidate = solution._replace(chi=chi)
+    assert refine(p, candidate, np.arange(2)).tolist() == [0, 1]
+    assert_close(candidate.z, solution.z, rtol=0, atol=0)
 
 
 def test_products_have_twice_the_working_precision():

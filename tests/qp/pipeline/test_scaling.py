@@ -9,7 +9,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.campaign.families import in_units
-from tests.problems import KnownQP, known_qp, programs_of, random_mpc
+from tests.problems import KnownQP, known_qp, programs_of
 from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
 from torch_qpmpc.qp.pipeline.batch import Prepared, Programs
 from torch_qpmpc.qp.pipeline.solve import solve_programs
@@ -36,33 +36,19 @@ def test_a_qp_of_any_size_is_solved_without_help(solver, unit, size):
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])
-def test_ordinary_sizes_have_no_units(matrices):
-    assert programs_of(known_qp(0, batch=(BATCH,), matrices=matrices)).prepared.units is None
-    qp = random_mpc(0).quadratic_program()
-    assert Programs.of(*qp.tensors(), torch.zeros(2).double())[0].prepared.units is None
-
-
-@pytest.mark.parametrize("matrices", [(), (BATCH,)])
 def test_units_are_powers_of_two_and_make_sizes_ordinary(matrices):
-    known = in_size(known_qp(0, batch=(BATCH,), matrices=matrices), cost=1e-9, variables=1e5)
-    prepared = programs_of(known).prepared
+    known = known_qp(0, batch=(BATCH,), matrices=matrices)
+    assert programs_of(known).prepared.units is None
+    prepared = programs_of(in_size(known, cost=1e-9, variables=1e5)).prepared
     assert prepared.units is not None
-    for unit in prepared.units:
-        assert (np.frexp(unit)[0] == 0.5).all()
+    assert all((np.frexp(unit)[0] == 0.5).all() for unit in prepared.units)
     assert prepared.scaled.units is None
-
-
-@pytest.mark.parametrize("matrices", [(), (BATCH,)])
-def test_condensed_matrices_are_the_same_by_way_of_the_units(matrices):
-    known = in_size(known_qp(0, batch=(BATCH,), matrices=matrices), cost=1e-9, variables=1e5)
-    p = programs_of(known).prepared
-    own, other = (Prepared(p.theta, p.group, p.n_kept, None) for _ in range(2))
-    assert other.scaled.units is None
-    own, other = own.condensed(p.n_kept), other.condensed(p.n_kept)
-    pairs = zip(
-        (*own.arrays, own.terms, *own.sums), (*other.arrays, other.terms, *other.sums), strict=True
-    )
-    assert all((a == b).all() for a, b in pairs)  # units are powers of two
+    args = prepared.theta, prepared.group, prepared.n_kept, None
+    own, other = Prepared(*args), Prepared(*args)
+    assert other.scaled.units is None  # then the matrices are condensed in units, and restored
+    own, other = (x.condensed(prepared.n_kept) for x in (own, other))
+    arrays = ((*x.arrays, x.terms, *x.sums) for x in (own, other))
+    assert all((a == b).all() for a, b in zip(*arrays, strict=True))
 
 
 def test_what_rounding_leaves_of_a_zero_sets_no_unit():
@@ -90,14 +76,8 @@ def test_bounds_that_are_far_away_change_no_answer(solver, bound):
 
 def test_a_hard_bound_holds_where_states_are_large_and_actions_small(solver):
     options = {"stage_weight": [1.0, 1.0, 0.1], "state_bounds": ([-1e4] * 2, [1e4] * 2)}
-    mpc = QPMPC.from_model(
-        [[1.0, 0.1], [0.0, 0.9]],
-        [[0.0], [1e5]],
-        10,
-        action_bounds=([-0.01], [0.01]),
-        solver=solver,
-        **options,
-    )
+    options |= {"action_bounds": ([-0.01], [0.01]), "solver": solver}
+    mpc = QPMPC.from_model([[1.0, 0.1], [0.0, 0.9]], [[0.0], [1e5]], 10, **options)
     s = torch.tensor([1e4, -1e3]).double()
     assert mpc.policy(s).abs() <= 0.01 * (1 + 1e-6)
     assert_close(mpc.value(s), torch.tensor(3.04986581e8).double(), rtol=1e-6, atol=0)
@@ -109,12 +89,8 @@ def test_solutions_come_back_in_the_numbers_of_the_qp():
     assert (raw.status == Status.SOLVED).all()
     for name in ("value", "z", "chi", "lam", "xi"):
         expected = getattr(known, name)
-        assert_close(
-            torch.from_numpy(getattr(raw, name)),
-            expected,
-            rtol=1e-6,
-            atol=1e-9 * expected.abs().max(),
-        )
+        atol = 1e-9 * expected.abs().max()
+        assert_close(torch.from_numpy(getattr(raw, name)), expected, rtol=1e-6, atol=atol)
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])

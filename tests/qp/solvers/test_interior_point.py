@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import inspect
 from typing import Any
 
 import numpy as np
@@ -218,20 +217,17 @@ def test_units_change_nothing():
 
 @pytest.mark.parametrize("matrices", [0, 1, 3])
 def test_an_empty_batch(matrices):
-    none = np.zeros((0, 4))
-    qps = as_tensors(
-        H=np.zeros((matrices, 2, 2)),
-        G=np.zeros((matrices, 4, 2)),
-        group=np.zeros(0, dtype=np.int64),
-        g=np.zeros((0, 2)),
-        l=none,
-        u=none,
-        w=none,
+    none, group = np.zeros((0, 4)), np.zeros(0, dtype=np.int64)
+    H, G = np.zeros((matrices, 2, 2)), np.zeros((matrices, 4, 2))
+    answer = interior_point.solve(
+        as_tensors(H=H, G=G, group=group, g=np.zeros((0, 2)), l=none, u=none, w=none)
     )
-    answer = interior_point.solve(qps)
-    assert answer.v.shape == (0, 2)
-    assert answer.lam.shape == (0, 4)
-    assert answer.iterations.shape == (0,)
+    assert [x.shape for x in answer] == [(0, 2), (0, 4), (0,)]
+
+
+def three(first: float, second: float) -> np.ndarray:
+    """Return the same two numbers for three QPs."""
+    return np.tile([float(first), float(second)], (3, 1))
 
 
 def one_row(count: int = 3, **changes: Any) -> SoftQPs:
@@ -253,8 +249,8 @@ def one_row(count: int = 3, **changes: Any) -> SoftQPs:
     ("changes", "v_1", "lam_1"),
     [
         ({}, -1, -8),
-        ({"w": np.full((3, 2), 5.0)}, -4, -5),
-        ({"w": np.zeros((3, 2))}, -9, 0),
+        ({"w": three(5, 5)}, -4, -5),
+        ({"w": three(0, 0)}, -9, 0),
         ({"l": np.full((3, 2), -np.inf)}, -9, 0),
         ({"l": np.full((3, 2), -1e30), "u": np.full((3, 2), 1e30)}, -9, 0),
         ({"l": np.full((3, 2), -np.inf), "u": np.full((3, 2), np.inf)}, -9, 0),
@@ -285,21 +281,13 @@ def test_without_variables_the_rows_are_only_checked():
 
 # QPs without a solution
 
+ALIKE, HARD = np.ones((1, 2, 2)), three(np.inf, np.inf)
+FLAT = np.zeros((1, 2, 2))
 HOPELESS = {
-    "infeasible": one_row(
-        G=np.ones((1, 2, 2)),
-        l=np.tile([-np.inf, 2.0], (3, 1)),
-        u=np.tile([1.0, np.inf], (3, 1)),
-        w=np.full((3, 2), np.inf),
-    ),
-    "equalities that conflict": one_row(
-        G=np.ones((1, 2, 2)),
-        l=np.tile([1.0, 2.0], (3, 1)),
-        u=np.tile([1.0, 2.0], (3, 1)),
-        w=np.full((3, 2), np.inf),
-    ),
-    "unbounded": one_row(H=np.zeros((1, 2, 2))),
-    "unbounded beyond soft rows": one_row(H=np.zeros((1, 2, 2)), w=np.ones((3, 2))),
+    "infeasible": one_row(G=ALIKE, l=three(-np.inf, 2), u=three(1, np.inf), w=HARD),
+    "equalities that conflict": one_row(G=ALIKE, l=three(1, 2), u=three(1, 2), w=HARD),
+    "unbounded": one_row(H=FLAT),
+    "unbounded beyond soft rows": one_row(H=FLAT, w=np.ones((3, 2))),
 }
 
 
@@ -397,12 +385,6 @@ def test_the_core_stays_on_its_device_in_float64(device):
     # Nearly parallel rows determine only the sum of their forces.
     forces = (torch.einsum("brd,br->bd", qps.G[qps.group], x) for x in (lam.cpu(), expected.lam))
     assert_allclose(*forces, rtol=1e-7, atol=1e-6)
-
-
-def test_the_core_never_leaves_the_device_nor_loops_over_the_batch():
-    source = inspect.getsource(interior_point)
-    for word in (".numpy(", ".cpu(", ".tolist(", "float32", "in range(len("):
-        assert word not in source
 
 
 def test_gradients_are_not_recorded():
