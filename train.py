@@ -28,7 +28,6 @@ from omegaconf import DictConfig
 from torchrl import torchrl_logger
 from tqdm import tqdm
 
-from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import make_learner, make_operator
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, drop_previous, save_checkpoint
@@ -39,8 +38,8 @@ from torch_qpmpc.experiment.collection import (
     warm_up_batches,
 )
 from torch_qpmpc.experiment.config import check_config
+from torch_qpmpc.experiment.costs import cost_text
 from torch_qpmpc.experiment.evaluation import Evaluation
-from torch_qpmpc.experiment.exporting import export_run
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.launch import Interrupt, check_overrides, launched
 from torch_qpmpc.experiment.metrics import (
@@ -50,7 +49,7 @@ from torch_qpmpc.experiment.metrics import (
     table,
     update_metrics,
 )
-from torch_qpmpc.experiment.proving import check_provable, prove_run
+from torch_qpmpc.experiment.outcome import check_provable, export_run, prove_run
 from torch_qpmpc.experiment.rivals import IDENTIFICATION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot

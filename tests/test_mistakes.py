@@ -32,7 +32,7 @@ from torch_qpmpc.analysis.structure import (
     second_moment,
 )
 from torch_qpmpc.envs import GymnasiumPlant, PointMass, PointMassEnv, PointMassGymEnv
-from torch_qpmpc.envs.closed_loop import closed_gap, closed_loop, gymnasium_loop
+from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
 from torch_qpmpc.experiment.run_state import resumed
 from torch_qpmpc.learning.replay import Replay, windows_to_tau
 from torch_qpmpc.mpc.banded import banded_matrix
@@ -253,7 +253,6 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("policy: got PointMass, expected a function. Pass a", lambda: closed_loop(pm, mpc.policy)),
     ("physics: got GymnasiumPlant, expected a", lambda: closed_loop(lambda s: s, pendulum)),
     ("plant: got str, expected a GymnasiumPlant. Use", lambda: gymnasium_loop(one, "Pendulum-v1")),
-    ("J_start: got '1', expected a number, or nan.", lambda: closed_gap("1", 1, 1)),
     ("num_envs: got True, expected a whole number >= 1.", lambda: PointMassEnv(True)),
     ("max_steps: got 1.5, expected a whole number >= 1.", lambda: PointMassEnv(2, max_steps=1.5)),
     ("dtype: got torch.int64, expected a", lambda: PointMassEnv(2, dtype=torch.int64)),

@@ -24,7 +24,7 @@ from scipy.stats import wilcoxon
 import train
 from tests.benchmarks.table import DOCS, two_tables
 from tests.runs import make_config
-from torch_qpmpc.envs.closed_loop import cost_text
+from torch_qpmpc.experiment.costs import cost_text
 from torch_qpmpc.experiment.evaluation import rival_costs
 from torch_qpmpc.experiment.plots import experience
 from torch_qpmpc.experiment.rivals import IDENTIFICATION, ZERO_ACTION

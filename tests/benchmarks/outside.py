@@ -39,9 +39,9 @@ from scipy.optimize import linprog
 import train
 from tests.benchmarks.table import DOCS, two_tables
 from tests.runs import make_config
-from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.costs import cost_text
 from torch_qpmpc.experiment.rivals import zero_action
 from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc, make_physics, run_code

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import gymnasium
@@ -16,7 +15,7 @@ from torchrl.envs import TransformedEnv
 
 from tests.store import Store
 from torch_qpmpc.envs import GrosZanonLTI, GymnasiumPlant, PastWindow, PlantEnv, PointMass
-from torch_qpmpc.envs.closed_loop import closed_gap, closed_loop, gymnasium_loop, plant_loop
+from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop, plant_loop
 from torch_qpmpc.errors import QPError
 
 K = torch.tensor([[1.5, 0.0, 1.0, 0.0], [0.0, 1.5, 0.0, 1.0]], dtype=torch.float64)
@@ -229,12 +228,3 @@ def test_a_policy_of_another_shape_is_an_error_in_gymnasium_too(shape):
     match = rf"policy\(s\): got shape \({shape[0]},.*\), expected shape \(32, 1\)"
     with pytest.raises(QPError, match=match):
         gymnasium_loop(lambda s: torch.zeros(shape), PENDULUM)
-
-
-def test_closed_gap():
-    assert closed_gap(100, 100, 50) == 0
-    assert closed_gap(100, 50, 50) == 1
-    assert closed_gap(100, 75, 50) == 0.5
-    assert closed_gap(100, 125, 50) == -0.5
-    assert all(map(math.isnan, (closed_gap(50, 40, 50), closed_gap(40, 40, 50))))
-    assert math.isnan(closed_gap(math.nan, 1, 0))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
-import signal
 from pathlib import Path
 
 import gymnasium
@@ -17,8 +15,7 @@ from tensordict import TensorDictBase
 from torch.testing import assert_close
 
 import train
-from tests.runs import SMALL, linear_system, make_config, run_command
-from tests.stops import assert_same_numbers, stop
+from tests.runs import SMALL, linear_system, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.start import LOG, Exploration, collect_log, make_start, stored_log
@@ -122,7 +119,6 @@ def test_a_plant_gives_its_window_and_its_signals():
     assert start.identified.R2.min() > 0.9
     # The level's noise shrinks the coefficients of the level but not those of the inputs.
     assert_close(start.identified.model.E, torch.tensor([[0.0, -1.0]]).double(), atol=0.05, rtol=0)
-    assert mpc.quadratic_program().H[0, mpc.n_p] == 1.0, "the price, from the task's own weight"
 
 
 @pytest.mark.parametrize("hessian", ["block", "diagonal", "full"])
@@ -172,15 +168,6 @@ def test_a_terminal_weight_from_the_riccati_equation_is_that_of_the_fitted_cost(
     assert_close(mpc.c.double(), 10 * start.cost.now.c + 0.9**3 * c)
 
 
-def test_the_id_alone_makes_a_qp():
-    cfg = make_config(*PENDULUM)
-    _, start, mpc = start_of(cfg)
-    assert torch.equal(mpc.C, start.identified.constraints.C)
-    assert mpc.c > 0, "costs of the pendulum are positive"
-    action = mpc.policy(torch.tensor([[1.0, 0.1, 0.0], [0.9, -0.3, 1.0]]))
-    assert action.isfinite().all()
-
-
 def test_the_fit_of_the_cost_is_shown():
     cfg = make_config(*PENDULUM, "start.transitions=1000")
     _, start, _ = start_of(cfg)
@@ -189,9 +176,6 @@ def test_the_fit_of_the_cost_is_shown():
     assert str(start).splitlines()[-1] == str(start.cost)
     R2 = {"R2_cost": start.cost.now.R2, "R2_cost_next": start.cost.after.R2}
     assert start.summary == {"log_episodes_cut": 0, **R2, "cost_of_next": start.cost.shifted}
-    _, start, _ = start_of(make_config(*DATA))
-    assert start.cost is None, "the task has its own"
-    assert start.summary == {"log_episodes_cut": 0}
 
 
 def test_episodes_that_blow_up_are_cut_and_counted():
@@ -247,23 +231,6 @@ def test_the_log_is_kept_read_and_shown(tmp_path, capsys):
     train.train(cfg, str(tmp_path / "second"), quiet=True)
     assert torch.equal(FinishedRun(tmp_path / "second").start.C, run.start.C)
     assert not capsys.readouterr().out.startswith("free C")
-
-
-def test_a_stopped_run_resumes_number_for_number(tmp_path, monkeypatch):
-    cfg, whole, cut = make_config(*DATA), tmp_path / "whole", tmp_path / "cut"
-    train.train(cfg, str(whole), quiet=True)
-    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
-    run_command(f"resume={cut}")
-    assert_same_numbers(cut, whole)
-
-
-def test_any_environment_trains_from_its_id(tmp_path):
-    settings = [x for x in PENDULUM if not x.startswith("optimizer")]
-    own = ("task.episode_steps=null", "task.eval_steps=null", "figures=false")
-    own += ("updates=2", "task.horizon=2")
-    run_command(*settings, *own, f"hydra.run.dir={tmp_path}")
-    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
-    assert summary["J_final"] > 0
 
 
 class Walk(gymnasium.Env):

@@ -7,7 +7,7 @@ import pytest
 import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPMPC
-from torch_qpmpc.experiment.exporting import export_run
+from torch_qpmpc.experiment.outcome import export_run
 from torch_qpmpc.export.__main__ import main
 from torch_qpmpc.export.library import Library, compiler
 

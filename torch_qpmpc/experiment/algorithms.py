@@ -125,12 +125,7 @@ def make_scheduler(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int 
     """Make the linear decay of the learning rates, continued after ``done`` updates."""
     # Read once: OmegaConf's lookups are slower than the function itself.
     last, updates = cfg.optimizer.final_fraction, cfg.updates
-    return LambdaLR(optimizer, lambda update: decay(done + update, updates, last))
-
-
-def decay(update: int, updates: int, last: float) -> float:
-    """Return the factor of the learning rates, which falls linearly from 1 to ``last``."""
-    return 1 - (1 - last) * min(update / updates, 1)
+    return LambdaLR(optimizer, lambda k: 1 - (1 - last) * min((done + k) / updates, 1))
 
 
 def evaluate(

@@ -37,7 +37,10 @@ def save_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
     second.unlink(missing_ok=True)
     try:
         if path.exists():
-            _duplicate(path, second)
+            try:
+                os.link(path, second)
+            except OSError:  # the file system has no hard links
+                shutil.copyfile(path, second)
         write_whole(path, buffer.getbuffer())
     except OSError:
         _remove(second)
@@ -51,13 +54,6 @@ def drop_previous(path: str | Path) -> None:
     """Remove the other checkpoints beside ``path``, which a finished run no longer needs."""
     for name in (PREVIOUS, SECOND):
         _remove(Path(path).with_name(name))
-
-
-def _duplicate(path: Path, second: Path) -> None:
-    try:
-        os.link(path, second)
-    except OSError:  # the file system has no hard links
-        shutil.copyfile(path, second)
 
 
 def _remove(path: Path) -> None:

@@ -94,16 +94,6 @@ class FromData(Group):
     ridge: NonNegative | None
 
 
-def _known_solver(name: str) -> str:
-    backend(name)
-    return name
-
-
-def _installed_step(name: str) -> str:
-    check_step(name)
-    return name
-
-
 def _installed_logger(name: str) -> str:
     if name in ("wandb", "mlflow") and importlib.util.find_spec(name) is None:
         got, remedy = f"{name}, which is not installed", f"Install it: pip install {name}."
@@ -122,7 +112,7 @@ class Config(Group):
 
     seed: Seed
     eval_seed: Seed | None
-    solver: Annotated[str, AfterValidator(_known_solver)]
+    solver: Annotated[str, AfterValidator(lambda name: backend(name) and name)]
     threads: Count
     updates: Count
     batch_size: Count
@@ -134,7 +124,9 @@ class Config(Group):
     exploration_std: NonNegative
     weighted: bool
     td_error_clip: Positive | None
-    step: Annotated[Literal["cholesky", "projection", "sdp"], AfterValidator(_installed_step)]
+    step: Annotated[
+        Literal["cholesky", "projection", "sdp"], AfterValidator(lambda x: check_step(x) or x)
+    ]
     release: Count | None
     resume: str | None
     ablation: str | None

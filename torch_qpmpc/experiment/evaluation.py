@@ -17,9 +17,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torch_qpmpc.envs import GymnasiumPlant
-from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_gap
+from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.costs import closed_gap
 from torch_qpmpc.experiment.rivals import IDENTIFICATION, Policy
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_true_mpc
 from torch_qpmpc.experiment.tasks.identified import nominal_mpcs

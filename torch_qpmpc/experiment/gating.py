@@ -48,7 +48,12 @@ class RunGate:
 
     def __init__(self, cfg: DictConfig, learner: Learner, physics: AnyPlant) -> None:
         self._cfg, self._learner, self._physics = cfg, learner, physics
-        options = {"seed": cfg.seed, "pairs": PAIRS, "decisions": _decisions(cfg)}
+        self._interval = cfg.gate_interval or cfg.eval_interval
+        options = {
+            "seed": cfg.seed,
+            "pairs": PAIRS,
+            "decisions": math.ceil(cfg.updates / self._interval) + 1,
+        }
         options |= {"bound": cfg.gate_bound, "patience": PATIENCE if cfg.gate in ACTING else None}
         self._gate = Gate(learner.actor, self._costs, **options) if cfg.gate else None
         self.kept: Any = learner.actor if self._gate is None else self._gate.actor
@@ -74,7 +79,7 @@ class RunGate:
 
         Judges each ``gate_interval`` updates and after the last one; without a gate, never.
         """
-        if self._gate is None or (update != self._cfg.updates and update % _interval(self._cfg)):
+        if self._gate is None or (update != self._cfg.updates and update % self._interval):
             return {}
         verdict = self._gate.judge(self._learner.actor)
         names = ("accepted", "mean", "low", "high", "pairs")
@@ -126,11 +131,3 @@ class RunGate:
         if self._gate is not None and state is not None:
             self._gate.load_state_dict(state)
             self.compared = state["simulated"]
-
-
-def _interval(cfg: DictConfig) -> int:
-    return cfg.gate_interval or cfg.eval_interval
-
-
-def _decisions(cfg: DictConfig) -> int:
-    return math.ceil(cfg.updates / _interval(cfg)) + 1

@@ -17,8 +17,8 @@ from torch_qpmpc.analysis.structure import (
     prediction_form,
 )
 from torch_qpmpc.envs import LinearSystem
-from torch_qpmpc.envs.closed_loop import cost_text, gap_text
 from torch_qpmpc.experiment.algorithms import Learner
+from torch_qpmpc.experiment.costs import cost_text, gap_text
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.gating import COMPARED, RunGate
 from torch_qpmpc.experiment.plots import learned_episode_figure, summary_figure
@@ -50,7 +50,7 @@ def update_metrics(
     metrics |= tally.metrics() | theta_metrics(mpc)
     if learner.deviation is not None:
         metrics.setdefault("loss/deviation", learner.deviation(mpc.C).item())
-    return metrics | watch.metrics()
+    return metrics | {"time/collect": watch.data, "time/update": watch.total - watch.data}
 
 
 def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str, Any]:
@@ -67,23 +67,14 @@ def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str
 
 
 def report(run: RunFolder, mpc: QPMPC, evaluation: Evaluation, update: int) -> dict[str, Any]:
-    """Log an evaluation: J and, after the first update, the structure of C.
-
-    Args:
-        run: the run's folder.
-        mpc: the learned QP.
-        evaluation: the evaluation.
-        update: the number of updates so far.
-
-    Returns:
-        `Evaluation.summary`.
-    """
+    """Log an evaluation: J and, after the first update, the structure of C; return its summary."""
     summary = evaluation.summary()
-    scalars = {f"eval/{name}": summary[key] for name, key in EVALUATION_SCALARS.items()}
-    scalars |= {f"eval/J_{tag(name)}": J for name, J in evaluation.rivals.items()}
+    scalars = {f"eval/{name}": summary[name] for name in ("J_true_model", "closed_gap")}
+    scalars |= {f"eval/{name}": summary[f"{name}_best"] for name in ("J", "J_discounted")}
+    tags = {name: re.sub(r"\W+", "_", name).strip("_") for name in evaluation.rivals}
+    scalars |= {f"eval/J_{tags[name]}": J for name, J in evaluation.rivals.items()}
     if update:
-        distances = distance_by_band(mpc)
-        distances |= structure_metrics(mpc)
+        distances = distance_by_band(mpc) | structure_metrics(mpc)
         scalars |= {f"structure/{name}": distance for name, distance in distances.items()}
     run.log(scalars, update)
     return summary
@@ -95,25 +86,6 @@ def draw_outcome(run: RunFolder, mpc: QPMPC, evaluation: Evaluation) -> None:
     summary.savefig(run.path / "summary.png", dpi=110)
     if evaluation.loops["learned"].known.isfinite().all():
         learned_episode_figure(mpc, evaluation).savefig(run.path / "episode.png", dpi=110)
-
-
-def tag(name: str) -> str:
-    """Return the words of a name with an underscore between them.
-
-    Example:
-        >>> tag("planner (R = 2)")
-        'planner_R_2'
-    """
-    return re.sub(r"\W+", "_", name).strip("_")
-
-
-#: Names of an evaluation's scalars, and their keys in `Evaluation.summary`.
-EVALUATION_SCALARS = {
-    "J": "J_best",
-    "J_true_model": "J_true_model",
-    "J_discounted": "J_discounted_best",
-    "closed_gap": "closed_gap",
-}
 
 
 def structure_summary(mpc: QPMPC, true_model: Sequence[Tensor] | None) -> dict[str, float]:

@@ -13,8 +13,9 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torch_qpmpc.analysis.plots import COLOURS, draw_matrix, episode_figure, plans_along
-from torch_qpmpc.envs.closed_loop import ClosedLoop, cost_text
+from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.collection import warm_up_batches
+from torch_qpmpc.experiment.costs import cost_text
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.mpc.module import QPMPC
@@ -24,12 +25,7 @@ SHOWN = 6
 #: Colours of the rivals' lines, in their order.
 RIVAL_COLOURS = (
     "0.2",
-    "tab:orange",
-    "tab:purple",
-    "tab:brown",
-    "tab:pink",
-    "tab:olive",
-    "tab:cyan",
+    *map("tab:{}".format, ("orange", "purple", "brown", "pink", "olive", "cyan")),
 )
 
 
@@ -42,7 +38,7 @@ def draw_positions(
     """Draw closed-loop paths from a few starts, and the learned QP's predictions.
 
     They are in the plane of the first two states or outputs, or over time if there is only one.
-    ``names`` are those of `episode_names`.
+    ``names`` are from `episode_names`.
     """
     plane = mpc.n_x > 1
     times = names.get("times", torch.arange(2.0))
@@ -75,30 +71,17 @@ def learned_episode_figure(mpc: QPMPC, evaluation: Evaluation) -> Figure:
     loop = evaluation.loops["learned"]
     steps = len(loop.actions) if loop.lengths is None else int(loop.lengths[0])
     p, y, u = loop.known[: steps + 1, 0], loop.states[: steps + 1, 0], loop.actions[:steps, 0]
-    options = {"times": torch.arange(len(p), dtype=torch.float64), **_names(mpc, evaluation)}
+    options = {"times": torch.arange(len(p), dtype=torch.float64), **episode_names(mpc, evaluation)}
     plans = plans_along(mpc, p[:-1], every=max(mpc.horizon // 2, 1))
     return episode_figure(y=y, u=u, plans=plans, **options)
 
 
-def episode_names(cfg: DictConfig, physics: Any, mpc: QPMPC, d: Tensor) -> dict[str, Any]:
-    """Return the names of outputs and actions, and what else the task shows of an episode.
-
-    Args:
-        cfg: the configuration of the run.
-        physics: the plant.
-        mpc: a QPMPC of its sizes.
-        d: the episode's known signals, ``(steps, n_d)``.
-    """
-    symbols = {
-        "outputs": [f"$s_{{{i + 1}}}$" for i in range(mpc.n_x)],
-        "actions": [f"$a_{{{i + 1}}}$" for i in range(mpc.n_u)],
-    }
-    return symbols | dict(find_task(cfg.task).episode(physics, d))
-
-
-def _names(mpc: QPMPC, evaluation: Evaluation) -> dict[str, Any]:
+def episode_names(mpc: QPMPC, evaluation: Evaluation) -> dict[str, Any]:
+    """Return the names of outputs and actions, and what else the task shows of an episode."""
     d = evaluation.loops["learned"].known[:, 0, : mpc.n_d]
-    return episode_names(evaluation.cfg, evaluation.physics, mpc, d)
+    shown = find_task(evaluation.cfg.task).episode(evaluation.physics, d)
+    outputs = [f"$s_{{{i + 1}}}$" for i in range(mpc.n_x)]
+    return {"outputs": outputs, "actions": [f"$a_{{{i + 1}}}$" for i in range(mpc.n_u)], **shown}
 
 
 def draw_learning(
@@ -109,7 +92,9 @@ def draw_learning(
     draw_lines(axes, evaluation.lines())
     axes.set(xlabel="update", ylabel="J, mean over starts")
     scale_costs(axes)
-    draw_experience(axes, evaluation.cfg)
+    first, each, unit = experience(evaluation.cfg)
+    ticks: Any = (lambda k: first + each * k, lambda x: (x - first) / each)
+    axes.secondary_xaxis("top", functions=ticks).set_xlabel(unit)
     axes.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
 
 
@@ -121,13 +106,6 @@ def draw_lines(axes: Axes, costs: Mapping[str, float]) -> None:
         line = "--" if name in COLOURS else ":"
         label = f"{name}, {cost_text(J)}"
         axes.axhline(J, color=colours.get(name), linestyle=line, label=label)
-
-
-def draw_experience(axes: Axes, cfg: DictConfig) -> None:
-    """Add an axis of the plant's experience above that of the updates."""
-    first, each, unit = experience(cfg)
-    ticks: Any = (lambda k: first + each * k, lambda x: (x - first) / each)
-    axes.secondary_xaxis("top", functions=ticks).set_xlabel(unit)
 
 
 def scale_costs(axes: Axes) -> None:
@@ -165,5 +143,5 @@ def summary_figure(
     left, middle, right = (panel.subplots() for panel in panels)
     draw_learning(left, updates, J, evaluation)
     draw_matrix(middle, mpc.C, mpc, r"Learned constraint matrix $C_\theta$")
-    draw_positions(right, evaluation.loops, mpc, _names(mpc, evaluation))
+    draw_positions(right, evaluation.loops, mpc, episode_names(mpc, evaluation))
     return figure

@@ -17,7 +17,7 @@ from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 @dataclass
 class Stopwatch:
-    """The seconds of one update, split into collection and learning."""
+    """The seconds of one update: ``data`` of collection, and ``total``."""
 
     began: float
     data: float = 0.0
@@ -26,9 +26,6 @@ class Stopwatch:
     def collected(self) -> None:
         """Mark the end of the collection."""
         self.data = time.perf_counter() - self.began
-
-    def metrics(self) -> dict[str, float]:
-        return {"time/collect": self.data, "time/update": self.total - self.data}
 
 
 @dataclass

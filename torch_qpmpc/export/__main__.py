@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT, learned_qp
-from torch_qpmpc.experiment.exporting import FOLDER
+from torch_qpmpc.experiment.outcome import FOLDER
 from torch_qpmpc.export.export import STORAGES, export_c
 from torch_qpmpc.export.writer import REAL
 

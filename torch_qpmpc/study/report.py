@@ -18,8 +18,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from torch_qpmpc.envs.closed_loop import cost_text
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.costs import cost_text
 from torch_qpmpc.files import write_whole
 from torch_qpmpc.study import plots
 from torch_qpmpc.study.markdown import escaped, replaced, table

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Self
 
 import pandas as pd
 
-from torch_qpmpc.envs.closed_loop import cost_text
+from torch_qpmpc.experiment.costs import cost_text
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.files import damaged, write_whole
 

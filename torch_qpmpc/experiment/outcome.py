@@ -1,16 +1,33 @@
-"""The proof at a run's end (``prove=BOUND``): the first step from every start keeps the bounds."""
+"""What a run does with its learned policy at its end: ``export=c`` and ``prove=BOUND``."""
 
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torch_qpmpc.envs.linear_system import LinearSystem
 from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.export.export import export_c
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.proofs import Plant, Polytope, largest_violation
+
+#: The folder of the C files in that of the run.
+FOLDER = "c"
+
+
+def export_run(mpc: QPMPC, path: Path, quiet: bool) -> None:
+    """Write the policy as C into the run's folder; warn if that is not possible."""
+    try:
+        export = export_c(mpc, path / FOLDER)
+    except QPError as error:
+        # The run's results are worth more than its export, which can be repeated.
+        warnings.warn(f"The policy is not exported. {error}", stacklevel=2)
+        return
+    if not quiet:
+        print(f"\n{export}")
 
 
 def check_provable(physics: Any) -> None:
@@ -22,10 +39,11 @@ def check_provable(physics: Any) -> None:
 
 
 def prove_run(mpc: QPMPC, physics: Any, bound: float, quiet: bool) -> dict[str, Any]:
-    """Return the entries of summary.json: ``proof``, a sentence, its ``value`` and its ``bound``.
+    """Bound the states after the first step from every start, with noise within ``bound``.
 
-    The states are the box of all starts, and each entry of the noise is within ``bound``. A
-    question without an answer is a warning, and has no entries.
+    Returns:
+        The entries of summary.json: ``proof``, a sentence, its ``value`` and its ``bound``; none,
+        but a warning, if the question has no answer.
 
     Raises:
         QPError: the plant is not a linear one with a box of starts.

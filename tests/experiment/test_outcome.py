@@ -1,4 +1,4 @@
-"""The proof at a run's end."""
+"""The proof at a run's end; tests/export/test_command.py has the export."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.envs import GrosZanonLTI, PointMass
-from torch_qpmpc.experiment.proving import check_provable, prove_run
+from torch_qpmpc.experiment.outcome import check_provable, prove_run
 from torch_qpmpc.experiment.tasks import make_mpc
 
 
