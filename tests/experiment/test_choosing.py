@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 import signal
-from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -21,13 +20,9 @@ import train
 from tests.runs import SMALL, make_config, run_command
 from tests.stops import stop
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment import choosing, evaluation
+from torch_qpmpc.experiment import choosing
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.choosing import (
-    NONE_HELD,
-    _blended,
-    _is_less,
-    _none_held,
     choose,
     chosen_before,
     starts,
@@ -36,7 +31,6 @@ from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log, learning_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.choice import HELD, MEAN_ACTION, NO_WINDOW, STARTS, Choice, Row
-from torch_qpmpc.experiment.tasks.identified import identified_start
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc import stage_cost
 from torch_qpmpc.study.runs import FinishedRun
@@ -65,9 +59,6 @@ class Lag(gymnasium.Env):
 DATA = (*SMALL, "start=data", "start.transitions=400", "task=gymnasium", "task.id=Lag-v0")
 DATA += ("noise=none", "task.start_episodes=4")
 BOUNDED = "task.observation_bounds=true"
-#: A model of Pendulum-v1.
-GIVEN = ("task.A=[[1,0,0],[0,1,0],[0,0,1]]", "task.B=[[0],[0],[.15]]")
-GIVEN += ("task.stage_weight=[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]",)
 #: Zero action is best: the input does next to nothing and is expensive.
 HOPELESS = (*DATA, "task.kwargs={gain: 0.001, price: 100}")
 
@@ -141,31 +132,6 @@ def test_set_points_are_held_in_all_starts_and_said(monkeypatch, given, held):
     assert "tied C, N=6, cost of (y_(k+1), u_k) in most steps" in named
 
 
-@pytest.mark.parametrize("less", [True, False])
-def test_a_start_that_holds_no_output_is_chosen_if_it_costs_less(tmp_path, monkeypatch, less):
-    plant_is(monkeypatch, Followed)
-    monkeypatch.setattr(choosing, "_is_less", lambda _: less)
-    asked, nominal = [], evaluation.nominal_mpcs
-    monkeypatch.setattr(
-        evaluation, "nominal_mpcs", lambda *x: asked.append(list(x[-1])) or nominal(*x)
-    )
-    cfg = make_config(*DATA, "start.transitions=800", "rivals=[identification]")
-    assert stop(monkeypatch, cfg, tmp_path, 3) == 128 + signal.SIGTERM
-    run_command(f"resume={tmp_path}")
-    choice = Choice.read(tmp_path)
-    assert choice is not None
-    (name,) = (name for name in choice.rows if name.endswith(NONE_HELD))
-    assert {choice.rows[x].episodes for x in (name, name.removesuffix(NONE_HELD))} == {4}
-    assert choice.name == (name if less else ZERO_ACTION)
-    assert FinishedRun(tmp_path).summary.get("outputs_held", []) == ([] if less else [1])
-    assert asked == [[] if less else [1]]
-    cfg.task.held, physics = [1], make_physics(cfg)
-    rows = {key: row._replace(chosen=key == name) for key, row in choice.rows.items()}
-    log = collect_log(cfg, physics)
-    with pytest.raises(QPError, match=f"starts.csv: got '.*{NONE_HELD}', expected one of"):
-        chosen_before(cfg, physics, log, Choice(rows))
-
-
 def test_the_starts_are_all_combinations_and_constant_actions():
     cfg = make_config(*DATA)
     physics = make_physics(cfg)
@@ -195,17 +161,12 @@ def test_a_start_that_costs_less_than_zero_action_is_chosen():
     assert rows[choice.name].J < rows[ZERO_ACTION].J
     assert sorted(row.episodes for row in rows.values()) == [2] * 5 + [4] * 7
     assert start.summary["start_transitions"] == sum(r.episodes for r in rows.values()) * 10
-    lines = str(choice).splitlines()
-    assert lines[-2] == f"Chosen by at most 380 transitions of the plant: {choice.name}"
-    assert lines[-1] == NO_WINDOW
-    assert lines[0].endswith("R2  episodes  J +- standard error (compare rows of equal episodes)")
-    assert len(lines) == 3 + len(rows)
+    assert NO_WINDOW in str(choice)
 
 
 def test_zero_action_is_held_if_nothing_costs_less():
     cfg, physics, start, choice = chosen(*HOPELESS)
     assert choice.name == start.summary["start"] == ZERO_ACTION
-    assert "No start is shown to cost less than zero action" in str(start)
     s = 3 * torch.randn(16, 1, dtype=torch.float64)
     mpc = make_mpc(cfg, physics, start)
     assert mpc.policy(s).abs().max() < 1e-12
@@ -221,15 +182,8 @@ def test_learning_begins_with_the_best_scheme_where_a_gate_keeps_the_held_action
     assert make_mpc(cfg, physics, learning_start(cfg, start)).policy(s).abs().max() > 1e-3
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        ("gate=true", "constraint=mpc", "optimizer=gauss_newton", "release=2", BOUNDED),
-        ("gate=act", "optimizer=adam", "constraint=free"),
-    ],
-    ids=" ".join,
-)
-def test_the_gate_keeps_the_held_action_and_the_run_resumes(tmp_path, monkeypatch, settings):
+def test_the_gate_keeps_the_held_action_and_the_run_resumes(tmp_path, monkeypatch):
+    settings = ("gate=true", "constraint=mpc", "optimizer=gauss_newton", "release=2", BOUNDED)
     cfg, whole, cut = make_config(*HOPELESS, *settings), tmp_path / "whole", tmp_path / "cut"
     summary = train.train(cfg, str(whole), quiet=True)
     assert summary["start"] == ZERO_ACTION
@@ -237,19 +191,6 @@ def test_the_gate_keeps_the_held_action_and_the_run_resumes(tmp_path, monkeypatc
     assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
     run_command(f"resume={cut}")
     assert FinishedRun(cut).summary["J_final"] == summary["J_final"]
-
-
-def test_the_runs_own_scheme_wins_a_tie():
-    row = Row(0.5, 4, 0.0, 0.0, 40, False)
-    rows = {"own": row, "other": row, ZERO_ACTION: row._replace(chosen=True)}
-    assert Choice(rows).scheme == "own"
-
-
-def test_a_finite_cost_is_less_than_an_infinite_one():
-    inf = torch.inf
-    assert _is_less(torch.tensor([-inf, -inf, -1.0]))
-    assert not _is_less(torch.tensor([-inf, inf, -1.0]))
-    assert not _is_less(torch.tensor([1.0, inf, 2.0]))
 
 
 @pytest.mark.parametrize("hessian", ["block", "diagonal", "full"])
@@ -276,20 +217,11 @@ def test_a_held_action_has_a_cost_of_its_own(hessian):
     assert_close(difference, (R / 8).expand(8), rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize("hessian", ["block", "diagonal", "full"])
-def test_a_held_action_has_the_parts_of_the_scheme_that_learning_begins_with(hessian):
-    """The gate copies them; a cost of the next output has a weight for each stage."""
-    cfg = make_config(*DATA, f"task.hessian={hessian}", "task.learn_cost=[q,c]")
+def test_the_gate_copies_a_held_action_into_the_scheme_that_learning_begins_with():
+    cfg = make_config(*DATA, "task.hessian=diagonal", "task.learn_cost=[q,c]")
     physics = make_physics(cfg)
     start = starts(cfg, physics, collect_log(cfg, physics))[ZERO_ACTION]
-    cost = start.cost
-    assert cost is not None
-    cost = cost._replace(now=replace(cost.now, R2=-1.0))
-    assert cost.shifted
-    held, scheme = (
-        make_mpc(cfg, physics, start._replace(cost=cost, held=action))
-        for action in (start.held, None)
-    )
+    held, scheme = make_mpc(cfg, physics, start), make_mpc(cfg, physics, start._replace(held=None))
     scheme.load_state_dict(held.state_dict())
     assert scheme.policy(torch.ones(1, 1, dtype=torch.float64)).abs() < 1e-12
 
@@ -320,16 +252,9 @@ def turning(monkeypatch):
     plant_is(monkeypatch, Turning)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        ("gate=act", "optimizer=gauss_newton", "constraint=mpc", "release=2"),
-        ("gate=false", "optimizer=adam", "constraint=free"),
-    ],
-    ids=" ".join,
-)
 @pytest.mark.usefixtures("turning")
-def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path, monkeypatch, settings):
+def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path, monkeypatch):
+    settings = ("gate=act", "optimizer=gauss_newton", "constraint=mpc", "release=2")
     cfg = make_config(*DATA, "task.start_episodes=2", *settings)
     run = trained_and_resumed(cfg, tmp_path, monkeypatch)
     assert run.summary["start"].startswith("blended models, N=6, cost of")
@@ -338,17 +263,12 @@ def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path, monkey
 
 
 @pytest.mark.usefixtures("turning")
-def test_blended_models_are_no_start_of_a_run_that_needs_one_C():
-    cfg = make_config(*DATA)
+@pytest.mark.parametrize(("needs", "there"), [((), True), (("export=c",), False)])
+def test_blended_models_are_no_start_of_a_run_that_needs_one_C(needs, there):
+    cfg = make_config(*DATA, *needs)
     physics = make_physics(cfg)
-    start = identified_start(cfg, physics, collect_log(cfg, physics))
-    models = _blended(cfg, start, 6)
-    assert models is not None
-    said = f"Linear models at {len(models.centres)} centres, blended, take the place of the model "
-    said += "above."
-    assert said in str(start._replace(blended=models)).splitlines()
-    for needs in ("export=c", "constraint=si"):
-        assert _blended(make_config(*DATA, needs), start, 6) is None, needs
+    named = starts(cfg, physics, collect_log(cfg, physics))
+    assert any("blended" in name for name in named) == there
 
 
 class Falling(Lag):
@@ -400,14 +320,10 @@ def test_a_run_starts_from_the_steps_near_where_episodes_begin(tmp_path, monkeyp
 
 
 def test_the_local_start_holds_outputs_that_hardly_move_there(falling):
-    cfg, physics, log = falling()
-    start = starts(cfg, physics, log)[LOCAL]
+    start = starts(*falling())[LOCAL]
     assert start.still == [1], "the cosine"
     assert start.outputs_held == []
-    assert _none_held(cfg, start) is None
-    lines = str(start).splitlines()
-    assert any(line.endswith("Outputs that hardly move there, and are held: y2") for line in lines)
-    assert not any("task.held" in line for line in lines)
+    assert any(line.endswith("are held: y2") for line in str(start).splitlines())
 
 
 def test_the_local_start_needs_no_discount(falling):
@@ -415,13 +331,6 @@ def test_the_local_start_needs_no_discount(falling):
     start = starts(cfg, physics, log)[LOCAL]
     s = torch.tensor([[0.05, 1.0, 0.0], [0.0, 1.0, 0.1]]).double()
     assert (make_mpc(cfg, physics, start).policy(s) < 0).all()
-
-
-def test_the_local_start_has_the_tasks_own_cost(falling):
-    own = "task.stage_weight=[[1,0,0,0],[0,0,0,0],[0,0,1,0],[0,0,0,.1]]"
-    named = starts(*falling(own, "task.A=null", "task.B=null"))
-    assert "local C, N=3" in named
-    assert not any("Riccati" in name for name in named), "it is the default's"
 
 
 @pytest.mark.parametrize("setting", ["task.hessian=diagonal", "task.past=2"])
@@ -486,20 +395,13 @@ def test_windows_are_no_start_if_the_run_names_its_own_or_episodes_are_short():
     cfg = make_config(*DATA)
     physics = make_physics(cfg)
     log = collect_log(cfg, physics)
-    windows = [name for name in starts(cfg, physics, log) if "past=3" in name]
-    assert len(windows) == 8
-    own = make_config(*DATA, "task.past=1")
-    assert not [name for name in starts(own, make_physics(own), log) if "past" in name]
+    assert any("past=3" in name for name in starts(cfg, physics, log))
     own = make_config(*DATA, "task.past=2")
     plant = make_physics(own)
     assert all("past=2" in name for name in starts(own, plant, log) if name not in HELD)
-    assert NO_WINDOW not in str(choose(own, plant, log))
     short = make_config(*DATA, "task.episode_steps=2")
     log = collect_log(short, physics)
     assert not [name for name in starts(short, physics, log) if "past" in name]
-    given = make_config("task=gymnasium", "task.id=Pendulum-v1", "task.past=2", *GIVEN)
-    with pytest.raises(QPError, match=r"^task.past: got 2 with a model that is given, expected 1"):
-        make_mpc(given, make_physics(given))
 
 
 def test_a_run_resumes_with_the_start_that_it_has_chosen(tmp_path, monkeypatch):
@@ -539,16 +441,6 @@ def test_the_table_is_kept_and_damage_is_named(tmp_path):
     table.to_csv(tmp_path / STARTS, index=False)
     with pytest.raises(QPError, match=r"starts\.csv: got .*expected the table of starts"):
         Choice.read(tmp_path)
-
-
-def test_episodes_that_end_early_are_said_and_huge_errors_cut():
-    zero = Row(math.nan, 4, 2.0, 0.0, 40, False, 10.0)
-    rows = {"own": Row(-1e6, 4, 1.0, 0.1, 40, True, 6.6), ZERO_ACTION: zero}
-    lines = str(Choice(rows)).splitlines()
-    assert "Its episodes end after 7 of 10 steps in the mean." in lines
-    assert lines[1].split()[:4] == ["own", "<", "-100", "4"]
-    rows["own"] = rows["own"]._replace(length=10.0)
-    assert not any("end after" in line for line in str(Choice(rows)).splitlines())
 
 
 def test_a_table_of_another_log_is_named():
