@@ -72,7 +72,7 @@ BUDGET = {
     "experiment": 4000,
     "export": 1412,
     "learning": 2473,
-    "mpc": 5109,
+    "mpc": 5104,
     "proofs": 998,
     "qp": 5766,
     "study": 606,

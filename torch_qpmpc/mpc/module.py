@@ -43,12 +43,12 @@ from torch_qpmpc.mpc.validation import (
     learned_entries,
 )
 from torch_qpmpc.qp.batching import full_precision, to_dtype
-from torch_qpmpc.qp.tracing import serially_if_forked
 from torch_qpmpc.qp.pipeline.solve import ON_FAILURE
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
 from torch_qpmpc.qp.solvers import backend
+from torch_qpmpc.qp.tracing import serially_if_forked
 
 #: The parts of theta that are learned by default.
 LEARN = ("H", "c", "C")

@@ -101,15 +101,10 @@ def read_numbers(name: str, value: Any) -> Tensor:
         # On the CPU: a default device of "meta" would drop the values of lists.
         return torch.as_tensor(value, dtype=torch.float64, device="cpu")
     except (TypeError, ValueError, RuntimeError) as error:
-        raise QPError.expected(
-            name, _brief(value), "a tensor, or what torch.as_tensor takes, of real numbers"
-        ) from error
-
-
-def _brief(value: Any) -> str:
-    if isinstance(value, Tensor):
-        return f"a tensor of {value.dtype} on {value.device}"
-    return repr(value)
+        tensor = isinstance(value, Tensor)
+        got = f"a tensor of {value.dtype} on {value.device}" if tensor else repr(value)
+        want = "a tensor, or what torch.as_tensor takes, of real numbers"
+        raise QPError.expected(name, got, want) from error
 
 
 def check_weight(name: str, weight: Tensor, diagonal: bool, n_d: int) -> None:
