@@ -165,28 +165,23 @@ def test_the_filter_is_stable_and_faster_with_more_drift():
             r"y: got signals \['T'\], expected the signals \['y1'\]",
         ),
         (lambda c: c.reset(u=[1.0, 2.0]), r"u: got shape \(1, 2\), expected 1 numbers"),
+        (
+            lambda c: qm.Controller(c.mpc, noise=0.0),
+            "noise: got 0 of y1, expected a standard deviation > 0 of each",
+        ),
+        (
+            lambda c: qm.Controller(c.mpc, drift=[1.0, 2.0]),
+            r"drift: got shape \(2,\) or NaN, expected a number, or one for",
+        ),
+        (lambda _: qm.Controller(Mock()), "mpc: got Mock, expected a LinearMPC"),
     ],
 )
-def test_bad_signals_are_named(call, message):
+def test_bad_arguments_are_named(call, message):
     with pytest.raises(QPError, match=f"^{message}"):
         call(qm.Controller(integrator()))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"noise": 0.0}, r"noise: got 0 of y1, expected a standard deviation > 0 of each"),
-        ({"drift": [1.0, 2.0]}, r"drift: got shape \(2,\) or NaN, expected a number, or one for"),
-    ],
-)
-def test_bad_arguments_are_named(arguments, message):
-    with pytest.raises(QPError, match=f"^{message}"):
-        qm.Controller(integrator(), **arguments)
-
-
-def test_other_modules_and_forecasts_that_are_missing_are_named():
-    with pytest.raises(QPError, match=r"^mpc: got Mock, expected a LinearMPC"):
-        qm.Controller(Mock())
+def test_forecasts_that_are_missing_are_named():
     mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 3, Q=1.0, E=[[0.5, 1.0]], known=["d", "e"])
     with pytest.raises(QPError, match=r"^known: got None, expected the signals d, e. Pass a forec"):
         qm.Controller(mpc).step([0.0], [0.0])

@@ -39,6 +39,7 @@ MPCS = {
     "preview": lambda: learned("preview"),
     "blocks": lambda: learned(blocks=[1, 3]),
     "integrator": integrator,
+    "window": integrator,
     "two by two": lambda: qm.LinearMPC((A, B, C), 8, Q=1.0, y_bounds=(-1.0, 1.0), **SIZES),
     "more outputs": lambda: qm.LinearMPC((A, B[:, :1], C), 8, Q=[1.0, 0.5], **SIZES),
     "more inputs": lambda: qm.LinearMPC((A, B, C), 8, Q=[1.0, 0.0], **SIZES),
@@ -69,15 +70,9 @@ def difference(controller, twin, steps):
     return largest
 
 
-def test_the_loop_with_a_window_is_that_of_python(tmp_path):
-    controller = qm.Controller(MPCS["integrator"](), window=True)
-    report = controller.export_c(tmp_path)
-    assert difference(controller, load(report.files, controller), STEPS) < 1e-9
-
-
 @pytest.mark.parametrize("name", MPCS)
 def test_the_loop_is_that_of_python(tmp_path, name):
-    controller = qm.Controller(MPCS[name]())
+    controller = qm.Controller(MPCS[name](), window=name == "window")
     report = controller.export_c(tmp_path)
     assert report.difference is not None
     assert report.difference < 1e-9
@@ -119,21 +114,12 @@ def test_a_reset_starts_where_the_plant_rests(exported):
     assert np.allclose(twin.step([1.5])[0], controller.step([1.5]), atol=1e-12)  # the last r
 
 
-def test_signals_that_are_not_finite_hold_the_last_input_and_the_loop_goes_on(exported):
-    _, _, twin = exported
-    twin.reset()
-    assert twin.step([np.nan], [1.0]) == (np.zeros(1), 3)
-    first, code = twin.step([0.0], [1.0])
-    assert code == 0
-    assert twin.step([np.inf]) == (first, 3)
-    assert twin.step([0.0], [np.nan]) == (first, 3)
-    assert twin.step([0.0])[1] == 0
-
-
-def test_a_signal_that_is_absurd_is_as_one_that_is_not_finite(exported):
+def test_a_signal_that_is_absurd_or_not_finite_holds_the_last_input_and_the_loop_goes_on(exported):
     controller, _, twin = exported
     inputs = []
-    for bad in (np.nan, 1e12, 3.4e38, -1e300):
+    for bad in (np.nan, np.inf, 1e12, 3.4e38, -1e300):
+        twin.reset()
+        assert twin.step([bad], [1.0]) == (np.zeros(1), 3)
         twin.reset([0.0], [0.0])
         twin.step([0.1], [1.0])
         held = twin.step([0.1])[0]

@@ -177,18 +177,14 @@ def test_bad_arguments_are_named(options, message):
         made(WRONG).learn(Lag(), **{**QUICK, **options})
 
 
-def test_logs_of_other_signals_and_constant_signals_are_named():
+def test_logs_of_other_signals_or_steps_and_constant_signals_are_named():
     controller = made(WRONG, inputs=["q"])
     with pytest.raises(QPError, match=r"^log: got inputs \('u1',\), expected the controller's \("):
         controller.learn(logged())
     controller = made(WRONG, E=[[0.1]], known=["sun"])
     with pytest.raises(QPError, match=r"^known: got a constant sun, expected one that varies"):
         controller.learn(Lag(), known=[0.3], **{**QUICK, "transitions": 12})
-
-
-def test_a_log_of_another_sampling_time_is_refused():
     controller = made(WRONG, dt=30.0)
-    message = "log: got one step every 60, expected the controller's sampling time, 30. Resample"
-    with pytest.raises(QPError, match=f"^{message}"):
+    with pytest.raises(QPError, match=r"^log: got one step every 60, expected .* 30. Resample"):
         controller.learn(logged(dt=60.0))
     assert controller.learn(logged(dt=30.0), steps=8).accepted

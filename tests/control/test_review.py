@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
 from torch_qpmpc.control import review, simulation
-from torch_qpmpc.control.findings import Finding, Review
 from torch_qpmpc.control.linear_loop import LinearLoop
+from torch_qpmpc.control.review import Finding, Review
 from torch_qpmpc.export.tables import make_tables
 from torch_qpmpc.proofs import Answer, Plant, Polytope, largest_violation
 

@@ -36,9 +36,7 @@ def test_a_loaded_controller_goes_on_with_the_same_inputs(tmp_path, options):
     assert np.array_equal(inputs(twin), inputs(controller))
     assert twin.known is not None
     assert twin.known.tolist() == [0.3, 0.19]
-    assert twin.rest[0] is None
-    assert twin.rest[1] is not None
-    assert twin.rest[1].tolist() == [0.1]
+    assert twin.simulate(steps=1).u_last.tolist() == [0.1]
     assert twin.mpc.design.plant.label("level") == "level [m]"
     assert twin.mpc.design.plant.dt == 0.5
 

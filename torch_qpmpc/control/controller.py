@@ -10,12 +10,11 @@ import torch
 
 from torch_qpmpc.checks import check_flag, check_kind
 from torch_qpmpc.control.exporting import ControllerExport, export_controller
-from torch_qpmpc.control.findings import Review
 from torch_qpmpc.control.law import Law, Memory, Signals
 from torch_qpmpc.control.learning import LearningReport, learn
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target, packed, unpacked
 from torch_qpmpc.control.observer import Observer
-from torch_qpmpc.control.review import review
+from torch_qpmpc.control.review import Review, review
 from torch_qpmpc.control.simulation import Run, simulate
 from torch_qpmpc.control.state_space import Array, read_row
 from torch_qpmpc.errors import SolverError
@@ -57,7 +56,6 @@ class Controller:
         x, w, u: the estimates of x and w, and the last input.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
         r: the set-points of the last step, without rows before the first.
-        rest: the outputs and the input at rest that the last reset was passed, or None for each.
         p: the input of the last step's plan, ``(n_p,)``.
         target: the `Target` of the last step, None before the first; with a preview, of all stages.
 
@@ -159,11 +157,6 @@ class Controller:
     def known(self) -> Array | None:
         """The known signals of the last step or reset."""
         return self._memory.known
-
-    @property
-    def rest(self) -> tuple[Array | None, Array | None]:
-        """The outputs and the input at rest of the last reset."""
-        return self._memory.rest
 
     def step(self, y: Any, r: Any = None, known: Any = None) -> Any:
         """Return the input for measured outputs: a vector ``(m,)``, or by name if y is by name.

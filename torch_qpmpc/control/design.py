@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from torch_qpmpc.checks import check_choice, check_number, check_whole
-from torch_qpmpc.control.disturbance import Disturbances, Steady, choose
+from torch_qpmpc.checks import check_choice, check_number
+from torch_qpmpc.control.disturbance import Disturbances, Steady
 from torch_qpmpc.control.state_space import Array, StateSpace, read_vector
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.layout import read_blocks
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
 
 REFERENCES = ("held", "preview")
@@ -35,6 +34,9 @@ class Design:
         disturbances: B_w, C_w and names.
         gamma: the discount.
         blocks: numbers of stages that share one input.
+
+    Raises:
+        QPError: a number is invalid, or nothing has a cost.
     """
 
     plant: StateSpace
@@ -50,8 +52,19 @@ class Design:
     references: str
     disturbances: Disturbances
     gamma: float
-    steady: Steady
     blocks: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_choice("references", self.references, REFERENCES)
+        check_number("gamma", self.gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
+        if not (self.Q.any() or self.linear):
+            y, u = self.plant.outputs[0], self.plant.inputs[0]
+            example = f"Q={{{y!r}: 1.0}}, dR={{{u!r}: 0.1}}"
+            remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
+            raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
+        if (self.y_slack < 0).any():
+            got = f"{self.y_slack.tolist()}"
+            raise QPError.expected("y_slack", got, "prices >= 0, or inf for hard rows")
 
     def __str__(self) -> str:
         plant, weights = self.plant, {"Q": self.Q, "R": self.R, "dR": self.dR}
@@ -72,6 +85,11 @@ class Design:
         """The cost of a stage that is half of the bounds' distance off the target."""
         y, u = half_range(self.y_bounds), half_range(self.u_bounds)
         return float(y @ self.Q @ y + u @ (self.R + self.dR) @ u)
+
+    @cached_property
+    def steady(self) -> Steady:
+        """The steady states with the disturbances."""
+        return Steady.of(self.plant, self.disturbances, self.Q, self.R)
 
     @cached_property
     def bounded(self) -> tuple[Array, Array]:
@@ -124,62 +142,10 @@ def middle(bounds: tuple[Array, Array]) -> Array:
     return np.where(np.isfinite(bounds).all(0), bounds, 0.0).mean(0)
 
 
-def read_design(
-    plant: StateSpace,
-    horizon: Any,
-    *,
-    Q: Any,
-    R: Any,
-    dR: Any,
-    y_bounds: Any,
-    u_bounds: Any,
-    du_bounds: Any,
-    y_slack: Any,
-    linear: Mapping[str, str | float] | None,
-    references: str,
-    disturbances: Any,
-    gamma: float,
-    blocks: Sequence[int],
-) -> Design:
-    """Return the design of the arguments of `LinearMPC`.
-
-    Raises:
-        QPError: an argument is invalid, or nothing has a cost.
-    """
-    check_whole("horizon", horizon, 1)
-    check_choice("references", references, REFERENCES)
-    check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
-    y, u = plant.outputs, plant.inputs
-    Q, R, dR = _weight("Q", Q, y), _weight("R", R, u), _weight("dR", dR, u)
-    prices = _prices(linear, plant)
-    if not (Q.any() or prices):
-        example = f"Q={{{y[0]!r}: 1.0}}, dR={{{u[0]!r}: 0.1}}"
-        remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
-        raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
-    slack = read_vector("y_slack", y_slack, y, 0.0)
-    if (slack < 0).any():
-        raise QPError.expected("y_slack", f"{slack.tolist()}", "prices >= 0, or inf for hard rows")
-    estimated = choose(plant, disturbances)
-    return Design(
-        plant,
-        int(horizon),
-        Q,
-        R,
-        dR,
-        _bounds("y_bounds", y_bounds, y),
-        _bounds("u_bounds", u_bounds, u),
-        _moves(du_bounds, u),
-        slack,
-        prices,
-        references,
-        estimated,
-        gamma,
-        Steady.of(plant, estimated, Q, R),
-        read_blocks(blocks, horizon),
-    )
-
-
-def _prices(linear: Mapping[str, str | float] | None, plant: StateSpace) -> dict[str, str | float]:
+def read_prices(
+    linear: Mapping[str, str | float] | None, plant: StateSpace
+) -> dict[str, str | float]:
+    """Read prices of inputs, as numbers or known signals by input."""
     want = f"a mapping from inputs {plant.inputs} to numbers or known signals {plant.known}"
     if linear is not None and not isinstance(linear, Mapping):
         raise QPError.expected("linear", repr(linear), want)
@@ -194,7 +160,7 @@ def _prices(linear: Mapping[str, str | float] | None, plant: StateSpace) -> dict
     return dict(linear or {})
 
 
-def _weight(name: str, value: Any, names: Sequence[str]) -> Array:
+def read_weight(name: str, value: Any, names: Sequence[str]) -> Array:
     """Read a weight by name, as a number, a vector or a matrix, as a matrix."""
     if value is None:
         return np.zeros((len(names), len(names)))
@@ -209,9 +175,9 @@ def _weight(name: str, value: Any, names: Sequence[str]) -> Array:
     return weight
 
 
-def _moves(du_bounds: Any, names: Sequence[str]) -> tuple[Array, Array]:
+def read_moves(du_bounds: Any, names: Sequence[str]) -> tuple[Array, Array]:
     """Read bounds of moves, which must allow to hold an input."""
-    lower, upper = _bounds("du_bounds", du_bounds, names)
+    lower, upper = read_bounds("du_bounds", du_bounds, names)
     for name, *pair in zip(names, lower, upper, strict=True):
         if not pair[0] <= 0 <= pair[1]:
             got, want = f"({pair[0]:g}, {pair[1]:g}) for {name}", "bounds with zero between them"
@@ -219,7 +185,7 @@ def _moves(du_bounds: Any, names: Sequence[str]) -> tuple[Array, Array]:
     return lower, upper
 
 
-def _bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Array]:
+def read_bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Array]:
     """Read bounds as a mapping from names to pairs, or as one pair of numbers or vectors."""
     if value is None:
         value = {}

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design, half_range
-from torch_qpmpc.control.disturbance import Steady, choose
+from torch_qpmpc.control.disturbance import choose
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import lowered
@@ -237,8 +237,7 @@ def _with_model(law: Law, model: Identified) -> Law:
     old = law.design
     plant = _state_space(model, old)
     w = choose(plant, "auto" if old.disturbances.names else None)
-    steady = Steady.of(plant, w, old.Q, old.R)
-    design = replace(old, plant=plant, disturbances=w, steady=steady)
+    design = replace(old, plant=plant, disturbances=w)
     mpc = LinearMPC(lowered(design), **{name: law.mpc.arguments[name] for name in KEYWORDS})
     drift = law.drift if w.names == old.disturbances.names else None
     return Law.of(mpc, law.noise, drift, law.window)

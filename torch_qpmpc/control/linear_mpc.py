@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.control.design import Design, read_design
-from torch_qpmpc.control.disturbance import Disturbances, Steady
-from torch_qpmpc.control.lowering import LinearScheme, lowered
-from torch_qpmpc.control.state_space import StateSpace, read_model
-from torch_qpmpc.control.target import free_mpc, target_mpc
+from torch_qpmpc.checks import check_whole
+from torch_qpmpc.control.design import Design, read_bounds, read_moves, read_prices, read_weight
+from torch_qpmpc.control.disturbance import Disturbances, choose
+from torch_qpmpc.control.lowering import LinearScheme, free_mpc, lowered, target_mpc
+from torch_qpmpc.control.state_space import StateSpace, read_model, read_vector
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
+from torch_qpmpc.mpc.layout import read_blocks
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import KEYWORDS, check_keywords
 from torch_qpmpc.mpc.state import KIND, check_own, stored
@@ -74,7 +75,7 @@ class LinearMPC(QPMPC):
 
     Attributes:
         targets: the QPMPC whose policy maps [r; w; d] to the target; see
-            `torch_qpmpc.control.target`.
+            `torch_qpmpc.control.lowering`.
         free: the one of the inputs that the target leaves free, None if there are none.
 
     Raises:
@@ -125,21 +126,23 @@ class LinearMPC(QPMPC):
             return
         check_keywords("LinearMPC", options, [*KEYWORDS, *signature(LinearMPC).parameters])
         prices = linear.values() if isinstance(linear, Mapping) else ()
-        design = read_design(
-            read_model(model, E, dt, inputs, outputs, known, prices),
-            horizon,
-            Q=Q,
-            R=R,
-            dR=dR,
-            y_bounds=y_bounds,
-            u_bounds=u_bounds,
-            du_bounds=du_bounds,
-            y_slack=y_slack,
-            linear=linear,
-            references=references,
-            disturbances=disturbances,
-            gamma=gamma,
-            blocks=blocks,
+        plant = read_model(model, E, dt, inputs, outputs, known, prices)
+        check_whole("horizon", horizon, 1)
+        design = Design(
+            plant,
+            int(horizon),  # pyright: ignore[reportArgumentType] - a number
+            read_weight("Q", Q, plant.outputs),
+            read_weight("R", R, plant.inputs),
+            read_weight("dR", dR, plant.inputs),
+            read_bounds("y_bounds", y_bounds, plant.outputs),
+            read_bounds("u_bounds", u_bounds, plant.inputs),
+            read_moves(du_bounds, plant.inputs),
+            read_vector("y_slack", y_slack, plant.outputs, 0.0),
+            read_prices(linear, plant),
+            references,
+            choose(plant, disturbances),
+            gamma,
+            read_blocks(blocks, int(horizon)),  # pyright: ignore[reportArgumentType]
         )
         defaults = {"structure": "tied", "learn": (), "solver": "daqp"}
         super().__init__(lowered(design), **{**defaults, **options})
@@ -199,7 +202,7 @@ class LinearMPC(QPMPC):
             QPError: a part has a parametrization that is not QPMPC's own.
         """
         check_own("save", self)
-        return {**stored(self), "design": stored_design(self.design)}
+        return {**stored(self), "design": packed(self.design)}
 
     @classmethod
     def of_stored(cls, content: Mapping[str, Any]) -> LinearMPC:
@@ -232,7 +235,7 @@ class LinearMPC(QPMPC):
         return self.steady_state(v, s)
 
     def steady_state(self, v: Tensor, s: Tensor) -> Target:
-        """Return the steady state of ``v`` and ``s = [r; w; d]``; `Steady` has its maps."""
+        """Return the steady state of ``v`` and ``s = [r; w; d]``, by the maps of ``steady``."""
         steady = self.design.steady
         loads = torch.cat((s[..., len(steady.Q) :], s.new_ones(*s.shape[:-1], 1)), -1)
         pairs = ((steady.X, steady.x), (steady.U, steady.u), (steady.Y, steady.y))
@@ -301,20 +304,12 @@ def _shifted(place: slice, by: int) -> slice:
     return slice(place.start + by, place.stop + by)
 
 
-def stored_design(design: Design) -> dict[str, Any]:
-    """Return a design without the steady states, which follow from the rest."""
-    content = packed(design)
-    del content["steady"]
-    return content
-
-
 def read_stored(content: Mapping[str, Any]) -> Design:
-    """Return the design that `stored_design` made ``content`` of."""
+    """Return the design that ``content`` was `packed` of."""
     parts = unpacked(content)
     parts["plant"] = StateSpace(**parts["plant"])
     parts["disturbances"] = Disturbances(**parts["disturbances"])
-    of = (parts[name] for name in ("plant", "disturbances", "Q", "R"))
-    return Design(**parts, steady=Steady.of(*of))
+    return Design(**parts)
 
 
 def packed(value: Any) -> Any:

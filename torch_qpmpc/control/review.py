@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import html
 from collections.abc import Mapping
-from itertools import product
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -14,7 +18,6 @@ from torch_qpmpc.checks import check_kind
 from torch_qpmpc.control.design import Design, half_range, middle
 from torch_qpmpc.control.disturbance import unseen_modes
 from torch_qpmpc.control.exporting import WEIGHT, own_bytes, undetermined
-from torch_qpmpc.control.findings import Finding, Review
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
@@ -30,6 +33,8 @@ from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solve import solve_qp
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from torch_qpmpc.proofs import Answer
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
@@ -38,9 +43,8 @@ MARGIN, CONDITION, SPREAD, HIDDEN = 0.3, 1e8, 1e4, 1e-3
 IDLE, NOTED = 1e-6, 1e-2
 #: Offsets relative to half the distance of an output's bounds.
 OFFSET = 1e-6
-#: The most times that a set-point is replaced by its nearest one, which soft bounds may move again,
-#: and the most outputs whose roundings are all tried.
-SETTLES, ROUNDED = 100, 6
+#: The most times that a set-point is replaced by its nearest one, which soft bounds may move again.
+SETTLES = 100
 #: A response below this share of those soon after, with inputs of half their range, is noise.
 SHOWS = 0.03
 #: The most powers of ten that the filter's noise is raised by, for a margin, and the most times
@@ -48,6 +52,91 @@ SHOWS = 0.03
 SLOWEST, PATIENCE = 8, 10
 #: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
 LARGEST = 2.0
+
+
+PAGE = """<!doctype html>
+<meta charset="utf-8">
+<title>Review of a controller</title>
+<style>
+body {{ font-family: sans-serif; max-width: 60em; margin: 2em auto }}
+td, th {{ text-align: left; vertical-align: top; padding: 0.2em 1em 0.2em 0 }}
+img {{ max-width: 100% }}
+</style>
+<h1>Review of a controller</h1>
+<table>
+<tr><th>Finding</th><th></th><th>Numbers</th><th>Remedy</th></tr>
+{table}
+</table>
+{images}
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One question to a design.
+
+    Attributes:
+        name: the subject, such as ``"stability"``.
+        ok: False if it is a fault.
+        numbers: the answer, by name.
+        remedy: what mends the fault; empty if it is none.
+    """
+
+    name: str
+    ok: bool
+    numbers: Mapping[str, Any]
+    remedy: str = ""
+
+    @property
+    def text(self) -> str:
+        """The numbers in words."""
+        return "; ".join(f"{key} {_number(x)}" for key, x in self.numbers.items())
+
+
+@dataclass(frozen=True)
+class Review:
+    """The findings about a controller; ``print`` shows them.
+
+    Attributes:
+        findings: all of them; those that need a definite cost or a stable loop only with one.
+    """
+
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def faults(self) -> list[Finding]:
+        """The findings that are not ok."""
+        return [finding for finding in self.findings if not finding.ok]
+
+    def __getitem__(self, name: str) -> Finding:
+        return {finding.name: finding for finding in self.findings}[name]
+
+    def __str__(self) -> str:
+        lines = [f"{len(self.faults)} faults in {len(self.findings)} findings"]
+        for finding in self.findings:
+            lines.append(f"{'ok   ' if finding.ok else 'FAULT'} {finding.name}: {finding.text}")
+            lines += [f"      {finding.remedy}"] * (not finding.ok)
+        return "\n".join(lines)
+
+    def to_html(self, path: str | Path, *figures: Figure) -> None:
+        """Write a page with a table of the findings and ``figures`` below it, such as a `Run`'s.
+
+        It is one file, and loads nothing from elsewhere.
+
+        Raises:
+            OSError: writing failed.
+        """
+        rows = [(x.name, "ok" if x.ok else "fault", x.text, x.remedy) for x in self.findings]
+        table = "\n".join(
+            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
+            for row in rows
+        )
+        images = []
+        for figure in figures:
+            figure.savefig(buffer := BytesIO(), format="png")
+            data = base64.b64encode(buffer.getvalue()).decode()
+            images.append(f'<img alt="" src="data:image/png;base64,{data}">')
+        Path(path).write_text(PAGE.format(table=table, images="\n".join(images)), encoding="utf-8")
 
 
 def review(
@@ -291,7 +380,7 @@ def _set_points(setting: Setting, r_last: Array, assumed: bool) -> Finding:
 def _settable(setting: Setting, r: Array) -> dict[int, str]:
     """Return the entries of r that must change for it to be in reach, as they may be typed.
 
-    They are rounded to either side of the steady outputs, to four digits or as many as it takes.
+    They have four digits, or as many as it takes.
     """
     design, y = setting.mpc.design, setting.target(r).y.numpy()
     wanted = np.where(setting.off(y, r), np.clip(y, *design.y_bounds), r)
@@ -301,24 +390,14 @@ def _settable(setting: Setting, r: Array) -> dict[int, str]:
             break
         wanted = np.where(off, y, wanted)
     changed = np.flatnonzero(setting.off(wanted, r))
-    sides = (np.floor, np.ceil) if len(changed) <= ROUNDED else (np.round,)
-    size = np.maximum(np.abs(wanted), OFFSET * half_range(design.y_bounds))
+    words: dict[int, str] = {}
     for digits in range(4, 13):
-        unit = 10.0 ** (np.floor(np.log10(size)) + 1 - digits)
-        tries = [
-            {
-                int(i): f"{rounded(wanted[i] / unit[i]) * unit[i] + 0.0:.{digits}g}"
-                for i, rounded in zip(changed, side, strict=True)
-            }
-            for side in product(sides, repeat=len(changed))
-        ]
-        values = np.tile(r, (len(tries), 1))
-        values[:, changed] = [[float(word) for word in tried.values()] for tried in tries]
-        distance = (np.abs(values - wanted) / unit).sum(-1)
-        distance[setting.off(setting.target(values).y.numpy(), values).any(-1)] = np.inf
-        if np.isfinite(distance).any():
-            return tries[int(distance.argmin())]
-    return {int(i): f"{wanted[i]:.10g}" for i in changed}
+        words = {int(i): f"{wanted[i]:.{digits}g}" for i in changed}
+        typed = r.copy()
+        typed[changed] = [*map(float, words.values())]
+        if not setting.off(setting.target(typed).y.numpy(), typed).any():
+            break
+    return words
 
 
 def _limits(design: Design, target: Target) -> str:
@@ -455,3 +534,9 @@ def _proof(name: str, answer: Answer, digest: str) -> Finding:
     numbers |= {f"d_{k}": d for k, d in enumerate(answer.disturbances) if len(d)}
     remedy = "Claim it of a smaller set, or of smaller disturbances, or tighten the bounds."
     return Finding(name, False, numbers, remedy)
+
+
+def _number(x: Any) -> str:
+    if isinstance(x, np.ndarray):
+        return "[" + ", ".join(f"{y:.4g}" for y in x.ravel()) + "]"
+    return x if isinstance(x, str) else f"{x:.4g}"

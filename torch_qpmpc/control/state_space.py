@@ -134,7 +134,8 @@ def read_model(
         if inputs and E is None and known:
             if missing := sorted({*known} - {*inputs}):
                 raise QPError.expected("known", repr(missing[0]), f"inputs among {inputs}")
-            A, B, E, inputs = A, *_columns(B, inputs, known)
+            names, inputs = [*inputs], [name for name in inputs if name not in known]
+            B, E = (B[:, [names.index(x) for x in part]] for part in (inputs, known))
     E = np.zeros((len(A), len(known))) if E is None else _matrix("E", E)
     if E.shape[1] > len(known) and not known:
         known = [f"d{i + 1}" for i in range(E.shape[1])]
@@ -206,13 +207,6 @@ def _matrix(name: str, value: Any) -> Array:
     if matrix.ndim != 2:
         raise QPError.expected(name, f"shape {matrix.shape}", "a matrix")
     return matrix
-
-
-def _columns(B: Array, inputs: Sequence[str], known: Sequence[str]) -> tuple[Array, Array, list]:
-    """Split the inputs of a system into those that act and those that are known."""
-    acting = [name for name in inputs if name not in known]
-    order = {name: i for i, name in enumerate(inputs)}
-    return B[:, [order[x] for x in acting]], B[:, [order[x] for x in known]], acting
 
 
 def _labels(system: Any, name: str, size: int) -> list[str] | None:
