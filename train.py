@@ -4,7 +4,7 @@
     python train.py task=gros_zanon solver=daqp         another plant, in one long episode
     python train.py -m constraint=fixed,free seed=1,2   a sweep
     python train.py task=gymnasium task.id=Pendulum-v1 start=data   from a log, without a model
-    python train.py resume=runs/point_mass/..           resume a stopped run
+    python train.py resume=FOLDER                       resume a stopped run
     tensorboard --logdir runs                           watch the runs
 
 configs/ holds every key. The run's folder gets config.yaml, metrics.csv, TensorBoard events,

@@ -58,6 +58,7 @@ def test_the_sdist_trains_and_tests(built):
     files = {name.removeprefix(f"{top}/") for name in files}
     alone = {"train.py", "pyproject.toml", "README.md", "LICENSE", "CITATION.cff"}
     alone |= {"CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "PKG-INFO", ".gitignore"}
+    alone |= {name for name in sources("docs/examples") if name.endswith(".py")}
     assert files == alone | sources("torch_qpmpc") | sources("configs") | sources("tests")
     assert built[0].stat().st_size < 1e6
 

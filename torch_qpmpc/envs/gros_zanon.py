@@ -71,7 +71,7 @@ class GrosZanonLTI(LinearSystem):
         return self.A.new_tensor([[0, 0.15]]).repeat(count, 1)
 
     def start_box(self) -> tuple[Tensor, Tensor]:
-        """Return s_0, twice."""
+        """Return the box of starts, which is the point s_0."""
         s = self.starts(torch.Generator(), 1)[0]
         return s, s
 

@@ -12,7 +12,7 @@ GROWTH = 1e6
 
 
 def without_blow_ups(log: TensorDictBase) -> tuple[TensorDictBase, int]:
-    """Mask the steps of each episode from that on at which it blows up.
+    """Mask each episode from its first diverging step on.
 
     An episode blows up where an observation or a reward is not finite, or an observation is larger
     than 1e6 times the largest of the log's first transitions.

@@ -105,7 +105,7 @@ def fit_rewards(
 def fit_most(
     log: Any, layout: Layout, fitted: RewardCost, diagonal: bool = False
 ) -> RewardCost | None:
-    """Fit the cost that is used, without the steps that it does not explain.
+    """Refit the cost robustly, with outlying steps left out.
 
     Fits in turn find these steps: jumps of a set-point that the observation shows too late, say.
 

@@ -25,7 +25,8 @@ NOTHING = (
     "No start is shown to cost less than zero action, which is the start. Perhaps no scheme "
     "of this log controls the plant: pass a log about the states where the controller is to work "
     "(start.file), one of short episodes if the plant is unstable (task.episode_steps=20), the "
-    "plant's own cost (task.stage_weight), or learn a network: 'Actor-critic' in the guides."
+    "plant's own cost (task.stage_weight), or a theta from a network: 'Scheduled and nonlinear "
+    "plants' in the guides."
 )
 
 
