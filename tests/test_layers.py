@@ -67,9 +67,9 @@ LAYERS = {
 BUDGET = {
     ".": 433,
     "analysis": 1203,
-    "control": 3799,
+    "control": 3711,
     "envs": 1525,
-    "experiment": 4000,
+    "experiment": 4001,
     "export": 1412,
     "learning": 2473,
     "mpc": 5104,
