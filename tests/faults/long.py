@@ -9,8 +9,8 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,17 +25,22 @@ SETTINGS = ("optimizer=adam", "solver=daqp", "figures=false")
 class Watch:
     """A progress bar that records time and memory at each hundredth of the updates."""
 
-    def __init__(self, updates: Iterable[int], total: int, **_: object) -> None:
-        self.updates, self.every = updates, total // 100
+    def __init__(self, total: int, **_: object) -> None:
+        self.every, self.done = total // 100, 0
         self.seconds: list[float] = []
         self.memory: list[float] = []
 
-    def __iter__(self) -> Iterator[int]:
-        for update in self.updates:
-            if update % self.every == 1:
-                self.note()
-            yield update
+    def __enter__(self) -> Watch:
         self.note()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stay as it is."""
+
+    def update(self) -> None:
+        self.done += 1
+        if self.done % self.every == 0:
+            self.note()
 
     def note(self) -> None:
         self.seconds.append(time.process_time())
@@ -63,8 +68,8 @@ def main(arguments: list[str] | None = None) -> None:
     sizes = (f"updates={options.updates}", f"eval_interval={options.updates // 4}")
     cfg, watches = make_config(*SETTINGS, *sizes, *options.settings), []
 
-    def watch(*given: Iterable[int], **named: int) -> Watch:
-        watches.append(Watch(*given, total=named["total"]))
+    def watch(**options: Any) -> Watch:
+        watches.append(Watch(**options))
         return watches[-1]
 
     train.tqdm = watch  # pyright: ignore[reportAttributeAccessIssue] -- what is used of it is there

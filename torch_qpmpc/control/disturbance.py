@@ -97,7 +97,7 @@ def _placed(plant: StateSpace, wanted: Mapping[str, str]) -> Disturbances:
 
 
 def check_observable(plant: StateSpace) -> None:
-    """Raise `QPError` if a mode of the model that does not decay leaves no trace in the outputs."""
+    """Raise `QPError` unless (A, C) is detectable."""
     for eigenvalue, mode in unseen_modes(plant.A, plant.C):
         state = int(np.abs(mode).argmax())
         remedy = "Measure a signal that shows it, or remove it from the model."
@@ -155,7 +155,7 @@ def _independent(matrix: Array) -> list[int]:
 
 
 def _hidden(plant: StateSpace, placed: Disturbances) -> str | None:
-    """Return the name of a disturbance that cannot be told from a mode at one, if there is one."""
+    """Return the name of a disturbance that cannot be told from an integrator, if any."""
     n = len(plant.A)
     shown = np.hstack((plant.C, placed.C))
     direction = null_direction(np.hstack((plant.A - np.eye(n), placed.B)), shown)

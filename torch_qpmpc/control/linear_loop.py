@@ -90,7 +90,7 @@ class LinearLoop:
 
 
 def _gains(mpc: LinearMPC, plan: Tables, target: Tables) -> tuple[Array, Array, Array]:
-    """Return the factors of the estimate e, of u_last and of r in the input without bounds."""
+    """Return the gains of the unconstrained law on the estimate e, u_last and r."""
     design = mpc.design
     n, m, n_y, n_d = design.plant.sizes
     n_w = len(design.disturbances.names)

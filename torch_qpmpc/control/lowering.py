@@ -138,7 +138,7 @@ def riccati(design: Design) -> Array | None:
 
 
 def _costless(design: Design) -> bool:
-    """Return True if a signal that neither grows nor decays has no cost.
+    """Return True if a mode on the unit circle is not observable in the cost.
 
     Then rounding alone decides what a solver of the Riccati equation returns.
     """

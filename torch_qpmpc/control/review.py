@@ -484,7 +484,7 @@ def _margin(loop: LinearLoop, law: Law, plan: Tables, target: Tables) -> Finding
 
 
 def _settling(loop: LinearLoop) -> float:
-    """Return the steps in which the slowest mode falls by a factor e; inf if it is unstable."""
+    """Return the loop's dominant time constant in steps; inf if it is unstable."""
     return -1 / np.log(max(loop.radius, 1e-9)) if loop.radius < 1 else np.inf
 
 
