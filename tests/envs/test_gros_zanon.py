@@ -108,6 +108,7 @@ def test_environments_are_of_5000_steps_with_unbounded_observations():
     far["observation"] += 1e6
     assert env.observation_spec.is_in(far.select("observation", "noise", "step_count"))
     assert isinstance(one.unwrapped, GrosZanonLTIGymEnv)
+    assert isinstance(one.unwrapped.physics, GrosZanonLTI)
     assert one.unwrapped.physics.w == 100
 
 

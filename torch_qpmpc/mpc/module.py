@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -196,7 +196,7 @@ class QPMPC(nn.Module):
     @classmethod
     def of(
         cls, n_x: int, n_u: int, horizon: int, past: int = 1, n_d: int = 0, **options: Any
-    ) -> QPMPC:
+    ) -> Self:
         """Return a QPMPC of these sizes, at random where no model or stage cost is passed.
 
         A random start is one to learn from: a `UserWarning` says so when the policy first acts
@@ -213,7 +213,7 @@ class QPMPC(nn.Module):
         return cls(Scheme.of(n_x, n_u, horizon, past, n_d, **options), **own)
 
     @classmethod
-    def from_model(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
+    def from_model(cls, A: Any, B: Any, horizon: int, **options: Any) -> Self:
         """Return a QPMPC whose C starts as the banded C_0 of the model x+ = A x + B u (eq:cband).
 
         Args:
@@ -246,7 +246,7 @@ class QPMPC(nn.Module):
         ridge: float | None = None,
         held: Sequence[int] = (),
         **options: Any,
-    ) -> QPMPC:
+    ) -> Self:
         """Return a QPMPC whose C and b start from least squares on logged trajectories.
 
         C_0 is the banded matrix of an ARX model; `identify` returns it with its prediction errors.
@@ -297,7 +297,7 @@ class QPMPC(nn.Module):
         return cls.of(**arguments)
 
     @classmethod
-    def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> QPMPC:
+    def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> Self:
         """Return a linear MPC scheme with all parts learned (eq:v1, eq:q1).
 
         It is `from_model` with other defaults: ``structure="tied"``, dense weights, discounted
