@@ -27,7 +27,7 @@ def test_without_noise_all_starts_predict_the_plant(structure):
     mpc = QPMPC.from_data(arx_log(), N, structure=structure, **PAST, **COST)
     assert (mpc.n_x, mpc.n_u, mpc.horizon, mpc.past, mpc.n_d) == (2, 1, N, 2, 1)
     assert mpc.structure == structure
-    z = windows(as_log(arx_log(seed=1), n_d=1).trajectories[0], mpc.layout)[:5]
+    z = windows(as_log(arx_log(seed=1), n_d=1).trajectories, mpc.layout).z[:5]
     plan = mpc.solve(z[:, : mpc.n_p], z[:, mpc.n_p : mpc.n_p + 1]).z
     true = banded_matrix(A, B, N, E)
     offset = -torch.tensor([0.1, -0.3]).double().repeat(N)
@@ -61,7 +61,8 @@ def test_errors_are_those_of_data_that_the_fit_has_not_seen():
     found = qm.identify(log, N, **PAST)
     assert found.errors.shape[1:] == (N, 2)
     fresh = as_log(arx_log(seed=5, noise=0.2, episodes=4, steps=400), n_d=1).trajectories
-    Z = torch.cat([windows(log, found.options.layout)[: -N + 1] for log in fresh])
+    Z, ahead = windows(fresh, found.options.layout)
+    Z = Z[ahead >= N]
     error = Z[:, outputs_in(found.options.layout)] - predict(
         found.constraints, Z, found.options.layout
     )
@@ -93,7 +94,7 @@ def test_a_held_output_keeps_its_value_and_others_depend_on_it(structure):
     log = arx_log(noise=0.2)
     held = qm.identify(log, N, structure=structure, held=[1], **PAST)
     sizes = held.options.layout
-    z = windows(as_log(log, n_d=1).trajectories[0], sizes)[:5]
+    z = windows(as_log(log, n_d=1).trajectories, sizes).z[:5]
     planned = predict(held.constraints, z, sizes)
     assert_close(planned[..., 1], z[:, sizes.n_p - 1 : sizes.n_p].expand(-1, N))
     assert held.model.A[0, 1].abs() > 0.1

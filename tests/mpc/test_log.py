@@ -60,9 +60,6 @@ def test_all_forms_are_the_same_log(tmp_path):
     tensors = {name: torch.tensor(array) for name, array in arrays.items()}
     for data in (file, str(file), arrays, tensors, dated):
         assert same(qm.read_log(data, **NAMES), expected)
-    assert qm.read_log(dated, **NAMES).dt == 900
-    dates = frame.assign(t=dated.index.astype(str))
-    assert qm.read_log(dates, **NAMES, time="t").dt == 900
     shorter = {"T": arrays["T"], "q": arrays["q"][:-1], "T_out": arrays["T_out"][:-1]}
     assert same(qm.read_log(shorter, **NAMES), expected)
 
@@ -96,6 +93,120 @@ def test_units_in_headers_are_kept():
     assert "RMSE of T [degC]" in str(qm.identify(log, 4))
 
 
+TABLE: Any = room()[["T", "q", "T_out"]]
+LINES = TABLE.to_csv(index=False).splitlines()
+HEADER, ROWS = LINES[0], LINES[1:]
+TWICE = "column: got 'T', which is there twice, expected one of T, q, T_out"
+
+
+@pytest.mark.parametrize(
+    ("lines", "steps"),
+    [
+        ([HEADER, *(f"{row}," for row in ROWS)], [59]),
+        ([HEADER, *(f"{row},,," for row in ROWS)], "Length of header"),
+        ([f"{HEADER},", *(f"{row}," for row in ROWS)], [59]),
+        (["\ufeff", HEADER.replace(",", " , "), "", *ROWS], [59]),
+        ([HEADER, *ROWS[:20], HEADER, *ROWS[20:]], [19, 39]),
+        ([HEADER.replace("q", "q1"), *ROWS[:20], HEADER.replace("q", "q1"), *ROWS[20:]], [19, 39]),
+        ([HEADER, *(f"{row},1" for row in ROWS)], "Length of header"),
+        ([HEADER, ROWS[0], *(f"{row},1" for row in ROWS)], "Expected 3 fields in line 3, saw 4"),
+        ([f"{HEADER},T", *(f"{row},1" for row in ROWS)], TWICE),
+        ([], "which cannot be read"),
+    ],
+)
+def test_a_file_is_read_by_its_header(tmp_path, lines, steps):
+    """Without a delimiter too many, and without columns that move."""
+    (file := tmp_path / "room.csv").write_text("\n".join(lines), encoding="utf-8")
+    if isinstance(steps, str):
+        with pytest.raises(QPError, match=steps):
+            qm.read_log(file, **NAMES)
+        return
+    inputs = ["q1" if any("q1" in line for line in lines) else "q"]
+    log = qm.read_log(file, **{**NAMES, "inputs": inputs})
+    assert lengths(log) == steps
+    read = torch.cat([part.y for part in log.trajectories])[:, 0]
+    assert torch.allclose(read, torch.as_tensor(TABLE["T"].to_numpy()), rtol=1e-14)
+
+
+@pytest.mark.parametrize("names", [["T", "d"], ["d", "q1"], ["y", "u1"], ["known", "time"]])
+def test_a_signal_may_have_any_name(names):
+    rng = np.random.default_rng(0)
+    y, u = rng.normal(size=(30, 2)), rng.normal(size=30)
+    log = qm.read_log({names[0]: y[:, 0], names[1]: y[:, 1], "u": u, "t": u}, names, ["u"])
+    assert (log.outputs, log.inputs, log.known) == (tuple(names), ("u",), ())
+    assert qm.LinearMPC(qm.identify(log, 2, structure="tied"), 3, Q=1.0).horizon == 3
+    assert qm.read_log({"y": u, "u": u**2, "d": np.arange(30)}, time="d").known == ()
+
+
+# Times
+
+
+def clock(text: str | None = None, start: str = "2020-09-01", freq: str = "15min") -> Any:
+    times = pd.date_range(start, periods=60, freq=freq)
+    return times if text is None else times.strftime(text)
+
+
+STEPS = pd.to_timedelta(900 * np.arange(60), unit="s")
+PERIODS = pd.period_range("2020-09-01", periods=60, freq="15min")
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        *(clock(), clock().tz_localize("Europe/Berlin"), STEPS, PERIODS, 900 * np.arange(60)),
+        *(clock().astype(str), clock("%Y-%m-%dT%H:%MZ"), clock("%b %d, %Y %I:%M %p")),
+        clock().floor("h"),  # four rows an hour
+    ],
+    ids=lambda times: f"{type(times).__name__} {times[0]}",
+)
+@pytest.mark.parametrize("place", ["index", "column"])
+def test_times_are_read_from_a_column_or_the_index(times, place):
+    frame, number = room(), not hasattr(times, "freq") or isinstance(times[0], str)
+    frame = frame.assign(t=times)
+    if place == "index" and not number:
+        frame = frame.set_index("t")
+    frame = frame.iloc[np.r_[:20, 30:60]]
+    log = qm.read_log(frame, **NAMES, time="t" if number or place == "column" else None)
+    assert (lengths(log), log.dt) == ([19, 29], 900)
+
+
+FORMATS = ("%d/%m/%Y %H:%M", "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%m-%d-%Y %H:%M")
+
+
+@pytest.mark.parametrize("text", FORMATS)
+@pytest.mark.parametrize("start", ["2020-09-29 13:45", "2020-09-02", "2020-09-12 20:00"])
+@pytest.mark.parametrize("freq", ["15min", "h", "6h"])
+def test_dates_may_begin_with_the_day(text, start, freq):
+    """Where both readings are dates with other gaps, a warning says so."""
+    frame = room().assign(t=clock(text, start, freq))
+    dt = {"15min": 900, "h": 3600, "6h": 21600}[freq]
+    options: Any = {**NAMES, "time": "t"}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        log = qm.read_log(frame, **options)
+    assert (lengths(log), log.dt) == ([59], dt)
+    days = {(x.day, x.month) for x in clock(None, start, freq)}
+    said = [str(x.message) for x in caught]
+    ambiguous = len(days) > 1 and all(max(pair) <= 12 for pair in days)
+    ambiguous = bool(said) if "%y" in text else ambiguous  # pandas guesses row by row
+    first = text.startswith("%d")
+    assert [f"day_first={first}" in x for x in said] == [True] * ambiguous
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert qm.read_log(frame, **options, day_first=first).dt == dt
+
+
+def test_a_clock_of_whole_seconds_may_show_a_time_twice():
+    frame = room(100)
+    for dt in (0.5, 0.4, 0.25, 0.1):
+        frame["t"] = np.floor(dt * np.arange(100) + 0.01)
+        assert (lengths(log := qm.read_log(frame, **NAMES, time="t")), log.dt) == ([99], dt)
+    frame.loc[50:, "t"] += 2
+    assert lengths(qm.read_log(frame, **NAMES, time="t")) == [49, 49]
+    with pytest.raises(QPError, match=r"^time: got steps of 0, expected times that increase"):
+        qm.read_log(frame.assign(t=3.0), **NAMES, time="t")
+
+
 # Gaps, marks and missing numbers
 
 
@@ -110,7 +221,8 @@ def test_gaps_marks_and_missing_numbers_end_trajectories():
     frame.loc[59, "T"] = "n/a"
     log = qm.read_log(frame, **NAMES, time="t", episode="run")
     assert lengths(log) == [9, 9, 18, 10, 6]
-    assert log.notes == ("60 rows: 1 gap, 5 trajectories, 5.0% of rows dropped",)
+    assert log.notes[0] == "60 rows: 1 gap, 5 trajectories, 5.0% of rows dropped"
+    assert log.notes[1:] == ("T is no number in 1 row, as in 'n/a'",)
     assert_close(
         log.trajectories[1].y[:, 0], torch.as_tensor(np.array(frame["T"][10:20], dtype=float))
     )
@@ -142,6 +254,19 @@ def test_constant_and_collinear_columns_are_named():
         qm.identify(log, 4)
 
 
+@pytest.mark.parametrize(("number", "rows"), [(-9999.0, 3), (-999.25, 2), (1e31, 2), (9999.0, 0)])
+def test_numbers_that_mark_missing_ones_are_named(number, rows):
+    frame = room()
+    frame.loc[list(range(5, 5 + rows)), "q"] = number
+    frame.loc[9, "T_out"] = 1e4  # once: it may have been so
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        log = qm.read_log(frame, **NAMES)
+    said = [f"q is {number:.6g} in {rows} rows, far from all others, which may mark missing"]
+    assert [str(x.message)[: len(said[0]) + 13].split(", ", 1)[1] for x in caught] == said[:rows]
+    assert len(log.notes) == 1 + len(caught)
+
+
 def test_a_short_log_is_not_called_collinear():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -162,12 +287,38 @@ def test_a_short_log_is_not_called_collinear():
         (room(), {"time": "clock"}, "column: got 'clock', which is missing"),
         (room(), {"episode": "run"}, "column: got 'run', which is missing"),
         (room().assign(q="on"), {}, "column: got q, without a number"),
-        (room().assign(t="noon"), {"time": "t"}, r"time: got t \(.*\), expected numbers or dates"),
+        *(
+            (room().assign(q=[text, *map(str, range(59))]), {}, f"column: got q with '{text}' in 1")
+            for text in ("1,234.5", "2,5", "12.3 kW", "-4e", "2020-01-01")
+        ),
+        (
+            room().assign(t="noon"),
+            {"time": "t"},
+            "time: got t with 'noon', expected numbers or dates of one format",
+        ),
+        (
+            room().assign(t=["2020-09-01", *["13/09/2020"] * 59]),
+            {"time": "t"},
+            "time: got t with '2020-09-01', expected numbers or dates of one format",
+        ),
+        *(
+            (
+                room().assign(t=np.r_[np.arange(30), 30 + step * np.arange(30)]),
+                {"time": "t"},
+                f"time: got steps of {step} from row 30 on, and of 1 in the median, expected one",
+            )
+            for step in (1.45, 1.2, 0.1, 3)
+        ),
+        (
+            {"T": torch.ones(9).requires_grad_(), "q": np.arange(9)},
+            {},
+            r"T: got a tensor that requires grad, expected one without. Pass T.detach\(\)",
+        ),
         (room()[::-1], {"time": "t"}, "time: got steps of -0.25, expected times that increase"),
         (
             [room(), room(30).assign(t=0.5 * np.arange(30))],
             {"time": "t"},
-            "time: got steps of 0.5 in one part, and of 0.25 in the median, expected one sampling",
+            "time: got steps of 0.5 from row 60 on, and of 0.25 in the median, expected one samp",
         ),
         (room(1), {}, "data: got 1 rows, of which no two in a row are complete, expected consec"),
         ({"T": np.zeros((2, 3, 4))}, {}, r"T: got shape \(2, 3, 4\), expected shape \(T,\) or"),

@@ -40,7 +40,7 @@ def layout(past: int, horizon: int = N) -> Layout:
 
 def test_a_window_is_z():
     sizes, (log, *_) = layout(3), trajectories()
-    Z = windows(log, sizes)
+    Z, _ = windows([log], sizes)
     assert Z.shape == (40 - 2, sizes.n_z)
     k = 5  # the start at step 7
     pairs = torch.cat((log.y[:-1], log.u), dim=-1)
@@ -52,7 +52,7 @@ def test_a_window_is_z():
 
 def test_what_is_after_the_end_is_zero():
     sizes, (log, *_) = layout(3), trajectories()
-    z = windows(log, sizes)[-1]
+    z = windows([log], sizes).z[-1]
     assert torch.equal(z[outputs_in(sizes)[0]], log.y[-1])
     assert (z[outputs_in(sizes)[1:]] == 0).all()
     assert (z[1 : sizes.n_preview] == 0).all()
@@ -111,8 +111,8 @@ def test_a_free_predictor_without_a_ridge_is_the_plain_regression():
     sizes, data = layout(2, 4), trajectories(noise=0.3, steps=60)
     _, found = fit(data, Options(sizes, ridge=0.0))
     k = 2
-    starts = [windows(log, sizes) for log in data]
-    Z = torch.cat([z[: len(z) - k] for z in starts])
+    Z, ahead = windows(data, sizes)
+    Z = Z[ahead > k]
     actions = [sizes.n_p + 3 * j for j in range(k + 1)]
     read = [*range(k + 1), *range(sizes.n_preview, sizes.n_p), *actions]
     X = torch.cat((Z[:, read], torch.ones(len(Z), 1)), dim=-1)

@@ -17,7 +17,7 @@ from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.validation import as_tensor
+from torch_qpmpc.mpc.validation import as_tensor, ungraded
 from torch_qpmpc.qp.solution import QPSolution
 
 GRID_REMEDY = "Pass torch.linspace(lower, upper, n)."
@@ -33,7 +33,7 @@ def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
         SolverError: if a QP has no solution, and ``mpc.on_failure`` is ``"raise"``.
     """
     check_kind("mpc", mpc, QPMPC)
-    return _solve_with_gain(mpc, check_tensor("s", s, mpc.n_p))[1]
+    return _solve_with_gain(mpc, check_tensor("s", ungraded("s", s), mpc.n_p))[1]
 
 
 def window_model(A: Tensor, B: Tensor) -> tuple[Tensor, Tensor]:

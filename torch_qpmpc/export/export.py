@@ -29,6 +29,7 @@ from torch_qpmpc.export.writer import (
     table_bytes,
 )
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.validation import ungraded
 
 STORAGES = ("fast", "small")
 #: Largest share of the solvable states that may be uncertified.
@@ -295,7 +296,7 @@ class CompiledPolicy:
             QPError: the shape or type of s is wrong.
             SolverError: with ``on_failure="raise"``, a step is not solved.
         """
-        check_tensor("s", s, self._n_p)
+        check_tensor("s", ungraded("s", s), self._n_p)
         p = s.detach().double().cpu().numpy().reshape(-1, self._n_p)
         if len(p) != self._count:
             self._states, self._count = self._library.states(len(p)), len(p)
@@ -305,8 +306,7 @@ class CompiledPolicy:
             failures = [f"{codes[i]} {CODES[i]}" for i in range(1, len(CODES)) if codes[i]]
             total = f"{(self.last.codes != 0).sum()} of {len(p)}"
             raise SolverError(f"{total} steps have no certified solution: {', '.join(failures)}.")
-        u = torch.from_numpy(self.last.u).to(s)
-        return u.reshape(*s.shape[:-1], self._n_u)
+        return torch.from_numpy(self.last.u).to(s).reshape(*s.shape[:-1], self._n_u)
 
     def value(self, s: Tensor) -> Tensor:
         """Return V(s), a cost to go: s ``(*batch, n_p)`` to ``(*batch,)``; errors as in a call.

@@ -15,6 +15,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.validation import ungraded
 
 WINDOWS_REMEDY = "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}."
 
@@ -99,18 +100,17 @@ class DeviationPenalty(nn.Module):
         check_whole("past", past, 1)
         check_whole("n_d", n_d, 0)
         remedy = "Pass the C_0 of a QPMPC."
-        check_tensor("C_0", C_0, "N n_x", "n_z", batched=False, remedy=remedy)
+        check_tensor("C_0", ungraded("C_0", C_0), "N n_x", "n_z", batched=False, remedy=remedy)
         if not C_0.isfinite().all():
             raise QPError.expected("C_0", "NaN or inf", "finite entries", remedy)
         horizon = max(C_0.shape[0] // n_x, 1)
-        distance = band_distance(Layout(n_x, n_u, horizon, past, n_d))
+        distance = band_distance(Layout(n_x, n_u, horizon, past, n_d)).to(C_0)
         if distance.shape != C_0.shape:
             raise QPError.expected(
                 "C_0",
                 f"shape {tuple(C_0.shape)}",
                 f"shape {tuple(distance.shape)} for N = {horizon}",
             )
-        distance = distance.to(C_0)
         mask = torch.full_like(distance, c_2)
         mask[distance > 0], mask[distance < 0] = c_1, c_3
         self.register_buffer("C_0", C_0.detach().clone())

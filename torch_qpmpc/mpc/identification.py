@@ -16,14 +16,16 @@ from torch import Tensor
 from torch_qpmpc.checks import check_choice, check_flag, check_number, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import SIZES, Layout
-from torch_qpmpc.mpc.log import Log, Trajectory, as_log, folds
+from torch_qpmpc.mpc.log import Log, as_log, folds
 from torch_qpmpc.mpc.predictor import (
     ARX,
     Constraints,
     Options,
+    Windows,
     fit,
     prediction_errors,
     transitions,
+    windows,
 )
 from torch_qpmpc.mpc.validation import STRUCTURES, as_tensor
 
@@ -69,11 +71,11 @@ class Identified:
         layout, causal = self.options.layout, self.options.causal
         data, total = self.log.trajectories, self.log.steps
         count = max(min(PARTS, total // (2 * (layout.past + layout.horizon))), 2)
-        parts = folds(data, count)
+        parts = [windows(part, layout) for part in folds(data, count)]
         errors = [torch.full((1, layout.horizon, layout.n_x), torch.nan, dtype=torch.float64)]
         for i, part in enumerate(parts):
-            others = [log for j, other in enumerate(parts) if j != i for log in other]
-            if _usable(others, layout) > _needed(layout):
+            others = Windows(*map(torch.cat, zip(*parts[:i], *parts[i + 1 :], strict=True)))
+            if len(others.z) > _needed(layout):
                 coefficients = fit(others, self.options)[1]
                 errors.append(prediction_errors(part, coefficients, layout, causal))
         return torch.cat(errors)
@@ -112,9 +114,9 @@ class Identified:
         """
         layout = self.options.layout
         past, n_d = layout.past, layout.n_d
-        u, y = as_tensor("u", u), as_tensor("y", y)
+        u, y = (as_tensor(name, x, True) for name, x in (("u", u), ("y", y)))
         steps = len(u) if u.ndim else 0
-        d = u.new_zeros(steps, 0) if d is None else as_tensor("d", d)
+        d = u.new_zeros(steps, 0) if d is None else as_tensor("d", d, True)
         sizes = {"u": (steps, layout.n_u), "y": (past, layout.n_x), "d": (steps, n_d)}
         for (name, shape), value in zip(sizes.items(), (u, y, d), strict=True):
             if tuple(value.shape) != shape:
@@ -231,7 +233,7 @@ def check_excitation(log: Log, layout: Layout) -> None:
     """
     past, n_x, n_u, n_d = layout.past, layout.n_x, layout.n_u, layout.n_d
     needed, trajectories = _needed(layout), log.trajectories
-    usable = _usable(trajectories, layout)
+    usable = sum(max(log.steps - past + 1, 0) for log in trajectories)
     if usable <= needed:
         got = f"{log.steps} transitions in {len(trajectories)} trajectories"
         if past > 1:
@@ -268,8 +270,3 @@ def check_excitation(log: Log, layout: Layout) -> None:
 def _needed(layout: Layout) -> int:
     """Return the number of an ARX model's coefficients for an output, with the offset."""
     return layout.past * layout.n + layout.n_d + 1
-
-
-def _usable(trajectories: Sequence[Trajectory], layout: Layout) -> int:
-    """Return the number of transitions that have a window before them."""
-    return sum(max(log.steps - layout.past + 1, 0) for log in trajectories)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import re
 import sys
 import warnings
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.validation import ungraded
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,11 +27,15 @@ if TYPE_CHECKING:
 LARGEST = 1e100
 #: A column is constant, or a linear function of others, up to this share of its size.
 STILL = 1e-6
-#: A part with at least FEWEST steps has another sampling time if its median step differs from the
-#: whole log's by more than the share ONE_DT.
+#: FEWEST steps in a row have another sampling time if their mean differs from the log's by more
+#: than the share ONE_DT; a clock is coarse if more than that share of rows repeat a time.
 FEWEST, ONE_DT = 10, 0.1
-#: The column of a DataFrame's index of dates.
-DATES = "the index"
+#: The steps over which a coarse clock is read, if a trajectory has that many.
+SPANS = (60, 12, 1)
+#: A number that repeats is a mark, such as -9999, if it is this many ranges of all others away.
+FAR = 10
+#: The column of a DataFrame's index of times.
+TIME_INDEX = "the index"
 KINDS = "a CSV file, a DataFrame, a dict of arrays, a list of these, or a TensorDict of steps"
 #: A column's header with its unit, as in ``T [degC]``.
 HEADER = re.compile(r"\s*(.*?)\s*\[(.*)\]\s*")
@@ -53,7 +60,7 @@ class Trajectory(NamedTuple):
     @property
     def steps(self) -> int:
         """The number of steps, T."""
-        return len(self.u)
+        return self.u.shape[0]  # len takes ten times as long
 
     def between(self, start: int, stop: int) -> Trajectory:
         """Return the steps start, .., stop - 1."""
@@ -107,6 +114,7 @@ def read_log(
     known: Sequence[str] | None = None,
     time: str | None = None,
     episode: str | None = None,
+    day_first: bool | None = None,
 ) -> Log:
     """Read a log of a plant: row k has outputs y_k, the inputs u_k applied until k + 1, and d_k.
 
@@ -119,15 +127,19 @@ def read_log(
             in ``T [degC]``, is not part of the name. Arrays shorter by one row lack the last.
         outputs, inputs, known: the columns of y, u and, optionally, d; by default ``y``, ``u`` and
             ``d`` or ``y1``, ``y2``, .. and so on.
-        time: the column of times, numbers or dates; by default a DataFrame's index of dates.
+        time: the column of times: numbers, dates, periods or time differences; by default a
+            DataFrame's index of these. A clock may show one time for several rows.
         episode: the column of marks that differ between episodes.
+        day_first: True for dates such as 29/09/2020, False for 09/29/2020; by default the reading
+            with fewer gaps.
 
     Returns:
-        The log. A `UserWarning` names columns that are constant or a linear function of others.
+        The log. A `UserWarning` names columns that are constant, a linear function of others or
+        marked by a number such as -9999, and dates that may be read in two ways.
 
     Raises:
-        QPError: a column is missing, named twice or without numbers, or no two consecutive rows
-            are complete.
+        QPError: a column is missing, named twice, without numbers or with text such as ``1,5`` or
+            ``3 kW``; the sampling time changes; or no two consecutive rows are complete.
 
     Example:
         >>> import numpy as np, torch_qpmpc as qm
@@ -147,23 +159,24 @@ def read_log(
     frame, marks = _table(data)
     headers = [HEADER.fullmatch(str(header)) for header in frame.columns]
     units = {match[1]: match[2] for match in headers if match}
-    frame.columns = [HEADER.sub(r"\1", str(header)) for header in frame.columns]
-    y = _columns(frame, outputs, "y", "outputs")
-    u = _columns(frame, inputs, "u", "inputs")
-    d = _columns(frame, known, "d", "known")
+    frame.columns = [_bare(header) for header in frame.columns]
+    chosen = [[x] if isinstance(x, str) else x for x in (outputs, inputs, known)]
+    taken = {time, episode, *(name for names in chosen for name in names or ())}
+    kinds = zip(chosen, "yud", ("outputs", "inputs", "known"), strict=True)
+    y, u, d = (_columns(frame, *kind, taken) for kind in kinds)
     names = (*y, *u, *d)
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise QPError.expected("column", f"{twice[0]!r} twice", "each once")
-    values, times = _numbers(frame, names), _times(frame, time)
+    (values, words), times = _numbers(frame, names), _times(frame, time, day_first)
     if episode is not None:
-        _check_column(frame, episode)
-        marks = marks + (frame[episode] != frame[episode].shift()).cumsum().to_numpy()
+        column = _column(frame, episode)
+        marks = marks + (column != column.shift()).cumsum().to_numpy()
     trajectories, dt, note = _split(values, times, marks, (len(y), len(u), len(d)))
-    dependent = _dependent(values[(np.abs(values) <= LARGEST).all(1)], names)
-    if dependent:
-        warnings.warn(f"In this log, {'; '.join(dependent)}.", UserWarning, stacklevel=2)
+    usual = values[(np.abs(values) <= LARGEST).all(1)]
+    if noticed := (*_marked(usual, names), *_dependent(usual, names)):
+        warnings.warn(f"In this log, {'; '.join(noticed)}.", UserWarning, stacklevel=2)
     units = {name: x for name, x in units.items() if name in names}
-    return Log(trajectories, y, u, d, units, dt, (note, *dependent))
+    return Log(trajectories, y, u, d, units, dt, (note, *words, *noticed))
 
 
 def as_log(data: Any, n_x: int | None = None, n_d: int | None = None) -> Log:
@@ -204,11 +217,13 @@ def folds(trajectories: Sequence[Trajectory], count: int) -> list[list[Trajector
     parts: list[list[Trajectory]] = [[] for _ in range(count)]
     begin = 0
     for trajectory in trajectories:
+        steps = trajectory.steps
         for part, first, last in zip(parts, bounds[:-1], bounds[1:], strict=True):
-            start, stop = max(first - begin, 0), min(last - begin, trajectory.steps)
+            start, stop = max(first - begin, 0), min(last - begin, steps)
             if start < stop:
-                part.append(trajectory.between(start, stop))
-        begin += trajectory.steps
+                whole = stop - start == steps
+                part.append(trajectory if whole else trajectory.between(start, stop))
+        begin += steps
     return parts
 
 
@@ -223,23 +238,24 @@ def _split(
     fits = np.abs(values) <= LARGEST  # False for NaN
     whole, measured = fits.all(1), fits[:, :n_y].all(1)
     inside = marks[1:] == marks[:-1]
-    gaps, dt = _gaps(times, inside, marks[1:])
+    gaps, dt = _gaps(times, inside, marks)
     steps = whole[:-1] & measured[1:] & inside & ~gaps
     edges = np.flatnonzero(np.diff(np.concatenate(([0], steps, [0])))).reshape(-1, 2)
     if not len(edges):
         got = f"{len(values)} rows, of which no two in a row are complete"
         raise QPError.expected("data", got, "consecutive rows with a number in each column")
-    trajectories, used = [], np.zeros(len(values), dtype=bool)
-    for start, stop in edges.tolist():
-        y, u, d = torch.as_tensor(values[start : stop + 1]).split(sizes, dim=1)
-        trajectories.append(Trajectory(y, u[:-1], d[:-1]))
-        used[start : stop + 1] = True
-    n_gaps, count = int(gaps.sum()), len(edges)
-    note = (
-        f"{len(values)} rows: {n_gaps} gap{'s' * (n_gaps != 1)}, {count} "
-        f"trajector{'y' if count == 1 else 'ies'}, {1 - used.mean():.1%} of rows dropped"
-    )
+    used = np.zeros(len(values), dtype=bool)
+    used[:-1] |= steps
+    used[1:] |= steps
+    y, u, d = torch.as_tensor(values).split(sizes, dim=1)
+    trajectories = [Trajectory(y[i : k + 1], u[i:k], d[i:k]) for i, k in edges.tolist()]
+    counted = f"{_count(gaps.sum(), 'gap')}, {_count(len(edges), 'trajectory')}"
+    note = f"{_count(len(values), 'row')}: {counted}, {1 - used.mean():.1%} of rows dropped"
     return trajectories, dt, note
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun if number == 1 else f'{noun}s'.replace('ys', 'ies')}"
 
 
 def _table(data: Any) -> tuple[pd.DataFrame, np.ndarray]:
@@ -259,19 +275,18 @@ def _frame(part: Any) -> pd.DataFrame:
 
     if isinstance(part, str | Path):
         try:
-            with Path(part).open(encoding="utf-8-sig") as file:  # no address in the internet
-                return pd.read_csv(file, skipinitialspace=True)
-        except (OSError, ValueError) as error:
+            return _read_csv(Path(part))
+        except (OSError, ValueError, Warning) as error:
             got = f"{part}, which cannot be read ({error})"
             raise QPError.expected("data", got, "a CSV file") from error
     if isinstance(part, pd.DataFrame):
-        dated = isinstance(part.index, pd.DatetimeIndex)
-        return part.assign(**{DATES: part.index}) if dated else part.copy()
+        timed = isinstance(part.index, pd.DatetimeIndex | pd.TimedeltaIndex | pd.PeriodIndex)
+        return part.assign(**{TIME_INDEX: part.index}) if timed else part.copy()
     if not isinstance(part, Mapping):
         raise QPError.expected("data", type(part).__name__, KINDS)
     columns: dict[str, pd.Series] = {}
     for name, value in part.items():
-        array = np.asarray(value)
+        array = np.asarray(ungraded(str(name), value))
         if array.ndim not in (1, 2):
             raise QPError.expected(str(name), f"shape {array.shape}", "shape (T,) or (T, n)")
         for i, column in enumerate(array.reshape(len(array), -1).T):
@@ -285,17 +300,32 @@ def _frame(part: Any) -> pd.DataFrame:
     return pd.DataFrame(columns)  # which fills a missing last row with NaN
 
 
+def _read_csv(path: Path) -> pd.DataFrame:
+    """Read a CSV file by its header; an empty field beyond that is a delimiter too many."""
+    import pandas as pd
+
+    with path.open(encoding="utf-8-sig", newline="") as file, warnings.catch_warnings():
+        warnings.simplefilter("error", pd.errors.ParserWarning)  # that fields would be lost
+        header = next(filter(None, csv.reader(file, skipinitialspace=True)), [])
+        file.seek(0)  # no address in the internet
+        frame = pd.read_csv(file, index_col=False, skipinitialspace=True, low_memory=False)
+    return frame.set_axis(header, axis=1)  # without pandas's other names for what is there twice
+
+
+def _bare(header: Any) -> str:
+    """Return a header without its unit."""
+    return HEADER.sub(r"\1", str(header)).strip()
+
+
 def _columns(
-    frame: pd.DataFrame, names: Sequence[str] | None, default: str, kind: str
+    frame: pd.DataFrame, names: Sequence[str] | None, default: str, kind: str, taken: set[Any]
 ) -> tuple[str, ...]:
     """Return the columns of ``names``; ``y`` may stand for ``y1``, ``y2``, ..."""
-    chosen = [default] if names is None else [names] if isinstance(names, str) else list(names)
+    present = [x for x in frame.columns if names is not None or x not in taken]
     columns = []
-    for name in chosen:
-        numbered = [x for x in frame.columns if re.fullmatch(rf"{re.escape(name)}\d+", x)]
-        columns += [name] if name in frame.columns else numbered or [name]
-    if names is None and columns == [default] and default not in frame.columns:
-        columns = []
+    for name in names or [default]:
+        numbered = [x for x in present if re.fullmatch(rf"{re.escape(name)}\d+", x)]
+        columns += [name] if name in present or (names and not numbered) else numbered
     if not columns and kind != "known":
         got = f"none, and columns {', '.join(frame.columns)}"
         remedy = f"Pass read_log(.., {kind}=[..])."
@@ -303,43 +333,91 @@ def _columns(
     return tuple(columns)
 
 
-def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> np.ndarray:
-    """Return the columns as float64, with NaN for what is no number."""
+def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> tuple[np.ndarray, list[str]]:
+    """Return the columns as float64, with NaN for words, and notes on these.
+
+    Text with digits that is no number would be lost, and is refused.
+    """
     import pandas as pd
 
-    values = np.empty((len(frame), len(names)))
+    values, notes = np.empty((len(frame), len(names))), []
     for i, name in enumerate(names):
-        _check_column(frame, name)
-        values[:, i] = np.asarray(pd.to_numeric(frame[name], errors="coerce"), dtype=float)
+        column = _column(frame, name)
+        numbers: Any = pd.to_numeric(column, errors="coerce")
+        values[:, i] = np.asarray(numbers, dtype=float)
+        words = column[numbers.isna() & column.notna()].astype(str)
+        odd = words[words.str.contains(r"\d") & (words.map(_bare) != name)]
+        if len(odd):
+            got, want = f"{name} with {odd.iloc[0]!r} in {_count(len(odd), 'row')}", "1234.5"
+            remedy = (
+                "Pass a DataFrame: pandas.read_csv(.., decimal=',') reads decimal commas, and "
+                "thousands=',' separators; units belong in the header, as in 'q [kW]'."
+            )
+            raise QPError.expected("column", got, want, remedy)
         if not np.isfinite(values[:, i]).any():
             got = f"{name}, without a number"
             raise QPError.expected("column", got, "a column of numbers")
-    return values
+        if len(words):
+            rows = _count(len(words), "row")
+            notes.append(f"{name} is no number in {rows}, as in {words.iloc[0]!r}")
+    return values, notes
 
 
-def _check_column(frame: pd.DataFrame, name: str) -> None:
+def _column(frame: pd.DataFrame, name: str) -> Any:
     count = list(frame.columns).count(name)
     if count != 1:
         got = f"{name!r}, which is {'missing' if count == 0 else 'there twice'}"
         expected = f"one of {', '.join(dict.fromkeys(frame.columns))}"
         raise QPError.expected("column", got, expected)
+    return frame[name]
 
 
-def _times(frame: pd.DataFrame, name: str | None) -> np.ndarray | None:
+def _times(frame: pd.DataFrame, name: str | None, day_first: bool | None) -> np.ndarray | None:
     """Return the times, dates in seconds; None without a column of times."""
     import pandas as pd
 
-    if name is None and DATES not in frame.columns:
+    if name is None and TIME_INDEX not in frame.columns:
         return None
-    _check_column(frame, name := name or DATES)
-    column = frame[name]
-    if pd.api.types.is_numeric_dtype(column):
-        return column.to_numpy(dtype=float)
-    try:
-        dates = pd.to_datetime(column, utc=True)
-    except (ValueError, TypeError) as error:
-        raise QPError.expected("time", f"{name} ({error})", "numbers or dates") from error
-    return (dates - dates.min()).dt.total_seconds().to_numpy()
+    column = _column(frame, name := name or TIME_INDEX)
+    if isinstance(column.dtype, pd.PeriodDtype):
+        column = column.dt.to_timestamp()
+    ways = [column]
+    if column.dtype.kind not in "mM":
+        numbers: Any = pd.to_numeric(column, errors="coerce")
+        if numbers.notna().any():
+            return np.asarray(numbers, dtype=float)
+        column = column.where(column.astype(str).map(_bare) != name)  # a header in between
+        ways = _dates(column, day_first)
+    if not ways:
+        got = f"{name} with {str(column.iloc[0])!r}"
+        raise QPError.expected("time", got, "numbers or dates of one format")
+    times = [(dates - dates.min()).dt.total_seconds().to_numpy() for dates in ways]
+    if len(times) == 1 or np.array_equal(*map(np.diff, times), equal_nan=True):
+        return times[0]
+    steps = [np.diff(x) / np.nanmedian(np.diff(x)) for x in times]
+    day, month = (np.nanmean(np.abs(x - 1)) for x in steps)
+    text = (
+        f"The dates in {name} may begin with the day or the month: its steps are more even if it "
+        f"is the {'day' if day <= month else 'month'}. Pass day_first={day <= month} if that is so."
+    )
+    warnings.warn(text, UserWarning, stacklevel=3)
+    return times[int(day > month)]
+
+
+def _dates(column: pd.Series, day_first: bool | None) -> list[pd.Series]:
+    """Return the dates in each way that they can be read."""
+    import pandas as pd
+
+    dates = []
+    ways: list[Any] = [{"format": "ISO8601"}]
+    ways += [{"dayfirst": x} for x in (True, False) if day_first in (x, None)]
+    for way in ways:
+        with contextlib.suppress(ValueError, TypeError), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # on dates that need no guess
+            dates.append(pd.to_datetime(column, utc=True, **way))
+            if "format" in way:
+                break
+    return dates
 
 
 def _gaps(
@@ -348,16 +426,44 @@ def _gaps(
     """Return True for the steps of a trajectory across a gap, and the time of the other steps."""
     if times is None or not inside.any():
         return np.zeros_like(inside), None
-    change = np.diff(times)
-    dt = float(np.nanmedian(change[inside]))
-    if not dt > 0:
+    change = np.where(inside, np.diff(times), np.nan)
+    tick = 0.0
+    if (change == 0).sum() > ONE_DT * inside.sum():  # a clock that shows whole seconds, say
+        tick = np.min(change[change > 0], initial=np.inf)
+    for lag in SPANS if tick else (1,):
+        apart = (times[lag:] - times[:-lag])[marks[lag:] == marks[:-lag]]
+        if len(apart):
+            break
+    dt = float(np.nanmedian(apart) / lag)
+    if not 0 < dt < np.inf:
         raise QPError.expected("time", f"steps of {dt:g}", "times that increase", "Sort the rows.")
-    for mark in np.unique(marks[inside]):
-        own = change[inside & (marks == mark)]
-        if len(own) >= FEWEST and abs(np.nanmedian(own) - dt) > ONE_DT * dt:
-            got = f"steps of {np.nanmedian(own):g} in one part, and of {dt:g} in the median"
+    gaps = inside & ~(np.abs(change - dt) <= 0.5 * dt + tick)
+    if len(change) >= FEWEST:
+        rows = np.lib.stride_tricks.sliding_window_view(change, FEWEST)
+        own = rows.mean(1)
+        even = (np.abs(rows - own[:, None]) <= 0.5 * own[:, None] + tick).all(1)
+        off = np.where(even, np.abs(own - dt), 0)
+        if off.max() > ONE_DT * dt + tick / FEWEST:
+            row = int(np.argmax(off > 0.99 * off.max()))
+            got = f"steps of {own[row]:g} from row {row} on, and of {dt:g} in the median"
             raise QPError.expected("time", got, "one sampling time", "Resample the data.")
-    return inside & ~(np.abs(change - dt) <= 0.5 * dt), dt
+    return gaps, dt
+
+
+def _marked(values: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Name the columns with a number that repeats and is far from all others, as -9999."""
+    notes = []
+    for name, column in zip(names, values.T, strict=True):
+        x, counts = np.unique(column, return_counts=True)
+        if counts[1:-1].sum() < FEWEST or not np.ptp(x[1:-1]):
+            continue
+        far = (np.diff(x)[[0, -1]] > FAR * np.ptp(x[1:-1])) & (counts[[0, -1]] > 1)
+        notes += [
+            f"{name} is {x[end]:.6g} in {counts[end]} rows, far from all others, which may mark "
+            "missing numbers: replace them by NaN"
+            for end in np.array([0, -1])[far]
+        ]
+    return notes
 
 
 def _dependent(values: np.ndarray, names: Sequence[str]) -> list[str]:
@@ -399,19 +505,13 @@ def _named(
     known: Sequence[str] | None = None,
 ) -> Log:
     """Return the log of trajectories, by default with the names y1, .., u1, .. and d1, ..."""
-
-    def names(kind: str, letter: str, chosen: Sequence[str] | None, size: int) -> tuple[str, ...]:
-        if chosen is not None and len(chosen) != size:
-            raise QPError.expected(kind, f"{list(chosen)}", f"{size} names")
-        return tuple(chosen or (f"{letter}{i + 1}" for i in range(size)))
-
-    y, u, d = (part.shape[-1] for part in trajectories[0])
-    return Log(
-        trajectories,
-        names("outputs", "y", outputs, y),
-        names("inputs", "u", inputs, u),
-        names("known", "d", known, d),
-    )
+    names = []
+    for kind, part in {"outputs": outputs, "inputs": inputs, "known": known}.items():
+        letter, size = "yud"[len(names)], trajectories[0][len(names)].shape[-1]
+        if part is not None and len(part) != size:
+            raise QPError.expected(kind, f"{list(part)}", f"{size} names")
+        names.append(tuple(part or (f"{letter}{i + 1}" for i in range(size))))
+    return Log(trajectories, *names)
 
 
 def _of_steps(data: Any, n_x: int | None, n_d: int) -> list[Trajectory]:
@@ -529,7 +629,7 @@ def _entry(
         raise QPError.expected(name, got, wanted, REMEDY)
     if value.shape[-1] < (width or 1):
         raise QPError.expected(name, f"shape {tuple(value.shape)}", wanted)
-    value = value.detach().to("cpu", torch.float64)
+    value = ungraded(name, value).detach().to("cpu", torch.float64)
     if width is not None:
         value = value[..., :width] if first else value[..., value.shape[-1] - width :]
     bad = (~value.isfinite() & valid.unsqueeze(-1)).nonzero()

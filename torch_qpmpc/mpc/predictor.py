@@ -28,7 +28,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.mpc.banded import banded_matrix
@@ -60,6 +59,20 @@ class Constraints(NamedTuple):
     b: Tensor
 
 
+class Windows(NamedTuple):
+    """z from each possible start in a log, ``(starts, n_z)``, with zeros after the end.
+
+    ``ahead`` is the number of steps from there to the end of the trajectory, ``(starts,)``.
+    """
+
+    z: Tensor
+    ahead: Tensor
+
+
+#: Trajectories, or their windows.
+Data = Sequence[Trajectory] | Windows
+
+
 class Options(NamedTuple):
     """How to fit: the sizes of z, and the arguments of `identify`; None chooses each ridge."""
 
@@ -71,7 +84,7 @@ class Options(NamedTuple):
 
 
 def arx(
-    trajectories: Sequence[Trajectory],
+    data: Data,
     layout: Layout,
     strength: float | None = None,
     held: tuple[int, ...] = (),
@@ -80,7 +93,7 @@ def arx(
 
     Outputs that are ``held`` keep their last value.
     """
-    X, Y = transitions(trajectories, layout)
+    X, Y = transitions(data, layout)
     W, offset = _regression(X, Y, _differences(layout, known(layout, 0)), strength)
     E, window = W[:, : layout.n_d], W[:, layout.n_d :]
     pairs = window.unflatten(-1, (layout.past, layout.n)).flip(-2)
@@ -92,37 +105,34 @@ def arx(
     return ARX(A, B, E, offset)
 
 
-def fit(trajectories: Sequence[Trajectory], options: Options) -> tuple[ARX, Constraints]:
+def fit(data: Data, options: Options) -> tuple[ARX, Constraints]:
     """Fit an ARX model, and correct its banded C and b as the structure allows.
 
     A row block is not corrected if the data have too few starts.
     """
     layout, structure, causal, strength, held = options
     N, n_x = layout.horizon, layout.n_x
-    model = arx(trajectories, layout, strength, held)
+    measured, ahead = data = windows(data, layout)
+    model = arx(data, layout, strength, held)
     C = banded_matrix(model.A, model.B, N, model.E)
     b = -model.offset.repeat(N)
     if structure == "tied":
         return model, Constraints(C, b)
-    measured = [windows(log, layout) for log in trajectories]
     outputs = outputs_in(layout)
-    Z = [z.index_fill(1, outputs.flatten(), 0.0) for z in measured]  # the predictions, one by one
+    Z = measured.index_fill(1, outputs.flatten(), 0.0)  # the predictions, one by one
     for k in range(N):
         rows = slice(k * n_x, (k + 1) * n_x)
         last = k if causal or structure == "varying" else N - 1
         read = _band(layout, k) if structure == "varying" else known(layout, last)
-        # Starts whose windows end after the log are left out.
-        inside = [slice(max(len(z) - last, 0)) for z in Z]
-        pairs = list(zip(Z, measured, inside, strict=True))
-        X = torch.cat([z[i] for z, _, i in pairs])
+        inside = ahead > last  # starts whose windows end after the log are left out
+        X = Z[inside]
         if (k or last) and len(X) > SPANS * last:
-            Y = torch.cat([y[i, outputs[k]] for _, y, i in pairs]) - X @ C[rows].mT + b[rows]
+            Y = measured[inside][:, outputs[k]] - X @ C[rows].mT + b[rows]
             Y[:, torch.tensor(held, dtype=torch.long)] = 0.0
             change, shift = _regression(X[:, read], Y, _differences(layout, read), strength)
             C[rows, read] += change
             b[rows] -= shift
-        for z in Z:
-            z[:, outputs[k]] = z @ C[rows].mT - b[rows]
+        Z[:, outputs[k]] = Z @ C[rows].mT - b[rows]
     return model, Constraints(C, b)
 
 
@@ -135,10 +145,7 @@ def predict(constraints: Constraints, Z: Tensor, layout: Layout) -> Tensor:
 
 
 def prediction_errors(
-    trajectories: Sequence[Trajectory],
-    constraints: Constraints,
-    layout: Layout,
-    causal: bool = True,
+    data: Data, constraints: Constraints, layout: Layout, causal: bool = True
 ) -> Tensor:
     """Return y_{k+1} minus its prediction from each start, ``(starts, N, n_x)``.
 
@@ -147,25 +154,34 @@ def prediction_errors(
     """
     N = layout.horizon
     needed = torch.arange(N) if causal else torch.full((N,), N - 1)
-    errors = [torch.zeros(0, N, layout.n_x, dtype=torch.float64)]
-    for log in trajectories:
-        Z = windows(log, layout)
-        over = torch.arange(len(Z)).unsqueeze(-1) + needed >= len(Z)
-        error = Z[:, outputs_in(layout)] - predict(constraints, Z, layout)
-        errors.append(error.masked_fill(over.unsqueeze(-1), torch.nan))
-    return torch.cat(errors)
+    Z, ahead = windows(data, layout)
+    error = Z[:, outputs_in(layout)] - predict(constraints, Z, layout)
+    over = needed >= ahead.unsqueeze(-1)
+    return error.masked_fill(over.unsqueeze(-1), torch.nan)
 
 
-def windows(log: Trajectory, layout: Layout) -> Tensor:
-    """Return z from each possible start, ``(T - L + 1, n_z)``, with zeros after the end."""
-    past, horizon, starts = layout.past, layout.horizon, log.steps - layout.past + 1
-    if starts < 1:
-        return log.y.new_zeros(0, layout.n_z)
-    pairs = torch.cat((log.y, F.pad(log.u, (0, 0, 0, 1))), dim=-1)
-    pairs = F.pad(pairs, (0, 0, 0, horizon)).unfold(0, past + horizon, 1)
-    preview = F.pad(log.d[past - 1 :], (0, 0, 0, horizon)).unfold(0, horizon + 1, 1)
-    preview, stages = (x[:starts].mT.flatten(1) for x in (preview, pairs))
-    return torch.cat((preview, stages[:, : stages.shape[1] - layout.n_u]), dim=-1)
+def windows(data: Data, layout: Layout) -> Windows:
+    """Return the windows of trajectories, all at once."""
+    if isinstance(data, Windows):
+        return data
+    past, horizon = layout.past, layout.horizon
+    y, u, d = map(torch.cat, zip(*data, strict=True))
+    steps = torch.tensor([log.steps for log in data])
+    # One table of all rows; those of a trajectory's last outputs have neither action nor signals.
+    last = (steps + 1).cumsum(0) - 1
+    moves = torch.ones(len(y), dtype=torch.bool).index_fill(0, last, False)
+    rows = y.new_zeros(len(y), layout.n_d + layout.n)
+    rows[:, layout.n_d : layout.n_d + layout.n_x] = y
+    rows[moves, : layout.n_d], rows[moves, layout.n_d + layout.n_x :] = d, u
+    ends = last.repeat_interleave(steps + 1)
+    ahead = ends - torch.arange(len(y)) - past + 1
+    starts = (ahead > 0).nonzero()
+    index = starts + torch.arange(past + horizon)
+    inside = index <= ends[starts]
+    Z = rows[index.clamp(max=len(y) - 1)] * inside.unsqueeze(-1)
+    preview, stages = Z[:, past - 1 :, : layout.n_d], Z[..., layout.n_d :].flatten(1)
+    Z = torch.cat((preview.flatten(1), stages[:, : stages.shape[1] - layout.n_u]), dim=-1)
+    return Windows(Z, ahead[starts[:, 0]])
 
 
 def outputs_in(layout: Layout) -> Tensor:
@@ -174,10 +190,11 @@ def outputs_in(layout: Layout) -> Tensor:
     return first.unsqueeze(-1) + torch.arange(layout.n_x)
 
 
-def transitions(trajectories: Sequence[Trajectory], layout: Layout) -> tuple[Tensor, Tensor]:
+def transitions(data: Data, layout: Layout) -> tuple[Tensor, Tensor]:
     """Return the regressors and targets of an ARX model: the columns `known` of z, and y_1."""
-    layout = replace(layout, horizon=1)
-    Z = torch.cat([windows(log, layout) for log in trajectories])
+    if not isinstance(data, Windows):
+        layout = replace(layout, horizon=1)
+    Z, _ = windows(data, layout)
     return Z[:, known(layout, 0)], Z[:, outputs_in(layout)[0]]
 
 

@@ -13,6 +13,7 @@ from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.log import NEXT, logs, valid_steps
 from torch_qpmpc.mpc.stage_cost import EXACT, StageCost, fit_stage_cost
+from torch_qpmpc.mpc.validation import ungraded
 
 REMEDY = (
     "Pass stage_weight (in train.py task.stage_weight), the weight W of the cost "
@@ -181,7 +182,7 @@ def _observed(steps: Any, layout: Layout) -> tuple[Tensor, ...]:
     if reward is None:
         raise _unfitted("a log without rewards")
     kept = valid_steps(steps)
-    reward = reward.detach().cpu().reshape(steps.shape)[kept].double()
+    reward = ungraded("reward", reward).detach().cpu().reshape(steps.shape)[kept].double()
     if not reward.isfinite().all():
         raise _unfitted("a log with rewards of NaN or inf")
     u = steps["action"]

@@ -72,9 +72,9 @@ def check_one_model(mpc: Any) -> None:
         raise QPError.expected("mpc", got, want, "Its model at s is mpc.schedule.linearised(s).")
 
 
-def as_tensor(name: str, value: Any) -> Tensor:
-    """Convert to a float64 tensor on the CPU; raise `QPError` unless it is finite."""
-    tensor = read_numbers(name, value)
+def as_tensor(name: str, value: Any, differentiable: bool = False) -> Tensor:
+    """Convert by `read_numbers`; raise `QPError` unless all entries are finite."""
+    tensor = read_numbers(name, value, differentiable)
     if not tensor.isfinite().all():
         raise QPError.expected(name, "NaN or inf", "finite entries")
     return tensor
@@ -85,8 +85,25 @@ def owned(name: str, value: Any) -> Tensor | None:
     return None if value is None else as_tensor(name, value).detach().clone()
 
 
-def read_numbers(name: str, value: Any) -> Tensor:
-    """Convert to a float64 tensor on the CPU, which may have NaN or inf."""
+def ungraded(name: str, value: Any) -> Any:
+    """Return ``value``; raise `QPError` if it is or has a tensor whose gradient would be lost."""
+    parts = value if isinstance(value, list | tuple) else ()
+    if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
+        remedy = f"Pass {name}.detach(): no gradient flows through this argument."
+        raise QPError.expected(name, "a tensor that requires grad", "one without", remedy)
+    for part in parts:
+        ungraded(name, part)
+    return value
+
+
+def read_numbers(name: str, value: Any, differentiable: bool = False) -> Tensor:
+    """Convert to a float64 tensor on the CPU, which may have NaN or inf.
+
+    Raises:
+        QPError: there are no real numbers, or a gradient would be lost: only ``differentiable``
+            arguments may require one.
+    """
+    value = value if differentiable else ungraded(name, value)
     of_scipy = hasattr(value, "toarray")
     if of_scipy or (isinstance(value, Tensor) and value.layout != torch.strided):
         remedy = f"Convert it: {name}.{'toarray' if of_scipy else 'to_dense'}()."
