@@ -72,7 +72,7 @@ BUDGET = {
     "experiment": 4001,
     "export": 1412,
     "learning": 2473,
-    "mpc": 5236,
+    "mpc": 5760,
     "proofs": 998,
     "qp": 5766,
     "study": 606,

@@ -1,0 +1,168 @@
+"""Identified state-space models in innovations form, and their filter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+
+from torch_qpmpc.mpc.innovations import Innovations
+from torch_qpmpc.mpc.log import Trajectory
+from torch_qpmpc.mpc.subspace import fit_state_space
+
+A = np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.7]])
+B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 1.0]])
+C = np.array([[1.0, 0.0, 0.0], [0.0, 0.5, 0.5]])
+# Each noise has its own source.
+Q, R = 0.01 * np.eye(3), np.diag([0.04, 0.02])
+
+
+def trajectory(y, u, d=None) -> Trajectory:
+    d = np.zeros((len(u), 0)) if d is None else d
+    return Trajectory(*map(torch.as_tensor, (y, u, d)))
+
+
+def noisy(count: int, steps: int, seed: int = 0, Q=Q, R=R, A=A, B=B, C=C) -> list[Trajectory]:
+    rng, data = np.random.default_rng(seed), []
+    for _ in range(count):
+        x, u, y = rng.normal(size=len(A)), rng.uniform(-1, 1, (steps, B.shape[1])), []
+        for k in range(steps + 1):
+            y.append(C @ x + rng.multivariate_normal(np.zeros(len(R)), R))
+            if k < steps:
+                x = A @ x + B @ u[k] + rng.multivariate_normal(np.zeros(len(Q)), Q)
+        data.append(trajectory(np.array(y), u))
+    return data
+
+
+def exact(A, B, count=20, steps=30, seed=1) -> list[Trajectory]:
+    none = np.zeros_like(A)
+    return noisy(count, steps, seed, none, none, A, B, np.eye(len(A)))
+
+
+def arrays(data: list[Trajectory]):
+    return [[part.numpy() for part in log] for log in data]
+
+
+def true_form() -> Innovations:
+    """The innovations form of the matrices above, in the plant's own states."""
+    P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
+    S = C @ P @ C.T + R
+    L = P @ C.T @ np.linalg.inv(S)
+    return Innovations(A, B, np.zeros((3, 0)), np.zeros(3), C, L, S, np.zeros(3), np.eye(3) - P)
+
+
+def test_first_gains_are_those_of_the_textbook_filter():
+    form, P = true_form(), np.eye(3)
+    gains = form.gains(200)
+    assert 3 < len(gains) < 200
+    for k in range(len(gains) + 3):
+        V = C @ P @ C.T + R
+        L = P @ C.T @ np.linalg.inv(V)
+        own = gains[k] if k < len(gains) else form.L
+        np.testing.assert_allclose(own, L, atol=1e-8)
+        P = A @ (P - L @ V @ L.T) @ A.T + Q
+
+
+def test_estimates_predict_through_what_is_missing():
+    form, (y, u, d) = true_form(), arrays(noisy(1, 40))[0]
+    y = y.copy()
+    y[3, 0] = y[7] = y[8] = np.nan
+    own, x, P = form.estimates(y, u, d), np.zeros(3), np.eye(3)
+    for k in range(41):
+        seen = np.isfinite(y[k])
+        Ck, V = C[seen], C[seen] @ P @ C[seen].T + R[np.ix_(seen, seen)]
+        L = P @ Ck.T @ np.linalg.inv(V)
+        x, P = x + L @ (y[k, seen] - Ck @ x), P - L @ V @ L.T
+        np.testing.assert_allclose(own[k], x, atol=1e-9)
+        if k < 40:
+            x, P = A @ x + B @ u[k], A @ P @ A.T + Q
+
+
+def test_a_fit_has_the_poles_gain_and_noise_of_the_plant():
+    data = noisy(20, 200)
+    model, true = fit_state_space(data, order=3).model, true_form()
+    np.testing.assert_allclose(np.sort_complex(model.poles), np.sort_complex(true.poles), atol=0.03)
+    np.testing.assert_allclose(model.S, true.S, atol=0.08 * np.trace(true.S))
+    np.testing.assert_array_equal(model.C, np.eye(2, 3))
+    own, best = (
+        np.concatenate([form.errors(y, u, d, 10) for y, u, d in arrays(noisy(10, 100, seed=5))])
+        for form in (model, true)
+    )
+    ratio = np.nanmean(own**2, 0) / np.nanmean(best**2, 0)
+    assert ratio.max() < 1.03
+
+
+PLANTS = {
+    "all measured": (np.array([[0.9, 0.2], [-0.2, 0.9]]), np.array([[0.0], [0.5]])),
+    "with a set-point": (
+        np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 1.0]]),
+        np.array([[0.0], [0.5], [0.0]]),
+    ),
+    "an integrator": (np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]])),
+}
+
+
+@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize(("count", "steps"), [(20, 30), (1, 300), (40, 5)])
+def test_an_exact_plant_is_its_outputs(name, count, steps):
+    if name == "with a set-point" and count == 1:
+        pytest.skip("One trajectory has one set-point.")
+    A, B = PLANTS[name]
+    data = exact(A, B, count, steps)
+    model, n = fit_state_space(data).model, len(A)
+    np.testing.assert_allclose(model.A, A, atol=1e-9)
+    np.testing.assert_allclose(model.B, B, atol=1e-9)
+    np.testing.assert_allclose(model.offset, 0, atol=1e-9)
+    np.testing.assert_array_equal(model.C, np.eye(n))
+    for y, u, d in arrays(data):
+        np.testing.assert_allclose(model.estimates(y, u, d), y, atol=1e-9)
+
+
+@pytest.mark.parametrize("order", [None, 3])
+def test_units_change_no_estimate(order):
+    data, size_y, size_u = noisy(10, 50), np.array([1e6, 1e-6]), np.array([1e-6, 1e4])
+    shift = np.array([3e6, -2e-6])
+    scaled = [trajectory(y * size_y + shift, u * size_u, d) for y, u, d in map(tuple, arrays(data))]
+    one, other = (
+        fit_state_space(data, order=order).model,
+        fit_state_space(scaled, order=order).model,
+    )
+    for (y, u, d), (ys, us, ds) in zip(arrays(data), arrays(scaled), strict=True):
+        xi = one.estimates(y, u, d)[:, :2]
+        np.testing.assert_allclose(
+            (other.estimates(ys, us, ds)[:, :2] - shift) / size_y, xi, atol=1e-6
+        )
+
+
+def test_missing_samples_cost_little():
+    data = noisy(20, 100)
+    rng, thinned = np.random.default_rng(3), []
+    for y, u, d in arrays(data):
+        y = np.where(rng.uniform(size=y.shape) < 0.1, np.nan, y)
+        thinned.append(trajectory(y, u, d))
+    model, true = fit_state_space(thinned, order=3).model, true_form()
+    own, best = (
+        np.concatenate([form.errors(y, u, d, 5) for y, u, d in arrays(noisy(10, 100, seed=5))])
+        for form in (model, true)
+    )
+    assert (np.nanmean(own**2, 0) / np.nanmean(best**2, 0)).max() < 1.05
+
+
+def test_outputs_that_stay_in_a_trajectory_are_known_to_the_others():
+    rng, data, hidden = np.random.default_rng(4), [], np.array([[0.2], [0.3]])
+    for y, u, d in arrays(noisy(20, 50)):
+        goal, effect = rng.normal(size=(1, 1)), np.zeros((51, 2))
+        for k in range(50):
+            effect[k + 1] = 0.5 * effect[k] + (hidden @ goal).ravel()
+        goals = np.tile(goal, (51, 1))
+        data.append(trajectory(np.hstack((y[:, :1] + effect[:, :1], goals, y[:, 1:])), u, d))
+    model = fit_state_space(data, order=4).model
+    n = len(model.A)
+    np.testing.assert_allclose(model.A[1], np.eye(n)[1])
+    np.testing.assert_allclose(model.L[1], [0, 1, 0])
+    np.testing.assert_allclose(model.B[1], 0)
+    for y, u, d in arrays(data[:3]):
+        xi = model.estimates(y, u, d)
+        np.testing.assert_allclose(xi[:, 1], y[:, 1], atol=1e-9)
+        assert np.square(xi[:, 0] - y[:, 0]).mean() < 0.05

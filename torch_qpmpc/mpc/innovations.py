@@ -1,0 +1,134 @@
+"""A linear state-space model in innovations form: its filter, its predictions and its noise."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+#: A gain that differs from the steady one by less than this share has settled.
+SETTLED = 1e-9
+#: Directions of a covariance below this share of its size, in unit variances, have none.
+SINGULAR = 1e-12
+
+
+class Innovations(NamedTuple):
+    r"""A linear model with noise, whose state at the time of decision k has seen y_k.
+
+    With innovations e of covariance S, the filter's steady state is
+
+        \xi_{k+1} = A \xi_k + B u_k + E d_k + offset + L e_{k+1},
+        y_{k+1} = C (A \xi_k + B u_k + E d_k + offset) + e_{k+1}.
+
+    The first state has the mean x0 before its output, and P0 is the covariance of its error *minus*
+    the steady state's, so that ``C P0 C' + S`` is the covariance of y_0. It is negative in
+    directions that are better known at the beginning than later.
+
+    Attributes:
+        A: ``(n, n)``.
+        B: ``(n, n_u)``.
+        E: ``(n, n_d)``.
+        offset: ``(n,)``.
+        C: ``(n_y, n)``; of a fit ``[I 0]``, so that the first states are the filtered outputs.
+        L: ``(n, n_y)``.
+        S: ``(n_y, n_y)``.
+        x0: ``(n,)``.
+        P0: ``(n, n)``.
+    """
+
+    A: Array
+    B: Array
+    E: Array
+    offset: Array
+    C: Array
+    L: Array
+    S: Array
+    x0: Array
+    P0: Array
+
+    @property
+    def poles(self) -> Array:
+        """The eigenvalues of A, the largest first."""
+        poles = np.linalg.eigvals(self.A)
+        return poles[np.argsort(-np.abs(poles), kind="stable")]
+
+    def gain(self, P: Array, seen: Array | None = None) -> tuple[Array, Array, Array]:
+        """Return L_k, the covariance of e_k and P_{k+1} from P_k, without outputs not ``seen``."""
+        C, L, S = self.C, self.L, self.S
+        V = C @ P @ C.T + S
+        gain = L + (P @ C.T - L @ C @ P @ C.T) @ _inverse(V)
+        if seen is not None and not seen.all():
+            gain = np.zeros_like(L)
+            gain[:, seen] = (P @ C.T + L @ S)[:, seen] @ _inverse(V[np.ix_(seen, seen)])
+        P = self.A @ (P + L @ S @ L.T - gain @ V @ gain.T) @ self.A.T
+        return gain, V, (P + P.T) / 2
+
+    def gains(self, steps: int) -> Array:
+        """Return the gains L_0, L_1, .. from P0 ``(steps', n, n_y)``, at most ``steps`` of them.
+
+        They end before the first that is equal to L within rounding.
+        """
+        gains, P = [], self.P0
+        size = np.sqrt(np.maximum(np.diag(self.S), 0))
+        for _ in range(steps):
+            gain, _, P = self.gain(P)
+            if np.abs((gain - self.L) * size).max() <= SETTLED * np.abs(self.L * size).max():
+                break
+            gains.append(gain)
+        return np.array(gains).reshape(-1, *self.L.shape)
+
+    def estimates(self, y: Array, u: Array, d: Array) -> Array:
+        r"""Return \xi_0, .., \xi_T ``(T + 1, n)`` of one trajectory.
+
+        Args:
+            y: outputs ``(T + 1, n_y)``; an entry that is NaN was not measured.
+            u: inputs ``(T, n_u)``.
+            d: known signals ``(T, n_d)``.
+        """
+        seen = np.isfinite(y)
+        whole, inputs = seen.all(), self.inputs(u, d)
+        gains = self.gains(len(y)) if whole else ()
+        xi, P, x = np.empty((len(y), len(self.A))), self.P0, self.x0
+        for k in range(len(y)):
+            if whole:
+                gain = gains[k] if k < len(gains) else self.L
+            else:
+                gain, _, P = self.gain(P, seen[k])
+            e = np.where(seen[k], y[k] - self.C @ x, 0.0)
+            xi[k] = x + gain @ e
+            if k < len(inputs):
+                x = self.A @ xi[k] + inputs[k]
+        return xi
+
+    def inputs(self, u: Array, d: Array) -> Array:
+        """Return B u + E d + offset, ``(*batch, n)``."""
+        return u @ self.B.T + d @ self.E.T + self.offset
+
+    def errors(self, y: Array, u: Array, d: Array, horizon: int) -> Array:
+        """Return y_{k+h} minus its prediction from the estimate at k, ``(T, horizon, n_y)``.
+
+        It is NaN after the end of the trajectory, and where the output was not measured.
+        """
+        steps = len(u)
+        errors = np.full((steps, horizon, len(self.C)), np.nan)
+        x, inputs = self.estimates(y, u, d)[:-1], self.inputs(u, d)
+        for h in range(min(horizon, steps)):
+            x = x[: steps - h] @ self.A.T + inputs[h:]
+            errors[: steps - h, h] = y[h + 1 :] - x @ self.C.T
+        return errors
+
+    def transformed(self, T: Array, inverse: Array, shift: Array) -> Innovations:
+        r"""Return the model of the states T \xi + shift; ``inverse @ T`` is the identity."""
+        A = T @ self.A @ inverse
+        offset = T @ self.offset + shift - A @ shift
+        ends = T @ self.L, self.S, T @ self.x0 + shift, T @ self.P0 @ T.T
+        return Innovations(A, T @ self.B, T @ self.E, offset, self.C @ inverse, *ends)
+
+
+def _inverse(V: Array) -> Array:
+    """Return the pseudoinverse of a covariance, in unit variances."""
+    size = np.sqrt(np.maximum(np.diag(V), 0))
+    scale = np.divide(1, size, out=np.zeros_like(size), where=size > 0)
+    return scale[:, None] * np.linalg.pinv(scale[:, None] * V * scale, SINGULAR, True) * scale
